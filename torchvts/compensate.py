@@ -1,0 +1,97 @@
+"""From a camera's image to the image the light model speaks of: linear light, constant defects taken out."""
+
+import torch
+from torch import Tensor, nn
+
+from .core.checks import check_batch, check_positive, check_same_size
+
+
+class Compensate(nn.Module):
+    """Linear light, with what the model and the background disagree on taken out.
+
+    ``compensated = image^gamma * gain + offset``; pixels named in ``defects`` then become the mean of their nearest sound
+    neighbours. The multiplicative form (gain = model / background) is exact for albedo, spots and vignetting, the additive
+    form of the paper (offset = I_delta = model - background) for ambient light.
+
+    Args:
+        gain: (3, H, W) or None for 1. offset: (3, H, W) or None for 0.
+        gamma: camera response, value = light^(1/gamma).
+        defects: (H, W) bool, pixels that tell nothing; None for none.
+    Source:
+        eq. 8 of the paper for the offset.
+    Example:
+        >>> Compensate(offset=torch.full((3, 4, 4), 0.1))(torch.zeros(1, 3, 4, 4)).max()
+        tensor(0.1000)
+    """
+
+    gain: Tensor | None
+    offset: Tensor | None
+    defect: Tensor
+    sound: Tensor
+
+    def __init__(
+        self,
+        gain: Tensor | None = None,
+        offset: Tensor | None = None,
+        gamma: float = 1.0,
+        defects: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.gamma = check_positive("gamma", gamma)
+        for name, value in (("gain", gain), ("offset", offset)):
+            if value is not None and (value.dim() != 3 or value.shape[0] != 3):
+                raise ValueError(f"{name}: expected (3, H, W), got {tuple(value.shape)}")
+        if defects is None or not bool(defects.any()):
+            sound = torch.zeros(0, 4, dtype=torch.int64)
+            flat_index = torch.zeros(0, dtype=torch.int64)
+        else:
+            flat_index, sound = nearest_sound(defects)
+        self.register_buffer("gain", None if gain is None else gain.detach().clone())
+        self.register_buffer("offset", None if offset is None else offset.detach().clone())
+        self.register_buffer("defect", flat_index)
+        self.register_buffer("sound", sound)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(B, 3, H, W) image in [0, 1] to (B, 3, H, W) linear light."""
+        check_batch("image", image, 3)
+        light = image if self.gamma == 1.0 else image.clamp_min(1e-6) ** self.gamma
+        gain, offset = self.gain, self.offset
+        if gain is not None:
+            check_same_size("image", image, "the calibration", gain.shape[1], gain.shape[2])
+            light = light * gain
+        if offset is not None:
+            check_same_size("image", image, "the calibration", offset.shape[1], offset.shape[2])
+            light = light + offset
+        if self.defect.shape[0] == 0:
+            return light
+        pixels = light.flatten(2)
+        repaired = pixels[:, :, self.sound].mean(dim=3)  # (B, 3, N)
+        return pixels.index_copy(2, self.defect, repaired).reshape(light.shape)
+
+
+def nearest_sound(defects: Tensor) -> tuple[Tensor, Tensor]:
+    """For every defect of an (H, W) bool mask its flat index (N,) and those of sound pixels to take its value from (N, 4).
+
+    Left, right, above and below, the next sound pixel each; where the border comes first, the pixel found the other way.
+
+    Raises:
+        ValueError: a whole row and column through a defect is defective.
+    """
+    height, width = defects.shape
+    rows, columns = torch.nonzero(defects, as_tuple=True)
+    found, missing = [], []
+    for dy, dx in ((0, -1), (0, 1), (-1, 0), (1, 0)):
+        y, x = rows.clone(), columns.clone()
+        for _ in range(max(height, width)):
+            y_next, x_next = (y + dy).clamp(0, height - 1), (x + dx).clamp(0, width - 1)
+            move = defects[y, x]
+            if not bool((move & ((y_next != y) | (x_next != x))).any()):
+                break
+            y, x = torch.where(move, y_next, y), torch.where(move, x_next, x)
+        found.append(y * width + x)
+        missing.append(defects[y, x])
+    index, lost = torch.stack(found, 1), torch.stack(missing, 1)
+    if bool(lost.all(1).any()):
+        raise ValueError("defects: expected sound pixels in the row or column of each defect, got none: the background is unusable")
+    substitute = index.gather(1, (~lost).to(torch.int64).argmax(1, keepdim=True))
+    return rows * width + columns, torch.where(lost, substitute, index)

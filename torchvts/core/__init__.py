@@ -1,0 +1,1 @@
+"""Floor 0: checks, geometry, the sensor, files. Imports nothing else of torchvts."""

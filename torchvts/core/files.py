@@ -1,0 +1,217 @@
+"""Images, video, tensors on disk: read with plain errors, written whole or not at all."""
+
+import json
+import os
+import struct
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.torch
+import torch
+from torch import Tensor
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+VIDEO_SUFFIXES = (".avi", ".mp4", ".mov", ".mkv", ".webm")
+
+
+@contextmanager
+def write_atomically(path: str | Path) -> Iterator[Path]:
+    """Give a temporary file beside ``path``; when the block ends well it takes the place of ``path``, else it is removed.
+
+    The temporary file keeps the suffix, so that writers which look at it work.
+
+    Raises:
+        FileNotFoundError: the folder is missing. PermissionError: it cannot be written.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path}: folder {path.parent} does not exist: make it first")
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: is a folder, expected the name of a file")
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    except OSError as error:
+        raise type(error)(f"{path}: cannot write into {path.parent}: {error.strerror}") from error
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        with temporary.open("rb") as stream:
+            os.fsync(stream.fileno())
+        mode = path.stat().st_mode & 0o777 if path.exists() else 0o666 & ~_umask()
+        temporary.chmod(mode)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def read_image(path: str | Path) -> Tensor:
+    """Read an image file as (3, H, W) float32 in [0, 1], channels R, G, B; 8 and 16 bits.
+
+    Raises:
+        FileNotFoundError: no such file. ValueError: not an image, or not in colour.
+    """
+    import cv2
+
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such image")
+    pixels = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_UNCHANGED) if path.stat().st_size else None
+    if pixels is None:
+        raise ValueError(f"{path}: not an image, or cut short")
+    if pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
+        raise ValueError(f"{path}: expected a colour image, got one of shape {pixels.shape}: three lights need three channels")
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"{path}: expected 8 or 16 bits per channel, got {pixels.dtype}")
+    return rgb_from_bgr(pixels[:, :, :3])
+
+
+def rgb_from_bgr(pixels: np.ndarray[Any, Any]) -> Tensor:
+    """OpenCV's (H, W, 3) B, G, R integers as (3, H, W) float32 in [0, 1], R, G, B."""
+    scale = float(np.iinfo(pixels.dtype).max)
+    return torch.from_numpy(np.ascontiguousarray(pixels[:, :, ::-1].transpose(2, 0, 1)).astype(np.float32)) / scale
+
+
+def write_image(path: str | Path, image: Tensor) -> None:
+    """Write (3, H, W) R, G, B in [0, 1] as an 8-bit image file.
+
+    Raises:
+        ValueError: another shape, or a suffix that is no image's.
+    """
+    if image.dim() != 3 or image.shape[0] != 3:
+        raise ValueError(f"image: expected (3, H, W), got {tuple(image.shape)}")
+    levels = torch.round(image.detach().clamp(0, 1) * 255).to(torch.uint8).cpu()
+    _write_pixels(Path(path), np.ascontiguousarray(levels.flip(0).permute(1, 2, 0).numpy()))
+
+
+DEPTH_PNG_STEP_MM = 0.0001
+DEPTH_PNG_ZERO = 32768
+
+
+def write_depth_png(path: str | Path, depth_mm: Tensor) -> None:
+    """Write depth as a 16-bit PNG: value = 32768 + depth / 0.0001 mm, so from -3.2768 to 3.2767 mm.
+
+    Raises:
+        ValueError: not one frame, or depth outside that range (write .npy instead).
+    """
+    frame = depth_mm.detach().cpu().double().reshape(depth_mm.shape[-2], depth_mm.shape[-1])
+    value = torch.round(frame / DEPTH_PNG_STEP_MM) + DEPTH_PNG_ZERO
+    if not bool(torch.isfinite(frame).all()) or float(value.min()) < 0 or float(value.max()) > 65535:
+        raise ValueError(
+            "depth_mm: expected finite values in [-3.2768, 3.2767] mm for a PNG, "
+            f"got [{frame.min():.4g}, {frame.max():.4g}]: write .npy"
+        )
+    _write_pixels(Path(path), value.numpy().astype(np.uint16))
+
+
+def read_depth_png(path: str | Path) -> Tensor:
+    """Read what :func:`write_depth_png` wrote: (1, 1, H, W), mm."""
+    import cv2
+
+    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 2:
+        raise ValueError(f"{path}: expected a 16-bit grey PNG with depth")
+    return (torch.from_numpy(pixels.astype(np.float32)) - DEPTH_PNG_ZERO)[None, None] * DEPTH_PNG_STEP_MM
+
+
+def _write_pixels(path: Path, pixels: np.ndarray[Any, Any]) -> None:
+    import cv2
+
+    if path.suffix.lower() not in IMAGE_SUFFIXES:
+        raise ValueError(f"{path}: expected a name ending in {', '.join(IMAGE_SUFFIXES)}")
+    with write_atomically(path) as temporary:
+        if not cv2.imwrite(str(temporary), pixels):
+            raise OSError(f"{path}: OpenCV could not write it")
+
+
+def read_frames(source: str | Path) -> Iterator[tuple[str, Tensor]]:
+    """Frames of an image file, a folder of images (by name) or a video: pairs of a name and (3, H, W) in [0, 1], R, G, B.
+
+    Raises:
+        FileNotFoundError: nothing there. ValueError: a file that cannot be read, or a folder without images.
+    """
+    path = Path(source)
+    if path.is_dir():
+        files = sorted(p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+        if not files:
+            raise ValueError(f"{path}: no images in this folder ({', '.join(IMAGE_SUFFIXES)})")
+        return ((file.stem, read_image(file)) for file in files)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file or folder")
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        return _read_video(path)
+    return iter([(path.stem, read_image(path))])
+
+
+def count_frames(source: str | Path) -> int:
+    """Number of frames that :func:`read_frames` will give (a video's own claim), for progress bars."""
+    import cv2
+
+    path = Path(source)
+    if path.is_dir():
+        return sum(p.suffix.lower() in IMAGE_SUFFIXES for p in path.iterdir())
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        return max(0, int(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT)))
+    return 1
+
+
+def _read_video(path: Path) -> Iterator[tuple[str, Tensor]]:
+    import cv2
+
+    capture = cv2.VideoCapture(str(path))
+    number = 0
+    try:
+        while True:
+            there, pixels = capture.read()
+            if not there:
+                break
+            yield f"{path.stem}_{number:06d}", rgb_from_bgr(pixels)
+            number += 1
+    finally:
+        capture.release()
+    if number == 0:
+        raise ValueError(f"{path}: not a video, or cut short: no frame could be read")
+
+
+def save_tensors(path: str | Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> None:
+    """Write tensors and JSON metadata as one safetensors file, whole or not at all."""
+    plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    with write_atomically(path) as temporary:
+        safetensors.torch.save_file(plain, str(temporary), {"torchvts": json.dumps(metadata, allow_nan=False)})
+
+
+def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read what :func:`save_tensors` wrote. Nothing is unpickled.
+
+    Raises:
+        FileNotFoundError: no such file. ValueError: not a safetensors file, cut short, or not written by torchvts.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        with safetensors.safe_open(str(path), framework="pt") as stream:
+            metadata = stream.metadata() or {}
+            tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
+    except (safetensors.SafetensorError, struct.error, ValueError) as error:
+        raise ValueError(f"{path}: not a safetensors file, or cut short: {error}") from error
+    if "torchvts" not in metadata:
+        raise ValueError(f"{path}: a safetensors file, but not one written by torchvts")
+    try:
+        described = json.loads(metadata["torchvts"])
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path}: its metadata is damaged: {error}") from error
+    if not isinstance(described, dict):
+        raise ValueError(f"{path}: its metadata is damaged: expected an object")
+    return tensors, described

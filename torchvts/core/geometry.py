@@ -1,0 +1,109 @@
+"""Axes, and the ways between depth, gradient, normal and points. The conventions themselves stand in docs/conventions.md."""
+
+import torch
+from torch import Tensor, nn
+
+from .checks import check_batch, check_same_size
+
+MAX_SLOPE = 10.0
+"""Largest |dz/dx|, |dz/dy| that ``gradient_from_normal`` returns, mm per mm: 84.3 degrees from flat."""
+
+
+def pixel_grid_mm(
+    height: int, width: int, mm_per_pixel: float, dtype: torch.dtype = torch.float32, device: torch.device | None = None
+) -> tuple[Tensor, Tensor]:
+    """Millimetre positions of the pixel centres: x (1, W) to the right, y (H, 1) down, zero at the image centre.
+
+    Example:
+        >>> pixel_grid_mm(3, 3, 0.5)[0]
+        tensor([[-0.5000,  0.0000,  0.5000]])
+    """
+    x = (torch.arange(width, dtype=dtype, device=device) - (width - 1) / 2.0) * mm_per_pixel
+    y = (torch.arange(height, dtype=dtype, device=device) - (height - 1) / 2.0) * mm_per_pixel
+    return x[None, :], y[:, None]
+
+
+def normal_from_gradient(gradient: Tensor) -> Tensor:
+    """Unit normals that face the camera: (-dz/dx, -dz/dy, 1) / norm.
+
+    Args:
+        gradient: (B, 2, H, W), (dz/dx, dz/dy), mm per mm.
+    Returns:
+        (B, 3, H, W), n_z > 0.
+    Raises:
+        ValueError: wrong shape. TypeError: not floating point.
+    Example:
+        >>> normal_from_gradient(torch.zeros(1, 2, 1, 1)).flatten() + 0.0
+        tensor([0., 0., 1.])
+    """
+    check_batch("gradient", gradient, 2)
+    p, q = gradient[:, 0:1], gradient[:, 1:2]
+    n_z = torch.rsqrt(p * p + q * q + 1.0)
+    return torch.cat((-p * n_z, -q * n_z, n_z), dim=1)
+
+
+def gradient_from_normal(normal: Tensor, max_slope: float = MAX_SLOPE) -> Tensor:
+    """Depth gradient of a normal map: p = -n_x / n_z, q = -n_y / n_z.
+
+    Where a normal grazes (n_z below ``hypot(n_x, n_y) / max_slope``) or faces away, n_z is held at that bound, so the
+    steepness never exceeds ``max_slope`` and its own gradient stays finite.
+
+    Args:
+        normal: (B, 3, H, W), of any length.
+        max_slope: largest steepness hypot(p, q), mm per mm.
+    Returns:
+        (B, 2, H, W), (dz/dx, dz/dy), mm per mm.
+    Raises:
+        ValueError: wrong shape. TypeError: not floating point.
+    Source:
+        eq. 5 of the paper.
+    Example:
+        >>> gradient_from_normal(torch.tensor([1.0, 0.0, 1e-6]).reshape(1, 3, 1, 1)).flatten()
+        tensor([-10.,   0.])
+    """
+    check_batch("normal", normal, 3)
+    n_xy = normal[:, 0:2]
+    tilt = torch.sqrt((n_xy * n_xy).sum(1, keepdim=True) + 1e-24)  # the constant keeps the root's own slope finite at 0
+    return -n_xy / torch.maximum(normal[:, 2:3], tilt / max_slope)
+
+
+class GradientFromNormal(nn.Module):
+    """Module face of :func:`gradient_from_normal`."""
+
+    def __init__(self, max_slope: float = MAX_SLOPE) -> None:
+        super().__init__()
+        self.max_slope = max_slope
+
+    def forward(self, normal: Tensor) -> Tensor:
+        return gradient_from_normal(normal, self.max_slope)
+
+
+def depth_to_points(depth_mm: Tensor, mm_per_pixel: float, contact: Tensor | None = None) -> Tensor:
+    """Points of one depth map in the right-handed frame: x right, **y up**, z towards the camera.
+
+    Args:
+        depth_mm: one frame, (H, W), (1, H, W) or (1, 1, H, W), mm.
+        mm_per_pixel: pixel pitch, mm.
+        contact: bool of the same size; only its pixels are kept. None keeps all.
+    Returns:
+        (N, 3) in mm, row by row.
+    Raises:
+        ValueError: more than one frame, or contact of another size.
+    Example:
+        >>> depth_to_points(torch.zeros(3, 3), 0.5)[0]
+        tensor([-0.5000,  0.5000,  0.0000])
+    """
+    z = _one_frame("depth_mm", depth_mm)
+    x, y = pixel_grid_mm(z.shape[0], z.shape[1], mm_per_pixel, z.dtype, z.device)
+    points = torch.stack((x.expand_as(z), -y.expand_as(z), z), dim=-1)  # (H, W, 3)
+    if contact is None:
+        return points.reshape(-1, 3)
+    keep = _one_frame("contact", contact)
+    check_same_size("contact", keep, "depth_mm", z.shape[0], z.shape[1])
+    return points[keep.bool()]
+
+
+def _one_frame(name: str, tensor: Tensor) -> Tensor:
+    if tensor.dim() < 2 or tensor.numel() != tensor.shape[-1] * tensor.shape[-2]:
+        raise ValueError(f"{name}: expected one frame, (H, W) or (1, 1, H, W), got {tuple(tensor.shape)}: loop over the batch")
+    return tensor.reshape(tensor.shape[-2], tensor.shape[-1])

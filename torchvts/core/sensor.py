@@ -1,0 +1,238 @@
+"""What is known of a sensor before it is calibrated: its size, pitch and camera response, where the gel lies in the frame."""
+
+import dataclasses
+from collections.abc import Hashable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import kornia
+import torch
+import yaml
+from torch import Tensor
+
+from .checks import check_batch, check_integer, check_numbers, check_positive
+from .files import write_atomically
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor type or unit.
+
+    Args:
+        name: any text.
+        height, width: pixels of the image that the pipeline works on.
+        mm_per_pixel: pixel pitch on the skin, mm.
+        gamma: response of the camera, value = light^(1 / gamma).
+        blur_px: standard deviation of a Gaussian blur before normals, pixels; 0 for none.
+        light_position_mm: (3, 3), rows R, G, B, if the lights are known from the drawing.
+        roi_px: (left, top, width, height) of the gel in the camera's frame, resized to the sensor's size.
+        corners_px: (4, 2), x and y of the gel's corners in the camera's frame: top left, top right, bottom right, bottom
+            left, rectified to the sensor's size. Either this or ``roi_px``.
+    Raises:
+        TypeError, ValueError: name the argument, what was expected and what came.
+    Example:
+        >>> Sensor(name="rig", height=480, width=640, mm_per_pixel=0.0625).field_mm
+        (30.0, 40.0)
+    """
+
+    name: str
+    height: int
+    width: int
+    mm_per_pixel: float
+    gamma: float = 1.0
+    blur_px: float = 0.0
+    light_position_mm: tuple[tuple[float, float, float], ...] | None = None
+    roi_px: tuple[int, int, int, int] | None = None
+    corners_px: tuple[tuple[float, float], ...] | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name.strip():
+            raise TypeError(f"name: expected a text, got {self.name!r}")
+        self._set("height", check_integer("height", self.height, 8))
+        self._set("width", check_integer("width", self.width, 8))
+        self._set("mm_per_pixel", check_positive("mm_per_pixel", self.mm_per_pixel, 10.0))
+        self._set("gamma", check_positive("gamma", self.gamma, 10.0))
+        if self.gamma < 0.1:
+            raise ValueError(f"gamma: expected a number in [0.1, 10], got {self.gamma}: value = light^(1/gamma), 2.2 for sRGB-like")
+        if self.blur_px != 0:
+            check_positive("blur_px", self.blur_px, 0.25 * min(self.height, self.width))
+        self._set("blur_px", float(self.blur_px))
+        if self.light_position_mm is not None:
+            numbers = check_numbers("light_position_mm", self.light_position_mm, (3, 3))
+            if min(numbers[2::3]) <= 0:
+                raise ValueError(f"light_position_mm: expected lights above the skin (z > 0), got {self.light_position_mm!r}")
+            self._set("light_position_mm", tuple(numbers[i : i + 3] for i in (0, 3, 6)))
+        if self.roi_px is not None and self.corners_px is not None:
+            raise ValueError("roi_px, corners_px: expected one of them, got both")
+        if self.roi_px is not None:
+            roi = check_numbers("roi_px", self.roi_px, (4,))
+            if any(v != int(v) for v in roi) or min(roi[:2]) < 0 or min(roi[2:]) < 2:
+                raise ValueError(f"roi_px: expected whole numbers (left, top, width, height) in the frame, got {self.roi_px!r}")
+            self._set("roi_px", tuple(int(v) for v in roi))
+        if self.corners_px is not None:
+            numbers = check_numbers("corners_px", self.corners_px, (4, 2))
+            corners = tuple(numbers[i : i + 2] for i in (0, 2, 4, 6))
+            if not _convex_clockwise(corners):
+                raise ValueError(
+                    "corners_px: expected a convex quadrilateral in the order top left, top right, bottom right, "
+                    f"bottom left, got {self.corners_px!r}"
+                )
+            self._set("corners_px", corners)
+
+    def _set(self, name: str, value: object) -> None:
+        object.__setattr__(self, name, value)
+
+    @property
+    def field_mm(self) -> tuple[float, float]:
+        """Height and width of the field of view, mm."""
+        return self.height * self.mm_per_pixel, self.width * self.mm_per_pixel
+
+    def resized(self, height: int, width: int) -> "Sensor":
+        """The same sensor seen with other pixels: field of view, lights and response stay, pitch and blur follow.
+
+        Raises:
+            ValueError: another aspect ratio (beyond 1 %), because pixels would no longer be square.
+        Example:
+            >>> Sensor(name="rig", height=480, width=640, mm_per_pixel=0.0625).resized(240, 320).mm_per_pixel
+            0.125
+        """
+        check_integer("height", height, 8), check_integer("width", width, 8)
+        scale_y, scale_x = height / self.height, width / self.width
+        if abs(scale_x / scale_y - 1.0) > 0.01:
+            raise ValueError(
+                f"height, width: expected the aspect ratio of {self.height} x {self.width}, got {height} x {width}: "
+                "pixels must stay square; crop instead"
+            )
+        return dataclasses.replace(
+            self, height=height, width=width, mm_per_pixel=self.mm_per_pixel / scale_x, blur_px=self.blur_px * scale_x
+        )
+
+    def rectify(self, frame: Tensor) -> Tensor:
+        """Camera frames (B, 3, H, W) as the sensor's images (B, 3, height, width): four corners, region of interest, or as is.
+
+        Raises:
+            ValueError: the frame does not hold the region, or has another size and the sensor names no region.
+        """
+        check_batch("frame", frame, 3)
+        size = (self.height, self.width)
+        height, width = frame.shape[2], frame.shape[3]
+        if self.corners_px is not None:
+            corners = torch.tensor(self.corners_px, dtype=frame.dtype, device=frame.device)[None]
+            if bool((corners < -0.5).any()) or bool((corners[..., 0] > width).any()) or bool((corners[..., 1] > height).any()):
+                raise ValueError(f"frame: {height} x {width} does not hold corners_px {self.corners_px} of sensor '{self.name}'")
+            right, bottom = self.width - 1.0, self.height - 1.0
+            target = torch.tensor(
+                [[[0.0, 0.0], [right, 0.0], [right, bottom], [0.0, bottom]]], dtype=frame.dtype, device=frame.device
+            )
+            homography = kornia.geometry.get_perspective_transform(corners, target).expand(frame.shape[0], 3, 3)
+            return kornia.geometry.warp_perspective(frame, homography, size, mode="bilinear", align_corners=True)
+        if self.roi_px is not None:
+            left, top, roi_width, roi_height = self.roi_px
+            if left + roi_width > width or top + roi_height > height:
+                raise ValueError(f"frame: {height} x {width} does not hold roi_px {self.roi_px} of sensor '{self.name}'")
+            frame = frame[:, :, top : top + roi_height, left : left + roi_width]
+            return frame if frame.shape[2:] == size else kornia.geometry.resize(frame, size, antialias=True)
+        if (height, width) != size:
+            raise ValueError(
+                f"frame: expected {self.height} x {self.width} for sensor '{self.name}', got {height} x {width}: "
+                f"resize it, or load the sensor with height={height}, width={width}"
+            )
+        return frame
+
+    @classmethod
+    def load(cls, source: str | Path, height: int | None = None, width: int | None = None) -> "Sensor":
+        """Read a sensor: the name of a shipped one, or the path of a YAML file; optionally resized.
+
+        Raises:
+            FileNotFoundError: no such name or file. ValueError: bad YAML, an unknown key, or a bad value; names file and key.
+        Example:
+            >>> Sensor.load("gelsight_mini").mm_per_pixel
+            0.0634
+        """
+        path = _find(source)
+        sensor = cls.from_dict(_read_yaml(path), str(path))
+        if height is None and width is None:
+            return sensor
+        if height is None or width is None:
+            raise ValueError("height, width: expected both or none")
+        return sensor.resized(height, width)
+
+    @classmethod
+    def from_dict(cls, values: Any, source: str) -> "Sensor":
+        """Build a sensor from a mapping; ``source`` names it in errors."""
+        if not isinstance(values, dict):
+            raise ValueError(f"{source}: expected keys and values of a sensor, got {type(values).__name__}")
+        known = [field.name for field in dataclasses.fields(cls)]
+        for key in values:
+            if key not in known:
+                raise ValueError(f"{source}: key {key!r}: unknown; a sensor knows {', '.join(known)}")
+        for field in dataclasses.fields(cls):
+            if field.default is dataclasses.MISSING and field.name not in values:
+                raise ValueError(f"{source}: key {field.name!r}: missing")
+        try:
+            return cls(**values)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{source}: key {error}") from error
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain lists and numbers, defaults left out; :meth:`from_dict` reads it back."""
+        pairs = ((field, getattr(self, field.name)) for field in dataclasses.fields(self))
+        return {field.name: _plain(value) for field, value in pairs if value != field.default}
+
+    def save(self, path: str | Path) -> None:
+        """Write the sensor as YAML, whole or not at all."""
+        with write_atomically(path) as temporary:
+            temporary.write_text(yaml.safe_dump(self.to_dict(), sort_keys=False))
+
+
+def shipped_sensors() -> list[str]:
+    """Names that :meth:`Sensor.load` finds."""
+    return sorted(path.stem for path in _shipped_folder().glob("*.yaml"))
+
+
+def _shipped_folder() -> Path:
+    here = Path(__file__).resolve()
+    installed = here.parents[1] / "configs" / "sensors"  # in a wheel
+    return installed if installed.is_dir() else here.parents[2] / "configs" / "sensors"  # in a checkout
+
+
+def _find(source: str | Path) -> Path:
+    path = Path(source)
+    if path.suffix in (".yaml", ".yml"):
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such sensor file")
+        return path
+    if str(source) in shipped_sensors():
+        return _shipped_folder() / f"{source}.yaml"
+    raise FileNotFoundError(f"sensor {str(source)!r}: expected a path ending in .yaml, or one of {', '.join(shipped_sensors())}")
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """Safe YAML that refuses a key given twice."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise yaml.constructor.ConstructorError(None, None, f"key {key!r}: given twice", node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
+def _read_yaml(path: Path) -> Any:
+    try:
+        return yaml.load(path.read_text(encoding="utf-8"), Loader=_StrictLoader)  # a SafeLoader
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: not a YAML file: {error}") from error
+
+
+def _plain(value: Any) -> Any:
+    return [_plain(item) for item in value] if isinstance(value, tuple) else value
+
+
+def _convex_clockwise(corners: tuple[tuple[float, ...], ...]) -> bool:
+    def turn(k: int) -> float:
+        (x0, y0), (x1, y1), (x2, y2) = (corners[(k + i) % 4] for i in range(3))
+        return (x1 - x0) * (y2 - y1) - (y1 - y0) * (x2 - x1)
+
+    return all(turn(k) > 0 for k in range(4))  # y points down, so clockwise on the screen is a positive turn

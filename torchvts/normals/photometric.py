@@ -1,0 +1,164 @@
+"""Normals by photometric stereo with near lights."""
+
+import torch
+from torch import Tensor, nn
+
+from ..core.checks import QUANTISATION_STD, check_batch, check_same_size
+from ..core.geometry import gradient_from_normal, normal_from_gradient
+from ..shading import PointLights, flat_image, gloss_lobe, inverse_light_matrix, light_matrix
+
+
+def slope_by_lit_lights(
+    start: Tensor, compensated: Tensor, rows: Tensor, noise_std: float, prior_std: float = 0.25, steps: int = 3
+) -> Tensor:
+    """Slopes of pixels where a light is blocked: each pixel against the clamped model max(0, L n), n of unit length.
+
+    A blocked channel says no more than that it is dark, which leaves two numbers for two slopes and, near |n| = 1, a
+    direction that is badly pinned. A weak prior (``prior_std``) towards ``start`` holds that direction; when ``start``
+    comes from a depth map, its neighbours speak through it. Gauss-Newton in closed form, steps of at most 0.5.
+
+    Args:
+        start: (N, 2), slopes (dz/dx, dz/dy). compensated: (N, 3). rows: (N, 3, 3), light matrix.
+        noise_std: of the compensated image, against which the prior is weighed.
+    Returns:
+        (N, 2).
+    Source:
+        the shadowed pixels of Barsky and Petrou, TPAMI 25(10), 2003, as a maximum a posteriori estimate.
+    """
+    weight = (noise_std / prior_std) ** 2
+    slope = start
+    for _ in range(steps):
+        p, q = slope[:, 0:1], slope[:, 1:2]
+        n_z = torch.rsqrt(1.0 + p * p + q * q)
+        normal = torch.cat((-p * n_z, -q * n_z, n_z), dim=1)
+        light = (rows * normal[:, None]).sum(2)  # (N, 3)
+        lit = (light > 0).to(light.dtype)
+        # d normal / d slope is -n_z (e - n (n.e)) along x and y: the part of the light row across the normal
+        across = -n_z[:, :, None] * (rows - light[:, :, None] * normal[:, None])[:, :, 0:2] * lit[:, :, None]
+        residual = compensated - light * lit
+        a = (across[:, :, 0] ** 2).sum(1) + weight
+        b = (across[:, :, 0] * across[:, :, 1]).sum(1)
+        c = (across[:, :, 1] ** 2).sum(1) + weight
+        right = (across * residual[:, :, None]).sum(1) + weight * (start - slope)
+        step = torch.stack((c * right[:, 0] - b * right[:, 1], a * right[:, 1] - b * right[:, 0]), dim=1)
+        step = step / (a * c - b * b)[:, None]
+        length = torch.sqrt((step * step).sum(1, keepdim=True) + 1e-18)
+        slope = slope + step * (0.5 / length).clamp_max(1.0)
+    return slope
+
+
+class NormalFromIntensity(nn.Module):
+    """Unit normals of a compensated image.
+
+    Without depth, the stored inverse of the light matrix at rest (eq. 9); with depth, the inverse at that depth (eq. 10).
+    Where a light is blocked (its channel below three times its noise), :func:`slope_by_lit_lights` decides.
+    While gradients are recorded for the lights (``requires_grad_(True)``), the matrix is built from them at every call.
+
+    Args:
+        lights: the three lights. height, width: pixels. mm_per_pixel: pixel pitch, mm.
+        noise_std: (3,), noise of the compensated image; None takes that of 8-bit rounding.
+        inverse: (3, 3, H, W), the stored inverse; None computes it.
+    Source:
+        eq. 3, 8, 9, 10 of the paper.
+    Example:
+        >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
+        >>> NormalFromIntensity(lights, 8, 8, 0.1)(torch.rand(2, 3, 8, 8)).shape
+        torch.Size([2, 3, 8, 8])
+    """
+
+    uses_depth: bool = True
+    inverse: Tensor
+    dark_below: Tensor
+    dark_where: Tensor
+
+    def __init__(
+        self,
+        lights: PointLights,
+        height: int,
+        width: int,
+        mm_per_pixel: float,
+        noise_std: Tensor | None = None,
+        inverse: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.mm_per_pixel = mm_per_pixel
+        position, albedo = lights.position_mm.detach(), lights.albedo.detach()
+        if inverse is None:
+            inverse = inverse_light_matrix(position.new_zeros(1, 1, height, width), position, albedo, mm_per_pixel)[0]
+        if tuple(inverse.shape) != (3, 3, height, width):
+            raise ValueError(f"inverse: expected (3, 3, {height}, {width}), got {tuple(inverse.shape)}")
+        self.lights = PointLights(position, albedo, lights.gloss).requires_grad_(False)
+        noise = torch.full((3,), QUANTISATION_STD) if noise_std is None else noise_std
+        self.noise_std = float(noise.square().mean().sqrt())
+        self.register_buffer("inverse", inverse.detach().clone())
+        self.register_buffer("dark_below", 3.0 * noise.detach().to(inverse.dtype))
+        # a channel can only be called dark where its light shines on the flat skin
+        flat = flat_image(self.lights, height, width, mm_per_pixel).to(inverse.dtype)
+        below = self.dark_below.reshape(3, 1, 1)
+        self.register_buffer("dark_where", torch.where(flat > 2.0 * below, below, -torch.inf))
+
+    def forward(self, compensated: Tensor, depth_mm: Tensor | None = None) -> Tensor:
+        check_batch("compensated", compensated, 3)
+        check_same_size("compensated", compensated, "the calibration", self.inverse.shape[2], self.inverse.shape[3])
+        position, albedo = self.lights.position_mm, self.lights.albedo
+        if self.lights.glossy:
+            compensated = self._matt(compensated, depth_mm)
+        live = torch.is_grad_enabled() and (position.requires_grad or albedo.requires_grad)
+        inverse = self.inverse[None]
+        if depth_mm is not None:
+            inverse = inverse_light_matrix(depth_mm, position, albedo, self.mm_per_pixel)
+        elif live:
+            rest = compensated.new_zeros(1, 1, compensated.shape[2], compensated.shape[3])
+            inverse = inverse_light_matrix(rest, position, albedo, self.mm_per_pixel)
+        normal = torch.addcmul(inverse[:, :, 0] * compensated[:, 0:1], inverse[:, :, 1], compensated[:, 1:2])
+        normal = torch.addcmul(normal, inverse[:, :, 2], compensated[:, 2:3])
+        n_x, n_y, n_z = normal[:, 0:1], normal[:, 1:2], normal[:, 2:3]
+        normal = normal * torch.rsqrt(torch.addcmul(torch.addcmul(n_x * n_x, n_y, n_y), n_z, n_z) + 1e-24)
+        return self._relight(normal, compensated, depth_mm, position, albedo)
+
+    def _matt(self, compensated: Tensor, depth_mm: Tensor | None) -> Tensor:
+        """What a matt skin would show: the specular lobe divided out, at the slope of the depth so far."""
+        depth = compensated.new_zeros(1, 1, compensated.shape[2], compensated.shape[3]) if depth_mm is None else depth_mm
+        normal = normal_from_gradient(_slope_of_depth(depth, self.mm_per_pixel))
+        matrix = light_matrix(depth, self.lights.position_mm, self.lights.albedo, self.mm_per_pixel)
+        return compensated / (1.0 + self.lights.gloss.reshape(1, 3, 1, 1) * gloss_lobe(matrix, normal))
+
+    def coarse(self, stride: int) -> "NormalFromIntensity":
+        """The same for an image of every ``stride``-th pixel."""
+        height, width = self.inverse.shape[2], self.inverse.shape[3]
+        rows, columns = len(range(stride // 2, height, stride)), len(range(stride // 2, width, stride))
+        coarse = NormalFromIntensity(self.lights, rows, columns, self.mm_per_pixel * stride, self.dark_below / 3.0)
+        coarse.lights = self.lights  # one set of parameters
+        return coarse
+
+    def _relight(self, normal: Tensor, compensated: Tensor, depth_mm: Tensor | None, position: Tensor, albedo: Tensor) -> Tensor:
+        """Replace the normals of pixels where a light that shines on the flat skin has gone dark."""
+        b, row, column = torch.where((compensated < self.dark_where).any(dim=1))
+        if len(b) == 0:
+            return normal
+        height, width = compensated.shape[2], compensated.shape[3]
+        x = (column.to(normal.dtype) - 0.5 * (width - 1)) * self.mm_per_pixel
+        y = (row.to(normal.dtype) - 0.5 * (height - 1)) * self.mm_per_pixel
+        z = torch.zeros_like(x)
+        start = gradient_from_normal(normal[b, :, row, column][:, :, None, None])[:, :, 0, 0]
+        if depth_mm is not None:
+            depth = depth_mm[:, 0].expand(compensated.shape[0], height, width)
+            left, right = depth[b, row, (column - 1).clamp_min(0)], depth[b, row, (column + 1).clamp_max(width - 1)]
+            above, below = depth[b, (row - 1).clamp_min(0), column], depth[b, (row + 1).clamp_max(height - 1), column]
+            z = depth[b, row, column]
+            start = torch.stack((right - left, below - above), dim=1) / (2.0 * self.mm_per_pixel)
+        to_light = position - torch.stack((x, y, z), dim=1)[:, None]  # (N, light, axis)
+        squared = (to_light * to_light).sum(2, keepdim=True)
+        rows = albedo[None, :, None] * to_light * (squared.rsqrt() / squared)
+        intensity = compensated[b, :, row, column]
+        slope = slope_by_lit_lights(start, intensity, rows, self.noise_std)
+        solution = normal_from_gradient(slope[:, :, None, None])[:, :, 0, 0]
+        return normal.permute(0, 2, 3, 1).index_put((b, row, column), solution).permute(0, 3, 1, 2)
+
+
+def _slope_of_depth(depth_mm: Tensor, mm_per_pixel: float) -> Tensor:
+    """Central differences, (B, 2, H, W); one-sided halves at the border."""
+    padded = nn.functional.pad(depth_mm, [1, 1, 1, 1], mode="replicate")
+    p = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]
+    q = padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
+    return torch.cat((p, q), dim=1) / (2.0 * mm_per_pixel)

@@ -1,0 +1,80 @@
+"""Point clouds as PCD and PLY files, by Open3D."""
+
+import ctypes
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..core.files import write_atomically
+
+CLOUD_SUFFIXES = (".pcd", ".ply")
+
+
+def open3d() -> Any:
+    """Import Open3D, lending it libusb from the package ``libusb-package`` where the system has none.
+
+    Raises:
+        ImportError: says what to install.
+    """
+    try:
+        import libusb_package
+
+        ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+    except (ImportError, OSError):
+        pass  # the system's own libusb may do; if not, the import below says so
+    try:
+        import open3d as o3d
+    except (ImportError, OSError) as error:
+        raise ImportError(f"point clouds need Open3D and libusb: pip install 'torchvts[pose]' ({error})") from error
+    return o3d
+
+
+def write_point_cloud(path: str | Path, points: Tensor, normals: Tensor | None = None) -> None:
+    """Write points (N, 3) in mm, right-handed (see :func:`torchvts.depth_to_points`), as .pcd or .ply, whole or not at all.
+
+    Raises:
+        ValueError: wrong shape, no points, values not finite, or another suffix. ImportError: without the extra ``pose``.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in CLOUD_SUFFIXES:
+        raise ValueError(f"{path}: expected a name ending in {' or '.join(CLOUD_SUFFIXES)}")
+    o3d = open3d()
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(_array("points", points, None)))
+    if normals is not None:
+        cloud.normals = o3d.utility.Vector3dVector(_array("normals", normals, len(points)))
+    with write_atomically(path) as temporary:
+        if not o3d.io.write_point_cloud(str(temporary), cloud):
+            raise OSError(f"{path}: Open3D could not write it")
+
+
+def read_point_cloud(path: str | Path) -> tuple[Tensor, Tensor | None]:
+    """Read a .pcd or .ply file: points (N, 3) float64, and normals (N, 3) if it has them.
+
+    Raises:
+        FileNotFoundError: no such file. ValueError: not a cloud, or an empty one. ImportError: without the extra ``pose``.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such point cloud")
+    if path.suffix.lower() not in CLOUD_SUFFIXES:
+        raise ValueError(f"{path}: expected a name ending in {' or '.join(CLOUD_SUFFIXES)}")
+    o3d = open3d()
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        cloud = o3d.io.read_point_cloud(str(path))
+    points = torch.from_numpy(np.asarray(cloud.points).copy())
+    if len(points) == 0:
+        raise ValueError(f"{path}: no points could be read: not a point cloud, cut short, or empty")
+    return points, torch.from_numpy(np.asarray(cloud.normals).copy()) if cloud.has_normals() else None
+
+
+def _array(name: str, values: Tensor, length: int | None) -> "np.ndarray[Any, Any]":
+    if values.dim() != 2 or values.shape[1] != 3 or len(values) == 0 or (length is not None and len(values) != length):
+        raise ValueError(
+            f"{name}: expected ({'N' if length is None else length}, 3) with N above 0, got {tuple(values.shape)}: no contact?"
+        )
+    if not bool(torch.isfinite(values).all()):
+        raise ValueError(f"{name}: expected finite values, got NaN or infinite ones")
+    return values.detach().cpu().double().numpy()

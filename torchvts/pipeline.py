@@ -35,7 +35,8 @@ class DepthPipeline(nn.Module):
 
     Args:
         compensate, contact, gradient, integrate: modules. normals: any module from a compensated image (B, 3, H, W) to
-            normals (B, 3, H, W); one that sets ``uses_depth = True`` takes a second argument, the depth or None.
+            normals (B, 3, H, W); one that sets ``uses_depth = True`` takes a second argument, the depth or None, and one
+            that has ``coarse(stride)``, itself for every stride-th pixel, lets ``auto`` foresee.
         mm_per_pixel: pixel pitch, mm. mode: "fast", "precise" or "auto".
         tolerance_px, worth_px: pixels of pitch. max_passes: bound of the precise loop.
     Source:
@@ -43,6 +44,7 @@ class DepthPipeline(nn.Module):
     """
 
     refines: Final[bool]
+    skips: Final[bool]
     foresees: Final[bool]
 
     def __init__(
@@ -79,8 +81,10 @@ class DepthPipeline(nn.Module):
         self.worth_px = worth_px
         self.max_passes = max_passes
         self.refines = uses_depth and mode != "fast"
-        self.foresees = mode == "auto"
-        self.coarse_normals = normals.coarse(8) if self.refines and self.foresees else nn.Identity()
+        self.skips = mode == "auto"
+        coarse = getattr(normals, "coarse", None)
+        self.foresees = self.skips and self.refines and callable(coarse)
+        self.coarse_normals = coarse(8) if self.foresees and callable(coarse) else nn.Identity()
 
     @classmethod
     def from_calibration(
@@ -133,12 +137,12 @@ class DepthPipeline(nn.Module):
             TypeError: not floating point.
         """
         check_batch("images", images, 3)
-        if not torch.jit.is_scripting():  # type: ignore[attr-defined]  # noqa: SIM102
+        if not torch.jit.is_scripting():  # noqa: SIM102
             if images.device.type == "cpu" and not torch.compiler.is_compiling():
                 check_range("images", images)
         compensated = self.compensate(images)
         contact = self.contact(compensated)
-        if self.foresees:  # noqa: SIM102
+        if self.skips:  # noqa: SIM102
             if not bool(contact.any()):
                 return _no_contact(compensated, contact)
         gradient = self.gradient(self.normals(compensated)) * contact

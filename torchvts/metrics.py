@@ -32,12 +32,12 @@ def depth_error(depth_mm: Tensor, truth_mm: Tensor, mm_per_pixel: float, region:
     Raises:
         ValueError: shapes differ, or an empty region.
     Example:
-        >>> depth_error(torch.full((1, 1, 4, 4), 0.1), torch.zeros(1, 1, 4, 4), 0.05).max_px
+        >>> depth_error(torch.full((1, 1, 4, 4), 0.5), torch.zeros(1, 1, 4, 4), 0.25).max_px
         2.0
     """
     error = (_inside("depth_mm", depth_mm, truth_mm, region) - _inside("truth_mm", truth_mm, truth_mm, region)).double()
     largest, rms = float(error.abs().max()), float(error.square().mean().sqrt())
-    return DepthError(*(round(v, 9) for v in (largest, rms, largest / mm_per_pixel, rms / mm_per_pixel)))
+    return DepthError(largest, rms, largest / mm_per_pixel, rms / mm_per_pixel)
 
 
 def normal_angle_deg(normal: Tensor, truth: Tensor, region: Tensor | None = None) -> Tensor:

@@ -20,7 +20,7 @@ class LevenbergMarquardt(Optimizer):
         >>> optimiser = LevenbergMarquardt(x)
         >>> for _ in range(20):
         ...     loss = optimiser.step(lambda values: values.exp() - 2.0)
-        >>> round(float(x), 5) == 0.69315
+        >>> round(x.item(), 5) == 0.69315
         True
     """
 

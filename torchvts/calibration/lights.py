@@ -77,7 +77,8 @@ def fit_lights(
     Example:
         >>> sensor = Sensor(name="rig", height=48, width=64, mm_per_pixel=0.6)
         >>> truth = PointLights([[25, 0, 30], [-12, 20, 30], [-12, -20, 30]], [900, 900, 900])
-        >>> fit = fit_lights(flat_image(truth, 48, 64, 0.6).detach(), sensor)
+        >>> flat = torch.tensor([0.0, 0.0, 1.0]).reshape(1, 3, 1, 1).expand(1, 3, 48, 64)
+        >>> fit = fit_lights(truth(torch.zeros(1, 1, 48, 64), flat, 0.6)[0].detach(), sensor)
         >>> fit.converged, bool((fit.lights.position_mm - truth.position_mm).abs().max() < 0.01)
         (True, True)
     """

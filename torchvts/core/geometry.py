@@ -58,8 +58,8 @@ def gradient_from_normal(normal: Tensor, max_slope: float = MAX_SLOPE) -> Tensor
     Source:
         eq. 5 of the paper.
     Example:
-        >>> gradient_from_normal(torch.tensor([1.0, 0.0, 1e-6]).reshape(1, 3, 1, 1)).flatten()
-        tensor([-10.,   0.])
+        >>> gradient_from_normal(torch.tensor([1.0, 0.0, 1e-6]).reshape(1, 3, 1, 1))[0, 0]
+        tensor([[-10.]])
     """
     check_batch("normal", normal, 3)
     n_xy = normal[:, 0:2]

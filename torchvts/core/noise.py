@@ -18,6 +18,7 @@ def noise_std(image: Tensor) -> Tensor:
     Source:
         Immerkaer, Fast noise variance estimation, CVIU 64(2), 1996, with the median in place of the mean.
     Example:
+        >>> import torch
         >>> bool((noise_std(0.01 * torch.randn(1, 1, 99, 99)) - 0.01).abs() < 0.001)
         True
     """

@@ -32,7 +32,7 @@ def slope_by_lit_lights(
         n_z = torch.rsqrt(1.0 + p * p + q * q)
         normal = torch.cat((-p * n_z, -q * n_z, n_z), dim=1)
         light = (rows * normal[:, None]).sum(2)  # (N, 3)
-        lit = (light > 0).to(light.dtype)
+        lit = (light > 0.1 * noise_std).to(light.dtype)  # above zero: a black channel starts exactly on the terminator
         # d normal / d slope is -n_z (e - n (n.e)) along x and y: the part of the light row across the normal
         across = -n_z[:, :, None] * (rows - light[:, :, None] * normal[:, None])[:, :, 0:2] * lit[:, :, None]
         residual = compensated - light * lit

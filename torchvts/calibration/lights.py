@@ -85,60 +85,24 @@ def fit_lights(
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     check_integer("max_steps", max_steps, 1)
     check_exposure(background)
-    value = background.detach().to(torch.float64).cpu()
-    x, y = (
-        axis.expand(value.shape[1:]).flatten()
-        for axis in pixel_grid_mm(sensor.height, sensor.width, sensor.mm_per_pixel, torch.float64)
-    )
-    image = value.flatten(1)
-    noise = noise_std(value[None])[0].clamp_min(QUANTISATION_STD)
-    exponent = 1.0 / sensor.gamma
-
-    def model(parameter: Tensor) -> Tensor:
-        a, b, log_z, log_rho = (parameter[:, k : k + 1] for k in range(4))
-        squared = (x - a) ** 2 + (y - b) ** 2 + torch.exp(2.0 * log_z)
-        log_light = log_rho + log_z - 1.5 * torch.log(squared)  # eq. 1 at rest
-        if parameter.shape[1] == 5:
-            n_l = torch.exp(log_z) * torch.rsqrt(squared)
-            lobe = microfacet(n_l, torch.ones_like(n_l), torch.sqrt(0.5 + 0.5 * n_l))
-            log_light = log_light + torch.log1p(parameter[:, 4:5].clamp_min(0.0) * lobe)
-        return torch.exp(exponent * log_light)  # in image value
-
-    def residual(parameter: Tensor) -> Tensor:
-        return (model(parameter) - image) / noise[:, None]
-
-    closed_form = _paraboloid_start(image, x, y, exponent, noise)
-    # a pixel that noise could clip at black or white is left out, judged by the model so that noise does not choose
-    expected, margin = model(closed_form), 2.5 * noise[:, None]
-    usable = (image < 0.995) & (expected > margin) & (expected < 1.0 - margin)
+    pixels = _Pixels.of(background.detach().to(torch.float64).cpu(), sensor)
+    noise = pixels.noise
 
     def solve(parameter: Tensor) -> _Solution:
-        parameter = parameter.clone().requires_grad_()
-        optimiser = LevenbergMarquardt(parameter)
-        history: list[float] = []
-        still, moved = 0, float("inf")
-        with tqdm(total=max_steps, desc="lights", disable=not progress, leave=False) as bar:
-            while len(history) < max_steps and still < 3:
-                weight, scale = _robust_weight(residual(parameter.detach()), usable)
-                optimiser.step(residual, weight)
-                history.append(float(_tukey_loss(residual(parameter.detach()), scale)))
-                moved = _moved_mm(optimiser.last_step, parameter.detach())
-                still = still + 1 if moved < STEP_TOLERANCE_MM else 0
-                bar.update()
-                bar.set_postfix(loss=f"{history[-1]:.4g}")
-        parameter = parameter.detach()
-        left, jacobian = residual_and_jacobian(residual, parameter)
-        weight, scale = _robust_weight(left, usable)
-        covariance, misfit = _covariance(left, jacobian, model(parameter) / noise[:, None], weight, scale, x, y, exponent)
-        return _Solution(parameter, history, still == 3, moved, weight, scale, covariance, misfit)
+        # some thousand pixels bring the lights near, all of them finish
+        near = _solve(pixels.every(_COARSE_PIXELS), parameter, max_steps, progress)
+        fit = _solve(pixels, near.parameter, max_steps, progress)
+        return fit._replace(history=near.history + fit.history)
 
-    best = solve(closed_form if start is None else _from_lights(start))
+    best = solve(_paraboloid_start(pixels) if start is None else _from_lights(start))
     if best.converged and bool((best.misfit > 0).all()):
         # structure is left that noise does not explain: a glossy skin? Only if that leaves next to nothing in every channel
         glossy = solve(torch.cat((best.parameter, torch.full_like(best.parameter[:, :1], 0.05)), dim=1))
         explained = (glossy.misfit < 0.5 * best.misfit) & (glossy.misfit < GLOSS_MISFIT) & (glossy.parameter[:, 4] > 0)
         if glossy.converged and bool(explained.all()):
-            best = glossy
+            # the width of the lobe is assumed: what choosing the lobe moved is as uncertain as the lights are
+            moved = glossy.parameter[:, :4] - best.parameter
+            best = glossy._replace(covariance=glossy.covariance + moved[:, :, None] * moved[:, None, :])
     parameter, history, scale, misfit = best.parameter, best.history, best.scale, best.misfit
     lights = _to_lights(parameter, background.dtype)
     direction_std, position_std = _spread(parameter, best.covariance)
@@ -150,7 +114,7 @@ def fit_lights(
             "raise max_steps, or the image pins no light"
         )
     elif loose:
-        percent = float((scale[:, 0] * noise / image.median(dim=1).values).max())
+        percent = float((scale[:, 0] * noise / pixels.image.median(dim=1).values).max())
         message += (
             f", but one image does not pin {', '.join(loose)}: a smooth misfit of {percent:.1%} is left (vignetting or scattered "
             "light); calibrate with presses or known lights"
@@ -169,6 +133,49 @@ def fit_lights(
     )
 
 
+class _Pixels(NamedTuple):
+    """What is fitted: positions in mm (N,), image values and which of them count (3, N), noise (3,), 1 / gamma."""
+
+    x: Tensor
+    y: Tensor
+    image: Tensor
+    usable: Tensor
+    noise: Tensor
+    exponent: float
+
+    @classmethod
+    def of(cls, value: Tensor, sensor: Sensor) -> "_Pixels":
+        x, y = pixel_grid_mm(sensor.height, sensor.width, sensor.mm_per_pixel, value.dtype)
+        x, y = (axis.expand(value.shape[1:]).flatten() for axis in (x, y))
+        noise = noise_std(value[None])[0].clamp_min(QUANTISATION_STD)
+        image = value.flatten(1)
+        every = cls(x, y, image, image < 0.995, noise, 1.0 / sensor.gamma)
+        # a pixel that noise could clip at black or white is left out, judged by the model so that noise does not choose
+        expected, margin = every.model(_paraboloid_start(every)), 2.5 * noise[:, None]
+        return every._replace(usable=every.usable & (expected > margin) & (expected < 1.0 - margin))
+
+    def every(self, count: int) -> "_Pixels":
+        """An even choice of about ``count`` pixels; an odd stride walks through all columns."""
+        stride = max(1, len(self.x) // count) | 1
+        part = [t[..., ::stride] for t in (self.x, self.y, self.image, self.usable)]
+        return _Pixels(part[0], part[1], part[2], part[3], self.noise, self.exponent)
+
+    def model(self, parameter: Tensor) -> Tensor:
+        """Image values (3, N) of lights (3, 4 or 5): x, y, log z, log albedo, gloss."""
+        a, b, log_z, log_rho = (parameter[:, k : k + 1] for k in range(4))
+        squared = (self.x - a) ** 2 + (self.y - b) ** 2 + torch.exp(2.0 * log_z)
+        log_light = log_rho + log_z - 1.5 * torch.log(squared)  # eq. 1 at rest
+        if parameter.shape[1] == 5:
+            n_l = torch.exp(log_z) * torch.rsqrt(squared)
+            lobe = microfacet(n_l, torch.ones_like(n_l), torch.sqrt(0.5 + 0.5 * n_l))
+            log_light = log_light + torch.log1p(parameter[:, 4:5].clamp_min(0.0) * lobe)
+        return torch.exp(self.exponent * log_light)
+
+    def residual(self, parameter: Tensor) -> Tensor:
+        """Model minus image in units of the noise, (3, N)."""
+        return (self.model(parameter) - self.image) / self.noise[:, None]
+
+
 class _Solution(NamedTuple):
     parameter: Tensor
     history: list[float]
@@ -179,6 +186,30 @@ class _Solution(NamedTuple):
     covariance: Tensor
     misfit: Tensor
 
+
+def _solve(pixels: _Pixels, start: Tensor, max_steps: int, progress: bool) -> _Solution:
+    """The optimiser loop: Levenberg-Marquardt steps, the robust weights renewed at each, until the lights lie still."""
+    parameter = start.clone().requires_grad_()
+    optimiser = LevenbergMarquardt(parameter)
+    history: list[float] = []
+    still, moved = 0, float("inf")
+    with tqdm(total=max_steps, desc=f"lights, {len(pixels.x)} pixels", disable=not progress, leave=False) as bar:
+        while len(history) < max_steps and still < 3:
+            weight, scale = _robust_weight(pixels.residual(parameter.detach()), pixels.usable)
+            optimiser.step(pixels.residual, weight)
+            history.append(float(_tukey_loss(pixels.residual(parameter.detach()), scale)))
+            moved = _moved_mm(optimiser.last_step, parameter.detach())
+            still = still + 1 if moved < STEP_TOLERANCE_MM else 0
+            bar.update()
+            bar.set_postfix(loss=f"{history[-1]:.4g}")
+    parameter = parameter.detach()
+    left, jacobian = residual_and_jacobian(pixels.residual, parameter)
+    weight, scale = _robust_weight(left, pixels.usable)
+    covariance, misfit = _covariance(pixels, left, jacobian, pixels.model(parameter), weight, scale)
+    return _Solution(parameter, history, still == 3, moved, weight, scale, covariance, misfit)
+
+
+_COARSE_PIXELS = 8000
 
 GLOSS_MISFIT = 0.01
 """A glossy skin is believed only if it leaves less relative structure than this."""
@@ -210,8 +241,9 @@ def check_exposure(background: Tensor) -> None:
             raise ValueError(f"background: channel {name} is constant at {mean:.4f}: not a camera image of a lit skin")
 
 
-def _paraboloid_start(image: Tensor, x: Tensor, y: Tensor, exponent: float, noise: Tensor) -> Tensor:
+def _paraboloid_start(pixels: _Pixels) -> Tensor:
     """I^(-2/3) = (rho z)^(-2/3) (x^2 + y^2 - 2 a x - 2 b y + a^2 + b^2 + z^2): weighted linear least squares per channel."""
+    x, y, image, exponent, noise = pixels.x, pixels.y, pixels.image, pixels.exponent, pixels.noise
     span = float(x.abs().max().maximum(y.abs().max()))
     u, v = x / span, y / span
     columns = torch.stack((u * u + v * v, u, v, torch.ones_like(u)))  # (4, N)
@@ -262,7 +294,7 @@ def _to_lights(parameter: Tensor, dtype: torch.dtype) -> PointLights:
 
 
 def _covariance(
-    residual: Tensor, jacobian: Tensor, model: Tensor, weight: Tensor, scale: Tensor, x: Tensor, y: Tensor, exponent: float
+    pixels: _Pixels, residual: Tensor, jacobian: Tensor, model: Tensor, weight: Tensor, scale: Tensor
 ) -> tuple[Tensor, Tensor]:
     r"""Covariance (3, 4, 4) of the parameters, and the misfit (3,), both honest about what the model does not explain.
 
@@ -275,7 +307,8 @@ def _covariance(
         Searle, Casella, McCulloch, Variance Components, 1992 (Henderson's method 3); Bjorck, Numerical Methods for Least
         Squares Problems, 1996, for the covariance.
     """
-    u, v = x / x.abs().max(), y / y.abs().max()
+    u, v = pixels.x / pixels.x.abs().max(), pixels.y / pixels.y.abs().max()
+    relative = pixels.exponent * model / pixels.noise[:, None]  # residual per relative gain
     in_u, in_v = _legendre(u), _legendre(v)
     orders = [(i, j) for i in range(5) for j in range(5 - i) if i + j > 0]
     gain = torch.stack([in_u[i] * in_v[j] / (i + j) ** 2 for i, j in orders])  # (14, N)
@@ -283,7 +316,7 @@ def _covariance(
     for c in range(3):
         root = weight[c].sqrt() / scale[c]
         lights = (jacobian[c] * root).t()  # (N, K)
-        gains = (gain * (exponent * model[c] * root)).t()  # (N, 14)
+        gains = (gain * (relative[c] * root)).t()  # (N, 14)
         rest = residual[c] * root
         basis = torch.linalg.qr(lights).Q
         gains_free = gains - basis @ (basis.t() @ gains)

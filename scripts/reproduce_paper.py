@@ -1,0 +1,112 @@
+"""Reproduce the paper's figures 3 and 4, beside the figures it reports.
+
+Ji, Liu, Ma: Model-Based 3D Contact Geometry Perception for Visual Tactile Sensor, Sensors 2022, 22(17), 6470.
+
+    python scripts/reproduce_paper.py [--out out/paper] [--lights 31.25 39.375]
+"""
+
+import argparse
+import math
+import os
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+import torchvts as vts
+from torchvts import metrics, scenes, viz
+
+PITCH = 0.0625
+PAPER_3 = {16: (0.31, 0.09), 32: (1.21, 0.16)}
+
+
+def ring(radius_mm: float, height_mm: float, turn_deg: float = 10.0, brightness: float = 0.45) -> vts.PointLights:
+    """Three lights 120 degrees apart that give ``brightness`` at the image centre."""
+    angles = [math.radians(turn_deg + 120.0 * k) for k in range(3)]
+    distance = math.hypot(radius_mm, height_mm)
+    position = [[radius_mm * math.cos(a), radius_mm * math.sin(a), height_mm] for a in angles]
+    return vts.PointLights(position, [brightness * distance**3 / height_mm] * 3)
+
+
+def figure_3(lights: vts.PointLights, out: Path) -> list[str]:
+    rows = []
+    calibration = vts.Calibration.from_lights(lights, vts.Sensor("figure 3", 480, 640, PITCH))
+    for press_px, paper in PAPER_3.items():
+        scene = scenes.sphere_press(10.0, press_px * PITCH)
+        image = scenes.render(scene, lights).detach()
+        floor = metrics.depth_error(vts.poisson_rest(scene.gradient, PITCH), scene.depth_mm, PITCH)
+        for mode, equation, reported in (("fast", "eq. 9", paper[0]), ("precise", "eq. 10", paper[1])):
+            pipe = vts.DepthPipeline.from_calibration(calibration, mode)
+            with torch.inference_mode():
+                result = pipe(image)
+            error = metrics.depth_error(result.depth_mm, scene.depth_mm, PITCH)
+            rows.append(
+                f"| sphere R 160 px, press {press_px} px | {equation} | {reported:.2f} | {error.max_px:.3f} | {error.rms_px:.4f} "
+                f"| {floor.max_px:.3f} / {floor.rms_px:.4f} |"
+            )
+            figure = viz.comparison_figure(result.depth_mm, scene.depth_mm, PITCH, f"figure 3: press {press_px} px, {equation}")
+            viz.save_figure(figure, out / f"figure_3_press_{press_px}_{mode}.png")
+    return [
+        "| scene | method | paper, largest px | ours, largest px | RMS px | integrator alone, largest / RMS px |",
+        "|---|---|---|---|---|---|",
+        *rows,
+    ]
+
+
+def figure_4(folder: Path, out: Path) -> list[str]:
+    import numpy as np
+
+    rows = []
+    sensor = vts.Sensor.load("tacto")
+    for camera in tqdm(["orthographic", "perspective"], desc="figure 4", leave=False):
+        if not (folder / camera / "background.png").is_file():
+            continue
+        calibration = vts.calibrate(vts.read_image(folder / camera / "background.png"), sensor)
+        pipe = vts.DepthPipeline.from_calibration(calibration, "precise")
+        for case, center, radius in (("sphere_R10_d2", (0, 0, -8), 10), ("sphere_R5_d1_off", (8, -5, -4), 5)):
+            depth_px = np.load(folder / camera / f"{case}_depth.npz")["depth_px"]
+            truth = torch.from_numpy(depth_px).float()[None, None] * PITCH
+            with torch.inference_mode():
+                result = pipe(vts.read_image(folder / camera / f"{case}.png")[None])
+            error = metrics.depth_error(result.depth_mm, truth, PITCH)
+            fit = metrics.fit_sphere(result.depth_mm, PITCH, result.contact)
+            found = ", ".join(f"{v + 0.0:.3f}" for v in fit.center_mm)
+            paper = ("3", "(0.031, 0.032, -7.650), 9.799") if case == "sphere_R10_d2" else ("", "")
+            rows.append(
+                f"| {camera}, {case} | {paper[0]} | {error.max_px:.2f} ({error.max_mm:.3f} mm) | {error.rms_px:.3f} "
+                f"| {paper[1]} | ({found}), {fit.radius_mm:.3f} | {center}, {radius} |"
+            )
+            figure = viz.comparison_figure(result.depth_mm, truth, PITCH, f"figure 4: TACTO, {camera}, {case}")
+            viz.save_figure(figure, out / f"figure_4_{camera}_{case}.png")
+    head = "| scene | paper, largest px | ours, largest px | RMS px | paper, sphere centre and radius mm | ours | truth |"
+    return [head, "|---|---|---|---|---|---|---|", *rows]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("out/paper"), help="folder for pictures and table.md")
+    parser.add_argument("--data", type=Path, default=data_folder(), help="folder that holds tacto/ (default: TORCHVTS_DATA)")
+    parser.add_argument("--lights", type=float, nargs=2, default=(31.25, 39.375), metavar=("RADIUS_MM", "HEIGHT_MM"))
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    lines = [
+        "Figure 3: exact lights known, 640 x 480, depth error over the whole image",
+        "",
+        *figure_3(ring(*arguments.lights), arguments.out),
+    ]
+    tacto = arguments.data / "tacto"
+    lines += ["", "Figure 4: TACTO renders, calibrated from the one background image, precise", ""]
+    lines += figure_4(tacto, arguments.out) if tacto.is_dir() else [f"not run: no {tacto} (scripts/render_tacto.py renders it)"]
+    text = "\n".join(lines)
+    (arguments.out / "table.md").write_text(text + "\n")
+    print(text)
+    print(f"\npictures and table.md in {arguments.out}")
+
+
+def data_folder() -> Path:
+    """Where third-party images lie: TORCHVTS_DATA, else ../shared/data beside the checkout."""
+    return Path(os.environ.get("TORCHVTS_DATA", Path(__file__).resolve().parents[1] / ".." / "shared" / "data"))
+
+
+if __name__ == "__main__":
+    main()

@@ -132,8 +132,7 @@ class ContactMask(nn.Module):
         spread = mean.abs().flatten(2).median(dim=2).values / 0.6745
         least = torch.sqrt(threshold[:, :, 0, 0]) / (self.sigmas * cell)  # white noise in the mean of a cell
         faint = (mean / torch.maximum(spread, least)[..., None, None]).square().sum(1, keepdim=True) > self.sigmas * self.sigmas
-        # beside a strong rim a cell's mean tells of its neighbour: there only pixels count
-        faint = faint & ~_dilate(any_strong)
+        faint = faint & ~any_strong  # where single pixels stand out, as at a rim, they decide
         cells = any_strong | faint
         border = torch.ones_like(cells)
         border[..., 1:-1, 1:-1] = False

@@ -97,12 +97,16 @@ def fit_lights(
     best = solve(_paraboloid_start(pixels) if start is None else _from_lights(start))
     if best.converged and bool((best.misfit > 0).all()):
         # structure is left that noise does not explain: a glossy skin? Only if that leaves next to nothing in every channel
-        glossy = solve(torch.cat((best.parameter, torch.full_like(best.parameter[:, :1], 0.05)), dim=1))
-        explained = (glossy.misfit < 0.5 * best.misfit) & (glossy.misfit < GLOSS_MISFIT) & (glossy.parameter[:, 4] > 0)
-        if glossy.converged and bool(explained.all()):
+        with_gloss = torch.cat((best.parameter, torch.full_like(best.parameter[:, :1], 0.05)), dim=1)
+        near = _solve(pixels.every(_COARSE_PIXELS), with_gloss, max_steps, progress)
+        glossy = _solve(pixels, near.parameter, max_steps, progress) if _explains(near, best) else best
+        if _explains(glossy, best):
             # the width of the lobe is assumed: what choosing the lobe moved is as uncertain as the lights are
             moved = glossy.parameter[:, :4] - best.parameter
-            best = glossy._replace(covariance=glossy.covariance + moved[:, :, None] * moved[:, None, :])
+            best = glossy._replace(
+                covariance=glossy.covariance + moved[:, :, None] * moved[:, None, :],
+                history=best.history + near.history + glossy.history,
+            )
     parameter, history, scale, misfit = best.parameter, best.history, best.scale, best.misfit
     lights = _to_lights(parameter, background.dtype)
     direction_std, position_std = _spread(parameter, best.covariance)
@@ -207,6 +211,12 @@ def _solve(pixels: _Pixels, start: Tensor, max_steps: int, progress: bool) -> _S
     weight, scale = _robust_weight(left, pixels.usable)
     covariance, misfit = _covariance(pixels, left, jacobian, pixels.model(parameter), weight, scale)
     return _Solution(parameter, history, still == 3, moved, weight, scale, covariance, misfit)
+
+
+def _explains(glossy: _Solution, matt: _Solution) -> bool:
+    """Whether a lobe takes at least half of what a matt skin leaves, and leaves next to nothing, in every channel."""
+    less = (glossy.misfit < 0.5 * matt.misfit) & (glossy.misfit < GLOSS_MISFIT)
+    return glossy.converged and bool((less & (glossy.parameter[:, -1] > 0)).all())
 
 
 _COARSE_PIXELS = 8000

@@ -1,0 +1,124 @@
+"""The main job on an embedded scene, and on real images where they are: calibrate from one image, reconstruct, look.
+
+python scripts/demo.py [--out out/demo]
+"""
+
+import argparse
+import os
+import time
+import warnings
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+import torchvts as vts
+from torchvts import metrics, scenes, viz
+
+PITCH = 0.0625
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("out/demo"))
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    lines = embedded(arguments.out)
+    folder = Path(os.environ.get("TORCHVTS_DATA", Path(__file__).resolve().parents[1] / ".." / "shared" / "data"))
+    lines += real(folder, arguments.out) if folder.is_dir() else [f"real images: none at {folder} (set TORCHVTS_DATA)"]
+    print("\n".join(lines))
+    print(f"\npictures in {arguments.out}")
+
+
+def embedded(out: Path) -> list[str]:
+    """A sensor with low lights, a worn skin, noise and 8 bits; calibrated from one image of it."""
+    lights = vts.PointLights([[20.0, 9.3, 16.5], [-18.0, 12.6, 15.5], [-1.9, -21.9, 17.5]], [200.0, 200.0, 200.0])
+    sensor = vts.Sensor("embedded", 480, 640, PITCH)
+    worn = scenes.skin_spots(480, 640)
+    rest = scenes.at_rest(scenes.sphere_press())
+    background = scenes.render(rest, lights, noise_std=0.01, bits=8, spots=worn, seed=1)[0].detach()
+    start = time.perf_counter()
+    calibration = vts.calibrate(background, sensor, progress=True)
+    seconds = time.perf_counter() - start
+    calibration.save(out / "embedded.safetensors")
+    calibration = vts.Calibration.load(out / "embedded.safetensors")
+    off = float((calibration.lights.position_mm - lights.position_mm).abs().max().detach())
+    lines = [
+        f"Embedded scene: 640 x 480, noise 0.01, 8 bits, spots; lights found within {off:.3f} mm in {seconds:.1f} s",
+        "",
+        "| press | mode | largest error px | RMS px | normals deg | mask IoU |",
+        "|---|---|---|---|---|---|",
+    ]
+    presses = {
+        "sphere": scenes.sphere_press(10.0, 1.0, center_mm=(-3.0, 2.0)),
+        "letters": scenes.letters_press("VTS", 0.5, bevel_mm=0.9),
+        "texture": scenes.sine_press(),
+        "cylinder": scenes.cylinder_press(),
+    }
+    for number, (name, scene) in enumerate(tqdm(presses.items(), desc="presses", leave=False)):
+        image = scenes.render(scene, lights, noise_std=0.01, bits=8, spots=worn, seed=2 + number).detach()
+        for mode in ("fast", "precise"):
+            with torch.inference_mode():
+                result = vts.DepthPipeline.from_calibration(calibration, mode)(image)
+            error = metrics.depth_error(result.depth_mm, scene.depth_mm, PITCH)
+            angle = float(metrics.normal_angle_deg(result.normal, scene.normal, scene.contact).mean())
+            iou = metrics.mask_iou(result.contact, scene.contact)
+            lines.append(f"| {name} | {mode} | {error.max_px:.3f} | {error.rms_px:.4f} | {angle:.2f} | {iou:.3f} |")
+        viz.save_figure(viz.depth_figure(result.depth_mm, PITCH, image, result.contact, f"{name}, {mode}"), out / f"{name}.png")
+        viz.save_figure(viz.comparison_figure(result.depth_mm, scene.depth_mm, PITCH, f"{name}, {mode}"), out / f"{name}_error.png")
+    return [*lines, ""]
+
+
+def real(folder: Path, out: Path) -> list[str]:
+    """Renders and photographs of other people; calibrated from the one background of each."""
+    lines = [
+        f"Images of {folder.name}/, each sensor calibrated from its one background",
+        "",
+        "| image | lights pinned to, deg | deepest mm | contact mm^2 | largest error px |",
+        "|---|---|---|---|---|",
+    ]
+    cases = [
+        ("tacto/orthographic", "tacto", "background.png", ["sphere_R10_d2.png", "cylinder_R4_d1.png"]),
+        ("gelsight_mini_a", "gelsight_mini", "background.png", ["6.310mm/0/gelsight.png"]),
+        ("gelsight_mini_b", "gelsight_mini", "background.png", ["bead.png"]),
+    ]
+    notes = []
+    for place, sensor_name, background, images in cases:
+        if not (folder / place / background).is_file():
+            lines.append(f"| {place} | not there | | | |")
+            continue
+        sensor = vts.Sensor.load(sensor_name)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", vts.CalibrationWarning)
+            calibration = vts.calibrate(vts.read_image(folder / place / background), sensor, progress=True)
+        notes += [f"{place}: {warning.message}" for warning in caught]
+        pipe = vts.DepthPipeline.from_calibration(calibration, "precise")
+        pinned = " / ".join(f"{v:.1f}" for v in calibration.report["direction_std_deg"])
+        for name in images:
+            if not (folder / place / name).is_file():
+                continue
+            image = vts.read_image(folder / place / name)[None]
+            with torch.inference_mode():
+                result = pipe(image)
+            area = float(result.contact.double().sum()) * sensor.mm_per_pixel**2
+            error = truth_error(folder / place / name.replace(".png", "_depth.npz"), result.depth_mm, sensor.mm_per_pixel)
+            lines.append(f"| {place}/{name} | {pinned} | {float(result.depth_mm.max()):.3f} | {area:.1f} | {error} |")
+            title = f"{place}/{name}, lights pinned to {pinned} deg"
+            picture = f"{place}_{Path(name).with_suffix('')}".replace("/", "_")
+            viz.save_figure(
+                viz.depth_figure(result.depth_mm, sensor.mm_per_pixel, image, result.contact, title), out / f"{picture}.png"
+            )
+    return lines + (["", "What the library itself says of these calibrations:"] + [f"* {note}" for note in notes] if notes else [])
+
+
+def truth_error(path: Path, depth_mm: torch.Tensor, mm_per_pixel: float) -> str:
+    if not path.is_file():
+        return "no truth"
+    import numpy as np
+
+    truth = torch.from_numpy(np.load(path)["depth_px"]).float()[None, None] * mm_per_pixel
+    return f"{metrics.depth_error(depth_mm, truth, mm_per_pixel).max_px:.2f}"
+
+
+if __name__ == "__main__":
+    main()

@@ -26,7 +26,8 @@ def main() -> None:
         rows = bench.run(
             f"python scripts/bench.py --threads {arguments.threads}", lambda name: (bar.set_postfix_str(name), bar.update())
         )
-    text = f"{bench.table(rows)}\n\n{rows[0].machine}, {arguments.threads} threads; one 640x480 frame, pipeline and all: {memory:.0f} MB beside torch"
+    text = f"{bench.table(rows)}\n\n{rows[0].machine}, {arguments.threads} threads; "
+    text += f"one 640x480 frame, pipeline and all: {memory:.0f} MB beside torch"
     (arguments.out / "bench.md").write_text(text + "\n")
     (arguments.out / "bench.json").write_text(bench.to_json(rows))
     print(text)

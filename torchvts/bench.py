@@ -92,7 +92,7 @@ def run(command: str, progress: Callable[[str], None]) -> list[Row]:
                         1000 * error.rms_mm,
                         error.max_px,
                         command,
-                    )  # fmt: skip
+                    )
                 )
     calibration, image, _ = _scene(480, 640, 1.0)
     for stage, call in _stages(calibration, image).items():

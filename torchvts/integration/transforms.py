@@ -1,6 +1,6 @@
-r"""Sine and cosine transforms as small matrix products, split by parity.
+r"""Sine and cosine transforms: small matrix products split by parity, and the cosine transform by one real FFT.
 
-Both bases have rows that are even or odd about the middle of the line. A line's even part meets only the even rows and its
+Matrices: both bases have rows that are even or odd about the middle of the line. A line's even part meets only the even rows, its
 odd part only the odd ones, so folding the line first halves the multiplications. The coefficients stay in two blocks: a
 solver that only scales them never needs them interleaved. Rows are orthonormal, so the inverse is the transpose.
 """
@@ -61,3 +61,57 @@ def unfold(even: Tensor, odd: Tensor, dim: int) -> Tensor:
     paired = even.narrow(dim, 0, half)
     middle = even.narrow(dim, half, even.shape[dim] - half)  # empty where the length is even
     return torch.cat((paired + odd, middle, (paired - odd).flip(dim)), dim=dim)
+
+
+def fft_is_fast(length: int) -> bool:
+    """Whether a length has no prime factor above 7."""
+    for prime in (2, 3, 5, 7):
+        while length % prime == 0:
+            length //= prime
+    return length == 1
+
+
+def cosine_twiddles(height: int, width: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    r"""Tables for a two-dimensional DCT-II by one real FFT.
+
+    With v the lines reordered by :func:`interleave`, A its FFT and w = exp(-i pi k / 2n), the complex array
+    E = w_x (w_y A(k_y) + conj(w_y) A(-k_y)) holds every coefficient: C(k_y, k_x) = Re E / 2 and
+    C(k_y, n_x - k_x) = -Im E / 2. Back, A = conj(w_y w_x) (E(k_y) - i E(n_y - k_y)) / 2, where E(n_y) counts as zero.
+
+    Returns:
+        what multiplies A(k_y) and A(-k_y), what multiplies E(k_y) and E(n_y - k_y), each (H, W // 2 + 1) complex128; and the
+        second difference's eigenvalues at (k_y, k_x) and (k_y, n_x - k_x).
+    Source:
+        Makhoul, A fast cosine transform in one and two dimensions, IEEE Trans. ASSP 28(1), 1980.
+    """
+    k_y = torch.arange(height, dtype=torch.float64)[:, None]
+    k_x = torch.arange(width // 2 + 1, dtype=torch.float64)[None, :]
+    turn_y, turn_x = -0.5 * math.pi / height * k_y, -0.5 * math.pi / width * k_x
+    one = torch.ones_like(turn_y + turn_x)
+    forward, flipped = torch.polar(one, turn_y + turn_x), torch.polar(one, turn_x - turn_y)
+    back = torch.polar(0.5 * one, -turn_y - turn_x)
+    back_flipped = torch.polar(0.5 * one, -turn_y - turn_x - 0.5 * math.pi)
+    back_flipped[0] = 0.0
+    value_y = -4.0 * torch.sin(turn_y).square()
+    value, value_flipped = value_y - 4.0 * torch.sin(turn_x).square(), value_y - 4.0 * torch.cos(turn_x).square()
+    return forward, flipped, back, back_flipped, value, value_flipped
+
+
+def interleave(lines: Tensor, dim: int) -> Tensor:
+    """Even places first, then the odd ones backwards."""
+    even, odd = (lines[..., ::2, :], lines[..., 1::2, :]) if dim == -2 else (lines[..., ::2], lines[..., 1::2])
+    return torch.cat((even, odd.flip(dim)), dim=dim)
+
+
+def deinterleave(lines: Tensor, dim: int) -> Tensor:
+    """The inverse of :func:`interleave`."""
+    n = lines.shape[dim]
+    half = (n + 1) // 2
+    even, odd = lines.narrow(dim, 0, half), lines.narrow(dim, n - half, half).flip(dim)  # of odd length: one too many, last
+    pairs = torch.stack((even, odd), dim=-2).flatten(-3, -2) if dim == -2 else torch.stack((even, odd), dim=-1).flatten(-2)
+    return pairs.narrow(dim, 0, n)
+
+
+def mirror_rows(array: Tensor) -> Tensor:
+    """Row 0, then the others backwards: row -k, modulo the height."""
+    return array.roll(-1, dims=[-2]).flip(-2)

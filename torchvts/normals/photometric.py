@@ -133,9 +133,10 @@ class NormalFromIntensity(nn.Module):
 
     def _relight(self, normal: Tensor, compensated: Tensor, depth_mm: Tensor | None, position: Tensor, albedo: Tensor) -> Tensor:
         """Replace the normals of pixels where a light that shines on the flat skin has gone dark."""
-        b, row, column = torch.where((compensated < self.dark_where).any(dim=1))
-        if len(b) == 0:
+        dark = compensated < self.dark_where
+        if not bool(dark.any()):
             return normal
+        b, row, column = torch.where(dark.any(dim=1))
         height, width = compensated.shape[2], compensated.shape[3]
         x = (column.to(normal.dtype) - 0.5 * (width - 1)) * self.mm_per_pixel
         y = (row.to(normal.dtype) - 0.5 * (height - 1)) * self.mm_per_pixel

@@ -65,9 +65,9 @@ def unfold(even: Tensor, odd: Tensor, dim: int) -> Tensor:
 
 def fft_is_fast(length: int) -> bool:
     """Whether a length has no prime factor above 7."""
-    for prime in (2, 3, 5, 7):
+    for prime in [2, 3, 5, 7]:
         while length % prime == 0:
-            length //= prime
+            length = length // prime
     return length == 1
 
 

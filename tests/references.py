@@ -1,0 +1,101 @@
+"""Slow twins of the package's numerics, in plain loops and dense algebra. Nothing here imports torchvts."""
+
+from collections import deque
+
+import numpy as np
+
+
+def pixel_mm(row, column, height, width, pitch):
+    return (column - (width - 1) / 2) * pitch, (row - (height - 1) / 2) * pitch
+
+
+def light_rows(x, y, z, position, albedo):
+    """The 3 x 3 matrix L of I = L n at one point (eq. 2)."""
+    rows = np.empty((3, 3))
+    for j in range(3):
+        to_light = position[j] - np.array([x, y, z])
+        rows[j] = albedo[j] * to_light / np.linalg.norm(to_light) ** 3
+    return rows
+
+
+def each_pixel(depth, pitch):
+    height, width = depth.shape
+    for row in range(height):
+        for column in range(width):
+            yield row, column, (*pixel_mm(row, column, height, width, pitch), depth[row, column])
+
+
+def shade(depth, normal, position, albedo, pitch):
+    """Image (3, H, W) of depth (H, W) and normals (3, H, W): eq. 1, attached shadows at zero."""
+    image = np.empty((3, *depth.shape))
+    for row, column, point in each_pixel(depth, pitch):
+        image[:, row, column] = np.maximum(0, light_rows(*point, position, albedo) @ normal[:, row, column])
+    return image
+
+
+def inverse_light(depth, position, albedo, pitch):
+    """Inverse light matrices (3, 3, H, W), each by a general 3 x 3 inverse."""
+    inverse = np.empty((3, 3, *depth.shape))
+    for row, column, point in each_pixel(depth, pitch):
+        inverse[:, :, row, column] = np.linalg.inv(light_rows(*point, position, albedo))
+    return inverse
+
+
+def edge_system(gradient, pitch):
+    """Edge differences A z = b of all pixels of a gradient map (2, H, W); an edge's slope is the mean of its two ends."""
+    _, height, width = gradient.shape
+    rows, right = [], []
+    for row in range(height):
+        for column in range(width):
+            here = row * width + column
+            for there, axis, inside in ((here + 1, 0, column + 1 < width), (here + width, 1, row + 1 < height)):
+                if inside:
+                    line = np.zeros(height * width)
+                    line[here], line[there] = -1, 1
+                    rows.append(line)
+                    end = gradient[axis].reshape(-1)[there]
+                    right.append(pitch * 0.5 * (gradient[axis, row, column] + end))
+    return np.array(rows), np.array(right)
+
+
+def poisson_free(gradient, pitch):
+    """Least squares over all edges, zero mean: the solution of least norm."""
+    matrix, right = edge_system(gradient, pitch)
+    return np.linalg.lstsq(matrix, right, rcond=None)[0].reshape(gradient.shape[1:])
+
+
+def poisson_zero(gradient, pitch):
+    """Least squares over all edges with the border held at zero."""
+    matrix, right = edge_system(gradient, pitch)
+    inside = np.zeros(gradient.shape[1:], dtype=bool)
+    inside[1:-1, 1:-1] = True
+    free = matrix[:, inside.reshape(-1)]
+    depth = np.zeros(gradient.shape[1:])
+    depth[inside] = np.linalg.solve(free.T @ free, free.T @ right)
+    return depth
+
+
+def flood(seed, mask):
+    """All of a mask (H, W) that a seed reaches over edges, pixel by pixel."""
+    reached = seed & mask
+    queue = deque(zip(*np.nonzero(reached)))
+    while queue:
+        row, column = queue.popleft()
+        for r, c in ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)):
+            if 0 <= r < mask.shape[0] and 0 <= c < mask.shape[1] and mask[r, c] and not reached[r, c]:
+                reached[r, c] = True
+                queue.append((r, c))
+    return reached
+
+
+def fill_holes(mask):
+    border = np.ones_like(mask)
+    border[1:-1, 1:-1] = False
+    return ~flood(border, ~mask)
+
+
+def dilate(mask):
+    result = np.zeros_like(mask)
+    for row, column in zip(*np.nonzero(mask)):
+        result[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2] = True
+    return result

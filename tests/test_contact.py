@@ -1,0 +1,207 @@
+"""The contact mask."""
+
+import numpy as np
+import pytest
+import references
+import torch
+from kornia.morphology import dilation
+
+import torchvts as vts
+from torchvts.contact import _dilate, _erode, reconstruct
+
+scenes, metrics = vts.scenes, vts.metrics
+
+
+def found(scene, lights, sensor, noise_std=0.0, bits=None, seed=3):
+    """Contact of one frame, judged with a background as noisy as the frame."""
+    background = scenes.render(scenes.at_rest(scene), lights, noise_std=noise_std, bits=bits, seed=seed + 1)[0]
+    pipeline = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, sensor, background))
+    return pipeline(scenes.render(scene, lights, noise_std=noise_std, bits=bits, seed=seed)).contact
+
+
+@pytest.mark.parametrize("noise_std, bits, least, rim_px", [(0.0, None, 0.999, 0.01), (0.01, 8, 0.99, 0.1)])
+@pytest.mark.parametrize("press_mm", [1.0, 2.0])
+def test_a_ball_full_size(ring, noise_std, bits, least, rim_px, press_mm):
+    scene = scenes.sphere_press(10.0, press_mm)
+    contact = found(scene, ring(), vts.Sensor("rig", 480, 640, 0.0625), noise_std, bits)
+    assert metrics.mask_iou(contact, scene.contact) > least
+    assert metrics.rim_distance_px(contact, scene.contact) < rim_px
+
+
+@pytest.mark.parametrize(
+    "press_mm, radius_mm, center_mm", [(1.0, 10.0, (0, 0)), (0.3, 4.0, (-9, 5)), (1.5, 5.0, (12, -8)), (1.0, 10.0, (18, 0))]
+)
+@pytest.mark.parametrize("noise_std, bits", [(0.0, None), (0.01, 8)])
+def test_balls_of_any_size_and_place(ring, small_sensor, small_press, press_mm, radius_mm, center_mm, noise_std, bits):
+    scene = small_press(press_mm, center_mm, radius_mm)
+    assert metrics.mask_iou(found(scene, ring(), small_sensor, noise_std, bits), scene.contact) > 0.97
+
+
+def test_letters(ring):
+    scene = scenes.letters_press("VTS", height=240, width=320, mm_per_pixel=0.125)
+    contact = found(scene, ring(), vts.Sensor("rig", 240, 320, 0.125), 0.005, 8)
+    assert metrics.mask_iou(contact, scene.contact) > 0.93
+    assert metrics.rim_distance_px(contact, scene.contact) < 1.0
+
+
+def mask_of(changed, height=480, width=640, noise=0.01, seed=None, **options):
+    flat = torch.full((3, height, width), 0.5)
+    image = flat[None].clone()
+    for rows, columns, change in changed:
+        image[:, :, rows, columns] += change
+    if seed is not None:
+        image += noise * torch.randn(image.shape, generator=torch.Generator().manual_seed(seed))
+    return vts.ContactMask(flat, torch.full((3,), noise), **options)(image)
+
+
+def test_a_hole_where_the_slope_vanishes_is_filled():
+    ring_shape = [(slice(100, 300), slice(100, 300), 0.2), (slice(180, 220), slice(180, 220), -0.2)]
+    expected = torch.zeros(1, 1, 480, 640, dtype=torch.bool)
+    expected[..., 100:300, 100:300] = True
+    for seed in (None, 0):
+        assert metrics.mask_iou(mask_of(ring_shape, seed=seed), expected) > (0.9999 if seed is None else 0.995)
+
+
+@pytest.mark.parametrize("side, kept", [(1, False), (3, False), (20, True)])
+def test_specks_go_and_contacts_stay(side, kept):
+    mask = mask_of([(slice(200, 200 + side), slice(300, 300 + side), 0.3)])
+    assert int(mask.sum()) == (side**2 if kept else 0)
+
+
+def test_the_smallest_contact_can_be_set():
+    change = [(slice(200, 220), slice(300, 320), 0.3)]
+    assert int(mask_of(change, min_size_px=40.0).sum()) == 0
+
+
+def test_faint_wide_contact_below_the_noise_of_a_pixel_is_found():
+    mask = mask_of([(slice(100, 300), slice(100, 300), 0.02)], seed=0)  # two sigmas
+    truth = mask_of([(slice(100, 300), slice(100, 300), 0.2)])
+    assert metrics.mask_iou(mask, truth) > 0.88
+
+
+@pytest.mark.parametrize("noise_std", [0.005, 0.02])
+def test_pure_noise_is_no_contact(ring, small_sensor, small_press, noise_std):
+    rest, lights = scenes.at_rest(small_press()), ring()
+    background = scenes.render(rest, lights, noise_std=noise_std, bits=8, seed=99)[0]
+    pipeline = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, small_sensor, background))
+    frames = torch.cat([scenes.render(rest, lights, noise_std=noise_std, bits=8, seed=seed) for seed in range(20)])
+    assert int(pipeline(frames).contact.sum()) == 0
+
+
+@pytest.mark.parametrize("times", [2, 4])
+def test_a_frame_noisier_than_the_calibration_does_not_flood(ring, small_sensor, small_press, times):
+    scene, lights = small_press(1.0), ring()
+    background = scenes.render(scenes.at_rest(scene), lights, noise_std=0.005, bits=8)[0]
+    pipeline = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, small_sensor, background))
+    rest = scenes.render(scenes.at_rest(scene), lights, noise_std=0.005 * times, bits=8, seed=1)
+    press = scenes.render(scene, lights, noise_std=0.005 * times, bits=8, seed=2)
+    assert int(pipeline(rest).contact.sum()) == 0
+    assert metrics.mask_iou(pipeline(press).contact, scene.contact) > 0.97
+
+
+def test_items_of_a_batch_do_not_influence_one_another(ring, small_sensor, small_press):
+    lights = ring()
+    cal = vts.Calibration.from_lights(lights, small_sensor)
+    block = vts.ContactMask(cal.model_image, cal.light_noise_std)
+    presses = [small_press(1.0), scenes.at_rest(small_press()), small_press(0.2, (8, 8))]
+    frames = torch.cat([scenes.render(scene, lights, noise_std=0.01 * k, seed=k) for k, scene in enumerate(presses)])
+    assert torch.equal(block(frames), torch.cat([block(frame[None]) for frame in frames]))
+
+
+def spiral(n):
+    """A path one pixel wide that winds inwards: the longest way a flood can be sent."""
+    mask = np.zeros((n, n), dtype=bool)
+    row, column, step = 0, -1, (0, 1)
+    for length in [n, *(k for j in range(n - 1, 0, -2) for k in (j, j))]:
+        for _ in range(length):
+            row, column = row + step[0], column + step[1]
+            mask[row, column] = True
+        step = (step[1], -step[0])
+    return mask
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.6, 0.8])
+@pytest.mark.parametrize("size", [(17, 23), (40, 31)])
+def test_reconstruct_equals_a_flood_fill_on_random_masks(share, size):
+    generator = np.random.default_rng(int(100 * share))
+    mask = generator.random((3, 1, *size)) < share
+    seed = generator.random(mask.shape) < 0.02
+    result = reconstruct(torch.from_numpy(seed), torch.from_numpy(mask)).numpy()
+    for item in range(3):
+        assert np.array_equal(result[item, 0], references.flood(seed[item, 0], mask[item, 0]))
+
+
+def test_reconstruct_follows_a_spiral_to_its_end():
+    mask = spiral(21)
+    seed = np.zeros_like(mask)
+    seed[0, 0] = True
+    result = reconstruct(torch.from_numpy(seed)[None, None], torch.from_numpy(mask)[None, None])[0, 0].numpy()
+    assert np.array_equal(result, references.flood(seed, mask)) and np.array_equal(result, mask)
+
+
+def test_filling_from_the_border_equals_the_twin():
+    mask = np.random.default_rng(0).random((30, 41)) < 0.6
+    border = np.ones_like(mask)
+    border[1:-1, 1:-1] = False
+    filled = ~reconstruct(torch.from_numpy(border)[None, None], torch.from_numpy(~mask)[None, None])[0, 0].numpy()
+    assert np.array_equal(filled, references.fill_holes(mask)) and (filled & ~mask).any()
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.9])
+def test_dilation_equals_kornia_and_the_twin(share):
+    mask = torch.rand(2, 1, 33, 47, generator=torch.Generator().manual_seed(0)) < share
+    grown = _dilate(mask)
+    assert torch.equal(grown, dilation(mask.float(), torch.ones(3, 3)) > 0.5)
+    assert np.array_equal(grown[0, 0].numpy(), references.dilate(mask[0, 0].numpy()))
+    assert torch.equal(_erode(mask), ~_dilate(~mask))
+
+
+@pytest.fixture(scope="module")
+def soft_case(ring, small_sensor, small_press):
+    lights, scene = ring(), small_press(1.0)
+    background = scenes.render(scenes.at_rest(scene), lights, noise_std=0.01, seed=1)[0]
+    cal = vts.Calibration.from_lights(lights, small_sensor, background)
+    return vts.ContactMask(cal.model_image, cal.light_noise_std), scenes.render(scene, lights, noise_std=0.01, seed=2)
+
+
+def test_soft_contact_thresholds_to_the_hard_mask(soft_case):
+    block, frame = soft_case
+    soft, hard = block.soft(frame), block(frame)
+    assert float(soft.min()) >= 0 and float(soft.max()) <= 1
+    assert metrics.mask_iou(soft > 0.5, hard) > 0.99
+
+
+def test_soft_contact_has_a_slope_at_the_rim_only(soft_case):
+    block, frame = soft_case
+    frame = frame.clone().requires_grad_(True)
+    block.soft(frame).sum().backward()
+    moved = frame.grad.abs().sum(1, keepdim=True) > 1e-3
+    assert bool(torch.isfinite(frame.grad).all()) and bool(moved.any())
+    assert not bool((moved & ~_dilate(_dilate(block(frame.detach())))).any())
+
+
+def test_the_slope_of_soft_contact_equals_differences():
+    flat = torch.full((3, 16, 18), 0.5, dtype=torch.float64)
+    block = vts.ContactMask(flat, torch.full((3,), 0.01, dtype=torch.float64))
+    image = flat[None].clone()
+    image[..., 3:13, 4:14] += 0.035  # six sigmas over three channels
+    assert torch.autograd.gradcheck(block.soft, image.requires_grad_(True), fast_mode=True)
+
+
+def test_it_scripts_with_both_faces(soft_case):
+    block, frame = soft_case
+    scripted = torch.jit.script(block)
+    assert torch.equal(scripted(frame), block(frame))
+    assert (scripted.soft(frame) - block.soft(frame)).abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("options", [{"sigmas": 0}, {"sigmas": float("nan")}, {"min_size_px": -1.0}])
+def test_impossible_options_are_refused(options):
+    name = next(iter(options))
+    with pytest.raises(ValueError, match=rf"{name}: expected a number above 0 and finite, got {next(iter(options.values()))}"):
+        vts.ContactMask(torch.zeros(3, 8, 8), torch.ones(3), **options)
+
+
+def test_a_flat_image_of_another_shape_is_refused():
+    with pytest.raises(ValueError, match=r"flat: expected \(3, H, W\), got \(1, 3, 8, 8\)"):
+        vts.ContactMask(torch.zeros(1, 3, 8, 8), torch.ones(3))

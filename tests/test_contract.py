@@ -1,0 +1,202 @@
+"""What every block promises: scripts, batches, dtypes, pickles, state dicts, Sequential, errors that name the argument."""
+
+import copy
+import io
+import pickle
+
+import pytest
+import torch
+from torch import nn
+
+import torchvts as vts
+
+HEIGHT, WIDTH, PITCH = 48, 64, 0.6
+SENSOR = vts.Sensor("rig", HEIGHT, WIDTH, PITCH)
+
+
+def calibration(dtype):
+    from conftest import ring_lights
+
+    lights = ring_lights(dtype=dtype)
+    rest = vts.scenes.at_rest(vts.scenes.sphere_press(10.0, 1.0, (0, 0), HEIGHT, WIDTH, PITCH, dtype))
+    background = vts.scenes.render(rest, lights, spots=vts.scenes.skin_spots(HEIGHT, WIDTH, 5, 5))[0]
+    return vts.Calibration.from_lights(lights, SENSOR, background)
+
+
+def images(dtype):
+    from conftest import ring_lights
+
+    presses = [
+        vts.scenes.sphere_press(10.0, press, (x, 0), HEIGHT, WIDTH, PITCH, dtype) for press, x in ((2.0, 0), (1.0, 5), (0.5, -9))
+    ]
+    frames = [vts.scenes.render(press, ring_lights(dtype=dtype)) for press in presses]
+    return torch.cat([*frames, calibration(dtype).background[None]])
+
+
+def gradient(dtype):
+    return torch.randn(4, 2, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(dtype)
+
+
+def part(name):
+    return lambda dtype: getattr(vts.DepthPipeline.from_calibration(calibration(dtype), "fast"), name)
+
+
+def pipe(mode):
+    return lambda dtype: vts.DepthPipeline.from_calibration(calibration(dtype), mode)
+
+
+CASES = {
+    "Compensate": (part("compensate"), images, "image"),
+    "ContactMask": (part("contact"), images, "compensated"),
+    "NormalFromIntensity": (part("normals"), images, "compensated"),
+    "GradientFromNormal": (
+        lambda dtype: vts.GradientFromNormal(),
+        lambda dtype: vts.normal_from_gradient(gradient(dtype)),
+        "normal",
+    ),
+    "PoissonDST": (lambda dtype: vts.PoissonDST(PITCH), gradient, "gradient"),
+    "PoissonDCT": (lambda dtype: vts.PoissonDCT(PITCH), gradient, "gradient"),
+    "PoissonRest": (lambda dtype: vts.PoissonRest(PITCH), gradient, "gradient"),
+    "DepthPipeline fast": (pipe("fast"), images, "images"),
+    "DepthPipeline precise": (pipe("precise"), images, "images"),
+    "DepthPipeline auto": (pipe("auto"), images, "images"),
+}
+SIZED = [name for name in CASES if "Poisson" not in name and "Gradient" not in name]
+every_block = pytest.mark.parametrize("name", CASES)
+
+
+def build(name, dtype=torch.float32):
+    make, example, _ = CASES[name]
+    return make(dtype), example(dtype)
+
+
+def outputs(result):
+    return list(result) if isinstance(result, tuple) else [result]
+
+
+def assert_same(one, two, tolerance=0.0):
+    for left, right in zip(outputs(one), outputs(two), strict=True):
+        assert left.dtype == right.dtype and left.shape == right.shape
+        assert float((left.double() - right.double()).abs().max()) <= tolerance
+
+
+@every_block
+@pytest.mark.parametrize("dtype, tolerance", [(torch.float64, 1e-11), (torch.float32, 2e-4)])
+def test_torchscript_gives_what_eager_gives(name, dtype, tolerance):
+    block, example = build(name, dtype)
+    assert_same(torch.jit.script(block)(example), block(example), tolerance)
+
+
+@every_block
+def test_a_script_survives_its_file(name):
+    block, example = build(name, torch.float64)
+    stream = io.BytesIO()
+    torch.jit.save(torch.jit.script(block), stream)
+    stream.seek(0)
+    assert_same(torch.jit.load(stream)(example), block(example), 1e-11)
+
+
+@every_block
+def test_items_of_a_batch_are_independent(name):
+    block, example = build(name, torch.float64)
+    single = [outputs(block(item[None])) for item in example]
+    assert_same(tuple(torch.cat(column) for column in zip(*single)), tuple(outputs(block(example))), 1e-12)
+
+
+@every_block
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_dtype_is_kept(name, dtype):
+    block, example = build(name, dtype)
+    assert {tensor.dtype for tensor in outputs(block(example))} <= {dtype, torch.bool}
+
+
+@every_block
+def test_single_precision_follows_double_precision(name):
+    (single, example), (double, exact) = build(name), build(name, torch.float64)
+    if name == "ContactMask":
+        assert torch.equal(single(example), double(exact))
+        return
+    for left, right in zip(outputs(single(example)), outputs(double(exact)), strict=True):
+        assert float((left.double() - right.double()).abs().max()) < 2e-4 * max(1.0, float(right.double().abs().max()))
+
+
+@every_block
+def test_the_input_is_left_as_it_was(name):
+    block, example = build(name)
+    before = example.clone()
+    block(example)
+    assert torch.equal(example, before)
+
+
+@every_block
+def test_pickle_and_deepcopy(name):
+    block, example = build(name)
+    assert_same(pickle.loads(pickle.dumps(block))(example), block(example))
+    assert_same(copy.deepcopy(block)(example), block(example))
+
+
+@every_block
+def test_state_dict(name):
+    block, example = build(name)
+    other = copy.deepcopy(block)
+    for tensor in other.state_dict().values():
+        tensor.zero_()
+    other.load_state_dict(block.state_dict())
+    assert_same(other(example), block(example))
+
+
+@every_block
+def test_no_nan_and_no_gradient_asked_for(name):
+    block, example = build(name)
+    for tensor in outputs(block(example)):
+        assert bool(torch.isfinite(tensor).all()) and not tensor.requires_grad
+
+
+@every_block
+def test_a_non_contiguous_input_changes_nothing(name):
+    block, example = build(name)
+    assert_same(block(example.permute(0, 2, 3, 1).contiguous().permute(0, 3, 1, 2)), block(example), 1e-6)
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if "Pipeline" not in name])
+def test_a_block_works_in_sequential(name):
+    block, example = build(name)
+    assert_same(nn.Sequential(nn.Identity(), block)(example), block(example))
+
+
+def test_blocks_chain_by_hand_in_sequential():
+    whole, example = build("DepthPipeline fast")
+    normals = nn.Sequential(whole.compensate, whole.normals, whole.gradient)(example)
+    depth = whole.integrate(normals * whole.contact(whole.compensate(example)))
+    assert_same(depth, whole(example).depth_mm)
+
+
+@every_block
+@pytest.mark.parametrize("kind", ["no batch", "channels", "channels last", "integers"])
+def test_a_wrong_shape_or_dtype_names_the_argument(name, kind):
+    block, example = build(name)
+    argument, channels = CASES[name][2], example.shape[1]
+    wrong, error, message = {
+        "no batch": (
+            example[0],
+            ValueError,
+            rf"expected \(B, {channels}, H, W\), got \[{channels}, 48, 64\]: add the batch dimension",
+        ),
+        "channels": (example[:, :1], ValueError, rf"expected \(B, {channels}, H, W\), got \[4, 1, 48, 64\]"),
+        "channels last": (example.permute(0, 2, 3, 1), ValueError, r"channels stand last: permute\(0, 3, 1, 2\)"),
+        "integers": (example.to(torch.uint8), TypeError, r"expected a floating-point tensor, got torch.uint8"),
+    }[kind]
+    with pytest.raises(error, match=rf"^{argument}: .*{message}"):
+        block(wrong)
+
+
+@pytest.mark.parametrize("name", SIZED)
+def test_another_size_than_the_calibration_is_refused(name):
+    block, example = build(name)
+    with pytest.raises(ValueError, match=r"expected 48 x 64 like the calibration, got 48 x 63"):
+        block(example[..., :63])
+
+
+def test_a_scripted_error_keeps_its_text():
+    with pytest.raises(torch.jit.Error, match=r"gradient: expected \(B, 2, H, W\), got \[2, 8, 8\]"):
+        torch.jit.script(vts.PoissonDST())(torch.zeros(2, 8, 8))

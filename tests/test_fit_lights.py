@@ -1,0 +1,241 @@
+"""Lights from one image without contact, and how honestly the fit speaks of itself."""
+
+import json
+import math
+import warnings
+
+import pytest
+import torch
+
+import torchvts as vts
+from torchvts.calibration.levenberg import LevenbergMarquardt, residual_and_jacobian
+
+scenes = vts.scenes
+LOW = {"radius_mm": 22.0, "height_mm": [15.0, 16.5, 18.0], "level": 0.2}
+
+
+def rest(lights, sensor, **camera):
+    return scenes.render(
+        scenes.at_rest(scenes.sphere_press(10, 1, (0, 0), sensor.height, sensor.width, sensor.mm_per_pixel)), lights, **camera
+    )[0]
+
+
+def angle_deg(one, two):
+    return torch.rad2deg(torch.atan2(torch.linalg.cross(one, two, dim=1).norm(dim=1), (one * two).sum(1)))
+
+
+def furthest_mm(one, two):
+    return float((one.position_mm - two.position_mm).detach().abs().max())
+
+
+@pytest.fixture(scope="module")
+def low_rig(ring):
+    return ring(**LOW)
+
+
+@pytest.fixture(scope="module")
+def small_background(low_rig, small_sensor):
+    return rest(low_rig, small_sensor, noise_std=0.01, bits=8)
+
+
+@pytest.fixture(scope="module")
+def small_fit(small_background, small_sensor):
+    return vts.fit_lights(small_background, small_sensor)
+
+
+def test_low_lights_of_a_worn_unit(low_rig):
+    sensor = vts.Sensor("rig", 480, 640, 0.0625)
+    fit = vts.fit_lights(rest(low_rig, sensor, noise_std=0.01, bits=8, spots=scenes.skin_spots(480, 640), seed=1), sensor)
+    assert fit.converged
+    assert furthest_mm(fit.lights, low_rig) < 0.02  # the aim is 0.1
+    assert float((fit.lights.albedo.detach() / low_rig.albedo - 1).abs().max()) < 0.002
+    assert fit.noise_std.tolist() == pytest.approx([0.01] * 3, rel=0.06)
+    assert 0.8 < fit.inlier_fraction < 1.0
+
+
+def test_the_stated_spread_is_the_true_one(low_rig, small_sensor):
+    """Errors over stated standard deviations, of 24 directions and 72 coordinates."""
+    directions, positions = [], []
+    for seed in range(8):
+        fit = vts.fit_lights(rest(low_rig, small_sensor, noise_std=0.01, bits=8, seed=seed), small_sensor)
+        directions.append(angle_deg(fit.lights.direction.detach().double(), low_rig.direction.double()) / fit.direction_std_deg)
+        positions.append((fit.lights.position_mm.detach() - low_rig.position_mm).double() / fit.position_std_mm)
+    for score in (torch.stack(directions), torch.stack(positions)):
+        assert 0.5 < float(score.square().mean().sqrt()) < 2.0
+
+
+def random_start(seed):
+    """Anywhere within 30 mm of the centre, 5 to 50 mm high, albedo within a factor of four."""
+    draw = torch.rand(3, 4, generator=torch.Generator().manual_seed(seed))
+    position = torch.stack((60 * draw[:, 0] - 30, 60 * draw[:, 1] - 30, 5 + 45 * draw[:, 2]), dim=1)
+    return vts.PointLights(position, 200.0 * 4 ** (2 * draw[:, 3] - 1))
+
+
+@pytest.fixture(scope="module")
+def tiny(low_rig):
+    sensor = vts.Sensor("rig", 48, 64, 0.625)
+    background = rest(low_rig, sensor, noise_std=0.003, bits=8)
+    return sensor, background, vts.fit_lights(background, sensor)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_random_start_ends_at_the_same_lights_or_says_that_it_did_not(tiny, seed):
+    sensor, background, reference = tiny
+    fit = vts.fit_lights(background, sensor, start=random_start(seed))
+    assert not fit.converged or furthest_mm(fit.lights, reference.lights) < 0.05
+
+
+def test_the_closed_form_start_converges_within_twenty_steps(small_fit):
+    assert small_fit.converged and len(small_fit.loss_history) <= 20
+    assert small_fit.message.startswith("converged in ")
+    assert small_fit.loss_history[-1] <= small_fit.loss_history[0]
+
+
+def test_too_few_steps_are_reported_with_the_remedy(small_background, small_sensor, ring):
+    fit = vts.fit_lights(small_background, small_sensor, start=ring(10.0, 30.0, 200.0), max_steps=1)
+    assert not fit.converged and len(fit.loss_history) <= 2  # one on a coarse choice of pixels, one on all
+    assert "stopped at 1 steps" in fit.message and "raise max_steps" in fit.message
+
+
+@pytest.mark.parametrize("gloss", [[0.2, 0.3, 0.25]])
+def test_gloss_is_found_on_a_glossy_skin(ring, small_sensor, gloss):
+    lights = ring(22.0, [15.0, 16.5, 18.0], level=0.2, gloss=gloss)
+    fit = vts.fit_lights(rest(lights, small_sensor, noise_std=0.003, bits=8), small_sensor)
+    assert fit.converged
+    assert fit.lights.gloss.tolist() == pytest.approx(gloss, abs=0.05)
+    assert furthest_mm(fit.lights, lights) < 0.3
+
+
+@pytest.mark.parametrize("camera", [{}, {"vignetting": 0.2}, {"bits": 8}])
+def test_gloss_is_not_invented_on_a_matt_skin(low_rig, small_sensor, camera):
+    fit = vts.fit_lights(rest(low_rig, small_sensor, noise_std=0.003, **camera), small_sensor)
+    assert fit.lights.gloss.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_vignetting_widens_the_stated_spread(low_rig, small_sensor):
+    clean, dim = (vts.fit_lights(rest(low_rig, small_sensor, noise_std=0.003, vignetting=v), small_sensor) for v in (0.0, 0.2))
+    assert bool((dim.direction_std_deg > 10 * clean.direction_std_deg).all()) and bool((dim.misfit > 0.01).all())
+    error = angle_deg(dim.lights.direction.detach().double(), low_rig.direction.double())
+    assert bool((error < 3 * dim.direction_std_deg).all())
+
+
+def test_the_response_of_the_camera_is_part_of_the_model(ring, small_sensor):
+    lights = ring()
+    image = rest(lights, small_sensor, noise_std=0.003, bits=8, gamma=2.2)
+    sensor = vts.Sensor("rig", 120, 160, 0.25, gamma=2.2)
+    fit = vts.fit_lights(image, sensor)
+    assert fit.converged and furthest_mm(fit.lights, lights) < 0.3
+    assert furthest_mm(vts.fit_lights(image, small_sensor).lights, lights) > 5.0
+
+
+TACTO_MM = torch.tensor([[-17.3205, -10.0, 17.0], [17.3205, -10.0, 17.0], [0.0, 20.0, 17.0]])  # manifest.json, v up
+
+
+@pytest.mark.parametrize("camera", ["orthographic"])
+def test_tacto(data, camera):
+    folder = data / "tacto" / camera
+    fit = vts.fit_lights(vts.read_image(folder / "background.png"), vts.Sensor.load("tacto"))
+    stated = json.loads((folder / "manifest.json").read_text())["lights"]
+    pixels = torch.tensor([light["position_px_col_row_height"] for light in stated])
+    truth = (pixels - torch.tensor([319.5, 239.5, 0.0])) * 0.0625
+    assert torch.allclose(truth, TACTO_MM, atol=1e-3)
+    assert fit.converged and float((fit.lights.position_mm.detach() - truth).abs().max()) < 0.5
+
+
+@pytest.mark.parametrize("unit", ["gelsight_mini_a", "gelsight_mini_b"])
+def test_a_real_sensor_does_not_pin_point_lights_and_says_so(data, unit):
+    background = vts.read_image(data / unit / "background.png")
+    fit = vts.fit_lights(background, vts.Sensor.load("gelsight_mini"))
+    assert float(fit.direction_std_deg.max()) > 5.0
+    assert not fit.converged or "calibrate with presses or known lights" in fit.message
+    with pytest.warns(vts.CalibrationWarning, match="background: "):
+        vts.calibrate(background, vts.Sensor.load("gelsight_mini"))
+
+
+def test_a_clean_background_warns_of_nothing(small_background, small_sensor):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        calibration = vts.calibrate(small_background, small_sensor)
+    assert calibration.report["converged"] is True and calibration.report["lights"] == "fitted"
+    assert json.loads(json.dumps(calibration.report)) == calibration.report
+    assert calibration.report["standing_out"] < 0.001
+
+
+@pytest.mark.parametrize("press_mm, center_mm", [(1.0, (0, 0)), (0.5, (8, 5))])
+def test_contact_in_the_background_is_noticed(low_rig, small_sensor, press_mm, center_mm):
+    scene = scenes.sphere_press(10.0, press_mm, center_mm, 120, 160, 0.25)
+    image = scenes.render(scene, low_rig, noise_std=0.005, bits=8)[0]
+    with pytest.warns(
+        vts.CalibrationWarning, match=r"background: .*% of the image stands out .* contact in the calibration image\?"
+    ):
+        vts.calibrate(image, small_sensor)
+
+
+def test_saturated_spots_under_low_lights_are_not_taken_for_contact(ring, small_sensor):
+    lights = ring(22.0, [15.0, 16.5, 18.0], level=0.45)
+    image = rest(lights, small_sensor, noise_std=0.005, bits=8)
+    assert 0.02 < float((image > 0.995).float().mean()) < 0.2
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        calibration = vts.calibrate(image, small_sensor)
+    assert furthest_mm(calibration.lights, lights) < 0.1
+
+
+def test_lights_that_the_sensor_file_gives_keep_their_place(low_rig, small_background):
+    known = tuple(map(tuple, low_rig.position_mm.tolist()))
+    sensor = vts.Sensor("rig", 120, 160, 0.25, light_position_mm=known)
+    calibration = vts.calibrate(small_background, sensor)
+    assert torch.equal(calibration.lights.position_mm, torch.tensor(known))
+    assert float((calibration.lights.albedo / low_rig.albedo - 1).abs().max()) < 0.002
+    assert calibration.report["lights"] == "positions from the sensor file, albedo fitted"
+
+
+def test_a_fit_keeps_the_dtype_of_the_image(tiny):
+    sensor, background, _ = tiny
+    assert vts.fit_lights(background.double(), sensor).lights.position_mm.dtype == torch.float64
+
+
+@pytest.mark.parametrize("max_steps, error", [(0, ValueError), (2.5, TypeError), (True, TypeError)])
+def test_impossible_numbers_of_steps_are_refused(tiny, max_steps, error):
+    with pytest.raises(error, match="max_steps: expected "):
+        vts.fit_lights(tiny[1], tiny[0], max_steps=max_steps)
+
+
+def test_levenberg_marquardt_solves_independent_problems():
+    """Rosenbrock's valley twice, from its usual start and from another."""
+    parameter = torch.tensor([[-1.2, 1.0], [2.0, -3.0]], dtype=torch.float64, requires_grad=True)
+    optimiser = LevenbergMarquardt(parameter)
+
+    def residual(values):
+        return torch.stack((10 * (values[:, 1] - values[:, 0] ** 2), 1 - values[:, 0]), dim=1)
+
+    losses = torch.stack([optimiser.step(residual) for _ in range(100)])
+    assert torch.allclose(parameter.detach(), torch.ones(2, 2, dtype=torch.float64), atol=1e-10)
+    assert losses[0, 0] == pytest.approx(0.5 * (4.4**2 + 2.2**2))
+    assert bool((losses[1:] <= losses[:-1]).all()), "a step that would raise the loss is not taken"
+
+
+def test_levenberg_marquardt_weighs_residuals():
+    target, weight = torch.tensor([[1.0, 2.0, 9.0]], dtype=torch.float64), torch.tensor([[3.0, 1.0, 0.0]], dtype=torch.float64)
+    parameter = torch.zeros(1, 1, dtype=torch.float64, requires_grad=True)
+    optimiser = LevenbergMarquardt(parameter)
+    for _ in range(20):
+        optimiser.step(lambda values: values - target, weight)
+    assert parameter.item() == pytest.approx(1.25, abs=1e-10)
+
+
+def test_levenberg_marquardt_survives_a_flat_direction_and_infinite_residuals():
+    parameter = torch.tensor([[5.0, 3.0]], dtype=torch.float64, requires_grad=True)
+    optimiser = LevenbergMarquardt(parameter)
+    for _ in range(60):
+        optimiser.step(lambda values: torch.log(values[:, :1]))  # not a number left of zero, where the first step would go
+    assert parameter[0, 0].item() == pytest.approx(1.0, abs=1e-8) and parameter[0, 1].item() == 3.0
+
+
+def test_the_jacobian_is_exact():
+    parameter = torch.tensor([[0.3, -0.7]], dtype=torch.float64)
+    value, jacobian = residual_and_jacobian(lambda p: torch.cat((p[:, :1] * p[:, 1:].exp(), p.sin()), dim=1), parameter)
+    a, b = parameter[0].tolist()
+    assert value[0].tolist() == pytest.approx([a * math.exp(b), math.sin(a), math.sin(b)])
+    expected = [[math.exp(b), math.cos(a), 0.0], [a * math.exp(b), 0.0, math.cos(b)]]
+    assert torch.allclose(jacobian[0], torch.tensor(expected, dtype=torch.float64), atol=1e-15)

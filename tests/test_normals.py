@@ -1,0 +1,169 @@
+"""Normals from intensity: eq. 9, eq. 10, and where a light is blocked."""
+
+import numpy as np
+import pytest
+import references
+import torch
+
+import torchvts as vts
+from torchvts.core.geometry import MAX_SLOPE
+
+scenes, metrics = vts.scenes, vts.metrics
+
+
+def press(press_mm=1.0, dtype=torch.float64, height=60, width=80):
+    return scenes.sphere_press(10.0, press_mm, (1.0, -0.5), height, width, 30.0 / height, dtype)
+
+
+def block_for(lights, scene, **options):
+    return vts.NormalFromIntensity(lights, scene.depth_mm.shape[2], scene.depth_mm.shape[3], scene.mm_per_pixel, **options)
+
+
+def rms_deg(normal, scene, region):
+    return float(metrics.normal_angle_deg(normal, scene.normal, region).square().mean().sqrt())
+
+
+def test_the_flat_inverse_is_exact_at_rest(ring):
+    scene, lights = scenes.at_rest(press()), ring(dtype=torch.float64)
+    assert metrics.normal_angle_deg(block_for(lights, scene)(scenes.render(scene, lights)), scene.normal).max() < 1e-12
+
+
+def test_the_flat_inverse_is_exact_for_slopes_without_depth(ring):
+    """eq. 9: right whatever the slope, as long as the surface has not moved."""
+    lights, scene = ring(dtype=torch.float64), press()
+    image = vts.near_field_shading(torch.zeros_like(scene.depth_mm), scene.normal, lights, scene.mm_per_pixel)
+    assert metrics.normal_angle_deg(block_for(lights, scene)(image), scene.normal).max() < 1e-12
+
+
+def test_the_inverse_at_the_true_depth_is_exact(ring):
+    """eq. 10, given the depth; eq. 9 is not."""
+    lights, scene = ring(dtype=torch.float64), press()
+    image, block = scenes.render(scene, lights), block_for(lights, scene)
+    assert metrics.normal_angle_deg(block(image, scene.depth_mm), scene.normal).max() < 1e-12
+    assert metrics.normal_angle_deg(block(image), scene.normal).max() > 0.4
+
+
+@pytest.mark.parametrize("gloss", [[0.05, 0.1, 0.15]])
+def test_gloss_is_divided_out_at_rest_and_nearly_so_in_contact(ring, gloss):
+    lights, scene = ring(dtype=torch.float64, gloss=gloss), press()
+    block = block_for(lights, scene)
+    rest = scenes.at_rest(scene)
+    assert metrics.normal_angle_deg(block(scenes.render(rest, lights)), rest.normal).max() < 1e-12
+    image = scenes.render(scene, lights)
+    matt = block_for(ring(dtype=torch.float64), scene)
+    inside = scene.contact & (scene.depth_mm > 0.1)
+    assert rms_deg(block(image, scene.depth_mm), scene, inside) < 0.25 * rms_deg(matt(image, scene.depth_mm), scene, inside)
+
+
+def test_the_stored_inverse_equals_the_twin(ring):
+    lights, scene = ring(dtype=torch.float64), press(height=12, width=16)
+    expected = references.inverse_light(np.zeros((12, 16)), lights.position_mm.numpy(), lights.albedo.numpy(), scene.mm_per_pixel)
+    assert np.abs(block_for(lights, scene).inverse.numpy() - expected).max() < 1e-12 * np.abs(expected).max()
+
+
+def test_a_given_inverse_is_used_and_must_fit(ring):
+    scene, lights = press(height=12, width=16), ring(dtype=torch.float64)
+    sensor = vts.Sensor("rig", 12, 16, scene.mm_per_pixel)
+    stored = vts.Calibration.from_lights(lights, sensor).inverse
+    image = scenes.render(scene, lights)
+    assert torch.equal(block_for(lights, scene, inverse=stored)(image), block_for(lights, scene)(image))
+    with pytest.raises(ValueError, match=r"inverse: expected \(3, 3, 12, 16\), got \(3, 3, 12, 15\)"):
+        block_for(lights, scene, inverse=stored[..., :15])
+
+
+@pytest.mark.parametrize("noise_std, bound_deg, share", [(0.0, 0.25, 0.1), (0.001, 1.0, 0.3), (0.002, 1.8, 0.5)])
+def test_a_blocked_light_does_not_spoil_the_normal(ring, noise_std, bound_deg, share):
+    """Low lights, 2 mm: walls that one light does not reach. The plain inverse reads black as a number."""
+    lights = ring(22.0, [15.0, 16.5, 18.0], level=0.2, dtype=torch.float64)
+    scene = press(2.0, height=120, width=160)
+    image = scenes.render(scene, lights, noise_std=noise_std)
+    blocked = (scenes.render(scene, lights).amin(1, keepdim=True) == 0) & scene.contact
+    assert int(blocked.sum()) > 200
+    block = block_for(lights, scene, noise_std=torch.full((3,), max(noise_std, 0.001), dtype=torch.float64))
+    plain = references.inverse_light(
+        scene.depth_mm[0, 0].numpy(), lights.position_mm.numpy(), lights.albedo.numpy(), scene.mm_per_pixel
+    )
+    plain = torch.from_numpy(np.einsum("ijhw,jhw->ihw", plain, image[0].numpy()))[None]
+    ours, theirs = rms_deg(block(image, scene.depth_mm), scene, blocked), rms_deg(plain, scene, blocked)
+    assert ours < bound_deg and ours < share * theirs
+
+
+def test_slopes_are_bounded_however_wild_the_image():
+    lights = vts.PointLights([[22, 0, 15], [-11, 19, 16.5], [-11, -19, 18]], [500, 500, 500])
+    image = torch.rand(4, 3, 24, 32, generator=torch.Generator().manual_seed(0))
+    image[0] = 0.0
+    gradient = vts.gradient_from_normal(vts.NormalFromIntensity(lights, 24, 32, 1.0)(image))
+    assert bool(torch.isfinite(gradient).all())
+    assert float(gradient.norm(dim=1).max()) < MAX_SLOPE * (1 + 1e-6)
+
+
+@pytest.mark.parametrize("max_slope", [0.5, 10.0])
+def test_steepness_stops_at_the_bound_and_keeps_its_direction(max_slope):
+    normal = torch.tensor([[3.0, 4.0, 0.01], [3.0, 4.0, -2.0], [0.0, 0.0, -1.0], [0.03, 0.04, 1.0]], dtype=torch.float64)
+    gradient = vts.gradient_from_normal(normal.reshape(4, 3, 1, 1), max_slope)[..., 0, 0]
+    expected = torch.tensor([[-0.6, -0.8], [-0.6, -0.8], [0.0, 0.0]], dtype=torch.float64) * max_slope
+    assert torch.allclose(gradient[:3], expected, atol=1e-11)
+    assert torch.allclose(gradient[3], torch.tensor([-0.03, -0.04], dtype=torch.float64), atol=1e-12)
+    assert torch.equal(vts.GradientFromNormal(max_slope)(normal.reshape(4, 3, 1, 1))[..., 0, 0], gradient)
+
+
+@pytest.mark.parametrize("dtype, tolerance", [(torch.float64, 1e-13), (torch.float32, 1e-5)])
+def test_gradient_to_normal_and_back(dtype, tolerance):
+    gradient = torch.randn(2, 2, 20, 20, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(dtype)
+    normal = vts.normal_from_gradient(gradient)
+    assert (normal.norm(dim=1) - 1).abs().max() < tolerance
+    assert (vts.gradient_from_normal(normal) - gradient).abs().max() < tolerance
+    assert (vts.gradient_from_normal(7 * normal) - gradient).abs().max() < tolerance
+
+
+def test_derivatives_of_gradient_and_normal():
+    gradient = torch.randn(1, 2, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64).requires_grad_(True)
+    assert torch.autograd.gradcheck(vts.normal_from_gradient, gradient)
+    assert torch.autograd.gradcheck(vts.gradient_from_normal, vts.normal_from_gradient(gradient.detach()).requires_grad_(True))
+    flat = torch.tensor([0.0, 0.0, 1.0]).reshape(1, 3, 1, 1).requires_grad_(True)
+    vts.gradient_from_normal(flat).sum().backward()
+    assert flat.grad.flatten().tolist() == [-1.0, -1.0, 0.0]
+
+
+@pytest.mark.parametrize("with_depth", [False, True])
+@pytest.mark.parametrize("gloss", [None, [0.1, 0.2, 0.1]])
+def test_derivatives_in_image_depth_and_lights(ring, with_depth, gloss):
+    lights, scene = ring(dtype=torch.float64, gloss=gloss), press(height=6, width=8)
+    block = block_for(lights, scene).requires_grad_(True)
+    depth = scene.depth_mm.clone() if with_depth else None
+
+    def normals(image, position, albedo, *depth):
+        names = {"lights.position_mm": position, "lights.albedo": albedo}
+        return torch.func.functional_call(block, names, (image, *depth))
+
+    inputs = [scenes.render(scene, lights), lights.position_mm.clone(), lights.albedo.clone(), *([depth] if with_depth else [])]
+    assert torch.autograd.gradcheck(normals, [value.requires_grad_(True) for value in inputs])
+
+
+def test_live_lights_give_what_the_stored_inverse_gives(ring):
+    lights, scene = ring(dtype=torch.float64), press()
+    frozen, live = block_for(lights, scene), block_for(lights, scene).requires_grad_(True)
+    image = scenes.render(scene, lights)
+    assert (frozen(image) - live(image).detach()).abs().max() < 1e-13
+
+
+@pytest.mark.parametrize(
+    "stride, size, bound_deg", [(3, (60, 81), 1e-12), (9, (63, 81), 1e-12), (8, (60, 80), 2.4), (2, (60, 80), 1.1)]
+)
+def test_the_coarse_block_speaks_of_every_nth_pixel(ring, stride, size, bound_deg):
+    """Exact where the coarse grid has the same centre; else it stands off by up to half its pitch."""
+    lights = ring(dtype=torch.float64)
+    scene = scenes.sphere_press(10.0, 1.0, (0, 0), *size, 0.5, torch.float64)
+    block = block_for(lights, scene)
+    every = (..., slice(stride // 2, None, stride), slice(stride // 2, None, stride))
+    image = scenes.render(scene, lights)
+    coarse = block.coarse(stride)
+    result, expected = coarse(image[every]), block(image)[every]
+    assert result.shape == expected.shape and coarse.lights is block.lights
+    assert metrics.normal_angle_deg(result, expected).max() < bound_deg
+
+
+@pytest.mark.parametrize("size", [(24, 31), (8, 8)])
+def test_an_image_of_another_size_is_refused(ring, size):
+    with pytest.raises(ValueError, match=rf"compensated: expected 24 x 32 like the calibration, got {size[0]} x {size[1]}"):
+        vts.NormalFromIntensity(ring(), 24, 32, 1.0)(torch.zeros(1, 3, *size))

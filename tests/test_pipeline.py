@@ -1,0 +1,261 @@
+"""From image to depth: the paper's figure 3, a worn unit with low lights, and what a chain of modules promises."""
+
+import warnings
+
+import pytest
+import torch
+from torch import nn
+
+import torchvts as vts
+
+scenes, metrics = vts.scenes, vts.metrics
+PITCH = 0.0625
+FULL = vts.Sensor("rig", 480, 640, PITCH)
+
+
+def pipeline(lights, sensor, mode="precise", **options):
+    return vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, sensor), mode, **options)
+
+
+@pytest.mark.parametrize(
+    "press_mm, mode, largest_px, rms_px",
+    [(1.0, "fast", 0.35, 0.16), (1.0, "precise", 0.13, 0.03), (2.0, "fast", 1.3, 0.58), (2.0, "precise", 0.19, 0.03)],
+)
+@pytest.mark.parametrize("rotation_deg", [10.0, 75.0])
+def test_figure_3_of_the_paper(ring, press_mm, mode, largest_px, rms_px, rotation_deg):
+    scene, lights = scenes.sphere_press(10.0, press_mm), ring(rotation_deg=rotation_deg)
+    out = pipeline(lights, FULL, mode)(scenes.render(scene, lights))
+    assert metrics.depth_error(out.depth_mm, scene.depth_mm, PITCH).max_px < largest_px
+    assert metrics.depth_error(out.depth_mm, scene.depth_mm, PITCH, scene.contact).rms_px < rms_px
+    assert metrics.mask_iou(out.contact, scene.contact) > 0.99
+
+
+@pytest.fixture(scope="module", params=[0.18, 0.45], ids=["no saturation", "saturated near the lights"])
+def worn_unit(request, ring):
+    """Low lights, noise, 8 bits, a spotted skin: calibrated from its own image at rest."""
+    lights = ring(22.0, [15.0, 16.5, 18.0], rotation_deg=90.0, level=request.param)
+    camera = {"noise_std": 0.01, "bits": 8, "spots": scenes.skin_spots(480, 640)}
+    background = scenes.render(scenes.at_rest(scenes.sphere_press()), lights, **camera, seed=1)[0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", vts.CalibrationWarning)  # judged in test_fit_lights
+        calibration = vts.calibrate(background, FULL)
+    return calibration, lambda scene: scenes.render(scene, lights, **camera, seed=2)
+
+
+@pytest.mark.parametrize("press_mm, largest_px, rms_px", [(1.0, 0.55, 0.12), (2.0, 0.85, 0.20)])
+def test_a_worn_unit_with_low_lights(worn_unit, press_mm, largest_px, rms_px):
+    calibration, camera = worn_unit
+    scene = scenes.sphere_press(10.0, press_mm)
+    out = vts.DepthPipeline.from_calibration(calibration, "precise")(camera(scene))
+    assert metrics.mask_iou(out.contact, scene.contact) > 0.99
+    assert metrics.depth_error(out.depth_mm, scene.depth_mm, PITCH).max_px < largest_px
+    assert metrics.depth_error(out.depth_mm, scene.depth_mm, PITCH, scene.contact).rms_px < rms_px
+
+
+@pytest.fixture(scope="module")
+def mixed(ring, small_sensor, small_press):
+    """Frames at rest, hardly pressed and well pressed, and their lights."""
+    lights = ring()
+    presses = [scenes.at_rest(small_press()), small_press(1.5), small_press(0.05, (6, 4), 4.0), small_press(1.0, (-8, 3))]
+    return lights, torch.cat([scenes.render(scene, lights, bits=8) for scene in presses])
+
+
+@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
+def test_a_batch_of_mixed_frames_equals_single_frames(mixed, small_sensor, mode):
+    lights, frames = mixed
+    pipe = pipeline(lights, small_sensor, mode)
+    whole, single = pipe(frames), [pipe(frame[None]) for frame in frames]
+    for name in whole._fields:
+        expected = torch.cat([getattr(out, name) for out in single])
+        assert (getattr(whole, name).double() - expected.double()).abs().max() < 2e-6, name
+
+
+def test_auto_is_precise_where_worth_it_and_fast_where_not(mixed, small_sensor):
+    lights, frames = mixed
+    fast, precise, auto = (pipeline(lights, small_sensor, mode)(frames).depth_mm for mode in ("fast", "precise", "auto"))
+    gain_px = (precise - fast).abs().amax(dim=(1, 2, 3)) / small_sensor.mm_per_pixel
+    assert (gain_px > 0.05).tolist() == [False, True, False, True]
+    for k in (1, 3):
+        assert (auto[k] - precise[k]).abs().max() < 1e-6
+    for k in (0, 2):
+        assert (auto[k] - fast[k]).abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
+def test_no_contact_is_exactly_zero(mixed, small_sensor, mode):
+    lights, frames = mixed
+    out = pipeline(lights, small_sensor, mode)(frames[:1])
+    assert not bool(out.contact.any())
+    assert out.depth_mm.abs().max() == 0 and out.gradient.abs().max() == 0
+    assert torch.equal(out.normal, torch.tensor([0.0, 0.0, 1.0]).reshape(1, 3, 1, 1).expand_as(out.normal))
+
+
+def test_gradients_outside_contact_are_zero(mixed, small_sensor):
+    lights, frames = mixed
+    out = pipeline(lights, small_sensor)(frames)
+    assert out.gradient[(~out.contact).expand_as(out.gradient)].abs().max() == 0
+
+
+class Restless(nn.Module):
+    """Normals that lean further at every call, so that depth never settles."""
+
+    uses_depth = True
+
+    def __init__(self):
+        super().__init__()
+        self.calls = 0
+
+    def forward(self, compensated, depth_mm=None):
+        self.calls += 1
+        normal = torch.zeros_like(compensated)
+        normal[:, 0], normal[:, 2] = 0.1 * self.calls, 1.0
+        return normal
+
+
+@pytest.mark.parametrize("passes", [1, 2, 8])
+def test_precise_ends_even_if_depth_never_settles(mixed, small_sensor, passes):
+    lights, frames = mixed
+    pipe = pipeline(lights, small_sensor, normals=Restless())
+    pipe.max_passes = passes
+    pipe(frames[1:2])
+    assert pipe.normals.calls == passes
+
+
+def test_precise_ends_by_itself_when_depth_has_settled(mixed, small_sensor):
+    lights, frames = mixed
+    pipe = pipeline(lights, small_sensor)
+    calls = []
+    pipe.normals.register_forward_hook(lambda *_: calls.append(1))
+    settled = pipe(frames[1:2]).depth_mm
+    assert 2 <= len(calls) <= 6
+    pipe.tolerance_px, pipe.max_passes = 1e-9, 50
+    assert (pipe(frames[1:2]).depth_mm - settled).abs().max() < 0.002 * small_sensor.mm_per_pixel
+
+
+@pytest.mark.parametrize("center_mm", [(20.0, 0.0), (0.0, 15.0), (20.0, 15.0), (-20.0, -15.0)])
+def test_contact_that_the_image_border_cuts(ring, center_mm):
+    lights, scene = ring(), scenes.sphere_press(10.0, 1.0, center_mm)
+    out = pipeline(lights, FULL)(scenes.render(scene, lights))
+    assert metrics.depth_error(out.depth_mm, scene.depth_mm, PITCH).max_px < 0.3
+
+
+def differentiable(ring, mode):
+    """16 x 20 pixels in float64, contact all over but for a margin that no step of a difference quotient moves."""
+    lights = ring(dtype=torch.float64)
+    scene = scenes.sphere_press(10.0, 2.0, (0, 0), 16, 20, 0.9, torch.float64)
+    pipe = pipeline(lights, vts.Sensor("tiny", 16, 20, 0.9), mode)
+    pipe.tolerance_px = 1e-30  # the same number of passes at both ends of a difference quotient
+    pipe.max_passes = 4
+    return pipe, scenes.render(scene, lights), lights
+
+
+@pytest.mark.parametrize("mode", ["fast", "precise"])
+def test_derivatives_of_the_chain_in_image_and_lights(ring, mode):
+    pipe, image, lights = differentiable(ring, mode)
+    pipe.requires_grad_(True)
+    assert int(pipe(image).contact.sum()) > 30
+
+    def depth(image, position, albedo):
+        names = {"normals.lights.position_mm": position, "normals.lights.albedo": albedo}
+        return torch.func.functional_call(pipe, names, (image,)).depth_mm
+
+    inputs = [image.clone(), lights.position_mm.clone(), lights.albedo.clone()]
+    assert torch.autograd.gradcheck(depth, [value.requires_grad_(True) for value in inputs], fast_mode=True)
+
+
+def test_the_lights_of_a_pipeline_are_frozen_until_asked_for(ring, small_sensor, mixed):
+    lights, frames = mixed
+    pipe = pipeline(lights, small_sensor)
+    assert not any(parameter.requires_grad for parameter in pipe.parameters())
+    pipe.requires_grad_(True)
+    pipe(frames[1:2]).depth_mm.sum().backward()
+    assert all(
+        p.grad is not None and float(p.grad.abs().max()) > 0 for p in (pipe.normals.lights.position_mm, pipe.normals.lights.albedo)
+    )
+
+
+def test_a_gradient_reaches_a_learned_module(mixed, small_sensor):
+    lights, frames = mixed
+    pipe = pipeline(lights, small_sensor, "fast", normals=nn.Conv2d(3, 3, 1))
+    with torch.no_grad():
+        pipe.normals.bias.copy_(torch.tensor([0.0, 0.0, 2.0]))
+    pipe(frames[1:2]).depth_mm.square().sum().backward()
+    for parameter in pipe.normals.parameters():
+        assert bool(torch.isfinite(parameter.grad).all()) and float(parameter.grad.abs().min()) > 0
+
+
+def test_a_learned_module_can_be_trained_in_the_chain(mixed, small_sensor):
+    lights, frames = mixed
+    truth = pipeline(lights, small_sensor, "fast")(frames)
+    torch.manual_seed(0)
+    pipe = pipeline(lights, small_sensor, "fast", normals=nn.Conv2d(3, 3, 1))
+    with torch.no_grad():
+        pipe.normals.weight.zero_()
+        pipe.normals.bias.copy_(torch.tensor([0.0, 0.0, 1.0]))
+    optimiser = torch.optim.Adam(pipe.parameters(), 0.05)
+    losses = []
+    for _ in range(60):
+        optimiser.zero_grad()
+        loss = (pipe(frames).depth_mm - truth.depth_mm).square().mean()
+        loss.backward()
+        optimiser.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.25 * losses[0]
+
+
+def test_precise_needs_normals_that_take_the_depth(ring, small_sensor):
+    with pytest.raises(
+        ValueError, match=r"mode: 'precise' hands the depth back to the normals, but Conv2d does not take it: use 'fast'"
+    ):
+        pipeline(ring(), small_sensor, "precise", normals=nn.Conv2d(3, 3, 1))
+
+
+def test_auto_with_normals_that_do_not_take_the_depth_is_fast(mixed, small_sensor):
+    lights, frames = mixed
+    torch.manual_seed(0)
+    learned = nn.Conv2d(3, 3, 1).requires_grad_(False)
+    fast, auto = (pipeline(lights, small_sensor, mode, normals=learned)(frames).depth_mm for mode in ("fast", "auto"))
+    assert (fast - auto).abs().max() < 1e-6
+
+
+def test_another_integrator_takes_its_place(mixed, small_sensor):
+    lights, frames = mixed
+    zero = pipeline(lights, small_sensor, "fast", integrate=vts.PoissonDST(small_sensor.mm_per_pixel))(frames)
+    assert (zero.depth_mm - vts.poisson_dst(zero.gradient, small_sensor.mm_per_pixel)).abs().max() == 0
+
+
+def test_spots_and_dead_pixels_are_compensated(ring, small_sensor, small_press):
+    lights, scene = ring(), small_press(1.0)
+    spots = scenes.skin_spots(120, 160)
+    background, image = (scenes.render(s, lights, spots=spots)[0] for s in (scenes.at_rest(scene), scene))
+    cal = vts.Calibration.from_lights(lights, small_sensor, background)
+    clean = pipeline(lights, small_sensor)(scenes.render(scene, lights)).depth_mm
+    assert int(cal.defects.sum()) >= 25
+    assert (vts.DepthPipeline.from_calibration(cal, "precise")(image[None]).depth_mm - clean).abs().max() < 0.03 * 0.25
+
+
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+def test_the_response_of_the_camera_is_undone(ring, small_press, gamma):
+    lights, scene = ring(), small_press(1.0)
+    sensor = vts.Sensor("rig", 120, 160, 0.25, gamma=gamma)
+    linear = pipeline(lights, vts.Sensor("rig", 120, 160, 0.25))(scenes.render(scene, lights)).depth_mm
+    assert (pipeline(lights, sensor)(scenes.render(scene, lights, gamma=gamma)).depth_mm - linear).abs().max() < 1e-5
+
+
+def test_defects_take_the_value_of_their_neighbours():
+    defects = torch.zeros(6, 7, dtype=torch.bool)
+    defects[0, 0] = defects[3, 3] = defects[3, 4] = True
+    x, y = torch.arange(7.0).expand(6, 7), torch.arange(6.0)[:, None].expand(6, 7)
+    image = (2 * x + 3 * y).expand(1, 3, 6, 7).clone()
+    broken = torch.where(defects, -99.0, image)
+    repaired = vts.Compensate(defects=defects)(broken)
+    assert torch.equal(repaired[..., ~defects], image[..., ~defects])
+    # at (3, 3): left neighbour, right one beyond the second defect, above, below
+    assert repaired[0, 0, 3, 3] == (image[0, 0, 3, 2] + image[0, 0, 3, 5] + image[0, 0, 2, 3] + image[0, 0, 4, 3]) / 4
+    # in the corner the border comes first to the left and above: right and below stand in for them
+    assert repaired[0, 0, 0, 0] == (2 * image[0, 0, 0, 1] + 2 * image[0, 0, 1, 0]) / 4
+
+
+def test_a_background_without_sound_pixels_is_refused():
+    with pytest.raises(ValueError, match="defects: expected sound pixels"):
+        vts.Compensate(defects=torch.ones(4, 4, dtype=torch.bool))

@@ -1,0 +1,203 @@
+"""Poisson integration against dense least squares, and what mathematics promises of it."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import references
+import torch
+
+import torchvts as vts
+
+SIZES = [(3, 3), (4, 4), (5, 8), (8, 5), (7, 11), (13, 13), (12, 10), (3, 16), (15, 14), (9, 6)]
+SOLVERS = {"zero": (vts.poisson_dst, references.poisson_zero), "free": (vts.poisson_dct, references.poisson_free)}
+
+
+both_ways = pytest.mark.parametrize("size", [(11, 13), (9, 14)], ids=["prime and odd", "small factors"])
+
+
+def random_gradient(height, width, batch=1, dtype=torch.float64, seed=0):
+    return torch.randn(batch, 2, height, width, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
+
+
+@pytest.mark.parametrize("border", SOLVERS)
+@pytest.mark.parametrize("size", SIZES)
+def test_equals_dense_least_squares(border, size):
+    solver, twin = SOLVERS[border]
+    gradient = random_gradient(*size, seed=size[0])
+    depth = solver(gradient, 0.37)
+    assert np.abs(depth[0, 0].numpy() - twin(gradient[0].numpy(), 0.37)).max() < 1e-12
+
+
+@pytest.mark.parametrize("size", [(2, 2), (2, 7), (5, 2)])
+def test_a_free_border_needs_two_pixels_only(size):
+    gradient = random_gradient(*size)
+    depth = vts.poisson_dct(gradient, 0.5)
+    assert np.abs(depth[0, 0].numpy() - references.poisson_free(gradient[0].numpy(), 0.5)).max() < 1e-13
+
+
+@pytest.mark.parametrize("solver, size", [(vts.poisson_dst, (2, 5)), (vts.poisson_dst, (5, 2)), (vts.poisson_dct, (1, 5))])
+def test_too_small_an_image_is_refused(solver, size):
+    with pytest.raises(ValueError, match=rf"gradient: expected H and W of at least \d, got {size[0]} x {size[1]}"):
+        solver(torch.zeros(1, 2, *size))
+
+
+@pytest.mark.parametrize("solver", [vts.poisson_dst, vts.poisson_dct])
+def test_single_precision_keeps_its_digits(solver):
+    gradient = random_gradient(120, 160)
+    exact = solver(gradient)
+    assert (solver(gradient.float()).double() - exact).abs().max() < 4e-6 * exact.abs().max()
+
+
+def test_a_zero_border_is_zero():
+    depth = vts.poisson_dst(random_gradient(9, 12))
+    depth[..., 1:-1, 1:-1] = 0
+    assert depth.abs().max() == 0
+
+
+def test_a_free_border_gives_zero_mean():
+    assert vts.poisson_dct(random_gradient(9, 12, batch=3)).mean(dim=(1, 2, 3)).abs().max() < 1e-14
+
+
+@pytest.mark.parametrize("solver", [vts.poisson_dst, vts.poisson_dct, vts.poisson_rest])
+@both_ways
+def test_items_of_a_batch_do_not_influence_one_another(size, solver):
+    gradient = random_gradient(*size, batch=3)
+    single = torch.cat([solver(gradient[i : i + 1]) for i in range(3)])
+    assert (solver(gradient) - single).abs().max() < 1e-13
+
+
+@pytest.mark.parametrize("size", [(9, 12), (31, 37)])
+def test_a_free_border_holds_a_tilt(size):
+    gradient = random_gradient(*size)
+    tilted = gradient + torch.tensor([0.3, -0.2], dtype=torch.float64).reshape(1, 2, 1, 1)
+    plane = vts.scenes.surface(lambda x, y: 99 + 0.3 * x - 0.2 * y, *size, 0.5, torch.float64).depth_mm - 99
+    assert (vts.poisson_dct(tilted, 0.5) - vts.poisson_dct(gradient, 0.5) - plane).abs().max() < 1e-12
+
+
+@pytest.mark.parametrize("solver", [vts.poisson_dst, vts.poisson_dct, vts.poisson_rest])
+@pytest.mark.parametrize("axis", [0, 1])
+@both_ways
+def test_a_flipped_image_gives_flipped_depth(size, solver, axis):
+    gradient = random_gradient(*size)
+    flipped = gradient.flip(3 - axis)
+    flipped[:, axis] *= -1
+    assert (solver(flipped) - solver(gradient).flip(3 - axis)).abs().max() < 1e-13
+
+
+@pytest.mark.parametrize("solver", [vts.poisson_dst, vts.poisson_dct, vts.poisson_rest])
+@both_ways
+def test_rows_and_columns_are_treated_alike(size, solver):
+    gradient = random_gradient(*size)
+    turned = gradient.transpose(2, 3).flip(1)
+    assert (solver(turned) - solver(gradient).transpose(2, 3)).abs().max() < 1e-13
+
+
+@pytest.mark.parametrize("solver", [vts.poisson_dst, vts.poisson_dct, vts.poisson_rest])
+@both_ways
+def test_depth_scales_with_the_pitch_and_with_the_gradient(size, solver):
+    gradient = random_gradient(*size)
+    depth = solver(gradient, 0.1)
+    assert (solver(gradient, 1.0) - 10 * depth).abs().max() < 1e-13
+    assert (solver(3 * gradient, 0.1) - 3 * depth).abs().max() < 1e-13
+
+
+@pytest.mark.parametrize("solver", [vts.poisson_dst, vts.poisson_dct, vts.poisson_rest])
+@both_ways
+def test_a_sum_of_gradients_gives_the_sum_of_depths(size, solver):
+    one, two = random_gradient(*size, seed=1), random_gradient(*size, seed=2)
+    # all pixels at rest in the last rows, so that every depth is levelled on the same ones
+    one[..., -3:, :] = 0
+    two[..., -3:, :] = 0
+    assert (solver(one + two) - solver(one) - solver(two)).abs().max() < 1e-13
+
+
+@pytest.mark.parametrize("size", [(6, 5), (5, 6)])
+@pytest.mark.parametrize("solver", [vts.poisson_dst, vts.poisson_dct, vts.poisson_rest])
+def test_derivatives(solver, size):
+    assert torch.autograd.gradcheck(lambda gradient: solver(gradient, 0.3), random_gradient(*size).requires_grad_(True))
+
+
+@pytest.mark.parametrize("solver", [vts.poisson_dst, vts.poisson_dct])
+@both_ways
+def test_the_solve_is_its_own_adjoint(size, solver):
+    one, two = random_gradient(*size, seed=1), random_gradient(*size, seed=2)
+    forward, backward = (solver(one) * vts.divergence(two)).sum(), (solver(two) * vts.divergence(one)).sum()
+    assert float(forward) == pytest.approx(float(backward), rel=1e-12)
+
+
+@pytest.mark.parametrize("solver, border", [(vts.poisson_dst, 1), (vts.poisson_dct, 0)])
+@both_ways
+def test_the_five_point_laplacian_of_depth_is_the_divergence(size, solver, border):
+    gradient = random_gradient(*size)
+    padded = torch.nn.functional.pad(solver(gradient), [1, 1, 1, 1], mode="replicate")
+    around = padded[..., 1:-1, 2:] + padded[..., 1:-1, :-2] + padded[..., 2:, 1:-1] + padded[..., :-2, 1:-1]
+    error = around - 4 * padded[..., 1:-1, 1:-1] - vts.divergence(gradient)
+    assert error[..., border : size[0] - border, border : size[1] - border].abs().max() < 1e-13
+
+
+def dome(x, y):
+    """Zero on the border of [-1, 1]^2, and no eigenfunction."""
+    return (1 - x**2) * (1 - y**2) * torch.exp(0.5 * x - 0.3 * y)
+
+
+def saddle(x, y):
+    """Nothing vanishes on the border."""
+    return torch.exp(0.6 * x) * torch.sin(1.7 * y + 0.4) + 0.3 * x**3
+
+
+@pytest.mark.parametrize("sizes", [(17, 33, 65, 129), (16, 32, 64, 128)], ids=["odd", "even"])
+@pytest.mark.parametrize("solver, shape", [(vts.poisson_dst, dome), (vts.poisson_dct, saddle), (vts.poisson_dct, dome)])
+def test_order_of_convergence_is_two(solver, shape, sizes):
+    errors = []
+    for n in sizes:
+        axis = torch.linspace(-1, 1, n, dtype=torch.float64)
+        x, y = axis.expand(n, n).clone().requires_grad_(), axis[:, None].expand(n, n).clone().requires_grad_()
+        z = shape(x, y)
+        gradient = torch.stack(torch.autograd.grad(z.sum(), (x, y)))[None]
+        error = solver(gradient, 2.0 / (n - 1))[0, 0] - z.detach()
+        errors.append(float((error - (error.mean() if solver is vts.poisson_dct else 0)).square().mean().sqrt()))
+    for (coarse, fine), (few, many) in zip(pairwise(errors), pairwise(sizes)):
+        assert math.log(coarse / fine) / math.log((many - 1) / (few - 1)) == pytest.approx(2.0, abs=0.15)
+
+
+def test_rest_equals_the_zero_border_for_a_contact_inside():
+    scene = vts.scenes.sine_press(height=120, width=160, mm_per_pixel=0.25, dtype=torch.float64)
+    rest, zero = vts.poisson_rest(scene.gradient, 0.25), vts.poisson_dst(scene.gradient, 0.25)
+    assert (rest - zero).abs().max() < 1e-4 * scene.depth_mm.max()
+    assert rest[~scene.contact].mean().abs() < 1e-14
+
+
+@pytest.mark.parametrize("center", [(20.0, 0.0), (0.0, -15.0), (20.0, 15.0)])
+def test_rest_stays_right_where_the_border_cuts_the_contact(center):
+    scene = vts.scenes.sphere_press(10.0, 1.0, center, 240, 320, 0.125, torch.float64)
+    error = {
+        solver: vts.metrics.depth_error(solver(scene.gradient, 0.125), scene.depth_mm, 0.125).max_px
+        for solver in (vts.poisson_rest, vts.poisson_dst)
+    }
+    assert error[vts.poisson_rest] < 0.2
+    assert error[vts.poisson_dst] > 20 * error[vts.poisson_rest]
+
+
+def test_rest_without_a_pixel_at_rest_has_zero_as_its_lowest_depth():
+    depth = vts.poisson_rest(torch.full((1, 2, 8, 9), 0.1, dtype=torch.float64), 0.5)
+    assert depth.min() == 0
+    assert float(depth.max()) == pytest.approx(0.1 * 0.5 * (7 + 8), abs=1e-13)
+
+
+@pytest.mark.parametrize("module", [vts.PoissonDST, vts.PoissonDCT, vts.PoissonRest])
+def test_a_module_equals_its_function_whatever_size_it_saw_before(module):
+    function = {vts.PoissonDST: vts.poisson_dst, vts.PoissonDCT: vts.poisson_dct, vts.PoissonRest: vts.poisson_rest}[module]
+    block = module(0.3)
+    for size, dtype in [((9, 12), torch.float64), ((12, 9), torch.float64), ((9, 12), torch.float32), ((3, 3), torch.float32)]:
+        gradient = random_gradient(*size, dtype=dtype)
+        assert torch.equal(block(gradient), function(gradient, 0.3))
+
+
+def test_sphere_error_is_the_integrators_floor_of_the_paper():
+    """The kink at the rim is all that is left when gradients are exact (figure 3 of the paper: 0.09 and 0.16 px)."""
+    for press, bound in ((1.0, 0.110), (2.0, 0.158)):
+        scene = vts.scenes.sphere_press(10.0, press)
+        for solver in (vts.poisson_dst, vts.poisson_rest):
+            assert vts.metrics.depth_error(solver(scene.gradient, 0.0625), scene.depth_mm, 0.0625).max_px < bound

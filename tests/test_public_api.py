@@ -1,0 +1,67 @@
+"""The public names, their arguments, and what an import costs."""
+
+import inspect
+import subprocess
+import sys
+
+import pytest
+
+import torchvts as vts
+
+NAMES = [
+    "Calibration", "CalibrationWarning", "Compensate", "ContactMask", "DepthOutput", "DepthPipeline", "GradientFromNormal",
+    "LightFit", "NormalFromIntensity", "PointLights", "PoissonDCT", "PoissonDST", "PoissonRest", "Sensor", "calibrate",
+    "depth_to_points", "divergence", "fit_lights", "gradient_from_normal", "metrics", "near_field_shading", "normal_from_gradient",
+    "poisson_dct", "poisson_dst", "poisson_rest", "read_image", "scenes", "shipped_sensors", "write_image",
+]  # fmt: skip
+ARGUMENTS = {
+    vts.Sensor: ["name", "height", "width", "mm_per_pixel"],
+    vts.Sensor.load: ["source", "height", "width"],
+    vts.PointLights: ["position_mm", "albedo", "gloss"],
+    vts.near_field_shading: ["depth_mm", "normal", "lights", "mm_per_pixel"],
+    vts.fit_lights: ["background", "sensor"],
+    vts.calibrate: ["background", "sensor"],
+    vts.Calibration.from_lights: ["lights", "sensor", "background", "report"],
+    vts.Calibration.load: ["path"],
+    vts.Calibration.save: ["self", "path"],
+    vts.DepthPipeline.from_calibration: ["calibration", "mode"],
+    vts.poisson_dst: ["gradient", "mm_per_pixel"],
+    vts.poisson_dct: ["gradient", "mm_per_pixel"],
+    vts.PoissonDST: ["mm_per_pixel"],
+    vts.PoissonDCT: ["mm_per_pixel"],
+    vts.depth_to_points: ["depth_mm", "mm_per_pixel", "contact"],
+    vts.Compensate: ["gain", "offset", "gamma", "defects"],
+    vts.ContactMask: ["flat", "noise_std", "sigmas", "min_size_px"],
+    vts.NormalFromIntensity: ["lights", "height", "width", "mm_per_pixel", "noise_std", "inverse"],
+}
+
+
+def test_public_names_are_frozen():
+    assert vts.__all__ == NAMES
+    assert all(hasattr(vts, name) for name in NAMES)
+
+
+@pytest.mark.parametrize("call", ARGUMENTS, ids=lambda call: call.__qualname__)
+def test_arguments_keep_their_names_and_order(call):
+    positional = [p.name for p in inspect.signature(call).parameters.values() if p.kind is p.POSITIONAL_OR_KEYWORD]
+    assert positional[: len(ARGUMENTS[call])] == ARGUMENTS[call]
+
+
+def test_results_have_their_fields_in_order():
+    assert vts.DepthOutput._fields == ("depth_mm", "gradient", "normal", "contact")
+    assert {"lights", "converged", "loss_history", "direction_std_deg", "message"} <= set(vts.LightFit.__dataclass_fields__)
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if callable(getattr(vts, name))])
+def test_every_public_name_is_documented(name):
+    assert inspect.getdoc(getattr(vts, name))
+
+
+def test_the_import_is_light():
+    program = (
+        "import sys, time, torch; start = time.perf_counter(); import torchvts; print(time.perf_counter() - start); "
+        "print(*[name for name in ('open3d', 'matplotlib', 'cv2') if name in sys.modules])"
+    )
+    runs = [subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout for _ in range(3)]
+    assert min(float(run.splitlines()[0]) for run in runs) < 0.7
+    assert runs[0].splitlines()[1] == ""

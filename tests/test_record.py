@@ -1,0 +1,232 @@
+"""The record of a calibrated unit on disk."""
+
+import json
+import os
+
+import pytest
+import safetensors.torch
+import torch
+
+import torchvts as vts
+from torchvts.core.files import load_tensors, write_atomically
+
+SENSOR = vts.Sensor("rig", 24, 32, 1.25, gamma=1.8)
+
+
+@pytest.fixture(scope="module")
+def calibration(ring):
+    lights = ring(gloss=[0.0, 0.1, 0.2])
+    rest = vts.scenes.at_rest(vts.scenes.sphere_press(10, 1, (0, 0), 24, 32, 1.25))
+    background = vts.scenes.render(rest, lights, noise_std=0.01, bits=8, gamma=1.8)[0]
+    return vts.Calibration.from_lights(lights, SENSOR, background, {"model": "point_lights", "note": "Grüße", "figures": [1, 2.5]})
+
+
+@pytest.fixture
+def saved(calibration, tmp_path):
+    calibration.save(tmp_path / "unit.safetensors")
+    return tmp_path / "unit.safetensors"
+
+
+def rewritten(path, change_tensors=None, change_metadata=None):
+    """The same file with something changed, written by safetensors itself."""
+    tensors, metadata = load_tensors(path)
+    (change_tensors or (lambda t: None))(tensors)
+    (change_metadata or (lambda m: None))(metadata)
+    safetensors.torch.save_file(tensors, str(path), {"torchvts": json.dumps(metadata)})
+
+
+def test_a_saved_calibration_loads_bit_for_bit(calibration, saved):
+    loaded = vts.Calibration.load(saved)
+    assert loaded.sensor == calibration.sensor and loaded.report == calibration.report and loaded.measured is True
+    for name in ("background", "noise_std", "inverse", "compensation", "model_image", "defects"):
+        assert torch.equal(getattr(loaded, name), getattr(calibration, name)), name
+    for name in ("position_mm", "albedo", "gloss"):
+        assert torch.equal(getattr(loaded.lights, name), getattr(calibration.lights, name)), name
+    loaded.save(saved.with_name("again.safetensors"))
+    assert saved.read_bytes() == saved.with_name("again.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize("mode", ["fast", "precise"])
+def test_a_loaded_calibration_gives_the_same_depth(calibration, saved, mode):
+    image = vts.scenes.render(vts.scenes.sphere_press(10, 2, (0, 0), 24, 32, 1.25), calibration.lights, gamma=1.8)
+    one, two = (vts.DepthPipeline.from_calibration(cal, mode)(image) for cal in (calibration, vts.Calibration.load(saved)))
+    assert bool(one.contact.any()) and all(torch.equal(left, right) for left, right in zip(one, two))
+
+
+def test_double_precision_survives(ring, tmp_path):
+    cal = vts.Calibration.from_lights(ring(dtype=torch.float64), SENSOR)
+    cal.save(tmp_path / "unit.safetensors")
+    loaded = vts.Calibration.load(str(tmp_path / "unit.safetensors"))
+    assert loaded.inverse.dtype == torch.float64 and torch.equal(loaded.inverse, cal.inverse) and loaded.measured is False
+
+
+def test_what_the_paper_keeps_is_in_the_file(saved):
+    tensors, metadata = load_tensors(saved)
+    assert {"light_position_mm", "light_albedo", "compensation", "inverse"} <= set(tensors)
+    assert metadata["format_version"] == 1 and metadata["sensor"]["mm_per_pixel"] == 1.25
+
+
+def no_tensor(name):
+    return lambda tensors: tensors.pop(name)
+
+
+def put(name, value):
+    def change(tensors):
+        tensors[name] = value(tensors[name].clone())
+
+    return change
+
+
+def with_nan(tensor):
+    tensor.view(-1)[0] = float("nan")
+    return tensor
+
+
+TENSORS = {
+    **{f"without {name}": (no_tensor(name), f"tensor '{name}' is missing")
+       for name in ("light_position_mm", "light_albedo", "light_gloss", "background", "compensation", "inverse", "noise_std")},
+    **{f"NaN in {name}": (put(name, with_nan), f"tensor '{name}': expected finite values")
+       for name in ("light_position_mm", "background", "inverse", "noise_std")},
+    "a light below the skin": (put("light_position_mm", lambda t: -t), "expected lights above the skin"),
+    "no albedo": (put("light_albedo", lambda t: 0 * t), "albedo: expected values above 0"),
+    "no noise": (put("noise_std", lambda t: 0 * t), "tensor 'noise_std': expected values above 0"),
+    "other lights": (put("light_albedo", lambda t: 1.5 * t), "does not fit the lights in the same file"),
+    "another inverse": (put("inverse", lambda t: t.flip(0).contiguous()), "tensor 'inverse' does not fit the lights"),
+    "another background": (put("background", lambda t: 0.5 * t), "tensor 'compensation' does not fit the lights"),
+    "another size": (put("background", lambda t: t[:, 1:].contiguous()),
+                     r"tensor 'background': expected \(3, 24, 32\) floats, got \(3, 23, 32\)"),
+    "integers": (put("background", lambda t: t.to(torch.int32)), "tensor 'background': expected .* floats, got .* torch.int32"),
+}  # fmt: skip
+METADATA = {
+    "a later version": (lambda m: m.update(format_version=99), "format version 99, this torchvts reads 1 to 1: update torchvts"),
+    "version zero": (lambda m: m.update(format_version=0), "format version 0"),
+    "version as text": (lambda m: m.update(format_version="1"), "format version '1'"),
+    "no version": (lambda m: m.pop("format_version"), "format version None"),
+    "another kind": (lambda m: m.update(kind="mesh"), "expected a calibration, got a file of kind 'mesh'"),
+    "no sensor": (lambda m: m.pop("sensor"), "expected keys and values of a sensor, got NoneType"),
+    "another sensor": (lambda m: m["sensor"].update(height=48), r"expected \(3, 48, 32\) floats, got \(3, 24, 32\)"),
+    "another pitch": (lambda m: m["sensor"].update(mm_per_pixel=0.1), "does not fit the lights in the same file"),
+    "unknown key of the sensor": (lambda m: m["sensor"].update(colour=1), "key 'colour': unknown"),
+    "no report": (lambda m: m.pop("report"), "'measured' or 'report' is missing"),
+    "measured as text": (lambda m: m.update(measured="yes"), "'measured' or 'report' is missing"),
+}
+
+
+@pytest.mark.parametrize("kind", TENSORS)
+def test_damaged_tensors_are_refused(saved, kind):
+    change, message = TENSORS[kind]
+    rewritten(saved, change_tensors=change)
+    with pytest.raises(ValueError, match=message) as caught:
+        vts.Calibration.load(saved)
+    assert str(caught.value).startswith(f"{saved}: ")
+
+
+@pytest.mark.parametrize("kind", METADATA)
+def test_damaged_metadata_is_refused(saved, kind):
+    change, message = METADATA[kind]
+    rewritten(saved, change_metadata=change)
+    with pytest.raises(ValueError, match=message) as caught:
+        vts.Calibration.load(saved)
+    assert str(caught.value).startswith(f"{saved}: ")
+
+
+@pytest.mark.parametrize("keep", [0, 4, 7, 8, 100, 0.5, 0.999])
+def test_a_file_cut_short_is_refused(saved, keep):
+    content = saved.read_bytes()
+    saved.write_bytes(content[: keep if isinstance(keep, int) else int(keep * len(content))])
+    with pytest.raises(ValueError, match="not a safetensors file, or cut short") as caught:
+        vts.Calibration.load(saved)
+    assert str(caught.value).startswith(f"{saved}: ")
+
+
+@pytest.mark.parametrize("content", [b"\x89PNG\r\n\x1a\n" + bytes(100), b"\xff" * 64, b"hello"])
+def test_what_is_no_safetensors_file_is_refused(tmp_path, content):
+    (tmp_path / "unit.safetensors").write_bytes(content)
+    with pytest.raises(ValueError, match=r"unit\.safetensors: not a safetensors file, or cut short"):
+        vts.Calibration.load(tmp_path / "unit.safetensors")
+
+
+@pytest.mark.parametrize("metadata", [None, {"format": "pt"}])
+def test_a_foreign_safetensors_file_is_refused(tmp_path, metadata):
+    path = tmp_path / "model.safetensors"
+    safetensors.torch.save_file({"weight": torch.zeros(3)}, str(path), metadata)
+    with pytest.raises(ValueError, match=r"model\.safetensors: a safetensors file, but not one written by torchvts"):
+        vts.Calibration.load(path)
+
+
+@pytest.mark.parametrize("text", ["{", "[1]"])
+def test_metadata_that_is_no_object_is_refused(tmp_path, text):
+    path = tmp_path / "unit.safetensors"
+    safetensors.torch.save_file({"weight": torch.zeros(3)}, str(path), {"torchvts": text})
+    with pytest.raises(ValueError, match=r"unit\.safetensors: its metadata is damaged"):
+        vts.Calibration.load(path)
+
+
+def test_a_missing_file_is_said_to_be_missing(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.safetensors: no such file"):
+        vts.Calibration.load(tmp_path / "nowhere.safetensors")
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        vts.Calibration.load(tmp_path)
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(saved):
+    before = saved.read_bytes()
+    with pytest.raises(RuntimeError, match="power cut"), write_atomically(saved) as temporary:
+        temporary.write_bytes(b"half")
+        assert temporary.parent == saved.parent
+        raise RuntimeError("power cut")
+    assert saved.read_bytes() == before
+    assert [path.name for path in saved.parent.iterdir()] == [saved.name]
+
+
+def test_a_report_that_json_cannot_hold_leaves_the_old_file(calibration, saved):
+    before = saved.read_bytes()
+    broken = vts.Calibration.from_lights(calibration.lights, SENSOR, None, {"figure": float("nan")})
+    with pytest.raises(ValueError, match="JSON"):
+        broken.save(saved)
+    assert saved.read_bytes() == before
+    assert [path.name for path in saved.parent.iterdir()] == [saved.name]
+
+
+def test_a_new_file_replaces_the_old_and_keeps_its_mode(calibration, saved):
+    saved.chmod(0o640)
+    vts.Calibration.from_lights(calibration.lights, SENSOR).save(saved)
+    assert vts.Calibration.load(saved).measured is False
+    assert saved.stat().st_mode & 0o777 == 0o640
+
+
+def test_a_missing_folder_and_a_folder_in_the_way_are_refused(calibration, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"folder .*nowhere does not exist: make it first"):
+        calibration.save(tmp_path / "nowhere" / "unit.safetensors")
+    with pytest.raises(IsADirectoryError, match="is a folder, expected the name of a file"):
+        calibration.save(tmp_path)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_that_cannot_be_written_is_refused(calibration, tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(PermissionError, match="cannot write into"):
+        calibration.save(tmp_path / "unit.safetensors")
+    tmp_path.chmod(0o700)
+
+
+def test_known_lights_need_no_image(ring):
+    cal = vts.Calibration.from_lights(ring(), SENSOR)
+    assert cal.measured is False and float(cal.compensation.abs().max()) == 0 and not bool(cal.defects.any())
+    assert cal.noise_std.tolist() == pytest.approx([1 / 255 / 12**0.5] * 3)
+
+
+def test_the_noise_of_the_background_is_measured(calibration):
+    assert calibration.noise_std.tolist() == pytest.approx([0.01] * 3, rel=0.2)
+    # in light: the slope of value^1.8
+    expected = 1.8 * calibration.background ** (0.8 / 1.8) * calibration.noise_std.reshape(3, 1, 1)
+    assert torch.allclose(calibration.light_noise_std, expected, rtol=1e-4)
+
+
+def test_lights_of_a_calibration_are_a_frozen_copy(ring):
+    lights = ring().requires_grad_(True)
+    cal = vts.Calibration.from_lights(lights, SENSOR)
+    assert not any(parameter.requires_grad for parameter in cal.lights.parameters())
+    with torch.no_grad():
+        lights.albedo.zero_()
+    assert float(cal.lights.albedo.min()) > 0

@@ -1,0 +1,215 @@
+"""Exact presses, the camera that sees them, and the figures that judge results."""
+
+import math
+
+import pytest
+import torch
+
+import torchvts as vts
+from torchvts.core.noise import noise_std
+
+scenes, metrics = vts.scenes, vts.metrics
+SIZE = {"height": 241, "width": 321, "mm_per_pixel": 0.125, "dtype": torch.float64}
+PRESSES = {
+    "sphere": lambda **size: scenes.sphere_press(10.0, 1.0, (2.0, -1.0), **size),
+    "cylinder": lambda **size: scenes.cylinder_press(**size),
+    "cone": lambda **size: scenes.cone_press(**size),
+    "sine": lambda **size: scenes.sine_press(**size),
+    "punch": lambda **size: scenes.punch_press(**size),
+    "letters": lambda **size: scenes.letters_press("VTS", **size),
+}
+
+
+@pytest.mark.parametrize("name", PRESSES)
+def test_the_gradient_is_the_slope_of_the_depth(name):
+    """Central differences err 4 times less on a grid twice as fine, 2 ** 1.5 times where curvature jumps."""
+    errors = []
+    for factor in (1, 2):
+        scene = PRESSES[name](height=240 * factor + 1, width=320 * factor + 1, mm_per_pixel=0.125 / factor, dtype=torch.float64)
+        z, pitch = scene.depth_mm, scene.mm_per_pixel
+        p, q = (z[..., 1:-1, 2:] - z[..., 1:-1, :-2]) / (2 * pitch), (z[..., 2:, 1:-1] - z[..., :-2, 1:-1]) / (2 * pitch)
+        inside = -torch.nn.functional.max_pool2d(-scene.contact.double(), 3, 1)  # its four neighbours too
+        error = ((torch.cat((p, q), 1) - scene.gradient[..., 1:-1, 1:-1]) * inside).abs()
+        errors.append(float(error.square().mean().sqrt()))
+    assert errors[0] < 0.02
+    assert errors[1] < errors[0] / 2.5
+
+
+@pytest.mark.parametrize("name", PRESSES)
+def test_contact_is_where_depth_is_positive_and_all_else_is_flat(name):
+    scene = PRESSES[name](**SIZE)
+    assert torch.equal(scene.contact, scene.depth_mm > 0) and 0 < float(scene.contact.double().mean()) < 0.6
+    assert scene.gradient[(~scene.contact).expand_as(scene.gradient)].abs().max() == 0
+    assert torch.equal(scene.normal, vts.normal_from_gradient(scene.gradient))
+    assert (scene.normal.norm(dim=1) - 1).abs().max() < 1e-14
+
+
+@pytest.mark.parametrize(
+    "name, largest_mm, area_mm2",
+    [
+        ("sphere", 1.0, math.pi * (10**2 - 9**2)),
+        ("cylinder", 0.5, math.pi * (4**2 - 3.5**2) + 16 * 2 * math.sqrt(4**2 - 3.5**2)),
+        ("sine", None, math.pi * 64),
+        ("letters", 0.5, None),
+    ],
+)
+def test_size_and_depth_of_presses(name, largest_mm, area_mm2):
+    scene = PRESSES[name](**SIZE)
+    if largest_mm is not None:
+        assert float(scene.depth_mm.max()) == pytest.approx(largest_mm, rel=2e-3)
+    if area_mm2 is not None:
+        assert int(scene.contact.sum()) * 0.125**2 == pytest.approx(area_mm2, rel=5e-3)
+
+
+def test_a_cylinder_turns_from_x_towards_y():
+    scene = scenes.cylinder_press(angle_deg=45.0, **SIZE)
+    rows, columns = torch.nonzero(scene.contact[0, 0], as_tuple=True)
+    assert float(torch.corrcoef(torch.stack((rows, columns)).double())[0, 1]) > 0.8
+
+
+def test_a_tilted_punch_has_the_slope_of_its_tilt():
+    scene = scenes.punch_press(tilt_deg=3.0, **SIZE)
+    assert float(scene.gradient[0, 0, 120, 160]) == pytest.approx(math.tan(math.radians(3.0)))
+    assert float(scene.gradient[0, 1, 120, 160]) == 0
+
+
+@pytest.mark.parametrize("text", ["", " ", "abc", "A1"])
+def test_letters_need_strokes(text):
+    with pytest.raises(ValueError, match="text: expected capital letters A-Z and blanks, got "):
+        scenes.letters_press(text)
+
+
+def test_every_letter_has_its_own_shape():
+    shapes = {
+        bytes(scenes.letters_press(c, height=64, width=64, mm_per_pixel=0.15).contact.numpy()) for c in "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
+    }
+    assert len(shapes) == 26
+
+
+@pytest.mark.parametrize(
+    "call, message",
+    [
+        (lambda: scenes.sphere_press(1.0, 2.0), r"press_mm: expected a number in \(0, 1\], got 2.0"),
+        (lambda: scenes.sphere_press(-1.0), "radius_mm: expected a number above 0 and finite, got -1.0"),
+        (lambda: scenes.cone_press(90.0), r"half_angle_deg: expected a number in \(0, 89.9\], got 90.0"),
+        (lambda: scenes.punch_press(wall_mm=0), "wall_mm: expected a number above 0"),
+        (lambda: scenes.sine_press(period_mm=float("nan")), "period_mm: expected a number above 0"),
+        (lambda: scenes.sphere_press(height=2), "height: expected at least 3, got 2"),
+    ],
+)
+def test_impossible_presses_are_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+@pytest.fixture(scope="module")
+def rendered(ring, small_press):
+    return small_press(1.0), ring()
+
+
+def test_without_options_an_image_is_the_forward_model(rendered):
+    scene, lights = rendered
+    assert torch.equal(scenes.render(scene, lights), vts.near_field_shading(scene.depth_mm, scene.normal, lights, 0.25).clamp(0, 1))
+
+
+@pytest.mark.parametrize("bits", [8, 10])
+def test_an_image_of_so_many_bits_has_so_many_levels(rendered, bits):
+    plain, levels = scenes.render(*rendered), scenes.render(*rendered, bits=bits) * (2**bits - 1)
+    assert (levels - levels.round()).abs().max() < 1e-4 * 2 ** (bits - 8)
+    assert (levels / (2**bits - 1) - plain).abs().max() < 0.5001 / (2**bits - 1)
+
+
+def test_noise_is_reproducible_and_as_strong_as_asked(rendered):
+    one, same, other = (scenes.render(*rendered, noise_std=0.01, seed=seed) for seed in (3, 3, 4))
+    plain = scenes.render(*rendered)
+    assert torch.equal(one, same) and not torch.equal(one, other)
+    assert float((one - plain).std()) == pytest.approx(0.01, rel=0.02)
+    assert abs(float((one - plain).mean())) < 1e-4
+
+
+@pytest.mark.parametrize("sigma", [0.002, 0.01, 0.03])
+def test_the_noise_of_an_image_is_measured_whatever_it_shows(rendered, sigma):
+    assert noise_std(scenes.render(*rendered, noise_std=sigma)).flatten().tolist() == pytest.approx([sigma] * 3, rel=0.06)
+
+
+def test_gamma_and_vignetting(rendered):
+    plain = scenes.render(*rendered)
+    assert (scenes.render(*rendered, gamma=2.2) ** 2.2 - plain).abs().max() < 1e-6
+    ratio = scenes.render(*rendered, vignetting=0.3) / plain
+    assert ratio[..., 0, 0].flatten().tolist() == pytest.approx([0.7] * 3, rel=1e-4)
+    assert float(ratio[..., 59:61, 79:81].min()) > 0.9999
+
+
+def test_spots_darken_and_dead_pixels_stay_black(rendered):
+    spots = scenes.skin_spots(120, 160)
+    image, plain = scenes.render(*rendered, spots=spots, noise_std=0.01), scenes.render(*rendered)
+    dead = (spots == 0).expand_as(image)
+    assert 25 <= int((spots == 0).sum()) <= 30 and image[dead].abs().max() == 0
+    assert (scenes.render(*rendered, spots=spots) - plain * spots).abs().max() < 1e-7
+    assert torch.equal(spots, scenes.skin_spots(120, 160)) and not torch.equal(spots, scenes.skin_spots(120, 160, seed=1))
+
+
+def test_at_rest_there_is_no_contact(rendered):
+    scene = scenes.at_rest(rendered[0])
+    assert scene.depth_mm.abs().max() == 0 and not bool(scene.contact.any()) and scene.mm_per_pixel == 0.25
+    assert torch.equal(scene.normal, vts.normal_from_gradient(scene.gradient).abs())
+
+
+def test_depth_error_by_hand():
+    truth, depth = torch.zeros(1, 1, 2, 2), torch.tensor([[3.0, 0.0], [-4.0, 0.0]]).reshape(1, 1, 2, 2)
+    assert metrics.depth_error(depth, truth, 0.5) == pytest.approx((4.0, 2.5, 8.0, 5.0))
+    region = torch.tensor([[True, True], [False, False]]).reshape(1, 1, 2, 2)
+    assert metrics.depth_error(depth, truth, 0.5, region) == pytest.approx((3.0, math.sqrt(4.5), 6.0, math.sqrt(18)))
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 1e-5, 1.0, 60.0, 90.0, 180.0])
+def test_the_angle_between_normals(angle_deg):
+    a = math.radians(angle_deg)
+    one, two = (
+        torch.tensor(v, dtype=torch.float64).reshape(1, 3, 1, 1) for v in ([0.0, 0.0, 1.0], [math.sin(a), 0.0, math.cos(a)])
+    )
+    assert float(metrics.normal_angle_deg(one, two)) == pytest.approx(angle_deg, rel=1e-9, abs=1e-12)
+    assert metrics.normal_angle_deg(one, two, torch.ones(1, 1, 1, 1, dtype=torch.bool)).shape == (1,)
+
+
+def square(left, size=4):
+    mask = torch.zeros(1, 1, 20, 20, dtype=torch.bool)
+    mask[..., 5 : 5 + size, left : left + size] = True
+    return mask
+
+
+def test_overlap_and_rim_distance_by_hand():
+    nothing = torch.zeros_like(square(5))
+    assert metrics.mask_iou(square(5), square(7)) == pytest.approx(8 / 24)
+    assert metrics.mask_iou(square(5), square(5)) == 1.0 and metrics.mask_iou(square(5), nothing) == 0.0
+    assert metrics.mask_iou(nothing, nothing) == 1.0
+    assert metrics.rim_distance_px(square(5), square(5)) == 0.0
+    # the 6 x 6 square around a 4 x 4 one: 16 of its 20 rim pixels are 1 away, the corners the root of 2
+    outer = torch.zeros_like(nothing)
+    outer[..., 4:10, 4:10] = True
+    assert metrics.rim_distance_px(square(5), outer) == pytest.approx(0.5 * (1.0 + (16 + 4 * math.sqrt(2)) / 20))
+    assert metrics.rim_distance_px(square(5), nothing) == math.inf and metrics.rim_distance_px(nothing, nothing) == 0.0
+
+
+@pytest.mark.parametrize("radius_mm, press_mm, center_mm", [(10.0, 0.2, (0.0, 0.0)), (3.0, 1.0, (5.0, -4.0))])
+def test_the_sphere_of_exact_points_is_exact(radius_mm, press_mm, center_mm):
+    scene = scenes.sphere_press(radius_mm, press_mm, center_mm, **SIZE)
+    fit = metrics.fit_sphere(scene.depth_mm, 0.125, scene.contact)
+    assert fit.center_mm == pytest.approx((center_mm[0], -center_mm[1], press_mm - radius_mm), abs=1e-8)
+    assert fit.radius_mm == pytest.approx(radius_mm, abs=1e-8) and fit.rms_mm < 1e-9
+
+
+def test_figures_refuse_what_does_not_fit():
+    one, other, none = torch.zeros(1, 1, 4, 4), torch.zeros(1, 1, 4, 5), torch.zeros(1, 1, 4, 4, dtype=torch.bool)
+    with pytest.raises(ValueError, match=r"depth_mm: expected \(1, 1, 4, 5\) like truth_mm, got \(1, 1, 4, 4\)"):
+        metrics.depth_error(one, other, 1.0)
+    with pytest.raises(ValueError, match=r"region: expected \(1, 1, 4, 4\) like truth_mm"):
+        metrics.depth_error(one, one, 1.0, other)
+    with pytest.raises(ValueError, match="region: expected at least one pixel, got none: no contact was found"):
+        metrics.depth_error(one, one, 1.0, none)
+    with pytest.raises(ValueError, match=r"normal: expected \(1, 3, 4, 5\) like truth, got \(1, 3, 4, 4\)"):
+        metrics.normal_angle_deg(torch.zeros(1, 3, 4, 4), torch.zeros(1, 3, 4, 5))
+    with pytest.raises(ValueError, match=r"mask: expected \(1, 1, 4, 5\) like truth"):
+        metrics.mask_iou(one, other)
+    with pytest.raises(ValueError, match="contact: expected at least 4 pixels, got 0: no contact, no sphere"):
+        metrics.fit_sphere(one, 1.0, none)

@@ -1,0 +1,98 @@
+"""The scripts do their job from the command line, and refuse bad input in a sentence."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import torchvts as vts
+from torchvts.core.files import read_depth_png
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def call(*arguments):
+    return subprocess.run([sys.executable, *map(str, arguments)], capture_output=True, text=True, cwd=ROOT, timeout=300)
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("images")
+    scene = vts.scenes.sphere_press(10.0, 1.0, height=120, width=160, mm_per_pixel=0.25)
+    lights = vts.PointLights([[20.0, 9.0, 25.0], [-18.0, 13.0, 25.0], [-2.0, -22.0, 25.0]], [600.0, 600.0, 600.0])
+    (folder / "presses").mkdir()
+    vts.write_image(folder / "background.png", vts.scenes.render(vts.scenes.at_rest(scene), lights, noise_std=0.002)[0])
+    for k in range(3):
+        vts.write_image(folder / "presses" / f"{k}.png", vts.scenes.render(scene, lights, noise_std=0.002, seed=k)[0])
+    return folder, scene
+
+
+@pytest.fixture(scope="module")
+def calibration(images):
+    folder, _ = images
+    out = folder / "unit.safetensors"
+    done = call("scripts/calibrate.py", folder / "background.png", "--mm-per-pixel", "0.25", "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert "wrote" in done.stdout and "converged" in done.stdout
+    return out
+
+
+def test_reconstruct_writes_depth_pictures_and_table(images, calibration, tmp_path):
+    folder, scene = images
+    done = call("scripts/reconstruct.py", calibration, folder / "presses", "--out", tmp_path, "--mode", "precise")
+    assert done.returncode == 0, done.stderr
+    assert len((tmp_path / "frames.csv").read_text().splitlines()) == 4
+    for k in range(3):
+        assert (tmp_path / f"{k}_picture.png").stat().st_size > 10_000
+        assert (read_depth_png(tmp_path / f"{k}_depth.png") - scene.depth_mm).abs().max() < 0.25 * 0.25
+
+
+def test_reconstruct_writes_clouds(images, calibration, tmp_path):
+    try:
+        from torchvts.pose import read_point_cloud
+        from torchvts.pose.clouds import open3d
+
+        open3d()
+    except ImportError as error:
+        pytest.skip(str(error))
+    folder, scene = images
+    arguments = ["--out", tmp_path, "--depth", "npy", "--cloud", "ply", "--no-pictures"]
+    done = call("scripts/reconstruct.py", calibration, folder / "presses" / "0.png", *arguments)
+    assert done.returncode == 0, done.stderr
+    points, normals = read_point_cloud(tmp_path / "0.ply")
+    assert abs(len(points) - int(scene.contact.sum())) < 0.03 * len(points)
+    assert normals is not None
+    # a ball: its normals point away from its centre, in the frame with y up
+    outward = torch.nn.functional.normalize(points - torch.tensor([0.0, 0.0, -9.0]), dim=1)
+    assert (normals * outward).sum(1).median() > 0.999
+
+
+def test_missing_and_foreign_files_are_refused_in_a_sentence(images, calibration, tmp_path):
+    folder, _ = images
+    for arguments, part in (
+        (["scripts/calibrate.py", folder / "none.png", "--sensor", "tacto", "--out", tmp_path / "a.safetensors"], "no such image"),
+        (["scripts/calibrate.py", folder / "background.png", "--sensor", "tacto", "--out", tmp_path / "a.safetensors"], "tacto"),
+        (["scripts/reconstruct.py", folder / "background.png", folder, "--out", tmp_path], "safetensors"),
+        (["scripts/reconstruct.py", calibration, tmp_path / "nothing", "--out", tmp_path], "no such file"),
+    ):
+        done = call(*arguments)
+        assert done.returncode == 1
+        assert done.stderr.startswith("error: ") and part in done.stderr, done.stderr
+        assert "Traceback" not in done.stderr
+    assert not (tmp_path / "a.safetensors").exists()
+
+
+def test_reproduce_paper_prints_figure_3_beside_the_papers(tmp_path):
+    done = call("scripts/reproduce_paper.py", "--out", tmp_path, "--data", tmp_path / "none")
+    assert done.returncode == 0, done.stderr
+    rows = [
+        [cell.strip() for cell in line.split("|")[1:-1]] for line in done.stdout.splitlines() if "press" in line and "eq." in line
+    ]
+    assert len(rows) == 4
+    bound = {("16", "eq. 9"): 0.40, ("16", "eq. 10"): 0.112, ("32", "eq. 9"): 1.30, ("32", "eq. 10"): 0.159}
+    for row in rows:
+        press = row[0].split("press ")[1].split()[0]
+        assert float(row[3]) <= bound[press, row[1]], row
+    assert len(list(tmp_path.glob("*.png"))) == 4

@@ -1,0 +1,240 @@
+"""Sensor files: strict, found wherever the package is installed, and what rectifies a camera's frame."""
+
+import math
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+import torch
+
+import torchvts as vts
+
+GOOD = {"name": "rig", "height": 24, "width": 32, "mm_per_pixel": 0.5}
+
+
+def written(folder, text):
+    path = folder / "unit.yaml"
+    path.write_text(text)
+    return path
+
+
+def as_text(**changes):
+    values = {**GOOD, **changes}
+    return "".join(f"{key}: {value}\n" for key, value in values.items() if value is not None)
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        (as_text(mm_per_pixle=0.1), r"key 'mm_per_pixle': unknown; a sensor knows name, height, .*mm_per_pixel"),
+        (as_text(height=None), "key 'height': missing"),
+        (as_text() + "height: 25\n", "key 'height': given twice"),
+        (as_text(height="tall"), "key height: expected an integer, got str 'tall'"),
+        (as_text(height=24.5), "key height: expected an integer, got float 24.5"),
+        (as_text(width=True), "key width: expected an integer, got bool"),
+        (as_text(width=4), "key width: expected at least 8, got 4"),
+        (as_text(mm_per_pixel=0), "key mm_per_pixel: expected a number in .*, got 0"),
+        (as_text(mm_per_pixel=-1), "key mm_per_pixel: expected a number in .*, got -1"),
+        (as_text(mm_per_pixel=63.4), r"key mm_per_pixel: expected a number in \(0, 10\], got 63.4"),
+        (as_text(mm_per_pixel=".nan"), "key mm_per_pixel: expected a number in .*, got nan"),
+        (as_text(mm_per_pixel="0.1 mm"), "key mm_per_pixel: expected a number, got str"),
+        (as_text(gamma=0.01), r"key gamma: expected a number in \[0.1, 10\], got 0.01"),
+        (as_text(blur_px=-1), "key blur_px: expected a number in"),
+        (as_text(blur_px=100), r"key blur_px: expected a number in \(0, 6\], got 100"),
+        (as_text(name=7), "key name: expected a text, got 7"),
+        (as_text(name="' '"), "key name: expected a text, got ' '"),
+        (as_text(light_position_mm="[[1, 2, 3]]"), r"key light_position_mm: expected 3 x 3 numbers, got shape \(1, 3\)"),
+        (
+            as_text(light_position_mm="[[1, 2, 3], [1, 2, 3], [1, 2, -3]]"),
+            r"key light_position_mm: expected lights above the skin \(z > 0\)",
+        ),
+        (as_text(light_position_mm="[[1, 2, a], [1, 2, 3], [1, 2, 3]]"), "key light_position_mm: expected 3 x 3 numbers"),
+        (as_text(roi_px="[0, 0, 10]"), r"key roi_px: expected 4 numbers, got shape \(3,\)"),
+        (as_text(roi_px="[-1, 0, 10, 10]"), "key roi_px: expected whole numbers"),
+        (as_text(corners_px="[[0, 0], [0, 9], [9, 9], [9, 0]]"), "key corners_px: expected a convex quadrilateral"),
+        (as_text(corners_px="[[0, 0], [9, 0], [9, 9], [0, 9]]", roi_px="[0, 0, 9, 9]"), "expected one of them, got both"),
+        ("- 1\n- 2\n", "expected keys and values of a sensor, got list"),
+        ("", "expected keys and values of a sensor, got NoneType"),
+        ("name: [rig\n", "not a YAML file"),
+        ("!!python/object/apply:os.getcwd []\n", "not a YAML file"),
+    ],
+)
+def test_a_bad_file_is_refused_by_file_and_key(tmp_path, text, message):
+    path = written(tmp_path, text)
+    with pytest.raises(ValueError, match=message) as caught:
+        vts.Sensor.load(path)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_bytes_that_are_no_text_are_refused(tmp_path):
+    path = tmp_path / "unit.yaml"
+    path.write_bytes(b"\x89PNG\xff\xfe")
+    with pytest.raises(ValueError, match="not a YAML file"):
+        vts.Sensor.load(path)
+
+
+@pytest.mark.parametrize("source", ["nowhere.yaml", "gelsight_maxi"])
+def test_what_is_not_there_is_said_with_what_is(source):
+    with pytest.raises(FileNotFoundError, match=r"nowhere.yaml: no such sensor file|'gelsight_maxi': expected .*gelsight_mini"):
+        vts.Sensor.load(source)
+
+
+@pytest.mark.parametrize("name", vts.shipped_sensors())
+def test_every_shipped_sensor_loads_under_its_own_name(name):
+    assert vts.Sensor.load(name).name == name
+
+
+def test_shipped_figures():
+    assert {"gelsight_mini", "gelsight_wedge", "tacto"} <= set(vts.shipped_sensors())
+    mini = vts.Sensor.load("gelsight_mini")
+    assert (mini.height, mini.width, mini.mm_per_pixel, mini.gamma) == (240, 320, 0.0634, 1.0)
+    assert vts.Sensor.load("tacto").gamma == 2.2
+
+
+def test_defaults_and_immutability():
+    sensor = vts.Sensor(**GOOD)
+    assert (sensor.gamma, sensor.blur_px, sensor.light_position_mm, sensor.roi_px, sensor.corners_px) == (
+        1.0,
+        0.0,
+        None,
+        None,
+        None,
+    )
+    with pytest.raises(AttributeError):
+        sensor.height = 5
+
+
+@pytest.mark.parametrize("height, width", [(480, 640), (120, 160), (60, 80)])
+def test_another_resolution_keeps_the_field_of_view(height, width):
+    sensor = vts.Sensor.load("gelsight_mini")
+    resized = vts.Sensor.load("gelsight_mini", height, width)
+    assert resized == sensor.resized(height, width)
+    assert resized.field_mm == pytest.approx(sensor.field_mm, rel=1e-12)
+    blurred = vts.Sensor(**GOOD, blur_px=2.0).resized(48, 64)
+    assert (blurred.blur_px, blurred.mm_per_pixel) == (4.0, 0.25)
+
+
+def test_another_aspect_ratio_is_refused():
+    with pytest.raises(
+        ValueError, match="height, width: expected the aspect ratio of 240 x 320, got 480 x 480: pixels must stay square"
+    ):
+        vts.Sensor.load("gelsight_mini", 480, 480)
+    with pytest.raises(ValueError, match="height, width: expected both or none"):
+        vts.Sensor.load("gelsight_mini", 480)
+
+
+@pytest.mark.parametrize(
+    "extra",
+    [
+        {},
+        {"gamma": 2.2, "blur_px": 1.5},
+        {"light_position_mm": [[20, 0, 30.5], [-10, 17, 30], [-10, -17, 30]]},
+        {"roi_px": [4, 5, 60, 45]},
+        {"corners_px": [[1, 2], [30, 3.5], [31, 22], [0, 23]]},
+    ],
+)
+def test_a_saved_sensor_loads_as_it_was(tmp_path, extra):
+    sensor = vts.Sensor(**GOOD, **extra)
+    sensor.save(tmp_path / "unit.yaml")
+    assert vts.Sensor.load(tmp_path / "unit.yaml") == sensor
+    assert vts.Sensor.load(str(tmp_path / "unit.yaml")) == sensor
+    assert [path.name for path in tmp_path.iterdir()] == ["unit.yaml"]
+
+
+def smooth(x, y):
+    """Any smooth picture, as a function of place."""
+    return torch.stack([0.5 + 0.4 * torch.sin(0.11 * k * x + 0.07 * y + k) for k in (1, 2, 3)])[None]
+
+
+def frame(height=120, width=160):
+    return smooth(torch.arange(width, dtype=torch.float64)[None, :], torch.arange(height, dtype=torch.float64)[:, None])
+
+
+def test_rectify_leaves_a_frame_of_the_right_size_alone():
+    assert torch.equal(vts.Sensor("rig", 120, 160, 0.1).rectify(frame()), frame())
+
+
+def test_rectify_cuts_the_region_of_interest():
+    sensor = vts.Sensor("rig", 50, 70, 0.1, roi_px=(12, 34, 70, 50))
+    assert torch.equal(sensor.rectify(frame()), frame()[:, :, 34:84, 12:82])
+    halved = vts.Sensor("rig", 25, 35, 0.2, roi_px=(12, 34, 70, 50)).rectify(frame())
+    x, y = 12.5 + 2 * torch.arange(35, dtype=torch.float64), 34.5 + 2 * torch.arange(25, dtype=torch.float64)
+    assert (halved - smooth(x[None, :], y[:, None]))[..., 2:-2, 2:-2].abs().max() < 0.02
+
+
+def test_rectify_straightens_a_quadrilateral():
+    """The picture seen through an exact perspective map: every pixel has the value of the place it shows."""
+    corners = [[20.0, 15.0], [140.0, 25.0], [130.0, 105.0], [25.0, 95.0]]
+    sensor = vts.Sensor("rig", 60, 80, 0.1, corners_px=corners)
+    target = [[0.0, 0.0], [79.0, 0.0], [79.0, 59.0], [0.0, 59.0]]
+    lines, right = [], []
+    for (u, v), (x, y) in zip(target, corners, strict=True):
+        lines += [[u, v, 1, 0, 0, 0, -u * x, -v * x], [0, 0, 0, u, v, 1, -u * y, -v * y]]
+        right += [x, y]
+    a, b, c, d, e, f, g, h = torch.linalg.solve(torch.tensor(lines, dtype=torch.float64), torch.tensor(right, dtype=torch.float64))
+    u, v = torch.arange(80, dtype=torch.float64)[None, :], torch.arange(60, dtype=torch.float64)[:, None]
+    w = g * u + h * v + 1
+    expected = smooth((a * u + b * v + c) / w, (d * u + e * v + f) / w)
+    result = sensor.rectify(frame().repeat(2, 1, 1, 1))
+    assert result.shape == (2, 3, 60, 80)
+    assert (result - expected).abs().max() < 0.4 * 0.36**2 / 4  # bilinear: curvature (0.33^2 + 0.07^2) / 8 per axis
+
+
+@pytest.mark.parametrize(
+    "options, size, message",
+    [
+        ({"roi_px": (100, 0, 70, 50)}, (120, 160), r"frame: 120 x 160 does not hold roi_px \(100, 0, 70, 50\) of sensor 'rig'"),
+        ({"corners_px": ((0, 0), (300, 0), (300, 90), (0, 90))}, (120, 160), "frame: 120 x 160 does not hold corners_px"),
+        (
+            {},
+            (48, 64),
+            "frame: expected 24 x 32 for sensor 'rig', got 48 x 64: resize it, or load the sensor with height=48, width=64",
+        ),
+    ],
+)
+def test_a_frame_that_does_not_fit_is_refused(options, size, message):
+    with pytest.raises(ValueError, match=message):
+        vts.Sensor(**GOOD, **options).rectify(torch.zeros(1, 3, *size))
+
+
+def test_the_wedge_video_is_rectified_to_its_gel(data):
+    from torchvts.core.files import read_frames
+
+    video = next(path for path in sorted((data / "wedge_video").iterdir()) if path.suffix in (".avi", ".mp4", ".mov"))
+    _, first = next(iter(read_frames(video)))
+    gel = vts.Sensor.load("gelsight_wedge").rectify(first[None])
+    assert gel.shape == (1, 3, 300, 400)
+    assert float(gel.amin()) >= 0 and float(gel.mean(dim=1).amin()) > 0.02, "no pixel from beyond the frame"
+
+
+def test_shipped_sensors_are_found_from_an_installed_wheel(tmp_path):
+    pytest.importorskip("build")
+    pytest.importorskip("hatchling")
+    root = Path(vts.__file__).resolve().parents[1]
+    if not (root / "pyproject.toml").is_file():
+        pytest.skip("torchvts is installed, there is no source to build a wheel from")
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path / "dist"), str(root)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    with zipfile.ZipFile(next((tmp_path / "dist").glob("*.whl"))) as wheel:
+        wheel.extractall(tmp_path / "site")
+    program = (
+        "import torchvts; print(torchvts.__file__); "
+        "print(torchvts.Sensor.load('gelsight_mini').mm_per_pixel, *torchvts.shipped_sensors())"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False, cwd=tmp_path, env=environment
+    )
+    assert done.returncode == 0, done.stderr
+    where, found = done.stdout.splitlines()
+    assert where.startswith(str(tmp_path / "site"))
+    assert found.split() == ["0.0634", *vts.shipped_sensors()]
+    assert (tmp_path / "site" / "torchvts" / "py.typed").is_file()
+
+
+def test_field_of_view():
+    assert math.isclose(vts.Sensor.load("gelsight_mini").field_mm[1], 320 * 0.0634)

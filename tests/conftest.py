@@ -8,7 +8,7 @@ import torch
 
 import torchvts as vts
 
-torch.set_num_threads(2)
+torch.set_num_threads(1)  # small tensors: a second thread gains nothing, and waits for a core where another process runs
 
 
 def ring_lights(radius_mm=31.0, height_mm=40.0, rotation_deg=10.0, level=0.45, gloss=None, dtype=torch.float32):

@@ -66,7 +66,7 @@ def run(command: str, progress: Callable[[str], None]) -> list[Row]:
     """Time every mode at several sizes, and the stages of one frame at 640 x 480."""
     machine = f"{platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}"
     rows = []
-    for height, width in ((120, 160), (240, 320), (480, 640), (960, 1280)):
+    for height, width in ((240, 320), (480, 640), (960, 1280)):
         for press_mm in (1.0, 2.0):
             calibration, image, scene = _scene(height, width, press_mm)
             for mode in MODES:

@@ -93,5 +93,6 @@ def nearest_sound(defects: Tensor) -> tuple[Tensor, Tensor]:
     index, lost = torch.stack(found, 1), torch.stack(missing, 1)
     if bool(lost.all(1).any()):
         raise ValueError("defects: expected sound pixels in the row or column of each defect, got none: the background is unusable")
-    substitute = index.gather(1, (~lost).to(torch.int64).argmax(1, keepdim=True))
-    return rows * width + columns, torch.where(lost, substitute, index)
+    other_way, other_lost = index[:, [1, 0, 3, 2]], lost[:, [1, 0, 3, 2]]
+    any_way = index.gather(1, (~lost).to(torch.int64).argmax(1, keepdim=True))
+    return rows * width + columns, torch.where(lost, torch.where(other_lost, any_way, other_way), index)

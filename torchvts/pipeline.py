@@ -123,6 +123,7 @@ class DepthPipeline(nn.Module):
                 sensor.mm_per_pixel,
                 noise_std=noise.flatten(1).median(dim=1).values,
                 inverse=calibration.inverse,
+                full_above=(0.995**sensor.gamma) * (torch.ones_like(model) if gain is None else gain),
             ),
             GradientFromNormal(),
             integrate or PoissonRest(sensor.mm_per_pixel),

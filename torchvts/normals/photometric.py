@@ -9,16 +9,17 @@ from ..shading import PointLights, flat_image, gloss_lobe, inverse_light_matrix,
 
 
 def slope_by_lit_lights(
-    start: Tensor, compensated: Tensor, rows: Tensor, noise_std: float, prior_std: float = 0.25, steps: int = 3
+    start: Tensor, compensated: Tensor, rows: Tensor, full: Tensor, noise_std: float, prior_std: float = 0.25, steps: int = 3
 ) -> Tensor:
-    """Slopes of pixels where a light is blocked: each pixel against the clamped model max(0, L n), n of unit length.
+    """Slopes of pixels where a light is blocked or a channel is full: each pixel against the clamped model max(0, L n).
 
-    A blocked channel says no more than that it is dark, which leaves two numbers for two slopes and, near |n| = 1, a
-    direction that is badly pinned. A weak prior (``prior_std``) towards ``start`` holds that direction; when ``start``
-    comes from a depth map, its neighbours speak through it. Gauss-Newton in closed form, steps of at most 0.5.
+    n is of unit length. A blocked channel says no more than that it is dark, a full one that it is at least so bright, which
+    leaves two numbers for two slopes and, near |n| = 1, a direction that is badly pinned. A weak prior (``prior_std``) towards
+    ``start`` holds that direction; when ``start`` comes from a depth map, its neighbours speak through it. Gauss-Newton in
+    closed form, steps of at most 0.5.
 
     Args:
-        start: (N, 2), slopes (dz/dx, dz/dy). compensated: (N, 3). rows: (N, 3, 3), light matrix.
+        start: (N, 2), slopes (dz/dx, dz/dy). compensated: (N, 3). rows: (N, 3, 3), light matrix. full: (N, 3) bool, saturated.
         noise_std: of the compensated image, against which the prior is weighed.
     Returns:
         (N, 2).
@@ -32,7 +33,8 @@ def slope_by_lit_lights(
         n_z = torch.rsqrt(1.0 + p * p + q * q)
         normal = torch.cat((-p * n_z, -q * n_z, n_z), dim=1)
         light = (rows * normal[:, None]).sum(2)  # (N, 3)
-        lit = (light > 0.1 * noise_std).to(light.dtype)  # above zero: a black channel starts exactly on the terminator
+        # 0.1 sigma above zero, because a black channel starts exactly on the terminator
+        lit = ((light > 0.1 * noise_std) & ~(full & (light >= compensated))).to(light.dtype)
         # d normal / d slope is -n_z (e - n (n.e)) along x and y: the part of the light row across the normal
         across = -n_z[:, :, None] * (rows - light[:, :, None] * normal[:, None])[:, :, 0:2] * lit[:, :, None]
         residual = compensated - light * lit
@@ -51,13 +53,14 @@ class NormalFromIntensity(nn.Module):
     """Unit normals of a compensated image.
 
     Without depth, the stored inverse of the light matrix at rest (eq. 9); with depth, the inverse at that depth (eq. 10).
-    Where a light is blocked (its channel below three times its noise), :func:`slope_by_lit_lights` decides.
+    Where a light is blocked (its channel below three times its noise) or a channel is full, :func:`slope_by_lit_lights` decides.
     While gradients are recorded for the lights (``requires_grad_(True)``), the matrix is built from them at every call.
 
     Args:
         lights: the three lights. height, width: pixels. mm_per_pixel: pixel pitch, mm.
         noise_std: (3,), noise of the compensated image; None takes that of 8-bit rounding.
         inverse: (3, 3, H, W), the stored inverse; None computes it.
+        full_above: (3, H, W), compensated intensity from which a channel counts as saturated; None for never.
     Source:
         eq. 3, 8, 9, 10 of the paper.
     Example:
@@ -70,6 +73,7 @@ class NormalFromIntensity(nn.Module):
     inverse: Tensor
     dark_below: Tensor
     dark_where: Tensor
+    full_above: Tensor
 
     def __init__(
         self,
@@ -79,6 +83,7 @@ class NormalFromIntensity(nn.Module):
         mm_per_pixel: float,
         noise_std: Tensor | None = None,
         inverse: Tensor | None = None,
+        full_above: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.mm_per_pixel = mm_per_pixel
@@ -96,6 +101,8 @@ class NormalFromIntensity(nn.Module):
         flat = flat_image(self.lights, height, width, mm_per_pixel).to(inverse.dtype)
         below = self.dark_below.reshape(3, 1, 1)
         self.register_buffer("dark_where", torch.where(flat > 2.0 * below, below, -torch.inf))
+        full = torch.full_like(flat, torch.inf) if full_above is None else full_above.detach().to(inverse.dtype)
+        self.register_buffer("full_above", full)
 
     def forward(self, compensated: Tensor, depth_mm: Tensor | None = None) -> Tensor:
         check_batch("compensated", compensated, 3)
@@ -127,16 +134,23 @@ class NormalFromIntensity(nn.Module):
         """The same for an image of every ``stride``-th pixel."""
         height, width = self.inverse.shape[2], self.inverse.shape[3]
         rows, columns = len(range(stride // 2, height, stride)), len(range(stride // 2, width, stride))
-        coarse = NormalFromIntensity(self.lights, rows, columns, self.mm_per_pixel * stride, self.dark_below / 3.0)
+        coarse = NormalFromIntensity(
+            self.lights,
+            rows,
+            columns,
+            self.mm_per_pixel * stride,
+            self.dark_below / 3.0,
+            full_above=self.full_above[:, stride // 2 :: stride, stride // 2 :: stride],
+        )
         coarse.lights = self.lights  # one set of parameters
         return coarse
 
     def _relight(self, normal: Tensor, compensated: Tensor, depth_mm: Tensor | None, position: Tensor, albedo: Tensor) -> Tensor:
-        """Replace the normals of pixels where a light that shines on the flat skin has gone dark."""
-        dark = compensated < self.dark_where
-        if not bool(dark.any()):
+        """Replace the normals of pixels where a light that shines on the flat skin has gone dark, or a channel is full."""
+        clipped = (compensated < self.dark_where) | (compensated >= self.full_above)
+        if not bool(clipped.any()):
             return normal
-        b, row, column = torch.where(dark.any(dim=1))
+        b, row, column = torch.where(clipped.any(dim=1))
         height, width = compensated.shape[2], compensated.shape[3]
         x = (column.to(normal.dtype) - 0.5 * (width - 1)) * self.mm_per_pixel
         y = (row.to(normal.dtype) - 0.5 * (height - 1)) * self.mm_per_pixel
@@ -152,7 +166,7 @@ class NormalFromIntensity(nn.Module):
         squared = (to_light * to_light).sum(2, keepdim=True)
         rows = albedo[None, :, None] * to_light * (squared.rsqrt() / squared)
         intensity = compensated[b, :, row, column]
-        slope = slope_by_lit_lights(start, intensity, rows, self.noise_std)
+        slope = slope_by_lit_lights(start, intensity, rows, intensity >= self.full_above[:, row, column].t(), self.noise_std)
         solution = normal_from_gradient(slope[:, :, None, None])[:, :, 0, 0]
         return normal.permute(0, 2, 3, 1).index_put((b, row, column), solution).permute(0, 3, 1, 2)
 

@@ -120,7 +120,7 @@ def to_json(rows: list[Row]) -> str:
 
 def _scene(height: int, width: int, press_mm: float) -> tuple[Calibration, Tensor, Scene]:
     pitch = 40.0 / width
-    lights = PointLights([[24.6, 15.0, 34.0], [-25.4, 14.1, 33.0], [0.9, -29.1, 35.0]], [1600.0, 1600.0, 1600.0])
+    lights = PointLights([[24.6, 15.0, 34.0], [-25.4, 14.1, 33.0], [0.9, -29.1, 35.0]], [1000.0, 1000.0, 1000.0])
     scene = sphere_press(10.0, press_mm, height=height, width=width, mm_per_pixel=pitch)
     image = render(scene, lights, noise_std=0.003, bits=8).detach()
     return Calibration.from_lights(lights, Sensor("bench", height, width, pitch)), image, scene

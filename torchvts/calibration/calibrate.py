@@ -69,7 +69,9 @@ def calibrate(background: Tensor, sensor: Sensor, *, progress: bool = False) -> 
     report["residual_std"] = spread.tolist()
     # contact changes the light by more than 5 % and is wider than dirt: 5 sigmas of the residual and of 1 % of the model
     judge = ContactMask(model, spread.reshape(3, 1, 1) + 0.01 * model, min_size_px=0.05 * sensor.height)
-    standing_out = float(judge(calibration.background[None]).double().mean())
+    full = (background.to(model.dtype) > 0.995) | (model > 0.95)  # what the camera clips tells nothing
+    seen = torch.where(full, model, calibration.background)
+    standing_out = float(judge(seen[None]).double().mean())
     report["standing_out"] = standing_out
     if standing_out > 0.01:
         warnings.warn(

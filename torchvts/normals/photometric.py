@@ -43,7 +43,10 @@ def slope_by_lit_lights(
         c = (across[:, :, 1] ** 2).sum(1) + weight
         right = (across * residual[:, :, None]).sum(1) + weight * (start - slope)
         step = torch.stack((c * right[:, 0] - b * right[:, 1], a * right[:, 1] - b * right[:, 0]), dim=1)
-        step = step / (a * c - b * b)[:, None]
+        p_q = torch.linalg.cross(across[:, :, 0], across[:, :, 1], dim=1)
+        # a c - b^2 without cancellation (Cauchy-Binet): one lit channel leaves a determinant of the prior's size
+        determinant = (p_q * p_q).sum(1) + weight * (a + c - weight)
+        step = step / determinant[:, None]
         length = torch.sqrt((step * step).sum(1, keepdim=True) + 1e-18)
         slope = slope + step * (0.5 / length).clamp_max(1.0)
     return slope

@@ -45,10 +45,35 @@ def pipe(mode):
     return lambda dtype: vts.DepthPipeline.from_calibration(calibration(dtype), mode)
 
 
+def response(dtype):
+    numbers = torch.Generator().manual_seed(3)
+    fields = [vts.calibration.field.Family(1, 1, deep, 20.0) for deep in (False, True)]
+    fast, precise = (f.field(0.1 * torch.randn(f.size(), generator=numbers, dtype=torch.float64)) for f in fields)
+    model = vts.core.response.ResponseModel(fast, precise)
+    return vts.Calibration.from_response(model, SENSOR, calibration(dtype).background)
+
+
+def response_pipe(mode):
+    return lambda dtype: vts.DepthPipeline.from_calibration(response(dtype), mode)
+
+
+def lookup(dtype):
+    slope = torch.randn(500, 2, generator=torch.Generator().manual_seed(1))
+    return vts.NormalFromLookup.fit(calibration(torch.float32).background, slope @ torch.ones(2, 3) * 0.1, slope).to(dtype)
+
+
+def network(dtype):
+    return vts.NormalFromMLP(HEIGHT, WIDTH, calibration(torch.float32).background).requires_grad_(False).to(dtype)
+
+
 CASES = {
     "Compensate": (part("compensate"), images, "image"),
     "ContactMask": (part("contact"), images, "compensated"),
     "NormalFromIntensity": (part("normals"), images, "compensated"),
+    "NormalFromResponse": (lambda dtype: vts.NormalFromResponse.from_calibration(response(dtype)), images, "compensated"),
+    "NormalFromLookup": (lookup, images, "compensated"),
+    "NormalFromMLP": (network, images, "compensated"),
+    "FillMarkers": (lambda dtype: vts.FillMarkers(5.0), images, "image"),
     "GradientFromNormal": (
         lambda dtype: vts.GradientFromNormal(),
         lambda dtype: vts.normal_from_gradient(gradient(dtype)),
@@ -60,8 +85,11 @@ CASES = {
     "DepthPipeline fast": (pipe("fast"), images, "images"),
     "DepthPipeline precise": (pipe("precise"), images, "images"),
     "DepthPipeline auto": (pipe("auto"), images, "images"),
+    "DepthPipeline response fast": (response_pipe("fast"), images, "images"),
+    "DepthPipeline response precise": (response_pipe("precise"), images, "images"),
+    "DepthPipeline response auto": (response_pipe("auto"), images, "images"),
 }
-SIZED = [name for name in CASES if "Poisson" not in name and "Gradient" not in name]
+SIZED = [name for name in CASES if not any(part in name for part in ("Poisson", "Gradient", "Markers"))]
 every_block = pytest.mark.parametrize("name", CASES)
 
 

@@ -1,5 +1,6 @@
 """Lights from one image without contact, and how honestly the fit speaks of itself."""
 
+import dataclasses
 import json
 import math
 import warnings
@@ -145,11 +146,12 @@ def test_tacto(data, camera):
 @pytest.mark.parametrize("unit", ["gelsight_mini_a", "gelsight_mini_b"])
 def test_a_real_sensor_does_not_pin_point_lights_and_says_so(data, unit):
     background = vts.read_image(data / unit / "background.png")
-    fit = vts.fit_lights(background, vts.Sensor.load("gelsight_mini"))
+    sensor = dataclasses.replace(vts.Sensor.load("gelsight_mini"), prior=None)
+    fit = vts.fit_lights(background, sensor)
     assert float(fit.direction_std_deg.max()) > 5.0
     assert not fit.converged or "calibrate with presses or known lights" in fit.message
     with pytest.warns(vts.CalibrationWarning, match="background: "):
-        vts.calibrate(background, vts.Sensor.load("gelsight_mini"))
+        vts.calibrate(background, sensor)
 
 
 def test_a_clean_background_warns_of_nothing(small_background, small_sensor):

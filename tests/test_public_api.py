@@ -9,10 +9,12 @@ import pytest
 import torchvts as vts
 
 NAMES = [
-    "Calibration", "CalibrationWarning", "Compensate", "ContactMask", "DepthOutput", "DepthPipeline", "GradientFromNormal",
-    "LightFit", "NormalFromIntensity", "PointLights", "PoissonDCT", "PoissonDST", "PoissonRest", "Sensor", "calibrate",
-    "depth_to_points", "divergence", "fit_lights", "gradient_from_normal", "metrics", "near_field_shading", "normal_from_gradient",
-    "poisson_dct", "poisson_dst", "poisson_rest", "read_image", "scenes", "shipped_sensors", "write_image",
+    "Calibration", "CalibrationWarning", "Compensate", "ContactMask", "DepthOutput", "DepthPipeline", "FillMarkers",
+    "GradientFromNormal", "LightFit", "NormalFromIntensity", "NormalFromLookup", "NormalFromMLP", "NormalFromResponse",
+    "PointLights", "PoissonDCT", "PoissonDST", "PoissonRest", "Press", "Sensor", "calibrate", "depth_to_points", "divergence",
+    "fill_markers", "find_markers", "fit_lights", "fit_mlp", "fit_prior", "gradient_from_normal", "gs_sdk", "metrics",
+    "near_field_shading", "normal_from_gradient", "poisson_dct", "poisson_dst", "poisson_rest", "read_image", "scenes",
+    "shipped_sensors", "write_image",
 ]  # fmt: skip
 ARGUMENTS = {
     vts.Sensor: ["name", "height", "width", "mm_per_pixel"],
@@ -20,7 +22,13 @@ ARGUMENTS = {
     vts.PointLights: ["position_mm", "albedo", "gloss"],
     vts.near_field_shading: ["depth_mm", "normal", "lights", "mm_per_pixel"],
     vts.fit_lights: ["background", "sensor"],
-    vts.calibrate: ["background", "sensor"],
+    vts.calibrate: ["background", "sensor", "presses"],
+    vts.Press: ["image", "ball_diameter_mm", "name"],
+    vts.fit_prior: ["background", "sensor", "presses", "source"],
+    vts.NormalFromLookup.fit: ["flat", "change", "slope"],
+    vts.NormalFromMLP: ["height", "width", "flat", "hidden"],
+    vts.NormalFromMLP.load: ["path", "flat"],
+    vts.NormalFromResponse: ["fast", "precise", "height", "width", "mm_per_pixel"],
     vts.Calibration.from_lights: ["lights", "sensor", "background", "report"],
     vts.Calibration.load: ["path"],
     vts.Calibration.save: ["self", "path"],

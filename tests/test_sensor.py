@@ -90,19 +90,14 @@ def test_every_shipped_sensor_loads_under_its_own_name(name):
 def test_shipped_figures():
     assert {"gelsight_mini", "gelsight_wedge", "tacto"} <= set(vts.shipped_sensors())
     mini = vts.Sensor.load("gelsight_mini")
-    assert (mini.height, mini.width, mini.mm_per_pixel, mini.gamma) == (240, 320, 0.0634, 1.0)
+    assert (mini.height, mini.width, mini.mm_per_pixel, mini.exponent) == (240, 320, 0.0634, 1.0)
     assert vts.Sensor.load("tacto").gamma == 2.2
 
 
 def test_defaults_and_immutability():
     sensor = vts.Sensor(**GOOD)
-    assert (sensor.gamma, sensor.blur_px, sensor.light_position_mm, sensor.roi_px, sensor.corners_px) == (
-        1.0,
-        0.0,
-        None,
-        None,
-        None,
-    )
+    assert (sensor.gamma, sensor.exponent, sensor.blur_px, sensor.markers) == (None, 1.0, 0.0, False)
+    assert (sensor.light_position_mm, sensor.roi_px, sensor.corners_px, sensor.prior) == (None, None, None, None)
     with pytest.raises(AttributeError):
         sensor.height = 5
 

@@ -1,14 +1,16 @@
 """torchvts: camera images of visual-tactile sensors into depth, normals, contact and pose, as differentiable PyTorch modules."""
 
 from . import metrics, scenes
-from .calibration import CalibrationWarning, LightFit, calibrate, fit_lights
+from .calibration import CalibrationWarning, LightFit, Press, calibrate, fit_lights, fit_prior
 from .compensate import Compensate
 from .contact import ContactMask
+from .core import gs_sdk
 from .core.files import read_image, write_image
 from .core.geometry import GradientFromNormal, depth_to_points, gradient_from_normal, normal_from_gradient
 from .core.sensor import Sensor, shipped_sensors
 from .integration import PoissonDCT, PoissonDST, PoissonRest, divergence, poisson_dct, poisson_dst, poisson_rest
-from .normals import NormalFromIntensity
+from .markers import FillMarkers, fill_markers, find_markers
+from .normals import NormalFromIntensity, NormalFromLookup, NormalFromMLP, NormalFromResponse, fit_mlp
 from .pipeline import DepthOutput, DepthPipeline
 from .record import Calibration
 from .shading import PointLights, near_field_shading
@@ -22,19 +24,29 @@ __all__ = [
     "ContactMask",
     "DepthOutput",
     "DepthPipeline",
+    "FillMarkers",
     "GradientFromNormal",
     "LightFit",
     "NormalFromIntensity",
+    "NormalFromLookup",
+    "NormalFromMLP",
+    "NormalFromResponse",
     "PointLights",
     "PoissonDCT",
     "PoissonDST",
     "PoissonRest",
+    "Press",
     "Sensor",
     "calibrate",
     "depth_to_points",
     "divergence",
+    "fill_markers",
+    "find_markers",
     "fit_lights",
+    "fit_mlp",
+    "fit_prior",
     "gradient_from_normal",
+    "gs_sdk",
     "metrics",
     "near_field_shading",
     "normal_from_gradient",

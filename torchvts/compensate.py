@@ -1,22 +1,29 @@
-"""From a camera's image to the image the light model speaks of: linear light, constant defects taken out."""
+"""From a camera's image to the image the model speaks of: linear light, constant defects taken out, noise smoothed."""
+
+import math
 
 import torch
 from torch import Tensor, nn
 
 from .core.checks import check_batch, check_positive, check_same_size
+from .markers import FillMarkers
+from .record import Calibration
 
 
 class Compensate(nn.Module):
     """Linear light, with what the model and the background disagree on taken out.
 
-    ``compensated = image^gamma * gain + offset``; pixels named in ``defects`` then become the mean of their nearest sound
-    neighbours. The multiplicative form (gain = model / background) is exact for albedo, spots and vignetting, the additive
-    form of the paper (offset = I_delta = model - background) for ambient light.
+    Printed markers are filled first; ``compensated = image^gamma * gain + offset``; pixels named in ``defects`` then become
+    the mean of their nearest sound neighbours, and the image is blurred. The multiplicative form (gain = model / background)
+    is exact for albedo, spots and vignetting, the additive form of the paper (offset = I_delta = model - background) for
+    ambient light.
 
     Args:
         gain: (3, H, W) or None for 1. offset: (3, H, W) or None for 0.
         gamma: camera response, value = light^(1/gamma).
         defects: (H, W) bool, pixels that tell nothing; None for none.
+        blur_px: standard deviation of a Gaussian blur, pixels; 0 for none.
+        markers: fills printed markers; None for a skin without.
     Source:
         eq. 8 of the paper for the offset.
     Example:
@@ -28,6 +35,7 @@ class Compensate(nn.Module):
     offset: Tensor | None
     defect: Tensor
     sound: Tensor
+    kernel: Tensor
 
     def __init__(
         self,
@@ -35,8 +43,12 @@ class Compensate(nn.Module):
         offset: Tensor | None = None,
         gamma: float = 1.0,
         defects: Tensor | None = None,
+        blur_px: float = 0.0,
+        markers: FillMarkers | None = None,
     ) -> None:
         super().__init__()
+        self.markers = nn.Identity() if markers is None else markers
+        self.blur_px = float(blur_px) if blur_px == 0 else check_positive("blur_px", blur_px)
         self.gamma = check_positive("gamma", gamma)
         for name, value in (("gain", gain), ("offset", offset)):
             if value is not None and (value.dim() != 3 or value.shape[0] != 3):
@@ -50,10 +62,18 @@ class Compensate(nn.Module):
         self.register_buffer("offset", None if offset is None else offset.detach().clone())
         self.register_buffer("defect", flat_index)
         self.register_buffer("sound", sound)
+        self.register_buffer("kernel", gaussian_kernel(self.blur_px))
+
+    @classmethod
+    def from_calibration(cls, calibration: Calibration) -> "Compensate":
+        """What a calibrated unit's images need, so that at rest they become ``calibration.flat``."""
+        sensor = calibration.sensor
+        return cls(calibration.gain, None, sensor.exponent, calibration.defects, sensor.blur_px, calibration.markers)
 
     def forward(self, image: Tensor) -> Tensor:
         """(B, 3, H, W) image in [0, 1] to (B, 3, H, W) linear light."""
         check_batch("image", image, 3)
+        image = self.markers(image)
         light = image if self.gamma == 1.0 else image.clamp_min(1e-6) ** self.gamma
         gain, offset = self.gain, self.offset
         if gain is not None:
@@ -62,11 +82,32 @@ class Compensate(nn.Module):
         if offset is not None:
             check_same_size("image", image, "the calibration", offset.shape[1], offset.shape[2])
             light = light + offset
-        if self.defect.shape[0] == 0:
-            return light
-        pixels = light.flatten(2)
-        repaired = pixels[:, :, self.sound].mean(dim=3)  # (B, 3, N)
-        return pixels.index_copy(2, self.defect, repaired).reshape(light.shape)
+        if self.defect.shape[0] > 0:
+            pixels = light.flatten(2)
+            repaired = pixels[:, :, self.sound].mean(dim=3)  # (B, 3, N)
+            light = pixels.index_copy(2, self.defect, repaired).reshape(light.shape)
+        return light if self.blur_px == 0.0 else blur(light, self.kernel)
+
+
+def gaussian_kernel(std_px: float) -> Tensor:
+    """Weights of a Gaussian at whole pixels up to three standard deviations, summing to one, (2 * ceil(3 std) + 1,)."""
+    reach = math.ceil(3.0 * std_px)
+    place = torch.arange(-reach, reach + 1, dtype=torch.float64)
+    weight = torch.exp(-0.5 * (place / max(std_px, 1e-6)) ** 2)
+    return (weight / weight.sum()).float()
+
+
+def blur(image: Tensor, kernel: Tensor) -> Tensor:
+    """Blur along rows and columns by a kernel of odd length, the border repeated. Scripts, which kornia's does not; equal to it.
+
+    Args:
+        image: (B, C, H, W). kernel: (K,).
+    """
+    count, reach = image.shape[1], kernel.shape[0] // 2
+    weight = kernel.to(image.dtype).expand(count, 1, 1, -1)
+    padded = nn.functional.pad(image, [reach, reach, reach, reach], mode="replicate")
+    rows = nn.functional.conv2d(padded, weight, groups=count)
+    return nn.functional.conv2d(rows, weight.transpose(2, 3), groups=count)
 
 
 def nearest_sound(defects: Tensor) -> tuple[Tensor, Tensor]:

@@ -10,6 +10,10 @@ from torch import Tensor, nn
 
 from .core.checks import QUANTISATION_STD, check_batch, check_positive, check_same_size
 from .core.noise import noise_std as frame_noise_std
+from .record import Calibration
+
+LIGHT_DRIFT = 0.008
+"""Least noise, relative to the background, with a response field: the lamps of real sensors drift by 1 to 2 % of their light."""
 
 
 def reconstruct(seed: Tensor, mask: Tensor) -> Tensor:
@@ -97,6 +101,12 @@ class ContactMask(nn.Module):
         noise = noise_std.reshape(3, 1, 1) if noise_std.dim() == 1 else noise_std
         self.register_buffer("flat", flat.detach().clone())
         self.register_buffer("per_noise", 1.0 / noise.detach().clamp_min(QUANTISATION_STD).to(flat.dtype))
+
+    @classmethod
+    def from_calibration(cls, calibration: Calibration) -> "ContactMask":
+        """The mask of a calibrated unit's compensated images."""
+        noise = calibration.compensated_noise_std
+        return cls(calibration.flat, noise if calibration.response is None else noise.clamp_min(LIGHT_DRIFT))
 
     def forward(self, compensated: Tensor) -> Tensor:
         """bool (B, 1, H, W)."""

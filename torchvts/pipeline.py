@@ -10,8 +10,8 @@ from .contact import ContactMask
 from .core.checks import check_batch, check_range
 from .core.geometry import GradientFromNormal, normal_from_gradient
 from .integration import PoissonRest, poisson_rest
-from .normals import NormalFromIntensity
-from .record import DEFECT_RATIO, Calibration
+from .normals import NormalFromIntensity, NormalFromResponse
+from .record import Calibration
 
 MODES = ("fast", "precise", "auto")
 
@@ -36,7 +36,7 @@ class DepthPipeline(nn.Module):
     Args:
         compensate, contact, gradient, integrate: modules. normals: any module from a compensated image (B, 3, H, W) to
             normals (B, 3, H, W); one that sets ``uses_depth = True`` takes a second argument, the depth or None, and one
-            that has ``coarse(stride)``, itself for every stride-th pixel, lets ``auto`` foresee.
+            that has ``coarse(stride)``, itself for every stride-th pixel, lets ``auto`` foresee; ``passes`` bounds the loop.
         mm_per_pixel: pixel pitch, mm. mode: "fast", "precise" or "auto".
         tolerance_px, worth_px: pixels of pitch. max_passes: bound of the precise loop.
     Source:
@@ -79,7 +79,7 @@ class DepthPipeline(nn.Module):
         self.mm_per_pixel = mm_per_pixel
         self.tolerance_px = tolerance_px
         self.worth_px = worth_px
-        self.max_passes = max_passes
+        self.max_passes = min(max_passes, int(getattr(normals, "passes", max_passes)))
         self.refines = uses_depth and mode != "fast"
         self.skips = mode == "auto"
         coarse = getattr(normals, "coarse", None)
@@ -95,7 +95,8 @@ class DepthPipeline(nn.Module):
         Args:
             calibration: from :func:`calibrate`, :meth:`Calibration.from_lights` or :meth:`Calibration.load`.
             mode: "fast", "precise" or "auto".
-            normals, integrate: modules to put in place of NormalFromIntensity and PoissonRest.
+            normals, integrate: modules to put in place of the calibrated inverse model and PoissonRest. ``normals`` sees what
+                the calibrated model would: the image scaled to the light model's, or image / background for a response field.
         Example:
             >>> from torchvts import PointLights, Sensor
             >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
@@ -106,25 +107,14 @@ class DepthPipeline(nn.Module):
         """
         if not isinstance(calibration, Calibration):
             raise TypeError(f"calibration: expected a Calibration, got {type(calibration).__name__}: Calibration.load reads a file")
-        sensor, model = calibration.sensor, calibration.model_image
-        noise = calibration.light_noise_std
-        gain = None
-        if calibration.measured:
-            gain = (model / calibration.background.clamp_min(1e-6)).clamp(1.0 / DEFECT_RATIO, DEFECT_RATIO)
-            noise = noise * gain * 2.0**0.5  # the frame's noise and the background's
+        sensor = calibration.sensor
+        if normals is None:
+            by_response = calibration.response is not None
+            normals = (NormalFromResponse if by_response else NormalFromIntensity).from_calibration(calibration)
         modules = (
-            Compensate(gain=gain, gamma=sensor.gamma, defects=calibration.defects),
-            ContactMask(model, noise),
-            normals
-            or NormalFromIntensity(
-                calibration.lights,
-                sensor.height,
-                sensor.width,
-                sensor.mm_per_pixel,
-                noise_std=noise.flatten(1).median(dim=1).values,
-                inverse=calibration.inverse,
-                full_above=(0.995**sensor.gamma) * (torch.ones_like(model) if gain is None else gain),
-            ),
+            Compensate.from_calibration(calibration),
+            ContactMask.from_calibration(calibration),
+            normals,
             GradientFromNormal(),
             integrate or PoissonRest(sensor.mm_per_pixel),
         )

@@ -1,6 +1,7 @@
 """Floor 3, offline: from images to the record of a calibrated unit."""
 
-from .calibrate import CalibrationWarning, calibrate
+from .calibrate import CalibrationWarning, calibrate, fit_prior
 from .lights import LightFit, fit_lights
+from .presses import Press
 
-__all__ = ["CalibrationWarning", "LightFit", "calibrate", "fit_lights"]
+__all__ = ["CalibrationWarning", "LightFit", "Press", "calibrate", "fit_lights", "fit_prior"]

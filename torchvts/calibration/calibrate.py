@@ -1,75 +1,262 @@
 """Calibrate a unit: from what is given of it to its record."""
 
+import dataclasses
+import math
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from ..compensate import Compensate
 from ..contact import ContactMask
 from ..core.checks import check_image
+from ..core.geometry import gradient_from_normal
+from ..core.response import ResponseField, ResponseModel, SensorPrior, fit_log_background
 from ..core.sensor import Sensor
+from ..normals import NormalFromIntensity
 from ..record import Calibration
 from ..shading import PointLights, flat_image
-from .lights import LOOSE_DEG, check_exposure, fit_lights
+from .field import angle_deg
+from .lights import LOOSE_DEG, LightFit, check_exposure, fit_lights
+from .presses import Contact, Press, read_contacts
+from .response import FAMILIES, ResponseFit, fit_response
+
+PINNED_DEG = 2.0
+"""Point lights are believed beside a sensor's prior only if the image pins each of them this well."""
+
+FOREIGN_SPREAD = 0.35
+"""A background whose logarithm departs this far (RMS) from that of the prior's unit, brightness aside, is not of its type."""
+
+RESPONSE_BLUR_PX = 1.0
+"""Blur of a response field at 320 x 240: it takes a third off the error of normals on a GelSight Mini, more takes nothing."""
+
+
+PRIOR_FAMILY = ((2, 1),)
+"""On a second GelSight Mini this one is 2.7 to 2.9 degrees from that unit's own network, degrees (3, 2) and (3, 3) 2.8 to 3.2."""
 
 
 class CalibrationWarning(UserWarning):
     """A calibration that was made, but should not be trusted as it is."""
 
 
-def calibrate(background: Tensor, sensor: Sensor, *, progress: bool = False) -> Calibration:
-    """Calibrate a unit from one image without contact.
+def calibrate(
+    background: Tensor,
+    sensor: Sensor,
+    presses: Sequence[Press] = (),
+    *,
+    progress: bool = False,
+) -> Calibration:
+    """Calibrate a unit from one image without contact, and, if there are any, presses of balls of known diameter.
 
-    Lights that the sensor file gives keep their place and only their albedo is fitted; else :func:`fit_lights` finds both.
+    The model is chosen from what is given. An image alone: the sensor's prior, carried to this unit, unless the image pins point
+    lights; without a prior point lights, and a warning where they are not pinned. Presses: response fields, their size by held-out
+    angle, starting from the prior if there is one; point lights if they do better on the presses. Where the balls lie is found.
 
     Args:
         background: (3, H, W) in [0, 1], R, G, B, of the sensor's size.
-        sensor: the sensor.
+        sensor: the sensor; its gamma is chosen where it is left open.
+        presses: images of balls pressed anywhere; centers need not be known.
         progress: show a bar.
     Returns:
-        A :class:`Calibration`; its ``report`` holds the figures of the fit.
+        A :class:`Calibration`. Its ``report`` holds "model", "reason", "candidates" (each with the figure that decided), and
+        "presses": per press "name", "used", "reason", "center_px" (x, y), "contact_radius_px", "error_deg".
     Raises:
-        ValueError, TypeError: bad image: shape, dtype, range, black, saturated.
+        ValueError, TypeError: bad image: shape, dtype, range, black, saturated; presses of which none can be used.
     Warns:
-        CalibrationWarning: the fit did not converge, the image does not pin the lights, or it seems to hold a contact.
+        CalibrationWarning: what was left out and why; the fit did not converge, the image does not pin the lights, it seems to
+            hold a contact, or it is not of the prior's sensor type.
     Source:
-        eq. 6-8 of the paper.
+        eq. 6-8 of the paper for lights; the rest is this project's.
     Example:
         >>> sensor = Sensor(name="rig", height=48, width=64, mm_per_pixel=0.6)
         >>> lights = PointLights([[25, 0, 30], [-12, 20, 30], [-12, -20, 30]], [900, 900, 900])
-        >>> calibrate(flat_image(lights, 48, 64, 0.6).detach(), sensor).report["converged"]
-        True
+        >>> calibrate(flat_image(lights, 48, 64, 0.6).detach(), sensor).report["model"]
+        'point_lights'
     """
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     check_exposure(background)
+    for k, press in enumerate(presses):
+        if not isinstance(press, Press):
+            raise TypeError(f"presses[{k}]: expected a Press, got {type(press).__name__}: Press(image, ball_diameter_mm)")
+    by_lights, lights_row, complaint = _by_lights(background, sensor, progress)
+    candidates = [lights_row]
+    prior = None if sensor.prior is None else sensor.prior.response
+    if prior is not None and sensor.blur_px > 0:
+        prior = dataclasses.replace(prior, blur_px=sensor.blur_px)
+    if prior is not None:
+        _check_type(background, sensor)
+    if not presses:
+        pinned = lights_row["score_deg"] <= PINNED_DEG and lights_row["misfit"] < 0.02
+        if prior is None or pinned:
+            if complaint:
+                warnings.warn(complaint, CalibrationWarning, stacklevel=2)
+            reason = f"the image pins the lights to {lights_row['score_deg']:.2f} deg" if pinned else lights_row["note"]
+            report = by_lights.report | {"reason": f"point lights: {reason}", "candidates": candidates}
+            return _judge_rest(dataclasses.replace(by_lights, report=report))
+        candidates.append({"model": "prior", "family": "response of the sensor type", "numbers": 0, "score_deg": None, "pass": 2})
+        reason = f"the sensor's prior, carried to this unit by its background; point lights rejected: {lights_row['note']}"
+        report = {"model": "response", "response": "the sensor's prior", "reason": reason, "candidates": candidates}
+        return Calibration.from_response(prior, sensor, background, report)
+    fit, contacts, by_response = _by_presses(background, sensor, presses, prior, progress)
+    candidates += fit.candidates
+    used = [contact for contact in contacts if not contact.reason]
+    lights_row["score_deg"] = lights_error = _lights_error(by_lights, sensor, presses, contacts)
+    for contact in contacts:
+        if contact.reason:
+            warnings.warn(f"{contact.name}: left out: {contact.reason}", CalibrationWarning, stacklevel=2)
+    told = {"candidates": candidates, "presses": [_tell(contact, sensor) for contact in contacts]}
+    if lights_error < (math.inf if fit.error_deg is None else fit.error_deg) and lights_error < 5.0:
+        other = "too few presses for a response field" if fit.error_deg is None else f"response fields {fit.error_deg:.2f}"
+        reason = f"point lights: on {len(used)} presses their normals are {lights_error:.2f} deg off, {other}"
+        return _judge_rest(dataclasses.replace(by_lights, report=by_lights.report | {"reason": reason} | told))
+    lights_row["note"] = f"rejected: on {len(used)} presses their normals are {lights_error:.1f} deg off; {lights_row['note']}"
+    report = {"model": "response", "response": "fitted to presses", "reason": fit.reason, "held_out_deg": fit.error_deg} | told
+    return dataclasses.replace(by_response, report=report)
+
+
+def fit_prior(background: Tensor, sensor: Sensor, presses: Sequence[Press], source: str = "") -> SensorPrior:
+    """What presses on one unit say of every unit of its type: a field of a size that carries over to other units.
+
+    Linear terms of degree 2 and products of degree 1: larger fields fit this unit better and others worse.
+
+    Args:
+        background, sensor, presses: as for :func:`calibrate`; a prior of the sensor is not looked at.
+        source: whose images these are, kept with the prior.
+    Raises:
+        ValueError, TypeError: as :func:`calibrate`.
+    Source:
+        this project.
+    """
+    fit, _, unit = _by_presses(background, dataclasses.replace(sensor, prior=None), presses, None, False, PRIOR_FAMILY)
+    log_background = fit_log_background(unit.background, sensor.mm_per_pixel)
+    return SensorPrior(fit.model, log_background, 0.5 * sensor.width * sensor.mm_per_pixel, source)
+
+
+def _by_lights(background: Tensor, sensor: Sensor, progress: bool) -> tuple[Calibration, dict[str, Any], str]:
+    """Point lights from the image, their row in the table of candidates, and what there is to complain of."""
     report: dict[str, Any] = {"model": "point_lights", "lights": "fitted"}
+    row: dict[str, Any] = {"model": "point lights", "family": "three lights", "numbers": 12, "pass": 2, "misfit": 0.0}
     if sensor.light_position_mm is not None:
         lights = _scale_albedo(PointLights([list(row) for row in sensor.light_position_mm], [1.0, 1.0, 1.0]), background, sensor)
         report |= {"lights": "positions from the sensor file, albedo fitted", "converged": True}
-    else:
-        fit = fit_lights(background, sensor, progress=progress)
-        lights = fit.lights
-        report |= {
-            "converged": fit.converged,
-            "message": fit.message,
-            "steps": len(fit.loss_history),
-            "loss": fit.loss_history[-1],
-            "direction_std_deg": fit.direction_std_deg.tolist(),
-            "position_std_mm": fit.position_std_mm.tolist(),
-            "misfit": fit.misfit.tolist(),
-            "inlier_fraction": fit.inlier_fraction,
-        }
-        report["gloss"] = fit.lights.gloss.tolist()
-        if not fit.converged or bool((fit.direction_std_deg > LOOSE_DEG).any()):
-            warnings.warn(f"background: {fit.message}", CalibrationWarning, stacklevel=2)
-    calibration = Calibration.from_lights(lights, sensor, background, report)
-    model = calibration.model_image
+        return (
+            Calibration.from_lights(lights, sensor, background, report),
+            row | {"numbers": 3, "score_deg": 0.0, "note": "given"},
+            "",
+        )
+    sensor, fit = _choose_gamma(background, sensor, progress)
+    loosest = float(fit.direction_std_deg.max())
+    report |= {
+        "converged": fit.converged,
+        "message": fit.message,
+        "steps": len(fit.loss_history),
+        "loss": fit.loss_history[-1],
+        "gamma": sensor.exponent,
+        "direction_std_deg": fit.direction_std_deg.tolist(),
+        "position_std_mm": fit.position_std_mm.tolist(),
+        "misfit": fit.misfit.tolist(),
+        "inlier_fraction": fit.inlier_fraction,
+        "gloss": fit.lights.gloss.tolist(),
+    }
+    note = f"one image leaves the lights {loosest:.1f} deg loose, with a smooth misfit of {float(fit.misfit.max()):.1%}"
+    row |= {"score_deg": loosest, "misfit": float(fit.misfit.max()), "note": note if fit.converged else fit.message}
+    complaint = f"background: {fit.message}" if not fit.converged or loosest > LOOSE_DEG else ""
+    if not fit.converged:
+        row["score_deg"] = 90.0
+    return Calibration.from_lights(fit.lights, sensor, background, report), row, complaint
+
+
+def _choose_gamma(background: Tensor, sensor: Sensor, progress: bool) -> tuple[Sensor, LightFit]:
+    """The sensor with a gamma, and its lights: 2.2 where the file leaves it open and that leaves clearly less unexplained."""
+    linear = dataclasses.replace(sensor, gamma=sensor.exponent)
+    fit = fit_lights(background, linear, progress=progress)
+    if sensor.gamma is not None or float(fit.misfit.max()) < 0.005:
+        return linear, fit
+    curved = dataclasses.replace(sensor, gamma=2.2)
+    other = fit_lights(background, curved, progress=progress)
+    better = other.converged and other.loss_history[-1] < 0.5 * fit.loss_history[-1]
+    return (curved, other) if better else (linear, fit)
+
+
+def _by_presses(
+    background: Tensor,
+    sensor: Sensor,
+    presses: Sequence[Press],
+    prior: ResponseModel | None,
+    progress: bool,
+    families: tuple[tuple[int, int], ...] = FAMILIES,
+) -> tuple[ResponseFit, list[Contact], Calibration]:
+    gamma = prior.gamma if prior is not None else sensor.exponent
+    blur_px = prior.blur_px if prior is not None else max(sensor.blur_px, RESPONSE_BLUR_PX)
+    chosen = dataclasses.replace(sensor, gamma=gamma, blur_px=blur_px)
+    contacts = _contacts(background, chosen, presses)
+    fit = fit_response(contacts, chosen, prior, blur_px, progress, families)
+    return fit, contacts, Calibration.from_response(fit.model, chosen, background)
+
+
+def _contacts(background: Tensor, sensor: Sensor, images: Sequence[Press | Tensor]) -> list[Contact]:
+    """Contacts as the pipeline would see them."""
+    unit = Calibration.from_response(_blank(sensor), sensor, background.double())
+    compensate, contact = Compensate.from_calibration(unit).double(), ContactMask.from_calibration(unit).double()
+    return read_contacts(images, background, compensate, contact, sensor)
+
+
+def _blank(sensor: Sensor) -> ResponseModel:
+    rest = ResponseField(0, -1, False, 1.0, ((0.0,) * 3, (0.0,) * 3))
+    return ResponseModel(rest, None, sensor.exponent, sensor.blur_px)
+
+
+def _lights_error(calibration: Calibration, sensor: Sensor, presses: Sequence[Press], contacts: Sequence[Contact]) -> float:
+    """Mean angle of the point lights' normals on the balls that were found, degrees."""
+    compensate = Compensate.from_calibration(calibration)
+    normals = NormalFromIntensity.from_calibration(calibration)
+    errors = []
+    for press, contact in zip(presses, contacts):
+        if contact.reason:
+            continue
+        image = press.image.detach().cpu().to(calibration.background.dtype)[None]
+        gradient = gradient_from_normal(normals(compensate(image)))[0].double().flatten(1)[:, contact.index]
+        inside = contact.inside()
+        errors.append(angle_deg(gradient[:, inside], contact.ball_slope()[:, inside]))
+    return sum(errors) / len(errors)
+
+
+def _tell(contact: Contact, sensor: Sensor) -> dict[str, Any]:
+    """A press's line in the report."""
+    told = {"name": contact.name, "used": not contact.reason, "reason": contact.reason} | contact.figures
+    if contact.contact_radius_mm > 0:
+        middle = ((sensor.width - 1) / 2, (sensor.height - 1) / 2)
+        told["center_px"] = [float(c) / sensor.mm_per_pixel + m for c, m in zip(contact.center_mm, middle)]
+        told["contact_radius_px"] = contact.contact_radius_mm / sensor.mm_per_pixel
+    return told
+
+
+def _check_type(background: Tensor, sensor: Sensor) -> None:
+    """Warn if the background is not one that units of this type show."""
+    assert sensor.prior is not None
+    gamma = sensor.prior.response.gamma
+    usual = sensor.prior.background(sensor.height, sensor.width, sensor.mm_per_pixel).log()
+    ratio = gamma * background.double().clamp_min(1e-3).log() - usual
+    spread = float((ratio - ratio.mean()).square().mean().sqrt())
+    if spread > FOREIGN_SPREAD:
+        warnings.warn(
+            f"background: its light is spread {spread:.0%} (RMS) unlike that of the unit the prior of sensor '{sensor.name}' was "
+            f"fitted on, at most {FOREIGN_SPREAD:.0%} is usual: another sensor type, channels swapped, or a lamp out",
+            CalibrationWarning,
+            stacklevel=3,
+        )
+
+
+def _judge_rest(calibration: Calibration) -> Calibration:
+    """Add how far the background is from the lights' model, and warn if it seems to hold a contact."""
+    model, report = calibration.model_image, dict(calibration.report)
     spread = calibration.compensation.abs().flatten(1).median(dim=1).values / 0.6745
     report["residual_std"] = spread.tolist()
     # contact changes the light by more than 5 % and is wider than dirt: 5 sigmas of the residual and of 1 % of the model
-    judge = ContactMask(model, spread.reshape(3, 1, 1) + 0.01 * model, min_size_px=0.05 * sensor.height)
-    full = (background.to(model.dtype) > 0.995) | (model > 0.95)  # what the camera clips tells nothing
+    judge = ContactMask(model, spread.reshape(3, 1, 1) + 0.01 * model, min_size_px=0.05 * calibration.sensor.height)
+    full = (calibration.background > 0.995) | (model > 0.95)  # what the camera clips tells nothing
     seen = torch.where(full, model, calibration.background)
     standing_out = float(judge(seen[None]).double().mean())
     report["standing_out"] = standing_out
@@ -78,13 +265,13 @@ def calibrate(background: Tensor, sensor: Sensor, *, progress: bool = False) -> 
             f"background: {standing_out:.1%} of the image stands out from the fitted lights by more than 5 times their residual "
             f"({', '.join(f'{v:.4f}' for v in spread.tolist())}): contact in the calibration image? take it again without",
             CalibrationWarning,
-            stacklevel=2,
+            stacklevel=3,
         )
-    return calibration
+    return dataclasses.replace(calibration, report=report)
 
 
 def _scale_albedo(lights: PointLights, background: Tensor, sensor: Sensor) -> PointLights:
     """The albedo that makes the median of image / model one in each channel."""
     model = flat_image(lights, sensor.height, sensor.width, sensor.mm_per_pixel).detach()
-    ratio = (background.to(model.dtype) ** sensor.gamma / model).flatten(1).median(dim=1).values
+    ratio = (background.to(model.dtype) ** sensor.exponent / model).flatten(1).median(dim=1).values
     return PointLights(lights.position_mm.detach(), torch.clamp_min(ratio, 1e-6))

@@ -153,7 +153,7 @@ class _Pixels(NamedTuple):
         x, y = (axis.expand(value.shape[1:]).flatten() for axis in (x, y))
         noise = noise_std(value[None])[0].clamp_min(QUANTISATION_STD)
         image = value.flatten(1)
-        every = cls(x, y, image, image < 0.995, noise, 1.0 / sensor.gamma)
+        every = cls(x, y, image, image < 0.995, noise, 1.0 / sensor.exponent)
         # a pixel that noise could clip at black or white is left out, judged by the model so that noise does not choose
         expected, margin = every.model(_paraboloid_start(every)), 2.5 * noise[:, None]
         return every._replace(usable=every.usable & (expected > margin) & (expected < 1.0 - margin))

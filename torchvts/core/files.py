@@ -95,6 +95,38 @@ def write_image(path: str | Path, image: Tensor) -> None:
     _write_pixels(Path(path), np.ascontiguousarray(levels.flip(0).permute(1, 2, 0).numpy()))
 
 
+def image_to_bytes(image: Tensor) -> Tensor:
+    """(3, H, W) R, G, B in [0, 1] as the bytes of a PNG, (N,) uint8: of 8 bits where they hold it exactly, else of 16."""
+    import cv2
+
+    levels = image.detach().cpu().double() * 255.0
+    depth = np.uint8 if bool((levels - levels.round()).abs().max() < 1e-3) else np.uint16
+    pixels = torch.round(image.detach().cpu().double() * float(np.iinfo(depth).max)).flip(0).permute(1, 2, 0).numpy().astype(depth)
+    done, data = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    if not done:
+        raise OSError("OpenCV could not encode the image as PNG")
+    return torch.from_numpy(data.reshape(-1).copy())
+
+
+def image_from_bytes(data: Tensor, size: tuple[int, int], source: str) -> Tensor:
+    """Read what :func:`image_to_bytes` gave, (3, H, W) float32.
+
+    Raises:
+        ValueError: not a PNG, or of another size than ``size``, which its header is held against before it is decoded.
+    """
+    import cv2
+
+    raw = data.numpy() if data.dtype == torch.uint8 and data.dim() == 1 else np.zeros(0, np.uint8)
+    header = raw[:24].tobytes()
+    if header[:8] != b"\x89PNG\r\n\x1a\n" or len(header) < 24:
+        raise ValueError(f"{source}: expected the bytes of a PNG")
+    width, height = struct.unpack(">II", header[16:24])
+    pixels = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED) if (height, width) == size else None
+    if pixels is None or pixels.shape != (*size, 3) or pixels.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"{source}: expected a whole colour PNG of {size[0]} x {size[1]}, got one that says {height} x {width}")
+    return rgb_from_bgr(pixels)
+
+
 DEPTH_PNG_STEP_MM = 0.0001
 DEPTH_PNG_ZERO = 32768
 

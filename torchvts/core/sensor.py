@@ -1,7 +1,7 @@
 """What is known of a sensor before it is calibrated: its size, pitch and camera response, where the gel lies in the frame."""
 
 import dataclasses
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from .checks import check_batch, check_integer, check_numbers, check_positive
 from .files import write_atomically
+from .response import SensorPrior
 
 
 @dataclass(frozen=True)
@@ -23,12 +24,14 @@ class Sensor:
         name: any text.
         height, width: pixels of the image that the pipeline works on.
         mm_per_pixel: pixel pitch on the skin, mm.
-        gamma: response of the camera, value = light^(1 / gamma).
+        gamma: response of the camera, value = light^(1 / gamma); None leaves it open: calibration chooses, all else takes 1.
         blur_px: standard deviation of a Gaussian blur before normals, pixels; 0 for none.
         light_position_mm: (3, 3), rows R, G, B, if the lights are known from the drawing.
         roi_px: (left, top, width, height) of the gel in the camera's frame, resized to the sensor's size.
         corners_px: (4, 2), x and y of the gel's corners in the camera's frame: top left, top right, bottom right, bottom
             left, rectified to the sensor's size. Either this or ``roi_px``.
+        markers: the skin carries printed markers, which are filled in every frame.
+        prior: what is known of every unit of this type, from presses on one.
     Raises:
         TypeError, ValueError: name the argument, what was expected and what came.
     Example:
@@ -40,11 +43,13 @@ class Sensor:
     height: int
     width: int
     mm_per_pixel: float
-    gamma: float = 1.0
+    gamma: float | None = None
     blur_px: float = 0.0
     light_position_mm: tuple[tuple[float, float, float], ...] | None = None
     roi_px: tuple[int, int, int, int] | None = None
     corners_px: tuple[tuple[float, float], ...] | None = None
+    markers: bool = False
+    prior: SensorPrior | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip():
@@ -52,8 +57,9 @@ class Sensor:
         self._set("height", check_integer("height", self.height, 8))
         self._set("width", check_integer("width", self.width, 8))
         self._set("mm_per_pixel", check_positive("mm_per_pixel", self.mm_per_pixel, 10.0))
-        self._set("gamma", check_positive("gamma", self.gamma, 10.0))
-        if self.gamma < 0.1:
+        if self.gamma is not None:
+            self._set("gamma", check_positive("gamma", self.gamma, 10.0))
+        if self.gamma is not None and self.gamma < 0.1:
             raise ValueError(f"gamma: expected a number in [0.1, 10], got {self.gamma}: value = light^(1/gamma), 2.2 for sRGB-like")
         if self.blur_px != 0:
             check_positive("blur_px", self.blur_px, 0.25 * min(self.height, self.width))
@@ -79,9 +85,21 @@ class Sensor:
                     f"bottom left, got {self.corners_px!r}"
                 )
             self._set("corners_px", corners)
+        if not isinstance(self.markers, bool):
+            raise TypeError(f"markers: expected true or false, got {self.markers!r}")
+        prior: object = self.prior
+        if isinstance(prior, dict):  # as YAML gives it
+            self._set("prior", SensorPrior.from_dict(prior, "prior"))
+        elif prior is not None and not isinstance(prior, SensorPrior):
+            raise TypeError(f"prior: expected a SensorPrior, got {type(prior).__name__}")
 
     def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)
+
+    @property
+    def exponent(self) -> float:
+        """Linear light is value to this power: gamma, or 1 where it is left open."""
+        return 1.0 if self.gamma is None else self.gamma
 
     @property
     def field_mm(self) -> tuple[float, float]:
@@ -104,9 +122,12 @@ class Sensor:
                 f"height, width: expected the aspect ratio of {self.height} x {self.width}, got {height} x {width}: "
                 "pixels must stay square; crop instead"
             )
-        return dataclasses.replace(
-            self, height=height, width=width, mm_per_pixel=self.mm_per_pixel / scale_x, blur_px=self.blur_px * scale_x
-        )
+        prior = self.prior
+        if prior is not None:
+            response = dataclasses.replace(prior.response, blur_px=prior.response.blur_px * scale_x)
+            prior = dataclasses.replace(prior, response=response)
+        pitch, blur_px = self.mm_per_pixel / scale_x, self.blur_px * scale_x
+        return dataclasses.replace(self, height=height, width=width, mm_per_pixel=pitch, blur_px=blur_px, prior=prior)
 
     def rectify(self, frame: Tensor) -> Tensor:
         """Camera frames (B, 3, H, W) as the sensor's images (B, 3, height, width): four corners, region of interest, or as is.
@@ -180,10 +201,11 @@ class Sensor:
         pairs = ((field, getattr(self, field.name)) for field in dataclasses.fields(self))
         return {field.name: _plain(value) for field, value in pairs if value != field.default}
 
-    def save(self, path: str | Path) -> None:
-        """Write the sensor as YAML, whole or not at all."""
+    def save(self, path: str | Path, comment: Sequence[str] = ()) -> None:
+        """Write the sensor as YAML, whole or not at all, under lines of ``comment`` (each with its #)."""
+        text = yaml.safe_dump(self.to_dict(), sort_keys=False, width=128, default_flow_style=None, allow_unicode=True)
         with write_atomically(path) as temporary:
-            temporary.write_text(yaml.safe_dump(self.to_dict(), sort_keys=False))
+            temporary.write_text("".join(f"{line}\n" for line in comment) + text, encoding="utf-8")
 
 
 def shipped_sensors() -> list[str]:
@@ -227,6 +249,8 @@ def _read_yaml(path: Path) -> Any:
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, SensorPrior):
+        return value.to_dict()
     return [_plain(item) for item in value] if isinstance(value, tuple) else value
 
 

@@ -5,6 +5,7 @@ from torch import Tensor, nn
 
 from ..core.checks import QUANTISATION_STD, check_batch, check_same_size
 from ..core.geometry import gradient_from_normal, normal_from_gradient
+from ..record import Calibration
 from ..shading import PointLights, flat_image, gloss_lobe, inverse_light_matrix, light_matrix
 
 
@@ -106,6 +107,23 @@ class NormalFromIntensity(nn.Module):
         self.register_buffer("dark_where", torch.where(flat > 2.0 * below, below, -torch.inf))
         full = torch.full_like(flat, torch.inf) if full_above is None else full_above.detach().to(inverse.dtype)
         self.register_buffer("full_above", full)
+
+    @classmethod
+    def from_calibration(cls, calibration: Calibration) -> "NormalFromIntensity":
+        """The block of a unit calibrated by lights."""
+        if calibration.lights is None:
+            raise ValueError("calibration: expected one by lights, got one by response fields: use NormalFromResponse")
+        sensor, gain = calibration.sensor, calibration.gain
+        full = torch.ones_like(calibration.background) if gain is None else gain
+        return cls(
+            calibration.lights,
+            sensor.height,
+            sensor.width,
+            sensor.mm_per_pixel,
+            noise_std=calibration.compensated_noise_std.flatten(1).median(dim=1).values,
+            inverse=calibration.inverse,
+            full_above=(0.995**sensor.exponent) * full,
+        )
 
     def forward(self, compensated: Tensor, depth_mm: Tensor | None = None) -> Tensor:
         check_batch("compensated", compensated, 3)

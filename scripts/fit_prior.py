@@ -1,0 +1,50 @@
+"""Fit a sensor type's prior on the presses of one unit, and write it into the sensor's YAML file.
+
+python scripts/fit_prior.py ../shared/data/gelsight_mini_a --sensor gelsight_mini --out configs/sensors/gelsight_mini.yaml
+
+The folder is one of gs_sdk's (catalog.csv, background.png, N/gelsight.png); centers from label.npz or labels.csv are used where
+they are there, else found.
+"""
+
+import argparse
+import dataclasses
+import sys
+from pathlib import Path
+
+import torchvts as vts
+from torchvts.core.gs_sdk import read_calibration_folder, read_labels
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="presses of balls, in gs_sdk's layout")
+    parser.add_argument("--sensor", required=True, help=f"YAML file, or one of {', '.join(vts.shipped_sensors())}")
+    parser.add_argument("--source", default="", help="whose images these are: kept in the file")
+    parser.add_argument("--out", type=Path, required=True, help="sensor file to write, .yaml; its leading comment is kept")
+    arguments = parser.parse_args()
+    sensor, folder = vts.Sensor.load(arguments.sensor), read_calibration_folder(arguments.folder)
+    labels = read_labels(arguments.folder) if (arguments.folder / "labels.csv").is_file() else {}
+    presses = []
+    for item in folder.presses:
+        center, radius = item.center_px, item.radius_px
+        if center is None and item.name in labels:
+            *place, radius = labels[item.name]
+            center = (place[0], place[1])
+        presses.append(vts.Press(item.image(), item.ball_diameter_mm, item.name, center, radius))
+    prior = vts.fit_prior(
+        folder.background, sensor, presses, arguments.source or f"{len(presses)} presses of {arguments.folder.name}"
+    )
+    before = arguments.out.read_text() if arguments.out.is_file() else ""
+    comment = [line for line in before.splitlines() if line.startswith("#")]
+    dataclasses.replace(sensor, prior=prior).save(arguments.out, comment)
+    fields = (prior.response.fast, prior.response.precise)
+    print(f"{len(presses)} presses; numbers in the fields: {', '.join(str(2 * f.size()) for f in fields if f is not None)}")
+    print(f"wrote {arguments.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except (OSError, ValueError, TypeError) as error:
+        sys.exit(f"error: {error}")

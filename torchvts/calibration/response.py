@@ -1,0 +1,238 @@
+"""A response model from presses: balls found, contradictions left out, the smallest family that explains them chosen."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from ..core.geometry import gradient_from_normal
+from ..core.response import ResponseField, ResponseModel
+from ..core.sensor import Sensor
+from ..normals import NormalFromResponse
+from .field import ContactForms, Family, solve, solve_with_centers
+from .presses import Contact, add_depth, center_by_slope, guess_circle, update_radius
+
+FAMILIES = ((0, -1), (1, -1), (2, -1), (2, 1), (3, 2), (3, 3))
+"""Degrees of candidates, linear terms and products, the smallest first."""
+
+OWN_PENALTIES = (0.03, 0.01, 0.003)
+PRIOR_PENALTIES = (10.0, 3.0, 1.0, 0.3, 0.1, 0.03)
+"""How dear coefficients are, in presses: strongest first."""
+
+WORTH = 0.02
+"""A larger family must lower the held-out error by this part of it."""
+
+FEW_PENALTY = 3.0
+"""Penalty on leaving a prior when there are too few presses to choose one: two presses or less."""
+
+
+@dataclass
+class ResponseFit:
+    """What presses gave: the model, the candidates and the choice."""
+
+    model: ResponseModel
+    error_deg: float | None
+    candidates: list[dict[str, Any]] = field(default_factory=list)
+    reason: str = ""
+
+
+def fit_response(
+    contacts: list[Contact],
+    sensor: Sensor,
+    prior: ResponseModel | None,
+    blur_px: float,
+    progress: bool = False,
+    families: tuple[tuple[int, int], ...] = FAMILIES,
+) -> ResponseFit:
+    """Locate the balls, leave out what contradicts, and fit.
+
+    Args:
+        contacts: from :func:`read_contacts`, with balls; located, judged and told of in place.
+        sensor: the sensor, whose gamma the contacts were read with.
+        prior: fields of the sensor's type, or None.
+        blur_px: that the contacts were read with.
+        progress: show a bar.
+        families: degrees to choose from, linear terms and products, the smallest first.
+    Raises:
+        ValueError: no press is left; names what became of each.
+    """
+    pitch = sensor.mm_per_pixel
+    half_mm = prior.fast.half_mm if prior is not None else 0.5 * sensor.width * pitch
+    with tqdm(total=4, desc="calibrating from presses", disable=not progress, leave=False) as bar:
+        bar.set_postfix(step="balls")
+        locate(contacts, pitch, sensor, prior, half_mm)
+        bar.update()
+        bar.set_postfix(step="contradictions")
+        leave_out(contacts, prior, half_mm)
+        used = [contact for contact in contacts if not contact.reason]
+        if not used:
+            raise ValueError("presses: none can be used: " + "; ".join(f"{c.name}: {c.reason}" for c in contacts))
+        bar.update()
+        bar.set_postfix(step="one pass")
+        fast, fast_rows, fast_index = _choose(used, families, False, half_mm, None if prior is None else prior.fast)
+        for contact in used:
+            add_depth(contact, fast, pitch)
+        bar.update()
+        bar.set_postfix(step="second pass")
+        given = None if prior is None else prior.precise
+        deep, deep_rows, deep_index = _choose(used, families, True, half_mm, given)
+        bar.update()
+    rows = fast_rows + deep_rows
+    score, before = deep_rows[deep_index]["score_deg"], fast_rows[fast_index]["score_deg"]
+    if score is not None and score > before:  # depth explains nothing: the second pass repeats the first
+        deep, score = fast.lifted(fast.degree, fast.product_degree, True), before
+    chosen = f"{fast_rows[fast_index]['model']}; {deep_rows[deep_index]['model']}"
+    count = len(used)
+    how = f"held-out angle {score:.2f} deg, each press by the others" if score is not None else "too few presses to hold any out"
+    reason = f"{chosen}: the smallest within {WORTH:.0%} of the best of {len(rows)} candidates on {count} presses ({how})"
+    for contact in used:
+        contact.figures["used"] = True
+    return ResponseFit(ResponseModel(fast, deep, sensor.exponent, blur_px), score, rows, reason)
+
+
+def locate(contacts: list[Contact], pitch_mm: float, sensor: Sensor, prior: ResponseModel | None, half_mm: float) -> None:
+    """Center and contact radius of every usable contact: by the prior's slopes, or jointly with fields of rising size."""
+    for contact in contacts:
+        if not contact.reason and not contact.known:
+            guess_circle(contact, sensor)
+    usable = [contact for contact in contacts if not contact.reason]
+    if prior is not None:
+        for contact in usable:
+            add_depth(contact, prior.fast, pitch_mm)
+            if not contact.known:
+                center_by_slope(contact, slope_map(contact, prior, pitch_mm), pitch_mm)
+    elif not all(contact.known for contact in usable):
+        _locate_jointly(usable, pitch_mm, half_mm)
+    for contact in usable:
+        if not contact.reason and contact.contact_radius_mm > 0.89 * contact.radius_mm:
+            wide_mm, ball_mm = 2 * contact.contact_radius_mm, 2 * contact.radius_mm
+            contact.reason = f"the contact seen is {wide_mm:.2f} mm wide, too wide for a ball of {ball_mm:g} mm"
+
+
+def _locate_jointly(contacts: list[Contact], pitch_mm: float, half_mm: float) -> None:
+    # linear fields first: with products or depth, a shift of all centers can hide in the field, so these only refine
+    # what linear ones found, each center held by a third of a press
+    most = 1 if len(contacts) < 4 else 2 if len(contacts) < 10 else 3
+    stages = [(0, -1, False, 3), (1, -1, False, 3), (2, -1, False, 6), (3, 2, False, 4), (3, 2, True, 4)]
+    anchors = None
+    for degree, products, uses_depth, rounds in [stage for stage in stages if stage[0] <= most]:
+        family = Family(degree, products, uses_depth, half_mm)
+        if products >= 0 and anchors is None:
+            anchors = [contact.center_mm.clone() for contact in contacts]
+        forms = [ContactForms(family, contact) for contact in contacts]
+        coefficient = torch.zeros(family.size(), dtype=torch.float64)
+        for _ in range(rounds):
+            coefficient = solve_with_centers(forms, 0.01 * family.penalty(), anchors, 0.3)
+            for item in forms:
+                if not item.contact.known:
+                    update_radius(item.contact, item.slope(coefficient), pitch_mm)
+        if not uses_depth:
+            for contact in contacts:
+                add_depth(contact, family.field(coefficient), pitch_mm)
+
+
+def slope_map(contact: Contact, model: ResponseModel, pitch_mm: float) -> Tensor:
+    """(2, H, W): slopes of the model's last pass; the contact has the depth of the first."""
+    height, width = contact.mask.shape
+    normals = NormalFromResponse(model.fast, model.precise, height, width, pitch_mm, dtype=torch.float64)
+    image = 1.0 + contact.change[None]
+    normal = normals(image) if model.precise is None else normals(image, contact.depth_mm[None, None])
+    return gradient_from_normal(normal)[0]
+
+
+def leave_out(contacts: list[Contact], prior: ResponseModel | None, half_mm: float) -> None:
+    """Give a reason to presses that the others, or the prior, contradict, the worst first."""
+    while True:
+        used = [contact for contact in contacts if not contact.reason]
+        if len(used) < (1 if prior is not None else 2):
+            return
+        small = Family.of(prior.fast) if prior is not None else Family(min(2, len(used) // 4), -1, False, half_mm)
+        evidence = _Evidence(small, used)
+        forms = evidence.forms
+        if prior is not None:
+            solutions = [prior.fast.tensor().reshape(-1)] * len(forms)
+        else:
+            solutions = evidence.held_out(0.01 * small.penalty(), None)
+        gains = torch.tensor([item.gain(solution) for item, solution in zip(forms, solutions)], dtype=torch.float64)
+        errors = torch.tensor([item.error_deg(solution) for item, solution in zip(forms, solutions)], dtype=torch.float64)
+        usual = float(errors.median())
+        for contact, gain, error in zip(used, gains.tolist(), errors.tolist()):
+            contact.figures |= {"error_deg": error, "gain": gain}
+        log_gain = gains.clamp_min(1e-3).log()
+        worst = int(log_gain.abs().argmax())
+        if float(log_gain.abs()[worst]) > math.log(1.5):
+            seen = 2 * used[worst].radius_mm / max(float(gains[worst]), 1e-3)
+            judge = "the sensor's prior" if prior is not None else f"the other {len(used) - 1} presses"
+            used[worst].reason = f"by {judge} the ball seems {seen:.2f} mm wide, but {2 * used[worst].radius_mm:g} mm was given"
+            if prior is None and len(used) == 2:
+                used[1 - worst].reason = "contradicts the only other press: one of the two diameters is wrong"
+            continue
+        worst = int(errors.argmax())
+        if float(errors[worst]) > max(3.0 * usual, 8.0) or float(errors[worst]) > 15.0:
+            off_deg = float(errors[worst])
+            used[worst].reason = f"its slopes are {off_deg:.1f} degrees from a ball's, others' {usual:.1f}: not a clean press"
+            continue
+        return
+
+
+def _choose(
+    contacts: list[Contact], degrees: tuple[tuple[int, int], ...], uses_depth: bool, half_mm: float, prior: ResponseField | None
+) -> tuple[ResponseField, list[dict[str, Any]], int]:
+    """The field of the smallest family within WORTH of the best held-out angle, the candidates, and which one it is."""
+    few = len(contacts) < 3
+    families = [Family(degree, products, uses_depth, half_mm) for degree, products in degrees[: 1 if few else None]]
+    if prior is not None:
+        own = Family.of(prior)
+        families = [own] + [f for f in families if not few and f.degree >= own.degree and f.product_degree > own.product_degree]
+    rows: list[dict[str, Any]] = []
+    fields: list[ResponseField] = []
+    for family in families:
+        evidence = _Evidence(family, contacts)
+        start: Tensor | None = None
+        names: tuple[float, ...] = OWN_PENALTIES
+        if prior is not None:
+            start = prior.lifted(family.degree, family.product_degree, uses_depth).tensor().reshape(-1)
+            names = (FEW_PENALTY,) if few else PRIOR_PENALTIES
+            if family == families[0]:
+                score = None if few else evidence.mean_error([start] * len(contacts))
+                rows.append(_row("prior as it is", family, 0, score))
+                fields.append(prior)
+        penalties = {weight: weight * family.penalty() for weight in names}
+        scores = {} if few else {w: evidence.mean_error(evidence.held_out(p, start)) for w, p in penalties.items()}
+        weight = min(scores, key=lambda w: scores[w]) if scores else names[0]
+        model = f"response, {family.label()}" if prior is None else f"prior moved, held by {weight:g} presses, {family.label()}"
+        rows.append(_row(model, family, family.size(), scores.get(weight)))
+        fields.append(family.field(evidence.solve(penalties[weight], start)))
+    best = min((row["score_deg"] for row in rows if row["score_deg"] is not None), default=None)
+    index = len(rows) - 1 if best is None else next(k for k, row in enumerate(rows) if row["score_deg"] <= best * (1.0 + WORTH))
+    return fields[index], rows, index
+
+
+class _Evidence:
+    """What all contacts say of a family's coefficients, together and without one."""
+
+    def __init__(self, family: Family, contacts: list[Contact]) -> None:
+        self.forms = [ContactForms(family, contact) for contact in contacts]
+        self.each = [item.ball() for item in self.forms]
+        self.form = torch.stack([form for form, _ in self.each]).sum(0)
+        self.right = torch.stack([right for _, right in self.each]).sum(0)
+
+    def solve(self, penalty: Tensor, start: Tensor | None) -> Tensor:
+        """Coefficients by all contacts."""
+        return solve(self.form, self.right, penalty, start)
+
+    def held_out(self, penalty: Tensor, start: Tensor | None) -> list[Tensor]:
+        """For each contact the coefficients that all others give."""
+        return [solve(self.form - form, self.right - right, penalty, start) for form, right in self.each]
+
+    def mean_error(self, solutions: list[Tensor]) -> float:
+        """Mean over presses of the mean angle each has under its own coefficients, degrees."""
+        return sum(item.error_deg(solution) for item, solution in zip(self.forms, solutions)) / len(self.forms)
+
+
+def _row(model: str, family: Family, numbers: int, score: float | None) -> dict[str, Any]:
+    two = 2 if family.uses_depth else 1
+    return {"model": model, "family": family.label(), "numbers": numbers, "score_deg": score, "pass": two}

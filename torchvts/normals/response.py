@@ -1,0 +1,97 @@
+"""Normals by a response field."""
+
+import torch
+from torch import Tensor, nn
+
+from ..core.checks import check_batch, check_same_size
+from ..core.geometry import normal_from_gradient
+from ..core.response import CHANGE_SCALE, ResponseField
+from ..record import Calibration
+
+
+class NormalFromResponse(nn.Module):
+    """Unit normals of a compensated image, which for a response field is image / background.
+
+    Without depth the field ``fast``; with the depth that pass led to, the field ``precise``, which was fitted on such depths:
+    a second pass is all there is to gain, and ``passes`` says so to the pipeline.
+
+    Args:
+        fast: field without depth. precise: field with depth, or None.
+        height, width: pixels. mm_per_pixel: pixel pitch, mm.
+        max_slope: largest steepness, mm per mm: polynomials run away outside of what they were fitted on.
+        dtype: of the coefficients.
+    Example:
+        >>> field = ResponseField(0, -1, False, 10.0, ((0.3, 0, 0), (0, 0.3, 0)))
+        >>> NormalFromResponse(field, None, 8, 8, 0.1)(torch.ones(2, 3, 8, 8))[0, :, 0, 0] + 0.0
+        tensor([0., 0., 1.])
+    """
+
+    uses_depth: bool
+    fast_maps: Tensor
+    precise_maps: Tensor
+
+    def __init__(
+        self,
+        fast: ResponseField,
+        precise: ResponseField | None,
+        height: int,
+        width: int,
+        mm_per_pixel: float,
+        max_slope: float = 3.0,
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        super().__init__()
+        self.max_slope = max_slope
+        self.uses_depth = precise is not None
+        self.passes = 2
+        self.register_buffer("fast_maps", _maps(fast, height, width, mm_per_pixel).to(dtype))
+        deep = torch.zeros(0, 2, height, width) if precise is None else _maps(precise, height, width, mm_per_pixel)
+        self.register_buffer("precise_maps", deep.to(dtype))
+
+    @classmethod
+    def from_calibration(cls, calibration: Calibration) -> "NormalFromResponse":
+        """The block of a unit calibrated by response fields."""
+        response, sensor = calibration.response, calibration.sensor
+        if response is None:
+            raise ValueError("calibration: expected one by response fields, got one by lights: use NormalFromIntensity")
+        size = (sensor.height, sensor.width, sensor.mm_per_pixel)
+        return cls(response.fast, response.precise, *size, dtype=calibration.background.dtype)
+
+    def forward(self, compensated: Tensor, depth_mm: Tensor | None = None) -> Tensor:
+        check_batch("compensated", compensated, 3)
+        check_same_size("compensated", compensated, "the calibration", self.fast_maps.shape[2], self.fast_maps.shape[3])
+        change = compensated - 1.0
+        inputs = [change[:, 0:1], change[:, 1:2], change[:, 2:3]]
+        maps = self.fast_maps
+        if depth_mm is not None:
+            if not self.uses_depth:
+                raise ValueError("depth_mm: expected None, because this response has no field with depth: use mode 'fast'")
+            inputs.append(depth_mm.to(change.dtype).expand_as(inputs[0]))
+            maps = self.precise_maps
+        gradient = maps[0] * inputs[0]  # (B, 2, H, W)
+        for k in range(1, len(inputs)):
+            gradient = torch.addcmul(gradient, maps[k], inputs[k])
+        place = len(inputs)
+        if maps.shape[0] > place:
+            for i in range(len(inputs)):
+                for k in range(i, len(inputs)):
+                    gradient = torch.addcmul(gradient, maps[place], inputs[i] * inputs[k])
+                    place += 1
+        p, q = gradient[:, 0:1], gradient[:, 1:2]
+        steepness = torch.sqrt(torch.addcmul(p * p, q, q) + 1e-12)
+        return normal_from_gradient(gradient * (self.max_slope / steepness).clamp_max(1.0))
+
+    def coarse(self, stride: int) -> "NormalFromResponse":
+        """The same for an image of every ``stride``-th pixel."""
+        rest = ResponseField(0, -1, False, 1.0, ((0, 0, 0), (0, 0, 0)))
+        other = NormalFromResponse(rest, None, 8, 8, 1.0, self.max_slope, self.fast_maps.dtype)
+        other.uses_depth = self.uses_depth
+        other.fast_maps = self.fast_maps[..., stride // 2 :: stride, stride // 2 :: stride].clone()
+        other.precise_maps = self.precise_maps[..., stride // 2 :: stride, stride // 2 :: stride].clone()
+        return other
+
+
+def _maps(field: ResponseField, height: int, width: int, mm_per_pixel: float) -> Tensor:
+    """The field's maps for inputs in plain units: relative change and mm."""
+    scale = [CHANGE_SCALE ** -sum(k < 3 for k in term) for term in field.terms()]
+    return field.maps(height, width, mm_per_pixel) * torch.tensor(scale, dtype=torch.float64)[:, None, None, None]

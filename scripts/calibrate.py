@@ -1,50 +1,105 @@
-"""Calibrate a unit from one image without contact.
+"""Calibrate a unit from one image without contact, and from presses of balls or touches of anything, if there are any.
 
-python scripts/calibrate.py background.png --sensor tacto --out unit.safetensors
+python scripts/calibrate.py background.png --sensor gelsight_mini --out unit.safetensors
 python scripts/calibrate.py background.png --mm-per-pixel 0.05 --out unit.safetensors
+python scripts/calibrate.py FOLDER --sensor gelsight_mini --out unit.safetensors
+
+FOLDER is a calibration folder of gs_sdk: catalog.csv, background.png, N/gelsight.png. Centers of the balls are found.
 """
 
 import argparse
 import sys
 import warnings
 from pathlib import Path
+from typing import Any
 
 import torchvts as vts
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("background", type=Path, help="image of the sensor at rest")
+    parser.add_argument("background", type=Path, help="image of the sensor at rest, or a calibration folder of gs_sdk")
     parser.add_argument("--sensor", help=f"YAML file, or one of {', '.join(vts.shipped_sensors())}")
     parser.add_argument("--mm-per-pixel", type=float, help="in place of --sensor: pixel pitch of an unknown sensor")
-    parser.add_argument("--gamma", type=float, default=1.0, help="with --mm-per-pixel: value = light^(1/gamma)")
+    parser.add_argument("--gamma", type=float, help="with --mm-per-pixel: value = light^(1/gamma); left out, it is chosen")
+    parser.add_argument("--touches", type=Path, nargs="+", default=[], help="images of unknown objects pressed in")
+    parser.add_argument(
+        "--use-labels", action="store_true", help="take centers from the folder's label.npz instead of finding them"
+    )
+    parser.add_argument("--no-prior", action="store_true", help="do as if the sensor file had no prior")
     parser.add_argument("--out", type=Path, required=True, help="calibration file to write, .safetensors")
     arguments = parser.parse_args()
     if (arguments.sensor is None) == (arguments.mm_per_pixel is None):
         parser.error("give either --sensor or --mm-per-pixel")
-    image = vts.read_image(arguments.background)
+    presses: list[vts.Press] = []
+    if arguments.background.is_dir():
+        folder = vts.gs_sdk.read_calibration_folder(arguments.background)
+        image = folder.background
+        items = [(item, arguments.use_labels) for item in folder.presses]
+        presses = [
+            vts.Press(
+                item.image(),
+                item.ball_diameter_mm,
+                item.name,
+                item.center_px if known else None,
+                item.radius_px if known else None,
+            )
+            for item, known in items
+        ]
+    else:
+        image = vts.read_image(arguments.background)
     if arguments.sensor is not None:
         sensor = vts.Sensor.load(arguments.sensor)
         image = sensor.rectify(image[None])[0]
     else:
-        sensor = vts.Sensor(arguments.background.stem, *image.shape[1:], arguments.mm_per_pixel, gamma=arguments.gamma)
+        pitch, gamma = arguments.mm_per_pixel, arguments.gamma
+        sensor = vts.Sensor(arguments.background.stem or "sensor", image.shape[1], image.shape[2], pitch, gamma=gamma)
+    if arguments.no_prior:
+        sensor = sensor.without_prior()
+    touches = [vts.Touch(sensor.rectify(vts.read_image(path)[None])[0], None, path.name) for path in arguments.touches]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", vts.CalibrationWarning)
-        calibration = vts.calibrate(image, sensor, progress=True)
+        calibration = vts.calibrate(image, sensor, presses, touches, progress=True)
     calibration.save(arguments.out)
-    report = calibration.report
-    print(f"sensor {sensor.name}: {sensor.height} x {sensor.width} px, {sensor.mm_per_pixel} mm a pixel, gamma {sensor.gamma}")
-    print(f"model {report['model']}, lights {report['lights']}: {report.get('message', '')}")
+    report, sensor = calibration.report, calibration.sensor
+    print(f"sensor {sensor.name}: {sensor.height} x {sensor.width} px, {sensor.mm_per_pixel} mm a pixel, gamma {sensor.exponent}")
+    print(f"chosen: {report['model']}: {report['reason']}\n")
+    print_candidates(report["candidates"])
+    if report["model"] == "point_lights" and calibration.lights is not None:
+        print_lights(calibration.lights, report)
+    if "presses" in report:
+        print_presses(report["presses"])
+    for warning in caught:
+        print(f"warning: {warning.message}", file=sys.stderr)
+    print(f"wrote {arguments.out} ({arguments.out.stat().st_size / 1000:.0f} kB)")
+    return 0
+
+
+def print_candidates(candidates: list[dict[str, Any]]) -> None:
+    print("| model | pass | numbers | deg | note |\n|---|---|---|---|---|")
+    for row in candidates:
+        score = "" if row["score_deg"] is None else f"{row['score_deg']:.2f}"
+        print(f"| {row['model']} | {row['pass']} | {row['numbers']} | {score} | {row.get('note', '')} |")
+    print("deg: of point lights without presses, how loose the image leaves them; else the mean angle on held-out presses\n")
+
+
+def print_lights(lights: vts.PointLights, report: dict[str, Any]) -> None:
     print("| light | x mm | y mm | z mm | direction +- deg | gloss |\n|---|---|---|---|---|---|")
-    position, gloss = calibration.lights.position_mm.tolist(), calibration.lights.gloss.tolist()
+    position, gloss = lights.position_mm.tolist(), lights.gloss.tolist()
     for j, name in enumerate("RGB"):
         spread = f"{report['direction_std_deg'][j]:.2f}" if "direction_std_deg" in report else "given"
         print(f"| {name} | " + " | ".join(f"{v:.2f}" for v in position[j]) + f" | {spread} | {gloss[j]:.3f} |")
-    print(f"noise {max(calibration.noise_std.tolist()):.4f}, residual {max(report['residual_std']):.4f} of full scale")
-    for warning in caught:
-        print(f"warning: {warning.message}", file=sys.stderr)
-    print(f"wrote {arguments.out}")
-    return 0
+    print()
+
+
+def print_presses(presses: list[dict[str, Any]]) -> None:
+    print("| press | center px | contact radius px | off by deg | |\n|---|---|---|---|---|")
+    for press in presses:
+        center = ", ".join(f"{v:.1f}" for v in press["center_px"]) if "center_px" in press else ""
+        radius = f"{press['contact_radius_px']:.1f}" if "contact_radius_px" in press else ""
+        off = f"{press['error_deg']:.1f}" if "error_deg" in press else ""
+        print(f"| {press['name']} | {center} | {radius} | {off} | {press['reason'] and 'left out: ' + press['reason']} |")
+    print()
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ import torchvts as vts
 NAMES = [
     "Calibration", "CalibrationWarning", "Compensate", "ContactMask", "DepthOutput", "DepthPipeline", "FillMarkers",
     "GradientFromNormal", "LightFit", "NormalFromIntensity", "NormalFromLookup", "NormalFromMLP", "NormalFromResponse",
-    "PointLights", "PoissonDCT", "PoissonDST", "PoissonRest", "Press", "Sensor", "calibrate", "depth_to_points", "divergence",
+    "PointLights", "PoissonDCT", "PoissonDST", "PoissonRest", "Press", "Sensor", "Touch", "calibrate", "depth_to_points", "divergence",
     "fill_markers", "find_markers", "fit_lights", "fit_mlp", "fit_prior", "gradient_from_normal", "gs_sdk", "metrics",
     "near_field_shading", "normal_from_gradient", "poisson_dct", "poisson_dst", "poisson_rest", "read_image", "scenes",
     "shipped_sensors", "write_image",
@@ -22,7 +22,7 @@ ARGUMENTS = {
     vts.PointLights: ["position_mm", "albedo", "gloss"],
     vts.near_field_shading: ["depth_mm", "normal", "lights", "mm_per_pixel"],
     vts.fit_lights: ["background", "sensor"],
-    vts.calibrate: ["background", "sensor", "presses"],
+    vts.calibrate: ["background", "sensor", "presses", "touches"],
     vts.Press: ["image", "ball_diameter_mm", "name"],
     vts.fit_prior: ["background", "sensor", "presses", "source"],
     vts.NormalFromLookup.fit: ["flat", "change", "slope"],

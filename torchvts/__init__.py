@@ -1,7 +1,7 @@
 """torchvts: camera images of visual-tactile sensors into depth, normals, contact and pose, as differentiable PyTorch modules."""
 
 from . import metrics, scenes
-from .calibration import CalibrationWarning, LightFit, Press, calibrate, fit_lights, fit_prior
+from .calibration import CalibrationWarning, LightFit, Press, Touch, calibrate, fit_lights, fit_prior
 from .compensate import Compensate
 from .contact import ContactMask
 from .core import gs_sdk
@@ -37,6 +37,7 @@ __all__ = [
     "PoissonRest",
     "Press",
     "Sensor",
+    "Touch",
     "calibrate",
     "depth_to_points",
     "divergence",

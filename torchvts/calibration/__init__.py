@@ -3,5 +3,6 @@
 from .calibrate import CalibrationWarning, calibrate, fit_prior
 from .lights import LightFit, fit_lights
 from .presses import Press
+from .touches import Touch
 
-__all__ = ["CalibrationWarning", "LightFit", "Press", "calibrate", "fit_lights", "fit_prior"]
+__all__ = ["CalibrationWarning", "LightFit", "Press", "Touch", "calibrate", "fit_lights", "fit_prior"]

@@ -20,8 +20,9 @@ from ..record import Calibration
 from ..shading import PointLights, flat_image
 from .field import angle_deg
 from .lights import LOOSE_DEG, LightFit, check_exposure, fit_lights
-from .presses import Contact, Press, read_contacts
+from .presses import Contact, Press, guess_circle, read_contacts
 from .response import FAMILIES, ResponseFit, fit_response
+from .touches import TOUCH_BLUR_PX, Touch, depth_of, fit_touches, moved_by_touches, scale_by_presses, scaled
 
 PINNED_DEG = 2.0
 """Point lights are believed beside a sensor's prior only if the image pins each of them this well."""
@@ -45,25 +46,30 @@ def calibrate(
     background: Tensor,
     sensor: Sensor,
     presses: Sequence[Press] = (),
+    touches: Sequence[Touch | Tensor] = (),
     *,
     progress: bool = False,
 ) -> Calibration:
-    """Calibrate a unit from one image without contact, and, if there are any, presses of balls of known diameter.
+    """Calibrate a unit from one image without contact, and what else there is: presses of balls, touches by any object.
 
     The model is chosen from what is given. An image alone: the sensor's prior, carried to this unit, unless the image pins point
     lights; without a prior point lights, and a warning where they are not pinned. Presses: response fields, their size by held-out
     angle, starting from the prior if there is one; point lights if they do better on the presses. Where the balls lie is found.
+    Touches: a field whose slopes have least curl; its scale from presses, a known depth, or the prior, whose place it takes if
+    there is none.
 
     Args:
         background: (3, H, W) in [0, 1], R, G, B, of the sensor's size.
         sensor: the sensor; its gamma is chosen where it is left open.
         presses: images of balls pressed anywhere; centers need not be known.
+        touches: images of unknown objects, or :class:`Touch` with the depth, if that is known.
         progress: show a bar.
     Returns:
         A :class:`Calibration`. Its ``report`` holds "model", "reason", "candidates" (each with the figure that decided), and
         "presses": per press "name", "used", "reason", "center_px" (x, y), "contact_radius_px", "error_deg".
     Raises:
-        ValueError, TypeError: bad image: shape, dtype, range, black, saturated; presses of which none can be used.
+        ValueError, TypeError: bad image: shape, dtype, range, black, saturated; presses or touches of which none can be used;
+            touches that pin nothing, or whose scale nothing tells.
     Warns:
         CalibrationWarning: what was left out and why; the fit did not converge, the image does not pin the lights, it seems to
             hold a contact, or it is not of the prior's sensor type.
@@ -80,6 +86,7 @@ def calibrate(
     for k, press in enumerate(presses):
         if not isinstance(press, Press):
             raise TypeError(f"presses[{k}]: expected a Press, got {type(press).__name__}: Press(image, ball_diameter_mm)")
+    named = [touch if isinstance(touch, Touch) else Touch(touch, None, f"touches[{k}]") for k, touch in enumerate(touches)]
     by_lights, lights_row, complaint = _by_lights(background, sensor, progress)
     candidates = [lights_row]
     prior = None if sensor.prior is None else sensor.prior.response
@@ -87,14 +94,22 @@ def calibrate(
         prior = dataclasses.replace(prior, blur_px=sensor.blur_px)
     if prior is not None:
         _check_type(background, sensor)
+    touched = None
+    if touches:
+        prior, touched = _by_touches(background, sensor, presses, named, prior)
+        candidates.append(touched["row"])
     if not presses:
         pinned = lights_row["score_deg"] <= PINNED_DEG and lights_row["misfit"] < 0.02
-        if prior is None or pinned:
+        if prior is None or (pinned and not touches):
             if complaint:
                 warnings.warn(complaint, CalibrationWarning, stacklevel=2)
             reason = f"the image pins the lights to {lights_row['score_deg']:.2f} deg" if pinned else lights_row["note"]
             report = by_lights.report | {"reason": f"point lights: {reason}", "candidates": candidates}
             return _judge_rest(dataclasses.replace(by_lights, report=report))
+        if touched is not None:
+            reason = f"{touched['row']['note']}; point lights rejected: {lights_row['note']}"
+            report = {"model": "response", "response": "fitted to touches", "reason": reason, "candidates": candidates}
+            return Calibration.from_response(prior, sensor, background, report | {"touches": touched["touches"]})
         candidates.append({"model": "prior", "family": "response of the sensor type", "numbers": 0, "score_deg": None, "pass": 2})
         reason = f"the sensor's prior, carried to this unit by its background; point lights rejected: {lights_row['note']}"
         report = {"model": "response", "response": "the sensor's prior", "reason": reason, "candidates": candidates}
@@ -106,7 +121,8 @@ def calibrate(
     for contact in contacts:
         if contact.reason:
             warnings.warn(f"{contact.name}: left out: {contact.reason}", CalibrationWarning, stacklevel=2)
-    told = {"candidates": candidates, "presses": [_tell(contact, sensor) for contact in contacts]}
+    told: dict[str, Any] = {} if touched is None else {"touches": touched["touches"]}
+    told |= {"candidates": candidates, "presses": [_tell(contact, sensor) for contact in contacts]}
     if lights_error < (math.inf if fit.error_deg is None else fit.error_deg) and lights_error < 5.0:
         other = "too few presses for a response field" if fit.error_deg is None else f"response fields {fit.error_deg:.2f}"
         reason = f"point lights: on {len(used)} presses their normals are {lights_error:.2f} deg off, {other}"
@@ -129,7 +145,7 @@ def fit_prior(background: Tensor, sensor: Sensor, presses: Sequence[Press], sour
     Source:
         this project.
     """
-    fit, _, unit = _by_presses(background, dataclasses.replace(sensor, prior=None), presses, None, False, PRIOR_FAMILY)
+    fit, _, unit = _by_presses(background, sensor.without_prior(), presses, None, False, PRIOR_FAMILY)
     log_background = fit_log_background(unit.background, sensor.mm_per_pixel)
     return SensorPrior(fit.model, log_background, 0.5 * sensor.width * sensor.mm_per_pixel, source)
 
@@ -201,6 +217,54 @@ def _contacts(background: Tensor, sensor: Sensor, images: Sequence[Press | Tenso
     unit = Calibration.from_response(_blank(sensor), sensor, background.double())
     compensate, contact = Compensate.from_calibration(unit).double(), ContactMask.from_calibration(unit).double()
     return read_contacts(images, background, compensate, contact, sensor)
+
+
+def _by_touches(
+    background: Tensor, sensor: Sensor, presses: Sequence[Press], touches: Sequence[Touch], prior: ResponseModel | None
+) -> tuple[ResponseModel, dict[str, Any]]:
+    """A model from touches, scaled; and what to tell of it."""
+    pitch = sensor.mm_per_pixel
+    gamma = sensor.exponent if prior is None else prior.gamma
+    seen = dataclasses.replace(sensor, gamma=gamma, blur_px=TOUCH_BLUR_PX)
+    contacts = _contacts(background, seen, [touch.image for touch in touches])
+    for touch, contact in zip(touches, contacts):
+        contact.name = touch.name or contact.name
+        if contact.reason:
+            warnings.warn(f"{contact.name}: left out: {contact.reason}", CalibrationWarning, stacklevel=3)
+    told = [{"name": contact.name, "used": not contact.reason, "reason": contact.reason} for contact in contacts]
+    used = [contact for contact in contacts if not contact.reason]
+    if not used:
+        raise ValueError("touches: none can be used: " + "; ".join(f"{c.name}: {c.reason}" for c in contacts))
+    row: dict[str, Any] = {"model": "touches", "score_deg": None, "pass": 1}
+    if prior is not None:
+        row |= {"family": "the prior, moved", "numbers": 2 * prior.fast.size(), "note": f"the prior, moved by {len(used)} touches"}
+        return moved_by_touches(prior, used), {"row": row, "touches": told}
+    fit = fit_touches(used, 0.5 * sensor.width * pitch, pitch)
+    depths = [(touch.depth_mm, c) for touch, c in zip(touches, contacts) if touch.depth_mm is not None and not c.reason]
+    sharp = dataclasses.replace(seen, blur_px=max(sensor.blur_px, RESPONSE_BLUR_PX))
+    balls = [contact for contact in _contacts(background, sharp, presses) if not contact.reason]
+    for ball in balls:
+        if not ball.known:
+            guess_circle(ball, sharp)
+    balls = [ball for ball in balls if not ball.reason]
+    if balls:
+        scale, by = scale_by_presses(fit.field, balls, pitch), f"{len(balls)} presses"
+    elif depths:
+        ratios = [known / max(float(depth_of(contact, fit.field, pitch).max()), 1e-9) for known, contact in depths]
+        scale, by = sorted(ratios)[len(ratios) // 2], f"{len(depths)} known depths"
+    else:
+        raise ValueError(
+            "touches: expected something that tells their scale, got only touches: add a press of a ball of known diameter, "
+            "Touch(image, depth_mm), or a sensor with a prior"
+        )
+    if not scale > 0:
+        raise ValueError(f"touches: the scale by {by} came out as {scale:.3g}: the presses are no clean balls, or not of this unit")
+    numbers = 2 * fit.field.size()
+    note = f"{len(used)} touches pin {numbers} numbers (eigenvalue gap {fit.gap:.1f}), the scale by {by}"
+    row |= {"family": f"linear {fit.field.degree}", "numbers": numbers, "note": note, "tried": fit.tried}
+    field = scaled(fit.field, scale)
+    precise = field.lifted(field.degree, field.product_degree, True)  # touches tell nothing of depth
+    return ResponseModel(field, precise, gamma, sharp.blur_px), {"row": row, "touches": told}
 
 
 def _blank(sensor: Sensor) -> ResponseModel:

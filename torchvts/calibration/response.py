@@ -77,7 +77,7 @@ def fit_response(
             add_depth(contact, fast, pitch)
         bar.update()
         bar.set_postfix(step="second pass")
-        given = None if prior is None else prior.precise
+        given = None if prior is None else prior.precise or fast.lifted(fast.degree, fast.product_degree, True)
         deep, deep_rows, deep_index = _choose(used, families, True, half_mm, given)
         bar.update()
     rows = fast_rows + deep_rows
@@ -86,10 +86,10 @@ def fit_response(
         deep, score = fast.lifted(fast.degree, fast.product_degree, True), before
     chosen = f"{fast_rows[fast_index]['model']}; {deep_rows[deep_index]['model']}"
     count = len(used)
-    how = f"held-out angle {score:.2f} deg, each press by the others" if score is not None else "too few presses to hold any out"
-    reason = f"{chosen}: the smallest within {WORTH:.0%} of the best of {len(rows)} candidates on {count} presses ({how})"
-    for contact in used:
-        contact.figures["used"] = True
+    how = (
+        f"the smallest within {WORTH:.0%} of the best of {len(rows)} candidates, {score or 0.0:.2f} deg on each press by the others"
+    )
+    reason = f"{chosen}, from {count} presses: {'too few to choose by holding some out' if score is None else how}"
     return ResponseFit(ResponseModel(fast, deep, sensor.exponent, blur_px), score, rows, reason)
 
 
@@ -186,7 +186,8 @@ def _choose(
     families = [Family(degree, products, uses_depth, half_mm) for degree, products in degrees[: 1 if few else None]]
     if prior is not None:
         own = Family.of(prior)
-        families = [own] + [f for f in families if not few and f.degree >= own.degree and f.product_degree > own.product_degree]
+        larger = [f for f in families if f.degree >= own.degree and f.product_degree >= own.product_degree and f != own]
+        families = [own] + ([] if few else larger)
     rows: list[dict[str, Any]] = []
     fields: list[ResponseField] = []
     for family in families:

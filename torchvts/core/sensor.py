@@ -129,6 +129,10 @@ class Sensor:
         pitch, blur_px = self.mm_per_pixel / scale_x, self.blur_px * scale_x
         return dataclasses.replace(self, height=height, width=width, mm_per_pixel=pitch, blur_px=blur_px, prior=prior)
 
+    def without_prior(self) -> "Sensor":
+        """The same sensor as if nothing were known of its type."""
+        return dataclasses.replace(self, prior=None)
+
     def rectify(self, frame: Tensor) -> Tensor:
         """Camera frames (B, 3, H, W) as the sensor's images (B, 3, height, width): four corners, region of interest, or as is.
 

@@ -45,7 +45,8 @@ def main() -> int:
         progress=True,
     )
     command = f"python {shlex.join(sys.argv)}"
-    lines = [ev.table(result), "", f"{result.how}; means over the {result.summaries[0].presses} presses scored"]
+    lines = [ev.table(result), "", f"{result.how}; {result.summaries[0].presses} presses scored"]
+    lines.append("means over presses; medians for radius and center of the sphere fitted to depth; absolute error of the apex")
     if result.not_scored:
         lines.append(f"not scored, no contact radius: {', '.join(result.not_scored)}")
     arguments.out.mkdir(parents=True, exist_ok=True)

@@ -7,9 +7,11 @@ and the network learn from the balls it found, so that all know the same. All sh
 import dataclasses
 import json
 import math
+import statistics
 import warnings
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +25,7 @@ from .calibration import CalibrationWarning, Press, calibrate
 from .calibration.calibrate import RESPONSE_BLUR_PX
 from .compensate import Compensate
 from .contact import ContactMask
-from .core.checks import check_integer, check_same_size
+from .core.checks import check_image, check_integer, check_same_size
 from .core.geometry import GradientFromNormal, normal_from_gradient, pixel_grid_mm
 from .core.gs_sdk import read_calibration_folder, read_labels
 from .core.response import ResponseField, ResponseModel
@@ -84,7 +86,10 @@ class PressScore:
 
 @dataclasses.dataclass(frozen=True)
 class MethodSummary:
-    """One method over all presses: means, the worst press, and how many numbers it learned; None where nothing was fitted."""
+    """One method over all presses: means, the worst press, and how many numbers it learned; None where nothing was fitted.
+
+    ``radius_percent`` and ``center_px`` are medians: the sphere through a badly wrong relief may lie anywhere.
+    """
 
     method: str
     numbers: int
@@ -509,6 +514,9 @@ def train_network(
     Raises:
         ValueError, TypeError: as :func:`calibrate` and :func:`fit_mlp`.
     """
+    check_image("background", background, sensor.height, sensor.width, sensor.name)
+    for press in presses:
+        check_image(f"{press.name}: image", press.image, sensor.height, sensor.width, sensor.name)
     missing = [press for press in presses if press.center_px is None]
     labelled = [press for press in presses if press.center_px is not None and press.contact_radius_px is not None]
     if missing:
@@ -559,6 +567,8 @@ def evaluate(
         judged = _spread(judged, limit)
     if test is None and folds > len(presses):
         raise ValueError(f"folds: expected at most the number of presses, {len(presses)}, got {folds}")
+    for image in (background, judged_background):
+        check_image("background", image, sensor.height, sensor.width, sensor.name)
     whole = Training(background, presses, sensor)
     truth, how = _with_truth(judged, whole if test is None else Training(judged_background, judged, sensor))
     not_scored = [press.name for press in judged if press.name not in truth]
@@ -594,7 +604,8 @@ def evaluate(
     order = list(truth)
     scores.sort(key=lambda score: (list(chosen).index(score.method), order.index(score.press)))
     summaries = [_summary(name, made[name], [s for s in scores if s.method == name]) for name in chosen]
-    return Evaluation(summaries, scores, not_scored, f"{split}; {how}", shown, outputs, sensor.mm_per_pixel)
+    how = f"{split}, learned without labels; judged by {how}"
+    return Evaluation(summaries, scores, not_scored, how, shown, outputs, sensor.mm_per_pixel)
 
 
 def _choose(methods: Sequence[str], sensor: Sensor, network_path: str | Path | None, seed: int) -> dict[str, Build]:
@@ -623,9 +634,8 @@ def _with_truth(presses: list[Press], training: Training) -> tuple[dict[str, Pre
     truth = {press.name: press for press in presses if press.center_px is not None and press.contact_radius_px is not None}
     if unlabelled:
         truth |= {press.name: press for press in training.located if press.name in unlabelled}
-    how = f"centers from labels ({len(presses) - len(unlabelled)} presses)"
-    if unlabelled:
-        how = f"{how if len(unlabelled) < len(presses) else 'no labels'}, found by calibrate ({len(unlabelled)})"
+    counts = {"labels": len(presses) - len(unlabelled), "calibrate, which saw all presses": len(unlabelled)}
+    how = "centers from " + " and ".join(f"{source} ({count})" for source, count in counts.items() if count)
     return {press.name: truth[press.name] for press in presses if press.name in truth}, how
 
 
@@ -645,8 +655,8 @@ def _summary(method: str, made: list[Method], scores: list[PressScore]) -> Metho
         len(scores),
         sum(score.normal_deg for score in scores) / len(scores),
         sum(score.relief_um for score in scores) / len(scores),
-        _mean([score.radius_percent for score in scores]),
-        _mean([score.center_px for score in scores]),
+        _median([score.radius_percent for score in scores]),
+        _median([score.center_px for score in scores]),
         _mean([None if score.apex_um is None else abs(score.apex_um) for score in scores]),
         worst.press,
         worst.normal_deg,
@@ -659,8 +669,13 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return sum(known) / len(known) if known else None
 
 
+def _median(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return statistics.median(known) if known else None
+
+
 def table(evaluation: Evaluation) -> str:
-    """The summaries as a Markdown table; figures are means over presses, that of the apex the mean of absolute errors."""
+    """The summaries as a Markdown table; means over presses, but medians for the sphere; of the apex the absolute error."""
     lines = [
         "| method | numbers | normal deg | relief um | radius % | center px | apex um | worst press | note |",
         "|---|---|---|---|---|---|---|---|---|",
@@ -694,7 +709,7 @@ def error_figure(evaluation: Evaluation, method: str) -> Figure:
     bars, places = figure.subplots(1, 2)
     by_slope = _pooled([s.by_slope_deg for s in scores], [s.by_slope_pixels for s in scores])
     edges = [f"{edge:g}" for edge in (0.0, *SLOPE_EDGES)]
-    names = [f"{low} to {high}" for low, high in zip(edges, edges[1:])] + [f"over {edges[-1]}"]
+    names = [f"{low} to {high}" for low, high in pairwise(edges)] + [f"over {edges[-1]}"]
     heights = [0.0 if math.isnan(v) else v for v in by_slope]
     bars.bar(names, heights, color="#4c72b0")
     for k, value in enumerate(by_slope):

@@ -31,6 +31,7 @@ class Family:
     product_degree: int
     uses_depth: bool
     half_mm: float
+    product_penalty: float = PRODUCT_PENALTY
 
     def label(self) -> str:
         """Such as "linear 2, products 1, with depth"."""
@@ -40,7 +41,7 @@ class Family:
     def penalty(self) -> Tensor:
         """(2 K,): what a unit of each coefficient costs; dz/dx first."""
         by_term = term_degrees_by_term(self.degree, self.product_degree, self.uses_depth)
-        dear = [PRODUCT_PENALTY ** (len(term) - 1) for term, d in by_term.items() for _ in range((d + 1) * (d + 2) // 2)]
+        dear = [self.product_penalty ** (len(term) - 1) for term, d in by_term.items() for _ in range((d + 1) * (d + 2) // 2)]
         degrees = torch.tensor(term_degrees(self.degree, self.product_degree, self.uses_depth), dtype=torch.float64)
         return (torch.tensor(dear, dtype=torch.float64) * DEGREE_PENALTY**degrees).repeat(2)
 

@@ -1,5 +1,6 @@
 """A response model from presses: balls found, contradictions left out, the smallest family that explains them chosen."""
 
+import dataclasses
 import math
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,7 +13,7 @@ from ..core.geometry import gradient_from_normal
 from ..core.response import ResponseField, ResponseModel
 from ..core.sensor import Sensor
 from ..normals import NormalFromResponse
-from .field import ContactForms, Family, solve, solve_with_centers
+from .field import PRODUCT_PENALTY, ContactForms, Family, solve, solve_with_centers
 from .presses import Contact, add_depth, center_by_slope, guess_circle, update_radius
 
 FAMILIES = ((0, -1), (1, -1), (2, -1), (2, 1), (3, 2), (3, 3))
@@ -46,6 +47,7 @@ def fit_response(
     blur_px: float,
     progress: bool = False,
     families: tuple[tuple[int, int], ...] = FAMILIES,
+    product_penalty: float = PRODUCT_PENALTY,
 ) -> ResponseFit:
     """Locate the balls, leave out what contradicts, and fit.
 
@@ -56,11 +58,13 @@ def fit_response(
         blur_px: that the contacts were read with.
         progress: show a bar.
         families: degrees to choose from, linear terms and products, the smallest first.
+        product_penalty: how much dearer coefficients of products are.
     Raises:
         ValueError: no press is left; names what became of each.
     """
     pitch = sensor.mm_per_pixel
     half_mm = prior.fast.half_mm if prior is not None else 0.5 * sensor.width * pitch
+    options = [Family(degree, products, False, half_mm, product_penalty) for degree, products in families]
     with tqdm(total=4, desc="calibrating from presses", disable=not progress, leave=False) as bar:
         bar.set_postfix(step="balls")
         locate(contacts, pitch, sensor, prior, half_mm)
@@ -72,13 +76,13 @@ def fit_response(
             raise ValueError("presses: none can be used: " + "; ".join(f"{c.name}: {c.reason}" for c in contacts))
         bar.update()
         bar.set_postfix(step="one pass")
-        fast, fast_rows, fast_index = _choose(used, families, False, half_mm, None if prior is None else prior.fast)
+        fast, fast_rows, fast_index = _choose(used, options, False, None if prior is None else prior.fast)
         for contact in used:
             add_depth(contact, fast, pitch)
         bar.update()
         bar.set_postfix(step="second pass")
         given = None if prior is None else prior.precise or fast.lifted(fast.degree, fast.product_degree, True)
-        deep, deep_rows, deep_index = _choose(used, families, True, half_mm, given)
+        deep, deep_rows, deep_index = _choose(used, options, True, given)
         bar.update()
     rows = fast_rows + deep_rows
     score, before = deep_rows[deep_index]["score_deg"], fast_rows[fast_index]["score_deg"]
@@ -179,11 +183,11 @@ def leave_out(contacts: list[Contact], prior: ResponseModel | None, half_mm: flo
 
 
 def _choose(
-    contacts: list[Contact], degrees: tuple[tuple[int, int], ...], uses_depth: bool, half_mm: float, prior: ResponseField | None
+    contacts: list[Contact], options: list[Family], uses_depth: bool, prior: ResponseField | None
 ) -> tuple[ResponseField, list[dict[str, Any]], int]:
     """The field of the smallest family within WORTH of the best held-out angle, the candidates, and which one it is."""
     few = len(contacts) < 3
-    families = [Family(degree, products, uses_depth, half_mm) for degree, products in degrees[: 1 if few else None]]
+    families = [dataclasses.replace(option, uses_depth=uses_depth) for option in options[: 1 if few else None]]
     if prior is not None:
         own = Family.of(prior)
         larger = [f for f in families if f.degree >= own.degree and f.product_degree >= own.product_degree and f != own]

@@ -24,8 +24,8 @@ class ResponseField:
 
     The inputs are the relative changes of R, G and B, image / background - 1, over :data:`CHANGE_SCALE`, and, if
     ``uses_depth``, the depth in mm. The terms are the inputs themselves and, if ``product_degree`` is not -1, their products
-    of two. No term is constant: a skin at rest has slope zero. Each W_t is a polynomial of total degree ``degree`` (products:
-    ``product_degree``) in x / half_mm and y / half_mm.
+    of two but for depth squared. No term is constant: a skin at rest has slope zero. Each W_t is a polynomial of total degree
+    ``degree`` (products: ``product_degree``) in x / half_mm and y / half_mm.
 
     Args:
         degree, product_degree: 0 to 6; product_degree -1 leaves products out.
@@ -210,10 +210,11 @@ def fit_log_background(background: Tensor, mm_per_pixel: float) -> tuple[tuple[f
 
 
 def field_terms(uses_depth: bool, product_degree: int) -> list[tuple[int, ...]]:
-    """Terms as indices of their inputs: first the inputs, then their products of two."""
+    """Terms as indices of their inputs: the inputs, then their products of two, but for depth squared, which explains nothing."""
     inputs = range(4 if uses_depth else 3)
     single: list[tuple[int, ...]] = [(k,) for k in inputs]
-    return single + (list(combinations_with_replacement(inputs, 2)) if product_degree >= 0 else [])
+    pairs = [pair for pair in combinations_with_replacement(inputs, 2) if pair != (3, 3)]
+    return single + (pairs if product_degree >= 0 else [])
 
 
 def term_degrees_by_term(degree: int, product_degree: int, uses_depth: bool) -> dict[tuple[int, ...], int]:

@@ -75,8 +75,9 @@ class NormalFromResponse(nn.Module):
         if maps.shape[0] > place:
             for i in range(len(inputs)):
                 for k in range(i, len(inputs)):
-                    gradient = torch.addcmul(gradient, maps[place], inputs[i] * inputs[k])
-                    place += 1
+                    if i < 3:  # depth squared is no term
+                        gradient = torch.addcmul(gradient, maps[place], inputs[i] * inputs[k])
+                        place += 1
         p, q = gradient[:, 0:1], gradient[:, 1:2]
         steepness = torch.sqrt(torch.addcmul(p * p, q, q) + 1e-12)
         return normal_from_gradient(gradient * (self.max_slope / steepness).clamp_max(1.0))

@@ -1,0 +1,134 @@
+"""How accurate a calibration is after 0, 1, 3, 5, ... presses or touches: a table and a picture.
+
+python scripts/learning_curve.py ../shared/data/gelsight_mini_a --sensor gelsight_mini
+
+Presses carry no labels; those left out are scored. Where a prior takes part it is fitted on the balls of all other diameters
+(with their labels), so it has not seen the ball that is scored.
+"""
+
+import argparse
+import dataclasses
+import random
+import statistics
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+import torch
+from tqdm import tqdm
+
+import torchvts as vts
+from torchvts.evaluate import PressScore, read_presses, score_press
+from torchvts.viz import save_figure
+
+matplotlib.use("Agg")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="presses of balls of two or more diameters, in gs_sdk's layout")
+    parser.add_argument("--sensor", required=True, help=f"YAML file, or one of {', '.join(vts.shipped_sensors())}")
+    parser.add_argument("--draws", type=int, default=4, help="choices of presses per figure")
+    parser.add_argument("--out", type=Path, default=Path("out/learning_curve"), help="folder for table.md and the picture")
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore", vts.CalibrationWarning)
+    bare = vts.Sensor.load(arguments.sensor).without_prior()
+    background, presses = read_presses(arguments.folder)
+    scored = [press for press in presses if press.center_px is not None and press.contact_radius_px is not None]
+    rows: list[tuple[str, int, list[PressScore]]] = []
+    balls = sorted({press.ball_diameter_mm for press in presses})
+    counts = (0, 1, 3, 5, 10)
+    with tqdm(desc="learning curve", leave=False) as bar:
+        sensors = {}
+        for ball in balls:
+            others = [press for press in presses if press.ball_diameter_mm != ball]
+            sensors[ball] = dataclasses.replace(bare, prior=vts.fit_prior(background, bare, others)) if others else bare
+        for count in counts:
+            found: list[PressScore] = []
+            for ball in balls if len(balls) > 1 else []:
+                own = [press for press in presses if press.ball_diameter_mm == ball]
+                for draw in draws(own, count, arguments.draws):
+                    found += score(background, sensors[ball], draw, [], left(scored, draw, ball))
+                    bar.update()
+            if found:
+                rows.append(("presses, prior of another ball", count, found))
+        for count in (3, 5, 10, len(presses) - len(presses) // 5):
+            found = []
+            for draw in draws(presses, count, arguments.draws):
+                found += score(background, bare, draw, [], left(scored, draw))
+                bar.update()
+            rows.append(("presses, no prior", count, found))
+        for count in (1, 5, 10, min(30, len(presses) - 1)):
+            found = []
+            for draw in draws(presses, count, arguments.draws):
+                one = random.Random(count).choice([press for press in scored if press not in draw] or scored)
+                found += score(background, bare, [one], draw, left(scored, [*draw, one]) or scored)
+                bar.update()
+            rows.append(("touches, and one press for the scale", count, found))
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    text = table(rows)
+    (arguments.out / "table.md").write_text(text + "\n")
+    save_figure(figure(rows), arguments.out / "learning_curve.png")
+    print(text)
+    print(f"\nwrote {arguments.out}/table.md and learning_curve.png")
+    return 0
+
+
+def draws(presses: Sequence[vts.Press], count: int, number: int) -> list[list[vts.Press]]:
+    """``number`` random choices of ``count`` presses, the same at every run; one if there is nothing to choose."""
+    return [random.Random(seed).sample(list(presses), count) for seed in range(number if count else 1)]
+
+
+def left(scored: Sequence[vts.Press], used: Sequence[vts.Press], ball: float | None = None) -> list[vts.Press]:
+    names = {press.name for press in used}
+    return [press for press in scored if press.name not in names and ball in (None, press.ball_diameter_mm)]
+
+
+def score(
+    background: torch.Tensor,
+    sensor: vts.Sensor,
+    presses: Sequence[vts.Press],
+    touches: Sequence[vts.Press],
+    judged: Sequence[vts.Press],
+) -> list[PressScore]:
+    """Calibrate with the labels forgotten, and score the precise depth of other presses."""
+    blind = [dataclasses.replace(press, center_px=None, contact_radius_px=None) for press in presses]
+    calibration = vts.calibrate(background, sensor, blind, [press.image for press in touches])
+    pipe = vts.DepthPipeline.from_calibration(calibration, "precise")
+    scores = []
+    for press in judged:
+        with torch.inference_mode():
+            out = pipe(press.image[None])
+        scores.append(score_press(press, out.depth_mm, out.normal, sensor.mm_per_pixel))
+    return scores
+
+
+def table(rows: Sequence[tuple[str, int, list[PressScore]]]) -> str:
+    lines = ["| given | number | normals deg | relief um | radius % | scored |", "|---|---|---|---|---|---|"]
+    for kind, count, scores in rows:
+        radius = statistics.mean(s.radius_percent for s in scores if s.radius_percent is not None)
+        angle, relief = statistics.mean(s.normal_deg for s in scores), statistics.mean(s.relief_um for s in scores)
+        lines.append(f"| {kind} | {count} | {angle:.2f} | {relief:.1f} | {radius:.1f} | {len(scores)} |")
+    return "\n".join(lines)
+
+
+def figure(rows: Sequence[tuple[str, int, list[PressScore]]]) -> "matplotlib.figure.Figure":
+    import matplotlib.pyplot as plt
+
+    drawn, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
+    for kind in dict.fromkeys(kind for kind, _, _ in rows):
+        points = [(count, statistics.mean(s.normal_deg for s in scores)) for k, count, scores in rows if k == kind]
+        axes.plot(*zip(*points), marker="o", label=kind)
+    axes.set(xlabel="presses or touches", ylabel="mean angle of normals, deg", ylim=(0, None))
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False)
+    return drawn
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except (OSError, ValueError, TypeError) as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,647 @@
+"""Calibration from presses of balls nobody labelled: on sensors whose truth is a response field, lights, or neither.
+
+Three synthetic units of 120 x 160 pixels at 0.125 mm, all with noise of 0.003 and 8 bits:
+"field": light is background * (1 + what a known response field inverts), and the skin leaves the ball along a skirt;
+"curve": a ring of lights seen with vignetting, channels mixed, value = light^0.6 + 0.05: no point lights explain it;
+"lights": a ring of point lights, as the paper has it.
+"""
+
+import dataclasses
+import json
+import math
+import re
+import warnings
+
+import pytest
+import torch
+from conftest import ring_lights
+
+import torchvts as vts
+from torchvts.calibration.calibrate import CalibrationWarning
+from torchvts.core.response import CHANGE_SCALE, ResponseField
+
+HEIGHT, WIDTH, PITCH = 120, 160, 0.125
+SIZE = (HEIGHT, WIDTH, PITCH)
+SENSOR = vts.Sensor("rig", *SIZE, gamma=1.0)
+GIVEN = dataclasses.replace(SENSOR, light_position_mm=ring_lights().position_mm.tolist())  # spares the fit of the lights
+BALL_MM = 6.0
+CENTERS_MM = [(0, 0), (5, 3), (-5, 3), (5, -3), (-5, -3), (0, 4), (0, -4), (7, 0), (-7, 0), (2.5, 1.5), (9.3, 2), (-3, -7)]
+DEPTHS_MM = [0.5, 0.4, 0.6, 0.45, 0.55, 0.5, 0.4, 0.6, 0.5, 0.35, 0.6, 0.5]
+CUT = {10: "right", 11: "top"}  # by the image border
+MIX = [[0.75, 0.2, 0.05], [0.1, 0.8, 0.1], [0.05, 0.25, 0.7]]
+OTHER_MIX = [[0.72, 0.22, 0.06], [0.12, 0.76, 0.12], [0.04, 0.28, 0.68]]
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit.script.*:DeprecationWarning")
+
+
+def ball(center_mm=(0.0, 0.0), press_mm=0.5, ball_mm=BALL_MM):
+    return vts.scenes.sphere_press(0.5 * ball_mm, press_mm, center_mm, *SIZE)
+
+
+def soft_ball(center_mm=(0.0, 0.0), press_mm=0.5, ball_mm=BALL_MM):
+    """A ball, and skin that falls away from it exponentially from 0.8 of its bare contact radius on, slope continuous."""
+    radius = 0.5 * ball_mm
+    edge = 0.8 * math.sqrt(radius**2 - (radius - press_mm) ** 2)
+    height = math.sqrt(radius**2 - edge**2) - (radius - press_mm)
+    fall = edge / math.sqrt(radius**2 - edge**2) / height
+
+    def depth(x, y):
+        r = torch.sqrt((x - center_mm[0]) ** 2 + (y - center_mm[1]) ** 2 + 1e-18)
+        on_ball = torch.sqrt(radius**2 - r.clamp_max(edge) ** 2) - (radius - press_mm)
+        return torch.where(r < edge, on_ball, height * torch.exp(-fall * (r - edge)))
+
+    return vts.scenes.surface(depth, *SIZE)
+
+
+def noisy(image, seed):
+    noise = 0.003 * torch.randn(image.shape, generator=torch.Generator().manual_seed(seed))
+    return torch.round((image + noise).clamp(0, 1) * 255) / 255
+
+
+def true_field():
+    """dz/dx from R against G and B, dz/dy from G against B, varying linearly over the image."""
+    base = 0.7 * torch.tensor([[0.5, -0.25, -0.25], [0.0, 0.43, -0.43]], dtype=torch.float64)
+    rows = torch.zeros(2, 3, 3, dtype=torch.float64)
+    rows[:, :, 0] = base
+    rows[:, :, 1:] = 0.1 * torch.randn(2, 3, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    return ResponseField(1, -1, False, 0.5 * WIDTH * PITCH, rows.reshape(2, 9).tolist())
+
+
+def seen_by_field(scene, seed):
+    """The smallest change of the three channels that the true field makes this slope of."""
+    maps = true_field().maps(*SIZE).permute(2, 3, 1, 0)  # (H, W, 2, 3)
+    change = CHANGE_SCALE * torch.einsum("hwki,ihw->khw", torch.linalg.pinv(maps), scene.gradient[0].double())
+    y, x = torch.meshgrid(torch.linspace(-1, 1, HEIGHT), torch.linspace(-1, 1, WIDTH), indexing="ij")
+    return noisy(torch.stack((0.45 + 0.1 * x, 0.4 - 0.1 * y, 0.42 - 0.1 * x * y)) * (1 + change.float()), seed)
+
+
+def seen_by_curve(scene, seed, mix=MIX, vignetting=0.4, **lights):
+    light = vts.scenes.render(scene, ring_lights(**lights), vignetting=vignetting)[0]
+    return noisy(torch.einsum("ij,jhw->ihw", torch.tensor(mix), light) ** 0.6 + 0.05, seed)
+
+
+def seen_by_other_curve(scene, seed):
+    """Another unit of the same type: turned by 4 degrees, dimmer, mixing otherwise."""
+    return seen_by_curve(scene, seed, OTHER_MIX, 0.35, rotation_deg=14.0, level=0.42)
+
+
+def seen_by_lights(scene, seed, noise_std=0.003, bits=8, **lights):
+    return vts.scenes.render(scene, ring_lights(**lights), noise_std=noise_std, bits=bits, seed=seed)[0]
+
+
+CAMERAS = {"field": (seen_by_field, soft_ball), "curve": (seen_by_curve, ball), "lights": (seen_by_lights, ball)}
+
+
+def background(camera=seen_by_curve):
+    return camera(vts.scenes.at_rest(ball()), 99)
+
+
+def take_presses(camera=seen_by_curve, shape=ball, count=12, deeper=1.0):
+    places = list(zip(CENTERS_MM, DEPTHS_MM))[:count]
+    return [vts.Press(camera(shape(c, deeper * d), k), BALL_MM, f"press {k}") for k, (c, d) in enumerate(places)]
+
+
+def in_px(center_mm):
+    return center_mm[0] / PITCH + (WIDTH - 1) / 2, center_mm[1] / PITCH + (HEIGHT - 1) / 2
+
+
+def calibrate(image, sensor, presses=()):
+    """The calibration, and what was warned of."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        calibration = vts.calibrate(image, sensor, presses)
+    return calibration, [str(w.message) for w in caught if issubclass(w.category, CalibrationWarning)]
+
+
+@pytest.fixture(scope="module", params=["field", "curve"])
+def unit(request):
+    """A unit's name, camera, kind of skin, presses and calibration."""
+    camera, shape = CAMERAS[request.param]
+    presses = take_presses(camera, shape)
+    sensor = SENSOR if request.param == "curve" else GIVEN
+    return request.param, camera, shape, presses, *calibrate(background(camera), sensor, presses)
+
+
+@pytest.fixture(scope="module")
+def good():
+    """Six clean presses on the unit "curve"."""
+    return take_presses(count=6)
+
+
+@pytest.fixture(scope="module")
+def rest():
+    return background()
+
+
+def depth_errors(calibration, camera, shape, mode, places):
+    """Mean error inside the contact, mm, and mean angle on the ball two pixels inside of its rim, degrees, over presses."""
+    pipe, depths, angles = vts.DepthPipeline.from_calibration(calibration, mode), [], []
+    for k, (center, press, ball_mm) in enumerate(places):
+        scene = shape(center, press, ball_mm)
+        edge = 0.8 * math.sqrt(ball_mm * press - press**2) if shape is soft_ball else math.sqrt(ball_mm * press - press**2)
+        y, x = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
+        middle = in_px(center)
+        inside = (((x - middle[0]) ** 2 + (y - middle[1]) ** 2) < (edge / PITCH - 2) ** 2)[None, None]
+        out = pipe(camera(scene, 500 + k)[None])
+        depths.append(float((out.depth_mm - scene.depth_mm).abs()[inside].mean()))
+        angles.append(float(vts.metrics.normal_angle_deg(out.normal, scene.normal, inside).mean()))
+    return sum(depths) / len(depths), sum(angles) / len(angles)
+
+
+HELD_OUT = [((1.5, -2), 0.5, 6.0), ((-4, 1), 0.4, 8.0), ((3, 3), 0.4, 5.0), ((-1, 4.5), 0.45, 7.0)]
+
+
+# presses nobody labelled
+
+
+def test_balls_are_found_without_labels(unit):
+    """Centers to 0.7 px in the median and 1.5 px at worst, also of those cut by the border."""
+    _, _, _, _, calibration, warned = unit
+    rows = calibration.report["presses"]
+    assert warned == [] and [row["name"] for row in rows] == [f"press {k}" for k in range(12)]
+    assert all(row["used"] and row["reason"] == "" for row in rows)
+    off = [math.dist(row["center_px"], in_px(center)) for row, center in zip(rows, CENTERS_MM)]
+    assert float(torch.tensor(off).median()) < 0.7 and max(off) < 1.5, off
+    assert all(off[k] < 1.0 for k in CUT), off
+
+
+def test_contact_radii_are_found_without_labels(unit):
+    name, _, _, _, calibration, _ = unit
+    for row, depth in zip(calibration.report["presses"], DEPTHS_MM):
+        bare = math.sqrt(BALL_MM * depth - depth**2) / PITCH
+        # a bare ball ends at its rim; on a skirt half the slope is lost a little outside of where the skirt begins
+        expected, tolerance = (0.88 * bare, 1.5) if name == "field" else (bare, 1.5)
+        assert row["contact_radius_px"] == pytest.approx(expected, abs=tolerance)
+
+
+def test_what_lights_cannot_explain_gets_a_response(unit):
+    name, _, _, _, calibration, _ = unit
+    report = calibration.report
+    assert report["model"] == "response" and calibration.response is not None and calibration.lights is None
+    assert "response, linear" in report["reason"] and "12 presses" in report["reason"]
+    lights = report["candidates"][0]
+    assert lights["model"] == "point lights" and lights["score_deg"] > 5.0 and "rejected" in lights["note"]
+    assert report["held_out_deg"] < 1.0, name
+
+
+def test_the_candidates_are_told_with_their_scores(unit):
+    _, _, _, _, calibration, _ = unit
+    text = json.dumps(calibration.report, allow_nan=False)
+    rows = json.loads(text)["candidates"]
+    assert len(rows) >= 9
+    for row in rows:
+        assert {"model", "family", "numbers", "score_deg", "pass"} <= set(row)
+        assert math.isfinite(row["score_deg"]) and row["score_deg"] > 0
+    assert {row["pass"] for row in rows[1:]} == {1, 2}
+    fast = [row for row in rows[1:] if row["pass"] == 1]
+    assert [row["numbers"] for row in fast] == sorted(row["numbers"] for row in fast)
+    best = min(row["score_deg"] for row in fast)
+    chosen = next(row for row in fast if row["numbers"] == 2 * calibration.response.fast.size())
+    assert chosen["score_deg"] <= 1.02 * best
+    assert all(row["score_deg"] > 1.02 * best for row in fast if row["numbers"] < chosen["numbers"])
+
+
+@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
+def test_other_balls_elsewhere_are_measured(unit, mode):
+    """Within 0.03 mm (a quarter of a pixel, 7 % of the press) of the true depth, and 1.2 degrees of the true normals."""
+    _, camera, shape, _, calibration, _ = unit
+    depth_mm, angle_deg = depth_errors(calibration, camera, shape, mode, HELD_OUT)
+    assert depth_mm < 0.03 and angle_deg < 1.2, (depth_mm, angle_deg)
+
+
+def test_the_true_field_is_found_where_the_balls_were(unit):
+    """Slopes that the fitted field makes of exact changes, held against the truth."""
+    name, _, _, _, calibration, _ = unit
+    if name != "field":
+        pytest.skip("the other unit has no field for its truth")
+    truth, found = true_field(), calibration.response.fast
+    assert found.half_mm == truth.half_mm
+    maps, want = found.maps(*SIZE)[:3], truth.maps(*SIZE)
+    inverse = torch.linalg.pinv(want.permute(2, 3, 1, 0))  # changes as they occur on this unit
+    slope = torch.einsum("kahw,hwkb->hwab", maps, inverse)  # should give back each unit slope
+    off = (slope - torch.eye(2, dtype=torch.float64)).abs()[20:-20, 20:-20]
+    assert float(off.mean()) < 0.03 and float(off.max()) < 0.15, (float(off.mean()), float(off.max()))
+
+
+def test_the_calibration_survives_a_file(unit, tmp_path):
+    _, camera, shape, _, calibration, _ = unit
+    calibration.save(tmp_path / "unit.safetensors")
+    loaded = vts.Calibration.load(tmp_path / "unit.safetensors")
+    assert torch.equal(loaded.background, calibration.background) and loaded.report == calibration.report
+    image = camera(shape((1.5, -2)), 7)[None]
+    one, two = (vts.DepthPipeline.from_calibration(c, "precise")(image).depth_mm for c in (calibration, loaded))
+    assert float((one - two).abs().max()) < 1e-5  # coefficients are kept to seven digits
+
+
+def test_calibrating_twice_gives_the_same_numbers(good, rest):
+    one, two = (calibrate(rest, GIVEN, good)[0] for _ in range(2))
+    assert one.response == two.response and one.report == two.report
+
+
+def test_the_order_of_the_presses_does_not_matter(good, rest):
+    one, two = (calibrate(rest, GIVEN, presses)[0].response for presses in (good, good[::-1]))
+    for field in ("fast", "precise"):
+        left, right = getattr(one, field), getattr(two, field)
+        assert torch.allclose(left.tensor(), right.tensor(), rtol=0, atol=1e-6)
+
+
+def test_a_mirrored_unit_is_calibrated_alike(good, rest):
+    """Images flipped left to right give the same depth, flipped."""
+    scene_image = seen_by_curve(ball((1.5, -2)), 77)
+    plain, _ = calibrate(rest, GIVEN, good)
+    mirrored, _ = calibrate(rest.flip(2), GIVEN, [dataclasses.replace(p, image=p.image.flip(2)) for p in good])
+    for row, other in zip(plain.report["presses"], mirrored.report["presses"]):
+        assert other["center_px"] == pytest.approx([WIDTH - 1 - row["center_px"][0], row["center_px"][1]], abs=0.1)
+    depth, flipped = (
+        vts.DepthPipeline.from_calibration(c)(image[None]).depth_mm
+        for c, image in ((plain, scene_image), (mirrored, scene_image.flip(2)))
+    )
+    assert float((depth - flipped.flip(3)).abs().max()) < 0.01
+
+
+def test_a_unit_of_length_does_not_matter(good, rest):
+    """Pitch and balls twice as large: the same slopes."""
+    double = dataclasses.replace(GIVEN, mm_per_pixel=2 * PITCH)
+    one, _ = calibrate(rest, GIVEN, good)
+    two, _ = calibrate(rest, double, [dataclasses.replace(p, ball_diameter_mm=2 * BALL_MM) for p in good])
+    for row, other in zip(one.report["presses"], two.report["presses"]):
+        assert other["center_px"] == pytest.approx(row["center_px"], abs=1e-4)
+    left, right = one.response.fast, two.response.fast
+    assert (left.degree, left.product_degree, 2 * left.half_mm) == (right.degree, right.product_degree, right.half_mm)
+    assert torch.allclose(left.tensor(), right.tensor(), rtol=0, atol=1e-5)
+
+
+def test_balls_of_several_sizes_go_together(rest):
+    sizes = [5.0, 6.0, 7.0, 8.0, 9.0, 6.0]
+    places = list(zip(CENTERS_MM, sizes))
+    presses = [vts.Press(seen_by_curve(ball(c, 0.4, d), k), d, f"press {k}") for k, (c, d) in enumerate(places)]
+    calibration, warned = calibrate(rest, GIVEN, presses)
+    off = [math.dist(row["center_px"], in_px(center)) for row, (center, _) in zip(calibration.report["presses"], places)]
+    assert warned == [] and max(off) < 0.7
+    assert depth_errors(calibration, seen_by_curve, ball, "fast", HELD_OUT)[1] < 1.2
+
+
+def test_double_precision_and_gradients_in_images_do_no_harm(good, rest):
+    plain, _ = calibrate(rest, GIVEN, good[:3])
+    presses = [dataclasses.replace(p, image=p.image.double().requires_grad_()) for p in good[:3]]
+    double, _ = calibrate(rest.double(), GIVEN, presses)
+    assert double.background.dtype == torch.float64
+    assert torch.allclose(double.response.fast.tensor(), plain.response.fast.tensor(), rtol=0, atol=1e-5)
+
+
+# point lights
+
+
+def test_clean_lights_without_noise_keep_point_lights():
+    def camera(scene, seed):
+        return seen_by_lights(scene, seed, noise_std=0.0, bits=None)
+
+    calibration, warned = calibrate(background(camera), SENSOR, take_presses(camera))
+    report = calibration.report
+    assert warned == [] and report["model"] == "point_lights" and calibration.response is None
+    assert report["reason"].startswith("point lights: on 12 presses their normals are 0.") and "response fields" in report["reason"]
+    assert len(report["candidates"]) >= 9 and len(report["presses"]) == 12
+    json.dumps(report, allow_nan=False)
+
+
+def test_too_few_presses_for_a_response_keep_pinned_lights():
+    calibration, _ = calibrate(background(seen_by_lights), SENSOR, take_presses(seen_by_lights, count=2))
+    assert calibration.report["model"] == "point_lights" and "too few presses for a response field" in calibration.report["reason"]
+    assert calibration.report["candidates"][0]["score_deg"] < 1.0
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="_lights_error judges point lights by their first pass, though their row says pass 2, and on balls at the centers that the "
+    "response found (up to 1.8 px off here, the field makes up for it): 1.77 degrees. Second pass and centers by the lights' own slopes "
+    "give 0.66, and lights win over 1.20; either alone does not. Measured truth: response 1.43, lights in mode 'precise' 0.44 degrees",
+)
+def test_near_lights_keep_point_lights_because_their_second_pass_is_better():
+    def camera(scene, seed):
+        return seen_by_lights(scene, seed, radius_mm=15.0, height_mm=12.0)
+
+    sensor = dataclasses.replace(SENSOR, blur_px=1.0)
+    calibration, _ = calibrate(background(camera), sensor, take_presses(camera, deeper=2.2))
+    places = [((1.5, -2), 1.0, 6.0), ((-4, 1), 0.9, 6.0)]
+    by_lights, _ = calibrate(background(camera), sensor)
+    assert by_lights.report["model"] == "point_lights"
+    angle = depth_errors(calibration, camera, ball, "precise", places)[1]
+    assert angle < 1.5 * depth_errors(by_lights, camera, ball, "precise", places)[1]
+    assert calibration.report["model"] == "point_lights"
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="lights and response are level here (0.290 against 0.289 deg at the same blur, within WORTH), but calibrate compares "
+    "by < alone, and takes the field of over a hundred numbers instead of twelve",
+)
+def test_where_lights_and_response_are_level_the_twelve_numbers_are_taken():
+    sensor = dataclasses.replace(SENSOR, blur_px=1.0)
+    calibration, _ = calibrate(background(seen_by_lights), sensor, take_presses(seen_by_lights))
+    scores = [row["score_deg"] for row in calibration.report["candidates"]]
+    assert scores[0] < 1.02 * min(scores[1:])
+    assert calibration.report["model"] == "point_lights"
+
+
+def test_on_clean_noisy_lights_the_choice_is_no_worse_than_the_lights():
+    chosen, _ = calibrate(background(seen_by_lights), SENSOR, take_presses(seen_by_lights, count=8))
+    lights, _ = calibrate(background(seen_by_lights), SENSOR)
+    assert lights.report["model"] == "point_lights"
+    left, right = (depth_errors(c, seen_by_lights, ball, "precise", HELD_OUT)[1] for c in (chosen, lights))
+    assert left < 1.02 * right
+
+
+# what the sensor's type says
+
+
+@pytest.fixture(scope="module")
+def prior():
+    """From presses on the unit "curve" with a ball of 6 mm."""
+    return vts.fit_prior(background(), SENSOR, take_presses(), "unit A, ball of 6 mm")
+
+
+def other_presses(count):
+    """Of a ball of 9 mm on another unit."""
+    places = [((1, -1), 0.4), ((-5, 3), 0.3), ((5, -3), 0.35), ((4, 3), 0.3), ((-4, -3), 0.4)][:count]
+    return [vts.Press(seen_by_other_curve(ball(c, p, 9.0), 200 + k), 9.0, f"other {k}") for k, (c, p) in enumerate(places)]
+
+
+@pytest.fixture(scope="module")
+def prior_alone(prior):
+    return calibrate(background(seen_by_other_curve), dataclasses.replace(SENSOR, prior=prior))
+
+
+def test_a_prior_tells_what_it_was_fitted_on(prior):
+    assert prior.source == "unit A, ball of 6 mm" and prior.response.gamma == 1.0 and prior.response.precise is not None
+    assert prior.half_mm == pytest.approx(0.5 * WIDTH * PITCH)
+    smooth = prior.background(*SIZE)
+    assert float((smooth / background() - 1).abs().mean()) < 0.02
+
+
+def test_a_prior_serves_another_unit_where_lights_are_not_pinned(prior, prior_alone):
+    calibration, warned = prior_alone
+    report = calibration.report
+    assert warned == [] and report["model"] == "response" and calibration.response == prior.response
+    assert "prior" in report["reason"] and "point lights rejected" in report["reason"]
+    assert [row["model"] for row in report["candidates"]] == ["point lights", "prior"]
+    json.dumps(report, allow_nan=False)
+    assert calibration.sensor.prior is None  # the unit's own response is what counts from here on
+    assert depth_errors(calibration, seen_by_other_curve, ball, "fast", HELD_OUT)[1] < 3.0
+
+
+def test_pinned_lights_go_before_a_prior(prior):
+    sensor = dataclasses.replace(SENSOR, prior=vts.fit_prior(background(seen_by_lights), SENSOR, take_presses(seen_by_lights)))
+    calibration, warned = calibrate(background(seen_by_lights), sensor)
+    assert warned == [] and calibration.report["model"] == "point_lights"
+    assert "the image pins the lights to" in calibration.report["reason"]
+
+
+@pytest.mark.parametrize("mode", ["fast", "precise"])
+@pytest.mark.parametrize("count", [1, 3, 5])
+def test_presses_of_another_ball_do_no_harm_to_a_prior(prior, prior_alone, count, mode):
+    sensor = dataclasses.replace(GIVEN, prior=prior)
+    calibration, warned = calibrate(background(seen_by_other_curve), sensor, other_presses(count))
+    assert warned == [] and "prior moved" in calibration.report["reason"]
+    alone = depth_errors(prior_alone[0], seen_by_other_curve, ball, mode, HELD_OUT)
+    after = depth_errors(calibration, seen_by_other_curve, ball, mode, HELD_OUT)
+    assert all(b < 1.1 * a for a, b in zip(alone, after)), (alone, after)
+    if count == 5:  # enough to be worth something
+        assert after[1] < 0.8 * alone[1]
+
+
+def test_balls_are_found_with_a_prior_from_one_press_on(prior):
+    sensor = dataclasses.replace(GIVEN, prior=prior)
+    calibration, _ = calibrate(background(seen_by_other_curve), sensor, other_presses(1))
+    row = calibration.report["presses"][0]
+    assert math.dist(row["center_px"], in_px((1, -1))) < 1.0
+    assert row["contact_radius_px"] == pytest.approx(math.sqrt(9 * 0.4 - 0.16) / PITCH, abs=2.0)
+
+
+def test_a_prior_sees_a_wrong_diameter_in_a_single_press(prior):
+    sensor = dataclasses.replace(GIVEN, prior=prior)
+    wrong = dataclasses.replace(other_presses(1)[0], ball_diameter_mm=18.0)
+    with pytest.raises(ValueError, match=r"other 0: by the sensor's prior the ball seems (8|9|10)\.\d+ mm wide, but 18 mm"):
+        calibrate(background(seen_by_other_curve), sensor, [wrong])
+
+
+def test_a_background_of_another_type_is_warned_of(prior):
+    """The light falls off to the right by 95 %."""
+    ramp = torch.linspace(1.0, 0.05, WIDTH)
+    _, warned = calibrate(background() * ramp, dataclasses.replace(SENSOR, prior=prior))
+    assert any("unlike that of the unit the prior of sensor 'rig' was fitted on" in text for text in warned)
+
+
+# known centers
+
+
+def test_known_centers_are_kept(good, rest):
+    known = [dataclasses.replace(p, center_px=in_px(c)) for p, c in zip(good, CENTERS_MM)]
+    for presses in (known, known[:2] + good[2:]):
+        calibration, warned = calibrate(rest, GIVEN, presses)
+        assert warned == []
+        for row, press in zip(calibration.report["presses"], presses):
+            if press.center_px is not None:
+                assert row["center_px"] == pytest.approx(press.center_px, abs=1e-9)
+    given = dataclasses.replace(good[0], center_px=[79.0, 60.0], contact_radius_px=12.0)
+    row = calibrate(rest, GIVEN, [given, *good[1:]])[0].report["presses"][0]
+    assert row["center_px"] == pytest.approx([79.0, 60.0], abs=1e-9) and row["contact_radius_px"] == pytest.approx(12.0)
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="the contact radius of a press with a known center is 0.6 sqrt(area / pi) of its mask, 36 % too small, and never "
+    "sought: guess_circle, _locate_jointly and center_by_slope all pass over known centers",
+)
+def test_the_radius_of_a_press_with_a_known_center_is_found(good, rest):
+    known = [dataclasses.replace(p, center_px=in_px(c)) for p, c in zip(good, CENTERS_MM)]
+    for row, depth in zip(calibrate(rest, GIVEN, known)[0].report["presses"], DEPTHS_MM):
+        assert row["contact_radius_px"] == pytest.approx(math.sqrt(BALL_MM * depth - depth**2) / PITCH, abs=1.5)
+
+
+NO_PIXELS = "no pixel lies inside the contact: error_deg is the mean of nothing, NaN, which spreads to the field or the report"
+
+
+@pytest.mark.xfail(strict=True, reason=NO_PIXELS)
+@pytest.mark.parametrize(
+    "odd",
+    [{"center_px": (1000.0, 1000.0)}, {"center_px": (5.0, 5.0)}, {"center_px": in_px((0, 0)), "contact_radius_px": 0.1}],
+    ids=["outside of the image", "beside the contact", "a radius below a pixel"],
+)
+def test_a_center_that_cannot_be_is_left_out_with_a_reason(good, rest, odd):
+    calibration, warned = calibrate(rest, GIVEN, [*good[1:], dataclasses.replace(good[0], name="odd", **odd)])
+    row = calibration.report["presses"][-1]
+    assert not row["used"] and row["reason"] and any(text.startswith("odd: left out: ") for text in warned)
+    json.dumps(calibration.report, allow_nan=False)
+
+
+@pytest.mark.xfail(strict=True, reason=NO_PIXELS)
+def test_a_single_press_with_an_impossible_center_is_refused(good, rest):
+    with pytest.raises(ValueError, match="odd: "):
+        calibrate(rest, GIVEN, [dataclasses.replace(good[0], name="odd", center_px=(1000.0, 1000.0))])
+
+
+# bad presses
+
+
+def two_balls():
+    def depth(x, y):
+        caps = [torch.sqrt((9.0 - (x - c) ** 2 - y**2).clamp_min(1e-12)) - 2.5 for c in (-4.0, 4.0)]
+        return torch.maximum(*caps)
+
+    return vts.scenes.surface(depth, *SIZE)
+
+
+@pytest.fixture(scope="module")
+def mixed(good, rest):
+    """Six good presses among bad ones of every kind: rows of the report by name, warnings, calibration."""
+    image = seen_by_curve(ball((1, -2)), 31)
+    contact = ball((1, -2)).contact[0, 0]
+    tint = torch.tensor([1.3, 0.8, 1.2]).reshape(3, 1, 1)
+    bad = {
+        "the background": (rest, BALL_MM),
+        "another background": (seen_by_curve(vts.scenes.at_rest(ball()), 5), BALL_MM),
+        "a hair's touch": (seen_by_curve(ball((1, -2), 0.004, 2.0), 6), 2.0),
+        "twice the diameter": (image, 2 * BALL_MM),
+        "half the diameter": (image, 0.5 * BALL_MM),
+        "saturated": (torch.where(contact, torch.ones_like(image), image), BALL_MM),
+        "two balls": (seen_by_curve(two_balls(), 7), BALL_MM),
+        "another unit": ((image * tint).clamp(0, 1), BALL_MM),
+        "other exposure": ((image * 1.3).clamp(0, 1), BALL_MM),
+        "other lights": (seen_by_lights(ball((1, -2)), 8), BALL_MM),
+        "out of sight": (seen_by_curve(ball((13.0, 10.0)), 9), BALL_MM),
+    }
+    presses = good[:3] + [vts.Press(*given, name) for name, given in bad.items()] + good[3:]
+    calibration, warned = calibrate(rest, GIVEN, presses)
+    return {row["name"]: row for row in calibration.report["presses"]}, warned, calibration, list(bad)
+
+
+REASONS = {
+    "the background": "no contact",
+    "another background": "no contact",
+    "a hair's touch": "no contact",
+    "out of sight": "no contact",
+    "twice the diameter": "but 12 mm was given",
+    "half the diameter": "3 mm",
+    "saturated": r"\d+% of the contact is saturated: lower the exposure",
+    "two balls": "2 contacts in one image: press one ball at a time",
+    "another unit": "another unit, other exposure, or the light has changed",
+    "other exposure": "another unit, other exposure, or the light has changed",
+    "other lights": "another unit, other exposure, or the light has changed",
+}
+
+
+@pytest.mark.parametrize("kind", REASONS)
+def test_a_bad_press_is_left_out_with_its_reason(mixed, kind):
+    rows, warned, _, _ = mixed
+    assert rows[kind]["used"] is False and re.search(REASONS[kind], rows[kind]["reason"]), rows[kind]
+    assert [text for text in warned if text.startswith(f"{kind}: left out: ")] == [f"{kind}: left out: {rows[kind]['reason']}"]
+
+
+def test_a_wrong_diameter_is_told_with_the_one_seen(mixed):
+    seen = re.search(r"the ball seems ([\d.]+) mm wide, but 12 mm was given", mixed[0]["twice the diameter"]["reason"])
+    assert seen and float(seen[1]) == pytest.approx(BALL_MM, rel=0.1)
+
+
+def test_good_presses_among_bad_ones_are_used(mixed, good, rest):
+    rows, warned, calibration, bad = mixed
+    assert all(rows[press.name]["used"] for press in good) and len(warned) == len(bad)
+    json.dumps(calibration.report, allow_nan=False)
+    alone, _ = calibrate(rest, GIVEN, good)
+    angle = depth_errors(calibration, seen_by_curve, ball, "fast", HELD_OUT)[1]
+    assert angle < 1.1 * depth_errors(alone, seen_by_curve, ball, "fast", HELD_OUT)[1]
+
+
+def test_two_wrong_diameters_among_seven_are_left_out(good, rest):
+    wrong = [dataclasses.replace(p, ball_diameter_mm=12.0) for p in take_presses(count=8)[6:]]
+    calibration, _ = calibrate(rest, GIVEN, good[:5] + wrong)
+    assert [row["used"] for row in calibration.report["presses"]] == [True] * 5 + [False] * 2
+
+
+@pytest.mark.parametrize(
+    "ball_mm",
+    [
+        60.0,
+        pytest.param(
+            500.0,
+            marks=pytest.mark.xfail(
+                strict=True,
+                reason="steps of a center are clamped by the ball's radius alone: a ball far larger than the image takes its "
+                "center out of it, nothing is inside, and the mean of nothing is NaN: all good presses are lost with it",
+            ),
+        ),
+    ],
+)
+def test_an_absurd_diameter_is_left_out_like_any_other(good, rest, ball_mm):
+    calibration, warned = calibrate(rest, GIVEN, [*good, dataclasses.replace(good[0], ball_diameter_mm=ball_mm, name="absurd")])
+    assert len(warned) == 1 and warned[0].startswith("absurd: left out: ") and not calibration.report["presses"][-1]["used"]
+
+
+def test_only_bad_presses_are_an_error_that_names_each(rest):
+    empty = [vts.Press(rest, 6.0, "first"), vts.Press(seen_by_curve(vts.scenes.at_rest(ball()), 5), 6.0)]
+    for call in (lambda: vts.calibrate(rest, GIVEN, empty), lambda: vts.fit_prior(rest, SENSOR, empty)):
+        with pytest.raises(ValueError, match=r"^presses: none can be used: first: no contact.*; presses\[1\]: no contact"):
+            call()
+
+
+def test_two_presses_that_contradict_each_other_are_an_error(good, rest):
+    wrong = dataclasses.replace(good[4], ball_diameter_mm=2 * BALL_MM)
+    with pytest.raises(ValueError, match=r"^presses: none can be used: press 0: .*; press 4: .*") as caught:
+        vts.calibrate(rest, GIVEN, [good[0], wrong])
+    assert "one of the two diameters is wrong" in str(caught.value)
+
+
+BAD_IMAGES = {
+    "another size": (lambda i: i[:, :100], ValueError, r"expected \(3, 120, 160\) .* got \(3, 100, 160\): resize it"),
+    "a batch": (lambda i: i[None], ValueError, r"got \(1, 3, 120, 160\): take one image of the batch with \[0\]"),
+    "channels last": (lambda i: i.permute(1, 2, 0), ValueError, "channels stand last"),
+    "0-255": (lambda i: 255 * i, ValueError, "0-255 given for 0-1: divide by 255"),
+    "bytes": (lambda i: (255 * i).to(torch.uint8), TypeError, "expected a floating-point image, got torch.uint8: divide by 255"),
+    "NaN": (lambda i: torch.full_like(i, float("nan")), ValueError, "expected finite values, got 57600 NaN or infinite"),
+    "a path": (lambda i: "press.png", TypeError, "expected a torch.Tensor, got str: read files with torchvts.read_image"),
+    "none": (lambda i: None, TypeError, "expected a torch.Tensor, got NoneType"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_IMAGES)
+@pytest.mark.parametrize("call", [vts.calibrate, vts.fit_prior])
+def test_a_bad_image_is_refused_by_its_place(good, rest, call, kind):
+    change, error, message = BAD_IMAGES[kind]
+    unnamed = dataclasses.replace(good[0], name="", image=change(good[0].image))
+    with pytest.raises(error, match=rf"^presses\[2\]: image: .*{message}"):
+        call(rest, GIVEN, [*good[:2], unnamed])
+
+
+BAD_PRESSES = {
+    "no diameter": ({"ball_diameter_mm": 0}, ValueError, r"ball_diameter_mm: expected a number in \(0, 1000\], got 0"),
+    "a negative diameter": ({"ball_diameter_mm": -6.0}, ValueError, "ball_diameter_mm: expected a number in .*, got -6.0"),
+    "a diameter of NaN": ({"ball_diameter_mm": float("nan")}, ValueError, "ball_diameter_mm: expected a number in .*, got nan"),
+    "an infinite diameter": ({"ball_diameter_mm": float("inf")}, ValueError, "ball_diameter_mm: expected a number in .*, got inf"),
+    "micrometres": ({"ball_diameter_mm": 6310}, ValueError, "ball_diameter_mm: expected a number in .*, got 6310"),
+    "a diameter as text": ({"ball_diameter_mm": "6"}, TypeError, "ball_diameter_mm: expected a number, got str"),
+    "a truth value": ({"ball_diameter_mm": True}, TypeError, "ball_diameter_mm: expected a number, got bool"),
+    "half a center": ({"center_px": (1.0,)}, ValueError, "center_px: expected 2 numbers"),
+    "a center of NaN": ({"center_px": (float("nan"), 1.0)}, ValueError, "center_px: expected finite numbers"),
+    "a center as text": ({"center_px": "ab"}, TypeError, "center_px: expected 2 numbers"),
+    "no radius": ({"contact_radius_px": 0}, ValueError, "contact_radius_px: expected a number above 0"),
+    "a radius of NaN": ({"contact_radius_px": float("nan")}, ValueError, "contact_radius_px: expected a number above 0"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_PRESSES)
+def test_an_impossible_press_is_refused_by_name(rest, kind):
+    change, error, message = BAD_PRESSES[kind]
+    with pytest.raises(error, match=f"^{message}"):
+        vts.Press(**({"image": rest, "ball_diameter_mm": 6.0} | change))
+
+
+FIT_PRIOR_ANY = pytest.mark.xfail(
+    strict=True,
+    raises=RuntimeError,
+    reason="fit_prior does not check that presses are Press: read_contacts takes a tensor for a touch, and avg_pool1d fails on it",
+)
+
+
+@pytest.mark.parametrize("call", [vts.calibrate, pytest.param(vts.fit_prior, marks=FIT_PRIOR_ANY)])
+def test_what_is_no_press_is_refused_by_its_place(good, rest, call):
+    with pytest.raises(TypeError, match=r"^presses\[1\]: expected a Press, got Tensor: Press\(image, ball_diameter_mm\)"):
+        call(rest, GIVEN, [good[0], good[1].image])

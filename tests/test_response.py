@@ -1,0 +1,652 @@
+"""Response fields by themselves, as normals, in files and in a sensor's YAML; the blur they are used under."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import cv2
+import kornia
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+import yaml
+
+import torchvts as vts
+from torchvts.compensate import blur, gaussian_kernel
+from torchvts.core.files import load_tensors
+from torchvts.core.response import ResponseField, ResponseModel, SensorPrior, fit_log_background
+
+FAMILIES = [(0, -1, False), (0, -1, True), (1, -1, False), (2, 1, False), (1, 2, True), (3, 3, True)]
+CHANGE_SCALE = 0.3  # stated in the definition
+DEPTH_SQUARED = False  # whether the depth times itself is a term
+
+
+def pairs(inputs):
+    """Products of two inputs, in order."""
+    return [(i, k) for i in range(inputs) for k in range(i, inputs) if DEPTH_SQUARED or i < 3]
+
+
+def count_by_hand(degree, product_degree, uses_depth):
+    inputs = 4 if uses_depth else 3
+    monomials = [(d + 1) * (d + 2) // 2 for d in (degree, product_degree)]
+    products = len(pairs(inputs)) if product_degree >= 0 else 0
+    return inputs * monomials[0] + products * monomials[1]
+
+
+def random_field(degree, product_degree, uses_depth, half_mm=9.0, size=0.1, seed=0):
+    """Coefficients of six digits, which plain text keeps."""
+    count = count_by_hand(degree, product_degree, uses_depth)
+    numbers = torch.randn(2, count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * size
+    rows = tuple(tuple(float(f"{v:.6g}") for v in row) for row in numbers.tolist())
+    return ResponseField(degree, product_degree, uses_depth, half_mm, rows)
+
+
+def maps_by_hand(field, height, width, pitch):
+    """W_t(x, y) from the definition, pixel by pixel: (terms, 2, H, W)."""
+    inputs = range(4 if field.uses_depth else 3)
+    degrees = [field.degree for _ in inputs]
+    if field.product_degree >= 0:
+        degrees += [field.product_degree for _ in pairs(len(inputs))]
+    out = np.zeros((len(degrees), 2, height, width))
+    for row in range(height):
+        for column in range(width):
+            u = (column - (width - 1) / 2) * pitch / field.half_mm
+            v = (row - (height - 1) / 2) * pitch / field.half_mm
+            for axis in range(2):
+                numbers = iter(field.coefficient[axis])
+                for term, degree in enumerate(degrees):
+                    for i in range(degree + 1):
+                        for j in range(degree + 1 - i):
+                            out[term, axis, row, column] += next(numbers) * u**i * v**j
+    return out
+
+
+def slope_by_hand(field, change, depth, pitch):
+    """Slope from the definition: change (3, H, W), depth (H, W) or None, to (2, H, W)."""
+    inputs = [channel / CHANGE_SCALE for channel in change] + ([depth] if field.uses_depth else [])
+    terms = list(inputs)
+    if field.product_degree >= 0:
+        terms += [inputs[i] * inputs[k] for i, k in pairs(len(inputs))]
+    maps = maps_by_hand(field, *change.shape[1:], pitch)
+    assert len(terms) == len(maps)
+    return sum(map_of_term * term for map_of_term, term in zip(maps, terms))
+
+
+def model(gamma=1.0, blur_px=1.0, **kwargs):
+    return ResponseModel(random_field(2, 1, False, **kwargs), random_field(2, 1, True, seed=1, **kwargs), gamma, blur_px)
+
+
+# the field
+
+
+def test_the_terms_are_the_inputs_and_then_their_products():
+    assert random_field(2, -1, False).terms() == [(0,), (1,), (2,)]
+    assert random_field(1, 1, False).terms() == [(0,), (1,), (2,), (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
+    deep = random_field(0, 0, True).terms()
+    assert deep[:4] == [(0,), (1,), (2,), (3,)] and deep[4:8] == [(0, 0), (0, 1), (0, 2), (0, 3)]
+    assert len(deep) == len(set(deep)) == 13 + DEPTH_SQUARED and ((3, 3) in deep) == DEPTH_SQUARED
+    assert all(len(term) > 0 for term in deep)  # none is constant
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_number_of_coefficients_is_that_of_the_monomials(family):
+    assert random_field(*family).size() == count_by_hand(*family)
+    assert tuple(random_field(*family).tensor().shape) == (2, count_by_hand(*family))
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_maps_are_those_of_the_definition(family):
+    field = random_field(*family, half_mm=0.9)
+    assert field.maps(5, 7, 0.3).numpy() == pytest.approx(maps_by_hand(field, 5, 7, 0.3), abs=1e-12)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_larger_family_holds_the_same_field(family):
+    field = random_field(*family, half_mm=2.0)
+    for larger in ((3, 3, True), (4, 5, True)):
+        lifted = field.lifted(*larger)
+        assert (lifted.degree, lifted.product_degree, lifted.uses_depth, lifted.half_mm) == (*larger, 2.0)
+        maps, old = dict(zip(lifted.terms(), lifted.maps(6, 8, 0.5))), dict(zip(field.terms(), field.maps(6, 8, 0.5)))
+        for term, values in maps.items():
+            expected = old.get(term, torch.zeros(2, 6, 8, dtype=torch.float64))
+            assert torch.allclose(values, expected, rtol=0, atol=1e-12), term
+
+
+@pytest.mark.parametrize("smaller", [(0, 1, False), (1, -1, False), (1, 0, False)])
+def test_a_smaller_family_is_refused(smaller):
+    with pytest.raises(ValueError, match="degree, product_degree, uses_depth: expected a family that holds"):
+        random_field(1, 1, False).lifted(*smaller)
+    with pytest.raises(ValueError, match="expected a family that holds"):
+        random_field(1, 1, True).lifted(3, 3, False)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_field_survives_plain_text(family):
+    field = random_field(*family)
+    assert ResponseField.from_dict(json.loads(json.dumps(field.to_dict())), "file") == field
+    assert ResponseField.from_dict(yaml.safe_load(yaml.safe_dump(field.to_dict())), "file") == field
+
+
+def test_a_field_of_any_numbers_survives_to_seven_digits():
+    fine = ResponseField(0, -1, False, 1 / 3, ((1 / 3, 2 / 3, -1e-9 / 7), (1e9 / 7, 0, 1)))
+    again = ResponseField.from_dict(fine.to_dict(), "file")
+    assert torch.allclose(again.tensor(), fine.tensor(), rtol=1e-6, atol=0)
+    assert again.to_dict() == fine.to_dict()
+
+
+REST = {"degree": 0, "product_degree": -1, "uses_depth": False, "half_mm": 1.0, "coefficient": [[0, 0, 0], [0, 0, 0]]}
+BAD_FIELDS = {
+    "degree too high": ({"degree": 7}, "degree: expected at most 6, got 7"),
+    "degree below zero": ({"degree": -1}, "degree: expected at least 0, got -1"),
+    "degree no integer": ({"degree": 1.0}, "degree: expected an integer, got float"),
+    "degree a truth value": ({"degree": True}, "degree: expected an integer, got bool"),
+    "product degree too high": ({"product_degree": 7}, "product_degree: expected at most 6, got 7"),
+    "product degree below -1": ({"product_degree": -2}, "product_degree: expected at least -1, got -2"),
+    "depth as a number": ({"uses_depth": 1}, "uses_depth: expected true or false, got 1"),
+    "no scale": ({"half_mm": 0}, "half_mm: expected a number above 0"),
+    "NaN scale": ({"half_mm": float("nan")}, "half_mm: expected a number above 0 and finite"),
+    "scale as text": ({"half_mm": "10"}, "half_mm: expected a number, got str"),
+    "one row": ({"coefficient": [[0, 0, 0]]}, "coefficient: expected 2 x 3 numbers"),
+    "rows too long": ({"coefficient": [[0] * 4, [0] * 4]}, "coefficient: expected 2 x 3 numbers"),
+    "ragged rows": ({"coefficient": [[0] * 3, [0] * 4]}, "coefficient: expected 2 x 3 numbers"),
+    "none": ({"coefficient": []}, "coefficient: expected 2 x 3 numbers"),
+    "text": ({"coefficient": "abc"}, "coefficient: expected 2 x 3 numbers"),
+    "NaN": ({"coefficient": [[0, 0, float("nan")], [0, 0, 0]]}, "coefficient: expected finite numbers"),
+    "infinite": ({"coefficient": [[0, 0, float("inf")], [0, 0, 0]]}, "coefficient: expected finite numbers"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_FIELDS)
+def test_a_bad_field_is_refused_by_name(kind):
+    change, message = BAD_FIELDS[kind]
+    with pytest.raises((ValueError, TypeError), match=f"^{message}"):
+        ResponseField(**(REST | change))
+    with pytest.raises(ValueError, match=f"^unit.yaml: key {message}"):
+        ResponseField.from_dict(REST | change, "unit.yaml")
+
+
+def test_unknown_and_missing_keys_are_named():
+    with pytest.raises(ValueError, match=r"^unit.yaml: key 'colour': unknown; expected degree, product_degree"):
+        ResponseField.from_dict(REST | {"colour": 1}, "unit.yaml")
+    for key in REST:
+        with pytest.raises(ValueError, match=f"^unit.yaml: key '{key}': missing"):
+            ResponseField.from_dict({k: v for k, v in REST.items() if k != key}, "unit.yaml")
+    for values in ([1], None, "field", 3):
+        with pytest.raises(ValueError, match=r"^unit\.yaml: expected keys and values, got"):
+            ResponseField.from_dict(values, "unit.yaml")
+        with pytest.raises(ValueError, match=r"^unit\.yaml: expected keys and values, got"):
+            ResponseModel.from_dict(values, "unit.yaml")
+        with pytest.raises(ValueError, match=r"^unit\.yaml: expected keys and values, got"):
+            SensorPrior.from_dict(values, "unit.yaml")
+
+
+def test_a_model_wants_its_fields_in_their_places():
+    shallow, deep = random_field(1, -1, False), random_field(1, -1, True)
+    with pytest.raises(ValueError, match="fast: expected a field that does not use depth"):
+        ResponseModel(deep, None)
+    with pytest.raises(ValueError, match="precise: expected a field that uses depth"):
+        ResponseModel(shallow, shallow)
+    for value in (0, -1, float("nan"), 11):
+        with pytest.raises(ValueError, match="gamma: expected a number in"):
+            ResponseModel(shallow, deep, gamma=value)
+    for value in (-1, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="blur_px: expected a number above 0 and finite"):
+            ResponseModel(shallow, deep, blur_px=value)
+    assert ResponseModel.from_dict(json.loads(json.dumps(model(2.2, 0).to_dict())), "file") == model(2.2, 0)
+    assert ResponseModel.from_dict(ResponseModel(shallow, None).to_dict(), "file") == ResponseModel(shallow, None)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_three_times_the_pixels_see_the_same_field(family):
+    field = random_field(*family, half_mm=2.0)
+    coarse, fine = field.maps(6, 8, 0.6), field.maps(18, 24, 0.2)
+    assert torch.allclose(fine[..., 1::3, 1::3], coarse, rtol=0, atol=1e-12)  # the middle of nine lies where the one did
+
+
+def test_twice_the_pixels_see_the_same_field():
+    field = random_field(1, 1, True, half_mm=2.0)  # linear in position: the mean of four is the value in their middle
+    coarse, fine = field.maps(6, 8, 0.5), field.maps(12, 16, 0.25)
+    mean = torch.nn.functional.avg_pool2d(fine.flatten(0, 1), 2).reshape(coarse.shape)
+    assert torch.allclose(mean, coarse, rtol=0, atol=1e-12)
+
+
+# normals
+
+
+def normals(uses_precise=True, dtype=torch.float64, height=6, width=7, pitch=0.4, max_slope=3.0, size=0.1):
+    fast = random_field(2, 1, False, half_mm=1.4, size=size)
+    precise = random_field(2, 2, True, half_mm=1.4, size=size, seed=1) if uses_precise else None
+    return fast, precise, vts.NormalFromResponse(fast, precise, height, width, pitch, max_slope, dtype)
+
+
+def random_image(batch=2, height=6, width=7, spread=0.2):
+    numbers = torch.rand(batch, 4, height, width, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    return 1.0 + spread * (2.0 * numbers[:, :3] - 1.0), numbers[:, 3:] - 0.2  # some depths below the skin at rest too
+
+
+def test_an_unchanged_image_has_slope_zero_exactly():
+    _, _, block = normals()
+    for depth in (None, torch.zeros(1, 1, 6, 7, dtype=torch.float64)):
+        normal = block(torch.ones(1, 3, 6, 7, dtype=torch.float64), depth)
+        assert torch.equal(normal[:, :2], torch.zeros_like(normal[:, :2]))
+        assert torch.equal(normal[:, 2], torch.ones_like(normal[:, 2]))
+
+
+@pytest.mark.parametrize("with_depth", [False, True])
+def test_normals_have_the_slopes_of_the_definition(with_depth):
+    fast, precise, block = normals()
+    image, depth = random_image()
+    normal = block(image, depth if with_depth else None)
+    slope = vts.gradient_from_normal(normal)
+    assert torch.allclose(normal.norm(dim=1), torch.ones(2, 6, 7, dtype=torch.float64), atol=1e-12)
+    for b in range(2):
+        field = precise if with_depth else fast
+        expected = slope_by_hand(field, image[b].numpy() - 1.0, depth[b, 0].numpy(), 0.4)
+        assert np.hypot(*expected).max() < 3.0  # nothing is cut
+        assert slope[b].numpy() == pytest.approx(expected, abs=1e-9)
+
+
+def test_depth_changes_the_slope_as_its_terms_say():
+    """A field that repeats the fast one, and adds a tenth of R's change times the depth to dz/dx."""
+    fast = random_field(1, -1, False, half_mm=1.4)
+    deep = fast.lifted(1, 0, True)
+    rows = [list(row) for row in deep.coefficient]
+    rows[0][4 * 3 + deep.terms()[4:].index((0, 3))] = 0.1
+    block = vts.NormalFromResponse(fast, dataclasses.replace(deep, coefficient=rows), 6, 7, 0.4, dtype=torch.float64)
+    image, depth = random_image()
+    before, after = (vts.gradient_from_normal(block(image, d)) for d in (None, depth))
+    assert torch.allclose(after[:, 0] - before[:, 0], 0.1 * (image[:, 0] - 1.0) / CHANGE_SCALE * depth[:, 0], atol=1e-12)
+    assert torch.allclose(after[:, 1], before[:, 1], atol=1e-12)
+
+
+def test_steepness_is_bounded_and_its_direction_kept():
+    _, _, block = normals(max_slope=0.7, size=1.0)
+    _, _, free = normals(max_slope=1e9, size=1.0)
+    image, depth = random_image(spread=0.9)
+    bound, wild = (vts.gradient_from_normal(b(image, depth), 1e9) for b in (block, free))
+    steep, length = wild.norm(dim=1), bound.norm(dim=1)
+    assert float(steep.max()) > 2.0 and float(length.max()) <= 0.7 * (1 + 1e-9)
+    expected = wild * (0.7 / steep).clamp_max(1.0)[:, None]
+    assert torch.allclose(bound, expected, atol=1e-9)
+
+
+def test_depth_is_refused_where_no_field_takes_it():
+    _, _, block = normals(uses_precise=False)
+    image, depth = random_image()
+    assert block.uses_depth is False
+    with pytest.raises(ValueError, match="depth_mm: expected None, because this response has no field with depth: use mode 'fast'"):
+        block(image, depth)
+
+
+def test_an_image_of_another_shape_is_refused():
+    _, _, block = normals()
+    with pytest.raises(ValueError, match="compensated: expected 6 x 7 like the calibration, got 7 x 6"):
+        block(torch.ones(1, 3, 7, 6, dtype=torch.float64))
+    with pytest.raises(ValueError, match=r"compensated: expected \(B, 3, H, W\), got \[3, 6, 7\]"):
+        block(torch.ones(3, 6, 7, dtype=torch.float64))
+
+
+def test_derivatives_are_those_of_the_slopes():
+    _, _, block = normals(height=3, width=4)
+    image, depth = (t.requires_grad_() for t in random_image(1, 3, 4))
+    assert torch.autograd.gradcheck(block, (image, depth))
+    assert torch.autograd.gradcheck(block, (image,))
+    rest = torch.ones(1, 3, 3, 4, dtype=torch.float64, requires_grad=True)
+    block(rest).sum().backward()
+    assert bool(torch.isfinite(rest.grad).all()) and float(rest.grad.abs().max()) > 0
+
+
+def test_the_coarse_block_is_every_eighth_pixel():
+    _, _, block = normals(height=41, width=50)
+    image, depth = random_image(2, 41, 50)
+    coarse = block.coarse(8)
+    assert coarse.uses_depth and coarse.max_slope == block.max_slope
+    for d in (None, depth):
+        small = None if d is None else d[..., 4::8, 4::8]
+        assert torch.equal(coarse(image[..., 4::8, 4::8], small), block(image, d)[..., 4::8, 4::8])
+
+
+# files
+
+
+def smooth_background(height=240, width=320, seed=0, noise=0.004):
+    y, x = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
+    light = torch.stack((0.5 + 0.2 * x, 0.4 + 0.15 * y, 0.45 - 0.2 * x * y))
+    return (light + noise * torch.randn(light.shape, generator=torch.Generator().manual_seed(seed))).clamp(0, 1)
+
+
+def eight_bits(image):
+    return torch.round(image * 255) / 255
+
+
+def small_calibration(gamma=1.0, dtype=torch.float32):
+    background = eight_bits(smooth_background(24, 32)).to(dtype)
+    sensor, report = vts.Sensor("rig", 24, 32, 0.5), {"model": "response", "note": "ü"}
+    return vts.Calibration.from_response(model(gamma), sensor, background, report)
+
+
+@pytest.fixture
+def saved(tmp_path):
+    small_calibration().save(tmp_path / "unit.safetensors")
+    return tmp_path / "unit.safetensors"
+
+
+@pytest.mark.parametrize("gamma", [1.0, 1.7, 2.2, 0.5])
+def test_an_eight_bit_background_survives_bit_for_bit_in_a_small_file(tmp_path, gamma):
+    sensor = vts.Sensor("rig", 240, 320, 0.0625)
+    calibration = vts.Calibration.from_response(model(gamma), sensor, eight_bits(smooth_background()))
+    path = tmp_path / "unit.safetensors"
+    calibration.save(path)
+    loaded = vts.Calibration.load(path)
+    assert path.stat().st_size < 200_000
+    for name in ("background", "noise_std", "gain", "flat", "defects", "compensated_noise_std"):
+        assert torch.equal(getattr(loaded, name), getattr(calibration, name)), name
+    assert loaded.response == calibration.response and loaded.sensor == calibration.sensor
+    assert loaded.report == calibration.report and loaded.measured is True and loaded.lights is None
+    loaded.save(tmp_path / "again.safetensors")
+    assert path.read_bytes() == (tmp_path / "again.safetensors").read_bytes()
+
+
+def test_every_grey_level_survives(tmp_path):
+    levels = (torch.arange(256, dtype=torch.float32) / 255).reshape(1, 16, 16).expand(3, 16, 16)
+    for gamma in (1.0, 2.2, 5.0):
+        cal = vts.Calibration.from_response(model(gamma), vts.Sensor("rig", 16, 16, 0.5), levels)
+        cal.save(tmp_path / "unit.safetensors")
+        assert torch.equal(vts.Calibration.load(tmp_path / "unit.safetensors").background, cal.background)
+
+
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_float_background_survives_within_sixteen_bits(tmp_path, gamma, dtype):
+    sensor = vts.Sensor("rig", 60, 80, 0.25)
+    calibration = vts.Calibration.from_response(model(gamma), sensor, smooth_background(60, 80).to(dtype))
+    calibration.save(tmp_path / "unit.safetensors")
+    loaded = vts.Calibration.load(tmp_path / "unit.safetensors").background
+    values, kept = (b ** (1.0 / gamma) for b in (calibration.background, loaded))
+    assert loaded.dtype == dtype and float((values - kept).abs().max()) < 0.51 / 65535 + 2e-7
+
+
+@pytest.mark.xfail(
+    strict=True, reason="image_from_bytes gives float32, so a float64 calibration loads k / 255 rounded to float32, 3e-8 off"
+)
+def test_an_eight_bit_background_survives_bit_for_bit_in_double_precision(tmp_path):
+    background = torch.round(smooth_background(24, 32).double() * 255) / 255
+    calibration = vts.Calibration.from_response(model(), vts.Sensor("rig", 24, 32, 0.5), background)
+    calibration.save(tmp_path / "unit.safetensors")
+    assert torch.equal(vts.Calibration.load(tmp_path / "unit.safetensors").background, calibration.background)
+
+
+@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
+def test_a_loaded_response_gives_the_same_depth(saved, mode):
+    x, y = torch.linspace(-1, 1, 32), torch.linspace(-1, 1, 24)[:, None]
+    change = 0.3 * torch.exp(-6 * (x**2 + y**2)) * torch.tensor([1.0, -0.8, 0.5]).reshape(1, 3, 1, 1)
+    image = small_calibration().background * (1 + change)
+    one, two = (vts.DepthPipeline.from_calibration(c, mode)(image) for c in (small_calibration(), vts.Calibration.load(saved)))
+    assert bool(one.contact.any()) and all(torch.equal(left, right) for left, right in zip(one, two))
+
+
+def rewritten(path, change_tensors=None, change_metadata=None):
+    """The same file with something changed, written by safetensors itself."""
+    tensors, metadata = load_tensors(path)
+    (change_tensors or (lambda t: None))(tensors)
+    (change_metadata or (lambda m: None))(metadata)
+    safetensors.torch.save_file(tensors, str(path), {"torchvts": json.dumps(metadata)})
+
+
+def png(shape, dtype=np.uint8, suffix=".png"):
+    return torch.from_numpy(cv2.imencode(suffix, np.full(shape, 9, dtype))[1].reshape(-1).copy())
+
+
+def flipped(raw, place):
+    raw = raw.clone()
+    raw[place] ^= 255
+    return raw
+
+
+WHOLE, NO_PNG = "expected a whole colour PNG of 24 x 32, got one that says", "expected the bytes of a PNG"
+PNGS = {
+    "a tenth": (lambda raw: raw[: len(raw) // 10].clone(), WHOLE),
+    "half": (lambda raw: raw[: len(raw) // 2].clone(), WHOLE),
+    "without its last bytes": (lambda raw: raw[:-16].clone(), WHOLE),
+    "a header alone": (lambda raw: raw[:24].clone(), WHOLE),
+    "less than a header": (lambda raw: raw[:20].clone(), NO_PNG),
+    "a flipped byte": (lambda raw: flipped(raw, len(raw) // 2), WHOLE),
+    "a header of another width": (lambda raw: flipped(raw, 19), WHOLE),
+    "a header of two thousand million pixels": (lambda raw: flipped(raw, 16), WHOLE),
+    "another size": (lambda raw: png((20, 32, 3)), WHOLE + " 20 x 32"),
+    "grey": (lambda raw: png((24, 32)), WHOLE),
+    "with opacity": (lambda raw: png((24, 32, 4)), WHOLE),
+    "a JPEG": (lambda raw: png((24, 32, 3), suffix=".jpg"), NO_PNG),
+    "zeros": (lambda raw: torch.zeros(1000, dtype=torch.uint8), NO_PNG),
+    "nothing": (lambda raw: torch.zeros(0, dtype=torch.uint8), NO_PNG),
+    "floats": (lambda raw: raw.float(), NO_PNG),
+    "a batch": (lambda raw: raw[None].clone(), NO_PNG),
+}
+
+
+@pytest.mark.parametrize("kind", PNGS)
+def test_a_damaged_background_is_refused(saved, kind):
+    change, message = PNGS[kind]
+    rewritten(saved, lambda tensors: tensors.update(background_png=change(tensors["background_png"])))
+    with pytest.raises(ValueError, match=f"tensor 'background_png': {message}") as caught:
+        vts.Calibration.load(saved)
+    assert str(caught.value).startswith(f"{saved}: ")
+
+
+def put(value, *path):
+    def change(metadata):
+        for key in path[:-1]:
+            metadata = metadata[key]
+        if value is KeyError:
+            del metadata[path[-1]]
+        else:
+            metadata[path[-1]] = value
+
+    return change
+
+
+NAN = float("nan")
+METADATA = {
+    "a list": (put([1], "response"), "response: expected keys and values, got list"),
+    "empty": (put({}, "response"), "response: key 'fast': missing"),
+    "a text": (put("x", "response"), "response: expected keys and values, got str"),
+    "none, and no lights": (put(None, "response"), "tensor 'light_position_mm' is missing"),
+    "no first field": (put(None, "response", "fast"), "response: key fast: expected a field that does not use depth"),
+    "first field missing": (put(KeyError, "response", "fast"), "response: key 'fast': missing"),
+    "second field missing": (put(KeyError, "response", "precise"), "response: key 'precise': missing"),
+    "an unknown key": (put(1, "response", "colour"), "response: key 'colour': unknown"),
+    "an unknown key of a field": (put(1, "response", "fast", "colour"), "response: fast: key 'colour': unknown"),
+    "NaN": (put(NAN, "response", "fast", "coefficient", 0, 3), "response: fast: key coefficient: expected finite numbers"),
+    "infinite": (put(-1e999, "response", "precise", "coefficient", 1, 3), "response: precise: key coefficient: expected finite"),
+    "a number missing": (put([[0.0] * 35] * 2, "response", "fast", "coefficient"), "fast: key coefficient: expected 2 x 36"),
+    "another degree": (put(1, "response", "fast", "degree"), "response: fast: key coefficient: expected 2 x 27 numbers"),
+    "a huge degree": (put(10**9, "response", "fast", "degree"), "response: fast: key degree: expected at most 6"),
+    "no scale": (put(0, "response", "fast", "half_mm"), "response: fast: key half_mm: expected a number above 0"),
+    "gamma of zero": (put(0, "response", "gamma"), "response: key gamma: expected a number in"),
+    "NaN gamma": (put(NAN, "response", "gamma"), "response: key gamma: expected a number in"),
+    "a negative blur": (put(-1, "response", "blur_px"), "response: key blur_px: expected a number above 0"),
+    "no blur": (put(None, "response", "blur_px"), "response: key blur_px: expected a number, got NoneType"),
+    "depth where none is": (put(True, "response", "fast", "uses_depth"), r"fast: key coefficient: expected 2 x \d+ numbers"),
+}
+
+
+@pytest.mark.parametrize("kind", METADATA)
+def test_a_damaged_response_is_refused(saved, kind):
+    change, message = METADATA[kind]
+    rewritten(saved, change_metadata=change)
+    with pytest.raises(ValueError, match=message) as caught:
+        vts.Calibration.load(saved)
+    assert str(caught.value).startswith(f"{saved}: ")
+
+
+@pytest.mark.parametrize("name", ["background_png", "noise_std"])
+def test_a_missing_tensor_is_named(saved, name):
+    rewritten(saved, lambda tensors: tensors.pop(name))
+    with pytest.raises(ValueError, match=f"tensor '{name}' is missing"):
+        vts.Calibration.load(saved)
+
+
+@pytest.mark.xfail(
+    strict=True, reason="Calibration.load never holds the sensor's gamma and blur against the response's: the two may disagree"
+)
+@pytest.mark.parametrize("where, key, value", [("sensor", "gamma", 1.3), ("response", "gamma", 1.3), ("response", "blur_px", 4.0)])
+def test_a_file_whose_sensor_and_response_disagree_is_refused(saved, where, key, value):
+    rewritten(saved, change_metadata=put(value, where, key))
+    with pytest.raises(ValueError, match=key):
+        vts.Calibration.load(saved)
+
+
+def test_a_file_of_lights_of_version_one_still_loads(ring, tmp_path):
+    """As the first release wrote it: no response, no markers."""
+    sensor = vts.Sensor("rig", 24, 32, 0.5)
+    calibration = vts.Calibration.from_lights(ring(), sensor, smooth_background(24, 32))
+    path = tmp_path / "unit.safetensors"
+    calibration.save(path)
+
+    def older(metadata):
+        metadata["format_version"] = 1
+        del metadata["response"], metadata["markers"]
+
+    rewritten(path, change_metadata=older)
+    loaded = vts.Calibration.load(path)
+    assert loaded.response is None and loaded.markers is None and torch.equal(loaded.background, calibration.background)
+    assert torch.equal(loaded.inverse, calibration.inverse) and loaded.sensor == calibration.sensor
+
+
+def test_a_response_has_no_light_matrix_and_is_one_at_rest():
+    calibration = small_calibration()
+    assert torch.equal(calibration.flat, torch.ones(3, 24, 32)) and calibration.sensor.blur_px == 1.0
+    assert float((calibration.gain * calibration.background - 1).abs().max()) < 1e-6
+    with pytest.raises(ValueError, match="inverse: expected a calibration by lights, got one by response fields"):
+        _ = calibration.inverse
+    with pytest.raises(ValueError, match="calibration: expected one by response fields, got one by lights"):
+        lights = vts.PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
+        vts.NormalFromResponse.from_calibration(vts.Calibration.from_lights(lights, vts.Sensor("rig", 24, 32, 0.5)))
+
+
+def test_depth_does_not_depend_on_the_sensor_s_pixels():
+    """The same skin seen with three times the pixels: the same depth at the same millimetres."""
+    sensor = vts.Sensor("rig", 40, 56, 0.3)
+    field = random_field(1, 0, False, half_mm=8.0, size=0.2)
+    depths = []
+    for scale in (1, 3):
+        seen = sensor.resized(40 * scale, 56 * scale)
+        scene = vts.scenes.sine_press(0.3, 6.0, 5.0, seen.height, seen.width, seen.mm_per_pixel)
+        background = torch.full((3, seen.height, seen.width), 0.5)
+        calibration = vts.Calibration.from_response(ResponseModel(field, None, 1.0, 0.0), seen, background)
+        change = torch.cat((scene.gradient, -scene.gradient[:, :1]), 1) * 0.3
+        depths.append(vts.DepthPipeline.from_calibration(calibration)(0.5 * (1 + change)).depth_mm)
+    assert float(depths[0].max()) > 0.02
+    assert torch.allclose(depths[1][..., 1::3, 1::3], depths[0], rtol=0, atol=0.05 * float(depths[0].abs().max()))
+
+
+# a sensor's prior
+
+
+def a_prior(blur_px=1.0):
+    numbers = 0.1 * torch.randn(3, 15, generator=torch.Generator().manual_seed(6))
+    rows = tuple(tuple(float(f"{v:.5g}") for v in row) for row in numbers.tolist())
+    return SensorPrior(model(2.2, blur_px), rows, 10.0, "12 presses, müßig")
+
+
+def test_a_prior_survives_yaml(tmp_path):
+    sensor = vts.Sensor("rig", 24, 32, 0.5, blur_px=0.5, prior=a_prior())
+    sensor.save(tmp_path / "rig.yaml")
+    loaded = vts.Sensor.load(tmp_path / "rig.yaml")
+    assert loaded == sensor and isinstance(loaded.prior, SensorPrior) and loaded.prior.source == "12 presses, müßig"
+    without = dataclasses.replace(sensor, prior=None)
+    without.save(tmp_path / "plain.yaml")
+    assert "prior" not in (tmp_path / "plain.yaml").read_text() and vts.Sensor.load(tmp_path / "plain.yaml") == without
+
+
+BAD_PRIORS = {
+    "unknown key": (put(1, "colour"), "key prior: key 'colour': unknown; expected response, log_background, half_mm, source"),
+    "unknown key of the model": (put(1, "response", "colour"), "key prior: response: key 'colour': unknown"),
+    "unknown key of a field": (put(1, "response", "fast", "colour"), "key prior: response: fast: key 'colour': unknown"),
+    "no source": (put(KeyError, "source"), "key prior: key 'source': missing"),
+    "no response": (put(KeyError, "response"), "key prior: key 'response': missing"),
+    "no text": (put(3, "source"), "key prior: key source: expected a text"),
+    "NaN": (put(NAN, "log_background", 0, 0), "key prior: key log_background: expected finite numbers"),
+    "too few": (put([[0.0] * 14] * 3, "log_background"), "key prior: key log_background: expected 3 x 15 numbers"),
+    "no scale": (put(0, "half_mm"), "key prior: key half_mm: expected a number above 0"),
+    "NaN coefficient": (put(NAN, "response", "precise", "coefficient", 0, 0), "response: precise: key coefficient: expected"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_PRIORS)
+def test_a_bad_prior_is_refused_by_file_and_key(tmp_path, kind):
+    change, message = BAD_PRIORS[kind]
+    path = tmp_path / "rig.yaml"
+    vts.Sensor("rig", 24, 32, 0.5, prior=a_prior()).save(path)
+    values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    change(values["prior"])
+    path.write_text(yaml.safe_dump(values), encoding="utf-8")
+    with pytest.raises(ValueError, match=message) as caught:
+        vts.Sensor.load(path)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_a_prior_of_another_type_is_refused():
+    with pytest.raises(TypeError, match="prior: expected a SensorPrior, got ResponseModel"):
+        vts.Sensor("rig", 24, 32, 0.5, prior=model())
+
+
+def test_another_number_of_pixels_scales_the_blur_and_nothing_else():
+    sensor = vts.Sensor("rig", 24, 32, 0.5, blur_px=0.5, prior=a_prior(1.25))
+    double = sensor.resized(48, 64)
+    assert double.prior.response.blur_px == pytest.approx(2.5) and double.blur_px == pytest.approx(1.0)
+    back = double.resized(24, 32)
+    assert back == sensor
+    assert double.prior.response.fast == sensor.prior.response.fast and double.prior.log_background == sensor.prior.log_background
+
+
+def test_the_smooth_background_of_a_prior_is_found_again():
+    numbers = 0.2 * torch.randn(3, 15, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    prior = SensorPrior(model(), tuple(map(tuple, numbers.tolist())), 8.0, "")
+    background = prior.background(24, 32, 0.5)
+    assert tuple(background.shape) == (3, 24, 32) and float(background.min()) > 1e-3
+    assert torch.allclose(torch.tensor(fit_log_background(background, 0.5), dtype=torch.float64), numbers, atol=1e-9)
+    assert torch.allclose(prior.background(72, 96, 0.5 / 3)[:, 1::3, 1::3], background, rtol=1e-12)
+
+
+def test_the_gelsight_mini_ships_with_a_prior():
+    sensor = vts.Sensor.load("gelsight_mini")
+    assert isinstance(sensor.prior, SensorPrior) and sensor.prior.response.precise is not None and sensor.prior.source
+    background = sensor.prior.background(sensor.height, sensor.width, sensor.mm_per_pixel)
+    assert bool(torch.isfinite(background).all()) and 0.005 < float(background.min()) < float(background.max()) < 1.5
+    fast, precise = sensor.prior.response.fast, sensor.prior.response.precise
+    assert fast.half_mm == pytest.approx(0.5 * sensor.width * sensor.mm_per_pixel, rel=1e-3) and precise.half_mm == fast.half_mm
+    path = Path(__file__).resolve().parents[1] / "configs" / "sensors" / "gelsight_mini.yaml"
+    assert path.stat().st_size < 10_000
+
+
+# the blur
+
+
+@pytest.mark.parametrize("std_px", [0.3, 0.5, 1.0, 1.7, 3.0])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_blur_is_kornia_s(std_px, dtype):
+    image = torch.rand(2, 3, 30, 41, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype)
+    size = len(gaussian_kernel(std_px))
+    expected = kornia.filters.gaussian_blur2d(image, (size, size), (std_px, std_px), border_type="replicate")
+    assert size % 2 == 1 and size >= 6 * std_px
+    assert float((vts.Compensate(blur_px=std_px)(image) - expected).abs().max()) < 1e-6
+
+
+@pytest.mark.parametrize("std_px", [0.2, 1.0, 4.0])
+def test_the_blur_keeps_a_constant_and_the_sum_of_a_point(std_px):
+    constant = torch.full((1, 3, 20, 25), 0.37)
+    assert float((vts.Compensate(blur_px=std_px)(constant) - constant).abs().max()) < 1e-6
+    point = torch.zeros(1, 3, 41, 41)
+    point[..., 20, 20] = 1.0
+    spread = blur(point, gaussian_kernel(std_px))
+    assert spread.sum(dim=(2, 3)).flatten().tolist() == pytest.approx([1.0] * 3, abs=1e-6)
+    assert torch.allclose(spread, spread.flip(3)) and torch.allclose(spread, spread.transpose(2, 3), atol=1e-7)
+
+
+def test_no_blur_leaves_the_image():
+    image = torch.rand(1, 3, 9, 9)
+    assert torch.equal(vts.Compensate(blur_px=0)(image), image)
+    with pytest.raises(ValueError, match="blur_px: expected a number above 0 and finite, got -1"):
+        vts.Compensate(blur_px=-1)

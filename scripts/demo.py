@@ -4,11 +4,14 @@ python scripts/demo.py [--out out/demo]
 """
 
 import argparse
+import dataclasses
 import os
+import statistics
 import time
 import warnings
 from pathlib import Path
 
+import kornia
 import torch
 from tqdm import tqdm
 
@@ -70,11 +73,11 @@ def embedded(out: Path) -> list[str]:
 
 
 def real(folder: Path, out: Path) -> list[str]:
-    """Renders and photographs of other people; calibrated from the one background of each."""
+    """Renders and photographs of other people; calibrated from the one background of each, the marked one from a few presses too."""
     lines = [
         f"Images of {folder.name}/, each sensor calibrated from its one background",
         "",
-        "| image | lights pinned to, deg | deepest mm | contact mm^2 | largest error px |",
+        "| image | model | deepest mm | contact mm^2 | largest error px |",
         "|---|---|---|---|---|",
     ]
     cases = [
@@ -93,7 +96,9 @@ def real(folder: Path, out: Path) -> list[str]:
             calibration = vts.calibrate(vts.read_image(folder / place / background), sensor, progress=True)
         notes += [f"{place}: {warning.message}" for warning in caught]
         pipe = vts.DepthPipeline.from_calibration(calibration, "precise")
-        pinned = " / ".join(f"{v:.1f}" for v in calibration.report["direction_std_deg"])
+        model = {"point_lights": "point lights", "response": "the type's prior, carried by the background"}[
+            calibration.report["model"]
+        ]
         for name in images:
             if not (folder / place / name).is_file():
                 continue
@@ -102,13 +107,53 @@ def real(folder: Path, out: Path) -> list[str]:
                 result = pipe(image)
             area = float(result.contact.double().sum()) * sensor.mm_per_pixel**2
             error = truth_error(folder / place / name.replace(".png", "_depth.npz"), result.depth_mm, sensor.mm_per_pixel)
-            lines.append(f"| {place}/{name} | {pinned} | {float(result.depth_mm.max()):.3f} | {area:.1f} | {error} |")
-            title = f"{place}/{name}, lights pinned to {pinned} deg"
+            lines.append(f"| {place}/{name} | {model} | {float(result.depth_mm.max()):.3f} | {area:.1f} | {error} |")
+            title = f"{place}/{name}, {model}"
             picture = f"{place}_{Path(name).with_suffix('')}".replace("/", "_")
             viz.save_figure(
                 viz.depth_figure(result.depth_mm, sensor.mm_per_pixel, image, result.contact, title), out / f"{picture}.png"
             )
+    if (folder / "gelslim_markers" / "ref.jpg").is_file():
+        lines += marked(folder / "gelslim_markers", out)
     return lines + (["", "What the library itself says of these calibrations:"] + [f"* {note}" for note in notes] if notes else [])
+
+
+def marked(folder: Path, out: Path) -> list[str]:
+    """A lab sensor with printed markers, calibrated from four presses, the markers filled and left in.
+
+    The pitch and the ball's diameter are not known: 0.05 mm and 5 mm are assumed, so depth has no true scale.
+    """
+    background = vts.read_image(folder / "ref.jpg")
+    sensor = vts.Sensor("lab sensor with markers", background.shape[1], background.shape[2], 0.05, markers=True)
+    names = ["sample_8", "sample_13", "sample_34", "sample_43"]
+    images = [vts.read_image(folder / f"{name}.jpg") for name in names]
+    presses = [vts.Press(image, 5.0, name) for image, name in zip(images, names)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", vts.CalibrationWarning)
+        calibration = vts.calibrate(background, sensor, presses, progress=True)
+    left_in = vts.Calibration.from_response(calibration.response, dataclasses.replace(sensor, markers=False), background)
+    lines = []
+    for state, unit in (("markers filled", calibration), ("markers left in", left_in)):
+        pipe = vts.DepthPipeline.from_calibration(unit, "fast")
+        with torch.inference_mode():
+            results = [pipe(image[None]) for image in images]
+        dots = statistics.mean(dots_um(result.depth_mm) for result in results)
+        deepest = statistics.mean(float(result.depth_mm.max()) for result in results)
+        lines.append(
+            f"| gelslim_markers, mean of 4 | {len(names)} presses, {state} | {deepest:.3f}, scale assumed | "
+            f"| dots in the depth: {dots:.1f} um RMS |"
+        )
+        title = f"gelslim_markers/{names[0]}, {state}"
+        figure = viz.depth_figure(results[0].depth_mm, sensor.mm_per_pixel, images[0][None], results[0].contact, title)
+        viz.save_figure(figure, out / f"gelslim_{state.replace(' ', '_')}.png")
+    return lines
+
+
+def dots_um(depth_mm: torch.Tensor, spacing_px: float = 22.0) -> float:
+    """RMS of depth at scales from a third of the dots' spacing to the spacing itself, over the whole image, micrometres."""
+    fine = kornia.filters.gaussian_blur2d(depth_mm, (9, 9), (1.5, 1.5))
+    coarse = kornia.filters.gaussian_blur2d(depth_mm, (67, 67), (0.5 * spacing_px, 0.5 * spacing_px))
+    return 1000.0 * float((fine - coarse).std())
 
 
 def truth_error(path: Path, depth_mm: torch.Tensor, mm_per_pixel: float) -> str:

@@ -24,6 +24,9 @@ FORMAT_VERSION = 2
 DEFECT_RATIO = 4.0
 """A pixel whose background is this factor darker or brighter than expected tells nothing: it is inpainted."""
 
+PEDESTAL = 0.03
+"""Added to image and background before response fields take their ratio: where a lamp does not reach, a ratio is all noise."""
+
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
@@ -111,8 +114,13 @@ class Calibration:
         if not self.measured:
             return None
         if self.response is not None:
-            return 1.0 / self.background.clamp_min(1.0 / 255.0)
+            return 1.0 / (self.background + PEDESTAL)
         return (self.model_image / self.background.clamp_min(1e-6)).clamp(1.0 / DEFECT_RATIO, DEFECT_RATIO)
+
+    @property
+    def offset(self) -> Tensor | None:
+        """(3, H, W), what is added after the gain: with a response field the pedestal, so that the skin at rest becomes 1."""
+        return None if self.response is None else PEDESTAL / (self.background + PEDESTAL)
 
     @property
     def model_image(self) -> Tensor:

@@ -73,7 +73,7 @@ def embedded(out: Path) -> list[str]:
 
 
 def real(folder: Path, out: Path) -> list[str]:
-    """Renders and photographs of other people; calibrated from the one background of each, the marked one from a few presses too."""
+    """Renders and photographs of other people; calibrated from the one background of each, one also from a few presses."""
     lines = [
         f"Images of {folder.name}/, each sensor calibrated from its one background",
         "",

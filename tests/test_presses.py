@@ -323,12 +323,6 @@ def test_too_few_presses_for_a_response_keep_pinned_lights():
     assert calibration.report["candidates"][0]["score_deg"] < 1.0
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="_lights_error judges point lights by their first pass, though their row says pass 2, and on balls at the centers that "
-    "the response found (up to 1.8 px off here, the field makes up for it): 1.77 degrees. Second pass and centers by the lights' "
-    "own slopes give 0.66, and win over 1.20; either alone does not. Truth: response 1.43, lights in mode 'precise' 0.44 degrees",
-)
 def test_near_lights_keep_point_lights_because_their_second_pass_is_better():
     def camera(scene, seed):
         return seen_by_lights(scene, seed, radius_mm=15.0, height_mm=12.0)
@@ -343,11 +337,6 @@ def test_near_lights_keep_point_lights_because_their_second_pass_is_better():
     assert calibration.report["model"] == "point_lights"
 
 
-@pytest.mark.xfail(
-    strict=False,  # who is ahead by a hundredth of a degree changes with every change of the response's inputs
-    reason="lights and response are level here (0.290 against 0.289 deg at the same blur, within WORTH), but calibrate compares "
-    "by < alone, and takes the field of over a hundred numbers instead of twelve",
-)
 def test_where_lights_and_response_are_level_the_twelve_numbers_are_taken():
     sensor = dataclasses.replace(SENSOR, blur_px=1.0)
     calibration, _ = calibrate(background(seen_by_lights), sensor, take_presses(seen_by_lights))
@@ -460,21 +449,12 @@ def test_known_centers_are_kept(good, rest):
     assert row["center_px"] == pytest.approx([79.0, 60.0], abs=1e-9) and row["contact_radius_px"] == pytest.approx(12.0)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="the contact radius of a press with a known center is 0.6 sqrt(area / pi) of its mask, 36 % too small, and never "
-    "sought: guess_circle, _locate_jointly and center_by_slope all pass over known centers",
-)
 def test_the_radius_of_a_press_with_a_known_center_is_found(good, rest):
     known = [dataclasses.replace(p, center_px=in_px(c)) for p, c in zip(good, CENTERS_MM)]
     for row, depth in zip(calibrate(rest, GIVEN, known)[0].report["presses"], DEPTHS_MM):
         assert row["contact_radius_px"] == pytest.approx(math.sqrt(BALL_MM * depth - depth**2) / PITCH, abs=1.5)
 
 
-NO_PIXELS = "no pixel lies inside the contact: error_deg is the mean of nothing, NaN, which spreads to the field or the report"
-
-
-@pytest.mark.xfail(strict=True, reason=NO_PIXELS)
 @pytest.mark.parametrize(
     "odd",
     [{"center_px": (1000.0, 1000.0)}, {"center_px": (5.0, 5.0)}, {"center_px": in_px((0, 0)), "contact_radius_px": 0.1}],
@@ -487,7 +467,6 @@ def test_a_center_that_cannot_be_is_left_out_with_a_reason(good, rest, odd):
     json.dumps(calibration.report, allow_nan=False)
 
 
-@pytest.mark.xfail(strict=True, reason=NO_PIXELS)
 def test_a_single_press_with_an_impossible_center_is_refused(good, rest):
     with pytest.raises(ValueError, match="odd: "):
         calibrate(rest, GIVEN, [dataclasses.replace(good[0], name="odd", center_px=(1000.0, 1000.0))])
@@ -570,20 +549,7 @@ def test_two_wrong_diameters_among_seven_are_left_out(good, rest):
     assert [row["used"] for row in calibration.report["presses"]] == [True] * 5 + [False] * 2
 
 
-@pytest.mark.parametrize(
-    "ball_mm",
-    [
-        60.0,
-        pytest.param(
-            500.0,
-            marks=pytest.mark.xfail(
-                strict=True,
-                reason="steps of a center are clamped by the ball's radius alone: a ball far larger than the image takes its "
-                "center out of it, nothing is inside, and the mean of nothing is NaN: all good presses are lost with it",
-            ),
-        ),
-    ],
-)
+@pytest.mark.parametrize("ball_mm", [60.0, 500.0])
 def test_an_absurd_diameter_is_left_out_like_any_other(good, rest, ball_mm):
     calibration, warned = calibrate(rest, GIVEN, [*good, dataclasses.replace(good[0], ball_diameter_mm=ball_mm, name="absurd")])
     assert len(warned) == 1 and warned[0].startswith("absurd: left out: ") and not calibration.report["presses"][-1]["used"]
@@ -647,14 +613,7 @@ def test_an_impossible_press_is_refused_by_name(rest, kind):
         vts.Press(**({"image": rest, "ball_diameter_mm": 6.0} | change))
 
 
-FIT_PRIOR_ANY = pytest.mark.xfail(
-    strict=True,
-    raises=RuntimeError,
-    reason="fit_prior does not check that presses are Press: read_contacts takes a tensor for a touch, and avg_pool1d fails on it",
-)
-
-
-@pytest.mark.parametrize("call", [vts.calibrate, pytest.param(vts.fit_prior, marks=FIT_PRIOR_ANY)])
+@pytest.mark.parametrize("call", [vts.calibrate, vts.fit_prior])
 def test_what_is_no_press_is_refused_by_its_place(good, rest, call):
     with pytest.raises(TypeError, match=r"^presses\[1\]: expected a Press, got Tensor: Press\(image, ball_diameter_mm\)"):
         call(rest, GIVEN, [good[0], good[1].image])

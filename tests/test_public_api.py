@@ -11,7 +11,8 @@ import torchvts as vts
 NAMES = [
     "Calibration", "CalibrationWarning", "Compensate", "ContactMask", "DepthOutput", "DepthPipeline", "FillMarkers",
     "GradientFromNormal", "LightFit", "NormalFromIntensity", "NormalFromLookup", "NormalFromMLP", "NormalFromResponse",
-    "PointLights", "PoissonDCT", "PoissonDST", "PoissonRest", "Press", "Sensor", "Touch", "calibrate", "depth_to_points", "divergence",
+    "PointLights", "PoissonDCT", "PoissonDST", "PoissonRest", "Press", "Sensor", "Touch", "calibrate", "depth_to_points",
+    "divergence",
     "fill_markers", "find_markers", "fit_lights", "fit_mlp", "fit_prior", "gradient_from_normal", "gs_sdk", "metrics",
     "near_field_shading", "normal_from_gradient", "poisson_dct", "poisson_dst", "poisson_rest", "read_image", "scenes",
     "shipped_sensors", "write_image",

@@ -367,9 +367,6 @@ def test_a_float_background_survives_within_sixteen_bits(tmp_path, gamma, dtype)
     assert loaded.dtype == dtype and float((values - kept).abs().max()) < 0.51 / 65535 + 2e-7
 
 
-@pytest.mark.xfail(
-    strict=True, reason="image_from_bytes gives float32, so a float64 calibration loads k / 255 rounded to float32, 3e-8 off"
-)
 def test_an_eight_bit_background_survives_bit_for_bit_in_double_precision(tmp_path):
     background = torch.round(smooth_background(24, 32).double() * 255) / 255
     calibration = vts.Calibration.from_response(model(), vts.Sensor("rig", 24, 32, 0.5), background)
@@ -487,9 +484,6 @@ def test_a_missing_tensor_is_named(saved, name):
         vts.Calibration.load(saved)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="Calibration.load never holds the sensor's gamma and blur against the response's: the two may disagree"
-)
 @pytest.mark.parametrize("where, key, value", [("sensor", "gamma", 1.3), ("response", "gamma", 1.3), ("response", "blur_px", 4.0)])
 def test_a_file_whose_sensor_and_response_disagree_is_refused(saved, where, key, value):
     rewritten(saved, change_metadata=put(value, where, key))

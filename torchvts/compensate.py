@@ -72,7 +72,9 @@ class Compensate(nn.Module):
         """What a calibrated unit's images need, so that at rest they become ``calibration.flat``."""
         sensor = calibration.sensor
         ratio = calibration.response is not None
-        return cls(calibration.gain, calibration.offset, sensor.exponent, calibration.defects, sensor.blur_px, calibration.markers, ratio)
+        return cls(
+            calibration.gain, calibration.offset, sensor.exponent, calibration.defects, sensor.blur_px, calibration.markers, ratio
+        )
 
     def forward(self, image: Tensor) -> Tensor:
         """(B, 3, H, W) image in [0, 1] to (B, 3, H, W) linear light."""

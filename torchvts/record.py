@@ -234,6 +234,8 @@ class Calibration:
                 raise ValueError(f"{path}: tensor 'background_png' is missing")
             value = image_from_bytes(tensors["background_png"], (sensor.height, sensor.width), f"{path}: tensor 'background_png'")
             light = value.to(tensors["noise_std"].dtype) ** sensor.exponent
+            if (sensor.exponent, sensor.blur_px) != (response.gamma, response.blur_px):
+                raise ValueError(f"{path}: sensor and response differ in gamma or blur_px: damaged or edited")
             return cls(sensor, None, light, tensors["noise_std"], measured, report, response, markers)
         size = (3, sensor.height, sensor.width)
         expected: dict[str, tuple[int, ...]] = {

@@ -108,9 +108,10 @@ class ContactForms:
         inside = self.contact.inside()
         r = self.contact.polar()[2][inside]
         lean = 1.0 / (self.contact.radius_mm**2 - r * r).clamp_min((0.3 * self.contact.radius_mm) ** 2).sqrt()
-        coupling = -(self.terms[:, inside] * lean).mean(1)
-        weight = lean.square().mean()
-        own = -(self.contact.ball_slope()[:, inside] * lean).mean(1)
+        count = max(1, len(r))
+        coupling = -(self.terms[:, inside] * lean).sum(1) / count
+        weight = lean.square().sum().clamp_min(1e-12) / count
+        own = -(self.contact.ball_slope()[:, inside] * lean).sum(1) / count
         return coupling, weight, own
 
     def slope(self, coefficient: Tensor) -> Tensor:
@@ -176,6 +177,6 @@ def solve_with_centers(forms: list[ContactForms], penalty: Tensor, anchors: list
     for k, item in enumerate(forms):
         if item.contact.known:
             continue
-        limit = 0.15 * item.contact.radius_mm
+        limit = min(0.15 * item.contact.radius_mm, 0.5 * item.contact.contact_radius_mm)
         item.contact.center_mm = item.contact.center_mm + solution[size + 2 * k : size + 2 * k + 2].clamp(-limit, limit)
     return solution[:size]

@@ -23,6 +23,9 @@ EDGE_SLOPE_RATIO = 0.6
 INSIDE = 0.85
 """Part of the contact radius within which the skin is taken to lie on the ball; beyond it begins to leave."""
 
+LEAST_INSIDE = 10
+"""Sampled pixels inside a contact below which nothing can be said of it."""
+
 MAX_SAMPLES = 3000
 """Pixels of a press that enter the fit: more are as alike as neighbours are."""
 
@@ -66,7 +69,7 @@ class Contact:
         x, y: (N,), mm. radius_mm: of the ball; 0 for an unknown object.
         center_mm: (2,), contact_radius_mm: where the ball is, as far as known.
         depth_mm: (H, W), what the field without depth led to; empty before.
-        known: the center was given and is not to be sought.
+        known, radius_known: the center, the contact radius was given and is not to be sought.
         reason: why it is left out; empty if it is not. figures: what the report tells of it.
     """
 
@@ -81,6 +84,7 @@ class Contact:
     contact_radius_mm: float = 0.0
     depth_mm: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
     known: bool = False
+    radius_known: bool = False
     reason: str = ""
     figures: dict[str, Any] = field(default_factory=dict)
 
@@ -132,9 +136,12 @@ def read_contacts(
         if press.center_px is not None:
             item.known = True
             item.center_mm = (torch.tensor(press.center_px, dtype=torch.float64) - middle) * sensor.mm_per_pixel
+            item.radius_known = press.contact_radius_px is not None
             radius_px = press.contact_radius_px or math.sqrt(float(mask.sum()) / math.pi) * 0.6
-            item.contact_radius_mm = radius_px * sensor.mm_per_pixel
+            item.contact_radius_mm = min(radius_px * sensor.mm_per_pixel, 0.9 * radius_mm)
         item.reason = _unusable(image, background, mask)
+        if item.known and not item.reason and int(item.inside().sum()) < LEAST_INSIDE:
+            item.reason = "no contact is seen at the given center and contact radius: a slip in the label?"
         contacts.append(item)
     return contacts
 
@@ -214,6 +221,8 @@ def _circle(points: Tensor) -> tuple[Tensor, float]:
 
 def update_radius(contact: Contact, slope: Tensor, pitch_mm: float, damping: float = 0.5) -> None:
     """Contact radius from slopes (2, N) at the sampled pixels: the ring where they fall below those of the ball."""
+    if contact.radius_known:
+        return
     dx, dy, r = contact.polar()
     ring = (r / pitch_mm).round().long()
     count = int(0.95 * contact.radius_mm / pitch_mm)
@@ -237,7 +246,7 @@ def center_by_slope(contact: Contact, slope_map: Tensor, pitch_mm: float, rounds
     limit = 0.25 * contact.radius_mm
     for _ in range(rounds):
         inside = contact.inside()
-        if int(inside.sum()) < 10:
+        if int(inside.sum()) < LEAST_INSIDE:
             contact.reason = "no ball fits the contact: too small, or not round"
             return
         r = contact.polar()[2]

@@ -14,7 +14,7 @@ from ..core.response import ResponseField, ResponseModel
 from ..core.sensor import Sensor
 from ..normals import NormalFromResponse
 from .field import PRODUCT_PENALTY, ContactForms, Family, solve, solve_with_centers
-from .presses import Contact, add_depth, center_by_slope, guess_circle, update_radius
+from .presses import LEAST_INSIDE, Contact, add_depth, center_by_slope, guess_circle, update_radius
 
 FAMILIES = ((0, -1), (1, -1), (2, -1), (2, 1), (3, 2), (3, 3))
 """Degrees of candidates, linear terms and products, the smallest first."""
@@ -106,11 +106,16 @@ def locate(contacts: list[Contact], pitch_mm: float, sensor: Sensor, prior: Resp
     if prior is not None:
         for contact in usable:
             add_depth(contact, prior.fast, pitch_mm)
+            slopes = slope_map(contact, prior, pitch_mm)
             if not contact.known:
-                center_by_slope(contact, slope_map(contact, prior, pitch_mm), pitch_mm)
-    elif not all(contact.known for contact in usable):
+                center_by_slope(contact, slopes, pitch_mm)
+            for _ in range(6):
+                update_radius(contact, slopes.flatten(1)[:, contact.index], pitch_mm)
+    elif not all(contact.known and contact.radius_known for contact in usable):
         _locate_jointly(usable, pitch_mm, half_mm)
     for contact in usable:
+        if not contact.reason and int(contact.inside().sum()) < LEAST_INSIDE:
+            contact.reason = "no ball of this diameter fits what is seen"
         if not contact.reason and contact.contact_radius_mm > 0.89 * contact.radius_mm:
             wide_mm, ball_mm = 2 * contact.contact_radius_mm, 2 * contact.radius_mm
             contact.reason = f"the contact seen is {wide_mm:.2f} mm wide, too wide for a ball of {ball_mm:g} mm"
@@ -131,8 +136,7 @@ def _locate_jointly(contacts: list[Contact], pitch_mm: float, half_mm: float) ->
         for _ in range(rounds):
             coefficient = solve_with_centers(forms, 0.01 * family.penalty(), anchors, 0.3)
             for item in forms:
-                if not item.contact.known:
-                    update_radius(item.contact, item.slope(coefficient), pitch_mm)
+                update_radius(item.contact, item.slope(coefficient), pitch_mm)
         if not uses_depth:
             for contact in contacts:
                 add_depth(contact, family.field(coefficient), pitch_mm)
@@ -169,7 +173,13 @@ def leave_out(contacts: list[Contact], prior: ResponseModel | None, half_mm: flo
         worst = int(log_gain.abs().argmax())
         if float(log_gain.abs()[worst]) > math.log(1.5):
             seen = 2 * used[worst].radius_mm / max(float(gains[worst]), 1e-3)
-            judge = "the sensor's prior" if prior is not None else f"the other {len(used) - 1} presses"
+            judge = (
+                "the sensor's prior"
+                if prior is not None
+                else "the other press"
+                if len(used) == 2
+                else f"the other {len(used) - 1} presses"
+            )
             used[worst].reason = f"by {judge} the ball seems {seen:.2f} mm wide, but {2 * used[worst].radius_mm:g} mm was given"
             if prior is None and len(used) == 2:
                 used[1 - worst].reason = "contradicts the only other press: one of the two diameters is wrong"

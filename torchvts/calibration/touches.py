@@ -24,6 +24,9 @@ TOUCH_BLUR_PX = 3.0
 LEAST_GAP = 4.0
 """The second eigenvalue over the first from which a family counts as pinned."""
 
+LEAST_SPREAD = 0.05
+"""Mean squared slope across over along: below it the touches say nothing of one of the two slopes."""
+
 
 @dataclass(frozen=True, eq=False)
 class Touch:
@@ -69,14 +72,16 @@ def fit_touches(contacts: list[Contact], half_mm: float, pitch_mm: float) -> Tou
     for degree in (0, 1, 2):
         family = Family(degree, -1, False, half_mm)
         solution, gap = _smallest_eigenvector(family, contacts)
-        tried.append({"degree": degree, "numbers": family.size(), "gap": gap})
-        if gap < LEAST_GAP:
+        spread = _spread(family, solution, contacts)
+        tried.append({"degree": degree, "numbers": family.size(), "gap": gap, "spread": spread})
+        if gap < LEAST_GAP or spread < LEAST_SPREAD:
             break
         best = (family, solution, gap)
     if best is None:
         raise ValueError(
             f"touches: expected contacts that pin a response field, got an eigenvalue gap of {tried[0]['gap']:.1f} (at least "
-            f"{LEAST_GAP:g} is needed): all are alike, flat or faint; add objects with slopes in several directions"
+            f"{LEAST_GAP:g} is needed) and a spread of directions of {tried[0]['spread']:.2f} (at least {LEAST_SPREAD:g}): all are "
+            "alike, flat or faint; add objects with slopes in several directions"
         )
     family, solution, gap = best
     field = family.field(solution)
@@ -84,6 +89,16 @@ def fit_touches(contacts: list[Contact], half_mm: float, pitch_mm: float) -> Tou
     if inward < 0:
         field = family.field(-solution)
     return TouchFit(field, gap, tried)
+
+
+def _spread(family: Family, solution: Tensor, contacts: list[Contact]) -> float:
+    """Mean squared slope across the touches' main direction over that along it: 1 for balls, 0 for a straight ridge."""
+    covariance = torch.zeros(2, 2, dtype=torch.float64)
+    for contact in contacts:
+        slope = solution.reshape(2, -1) @ family.terms(contact)
+        covariance += slope @ slope.t() / max(1, slope.shape[1])
+    values = torch.linalg.eigvalsh(covariance)
+    return float(values[0] / values[1].clamp_min(1e-30))
 
 
 def _smallest_eigenvector(family: Family, contacts: list[Contact]) -> tuple[Tensor, float]:

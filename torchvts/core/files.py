@@ -109,7 +109,7 @@ def image_to_bytes(image: Tensor) -> Tensor:
 
 
 def image_from_bytes(data: Tensor, size: tuple[int, int], source: str) -> Tensor:
-    """Read what :func:`image_to_bytes` gave, (3, H, W) float32.
+    """Read what :func:`image_to_bytes` gave, (3, H, W) float64.
 
     Raises:
         ValueError: not a PNG, or of another size than ``size``, which its header is held against before it is decoded.
@@ -124,7 +124,8 @@ def image_from_bytes(data: Tensor, size: tuple[int, int], source: str) -> Tensor
     pixels = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED) if (height, width) == size else None
     if pixels is None or pixels.shape != (*size, 3) or pixels.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{source}: expected a whole colour PNG of {size[0]} x {size[1]}, got one that says {height} x {width}")
-    return rgb_from_bgr(pixels)
+    levels: Tensor = torch.from_numpy(np.ascontiguousarray(pixels[:, :, ::-1].transpose(2, 0, 1)).astype(np.float64))
+    return levels / (255.0 if pixels.dtype == np.uint8 else 65535.0)
 
 
 DEPTH_PNG_STEP_MM = 0.0001

@@ -1,0 +1,157 @@
+"""Calibration from touches of unknown objects: the curl pins a field up to its scale."""
+
+import types
+import warnings
+
+import pytest
+import torch
+
+import torchvts as vts
+import torchvts.evaluate
+from torchvts.calibration.field import Family
+from torchvts.core.response import ResponseField, ResponseModel, SensorPrior, fit_log_background
+
+PITCH, HEIGHT, WIDTH = 0.125, 120, 160
+SENSOR = vts.Sensor("touched", HEIGHT, WIDTH, PITCH, gamma=1.0)
+MIX = torch.tensor([[0.35, -0.05], [-0.2, 0.3], [-0.1, -0.33]])
+"""Change of R, G, B per slope: three lamps around the skin."""
+
+
+def seen(scene, noise=0.002, seed=0):
+    """What a skin whose change of light is linear in its slope shows."""
+    generator = torch.Generator().manual_seed(seed)
+    change = torch.einsum("cs,bshw->bchw", MIX, scene.gradient.float())
+    image = 0.45 * (1.0 + change)[0] + noise * torch.randn(3, HEIGHT, WIDTH, generator=generator)
+    return (image.clamp(0, 1) * 255).round() / 255
+
+
+def letters():
+    return vts.scenes.letters_press("VTS", 0.3, height=HEIGHT, width=WIDTH, mm_per_pixel=PITCH, bevel_mm=0.7)
+
+
+def ball(x_mm=0.0, y_mm=0.0, press_mm=0.5, radius_mm=6.0):
+    return vts.scenes.sphere_press(radius_mm, press_mm, (x_mm, y_mm), HEIGHT, WIDTH, PITCH)
+
+
+@pytest.fixture(scope="module")
+def rest():
+    return seen(vts.scenes.at_rest(ball()), seed=99)
+
+
+@pytest.fixture(scope="module")
+def touches():
+    places = [(-3.0, 1.0), (4.0, -2.0), (0.5, 3.0), (-5.0, -3.0)]
+    images = [seen(ball(x, y, press), seed=k) for k, ((x, y), press) in enumerate(zip(places, (0.3, 0.5, 0.4, 0.6)))]
+    return [*images, seen(letters(), seed=7)]
+
+
+def calibrate(*arguments, **named):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", vts.CalibrationWarning)
+        return vts.calibrate(*arguments, **named)
+
+
+def angle(calibration, scene, mode="precise"):
+    out = vts.DepthPipeline.from_calibration(calibration, mode)(seen(scene, seed=50)[None])
+    inside = torch.nn.functional.avg_pool2d(scene.contact.float(), 9, 1, 4) > 0.999
+    return float(vts.metrics.normal_angle_deg(out.normal, scene.normal, inside).mean())
+
+
+def test_touches_and_one_press_give_the_field(rest, touches):
+    calibration = calibrate(rest, SENSOR, [vts.Press(seen(ball(1.0, -1.0), seed=20), 12.0)], touches)
+    assert calibration.report["model"] == "response" and any(row["model"] == "touches" for row in calibration.report["candidates"])
+    assert angle(calibration, ball(2.0, 2.0, 0.6)) < 1.5
+
+
+def test_a_known_depth_gives_the_scale(rest, touches):
+    known = [vts.Touch(touches[1], 0.5, "on the stage"), *touches[2:]]
+    calibration = calibrate(rest, SENSOR, touches=known)
+    assert "the scale by 1 known depths" in calibration.report["reason"] and angle(calibration, ball(2.0, 2.0, 0.6)) < 3.0
+    assert [row["used"] for row in calibration.report["touches"]] == [True] * len(known)
+
+
+def test_the_direction_of_the_field_is_that_of_the_truth(rest, touches):
+    calibration = calibrate(rest, SENSOR, touches=[vts.Touch(touches[1], 0.5), *touches[2:]])
+    found = calibration.response.fast.tensor() / 0.3  # slope per relative change
+    product = found @ MIX.double()  # the identity if it is the inverse
+    assert calibration.response.fast.degree == 0
+    assert torch.allclose(product / product.diagonal().mean(), torch.eye(2, dtype=torch.float64), atol=0.08)
+
+
+def test_contacts_press_inward(rest, touches):
+    calibration = calibrate(rest, SENSOR, touches=[vts.Touch(touches[1], 0.5), *touches[2:]])
+    out = vts.DepthPipeline.from_calibration(calibration, "fast")(touches[0][None])
+    assert float(out.depth_mm.max()) > 0.2 > -0.05 > float(out.depth_mm.min()) - 0.1
+
+
+def test_with_a_prior_touches_need_no_scale_and_keep_its(rest, touches):
+    truth = torch.linalg.pinv(MIX.double()) * 0.3
+    rows = tuple(tuple(row) for row in truth.tolist())
+    response = ResponseModel(ResponseField(0, -1, False, 10.0, rows), None)
+    prior = SensorPrior(response, fit_log_background(rest, PITCH), 10.0, "made up")
+    sensor = vts.Sensor("touched", HEIGHT, WIDTH, PITCH, prior=prior)
+    calibration = calibrate(rest, sensor, touches=touches)
+    moved = calibration.response.fast.tensor()
+    assert "prior, moved by 5 touches" in calibration.report["reason"]
+    assert float((moved - truth).abs().max() / truth.abs().max()) < 0.1
+
+
+def test_touches_without_a_scale_are_refused(rest, touches):
+    with pytest.raises(ValueError, match=r"^touches: expected something that tells their scale.*Touch\(image, depth_mm\)"):
+        calibrate(rest, SENSOR, touches=touches)
+
+
+def test_flat_touches_pin_nothing_and_say_so(rest):
+    # slopes in one direction only: any row of the field does for them
+    x = torch.linspace(-3.14, 3.14, WIDTH).clamp(-2.0, 2.0)
+    ridge = types.SimpleNamespace(
+        gradient=torch.stack((0.3 * torch.sin(1.57 * x), 0 * x))[None, :, None].expand(1, 2, HEIGHT, WIDTH)
+    )
+    with pytest.raises(ValueError, match=r"^touches: .*spread of directions"):
+        calibrate(rest, SENSOR, touches=[vts.Touch(seen(ridge), 0.4)])
+
+
+def test_a_touch_without_contact_is_left_out(rest, touches):
+    with pytest.warns(vts.CalibrationWarning, match=r"touches\[1\]: left out: no contact"):
+        calibration = vts.calibrate(rest, SENSOR, touches=[vts.Touch(touches[1], 0.5), rest, *touches[2:]])
+    assert [row["used"] for row in calibration.report["touches"]] == [True, False, True, True, True]
+
+
+def test_only_touches_without_contact_are_an_error(rest):
+    with pytest.raises(ValueError, match=r"^touches: none can be used: .*no contact"):
+        calibrate(rest, SENSOR, touches=[rest])
+
+
+def test_a_touch_of_another_size_is_refused(rest):
+    with pytest.raises(ValueError, match=r"touches\[0\]: image: expected \(3, 120, 160\)"):
+        calibrate(rest, SENSOR, touches=[rest[:, :60]])
+
+
+@pytest.mark.parametrize(
+    "depth_mm, error", [(0.0, ValueError), (-1.0, ValueError), ("deep", TypeError), (float("nan"), ValueError)]
+)
+def test_an_impossible_depth_is_refused(rest, depth_mm, error):
+    with pytest.raises(error, match=r"^depth_mm: "):
+        vts.Touch(rest, depth_mm)
+
+
+def test_real_touches(data):
+    """The presses of a GelSight Mini as if nobody knew what was pressed; one of them gives the scale."""
+    sensor = vts.Sensor.load("gelsight_mini").without_prior()
+    folder = vts.gs_sdk.read_calibration_folder(data / "gelsight_mini_a")
+    ball = next(press for press in folder.presses if press.name == "6.310mm/14")
+    others = [press.image() for press in folder.presses if press is not ball][::3][:10]
+    calibration = calibrate(folder.background, sensor, [vts.Press(ball.image(), ball.ball_diameter_mm)], others)
+    judged = [press for press in vts.evaluate.read_presses(data / "gelsight_mini_a")[1] if press.contact_radius_px is not None]
+    pipe = vts.DepthPipeline.from_calibration(calibration, "precise")
+    scores = []
+    for press in judged:
+        out = pipe(press.image[None])
+        scores.append(vts.evaluate.score_press(press, out.depth_mm, out.normal, sensor.mm_per_pixel).normal_deg)
+    assert sum(scores) / len(scores) < 6.2
+
+
+def test_the_family_of_touches_is_the_smallest_that_is_pinned(rest, touches):
+    calibration = calibrate(rest, SENSOR, touches=[vts.Touch(touches[1], 0.5), *touches[2:]])
+    tried = next(row for row in calibration.report["candidates"] if row["model"] == "touches")["tried"]
+    assert tried[0]["numbers"] == Family(0, -1, False, 10.0).size() == 6 and tried[0]["gap"] > 4.0

@@ -45,6 +45,10 @@ TIE = 1.05
 """Point lights are preferred to response fields unless these are better by more than this."""
 
 
+HOPELESS_MISFIT = 0.2
+"""Relative structure that lights leave unexplained, from which they are no candidate beside another model."""
+
+
 class CalibrationWarning(UserWarning):
     """A calibration that was made, but should not be trusted as it is."""
 
@@ -92,7 +96,7 @@ def calibrate(
     check_exposure(background)
     _check_presses(presses, sensor)
     named = [touch if isinstance(touch, Touch) else Touch(touch, None, f"touches[{k}]") for k, touch in enumerate(touches)]
-    by_lights, lights_row, complaint = _by_lights(background, sensor, progress)
+    by_lights, lights_row, complaint = _by_lights(background, sensor, bool(presses or touches or sensor.prior), progress)
     candidates = [lights_row]
     prior = None if sensor.prior is None else sensor.prior.response
     if prior is not None and sensor.blur_px > 0:
@@ -158,7 +162,7 @@ def fit_prior(background: Tensor, sensor: Sensor, presses: Sequence[Press], sour
     return SensorPrior(fit.model, log_background, 0.5 * sensor.width * sensor.mm_per_pixel, source)
 
 
-def _by_lights(background: Tensor, sensor: Sensor, progress: bool) -> tuple[Calibration, dict[str, Any], str]:
+def _by_lights(background: Tensor, sensor: Sensor, other_models: bool, progress: bool) -> tuple[Calibration, dict[str, Any], str]:
     """Point lights from the image, their row in the table of candidates, and what there is to complain of."""
     report: dict[str, Any] = {"model": "point_lights", "lights": "fitted"}
     row: dict[str, Any] = {"model": "point lights", "family": "three lights", "numbers": 12, "pass": 2, "misfit": 0.0}
@@ -170,7 +174,7 @@ def _by_lights(background: Tensor, sensor: Sensor, progress: bool) -> tuple[Cali
             row | {"numbers": 3, "score_deg": 0.0, "note": "given"},
             "",
         )
-    sensor, fit = _choose_gamma(background, sensor, progress)
+    sensor, fit = _choose_gamma(background, sensor, other_models, progress)
     loosest = float(fit.direction_std_deg.max())
     report |= {
         "converged": fit.converged,
@@ -192,22 +196,30 @@ def _by_lights(background: Tensor, sensor: Sensor, progress: bool) -> tuple[Cali
     return Calibration.from_lights(fit.lights, sensor, background, report), row, complaint
 
 
-def _choose_gamma(background: Tensor, sensor: Sensor, progress: bool) -> tuple[Sensor, LightFit]:
-    """The sensor with a gamma, and its lights: 2.2 where the file leaves it open and that leaves clearly less unexplained."""
-    linear = dataclasses.replace(sensor, gamma=sensor.exponent)
-    fit = fit_lights(background, linear, progress=progress)
-    if sensor.gamma is not None or float(fit.misfit.max()) < 0.005:
-        return linear, fit
-    stride = max(1, min(sensor.height, sensor.width) // 60)  # a sparse image is enough to choose
+def _choose_gamma(background: Tensor, sensor: Sensor, other_models: bool, progress: bool) -> tuple[Sensor, LightFit]:
+    """The sensor with a gamma, and its lights: 2.2 where the file leaves it open and that leaves clearly less unexplained.
+
+    Where there are other models, lights that leave much unexplained in a sparse image are not refined on the whole one.
+    """
+    linear = dataclasses.replace(sensor, gamma=sensor.exponent, prior=None)
+    stride = max(1, min(sensor.height, sensor.width) // 60)
     sparse = background[:, stride // 2 :: stride, stride // 2 :: stride]
     small = dataclasses.replace(
-        linear, height=sparse.shape[1], width=sparse.shape[2], mm_per_pixel=stride * sensor.mm_per_pixel, prior=None
+        linear,
+        height=sparse.shape[1],
+        width=sparse.shape[2],
+        mm_per_pixel=stride * sensor.mm_per_pixel,
+        corners_px=None,
+        roi_px=None,
     )
-    one, other = (fit_lights(sparse, dataclasses.replace(small, gamma=gamma), progress=progress) for gamma in (1.0, 2.2))
-    if not other.converged or other.loss_history[-1] > 0.5 * one.loss_history[-1]:
-        return linear, fit
-    curved = dataclasses.replace(sensor, gamma=2.2)
-    return curved, fit_lights(background, curved, progress=progress)
+    one = fit_lights(sparse, small, progress=progress)
+    if sensor.gamma is None and float(one.misfit.max()) > 0.005:
+        other = fit_lights(sparse, dataclasses.replace(small, gamma=2.2), progress=progress)
+        if other.converged and other.loss_history[-1] < 0.5 * one.loss_history[-1]:
+            linear, one = dataclasses.replace(linear, gamma=2.2), other
+    if other_models and float(one.misfit.max()) > HOPELESS_MISFIT:
+        return linear, one
+    return linear, fit_lights(background, linear, progress=progress)
 
 
 def _by_presses(

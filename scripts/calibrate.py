@@ -8,6 +8,7 @@ FOLDER is a calibration folder of gs_sdk: catalog.csv, background.png, N/gelsigh
 """
 
 import argparse
+import dataclasses
 import sys
 import warnings
 from pathlib import Path
@@ -24,7 +25,7 @@ def main() -> int:
     parser.add_argument("--gamma", type=float, help="with --mm-per-pixel: value = light^(1/gamma); left out, it is chosen")
     parser.add_argument("--touches", type=Path, nargs="+", default=[], help="images of unknown objects pressed in")
     parser.add_argument(
-        "--use-labels", action="store_true", help="take centers from the folder's label.npz instead of finding them"
+        "--use-labels", action="store_true", help="take centers from the folder's label.npz or labels.csv instead of finding them"
     )
     parser.add_argument("--no-prior", action="store_true", help="do as if the sensor file had no prior")
     parser.add_argument("--out", type=Path, required=True, help="calibration file to write, .safetensors")
@@ -33,19 +34,9 @@ def main() -> int:
         parser.error("give either --sensor or --mm-per-pixel")
     presses: list[vts.Press] = []
     if arguments.background.is_dir():
-        folder = vts.gs_sdk.read_calibration_folder(arguments.background)
-        image = folder.background
-        items = [(item, arguments.use_labels) for item in folder.presses]
-        presses = [
-            vts.Press(
-                item.image(),
-                item.ball_diameter_mm,
-                item.name,
-                item.center_px if known else None,
-                item.radius_px if known else None,
-            )
-            for item, known in items
-        ]
+        image, presses = vts.read_presses(arguments.background)
+        if not arguments.use_labels:
+            presses = [dataclasses.replace(press, center_px=None, contact_radius_px=None) for press in presses]
     else:
         image = vts.read_image(arguments.background)
     if arguments.sensor is not None:

@@ -12,7 +12,6 @@ import sys
 from pathlib import Path
 
 import torchvts as vts
-from torchvts.core.gs_sdk import read_calibration_folder, read_labels
 
 
 def main() -> int:
@@ -22,18 +21,9 @@ def main() -> int:
     parser.add_argument("--source", default="", help="whose images these are: kept in the file")
     parser.add_argument("--out", type=Path, required=True, help="sensor file to write, .yaml; its leading comment is kept")
     arguments = parser.parse_args()
-    sensor, folder = vts.Sensor.load(arguments.sensor), read_calibration_folder(arguments.folder)
-    labels = read_labels(arguments.folder) if (arguments.folder / "labels.csv").is_file() else {}
-    presses = []
-    for item in folder.presses:
-        center, radius = item.center_px, item.radius_px
-        if center is None and item.name in labels:
-            *place, radius = labels[item.name]
-            center = (place[0], place[1])
-        presses.append(vts.Press(item.image(), item.ball_diameter_mm, item.name, center, radius))
-    prior = vts.fit_prior(
-        folder.background, sensor, presses, arguments.source or f"{len(presses)} presses of {arguments.folder.name}"
-    )
+    sensor = vts.Sensor.load(arguments.sensor)
+    background, presses = vts.read_presses(arguments.folder)
+    prior = vts.fit_prior(background, sensor, presses, arguments.source or f"{len(presses)} presses of {arguments.folder.name}")
     before = arguments.out.read_text() if arguments.out.is_file() else ""
     comment = [line for line in before.splitlines() if line.startswith("#")]
     dataclasses.replace(sensor, prior=prior).save(arguments.out, comment)

@@ -20,7 +20,7 @@ import torch
 from tqdm import tqdm
 
 import torchvts as vts
-from torchvts.evaluate import PressScore, read_presses, score_press
+from torchvts.evaluate import PressScore, score_press
 from torchvts.viz import save_figure
 
 matplotlib.use("Agg")
@@ -35,7 +35,7 @@ def main() -> int:
     arguments = parser.parse_args()
     warnings.simplefilter("ignore", vts.CalibrationWarning)
     bare = vts.Sensor.load(arguments.sensor).without_prior()
-    background, presses = read_presses(arguments.folder)
+    background, presses = vts.read_presses(arguments.folder)
     scored = [press for press in presses if press.center_px is not None and press.contact_radius_px is not None]
     rows: list[tuple[str, int, list[PressScore]]] = []
     balls = sorted({press.ball_diameter_mm for press in presses})

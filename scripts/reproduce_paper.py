@@ -85,7 +85,7 @@ def figure_4(folder: Path, out: Path) -> list[str]:
 def table_2(folder: Path, out: Path) -> list[str]:
     """RMSE between model-based and look-up depth on real contacts (eq. 11), over the image and over the contact, in px."""
     sensor = vts.Sensor.load("gelsight_mini").without_prior()
-    background, presses = evaluate.read_presses(folder)
+    background, presses = vts.read_presses(folder)
     kept = [press for k, press in enumerate(presses) if k % 5 == 0 and press.contact_radius_px is not None]
     training = evaluate.Training(background, [press for press in presses if press not in kept], sensor)
     table = evaluate.lookup_table(training, background, sensor).pipeline

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 import torchvts as vts
-from torchvts.evaluate import read_presses, train_network
+from torchvts.evaluate import train_network
 
 
 def main() -> int:
@@ -26,7 +26,7 @@ def main() -> int:
     if arguments.out.suffix != ".safetensors":
         parser.error(f"--out: expected a name ending in .safetensors, got {arguments.out}")
     sensor = vts.Sensor.load(arguments.sensor)
-    background, presses = read_presses(arguments.folder)
+    background, presses = vts.read_presses(arguments.folder)
     fit = train_network(
         background, presses, sensor, arguments.blur_px, arguments.seed, max_epochs=arguments.max_epochs, progress=True
     )

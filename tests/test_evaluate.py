@@ -200,7 +200,7 @@ def test_evaluate_on_a_second_folder_and_with_a_trained_network(folder, tmp_path
 
 def test_without_labels_balls_are_found(folder, tmp_path):
     sensor = vts.Sensor.load(folder / "rig.yaml")
-    background, presses = ev.read_presses(folder)
+    background, presses = vts.read_presses(folder)
     assert presses[0].center_px is not None and presses[5].contact_radius_px is None
     training = ev.Training(background, presses, sensor)
     for found, given in zip(training.located, presses, strict=True):
@@ -208,7 +208,7 @@ def test_without_labels_balls_are_found(folder, tmp_path):
     bare = shutil.copytree(folder, tmp_path / "bare", ignore=shutil.ignore_patterns("labels.csv"))
     result = ev.evaluate(bare, sensor, ["flat"], folds=1)
     assert "centers from calibrate, which saw all presses (6)" in result.how and result.summaries[0].presses == 6
-    fit = ev.train_network(*ev.read_presses(bare), sensor, max_epochs=2)
+    fit = ev.train_network(*vts.read_presses(bare), sensor, max_epochs=2)
     assert len(fit.history) == 2 and "raise max_epochs" in fit.message
 
 

@@ -14,7 +14,8 @@ NAMES = [
     "PointLights", "PoissonDCT", "PoissonDST", "PoissonRest", "Press", "Sensor", "Touch", "calibrate", "depth_to_points",
     "divergence",
     "fill_markers", "find_markers", "fit_lights", "fit_mlp", "fit_prior", "gradient_from_normal", "gs_sdk", "metrics",
-    "near_field_shading", "normal_from_gradient", "poisson_dct", "poisson_dst", "poisson_rest", "read_image", "scenes",
+    "near_field_shading", "normal_from_gradient", "poisson_dct", "poisson_dst", "poisson_rest", "read_image",
+    "read_presses", "scenes",
     "shipped_sensors", "write_image",
 ]  # fmt: skip
 ARGUMENTS = {

@@ -103,7 +103,7 @@ METADATA = {
     "version as text": (lambda m: m.update(format_version="1"), "format version '1'"),
     "no version": (lambda m: m.pop("format_version"), "format version None"),
     "another kind": (lambda m: m.update(kind="mesh"), "expected a calibration, got a file of kind 'mesh'"),
-    "no sensor": (lambda m: m.pop("sensor"), "expected keys and values of a sensor, got NoneType"),
+    "no sensor": (lambda m: m.pop("sensor"), "expected keys and values, got NoneType"),
     "another sensor": (lambda m: m["sensor"].update(height=48), r"expected \(3, 48, 32\) floats, got \(3, 24, 32\)"),
     "another pitch": (lambda m: m["sensor"].update(mm_per_pixel=0.1), "does not fit the lights in the same file"),
     "unknown key of the sensor": (lambda m: m["sensor"].update(colour=1), "key 'colour': unknown"),

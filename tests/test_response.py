@@ -13,7 +13,7 @@ import torch
 import yaml
 
 import torchvts as vts
-from torchvts.compensate import blur, gaussian_kernel
+from torchvts.compensate import blur, gaussian_weights
 from torchvts.core.files import load_tensors
 from torchvts.core.response import ResponseField, ResponseModel, SensorPrior, fit_log_background
 
@@ -622,7 +622,7 @@ def test_the_gelsight_mini_ships_with_a_prior():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_blur_is_kornia_s(std_px, dtype):
     image = torch.rand(2, 3, 30, 41, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype)
-    size = len(gaussian_kernel(std_px))
+    size = len(gaussian_weights(std_px))
     expected = kornia.filters.gaussian_blur2d(image, (size, size), (std_px, std_px), border_type="replicate")
     assert size % 2 == 1 and size >= 6 * std_px
     assert float((vts.Compensate(blur_px=std_px)(image) - expected).abs().max()) < 1e-6
@@ -634,7 +634,7 @@ def test_the_blur_keeps_a_constant_and_the_sum_of_a_point(std_px):
     assert float((vts.Compensate(blur_px=std_px)(constant) - constant).abs().max()) < 1e-6
     point = torch.zeros(1, 3, 41, 41)
     point[..., 20, 20] = 1.0
-    spread = blur(point, gaussian_kernel(std_px))
+    spread = blur(point, gaussian_weights(std_px))
     assert spread.sum(dim=(2, 3)).flatten().tolist() == pytest.approx([1.0] * 3, abs=1e-6)
     assert torch.allclose(spread, spread.flip(3)) and torch.allclose(spread, spread.transpose(2, 3), atol=1e-7)
 

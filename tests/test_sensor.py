@@ -29,7 +29,7 @@ def as_text(**changes):
 @pytest.mark.parametrize(
     "text, message",
     [
-        (as_text(mm_per_pixle=0.1), r"key 'mm_per_pixle': unknown; a sensor knows name, height, .*mm_per_pixel"),
+        (as_text(mm_per_pixle=0.1), r"key 'mm_per_pixle': unknown; expected name, height, .*mm_per_pixel"),
         (as_text(height=None), "key 'height': missing"),
         (as_text() + "height: 25\n", "key 'height': given twice"),
         (as_text(height="tall"), "key height: expected an integer, got str 'tall'"),
@@ -56,8 +56,8 @@ def as_text(**changes):
         (as_text(roi_px="[-1, 0, 10, 10]"), "key roi_px: expected whole numbers"),
         (as_text(corners_px="[[0, 0], [0, 9], [9, 9], [9, 0]]"), "key corners_px: expected a convex quadrilateral"),
         (as_text(corners_px="[[0, 0], [9, 0], [9, 9], [0, 9]]", roi_px="[0, 0, 9, 9]"), "expected one of them, got both"),
-        ("- 1\n- 2\n", "expected keys and values of a sensor, got list"),
-        ("", "expected keys and values of a sensor, got NoneType"),
+        ("- 1\n- 2\n", "expected keys and values, got list"),
+        ("", "expected keys and values, got NoneType"),
         ("name: [rig\n", "not a YAML file"),
         ("!!python/object/apply:os.getcwd []\n", "not a YAML file"),
     ],

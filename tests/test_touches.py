@@ -142,7 +142,7 @@ def test_real_touches(data):
     ball = next(press for press in folder.presses if press.name == "6.310mm/14")
     others = [press.image() for press in folder.presses if press is not ball][::3][:10]
     calibration = calibrate(folder.background, sensor, [vts.Press(ball.image(), ball.ball_diameter_mm)], others)
-    judged = [press for press in vts.evaluate.read_presses(data / "gelsight_mini_a")[1] if press.contact_radius_px is not None]
+    judged = [press for press in vts.read_presses(data / "gelsight_mini_a")[1] if press.contact_radius_px is not None]
     pipe = vts.DepthPipeline.from_calibration(calibration, "precise")
     scores = []
     for press in judged:

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import torchvts as vts
-from torchvts.compensate import blur, gaussian_kernel
-from torchvts.evaluate import read_presses, score_press
+from torchvts.compensate import blur, gaussian_weights
+from torchvts.evaluate import score_press
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def test_a_second_unit_from_its_background_alone(data, mini, mode, limit_deg):
     background, bead = (vts.read_image(data / "gelsight_mini_b" / name) for name in ("background.png", "bead.png"))
     calibration = vts.calibrate(background, mini)
     assert calibration.report["response"] == "the sensor's prior" and "point lights rejected" in calibration.report["reason"]
-    smooth_rest, smooth = (blur(image[None], gaussian_kernel(1.0)) for image in (background, bead))
+    smooth_rest, smooth = (blur(image[None], gaussian_weights(1.0)) for image in (background, bead))
     own = vts.NormalFromMLP.load(data / "gelsight_mini_b" / "model" / "nnmodel.pth", smooth_rest[0])(smooth)
     out = vts.DepthPipeline.from_calibration(calibration, mode)(bead[None])
     changed = ((smooth - smooth_rest).abs().amax(1, keepdim=True) > 15 / 255) & out.contact
@@ -40,7 +40,7 @@ def test_the_contact_of_a_unit_whose_light_drifts_is_not_the_whole_frame(data, m
 
 
 def test_presses_of_one_ball_calibrate_for_another(data, mini):
-    background, presses = read_presses(data / "gelsight_mini_a")
+    background, presses = vts.read_presses(data / "gelsight_mini_a")
     small, large = ([p for p in presses if (p.ball_diameter_mm > 8) is big and p.contact_radius_px] for big in (False, True))
     prior = vts.fit_prior(background, mini, small)
     sensor = dataclasses.replace(mini, prior=prior)

@@ -1,7 +1,7 @@
 """torchvts: camera images of visual-tactile sensors into depth, normals, contact and pose, as differentiable PyTorch modules."""
 
 from . import metrics, scenes
-from .calibration import CalibrationWarning, LightFit, Press, Touch, calibrate, fit_lights, fit_prior
+from .calibration import CalibrationWarning, LightFit, Press, Touch, calibrate, fit_lights, fit_prior, read_presses
 from .compensate import Compensate
 from .contact import ContactMask
 from .core import gs_sdk
@@ -55,6 +55,7 @@ __all__ = [
     "poisson_dst",
     "poisson_rest",
     "read_image",
+    "read_presses",
     "scenes",
     "shipped_sensors",
     "write_image",

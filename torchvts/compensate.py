@@ -36,7 +36,6 @@ class Compensate(nn.Module):
     offset: Tensor | None
     defect: Tensor
     sound: Tensor
-    kernel: Tensor
 
     def __init__(
         self,
@@ -65,7 +64,7 @@ class Compensate(nn.Module):
         self.register_buffer("offset", None if offset is None else offset.detach().clone())
         self.register_buffer("defect", flat_index)
         self.register_buffer("sound", sound)
-        self.register_buffer("kernel", gaussian_kernel(self.blur_px))
+        self.weights = gaussian_weights(self.blur_px)
 
     @classmethod
     def from_calibration(cls, calibration: Calibration) -> "Compensate":
@@ -93,7 +92,7 @@ class Compensate(nn.Module):
             repaired = pixels[:, :, self.sound].mean(dim=3)  # (B, 3, N)
             light = pixels.index_copy(2, self.defect, repaired).reshape(light.shape)
         if self.blur_px > 0.0:
-            light = blur(light, self.kernel)
+            light = blur(light, self.weights)
         return light / rest_level(light) if self.level else light
 
 
@@ -101,9 +100,9 @@ def rest_level(ratio: Tensor, least: float = 0.01, most: float = 0.15) -> Tensor
     """How bright the skin at rest is in each channel of a frame, relative to the background: the mode of image / background.
 
     A press scatters light over the whole skin and lamps drift: on a GelSight Mini up to 1 %, on another 5 %. The mode is found by
-    medians of ever narrower halves, and held to 1 +- ``most``. Where no channel is ``least`` off it is left at 1, because then the
-    error of the mode is no smaller (relief 26 against 28 um on the first Mini); from twice that it counts in full. Scripts; no
-    gradient flows through it.
+    the narrowest half of the values, the narrowest half of that, and so on, and held to 1 +- ``most``. Where no channel is
+    ``least`` off it is left at 1, because then the error of the mode is no smaller (relief 26 against 28 um on the first Mini);
+    from twice that it counts in full. Scripts; no gradient flows through it.
 
     Args:
         ratio: (B, 3, H, W), image / background.
@@ -113,38 +112,43 @@ def rest_level(ratio: Tensor, least: float = 0.01, most: float = 0.15) -> Tensor
         the half-sample mode: Bickel and Fruhwirth, Computational Statistics and Data Analysis 50(12), 2006.
     """
     stride = max(1, min(ratio.shape[2], ratio.shape[3]) // 60)
-    pixels = ratio.detach()[:, :, stride // 2 :: stride, stride // 2 :: stride].flatten(2)
-    level = pixels.median(dim=2, keepdim=True).values
-    near = torch.ones_like(pixels, dtype=torch.bool)
+    pixels = ratio.detach()[:, :, stride // 2 :: stride, stride // 2 :: stride].flatten(2).sort(dim=2).values
     for _ in range(4):
-        away = (pixels - level).abs()
-        reach = torch.where(near, away, torch.nan).nanmedian(dim=2, keepdim=True).values
-        near = near & (away <= reach)
-        level = torch.where(near, pixels, torch.nan).nanmedian(dim=2, keepdim=True).values
-    drift = (level - 1.0).clamp(-most, most)
+        half = (pixels.shape[2] + 1) // 2
+        width = pixels[:, :, half - 1 :] - pixels[:, :, : pixels.shape[2] - half + 1]
+        start = width.argmin(dim=2, keepdim=True)
+        pixels = pixels.gather(2, start + torch.arange(half, device=pixels.device))
+    drift = (pixels[:, :, pixels.shape[2] // 2] - 1.0).clamp(-most, most)  # (B, 3)
     weight = (drift.abs().amax(dim=1, keepdim=True) / least - 1.0).clamp(0.0, 1.0)
-    return (1.0 + weight * drift)[..., None]
+    return (1.0 + weight * drift)[..., None, None]
 
 
-def gaussian_kernel(std_px: float) -> Tensor:
-    """Weights of a Gaussian at whole pixels up to three standard deviations, summing to one, (2 * ceil(3 std) + 1,)."""
+def gaussian_weights(std_px: float) -> list[float]:
+    """Weights of a Gaussian at whole pixels up to three standard deviations, summing to one: 2 * ceil(3 std) + 1 of them."""
     reach = math.ceil(3.0 * std_px)
-    place = torch.arange(-reach, reach + 1, dtype=torch.float64)
-    weight = torch.exp(-0.5 * (place / max(std_px, 1e-6)) ** 2)
-    return (weight / weight.sum()).float()
+    weights = [math.exp(-0.5 * (place / max(std_px, 1e-6)) ** 2) for place in range(-reach, reach + 1)]
+    return [weight / sum(weights) for weight in weights]
 
 
-def blur(image: Tensor, kernel: Tensor) -> Tensor:
-    """Blur along rows and columns by a kernel of odd length, the border repeated. Scripts, which kornia's does not; equal to it.
+def blur(image: Tensor, weights: list[float]) -> Tensor:
+    """Blur along rows and columns, the border repeated. Scripts, which kornia's does not; equal to it.
+
+    By shifted sums: on two cores 0.5 ms for a 320 x 240 image and a blur of 1 px, where a depthwise convolution takes 5.
 
     Args:
-        image: (B, C, H, W). kernel: (K,).
+        image: (B, C, H, W). weights: an odd number, from one end to the other.
     """
-    count, reach = image.shape[1], kernel.shape[0] // 2
-    weight = kernel.to(image.dtype).expand(count, 1, 1, -1)
+    reach = len(weights) // 2
     padded = nn.functional.pad(image, [reach, reach, reach, reach], mode="replicate")
-    rows = nn.functional.conv2d(padded, weight, groups=count)
-    return nn.functional.conv2d(rows, weight.transpose(2, 3), groups=count)
+    return _shifted_sum(_shifted_sum(padded, weights, 3), weights, 2)
+
+
+def _shifted_sum(padded: Tensor, weights: list[float], dim: int) -> Tensor:
+    length = padded.shape[dim] - len(weights) + 1
+    total = padded.narrow(dim, 0, length) * weights[0]
+    for k in range(1, len(weights)):
+        total.add_(padded.narrow(dim, k, length), alpha=weights[k])
+    return total
 
 
 def nearest_sound(defects: Tensor) -> tuple[Tensor, Tensor]:

@@ -12,6 +12,9 @@ from .core.checks import QUANTISATION_STD, check_batch, check_positive, check_sa
 from .core.noise import noise_std as frame_noise_std
 from .record import Calibration
 
+CELLS = 80
+"""Cells along the shorter side of the image."""
+
 LIGHT_DRIFT = 0.008
 """Least noise, relative to the background, with a response field: the lamps of real sensors drift by 1 to 2 % of their light."""
 
@@ -34,27 +37,41 @@ def reconstruct(seed: Tensor, mask: Tensor) -> Tensor:
         [True, True, False, False]
     """
     reached = seed & mask
-    before = 0
-    count = int(reached.sum())
-    while count > before:
+    gained = bool(reached.any())
+    while gained:
         for dim in (2, 3):
-            reached = _sweep(_sweep(reached, mask, dim).flip(dim), mask.flip(dim), dim).flip(dim)
-        before, count = count, int(reached.sum())
+            reached = _sweep(reached, mask, dim)
+        gained = bool((_dilate_cross(reached) & mask & ~reached).any())
     return reached
 
 
 def _sweep(reached: Tensor, mask: Tensor, dim: int) -> Tensor:
-    # on the way from the start of a line, what came last before a pixel: a reached pixel or a barrier?
-    place = 2 * torch.arange(1, mask.shape[dim] + 1, dtype=torch.int32, device=mask.device)
+    """What can be reached along lines, both ways."""
+    both = torch.cat((reached, reached.flip(dim)))
+    wall = torch.cat((mask, mask.flip(dim))).logical_not_()
+    # on the way from the start of a line, what came last before a pixel: a reached pixel (odd) or a wall (even)?
+    place = torch.arange(2, 2 * mask.shape[dim] + 2, 2, dtype=torch.int16, device=mask.device)
     place = place[:, None] if dim == 2 else place
-    code = (place + reached.to(torch.int32)) * (reached | ~mask).to(torch.int32)
-    return mask & (torch.cummax(code, dim=dim).values % 2 == 1)
+    last = torch.cummax((place + both) * (both | wall), dim=dim).values
+    found = (last.bitwise_and_(1) == 1).logical_and_(wall.logical_not_())
+    count = reached.shape[0]
+    return found[:count] | found[count:].flip(dim)
+
+
+def _dilate_cross(mask: Tensor) -> Tensor:
+    """Dilation over edges, not corners."""
+    grown = mask.clone()
+    grown[..., 1:].logical_or_(mask[..., :-1])  # by method: TorchScript takes |= on a slice for a new tensor
+    grown[..., :-1].logical_or_(mask[..., 1:])
+    grown[..., 1:, :].logical_or_(mask[..., :-1, :])
+    grown[..., :-1, :].logical_or_(mask[..., 1:, :])
+    return grown
 
 
 def _dilate(mask: Tensor) -> Tensor:
     """3 x 3 dilation of a bool mask; equal to kornia.morphology.dilation (a test holds them together), 30 times faster."""
     grown = mask.clone()
-    grown[..., 1:].logical_or_(mask[..., :-1])  # by method: TorchScript takes |= on a slice for a new tensor
+    grown[..., 1:].logical_or_(mask[..., :-1])
     grown[..., :-1].logical_or_(mask[..., 1:])
     result = grown.clone()
     result[..., 1:, :].logical_or_(grown[..., :-1, :])
@@ -88,6 +105,9 @@ class ContactMask(nn.Module):
 
     flat: Tensor
     per_noise: Tensor
+    rest: Tensor
+    cell_row: Tensor
+    cell_column: Tensor
 
     def __init__(self, flat: Tensor, noise_std: Tensor, sigmas: float = 5.0, min_size_px: float = 8.0) -> None:
         super().__init__()
@@ -95,12 +115,15 @@ class ContactMask(nn.Module):
             raise ValueError(f"flat: expected (3, H, W), got {tuple(flat.shape)}")
         self.sigmas = check_positive("sigmas", sigmas)
         self.min_size_px = check_positive("min_size_px", min_size_px)
-        self.cell = max(1, min(flat.shape[1], flat.shape[2]) // 96)
+        self.cell = max(1, min(flat.shape[1], flat.shape[2]) // CELLS)
         self.reach = max(1, math.ceil(0.5 * min_size_px / self.cell))  # cells around one that a smallest contact may touch
         self.least_cells = 0.6 * (min_size_px / self.cell) ** 2  # nearly the area of a disc of that size
         noise = noise_std.reshape(3, 1, 1) if noise_std.dim() == 1 else noise_std
         self.register_buffer("flat", flat.detach().clone())
         self.register_buffer("per_noise", 1.0 / noise.detach().clamp_min(QUANTISATION_STD).to(flat.dtype))
+        self.register_buffer("rest", -self.flat * self.per_noise)
+        self.register_buffer("cell_row", torch.arange(flat.shape[1]) // self.cell)
+        self.register_buffer("cell_column", torch.arange(flat.shape[2]) // self.cell)
 
     @classmethod
     def from_calibration(cls, calibration: Calibration) -> "ContactMask":
@@ -126,27 +149,24 @@ class ContactMask(nn.Module):
         """Change in units of the calibrated noise (B, 3, H, W), its square summed over channels, and that one's threshold."""
         check_batch("compensated", compensated, 3)
         check_same_size("compensated", compensated, "the calibration", self.flat.shape[1], self.flat.shape[2])
-        change = (compensated - self.flat) * self.per_noise
+        change = torch.addcmul(self.rest, compensated, self.per_noise)
         r, g, b = change[:, 0:1], change[:, 1:2], change[:, 2:3]
         squared = torch.addcmul(torch.addcmul(r * r, g, g), b, b)
         noise = frame_noise_std(change.detach()).amax(dim=1).clamp_min(1.0)  # a frame noisier than calibration
         return change, squared, (self.sigmas * noise).square()[:, None, None, None]
 
     def _clean(self, change: Tensor, strong: Tensor, threshold: Tensor) -> tuple[Tensor, Tensor]:
-        height, width, cell = change.shape[2], change.shape[3], self.cell
-        strong = ~_dilate(~_dilate(strong))  # closing: pixels lost to noise at the rim
-        pad = [0, -width % cell, 0, -height % cell]
-        counted = strong.to(change.dtype)
-        if pad[1] > 0 or pad[3] > 0:  # padding by nothing would copy
-            counted, change = nn.functional.pad(counted, pad), nn.functional.pad(change, pad, mode="replicate")
-        density = nn.functional.avg_pool2d(counted, cell)
+        strong = _erode(_dilate(strong))  # closing: pixels lost to noise at the rim
+        density = _cell_sums(strong.to(torch.uint8), self.cell).to(change.dtype) / float(self.cell * self.cell)
+        mean = _cell_sums(change, self.cell) / float(self.cell * self.cell)
         any_strong = density > 0
-        mean = nn.functional.avg_pool2d(change, cell)
         spread = mean.abs().flatten(2).median(dim=2).values / 0.6745
-        least = torch.sqrt(threshold[:, :, 0, 0]) / (self.sigmas * cell)  # white noise in the mean of a cell
+        least = torch.sqrt(threshold[:, :, 0, 0]) / (self.sigmas * self.cell)  # white noise in the mean of a cell
         faint = (mean / torch.maximum(spread, least)[..., None, None]).square().sum(1, keepdim=True) > self.sigmas * self.sigmas
         faint = faint & ~any_strong  # where single pixels stand out, as at a rim, they decide
         cells = any_strong | faint
+        if not bool(cells.any()):
+            return strong, strong
         border = torch.ones_like(cells)
         border[..., 1:-1, 1:-1] = False
         filled = ~reconstruct(border, ~cells)
@@ -154,10 +174,25 @@ class ContactMask(nn.Module):
         around = 2 * self.reach + 1
         area = nn.functional.avg_pool2d(density, around, 1, self.reach) * float(around * around)
         kept = reconstruct(filled & (area > self.least_cells), filled)
-        interior = self._to_pixels(kept & (_erode(filled) | faint), height, width)
-        return (strong & self._to_pixels(kept, height, width)) | interior, interior
+        interior = kept & (_erode(filled) | faint)
+        inner = self._to_pixels(interior)
+        return (strong & self._to_pixels(kept)) | inner, inner
 
-    def _to_pixels(self, cells: Tensor, height: int, width: int) -> Tensor:
-        rows, columns, cell = cells.shape[2], cells.shape[3], self.cell
-        blocks = cells[:, :, :, None, :, None].expand(-1, -1, rows, cell, columns, cell)
-        return blocks.reshape(-1, 1, rows * cell, columns * cell)[..., :height, :width]
+    def _to_pixels(self, cells: Tensor) -> Tensor:
+        return cells.index_select(3, self.cell_column).index_select(2, self.cell_row)
+
+
+def _cell_sums(image: Tensor, cell: int) -> Tensor:
+    """Sums over cells of a (B, C, H, W) image, in its own dtype; where the size is no multiple, the last cells overlap others."""
+    return image if cell == 1 else _line_sums(_line_sums(image, cell).transpose(2, 3), cell).transpose(2, 3)
+
+
+def _line_sums(image: Tensor, cell: int) -> Tensor:
+    """Sums of each ``cell`` rows."""
+    whole = image.shape[2] // cell
+    batch, channels, _, width = image.shape
+    sums = image.narrow(2, 0, whole * cell).reshape(batch, channels, whole, cell, width).sum(3, dtype=image.dtype)
+    if whole * cell == image.shape[2]:
+        return sums
+    last = image.narrow(2, image.shape[2] - cell, cell).sum(2, keepdim=True, dtype=image.dtype)
+    return torch.cat((sums, last), dim=2)

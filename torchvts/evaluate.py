@@ -21,14 +21,13 @@ from matplotlib.figure import Figure
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from .calibration import CalibrationWarning, Press, calibrate
+from .calibration import CalibrationWarning, Press, calibrate, read_presses
 from .calibration.calibrate import RESPONSE_BLUR_PX
 from .compensate import Compensate
 from .contact import ContactMask
 from .core.checks import check_image, check_integer, check_same_size
 from .core.geometry import GradientFromNormal, normal_from_gradient, pixel_grid_mm
-from .core.gs_sdk import read_calibration_folder, read_labels
-from .core.response import ResponseField, ResponseModel
+from .core.response import ResponseModel
 from .core.sensor import Sensor
 from .integration import PoissonRest
 from .metrics import fit_sphere, normal_angle_deg
@@ -253,24 +252,6 @@ def _by_bin(values: Tensor, index: Tensor, bins: int) -> tuple[tuple[float | Non
     return tuple(float(s / n) if n else None for s, n in zip(sums, counts)), tuple(counts.tolist())
 
 
-def read_presses(folder: str | Path) -> tuple[Tensor, list[Press]]:
-    """Background and presses of a folder in gs_sdk's layout, with the centers of ``label.npz`` or ``labels.csv`` if there.
-
-    Raises:
-        FileNotFoundError, ValueError: as :func:`read_calibration_folder` and :func:`read_labels`.
-    """
-    read = read_calibration_folder(folder)
-    labels = read_labels(folder) if (Path(folder) / "labels.csv").is_file() else {}
-    presses = []
-    for item in read.presses:
-        center, radius = item.center_px, item.radius_px
-        if center is None and item.name in labels:
-            x, y, radius = labels[item.name]
-            center = (x, y)
-        presses.append(Press(item.image(), item.ball_diameter_mm, item.name, center, radius))
-    return read.background, presses
-
-
 class Training:
     """Presses to learn from, their labels forgotten, and what calibration by response fields, without a prior, finds in them.
 
@@ -280,7 +261,7 @@ class Training:
 
     def __init__(self, background: Tensor, presses: Sequence[Press], sensor: Sensor) -> None:
         self.background = background
-        self.sensor = dataclasses.replace(sensor, prior=None)
+        self.sensor = sensor.without_prior()
         self.presses = [dataclasses.replace(press, center_px=None, contact_radius_px=None) for press in presses]
 
     @cached_property
@@ -330,7 +311,7 @@ def point_lights(training: Training, background: Tensor, sensor: Sensor) -> Meth
     unit = _unit(background, sensor)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CalibrationWarning)
-        found = calibrate(background, dataclasses.replace(sensor, prior=None, blur_px=unit.sensor.blur_px))
+        found = calibrate(background, dataclasses.replace(sensor.without_prior(), blur_px=unit.sensor.blur_px))
     normals = NormalFromIntensity.from_calibration(found)
     return Method(_chain(unit, Compensate.from_calibration(found), normals, "precise"), 12, "from the background alone")
 
@@ -449,9 +430,8 @@ class _OfSecond(nn.Module):
 
 def _unit(background: Tensor, sensor: Sensor) -> Calibration:
     """The unit as a response field sees it that says 0 everywhere: it gives every method's contact mask."""
-    rest = ResponseField(0, -1, False, 1.0, ((0.0,) * 3, (0.0,) * 3))
     blur_px = max(sensor.blur_px, RESPONSE_BLUR_PX)
-    return Calibration.from_response(ResponseModel(rest, None, sensor.exponent, blur_px), sensor, background)
+    return Calibration.from_response(ResponseModel.blank(sensor.exponent, blur_px), sensor, background)
 
 
 def _smooth(unit: Calibration) -> Compensate:

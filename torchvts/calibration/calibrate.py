@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import statistics
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -13,17 +14,18 @@ from ..compensate import Compensate
 from ..contact import ContactMask
 from ..core.checks import check_image
 from ..core.geometry import gradient_from_normal
-from ..core.response import ResponseField, ResponseModel, SensorPrior, fit_log_background
+from ..core.response import ResponseModel, SensorPrior, fit_log_background
 from ..core.sensor import Sensor
 from ..integration import poisson_rest
 from ..normals import NormalFromIntensity
 from ..record import Calibration
 from ..shading import PointLights, flat_image
-from .field import PRODUCT_PENALTY, angle_deg
+from .balls import center_by_slope, guess_circle
+from .contacts import Contact, Press, Touch, depths, middle_px, read_contacts
+from .field import PRODUCT_PENALTY, Family, angle_deg
 from .lights import LOOSE_DEG, LightFit, check_exposure, fit_lights
-from .presses import Contact, Press, center_by_slope, guess_circle, read_contacts
-from .response import FAMILIES, ResponseFit, fit_response
-from .touches import TOUCH_BLUR_PX, Touch, depth_of, fit_touches, moved_by_touches, scale_by_presses, scaled
+from .response import FAMILIES, ResponseFit, fit_response, held_out_deg
+from .touches import TOUCH_BLUR_PX, fit_touches, moved_by_touches, scale_by_presses, scaled
 
 PINNED_DEG = 2.0
 """Point lights are believed beside a sensor's prior only if the image pins each of them this well."""
@@ -34,16 +36,16 @@ FOREIGN_SPREAD = 0.35
 RESPONSE_BLUR_PX = 1.0
 """Blur of a response field at 320 x 240: it takes a third off the error of normals on a GelSight Mini, more takes nothing."""
 
+READING_WORTH = 0.1
+"""Another gamma or blur must lower the held-out error by this part: balls are smooth, and do not show what a wider blur loses."""
 
 PRIOR_FAMILY = ((2, 1),)
 PRIOR_PRODUCT_PENALTY = 40.0
 """Free products fit their own unit better and another worse: with penalties of 10, 40, 100 the second pass is 2.1, 2.2, 2.4 degrees
 off on the presses of the prior's own GelSight Mini, and 3.2, 2.9, 2.8 from the network of a second one."""
 
-
 TIE = 1.05
 """Point lights are preferred to response fields unless these are better by more than this."""
-
 
 HOPELESS_MISFIT = 0.2
 """Relative structure that lights leave unexplained, from which they are no candidate beside another model."""
@@ -94,8 +96,7 @@ def calibrate(
     """
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     check_exposure(background)
-    _check_presses(presses, sensor)
-    named = [touch if isinstance(touch, Touch) else Touch(touch, None, f"touches[{k}]") for k, touch in enumerate(touches)]
+    presses, touches = _named_presses(presses, sensor), _named_touches(touches, sensor)
     by_lights, lights_row, complaint = _by_lights(background, sensor, bool(presses or touches or sensor.prior), progress)
     candidates = [lights_row]
     prior = None if sensor.prior is None else sensor.prior.response
@@ -105,11 +106,16 @@ def calibrate(
         _check_type(background, sensor)
     touched = None
     if touches:
-        prior, touched = _by_touches(background, sensor, presses, named, prior)
-        candidates.append(touched["row"])
+        try:
+            prior, touched = _by_touches(background, sensor, presses, touches, prior)
+            candidates.append(touched["row"])
+        except ValueError as error:
+            if not presses:
+                raise
+            warnings.warn(f"{error}; going on with the presses alone", CalibrationWarning, stacklevel=2)
     if not presses:
         pinned = lights_row["score_deg"] <= PINNED_DEG and lights_row["misfit"] < 0.02
-        if prior is None or (pinned and not touches):
+        if prior is None or (pinned and touched is None):
             if complaint:
                 warnings.warn(complaint, CalibrationWarning, stacklevel=2)
             reason = f"the image pins the lights to {lights_row['score_deg']:.2f} deg" if pinned else lights_row["note"]
@@ -155,8 +161,9 @@ def fit_prior(background: Tensor, sensor: Sensor, presses: Sequence[Press], sour
     """
     bare = sensor.without_prior()
     check_image("background", background, sensor.height, sensor.width, sensor.name)
-    _check_presses(presses, sensor)
-    fit, contacts, unit = _by_presses(background, bare, presses, None, False, PRIOR_FAMILY, PRIOR_PRODUCT_PENALTY)
+    fit, contacts, unit = _by_presses(
+        background, bare, _named_presses(presses, sensor), None, False, PRIOR_FAMILY, PRIOR_PRODUCT_PENALTY
+    )
     _warn_left_out(contacts)
     log_background = fit_log_background(unit.background, sensor.mm_per_pixel)
     return SensorPrior(fit.model, log_background, 0.5 * sensor.width * sensor.mm_per_pixel, source)
@@ -231,19 +238,64 @@ def _by_presses(
     families: tuple[tuple[int, int], ...] = FAMILIES,
     product_penalty: float = PRODUCT_PENALTY,
 ) -> tuple[ResponseFit, list[Contact], Calibration]:
-    gamma = prior.gamma if prior is not None else sensor.exponent
-    blur_px = prior.blur_px if prior is not None else max(sensor.blur_px, RESPONSE_BLUR_PX)
-    chosen = dataclasses.replace(sensor, gamma=gamma, blur_px=blur_px)
+    chosen = _as_read(sensor, prior)
     contacts = _contacts(background, chosen, presses)
-    fit = fit_response(contacts, chosen, prior, blur_px, progress, families, product_penalty)
+    fit = fit_response(contacts, chosen, prior, progress, families, product_penalty)
+    if prior is None and fit.error_deg is not None:
+        open_to = (sensor.gamma is None, sensor.blur_px == 0)
+        fit, chosen = _choose_reading(background, chosen, *open_to, presses, contacts, fit, families, product_penalty)
     return fit, contacts, Calibration.from_response(fit.model, chosen, background)
 
 
-def _contacts(background: Tensor, sensor: Sensor, images: Sequence[Press | Tensor]) -> list[Contact]:
+def _as_read(sensor: Sensor, prior: ResponseModel | None) -> Sensor:
+    """The sensor with the gamma and blur that images are read with: the prior's, or usual ones to start with."""
+    if prior is not None:
+        return dataclasses.replace(sensor, gamma=prior.gamma, blur_px=prior.blur_px)
+    usual_px = RESPONSE_BLUR_PX * max(1.0, min(sensor.height, sensor.width) / 240)
+    return dataclasses.replace(sensor, gamma=sensor.exponent, blur_px=max(sensor.blur_px, usual_px))
+
+
+def _choose_reading(
+    background: Tensor,
+    sensor: Sensor,
+    gamma_open: bool,
+    blur_open: bool,
+    presses: Sequence[Press],
+    contacts: Sequence[Contact],
+    fit: ResponseFit,
+    families: tuple[tuple[int, int], ...],
+    product_penalty: float,
+) -> tuple[ResponseFit, Sensor]:
+    """Whether another gamma or blur makes the first pass of the same family clearly better on held-out presses; if so, that fit.
+
+    The balls stay where they were found: a reading changes a center by less than it was uncertain.
+    """
+    used = [(press, contact) for press, contact in zip(presses, contacts) if not contact.reason]
+    located = [_located(press, contact, sensor) for press, contact in used]
+    readings = [(sensor.exponent, factor * sensor.blur_px) for factor in (0.5, 2.0) if blur_open]
+    readings += [(2.2, sensor.blur_px)] if gamma_open else []
+    least, taken = (1.0 - READING_WORTH) * held_out_deg([contact for _, contact in used], fit.model.fast), None
+    for gamma, blur_px in readings:
+        other = dataclasses.replace(sensor, gamma=gamma, blur_px=blur_px)
+        read = _contacts(background, other, located)
+        score = held_out_deg(read, fit.model.fast)
+        label = f"response, read with gamma {gamma:g} and a blur of {blur_px:g} px"
+        family, numbers = Family.of(fit.model.fast).label(), 2 * fit.model.fast.size()
+        fit.candidates.append({"model": label, "family": family, "numbers": numbers, "score_deg": score, "pass": 1})
+        if score < least:
+            least, taken = score, (other, read)
+    if taken is None:
+        return fit, sensor
+    again = fit_response(taken[1], taken[0], None, False, families, product_penalty)
+    again.candidates = fit.candidates + again.candidates
+    return again, taken[0]
+
+
+def _contacts(background: Tensor, sensor: Sensor, given: Sequence[Press | Touch]) -> list[Contact]:
     """Contacts as the pipeline would see them."""
-    unit = Calibration.from_response(_blank(sensor), sensor, background.double())
+    unit = Calibration.from_response(ResponseModel.blank(sensor.exponent, sensor.blur_px), sensor, background.double())
     compensate, contact = Compensate.from_calibration(unit).double(), ContactMask.from_calibration(unit).double()
-    return read_contacts(images, background, compensate, contact, sensor)
+    return read_contacts(given, background, compensate, contact, sensor)
 
 
 def _by_touches(
@@ -251,11 +303,9 @@ def _by_touches(
 ) -> tuple[ResponseModel, dict[str, Any]]:
     """A model from touches, scaled; and what to tell of it."""
     pitch = sensor.mm_per_pixel
-    gamma = sensor.exponent if prior is None else prior.gamma
-    seen = dataclasses.replace(sensor, gamma=gamma, blur_px=TOUCH_BLUR_PX)
-    contacts = _contacts(background, seen, [touch.image for touch in touches])
-    for touch, contact in zip(touches, contacts):
-        contact.name = touch.name or contact.name
+    sharp = _as_read(sensor, prior)
+    seen = dataclasses.replace(sharp, blur_px=TOUCH_BLUR_PX)
+    contacts = _contacts(background, seen, touches)
     _warn_left_out(contacts)
     told = [{"name": contact.name, "used": not contact.reason, "reason": contact.reason} for contact in contacts]
     used = [contact for contact in contacts if not contact.reason]
@@ -266,8 +316,7 @@ def _by_touches(
         row |= {"family": "the prior, moved", "numbers": 2 * prior.fast.size(), "note": f"the prior, moved by {len(used)} touches"}
         return moved_by_touches(prior, used), {"row": row, "touches": told}
     fit = fit_touches(used, 0.5 * sensor.width * pitch, pitch)
-    depths = [(touch.depth_mm, c) for touch, c in zip(touches, contacts) if touch.depth_mm is not None and not c.reason]
-    sharp = dataclasses.replace(seen, blur_px=max(sensor.blur_px, RESPONSE_BLUR_PX))
+    told_depth = [(touch.depth_mm, c) for touch, c in zip(touches, contacts) if touch.depth_mm is not None and not c.reason]
     balls = [contact for contact in _contacts(background, sharp, presses) if not contact.reason]
     for ball in balls:
         if not ball.known:
@@ -275,9 +324,10 @@ def _by_touches(
     balls = [ball for ball in balls if not ball.reason]
     if balls:
         scale, by = scale_by_presses(fit.field, balls, pitch), f"{len(balls)} presses"
-    elif depths:
-        ratios = [known / max(float(depth_of(contact, fit.field, pitch).max()), 1e-9) for known, contact in depths]
-        scale, by = sorted(ratios)[len(ratios) // 2], f"{len(depths)} known depths"
+    elif told_depth:
+        deepest = [float(depth.max()) for depth in depths([contact for _, contact in told_depth], fit.field, pitch)]
+        ratios = [known / max(found, 1e-9) for (known, _), found in zip(told_depth, deepest)]
+        scale, by = statistics.median(ratios), f"{len(ratios)} known depths"
     else:
         raise ValueError(
             "touches: expected something that tells their scale, got only touches: add a press of a ball of known diameter, "
@@ -290,14 +340,28 @@ def _by_touches(
     row |= {"family": f"linear {fit.field.degree}", "numbers": numbers, "note": note, "tried": fit.tried}
     field = scaled(fit.field, scale)
     precise = field.lifted(field.degree, field.product_degree, True)  # touches tell nothing of depth
-    return ResponseModel(field, precise, gamma, sharp.blur_px), {"row": row, "touches": told}
+    return ResponseModel(field, precise, sharp.exponent, sharp.blur_px), {"row": row, "touches": told}
 
 
-def _check_presses(presses: Sequence[Press], sensor: Sensor) -> None:
+def _named_presses(presses: Sequence[Press], sensor: Sensor) -> list[Press]:
+    """The presses, each with a name; checked."""
+    named = []
     for k, press in enumerate(presses):
         if not isinstance(press, Press):
             raise TypeError(f"presses[{k}]: expected a Press, got {type(press).__name__}: Press(image, ball_diameter_mm)")
-        check_image(f"{press.name or f'presses[{k}]'}: image", press.image, sensor.height, sensor.width, sensor.name)
+        named.append(press if press.name else dataclasses.replace(press, name=f"presses[{k}]"))
+        check_image(f"{named[k].name}: image", press.image, sensor.height, sensor.width, sensor.name)
+    return named
+
+
+def _named_touches(touches: Sequence[Touch | Tensor], sensor: Sensor) -> list[Touch]:
+    """The touches, each with a name; checked."""
+    named = []
+    for k, given in enumerate(touches):
+        touch = given if isinstance(given, Touch) else Touch(given)
+        named.append(touch if touch.name else dataclasses.replace(touch, name=f"touches[{k}]"))
+        check_image(f"{named[k].name}: image", touch.image, sensor.height, sensor.width, sensor.name)
+    return named
 
 
 def _warn_left_out(contacts: Sequence[Contact]) -> None:
@@ -306,9 +370,10 @@ def _warn_left_out(contacts: Sequence[Contact]) -> None:
             warnings.warn(f"{contact.name}: left out: {contact.reason}", CalibrationWarning, stacklevel=4)
 
 
-def _blank(sensor: Sensor) -> ResponseModel:
-    rest = ResponseField(0, -1, False, 1.0, ((0.0,) * 3, (0.0,) * 3))
-    return ResponseModel(rest, None, sensor.exponent, sensor.blur_px)
+def _located(press: Press, contact: Contact, sensor: Sensor) -> Press:
+    """The press with the ball where it was found."""
+    x, y = (contact.center_mm / sensor.mm_per_pixel + middle_px(sensor)).tolist()
+    return dataclasses.replace(press, center_px=(x, y), contact_radius_px=contact.contact_radius_mm / sensor.mm_per_pixel)
 
 
 def _lights_error(calibration: Calibration, presses: Sequence[Press], contacts: Sequence[Contact], blur_px: float) -> float:
@@ -341,8 +406,7 @@ def _tell(contact: Contact, sensor: Sensor) -> dict[str, Any]:
     """A press's line in the report."""
     told = {"name": contact.name, "used": not contact.reason, "reason": contact.reason} | contact.figures
     if contact.contact_radius_mm > 0:
-        middle = ((sensor.width - 1) / 2, (sensor.height - 1) / 2)
-        told["center_px"] = [float(c) / sensor.mm_per_pixel + m for c, m in zip(contact.center_mm, middle)]
+        told["center_px"] = (contact.center_mm / sensor.mm_per_pixel + middle_px(sensor)).tolist()
         told["contact_radius_px"] = contact.contact_radius_mm / sensor.mm_per_pixel
     return told
 

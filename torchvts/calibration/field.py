@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..core.response import ResponseField, term_degrees, term_degrees_by_term, term_values
-from .presses import Contact
+from .contacts import Contact
 
 CURL_WEIGHT = 3.0
 SKIRT_WEIGHT = 0.3
@@ -106,9 +106,8 @@ class ContactForms:
         Around the present center the ball's slope is -(x - c) / down, so a shift of the center by d adds d / down.
         """
         inside = self.contact.inside()
-        r = self.contact.polar()[2][inside]
-        lean = 1.0 / (self.contact.radius_mm**2 - r * r).clamp_min((0.3 * self.contact.radius_mm) ** 2).sqrt()
-        count = max(1, len(r))
+        lean = 1.0 / self.contact.down()[inside]
+        count = max(1, len(lean))
         coupling = -(self.terms[:, inside] * lean).sum(1) / count
         weight = lean.square().sum().clamp_min(1e-12) / count
         own = -(self.contact.ball_slope()[:, inside] * lean).sum(1) / count

@@ -13,8 +13,9 @@ from ..core.geometry import gradient_from_normal
 from ..core.response import ResponseField, ResponseModel
 from ..core.sensor import Sensor
 from ..normals import NormalFromResponse
+from .balls import center_by_slope, guess_circle, update_radius
+from .contacts import LEAST_INSIDE, Contact, depths
 from .field import PRODUCT_PENALTY, ContactForms, Family, solve, solve_with_centers
-from .presses import LEAST_INSIDE, Contact, add_depth, center_by_slope, guess_circle, update_radius
 
 FAMILIES = ((0, -1), (1, -1), (2, -1), (2, 1), (3, 2), (3, 3))
 """Degrees of candidates, linear terms and products, the smallest first."""
@@ -44,7 +45,6 @@ def fit_response(
     contacts: list[Contact],
     sensor: Sensor,
     prior: ResponseModel | None,
-    blur_px: float,
     progress: bool = False,
     families: tuple[tuple[int, int], ...] = FAMILIES,
     product_penalty: float = PRODUCT_PENALTY,
@@ -53,9 +53,8 @@ def fit_response(
 
     Args:
         contacts: from :func:`read_contacts`, with balls; located, judged and told of in place.
-        sensor: the sensor, whose gamma the contacts were read with.
+        sensor: the sensor, whose gamma and blur the contacts were read with.
         prior: fields of the sensor's type, or None.
-        blur_px: that the contacts were read with.
         progress: show a bar.
         families: degrees to choose from, linear terms and products, the smallest first.
         product_penalty: how much dearer coefficients of products are.
@@ -77,8 +76,8 @@ def fit_response(
         bar.update()
         bar.set_postfix(step="one pass")
         fast, fast_rows, fast_index = _choose(used, options, False, None if prior is None else prior.fast)
-        for contact in used:
-            add_depth(contact, fast, pitch)
+        for contact, depth in zip(used, depths(used, fast, pitch)):
+            contact.depth_mm = depth
         bar.update()
         bar.set_postfix(step="second pass")
         given = None if prior is None else prior.precise or fast.lifted(fast.degree, fast.product_degree, True)
@@ -94,7 +93,14 @@ def fit_response(
         f"the smallest within {WORTH:.0%} of the best of {len(rows)} candidates, {score or 0.0:.2f} deg on each press by the others"
     )
     reason = f"{chosen}, from {count} presses: {'too few to choose by holding some out' if score is None else how}"
-    return ResponseFit(ResponseModel(fast, deep, sensor.exponent, blur_px), score, rows, reason)
+    return ResponseFit(ResponseModel(fast, deep, sensor.exponent, sensor.blur_px), score, rows, reason)
+
+
+def held_out_deg(contacts: list[Contact], like: ResponseField) -> float:
+    """Mean angle on each press by a field of that family that the others give, degrees."""
+    family = Family.of(like)
+    evidence = _Evidence(family, contacts)
+    return evidence.mean_error(evidence.held_out(OWN_PENALTIES[1] * family.penalty(), None))
 
 
 def locate(contacts: list[Contact], pitch_mm: float, sensor: Sensor, prior: ResponseModel | None, half_mm: float) -> None:
@@ -104,9 +110,7 @@ def locate(contacts: list[Contact], pitch_mm: float, sensor: Sensor, prior: Resp
             guess_circle(contact, sensor)
     usable = [contact for contact in contacts if not contact.reason]
     if prior is not None:
-        for contact in usable:
-            add_depth(contact, prior.fast, pitch_mm)
-            slopes = slope_map(contact, prior, pitch_mm)
+        for contact, slopes in zip(usable, slope_maps(usable, prior, pitch_mm)):
             if not contact.known:
                 center_by_slope(contact, slopes, pitch_mm)
             for _ in range(6):
@@ -127,28 +131,34 @@ def _locate_jointly(contacts: list[Contact], pitch_mm: float, half_mm: float) ->
     most = 1 if len(contacts) < 4 else 2 if len(contacts) < 10 else 3
     stages = [(0, -1, False, 3), (1, -1, False, 3), (2, -1, False, 6), (3, 2, False, 4), (3, 2, True, 4)]
     anchors = None
+    fast: ResponseField | None = None
     for degree, products, uses_depth, rounds in [stage for stage in stages if stage[0] <= most]:
         family = Family(degree, products, uses_depth, half_mm)
         if products >= 0 and anchors is None:
             anchors = [contact.center_mm.clone() for contact in contacts]
+        if uses_depth and fast is not None:
+            for contact, depth in zip(contacts, depths(contacts, fast, pitch_mm)):
+                contact.depth_mm = depth
         forms = [ContactForms(family, contact) for contact in contacts]
         coefficient = torch.zeros(family.size(), dtype=torch.float64)
         for _ in range(rounds):
             coefficient = solve_with_centers(forms, 0.01 * family.penalty(), anchors, 0.3)
             for item in forms:
                 update_radius(item.contact, item.slope(coefficient), pitch_mm)
-        if not uses_depth:
-            for contact in contacts:
-                add_depth(contact, family.field(coefficient), pitch_mm)
+        fast = family.field(coefficient)
 
 
-def slope_map(contact: Contact, model: ResponseModel, pitch_mm: float) -> Tensor:
-    """(2, H, W): slopes of the model's last pass; the contact has the depth of the first."""
-    height, width = contact.mask.shape
+def slope_maps(contacts: list[Contact], model: ResponseModel, pitch_mm: float) -> list[Tensor]:
+    """(2, H, W) each: slopes of the model's last pass."""
+    if not contacts:
+        return []
+    height, width = contacts[0].mask.shape
     normals = NormalFromResponse(model.fast, model.precise, height, width, pitch_mm, dtype=torch.float64)
-    image = 1.0 + contact.change[None]
-    normal = normals(image) if model.precise is None else normals(image, contact.depth_mm[None, None])
-    return gradient_from_normal(normal)[0]
+    images = [1.0 + contact.change[None] for contact in contacts]
+    if model.precise is None:
+        return [gradient_from_normal(normals(image))[0] for image in images]
+    first = depths(contacts, model.fast, pitch_mm)
+    return [gradient_from_normal(normals(image, depth[None, None]))[0] for image, depth in zip(images, first)]
 
 
 def leave_out(contacts: list[Contact], prior: ResponseModel | None, half_mm: float) -> None:
@@ -173,13 +183,8 @@ def leave_out(contacts: list[Contact], prior: ResponseModel | None, half_mm: flo
         worst = int(log_gain.abs().argmax())
         if float(log_gain.abs()[worst]) > math.log(1.5):
             seen = 2 * used[worst].radius_mm / max(float(gains[worst]), 1e-3)
-            judge = (
-                "the sensor's prior"
-                if prior is not None
-                else "the other press"
-                if len(used) == 2
-                else f"the other {len(used) - 1} presses"
-            )
+            others = "the other press" if len(used) == 2 else f"the other {len(used) - 1} presses"
+            judge = others if prior is None else "the sensor's prior"
             used[worst].reason = f"by {judge} the ball seems {seen:.2f} mm wide, but {2 * used[worst].radius_mm:g} mm was given"
             if prior is None and len(used) == 2:
                 used[1 - worst].reason = "contradicts the only other press: one of the two diameters is wrong"

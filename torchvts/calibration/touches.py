@@ -10,13 +10,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..core.checks import check_positive
-from ..core.geometry import gradient_from_normal
 from ..core.response import ResponseField, ResponseModel
-from ..integration import poisson_rest
-from ..normals import NormalFromResponse
+from .balls import update_radius
+from .contacts import Contact, depths
 from .field import Family, curl_form, solve
-from .presses import Contact, update_radius
 
 TOUCH_BLUR_PX = 3.0
 """Blur of touches at 320 x 240: the curl is a derivative, and noise in it pulls the field towards smooth channels."""
@@ -26,28 +23,6 @@ LEAST_GAP = 4.0
 
 LEAST_SPREAD = 0.05
 """Mean squared slope across over along: below it the touches say nothing of one of the two slopes."""
-
-
-@dataclass(frozen=True, eq=False)
-class Touch:
-    """An image of any object pressed into the skin.
-
-    Args:
-        image: (3, H, W) in [0, 1], R, G, B, of the unit to calibrate.
-        depth_mm: deepest indentation, mm, if it is known, as from a stage; else None.
-        name: used in messages.
-    Example:
-        >>> Touch(torch.zeros(3, 240, 320)).depth_mm is None
-        True
-    """
-
-    image: Tensor
-    depth_mm: float | None = None
-    name: str = ""
-
-    def __post_init__(self) -> None:
-        if self.depth_mm is not None:
-            check_positive("depth_mm", self.depth_mm, 100.0)
 
 
 @dataclass(frozen=True)
@@ -85,7 +60,7 @@ def fit_touches(contacts: list[Contact], half_mm: float, pitch_mm: float) -> Tou
         )
     family, solution, gap = best
     field = family.field(solution)
-    inward = sum(float(depth_of(contact, field, pitch_mm)[contact.mask].sum()) for contact in contacts)
+    inward = sum(float(depth[contact.mask].sum()) for contact, depth in zip(contacts, depths(contacts, field, pitch_mm)))
     if inward < 0:
         field = family.field(-solution)
     return TouchFit(field, gap, tried)
@@ -114,13 +89,6 @@ def _smallest_eigenvector(family: Family, contacts: list[Contact]) -> tuple[Tens
     return whiten.t() @ vectors[:, 0], float(values[1] / values[0].clamp_min(1e-30))
 
 
-def depth_of(contact: Contact, field: ResponseField, pitch_mm: float) -> Tensor:
-    """(H, W) depth, mm, that a field without depth leads to."""
-    height, width = contact.mask.shape
-    normals = NormalFromResponse(field, None, height, width, pitch_mm, dtype=torch.float64)
-    return poisson_rest(gradient_from_normal(normals(1.0 + contact.change[None])) * contact.mask, pitch_mm)[0, 0]
-
-
 def scaled(field: ResponseField, scale: float) -> ResponseField:
     """The field times a number."""
     rows = tuple(tuple(scale * number for number in row) for row in field.coefficient)
@@ -136,26 +104,25 @@ def scale_by_presses(field: ResponseField, presses: list[Contact], pitch_mm: flo
     slopes = [field.tensor() @ family.terms(press) for press in presses]
     scale = 0.0
     for _ in range(rounds):
-        matrix, right = torch.zeros(1, 1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
+        product = square = 0.0
         parts = []
         for press, slope in zip(presses, slopes):
             inside = press.inside()
-            r = press.polar()[2][inside]
-            lean = 1.0 / (press.radius_mm**2 - r * r).clamp_min((0.3 * press.radius_mm) ** 2).sqrt()
+            lean = 1.0 / press.down()[inside]
             found, ball = slope[:, inside], press.ball_slope()[:, inside]
-            # eliminate the shift: project found and ball off the lean
+            # eliminate the shift: project found off the lean
             across = lean / lean.square().sum().sqrt()
             free = found - (found @ across)[:, None] * across
-            matrix += free.square().sum() / free.shape[1]
-            right += (free * ball).sum() / free.shape[1]
+            product += float((free * ball).sum()) / free.shape[1]
+            square += float(free.square().sum()) / free.shape[1]
             parts.append((found, ball, lean))
-        scale = float(right[0] / matrix[0, 0].clamp_min(1e-30))
+        scale = product / max(square, 1e-30)
         for press, slope, (found, ball, lean) in zip(presses, slopes, parts):
             if not press.known:
                 shift = ((scale * found - ball) * lean).sum(1) / lean.square().sum()
                 limit = 0.25 * press.radius_mm
                 press.center_mm = press.center_mm + shift.clamp(-limit, limit)
-                update_radius(press, scale * slope, pitch_mm)
+            update_radius(press, scale * slope, pitch_mm)
     return scale
 
 

@@ -4,12 +4,16 @@ Checks of shape and dtype are TorchScript and may stand in a ``forward``. Checks
 calibration and the door of the pipeline: on a GPU they would wait for the device.
 """
 
+import dataclasses
 import math
 import numbers
 from collections.abc import Sequence
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+
+_Record = TypeVar("_Record")
 
 QUANTISATION_STD = 1.0 / 255.0 / math.sqrt(12.0)
 """Noise of rounding to 8 bits, the least that a camera image has."""
@@ -108,3 +112,25 @@ def check_numbers(name: str, value: object, shape: Sequence[int]) -> tuple[float
     if not bool(torch.isfinite(tensor).all()):
         raise ValueError(f"{name}: expected finite numbers, got {value!r}")
     return tuple(tensor.flatten().tolist())
+
+
+def from_dict(cls: type[_Record], values: object, source: str) -> _Record:
+    """Make a dataclass of keys and values that came from a file; errors name ``source`` and the key.
+
+    Raises:
+        ValueError: not keys and values, a key that is unknown or missing, or a value that the class refuses.
+    """
+    if not isinstance(values, dict):
+        raise ValueError(f"{source}: expected keys and values, got {type(values).__name__}")
+    fields: tuple[dataclasses.Field[Any], ...] = dataclasses.fields(cls)  # type: ignore[arg-type]
+    known = [field.name for field in fields]
+    for key in values:
+        if key not in known:
+            raise ValueError(f"{source}: key {key!r}: unknown; expected {', '.join(known)}")
+    for field in fields:
+        if field.default is dataclasses.MISSING and field.name not in values:
+            raise ValueError(f"{source}: key {field.name!r}: missing")
+    try:
+        return cls(**values)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{source}: key {error}") from error

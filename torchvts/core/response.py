@@ -4,15 +4,13 @@ import dataclasses
 import math
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from .checks import check_integer, check_numbers, check_positive
+from .checks import check_integer, check_numbers, check_positive, from_dict
 from .geometry import pixel_grid_mm
-
-_Known = TypeVar("_Known", "ResponseField", "ResponseModel", "SensorPrior")
 
 CHANGE_SCALE = 0.3
 """Relative change of intensity that counts as one; with it and depth in mm the inputs are of order one."""
@@ -109,7 +107,7 @@ class ResponseField:
     @classmethod
     def from_dict(cls, values: Any, source: str) -> "ResponseField":
         """Read what :meth:`to_dict` gave; ``source`` names it in errors."""
-        return _from_dict(cls, values, source)
+        return from_dict(cls, values, source)
 
 
 @dataclass(frozen=True)
@@ -137,6 +135,11 @@ class ResponseModel:
             check_positive("blur_px", self.blur_px)
         object.__setattr__(self, "blur_px", float(self.blur_px))
 
+    @classmethod
+    def blank(cls, gamma: float = 1.0, blur_px: float = 1.0) -> "ResponseModel":
+        """A model that says flat of everything: what an image is read with before there is another."""
+        return cls(ResponseField(0, -1, False, 1.0, ((0.0,) * 3, (0.0,) * 3)), None, gamma, blur_px)
+
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers."""
         precise = None if self.precise is None else self.precise.to_dict()
@@ -151,7 +154,7 @@ class ResponseModel:
         for name in ("fast", "precise"):
             if values.get(name) is not None:
                 values[name] = ResponseField.from_dict(values[name], f"{source}: {name}")
-        return _from_dict(cls, values, source)
+        return from_dict(cls, values, source)
 
 
 @dataclass(frozen=True)
@@ -196,7 +199,7 @@ class SensorPrior:
         """Read what :meth:`to_dict` gave; ``source`` names it in errors."""
         if isinstance(values, dict) and "response" in values:
             values = values | {"response": ResponseModel.from_dict(values["response"], f"{source}: response")}
-        return _from_dict(cls, values, source)
+        return from_dict(cls, values, source)
 
 
 def fit_log_background(background: Tensor, mm_per_pixel: float) -> tuple[tuple[float, ...], ...]:
@@ -249,19 +252,3 @@ def term_values(
         value = math.prod([inputs[k] for k in term[1:]], start=inputs[term[0]])
         rows.append(value * bases[degree if len(term) == 1 else product_degree])
     return torch.cat(rows)
-
-
-def _from_dict(cls: type[_Known], values: Any, source: str) -> _Known:
-    if not isinstance(values, dict):
-        raise ValueError(f"{source}: expected keys and values, got {type(values).__name__}")
-    known = [field.name for field in dataclasses.fields(cls)]
-    for key in values:
-        if key not in known:
-            raise ValueError(f"{source}: key {key!r}: unknown; expected {', '.join(known)}")
-    for field in dataclasses.fields(cls):
-        if field.default is dataclasses.MISSING and field.name not in values:
-            raise ValueError(f"{source}: key {field.name!r}: missing")
-    try:
-        return cls(**values)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{source}: key {error}") from error

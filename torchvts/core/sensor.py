@@ -11,7 +11,7 @@ import torch
 import yaml
 from torch import Tensor
 
-from .checks import check_batch, check_integer, check_numbers, check_positive
+from .checks import check_batch, check_integer, check_numbers, check_positive, from_dict
 from .files import write_atomically
 from .response import SensorPrior
 
@@ -186,19 +186,7 @@ class Sensor:
     @classmethod
     def from_dict(cls, values: Any, source: str) -> "Sensor":
         """Build a sensor from a mapping; ``source`` names it in errors."""
-        if not isinstance(values, dict):
-            raise ValueError(f"{source}: expected keys and values of a sensor, got {type(values).__name__}")
-        known = [field.name for field in dataclasses.fields(cls)]
-        for key in values:
-            if key not in known:
-                raise ValueError(f"{source}: key {key!r}: unknown; a sensor knows {', '.join(known)}")
-        for field in dataclasses.fields(cls):
-            if field.default is dataclasses.MISSING and field.name not in values:
-                raise ValueError(f"{source}: key {field.name!r}: missing")
-        try:
-            return cls(**values)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{source}: key {error}") from error
+        return from_dict(cls, values, source)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain lists and numbers, defaults left out; :meth:`from_dict` reads it back."""

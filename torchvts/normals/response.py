@@ -1,5 +1,7 @@
 """Normals by a response field."""
 
+import copy
+
 import torch
 from torch import Tensor, nn
 
@@ -84,11 +86,9 @@ class NormalFromResponse(nn.Module):
 
     def coarse(self, stride: int) -> "NormalFromResponse":
         """The same for an image of every ``stride``-th pixel."""
-        rest = ResponseField(0, -1, False, 1.0, ((0, 0, 0), (0, 0, 0)))
-        other = NormalFromResponse(rest, None, 8, 8, 1.0, self.max_slope, self.fast_maps.dtype)
-        other.uses_depth = self.uses_depth
-        other.fast_maps = self.fast_maps[..., stride // 2 :: stride, stride // 2 :: stride].clone()
-        other.precise_maps = self.precise_maps[..., stride // 2 :: stride, stride // 2 :: stride].clone()
+        other = copy.deepcopy(self)
+        for name in ("fast_maps", "precise_maps"):
+            setattr(other, name, getattr(other, name)[..., stride // 2 :: stride, stride // 2 :: stride].clone())
         return other
 
 

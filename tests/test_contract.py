@@ -196,7 +196,7 @@ def test_blocks_chain_by_hand_in_sequential():
     whole, example = build("DepthPipeline fast")
     normals = nn.Sequential(whole.compensate, whole.normals, whole.gradient)(example)
     depth = whole.integrate(normals * whole.contact(whole.compensate(example)))
-    assert_same(depth, whole(example).depth_mm)
+    assert_same(depth, whole(example).depth_mm, 1e-6)  # the pipeline sees normals in a window only
 
 
 @every_block

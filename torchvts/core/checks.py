@@ -49,6 +49,28 @@ def check_same_size(name: str, tensor: Tensor, other_name: str, height: int, wid
         )
 
 
+def may_read_values() -> bool:
+    """Whether Python may decide by the values of tensors: always, but while torch.export traces. Scripts."""
+    if torch.jit.is_scripting():  # type: ignore[attr-defined]
+        return True
+    else:  # noqa: RET505, TorchScript leaves out the other branch only so
+        return not torch.compiler.is_exporting()
+
+
+def check_window(name: str, tensor: Tensor, size: tuple[int, int], window: tuple[int, int] | None) -> tuple[int, int]:
+    """(top, left) of the part of an image of ``size`` that ``tensor`` is; without a window it must be all of it. Scripts."""
+    if window is None:
+        check_same_size(name, tensor, "the calibration", size[0], size[1])
+        return 0, 0
+    top, left = window
+    rows, columns = tensor.shape[-2], tensor.shape[-1]
+    if top < 0 or left < 0 or top + rows > size[0] or left + columns > size[1]:
+        raise ValueError(
+            f"{name}, window: expected a part of {size[0]} x {size[1]}, got {rows} x {columns} at row {top}, column {left}"
+        )
+    return top, left
+
+
 def check_image(name: str, image: Tensor, height: int, width: int, sensor_name: str) -> None:
     """Raise unless ``image`` is one finite (3, ``height``, ``width``) image in [0, 1]."""
     if not isinstance(image, Tensor):

@@ -71,47 +71,56 @@ def fft_is_fast(length: int) -> bool:
     return length == 1
 
 
-def cosine_twiddles(height: int, width: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    r"""Tables for a two-dimensional DCT-II by one real FFT.
+def cosine_tables(height: int, width: int) -> list[Tensor]:
+    r"""Tables for solving with the cosine family by one real FFT there and one back.
 
-    With v the lines reordered by :func:`interleave`, A its FFT and w = exp(-i pi k / 2n), the complex array
-    E = w_x (w_y A(k_y) + conj(w_y) A(-k_y)) holds every coefficient: C(k_y, k_x) = Re E / 2 and
+    With v the lines reordered by :func:`reordering`, A its FFT and w = exp(-i pi k / 2n), the complex array
+    E(k_y) = w_x (w_y A(k_y) + conj(w_y) A(-k_y)) holds every coefficient: C(k_y, k_x) = Re E / 2 and
     C(k_y, n_x - k_x) = -Im E / 2. Back, A = conj(w_y w_x) (E(k_y) - i E(n_y - k_y)) / 2, where E(n_y) counts as zero.
 
+    The rows k_y and n_y - k_y meet only each other. With U = w_x w_y A(k_y) and V = w_x conj(w_y) A(-k_y) they are U + V and
+    i (U - V), so a solver forms sum and difference, scales their parts, and goes back; only half the rows are looped over.
+
     Returns:
-        what multiplies A(k_y) and A(-k_y), what multiplies E(k_y) and E(n_y - k_y), each (H, W // 2 + 1) complex128; and the
-        second difference's eigenvalues at (k_y, k_x) and (k_y, n_x - k_x).
+        w_x w_y and w_x conj(w_y), and their conjugates halved, (2, H // 2 + 1, W // 2 + 1) complex128; the second difference's
+        inverse eigenvalues for the sum and for the difference, (H // 2 + 1, W // 2 + 1, 2) for real and imaginary part; the
+        rows A(k_y), then A(-k_y).
     Source:
-        Makhoul, A fast cosine transform in one and two dimensions, IEEE Trans. ASSP 28(1), 1980.
+        Makhoul, A fast cosine transform in one and two dimensions, IEEE Trans. ASSP 28(1), 1980; the pairing is this project's.
     """
-    k_y = torch.arange(height, dtype=torch.float64)[:, None]
+    k_y = torch.arange(height // 2 + 1, dtype=torch.float64)[:, None]
     k_x = torch.arange(width // 2 + 1, dtype=torch.float64)[None, :]
     turn_y, turn_x = -0.5 * math.pi / height * k_y, -0.5 * math.pi / width * k_x
     one = torch.ones_like(turn_y + turn_x)
-    forward, flipped = torch.polar(one, turn_y + turn_x), torch.polar(one, turn_x - turn_y)
-    back = torch.polar(0.5 * one, -turn_y - turn_x)
-    back_flipped = torch.polar(0.5 * one, -turn_y - turn_x - 0.5 * math.pi)
-    back_flipped[0] = 0.0
-    value_y = -4.0 * torch.sin(turn_y).square()
-    value, value_flipped = value_y - 4.0 * torch.sin(turn_x).square(), value_y - 4.0 * torch.cos(turn_x).square()
-    return forward, flipped, back, back_flipped, value, value_flipped
+    there = torch.stack((torch.polar(one, turn_x + turn_y), torch.polar(one, turn_x - turn_y)))
+    back = torch.stack((torch.polar(0.5 * one, -turn_x - turn_y), torch.polar(0.5 * one, turn_y - turn_x)))
+    low_y, low_x = -4.0 * torch.sin(turn_y).square(), -4.0 * torch.sin(turn_x).square()  # eigenvalues at k
+    high_y, high_x = -4.0 * torch.cos(turn_y).square(), -4.0 * torch.cos(turn_x).square()  # and at n - k
+    of_sum = torch.stack((low_y + low_x, low_y + high_x), dim=-1)
+    of_difference = torch.stack((high_y + high_x, high_y + low_x), dim=-1)
+    rows = torch.arange(height // 2 + 1)
+    return [there, back, inverse_or_zero(of_sum), inverse_or_zero(of_difference), torch.cat((rows, (-rows) % height))]
 
 
-def interleave(lines: Tensor, dim: int) -> Tensor:
-    """Even places first, then the odd ones backwards."""
-    even, odd = (lines[..., ::2, :], lines[..., 1::2, :]) if dim == -2 else (lines[..., ::2], lines[..., 1::2])
-    return torch.cat((even, odd.flip(dim)), dim=dim)
+def inverse_or_zero(values: Tensor) -> Tensor:
+    """1 / values, and 0 where they are 0: of a solver's eigenvalues only the constant's, whose coefficient, the mean, becomes 0."""
+    return torch.where(values == 0.0, torch.zeros_like(values), 1.0 / values)
 
 
-def deinterleave(lines: Tensor, dim: int) -> Tensor:
+def reordering(length: int) -> Tensor:
+    """Where each element of a line goes before the FFT: even places first, then the odd ones backwards; (length,) int64."""
+    place = torch.arange(length)
+    return torch.where(place % 2 == 0, place // 2, length - 1 - place // 2)
+
+
+def interleave(lines: Tensor) -> Tensor:
+    """Rows reordered by :func:`reordering`."""
+    return torch.cat((lines[..., ::2], lines[..., 1::2].flip(-1)), dim=-1)
+
+
+def deinterleave(lines: Tensor) -> Tensor:
     """The inverse of :func:`interleave`."""
-    n = lines.shape[dim]
+    n = lines.shape[-1]
     half = (n + 1) // 2
-    even, odd = lines.narrow(dim, 0, half), lines.narrow(dim, n - half, half).flip(dim)  # of odd length: one too many, last
-    pairs = torch.stack((even, odd), dim=-2).flatten(-3, -2) if dim == -2 else torch.stack((even, odd), dim=-1).flatten(-2)
-    return pairs.narrow(dim, 0, n)
-
-
-def mirror_rows(array: Tensor) -> Tensor:
-    """Row 0, then the others backwards: row -k, modulo the height."""
-    return array.roll(-1, dims=[-2]).flip(-2)
+    even, odd = lines.narrow(-1, 0, half), lines.narrow(-1, n - half, half).flip(-1)  # of odd length: one too many, last
+    return torch.stack((even, odd), dim=-1).flatten(-2).narrow(-1, 0, n)

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import QUANTISATION_STD, check_batch, check_same_size
+from ..core.checks import QUANTISATION_STD, check_batch, check_window
 from ..core.geometry import gradient_from_normal, normal_from_gradient
 from ..record import Calibration
 from ..shading import PointLights, flat_image, gloss_lobe, inverse_light_matrix, light_matrix
@@ -58,7 +58,8 @@ class NormalFromIntensity(nn.Module):
 
     Without depth, the stored inverse of the light matrix at rest (eq. 9); with depth, the inverse at that depth (eq. 10).
     Where a light is blocked (its channel below three times its noise) or a channel is full, :func:`slope_by_lit_lights` decides.
-    While gradients are recorded for the lights (``requires_grad_(True)``), the matrix is built from them at every call.
+    While gradients are recorded for the lights (``requires_grad_(True)``), the matrix is built from them at every call. Given
+    ``window`` (top, left), the image is the part of the calibrated one whose first pixel is there.
 
     Args:
         lights: the three lights. height, width: pixels. mm_per_pixel: pixel pitch, mm.
@@ -74,6 +75,7 @@ class NormalFromIntensity(nn.Module):
     """
 
     uses_depth: bool = True
+    takes_window: bool = True
     inverse: Tensor
     dark_below: Tensor
     dark_where: Tensor
@@ -125,14 +127,21 @@ class NormalFromIntensity(nn.Module):
             full_above=(0.995**sensor.exponent) * full,
         )
 
-    def forward(self, compensated: Tensor, depth_mm: Tensor | None = None) -> Tensor:
+    def forward(self, compensated: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
         check_batch("compensated", compensated, 3)
-        check_same_size("compensated", compensated, "the calibration", self.inverse.shape[2], self.inverse.shape[3])
-        position, albedo = self.lights.position_mm, self.lights.albedo
+        height, width = self.inverse.shape[2], self.inverse.shape[3]
+        top, left = check_window("compensated", compensated, (height, width), window)
+        bottom, right = top + compensated.shape[2], left + compensated.shape[3]
+        position: Tensor = self.lights.position_mm
+        albedo = self.lights.albedo
+        if bottom - top < height or right - left < width:  # the lights as seen from the window's middle
+            x = 0.5 * (left + right - width) * self.mm_per_pixel
+            y = 0.5 * (top + bottom - height) * self.mm_per_pixel
+            position = torch.cat((position[:, 0:1] - x, position[:, 1:2] - y, position[:, 2:3]), dim=1)
         if self.lights.glossy:
-            compensated = self._matt(compensated, depth_mm)
+            compensated = self._matt(compensated, depth_mm, position)
         live = torch.is_grad_enabled() and (position.requires_grad or albedo.requires_grad)
-        inverse = self.inverse[None]
+        inverse = self.inverse[None, :, :, top:bottom, left:right]
         if depth_mm is not None:
             inverse = inverse_light_matrix(depth_mm, position, albedo, self.mm_per_pixel)
         elif live:
@@ -142,13 +151,14 @@ class NormalFromIntensity(nn.Module):
         normal = torch.addcmul(normal, inverse[:, :, 2], compensated[:, 2:3])
         n_x, n_y, n_z = normal[:, 0:1], normal[:, 1:2], normal[:, 2:3]
         normal = normal * torch.rsqrt(torch.addcmul(torch.addcmul(n_x * n_x, n_y, n_y), n_z, n_z) + 1e-24)
-        return self._relight(normal, compensated, depth_mm, position, albedo)
+        dark = self.dark_where[:, top:bottom, left:right]
+        return self._relight(normal, compensated, depth_mm, position, albedo, dark, self.full_above[:, top:bottom, left:right])
 
-    def _matt(self, compensated: Tensor, depth_mm: Tensor | None) -> Tensor:
+    def _matt(self, compensated: Tensor, depth_mm: Tensor | None, position: Tensor) -> Tensor:
         """What a matt skin would show: the specular lobe divided out, at the slope of the depth so far."""
         depth = compensated.new_zeros(1, 1, compensated.shape[2], compensated.shape[3]) if depth_mm is None else depth_mm
         normal = normal_from_gradient(_slope_of_depth(depth, self.mm_per_pixel))
-        matrix = light_matrix(depth, self.lights.position_mm, self.lights.albedo, self.mm_per_pixel)
+        matrix = light_matrix(depth, position, self.lights.albedo, self.mm_per_pixel)
         return compensated / (1.0 + self.lights.gloss.reshape(1, 3, 1, 1) * gloss_lobe(matrix, normal))
 
     def coarse(self, stride: int) -> "NormalFromIntensity":
@@ -166,9 +176,18 @@ class NormalFromIntensity(nn.Module):
         coarse.lights = self.lights  # one set of parameters
         return coarse
 
-    def _relight(self, normal: Tensor, compensated: Tensor, depth_mm: Tensor | None, position: Tensor, albedo: Tensor) -> Tensor:
+    def _relight(
+        self,
+        normal: Tensor,
+        compensated: Tensor,
+        depth_mm: Tensor | None,
+        position: Tensor,
+        albedo: Tensor,
+        dark_where: Tensor,
+        full_above: Tensor,
+    ) -> Tensor:
         """Replace the normals of pixels where a light that shines on the flat skin has gone dark, or a channel is full."""
-        clipped = (compensated < self.dark_where) | (compensated >= self.full_above)
+        clipped = (compensated < dark_where) | (compensated >= full_above)
         if not bool(clipped.any()):
             return normal
         b, row, column = torch.where(clipped.any(dim=1))
@@ -187,7 +206,7 @@ class NormalFromIntensity(nn.Module):
         squared = (to_light * to_light).sum(2, keepdim=True)
         rows = albedo[None, :, None] * to_light * (squared.rsqrt() / squared)
         intensity = compensated[b, :, row, column]
-        slope = slope_by_lit_lights(start, intensity, rows, intensity >= self.full_above[:, row, column].t(), self.noise_std)
+        slope = slope_by_lit_lights(start, intensity, rows, intensity >= full_above[:, row, column].t(), self.noise_std)
         solution = normal_from_gradient(slope[:, :, None, None])[:, :, 0, 0]
         return normal.permute(0, 2, 3, 1).index_put((b, row, column), solution).permute(0, 3, 1, 2)
 

@@ -5,7 +5,7 @@ import copy
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_batch, check_same_size
+from ..core.checks import check_batch, check_window
 from ..core.geometry import normal_from_gradient
 from ..core.response import CHANGE_SCALE, ResponseField
 from ..record import Calibration
@@ -15,7 +15,8 @@ class NormalFromResponse(nn.Module):
     """Unit normals of a compensated image, which for a response field is image / background.
 
     Without depth the field ``fast``; with the depth that pass led to, the field ``precise``, which was fitted on such depths:
-    a second pass is all there is to gain, and ``passes`` says so to the pipeline.
+    a second pass is all there is to gain, and ``passes`` says so to the pipeline. Given ``window`` (top, left), the image is
+    the part of the calibrated one whose first pixel is there.
 
     Args:
         fast: field without depth. precise: field with depth, or None.
@@ -29,6 +30,7 @@ class NormalFromResponse(nn.Module):
     """
 
     uses_depth: bool
+    takes_window: bool = True
     fast_maps: Tensor
     precise_maps: Tensor
 
@@ -59,9 +61,10 @@ class NormalFromResponse(nn.Module):
         size = (sensor.height, sensor.width, sensor.mm_per_pixel)
         return cls(response.fast, response.precise, *size, dtype=calibration.background.dtype)
 
-    def forward(self, compensated: Tensor, depth_mm: Tensor | None = None) -> Tensor:
+    def forward(self, compensated: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
         check_batch("compensated", compensated, 3)
-        check_same_size("compensated", compensated, "the calibration", self.fast_maps.shape[2], self.fast_maps.shape[3])
+        size = (self.fast_maps.shape[2], self.fast_maps.shape[3])
+        top, left = check_window("compensated", compensated, size, window)
         change = compensated - 1.0
         inputs = [change[:, 0:1], change[:, 1:2], change[:, 2:3]]
         maps = self.fast_maps
@@ -70,6 +73,7 @@ class NormalFromResponse(nn.Module):
                 raise ValueError("depth_mm: expected None, because this response has no field with depth: use mode 'fast'")
             inputs.append(depth_mm.to(change.dtype).expand_as(inputs[0]))
             maps = self.precise_maps
+        maps = maps[:, :, top : top + compensated.shape[2], left : left + compensated.shape[3]]
         gradient = maps[0] * inputs[0]  # (B, 2, H, W)
         for k in range(1, len(inputs)):
             gradient = torch.addcmul(gradient, maps[k], inputs[k])

@@ -17,15 +17,16 @@ import re
 import sys
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, fields
 from datetime import timedelta
 from itertools import groupby, islice
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 import torch
@@ -592,33 +593,54 @@ class _Worker:
         self.frames = self.failed = 0
 
     def run(self, batch: int, workers: int, bar: "tqdm[Any]") -> None:
+        """All of the share. Files are written by threads, because most of that is waiting for the disk; lines keep their order."""
         log = self.out / STATE / f"log-{time.time_ns()}-{self.ranks.rank}.jsonl"
-        with log.open("x", encoding="utf-8") as stream, torch.inference_mode():
-            for frames, images in self._batches(batch, workers):
-                place = 0
-                for frame in frames:
-                    self.ranks.check()
-                    usable = not frame.reason and not frame.end
-                    record = self._frame(frame, images[place : place + 1] if usable else None)
-                    place += usable
-                    stream.write(json.dumps(record) + "\n")
-                    stream.flush()
-                    if "failed" in record:
-                        self._left_out(frame, record["failed"])
-                    self.frames += "deepest_mm" in record
-                    self.ranks.count = self.frames + self.failed
-                bar.update(self.ranks.total() - bar.n)
+        writers = 1 if self.settings.pictures else 4  # matplotlib draws in one thread only
+        waiting: deque[tuple[_Frame, dict[str, Any], Future[None] | None]] = deque()
+        with log.open("x", encoding="utf-8") as stream, ThreadPoolExecutor(writers) as pool:
+            for loader in self._loaders(batch, workers):
+                for frames, images in loader:
+                    place = 0
+                    for frame in frames:
+                        self.ranks.check()
+                        usable = not frame.reason and not frame.end
+                        waiting.append(self._frame(frame, images[place : place + 1] if usable else None, pool))
+                        place += usable
+                        if len(waiting) > 4 * writers:
+                            self._settle(*waiting.popleft(), stream)
+                    bar.update(self.ranks.total() - bar.n)
+                while waiting:  # the next loader forks: no thread may be busy then
+                    self._settle(*waiting.popleft(), stream)
+        bar.update(self.ranks.total() - bar.n)
 
-    def _batches(self, batch: int, workers: int) -> Iterator[_Batch]:
+    def _settle(self, frame: _Frame, record: dict[str, Any], written: "Future[None] | None", stream: TextIO) -> None:
+        """Log a frame whose files are in place, or why there are none."""
+        if written is not None:
+            try:
+                written.result()
+            except ValueError as error:  # a depth that its format does not hold; a full disk is an OSError and stops the run
+                record = _failure(record, error)
+        stream.write(json.dumps(record) + "\n")
+        stream.flush()
+        self.frames += "deepest_mm" in record
+        self.failed += "failed" in record
+        self.ranks.count = self.frames + self.failed
+        if "failed" in record:
+            name = _name(frame.item.path, frame.number)
+            if self.strict:
+                raise ValueError(f"{name}: {record['failed']}")
+            tqdm.write(f"left out {name}: {record['failed']}", file=sys.stderr)
+
+    def _loaders(self, batch: int, workers: int) -> Iterator[Iterable[_Batch]]:
         images = _Images(self.source, self.sensor)
         for is_video, items in groupby(self._share(), key=lambda item: item.is_video):
             if is_video:
                 for item in items:
                     video = _Video(_file(self.source, item), item, self.sensor, self.ranks.rank, self.ranks.world, batch)
-                    yield from DataLoader(video, batch_size=None, num_workers=min(1, workers), collate_fn=_as_is)
+                    yield DataLoader(video, batch_size=None, num_workers=min(1, workers), collate_fn=_as_is)
             else:
                 lazily: Any = _batches(items, batch)
-                yield from DataLoader(images, batch_sampler=lazily, num_workers=workers, collate_fn=_as_is)
+                yield DataLoader(images, batch_sampler=lazily, num_workers=workers, collate_fn=_as_is)
 
     def _share(self) -> Iterator[Item]:
         """Every world-th image that is not done, and all videos that are not: of those every rank does some frames."""
@@ -630,20 +652,24 @@ class _Worker:
                 yield item
             place += not item.is_video
 
-    def _frame(self, frame: _Frame, image: Tensor | None) -> dict[str, Any]:
+    def _frame(
+        self, frame: _Frame, image: Tensor | None, pool: ThreadPoolExecutor
+    ) -> tuple[_Frame, dict[str, Any], "Future[None] | None"]:
         record: dict[str, Any] = {"item": frame.item.path, "frame": frame.number, "mark": list(frame.item.mark)}
         if frame.end:
-            return {**record, "end": True}
+            return frame, {**record, "end": True}, None
         if image is None:
-            return {**record, "failed": frame.reason}
+            return frame, {**record, "failed": frame.reason}, None
         try:
-            result = self.pipe(image)
-            self._write(_stem(self.out, frame.item, frame.number), _name(frame.item.path, frame.number), image, result)
-        except ValueError as error:  # a depth that its format does not hold; a full disk is an OSError and stops the run
-            return {**record, "failed": " ".join(str(error).split())}
+            with torch.inference_mode():
+                result = self.pipe(image)
+        except ValueError as error:
+            return frame, _failure(record, error), None
         area = float(result.contact.double().sum()) * self.sensor.mm_per_pixel**2
         touched = bool(result.contact.any())
-        return {**record, "deepest_mm": float(result.depth_mm.max()), "contact_mm2": area, "cloud": touched}
+        record |= {"deepest_mm": float(result.depth_mm.max()), "contact_mm2": area, "cloud": touched}
+        stem, name = _stem(self.out, frame.item, frame.number), _name(frame.item.path, frame.number)
+        return frame, record, pool.submit(self._write, stem, name, image, result)
 
     def _write(self, stem: Path, name: str, image: Tensor, frame: DepthOutput) -> None:
         stem.parent.mkdir(parents=True, exist_ok=True)
@@ -664,12 +690,9 @@ class _Worker:
 
             viz.save_figure(viz.depth_figure(frame.depth_mm, pitch, image, frame.contact, name), f"{stem}_picture.png")
 
-    def _left_out(self, frame: _Frame, reason: str) -> None:
-        self.failed += 1
-        name = _name(frame.item.path, frame.number)
-        if self.strict:
-            raise ValueError(f"{name}: {reason}")
-        tqdm.write(f"left out {name}: {reason}", file=sys.stderr)
+
+def _failure(record: dict[str, Any], error: ValueError) -> dict[str, Any]:
+    return {name: record[name] for name in ("item", "frame", "mark")} | {"failed": " ".join(str(error).split())}
 
 
 # ---- processes -----------------------------------------------------------------------------------------------------------------
@@ -758,19 +781,24 @@ class Ranks:
                 if self._store.check([key]):
                     return
                 self._read_lives()
+                silent_s = self._silence(start)
             except RuntimeError as error:
                 raise RuntimeError("the launcher, or rank 0, is gone: run the same command again to go on") from error
             if bar is not None:
                 bar.update(self.total() - bar.n)
-            for rank in range(self.world):
-                _, heard = self._seen.get(rank, ("", start))
-                silent = time.monotonic() - max(heard, start)
-                if rank != self.rank and silent > self.timeout_s and not self._store.check([f"finished/{rank}"]):
+            for rank, silence in silent_s.items():
+                if silence > self.timeout_s:
                     raise RuntimeError(
-                        f"rank {rank} has not been heard of for {silent:.0f} s (waiting for {what}): killed, out of memory, or its "
-                        "machine is gone: run the same command again to go on"
+                        f"rank {rank} has not been heard of for {silence:.0f} s (waiting for {what}): killed, out of memory, or "
+                        "its machine is gone: run the same command again to go on"
                     )
             time.sleep(0.1)
+
+    def _silence(self, start: float) -> dict[int, float]:
+        """Seconds since the others that have not finished were last heard of, since ``start`` at most."""
+        heard = {rank: max(start, self._seen.get(rank, ("", start))[1]) for rank in range(self.world) if rank != self.rank}
+        now = time.monotonic()
+        return {rank: now - at for rank, at in heard.items() if not self._store.check([f"finished/{rank}"])}
 
     def _read_lives(self) -> None:
         for rank in range(self.world):

@@ -36,6 +36,7 @@ def main() -> int:
     parser.add_argument("--strict", action="store_true", help="stop at the first frame that cannot be used")
     parser.add_argument("--timeout", type=float, default=60.0, help="seconds after which a silent process counts as dead")
     arguments = parser.parse_args()
+    sys.stdout.reconfigure(errors="backslashreplace")  # names of files may be no text
     report = reconstruct_dataset(
         arguments.calibration,
         arguments.source,

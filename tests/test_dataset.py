@@ -284,6 +284,17 @@ def test_listing_is_sorted_by_folder_and_name(tmp_path):
     assert paths == ["a/b/c.PNG", "a/z.png", "a-b.png", "a.png", "b.png"] and paths == sorted(paths, key=lambda p: p.split("/"))
 
 
+def test_a_name_that_is_no_text_is_left_out(unit, tmp_path):
+    source = fill(tmp_path / "in", ["a, b.png"])
+    try:
+        (source / os.fsdecode(b"bad\xff.png")).write_bytes((source / "a, b.png").read_bytes())
+    except OSError:
+        pytest.skip("this file system takes UTF-8 names only")
+    report = reconstruct_dataset(unit, source, tmp_path / "out", pictures=False)
+    assert report.rows == 1 and [reason for _, reason in report.failed] == ["its name is not UTF-8: rename it"]
+    assert '"a, b.png",' in (tmp_path / "out" / "frames.csv").read_text()
+
+
 def write_film(path, count):
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (WIDTH, HEIGHT))
     for k in range(count):

@@ -74,7 +74,12 @@ class Item(NamedTuple):
     @property
     def is_video(self) -> bool:
         """Whether it has frames."""
-        return self.path.lower().endswith(VIDEO_SUFFIXES)
+        return self.is_text and self.path.lower().endswith(VIDEO_SUFFIXES)
+
+    @property
+    def is_text(self) -> bool:
+        """Whether the name is UTF-8; OpenCV crashes on others."""
+        return not any("\ud800" <= letter <= "\udfff" for letter in self.path)
 
 
 class Report(NamedTuple):
@@ -531,7 +536,9 @@ class _Images(Dataset[_Batch]):
         frames, images = [], []
         for item in items:
             path = _file(self.source, item)
-            image, reason = _load(lambda path=path: read_image(path), self.sensor)
+            image, reason = None, "its name is not UTF-8: rename it"
+            if item.is_text:
+                image, reason = _load(lambda path=path: read_image(path), self.sensor)
             frames.append(_Frame(item, -1, reason))
             images += [] if image is None else [image]
         return frames, _stack(images)

@@ -1,89 +1,88 @@
-"""Depth from camera images: an image, a folder of images or a video in; depth, clouds and pictures out.
+"""Depth from camera images: an image, a folder (with all below it) or a video in; depth, clouds and pictures out.
 
 python scripts/reconstruct.py unit.safetensors press.png --out out/press
 python scripts/reconstruct.py unit.safetensors folder/ --out out/all --depth npy --cloud ply --mode precise
+torchrun --standalone --nproc_per_node=4 scripts/reconstruct.py unit.safetensors folder/ --out out/all
+
+Stopped, the same command goes on where it was. Exit status 1 if a frame had to be left out.
 """
 
 import argparse
-import itertools
 import sys
-from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
-from typing import TypeVar
 
-import numpy as np
-import torch
-from tqdm import tqdm
-
-import torchvts as vts
-from torchvts import viz
-from torchvts.core.files import count_frames, read_frames, write_atomically, write_depth_png
-
-T = TypeVar("T")
+from torchvts.dataset import CLOUD_FORMATS, DEPTH_FORMATS, PICTURES_UP_TO, Report, reconstruct_dataset
+from torchvts.pipeline import MODES
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("calibration", type=Path, help="file that calibrate.py wrote")
-    parser.add_argument("source", type=Path, help="image, folder of images, or video")
-    parser.add_argument("--out", type=Path, required=True, help="folder for the results")
-    parser.add_argument("--mode", choices=["fast", "precise", "auto"], default="auto")
-    parser.add_argument("--depth", choices=["png", "npy", "none"], default="png", help="png: 16 bits, 32768 + depth / 0.0001 mm")
-    parser.add_argument("--cloud", choices=["pcd", "ply", "none"], default="none", help="contact points in mm, y up")
-    parser.add_argument("--no-pictures", action="store_true", help="leave out the contour and surface pictures")
-    parser.add_argument("--batch", type=int, default=8)
+    parser.add_argument("source", type=Path, help="image, folder of images and videos, or video")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the results; folders of the source are kept in it")
+    parser.add_argument("--mode", choices=MODES, default="auto")
+    parser.add_argument("--depth", choices=DEPTH_FORMATS, default="png", help="png: 16 bits, 32768 + depth / 0.0001 mm")
+    parser.add_argument("--cloud", choices=CLOUD_FORMATS, default="none", help="contact points in mm, y up")
+    parser.add_argument(
+        "--pictures",
+        action=argparse.BooleanOptionalAction,
+        help=f"contour and surface pictures; left out: of at most {PICTURES_UP_TO} frames",
+    )
+    parser.add_argument("--batch", type=int, default=8, help="frames that a loader worker hands over at once")
+    parser.add_argument("--workers", type=int, help="loader processes for each rank; left out, up to 4")
+    parser.add_argument("--threads", type=int, default=1, help="of each rank; results are bit for bit equal for equal numbers only")
+    parser.add_argument("--overwrite", action="store_true", help="begin anew, whatever --out holds")
+    parser.add_argument("--strict", action="store_true", help="stop at the first frame that cannot be used")
+    parser.add_argument("--timeout", type=float, default=60.0, help="seconds after which a silent process counts as dead")
     arguments = parser.parse_args()
-    calibration = vts.Calibration.load(arguments.calibration)
-    pipe = vts.DepthPipeline.from_calibration(calibration, arguments.mode)
-    frames = read_frames(arguments.source)
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    pitch = calibration.sensor.mm_per_pixel
-    rows = []
-    with torch.inference_mode(), tqdm(total=count_frames(arguments.source), unit="frame") as bar:
-        for batch in batches(frames, max(1, arguments.batch)):
-            images = torch.cat([calibration.sensor.rectify(image[None]) for _, image in batch])
-            result = pipe(images)
-            for k, (name, _) in enumerate(batch):
-                frame = vts.DepthOutput(*(t[k : k + 1] for t in result))
-                write_frame(arguments, name, images[k : k + 1], frame, pitch)
-                area = float(frame.contact.double().sum()) * pitch**2
-                rows.append((name, float(frame.depth_mm.max()), area))
-                bar.update()
+    sys.stdout.reconfigure(errors="backslashreplace")  # names of files may be no text
+    report = reconstruct_dataset(
+        arguments.calibration,
+        arguments.source,
+        arguments.out,
+        mode=arguments.mode,
+        depth=arguments.depth,
+        cloud=arguments.cloud,
+        pictures=arguments.pictures,
+        batch=arguments.batch,
+        workers=arguments.workers,
+        threads=arguments.threads,
+        overwrite=arguments.overwrite,
+        strict=arguments.strict,
+        timeout_s=arguments.timeout,
+    )
+    if report.rank > 0:
+        return 0
+    print_report(report, arguments.out)
+    return 1 if report.failed else 0
+
+
+def print_report(report: Report, out: Path) -> None:
     print("| frame | deepest mm | contact mm^2 |\n|---|---|---|")
-    for name, deepest, area in rows[:20]:
-        print(f"| {name} | {deepest:.3f} | {area:.2f} |")
-    if len(rows) > 20:
-        print(f"... {len(rows) - 20} more")
-    with write_atomically(arguments.out / "frames.csv") as temporary:
-        temporary.write_text("frame,deepest_mm,contact_mm2\n" + "".join(f"{n},{d:.6f},{a:.6f}\n" for n, d, a in rows))
-    print(f"wrote {len(rows)} frames to {arguments.out}")
-    return 0
-
-
-def batches(items: Iterator[T], size: int) -> Iterator[list[T]]:
-    while batch := list(itertools.islice(items, size)):
-        yield batch
-
-
-def write_frame(arguments: argparse.Namespace, name: str, image: torch.Tensor, frame: vts.DepthOutput, pitch: float) -> None:
-    stem = arguments.out / name
-    if arguments.depth == "png":
-        write_depth_png(f"{stem}_depth.png", frame.depth_mm)
-    elif arguments.depth == "npy":
-        with write_atomically(f"{stem}_depth.npy") as temporary:
-            np.save(temporary, frame.depth_mm[0, 0].numpy())
-    if arguments.cloud != "none" and bool(frame.contact.any()):
-        from torchvts.pose import write_point_cloud
-
-        inside = frame.contact[0, 0]
-        normals = frame.normal[0].permute(1, 2, 0)[inside] * torch.tensor([1.0, -1.0, 1.0])  # y up
-        write_point_cloud(f"{stem}.{arguments.cloud}", vts.depth_to_points(frame.depth_mm, pitch, frame.contact), normals)
-    if not arguments.no_pictures:
-        viz.save_figure(viz.depth_figure(frame.depth_mm, pitch, image, frame.contact, name), f"{stem}_picture.png")
+    with (out / "frames.csv").open(encoding="utf-8", errors="replace") as stream:
+        for line in islice(stream, 1, 21):
+            name, deepest, area = line.rstrip("\n").rsplit(",", 2)
+            print(f"| {name} | {float(deepest):.3f} | {float(area):.2f} |")
+    if report.rows > 20:
+        print(f"... {report.rows - 20} more")
+    print("\n| rank | frames | left out | s | frames/s |\n|---|---|---|---|---|")
+    for rank, (frames, failed, seconds) in enumerate(report.ranks):
+        print(f"| {rank} | {frames:.0f} | {failed:.0f} | {seconds:.1f} | {frames / max(seconds, 1e-9):.1f} |")
+    frames, slowest = sum(row[0] for row in report.ranks), max(row[2] for row in report.ranks)
+    print(f"{frames:.0f} frames in {slowest:.1f} s: {frames / max(slowest, 1e-9):.1f} frames/s; {report.before} were there before")
+    if report.failed:
+        print("\n| left out | reason |\n|---|---|")
+        for name, reason in report.failed[:20]:
+            print(f"| {name} | {reason} |")
+        print(f"{len(report.failed)} left out, all of them in {out / 'failed.csv'}")
+    print(f"wrote {report.rows} frames to {out}")
 
 
 if __name__ == "__main__":
     try:
         sys.exit(main())
-    except (OSError, ValueError, TypeError, ImportError) as error:
+    except (OSError, ValueError, TypeError, ImportError, RuntimeError) as error:
         sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit("stopped: run the same command again to go on")

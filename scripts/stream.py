@@ -71,16 +71,19 @@ def main() -> int:
 def play(
     stream: TactileStream, report: StreamReport, overlay: Overlay | None, window: Window | None, video: VideoFile | None
 ) -> None:
-    """Every frame until the source ends, the window is closed, or Ctrl-C."""
+    """Every frame until the source ends, the window is closed, or Ctrl-C; what was dropped is shown by the next frame again."""
+    shown = -1
     try:
         for frame in stream:
-            line = report.add(frame)
+            lines = report.add(frame)
             if overlay is not None:
                 with stream.stages.stage("draw"):
-                    picture = overlay(frame, line)
+                    picture = overlay(frame, lines)
                 if video is not None:
                     with stream.stages.stage("write"):
-                        video.write(picture)
+                        for _ in range(max(1, frame.number - shown)):
+                            video.write(picture)
+                    shown = frame.number
                 if window is not None and not window.show(picture):
                     break
     except KeyboardInterrupt:

@@ -35,6 +35,9 @@ TIME_CONSTANT_S = 1.0
 LIGHT_STEP = 0.03
 """Light that departs further than this from what was followed so far has stepped: told, and not learned."""
 
+RECOVERY_S = 1.0
+"""After a contact the gel takes this long to come back; what the light seems to do until then is no step."""
+
 LEAST_FREE = 0.25
 """Part of the skin that must be out of contact for the light to be judged by it."""
 
@@ -56,9 +59,9 @@ CODES = {".mp4": "mp4v", ".avi": "MJPG"}
 
 
 class TactileFrame(NamedTuple):
-    """index in the source; time_s since its start; image (3, H, W), rectified and in the light of the background; the depth."""
+    """number in the source, from 0; time_s since its start; image (3, H, W), rectified, in the background's light; the depth."""
 
-    index: int
+    number: int
     time_s: float
     image: Tensor
     output: DepthOutput
@@ -183,7 +186,7 @@ def open_source(source: str | int | Path) -> Reader:
         FileNotFoundError: nothing there. OSError: no such camera. ValueError: not a video, or no images; all name ``source``.
     """
     if isinstance(source, int) or str(source).isdigit():
-        return CaptureReader(int(source))
+        return CaptureReader(int(str(source)))
     path = Path(source)
     if path.is_dir():
         return FolderReader(path)
@@ -343,8 +346,8 @@ class FollowLight:
     * from the others, robustly (Tukey), the plane moves by 1 - exp(-dt / time_constant_s) of what is missing;
     * with less than a quarter of the cells free nothing is learned ("held");
     * what departs by more than 3 % from the light followed so far is no drift. Without contact, or where one plane explains 90 % of
-      all cells to 1 %, it is told as a step ("stepped"); with a contact, which scatters light, it is "held". Neither is learned;
-      when the light comes back, or drift explains it, following goes on.
+      all cells to 1 %, it is told as a step ("stepped"); with a contact, which scatters light, and for a second after it, while
+      the gel comes back, it is "held". Neither is learned; when the light comes back, following goes on.
 
     Args:
         background: (3, H, W), image value of the unit at rest. time_constant_s: see above.
@@ -355,10 +358,9 @@ class FollowLight:
     def __init__(self, background: Tensor, time_constant_s: float = TIME_CONSTANT_S) -> None:
         self.time_constant_s = check_positive("time_constant_s", time_constant_s)
         self.cell = max(2, background.shape[1] // 24)
-        rest = nn.functional.avg_pool2d(background[None], self.cell)[0].double()
-        self._rest = rest + PEDESTAL
-        self._judged = (rest > 0.06) & (rest < 0.97)
-        rows, columns = rest.shape[1:]
+        self.plane = torch.tensor([[1.0, 0.0, 0.0]] * 3, dtype=torch.float64)
+        self.set_rest(background[None])
+        rows, columns = self._rest.shape[1:]
         x = torch.linspace(-1.0, 1.0, columns, dtype=torch.float64).expand(rows, columns)
         y = torch.linspace(-1.0, 1.0, rows, dtype=torch.float64)[:, None].expand(rows, columns)
         self._basis = torch.stack((torch.ones_like(x), x, y)).flatten(1)  # (3, cells)
@@ -366,9 +368,9 @@ class FollowLight:
         reach_x, reach_y = width / (columns * self.cell), height / (rows * self.cell)  # beyond the cells lies a rest of pixels
         x_mm, y_mm = pixel_grid_mm(height, width, 1.0, background.dtype)
         self._x, self._y = (x_mm * 2.0 / width * reach_x)[None], (y_mm * 2.0 / height * reach_y)[None]
-        self.plane = torch.tensor([[1.0, 0.0, 0.0]] * 3, dtype=torch.float64)
         self.state = "following"
         self.steps = 0
+        self._since_contact_s = RECOVERY_S
 
     @property
     def level(self) -> list[float]:
@@ -389,6 +391,7 @@ class FollowLight:
         near = nn.functional.max_pool2d(touched, 3, 1, 1)[0, 0] > 0
         usable = self._judged & (cells < 0.97)
         before = self.state
+        self._since_contact_s = 0.0 if bool(touched.any()) else self._since_contact_s + seconds
         free = usable & ~near
         enough = bool((free.flatten(1).double().mean(1) >= LEAST_FREE * usable.flatten(1).double().mean(1)).all())
         change = self._fit(missing, free if enough else usable)
@@ -396,7 +399,7 @@ class FollowLight:
         if departure > LIGHT_STEP:
             left = (missing.flatten(1) - change @ self._basis).abs()[usable.flatten(1)]
             smooth = left.numel() > 0 and float((left < 0.01).double().mean()) > 0.9
-            self.state = "stepped" if smooth or not bool(touched.any()) else "held"
+            self.state = "stepped" if smooth or self._since_contact_s >= RECOVERY_S else "held"
         elif not enough:
             self.state = "held"
         else:
@@ -404,6 +407,12 @@ class FollowLight:
             self.plane += (1.0 - float(np.exp(-max(0.0, seconds) / self.time_constant_s))) * change * self.plane[:, :1]
         self.steps += self.state == "stepped" and before != "stepped"
         return self.state
+
+    def set_rest(self, image: Tensor) -> None:
+        """Take an image (1, 3, H, W) in the background's light for what cells look like at rest, printed markers and all."""
+        rest = nn.functional.avg_pool2d(image, self.cell)[0].double()
+        self._rest = rest + PEDESTAL
+        self._judged = (rest > 0.06) & (rest < 0.97)
 
     def start(self, image: Tensor) -> None:
         """Take over the light of an image (1, 3, H, W) that is known to be at rest."""
@@ -536,8 +545,8 @@ class TactileStream:
         ValueError, OSError: the source, or contact or changing light in the first frames; says which.
     Example:
         >>> with TactileStream(0, Sensor.load("gelsight_mini")) as stream:  # doctest: +SKIP
-        ...     for index, time_s, image, out in stream:
-        ...         print(index, float(out.depth_mm.max()))
+        ...     for number, time_s, image, out in stream:
+        ...         print(number, float(out.depth_mm.max()))
     """
 
     def __init__(
@@ -580,8 +589,10 @@ class TactileStream:
             self.light = FollowLight(value, time_constant_s)
             self.pipe = DepthPipeline.from_calibration(self.calibration, mode).float()
             self.pipe.contact = _contact_in_video(self.calibration, noise)
+            image = image[None].clamp(0.0, 1.0)
             if given is not None:
-                self._check_rest(image[None].clamp(0.0, 1.0))
+                self._check_rest(image)
+            self.light.set_rest(self.light.correct(image))
             self._hooks = self.stages.watch(self.pipe)
         except BaseException:
             self.reader.close()
@@ -616,11 +627,11 @@ class TactileStream:
     def _check_rest(self, image: Tensor) -> None:
         """Bring the first frames into the calibration's light, and refuse a contact in them."""
         light = self.light
-        light.start(image)
+        light.start(image if self.calibration.markers is None else self.calibration.markers(image))
         level = max(abs(v - 1.0) for v in light.level)
         if level > 0.15:
             raise ValueError(
-                f"background: the light is {level:.0%} off the calibration's: another unit, other exposure or lamps; calibrate again"
+                f"background: the light is {level:.0%} off the calibration's: another unit, exposure or lamps; calibrate again"
             )
         with torch.inference_mode():
             contact = self.pipe.contact(self.pipe.compensate(light.correct(image)))
@@ -716,10 +727,13 @@ def _contact_in_video(calibration: Calibration, noise: Tensor) -> ContactMask:
     return ContactMask(calibrated.flat.float(), most).eval()
 
 
+_RANGES = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+
+
 class Overlay:
     """Draws a frame: the image with its contact outlined, beside it depth in colour with contour lines, figures beneath.
 
-    The range of colours grows with the deepest press so far, in steps of 1, 2 and 5.
+    The range of colours grows with the deepest press so far, over round numbers; ten lines fill it.
 
     Args:
         metric: whether depth is in mm; if not, it says so.
@@ -739,14 +753,15 @@ class Overlay:
         import cv2
 
         depth = depth_mm[0, 0].float().numpy()
-        low, _, high, _ = 0.0, None, float(depth.max()), None
+        high = float(depth.max())
         while high > self.range_mm:
-            mantissa = self.range_mm / 10.0 ** np.floor(np.log10(self.range_mm) + 1e-9)
-            self.range_mm *= 2.5 if 1.5 < mantissa < 3.0 else 2.0
-        level = cv2.convertScaleAbs(np.maximum(depth, low), alpha=255.0 / self.range_mm)
+            power = 10.0 ** np.floor(np.log10(self.range_mm) + 1e-9)
+            self.range_mm = float(power * next(s for s in _RANGES if s > self.range_mm / power + 1e-6))
+        depth = np.maximum(depth, 0.0)
+        level = cv2.convertScaleAbs(depth, alpha=255.0 / self.range_mm)
         picture: Pixels = cv2.applyColorMap(level, self._table)
         if high > 0.02 * self.range_mm:
-            smooth = cv2.blur(np.maximum(depth, low), (3, 3))
+            smooth = cv2.blur(depth, (3, 3))
             step = cv2.convertScaleAbs(smooth, alpha=10.0 / self.range_mm, beta=-0.5)  # ten lines over the range
             lines = np.zeros(step.shape, np.uint8)
             lines[:, 1:] |= (step[:, 1:] != step[:, :-1]).view(np.uint8)
@@ -812,8 +827,8 @@ class VideoFile:
         if self._writer is not None:
             self._writer.release()
         if self._writer is None and error[0] is None:
-            error = (OSError, OSError(f"video: {self.path}: no frame came, so none is written"), None)
-            self._file.__exit__(*error)
+            nothing = OSError(f"video: {self.path}: no frame came, so none is written")
+            self._file.__exit__(OSError, nothing, None)  # removes the temporary file
             return
         self._file.__exit__(*error)
 
@@ -839,12 +854,12 @@ class StreamReport:
         area = float(frame.output.contact.sum()) * self._pixel_mm2
         deepest = float(frame.output.depth_mm.max())
         state = self.stream.light.state
-        self.rows.append((frame.index, frame.time_s, area, deepest, state))
+        self.rows.append((frame.number, frame.time_s, area, deepest, state))
         dropped = f", {self.stream.dropped} dropped" if self.stream.dropped else ""
         times = " ".join(f"{name} {ms:.1f}" for name, ms in self.stream.stages.last.items())
         light = "  LIGHT HAS CHANGED: start again without contact" if state == "stepped" else ""
         return [
-            f"frame {frame.index}  {frame.time_s:.2f} s  contact {area:.1f} mm2  deepest {deepest:.2f}{light}",
+            f"frame {frame.number}  {frame.time_s:.2f} s  contact {area:.1f} mm2  deepest {deepest:.2f}{light}",
             f"{self.fps:.0f} fps{dropped}, ms: {times}",
         ]
 

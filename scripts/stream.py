@@ -13,6 +13,9 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
+import torch
+
 import torchvts as vts
 from torchvts.stream import Overlay, StreamReport, TactileStream, VideoFile, Window, has_display
 
@@ -31,7 +34,10 @@ def main() -> int:
     parser.add_argument("--background-frames", type=int, default=12, help="first frames, free of contact")
     parser.add_argument("--realtime", action="store_true", help="play a recording at its own rate, dropping late frames")
     parser.add_argument("--no-follow", action="store_true", help="do not follow slow drift of the light")
+    parser.add_argument("--threads", type=int, default=1, help="of PyTorch and OpenCV; one leaves a core to the reading")
     arguments = parser.parse_args()
+    torch.set_num_threads(max(1, arguments.threads))
+    cv2.setNumThreads(max(1, arguments.threads))
     if (arguments.sensor is None) == (arguments.calibration is None):
         parser.error("give either --sensor or --calibration")
     unit = vts.Sensor.load(arguments.sensor) if arguments.sensor else vts.Calibration.load(arguments.calibration)

@@ -391,10 +391,10 @@ def test_the_overlay_shows_contours_and_grows_its_range(unit, small_press):
     output = vts.DepthOutput(scene.depth_mm, scene.gradient, scene.normal, scene.contact)
     overlay = streams.Overlay(metric=False)
     picture = overlay(streams.TactileFrame(0, 0.0, torch.zeros(3, 120, 160), output), ["one", "two"])
-    assert picture.shape == (186, 320, 3) and picture.dtype == np.uint8
+    assert picture.shape == (240 + 86, 640, 3) and picture.dtype == np.uint8
     assert overlay.range_mm == pytest.approx(1.0)
     inside = scene.contact[0, 0].numpy()
-    ys, xs = np.nonzero((picture[:120, :160] > 128).all(2))
+    ys, xs = np.nonzero((picture[:240:2, :320:2] > 128).all(2))  # shown twice as large
     ramp = torch.linspace(0.0, 1.0, 160).expand(1, 1, 40, -1)
     row = (overlay.depth(ramp)[20] == 255).all(1)
     assert 9 <= int(row.sum()) <= 11  # ten lines fill the range
@@ -407,12 +407,12 @@ def test_lights_that_do_not_fit_the_image_give_only_their_directions(ring, small
     x = torch.linspace(-1.0, 1.0, 160)
     uneven = torch.stack((0.6 + 0.4 * x, 0.6 - 0.4 * x, 0.5 + 0.4 * (1 - x**2)))[None, :, None]  # lamps that spread badly
     rest, image = (vts.scenes.render(s, lights) * uneven for s in (vts.scenes.at_rest(scene), scene))
-    calibration, told = streams.calibrate_at_rest(rest[0], sensor)
-    assert calibration.report["response"] == "stand-in" and "NOT METRIC" in told
+    calibration, told, metric = streams.calibrate_at_rest(rest[0], sensor)
+    assert calibration.report["response"] == "stand-in" and "NOT METRIC" in told and not metric
     out = vts.DepthPipeline.from_calibration(calibration)(image)
     assert float(out.depth_mm.max()) == pytest.approx(0.5, rel=0.25)
-    even, told = streams.calibrate_at_rest(vts.scenes.render(vts.scenes.at_rest(scene), lights)[0], sensor)
-    assert even.lights is not None and "NOT METRIC" in told
+    even, _, metric = streams.calibrate_at_rest(vts.scenes.render(vts.scenes.at_rest(scene), lights)[0], sensor)
+    assert even.lights is not None and not metric
 
 
 def test_a_window_shows_until_it_is_closed(monkeypatch):

@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from .calibration import CalibrationWarning, calibrate
+from .calibration.lights import LOOSE_DEG
 from .compensate import blur, gaussian_kernel
 from .contact import ContactMask
 from .core.checks import check_batch, check_integer, check_positive
@@ -442,15 +444,26 @@ class FollowLight:
         return plane
 
 
-def calibrate_at_rest(background: Tensor, sensor: Sensor) -> tuple[Calibration, str]:
+class AtRest(NamedTuple):
+    """A calibration, what is to be told of it in words, and whether its depth is metric as far as it knows."""
+
+    calibration: Calibration
+    told: str
+    metric: bool
+
+
+def calibrate_at_rest(background: Tensor, sensor: Sensor) -> AtRest:
     """A calibration from one image at rest, and what is to be told of it.
 
     :func:`torchvts.calibrate`; but where the sensor file names its lights and the light they would give does not look like the
     background (RMS of the log ratio above 0.2), only their directions are believed: slope = - pinv(D) change, D being the lights'
     x / z and y / z. That is a stand-in: shapes are right, and how deep they are is only as right as the lamps' heights.
 
-    Returns:
-        The calibration and a text: the reason, warnings, and whether depth is metric.
+    Example:
+        >>> from torchvts.shading import PointLights, flat_image
+        >>> lights = PointLights([[25, 0, 30], [-12, 20, 30], [-12, -20, 30]], [900, 900, 900])
+        >>> calibrate_at_rest(flat_image(lights, 48, 64, 0.6).detach(), Sensor("rig", 48, 64, 0.6)).metric
+        True
     """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -470,17 +483,24 @@ def calibrate_at_rest(background: Tensor, sensor: Sensor) -> tuple[Calibration, 
             report = {"model": "response", "response": "stand-in", "reason": reason}
             calibration = Calibration.from_response(model, sensor, background, report)
         told.append("the lights are the sensor file's, not this unit's")
-    if told:
-        return calibration, "; ".join([reason, *told, "depth is NOT METRIC: calibrate with presses of a ball"])
-    return calibration, reason
+    metric = not told
+    told = [reason, *told] + ([] if metric else ["depth is NOT METRIC: calibrate with presses of a ball"])
+    return AtRest(calibration, "; ".join(told), metric)
+
+
+def _given(calibration: Calibration) -> AtRest:
+    report = calibration.report
+    told = f"calibration given: {report.get('reason', report.get('model', 'lights'))}"
+    metric = max(report.get("direction_std_deg", [0.0])) <= LOOSE_DEG
+    return AtRest(calibration, told if metric else f"{told}; depth is NOT METRIC: calibrate with presses of a ball", metric)
 
 
 class StageClock:
-    """Milliseconds by stage of every frame."""
+    """Milliseconds by stage, of the last 10,000 frames."""
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self._clock = clock
-        self._frames: list[dict[str, float]] = []
+        self._frames: deque[dict[str, float]] = deque(maxlen=10_000)  # a camera may run for days
         self._now: dict[str, float] = {}
         self._started: dict[str, float] = {}
 
@@ -539,7 +559,8 @@ class TactileStream:
         realtime: play a recording at its own rate as if it were a camera. follow: follow slow drift of the light.
         time_constant_s: of following.
     Attributes:
-        calibration; told: what is to be known of it, in words; dropped: frames nobody took; stages: :class:`StageClock`;
+        calibration; told: what is to be known of it, in words; metric: whether depth is, as far as it knows;
+        dropped: frames nobody took; stages: :class:`StageClock`;
         light: :class:`FollowLight`; fps: rate of the source.
     Raises:
         ValueError, OSError: the source, or contact or changing light in the first frames; says which.
@@ -581,10 +602,8 @@ class TactileStream:
             self.rectify = Rectify(sensor, *self._waiting[0].shape[:2])
             rest = torch.cat([self.rectify(rgb_from_bgr(pixels)[None]) for pixels in self._waiting])
             image, noise = rest_image(rest)
-            if given is None:
-                self.calibration, self.told = calibrate_at_rest(image, sensor)
-            else:
-                self.calibration, self.told = given, f"calibration given: {given.report.get('reason', given.report.get('model'))}"
+            at_rest = calibrate_at_rest(image, sensor) if given is None else _given(given)
+            self.calibration, self.told, self.metric = at_rest
             value = self.calibration.background.float() ** (1.0 / self.calibration.sensor.exponent)
             self.light = FollowLight(value, time_constant_s)
             self.pipe = DepthPipeline.from_calibration(self.calibration, mode).float()
@@ -597,11 +616,6 @@ class TactileStream:
         except BaseException:
             self.reader.close()
             raise
-
-    @property
-    def metric(self) -> bool:
-        """Whether depth is in mm as far as the calibration knows."""
-        return "NOT METRIC" not in self.told
 
     @property
     def dropped(self) -> int:
@@ -739,7 +753,7 @@ class Overlay:
         metric: whether depth is in mm; if not, it says so.
     """
 
-    HEIGHT = 66
+    TEXT_HEIGHT = 86
 
     def __init__(self, metric: bool = True) -> None:
         import cv2
@@ -770,21 +784,25 @@ class Overlay:
         return picture
 
     def __call__(self, frame: TactileFrame, lines: Sequence[str] = ()) -> Pixels:
-        """The overlay, (H + 66, 2 W, 3) B, G, R, with up to three lines of text."""
+        """The overlay, B, G, R, with up to three lines of text under it; images narrower than 300 pixels are shown larger."""
         import cv2
 
         height, width = frame.image.shape[1:]
-        out = np.zeros((height + self.HEIGHT + (height + self.HEIGHT) % 2, 2 * width, 3), np.uint8)
-        out[:height, :width] = (frame.image.flip(0).permute(1, 2, 0) * 255.0 + 0.5).to(torch.uint8).numpy()
-        depth = self.depth(frame.output.depth_mm)
+        left = np.ascontiguousarray((frame.image.flip(0).permute(1, 2, 0) * 255.0 + 0.5).to(torch.uint8).numpy())
         contact = frame.output.contact[0, 0].numpy().view(np.uint8)
         if contact.any():
             smooth = (cv2.blur(contact * 255, (7, 7)) > 127).view(np.uint8)
             outline, _ = cv2.findContours(smooth, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-            cv2.drawContours(out[:height, :width], outline, -1, (255, 255, 255), 1, cv2.LINE_AA)
-        out[:height, width:] = depth
+            cv2.drawContours(left, outline, -1, (255, 255, 255), 1, cv2.LINE_AA)
+        right, larger = self.depth(frame.output.depth_mm), -(-300 // width)
+        height, width = height * larger, width * larger
+        out = np.zeros((height + self.TEXT_HEIGHT + height % 2, 2 * width, 3), np.uint8)
+        for picture, place in ((left, 0), (right, width)):
+            if larger > 1:
+                picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_NEAREST)
+            out[:height, place : place + width] = picture
         unit = "mm" if self.metric else "mm, NOT METRIC"
-        texts = [f"depth 0 to {self.range_mm:g} {unit}, a line each {self.range_mm / 10:g}", *lines][:3]
+        texts = [f"depth 0 to {self.range_mm:g} {unit}, a line each {self.range_mm / 10:g}", *lines][:4]
         for k, text in enumerate(texts):
             cv2.putText(out, text, (6, height + 18 + 20 * k), cv2.FONT_HERSHEY_SIMPLEX, 0.43, (230, 230, 230), 1, cv2.LINE_AA)
         return out
@@ -849,18 +867,20 @@ class StreamReport:
         self._pixel_mm2 = stream.calibration.sensor.mm_per_pixel**2
 
     def add(self, frame: TactileFrame) -> list[str]:
-        """Keep a frame's figures; returns them as two lines of text."""
+        """Keep a frame's figures; returns them as lines of text."""
         self._end = self._clock()
         area = float(frame.output.contact.sum()) * self._pixel_mm2
         deepest = float(frame.output.depth_mm.max())
         state = self.stream.light.state
         self.rows.append((frame.number, frame.time_s, area, deepest, state))
         dropped = f", {self.stream.dropped} dropped" if self.stream.dropped else ""
-        times = " ".join(f"{name} {ms:.1f}" for name, ms in self.stream.stages.last.items())
+        times = [f"{name} {ms:.1f}" for name, ms in self.stream.stages.last.items()]
+        half = (len(times) + 1) // 2
         light = "  LIGHT HAS CHANGED: start again without contact" if state == "stepped" else ""
         return [
             f"frame {frame.number}  {frame.time_s:.2f} s  contact {area:.1f} mm2  deepest {deepest:.2f}{light}",
-            f"{self.fps:.0f} fps{dropped}, ms: {times}",
+            f"{self.fps:.0f} fps{dropped}, ms: {' '.join(times[:half])}",
+            " ".join(times[half:]),
         ]
 
     @property

@@ -16,7 +16,7 @@ NAMES = [
     "fill_markers", "find_markers", "fit_lights", "fit_mlp", "fit_prior", "gradient_from_normal", "gs_sdk", "metrics",
     "near_field_shading", "normal_from_gradient", "poisson_dct", "poisson_dst", "poisson_rest", "read_image",
     "read_presses", "scenes",
-    "shipped_sensors", "write_image",
+    "shipped_sensors", "stream", "write_image",
 ]  # fmt: skip
 ARGUMENTS = {
     vts.Sensor: ["name", "height", "width", "mm_per_pixel"],

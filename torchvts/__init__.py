@@ -1,6 +1,6 @@
 """torchvts: camera images of visual-tactile sensors into depth, normals, contact and pose, as differentiable PyTorch modules."""
 
-from . import metrics, scenes
+from . import metrics, scenes, stream
 from .calibration import CalibrationWarning, LightFit, Press, Touch, calibrate, fit_lights, fit_prior, read_presses
 from .compensate import Compensate
 from .contact import ContactMask
@@ -58,5 +58,6 @@ __all__ = [
     "read_presses",
     "scenes",
     "shipped_sensors",
+    "stream",
     "write_image",
 ]

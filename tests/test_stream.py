@@ -1,0 +1,501 @@
+"""Streams: what is read, what is refused, what is dropped, how the light is followed, and what is left on disk."""
+
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import torchvts as vts
+from torchvts import stream as streams
+from torchvts.core.files import read_frames, rgb_from_bgr
+
+ROOT = Path(__file__).resolve().parents[1]
+PITCH = 0.25
+
+
+class Frames:
+    """A reader of pictures made up front."""
+
+    name, live, fps = "made up", False, 30.0
+
+    def __init__(self, pictures):
+        self._pictures = iter(pictures)
+
+    def read(self):
+        return next(self._pictures, None)
+
+    def close(self):
+        self._pictures = iter(())
+
+
+@pytest.fixture(scope="module")
+def unit(ring, small_sensor, small_press):
+    """A calibrated unit, and a camera: press in mm and brightness to a picture (H, W, 3) B, G, R, 8 bits, with noise."""
+    lights = ring()
+    rest = vts.scenes.render(vts.scenes.at_rest(small_press()), lights)
+    rendered = {0.0: rest} | {mm: vts.scenes.render(small_press(mm), lights) for mm in (0.5, 1.0)}
+    calibration = vts.Calibration.from_lights(lights, small_sensor, vts.scenes.render(vts.scenes.at_rest(small_press()), lights)[0])
+    seeds = itertools.count()
+
+    def camera(press_mm=0.0, brightness=1.0, noise=0.004):
+        generator = np.random.default_rng(next(seeds))
+        image = rendered[press_mm][0].permute(1, 2, 0).flip(2).numpy() * brightness
+        image = image + noise * generator.standard_normal(image.shape, dtype=np.float32)
+        return (image.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+
+    return calibration, camera
+
+
+def write_video(path, pictures, code="MJPG"):
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), 30.0, pictures[0].shape[1::-1])
+    for picture in pictures:
+        writer.write(picture)
+    writer.release()
+    return path
+
+
+@pytest.fixture(scope="module")
+def video(unit, tmp_path_factory):
+    """15 frames at rest, 10 pressed, 10 at rest."""
+    _, camera = unit
+    pictures = [camera(1.0 if 15 <= k < 25 else 0.0) for k in range(35)]
+    return write_video(tmp_path_factory.mktemp("video") / "press.avi", pictures)
+
+
+@pytest.mark.parametrize("region", ["corners", "roi", "none"])
+def test_rectify_equals_the_sensors(region):
+    options = {
+        "corners": {"corners_px": ((7, 6), (66, 12), (69, 40), (9, 45))},
+        "roi": {"roi_px": (4, 6, 60, 40)},
+        "none": {},
+    }[region]
+    size = (52, 76) if region == "none" else (48, 72)
+    sensor = vts.Sensor("rig", 48 if region != "none" else 52, 60 if region != "none" else 76, 0.1, **options)
+    frame = torch.rand(2, 3, *size, generator=torch.Generator().manual_seed(0))
+    assert (streams.Rectify(sensor, *size)(frame) - sensor.rectify(frame)).abs().max() < 1e-4
+
+
+def test_rectify_refuses_frames_of_another_size():
+    with pytest.raises(ValueError, match="the source has changed"):
+        streams.Rectify(vts.Sensor("rig", 24, 32, 0.1), 24, 32)(torch.zeros(1, 3, 48, 64))
+    with pytest.raises(ValueError, match="does not hold corners_px"):
+        streams.Rectify(vts.Sensor.load("gelsight_wedge"), 240, 320)
+
+
+@pytest.mark.parametrize(
+    "name, error, message",
+    [
+        ("none.avi", FileNotFoundError, "source: .*no such file or folder"),
+        ("text.txt", ValueError, "source: .*expected a video"),
+        ("empty", ValueError, "source: .*no images"),
+        ("damaged.avi", ValueError, "source: .*not a video"),
+    ],
+)
+def test_bad_sources_are_named(tmp_path, name, error, message):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "text.txt").write_text("no video")
+    (tmp_path / "damaged.avi").write_bytes(b"RIFF0000AVI ")
+    with pytest.raises(error, match=message):
+        streams.open_source(tmp_path / name)
+
+
+def test_a_missing_camera_is_named():
+    with pytest.raises(OSError, match="source: expected a camera with index 97"):
+        streams.open_source("97")
+
+
+def images(pictures):
+    return torch.stack([rgb_from_bgr(picture) for picture in pictures])
+
+
+def test_the_image_at_rest_is_the_mean_without_the_noise(unit):
+    calibration, camera = unit
+    image, noise = streams.rest_image(images([camera() for _ in range(12)]))
+    assert (image - calibration.background).abs().mean() < 0.0015
+    assert noise.mean() == pytest.approx(0.0042, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    "frames, message",
+    [
+        (lambda camera: [camera(0.0, 1.0 - 0.004 * k) for k in range(12)], "the light changes by"),
+        (lambda camera: [camera(0.5 if k > 8 else 0.0) for k in range(12)], "differs from the others"),
+        (lambda camera: [camera(1.0) for _ in range(12)], "a contact rests there"),
+        (lambda camera: [camera() for _ in range(2)], "at least 3 frames"),
+    ],
+)
+def test_first_frames_that_are_not_at_rest_are_refused(unit, frames, message):
+    _, camera = unit
+    with pytest.raises(ValueError, match=message):
+        streams.rest_image(images(frames(camera)))
+
+
+def check_press(stream, small_press):
+    frames = list(stream)
+    assert [frame.number for frame in frames] == list(range(35))
+    assert [bool(frame.output.contact.any()) for frame in frames] == [15 <= k < 25 for k in range(35)]
+    for frame in frames:
+        if not 15 <= frame.number < 25:
+            assert frame.output.depth_mm.abs().max() == 0
+    scene = small_press(1.0)
+    assert (frames[20].output.depth_mm - scene.depth_mm).abs().max() < 0.1
+    assert frames[20].time_s == pytest.approx(20 / 30)
+    assert stream.dropped == 0
+    return frames
+
+
+def test_a_video_gives_contact_and_depth(unit, video, small_press):
+    with streams.TactileStream(video, unit[0], mode="precise") as stream:
+        check_press(stream, small_press)
+    times = stream.stages.median_ms()
+    assert {"read", "rectify", "compensate", "contact", "normals", "gradient", "integrate"} <= set(times)
+    assert stream.metric
+
+
+def test_a_folder_gives_the_same_and_calibrates_itself(unit, small_sensor, small_press, tmp_path):
+    _, camera = unit
+    for k in range(35):
+        cv2.imwrite(str(tmp_path / f"{k:03d}.png"), camera(1.0 if 15 <= k < 25 else 0.0))
+    with streams.TactileStream(str(tmp_path), small_sensor, mode="precise") as stream:
+        assert "pins the lights" in stream.told and stream.metric
+        check_press(stream, small_press)
+
+
+def test_corners_are_rectified(unit, small_sensor, tmp_path):
+    calibration, camera = unit
+    corners = [(30, 20), (210, 35), (200, 150), (25, 170)]
+    target = np.float32([[0, 0], [159, 0], [159, 119], [0, 119]])
+    there = cv2.getPerspectiveTransform(target, np.float32(corners))
+    pictures = [cv2.warpPerspective(camera(1.0 if k >= 14 else 0.0), there, (240, 180)) for k in range(18)]
+    video = write_video(tmp_path / "slanted.avi", pictures)
+    calibration = replace(calibration, sensor=replace(calibration.sensor, corners_px=tuple(corners)))
+    with streams.TactileStream(video, replace(small_sensor, corners_px=tuple(corners))) as stream:
+        areas = [float(frame.output.contact.double().mean()) for frame in stream]
+    assert max(areas[:14]) == 0 and min(areas[14:]) > 0.05
+
+
+def test_a_given_calibration_is_held_against_the_first_frames(unit):
+    calibration, camera = unit
+    with pytest.raises(ValueError, match="first frames show contact"):
+        streams.TactileStream(Frames([camera(0.5) for _ in range(12)]), calibration)
+    with pytest.raises(ValueError, match="the light is 30% off"):
+        streams.TactileStream(Frames([camera(0.0, 0.7) for _ in range(12)]), calibration)
+    with streams.TactileStream(Frames([camera(0.0, 0.9) for _ in range(12)]), calibration) as stream:
+        assert stream.light.level == pytest.approx([0.9] * 3, abs=0.005)
+        assert not any(bool(frame.output.contact.any()) for frame in stream)
+    with pytest.raises(ValueError, match="background_frames: expected at least 12 frames from made up, got 4"):
+        streams.TactileStream(Frames([camera() for _ in range(4)]), calibration)
+    with pytest.raises(TypeError, match="sensor_or_calibration: expected a Sensor or a Calibration, got str"):
+        streams.TactileStream(Frames([]), "gelsight_mini")
+
+
+def dimming(k):
+    return 1.0 - 0.1 * min(1.0, max(0, k - 12) / 300)
+
+
+def test_slow_dimming_is_followed(unit, small_press):
+    calibration, camera = unit
+    truth = small_press(1.0)
+
+    def run(brightness, rest=300, pressed=5, follow=True):
+        pictures = (camera(1.0 if k >= 12 + rest else 0.0, brightness(k)) for k in range(12 + rest + pressed))
+        with streams.TactileStream(Frames(pictures), calibration, follow=follow) as stream:
+            frames = [(f.output.contact.any(), (f.output.depth_mm - truth.depth_mm).square().mean().sqrt()) for f in stream]
+        contact, errors = zip(*frames)
+        return any(contact[: 12 + rest]), sum(errors[12 + rest :]) / max(1, pressed), stream
+
+    _, still_error, _ = run(lambda k: 1.0, 3)
+    contact, error, stream = run(dimming)
+    assert not contact
+    assert error < 1.5 * still_error
+    assert stream.light.level == pytest.approx([0.9] * 3, abs=0.012) and stream.light.steps == 0
+
+
+def test_dimming_that_is_not_followed_would_pass_for_contact(unit):
+    calibration, camera = unit
+    pictures = (camera(0.0, 0.9 if k >= 12 else 1.0) for k in range(14))
+    with streams.TactileStream(Frames(pictures), calibration, follow=False) as stream:
+        assert [bool(f.output.contact.any()) for f in stream][-2:] == [True, True]
+
+
+def test_a_held_contact_does_not_fade(unit):
+    calibration, camera = unit
+    pictures = (camera(1.0 if k >= 15 else 0.0) for k in range(315))
+    with streams.TactileStream(Frames(pictures), calibration) as stream:
+        frames = [(float(f.output.depth_mm.max()), int(f.output.contact.sum())) for f in stream]
+    first, last = np.mean(frames[15:25], 0), np.mean(frames[-10:], 0)
+    assert last == pytest.approx(first, rel=0.01)
+    assert stream.light.level == pytest.approx([1.0] * 3, abs=0.003)
+
+
+def test_dimming_while_a_contact_is_held_is_followed_around_it(unit):
+    calibration, camera = unit
+    pictures = (camera(1.0 if k >= 15 else 0.0, dimming(k)) for k in range(300))
+    with streams.TactileStream(Frames(pictures), calibration) as stream:
+        frames = [(float(f.output.depth_mm.max()), int(f.output.contact.sum())) for f in stream]
+    first, last = np.mean(frames[15:25], 0), np.mean(frames[-10:], 0)
+    assert last == pytest.approx(first, rel=0.03)
+
+
+def test_a_sudden_step_is_told_and_not_learned(unit):
+    calibration, camera = unit
+    pictures = (camera(0.0, 0.92 if 20 <= k < 80 else 1.0) for k in range(100))
+    with streams.TactileStream(Frames(pictures), calibration) as stream:
+        report = streams.StreamReport(stream)
+        states = []
+        for frame in stream:
+            lines = report.add(frame)
+            states.append(stream.light.state)
+            assert ("LIGHT HAS CHANGED" in lines[0]) == (stream.light.state == "stepped")
+    assert states == ["following"] * 20 + ["stepped"] * 60 + ["following"] * 20
+    assert stream.light.level == pytest.approx([1.0] * 3, abs=0.003)
+    assert stream.light.steps == 1 and "stepped 1 times" in report.table()
+
+
+def test_printed_markers_do_not_pass_for_other_light(unit, small_sensor):
+    calibration, camera = unit
+    dots = torch.ones(120, 160)
+    for y, x in itertools.product(range(10, 120, 20), range(10, 160, 20)):
+        dots[y - 2 : y + 3, x - 2 : x + 3] = 0.2
+    marked = replace(small_sensor, markers=True)
+    known = vts.Calibration.from_lights(calibration.lights, marked, calibration.background * dots)
+    assert known.markers is not None
+    pictures = ((camera(1.0 if k >= 14 else 0.0) * dots[..., None].numpy()).astype(np.uint8) for k in range(20))
+    with streams.TactileStream(Frames(pictures), known) as stream:
+        contact = [bool(frame.output.contact.any()) for frame in stream]
+    assert contact == [False] * 14 + [True] * 6
+    assert stream.light.level == pytest.approx([1.0] * 3, abs=0.01) and stream.light.state == "following"
+
+
+class Scripted:
+    """A camera that gives a frame each time the test lets it; ``asked`` counts how often it was asked."""
+
+    name, live, fps = "scripted", True, 30.0
+
+    def __init__(self, error=None):
+        self.allowed, self.asked = threading.Semaphore(0), threading.Semaphore(0)
+        self.error, self.count, self.closed = error, 0, False
+
+    def read(self):
+        self.asked.release()
+        self.allowed.acquire()
+        if self.error is not None:
+            raise self.error
+        self.count += 1
+        return np.full((2, 2, 3), self.count, np.uint8)
+
+    def give(self, frames):
+        for _ in range(frames):
+            self.allowed.release()
+            self.asked.acquire()  # asked for the next one: this one is laid down
+
+    def close(self):
+        self.closed = True
+
+
+def test_who_comes_late_finds_only_the_newest_frame():
+    reader = Scripted()
+    newest = streams.NewestFrame(reader)
+    reader.asked.acquire()
+    for number in range(3):  # fast: each frame is taken before the next
+        reader.give(1)
+        assert newest.take()[0] == number
+    assert newest.dropped == 0
+    reader.give(4)  # slow: four come meanwhile
+    number, _, pixels = newest.take()
+    assert (number, int(pixels[0, 0, 0]), newest.dropped) == (6, 7, 3)
+    newest._stop.set()
+    reader.allowed.release()
+    newest.close()
+    assert reader.closed and not newest._thread.is_alive()
+
+
+def test_what_the_reader_raises_reaches_who_takes():
+    reader = Scripted(OSError("unplugged"))
+    reader.allowed.release()
+    newest = streams.NewestFrame(reader)
+    with pytest.raises(OSError, match="unplugged"):
+        newest.take()
+    newest.close()
+
+
+def test_a_recording_is_played_at_its_rate():
+    now, waits = [0.0], []
+
+    def sleep(seconds):
+        waits.append(seconds)
+        now[0] += seconds
+
+    newest = streams.NewestFrame(Frames([np.zeros((2, 2, 3), np.uint8)] * 5), 10.0, lambda: now[0], sleep)
+    newest._thread.join()
+    assert waits == pytest.approx([0.1] * 4)
+    assert newest.take()[:2] == (4, pytest.approx(0.4)) and newest.dropped == 4
+    assert newest.take() is None
+    newest.close()
+
+
+def test_realtime_takes_every_frame_where_there_is_time(unit):
+    calibration, camera = unit
+    with streams.TactileStream(Frames([camera() for _ in range(16)]), calibration, realtime=True) as stream:
+        numbers = [frame.number for frame in stream]
+    assert numbers == sorted(set(numbers)) and numbers[-1] == 15
+    assert len(numbers) + stream.dropped == 16
+    assert not any(thread.name == "torchvts-reader" for thread in threading.enumerate())
+
+
+def test_stage_times_are_those_of_the_clock():
+    ticks = itertools.count()
+    stages = streams.StageClock(lambda: next(ticks) * 0.001)
+    for _ in range(2):
+        with stages.stage("read"):
+            next(ticks)
+        with stages.stage("read"):
+            pass
+        stages.end_frame()
+    assert stages.median_ms() == pytest.approx({"read": 3.0}) and stages.last == pytest.approx({"read": 3.0})
+
+
+@pytest.mark.parametrize("suffix", [".avi", ".mp4"])
+def test_a_video_file_is_whole_or_not_there(tmp_path, suffix):
+    path = tmp_path / f"out{suffix}"
+    picture = np.zeros((32, 64, 3), np.uint8)
+    with pytest.raises(RuntimeError), streams.VideoFile(path, 30.0) as video:
+        video.write(picture)
+        raise RuntimeError("in the middle")
+    assert list(tmp_path.iterdir()) == []
+    with streams.VideoFile(path, 30.0) as video:
+        pass
+    assert list(tmp_path.iterdir()) == []
+    with streams.VideoFile(path, 30.0) as video:
+        for _ in range(3):
+            video.write(picture)
+        assert not path.exists()
+    assert len(list(read_frames(path))) == 3
+    with pytest.raises(ValueError, match=r"video: expected a name ending in .mp4 or .avi, got 'a.gif'"):
+        streams.VideoFile(tmp_path / "a.gif", 30.0)
+
+
+def test_the_overlay_shows_contours_and_grows_its_range(unit, small_press):
+    scene = small_press(1.0)
+    output = vts.DepthOutput(scene.depth_mm, scene.gradient, scene.normal, scene.contact)
+    overlay = streams.Overlay(metric=False)
+    picture = overlay(streams.TactileFrame(0, 0.0, torch.zeros(3, 120, 160), output), ["one", "two"])
+    assert picture.shape == (240 + 86, 640, 3) and picture.dtype == np.uint8
+    assert overlay.range_mm == pytest.approx(1.0)
+    inside = scene.contact[0, 0].numpy()
+    ys, xs = np.nonzero((picture[:240:2, :320:2] > 128).all(2))  # shown twice as large
+    ramp = torch.linspace(0.0, 1.0, 160).expand(1, 1, 40, -1)
+    row = (overlay.depth(ramp)[20] == 255).all(1)
+    assert 9 <= int(row.sum()) <= 11  # ten lines fill the range
+    assert len(ys) > 50 and abs(np.hypot(ys - 59.5, xs - 79.5) - np.sqrt(inside.sum() / np.pi)).max() < 3
+
+
+def test_lights_that_do_not_fit_the_image_give_only_their_directions(ring, small_press):
+    lights, scene = ring(60.0, 60.0), small_press(0.5)
+    sensor = vts.Sensor("rig", 120, 160, PITCH, light_position_mm=tuple(map(tuple, lights.position_mm.tolist())))
+    x = torch.linspace(-1.0, 1.0, 160)
+    uneven = torch.stack((0.6 + 0.4 * x, 0.6 - 0.4 * x, 0.5 + 0.4 * (1 - x**2)))[None, :, None]  # lamps that spread badly
+    rest, image = (vts.scenes.render(s, lights) * uneven for s in (vts.scenes.at_rest(scene), scene))
+    calibration, told, metric = streams.calibrate_at_rest(rest[0], sensor)
+    assert calibration.report["response"] == "stand-in" and "NOT METRIC" in told and not metric
+    out = vts.DepthPipeline.from_calibration(calibration)(image)
+    assert float(out.depth_mm.max()) == pytest.approx(0.5, rel=0.25)
+    even, _, metric = streams.calibrate_at_rest(vts.scenes.render(vts.scenes.at_rest(scene), lights)[0], sensor)
+    assert even.lights is not None and not metric
+
+
+def test_a_window_shows_until_it_is_closed(monkeypatch):
+    import matplotlib.pyplot as plt
+
+    monkeypatch.setattr(plt, "pause", lambda _: None)
+    monkeypatch.setattr(plt, "ion", lambda: None)
+    plt.switch_backend("agg")
+    window = streams.Window()
+    picture = np.zeros((8, 12, 3), np.uint8)
+    assert window.show(picture) and window.show(picture + 1)
+    plt.close("torchvts")
+    assert not window.show(picture)
+
+
+def test_without_a_screen_there_is_no_display(monkeypatch):
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert not streams.has_display()
+
+
+def script(*arguments):
+    return [sys.executable, "scripts/stream.py", *map(str, arguments)]
+
+
+ENVIRONMENT = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+
+
+def test_the_script_writes_overlay_summary_and_frames(unit, video, tmp_path):
+    calibration, _ = unit
+    calibration.save(tmp_path / "unit.safetensors")
+    command = script("--source", video, "--calibration", tmp_path / "unit.safetensors", "--out", tmp_path / "out", "--video", "avi")
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=ENVIRONMENT, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert "35 frames, 0 dropped" in done.stdout and "| integrate |" in done.stdout and "no display: no live view" in done.stdout
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["frames"] == 35 and summary["contact_frames"] == 10 and summary["deepest_mm"] == pytest.approx(1.0, abs=0.1)
+    assert {"read", "draw", "write", "contact"} <= set(summary["stages_ms"])
+    assert len((tmp_path / "out" / "frames.csv").read_text().splitlines()) == 36
+    assert len(list(read_frames(tmp_path / "out" / "overlay.avi"))) == 35
+
+
+def test_bad_arguments_are_refused_in_a_sentence(video, tmp_path):
+    for arguments, part in (
+        (["--source", tmp_path / "none.avi", "--sensor", "tacto"], "source: "),
+        (["--source", video, "--sensor", "gelsight_wedge", "--corners", "1 2 3"], "corners: expected eight numbers"),
+    ):
+        done = subprocess.run(script(*arguments), capture_output=True, text=True, cwd=ROOT, env=ENVIRONMENT, timeout=120)
+        assert done.returncode == 1 and done.stderr.startswith("error: ") and part in done.stderr, done.stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGINT], ids=["killed", "interrupted"])
+def test_ended_in_the_middle(unit, tmp_path, end):
+    calibration, camera = unit
+    calibration.save(tmp_path / "unit.safetensors")
+    video = write_video(tmp_path / "long.avi", [camera() for _ in range(20)] * 15)  # ten seconds
+    command = script("--source", video, "--calibration", tmp_path / "unit.safetensors", "--out", tmp_path / "out", "--realtime")
+    process = subprocess.Popen([*command, "--video", "avi"], stdout=subprocess.PIPE, cwd=ROOT, env=ENVIRONMENT, text=True)
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and not any(p.stat().st_size > 20_000 for p in (tmp_path / "out").glob(".overlay*")):
+        time.sleep(0.05)
+    process.send_signal(end)
+    output, _ = process.communicate(timeout=60)
+    final = tmp_path / "out" / "overlay.avi"
+    if end == signal.SIGKILL:
+        assert not final.exists()
+        return
+    assert process.returncode == 0 and "interrupted" in output
+    frames = len(list(read_frames(final)))
+    assert 0 < frames < 300
+    assert not list((tmp_path / "out").glob(".overlay*"))
+    assert (tmp_path / "out" / "summary.json").is_file()
+
+
+def test_the_golf_ball_appears_and_vanishes(data):
+    video = data / "wedge_video" / "golf_ball.avi"
+    with streams.TactileStream(video, vts.Sensor.load("gelsight_wedge")) as stream:
+        assert "NOT METRIC" in stream.told
+        rows = [(float(f.output.depth_mm.abs().max()), int(f.output.contact.sum())) for f in stream]
+    assert len(rows) == 63
+    assert max(rows[:12]) == (0.0, 0)  # before
+    assert min(depth for depth, _ in rows[25:40]) > 0.5 and min(area for _, area in rows[25:40]) > 20_000
+    assert max(depth for depth, _ in rows[-6:]) < 0.02 and max(area for _, area in rows[-6:]) < 200  # after
+    assert stream.light.steps == 0

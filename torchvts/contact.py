@@ -34,6 +34,9 @@ def reconstruct(seed: Tensor, mask: Tensor) -> Tensor:
         [True, True, False, False]
     """
     reached = seed & mask
+    if not torch.jit.is_scripting():  # noqa: SIM102
+        if torch.compiler.is_exporting():
+            return _reconstruct_in_graph(reached, mask)
     before = 0
     count = int(reached.sum())
     while count > before:
@@ -41,6 +44,23 @@ def reconstruct(seed: Tensor, mask: Tensor) -> Tensor:
             reached = _sweep(_sweep(reached, mask, dim).flip(dim), mask.flip(dim), dim).flip(dim)
         before, count = count, int(reached.sum())
     return reached
+
+
+def _reconstruct_in_graph(reached: Tensor, mask: Tensor) -> Tensor:
+    """The loop of :func:`reconstruct` as one operator of the graph, for torch.export."""
+    from torch._higher_order_ops.while_loop import while_loop
+
+    def gained(reached: Tensor, before: Tensor) -> Tensor:
+        return (reached != before).any()
+
+    def sweep_all(reached: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
+        grown = reached
+        for dim in (2, 3):
+            grown = _sweep(_sweep(grown, mask, dim).flip(dim), mask.flip(dim), dim).flip(dim)
+        return grown.contiguous(), reached.clone()
+
+    found: Tensor = while_loop(gained, sweep_all, (reached.contiguous(), torch.zeros_like(reached)))[0]
+    return found
 
 
 def _sweep(reached: Tensor, mask: Tensor, dim: int) -> Tensor:

@@ -7,9 +7,9 @@ from torch import Tensor, nn
 
 from .compensate import Compensate
 from .contact import ContactMask
-from .core.checks import check_batch, check_range
+from .core.checks import check_batch, check_range, may_read_values
 from .core.geometry import GradientFromNormal, normal_from_gradient
-from .integration import PoissonRest, poisson_rest
+from .integration import PoissonRest
 from .normals import NormalFromIntensity, NormalFromResponse
 from .record import Calibration
 
@@ -85,6 +85,7 @@ class DepthPipeline(nn.Module):
         coarse = getattr(normals, "coarse", None)
         self.foresees = self.skips and self.refines and callable(coarse)
         self.coarse_normals = coarse(8) if self.foresees and callable(coarse) else nn.Identity()
+        self.coarse_integrate = PoissonRest(8 * mm_per_pixel) if self.foresees else nn.Identity()
 
     @classmethod
     def from_calibration(
@@ -133,7 +134,7 @@ class DepthPipeline(nn.Module):
                 check_range("images", images)
         compensated = self.compensate(images)
         contact = self.contact(compensated)
-        if self.skips:  # noqa: SIM102
+        if self.skips and may_read_values():  # noqa: SIM102
             if not bool(contact.any()):
                 return _no_contact(compensated, contact)
         gradient = self.gradient(self.normals(compensated)) * contact
@@ -148,6 +149,9 @@ class DepthPipeline(nn.Module):
     def _refine(
         self, compensated: Tensor, contact: Tensor, gradient: Tensor, depth: Tensor, active: Tensor
     ) -> tuple[Tensor, Tensor]:
+        if not torch.jit.is_scripting():  # noqa: SIM102
+            if torch.compiler.is_exporting():
+                return self._refine_in_graph(compensated, contact, gradient, depth, active)
         last_px = depth.detach().abs().amax(dim=(1, 2, 3)) / self.mm_per_pixel
         for _ in range(1, self.max_passes):
             if not bool(active.any()):
@@ -163,13 +167,41 @@ class DepthPipeline(nn.Module):
             last_px = last_px.index_copy(0, index, change_px)
         return gradient, depth
 
+    def _refine_in_graph(
+        self, compensated: Tensor, contact: Tensor, gradient: Tensor, depth: Tensor, active: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """:meth:`_refine` for torch.export: the loop as one operator, settled frames computed along and left as they are."""
+        from torch._higher_order_ops.while_loop import while_loop
+
+        def unsettled(step: Tensor, gradient: Tensor, depth: Tensor, active: Tensor, last_px: Tensor) -> Tensor:
+            return active.any() & (step < self.max_passes)
+
+        def go_again(step: Tensor, gradient: Tensor, depth: Tensor, active: Tensor, last_px: Tensor) -> tuple[Tensor, ...]:
+            part = self.gradient(self.normals(compensated, depth)) * contact
+            found = self.integrate(part)
+            change_px = (found - depth).abs().amax(dim=(1, 2, 3)) / self.mm_per_pixel
+            ratio = (change_px / last_px.clamp_min(1e-12)).clamp(0.0, 0.9)
+            left = active & (change_px * ratio / (1.0 - ratio) > self.tolerance_px)
+            frame = active[:, None, None, None]
+            gradient, depth = torch.where(frame, part, gradient), torch.where(frame, found, depth)
+            return step + 1, gradient.contiguous(), depth.contiguous(), left, torch.where(active, change_px, last_px)
+
+        last_px = depth.abs().amax(dim=(1, 2, 3)) / self.mm_per_pixel
+        step = torch.ones((), dtype=torch.int64, device=depth.device)
+        state = (step, gradient.contiguous(), depth.contiguous(), active, last_px)
+        if self.max_passes == 2:  # one pass needs no loop, and stays differentiable
+            state = go_again(*state)
+        elif self.max_passes > 2:
+            state = while_loop(unsettled, go_again, state)
+        return state[1], state[2]
+
     def _foreseen_px(self, compensated: Tensor, contact: Tensor, depth: Tensor) -> Tensor:
         """Largest change of depth that a second pass would bring, per frame (B,), from every eighth pixel."""
         image = compensated.detach()[:, :, 4::8, 4::8]
         z = depth.detach()[:, :, 4::8, 4::8]
         inside = contact[:, :, 4::8, 4::8]
         change = self.gradient(self.coarse_normals(image, z)) - self.gradient(self.coarse_normals(image))
-        return poisson_rest(change * inside, 8 * self.mm_per_pixel).abs().amax(dim=(1, 2, 3)) / self.mm_per_pixel
+        return self.coarse_integrate(change * inside).abs().amax(dim=(1, 2, 3)) / self.mm_per_pixel
 
     def extra_repr(self) -> str:
         return f"mode={self.mode}, mm_per_pixel={self.mm_per_pixel}"

@@ -45,6 +45,14 @@ def check_same_size(name: str, tensor: Tensor, other_name: str, height: int, wid
         )
 
 
+def may_read_values() -> bool:
+    """Whether Python may decide by the values of tensors: always, but while torch.export traces. Scripts."""
+    if torch.jit.is_scripting():
+        return True
+    else:  # noqa: RET505, TorchScript leaves out the other branch only so
+        return not torch.compiler.is_exporting()
+
+
 def check_image(name: str, image: Tensor, height: int, width: int, sensor_name: str) -> None:
     """Raise unless ``image`` is one finite (3, ``height``, ``width``) image in [0, 1]."""
     if not isinstance(image, Tensor):

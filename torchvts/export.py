@@ -5,6 +5,7 @@ Every file takes images (B, 3, H, W) of the pipeline's size, any B, and gives de
 
 import copy
 import json
+import math
 import shutil
 import subprocess
 import sys
@@ -21,9 +22,11 @@ import torch
 from torch import Tensor, nn
 
 from .core.files import write_atomically
+from .core.geometry import pixel_grid_mm
 from .integration import PoissonDCT, PoissonRest, divergence
 from .integration.transforms import cosine_bases, fold, unfold
 from .pipeline import DepthPipeline
+from .record import Calibration
 
 METADATA_KEY = "torchvts"
 """Under this name the files keep what they are, as JSON: :func:`describe`."""
@@ -174,10 +177,17 @@ def export_aoti(pipe: DepthPipeline, path: str | Path) -> Path:
     if path.suffix != ".pt2":
         raise ValueError(f"path: expected a name ending in .pt2, got {path}: AOTInductor packages have no other")
     program = _trace(pipe, by_matrix=True)
-    settings = {"aot_inductor.metadata": {METADATA_KEY: json.dumps(describe(pipe))}}
+    settings: dict[str, Any] = {"aot_inductor.metadata": {METADATA_KEY: json.dumps(describe(pipe))}}
     with warnings.catch_warnings(), write_atomically(path) as temporary:
         warnings.simplefilter("ignore")
-        torch._inductor.aoti_compile_and_package(program, package_path=str(temporary), inductor_configs=settings)
+        try:
+            torch._inductor.aoti_compile_and_package(program, package_path=str(temporary), inductor_configs=settings)
+        except Exception as error:
+            if "CppCompileError" not in str(error):
+                raise
+            # Inductor (torch 2.13) writes some vectors of bool that no compiler takes: without vectors it is slower and right
+            settings = settings | {"cpp.simdlen": 1}
+            torch._inductor.aoti_compile_and_package(program, package_path=str(temporary), inductor_configs=settings)
     return path
 
 
@@ -253,6 +263,28 @@ def missing(name: str) -> str:
         if not compiler or shutil.which(compiler) is None:
             return f"aoti: expected a C++ compiler, got none ({reason}): install g++ or clang++, or set CXX"
     return ""
+
+
+def sample_frames(calibration: Calibration, seed: int = 0) -> Tensor:
+    """Four frames of a unit to compare exports on, (4, 3, H, W), 8 bits with noise: touched, at rest, touched twice, all random."""
+    random = torch.Generator().manual_seed(seed)
+    height, width, pitch = calibration.sensor.height, calibration.sensor.width, calibration.sensor.mm_per_pixel
+    x, y = pixel_grid_mm(height, width, pitch)
+    reach = 0.12 * min(height, width) * pitch
+    at_rest = calibration.background.detach().float().clamp(0.0, 1.0) ** (1.0 / calibration.sensor.exponent)
+    frames = []
+    for touches in (1, 0, 2):
+        change = torch.zeros_like(at_rest)
+        for _ in range(touches):
+            x_0, y_0 = (0.5 * (torch.rand(2, generator=random) - 0.5) * torch.tensor([width, height]) * pitch).tolist()
+            u, v = (x - x_0) / reach, (y - y_0) / reach
+            for j in range(3):  # each light from its side, as on a ball
+                angle = 2.0 * math.pi * j / 3.0
+                change[j] += 0.6 * (math.cos(angle) * u + math.sin(angle) * v) * torch.exp(-(u * u + v * v) ** 2)
+        frames.append(at_rest * (1.0 + change) + 0.004 * torch.randn(at_rest.shape, generator=random))
+    frames.append(torch.rand(at_rest.shape, generator=random))
+    images = (torch.stack(frames).clamp(0.0, 1.0) * 255.0).round() / 255.0
+    return images.to(calibration.background.dtype)
 
 
 @dataclass(frozen=True)

@@ -202,7 +202,9 @@ def test_errors_are_sentences(low, tmp_path, monkeypatch):
 
 
 def call(*arguments):
-    return subprocess.run([sys.executable, *map(str, arguments)], capture_output=True, text=True, cwd=ROOT, timeout=300, check=False)
+    return subprocess.run(
+        [sys.executable, *map(str, arguments)], capture_output=True, text=True, cwd=ROOT, timeout=300, check=False
+    )
 
 
 def test_the_script(low, tmp_path):

@@ -59,7 +59,8 @@ def _reconstruct_in_graph(reached: Tensor, mask: Tensor) -> Tensor:
             grown = _sweep(_sweep(grown, mask, dim).flip(dim), mask.flip(dim), dim).flip(dim)
         return grown.contiguous(), reached.clone()
 
-    found: Tensor = while_loop(gained, sweep_all, (reached.contiguous(), torch.zeros_like(reached)))[0]
+    start = (reached.contiguous(), torch.zeros_like(reached))
+    found: Tensor = while_loop(gained, sweep_all, start)[0]  # type: ignore[no-untyped-call]
     return found
 
 

@@ -155,7 +155,8 @@ def export_program(pipe: DepthPipeline, path: str | Path | None = None) -> torch
     if path is not None:
         with write_atomically(path) as temporary, warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            torch.export.save(program, temporary, extra_files={f"{METADATA_KEY}.json": json.dumps(describe(pipe))})
+            said = {f"{METADATA_KEY}.json": json.dumps(describe(pipe))}
+            torch.export.save(program, temporary, extra_files=said)  # type: ignore[no-untyped-call]
     return program
 
 
@@ -280,7 +281,7 @@ def sample_frames(calibration: Calibration, seed: int = 0) -> Tensor:
             u, v = (x - x_0) / reach, (y - y_0) / reach
             for j in range(3):  # each light from its side, as on a ball
                 angle = 2.0 * math.pi * j / 3.0
-                change[j] += 0.6 * (math.cos(angle) * u + math.sin(angle) * v) * torch.exp(-(u * u + v * v) ** 2)
+                change[j] += 0.6 * (math.cos(angle) * u + math.sin(angle) * v) * torch.exp(-((u * u + v * v) ** 2))
         frames.append(at_rest * (1.0 + change) + 0.004 * torch.randn(at_rest.shape, generator=random))
     frames.append(torch.rand(at_rest.shape, generator=random))
     images = (torch.stack(frames).clamp(0.0, 1.0) * 255.0).round() / 255.0
@@ -449,7 +450,7 @@ def _median(values: Tensor, dim: int, keepdim: bool = False) -> tuple[Tensor, Te
 
 
 def _nanmedian(values: Tensor, dim: int, keepdim: bool = False) -> tuple[Tensor, Tensor]:
-    known = values == values  # noqa: PLR0124, false for NaN
+    known = ~torch.isnan(values)
     ordered, index = torch.sort(torch.where(known, values, torch.inf), dim=dim)
     middle = ((known.to(torch.int64).sum(dim, keepdim=True) - 1) // 2).clamp_min(0)
     ordered, index = ordered.gather(dim, middle), index.gather(dim, middle)

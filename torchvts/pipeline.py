@@ -85,7 +85,7 @@ class DepthPipeline(nn.Module):
         coarse = getattr(normals, "coarse", None)
         self.foresees = self.skips and self.refines and callable(coarse)
         self.coarse_normals = coarse(8) if self.foresees and callable(coarse) else nn.Identity()
-        self.coarse_integrate = PoissonRest(8 * mm_per_pixel) if self.foresees else nn.Identity()
+        self.coarse_integrate: nn.Module = PoissonRest(8 * mm_per_pixel) if self.foresees else nn.Identity()
 
     @classmethod
     def from_calibration(
@@ -188,11 +188,11 @@ class DepthPipeline(nn.Module):
 
         last_px = depth.abs().amax(dim=(1, 2, 3)) / self.mm_per_pixel
         step = torch.ones((), dtype=torch.int64, device=depth.device)
-        state = (step, gradient.contiguous(), depth.contiguous(), active, last_px)
+        state: tuple[Tensor, ...] = (step, gradient.contiguous(), depth.contiguous(), active, last_px)
         if self.max_passes == 2:  # one pass needs no loop, and stays differentiable
             state = go_again(*state)
         elif self.max_passes > 2:
-            state = while_loop(unsettled, go_again, state)
+            state = while_loop(unsettled, go_again, state)  # type: ignore[no-untyped-call]
         return state[1], state[2]
 
     def _foreseen_px(self, compensated: Tensor, contact: Tensor, depth: Tensor) -> Tensor:
@@ -201,7 +201,8 @@ class DepthPipeline(nn.Module):
         z = depth.detach()[:, :, 4::8, 4::8]
         inside = contact[:, :, 4::8, 4::8]
         change = self.gradient(self.coarse_normals(image, z)) - self.gradient(self.coarse_normals(image))
-        return self.coarse_integrate(change * inside).abs().amax(dim=(1, 2, 3)) / self.mm_per_pixel
+        change_mm: Tensor = self.coarse_integrate(change * inside)
+        return change_mm.abs().amax(dim=(1, 2, 3)) / self.mm_per_pixel
 
     def extra_repr(self) -> str:
         return f"mode={self.mode}, mm_per_pixel={self.mm_per_pixel}"

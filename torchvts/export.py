@@ -38,7 +38,7 @@ MAX_BATCH = 1024
 
 
 class PoissonRestByMatrix(nn.Module):
-    """:class:`PoissonRest` for one size, by matrix products alone: ONNX Runtime and Inductor generate no code for the FFT.
+    """:class:`PoissonRest` for one size, by matrix products alone: ONNX has no such FFT.
 
     Args:
         height, width: pixels. mm_per_pixel: pixel pitch, mm.
@@ -134,7 +134,8 @@ def export_torchscript(pipe: DepthPipeline, path: str | Path) -> Path:
     with warnings.catch_warnings(), write_atomically(path) as temporary:
         warnings.simplefilter("ignore")  # that TorchScript is deprecated
         scripted = torch.jit.script(copy.deepcopy(pipe))
-        scripted.save(str(temporary), _extra_files={f"{METADATA_KEY}.json": json.dumps(describe(pipe))})
+        said = {f"{METADATA_KEY}.json": json.dumps(describe(pipe))}
+        scripted.save(str(temporary), _extra_files=said)  # type: ignore[no-untyped-call]
     return path
 
 
@@ -156,7 +157,7 @@ def export_program(pipe: DepthPipeline, path: str | Path | None = None) -> torch
         with write_atomically(path) as temporary, warnings.catch_warnings():
             warnings.simplefilter("ignore")
             said = {f"{METADATA_KEY}.json": json.dumps(describe(pipe))}
-            torch.export.save(program, temporary, extra_files=said)  # type: ignore[no-untyped-call]
+            torch.export.save(program, temporary, extra_files=said)
     return program
 
 
@@ -177,7 +178,7 @@ def export_aoti(pipe: DepthPipeline, path: str | Path) -> Path:
         raise RuntimeError(complaint)
     if path.suffix != ".pt2":
         raise ValueError(f"path: expected a name ending in .pt2, got {path}: AOTInductor packages have no other")
-    program = _trace(pipe, by_matrix=True)
+    program = _trace(pipe, by_matrix=False)
     settings: dict[str, Any] = {"aot_inductor.metadata": {METADATA_KEY: json.dumps(describe(pipe))}}
     with warnings.catch_warnings(), write_atomically(path) as temporary:
         warnings.simplefilter("ignore")

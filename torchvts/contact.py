@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from .core.checks import QUANTISATION_STD, check_batch, check_positive, check_same_size
+from .core.checks import QUANTISATION_STD, check_batch, check_positive, check_same_size, may_read_values
 from .core.noise import noise_std as frame_noise_std
 from .record import Calibration
 
@@ -37,12 +37,33 @@ def reconstruct(seed: Tensor, mask: Tensor) -> Tensor:
         [True, True, False, False]
     """
     reached = seed & mask
+    if not torch.jit.is_scripting():  # noqa: SIM102
+        if torch.compiler.is_exporting():
+            return _reconstruct_in_graph(reached, mask)
     gained = bool(reached.any())
     while gained:
         for dim in (2, 3):
             reached = _sweep(reached, mask, dim)
         gained = bool((_dilate_cross(reached) & mask & ~reached).any())
     return reached
+
+
+def _reconstruct_in_graph(reached: Tensor, mask: Tensor) -> Tensor:
+    """The loop of :func:`reconstruct` as one operator of the graph, for torch.export."""
+    from torch._higher_order_ops.while_loop import while_loop
+
+    def gained(reached: Tensor, before: Tensor) -> Tensor:
+        return (reached != before).any()
+
+    def sweep_all(reached: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
+        grown = reached
+        for dim in (2, 3):
+            grown = _sweep(grown, mask, dim)
+        return grown.contiguous(), reached.clone()
+
+    start = (reached.contiguous(), torch.zeros_like(reached))
+    found: Tensor = while_loop(gained, sweep_all, start)[0]  # type: ignore[no-untyped-call]
+    return found
 
 
 def _sweep(reached: Tensor, mask: Tensor, dim: int) -> Tensor:
@@ -70,6 +91,9 @@ def _dilate_cross(mask: Tensor) -> Tensor:
 
 def _dilate(mask: Tensor) -> Tensor:
     """3 x 3 dilation of a bool mask; equal to kornia.morphology.dilation (a test holds them together), 30 times faster."""
+    if not torch.jit.is_scripting():  # noqa: SIM102
+        if torch.compiler.is_exporting():  # slices of bool that are written to do not compile in Inductor (torch 2.13)
+            return nn.functional.max_pool2d(mask.to(torch.float32), 3, 1, 1) > 0
     grown = mask.clone()
     grown[..., 1:].logical_or_(mask[..., :-1])
     grown[..., :-1].logical_or_(mask[..., 1:])
@@ -165,7 +189,7 @@ class ContactMask(nn.Module):
         faint = (mean / torch.maximum(spread, least)[..., None, None]).square().sum(1, keepdim=True) > self.sigmas * self.sigmas
         faint = faint & ~any_strong  # where single pixels stand out, as at a rim, they decide
         cells = any_strong | faint
-        if not bool(cells.any()):
+        if may_read_values() and not bool(cells.any()):
             return strong, strong
         border = torch.ones_like(cells)
         border[..., 1:-1, 1:-1] = False

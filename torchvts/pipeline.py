@@ -93,7 +93,7 @@ class DepthPipeline(nn.Module):
         coarse = getattr(normals, "coarse", None)
         self.foresees = self.skips and self.refines and self.windows and callable(coarse)
         self.coarse_normals = coarse(self.stride) if self.foresees and callable(coarse) else nn.Identity()
-        self.coarse_integrate = PoissonRest(self.stride * mm_per_pixel) if self.foresees else nn.Identity()
+        self.coarse_integrate: nn.Module = PoissonRest(self.stride * mm_per_pixel) if self.foresees else nn.Identity()
 
     @classmethod
     def from_calibration(
@@ -182,6 +182,9 @@ class DepthPipeline(nn.Module):
     def _refine(
         self, seen: Tensor, touched: Tensor, gradient: Tensor, depth: Tensor, active: Tensor, window: tuple[int, int]
     ) -> tuple[Tensor, Tensor]:
+        if not torch.jit.is_scripting():  # noqa: SIM102
+            if torch.compiler.is_exporting():
+                return self._refine_in_graph(seen, touched, gradient, depth, active, (depth.shape[2], depth.shape[3]))
         last_px = depth.detach().abs().amax(dim=(1, 2, 3)) / self.mm_per_pixel
         size = (depth.shape[2], depth.shape[3])
         top, left = window
@@ -199,6 +202,33 @@ class DepthPipeline(nn.Module):
             active = active.index_copy(0, index, change_px * ratio / (1.0 - ratio) > self.tolerance_px)
             last_px = last_px.index_copy(0, index, change_px)
         return gradient, depth
+
+    def _refine_in_graph(
+        self, seen: Tensor, touched: Tensor, gradient: Tensor, depth: Tensor, active: Tensor, size: tuple[int, int]
+    ) -> tuple[Tensor, Tensor]:
+        """:meth:`_refine` for torch.export: the loop as one operator, settled frames computed along and left as they are."""
+        from torch._higher_order_ops.while_loop import while_loop
+
+        def unsettled(step: Tensor, gradient: Tensor, depth: Tensor, active: Tensor, last_px: Tensor) -> Tensor:
+            return active.any() & (step < self.max_passes)
+
+        def go_again(step: Tensor, gradient: Tensor, depth: Tensor, active: Tensor, last_px: Tensor) -> tuple[Tensor, ...]:
+            part, found = self._solve(seen, depth, touched, (0, 0), size)
+            change_px = (found - depth).abs().amax(dim=(1, 2, 3)) / self.mm_per_pixel
+            ratio = (change_px / last_px.clamp_min(1e-12)).clamp(0.0, 0.9)
+            left = active & (change_px * ratio / (1.0 - ratio) > self.tolerance_px)
+            frame = active[:, None, None, None]
+            gradient, depth = torch.where(frame, part, gradient), torch.where(frame, found, depth)
+            return step + 1, gradient.contiguous(), depth.contiguous(), left, torch.where(active, change_px, last_px)
+
+        last_px = depth.abs().amax(dim=(1, 2, 3)) / self.mm_per_pixel
+        step = torch.ones((), dtype=torch.int64, device=depth.device)
+        state: tuple[Tensor, ...] = (step, gradient.contiguous(), depth.contiguous(), active, last_px)
+        if self.max_passes == 2:  # one pass needs no loop, and stays differentiable
+            state = go_again(*state)
+        elif self.max_passes > 2:
+            state = while_loop(unsettled, go_again, state)  # type: ignore[no-untyped-call]
+        return state[1], state[2]
 
     def _foreseen_px(self, seen: Tensor, touched: Tensor, depth: Tensor, window: tuple[int, int]) -> Tensor:
         """Largest change of depth that a second pass would bring, per frame (B,), from every eighth pixel."""

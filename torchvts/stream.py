@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from .calibration import CalibrationWarning, calibrate
 from .calibration.lights import LOOSE_DEG
-from .compensate import blur, gaussian_kernel
+from .compensate import blur, gaussian_weights
 from .contact import ContactMask
 from .core.checks import check_batch, check_integer, check_positive
 from .core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, rgb_from_bgr, write_atomically
@@ -332,7 +332,7 @@ def _roughness(image: Tensor) -> float:
     log = (nn.functional.avg_pool2d(image[None].float(), stride) + PEDESTAL).log()
     log = log - log.mean(1, keepdim=True)
     height = log.shape[2]
-    band = blur(log, gaussian_kernel(height / 40.0)) - blur(log, gaussian_kernel(height / 16.0))
+    band = blur(log, gaussian_weights(height / 40.0)) - blur(log, gaussian_weights(height / 16.0))
     margin = round(0.14 * height)
     inner = band[0, :, margin : height - margin, margin : log.shape[3] - margin]
     return float(inner.square().sum(0).sqrt().flatten().quantile(0.99))

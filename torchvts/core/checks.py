@@ -51,7 +51,7 @@ def check_same_size(name: str, tensor: Tensor, other_name: str, height: int, wid
 
 def may_read_values() -> bool:
     """Whether Python may decide by the values of tensors: always, but while torch.export traces. Scripts."""
-    if torch.jit.is_scripting():  # type: ignore[attr-defined]
+    if torch.jit.is_scripting():
         return True
     else:  # noqa: RET505, TorchScript leaves out the other branch only so
         return not torch.compiler.is_exporting()

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import QUANTISATION_STD, check_batch, check_window
+from ..core.checks import QUANTISATION_STD, check_batch, check_window, may_read_values
 from ..core.geometry import gradient_from_normal, normal_from_gradient
 from ..record import Calibration
 from ..shading import PointLights, flat_image, gloss_lobe, inverse_light_matrix, light_matrix
@@ -188,7 +188,7 @@ class NormalFromIntensity(nn.Module):
     ) -> Tensor:
         """Replace the normals of pixels where a light that shines on the flat skin has gone dark, or a channel is full."""
         clipped = (compensated < dark_where) | (compensated >= full_above)
-        if not bool(clipped.any()):
+        if may_read_values() and not bool(clipped.any()):
             return normal
         b, row, column = torch.where(clipped.any(dim=1))
         height, width = compensated.shape[2], compensated.shape[3]

@@ -1,0 +1,213 @@
+"""Exported files give what the pipeline gives, in a process that cannot import torchvts."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+import torchvts as vts
+from torchvts import export
+
+ROOT = Path(__file__).resolve().parents[1]
+HEIGHT, WIDTH, PITCH = 48, 64, 0.6
+SENSOR = vts.Sensor("rig", HEIGHT, WIDTH, PITCH)
+
+
+@pytest.fixture(scope="module")
+def low(ring):
+    """Lights so low that a press blocks some: their calibration, and frames well, hardly and not pressed."""
+    lights = ring(20.0, 15.0)
+    presses = [vts.scenes.sphere_press(10.0, mm, (x, 0), HEIGHT, WIDTH, PITCH) for mm, x in ((3.0, 0), (0.5, -6), (1.5, 5))]
+    frames = [vts.scenes.render(scene, lights, noise_std=0.003, bits=8, seed=k) for k, scene in enumerate(presses)]
+    rest = vts.scenes.render(vts.scenes.at_rest(presses[0]), lights, noise_std=0.003, bits=8, seed=9)
+    return vts.Calibration.from_lights(lights, SENSOR, rest[0]), torch.cat([*frames, rest])
+
+
+@pytest.fixture(scope="module")
+def mini():
+    """A GelSight Mini by the prior of its type, on a background of its own making."""
+    sensor = vts.Sensor.load("gelsight_mini", height=48, width=64)
+    prior = sensor.prior
+    background = (prior.background(48, 64, sensor.mm_per_pixel) ** (1.0 / prior.response.gamma)).float().clamp(0.0, 1.0)
+    calibration = vts.Calibration.from_response(prior.response, sensor, background)
+    return calibration, export.sample_frames(calibration)
+
+
+def pipeline(calibration, mode, **options):
+    return vts.DepthPipeline.from_calibration(calibration, mode, **options)
+
+
+def learned():
+    block = nn.Conv2d(3, 3, 1)
+    with torch.no_grad():
+        block.weight.copy_(torch.eye(3)[:, :, None, None])
+        block.bias.copy_(torch.tensor([-0.4, -0.4, 1.0]))
+    return block.requires_grad_(False)
+
+
+def test_the_scenes_are_hard_enough(low, mini):
+    calibration, frames = low
+    pipe = pipeline(calibration, "precise")
+    compensated = pipe.compensate(frames)
+    blocked = (compensated < pipe.normals.dark_where) | (compensated >= pipe.normals.full_above)
+    assert int(blocked[0].sum()) > 10
+    assert pipe(frames).contact.flatten(1).any(1).tolist() == [True, True, True, False]
+    assert (pipe(frames).depth_mm - pipeline(calibration, "fast")(frames).depth_mm).abs().max() > 0.05
+    assert pipeline(mini[0], "fast")(mini[1]).contact[:3].flatten(1).any(1).tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("kind", ["lights precise", "response auto", "own normals"])
+def test_torchscript_without_torchvts(low, mini, tmp_path, kind):
+    calibration, frames = mini if kind == "response auto" else low
+    pipe = pipeline(calibration, kind.split()[1]) if kind != "own normals" else pipeline(calibration, "fast", normals=learned())
+    path = export.export_torchscript(pipe, tmp_path / "pipe.pt")
+    assert export.compare(path, pipe, frames, "torchscript") <= 1e-5
+
+
+def test_gradients_through_torchscript_without_torchvts(low, tmp_path):
+    calibration, frames = low
+    pipe = pipeline(calibration, "precise").requires_grad_(True)
+    image = frames[:1].clone().requires_grad_(True)
+    pipe(image).depth_mm.square().sum().backward()
+    export.export_torchscript(pipe, tmp_path / "pipe.pt")
+    torch.save(frames[:1], tmp_path / "image")
+    code = (
+        "import sys, json, torch; sys.modules['torchvts'] = None; said = {'torchvts.json': ''}\n"
+        "pipe = torch.jit.load('pipe.pt', _extra_files=said)\n"
+        "image = torch.load('image', weights_only=True).requires_grad_(True)\n"
+        "pipe(image).depth_mm.square().sum().backward()\n"
+        "found = {name: p.grad for name, p in pipe.named_parameters() if p.grad is not None}\n"
+        "torch.save(found | {'image': image.grad}, 'grad'); print(said['torchvts.json'].decode())\n"
+    )
+    command = [sys.executable, "-I", "-W", "ignore", "-c", code]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    found = torch.load(tmp_path / "grad", weights_only=True)
+    expected = {name: p.grad for name, p in pipe.named_parameters()} | {"image": image.grad}
+    assert {"image", "normals.lights.position_mm", "normals.lights.albedo"} <= set(found)
+    for name, gradient in found.items():
+        assert float(gradient.abs().max()) > 0
+        assert torch.allclose(gradient, expected[name], rtol=1e-3, atol=1e-4 * float(expected[name].abs().max())), name
+    said = json.loads(done.stdout)
+    assert (said["mode"], said["mm_per_pixel"], said["height"], said["width"]) == ("precise", PITCH, HEIGHT, WIDTH)
+
+
+@pytest.mark.parametrize("kind", ["lights precise", "response auto", "own normals"])
+def test_a_program_takes_the_decisions_of_the_pipeline(low, mini, tmp_path, kind):
+    """Loops, early ends and dark pixels in the graph, against the Python of the pipeline; then from its file, without torchvts."""
+    calibration, frames = mini if kind == "response auto" else low
+    pipe = pipeline(calibration, kind.split()[1]) if kind != "own normals" else pipeline(calibration, "fast", normals=learned())
+    program = export.export_program(pipe, tmp_path / "pipe.pt2").module()
+    for batch in (frames[:1], frames[1:3], frames[:3], frames[3:], frames):
+        for found, expected in zip(program(batch), pipe(batch), strict=True):
+            assert (found.double() - expected.double()).abs().max() <= 1e-5
+    if kind != "response auto":
+        assert export.compare(tmp_path / "pipe.pt2", pipe, frames, "pt2") <= 1e-5
+
+
+@pytest.mark.parametrize("kind", ["lights fast", "response precise"])
+def test_onnx_without_torchvts(low, mini, tmp_path, kind):
+    if export.missing("onnx"):
+        pytest.skip(export.missing("onnx"))
+    calibration, frames = low if kind == "lights fast" else mini
+    pipe = pipeline(calibration, kind.split()[1])
+    path = export.export_onnx(pipe, tmp_path / "pipe.onnx")
+    assert export.compare(path, pipe, frames, "onnx") <= 1e-3
+
+
+def test_aoti_without_torchvts(mini, tmp_path):
+    if export.missing("aoti"):
+        pytest.skip(export.missing("aoti"))
+    calibration, frames = mini
+    pipe = pipeline(calibration, "fast")
+    path = export.export_aoti(pipe, tmp_path / "pipe.pt2")
+    assert export.compare(path, pipe, frames, "aoti") <= 1e-5
+
+
+@pytest.mark.parametrize("height, width", [(24, 32), (23, 35)])
+@pytest.mark.parametrize("levelled", [True, False])
+def test_matrix_products_integrate_as_the_pipeline_does(height, width, levelled):
+    gradient = torch.randn(3, 2, height, width, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    gradient[1:, :, :8] = 0.0
+    by_matrix = export.PoissonRestByMatrix(height, width, 0.3, torch.float64, levelled)(gradient)
+    expected = (vts.PoissonRest if levelled else vts.PoissonDCT)(0.3)(gradient)
+    assert (by_matrix - expected).abs().max() < 1e-12
+
+
+@pytest.mark.parametrize("length", [1, 2, 7, 8])
+def test_what_stands_in_for_operators_that_onnx_lacks(length):
+    values = torch.randn(3, length, 2, generator=torch.Generator().manual_seed(length))
+    some = torch.where(values > 0.3, torch.nan, values)
+    for keep in (True, False):
+        assert torch.equal(export._median(values, 1, keep)[0], values.median(1, keep).values)
+        found, expected = export._nanmedian(some, 1, keep)[0], some.nanmedian(1, keep).values
+        assert torch.equal(found.nan_to_num(9.0), expected.nan_to_num(9.0))
+    assert torch.equal(export._cummax(values, 1)[0], values.cummax(1).values)
+
+
+def test_a_file_that_does_not_agree_or_does_not_run_is_told(low, tmp_path):
+    calibration, frames = low
+    pipe = pipeline(calibration, "precise")
+    path = export.export_torchscript(pipeline(calibration, "fast"), tmp_path / "pipe.pt")
+    assert export.compare(path, pipe, frames, "torchscript") > 0.05
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(RuntimeError, match=r"pipe.pt: could not be run without torchvts: .+"):
+        export.compare(path, pipe, frames, "torchscript")
+
+
+class Unscriptable(nn.Module):
+    def forward(self, compensated):
+        return compensated * float(next(iter({compensated.mean().item()})))
+
+
+def test_one_format_that_fails_leaves_the_others(low, tmp_path, monkeypatch):
+    calibration, frames = low
+    monkeypatch.setattr(export, "find_spec", lambda name: None)
+    rows = export.export_checked(pipeline(calibration, "fast"), tmp_path / "new", ["onnx", "torchscript"], frames)
+    assert [row.ok for row in rows] == [False, True]
+    assert rows[0].reason == "onnx: onnx, onnxscript, onnxruntime not found: pip install 'torchvts[onnx]'"
+    assert rows[1].size_kb > 10 and rows[1].difference_mm <= 1e-5
+    rows = export.export_checked(pipeline(calibration, "fast", normals=Unscriptable()), tmp_path, ["torchscript"], frames)
+    assert not rows[0].ok and rows[0].reason and not (tmp_path / "pipeline.pt").exists()
+
+
+def test_errors_are_sentences(low, tmp_path, monkeypatch):
+    pipe = pipeline(low[0], "fast")
+    with pytest.raises(ValueError, match="format: expected one of torchscript, pt2, aoti, onnx, got 'tflite'"):
+        export.export_checked(pipe, tmp_path, ["tflite"], low[1])
+    with pytest.raises(ValueError, match="format: expected one of"):
+        export.missing("tflite")
+    with pytest.raises(TypeError, match="pipe: expected a DepthPipeline, got Linear"):
+        export.export_program(nn.Linear(1, 1))
+    with pytest.raises(ValueError, match=r"path: expected a name ending in .pt2"):
+        export.export_aoti(pipe, tmp_path / "pipe.bin")
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        export.compare(tmp_path / "nothing.pt", pipe, low[1], "torchscript")
+    monkeypatch.setattr(export.shutil, "which", lambda name: None)
+    with pytest.raises(RuntimeError, match=r"aoti: expected a C\+\+ compiler, got none .*: install g\+\+ or clang\+\+, or set CXX"):
+        export.export_aoti(pipe, tmp_path / "pipe.pt2")
+    monkeypatch.setattr(export, "find_spec", lambda name: None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'torchvts\[onnx\]'"):
+        export.export_onnx(pipe, tmp_path / "pipe.onnx")
+
+
+def call(*arguments):
+    return subprocess.run(
+        [sys.executable, *map(str, arguments)], capture_output=True, text=True, cwd=ROOT, timeout=300, check=False
+    )
+
+
+def test_the_script(low, tmp_path):
+    low[0].save(tmp_path / "unit.safetensors")
+    vts.write_image(tmp_path / "press.png", low[1][0])
+    script = ("scripts/export.py", tmp_path / "unit.safetensors", "--out", tmp_path / "out", "--mode", "auto")
+    done = call(*script, "--format", "torchscript", "--frames", tmp_path / "press.png")
+    assert done.returncode == 0, done.stderr
+    assert "| torchscript |" in done.stdout and done.stdout.rstrip().endswith("| ok |")
+    assert [file.name for file in (tmp_path / "out").iterdir()] == ["pipeline.pt"]
+    done = call(*script, "--format", "tflite")
+    assert done.returncode != 0 and "error: format: expected one of torchscript" in done.stderr

@@ -188,7 +188,7 @@ def _by_lights(
         "misfit": fit.misfit.tolist(),
         "inlier_fraction": fit.inlier_fraction,
         "gloss": fit.lights.gloss.tolist(),
-        "vignetting": fit.vignetting,
+        "vignetting": list(fit.falloff),
         "ambient": fit.ambient.tolist(),
     }
     ambient = fit.ambient.clamp_min(0.0) if bool((fit.ambient > 0).any()) else None
@@ -339,8 +339,8 @@ def _check_type(background: Tensor, sensor: Sensor) -> None:
 def _judge_rest(calibration: Calibration) -> Calibration:
     """Add how far the background is from the lights' model, and warn if it seems to hold a contact."""
     model, report = calibration.model_image, dict(calibration.report)
-    if report.get("vignetting", 0.0) > 0:  # the camera's, which the gain takes out
-        model = model * falloff(outwardness(calibration.sensor), report["vignetting"]).to(model.dtype)
+    if "vignetting" in report:  # the camera's, which the gain takes out
+        model = model * falloff(outwardness(calibration.sensor), *report["vignetting"]).to(model.dtype)
     if calibration.ambient is not None:
         model = model + calibration.ambient.reshape(3, 1, 1)
     spread = (model - calibration.background).abs().flatten(1).median(dim=1).values / 0.6745

@@ -51,7 +51,7 @@ class LightChoice:
 @dataclass
 class _Candidate:
     gamma: float
-    vignetting: bool
+    vignetting: int
     ambient: bool
     known_azimuth: bool
     numbers: int
@@ -68,7 +68,7 @@ class _Candidate:
             "three lights"
             + " at known azimuths" * self.known_azimuth
             + ", glossy skin" * self.fit.lights.glossy
-            + ", vignetting" * self.vignetting
+            + ("", ", vignetting", ", vignetting of fourth order")[self.vignetting]
             + ", ambient light" * self.ambient
         )
 
@@ -98,9 +98,9 @@ def choose_lights(background: Tensor, sensor: Sensor, other_models: bool = False
     """
     linear = dataclasses.replace(sensor, gamma=sensor.exponent, prior=None)
     sparse, small = _sparse(background, linear)
-    tried = _try(sparse, small, None, progress)
+    tried = _try(sparse, small, [], progress)
     if sensor.gamma is None and tried[0].misfit > 0.005:
-        tried += _try(sparse, dataclasses.replace(small, gamma=OTHER_GAMMA), tried[0], progress)
+        tried += _try(sparse, dataclasses.replace(small, gamma=OTHER_GAMMA), tried, progress)
     for candidate in tried:
         candidate.against = _against(candidate, tried, sensor)
     chosen = _choose(tried)
@@ -133,30 +133,25 @@ def _evenly(size: int, stride: int) -> Tensor:
     return (size - 1 - steps * stride) // 2 + stride * torch.arange(steps + 1)
 
 
-def _try(image: Tensor, sensor: Sensor, first: _Candidate | None, progress: bool) -> list[_Candidate]:
-    """All candidates at one gamma; the plain ones first, the others where these leave something, and not where ``first``, the
-    plain lights of the other gamma, does about as well."""
+def _try(image: Tensor, sensor: Sensor, before: list[_Candidate], progress: bool) -> list[_Candidate]:
+    """All candidates at one gamma, the plain ones first; larger ones as long as nothing explains the image."""
     found: list[_Candidate] = []
-    for vignetting, ambient in ((False, False), (True, False), (False, True), (True, True)):
-        if vignetting or ambient:
-            plain = [candidate for candidate in found if candidate.plain]
-            if min(candidate.misfit for candidate in plain) < NOTHING_LEFT or not any(_clearly(one, first) for one in plain):
-                break
+    for vignetting, ambient in ((0, False), (1, False), (0, True), (1, True), (2, False), (2, True)):
+        plain = vignetting == 0 and not ambient
+        # where one explains the image, its peers are still tried, to be compared with it, but nothing larger, no other gamma's
+        smaller = [one for one in found if one.plain or vignetting == 2]
+        if not plain and any(one.misfit < NOTHING_LEFT for one in before + smaller):
+            break
         for known in (False, True) if sensor.light_azimuth_deg is not None else (False,):
             fit = _fit(image, sensor, vignetting, ambient, known, progress)
-            found.append(_Candidate(sensor.exponent, vignetting, ambient, known, fit.numbers + int(first is not None), fit))
+            found.append(_Candidate(sensor.exponent, vignetting, ambient, known, fit.numbers + int(bool(before)), fit))
     return found
 
 
-def _fit(image: Tensor, sensor: Sensor, vignetting: bool, ambient: bool, known: bool, progress: bool) -> LightFit:
+def _fit(image: Tensor, sensor: Sensor, vignetting: int, ambient: bool, known: bool, progress: bool) -> LightFit:
     return fit_lights(
         image, sensor, progress=progress, vignetting=vignetting, ambient=ambient, known_azimuth=known, gloss=not known
     )
-
-
-def _clearly(candidate: _Candidate, first: _Candidate | None) -> bool:
-    """Whether another gamma leaves plain lights less than half the loss."""
-    return first is None or candidate.fit.loss_history[-1] <= 0.5 * first.fit.loss_history[-1]
 
 
 def _against(candidate: _Candidate, tried: list[_Candidate], sensor: Sensor) -> str:
@@ -165,7 +160,7 @@ def _against(candidate: _Candidate, tried: list[_Candidate], sensor: Sensor) -> 
     if not fit.converged:
         return fit.message
     base = next(one for one in tried if one.plain and one.gamma == candidate.gamma and one.known_azimuth == candidate.known_azimuth)
-    if candidate.gamma != tried[0].gamma and not _clearly(base, tried[0]):
+    if candidate.plain and candidate.gamma != tried[0].gamma and fit.loss_history[-1] > 0.5 * tried[0].fit.loss_history[-1]:
         return f"gamma {candidate.gamma} does not halve the loss"
     if candidate.vignetting and fit.vignetting < 2.0 * fit.vignetting_std:
         return f"vignetting {fit.vignetting:.3f} +- {fit.vignetting_std:.3f} is not pinned"
@@ -228,7 +223,7 @@ def _row(candidate: _Candidate) -> dict[str, Any]:
         "score_deg": float(fit.direction_std_deg.max()) if fit.converged else 90.0,
         "misfit": candidate.misfit,
         "held_out": candidate.held_out,
-        "vignetting": fit.vignetting,
+        "vignetting": list(fit.falloff),
         "ambient": fit.ambient.tolist(),
         "note": against,
     }

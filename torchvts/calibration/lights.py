@@ -19,8 +19,10 @@ from .levenberg import LevenbergMarquardt, residual_and_jacobian
 from .rest_image import (
     AMBIENT,
     GLOSS,
+    OF_THE_CAMERA,
     TUKEY,
     VIGNETTING,
+    VIGNETTING_4,
     RestPixels,
     falloff,
     free_numbers,
@@ -46,6 +48,7 @@ class LightFit:
         misfit: (3,), relative structure that the model leaves unexplained (0 where only noise is left).
         inlier_fraction: share of the pixels that the robust loss kept.
         vignetting: share of the light that the lens loses in the image corners; 0 where it was not fitted.
+        falloff: the coefficients of the second and fourth power of the distance from the centre that make it up.
         ambient: (3,), constant light in linear light; 0 where it was not fitted.
         vignetting_std, ambient_std: standard deviations of these, infinite where they were not fitted.
         numbers: how many numbers were fitted.
@@ -64,6 +67,7 @@ class LightFit:
     misfit: Tensor = field(repr=False)
     inlier_fraction: float = 1.0
     vignetting: float = 0.0
+    falloff: tuple[float, float] = (0.0, 0.0)
     ambient: Tensor = field(default_factory=lambda: torch.zeros(3), repr=False)
     vignetting_std: float = torch.inf
     ambient_std: Tensor = field(default_factory=lambda: torch.full((3,), torch.inf), repr=False)
@@ -78,7 +82,7 @@ def fit_lights(
     start: PointLights | None = None,
     max_steps: int = 100,
     progress: bool = False,
-    vignetting: bool = False,
+    vignetting: int = 0,
     ambient: bool = False,
     known_azimuth: bool = False,
     gloss: bool = True,
@@ -94,8 +98,8 @@ def fit_lights(
         sensor: gives the pixel pitch and ``gamma``.
         start: lights to start from; None takes the closed-form start.
         max_steps: bound of the loop. progress: show a bar.
-        vignetting: fit the lens's fall-off too, one number. ambient: fit a constant light too, one number a channel. A skin
-            fitted with either stays matt.
+        vignetting: fit the lens's fall-off too, by 1 or 2 numbers. ambient: fit a constant light too, one number a channel. A
+            skin fitted with either stays matt.
         gloss: try a glossy skin where structure remains.
         known_azimuth: the lights stand where ``sensor.light_azimuth_deg`` says, their distance and height are fitted.
     Returns:
@@ -114,6 +118,8 @@ def fit_lights(
     """
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     check_integer("max_steps", max_steps, 1)
+    if vignetting not in (0, 1, 2):
+        raise ValueError(f"vignetting: expected 0, 1 or 2 numbers, got {vignetting!r}")
     check_exposure(background)
     azimuth = None
     if known_azimuth:
@@ -121,7 +127,7 @@ def fit_lights(
             raise ValueError(f"known_azimuth: sensor '{sensor.name}' names no light_azimuth_deg: add it to the sensor file")
         azimuth = torch.deg2rad(torch.tensor(sensor.light_azimuth_deg, dtype=torch.float64))
     plain = RestPixels.of(background.detach().to(torch.float64).cpu(), sensor)
-    terms = (VIGNETTING,) * vignetting + (AMBIENT,) * ambient
+    terms = (VIGNETTING, VIGNETTING_4)[:vignetting] + (AMBIENT,) * ambient
     pixels = plain._replace(terms=terms)
     starts = [paraboloid_start(plain) if start is None else from_lights(start)]
     if vignetting and start is None:  # lights that fall off by themselves leave the lens little: start from the other side, too
@@ -134,7 +140,7 @@ def fit_lights(
     if len(coarse.x) < len(pixels.x):
         best = _solve(pixels, near.parameter, azimuth, max_steps, progress)
         best = best._replace(history=near.history + best.history)
-    if gloss and not terms and best.converged and bool((best.misfit > 0).all()):
+    if gloss and not terms and best.converged and bool((best.misfit > 0).all()) and float(best.misfit.max()) < NOT_GLOSS:
         # structure is left that noise does not explain: a glossy skin? Only if that leaves next to nothing in every channel
         shiny = pixels._replace(terms=(GLOSS,))
         with_gloss = torch.cat((best.parameter, torch.full_like(best.parameter[:, :1], 0.05)), dim=1)
@@ -172,8 +178,10 @@ def _tell(background: Tensor, pixels: RestPixels, best: "_Solution", azimuth: Te
     fitted: dict[str, Any] = {}
     variance = torch.diagonal(best.covariance, dim1=1, dim2=2)
     if VIGNETTING in terms:
-        k = 4 + terms.index(VIGNETTING)
-        fitted |= {"vignetting": float(parameter[0, k]), "vignetting_std": float(variance[0, k].sqrt())}
+        part = [4 + k for k, name in enumerate(terms) if name in OF_THE_CAMERA]
+        corner = best.covariance[0][part][:, part].sum().clamp_min(0.0).sqrt()
+        powers = [*parameter[0, part].tolist(), 0.0][:2]
+        fitted |= {"vignetting": sum(powers), "falloff": tuple(powers), "vignetting_std": float(corner)}
     if AMBIENT in terms:
         k = 4 + terms.index(AMBIENT)
         fitted |= {"ambient": parameter[:, k], "ambient_std": variance[:, k].sqrt()}
@@ -251,6 +259,9 @@ _COARSE_PIXELS = 8000
 
 GLOSS_MISFIT = 0.01
 """A glossy skin is believed only if it leaves less relative structure than this."""
+
+NOT_GLOSS = 0.1
+"""A matt skin that leaves more relative structure than this is not tried as a glossy one: no gloss of the width assumed does."""
 
 STEP_TOLERANCE_MM = 1e-4
 """The loop ends after three steps that move no light further than this."""

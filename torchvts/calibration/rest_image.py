@@ -11,9 +11,11 @@ from ..core.noise import noise_std
 from ..core.sensor import Sensor
 from ..shading import PointLights, microfacet
 
-GLOSS, VIGNETTING, AMBIENT = "gloss", "vignetting", "ambient"
-TERMS = (GLOSS, VIGNETTING, AMBIENT)
-"""What a light's column of numbers may hold after x, y, log z, log albedo, in this order."""
+GLOSS, VIGNETTING, VIGNETTING_4, AMBIENT = "gloss", "vignetting", "vignetting of fourth order", "ambient"
+"""What a light's row of numbers may hold after x, y, log z, log albedo."""
+
+OF_THE_CAMERA = (VIGNETTING, VIGNETTING_4)
+"""Terms that the three lights share."""
 
 TUKEY = 4.685  # 95 % efficiency under Gaussian noise
 
@@ -59,7 +61,8 @@ class RestPixels(NamedTuple):
             lobe = microfacet(n_l, torch.ones_like(n_l), torch.sqrt(0.5 + 0.5 * n_l))
             log_light = log_light + torch.log1p(extra[GLOSS].clamp_min(0.0) * lobe)
         if VIGNETTING in extra:
-            log_light = log_light + torch.log(falloff(self.outward, extra[VIGNETTING]))
+            fourth = extra.get(VIGNETTING_4, 0.0)
+            log_light = log_light + torch.log(falloff(self.outward, extra[VIGNETTING], fourth))
         if AMBIENT not in extra:
             return torch.exp(self.exponent * log_light)
         return (torch.exp(log_light) + extra[AMBIENT]).clamp_min(1e-6) ** self.exponent
@@ -75,13 +78,16 @@ def outwardness(sensor: Sensor) -> Tensor:
     return (x**2 + y**2) / float(x.max() ** 2 + y.max() ** 2)
 
 
-def falloff(outward: Tensor, vignetting: Tensor | float) -> Tensor:
-    """Share of the light that a lens with vignetting lets through: 1 in the middle, 1 - vignetting in the corners.
+def falloff(outward: Tensor, second: Tensor | float, fourth: Tensor | float = 0.0) -> Tensor:
+    """Share of the light that a lens with vignetting lets through: 1 in the middle, 1 - second - fourth in the corners.
 
+    Args:
+        outward: squared distance from the image centre, 1 in the corners.
+        second, fourth: coefficients of the second and fourth power of the distance.
     Source:
-        the first term of the usual even polynomial; cos^4 of the angle of view begins with it.
+        the first terms of the usual even polynomial; cos^4 of the angle of view begins with them.
     """
-    return (1.0 - vignetting * outward).clamp_min(0.05)
+    return (1.0 - outward * (second + fourth * outward)).clamp_min(0.05)
 
 
 def paraboloid_start(pixels: RestPixels) -> Tensor:
@@ -126,10 +132,10 @@ def to_lights(parameter: Tensor, terms: tuple[str, ...], dtype: torch.dtype) -> 
 def free_numbers(terms: tuple[str, ...], azimuth: Tensor | None) -> Tensor:
     """What the fit may move: (3, 4 + terms, F), parameters of the three lights per free number.
 
-    Vignetting is the camera's, one number for all lights; with known azimuths (3,), radians, a light moves along its ray.
+    Vignetting is the camera's, shared by all lights; with known azimuths (3,), radians, a light moves along its ray.
     """
     columns = 4 + len(terms)
-    own = [k for k in range(columns) if not (k >= 4 and terms[k - 4] == VIGNETTING)]
+    own = [k for k in range(columns) if k < 4 or terms[k - 4] not in OF_THE_CAMERA]
     rows: list[Tensor] = []
     for light in range(3):
         for k in own:
@@ -140,8 +146,9 @@ def free_numbers(terms: tuple[str, ...], azimuth: Tensor | None) -> Tensor:
                     continue
                 row[light, :2] = torch.stack((azimuth[light].cos(), azimuth[light].sin()))
             rows.append(row)
-    if VIGNETTING in terms:
-        row = torch.zeros(3, columns, dtype=torch.float64)
-        row[:, 4 + terms.index(VIGNETTING)] = 1.0
-        rows.append(row)
+    for k, name in enumerate(terms):
+        if name in OF_THE_CAMERA:
+            row = torch.zeros(3, columns, dtype=torch.float64)
+            row[:, 4 + k] = 1.0
+            rows.append(row)
     return torch.stack(rows, dim=2)

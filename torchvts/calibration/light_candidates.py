@@ -149,8 +149,16 @@ def _try(image: Tensor, sensor: Sensor, before: list[_Candidate], progress: bool
 
 
 def _fit(image: Tensor, sensor: Sensor, vignetting: int, ambient: bool, known: bool, progress: bool) -> LightFit:
+    extra = vignetting > 0 or ambient
     return fit_lights(
-        image, sensor, progress=progress, vignetting=vignetting, ambient=ambient, known_azimuth=known, gloss=not known
+        image,
+        sensor,
+        max_steps=50 if extra else 100,  # one that moves on after that is not pinned
+        progress=progress,
+        vignetting=vignetting,
+        ambient=ambient,
+        known_azimuth=known,
+        gloss=not known,
     )
 
 
@@ -173,6 +181,9 @@ def _against(candidate: _Candidate, tried: list[_Candidate], sensor: Sensor) -> 
         return f"a smooth misfit of {candidate.misfit:.1%} is left, {base.misfit:.1%} without"
     if sensor.light_azimuth_deg is not None:
         if not candidate.known_azimuth:
+            loosest = float(fit.direction_std_deg.max())
+            if loosest > LOOSE_DEG:
+                return f"the image alone leaves the lights {loosest:.1f} deg loose"
             return _off_the_drawing(fit, sensor.light_azimuth_deg)
         if candidate.misfit > 2.0 * EXPLAINED:
             return f"lights at the azimuths of the sensor file leave a smooth misfit of {candidate.misfit:.1%}"

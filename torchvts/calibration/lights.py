@@ -244,6 +244,10 @@ def _solve(pixels: RestPixels, start: Tensor, azimuth: Tensor | None, max_steps:
     parameter = parameter.detach()
     left, jacobian = residual_and_jacobian(pixels.residual, parameter)
     weight, scale = _robust_weight(left, pixels.usable)
+    if not bool(torch.isfinite(left).all() & torch.isfinite(jacobian).all() & torch.isfinite(scale).all()):
+        # the lights ran away: nothing is known of them, and nothing explained
+        lost = 1e6 * torch.eye(parameter.shape[1], dtype=parameter.dtype).expand(3, -1, -1)
+        return _Solution(start, [*history, 1e6], False, 1e6, weight, scale, lost, torch.ones(3), torch.full((16,), 1e6))
     covariance, misfit = _covariance(pixels, left, jacobian, pixels.model(parameter), weight / scale.square(), tie)
     held_out = _held_out(pixels, left, jacobian, weight / scale.square(), tie)
     return _Solution(parameter, history, still == 3, moved, weight, scale, covariance, misfit, held_out)

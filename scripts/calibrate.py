@@ -67,11 +67,14 @@ def main() -> int:
 
 
 def print_candidates(candidates: list[dict[str, Any]]) -> None:
-    print("| model | pass | numbers | deg | note |\n|---|---|---|---|---|")
+    print("| model | family | pass | numbers | deg | misfit | note |\n|---|---|---|---|---|---|---|")
     for row in candidates:
         score = "" if row["score_deg"] is None else f"{row['score_deg']:.2f}"
-        print(f"| {row['model']} | {row['pass']} | {row['numbers']} | {score} | {row.get('note', '')} |")
-    print("deg: of point lights without presses, how loose the image leaves them; else the mean angle on held-out presses\n")
+        misfit = f"{row['misfit']:.1%}" if "misfit" in row else ""
+        family = row.get("family", "") + (f", gamma {row['gamma']:g}" if row.get("gamma", 1.0) != 1.0 else "")
+        print(f"| {row['model']} | {family} | {row['pass']} | {row['numbers']} | {score} | {misfit} | {row.get('note', '')} |")
+    print("deg: of point lights without presses, how loose the image leaves them; else the mean angle on held-out presses")
+    print("misfit: smooth relative structure of the image that the lights leave unexplained\n")
 
 
 def print_lights(lights: vts.PointLights, report: dict[str, Any]) -> None:

@@ -129,6 +129,114 @@ def test_the_response_of_the_camera_is_part_of_the_model(ring, small_sensor):
     assert furthest_mm(vts.fit_lights(image, small_sensor).lights, lights) > 5.0
 
 
+VIGNETTED, LIT, BOTH = ("three lights, vignetting", "three lights, ambient light", "three lights, vignetting, ambient light")
+
+
+def seen(scene, lights, vignetting=0.0, ambient=0.0, gamma=1.0, noise_std=0.003, bits=8):
+    """A camera with ambient light, which is added to what the lens lets through."""
+    light = scenes.render(scene, lights, vignetting=vignetting) + ambient
+    image = light ** (1.0 / gamma) + noise_std * torch.randn(light.shape, generator=torch.Generator().manual_seed(3))
+    levels = 2**bits - 1
+    return torch.round(image.clamp(0, 1) * levels) / levels
+
+
+def largest_px(calibration, lights, **camera):
+    """Largest error of depth of a ball pressed by 1 mm, in pixels."""
+    scene = scenes.sphere_press(10.0, 1.0, (0, 0), 120, 160, 0.25)
+    with torch.inference_mode():
+        out = vts.DepthPipeline.from_calibration(calibration, "precise")(seen(scene, lights, **camera))
+    return float((out.depth_mm - scene.depth_mm).abs().max()) / 0.25
+
+
+CAMERAS = {
+    "clean": ({}, "three lights", 1.0),
+    "vignetting": ({"vignetting": 0.2}, VIGNETTED, 1.0),
+    "ambient": ({"ambient": 0.1}, LIT, 1.0),
+    "both": ({"vignetting": 0.2, "ambient": 0.1}, BOTH, 1.0),
+    "gamma": ({"gamma": 2.2}, "three lights", 2.2),
+    "gamma, vignetting": ({"gamma": 2.2, "vignetting": 0.2}, VIGNETTED, 2.2),
+}
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_the_camera_is_found_and_the_depth_does_not_feel_it(low_rig, small_sensor, name):
+    camera, family, gamma = CAMERAS[name]
+    flat = scenes.at_rest(scenes.sphere_press(10, 1, (0, 0), 120, 160, 0.25))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", vts.CalibrationWarning)
+        calibration = vts.calibrate(seen(flat, low_rig, **camera)[0], small_sensor)
+    report = calibration.report
+    assert (report["model"], report["family"], report["gamma"]) == ("point_lights", family, gamma)
+    assert furthest_mm(calibration.lights, low_rig) < 0.1
+    assert report["vignetting"][0] == pytest.approx(camera.get("vignetting", 0.0), abs=0.02)
+    assert report["ambient"] == pytest.approx([camera.get("ambient", 0.0)] * 3, abs=0.005)
+    assert largest_px(calibration, low_rig, **camera) < 0.3
+    assert json.loads(json.dumps(report)) == report
+
+
+def test_the_table_of_candidates_says_what_was_tried_and_why_not(low_rig, small_sensor):
+    calibration = vts.calibrate(rest(low_rig, small_sensor, noise_std=0.003, vignetting=0.2), small_sensor)
+    first, *others = calibration.report["candidates"]
+    assert (
+        first["family"] == VIGNETTED and first["numbers"] == 13 and first["note"].startswith("one image leaves the lights 0.0 deg")
+    )
+    assert {row["family"] for row in others} >= {"three lights", LIT, BOTH}
+    assert all(row["model"] == "point lights" and row["held_out"] > 0 for row in others)
+    assert next(row for row in others if row["family"] == LIT)["note"].startswith("not taken: ")
+    assert "three lights, vignetting: the smallest within 1%" in calibration.report["reason"]
+    assert "-> 0.0%" in calibration.report["reason"]
+
+
+def test_ambient_light_survives_the_file(tmp_path, low_rig, small_sensor):
+    flat = scenes.at_rest(scenes.sphere_press(10, 1, (0, 0), 120, 160, 0.25))
+    calibration = vts.calibrate(seen(flat, low_rig, ambient=0.1)[0], small_sensor)
+    calibration.save(tmp_path / "unit.safetensors")
+    loaded = vts.Calibration.load(tmp_path / "unit.safetensors")
+    assert torch.equal(loaded.ambient, calibration.ambient) and torch.equal(loaded.offset, calibration.offset)
+    rested = vts.Compensate.from_calibration(loaded)(seen(flat, low_rig, ambient=0.1))
+    assert float((rested[0] - loaded.flat).abs().max()) < 1e-5
+    with pytest.raises(ValueError, match=r"ambient: expected \(3,\) finite values of at least 0"):
+        vts.Calibration.from_lights(low_rig, small_sensor, ambient=torch.tensor([0.1, -0.1, 0.1]))
+
+
+@pytest.mark.parametrize("vignetting", [0.0, 0.2])
+def test_known_azimuths_are_kept(low_rig, vignetting):
+    sensor = vts.Sensor("rig", 120, 160, 0.25, light_azimuth_deg=(10.0, 130.0, 250.0))
+    calibration = vts.calibrate(rest(low_rig, sensor, noise_std=0.005, bits=8, vignetting=vignetting), sensor)
+    azimuth = torch.rad2deg(torch.atan2(calibration.lights.position_mm[:, 1], calibration.lights.position_mm[:, 0]))
+    assert azimuth.tolist() == pytest.approx([10.0, 130.0, -110.0], abs=1e-3)
+    assert calibration.report["family"] == "three lights at known azimuths" + ", vignetting" * (vignetting > 0)
+    assert calibration.report["candidates"][0]["numbers"] == (10 if vignetting else 9)
+    assert furthest_mm(calibration.lights, low_rig) < 0.2
+
+
+def test_azimuths_in_the_wrong_order_are_complained_of(low_rig):
+    sensor = vts.Sensor("rig", 120, 160, 0.25, light_azimuth_deg=(130.0, 10.0, 250.0))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", vts.CalibrationWarning)
+        calibration = vts.calibrate(rest(low_rig, sensor, noise_std=0.005, bits=8), sensor)
+    assert any("one image does not pin R" in str(warning.message) for warning in caught)
+    free = next(row for row in calibration.report["candidates"] if row["family"] == "three lights")
+    assert "not taken: light R stands -120 deg off the azimuth in the sensor file" in free["note"]
+
+
+def test_an_azimuth_that_no_file_names_is_refused(tiny):
+    with pytest.raises(ValueError, match="known_azimuth: sensor 'rig' names no light_azimuth_deg"):
+        vts.fit_lights(tiny[1], tiny[0], known_azimuth=True)
+    with pytest.raises(ValueError, match="vignetting: expected 0, 1 or 2 numbers"):
+        vts.fit_lights(tiny[1], tiny[0], vignetting=3)
+
+
+@pytest.mark.parametrize("extra", [{"vignetting": 1}, {"ambient": True}, {"vignetting": 1, "ambient": True}])
+def test_the_stated_spread_of_a_larger_model_is_the_true_one(low_rig, small_sensor, extra):
+    scores = []
+    for seed in range(4):
+        image = rest(low_rig, small_sensor, noise_std=0.01, bits=8, vignetting=0.2 * ("vignetting" in extra), seed=seed)
+        fit = vts.fit_lights(image, small_sensor, **extra)
+        scores.append((fit.lights.position_mm.detach() - low_rig.position_mm).double() / fit.position_std_mm)
+    assert 0.5 < float(torch.stack(scores).square().mean().sqrt()) < 2.0
+
+
 TACTO_MM = torch.tensor([[-17.3205, -10.0, 17.0], [17.3205, -10.0, 17.0], [0.0, 20.0, 17.0]])  # manifest.json, v up
 
 
@@ -215,6 +323,23 @@ def test_levenberg_marquardt_solves_independent_problems():
     assert torch.allclose(parameter.detach(), torch.ones(2, 2, dtype=torch.float64), atol=1e-10)
     assert losses[0, 0] == pytest.approx(0.5 * (4.4**2 + 2.2**2))
     assert bool((losses[1:] <= losses[:-1]).all()), "a step that would raise the loss is not taken"
+
+
+def test_levenberg_marquardt_ties_groups():
+    """Two groups of two numbers, the second number shared: the least squares of the joint problem."""
+    tie = torch.zeros(2, 2, 3, dtype=torch.float64)
+    tie[0, 0, 0] = tie[1, 0, 1] = tie[0, 1, 2] = tie[1, 1, 2] = 1.0
+    place, target = torch.tensor([0.0, 1.0, 3.0], dtype=torch.float64), torch.tensor([[1.0, 2.0, 4.5], [0.0, -1.0, 7.0]]).double()
+    parameter = torch.zeros(2, 2, dtype=torch.float64, requires_grad=True)
+    optimiser = LevenbergMarquardt(parameter, tie=tie)
+    for _ in range(30):
+        optimiser.step(lambda values: values[:, :1] + values[:, 1:] * place - target)
+    design = torch.zeros(6, 3, dtype=torch.float64)
+    design[:3, 0] = design[3:, 1] = 1.0
+    design[:, 2] = place.repeat(2)
+    expected = torch.linalg.lstsq(design, target.flatten()).solution
+    assert parameter.detach()[:, 0].tolist() == pytest.approx(expected[:2].tolist(), abs=1e-9)
+    assert parameter.detach()[:, 1].tolist() == pytest.approx([float(expected[2])] * 2, abs=1e-9)
 
 
 def test_levenberg_marquardt_weighs_residuals():

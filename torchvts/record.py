@@ -18,7 +18,7 @@ from .core.sensor import Sensor
 from .markers import FillMarkers
 from .shading import PointLights, flat_image, inverse_light_matrix
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 """Raised when a file of an older version can no longer be read as it is, or an older torchvts cannot read a new one."""
 
 DEFECT_RATIO = 4.0
@@ -41,6 +41,7 @@ class Calibration:
         report: how it was made, plain JSON: model, convergence, figures, warnings.
         response: the response fields, if they are the model; else None.
         markers: the block that fills printed markers before anything else, or None.
+        ambient: (3,), constant linear light that the lights do not give, taken off before the gain; None for none.
     """
 
     sensor: Sensor
@@ -51,10 +52,16 @@ class Calibration:
     report: dict[str, Any] = field(default_factory=dict)
     response: ResponseModel | None = None
     markers: FillMarkers | None = None
+    ambient: Tensor | None = None
 
     @classmethod
     def from_lights(
-        cls, lights: PointLights, sensor: Sensor, background: Tensor | None = None, report: dict[str, Any] | None = None
+        cls,
+        lights: PointLights,
+        sensor: Sensor,
+        background: Tensor | None = None,
+        report: dict[str, Any] | None = None,
+        ambient: Tensor | None = None,
     ) -> "Calibration":
         """A calibration from known lights: nothing is fitted.
 
@@ -62,8 +69,9 @@ class Calibration:
             lights: the three lights. sensor: the sensor.
             background: (3, H, W) image at rest in [0, 1], if there is one: it gives the constant defects and the noise.
             report: kept with the calibration.
+            ambient: (3,) constant linear light per channel, at least 0; None for none.
         Raises:
-            ValueError, TypeError: background of another shape or range.
+            ValueError, TypeError: background or ambient of another shape or range.
         Example:
             >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
             >>> Calibration.from_lights(lights, Sensor("rig", 48, 64, 0.5)).compensation.abs().max()
@@ -74,11 +82,17 @@ class Calibration:
         sensor = dataclasses.replace(sensor, gamma=sensor.exponent, prior=None)
         frozen = PointLights(*(t.detach().cpu() for t in (lights.position_mm, lights.albedo, lights.gloss))).requires_grad_(False)
         report = report or {"model": "point_lights", "lights": "given"}
+        if ambient is not None:
+            ambient = ambient.detach().cpu().to(frozen.position_mm.dtype)
+            if tuple(ambient.shape) != (3,) or not bool((ambient >= 0).all() & torch.isfinite(ambient).all()):
+                raise ValueError(f"ambient: expected (3,) finite values of at least 0, got {ambient.tolist()}")
         if background is None:
             model = flat_image(frozen, sensor.height, sensor.width, sensor.mm_per_pixel)
-            return cls(sensor, frozen, model, torch.full((3,), QUANTISATION_STD, dtype=model.dtype), False, report)
+            model = model if ambient is None else model + ambient.reshape(3, 1, 1)
+            noise = torch.full((3,), QUANTISATION_STD, dtype=model.dtype)
+            return cls(sensor, frozen, model, noise, False, report, None, None, ambient)
         light, noise, markers = _at_rest(background, sensor, frozen.position_mm.dtype)
-        return cls(sensor, frozen, light, noise, True, report, None, markers)
+        return cls(sensor, frozen, light, noise, True, report, None, markers, ambient)
 
     @classmethod
     def from_response(
@@ -115,12 +129,23 @@ class Calibration:
             return None
         if self.response is not None:
             return 1.0 / (self.background + PEDESTAL)
-        return (self.model_image / self.background.clamp_min(1e-6)).clamp(1.0 / DEFECT_RATIO, DEFECT_RATIO)
+        return (self.model_image / self.lit.clamp_min(1e-6)).clamp(1.0 / DEFECT_RATIO, DEFECT_RATIO)
 
     @property
     def offset(self) -> Tensor | None:
-        """(3, H, W), what is added after the gain: with a response field the pedestal, so that the skin at rest becomes 1."""
-        return None if self.response is None else PEDESTAL / (self.background + PEDESTAL)
+        """(3, H, W), what is added after the gain: with a response field the pedestal, so that the skin at rest becomes 1; with
+        lights minus the ambient light, through the gain."""
+        if self.response is not None:
+            return PEDESTAL / (self.background + PEDESTAL)
+        if self.ambient is None:
+            return None
+        offset, gain = -self.ambient.reshape(3, 1, 1), self.gain
+        return offset.expand_as(self.background) if gain is None else offset * gain
+
+    @property
+    def lit(self) -> Tensor:
+        """(3, H, W), the background without ambient light."""
+        return self.background if self.ambient is None else self.background - self.ambient.reshape(3, 1, 1)
 
     @property
     def model_image(self) -> Tensor:
@@ -151,12 +176,12 @@ class Calibration:
         """(H, W) bool: pixels whose background is far from the model, or for a response field from the median around them."""
         if not self.measured:
             return torch.zeros(self.sensor.height, self.sensor.width, dtype=torch.bool)
-        expected, floor = self.model_image, 3.0 * self.light_noise_std
+        expected, rest, floor = self.model_image, self.lit, 3.0 * self.light_noise_std
         if self.lights is None:
             expected = kornia.filters.median_blur(self.background[None], 7)[0]
         # a pixel that the model itself leaves within the noise cannot be judged
-        far = (self.background * DEFECT_RATIO < expected) | (self.background > expected * DEFECT_RATIO)
-        found: Tensor = (far & (torch.maximum(expected, self.background) > floor)).any(dim=0)
+        far = (rest * DEFECT_RATIO < expected) | (rest > expected * DEFECT_RATIO)
+        found: Tensor = (far & (torch.maximum(expected, rest) > floor)).any(dim=0)
         return found
 
     @property
@@ -181,9 +206,9 @@ class Calibration:
     def save(self, path: str | Path) -> None:
         """Write one safetensors file, whole or not at all.
 
-        Tensors, by lights: S, rho, I_delta, the inverse light matrix at rest, the background, the noise. By response: the
-        noise, and the background as a 16-bit PNG of the camera's values, which an 8-bit image survives bit for bit. JSON
-        metadata: the format version, the sensor, the response, the report.
+        Tensors, by lights: S, rho, I_delta, the inverse light matrix at rest, the background, the noise, ambient light if there
+        is any. By response: the noise, and the background as a 16-bit PNG of the camera's values, which an 8-bit image survives
+        bit for bit. JSON metadata: the format version, the sensor, the response, the report.
         """
         markers = None if self.markers is None else self.markers.to_dict()
         metadata = {
@@ -207,6 +232,8 @@ class Calibration:
                 "compensation": self.compensation,
                 "inverse": self.inverse,
             }
+            if self.ambient is not None:
+                tensors["ambient"] = self.ambient
         save_tensors(path, tensors, metadata)
 
     @classmethod
@@ -242,12 +269,16 @@ class Calibration:
             "light_position_mm": (3, 3), "light_albedo": (3,), "light_gloss": (3,), "noise_std": (3,),
             "background": size, "compensation": size, "inverse": (3, *size),
         }  # fmt: skip
+        if "ambient" in tensors:
+            expected["ambient"] = (3,)
         _check_tensors(path, tensors, expected)
         try:
             lights = PointLights(*(tensors[f"light_{part}"] for part in ("position_mm", "albedo", "gloss"))).requires_grad_(False)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
-        calibration = cls(sensor, lights, tensors["background"], tensors["noise_std"], measured, report, None, markers)
+        calibration = cls(
+            sensor, lights, tensors["background"], tensors["noise_std"], measured, report, None, markers, tensors.get("ambient")
+        )
         for name, derived in (("compensation", calibration.compensation), ("inverse", calibration.inverse)):
             if not torch.allclose(tensors[name], derived, rtol=1e-3, atol=1e-3 * float(derived.abs().max())):
                 raise ValueError(f"{path}: tensor {name!r} does not fit the lights in the same file: damaged or edited")

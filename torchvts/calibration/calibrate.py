@@ -23,8 +23,10 @@ from ..shading import PointLights, flat_image
 from .balls import center_by_slope, guess_circle
 from .contacts import Contact, Press, Touch, depths, middle_px, read_contacts
 from .field import PRODUCT_PENALTY, Family, angle_deg
-from .lights import LOOSE_DEG, LightFit, check_exposure, fit_lights
+from .light_candidates import choose_lights
+from .lights import LOOSE_DEG, check_exposure
 from .response import FAMILIES, ResponseFit, fit_response, held_out_deg
+from .rest_image import falloff, outwardness
 from .touches import TOUCH_BLUR_PX, fit_touches, moved_by_touches, scale_by_presses, scaled
 
 PINNED_DEG = 2.0
@@ -46,9 +48,6 @@ off on the presses of the prior's own GelSight Mini, and 3.2, 2.9, 2.8 from the 
 
 TIE = 1.05
 """Point lights are preferred to response fields unless these are better by more than this."""
-
-HOPELESS_MISFIT = 0.2
-"""Relative structure that lights leave unexplained, from which they are no candidate beside another model."""
 
 
 class CalibrationWarning(UserWarning):
@@ -97,8 +96,8 @@ def calibrate(
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     check_exposure(background)
     presses, touches = _named_presses(presses, sensor), _named_touches(touches, sensor)
-    by_lights, lights_row, complaint = _by_lights(background, sensor, bool(presses or touches or sensor.prior), progress)
-    candidates = [lights_row]
+    by_lights, light_rows, complaint = _by_lights(background, sensor, bool(presses or touches or sensor.prior), progress)
+    lights_row, candidates = light_rows[0], list(light_rows)
     prior = None if sensor.prior is None else sensor.prior.response
     if prior is not None and sensor.blur_px > 0:
         prior = dataclasses.replace(prior, blur_px=sensor.blur_px)
@@ -119,6 +118,8 @@ def calibrate(
             if complaint:
                 warnings.warn(complaint, CalibrationWarning, stacklevel=2)
             reason = f"the image pins the lights to {lights_row['score_deg']:.2f} deg" if pinned else lights_row["note"]
+            if len(light_rows) > 1:
+                reason += f"; {by_lights.report['chosen_because']}"
             report = by_lights.report | {"reason": f"point lights: {reason}", "candidates": candidates}
             return _judge_rest(dataclasses.replace(by_lights, report=report))
         if touched is not None:
@@ -169,64 +170,37 @@ def fit_prior(background: Tensor, sensor: Sensor, presses: Sequence[Press], sour
     return SensorPrior(fit.model, log_background, 0.5 * sensor.width * sensor.mm_per_pixel, source)
 
 
-def _by_lights(background: Tensor, sensor: Sensor, other_models: bool, progress: bool) -> tuple[Calibration, dict[str, Any], str]:
-    """Point lights from the image, their row in the table of candidates, and what there is to complain of."""
+def _by_lights(
+    background: Tensor, sensor: Sensor, other_models: bool, progress: bool
+) -> tuple[Calibration, list[dict[str, Any]], str]:
+    """Point lights from the image, their rows in the table of candidates, chosen one first, and what there is to complain of."""
     report: dict[str, Any] = {"model": "point_lights", "lights": "fitted"}
-    row: dict[str, Any] = {"model": "point lights", "family": "three lights", "numbers": 12, "pass": 2, "misfit": 0.0}
     if sensor.light_position_mm is not None:
         lights = _scale_albedo(PointLights([list(row) for row in sensor.light_position_mm], [1.0, 1.0, 1.0]), background, sensor)
-        report |= {"lights": "positions from the sensor file, albedo fitted", "converged": True}
-        return (
-            Calibration.from_lights(lights, sensor, background, report),
-            row | {"numbers": 3, "score_deg": 0.0, "note": "given"},
-            "",
-        )
-    sensor, fit = _choose_gamma(background, sensor, other_models, progress)
-    loosest = float(fit.direction_std_deg.max())
+        family = "three lights at known positions"
+        report |= {"lights": "positions from the sensor file, albedo fitted", "converged": True, "family": family}
+        row: dict[str, Any] = {"model": "point lights", "family": family, "numbers": 3, "pass": 2, "misfit": 0.0}
+        return Calibration.from_lights(lights, sensor, background, report), [row | {"score_deg": 0.0, "note": "given"}], ""
+    choice = choose_lights(background, sensor, other_models, progress)
+    fit, row = choice.fit, choice.rows[0]
     report |= {
+        "family": row["family"],
+        "chosen_because": choice.reason,
         "converged": fit.converged,
         "message": fit.message,
         "steps": len(fit.loss_history),
         "loss": fit.loss_history[-1],
-        "gamma": sensor.exponent,
+        "gamma": choice.sensor.exponent,
         "direction_std_deg": fit.direction_std_deg.tolist(),
         "position_std_mm": fit.position_std_mm.tolist(),
         "misfit": fit.misfit.tolist(),
         "inlier_fraction": fit.inlier_fraction,
         "gloss": fit.lights.gloss.tolist(),
+        "vignetting": list(fit.falloff),
+        "ambient": fit.ambient.tolist(),
     }
-    note = f"one image leaves the lights {loosest:.1f} deg loose, with a smooth misfit of {float(fit.misfit.max()):.1%}"
-    row |= {"score_deg": loosest, "misfit": float(fit.misfit.max()), "note": note if fit.converged else fit.message}
-    complaint = f"background: {fit.message}" if not fit.converged or loosest > LOOSE_DEG else ""
-    if not fit.converged:
-        row["score_deg"] = 90.0
-    return Calibration.from_lights(fit.lights, sensor, background, report), row, complaint
-
-
-def _choose_gamma(background: Tensor, sensor: Sensor, other_models: bool, progress: bool) -> tuple[Sensor, LightFit]:
-    """The sensor with a gamma, and its lights: 2.2 where the file leaves it open and that leaves clearly less unexplained.
-
-    Where there are other models, lights that leave much unexplained in a sparse image are not refined on the whole one.
-    """
-    linear = dataclasses.replace(sensor, gamma=sensor.exponent, prior=None)
-    stride = max(1, min(sensor.height, sensor.width) // 60)
-    sparse = background[:, stride // 2 :: stride, stride // 2 :: stride]
-    small = dataclasses.replace(
-        linear,
-        height=sparse.shape[1],
-        width=sparse.shape[2],
-        mm_per_pixel=stride * sensor.mm_per_pixel,
-        corners_px=None,
-        roi_px=None,
-    )
-    one = fit_lights(sparse, small, progress=progress)
-    if sensor.gamma is None and float(one.misfit.max()) > 0.005:
-        other = fit_lights(sparse, dataclasses.replace(small, gamma=2.2), progress=progress)
-        if other.converged and other.loss_history[-1] < 0.5 * one.loss_history[-1]:
-            linear, one = dataclasses.replace(linear, gamma=2.2), other
-    if other_models and float(one.misfit.max()) > HOPELESS_MISFIT:
-        return linear, one
-    return linear, fit_lights(background, linear, progress=progress)
+    ambient = fit.ambient.clamp_min(0.0) if bool((fit.ambient > 0).any()) else None
+    return Calibration.from_lights(fit.lights, choice.sensor, background, report, ambient), choice.rows, choice.complaint
 
 
 def _by_presses(
@@ -430,7 +404,11 @@ def _check_type(background: Tensor, sensor: Sensor) -> None:
 def _judge_rest(calibration: Calibration) -> Calibration:
     """Add how far the background is from the lights' model, and warn if it seems to hold a contact."""
     model, report = calibration.model_image, dict(calibration.report)
-    spread = calibration.compensation.abs().flatten(1).median(dim=1).values / 0.6745
+    if "vignetting" in report:  # the camera's, which the gain takes out
+        model = model * falloff(outwardness(calibration.sensor), *report["vignetting"]).to(model.dtype)
+    if calibration.ambient is not None:
+        model = model + calibration.ambient.reshape(3, 1, 1)
+    spread = (model - calibration.background).abs().flatten(1).median(dim=1).values / 0.6745
     report["residual_std"] = spread.tolist()
     # contact changes the light by more than 5 % and is wider than dirt: 5 sigmas of the residual and of 1 % of the model
     judge = ContactMask(model, spread.reshape(3, 1, 1) + 0.01 * model, min_size_px=0.05 * calibration.sensor.height)

@@ -6,18 +6,30 @@ together with what the model leaves unexplained, says how well the image pins th
 """
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from ..core.checks import QUANTISATION_STD, check_image, check_integer
-from ..core.geometry import pixel_grid_mm
-from ..core.noise import noise_std
+from ..core.checks import check_image, check_integer
 from ..core.sensor import Sensor
-from ..shading import PointLights, microfacet
+from ..shading import PointLights
 from .levenberg import LevenbergMarquardt, residual_and_jacobian
+from .rest_image import (
+    AMBIENT,
+    GLOSS,
+    OF_THE_CAMERA,
+    TUKEY,
+    VIGNETTING,
+    VIGNETTING_4,
+    RestPixels,
+    falloff,
+    free_numbers,
+    from_lights,
+    paraboloid_start,
+    to_lights,
+)
 
 
 @dataclass(frozen=True)
@@ -35,6 +47,13 @@ class LightFit:
         noise_std: (3,), noise of the image by itself, in image value.
         misfit: (3,), relative structure that the model leaves unexplained (0 where only noise is left).
         inlier_fraction: share of the pixels that the robust loss kept.
+        vignetting: share of the light that the lens loses in the image corners; 0 where it was not fitted.
+        falloff: the coefficients of the second and fourth power of the distance from the centre that make it up.
+        ambient: (3,), constant light in linear light; 0 where it was not fitted.
+        vignetting_std, ambient_std: standard deviations of these, infinite where they were not fitted.
+        numbers: how many numbers were fitted.
+        held_out: (16,), loss of each block of the image under the lights fitted to all others: mean log of 1 + the square of
+            the residual in units of three times the noise.
     """
 
     lights: PointLights
@@ -47,6 +66,13 @@ class LightFit:
     noise_std: Tensor = field(repr=False)
     misfit: Tensor = field(repr=False)
     inlier_fraction: float = 1.0
+    vignetting: float = 0.0
+    falloff: tuple[float, float] = (0.0, 0.0)
+    ambient: Tensor = field(default_factory=lambda: torch.zeros(3), repr=False)
+    vignetting_std: float = torch.inf
+    ambient_std: Tensor = field(default_factory=lambda: torch.full((3,), torch.inf), repr=False)
+    numbers: int = 12
+    held_out: Tensor = field(default_factory=lambda: torch.zeros(16), repr=False)
 
 
 def fit_lights(
@@ -56,6 +82,10 @@ def fit_lights(
     start: PointLights | None = None,
     max_steps: int = 100,
     progress: bool = False,
+    vignetting: int = 0,
+    ambient: bool = False,
+    known_azimuth: bool = False,
+    gloss: bool = True,
 ) -> LightFit:
     """Fit one point light per channel to an image without contact.
 
@@ -68,10 +98,14 @@ def fit_lights(
         sensor: gives the pixel pitch and ``gamma``.
         start: lights to start from; None takes the closed-form start.
         max_steps: bound of the loop. progress: show a bar.
+        vignetting: fit the lens's fall-off too, by 1 or 2 numbers. ambient: fit a constant light too, one number a channel. A
+            skin fitted with either stays matt.
+        gloss: try a glossy skin where structure remains.
+        known_azimuth: the lights stand where ``sensor.light_azimuth_deg`` says, their distance and height are fitted.
     Returns:
         A :class:`LightFit`. Read ``converged`` and ``direction_std_deg`` before using the lights.
     Raises:
-        ValueError: wrong shape or range, a black, saturated or featureless image.
+        ValueError: wrong shape or range, a black, saturated or featureless image; a known azimuth that the sensor does not know.
     Source:
         eq. 6-7 of the paper; Beaton and Tukey, Technometrics 16, 1974, for the loss.
     Example:
@@ -84,31 +118,49 @@ def fit_lights(
     """
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     check_integer("max_steps", max_steps, 1)
+    if vignetting not in (0, 1, 2):
+        raise ValueError(f"vignetting: expected 0, 1 or 2 numbers, got {vignetting!r}")
     check_exposure(background)
-    pixels = _Pixels.of(background.detach().to(torch.float64).cpu(), sensor)
-    noise = pixels.noise
-
-    def solve(parameter: Tensor) -> _Solution:
-        # some thousand pixels bring the lights near, all of them finish
-        near = _solve(pixels.every(_COARSE_PIXELS), parameter, max_steps, progress)
-        fit = _solve(pixels, near.parameter, max_steps, progress)
-        return fit._replace(history=near.history + fit.history)
-
-    best = solve(_paraboloid_start(pixels) if start is None else _from_lights(start))
-    if best.converged and bool((best.misfit > 0).all()):
+    azimuth = None
+    if known_azimuth:
+        if sensor.light_azimuth_deg is None:
+            raise ValueError(f"known_azimuth: sensor '{sensor.name}' names no light_azimuth_deg: add it to the sensor file")
+        azimuth = torch.deg2rad(torch.tensor(sensor.light_azimuth_deg, dtype=torch.float64))
+    plain = RestPixels.of(background.detach().to(torch.float64).cpu(), sensor)
+    terms = (VIGNETTING, VIGNETTING_4)[:vignetting] + (AMBIENT,) * ambient
+    pixels = plain._replace(terms=terms)
+    starts = [paraboloid_start(plain) if start is None else from_lights(start)]
+    if vignetting and start is None:  # lights that fall off by themselves leave the lens little: start from the other side, too
+        brightened = plain._replace(image=plain.image / falloff(plain.outward, 0.3) ** plain.exponent)
+        starts.append(paraboloid_start(brightened))
+    # some thousand pixels bring the lights near, all of them finish
+    coarse = pixels.every(_COARSE_PIXELS)
+    nears = [_solve(coarse, _with_terms(one, terms, azimuth), azimuth, max_steps, progress) for one in starts]
+    near = best = min(nears, key=lambda solution: solution.history[-1])
+    if len(coarse.x) < len(pixels.x):
+        best = _solve(pixels, near.parameter, azimuth, max_steps, progress)
+        best = best._replace(history=near.history + best.history)
+    if gloss and not terms and best.converged and bool((best.misfit > 0).all()) and float(best.misfit.max()) < NOT_GLOSS:
         # structure is left that noise does not explain: a glossy skin? Only if that leaves next to nothing in every channel
+        shiny = pixels._replace(terms=(GLOSS,))
         with_gloss = torch.cat((best.parameter, torch.full_like(best.parameter[:, :1], 0.05)), dim=1)
-        near = _solve(pixels.every(_COARSE_PIXELS), with_gloss, max_steps, progress)
-        glossy = _solve(pixels, near.parameter, max_steps, progress) if _explains(near, best) else best
+        near = glossy = _solve(shiny.every(_COARSE_PIXELS), with_gloss, azimuth, max_steps, progress)
+        if len(coarse.x) < len(pixels.x):
+            glossy = _solve(shiny, near.parameter, azimuth, max_steps, progress) if _explains(near, best) else best
         if _explains(glossy, best):
             # the width of the lobe is assumed: what choosing the lobe moved is as uncertain as the lights are
-            moved = glossy.parameter[:, :4] - best.parameter
+            moved = torch.zeros_like(glossy.parameter)
+            moved[:, :4] = glossy.parameter[:, :4] - best.parameter
             best = glossy._replace(
                 covariance=glossy.covariance + moved[:, :, None] * moved[:, None, :],
                 history=best.history + near.history + glossy.history,
             )
-    parameter, history, scale, misfit = best.parameter, best.history, best.scale, best.misfit
-    lights = _to_lights(parameter, background.dtype)
+            pixels = shiny
+    return _tell(background, pixels, best, azimuth, max_steps)
+
+
+def _tell(background: Tensor, pixels: RestPixels, best: "_Solution", azimuth: Tensor | None, max_steps: int) -> LightFit:
+    parameter, history, scale, terms = best.parameter, best.history, best.scale, pixels.terms
     direction_std, position_std = _spread(parameter, best.covariance)
     loose = [f"{name} +-{float(std):.1f} deg" for name, std in zip("RGB", direction_std, strict=True) if std > LOOSE_DEG]
     message = f"converged in {len(history)} steps"
@@ -118,66 +170,36 @@ def fit_lights(
             "raise max_steps, or the image pins no light"
         )
     elif loose:
-        percent = float((scale[:, 0] * noise / pixels.image.median(dim=1).values).max())
+        percent = float((scale[:, 0] * pixels.noise / pixels.image.median(dim=1).values).max())
         message += (
             f", but one image does not pin {', '.join(loose)}: a smooth misfit of {percent:.1%} is left (vignetting or scattered "
             "light); calibrate with presses or known lights"
         )
+    fitted: dict[str, Any] = {}
+    variance = torch.diagonal(best.covariance, dim1=1, dim2=2)
+    if VIGNETTING in terms:
+        part = [4 + k for k, name in enumerate(terms) if name in OF_THE_CAMERA]
+        corner = best.covariance[0][part][:, part].sum().clamp_min(0.0).sqrt()
+        powers = [*parameter[0, part].tolist(), 0.0][:2]
+        fitted |= {"vignetting": sum(powers), "falloff": tuple(powers), "vignetting_std": float(corner)}
+    if AMBIENT in terms:
+        k = 4 + terms.index(AMBIENT)
+        fitted |= {"ambient": parameter[:, k], "ambient_std": variance[:, k].sqrt()}
     return LightFit(
-        lights=lights,
+        lights=to_lights(parameter, terms, background.dtype),
         converged=best.converged,
         message=message,
         loss_history=history,
         direction_std_deg=direction_std,
         position_std_mm=position_std,
-        residual_std=scale[:, 0] * noise,
-        noise_std=noise,
-        misfit=misfit,
+        residual_std=scale[:, 0] * pixels.noise,
+        noise_std=pixels.noise,
+        misfit=best.misfit,
         inlier_fraction=float((best.weight > 0).double().mean()),
+        numbers=free_numbers(terms, azimuth).shape[2],
+        held_out=best.held_out,
+        **fitted,
     )
-
-
-class _Pixels(NamedTuple):
-    """What is fitted: positions in mm (N,), image values and which of them count (3, N), noise (3,), 1 / gamma."""
-
-    x: Tensor
-    y: Tensor
-    image: Tensor
-    usable: Tensor
-    noise: Tensor
-    exponent: float
-
-    @classmethod
-    def of(cls, value: Tensor, sensor: Sensor) -> "_Pixels":
-        x, y = pixel_grid_mm(sensor.height, sensor.width, sensor.mm_per_pixel, value.dtype)
-        x, y = (axis.expand(value.shape[1:]).flatten() for axis in (x, y))
-        noise = noise_std(value[None])[0].clamp_min(QUANTISATION_STD)
-        image = value.flatten(1)
-        every = cls(x, y, image, image < 0.995, noise, 1.0 / sensor.exponent)
-        # a pixel that noise could clip at black or white is left out, judged by the model so that noise does not choose
-        expected, margin = every.model(_paraboloid_start(every)), 2.5 * noise[:, None]
-        return every._replace(usable=every.usable & (expected > margin) & (expected < 1.0 - margin))
-
-    def every(self, count: int) -> "_Pixels":
-        """An even choice of about ``count`` pixels; an odd stride walks through all columns."""
-        stride = max(1, len(self.x) // count) | 1
-        part = [t[..., ::stride] for t in (self.x, self.y, self.image, self.usable)]
-        return _Pixels(part[0], part[1], part[2], part[3], self.noise, self.exponent)
-
-    def model(self, parameter: Tensor) -> Tensor:
-        """Image values (3, N) of lights (3, 4 or 5): x, y, log z, log albedo, gloss."""
-        a, b, log_z, log_rho = (parameter[:, k : k + 1] for k in range(4))
-        squared = (self.x - a) ** 2 + (self.y - b) ** 2 + torch.exp(2.0 * log_z)
-        log_light = log_rho + log_z - 1.5 * torch.log(squared)  # eq. 1 at rest
-        if parameter.shape[1] == 5:
-            n_l = torch.exp(log_z) * torch.rsqrt(squared)
-            lobe = microfacet(n_l, torch.ones_like(n_l), torch.sqrt(0.5 + 0.5 * n_l))
-            log_light = log_light + torch.log1p(parameter[:, 4:5].clamp_min(0.0) * lobe)
-        return torch.exp(self.exponent * log_light)
-
-    def residual(self, parameter: Tensor) -> Tensor:
-        """Model minus image in units of the noise, (3, N)."""
-        return (self.model(parameter) - self.image) / self.noise[:, None]
 
 
 class _Solution(NamedTuple):
@@ -189,18 +211,31 @@ class _Solution(NamedTuple):
     scale: Tensor
     covariance: Tensor
     misfit: Tensor
+    held_out: Tensor
 
 
-def _solve(pixels: _Pixels, start: Tensor, max_steps: int, progress: bool) -> _Solution:
+def _with_terms(start: Tensor, terms: tuple[str, ...], azimuth: Tensor | None) -> Tensor:
+    """A start (3, 4) with its terms at zero, moved to the known azimuths."""
+    start = torch.cat((start, torch.zeros(3, len(terms), dtype=start.dtype)), dim=1)
+    if azimuth is not None:
+        ray = torch.stack((azimuth.cos(), azimuth.sin()), dim=1)
+        along = (start[:, :2] * ray).sum(1, keepdim=True).maximum(0.1 * start[:, 2:3].exp())
+        start[:, :2] = along * ray
+    return start
+
+
+def _solve(pixels: RestPixels, start: Tensor, azimuth: Tensor | None, max_steps: int, progress: bool) -> _Solution:
     """The optimiser loop: Levenberg-Marquardt steps, the robust weights renewed at each, until the lights lie still."""
     parameter = start.clone().requires_grad_()
-    optimiser = LevenbergMarquardt(parameter)
+    tie = free_numbers(pixels.terms, azimuth)
+    tied = azimuth is not None or VIGNETTING in pixels.terms
+    optimiser = LevenbergMarquardt(parameter, tie=tie if tied else None)
     history: list[float] = []
     still, moved = 0, float("inf")
     with tqdm(total=max_steps, desc=f"lights, {len(pixels.x)} pixels", disable=not progress, leave=False) as bar:
         while len(history) < max_steps and still < 3:
             weight, scale = _robust_weight(pixels.residual(parameter.detach()), pixels.usable)
-            optimiser.step(pixels.residual, weight)
+            optimiser.step(pixels.residual, weight / scale.square() if tied else weight)
             history.append(float(_tukey_loss(pixels.residual(parameter.detach()), scale)))
             moved = _moved_mm(optimiser.last_step, parameter.detach())
             still = still + 1 if moved < STEP_TOLERANCE_MM else 0
@@ -209,8 +244,13 @@ def _solve(pixels: _Pixels, start: Tensor, max_steps: int, progress: bool) -> _S
     parameter = parameter.detach()
     left, jacobian = residual_and_jacobian(pixels.residual, parameter)
     weight, scale = _robust_weight(left, pixels.usable)
-    covariance, misfit = _covariance(pixels, left, jacobian, pixels.model(parameter), weight, scale)
-    return _Solution(parameter, history, still == 3, moved, weight, scale, covariance, misfit)
+    if not bool(torch.isfinite(left).all() & torch.isfinite(jacobian).all() & torch.isfinite(scale).all()):
+        # the lights ran away: nothing is known of them, and nothing explained
+        lost = 1e6 * torch.eye(parameter.shape[1], dtype=parameter.dtype).expand(3, -1, -1)
+        return _Solution(start, [*history, 1e6], False, 1e6, weight, scale, lost, torch.ones(3), torch.full((16,), 1e6))
+    covariance, misfit = _covariance(pixels, left, jacobian, pixels.model(parameter), weight / scale.square(), tie)
+    held_out = _held_out(pixels, left, jacobian, weight / scale.square(), tie)
+    return _Solution(parameter, history, still == 3, moved, weight, scale, covariance, misfit, held_out)
 
 
 def _explains(glossy: _Solution, matt: _Solution) -> bool:
@@ -224,13 +264,14 @@ _COARSE_PIXELS = 8000
 GLOSS_MISFIT = 0.01
 """A glossy skin is believed only if it leaves less relative structure than this."""
 
+NOT_GLOSS = 0.1
+"""A matt skin that leaves more relative structure than this is not tried as a glossy one: no gloss of the width assumed does."""
+
 STEP_TOLERANCE_MM = 1e-4
 """The loop ends after three steps that move no light further than this."""
 
 LOOSE_DEG = 5.0
 """A light whose direction is known no better than this is reported as not pinned by the image."""
-
-_TUKEY = 4.685  # 95 % efficiency under Gaussian noise
 
 
 def check_exposure(background: Tensor) -> None:
@@ -251,66 +292,29 @@ def check_exposure(background: Tensor) -> None:
             raise ValueError(f"background: channel {name} is constant at {mean:.4f}: not a camera image of a lit skin")
 
 
-def _paraboloid_start(pixels: _Pixels) -> Tensor:
-    """I^(-2/3) = (rho z)^(-2/3) (x^2 + y^2 - 2 a x - 2 b y + a^2 + b^2 + z^2): weighted linear least squares per channel."""
-    x, y, image, exponent, noise = pixels.x, pixels.y, pixels.image, pixels.exponent, pixels.noise
-    span = float(x.abs().max().maximum(y.abs().max()))
-    u, v = x / span, y / span
-    columns = torch.stack((u * u + v * v, u, v, torch.ones_like(u)))  # (4, N)
-    light = image.clamp(1e-3, 1.0) ** (1.0 / exponent)
-    target = light ** (-2.0 / 3.0)
-    # d target / d value, inverted: what weighs residuals as in image value
-    weight = (
-        (image > 3.0 * noise[:, None]) * (image < 0.995) * (light ** (5.0 / 3.0) * image.clamp_min(1e-3) ** (1 - 1 / exponent)) ** 2
-    )
-    robust = torch.ones_like(weight)
-    solution = torch.zeros(3, 4, dtype=image.dtype)
-    for _ in range(8):
-        weighted = columns * (weight * robust)[:, None]  # (3, 4, N)
-        solution = torch.linalg.solve(weighted @ columns.t(), weighted @ target[:, :, None])[:, :, 0]
-        residual = (target - solution @ columns).abs() * weight.sqrt()
-        scale = residual.median(dim=1, keepdim=True).values.clamp_min(1e-12) / 0.6745
-        robust = (1.0 - (residual / (_TUKEY * scale)) ** 2).clamp_min(0.0) ** 2
-    curvature = solution[:, 0].clamp_min(1e-6 * target.mean(1))  # a light infinitely far leaves no curvature
-    a, b = -0.5 * solution[:, 1] / curvature, -0.5 * solution[:, 2] / curvature
-    z = (solution[:, 3] / curvature - a * a - b * b).clamp_min(0.01).sqrt()
-    return torch.stack((a * span, b * span, (z * span).log(), -1.5 * (curvature / span**2).log() - (z * span).log()), dim=1)
-
-
 def _robust_weight(residual: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:
     """Tukey weights (3, N) and robust scale (3, 1) of residuals in units of the noise."""
     scale = (residual.abs().median(dim=1, keepdim=True).values / 0.6745).clamp_min(1.0)
-    return usable * (1.0 - (residual / (_TUKEY * scale)) ** 2).clamp_min(0.0) ** 2, scale
+    return usable * (1.0 - (residual / (TUKEY * scale)) ** 2).clamp_min(0.0) ** 2, scale
 
 
 def _tukey_loss(residual: Tensor, scale: Tensor) -> Tensor:
-    ratio = (residual / (_TUKEY * scale)).square().clamp_max(1.0)
-    return (scale.square() * _TUKEY**2 / 6.0 * (1.0 - (1.0 - ratio) ** 3)).mean()
+    ratio = (residual / (TUKEY * scale)).square().clamp_max(1.0)
+    return (scale.square() * TUKEY**2 / 6.0 * (1.0 - (1.0 - ratio) ** 3)).mean()
 
 
 def _moved_mm(step: Tensor, parameter: Tensor) -> float:
     return float(torch.stack((step[:, 0].abs(), step[:, 1].abs(), (step[:, 2] * parameter[:, 2].exp()).abs())).max())
 
 
-def _from_lights(lights: PointLights) -> Tensor:
-    position, albedo = lights.position_mm.detach().double().cpu(), lights.albedo.detach().double().cpu()
-    return torch.cat((position[:, :2], position[:, 2:].log(), albedo[:, None].log()), dim=1)
-
-
-def _to_lights(parameter: Tensor, dtype: torch.dtype) -> PointLights:
-    position = torch.cat((parameter[:, :2], parameter[:, 2:3].exp()), dim=1)
-    gloss = parameter[:, 4].to(dtype) if parameter.shape[1] == 5 else None
-    return PointLights(position.to(dtype), parameter[:, 3].exp().to(dtype), gloss)
-
-
 def _covariance(
-    pixels: _Pixels, residual: Tensor, jacobian: Tensor, model: Tensor, weight: Tensor, scale: Tensor
+    pixels: RestPixels, residual: Tensor, jacobian: Tensor, model: Tensor, weight: Tensor, tie: Tensor
 ) -> tuple[Tensor, Tensor]:
-    r"""Covariance (3, 4, 4) of the parameters, and the misfit (3,), both honest about what the model does not explain.
+    r"""Covariance (3, K, K) of the parameters, and the misfit (3,), both honest about what the model does not explain.
 
     Vignetting, scattered light and uneven skin act as a smooth relative gain. It is a random effect here: Legendre products
     up to degree 4 whose standard deviation tau / degree^2 falls as bending energy has it; the part of the residual that
-    lights cannot imitate gives tau, one per channel, by moments. What such a gain does to the fitted lights adds to the
+    the model cannot imitate gives tau, one per channel, by moments. What such a gain does to the fitted lights adds to the
     Gauss-Newton covariance. Where only noise is left, tau = 0 and nothing is added.
 
     Source:
@@ -322,21 +326,61 @@ def _covariance(
     in_u, in_v = _legendre(u), _legendre(v)
     orders = [(i, j) for i in range(5) for j in range(5 - i) if i + j > 0]
     gain = torch.stack([in_u[i] * in_v[j] / (i + j) ** 2 for i, j in orders])  # (14, N)
-    covariances, misfits = [], []
+    # everything below needs products of columns only: those of the parameters (K), the gains (14) and the residual (1)
+    products = []
     for c in range(3):
-        root = weight[c].sqrt() / scale[c]
-        lights = (jacobian[c] * root).t()  # (N, K)
-        gains = (gain * (relative[c] * root)).t()  # (N, 14)
-        rest = residual[c] * root
-        basis = torch.linalg.qr(lights).Q
-        gains_free = gains - basis @ (basis.t() @ gains)
-        explained = torch.linalg.qr(gains_free).Q.t() @ rest
-        tau_squared = ((explained.square().sum() - gains.shape[1]) / gains_free.square().sum()).clamp_min(0.0)
-        inverse = torch.linalg.pinv(lights.t() @ lights, rtol=1e-15, hermitian=True)
-        carried = inverse @ (lights.t() @ gains)  # what the lights do when the gain is there and not in the model
-        covariances.append((inverse + tau_squared * carried @ carried.t())[:4, :4])
+        columns = torch.cat((jacobian[c], gain * relative[c], residual[c : c + 1]))
+        products.append((columns * weight[c]) @ columns.t())
+    k = jacobian.shape[1]
+    numbers = torch.stack([tie[c].t() @ products[c][:k, :k] @ tie[c] for c in range(3)]).sum(0)
+    pull = torch.stack([tie[c].t() @ products[c][:k, -1] for c in range(3)]).sum(0)
+    inverse = _inverse(numbers)
+    covariance, misfits = inverse.clone(), []
+    for c in range(3):
+        shared = tie[c].t() @ products[c][:k, k:-1]  # (F, 14)
+        carried = inverse @ shared  # what the numbers do when the gain is there and not in the model
+        free = products[c][k:-1, k:-1] - shared.t() @ carried
+        rest = products[c][k:-1, -1] - carried.t() @ pull
+        explained = rest @ torch.linalg.pinv(free, rtol=1e-10, hermitian=True) @ rest
+        tau_squared = ((explained - gain.shape[0]) / torch.trace(free)).clamp_min(0.0)
+        covariance += tau_squared * carried @ carried.t()
         misfits.append(tau_squared.sqrt())
-    return torch.stack(covariances), torch.stack(misfits)
+    return tie @ covariance @ tie.transpose(1, 2), torch.stack(misfits)
+
+
+def _inverse(matrix: Tensor) -> Tensor:
+    """Inverse of a normal matrix; what the image does not pin at all gets a huge variance, not none."""
+    size = torch.diagonal(matrix).clamp_min(1e-20).sqrt()
+    values, vectors = torch.linalg.eigh(matrix / (size[:, None] * size))
+    inverse: Tensor = (vectors / values.clamp_min(1e-13)) @ vectors.t() / (size[:, None] * size)
+    return inverse
+
+
+def _held_out(pixels: RestPixels, residual: Tensor, jacobian: Tensor, weight: Tensor, tie: Tensor) -> Tensor:
+    """Loss (16,) of each block of the image under the numbers that fit all others best, to first order.
+
+    The other blocks pull the numbers by what this block's pixels no longer do: one Gauss-Newton step, as exact as that for a
+    linear model. A block, not a pixel, is left out because what a wrong model leaves is smooth.
+    """
+    row = ((pixels.y / pixels.y.abs().max() + 1.0) * 2.0).long().clamp(0, 3)
+    column = ((pixels.x / pixels.x.abs().max() + 1.0) * 2.0).long().clamp(0, 3)
+    block = 4 * row + column
+    parts, pulls = [], []
+    for b in range(16):
+        inside = torch.nonzero(block == b)[:, 0]
+        columns = tie.transpose(1, 2) @ jacobian[:, :, inside]  # (3, F, n)
+        weighted = columns * weight[:, None, inside]
+        parts.append((weighted @ columns.transpose(1, 2)).sum(0))
+        pulls.append((weighted @ residual[:, inside, None]).sum(0)[:, 0])
+    whole = torch.stack(parts).sum(0)
+    losses = []
+    for b in range(16):
+        inside = torch.nonzero(block == b)[:, 0]
+        step = _inverse(whole - parts[b]) @ pulls[b]
+        left = residual[:, inside] + ((tie @ step)[:, None] @ jacobian[:, :, inside])[:, 0]
+        usable = pixels.usable[:, inside]
+        losses.append((torch.log1p(left.square() / 9.0) * usable).sum() / usable.sum().clamp_min(1))
+    return torch.stack(losses)
 
 
 def _legendre(t: Tensor) -> list[Tensor]:

@@ -116,7 +116,7 @@ class NormalFromIntensity(nn.Module):
         if calibration.lights is None:
             raise ValueError("calibration: expected one by lights, got one by response fields: use NormalFromResponse")
         sensor, gain = calibration.sensor, calibration.gain
-        full = torch.ones_like(calibration.background) if gain is None else gain
+        full = (0.995**sensor.exponent) * (torch.ones_like(calibration.background) if gain is None else gain)
         return cls(
             calibration.lights,
             sensor.height,
@@ -124,7 +124,7 @@ class NormalFromIntensity(nn.Module):
             sensor.mm_per_pixel,
             noise_std=calibration.compensated_noise_std.flatten(1).median(dim=1).values,
             inverse=calibration.inverse,
-            full_above=(0.995**sensor.exponent) * full,
+            full_above=full if calibration.offset is None else full + calibration.offset,
         )
 
     def forward(self, compensated: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:

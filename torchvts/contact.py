@@ -71,7 +71,7 @@ def _sweep(reached: Tensor, mask: Tensor, dim: int) -> Tensor:
     both = torch.cat((reached, reached.flip(dim)))
     wall = torch.cat((mask, mask.flip(dim))).logical_not_()
     # on the way from the start of a line, what came last before a pixel: a reached pixel (odd) or a wall (even)?
-    place = torch.arange(2, 2 * mask.shape[dim] + 2, 2, dtype=torch.int16, device=mask.device)
+    place = torch.arange(2, 2 * mask.shape[dim] + 2, 2, dtype=torch.int32, device=mask.device)
     place = place[:, None] if dim == 2 else place
     last = torch.cummax((place + both) * (both | wall), dim=dim).values
     found = (last.bitwise_and_(1) == 1).logical_and_(wall.logical_not_())

@@ -268,12 +268,15 @@ def _solve_by_fft(right: Tensor, plan: list[Tensor], top: int) -> Tensor:
     there, back, of_sum, of_difference, rows, order_y = plan[0], plan[1], plan[2], plan[3], plan[4], plan[5]
     height, width = int(order_y.shape[0]), right.shape[-1]
     lines = torch.fft.rfft(interleave(right))  # (B, 1, h, W // 2 + 1)
-    spectrum = lines.new_zeros([lines.shape[0], lines.shape[1], height, lines.shape[3]])
-    spectrum = torch.fft.fft(spectrum.index_copy(2, order_y.narrow(0, top, lines.shape[2]), lines), dim=2)
-    pairs = spectrum.index_select(2, rows).unflatten(2, [2, height // 2 + 1]) * there
+    if lines.shape[2] == height:
+        lines = torch.cat((lines[:, :, ::2], lines[:, :, 1::2].flip(2)), dim=2)
+    else:
+        empty = lines.new_zeros([lines.shape[0], lines.shape[1], height, lines.shape[3]])
+        lines = empty.index_copy(2, order_y.narrow(0, top, lines.shape[2]), lines)
+    spectrum = torch.fft.fft(lines, dim=2)
+    pairs = torch.view_as_real(spectrum.index_select(2, rows).unflatten(2, [2, height // 2 + 1]) * there)
     up, down = pairs[:, :, 0], pairs[:, :, 1]
-    total = torch.view_as_real(up + down) * of_sum
-    difference = torch.view_as_real(up - down)
+    total, difference = (up + down) * of_sum, up - down
     up = torch.view_as_complex(torch.addcmul(total, difference, of_difference)) * back[0]
     down = torch.view_as_complex(torch.addcmul(total, difference, of_difference, value=-1.0)) * back[1]
     spectrum = torch.cat((up, down[:, :, 1 : (height + 1) // 2].flip(2)), dim=2)

@@ -1,10 +1,15 @@
 """Measure speed and error together, print the table, and chart one against the other.
 
-python scripts/bench.py [--out out/bench] [--threads 2]
+python scripts/bench.py [--out out/bench] [--threads 2] [--chart docs/speed_accuracy.png]
+
+Peers are timed in the same run. The real sensor's rows need ../shared/data, or the folder that TORCHVTS_DATA names.
 """
 
 import argparse
+import os
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -12,49 +17,79 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from torchvts import bench, viz
+from torchvts.core.files import write_atomically
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/bench"))
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--chart", type=Path, help="write the chart here too")
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
+    data = Path(os.environ.get("TORCHVTS_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
     arguments.out.mkdir(parents=True, exist_ok=True)
-    memory = bench.frame_memory_mb()
     with tqdm(unit="row") as bar:
         rows = bench.run(
-            f"python scripts/bench.py --threads {arguments.threads}", lambda name: (bar.set_postfix_str(name), bar.update())
+            f"python scripts/bench.py --threads {arguments.threads}",
+            lambda name: (bar.set_postfix_str(name), bar.update()),
+            data if data.is_dir() else None,
         )
-    text = f"{bench.table(rows)}\n\n{rows[0].machine}, {arguments.threads} threads; "
-    text += f"one 640x480 frame, pipeline and all: {memory:.0f} MB beside torch"
-    (arguments.out / "bench.md").write_text(text + "\n")
-    (arguments.out / "bench.json").write_text(bench.to_json(rows))
+    ratios = bench.peer_ratios(rows)
+    text = "\n".join([bench.table(rows), "", f"{rows[0].machine}, {arguments.threads} threads, float32", *ratios])
+    for name, content in (("bench.md", text + "\n"), ("bench.json", bench.to_json(rows))):
+        with write_atomically(arguments.out / name) as temporary:
+            temporary.write_text(content)
     print(text)
-    viz.save_figure(chart(rows), arguments.out / "speed_accuracy.png")
+    figure = chart(rows)
+    for path in filter(None, (arguments.out / "speed_accuracy.png", arguments.chart)):
+        viz.save_figure(figure, path)
     print(f"\nbench.md, bench.json and speed_accuracy.png in {arguments.out}")
 
 
-def chart(rows: list[bench.Row]) -> Figure:
-    figure = Figure(figsize=(7.0, 4.6), layout="constrained", dpi=120)
+def chart(rows: Sequence[bench.Row]) -> Figure:
+    sensor = [row for row in rows if row.kind == "sensor"]
+    figure = Figure(figsize=(13.0, 4.8) if sensor else (9.0, 4.8), layout="constrained", dpi=110)
     FigureCanvasAgg(figure)
-    axes = figure.subplots()
-    for mode, marker in (("fast", "o"), ("precise", "s"), ("auto", "^")):
-        for press, style in (("press 1 mm", "-"), ("press 2 mm", "--")):
-            line = [r for r in rows if r.method == mode and press in r.scene]
-            axes.plot([r.ms_median for r in line], [r.rms_um for r in line], style, marker=marker, label=f"{mode}, {press}")
-            for r in line:
-                axes.annotate(f"{r.width}", (r.ms_median, r.rms_um or 0.0), fontsize=6, xytext=(3, 3), textcoords="offset points")
-    axes.set(
-        xscale="log",
-        yscale="log",
-        xlabel="ms a frame",
-        ylabel="depth RMS, um",
-        title="Error against time; numbers are image widths",
-    )
-    axes.grid(which="both", alpha=0.3)
-    axes.legend(fontsize=7)
+    axes = figure.subplots(1, 3 if sensor else 2)
+    scene = [r for r in rows if r.kind == "scene" and r.height == 480 and "press 1 mm" in r.data]
+    errors_against_time(axes[0], scene, "rms_um", "depth RMS, um", "Exact scene, 640x480: ball pressed 1 mm")
+    if sensor:
+        errors_against_time(
+            axes[1], sensor, "normal_deg", "normals off by, degrees", "GelSight Mini, 320x240: balls not learned from"
+        )
+    cost(axes[-1], [r for r in rows if r.kind == "scene" and "press 1 mm" in r.data])
+    figure.suptitle(f"{rows[0].machine}, {rows[0].threads} threads, one frame", fontsize=9)
     return figure
+
+
+def errors_against_time(axes: Any, rows: Sequence[bench.Row], error: str, label: str, title: str) -> None:
+    shown = [row for row in rows if getattr(row, error) is not None]
+    best = bench.front(shown, error)
+    axes.step([r.ms_median for r in best], [getattr(r, error) for r in best], where="post", color="0.6", lw=1, label="Pareto front")
+    for ours, color, marker, name in ((True, "tab:blue", "o", "torchvts"), (False, "tab:red", "s", "peers")):
+        part = [row for row in shown if row.ours == ours]
+        axes.plot([r.ms_median for r in part], [getattr(r, error) for r in part], marker, color=color, label=name, ls="none")
+    for k, row in enumerate(sorted(shown, key=lambda row: row.ms_median)):
+        above = 5 if k % 2 == 0 else -10
+        axes.annotate(row.method, (row.ms_median, getattr(row, error)), fontsize=6, xytext=(4, above), textcoords="offset points")
+    axes.set(xscale="log", yscale="log", xlabel="ms a frame", ylabel=label)
+    axes.set_title(title, fontsize=9)
+    axes.margins(x=0.25, y=0.1)
+    axes.grid(which="both", alpha=0.25)
+    axes.legend(fontsize=7)
+
+
+def cost(axes: Any, rows: Sequence[bench.Row]) -> None:
+    for method in ("fast", "precise", "auto", "fast, SciPy's DCT", "look-up table", "gs_sdk's pipeline"):
+        line = sorted((r for r in rows if r.method == method), key=lambda row: row.height)
+        if line:
+            style = "o-" if line[0].ours else "s--"
+            axes.plot([r.height * r.width for r in line], [r.ms_median for r in line], style, ms=4, lw=1, label=method)
+    axes.set(xscale="log", yscale="log", xlabel="pixels of a frame", ylabel="ms a frame")
+    axes.set_title("Cost against size", fontsize=9)
+    axes.grid(which="both", alpha=0.25)
+    axes.legend(fontsize=7)
 
 
 if __name__ == "__main__":

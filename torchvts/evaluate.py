@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from .calibration import CalibrationWarning, Press, calibrate, read_presses
-from .calibration.calibrate import RESPONSE_BLUR_PX
+from .calibration.calibrate import RESPONSE_BLUR_PX, by_presses
 from .compensate import Compensate
 from .contact import ContactMask
 from .core.checks import check_image, check_integer, check_same_size
@@ -275,6 +275,10 @@ class Training:
     def located(self) -> list[Press]:
         """The presses that calibration used, with the centers and contact radii that it found."""
         return _found(self.presses, self.calibration)
+
+    def of_family(self, degree: int, product_degree: int) -> Calibration:
+        """By the located presses and response fields of that size alone."""
+        return by_presses(self.background, self.sensor, self.located, None, False, ((degree, product_degree),))[2]
 
 
 def _found(presses: Sequence[Press], calibration: Calibration) -> list[Press]:

@@ -264,8 +264,8 @@ def _window(contact: Tensor, stride: int) -> tuple[int, int, int, int]:
     All of the image where little would be saved, and at least two strides where there is no contact.
     """
     height, width = contact.shape[2], contact.shape[3]
-    touched = _as_factor(contact, torch.zeros(1)).amax(dim=(0, 1))
-    rows, columns = touched.sum(1).nonzero(), touched.sum(0).nonzero()
+    touched = _as_factor(contact, torch.zeros(1))
+    rows, columns = touched.sum(dim=(0, 1, 3)).nonzero(), touched.sum(dim=(0, 1, 2)).nonzero()
     top, bottom, left, right = 0, 0, 0, 0
     if rows.shape[0] > 0:
         top, bottom = int(rows[0]) // stride * stride, int(rows[-1]) + 1

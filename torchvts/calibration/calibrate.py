@@ -130,7 +130,7 @@ def calibrate(
         reason = f"the sensor's prior, carried to this unit by its background; point lights rejected: {lights_row['note']}"
         report = {"model": "response", "response": "the sensor's prior", "reason": reason, "candidates": candidates}
         return Calibration.from_response(prior, sensor, background, report)
-    fit, contacts, by_response = _by_presses(background, sensor, presses, prior, progress)
+    fit, contacts, by_response = by_presses(background, sensor, presses, prior, progress)
     candidates += fit.candidates
     used = [contact for contact in contacts if not contact.reason]
     lights_row["score_deg"] = lights_error = _lights_error(by_lights, presses, contacts, by_response.sensor.blur_px)
@@ -162,7 +162,7 @@ def fit_prior(background: Tensor, sensor: Sensor, presses: Sequence[Press], sour
     """
     bare = sensor.without_prior()
     check_image("background", background, sensor.height, sensor.width, sensor.name)
-    fit, contacts, unit = _by_presses(
+    fit, contacts, unit = by_presses(
         background, bare, _named_presses(presses, sensor), None, False, PRIOR_FAMILY, PRIOR_PRODUCT_PENALTY
     )
     _warn_left_out(contacts)
@@ -203,7 +203,7 @@ def _by_lights(
     return Calibration.from_lights(fit.lights, choice.sensor, background, report, ambient), choice.rows, choice.complaint
 
 
-def _by_presses(
+def by_presses(
     background: Tensor,
     sensor: Sensor,
     presses: Sequence[Press],
@@ -212,6 +212,7 @@ def _by_presses(
     families: tuple[tuple[int, int], ...] = FAMILIES,
     product_penalty: float = PRODUCT_PENALTY,
 ) -> tuple[ResponseFit, list[Contact], Calibration]:
+    """A response model from presses: the fit, what became of each press, and the unit."""
     chosen = _as_read(sensor, prior)
     contacts = _contacts(background, chosen, presses)
     fit = fit_response(contacts, chosen, prior, progress, families, product_penalty)

@@ -168,7 +168,7 @@ def bolt_head(across_flats_mm: float = 9.0) -> Height:
         apothem = 0.5 * across_flats_mm
         beyond = (across.abs() - apothem * math.tan(math.pi / 6)).clamp_min(0.0)
         hexagon = torch.where(along > apothem, torch.sqrt((along - apothem).clamp_min(0) ** 2 + beyond**2 + 1e-18), along - apothem)
-        chamfer = (r - 0.97 * apothem).clamp_min(0.0)
+        chamfer = (r - 1.04 * apothem).clamp_min(0.0)
         return -_wall(hexagon + 0.2, 0.9, 0.9) - 0.01 * r**2 - 0.6 * chamfer**2
 
     return height

@@ -7,8 +7,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, max_pool2d
 
-from ..core.noise import noise_std
-
 LEAST_DEPTH_MM = 0.03
 """Skin less deep than this is taken for skirt: it bends away from the object before it leaves it."""
 
@@ -61,11 +59,12 @@ class Relief(NamedTuple):
 
 
 class Levels(NamedTuple):
-    """A frame on three grids, from fine to coarse, and the noise of its slopes on the first."""
+    """A frame on three grids, from fine to coarse, and the noise of slopes on the coarse one."""
 
     fine: Relief
     middle: Relief
     coarse: Relief
+    noise: float
 
 
 def contact_of(frame: Frame, name: str) -> tuple[Tensor, Tensor, Tensor]:
@@ -95,33 +94,42 @@ def contact_of(frame: Frame, name: str) -> tuple[Tensor, Tensor, Tensor]:
 def levels(frame: Frame, mm_per_pixel: float, name: str) -> Levels:
     """The frame on grids of at most 320, 160 and 80 columns; each pixel there is the mean of all it covers."""
     depth, gradient, contact = contact_of(frame, name)
-    noise = float(noise_std(gradient[None])[0].mean())
+    noise = _noise(gradient, contact)
     least_mm = max(LEAST_DEPTH_MM, 4.0 * noise * mm_per_pixel)
     inside = contact & (depth > least_mm)
+    # flat faces whose outline the image cuts off may be missing from the mask: of these nothing is said, not even "no contact"
+    deep = depth > 0.3 * float(depth[contact].max())
     slope = torch.stack((gradient[0], -gradient[1]))  # y up
     first = max(1, math.ceil(max(depth.shape) / 330))
-    made = [_relief(depth, slope, inside, contact, mm_per_pixel, first * times) for times in (1, 2, 4)]
+    made = [_relief(depth, slope, inside, inside | deep, mm_per_pixel, first * times) for times in (1, 2, 4)]
     if len(made[1].points) < 12:
         raise ValueError(
             f"{name}: expected a contact deeper than {least_mm:.3f} mm on some dozen pixels, got {int(inside.sum())}: pressed too faintly"
         )
-    return Levels(*made)
+    return Levels(*made, noise / (4 * first))
 
 
-def _relief(depth: Tensor, slope: Tensor, inside: Tensor, contact: Tensor, mm_per_pixel: float, times: int) -> Relief:
+def _noise(gradient: Tensor, contact: Tensor) -> float:
+    """Noise of slopes inside the contact, from second differences along rows, as :func:`torchvts.core.noise.noise_std`."""
+    whole = contact[:, :-2] & contact[:, 1:-1] & contact[:, 2:]
+    second = (gradient[..., 1:-1] - 0.5 * (gradient[..., :-2] + gradient[..., 2:]))[:, whole].abs()
+    return float(second.median()) / (0.6745 * math.sqrt(1.5)) if second.numel() else 0.0
+
+
+def _relief(depth: Tensor, slope: Tensor, inside: Tensor, perhaps: Tensor, mm_per_pixel: float, times: int) -> Relief:
     height, width = depth.shape
     rows, columns = height // times * times, width // times * times
     stack = torch.cat((depth[None], slope))[:, :rows, :columns]
-    share = inside.float()[None, :rows, :columns]
+    share = torch.stack((inside, perhaps)).float()[:, :rows, :columns]
     if times > 1:
         stack, share = avg_pool2d(stack[None], times)[0], avg_pool2d(share[None], times)[0]
     pitch = times * mm_per_pixel
     x0 = (0.5 * (times - 1) - 0.5 * (width - 1)) * mm_per_pixel
     y0 = -(0.5 * (times - 1) - 0.5 * (height - 1)) * mm_per_pixel
-    whole = share > 0.99
+    whole = share[:1] > 0.99
     if times <= 2:
         whole = -max_pool2d(-whole.float()[None], 3, 1, 1)[0] > 0.5  # the rim itself is half skirt
-    near = max_pool2d((share > 0.01).float()[None], 3, 1, 1)[0] > 0.5
+    near = max_pool2d((share[1:] > 0.01).float()[None], 3, 1, 1)[0] > 0.5
     smooth = _blur(stack[1:])
     p_y, p_x = torch.gradient(smooth[0], spacing=pitch)
     q_y, q_x = torch.gradient(smooth[1], spacing=pitch)

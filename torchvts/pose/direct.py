@@ -32,7 +32,10 @@ LEAST_INFORMATION = 0.05
 ALIKE_PIXELS = 25.0
 """Errors of slope are alike over so many pixels; with it the covariance foretells the errors measured on rendered scenes."""
 
-LEAST_FITNESS, LEAST_OVERLAP, MOST_COST = 0.8, 0.2, 0.25
+UNKNOWN_VARIANCE = 100.0
+"""Of a motion that the surface does not show, mm^2."""
+
+LEAST_FITNESS, LEAST_OVERLAP, MOST_COST = 0.85, 0.3, 0.25
 """What a pose must reach to be trusted."""
 
 
@@ -203,20 +206,24 @@ def register_depth(source: Frame, target: Frame, mm_per_pixel: float, *, initial
     """
     check_positive("mm_per_pixel", mm_per_pixel)
     a, b = levels(source, mm_per_pixel, "source"), levels(target, mm_per_pixel, "target")
-    start = None if initial is None else rigid("initial", initial)
+    return align(a, b, None if initial is None else rigid("initial", initial))
+
+
+def align(a: Levels, b: Levels, start: Tensor | None) -> Registration:
+    """What :func:`register_depth` does, on frames made ready: source ``a``, target ``b``."""
     if start is not None:
         poses = refine(a.coarse, b.coarse, start[None], 6, 2.0)
         if trusted(judge(a.coarse, b.coarse, poses), 0):
-            return _finish(a, b, poses[:1])
+            return _finish(a, b, poses)
     poses, score = search_plane(a.coarse, b.coarse)
     poses = poses[score > 0.4 * score[0]]
     if start is not None:
         poses = torch.cat((start[None], poses))
     poses = refine(a.coarse, b.coarse, poses, 4, 4.0)
     fit = judge(a.coarse, b.coarse, poses)
-    kept = distinct(fit, a.coarse, 0.5)
-    kept = [k for k in kept if ranked(fit)[k] < 2.0 * ranked(fit)[kept[0]] + 0.1]
-    return _finish(a, b, poses[kept])
+    order = distinct(fit, a.coarse, 0.5)
+    value = ranked(fit)
+    return _finish(a, b, poses[[k for k in order if value[k] < 2.0 * value[order[0]] + 0.1]])
 
 
 def _finish(a: Levels, b: Levels, poses: Tensor) -> Registration:
@@ -227,20 +234,15 @@ def _finish(a: Levels, b: Levels, poses: Tensor) -> Registration:
     fit = judge(a.middle, b.middle, poses)
     kept = _as_good(fit, distinct(fit, a.middle, 0.4))
     best = refine(a.fine, b.fine, poses[kept[:1]], 4, 0.5)
-    fit = judge(a.middle, b.middle, torch.cat((best, poses[kept[1:]])))
-    names = _unknown(a.coarse, b.coarse, best, b.noise)
-    rmse_mm, covariance = _spread(a.fine, b.fine, best)
+    others = poses[kept[1:]]
+    fit = judge(a.middle, b.middle, best)
     converged = trusted(fit, 0)
-    return Registration(
-        best[0],
-        rmse_mm,
-        float(fit.fitness[0]),
-        converged,
-        _message(fit, names, len(kept) - 1),
-        covariance,
-        names if converged else [],
-        list(poses[kept[1:]]) if converged and not names else [],
-    )
+    free, names = _unknown(a.coarse, b.coarse, best, b.noise) if converged else (torch.zeros(6, 0, dtype=torch.float64), [])
+    rmse_mm, covariance = _spread(a.fine, b.fine, best)
+    covariance = covariance + free @ free.T * UNKNOWN_VARIANCE if names else covariance
+    alternatives = list(others) if converged and not names else []
+    message = _message(fit, names, len(alternatives))
+    return Registration(best[0], rmse_mm, float(fit.fitness[0]), converged, message, covariance, names, alternatives)
 
 
 def _as_good(fit: Fit, order: list[int]) -> list[int]:
@@ -265,13 +267,13 @@ def _message(fit: Fit, names: list[str], others: int) -> str:
     return seen + (f"; {others} more poses fit as well: the object is symmetric" if others else "")
 
 
-def _unknown(source: Relief, target: Relief, pose: Tensor, noise: float) -> list[str]:
-    """Names of the motions that the surface does not show, judged on the coarse grid, where noise is low."""
+def _unknown(source: Relief, target: Relief, pose: Tensor, noise: float) -> tuple[Tensor, list[str]]:
+    """Motions (6, k) about the target's origin that the surface does not show, and names; by the coarse grid, where noise is low."""
     points, slopes = target.points, target.slopes
     back = invert(pose)[0].float()
     _, inside, _, _ = source.sample((points @ back[:3, :3].T + back[:3, 3])[:, :2])
     if int(inside.sum()) < 6:
-        return []
+        return torch.zeros(6, 0, dtype=torch.float64), []
     common = target._replace(points=points[inside], slopes=slopes[inside])
     target = target._replace(field=_own_bend(target))
     one = torch.eye(4, dtype=torch.float64)[None]
@@ -284,7 +286,10 @@ def _unknown(source: Relief, target: Relief, pose: Tensor, noise: float) -> list
     bend = 1.5 / 6.0 * (noise / target.pitch / SLOPE_NOISE) ** 2  # of planes through 3 x 3 noisy slopes
     bias = torch.diag(bend * torch.tensor([0.1, 0.1, 1.0, 1.0, 1.0, 0.1], dtype=torch.float64))
     free, shifts = free_directions(information, bias, LEAST_INFORMATION)
-    return name_directions(free, shifts)
+    names = name_directions(free, shifts)
+    moved = units[:, None] * free  # rad and mm; turns about the contact's centre become turns about the origin and shifts
+    moved[3:] = moved[3:] - torch.linalg.cross(moved[:3], center[:, None].expand_as(moved[:3]), dim=0)
+    return moved, names
 
 
 def _own_bend(relief: Relief) -> Tensor:

@@ -101,7 +101,9 @@ def levels(frame: Frame, mm_per_pixel: float, name: str) -> Levels:
     deep = depth > 0.3 * float(depth[contact].max())
     slope = torch.stack((gradient[0], -gradient[1]))  # y up
     first = max(1, math.ceil(max(depth.shape) / 330))
-    made = [_relief(depth, slope, inside, inside | deep, mm_per_pixel, first * times) for times in (1, 2, 4)]
+    corner = (-0.5 * (depth.shape[1] - 1) * mm_per_pixel, 0.5 * (depth.shape[0] - 1) * mm_per_pixel)
+    every = (first, 2 * first, 4 * first)
+    made = [relief(depth, slope, inside, inside | deep, mm_per_pixel, times, corner) for times in every]
     if len(made[1].points) < 12:
         raise ValueError(
             f"{name}: expected a contact deeper than {least_mm:.3f} mm on some dozen pixels, got {int(inside.sum())}: pressed too faintly"
@@ -116,7 +118,10 @@ def _noise(gradient: Tensor, contact: Tensor) -> float:
     return float(second.median()) / (0.6745 * math.sqrt(1.5)) if second.numel() else 0.0
 
 
-def _relief(depth: Tensor, slope: Tensor, inside: Tensor, perhaps: Tensor, mm_per_pixel: float, times: int) -> Relief:
+def relief(
+    depth: Tensor, slope: Tensor, inside: Tensor, perhaps: Tensor, mm_per_pixel: float, times: int, corner: tuple[float, float]
+) -> Relief:
+    """One grid: means of ``times`` x ``times`` pixels of depth (H, W) and slope (2, H, W), y up; ``corner``: the first pixel, mm."""
     height, width = depth.shape
     rows, columns = height // times * times, width // times * times
     stack = torch.cat((depth[None], slope))[:, :rows, :columns]
@@ -124,8 +129,7 @@ def _relief(depth: Tensor, slope: Tensor, inside: Tensor, perhaps: Tensor, mm_pe
     if times > 1:
         stack, share = avg_pool2d(stack[None], times)[0], avg_pool2d(share[None], times)[0]
     pitch = times * mm_per_pixel
-    x0 = (0.5 * (times - 1) - 0.5 * (width - 1)) * mm_per_pixel
-    y0 = -(0.5 * (times - 1) - 0.5 * (height - 1)) * mm_per_pixel
+    x0, y0 = corner[0] + 0.5 * (times - 1) * mm_per_pixel, corner[1] - 0.5 * (times - 1) * mm_per_pixel
     whole = share[:1] > 0.99
     if times <= 2:
         whole = -max_pool2d(-whole.float()[None], 3, 1, 1)[0] > 0.5  # the rim itself is half skirt

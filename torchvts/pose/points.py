@@ -1,0 +1,427 @@
+"""Pose from two point clouds: as reliefs where they are such, else by their own axes and features; then nearest points."""
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d, unfold
+
+from .ambiguity import free_directions, name_directions
+from .direct import UNKNOWN_VARIANCE, align, rigid
+from .relief import LEAST_DEPTH_MM, Levels, relief
+from .result import Registration, invert, motion
+
+LEAST_POINTS = 10
+"""A cloud of fewer points has no pose."""
+
+SEARCH_POINTS = 1000
+"""To so many the clouds are thinned while hypotheses are compared."""
+
+FINE_POINTS = 20000
+"""To so many for the last steps."""
+
+LEAST_INFORMATION = 1e-3
+"""Mean squared share of a motion of 1 mm that goes along the normals, below which it is called unknown."""
+
+
+def register_points(
+    source: Tensor,
+    target: Tensor,
+    *,
+    source_normals: Tensor | None = None,
+    target_normals: Tensor | None = None,
+    initial: Tensor | None = None,
+) -> Registration:
+    """Pose of one point cloud relative to another.
+
+    Clouds that are reliefs over x and y, as contacts are, are compared as such: every turn and shift in the plane, then slopes
+    and heights. Clouds of any other shape, or turned out of the plane, start from their principal axes and, where Open3D is
+    installed, from FPFH features and sample consensus. Iterated nearest points end it: point to plane, and point to point where
+    the clouds are copies of each other.
+
+    Args:
+        source, target: (N, 3) and (M, 3), mm, right-handed, x right, y up, z to the camera (:func:`torchvts.depth_to_points`).
+        source_normals, target_normals: their unit normals, of the same shape; estimated from the points if absent. Photometric
+            normals are better than any estimate.
+        initial: T_target_source (4, 4) to try first.
+    Returns:
+        The registration; ``converged`` is False if nothing fits.
+    Raises:
+        ValueError: not (N, 3), not finite, fewer than 10 distinct points, or points on one line. TypeError: no tensors.
+    Source:
+        Chen, Medioni 1992 for point to plane; Rusu, Blodow, Beetz 2009 for FPFH; the search over the plane is this project's.
+    Example:
+        >>> points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 5
+        >>> shift = torch.tensor([1.0, 0.5, 0.2], dtype=torch.float64)
+        >>> reg = register_points(points, points + shift)
+        >>> reg.converged, bool((reg.T_target_source[:3, 3] - shift).abs().max() < 1e-4)
+        (True, True)
+    """
+    source, source_normals = _checked("source", source, source_normals)
+    target, target_normals = _checked("target", target, target_normals)
+    start = None if initial is None else rigid("initial", initial)
+    found = _as_reliefs(source, target, source_normals, target_normals, start)
+    if found is not None and found.converged and found.ambiguous:
+        return found  # nearest points would only drift along what is unknown
+    clouds = _Pair(source, target, source_normals, target_normals)
+    poses = [] if found is None else [found.T_target_source]
+    if start is not None:
+        poses.append(start)
+    if found is None or not found.converged:
+        poses += [torch.eye(4, dtype=torch.float64), *_axes(source, target)]
+    best = clouds.best(poses)
+    if best[1] < 0.9 and (found is None or not found.converged):
+        best = clouds.best([best[0], *_by_features(clouds)])
+    result = clouds.finish(best[0])
+    if found is not None and found.converged:
+        # the reliefs know of what does not touch, and of symmetry; nearest points only make copies exact
+        exact = result.converged and result.rmse_mm < 0.3 * found.rmse_mm + 1e-9
+        pose, rmse_mm = (result.T_target_source, result.rmse_mm) if exact else (found.T_target_source, found.rmse_mm)
+        return Registration(
+            pose, rmse_mm, found.fitness, True, found.message, found.covariance, found.ambiguous, found.alternatives
+        )
+    return result
+
+
+class _Pair:
+    """Two clouds, thinned twice, with the target's normals."""
+
+    def __init__(self, source: Tensor, target: Tensor, source_normals: Tensor | None, target_normals: Tensor | None) -> None:
+        self.source, self.target = source, target
+        self.few_s, self.few_t = _thin(source, SEARCH_POINTS), _thin(target, 2 * SEARCH_POINTS)
+        self.spacing = max(_spacing(source[self.few_s]), _spacing(target[self.few_t]))
+        self.full_s, self.full_t = _thin(source, FINE_POINTS), _thin(target, 5 * FINE_POINTS)
+        points_t = target[self.full_t]
+        self.tree, self.tree_s = _Tree(points_t), _Tree(source[self.full_s])
+        self.normals = _normals(points_t, self.tree) if target_normals is None else target_normals[self.full_t]
+        few = target[self.few_t]
+        self.few_normals = _normals(few, _Tree(few)) if target_normals is None else target_normals[self.few_t]
+        del source_normals
+
+    def best(self, poses: list[Tensor]) -> tuple[Tensor, float]:
+        """The hypothesis that fits best after some steps, and the share of points near the other cloud."""
+        results = []
+        for pose in poses:
+            reach = 8.0 * self.spacing
+            for _ in range(15):
+                reach = max(1.5 * self.spacing, 0.75 * reach)
+                pose = self._step(pose, self.source[self.few_s], self.target[self.few_t], self.few_normals, reach)
+            results.append((self._share(pose), pose))
+        share, pose = max(results, key=lambda entry: entry[0])
+        return pose, share
+
+    def _share(self, pose: Tensor) -> float:
+        moved = _move(pose, self.source[self.few_s])
+        distance = torch.cdist(moved, self.target[self.few_t])
+        near = 1.0 - (distance.min(1).values / self.spacing).clamp_max(1.0).square()
+        back = 1.0 - (distance.min(0).values / self.spacing).clamp_max(1.0).square()
+        return 0.5 * float(near.mean() + back.mean())
+
+    @staticmethod
+    def _step(pose: Tensor, source: Tensor, target: Tensor, normals: Tensor, reach: float, tree: "_Tree | None" = None) -> Tensor:
+        moved = _move(pose, source)
+        if tree is None:
+            distance, index = torch.cdist(moved, target).min(1)
+        else:
+            distance, index = tree.nearest(moved)
+        near = distance < reach
+        if int(near.sum()) < 6:
+            return pose
+        p, q, n = moved[near], target[index[near]], normals[index[near]]
+        center = p.mean(0)
+        residual = ((q - p) * n).sum(1)
+        scale = 2.0 * float(residual.abs().median()) + 1e-9
+        weight = 1.0 / (1.0 + (residual / scale) ** 2)
+        jacobian = torch.cat((torch.linalg.cross(p - center, n, dim=1), n), 1)
+        matrix = jacobian.T @ (jacobian * weight[:, None])
+        matrix = matrix + 1e-6 * float(matrix.diagonal().max()) * torch.eye(6, dtype=matrix.dtype)
+        return motion(torch.linalg.solve(matrix, jacobian.T @ (weight * residual)), center) @ pose
+
+    def finish(self, pose: Tensor) -> Registration:
+        source, target = self.source[self.full_s], self.target[self.full_t]
+        spacing = _spacing(target)
+        for k in range(12):
+            pose = self._step(pose, source, target, self.normals, max(1.5 * spacing, 3.0 * self.spacing * 0.7**k), self.tree)
+        pose = self._as_copies(pose, source, target, spacing)
+        moved = _move(pose, source)
+        distance, index = self.tree.nearest(moved)
+        back, _ = self.tree_s.nearest(_move(invert(pose), target))
+        reach = 1.5 * max(spacing, _spacing(source))
+        near = distance < reach
+        fitness = min(1.0, max(float(near.double().mean()), float((back < reach).double().mean())))
+        normal = self.normals[index[near]]
+        off = ((moved[near] - target[index[near]]) * normal).sum(1)
+        rmse_mm = float(off.square().mean().sqrt()) if bool(near.any()) else math.inf
+        size = float((target - target.mean(0)).square().sum(1).mean().sqrt())
+        converged = fitness >= 0.6 and rmse_mm < 0.3 * reach and int(near.sum()) >= LEAST_POINTS
+        covariance = torch.diag(torch.tensor([1.0] * 3 + [UNKNOWN_VARIANCE] * 3, dtype=torch.float64))
+        if not converged:
+            message = f"nothing fits: {100 * fitness:.0f} % of the points have a neighbour in the other cloud"
+            return Registration(pose, rmse_mm, fitness, False, message, covariance)
+        center = moved[near].mean(0)
+        units = torch.tensor([1.0 / size] * 3 + [1.0] * 3, dtype=torch.float64)
+        jacobian = torch.cat((torch.linalg.cross(moved[near] - center, normal, dim=1), normal), 1) * units
+        information = jacobian.T @ jacobian / len(jacobian)
+        free, shifts = free_directions(information, torch.zeros(6, 6, dtype=torch.float64), LEAST_INFORMATION)
+        names = name_directions(free, shifts)
+        about_origin = torch.cat((torch.linalg.cross(moved[near], normal, dim=1), normal), 1)
+        known = about_origin.T @ about_origin / max(rmse_mm, 1e-6) ** 2
+        covariance = torch.linalg.inv(known + torch.diag(torch.tensor([1.0] * 3 + [0.01] * 3, dtype=torch.float64)))
+        message = f"{100 * fitness:.0f} % of the points have a neighbour in the other cloud"
+        message += f"; the surface slides on itself: {', '.join(names)} unknown" if names else ""
+        return Registration(pose, rmse_mm, fitness, True, message, covariance, names)
+
+    def _as_copies(self, pose: Tensor, source: Tensor, target: Tensor, spacing: float) -> Tensor:
+        """Point to point over mutual nearest points, kept only if the points then fall on each other."""
+        trial = pose
+        for _ in range(10):
+            moved = _move(trial, source)
+            distance, index = self.tree.nearest(moved)
+            near = distance < 0.7 * spacing
+            if int(near.sum()) < LEAST_POINTS:
+                return pose
+            trial = _rigid_between(source[near], target[index[near]])
+        distance, index = self.tree.nearest(_move(trial, source))
+        exact = distance < 0.02 * spacing
+        if float(exact.double().mean()) < 0.3:
+            return pose
+        return _rigid_between(source[exact], target[index[exact]])
+
+
+class _Tree:
+    """Nearest points of a cloud, by OpenCV's k-d tree."""
+
+    def __init__(self, points: Tensor) -> None:
+        import cv2
+
+        self.points = points
+        self.center = points.mean(0)
+        self.index: Any = cv2.flann_Index((points - self.center).float().contiguous().numpy(), {"algorithm": 4})
+
+    def nearest(self, points: Tensor, count: int = 1) -> tuple[Tensor, Tensor]:
+        """Distances and indices, (N,), or (N, count)."""
+        found, _ = self.index.knnSearch((points - self.center).float().contiguous().numpy(), count, params={"checks": -1})
+        index = torch.from_numpy(found.astype("int64"))
+        distance = (points[:, None] - self.points[index]).norm(dim=2)
+        return (distance[:, 0], index[:, 0]) if count == 1 else (distance, index)
+
+
+def _checked(name: str, points: Tensor, normals: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    if not isinstance(points, Tensor):
+        raise TypeError(f"{name}: expected a tensor (N, 3), got {type(points).__name__}")
+    if points.dim() != 2 or points.shape[1] != 3:
+        raise ValueError(f"{name}: expected (N, 3), got {tuple(points.shape)}")
+    if len(points) == 0:
+        raise ValueError(f"{name}: expected points, got none: no contact?")
+    points = points.detach().cpu().double()
+    if not bool(torch.isfinite(points).all()):
+        raise ValueError(f"{name}: expected finite points, got {int((~torch.isfinite(points)).any(1).sum())} with NaN or infinity")
+    if normals is not None:
+        if tuple(normals.shape) != tuple(points.shape):
+            raise ValueError(f"{name}_normals: expected {tuple(points.shape)} like the points, got {tuple(normals.shape)}")
+        normals = torch.nn.functional.normalize(normals.detach().cpu().double(), dim=1)
+        if not bool(torch.isfinite(normals).all()):
+            raise ValueError(f"{name}_normals: expected finite normals, got NaN or infinite ones")
+    distinct, inverse = torch.unique(points, dim=0, return_inverse=True)
+    if len(distinct) < LEAST_POINTS:
+        raise ValueError(f"{name}: expected at least {LEAST_POINTS} distinct points, got {len(distinct)} of {len(points)}")
+    if len(distinct) < len(points):
+        first = torch.full((len(distinct),), len(points)).scatter_reduce(0, inverse, torch.arange(len(points)), "amin")
+        first = first.sort().values
+        points, normals = points[first], None if normals is None else normals[first]
+    spread = torch.linalg.svdvals(points - points.mean(0))
+    if float(spread[1]) < 1e-6 * float(spread[0]):
+        raise ValueError(f"{name}: expected a surface, got points on one line")
+    return points, normals
+
+
+def _as_reliefs(
+    source: Tensor, target: Tensor, source_normals: Tensor | None, target_normals: Tensor | None, start: Tensor | None
+) -> Registration | None:
+    """Registration of the clouds as height maps over x and y; None if they are not such."""
+    pitch = 1.01 * max(_spacing_plane(source), _spacing_plane(target))
+    grids = []
+    for points, normals in ((source, source_normals), (target, target_normals)):
+        grid = _grid(points, normals, pitch)
+        if grid is None:
+            return None
+        grids.append(grid)
+    try:
+        return align(grids[0], grids[1], start)
+    except (ValueError, RuntimeError):
+        return None
+
+
+def _grid(points: Tensor, normals: Tensor | None, pitch: float) -> Levels | None:
+    low, high = points[:, :2].amin(0), points[:, :2].amax(0)
+    columns, rows = (((high - low) / pitch).round().long() + 1).tolist()
+    if columns * rows > 4_000_000 or columns < 8 or rows < 8:
+        return None
+    column = ((points[:, 0] - low[0]) / pitch).round().long()
+    row = ((high[1] - points[:, 1]) / pitch).round().long()
+    cell = row * columns + column
+    count = torch.zeros(rows * columns, dtype=torch.float64).index_add_(0, cell, torch.ones(len(points), dtype=torch.float64))
+
+    def mean(values: Tensor) -> Tensor:
+        total = torch.zeros(rows * columns, dtype=torch.float64).index_add_(0, cell, values)
+        return (total / count.clamp_min(1.0)).reshape(rows, columns)
+
+    z = mean(points[:, 2])
+    spread = (points[:, 2] - z.flatten()[cell]).abs()
+    if float(torch.quantile(spread[:: max(1, len(spread) // 100_000)], 0.95)) > 3.0 * pitch:
+        return None  # several heights over one place
+    known = (count > 0).reshape(rows, columns)
+    lowest = float(points[:, 2].min())
+    skin = -0.02 < lowest < 0.15  # a contact's own frame: the skin at rest is at 0
+    level = 0.0 if skin else lowest - 1.0
+    slopes = None
+    if normals is not None:
+        upright = normals[:, 2].clamp_min(0.1)
+        slopes = torch.stack((mean(-normals[:, 0] / upright), mean(-normals[:, 1] / upright)))
+    border = 2
+    pad = [border] * 4
+    z = torch.nn.functional.pad(z - level, pad).float()
+    known = torch.nn.functional.pad(known, pad)
+    kernel = torch.ones(1, 1, 3, 3)
+    around = conv2d(known.float()[None, None], kernel, padding=1)[0, 0]
+    hole = ~known & (around >= 5)
+    z = torch.where(hole, conv2d((z * known)[None, None], kernel, padding=1)[0, 0] / around.clamp_min(1.0), z)
+    if slopes is not None:
+        slopes = torch.nn.functional.pad(slopes, pad).float()
+        filled = conv2d((slopes * known)[:, None], kernel, padding=1)[:, 0] / around.clamp_min(1.0)
+        slopes = torch.where(hole, filled, slopes)
+    inside = known | hole
+    slope = _slopes(z, inside, pitch) if slopes is None else slopes
+    first = max(1, math.ceil(max(z.shape) / 330))
+    every = [max(1, min(times, round(0.3 / (pitch * first)))) * first for times in (1, 2, 4)]
+    corner = (float(low[0]) - border * pitch, float(high[1]) + border * pitch)
+    perhaps = inside if skin else torch.ones_like(inside)
+    deep = inside & (z > LEAST_DEPTH_MM) if skin else inside
+    made = [relief(z, slope, deep, perhaps, pitch, times, corner) for times in every]
+    if level:
+        made = [one._replace(field=torch.cat((one.field[:1] + level, one.field[1:]))) for one in made]
+        made = [one._replace(points=one.points + torch.tensor([0.0, 0.0, level])) for one in made]
+    return Levels(made[0], made[1], made[2], 0.0) if min(len(one.points) for one in made) >= 12 else None
+
+
+def _slopes(z: Tensor, inside: Tensor, pitch: float) -> Tensor:
+    """Slopes (2, H, W), y up, of planes through 3 x 3 heights inside."""
+    side = (-1.0, 0.0, 1.0)
+    place = torch.tensor([[1.0, x, -y] for y in side for x in side])
+    weight = unfold(inside.float()[None, None], 3, padding=1)[0].T
+    heights = unfold(z[None, None], 3, padding=1)[0].T[..., None]
+    weighted = place.T * weight[:, None]
+    ridge = torch.diag(torch.tensor([1e-9, 1e-3, 1e-3]))
+    middle = z.reshape(-1, 1, 1)
+    plane = torch.linalg.solve(weighted @ place + ridge, weighted @ (heights - middle))
+    return (plane[:, 1:, 0].T / pitch).reshape(2, *z.shape) * inside
+
+
+def _axes(source: Tensor, target: Tensor) -> list[Tensor]:
+    """Poses that lay the principal axes on each other: four, for each axis may point either way."""
+    frames = []
+    for points in (source, target):
+        center = points.mean(0)
+        axes = torch.linalg.svd(points - center, full_matrices=False).Vh
+        axes[2] = torch.linalg.cross(axes[0], axes[1])
+        frames.append((center, axes))
+    (c_s, a_s), (c_t, a_t) = frames
+    poses = []
+    for one, two in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)):
+        flip = torch.diag(torch.tensor([one, two, one * two], dtype=torch.float64))
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3] = a_t.T @ flip @ a_s
+        pose[:3, 3] = c_t - pose[:3, :3] @ c_s
+        poses.append(pose)
+    return poses
+
+
+def _by_features(pair: _Pair) -> list[Tensor]:
+    """A pose from FPFH features and sample consensus; none where Open3D is not installed."""
+    from .clouds import open3d
+
+    try:
+        o3d = open3d()
+    except ImportError:
+        return []
+    clouds, features = [], []
+    for points in (pair.source[pair.few_s], pair.target[pair.few_t]):
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.numpy()))
+        cloud.normals = o3d.utility.Vector3dVector(_normals(points, _Tree(points)).numpy())
+        search = o3d.geometry.KDTreeSearchParamHybrid(radius=6.0 * pair.spacing, max_nn=100)
+        features.append(o3d.pipelines.registration.compute_fpfh_feature(cloud, search))
+        clouds.append(cloud)
+    o3d.utility.random.seed(0)
+    found = o3d.pipelines.registration.registration_ransac_based_on_feature_matching(
+        clouds[0], clouds[1], features[0], features[1], True, 1.5 * pair.spacing,
+        criteria=o3d.pipelines.registration.RANSACConvergenceCriteria(50000, 0.999),
+    )  # fmt: skip
+    return [torch.from_numpy(found.transformation.copy())]
+
+
+def _normals(points: Tensor, tree: _Tree, neighbours: int = 12) -> Tensor:
+    """Normals of planes through nearest points, towards the camera."""
+    _, index = tree.nearest(points, min(neighbours, len(points)))
+    around = points[index] - points[index].mean(1, keepdim=True)
+    normal = torch.linalg.eigh(around.transpose(1, 2) @ around).eigenvectors[:, :, 0]
+    return torch.where(normal[:, 2:] < 0, -normal, normal)
+
+
+def _rigid_between(source: Tensor, target: Tensor) -> Tensor:
+    """Least-squares rigid motion of paired points (Kabsch 1976)."""
+    c_s, c_t = source.mean(0), target.mean(0)
+    u, _, vh = torch.linalg.svd((target - c_t).T @ (source - c_s))
+    flip = torch.diag(torch.tensor([1.0, 1.0, float(torch.sign(torch.linalg.det(u @ vh)))], dtype=torch.float64))
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = u @ flip @ vh
+    pose[:3, 3] = c_t - pose[:3, :3] @ c_s
+    return pose
+
+
+def _move(pose: Tensor, points: Tensor) -> Tensor:
+    return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def _thin(points: Tensor, most: int) -> Tensor:
+    """Indices of at most about ``most`` points, evenly spread: one of each cell of a grid."""
+    if len(points) <= most:
+        return torch.arange(len(points))
+    low, high = 0.0, float((points.amax(0) - points.amin(0)).max())
+    kept = torch.arange(len(points))
+    for _ in range(24):
+        size = 0.5 * (low + high)
+        index = voxel_first(points, size)
+        if len(index) > most:
+            low = size
+        else:
+            high, kept = size, index
+            if len(index) > 0.9 * most:
+                break
+    return kept
+
+
+def voxel_first(points: Tensor, size: float) -> Tensor:
+    """Indices of the first point of each cube of side ``size``, ascending."""
+    cell = torch.floor((points - points.amin(0)) / size).long()
+    extent = cell.amax(0) + 1
+    code = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
+    order = torch.argsort(code, stable=True)
+    code = code[order]
+    fresh = torch.cat((torch.ones(1, dtype=torch.bool), code[1:] != code[:-1]))
+    return order[fresh].sort().values
+
+
+def _spacing(points: Tensor) -> float:
+    """Median distance to the nearest other point."""
+    some = points[:: max(1, len(points) // 500)]
+    distance, _ = _Tree(points).nearest(some, 2)
+    return max(float(distance[:, 1].median()), 1e-9)
+
+
+def _spacing_plane(points: Tensor) -> float:
+    """The same over x and y only, where points of one place count once; for scattered points the side of their mean cell."""
+    flat = torch.cat((points[:, :2], torch.zeros(len(points), 1, dtype=points.dtype)), 1)
+    nearest = _spacing(flat)
+    covered = len(voxel_first(flat, 4.0 * nearest)) * 16.0 * nearest**2
+    return max(nearest, math.sqrt(covered / len(points)) if nearest < 0.7 * math.sqrt(covered / len(points)) else nearest)

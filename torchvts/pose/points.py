@@ -1,16 +1,18 @@
 """Pose from two point clouds: as reliefs where they are such, else by their own axes and features; then nearest points."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d, unfold
+from torch.nn.functional import conv2d, max_pool2d, unfold
 
 from .ambiguity import free_directions, name_directions
+from .clouds import open3d, thin, voxel_first
 from .direct import UNKNOWN_VARIANCE, align, rigid
-from .relief import LEAST_DEPTH_MM, Levels, relief
-from .result import Registration, invert, motion
+from .relief import LEAST_DEPTH_MM, Levels, relief, slope_noise
+from .result import Registration, invert, motion, turn_deg
 
 LEAST_POINTS = 10
 """A cloud of fewer points has no pose."""
@@ -62,54 +64,65 @@ def register_points(
     target, target_normals = _checked("target", target, target_normals)
     start = None if initial is None else rigid("initial", initial)
     found = _as_reliefs(source, target, source_normals, target_normals, start)
+    if found is None and start is None:
+        found = _levelled(source, target, source_normals, target_normals)
     if found is not None and found.converged and found.ambiguous:
         return found  # nearest points would only drift along what is unknown
-    clouds = _Pair(source, target, source_normals, target_normals)
-    poses = [] if found is None else [found.T_target_source]
-    if start is not None:
-        poses.append(start)
-    if found is None or not found.converged:
-        poses += [torch.eye(4, dtype=torch.float64), *_axes(source, target)]
-    best = clouds.best(poses)
-    if best[1] < 0.9 and (found is None or not found.converged):
-        best = clouds.best([best[0], *_by_features(clouds)])
-    result = clouds.finish(best[0])
+    clouds = _Pair(source, target, target_normals)
     if found is not None and found.converged:
         # the reliefs know of what does not touch, and of symmetry; nearest points only make copies exact
-        exact = result.converged and result.rmse_mm < 0.3 * found.rmse_mm + 1e-9
-        pose, rmse_mm = (result.T_target_source, result.rmse_mm) if exact else (found.T_target_source, found.rmse_mm)
-        return Registration(
-            pose, rmse_mm, found.fitness, True, found.message, found.covariance, found.ambiguous, found.alternatives
-        )
-    return result
+        for pose in (found.T_target_source, *found.alternatives):
+            exact = clouds.as_copies(clouds.approach(pose))
+            if exact is not None:
+                return replace(found, T_target_source=exact, rmse_mm=clouds.finish(exact).rmse_mm, alternatives=[])
+        return found
+    if found is not None:
+        exact = clouds.as_copies(clouds.approach(found.T_target_source))
+        return found if exact is None else clouds.finish(exact)
+    poses = [torch.eye(4, dtype=torch.float64), *_axes(source, target)]
+    ranked = clouds.ranked(poses if start is None else [start, *poses])
+    if ranked[0][0] < 0.9:
+        ranked = clouds.ranked([ranked[0][1], *_by_features(clouds)])
+    ranked = clouds.ranked([ranked[0][1], *_turned(ranked[0][1], target)])
+    for _, pose in ranked[:8]:
+        exact = clouds.as_copies(pose)
+        if exact is not None:
+            return clouds.finish(exact)
+    result = clouds.finish(ranked[0][1])
+    others = [pose for share, pose in ranked[1:] if share > ranked[0][0] - 0.01]
+    apart = [pose for pose in others if float(turn_deg(pose @ invert(result.T_target_source))) > 3.0]
+    return replace(result, alternatives=apart) if result.converged and not result.ambiguous else result
 
 
 class _Pair:
     """Two clouds, thinned twice, with the target's normals."""
 
-    def __init__(self, source: Tensor, target: Tensor, source_normals: Tensor | None, target_normals: Tensor | None) -> None:
+    def __init__(self, source: Tensor, target: Tensor, target_normals: Tensor | None) -> None:
         self.source, self.target = source, target
-        self.few_s, self.few_t = _thin(source, SEARCH_POINTS), _thin(target, 2 * SEARCH_POINTS)
+        self.few_s, self.few_t = thin(source, SEARCH_POINTS), thin(target, 2 * SEARCH_POINTS)
         self.spacing = max(_spacing(source[self.few_s]), _spacing(target[self.few_t]))
-        self.full_s, self.full_t = _thin(source, FINE_POINTS), _thin(target, 5 * FINE_POINTS)
+        self.full_s, self.full_t = thin(source, FINE_POINTS), thin(target, 5 * FINE_POINTS)
         points_t = target[self.full_t]
         self.tree, self.tree_s = _Tree(points_t), _Tree(source[self.full_s])
         self.normals = _normals(points_t, self.tree) if target_normals is None else target_normals[self.full_t]
         few = target[self.few_t]
         self.few_normals = _normals(few, _Tree(few)) if target_normals is None else target_normals[self.few_t]
-        del source_normals
 
-    def best(self, poses: list[Tensor]) -> tuple[Tensor, float]:
-        """The hypothesis that fits best after some steps, and the share of points near the other cloud."""
-        results = []
-        for pose in poses:
-            reach = 8.0 * self.spacing
-            for _ in range(15):
-                reach = max(1.5 * self.spacing, 0.75 * reach)
-                pose = self._step(pose, self.source[self.few_s], self.target[self.few_t], self.few_normals, reach)
-            results.append((self._share(pose), pose))
-        share, pose = max(results, key=lambda entry: entry[0])
-        return pose, share
+    def ranked(self, poses: list[Tensor]) -> list[tuple[float, Tensor]]:
+        """The hypotheses after some steps, best first, with the share of points near the other cloud."""
+        return sorted(((self._share(pose), pose) for pose in map(self.approach, poses)), key=lambda entry: -entry[0])
+
+    def approach(self, pose: Tensor) -> Tensor:
+        """Point to plane on the thinned clouds."""
+        reach = 8.0 * self.spacing
+        for _ in range(15):
+            reach = max(1.5 * self.spacing, 0.75 * reach)
+            moved_on = self._step(pose, self.source[self.few_s], self.target[self.few_t], self.few_normals, reach)
+            settled = reach <= 1.5 * self.spacing and float((moved_on - pose).abs().max()) < 1e-4
+            pose = moved_on
+            if settled:
+                break
+        return pose
 
     def _share(self, pose: Tensor) -> float:
         moved = _move(pose, self.source[self.few_s])
@@ -143,7 +156,8 @@ class _Pair:
         spacing = _spacing(target)
         for k in range(12):
             pose = self._step(pose, source, target, self.normals, max(1.5 * spacing, 3.0 * self.spacing * 0.7**k), self.tree)
-        pose = self._as_copies(pose, source, target, spacing)
+        exact = self.as_copies(pose)
+        pose = pose if exact is None else exact
         moved = _move(pose, source)
         distance, index = self.tree.nearest(moved)
         back, _ = self.tree_s.nearest(_move(invert(pose), target))
@@ -154,7 +168,7 @@ class _Pair:
         off = ((moved[near] - target[index[near]]) * normal).sum(1)
         rmse_mm = float(off.square().mean().sqrt()) if bool(near.any()) else math.inf
         size = float((target - target.mean(0)).square().sum(1).mean().sqrt())
-        converged = fitness >= 0.6 and rmse_mm < 0.3 * reach and int(near.sum()) >= LEAST_POINTS
+        converged = fitness >= 0.8 and rmse_mm < 0.3 * reach and int(near.sum()) >= LEAST_POINTS
         covariance = torch.diag(torch.tensor([1.0] * 3 + [UNKNOWN_VARIANCE] * 3, dtype=torch.float64))
         if not converged:
             message = f"nothing fits: {100 * fitness:.0f} % of the points have a neighbour in the other cloud"
@@ -172,21 +186,21 @@ class _Pair:
         message += f"; the surface slides on itself: {', '.join(names)} unknown" if names else ""
         return Registration(pose, rmse_mm, fitness, True, message, covariance, names)
 
-    def _as_copies(self, pose: Tensor, source: Tensor, target: Tensor, spacing: float) -> Tensor:
-        """Point to point over mutual nearest points, kept only if the points then fall on each other."""
-        trial = pose
-        for _ in range(10):
-            moved = _move(trial, source)
-            distance, index = self.tree.nearest(moved)
-            near = distance < 0.7 * spacing
-            if int(near.sum()) < LEAST_POINTS:
-                return pose
-            trial = _rigid_between(source[near], target[index[near]])
-        distance, index = self.tree.nearest(_move(trial, source))
-        exact = distance < 0.02 * spacing
-        if float(exact.double().mean()) < 0.3:
-            return pose
-        return _rigid_between(source[exact], target[index[exact]])
+    def as_copies(self, pose: Tensor) -> Tensor | None:
+        """Point to point over nearest points; None unless the points then fall on each other."""
+        few, target = self.source[self.few_s], self.target[self.full_t]
+        spacing = _spacing(target)
+        for reach in (4.0, 2.0, 1.0, 0.7, 0.7, 0.7):
+            distance, index = self.tree.nearest(_move(pose, few))
+            near = distance < max(reach * spacing, float(distance.median()))
+            pose = _rigid_between(few[near], target[index[near]])
+        for points in (few, self.source[self.full_s]):
+            distance, index = self.tree.nearest(_move(pose, points))
+            exact = distance < 0.02 * spacing
+            if float(exact.double().mean()) < 0.3:
+                return None
+            pose = _rigid_between(points[exact], target[index[exact]])
+        return pose
 
 
 class _Tree:
@@ -240,7 +254,7 @@ def _as_reliefs(
     source: Tensor, target: Tensor, source_normals: Tensor | None, target_normals: Tensor | None, start: Tensor | None
 ) -> Registration | None:
     """Registration of the clouds as height maps over x and y; None if they are not such."""
-    pitch = 1.01 * max(_spacing_plane(source), _spacing_plane(target))
+    pitch = max(_spacing_plane(source), _spacing_plane(target))
     grids = []
     for points, normals in ((source, source_normals), (target, target_normals)):
         grid = _grid(points, normals, pitch)
@@ -253,7 +267,48 @@ def _as_reliefs(
         return None
 
 
+def _levelled(source: Tensor, target: Tensor, source_normals: Tensor | None, target_normals: Tensor | None) -> Registration | None:
+    """The same after both are laid flat, the target either side up; None if neither way fits."""
+    results = []
+    to_s = _flat_frame(source)
+    laid_s = _move(to_s, source), None if source_normals is None else source_normals @ to_s[:3, :3].T
+    for side in (1.0, -1.0):
+        to_t = torch.diag(torch.tensor([1.0, side, side, 1.0], dtype=torch.float64)) @ _flat_frame(target)
+        laid_t = _move(to_t, target), None if target_normals is None else target_normals @ to_t[:3, :3].T
+        found = _as_reliefs(laid_s[0], laid_t[0], laid_s[1], laid_t[1], None)
+        if found is None or not found.converged:
+            continue
+        back = invert(to_t)
+        turn = torch.block_diag(back[:3, :3], back[:3, :3])
+        arm = back[:3, 3]  # twists about the laid origin become twists about the target's
+        turn[3:, :3] = torch.tensor([[0.0, -arm[2], arm[1]], [arm[2], 0.0, -arm[0]], [-arm[1], arm[0], 0.0]]) @ back[:3, :3]
+        words = [name.replace(" along ", " along the laid ").replace(" about ", " about the laid ") for name in found.ambiguous]
+        results.append(
+            replace(
+                found,
+                T_target_source=back @ found.T_target_source @ to_s,
+                alternatives=[back @ T @ to_s for T in found.alternatives],
+                covariance=turn @ found.covariance @ turn.T,
+                ambiguous=words,
+            )
+        )
+    return min(results, key=lambda r: r.rmse_mm / max(r.fitness, 0.1)) if results else None
+
+
+def _flat_frame(points: Tensor) -> Tensor:
+    """Rigid motion that lays a cloud flat: its middle at zero, its flattest axis along z."""
+    center = points.mean(0)
+    axes = torch.linalg.svd(points - center, full_matrices=False).Vh
+    axes[2] = torch.linalg.cross(axes[0], axes[1])
+    frame = torch.eye(4, dtype=torch.float64)
+    frame[:3, :3], frame[:3, 3] = axes, -axes @ center
+    return frame
+
+
 def _grid(points: Tensor, normals: Tensor | None, pitch: float) -> Levels | None:
+    flattest = _flat_frame(points)[2, :3]
+    if abs(float(flattest[2])) < 0.9:
+        return None  # steep as a whole
     low, high = points[:, :2].amin(0), points[:, :2].amax(0)
     columns, rows = (((high - low) / pitch).round().long() + 1).tolist()
     if columns * rows > 4_000_000 or columns < 8 or rows < 8:
@@ -268,6 +323,9 @@ def _grid(points: Tensor, normals: Tensor | None, pitch: float) -> Levels | None
         return (total / count.clamp_min(1.0)).reshape(rows, columns)
 
     z = mean(points[:, 2])
+    # where the points of a cell lie, off its middle
+    off_x = mean(points[:, 0] - low[0] - column * pitch)
+    off_y = mean(points[:, 1] - high[1] + row * pitch)
     spread = (points[:, 2] - z.flatten()[cell]).abs()
     if float(torch.quantile(spread[:: max(1, len(spread) // 100_000)], 0.95)) > 3.0 * pitch:
         return None  # several heights over one place
@@ -282,6 +340,7 @@ def _grid(points: Tensor, normals: Tensor | None, pitch: float) -> Levels | None
     border = 2
     pad = [border] * 4
     z = torch.nn.functional.pad(z - level, pad).float()
+    off = torch.nn.functional.pad(torch.stack((off_x, off_y)), pad).float()
     known = torch.nn.functional.pad(known, pad)
     kernel = torch.ones(1, 1, 3, 3)
     around = conv2d(known.float()[None, None], kernel, padding=1)[0, 0]
@@ -292,17 +351,22 @@ def _grid(points: Tensor, normals: Tensor | None, pitch: float) -> Levels | None
         filled = conv2d((slopes * known)[:, None], kernel, padding=1)[:, 0] / around.clamp_min(1.0)
         slopes = torch.where(hole, filled, slopes)
     inside = known | hole
-    slope = _slopes(z, inside, pitch) if slopes is None else slopes
+    if slopes is None:
+        slopes = _slopes(z, inside, pitch)
+        for _ in range(3):
+            slopes = _slopes(z - slopes[0] * off[0] - slopes[1] * off[1], inside, pitch)
+    z = z - slopes[0] * off[0] - slopes[1] * off[1]
     first = max(1, math.ceil(max(z.shape) / 330))
     every = [max(1, min(times, round(0.3 / (pitch * first)))) * first for times in (1, 2, 4)]
     corner = (float(low[0]) - border * pitch, float(high[1]) + border * pitch)
-    perhaps = inside if skin else torch.ones_like(inside)
     deep = inside & (z > LEAST_DEPTH_MM) if skin else inside
-    made = [relief(z, slope, deep, perhaps, pitch, times, corner) for times in every]
+    perhaps = deep if skin else torch.ones_like(inside)
+    deep = deep & (-max_pool2d(-inside.float()[None], 3, 1, 1)[0] > 0.5)  # at the edge slopes look one way only
+    made = [relief(z, slopes, deep, perhaps, pitch, times, corner) for times in every]
     if level:
         made = [one._replace(field=torch.cat((one.field[:1] + level, one.field[1:]))) for one in made]
         made = [one._replace(points=one.points + torch.tensor([0.0, 0.0, level])) for one in made]
-    return Levels(made[0], made[1], made[2], 0.0) if min(len(one.points) for one in made) >= 12 else None
+    return Levels(made[0], made[1], made[2], slope_noise(slopes, inside) / (4 * first)) if min(len(one.points) for one in made) >= 12 else None
 
 
 def _slopes(z: Tensor, inside: Tensor, pitch: float) -> Tensor:
@@ -320,27 +384,22 @@ def _slopes(z: Tensor, inside: Tensor, pitch: float) -> Tensor:
 
 def _axes(source: Tensor, target: Tensor) -> list[Tensor]:
     """Poses that lay the principal axes on each other: four, for each axis may point either way."""
-    frames = []
-    for points in (source, target):
-        center = points.mean(0)
-        axes = torch.linalg.svd(points - center, full_matrices=False).Vh
-        axes[2] = torch.linalg.cross(axes[0], axes[1])
-        frames.append((center, axes))
-    (c_s, a_s), (c_t, a_t) = frames
-    poses = []
-    for one, two in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)):
-        flip = torch.diag(torch.tensor([one, two, one * two], dtype=torch.float64))
-        pose = torch.eye(4, dtype=torch.float64)
-        pose[:3, :3] = a_t.T @ flip @ a_s
-        pose[:3, 3] = c_t - pose[:3, :3] @ c_s
-        poses.append(pose)
-    return poses
+    back, to = invert(_flat_frame(target)), _flat_frame(source)
+    flips = [torch.diag(torch.tensor([a, b, a * b, 1.0], dtype=torch.float64)) for a in (1.0, -1.0) for b in (1.0, -1.0)]
+    return [back @ flip @ to for flip in flips]
+
+
+def _turned(pose: Tensor, target: Tensor) -> list[Tensor]:
+    """The pose turned about the target's flattest axis, all around."""
+    center = target.mean(0)
+    axis = torch.linalg.svd(target - center, full_matrices=False).Vh[2]
+    angles = torch.deg2rad(torch.arange(10.0, 360.0, 10.0, dtype=torch.float64))
+    twists = torch.cat((angles[:, None] * axis, torch.zeros(len(angles), 3, dtype=torch.float64)), 1)
+    return list(motion(twists, center.expand(len(angles), 3)) @ pose)
 
 
 def _by_features(pair: _Pair) -> list[Tensor]:
     """A pose from FPFH features and sample consensus; none where Open3D is not installed."""
-    from .clouds import open3d
-
     try:
         o3d = open3d()
     except ImportError:
@@ -355,7 +414,7 @@ def _by_features(pair: _Pair) -> list[Tensor]:
     o3d.utility.random.seed(0)
     found = o3d.pipelines.registration.registration_ransac_based_on_feature_matching(
         clouds[0], clouds[1], features[0], features[1], True, 1.5 * pair.spacing,
-        criteria=o3d.pipelines.registration.RANSACConvergenceCriteria(50000, 0.999),
+        criteria=o3d.pipelines.registration.RANSACConvergenceCriteria(20000, 0.999),
     )  # fmt: skip
     return [torch.from_numpy(found.transformation.copy())]
 
@@ -381,35 +440,6 @@ def _rigid_between(source: Tensor, target: Tensor) -> Tensor:
 
 def _move(pose: Tensor, points: Tensor) -> Tensor:
     return points @ pose[:3, :3].T + pose[:3, 3]
-
-
-def _thin(points: Tensor, most: int) -> Tensor:
-    """Indices of at most about ``most`` points, evenly spread: one of each cell of a grid."""
-    if len(points) <= most:
-        return torch.arange(len(points))
-    low, high = 0.0, float((points.amax(0) - points.amin(0)).max())
-    kept = torch.arange(len(points))
-    for _ in range(24):
-        size = 0.5 * (low + high)
-        index = voxel_first(points, size)
-        if len(index) > most:
-            low = size
-        else:
-            high, kept = size, index
-            if len(index) > 0.9 * most:
-                break
-    return kept
-
-
-def voxel_first(points: Tensor, size: float) -> Tensor:
-    """Indices of the first point of each cube of side ``size``, ascending."""
-    cell = torch.floor((points - points.amin(0)) / size).long()
-    extent = cell.amax(0) + 1
-    code = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
-    order = torch.argsort(code, stable=True)
-    code = code[order]
-    fresh = torch.cat((torch.ones(1, dtype=torch.bool), code[1:] != code[:-1]))
-    return order[fresh].sort().values
 
 
 def _spacing(points: Tensor) -> float:

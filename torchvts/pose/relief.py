@@ -94,9 +94,8 @@ def contact_of(frame: Frame, name: str) -> tuple[Tensor, Tensor, Tensor]:
 def levels(frame: Frame, mm_per_pixel: float, name: str) -> Levels:
     """The frame on grids of at most 320, 160 and 80 columns; each pixel there is the mean of all it covers."""
     depth, gradient, contact = contact_of(frame, name)
-    noise = _noise(gradient, contact)
-    least_mm = max(LEAST_DEPTH_MM, 4.0 * noise * mm_per_pixel)
-    inside = contact & (depth > least_mm)
+    noise = slope_noise(gradient, contact)
+    inside = contact & (depth > least_depth_mm(noise, mm_per_pixel))
     # flat faces whose outline the image cuts off may be missing from the mask: of these nothing is said, not even "no contact"
     deep = depth > 0.3 * float(depth[contact].max())
     slope = torch.stack((gradient[0], -gradient[1]))  # y up
@@ -106,12 +105,23 @@ def levels(frame: Frame, mm_per_pixel: float, name: str) -> Levels:
     made = [relief(depth, slope, inside, inside | deep, mm_per_pixel, times, corner) for times in every]
     if len(made[1].points) < 12:
         raise ValueError(
-            f"{name}: expected a contact deeper than {least_mm:.3f} mm on some dozen pixels, got {int(inside.sum())}: pressed too faintly"
+            f"{name}: expected a contact deeper than {least_depth_mm(noise, mm_per_pixel):.3f} mm on some dozen pixels, got {int(inside.sum())}: pressed too faintly"
         )
     return Levels(*made, noise / (4 * first))
 
 
-def _noise(gradient: Tensor, contact: Tensor) -> float:
+def least_depth_mm(noise: float, mm_per_pixel: float) -> float:
+    """Depth that is surely contact: above the skirt, and above what noise of slopes adds up to over some pixels."""
+    return max(LEAST_DEPTH_MM, 4.0 * noise * mm_per_pixel)
+
+
+def sure_contact(depth: Tensor, gradient: Tensor, contact: Tensor, mm_per_pixel: float) -> Tensor:
+    """(H, W) bool: contact deeper than that, less its rim of one pixel."""
+    inside = contact & (depth > least_depth_mm(slope_noise(gradient, contact), mm_per_pixel))
+    return -max_pool2d(-inside.float()[None], 3, 1, 1)[0] > 0.5
+
+
+def slope_noise(gradient: Tensor, contact: Tensor) -> float:
     """Noise of slopes inside the contact, from second differences along rows, as :func:`torchvts.core.noise.noise_std`."""
     whole = contact[:, :-2] & contact[:, 1:-1] & contact[:, 2:]
     second = (gradient[..., 1:-1] - 0.5 * (gradient[..., :-2] + gradient[..., 2:]))[:, whole].abs()

@@ -24,12 +24,14 @@ class Target(NamedTuple):
     Attributes:
         height_mm: maps u and v, mm, to height, mm.
         period_deg: the object looks the same when turned by this about its z axis; 360 if by no less.
-        free: what no measurement of its surface can tell, in the words of :attr:`torchvts.Registration.ambiguous`.
+        free: what no measurement of its surface can tell: how the names in :attr:`torchvts.Registration.ambiguous` begin.
+        freedom: how many such directions there are.
     """
 
     height_mm: Height
     period_deg: float = 360.0
     free: tuple[str, ...] = ()
+    freedom: int = 0
 
 
 def pose(
@@ -205,7 +207,9 @@ def textured_patch(bumps: int = 60, radius_mm: float = 5.5, seed: int = 3) -> He
     generator = torch.Generator().manual_seed(seed)
     draws = torch.rand(bumps, 5, generator=generator, dtype=torch.float64)
     reach, turn = radius_mm * draws[:, 0].sqrt(), 2.0 * math.pi * draws[:, 1]
-    places = torch.stack((reach * turn.cos(), reach * turn.sin(), 0.4 + 0.5 * draws[:, 2], 0.3 * (draws[:, 3] - 0.5)), dim=1).tolist()
+    places = torch.stack(
+        (reach * turn.cos(), reach * turn.sin(), 0.4 + 0.5 * draws[:, 2], 0.3 * (draws[:, 3] - 0.5)), dim=1
+    ).tolist()
 
     def height(u: Tensor, v: Tensor) -> Tensor:
         total = torch.zeros_like(u)
@@ -255,9 +259,9 @@ TARGETS: dict[str, Target] = {
 """The seven targets of the pose bench."""
 
 FREE_TARGETS: dict[str, Target] = {
-    "sphere": Target(sphere(), free=("rotation",)),
-    "cylinder": Target(cylinder(), 180.0, free=("slide along", "turn about")),
-    "plane": Target(plane(), free=("translation", "rotation about z")),
+    "sphere": Target(sphere(), free=("rotation about",), freedom=3),
+    "cylinder": Target(cylinder(), 180.0, free=("translation along", "rotation about"), freedom=2),
+    "plane": Target(plane(), free=("translation along x", "translation along y", "rotation about z"), freedom=3),
 }
 """Surfaces that slide on themselves: part of their pose cannot be known."""
 

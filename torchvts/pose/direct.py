@@ -334,7 +334,9 @@ def rigid(name: str, T: Tensor) -> Tensor:
         ValueError: no rigid motion.
     """
     if not isinstance(T, Tensor) or tuple(T.shape) != (4, 4) or not bool(torch.isfinite(T).all()):
-        raise ValueError(f"{name}: expected a finite (4, 4) tensor, got {tuple(T.shape) if isinstance(T, Tensor) else type(T).__name__}")
+        raise ValueError(
+            f"{name}: expected a finite (4, 4) tensor, got {tuple(T.shape) if isinstance(T, Tensor) else type(T).__name__}"
+        )
     T = T.detach().cpu().double()
     last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
     off = float((T[:3, :3] @ T[:3, :3].T - torch.eye(3, dtype=torch.float64)).abs().max())

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d, max_pool2d, unfold
+from torch.nn.functional import max_pool2d, unfold
 
 from .ambiguity import free_directions, name_directions
 from .clouds import open3d, thin, voxel_first
@@ -89,6 +89,11 @@ def register_points(
         if exact is not None:
             return clouds.finish(exact)
     result = clouds.finish(ranked[0][1])
+    extent = torch.linalg.svdvals(target - target.mean(0))
+    if float(extent[2]) < 0.25 * float(extent[1]):
+        # flat clouds have near neighbours in any pose
+        message = "nothing fits for sure: flat clouds that are no copies and do not agree as reliefs; register_depth sees more"
+        return replace(result, converged=False, message=message, ambiguous=[])
     others = [pose for share, pose in ranked[1:] if share > ranked[0][0] - 0.01]
     apart = [pose for pose in others if float(turn_deg(pose @ invert(result.T_target_source))) > 3.0]
     return replace(result, alternatives=apart) if result.converged and not result.ambiguous else result
@@ -255,7 +260,7 @@ def _as_reliefs(
 ) -> Registration | None:
     """Registration of the clouds as height maps over x and y; None if they are not such."""
     pitch = max(_spacing_plane(source), _spacing_plane(target))
-    grids = []
+    grids: list[Levels] = []
     for points, normals in ((source, source_normals), (target, target_normals)):
         grid = _grid(points, normals, pitch)
         if grid is None:
@@ -263,7 +268,7 @@ def _as_reliefs(
         grids.append(grid)
     try:
         return align(grids[0], grids[1], start)
-    except (ValueError, RuntimeError):
+    except ValueError:
         return None
 
 
@@ -310,11 +315,45 @@ def _grid(points: Tensor, normals: Tensor | None, pitch: float) -> Levels | None
     if abs(float(flattest[2])) < 0.9:
         return None  # steep as a whole
     low, high = points[:, :2].amin(0), points[:, :2].amax(0)
+    off = (points[:, :2] - low) / pitch
+    lattice = float((off - off.round()).abs().max()) < 0.05
+    pitch = pitch if lattice else 0.5 * pitch
     columns, rows = (((high - low) / pitch).round().long() + 1).tolist()
-    if columns * rows > 4_000_000 or columns < 8 or rows < 8:
+    if columns * rows > 4_000_000 or columns < 6 or rows < 6:
         return None
-    column = ((points[:, 0] - low[0]) / pitch).round().long()
-    row = ((high[1] - points[:, 1]) / pitch).round().long()
+    lowest = float(points[:, 2].min())
+    skin = -0.02 < lowest < 0.15  # a contact's own frame: the skin at rest is at 0
+    level = 0.0 if skin else lowest - 1.0
+    border = 2
+    size = rows + 2 * border, columns + 2 * border
+    corner = (float(low[0]) - border * pitch, float(high[1]) + border * pitch)
+    laid = points - torch.tensor([corner[0], corner[1], level], dtype=torch.float64)
+    drawn = _by_cells(laid, normals, size, pitch) if lattice else _by_neighbours(laid, normals, size, pitch)
+    if drawn is None:
+        return None  # several heights over one place
+    z, slopes, inside, noise = drawn
+    first = max(1, math.ceil(max(z.shape) / 330))
+    every = [max(1, min(times, round(0.3 / (pitch * first)))) * first for times in (1, 2, 4)]
+    deep = inside & (z > LEAST_DEPTH_MM) if skin else inside
+    perhaps = deep if skin else torch.ones_like(inside)
+    deep = deep & (-max_pool2d(-inside.float()[None], 3, 1, 1)[0] > 0.5)  # at the edge slopes look one way only
+    made = [relief(z, slopes, deep, perhaps, pitch, times, corner) for times in every]
+    if level:
+        made = [one._replace(field=torch.cat((one.field[:1] + level, one.field[1:]))) for one in made]
+        made = [one._replace(points=one.points + torch.tensor([0.0, 0.0, level])) for one in made]
+    return (
+        Levels(made[0], made[1], made[2], noise / (every[2] if lattice else 1))
+        if min(len(one.points) for one in made) >= 12
+        else None
+    )
+
+
+def _by_cells(
+    points: Tensor, normals: Tensor | None, size: tuple[int, int], pitch: float
+) -> tuple[Tensor, Tensor, Tensor, float] | None:
+    """Heights (H, W), slopes (2, H, W), where they are known (H, W), and their noise, of points on a grid: x right, y up from the first cell."""
+    rows, columns = size
+    column, row = (points[:, 0] / pitch).round().long(), (-points[:, 1] / pitch).round().long()
     cell = row * columns + column
     count = torch.zeros(rows * columns, dtype=torch.float64).index_add_(0, cell, torch.ones(len(points), dtype=torch.float64))
 
@@ -323,50 +362,51 @@ def _grid(points: Tensor, normals: Tensor | None, pitch: float) -> Levels | None
         return (total / count.clamp_min(1.0)).reshape(rows, columns)
 
     z = mean(points[:, 2])
-    # where the points of a cell lie, off its middle
-    off_x = mean(points[:, 0] - low[0] - column * pitch)
-    off_y = mean(points[:, 1] - high[1] + row * pitch)
-    spread = (points[:, 2] - z.flatten()[cell]).abs()
-    if float(torch.quantile(spread[:: max(1, len(spread) // 100_000)], 0.95)) > 3.0 * pitch:
-        return None  # several heights over one place
+    if float((points[:, 2] - z.flatten()[cell]).abs().max()) > 3.0 * pitch:
+        return None
     known = (count > 0).reshape(rows, columns)
-    lowest = float(points[:, 2].min())
-    skin = -0.02 < lowest < 0.15  # a contact's own frame: the skin at rest is at 0
-    level = 0.0 if skin else lowest - 1.0
-    slopes = None
-    if normals is not None:
+    if normals is None:
+        slopes = _slopes(z.float(), known, pitch)
+    else:
         upright = normals[:, 2].clamp_min(0.1)
-        slopes = torch.stack((mean(-normals[:, 0] / upright), mean(-normals[:, 1] / upright)))
-    border = 2
-    pad = [border] * 4
-    z = torch.nn.functional.pad(z - level, pad).float()
-    off = torch.nn.functional.pad(torch.stack((off_x, off_y)), pad).float()
-    known = torch.nn.functional.pad(known, pad)
-    kernel = torch.ones(1, 1, 3, 3)
-    around = conv2d(known.float()[None, None], kernel, padding=1)[0, 0]
-    hole = ~known & (around >= 5)
-    z = torch.where(hole, conv2d((z * known)[None, None], kernel, padding=1)[0, 0] / around.clamp_min(1.0), z)
-    if slopes is not None:
-        slopes = torch.nn.functional.pad(slopes, pad).float()
-        filled = conv2d((slopes * known)[:, None], kernel, padding=1)[:, 0] / around.clamp_min(1.0)
-        slopes = torch.where(hole, filled, slopes)
-    inside = known | hole
-    if slopes is None:
-        slopes = _slopes(z, inside, pitch)
-        for _ in range(3):
-            slopes = _slopes(z - slopes[0] * off[0] - slopes[1] * off[1], inside, pitch)
-    z = z - slopes[0] * off[0] - slopes[1] * off[1]
-    first = max(1, math.ceil(max(z.shape) / 330))
-    every = [max(1, min(times, round(0.3 / (pitch * first)))) * first for times in (1, 2, 4)]
-    corner = (float(low[0]) - border * pitch, float(high[1]) + border * pitch)
-    deep = inside & (z > LEAST_DEPTH_MM) if skin else inside
-    perhaps = deep if skin else torch.ones_like(inside)
-    deep = deep & (-max_pool2d(-inside.float()[None], 3, 1, 1)[0] > 0.5)  # at the edge slopes look one way only
-    made = [relief(z, slopes, deep, perhaps, pitch, times, corner) for times in every]
-    if level:
-        made = [one._replace(field=torch.cat((one.field[:1] + level, one.field[1:]))) for one in made]
-        made = [one._replace(points=one.points + torch.tensor([0.0, 0.0, level])) for one in made]
-    return Levels(made[0], made[1], made[2], slope_noise(slopes, inside) / (4 * first)) if min(len(one.points) for one in made) >= 12 else None
+        slopes = torch.stack((mean(-normals[:, 0] / upright), mean(-normals[:, 1] / upright))).float()
+    return z.float(), slopes, known, slope_noise(slopes, known)
+
+
+def _by_neighbours(
+    points: Tensor, normals: Tensor | None, size: tuple[int, int], pitch: float
+) -> tuple[Tensor, Tensor, Tensor, float] | None:
+    """The same of scattered points: planes through the nearest ones, or, with normals, the mean of the planes that these give."""
+    rows, columns = size
+    flat = torch.cat((points[:, :2], torch.zeros(len(points), 1, dtype=points.dtype)), 1)
+    row, column = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
+    cells = torch.stack((column * pitch, -row * pitch, torch.zeros_like(row)), -1).reshape(-1, 3).double()
+    distance, index = _Tree(flat).nearest(cells, min(9 if normals is None else 5, len(points)))
+    spacing = 2.0 * pitch
+    inside = distance[:, 0] < 0.8 * spacing
+    index, distance = index[inside], distance[inside]
+    wide = 0.8 * spacing if normals is None else 0.5 * spacing
+    weight = torch.exp(-0.5 * (distance / wide) ** 2)
+    weight = weight / weight.sum(1, keepdim=True)
+    away = points[index, :2] - cells[inside][:, None, :2]  # (C, k, 2)
+    heights = points[index, 2]
+    if float(torch.quantile((heights - (weight * heights).sum(1, keepdim=True)).abs().amax(1)[:100_000], 0.9)) > 8.0 * spacing:
+        return None
+    noise = 0.005
+    if normals is None:
+        place = torch.cat((torch.ones_like(away[..., :1]), away), -1)
+        weighted = (place * weight[..., None]).transpose(1, 2)
+        ridge = 1e-4 * torch.diag(torch.tensor([0.0, 1.0, 1.0], dtype=torch.float64)) * spacing**2
+        plane = torch.linalg.solve(weighted @ place + ridge, weighted @ heights[..., None])[..., 0]
+        height, slope = plane[:, 0], plane[:, 1:]
+    else:
+        tilt = -normals[:, :2] / normals[:, 2:].clamp_min(0.1)
+        slope = (weight[..., None] * tilt[index]).sum(1)
+        height = (weight * (heights - (tilt[index] * away).sum(-1))).sum(1)
+        noise = min(0.012, float((tilt[index[:, 0]] - slope).abs().median()) / 0.6745)
+    z, slopes = torch.zeros(rows * columns), torch.zeros(2, rows * columns)
+    z[inside], slopes[:, inside] = height.float(), slope.T.float()
+    return z.reshape(rows, columns), slopes.reshape(2, rows, columns), inside.reshape(rows, columns), noise
 
 
 def _slopes(z: Tensor, inside: Tensor, pitch: float) -> Tensor:

@@ -87,7 +87,9 @@ def contact_of(frame: Frame, name: str) -> tuple[Tensor, Tensor, Tensor]:
         raise ValueError(f"{name}: expected finite depth and gradient, got NaN or infinite ones")
     inside = contact.reshape(height, width).bool()
     if int(inside.sum()) < LEAST_PIXELS:
-        raise ValueError(f"{name}: expected a contact of at least {LEAST_PIXELS} pixels, got {int(inside.sum())}: nothing is touched?")
+        raise ValueError(
+            f"{name}: expected a contact of at least {LEAST_PIXELS} pixels, got {int(inside.sum())}: nothing is touched?"
+        )
     return depth.reshape(height, width).float(), gradient.reshape(2, height, width).float(), inside
 
 

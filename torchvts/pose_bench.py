@@ -70,8 +70,10 @@ def rig(height: int = 240, width: int = 320, mm_per_pixel: float = 0.0625) -> tu
 def pose_case(
     target: objects.Target, seed: int, lights: PointLights, pipe: DepthPipeline, size: tuple[int, int], noise_std: float
 ) -> PoseCase:
-    """A reference press near the middle, and one turned by any angle and moved by up to 4 mm; both 0.3 to 0.6 mm deep, tilted by
-    up to 3 degrees, noisy and rounded to 8 bits. A plane, which touches only where it is tilted, by 2.8 to 3 and about 0 mm deep."""
+    """A reference press near the middle, and one turned by any angle and moved by up to 4 mm; noisy, 8 bits.
+
+    Both are 0.3 to 0.6 mm deep and tilted by up to 3 degrees; a plane, which touches only where it is tilted, by 2.8 to 3.
+    """
     generator = torch.Generator().manual_seed(seed)
 
     def between(low: float, high: float) -> float:
@@ -118,7 +120,8 @@ def run_poses(
 ) -> tuple[list[PoseRow], dict[str, tuple[PoseCase, Registration]]]:
     """All objects in ``poses`` poses each; the rows, and the first pose of each for a picture. The field is 20 mm wide."""
     lights, pipe = rig(*size, 20.0 / size[1])
-    rows, shown = [], {}
+    rows: list[PoseRow] = []
+    shown: dict[str, tuple[PoseCase, Registration]] = {}
     for name, target in targets.items():
         row = PoseRow(name, poses)
         named = good = wrong = converged = 0
@@ -134,7 +137,8 @@ def run_poses(
             row.seconds.append(time.perf_counter() - start)
             shown.setdefault(name, (case, found))
             deg, mm = pose_error(found.T_target_source, case, target.period_deg)
-            row.deg.append(deg), row.mm.append(mm)
+            row.deg.append(deg)
+            row.mm.append(mm)
             within = deg <= GOAL_DEG and mm <= GOAL_MM
             converged += found.converged
             good += within and found.converged
@@ -162,13 +166,14 @@ def run_poses(
 def pose_table(rows: list[PoseRow]) -> str:
     """The rows as a Markdown table."""
     lines = [
-        "| object | poses | angle deg, median / 95 % | position mm, median / 95 % | within 1 deg and 0.15 mm | confident and wrong | "
-        "unknown directions named | s, median |",
+        "| object | poses | angle deg, median / 95 % | position mm, median / 95 % | within 1 deg and 0.15 mm "
+        "| confident and wrong | unknown directions named | s, median |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
         if row.named is None:
-            errors = f"{_quantile(row.deg, 0.5):.3f} / {_quantile(row.deg, 0.95):.3f} | {_quantile(row.mm, 0.5):.4f} / {_quantile(row.mm, 0.95):.4f}"
+            angle = f"{_quantile(row.deg, 0.5):.3f} / {_quantile(row.deg, 0.95):.3f}"
+            errors = f"{angle} | {_quantile(row.mm, 0.5):.4f} / {_quantile(row.mm, 0.95):.4f}"
             share, named = f"{100 * row.success:.0f} %", ""
         else:
             errors, share, named = " | ", "", f"{100 * row.named:.0f} %"

@@ -11,7 +11,6 @@ from .core.checks import check_integer, check_positive
 from .core.geometry import normal_from_gradient, pixel_grid_mm
 from .shading import PointLights, near_field_shading
 
-
 Segment = tuple[tuple[float, float], tuple[float, float]]
 """Start and end, (x, y) in mm."""
 

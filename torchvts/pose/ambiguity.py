@@ -26,7 +26,8 @@ def free_directions(information: Tensor, bias: Tensor, least: float) -> tuple[Te
 def _below(information: Tensor, bias: Tensor, least: float) -> Tensor:
     values, vectors = torch.linalg.eigh(information)
     noise = ((vectors.T @ bias) * vectors.T).sum(1)
-    return vectors[:, values < least + 3.0 * noise]
+    free: Tensor = vectors[:, values < least + 3.0 * noise]
+    return free
 
 
 def name_directions(free: Tensor, shifts: Tensor) -> list[str]:

@@ -12,7 +12,6 @@ from torch.nn.functional import avg_pool2d
 from ..core.checks import check_integer
 from ..core.files import write_atomically
 from ..core.geometry import depth_to_points
-
 from .relief import Frame, contact_of, sure_contact
 
 CLOUD_SUFFIXES = (".pcd", ".ply")

@@ -40,7 +40,7 @@ LEAST_FITNESS, LEAST_OVERLAP, MOST_COST = 0.85, 0.3, 0.25
 
 
 class Fit(NamedTuple):
-    """Hypotheses (K, 4, 4), their cost (K,), 0 to 1, the share of agreeing pixels (K,), and of the smaller contact compared (K,)."""
+    """Hypotheses (K, 4, 4), their cost (K,), 0 to 1, shares (K,) of pixels that agree, and of the smaller contact compared."""
 
     poses: Tensor
     cost: Tensor
@@ -268,7 +268,7 @@ def _message(fit: Fit, names: list[str], others: int) -> str:
 
 
 def _unknown(source: Relief, target: Relief, pose: Tensor, noise: float) -> tuple[Tensor, list[str]]:
-    """Motions (6, k) about the target's origin that the surface does not show, and names; by the coarse grid, where noise is low."""
+    """Motions (6, k) about the target's origin that the surface does not show, and names; by the coarse, least noisy grid."""
     points, slopes = target.points, target.slopes
     back = invert(pose)[0].float()
     _, inside, _, _ = source.sample((points @ back[:3, :3].T + back[:3, 3])[:, :2])

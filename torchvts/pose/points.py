@@ -216,7 +216,9 @@ class _Tree:
 
         self.points = points
         self.center = points.mean(0)
-        self.index: Any = cv2.flann_Index((points - self.center).float().contiguous().numpy(), {"algorithm": 4})
+        self.index: Any = cv2.flann_Index(  # type: ignore[attr-defined]
+            (points - self.center).float().contiguous().numpy(), {"algorithm": 4}
+        )
 
     def nearest(self, points: Tensor, count: int = 1) -> tuple[Tensor, Tensor]:
         """Distances and indices, (N,), or (N, count)."""
@@ -284,7 +286,8 @@ def _levelled(source: Tensor, target: Tensor, source_normals: Tensor | None, tar
         if found is None or not found.converged:
             continue
         back = invert(to_t)
-        turn = torch.block_diag(back[:3, :3], back[:3, :3])
+        turn = torch.zeros(6, 6, dtype=torch.float64)
+        turn[:3, :3], turn[3:, 3:] = back[:3, :3], back[:3, :3]
         arm = back[:3, 3]  # twists about the laid origin become twists about the target's
         turn[3:, :3] = torch.tensor([[0.0, -arm[2], arm[1]], [arm[2], 0.0, -arm[0]], [-arm[1], arm[0], 0.0]]) @ back[:3, :3]
         words = [name.replace(" along ", " along the laid ").replace(" about ", " about the laid ") for name in found.ambiguous]
@@ -351,7 +354,7 @@ def _grid(points: Tensor, normals: Tensor | None, pitch: float) -> Levels | None
 def _by_cells(
     points: Tensor, normals: Tensor | None, size: tuple[int, int], pitch: float
 ) -> tuple[Tensor, Tensor, Tensor, float] | None:
-    """Heights (H, W), slopes (2, H, W), where they are known (H, W), and their noise, of points on a grid: x right, y up from the first cell."""
+    """Heights (H, W), slopes (2, H, W), where they are known (H, W), and their noise, of points on a grid."""
     rows, columns = size
     column, row = (points[:, 0] / pitch).round().long(), (-points[:, 1] / pitch).round().long()
     cell = row * columns + column

@@ -18,11 +18,11 @@ class Frame(Protocol):
     """What :class:`torchvts.DepthOutput` has."""
 
     @property
-    def depth_mm(self) -> Tensor: ...  # noqa: D102
+    def depth_mm(self) -> Tensor: ...
     @property
-    def gradient(self) -> Tensor: ...  # noqa: D102
+    def gradient(self) -> Tensor: ...
     @property
-    def contact(self) -> Tensor: ...  # noqa: D102
+    def contact(self) -> Tensor: ...
 
 
 class Relief(NamedTuple):
@@ -101,15 +101,17 @@ def levels(frame: Frame, mm_per_pixel: float, name: str) -> Levels:
     # flat faces whose outline the image cuts off may be missing from the mask: of these nothing is said, not even "no contact"
     deep = depth > 0.3 * float(depth[contact].max())
     slope = torch.stack((gradient[0], -gradient[1]))  # y up
-    first = max(1, math.ceil(max(depth.shape) / 330))
+    longest = max(depth.shape)
+    first = max(1, math.ceil(longest / 330))
     corner = (-0.5 * (depth.shape[1] - 1) * mm_per_pixel, 0.5 * (depth.shape[0] - 1) * mm_per_pixel)
-    every = (first, 2 * first, 4 * first)
+    every = (first, max(first, round(longest / 160)), max(first, round(longest / 80)))
     made = [relief(depth, slope, inside, inside | deep, mm_per_pixel, times, corner) for times in every]
-    if len(made[1].points) < 12:
+    if min(len(one.points) for one in made) < 12:
+        least = least_depth_mm(noise, mm_per_pixel)
         raise ValueError(
-            f"{name}: expected a contact deeper than {least_depth_mm(noise, mm_per_pixel):.3f} mm on some dozen pixels, got {int(inside.sum())}: pressed too faintly"
+            f"{name}: expected a contact deeper than {least:.3f} mm on some dozens of pixels, got {int(inside.sum())}: pressed too faintly"
         )
-    return Levels(*made, noise / (4 * first))
+    return Levels(made[0], made[1], made[2], noise / every[2])
 
 
 def least_depth_mm(noise: float, mm_per_pixel: float) -> float:
@@ -133,7 +135,7 @@ def slope_noise(gradient: Tensor, contact: Tensor) -> float:
 def relief(
     depth: Tensor, slope: Tensor, inside: Tensor, perhaps: Tensor, mm_per_pixel: float, times: int, corner: tuple[float, float]
 ) -> Relief:
-    """One grid: means of ``times`` x ``times`` pixels of depth (H, W) and slope (2, H, W), y up; ``corner``: the first pixel, mm."""
+    """One grid: means of ``times`` x ``times`` pixels of depth (H, W) and slope (2, H, W), y up; ``corner``: first pixel, mm."""
     height, width = depth.shape
     rows, columns = height // times * times, width // times * times
     stack = torch.cat((depth[None], slope))[:, :rows, :columns]

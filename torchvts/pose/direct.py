@@ -10,7 +10,7 @@ from torch.nn.functional import unfold
 from ..core.checks import check_positive
 from .ambiguity import free_directions, name_directions
 from .relief import Frame, Levels, Relief, levels
-from .result import Registration, invert, motion
+from .result import Registration, invert, motion, turn_deg
 from .search import search_plane
 
 SLOPE_NOISE = 0.06
@@ -233,7 +233,7 @@ def _finish(a: Levels, b: Levels, poses: Tensor) -> Registration:
     poses = refine(a.middle, b.middle, poses[kept], 3, 1.0)
     fit = judge(a.middle, b.middle, poses)
     kept = _as_good(fit, distinct(fit, a.middle, 0.4))
-    best = refine(a.fine, b.fine, poses[kept[:1]], 4, 0.5)
+    best = _between(a, b, poses[kept[:1]])
     others = poses[kept[1:]]
     fit = judge(a.middle, b.middle, best)
     converged = trusted(fit, 0)
@@ -243,6 +243,21 @@ def _finish(a: Levels, b: Levels, poses: Tensor) -> Registration:
     alternatives = list(others) if converged and not names else []
     message = _message(fit, names, len(alternatives))
     return Registration(best[0], rmse_mm, float(fit.fitness[0]), converged, message, covariance, names, alternatives)
+
+
+def _between(a: Levels, b: Levels, pose: Tensor) -> Tensor:
+    """The fine pose, from source to target and back, and the mean of both: so that neither frame is preferred."""
+    forth = refine(a.fine, b.fine, pose, 4, 0.5)
+    back = invert(refine(b.fine, a.fine, invert(pose), 4, 0.5))
+    center = a.fine.points.double().mean(0)
+    places = [T[0, :3, :3] @ center + T[0, :3, 3] for T in (forth, back)]
+    if float((places[0] - places[1]).norm()) > 0.1 or float(turn_deg(forth @ invert(back))) > 1.0:
+        return forth
+    u, _, vh = torch.linalg.svd(forth[0, :3, :3] + back[0, :3, :3])
+    mean = forth.clone()
+    mean[0, :3, :3] = u @ vh
+    mean[0, :3, 3] = 0.5 * (places[0] + places[1]) - u @ vh @ center
+    return mean
 
 
 def _as_good(fit: Fit, order: list[int]) -> list[int]:

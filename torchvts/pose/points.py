@@ -81,13 +81,13 @@ def register_points(
         return found if exact is None else clouds.finish(exact)
     poses = [torch.eye(4, dtype=torch.float64), *_axes(source, target)]
     ranked = clouds.ranked(poses if start is None else [start, *poses])
-    if ranked[0][0] < 0.9:
-        ranked = clouds.ranked([ranked[0][1], *_by_features(clouds)])
-    ranked = clouds.ranked([ranked[0][1], *_turned(ranked[0][1], target)])
-    for _, pose in ranked[:8]:
-        exact = clouds.as_copies(pose)
-        if exact is not None:
-            return clouds.finish(exact)
+    for widen in (None, _turned, _by_features):
+        if widen is not None:
+            ranked = clouds.ranked([ranked[0][1], *widen(ranked[0][1], clouds)])
+        for _, pose in ranked[:8]:
+            exact = clouds.as_copies(pose)
+            if exact is not None:
+                return clouds.finish(exact)
     result = clouds.finish(ranked[0][1])
     extent = torch.linalg.svdvals(target - target.mean(0))
     if float(extent[2]) < 0.25 * float(extent[1]):
@@ -262,16 +262,37 @@ def _as_reliefs(
 ) -> Registration | None:
     """Registration of the clouds as height maps over x and y; None if they are not such."""
     pitch = max(_spacing_plane(source), _spacing_plane(target))
+    lowest = [float(cloud[:, 2].min()) for cloud in (source, target)]
+    skin = all(-0.02 < low < 0.15 for low in lowest)  # a contact's own frame: the skin at rest is at 0
+    lift = torch.zeros(3, dtype=torch.float64)
+    lift[2] = 0.0 if skin else 2.0 - min(lowest)  # elsewhere nothing is known of what does not touch: all counts as deep
     grids: list[Levels] = []
     for points, normals in ((source, source_normals), (target, target_normals)):
-        grid = _grid(points, normals, pitch)
+        grid = _grid(points + lift, normals, pitch, skin)
         if grid is None:
             return None
         grids.append(grid)
+    up = torch.eye(4, dtype=torch.float64)
+    up[:3, 3] = lift
     try:
-        return align(grids[0], grids[1], start)
+        found = align(grids[0], grids[1], None if start is None else up @ start @ invert(up))
     except ValueError:
         return None
+    return _seen_from(found, invert(up), up)
+
+
+def _seen_from(found: Registration, to_target: Tensor, from_source: Tensor) -> Registration:
+    """A registration of clouds that were moved, for the clouds as they were: the moves into the true target, from the source."""
+    turn = torch.zeros(6, 6, dtype=torch.float64)
+    turn[:3, :3], turn[3:, 3:] = to_target[:3, :3], to_target[:3, :3]
+    arm = to_target[:3, 3]  # twists about the moved origin become twists about the true one
+    turn[3:, :3] = torch.linalg.cross(arm[:, None].expand(3, 3), to_target[:3, :3], dim=0)
+    return replace(
+        found,
+        T_target_source=to_target @ found.T_target_source @ from_source,
+        alternatives=[to_target @ T @ from_source for T in found.alternatives],
+        covariance=turn @ found.covariance @ turn.T,
+    )
 
 
 def _levelled(source: Tensor, target: Tensor, source_normals: Tensor | None, target_normals: Tensor | None) -> Registration | None:
@@ -285,21 +306,8 @@ def _levelled(source: Tensor, target: Tensor, source_normals: Tensor | None, tar
         found = _as_reliefs(laid_s[0], laid_t[0], laid_s[1], laid_t[1], None)
         if found is None or not found.converged:
             continue
-        back = invert(to_t)
-        turn = torch.zeros(6, 6, dtype=torch.float64)
-        turn[:3, :3], turn[3:, 3:] = back[:3, :3], back[:3, :3]
-        arm = back[:3, 3]  # twists about the laid origin become twists about the target's
-        turn[3:, :3] = torch.tensor([[0.0, -arm[2], arm[1]], [arm[2], 0.0, -arm[0]], [-arm[1], arm[0], 0.0]]) @ back[:3, :3]
         words = [name.replace(" along ", " along the laid ").replace(" about ", " about the laid ") for name in found.ambiguous]
-        results.append(
-            replace(
-                found,
-                T_target_source=back @ found.T_target_source @ to_s,
-                alternatives=[back @ T @ to_s for T in found.alternatives],
-                covariance=turn @ found.covariance @ turn.T,
-                ambiguous=words,
-            )
-        )
+        results.append(replace(_seen_from(found, invert(to_t), to_s), ambiguous=words))
     return min(results, key=lambda r: r.rmse_mm / max(r.fitness, 0.1)) if results else None
 
 
@@ -313,7 +321,8 @@ def _flat_frame(points: Tensor) -> Tensor:
     return frame
 
 
-def _grid(points: Tensor, normals: Tensor | None, pitch: float) -> Levels | None:
+def _grid(points: Tensor, normals: Tensor | None, pitch: float, skin: bool) -> Levels | None:
+    """The cloud on three grids; None if it is no relief over x and y, or too small."""
     flattest = _flat_frame(points)[2, :3]
     if abs(float(flattest[2])) < 0.9:
         return None  # steep as a whole
@@ -324,13 +333,10 @@ def _grid(points: Tensor, normals: Tensor | None, pitch: float) -> Levels | None
     columns, rows = (((high - low) / pitch).round().long() + 1).tolist()
     if columns * rows > 4_000_000 or columns < 6 or rows < 6:
         return None
-    lowest = float(points[:, 2].min())
-    skin = -0.02 < lowest < 0.15  # a contact's own frame: the skin at rest is at 0
-    level = 0.0 if skin else lowest - 1.0
     border = 2
     size = rows + 2 * border, columns + 2 * border
     corner = (float(low[0]) - border * pitch, float(high[1]) + border * pitch)
-    laid = points - torch.tensor([corner[0], corner[1], level], dtype=torch.float64)
+    laid = points - torch.tensor([corner[0], corner[1], 0.0], dtype=torch.float64)
     drawn = _by_cells(laid, normals, size, pitch) if lattice else _by_neighbours(laid, normals, size, pitch)
     if drawn is None:
         return None  # several heights over one place
@@ -341,14 +347,9 @@ def _grid(points: Tensor, normals: Tensor | None, pitch: float) -> Levels | None
     perhaps = deep if skin else torch.ones_like(inside)
     deep = deep & (-max_pool2d(-inside.float()[None], 3, 1, 1)[0] > 0.5)  # at the edge slopes look one way only
     made = [relief(z, slopes, deep, perhaps, pitch, times, corner) for times in every]
-    if level:
-        made = [one._replace(field=torch.cat((one.field[:1] + level, one.field[1:]))) for one in made]
-        made = [one._replace(points=one.points + torch.tensor([0.0, 0.0, level])) for one in made]
-    return (
-        Levels(made[0], made[1], made[2], noise / (every[2] if lattice else 1))
-        if min(len(one.points) for one in made) >= 12
-        else None
-    )
+    if min(len(one.points) for one in made) < 12:
+        return None
+    return Levels(made[0], made[1], made[2], noise / (every[2] if lattice else 1))
 
 
 def _by_cells(
@@ -422,7 +423,8 @@ def _slopes(z: Tensor, inside: Tensor, pitch: float) -> Tensor:
     ridge = torch.diag(torch.tensor([1e-9, 1e-3, 1e-3]))
     middle = z.reshape(-1, 1, 1)
     plane = torch.linalg.solve(weighted @ place + ridge, weighted @ (heights - middle))
-    return (plane[:, 1:, 0].T / pitch).reshape(2, *z.shape) * inside
+    slopes: Tensor = (plane[:, 1:, 0].T / pitch).reshape(2, *z.shape) * inside
+    return slopes
 
 
 def _axes(source: Tensor, target: Tensor) -> list[Tensor]:
@@ -432,17 +434,17 @@ def _axes(source: Tensor, target: Tensor) -> list[Tensor]:
     return [back @ flip @ to for flip in flips]
 
 
-def _turned(pose: Tensor, target: Tensor) -> list[Tensor]:
+def _turned(pose: Tensor, pair: _Pair) -> list[Tensor]:
     """The pose turned about the target's flattest axis, all around."""
-    center = target.mean(0)
-    axis = torch.linalg.svd(target - center, full_matrices=False).Vh[2]
+    center, axis = pair.target.mean(0), _flat_frame(pair.target)[2, :3]
     angles = torch.deg2rad(torch.arange(10.0, 360.0, 10.0, dtype=torch.float64))
     twists = torch.cat((angles[:, None] * axis, torch.zeros(len(angles), 3, dtype=torch.float64)), 1)
     return list(motion(twists, center.expand(len(angles), 3)) @ pose)
 
 
-def _by_features(pair: _Pair) -> list[Tensor]:
+def _by_features(pose: Tensor, pair: _Pair) -> list[Tensor]:
     """A pose from FPFH features and sample consensus; none where Open3D is not installed."""
+    del pose
     try:
         o3d = open3d()
     except ImportError:

@@ -109,7 +109,8 @@ def levels(frame: Frame, mm_per_pixel: float, name: str) -> Levels:
     if min(len(one.points) for one in made) < 12:
         least = least_depth_mm(noise, mm_per_pixel)
         raise ValueError(
-            f"{name}: expected a contact deeper than {least:.3f} mm on some dozens of pixels, got {int(inside.sum())}: pressed too faintly"
+            f"{name}: expected a contact deeper than {least:.3f} mm on some dozens of pixels, got {int(inside.sum())}: "
+            "pressed too faintly"
         )
     return Levels(made[0], made[1], made[2], noise / every[2])
 

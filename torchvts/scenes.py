@@ -313,12 +313,13 @@ def letter_segments(text: str, size_mm: float) -> list[Segment]:
 
 def distance_to_segments(x: Tensor, y: Tensor, segments: Sequence[Segment]) -> Tensor:
     """Distance of each point to the nearest of the segments."""
-    squared = torch.full_like(x, torch.inf)
+    distance = torch.full_like(x, torch.inf)
     for start, end in segments:
         dx, dy = end[0] - start[0], end[1] - start[1]
         along = (((x - start[0]) * dx + (y - start[1]) * dy) / (dx * dx + dy * dy)).clamp(0.0, 1.0)
-        squared = torch.minimum(squared, (x - start[0] - along * dx) ** 2 + (y - start[1] - along * dy) ** 2)
-    return torch.sqrt(squared + 1e-18)
+        away = torch.sqrt((x - start[0] - along * dx) ** 2 + (y - start[1] - along * dy) ** 2 + 1e-18)
+        distance = torch.minimum(distance, away)
+    return distance
 
 
 # Strokes of capital letters on a grid 4 wide and 6 high, y up: pairs of digits, a blank lifts the pen.

@@ -103,7 +103,7 @@ def refine(source: Relief, target: Relief, poses: Tensor, steps: int, wide: floa
         size = twist.norm(dim=1, keepdim=True)
         twist = twist * (0.6 / size.clamp_min(0.6))
         poses = motion(twist * units, center) @ poses
-        if wide <= 0.5 and float(size.max()) < 2e-5:
+        if wide <= 0.5 and float(size.max()) < 5e-5:
             break
         wide = max(0.5, 0.5 * wide)
     return poses
@@ -202,7 +202,7 @@ def register_depth(source: Frame, target: Frame, mm_per_pixel: float, *, initial
         >>> moved = objects.press(objects.stamp("T"), objects.pose(30.0, (1.0, -0.5)), 96, 128, 0.125)
         >>> reg = register_depth(moved, frame, 0.125)
         >>> reg.converged, round(math.degrees(math.acos(float(reg.T_target_source[0, 0]))), 1)
-        (True, -30.0)
+        (True, 30.0)
     """
     check_positive("mm_per_pixel", mm_per_pixel)
     a, b = levels(source, mm_per_pixel, "source"), levels(target, mm_per_pixel, "target")
@@ -247,8 +247,8 @@ def _finish(a: Levels, b: Levels, poses: Tensor) -> Registration:
 
 def _between(a: Levels, b: Levels, pose: Tensor) -> Tensor:
     """The fine pose, from source to target and back, and the mean of both: so that neither frame is preferred."""
-    forth = refine(a.fine, b.fine, pose, 4, 0.5)
-    back = invert(refine(b.fine, a.fine, invert(pose), 4, 0.5))
+    forth = refine(a.fine, b.fine, pose, 12, 0.5)
+    back = invert(refine(b.fine, a.fine, invert(pose), 12, 0.5))
     center = a.fine.points.double().mean(0)
     places = [T[0, :3, :3] @ center + T[0, :3, 3] for T in (forth, back)]
     if float((places[0] - places[1]).norm()) > 0.1 or float(turn_deg(forth @ invert(back))) > 1.0:

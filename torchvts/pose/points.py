@@ -6,12 +6,12 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d, unfold
+from torch.nn.functional import avg_pool2d, unfold
 
 from .ambiguity import free_directions, name_directions
 from .clouds import open3d, thin, voxel_first
 from .direct import UNKNOWN_VARIANCE, align, rigid
-from .relief import LEAST_DEPTH_MM, Levels, relief, slope_noise
+from .relief import LEAST_DEPTH_MM, Levels, relief, slope_noise, without_rim
 from .result import Registration, invert, motion, turn_deg
 
 LEAST_POINTS = 10
@@ -328,7 +328,7 @@ def _grid(points: Tensor, normals: Tensor | None, pitch: float, skin: bool) -> L
         return None  # steep as a whole
     low, high = points[:, :2].amin(0), points[:, :2].amax(0)
     off = (points[:, :2] - low) / pitch
-    lattice = float((off - off.round()).abs().max()) < 0.05
+    lattice = float((off - off.round()).abs().max()) < 0.05 and _is_full(off.round().long())
     pitch = pitch if lattice else 0.5 * pitch
     columns, rows = (((high - low) / pitch).round().long() + 1).tolist()
     if columns * rows > 4_000_000 or columns < 6 or rows < 6:
@@ -345,11 +345,20 @@ def _grid(points: Tensor, normals: Tensor | None, pitch: float, skin: bool) -> L
     every = [max(1, min(times, round(0.3 / (pitch * first)))) * first for times in (1, 2, 4)]
     deep = inside & (z > LEAST_DEPTH_MM) if skin else inside
     perhaps = deep if skin else torch.ones_like(inside)
-    deep = deep & (-max_pool2d(-inside.float()[None], 3, 1, 1)[0] > 0.5)  # at the edge slopes look one way only
+    deep = deep & without_rim(inside[None])[0]  # at the edge slopes look one way only
     made = [relief(z, slopes, deep, perhaps, pitch, times, corner) for times in every]
     if min(len(one.points) for one in made) < 12:
         return None
     return Levels(made[0], made[1], made[2], noise / (every[2] if lattice else 1))
+
+
+def _is_full(cells: Tensor) -> bool:
+    """Whether cells (N, 2) of a grid leave hardly any hole among them, as pixels of a contact do, unlike a thinned cloud."""
+    columns, rows = (cells.amax(0) + 1).tolist()
+    known = torch.zeros(1, 1, rows, columns)
+    known[0, 0, cells[:, 1], cells[:, 0]] = 1.0
+    holes = (known == 0) & (avg_pool2d(known, 3, 1, 1) > 4.5 / 9.0)
+    return float(holes.sum()) < 0.03 * len(cells)
 
 
 def _by_cells(

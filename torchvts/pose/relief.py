@@ -115,6 +115,12 @@ def levels(frame: Frame, mm_per_pixel: float, name: str) -> Levels:
     return Levels(made[0], made[1], made[2], noise / every[2])
 
 
+def without_rim(mask: Tensor) -> Tensor:
+    """A mask (1, H, W) less its outermost pixels, or as it is where it has hardly any others."""
+    core = -max_pool2d(-mask.float()[None], 3, 1, 1)[0] > 0.5
+    return core if 5 * int(core.sum()) > 2 * int(mask.sum()) else mask
+
+
 def least_depth_mm(noise: float, mm_per_pixel: float) -> float:
     """Depth that is surely contact: above the skirt, and above what noise of slopes adds up to over some pixels."""
     return max(LEAST_DEPTH_MM, 4.0 * noise * mm_per_pixel)
@@ -123,7 +129,7 @@ def least_depth_mm(noise: float, mm_per_pixel: float) -> float:
 def sure_contact(depth: Tensor, gradient: Tensor, contact: Tensor, mm_per_pixel: float) -> Tensor:
     """(H, W) bool: contact deeper than that, less its rim of one pixel."""
     inside = contact & (depth > least_depth_mm(slope_noise(gradient, contact), mm_per_pixel))
-    return -max_pool2d(-inside.float()[None], 3, 1, 1)[0] > 0.5
+    return without_rim(inside[None])[0]
 
 
 def slope_noise(gradient: Tensor, contact: Tensor) -> float:
@@ -142,12 +148,14 @@ def relief(
     stack = torch.cat((depth[None], slope))[:, :rows, :columns]
     share = torch.stack((inside, perhaps)).float()[:, :rows, :columns]
     if times > 1:
+        within = avg_pool2d((stack * share[:1])[None], times)[0]
         stack, share = avg_pool2d(stack[None], times)[0], avg_pool2d(share[None], times)[0]
+        stack = torch.where(share[:1] > 0.5, within / share[:1].clamp_min(0.5), stack)
     pitch = times * mm_per_pixel
     x0, y0 = corner[0] + 0.5 * (times - 1) * mm_per_pixel, corner[1] - 0.5 * (times - 1) * mm_per_pixel
-    whole = share[:1] > 0.99
+    whole = share[:1] > (0.99 if times <= 2 else 0.5)
     if times <= 2:
-        whole = -max_pool2d(-whole.float()[None], 3, 1, 1)[0] > 0.5  # the rim itself is half skirt
+        whole = without_rim(whole)  # half of it is skirt
     near = max_pool2d((share[1:] > 0.01).float()[None], 3, 1, 1)[0] > 0.5
     smooth = _blur(stack[1:])
     p_y, p_x = torch.gradient(smooth[0], spacing=pitch)

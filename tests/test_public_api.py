@@ -11,12 +11,12 @@ import torchvts as vts
 NAMES = [
     "Calibration", "CalibrationWarning", "Compensate", "ContactMask", "DepthOutput", "DepthPipeline", "FillMarkers",
     "GradientFromNormal", "LightFit", "NormalFromIntensity", "NormalFromLookup", "NormalFromMLP", "NormalFromResponse",
-    "PointLights", "PoissonDCT", "PoissonDST", "PoissonRest", "Press", "Sensor", "Touch", "calibrate", "depth_to_points",
+    "PointLights", "PoissonDCT", "PoissonDST", "PoissonRest", "Press", "Registration", "Sensor", "Touch", "calibrate",
+    "contact_cloud", "depth_to_points",
     "divergence",
     "fill_markers", "find_markers", "fit_lights", "fit_mlp", "fit_prior", "gradient_from_normal", "gs_sdk", "metrics",
-    "near_field_shading", "normal_from_gradient", "poisson_dct", "poisson_dst", "poisson_rest", "read_image",
-    "read_presses", "scenes",
-    "shipped_sensors", "stream", "write_image",
+    "near_field_shading", "normal_from_gradient", "objects", "poisson_dct", "poisson_dst", "poisson_rest", "read_image",
+    "read_presses", "register_depth", "register_points", "scenes", "shipped_sensors", "stream", "write_image",
 ]  # fmt: skip
 ARGUMENTS = {
     vts.Sensor: ["name", "height", "width", "mm_per_pixel"],
@@ -40,6 +40,9 @@ ARGUMENTS = {
     vts.PoissonDST: ["mm_per_pixel"],
     vts.PoissonDCT: ["mm_per_pixel"],
     vts.depth_to_points: ["depth_mm", "mm_per_pixel", "contact"],
+    vts.register_points: ["source", "target"],
+    vts.register_depth: ["source", "target", "mm_per_pixel"],
+    vts.contact_cloud: ["frame", "mm_per_pixel", "most"],
     vts.Compensate: ["gain", "offset", "gamma", "defects"],
     vts.ContactMask: ["flat", "noise_std", "sigmas", "min_size_px"],
     vts.NormalFromIntensity: ["lights", "height", "width", "mm_per_pixel", "noise_std", "inverse"],

@@ -1,6 +1,6 @@
 """torchvts: camera images of visual-tactile sensors into depth, normals, contact and pose, as differentiable PyTorch modules."""
 
-from . import metrics, scenes, stream
+from . import metrics, objects, scenes, stream
 from .calibration import CalibrationWarning, LightFit, Press, Touch, calibrate, fit_lights, fit_prior, read_presses
 from .compensate import Compensate
 from .contact import ContactMask
@@ -12,6 +12,7 @@ from .integration import PoissonDCT, PoissonDST, PoissonRest, divergence, poisso
 from .markers import FillMarkers, fill_markers, find_markers
 from .normals import NormalFromIntensity, NormalFromLookup, NormalFromMLP, NormalFromResponse, fit_mlp
 from .pipeline import DepthOutput, DepthPipeline
+from .pose import Registration, contact_cloud, register_depth, register_points
 from .record import Calibration
 from .shading import PointLights, near_field_shading
 
@@ -36,9 +37,11 @@ __all__ = [
     "PoissonDST",
     "PoissonRest",
     "Press",
+    "Registration",
     "Sensor",
     "Touch",
     "calibrate",
+    "contact_cloud",
     "depth_to_points",
     "divergence",
     "fill_markers",
@@ -51,11 +54,14 @@ __all__ = [
     "metrics",
     "near_field_shading",
     "normal_from_gradient",
+    "objects",
     "poisson_dct",
     "poisson_dst",
     "poisson_rest",
     "read_image",
     "read_presses",
+    "register_depth",
+    "register_points",
     "scenes",
     "shipped_sensors",
     "stream",

@@ -1,7 +1,7 @@
 """Exact presses: surfaces given by a formula, with their depth, gradient, normal and contact, and a camera to see them."""
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -10,6 +10,9 @@ from torch import Tensor
 from .core.checks import check_integer, check_positive
 from .core.geometry import normal_from_gradient, pixel_grid_mm
 from .shading import PointLights, near_field_shading
+
+Segment = tuple[tuple[float, float], tuple[float, float]]
+"""Start and end, (x, y) in mm."""
 
 
 class Scene(NamedTuple):
@@ -163,7 +166,7 @@ def punch_press(
 
     def depth(x: Tensor, y: Tensor) -> Tensor:
         outside = (torch.sqrt(x**2 + y**2 + 1e-18) - radius_mm) / wall_mm
-        return (press_mm + slope * x).clamp_min(0.0) * (1.0 - _smooth_step(outside))
+        return (press_mm + slope * x).clamp_min(0.0) * (1.0 - smooth_step(outside))
 
     return surface(depth, height, width, mm_per_pixel, dtype)
 
@@ -189,24 +192,11 @@ def letters_press(
     """
     check_positive("press_mm", press_mm), check_positive("size_mm", size_mm)
     check_positive("stroke_mm", stroke_mm), check_positive("bevel_mm", bevel_mm)
-    unknown = sorted({letter for letter in text if letter != " " and letter not in _STROKES})
-    if unknown or not text.strip():
-        raise ValueError(f"text: expected capital letters A-Z and blanks, got {text!r}")
-    unit = size_mm / 6.0
-    left = -0.5 * unit * (6.0 * len(text) - 2.0)
-    segments = []
-    for index, letter in enumerate(text):
-        for line in _STROKES.get(letter, "").split():
-            corners = [
-                (left + unit * (int(x) + 6.0 * index), unit * (3.0 - int(y))) for x, y in zip(line[::2], line[1::2], strict=True)
-            ]
-            segments += list(itertools.pairwise(corners))
+    segments = letter_segments(text, size_mm)
 
     def depth(x: Tensor, y: Tensor) -> Tensor:
-        distance = torch.full_like(x, torch.inf)
-        for start, end in segments:
-            distance = torch.minimum(distance, _distance_to_segment(x, y, start, end))
-        return press_mm * (1.0 - _smooth_step((distance - 0.5 * stroke_mm) / bevel_mm))
+        distance = distance_to_segments(x, y, segments)
+        return press_mm * (1.0 - smooth_step((distance - 0.5 * stroke_mm) / bevel_mm))
 
     return surface(depth, height, width, mm_per_pixel, dtype)
 
@@ -294,16 +284,42 @@ def _turn(x: Tensor, y: Tensor, angle_deg: float) -> tuple[Tensor, Tensor]:
     return x * torch.cos(angle) + y * torch.sin(angle), y * torch.cos(angle) - x * torch.sin(angle)
 
 
-def _smooth_step(t: Tensor) -> Tensor:
+def smooth_step(t: Tensor) -> Tensor:
     """0 below 0, 1 above 1, between them the quintic with zero first and second derivative at both ends."""
     t = t.clamp(0.0, 1.0)
     return t**3 * (10.0 - 15.0 * t + 6.0 * t**2)
 
 
-def _distance_to_segment(x: Tensor, y: Tensor, start: tuple[float, float], end: tuple[float, float]) -> Tensor:
-    dx, dy = end[0] - start[0], end[1] - start[1]
-    along = (((x - start[0]) * dx + (y - start[1]) * dy) / (dx * dx + dy * dy)).clamp(0.0, 1.0)
-    return torch.sqrt((x - start[0] - along * dx) ** 2 + (y - start[1] - along * dy) ** 2 + 1e-18)
+def letter_segments(text: str, size_mm: float) -> list[Segment]:
+    """Strokes of capital letters as segments in mm, the text's middle at zero, y down; letters are ``size_mm`` high.
+
+    Raises:
+        ValueError: a character without strokes, or an empty text.
+    """
+    unknown = sorted({letter for letter in text if letter != " " and letter not in _STROKES})
+    if unknown or not text.strip():
+        raise ValueError(f"text: expected capital letters A-Z and blanks, got {text!r}")
+    unit = size_mm / 6.0
+    left = -0.5 * unit * (6.0 * len(text) - 2.0)
+    segments: list[Segment] = []
+    for index, letter in enumerate(text):
+        for line in _STROKES.get(letter, "").split():
+            corners = [
+                (left + unit * (int(x) + 6.0 * index), unit * (3.0 - int(y))) for x, y in zip(line[::2], line[1::2], strict=True)
+            ]
+            segments += list(itertools.pairwise(corners))
+    return segments
+
+
+def distance_to_segments(x: Tensor, y: Tensor, segments: Sequence[Segment]) -> Tensor:
+    """Distance of each point to the nearest of the segments."""
+    distance = torch.full_like(x, torch.inf)
+    for start, end in segments:
+        dx, dy = end[0] - start[0], end[1] - start[1]
+        along = (((x - start[0]) * dx + (y - start[1]) * dy) / (dx * dx + dy * dy)).clamp(0.0, 1.0)
+        away = torch.sqrt((x - start[0] - along * dx) ** 2 + (y - start[1] - along * dy) ** 2 + 1e-18)
+        distance = torch.minimum(distance, away)
+    return distance
 
 
 # Strokes of capital letters on a grid 4 wide and 6 high, y up: pairs of digits, a blank lifts the pen.

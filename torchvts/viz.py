@@ -100,6 +100,35 @@ def comparison_figure(depth_mm: Tensor, truth_mm: Tensor, mm_per_pixel: float, t
     return figure
 
 
+def pose_figure(source: Tensor, target: Tensor, T_target_source: Tensor, title: str = "", most: int = 4000) -> Figure:
+    """Two clouds (N, 3) before and after registration, each from above and in space, as the paper's figure 8."""
+    clouds = [points.detach().cpu().double()[:: max(1, len(points) // most)] for points in (source, target)]
+    T = T_target_source.detach().cpu().double()
+    moved = clouds[0] @ T[:3, :3].T + T[:3, 3]
+    figure = Figure(figsize=(13.5, 3.8), layout="constrained", dpi=110)
+    FigureCanvasAgg(figure)
+    for k, (name, points) in enumerate((("before", clouds[0]), ("after", moved))):
+        above = figure.add_subplot(1, 4, 2 * k + 1)
+        space = figure.add_subplot(1, 4, 2 * k + 2, projection="3d")
+        for cloud, colour, label in ((clouds[1], "#1b6ca8", "target"), (points, "#d1495b", "source")):
+            x, y, z = cloud.numpy().T
+            above.scatter(x, y, s=1.2, c=colour, label=label, alpha=0.6, linewidths=0)
+            space.scatter(x, y, z, s=0.8, c=colour, alpha=0.6, linewidths=0)
+        above.set_aspect("equal")
+        above.set_title(f"{name}, from above")
+        above.set_xlabel("x, mm")
+        above.set_ylabel("y, mm (up)")
+        above.legend(markerscale=6, fontsize=7, loc="upper right")
+        spans = np.ptp(np.concatenate((clouds[1].numpy(), points.numpy())), axis=0)
+        space.set_box_aspect((spans[0], spans[1], max(spans[2], 0.3 * spans[0])))
+        space.view_init(elev=35, azim=-65)
+        space.set_title(name)
+        space.tick_params(labelsize=6)
+    if title:
+        figure.suptitle(title)
+    return figure
+
+
 def save_figure(figure: Figure, path: str | Path) -> None:
     """Write a figure, whole or not at all; the suffix names the format."""
     with write_atomically(path) as temporary:

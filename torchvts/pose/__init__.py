@@ -1,5 +1,8 @@
-"""Floor 2: point clouds of contacts. Needs the extra ``pose``; nothing here is imported by ``import torchvts``."""
+"""Floor 2: pose from touch, and point clouds of contacts. Only cloud files and FPFH need the extra ``pose`` (Open3D)."""
 
-from .clouds import read_point_cloud, write_point_cloud
+from .clouds import contact_cloud, read_point_cloud, write_point_cloud
+from .direct import register_depth
+from .points import register_points
+from .result import Registration
 
-__all__ = ["read_point_cloud", "write_point_cloud"]
+__all__ = ["Registration", "contact_cloud", "read_point_cloud", "register_depth", "register_points", "write_point_cloud"]

@@ -1,4 +1,4 @@
-"""Point clouds as PCD and PLY files, by Open3D."""
+"""Point clouds of contacts, thinned evenly, and their PCD and PLY files, by Open3D."""
 
 import ctypes
 from pathlib import Path
@@ -7,10 +7,71 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
+from ..core.checks import check_integer
 from ..core.files import write_atomically
+from ..core.geometry import depth_to_points
+from .relief import Frame, contact_of, sure_contact
 
 CLOUD_SUFFIXES = (".pcd", ".ply")
+
+
+def contact_cloud(frame: Frame, mm_per_pixel: float, most: int | None = 1000) -> tuple[Tensor, Tensor]:
+    """The contact of one depth frame as points and normals, in the right-handed frame (x right, y up, z to the camera).
+
+    Kept is what is deeper than the noise of depth and than the skirt around a contact, less a rim of one pixel; the normals are
+    those of the slopes that the camera saw (of 3 x 3 pixels where the cloud is thinned), not estimates from the points.
+
+    Args:
+        frame: a :class:`torchvts.DepthOutput`. mm_per_pixel: pitch, mm.
+        most: thin evenly, one point of each cube of a grid, to at most so many and seldom fewer than 0.9 of it; None keeps all.
+    Returns:
+        Points (N, 3), mm, and unit normals (N, 3), float64.
+    Raises:
+        ValueError: not one frame, values not finite, or no contact deeper than the noise.
+    """
+    depth, gradient, contact = contact_of(frame, "frame")
+    inside = sure_contact(depth, gradient, contact, mm_per_pixel)
+    if not bool(inside.any()):
+        raise ValueError("frame: expected a contact deeper than its own noise, got none: pressed too faintly")
+    points = depth_to_points(depth, mm_per_pixel, inside).double()
+    if most is not None:  # fewer points: each speaks for its neighbours
+        share = avg_pool2d(contact.float()[None], 3, 1, 1)
+        gradient = avg_pool2d(gradient * contact, 3, 1, 1) / share.clamp_min(1e-6)
+    normals = torch.stack((-gradient[0], gradient[1], torch.ones_like(depth)), dim=-1)[inside].double()
+    normals = torch.nn.functional.normalize(normals, dim=1)
+    index = torch.arange(len(points)) if most is None else thin(points, check_integer("most", most, 1))
+    return points[index], normals[index]
+
+
+def thin(points: Tensor, most: int) -> Tensor:
+    """Indices of at most ``most`` points, evenly spread: one of each cell of a grid."""
+    if len(points) <= most:
+        return torch.arange(len(points))
+    low, high = 0.0, float((points.amax(0) - points.amin(0)).max())
+    kept = torch.arange(len(points))
+    for _ in range(24):
+        size = 0.5 * (low + high)
+        index = voxel_first(points, size)
+        if len(index) > most:
+            low = size
+        else:
+            high, kept = size, index
+            if len(index) > 0.9 * most:
+                break
+    return kept
+
+
+def voxel_first(points: Tensor, size: float) -> Tensor:
+    """Indices of the first point of each cube of side ``size``, ascending."""
+    cell = torch.floor((points - points.amin(0)) / size).long()
+    extent = cell.amax(0) + 1
+    code = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
+    order = torch.argsort(code, stable=True)
+    code = code[order]
+    fresh = torch.cat((torch.ones(1, dtype=torch.bool), code[1:] != code[:-1]))
+    return order[fresh].sort().values
 
 
 def open3d() -> Any:

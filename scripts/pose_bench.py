@@ -1,0 +1,64 @@
+"""Pose bench: seven objects, and three whose pose cannot be known, from rendered noisy images to pose; table, JSON, pictures.
+
+python scripts/pose_bench.py --poses 100 --out out/pose_bench
+"""
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+import torchvts as vts
+from torchvts import objects, viz
+from torchvts.core.files import write_atomically
+from torchvts.pose_bench import PoseCase, machine, pose_table, run_poses
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--poses", type=int, default=100, help="of each object")
+    parser.add_argument("--size", type=int, nargs=2, default=(320, 240), metavar=("WIDTH", "HEIGHT"))
+    parser.add_argument("--noise", type=float, default=0.005, help="standard deviation of image noise; 8 bits on top")
+    parser.add_argument("--only", nargs="+", choices=[*objects.TARGETS, *objects.FREE_TARGETS], help="these objects")
+    parser.add_argument("--clouds", type=int, metavar="POINTS", help="register clouds of so many points instead (0: all pixels)")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--out", type=Path, required=True)
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    everything = {**objects.TARGETS, **objects.FREE_TARGETS}
+    targets = {name: everything[name] for name in arguments.only or everything}
+
+    def by_clouds(case: PoseCase) -> vts.Registration:
+        (s, n_s), (t, n_t) = (vts.contact_cloud(f, case.mm_per_pixel, arguments.clouds or None) for f in (case.source, case.target))
+        return vts.register_points(s, t, source_normals=n_s, target_normals=n_t)
+
+    options = {} if arguments.clouds is None else {"register": by_clouds}
+    size = (arguments.size[1], arguments.size[0])
+    with tqdm(total=arguments.poses * len(targets), unit="pose") as bar:
+        rows, shown = run_poses(targets, arguments.poses, size=size, noise_std=arguments.noise, progress=bar.update, **options)
+    for name, (case, found) in shown.items():
+        clouds = [vts.contact_cloud(frame, case.mm_per_pixel, 4000)[0] for frame in (case.source, case.target)]
+        figure = viz.pose_figure(clouds[0], clouds[1], found.T_target_source, f"{name}: {found.message}")
+        viz.save_figure(figure, arguments.out / f"{name.replace(' ', '_')}.png")
+    how = f"{arguments.poses} poses each, {size[1]} x {size[0]}, noise {arguments.noise:g} and 8 bits; {machine()}"
+    text = f"{how}\n\n{pose_table(rows)}\n"
+    for name, content in (("table.md", text), ("poses.json", json.dumps([asdict(row) for row in rows], indent=1))):
+        with write_atomically(arguments.out / name) as temporary:
+            temporary.write_text(content)
+    print(text)
+    for row in rows:
+        for note in row.notes[:5]:
+            print(f"{row.name}, {note}")
+    return 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except (OSError, ValueError, TypeError, ImportError) as error:
+        sys.exit(f"error: {error}")

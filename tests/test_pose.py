@@ -1,0 +1,403 @@
+"""Pose from touch: known motions come back, what cannot be known is named, what does not fit is said."""
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import torchvts as vts
+from torchvts import objects, pose_bench
+from torchvts.pose import ambiguity, clouds, points
+from torchvts.pose.result import invert, motion, turn_deg
+
+ROOT = Path(__file__).resolve().parents[1]
+PITCH = 0.125
+SIZE = (120, 160)
+
+
+def frame(height_mm, T):
+    """An exact press as a DepthOutput."""
+    scene = objects.press(height_mm, T, *SIZE, PITCH)
+    return vts.DepthOutput(scene.depth_mm, scene.gradient, scene.normal, scene.contact)
+
+
+def off(found, truth, middle=(0.0, 0.0, 0.0)):
+    """Degrees, and mm at a point of the target."""
+    rest = found @ invert(truth)
+    at = torch.tensor(middle, dtype=torch.float64)
+    return float(turn_deg(rest)), float((rest[:3, :3] @ at + rest[:3, 3] - at).norm())
+
+
+@pytest.fixture(scope="module")
+def letters():
+    return objects.stamp("VTS", 4.2)
+
+
+@pytest.fixture(scope="module")
+def reference(letters):
+    return frame(letters, objects.pose(0.0, (0.2, -0.1), 0.45, (1.0, -0.5)))
+
+
+# objects
+
+
+def test_a_pressed_object_has_the_gradient_of_its_depth():
+    T = objects.pose(33.0, (0.7, -0.4), 0.4, (2.0, -1.5))
+    errors = []
+    for refine in (1, 2):
+        scene = objects.press(objects.textured_patch(), T, 80 * refine, 80 * refine, 0.15 / refine, dtype=torch.float64)
+        q, p = torch.gradient(scene.depth_mm[0, 0], spacing=0.15 / refine)
+        inside = scene.depth_mm[0, 0] > 0.1
+        errors.append(float((torch.stack((p, q)) - scene.gradient[0])[:, inside].abs().mean()))
+    assert errors[1] < errors[0] / 3.4  # second order
+
+
+def test_a_tilted_sphere_is_the_same_sphere():
+    straight = objects.press(objects.sphere(), objects.pose(press_mm=0.5), 60, 60, 0.1, dtype=torch.float64)
+    center = objects.pose(press_mm=0.5) @ torch.tensor([0.0, 0.0, -10.0, 1.0], dtype=torch.float64)
+    T = motion(torch.tensor([0.05, -0.04, 1.0, 0.0, 0.0, 0.0], dtype=torch.float64), center[:3]) @ objects.pose(press_mm=0.5)
+    turned = objects.press(objects.sphere(), T, 60, 60, 0.1, dtype=torch.float64)
+    assert (straight.depth_mm - turned.depth_mm).abs().max() < 1e-9
+
+
+@pytest.mark.parametrize("name", objects.TARGETS)
+def test_targets_have_the_symmetry_they_state(name):
+    target = objects.TARGETS[name]
+    axis = torch.linspace(-5, 5, 41, dtype=torch.float64)
+    v, u = torch.meshgrid(axis, axis, indexing="ij")
+
+    def turned(angle_deg):
+        c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+        return target.height_mm(c * u - s * v, s * u + c * v)
+
+    assert (turned(target.period_deg) - turned(0.0)).abs().max() < 1e-6
+    assert (turned(0.5 * target.period_deg) - turned(0.0)).abs().max() > 0.02
+
+
+def test_impossible_presses_are_refused():
+    with pytest.raises(ValueError, match=r"T_sensor_object: expected \(4, 4\), got \(3, 3\)"):
+        objects.press(objects.sphere(), torch.eye(3))
+    with pytest.raises(ValueError, match="expected a tilt below 25 degrees"):
+        objects.press(objects.sphere(), objects.pose(tilt_deg=(40.0, 0.0)))
+
+
+# two depth frames
+
+
+@pytest.mark.parametrize("angle_deg", [17.0, 144.0, 260.0])
+def test_a_press_turned_moved_tilted_and_deeper_is_found(letters, reference, angle_deg):
+    T = objects.pose(angle_deg, (2.0, -1.2), 0.6, (-1.5, 1.0))
+    truth = objects.pose(0.0, (0.2, -0.1), 0.45, (1.0, -0.5)) @ invert(T)
+    moved = frame(letters, T)
+    forth = vts.register_depth(moved, reference, PITCH)
+    back = vts.register_depth(reference, moved, PITCH)
+    assert forth.converged and not forth.ambiguous and not forth.alternatives, forth.message
+    deg, mm = off(forth.T_target_source, truth)
+    assert deg < 0.1 and mm < 0.02
+    deg, mm = off(forth.T_target_source @ back.T_target_source, torch.eye(4, dtype=torch.float64))
+    assert deg < 0.05 and mm < 0.01
+    assert torch.allclose(forth.inverse() @ forth.T_target_source, torch.eye(4, dtype=torch.float64), atol=1e-12)
+
+
+def test_a_frame_on_itself_stays(reference):
+    found = vts.register_depth(reference, reference, PITCH)
+    assert off(found.T_target_source, torch.eye(4, dtype=torch.float64))[0] < 1e-3
+    assert found.rmse_mm < 1e-5 and found.fitness == 1.0
+
+
+def test_turning_both_frames_turns_the_pose(letters, reference):
+    """The same pose, seen by a sensor that is mounted upside down."""
+    moved = frame(letters, objects.pose(40.0, (1.0, 1.5), 0.5))
+    found = vts.register_depth(moved, reference, PITCH)
+
+    def half_turn(f):
+        return vts.DepthOutput(*(t.flip((2, 3)) * s for t, s in zip(f, (1, -1, torch.tensor([-1, -1, 1])[:, None, None], True))))
+
+    other = vts.register_depth(half_turn(moved), half_turn(reference), PITCH)
+    half = objects.pose(180.0, press_mm=0.0)
+    deg, mm = off(half @ other.T_target_source @ half, found.T_target_source)
+    assert deg < 0.02 and mm < 0.003
+
+
+def test_a_symmetric_object_lists_its_other_poses():
+    target = objects.TARGETS["gear"]
+    T_t, T_s = objects.pose(0.0, press_mm=0.45), objects.pose(100.0, (1.0, 0.5), 0.5, (1.0, 1.0))
+    found = vts.register_depth(frame(target.height_mm, T_s), frame(target.height_mm, T_t), PITCH)
+    assert found.converged and not found.ambiguous and len(found.alternatives) == 11
+    every = [found.T_target_source, *found.alternatives]
+    for k in range(12):
+        truth = T_t @ objects.pose(30.0 * k, press_mm=0.0) @ invert(T_s)
+        deg, mm = min(off(T, truth) for T in every)
+        assert deg < 0.5 and mm < 0.05
+
+
+@pytest.mark.parametrize(
+    "name, shape, names",
+    [
+        ("sphere", objects.sphere(), ["rotation about x", "rotation about y", "rotation about z"]),
+        ("cylinder", objects.cylinder(), ["translation along 30 degrees", "rotation about 30 degrees"]),
+        ("plane", objects.plane(), ["translation along x", "translation along y", "rotation about z"]),
+    ],
+)
+def test_surfaces_that_slide_on_themselves_are_ambiguous(name, shape, names):
+    del name
+    tilt = (2.5, 1.0)
+    one = frame(shape, objects.pose(30.0, (0.3, 0.2), 0.3, tilt))
+    two = frame(shape, objects.pose(75.0, (-0.5, 0.6), 0.35, (-1.0, 2.0)))
+    found = vts.register_depth(two, one, PITCH)
+    assert found.converged and not found.alternatives
+    for said, expected in zip(found.ambiguous, names, strict=True):
+        kind, angle = said.rsplit(" ", 2)[0], said.split()[2]
+        assert expected.startswith(kind.split(" degrees")[0].rsplit(" ", 1)[0]) or said == expected
+        if "degrees" in expected:
+            assert abs(float(angle) - 30.0) <= 3.0
+    assert found.covariance.diagonal().max() > 1.0 and torch.linalg.eigvalsh(found.covariance).min() > 0
+
+
+def test_a_surface_of_revolution_hides_its_turn_only():
+    def mound(u, v):
+        r = torch.sqrt(u**2 + v**2 + 1e-12)
+        return 0.2 * torch.cos(2.0 * r) - 0.04 * r**2 - 0.2
+
+    found = vts.register_depth(frame(mound, objects.pose(50.0, (1.0, -0.4), 0.5)), frame(mound, objects.pose(press_mm=0.6)), PITCH)
+    assert found.converged and found.ambiguous == ["rotation about z"]
+    assert float(found.T_target_source[:2, 3].norm() - math.hypot(1.0, 0.4)) < 0.01
+
+
+def test_different_objects_do_not_fit(reference):
+    for name in ("gear", "key", "textured patch"):
+        other = frame(objects.TARGETS[name].height_mm, objects.pose(20.0, (0.5, 0.0), 0.5))
+        found = vts.register_depth(other, reference, PITCH)
+        assert not found.converged and not found.ambiguous and "nothing fits" in found.message
+
+
+def test_a_sequence_starts_from_the_pose_before(letters, reference, monkeypatch):
+    truth = objects.pose(0.0, (0.2, -0.1), 0.45, (1.0, -0.5)) @ invert(objects.pose(5.0, (0.5, 0.3), 0.5))
+    moved = frame(letters, objects.pose(5.0, (0.5, 0.3), 0.5))
+    near = motion(torch.tensor([0.01, -0.01, 0.05, 0.2, -0.2, 0.05], dtype=torch.float64)) @ truth
+    monkeypatch.setattr("torchvts.pose.direct.search_plane", None)  # no search is needed
+    found = vts.register_depth(moved, reference, PITCH, initial=near)
+    assert found.converged and off(found.T_target_source, truth)[0] < 0.1
+
+
+def test_a_start_that_is_wrong_is_left(letters, reference):
+    found = vts.register_depth(frame(letters, objects.pose(5.0, (0.5, 0.3), 0.5)), reference, PITCH, initial=objects.pose(170.0))
+    assert found.converged and found.fitness > 0.95
+
+
+def test_impossible_frames_are_refused(reference):
+    nothing = reference._replace(contact=torch.zeros_like(reference.contact))
+    with pytest.raises(ValueError, match="source: expected a contact of at least 60 pixels, got 0: nothing is touched"):
+        vts.register_depth(nothing, reference, PITCH)
+    faint = reference._replace(depth_mm=0.01 * reference.depth_mm)
+    with pytest.raises(ValueError, match=r"target: .*pressed too faintly"):
+        vts.register_depth(reference, faint, PITCH)
+    with pytest.raises(ValueError, match="source: expected finite depth"):
+        vts.register_depth(reference._replace(depth_mm=reference.depth_mm * torch.nan), reference, PITCH)
+    with pytest.raises(ValueError, match=r"source: expected one frame.*loop over the batch"):
+        vts.register_depth(vts.DepthOutput(*(torch.cat((t, t)) for t in reference)), reference, PITCH)
+    with pytest.raises(TypeError, match="source: expected a DepthOutput"):
+        vts.register_depth(reference.depth_mm, reference, PITCH)
+    with pytest.raises(ValueError, match="initial: expected a rigid motion"):
+        vts.register_depth(reference, reference, PITCH, initial=2 * torch.eye(4))
+    with pytest.raises(ValueError, match=r"initial: expected a finite \(4, 4\) tensor"):
+        vts.register_depth(reference, reference, PITCH, initial=torch.eye(3))
+
+
+def test_the_whole_chain_keeps_within_its_goal():
+    targets = {name: objects.TARGETS[name] for name in ("stamp", "bottle cap", "tool handle")} | {
+        "plane": objects.FREE_TARGETS["plane"]
+    }
+    rows, shown = pose_bench.run_poses(targets, 3, size=(180, 240), noise_std=0.005)
+    for row in rows[:3]:
+        assert row.success == 1.0 and row.wrong == 0 and max(row.deg) < 0.3 and max(row.mm) < 0.05
+    assert rows[3].named == 1.0 and rows[3].wrong == 0
+    assert pose_bench.pose_table(rows).count("\n") == 5 and set(shown) == set(targets)
+
+
+def test_the_covariance_foretells_the_error():
+    rows = []
+    lights, pipe = pose_bench.rig(120, 160, PITCH)
+    for seed in range(6):
+        case = pose_bench.pose_case(objects.TARGETS["textured patch"], seed, lights, pipe, SIZE, 0.01)
+        found = vts.register_depth(case.source, case.target, PITCH)
+        truth = case.T_sensor_target @ invert(case.T_sensor_source)
+        rest = found.T_target_source @ invert(truth)
+        rows.append(float(rest[1, 0]) ** 2 / float(found.covariance[2, 2]))
+    assert 0.02 < sum(rows) / len(rows) < 30
+
+
+# clouds
+
+
+def test_the_contact_cloud_is_even_sure_and_has_the_cameras_normals(reference):
+    cloud, normals = vts.contact_cloud(reference, PITCH, 400)
+    assert 320 <= len(cloud) <= 400 and normals.shape == cloud.shape
+    assert float(cloud[:, 2].min()) > 0.03
+    assert torch.allclose(normals.norm(dim=1), torch.ones(len(cloud), dtype=torch.float64))
+    whole, fine = vts.contact_cloud(reference, PITCH, None)
+    assert len(whole) < int(reference.contact.sum())
+    assert (torch.cdist(whole, cloud).min(1).values < 1.0).all()  # evenly spread: no part is far from a kept point
+    row = (SIZE[0] - 1) / 2 - whole[:, 1] / PITCH
+    column = whole[:, 0] / PITCH + (SIZE[1] - 1) / 2
+    seen = reference.normal[0, :, row.round().long(), column.round().long()].T * torch.tensor([1.0, -1.0, 1.0])
+    assert (seen - fine).abs().max() < 1e-5
+    with pytest.raises(ValueError, match="frame: expected a contact deeper than its own noise"):
+        vts.contact_cloud(reference._replace(depth_mm=0.01 * reference.depth_mm), PITCH)
+
+
+@pytest.mark.parametrize("twist", [(0.02, -0.03, 2.0, 3.0, -2.0, 0.1), (1.2, -0.8, 2.0, 3.0, -2.0, 5.0)])
+@pytest.mark.parametrize("order", ["same", "mixed"])
+def test_a_known_motion_of_a_cloud_comes_back(reference, twist, order):
+    cloud = vts.contact_cloud(reference, PITCH, None)[0]
+    T = motion(torch.tensor(twist, dtype=torch.float64))
+    moved = cloud @ T[:3, :3].T + T[:3, 3]
+    if order == "mixed":
+        moved = moved[torch.randperm(len(moved), generator=torch.Generator().manual_seed(0))]
+    found = vts.register_points(cloud, moved)
+    assert found.converged, found.message
+    assert (found.T_target_source - T).abs().max() < 1e-4
+
+
+def test_a_cloud_that_is_no_relief_is_registered():
+    generator = torch.Generator().manual_seed(1)
+    blob = torch.randn(800, 3, generator=generator, dtype=torch.float64)
+    blob = torch.nn.functional.normalize(blob, dim=1) * torch.tensor([4.0, 2.5, 2.0]) + 0.3 * torch.sin(2 * blob)
+    T = motion(torch.tensor([0.8, -0.5, 1.5, 1.0, 2.0, -3.0], dtype=torch.float64))
+    found = vts.register_points(blob, blob @ T[:3, :3].T + T[:3, 3])
+    assert found.converged and (found.T_target_source - T).abs().max() < 1e-4
+
+
+@pytest.mark.parametrize("with_normals", [False, True])
+@pytest.mark.parametrize("most", [None, 1200])
+def test_contact_clouds_of_two_presses(with_normals, most):
+    shape = objects.textured_patch()
+    T_t, T_s = objects.pose(0.0, press_mm=0.5), objects.pose(75.0, (1.0, -0.8), 0.6, (1.0, 0.5))
+    (s, n_s), (t, n_t) = (vts.contact_cloud(frame(shape, T), PITCH, most) for T in (T_s, T_t))
+    normals = {"source_normals": n_s, "target_normals": n_t} if with_normals else {}
+    forth, back = vts.register_points(s, t, **normals), vts.register_points(t, s, **{
+        "source_normals": n_t, "target_normals": n_s} if with_normals else {})  # fmt: skip
+    assert forth.converged
+    deg, mm = off(forth.T_target_source, T_t @ invert(T_s))
+    assert deg < 0.3 and mm < 0.05
+    deg, mm = off(forth.T_target_source @ back.T_target_source, torch.eye(4, dtype=torch.float64))
+    assert deg < (0.05 if most is None else 0.3) and mm < (0.01 if most is None else 0.05)
+
+
+def test_clouds_of_spheres_are_ambiguous():
+    one, two = (frame(objects.sphere(), objects.pose(press_mm=d)) for d in (0.5, 0.6))
+    found = vts.register_points(vts.contact_cloud(one, PITCH, None)[0], vts.contact_cloud(two, PITCH, None)[0])
+    assert found.ambiguous == ["rotation about x", "rotation about y", "rotation about z"]
+
+
+def test_clouds_that_do_not_match_do_not_converge(reference):
+    other = frame(objects.TARGETS["gear"].height_mm, objects.pose(20.0, (0.5, 0.0), 0.5))
+    found = vts.register_points(vts.contact_cloud(other, PITCH, None)[0], vts.contact_cloud(reference, PITCH, None)[0])
+    assert not found.converged and found.message
+
+
+def test_impossible_clouds_are_refused():
+    good = torch.rand(50, 3)
+    for cloud, message in (
+        (torch.zeros(0, 3), r"source: expected points, got none: no contact\?"),
+        (torch.rand(50, 2), r"source: expected \(N, 3\), got \(50, 2\)"),
+        (torch.rand(6, 3), "source: expected at least 10 distinct points, got 6 of 6"),
+        (torch.ones(50, 3), "source: expected at least 10 distinct points, got 1 of 50"),
+        (torch.full((50, 3), torch.nan), "source: expected finite points, got 50 with NaN"),
+        (torch.arange(50.0)[:, None].expand(50, 3), "source: expected a surface, got points on one line"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            vts.register_points(cloud, good)
+    with pytest.raises(ValueError, match=r"target_normals: expected \(50, 3\)"):
+        vts.register_points(good, good, target_normals=torch.rand(4, 3))
+    with pytest.raises(TypeError, match="source: expected a tensor"):
+        vts.register_points([[0.0, 0.0, 0.0]], good)
+
+
+def test_duplicate_points_change_nothing(reference):
+    cloud = vts.contact_cloud(reference, PITCH, None)[0]
+    moved = cloud + torch.tensor([0.5, 0.2, 0.0], dtype=torch.float64)
+    found = vts.register_points(torch.cat((cloud, cloud[:100])), moved)
+    assert found.converged and (found.T_target_source[:3, 3] - (moved - cloud)[0]).abs().max() < 1e-4
+
+
+def test_without_open3d_clouds_register_and_files_say_what_to_install(monkeypatch, reference, tmp_path):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    cloud = vts.contact_cloud(reference, PITCH, None)[0]
+    assert vts.register_points(cloud, cloud + 0.1).converged
+    other = frame(objects.key(), objects.pose(20.0))
+    assert not vts.register_points(cloud, vts.contact_cloud(other, PITCH, None)[0]).converged
+    with pytest.raises(ImportError, match=r"pip install 'torchvts\[pose\]'"):
+        clouds.write_point_cloud(tmp_path / "a.ply", cloud)
+
+
+# words, and the small parts
+
+
+def test_names_of_single_directions():
+    one = torch.eye(6, dtype=torch.float64)
+    nothing = torch.zeros(3, 0, dtype=torch.float64)
+    assert ambiguity.name_directions(one[:, 3:4], one[3:, 3:4]) == ["translation along x"]
+    assert ambiguity.name_directions(one[:, 4:5], one[3:, 4:5]) == ["translation along y"]
+    assert ambiguity.name_directions(one[:, 5:6], one[3:, 5:6]) == ["translation along z"]
+    assert ambiguity.name_directions(one[:, 2:3], nothing) == ["rotation about z"]
+    assert ambiguity.name_directions(one[:, :0], nothing) == []
+
+
+def test_thinning_is_even():
+    axis = torch.linspace(0, 10, 101, dtype=torch.float64)
+    y, x = torch.meshgrid(axis, axis, indexing="ij")
+    grid = torch.stack((x, y, torch.zeros_like(x)), -1).reshape(-1, 3)
+    kept = clouds.thin(grid, 500)
+    assert 400 <= len(kept) <= 500 and torch.equal(kept, kept.sort().values)
+    assert float(torch.cdist(grid, grid[kept]).min(1).values.max()) < 1.0
+    assert len(clouds.thin(grid[:50], 500)) == 50
+
+
+def test_nearest_points_are_the_nearest():
+    cloud = torch.rand(300, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    probe = torch.rand(40, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    distance, index = points._Tree(cloud).nearest(probe)
+    true = torch.cdist(probe, cloud).min(1)
+    assert torch.equal(index, true.indices) and torch.allclose(distance, true.values)
+
+
+# the script
+
+
+def test_the_script_writes_pose_and_picture(tmp_path):
+    lights, pipe = pose_bench.rig(*SIZE, PITCH)
+    del pipe
+    T_t, T_s = objects.pose(0.0, press_mm=0.5), objects.pose(50.0, (1.0, 0.5), 0.55)
+    rest = vts.scenes.at_rest(objects.press(objects.stamp(), T_t, *SIZE, PITCH))
+    background = vts.scenes.render(rest, lights)[0]
+    sensor = vts.Sensor("pose rig", *SIZE, PITCH)
+    vts.Calibration.from_lights(lights, sensor, background).save(tmp_path / "unit.safetensors")
+    (tmp_path / "film").mkdir()
+    vts.write_image(tmp_path / "rest.png", background)
+    for name, T in (("target", T_t), ("film/a", T_s), ("film/b", objects.pose(54.0, (1.1, 0.5), 0.55))):
+        scene = objects.press(objects.stamp(), T, *SIZE, PITCH)
+        vts.write_image(tmp_path / f"{name}.png", vts.scenes.render(scene, lights, noise_std=0.003)[0])
+
+    def call(*arguments):
+        command = [sys.executable, "scripts/pose.py", *map(str, arguments)]
+        return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=120)
+
+    unit = ["--calibration", tmp_path / "unit.safetensors"]
+    done = call(tmp_path / "film" / "a.png", tmp_path / "target.png", *unit, "--out", tmp_path / "one")
+    assert done.returncode == 0, done.stderr
+    result = json.loads((tmp_path / "one" / "pose.json").read_text())
+    deg, mm = off(torch.tensor(result["T_target_source"], dtype=torch.float64), T_t @ invert(T_s))
+    assert result["converged"] and deg < 0.3 and mm < 0.05
+    assert (tmp_path / "one" / "a_pose.png").stat().st_size > 10_000
+    done = call(tmp_path / "film", tmp_path / "target.png", *unit, "--out", tmp_path / "track")
+    assert done.returncode == 0, done.stderr
+    assert [entry["converged"] for entry in json.loads((tmp_path / "track" / "pose.json").read_text())] == [True, True]
+    done = call(tmp_path / "rest.png", tmp_path / "target.png", *unit, "--out", tmp_path / "none")
+    assert done.returncode == 1 and done.stderr.strip().splitlines()[-1].startswith("error: ") and "touched" in done.stderr
+    done = call(tmp_path / "target.png", tmp_path / "target.ply", "--out", tmp_path / "none")
+    assert done.returncode == 1 and "got one of each" in done.stderr

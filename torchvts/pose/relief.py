@@ -1,0 +1,174 @@
+"""A depth frame made ready to be compared: relief, slope and contact on a pyramid of grids, in the right-handed frame."""
+
+import math
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, grid_sample, max_pool2d
+
+LEAST_DEPTH_MM = 0.03
+"""Skin less deep than this is taken for skirt: it bends away from the object before it leaves it."""
+
+LEAST_PIXELS = 60
+"""A contact of fewer pixels has no pose."""
+
+
+class Frame(Protocol):
+    """What :class:`torchvts.DepthOutput` has."""
+
+    @property
+    def depth_mm(self) -> Tensor: ...
+    @property
+    def gradient(self) -> Tensor: ...
+    @property
+    def contact(self) -> Tensor: ...
+
+
+class Relief(NamedTuple):
+    """One frame on one grid, y up: z, slopes and second derivatives in ``field`` (6, H, W), order z, p, q, z_xx, z_xy, z_yy.
+
+    Attributes:
+        field: the six channels, mm, mm per mm, 1/mm.
+        inside: (H, W) bool, where the skin lies on the object.
+        near: (H, W) bool, the same, grown by a pixel: beyond it there is surely no contact.
+        x0, y0: position of the upper left pixel, mm, y up. pitch: mm.
+        points: (N, 3), the pixels inside. slopes: (N, 2), theirs.
+    """
+
+    field: Tensor
+    inside: Tensor
+    near: Tensor
+    x0: float
+    y0: float
+    pitch: float
+    points: Tensor
+    slopes: Tensor
+
+    def sample(self, xy: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """At positions (..., 2): the channels (6, ...), whether inside, whether near, whether in the image."""
+        height, width = self.inside.shape
+        column = (xy[..., 0] - self.x0) / self.pitch
+        row = (self.y0 - xy[..., 1]) / self.pitch
+        grid = torch.stack((column * (2.0 / max(width - 1, 1)) - 1.0, row * (2.0 / max(height - 1, 1)) - 1.0), -1)
+        flat = grid.reshape(1, 1, -1, 2)
+        channels = torch.cat((self.field, self.inside[None].to(self.field.dtype), self.near[None].to(self.field.dtype)))
+        values = grid_sample(channels[None], flat, align_corners=True)[0, :, 0].reshape(8, *xy.shape[:-1])
+        seen = (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
+        return values[:6], (values[6] > 0.999) & seen, values[7] > 0.001, seen
+
+
+class Levels(NamedTuple):
+    """A frame on three grids, from fine to coarse, and the noise of slopes on the coarse one."""
+
+    fine: Relief
+    middle: Relief
+    coarse: Relief
+    noise: float
+
+
+def contact_of(frame: Frame, name: str) -> tuple[Tensor, Tensor, Tensor]:
+    """Depth (H, W), gradient (2, H, W) (y down) and contact (H, W) bool of one frame, checked.
+
+    Raises:
+        ValueError: not one frame, shapes that differ, values not finite, or next to no contact.
+    """
+    for part in ("depth_mm", "gradient", "contact"):
+        if not isinstance(getattr(frame, part, None), Tensor):
+            raise TypeError(f"{name}: expected a DepthOutput, as a DepthPipeline returns, got {type(frame).__name__}")
+    depth, gradient, contact = frame.depth_mm.detach(), frame.gradient.detach(), frame.contact.detach()
+    height, width = depth.shape[-2:] if depth.dim() >= 2 else (0, 0)
+    if depth.numel() != height * width or gradient.numel() != 2 * height * width or contact.numel() != height * width:
+        raise ValueError(
+            f"{name}: expected one frame, depth (1, 1, H, W), gradient (1, 2, H, W), contact (1, 1, H, W), got "
+            f"{tuple(depth.shape)}, {tuple(gradient.shape)}, {tuple(contact.shape)}: loop over the batch"
+        )
+    if not bool(torch.isfinite(depth).all() and torch.isfinite(gradient).all()):
+        raise ValueError(f"{name}: expected finite depth and gradient, got NaN or infinite ones")
+    inside = contact.reshape(height, width).bool()
+    if int(inside.sum()) < LEAST_PIXELS:
+        raise ValueError(
+            f"{name}: expected a contact of at least {LEAST_PIXELS} pixels, got {int(inside.sum())}: nothing is touched?"
+        )
+    return depth.reshape(height, width).float(), gradient.reshape(2, height, width).float(), inside
+
+
+def levels(frame: Frame, mm_per_pixel: float, name: str) -> Levels:
+    """The frame on grids of at most 320, 160 and 80 columns; each pixel there is the mean of all it covers."""
+    depth, gradient, contact = contact_of(frame, name)
+    noise = slope_noise(gradient, contact)
+    inside = contact & (depth > least_depth_mm(noise, mm_per_pixel))
+    # flat faces whose outline the image cuts off may be missing from the mask: of these nothing is said, not even "no contact"
+    deep = depth > 0.3 * float(depth[contact].max())
+    slope = torch.stack((gradient[0], -gradient[1]))  # y up
+    longest = max(depth.shape)
+    first = max(1, math.ceil(longest / 330))
+    corner = (-0.5 * (depth.shape[1] - 1) * mm_per_pixel, 0.5 * (depth.shape[0] - 1) * mm_per_pixel)
+    every = (first, max(first, round(longest / 160)), max(first, round(longest / 80)))
+    made = [relief(depth, slope, inside, inside | deep, mm_per_pixel, times, corner) for times in every]
+    if min(len(one.points) for one in made) < 12:
+        least = least_depth_mm(noise, mm_per_pixel)
+        raise ValueError(
+            f"{name}: expected a contact deeper than {least:.3f} mm on some dozens of pixels, got {int(inside.sum())}: "
+            "pressed too faintly"
+        )
+    return Levels(made[0], made[1], made[2], noise / every[2])
+
+
+def without_rim(mask: Tensor) -> Tensor:
+    """A mask (1, H, W) less its outermost pixels, or as it is where it has hardly any others."""
+    core = -max_pool2d(-mask.float()[None], 3, 1, 1)[0] > 0.5
+    return core if 5 * int(core.sum()) > 2 * int(mask.sum()) else mask
+
+
+def least_depth_mm(noise: float, mm_per_pixel: float) -> float:
+    """Depth that is surely contact: above the skirt, and above what noise of slopes adds up to over some pixels."""
+    return max(LEAST_DEPTH_MM, 4.0 * noise * mm_per_pixel)
+
+
+def sure_contact(depth: Tensor, gradient: Tensor, contact: Tensor, mm_per_pixel: float) -> Tensor:
+    """(H, W) bool: contact deeper than that, less its rim of one pixel."""
+    inside = contact & (depth > least_depth_mm(slope_noise(gradient, contact), mm_per_pixel))
+    return without_rim(inside[None])[0]
+
+
+def slope_noise(gradient: Tensor, contact: Tensor) -> float:
+    """Noise of slopes inside the contact, from second differences along rows, as :func:`torchvts.core.noise.noise_std`."""
+    whole = contact[:, :-2] & contact[:, 1:-1] & contact[:, 2:]
+    second = (gradient[..., 1:-1] - 0.5 * (gradient[..., :-2] + gradient[..., 2:]))[:, whole].abs()
+    return float(second.median()) / (0.6745 * math.sqrt(1.5)) if second.numel() else 0.0
+
+
+def relief(
+    depth: Tensor, slope: Tensor, inside: Tensor, perhaps: Tensor, mm_per_pixel: float, times: int, corner: tuple[float, float]
+) -> Relief:
+    """One grid: means of ``times`` x ``times`` pixels of depth (H, W) and slope (2, H, W), y up; ``corner``: first pixel, mm."""
+    height, width = depth.shape
+    rows, columns = height // times * times, width // times * times
+    stack = torch.cat((depth[None], slope))[:, :rows, :columns]
+    share = torch.stack((inside, perhaps)).float()[:, :rows, :columns]
+    if times > 1:
+        within = avg_pool2d((stack * share[:1])[None], times)[0]
+        stack, share = avg_pool2d(stack[None], times)[0], avg_pool2d(share[None], times)[0]
+        stack = torch.where(share[:1] > 0.5, within / share[:1].clamp_min(0.5), stack)
+    pitch = times * mm_per_pixel
+    x0, y0 = corner[0] + 0.5 * (times - 1) * mm_per_pixel, corner[1] - 0.5 * (times - 1) * mm_per_pixel
+    whole = share[:1] > (0.99 if times <= 2 else 0.5)
+    if times <= 2:
+        whole = without_rim(whole)  # half of it is skirt
+    near = max_pool2d((share[1:] > 0.01).float()[None], 3, 1, 1)[0] > 0.5
+    smooth = _blur(stack[1:])
+    p_y, p_x = torch.gradient(smooth[0], spacing=pitch)
+    q_y, q_x = torch.gradient(smooth[1], spacing=pitch)
+    field = torch.cat((stack, p_x[None], 0.5 * (q_x - p_y)[None], -q_y[None]))
+    mask = whole[0]
+    row, column = torch.nonzero(mask, as_tuple=True)
+    points = torch.stack((x0 + column * pitch, y0 - row * pitch, stack[0][mask]), dim=1)
+    return Relief(field, mask, near[0], x0, y0, pitch, points, stack[1:, mask].T.contiguous())
+
+
+def _blur(field: Tensor) -> Tensor:
+    kernel = torch.tensor([0.25, 0.5, 0.25])
+    padded = torch.nn.functional.pad(field[:, None], (1, 1, 1, 1), mode="replicate")
+    across = torch.nn.functional.conv2d(padded, kernel.reshape(1, 1, 1, 3))
+    return torch.nn.functional.conv2d(across, kernel.reshape(1, 1, 3, 1))[:, 0]

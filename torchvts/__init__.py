@@ -4,6 +4,7 @@ from . import metrics, objects, scenes, stream
 from .calibration import CalibrationWarning, LightFit, Press, Touch, calibrate, fit_lights, fit_prior, read_presses
 from .compensate import Compensate
 from .contact import ContactMask
+from .core import __version__ as __version__
 from .core import gs_sdk
 from .core.files import read_image, write_image
 from .core.geometry import GradientFromNormal, depth_to_points, gradient_from_normal, normal_from_gradient
@@ -15,8 +16,6 @@ from .pipeline import DepthOutput, DepthPipeline
 from .pose import Registration, contact_cloud, register_depth, register_points
 from .record import Calibration
 from .shading import PointLights, near_field_shading
-
-__version__ = "0.1.0"
 
 __all__ = [
     "Calibration",

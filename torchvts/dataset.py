@@ -31,6 +31,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, IterableDataset
 from tqdm import tqdm
 
+from .core import __version__
 from .core.checks import check_integer, check_positive
 from .core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, count_frames, read_image, rgb_from_bgr, write_atomically, write_depth_png
 from .core.geometry import depth_to_points
@@ -248,7 +249,6 @@ def _name(path: str, frame: int) -> str:
 
 
 def _settings(calibration: str | Path, source: Path, mode: str, depth: str, cloud: str, pictures: bool, threads: int) -> Settings:
-    from . import __version__
 
     digest = hashlib.sha256(Path(calibration).read_bytes()).hexdigest()
     return Settings(digest, str(source.resolve()), mode, depth, cloud, pictures, threads, __version__, str(torch.__version__))

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from .core import __version__
 from .core.files import write_atomically
 from .core.geometry import pixel_grid_mm
 from .integration import PoissonDCT, PoissonRest, divergence
@@ -105,7 +106,6 @@ class _PlainOutput(nn.Module):
 
 def describe(pipe: DepthPipeline) -> dict[str, Any]:
     """What an exported file says of itself: plain JSON."""
-    from . import __version__
 
     height, width, dtype = _size(pipe)
     return {

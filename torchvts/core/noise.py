@@ -30,7 +30,7 @@ def noise_std(image: Tensor, samples: int = 8000) -> Tensor:
     second = (middle - 0.5 * (left + right)).abs().flatten(2)
     std = 1.5 * second.median(dim=2, keepdim=True).values / 0.6745
     squared = second * second
-    for _ in range(3):
+    for _ in range(2):
         near = (second <= 3.0 * std).to(second.dtype)
         mean = (squared * near).sum(dim=2, keepdim=True) / near.sum(dim=2, keepdim=True).clamp_min(1.0)
         std = torch.sqrt(mean / 0.97334)  # mean of x^2 of a standard Gaussian x within three standard deviations

@@ -16,7 +16,7 @@ demo: setup
 	$(BIN)/python scripts/demo.py --out out/demo
 
 test: setup
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 check: setup
 	$(BIN)/ruff check .

@@ -41,7 +41,7 @@ def test_letters(ring):
     scene = scenes.letters_press("VTS", height=240, width=320, mm_per_pixel=0.125)
     contact = found(scene, ring(), vts.Sensor("rig", 240, 320, 0.125), 0.005, 8)
     assert metrics.mask_iou(contact, scene.contact) > 0.93
-    assert metrics.rim_distance_px(contact, scene.contact) < 1.1
+    assert metrics.rim_distance_px(contact, scene.contact) < 1.0
 
 
 def mask_of(changed, height=480, width=640, noise=0.01, seed=None, **options):

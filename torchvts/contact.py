@@ -129,7 +129,7 @@ class ContactMask(nn.Module):
     Args:
         flat: (3, H, W), what the compensated image is at rest.
         noise_std: (3,) or (3, H, W), noise of the compensated image at calibration.
-        sigmas: threshold; 5 leaves 5 false pixels in a 640 x 480 frame, all specks.
+        sigmas: threshold of a pixel; 4.5 leaves some 40 false pixels in a 640 x 480 frame, all specks.
         min_size_px: diameter of the smallest contact.
     Example:
         >>> flat = torch.full((3, 64, 64), 0.5)
@@ -144,7 +144,7 @@ class ContactMask(nn.Module):
     cell_row: Tensor
     cell_column: Tensor
 
-    def __init__(self, flat: Tensor, noise_std: Tensor, sigmas: float = 5.0, min_size_px: float = 8.0) -> None:
+    def __init__(self, flat: Tensor, noise_std: Tensor, sigmas: float = 4.5, min_size_px: float = 8.0) -> None:
         super().__init__()
         if flat.dim() != 3 or flat.shape[0] != 3:
             raise ValueError(f"flat: expected (3, H, W), got {tuple(flat.shape)}")
@@ -156,6 +156,7 @@ class ContactMask(nn.Module):
         noise = noise_std.reshape(3, 1, 1) if noise_std.dim() == 1 else noise_std
         self.register_buffer("flat", flat.detach().clone())
         self.register_buffer("per_noise", 1.0 / noise.detach().clamp_min(QUANTISATION_STD).to(flat.dtype))
+        self.rounding = float((QUANTISATION_STD * self.per_noise).square().mean())
         self.register_buffer("rest", -self.flat * self.per_noise)
         self.register_buffer("cell_row", torch.arange(flat.shape[1]) // self.cell)
         self.register_buffer("cell_column", torch.arange(flat.shape[2]) // self.cell)
@@ -188,6 +189,9 @@ class ContactMask(nn.Module):
         r, g, b = change[:, 0:1], change[:, 1:2], change[:, 2:3]
         squared = torch.addcmul(torch.addcmul(r * r, g, g), b, b)
         noise = frame_noise_std(change.detach(), 2000).amax(dim=1).clamp_min(1.0)  # a frame noisier than calibration
+        noise = torch.sqrt(
+            noise * noise + self.rounding
+        )  # of smooth light, rounding to 8 bits is no white noise, and not seen there
         return change, squared, (self.sigmas * noise).square()[:, None, None, None]
 
     def _clean(self, change: Tensor, strong: Tensor, threshold: Tensor) -> tuple[Tensor, Tensor]:
@@ -198,7 +202,7 @@ class ContactMask(nn.Module):
         step = max(1, max(mean.shape[2], mean.shape[3]) // 40)  # a median of some thousand cells is as good
         spread = mean[:, :, step // 2 :: step, step // 2 :: step].abs().flatten(2).median(dim=2).values / 0.6745
         least = torch.sqrt(threshold[:, :, 0, 0]) / (self.sigmas * self.cell)  # white noise in the mean of a cell
-        faint = (mean / torch.maximum(spread, least)[..., None, None]).square().sum(1, keepdim=True) > self.sigmas * self.sigmas
+        faint = (mean / torch.maximum(spread, least)[..., None, None]).square().sum(1, keepdim=True) > 25.0  # 5 sigmas
         faint = faint & ~any_strong  # where single pixels stand out, as at a rim, they decide
         cells = any_strong | faint
         if may_read_values() and not bool(cells.any()):

@@ -1,0 +1,247 @@
+"""A stream shown: image beside depth with contours, as a video, in a window, and what it came to in figures."""
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..core.checks import check_positive
+from ..core.files import write_atomically
+from .live import TactileFrame, TactileStream
+from .sources import Pixels
+
+CODES = {".mp4": "mp4v", ".avi": "MJPG"}
+"""What videos can be written, and OpenCV's code for it."""
+
+
+_RANGES = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+
+
+class Overlay:
+    """Draws a frame: the image with its contact outlined, beside it depth in colour with contour lines, figures beneath.
+
+    The range of colours grows with the deepest press so far, over round numbers; ten lines fill it.
+
+    Args:
+        metric: whether depth is in mm; if not, it says so.
+    """
+
+    TEXT_HEIGHT = 86
+
+    def __init__(self, metric: bool = True) -> None:
+        import cv2
+
+        self.metric, self.range_mm = metric, 0.1
+        table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)
+        self._table = np.ascontiguousarray(table)
+
+    def depth(self, depth_mm: Tensor) -> Pixels:
+        """Depth (1, 1, H, W) as colours with contour lines, (H, W, 3) B, G, R."""
+        import cv2
+
+        depth = depth_mm[0, 0].float().numpy()
+        high = float(depth.max())
+        while high > self.range_mm:
+            power = 10.0 ** np.floor(np.log10(self.range_mm) + 1e-9)
+            self.range_mm = float(power * next(s for s in _RANGES if s > self.range_mm / power + 1e-6))
+        depth = np.maximum(depth, 0.0)
+        level = cv2.convertScaleAbs(depth, alpha=255.0 / self.range_mm)
+        picture: Pixels = cv2.applyColorMap(level, self._table)
+        if high > 0.02 * self.range_mm:
+            smooth = cv2.blur(depth, (3, 3))
+            step = cv2.convertScaleAbs(smooth, alpha=10.0 / self.range_mm, beta=-0.5)  # ten lines over the range
+            lines = np.zeros(step.shape, np.uint8)
+            lines[:, 1:] |= (step[:, 1:] != step[:, :-1]).view(np.uint8)
+            lines[1:] |= (step[1:] != step[:-1]).view(np.uint8)
+            picture[lines.astype(bool)] = (255, 255, 255)
+        return picture
+
+    def __call__(self, frame: TactileFrame, lines: Sequence[str] = ()) -> Pixels:
+        """The overlay, B, G, R, with up to three lines of text under it; images narrower than 300 pixels are shown larger."""
+        import cv2
+
+        height, width = frame.image.shape[1:]
+        left = np.ascontiguousarray((frame.image.flip(0).permute(1, 2, 0) * 255.0 + 0.5).to(torch.uint8).numpy())
+        contact = frame.output.contact[0, 0].numpy().view(np.uint8)
+        if contact.any():
+            smooth = (cv2.blur(contact * 255, (7, 7)) > 127).view(np.uint8)
+            outline, _ = cv2.findContours(smooth, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+            cv2.drawContours(left, outline, -1, (255, 255, 255), 1, cv2.LINE_AA)
+        right, larger = self.depth(frame.output.depth_mm), -(-300 // width)
+        height, width = height * larger, width * larger
+        out = np.zeros((height + self.TEXT_HEIGHT + height % 2, 2 * width, 3), np.uint8)
+        for picture, place in ((left, 0), (right, width)):
+            if larger > 1:
+                picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_NEAREST)
+            out[:height, place : place + width] = picture
+        unit = "mm" if self.metric else "mm, NOT METRIC"
+        texts = [f"depth 0 to {self.range_mm:g} {unit}, a line each {self.range_mm / 10:g}", *lines][:4]
+        for k, text in enumerate(texts):
+            cv2.putText(out, text, (6, height + 18 + 20 * k), cv2.FONT_HERSHEY_SIMPLEX, 0.43, (230, 230, 230), 1, cv2.LINE_AA)
+        return out
+
+
+class VideoFile:
+    """A video that is there whole or not at all: written beside its name, renamed when the block ends well.
+
+    Args:
+        path: .mp4 (mp4v) or .avi (MJPG). fps: frames a second.
+    Raises:
+        ValueError: another suffix. OSError: OpenCV cannot write it.
+    """
+
+    def __init__(self, path: str | Path, fps: float) -> None:
+        self.path, self.fps = Path(path), check_positive("fps", fps)
+        if self.path.suffix.lower() not in CODES:
+            raise ValueError(f"video: expected a name ending in {' or '.join(CODES)}, got {self.path.name!r}")
+        self._file: Any = None
+        self._writer: Any = None
+        self._temporary = self.path
+
+    def __enter__(self) -> "VideoFile":
+        self._file = write_atomically(self.path)
+        self._temporary = self._file.__enter__()
+        return self
+
+    def write(self, picture: Pixels) -> None:
+        """Append a frame, (H, W, 3) B, G, R, 8 bits; all of one size."""
+        import cv2
+
+        if self._writer is None:
+            code = cv2.VideoWriter.fourcc(*CODES[self.path.suffix.lower()])
+            self._writer = cv2.VideoWriter(str(self._temporary), code, self.fps, (picture.shape[1], picture.shape[0]))
+            if not self._writer.isOpened():
+                raise OSError(f"video: {self.path}: OpenCV cannot write this kind of file here: try .avi")
+        self._writer.write(picture)
+
+    def __exit__(self, *error: Any) -> None:
+        if self._writer is not None:
+            self._writer.release()
+        if self._writer is None and error[0] is None:
+            nothing = OSError(f"video: {self.path}: no frame came, so none is written")
+            self._file.__exit__(OSError, nothing, None)  # removes the temporary file
+            return
+        self._file.__exit__(*error)
+
+
+class StreamReport:
+    """What is kept of every frame, for a table at the end and two files.
+
+    Args:
+        stream: told of by its frames.
+    """
+
+    HEADER = "frame,time_s,contact_mm2,deepest_mm,light"
+
+    def __init__(self, stream: TactileStream, clock: Callable[[], float] = time.perf_counter) -> None:
+        self.stream, self._clock = stream, clock
+        self.rows: list[tuple[int, float, float, float, str]] = []
+        self._begin = self._end = clock()
+        self._pixel_mm2 = stream.calibration.sensor.mm_per_pixel**2
+
+    def add(self, frame: TactileFrame) -> list[str]:
+        """Keep a frame's figures; returns them as lines of text."""
+        self._end = self._clock()
+        area = float(frame.output.contact.sum()) * self._pixel_mm2
+        deepest = float(frame.output.depth_mm.max())
+        state = self.stream.light.state
+        self.rows.append((frame.number, frame.time_s, area, deepest, state))
+        dropped = f", {self.stream.dropped} dropped" if self.stream.dropped else ""
+        times = [f"{name} {ms:.1f}" for name, ms in self.stream.stages.last.items()]
+        half = (len(times) + 1) // 2
+        light = "  LIGHT HAS CHANGED: start again without contact" if state == "stepped" else ""
+        return [
+            f"frame {frame.number}  {frame.time_s:.2f} s  contact {area:.1f} mm2  deepest {deepest:.2f}{light}",
+            f"{self.fps:.0f} fps{dropped}, ms: {' '.join(times[:half])}",
+            " ".join(times[half:]),
+        ]
+
+    @property
+    def fps(self) -> float:
+        """Frames a second from the start to the last frame, drawing and writing included."""
+        return len(self.rows) / max(self._end - self._begin, 1e-9)
+
+    def summary(self) -> dict[str, Any]:
+        """Plain JSON: frames, dropped, fps, stages_ms, and what the stream is."""
+        stream = self.stream
+        return {
+            "source": stream.reader.name,
+            "source_fps": stream.fps,
+            "frames": len(self.rows),
+            "dropped": stream.dropped,
+            "fps": round(self.fps, 2),
+            "stages_ms": {name: round(ms, 3) for name, ms in stream.stages.median_ms().items()},
+            "contact_frames": sum(row[2] > 0 for row in self.rows),
+            "deepest_mm": max((row[3] for row in self.rows), default=0.0),
+            "light_level": [round(v, 5) for v in stream.light.level],
+            "light_steps": stream.light.steps,
+            "metric": stream.metric,
+            "calibration": stream.told,
+        }
+
+    def table(self) -> str:
+        """The summary as text."""
+        values = self.summary()
+        lines = [f"{values['frames']} frames, {values['dropped']} dropped, {values['fps']:.1f} frames a second"]
+        lines.append("| stage | median ms |\n|---|---|")
+        lines += [f"| {name} | {ms:.2f} |" for name, ms in values["stages_ms"].items()]
+        unit = "mm" if values["metric"] else "mm (NOT METRIC)"
+        lines.append(f"contact in {values['contact_frames']} frames, deepest {values['deepest_mm']:.3f} {unit}")
+        lines.append("light at the end, R G B: " + " ".join(f"{v:.3f}" for v in values["light_level"]) + " of the background's")
+        if values["light_steps"]:
+            lines.append(f"the light stepped {values['light_steps']} times (frames marked 'stepped' in frames.csv): not learned")
+        return "\n".join(lines)
+
+    def save(self, folder: Path) -> None:
+        """Write summary.json and frames.csv, each whole or not at all."""
+        with write_atomically(folder / "summary.json") as temporary:
+            temporary.write_text(json.dumps(self.summary(), indent=2) + "\n", encoding="utf-8")
+        with write_atomically(folder / "frames.csv") as temporary:
+            rows = (f"{i},{t:.4f},{area:.4f},{deepest:.6f},{state}\n" for i, t, area, deepest, state in self.rows)
+            temporary.write_text(f"{self.HEADER}\n" + "".join(rows), encoding="utf-8")
+
+
+def has_display() -> bool:
+    """Whether a window could be opened: a screen is named, and Matplotlib finds a toolkit for it."""
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        return False
+    import matplotlib
+
+    try:
+        import matplotlib.pyplot as plt
+
+        plt.figure().clear()
+        plt.close("all")
+    except Exception:  # toolkits raise of their own when the screen does not answer
+        return False
+    return str(matplotlib.get_backend()).lower() not in ("agg", "pdf", "ps", "svg", "cairo", "template")
+
+
+class Window:
+    """A live view by Matplotlib, because OpenCV without a screen has none."""
+
+    def __init__(self) -> None:
+        import matplotlib.pyplot as plt
+
+        plt.ion()
+        self._plt = plt
+        self._figure, self._axes = plt.subplots(num="torchvts")
+        self._axes.axis("off")
+        self._image: Any = None
+
+    def show(self, picture: Pixels) -> bool:
+        """Show a picture (H, W, 3) B, G, R; False once the window is closed."""
+        rgb = picture[:, :, ::-1]
+        if self._image is None:
+            self._image = self._axes.imshow(rgb)
+        else:
+            self._image.set_data(rgb)
+        self._plt.pause(0.001)
+        return bool(self._plt.fignum_exists(self._figure.number))

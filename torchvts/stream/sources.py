@@ -1,0 +1,233 @@
+"""Where frames come from: cameras, videos, folders; the newest frame of those that do not wait; rectified to the sensor's view."""
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import kornia
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ..core.checks import check_batch
+from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES
+from ..core.sensor import Sensor
+
+Pixels = np.ndarray[Any, Any]
+
+
+class Reader(Protocol):
+    """Where frames come from. ``live`` sources do not wait; ``fps`` is their rate, or what is assumed of it."""
+
+    name: str
+    live: bool
+    fps: float
+
+    def read(self) -> Pixels | None:
+        """The next frame, (H, W, 3) B, G, R, 8 or 16 bits; None at the end."""
+
+    def close(self) -> None:
+        """Let go of the device or file."""
+
+
+class CaptureReader:
+    """A camera (an index) or a video file, by OpenCV."""
+
+    def __init__(self, source: int | Path) -> None:
+        import cv2
+
+        self.live = isinstance(source, int)
+        self.name = f"camera {source}" if self.live else str(source)
+        self._capture = cv2.VideoCapture(source if isinstance(source, int) else str(source))
+        if not self._capture.isOpened():
+            self._capture.release()
+            if self.live:
+                raise OSError(f"source: expected a camera with index {source}, got none that opens: plugged in? in use elsewhere?")
+            raise ValueError(f"source: {source}: not a video, or cut short: it does not open")
+        if self.live:
+            self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        fps = float(self._capture.get(cv2.CAP_PROP_FPS))
+        self.fps = fps if 0.5 <= fps <= 1000.0 else 30.0
+
+    def read(self) -> Pixels | None:
+        there, pixels = self._capture.read()
+        return pixels if there else None
+
+    def close(self) -> None:
+        self._capture.release()
+
+
+class FolderReader:
+    """A folder of images, by name."""
+
+    def __init__(self, folder: Path, fps: float = 30.0) -> None:
+        self.name, self.live, self.fps = str(folder), False, fps
+        files = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+        if not files:
+            raise ValueError(f"source: {folder}: no images in this folder ({', '.join(IMAGE_SUFFIXES)})")
+        self._files = iter(files)
+
+    def read(self) -> Pixels | None:
+        import cv2
+
+        path = next(self._files, None)
+        if path is None:
+            return None
+        pixels = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_COLOR)
+        if pixels is None:
+            raise ValueError(f"source: {path}: not an image, or cut short")
+        return pixels
+
+    def close(self) -> None:
+        self._files = iter(())
+
+
+def open_source(source: str | int | Path) -> Reader:
+    """A camera by its index (digits), a video file, or a folder of images.
+
+    Raises:
+        FileNotFoundError: nothing there. OSError: no such camera. ValueError: not a video, or no images; all name ``source``.
+    """
+    if isinstance(source, int) or str(source).isdigit():
+        return CaptureReader(int(str(source)))
+    path = Path(source)
+    if path.is_dir():
+        return FolderReader(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"source: {path}: no such file or folder, and no camera's index (digits)")
+    if path.suffix.lower() not in VIDEO_SUFFIXES:
+        raise ValueError(f"source: {path}: expected a video ({', '.join(VIDEO_SUFFIXES)}), a folder of images or a camera's index")
+    return CaptureReader(path)
+
+
+class NewestFrame:
+    """The newest frame of a reader that does not wait: a thread reads, who comes late finds only the last one.
+
+    Args:
+        reader: read by the thread until it ends or :meth:`close`.
+        rate: frames a second at which a recording is played; None for a camera, which has its own.
+        clock, sleep: for tests.
+    """
+
+    def __init__(
+        self,
+        reader: Reader,
+        rate: float | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], Any] | None = None,
+    ) -> None:
+        self.dropped = 0
+        self._reader, self._rate, self._clock = reader, rate, clock
+        self._changed, self._stop = threading.Condition(), threading.Event()
+        self._sleep = sleep or self._stop.wait
+        self._newest: tuple[int, float, Pixels] | None = None
+        self._error: BaseException | None = None
+        self._ended = False
+        self._thread = threading.Thread(target=self._run, name="torchvts-reader", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            start, index = self._clock(), 0
+            while not self._stop.is_set():
+                pixels = self._reader.read()
+                if pixels is None:
+                    break
+                if self._rate is not None:
+                    wait = start + index / self._rate - self._clock()
+                    if wait > 0:
+                        self._sleep(wait)
+                self.put(index, self._clock() - start, pixels)
+                index += 1
+        except Exception as error:  # handed to who takes the frames
+            self._error = error
+        finally:
+            with self._changed:
+                self._ended = True
+                self._changed.notify_all()
+
+    def put(self, index: int, time_s: float, pixels: Pixels) -> None:
+        """Lay down a frame; one that nobody took is dropped."""
+        with self._changed:
+            self.dropped += self._newest is not None
+            self._newest = (index, time_s, pixels)
+            self._changed.notify_all()
+
+    def take(self) -> tuple[int, float, Pixels] | None:
+        """The newest frame that was not yet taken: waits for it; None at the end. Raises what the reader raised."""
+        with self._changed:
+            while self._newest is None and not self._ended:
+                self._changed.wait(0.2)  # so that Ctrl-C comes through
+            newest, self._newest = self._newest, None
+            if newest is None and self._error is not None:
+                raise self._error
+            return newest
+
+    def close(self) -> None:
+        """End the thread, then let go of the source."""
+        self._stop.set()
+        self._thread.join(timeout=5.0)
+        self._reader.close()
+
+
+class Rectify(nn.Module):
+    """:meth:`Sensor.rectify` for frames of one size, its sampling grid made once.
+
+    Args:
+        sensor: the sensor. height, width: pixels of the camera's frames.
+    Raises:
+        ValueError: the frame does not hold the region that the sensor names.
+    Example:
+        >>> corners = ((1, 1), (14, 2), (13, 10), (2, 9))
+        >>> Rectify(Sensor("rig", 8, 10, 0.1, corners_px=corners), 12, 16)(torch.zeros(1, 3, 12, 16)).shape
+        torch.Size([1, 3, 8, 10])
+    """
+
+    grid: Tensor
+
+    def __init__(self, sensor: Sensor, height: int, width: int) -> None:
+        super().__init__()
+        self.sensor = sensor
+        self.frame_size = (height, width)
+        sensor.rectify(torch.zeros(1, 3, height, width))  # raises where it does not fit
+        grid = torch.zeros(0)
+        if sensor.corners_px is not None:
+            right, bottom = sensor.width - 1.0, sensor.height - 1.0
+            target = torch.tensor([[[0.0, 0.0], [right, 0.0], [right, bottom], [0.0, bottom]]], dtype=torch.float64)
+            corners = torch.tensor([sensor.corners_px], dtype=torch.float64)
+            to_frame = kornia.geometry.get_perspective_transform(target, corners)[0]
+            x = torch.arange(sensor.width, dtype=torch.float64).expand(sensor.height, -1)
+            y = torch.arange(sensor.height, dtype=torch.float64)[:, None].expand(-1, sensor.width)
+            place = torch.stack((x, y, torch.ones_like(x)), 2) @ to_frame.T
+            place = place[..., :2] / place[..., 2:]
+            grid = (2.0 * place / torch.tensor([width - 1.0, height - 1.0], dtype=torch.float64) - 1.0)[None].float()
+        self.register_buffer("grid", grid)
+
+    def forward(self, frame: Tensor) -> Tensor:
+        """(B, 3, H, W) to (B, 3, sensor.height, sensor.width)."""
+        check_batch("frame", frame, 3)
+        if frame.shape[2:] != self.frame_size:
+            raise ValueError(
+                f"frame: expected {self.frame_size} like the first, got {tuple(frame.shape[2:])}: the source has changed"
+            )
+        if self.grid.numel() == 0:
+            return self.sensor.rectify(frame)
+        grid = self.grid.to(frame.dtype).expand(frame.shape[0], -1, -1, -1)
+        return nn.functional.grid_sample(frame, grid, mode="bilinear", padding_mode="zeros", align_corners=True)
+
+
+class Replay:
+    """The frames that were already read, then the rest of a reader."""
+
+    def __init__(self, reader: Reader, first: Sequence[Pixels]) -> None:
+        self.name, self.live, self.fps = reader.name, reader.live, reader.fps
+        self._reader, self._first = reader, iter(list(first))
+
+    def read(self) -> Pixels | None:
+        pixels = next(self._first, None)
+        return self._reader.read() if pixels is None else pixels
+
+    def close(self) -> None:
+        self._reader.close()

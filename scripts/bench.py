@@ -7,6 +7,7 @@ Peers are timed in the same run. The real sensor's rows need ../shared/data, or 
 
 import argparse
 import os
+import statistics
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -64,20 +65,25 @@ def chart(rows: Sequence[bench.Row]) -> Figure:
 
 
 def errors_against_time(axes: Any, rows: Sequence[bench.Row], error: str, label: str, title: str) -> None:
-    shown = [row for row in rows if getattr(row, error) is not None]
+    known = [row for row in rows if getattr(row, error) is not None]
+    beyond = 4.0 * statistics.median(getattr(row, error) for row in known)  # such as flat: told, not drawn
+    shown = sorted((row for row in known if getattr(row, error) <= beyond), key=lambda row: row.ms_median)
     best = bench.front(shown, error)
     axes.step([r.ms_median for r in best], [getattr(r, error) for r in best], where="post", color="0.6", lw=1, label="Pareto front")
     for ours, color, marker, name in ((True, "tab:blue", "o", "torchvts"), (False, "tab:red", "s", "peers")):
         part = [row for row in shown if row.ours == ours]
         axes.plot([r.ms_median for r in part], [getattr(r, error) for r in part], marker, color=color, label=name, ls="none")
-    for k, row in enumerate(sorted(shown, key=lambda row: row.ms_median)):
-        above = 5 if k % 2 == 0 else -10
-        axes.annotate(row.method, (row.ms_median, getattr(row, error)), fontsize=6, xytext=(4, above), textcoords="offset points")
+    for k, row in enumerate(shown):
+        place, above = (row.ms_median, getattr(row, error)), (8, -14, 22, -28)[k % 4]
+        arrow = {"arrowstyle": "-", "lw": 0.4, "color": "0.5"}
+        axes.annotate(row.method, place, fontsize=6.5, xytext=(6, above), textcoords="offset points", arrowprops=arrow)
+    told = [f"{row.method}: {getattr(row, error):.0f} at {row.ms_median:.2g} ms" for row in known if row not in shown]
+    axes.text(0.02, 0.02, "\n".join(["not drawn:", *told] if told else []), transform=axes.transAxes, fontsize=6.5, color="0.35")
     axes.set(xscale="log", yscale="log", xlabel="ms a frame", ylabel=label)
     axes.set_title(title, fontsize=9)
-    axes.margins(x=0.25, y=0.1)
+    axes.margins(x=0.3, y=0.2)
     axes.grid(which="both", alpha=0.25)
-    axes.legend(fontsize=7)
+    axes.legend(fontsize=7, loc="upper right")
 
 
 def cost(axes: Any, rows: Sequence[bench.Row]) -> None:

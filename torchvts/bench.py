@@ -159,7 +159,8 @@ def peer_ratios(rows: Sequence[Row]) -> list[str]:
     """How many times faster than gs_sdk's pipeline the fast frame is, and how many times slower precise, by size."""
     lines = []
     for height, width in SIZES:
-        times = {row.method: row.ms_median for row in rows if (row.height, row.width) == (height, width) and row.kind == "scene"}
+        shown = [row for row in rows if (row.height, row.width) == (height, width) and f"press {PRESSES_MM[0]:g} mm" in row.data]
+        times = {row.method: row.ms_median for row in shown if row.kind == "scene"}
         peer = next((ms for method, ms in times.items() if method.startswith("gs_sdk")), None)
         if peer is not None and "fast" in times:
             slower = times["precise"] / times["fast"]

@@ -272,7 +272,7 @@ def _solve_by_fft(right: Tensor, plan: list[Tensor], top: int) -> Tensor:
         lines = torch.cat((lines[:, :, ::2], lines[:, :, 1::2].flip(2)), dim=2)
     else:
         empty = lines.new_zeros([lines.shape[0], lines.shape[1], height, lines.shape[3]])
-        lines = empty.index_copy(2, order_y.narrow(0, top, lines.shape[2]), lines)
+        lines = empty.index_copy_(2, order_y.narrow(0, top, lines.shape[2]), lines)
     spectrum = torch.fft.fft(lines, dim=2)
     pairs = torch.view_as_real(spectrum.index_select(2, rows).unflatten(2, [2, height // 2 + 1]) * there)
     up, down = pairs[:, :, 0], pairs[:, :, 1]

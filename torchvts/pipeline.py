@@ -154,7 +154,7 @@ class DepthPipeline(nn.Module):
         if self.refines:
             active = torch.ones(images.shape[0], dtype=torch.bool, device=images.device)
             if self.foresees:
-                active = self._foreseen_px(seen, touched, depth, (top, left)) > self.worth_px
+                active = self._foreseen_px(seen, touched, gradient, depth, (top, left)) > self.worth_px
             gradient, depth = self._refine(seen, touched, gradient, depth, active, (top, left))
         normal = normal_from_gradient(gradient)
         if bottom - top < height or right - left < width:
@@ -230,17 +230,18 @@ class DepthPipeline(nn.Module):
             state = while_loop(unsettled, go_again, state)  # type: ignore[no-untyped-call]
         return state[1], state[2]
 
-    def _foreseen_px(self, seen: Tensor, touched: Tensor, depth: Tensor, window: tuple[int, int]) -> Tensor:
+    def _foreseen_px(self, seen: Tensor, touched: Tensor, gradient: Tensor, depth: Tensor, window: tuple[int, int]) -> Tensor:
         """Largest change of depth that a second pass would bring, per frame (B,), from every eighth pixel."""
         top, left = window
         first, step = self.stride // 2, self.stride
         image = seen.detach()[:, :, first::step, first::step]
         z = depth.detach()[:, :, top : top + seen.shape[2], left : left + seen.shape[3]][:, :, first::step, first::step]
-        inside = touched[:, :, first::step, first::step]
+        inside = _as_factor(touched[:, :, first::step, first::step], image)
+        before = gradient.detach()[:, :, first::step, first::step]
         corner = (top // step, left // step)
         size = ((depth.shape[2] + step - first - 1) // step, (depth.shape[3] + step - first - 1) // step)
-        change = self.gradient(self.coarse_normals(image, z, corner)) - self.gradient(self.coarse_normals(image, None, corner))
-        found: Tensor = self.coarse_integrate(change * inside, corner, size)
+        change = self.gradient(self.coarse_normals(image, z, corner)) * inside - before
+        found: Tensor = self.coarse_integrate(change, corner, size)
         return found.abs().amax(dim=(1, 2, 3)) / self.mm_per_pixel
 
     def extra_repr(self) -> str:

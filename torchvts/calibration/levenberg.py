@@ -1,6 +1,7 @@
 """A torch optimiser for small least-squares problems: Levenberg-Marquardt with forward-mode derivatives."""
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -69,14 +70,14 @@ class LevenbergMarquardt(Optimizer):
 
 def residual_and_jacobian(closure: Callable[[Tensor], Tensor], parameter: Tensor) -> tuple[Tensor, Tensor]:
     """Residuals (G, N) and their derivatives (G, K, N) at parameters (G, K); group g depends on row g alone."""
-    columns = []
-    residual = torch.empty(0)
-    for k in range(parameter.shape[1]):
-        tangent = torch.zeros_like(parameter)
-        tangent[:, k] = 1.0
-        residual, column = torch.func.jvp(closure, (parameter.detach(),), (tangent,))[:2]
-        columns.append(column)
-    return residual, torch.stack(columns, dim=1)
+    groups, numbers = parameter.shape
+
+    def along(tangent: Tensor) -> Any:
+        return torch.func.jvp(closure, (parameter.detach(),), (tangent,))[:2]
+
+    tangents = torch.eye(numbers, dtype=parameter.dtype, device=parameter.device)[:, None].expand(numbers, groups, numbers)
+    residual, columns = torch.func.vmap(along, out_dims=(None, 1))(tangents)
+    return residual, columns
 
 
 def _half_square(residual: Tensor, weight: Tensor | None) -> Tensor:

@@ -89,7 +89,7 @@ def choose_lights(background: Tensor, sensor: Sensor, other_models: bool = False
 
     Args:
         background: (3, H, W) in [0, 1]. sensor: its gamma is chosen where it is left open.
-        other_models: there are other models than lights: lights that leave much unexplained are not refined.
+        other_models: there are other models than lights: lights that leave much unexplained in 30 rows are looked at no closer.
         progress: show a bar.
     Raises:
         ValueError: as :func:`fit_lights`.
@@ -97,8 +97,11 @@ def choose_lights(background: Tensor, sensor: Sensor, other_models: bool = False
         Stone, JRSS B 36(2), 1974, for held-out choice; Roberts et al., Ecography 40(8), 2017, for holding out blocks.
     """
     linear = dataclasses.replace(sensor, gamma=sensor.exponent, prior=None)
-    sparse, small = _sparse(background, linear)
+    sparse, small = _sparse(background, linear, 30 if other_models else 60)
     tried = _try(sparse, small, [], progress)
+    if other_models and min(candidate.misfit for candidate in tried) <= HOPELESS_MISFIT:  # worth a closer look
+        sparse, small = _sparse(background, linear, 60)
+        tried = _try(sparse, small, [], progress)
     if sensor.gamma is None and tried[0].misfit > 0.005:
         tried += _try(sparse, dataclasses.replace(small, gamma=OTHER_GAMMA), tried, progress)
     for candidate in tried:
@@ -117,9 +120,9 @@ def choose_lights(background: Tensor, sensor: Sensor, other_models: bool = False
     return LightChoice(linear, fit, [row, *rows], reason, complaint)
 
 
-def _sparse(background: Tensor, sensor: Sensor) -> tuple[Tensor, Sensor]:
-    """Every so manieth row and column, about 60 rows, the image centre kept in the middle."""
-    stride = max(1, min(sensor.height, sensor.width) // 60) // 2 * 2 + 1
+def _sparse(background: Tensor, sensor: Sensor, rows: int) -> tuple[Tensor, Sensor]:
+    """Every so manieth row and column, about ``rows`` rows, the image centre kept in the middle."""
+    stride = max(1, min(sensor.height, sensor.width) // rows) // 2 * 2 + 1
     row, column = _evenly(sensor.height, stride), _evenly(sensor.width, stride)
     pitch = stride * sensor.mm_per_pixel
     small = dataclasses.replace(sensor, height=len(row), width=len(column), mm_per_pixel=pitch, corners_px=None, roi_px=None)

@@ -76,7 +76,7 @@ def residual_and_jacobian(closure: Callable[[Tensor], Tensor], parameter: Tensor
         return torch.func.jvp(closure, (parameter.detach(),), (tangent,))[:2]
 
     tangents = torch.eye(numbers, dtype=parameter.dtype, device=parameter.device)[:, None].expand(numbers, groups, numbers)
-    residual, columns = torch.func.vmap(along, out_dims=(None, 1))(tangents)
+    residual, columns = torch.func.vmap(along, out_dims=(None, 1))(tangents)  # type: ignore[arg-type]
     return residual, columns
 
 

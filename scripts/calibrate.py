@@ -32,6 +32,7 @@ def main() -> int:
     arguments = parser.parse_args()
     if (arguments.sensor is None) == (arguments.mm_per_pixel is None):
         parser.error("give either --sensor or --mm-per-pixel")
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
     presses: list[vts.Press] = []
     if arguments.background.is_dir():
         image, presses = vts.read_presses(arguments.background)

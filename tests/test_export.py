@@ -60,6 +60,17 @@ def test_the_scenes_are_hard_enough(low, mini):
     assert pipeline(mini[0], "fast")(mini[1]).contact[:3].flatten(1).any(1).tolist() == [True, False, True]
 
 
+def test_a_program_of_an_image_whose_cells_are_larger_than_pixels(ring):
+    height, width, lights = 166, 222, ring(20.0, 15.0)  # two pixels a cell, the last ones overlap others
+    scene = vts.scenes.sphere_press(10.0, 1.5, (3.0, 1.0), height, width, 0.17)
+    frames = vts.scenes.render(scene, lights, noise_std=0.003, bits=8, seed=1).detach().repeat(3, 1, 1, 1)
+    pipe = pipeline(vts.Calibration.from_lights(lights, vts.Sensor("rig", height, width, 0.17)), "fast")
+    assert pipe.contact.cell == 2
+    with torch.no_grad():
+        found, expected = export.export_program(pipe).module()(frames), pipe(frames)
+    assert torch.equal(found[3], expected.contact) and (found[0] - expected.depth_mm).abs().max() < 1e-5
+
+
 @pytest.mark.parametrize("kind", ["lights precise", "response auto", "own normals"])
 def test_torchscript_without_torchvts(low, mini, tmp_path, kind):
     calibration, frames = mini if kind == "response auto" else low

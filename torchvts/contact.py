@@ -60,7 +60,8 @@ def _reconstruct_in_graph(reached: Tensor, mask: Tensor) -> Tensor:
             grown = _sweep(grown, mask, dim)
         return grown.contiguous(), reached.clone()
 
-    start = (reached.contiguous(), torch.zeros_like(reached))
+    reached = reached.contiguous()
+    start = (reached, torch.zeros_like(reached))
     found: Tensor = while_loop(gained, sweep_all, start)[0]  # type: ignore[no-untyped-call]
     return found
 
@@ -196,7 +197,8 @@ class ContactMask(nn.Module):
 
     def _clean(self, change: Tensor, strong: Tensor, threshold: Tensor) -> tuple[Tensor, Tensor]:
         strong = _erode(_dilate(strong))  # closing: pixels lost to noise at the rim
-        density = _cell_sums(strong.to(torch.uint8), self.cell).to(change.dtype) / float(self.cell * self.cell)
+        counted = strong.to(torch.uint8) if may_read_values() else strong.to(change.dtype)  # ONNX sums no bytes
+        density = _cell_sums(counted, self.cell).to(change.dtype) / float(self.cell * self.cell)
         mean = _cell_sums(change, self.cell) / float(self.cell * self.cell)
         any_strong = density > 0
         step = max(1, max(mean.shape[2], mean.shape[3]) // 40)  # a median of some thousand cells is as good
@@ -223,7 +225,7 @@ class ContactMask(nn.Module):
 
 def _cell_sums(image: Tensor, cell: int) -> Tensor:
     """Sums over cells of a (B, C, H, W) image, in its own dtype; where the size is no multiple, the last cells overlap others."""
-    return image if cell == 1 else _line_sums(_line_sums(image, cell).transpose(2, 3), cell).transpose(2, 3)
+    return image if cell == 1 else _line_sums(_line_sums(image, cell).transpose(2, 3), cell).transpose(2, 3).contiguous()
 
 
 def _line_sums(image: Tensor, cell: int) -> Tensor:

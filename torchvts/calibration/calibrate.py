@@ -21,7 +21,7 @@ from ..normals import NormalFromIntensity
 from ..record import Calibration
 from ..shading import PointLights, flat_image
 from .balls import center_by_slope, guess_circle
-from .contacts import Contact, Press, Touch, depths, middle_px, read_contacts
+from .contacts import ROUGH, Contact, Press, Touch, channel_structure, depths, middle_px, read_contacts
 from .field import PRODUCT_PENALTY, Family, angle_deg
 from .light_candidates import choose_lights
 from .lights import LOOSE_DEG, check_exposure
@@ -31,6 +31,12 @@ from .touches import TOUCH_BLUR_PX, fit_touches, moved_by_touches, scale_by_pres
 
 PINNED_DEG = 2.0
 """Point lights are believed beside a sensor's prior only if the image pins each of them this well."""
+
+USUAL_GAIN = 1.15
+"""Slopes by a prior over those of the balls are within this factor: 0.93 to 1.00 on a GelSight Mini."""
+
+GIVEN_MISFIT = 0.2
+"""RMS of log(background / what the sensor file's lights give) from which they are not this unit's."""
 
 FOREIGN_SPREAD = 0.35
 """A background whose logarithm departs this far (RMS) from that of the prior's unit, brightness aside, is not of its type."""
@@ -103,6 +109,14 @@ def calibrate(
         prior = dataclasses.replace(prior, blur_px=sensor.blur_px)
     if prior is not None:
         _check_type(background, sensor)
+        structure = channel_structure(background)
+        if structure > ROUGH and not sensor.markers:
+            warnings.warn(
+                f"background: structure between the channels of {structure:.2f}, a skin at rest stays below {ROUGH}: contact in "
+                "the calibration image? take it again without",
+                CalibrationWarning,
+                stacklevel=2,
+            )
     touched = None
     if touches:
         try:
@@ -117,7 +131,8 @@ def calibrate(
         if prior is None or (pinned and touched is None):
             if complaint:
                 warnings.warn(complaint, CalibrationWarning, stacklevel=2)
-            reason = f"the image pins the lights to {lights_row['score_deg']:.2f} deg" if pinned else lights_row["note"]
+            pins = pinned and lights_row["score_deg"] > 0.0
+            reason = f"the image pins the lights to {lights_row['score_deg']:.2f} deg" if pins else lights_row["note"]
             if len(light_rows) > 1:
                 reason += f"; {by_lights.report['chosen_because']}"
             report = by_lights.report | {"reason": f"point lights: {reason}", "candidates": candidates}
@@ -135,6 +150,8 @@ def calibrate(
     used = [contact for contact in contacts if not contact.reason]
     lights_row["score_deg"] = lights_error = _lights_error(by_lights, presses, contacts, by_response.sensor.blur_px)
     _warn_left_out(contacts)
+    if prior is not None:
+        _warn_of_diameters(used)
     told: dict[str, Any] = {} if touched is None else {"touches": touched["touches"]}
     told |= {"candidates": candidates, "presses": [_tell(contact, sensor) for contact in contacts]}
     # twelve numbers that do about as well as a hundred are the better model
@@ -179,8 +196,14 @@ def _by_lights(
         lights = _scale_albedo(PointLights([list(row) for row in sensor.light_position_mm], [1.0, 1.0, 1.0]), background, sensor)
         family = "three lights at known positions"
         report |= {"lights": "positions from the sensor file, albedo fitted", "converged": True, "family": family}
-        row: dict[str, Any] = {"model": "point lights", "family": family, "numbers": 3, "pass": 2, "misfit": 0.0}
-        return Calibration.from_lights(lights, sensor, background, report), [row | {"score_deg": 0.0, "note": "given"}], ""
+        given = Calibration.from_lights(lights, sensor, background, report)
+        cell = max(1, min(sensor.height, sensor.width) // 30)
+        log = [torch.nn.functional.avg_pool2d(i[None], cell).clamp_min(1e-3).log() for i in (given.background, given.model_image)]
+        misfit = float((log[0] - log[1]).std(dim=(2, 3)).max())
+        row: dict[str, Any] = {"model": "point lights", "family": family, "numbers": 3, "pass": 2, "misfit": misfit}
+        note = f"given by the sensor file; the background departs from them by {misfit:.1%} (RMS)"
+        complaint = "" if misfit < GIVEN_MISFIT else f"background: lights {note}: not this unit's lights, and depth is not metric"
+        return given, [row | {"score_deg": 0.0, "note": note}], complaint
     choice = choose_lights(background, sensor, other_models, progress)
     fit, row = choice.fit, choice.rows[0]
     report |= {
@@ -343,6 +366,18 @@ def _warn_left_out(contacts: Sequence[Contact]) -> None:
     for contact in contacts:
         if contact.reason:
             warnings.warn(f"{contact.name}: left out: {contact.reason}", CalibrationWarning, stacklevel=4)
+
+
+def _warn_of_diameters(contacts: Sequence[Contact]) -> None:
+    """The prior's slopes on the balls, over the balls' own: one diameter wrong is found by the others, all wrong only so."""
+    gain = statistics.median(contact.figures["gain"] for contact in contacts)
+    if abs(math.log(max(gain, 1e-3))) > math.log(USUAL_GAIN):
+        warnings.warn(
+            f"presses: by the sensor's prior the balls seem {1.0 / gain:.2f} times as wide as was said: wrong diameter or pitch? "
+            "if they are right, this unit differs from the prior's, and more presses tell",
+            CalibrationWarning,
+            stacklevel=3,
+        )
 
 
 def _located(press: Press, contact: Contact, sensor: Sensor) -> Press:

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..compensate import blur, gaussian_weights
 from ..contact import ContactMask
 from ..core.checks import check_numbers, check_positive
 from ..core.geometry import gradient_from_normal, pixel_grid_mm
@@ -17,12 +18,16 @@ from ..core.response import ResponseField
 from ..core.sensor import Sensor
 from ..integration import poisson_rest
 from ..normals import NormalFromResponse
+from ..record import PEDESTAL
 
 INSIDE = 0.85
 """Part of the contact radius within which the skin is taken to lie on the ball; beyond it begins to leave."""
 
 LEAST_INSIDE = 10
 """Sampled pixels inside a contact below which nothing can be said of it."""
+
+ROUGH = 0.13
+"""Structure between the channels of an image at rest from which it is taken for a contact: :func:`channel_structure`."""
 
 MAX_SAMPLES = 3000
 """Pixels of a press that enter the fit: more are as alike as neighbours are."""
@@ -200,6 +205,23 @@ def _unusable(image: Tensor, background: Tensor, mask: Tensor) -> str:
 def middle_px(sensor: Sensor) -> Tensor:
     """(x, y) of the image's middle, where positions in mm start, float64."""
     return torch.tensor([(sensor.width - 1) / 2, (sensor.height - 1) / 2], dtype=torch.float64)
+
+
+def channel_structure(image: Tensor) -> float:
+    """Structure between the channels of an image (3, H, W), within a few millimetres, relative to the light.
+
+    A lamp's fall-off is smooth and a spot is dark in all channels alike; a contact is bright in one channel where it is dark in
+    another. The 99th percentile of the channels' log ratios, band-passed (Gaussians of 1/40 and 1/16 of the height): 0.01 to
+    0.03 on most sensors at rest, 0.10 on a Wedge, whose lamps stand in the picture; 0.06 to 0.36 under clear contact.
+    """
+    stride = max(1, min(image.shape[1], image.shape[2]) // 120)
+    log = (torch.nn.functional.avg_pool2d(image[None].float(), stride) + PEDESTAL).log()
+    log = log - log.mean(1, keepdim=True)
+    height = log.shape[2]
+    band = blur(log, gaussian_weights(height / 40.0)) - blur(log, gaussian_weights(height / 16.0))
+    margin = round(0.14 * height)
+    inner = band[0, :, margin : height - margin, margin : log.shape[3] - margin]
+    return float(inner.square().sum(0).sqrt().flatten().quantile(0.99))
 
 
 def depths(contacts: Sequence[Contact], fast: ResponseField, pitch_mm: float) -> list[Tensor]:

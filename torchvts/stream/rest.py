@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from ..calibration import CalibrationWarning, calibrate
+from ..calibration.contacts import ROUGH, channel_structure
 from ..calibration.lights import LOOSE_DEG
-from ..compensate import blur, gaussian_weights
 from ..contact import ContactMask
 from ..core.checks import check_batch, check_positive
 from ..core.geometry import pixel_grid_mm
@@ -31,9 +31,6 @@ LEAST_FREE = 0.25
 
 MOVED = 0.02
 """Relative change of a cell of 1/20 of the frame that counts as movement among the first frames."""
-
-ROUGH = 0.13
-"""Relative structure between the channels of an image at rest at which it is taken for a contact: see :func:`rest_image`."""
 
 MISFIT = 0.2
 """RMS of log(background / what the lights give) from which given lights are only believed in their directions."""
@@ -89,7 +86,7 @@ def rest_image(images: Tensor) -> tuple[Tensor, Tensor]:
     rank = images.sort(0).values
     quarter = len(images) // 4
     image = rank[quarter : len(images) - quarter].mean(0)
-    rough = _roughness(image)
+    rough = channel_structure(image)
     if rough > ROUGH:
         raise ValueError(
             f"background: the first {len(images)} frames show structure between the channels of {rough:.2f}, a skin at rest stays "
@@ -98,17 +95,6 @@ def rest_image(images: Tensor) -> tuple[Tensor, Tensor]:
     deviation = nn.functional.avg_pool2d(images - image, 3, 1, 1, count_include_pad=False).square().mean(0)
     smooth = nn.functional.avg_pool2d(deviation[None], 15, 1, 7, count_include_pad=False)[0]
     return image, 3.0 * torch.sqrt(smooth)
-
-
-def _roughness(image: Tensor) -> float:
-    stride = max(1, min(image.shape[1], image.shape[2]) // 120)
-    log = (nn.functional.avg_pool2d(image[None].float(), stride) + PEDESTAL).log()
-    log = log - log.mean(1, keepdim=True)
-    height = log.shape[2]
-    band = blur(log, gaussian_weights(height / 40.0)) - blur(log, gaussian_weights(height / 16.0))
-    margin = round(0.14 * height)
-    inner = band[0, :, margin : height - margin, margin : log.shape[3] - margin]
-    return float(inner.square().sum(0).sqrt().flatten().quantile(0.99))
 
 
 class FollowLight:

@@ -2,6 +2,7 @@
 
 import threading
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -72,13 +73,13 @@ class FolderReader:
     def read(self) -> Pixels | None:
         import cv2
 
-        path = next(self._files, None)
-        if path is None:
-            return None
-        pixels = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_COLOR)
-        if pixels is None:
-            raise ValueError(f"source: {path}: not an image, or cut short")
-        return pixels
+        for path in self._files:
+            data = np.fromfile(path, dtype=np.uint8)
+            pixels = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+            if pixels is not None:
+                return pixels
+            warnings.warn(f"source: {path}: left out: not an image, or cut short", stacklevel=2)
+        return None
 
     def close(self) -> None:
         self._files = iter(())

@@ -95,4 +95,5 @@ def test_reproduce_paper_prints_figure_3_beside_the_papers(tmp_path):
     for row in rows:
         press = row[0].split("press ")[1].split()[0]
         assert float(row[3]) <= bound[press, row[1]], row
-    assert len(list(tmp_path.glob("*.png"))) == 4
+    assert len(list(tmp_path.glob("figure_3*.png"))) == 4 and len(list(tmp_path.glob("table_3*.png"))) == 3
+    assert "| paper, three targets | 0.64, 2.35, 2.59 | below 1 | 6 to 8 |" in done.stdout

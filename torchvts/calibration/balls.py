@@ -34,7 +34,11 @@ def guess_circle(contact: Contact, sensor: Sensor) -> None:
         return
     blob = (labels == 1 + int(areas.argmax())).astype(np.uint8)
     outlines, _ = cv2.findContours(blob, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    outline = torch.from_numpy(max(outlines, key=len)[:, 0].astype(np.float64))
+    longest = max(outlines, key=len)
+    hull = cv2.convexHull(longest)
+    # a ball's outline is convex: where the border cuts it, that of the faint middle opens to the outside
+    convex = [abs(cv2.pointPolygonTest(hull, (float(x), float(y)), True)) < 2.0 for x, y in longest[:, 0]]
+    outline = torch.from_numpy(longest[:, 0][convex].astype(np.float64))
     free = (outline > 1).all(1) & (outline[:, 0] < sensor.width - 2) & (outline[:, 1] < sensor.height - 2)
     if int(free.sum()) < 12:
         contact.reason = "the contact has no outline within the image: press nearer to the middle"

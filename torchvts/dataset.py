@@ -249,7 +249,6 @@ def _name(path: str, frame: int) -> str:
 
 
 def _settings(calibration: str | Path, source: Path, mode: str, depth: str, cloud: str, pictures: bool, threads: int) -> Settings:
-
     digest = hashlib.sha256(Path(calibration).read_bytes()).hexdigest()
     return Settings(digest, str(source.resolve()), mode, depth, cloud, pictures, threads, __version__, str(torch.__version__))
 

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from .calibration import CalibrationWarning, Press, calibrate, read_presses
-from .calibration.calibrate import RESPONSE_BLUR_PX, by_presses
+from .calibration.calibrate import RESPONSE_BLUR_PX, as_read, by_presses
 from .compensate import Compensate
 from .contact import ContactMask
 from .core.checks import check_image, check_integer, check_same_size
@@ -434,7 +434,7 @@ class _OfSecond(nn.Module):
 
 def _unit(background: Tensor, sensor: Sensor) -> Calibration:
     """The unit as a response field sees it that says 0 everywhere: it gives every method's contact mask."""
-    blur_px = max(sensor.blur_px, RESPONSE_BLUR_PX)
+    blur_px = as_read(sensor, None).blur_px
     return Calibration.from_response(ResponseModel.blank(sensor.exponent, blur_px), sensor, background)
 
 

@@ -432,8 +432,8 @@ def _trace(pipe: DepthPipeline, by_matrix: bool) -> torch.export.ExportedProgram
         levelled = isinstance(pipe.integrate, PoissonRest)
         pipe.integrate = PoissonRestByMatrix(height, width, pipe.mm_per_pixel, dtype, levelled)
     if by_matrix and isinstance(pipe.coarse_integrate, PoissonRest):
-        rows, columns = len(range(4, height, 8)), len(range(4, width, 8))
-        pipe.coarse_integrate = PoissonRestByMatrix(rows, columns, 8 * pipe.mm_per_pixel, dtype)
+        rows, columns = (len(range(pipe.stride // 2, n, pipe.stride)) for n in (height, width))
+        pipe.coarse_integrate = PoissonRestByMatrix(rows, columns, pipe.stride * pipe.mm_per_pixel, dtype)
     images = torch.full((2, 3, height, width), 0.5, dtype=dtype)
     batch = torch.export.Dim("batch", min=1, max=MAX_BATCH)
     with torch.no_grad(), warnings.catch_warnings():

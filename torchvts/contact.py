@@ -5,6 +5,7 @@ Fine pixels decide the rim; a grid of coarse cells decides what is a hole and wh
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -22,9 +23,6 @@ LIGHT_DRIFT = 0.008
 def reconstruct(seed: Tensor, mask: Tensor) -> Tensor:
     """All of ``mask`` that is connected (over edges, not corners) to a seed inside it.
 
-    Sweeps along rows and columns both ways until nothing is gained: each sweep crosses the whole image, so blobs take a few
-    rounds where a 3 x 3 dilation takes as many as the longest path has pixels.
-
     Args:
         seed, mask: bool (B, 1, H, W).
     Returns:
@@ -35,6 +33,33 @@ def reconstruct(seed: Tensor, mask: Tensor) -> Tensor:
         >>> row = torch.tensor([[True, True, False, True]])[None, None]
         >>> reconstruct(torch.tensor([[True, False, False, False]])[None, None], row).flatten().tolist()
         [True, True, False, False]
+    """
+    if not torch.jit.is_scripting():  # noqa: SIM102
+        if may_read_values() and mask.device.type == "cpu":
+            return _reconstruct_by_labels(seed, mask)
+    return _reconstruct_by_sweeps(seed, mask)
+
+
+@torch.jit.unused
+def _reconstruct_by_labels(seed: Tensor, mask: Tensor) -> Tensor:
+    """:func:`reconstruct` by OpenCV's connected components; on 80 x 107 cells 0.03 ms where sweeps take 0.28."""
+    import cv2
+
+    reached = np.empty(mask.shape, np.bool_)
+    for found, seeded, inside in zip(reached, seed.numpy(), mask.numpy(), strict=True):
+        count, label = cv2.connectedComponents(inside[0].view(np.uint8), connectivity=4)
+        kept = np.zeros(count, np.bool_)
+        kept[label[seeded[0]]] = True
+        kept[0] = False  # what is not in the mask
+        kept.take(label, out=found[0], mode="clip")
+    return torch.from_numpy(reached)
+
+
+def _reconstruct_by_sweeps(seed: Tensor, mask: Tensor) -> Tensor:
+    """:func:`reconstruct` by tensor operations alone, for what is scripted, exported or on another device.
+
+    Sweeps along rows and columns both ways until nothing is gained: each sweep crosses the whole image, so blobs take a few
+    rounds where a 3 x 3 dilation takes as many as the longest path has pixels.
     """
     reached = seed & mask
     if not torch.jit.is_scripting():  # noqa: SIM102

@@ -158,6 +158,41 @@ def test_surfaces_that_slide_on_themselves_are_ambiguous(name, shape, names):
     assert found.covariance.diagonal().max() > 1.0 and torch.linalg.eigvalsh(found.covariance).min() > 0
 
 
+def skirted_ball(x0, y0, press, seed):
+    """A ball as a sensor shows it: the skin leaves it at a slope of 0.6 and sinks slowly, and slopes are off by 0.03."""
+
+    def depth(x, y):
+        r = torch.sqrt((x - x0) ** 2 + (y - y0) ** 2 + 1e-12)
+        edge = 3.2 * 0.6 / math.sqrt(1.36)
+        cap = torch.sqrt(3.2**2 - r.clamp_max(edge) ** 2) - 3.2 + press
+        rim = math.sqrt(3.2**2 - edge**2) - 3.2 + press
+        return torch.where(r < edge, cap, rim * torch.exp(-0.6 / rim * (r - edge)) - 0.02)
+
+    scene = vts.scenes.surface(depth, *SIZE, PITCH)
+    coarse = 0.03 * torch.randn(1, 2, 8, 10, generator=torch.Generator().manual_seed(seed))
+    error = torch.nn.functional.interpolate(coarse, SIZE, mode="bicubic", align_corners=True)
+    gradient = (scene.gradient + error) * scene.contact
+    return vts.DepthOutput(vts.integration.poisson_rest(gradient, PITCH), gradient, scene.normal, scene.contact)
+
+
+def test_a_ball_in_its_skirt_is_still_a_ball():
+    """The skin around a ball moves with the contact: only its deep part tells that it rolls."""
+    target = skirted_ball(0.0, 0.0, 0.9, 0)
+    for seed, (x, y, press) in enumerate([(1.5, 0.5, 0.9), (-2.0, 1.0, 0.75), (0.5, -1.0, 1.0), (-1.0, -1.5, 0.85)], 1):
+        found = vts.register_depth(skirted_ball(x, y, press, seed), target, PITCH)
+        assert found.converged and found.ambiguous == ["rotation about x", "rotation about y", "rotation about z"], found.message
+
+
+def test_real_presses_of_a_ball_are_ambiguous(data):
+    background, presses = vts.read_presses(data / "gelsight_mini_a")[:2]
+    sensor = vts.Sensor.load("gelsight_mini")
+    pipe = vts.DepthPipeline.from_calibration(vts.calibrate(background, sensor), "precise")
+    frames = [pipe(presses[k].image[None]) for k in (0, 5, 10, 15, 20)]
+    said = [vts.register_depth(one, frames[0], sensor.mm_per_pixel) for one in frames[1:]]
+    assert sum(found.converged for found in said) >= 3
+    assert all("rotation about" in " ".join(found.ambiguous) for found in said if found.converged)
+
+
 def test_a_surface_of_revolution_hides_its_turn_only():
     def mound(u, v):
         r = torch.sqrt(u**2 + v**2 + 1e-12)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import unfold
+from torch.nn.functional import max_pool2d, unfold
 
 from ..core.checks import check_positive
 from .ambiguity import free_directions, name_directions
@@ -28,6 +28,11 @@ CUT = 4.0
 
 LEAST_INFORMATION = 0.05
 """Squared change of slope in units of its noise per squared mm of motion, below which a motion is called unknown: 0.013 a mm."""
+
+DEEP, ROLL = 0.6, 0.5
+"""Share of the largest depth above which the skin lies on the object for sure, not on its skirt; and share of the contact's
+radius by which a motion is tried. A ball's deep part on a GelSight Mini, rolled by 0.35 of it, fits worse by 0.00 to 0.03 of slope
+where frames disagree by 0.03 to 0.06; moved in the three other ways by 0.14 and more."""
 
 ALIKE_PIXELS = 25.0
 """Errors of slope are alike over so many pixels; with it the covariance foretells the errors measured on rendered scenes."""
@@ -288,28 +293,74 @@ def _message(fit: Fit, names: list[str], others: int) -> str:
 
 
 def _unknown(source: Relief, target: Relief, pose: Tensor, noise: float) -> tuple[Tensor, list[str]]:
-    """Motions (6, k) about the target's origin that the surface does not show, and names; by the coarse, least noisy grid."""
+    """Motions (6, k) about the target's origin that the contact does not show, and names; by the coarse, least noisy grid.
+
+    Two questions. Do the whole contact's slopes and heights answer to a motion at all? And, of a contact that is a single hill,
+    does its deep part roll on itself: do its normals turn by more than what frames disagree by, and yet fit the other frame no
+    worse? That part lies on the object for sure; the skin around a ball moves with the contact, not with the ball, and would make
+    a rolling ball look fixed.
+    """
     points, slopes = target.points, target.slopes
     back = invert(pose)[0].float()
     _, inside, _, _ = source.sample((points @ back[:3, :3].T + back[:3, 3])[:, :2])
-    if int(inside.sum()) < 6:
-        return torch.zeros(6, 0, dtype=torch.float64), []
-    common = target._replace(points=points[inside], slopes=slopes[inside])
-    target = target._replace(field=_own_bend(target))
-    one = torch.eye(4, dtype=torch.float64)[None]
-    center = common.points.double().mean(0)
-    lin = linearise(common, target, one, center[None, None])
-    units = _units(common)
-    slope_by = (lin.slope_by_twist[0].double() * units / SLOPE_NOISE).flatten(0, 1)
-    height_by = lin.height_by_twist[0].double() * units / (5.0 * DEPTH_NOISE_MM)
-    information = (slope_by.T @ slope_by + height_by.T @ height_by) / len(common.points)
+    bent = target._replace(field=_own_bend(target))
     bend = 1.5 / 6.0 * (noise / target.pitch / SLOPE_NOISE) ** 2  # of planes through 3 x 3 noisy slopes
     bias = torch.diag(bend * torch.tensor([0.1, 0.1, 1.0, 1.0, 1.0, 0.1], dtype=torch.float64))
-    free, shifts = free_directions(information, bias, LEAST_INFORMATION)
-    names = name_directions(free, shifts)
-    moved = units[:, None] * free  # rad and mm; turns about the contact's centre become turns about the origin and shifts
-    moved[3:] = moved[3:] - torch.linalg.cross(moved[:3], center[:, None].expand_as(moved[:3]), dim=0)
-    return moved, names
+    found = torch.zeros(6, 0, dtype=torch.float64), torch.zeros(6, 0, dtype=torch.float64)
+    names: list[str] = []
+    for part in (inside, inside & (points[:, 2] > DEEP * points[:, 2].max())):
+        if int(part.sum()) < 6 or (part is not inside and not _one_hill(target)):
+            continue
+        common = target._replace(points=points[part], slopes=slopes[part])
+        center, units = common.points.double().mean(0), _units(common)
+        information = _information(common, bent, center, units)
+        free, shifts = free_directions(information, bias, LEAST_INFORMATION)
+        if part is not inside:
+            motions = torch.linalg.eigh(information).eigenvectors
+            rolls = _rolls(source, target, pose, common, center, units, motions)
+            free, shifts = motions[:, rolls], shifts[:, :0]
+        if free.shape[1] > found[0].shape[1]:
+            moved = units[:, None] * free  # rad and mm; turns about the contact's center become turns about the origin and shifts
+            moved[3:] = moved[3:] - torch.linalg.cross(moved[:3], center[:, None].expand_as(moved[:3]), dim=0)
+            found, names = (moved, free), name_directions(free, shifts)
+    return found[0], names
+
+
+def _one_hill(relief: Relief) -> bool:
+    """Whether every way from the contact's deep part leads down, or up by no more than a tenth: no other part stands by itself."""
+    depth = torch.where(relief.inside, relief.field[0], 0.0)[None, None]
+    highest = float(depth.amax())
+    reached, before = torch.where(depth > DEEP * highest, depth, 0.0), torch.zeros_like(depth)
+    while not torch.equal(reached, before):
+        before, reached = reached, torch.minimum(max_pool2d(reached, 3, 1, 1), depth)
+    return float((depth - reached).amax()) < 0.1 * highest
+
+
+def _information(common: Relief, target: Relief, center: Tensor, units: Tensor) -> Tensor:
+    """(6, 6), mean over pixels of J^T J in units of the noise, for motions of ``common`` on the target about ``center``."""
+    lin = linearise(common, target, torch.eye(4, dtype=torch.float64)[None], center[None, None])
+    slope_by = (lin.slope_by_twist[0].double() * units / SLOPE_NOISE).flatten(0, 1)
+    height_by = lin.height_by_twist[0].double() * units / (5.0 * DEPTH_NOISE_MM)
+    information: Tensor = (slope_by.T @ slope_by + height_by.T @ height_by) / len(common.points)
+    return information
+
+
+def _rolls(source: Relief, target: Relief, pose: Tensor, common: Relief, center: Tensor, units: Tensor, motions: Tensor) -> Tensor:
+    """Which motions (6, K), columns, turn the deep part's normals and leave its fit as it is; bool (K,)."""
+    step = ROLL / float(units[0])  # mm: a share of the contact's radius
+    twists = (motions * units[:, None]).T
+    poses = torch.cat([pose] + [motion(share * step * twists, center) @ pose for share in (1.0, -1.0, 0.5, -0.5)])
+    lin = linearise(source, target, poses, torch.zeros(1, 1, 3, dtype=torch.float64))
+    deep = lin.counts.all(0) & (source.points[:, 2] > DEEP * source.points[:, 2].max())
+    if int(deep.sum()) < 6:
+        return torch.zeros(motions.shape[1], dtype=torch.bool)
+    misfit = lin.slope.square().sum(-1) + (lin.height * (SLOPE_NOISE / (5.0 * DEPTH_NOISE_MM))).square()
+    misfit = misfit[:, deep].clamp_max((CUT * SLOPE_NOISE) ** 2).mean(1)
+    rise = (misfit[1:] - misfit[:1]).reshape(4, -1).amax(0)
+    p, q = common.slopes.double().T
+    turn = torch.stack((torch.stack((p * q, -(1 + p * p), -q), -1), torch.stack((1 + q * q, -p * q, p), -1)), 1)  # (N, 2, 3)
+    turned = (turn @ twists[:, :3].T).square().sum(1).mean(0) * step**2
+    return (rise < 2.0 * misfit[0].clamp_min(SLOPE_NOISE**2)) & (turned > torch.maximum(2.0 * misfit[0], 3.0 * rise))
 
 
 def _own_bend(relief: Relief) -> Tensor:

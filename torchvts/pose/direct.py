@@ -351,16 +351,19 @@ def _rolls(source: Relief, target: Relief, pose: Tensor, common: Relief, center:
     twists = (motions * units[:, None]).T
     poses = torch.cat([pose] + [motion(share * step * twists, center) @ pose for share in (1.0, -1.0, 0.5, -0.5)])
     lin = linearise(source, target, poses, torch.zeros(1, 1, 3, dtype=torch.float64))
-    deep = lin.counts.all(0) & (source.points[:, 2] > DEEP * source.points[:, 2].max())
-    if int(deep.sum()) < 6:
-        return torch.zeros(motions.shape[1], dtype=torch.bool)
+    deep = source.points[:, 2] > DEEP * source.points[:, 2].max()
     misfit = lin.slope.square().sum(-1) + (lin.height * (SLOPE_NOISE / (5.0 * DEPTH_NOISE_MM))).square()
-    misfit = misfit[:, deep].clamp_max((CUT * SLOPE_NOISE) ** 2).mean(1)
-    rise = (misfit[1:] - misfit[:1]).reshape(4, -1).amax(0)
+    misfit = misfit[:, deep].clamp_max((CUT * SLOPE_NOISE) ** 2)
+    tried = misfit[1:].reshape(4, len(twists), -1)  # (4, K, N)
+    seen = (lin.counts[1:, deep].reshape(tried.shape) & lin.counts[0, deep]).double()
+    least = seen.sum(-1)
+    rise = (((tried - misfit[0]) * seen).sum(-1) / least.clamp_min(1.0)).amax(0)
     p, q = common.slopes.double().T
     turn = torch.stack((torch.stack((p * q, -(1 + p * p), -q), -1), torch.stack((1 + q * q, -p * q, p), -1)), 1)  # (N, 2, 3)
     turned = (turn @ twists[:, :3].T).square().sum(1).mean(0) * step**2
-    return (rise < 2.0 * misfit[0].clamp_min(SLOPE_NOISE**2)) & (turned > torch.maximum(2.0 * misfit[0], 3.0 * rise))
+    noise = 2.0 * max(float(misfit[0][lin.counts[0, deep]].mean()), SLOPE_NOISE**2)
+    whole = least.amin(0) > 0.5 * int(deep.sum())
+    return whole & (rise < noise) & (turned > (3.0 * rise).clamp_min(noise))
 
 
 def _own_bend(relief: Relief) -> Tensor:

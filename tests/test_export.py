@@ -60,15 +60,29 @@ def test_the_scenes_are_hard_enough(low, mini):
     assert pipeline(mini[0], "fast")(mini[1]).contact[:3].flatten(1).any(1).tolist() == [True, False, True]
 
 
-def test_a_program_of_an_image_whose_cells_are_larger_than_pixels(ring):
-    height, width, lights = 166, 222, ring(20.0, 15.0)  # two pixels a cell, the last ones overlap others
+@pytest.fixture(scope="module")
+def cells_of_two(ring):
+    """A fast pipeline of an image with two pixels a mask cell, the last ones overlapping others, and three frames."""
+    height, width, lights = 166, 222, ring(20.0, 15.0)
     scene = vts.scenes.sphere_press(10.0, 1.5, (3.0, 1.0), height, width, 0.17)
     frames = vts.scenes.render(scene, lights, noise_std=0.003, bits=8, seed=1).detach().repeat(3, 1, 1, 1)
     pipe = pipeline(vts.Calibration.from_lights(lights, vts.Sensor("rig", height, width, 0.17)), "fast")
     assert pipe.contact.cell == 2
+    return pipe, frames
+
+
+def test_a_program_of_an_image_whose_cells_are_larger_than_pixels(cells_of_two):
+    pipe, frames = cells_of_two
     with torch.no_grad():
         found, expected = export.export_program(pipe).module()(frames), pipe(frames)
     assert torch.equal(found[3], expected.contact) and (found[0] - expected.depth_mm).abs().max() < 1e-5
+
+
+def test_onnx_of_an_image_whose_cells_are_larger_than_pixels(cells_of_two, tmp_path):
+    if export.missing("onnx"):
+        pytest.skip(export.missing("onnx"))
+    pipe, frames = cells_of_two
+    assert export.compare(export.export_onnx(pipe, tmp_path / "pipe.onnx"), pipe, frames, "onnx") <= 1e-3
 
 
 @pytest.mark.parametrize("kind", ["lights precise", "response auto", "own normals"])

@@ -15,7 +15,7 @@ from tqdm import tqdm
 import torchvts as vts
 from torchvts import objects, viz
 from torchvts.core.files import write_atomically
-from torchvts.pose_bench import PoseCase, machine, pose_table, run_poses
+from torchvts.pose_bench import PoseCase, ball_pairs, machine, pose_table, run_poses
 
 
 def main() -> int:
@@ -25,6 +25,8 @@ def main() -> int:
     parser.add_argument("--noise", type=float, default=0.005, help="standard deviation of image noise; 8 bits on top")
     parser.add_argument("--only", nargs="+", choices=[*objects.TARGETS, *objects.FREE_TARGETS], help="these objects")
     parser.add_argument("--clouds", type=int, metavar="POINTS", help="register clouds of so many points instead (0: all pixels)")
+    parser.add_argument("--presses", type=Path, metavar="FOLDER", help="also pairs of real presses of a ball: a calibration folder")
+    parser.add_argument("--sensor", default="gelsight_mini", help="of that folder; needs a prior")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
@@ -47,6 +49,11 @@ def main() -> int:
         viz.save_figure(figure, arguments.out / f"{name.replace(' ', '_')}.png")
     how = f"{arguments.poses} poses each, {size[1]} x {size[0]}, noise {arguments.noise:g} and 8 bits; {machine()}"
     text = f"{how}\n\n{pose_table(rows)}\n"
+    if arguments.presses is not None:
+        background, presses = vts.read_presses(arguments.presses)
+        with tqdm(total=100, unit="pair") as bar:
+            counts = ball_pairs(background, presses, vts.Sensor.load(arguments.sensor), 100, bar.update)
+        text += "\nreal presses of a ball: " + ", ".join(f"{name} {number}" for name, number in counts.items()) + "\n"
     for name, content in (("table.md", text), ("poses.json", json.dumps([asdict(row) for row in rows], indent=1))):
         with write_atomically(arguments.out / name) as temporary:
             temporary.write_text(content)

@@ -1,15 +1,17 @@
 """Pose through the whole chain: objects of known pose rendered, calibrated depth from the images, registration, errors."""
 
+import itertools
 import math
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from . import objects
+from .calibration import Press, calibrate
 from .core.sensor import Sensor
 from .pipeline import DepthOutput, DepthPipeline
 from .pose import Registration, register_depth
@@ -161,6 +163,37 @@ def run_poses(
             )
         )
     return rows, shown
+
+
+def ball_pairs(
+    background: Tensor, presses: Sequence[Press], sensor: Sensor, most: int = 100, progress: Callable[[], object] = lambda: None
+) -> dict[str, int]:
+    """What registration says of real presses of one ball against each other, of which it can know no rotation.
+
+    Args:
+        background: (3, H, W). presses: of balls. sensor: with a prior, by which the unit is calibrated, no press being used.
+        most: pairs, evenly chosen of all with the same ball.
+    Returns:
+        Numbers of pairs: "pairs", "converged", and of these "named" (three rotations), "named in part", "not named".
+    """
+    pipe = DepthPipeline.from_calibration(calibrate(background, sensor), "precise")
+    with torch.inference_mode():
+        frames = [pipe(press.image[None]) for press in presses]
+    pairs = [
+        (i, j)
+        for i, j in itertools.combinations(range(len(presses)), 2)
+        if presses[i].ball_diameter_mm == presses[j].ball_diameter_mm
+    ]
+    counts = {"pairs": 0, "converged": 0, "named": 0, "named in part": 0, "not named": 0}
+    for i, j in pairs[:: max(1, math.ceil(len(pairs) / most))]:
+        counts["pairs"] += 1
+        found = register_depth(frames[i], frames[j], sensor.mm_per_pixel)
+        if found.converged:
+            counts["converged"] += 1
+            turns = sum(name.startswith("rotation") for name in found.ambiguous)
+            counts["named" if turns == 3 else "named in part" if turns else "not named"] += 1
+        progress()
+    return counts
 
 
 def pose_table(rows: list[PoseRow]) -> str:

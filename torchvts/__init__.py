@@ -9,7 +9,17 @@ from .core import gs_sdk
 from .core.files import read_image, write_image
 from .core.geometry import GradientFromNormal, depth_to_points, gradient_from_normal, normal_from_gradient
 from .core.sensor import Sensor, shipped_sensors
-from .integration import PoissonDCT, PoissonDST, PoissonRest, divergence, poisson_dct, poisson_dst, poisson_rest
+from .integration import (
+    CliffIntegration,
+    PoissonDCT,
+    PoissonDST,
+    PoissonRest,
+    divergence,
+    integrate_cliffs,
+    poisson_dct,
+    poisson_dst,
+    poisson_rest,
+)
 from .markers import FillMarkers, fill_markers, find_markers
 from .normals import NormalFromIntensity, NormalFromLookup, NormalFromMLP, NormalFromResponse, fit_mlp
 from .pipeline import DepthOutput, DepthPipeline
@@ -20,6 +30,7 @@ from .shading import PointLights, near_field_shading
 __all__ = [
     "Calibration",
     "CalibrationWarning",
+    "CliffIntegration",
     "Compensate",
     "ContactMask",
     "DepthOutput",
@@ -50,6 +61,7 @@ __all__ = [
     "fit_prior",
     "gradient_from_normal",
     "gs_sdk",
+    "integrate_cliffs",
     "metrics",
     "near_field_shading",
     "normal_from_gradient",

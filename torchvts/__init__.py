@@ -10,12 +10,15 @@ from .core.files import read_image, write_image
 from .core.geometry import GradientFromNormal, depth_to_points, gradient_from_normal, normal_from_gradient
 from .core.sensor import Sensor, shipped_sensors
 from .integration import (
+    AdaptiveIntegration,
     CliffIntegration,
+    PerspectiveIntegration,
     PoissonDCT,
     PoissonDST,
     PoissonRest,
     divergence,
     integrate_cliffs,
+    integrate_perspective,
     poisson_dct,
     poisson_dst,
     poisson_rest,
@@ -28,6 +31,7 @@ from .record import Calibration
 from .shading import PointLights, near_field_shading
 
 __all__ = [
+    "AdaptiveIntegration",
     "Calibration",
     "CalibrationWarning",
     "CliffIntegration",
@@ -42,6 +46,7 @@ __all__ = [
     "NormalFromLookup",
     "NormalFromMLP",
     "NormalFromResponse",
+    "PerspectiveIntegration",
     "PointLights",
     "PoissonDCT",
     "PoissonDST",
@@ -62,6 +67,7 @@ __all__ = [
     "gradient_from_normal",
     "gs_sdk",
     "integrate_cliffs",
+    "integrate_perspective",
     "metrics",
     "near_field_shading",
     "normal_from_gradient",

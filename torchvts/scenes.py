@@ -1,6 +1,7 @@
 """Exact presses: surfaces given by a formula, with their depth, gradient, normal and contact, and a camera to see them."""
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -9,20 +10,24 @@ from torch import Tensor
 
 from .core.checks import check_integer, check_positive
 from .core.geometry import normal_from_gradient, pixel_grid_mm
-from .shading import PointLights, near_field_shading
+from .shading import PointLights, near_field_shading, seen_at
 
 Segment = tuple[tuple[float, float], tuple[float, float]]
 """Start and end, (x, y) in mm."""
 
 
 class Scene(NamedTuple):
-    """One press, exact: depth_mm (1, 1, H, W), gradient (1, 2, H, W), normal (1, 3, H, W), contact (1, 1, H, W) bool."""
+    """One press, exact: depth_mm (1, 1, H, W), gradient (1, 2, H, W), normal (1, 3, H, W), contact (1, 1, H, W) bool.
+
+    With a finite ``camera_height_mm`` all maps are what the pixels of a pinhole camera at that height see.
+    """
 
     depth_mm: Tensor
     gradient: Tensor
     normal: Tensor
     contact: Tensor
     mm_per_pixel: float
+    camera_height_mm: float = math.inf
 
 
 def surface(
@@ -31,6 +36,7 @@ def surface(
     width: int = 640,
     mm_per_pixel: float = 0.0625,
     dtype: torch.dtype = torch.float32,
+    camera_height_mm: float = math.inf,
 ) -> Scene:
     """A press of any shape: depth as a function of x (right) and y (down) in mm; negative values mean no contact.
 
@@ -38,7 +44,11 @@ def surface(
 
     Args:
         depth_mm: maps x and y, both (H, W) float64, to depth (H, W), mm.
-        height, width: pixels. mm_per_pixel: pitch, mm. dtype: of the result.
+        height, width: pixels. mm_per_pixel: pitch, mm, on the skin at rest. dtype: of the result.
+        camera_height_mm: of a pinhole camera above the image centre; infinite for an orthographic camera. What each of its pixels
+            sees is found by fixed-point iteration, which converges as long as the surface does not hide parts of itself.
+    Raises:
+        ValueError: a camera not above the skin, or a surface that hides parts of itself from it.
     Example:
         >>> scene = surface(lambda x, y: 1.0 - x**2 - y**2, 9, 9, 0.25)
         >>> float(scene.depth_mm.max()), bool(scene.contact[0, 0, 0, 0])
@@ -47,15 +57,35 @@ def surface(
     check_integer("height", height, 3), check_integer("width", width, 3)
     check_positive("mm_per_pixel", mm_per_pixel)
     x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
-    x = x.expand(height, width).clone().requires_grad_()
-    y = y.expand(height, width).clone().requires_grad_()
+    x, y = x.expand(height, width), y.expand(height, width)
+    if not math.isinf(camera_height_mm):
+        x, y = _seen_by_pinhole(depth_mm, x, y, check_positive("camera_height_mm", camera_height_mm))
+    x, y = x.clone().requires_grad_(), y.clone().requires_grad_()
     with torch.enable_grad():
         depth = depth_mm(x, y)
         p, q = torch.autograd.grad(depth.sum(), (x, y))
     contact = (depth > 0).detach()[None, None]
     gradient = torch.where(contact, torch.stack((p, q))[None], 0.0).to(dtype)
     depth = depth.detach().clamp_min(0.0)[None, None].to(dtype)
-    return Scene(depth, gradient, normal_from_gradient(gradient), contact, mm_per_pixel)
+    return Scene(depth, gradient, normal_from_gradient(gradient), contact, mm_per_pixel, camera_height_mm)
+
+
+def _seen_by_pinhole(
+    depth_mm: Callable[[Tensor, Tensor], Tensor], u: Tensor, v: Tensor, camera_height_mm: float, steps: int = 100
+) -> tuple[Tensor, Tensor]:
+    """x and y of the surface points behind pixels that see (u, v) of the skin at rest."""
+    depth = torch.zeros_like(u)
+    for _ in range(steps):
+        before = depth
+        x, y = seen_at(u, before, camera_height_mm), seen_at(v, before, camera_height_mm)
+        depth = depth_mm(x, y).detach().clamp_min(0.0)
+        if float((depth - before).abs().max()) < 1e-12:
+            return x, y
+    left = float((depth - before).abs().max())
+    raise ValueError(
+        f"camera_height_mm: the points seen from {camera_height_mm:g} mm were not found, {left:.2g} mm missing after {steps} "
+        "steps: the surface hides parts of itself, or has cliffs; raise the camera"
+    )
 
 
 def sphere_press(
@@ -66,6 +96,7 @@ def sphere_press(
     width: int = 640,
     mm_per_pixel: float = 0.0625,
     dtype: torch.dtype = torch.float32,
+    camera_height_mm: float = math.inf,
 ) -> Scene:
     """A ball pressed in by ``press_mm``: the paper's figure 3 at radius 10 mm, press 1 and 2 mm.
 
@@ -79,7 +110,7 @@ def sphere_press(
         squared = (x - center_mm[0]) ** 2 + (y - center_mm[1]) ** 2
         return _cap(squared, radius_mm, press_mm)
 
-    return surface(depth, height, width, mm_per_pixel, dtype)
+    return surface(depth, height, width, mm_per_pixel, dtype, camera_height_mm)
 
 
 def cylinder_press(
@@ -226,7 +257,7 @@ def render(
     Returns:
         (1, 3, H, W) in [0, 1].
     """
-    image = near_field_shading(scene.depth_mm, scene.normal, lights, scene.mm_per_pixel)
+    image = near_field_shading(scene.depth_mm, scene.normal, lights, scene.mm_per_pixel, scene.camera_height_mm)
     if vignetting:
         x, y = pixel_grid_mm(image.shape[2], image.shape[3], 1.0, image.dtype)
         image = image * (1.0 - vignetting * (x**2 + y**2) / float(x.max() ** 2 + y.max() ** 2))
@@ -254,6 +285,7 @@ def at_rest(scene: Scene) -> Scene:
         flat,
         torch.zeros_like(scene.contact),
         scene.mm_per_pixel,
+        scene.camera_height_mm,
     )
 
 

@@ -15,8 +15,24 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
+from .checks import check_field, check_path
+
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mov", ".mkv", ".webm")
+
+
+def check_target(path: str | Path) -> Path:
+    """The path of a file that may be written, or raise: said before the work that leads to it.
+
+    Raises:
+        TypeError: no path. FileNotFoundError: the folder is missing. IsADirectoryError: it is one itself.
+    """
+    path = check_path("path", path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path}: folder {path.parent} does not exist: make it first")
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: expected the name of a file, got a folder")
+    return path
 
 
 @contextmanager
@@ -28,11 +44,7 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
     Raises:
         FileNotFoundError: the folder is missing. PermissionError: it cannot be written.
     """
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path}: folder {path.parent} does not exist: make it first")
-    if path.is_dir():
-        raise IsADirectoryError(f"{path}: is a folder, expected the name of a file")
+    path = check_target(path)
     try:
         handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
     except OSError as error:
@@ -64,7 +76,7 @@ def read_image(path: str | Path) -> Tensor:
     """
     import cv2
 
-    path = Path(path)
+    path = check_path("path", path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such image")
     pixels = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_UNCHANGED) if path.stat().st_size else None
@@ -89,10 +101,9 @@ def write_image(path: str | Path, image: Tensor) -> None:
     Raises:
         ValueError: another shape, or a suffix that is no image's.
     """
-    if image.dim() != 3 or image.shape[0] != 3:
-        raise ValueError(f"image: expected (3, H, W), got {tuple(image.shape)}")
+    check_field("image", image)
     levels = torch.round(image.detach().clamp(0, 1) * 255).to(torch.uint8).cpu()
-    _write_pixels(Path(path), np.ascontiguousarray(levels.flip(0).permute(1, 2, 0).numpy()))
+    _write_pixels(check_path("path", path), np.ascontiguousarray(levels.flip(0).permute(1, 2, 0).numpy()))
 
 
 def image_to_bytes(image: Tensor) -> Tensor:
@@ -162,7 +173,7 @@ def _write_pixels(path: Path, pixels: np.ndarray[Any, Any]) -> None:
     import cv2
 
     if path.suffix.lower() not in IMAGE_SUFFIXES:
-        raise ValueError(f"{path}: expected a name ending in {', '.join(IMAGE_SUFFIXES)}")
+        raise ValueError(f"{path}: expected a name ending in {', '.join(IMAGE_SUFFIXES)}, got {path.suffix!r}")
     with write_atomically(path) as temporary:
         if not cv2.imwrite(str(temporary), pixels):
             raise OSError(f"{path}: OpenCV could not write it")
@@ -230,7 +241,7 @@ def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     Raises:
         FileNotFoundError: no such file. ValueError: not a safetensors file, cut short, or not written by torchvts.
     """
-    path = Path(path)
+    path = check_path("path", path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:

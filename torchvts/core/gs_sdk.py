@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .checks import check_batch, check_positive
+from .checks import check_batch, check_path, check_positive, check_tensor
 from .files import read_image, rgb_from_bgr
 from .sensor import Sensor, _read_yaml
 
@@ -90,7 +90,7 @@ def read_calibration_folder(folder: str | Path) -> GsSdkFolder:
         ...
         FileNotFoundError: no/such/folder: no such folder: expected one with catalog.csv and background.png
     """
-    folder = Path(folder)
+    folder = check_path("folder", folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder: expected one with catalog.csv and background.png")
     catalog, background_path = folder / "catalog.csv", folder / "background.png"
@@ -134,7 +134,7 @@ def read_labels(folder: str | Path) -> dict[str, tuple[float, float, float | Non
     Raises:
         FileNotFoundError: no such file. ValueError: empty, other columns, a bad number, a press named twice.
     """
-    path = Path(folder) / "labels.csv"
+    path = check_path("folder", folder) / "labels.csv"
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file: expected a table of {','.join(LABEL_COLUMNS)}")
     labels: dict[str, tuple[float, float, float | None]] = {}
@@ -290,6 +290,7 @@ def image_to_bgr(image: Tensor) -> np.ndarray[Any, Any]:
     Raises:
         ValueError: wrong shape or not finite. TypeError: not floating point.
     """
+    check_tensor("image", image)
     if image.dim() != 3:
         cause = "take one image of the batch with [0]" if image.dim() == 4 else "one RGB image is needed"
         raise ValueError(f"image: expected (3, H, W), got {tuple(image.shape)}: {cause}")
@@ -301,6 +302,8 @@ def image_to_bgr(image: Tensor) -> np.ndarray[Any, Any]:
 
 
 def _map(name: str, values: Tensor | np.ndarray[Any, Any]) -> Tensor:
+    if not isinstance(values, Tensor | np.ndarray):
+        raise TypeError(f"{name}: expected an array or a tensor, got {type(values).__name__}: gs_sdk's maps are float32 arrays")
     tensor = values if isinstance(values, Tensor) else torch.from_numpy(np.ascontiguousarray(values))
     if tensor.dim() != 2:
         raise ValueError(f"{name}: expected (H, W), got {tuple(tensor.shape)}: gs_sdk's maps have no batch and no channel")

@@ -11,7 +11,7 @@ import torch
 import yaml
 from torch import Tensor
 
-from .checks import check_batch, check_integer, check_numbers, check_positive, from_dict
+from .checks import check_batch, check_integer, check_numbers, check_path, check_positive, check_record, from_dict
 from .files import write_atomically
 from .response import SensorPrior
 
@@ -207,6 +207,12 @@ class Sensor:
             temporary.write_text("".join(f"{line}\n" for line in comment) + text, encoding="utf-8")
 
 
+def check_sensor(name: str, value: object) -> None:
+    """Raise unless ``value`` is a Sensor; a name or path is told the way."""
+    text = str(value) if isinstance(value, str | Path) else "gelsight_mini"
+    check_record(name, value, Sensor, f"load it by Sensor.load({text!r})")
+
+
 def shipped_sensors() -> list[str]:
     """Names that :meth:`Sensor.load` finds."""
     return sorted(path.stem for path in _shipped_folder().glob("*.yaml"))
@@ -219,14 +225,16 @@ def _shipped_folder() -> Path:
 
 
 def _find(source: str | Path) -> Path:
-    path = Path(source)
+    path = check_path("source", source)
     if path.suffix in (".yaml", ".yml"):
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such sensor file")
         return path
     if str(source) in shipped_sensors():
         return _shipped_folder() / f"{source}.yaml"
-    raise FileNotFoundError(f"sensor {str(source)!r}: expected a path ending in .yaml, or one of {', '.join(shipped_sensors())}")
+    raise FileNotFoundError(
+        f"source: expected a path ending in .yaml, or one of {', '.join(shipped_sensors())}, got {str(source)!r}"
+    )
 
 
 class _StrictLoader(yaml.SafeLoader):

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from ..core.checks import check_integer
+from ..core.checks import check_integer, check_path, check_positive, check_tensor
 from ..core.files import write_atomically
 from ..core.geometry import depth_to_points
 from .relief import Frame, contact_of, sure_contact
@@ -31,6 +31,7 @@ def contact_cloud(frame: Frame, mm_per_pixel: float, most: int | None = 1000) ->
     Raises:
         ValueError: not one frame, values not finite, or no contact deeper than the noise.
     """
+    check_positive("mm_per_pixel", mm_per_pixel)
     depth, gradient, contact = contact_of(frame, "frame")
     inside = sure_contact(depth, gradient, contact, mm_per_pixel)
     if not bool(inside.any()):
@@ -99,9 +100,9 @@ def write_point_cloud(path: str | Path, points: Tensor, normals: Tensor | None =
     Raises:
         ValueError: wrong shape, no points, values not finite, or another suffix. ImportError: without the extra ``pose``.
     """
-    path = Path(path)
+    path = check_path("path", path)
     if path.suffix.lower() not in CLOUD_SUFFIXES:
-        raise ValueError(f"{path}: expected a name ending in {' or '.join(CLOUD_SUFFIXES)}")
+        raise ValueError(f"{path}: expected a name ending in {' or '.join(CLOUD_SUFFIXES)}, got {path.suffix!r}")
     o3d = open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(_array("points", points, None)))
     if normals is not None:
@@ -117,11 +118,11 @@ def read_point_cloud(path: str | Path) -> tuple[Tensor, Tensor | None]:
     Raises:
         FileNotFoundError: no such file. ValueError: not a cloud, or an empty one. ImportError: without the extra ``pose``.
     """
-    path = Path(path)
+    path = check_path("path", path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such point cloud")
     if path.suffix.lower() not in CLOUD_SUFFIXES:
-        raise ValueError(f"{path}: expected a name ending in {' or '.join(CLOUD_SUFFIXES)}")
+        raise ValueError(f"{path}: expected a name ending in {' or '.join(CLOUD_SUFFIXES)}, got {path.suffix!r}")
     o3d = open3d()
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         cloud = o3d.io.read_point_cloud(str(path))
@@ -132,6 +133,7 @@ def read_point_cloud(path: str | Path) -> tuple[Tensor, Tensor | None]:
 
 
 def _array(name: str, values: Tensor, length: int | None) -> "np.ndarray[Any, Any]":
+    check_tensor(name, values)
     if values.dim() != 2 or values.shape[1] != 3 or len(values) == 0 or (length is not None and len(values) != length):
         raise ValueError(
             f"{name}: expected ({'N' if length is None else length}, 3) with N above 0, got {tuple(values.shape)}: no contact?"

@@ -165,7 +165,7 @@ class DepthPipeline(nn.Module):
         gradient, depth = self._solve(seen, None, touched, (top, left), (height, width))
         if self.refines:
             active = torch.ones(images.shape[0], dtype=torch.bool, device=images.device)
-            if self.foresees:
+            if self.foresees and min(height, width) > self.stride + self.stride // 2:  # else its grid has one pixel a line
                 active = self._foreseen_px(seen, touched, gradient, depth, (top, left)) > self.worth_px
             gradient, depth = self._refine(seen, touched, gradient, depth, active, (top, left))
         normal = normal_from_gradient(gradient)

@@ -58,10 +58,10 @@ def surface(
     check_size(height, width, mm_per_pixel, 3)
     if not callable(depth_mm):
         raise TypeError(f"depth_mm: expected a function of x and y, got {type(depth_mm).__name__}")
-    x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
-    x = x.expand(height, width).clone().requires_grad_()
-    y = y.expand(height, width).clone().requires_grad_()
-    with torch.enable_grad():
+    with torch.inference_mode(False), torch.enable_grad():
+        x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
+        x = x.expand(height, width).clone().requires_grad_()
+        y = y.expand(height, width).clone().requires_grad_()
         depth = depth_mm(x, y)
         if not isinstance(depth, Tensor) or depth.shape != x.shape or not depth.requires_grad:
             got = tuple(depth.shape) if isinstance(depth, Tensor) else type(depth).__name__

@@ -200,18 +200,25 @@ def check_positive(name: str, value: object, most: float = math.inf) -> float:
     """Return ``value`` as a float, or raise unless it is a finite number in (0, ``most``]."""
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
-    number = float(value)
+    number = _float(value)
     if not math.isfinite(number) or number <= 0 or number > most:
         bound = f"in (0, {most:g}]" if math.isfinite(most) else "above 0 and finite"
         raise ValueError(f"{name}: expected a number {bound}, got {value}")
     return number
 
 
+def _float(value: numbers.Real) -> float:
+    try:
+        return float(value)
+    except OverflowError:  # of an integer of hundreds of digits
+        return math.inf
+
+
 def check_least(name: str, value: object, least: float = 0.0, most: float = math.inf) -> float:
     """Return ``value`` as a float, or raise unless it is a finite number in [``least``, ``most``]."""
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
-    number = float(value)
+    number = _float(value)
     if not math.isfinite(number) or not least <= number <= most:
         bound = (
             f"in [{least:g}, {most:g}]"
@@ -238,7 +245,7 @@ def check_numbers(name: str, value: object, shape: Sequence[int]) -> tuple[float
     text = " x ".join(str(n) for n in shape)
     try:
         tensor = torch.as_tensor(value, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise TypeError(f"{name}: expected {text} numbers, got {value!r}") from error
     if tuple(tensor.shape) != tuple(shape):
         raise ValueError(f"{name}: expected {text} numbers, got shape {tuple(tensor.shape)}")

@@ -8,6 +8,7 @@ import csv
 import math
 import struct
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,10 @@ LABEL_COLUMNS = ("experiment_reldir", "diameter_mm", "center_x_px", "center_y_px
 SENSOR_KEYS = ("ppmm", "imgh", "imgw")
 SENSOR_KEYS_UNUSED = ("raw_imgh", "raw_imgw", "framerate", "device_name")
 """Keys of a gs_sdk sensor file that describe the camera behind the image, which :class:`Sensor` does not need."""
+
+
+MOST_TABLE_BYTES = 2**24
+"""A table of presses has some kilobytes."""
 
 
 @dataclass(frozen=True)
@@ -321,6 +326,10 @@ def _frame(name: str, tensor: Tensor, channels: int) -> Tensor:
 
 def _read_table(path: Path, columns: tuple[str, ...]) -> list[tuple[int, dict[str, str]]]:
     """Rows of a CSV file with exactly these columns, each with its line number; blank lines are left out."""
+    if path.stat().st_size > MOST_TABLE_BYTES:
+        raise ValueError(
+            f"{path}: expected a table of at most {MOST_TABLE_BYTES} bytes, got {path.stat().st_size}: not a CSV table"
+        )
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
             reader = csv.reader(stream, strict=True)
@@ -392,7 +401,18 @@ def _read_label(path: Path) -> tuple[tuple[float, float], float]:
             radius = np.asarray(stored["radius"], dtype=np.float64).ravel()
     except KeyError as error:
         raise ValueError(f"{path}: expected the arrays 'center' and 'radius', one is missing: {error}") from error
-    except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile, struct.error) as error:
+    except (
+        ValueError,
+        TypeError,
+        OSError,
+        EOFError,
+        RuntimeError,
+        MemoryError,
+        OverflowError,
+        zipfile.BadZipFile,
+        struct.error,
+        zlib.error,
+    ) as error:
         raise ValueError(f"{path}: not a label of gs_sdk, or cut short: {error}") from error
     if center.shape != (2,) or radius.shape != (1,):
         raise ValueError(f"{path}: expected center (x, y) and one radius, got shapes {center.shape} and {radius.shape}")

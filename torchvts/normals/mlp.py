@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from ..core.checks import check_batch, check_integer, check_least, check_path, check_range, check_same_size
+from ..core.checks import check_batch, check_field, check_integer, check_least, check_path, check_range, check_same_size
 from ..core.files import load_tensors, save_tensors
 from ..core.geometry import normal_from_gradient
 
@@ -169,7 +169,13 @@ class NormalFromMLP(nn.Module):
             if described.get("kind") != MLP_KIND or "flat" not in state or described.get("output") not in OUTPUTS:
                 raise ValueError(f"{path}: expected a network that NormalFromMLP.save wrote, got {described.get('kind')!r}")
             stored = state.pop("flat")
-            flat = stored if flat is None else flat
+            if flat is None:
+                flat = stored
+                try:
+                    check_field("flat", flat)
+                    check_range("flat", flat)
+                except (TypeError, ValueError) as error:
+                    raise ValueError(f"{path}: damaged: {error}") from error
         else:
             state = _read_state(path)
         if flat is None:

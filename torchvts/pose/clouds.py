@@ -1,4 +1,4 @@
-"""Point clouds of contacts, thinned evenly, and their PCD and PLY files, by Open3D."""
+"""Point clouds of contacts, thinned evenly, and their PCD and PLY files, written by Open3D."""
 
 import ctypes
 from pathlib import Path
@@ -12,9 +12,11 @@ from torch.nn.functional import avg_pool2d
 from ..core.checks import check_integer, check_path, check_positive, check_tensor
 from ..core.files import write_atomically
 from ..core.geometry import depth_to_points
+from .cloud_formats import read_columns
 from .relief import Frame, contact_of, sure_contact
 
 CLOUD_SUFFIXES = (".pcd", ".ply")
+NORMAL_NAMES = {".pcd": ("normal_x", "normal_y", "normal_z"), ".ply": ("nx", "ny", "nz")}
 
 
 def contact_cloud(frame: Frame, mm_per_pixel: float, most: int | None = 1000) -> tuple[Tensor, Tensor]:
@@ -116,20 +118,26 @@ def read_point_cloud(path: str | Path) -> tuple[Tensor, Tensor | None]:
     """Read a .pcd or .ply file: points (N, 3) float64, and normals (N, 3) if it has them.
 
     Raises:
-        FileNotFoundError: no such file. ValueError: not a cloud, or an empty one. ImportError: without the extra ``pose``.
+        FileNotFoundError: no such file. ValueError: not a cloud, cut short, or an empty one.
     """
     path = check_path("path", path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such point cloud")
     if path.suffix.lower() not in CLOUD_SUFFIXES:
         raise ValueError(f"{path}: expected a name ending in {' or '.join(CLOUD_SUFFIXES)}, got {path.suffix!r}")
-    o3d = open3d()
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        cloud = o3d.io.read_point_cloud(str(path))
-    points = torch.from_numpy(np.asarray(cloud.points).copy())
-    if len(points) == 0:
-        raise ValueError(f"{path}: no points could be read: not a point cloud, cut short, or empty")
-    return points, torch.from_numpy(np.asarray(cloud.normals).copy()) if cloud.has_normals() else None
+    try:
+        columns = read_columns(path)
+        groups = [
+            [columns[name] for name in names]
+            for names in (("x", "y", "z"), NORMAL_NAMES[path.suffix.lower()])
+            if names[0] in columns
+        ]
+    except (ValueError, KeyError) as error:
+        raise ValueError(f"{path}: no points could be read: {error}") from error
+    if "x" not in columns:
+        raise ValueError(f"{path}: no points could be read: it has no x, y, z")
+    points = torch.from_numpy(np.stack(groups[0], axis=1))
+    return points, torch.from_numpy(np.stack(groups[1], axis=1)) if len(groups) > 1 else None
 
 
 def _array(name: str, values: Tensor, length: int | None) -> "np.ndarray[Any, Any]":

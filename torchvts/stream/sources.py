@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from ..core.checks import check_batch, check_integer, check_path
-from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES
+from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, decode_image, image_files
 from ..core.sensor import Sensor, check_sensor
 
 Pixels = np.ndarray[Any, Any]
@@ -65,7 +65,7 @@ class FolderReader:
 
     def __init__(self, folder: Path, fps: float = 30.0) -> None:
         self.name, self.live, self.fps = str(folder), False, fps
-        files = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+        files = image_files(folder)
         if not files:
             raise ValueError(
                 f"source: expected a folder of images ({', '.join(IMAGE_SUFFIXES)}), got {folder}: no images in this folder"
@@ -76,8 +76,10 @@ class FolderReader:
         import cv2
 
         for path in self._files:
-            data = np.fromfile(path, dtype=np.uint8)
-            pixels = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+            try:
+                pixels = decode_image(path, cv2.IMREAD_COLOR)
+            except (ValueError, OSError):
+                pixels = None
             if pixels is not None:
                 return pixels
             warnings.warn(f"source: {path}: left out: not an image, or cut short", stacklevel=2)

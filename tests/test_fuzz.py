@@ -33,7 +33,7 @@ from torchvts.core.files import read_depth_png, read_frames, write_atomically, w
 from torchvts.core.response import ResponseField, ResponseModel
 
 LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
-DAMAGES = 3000 if LONG else 60
+DAMAGES = 3000 if LONG else 40
 KILLS = 60 if LONG else 5
 MEMORY = 2**30
 """Bytes of address space that reading one damaged file may take beyond what the process has."""
@@ -181,10 +181,6 @@ def child(folder, names, count, seed):
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     folder = Path(folder)
-    if any("pcd" in name or "ply" in name for name in names):
-        from torchvts.pose.clouds import open3d
-
-        open3d()
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
     for name in names:
@@ -233,23 +229,11 @@ def run_child(program, timeout_s=120, check=True):
     return done
 
 
-GROUPS = [
-    ["unit.safetensors", "field.safetensors", "lookup.safetensors", "network.safetensors", "nnmodel.pth"],
-    ["rig.yaml", "gs_sdk.yaml", "catalog.csv", "labels.csv", "label.npz", "gelsight.png", "film.avi"],
-    ["image.png", "image.jpg", "image.bmp", "image.tif", "depth.png"],
-    ["cloud.pcd", "text.pcd", "small.pcd", "cloud.ply", "text.ply"],
-]
-
-
-def test_every_reader_is_in_a_group():
-    assert sorted(name for group in GROUPS for name in group) == sorted(READERS)
-
-
-@pytest.mark.parametrize("names", GROUPS, ids=lambda names: Path(names[0]).suffix[1:])
-def test_damaged_files_are_refused_in_words(tmp_path, names):
+def test_damaged_files_are_refused_in_words(tmp_path):
+    names = list(READERS)
     prepare(tmp_path, names)
     run = f"test_fuzz.child({str(tmp_path)!r}, {names!r}, {DAMAGES}, 0)"
-    done = run_child(run, 600 if LONG else 120, check=False)
+    done = run_child(run, 1800 if LONG else 120, check=False)
     assert done.returncode == 0, f"died of {done.stdout.splitlines()[-1:]} (its file is in {tmp_path}): {done.stderr[-800:]}"
     lines = [line.split("] ", 1) for line in done.stdout.splitlines() if line.startswith('["')]
     assert len(lines) == DAMAGES * len(names)
@@ -334,72 +318,45 @@ CLAIMS = {
     "ply of 2^31": ("cloud.ply", ply_that_claims(2**31 - 1)),
     "laughs": ("rig.yaml", LAUGHS.encode()),
     "yaml deep": ("rig.yaml", b"name: " + b"[" * 50_000),
-    "yaml of keys": ("rig.yaml", b"".join(b"k%d: 1\n" % k for k in range(60_000))),
+    "yaml of keys": ("rig.yaml", b"".join(b"k%d: 1\n" % k for k in range(8_000))),
     "yaml of digits": ("rig.yaml", b"name: rig\nheight: " + b"9" * 10_000),
     "yaml of bytes": ("rig.yaml", b"name: rig\nheight: \x00\xff"),
-    "yaml of many megabytes": ("rig.yaml", b"# \n" * 1_000_000),
+    "yaml of many bytes": ("rig.yaml", b"# \n" * 50_000),
     "laughs of gs_sdk": ("gs_sdk.yaml", LAUGHS.encode()),
     "a table of one line": ("catalog.csv", b"x" * 2**25),
     "a pickle for weights": ("nnmodel.pth", pickle.dumps({"fc1.weight": [1.0]})),
+    **{
+        f"a terabyte of {name}": (name, None)
+        for name in ("image.png", "rig.yaml", "catalog.csv", "unit.safetensors", "nnmodel.pth")
+    },
     "numbers for weights": ("nnmodel.pth", b"\x80\x02" + b"(" * 100_000),
 }
 
 
-def read_told(folder, name):
-    """Tell of one file, with memory bounded."""
+def all_told(folder):
+    """Tell of the claims, one after another, with memory bounded."""
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
-    print(json.dumps(told(READERS[name][1], Path(folder) / name)), flush=True)
+    for label, (name, _) in CLAIMS.items():
+        print(json.dumps([label, *told(READERS[name][1], Path(folder) / label / name)]), flush=True)
 
 
-def all_told(folder, labels):
-    """The claims, one after another."""
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    if any("pcd" in label or "ply" in label for label in labels):
-        from torchvts.pose.clouds import open3d
-
-        open3d()
-        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
-    for label in labels:
-        name = CLAIMS[label][0]
-        path = Path(folder) / label / name
-        start = time.monotonic()
-        print(json.dumps([label, *told(READERS[name][1], path), time.monotonic() - start]), flush=True)
-
-
-@pytest.mark.parametrize("clouds", [False, True], ids=["others", "clouds"])
-def test_claims_beyond_all_memory_are_refused_in_words(tmp_path, clouds):
-    labels = [label for label in CLAIMS if clouds == ("pcd" in label or "ply" in label)]
-    if clouds:
-        try:
-            pytest.importorskip("torchvts.pose.clouds").open3d()
-        except ImportError as error:
-            pytest.skip(str(error))
-    for label in labels:
-        name, content = CLAIMS[label]
+def test_claims_beyond_all_memory_are_refused_in_words(tmp_path):
+    for label, (name, content) in CLAIMS.items():
         (tmp_path / label).mkdir()
         if name == "catalog.csv":
             write_folder(tmp_path / label / name)
-        (tmp_path / label / name).write_bytes(content)
-    done = run_child(f"test_fuzz.all_told({str(tmp_path)!r}, {labels!r})", 60, check=False)
+        with (tmp_path / label / name).open("wb") as stream:
+            if content is None:
+                stream.truncate(2**40)
+            else:
+                stream.write(content)
+    done = run_child(f"test_fuzz.all_told({str(tmp_path)!r})", 100, check=False)
     lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[")]
     assert done.returncode == 0, f"died after {lines[-1:]}: {done.stderr[-800:]}"
-    assert [line[0] for line in lines] == labels
+    assert [line[0] for line in lines] == list(CLAIMS)
     bad = [line for line in lines if line[1] not in ("ValueError", "TypeError") or str(tmp_path) not in line[2] or line[3] > 5000]
     assert bad == []
-
-
-def test_a_sparse_file_of_a_terabyte_is_not_read(tmp_path):
-    for name in ("image.png", "rig.yaml", "catalog.csv", "unit.safetensors", "nnmodel.pth"):
-        if name == "catalog.csv":
-            write_folder(tmp_path / name)
-        with (tmp_path / name).open("wb") as stream:
-            stream.truncate(2**40)
-        done = run_child(f"test_fuzz.read_told({str(tmp_path)!r}, {name!r})", 60)
-        kind, text, _ = json.loads(done.stdout.splitlines()[-1])
-        assert kind == "ValueError" and name in text, (kind, text)
-        (tmp_path / name).unlink()
 
 
 def test_a_label_that_claims_a_terabyte_is_refused(tmp_path):
@@ -549,7 +506,10 @@ def save_cloud(path, count):
     write_point_cloud(path, torch.rand(count, 3, generator=torch.Generator().manual_seed(count)))
 
 
-@pytest.mark.parametrize("kind", ["unit.safetensors", "rig.yaml", "image.png", "depth.png", "frames.csv", "cloud.ply", "cloud.pcd"])
+SAVED = ["unit.safetensors", "image.png", "cloud.ply"] + LONG * ["rig.yaml", "depth.png", "frames.csv", "cloud.pcd"]
+
+
+@pytest.mark.parametrize("kind", SAVED)
 def test_a_kill_in_the_middle_of_a_save_leaves_a_whole_file(tmp_path, kind):
     path, rng = tmp_path / kind, random.Random(kind)
     environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}

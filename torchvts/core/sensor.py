@@ -237,7 +237,7 @@ def _find(source: str | Path) -> Path:
     )
 
 
-MOST_YAML_BYTES = 2**20
+MOST_YAML_BYTES = 2**17
 """A sensor file has some kilobytes."""
 
 

@@ -97,7 +97,7 @@ def press(
     check_positive("fillet_mm", fillet_mm)
     if not callable(height_mm):
         raise TypeError(f"height_mm: expected a function of u and v, got {type(height_mm).__name__}: objects.stamp() makes one")
-    check_shape("T_sensor_object", T_sensor_object, (4, 4), "what objects.pose makes")
+    check_shape("T_sensor_object", T_sensor_object, (4, 4))
     transform = T_sensor_object.detach().double()
     turned = transform[:3, :3]
     if not bool((turned @ turned.T - torch.eye(3, dtype=torch.float64)).abs().max() < 1e-3):

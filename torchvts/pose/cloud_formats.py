@@ -37,7 +37,7 @@ def read_columns(path: Path) -> Columns:
     data = path.read_bytes()
     try:
         columns = _read_pcd(data) if path.suffix.lower() == ".pcd" else _read_ply(data)
-    except (struct.error, IndexError, KeyError, OverflowError) as error:
+    except (struct.error, LookupError, OverflowError, TypeError) as error:
         raise ValueError(f"its head is damaged: {error!r}") from error
     return {name: column.astype(np.float64) for name, column in columns.items()}
 
@@ -123,7 +123,7 @@ def _text_columns(body: bytes, points: int, names: list[str], counts: list[int])
     words = body.split(maxsplit=points * width)[: points * width]
     if len(words) < points * width:
         raise ValueError(f"cut short: {points * width} numbers are announced, {len(words)} are there")
-    table = np.array(words, dtype="S").astype(np.float64).reshape(points, width)
+    table = np.array([float(word) for word in words]).reshape(points, width)
     place = np.cumsum([0, *counts])
     return {name: table[:, place[k]] for k, name in enumerate(names)}
 

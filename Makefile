@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup demo test check bench clean
+.PHONY: setup demo test test-long check bench clean
 
 setup: $(VENV)/.done
 
@@ -17,6 +17,10 @@ demo: setup
 
 test: setup
 	$(BIN)/python -m pytest -n auto --dist loadfile
+
+# Fuzzed files, drawn scenes and frames by the thousands; some tens of minutes.
+test-long: setup
+	TORCHVTS_TEST_PROFILE=long $(BIN)/python -m pytest tests/test_properties.py tests/test_fuzz.py --no-cov -n auto
 
 check: setup
 	$(BIN)/ruff check .

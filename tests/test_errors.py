@@ -42,15 +42,21 @@ BAD = {
     "slightly bright": (lambda i: i + 0.6, ValueError, r"expected values in \[0, 1\], got \[.*, 1\..*\]: clamp it"),
     "one NaN": (lambda i: with_value(i, float("nan"), 0.002), ValueError, "expected finite values, got 1 NaN or infinite"),
     "infinite": (lambda i: with_value(i, float("inf"), 0.01), ValueError, "expected finite values, got 7 NaN or infinite"),
-    "numpy": (lambda i: i.numpy(), TypeError, "expected a torch.Tensor, got ndarray: read files with torchvts.read_image"),
+    "numpy": (lambda i: i.numpy(), TypeError, "expected a torch.Tensor, got ndarray: torch.from_numpy"),
     "a path": (lambda i: "background.png", TypeError, "expected a torch.Tensor, got str: read files with torchvts.read_image"),
     "none": (lambda i: None, TypeError, "expected a torch.Tensor, got NoneType"),
 }
 UNUSABLE = {
     "black": (lambda i: 0 * i, r"expected light in channel R, got a mean of 0.0000: black image, lamp or exposure off"),
     "one lamp off": (lambda i: with_value(i, 0.001), r"expected light in channel G, got a mean of 0.0010"),
-    "saturated": (lambda i: with_value(i, 1.0, 0.75, 2), r"channel B is saturated in 75% of the image: lower the exposure"),
-    "constant": (lambda i: with_value(i, 0.5, 1.0, 0), r"channel R is constant at 0.5000: not a camera image"),
+    "saturated": (
+        lambda i: with_value(i, 1.0, 0.75, 2),
+        r"expected light below .*, got a channel B that is saturated in 75% of the image: lower the exposure",
+    ),
+    "constant": (
+        lambda i: with_value(i, 0.5, 1.0, 0),
+        r"expected light that varies, got a channel R that is constant at 0.5000: not a camera image",
+    ),
 }
 
 

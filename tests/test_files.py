@@ -192,3 +192,18 @@ def test_broken_clouds_are_refused(tmp_path, clouds):
     (tmp_path / "cloud.ply").write_bytes(b"no cloud")
     with pytest.raises(ValueError, match=r"cloud\.ply: no points could be read"):
         clouds.read_point_cloud(tmp_path / "cloud.ply")
+
+
+@pytest.mark.parametrize("form", [{}, {"write_ascii": True}, {"compressed": True}])
+@pytest.mark.parametrize("suffix", [".ply", ".pcd"])
+def test_clouds_are_read_as_open3d_reads_them(tmp_path, clouds, suffix, form):
+    o3d, path = clouds.open3d(), tmp_path / f"cloud{suffix}"
+    numbers = np.random.default_rng(0).integers(0, 4, (300, 3)).astype(float)  # which repeat, so that there is what to compress
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(numbers))
+    cloud.colors = o3d.utility.Vector3dVector(numbers / 4)
+    cloud.normals = o3d.utility.Vector3dVector(numbers)
+    o3d.io.write_point_cloud(str(path), cloud, **form)
+    points, normals = clouds.read_point_cloud(path)
+    expected = o3d.io.read_point_cloud(str(path))
+    assert np.array_equal(points.numpy(), np.asarray(expected.points))
+    assert np.array_equal(normals.numpy(), np.asarray(expected.normals))

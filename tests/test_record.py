@@ -198,7 +198,7 @@ def test_a_new_file_replaces_the_old_and_keeps_its_mode(calibration, saved):
 def test_a_missing_folder_and_a_folder_in_the_way_are_refused(calibration, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"folder .*nowhere does not exist: make it first"):
         calibration.save(tmp_path / "nowhere" / "unit.safetensors")
-    with pytest.raises(IsADirectoryError, match="is a folder, expected the name of a file"):
+    with pytest.raises(IsADirectoryError, match="expected the name of a file, got a folder"):
         calibration.save(tmp_path)
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from .core.checks import check_batch, check_positive, check_same_size, may_read_values
+from .core.checks import check_batch, check_field, check_positive, check_record, check_same_size, check_tensor, may_read_values
 from .markers import FillMarkers
-from .record import Calibration
+from .record import Calibration, check_calibration
 
 
 class Compensate(nn.Module):
@@ -60,12 +60,18 @@ class Compensate(nn.Module):
         super().__init__()
         self.level = level
         self.scatters = scatters
+        if markers is not None:
+            check_record("markers", markers, nn.Module, "FillMarkers() makes one")
         self.markers = nn.Identity() if markers is None else markers
         self.blur_px = float(blur_px) if blur_px == 0 else check_positive("blur_px", blur_px)
         self.gamma = check_positive("gamma", gamma)
         for name, value in (("gain", gain), ("offset", offset)):
-            if value is not None and (value.dim() != 3 or value.shape[0] != 3):
-                raise ValueError(f"{name}: expected (3, H, W), got {tuple(value.shape)}")
+            if value is not None:
+                check_field(name, value)
+        if defects is not None:
+            check_tensor("defects", defects)
+            if defects.dim() != 2 or defects.dtype != torch.bool:
+                raise ValueError(f"defects: expected (H, W) bool, got {tuple(defects.shape)} {defects.dtype}: threshold it")
         if defects is None or not bool(defects.any()):
             sound = torch.zeros(0, 4, dtype=torch.int64)
             flat_index = torch.zeros(0, dtype=torch.int64)
@@ -93,6 +99,7 @@ class Compensate(nn.Module):
             level: bring lamps that have drifted since back to their brightness, if the model is lights. With response fields
                 this is always done.
         """
+        check_calibration("calibration", calibration)
         sensor = calibration.sensor
         parts = (calibration.gain, calibration.offset, sensor.exponent, calibration.defects, sensor.blur_px, calibration.markers)
         by_response = calibration.response is not None

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from .core.checks import QUANTISATION_STD, check_batch, check_positive, check_same_size, may_read_values
+from .core.checks import QUANTISATION_STD, check_batch, check_field, check_positive, check_same_size, check_tensor, may_read_values
 from .core.noise import noise_std as frame_noise_std
-from .record import Calibration
+from .record import Calibration, check_calibration
 
 CELLS = 80
 """Cells along the shorter side of the image."""
@@ -174,8 +174,10 @@ class ContactMask(nn.Module):
 
     def __init__(self, flat: Tensor, noise_std: Tensor, sigmas: float = 4.5, min_size_px: float = 8.0) -> None:
         super().__init__()
-        if flat.dim() != 3 or flat.shape[0] != 3:
-            raise ValueError(f"flat: expected (3, H, W), got {tuple(flat.shape)}")
+        check_field("flat", flat)
+        check_tensor("noise_std", noise_std)
+        if tuple(noise_std.shape) not in ((3,), tuple(flat.shape)) or not bool(torch.isfinite(noise_std).all()):
+            raise ValueError(f"noise_std: expected (3,) or {tuple(flat.shape)} finite values, got {tuple(noise_std.shape)}")
         self.sigmas = check_positive("sigmas", sigmas)
         self.min_size_px = check_positive("min_size_px", min_size_px)
         self.cell = max(1, min(flat.shape[1], flat.shape[2]) // CELLS)
@@ -195,6 +197,7 @@ class ContactMask(nn.Module):
     @classmethod
     def from_calibration(cls, calibration: Calibration) -> "ContactMask":
         """The mask of a calibrated unit's compensated images."""
+        check_calibration("calibration", calibration)
         noise = calibration.compensated_noise_std
         return cls(calibration.flat, noise if calibration.response is None else noise.clamp_min(LIGHT_DRIFT))
 

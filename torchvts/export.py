@@ -22,12 +22,22 @@ import torch
 from torch import Tensor, nn
 
 from .core import __version__
-from .core.files import write_atomically
+from .core.checks import (
+    check_batch,
+    check_choice,
+    check_integer,
+    check_path,
+    check_record,
+    check_sequence,
+    check_size,
+    check_window,
+)
+from .core.files import check_target, write_atomically
 from .core.geometry import pixel_grid_mm
 from .integration import PoissonDCT, PoissonRest, divergence
 from .integration.transforms import cosine_bases, fold, unfold
 from .pipeline import DepthPipeline
-from .record import Calibration
+from .record import Calibration, check_calibration
 
 METADATA_KEY = "torchvts"
 """Under this name the files keep what they are, as JSON: :func:`describe`."""
@@ -57,6 +67,8 @@ class PoissonRestByMatrix(nn.Module):
         self, height: int, width: int, mm_per_pixel: float, dtype: torch.dtype = torch.float32, levelled: bool = True
     ) -> None:
         super().__init__()
+        check_size(height, width, mm_per_pixel)
+        self.size = (height, width)
         self.mm_per_pixel = mm_per_pixel
         self.levelled = levelled
         even_y, odd_y, value_even_y, value_odd_y = cosine_bases(height)
@@ -72,6 +84,10 @@ class PoissonRestByMatrix(nn.Module):
     takes_window: bool = True
 
     def forward(self, gradient: Tensor, window: tuple[int, int] = (0, 0), size: tuple[int, int] | None = None) -> Tensor:
+        check_batch("gradient", gradient, 2)
+        if size is not None and size != self.size:
+            raise ValueError(f"gradient, window: expected size {self.size}, for which the matrices are, got {size}")
+        check_window("gradient", gradient, self.size, None if size is None and window == (0, 0) else window)
         if size is not None and size != (gradient.shape[2], gradient.shape[3]):
             after = [size[k] - window[k] - gradient.shape[2 + k] for k in (0, 1)]
             gradient = nn.functional.pad(gradient, [window[1], after[1], window[0], after[0]])
@@ -106,7 +122,7 @@ class _PlainOutput(nn.Module):
 
 def describe(pipe: DepthPipeline) -> dict[str, Any]:
     """What an exported file says of itself: plain JSON."""
-
+    _check_pipeline(pipe)
     height, width, dtype = _size(pipe)
     return {
         "torchvts": __version__,
@@ -134,8 +150,8 @@ def export_torchscript(pipe: DepthPipeline, path: str | Path) -> Path:
     Raises:
         RuntimeError: a module of the pipeline does not script. TypeError: no pipeline.
     """
-    path = Path(path)
     _check_pipeline(pipe)
+    path = check_target(path)
     with warnings.catch_warnings(), write_atomically(path) as temporary:
         warnings.simplefilter("ignore")  # that TorchScript is deprecated
         scripted = torch.jit.script(copy.deepcopy(pipe))
@@ -157,6 +173,8 @@ def export_program(pipe: DepthPipeline, path: str | Path | None = None) -> torch
         TypeError: no pipeline. Whatever torch.export raises for a module of your own that it cannot trace.
     """
     _check_pipeline(pipe)
+    if path is not None:
+        check_target(path)
     program = _trace(pipe, by_matrix=False)
     if path is not None:
         with write_atomically(path) as temporary, warnings.catch_warnings():
@@ -176,8 +194,8 @@ def export_aoti(pipe: DepthPipeline, path: str | Path) -> Path:
     Raises:
         RuntimeError: there is no C++ compiler. TypeError: no pipeline.
     """
-    path = Path(path)
     _check_pipeline(pipe)
+    path = check_target(path)
     complaint = missing("aoti")
     if complaint:
         raise RuntimeError(complaint)
@@ -208,8 +226,8 @@ def export_onnx(pipe: DepthPipeline, path: str | Path) -> Path:
     Raises:
         ModuleNotFoundError: the extra ``onnx`` is not installed. TypeError: no pipeline.
     """
-    path = Path(path)
     _check_pipeline(pipe)
+    path = check_target(path)
     complaint = missing("onnx")
     if complaint:
         raise ModuleNotFoundError(complaint)
@@ -252,8 +270,7 @@ def missing(name: str) -> str:
     Raises:
         ValueError: unknown format.
     """
-    if name not in FORMATS:
-        raise ValueError(f"format: expected one of {', '.join(FORMATS)}, got {name!r}")
+    check_choice("format", name, list(FORMATS))
     if name == "onnx":
         absent = [package for package in ("onnx", "onnxscript", "onnxruntime") if find_spec(package) is None]
         if absent:
@@ -274,6 +291,7 @@ def missing(name: str) -> str:
 
 def sample_frames(calibration: Calibration, seed: int = 0) -> Tensor:
     """Four frames of a unit to compare exports on, (4, 3, H, W), 8 bits with noise: touched, at rest, touched twice, all random."""
+    check_calibration("calibration", calibration)
     random = torch.Generator().manual_seed(seed)
     height, width, pitch = calibration.sensor.height, calibration.sensor.width, calibration.sensor.mm_per_pixel
     x, y = pixel_grid_mm(height, width, pitch)
@@ -321,10 +339,12 @@ def export_checked(pipe: DepthPipeline, folder: str | Path, formats: Sequence[st
     Raises:
         ValueError: unknown format.
     """
+    _check_pipeline(pipe)
+    check_batch("images", images, 3)
+    check_sequence("formats", formats, "formats")
     for name in formats:
-        if name not in FORMATS:
-            raise ValueError(f"format: expected one of {', '.join(FORMATS)}, got {name!r}")
-    folder = Path(folder)
+        check_choice("format", name, list(FORMATS))
+    folder = check_path("folder", folder)
     folder.mkdir(parents=True, exist_ok=True)
     rows = []
     for name in formats:
@@ -352,7 +372,10 @@ def compare(path: str | Path, pipe: DepthPipeline, images: Tensor, name: str) ->
     Raises:
         RuntimeError: that process failed; carries the end of what it said. FileNotFoundError: no such file.
     """
-    path = Path(path)
+    _check_pipeline(pipe)
+    check_batch("images", images, 3)
+    check_choice("format", name, list(FORMATS))
+    path = check_path("path", path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     batches = sorted({size for size in (1, 2, 3, images.shape[0]) if size <= images.shape[0]})
@@ -365,6 +388,13 @@ def compare(path: str | Path, pipe: DepthPipeline, images: Tensor, name: str) ->
 
 def run_bare(path: str | Path, images: Tensor, name: str, batches: Sequence[int]) -> list[Tensor]:
     """Depth by an exported file, for the first so many images each, from a process without torchvts."""
+    check_batch("images", images, 3)
+    check_choice("format", name, list(FORMATS))
+    check_sequence("batches", batches, "sizes")
+    for size in batches:
+        check_integer("batches", size, 1)
+    if not check_path("path", path).is_file():
+        raise FileNotFoundError(f"{path}: no such file")
     with tempfile.TemporaryDirectory() as folder:
         np.save(Path(folder) / "images.npy", images.detach().cpu().numpy())
         job = {"path": str(Path(path).resolve()), "format": name, "batches": list(batches), "threads": torch.get_num_threads()}
@@ -413,8 +443,7 @@ for size in job["batches"]:
 
 
 def _check_pipeline(pipe: DepthPipeline) -> None:
-    if not isinstance(pipe, DepthPipeline):
-        raise TypeError(f"pipe: expected a DepthPipeline, got {type(pipe).__name__}: DepthPipeline.from_calibration makes one")
+    check_record("pipe", pipe, DepthPipeline, "DepthPipeline.from_calibration makes one")
 
 
 def _size(pipe: DepthPipeline) -> tuple[int, int, torch.dtype]:

@@ -9,7 +9,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from .core.checks import check_batch, check_positive, check_same_size
+from .core.checks import check_batch, check_field, check_integer, check_positive, check_range, check_same_size, check_tensor
 from .core.noise import noise_std
 
 
@@ -46,6 +46,9 @@ def find_markers(
         (True, False)
     """
     check_batch("image", image, 3)
+    if not torch.jit.is_scripting():
+        check_positive("diameter_px", diameter_px), check_positive("contrast", contrast)
+        check_positive("sigmas", sigmas), check_positive("skirt", skirt, 2.0)
     cell = max(1, int(diameter_px / 8.0))
     diameter = diameter_px / cell
     light = _log_light(image.detach(), cell)
@@ -90,6 +93,10 @@ def fill_markers(image: Tensor, mask: Tensor, relaxations: int = 4) -> Tensor:
         >>> bool((fill_markers(image, image[:, :1] < 0.3) - 0.5).abs().max() < 1e-6)
         True
     """
+    if not torch.jit.is_scripting():
+        check_tensor("image", image)
+        check_tensor("mask", mask)
+        check_integer("relaxations", relaxations, 0)
     check_batch("image", image, image.shape[1] if image.dim() == 4 else 3)
     if mask.dtype != torch.bool:
         raise TypeError(f"mask: expected torch.bool, got {mask.dtype}: threshold it")
@@ -142,6 +149,7 @@ class FillMarkers(nn.Module):
         ``diameter_px`` by :func:`marker_diameter_px`; the least contrast, at least ``contrast``, is a fifth of that of all
         but the faintest twentieth of the markers. Fewer than ``least_markers`` are taken for dust: nothing is filled.
         """
+        check_positive("skirt", skirt, 2.0)
         diameter_px, found = marker_diameter_px(background, contrast, least_markers)
         return cls(diameter_px, max(contrast, found / 5.0), skirt=skirt)
 
@@ -159,8 +167,13 @@ class FillMarkers(nn.Module):
     @classmethod
     def from_dict(cls, values: object, source: str) -> "FillMarkers":
         """Build the block from what :meth:`to_dict` gave; ``source`` names it in errors."""
+        if not isinstance(values, dict):
+            raise ValueError(f"{source}: expected keys and values, got {type(values).__name__}")
+        for key in values:
+            if key not in ("diameter_px", "contrast", "sigmas", "skirt"):
+                raise ValueError(f"{source}: key {key!r}: unknown; expected diameter_px, contrast, sigmas, skirt")
         try:
-            return cls(**values)  # type: ignore[arg-type]
+            return cls(**values)
         except (TypeError, ValueError) as error:
             raise ValueError(f"{source}: {error}") from error
 
@@ -183,8 +196,9 @@ def marker_diameter_px(background: Tensor, contrast: float = 0.06, least_markers
         >>> marker_diameter_px(torch.full((3, 64, 64), 0.5))
         (0.0, 0.0)
     """
-    if background.dim() != 3 or background.shape[0] != 3:
-        raise ValueError(f"background: expected (3, H, W), got {tuple(background.shape)}")
+    check_field("background", background)
+    check_range("background", background)
+    check_positive("contrast", contrast), check_integer("least_markers", least_markers, 1)
     light, diameter, best = _log_light(background[None], 1), 0.0, 0.0
     reach = 3.0
     while reach < min(background.shape[1:]) / 8.0:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .core.checks import check_batch, check_integer, check_positive, check_shape, check_tensor
 from .core.geometry import depth_to_points
 
 
@@ -35,6 +36,8 @@ def depth_error(depth_mm: Tensor, truth_mm: Tensor, mm_per_pixel: float, region:
         >>> depth_error(torch.full((1, 1, 4, 4), 0.5), torch.zeros(1, 1, 4, 4), 0.25).max_px
         2.0
     """
+    check_tensor("truth_mm", truth_mm)
+    check_positive("mm_per_pixel", mm_per_pixel)
     error = (_inside("depth_mm", depth_mm, truth_mm, region) - _inside("truth_mm", truth_mm, truth_mm, region)).double()
     largest, rms = float(error.abs().max()), float(error.square().mean().sqrt())
     return DepthError(largest, rms, largest / mm_per_pixel, rms / mm_per_pixel)
@@ -45,8 +48,11 @@ def normal_angle_deg(normal: Tensor, truth: Tensor, region: Tensor | None = None
 
     Computed from the cross product too, so small angles keep their digits.
     """
-    if normal.shape != truth.shape:
-        raise ValueError(f"normal: expected {tuple(truth.shape)} like truth, got {tuple(normal.shape)}")
+    check_tensor("truth", truth)
+    check_batch("normal", normal, 3)
+    check_shape("normal", normal, truth.shape, "truth")
+    if region is not None:
+        check_shape("region", region, (normal.shape[0], 1, *normal.shape[2:]), "one channel of normal")
     cross = torch.linalg.cross(normal, truth, dim=1).norm(dim=1)
     angle = torch.rad2deg(torch.atan2(cross, (normal * truth).sum(1)))
     return angle if region is None else angle[region[:, 0].bool()]
@@ -54,14 +60,18 @@ def normal_angle_deg(normal: Tensor, truth: Tensor, region: Tensor | None = None
 
 def mask_iou(mask: Tensor, truth: Tensor) -> float:
     """Intersection over union of two masks; 1 if both are empty."""
-    if mask.shape != truth.shape:
-        raise ValueError(f"mask: expected {tuple(truth.shape)} like truth, got {tuple(mask.shape)}")
+    check_tensor("truth", truth)
+    check_shape("mask", mask, truth.shape, "truth")
     union = int((mask.bool() | truth.bool()).sum())
     return int((mask.bool() & truth.bool()).sum()) / union if union else 1.0
 
 
 def rim_distance_px(mask: Tensor, truth: Tensor) -> float:
     """Mean distance of a mask's rim to the true rim, and back, in pixels, of one frame; infinite if one has no rim."""
+    for name, value in (("mask", mask), ("truth", truth)):
+        check_tensor(name, value)
+        if value.dim() < 2 or value.numel() != value.shape[-1] * value.shape[-2]:
+            raise ValueError(f"{name}: expected one frame, (H, W) or (1, 1, H, W), got {tuple(value.shape)}: loop over the batch")
     rims = [torch.nonzero(_rim(m)).double() for m in (mask, truth)]
     if not (len(rims[0]) and len(rims[1])):
         return math.inf if len(rims[0]) + len(rims[1]) else 0.0
@@ -75,6 +85,8 @@ def fit_sphere(depth_mm: Tensor, mm_per_pixel: float, contact: Tensor, steps: in
     Raises:
         ValueError: fewer than 4 points.
     """
+    check_integer("steps", steps, 0)
+    check_tensor("contact", contact)
     points = depth_to_points(depth_mm, mm_per_pixel, contact).double()
     if len(points) < 4:
         raise ValueError(f"contact: expected at least 4 pixels, got {len(points)}: no contact, no sphere")
@@ -95,12 +107,10 @@ def fit_sphere(depth_mm: Tensor, mm_per_pixel: float, contact: Tensor, steps: in
 
 
 def _inside(name: str, values: Tensor, truth: Tensor, region: Tensor | None) -> Tensor:
-    if values.shape != truth.shape:
-        raise ValueError(f"{name}: expected {tuple(truth.shape)} like truth_mm, got {tuple(values.shape)}")
+    check_shape(name, values, truth.shape, "truth_mm")
     if region is None:
         return values
-    if region.shape != truth.shape:
-        raise ValueError(f"region: expected {tuple(truth.shape)} like truth_mm, got {tuple(region.shape)}")
+    check_shape("region", region, truth.shape, "truth_mm")
     if not bool(region.any()):
         raise ValueError("region: expected at least one pixel, got none: no contact was found")
     return values[region.bool()]

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .core.checks import check_integer, check_positive
+from .core.checks import check_integer, check_least, check_numbers, check_positive, check_shape, check_size
 from .core.geometry import normal_from_gradient, pixel_grid_mm
 from .scenes import Scene, distance_to_segments, letter_segments, smooth_step
 
@@ -50,6 +50,8 @@ def pose(
         tensor([[ 0., -1.,  0.,  1.],
                 [ 1.,  0.,  0.,  2.]], dtype=torch.float64)
     """
+    check_least("angle_deg", angle_deg, -math.inf), check_least("press_mm", press_mm, -math.inf)
+    check_numbers("shift_mm", shift_mm, (2,)), check_numbers("tilt_deg", tilt_deg, (2,))
     turn = math.radians(angle_deg)
     about_z = torch.zeros(3, 3, dtype=torch.float64)
     about_z[2, 2] = 1.0
@@ -91,11 +93,17 @@ def press(
         >>> round(float(scene.depth_mm.max()), 6)
         0.5
     """
-    check_integer("height", height, 3), check_integer("width", width, 3)
-    check_positive("mm_per_pixel", mm_per_pixel), check_positive("fillet_mm", fillet_mm)
+    check_size(height, width, mm_per_pixel, 3)
+    check_positive("fillet_mm", fillet_mm)
+    if not callable(height_mm):
+        raise TypeError(f"height_mm: expected a function of u and v, got {type(height_mm).__name__}: objects.stamp() makes one")
+    check_shape("T_sensor_object", T_sensor_object, (4, 4))
     transform = T_sensor_object.detach().double()
-    if tuple(transform.shape) != (4, 4):
-        raise ValueError(f"T_sensor_object: expected (4, 4), got {tuple(transform.shape)}: objects.pose makes one")
+    turned = transform[:3, :3]
+    if not bool((turned @ turned.T - torch.eye(3, dtype=torch.float64)).abs().max() < 1e-3):
+        raise ValueError(
+            "T_sensor_object: expected a rigid motion, got one that stretches or is not finite: objects.pose makes one"
+        )
     rotation, shift = transform[:3, :3], transform[:3, 3]
     if float(rotation[2, 2]) < 0.9:
         raise ValueError(f"T_sensor_object: expected a tilt below 25 degrees, got cos {float(rotation[2, 2]):.3f}")
@@ -141,6 +149,7 @@ def tool_handle() -> Height:
 
 def bottle_cap(ribs: int = 18) -> Height:
     """A round cap with a raised ring and ribs around it, 12 mm across."""
+    check_integer("ribs", ribs, 1)
 
     def height(u: Tensor, v: Tensor) -> Tensor:
         r, along, across = _fold(u, v, ribs)
@@ -164,6 +173,7 @@ def stamp(text: str = "VTS", size_mm: float = 4.2) -> Height:
 
 def bolt_head(across_flats_mm: float = 9.0) -> Height:
     """A hexagon head, slightly domed, with a round chamfer."""
+    check_positive("across_flats_mm", across_flats_mm)
 
     def height(u: Tensor, v: Tensor) -> Tensor:
         r, along, across = _fold(u, v, 6)
@@ -193,6 +203,7 @@ def key() -> Height:
 
 def gear(teeth: int = 12) -> Height:
     """A flat gear with a bore, 11 mm across."""
+    check_integer("teeth", teeth, 1)
 
     def height(u: Tensor, v: Tensor) -> Tensor:
         r, along, across = _fold(u, v, teeth)
@@ -204,6 +215,7 @@ def gear(teeth: int = 12) -> Height:
 
 def textured_patch(bumps: int = 60, radius_mm: float = 5.5, seed: int = 3) -> Height:
     """A round pad with bumps and dents of many sizes, strewn by chance."""
+    check_integer("bumps", bumps, 1), check_positive("radius_mm", radius_mm)
     generator = torch.Generator().manual_seed(seed)
     draws = torch.rand(bumps, 5, generator=generator, dtype=torch.float64)
     reach, turn = radius_mm * draws[:, 0].sqrt(), 2.0 * math.pi * draws[:, 1]
@@ -222,6 +234,7 @@ def textured_patch(bumps: int = 60, radius_mm: float = 5.5, seed: int = 3) -> He
 
 def sphere(radius_mm: float = 10.0) -> Height:
     """A ball; beyond its equator's neighbourhood it stays at that height."""
+    check_positive("radius_mm", radius_mm)
 
     def height(u: Tensor, v: Tensor) -> Tensor:
         return torch.sqrt((radius_mm**2 - u**2 - v**2).clamp_min(0.25 * radius_mm**2)) - radius_mm
@@ -231,6 +244,7 @@ def sphere(radius_mm: float = 10.0) -> Height:
 
 def cylinder(radius_mm: float = 6.0) -> Height:
     """An endless cylinder along u."""
+    check_positive("radius_mm", radius_mm)
 
     def height(u: Tensor, v: Tensor) -> Tensor:
         return torch.sqrt((radius_mm**2 - v**2).clamp_min(0.25 * radius_mm**2)) - radius_mm + 0.0 * u

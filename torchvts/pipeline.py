@@ -7,11 +7,20 @@ from torch import Tensor, nn
 
 from .compensate import Compensate
 from .contact import ContactMask
-from .core.checks import check_batch, check_range, may_read_values
+from .core.checks import (
+    check_batch,
+    check_choice,
+    check_integer,
+    check_least,
+    check_positive,
+    check_range,
+    check_record,
+    may_read_values,
+)
 from .core.geometry import GradientFromNormal, normal_from_gradient
 from .integration import PoissonRest
 from .normals import NormalFromIntensity, NormalFromResponse
-from .record import Calibration
+from .record import Calibration, check_calibration
 
 MODES = ("fast", "precise", "auto")
 
@@ -69,8 +78,12 @@ class DepthPipeline(nn.Module):
         max_passes: int = 8,
     ) -> None:
         super().__init__()
-        if mode not in MODES:
-            raise ValueError(f"mode: expected one of {', '.join(MODES)}, got {mode!r}")
+        check_choice("mode", mode, MODES)
+        blocks = {"compensate": compensate, "contact": contact, "normals": normals, "gradient": gradient, "integrate": integrate}
+        for name, block in blocks.items():
+            check_record(name, block, nn.Module)
+        check_positive("mm_per_pixel", mm_per_pixel), check_positive("tolerance_px", tolerance_px)
+        check_least("worth_px", worth_px), check_integer("max_passes", max_passes, 1)
         uses_depth = bool(getattr(normals, "uses_depth", False))
         if mode == "precise" and not uses_depth:
             raise ValueError(
@@ -114,8 +127,7 @@ class DepthPipeline(nn.Module):
             >>> out.depth_mm.shape, bool(out.contact.any())
             (torch.Size([1, 1, 48, 64]), False)
         """
-        if not isinstance(calibration, Calibration):
-            raise TypeError(f"calibration: expected a Calibration, got {type(calibration).__name__}: Calibration.load reads a file")
+        check_calibration("calibration", calibration)
         sensor = calibration.sensor
         if normals is None:
             by_response = calibration.response is not None
@@ -153,7 +165,7 @@ class DepthPipeline(nn.Module):
         gradient, depth = self._solve(seen, None, touched, (top, left), (height, width))
         if self.refines:
             active = torch.ones(images.shape[0], dtype=torch.bool, device=images.device)
-            if self.foresees:
+            if self.foresees and min(height, width) > self.stride + self.stride // 2:  # else its grid has one pixel a line
                 active = self._foreseen_px(seen, touched, gradient, depth, (top, left)) > self.worth_px
             gradient, depth = self._refine(seen, touched, gradient, depth, active, (top, left))
         normal = normal_from_gradient(gradient)

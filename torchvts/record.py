@@ -10,11 +10,11 @@ import kornia
 import torch
 from torch import Tensor
 
-from .core.checks import QUANTISATION_STD, check_image
+from .core.checks import QUANTISATION_STD, check_image, check_record, check_tensor
 from .core.files import image_from_bytes, image_to_bytes, load_tensors, save_tensors
 from .core.noise import noise_std
 from .core.response import ResponseModel
-from .core.sensor import Sensor
+from .core.sensor import Sensor, check_sensor
 from .markers import FillMarkers
 from .shading import PointLights, flat_image, inverse_light_matrix
 
@@ -77,12 +77,13 @@ class Calibration:
             >>> Calibration.from_lights(lights, Sensor("rig", 48, 64, 0.5)).compensation.abs().max()
             tensor(0.)
         """
-        if not isinstance(lights, PointLights):
-            raise TypeError(f"lights: expected PointLights, got {type(lights).__name__}")
+        check_record("lights", lights, PointLights, "PointLights(position_mm, albedo) makes them")
+        check_sensor("sensor", sensor)
         sensor = dataclasses.replace(sensor, gamma=sensor.exponent, prior=None)
         frozen = PointLights(*(t.detach().cpu() for t in (lights.position_mm, lights.albedo, lights.gloss))).requires_grad_(False)
         report = report or {"model": "point_lights", "lights": "given"}
         if ambient is not None:
+            check_tensor("ambient", ambient)
             ambient = ambient.detach().cpu().to(frozen.position_mm.dtype)
             if tuple(ambient.shape) != (3,) or not bool((ambient >= 0).all() & torch.isfinite(ambient).all()):
                 raise ValueError(f"ambient: expected (3,) finite values of at least 0, got {ambient.tolist()}")
@@ -113,9 +114,20 @@ class Calibration:
             >>> Calibration.from_response(ResponseModel(field, None), sensor, torch.full((3, 48, 64), 0.5)).sensor.blur_px
             1.0
         """
+        check_record("response", response, ResponseModel, "a sensor's prior has one: sensor.prior.response")
+        check_sensor("sensor", sensor)
+        check_image("background", background, sensor.height, sensor.width, sensor.name)
         sensor = dataclasses.replace(sensor, gamma=response.gamma, blur_px=response.blur_px, prior=None)
         light, noise, markers = _at_rest(background, sensor, background.dtype)
         return cls(sensor, None, light, noise, True, report or {"model": "response", "response": "given"}, response, markers)
+
+    def __repr__(self) -> str:
+        sensor, made = self.sensor, "an image" if self.measured else "the lights alone"
+        model = (
+            f"response fields ({self.report.get('response', 'given')})" if self.lights is None else f"point lights, {self.lights}"
+        )
+        size = f"{sensor.height} x {sensor.width}, {sensor.mm_per_pixel:g} mm per pixel"
+        return f"Calibration({sensor.name!r}, {size}, from {made}: {model})"
 
     @property
     def flat(self) -> Tensor:
@@ -283,6 +295,11 @@ class Calibration:
             if not torch.allclose(tensors[name], derived, rtol=1e-3, atol=1e-3 * float(derived.abs().max())):
                 raise ValueError(f"{path}: tensor {name!r} does not fit the lights in the same file: damaged or edited")
         return calibration
+
+
+def check_calibration(name: str, value: object) -> None:
+    """Raise unless ``value`` is a Calibration."""
+    check_record(name, value, Calibration, "Calibration.load reads a file, calibrate makes one")
 
 
 def _at_rest(background: Tensor, sensor: Sensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, FillMarkers | None]:

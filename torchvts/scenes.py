@@ -8,7 +8,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .core.checks import check_integer, check_positive
+from .core.checks import (
+    check_camera_height,
+    check_integer,
+    check_least,
+    check_numbers,
+    check_positive,
+    check_record,
+    check_sequence,
+    check_shape,
+    check_size,
+    check_tensor,
+)
 from .core.geometry import normal_from_gradient, pixel_grid_mm
 from .shading import PointLights, near_field_shading, seen_at
 
@@ -54,16 +65,20 @@ def surface(
         >>> float(scene.depth_mm.max()), bool(scene.contact[0, 0, 0, 0])
         (1.0, False)
     """
-    check_integer("height", height, 3), check_integer("width", width, 3)
-    check_positive("mm_per_pixel", mm_per_pixel)
-    x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
-    x, y = x.expand(height, width), y.expand(height, width)
-    if not math.isinf(camera_height_mm):
-        x, y = _seen_by_pinhole(depth_mm, x, y, check_positive("camera_height_mm", camera_height_mm))
-    x, y = x.clone().requires_grad_(), y.clone().requires_grad_()
-    with torch.enable_grad():
+    check_size(height, width, mm_per_pixel, 3)
+    if not callable(depth_mm):
+        raise TypeError(f"depth_mm: expected a function of x and y, got {type(depth_mm).__name__}")
+    with torch.inference_mode(False), torch.enable_grad():
+        x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
+        x, y = x.expand(height, width), y.expand(height, width)
+        if check_camera_height(camera_height_mm) < math.inf:
+            x, y = _seen_by_pinhole(depth_mm, x, y, camera_height_mm)
+        x, y = x.clone().requires_grad_(), y.clone().requires_grad_()
         depth = depth_mm(x, y)
-        p, q = torch.autograd.grad(depth.sum(), (x, y))
+        if not isinstance(depth, Tensor) or depth.shape != x.shape or not depth.requires_grad:
+            got = tuple(depth.shape) if isinstance(depth, Tensor) else type(depth).__name__
+            raise ValueError(f"depth_mm: expected a function that gives {tuple(x.shape)} computed from x and y, got {got}")
+        p, q = torch.autograd.grad(depth.sum(), (x, y), materialize_grads=True)
     contact = (depth > 0).detach()[None, None]
     gradient = torch.where(contact, torch.stack((p, q))[None], 0.0).to(dtype)
     depth = depth.detach().clamp_min(0.0)[None, None].to(dtype)
@@ -105,6 +120,7 @@ def sphere_press(
         2.0
     """
     check_positive("press_mm", press_mm, check_positive("radius_mm", radius_mm))
+    check_numbers("center_mm", center_mm, (2,))
 
     def depth(x: Tensor, y: Tensor) -> Tensor:
         squared = (x - center_mm[0]) ** 2 + (y - center_mm[1]) ** 2
@@ -126,7 +142,8 @@ def cylinder_press(
 ) -> Scene:
     """A lying cylinder with round ends (a capsule), its axis turned by ``angle_deg`` from x towards y (down)."""
     check_positive("press_mm", press_mm, check_positive("radius_mm", radius_mm))
-    check_positive("length_mm", length_mm)
+    check_numbers("center_mm", center_mm, (2,))
+    check_positive("length_mm", length_mm), check_least("angle_deg", angle_deg, -math.inf)
 
     def depth(x: Tensor, y: Tensor) -> Tensor:
         along, across = _turn(x - center_mm[0], y - center_mm[1], angle_deg)
@@ -149,6 +166,7 @@ def cone_press(
     """A cone with a ball tip; ``half_angle_deg`` is between axis and wall, so walls slope by its cotangent."""
     check_positive("half_angle_deg", half_angle_deg, 89.9)
     check_positive("press_mm", press_mm), check_positive("tip_radius_mm", tip_radius_mm)
+    check_numbers("center_mm", center_mm, (2,))
     wall = 1.0 / torch.tan(torch.deg2rad(torch.tensor(half_angle_deg, dtype=torch.float64)))
     touch = tip_radius_mm * wall / torch.sqrt(1 + wall**2)  # the ball meets the wall here, tangentially
     drop = tip_radius_mm - torch.sqrt(tip_radius_mm**2 - touch**2)
@@ -193,6 +211,7 @@ def punch_press(
 ) -> Scene:
     """A flat round punch tilted about y; the skin falls away from its edge over ``wall_mm`` along a smooth flank."""
     check_positive("radius_mm", radius_mm), check_positive("press_mm", press_mm), check_positive("wall_mm", wall_mm)
+    check_least("tilt_deg", tilt_deg, -math.inf)
     slope = torch.tan(torch.deg2rad(torch.tensor(tilt_deg, dtype=torch.float64)))
 
     def depth(x: Tensor, y: Tensor) -> Tensor:
@@ -257,6 +276,12 @@ def render(
     Returns:
         (1, 3, H, W) in [0, 1].
     """
+    check_record("scene", scene, Scene, "sphere_press and its kin make one")
+    check_least("noise_std", noise_std), check_positive("gamma", gamma), check_least("vignetting", vignetting, 0.0, 1.0)
+    if bits is not None and check_integer("bits", bits, 1) > 16:
+        raise ValueError(f"bits: expected 1 to 16, got {bits}")
+    if spots is not None:
+        check_shape("spots", spots, scene.depth_mm.shape, "the scene")
     image = near_field_shading(scene.depth_mm, scene.normal, lights, scene.mm_per_pixel, scene.camera_height_mm)
     if vignetting:
         x, y = pixel_grid_mm(image.shape[2], image.shape[3], 1.0, image.dtype)
@@ -277,6 +302,7 @@ def render(
 
 def at_rest(scene: Scene) -> Scene:
     """The same sensor without contact."""
+    check_record("scene", scene, Scene, "sphere_press and its kin make one")
     flat = torch.zeros_like(scene.normal)
     flat[:, 2] = 1.0
     return Scene(
@@ -295,6 +321,8 @@ def skin_spots(height: int, width: int, spots: int = 30, dead_pixels: int = 30, 
     Returns:
         (1, 1, H, W) in [0, 1].
     """
+    check_integer("height", height, 1), check_integer("width", width, 1)
+    check_integer("spots", spots, 0), check_integer("dead_pixels", dead_pixels, 0)
     generator = torch.Generator().manual_seed(seed)
     x, y = pixel_grid_mm(height, width, 1.0)
     factor = torch.ones(height, width)
@@ -318,6 +346,7 @@ def _turn(x: Tensor, y: Tensor, angle_deg: float) -> tuple[Tensor, Tensor]:
 
 def smooth_step(t: Tensor) -> Tensor:
     """0 below 0, 1 above 1, between them the quintic with zero first and second derivative at both ends."""
+    check_tensor("t", t)
     t = t.clamp(0.0, 1.0)
     return t**3 * (10.0 - 15.0 * t + 6.0 * t**2)
 
@@ -328,6 +357,9 @@ def letter_segments(text: str, size_mm: float) -> list[Segment]:
     Raises:
         ValueError: a character without strokes, or an empty text.
     """
+    if not isinstance(text, str):
+        raise TypeError(f"text: expected capital letters A-Z and blanks, got {type(text).__name__}")
+    check_positive("size_mm", size_mm)
     unknown = sorted({letter for letter in text if letter != " " and letter not in _STROKES})
     if unknown or not text.strip():
         raise ValueError(f"text: expected capital letters A-Z and blanks, got {text!r}")
@@ -345,6 +377,10 @@ def letter_segments(text: str, size_mm: float) -> list[Segment]:
 
 def distance_to_segments(x: Tensor, y: Tensor, segments: Sequence[Segment]) -> Tensor:
     """Distance of each point to the nearest of the segments."""
+    check_tensor("x", x)
+    check_sequence("segments", segments, "segments")
+    check_shape("y", y, x.shape, "x")
+    check_numbers("segments", list(segments), (max(1, len(segments)), 2, 2))
     distance = torch.full_like(x, torch.inf)
     for start, end in segments:
         dx, dy = end[0] - start[0], end[1] - start[1]

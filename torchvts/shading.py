@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from .core.checks import check_batch, check_same_size
+from .core.checks import check_batch, check_camera_height, check_positive, check_record, check_same_size
 from .core.geometry import pixel_grid_mm
 
 
@@ -34,22 +34,23 @@ class PointLights(nn.Module):
         self, position_mm: Tensor | list[list[float]], albedo: Tensor | list[float], gloss: Tensor | list[float] | None = None
     ) -> None:
         super().__init__()
-        position, rho = torch.as_tensor(position_mm), torch.as_tensor(albedo)
+        position, rho = _numbers("position_mm", position_mm), _numbers("albedo", albedo)
         dtype = torch.promote_types(torch.promote_types(position.dtype, rho.dtype), torch.get_default_dtype())
         position, rho = position.to(dtype), rho.to(dtype)
         if tuple(position.shape) != (3, 3):
             raise ValueError(f"position_mm: expected (3, 3), rows R, G, B, got {tuple(position.shape)}")
         if tuple(rho.shape) != (3,):
             raise ValueError(f"albedo: expected (3,), one per channel, got {tuple(rho.shape)}")
-        if not bool(torch.isfinite(position).all() & torch.isfinite(rho).all()):
-            raise ValueError("position_mm, albedo: expected finite values, got NaN or infinite ones")
+        for name, values in (("position_mm", position), ("albedo", rho)):
+            if not bool(torch.isfinite(values).all()):
+                raise ValueError(f"{name}: expected finite values, got {values.tolist()}")
         if not bool((position[:, 2] > 0).all()):
             raise ValueError(
                 f"position_mm: expected lights above the skin (z > 0), got z = {position[:, 2].tolist()}: z points to the camera"
             )
         if not bool((rho > 0).all()):
             raise ValueError(f"albedo: expected values above 0, got {rho.tolist()}")
-        shine = torch.zeros(3, dtype=dtype) if gloss is None else torch.as_tensor(gloss).detach().to(dtype)
+        shine = torch.zeros(3, dtype=dtype) if gloss is None else _numbers("gloss", gloss).detach().to(dtype)
         if tuple(shine.shape) != (3,) or not bool((shine >= 0).all() & torch.isfinite(shine).all()):
             raise ValueError(f"gloss: expected (3,) finite values of at least 0, got {shine.tolist()}")
         self.position_mm = nn.Parameter(position.detach().clone())
@@ -61,6 +62,8 @@ class PointLights(nn.Module):
         check_batch("depth_mm", depth_mm, 1)
         check_batch("normal", normal, 3)
         check_same_size("normal", normal, "depth_mm", depth_mm.shape[2], depth_mm.shape[3])
+        if not torch.jit.is_scripting():
+            check_positive("mm_per_pixel", mm_per_pixel), check_camera_height(camera_height_mm)
         matrix = light_matrix(depth_mm, self.position_mm, self.albedo, mm_per_pixel, camera_height_mm)
         light = (matrix * normal.unsqueeze(1)).sum(2).clamp_min(0.0)
         if self.glossy:
@@ -75,6 +78,13 @@ class PointLights(nn.Module):
     def extra_repr(self) -> str:
         rows = [f"{c}: {[round(v, 3) for v in row]} mm" for c, row in zip("RGB", self.position_mm.tolist(), strict=True)]
         return ", ".join(rows)
+
+
+def _numbers(name: str, values: object) -> Tensor:
+    try:
+        return torch.as_tensor(values)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"{name}: expected numbers, got {values!r}: a tensor, or lists of floats") from error
 
 
 def near_field_shading(
@@ -102,6 +112,7 @@ def near_field_shading(
         >>> near_field_shading(torch.zeros(1, 1, 8, 8), flat, lights, 0.1).shape
         torch.Size([1, 3, 8, 8])
     """
+    check_record("lights", lights, PointLights, "PointLights(position_mm, albedo) makes them")
     image: Tensor = lights(depth_mm, normal, mm_per_pixel, camera_height_mm)
     return image
 

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from ..compensate import Compensate
 from ..contact import ContactMask
-from ..core.checks import check_image
+from ..core.checks import check_image, check_sequence
 from ..core.geometry import gradient_from_normal
 from ..core.response import ResponseModel, SensorPrior, fit_log_background
-from ..core.sensor import Sensor
+from ..core.sensor import Sensor, check_sensor
 from ..integration import poisson_rest
 from ..normals import NormalFromIntensity
 from ..record import Calibration
@@ -99,6 +99,7 @@ def calibrate(
         >>> calibrate(flat_image(lights, 48, 64, 0.6).detach(), sensor).report["model"]
         'point_lights'
     """
+    check_sensor("sensor", sensor)
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     check_exposure(background)
     presses, touches = _named_presses(presses, sensor), _named_touches(touches, sensor)
@@ -177,6 +178,12 @@ def fit_prior(background: Tensor, sensor: Sensor, presses: Sequence[Press], sour
     Source:
         this project.
     """
+    check_sensor("sensor", sensor)
+    if not isinstance(source, str):
+        raise TypeError(f"source: expected a text, got {type(source).__name__}")
+    check_sequence("presses", presses, "Press")
+    if len(presses) == 0:
+        raise ValueError("presses: expected one or more, got none: a prior is what presses say")
     bare = sensor.without_prior()
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     fit, contacts, unit = by_presses(
@@ -343,6 +350,7 @@ def _by_touches(
 
 def _named_presses(presses: Sequence[Press], sensor: Sensor) -> list[Press]:
     """The presses, each with a name; checked."""
+    check_sequence("presses", presses, "Press")
     named = []
     for k, press in enumerate(presses):
         if not isinstance(press, Press):
@@ -354,6 +362,7 @@ def _named_presses(presses: Sequence[Press], sensor: Sensor) -> list[Press]:
 
 def _named_touches(touches: Sequence[Touch | Tensor], sensor: Sensor) -> list[Touch]:
     """The touches, each with a name; checked."""
+    check_sequence("touches", touches, "images or Touch")
     named = []
     for k, given in enumerate(touches):
         touch = given if isinstance(given, Touch) else Touch(given)

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from ..core.checks import check_image, check_integer
-from ..core.sensor import Sensor
+from ..core.checks import check_image, check_integer, check_record
+from ..core.sensor import Sensor, check_sensor
 from ..shading import PointLights
 from .levenberg import LevenbergMarquardt, residual_and_jacobian
 from .rest_image import (
@@ -116,6 +116,9 @@ def fit_lights(
         >>> fit.converged, bool((fit.lights.position_mm - truth.position_mm).abs().max() < 0.01)
         (True, True)
     """
+    check_sensor("sensor", sensor)
+    if start is not None:
+        check_record("start", start, PointLights, "PointLights(position_mm, albedo) makes them")
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     check_integer("max_steps", max_steps, 1)
     if vignetting not in (0, 1, 2):
@@ -287,9 +290,15 @@ def check_exposure(background: Tensor) -> None:
                 f"background: expected light in channel {name}, got a mean of {mean:.4f}: black image, lamp or exposure off"
             )
         if saturated > 0.5:
-            raise ValueError(f"background: channel {name} is saturated in {saturated:.0%} of the image: lower the exposure")
+            raise ValueError(
+                f"background: expected light below the camera's limit, got a channel {name} that is saturated "
+                f"in {saturated:.0%} of the image: lower the exposure"
+            )
         if float(channel.max() - channel.min()) < 1e-6:
-            raise ValueError(f"background: channel {name} is constant at {mean:.4f}: not a camera image of a lit skin")
+            raise ValueError(
+                f"background: expected light that varies, got a channel {name} that is constant at {mean:.4f}: "
+                "not a camera image of a lit skin"
+            )
 
 
 def _robust_weight(residual: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:

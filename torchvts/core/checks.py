@@ -7,9 +7,12 @@ calibration and the door of the pipeline: on a GPU they would wait for the devic
 import dataclasses
 import math
 import numbers
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,6 +20,71 @@ _Record = TypeVar("_Record")
 
 QUANTISATION_STD = 1.0 / 255.0 / math.sqrt(12.0)
 """Noise of rounding to 8 bits, the least that a camera image has."""
+
+
+def check_tensor(name: str, value: object) -> None:
+    """Raise unless ``value`` is a tensor; arrays, as OpenCV and NumPy give them, are told the way.
+
+    Example:
+        >>> import numpy as np
+        >>> check_tensor("depth_mm", np.zeros((4, 4)))
+        Traceback (most recent call last):
+        ...
+        TypeError: depth_mm: expected a torch.Tensor, got ndarray: torch.from_numpy(array) makes one
+    """
+    if isinstance(value, Tensor):
+        return
+    cause = "torch.tensor(...) makes one"
+    if isinstance(value, str | os.PathLike):
+        cause = "read files with torchvts.read_image"
+    elif hasattr(value, "__array_interface__"):
+        cause = "torch.from_numpy(array) makes one"
+        array: np.ndarray[Any, Any] = np.asarray(value)
+        shape, kind = array.shape, array.dtype
+        if len(shape) == 3 and shape[2] in (3, 4):
+            scale = f" / {np.iinfo(kind).max}" if np.issubdtype(kind, np.integer) else ""
+            cause = (
+                f"torch.from_numpy(array).permute(2, 0, 1){scale} makes an image of one in R, G, B (OpenCV's are B, G, R), "
+                "torchvts.read_image reads a file"
+            )
+    raise TypeError(f"{name}: expected a torch.Tensor, got {type(value).__name__}: {cause}")
+
+
+def check_record(name: str, value: object, kind: type, cause: str = "") -> None:
+    """Raise unless ``value`` is a ``kind``; ``cause`` says how to come by one."""
+    if not isinstance(value, kind):
+        what = kind.__name__ if kind.__name__.endswith("Lights") else f"a {kind.__name__}"
+        raise TypeError(f"{name}: expected {what}, got {type(value).__name__}{f': {cause}' if cause else ''}")
+
+
+def check_path(name: str, value: object) -> Path:
+    """Return ``value`` as a Path, or raise unless it is the name of a file or folder."""
+    if not isinstance(value, str | os.PathLike):
+        raise TypeError(f"{name}: expected a path, got {type(value).__name__}")
+    if "\0" in str(value):
+        raise ValueError(f"{name}: expected a path, got {str(value)!r}: no file's name holds a NUL")
+    return Path(value)
+
+
+def check_size(height: object, width: object, mm_per_pixel: object, least: int = 1) -> None:
+    """Raise unless these are a size in pixels of at least ``least`` each way, and a pitch in mm."""
+    check_integer("height", height, least)
+    check_integer("width", width, least)
+    check_positive("mm_per_pixel", mm_per_pixel)
+
+
+def check_sequence(name: str, value: object, items: str) -> None:
+    """Raise unless ``value`` is a sequence, or a batch of images; ``items`` says of what."""
+    batch = isinstance(value, Tensor) and value.dim() == 4
+    if isinstance(value, str) or not (batch or isinstance(value, Sequence)):
+        raise TypeError(f"{name}: expected a list of {items}, got {type(value).__name__}: put a single one into [ ]")
+
+
+def check_choice(name: str, value: object, choices: Sequence[str]) -> str:
+    """Return ``value``, or raise unless it is one of ``choices``."""
+    if not isinstance(value, str) or value not in choices:
+        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
+    return value
 
 
 def check_batch(name: str, tensor: Tensor, channels: int) -> None:
@@ -28,6 +96,8 @@ def check_batch(name: str, tensor: Tensor, channels: int) -> None:
         ...
         ValueError: gradient: expected (B, 2, H, W), got [2, 8, 8]: add the batch dimension with [None]
     """
+    if not torch.jit.is_scripting():
+        check_tensor(name, tensor)
     if tensor.dim() != 4:
         cause = "add the batch dimension with [None]" if tensor.dim() == 3 else "see the docstring for shapes"
         raise ValueError(f"{name}: expected (B, {channels}, H, W), got {list(tensor.shape)}: {cause}")
@@ -73,8 +143,7 @@ def check_window(name: str, tensor: Tensor, size: tuple[int, int], window: tuple
 
 def check_image(name: str, image: Tensor, height: int, width: int, sensor_name: str) -> None:
     """Raise unless ``image`` is one finite (3, ``height``, ``width``) image in [0, 1]."""
-    if not isinstance(image, Tensor):
-        raise TypeError(f"{name}: expected a torch.Tensor, got {type(image).__name__}: read files with torchvts.read_image")
+    check_tensor(name, image)
     if tuple(image.shape) != (3, height, width):
         shape = tuple(image.shape)
         if len(shape) == 4 and shape[0] == 1:
@@ -89,6 +158,31 @@ def check_image(name: str, image: Tensor, height: int, width: int, sensor_name: 
     if not image.is_floating_point():
         raise TypeError(f"{name}: expected a floating-point image, got {image.dtype}: divide by 255")
     check_range(name, image)
+
+
+def check_field(name: str, value: object) -> None:
+    """Raise unless ``value`` is one (3, H, W) image of finite floats. Reads values."""
+    check_tensor(name, value)
+    assert isinstance(value, Tensor)
+    if value.dim() != 3 or value.shape[0] != 3 or value.numel() == 0:
+        cause = "one RGB image is needed"
+        if value.dim() == 4:
+            cause = "take one image of the batch with [0]"
+        elif value.dim() == 3 and value.shape[2] == 3:
+            cause = "channels stand last: permute(2, 0, 1)"
+        raise ValueError(f"{name}: expected (3, H, W), got {tuple(value.shape)}: {cause}")
+    if not value.is_floating_point():
+        raise TypeError(f"{name}: expected a floating-point image, got {value.dtype}: divide by 255")
+    if not bool(torch.isfinite(value).all()):
+        raise ValueError(f"{name}: expected finite values, got NaN or infinite: a camera or an upstream division failed")
+
+
+def check_shape(name: str, value: object, shape: Sequence[int], like: str = "") -> None:
+    """Raise unless ``value`` is a tensor of ``shape``, which is that of ``like``."""
+    check_tensor(name, value)
+    assert isinstance(value, Tensor)
+    if tuple(value.shape) != tuple(shape):
+        raise ValueError(f"{name}: expected {tuple(shape)}{f' like {like}' if like else ''}, got {tuple(value.shape)}")
 
 
 def check_range(name: str, image: Tensor) -> None:
@@ -106,9 +200,40 @@ def check_positive(name: str, value: object, most: float = math.inf) -> float:
     """Return ``value`` as a float, or raise unless it is a finite number in (0, ``most``]."""
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
-    number = float(value)
+    number = _float(value)
     if not math.isfinite(number) or number <= 0 or number > most:
         bound = f"in (0, {most:g}]" if math.isfinite(most) else "above 0 and finite"
+        raise ValueError(f"{name}: expected a number {bound}, got {value}")
+    return number
+
+
+def check_camera_height(value: object) -> float:
+    """Return ``value`` as a float, or raise unless it is above 0; infinite is an orthographic camera's."""
+    if isinstance(value, float) and value == math.inf:
+        return value
+    return check_positive("camera_height_mm", value)
+
+
+def _float(value: numbers.Real) -> float:
+    try:
+        return float(value)
+    except OverflowError:  # of an integer of hundreds of digits
+        return math.inf
+
+
+def check_least(name: str, value: object, least: float = 0.0, most: float = math.inf) -> float:
+    """Return ``value`` as a float, or raise unless it is a finite number in [``least``, ``most``]."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
+    number = _float(value)
+    if not math.isfinite(number) or not least <= number <= most:
+        bound = (
+            f"in [{least:g}, {most:g}]"
+            if math.isfinite(most)
+            else f"of at least {least:g}"
+            if math.isfinite(least)
+            else "that is finite"
+        )
         raise ValueError(f"{name}: expected a number {bound}, got {value}")
     return number
 
@@ -127,7 +252,7 @@ def check_numbers(name: str, value: object, shape: Sequence[int]) -> tuple[float
     text = " x ".join(str(n) for n in shape)
     try:
         tensor = torch.as_tensor(value, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise TypeError(f"{name}: expected {text} numbers, got {value!r}") from error
     if tuple(tensor.shape) != tuple(shape):
         raise ValueError(f"{name}: expected {text} numbers, got shape {tuple(tensor.shape)}")

@@ -2,8 +2,8 @@
 
 import json
 import os
+import secrets
 import struct
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,45 +15,59 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
+from .checks import check_field, check_path
+
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mov", ".mkv", ".webm")
+
+MOST_PIXELS = 2**26
+"""An image that says it has more, 8192 x 8192, is not decoded: some kilobytes can claim gigabytes."""
+
+MOST_BYTES = 2**29
+"""A file of an image that is larger is not read."""
+
+
+def check_target(path: str | Path) -> Path:
+    """The path of a file that may be written, or raise: said before the work that leads to it.
+
+    Raises:
+        TypeError: no path. FileNotFoundError: the folder is missing. IsADirectoryError: it is one itself.
+    """
+    path = check_path("path", path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path}: folder {path.parent} does not exist: make it first")
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: expected the name of a file, got a folder")
+    return path
 
 
 @contextmanager
 def write_atomically(path: str | Path) -> Iterator[Path]:
     """Give a temporary file beside ``path``; when the block ends well it takes the place of ``path``, else it is removed.
 
-    The temporary file keeps the suffix, so that writers which look at it work.
+    The temporary file keeps the suffix, so that writers which look at it work. A process that is killed in between leaves the old
+    file as it was and one hidden ``.stem-xxxxxxxx.suffix`` beside it, which nothing reads.
 
     Raises:
         FileNotFoundError: the folder is missing. PermissionError: it cannot be written.
     """
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path}: folder {path.parent} does not exist: make it first")
-    if path.is_dir():
-        raise IsADirectoryError(f"{path}: is a folder, expected the name of a file")
+    path = check_target(path)
+    temporary = path.with_name(f".{path.stem}-{secrets.token_hex(4)}{path.suffix}")
     try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+        temporary.open(
+            "xb"
+        ).close()  # not by tempfile: whose mode would be private, and asking for the umask is no thread's business
     except OSError as error:
         raise type(error)(f"{path}: cannot write into {path.parent}: {error.strerror}") from error
-    os.close(handle)
-    temporary = Path(name)
     try:
         yield temporary
         with temporary.open("rb") as stream:
             os.fsync(stream.fileno())
-        mode = path.stat().st_mode & 0o777 if path.exists() else 0o666 & ~_umask()
-        temporary.chmod(mode)
+        if path.exists():
+            temporary.chmod(path.stat().st_mode & 0o777)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def read_image(path: str | Path) -> Tensor:
@@ -64,10 +78,10 @@ def read_image(path: str | Path) -> Tensor:
     """
     import cv2
 
-    path = Path(path)
+    path = check_path("path", path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such image")
-    pixels = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_UNCHANGED) if path.stat().st_size else None
+    pixels = decode_image(path, cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise ValueError(f"{path}: not an image, or cut short")
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
@@ -75,6 +89,48 @@ def read_image(path: str | Path) -> Tensor:
     if pixels.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{path}: expected 8 or 16 bits per channel, got {pixels.dtype}")
     return rgb_from_bgr(pixels[:, :, :3])
+
+
+def decode_image(path: Path, flags: int) -> np.ndarray[Any, Any] | None:
+    """An image file as OpenCV decodes it; None if it does not.
+
+    Raises:
+        ValueError: larger than :data:`MOST_BYTES`, or says that it has more than :data:`MOST_PIXELS`.
+    """
+    size = path.stat().st_size
+    if size > MOST_BYTES:
+        raise ValueError(f"{path}: expected an image of at most {MOST_BYTES} bytes, got {size}: not an image")
+    return decode_bytes(np.fromfile(path, dtype=np.uint8), flags, str(path)) if size else None
+
+
+def decode_bytes(data: np.ndarray[Any, Any], flags: int, source: str) -> np.ndarray[Any, Any] | None:
+    """:func:`decode_image` of bytes (N,) that are in memory; ``source`` names them in errors."""
+    import cv2
+
+    width, height = _claimed_size(data[: 2**16].tobytes())
+    if width * height > MOST_PIXELS:
+        raise ValueError(f"{source}: expected an image of at most {MOST_PIXELS} pixels, got one that says {height} x {width}")
+    try:
+        return cv2.imdecode(data, flags)
+    except cv2.error:  # of damaged files, and of those that claim still more
+        return None
+
+
+def _claimed_size(head: bytes) -> tuple[int, int]:
+    """Width and height in the head of a PNG, BMP or JPEG file; 0 for what OpenCV judges alone."""
+    if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) >= 24:
+        width, height = struct.unpack(">II", head[16:24])
+        return width, height
+    if head[:2] == b"BM" and len(head) >= 26:
+        width, height = struct.unpack("<ii", head[18:26])
+        return abs(width), abs(height)
+    place = 2
+    while head[:2] == b"\xff\xd8" and place + 9 <= len(head) and head[place] == 0xFF:
+        kind, length = head[place + 1], int.from_bytes(head[place + 2 : place + 4], "big")
+        if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):  # start of frame
+            return int.from_bytes(head[place + 7 : place + 9], "big"), int.from_bytes(head[place + 5 : place + 7], "big")
+        place += 2 + max(length, 2)
+    return 0, 0
 
 
 def rgb_from_bgr(pixels: np.ndarray[Any, Any]) -> Tensor:
@@ -89,10 +145,9 @@ def write_image(path: str | Path, image: Tensor) -> None:
     Raises:
         ValueError: another shape, or a suffix that is no image's.
     """
-    if image.dim() != 3 or image.shape[0] != 3:
-        raise ValueError(f"image: expected (3, H, W), got {tuple(image.shape)}")
+    check_field("image", image)
     levels = torch.round(image.detach().clamp(0, 1) * 255).to(torch.uint8).cpu()
-    _write_pixels(Path(path), np.ascontiguousarray(levels.flip(0).permute(1, 2, 0).numpy()))
+    _write_pixels(check_path("path", path), np.ascontiguousarray(levels.flip(0).permute(1, 2, 0).numpy()))
 
 
 def image_to_bytes(image: Tensor) -> Tensor:
@@ -121,7 +176,7 @@ def image_from_bytes(data: Tensor, size: tuple[int, int], source: str) -> Tensor
     if header[:8] != b"\x89PNG\r\n\x1a\n" or len(header) < 24:
         raise ValueError(f"{source}: expected the bytes of a PNG")
     width, height = struct.unpack(">II", header[16:24])
-    pixels = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED) if (height, width) == size else None
+    pixels = decode_bytes(raw, cv2.IMREAD_UNCHANGED, source) if (height, width) == size else None
     if pixels is None or pixels.shape != (*size, 3) or pixels.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{source}: expected a whole colour PNG of {size[0]} x {size[1]}, got one that says {height} x {width}")
     levels: Tensor = torch.from_numpy(np.ascontiguousarray(pixels[:, :, ::-1].transpose(2, 0, 1)).astype(np.float64))
@@ -152,7 +207,10 @@ def read_depth_png(path: str | Path) -> Tensor:
     """Read what :func:`write_depth_png` wrote: (1, 1, H, W), mm."""
     import cv2
 
-    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    path = check_path("path", path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such image")
+    pixels = decode_image(path, cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 2:
         raise ValueError(f"{path}: expected a 16-bit grey PNG with depth")
     return (torch.from_numpy(pixels.astype(np.float32)) - DEPTH_PNG_ZERO)[None, None] * DEPTH_PNG_STEP_MM
@@ -162,7 +220,7 @@ def _write_pixels(path: Path, pixels: np.ndarray[Any, Any]) -> None:
     import cv2
 
     if path.suffix.lower() not in IMAGE_SUFFIXES:
-        raise ValueError(f"{path}: expected a name ending in {', '.join(IMAGE_SUFFIXES)}")
+        raise ValueError(f"{path}: expected a name ending in {', '.join(IMAGE_SUFFIXES)}, got {path.suffix!r}")
     with write_atomically(path) as temporary:
         if not cv2.imwrite(str(temporary), pixels):
             raise OSError(f"{path}: OpenCV could not write it")
@@ -176,7 +234,7 @@ def read_frames(source: str | Path) -> Iterator[tuple[str, Tensor]]:
     """
     path = Path(source)
     if path.is_dir():
-        files = sorted(p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+        files = image_files(path)
         if not files:
             raise ValueError(f"{path}: no images in this folder ({', '.join(IMAGE_SUFFIXES)})")
         return ((file.stem, read_image(file)) for file in files)
@@ -187,13 +245,18 @@ def read_frames(source: str | Path) -> Iterator[tuple[str, Tensor]]:
     return iter([(path.stem, read_image(path))])
 
 
+def image_files(folder: Path) -> list[Path]:
+    """Images of a folder by name; hidden ones, such as a killed writer leaves, are none."""
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+
+
 def count_frames(source: str | Path) -> int:
     """Number of frames that :func:`read_frames` will give (a video's own claim), for progress bars."""
     import cv2
 
     path = Path(source)
     if path.is_dir():
-        return sum(p.suffix.lower() in IMAGE_SUFFIXES for p in path.iterdir())
+        return len(image_files(path))
     if path.suffix.lower() in VIDEO_SUFFIXES:
         return max(0, int(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT)))
     return 1
@@ -230,20 +293,29 @@ def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     Raises:
         FileNotFoundError: no such file. ValueError: not a safetensors file, cut short, or not written by torchvts.
     """
-    path = Path(path)
+    path = check_path("path", path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
         with safetensors.safe_open(str(path), framework="pt") as stream:
             metadata = stream.metadata() or {}
             tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
-    except (safetensors.SafetensorError, struct.error, ValueError) as error:
+    except (
+        safetensors.SafetensorError,
+        struct.error,
+        ValueError,
+        TypeError,
+        KeyError,
+        AttributeError,
+        RuntimeError,
+        MemoryError,
+    ) as error:
         raise ValueError(f"{path}: not a safetensors file, or cut short: {error}") from error
     if "torchvts" not in metadata:
         raise ValueError(f"{path}: a safetensors file, but not one written by torchvts")
     try:
         described = json.loads(metadata["torchvts"])
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: its metadata is damaged: {error}") from error
     if not isinstance(described, dict):
         raise ValueError(f"{path}: its metadata is damaged: expected an object")

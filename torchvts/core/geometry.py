@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from .checks import check_batch, check_same_size
+from .checks import check_batch, check_positive, check_same_size, check_tensor
 
 MAX_SLOPE = 10.0
 """Largest |dz/dx|, |dz/dy| that ``gradient_from_normal`` returns, mm per mm: 84.3 degrees from flat."""
@@ -62,6 +62,8 @@ def gradient_from_normal(normal: Tensor, max_slope: float = MAX_SLOPE) -> Tensor
         tensor([[-10.]])
     """
     check_batch("normal", normal, 3)
+    if not torch.jit.is_scripting():
+        check_positive("max_slope", max_slope)
     n_xy = normal[:, 0:2]
     tilt = torch.sqrt((n_xy * n_xy).sum(1, keepdim=True) + 1e-24)  # the constant keeps the root's own slope finite at 0
     return -n_xy / torch.maximum(normal[:, 2:3], tilt / max_slope)
@@ -72,7 +74,7 @@ class GradientFromNormal(nn.Module):
 
     def __init__(self, max_slope: float = MAX_SLOPE) -> None:
         super().__init__()
-        self.max_slope = max_slope
+        self.max_slope = check_positive("max_slope", max_slope)
 
     def forward(self, normal: Tensor) -> Tensor:
         return gradient_from_normal(normal, self.max_slope)
@@ -94,6 +96,7 @@ def depth_to_points(depth_mm: Tensor, mm_per_pixel: float, contact: Tensor | Non
         tensor([-0.5000,  0.5000,  0.0000])
     """
     z = _one_frame("depth_mm", depth_mm)
+    check_positive("mm_per_pixel", mm_per_pixel)
     x, y = pixel_grid_mm(z.shape[0], z.shape[1], mm_per_pixel, z.dtype, z.device)
     points = torch.stack((x.expand_as(z), -y.expand_as(z), z), dim=-1)  # (H, W, 3)
     if contact is None:
@@ -104,6 +107,7 @@ def depth_to_points(depth_mm: Tensor, mm_per_pixel: float, contact: Tensor | Non
 
 
 def _one_frame(name: str, tensor: Tensor) -> Tensor:
+    check_tensor(name, tensor)
     if tensor.dim() < 2 or tensor.numel() != tensor.shape[-1] * tensor.shape[-2]:
         raise ValueError(f"{name}: expected one frame, (H, W) or (1, 1, H, W), got {tuple(tensor.shape)}: loop over the batch")
     return tensor.reshape(tensor.shape[-2], tensor.shape[-1])

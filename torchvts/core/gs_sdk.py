@@ -8,6 +8,7 @@ import csv
 import math
 import struct
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .checks import check_batch, check_positive
+from .checks import check_batch, check_path, check_positive, check_tensor
 from .files import read_image, rgb_from_bgr
 from .sensor import Sensor, _read_yaml
 
@@ -25,6 +26,10 @@ LABEL_COLUMNS = ("experiment_reldir", "diameter_mm", "center_x_px", "center_y_px
 SENSOR_KEYS = ("ppmm", "imgh", "imgw")
 SENSOR_KEYS_UNUSED = ("raw_imgh", "raw_imgw", "framerate", "device_name")
 """Keys of a gs_sdk sensor file that describe the camera behind the image, which :class:`Sensor` does not need."""
+
+
+MOST_TABLE_BYTES = 2**24
+"""A table of presses has some kilobytes."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +95,7 @@ def read_calibration_folder(folder: str | Path) -> GsSdkFolder:
         ...
         FileNotFoundError: no/such/folder: no such folder: expected one with catalog.csv and background.png
     """
-    folder = Path(folder)
+    folder = check_path("folder", folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder: expected one with catalog.csv and background.png")
     catalog, background_path = folder / "catalog.csv", folder / "background.png"
@@ -134,7 +139,7 @@ def read_labels(folder: str | Path) -> dict[str, tuple[float, float, float | Non
     Raises:
         FileNotFoundError: no such file. ValueError: empty, other columns, a bad number, a press named twice.
     """
-    path = Path(folder) / "labels.csv"
+    path = check_path("folder", folder) / "labels.csv"
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file: expected a table of {','.join(LABEL_COLUMNS)}")
     labels: dict[str, tuple[float, float, float | None]] = {}
@@ -290,6 +295,7 @@ def image_to_bgr(image: Tensor) -> np.ndarray[Any, Any]:
     Raises:
         ValueError: wrong shape or not finite. TypeError: not floating point.
     """
+    check_tensor("image", image)
     if image.dim() != 3:
         cause = "take one image of the batch with [0]" if image.dim() == 4 else "one RGB image is needed"
         raise ValueError(f"image: expected (3, H, W), got {tuple(image.shape)}: {cause}")
@@ -301,6 +307,8 @@ def image_to_bgr(image: Tensor) -> np.ndarray[Any, Any]:
 
 
 def _map(name: str, values: Tensor | np.ndarray[Any, Any]) -> Tensor:
+    if not isinstance(values, Tensor | np.ndarray):
+        raise TypeError(f"{name}: expected an array or a tensor, got {type(values).__name__}: gs_sdk's maps are float32 arrays")
     tensor = values if isinstance(values, Tensor) else torch.from_numpy(np.ascontiguousarray(values))
     if tensor.dim() != 2:
         raise ValueError(f"{name}: expected (H, W), got {tuple(tensor.shape)}: gs_sdk's maps have no batch and no channel")
@@ -318,6 +326,10 @@ def _frame(name: str, tensor: Tensor, channels: int) -> Tensor:
 
 def _read_table(path: Path, columns: tuple[str, ...]) -> list[tuple[int, dict[str, str]]]:
     """Rows of a CSV file with exactly these columns, each with its line number; blank lines are left out."""
+    if path.stat().st_size > MOST_TABLE_BYTES:
+        raise ValueError(
+            f"{path}: expected a table of at most {MOST_TABLE_BYTES} bytes, got {path.stat().st_size}: not a CSV table"
+        )
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
             reader = csv.reader(stream, strict=True)
@@ -389,7 +401,18 @@ def _read_label(path: Path) -> tuple[tuple[float, float], float]:
             radius = np.asarray(stored["radius"], dtype=np.float64).ravel()
     except KeyError as error:
         raise ValueError(f"{path}: expected the arrays 'center' and 'radius', one is missing: {error}") from error
-    except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile, struct.error) as error:
+    except (
+        ValueError,
+        TypeError,
+        OSError,
+        EOFError,
+        RuntimeError,
+        MemoryError,
+        OverflowError,
+        zipfile.BadZipFile,
+        struct.error,
+        zlib.error,
+    ) as error:
         raise ValueError(f"{path}: not a label of gs_sdk, or cut short: {error}") from error
     if center.shape != (2,) or radius.shape != (1,):
         raise ValueError(f"{path}: expected center (x, y) and one radius, got shapes {center.shape} and {radius.shape}")

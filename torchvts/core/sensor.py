@@ -11,7 +11,7 @@ import torch
 import yaml
 from torch import Tensor
 
-from .checks import check_batch, check_integer, check_numbers, check_positive, from_dict
+from .checks import check_batch, check_integer, check_numbers, check_path, check_positive, check_record, from_dict
 from .files import write_atomically
 from .response import SensorPrior
 
@@ -207,6 +207,12 @@ class Sensor:
             temporary.write_text("".join(f"{line}\n" for line in comment) + text, encoding="utf-8")
 
 
+def check_sensor(name: str, value: object) -> None:
+    """Raise unless ``value`` is a Sensor; a name or path is told the way."""
+    text = str(value) if isinstance(value, str | Path) else "gelsight_mini"
+    check_record(name, value, Sensor, f"load it by Sensor.load({text!r})")
+
+
 def shipped_sensors() -> list[str]:
     """Names that :meth:`Sensor.load` finds."""
     return sorted(path.stem for path in _shipped_folder().glob("*.yaml"))
@@ -219,31 +225,49 @@ def _shipped_folder() -> Path:
 
 
 def _find(source: str | Path) -> Path:
-    path = Path(source)
+    path = check_path("source", source)
     if path.suffix in (".yaml", ".yml"):
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such sensor file")
         return path
     if str(source) in shipped_sensors():
         return _shipped_folder() / f"{source}.yaml"
-    raise FileNotFoundError(f"sensor {str(source)!r}: expected a path ending in .yaml, or one of {', '.join(shipped_sensors())}")
+    raise FileNotFoundError(
+        f"source: expected a path ending in .yaml, or one of {', '.join(shipped_sensors())}, got {str(source)!r}"
+    )
+
+
+MOST_YAML_BYTES = 2**17
+"""A sensor file has some kilobytes."""
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """Safe YAML that refuses a key given twice."""
+    """Safe YAML that refuses a key given twice, and aliases, by which some lines stand for gigabytes."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.events.AliasEvent):
+            mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
+            raise yaml.composer.ComposerError(None, None, "an alias (*): write the value itself", mark)
+        return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        for key in keys:
-            if keys.count(key) > 1:
-                raise yaml.constructor.ConstructorError(None, None, f"key {key!r}: given twice", node.start_mark)
+        seen: set[str] = set()
+        for key, _ in node.value:
+            name = repr(self.construct_object(key, deep=True))
+            if name in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"key {name}: given twice", node.start_mark)
+            seen.add(name)
         return super().construct_mapping(node, deep)
 
 
 def _read_yaml(path: Path) -> Any:
+    if path.stat().st_size > MOST_YAML_BYTES:
+        raise ValueError(
+            f"{path}: expected a file of at most {MOST_YAML_BYTES} bytes, got {path.stat().st_size}: not a sensor file"
+        )
     try:
         return yaml.load(path.read_text(encoding="utf-8"), Loader=_StrictLoader)  # a SafeLoader
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError, AttributeError, TypeError) as error:
         raise ValueError(f"{path}: not a YAML file: {error}") from error
 
 

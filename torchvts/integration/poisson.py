@@ -8,7 +8,7 @@ exact inverses of one discrete operator.
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_batch, check_window
+from ..core.checks import check_batch, check_positive, check_window
 from .transforms import (
     cosine_bases,
     cosine_tables,
@@ -33,7 +33,7 @@ def divergence(gradient: Tensor) -> Tensor:
     Returns:
         (B, 1, H, W), in the gradient's unit per pixel.
     """
-    check_batch("gradient", gradient, 2)
+    _check(gradient, 2)
     p, q = gradient[:, 0:1], gradient[:, 1:2]
     first, last = p[..., :1] + p[..., 1:2], p[..., -1:] + p[..., -2:-1]
     along_x = torch.cat((first, p[..., 2:] - p[..., :-2], -last), dim=3)
@@ -62,6 +62,8 @@ def poisson_dst(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
         torch.Size([1, 1, 8, 8])
     """
     _check(gradient, 3)
+    if not torch.jit.is_scripting():
+        check_positive("mm_per_pixel", mm_per_pixel)
     return _integrate_dst(gradient, mm_per_pixel, _plan_dst(gradient))
 
 
@@ -86,6 +88,8 @@ def poisson_dct(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
         True
     """
     _check(gradient, 2)
+    if not torch.jit.is_scripting():
+        check_positive("mm_per_pixel", mm_per_pixel)
     return _integrate_dct(gradient, mm_per_pixel, _plan_dct(gradient, gradient.shape[2], gradient.shape[3]), 0, 0)
 
 
@@ -115,7 +119,7 @@ class PoissonDST(nn.Module):
 
     def __init__(self, mm_per_pixel: float = 1.0) -> None:
         super().__init__()
-        self.mm_per_pixel = mm_per_pixel
+        self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         self._plan: list[Tensor] = _plan_dst(torch.zeros(1, 2, 3, 3))
 
     def forward(self, gradient: Tensor) -> Tensor:
@@ -138,7 +142,7 @@ class PoissonDCT(nn.Module):
 
     def __init__(self, mm_per_pixel: float = 1.0) -> None:
         super().__init__()
-        self.mm_per_pixel = mm_per_pixel
+        self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         self._plan: list[Tensor] = _plan_dct(torch.zeros(1, 2, 2, 2), 2, 2)
 
     def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:

@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_batch, check_integer, check_same_size
+from ..core.checks import check_batch, check_field, check_integer, check_least, check_same_size, check_tensor
 from ..core.files import load_tensors, save_tensors
 from ..core.geometry import normal_from_gradient
 
@@ -44,7 +44,9 @@ class NormalFromLookup(nn.Module):
 
     def __init__(self, flat: Tensor, table: Tensor, step: Tensor, zero_index: Tensor) -> None:
         super().__init__()
-        _check_flat(flat)
+        check_field("flat", flat)
+        for name, value in (("table", table), ("step", step), ("zero_index", zero_index)):
+            check_tensor(name, value)
         if table.dim() != 4 or tuple(table.shape) != (table.shape[0],) * 3 + (2,) or table.shape[0] < 3:
             raise ValueError(f"table: expected (n, n, n, 2) with n of 3 or more, got {tuple(table.shape)}")
         if tuple(step.shape) != (3,) or not bool((step > 0).all()) or not bool(torch.isfinite(step).all()):
@@ -110,12 +112,11 @@ class NormalFromLookup(nn.Module):
             Yuan, Dong, Adelson, Sensors 17(12) 2762, 2017; the filling is normalised convolution, Knutsson and Westin,
             CVPR 1993.
         """
-        _check_flat(flat)
+        check_field("flat", flat)
         check_integer("bins", bins, 3)
         if bins > 128:
             raise ValueError(f"bins: expected at most 128, got {bins}: the table holds bins^3 slopes")
-        if not (isinstance(smoothing, (int, float)) and 0.0 <= smoothing <= bins):
-            raise ValueError(f"smoothing: expected a number of bins in [0, {bins}], got {smoothing}")
+        check_least("smoothing", smoothing, 0.0, bins)
         _check_samples("change", change, 3)
         _check_samples("slope", slope, 2)
         if change.shape[0] != slope.shape[0]:
@@ -179,16 +180,6 @@ def _gaussian(volume: Tensor, width: float) -> Tensor:
         lines = turned.reshape(-1, 1, turned.shape[3])
         volume = nn.functional.conv1d(lines, kernel, padding=reach).reshape(turned.shape).movedim(3, axis)
     return volume
-
-
-def _check_flat(flat: Tensor) -> None:
-    if not isinstance(flat, Tensor) or flat.dim() != 3 or flat.shape[0] != 3:
-        got = tuple(flat.shape) if isinstance(flat, Tensor) else type(flat).__name__
-        raise ValueError(f"flat: expected one image of the flat skin, (3, H, W), got {got}: take one of the batch with [0]")
-    if not flat.is_floating_point():
-        raise TypeError(f"flat: expected a floating-point image, got {flat.dtype}: divide by 255")
-    if not bool(torch.isfinite(flat).all()):
-        raise ValueError("flat: expected finite values, got NaN or infinite: a camera or an upstream division failed")
 
 
 def _check_samples(name: str, values: Tensor, columns: int) -> None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from ..core.checks import check_batch, check_integer, check_range, check_same_size
+from ..core.checks import check_batch, check_field, check_integer, check_least, check_path, check_range, check_same_size
 from ..core.files import load_tensors, save_tensors
 from ..core.geometry import normal_from_gradient
 
@@ -98,6 +98,8 @@ class NormalFromMLP(nn.Module):
 
     def gradient_px(self, image: Tensor) -> Tensor:
         """What the network says, (B, 2, H, W): gs_sdk's d(H)/dx, d(H)/dy, before the flat skin's is subtracted."""
+        check_batch("image", image, 3)
+        check_same_size("image", image, "the calibration", self.height, self.width)
         x = torch.arange(self.width, dtype=image.dtype, device=image.device) / self.width
         y = torch.arange(self.height, dtype=image.dtype, device=image.device) / self.height
         shape = (image.shape[0], 1, self.height, self.width)
@@ -157,7 +159,7 @@ class NormalFromMLP(nn.Module):
             FileNotFoundError: no such file. ValueError: cut short or no file of weights, wrong names or shapes, not finite, no
                 flat image or one of a wrong shape or range. TypeError: flat is not floating point.
         """
-        path = Path(path)
+        path = check_path("path", path)
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such file")
         described: dict[str, Any] = {}
@@ -167,7 +169,13 @@ class NormalFromMLP(nn.Module):
             if described.get("kind") != MLP_KIND or "flat" not in state or described.get("output") not in OUTPUTS:
                 raise ValueError(f"{path}: expected a network that NormalFromMLP.save wrote, got {described.get('kind')!r}")
             stored = state.pop("flat")
-            flat = stored if flat is None else flat
+            if flat is None:
+                flat = stored
+                try:
+                    check_field("flat", flat)
+                    check_range("flat", flat)
+                except (TypeError, ValueError) as error:
+                    raise ValueError(f"{path}: damaged: {error}") from error
         else:
             state = _read_state(path)
         if flat is None:
@@ -188,7 +196,7 @@ class NormalFromMLP(nn.Module):
             ValueError: the name does not end in .safetensors. FileNotFoundError: the folder is missing.
         """
         if Path(path).suffix != ".safetensors":
-            raise ValueError(f"{path}: expected a name ending in .safetensors")
+            raise ValueError(f"{path}: expected a name ending in .safetensors, got {Path(path).suffix!r}")
         save_tensors(path, {**self.gs_sdk_state(), "flat": self.flat}, {"kind": MLP_KIND, "output": self.output})
 
     def gs_sdk_state(self) -> dict[str, Tensor]:
@@ -271,8 +279,7 @@ def fit_mlp(
     _check_samples(intensity, xy, slope, groups)
     for name, value in (("max_epochs", max_epochs), ("patience", patience), ("batch_size", batch_size)):
         check_integer(name, value, 1)
-    if not (math.isfinite(weight_decay) and weight_decay >= 0.0):
-        raise ValueError(f"weight_decay: expected a number of at least 0, got {weight_decay}")
+    check_least("weight_decay", weight_decay), check_least("held_out", held_out, 0.0, 1.0)
     if not 0.0 < held_out < 1.0:
         raise ValueError(f"held_out: expected a share of the presses in (0, 1), got {held_out}")
     if not isinstance(flat, Tensor) or flat.dim() != 3:
@@ -407,7 +414,8 @@ def _check_samples(intensity: Tensor, xy: Tensor, slope: Tensor, groups: Tensor)
             got = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
             raise ValueError(f"{name}: expected {shape}, one row for each of the {count} pixels of intensity, got {got}")
     if not intensity.is_floating_point() or not slope.is_floating_point():
-        raise TypeError(f"intensity, slope: expected floating point, got {intensity.dtype} and {slope.dtype}: divide by 255")
+        name, values = ("slope", slope) if intensity.is_floating_point() else ("intensity", intensity)
+        raise TypeError(f"{name}: expected floating point, got {values.dtype}: images are value / 255")
     check_range("intensity", intensity)
     if not bool(torch.isfinite(xy).all()):
         raise ValueError("xy: expected finite pixels, got NaN or infinite")

@@ -5,9 +5,20 @@ import math
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import QUANTISATION_STD, check_batch, check_window, may_read_values
+from ..core.checks import (
+    QUANTISATION_STD,
+    check_batch,
+    check_camera_height,
+    check_integer,
+    check_record,
+    check_same_size,
+    check_shape,
+    check_size,
+    check_window,
+    may_read_values,
+)
 from ..core.geometry import gradient_from_normal, normal_from_gradient
-from ..record import Calibration
+from ..record import Calibration, check_calibration
 from ..shading import PointLights, flat_image, gloss_lobe, inverse_light_matrix, light_matrix, seen_at
 
 CLIFF_SLOPE = 2.0
@@ -125,15 +136,21 @@ class NormalFromIntensity(nn.Module):
         camera_height_mm: float = math.inf,
     ) -> None:
         super().__init__()
+        check_record("lights", lights, PointLights, "PointLights(position_mm, albedo) makes them")
+        check_size(height, width, mm_per_pixel)
         self.mm_per_pixel = mm_per_pixel
-        self.camera_height_mm = float(camera_height_mm)
+        self.camera_height_mm = check_camera_height(camera_height_mm)
         position, albedo = lights.position_mm.detach(), lights.albedo.detach()
         if inverse is None:
             inverse = inverse_light_matrix(position.new_zeros(1, 1, height, width), position, albedo, mm_per_pixel)[0]
-        if tuple(inverse.shape) != (3, 3, height, width):
-            raise ValueError(f"inverse: expected (3, 3, {height}, {width}), got {tuple(inverse.shape)}")
+        check_shape("inverse", inverse, (3, 3, height, width))
+        if bool(torch.isnan(inverse).all()):  # infinite it is of lights in one plane, which unit length still helps
+            raise ValueError("inverse: expected numbers, got NaN: was it made of a broken calibration?")
         self.lights = PointLights(position, albedo, lights.gloss).requires_grad_(False)
         noise = torch.full((3,), QUANTISATION_STD) if noise_std is None else noise_std
+        check_shape("noise_std", noise, (3,))
+        if not bool((noise > 0).all()):
+            raise ValueError(f"noise_std: expected values above 0, got {noise.tolist()}")
         self.noise_std = float(noise.square().mean().sqrt())
         self.register_buffer("inverse", inverse.detach().clone())
         self.register_buffer("dark_below", 3.0 * noise.detach().to(inverse.dtype))
@@ -146,12 +163,15 @@ class NormalFromIntensity(nn.Module):
         flat = flat_image(self.lights, height, width, mm_per_pixel).to(inverse.dtype)
         below = self.dark_below.reshape(3, 1, 1)
         self.register_buffer("dark_where", torch.where(flat > 2.0 * below, below, -torch.inf))
+        if full_above is not None:
+            check_shape("full_above", full_above, flat.shape)
         full = torch.full_like(flat, torch.inf) if full_above is None else full_above.detach().to(inverse.dtype)
         self.register_buffer("full_above", full)
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, camera_height_mm: float = math.inf) -> "NormalFromIntensity":
         """The block of a unit calibrated by lights."""
+        check_calibration("calibration", calibration)
         if calibration.lights is None:
             raise ValueError("calibration: expected one by lights, got one by response fields: use NormalFromResponse")
         sensor, gain = calibration.sensor, calibration.gain
@@ -172,6 +192,9 @@ class NormalFromIntensity(nn.Module):
         height, width = self.inverse.shape[2], self.inverse.shape[3]
         top, left = check_window("compensated", compensated, (height, width), window)
         bottom, right = top + compensated.shape[2], left + compensated.shape[3]
+        if depth_mm is not None:
+            check_batch("depth_mm", depth_mm, 1)
+            check_same_size("depth_mm", depth_mm, "compensated", compensated.shape[2], compensated.shape[3])
         position: Tensor = self.lights.position_mm
         albedo = self.lights.albedo
         axis = (0.0, 0.0)
@@ -207,6 +230,7 @@ class NormalFromIntensity(nn.Module):
 
     def coarse(self, stride: int) -> "NormalFromIntensity":
         """The same for an image of every ``stride``-th pixel."""
+        check_integer("stride", stride, 1)
         height, width = self.inverse.shape[2], self.inverse.shape[3]
         rows, columns = len(range(stride // 2, height, stride)), len(range(stride // 2, width, stride))
         coarse = NormalFromIntensity(

@@ -5,10 +5,10 @@ import copy
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_batch, check_window
+from ..core.checks import check_batch, check_integer, check_positive, check_record, check_same_size, check_size, check_window
 from ..core.geometry import normal_from_gradient
 from ..core.response import CHANGE_SCALE, ResponseField
-from ..record import Calibration
+from ..record import Calibration, check_calibration
 
 
 class NormalFromResponse(nn.Module):
@@ -45,7 +45,14 @@ class NormalFromResponse(nn.Module):
         dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__()
-        self.max_slope = max_slope
+        check_record("fast", fast, ResponseField)
+        check_size(height, width, mm_per_pixel)
+        if precise is not None:
+            check_record("precise", precise, ResponseField)
+        for name, field, uses in (("fast", fast, False), ("precise", precise, True)):
+            if field is not None and field.uses_depth != uses:
+                raise ValueError(f"{name}: expected a field with uses_depth={uses}, got uses_depth={field.uses_depth}")
+        self.max_slope = check_positive("max_slope", max_slope)
         self.uses_depth = precise is not None
         self.passes = 2
         self.register_buffer("fast_maps", _maps(fast, height, width, mm_per_pixel).to(dtype))
@@ -55,6 +62,7 @@ class NormalFromResponse(nn.Module):
     @classmethod
     def from_calibration(cls, calibration: Calibration) -> "NormalFromResponse":
         """The block of a unit calibrated by response fields."""
+        check_calibration("calibration", calibration)
         response, sensor = calibration.response, calibration.sensor
         if response is None:
             raise ValueError("calibration: expected one by response fields, got one by lights: use NormalFromIntensity")
@@ -71,6 +79,8 @@ class NormalFromResponse(nn.Module):
         if depth_mm is not None:
             if not self.uses_depth:
                 raise ValueError("depth_mm: expected None, because this response has no field with depth: use mode 'fast'")
+            check_batch("depth_mm", depth_mm, 1)
+            check_same_size("depth_mm", depth_mm, "compensated", compensated.shape[2], compensated.shape[3])
             inputs.append(depth_mm.to(change.dtype).expand_as(inputs[0]))
             maps = self.precise_maps
         maps = maps[:, :, top : top + compensated.shape[2], left : left + compensated.shape[3]]
@@ -90,6 +100,7 @@ class NormalFromResponse(nn.Module):
 
     def coarse(self, stride: int) -> "NormalFromResponse":
         """The same for an image of every ``stride``-th pixel."""
+        check_integer("stride", stride, 1)
         other = copy.deepcopy(self)
         for name in ("fast_maps", "precise_maps"):
             setattr(other, name, getattr(other, name)[..., stride // 2 :: stride, stride // 2 :: stride].clone())

@@ -1,4 +1,4 @@
-"""Point clouds of contacts, thinned evenly, and their PCD and PLY files, by Open3D."""
+"""Point clouds of contacts, thinned evenly, and their PCD and PLY files, written by Open3D."""
 
 import ctypes
 from pathlib import Path
@@ -9,12 +9,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from ..core.checks import check_integer
+from ..core.checks import check_integer, check_path, check_positive, check_tensor
 from ..core.files import write_atomically
 from ..core.geometry import depth_to_points
+from .cloud_formats import read_columns
 from .relief import Frame, contact_of, sure_contact
 
 CLOUD_SUFFIXES = (".pcd", ".ply")
+NORMAL_NAMES = {".pcd": ("normal_x", "normal_y", "normal_z"), ".ply": ("nx", "ny", "nz")}
 
 
 def contact_cloud(frame: Frame, mm_per_pixel: float, most: int | None = 1000) -> tuple[Tensor, Tensor]:
@@ -31,6 +33,7 @@ def contact_cloud(frame: Frame, mm_per_pixel: float, most: int | None = 1000) ->
     Raises:
         ValueError: not one frame, values not finite, or no contact deeper than the noise.
     """
+    check_positive("mm_per_pixel", mm_per_pixel)
     depth, gradient, contact = contact_of(frame, "frame")
     inside = sure_contact(depth, gradient, contact, mm_per_pixel)
     if not bool(inside.any()):
@@ -99,9 +102,9 @@ def write_point_cloud(path: str | Path, points: Tensor, normals: Tensor | None =
     Raises:
         ValueError: wrong shape, no points, values not finite, or another suffix. ImportError: without the extra ``pose``.
     """
-    path = Path(path)
+    path = check_path("path", path)
     if path.suffix.lower() not in CLOUD_SUFFIXES:
-        raise ValueError(f"{path}: expected a name ending in {' or '.join(CLOUD_SUFFIXES)}")
+        raise ValueError(f"{path}: expected a name ending in {' or '.join(CLOUD_SUFFIXES)}, got {path.suffix!r}")
     o3d = open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(_array("points", points, None)))
     if normals is not None:
@@ -115,23 +118,30 @@ def read_point_cloud(path: str | Path) -> tuple[Tensor, Tensor | None]:
     """Read a .pcd or .ply file: points (N, 3) float64, and normals (N, 3) if it has them.
 
     Raises:
-        FileNotFoundError: no such file. ValueError: not a cloud, or an empty one. ImportError: without the extra ``pose``.
+        FileNotFoundError: no such file. ValueError: not a cloud, cut short, or an empty one.
     """
-    path = Path(path)
+    path = check_path("path", path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such point cloud")
     if path.suffix.lower() not in CLOUD_SUFFIXES:
-        raise ValueError(f"{path}: expected a name ending in {' or '.join(CLOUD_SUFFIXES)}")
-    o3d = open3d()
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        cloud = o3d.io.read_point_cloud(str(path))
-    points = torch.from_numpy(np.asarray(cloud.points).copy())
-    if len(points) == 0:
-        raise ValueError(f"{path}: no points could be read: not a point cloud, cut short, or empty")
-    return points, torch.from_numpy(np.asarray(cloud.normals).copy()) if cloud.has_normals() else None
+        raise ValueError(f"{path}: expected a name ending in {' or '.join(CLOUD_SUFFIXES)}, got {path.suffix!r}")
+    try:
+        columns = read_columns(path)
+        groups = [
+            [columns[name] for name in names]
+            for names in (("x", "y", "z"), NORMAL_NAMES[path.suffix.lower()])
+            if names[0] in columns
+        ]
+    except (ValueError, KeyError) as error:
+        raise ValueError(f"{path}: no points could be read: {error}") from error
+    if "x" not in columns:
+        raise ValueError(f"{path}: no points could be read: it has no x, y, z")
+    points = torch.from_numpy(np.stack(groups[0], axis=1))
+    return points, torch.from_numpy(np.stack(groups[1], axis=1)) if len(groups) > 1 else None
 
 
 def _array(name: str, values: Tensor, length: int | None) -> "np.ndarray[Any, Any]":
+    check_tensor(name, values)
     if values.dim() != 2 or values.shape[1] != 3 or len(values) == 0 or (length is not None and len(values) != length):
         raise ValueError(
             f"{name}: expected ({'N' if length is None else length}, 3) with N above 0, got {tuple(values.shape)}: no contact?"

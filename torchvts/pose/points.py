@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, unfold
 
+from ..core.checks import check_tensor
 from .ambiguity import free_directions, name_directions
 from .clouds import open3d, thin, voxel_first
 from .direct import UNKNOWN_VARIANCE, align, rigid
@@ -239,6 +240,7 @@ def _checked(name: str, points: Tensor, normals: Tensor | None) -> tuple[Tensor,
     if not bool(torch.isfinite(points).all()):
         raise ValueError(f"{name}: expected finite points, got {int((~torch.isfinite(points)).any(1).sum())} with NaN or infinity")
     if normals is not None:
+        check_tensor(f"{name}_normals", normals)
         if tuple(normals.shape) != tuple(points.shape):
             raise ValueError(f"{name}_normals: expected {tuple(points.shape)} like the points, got {tuple(normals.shape)}")
         normals = torch.nn.functional.normalize(normals.detach().cpu().double(), dim=1)

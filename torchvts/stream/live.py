@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_integer, check_positive
+from ..core.checks import check_choice, check_integer, check_positive
 from ..core.files import rgb_from_bgr
 from ..core.sensor import Sensor
-from ..pipeline import DepthOutput, DepthPipeline
+from ..pipeline import MODES, DepthOutput, DepthPipeline
 from ..record import Calibration
 from .rest import TIME_CONSTANT_S, FollowLight, calibrate_at_rest, contact_in_video, given_at_rest, rest_image
 from .sources import NewestFrame, Pixels, Reader, Rectify, Replay, open_source
@@ -78,6 +78,12 @@ class StageClock:
         return {name: float(np.median([frame[name] for frame in self._frames if name in frame])) for name in names}
 
 
+def _reader(source: Reader) -> Reader:
+    if not callable(getattr(source, "read", None)):
+        raise TypeError(f"source: expected a path, a camera's index or a Reader, got {type(source).__name__}")
+    return source
+
+
 class TactileStream:
     """Depth of every frame of a camera, a video or a folder of images.
 
@@ -116,6 +122,7 @@ class TactileStream:
         time_constant_s: float = TIME_CONSTANT_S,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        check_choice("mode", mode, MODES)
         check_integer("background_frames", background_frames, 3)
         check_positive("time_constant_s", time_constant_s)
         given = sensor_or_calibration if isinstance(sensor_or_calibration, Calibration) else None
@@ -124,7 +131,7 @@ class TactileStream:
                 f"sensor_or_calibration: expected a Sensor or a Calibration, got {type(sensor_or_calibration).__name__}"
             )
         sensor = sensor_or_calibration.sensor if isinstance(sensor_or_calibration, Calibration) else sensor_or_calibration
-        self.reader: Reader = open_source(source) if isinstance(source, str | int | Path) else source
+        self.reader: Reader = open_source(source) if isinstance(source, str | int | Path) else _reader(source)
         self._newest: NewestFrame | None = None
         self._hooks: list[Any] = []
         try:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..core.checks import check_positive
+from ..core.checks import check_path, check_positive, check_record
 from ..core.files import write_atomically
 from .live import TactileFrame, TactileStream
 from .sources import Pixels
@@ -98,7 +98,7 @@ class VideoFile:
     """
 
     def __init__(self, path: str | Path, fps: float) -> None:
-        self.path, self.fps = Path(path), check_positive("fps", fps)
+        self.path, self.fps = check_path("video", path), check_positive("fps", fps)
         if self.path.suffix.lower() not in CODES:
             raise ValueError(f"video: expected a name ending in {' or '.join(CODES)}, got {self.path.name!r}")
         self._file: Any = None
@@ -141,6 +141,7 @@ class StreamReport:
     HEADER = "frame,time_s,contact_mm2,deepest_mm,light"
 
     def __init__(self, stream: TactileStream, clock: Callable[[], float] = time.perf_counter) -> None:
+        check_record("stream", stream, TactileStream)
         self.stream, self._clock = stream, clock
         self.rows: list[tuple[int, float, float, float, str]] = []
         self._begin = self._end = clock()

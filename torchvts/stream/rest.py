@@ -12,10 +12,10 @@ from ..calibration.calibrate import GIVEN_MISFIT
 from ..calibration.contacts import ROUGH, channel_structure
 from ..calibration.lights import LOOSE_DEG
 from ..contact import ContactMask
-from ..core.checks import check_batch, check_positive
+from ..core.checks import check_batch, check_field, check_least, check_positive, check_range, check_same_size, check_shape
 from ..core.geometry import pixel_grid_mm
 from ..core.response import CHANGE_SCALE, ResponseField, ResponseModel
-from ..core.sensor import Sensor
+from ..core.sensor import Sensor, check_sensor
 from ..record import PEDESTAL, Calibration
 
 TIME_CONSTANT_S = 1.0
@@ -116,6 +116,11 @@ class FollowLight:
 
     def __init__(self, background: Tensor, time_constant_s: float = TIME_CONSTANT_S) -> None:
         self.time_constant_s = check_positive("time_constant_s", time_constant_s)
+        check_field("background", background)
+        check_range("background", background)
+        if min(background.shape[1:]) < 4:
+            raise ValueError(f"background: expected H and W of at least 4, got {tuple(background.shape)}: too small for cells")
+        self.size = (background.shape[1], background.shape[2])
         self.cell = max(2, background.shape[1] // 24)
         self.plane = torch.tensor([[1.0, 0.0, 0.0]] * 3, dtype=torch.float64)
         self.set_rest(background[None])
@@ -138,6 +143,7 @@ class FollowLight:
 
     def correct(self, image: Tensor) -> Tensor:
         """(1, 3, H, W) as it would be in the background's light."""
+        self._check(image)
         if float((self.plane - torch.tensor([1.0, 0.0, 0.0])).abs().max()) < 1e-5:
             return image
         level, tilt_x, tilt_y = (self.plane[:, k, None, None].to(image.dtype) for k in range(3))
@@ -145,6 +151,9 @@ class FollowLight:
 
     def update(self, image: Tensor, contact: Tensor, seconds: float) -> str:
         """Learn from a frame (1, 3, H, W) as the camera gave it, its contact, and the time since the last; returns the state."""
+        self._check(image)
+        check_shape("contact", contact, (1, 1, *self.size), "image")
+        check_least("seconds", seconds, -np.inf)
         cells, missing = self._missing(image)
         touched = nn.functional.max_pool2d(contact.float(), self.cell)
         near = nn.functional.max_pool2d(touched, 3, 1, 1)[0, 0] > 0
@@ -169,15 +178,21 @@ class FollowLight:
 
     def set_rest(self, image: Tensor) -> None:
         """Take an image (1, 3, H, W) in the background's light for what cells look like at rest, printed markers and all."""
+        self._check(image)
         rest = nn.functional.avg_pool2d(image, self.cell)[0].double()
         self._rest = rest + PEDESTAL
         self._judged = (rest > 0.06) & (rest < 0.97)
 
     def start(self, image: Tensor) -> None:
         """Take over the light of an image (1, 3, H, W) that is known to be at rest."""
+        self._check(image)
         for _ in range(3):
             cells, missing = self._missing(image)
             self.plane += self._fit(missing, self._judged & (cells < 0.97)) * self.plane[:, :1]
+
+    def _check(self, image: Tensor) -> None:
+        check_batch("image", image, 3)
+        check_same_size("image", image, "the background", *self.size)
 
     def _missing(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Cells of an image, and how far they are off the light followed so far, relative to it."""
@@ -223,6 +238,7 @@ def calibrate_at_rest(background: Tensor, sensor: Sensor) -> AtRest:
         >>> calibrate_at_rest(flat_image(lights, 48, 64, 0.6).detach(), Sensor("rig", 48, 64, 0.6)).metric
         True
     """
+    check_sensor("sensor", sensor)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         calibration = calibrate(background, sensor)

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_batch
-from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES
-from ..core.sensor import Sensor
+from ..core.checks import check_batch, check_integer, check_path
+from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, decode_image, image_files
+from ..core.sensor import Sensor, check_sensor
 
 Pixels = np.ndarray[Any, Any]
 
@@ -65,17 +65,21 @@ class FolderReader:
 
     def __init__(self, folder: Path, fps: float = 30.0) -> None:
         self.name, self.live, self.fps = str(folder), False, fps
-        files = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+        files = image_files(folder)
         if not files:
-            raise ValueError(f"source: {folder}: no images in this folder ({', '.join(IMAGE_SUFFIXES)})")
+            raise ValueError(
+                f"source: expected a folder of images ({', '.join(IMAGE_SUFFIXES)}), got {folder}: no images in this folder"
+            )
         self._files = iter(files)
 
     def read(self) -> Pixels | None:
         import cv2
 
         for path in self._files:
-            data = np.fromfile(path, dtype=np.uint8)
-            pixels = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+            try:
+                pixels = decode_image(path, cv2.IMREAD_COLOR)
+            except (ValueError, OSError):
+                pixels = None
             if pixels is not None:
                 return pixels
             warnings.warn(f"source: {path}: left out: not an image, or cut short", stacklevel=2)
@@ -91,13 +95,17 @@ def open_source(source: str | int | Path) -> Reader:
     Raises:
         FileNotFoundError: nothing there. OSError: no such camera. ValueError: not a video, or no images; all name ``source``.
     """
+    if not isinstance(source, int) or isinstance(source, bool):
+        check_path("source", source)
     if isinstance(source, int) or str(source).isdigit():
         return CaptureReader(int(str(source)))
     path = Path(source)
     if path.is_dir():
         return FolderReader(path)
     if not path.is_file():
-        raise FileNotFoundError(f"source: {path}: no such file or folder, and no camera's index (digits)")
+        raise FileNotFoundError(
+            f"source: expected a file, a folder or a camera's index (digits), got {path}: no such file or folder"
+        )
     if path.suffix.lower() not in VIDEO_SUFFIXES:
         raise ValueError(f"source: {path}: expected a video ({', '.join(VIDEO_SUFFIXES)}), a folder of images or a camera's index")
     return CaptureReader(path)
@@ -190,6 +198,8 @@ class Rectify(nn.Module):
 
     def __init__(self, sensor: Sensor, height: int, width: int) -> None:
         super().__init__()
+        check_sensor("sensor", sensor)
+        check_integer("height", height, 1), check_integer("width", width, 1)
         self.sensor = sensor
         self.frame_size = (height, width)
         sensor.rectify(torch.zeros(1, 3, height, width))  # raises where it does not fit

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from .core.checks import check_integer, check_positive
 from .core.geometry import normal_from_gradient, pixel_grid_mm
-from .shading import PointLights, near_field_shading
+from .shading import PointLights, cast_shadows, near_field_shading
 
 Segment = tuple[tuple[float, float], tuple[float, float]]
 """Start and end, (x, y) in mm."""
@@ -47,8 +47,19 @@ def surface(
     check_integer("height", height, 3), check_integer("width", width, 3)
     check_positive("mm_per_pixel", mm_per_pixel)
     x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
-    x = x.expand(height, width).clone().requires_grad_()
-    y = y.expand(height, width).clone().requires_grad_()
+    return surface_at(depth_mm, x.expand(height, width), y.expand(height, width), mm_per_pixel, dtype)
+
+
+def surface_at(
+    depth_mm: Callable[[Tensor, Tensor], Tensor], x: Tensor, y: Tensor, mm_per_pixel: float, dtype: torch.dtype = torch.float32
+) -> Scene:
+    """:func:`surface`, at any positions: what pixels see that do not look straight down at an even grid.
+
+    Args:
+        depth_mm: as for :func:`surface`. x, y: (H, W) float64, where each pixel meets the skin, mm.
+        mm_per_pixel: the pitch that is called the scene's, mm.
+    """
+    x, y = x.clone().requires_grad_(), y.clone().requires_grad_()
     with torch.enable_grad():
         depth = depth_mm(x, y)
         p, q = torch.autograd.grad(depth.sum(), (x, y))
@@ -210,6 +221,7 @@ def render(
     gamma: float = 1.0,
     vignetting: float = 0.0,
     spots: Tensor | None = None,
+    shadows: bool = False,
     seed: int = 0,
 ) -> Tensor:
     """The camera image of a scene: shading, then what optics, skin and sensor do to it, in that order.
@@ -222,11 +234,14 @@ def render(
         gamma: the camera's response, value = light^(1/gamma).
         vignetting: relative loss of light in the image corners.
         spots: (1, 1, H, W) factor on the skin's albedo from :func:`skin_spots`; zero is a dead pixel.
+        shadows: whether the relief casts shadows, :func:`torchvts.shading.cast_shadows`.
         seed: of the noise.
     Returns:
         (1, 3, H, W) in [0, 1].
     """
     image = near_field_shading(scene.depth_mm, scene.normal, lights, scene.mm_per_pixel)
+    if shadows:
+        image = image * cast_shadows(scene.depth_mm, lights, scene.mm_per_pixel)
     if vignetting:
         x, y = pixel_grid_mm(image.shape[2], image.shape[3], 1.0, image.dtype)
         image = image * (1.0 - vignetting * (x**2 + y**2) / float(x.max() ** 2 + y.max() ** 2))

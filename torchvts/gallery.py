@@ -183,15 +183,18 @@ def _specks(severity: float, seed: int) -> Conditions:
 
 
 def _worn(severity: float, seed: int) -> Conditions:
-    """A smooth pattern of unit amplitude and periods of 5 to 20 mm, darker by up to twice ``severity``."""
+    """Smooth stains, darker by up to twice ``severity``: three parts of a common pattern to one of each channel's own."""
     generator = torch.Generator().manual_seed(2000 + seed)
     x, y = pixel_grid_mm(HEIGHT, WIDTH, MM_PER_PIXEL)
-    pattern = torch.zeros(HEIGHT, WIDTH)
-    for draw in torch.rand(6, 3, generator=generator):
-        wave, angle = 2.0 * math.pi / (5.0 + 15.0 * float(draw[0])), 2.0 * math.pi * float(draw[1])
-        pattern += torch.sin(wave * (x * math.cos(angle) + y * math.sin(angle)) + 2.0 * math.pi * float(draw[2]))
-    pattern = pattern / pattern.abs().max()
-    return replace(USUAL, albedo=(1.0 - severity * (1.0 + pattern)).clamp_min(0.0)[None, None])
+    patterns = []
+    for _ in range(4):  # of unit amplitude and periods of 5 to 20 mm
+        pattern = torch.zeros(HEIGHT, WIDTH)
+        for draw in torch.rand(6, 3, generator=generator):
+            wave, angle = 2.0 * math.pi / (5.0 + 15.0 * float(draw[0])), 2.0 * math.pi * float(draw[1])
+            pattern += torch.sin(wave * (x * math.cos(angle) + y * math.sin(angle)) + 2.0 * math.pi * float(draw[2]))
+        patterns.append(pattern / pattern.abs().max())
+    stain = 0.75 * patterns[3] + 0.25 * torch.stack(patterns[:3])
+    return replace(USUAL, albedo=(1.0 - severity * (1.0 + stain)).clamp_min(0.0)[None])
 
 
 def _dimmed(severity: float, seed: int) -> Conditions:
@@ -351,14 +354,14 @@ DIALS: dict[str, Dial] = {
         Dial("a light moves", "mm", (0.0, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0), "One lamp, 40 mm away, is shifted sideways after calibration.", _since(_moved)),  # noqa: E501
         Dial("lights close together", "deg", (0.0, 40.0, 80.0, 100.0, 110.0, 116.0), "The lights stand less than 120 degrees apart by so much: the light matrix comes near to singular, and noise grows.", _together),  # noqa: E501
         # skin
-        Dial("albedo drift", "share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.3), "The skin wears unevenly after calibration: smooth patches darker by up to twice as much.", _since(_worn)),  # noqa: E501
-        Dial("spots and dead pixels", "of each", (0.0, 3.0, 10.0, 30.0, 100.0, 300.0), "Dirt on the skin and dead pixels come after calibration.", _since(_specks)),  # noqa: E501
+        Dial("albedo drift", "share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.3), "The skin wears after calibration: smooth stains, darker by up to twice as much, three quarters of it alike in all channels.", _since(_worn)),  # noqa: E501
+        Dial("spots and dead pixels", "of each", (0.0, 10.0, 30.0, 100.0, 300.0, 1000.0), "Dirt on the skin and dead pixels come after calibration.", _since(_specks)),  # noqa: E501
         Dial("markers", "mm", (0.0, 0.4, 0.7, 1.0, 1.4, 1.8), "Dots of this diameter, printed every 2.5 mm, move with the skin; the sensor file says that there are some.", _marked),  # noqa: E501
         # lens
         Dial("defocus", "px", (0.0, 0.7, 1.5, 3.0, 6.0, 12.0), "The lens is out of focus: a Gaussian of this standard deviation.", _always(lambda s: replace(USUAL, blur_px=s))),  # noqa: E501
         Dial("motion blur", "px", (0.0, 2.0, 5.0, 10.0, 20.0, 40.0), "The ball slides while the shutter is open; truth is its middle position.", _since(lambda s, seed: replace(USUAL, motion_px=s))),  # noqa: E501
         Dial("vignetting", "share", (0.0, 0.1, 0.3, 0.5, 0.7, 0.9), "The lens darkens the corners by so much, at calibration too.", _always(lambda s: replace(USUAL, vignetting=s))),  # noqa: E501
-        Dial("lens distortion", "share", (0.0, 0.02, 0.05, 0.1, 0.2, 0.3), "Barrel distortion: the corners show skin nearer to the middle by so much.", _distorted),  # noqa: E501
+        Dial("lens distortion", "share", (0.0, 0.05, 0.1, 0.2, 0.35, 0.5), "Barrel distortion: the corners show skin nearer to the middle by so much.", _distorted),  # noqa: E501
         Dial("perspective", "deg", (0.0, 5.0, 10.0, 20.0, 30.0, 45.0), "The camera is a pin-hole with half this angle of view to either side, treated as if it looked straight down.", _perspective),  # noqa: E501
         Dial("wrong pitch", "share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.2), "A pixel is larger than the sensor file says.", _wrong_pitch),  # noqa: E501
         # sensor

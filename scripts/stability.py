@@ -167,7 +167,7 @@ def save(figure: Figure, path: Path) -> None:
     canvas.draw()
     pixels = np.asarray(canvas.buffer_rgba())[:, :, :3]
     with write_atomically(path) as temporary:
-        Image.fromarray(pixels).quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(temporary, optimize=True)
+        Image.fromarray(pixels).quantize(256).save(temporary, optimize=True)
 
 
 if __name__ == "__main__":

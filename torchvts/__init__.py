@@ -9,7 +9,20 @@ from .core import gs_sdk
 from .core.files import read_image, write_image
 from .core.geometry import GradientFromNormal, depth_to_points, gradient_from_normal, normal_from_gradient
 from .core.sensor import Sensor, shipped_sensors
-from .integration import PoissonDCT, PoissonDST, PoissonRest, divergence, poisson_dct, poisson_dst, poisson_rest
+from .integration import (
+    AdaptiveIntegration,
+    CliffIntegration,
+    PerspectiveIntegration,
+    PoissonDCT,
+    PoissonDST,
+    PoissonRest,
+    divergence,
+    integrate_cliffs,
+    integrate_perspective,
+    poisson_dct,
+    poisson_dst,
+    poisson_rest,
+)
 from .markers import FillMarkers, fill_markers, find_markers
 from .normals import NormalFromIntensity, NormalFromLookup, NormalFromMLP, NormalFromResponse, fit_mlp
 from .pipeline import DepthOutput, DepthPipeline
@@ -18,8 +31,10 @@ from .record import Calibration
 from .shading import PointLights, near_field_shading
 
 __all__ = [
+    "AdaptiveIntegration",
     "Calibration",
     "CalibrationWarning",
+    "CliffIntegration",
     "Compensate",
     "ContactMask",
     "DepthOutput",
@@ -31,6 +46,7 @@ __all__ = [
     "NormalFromLookup",
     "NormalFromMLP",
     "NormalFromResponse",
+    "PerspectiveIntegration",
     "PointLights",
     "PoissonDCT",
     "PoissonDST",
@@ -50,6 +66,8 @@ __all__ = [
     "fit_prior",
     "gradient_from_normal",
     "gs_sdk",
+    "integrate_cliffs",
+    "integrate_perspective",
     "metrics",
     "near_field_shading",
     "normal_from_gradient",

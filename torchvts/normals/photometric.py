@@ -1,12 +1,17 @@
 """Normals by photometric stereo with near lights."""
 
+import math
+
 import torch
 from torch import Tensor, nn
 
 from ..core.checks import QUANTISATION_STD, check_batch, check_window, may_read_values
 from ..core.geometry import gradient_from_normal, normal_from_gradient
 from ..record import Calibration
-from ..shading import PointLights, flat_image, gloss_lobe, inverse_light_matrix, light_matrix
+from ..shading import PointLights, flat_image, gloss_lobe, inverse_light_matrix, light_matrix, seen_at
+
+CLIFF_SLOPE = 2.0
+"""Difference of neighbouring slopes from which depth is taken for a cliff."""
 
 
 def slope_by_lit_lights(
@@ -66,6 +71,8 @@ class NormalFromIntensity(nn.Module):
         noise_std: (3,), noise of the compensated image; None takes that of 8-bit rounding.
         inverse: (3, 3, H, W), the stored inverse; None computes it.
         full_above: (3, H, W), compensated intensity from which a channel counts as saturated; None for never.
+        camera_height_mm: of a pinhole camera above the image centre, which sees deep points nearer to its axis; infinite for an
+            orthographic camera. (:class:`PerspectiveIntegration` is its partner.)
     Source:
         eq. 3, 8, 9, 10 of the paper.
     Example:
@@ -90,9 +97,11 @@ class NormalFromIntensity(nn.Module):
         noise_std: Tensor | None = None,
         inverse: Tensor | None = None,
         full_above: Tensor | None = None,
+        camera_height_mm: float = math.inf,
     ) -> None:
         super().__init__()
         self.mm_per_pixel = mm_per_pixel
+        self.camera_height_mm = float(camera_height_mm)
         position, albedo = lights.position_mm.detach(), lights.albedo.detach()
         if inverse is None:
             inverse = inverse_light_matrix(position.new_zeros(1, 1, height, width), position, albedo, mm_per_pixel)[0]
@@ -111,7 +120,7 @@ class NormalFromIntensity(nn.Module):
         self.register_buffer("full_above", full)
 
     @classmethod
-    def from_calibration(cls, calibration: Calibration) -> "NormalFromIntensity":
+    def from_calibration(cls, calibration: Calibration, camera_height_mm: float = math.inf) -> "NormalFromIntensity":
         """The block of a unit calibrated by lights."""
         if calibration.lights is None:
             raise ValueError("calibration: expected one by lights, got one by response fields: use NormalFromResponse")
@@ -125,6 +134,7 @@ class NormalFromIntensity(nn.Module):
             noise_std=calibration.compensated_noise_std.flatten(1).median(dim=1).values,
             inverse=calibration.inverse,
             full_above=full if calibration.offset is None else full + calibration.offset,
+            camera_height_mm=camera_height_mm,
         )
 
     def forward(self, compensated: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
@@ -134,16 +144,18 @@ class NormalFromIntensity(nn.Module):
         bottom, right = top + compensated.shape[2], left + compensated.shape[3]
         position: Tensor = self.lights.position_mm
         albedo = self.lights.albedo
+        axis = (0.0, 0.0)
         if bottom - top < height or right - left < width:  # the lights as seen from the window's middle
             x = 0.5 * (left + right - width) * self.mm_per_pixel
             y = 0.5 * (top + bottom - height) * self.mm_per_pixel
             position = torch.cat((position[:, 0:1] - x, position[:, 1:2] - y, position[:, 2:3]), dim=1)
+            axis = (-x, -y)
         if self.lights.glossy:
-            compensated = self._matt(compensated, depth_mm, position)
+            compensated = self._matt(compensated, depth_mm, position, axis)
         live = torch.is_grad_enabled() and (position.requires_grad or albedo.requires_grad)
         inverse = self.inverse[None, :, :, top:bottom, left:right]
         if depth_mm is not None:
-            inverse = inverse_light_matrix(depth_mm, position, albedo, self.mm_per_pixel)
+            inverse = inverse_light_matrix(depth_mm, position, albedo, self.mm_per_pixel, self.camera_height_mm, axis)
         elif live:
             rest = compensated.new_zeros(1, 1, compensated.shape[2], compensated.shape[3])
             inverse = inverse_light_matrix(rest, position, albedo, self.mm_per_pixel)
@@ -152,13 +164,14 @@ class NormalFromIntensity(nn.Module):
         n_x, n_y, n_z = normal[:, 0:1], normal[:, 1:2], normal[:, 2:3]
         normal = normal * torch.rsqrt(torch.addcmul(torch.addcmul(n_x * n_x, n_y, n_y), n_z, n_z) + 1e-24)
         dark = self.dark_where[:, top:bottom, left:right]
-        return self._relight(normal, compensated, depth_mm, position, albedo, dark, self.full_above[:, top:bottom, left:right])
+        full = self.full_above[:, top:bottom, left:right]
+        return self._relight(normal, compensated, depth_mm, position, albedo, dark, full, axis)
 
-    def _matt(self, compensated: Tensor, depth_mm: Tensor | None, position: Tensor) -> Tensor:
+    def _matt(self, compensated: Tensor, depth_mm: Tensor | None, position: Tensor, axis: tuple[float, float]) -> Tensor:
         """What a matt skin would show: the specular lobe divided out, at the slope of the depth so far."""
         depth = compensated.new_zeros(1, 1, compensated.shape[2], compensated.shape[3]) if depth_mm is None else depth_mm
         normal = normal_from_gradient(_slope_of_depth(depth, self.mm_per_pixel))
-        matrix = light_matrix(depth, position, self.lights.albedo, self.mm_per_pixel)
+        matrix = light_matrix(depth, position, self.lights.albedo, self.mm_per_pixel, self.camera_height_mm, axis)
         return compensated / (1.0 + self.lights.gloss.reshape(1, 3, 1, 1) * gloss_lobe(matrix, normal))
 
     def coarse(self, stride: int) -> "NormalFromIntensity":
@@ -172,6 +185,7 @@ class NormalFromIntensity(nn.Module):
             self.mm_per_pixel * stride,
             self.dark_below / 3.0,
             full_above=self.full_above[:, stride // 2 :: stride, stride // 2 :: stride],
+            camera_height_mm=self.camera_height_mm,
         )
         coarse.lights = self.lights  # one set of parameters
         return coarse
@@ -185,6 +199,7 @@ class NormalFromIntensity(nn.Module):
         albedo: Tensor,
         dark_where: Tensor,
         full_above: Tensor,
+        axis: tuple[float, float],
     ) -> Tensor:
         """Replace the normals of pixels where a light that shines on the flat skin has gone dark, or a channel is full."""
         if may_read_values():  # asked by subtraction, which is three times as fast as comparison
@@ -200,10 +215,9 @@ class NormalFromIntensity(nn.Module):
         start = gradient_from_normal(normal[b, :, row, column][:, :, None, None])[:, :, 0, 0]
         if depth_mm is not None:
             depth = depth_mm[:, 0].expand(compensated.shape[0], height, width)
-            left, right = depth[b, row, (column - 1).clamp_min(0)], depth[b, row, (column + 1).clamp_max(width - 1)]
-            above, below = depth[b, (row - 1).clamp_min(0), column], depth[b, (row + 1).clamp_max(height - 1), column]
             z = depth[b, row, column]
-            start = torch.stack((right - left, below - above), dim=1) / (2.0 * self.mm_per_pixel)
+            start = _slope_of_depth(depth[:, None], self.mm_per_pixel)[b, :, row, column]
+            x, y = seen_at(x, z, self.camera_height_mm, axis[0]), seen_at(y, z, self.camera_height_mm, axis[1])
         to_light = position - torch.stack((x, y, z), dim=1)[:, None]  # (N, light, axis)
         squared = (to_light * to_light).sum(2, keepdim=True)
         rows = albedo[None, :, None] * to_light * (squared.rsqrt() / squared)
@@ -214,8 +228,15 @@ class NormalFromIntensity(nn.Module):
 
 
 def _slope_of_depth(depth_mm: Tensor, mm_per_pixel: float) -> Tensor:
-    """Central differences, (B, 2, H, W); one-sided halves at the border."""
-    padded = nn.functional.pad(depth_mm, [1, 1, 1, 1], mode="replicate")
-    p = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]
-    q = padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
-    return torch.cat((p, q), dim=1) / (2.0 * mm_per_pixel)
+    """Central differences, (B, 2, H, W); one-sided halves at the border, and beside a cliff the difference on its other side."""
+    padded = nn.functional.pad(depth_mm, [1, 1, 1, 1], mode="replicate") / mm_per_pixel
+    along_x, along_y = padded[..., 1:-1, 1:] - padded[..., 1:-1, :-1], padded[..., 1:, 1:-1] - padded[..., :-1, 1:-1]
+    p = _beside_cliffs(along_x[..., :-1], along_x[..., 1:])
+    q = _beside_cliffs(along_y[..., :-1, :], along_y[..., 1:, :])
+    return torch.cat((p, q), dim=1)
+
+
+def _beside_cliffs(one: Tensor, other: Tensor) -> Tensor:
+    """The mean of two differences, or the smaller where they are so far apart that a cliff must lie on one side."""
+    smaller = torch.where(one.abs() < other.abs(), one, other)
+    return torch.where((one - other).abs() < CLIFF_SLOPE, 0.5 * (one + other), smaller)

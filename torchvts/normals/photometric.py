@@ -15,18 +15,29 @@ CLIFF_SLOPE = 2.0
 
 
 def slope_by_lit_lights(
-    start: Tensor, compensated: Tensor, rows: Tensor, full: Tensor, noise_std: float, prior_std: float = 0.25, steps: int = 3
+    start: Tensor,
+    compensated: Tensor,
+    rows: Tensor,
+    full: Tensor,
+    noise_std: float,
+    prior_std: float = 0.25,
+    brightness_std: float = 0.02,
+    steps: int = 3,
 ) -> Tensor:
     """Slopes of pixels where a light is blocked or a channel is full: each pixel against the clamped model max(0, L n).
 
     n is of unit length. A blocked channel says no more than that it is dark, a full one that it is at least so bright, which
     leaves two numbers for two slopes and, near |n| = 1, a direction that is badly pinned. A weak prior (``prior_std``) towards
-    ``start`` holds that direction; when ``start`` comes from a depth map, its neighbours speak through it. Gauss-Newton in
-    closed form, steps of at most 0.5.
+    ``start`` holds that direction; when ``start`` comes from a depth map, its neighbours speak through it. The brightness that
+    all channels share counts no more than to ``brightness_std``: a depth 0.2 mm off changes it by as much, and near the plane
+    of two lights, where |n| = 1 bends away from it, noise in it would push the slope. Gauss-Newton in closed form, steps of at
+    most 0.5.
 
     Args:
-        start: (N, 2), slopes (dz/dx, dz/dy). compensated: (N, 3). rows: (N, 3, 3), light matrix. full: (N, 3) bool, saturated.
+        start: (N, 2), slopes (dz/dx, dz/dy). compensated: (N, 3). rows: (N, 3, 3), light matrix.
+        full: (N, 3) bool, channels that are saturated; one that is broken is a full one of intensity 0.
         noise_std: of the compensated image, against which the prior is weighed.
+        prior_std: of the slope about ``start``. brightness_std: relative. steps: of Gauss-Newton.
     Returns:
         (N, 2).
     Source:
@@ -43,7 +54,14 @@ def slope_by_lit_lights(
         lit = ((light > 0.1 * noise_std) & ~(full & (light >= compensated))).to(light.dtype)
         # d normal / d slope is -n_z (e - n (n.e)) along x and y: the part of the light row across the normal
         across = -n_z[:, :, None] * (rows - light[:, :, None] * normal[:, None])[:, :, 0:2] * lit[:, :, None]
-        residual = compensated - light * lit
+        seen = light * lit
+        residual = compensated * lit - seen
+        # whitened by the covariance noise^2 1 + brightness^2 seen seen^T
+        energy = (seen * seen).sum(1, keepdim=True)
+        common = (1.0 - torch.rsqrt(1.0 + (brightness_std / noise_std) ** 2 * energy)) / energy.clamp_min(1e-12)
+        along = common * seen
+        residual = residual - along * (seen * residual).sum(1, keepdim=True)
+        across = across - along[:, :, None] * (seen[:, :, None] * across).sum(1, keepdim=True)
         a = (across[:, :, 0] ** 2).sum(1) + weight
         b = (across[:, :, 0] * across[:, :, 1]).sum(1)
         c = (across[:, :, 1] ** 2).sum(1) + weight
@@ -201,18 +219,25 @@ class NormalFromIntensity(nn.Module):
         full_above: Tensor,
         axis: tuple[float, float],
     ) -> Tensor:
-        """Replace the normals of pixels where a light that shines on the flat skin has gone dark, or a channel is full."""
+        """Replace the normals of pixels where a light that shines on the flat skin has gone dark, or a channel is full.
+
+        Of a lamp that is dead altogether the other two and |n| = 1 are left: all pixels go this way, and from the flat skin.
+        """
         if may_read_values():  # asked by subtraction, which is three times as fast as comparison
             seen = compensated.detach()
             if float((seen - dark_where).amin()) >= 0.0 and float((seen - full_above).amax()) < 0.0:
                 return normal
-        clipped = (compensated < dark_where) | (compensated >= full_above)
+        dark = compensated < dark_where
+        # black nearly everywhere: no shadow is so large, the lamp is dead
+        broken = dark.to(compensated.dtype).mean(dim=(2, 3)) > 0.98  # (B, 3)
+        clipped = dark | (compensated >= full_above) | broken[:, :, None, None]
         b, row, column = torch.where(clipped.any(dim=1))
         height, width = compensated.shape[2], compensated.shape[3]
         x = (column.to(normal.dtype) - 0.5 * (width - 1)) * self.mm_per_pixel
         y = (row.to(normal.dtype) - 0.5 * (height - 1)) * self.mm_per_pixel
         z = torch.zeros_like(x)
         start = gradient_from_normal(normal[b, :, row, column][:, :, None, None])[:, :, 0, 0]
+        start = start * (~broken.any(dim=1))[b, None].to(start.dtype)
         if depth_mm is not None:
             depth = depth_mm[:, 0].expand(compensated.shape[0], height, width)
             z = depth[b, row, column]
@@ -221,8 +246,9 @@ class NormalFromIntensity(nn.Module):
         to_light = position - torch.stack((x, y, z), dim=1)[:, None]  # (N, light, axis)
         squared = (to_light * to_light).sum(2, keepdim=True)
         rows = albedo[None, :, None] * to_light * (squared.rsqrt() / squared)
-        intensity = compensated[b, :, row, column]
-        slope = slope_by_lit_lights(start, intensity, rows, intensity >= full_above[:, row, column].t(), self.noise_std)
+        intensity, dead = compensated[b, :, row, column], broken[b]
+        full = (intensity >= full_above[:, row, column].t()) | dead
+        slope = slope_by_lit_lights(start, intensity * (~dead).to(intensity.dtype), rows, full, self.noise_std)
         solution = normal_from_gradient(slope[:, :, None, None])[:, :, 0, 0]
         return normal.permute(0, 2, 3, 1).index_put((b, row, column), solution).permute(0, 3, 1, 2)
 

@@ -34,6 +34,8 @@ STYLES: dict[str, dict[str, Any]] = {
     "fast, zero border": {"color": "navy", "lw": 1.2, "ls": "--"},
     "precise, plain inverse": {"color": "tab:purple", "lw": 1.4},
     "precise, blur 1 px": {"color": "tab:green", "lw": 1.4},
+    "precise, cliffs": {"color": "saddlebrown", "lw": 1.4, "ls": "-."},
+    "precise, pinhole": {"color": "deeppink", "lw": 1.2, "ls": (0, (1, 2))},
     MASK: {"color": "black", "lw": 1.4, "marker": "o", "ms": 3},
 }
 
@@ -121,8 +123,8 @@ def picture(dial: Dial, rows: Sequence[Row], points: Sequence[Breaking]) -> Figu
     legend.text(0.0, 1.0, f"breaks at{f', {dial.unit}' if dial.unit else ''}", fontsize=8, weight="bold", va="top")
     for k, point in enumerate(points):
         at = point.at if isinstance(point.at, str) else f"{point.at:.3g}"
-        legend.text(0.0, 0.88 - 0.088 * k, f"{at}", color=STYLES[point.method]["color"], fontsize=8, va="top", weight="bold")
-        legend.text(0.3, 0.88 - 0.088 * k, point.method, color=STYLES[point.method]["color"], fontsize=8, va="top")
+        legend.text(0.0, 0.9 - 0.085 * k, f"{at}", color=STYLES[point.method]["color"], fontsize=8, va="top", weight="bold")
+        legend.text(0.3, 0.9 - 0.085 * k, point.method, color=STYLES[point.method]["color"], fontsize=8, va="top")
     return figure
 
 

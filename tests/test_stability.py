@@ -2,6 +2,8 @@
 
 import json
 import math
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 
@@ -23,7 +25,7 @@ def test_every_method_and_dial_has_a_kept_breaking_point():
 @pytest.mark.parametrize("name", DIALS)
 def test_no_breaking_point_has_moved(name):
     """Measured again with the same seeds at the two severities around it; further off only where that says it moved there."""
-    dial, kept = DIALS[name], [p for p in POINTS if p.dial == name and p.method in ("fast", "precise", MASK)]
+    dial, kept = DIALS[name], [p for p in POINTS if p.dial == name and p.method in ("fast", "auto", "precise, cliffs", MASK)]
     cases = {(s, seed): dial.make(s, seed) for s in {s for p in kept for s in p.between} for seed in range(SEEDS)}
     for point in kept:
         method, error = (point.method, lambda row: row.limits) if point.method != MASK else ("fast", lambda row: row.mask_limits)
@@ -215,3 +217,17 @@ def test_errors_grow_along_a_dial_of_noise():
     cases = [DIALS["noise"].make(severity, 0) for severity in (0.002, 0.01, 0.05)]
     errors = [stability.measure("fast", "noise", 0.0, 0, case).limits for case in cases]
     assert errors[0] < errors[1] < errors[2]
+
+
+def test_the_script_writes_table_rows_and_pictures(tmp_path):
+    command = [sys.executable, "scripts/stability.py", "--out", tmp_path, "--seeds", "1", "--workers", "0", "--only", "vignetting"]
+    done = subprocess.run([str(word) for word in command], capture_output=True, text=True, cwd=ROOT, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "| vignetting, 0 to 0.9 share | always | never |" in done.stdout and stability.LIMITS in done.stdout
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "breaking_points.json", "breaking_points.md", "overview.png", "rows.jsonl", "rows.md", "vignetting.png"
+    }  # fmt: skip
+    points, seeds = stability.from_json((tmp_path / "breaking_points.json").read_text())
+    assert seeds == 1 and len(points) == len(METHODS) + 1
+    refused = subprocess.run([*map(str, command), "--keep"], capture_output=True, text=True, cwd=ROOT, timeout=300)
+    assert refused.returncode == 2 and "--keep: expected all dials, got --only" in refused.stderr

@@ -21,7 +21,7 @@ from .core import __version__
 from .core.files import write_atomically
 from .core.geometry import normal_from_gradient
 from .gallery import DIALS, Case, Dial
-from .integration import PoissonDST
+from .integration import AdaptiveIntegration, PerspectiveIntegration, PoissonDST
 from .metrics import depth_error, mask_iou, normal_angle_deg
 from .normals import NormalFromIntensity
 from .pipeline import DepthOutput, DepthPipeline
@@ -79,6 +79,16 @@ def _blurred(calibration: Calibration) -> Method:
     return DepthPipeline.from_calibration(blurred, "precise")
 
 
+def _pinhole(calibration: Calibration) -> Method:
+    """Normals and integral of a pinhole camera, where the calibration's report tells how high it stands; else as precise."""
+    height_mm = calibration.report.get("camera_height_mm", math.inf)
+    if math.isinf(height_mm):
+        return DepthPipeline.from_calibration(calibration, "precise")
+    normals = NormalFromIntensity.from_calibration(calibration, height_mm)
+    integrate = PerspectiveIntegration(calibration.sensor.mm_per_pixel, height_mm)
+    return DepthPipeline.from_calibration(calibration, "precise", normals=normals, integrate=integrate)
+
+
 METHODS: dict[str, Callable[[Calibration], Method]] = {
     "flat": _flat,
     "fast": lambda c: DepthPipeline.from_calibration(c, "fast"),
@@ -87,6 +97,8 @@ METHODS: dict[str, Callable[[Calibration], Method]] = {
     "fast, zero border": lambda c: DepthPipeline.from_calibration(c, "fast", integrate=PoissonDST(c.sensor.mm_per_pixel)),
     "precise, plain inverse": _plain_inverse,
     "precise, blur 1 px": _blurred,
+    "precise, cliffs": lambda c: DepthPipeline.from_calibration(c, "precise", integrate=AdaptiveIntegration(c.sensor.mm_per_pixel)),
+    "precise, pinhole": _pinhole,
 }
 """Every method by name: from a calibration to what reconstructs an image."""
 

@@ -65,7 +65,8 @@ def integrate_cliffs(
         mm_per_pixel: pixel pitch in mm.
         contact: bool (B, 1, H, W); None takes pixels whose gradient is not exactly zero, and gaps of one or two pixels between
             them. Rest that does not reach the image border (a hole) counts as contact, unless none does.
-        weight: (B, 1, H, W) in [0, 1], how far each pixel's slope is to be trusted; 0 for missing. None for 1.
+        weight: (B, 1, H, W) in [0, 1], how far each pixel's slope is to be trusted; 0 for missing: bridged as by a membrane.
+            None for 1.
     Returns:
         Depth in mm, (B, 1, H, W). Without any pixel at rest, the lowest depth is zero.
     Raises:
@@ -94,6 +95,7 @@ class CliffIntegration(nn.Module):
         threshold: c, standard deviations from which an edge counts as contradicted.
         rim_weight: of an edge across the rim of the contact, in (0, 1].
         max_passes: bound of step 3. max_iterations: bound of the conjugate-gradient steps of each solve.
+        residual: of a solve, relative, in the preconditioner's norm.
         tolerance_px: the depth stands still when no pixel moves by more, in pixels of pitch.
     """
 
@@ -108,6 +110,7 @@ class CliffIntegration(nn.Module):
         rim_weight: float = 0.1,
         max_passes: int = 12,
         max_iterations: int = 300,
+        residual: float = 1e-3,
         tolerance_px: float = 0.02,
     ) -> None:
         super().__init__()
@@ -117,6 +120,7 @@ class CliffIntegration(nn.Module):
         self.rim_weight = check_positive("rim_weight", rim_weight, 1.0)
         self.max_passes = check_integer("max_passes", max_passes, 1)
         self.max_iterations = check_integer("max_iterations", max_iterations, 1)
+        self.residual = check_positive("residual", residual)
         self.tolerance_px = check_positive("tolerance_px", tolerance_px)
 
     def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
@@ -157,12 +161,15 @@ class CliffIntegration(nn.Module):
         free = contacts > 0
         covered = self._covered(gradient.detach(), free)
         slopes, variances = _edges(gradient, self.slope_std)
-        rims, bases = [], []
+        rims, bases, bridged = [], [], []
         for dim, variance in zip((3, 2), variances, strict=True):
             one, other = _ends(covered, dim)
             rims.append(one != other)
             first, second = _ends(trust, dim)
-            bases.append(first * second * self.slope_std**2 / variance)
+            sure = first * second
+            bases.append(sure * self.slope_std**2 / variance)
+            bridged.append(slopes[3 - dim] * (sure > 0))  # missing slopes count as zero, at the least weight: a membrane
+        slopes = bridged
         system = _System(free, gradient, self.max_iterations)
         with torch.no_grad():
             right = [slope.detach() for slope in slopes]
@@ -181,7 +188,7 @@ class CliffIntegration(nn.Module):
                     surprise = (after - before - slope).square() / (self.threshold**2 * variance)
                     factor = torch.where(rim, self.rim_weight, 1.0) / (1.0 + surprise)
                     weights.append((base * factor).clamp_min(LEAST_WEIGHT))
-                found = system.solve(weights, _adjoint(weights[0] * right[0], weights[1] * right[1]), depth, 1e-3)
+                found = system.solve(weights, _adjoint(weights[0] * right[0], weights[1] * right[1]), depth, self.residual)
                 moved = float((found - depth).abs().amax())
                 depth, passes = found, passes + 1
         if torch.is_grad_enabled() and gradient.requires_grad:

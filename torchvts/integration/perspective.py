@@ -57,6 +57,7 @@ class PerspectiveIntegration(nn.Module):
         super().__init__()
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         self.camera_height_mm = check_positive("camera_height_mm", camera_height_mm)
+        self.least_facing_mm = LEAST_COSINE * self.camera_height_mm
         self.integrate = PoissonRest(mm_per_pixel) if integrate is None else integrate
 
     def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
@@ -67,7 +68,7 @@ class PerspectiveIntegration(nn.Module):
         u, v = pixel_grid_mm(height, width, self.mm_per_pixel, gradient.dtype, gradient.device)
         u, v = u[:, left : left + columns], v[top : top + rows]
         h = self.camera_height_mm
-        facing = (h + gradient[:, 0:1] * u + gradient[:, 1:2] * v).clamp_min(LEAST_COSINE * h)
+        facing = (h + gradient[:, 0:1] * u + gradient[:, 1:2] * v).clamp_min(self.least_facing_mm)
         w: Tensor = self.integrate(gradient * (h / facing), window, size)
         return -h * torch.expm1(-w / h)
 

@@ -241,7 +241,12 @@ class NormalFromIntensity(nn.Module):
         if depth_mm is not None:
             depth = depth_mm[:, 0].expand(compensated.shape[0], height, width)
             z = depth[b, row, column]
-            start = _slope_of_depth(depth[:, None], self.mm_per_pixel)[b, :, row, column]
+            left, right = depth[b, row, (column - 1).clamp_min(0)], depth[b, row, (column + 1).clamp_max(width - 1)]
+            above, below = depth[b, (row - 1).clamp_min(0), column], depth[b, (row + 1).clamp_max(height - 1), column]
+            pitch = self.mm_per_pixel
+            p = _beside_cliffs((z - left) / pitch, (right - z) / pitch)
+            q = _beside_cliffs((z - above) / pitch, (below - z) / pitch)
+            start = torch.stack((p, q), dim=1)
             x, y = seen_at(x, z, self.camera_height_mm, axis[0]), seen_at(y, z, self.camera_height_mm, axis[1])
         to_light = position - torch.stack((x, y, z), dim=1)[:, None]  # (N, light, axis)
         squared = (to_light * to_light).sum(2, keepdim=True)
@@ -262,7 +267,7 @@ def _slope_of_depth(depth_mm: Tensor, mm_per_pixel: float) -> Tensor:
     return torch.cat((p, q), dim=1)
 
 
-def _beside_cliffs(one: Tensor, other: Tensor) -> Tensor:
-    """The mean of two differences, or the smaller where they are so far apart that a cliff must lie on one side."""
+def _beside_cliffs(one: Tensor, other: Tensor, apart: float = CLIFF_SLOPE) -> Tensor:
+    """The mean of two slopes, or the smaller where they are so far apart that a cliff must lie on one side."""
     smaller = torch.where(one.abs() < other.abs(), one, other)
-    return torch.where((one - other).abs() < CLIFF_SLOPE, 0.5 * (one + other), smaller)
+    return torch.where((one - other).abs() < apart, 0.5 * (one + other), smaller)

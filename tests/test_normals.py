@@ -120,6 +120,48 @@ def test_two_lamps_go_on_when_one_is_dead(ring, press_mm, worst_px, dead):
     assert out.depth_mm[1].abs().max() == 0
 
 
+def fan(azimuth_deg):
+    """Three lights, the outer two so many degrees from the one in the middle: coplanar as that goes to zero."""
+    angle = torch.deg2rad(torch.tensor([0.0, azimuth_deg, -azimuth_deg]))
+    position = torch.stack((31.0 * angle.cos(), 31.0 * angle.sin(), torch.full((3,), 40.0)), 1)
+    return vts.PointLights(position, 0.45 * position.norm(dim=1) ** 3 / 40.0).requires_grad_(False)
+
+
+@pytest.mark.parametrize(
+    "azimuth_deg, rms_px, share", [(120.0, 0.1, None), (60.0, 0.2, None), (15.0, 0.3, 0.05), (2.0, 2.0, 0.05), (0.0, 4.0, 0.05)]
+)
+def test_lights_that_nearly_lie_in_a_plane_are_damped(azimuth_deg, rms_px, share):
+    """Where the inverse makes more of the noise than slopes are; else bit for bit the plain inverse."""
+    lights, scene = fan(azimuth_deg), press(1.0, torch.float32, 120, 160)
+    rest, image = (scenes.render(s, lights, noise_std=0.004, bits=8, seed=k) for k, s in enumerate((scenes.at_rest(scene), scene)))
+    sensor = vts.Sensor("rig", 120, 160, scene.mm_per_pixel)
+    pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, sensor, rest[0]), "precise")
+    assert bool(pipe.normals.weak.all()) == (share is not None) and bool(pipe.normals.weak.any()) == (share is not None)
+    out = pipe(image)
+    pipe.normals.weak.fill_(False)
+    pipe.normals.ill = False
+    plain = pipe(image)
+    ours = metrics.depth_error(out.depth_mm, scene.depth_mm, 0.0625).rms_px
+    assert ours < rms_px
+    if share is None:
+        assert torch.equal(out.depth_mm, plain.depth_mm)
+    else:
+        theirs = plain.depth_mm.nan_to_num(100.0)
+        assert ours < share * metrics.depth_error(theirs, scene.depth_mm, 0.0625).rms_px
+
+
+@pytest.mark.parametrize("azimuth_deg", [40.0, 15.0, 2.0])
+def test_without_noise_the_damped_slope_is_the_true_one(azimuth_deg):
+    """The limit of small noise, at the true depth."""
+    lights, scene = fan(azimuth_deg).double(), press(1.0, height=24, width=32)
+    block = block_for(lights, scene, noise_std=torch.full((3,), 1e-9, dtype=torch.float64))
+    assert not bool(block.weak.any())
+    block.weak.fill_(True)
+    block.ill = True
+    inside = scene.contact & (scene.depth_mm > 0.2)
+    assert rms_deg(block(scenes.render(scene, lights), scene.depth_mm), scene, inside) < 0.5
+
+
 def test_slopes_are_bounded_however_wild_the_image():
     lights = vts.PointLights([[22, 0, 15], [-11, 19, 16.5], [-11, -19, 18]], [500, 500, 500])
     image = torch.rand(4, 3, 24, 32, generator=torch.Generator().manual_seed(0))

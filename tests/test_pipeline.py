@@ -99,6 +99,21 @@ def test_a_tilted_punch_larger_than_half_of_the_image_is_no_drift(ring, small_se
     assert torch.equal(level(image), vts.Compensate.from_calibration(calibration)(image))
 
 
+@pytest.mark.parametrize("factor", [1.0, 0.9, 0.75])
+@pytest.mark.parametrize("touched", [0.0, 0.4])
+def test_a_response_field_levels_up_to_a_quarter(small_sensor, factor, touched):
+    field = vts.core.response.ResponseField(0, -1, False, 10.0, ((0.3, 0, 0), (0, 0.3, 0)))
+    model = vts.core.response.ResponseModel(field, None)
+    background = 0.5 + 0.004 * torch.randn(3, 120, 160, generator=torch.Generator().manual_seed(0))
+    image = background + 0.004 * torch.randn(3, 120, 160, generator=torch.Generator().manual_seed(1))
+    rows = int(touched * 120)
+    image[:, :rows] *= torch.linspace(0.6, 1.4, 160)
+    image = image * torch.tensor([1.0, factor, 1.0])[:, None, None]
+    compensate = vts.Compensate.from_calibration(vts.Calibration.from_response(model, small_sensor, background))
+    at_rest = compensate(image.clamp(0.0, 1.0)[None])[0, :, rows + 5 :].mean(dim=(1, 2))
+    assert (at_rest - 1.0).abs().max() < 0.006
+
+
 def test_a_lamp_that_is_out_is_no_drift(ring, small_sensor, small_press):
     lights, scene = ring(), small_press(1.0)
     calibration = vts.Calibration.from_lights(lights, small_sensor)

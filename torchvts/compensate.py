@@ -28,6 +28,8 @@ class Compensate(nn.Module):
         level: divide each channel of a frame by how bright its skin at rest is against calibration: by :func:`rest_level`, or
             given ``flat`` by :func:`sure_level`.
         flat: (3, H, W), what the compensated image is at rest. noise_std: (3, H, W), its noise.
+        scatters: presses change the light of the whole skin a little, as on real sensors: then :func:`rest_level` up to its
+            limit, and :func:`sure_level` beyond.
     Source:
         eq. 8 of the paper for the offset.
     Example:
@@ -53,9 +55,11 @@ class Compensate(nn.Module):
         level: bool = False,
         flat: Tensor | None = None,
         noise_std: Tensor | None = None,
+        scatters: bool = False,
     ) -> None:
         super().__init__()
         self.level = level
+        self.scatters = scatters
         self.markers = nn.Identity() if markers is None else markers
         self.blur_px = float(blur_px) if blur_px == 0 else check_positive("blur_px", blur_px)
         self.gamma = check_positive("gamma", gamma)
@@ -91,9 +95,10 @@ class Compensate(nn.Module):
         """
         sensor = calibration.sensor
         parts = (calibration.gain, calibration.offset, sensor.exponent, calibration.defects, sensor.blur_px, calibration.markers)
-        if level and calibration.response is None:
-            return cls(*parts, True, calibration.flat, calibration.compensated_noise_std)
-        return cls(*parts, calibration.response is not None)
+        by_response = calibration.response is not None
+        if not (level or by_response):
+            return cls(*parts)
+        return cls(*parts, True, calibration.flat, calibration.compensated_noise_std, by_response)
 
     def forward(self, image: Tensor) -> Tensor:
         """(B, 3, H, W) image in [0, 1] to (B, 3, H, W) linear light."""
@@ -118,6 +123,12 @@ class Compensate(nn.Module):
         rest, noise = self.rest, self.rest_noise
         if rest is None or noise is None:
             return light / rest_level(light)
+        if self.scatters:
+            near = rest_level(light)
+            if may_read_values() and float((near - 1.0).abs().amax()) < 0.149:
+                return light / near
+            far = sure_level(_some_means(light.detach()), rest, noise)
+            return light / torch.where((far - 1.0).abs() > 0.15, far, near)
         level = sure_level(_some_means(light.detach()), rest, noise)
         if may_read_values() and bool((level == 1.0).all()):
             return light

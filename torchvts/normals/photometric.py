@@ -14,13 +14,17 @@ CLIFF_SLOPE = 2.0
 """Difference of neighbouring slopes from which depth is taken for a cliff."""
 
 
+PRIOR_STD = 0.25
+"""How far slopes spread about what is known of them beforehand."""
+
+
 def slope_by_lit_lights(
     start: Tensor,
     compensated: Tensor,
     rows: Tensor,
     full: Tensor,
     noise_std: float,
-    prior_std: float = 0.25,
+    prior_std: float = PRIOR_STD,
     brightness_std: float = 0.02,
     steps: int = 3,
 ) -> Tensor:
@@ -80,7 +84,9 @@ class NormalFromIntensity(nn.Module):
     """Unit normals of a compensated image.
 
     Without depth, the stored inverse of the light matrix at rest (eq. 9); with depth, the inverse at that depth (eq. 10).
-    Where a light is blocked (its channel below three times its noise) or a channel is full, :func:`slope_by_lit_lights` decides.
+    Where a light is blocked (its channel below three times its noise) or a channel is full, :func:`slope_by_lit_lights` decides;
+    also where the lights nearly lie in one plane, so that the inverse makes more of the noise than ``PRIOR_STD``, what is known of
+    slopes beforehand: |n| = 1 and that prior then damp it, which the plain inverse does not know. Elsewhere nothing changes.
     While gradients are recorded for the lights (``requires_grad_(True)``), the matrix is built from them at every call. Given
     ``window`` (top, left), the image is the part of the calibrated one whose first pixel is there.
 
@@ -105,6 +111,7 @@ class NormalFromIntensity(nn.Module):
     dark_below: Tensor
     dark_where: Tensor
     full_above: Tensor
+    weak: Tensor
 
     def __init__(
         self,
@@ -130,6 +137,11 @@ class NormalFromIntensity(nn.Module):
         self.noise_std = float(noise.square().mean().sqrt())
         self.register_buffer("inverse", inverse.detach().clone())
         self.register_buffer("dark_below", 3.0 * noise.detach().to(inverse.dtype))
+        # where the noise of the inverse exceeds what is known of slopes beforehand, lights that nearly lie in one plane
+        spread = self.noise_std * inverse.detach().square().sum(dim=(0, 1)).sqrt()
+        weak = ~(spread <= PRIOR_STD)  # infinite ones too
+        self.ill = bool(weak.any())
+        self.register_buffer("weak", weak)
         # a channel can only be called dark where its light shines on the flat skin
         flat = flat_image(self.lights, height, width, mm_per_pixel).to(inverse.dtype)
         below = self.dark_below.reshape(3, 1, 1)
@@ -183,7 +195,8 @@ class NormalFromIntensity(nn.Module):
         normal = normal * torch.rsqrt(torch.addcmul(torch.addcmul(n_x * n_x, n_y, n_y), n_z, n_z) + 1e-24)
         dark = self.dark_where[:, top:bottom, left:right]
         full = self.full_above[:, top:bottom, left:right]
-        return self._relight(normal, compensated, depth_mm, position, albedo, dark, full, axis)
+        weak = self.weak[top:bottom, left:right]
+        return self._relight(normal, compensated, depth_mm, position, albedo, dark, full, weak, axis)
 
     def _matt(self, compensated: Tensor, depth_mm: Tensor | None, position: Tensor, axis: tuple[float, float]) -> Tensor:
         """What a matt skin would show: the specular lobe divided out, at the slope of the depth so far."""
@@ -217,27 +230,29 @@ class NormalFromIntensity(nn.Module):
         albedo: Tensor,
         dark_where: Tensor,
         full_above: Tensor,
+        weak: Tensor,
         axis: tuple[float, float],
     ) -> Tensor:
-        """Replace the normals of pixels where a light that shines on the flat skin has gone dark, or a channel is full.
+        """Replace the normals of pixels where a light that shines on the flat skin has gone dark, a channel is full, or L is weak.
 
         Of a lamp that is dead altogether the other two and |n| = 1 are left: all pixels go this way, and from the flat skin.
         """
         if may_read_values():  # asked by subtraction, which is three times as fast as comparison
             seen = compensated.detach()
-            if float((seen - dark_where).amin()) >= 0.0 and float((seen - full_above).amax()) < 0.0:
+            sound = float((seen - dark_where).amin()) >= 0.0 and float((seen - full_above).amax()) < 0.0
+            if sound and not (self.ill and bool(weak.any())):
                 return normal
         dark = compensated < dark_where
         # black nearly everywhere: no shadow is so large, the lamp is dead
         broken = dark.to(compensated.dtype).mean(dim=(2, 3)) > 0.98  # (B, 3)
         clipped = dark | (compensated >= full_above) | broken[:, :, None, None]
-        b, row, column = torch.where(clipped.any(dim=1))
+        b, row, column = torch.where(clipped.any(dim=1) | weak)
         height, width = compensated.shape[2], compensated.shape[3]
         x = (column.to(normal.dtype) - 0.5 * (width - 1)) * self.mm_per_pixel
         y = (row.to(normal.dtype) - 0.5 * (height - 1)) * self.mm_per_pixel
         z = torch.zeros_like(x)
         start = gradient_from_normal(normal[b, :, row, column][:, :, None, None])[:, :, 0, 0]
-        start = start * (~broken.any(dim=1))[b, None].to(start.dtype)
+        start = torch.where((broken.any(dim=1)[b] | weak[row, column])[:, None], torch.zeros_like(start), start)
         if depth_mm is not None:
             depth = depth_mm[:, 0].expand(compensated.shape[0], height, width)
             z = depth[b, row, column]

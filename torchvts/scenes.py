@@ -21,7 +21,7 @@ from .core.checks import (
     check_tensor,
 )
 from .core.geometry import normal_from_gradient, pixel_grid_mm
-from .shading import PointLights, near_field_shading, seen_at
+from .shading import PointLights, cast_shadows, near_field_shading, seen_at
 
 Segment = tuple[tuple[float, float], tuple[float, float]]
 """Start and end, (x, y) in mm."""
@@ -68,11 +68,30 @@ def surface(
     check_size(height, width, mm_per_pixel, 3)
     if not callable(depth_mm):
         raise TypeError(f"depth_mm: expected a function of x and y, got {type(depth_mm).__name__}")
-    with torch.inference_mode(False), torch.enable_grad():
+    with torch.inference_mode(False):
         x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
         x, y = x.expand(height, width), y.expand(height, width)
         if check_camera_height(camera_height_mm) < math.inf:
             x, y = _seen_by_pinhole(depth_mm, x, y, camera_height_mm)
+        return surface_at(depth_mm, x, y, mm_per_pixel, dtype)._replace(camera_height_mm=camera_height_mm)
+
+
+def surface_at(
+    depth_mm: Callable[[Tensor, Tensor], Tensor], x: Tensor, y: Tensor, mm_per_pixel: float, dtype: torch.dtype = torch.float32
+) -> Scene:
+    """:func:`surface`, at any positions: what pixels see that do not look straight down at an even grid.
+
+    Args:
+        depth_mm: as for :func:`surface`. x, y: (H, W) float64, where each pixel meets the skin, mm.
+        mm_per_pixel: the pitch that is called the scene's, mm.
+    """
+    if not callable(depth_mm):
+        raise TypeError(f"depth_mm: expected a function of x and y, got {type(depth_mm).__name__}")
+    check_tensor("x", x), check_tensor("y", y)
+    if x.dim() != 2 or x.shape != y.shape:
+        raise ValueError(f"y: expected (H, W) like x, got {tuple(x.shape)} and {tuple(y.shape)}")
+    check_positive("mm_per_pixel", mm_per_pixel)
+    with torch.inference_mode(False), torch.enable_grad():
         x, y = x.clone().requires_grad_(), y.clone().requires_grad_()
         depth = depth_mm(x, y)
         if not isinstance(depth, Tensor) or depth.shape != x.shape or not depth.requires_grad:
@@ -82,7 +101,7 @@ def surface(
     contact = (depth > 0).detach()[None, None]
     gradient = torch.where(contact, torch.stack((p, q))[None], 0.0).to(dtype)
     depth = depth.detach().clamp_min(0.0)[None, None].to(dtype)
-    return Scene(depth, gradient, normal_from_gradient(gradient), contact, mm_per_pixel, camera_height_mm)
+    return Scene(depth, gradient, normal_from_gradient(gradient), contact, mm_per_pixel)
 
 
 def _seen_by_pinhole(
@@ -260,6 +279,7 @@ def render(
     gamma: float = 1.0,
     vignetting: float = 0.0,
     spots: Tensor | None = None,
+    shadows: bool = False,
     seed: int = 0,
 ) -> Tensor:
     """The camera image of a scene: shading, then what optics, skin and sensor do to it, in that order.
@@ -272,9 +292,12 @@ def render(
         gamma: the camera's response, value = light^(1/gamma).
         vignetting: relative loss of light in the image corners.
         spots: (1, 1, H, W) factor on the skin's albedo from :func:`skin_spots`; zero is a dead pixel.
+        shadows: whether the relief casts shadows, :func:`torchvts.shading.cast_shadows`.
         seed: of the noise.
     Returns:
         (1, 3, H, W) in [0, 1].
+    Raises:
+        ValueError: shadows seen by a pinhole camera.
     """
     check_record("scene", scene, Scene, "sphere_press and its kin make one")
     check_least("noise_std", noise_std), check_positive("gamma", gamma), check_least("vignetting", vignetting, 0.0, 1.0)
@@ -283,6 +306,10 @@ def render(
     if spots is not None:
         check_shape("spots", spots, scene.depth_mm.shape, "the scene")
     image = near_field_shading(scene.depth_mm, scene.normal, lights, scene.mm_per_pixel, scene.camera_height_mm)
+    if shadows:
+        if not math.isinf(scene.camera_height_mm):
+            raise ValueError("shadows: expected an orthographic camera, whose depth lies on an even grid; got a pinhole")
+        image = image * cast_shadows(scene.depth_mm, lights, scene.mm_per_pixel)
     if vignetting:
         x, y = pixel_grid_mm(image.shape[2], image.shape[3], 1.0, image.dtype)
         image = image * (1.0 - vignetting * (x**2 + y**2) / float(x.max() ** 2 + y.max() ** 2))

@@ -117,6 +117,50 @@ def near_field_shading(
     return image
 
 
+def cast_shadows(depth_mm: Tensor, lights: PointLights, mm_per_pixel: float) -> Tensor:
+    """Which pixels each light reaches past the relief that stands in its way: 1 where it does, 0 in a cast shadow.
+
+    From every pixel a ray goes to the light in steps of one pixel, until it is above all relief; where the depth map, between
+    pixels bilinear, is above the ray by more than a twentieth of a pixel, the light is blocked. Beyond the image the skin is
+    at rest. Attached shadows are the clamp of :func:`near_field_shading`, not found here.
+
+    Args:
+        depth_mm: (B, 1, H, W), positive towards the camera. lights: the three lights. mm_per_pixel: pixel pitch, mm.
+    Returns:
+        (B, 3, H, W), a factor on the image of each light. Not differentiable: its edges are sharp.
+    Example:
+        >>> wall = torch.zeros(1, 1, 8, 16); wall[..., 8] = 2.0
+        >>> lights = PointLights([[40, 0, 20], [-40, 0, 20], [0, 40, 20]], [900, 900, 900])
+        >>> cast_shadows(wall, lights, 0.5)[0, :, 4].int()[:, 4:12]  # to the left of the wall no light from the right
+        tensor([[0, 0, 0, 0, 1, 1, 1, 1],
+                [1, 1, 1, 1, 1, 0, 0, 0],
+                [1, 1, 1, 1, 1, 1, 1, 1]], dtype=torch.int32)
+    """
+    check_batch("depth_mm", depth_mm, 1)
+    depth = depth_mm.detach()
+    height, width = depth.shape[2], depth.shape[3]
+    x, y = pixel_grid_mm(height, width, mm_per_pixel, depth.dtype, depth.device)
+    half = depth.new_tensor([width, height]) * 0.5 * mm_per_pixel
+    highest = float(depth.amax())
+    reached = []
+    for light in lights.position_mm.detach().to(depth.dtype):
+        to_x, to_y, to_z = light[0] - x, light[1] - y, light[2] - depth  # (1, W), (H, 1), (B, 1, H, W)
+        across = torch.sqrt(to_x**2 + to_y**2).clamp_min(1e-6)  # (H, W)
+        rise = to_z / across  # mm of height per mm of way
+        furthest = float(across.max())
+        if float(light[2]) > highest:
+            furthest = min(furthest, float(((highest - depth) / rise).max()))
+        lit = torch.ones_like(depth, dtype=torch.bool)
+        for step in range(1, math.ceil(furthest / mm_per_pixel) + 1):
+            way = torch.minimum(across, torch.full_like(across, step * mm_per_pixel))
+            place = torch.stack(((x + to_x / across * way) / half[0], (y + to_y / across * way) / half[1]), dim=-1)
+            place = place.expand(depth.shape[0], height, width, 2)
+            relief = nn.functional.grid_sample(depth, place, align_corners=False)
+            lit &= relief <= depth + rise * way + 0.05 * mm_per_pixel
+        reached.append(lit)
+    return torch.cat(reached, dim=1).to(depth_mm.dtype)
+
+
 def flat_image(lights: PointLights, height: int, width: int, mm_per_pixel: float) -> Tensor:
     """What the model sees of the skin at rest: (3, H, W), linear light."""
     reference = lights.position_mm

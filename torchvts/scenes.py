@@ -87,7 +87,8 @@ def surface_at(
     """
     if not callable(depth_mm):
         raise TypeError(f"depth_mm: expected a function of x and y, got {type(depth_mm).__name__}")
-    check_tensor("x", x), check_tensor("y", y)
+    for name, place in (("x", x), ("y", y)):
+        check_tensor(name, place)
     if x.dim() != 2 or x.shape != y.shape:
         raise ValueError(f"y: expected (H, W) like x, got {tuple(x.shape)} and {tuple(y.shape)}")
     check_positive("mm_per_pixel", mm_per_pixel)

@@ -144,8 +144,6 @@ class NormalFromIntensity(nn.Module):
         if inverse is None:
             inverse = inverse_light_matrix(position.new_zeros(1, 1, height, width), position, albedo, mm_per_pixel)[0]
         check_shape("inverse", inverse, (3, 3, height, width))
-        if bool(torch.isnan(inverse).all()):  # infinite it is of lights in one plane, which unit length still helps
-            raise ValueError("inverse: expected numbers, got NaN: was it made of a broken calibration?")
         self.lights = PointLights(position, albedo, lights.gloss).requires_grad_(False)
         noise = torch.full((3,), QUANTISATION_STD) if noise_std is None else noise_std
         check_shape("noise_std", noise, (3,))

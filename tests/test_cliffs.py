@@ -184,7 +184,7 @@ def test_too_small_an_image_is_refused(shape):
 def test_masks_and_weights_of_another_size_are_refused():
     gradient = torch.zeros(1, 2, 8, 9)
     for name in ("contact", "weight"):
-        with pytest.raises(ValueError, match=rf"{name}: expected 8 x 9 like gradient, got 8 x 8"):
+        with pytest.raises(ValueError, match=rf"{name}: expected \(1, 1, 8, 9\) like gradient, got \(1, 1, 8, 8\)"):
             vts.integrate_cliffs(gradient, **{name: torch.ones(1, 1, 8, 8)})
 
 

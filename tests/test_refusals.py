@@ -150,6 +150,7 @@ def shaped(**more):
     return {"height": INTEGER, "width": INTEGER, "mm_per_pixel": NUMBER, **more}
 
 
+HEIGHTS = ["1", None, True, NAN, 0, -1.0, [1.0]]  # of a camera; infinite is one
 SIZE = {"height": HEIGHT, "width": WIDTH, "mm_per_pixel": PITCH}
 CENTER = [(1.0,), None, "00", (0.0, NAN), 3.0]
 DEPTH = torch.zeros(1, 1, HEIGHT, WIDTH)
@@ -163,6 +164,11 @@ BAD_POSITION = [[[0, 0, 1]], "lights", None, [[20.0, 0.0, -30.0]] * 3, [[20.0, 0
 BAD_POINTS = [torch.zeros(50), torch.zeros(50, 2), torch.zeros(0, 3), torch.zeros(50, 3), cloud() + NAN, cloud().numpy(), None]
 EYE = torch.eye(4, dtype=torch.float64)
 BAD_POSE = [EYE[:3], 2 * EYE, EYE + NAN, np.eye(4), "pose"]
+
+GRADIENT = torch.zeros(1, 2, 8, 8)
+BAD_GRADIENT = [*batches(2), torch.zeros(1, 2, 1, 8)]
+BAD_MASKS = [torch.zeros(1, 1, 4, 4) > 0, torch.zeros(1, 1, 8, 8), torch.zeros(8, 8) > 0, "all", np.zeros((1, 1, 8, 8), bool)]
+BAD_WEIGHTS = [torch.ones(1, 1, 4, 4), torch.ones(8, 8), torch.ones(1, 1, 8, 8).bool(), "all", np.ones((1, 1, 8, 8))]
 
 TABLE = {
     "Calibration.from_lights": Entry(
@@ -181,8 +187,20 @@ TABLE = {
     "Calibration.load": Entry({"path": ...}, {"path": [*MISSING, ".", 3, None]}, file=("path",), run=False),
     "Calibration.save": Entry({"path": ...}, {"path": [*MISSING, ".", 3, None]}, lambda: unit().save, file=("path",), run=False),
     "Compensate": Entry(
-        {"gain": FLAT, "offset": FLAT, "gamma": 2.2, "defects": FLAT[0] > 1, "blur_px": 1.0, "markers": vts.FillMarkers()},
         {
+            "gain": FLAT,
+            "offset": FLAT,
+            "gamma": 2.2,
+            "defects": FLAT[0] > 1,
+            "blur_px": 1.0,
+            "markers": vts.FillMarkers(),
+            "level": True,
+            "flat": FLAT,
+            "noise_std": 0.01 * FLAT,
+        },
+        {
+            "flat": BAD_FLAT[:-1],
+            "noise_std": BAD_FLAT[:-1],
             "gain": BAD_FLAT[:-1],
             "offset": BAD_FLAT[:-1],
             "gamma": NUMBER,
@@ -261,11 +279,15 @@ TABLE = {
             "lights": [POSITION, None],
             **shaped(),
             "noise_std": [torch.zeros(2), torch.full((3,), NAN), 0.01],
-            "inverse": [unit().inverse[None], unit().inverse + NAN, "inverse"],
+            "inverse": [unit().inverse[None], "inverse"],
+            "camera_height_mm": HEIGHTS,
             "full_above": [FLAT[None], FLAT[:, 1:], "full"],
         },
     ),
-    "NormalFromIntensity.from_calibration": Entry({"calibration": unit()}, {"calibration": [*OTHERS, unit("response")]}),
+    "NormalFromIntensity.from_calibration": Entry(
+        {"calibration": unit(), "camera_height_mm": 30.0},
+        {"calibration": [*OTHERS, unit("response")], "camera_height_mm": HEIGHTS},
+    ),
     "NormalFromIntensity.forward": Entry(
         {"compensated": FLAT[None], "depth_mm": DEPTH, "window": (0, 0)},
         {"compensated": batches(3), "depth_mm": [b for b in batches(1) if b is not None], "window": [(20, 20), (-1, 0)]},
@@ -343,10 +365,40 @@ TABLE = {
     ),
     "PointLights.forward": Entry(
         {"depth_mm": DEPTH, "normal": torch.zeros(1, 3, HEIGHT, WIDTH), "mm_per_pixel": 1.0},
-        {"depth_mm": batches(1), "normal": [*batches(3), torch.zeros(1, 3, 8, 8)], "mm_per_pixel": NUMBER},
+        {
+            "depth_mm": batches(1),
+            "normal": [*batches(3), torch.zeros(1, 3, 8, 8)],
+            "mm_per_pixel": NUMBER,
+            "camera_height_mm": HEIGHTS,
+        },
         lights,
     ),
     **{name: Entry({"mm_per_pixel": 1.0}, {"mm_per_pixel": NUMBER}) for name in ("PoissonDCT", "PoissonDST", "PoissonRest")},
+    "AdaptiveIntegration": Entry({"mm_per_pixel": 1.0, "share": 0.1}, {"mm_per_pixel": NUMBER, "share": [*NUMBER, 2.0]}),
+    "CliffIntegration": Entry(
+        {"mm_per_pixel": 1.0, "slope_std": 0.05},
+        {
+            **dict.fromkeys(("mm_per_pixel", "slope_std", "threshold", "residual", "tolerance_px"), NUMBER),
+            "rim_weight": [*NUMBER, 2.0],
+            "max_passes": INTEGER,
+            "max_iterations": INTEGER,
+        },
+    ),
+    "CliffIntegration.solve": Entry(
+        {"gradient": GRADIENT, "contact": GRADIENT[:, :1] > 0, "weight": torch.ones(1, 1, 8, 8)},
+        {"gradient": BAD_GRADIENT, "contact": BAD_MASKS, "weight": BAD_WEIGHTS},
+        lambda: vts.CliffIntegration().solve,
+    ),
+    "PerspectiveIntegration": Entry(
+        {"mm_per_pixel": 1.0, "camera_height_mm": 30.0, "integrate": vts.PoissonRest()},
+        {"mm_per_pixel": NUMBER, "camera_height_mm": NUMBER, "integrate": ["rest", 3]},
+    ),
+    "PerspectiveIntegration.forward": Entry(
+        {"gradient": GRADIENT, "window": (0, 0), "size": (16, 16)},
+        {"gradient": BAD_GRADIENT, "window": [(9, 0), (-1, 0)], "size": [(4, 4)]},
+        lambda: vts.PerspectiveIntegration(1.0, 30.0),
+        named={"window": "gradient, window", "size": "gradient, window"},
+    ),
     "PoissonDST.forward": Entry(
         {"gradient": torch.zeros(1, 2, 8, 8)}, {"gradient": [*batches(2), torch.zeros(1, 2, 2, 8)]}, lambda: vts.PoissonDST()
     ),
@@ -357,7 +409,7 @@ TABLE = {
             lambda name=name: getattr(vts, name)(),
             named={"window": "gradient, window", "size": "gradient, window"},
         )
-        for name in ("PoissonDCT", "PoissonRest")
+        for name in ("PoissonDCT", "PoissonRest", "AdaptiveIntegration", "CliffIntegration")
     },
     "Press": Entry(
         {"image": image(), "ball_diameter_mm": 6.0, "center_px": (4.0, 5.0), "contact_radius_px": 3.0},
@@ -529,7 +581,16 @@ TABLE = {
             "normal": [*batches(3), torch.zeros(1, 3, 8, 8)],
             "lights": [POSITION, None],
             "mm_per_pixel": NUMBER,
+            "camera_height_mm": HEIGHTS,
         },
+    ),
+    "integrate_cliffs": Entry(
+        {"gradient": GRADIENT, "mm_per_pixel": 1.0, "contact": GRADIENT[:, :1] > 0, "weight": torch.ones(1, 1, 8, 8)},
+        {"gradient": BAD_GRADIENT, "mm_per_pixel": NUMBER, "contact": BAD_MASKS, "weight": BAD_WEIGHTS},
+    ),
+    "integrate_perspective": Entry(
+        {"gradient": GRADIENT, "mm_per_pixel": 1.0, "camera_height_mm": 30.0},
+        {"gradient": BAD_GRADIENT, "mm_per_pixel": NUMBER, "camera_height_mm": NUMBER},
     ),
     "normal_from_gradient": forward(lambda: vts.normal_from_gradient, 2, "gradient"),
     **{
@@ -654,11 +715,23 @@ TABLE = {
     # ---- scenes ----
     "scenes.surface": Entry(
         {"depth_mm": lambda x, y: 1.0 - x**2 - y**2, **SIZE},
-        {"depth_mm": [None, torch.zeros(4, 4), lambda x, y: 1.0, lambda x, y: x[0]], **shaped()},
+        {
+            "depth_mm": [None, torch.zeros(4, 4), lambda x, y: 1.0, lambda x, y: x[0]],
+            **shaped(camera_height_mm=HEIGHTS),
+        },
+    ),
+    "scenes.surface_at": Entry(
+        {"depth_mm": lambda x, y: 1.0 - x**2 - y**2, "x": torch.rand(8, 8), "y": torch.rand(8, 8), "mm_per_pixel": 1.0},
+        {
+            "depth_mm": [None, torch.zeros(4, 4), lambda x, y: 1.0, lambda x, y: x[0]],
+            "x": [None, np.zeros((8, 8))],
+            "y": [None, torch.zeros(4, 8), torch.zeros(1, 8, 8)],
+            "mm_per_pixel": NUMBER,
+        },
     ),
     "scenes.sphere_press": Entry(
         {"radius_mm": 10.0, "press_mm": 1.0, "center_mm": (0.0, 0.0), **SIZE},
-        shaped(radius_mm=NUMBER, press_mm=[*NUMBER, 99.0], center_mm=CENTER),
+        shaped(radius_mm=NUMBER, press_mm=[*NUMBER, 99.0], center_mm=CENTER, camera_height_mm=HEIGHTS),
     ),
     "scenes.cylinder_press": Entry(
         {"radius_mm": 4.0, "press_mm": 0.5, "length_mm": 9.0, "angle_deg": 25.0, "center_mm": (0.0, 0.0), **SIZE},

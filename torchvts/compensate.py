@@ -65,7 +65,7 @@ class Compensate(nn.Module):
         self.markers = nn.Identity() if markers is None else markers
         self.blur_px = float(blur_px) if blur_px == 0 else check_positive("blur_px", blur_px)
         self.gamma = check_positive("gamma", gamma)
-        for name, value in (("gain", gain), ("offset", offset)):
+        for name, value in (("gain", gain), ("offset", offset), ("flat", flat), ("noise_std", noise_std)):
             if value is not None:
                 check_field(name, value)
         if defects is not None:

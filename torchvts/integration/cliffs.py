@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_batch, check_integer, check_positive, check_same_size
-from .poisson import PoissonRest, laplace_plan, solve_laplace
+from ..core.checks import check_batch, check_integer, check_positive, check_same_size, check_shape, check_window
+from .poisson import PoissonRest, check_gradient, laplace_plan, solve_laplace
 
 SLOPE_STD = 0.05
 """Noise of the slope of flat pixels; a factor of two either way changes little."""
@@ -124,23 +124,25 @@ class CliffIntegration(nn.Module):
         self.tolerance_px = check_positive("tolerance_px", tolerance_px)
 
     def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
-        check_batch("gradient", gradient, 2)
+        check_gradient(gradient, 2)
         if size is not None:
-            top, left = (0, 0) if window is None else window
+            top, left = check_window("gradient", gradient, size, window)
             below, after = size[0] - top - gradient.shape[2], size[1] - left - gradient.shape[3]
             gradient = nn.functional.pad(gradient, [left, after, top, below])
         return self.solve(gradient).depth_mm
 
     def solve(self, gradient: Tensor, contact: Tensor | None = None, weight: Tensor | None = None) -> CliffSolution:
         """Depth with its status; arguments as :func:`integrate_cliffs`."""
-        check_batch("gradient", gradient, 2)
+        check_gradient(gradient, 2)
         height, width = gradient.shape[2], gradient.shape[3]
-        if height < 2 or width < 2:
-            raise ValueError(f"gradient: expected H and W of at least 2, got {height} x {width}: there is nothing to integrate")
-        touched = _without_gaps((gradient != 0).any(dim=1, keepdim=True)) if contact is None else contact.bool()
-        check_same_size("contact", touched, "gradient", height, width)
-        trust = torch.ones_like(gradient[:, 0:1]) if weight is None else weight.to(gradient.dtype)
-        check_same_size("weight", trust, "gradient", height, width)
+        touched = _without_gaps((gradient != 0).any(dim=1, keepdim=True)) if contact is None else contact
+        trust = torch.ones_like(gradient[:, 0:1]) if weight is None else weight
+        for name, value in (("contact", touched), ("weight", trust)):
+            check_shape(name, value, (gradient.shape[0], 1, height, width), "gradient")
+            if (value.dtype == torch.bool) != (name == "contact"):
+                kind = "bool: threshold it" if name == "contact" else "a number from 0 to 1: weight.float() of a mask"
+                raise TypeError(f"{name}: expected {kind.split(':')[0]}, got {value.dtype}:{kind.split(':')[1]}")
+        trust = trust.to(gradient.dtype)
         depths, status = [], []
         for frame, mask, sure in zip(gradient.unsqueeze(1), touched.unsqueeze(1), trust.unsqueeze(1), strict=True):
             contacts = _label(mask)

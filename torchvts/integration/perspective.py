@@ -11,9 +11,9 @@ dw/dv likewise with q. w is depth to first order, zero where z is, and z = h (1 
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_batch, check_positive
+from ..core.checks import check_positive, check_record, check_window
 from ..core.geometry import pixel_grid_mm
-from .poisson import PoissonRest
+from .poisson import PoissonRest, check_gradient
 
 LEAST_COSINE = 0.05
 """Of h + p u + q v, relative to h: a surface steeper than that turns away from the camera."""
@@ -58,13 +58,15 @@ class PerspectiveIntegration(nn.Module):
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         self.camera_height_mm = check_positive("camera_height_mm", camera_height_mm)
         self.least_facing_mm = LEAST_COSINE * self.camera_height_mm
+        if integrate is not None:
+            check_record("integrate", integrate, nn.Module, "PoissonRest(mm_per_pixel) is one")
         self.integrate = PoissonRest(mm_per_pixel) if integrate is None else integrate
 
     def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
-        check_batch("gradient", gradient, 2)
+        check_gradient(gradient, 2)
         rows, columns = gradient.shape[2], gradient.shape[3]
         height, width = (rows, columns) if size is None else size
-        top, left = (0, 0) if window is None else window
+        top, left = check_window("gradient", gradient, (height, width), window)
         u, v = pixel_grid_mm(height, width, self.mm_per_pixel, gradient.dtype, gradient.device)
         u, v = u[:, left : left + columns], v[top : top + rows]
         h = self.camera_height_mm

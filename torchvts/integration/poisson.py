@@ -33,7 +33,7 @@ def divergence(gradient: Tensor) -> Tensor:
     Returns:
         (B, 1, H, W), in the gradient's unit per pixel.
     """
-    _check(gradient, 2)
+    check_gradient(gradient, 2)
     p, q = gradient[:, 0:1], gradient[:, 1:2]
     first, last = p[..., :1] + p[..., 1:2], p[..., -1:] + p[..., -2:-1]
     along_x = torch.cat((first, p[..., 2:] - p[..., :-2], -last), dim=3)
@@ -61,7 +61,7 @@ def poisson_dst(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
         >>> poisson_dst(torch.zeros(1, 2, 8, 8), 0.05).shape
         torch.Size([1, 1, 8, 8])
     """
-    _check(gradient, 3)
+    check_gradient(gradient, 3)
     if not torch.jit.is_scripting():
         check_positive("mm_per_pixel", mm_per_pixel)
     return _integrate_dst(gradient, mm_per_pixel, _plan_dst(gradient))
@@ -87,7 +87,7 @@ def poisson_dct(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
         >>> bool((z[0, 0, 1:, 1:] - z[0, 0, :-1, :-1] - 0.2).abs().max() < 1e-6)
         True
     """
-    _check(gradient, 2)
+    check_gradient(gradient, 2)
     if not torch.jit.is_scripting():
         check_positive("mm_per_pixel", mm_per_pixel)
     return _integrate_dct(gradient, mm_per_pixel, _plan_dct(gradient, gradient.shape[2], gradient.shape[3]), 0, 0)
@@ -123,7 +123,7 @@ class PoissonDST(nn.Module):
         self._plan: list[Tensor] = _plan_dst(torch.zeros(1, 2, 3, 3))
 
     def forward(self, gradient: Tensor) -> Tensor:
-        _check(gradient, 3)
+        check_gradient(gradient, 3)
         plan = self._plan
         if not _plan_fits(plan, gradient, gradient.shape[2], gradient.shape[3]):
             plan = _plan_dst(gradient)
@@ -146,7 +146,7 @@ class PoissonDCT(nn.Module):
         self._plan: list[Tensor] = _plan_dct(torch.zeros(1, 2, 2, 2), 2, 2)
 
     def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
-        _check(gradient, 2)
+        check_gradient(gradient, 2)
         height, width = (gradient.shape[2], gradient.shape[3]) if size is None else size
         top, left = check_window("gradient", gradient, (height, width), window)
         plan = self._plan
@@ -183,7 +183,8 @@ def _level(depth: Tensor, gradient: Tensor, top: int, left: int) -> Tensor:
     return depth - mean
 
 
-def _check(gradient: Tensor, least: int) -> None:
+def check_gradient(gradient: Tensor, least: int) -> None:
+    """Raise unless ``gradient`` is (B, 2, H, W) with H and W of at least ``least``. Scripts."""
     check_batch("gradient", gradient, 2)
     if gradient.shape[2] < least or gradient.shape[3] < least:
         raise ValueError(

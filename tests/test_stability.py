@@ -163,7 +163,7 @@ def test_pages_tell_of_breaking_points():
         Breaking("precise", "noise", "value", "never", 0.0, (0.1,), 1.0),
     ]
     page = "# a page\n<!-- dial: noise -->\nold\nrest"
-    told = "# a page\n<!-- dial: noise -->\nBreaks at 0.0123 value: fast; auto. Holds to the end: precise.\nrest"
+    told = "# a page\n<!-- dial: noise -->\nBreaks at 0.0123 value: *fast*, *auto*; holds to the end: *precise*.\nrest"
     assert stability.told_in(page, points) == told
     with pytest.raises(ValueError, match="page: <!-- dial: flood -->: no such dial was measured"):
         stability.told_in("<!-- dial: flood -->\n", points)

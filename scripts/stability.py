@@ -145,7 +145,7 @@ def overview(points: Sequence[Breaking]) -> Figure:
     dials = list(dict.fromkeys(p.dial for p in points))
     by_place = {(p.dial, p.method): p for p in points}
     held = np.array([[by_place[dial, method].held for method in methods] for dial in dials])
-    figure = Figure(figsize=(2.6 + 0.95 * len(methods), 1.3 + 0.24 * len(dials)), layout="constrained", dpi=100)
+    figure = Figure(figsize=(2.6 + 0.95 * len(methods), 1.3 + 0.24 * len(dials)), layout="constrained", dpi=88)
     axes = figure.subplots()
     picture = axes.imshow(held, cmap="RdYlGn", vmin=0.0, vmax=1.0, aspect="auto", alpha=0.7)
     for row, dial in enumerate(dials):

@@ -42,7 +42,7 @@ LIMITS = (
 """The limits in words, as they are printed."""
 
 MASK = "contact mask"
-"""Stands among the methods where breaking points are told: the mask is judged by itself, because all methods here share it."""
+"""Stands among the methods where breaking points are told: the mask is judged by itself, on the rows of "fast"."""
 
 WORST = 10.0
 """An error of so many limits is as bad as any: what raises an error has it, and one seed cannot weigh more."""
@@ -396,12 +396,11 @@ def told_in(page: str, points: Sequence[Breaking]) -> str:
 def _sentence(points: Sequence[Breaking]) -> str:
     groups: dict[str, list[str]] = {}
     for point in sorted(points, key=lambda point: point.held):
-        groups.setdefault(_told(point), []).append(point.method)
+        groups.setdefault(_told(point), []).append(f"*{point.method}*")
     unit = f" {points[0].unit}" if points[0].unit else ""
-    parts = [f"at {at}{unit}: {'; '.join(names)}" for at, names in groups.items() if at not in ("never", "always")]
-    text = f"Breaks {', '.join(parts)}." if parts else ""
-    if "always" in groups:
-        text = f"Broken from the start: {'; '.join(groups['always'])}. {text}"
-    if "never" in groups:
-        text += f" Holds to the end: {'; '.join(groups['never'])}."
-    return text.strip()
+    told = [f"broken from the start: {', '.join(groups.pop('always'))}"] if "always" in groups else []
+    holding = groups.pop("never", [])
+    told += [f"breaks at {at}{unit}: {', '.join(names)}" for at, names in groups.items()]
+    told += [f"holds to the end: {', '.join(holding)}"] if holding else []
+    text = "; ".join(told)
+    return text[:1].upper() + text[1:] + "."

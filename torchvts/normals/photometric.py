@@ -29,8 +29,8 @@ PRIOR_STD = 0.25
 """How far slopes spread about what is known of them beforehand."""
 
 BRIGHTNESS_NOISES = 1.5
-"""Brightness counts to so many noises where a light is blocked. Trusted fully, a ball at a noise of 0.01 keeps a quarter of the plain
-inverse's error instead of a fifth; to 2 % at any noise, walls of slope 4 at a noise of 0.002 are twice as wrong."""
+"""Brightness counts to so many noises where a light is blocked. Trusted fully, a ball at a noise of 0.01 keeps a quarter of the
+plain inverse's error instead of a fifth; to 2 % at any noise, walls of slope 4 at a noise of 0.002 are twice as wrong."""
 
 
 def slope_by_lit_lights(

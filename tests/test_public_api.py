@@ -9,11 +9,12 @@ import pytest
 import torchvts as vts
 
 NAMES = [
-    "Calibration", "CalibrationWarning", "Compensate", "ContactMask", "DepthOutput", "DepthPipeline", "FillMarkers",
+    "Calibration", "CalibrationWarning", "Compensate", "ContactMask", "DepthOutput", "DepthPipeline", "Diagnosis",
+    "FillMarkers", "Finding",
     "GradientFromNormal", "LightFit", "NormalFromIntensity", "NormalFromLookup", "NormalFromMLP", "NormalFromResponse",
     "PointLights", "PoissonDCT", "PoissonDST", "PoissonRest", "Press", "Registration", "Sensor", "Touch", "calibrate",
     "contact_cloud", "depth_to_points",
-    "divergence",
+    "diagnose", "divergence",
     "fill_markers", "find_markers", "fit_lights", "fit_mlp", "fit_prior", "gradient_from_normal", "gs_sdk", "metrics",
     "near_field_shading", "normal_from_gradient", "objects", "poisson_dct", "poisson_dst", "poisson_rest", "read_image",
     "read_presses", "register_depth", "register_points", "scenes", "shipped_sensors", "stream", "write_image",
@@ -35,6 +36,8 @@ ARGUMENTS = {
     vts.Calibration.load: ["path"],
     vts.Calibration.save: ["self", "path"],
     vts.DepthPipeline.from_calibration: ["calibration", "mode"],
+    vts.diagnose: ["background", "image", "calibration"],
+    vts.Finding: ["name", "message", "severity", "value"],
     vts.poisson_dst: ["gradient", "mm_per_pixel"],
     vts.poisson_dct: ["gradient", "mm_per_pixel"],
     vts.PoissonDST: ["mm_per_pixel"],

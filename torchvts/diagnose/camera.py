@@ -3,7 +3,6 @@
 import math
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -22,6 +21,9 @@ def levels_of(image: Tensor) -> float:
         63.0
     """
     values = image.detach().double().flatten()
+    values = values[(values > 0.0) & (values < 1.0)]  # clipped ones tell nothing
+    if len(values) < 100:
+        return math.inf
     for bits in range(1, 9):
         count = 2**bits - 1
         scaled = values * count
@@ -45,7 +47,7 @@ def blockiness(image: Tensor) -> float:
     for plane in (luma, luma.t()):
         first = plane[:, 1:] - plane[:, :-1]
         jump = (first[:, 1:-1] - 0.5 * (first[:, :-2] + first[:, 2:])).abs()
-        limit = 6.0 * jump.median().clamp_min(1e-9)
+        limit = 2.5 * jump.median().clamp_min(1e-9)
         columns = jump.clamp_max(float(limit)).mean(0)  # one jump per column border
         whole = columns.shape[0] // BLOCK * BLOCK
         phases = columns[:whole].reshape(-1, BLOCK).median(0).values
@@ -56,9 +58,9 @@ def blockiness(image: Tensor) -> float:
 
 
 class Spots(NamedTuple):
-    """New spots: how many, how many pixels, how many pixels read nothing, and which pixels (H, W) bool."""
+    """New spots: how many, how many pixels, how many of those read nothing, and which they are, (H, W) bool."""
 
-    count: int
+    number: int
     pixels: int
     dead: int
     mask: Tensor
@@ -75,9 +77,11 @@ def new_spots(image: Tensor, expected: Tensor, noise_std: Tensor, widest_px: int
         image, expected: (3, H, W), values. noise_std: (3,), of their difference. widest_px: diameter of the widest spot.
         contact: (H, W) bool; parts of it no wider than a spot do not count as such.
     """
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (widest_px | 1, widest_px | 1))
-    touched = cv2.morphologyEx(contact.numpy().astype(np.uint8), cv2.MORPH_OPEN, disc)
-    touched = cv2.dilate(touched, np.ones((7, 7), np.uint8)) > 0
+    import cv2
+
+    number, label, stats, _ = cv2.connectedComponentsWithStats(contact.numpy().astype(np.uint8), connectivity=8)
+    wide = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]) > 1.5 * widest_px
+    touched = cv2.dilate((wide & (np.arange(number) > 0))[label].astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
     value, rest = image.double().numpy(), expected.double().numpy()
     noise = noise_std.double().numpy()[:, None, None]
     dead = (value < 3.0 * noise).all(0) & (rest > 12.0 * noise).all(0)

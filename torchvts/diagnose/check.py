@@ -4,21 +4,18 @@ import dataclasses
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..calibration.contacts import ROUGH, channel_structure
+from ..calibration.rest_image import falloff, outwardness
 from ..core.checks import QUANTISATION_STD, check_range
-from ..core.geometry import normal_from_gradient
 from ..core.noise import noise_std
-from ..markers import find_markers
-from ..pipeline import DepthPipeline
 from ..record import Calibration
 from ..shading import PointLights
 from .camera import Spots, blockiness, levels_of, new_spots, texture_share
-from .findings import Diagnosis, Finding
+from .findings import SEVERITIES, Diagnosis, Finding
 from .relief import (
     Reader,
     Relief,
@@ -32,7 +29,8 @@ from .relief import (
     regions,
     skirt_mm,
 )
-from .rest import CHANNELS, Change, compare
+from .rest import CHANNELS, FULL, Change, cell_means, compare
+from .words import THAN_AT_CALIBRATION, in_words
 
 USUAL_DRIFT = 0.05
 """Light of real lamps drifts, and a press scatters light over the skin: by 2 % on one GelSight Mini, by 5 % on another. What a
@@ -50,8 +48,9 @@ OF_THE_MODEL = {
 FLOODED = {"skin_changed", "new_spots", "few_bits", "compressed", "other_unit", "light_changed", "noise"}
 """What may pass for contact: then its outline and number mean nothing."""
 
-BLOCKY = 1.25
-"""Steps at the borders of 8 x 8 blocks over those inside from which an image was compressed; noise alone stays below 1.1."""
+BLOCKY = 1.18
+"""Steps at the borders of 8 x 8 blocks over those inside from which an image was compressed; noise alone stays below 1.1, a
+JPEG of quality 95 is at 1.2 to 1.3."""
 
 COPLANAR = 0.3
 """Smallest singular value of the lights' directions below which they nearly lie in one plane."""
@@ -139,9 +138,16 @@ class _Examination:
         found = self._calibration()
         found += self._background()
         found += self._camera()
+        if self._is_empty():
+            message = (
+                "the image shows nothing of the skin, one value everywhere: lens covered, no lamps, or no picture from the camera"
+            )
+            return [*found, Finding("no_picture", message, "fault", float(self.image.mean()))]
         if bool(self.dead.any()):
-            names = " and ".join(CHANNELS[j] for j in range(3) if self.dead[j])
-            message = f"the {names} light is dead (its channel is black everywhere): check lamp and cable; there is no depth without it"
+            lost = " and ".join(CHANNELS[j] for j in range(3) if self.dead[j])
+            message = (
+                f"the {lost} light is dead (its channel is black everywhere): check lamp and cable; there is no depth without it"
+            )
             return found + [Finding("light_dead", message, "fault", float(self.dead.sum()))]
         change = self._compare(self.image)
         relief_like = self._is_relief(change)
@@ -155,10 +161,10 @@ class _Examination:
         relief = Relief.of(light, self.reader, self.noise)
         spots = self._spots(change, relief.contact)
         found += self._skin(change, spots)
-        names = {finding.name for finding in found}
-        if "skin_changed" in names:  # the better word for it
+        said = {finding.name for finding in found}
+        if "skin_changed" in said:  # the better word for it
             found = [finding for finding in found if finding.name != "light_changed"]
-        if not names & OF_THE_MODEL:
+        if not said & OF_THE_MODEL:
             found += self._misfit(relief, spots.mask)
         return found + self._scene(light, relief, {finding.name for finding in found})
 
@@ -167,6 +173,11 @@ class _Examination:
     def _dead(self, image: Tensor) -> Tensor:
         level, rest = image.flatten(1).quantile(0.99, dim=1), self.value.flatten(1).median(dim=1).values
         return (level < (4.0 * self.noise).clamp_min(0.02)) & (rest > 0.06)
+
+    def _is_empty(self) -> bool:
+        """Whether all channels are even, where the skin at rest is not: by cells, so that noise does not matter."""
+        even, rest = (cell_means(image).flatten(1).std(dim=1) for image in (self.image, self.value))
+        return bool((even < 0.05 * rest).all()) and bool((rest > 0.002).all())
 
     def _compare(self, image: Tensor) -> Change:
         noise = torch.sqrt(self.calibrated_noise**2 + self.noise**2)
@@ -196,8 +207,10 @@ class _Examination:
             if unit.lights is None and rough > ROUGH and not unit.sensor.markers:
                 found.append(self._contact_at_rest("calibration", rough))
         if unit.markers is not None:
-            share = float((unit.markers.find(self.raw[None]) if hasattr(unit.markers, "find") else find_markers(self.raw[None])).double().mean())
-            message = f"printed markers cover {share:.0%} of the image: they are filled from around them, so no detail is seen there"
+            share = float((self.raw != self.image).any(0).double().mean())
+            message = (
+                f"printed markers cover {share:.0%} of the image: they are filled from around them, so no detail is seen there"
+            )
             found.append(Finding("markers", message, "note", share))
         if unit.lights is None:
             return found
@@ -225,8 +238,6 @@ class _Examination:
         model = unit.model_image.float()
         told = unit.report.get("vignetting", [])
         if isinstance(told, list) and any(told):
-            from ..calibration.rest_image import falloff, outwardness
-
             model = model * falloff(outwardness(unit.sensor), *[float(v) for v in told[:2]]).float()
         return model
 
@@ -244,7 +255,8 @@ class _Examination:
         noise = noise_std(given[None])[0].float().clamp_min(QUANTISATION_STD)
         change = compare(given, self.light, torch.sqrt(self.calibrated_noise**2 + noise**2), unit, self.rounding)
         found = self._light(change, "background")
-        if _blob(change) > 12 and change.rest_share > 0.3:
+        strange = any(finding.name == "other_unit" for finding in found)
+        if _blob(change) > 12 and change.rest_share > 0.3 and not strange:
             found.append(self._contact_at_rest("background", float(change.departs.max())))
         return found
 
@@ -252,92 +264,24 @@ class _Examination:
         """A change of the light in words. ``which``: "calibration" (its image against its lights), "background" or "image"."""
         if change.name == "same":
             if which != "calibration" and change.rest_share < 0.05:
-                message = "the whole skin is touched, or all light has changed: nothing to level on; take an image with skin at rest in it"
+                message = "the whole skin is touched, or all light has changed: nothing to level on; leave some skin at rest"
                 return [Finding("nothing_at_rest", message, "warning", change.rest_share)]
             return []
-        numbers, most = change.numbers, float(change.effect.max())
-        since = "than the calibration's lights say" if which == "calibration" else "than at calibration"
+        most = float(change.effect.max())
         cost = self._cost_deg(change, which)
-        names = [CHANNELS[j] for j in change.hypothesis.channels]
-        pay = f"or accept {cost:.1f} degrees" if cost == cost else "its cost in degrees is not known"
-        severity = "fault" if cost >= 6.0 * WORTH_DEG else "warning" if cost >= WORTH_DEG else "note"
-        name, value = change.name, most
-        if name == "channels_swapped":
-            order = change.hypothesis.channels
-            moved = [CHANNELS[j] for j in range(3) if order[j] != j]
-            text, severity = f"channels look swapped ({' and '.join(moved)}): read the image in the order R, G, B", "fault"
-        elif name == "channels_mixed":
-            value = float(numbers[0])
-            if value > 0.75:
-                name, severity = "channels_swapped", "fault"
-                text = f"channels look swapped ({' and '.join(names)}): read the image in the order R, G, B"
-            else:
-                text = f"{value:.0%} of the {names[0]} channel is seen in {names[1]} and the other way round: the camera mixes colours, {pay}"
-        elif name == "channel":
-            value = float(numbers.exp() - 1.0)
-            name, text = "channel_level", f"{names[0]} channel {abs(value):.1%} {'dimmer' if value < 0 else 'brighter'} {since}: recalibrate {pay}"
-        elif name == "channels":
-            levels = [f"{CHANNELS[j]} {float(numbers[j].exp() - 1.0):+.1%}" for j in range(3)]
-            name, text = "channel_level", f"the channels' levels are other {since} ({', '.join(levels)}): recalibrate {pay}"
-        elif name == "exposure":
-            value = float(numbers.exp() - 1.0)
-            name, text = "exposure", f"the image is {abs(value):.1%} {'darker' if value < 0 else 'brighter'} {since}: exposure or lamps; recalibrate {pay}"
-        elif name == "ambient":
-            value = float(numbers[:3].mean())
-            if value > 0:
-                name, text = "ambient_light", f"light of {value:.3f} is added everywhere, which the lamps do not give: shade the sensor, or recalibrate with ambient light, {pay}"
-            else:
-                name, text = "black_level", f"a black level of {-value:.3f} is taken off every value: switch it off in the camera, {pay}"
-        elif name == "gamma":
-            value = float(numbers.exp())
-            text = f"values are light to the power {value:.2f}: another gamma than the sensor file says (set gamma = {self.exponent / value:.2f}), {pay}"
-        elif name == "vignetting":
-            value = float(numbers[0])
-            text = f"the lens darkens the corners by {value:.0%} {since}: the background takes it out, only noise in the corners grows"
-            severity = "note" if which == "calibration" else severity
-        elif name == "light_moved":
-            text = f"the {names[0]} light seems to have moved{self._way(change)}: fix it and recalibrate, {pay}"
-        elif name == "pitch":
-            value = float(numbers.exp() - 1.0)
-            name, text = "wrong_pitch", f"pixels seem {abs(value):.1%} {'larger' if value > 0 else 'smaller'} on the skin than mm_per_pixel says: all depths are off by that; measure the pitch again"
-            severity = "warning" if abs(value) > 0.01 else "note"
-        elif name == "distortion":
-            value = float(numbers[0])
-            name, text = "lens_distortion", f"the image corners seem {abs(value):.1%} {'nearer to' if value < 0 else 'further from'} the middle than a straight lens shows: rectify the images"
-            severity = "warning" if abs(value) > 0.02 else "note"
-        elif name == "gloss":
-            value = float(numbers[0])
-            name, text = "specular", f"the skin shines: a gloss of {value:.2f} beside the matt light explains the rest image; slopes towards the lights are off"
-            severity = "warning"
-        elif name == "skin_changed":
-            text = f"the skin is up to {most:.1%} brighter or darker, in all channels alike, {since}: worn or dirty; recalibrate {pay}"
-        elif which == "calibration":
-            name = "lights_misfit"
-            text = f"the calibration's lights do not explain its own image (off by {most:.1%}): other lights, scattered light, or a lens; use presses or a prior"
-            severity = "warning" if most > 0.01 else "note"
-        elif change.rest_share < 0.5:
-            name, severity = "other_unit", "fault"
-            text = f"only {change.rest_share:.0%} of the skin looks as at calibration, whatever simple change of light is allowed: another unit, or all its light changed; recalibrate"
-        else:
-            name, text = "light_changed", f"light at rest is off by {most:.1%}, differently over the skin and by channel: lamps changed, or another unit; recalibrate {pay}"
-        if self.calibration.response is not None and most < USUAL_DRIFT and name != "channels_swapped":
+        since = "than the calibration's lights say" if which == "calibration" else THAN_AT_CALIBRATION
+        words = in_words(change, self.calibration, since, cost)
+        by_cost = "fault" if cost >= 6.0 * WORTH_DEG else "warning" if cost >= WORTH_DEG else "note"
+        severity = min(by_cost, words.least, key=SEVERITIES.index)
+        if self.calibration.response is not None and words.name != "channels_swapped":
             if most < NO_DRIFT:
                 return []
-            severity = "note"
-        if which == "calibration":
-            text = f"at calibration already: {text}"
-        elif which == "background":
-            text = f"the background shows: {text}"
-        return [Finding(name, text, severity, value)]
-
-    def _way(self, change: Change) -> str:
-        lights = self.calibration.lights
-        if lights is None:
-            return f" or changed (its light is off by {float(change.effect.max()):.1%})"
-        reach = float(lights.position_mm.norm(dim=1).mean())
-        side = reach * change.numbers[:2].norm()
-        up = float(lights.position_mm[change.hypothesis.channels[0], 2]) * (change.numbers[2].exp() - 1.0)
-        return f" by about {float(torch.sqrt(side**2 + up**2)):.1f} mm"
+            if most < USUAL_DRIFT:
+                severity = "note"
+            elif severity == "note":
+                severity = "warning"
+        says = {"calibration": "at calibration already: ", "background": "the background shows: "}.get(which, "")
+        return [Finding(words.name, says + words.text, severity, words.value)]
 
     def _cost_deg(self, change: Change, which: str) -> float:
         """Mean angle between the image's normals as they are and as they would be without the change; nan if that is not known."""
@@ -373,32 +317,38 @@ class _Examination:
     def _camera(self) -> list[Finding]:
         unit = self.calibration
         found: list[Finding] = []
-        calibrated_levels = levels_of(self.value) if unit.measured and self.exponent == 1.0 else math.inf
         if self.levels < 200:
             bits = round(math.log2(self.levels + 1))
             which = "image" if levels_of(self.raw) == self.levels else "calibration's image"
             cost = normal_noise_deg(self.reader, torch.full((3,), 1.0 / self.levels / math.sqrt(12.0)))
-            message = f"the {which} has {bits} bits only: rounding makes normals waver by {cost:.1f} degrees; read the camera with 8 bits or more"
+            message = (
+                f"the {which} has {bits} bits only: rounding makes normals waver by {cost:.1f} degrees; read the camera with 8 "
+                "bits or more"
+            )
             found.append(Finding("few_bits", message, _by_cost(cost), float(bits)))
-        elif calibrated_levels < 200:
-            found.append(Finding("few_bits", "the calibration's image has few levels", "warning", math.log2(calibrated_levels + 1)))
-        reference_blocks = blockiness(self.value) if unit.measured else 1.0
-        if self.levels >= 200 and max(self.blocks, reference_blocks) > BLOCKY:
+        steps = max(self.blocks, blockiness(self.value) if unit.measured else 1.0)
+        if self.levels >= 200 and steps > BLOCKY:
             which = "image" if self.blocks > BLOCKY else "calibration's image"
             message = (
-                f"the {which} was compressed: steps at the borders of 8 x 8 blocks are {max(self.blocks, reference_blocks):.1f} times "
+                f"the {which} was compressed: steps at the borders of 8 x 8 blocks are {steps:.1f} times "
                 "those inside; take uncompressed images, or a JPEG quality of 95 and more"
             )
-            found.append(Finding("compressed", message, "warning", max(self.blocks, reference_blocks)))
+            found.append(Finding("compressed", message, "warning", steps))
         ratio = float((self.noise / self.calibrated_noise).max())
         cost = normal_noise_deg(self.reader, self.noise)
         if self.levels >= 200 and not bool(self.dead.any()):
             if ratio > 3.0 and cost > WORTH_DEG:
-                message = f"noise is {ratio:.1f} times that at calibration and makes normals waver by {cost:.1f} degrees: more light, less gain, or average frames"
+                message = (
+                    f"noise is {ratio:.1f} times that at calibration and makes normals waver by {cost:.1f} degrees: more light, "
+                    "less gain, or average frames"
+                )
                 found.append(Finding("noise", message, _by_cost(0.5 * cost), ratio))
             elif cost > 3.0 * WORTH_DEG:
                 level = float(self.noise.max())
-                message = f"noise of {level:.3f} makes normals waver by {cost:.1f} degrees, at calibration too: more light, less gain, or average frames"
+                message = (
+                    f"noise of {level:.3f} makes normals waver by {cost:.1f} degrees, at calibration too: more light, less gain, "
+                    "or average frames"
+                )
                 found.append(Finding("noise", message, "warning", level))
         return found
 
@@ -409,8 +359,8 @@ class _Examination:
 
     def _spots(self, change: Change, contact: Tensor) -> Spots:
         unit = self.calibration
-        flat_lights = unit.lights is not None and least_spread(unit.lights) < COPLANAR  # a slope, too, takes light from all
-        if not unit.measured or unit.markers is not None or flat_lights:
+        coplanar = unit.lights is not None and least_spread(unit.lights) < COPLANAR  # a slope, too, takes light from all
+        if not unit.measured or unit.markers is not None or coplanar or self.blocks > BLOCKY:
             return Spots(0, 0, 0, torch.zeros_like(contact))
         noise = torch.sqrt(self.noise**2 + self.calibrated_noise**2)
         return new_spots(self.image, self._expected(change), noise, max(6, min(self.image.shape[1:]) // 10), contact)
@@ -422,39 +372,56 @@ class _Examination:
         if spots.pixels >= 3:
             dead = f", {spots.dead} dead pixels among them" if spots.dead else ""
             share = spots.pixels / spots.mask.numel()
-            message = f"{spots.count} spots that were not there at calibration ({share:.1%} of the image{dead}): clean the skin, or recalibrate"
-            found.append(Finding("new_spots", message, "warning" if spots.count >= 3 else "note", float(spots.count)))
-        shared = self._worn(change)
-        if shared > 0.2 and change.name in ("same", "skin_changed", "light_field", "exposure", "vignetting", "ambient"):
-            message = f"the skin's brightness has changed unevenly, in all channels alike, on {shared:.0%} of the image: worn or dirty; recalibrate"
-            found.append(Finding("skin_changed", message, "warning", shared))
+            message = (
+                f"{spots.number} spots that were not there at calibration ({share:.1%} of the image{dead}): clean the skin, or "
+                "recalibrate"
+            )
+            found.append(Finding("new_spots", message, "warning" if spots.number >= 3 else "note", float(spots.number)))
+        worn = self._worn(change)
+        if worn > 0.0:
+            message = (
+                f"the skin's brightness has changed by {worn:.1%} (RMS), unevenly and in all channels nearly alike: worn, stained "
+                "or dirty; clean it, or recalibrate"
+            )
+            found.append(Finding("skin_changed", message, "warning", worn))
         follows = torch.nn.functional.interpolate(change.follows[None, None].float(), size=self.image.shape[1:])[0, 0] > 0.5
+        follows = follows & ~(self.raw > 0.98).any(0)
         left, error = texture_share(self.image, self._expected(change), self.calibrated_noise, follows)
         if self.levels >= 200 and error < 0.05 and left < 0.6:
-            message = f"the image is blurred or moved: only {left:.0%} of the skin's fine texture is left; focus, clean the lens, mount the camera firmly"
+            message = (
+                f"the image is blurred or moved: only {left:.0%} of the skin's fine texture is left; focus, clean the lens, mount "
+                "the camera firmly"
+            )
             found.append(Finding("blurred", message, "warning", left))
         return found
 
     def _worn(self, change: Change) -> float:
-        """Share of the image where the light has changed by one factor in all three channels, beyond what noise does."""
-        from .rest import cell_means
+        """RMS of an uneven change of brightness that the channels share, if they share most of it and it is no noise; else 0.
 
-        side = max(1, min(self.image.shape[1:]) // 60)
-        predicted = change.predicted(self.light, self.calibration).clamp_min(1e-4)
-        cells = cell_means(self.image) ** self.exponent
-        rest = cell_means(predicted)
-        log = (cells.clamp_min(1e-4) / rest.clamp_min(1e-4)).log()
-        noise = torch.sqrt(self.noise**2 + self.calibrated_noise**2)[:, None, None].double() / side
-        sigma = self.exponent * torch.sqrt(noise**2 + self.rounding**2) / cell_means(self.value).clamp_min(0.02) + 0.002
-        mean = log.mean(0)
-        apart = ((log - mean).abs() / sigma).amax(0)
-        alike = (apart < 3.0) & (mean.abs() > 4.0 * sigma.amax(0) / math.sqrt(3.0)) & (mean.abs() > 0.008)
-        return float(alike.double().mean())
+        A lamp changes one channel; a slope takes light from one and gives it to another; what lies on the skin takes it from all.
+        Medians over cells stand for RMS, so a contact does not count.
+        """
+        if change.name == "vignetting":
+            return 0.0
+        cells, rest = cell_means(self.image), cell_means(self.value)
+        usable = ((cells > 0.03) & (cells < FULL) & (rest > 0.03)).all(0)
+        if float(usable.double().mean()) < 0.3:
+            return 0.0
+        log = self.exponent * (cells / rest).log()[:, usable]
+        log = log - log.median(dim=1, keepdim=True).values
+        shared = log.mean(0)
+        own = (log - shared).abs().median() / 0.6745
+        side = self.image.shape[1] // cells.shape[1]
+        noise = torch.sqrt(self.noise**2 + self.calibrated_noise**2).double() / side
+        sigma = self.exponent * torch.sqrt(noise**2 + self.rounding**2) / rest[:, usable].mean(1)
+        level = float(shared.abs().median() / 0.6745)
+        own_beyond_noise = math.sqrt(max(0.0, float(own) ** 2 - float(sigma.square().mean())))
+        return level if level > max(0.006, 3.0 * float(sigma.mean())) and level > 1.8 * own_beyond_noise else 0.0
 
     # what the frame shows
 
     def _scene(self, light: Tensor, relief: Relief, names: set[str]) -> list[Finding]:
-        unit, sensor = self.calibration, self.calibration.sensor
+        sensor = self.calibration.sensor
         found: list[Finding] = []
         outlined = not names & FLOODED
         contact = relief.contact
@@ -475,7 +442,10 @@ class _Examination:
         top = float(torch.where(contact, depth, 0.0).max())
         share = found_regions.share
         if share > 0.4 and outlined:
-            message = f"contact covers {share:.0%} of the image: little skin at rest is left to level on, and depth beyond the border is not seen"
+            message = (
+                f"contact covers {share:.0%} of the image: little skin at rest is left to level on, and depth beyond the border "
+                "is not seen"
+            )
             found.append(Finding("contact_covers_image", message, "note", share))
         if found_regions.at_border and outlined:
             message = "the contact reaches the image border: what lies beyond is not seen, and depth there is less certain"
@@ -491,20 +461,31 @@ class _Examination:
         steep = float(torch.where(contact, relief.steepness, 0.0).flatten().quantile(1.0 - 0.02 * share))
         if steep > 1.3:
             angle = math.degrees(math.atan(steep))
-            message = f"walls of {angle:.0f} degrees: a light may be blocked there, and integration cannot hold a cliff; use precise mode, trust the top only"
+            message = (
+                f"walls of {angle:.0f} degrees: a light may be blocked there, and integration cannot hold a cliff; use precise "
+                "mode, trust the top only"
+            )
             found.append(Finding("steep_walls", message, "note", angle))
         dark = float((relief.dark.any(1)[0] & contact).double().sum() / contact.double().sum().clamp_min(1))
         if dark > 0.01:
-            message = f"a light is blocked in {dark:.0%} of the contact: slopes there rest on two lights and a guess; press less, or raise the lights"
-            found.append(Finding("shadow", message, "warning" if dark > 0.1 else "note", dark))
+            message = (
+                f"a light is blocked in {dark:.0%} of the contact: slopes there rest on two lights and a guess; press less, or "
+                "raise the lights"
+            )
+            found.append(Finding("shadow", message, "warning" if dark > 0.3 else "note", dark))
         cast = cast_shadow_share(relief, self.noise)
         if cast > 0.002:
-            message = f"a shadow falls on {cast:.1%} of the image, on skin that is flat: it will be read as a slope; raise the lights"
+            message = (
+                f"a shadow falls on {cast:.1%} of the image, on skin that is flat: it will be read as a slope; raise the lights"
+            )
             found.append(Finding("cast_shadow", message, "warning", cast))
         skirt = skirt_mm(relief)
         sharp = outlined and not names & {"blurred", "moved", "shadow"}
         if sharp and skirt > max(3.0, 2.0 * sensor.blur_px + 2.0) * sensor.mm_per_pixel:
-            message = f"the skin slopes down over {skirt:.1f} mm around the contact: the gel sags, so contact is smaller than the mask"
+            message = (
+                f"the skin slopes down over {skirt:.1f} mm around the contact: the gel sags, or the object is round there; "
+                "contact is smaller than the mask"
+            )
             found.append(Finding("skirt", message, "note", skirt))
         found += self._depth_of_press(light, relief, top)
         return found
@@ -529,14 +510,20 @@ class _Examination:
         if misfit is None:
             return []
         if misfit.longer > 0.03 and misfit.mean > 0.003:
-            message = f"{misfit.longer:.0%} of the contact is brighter in all than any matt slope: the skin shines (specular); a matt coating, or softer light"
+            message = (
+                f"{misfit.longer:.0%} of the contact is brighter in all than any matt slope: the skin shines (specular); a matt "
+                "coating, or softer light"
+            )
             return [Finding("specular", message, "warning", misfit.longer)]
         best = max(misfit.sigmas, key=lambda name: misfit.sigmas[name])
         sigmas, amount = misfit.sigmas[best], misfit.amount[best]
         if sigmas < 20.0 or amount < 0.05:
             return []
         if best.startswith("bounce"):
-            message = f"slopes look washed out, as when {amount:.0%} of the light comes by way of other skin (inter-reflection) or from around: darker gel or coating"
+            message = (
+                f"slopes look washed out, as when {amount:.0%} of the light comes by way of other skin (inter-reflection) or from "
+                "around: darker gel or coating"
+            )
             return [Finding("inter_reflection", message, "warning", amount)]
         if self.levels < 200 or self.blocks > BLOCKY or int(spots.sum()) >= 3:
             return []
@@ -553,7 +540,9 @@ def _by_cost(cost: float) -> str:
 
 def _blob(change: Change) -> int:
     """Cells of the largest part that departs by 3 % and more, specks removed."""
+    import cv2
+
     far = (change.departs > 0.03).numpy().astype(np.uint8)
-    far = cv2.morphologyEx(far, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
-    _, _, stats, _ = cv2.connectedComponentsWithStats(far, connectivity=8)
+    opened = cv2.morphologyEx(far, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    _, _, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
     return int(stats[1:, cv2.CC_STAT_AREA].max(initial=0))

@@ -7,7 +7,6 @@ longer, bounced light and mixed pixels (blur) shorter, and each does so at its o
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -49,7 +48,13 @@ class Reader:
     def output(self, image: Tensor, mode: str) -> DepthOutput:
         """The pipeline of these blocks, in a mode: "fast" or "precise"."""
         pitch = self.calibration.sensor.mm_per_pixel
-        chain = (self.compensate, ContactMask.from_calibration(self.calibration), self.normals, GradientFromNormal(), PoissonRest(pitch))
+        chain = (
+            self.compensate,
+            ContactMask.from_calibration(self.calibration),
+            self.normals,
+            GradientFromNormal(),
+            PoissonRest(pitch),
+        )
         with torch.no_grad():
             result: DepthOutput = DepthPipeline(*chain, mm_per_pixel=pitch, mode=mode).eval()(image)
         return result
@@ -101,12 +106,14 @@ class Relief:
     @property
     def contact(self) -> Tensor:
         """(H, W) bool."""
-        return self.output.contact[0, 0]
+        contact: Tensor = self.output.contact[0, 0]
+        return contact
 
     @property
     def steepness(self) -> Tensor:
         """(H, W), mm per mm."""
-        return self.output.gradient[0].norm(dim=0)
+        steep: Tensor = torch.linalg.vector_norm(self.output.gradient[0], dim=0)
+        return steep
 
 
 @dataclass(frozen=True)
@@ -168,11 +175,12 @@ def length_misfit(relief: Relief, unsound: Tensor) -> LengthMisfit | None:
 
 
 def _gaussian(planes: Tensor, std_px: float) -> Tensor:
-    return blur(planes.clone(), gaussian_weights(std_px))
+    blurred: Tensor = blur(planes, gaussian_weights(std_px))
+    return blurred
 
 
 def _smoothed(normal: Tensor, std_px: float) -> Tensor:
-    return _gaussian(normal, std_px).norm(dim=1, keepdim=True)
+    return _length(_gaussian(normal, std_px))
 
 
 def _moved(normal: Tensor, shift: tuple[int, int], length: int) -> Tensor:
@@ -184,7 +192,12 @@ def _moved(normal: Tensor, shift: tuple[int, int], length: int) -> Tensor:
     for k in steps:
         top, left = reach + k * shift[0], reach + k * shift[1]
         total = total + padded[:, :, top : top + height, left : left + width]
-    return (total / len(steps)).norm(dim=1, keepdim=True)
+    return _length(total / len(steps))
+
+
+def _length(vectors: Tensor) -> Tensor:
+    length: Tensor = torch.linalg.vector_norm(vectors, dim=1, keepdim=True)
+    return length
 
 
 def normal_noise_deg(reader: Reader, noise_std: Tensor) -> float:
@@ -192,7 +205,9 @@ def normal_noise_deg(reader: Reader, noise_std: Tensor) -> float:
     unit = reader.calibration
     rest = (unit.background.clamp_min(0.0) ** (1.0 / unit.sensor.exponent))[None]
     noise = torch.randn(rest.shape, generator=torch.Generator().manual_seed(0)).to(rest.dtype)
-    return float(angle_deg(reader.normal(rest), reader.normal(rest + noise * noise_std.to(rest.dtype).reshape(1, 3, 1, 1))).median())
+    return float(
+        angle_deg(reader.normal(rest), reader.normal(rest + noise * noise_std.to(rest.dtype).reshape(1, 3, 1, 1))).median()
+    )
 
 
 def angle_deg(normal: Tensor, other: Tensor) -> Tensor:
@@ -202,7 +217,7 @@ def angle_deg(normal: Tensor, other: Tensor) -> Tensor:
 
 
 def least_spread(lights: PointLights) -> float:
-    """Smallest singular value of the lights' unit directions at the image centre: 0 where they lie in one plane, 1 at right angles."""
+    """Smallest singular value of the lights' unit directions at the image centre: 0 in one plane, 1 at right angles."""
     directions = lights.direction.detach().double()
     return float(torch.linalg.svdvals(directions)[-1])
 
@@ -218,9 +233,12 @@ class Regions:
 
 
 def regions(contact: Tensor, least_px: int) -> Regions:
-    """Connected parts of a mask (H, W) of at least ``least_px`` pixels."""
+    """Connected parts of a mask (H, W) of at least ``least_px`` pixels and a twentieth of the largest."""
+    import cv2
+
     number, _, stats, _ = cv2.connectedComponentsWithStats(contact.numpy().astype(np.uint8), connectivity=8)
-    kept = [k for k in range(1, number) if stats[k, cv2.CC_STAT_AREA] >= least_px]
+    least = max(least_px, 0.05 * stats[1:, cv2.CC_STAT_AREA].max(initial=0))
+    kept = [k for k in range(1, number) if stats[k, cv2.CC_STAT_AREA] >= least]
     height, width = contact.shape
 
     def meets_border(k: int) -> bool:
@@ -228,40 +246,43 @@ def regions(contact: Tensor, least_px: int) -> Regions:
         return left == 0 or top == 0 or left + wide == width or top + high == height
 
     sizes = [int(stats[k, cv2.CC_STAT_AREA]) for k in kept]
-    return Regions(
-        len(kept), sum(sizes) / contact.numel(), any(meets_border(k) for k in kept), max(sizes, default=0)
-    )
+    return Regions(len(kept), sum(sizes) / contact.numel(), any(meets_border(k) for k in kept), max(sizes, default=0))
 
 
 def peaks(depth_mm: Tensor, contact: Tensor, noise_mm: float) -> int:
-    """Summits of the depth (H, W) that stand above the saddles between them by a fifth of the deepest and five times its noise."""
+    """Summits of the depth (H, W) that stand above the saddles between them by a fifth of the deepest and five times its noise.
+
+    Source:
+        the h-domes of Vincent, Morphological grayscale reconstruction, IEEE Trans. Image Processing 2(2), 1993.
+    """
+    import cv2
+
     depth = cv2.GaussianBlur(np.where(contact.numpy(), depth_mm.double().numpy(), 0.0), (0, 0), 1.5)
     top = float(depth.max())
     prominence = max(0.2 * top, 5.0 * noise_mm)
     if top <= prominence:
         return 0
-    # summits of an h-dome: flood from (depth - prominence) under depth, count what is left standing out
-    found = 0
-    marker = depth - prominence
-    kernel = np.ones((3, 3), np.uint8)
-    for _ in range(4 * max(depth.shape)):
+    marker, kernel = depth - prominence, np.ones((3, 3), np.uint8)
+    for _ in range(4 * max(depth.shape)):  # flood from (depth - prominence) under depth: what is left standing out are domes
         grown = np.minimum(cv2.dilate(marker, kernel), depth)
         if float(np.abs(grown - marker).max()) < 1e-9:
             break
         marker = grown
-    domes = (depth - marker > 0.999 * prominence).astype(np.uint8)
-    number, _ = cv2.connectedComponents(cv2.dilate(domes, kernel), connectivity=8)
-    found = number - 1
-    return max(1, found)
+    dome = depth - marker
+    number, label = cv2.connectedComponents((dome > 1e-6 * prominence).astype(np.uint8), connectivity=8)
+    heights = [float(dome[label == k].max()) for k in range(1, number)]
+    return max(1, sum(height > 0.999 * prominence for height in heights))
 
 
 def skirt_mm(relief: Relief) -> float:
     """How far from the rim of the contact the skin is steepest, mm: next to nothing where an object lets go with a kink."""
+    import cv2
+
     contact = relief.contact.numpy().astype(np.uint8)
     padded = np.pad(contact, 1, mode="edge")
     inward = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
-    deepest = int(inward.max())
-    if deepest < 3:
+    deepest = int(min(float(inward.max()), float(sum(contact.shape))))
+    if deepest < 3 or bool(contact.all()):
         return 0.0
     ring = np.clip(np.ceil(inward).astype(int), 0, deepest)
     steep = relief.steepness.double().numpy()

@@ -16,7 +16,6 @@ from torch import Tensor, nn
 from ..calibration.rest_image import falloff
 from ..core.geometry import pixel_grid_mm
 from ..record import Calibration
-from ..shading import PointLights, light_matrix
 
 CELLS = 60
 """Cells along the shorter side."""
@@ -33,8 +32,11 @@ CUT = 25.0
 TRIFLE = 0.0025
 """Light that differs less than this, RMS, is not told from the same: hypotheses so close are one."""
 
-TOLD = 0.02
+UNTOLD = 0.02
 """A simpler hypothesis may leave so much of what there was to explain."""
+
+SCATTER, UNTOLD_SCATTER = 0.015, 0.3
+"""The same for real sensors, whose presses scatter light over the skin: uneven by 1.5 %."""
 
 CHANNELS = ("red", "green", "blue")
 
@@ -59,7 +61,9 @@ class Grid:
         _, y = pixel_grid_mm(height, width, pitch_y, torch.float64)
         x, y = (axis.expand(height, width).flatten() for axis in (x, y))
         squared = x**2 + y**2
-        return cls(x, y, squared / (0.25 * sum(side**2 for side in calibration.sensor.field_mm)), light.flatten(1).double(), calibration)
+        return cls(
+            x, y, squared / (0.25 * sum(side**2 for side in calibration.sensor.field_mm)), light.flatten(1).double(), calibration
+        )
 
     def lit_by(self, position_mm: Tensor, x: Tensor | None = None, y: Tensor | None = None) -> Tensor:
         """Flat skin's light (3, N) under lights of unit power at (3, 3), at these or other places."""
@@ -169,11 +173,12 @@ def compare(
     predicted = best.predict(grid, numbers)
     told = usable.any(0) & (squared < CUT)
     # of hypotheses that foretell the same light but for a trifle, the simplest
+    trifle, untold = (TRIFLE, UNTOLD) if calibration.lights is not None else (SCATTER, UNTOLD_SCATTER)
     same, least = fits[0][0], min(score for score, *_ in fits)
     for score, other, other_numbers, other_squared in fits:
         apart = ((other.predict(grid, other_numbers) / predicted.clamp_min(1e-6) - 1.0) * usable)[:, told]
-        close = bool(told.any()) and float(apart.square().mean(1).max().sqrt()) < TRIFLE
-        if close and other.size < best.size and (other.name == "same" or score < least + TOLD * (same - least)):
+        close = bool(told.any()) and float(apart.square().mean(1).max().sqrt()) < trifle
+        if close and other.size < best.size and (other.name == "same" or score < least + untold * (same - least)):
             best, numbers, squared = other, other_numbers, other_squared
             break
     predicted = best.predict(grid, numbers)
@@ -212,7 +217,13 @@ def _fit(
         length = torch.where(usable, now.abs(), torch.nan)
         width = max(4.685, 4.685 * 1.4826 * float(length.nanmedian())) if turn == 0 else max(4.685, 0.6 * width)
         weight = ((1.0 - (now / width) ** 2).clamp_min(0.0) ** 2 * usable).flatten()
-        columns = torch.stack([((residual(numbers + step_size * e) - now) / step_size).flatten() for e in torch.eye(hypothesis.size, dtype=torch.float64)], 1)
+        columns = torch.stack(
+            [
+                ((residual(numbers + step_size * e) - now) / step_size).flatten()
+                for e in torch.eye(hypothesis.size, dtype=torch.float64)
+            ],
+            1,
+        )
         weighted = columns * weight[:, None]
         normal = weighted.t() @ columns
         normal = normal + torch.diag(normal.diagonal() * 1e-6 + 1e-9)
@@ -243,7 +254,12 @@ def _hypotheses(calibration: Calibration, level: Tensor) -> list[Hypothesis]:
     found.append(Hypothesis("channels", 3, lambda grid, n: grid.light * n.exp()[:, None], start=logs))
     found.append(Hypothesis("ambient", 3, lambda grid, n: grid.light + n[:, None], undo=lambda light, n: light - n[:, None, None]))
     found.append(
-        Hypothesis("ambient", 4, lambda grid, n: grid.light * n[3].exp() + n[:3, None], undo=lambda light, n: (light - n[:3, None, None]) / n[3].exp())
+        Hypothesis(
+            "ambient",
+            4,
+            lambda grid, n: grid.light * n[3].exp() + n[:3, None],
+            undo=lambda light, n: (light - n[:3, None, None]) / n[3].exp(),
+        )
     )
     found.append(
         Hypothesis("gamma", 1, lambda grid, n: grid.light ** n.exp(), undo=lambda light, n: light.clamp_min(0.0) ** (-n).exp())
@@ -271,7 +287,9 @@ def _quadratic(grid: Grid) -> Tensor:
 def _swapped(order: tuple[int, ...]) -> Hypothesis:
     back = [order.index(j) for j in range(3)]
     index = list(order)
-    return Hypothesis("channels_swapped", 0, lambda grid, _: grid.light[index], tuple(index), lambda light, _: light[back], burden=1.0)
+    return Hypothesis(
+        "channels_swapped", 0, lambda grid, _: grid.light[index], tuple(index), lambda light, _: light[back], burden=1.0
+    )
 
 
 def _mixed(pair: tuple[int, int]) -> Hypothesis:

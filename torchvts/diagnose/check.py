@@ -133,6 +133,7 @@ class _Examination:
         self.blocks = blockiness(self.image)
         self.dead = self._dead(self.image)
         self.reader = Reader.of(unit)
+        self.coplanar = unit.lights is not None and least_spread(unit.lights) < COPLANAR
 
     def findings(self) -> list[Finding]:
         found = self._calibration()
@@ -214,8 +215,8 @@ class _Examination:
             found.append(Finding("markers", message, "note", share))
         if unit.lights is None:
             return found
-        spread = least_spread(unit.lights)
-        if spread < COPLANAR:
+        if self.coplanar:
+            spread = least_spread(unit.lights)
             gain = normal_noise_deg(self.reader, self.noise)
             message = (
                 f"the lights stand nearly in one plane (smallest singular value of their directions {spread:.2f}, 0.8 is usual): "
@@ -273,6 +274,8 @@ class _Examination:
         words = in_words(change, self.calibration, since, cost)
         by_cost = "fault" if cost >= 6.0 * WORTH_DEG else "warning" if cost >= WORTH_DEG else "note"
         severity = min(by_cost, words.least, key=SEVERITIES.index)
+        if words.name == "lights_misfit" and most < 0.5 * NO_DRIFT:
+            return []
         if self.calibration.response is not None and words.name != "channels_swapped":
             if most < NO_DRIFT:
                 return []
@@ -343,7 +346,7 @@ class _Examination:
                     "less gain, or average frames"
                 )
                 found.append(Finding("noise", message, _by_cost(0.5 * cost), ratio))
-            elif cost > 3.0 * WORTH_DEG:
+            elif cost > 3.0 * WORTH_DEG and not self.coplanar:
                 level = float(self.noise.max())
                 message = (
                     f"noise of {level:.3f} makes normals waver by {cost:.1f} degrees, at calibration too: more light, less gain, "
@@ -359,8 +362,8 @@ class _Examination:
 
     def _spots(self, change: Change, contact: Tensor) -> Spots:
         unit = self.calibration
-        coplanar = unit.lights is not None and least_spread(unit.lights) < COPLANAR  # a slope, too, takes light from all
-        if not unit.measured or unit.markers is not None or coplanar or self.blocks > BLOCKY:
+        # where lights stand together a slope, too, takes light from all
+        if not unit.measured or unit.markers is not None or self.coplanar or self.blocks > BLOCKY:
             return Spots(0, 0, 0, torch.zeros_like(contact))
         noise = torch.sqrt(self.noise**2 + self.calibrated_noise**2)
         return new_spots(self.image, self._expected(change), noise, max(6, min(self.image.shape[1:]) // 10), contact)
@@ -519,9 +522,10 @@ class _Examination:
         sigmas, amount = misfit.sigmas[best], misfit.amount[best]
         if sigmas < 20.0 or amount < 0.05:
             return []
-        if best.startswith("bounce"):
+        sharp = misfit.sigmas["blur 1.5"] > 0.85 * sigmas  # narrow mixing, such as colours at half resolution, is no bounced light
+        if best.startswith("bounce") and not sharp:
             message = (
-                f"slopes look washed out, as when {amount:.0%} of the light comes by way of other skin (inter-reflection) or from "
+                f"slopes look washed out, as when roughly {amount:.0%} of the light comes by way of other skin (inter-reflection) or from "
                 "around: darker gel or coating"
             )
             return [Finding("inter_reflection", message, "warning", amount)]
@@ -530,7 +534,7 @@ class _Examination:
         if best.startswith("move"):
             message = "the image is moved: rims are mixed along one direction; shorter exposure, or slower motion"
             return [Finding("moved", message, "warning", sigmas)]
-        message = "the image is blurred: rims are mixed with what is beside them; focus the camera"
+        message = "the image is blurred: rims are mixed with what is beside them; focus the camera, take colours at full resolution"
         return [Finding("blurred", message, "warning", sigmas)]
 
 

@@ -50,10 +50,11 @@ def in_words(change: Change, calibration: Calibration, since: str, cost_deg: flo
         text = f"the image is {abs(ratio):.1%} {_brighter(ratio)} {since}: exposure or lamps; recalibrate {pay}"
         return Words("exposure", text, ratio)
     if change.name == "ambient":
-        level = float(numbers[:3].mean())
+        level = float(numbers[:3].mean())  # light becomes gain * light + level
         if level > 0:
             text = f"light of {level:.3f} that is not the lamps' is added everywhere: shade the sensor, or recalibrate, {pay}"
             return Words("ambient_light", text, level)
+        level = level / math.exp(float(numbers[3]) if len(numbers) > 3 else 0.0)
         text = f"a black level of {-level:.3f} is taken off every value: switch it off in the camera, {pay}"
         return Words("black_level", text, level)
     if change.name == "gamma":

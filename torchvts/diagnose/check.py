@@ -525,8 +525,8 @@ class _Examination:
         sharp = misfit.sigmas["blur 1.5"] > 0.85 * sigmas  # narrow mixing, such as colours at half resolution, is no bounced light
         if best.startswith("bounce") and not sharp:
             message = (
-                f"slopes look washed out, as when roughly {amount:.0%} of the light comes by way of other skin (inter-reflection) or from "
-                "around: darker gel or coating"
+                f"slopes look washed out, as when roughly {amount:.0%} of the light comes by way of other skin "
+                "(inter-reflection) or from around: darker gel or coating"
             )
             return [Finding("inter_reflection", message, "warning", amount)]
         if self.levels < 200 or self.blocks > BLOCKY or int(spots.sum()) >= 3:

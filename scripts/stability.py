@@ -25,15 +25,26 @@ from torchvts.gallery import DIALS, Dial
 from torchvts.stability import DEPTH_LIMIT, MASK, MASK_LIMIT, METHODS, NORMAL_LIMIT_DEG, Breaking, Row
 
 ROOT = Path(__file__).resolve().parents[1]
-COLORS = {"flat": "0.6", MASK: "black"} | dict(
-    zip((m for m in METHODS if m != "flat"), ("tab:blue", "tab:orange", "tab:red", "tab:cyan", "tab:purple", "tab:green", "tab:brown", "tab:pink", "tab:olive"))  # noqa: E501
-)  # fmt: skip
+# the two ways of the paper are broad lines, what goes almost the same way is drawn upon them
+STYLES: dict[str, dict[str, Any]] = {
+    "flat": {"color": "0.6", "lw": 1.2, "ls": "--"},
+    "fast": {"color": "tab:blue", "lw": 4.0, "alpha": 0.55},
+    "precise": {"color": "tab:orange", "lw": 4.0, "alpha": 0.7},
+    "auto": {"color": "tab:red", "lw": 1.4, "ls": ":"},
+    "fast, zero border": {"color": "navy", "lw": 1.2, "ls": "--"},
+    "precise, plain inverse": {"color": "tab:purple", "lw": 1.4},
+    "precise, blur 1 px": {"color": "tab:green", "lw": 1.4},
+    "precise, cliffs": {"color": "saddlebrown", "lw": 1.4, "ls": "-."},
+    "precise, pinhole": {"color": "deeppink", "lw": 1.2, "ls": (0, (1, 2))},
+    MASK: {"color": "black", "lw": 1.4, "marker": "o", "ms": 3},
+}
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/stability"))
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=int, default=3, help="noises and places of each press")
+    parser.add_argument("--workers", type=int, default=2, help="processes; 0 for none beside this one")
     parser.add_argument("--only", nargs="+", choices=list(DIALS), default=list(DIALS), metavar="DIAL", help=", ".join(DIALS))
     parser.add_argument("--keep", action="store_true", help="write docs/ and tests/breaking_points.json too")
     arguments = parser.parse_args()
@@ -43,7 +54,9 @@ def main() -> int:
     arguments.out.mkdir(parents=True, exist_ok=True)
     total = len(METHODS) * arguments.seeds * sum(len(DIALS[name].severities) for name in arguments.only)
     with tqdm(total=total, unit="row") as bar:
-        rows = stability.sweep(arguments.out / "rows.jsonl", list(METHODS), arguments.only, arguments.seeds, bar.update)
+        rows = stability.sweep(
+            arguments.out / "rows.jsonl", list(METHODS), arguments.only, arguments.seeds, arguments.workers, bar.update
+        )
     points = stability.breaking_points(rows)
     text = f"{stability.table(points)}\n\n{stability.LIMITS}\n"
     kept = stability.to_json(points, "python scripts/stability.py --keep", arguments.seeds)
@@ -80,17 +93,14 @@ def picture(dial: Dial, rows: Sequence[Row], points: Sequence[Breaking]) -> Figu
         axes.set_axis_off()
     methods = list(dict.fromkeys(row.method for row in rows))
     panels = [figure.add_subplot(grid[:, k]) for k in (1, 2, 3)]
-    for k, method in enumerate(methods):
+    for method in methods:
         own = [[row for row in rows if row.method == method and row.severity == s] for s in dial.severities]
-        # ever thinner, so that of lines upon one another all are seen
-        style = {"color": COLORS[method], "lw": max(1.0, 4.4 - 0.7 * k), "marker": "o", "ms": 3.5}
-        if method == "flat":
-            style |= {"lw": 1.2, "ls": "--"}
+        style = STYLES[method]
         draw(panels[0], [[row.normal_deg for row in group] for group in own], style, 0.2)
         shares = [[None if row.depth_share is None else 100.0 * row.depth_share for row in group] for group in own]
         draw(panels[1], shares, style, 0.1)
         if method == "fast":
-            draw(panels[2], [[row.iou for row in group] for group in own], style | {"color": COLORS[MASK], "lw": 1.4}, 0.0)
+            draw(panels[2], [[row.iou for row in group] for group in own], STYLES[MASK], 0.0)
     titles = ("normals off by, deg (mean in contact)", "depth RMS, % of the press", "contact mask, IoU")
     for axes, limit, title in zip(panels, (NORMAL_LIMIT_DEG, 100 * DEPTH_LIMIT, MASK_LIMIT), titles):
         axes.axhline(limit, color="black", lw=0.8, ls=(0, (5, 3)))
@@ -107,14 +117,14 @@ def picture(dial: Dial, rows: Sequence[Row], points: Sequence[Breaking]) -> Figu
     for point in points:
         if not isinstance(point.at, str):
             for axes in panels[2:] if point.method == MASK else panels[:2]:
-                axes.axvline(last * point.held, ymax=0.06, color=COLORS[point.method], lw=2)
+                axes.axvline(last * point.held, ymax=0.06, color=STYLES[point.method]["color"], lw=2)
     legend = figure.add_subplot(grid[:, 4])
     legend.set_axis_off()
     legend.text(0.0, 1.0, f"breaks at{f', {dial.unit}' if dial.unit else ''}", fontsize=8, weight="bold", va="top")
     for k, point in enumerate(points):
         at = point.at if isinstance(point.at, str) else f"{point.at:.3g}"
-        legend.text(0.0, 0.88 - 0.088 * k, f"{at}", color=COLORS[point.method], fontsize=8, va="top", weight="bold")
-        legend.text(0.3, 0.88 - 0.088 * k, point.method, color=COLORS[point.method], fontsize=8, va="top")
+        legend.text(0.0, 0.9 - 0.085 * k, f"{at}", color=STYLES[point.method]["color"], fontsize=8, va="top", weight="bold")
+        legend.text(0.3, 0.9 - 0.085 * k, point.method, color=STYLES[point.method]["color"], fontsize=8, va="top")
     return figure
 
 
@@ -159,7 +169,7 @@ def save(figure: Figure, path: Path) -> None:
     canvas.draw()
     pixels = np.asarray(canvas.buffer_rgba())[:, :, :3]
     with write_atomically(path) as temporary:
-        Image.fromarray(pixels).quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(temporary, optimize=True)
+        Image.fromarray(pixels).quantize(256).save(temporary, optimize=True)
 
 
 if __name__ == "__main__":

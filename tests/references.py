@@ -99,3 +99,30 @@ def dilate(mask):
     for row, column in zip(*np.nonzero(mask)):
         result[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2] = True
     return result
+
+
+def cliffs(gradient, contact, pitch, slope_std, threshold, rim_weight, depth):
+    """One more dense pass of robust integration from a depth map (H, W): weights by its residuals, zero outside the contact."""
+    _, height, width = gradient.shape
+    normal, right = np.zeros((height * width, height * width)), np.zeros(height * width)
+    variance = (slope_std * (1 + (gradient**2).sum(0))) ** 2
+    for row in range(height):
+        for column in range(width):
+            for down, axis in ((0, 0), (1, 1)):
+                r, c = row + down, column + 1 - down
+                if r >= height or c >= width:
+                    continue
+                g = gradient[axis, row, column], gradient[axis, r, c]
+                v = (variance[row, column] + variance[r, c]) / 2 + (g[1] - g[0]) ** 2 / 12
+                misfit = (depth[r, c] - depth[row, column]) / pitch - (g[0] + g[1]) / 2
+                weight = (rim_weight if contact[row, column] != contact[r, c] else 1) * slope_std**2 / v
+                weight /= 1 + misfit**2 / (threshold**2 * v)
+                a, b = row * width + column, r * width + c
+                normal[[a, b], [a, b]] += weight
+                normal[[a, b], [b, a]] -= weight
+                right[b] += weight * pitch * (g[0] + g[1]) / 2
+                right[a] -= weight * pitch * (g[0] + g[1]) / 2
+    inside = contact.reshape(-1)
+    found = np.zeros(height * width)
+    found[inside] = np.linalg.solve(normal[np.ix_(inside, inside)], right[inside])
+    return found.reshape(height, width)

@@ -82,6 +82,7 @@ CASES = {
     "PoissonDST": (lambda dtype: vts.PoissonDST(PITCH), gradient, "gradient"),
     "PoissonDCT": (lambda dtype: vts.PoissonDCT(PITCH), gradient, "gradient"),
     "PoissonRest": (lambda dtype: vts.PoissonRest(PITCH), gradient, "gradient"),
+    "PerspectiveIntegration": (lambda dtype: vts.PerspectiveIntegration(PITCH, 400.0), gradient, "gradient"),
     "DepthPipeline fast": (pipe("fast"), images, "images"),
     "DepthPipeline precise": (pipe("precise"), images, "images"),
     "DepthPipeline auto": (pipe("auto"), images, "images"),
@@ -89,7 +90,7 @@ CASES = {
     "DepthPipeline response precise": (response_pipe("precise"), images, "images"),
     "DepthPipeline response auto": (response_pipe("auto"), images, "images"),
 }
-SIZED = [name for name in CASES if not any(part in name for part in ("Poisson", "Gradient", "Markers"))]
+SIZED = [name for name in CASES if not any(part in name for part in ("Poisson", "Integration", "Gradient", "Markers"))]
 every_block = pytest.mark.parametrize("name", CASES)
 
 

@@ -143,16 +143,6 @@ def test_a_far_pinhole_looks_straight_down():
     assert change[2] / change[1] == pytest.approx(2.0, rel=0.1)
 
 
-def test_a_pinhole_sees_points_of_the_surface_on_its_rays():
-    angle, seed = 30.0, 1
-    truth = DIALS["perspective"].make(angle, seed).truth
-    distance = 0.5 * WIDTH * MM_PER_PIXEL / math.tan(math.radians(angle))
-    x, y = gallery._grid()
-    z = truth.depth_mm[0, 0].double()
-    met = gallery._press(seed)(x * (1 - z / distance), y * (1 - z / distance)).clamp_min(0.0)
-    assert (met - z).abs().max() < 1e-5
-
-
 def test_blurs_keep_the_light_and_spread_a_point_as_far_as_asked():
     point = torch.zeros(1, 1, 41, 41, dtype=torch.float64)
     point[..., 20, 20] = 1.0
@@ -209,5 +199,5 @@ def test_the_skirt_of_sagging_gel_joins_the_ball_without_a_kink():
 
 def test_positions_and_cast_shadows_do_not_go_together():
     case = gallery.undisturbed()
-    with pytest.raises(ValueError, match="at_mm: expected None with cast shadows"):
+    with pytest.raises(ValueError, match="shadows: expected a camera that looks straight down"):
         faults.radiance(case.truth, replace(USUAL, shadows=True), gallery._grid())

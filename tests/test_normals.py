@@ -7,6 +7,7 @@ import torch
 
 import torchvts as vts
 from torchvts.core.geometry import MAX_SLOPE
+from torchvts.normals.photometric import slope_by_lit_lights
 
 scenes, metrics = vts.scenes, vts.metrics
 
@@ -71,7 +72,7 @@ def test_a_given_inverse_is_used_and_must_fit(ring):
         block_for(lights, scene, inverse=stored[..., :15])
 
 
-@pytest.mark.parametrize("noise_std, bound_deg, share", [(0.0, 0.25, 0.1), (0.001, 1.0, 0.3), (0.002, 1.8, 0.5)])
+@pytest.mark.parametrize("noise_std, bound_deg, share", [(0.0, 1.5, 0.45), (0.001, 2.0, 0.6), (0.002, 2.4, 0.7)])
 def test_a_blocked_light_does_not_spoil_the_normal(ring, noise_std, bound_deg, share):
     """Low lights, 2 mm: walls that one light does not reach. The plain inverse reads black as a number."""
     lights = ring(22.0, [15.0, 16.5, 18.0], level=0.2, dtype=torch.float64)
@@ -86,6 +87,79 @@ def test_a_blocked_light_does_not_spoil_the_normal(ring, noise_std, bound_deg, s
     plain = torch.from_numpy(np.einsum("ijhw,jhw->ihw", plain, image[0].numpy()))[None]
     ours, theirs = rms_deg(block(image, scene.depth_mm), scene, blocked), rms_deg(plain, scene, blocked)
     assert ours < bound_deg and ours < share * theirs
+
+
+@pytest.mark.parametrize("brightness_std, tolerance", [(0.0, 0.02), (0.02, 0.1)])
+def test_two_lights_and_unit_length_give_the_slope(ring, brightness_std, tolerance):
+    """The third light behind the wall; brightness trusted fully, or to 2 %, where the start keeps some of its say."""
+    lights = ring(22.0, 16.0, level=0.2, dtype=torch.float64)
+    slope = torch.tensor([[0.9, 0.1], [0.8, -0.2], [0.7, 0.3]], dtype=torch.float64)
+    rows = vts.shading.light_matrix(torch.zeros(1, 1, 1, 1), lights.position_mm, lights.albedo, 1.0)[:, :, :, 0, 0]
+    turned = torch.stack((-slope[:, 0], -slope[:, 1], torch.ones(3, dtype=torch.float64)), 1)
+    light = (rows * (turned / turned.norm(dim=1, keepdim=True))[:, None]).sum(2)
+    assert ((light <= 0).sum(1) == 1).all()
+    found = slope_by_lit_lights(
+        slope + 0.1, light.clamp_min(0.0), rows.expand(3, 3, 3), light > 1e9, 1e-3, brightness_std=brightness_std, steps=30
+    )
+    assert (found - slope).norm(dim=1).max() < tolerance
+
+
+@pytest.mark.parametrize("press_mm, worst_px", [(0.5, 0.08), (1.0, 0.4)])
+@pytest.mark.parametrize("dead", [0, 1, 2])
+def test_two_lamps_go_on_when_one_is_dead(ring, press_mm, worst_px, dead):
+    """What is left of the third channel is noise. The plain inverse errs by more than the press is deep."""
+    lights, scene = ring(), press(press_mm, torch.float32, 120, 160)
+    rest = scenes.render(scenes.at_rest(scene), lights, noise_std=0.004, bits=8, seed=1)[0]
+    sensor = vts.Sensor("rig", 120, 160, scene.mm_per_pixel)
+    image = scenes.render(scene, lights, noise_std=0.004, bits=8, seed=2)
+    image[:, dead] = (0.004 * torch.randn(120, 160, generator=torch.Generator().manual_seed(3))).clamp_min(0.0)
+    pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, sensor, rest), "precise")
+    out = pipe(torch.cat((image, rest[None])))
+    assert metrics.mask_iou(out.contact[:1], scene.contact) > 0.98 and not bool(out.contact[1].any())
+    assert metrics.depth_error(out.depth_mm[:1], scene.depth_mm, 0.0625).rms_px < worst_px
+    assert out.depth_mm[1].abs().max() == 0
+
+
+def fan(azimuth_deg):
+    """Three lights, the outer two so many degrees from the one in the middle: coplanar as that goes to zero."""
+    angle = torch.deg2rad(torch.tensor([0.0, azimuth_deg, -azimuth_deg]))
+    position = torch.stack((31.0 * angle.cos(), 31.0 * angle.sin(), torch.full((3,), 40.0)), 1)
+    return vts.PointLights(position, 0.45 * position.norm(dim=1) ** 3 / 40.0).requires_grad_(False)
+
+
+@pytest.mark.parametrize(
+    "azimuth_deg, rms_px, share", [(120.0, 0.1, None), (60.0, 0.2, None), (15.0, 0.3, 0.05), (2.0, 2.0, 0.05), (0.0, 4.0, 0.05)]
+)
+def test_lights_that_nearly_lie_in_a_plane_are_damped(azimuth_deg, rms_px, share):
+    """Where the inverse makes more of the noise than slopes are; else bit for bit the plain inverse."""
+    lights, scene = fan(azimuth_deg), press(1.0, torch.float32, 120, 160)
+    rest, image = (scenes.render(s, lights, noise_std=0.004, bits=8, seed=k) for k, s in enumerate((scenes.at_rest(scene), scene)))
+    sensor = vts.Sensor("rig", 120, 160, scene.mm_per_pixel)
+    pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, sensor, rest[0]), "precise")
+    assert bool(pipe.normals.weak.all()) == (share is not None) and bool(pipe.normals.weak.any()) == (share is not None)
+    out = pipe(image)
+    pipe.normals.weak.fill_(False)
+    pipe.normals.ill = False
+    plain = pipe(image)
+    ours = metrics.depth_error(out.depth_mm, scene.depth_mm, 0.0625).rms_px
+    assert ours < rms_px
+    if share is None:
+        assert torch.equal(out.depth_mm, plain.depth_mm)
+    else:
+        theirs = plain.depth_mm.nan_to_num(100.0)
+        assert ours < share * metrics.depth_error(theirs, scene.depth_mm, 0.0625).rms_px
+
+
+@pytest.mark.parametrize("azimuth_deg", [40.0, 15.0, 2.0])
+def test_without_noise_the_damped_slope_is_the_true_one(azimuth_deg):
+    """The limit of small noise, at the true depth."""
+    lights, scene = fan(azimuth_deg).double(), press(1.0, height=24, width=32)
+    block = block_for(lights, scene, noise_std=torch.full((3,), 1e-9, dtype=torch.float64))
+    assert not bool(block.weak.any())
+    block.weak.fill_(True)
+    block.ill = True
+    inside = scene.contact & (scene.depth_mm > 0.2)
+    assert rms_deg(block(scenes.render(scene, lights), scene.depth_mm), scene, inside) < 0.5
 
 
 def test_slopes_are_bounded_however_wild_the_image():

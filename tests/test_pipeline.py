@@ -52,6 +52,77 @@ def test_a_worn_unit_with_low_lights(worn_unit, press_mm, largest_px, rms_px):
     assert metrics.depth_error(out.depth_mm, scene.depth_mm, PITCH, scene.contact).rms_px < rms_px
 
 
+@pytest.mark.parametrize("level, noise_std", [(0.2, 0.003), (0.18, 0.01), (0.45, 0.01)])
+def test_a_blocked_light_leaves_a_fifth_of_the_error_of_the_plain_inverse(ring, level, noise_std):
+    """Low lights that a 2 mm press blocks on one wall, noise, 8 bits."""
+    lights, scene = ring(22.0, [15.0, 16.5, 18.0], rotation_deg=90.0, level=level), scenes.sphere_press(10.0, 2.0)
+    rest = scenes.render(scenes.at_rest(scene), lights, noise_std=noise_std, bits=8, seed=1)[0]
+    image = scenes.render(scene, lights, noise_std=noise_std, bits=8, seed=2)
+    pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, FULL, rest), "precise")
+    ours = metrics.depth_error(pipe(image).depth_mm, scene.depth_mm, PITCH).rms_px
+    pipe.normals.dark_where.fill_(-torch.inf)
+    assert ours < 0.2 * metrics.depth_error(pipe(image).depth_mm, scene.depth_mm, PITCH).rms_px
+
+
+def dimmed(lights, factors):
+    return vts.PointLights(lights.position_mm, lights.albedo * torch.tensor(factors)).requires_grad_(False)
+
+
+@pytest.mark.parametrize("factors", [(0.9, 1.0, 1.0), (1.0, 0.75, 1.0), (1.1, 0.85, 0.95)])
+@pytest.mark.parametrize("radius_mm, press_mm", [(10.0, 1.0), (40.0, 2.0)])
+def test_auto_levels_lamps_that_have_dimmed(ring, small_sensor, small_press, factors, radius_mm, press_mm):
+    """10 to 25 % off; contacts of 5 and 40 % of the image. Left as it is, the mask floods and the depth is far off."""
+    lights, scene = ring(), small_press(press_mm, (2.0, 1.0), radius_mm)
+    rest = scenes.render(scenes.at_rest(scene), lights, noise_std=0.004, bits=8, seed=1)[0]
+    calibration = vts.Calibration.from_lights(lights, small_sensor, rest)
+    before = scenes.render(scene, lights, noise_std=0.004, bits=8, seed=2)
+    after = scenes.render(scene, dimmed(lights, factors), noise_std=0.004, bits=8, seed=2)
+    auto, precise = (vts.DepthPipeline.from_calibration(calibration, mode) for mode in ("auto", "precise"))
+    assert torch.equal(auto(before).depth_mm, precise(before).depth_mm)  # undisturbed, it is left alone
+    undisturbed, left, levelled = (
+        metrics.depth_error(pipe(image).depth_mm, scene.depth_mm, PITCH).rms_px
+        for pipe, image in ((auto, before), (precise, after), (auto, after))
+    )
+    assert levelled < 1.3 * undisturbed and left > 20 * undisturbed
+    assert metrics.mask_iou(auto(after).contact, scene.contact) > 0.98
+    nothing = auto(scenes.render(scenes.at_rest(scene), dimmed(lights, factors), noise_std=0.004, bits=8, seed=3))
+    assert not bool(nothing.contact.any())
+
+
+@pytest.mark.parametrize("radius_mm, press_mm", [(8.0, 1.0), (12.0, 2.0)])
+def test_a_tilted_punch_larger_than_half_of_the_image_is_no_drift(ring, small_sensor, radius_mm, press_mm):
+    lights, scene = ring(), scenes.punch_press(radius_mm, press_mm, 2.0, 1.0, 120, 160, 0.25)
+    rest = scenes.render(scenes.at_rest(scene), lights, noise_std=0.004, bits=8, seed=1)[0]
+    calibration = vts.Calibration.from_lights(lights, small_sensor, rest)
+    image = scenes.render(scene, lights, noise_std=0.004, bits=8, seed=2)
+    level = vts.Compensate.from_calibration(calibration, level=True)
+    assert torch.equal(level(image), vts.Compensate.from_calibration(calibration)(image))
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.9, 0.75])
+@pytest.mark.parametrize("touched", [0.0, 0.4])
+def test_a_response_field_levels_up_to_a_quarter(small_sensor, factor, touched):
+    field = vts.core.response.ResponseField(0, -1, False, 10.0, ((0.3, 0, 0), (0, 0.3, 0)))
+    model = vts.core.response.ResponseModel(field, None)
+    background = 0.5 + 0.004 * torch.randn(3, 120, 160, generator=torch.Generator().manual_seed(0))
+    image = background + 0.004 * torch.randn(3, 120, 160, generator=torch.Generator().manual_seed(1))
+    rows = int(touched * 120)
+    image[:, :rows] *= torch.linspace(0.6, 1.4, 160)
+    image = image * torch.tensor([1.0, factor, 1.0])[:, None, None]
+    compensate = vts.Compensate.from_calibration(vts.Calibration.from_response(model, small_sensor, background))
+    at_rest = compensate(image.clamp(0.0, 1.0)[None])[0, :, rows + 5 :].mean(dim=(1, 2))
+    assert (at_rest - 1.0).abs().max() < 0.006
+
+
+def test_a_lamp_that_is_out_is_no_drift(ring, small_sensor, small_press):
+    lights, scene = ring(), small_press(1.0)
+    calibration = vts.Calibration.from_lights(lights, small_sensor)
+    image = scenes.render(scene, lights)
+    image[:, 1] = 0.0
+    level = vts.Compensate.from_calibration(calibration, level=True)
+    assert torch.equal(level(image), vts.Compensate.from_calibration(calibration)(image))
+
+
 @pytest.fixture(scope="module")
 def mixed(ring, small_sensor, small_press):
     """Frames at rest, hardly pressed and well pressed, and their lights."""

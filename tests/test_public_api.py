@@ -9,15 +9,16 @@ import pytest
 import torchvts as vts
 
 NAMES = [
-    "Calibration", "CalibrationWarning", "Compensate", "ContactMask", "DepthOutput", "DepthPipeline", "Diagnosis",
-    "FillMarkers", "Finding",
-    "GradientFromNormal", "LightFit", "NormalFromIntensity", "NormalFromLookup", "NormalFromMLP", "NormalFromResponse",
-    "PointLights", "PoissonDCT", "PoissonDST", "PoissonRest", "Press", "Registration", "Sensor", "Touch", "calibrate",
-    "contact_cloud", "depth_to_points",
-    "diagnose", "divergence",
-    "fill_markers", "find_markers", "fit_lights", "fit_mlp", "fit_prior", "gradient_from_normal", "gs_sdk", "metrics",
-    "near_field_shading", "normal_from_gradient", "objects", "poisson_dct", "poisson_dst", "poisson_rest", "read_image",
-    "read_presses", "register_depth", "register_points", "scenes", "shipped_sensors", "stream", "write_image",
+    "AdaptiveIntegration", "Calibration", "CalibrationWarning", "CliffIntegration", "Compensate", "ContactMask", "DepthOutput",
+    "DepthPipeline", "Diagnosis", "FillMarkers", "Finding",
+    "GradientFromNormal", "LightFit", "NormalFromIntensity", "NormalFromLookup",
+    "NormalFromMLP", "NormalFromResponse", "PerspectiveIntegration", "PointLights", "PoissonDCT", "PoissonDST", "PoissonRest",
+    "Press", "Registration", "Sensor", "Touch", "calibrate", "contact_cloud", "depth_to_points",
+    "diagnose", "divergence", "fill_markers",
+    "find_markers", "fit_lights", "fit_mlp", "fit_prior", "gradient_from_normal", "gs_sdk", "integrate_cliffs",
+    "integrate_perspective", "metrics", "near_field_shading", "normal_from_gradient", "objects", "poisson_dct", "poisson_dst",
+    "poisson_rest", "read_image", "read_presses", "register_depth", "register_points", "scenes", "shipped_sensors", "stream",
+    "write_image",
 ]  # fmt: skip
 ARGUMENTS = {
     vts.Sensor: ["name", "height", "width", "mm_per_pixel"],

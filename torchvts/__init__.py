@@ -10,7 +10,20 @@ from .core.files import read_image, write_image
 from .core.geometry import GradientFromNormal, depth_to_points, gradient_from_normal, normal_from_gradient
 from .core.sensor import Sensor, shipped_sensors
 from .diagnose import Diagnosis, Finding, diagnose
-from .integration import PoissonDCT, PoissonDST, PoissonRest, divergence, poisson_dct, poisson_dst, poisson_rest
+from .integration import (
+    AdaptiveIntegration,
+    CliffIntegration,
+    PerspectiveIntegration,
+    PoissonDCT,
+    PoissonDST,
+    PoissonRest,
+    divergence,
+    integrate_cliffs,
+    integrate_perspective,
+    poisson_dct,
+    poisson_dst,
+    poisson_rest,
+)
 from .markers import FillMarkers, fill_markers, find_markers
 from .normals import NormalFromIntensity, NormalFromLookup, NormalFromMLP, NormalFromResponse, fit_mlp
 from .pipeline import DepthOutput, DepthPipeline
@@ -19,8 +32,10 @@ from .record import Calibration
 from .shading import PointLights, near_field_shading
 
 __all__ = [
+    "AdaptiveIntegration",
     "Calibration",
     "CalibrationWarning",
+    "CliffIntegration",
     "Compensate",
     "ContactMask",
     "DepthOutput",
@@ -34,6 +49,7 @@ __all__ = [
     "NormalFromLookup",
     "NormalFromMLP",
     "NormalFromResponse",
+    "PerspectiveIntegration",
     "PointLights",
     "PoissonDCT",
     "PoissonDST",
@@ -54,6 +70,8 @@ __all__ = [
     "fit_prior",
     "gradient_from_normal",
     "gs_sdk",
+    "integrate_cliffs",
+    "integrate_perspective",
     "metrics",
     "near_field_shading",
     "normal_from_gradient",

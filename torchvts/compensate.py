@@ -25,7 +25,11 @@ class Compensate(nn.Module):
         defects: (H, W) bool, pixels that tell nothing; None for none.
         blur_px: standard deviation of a Gaussian blur, pixels; 0 for none.
         markers: fills printed markers; None for a skin without.
-        level: divide each channel of a frame by its :func:`rest_level`; for compensated images that are 1 at rest.
+        level: divide each channel of a frame by how bright its skin at rest is against calibration: by :func:`rest_level`, or
+            given ``flat`` by :func:`sure_level`.
+        flat: (3, H, W), what the compensated image is at rest. noise_std: (3, H, W), its noise.
+        scatters: presses change the light of the whole skin a little, as on real sensors: then :func:`rest_level` up to its
+            limit, and :func:`sure_level` beyond.
     Source:
         eq. 8 of the paper for the offset.
     Example:
@@ -37,6 +41,8 @@ class Compensate(nn.Module):
     offset: Tensor | None
     defect: Tensor
     sound: Tensor
+    rest: Tensor | None
+    rest_noise: Tensor | None
 
     def __init__(
         self,
@@ -47,9 +53,13 @@ class Compensate(nn.Module):
         blur_px: float = 0.0,
         markers: FillMarkers | None = None,
         level: bool = False,
+        flat: Tensor | None = None,
+        noise_std: Tensor | None = None,
+        scatters: bool = False,
     ) -> None:
         super().__init__()
         self.level = level
+        self.scatters = scatters
         self.markers = nn.Identity() if markers is None else markers
         self.blur_px = float(blur_px) if blur_px == 0 else check_positive("blur_px", blur_px)
         self.gamma = check_positive("gamma", gamma)
@@ -63,18 +73,32 @@ class Compensate(nn.Module):
             flat_index, sound = nearest_sound(defects)
         self.register_buffer("gain", None if gain is None else gain.detach().clone())
         self.register_buffer("offset", None if offset is None else offset.detach().clone())
+        rest, noise = None, None
+        if flat is not None and noise_std is not None:
+            rest, noise = _some_means(flat[None])[0], _some_means(noise_std[None])[0]
+            if self.blur_px == 0.0 and min(flat.shape[1], flat.shape[2]) >= 180:
+                noise = noise / 3.0  # of a mean of nine
+        self.register_buffer("rest", None if rest is None else rest.detach().clone())
+        self.register_buffer("rest_noise", None if noise is None else noise.detach().clone())
         self.register_buffer("defect", flat_index)
         self.register_buffer("sound", sound)
         self.weights = gaussian_weights(self.blur_px)
 
     @classmethod
-    def from_calibration(cls, calibration: Calibration) -> "Compensate":
-        """What a calibrated unit's images need, so that at rest they become ``calibration.flat``."""
+    def from_calibration(cls, calibration: Calibration, level: bool = False) -> "Compensate":
+        """What a calibrated unit's images need, so that at rest they become ``calibration.flat``.
+
+        Args:
+            calibration: of the unit.
+            level: bring lamps that have drifted since back to their brightness, if the model is lights. With response fields
+                this is always done.
+        """
         sensor = calibration.sensor
-        ratio = calibration.response is not None
-        return cls(
-            calibration.gain, calibration.offset, sensor.exponent, calibration.defects, sensor.blur_px, calibration.markers, ratio
-        )
+        parts = (calibration.gain, calibration.offset, sensor.exponent, calibration.defects, sensor.blur_px, calibration.markers)
+        by_response = calibration.response is not None
+        if not (level or by_response):
+            return cls(*parts)
+        return cls(*parts, True, calibration.flat, calibration.compensated_noise_std, by_response)
 
     def forward(self, image: Tensor) -> Tensor:
         """(B, 3, H, W) image in [0, 1] to (B, 3, H, W) linear light."""
@@ -94,7 +118,21 @@ class Compensate(nn.Module):
             light = pixels.index_copy(2, self.defect, repaired).reshape(light.shape)
         if self.blur_px > 0.0:
             light = blur(light, self.weights)
-        return light / rest_level(light) if self.level else light
+        if not self.level:
+            return light
+        rest, noise = self.rest, self.rest_noise
+        if rest is None or noise is None:
+            return light / rest_level(light)
+        if self.scatters:
+            near = rest_level(light)
+            if may_read_values() and float((near - 1.0).abs().amax()) < 0.149:
+                return light / near
+            far = sure_level(_some_means(light.detach()), rest, noise)
+            return light / torch.where((far - 1.0).abs() > 0.15, far, near)
+        level = sure_level(_some_means(light.detach()), rest, noise)
+        if may_read_values() and bool((level == 1.0).all()):
+            return light
+        return light / level
 
 
 def rest_level(ratio: Tensor, least: float = 0.01, most: float = 0.15) -> Tensor:
@@ -112,16 +150,77 @@ def rest_level(ratio: Tensor, least: float = 0.01, most: float = 0.15) -> Tensor
     Source:
         the half-sample mode: Bickel and Fruhwirth, Computational Statistics and Data Analysis 50(12), 2006.
     """
-    stride = max(1, min(ratio.shape[2], ratio.shape[3]) // 60)
-    pixels = _sorted(ratio.detach()[:, :, stride // 2 :: stride, stride // 2 :: stride].flatten(2))
+    drift = _mode(_some(ratio.detach())).clamp(-most, most)  # (B, 3)
+    weight = (drift.abs().amax(dim=1, keepdim=True) / least - 1.0).clamp(0.0, 1.0)
+    return (1.0 + weight * drift)[..., None, None]
+
+
+def sure_level(light: Tensor, flat: Tensor, noise_std: Tensor, least: float = 0.01, most: float = 0.35) -> Tensor:
+    """:func:`rest_level` for light models, which refuses where it cannot tell the skin at rest from contact.
+
+    At the modes of the three channels, pixels at rest in all three at once are counted, each by exp(-chi^2 / 2), chi in units of
+    noise; their means refine the modes. There must be 5 % of such pixels, and a channel's drift is believed only if they become
+    less than 0.4 times as many without it, or 0.7 times if they are more than half of all: the flat top of a tilted punch larger
+    than half of the image has a mode of its own in one channel, but the skin around it is at rest without. No gradient flows
+    through it.
+
+    Args:
+        light: (B, 3, h, w), some pixels of compensated frames. flat: (3, h, w), the same at rest. noise_std: (3, h, w).
+        least: drift that counts, and least noise, relative. most: largest drift that is believed.
+    Returns:
+        (B, 3, 1, 1), 1 where refused.
+    Example:
+        >>> flat = torch.full((3, 40, 40), 0.5)
+        >>> frame = flat * torch.tensor([0.8, 1.0, 1.0]).reshape(3, 1, 1) + 0.001 * torch.randn(1, 3, 40, 40)
+        >>> [round(float(v), 2) for v in sure_level(frame, flat, torch.full_like(flat, 0.002)).flatten()]
+        [0.8, 1.0, 1.0]
+    """
+    flat = flat.clamp_min(1e-6)
+    ratio = light.detach() / flat
+    variance = (noise_std / flat) ** 2 + least**2
+    level = (1.0 + _mode(ratio))[..., None, None]
+    for _ in range(2):
+        chi = ((ratio - level) ** 2 / variance).sum(dim=1, keepdim=True)
+        weight = torch.exp(-0.5 * chi) / variance
+        level = (weight * ratio).sum(dim=(2, 3), keepdim=True) / weight.sum(dim=(2, 3), keepdim=True).clamp_min(1e-12)
+    off = (ratio - level) ** 2 / variance
+    chi = off.sum(dim=1, keepdim=True)
+    # a Gaussian in three channels has a mean exp(-chi^2 / 2) of 2^(-3/2)
+    at_rest = torch.exp(-0.5 * chi).mean(dim=(2, 3), keepdim=True) * 2.0**1.5
+    without = torch.exp(-0.5 * (chi - off + (ratio - 1.0) ** 2 / variance)).mean(dim=(2, 3), keepdim=True) * 2.0**1.5
+    drift = (level - 1.0).abs()
+    share = torch.where(at_rest > 0.5, 0.7, 0.4)
+    sure = (drift > least) & (drift < most) & (at_rest > 0.05) & (without < share * at_rest)
+    return torch.where(sure, level, torch.ones_like(level))
+
+
+def _some_means(image: Tensor) -> Tensor:
+    """:func:`_some`, each the mean of 3 x 3 pixels where these do not overlap."""
+    stride = max(1, min(image.shape[2], image.shape[3]) // 60)
+    if stride < 3:
+        return _some(image)
+    rows, columns, first = image.shape[2] // stride * stride, image.shape[3] // stride * stride, stride // 2 - 1
+    total = image[:, :, first:rows:stride, first:columns:stride].clone()
+    for k in range(1, 9):
+        total += image[:, :, first + k // 3 : rows : stride, first + k % 3 : columns : stride]
+    return total / 9.0
+
+
+def _some(image: Tensor) -> Tensor:
+    """Some thousand pixels of a (B, C, H, W) image, on a grid."""
+    stride = max(1, min(image.shape[2], image.shape[3]) // 60)
+    return image[:, :, stride // 2 :: stride, stride // 2 :: stride]
+
+
+def _mode(ratio: Tensor) -> Tensor:
+    """Half-sample mode of each channel of (B, 3, h, w), less 1: (B, 3)."""
+    pixels = _sorted(ratio.flatten(2))
     for _ in range(4):
         half = (pixels.shape[2] + 1) // 2
         width = pixels[:, :, half - 1 :] - pixels[:, :, : pixels.shape[2] - half + 1]
         start = width.argmin(dim=2, keepdim=True)
         pixels = pixels.gather(2, start + torch.arange(half, device=pixels.device))
-    drift = (pixels[:, :, pixels.shape[2] // 2] - 1.0).clamp(-most, most)  # (B, 3)
-    weight = (drift.abs().amax(dim=1, keepdim=True) / least - 1.0).clamp(0.0, 1.0)
-    return (1.0 + weight * drift)[..., None, None]
+    return pixels[:, :, pixels.shape[2] // 2] - 1.0
 
 
 def _sorted(values: Tensor) -> Tensor:

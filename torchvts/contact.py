@@ -151,6 +151,7 @@ class ContactMask(nn.Module):
     A pixel is in contact if its change over the three channels, each in units of its noise, is longer than ``sigmas``;
     a coarse cell also if its mean change is, in units of the frame's own spread of cell means (faint contact). The noise is
     the larger of the calibrated one and the frame's own. Holes are filled; components smaller than a disc of ``min_size_px`` go.
+    A channel that is black in all of the frame (below 5 % of its light at rest) has lost its lamp: the other two decide.
 
     Args:
         flat: (3, H, W), what the compensated image is at rest.
@@ -167,6 +168,7 @@ class ContactMask(nn.Module):
     flat: Tensor
     per_noise: Tensor
     rest: Tensor
+    dead_below: Tensor
     cell_row: Tensor
     cell_column: Tensor
 
@@ -184,6 +186,9 @@ class ContactMask(nn.Module):
         self.register_buffer("per_noise", 1.0 / noise.detach().clamp_min(QUANTISATION_STD).to(flat.dtype))
         self.rounding = float((QUANTISATION_STD * self.per_noise).square().mean())
         self.register_buffer("rest", -self.flat * self.per_noise)
+        self.step = max(1, min(flat.shape[1], flat.shape[2]) // 60)
+        some = self.flat[:, self.step // 2 :: self.step, self.step // 2 :: self.step]
+        self.register_buffer("dead_below", 0.05 * some.mean(dim=(1, 2)))
         self.register_buffer("cell_row", torch.arange(flat.shape[1]) // self.cell)
         self.register_buffer("cell_column", torch.arange(flat.shape[2]) // self.cell)
 
@@ -212,6 +217,12 @@ class ContactMask(nn.Module):
         check_batch("compensated", compensated, 3)
         check_same_size("compensated", compensated, "the calibration", self.flat.shape[1], self.flat.shape[2])
         change = torch.addcmul(self.rest, compensated, self.per_noise)
+        step = self.step
+        bright = compensated.detach()[:, :, step // 2 :: step, step // 2 :: step].mean(dim=(2, 3))  # (B, 3)
+        broken = bright < self.dead_below
+        broken = broken & (broken.to(torch.uint8).sum(dim=1, keepdim=True) == 1)
+        if not may_read_values() or bool(broken.any()):
+            change = change * (~broken)[:, :, None, None].to(change.dtype)
         r, g, b = change[:, 0:1], change[:, 1:2], change[:, 2:3]
         squared = torch.addcmul(torch.addcmul(r * r, g, g), b, b)
         noise = frame_noise_std(change.detach(), 2000).amax(dim=1).clamp_min(1.0)  # a frame noisier than calibration

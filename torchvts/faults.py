@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from .core.files import rgb_from_bgr
 from .core.geometry import pixel_grid_mm
 from .scenes import Scene
-from .shading import PointLights, cast_shadows
+from .shading import PointLights, cast_shadows, seen_at
 
 SHININESS = 30.0
 """Exponent of the specular lobe: half its height 12 degrees from the mirror direction."""
@@ -61,7 +61,7 @@ def photograph(scene: Scene, conditions: Conditions, seed: int = 0, at_mm: tuple
 
     Args:
         scene: what each pixel sees. conditions: under what. seed: of the noise.
-        at_mm: x and y (H, W) of the skin that each pixel sees; None for a camera that looks straight down.
+        at_mm: x and y (H, W) of the skin that each pixel sees; None for those of the scene's camera.
     Returns:
         (1, 3, H, W) in [0, 1].
     Example:
@@ -79,6 +79,7 @@ def radiance(scene: Scene, conditions: Conditions, at_mm: tuple[Tensor, Tensor] 
     height, width = depth.shape[2], depth.shape[3]
     if at_mm is None:
         x, y = pixel_grid_mm(height, width, scene.mm_per_pixel, depth.dtype)
+        x, y = seen_at(x, depth[0, 0], scene.camera_height_mm), seen_at(y, depth[0, 0], scene.camera_height_mm)
     else:
         x, y = (t.to(depth.dtype) for t in at_mm)
     place = torch.stack((x.expand(height, width), y.expand(height, width), depth[0, 0]))  # (3, H, W)
@@ -94,8 +95,8 @@ def radiance(scene: Scene, conditions: Conditions, at_mm: tuple[Tensor, Tensor] 
         lobe = (half_way * normal).sum(1).clamp_min(0.0) ** SHININESS * (facing > 0)
         light = light + conditions.specular * strength * lobe
     if conditions.shadows:
-        if at_mm is not None:
-            raise ValueError("at_mm: expected None with cast shadows, which need the depth on an even grid")
+        if at_mm is not None or not math.isinf(scene.camera_height_mm):
+            raise ValueError("shadows: expected a camera that looks straight down, whose depth lies on an even grid, got another")
         light = light * cast_shadows(depth, lights, scene.mm_per_pixel)[0]
     light = light[None]
     if conditions.albedo is not None:

@@ -226,40 +226,25 @@ def _distorted(severity: float, seed: int) -> Case:
     """Pixels see the skin at r (1 - k (r / R)^2), R reaching the corner: barrel distortion, with and without contact."""
     x, y = _grid()
     factor = 1.0 - severity * (x**2 + y**2) / float(x.max() ** 2 + y.max() ** 2)
-    return _case_at(_press(seed), (x * factor, y * factor), (x * factor, y * factor), seed)
+    at_mm = (x * factor, y * factor)
+    scene = surface_at(_press(seed), *at_mm, MM_PER_PIXEL)
+    background = photograph(at_rest(scene), USUAL, 2 * seed, at_mm)[0]
+    image = photograph(scene, USUAL, 2 * seed + 1, at_mm)
+    return Case(Calibration.from_lights(LIGHTS, SENSOR, background), background, image, scene)
 
 
 def _perspective(severity: float, seed: int) -> Case:
-    """A pin-hole above the middle that sees the resting skin as an even grid; severity is half its horizontal angle of view."""
-    x, y = _grid()
+    """A pinhole above the middle that sees the resting skin as an even grid; severity is half its horizontal angle of view.
+
+    The calibration's report tells how high it stands, to those who ask.
+    """
     if severity == 0.0:
         return undisturbed(seed)
-    distance, relief = 0.5 * WIDTH * MM_PER_PIXEL / math.tan(math.radians(severity)), _press(seed)
-    # the highest point along a pixel's ray is met first: march down from above all relief, then halve the step
-    step = PRESS_MM / 64.0
-    height = torch.full_like(x, PRESS_MM)
-    for _ in range(64):
-        height = torch.where(_relief_along(relief, x, y, height, distance) < height, (height - step).clamp_min(0.0), height)
-    low, high = height, (height + step).clamp_max(PRESS_MM)
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        above = _relief_along(relief, x, y, middle, distance) < middle
-        low, high = torch.where(above, low, middle), torch.where(above, middle, high)
-    nearness = 1.0 - low / distance
-    return _case_at(relief, (x, y), (x * nearness, y * nearness), seed)
-
-
-def _relief_along(relief: Relief, x: Tensor, y: Tensor, height: Tensor, distance: float) -> Tensor:
-    nearness = 1.0 - height / distance
-    return relief(x * nearness, y * nearness).clamp_min(0.0)
-
-
-def _case_at(relief: Relief, rest_mm: tuple[Tensor, Tensor], at_mm: tuple[Tensor, Tensor], seed: int) -> Case:
-    """A camera whose pixels see ``rest_mm`` of the skin at rest and ``at_mm`` of the pressed one, and whose user knows neither."""
-    scene = surface_at(relief, *at_mm, MM_PER_PIXEL)
-    background = photograph(at_rest(scene), USUAL, 2 * seed, rest_mm)[0]
-    image = photograph(scene, USUAL, 2 * seed + 1, at_mm)
-    return Case(Calibration.from_lights(LIGHTS, SENSOR, background), background, image, scene)
+    height_mm = 0.5 * WIDTH * MM_PER_PIXEL / math.tan(math.radians(severity))
+    scene = surface(_press(seed), HEIGHT, WIDTH, MM_PER_PIXEL, camera_height_mm=height_mm)
+    case = _case(scene, seed)
+    report = case.calibration.report | {"camera_height_mm": height_mm}
+    return case._replace(calibration=replace(case.calibration, report=report))
 
 
 def _grid() -> tuple[Tensor, Tensor]:

@@ -121,7 +121,7 @@ class DepthPipeline(nn.Module):
             by_response = calibration.response is not None
             normals = (NormalFromResponse if by_response else NormalFromIntensity).from_calibration(calibration)
         modules = (
-            Compensate.from_calibration(calibration),
+            Compensate.from_calibration(calibration, level=mode == "auto"),
             ContactMask.from_calibration(calibration),
             normals,
             GradientFromNormal(),

@@ -1,6 +1,7 @@
 """Exact presses: surfaces given by a formula, with their depth, gradient, normal and contact, and a camera to see them."""
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -9,20 +10,24 @@ from torch import Tensor
 
 from .core.checks import check_integer, check_positive
 from .core.geometry import normal_from_gradient, pixel_grid_mm
-from .shading import PointLights, cast_shadows, near_field_shading
+from .shading import PointLights, cast_shadows, near_field_shading, seen_at
 
 Segment = tuple[tuple[float, float], tuple[float, float]]
 """Start and end, (x, y) in mm."""
 
 
 class Scene(NamedTuple):
-    """One press, exact: depth_mm (1, 1, H, W), gradient (1, 2, H, W), normal (1, 3, H, W), contact (1, 1, H, W) bool."""
+    """One press, exact: depth_mm (1, 1, H, W), gradient (1, 2, H, W), normal (1, 3, H, W), contact (1, 1, H, W) bool.
+
+    With a finite ``camera_height_mm`` all maps are what the pixels of a pinhole camera at that height see.
+    """
 
     depth_mm: Tensor
     gradient: Tensor
     normal: Tensor
     contact: Tensor
     mm_per_pixel: float
+    camera_height_mm: float = math.inf
 
 
 def surface(
@@ -31,6 +36,7 @@ def surface(
     width: int = 640,
     mm_per_pixel: float = 0.0625,
     dtype: torch.dtype = torch.float32,
+    camera_height_mm: float = math.inf,
 ) -> Scene:
     """A press of any shape: depth as a function of x (right) and y (down) in mm; negative values mean no contact.
 
@@ -38,7 +44,11 @@ def surface(
 
     Args:
         depth_mm: maps x and y, both (H, W) float64, to depth (H, W), mm.
-        height, width: pixels. mm_per_pixel: pitch, mm. dtype: of the result.
+        height, width: pixels. mm_per_pixel: pitch, mm, on the skin at rest. dtype: of the result.
+        camera_height_mm: of a pinhole camera above the image centre; infinite for an orthographic camera. What each of its pixels
+            sees is found by fixed-point iteration, which converges as long as the surface does not hide parts of itself.
+    Raises:
+        ValueError: a camera not above the skin, or a surface that hides parts of itself from it.
     Example:
         >>> scene = surface(lambda x, y: 1.0 - x**2 - y**2, 9, 9, 0.25)
         >>> float(scene.depth_mm.max()), bool(scene.contact[0, 0, 0, 0])
@@ -47,7 +57,10 @@ def surface(
     check_integer("height", height, 3), check_integer("width", width, 3)
     check_positive("mm_per_pixel", mm_per_pixel)
     x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
-    return surface_at(depth_mm, x.expand(height, width), y.expand(height, width), mm_per_pixel, dtype)
+    x, y = x.expand(height, width), y.expand(height, width)
+    if not math.isinf(camera_height_mm):
+        x, y = _seen_by_pinhole(depth_mm, x, y, check_positive("camera_height_mm", camera_height_mm))
+    return surface_at(depth_mm, x, y, mm_per_pixel, dtype)._replace(camera_height_mm=camera_height_mm)
 
 
 def surface_at(
@@ -69,6 +82,24 @@ def surface_at(
     return Scene(depth, gradient, normal_from_gradient(gradient), contact, mm_per_pixel)
 
 
+def _seen_by_pinhole(
+    depth_mm: Callable[[Tensor, Tensor], Tensor], u: Tensor, v: Tensor, camera_height_mm: float, steps: int = 100
+) -> tuple[Tensor, Tensor]:
+    """x and y of the surface points behind pixels that see (u, v) of the skin at rest."""
+    depth = torch.zeros_like(u)
+    for _ in range(steps):
+        before = depth
+        x, y = seen_at(u, before, camera_height_mm), seen_at(v, before, camera_height_mm)
+        depth = depth_mm(x, y).detach().clamp_min(0.0)
+        if float((depth - before).abs().max()) < 1e-12:
+            return x, y
+    left = float((depth - before).abs().max())
+    raise ValueError(
+        f"camera_height_mm: the points seen from {camera_height_mm:g} mm were not found, {left:.2g} mm missing after {steps} "
+        "steps: the surface hides parts of itself, or has cliffs; raise the camera"
+    )
+
+
 def sphere_press(
     radius_mm: float = 10.0,
     press_mm: float = 1.0,
@@ -77,6 +108,7 @@ def sphere_press(
     width: int = 640,
     mm_per_pixel: float = 0.0625,
     dtype: torch.dtype = torch.float32,
+    camera_height_mm: float = math.inf,
 ) -> Scene:
     """A ball pressed in by ``press_mm``: the paper's figure 3 at radius 10 mm, press 1 and 2 mm.
 
@@ -90,7 +122,7 @@ def sphere_press(
         squared = (x - center_mm[0]) ** 2 + (y - center_mm[1]) ** 2
         return _cap(squared, radius_mm, press_mm)
 
-    return surface(depth, height, width, mm_per_pixel, dtype)
+    return surface(depth, height, width, mm_per_pixel, dtype, camera_height_mm)
 
 
 def cylinder_press(
@@ -238,9 +270,13 @@ def render(
         seed: of the noise.
     Returns:
         (1, 3, H, W) in [0, 1].
+    Raises:
+        ValueError: shadows seen by a pinhole camera.
     """
-    image = near_field_shading(scene.depth_mm, scene.normal, lights, scene.mm_per_pixel)
+    image = near_field_shading(scene.depth_mm, scene.normal, lights, scene.mm_per_pixel, scene.camera_height_mm)
     if shadows:
+        if not math.isinf(scene.camera_height_mm):
+            raise ValueError("shadows: expected an orthographic camera, whose depth lies on an even grid; got a pinhole")
         image = image * cast_shadows(scene.depth_mm, lights, scene.mm_per_pixel)
     if vignetting:
         x, y = pixel_grid_mm(image.shape[2], image.shape[3], 1.0, image.dtype)
@@ -269,6 +305,7 @@ def at_rest(scene: Scene) -> Scene:
         flat,
         torch.zeros_like(scene.contact),
         scene.mm_per_pixel,
+        scene.camera_height_mm,
     )
 
 

@@ -57,11 +57,11 @@ class PointLights(nn.Module):
         self.register_buffer("gloss", shine.clone())
         self.glossy = bool((shine > 0).any())
 
-    def forward(self, depth_mm: Tensor, normal: Tensor, mm_per_pixel: float) -> Tensor:
+    def forward(self, depth_mm: Tensor, normal: Tensor, mm_per_pixel: float, camera_height_mm: float = math.inf) -> Tensor:
         check_batch("depth_mm", depth_mm, 1)
         check_batch("normal", normal, 3)
         check_same_size("normal", normal, "depth_mm", depth_mm.shape[2], depth_mm.shape[3])
-        matrix = light_matrix(depth_mm, self.position_mm, self.albedo, mm_per_pixel)
+        matrix = light_matrix(depth_mm, self.position_mm, self.albedo, mm_per_pixel, camera_height_mm)
         light = (matrix * normal.unsqueeze(1)).sum(2).clamp_min(0.0)
         if self.glossy:
             light = light * (1.0 + self.gloss.reshape(1, 3, 1, 1) * gloss_lobe(matrix, normal))
@@ -77,16 +77,19 @@ class PointLights(nn.Module):
         return ", ".join(rows)
 
 
-def near_field_shading(depth_mm: Tensor, normal: Tensor, lights: PointLights, mm_per_pixel: float) -> Tensor:
+def near_field_shading(
+    depth_mm: Tensor, normal: Tensor, lights: PointLights, mm_per_pixel: float, camera_height_mm: float = math.inf
+) -> Tensor:
     """Image of a skin under near point lights; attached shadows clamp at zero.
 
-    ``I^j = max(0, rho^j (S^j - P) . n / |S^j - P|^3)`` at P = (x, y, depth).
+    ``I^j = max(0, rho^j (S^j - P) . n / |S^j - P|^3)`` at P = (x, y, depth), where x and y are the pixel's (:func:`seen_at`).
 
     Args:
         depth_mm: (B, 1, H, W), positive towards the camera.
         normal: (B, 3, H, W), unit, n_z > 0.
         lights: the three lights.
-        mm_per_pixel: pixel pitch, mm.
+        mm_per_pixel: pixel pitch, mm, on the skin at rest.
+        camera_height_mm: of a pinhole camera above the image centre; infinite for an orthographic camera.
     Returns:
         Linear light, (B, 3, H, W), channels R, G, B; not clamped at 1. Differentiable in every input.
     Raises:
@@ -99,7 +102,7 @@ def near_field_shading(depth_mm: Tensor, normal: Tensor, lights: PointLights, mm
         >>> near_field_shading(torch.zeros(1, 1, 8, 8), flat, lights, 0.1).shape
         torch.Size([1, 3, 8, 8])
     """
-    image: Tensor = lights(depth_mm, normal, mm_per_pixel)
+    image: Tensor = lights(depth_mm, normal, mm_per_pixel, camera_height_mm)
     return image
 
 
@@ -156,13 +159,35 @@ def flat_image(lights: PointLights, height: int, width: int, mm_per_pixel: float
     return near_field_shading(depth_mm, flat.expand(1, 3, height, width), lights, mm_per_pixel)[0]
 
 
-def light_matrix(depth_mm: Tensor, position_mm: Tensor, albedo: Tensor, mm_per_pixel: float) -> Tensor:
+def seen_at(at_rest_mm: Tensor, depth_mm: Tensor, camera_height_mm: float, axis_mm: float = 0.0) -> Tensor:
+    """x or y of what a pixel sees, from where it sees the skin at rest: a pinhole at height h sees X = u (h - z) / h.
+
+    Args:
+        at_rest_mm: u, broadcast against depth_mm. camera_height_mm: h; infinite for an orthographic camera, X = u.
+        axis_mm: where the camera stands, if not at 0.
+    Example:
+        >>> seen_at(torch.tensor([-10.0, 10.0]), torch.tensor(2.0), 20.0)
+        tensor([-9.,  9.])
+    """
+    if math.isinf(camera_height_mm):
+        return at_rest_mm
+    return at_rest_mm - (at_rest_mm - axis_mm) * (depth_mm / camera_height_mm)
+
+
+def light_matrix(
+    depth_mm: Tensor,
+    position_mm: Tensor,
+    albedo: Tensor,
+    mm_per_pixel: float,
+    camera_height_mm: float = math.inf,
+    axis_mm: tuple[float, float] = (0.0, 0.0),
+) -> Tensor:
     """The matrix L of ``I = L n``: row j is rho^j (S^j - P) / |S^j - P|^3.
 
     Args:
         depth_mm: (B, 1, H, W), mm.
         position_mm: (3, 3), mm. albedo: (3,).
-        mm_per_pixel: pixel pitch, mm.
+        mm_per_pixel: pixel pitch, mm. camera_height_mm, axis_mm: as :func:`seen_at` takes them, the latter's x and y.
     Returns:
         (B, 3, 3, H, W): light, axis, row, column.
     Source:
@@ -170,6 +195,7 @@ def light_matrix(depth_mm: Tensor, position_mm: Tensor, albedo: Tensor, mm_per_p
     """
     depth = depth_mm.unsqueeze(1)  # (B, 1, 1, H, W)
     x, y = pixel_grid_mm(depth_mm.shape[2], depth_mm.shape[3], mm_per_pixel, depth_mm.dtype, depth_mm.device)
+    x, y = seen_at(x, depth, camera_height_mm, axis_mm[0]), seen_at(y, depth, camera_height_mm, axis_mm[1])
     light = position_mm.reshape(1, 3, 3, 1, 1)
     to_light = torch.cat(
         (
@@ -212,7 +238,14 @@ def microfacet(n_l: Tensor, n_v: Tensor, n_h: Tensor, roughness: float = GLOSS_R
     return spread / (n_l * torch.sqrt(n_v * n_v * (1.0 - a) + a) + n_v * torch.sqrt(n_l * n_l * (1.0 - a) + a))
 
 
-def inverse_light_matrix(depth_mm: Tensor, position_mm: Tensor, albedo: Tensor, mm_per_pixel: float) -> Tensor:
+def inverse_light_matrix(
+    depth_mm: Tensor,
+    position_mm: Tensor,
+    albedo: Tensor,
+    mm_per_pixel: float,
+    camera_height_mm: float = math.inf,
+    axis_mm: tuple[float, float] = (0.0, 0.0),
+) -> Tensor:
     r"""Inverse of the light matrix at every pixel, in closed form.
 
     With a_j = S^j - P the rows of L are rho^j a_j / |a_j|^3, so column j of the inverse is
@@ -221,7 +254,7 @@ def inverse_light_matrix(depth_mm: Tensor, position_mm: Tensor, albedo: Tensor, 
     Args:
         depth_mm: (B, 1, H, W), mm.
         position_mm: (3, 3), mm. albedo: (3,).
-        mm_per_pixel: pixel pitch, mm.
+        mm_per_pixel: pixel pitch, mm. camera_height_mm, axis_mm: as :func:`light_matrix` takes them.
     Returns:
         (B, 3, 3, H, W): normal axis, light, row, column.
     Source:
@@ -232,6 +265,7 @@ def inverse_light_matrix(depth_mm: Tensor, position_mm: Tensor, albedo: Tensor, 
     constant = torch.linalg.cross(second, third, dim=1)  # (light, axis)
     along = third - second
     z = depth_mm[:, 0]  # (B, H, W)
+    x, y = seen_at(x, z, camera_height_mm, axis_mm[0]), seen_at(y, z, camera_height_mm, axis_mm[1])
     columns: list[Tensor] = []
     determinant = torch.zeros_like(z)
     for j in range(3):

@@ -3,10 +3,13 @@
 import hashlib
 import json
 import math
+import multiprocessing
 import os
 import warnings
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +21,7 @@ from .core import __version__
 from .core.files import write_atomically
 from .core.geometry import normal_from_gradient
 from .gallery import DIALS, Case, Dial
-from .integration import PoissonDST
+from .integration import AdaptiveIntegration, PerspectiveIntegration, PoissonDST
 from .metrics import depth_error, mask_iou, normal_angle_deg
 from .normals import NormalFromIntensity
 from .pipeline import DepthOutput, DepthPipeline
@@ -70,6 +73,22 @@ def _plain_inverse(calibration: Calibration) -> Method:
     return DepthPipeline.from_calibration(calibration, "precise", normals=normals)
 
 
+def _blurred(calibration: Calibration) -> Method:
+    """Images blurred by a pixel before anything is made of them, as ``Sensor(blur_px=1)`` asks for."""
+    blurred = replace(calibration, sensor=replace(calibration.sensor, blur_px=1.0))
+    return DepthPipeline.from_calibration(blurred, "precise")
+
+
+def _pinhole(calibration: Calibration) -> Method:
+    """Normals and integral of a pinhole camera, where the calibration's report tells how high it stands; else as precise."""
+    height_mm = calibration.report.get("camera_height_mm", math.inf)
+    if math.isinf(height_mm):
+        return DepthPipeline.from_calibration(calibration, "precise")
+    normals = NormalFromIntensity.from_calibration(calibration, height_mm)
+    integrate = PerspectiveIntegration(calibration.sensor.mm_per_pixel, height_mm)
+    return DepthPipeline.from_calibration(calibration, "precise", normals=normals, integrate=integrate)
+
+
 METHODS: dict[str, Callable[[Calibration], Method]] = {
     "flat": _flat,
     "fast": lambda c: DepthPipeline.from_calibration(c, "fast"),
@@ -77,6 +96,9 @@ METHODS: dict[str, Callable[[Calibration], Method]] = {
     "auto": lambda c: DepthPipeline.from_calibration(c, "auto"),
     "fast, zero border": lambda c: DepthPipeline.from_calibration(c, "fast", integrate=PoissonDST(c.sensor.mm_per_pixel)),
     "precise, plain inverse": _plain_inverse,
+    "precise, blur 1 px": _blurred,
+    "precise, cliffs": lambda c: DepthPipeline.from_calibration(c, "precise", integrate=AdaptiveIntegration(c.sensor.mm_per_pixel)),
+    "precise, pinhole": _pinhole,
 }
 """Every method by name: from a calibration to what reconstructs an image."""
 
@@ -150,7 +172,7 @@ def measure(method: str, dial: str, severity: float, seed: int, case: Case) -> R
     Example:
         >>> from torchvts.gallery import undisturbed
         >>> round(measure("fast", "noise", 0.002, 0, undisturbed()).normal_deg, 1)
-        0.5
+        0.6
     """
     truth = case.truth
     region = truth.contact if bool(truth.contact.any()) else torch.ones_like(truth.contact)
@@ -177,6 +199,7 @@ def sweep(
     methods: Sequence[str] = tuple(METHODS),
     dials: Sequence[str] = tuple(DIALS),
     seeds: int = 3,
+    workers: int = 0,
     progress: Callable[[], object] = lambda: None,
 ) -> list[Row]:
     """Measure every method on every dial, and keep each row in a file of JSON lines, from which a later call goes on.
@@ -184,9 +207,10 @@ def sweep(
     The first line of the file tells of which state of this package the rows are; rows of another state are refused.
 
     Args:
-        path: the file, made if missing. methods, dials: names. seeds: 0 up to this are measured. progress: called for each row.
+        path: the file, made if missing. methods, dials: names. seeds: 0 up to this are measured.
+        workers: processes; 0 for none beside this one. progress: called for each row.
     Returns:
-        The rows asked for, by dial, severity, method and seed.
+        The rows asked for, by dial, severity, seed and method.
     Raises:
         ValueError: an unknown name, or a file of another state of the package, or that is none of this function's.
     """
@@ -195,23 +219,37 @@ def sweep(
         if unknown := [value for value in values if value not in known]:
             raise ValueError(f"{name}: expected some of {', '.join(known)}, got {unknown[0]!r}")
     kept = _read(path)
-    rows: list[Row] = []
-    with path.open("a", encoding="utf-8") as stream:
-        for dial in (DIALS[name] for name in dials):
-            for severity in dial.severities:
-                cases: dict[int, Case] = {}
-                for method in methods:
-                    for seed in range(seeds):
-                        row = kept.get((method, dial.name, severity, seed))
-                        if row is None:
-                            if seed not in cases:
-                                cases[seed] = dial.make(severity, seed)
-                            row = measure(method, dial.name, severity, seed, cases[seed])
-                            stream.write(json.dumps(asdict(row)) + "\n")
-                            stream.flush()
-                        rows.append(row)
-                        progress()
-    return rows
+    asked = [(dial, severity, seed) for dial in dials for severity in DIALS[dial].severities for seed in range(seeds)]
+    jobs = [(place, [method for method in methods if (method, *place) not in kept]) for place in asked]
+    for _ in range(len(asked) * len(methods) - sum(len(missing) for _, missing in jobs)):
+        progress()
+    jobs = [job for job in jobs if job[1]]
+    with path.open("a", encoding="utf-8") as stream, _pool(workers) as map_jobs:
+        for rows in map_jobs(_measure_all, jobs):
+            stream.write("".join(json.dumps(asdict(row)) + "\n" for row in rows))
+            stream.flush()
+            for row in rows:
+                kept[row.method, row.dial, row.severity, row.seed] = row
+                progress()
+    return [kept[(method, *place)] for place in asked for method in methods]
+
+
+def _measure_all(job: tuple[tuple[str, float, int], list[str]]) -> list[Row]:
+    """Some methods on one case, which is made once."""
+    (dial, severity, seed), methods = job
+    case = DIALS[dial].make(severity, seed)
+    return [measure(method, dial, severity, seed, case) for method in methods]
+
+
+@contextmanager
+def _pool(workers: int) -> Iterator[Callable[..., Iterable[list[Row]]]]:
+    """``map``, over processes of one thread each, or in this one if there are to be none."""
+    if workers == 0:
+        yield map
+        return
+    context = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
+    with ProcessPoolExecutor(workers, context, torch.set_num_threads, (1,)) as pool:
+        yield pool.map
 
 
 def fingerprint() -> str:

@@ -12,6 +12,7 @@ from ..calibration.contacts import ROUGH, channel_structure
 from ..calibration.rest_image import falloff, outwardness
 from ..core.checks import QUANTISATION_STD, check_range
 from ..core.noise import noise_std
+from ..integration import integrate_perspective
 from ..record import Calibration
 from ..shading import PointLights
 from .camera import Spots, blockiness, levels_of, new_spots, texture_share
@@ -490,7 +491,7 @@ class _Examination:
                 "contact is smaller than the mask"
             )
             found.append(Finding("skirt", message, "note", skirt))
-        found += self._depth_of_press(light, relief, top)
+        found += self._depth_of_press(light, relief, top) + self._perspective(relief)
         return found
 
     def _depth_of_press(self, light: Tensor, relief: Relief, top: float) -> list[Finding]:
@@ -504,6 +505,21 @@ class _Examination:
             return []
         message = f"deep press ({top:.1f} mm): fast mode is off by {off_px:.1f} px; use precise or auto"
         return [Finding("deep_press", message, "note", off_px)]
+
+    def _perspective(self, relief: Relief) -> list[Finding]:
+        """What a near camera does to the depth, where the calibration tells its height: no image shows it."""
+        height, pitch = self.calibration.report.get("camera_height_mm"), self.calibration.sensor.mm_per_pixel
+        if isinstance(height, bool) or not isinstance(height, int | float) or not 0 < height < math.inf:
+            return []
+        seen = integrate_perspective(relief.output.gradient, pitch, float(height))
+        off_px = float((seen - relief.output.depth_mm).abs().max()) / pitch
+        if off_px < 0.1:
+            return []
+        message = (
+            f"the camera stands {height:.0f} mm above the skin: read as if it looked straight down, depth is off by "
+            f"{off_px:.1f} px; use PerspectiveIntegration"
+        )
+        return [Finding("perspective", message, "warning" if off_px > 0.5 else "note", off_px)]
 
     def _misfit(self, relief: Relief, spots: Tensor) -> list[Finding]:
         unsound = spots | (self.raw > 0.98).any(0)

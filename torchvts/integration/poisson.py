@@ -211,6 +211,16 @@ def _integrate_dct(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], to
     return _solve(nn.functional.pad(right, [0, 0, top, below]), plan)
 
 
+def laplace_plan(like: Tensor) -> list[Tensor]:
+    """What :func:`solve_laplace` needs for images of the size, dtype and device of ``like`` (B, C, H, W)."""
+    return _plan_dct(like, like.shape[2], like.shape[3])
+
+
+def solve_laplace(right: Tensor, plan: list[Tensor]) -> Tensor:
+    """(B, 1, H, W) of zero mean whose five-point Laplacian with a free border is ``right`` less its mean."""
+    return _solve_by_fft(right, plan, 0) if len(plan) == 7 else _solve(right, plan)
+
+
 def _plan_dst(gradient: Tensor) -> list[Tensor]:
     even_y, odd_y, value_even_y, value_odd_y = sine_bases(gradient.shape[2] - 2)
     even_x, odd_x, value_even_x, value_odd_x = sine_bases(gradient.shape[3] - 2)

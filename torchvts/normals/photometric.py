@@ -1,27 +1,47 @@
 """Normals by photometric stereo with near lights."""
 
+import math
+
 import torch
 from torch import Tensor, nn
 
 from ..core.checks import QUANTISATION_STD, check_batch, check_window, may_read_values
 from ..core.geometry import gradient_from_normal, normal_from_gradient
 from ..record import Calibration
-from ..shading import PointLights, flat_image, gloss_lobe, inverse_light_matrix, light_matrix
+from ..shading import PointLights, flat_image, gloss_lobe, inverse_light_matrix, light_matrix, seen_at
+
+CLIFF_SLOPE = 2.0
+"""Difference of neighbouring slopes from which depth is taken for a cliff."""
+
+
+PRIOR_STD = 0.25
+"""How far slopes spread about what is known of them beforehand."""
 
 
 def slope_by_lit_lights(
-    start: Tensor, compensated: Tensor, rows: Tensor, full: Tensor, noise_std: float, prior_std: float = 0.25, steps: int = 3
+    start: Tensor,
+    compensated: Tensor,
+    rows: Tensor,
+    full: Tensor,
+    noise_std: float,
+    prior_std: float = PRIOR_STD,
+    brightness_std: float = 0.02,
+    steps: int = 3,
 ) -> Tensor:
     """Slopes of pixels where a light is blocked or a channel is full: each pixel against the clamped model max(0, L n).
 
     n is of unit length. A blocked channel says no more than that it is dark, a full one that it is at least so bright, which
     leaves two numbers for two slopes and, near |n| = 1, a direction that is badly pinned. A weak prior (``prior_std``) towards
-    ``start`` holds that direction; when ``start`` comes from a depth map, its neighbours speak through it. Gauss-Newton in
-    closed form, steps of at most 0.5.
+    ``start`` holds that direction; when ``start`` comes from a depth map, its neighbours speak through it. The brightness that
+    all channels share counts no more than to ``brightness_std``: a depth 0.2 mm off changes it by as much, and near the plane
+    of two lights, where |n| = 1 bends away from it, noise in it would push the slope. Gauss-Newton in closed form, steps of at
+    most 0.5.
 
     Args:
-        start: (N, 2), slopes (dz/dx, dz/dy). compensated: (N, 3). rows: (N, 3, 3), light matrix. full: (N, 3) bool, saturated.
+        start: (N, 2), slopes (dz/dx, dz/dy). compensated: (N, 3). rows: (N, 3, 3), light matrix.
+        full: (N, 3) bool, channels that are saturated; one that is broken is a full one of intensity 0.
         noise_std: of the compensated image, against which the prior is weighed.
+        prior_std: of the slope about ``start``. brightness_std: relative. steps: of Gauss-Newton.
     Returns:
         (N, 2).
     Source:
@@ -38,7 +58,14 @@ def slope_by_lit_lights(
         lit = ((light > 0.1 * noise_std) & ~(full & (light >= compensated))).to(light.dtype)
         # d normal / d slope is -n_z (e - n (n.e)) along x and y: the part of the light row across the normal
         across = -n_z[:, :, None] * (rows - light[:, :, None] * normal[:, None])[:, :, 0:2] * lit[:, :, None]
-        residual = compensated - light * lit
+        seen = light * lit
+        residual = compensated * lit - seen
+        # whitened by the covariance noise^2 1 + brightness^2 seen seen^T
+        energy = (seen * seen).sum(1, keepdim=True)
+        common = (1.0 - torch.rsqrt(1.0 + (brightness_std / noise_std) ** 2 * energy)) / energy.clamp_min(1e-12)
+        along = common * seen
+        residual = residual - along * (seen * residual).sum(1, keepdim=True)
+        across = across - along[:, :, None] * (seen[:, :, None] * across).sum(1, keepdim=True)
         a = (across[:, :, 0] ** 2).sum(1) + weight
         b = (across[:, :, 0] * across[:, :, 1]).sum(1)
         c = (across[:, :, 1] ** 2).sum(1) + weight
@@ -57,7 +84,9 @@ class NormalFromIntensity(nn.Module):
     """Unit normals of a compensated image.
 
     Without depth, the stored inverse of the light matrix at rest (eq. 9); with depth, the inverse at that depth (eq. 10).
-    Where a light is blocked (its channel below three times its noise) or a channel is full, :func:`slope_by_lit_lights` decides.
+    Where a light is blocked (its channel below three times its noise) or a channel is full, :func:`slope_by_lit_lights` decides;
+    also where the lights nearly lie in one plane, so that the inverse makes more of the noise than ``PRIOR_STD``, what is known of
+    slopes beforehand: |n| = 1 and that prior then damp it, which the plain inverse does not know. Elsewhere nothing changes.
     While gradients are recorded for the lights (``requires_grad_(True)``), the matrix is built from them at every call. Given
     ``window`` (top, left), the image is the part of the calibrated one whose first pixel is there.
 
@@ -66,6 +95,8 @@ class NormalFromIntensity(nn.Module):
         noise_std: (3,), noise of the compensated image; None takes that of 8-bit rounding.
         inverse: (3, 3, H, W), the stored inverse; None computes it.
         full_above: (3, H, W), compensated intensity from which a channel counts as saturated; None for never.
+        camera_height_mm: of a pinhole camera above the image centre, which sees deep points nearer to its axis; infinite for an
+            orthographic camera. (:class:`PerspectiveIntegration` is its partner.)
     Source:
         eq. 3, 8, 9, 10 of the paper.
     Example:
@@ -80,6 +111,7 @@ class NormalFromIntensity(nn.Module):
     dark_below: Tensor
     dark_where: Tensor
     full_above: Tensor
+    weak: Tensor
 
     def __init__(
         self,
@@ -90,9 +122,11 @@ class NormalFromIntensity(nn.Module):
         noise_std: Tensor | None = None,
         inverse: Tensor | None = None,
         full_above: Tensor | None = None,
+        camera_height_mm: float = math.inf,
     ) -> None:
         super().__init__()
         self.mm_per_pixel = mm_per_pixel
+        self.camera_height_mm = float(camera_height_mm)
         position, albedo = lights.position_mm.detach(), lights.albedo.detach()
         if inverse is None:
             inverse = inverse_light_matrix(position.new_zeros(1, 1, height, width), position, albedo, mm_per_pixel)[0]
@@ -103,6 +137,11 @@ class NormalFromIntensity(nn.Module):
         self.noise_std = float(noise.square().mean().sqrt())
         self.register_buffer("inverse", inverse.detach().clone())
         self.register_buffer("dark_below", 3.0 * noise.detach().to(inverse.dtype))
+        # where the noise of the inverse exceeds what is known of slopes beforehand, lights that nearly lie in one plane
+        spread = self.noise_std * inverse.detach().square().sum(dim=(0, 1)).sqrt()
+        weak = ~(spread <= PRIOR_STD)  # infinite ones too
+        self.ill = bool(weak.any())
+        self.register_buffer("weak", weak)
         # a channel can only be called dark where its light shines on the flat skin
         flat = flat_image(self.lights, height, width, mm_per_pixel).to(inverse.dtype)
         below = self.dark_below.reshape(3, 1, 1)
@@ -111,7 +150,7 @@ class NormalFromIntensity(nn.Module):
         self.register_buffer("full_above", full)
 
     @classmethod
-    def from_calibration(cls, calibration: Calibration) -> "NormalFromIntensity":
+    def from_calibration(cls, calibration: Calibration, camera_height_mm: float = math.inf) -> "NormalFromIntensity":
         """The block of a unit calibrated by lights."""
         if calibration.lights is None:
             raise ValueError("calibration: expected one by lights, got one by response fields: use NormalFromResponse")
@@ -125,6 +164,7 @@ class NormalFromIntensity(nn.Module):
             noise_std=calibration.compensated_noise_std.flatten(1).median(dim=1).values,
             inverse=calibration.inverse,
             full_above=full if calibration.offset is None else full + calibration.offset,
+            camera_height_mm=camera_height_mm,
         )
 
     def forward(self, compensated: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
@@ -134,16 +174,18 @@ class NormalFromIntensity(nn.Module):
         bottom, right = top + compensated.shape[2], left + compensated.shape[3]
         position: Tensor = self.lights.position_mm
         albedo = self.lights.albedo
+        axis = (0.0, 0.0)
         if bottom - top < height or right - left < width:  # the lights as seen from the window's middle
             x = 0.5 * (left + right - width) * self.mm_per_pixel
             y = 0.5 * (top + bottom - height) * self.mm_per_pixel
             position = torch.cat((position[:, 0:1] - x, position[:, 1:2] - y, position[:, 2:3]), dim=1)
+            axis = (-x, -y)
         if self.lights.glossy:
-            compensated = self._matt(compensated, depth_mm, position)
+            compensated = self._matt(compensated, depth_mm, position, axis)
         live = torch.is_grad_enabled() and (position.requires_grad or albedo.requires_grad)
         inverse = self.inverse[None, :, :, top:bottom, left:right]
         if depth_mm is not None:
-            inverse = inverse_light_matrix(depth_mm, position, albedo, self.mm_per_pixel)
+            inverse = inverse_light_matrix(depth_mm, position, albedo, self.mm_per_pixel, self.camera_height_mm, axis)
         elif live:
             rest = compensated.new_zeros(1, 1, compensated.shape[2], compensated.shape[3])
             inverse = inverse_light_matrix(rest, position, albedo, self.mm_per_pixel)
@@ -152,13 +194,15 @@ class NormalFromIntensity(nn.Module):
         n_x, n_y, n_z = normal[:, 0:1], normal[:, 1:2], normal[:, 2:3]
         normal = normal * torch.rsqrt(torch.addcmul(torch.addcmul(n_x * n_x, n_y, n_y), n_z, n_z) + 1e-24)
         dark = self.dark_where[:, top:bottom, left:right]
-        return self._relight(normal, compensated, depth_mm, position, albedo, dark, self.full_above[:, top:bottom, left:right])
+        full = self.full_above[:, top:bottom, left:right]
+        weak = self.weak[top:bottom, left:right]
+        return self._relight(normal, compensated, depth_mm, position, albedo, dark, full, weak, axis)
 
-    def _matt(self, compensated: Tensor, depth_mm: Tensor | None, position: Tensor) -> Tensor:
+    def _matt(self, compensated: Tensor, depth_mm: Tensor | None, position: Tensor, axis: tuple[float, float]) -> Tensor:
         """What a matt skin would show: the specular lobe divided out, at the slope of the depth so far."""
         depth = compensated.new_zeros(1, 1, compensated.shape[2], compensated.shape[3]) if depth_mm is None else depth_mm
         normal = normal_from_gradient(_slope_of_depth(depth, self.mm_per_pixel))
-        matrix = light_matrix(depth, position, self.lights.albedo, self.mm_per_pixel)
+        matrix = light_matrix(depth, position, self.lights.albedo, self.mm_per_pixel, self.camera_height_mm, axis)
         return compensated / (1.0 + self.lights.gloss.reshape(1, 3, 1, 1) * gloss_lobe(matrix, normal))
 
     def coarse(self, stride: int) -> "NormalFromIntensity":
@@ -172,6 +216,7 @@ class NormalFromIntensity(nn.Module):
             self.mm_per_pixel * stride,
             self.dark_below / 3.0,
             full_above=self.full_above[:, stride // 2 :: stride, stride // 2 :: stride],
+            camera_height_mm=self.camera_height_mm,
         )
         coarse.lights = self.lights  # one set of parameters
         return coarse
@@ -185,37 +230,59 @@ class NormalFromIntensity(nn.Module):
         albedo: Tensor,
         dark_where: Tensor,
         full_above: Tensor,
+        weak: Tensor,
+        axis: tuple[float, float],
     ) -> Tensor:
-        """Replace the normals of pixels where a light that shines on the flat skin has gone dark, or a channel is full."""
+        """Replace the normals of pixels where a light that shines on the flat skin has gone dark, a channel is full, or L is weak.
+
+        Of a lamp that is dead altogether the other two and |n| = 1 are left: all pixels go this way, and from the flat skin.
+        """
         if may_read_values():  # asked by subtraction, which is three times as fast as comparison
             seen = compensated.detach()
-            if float((seen - dark_where).amin()) >= 0.0 and float((seen - full_above).amax()) < 0.0:
+            sound = float((seen - dark_where).amin()) >= 0.0 and float((seen - full_above).amax()) < 0.0
+            if sound and not (self.ill and bool(weak.any())):
                 return normal
-        clipped = (compensated < dark_where) | (compensated >= full_above)
-        b, row, column = torch.where(clipped.any(dim=1))
+        dark = compensated < dark_where
+        # black nearly everywhere: no shadow is so large, the lamp is dead
+        broken = dark.to(compensated.dtype).mean(dim=(2, 3)) > 0.98  # (B, 3)
+        clipped = dark | (compensated >= full_above) | broken[:, :, None, None]
+        b, row, column = torch.where(clipped.any(dim=1) | weak)
         height, width = compensated.shape[2], compensated.shape[3]
         x = (column.to(normal.dtype) - 0.5 * (width - 1)) * self.mm_per_pixel
         y = (row.to(normal.dtype) - 0.5 * (height - 1)) * self.mm_per_pixel
         z = torch.zeros_like(x)
         start = gradient_from_normal(normal[b, :, row, column][:, :, None, None])[:, :, 0, 0]
+        start = torch.where((broken.any(dim=1)[b] | weak[row, column])[:, None], torch.zeros_like(start), start)
         if depth_mm is not None:
             depth = depth_mm[:, 0].expand(compensated.shape[0], height, width)
+            z = depth[b, row, column]
             left, right = depth[b, row, (column - 1).clamp_min(0)], depth[b, row, (column + 1).clamp_max(width - 1)]
             above, below = depth[b, (row - 1).clamp_min(0), column], depth[b, (row + 1).clamp_max(height - 1), column]
-            z = depth[b, row, column]
-            start = torch.stack((right - left, below - above), dim=1) / (2.0 * self.mm_per_pixel)
+            pitch = self.mm_per_pixel
+            p = _beside_cliffs((z - left) / pitch, (right - z) / pitch)
+            q = _beside_cliffs((z - above) / pitch, (below - z) / pitch)
+            start = torch.stack((p, q), dim=1)
+            x, y = seen_at(x, z, self.camera_height_mm, axis[0]), seen_at(y, z, self.camera_height_mm, axis[1])
         to_light = position - torch.stack((x, y, z), dim=1)[:, None]  # (N, light, axis)
         squared = (to_light * to_light).sum(2, keepdim=True)
         rows = albedo[None, :, None] * to_light * (squared.rsqrt() / squared)
-        intensity = compensated[b, :, row, column]
-        slope = slope_by_lit_lights(start, intensity, rows, intensity >= full_above[:, row, column].t(), self.noise_std)
+        intensity, dead = compensated[b, :, row, column], broken[b]
+        full = (intensity >= full_above[:, row, column].t()) | dead
+        slope = slope_by_lit_lights(start, intensity * (~dead).to(intensity.dtype), rows, full, self.noise_std)
         solution = normal_from_gradient(slope[:, :, None, None])[:, :, 0, 0]
         return normal.permute(0, 2, 3, 1).index_put((b, row, column), solution).permute(0, 3, 1, 2)
 
 
 def _slope_of_depth(depth_mm: Tensor, mm_per_pixel: float) -> Tensor:
-    """Central differences, (B, 2, H, W); one-sided halves at the border."""
-    padded = nn.functional.pad(depth_mm, [1, 1, 1, 1], mode="replicate")
-    p = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]
-    q = padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
-    return torch.cat((p, q), dim=1) / (2.0 * mm_per_pixel)
+    """Central differences, (B, 2, H, W); one-sided halves at the border, and beside a cliff the difference on its other side."""
+    padded = nn.functional.pad(depth_mm, [1, 1, 1, 1], mode="replicate") / mm_per_pixel
+    along_x, along_y = padded[..., 1:-1, 1:] - padded[..., 1:-1, :-1], padded[..., 1:, 1:-1] - padded[..., :-1, 1:-1]
+    p = _beside_cliffs(along_x[..., :-1], along_x[..., 1:])
+    q = _beside_cliffs(along_y[..., :-1, :], along_y[..., 1:, :])
+    return torch.cat((p, q), dim=1)
+
+
+def _beside_cliffs(one: Tensor, other: Tensor, apart: float = CLIFF_SLOPE) -> Tensor:
+    """The mean of two slopes, or the smaller where they are so far apart that a cliff must lie on one side."""
+    smaller = torch.where(one.abs() < other.abs(), one, other)
+    return torch.where((one - other).abs() < apart, 0.5 * (one + other), smaller)

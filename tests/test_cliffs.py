@@ -1,0 +1,290 @@
+"""Integration across cliffs, its test for them, contact at the image border, and pinhole cameras."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import references
+import torch
+
+import torchvts as vts
+from torchvts import metrics, scenes
+from torchvts.integration import cliff_share
+from torchvts.normals import NormalFromIntensity
+from torchvts.shading import inverse_light_matrix, light_matrix
+
+SIZE, PITCH = (120, 160), 0.25
+
+
+def prism(profile, length_mm=12.0, angle_deg=20.0):
+    """A ridge of the given profile across, cut off vertically at both ends."""
+
+    def depth(x, y):
+        angle = math.radians(angle_deg)
+        along, across = x * math.cos(angle) + y * math.sin(angle), y * math.cos(angle) - x * math.sin(angle)
+        return torch.where(along.abs() < 0.5 * length_mm, profile(across), -1.0)
+
+    return depth
+
+
+CLIFFS = {
+    "wedge": prism(lambda t: 3.0 - t.abs()),
+    "flat wedge": prism(lambda t: 1.5 - 0.5 * t.abs(), 16.0, -65.0),
+    "cylinder": prism(lambda t: torch.sqrt((36.0 - t**2).clamp_min(1e-9)) - 4.5),
+}
+SMOOTH = {
+    "sphere": lambda: scenes.sphere_press(10.0, 2.0, (0, 0), *SIZE, PITCH, torch.float64),
+    "sphere cut by the border": lambda: scenes.sphere_press(10.0, 1.0, (19.0, -13.0), *SIZE, PITCH, torch.float64),
+    "sine": lambda: scenes.sine_press(0.2, 4.0, 9.0, *SIZE, PITCH, torch.float64),
+    "capsule": lambda: scenes.cylinder_press(height=120, width=160, mm_per_pixel=PITCH, dtype=torch.float64),
+    "cone": lambda: scenes.cone_press(height=120, width=160, mm_per_pixel=PITCH, dtype=torch.float64),
+}
+every_cliff = pytest.mark.parametrize("name", CLIFFS)
+every_smooth = pytest.mark.parametrize("name", SMOOTH)
+
+
+def cliff(name):
+    return scenes.surface(CLIFFS[name], *SIZE, PITCH, torch.float64)
+
+
+def noisy(scene, std=0.02, seed=0):
+    noise = torch.randn(scene.gradient.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return scene.gradient + std * noise * scene.contact
+
+
+def largest_px(depth, scene):
+    return metrics.depth_error(depth, scene.depth_mm, PITCH).max_px
+
+
+@every_cliff
+@pytest.mark.parametrize("std", [0.0, 0.02, 0.05])
+def test_a_cliff_costs_at_most_a_tenth_of_poissons_error(name, std):
+    scene = cliff(name)
+    gradient = noisy(scene, std)
+    assert largest_px(vts.integrate_cliffs(gradient, PITCH), scene) < 0.1 * largest_px(vts.poisson_rest(gradient, PITCH), scene)
+
+
+@every_smooth
+@pytest.mark.parametrize("std", [0.0, 0.02])
+def test_smooth_presses_lose_nothing(name, std):
+    scene = SMOOTH[name]()
+    gradient = noisy(scene, std)
+    smooth, robust = (solve(gradient, PITCH) for solve in (vts.poisson_rest, vts.integrate_cliffs))
+    errors = [metrics.depth_error(depth, scene.depth_mm, PITCH) for depth in (smooth, robust)]
+    assert errors[1].rms_px < 1.15 * errors[0].rms_px
+    assert errors[1].max_px < 1.25 * errors[0].max_px
+
+
+@pytest.mark.parametrize("noise_std", [0.002, 0.01])
+def test_a_wedge_from_an_image_of_eight_bits(noise_std, ring):
+    scene = scenes.surface(CLIFFS["wedge"], *SIZE, PITCH)
+    rest = scenes.render(scenes.at_rest(scene), ring(), noise_std=noise_std, bits=8, seed=1)[0]
+    calibration = vts.Calibration.from_lights(ring(), vts.Sensor("rig", *SIZE, PITCH), rest)
+    image = scenes.render(scene, ring(), noise_std=noise_std, bits=8)
+    error = {}
+    for integrate in (None, vts.CliffIntegration(PITCH), vts.AdaptiveIntegration(PITCH)):
+        pipe = vts.DepthPipeline.from_calibration(calibration, "precise", integrate=integrate)
+        error[type(integrate)] = largest_px(pipe(image).depth_mm, scene)
+    assert error[vts.CliffIntegration] < error[type(None)] / 3
+    assert error[vts.AdaptiveIntegration] < error[type(None)] / 3
+
+
+def test_it_equals_dense_weighted_least_squares_at_its_own_weights():
+    scene = scenes.surface(prism(lambda t: 2.0 - t.abs(), 5.0, 0.0), 15, 18, 0.5, torch.float64)
+    gradient = noisy(scene)
+    depth = vts.CliffIntegration(0.5, max_passes=100, tolerance_px=1e-7, residual=1e-9).solve(gradient).depth_mm
+    twin = references.cliffs(gradient[0].numpy(), scene.contact[0, 0].numpy(), 0.5, 0.05, 2.0, 0.1, depth[0, 0].numpy())
+    assert np.abs(depth[0, 0].numpy() - twin).max() < 1e-6
+
+
+@every_cliff
+def test_depth_is_zero_at_rest(name):
+    scene = cliff(name)
+    depth = vts.integrate_cliffs(noisy(scene), PITCH, scene.contact)
+    assert depth[~scene.contact].abs().max() == 0
+
+
+def test_no_contact_and_all_contact():
+    assert vts.integrate_cliffs(torch.zeros(2, 2, 9, 12)).abs().max() == 0
+    tilt = torch.full((1, 2, 9, 12), 0.1, dtype=torch.float64)
+    assert (vts.integrate_cliffs(tilt, 0.5) - vts.poisson_rest(tilt, 0.5)).abs().max() < 1e-3
+
+
+def test_items_of_a_batch_are_independent_and_report_their_own_status():
+    gradient = torch.cat((cliff("wedge").gradient, torch.zeros(1, 2, *SIZE, dtype=torch.float64), SMOOTH["sphere"]().gradient))
+    solver = vts.CliffIntegration(PITCH)
+    whole = solver.solve(gradient)
+    single = [solver.solve(gradient[i : i + 1]) for i in range(3)]
+    assert torch.equal(whole.depth_mm, torch.cat([one.depth_mm for one in single]))
+    assert whole.iterations.tolist() == [int(one.iterations) for one in single]
+    assert whole.converged.all() and whole.passes.tolist()[1] == 0 and whole.passes.min() < whole.passes.max()
+    hurried = vts.CliffIntegration(PITCH, max_passes=1).solve(gradient[:1])
+    assert hurried.passes.tolist() == [1] and hurried.converged.tolist() == [False]
+
+
+@pytest.mark.parametrize("name", ["wedge", "cylinder"])
+def test_single_precision_follows_double_precision(name):
+    gradient = noisy(cliff(name))
+    exact = vts.integrate_cliffs(gradient, PITCH)
+    single = vts.integrate_cliffs(gradient.float(), PITCH)
+    assert single.dtype == torch.float32 and (single.double() - exact).abs().max() < 0.1 * PITCH
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_flipped_image_gives_flipped_depth(axis):
+    gradient = noisy(cliff("wedge"))
+    flipped = gradient.flip(3 - axis)
+    flipped[:, axis] *= -1
+    difference = vts.integrate_cliffs(flipped, PITCH) - vts.integrate_cliffs(gradient, PITCH).flip(3 - axis)
+    assert difference.abs().max() < 0.05 * PITCH
+
+
+MODULES = [vts.CliffIntegration(PITCH), vts.AdaptiveIntegration(PITCH), vts.PerspectiveIntegration(PITCH, 40.0)]
+
+
+@pytest.mark.parametrize("module", MODULES, ids=lambda module: type(module).__name__)
+def test_a_window_changes_nothing(module):
+    gradient = cliff("wedge").gradient
+    rows, columns = slice(24, 104), slice(40, 128)
+    part = module(gradient[:, :, rows, columns], (24, 40), SIZE)
+    assert not bool(gradient[..., :24, :].any()) and not bool(gradient[..., 128:].any())
+    assert (part - module(gradient)).abs().max() < 1e-9
+
+
+def test_pixels_without_weight_are_bridged():
+    scene = SMOOTH["sphere"]()
+    gradient, weight = scene.gradient.clone(), torch.ones_like(scene.depth_mm)
+    gradient[:, :, 50:58, 70:90] = 5.0
+    weight[:, :, 50:58, 70:90] = 0.0
+    bridged, misled = vts.integrate_cliffs(gradient, PITCH, weight=weight), vts.integrate_cliffs(gradient, PITCH)
+    sound = weight.bool()
+    assert metrics.depth_error(bridged, scene.depth_mm, PITCH, sound).max_px < 0.1
+    assert metrics.depth_error(bridged, scene.depth_mm, PITCH, ~sound).max_px < 0.7
+    assert metrics.depth_error(misled, scene.depth_mm, PITCH, ~sound).max_px > 2.0
+
+
+def test_a_gradient_flows_back_with_the_weights_held():
+    gradient = noisy(cliff("wedge")).requires_grad_()
+    depth = vts.CliffIntegration(PITCH, max_passes=1).solve(gradient).depth_mm
+    (slope,) = torch.autograd.grad((depth * torch.sin(torch.arange(160.0, dtype=torch.float64))).sum(), gradient)
+    assert bool(torch.isfinite(slope).all()) and slope.abs().max() > 0
+    # with weights held, depth is linear in the gradient: its product with the derivative is the depth itself
+    depth = vts.CliffIntegration(PITCH, residual=1e-9).solve(gradient).depth_mm
+    (along,) = torch.autograd.grad(depth.sum(), gradient)
+    assert float((along * gradient.detach()).sum()) == pytest.approx(float(depth.detach().sum()), rel=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(1, 2, 1, 5), (1, 2, 5, 1)])
+def test_too_small_an_image_is_refused(shape):
+    with pytest.raises(ValueError, match="gradient: expected H and W of at least 2"):
+        vts.integrate_cliffs(torch.zeros(shape))
+
+
+def test_masks_and_weights_of_another_size_are_refused():
+    gradient = torch.zeros(1, 2, 8, 9)
+    for name in ("contact", "weight"):
+        with pytest.raises(ValueError, match=rf"{name}: expected 8 x 9 like gradient, got 8 x 8"):
+            vts.integrate_cliffs(gradient, **{name: torch.ones(1, 1, 8, 8)})
+
+
+@every_smooth
+@pytest.mark.parametrize("std", [0.0, 0.02, 0.04])
+def test_the_sign_of_cliffs_is_silent_on_smooth_presses(name, std):
+    gradient = noisy(SMOOTH[name](), std)
+    assert float(cliff_share(gradient, vts.poisson_rest(gradient, PITCH), PITCH)) < 0.0005
+
+
+@every_cliff
+@pytest.mark.parametrize("std", [0.0, 0.02, 0.04])
+def test_the_sign_of_cliffs_fires_on_cliffs(name, std):
+    gradient = noisy(cliff(name), std)
+    assert float(cliff_share(gradient, vts.poisson_rest(gradient, PITCH), PITCH)) > 0.003
+
+
+def test_adaptive_integration_is_poisson_on_smooth_frames_and_robust_on_others():
+    smooth, steep = SMOOTH["sphere"]().gradient, cliff("wedge").gradient
+    depth = vts.AdaptiveIntegration(PITCH)(torch.cat((smooth, steep)))
+    assert (depth[:1] - vts.poisson_rest(smooth, PITCH)).abs().max() < 1e-12
+    assert torch.equal(depth[1:], vts.integrate_cliffs(steep, PITCH))
+
+
+@pytest.mark.parametrize("center_mm", [(19.0, 0.0), (-17.0, 4.0), (0.0, 14.0), (3.0, -12.0), (18.0, -13.0)])
+def test_contact_at_the_image_border_wants_a_free_border(center_mm, ring):
+    """From the image: the free border has at most half of the zero border's largest error (0.4 against 4 to 15 px)."""
+    scene = scenes.sphere_press(10.0, 1.0, center_mm, *SIZE, PITCH)
+    rest = scenes.render(scenes.at_rest(scene), ring(), noise_std=0.005, bits=8, seed=1)[0]
+    calibration = vts.Calibration.from_lights(ring(), vts.Sensor("rig", *SIZE, PITCH), rest)
+    image = scenes.render(scene, ring(), noise_std=0.005, bits=8)
+    free, zero = (
+        largest_px(vts.DepthPipeline.from_calibration(calibration, "precise", integrate=integrate(PITCH))(image).depth_mm, scene)
+        for integrate in (vts.PoissonRest, vts.PoissonDST)
+    )
+    assert free < 0.5 * zero and free < 0.5
+
+
+def smooth_hill(x, y):
+    """Not zero anywhere, tilted, no symmetry."""
+    return 2.0 + 0.8 * torch.exp(-((x - 3) ** 2 + (y + 2) ** 2) / 30) + 0.03 * x - 0.02 * y + 0.2 * torch.sin(0.4 * x + 0.2 * y)
+
+
+def test_perspective_integration_has_order_two():
+    errors = []
+    for n in (32, 64, 128):
+        scene = scenes.surface(smooth_hill, n, n, 24.0 / n, torch.float64, camera_height_mm=30.0)
+        error = vts.integrate_perspective(scene.gradient, 24.0 / n, 30.0)
+        # the level of depth is not in the gradient: compare in log distance, where it is an added constant
+        error = torch.log(30.0 - error) - torch.log(30.0 - scene.depth_mm)
+        errors.append(float((error - error.mean()).square().mean().sqrt()))
+    for coarse, fine in pairwise(errors):
+        assert math.log2(coarse / fine) == pytest.approx(2.0, abs=0.15)
+
+
+@pytest.mark.parametrize("center_mm", [(0.0, 0.0), (8.0, -5.0)])
+@pytest.mark.parametrize("camera_height_mm", [26.0, 40.0])
+def test_a_pinhole_is_as_good_as_an_orthographic_camera(camera_height_mm, center_mm, ring):
+    """From the image: 0.2 px where the orthographic chain errs by 1.3 to 5 px."""
+    scene = scenes.sphere_press(10.0, 2.0, center_mm, 240, 320, 0.125, camera_height_mm=camera_height_mm)
+    calibration = vts.Calibration.from_lights(ring(), vts.Sensor("rig", 240, 320, 0.125))
+    image = scenes.render(scene, ring())
+    normals = NormalFromIntensity.from_calibration(calibration, camera_height_mm)
+    integrate = vts.PerspectiveIntegration(0.125, camera_height_mm)
+    right = vts.DepthPipeline.from_calibration(calibration, "precise", normals=normals, integrate=integrate)(image)
+    wrong = vts.DepthPipeline.from_calibration(calibration, "precise")(image)
+    error = [metrics.depth_error(out.depth_mm, scene.depth_mm, 0.125).max_px for out in (right, wrong)]
+    assert error[0] < 0.3 and error[0] < error[1] / 3
+
+
+def test_a_far_pinhole_is_orthographic():
+    near, far = (scenes.sphere_press(10.0, 1.0, (3.0, 2.0), *SIZE, PITCH, torch.float64, height) for height in (math.inf, 1e7))
+    assert (near.depth_mm - far.depth_mm).abs().max() < 1e-5
+    inside = near.contact & far.contact
+    depth = [vts.poisson_rest(near.gradient, PITCH), vts.integrate_perspective(far.gradient, PITCH, 1e7)]
+    assert (depth[0] - depth[1])[inside].abs().max() < 1e-4
+
+
+def test_what_a_pinhole_sees_lies_on_its_rays():
+    scene = scenes.sphere_press(10.0, 2.0, (4.0, -3.0), *SIZE, PITCH, torch.float64, 30.0)
+    for row, column in ((40, 90), (60, 80), (45, 110)):
+        u, v = references.pixel_mm(row, column, *SIZE, PITCH)
+        z = float(scene.depth_mm[0, 0, row, column])
+        x, y = u * (30 - z) / 30, v * (30 - z) / 30
+        assert (x - 4) ** 2 + (y + 3) ** 2 + (z + 8) ** 2 == pytest.approx(100, abs=1e-9)
+
+
+def test_the_inverse_light_matrix_of_a_pinhole_inverts_its_light_matrix(ring):
+    depth = torch.rand(2, 1, 7, 9, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    lights = ring(dtype=torch.float64)
+    arguments = (depth, lights.position_mm, lights.albedo, 2.0, 30.0, (1.5, -4.0))
+    product = torch.einsum("bijhw,bjkhw->bhwik", inverse_light_matrix(*arguments), light_matrix(*arguments))
+    assert (product - torch.eye(3, dtype=torch.float64)).abs().max() < 1e-11
+
+
+def test_a_surface_that_hides_parts_of_itself_from_a_pinhole_is_refused():
+    with pytest.raises(ValueError, match="camera_height_mm: the points seen from 15 mm were not found"):
+        scenes.surface(lambda x, y: 4.0 * torch.exp(-((x - 10.0) ** 2 + y**2)), *SIZE, PITCH, camera_height_mm=15.0)
+
+
+def test_perspective_derivatives():
+    gradient = 0.3 * torch.randn(1, 2, 5, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda g: vts.integrate_perspective(g, 0.5, 20.0), gradient.requires_grad_())

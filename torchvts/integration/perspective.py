@@ -1,0 +1,76 @@
+r"""Depth as a pinhole camera sees it: the logarithm of distance has an exact gradient, so any integrator serves.
+
+A pinhole at height h above the image centre, whose pixels see (u, v) of the skin at rest, sees the surface z(X, Y) at
+X = u (h - z) / h, Y = v (h - z) / h. With p = dz/dX, q = dz/dY, differentiating z(X(u, v), Y(u, v)) gives
+
+    dz/du (h + p u + q v) = p (h - z),   so   w = -h ln((h - z) / h)   has   dw/du = h p / (h + p u + q v),
+
+dw/dv likewise with q. w is depth to first order, zero where z is, and z = h (1 - exp(-w / h)).
+"""
+
+import torch
+from torch import Tensor, nn
+
+from ..core.checks import check_batch, check_positive
+from ..core.geometry import pixel_grid_mm
+from .poisson import PoissonRest
+
+LEAST_COSINE = 0.05
+"""Of h + p u + q v, relative to h: a surface steeper than that turns away from the camera."""
+
+
+def integrate_perspective(gradient: Tensor, mm_per_pixel: float, camera_height_mm: float) -> Tensor:
+    """Integrate the gradient of a surface seen by a pinhole camera.
+
+    Args:
+        gradient: (B, 2, H, W), (dz/dx, dz/dy) of the surface at the point that each pixel sees, mm per mm.
+        mm_per_pixel: pixel pitch in mm, on the skin at rest.
+        camera_height_mm: of the camera above the skin at rest, over the image centre.
+    Returns:
+        Depth in mm of the point that each pixel sees, (B, 1, H, W), levelled as by :func:`poisson_rest`.
+    Raises:
+        ValueError: wrong shape, or H or W below 2; pitch or height not above 0. TypeError: not floating point.
+    Source:
+        Tankus, Sochen, Yeshurun, Shape-from-shading under perspective projection, IJCV 63(1), 2005: the logarithm of depth;
+        Queau, Durou, Aujol, Normal integration: a survey, JMIV 60, 2018.
+    Example:
+        >>> integrate_perspective(torch.zeros(1, 2, 8, 8), 0.1, 30.0).shape
+        torch.Size([1, 1, 8, 8])
+    """
+    depth: Tensor = PerspectiveIntegration(mm_per_pixel, camera_height_mm)(gradient)
+    return depth
+
+
+class PerspectiveIntegration(nn.Module):
+    """Module face of :func:`integrate_perspective`; takes PoissonRest's place in a pipeline, windows too.
+
+    Its normals should know of the camera as well: ``NormalFromIntensity.from_calibration(calibration, camera_height_mm)``.
+
+    Args:
+        mm_per_pixel, camera_height_mm: as the function's.
+        integrate: any integrator that takes windows; None for PoissonRest.
+    """
+
+    takes_window: bool = True
+
+    def __init__(self, mm_per_pixel: float, camera_height_mm: float, integrate: nn.Module | None = None) -> None:
+        super().__init__()
+        self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
+        self.camera_height_mm = check_positive("camera_height_mm", camera_height_mm)
+        self.least_facing_mm = LEAST_COSINE * self.camera_height_mm
+        self.integrate = PoissonRest(mm_per_pixel) if integrate is None else integrate
+
+    def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
+        check_batch("gradient", gradient, 2)
+        rows, columns = gradient.shape[2], gradient.shape[3]
+        height, width = (rows, columns) if size is None else size
+        top, left = (0, 0) if window is None else window
+        u, v = pixel_grid_mm(height, width, self.mm_per_pixel, gradient.dtype, gradient.device)
+        u, v = u[:, left : left + columns], v[top : top + rows]
+        h = self.camera_height_mm
+        facing = (h + gradient[:, 0:1] * u + gradient[:, 1:2] * v).clamp_min(self.least_facing_mm)
+        w: Tensor = self.integrate(gradient * (h / facing), window, size)
+        return -h * torch.expm1(-w / h)
+
+    def extra_repr(self) -> str:
+        return f"mm_per_pixel={self.mm_per_pixel}, camera_height_mm={self.camera_height_mm}"

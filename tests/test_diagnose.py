@@ -162,6 +162,16 @@ def test_a_background_of_now_tells_the_same_as_the_image():
     assert found.findings[0].name == "channel_level" and found.names.count("channel_level") == 1
 
 
+def test_a_skin_touched_all_over_is_not_taken_for_other_light():
+    smooth = DIALS["covers the image"].make(2.2, 3)
+    assert "nothing_at_rest" in vts.diagnose(smooth.background, smooth.image, smooth.calibration).names
+    size = {"height": 120, "width": 160, "mm_per_pixel": 0.125}
+    waves = scenes.surface(lambda x, y: 1.0 + 0.15 * torch.sin(2.1 * x) * torch.sin(1.7 * y), **size)
+    image = scenes.render(waves, smooth.calibration.lights, noise_std=0.002, bits=8, seed=1)
+    found = vts.diagnose(smooth.background, image, smooth.calibration)
+    assert found.names[0] == "nothing_at_rest" and "channel_level" not in found.names, str(found)
+
+
 def test_another_size_is_a_finding_and_another_shape_an_error():
     case = undisturbed(1)
     found = vts.diagnose(None, case.image[..., :100], case.calibration)

@@ -30,7 +30,7 @@ from .relief import (
     regions,
     skirt_mm,
 )
-from .rest import CHANNELS, FULL, Change, cell_means, compare
+from .rest import CHANNELS, FULL, SAME, Change, cell_means, compare
 from .words import THAN_AT_CALIBRATION, in_words
 
 USUAL_DRIFT = 0.05
@@ -52,6 +52,9 @@ FLOODED = {"skin_changed", "new_spots", "few_bits", "compressed", "other_unit", 
 BLOCKY = 1.18
 """Steps at the borders of 8 x 8 blocks over those inside from which an image was compressed; noise alone stays below 1.1, a
 JPEG of quality 95 is at 1.2 to 1.3."""
+
+LEAST_REST = 0.15
+"""Part of the image that must follow a change of light for it to be believed."""
 
 COPLANAR = 0.3
 """Smallest singular value of the lights' directions below which they nearly lie in one plane."""
@@ -155,6 +158,9 @@ class _Examination:
         relief_like = self._is_relief(change)
         if relief_like:
             change = dataclasses.replace(change, effect=torch.zeros(3))
+        elif change.rest_share < LEAST_REST and self.levels >= 200:
+            found.append(self._nothing_at_rest(change.rest_share))
+            change = dataclasses.replace(change, hypothesis=SAME, numbers=torch.zeros(0), effect=torch.zeros(3))
         else:
             found += self._light(change, "image")
         light = self.image**self.exponent
@@ -175,6 +181,10 @@ class _Examination:
     def _dead(self, image: Tensor) -> Tensor:
         level, rest = image.flatten(1).quantile(0.99, dim=1), self.value.flatten(1).median(dim=1).values
         return (level < (4.0 * self.noise).clamp_min(0.02)) & (rest > 0.06)
+
+    def _nothing_at_rest(self, share: float) -> Finding:
+        message = "the whole skin is touched, or all light has changed: nothing to level on; leave some skin at rest in the image"
+        return Finding("nothing_at_rest", message, "warning", share)
 
     def _is_empty(self) -> bool:
         """Whether all channels are even, where the skin at rest is not: by cells, so that noise does not matter."""
@@ -265,9 +275,6 @@ class _Examination:
     def _light(self, change: Change, which: str) -> list[Finding]:
         """A change of the light in words. ``which``: "calibration" (its image against its lights), "background" or "image"."""
         if change.name == "same":
-            if which != "calibration" and change.rest_share < 0.05:
-                message = "the whole skin is touched, or all light has changed: nothing to level on; leave some skin at rest"
-                return [Finding("nothing_at_rest", message, "warning", change.rest_share)]
             return []
         most = float(change.effect.max())
         cost = self._cost_deg(change, which)
@@ -451,6 +458,8 @@ class _Examination:
                 "is not seen"
             )
             found.append(Finding("contact_covers_image", message, "note", share))
+        if share > 0.97 and outlined:
+            found.append(self._nothing_at_rest(1.0 - share))
         if found_regions.at_border and outlined:
             message = "the contact reaches the image border: what lies beyond is not seen, and depth there is less certain"
             found.append(Finding("contact_at_border", message, "note", share))
@@ -522,6 +531,8 @@ class _Examination:
         return [Finding("perspective", message, "warning" if off_px > 0.5 else "note", off_px)]
 
     def _misfit(self, relief: Relief, spots: Tensor) -> list[Finding]:
+        if self.levels < 200 or self.blocks > BLOCKY:  # these break the length everywhere
+            return []
         unsound = spots | (self.raw > 0.98).any(0)
         if self.calibration.markers is not None:
             unsound = unsound | (self.raw != self.image).any(0)
@@ -545,7 +556,7 @@ class _Examination:
                 "(inter-reflection) or from around: darker gel or coating"
             )
             return [Finding("inter_reflection", message, "warning", amount)]
-        if self.levels < 200 or self.blocks > BLOCKY or int(spots.sum()) >= 3:
+        if int(spots.sum()) >= 3:
             return []
         if best.startswith("move"):
             message = "the image is moved: rims are mixed along one direction; shorter exposure, or slower motion"

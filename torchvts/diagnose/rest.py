@@ -88,6 +88,9 @@ class Hypothesis:
     burden: float = 0.0
 
 
+SAME = Hypothesis("same", 0, lambda grid, _: grid.light)
+
+
 @dataclass(frozen=True)
 class Change:
     """The change that was found.
@@ -244,7 +247,7 @@ def _hypotheses(calibration: Calibration, level: Tensor) -> list[Hypothesis]:
     """
     logs: tuple[float, float, float] = (float(level[0]), float(level[1]), float(level[2]))
     all_alike = float(level.median())
-    found = [Hypothesis("same", 0, lambda grid, _: grid.light)]
+    found = [SAME]
     for order in itertools.permutations(range(3)):
         if order != (0, 1, 2):
             found.append(_swapped(order))

@@ -10,9 +10,11 @@ import torchvts as vts
 
 NAMES = [
     "AdaptiveIntegration", "Calibration", "CalibrationWarning", "CliffIntegration", "Compensate", "ContactMask", "DepthOutput",
-    "DepthPipeline", "FillMarkers", "GradientFromNormal", "LightFit", "NormalFromIntensity", "NormalFromLookup",
+    "DepthPipeline", "Diagnosis", "FillMarkers", "Finding",
+    "GradientFromNormal", "LightFit", "NormalFromIntensity", "NormalFromLookup",
     "NormalFromMLP", "NormalFromResponse", "PerspectiveIntegration", "PointLights", "PoissonDCT", "PoissonDST", "PoissonRest",
-    "Press", "Registration", "Sensor", "Touch", "calibrate", "contact_cloud", "depth_to_points", "divergence", "fill_markers",
+    "Press", "Registration", "Sensor", "Touch", "calibrate", "contact_cloud", "depth_to_points",
+    "diagnose", "divergence", "fill_markers",
     "find_markers", "fit_lights", "fit_mlp", "fit_prior", "gradient_from_normal", "gs_sdk", "integrate_cliffs",
     "integrate_perspective", "metrics", "near_field_shading", "normal_from_gradient", "objects", "poisson_dct", "poisson_dst",
     "poisson_rest", "read_image", "read_presses", "register_depth", "register_points", "scenes", "shipped_sensors", "stream",
@@ -35,6 +37,8 @@ ARGUMENTS = {
     vts.Calibration.load: ["path"],
     vts.Calibration.save: ["self", "path"],
     vts.DepthPipeline.from_calibration: ["calibration", "mode"],
+    vts.diagnose: ["background", "image", "calibration"],
+    vts.Finding: ["name", "message", "severity", "value"],
     vts.poisson_dst: ["gradient", "mm_per_pixel"],
     vts.poisson_dct: ["gradient", "mm_per_pixel"],
     vts.PoissonDST: ["mm_per_pixel"],

@@ -9,6 +9,7 @@ from .core import gs_sdk
 from .core.files import read_image, write_image
 from .core.geometry import GradientFromNormal, depth_to_points, gradient_from_normal, normal_from_gradient
 from .core.sensor import Sensor, shipped_sensors
+from .diagnose import Diagnosis, Finding, diagnose
 from .integration import (
     AdaptiveIntegration,
     CliffIntegration,
@@ -39,7 +40,9 @@ __all__ = [
     "ContactMask",
     "DepthOutput",
     "DepthPipeline",
+    "Diagnosis",
     "FillMarkers",
+    "Finding",
     "GradientFromNormal",
     "LightFit",
     "NormalFromIntensity",
@@ -58,6 +61,7 @@ __all__ = [
     "calibrate",
     "contact_cloud",
     "depth_to_points",
+    "diagnose",
     "divergence",
     "fill_markers",
     "find_markers",

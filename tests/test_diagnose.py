@@ -1,0 +1,296 @@
+"""Symptoms are named: seeded faults, clean frames, real units.
+
+All dials of the gallery at middle severity, 20 seeds each, as docs/diagnose.md has them: python tests/test_diagnose.py --seeds 20
+"""
+
+import argparse
+import dataclasses
+import json
+import subprocess
+import sys
+import warnings
+
+import pytest
+import torch
+
+import torchvts as vts
+from torchvts import scenes
+from torchvts.diagnose import Diagnosis, Finding
+from torchvts.diagnose.camera import blockiness, levels_of
+from torchvts.faults import jpeg
+from torchvts.gallery import DIALS, undisturbed
+
+NAMED = {
+    "deeper press": {"deep_press"},
+    "steep walls": {"steep_walls"},
+    "cut ends": {"steep_walls"},
+    "cut by the border": {"contact_at_border"},
+    "covers the image": {"contact_covers_image"},
+    "two contacts": {"several_contacts"},
+    "faint contact": {"faint_contact", "no_contact"},
+    "gel sag": {"skirt"},
+    "attached shadows": {"shadow"},
+    "cast shadows": {"cast_shadow"},
+    "specular": {"specular"},
+    "inter-reflection": {"inter_reflection"},
+    "ambient light": {"ambient_light"},
+    "a channel dims": {"channel_level"},
+    "dead lights": {"light_dead"},
+    "a light moves": {"light_moved"},
+    "lights close together": {"lights_coplanar"},
+    "albedo drift": {"skin_changed"},
+    "spots and dead pixels": {"new_spots"},
+    "markers": {"markers"},
+    "defocus": {"blurred"},
+    "motion blur": {"moved"},
+    "vignetting": {"vignetting"},
+    "lens distortion": {"lens_distortion"},
+    "perspective": {"perspective"},
+    "wrong pitch": {"wrong_pitch"},
+    "saturation": {"saturated"},
+    "black crush": {"black_level"},
+    "wrong gamma": {"gamma"},
+    "channel order": {"channels_mixed", "channels_swapped"},
+    "noise": {"noise"},
+    "few bits": {"few_bits"},
+    "JPEG": {"compressed"},
+}
+"""Fault -> findings that name it."""
+
+NEVER_HARMLESS = {"two contacts", "markers", "JPEG"}
+"""Dials whose first severity shows what they are about, or is no clean image: a JPEG halves the resolution of colours."""
+
+
+def middle(dial):
+    return dial.severities[len(dial.severities) // 2]
+
+
+def named(name, seed, severity=None):
+    case = DIALS[name].make(middle(DIALS[name]) if severity is None else severity, seed)
+    found = vts.diagnose(case.background, case.image, case.calibration)
+    return bool(NAMED[name] & set(found.names)), found
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_every_fault_of_the_gallery_is_named(name):
+    hit, found = named(name, seed=7)
+    assert hit, str(found)
+
+
+@pytest.mark.parametrize("name", [name for name in NAMED if name not in NEVER_HARMLESS])
+def test_findings_come_of_the_fault_and_not_of_the_rest(name):
+    """With the fault turned down to nothing nobody names it."""
+    hit, found = named(name, seed=7, severity=DIALS[name].severities[0])
+    assert not hit and found.ok, str(found)
+
+
+def test_perspective_is_not_seen_but_told_by_the_calibration():
+    case = DIALS["perspective"].make(20.0, 0)
+    silent = dataclasses.replace(case.calibration, report={})
+    assert vts.diagnose(case.background, case.image, silent).findings == ()
+    assert vts.diagnose(case.background, case.image, case.calibration).names == ("perspective",)
+
+
+CLEAN = {
+    "ball": lambda k: scenes.sphere_press(10.0, 1.0, **k),
+    "ball aside": lambda k: scenes.sphere_press(5.0, 0.5, (8.0, -6.0), **k),
+    "cylinder": lambda k: scenes.cylinder_press(**k),
+    "cone": lambda k: scenes.cone_press(**k),
+    "sine": lambda k: scenes.sine_press(**k),
+    "punch": lambda k: scenes.punch_press(**k),
+    "letters": lambda k: scenes.letters_press(**k),
+}
+
+
+@pytest.mark.parametrize("fitted", [False, True])
+def test_clean_frames_of_any_object_raise_no_alarm(ring, small_sensor, fitted):
+    size = {"height": 120, "width": 160, "mm_per_pixel": 0.25}
+    lights = ring(rotation_deg=40.0, level=0.4)
+    sensor = small_sensor if fitted else vts.Sensor("rig", 120, 160, 0.25, gamma=1.0)
+    rest = scenes.at_rest(CLEAN["ball"](size))
+    background = scenes.render(rest, lights, noise_std=0.003, bits=8, seed=1)[0]
+    unit = vts.calibrate(background, sensor) if fitted else vts.Calibration.from_lights(lights, sensor, background)
+    for k, (name, press) in enumerate(CLEAN.items()):
+        image = scenes.render(press(size), lights, noise_std=0.003, bits=8, seed=2 + k)
+        found = vts.diagnose(background if k % 2 else None, image, unit)
+        assert found.ok, f"{name}: {found}"
+    found = vts.diagnose(None, scenes.render(rest, lights, noise_std=0.003, bits=8, seed=20), unit)
+    assert found.names == ("no_contact",)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.12, 0.3])
+def test_a_dimmer_channel_is_measured(share):
+    case = undisturbed(3)
+    factor = torch.tensor([1.0, 1.0, 1.0 - share]).reshape(3, 1, 1)
+    first = vts.diagnose(None, torch.round(case.image * factor * 255) / 255, case.calibration).findings[0]
+    assert first.name == "channel_level" and first.severity != "note"
+    assert first.value == pytest.approx(-share, abs=0.005)
+    assert "blue channel" in first.message and "degrees" in first.message
+
+
+def test_the_cost_in_degrees_is_what_the_pipeline_suffers():
+    case = undisturbed(3)
+    dim = case.image * torch.tensor([1.0, 1.0, 0.88]).reshape(3, 1, 1)
+    message = vts.diagnose(None, dim, case.calibration).findings[0].message
+    claimed = float(message.split("accept ")[1].split(" degrees")[0])
+    normals, compensate = (
+        vts.NormalFromIntensity.from_calibration(case.calibration),
+        vts.Compensate.from_calibration(case.calibration),
+    )
+    cosine = (normals(compensate(case.image)) * normals(compensate(dim))).sum(1).clamp(-1, 1)
+    angle = torch.rad2deg(torch.arccos(cosine))
+    assert float(angle.mean()) - 0.1 < claimed < float(angle.max())
+
+
+@pytest.mark.parametrize("order", [(2, 1, 0), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1)])
+def test_every_wrong_order_of_channels_is_seen(order):
+    case = undisturbed(1)
+    assert vts.diagnose(None, case.image[:, list(order)], case.calibration).findings[0].name == "channels_swapped"
+
+
+def test_contact_in_the_background_and_at_calibration():
+    case, other = undisturbed(1), DIALS["cut by the border"].make(8.0, 2)
+    assert "contact_in_background" in vts.diagnose(other.image[0], case.image, case.calibration).names
+    unit = vts.Calibration.from_lights(case.calibration.lights, case.calibration.sensor, other.image[0])
+    assert "contact_in_calibration" in vts.diagnose(None, case.image, unit).names
+
+
+def test_a_background_of_now_tells_the_same_as_the_image():
+    case = undisturbed(1)
+    factor = torch.tensor([0.9, 1.0, 1.0]).reshape(3, 1, 1)
+    found = vts.diagnose(case.background * factor, case.image * factor, case.calibration)
+    assert found.findings[0].name == "channel_level" and found.names.count("channel_level") == 1
+
+
+def test_a_skin_touched_all_over_is_not_taken_for_other_light():
+    smooth = DIALS["covers the image"].make(2.2, 3)
+    assert "nothing_at_rest" in vts.diagnose(smooth.background, smooth.image, smooth.calibration).names
+    size = {"height": 120, "width": 160, "mm_per_pixel": 0.125}
+    waves = scenes.surface(lambda x, y: 1.0 + 0.15 * torch.sin(2.1 * x) * torch.sin(1.7 * y), **size)
+    image = scenes.render(waves, smooth.calibration.lights, noise_std=0.002, bits=8, seed=1)
+    found = vts.diagnose(smooth.background, image, smooth.calibration)
+    assert found.names[0] == "nothing_at_rest" and "channel_level" not in found.names, str(found)
+
+
+def test_another_size_is_a_finding_and_another_shape_an_error():
+    case = undisturbed(1)
+    found = vts.diagnose(None, case.image[..., :100], case.calibration)
+    assert found.names == ("wrong_size",) and not found.ok
+    with pytest.raises(ValueError, match="image: expected"):
+        vts.diagnose(None, case.image[:, :2], case.calibration)
+    with pytest.raises(ValueError, match="divide by 255"):
+        vts.diagnose(None, case.image * 255, case.calibration)
+    with pytest.raises(TypeError, match="background: expected a torch"):
+        vts.diagnose([1], case.image, case.calibration)
+    with pytest.raises(TypeError, match="divide by 255"):
+        vts.diagnose(None, (case.image * 255).to(torch.uint8), case.calibration)
+    with pytest.raises(TypeError, match="calibration: expected"):
+        vts.diagnose(None, case.image, "unit.safetensors")
+
+
+@pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
+def test_an_empty_image_is_a_fault_and_no_crash(value):
+    case = undisturbed(1)
+    found = vts.diagnose(None, torch.full_like(case.image, value), case.calibration)
+    assert found.findings[0].severity == "fault", str(found)
+
+
+def test_without_a_background_only_what_can_be_seen_is_judged(ring, small_sensor, small_press):
+    unit = vts.Calibration.from_lights(ring(), small_sensor)
+    assert vts.diagnose(None, scenes.render(small_press(), ring(), noise_std=0.002, bits=8), unit).ok
+
+
+def test_levels_and_blocks():
+    smooth = torch.linspace(0.2, 0.8, 128).expand(3, 96, 128) + 0.002 * torch.randn(
+        3, 96, 128, generator=torch.Generator().manual_seed(0)
+    )
+    for bits in (3, 5, 8):
+        assert levels_of(torch.round(smooth * (2**bits - 1)) / (2**bits - 1)) == 2**bits - 1
+    assert levels_of(smooth) == float("inf")
+    assert blockiness(smooth) < 1.1 < 1.3 < blockiness(jpeg(smooth[None], 60)[0])
+
+
+def test_the_worst_comes_first_and_each_name_once():
+    note, warning, fault = (Finding(name, name, severity, 0.0) for name, severity in zip("abc", ("note", "warning", "fault")))
+    again = Finding("c", "milder", "note", 0.0)
+    found = Diagnosis.of([note, again, warning, fault])
+    assert found.findings == (fault, warning, note) and found.names == ("c", "b", "a") and not found.ok
+    assert str(found).splitlines()[0] == "fault: c [c]" and Diagnosis.of([note]).ok
+    with pytest.raises(ValueError, match="severity"):
+        Finding("x", "x", "grave", 0.0)
+
+
+def test_the_script_prints_words_and_json(tmp_path):
+    case = undisturbed(2)
+    case.calibration.save(tmp_path / "unit.safetensors")
+    vts.write_image(tmp_path / "swapped.png", case.image[0, [2, 1, 0]])
+    vts.write_image(tmp_path / "now.png", case.background)
+    command = [sys.executable, "scripts/diagnose.py", str(tmp_path / "unit.safetensors"), str(tmp_path / "swapped.png")]
+    told = subprocess.run(command, capture_output=True, text=True)
+    assert told.returncode == 1 and "channels look swapped (red and blue)" in told.stdout, told.stderr
+    told = subprocess.run([*command, "--background", str(tmp_path / "now.png"), "--json"], capture_output=True, text=True)
+    assert json.loads(told.stdout)["findings"][0]["name"] == "channels_swapped"
+    told = subprocess.run([*command[:3], str(tmp_path / "none.png")], capture_output=True, text=True)
+    assert told.returncode == 1 and told.stderr.startswith("error: ")
+
+
+@pytest.fixture(scope="module")
+def minis(data):
+    units = [vts.read_image(data / f"gelsight_mini_{name}" / "background.png") for name in "ab"]
+    _, presses = vts.read_presses(data / "gelsight_mini_a")
+    sensor = vts.Sensor.load("gelsight_mini")
+    return units, presses, [vts.calibrate(background, sensor) for background in units], sensor
+
+
+def test_real_presses_raise_no_alarm(minis, data):
+    (background, other), presses, (unit, other_unit), sensor = minis
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", vts.CalibrationWarning)
+        by_presses = vts.calibrate(background, sensor, presses[::8])
+    for calibration, seen in ((unit, presses[1::12]), (by_presses, presses[5:6])):
+        for press in seen:
+            found = vts.diagnose(background, press.image, calibration)
+            assert found.ok, f"{press.name}: {found}"
+    assert vts.diagnose(other, vts.read_image(data / "gelsight_mini_b" / "bead.png"), other_unit).ok
+
+
+def test_real_faults_are_named(minis, data):
+    _, presses, (unit, other_unit), sensor = minis
+    image = presses[7].image
+    assert vts.diagnose(None, vts.read_image(data / "gelsight_mini_b" / "bead.png"), unit).names[0] == "other_unit"
+    assert not vts.diagnose(None, image, other_unit).ok
+    assert vts.diagnose(None, image[[2, 1, 0]], unit).names[0] == "channels_swapped"
+    found = vts.diagnose(None, image * torch.tensor([1.0, 1.0, 0.88]).reshape(3, 1, 1), unit)
+    assert found.names[0] == "channel_level" and found.findings[0].value == pytest.approx(-0.12, abs=0.02)
+    assert "contact_in_background" in vts.diagnose(image, presses[20].image, unit).names
+    with pytest.warns(vts.CalibrationWarning, match="contact in the calibration image"):
+        spoiled = vts.calibrate(presses[20].image, sensor)
+    assert "contact_in_calibration" in vts.diagnose(None, image, spoiled).names
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--dials", nargs="+", default=list(DIALS))
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    hits = total = 0
+    for name in arguments.dials:
+        beside: dict[str, int] = {}
+        right = 0
+        for seed in range(arguments.seeds):
+            hit, found = named(name, seed)
+            right += hit
+            for finding in found:
+                if finding.name not in NAMED[name] and finding.severity != "note":
+                    beside[finding.name] = beside.get(finding.name, 0) + 1
+        print(f"| {name} | {middle(DIALS[name]):g} {DIALS[name].unit} | {right}/{arguments.seeds} | {beside or ''} |", flush=True)
+        hits, total = hits + right, total + arguments.seeds
+    clean = [vts.diagnose(c.background, c.image, c.calibration) for c in map(undisturbed, range(100, 100 + arguments.seeds))]
+    print(
+        f"named {hits} of {total} ({hits / total:.1%}); false alarms on clean frames {sum(not d.ok for d in clean)} of {len(clean)}"
+    )
+
+
+if __name__ == "__main__":
+    main()

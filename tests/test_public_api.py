@@ -9,9 +9,9 @@ import pytest
 import torchvts as vts
 
 NAMES = [
-    "Calibration", "CalibrationWarning", "Compensate", "ContactMask", "DepthOutput", "DepthPipeline", "FillMarkers",
+    "Calibration", "CalibrationWarning", "Compensate", "Confidence", "ConfidentOutput", "ConfidentPipeline", "ContactMask", "DepthOutput", "DepthPipeline", "FillMarkers",
     "GradientFromNormal", "LightFit", "NormalFromIntensity", "NormalFromLookup", "NormalFromMLP", "NormalFromResponse",
-    "PointLights", "PoissonDCT", "PoissonDST", "PoissonRest", "Press", "Registration", "Sensor", "Touch", "calibrate",
+    "PointLights", "PoissonDCT", "PoissonDST", "PoissonRest", "Press", "Registration", "Sensor", "Touch", "bound_at", "calibrate",
     "contact_cloud", "depth_to_points",
     "divergence",
     "fill_markers", "find_markers", "fit_lights", "fit_mlp", "fit_prior", "gradient_from_normal", "gs_sdk", "metrics",
@@ -35,6 +35,8 @@ ARGUMENTS = {
     vts.Calibration.load: ["path"],
     vts.Calibration.save: ["self", "path"],
     vts.DepthPipeline.from_calibration: ["calibration", "mode"],
+    vts.Confidence.from_calibration: ["calibration", "normals"],
+    vts.bound_at: ["bound_95", "level", "spread"],
     vts.poisson_dst: ["gradient", "mm_per_pixel"],
     vts.poisson_dct: ["gradient", "mm_per_pixel"],
     vts.PoissonDST: ["mm_per_pixel"],
@@ -62,6 +64,8 @@ def test_arguments_keep_their_names_and_order(call):
 
 def test_results_have_their_fields_in_order():
     assert vts.DepthOutput._fields == ("depth_mm", "gradient", "normal", "contact")
+    assert vts.ConfidentOutput._fields[:4] == vts.DepthOutput._fields
+    assert vts.ConfidentOutput._fields[4:] == vts.confidence.Bounds._fields
     assert {"lights", "converged", "loss_history", "direction_std_deg", "message"} <= set(vts.LightFit.__dataclass_fields__)
 
 

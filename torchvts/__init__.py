@@ -3,6 +3,7 @@
 from . import metrics, objects, scenes, stream
 from .calibration import CalibrationWarning, LightFit, Press, Touch, calibrate, fit_lights, fit_prior, read_presses
 from .compensate import Compensate
+from .confidence import Confidence, bound_at
 from .contact import ContactMask
 from .core import __version__ as __version__
 from .core import gs_sdk
@@ -12,7 +13,7 @@ from .core.sensor import Sensor, shipped_sensors
 from .integration import PoissonDCT, PoissonDST, PoissonRest, divergence, poisson_dct, poisson_dst, poisson_rest
 from .markers import FillMarkers, fill_markers, find_markers
 from .normals import NormalFromIntensity, NormalFromLookup, NormalFromMLP, NormalFromResponse, fit_mlp
-from .pipeline import DepthOutput, DepthPipeline
+from .pipeline import ConfidentOutput, ConfidentPipeline, DepthOutput, DepthPipeline
 from .pose import Registration, contact_cloud, register_depth, register_points
 from .record import Calibration
 from .shading import PointLights, near_field_shading
@@ -21,6 +22,9 @@ __all__ = [
     "Calibration",
     "CalibrationWarning",
     "Compensate",
+    "Confidence",
+    "ConfidentOutput",
+    "ConfidentPipeline",
     "ContactMask",
     "DepthOutput",
     "DepthPipeline",
@@ -39,6 +43,7 @@ __all__ = [
     "Registration",
     "Sensor",
     "Touch",
+    "bound_at",
     "calibrate",
     "contact_cloud",
     "depth_to_points",

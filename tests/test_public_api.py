@@ -9,7 +9,8 @@ import pytest
 import torchvts as vts
 
 NAMES = [
-    "Calibration", "CalibrationWarning", "Compensate", "Confidence", "ConfidentOutput", "ConfidentPipeline", "ContactMask", "DepthOutput", "DepthPipeline", "FillMarkers",
+    "Calibration", "CalibrationWarning", "Compensate", "Confidence", "ConfidentOutput", "ConfidentPipeline",
+    "ContactMask", "DepthOutput", "DepthPipeline", "FillMarkers",
     "GradientFromNormal", "LightFit", "NormalFromIntensity", "NormalFromLookup", "NormalFromMLP", "NormalFromResponse",
     "PointLights", "PoissonDCT", "PoissonDST", "PoissonRest", "Press", "Registration", "Sensor", "Touch", "bound_at", "calibrate",
     "contact_cloud", "depth_to_points",

@@ -28,7 +28,7 @@ USEFUL_DEG = 10.0
 """``confidence`` is the probability that a normal is within this of the truth."""
 
 DEPTH_SPREAD = 1.46
-"""Spread of depth errors for :func:`bound_at`: that of a Gaussian in one dimension. Normals of point lights have 1, two dimensions."""
+"""Spread of depth errors for :func:`bound_at`: a Gaussian's in one dimension. Normals of point lights have 1, in two."""
 
 RESPONSE_SPREAD = 1.2
 """The same for normals of a response field, whose errors have longer tails."""
@@ -51,7 +51,7 @@ BORDER_SHARE = 3.0
 CURL_SHARE = 0.4
 """Variance of a slope, over the square of its part that no surface has: half for white noise, less for what is smooth."""
 
-BLUR_SHARE = 1.5
+BLUR_SHARE = 3.0
 """Variance of a slope, over the square of what another blur of the same width takes from it."""
 
 CLIPPED_DEG = 3.0
@@ -104,7 +104,8 @@ def bound_at(bound_95: Tensor, level: float, spread: float = 1.0) -> Tensor:
     """
     if not 0.0 < level < 1.0:
         raise ValueError(f"level: expected a probability between 0 and 1, got {level}: 0.95, not 95")
-    return bound_95 * (math.log(1.0 - level) / math.log(0.05)) ** (0.5 * spread)
+    factor: float = (math.log(1.0 - level) / math.log(0.05)) ** (0.5 * spread)
+    return bound_95 * factor
 
 
 class Confidence(nn.Module):
@@ -172,6 +173,11 @@ class Confidence(nn.Module):
         self.reach = math.ceil(blur_px)
         self.correlation = max(1.0, 2.0 * math.sqrt(math.pi) * blur_px)  # blurred noise is as much larger in the sums
         self.spread = spread
+        # TorchScript sees no numbers of the module
+        self.clipped_variance = math.radians(CLIPPED_DEG) ** 2
+        self.detected, self.useful_deg = DETECTED_SIGMAS, USEFUL_DEG
+        self.curl_share, self.blur_share = CURL_SHARE, BLUR_SHARE
+        self.system_variance, self.kink_variance_mm = SYSTEM_SHARE**2, (KINK_PX * mm_per_pixel) ** 2
         height, width = noise_std.shape[1], noise_std.shape[2]
         self.band = max(3, round(BAND * min(height, width)))
         x, y = torch.linspace(-1.0, 1.0, width) * width, torch.linspace(-1.0, 1.0, height) * height
@@ -233,20 +239,20 @@ class Confidence(nn.Module):
         clipped = torch.zeros_like(noise)
         if self.by_lights:
             dark = (compensated < self.normals.dark_where) | (compensated >= self.normals.full_above)
-            clipped = math.radians(CLIPPED_DEG) ** 2 * dark.any(dim=1, keepdim=True).to(noise.dtype)
+            clipped = self.clipped_variance * dark.any(dim=1, keepdim=True).to(noise.dtype)
             # three channels give two slopes and a check: a third of the noise is left over, the rest is not noise
-            left = (compensated - self.normals.lights(depth_mm, again, self.mm_per_pixel)).square().sum(1, keepdim=True)
-            left = 3.0 * _smooth(left) / sigma.square().sum(1, keepdim=True)
+            left = (compensated - self.normals.lights(depth_mm, again, self.mm_per_pixel)).masked_fill(dark, 0.0)
+            left = 3.0 * _smooth(left.square().sum(1, keepdim=True)) / sigma.square().sum(1, keepdim=True)
             noise = noise * (left / 1.7).clamp_min(1.0)
         surface = self._no_surface(depth_mm, gradient, steep, noise)
-        variance = noise + model + surface + clipped
+        variance = noise + model + clipped if self.by_lights else noise + model + surface
         bound = _length_95(apart, torch.sqrt(variance + 1e-12), 1.0 if self.by_lights else 1.06)
-        bound = torch.where(contact, bound, DETECTED_SIGMAS * torch.sqrt(noise + 1e-12))
+        bound = torch.where(contact, bound, self.detected * torch.sqrt(noise + 1e-12))
         normal_95 = torch.rad2deg(bound).clamp_max(180.0)
         touched = contact.to(noise.dtype)
         depth_95 = self._depth_95(depth_mm, gradient, again, touched, steep, noise + surface, model + clipped)
         # the inverse of bound_at
-        likely = 1.0 - torch.exp(math.log(0.05) * (USEFUL_DEG / normal_95) ** (2.0 / self.spread))
+        likely = 1.0 - torch.exp(math.log(0.05) * (self.useful_deg / normal_95) ** (2.0 / self.spread))
         count = touched.sum(dim=(1, 2, 3))
         frame = torch.where(count > 0, (likely * touched).sum(dim=(1, 2, 3)) / count.clamp_min(1.0), torch.ones_like(count))
         parts = torch.cat((noise.sqrt(), model.sqrt(), apart, surface.sqrt(), clipped.sqrt()), dim=1)
@@ -273,17 +279,16 @@ class Confidence(nn.Module):
     def _no_surface(self, depth_mm: Tensor, gradient: Tensor, steep: Tensor, noise: Tensor) -> Tensor:
         """Variance of what is no gradient of any depth, beyond noise, and of what blur took."""
         odd = _smooth((_slope(depth_mm, self.mm_per_pixel) - gradient).square().sum(1, keepdim=True)) * steep.square()
-        odd = CURL_SHARE * (odd - 3.0 * noise).clamp_min(0.0)
+        odd = self.curl_share * (odd - 3.0 * noise).clamp_min(0.0)
         if self.blur_px > 0.0:
             taken = (blur(gradient, self.weights) - gradient).square().sum(1, keepdim=True)
             taken = nn.functional.max_pool2d(taken, 2 * self.reach + 1, 1, self.reach)
-            odd = odd + BLUR_SHARE * taken * steep.square()
+            odd = odd + self.blur_share * taken * steep.square()
         return odd
 
     def _depth_95(
         self, depth_mm: Tensor, gradient: Tensor, again: Tensor, touched: Tensor, steep: Tensor, white: Tensor, model: Tensor
     ) -> Tensor:
-        frames = depth_mm.shape[0]
         # the next pass inside, and around it what the mask has left out, smoothed
         beyond = 1.0 - touched
         better = gradient_from_normal(again)
@@ -293,13 +298,14 @@ class Confidence(nn.Module):
         length = torch.sqrt(gradient.square().sum(1, keepdim=True) + std.square() + 1e-12)
         none = torch.zeros_like(std)
         tilts = torch.cat((torch.cat((std, none), 1), torch.cat((none, std), 1)))
-        found = self.integrate(torch.cat((better, std * gradient / length, tilts))).reshape(4, frames, 1, *depth_mm.shape[2:])
+        found: Tensor = self.integrate(torch.cat((better, std * gradient / length, tilts)))
+        found = found.reshape(4, depth_mm.shape[0], 1, depth_mm.shape[2], depth_mm.shape[3])
         count = touched.sum(dim=(1, 2, 3), keepdim=True).clamp_min(1.0)
         mean = (white / steep.square().clamp_min(0.01) * touched).sum(dim=(1, 2, 3), keepdim=True) / count
         growth = 0.2 + torch.log1p(torch.sqrt(count / math.pi)) / (2.0 * math.pi)
         scatter = mean * growth * (self.correlation * self.mm_per_pixel) ** 2
-        kink = (KINK_PX * self.mm_per_pixel) ** 2 * gradient.square().sum(dim=(1, 2, 3), keepdim=True) / count
-        system = SYSTEM_SHARE**2 * found[1:].square().sum(0)
+        kink = self.kink_variance_mm * gradient.square().sum(dim=(1, 2, 3), keepdim=True) / count
+        system = self.system_variance * found[1:].square().sum(0)
         return (found[0] - depth_mm).abs() + 1.96 * torch.sqrt(scatter + kink + system)
 
 

@@ -310,7 +310,8 @@ class ConfidentPipeline(nn.Module):
         >>> from torchvts import PointLights, Sensor
         >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
         >>> cal = Calibration.from_lights(lights, Sensor("rig", 48, 64, 0.5))
-        >>> ConfidentPipeline(DepthPipeline.from_calibration(cal), Confidence.from_calibration(cal))(cal.model_image[None])._fields[4:]
+        >>> pipe = ConfidentPipeline(DepthPipeline.from_calibration(cal), Confidence.from_calibration(cal))
+        >>> pipe(cal.model_image[None])._fields[4:]
         ('normal_95_deg', 'depth_95_mm', 'confidence', 'frame_confidence', 'factors_deg')
     """
 

@@ -57,11 +57,14 @@ BLUR_SHARE = 3.0
 CLIPPED_DEG = 3.0
 """Error of a normal, along one axis, where a light is blocked or a channel is full and the other two must do."""
 
+MISFIT_SHARE = 3.0
+"""Error of the light per unit of tilt, over the part of the background that fitted lights leave unexplained."""
+
 DETECTED_SIGMAS = 4.5
 """A tilt of so many standard deviations of its noise is seen as contact: the threshold of :class:`ContactMask`."""
 
 SYSTEM_SHARE = 0.5
-"""Depth error by the model, over what slopes that are off by one standard deviation all the same way would give."""
+"""Depth error by a response field, over what slopes that are off by one standard deviation all the same way would give."""
 
 KINK_PX = 0.08
 """Depth error of the grid where the surface has a kink, pixels, for a contact as steep as 45 degrees."""
@@ -177,7 +180,8 @@ class Confidence(nn.Module):
         self.clipped_variance = math.radians(CLIPPED_DEG) ** 2
         self.detected, self.useful_deg = DETECTED_SIGMAS, USEFUL_DEG
         self.curl_share, self.blur_share = CURL_SHARE, BLUR_SHARE
-        self.system_variance, self.kink_variance_mm = SYSTEM_SHARE**2, (KINK_PX * mm_per_pixel) ** 2
+        self.system_variance = 1.0 if self.by_lights else SYSTEM_SHARE**2  # lights that are off are off everywhere
+        self.kink_variance_mm = (KINK_PX * mm_per_pixel) ** 2
         height, width = noise_std.shape[1], noise_std.shape[2]
         self.band = max(3, round(BAND * min(height, width)))
         x, y = torch.linspace(-1.0, 1.0, width) * width, torch.linspace(-1.0, 1.0, height) * height
@@ -315,11 +319,14 @@ def _length_95(bias: Tensor, std: Tensor, tail: float) -> Tensor:
 
 
 def _light_std_by_fit(calibration: Calibration) -> Tensor:
-    """(3, H, W): a light whose direction is off by its standard deviation, in light per unit of |n - n_rest|."""
+    """(3, H, W): light off by a direction that is off by its standard deviation, and by misfit, per unit of |n - n_rest|."""
     assert calibration.lights is not None
-    off = torch.tensor(calibration.report.get("direction_std_deg", [0.0, 0.0, 0.0]), dtype=calibration.background.dtype)
+    none, dtype = [0.0, 0.0, 0.0], calibration.background.dtype
+    turned = torch.tensor(calibration.report.get("direction_std_deg", none), dtype=dtype).nan_to_num(45.0).clamp(0.0, 45.0)
+    misfit = torch.tensor(calibration.report.get("misfit", none), dtype=dtype).nan_to_num(1.0).clamp(0.0, 1.0)
     rise = calibration.lights.direction[:, 2].detach().clamp_min(0.2)
-    return calibration.model_image.detach() * (torch.deg2rad(off.nan_to_num(45.0).clamp(0.0, 45.0)) / rise).reshape(3, 1, 1)
+    off = torch.hypot(torch.deg2rad(turned) / rise, MISFIT_SHARE * misfit)
+    return calibration.model_image.detach() * off.reshape(3, 1, 1)
 
 
 def _model_deg(calibration: Calibration) -> float:

@@ -28,10 +28,11 @@ def main() -> None:
     for number, unit in enumerate(coverage.UNITS):
         first = arguments.seed + number * arguments.frames
         found = coverage.of_scenes(range(first, first + arguments.frames), unit, progress=True)
-        rows.append(coverage.mean(found, f"scenes, {unit}"))
+        rows += [coverage.mean(found, f"scenes, {unit}")] if found else []
         every += found
     for shape in coverage.SHAPES:
-        rows.append(coverage.mean([row for row in every if row.shape == shape], f"scenes of all units, {shape}"))
+        found = [row for row in every if row.shape == shape]
+        rows += [coverage.mean(found, f"scenes of all units, {shape}")] if found else []
     curves = [coverage.mean(every, "scenes")]
     if arguments.presses is not None:
         sensor = vts.Sensor.load(arguments.sensor)

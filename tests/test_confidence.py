@@ -4,7 +4,10 @@ import copy
 import dataclasses
 import io
 import pickle
+import subprocess
+import sys
 import warnings
+from pathlib import Path
 
 import pytest
 import torch
@@ -265,6 +268,14 @@ def test_coverage_says_what_is_missing(ring):
     out = vts.DepthPipeline.from_calibration(calibration, confidence=True)(camera(1))
     with pytest.raises(ValueError, match="region: expected at least one pixel"):
         coverage.coverage(out, scene.depth_mm, scene.normal, torch.zeros_like(out.contact), 1.0)
+
+
+def test_the_script_makes_table_and_picture(tmp_path):
+    root = Path(__file__).resolve().parents[1]
+    command = [sys.executable, "scripts/confidence.py", "--frames", "1", "--out", str(tmp_path / "coverage.png")]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=root, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "| scenes, lights fitted |" in done.stdout and (tmp_path / "coverage.png").stat().st_size > 10_000
 
 
 def test_presses_of_a_real_sensor(data):

@@ -9,12 +9,11 @@ import pytest
 import torchvts as vts
 
 NAMES = [
-    "AdaptiveIntegration", "Calibration", "CalibrationWarning", "CliffIntegration", "Compensate", "ContactMask", "DepthOutput",
-    "DepthPipeline", "Diagnosis", "FillMarkers", "Finding",
-    "GradientFromNormal", "LightFit", "NormalFromIntensity", "NormalFromLookup",
-    "NormalFromMLP", "NormalFromResponse", "PerspectiveIntegration", "PointLights", "PoissonDCT", "PoissonDST", "PoissonRest",
-    "Press", "Registration", "Sensor", "Touch", "calibrate", "contact_cloud", "depth_to_points",
-    "diagnose", "divergence", "fill_markers",
+    "AdaptiveIntegration", "Calibration", "CalibrationWarning", "CliffIntegration", "Compensate", "Confidence", "ConfidentOutput",
+    "ConfidentPipeline", "ContactMask", "DepthOutput", "DepthPipeline", "Diagnosis", "FillMarkers", "Finding",
+    "GradientFromNormal", "LightFit", "NormalFromIntensity", "NormalFromLookup", "NormalFromMLP", "NormalFromResponse",
+    "PerspectiveIntegration", "PointLights", "PoissonDCT", "PoissonDST", "PoissonRest", "Press", "Registration", "Sensor",
+    "Touch", "bound_at", "calibrate", "contact_cloud", "depth_to_points", "diagnose", "divergence", "fill_markers",
     "find_markers", "fit_lights", "fit_mlp", "fit_prior", "gradient_from_normal", "gs_sdk", "integrate_cliffs",
     "integrate_perspective", "metrics", "near_field_shading", "normal_from_gradient", "objects", "poisson_dct", "poisson_dst",
     "poisson_rest", "read_image", "read_presses", "register_depth", "register_points", "scenes", "shipped_sensors", "stream",
@@ -39,6 +38,8 @@ ARGUMENTS = {
     vts.DepthPipeline.from_calibration: ["calibration", "mode"],
     vts.diagnose: ["background", "image", "calibration"],
     vts.Finding: ["name", "message", "severity", "value"],
+    vts.Confidence.from_calibration: ["calibration", "normals"],
+    vts.bound_at: ["bound_95", "level", "spread"],
     vts.poisson_dst: ["gradient", "mm_per_pixel"],
     vts.poisson_dct: ["gradient", "mm_per_pixel"],
     vts.PoissonDST: ["mm_per_pixel"],
@@ -66,6 +67,8 @@ def test_arguments_keep_their_names_and_order(call):
 
 def test_results_have_their_fields_in_order():
     assert vts.DepthOutput._fields == ("depth_mm", "gradient", "normal", "contact")
+    assert vts.ConfidentOutput._fields[:4] == vts.DepthOutput._fields
+    assert vts.ConfidentOutput._fields[4:] == vts.confidence.Bounds._fields
     assert {"lights", "converged", "loss_history", "direction_std_deg", "message"} <= set(vts.LightFit.__dataclass_fields__)
 
 

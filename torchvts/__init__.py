@@ -3,6 +3,7 @@
 from . import metrics, objects, scenes, stream
 from .calibration import CalibrationWarning, LightFit, Press, Touch, calibrate, fit_lights, fit_prior, read_presses
 from .compensate import Compensate
+from .confidence import Confidence, bound_at
 from .contact import ContactMask
 from .core import __version__ as __version__
 from .core import gs_sdk
@@ -26,7 +27,7 @@ from .integration import (
 )
 from .markers import FillMarkers, fill_markers, find_markers
 from .normals import NormalFromIntensity, NormalFromLookup, NormalFromMLP, NormalFromResponse, fit_mlp
-from .pipeline import DepthOutput, DepthPipeline
+from .pipeline import ConfidentOutput, ConfidentPipeline, DepthOutput, DepthPipeline
 from .pose import Registration, contact_cloud, register_depth, register_points
 from .record import Calibration
 from .shading import PointLights, near_field_shading
@@ -37,6 +38,9 @@ __all__ = [
     "CalibrationWarning",
     "CliffIntegration",
     "Compensate",
+    "Confidence",
+    "ConfidentOutput",
+    "ConfidentPipeline",
     "ContactMask",
     "DepthOutput",
     "DepthPipeline",
@@ -58,6 +62,7 @@ __all__ = [
     "Registration",
     "Sensor",
     "Touch",
+    "bound_at",
     "calibrate",
     "contact_cloud",
     "depth_to_points",

@@ -1,11 +1,12 @@
 """Online: a calibration made into a chain of modules that turns images into depth."""
 
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple, overload
 
 import torch
 from torch import Tensor, nn
 
 from .compensate import Compensate
+from .confidence import Bounds, Confidence
 from .contact import ContactMask
 from .core.checks import (
     check_batch,
@@ -32,6 +33,24 @@ class DepthOutput(NamedTuple):
     gradient: Tensor
     normal: Tensor
     contact: Tensor
+
+
+class ConfidentOutput(NamedTuple):
+    """The fields of :class:`DepthOutput`, then those of :class:`~torchvts.confidence.Bounds`: how far the former may be off.
+
+    normal_95_deg, depth_95_mm (B, 1, H, W): within these the errors lie with a probability of 95 %; confidence (B, 1, H, W):
+    probability that the normal is within 10 degrees; frame_confidence (B,): its mean over the contact; factors_deg (B, 5, H, W).
+    """
+
+    depth_mm: Tensor
+    gradient: Tensor
+    normal: Tensor
+    contact: Tensor
+    normal_95_deg: Tensor
+    depth_95_mm: Tensor
+    confidence: Tensor
+    frame_confidence: Tensor
+    factors_deg: Tensor
 
 
 class DepthPipeline(nn.Module):
@@ -108,10 +127,40 @@ class DepthPipeline(nn.Module):
         self.coarse_normals = coarse(self.stride) if self.foresees and callable(coarse) else nn.Identity()
         self.coarse_integrate: nn.Module = PoissonRest(self.stride * mm_per_pixel) if self.foresees else nn.Identity()
 
+    @overload
     @classmethod
     def from_calibration(
-        cls, calibration: Calibration, mode: str = "fast", *, normals: nn.Module | None = None, integrate: nn.Module | None = None
-    ) -> "DepthPipeline":
+        cls,
+        calibration: Calibration,
+        mode: str = ...,
+        *,
+        normals: nn.Module | None = ...,
+        integrate: nn.Module | None = ...,
+        confidence: Literal[False] = ...,
+    ) -> "DepthPipeline": ...
+
+    @overload
+    @classmethod
+    def from_calibration(
+        cls,
+        calibration: Calibration,
+        mode: str = ...,
+        *,
+        normals: nn.Module | None = ...,
+        integrate: nn.Module | None = ...,
+        confidence: Literal[True],
+    ) -> "ConfidentPipeline": ...
+
+    @classmethod
+    def from_calibration(
+        cls,
+        calibration: Calibration,
+        mode: str = "fast",
+        *,
+        normals: nn.Module | None = None,
+        integrate: nn.Module | None = None,
+        confidence: bool = False,
+    ) -> "DepthPipeline | ConfidentPipeline":
         """The pipeline of a calibrated unit, in eval mode, its lights frozen (``requires_grad_(True)`` frees them).
 
         Args:
@@ -119,6 +168,9 @@ class DepthPipeline(nn.Module):
             mode: "fast", "precise" or "auto".
             normals, integrate: modules to put in place of the calibrated inverse model and PoissonRest. ``normals`` sees what
                 the calibrated model would: the image scaled to the light model's, or image / background for a response field.
+            confidence: give a :class:`ConfidentPipeline`, whose output tells how far it may be off too.
+        Raises:
+            TypeError: no Calibration; or confidence of ``normals`` that are not the calibrated model.
         Example:
             >>> from torchvts import PointLights, Sensor
             >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
@@ -139,7 +191,8 @@ class DepthPipeline(nn.Module):
             GradientFromNormal(),
             integrate or PoissonRest(sensor.mm_per_pixel),
         )
-        return cls(*modules, mm_per_pixel=sensor.mm_per_pixel, mode=mode).eval()
+        pipe = cls(*modules, mm_per_pixel=sensor.mm_per_pixel, mode=mode)
+        return ConfidentPipeline(pipe, Confidence.from_calibration(calibration, normals)).eval() if confidence else pipe.eval()
 
     def forward(self, images: Tensor) -> DepthOutput:
         """(B, 3, H, W) images in [0, 1], R, G, B.
@@ -258,6 +311,42 @@ class DepthPipeline(nn.Module):
 
     def extra_repr(self) -> str:
         return f"mode={self.mode}, mm_per_pixel={self.mm_per_pixel}"
+
+
+class ConfidentPipeline(nn.Module):
+    """A pipeline that tells how far its output may be off: images (B, 3, H, W) to a :class:`ConfidentOutput`.
+
+    Args:
+        pipe: the pipeline. confidence: from the same calibration.
+    Example:
+        >>> from torchvts import PointLights, Sensor
+        >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
+        >>> cal = Calibration.from_lights(lights, Sensor("rig", 48, 64, 0.5))
+        >>> pipe = ConfidentPipeline(DepthPipeline.from_calibration(cal), Confidence.from_calibration(cal))
+        >>> pipe(cal.model_image[None])._fields[4:]
+        ('normal_95_deg', 'depth_95_mm', 'confidence', 'frame_confidence', 'factors_deg')
+    """
+
+    def __init__(self, pipe: DepthPipeline, confidence: Confidence) -> None:
+        super().__init__()
+        self.pipe = pipe
+        self.confidence = confidence
+
+    def forward(self, images: Tensor) -> ConfidentOutput:
+        """As :meth:`DepthPipeline.forward`."""
+        out: DepthOutput = self.pipe(images)
+        told: Bounds = self.confidence(images, self.pipe.compensate(images), out.depth_mm, out.gradient, out.normal, out.contact)
+        return ConfidentOutput(
+            out.depth_mm,
+            out.gradient,
+            out.normal,
+            out.contact,
+            told.normal_95_deg,
+            told.depth_95_mm,
+            told.confidence,
+            told.frame_confidence,
+            told.factors_deg,
+        )
 
 
 def _no_contact(compensated: Tensor, contact: Tensor) -> DepthOutput:

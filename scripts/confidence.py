@@ -1,0 +1,54 @@
+"""How often errors lie within the bounds that confidence states: a table and a picture.
+
+python scripts/confidence.py --presses ../shared/data/gelsight_mini_a --sensor gelsight_mini
+
+Random exact scenes of four kinds of units, and presses of balls that calibration has not seen.
+"""
+
+import argparse
+from pathlib import Path
+
+import torch
+
+import torchvts as vts
+from torchvts import coverage
+from torchvts.viz import save_figure
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--presses", type=Path, help="folder of ball presses in gs_sdk's layout, with labels")
+    parser.add_argument("--sensor", default="gelsight_mini", help="of the presses: YAML file or shipped name")
+    parser.add_argument("--frames", type=int, default=100, help="random scenes of each kind of unit")
+    parser.add_argument("--seed", type=int, default=10000, help="of the first scene")
+    parser.add_argument("--out", type=Path, default=Path("out/confidence.png"), help="the picture")
+    arguments = parser.parse_args()
+    torch.set_grad_enabled(False)
+    rows, every = [], []
+    for number, unit in enumerate(coverage.UNITS):
+        first = arguments.seed + number * arguments.frames
+        found = coverage.of_scenes(range(first, first + arguments.frames), unit, progress=True)
+        rows += [coverage.mean(found, f"scenes, {unit}")] if found else []
+        every += found
+    for shape in coverage.SHAPES:
+        found = [row for row in every if row.shape == shape]
+        rows += [coverage.mean(found, f"scenes of all units, {shape}")] if found else []
+    curves = [coverage.mean(every, "scenes")]
+    if arguments.presses is not None:
+        sensor = vts.Sensor.load(arguments.sensor)
+        kinds = [
+            ("presses, no prior", sensor.without_prior(), True, "precise"),
+            ("presses, no prior, fast", sensor.without_prior(), True, "fast"),
+        ]
+        if sensor.prior is not None:
+            kinds += [("presses and prior", sensor, True, "precise"), ("prior alone", sensor, False, "precise")]
+        for name, kind, learn, mode in kinds:
+            found = coverage.of_presses(arguments.presses, kind, learn=learn, mode=mode, progress=True)
+            rows.append(coverage.mean(found, f"{arguments.presses.name}, {name}"))
+            curves.append(rows[-1])
+    print(coverage.table([*rows, curves[0]]))
+    save_figure(coverage.figure(curves), arguments.out)
+
+
+if __name__ == "__main__":
+    main()

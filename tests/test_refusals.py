@@ -34,9 +34,9 @@ MODULES = {
     "metrics.": vts.metrics,
 }
 RECORDS = {
-    "CalibrationWarning", "DepthOutput", "LightFit", "Registration", "gs_sdk.GsSdkFolder", "gs_sdk.GsSdkPress",
-    "export.ExportCheck", "export.Format", "metrics.DepthError", "metrics.SphereFit", "objects.Target", "scenes.Scene",
-    "stream.Reader", "stream.TactileFrame", "Calibration",
+    "Calibration", "CalibrationWarning", "ConfidentOutput", "DepthOutput", "Diagnosis", "Diagnosis.of", "Finding", "LightFit",
+    "Registration", "export.ExportCheck", "export.Format", "gs_sdk.GsSdkFolder", "gs_sdk.GsSdkPress", "metrics.DepthError",
+    "metrics.SphereFit", "objects.Target", "scenes.Scene", "stream.Reader", "stream.TactileFrame",
 }  # fmt: skip
 """What the library hands out and nobody makes: their constructors keep what they are given. (Their methods are in the table.)"""
 PARTS = {"stream.NewestFrame", "stream.Overlay", "stream.StageClock", "stream.StreamReport.", "stream.VideoFile.", "stream.Window"}
@@ -125,6 +125,11 @@ def images(height=HEIGHT, width=WIDTH):
     ]  # fmt: skip
 
 
+def of_other_size(frame):
+    """Whether it is a sound image, of a size or count that diagnose takes: another size is a finding."""
+    return isinstance(frame, torch.Tensor) and tuple(frame.shape) in {(1, 3, HEIGHT, WIDTH), (3, HEIGHT - 1, WIDTH)}
+
+
 PRESS = vts.Press(torch.full((3, HEIGHT, WIDTH), 0.5), 6.0)
 
 
@@ -165,6 +170,7 @@ BAD_POINTS = [torch.zeros(50), torch.zeros(50, 2), torch.zeros(0, 3), torch.zero
 EYE = torch.eye(4, dtype=torch.float64)
 BAD_POSE = [EYE[:3], 2 * EYE, EYE + NAN, np.eye(4), "pose"]
 
+UP = torch.tensor([0.0, 0.0, 1.0]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)
 GRADIENT = torch.zeros(1, 2, 8, 8)
 BAD_GRADIENT = [*batches(2), torch.zeros(1, 2, 1, 8)]
 BAD_MASKS = [torch.zeros(1, 1, 4, 4) > 0, torch.zeros(1, 1, 8, 8), torch.zeros(8, 8) > 0, "all", np.zeros((1, 1, 8, 8), bool)]
@@ -398,6 +404,62 @@ TABLE = {
         {"gradient": BAD_GRADIENT, "window": [(9, 0), (-1, 0)], "size": [(4, 4)]},
         lambda: vts.PerspectiveIntegration(1.0, 30.0),
         named={"window": "gradient, window", "size": "gradient, window"},
+    ),
+    "Confidence": Entry(
+        {
+            "normals": pipe().normals,
+            "noise_std": 0.01 * FLAT,
+            "image_noise_std": torch.full((3,), 0.01),
+            "light_std": 0.01 * FLAT,
+            "mm_per_pixel": 1.0,
+        },
+        {
+            "normals": ["lights", None],
+            "noise_std": BAD_FLAT,
+            "image_noise_std": [torch.zeros(2), None, 0.01],
+            "light_std": [FLAT[None], None, 0.01],
+            "mm_per_pixel": NUMBER,
+            "model_deg": ["1", None, NAN, -1.0],
+            "blur_px": ["1", None, NAN, -1.0],
+            "spread": NUMBER,
+        },
+    ),
+    "Confidence.from_calibration": Entry(
+        {"calibration": unit(), "normals": pipe().normals}, {"calibration": OTHERS, "normals": ["mine", torch.nn.Identity()]}
+    ),
+    "Confidence.forward": Entry(
+        {
+            "images": FLAT[None],
+            "compensated": FLAT[None],
+            "depth_mm": DEPTH,
+            "gradient": torch.zeros(1, 2, HEIGHT, WIDTH),
+            "normal": UP,
+            "contact": DEPTH > 0,
+        },
+        {
+            **{name: batches(3) for name in ("images", "compensated", "normal")},
+            "depth_mm": batches(1),
+            "gradient": batches(2),
+            "contact": [DEPTH[0] > 0, (DEPTH > 0)[:, :, 1:], None, "all", DEPTH],
+        },
+        lambda: vts.Confidence.from_calibration(unit()),
+    ),
+    "ConfidentPipeline": Entry(
+        {"pipe": pipe(), "confidence": vts.Confidence.from_calibration(unit())},
+        {"pipe": ["fast", None, unit()], "confidence": [True, None, unit()]},
+    ),
+    "ConfidentPipeline.forward": forward(lambda: vts.DepthPipeline.from_calibration(unit(), confidence=True), 3, "images"),
+    "bound_at": Entry(
+        {"bound_95": torch.ones(2), "level": 0.5, "spread": 1.0},
+        {"bound_95": [1.0, None, np.ones(2)], "level": [0.0, 1.0, 95, NAN, "0.5", None], "spread": NUMBER},
+    ),
+    "diagnose": Entry(
+        {"background": image(), "image": image(), "calibration": unit()},
+        {
+            "background": [bad for bad in images() if bad is not None and not of_other_size(bad)],
+            "image": [bad for bad in images() if not of_other_size(bad)],
+            "calibration": OTHERS,
+        },
     ),
     "PoissonDST.forward": Entry(
         {"gradient": torch.zeros(1, 2, 8, 8)}, {"gradient": [*batches(2), torch.zeros(1, 2, 2, 8)]}, lambda: vts.PoissonDST()

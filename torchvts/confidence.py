@@ -13,12 +13,21 @@ import torch
 from torch import Tensor, nn
 
 from .compensate import blur, gaussian_weights
-from .core.checks import check_batch, check_same_size
+from .core.checks import (
+    check_batch,
+    check_field,
+    check_least,
+    check_positive,
+    check_record,
+    check_same_size,
+    check_shape,
+    check_tensor,
+)
 from .core.geometry import gradient_from_normal
 from .core.noise import noise_std as frame_noise_std
 from .integration import PoissonRest
 from .normals import NormalFromIntensity, NormalFromResponse
-from .record import Calibration
+from .record import Calibration, check_calibration
 
 FACTORS = ("noise", "model", "pass", "surface", "saturation")
 """What ``factors_deg`` holds, in that order: noise through the inverse model, raised where the light does not fit; error of the
@@ -105,8 +114,10 @@ def bound_at(bound_95: Tensor, level: float, spread: float = 1.0) -> Tensor:
         >>> [round(float(bound_at(torch.tensor(6.0), level)), 2) for level in (0.5, 0.68, 0.95)]
         [2.89, 3.7, 6.0]
     """
-    if not 0.0 < level < 1.0:
+    check_tensor("bound_95", bound_95)
+    if not 0.0 < check_least("level", level) < 1.0:
         raise ValueError(f"level: expected a probability between 0 and 1, got {level}: 0.95, not 95")
+    check_positive("spread", spread)
     factor: float = (math.log(1.0 - level) / math.log(0.05)) ** (0.5 * spread)
     return bound_95 * factor
 
@@ -165,6 +176,12 @@ class Confidence(nn.Module):
         spread: float = 1.0,
     ) -> None:
         super().__init__()
+        check_record("normals", normals, nn.Module, "the block of the pipeline")
+        check_field("noise_std", noise_std)
+        check_shape("image_noise_std", image_noise_std, (3,))
+        check_shape("light_std", light_std, noise_std.shape, "noise_std")
+        check_positive("mm_per_pixel", mm_per_pixel), check_positive("spread", spread)
+        check_least("model_deg", model_deg), check_least("blur_px", blur_px)
         self.normals = normals
         self.uses_depth = bool(getattr(normals, "uses_depth", False))
         self.by_lights = isinstance(normals, NormalFromIntensity)
@@ -201,6 +218,7 @@ class Confidence(nn.Module):
         Raises:
             TypeError: normals that are not of the calibrated model, of whose errors calibration knows nothing.
         """
+        check_calibration("calibration", calibration)
         kind = NormalFromResponse if calibration.response is not None else NormalFromIntensity
         block = kind.from_calibration(calibration) if normals is None else normals
         if not isinstance(block, kind):
@@ -230,8 +248,20 @@ class Confidence(nn.Module):
         Raises:
             ValueError: wrong shapes, or another size than the calibrated one.
         """
-        check_batch("compensated", compensated, 3)
-        check_same_size("compensated", compensated, "the calibration", self.noise.shape[1], self.noise.shape[2])
+        height, width = self.noise.shape[1], self.noise.shape[2]
+        for name, tensor, channels in (
+            ("images", images, 3),
+            ("compensated", compensated, 3),
+            ("depth_mm", depth_mm, 1),
+            ("gradient", gradient, 2),
+            ("normal", normal, 3),
+        ):
+            check_batch(name, tensor, channels)
+            check_same_size(name, tensor, "the calibration", height, width)
+        if not torch.jit.is_scripting():
+            check_tensor("contact", contact)
+        if contact.dtype != torch.bool or contact.shape != depth_mm.shape:
+            raise ValueError(f"contact: expected bool like depth_mm, got {contact.shape} {contact.dtype}")
         sigma = self._noise_of(images)
         base = self.normals(compensated)
         noise, model = self._through_the_inverse(base, compensated, sigma)

@@ -329,6 +329,8 @@ class ConfidentPipeline(nn.Module):
 
     def __init__(self, pipe: DepthPipeline, confidence: Confidence) -> None:
         super().__init__()
+        check_record("pipe", pipe, DepthPipeline, "DepthPipeline.from_calibration makes one")
+        check_record("confidence", confidence, Confidence, "Confidence.from_calibration makes one")
         self.pipe = pipe
         self.confidence = confidence
 

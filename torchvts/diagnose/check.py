@@ -10,10 +10,10 @@ from torch import Tensor
 
 from ..calibration.contacts import ROUGH, channel_structure
 from ..calibration.rest_image import falloff, outwardness
-from ..core.checks import QUANTISATION_STD, check_range
+from ..core.checks import QUANTISATION_STD, check_field, check_range
 from ..core.noise import noise_std
 from ..integration import integrate_perspective
-from ..record import Calibration
+from ..record import Calibration, check_calibration
 from ..shading import PointLights
 from .camera import Spots, blockiness, levels_of, new_spots, texture_share
 from .findings import SEVERITIES, Diagnosis, Finding
@@ -85,8 +85,7 @@ def diagnose(background: Tensor | None, image: Tensor, calibration: Calibration)
         >>> print(diagnose(None, unit.background[[2, 1, 0]], unit).findings[0])
         fault: channels look swapped (red and blue): read the image in the order R, G, B [channels_swapped]
     """
-    if not isinstance(calibration, Calibration):
-        raise TypeError(f"calibration: expected a Calibration, got {type(calibration).__name__}: Calibration.load reads a file")
+    check_calibration("calibration", calibration)
     image = _one_image("image", image)
     given = None if background is None else _one_image("background", background)
     sensor = calibration.sensor
@@ -102,14 +101,9 @@ def diagnose(background: Tensor | None, image: Tensor, calibration: Calibration)
 
 
 def _one_image(name: str, image: Tensor) -> Tensor:
-    if not isinstance(image, Tensor):
-        raise TypeError(f"{name}: expected a torch.Tensor, got {type(image).__name__}: read files with torchvts.read_image")
-    if image.dim() == 4 and image.shape[0] == 1:
+    if isinstance(image, Tensor) and image.dim() == 4 and image.shape[0] == 1:
         image = image[0]
-    if image.dim() != 3 or image.shape[0] != 3:
-        raise ValueError(f"{name}: expected (3, H, W) or (1, 3, H, W), got {tuple(image.shape)}: one RGB image is needed")
-    if not image.is_floating_point():
-        raise TypeError(f"{name}: expected a floating-point image, got {image.dtype}: divide by 255")
+    check_field(name, image)
     check_range(name, image)
     return image.detach().cpu().float().clamp(0.0, 1.0)
 

@@ -562,7 +562,7 @@ BAD_PRIORS = {
     "no response": (put(KeyError, "response"), "key prior: key 'response': missing"),
     "no text": (put(3, "source"), "key prior: key source: expected a text"),
     "NaN": (put(NAN, "log_background", 0, 0), "key prior: key log_background: expected finite numbers"),
-    "too few": (put([[0.0] * 14] * 3, "log_background"), "key prior: key log_background: expected 3 x 15 numbers"),
+    "too few": (put([[0.0] * 14 for _ in range(3)], "log_background"), "key prior: key log_background: expected 3 x 15 numbers"),
     "no scale": (put(0, "half_mm"), "key prior: key half_mm: expected a number above 0"),
     "NaN coefficient": (put(NAN, "response", "precise", "coefficient", 0, 0), "response: precise: key coefficient: expected"),
 }

@@ -96,15 +96,14 @@ class Compensate(nn.Module):
 
         Args:
             calibration: of the unit.
-            level: bring lamps that have drifted since back to their brightness, if the model is lights. With response fields
-                this is always done.
+            level: bring lamps that have drifted since back to their brightness. With response fields up to 15 % always are.
         """
         check_calibration("calibration", calibration)
         sensor = calibration.sensor
         parts = (calibration.gain, calibration.offset, sensor.exponent, calibration.defects, sensor.blur_px, calibration.markers)
         by_response = calibration.response is not None
-        if not (level or by_response):
-            return cls(*parts)
+        if not level:
+            return cls(*parts, by_response)
         return cls(*parts, True, calibration.flat, calibration.compensated_noise_std, by_response)
 
     def forward(self, image: Tensor) -> Tensor:

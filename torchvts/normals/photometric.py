@@ -151,9 +151,9 @@ class NormalFromIntensity(nn.Module):
         self.lights = PointLights(position, albedo, lights.gloss).requires_grad_(False)
         noise = torch.full((3,), QUANTISATION_STD) if noise_std is None else noise_std
         check_shape("noise_std", noise, (3,))
-        if not bool((noise > 0).all()):
-            raise ValueError(f"noise_std: expected values above 0, got {noise.tolist()}")
-        self.noise_std = float(noise.square().mean().sqrt())
+        if not bool((noise >= 0).all()):
+            raise ValueError(f"noise_std: expected values of at least 0, got {noise.tolist()}")
+        self.noise_std = max(float(noise.square().mean().sqrt()), 1e-6)
         self.brightness_std = max(0.005, BRIGHTNESS_NOISES * self.noise_std)
         self.register_buffer("inverse", inverse.detach().clone())
         self.register_buffer("dark_below", 3.0 * noise.detach().to(inverse.dtype))

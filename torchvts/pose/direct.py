@@ -250,7 +250,8 @@ def _finish(a: Levels, b: Levels, poses: Tensor) -> Registration:
     covariance = covariance + free @ free.T * UNKNOWN_VARIANCE if names else covariance
     alternatives = list(others) if converged and not names else []
     message = _message(fit, names, len(alternatives))
-    return Registration(best[0], rmse_mm, float(fit.fitness[0]), converged, message, covariance, names, alternatives)
+    fitness, overlap = float(fit.fitness[0]), float(fit.overlap[0])
+    return Registration(best[0], rmse_mm, fitness, converged, message, covariance, names, alternatives, overlap)
 
 
 def _between(a: Levels, b: Levels, pose: Tensor) -> Tensor:

@@ -18,6 +18,9 @@ from .result import Registration, invert, motion, turn_deg
 LEAST_POINTS = 10
 """A cloud of fewer points has no pose."""
 
+LEAST_OVERLAP = 0.5
+"""Of clouds as reliefs: thinned, narrow walls are lost, and a stamp the wrong way round agrees on a quarter of itself."""
+
 SEARCH_POINTS = 1000
 """To so many the clouds are thinned while hypotheses are compared."""
 
@@ -280,6 +283,9 @@ def _as_reliefs(
         found = align(grids[0], grids[1], None if start is None else up @ start @ invert(up))
     except ValueError:
         return None
+    if found.converged and found.overlap < LEAST_OVERLAP:
+        message = f"nothing fits for sure: only {found.overlap:.0%} of the smaller cloud is comparable; register_depth sees more"
+        found = replace(found, converged=False, message=message, ambiguous=[], alternatives=[])
     return _seen_from(found, invert(up), up)
 
 

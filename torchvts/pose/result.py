@@ -20,6 +20,7 @@ class Registration:
             and mm; where a direction is not observable its variance is that of not knowing (a radian, ten millimetres).
         ambiguous: directions in which the surface slides on itself, in words; empty if there is none.
         alternatives: (4, 4) poses that fit as well, the object being symmetric; the best one is not among them.
+        overlap: share of the smaller contact that could be compared, 0 to 1; 1 for clouds that are no reliefs.
     """
 
     T_target_source: Tensor
@@ -30,6 +31,7 @@ class Registration:
     covariance: Tensor
     ambiguous: list[str] = field(default_factory=list)
     alternatives: list[Tensor] = field(default_factory=list)
+    overlap: float = 1.0
 
     def inverse(self) -> Tensor:
         """T_source_target (4, 4)."""

@@ -7,6 +7,7 @@ python scripts/pose.py source.ply reference.pcd --out out/pose
 
 import argparse
 import json
+import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -83,7 +84,7 @@ def record(name: str, found: vts.Registration) -> dict[str, Any]:
     return {
         "frame": name,
         "T_target_source": found.T_target_source.tolist(),
-        "rmse_mm": found.rmse_mm,
+        "rmse_mm": found.rmse_mm if math.isfinite(found.rmse_mm) else None,
         "fitness": found.fitness,
         "converged": found.converged,
         "message": found.message,

@@ -190,6 +190,15 @@ def test_real_presses_of_a_ball_are_ambiguous(data):
     assert counts["not named"] == 0 and counts["named"] >= counts["converged"] - 1
 
 
+def test_frames_of_other_sizes_are_refused(reference):
+    cropped = vts.DepthOutput(*(part[..., :100] for part in reference))
+    with pytest.raises(ValueError, match=r"source: expected 120 x 160 like target, got 120 x 100: positions count from"):
+        vts.register_depth(cropped, reference, PITCH)
+    narrow = vts.DepthOutput(*(part[..., 60:65] for part in reference))
+    with pytest.raises(ValueError, match=r"source: expected a frame of at least 16 x 16, got 120 x 5"):
+        vts.register_depth(narrow, narrow, PITCH)
+
+
 def test_a_surface_of_revolution_hides_its_turn_only():
     def mound(u, v):
         r = torch.sqrt(u**2 + v**2 + 1e-12)

@@ -106,6 +106,8 @@ def held_out_deg(contacts: list[Contact], like: ResponseField) -> float:
 def locate(contacts: list[Contact], pitch_mm: float, sensor: Sensor, prior: ResponseModel | None, half_mm: float) -> None:
     """Center and contact radius of every usable contact: by the prior's slopes, or jointly with fields of rising size."""
     for contact in contacts:
+        if not contact.reason and 0.0 < contact.radius_mm < 2.0 * pitch_mm:
+            contact.reason = f"a ball of {2 * contact.radius_mm:g} mm is smaller than four pixels: is its diameter in mm?"
         if not contact.reason and not contact.known:
             guess_circle(contact, sensor)
     usable = [contact for contact in contacts if not contact.reason]

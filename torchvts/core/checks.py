@@ -106,6 +106,8 @@ def check_batch(name: str, tensor: Tensor, channels: int) -> None:
         if tensor.shape[3] == channels:
             cause = "channels stand last: permute(0, 3, 1, 2)"
         raise ValueError(f"{name}: expected (B, {channels}, H, W), got {list(tensor.shape)}: {cause}")
+    if tensor.numel() == 0:
+        raise ValueError(f"{name}: expected at least one image of at least one pixel, got {list(tensor.shape)}: nothing was read?")
     if not tensor.is_floating_point():
         raise TypeError(f"{name}: expected a floating-point tensor, got {tensor.dtype}: images are value / 255 in [0, 1]")
 

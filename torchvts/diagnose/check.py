@@ -437,7 +437,7 @@ class _Examination:
         full = float(clipped[touched].double().mean())
         anywhere = float(clipped.double().mean())
         if full > 0.01 or anywhere > 0.02:
-            where = f"{full:.0%} of the contact" if bool(contact.any()) else f"{anywhere:.0%} of the image"
+            where = f"{full:.0%} of the contact" if full > 0.01 and bool(contact.any()) else f"{anywhere:.0%} of the image"
             severity = "fault" if full > 0.3 else "warning"
             found.append(Finding("saturated", f"the image is saturated in {where}: expose shorter", severity, max(full, anywhere)))
         if found_regions.count == 0:

@@ -200,7 +200,7 @@ def register_depth(source: Frame, target: Frame, mm_per_pixel: float, *, initial
         The registration. ``converged`` is False if nothing fits; ``ambiguous`` and ``alternatives`` say what the contact does not
         tell.
     Raises:
-        ValueError: not one frame, values not finite, next to no contact, or ``initial`` no rigid motion.
+        ValueError: not one frame, sizes that differ, values not finite, next to no contact, or ``initial`` no rigid motion.
     Source:
         Padfield 2012 for the search; direct alignment as in Lucas, Kanade 1981 with Cauchy's loss; this project's choice of slopes
         before depth.
@@ -214,6 +214,10 @@ def register_depth(source: Frame, target: Frame, mm_per_pixel: float, *, initial
     """
     check_positive("mm_per_pixel", mm_per_pixel)
     a, b = levels(source, mm_per_pixel, "source"), levels(target, mm_per_pixel, "target")
+    sizes = [tuple(frame.depth_mm.shape[-2:]) for frame in (source, target)]
+    if sizes[0] != sizes[1]:
+        cause = "positions count from the image's middle, so a cropped frame lies elsewhere"
+        raise ValueError(f"source: expected {sizes[1][0]} x {sizes[1][1]} like target, got {sizes[0][0]} x {sizes[0][1]}: {cause}")
     return align(a, b, None if initial is None else rigid("initial", initial))
 
 

@@ -247,8 +247,8 @@ def _checked(name: str, points: Tensor, normals: Tensor | None) -> tuple[Tensor,
         if tuple(normals.shape) != tuple(points.shape):
             raise ValueError(f"{name}_normals: expected {tuple(points.shape)} like the points, got {tuple(normals.shape)}")
         normals = torch.nn.functional.normalize(normals.detach().cpu().double(), dim=1)
-        if not bool(torch.isfinite(normals).all()):
-            raise ValueError(f"{name}_normals: expected finite normals, got NaN or infinite ones")
+        if not bool((normals.norm(dim=1) > 0.5).all()):  # NaN too
+            raise ValueError(f"{name}_normals: expected finite normals, got NaN, infinite or zero ones")
     distinct, inverse = torch.unique(points, dim=0, return_inverse=True)
     if len(distinct) < LEAST_POINTS:
         raise ValueError(f"{name}: expected at least {LEAST_POINTS} distinct points, got {len(distinct)} of {len(points)}")

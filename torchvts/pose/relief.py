@@ -10,6 +10,9 @@ from torch.nn.functional import avg_pool2d, grid_sample, max_pool2d
 LEAST_DEPTH_MM = 0.03
 """Skin less deep than this is taken for skirt: it bends away from the object before it leaves it."""
 
+LEAST_SIDE = 16
+"""Pixels along the shorter side of a frame."""
+
 LEAST_PIXELS = 60
 """A contact of fewer pixels has no pose."""
 
@@ -96,6 +99,10 @@ def contact_of(frame: Frame, name: str) -> tuple[Tensor, Tensor, Tensor]:
 def levels(frame: Frame, mm_per_pixel: float, name: str) -> Levels:
     """The frame on grids of at most 320, 160 and 80 columns; each pixel there is the mean of all it covers."""
     depth, gradient, contact = contact_of(frame, name)
+    if min(depth.shape) < LEAST_SIDE:
+        raise ValueError(
+            f"{name}: expected a frame of at least {LEAST_SIDE} x {LEAST_SIDE}, got {depth.shape[0]} x {depth.shape[1]}"
+        )
     noise = slope_noise(gradient, contact)
     inside = contact & (depth > least_depth_mm(noise, mm_per_pixel))
     # flat faces whose outline the image cuts off may be missing from the mask: of these nothing is said, not even "no contact"

@@ -17,7 +17,7 @@ class Registration:
         converged: whether the pose is to be trusted, up to what ``ambiguous`` and ``alternatives`` say.
         message: why, in a sentence.
         covariance: (6, 6) of a small motion ``p -> p + w x p + t`` after the pose, order (w_x, w_y, w_z, t_x, t_y, t_z), rad
-            and mm; where a direction is not observable its variance is that of not knowing (a radian, ten millimetres).
+            and mm; a direction that is not observable has a variance of 100 mm^2 or more at the contact.
         ambiguous: directions in which the surface slides on itself, in words; empty if there is none.
         alternatives: (4, 4) poses that fit as well, the object being symmetric; the best one is not among them.
         overlap: share of the smaller contact that could be compared, 0 to 1; 1 for clouds that are no reliefs.

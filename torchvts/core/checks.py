@@ -106,8 +106,8 @@ def check_batch(name: str, tensor: Tensor, channels: int) -> None:
         if tensor.shape[3] == channels:
             cause = "channels stand last: permute(0, 3, 1, 2)"
         raise ValueError(f"{name}: expected (B, {channels}, H, W), got {list(tensor.shape)}: {cause}")
-    if tensor.numel() == 0:
-        raise ValueError(f"{name}: expected at least one image of at least one pixel, got {list(tensor.shape)}: nothing was read?")
+    if tensor.shape[2] == 0 or tensor.shape[3] == 0:
+        raise ValueError(f"{name}: expected images of at least one pixel, got {list(tensor.shape)}: nothing was read?")
     if not tensor.is_floating_point():
         raise TypeError(f"{name}: expected a floating-point tensor, got {tensor.dtype}: images are value / 255 in [0, 1]")
 
@@ -189,6 +189,8 @@ def check_shape(name: str, value: object, shape: Sequence[int], like: str = "") 
 
 def check_range(name: str, image: Tensor) -> None:
     """Raise unless every value is finite and in [0, 1]. Reads values."""
+    if image.numel() == 0:
+        return
     low, high = (float(v) for v in torch.aminmax(image.detach()))
     if not (math.isfinite(low) and math.isfinite(high)):
         count = int((~torch.isfinite(image)).sum())

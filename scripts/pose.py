@@ -100,8 +100,9 @@ def tell(name: str, found: vts.Registration) -> None:
     turn = float(torch.rad2deg(torch.atan2(T[1, 0], T[0, 0])))
     tilt = float(torch.rad2deg(torch.acos(T[2, 2].clamp(-1, 1))))
     x, y, z = T[:3, 3].tolist()
-    print(f"{name}: turned {turn:.3f} degrees in the plane, tilted {tilt:.3f}, moved ({x:.4f}, {y:.4f}, {z:.4f}) mm")
     print(f"{name}: {'converged' if found.converged else 'NOT converged'}, rmse {1000 * found.rmse_mm:.1f} um: {found.message}")
+    which = "one of the poses that fit: " if found.ambiguous or found.alternatives else ""
+    print(f"{name}: {which}turned {turn:.3f} degrees in the plane, tilted {tilt:.3f}, moved ({x:.4f}, {y:.4f}, {z:.4f}) mm")
 
 
 def draw(arguments: argparse.Namespace, name: str, source: torch.Tensor, target: torch.Tensor, found: vts.Registration) -> None:

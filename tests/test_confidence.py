@@ -69,7 +69,7 @@ def test_a_level_is_a_probability(level):
 @pytest.mark.parametrize("rise", [40.0, 25.0])
 def test_noise_and_conditioning_against_many_noisy_frames(ring, noise_std, rise):
     calibration, _, camera = lights_unit(ring, noise_std, background=False, height_mm=rise, radius_mm=35.0)
-    pipe = vts.DepthPipeline.from_calibration(calibration, "fast", confidence=True)
+    pipe = vts.ConfidentPipeline.from_calibration(calibration, "fast")
     frames = torch.cat([camera(seed) for seed in range(60)])
     still = pipe(camera(0, 0.0))
     inside = still.contact & pipe(frames).contact.all(0, keepdim=True)
@@ -119,7 +119,7 @@ def test_attached_shadows_and_a_worn_skin(ring):
     rest = scenes.render(scenes.at_rest(scene), lights, **camera, seed=1)[0]
     calibration = vts.Calibration.from_lights(lights, sensor, rest)
     for mode in ("fast", "precise"):
-        pipe = vts.DepthPipeline.from_calibration(calibration, mode, confidence=True)
+        pipe = vts.ConfidentPipeline.from_calibration(calibration, mode)
         out = pipe(scenes.render(scene, lights, **camera, seed=2))
         assert bool((out.factors_deg[:, FACTORS.index("saturation")] > 0).any())
         row = coverage.coverage(out, scene.depth_mm, scene.normal, out.contact | scene.contact, pipe.confidence.spread)
@@ -128,7 +128,7 @@ def test_attached_shadows_and_a_worn_skin(ring):
 
 def test_a_noisier_frame_has_wider_bounds(ring):
     calibration, _, camera = lights_unit(ring, 0.004)
-    pipe = vts.DepthPipeline.from_calibration(calibration, "precise", confidence=True)
+    pipe = vts.ConfidentPipeline.from_calibration(calibration, "precise")
     quiet, noisy = pipe(camera(1)), pipe(camera(1, 0.016))
     both = quiet.contact & noisy.contact
     assert 2.0 < float((noisy.normal_95_deg / quiet.normal_95_deg)[both].median()) < 4.5
@@ -138,7 +138,7 @@ def test_a_noisier_frame_has_wider_bounds(ring):
 
 def test_light_that_the_model_does_not_explain_widens_the_bounds(ring):
     calibration, _, camera = lights_unit(ring)
-    pipe = vts.DepthPipeline.from_calibration(calibration, "precise", confidence=True)
+    pipe = vts.ConfidentPipeline.from_calibration(calibration, "precise")
     right, image = pipe(camera(1)), camera(1)
     image[:, :, :, WIDTH // 2 :] *= 0.9  # a shadow over half of the frame
     wrong = pipe(image)
@@ -149,9 +149,7 @@ def test_light_that_the_model_does_not_explain_widens_the_bounds(ring):
 
 def test_fast_knows_what_precise_would_change(ring):
     calibration, _, camera = lights_unit(ring, 0.001)
-    fast, precise = (
-        vts.DepthPipeline.from_calibration(calibration, mode, confidence=True)(camera(1)) for mode in ("fast", "precise")
-    )
+    fast, precise = (vts.ConfidentPipeline.from_calibration(calibration, mode)(camera(1)) for mode in ("fast", "precise"))
     inside, change = fast.contact, FACTORS.index("pass")
     assert float(fast.factors_deg[:, change][inside[:, 0]].median()) > 10 * float(
         precise.factors_deg[:, change][inside[:, 0]].median()
@@ -162,7 +160,7 @@ def test_fast_knows_what_precise_would_change(ring):
 def test_loosely_pinned_lights_widen_the_bounds(ring):
     calibration, _, camera = lights_unit(ring)
     loose = dataclasses.replace(calibration, report=calibration.report | {"direction_std_deg": [5.0, 5.0, 5.0]})
-    pinned, unpinned = (vts.DepthPipeline.from_calibration(c, confidence=True)(camera(1)) for c in (calibration, loose))
+    pinned, unpinned = (vts.ConfidentPipeline.from_calibration(c)(camera(1)) for c in (calibration, loose))
     steep = (pinned.gradient.norm(dim=1, keepdim=True) > 0.3) & pinned.contact
     assert float((unpinned.normal_95_deg / pinned.normal_95_deg)[steep].median()) > 1.3
     assert float((unpinned.depth_95_mm / pinned.depth_95_mm)[steep].median()) > 1.3
@@ -171,7 +169,7 @@ def test_loosely_pinned_lights_widen_the_bounds(ring):
 def test_the_held_out_error_of_presses_sets_the_bounds():
     def bound(**said):
         calibration, frames = response_unit(**said)
-        out = vts.DepthPipeline.from_calibration(calibration, "precise", confidence=True)(frames[:1])
+        out = vts.ConfidentPipeline.from_calibration(calibration, "precise")(frames[:1])
         return float(out.factors_deg[:, FACTORS.index("model")][out.contact[:, 0]].median())
 
     good, bad, few = bound(held_out_deg=1.0), bound(held_out_deg=4.0), bound(held_out_deg=1.0, presses=3)
@@ -183,7 +181,7 @@ def test_no_contact(ring):
     calibration, scene, _ = lights_unit(ring)
     image = scenes.render(scenes.at_rest(scene), ring(), noise_std=0.004, seed=9)
     for mode in ("fast", "precise", "auto"):
-        out = vts.DepthPipeline.from_calibration(calibration, mode, confidence=True)(image)
+        out = vts.ConfidentPipeline.from_calibration(calibration, mode)(image)
         assert not bool(out.contact.any()) and out.frame_confidence.tolist() == [1.0]
         assert bool(torch.isfinite(out.normal_95_deg).all()) and float(out.depth_95_mm.max()) < PITCH
 
@@ -197,7 +195,7 @@ def made(request, ring):
         frames = torch.cat([camera(1), camera(2, 0.02), rest, camera(3)])
     else:
         calibration, frames = response_unit()
-    return calibration, mode, vts.DepthPipeline.from_calibration(calibration, mode, confidence=True), frames
+    return calibration, mode, vts.ConfidentPipeline.from_calibration(calibration, mode), frames
 
 
 def test_the_first_four_fields_are_those_of_the_pipeline(made):
@@ -225,7 +223,7 @@ def test_it_scripts_and_pickles_and_keeps_its_state(made):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         scripted = torch.jit.script(copy.deepcopy(pipe))
-    other = vts.DepthPipeline.from_calibration(calibration, mode, confidence=True)
+    other = vts.ConfidentPipeline.from_calibration(calibration, mode)
     buffer = io.BytesIO()
     torch.save(pipe.state_dict(), buffer)
     buffer.seek(0)
@@ -250,13 +248,13 @@ def test_a_calibration_read_from_its_file_tells_the_same(ring, tmp_path):
     for calibration, frames in ((lights_unit(ring)[0], lights_unit(ring)[2](1)), response_unit()):
         calibration.save(tmp_path / "unit.safetensors")
         read = vts.Calibration.load(tmp_path / "unit.safetensors")
-        now, then = (vts.DepthPipeline.from_calibration(c, confidence=True)(frames) for c in (calibration, read))
+        now, then = (vts.ConfidentPipeline.from_calibration(c)(frames) for c in (calibration, read))
         assert torch.allclose(now.normal_95_deg, then.normal_95_deg, rtol=1e-3)
 
 
 def test_of_a_learned_module_nothing_is_known(ring):
     with pytest.raises(TypeError, match="normals: expected the calibrated NormalFromIntensity, got Conv2d"):
-        vts.DepthPipeline.from_calibration(lights_unit(ring)[0], normals=nn.Conv2d(3, 3, 1), confidence=True)
+        vts.ConfidentPipeline.from_calibration(lights_unit(ring)[0], normals=nn.Conv2d(3, 3, 1))
 
 
 def test_coverage_says_what_is_missing(ring):
@@ -265,7 +263,7 @@ def test_coverage_says_what_is_missing(ring):
     with pytest.raises(ValueError, match="rows: expected at least one frame"):
         coverage.mean([])
     calibration, scene, camera = lights_unit(ring)
-    out = vts.DepthPipeline.from_calibration(calibration, confidence=True)(camera(1))
+    out = vts.ConfidentPipeline.from_calibration(calibration)(camera(1))
     with pytest.raises(ValueError, match="region: expected at least one pixel"):
         coverage.coverage(out, scene.depth_mm, scene.normal, torch.zeros_like(out.contact), 1.0)
 
@@ -286,7 +284,7 @@ def test_presses_of_a_real_sensor(data):
     learned = [dataclasses.replace(press, center_px=None, contact_radius_px=None) for press in presses[::4]]
     names = {press.name for press in learned}
     for calibration in (vts.calibrate(background, sensor), vts.calibrate(background, sensor.without_prior(), learned)):
-        pipe = vts.DepthPipeline.from_calibration(calibration, "precise", confidence=True)
+        pipe = vts.ConfidentPipeline.from_calibration(calibration, "precise")
         judged = [press for press in known if press.name not in names]
         rows = [coverage.of_press(pipe(p.image[None]), p, sensor.mm_per_pixel, pipe.confidence.spread) for p in judged]
         mean = coverage.mean(rows)

@@ -448,7 +448,11 @@ TABLE = {
         {"pipe": pipe(), "confidence": vts.Confidence.from_calibration(unit())},
         {"pipe": ["fast", None, unit()], "confidence": [True, None, unit()]},
     ),
-    "ConfidentPipeline.forward": forward(lambda: vts.DepthPipeline.from_calibration(unit(), confidence=True), 3, "images"),
+    "ConfidentPipeline.from_calibration": Entry(
+        {"calibration": unit(), "mode": "fast"},
+        {"calibration": OTHERS, "mode": ["quick", None], "normals": ["mine", torch.nn.Identity()], "integrate": ["mine"]},
+    ),
+    "ConfidentPipeline.forward": forward(lambda: vts.ConfidentPipeline.from_calibration(unit()), 3, "images"),
     "bound_at": Entry(
         {"bound_95": torch.ones(2), "level": 0.5, "spread": 1.0},
         {"bound_95": [1.0, None, np.ones(2)], "level": [0.0, 1.0, 95, NAN, "0.5", None], "spread": NUMBER},

@@ -147,10 +147,10 @@ class Confidence(nn.Module):
         propagation of noise through photometric stereo: Barsky and Petrou, Signal Processing 86(11), 2006; the rest is this
         project's, its constants measured on random scenes and on a GelSight Mini (docs/confidence.md).
     Example:
-        >>> from torchvts import DepthPipeline, PointLights, Sensor
+        >>> from torchvts import ConfidentPipeline, PointLights, Sensor
         >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
         >>> cal = Calibration.from_lights(lights, Sensor("rig", 48, 64, 0.5))
-        >>> out = DepthPipeline.from_calibration(cal, confidence=True)(cal.model_image[None])
+        >>> out = ConfidentPipeline.from_calibration(cal)(cal.model_image[None])
         >>> out.normal_95_deg.shape, out.frame_confidence
         (torch.Size([1, 1, 48, 64]), tensor([1.]))
     """

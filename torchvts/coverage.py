@@ -23,7 +23,7 @@ from .core.geometry import normal_from_gradient
 from .core.sensor import Sensor
 from .evaluate import ball_truth
 from .metrics import normal_angle_deg
-from .pipeline import ConfidentOutput, DepthPipeline
+from .pipeline import ConfidentOutput, ConfidentPipeline
 from .record import Calibration
 from .shading import PointLights
 
@@ -125,7 +125,7 @@ def of_scenes(seeds: Sequence[int], unit: str | None = None, progress: bool = Fa
     rows = []
     for seed in tqdm(seeds, desc=unit or "scenes", disable=not progress, leave=False):
         frame = random_frame(seed, unit)
-        pipe = DepthPipeline.from_calibration(frame.calibration, frame.mode, confidence=True)
+        pipe = ConfidentPipeline.from_calibration(frame.calibration, frame.mode)
         with torch.inference_mode():
             out = pipe(frame.image)
         if int(out.contact.sum()) >= 20:
@@ -158,7 +158,7 @@ def of_presses(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CalibrationWarning)
             calibration = calibrate(background, sensor, others)
-        pipe = DepthPipeline.from_calibration(calibration, mode, confidence=True)
+        pipe = ConfidentPipeline.from_calibration(calibration, mode)
         for press in presses[fold::folds]:
             if press.center_px is None or press.contact_radius_px is None:
                 continue
@@ -227,7 +227,7 @@ def figure(curves: Sequence[Coverage], seed: int = 1) -> Figure:
         panel.grid(alpha=0.3)
     panel.legend(loc="lower right", fontsize=8)
     frame = random_frame(seed, "lights known, background", "letters")
-    out = DepthPipeline.from_calibration(frame.calibration, "precise", confidence=True)(frame.image)
+    out = ConfidentPipeline.from_calibration(frame.calibration, "precise")(frame.image)
     angle = normal_angle_deg(out.normal, frame.scene.normal)
     depth_um = 1000.0 * (out.depth_mm - frame.scene.depth_mm).abs()[0, 0]
     maps: list[tuple[str, Tensor]] = [

@@ -1,6 +1,6 @@
 """Online: a calibration made into a chain of modules that turns images into depth."""
 
-from typing import Final, Literal, NamedTuple, overload
+from typing import Final, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -127,40 +127,10 @@ class DepthPipeline(nn.Module):
         self.coarse_normals = coarse(self.stride) if self.foresees and callable(coarse) else nn.Identity()
         self.coarse_integrate: nn.Module = PoissonRest(self.stride * mm_per_pixel) if self.foresees else nn.Identity()
 
-    @overload
     @classmethod
     def from_calibration(
-        cls,
-        calibration: Calibration,
-        mode: str = ...,
-        *,
-        normals: nn.Module | None = ...,
-        integrate: nn.Module | None = ...,
-        confidence: Literal[False] = ...,
-    ) -> "DepthPipeline": ...
-
-    @overload
-    @classmethod
-    def from_calibration(
-        cls,
-        calibration: Calibration,
-        mode: str = ...,
-        *,
-        normals: nn.Module | None = ...,
-        integrate: nn.Module | None = ...,
-        confidence: Literal[True],
-    ) -> "ConfidentPipeline": ...
-
-    @classmethod
-    def from_calibration(
-        cls,
-        calibration: Calibration,
-        mode: str = "fast",
-        *,
-        normals: nn.Module | None = None,
-        integrate: nn.Module | None = None,
-        confidence: bool = False,
-    ) -> "DepthPipeline | ConfidentPipeline":
+        cls, calibration: Calibration, mode: str = "fast", *, normals: nn.Module | None = None, integrate: nn.Module | None = None
+    ) -> "DepthPipeline":
         """The pipeline of a calibrated unit, in eval mode, its lights frozen (``requires_grad_(True)`` frees them).
 
         Args:
@@ -168,9 +138,8 @@ class DepthPipeline(nn.Module):
             mode: "fast", "precise" or "auto".
             normals, integrate: modules to put in place of the calibrated inverse model and PoissonRest. ``normals`` sees what
                 the calibrated model would: the image scaled to the light model's, or image / background for a response field.
-            confidence: give a :class:`ConfidentPipeline`, whose output tells how far it may be off too.
         Raises:
-            TypeError: no Calibration; or confidence of ``normals`` that are not the calibrated model.
+            TypeError: no Calibration.
         Example:
             >>> from torchvts import PointLights, Sensor
             >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
@@ -191,8 +160,7 @@ class DepthPipeline(nn.Module):
             GradientFromNormal(),
             integrate or PoissonRest(sensor.mm_per_pixel),
         )
-        pipe = cls(*modules, mm_per_pixel=sensor.mm_per_pixel, mode=mode)
-        return ConfidentPipeline(pipe, Confidence.from_calibration(calibration, normals)).eval() if confidence else pipe.eval()
+        return cls(*modules, mm_per_pixel=sensor.mm_per_pixel, mode=mode).eval()
 
     def forward(self, images: Tensor) -> DepthOutput:
         """(B, 3, H, W) images in [0, 1], R, G, B.
@@ -333,6 +301,18 @@ class ConfidentPipeline(nn.Module):
         check_record("confidence", confidence, Confidence, "Confidence.from_calibration makes one")
         self.pipe = pipe
         self.confidence = confidence
+
+    @classmethod
+    def from_calibration(
+        cls, calibration: Calibration, mode: str = "fast", *, normals: nn.Module | None = None, integrate: nn.Module | None = None
+    ) -> "ConfidentPipeline":
+        """As :meth:`DepthPipeline.from_calibration`.
+
+        Raises:
+            TypeError: no Calibration; or ``normals`` that are not the calibrated model.
+        """
+        pipe = DepthPipeline.from_calibration(calibration, mode, normals=normals, integrate=integrate)
+        return cls(pipe, Confidence.from_calibration(calibration, pipe.normals)).eval()
 
     def forward(self, images: Tensor) -> ConfidentOutput:
         """As :meth:`DepthPipeline.forward`."""

@@ -35,6 +35,7 @@ STYLES: dict[str, dict[str, Any]] = {
     "precise, plain inverse": {"color": "tab:purple", "lw": 1.4},
     "precise, blur 1 px": {"color": "tab:green", "lw": 1.4},
     "precise, cliffs": {"color": "saddlebrown", "lw": 1.4, "ls": "-."},
+    "auto, heights": {"color": "teal", "lw": 1.4, "ls": (0, (1, 1))},
     "precise, pinhole": {"color": "deeppink", "lw": 1.2, "ls": (0, (1, 2))},
     MASK: {"color": "black", "lw": 1.4, "marker": "o", "ms": 3},
 }

@@ -9,9 +9,10 @@ import pytest
 import torchvts as vts
 
 NAMES = [
-    "AdaptiveIntegration", "Calibration", "CalibrationWarning", "CliffIntegration", "Compensate", "Confidence", "ConfidentOutput",
-    "ConfidentPipeline", "ContactMask", "DepthOutput", "DepthPipeline", "Diagnosis", "FillMarkers", "Finding",
-    "GradientFromNormal", "LightFit", "NormalFromIntensity", "NormalFromLookup", "NormalFromMLP", "NormalFromResponse",
+    "AdaptiveIntegration", "Calibration", "CalibrationWarning", "CliffIntegration", "CliffPipeline", "Compensate", "Confidence",
+    "ConfidentOutput", "ConfidentPipeline", "ContactMask", "DepthOutput", "DepthPipeline", "Diagnosis", "FillMarkers", "Finding",
+    "GradientFromNormal", "HeightFromBrightness", "LightFit", "NormalFromIntensity", "NormalFromLookup", "NormalFromMLP",
+    "NormalFromResponse",
     "PerspectiveIntegration", "PointLights", "PoissonDCT", "PoissonDST", "PoissonRest", "Press", "Registration", "Sensor",
     "Touch", "bound_at", "calibrate", "contact_cloud", "depth_to_points", "diagnose", "divergence", "fill_markers",
     "find_markers", "fit_lights", "fit_mlp", "fit_prior", "gradient_from_normal", "gs_sdk", "integrate_cliffs",

@@ -175,6 +175,11 @@ GRADIENT = torch.zeros(1, 2, 8, 8)
 BAD_GRADIENT = [*batches(2), torch.zeros(1, 2, 1, 8)]
 BAD_MASKS = [torch.zeros(1, 1, 4, 4) > 0, torch.zeros(1, 1, 8, 8), torch.zeros(8, 8) > 0, "all", np.zeros((1, 1, 8, 8), bool)]
 BAD_WEIGHTS = [torch.ones(1, 1, 4, 4), torch.ones(8, 8), torch.ones(1, 1, 8, 8).bool(), "all", np.ones((1, 1, 8, 8))]
+KNOWN = {name: torch.ones(1, 1, 8, 8) for name in ("known_mm", "known_weight")}
+BAD_KNOWN = {
+    "known_mm": [*BAD_WEIGHTS, KNOWN["known_mm"] + NAN],
+    "known_weight": [*BAD_WEIGHTS, KNOWN["known_weight"] - 2.0, KNOWN["known_weight"] + INF],
+}
 
 TABLE = {
     "Calibration.from_lights": Entry(
@@ -391,9 +396,10 @@ TABLE = {
         },
     ),
     "CliffIntegration.solve": Entry(
-        {"gradient": GRADIENT, "contact": GRADIENT[:, :1] > 0, "weight": torch.ones(1, 1, 8, 8)},
-        {"gradient": BAD_GRADIENT, "contact": BAD_MASKS, "weight": BAD_WEIGHTS},
+        {"gradient": GRADIENT, "contact": GRADIENT[:, :1] > 0, "weight": torch.ones(1, 1, 8, 8), **KNOWN},
+        {"gradient": BAD_GRADIENT, "contact": BAD_MASKS, "weight": BAD_WEIGHTS, **BAD_KNOWN},
         lambda: vts.CliffIntegration().solve,
+        named={"known_mm": "known_mm", "known_weight": "known_weight|known_mm, known_weight"},
     ),
     "PerspectiveIntegration": Entry(
         {"mm_per_pixel": 1.0, "camera_height_mm": 30.0, "integrate": vts.PoissonRest()},
@@ -453,6 +459,51 @@ TABLE = {
         {"calibration": OTHERS, "mode": ["quick", None], "normals": ["mine", torch.nn.Identity()], "integrate": ["mine"]},
     ),
     "ConfidentPipeline.forward": forward(lambda: vts.ConfidentPipeline.from_calibration(unit()), 3, "images"),
+    "HeightFromBrightness": Entry(
+        {"lights": lights(), "noise_std": FLAT, "mm_per_pixel": 1.0, "misfit": 0.1, "full_above": FLAT},
+        {
+            "lights": [POSITION, None],
+            "noise_std": BAD_FLAT,
+            "mm_per_pixel": NUMBER,
+            "misfit": ["1", True, NAN, -1.0, [1.0]],
+            "full_above": [FLAT[None], FLAT[0], "255", FLAT.numpy()],
+        },
+    ),
+    "HeightFromBrightness.from_calibration": Entry({"calibration": unit()}, {"calibration": [*OTHERS, unit("response")]}),
+    **{
+        f"HeightFromBrightness.{name}": Entry(
+            {"compensated": torch.full_like(UP, 0.5), "normal": UP, "depth_mm": DEPTH, **dict.fromkeys(masks, DEPTH > 0)},
+            {
+                **{argument: batches(3) for argument in ("compensated", "normal")},
+                "depth_mm": batches(1),
+                **{mask: [DEPTH[0] > 0, (DEPTH > 0)[:, :, 1:], None, "all", DEPTH] for mask in masks},
+            },
+            lambda name=name: getattr(vts.HeightFromBrightness.from_calibration(unit()), name),
+        )
+        for name, masks in {"forward": ["contact"], "reach": ["contact", "apart"]}.items()
+    },
+    "CliffPipeline": Entry(
+        {
+            "pipe": pipe("precise"),
+            "heights": vts.HeightFromBrightness.from_calibration(unit()),
+            "cliffs": vts.CliffIntegration(PITCH),
+            "sure": 4.0,
+            "rounds": 3,
+        },
+        {
+            "pipe": ["precise", None, unit(), pipe("fast")],
+            "heights": [True, None, unit()],
+            "cliffs": ["mine", None, vts.PoissonRest(1.0)],
+            "sure": NUMBER,
+            "rounds": INTEGER,
+        },
+    ),
+    "CliffPipeline.from_calibration": Entry(
+        {"calibration": unit(), "mode": "auto"},
+        {"calibration": [*OTHERS, unit("response")], "mode": ["fast", "quick", None]},
+        named={"mode": "mode|pipe"},
+    ),
+    "CliffPipeline.forward": forward(lambda: vts.CliffPipeline.from_calibration(unit()), 3, "images"),
     "bound_at": Entry(
         {"bound_95": torch.ones(2), "level": 0.5, "spread": 1.0},
         {"bound_95": [1.0, None, np.ones(2)], "level": [0.0, 1.0, 95, NAN, "0.5", None], "spread": NUMBER},
@@ -651,8 +702,8 @@ TABLE = {
         },
     ),
     "integrate_cliffs": Entry(
-        {"gradient": GRADIENT, "mm_per_pixel": 1.0, "contact": GRADIENT[:, :1] > 0, "weight": torch.ones(1, 1, 8, 8)},
-        {"gradient": BAD_GRADIENT, "mm_per_pixel": NUMBER, "contact": BAD_MASKS, "weight": BAD_WEIGHTS},
+        {"gradient": GRADIENT, "mm_per_pixel": 1.0, "contact": GRADIENT[:, :1] > 0, "weight": torch.ones(1, 1, 8, 8), **KNOWN},
+        {"gradient": BAD_GRADIENT, "mm_per_pixel": NUMBER, "contact": BAD_MASKS, "weight": BAD_WEIGHTS, **BAD_KNOWN},
     ),
     "integrate_perspective": Entry(
         {"gradient": GRADIENT, "mm_per_pixel": 1.0, "camera_height_mm": 30.0},

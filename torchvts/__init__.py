@@ -11,6 +11,7 @@ from .core.files import read_image, write_image
 from .core.geometry import GradientFromNormal, depth_to_points, gradient_from_normal, normal_from_gradient
 from .core.sensor import Sensor, shipped_sensors
 from .diagnose import Diagnosis, Finding, diagnose
+from .heights import HeightFromBrightness
 from .integration import (
     AdaptiveIntegration,
     CliffIntegration,
@@ -27,7 +28,7 @@ from .integration import (
 )
 from .markers import FillMarkers, fill_markers, find_markers
 from .normals import NormalFromIntensity, NormalFromLookup, NormalFromMLP, NormalFromResponse, fit_mlp
-from .pipeline import ConfidentOutput, ConfidentPipeline, DepthOutput, DepthPipeline
+from .pipeline import CliffPipeline, ConfidentOutput, ConfidentPipeline, DepthOutput, DepthPipeline
 from .pose import Registration, contact_cloud, register_depth, register_points
 from .record import Calibration
 from .shading import PointLights, near_field_shading
@@ -37,6 +38,7 @@ __all__ = [
     "Calibration",
     "CalibrationWarning",
     "CliffIntegration",
+    "CliffPipeline",
     "Compensate",
     "Confidence",
     "ConfidentOutput",
@@ -48,6 +50,7 @@ __all__ = [
     "FillMarkers",
     "Finding",
     "GradientFromNormal",
+    "HeightFromBrightness",
     "LightFit",
     "NormalFromIntensity",
     "NormalFromLookup",

@@ -19,7 +19,8 @@ from .core.checks import (
     may_read_values,
 )
 from .core.geometry import GradientFromNormal, normal_from_gradient
-from .integration import PoissonRest
+from .heights import HeightFromBrightness, Heights
+from .integration import AdaptiveIntegration, CliffIntegration, PoissonRest
 from .normals import NormalFromIntensity, NormalFromResponse
 from .record import Calibration, check_calibration
 
@@ -328,6 +329,87 @@ class ConfidentPipeline(nn.Module):
             told.confidence,
             told.frame_confidence,
             told.factors_deg,
+        )
+
+
+class CliffPipeline(nn.Module):
+    """For scenes with cliffs, of units calibrated by lights: images (B, 3, H, W) to a :class:`DepthOutput`.
+
+    A pipeline with :class:`AdaptiveIntegration`. Where the brightness of a contact says that it stands higher than its slopes
+    have carried it, as a stamp with a flat top and upright walls does, it is set to the height that brightness tells
+    (:class:`~torchvts.heights.HeightFromBrightness`), its rim and its slopes are sought anew. Other frames stay as they are.
+
+    Args:
+        pipe: a pipeline whose normals take depth. heights: of the same unit. cliffs: integrates frames that brightness contradicts.
+        sure: standard deviations from which it does. rounds: times that slopes and heights are sought anew.
+    Source:
+        this project.
+    Example:
+        >>> from torchvts import PointLights, Sensor, scenes
+        >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
+        >>> cal = Calibration.from_lights(lights, Sensor("rig", 96, 128, 0.25))
+        >>> top = lambda x, y: torch.where((x.abs() < 5) & (y.abs() < 4), 1.0 + 0 * x, -1.0)
+        >>> image = scenes.render(scenes.surface(top, 96, 128, 0.25), lights)
+        >>> pipes = (DepthPipeline.from_calibration(cal, "precise"), CliffPipeline.from_calibration(cal))
+        >>> [round(float(pipe(image).depth_mm[0, 0, 48, 64]), 1) for pipe in pipes]
+        [0.0, 1.0]
+    """
+
+    def __init__(
+        self, pipe: DepthPipeline, heights: HeightFromBrightness, cliffs: CliffIntegration, sure: float = 4.0, rounds: int = 3
+    ) -> None:
+        super().__init__()
+        check_record("pipe", pipe, DepthPipeline, "DepthPipeline.from_calibration makes one")
+        check_record("heights", heights, HeightFromBrightness, "HeightFromBrightness.from_calibration makes one")
+        check_record("cliffs", cliffs, CliffIntegration)
+        if not pipe.refines:
+            raise ValueError("pipe: expected mode 'precise' or 'auto', got 'fast': slopes depend on the height")
+        self.pipe = pipe
+        self.heights = heights
+        self.cliffs = cliffs
+        self.sure = check_positive("sure", sure)
+        self.rounds = check_integer("rounds", rounds, 1)
+
+    @classmethod
+    def from_calibration(cls, calibration: Calibration, mode: str = "auto") -> "CliffPipeline":
+        """The pipeline of a unit calibrated by lights, in eval mode.
+
+        Args:
+            calibration: as :meth:`DepthPipeline.from_calibration` takes it.
+            mode: "auto", which levels lamps that have dimmed, or "precise".
+        Raises:
+            ValueError: a unit calibrated by response fields, which know nothing of distances to lights; mode "fast".
+            TypeError: no Calibration.
+        """
+        heights = HeightFromBrightness.from_calibration(calibration)
+        pitch = calibration.sensor.mm_per_pixel
+        pipe = DepthPipeline.from_calibration(calibration, mode, integrate=AdaptiveIntegration(pitch))
+        return cls(pipe, heights, CliffIntegration(pitch)).eval()
+
+    def forward(self, images: Tensor) -> DepthOutput:
+        """As :meth:`DepthPipeline.forward`."""
+        out: DepthOutput = self.pipe(images)
+        seen, depth, normal = self.pipe.compensate(images), out.depth_mm, out.normal
+        told: Heights = self.heights(seen, normal, depth, out.contact)
+        apart = told.lift_mm > self.sure * told.lift_std_mm  # lost walls only ever lower a contact
+        index = torch.where(apart.flatten(1).any(dim=1))[0]
+        if len(index) == 0:
+            return out
+        seen, contact, apart = seen[index], out.contact[index], apart[index]
+        depth = depth[index] + torch.where(apart, told.lift_mm[index], 0.0)
+        normal = self.pipe.normals(seen, depth)
+        contact, apart, depth = self.heights.reach(seen, normal, depth, contact, apart)  # depth loses its gradient: a start
+        for _ in range(self.rounds):
+            normal = self.pipe.normals(seen, depth)
+            told = self.heights(seen, normal, depth, contact)
+            gradient = self.pipe.gradient(normal) * contact
+            depth = self.cliffs.solve(gradient, contact, None, told.depth_mm, told.weight * apart).depth_mm
+        normal = normal_from_gradient(gradient)
+        return DepthOutput(
+            out.depth_mm.index_copy(0, index, depth),
+            out.gradient.index_copy(0, index, gradient),
+            out.normal.index_copy(0, index, normal),
+            out.contact.index_copy(0, index, contact),
         )
 
 

@@ -144,6 +144,13 @@ class Calibration:
         return (self.model_image / self.lit.clamp_min(1e-6)).clamp(1.0 / DEFECT_RATIO, DEFECT_RATIO)
 
     @property
+    def full_above(self) -> Tensor:
+        """(3, H, W), compensated intensity from which a channel counts as saturated: 99.5 % of what the camera can say."""
+        gain, offset = self.gain, self.offset
+        full: Tensor = (0.995**self.sensor.exponent) * (torch.ones_like(self.background) if gain is None else gain)
+        return full if offset is None else full + offset
+
+    @property
     def offset(self) -> Tensor | None:
         """(3, H, W), what is added after the gain: with a response field the pedestal, so that the skin at rest becomes 1; with
         lights minus the ambient light, through the gain."""

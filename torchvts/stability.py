@@ -24,7 +24,7 @@ from .gallery import DIALS, Case, Dial
 from .integration import AdaptiveIntegration, PerspectiveIntegration, PoissonDST
 from .metrics import depth_error, mask_iou, normal_angle_deg
 from .normals import NormalFromIntensity
-from .pipeline import DepthOutput, DepthPipeline
+from .pipeline import CliffPipeline, DepthOutput, DepthPipeline
 from .record import Calibration
 
 Method = Callable[[Tensor], DepthOutput]
@@ -98,6 +98,7 @@ METHODS: dict[str, Callable[[Calibration], Method]] = {
     "precise, plain inverse": _plain_inverse,
     "precise, blur 1 px": _blurred,
     "precise, cliffs": lambda c: DepthPipeline.from_calibration(c, "precise", integrate=AdaptiveIntegration(c.sensor.mm_per_pixel)),
+    "auto, heights": CliffPipeline.from_calibration,
     "precise, pinhole": _pinhole,
 }
 """Every method by name: from a calibration to what reconstructs an image."""

@@ -1,6 +1,6 @@
 """Floor 2: from gradient to depth."""
 
-from .cliffs import AdaptiveIntegration, CliffIntegration, CliffSolution, cliff_share, integrate_cliffs
+from .cliffs import AdaptiveIntegration, CliffIntegration, CliffSolution, cliff_share, integrate_cliffs, label_contacts
 from .perspective import PerspectiveIntegration, integrate_perspective
 from .poisson import PoissonDCT, PoissonDST, PoissonRest, divergence, poisson_dct, poisson_dst, poisson_rest
 
@@ -16,6 +16,7 @@ __all__ = [
     "divergence",
     "integrate_cliffs",
     "integrate_perspective",
+    "label_contacts",
     "poisson_dct",
     "poisson_dst",
     "poisson_rest",

@@ -42,7 +42,12 @@ class CliffSolution(NamedTuple):
 
 
 def integrate_cliffs(
-    gradient: Tensor, mm_per_pixel: float = 1.0, contact: Tensor | None = None, weight: Tensor | None = None
+    gradient: Tensor,
+    mm_per_pixel: float = 1.0,
+    contact: Tensor | None = None,
+    weight: Tensor | None = None,
+    known_mm: Tensor | None = None,
+    known_weight: Tensor | None = None,
 ) -> Tensor:
     r"""Integrate a gradient map into depth that may have cliffs, zero where the skin is at rest.
 
@@ -58,7 +63,8 @@ def integrate_cliffs(
     Each solve is by conjugate gradients without a matrix, from the depth so far, the cosine solver of :func:`poisson_dct` as
     preconditioner. Differentiable with the weights held constant.
 
-    What slopes cannot tell remains untold: a flat piece with cliffs all around has no height, and is left at rest's.
+    What slopes cannot tell remains untold: a flat piece with cliffs all around has no height, and is left at rest's, unless
+    depths known from elsewhere say more (``known_mm``): a contact that has such stands where they say, not where its rim does.
 
     Args:
         gradient: (B, 2, H, W), (dz/dx, dz/dy), mm per mm.
@@ -67,10 +73,13 @@ def integrate_cliffs(
             them. Rest that does not reach the image border (a hole) counts as contact, unless none does.
         weight: (B, 1, H, W) in [0, 1], how far each pixel's slope is to be trusted; 0 for missing: bridged as by a membrane.
             None for 1.
+        known_mm: (B, 1, H, W), depth of pixels as known from elsewhere, mm. known_weight: (B, 1, H, W), at least 0, how much each
+            counts beside the others of its contact. All of a contact together weigh as one edge between two flat pixels: they
+            say how high it stands, slopes what shape it has. Both or neither.
     Returns:
         Depth in mm, (B, 1, H, W). Without any pixel at rest, the lowest depth is zero.
     Raises:
-        ValueError: wrong shape, or H or W below 2. TypeError: not floating point.
+        ValueError: wrong shape, or H or W below 2, or one of two arguments that go together. TypeError: not floating point.
     Source:
         Holland and Welsch, Communications in Statistics 6(9), 1977, for the weights (Cauchy's); Queau, Durou, Aujol,
         Variational methods for normal integration, JMIV 60, 2018, for edges that the others contradict. Variances, levelling
@@ -83,7 +92,7 @@ def integrate_cliffs(
         >>> [round(float(solve(roof)[0, 0, 4, 12]), 1) for solve in (integrate_cliffs, poisson_rest)]
         [7.7, 3.7]
     """
-    return CliffIntegration(mm_per_pixel).solve(gradient, contact, weight).depth_mm
+    return CliffIntegration(mm_per_pixel).solve(gradient, contact, weight, known_mm, known_weight).depth_mm
 
 
 class CliffIntegration(nn.Module):
@@ -131,7 +140,14 @@ class CliffIntegration(nn.Module):
             gradient = nn.functional.pad(gradient, [left, after, top, below])
         return self.solve(gradient).depth_mm
 
-    def solve(self, gradient: Tensor, contact: Tensor | None = None, weight: Tensor | None = None) -> CliffSolution:
+    def solve(
+        self,
+        gradient: Tensor,
+        contact: Tensor | None = None,
+        weight: Tensor | None = None,
+        known_mm: Tensor | None = None,
+        known_weight: Tensor | None = None,
+    ) -> CliffSolution:
         """Depth with its status; arguments as :func:`integrate_cliffs`."""
         check_gradient(gradient, 2)
         height, width = gradient.shape[2], gradient.shape[3]
@@ -143,22 +159,39 @@ class CliffIntegration(nn.Module):
                 kind = "bool: threshold it" if name == "contact" else "a number from 0 to 1: weight.float() of a mask"
                 raise TypeError(f"{name}: expected {kind.split(':')[0]}, got {value.dtype}:{kind.split(':')[1]}")
         trust = trust.to(gradient.dtype)
+        known = self._known(gradient, known_mm, known_weight)
         depths, status = [], []
-        for frame, mask, sure in zip(gradient.unsqueeze(1), touched.unsqueeze(1), trust.unsqueeze(1), strict=True):
-            contacts = _label(mask)
+        for frame, mask, sure, data in zip(*(each.unsqueeze(1) for each in (gradient, touched, trust, known)), strict=True):
+            contacts = label_contacts(mask)
             if not bool(contacts.any()):
                 depths.append(torch.zeros_like(sure) + 0.0 * frame[:, 0:1])
                 status.append((True, 0, 0))
                 continue
             top, bottom, left, right = _box(contacts[0, 0] > 0)
             part = (slice(None), slice(None), slice(top, bottom), slice(left, right))
-            depth, still, passes, iterations = self._solve_frame(frame[part], contacts[part], sure[part])
+            depth, still, passes, iterations = self._solve_frame(frame[part], contacts[part], sure[part], data[part])
             depths.append(nn.functional.pad(self.mm_per_pixel * depth, [left, width - right, top, height - bottom]))
             status.append((still, passes, iterations))
         columns = [torch.tensor(values, device=gradient.device) for values in zip(*status, strict=True)]
         return CliffSolution(torch.cat(depths), columns[0], columns[1], columns[2])
 
-    def _solve_frame(self, gradient: Tensor, contacts: Tensor, trust: Tensor) -> tuple[Tensor, bool, int, int]:
+    def _known(self, gradient: Tensor, known_mm: Tensor | None, known_weight: Tensor | None) -> Tensor:
+        """(B, 2, H, W): depth known from elsewhere, at unit pitch, and its weight."""
+        if known_mm is None or known_weight is None:
+            if known_mm is not None or known_weight is not None:
+                raise ValueError("known_mm, known_weight: expected both or neither, got one of them")
+            return torch.zeros_like(gradient)
+        for name, value in (("known_mm", known_mm), ("known_weight", known_weight)):
+            check_shape(name, value, (gradient.shape[0], 1, *gradient.shape[2:]), "gradient")
+            if not value.dtype.is_floating_point:
+                raise TypeError(f"{name}: expected floating point, got {value.dtype}: .float() converts it")
+            if not bool(torch.isfinite(value).all()):
+                raise ValueError(f"{name}: expected finite values, got NaN or infinite ones: give unknown pixels the weight 0")
+        if not bool((known_weight >= 0).all()):
+            raise ValueError(f"known_weight: expected values of at least 0, got {float(known_weight.min()):g}")
+        return torch.cat((known_mm / self.mm_per_pixel, known_weight), dim=1).to(gradient.dtype)
+
+    def _solve_frame(self, gradient: Tensor, contacts: Tensor, trust: Tensor, known: Tensor) -> tuple[Tensor, bool, int, int]:
         """Depth at unit pitch, whether it stood still, passes, conjugate-gradient steps."""
         free = contacts > 0
         covered = self._covered(gradient.detach(), free)
@@ -172,7 +205,9 @@ class CliffIntegration(nn.Module):
             bases.append(sure * self.slope_std**2 / variance)
             bridged.append(slopes[3 - dim] * (sure > 0))  # missing slopes count as zero, at the least weight: a membrane
         slopes = bridged
-        system = _System(free, gradient, self.max_iterations)
+        known_in = torch.bincount(contacts.flatten().long(), known[:, 1].flatten(), int(contacts.amax()) + 1).to(known.dtype)
+        pull = known[:, 1:2] / known_in.clamp_min(1e-12)[contacts.long()] * free
+        system = _System(free, gradient, known[:, 0:1], pull, self.max_iterations)
         with torch.no_grad():
             right = [slope.detach() for slope in slopes]
             cut = [
@@ -181,7 +216,8 @@ class CliffIntegration(nn.Module):
             ]
             start = solve_laplace(-_adjoint(*right), system.plan) * system.free
             depth = system.solve(cut, _adjoint(cut[0] * right[0], cut[1] * right[1]), start, 1e-2)
-            depth = self._level(depth, torch.where(covered, contacts, 0), right, variances, rims)
+            by_rim = torch.where(covered & (known_in[contacts.long()] == 0), contacts, 0)
+            depth = self._level(depth, by_rim, right, variances, rims)
             weights, passes, moved = bases, 0, float("inf")
             while passes < self.max_passes and moved > self.tolerance_px:
                 weights = []
@@ -302,18 +338,20 @@ class AdaptiveIntegration(nn.Module):
 
 
 class _System:
-    """Weighted sums of edges, solved for pixels that are free; the others are zero."""
+    """Weighted sums of edges, and depths that are known with some weight, solved for free pixels; the others are zero."""
 
-    def __init__(self, free: Tensor, like: Tensor, max_iterations: int) -> None:
+    def __init__(self, free: Tensor, like: Tensor, known: Tensor, pull: Tensor, max_iterations: int) -> None:
         self.free = free.to(like.dtype)
+        self.pull = pull
+        self.pulled = pull * known
         self.plan = laplace_plan(like)
         self.max_iterations = max_iterations
         self.iterations = 0
 
     def solve(self, weights: list[Tensor], right: Tensor, start: Tensor, tolerance: float) -> Tensor:
         """Preconditioned conjugate gradients, until the residual is below ``tolerance`` of the right-hand side, in the
-        preconditioner's norm."""
-        right = right * self.free
+        preconditioner's norm. The right-hand side is that of the edges."""
+        right = (right + self.pulled) * self.free
         depth = start * self.free
         residual = right - self._apply(weights, depth)
         search = towards = self._precondition(residual)
@@ -334,7 +372,7 @@ class _System:
 
     def _apply(self, weights: list[Tensor], depth: Tensor) -> Tensor:
         along_x, along_y = depth[..., 1:] - depth[..., :-1], depth[..., 1:, :] - depth[..., :-1, :]
-        return _adjoint(weights[0] * along_x, weights[1] * along_y) * self.free
+        return _adjoint(weights[0] * along_x, weights[1] * along_y) * self.free + self.pull * depth
 
     def _precondition(self, residual: Tensor) -> Tensor:
         return -solve_laplace(residual, self.plan) * self.free
@@ -351,7 +389,9 @@ class _Solve(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *of_depth: Tensor) -> tuple[Tensor, None, None, None]:
         start = torch.zeros_like(of_depth[0])
-        return ctx.system.solve(ctx.weights, of_depth[0], start, 1e-8) * ctx.system.free, None, None, None
+        system = ctx.system
+        of_edges = of_depth[0] - system.pulled  # solve adds what is known, which does not depend on the slopes
+        return system.solve(ctx.weights, of_edges, start, 1e-8) * system.free, None, None, None
 
 
 def _edges(gradient: Tensor, slope_std: float) -> tuple[list[Tensor], list[Tensor]]:
@@ -384,8 +424,8 @@ def _without_gaps(touched: Tensor) -> Tensor:
     return nn.functional.max_pool2d(-grown, 3, 1, 1) < 0
 
 
-def _label(touched: Tensor) -> Tensor:
-    """Contacts (1, 1, H, W) numbered from 1 on, int32; rest is 0. Holes belong to the contact around them."""
+def label_contacts(touched: Tensor) -> Tensor:
+    """Contacts of a bool mask (1, 1, H, W) numbered from 1 on, int32; rest is 0. Holes belong to the contact around them."""
     import cv2
 
     mask = touched[0, 0].cpu().numpy()

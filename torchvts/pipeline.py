@@ -349,7 +349,7 @@ class CliffPipeline(nn.Module):
         >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
         >>> cal = Calibration.from_lights(lights, Sensor("rig", 96, 128, 0.25))
         >>> top = lambda x, y: torch.where((x.abs() < 5) & (y.abs() < 4), 1.0 + 0 * x, -1.0)
-        >>> image = scenes.render(scenes.surface(top, 96, 128, 0.25), lights)
+        >>> image = scenes.render(scenes.surface(top, 96, 128, 0.25), lights).detach()
         >>> pipes = (DepthPipeline.from_calibration(cal, "precise"), CliffPipeline.from_calibration(cal))
         >>> [round(float(pipe(image).depth_mm[0, 0, 48, 64]), 1) for pipe in pipes]
         [0.0, 1.0]

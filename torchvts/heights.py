@@ -38,8 +38,11 @@ PIECES = 4
 """Contact and skin at rest are cut into so many rows and columns; how far the pieces differ tells how far they are wrong."""
 
 
-MOST_EVIDENCE = 40.0
-"""Of a pixel, doubled log odds: one that fits neither must not outvote its neighbours."""
+MOST_EVIDENCE, MOST_COMPANY = 40.0, 8.0
+"""Doubled log odds that a pixel may have by itself, and by its neighbours: they decide where it does not know."""
+
+MOST_MISFIT = 30.0
+"""Squared deviations, over three channels, from which a pixel is neither skin at rest nor top: it keeps its place."""
 
 
 class Heights(NamedTuple):
@@ -166,7 +169,8 @@ class HeightFromBrightness(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Contacts with cliffs all around, their rims sought again: a pixel belongs to what its brightness is nearer to.
 
-        That is the skin at rest, or the contact beside it, as high and as inclined as there. Steep pixels keep their place.
+        That is the skin at rest, or the contact beside it, as high and as inclined as there. Pixels that are steep, or like
+        neither, keep their place.
 
         Args:
             compensated, normal, depth_mm, contact: as for :meth:`forward`, the depth lifted. apart: bool (B, 1, H, W), the pixels
@@ -188,10 +192,14 @@ class HeightFromBrightness(nn.Module):
         up = torch.zeros_like(top)
         up[:, 2] = 1.0
         rest = self.lights(torch.zeros_like(depth_mm), up.to(depth_mm.dtype), self.mm_per_pixel).double()
-        nearer = ((image - rest) / noise).square() - ((image - top) / noise).square()  # log odds of top, doubled
-        evidence = blur(nearer.sum(1, keepdim=True).clamp(-MOST_EVIDENCE, MOST_EVIDENCE), [0.25, 0.5, 0.25]) > 0
+        seen, apart_by = (image - rest) / noise, (top - rest) / noise
+        square = apart_by.square().sum(1, keepdim=True).clamp_min(1e-12)
+        part = (seen * apart_by).sum(1, keepdim=True) / square  # 0 at rest, 1 on top, between for a pixel that sees both
+        own = (square * (2.0 * part - 1.0)).clamp(-MOST_EVIDENCE, MOST_EVIDENCE)  # log odds of top, doubled
+        evidence = own + blur(own, [0.25, 0.5, 0.25]).clamp(-MOST_COMPANY, MOST_COMPANY) > 0
+        neither = (seen - part.clamp(0.0, 1.0) * apart_by).square().sum(1, keepdim=True) > MOST_MISFIT
         local = around > 1e-3
-        candidates = torch.where(local & ~steep & (apart | ~contact), evidence, contact)
+        candidates = torch.where(local & ~steep & ~neither & (apart | ~contact), evidence, contact)
         found = reconstruct(contact & candidates, candidates)
         won = found & ~contact
         return found, (apart | won) & found, torch.where(won, beside[:, 0:1].to(depth_mm.dtype), depth_mm)

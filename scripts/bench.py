@@ -50,15 +50,17 @@ def main() -> None:
 
 def chart(rows: Sequence[bench.Row]) -> Figure:
     sensor = [row for row in rows if row.kind == "sensor"]
-    figure = Figure(figsize=(13.0, 4.8) if sensor else (9.0, 4.8), layout="constrained", dpi=110)
+    figure = Figure(figsize=(17.0, 4.8) if sensor else (13.0, 4.8), layout="constrained", dpi=110)
     FigureCanvasAgg(figure)
-    axes = figure.subplots(1, 3 if sensor else 2)
+    axes = figure.subplots(1, 4 if sensor else 3)
     scene = [r for r in rows if r.kind == "scene" and r.height == 480 and "press 1 mm" in r.data]
     errors_against_time(axes[0], scene, "rms_um", "depth RMS, um", "Exact scene, 640x480: ball pressed 1 mm")
     if sensor:
         errors_against_time(
             axes[1], sensor, "normal_deg", "normals off by, degrees", "GelSight Mini, 320x240: balls not learned from"
         )
+    stamps = [row for row in rows if row.kind == "cliff" and row.data.startswith("stamp")]
+    errors_against_time(axes[-2], stamps, "rms_um", "depth RMS, um", "Exact scene, 320x240: stamp with upright walls, 1 mm")
     cost(axes[-1], [r for r in rows if r.kind == "scene" and "press 1 mm" in r.data])
     figure.suptitle(f"{rows[0].machine}, {rows[0].threads} threads, one frame", fontsize=9)
     return figure

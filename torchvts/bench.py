@@ -25,12 +25,13 @@ from .core import gs_sdk
 from .core.geometry import normal_from_gradient
 from .core.sensor import Sensor
 from .evaluate import Training, score_press, training_pixels
-from .integration import PoissonDST, divergence
+from .gallery import roof, stamp
+from .integration import AdaptiveIntegration, PoissonDST, divergence
 from .metrics import depth_error, normal_angle_deg
 from .normals import NormalFromLookup, NormalFromMLP
-from .pipeline import MODES, DepthPipeline
+from .pipeline import MODES, CliffPipeline, DepthPipeline
 from .record import Calibration
-from .scenes import Scene, render, sphere_press
+from .scenes import Scene, render, sphere_press, surface
 from .shading import PointLights
 
 SIZES = ((120, 160), (240, 320), (480, 640), (960, 1280))
@@ -42,7 +43,8 @@ class Row:
     """One measurement; errors are those of the very frames that were timed, None where there is nothing to compare with.
 
     Attributes:
-        kind: "scene" (exact truth), "sensor" (balls on a real sensor), "stage" (part of a frame), "batch", "threads".
+        kind: "scene" (exact truth), "cliff" (the same, with walls), "sensor" (balls on a real sensor), "stage" (part of a frame),
+            "batch", "threads".
         method, data: names. ours: whether it is this library's, and not a peer's.
         height, width: pixels. batch, threads: as said. machine: kind, cores, torch.
         ms_median, ms_iqr: of one frame, milliseconds. frames_per_second: by the median.
@@ -149,7 +151,7 @@ class Bench:
 def run(command: str, progress: Callable[[str], None], data: Path | None) -> list[Row]:
     """All rows: exact scenes, a real sensor if ``data`` holds it, stages with their floors, batches and threads."""
     bench = Bench(command, progress)
-    rows = [*_scenes(bench), *_stages(bench), *_scaling(bench)]
+    rows = [*_scenes(bench), *_cliffs(bench), *_stages(bench), *_scaling(bench)]
     if data is not None and (data / "gelsight_mini_a").is_dir():
         rows += list(_sensor(bench, data))
     return rows
@@ -267,6 +269,28 @@ def _lookup_on_scenes(bench: Bench, calibration: Calibration, image: Tensor, sce
 def _errors(depth_mm: Tensor, normal: Tensor, scene: Scene) -> tuple[float, float, float]:
     error = depth_error(depth_mm, scene.depth_mm, scene.mm_per_pixel)
     return float(normal_angle_deg(normal, scene.normal, scene.contact).mean()), 1000.0 * error.rms_mm, error.max_px
+
+
+def _cliffs(bench: Bench) -> Iterator[Row]:
+    """What each robust variant costs and gains on walls: a roof with upright ends, a stamp."""
+    height, width = 240, 320
+    reliefs = {"roof, upright ends": roof(1.0, 0.4, 100.0, 9.0, 0.0, 0.0), "stamp, upright walls": stamp(3.5, 1.0, 100.0, 0.0, 0.0)}
+    for name, relief in reliefs.items():
+        calibration, _, ball = _rig(height, width, 1.0)
+        assert calibration.lights is not None
+        pitch = ball.mm_per_pixel
+        scene = surface(relief, height, width, pitch)
+        image = render(scene, calibration.lights, noise_std=0.003, bits=8).detach()
+        pipes = {
+            "precise": DepthPipeline.from_calibration(calibration, "precise"),
+            "precise, cliffs": DepthPipeline.from_calibration(calibration, "precise", integrate=AdaptiveIntegration(pitch)),
+            "auto, cliffs and heights": CliffPipeline.from_calibration(calibration),
+        }
+        for method, pipe in pipes.items():
+            with torch.inference_mode():
+                found = pipe(image)
+            errors = _errors(found.depth_mm, found.normal, scene)
+            yield bench.row("cliff", method, name, (height, width), partial(pipe, image), errors=errors)
 
 
 # parts of a frame, and how cost grows

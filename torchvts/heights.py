@@ -31,6 +31,9 @@ LEAST_PIXELS = 40
 MODEL_STD = 0.0015
 """Brightness that the light model gets wrong even where it fits the image at rest: TACTO's renders, over 1 to 2 mm."""
 
+UNSEEN_STD = 0.01
+"""How far lamps may have changed where no skin at rest is in sight to tell."""
+
 MISFIT_PART = 0.2
 """What part of the misfit at rest, which compensation takes out, comes back where the skin is pressed in."""
 
@@ -69,8 +72,8 @@ class HeightFromBrightness(nn.Module):
         misfit: what the lights leave of the image at rest, relative. full_above: (3, H, W), compensated intensity from which a
             channel counts as saturated; None for never.
     Source:
-        that the length of L(z)^-1 I tells of depth: near-light photometric stereo, Queau and others, JMIV 60(3), 2018; heights
-        of contacts and their uncertainty: this project.
+        that the length of L(z)^-1 I tells of depth: near lights, Queau, Durix, Wu, Cremers, Lauze, Durou, LED-based
+        photometric stereo, JMIV 60(3), 2018; heights of contacts, their deviation and their rims: this project.
     Example:
         >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
         >>> up = torch.tensor([0.0, 0.0, 1.0]).reshape(1, 3, 1, 1).expand(1, 3, 24, 32)
@@ -97,7 +100,7 @@ class HeightFromBrightness(nn.Module):
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         self.model_std = max(MODEL_STD, MISFIT_PART * misfit)
         self.smoothing_px = max(1.0, min(noise_std.shape[1], noise_std.shape[2]) / 60.0)
-        self.register_buffer("noise_std", noise_std.detach().clone())
+        self.register_buffer("noise_std", noise_std.detach().clamp_min(1e-6))
         full = torch.full_like(noise_std, torch.inf) if full_above is None else full_above.detach().clone()
         self.register_buffer("full_above", full)
 
@@ -155,7 +158,7 @@ class HeightFromBrightness(nn.Module):
         for frame in range(len(depth)):
             away = nn.functional.max_pool2d(contact[frame].to(image.dtype), 5, 1, 2)[0] == 0
             _, off = _by_pieces(away & lit[frame, 0], length[frame, 0] - 1.0, length_std[frame, 0].square().reciprocal())
-            model_std = math.hypot(self.model_std, float(off.square().mean().sqrt()) if len(off) > 0 else 0.0)
+            model_std = math.hypot(self.model_std, float(off.square().mean().sqrt()) if len(off) > 0 else UNSEEN_STD)
             label = label_contacts(contact[frame : frame + 1])[0, 0]
             for number in range(1, int(label.amax()) + 1):
                 mine = label == number

@@ -330,3 +330,24 @@ def test_defects_take_the_value_of_their_neighbours():
 def test_a_background_without_sound_pixels_is_refused():
     with pytest.raises(ValueError, match="defects: expected sound pixels"):
         vts.Compensate(defects=torch.ones(4, 4, dtype=torch.bool))
+
+
+@pytest.mark.parametrize("height_mm, out_mm, albedo", [(30.0, 25.0, 1000.0), (18.0, 22.0, 500.0), (15.0, 24.0, 450.0)])
+@pytest.mark.parametrize("noise_std", [0.002, 0.005])
+def test_a_dimmed_lamp_costs_nothing_on_rigs_that_saturate(height_mm, out_mm, albedo, noise_std):
+    angles = torch.deg2rad(torch.tensor([0.0, 120.0, 240.0]))
+    position = torch.stack((out_mm * angles.cos(), out_mm * angles.sin(), torch.full((3,), height_mm)), dim=1)
+    lights = vts.PointLights(position, [albedo] * 3)
+    scene = vts.scenes.sphere_press(10.0, 1.0, (0, 0), 120, 160, 0.25)
+    rest = vts.scenes.render(vts.scenes.at_rest(scene), lights, noise_std=noise_std, bits=8, seed=1)[0].detach()
+    assert float((rest > 0.98).any(dim=0).double().mean()) > 0.01
+    calibration = vts.Calibration.from_lights(lights, vts.Sensor("rig", 120, 160, 0.25), rest)
+    pipe = vts.DepthPipeline.from_calibration(calibration, "auto")
+    errors = []
+    for gain in (1.0, 0.9):
+        lamps = vts.PointLights(position, [albedo, gain * albedo, albedo])
+        with torch.inference_mode():
+            out = pipe(vts.scenes.render(scene, lamps, noise_std=noise_std, bits=8))
+        errors.append(vts.metrics.depth_error(out.depth_mm, scene.depth_mm, 0.25))
+    assert errors[1].rms_px < 1.3 * errors[0].rms_px
+    assert errors[1].max_px < 1.3 * errors[0].max_px

@@ -208,9 +208,13 @@ TABLE = {
             "level": True,
             "flat": FLAT,
             "noise_std": 0.01 * FLAT,
+            "beyond_full": FLAT,
+            "full_light": 0.99,
         },
         {
             "flat": BAD_FLAT[:-1],
+            "beyond_full": BAD_FLAT[:-1],
+            "full_light": NUMBER,
             "noise_std": BAD_FLAT[:-1],
             "gain": BAD_FLAT[:-1],
             "offset": BAD_FLAT[:-1],

@@ -30,6 +30,8 @@ class Compensate(nn.Module):
         flat: (3, H, W), what the compensated image is at rest. noise_std: (3, H, W), its noise.
         scatters: presses change the light of the whole skin a little, as on real sensors: then :func:`rest_level` up to its
             limit, and :func:`sure_level` beyond.
+        beyond_full: (3, H, W), what channels that are full at rest are taken for while they are full, 0 for the others.
+        full_light: linear light from which a channel is full.
     Source:
         eq. 8 of the paper for the offset.
     Example:
@@ -43,6 +45,7 @@ class Compensate(nn.Module):
     sound: Tensor
     rest: Tensor | None
     rest_noise: Tensor | None
+    beyond_full: Tensor | None
 
     def __init__(
         self,
@@ -56,6 +59,8 @@ class Compensate(nn.Module):
         flat: Tensor | None = None,
         noise_std: Tensor | None = None,
         scatters: bool = False,
+        beyond_full: Tensor | None = None,
+        full_light: float = 1.0,
     ) -> None:
         super().__init__()
         self.level = level
@@ -65,7 +70,13 @@ class Compensate(nn.Module):
         self.markers = nn.Identity() if markers is None else markers
         self.blur_px = float(blur_px) if blur_px == 0 else check_positive("blur_px", blur_px)
         self.gamma = check_positive("gamma", gamma)
-        for name, value in (("gain", gain), ("offset", offset), ("flat", flat), ("noise_std", noise_std)):
+        for name, value in (
+            ("gain", gain),
+            ("offset", offset),
+            ("flat", flat),
+            ("noise_std", noise_std),
+            ("beyond_full", beyond_full),
+        ):
             if value is not None:
                 check_field(name, value)
         if defects is not None:
@@ -86,6 +97,8 @@ class Compensate(nn.Module):
                 noise = noise / 3.0  # of a mean of nine
         self.register_buffer("rest", None if rest is None else rest.detach().clone())
         self.register_buffer("rest_noise", None if noise is None else noise.detach().clone())
+        self.register_buffer("beyond_full", None if beyond_full is None else beyond_full.detach().clone())
+        self.full_light = check_positive("full_light", full_light)
         self.register_buffer("defect", flat_index)
         self.register_buffer("sound", sound)
         self.weights = gaussian_weights(self.blur_px)
@@ -102,22 +115,29 @@ class Compensate(nn.Module):
         sensor = calibration.sensor
         parts = (calibration.gain, calibration.offset, sensor.exponent, calibration.defects, sensor.blur_px, calibration.markers)
         by_response = calibration.response is not None
+        full = (calibration.beyond_full, calibration.full_light)
         if not level:
-            return cls(*parts, by_response)
-        return cls(*parts, True, calibration.flat, calibration.compensated_noise_std, by_response)
+            return cls(*parts, by_response, None, None, False, *full)
+        return cls(*parts, True, calibration.flat, calibration.compensated_noise_std, by_response, *full)
 
     def forward(self, image: Tensor) -> Tensor:
         """(B, 3, H, W) image in [0, 1] to (B, 3, H, W) linear light."""
         check_batch("image", image, 3)
         image = self.markers(image)
         light = image if self.gamma == 1.0 else image.clamp_min(1e-6) ** self.gamma
-        gain, offset = self.gain, self.offset
+        gain, offset, beyond = self.gain, self.offset, self.beyond_full
+        unseen = torch.zeros(0, dtype=torch.bool)
+        if beyond is not None:
+            check_same_size("image", image, "the calibration", beyond.shape[1], beyond.shape[2])
+            unseen = (light >= self.full_light) & (beyond > 0)
         if gain is not None:
             check_same_size("image", image, "the calibration", gain.shape[1], gain.shape[2])
             light = light * gain
         if offset is not None:
             check_same_size("image", image, "the calibration", offset.shape[1], offset.shape[2])
             light = light + offset
+        if beyond is not None:
+            light = torch.where(unseen, beyond, light)
         if self.defect.shape[0] > 0:
             pixels = light.flatten(2)
             repaired = pixels[:, :, self.sound].mean(dim=3)  # (B, 3, N)
@@ -138,7 +158,7 @@ class Compensate(nn.Module):
         level = sure_level(_some_means(light.detach()), rest, noise)
         if may_read_values() and bool((level == 1.0).all()):
             return light
-        return light / level
+        return light / level if beyond is None else torch.where(unseen, beyond, light / level)
 
 
 def rest_level(ratio: Tensor, least: float = 0.01, most: float = 0.15) -> Tensor:

@@ -141,7 +141,29 @@ class Calibration:
             return None
         if self.response is not None:
             return 1.0 / (self.background + PEDESTAL)
-        return (self.model_image / self.lit.clamp_min(1e-6)).clamp(1.0 / DEFECT_RATIO, DEFECT_RATIO)
+        gain = (self.model_image / self.lit.clamp_min(1e-6)).clamp(1.0 / DEFECT_RATIO, DEFECT_RATIO)
+        full = self.beyond_full
+        if full is None:
+            return gain
+        usual = torch.stack([channel[beyond == 0].median() for channel, beyond in zip(gain, full, strict=True)])
+        return torch.where(full > 0, usual.nan_to_num(1.0)[:, None, None], gain)
+
+    @property
+    def full_light(self) -> float:
+        """Linear light from which a channel may be full: 99.5 % of what the camera can say, less its noise."""
+        return float(0.995**self.sensor.exponent) - 3.0 * float(self.light_noise_std.max())
+
+    @property
+    def beyond_full(self) -> Tensor | None:
+        """(3, H, W), what the lights give at rest where that is more than the camera can tell, 0 elsewhere; None if nowhere.
+
+        How bright the skin is there was not measured, so the usual gain of the channel stands for that of these pixels.
+        """
+        if not self.measured or self.lights is None:
+            return None
+        model = self.model_image
+        beyond = torch.where((self.background >= self.full_light) & (model >= self.full_light), model, 0.0)
+        return beyond if bool((beyond > 0).any()) else None
 
     @property
     def full_above(self) -> Tensor:

@@ -9,6 +9,7 @@ The first frames must be free of contact. Ctrl-C ends it and finishes what is wr
 
 import argparse
 import dataclasses
+import signal
 import sys
 import time
 from pathlib import Path
@@ -79,8 +80,17 @@ def play(
 ) -> None:
     """Every frame until the source ends, the window is closed, or Ctrl-C; what was dropped is shown by the next frame again."""
     shown = -1
+    asked: list[int] = []
+
+    def interrupt(number: int, _: object) -> None:
+        asked.append(number)  # the exception is lost where it meets a destructor or a callback
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, interrupt)
     try:
         for frame in stream:
+            if asked:
+                raise KeyboardInterrupt
             lines = report.add(frame)
             if overlay is not None:
                 with stream.stages.stage("draw"):
@@ -94,6 +104,8 @@ def play(
                     break
     except KeyboardInterrupt:
         print("interrupted: what came until now is kept")
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def with_corners(unit: vts.Sensor | vts.Calibration, text: str) -> vts.Sensor | vts.Calibration:

@@ -470,7 +470,7 @@ def test_bad_arguments_are_refused_in_a_sentence(video, tmp_path):
 def test_ended_in_the_middle(unit, tmp_path, end):
     calibration, camera = unit
     calibration.save(tmp_path / "unit.safetensors")
-    video = write_video(tmp_path / "long.avi", [camera() for _ in range(20)] * 15)  # ten seconds
+    video = write_video(tmp_path / "long.avi", [camera() for _ in range(20)] * 90)  # a minute: it is not over before it is ended
     command = script("--source", video, "--calibration", tmp_path / "unit.safetensors", "--out", tmp_path / "out", "--realtime")
     process = subprocess.Popen([*command, "--video", "avi"], stdout=subprocess.PIPE, cwd=ROOT, env=ENVIRONMENT, text=True)
     deadline = time.monotonic() + 60
@@ -484,7 +484,7 @@ def test_ended_in_the_middle(unit, tmp_path, end):
         return
     assert process.returncode == 0 and "interrupted" in output
     frames = len(list(read_frames(final)))
-    assert 0 < frames < 300
+    assert 0 < frames < 1800
     assert not list((tmp_path / "out").glob(".overlay*"))
     assert (tmp_path / "out" / "summary.json").is_file()
 

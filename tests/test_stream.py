@@ -46,15 +46,22 @@ def unit(ring, small_sensor, small_press):
     rest = vts.scenes.render(vts.scenes.at_rest(small_press()), lights)
     rendered = {0.0: rest} | {mm: vts.scenes.render(small_press(mm), lights) for mm in (0.5, 1.0)}
     calibration = vts.Calibration.from_lights(lights, small_sensor, vts.scenes.render(vts.scenes.at_rest(small_press()), lights)[0])
-    seeds = itertools.count()
+    taken = []
 
     def camera(press_mm=0.0, brightness=1.0, noise=0.004):
-        generator = np.random.default_rng(next(seeds))
+        generator = np.random.default_rng(len(taken))
+        taken.append(press_mm)
         image = rendered[press_mm][0].permute(1, 2, 0).flip(2).numpy() * brightness
         image = image + noise * generator.standard_normal(image.shape, dtype=np.float32)
         return (image.clip(0, 1) * 255 + 0.5).astype(np.uint8)
 
+    camera.restart = taken.clear
     return calibration, camera
+
+
+@pytest.fixture(autouse=True)
+def _the_same_noise_in_any_order_of_tests(unit):
+    unit[1].restart()
 
 
 def write_video(path, pictures, code="MJPG"):
@@ -69,6 +76,7 @@ def write_video(path, pictures, code="MJPG"):
 def video(unit, tmp_path_factory):
     """15 frames at rest, 10 pressed, 10 at rest."""
     _, camera = unit
+    camera.restart()
     pictures = [camera(1.0 if 15 <= k < 25 else 0.0) for k in range(35)]
     return write_video(tmp_path_factory.mktemp("video") / "press.avi", pictures)
 

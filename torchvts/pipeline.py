@@ -389,6 +389,8 @@ class CliffPipeline(nn.Module):
     def forward(self, images: Tensor) -> DepthOutput:
         """As :meth:`DepthPipeline.forward`."""
         out: DepthOutput = self.pipe(images)
+        if not bool(out.contact.any()):
+            return out
         seen, depth, normal = self.pipe.compensate(images), out.depth_mm, out.normal
         told: Heights = self.heights(seen, normal, depth, out.contact)
         apart = told.lift_mm > self.sure * told.lift_std_mm  # lost walls only ever lower a contact

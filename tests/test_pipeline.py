@@ -64,6 +64,20 @@ def test_a_blocked_light_leaves_a_fifth_of_the_error_of_the_plain_inverse(ring, 
     assert ours < 0.2 * metrics.depth_error(pipe(image).depth_mm, scene.depth_mm, PITCH).rms_px
 
 
+@pytest.mark.parametrize(
+    "out_mm, height_mm, press_mm, noise_std", [(26.0, 15.0, 2.0, 0.003), (30.0, 18.0, 2.0, 0.005), (22.0, 12.0, 1.5, 0.003)]
+)
+def test_of_two_slopes_that_fit_where_a_light_is_blocked_the_right_one_is_taken(ring, out_mm, height_mm, press_mm, noise_std):
+    """Walls near the plane of the other two lights, on whose sides two slopes look alike: the wrong ones leave 0.5 to 0.7."""
+    lights, scene = ring(out_mm, height_mm, rotation_deg=60.0, level=0.2), scenes.sphere_press(10.0, press_mm)
+    rest = scenes.render(scenes.at_rest(scene), lights, noise_std=noise_std, bits=8, seed=1)[0]
+    image = scenes.render(scene, lights, noise_std=noise_std, bits=8, seed=2)
+    pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, FULL, rest), "precise")
+    ours = metrics.depth_error(pipe(image).depth_mm, scene.depth_mm, PITCH).rms_px
+    pipe.normals.dark_where.fill_(-torch.inf)
+    assert ours < 0.2 * metrics.depth_error(pipe(image).depth_mm, scene.depth_mm, PITCH).rms_px
+
+
 def dimmed(lights, factors):
     return vts.PointLights(lights.position_mm, lights.albedo * torch.tensor(factors)).requires_grad_(False)
 

@@ -22,6 +22,7 @@ from .core.geometry import GradientFromNormal, normal_from_gradient
 from .heights import HeightFromBrightness, Heights
 from .integration import AdaptiveIntegration, CliffIntegration, PoissonRest
 from .normals import NormalFromIntensity, NormalFromResponse
+from .normals.photometric import extrapolated_slope, slope_of_depth
 from .record import Calibration, check_calibration
 
 MODES = ("fast", "precise", "auto")
@@ -70,7 +71,8 @@ class DepthPipeline(nn.Module):
             normals (B, 3, H, W); one that sets ``uses_depth = True`` takes a second argument, the depth or None, and one
             that has ``coarse(stride)``, itself for every stride-th pixel, lets ``auto`` foresee; ``passes`` bounds the loop.
             If normals and integrate set ``takes_window = True``, normals takes a third argument, the window's (top, left),
-            and integrate takes that and the image's (height, width) after the gradient.
+            and integrate takes that and the image's (height, width) after the gradient. One that also has
+            ``blocked(compensated, window)`` takes as a fourth the slopes (B, 2, H, W) expected where that is true.
         mm_per_pixel: pixel pitch, mm. mode: "fast", "precise" or "auto".
         tolerance_px, worth_px: pixels of pitch. max_passes: bound of the precise loop.
     Source:
@@ -80,6 +82,7 @@ class DepthPipeline(nn.Module):
     refines: Final[bool]
     skips: Final[bool]
     foresees: Final[bool]
+    expects: Final[bool]
     windows: Final[bool]
     stride: Final[int] = 8  # auto foresees on every so many pixels, and windows begin at such
 
@@ -123,6 +126,7 @@ class DepthPipeline(nn.Module):
         self.refines = uses_depth and mode != "fast"
         self.skips = mode == "auto"
         self.windows = bool(getattr(normals, "takes_window", False)) and bool(getattr(integrate, "takes_window", False))
+        self.expects = self.refines and self.windows and callable(getattr(normals, "blocked", None))
         coarse = getattr(normals, "coarse", None)
         self.foresees = self.skips and self.refines and self.windows and callable(coarse)
         self.coarse_normals = coarse(self.stride) if self.foresees and callable(coarse) else nn.Identity()
@@ -189,6 +193,8 @@ class DepthPipeline(nn.Module):
             active = torch.ones(images.shape[0], dtype=torch.bool, device=images.device)
             if self.foresees and min(height, width) > self.stride + self.stride // 2:  # else its grid has one pixel a line
                 active = self._foreseen_px(seen, touched, gradient, depth, (top, left)) > self.worth_px
+            if self.expects:
+                gradient, depth = self._guess_again(seen, touched, gradient, depth, active, (top, left))
             gradient, depth = self._refine(seen, touched, gradient, depth, active, (top, left))
         normal = normal_from_gradient(gradient)
         if bottom - top < height or right - left < width:
@@ -212,6 +218,28 @@ class DepthPipeline(nn.Module):
     def _normals_at(self, seen: Tensor, depth: Tensor) -> Tensor:
         normal: Tensor = self.normals(seen, depth) if self.refines else self.normals(seen)
         return normal
+
+    def _guess_again(
+        self, seen: Tensor, touched: Tensor, gradient: Tensor, depth: Tensor, active: Tensor, window: tuple[int, int]
+    ) -> tuple[Tensor, Tensor]:
+        """Where a light is blocked, two slopes may fit: those near the plain inverse's, and those that the contact's lit pixels
+        foretell. Each frame goes on with the ones that its depth contradicts less."""
+        blocked: Tensor = self.normals.blocked(seen, window) & touched  # type: ignore[operator]
+        active = active & blocked.flatten(1).any(dim=1)
+        if may_read_values() and not bool(active.any()):
+            return gradient, depth
+        height, width = depth.shape[2], depth.shape[3]
+        top, left = window
+        expected = extrapolated_slope(gradient, touched & ~blocked, max(1, min(height, width) // 30), top, left)
+        other = self.gradient(self.normals(seen, None, window, expected)) * _as_factor(touched, seen)
+        found = self.integrate(other, window, (height, width))
+        misfits = []
+        for slope, z in ((gradient, depth), (other, found)):
+            part = z[:, :, top : top + seen.shape[2], left : left + seen.shape[3]]
+            apart = (slope_of_depth(part, self.mm_per_pixel) - slope) * _as_factor(touched, seen)
+            misfits.append(nn.functional.avg_pool2d(apart, 9, 1, 4).square().sum(dim=(1, 2, 3)))
+        better = (active & (misfits[1] < misfits[0]))[:, None, None, None]
+        return torch.where(better, other, gradient), torch.where(better, found, depth)
 
     def _refine(
         self, seen: Tensor, touched: Tensor, gradient: Tensor, depth: Tensor, active: Tensor, window: tuple[int, int]

@@ -12,7 +12,9 @@ import sys
 from itertools import islice
 from pathlib import Path
 
-from torchvts.dataset import CLOUD_FORMATS, DEPTH_FORMATS, PICTURES_UP_TO, Report, reconstruct_dataset
+import torchvts as vts
+from torchvts.core.files import read_frames
+from torchvts.dataset import CLOUD_FORMATS, DEPTH_FORMATS, PICTURES_UP_TO, Report, list_items, reconstruct_dataset
 from torchvts.pipeline import MODES
 
 
@@ -55,6 +57,8 @@ def main() -> int:
     if report.rank > 0:
         return 0
     print_report(report, arguments.out)
+    for symptom in symptoms(arguments.calibration, arguments.source):
+        print(f"first frame: {symptom}")
     return 1 if report.failed else 0
 
 
@@ -77,6 +81,18 @@ def print_report(report: Report, out: Path) -> None:
             print(f"| {name} | {reason} |")
         print(f"{len(report.failed)} left out, all of them in {out / 'failed.csv'}")
     print(f"wrote {report.rows} frames to {out}")
+
+
+def symptoms(calibration: Path, source: Path) -> list[vts.Finding]:
+    """What is wrong with the first frame, such as that it is another unit's; that it cannot be read is told above."""
+    unit = vts.Calibration.load(calibration)
+    try:
+        first = next(list_items(source))
+        _, image = next(iter(read_frames(source / first.path if source.is_dir() else source)))
+        found = vts.diagnose(None, unit.sensor.rectify(image[None])[0], unit)
+    except (OSError, ValueError, StopIteration):
+        return []
+    return [finding for finding in found if finding.severity != "note"]
 
 
 if __name__ == "__main__":

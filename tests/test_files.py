@@ -61,6 +61,8 @@ def test_what_is_no_image_is_refused(tmp_path, content):
 
 
 def test_a_missing_image_is_said_to_be_missing(tmp_path):
+    with pytest.raises(FileNotFoundError, match="expected an image, got a folder"):
+        vts.read_image(tmp_path)
     with pytest.raises(FileNotFoundError, match=r"nowhere\.png: no such image"):
         vts.read_image(tmp_path / "nowhere.png")
 

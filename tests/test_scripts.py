@@ -49,6 +49,16 @@ def test_reconstruct_writes_depth_pictures_and_table(images, calibration, tmp_pa
         assert (read_depth_png(tmp_path / f"{k}_depth.png") - scene.depth_mm).abs().max() < 0.25 * 0.25
 
 
+def test_reconstruct_tells_what_is_wrong_with_the_first_frame(images, calibration, tmp_path):
+    folder, _ = images
+    sound = call("scripts/reconstruct.py", calibration, folder / "presses", "--out", tmp_path / "sound")
+    image = vts.read_image(folder / "presses" / "0.png") * torch.tensor([1.0, 0.85, 1.0])[:, None, None]
+    vts.write_image(tmp_path / "dimmed.png", image)
+    dimmed = call("scripts/reconstruct.py", calibration, tmp_path / "dimmed.png", "--out", tmp_path / "out")
+    assert sound.returncode == dimmed.returncode == 0, sound.stderr + dimmed.stderr
+    assert "first frame" not in sound.stdout and "first frame: fault: green channel 15" in dimmed.stdout
+
+
 def test_reconstruct_writes_clouds(images, calibration, tmp_path):
     try:
         from torchvts.pose import read_point_cloud

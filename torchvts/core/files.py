@@ -70,6 +70,15 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def _image_path(path: str | Path) -> Path:
+    path = check_path("path", path)
+    if path.is_dir():
+        raise FileNotFoundError(f"{path}: expected an image, got a folder: name one of its files")
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such image")
+    return path
+
+
 def read_image(path: str | Path) -> Tensor:
     """Read an image file as (3, H, W) float32 in [0, 1], channels R, G, B; 8 and 16 bits.
 
@@ -78,9 +87,7 @@ def read_image(path: str | Path) -> Tensor:
     """
     import cv2
 
-    path = check_path("path", path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such image")
+    path = _image_path(path)
     pixels = decode_image(path, cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise ValueError(f"{path}: not an image, or cut short")
@@ -207,9 +214,7 @@ def read_depth_png(path: str | Path) -> Tensor:
     """Read what :func:`write_depth_png` wrote: (1, 1, H, W), mm."""
     import cv2
 
-    path = check_path("path", path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such image")
+    path = _image_path(path)
     pixels = decode_image(path, cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 2:
         raise ValueError(f"{path}: expected a 16-bit grey PNG with depth")

@@ -176,7 +176,7 @@ def rest_level(ratio: Tensor, least: float = 0.01, most: float = 0.15) -> Tensor
     Source:
         the half-sample mode: Bickel and Fruhwirth, Computational Statistics and Data Analysis 50(12), 2006.
     """
-    drift = _mode(_some(ratio.detach())).clamp(-most, most)  # (B, 3)
+    drift = _mode(_sorted(_some(ratio.detach()).flatten(2))).clamp(-most, most)  # (B, 3)
     weight = (drift.abs().amax(dim=1, keepdim=True) / least - 1.0).clamp(0.0, 1.0)
     return (1.0 + weight * drift)[..., None, None]
 
@@ -204,7 +204,10 @@ def sure_level(light: Tensor, flat: Tensor, noise_std: Tensor, least: float = 0.
     flat = flat.clamp_min(1e-6)
     ratio = light.detach() / flat
     variance = (noise_std / flat) ** 2 + least**2
-    level = (1.0 + _mode(ratio))[..., None, None]
+    pixels = _sorted(ratio.flatten(2))
+    if may_read_values() and bool(((pixels[:, :, pixels.shape[2] // 2] - 1.0).abs() < 0.5 * least).all()):
+        return torch.ones_like(ratio[:, :, :1, :1])  # a lamp that drifts takes the middle of all pixels along
+    level = (1.0 + _mode(pixels))[..., None, None]
     for _ in range(2):
         chi = ((ratio - level) ** 2 / variance).sum(dim=1, keepdim=True)
         weight = torch.exp(-0.5 * chi) / variance
@@ -238,9 +241,8 @@ def _some(image: Tensor) -> Tensor:
     return image[:, :, stride // 2 :: stride, stride // 2 :: stride]
 
 
-def _mode(ratio: Tensor) -> Tensor:
-    """Half-sample mode of each channel of (B, 3, h, w), less 1: (B, 3)."""
-    pixels = _sorted(ratio.flatten(2))
+def _mode(pixels: Tensor) -> Tensor:
+    """Half-sample mode of each channel of (B, 3, N), sorted, less 1: (B, 3)."""
     for _ in range(4):
         half = (pixels.shape[2] + 1) // 2
         width = pixels[:, :, half - 1 :] - pixels[:, :, : pixels.shape[2] - half + 1]

@@ -92,7 +92,8 @@ def test_auto_levels_lamps_that_have_dimmed(ring, small_sensor, small_press, fac
     before = scenes.render(scene, lights, noise_std=0.004, bits=8, seed=2)
     after = scenes.render(scene, dimmed(lights, factors), noise_std=0.004, bits=8, seed=2)
     auto, precise = (vts.DepthPipeline.from_calibration(calibration, mode) for mode in ("auto", "precise"))
-    assert torch.equal(auto(before).depth_mm, precise(before).depth_mm)  # undisturbed, it is left alone
+    again = (auto(before).depth_mm - precise(before).depth_mm).abs().max() / small_sensor.mm_per_pixel
+    assert again < auto.worth_px  # undisturbed, it is left alone
     undisturbed, left, levelled = (
         metrics.depth_error(pipe(image).depth_mm, scene.depth_mm, PITCH).rms_px
         for pipe, image in ((auto, before), (precise, after), (auto, after))
@@ -161,7 +162,7 @@ def test_auto_is_precise_where_worth_it_and_fast_where_not(mixed, small_sensor):
     gain_px = (precise - fast).abs().amax(dim=(1, 2, 3)) / small_sensor.mm_per_pixel
     assert (gain_px > 0.05).tolist() == [False, True, False, True]
     for k in (1, 3):
-        assert (auto[k] - precise[k]).abs().max() < 1e-6
+        assert (auto[k] - precise[k]).abs().max() < 0.05 * small_sensor.mm_per_pixel
     for k in (0, 2):
         assert (auto[k] - fast[k]).abs().max() < 1e-6
 

@@ -237,8 +237,8 @@ def _plan_dct(gradient: Tensor, height: int, width: int) -> list[Tensor]:
     order = [reordering(height).to(gradient.device), reordering(width).to(gradient.device)]
     if fft_is_fast(height) and fft_is_fast(width):
         kind = torch.complex128 if gradient.dtype == torch.float64 else torch.complex64
-        there, back, of_sum, of_difference, rows = cosine_tables(height, width)
-        tables = [there.to(kind), back.to(kind), of_sum.to(gradient.dtype), of_difference.to(gradient.dtype), rows]
+        there, back, of_sum, of_difference, back_y = cosine_tables(height, width)
+        tables = [there.to(kind), back.to(kind), of_sum.to(gradient.dtype), of_difference.to(gradient.dtype), back_y]
         return [table.to(gradient.device) for table in tables] + order
     even_y, odd_y, value_even_y, value_odd_y = cosine_bases(height)
     even_x, odd_x, value_even_x, value_odd_x = cosine_bases(width)
@@ -280,20 +280,17 @@ def _solve(right: Tensor, plan: list[Tensor]) -> Tensor:
 
 def _solve_by_fft(right: Tensor, plan: list[Tensor], top: int) -> Tensor:
     """The same as :func:`_solve` for the cosine family, by one real FFT there and one back; rows not given are zero."""
-    there, back, of_sum, of_difference, rows, order_y = plan[0], plan[1], plan[2], plan[3], plan[4], plan[5]
+    there, back, of_sum, of_difference, back_y, order_y = plan[0], plan[1], plan[2], plan[3], plan[4], plan[5]
     height, width = int(order_y.shape[0]), right.shape[-1]
-    lines = torch.fft.rfft(interleave(right))  # (B, 1, h, W // 2 + 1)
-    if lines.shape[2] == height:
-        lines = torch.cat((lines[:, :, ::2], lines[:, :, 1::2].flip(2)), dim=2)
-    else:
-        empty = lines.new_zeros([lines.shape[0], lines.shape[1], height, lines.shape[3]])
-        lines = empty.index_copy_(2, order_y.narrow(0, top, lines.shape[2]), lines)
-    spectrum = torch.fft.fft(lines, dim=2)
-    pairs = torch.view_as_real(spectrum.index_select(2, rows).unflatten(2, [2, height // 2 + 1]) * there)
-    up, down = pairs[:, :, 0], pairs[:, :, 1]
+    lines = torch.fft.rfft(interleave(right)).transpose(2, 3)  # (B, 1, W // 2 + 1, h): columns are contiguous from here on
+    empty = lines.new_zeros([lines.shape[0], lines.shape[1], lines.shape[2], height])
+    lines = empty.index_copy_(3, order_y.narrow(0, top, lines.shape[3]), lines)
+    spectrum = torch.fft.fft(lines)
+    up = torch.view_as_real(spectrum.narrow(3, 0, height // 2 + 1) * there[0])
+    down = torch.view_as_real(spectrum.index_select(3, back_y) * there[1])
     total, difference = (up + down) * of_sum, up - down
     up = torch.view_as_complex(torch.addcmul(total, difference, of_difference)) * back[0]
     down = torch.view_as_complex(torch.addcmul(total, difference, of_difference, value=-1.0)) * back[1]
-    spectrum = torch.cat((up, down[:, :, 1 : (height + 1) // 2].flip(2)), dim=2)
-    lines = torch.fft.irfft2(spectrum, s=(height, width))
+    spectrum = torch.cat((up, down[..., 1 : (height + 1) // 2].flip(3)), dim=3)
+    lines = torch.fft.irfft(torch.fft.ifft(spectrum), n=width, dim=2).transpose(2, 3)
     return deinterleave(lines.index_select(2, order_y))

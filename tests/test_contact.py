@@ -108,6 +108,41 @@ def test_items_of_a_batch_do_not_influence_one_another(ring, small_sensor, small
     assert torch.equal(block(frames), torch.cat([block(frame[None]) for frame in frames]))
 
 
+def any_frame(generator, flat, noise, count=3):
+    """Frames of noise with up to six contacts: discs, rings and boxes, faint or strong, some cut by the border, one everywhere."""
+    height, width = flat.shape[1:]
+    y, x = np.mgrid[:height, :width]
+    frames = np.repeat(flat.numpy()[None], count, axis=0)
+    for frame in frames:
+        for _ in range(generator.integers(0, 7)):
+            from_center = np.hypot(y - generator.uniform(0, height), x - generator.uniform(0, width))
+            if generator.random() < 0.3:
+                from_center = np.maximum(abs(y - generator.uniform(0, height)), abs(x - generator.uniform(0, width)))
+            radius = generator.uniform(1.0, 0.5 * min(height, width))
+            inside = (from_center < radius) & (from_center >= generator.choice([0.0, 0.5, 0.9]) * radius)
+            frame += inside * (noise * generator.choice([0.5, 2.0, 5.0, 20.0]) * generator.normal(size=(3, 1, 1)))
+        frame += 0.3 * (generator.random() < 0.05)
+        frame += noise * generator.choice([0.0, 0.5, 1.0, 3.0]) * generator.normal(size=frame.shape)
+    return torch.from_numpy(frames).to(flat.dtype)
+
+
+@pytest.mark.parametrize("size", [(240, 320), (243, 322), (480, 641), (161, 204), (160, 160), (120, 157), (81, 400), (12, 9)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_arrays_find_the_masks_that_tensors_find(monkeypatch, size, dtype):
+    generator = np.random.default_rng(size[1])
+    flat = torch.full((3, *size), 0.5, dtype=dtype)
+    touched = 0
+    for min_size_px, count in ((8.0, 6), (3.0, 1), (25.0, 1)):
+        block = vts.ContactMask(flat, torch.full((3,), 0.01, dtype=dtype), min_size_px=min_size_px)
+        frames = any_frame(generator, flat, 0.01, count)
+        mask, soft = block(frames), block.soft(frames)
+        with monkeypatch.context() as patch:
+            patch.setattr("torchvts.contact.may_use_arrays", lambda tensor: False)
+            assert torch.equal(mask, block(frames)) and torch.equal(soft, block.soft(frames))
+        touched += int(mask.flatten(1).any(dim=1).sum())
+    assert touched > 0 or min(size) < 20
+
+
 def spiral(n):
     """A path one pixel wide that winds inwards: the longest way a flood can be sent."""
     mask = np.zeros((n, n), dtype=bool)
@@ -195,6 +230,11 @@ def test_it_scripts_with_both_faces(soft_case):
     scripted = torch.jit.script(block)
     assert torch.equal(scripted(frame), block(frame))
     assert (scripted.soft(frame) - block.soft(frame)).abs().max() < 1e-6
+
+
+def test_it_compiles(soft_case):
+    block, frame = soft_case
+    assert torch.equal(torch.compile(block, backend="eager")(frame), block(frame))
 
 
 @pytest.mark.parametrize("options", [{"sigmas": 0}, {"sigmas": float("nan")}, {"min_size_px": -1.0}])

@@ -4,14 +4,26 @@ Fine pixels decide the rim; a grid of coarse cells decides what is a hole and wh
 """
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from .core.checks import QUANTISATION_STD, check_batch, check_field, check_positive, check_same_size, check_tensor, may_read_values
+from .core.checks import (
+    QUANTISATION_STD,
+    check_batch,
+    check_field,
+    check_positive,
+    check_same_size,
+    check_tensor,
+    may_read_values,
+    may_use_arrays,
+)
 from .core.noise import noise_std as frame_noise_std
 from .record import Calibration, check_calibration
+
+Array = np.ndarray[Any, Any]
 
 CELLS = 80
 """Cells along the shorter side of the image."""
@@ -34,25 +46,31 @@ def reconstruct(seed: Tensor, mask: Tensor) -> Tensor:
         >>> reconstruct(torch.tensor([[True, False, False, False]])[None, None], row).flatten().tolist()
         [True, True, False, False]
     """
-    if not torch.jit.is_scripting():  # noqa: SIM102
-        if may_read_values() and mask.device.type == "cpu":
-            return _reconstruct_by_labels(seed, mask)
+    if may_use_arrays(mask):
+        return _reconstruct_by_labels(seed, mask)
     return _reconstruct_by_sweeps(seed, mask)
 
 
 @torch.jit.unused
 def _reconstruct_by_labels(seed: Tensor, mask: Tensor) -> Tensor:
     """:func:`reconstruct` by OpenCV's connected components; on 80 x 107 cells 0.03 ms where sweeps take 0.28."""
-    import cv2
-
     reached = np.empty(mask.shape, np.bool_)
     for found, seeded, inside in zip(reached, seed.numpy(), mask.numpy(), strict=True):
-        count, label = cv2.connectedComponents(inside[0].view(np.uint8), connectivity=4)
-        kept = np.zeros(count, np.bool_)
-        kept[label[seeded[0]]] = True
-        kept[0] = False  # what is not in the mask
-        kept.take(label, out=found[0], mode="clip")
+        found[0] = _reach(seeded[0], inside[0])
     return torch.from_numpy(reached)
+
+
+def _reach(seed: Array, mask: Array) -> Array:
+    """:func:`reconstruct` of one image, (H, W) arrays of bool."""
+    import cv2
+
+    kind = cv2.CV_16U if mask.size < 2**17 - 8 else cv2.CV_32S  # every other pixel a label; labels of 16 bits wake no threads
+    count, label = cv2.connectedComponents(mask.view(np.uint8), connectivity=4, ltype=kind)
+    kept = np.zeros(count, np.bool_)
+    kept[label[seed]] = True
+    kept[0] = False  # what is not in the mask
+    reached: Array = kept[label]
+    return reached
 
 
 def _reconstruct_by_sweeps(seed: Tensor, mask: Tensor) -> Tensor:
@@ -223,8 +241,8 @@ class ContactMask(nn.Module):
         step = self.step
         bright = compensated.detach()[:, :, step // 2 :: step, step // 2 :: step].mean(dim=(2, 3))  # (B, 3)
         broken = bright < self.dead_below
-        broken = broken & (broken.to(torch.uint8).sum(dim=1, keepdim=True) == 1)
         if not may_read_values() or bool(broken.any()):
+            broken = broken & (broken.to(torch.uint8).sum(dim=1, keepdim=True) == 1)
             change = change * (~broken)[:, :, None, None].to(change.dtype)
         r, g, b = change[:, 0:1], change[:, 1:2], change[:, 2:3]
         squared = torch.addcmul(torch.addcmul(r * r, g, g), b, b)
@@ -235,6 +253,8 @@ class ContactMask(nn.Module):
         return change, squared, (self.sigmas * noise).square()[:, None, None, None]
 
     def _clean(self, change: Tensor, strong: Tensor, threshold: Tensor) -> tuple[Tensor, Tensor]:
+        if may_use_arrays(change):
+            return self._clean_by_arrays(change, strong, threshold)
         strong = _erode(_dilate(strong))  # closing: pixels lost to noise at the rim
         counted = strong.to(torch.uint8) if may_read_values() else strong.to(change.dtype)  # ONNX sums no bytes
         density = _cell_sums(counted, self.cell).to(change.dtype) / float(self.cell * self.cell)
@@ -258,6 +278,48 @@ class ContactMask(nn.Module):
         inner = self._to_pixels(interior)
         return (strong & self._to_pixels(kept)) | inner, inner
 
+    @torch.jit.unused
+    def _clean_by_arrays(self, change: Tensor, strong: Tensor, threshold: Tensor) -> tuple[Tensor, Tensor]:
+        """:meth:`_clean` by NumPy and OpenCV, to the same masks in half the time: 0.27 ms of 320 x 240 pixels, tensors 0.53."""
+        import cv2
+
+        fine = np.empty(strong.shape, np.uint8)
+        for seen, closed in zip(strong.numpy(), fine):
+            cv2.morphologyEx(seen[0].view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8), dst=closed[0])
+        area = float(self.cell * self.cell)
+        density = _column_sums(_line_sums(torch.from_numpy(fine), self.cell).numpy(), self.cell)[:, 0]
+        mean = _column_sums(_line_sums(change.detach(), self.cell).numpy(), self.cell) / area
+        density = density.astype(mean.dtype) / area
+        any_strong = density > 0
+        step = max(1, max(mean.shape[2], mean.shape[3]) // 40)
+        some = np.abs(mean[:, :, step // 2 :: step, step // 2 :: step]).reshape(*mean.shape[:2], -1)
+        middle = (some.shape[2] - 1) // 2
+        spread = np.partition(some, middle)[:, :, middle] / 0.6745
+        least = torch.sqrt(threshold[:, :, 0, 0]).numpy() / (self.sigmas * self.cell)
+        mean /= np.maximum(spread, least)[..., None, None]
+        mean *= mean
+        faint = (mean[:, 0] + mean[:, 1] + mean[:, 2] > 25.0) & ~any_strong
+        cells = any_strong | faint
+        mask, inner = np.zeros(strong.shape, np.bool_), np.zeros(strong.shape, np.bool_)
+        for k in np.flatnonzero(cells.any(axis=(1, 2))):
+            walled = np.zeros((cells.shape[1] + 2, cells.shape[2] + 2), np.uint8)
+            walled[1:-1, 1:-1] = cells[k]
+            cv2.floodFill(walled, None, (0, 0), 2)
+            filled = walled[1:-1, 1:-1] != 2
+            weight = density[k]
+            weight[filled & ~any_strong[k]] = 1.0
+            weight[faint[k]] = min(1.0, 0.4 * self.least_cells)
+            kept = _reach(filled & (_box_sum_of_array(weight, self.reach) > self.least_cells), filled)
+            interior = kept & (cv2.erode(filled.view(np.uint8), np.ones((3, 3), np.uint8)).view(np.bool_) | faint[k])
+            left, top, columns, rows = cv2.boundingRect(kept.view(np.uint8))
+            votes = (kept.view(np.uint8) + interior.view(np.uint8))[top : top + rows, left : left + columns]
+            votes = votes.repeat(self.cell, axis=1).repeat(self.cell, axis=0)  # 2 in the interior, which needs no strong pixel
+            here = (k, 0, slice(top * self.cell, (top + rows) * self.cell), slice(left * self.cell, (left + columns) * self.cell))
+            votes = votes[: mask[here].shape[0], : mask[here].shape[1]]  # the last cells reach beyond the image
+            np.greater(fine[here] + votes, 1, out=mask[here])
+            np.equal(votes, 2, out=inner[here])
+        return torch.from_numpy(mask), torch.from_numpy(inner)
+
     def _to_pixels(self, cells: Tensor) -> Tensor:
         return cells.index_select(3, self.cell_column).index_select(2, self.cell_row)
 
@@ -275,8 +337,26 @@ def _line_sums(image: Tensor, cell: int) -> Tensor:
         sums = sums + image[:, :, k:whole:cell]
     if whole == image.shape[2]:
         return sums
-    last = image[:, :, -cell:].sum(2, keepdim=True, dtype=image.dtype)
+    last = image[:, :, -cell : image.shape[2] - cell + 1]
+    for k in range(1, cell):
+        first = image.shape[2] - cell + k
+        last = last + image[:, :, first : first + 1]
     return torch.cat((sums, last), dim=2)
+
+
+def _column_sums(image: Array, cell: int) -> Array:
+    """:func:`_line_sums` along the columns of an array."""
+    width = image.shape[-1]
+    whole = width // cell * cell
+    sums = image[..., 0:whole:cell]
+    for k in range(1, cell):
+        sums = sums + image[..., k:whole:cell]
+    if whole == width:
+        return sums
+    last = image[..., -cell : width - cell + 1]
+    for k in range(width - cell + 1, width):
+        last = last + image[..., k : k + 1]
+    return np.concatenate((sums, last), axis=-1)
 
 
 def _box_sum(image: Tensor, reach: int, dim: int) -> Tensor:
@@ -286,4 +366,18 @@ def _box_sum(image: Tensor, reach: int, dim: int) -> Tensor:
     total = padded.narrow(dim, 0, length)
     for k in range(1, 2 * reach + 1):
         total = total + padded.narrow(dim, k, length)
+    return total
+
+
+def _box_sum_of_array(image: Array, reach: int) -> Array:
+    """:func:`_box_sum` along both dimensions of an (H, W) array."""
+    height, width = image.shape
+    padded = np.zeros((height + 2 * reach, width + 2 * reach), image.dtype)
+    padded[reach : reach + height, reach : reach + width] = image
+    rows = padded[0:height] + padded[1 : height + 1]
+    for k in range(2, 2 * reach + 1):
+        rows += padded[k : k + height]
+    total: Array = rows[:, 0:width] + rows[:, 1 : width + 1]
+    for k in range(2, 2 * reach + 1):
+        total += rows[:, k : k + width]
     return total

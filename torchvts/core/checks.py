@@ -129,6 +129,15 @@ def may_read_values() -> bool:
         return not torch.compiler.is_exporting()
 
 
+def may_use_arrays(tensor: Tensor) -> bool:
+    """Whether NumPy may stand in for operators on ``tensor``: on a CPU, where Python runs them one by one. Scripts."""
+    if torch.jit.is_scripting():
+        return False
+    else:  # noqa: RET505, TorchScript leaves out the other branch only so
+        half = tensor.dtype in (torch.float16, torch.bfloat16)  # of which NumPy knows one and makes other sums
+        return tensor.device.type == "cpu" and not half and not torch.compiler.is_compiling()
+
+
 def check_window(name: str, tensor: Tensor, size: tuple[int, int], window: tuple[int, int] | None) -> tuple[int, int]:
     """(top, left) of the part of an image of ``size`` that ``tensor`` is; without a window it must be all of it. Scripts."""
     if window is None:

@@ -2,8 +2,11 @@
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from .checks import may_use_arrays
 
 
 def noise_std(image: Tensor, samples: int = 8000) -> Tensor:
@@ -28,10 +31,19 @@ def noise_std(image: Tensor, samples: int = 8000) -> Tensor:
     rows = image[:, :, stride // 2 :: stride]
     left, middle, right = rows[..., :-2:stride], rows[..., 1:-1:stride], rows[..., 2::stride]
     second = (middle - 0.5 * (left + right)).abs().flatten(2)
-    std = 1.5 * second.median(dim=2, keepdim=True).values / 0.6745
+    std = 1.5 * _median(second) / 0.6745
     squared = second * second
     for _ in range(2):
         near = (second <= 3.0 * std).to(second.dtype)
         mean = (squared * near).sum(dim=2, keepdim=True) / near.sum(dim=2, keepdim=True).clamp_min(1.0)
         std = torch.sqrt(mean / 0.97334)  # mean of x^2 of a standard Gaussian x within three standard deviations
     return std[:, :, 0] / math.sqrt(1.5)
+
+
+def _median(values: Tensor) -> Tensor:
+    """Of the last dimension, the lower one of two; by NumPy where Python runs: 0.02 ms for 3 x 2,000 values, torch 0.07."""
+    if not torch.jit.is_scripting():  # noqa: SIM102
+        if may_use_arrays(values) and not values.requires_grad:
+            middle = (values.shape[-1] - 1) // 2
+            return torch.from_numpy(np.partition(values.numpy(), middle)[..., middle : middle + 1])
+    return values.median(dim=-1, keepdim=True).values

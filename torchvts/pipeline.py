@@ -17,6 +17,7 @@ from .core.checks import (
     check_range,
     check_record,
     may_read_values,
+    may_use_arrays,
 )
 from .core.geometry import GradientFromNormal, normal_from_gradient
 from .heights import HeightFromBrightness, Heights
@@ -198,10 +199,10 @@ class DepthPipeline(nn.Module):
             gradient, depth = self._refine(seen, touched, gradient, depth, active, (top, left))
         normal = normal_from_gradient(gradient)
         if bottom - top < height or right - left < width:
-            beyond = [left, width - right, top, height - bottom]
-            normal = torch.cat((normal[:, 0:2], normal[:, 2:3] - 1.0), dim=1)
-            gradient, normal = nn.functional.pad(gradient, beyond), nn.functional.pad(normal, beyond)
-            normal[:, 2].add_(1.0)
+            gradient = nn.functional.pad(gradient, [left, width - right, top, height - bottom])
+            inside, normal = normal, normal.new_zeros([images.shape[0], 3, height, width])
+            normal[:, 2].fill_(1.0)
+            normal[:, :, top:bottom, left:right] = inside
         return DepthOutput(depth, gradient, normal, contact)
 
     def _solve(
@@ -454,18 +455,35 @@ def _as_factor(mask: Tensor, like: Tensor) -> Tensor:
     return mask.to(torch.uint8).to(like.dtype)  # four times as fast as straight from bool
 
 
+def _box(contact: Tensor) -> tuple[int, int, int, int]:
+    """(top, bottom, left, right) of the smallest box that holds all contact of all frames; zeros without contact."""
+    if may_use_arrays(contact):
+        return _box_by_array(contact)
+    touched = _as_factor(contact, torch.zeros(1))
+    rows, columns = touched.sum(dim=(0, 1, 3)).nonzero(), touched.sum(dim=(0, 1, 2)).nonzero()
+    if rows.shape[0] == 0:
+        return 0, 0, 0, 0
+    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+
+
+@torch.jit.unused
+def _box_by_array(contact: Tensor) -> tuple[int, int, int, int]:
+    """:func:`_box` by OpenCV; of 320 x 240 pixels in 0.01 ms where tensors take 0.05."""
+    import cv2
+
+    touched = contact[:, 0].to(torch.uint8).numpy()
+    left, top, columns, rows = cv2.boundingRect(touched[0] if len(touched) == 1 else touched.max(axis=0))
+    return top, top + rows, left, left + columns
+
+
 def _window(contact: Tensor, stride: int) -> tuple[int, int, int, int]:
     """(top, bottom, left, right) of the part of the image that holds all contact, its corners multiples of ``stride``.
 
     All of the image where little would be saved, and at least two strides where there is no contact.
     """
     height, width = contact.shape[2], contact.shape[3]
-    touched = _as_factor(contact, torch.zeros(1))
-    rows, columns = touched.sum(dim=(0, 1, 3)).nonzero(), touched.sum(dim=(0, 1, 2)).nonzero()
-    top, bottom, left, right = 0, 0, 0, 0
-    if rows.shape[0] > 0:
-        top, bottom = int(rows[0]) // stride * stride, int(rows[-1]) + 1
-        left, right = int(columns[0]) // stride * stride, int(columns[-1]) + 1
+    top, bottom, left, right = _box(contact)
+    top, left = top // stride * stride, left // stride * stride
     bottom = min(height, max((bottom + stride - 1) // stride, top // stride + 2) * stride)
     right = min(width, max((right + stride - 1) // stride, left // stride + 2) * stride)
     top, left = max(0, min(top, bottom - 2 * stride)), max(0, min(left, right - 2 * stride))

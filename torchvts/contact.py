@@ -256,7 +256,9 @@ class ContactMask(nn.Module):
         if may_use_arrays(change):
             return self._clean_by_arrays(change, strong, threshold)
         strong = _erode(_dilate(strong))  # closing: pixels lost to noise at the rim
-        counted = strong.to(torch.uint8) if may_read_values() else strong.to(change.dtype)  # ONNX sums no bytes
+        counted = strong.to(change.dtype)  # ONNX sums no bytes
+        if may_read_values():
+            counted = strong.to(torch.uint8 if self.cell < 16 else torch.int16)
         density = _cell_sums(counted, self.cell).to(change.dtype) / float(self.cell * self.cell)
         mean = _cell_sums(change, self.cell) / float(self.cell * self.cell)
         any_strong = density > 0
@@ -287,7 +289,8 @@ class ContactMask(nn.Module):
         for seen, closed in zip(strong.numpy(), fine):
             cv2.morphologyEx(seen[0].view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8), dst=closed[0])
         area = float(self.cell * self.cell)
-        density = _column_sums(_line_sums(torch.from_numpy(fine), self.cell).numpy(), self.cell)[:, 0]
+        counted = fine if self.cell < 16 else fine.astype(np.int16)
+        density = _column_sums(_line_sums(torch.from_numpy(counted), self.cell).numpy(), self.cell)[:, 0]
         mean = _column_sums(_line_sums(change.detach(), self.cell).numpy(), self.cell) / area
         density = density.astype(mean.dtype) / area
         any_strong = density > 0

@@ -6,7 +6,7 @@ import references
 import torch
 
 import torchvts as vts
-from torchvts.shading import flat_image, gloss_lobe, inverse_light_matrix, light_matrix
+from torchvts.shading import flat_image, gloss_lobe, inverse_light_matrix, light_matrix, normal_at_depth
 
 
 def random_scene(batch=1, height=5, width=7, dtype=torch.float64, seed=0):
@@ -142,3 +142,16 @@ def test_lights_keep_the_wider_dtype_and_own_their_values():
 def test_wrong_shapes_are_refused(ring, depth, normal, error, message):
     with pytest.raises(error, match=message):
         vts.near_field_shading(depth, normal, ring(), 0.5)
+
+
+@pytest.mark.parametrize("camera", [(float("inf"), (0.0, 0.0)), (30.0, (1.0, -2.0))])
+@pytest.mark.parametrize("far", [1.0, 1e3, 1e6])
+def test_the_normal_at_a_depth_is_along_the_inverse_times_the_image(camera, far):
+    position = far * torch.tensor([[20.0, 9.0, 25.0], [-18.0, 13.0, 26.0], [-2.0, -22.0, 24.0]])
+    albedo, generator = far**2 * torch.tensor([600.0, 650.0, 700.0]), torch.Generator().manual_seed(1)
+    depth = 2.0 * torch.rand(2, 1, 12, 17, generator=generator)
+    image = torch.rand(2, 3, 12, 17, generator=generator)
+    vector = (inverse_light_matrix(depth, position, albedo, 0.25, *camera) * image[:, None]).sum(2)
+    found = normal_at_depth(image, depth, position, albedo, 0.25, *camera)
+    assert (found - vector / vector.norm(dim=1, keepdim=True)).abs().max() < 2e-6
+    assert not normal_at_depth(0 * image, depth, position, albedo, 0.25, *camera).any()

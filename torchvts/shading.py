@@ -293,6 +293,49 @@ def inverse_light_matrix(
     return torch.stack(columns, dim=2)
 
 
+def normal_at_depth(
+    image: Tensor,
+    depth_mm: Tensor,
+    position_mm: Tensor,
+    albedo: Tensor,
+    mm_per_pixel: float,
+    camera_height_mm: float = math.inf,
+    axis_mm: tuple[float, float] = (0.0, 0.0),
+) -> Tensor:
+    r"""Unit normals along L^-1 I at a known depth, without the inverse: a third of its operations.
+
+    The columns of L^-1 (:func:`inverse_light_matrix`) share the determinant, whose sign is all that a direction needs of it. With
+    t_j = I^j |a_j|^3 / rho^j the rest is sum_j t_j S^k x S^l - P x sum_j t_j (S^l - S^k), j, k, l cyclic.
+
+    Args:
+        image: (B, 3, H, W), linear light. The others as :func:`inverse_light_matrix` takes them.
+    Returns:
+        (B, 3, H, W); zero where the image is.
+    Source:
+        eq. 10 of the paper.
+    """
+    x, y = pixel_grid_mm(depth_mm.shape[2], depth_mm.shape[3], mm_per_pixel, depth_mm.dtype, depth_mm.device)
+    x, y = seen_at(x, depth_mm, camera_height_mm, axis_mm[0]), seen_at(y, depth_mm, camera_height_mm, axis_mm[1])
+    second, third = position_mm.roll(-1, 0), position_mm.roll(-2, 0)
+    cross = torch.linalg.cross(second, third, dim=1)
+    place = position_mm.reshape(3, 3, 1, 1)
+    away = depth_mm - place[:, 2]
+    squared = torch.addcmul((x - place[:, 0]).square() + (y - place[:, 1]).square(), away, away)  # (B, 3, H, W)
+    share = image * squared * squared.sqrt()
+    table = torch.cat((cross, third - second), dim=1) / albedo[:, None]  # (light, 6)
+    table = table / (table.detach().abs().amax() * position_mm.detach().norm() ** 3)  # results near 1, however far the lights
+    sums = (table.t() @ share.flatten(2)).unflatten(2, depth_mm.shape[2:])  # (B, 6, H, W)
+    u, v, w = sums[:, 3:4], sums[:, 4:5], sums[:, 5:6]
+    n_x = torch.addcmul(torch.addcmul(sums[:, 0:1], y, w, value=-1.0), depth_mm, v)
+    n_y = torch.addcmul(torch.addcmul(sums[:, 1:2], x, w), depth_mm, u, value=-1.0)
+    n_z = torch.addcmul(torch.addcmul(sums[:, 2:3], x, v, value=-1.0), y, u)
+    plane = cross.sum(0)  # the determinant is linear in P too
+    determinant = (position_mm[0] * cross[0]).sum() - plane[0] * x - plane[1] * y - plane[2] * depth_mm
+    squared = torch.addcmul(torch.addcmul(n_x * n_x, n_y, n_y), n_z, n_z)
+    scale = torch.rsqrt(squared + 1e-24) * determinant.sign()
+    return torch.cat((n_x * scale, n_y * scale, n_z * scale), dim=1)
+
+
 def _shade(depth_mm: Tensor, normal: Tensor, position_mm: Tensor, albedo: Tensor, mm_per_pixel: float) -> Tensor:
     check_batch("depth_mm", depth_mm, 1)
     check_batch("normal", normal, 3)

@@ -19,7 +19,7 @@ from ..core.checks import (
 )
 from ..core.geometry import gradient_from_normal, normal_from_gradient
 from ..record import Calibration, check_calibration
-from ..shading import PointLights, flat_image, gloss_lobe, inverse_light_matrix, light_matrix, seen_at
+from ..shading import PointLights, flat_image, gloss_lobe, inverse_light_matrix, light_matrix, normal_at_depth, seen_at
 
 CLIFF_SLOPE = 2.0
 """Difference of neighbouring slopes from which depth is taken for a cliff."""
@@ -268,17 +268,17 @@ class NormalFromIntensity(nn.Module):
             axis = (-x, -y)
         if self.lights.glossy:
             compensated = self._matt(compensated, depth_mm, position, axis)
-        live = torch.is_grad_enabled() and (position.requires_grad or albedo.requires_grad)
-        inverse = self.inverse[None, :, :, top:bottom, left:right]
         if depth_mm is not None:
-            inverse = inverse_light_matrix(depth_mm, position, albedo, self.mm_per_pixel, self.camera_height_mm, axis)
-        elif live:
+            normal = normal_at_depth(compensated, depth_mm, position, albedo, self.mm_per_pixel, self.camera_height_mm, axis)
+        elif torch.is_grad_enabled() and (position.requires_grad or albedo.requires_grad):
             rest = compensated.new_zeros(1, 1, compensated.shape[2], compensated.shape[3])
-            inverse = inverse_light_matrix(rest, position, albedo, self.mm_per_pixel)
-        normal = torch.addcmul(inverse[:, :, 0] * compensated[:, 0:1], inverse[:, :, 1], compensated[:, 1:2])
-        normal = torch.addcmul(normal, inverse[:, :, 2], compensated[:, 2:3])
-        n_x, n_y, n_z = normal[:, 0:1], normal[:, 1:2], normal[:, 2:3]
-        normal = normal * torch.rsqrt(torch.addcmul(torch.addcmul(n_x * n_x, n_y, n_y), n_z, n_z) + 1e-24)
+            normal = normal_at_depth(compensated, rest, position, albedo, self.mm_per_pixel)
+        else:
+            inverse = self.inverse[None, :, :, top:bottom, left:right]
+            normal = torch.addcmul(inverse[:, :, 0] * compensated[:, 0:1], inverse[:, :, 1], compensated[:, 1:2])
+            normal = torch.addcmul(normal, inverse[:, :, 2], compensated[:, 2:3])
+            n_x, n_y, n_z = normal[:, 0:1], normal[:, 1:2], normal[:, 2:3]
+            normal = normal * torch.rsqrt(torch.addcmul(torch.addcmul(n_x * n_x, n_y, n_y), n_z, n_z) + 1e-24)
         dark = self.dark_where[:, top:bottom, left:right]
         full = self.full_above[:, top:bottom, left:right]
         weak = self.weak[top:bottom, left:right]

@@ -288,3 +288,20 @@ def test_a_surface_that_hides_parts_of_itself_from_a_pinhole_is_refused():
 def test_perspective_derivatives():
     gradient = 0.3 * torch.randn(1, 2, 5, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     assert torch.autograd.gradcheck(lambda g: vts.integrate_perspective(g, 0.5, 20.0), gradient.requires_grad_())
+
+
+@pytest.mark.parametrize("slope", [0.35, 0.25])
+def test_a_ramp_stands_on_its_low_end(slope):
+    """Cliffs on three sides, as high at one end as the ramp is; upside down it would hang from there."""
+    ramp = vts.scenes.surface(lambda x, y: torch.where((y.abs() < 2.5) & (x.abs() < 3), (x + 3) * slope, -1.0), 120, 160, 0.1)
+    smooth = (vts.poisson_rest(ramp.gradient, 0.1) - ramp.depth_mm).abs().max()
+    for found in (vts.integrate_cliffs(ramp.gradient, 0.1, ramp.contact), vts.AdaptiveIntegration(0.1)(ramp.gradient)):
+        assert (found - ramp.depth_mm).abs().max() < 0.02 * smooth
+
+
+def test_gradients_and_weights_that_are_none_are_refused():
+    gradient, weight = torch.zeros(1, 2, 8, 8), torch.ones(1, 1, 8, 8)
+    with pytest.raises(ValueError, match="gradient: expected finite values, got NaN"):
+        vts.integrate_cliffs(gradient * torch.nan)
+    with pytest.raises(ValueError, match="weight: expected values from 0 to 1, got 2 to 2"):
+        vts.integrate_cliffs(gradient, weight=2 * weight)

@@ -126,6 +126,9 @@ def test_an_empty_batch_gives_an_empty_batch(ring, background):
     """No frames are no error: they may be what a filter left of a stream."""
     out = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(ring(), SENSOR), "fast").compensate(background[None][:0])
     assert out.shape == (0, 3, 24, 32)
+    calibration = vts.Calibration.from_lights(ring(), SENSOR)
+    for mode in ("fast", "precise", "auto"):
+        assert vts.DepthPipeline.from_calibration(calibration, mode)(background[None][:0]).depth_mm.shape == (0, 1, 24, 32)
 
 
 @pytest.mark.parametrize("kwargs", [{"gain": torch.ones(3, 4)}, {"offset": torch.ones(1, 4, 4)}])

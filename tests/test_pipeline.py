@@ -78,6 +78,19 @@ def test_of_two_slopes_that_fit_where_a_light_is_blocked_the_right_one_is_taken(
     assert ours < 0.2 * metrics.depth_error(pipe(image).depth_mm, scene.depth_mm, PITCH).rms_px
 
 
+@pytest.mark.parametrize("mode", ["fast", "precise"])
+def test_a_pipeline_that_ran_in_inference_mode_still_gives_gradients(ring, small_sensor, small_press, mode):
+    lights, scene = ring(), small_press(1.0)
+    pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, small_sensor), mode)
+    image = scenes.render(scene, lights).detach()
+    with torch.inference_mode():
+        before = pipe(image).depth_mm
+    image.requires_grad_(True)
+    after = pipe(image).depth_mm
+    after.sum().backward()
+    assert torch.equal(before, after) and float(image.grad.abs().max()) > 0
+
+
 def dimmed(lights, factors):
     return vts.PointLights(lights.position_mm, lights.albedo * torch.tensor(factors)).requires_grad_(False)
 

@@ -304,9 +304,20 @@ TABLE = {
         {"calibration": [*OTHERS, unit("response")], "camera_height_mm": HEIGHTS},
     ),
     "NormalFromIntensity.forward": Entry(
-        {"compensated": FLAT[None], "depth_mm": DEPTH, "window": (0, 0)},
-        {"compensated": batches(3), "depth_mm": [b for b in batches(1) if b is not None], "window": [(20, 20), (-1, 0)]},
+        {"compensated": FLAT[None], "depth_mm": DEPTH, "window": (0, 0), "expected": torch.zeros(1, 2, HEIGHT, WIDTH)},
+        {
+            "compensated": batches(3),
+            "depth_mm": [b for b in batches(1) if b is not None],
+            "window": [(20, 20), (-1, 0)],
+            "expected": [b for b in batches(2) if b is not None],
+        },
         lambda: pipe().normals,
+        named={"window": "compensated, window"},
+    ),
+    "NormalFromIntensity.blocked": Entry(
+        {"compensated": FLAT[None], "window": (0, 0)},
+        {"compensated": batches(3), "window": [(20, 20), (-1, 0)]},
+        lambda: pipe().normals.blocked,
         named={"window": "compensated, window"},
     ),
     "NormalFromIntensity.coarse": Entry({"stride": 8}, {"stride": INTEGER}, lambda: pipe().normals.coarse),

@@ -253,7 +253,7 @@ class ContactMask(nn.Module):
         return change, squared, (self.sigmas * noise).square()[:, None, None, None]
 
     def _clean(self, change: Tensor, strong: Tensor, threshold: Tensor) -> tuple[Tensor, Tensor]:
-        if may_use_arrays(change):
+        if change.shape[0] > 0 and may_use_arrays(change):
             return self._clean_by_arrays(change, strong, threshold)
         strong = _erode(_dilate(strong))  # closing: pixels lost to noise at the rim
         counted = strong.to(change.dtype)  # ONNX sums no bytes

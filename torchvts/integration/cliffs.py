@@ -23,6 +23,9 @@ LEAST_WEIGHT = 1e-6
 RIM_TOLERANCE_PX = 0.1
 """Added to the standard deviation of a rim edge when it votes for the height of a contact."""
 
+BELOW_REST_PX = 1.0
+"""Skin lower than that is unlikely to be what touches: of two heights that as much of a rim agrees with, the other one is taken."""
+
 MARGIN_PX = 2
 """Pixels at rest kept around the contacts when the rest of the image is left out."""
 
@@ -55,8 +58,9 @@ def integrate_cliffs(
        s^2 (1 + |g|^2)^2 (a slope g whose angle is off), plus a twelfth of the square of their difference (a crease may lie
        anywhere between them).
     2. Each contact is solved by itself, cut off along its rim, and set to the height that most of its rim agrees with: a roof
-       between two vertical ends stands on its eaves. (Pixels on the rim whose slope is less than half of that further in are
-       seen half beside the object; the rim is then taken to lie within them.)
+       between two vertical ends stands on its eaves. A height that leaves most of the contact below the skin at rest must have
+       clearly more of the rim for it: a ramp stands on its low end, not on the cliff at its high one. (Pixels on the rim whose
+       slope is less than half of that further in are seen half beside the object; the rim is then taken to lie within them.)
     3. All is solved together with weights 1 / (v (1 + r^2 / (c^2 v))), r being what edge and depth disagree by, until the depth
        stands still. Edges across the rim weigh a tenth: that is where cliffs are.
 
@@ -150,6 +154,8 @@ class CliffIntegration(nn.Module):
     ) -> CliffSolution:
         """Depth with its status; arguments as :func:`integrate_cliffs`."""
         check_gradient(gradient, 2)
+        if not bool(torch.isfinite(gradient).all()):
+            raise ValueError("gradient: expected finite values, got NaN or infinite ones: set them to 0 and give them the weight 0")
         height, width = gradient.shape[2], gradient.shape[3]
         touched = _without_gaps((gradient != 0).any(dim=1, keepdim=True)) if contact is None else contact
         trust = torch.ones_like(gradient[:, 0:1]) if weight is None else weight
@@ -158,6 +164,8 @@ class CliffIntegration(nn.Module):
             if (value.dtype == torch.bool) != (name == "contact"):
                 kind = "bool: threshold it" if name == "contact" else "a number from 0 to 1: weight.float() of a mask"
                 raise TypeError(f"{name}: expected {kind.split(':')[0]}, got {value.dtype}:{kind.split(':')[1]}")
+        if not bool(((trust >= 0) & (trust <= 1)).all()):
+            raise ValueError(f"weight: expected values from 0 to 1, got {float(trust.min()):g} to {float(trust.max()):g}")
         trust = trust.to(gradient.dtype)
         known = self._known(gradient, known_mm, known_weight)
         depths, status = [], []
@@ -262,7 +270,10 @@ class CliffIntegration(nn.Module):
             height = depth.new_zeros(())
             if vote.numel() > 0:
                 candidates = vote[:: 1 + vote.numel() // 400]
-                cost = torch.log1p(((candidates[:, None] - vote) / scale).square()).sum(1)
+                cost = torch.log1p(((candidates[:, None] - vote) / scale).square()).mean(1)
+                inside = depth[mine]
+                inside = inside[:: 1 + inside.numel() // 400]
+                cost = cost + (candidates[:, None] + inside < -BELOW_REST_PX).to(cost.dtype).mean(1)
                 height = candidates[cost.argmin()]
                 for _ in range(5):
                     weight = 1.0 / (scale.square() + (height - vote).square())
@@ -278,7 +289,7 @@ def cliff_share(gradient: Tensor, depth_mm: Tensor, mm_per_pixel: float = 1.0) -
     """Share of the contact's edges on which a depth contradicts the gradient it was integrated from: the sign of cliffs.
 
     An edge is contradicted if both differ by more than three standard deviations of its slope, as :func:`integrate_cliffs`
-    estimates them. Cheap: two differences a pixel.
+    estimates them; ten that differ by more than two count as one, for a low cliff is smeared over many. Cheap.
 
     Args:
         gradient: (B, 2, H, W), mm per mm. depth_mm: (B, 1, H, W), of :func:`poisson_rest`. mm_per_pixel: pixel pitch, mm.
@@ -298,14 +309,16 @@ def cliff_share(gradient: Tensor, depth_mm: Tensor, mm_per_pixel: float = 1.0) -
     gradient, depth = gradient.detach(), depth_mm.detach() / mm_per_pixel
     touched = (gradient != 0).any(dim=1, keepdim=True)
     slopes, variances = _edges(gradient, SLOPE_STD)
-    wrong, count = gradient.new_zeros(gradient.shape[0]), gradient.new_zeros(gradient.shape[0])
+    wrong, odd, count = (gradient.new_zeros(gradient.shape[0]) for _ in range(3))
     for dim, slope, variance in zip((3, 2), slopes, variances, strict=True):
         before, after = _ends(depth, dim)
         one, other = _ends(touched, dim)
         counts = one | other
-        wrong = wrong + (counts & ((after - before - slope).square() > 9.0 * variance)).sum(dim=(1, 2, 3))
+        surprise = (after - before - slope).square() / variance * counts
+        wrong = wrong + (surprise > 9.0).sum(dim=(1, 2, 3))
+        odd = odd + (surprise > 4.0).sum(dim=(1, 2, 3))
         count = count + counts.sum(dim=(1, 2, 3))
-    return wrong / count.clamp_min(1.0)
+    return torch.maximum(wrong, 0.1 * odd) / count.clamp_min(1.0)
 
 
 class AdaptiveIntegration(nn.Module):

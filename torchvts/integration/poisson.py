@@ -126,7 +126,7 @@ class PoissonDST(nn.Module):
         check_gradient(gradient, 3)
         plan = self._plan
         if not _plan_fits(plan, gradient, gradient.shape[2], gradient.shape[3]):
-            plan = _plan_dst(gradient)
+            plan = _kept(_plan_dst(gradient))
             self._plan = plan
         return _integrate_dst(gradient, self.mm_per_pixel, plan)
 
@@ -151,7 +151,7 @@ class PoissonDCT(nn.Module):
         top, left = check_window("gradient", gradient, (height, width), window)
         plan = self._plan
         if not _plan_fits(plan, gradient, height, width):
-            plan = _plan_dct(gradient, height, width)
+            plan = _kept(_plan_dct(gradient, height, width))
             self._plan = plan
         return _integrate_dct(gradient, self.mm_per_pixel, plan, top, left)
 
@@ -224,6 +224,20 @@ def laplace_plan(like: Tensor) -> list[Tensor]:
 def solve_laplace(right: Tensor, plan: list[Tensor]) -> Tensor:
     """(B, 1, H, W) of zero mean whose five-point Laplacian with a free border is ``right`` less its mean."""
     return _solve_by_fft(right, plan, 0) if len(plan) == 7 else _solve(right, plan)
+
+
+def _kept(plan: list[Tensor]) -> list[Tensor]:
+    """A plan as calls keep it that come later and may record gradients: made under inference mode, tensors would refuse to."""
+    if not torch.jit.is_scripting():  # noqa: SIM102
+        if torch.is_inference_mode_enabled():
+            return _outside_of_inference_mode(plan)
+    return plan
+
+
+@torch.jit.unused
+def _outside_of_inference_mode(plan: list[Tensor]) -> list[Tensor]:
+    with torch.inference_mode(False):
+        return [table.clone() for table in plan]
 
 
 def _plan_dst(gradient: Tensor) -> list[Tensor]:

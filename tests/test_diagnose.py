@@ -5,6 +5,7 @@ All dials of the gallery at middle severity, 20 seeds each, as docs/diagnose.md 
 
 import argparse
 import dataclasses
+import itertools
 import json
 import subprocess
 import sys
@@ -116,6 +117,24 @@ def test_clean_frames_of_any_object_raise_no_alarm(ring, small_sensor, fitted):
         assert found.ok, f"{name}: {found}"
     found = vts.diagnose(None, scenes.render(rest, lights, noise_std=0.003, bits=8, seed=20), unit)
     assert found.names == ("no_contact",)
+
+
+@pytest.mark.parametrize("spots", [2, 10, 40])
+def test_dust_is_no_contact(ring, small_sensor, small_press, spots):
+    """Spots of up to a twelfth of the height, at calibration already or since then; a contact is still called one."""
+    lights, dust = ring(), vts.scenes.skin_spots(120, 160, spots, 0, seed=1)
+    rest, press = vts.scenes.at_rest(small_press()), small_press(0.5, (3.0, 2.0))
+    seen = {
+        (scene, worn): vts.scenes.render(scene, lights, noise_std=0.004, bits=8, seed=k, spots=dust if worn else None)
+        for k, (scene, worn) in enumerate(itertools.product((rest, press), (False, True)))
+    }
+    for worn in (False, True):
+        calibration = vts.Calibration.from_lights(lights, small_sensor, seen[rest, worn][0])
+        for background, touched in ((None, False), (seen[rest, True][0], False), (seen[press, True][0], True)):
+            names = vts.diagnose(background, seen[press, True], calibration).names
+            assert "contact_in_calibration" not in names and ("contact_in_background" in names) == touched
+    begun = vts.Calibration.from_lights(lights, small_sensor, seen[press, False][0])
+    assert "contact_in_calibration" in vts.diagnose(None, seen[press, False], begun).names
 
 
 @pytest.mark.parametrize("share", [0.05, 0.12, 0.3])

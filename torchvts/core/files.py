@@ -205,7 +205,7 @@ def write_depth_png(path: str | Path, depth_mm: Tensor) -> None:
     if not bool(torch.isfinite(frame).all()) or float(value.min()) < 0 or float(value.max()) > 65535:
         raise ValueError(
             "depth_mm: expected finite values in [-3.2768, 3.2767] mm for a PNG, "
-            f"got [{frame.min():.4g}, {frame.max():.4g}]: write .npy"
+            f"got [{frame.min():.4g}, {frame.max():.4g}]: write .npy, or ask vts.diagnose what is wrong with the frame"
         )
     _write_pixels(Path(path), value.numpy().astype(np.uint16))
 

@@ -145,7 +145,8 @@ class _Examination:
         if bool(self.dead.any()):
             lost = " and ".join(CHANNELS[j] for j in range(3) if self.dead[j])
             message = (
-                f"the {lost} light is dead (its channel is black everywhere): check lamp and cable; there is no depth without it"
+                f"the {lost} light is dead (its channel is black everywhere): check lamp and cable; with two lights left modes "
+                "precise and auto still find a rough depth, with one none does"
             )
             return found + [Finding("light_dead", message, "fault", float(self.dead.sum()))]
         change = self._compare(self.image)

@@ -97,7 +97,8 @@ class Change:
 
     Attributes:
         hypothesis: the kind. numbers: its numbers.
-        follows: (h, w) bool, cells that it explains. departs: (h, w), how far the others are off, relative.
+        follows: (h, w) bool, cells that it explains. departs: (h, w), how far the others are off,
+            relative, less what the channels share: dust is dark in all of them alike, a contact is not.
         effect: (3,), mean change of the light, relative.
     """
 
@@ -187,7 +188,8 @@ def compare(
     predicted = best.predict(grid, numbers)
     told = usable.any(0) & (squared < CUT)
     effect = torch.where(usable, (predicted / grid.light.clamp_min(1e-6) - 1.0).abs(), 0.0).sum(1) / usable.sum(1).clamp_min(1)
-    departs = ((target / predicted.clamp_min(1e-6) ** (1.0 / exponent) - 1.0).abs() * usable).amax(0)
+    off = (target / predicted.clamp_min(1e-6) ** (1.0 / exponent) - 1.0) * usable
+    departs = ((off - off.sum(0) / usable.sum(0).clamp_min(1)).abs() * usable).amax(0)
     departs = torch.where(told, 0.0, departs)
     return Change(best, numbers, told.reshape(height, width), departs.reshape(height, width), effect)
 

@@ -62,7 +62,7 @@ class DepthPipeline(nn.Module):
     ``fast`` goes once (eq. 9). ``precise`` goes again with the depth found (eq. 10), until what is still missing, foreseen
     from how fast the change shrinks, is below ``tolerance_px``. ``auto`` skips frames without contact, and foresees on every
     eighth pixel what a second pass would change: only frames where that exceeds ``worth_px`` go again, and stop when what is
-    missing is below it. Frames of a batch do not influence one another.
+    missing is below a tenth of it. Frames of a batch do not influence one another.
 
     Normals are sought only in the smallest window that holds all contact: outside, the gradient is zero. This changes nothing
     but the time. (Only on a CPU: elsewhere it would wait for the device.)
@@ -75,7 +75,7 @@ class DepthPipeline(nn.Module):
             and integrate takes that and the image's (height, width) after the gradient. One that also has
             ``blocked(compensated, window)`` takes as a fourth the slopes (B, 2, H, W) expected where that is true.
         mm_per_pixel: pixel pitch, mm. mode: "fast", "precise" or "auto".
-        tolerance_px, worth_px: pixels of pitch; auto stops at the larger. max_passes: bound of the precise loop.
+        tolerance_px, worth_px: pixels of pitch. max_passes: bound of the precise loop.
     Source:
         figure 2 and eq. 3-10 of the paper; "auto" and the stopping rule are this project's.
     """
@@ -121,7 +121,7 @@ class DepthPipeline(nn.Module):
         self.integrate = integrate
         self.mode = mode
         self.mm_per_pixel = mm_per_pixel
-        self.tolerance_px = max(tolerance_px, worth_px) if mode == "auto" else tolerance_px
+        self.tolerance_px = max(tolerance_px, 0.1 * worth_px) if mode == "auto" else tolerance_px
         self.worth_px = worth_px
         self.max_passes = min(max_passes, int(getattr(normals, "passes", max_passes)))
         self.refines = uses_depth and mode != "fast"

@@ -23,8 +23,8 @@ LEAST_WEIGHT = 1e-6
 RIM_TOLERANCE_PX = 0.1
 """Added to the standard deviation of a rim edge when it votes for the height of a contact."""
 
-BELOW_REST_PX = 1.0
-"""Skin lower than that is unlikely to be what touches: of two heights that as much of a rim agrees with, the other one is taken."""
+BELOW_REST_PX, BELOW_REST = 1.0, 0.1
+"""Skin lower than that is unlikely to be what touches, and costs so much: it decides between heights that a rim nearly agrees with."""
 
 MARGIN_PX = 2
 """Pixels at rest kept around the contacts when the rest of the image is left out."""
@@ -58,9 +58,9 @@ def integrate_cliffs(
        s^2 (1 + |g|^2)^2 (a slope g whose angle is off), plus a twelfth of the square of their difference (a crease may lie
        anywhere between them).
     2. Each contact is solved by itself, cut off along its rim, and set to the height that most of its rim agrees with: a roof
-       between two vertical ends stands on its eaves. A height that leaves most of the contact below the skin at rest must have
-       clearly more of the rim for it: a ramp stands on its low end, not on the cliff at its high one. (Pixels on the rim whose
-       slope is less than half of that further in are seen half beside the object; the rim is then taken to lie within them.)
+       between two vertical ends stands on its eaves. Of two that as much of the rim agrees with, the one is taken that
+       leaves less of the contact below rest: a ramp stands on its low end, not on the cliff at its high one. (Pixels on the rim
+       whose slope is less than half of that further in are seen half beside the object; the rim is then taken to lie within them.)
     3. All is solved together with weights 1 / (v (1 + r^2 / (c^2 v))), r being what edge and depth disagree by, until the depth
        stands still. Edges across the rim weigh a tenth: that is where cliffs are.
 
@@ -273,7 +273,7 @@ class CliffIntegration(nn.Module):
                 cost = torch.log1p(((candidates[:, None] - vote) / scale).square()).mean(1)
                 inside = depth[mine]
                 inside = inside[:: 1 + inside.numel() // 400]
-                cost = cost + (candidates[:, None] + inside < -BELOW_REST_PX).to(cost.dtype).mean(1)
+                cost = cost + BELOW_REST * (candidates[:, None] + inside < -BELOW_REST_PX).to(cost.dtype).mean(1)
                 height = candidates[cost.argmin()]
                 for _ in range(5):
                     weight = 1.0 / (scale.square() + (height - vote).square())

@@ -62,7 +62,7 @@ class DepthPipeline(nn.Module):
     ``fast`` goes once (eq. 9). ``precise`` goes again with the depth found (eq. 10), until what is still missing, foreseen
     from how fast the change shrinks, is below ``tolerance_px``. ``auto`` skips frames without contact, and foresees on every
     eighth pixel what a second pass would change: only frames where that exceeds ``worth_px`` go again, and stop when what is
-    missing is below a tenth of it. Frames of a batch do not influence one another.
+    missing is below a fifth of it. Frames of a batch do not influence one another.
 
     Normals are sought only in the smallest window that holds all contact: outside, the gradient is zero. This changes nothing
     but the time. (Only on a CPU: elsewhere it would wait for the device.)
@@ -121,7 +121,7 @@ class DepthPipeline(nn.Module):
         self.integrate = integrate
         self.mode = mode
         self.mm_per_pixel = mm_per_pixel
-        self.tolerance_px = max(tolerance_px, 0.1 * worth_px) if mode == "auto" else tolerance_px
+        self.tolerance_px = max(tolerance_px, 0.2 * worth_px) if mode == "auto" else tolerance_px
         self.worth_px = worth_px
         self.max_passes = min(max_passes, int(getattr(normals, "passes", max_passes)))
         self.refines = uses_depth and mode != "fast"

@@ -24,7 +24,7 @@ RIM_TOLERANCE_PX = 0.1
 """Added to the standard deviation of a rim edge when it votes for the height of a contact."""
 
 BELOW_REST_PX, BELOW_REST = 1.0, 0.1
-"""Skin lower than that is unlikely to be what touches, and costs so much: it decides between heights that a rim nearly agrees with."""
+"""Skin lower than that is unlikely to be what touches, and costs so much: enough to decide where a rim agrees with two heights."""
 
 MARGIN_PX = 2
 """Pixels at rest kept around the contacts when the rest of the image is left out."""

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 from tqdm import tqdm
 
 from torchvts import bench, viz
@@ -61,6 +62,7 @@ def chart(rows: Sequence[bench.Row]) -> Figure:
         )
     stamps = [row for row in rows if row.kind == "cliff" and row.data.startswith("stamp")]
     errors_against_time(axes[-2], stamps, "rms_um", "depth RMS, um", "Exact scene, 320x240: stamp with upright walls, 1 mm")
+    axes[0].legend(fontsize=7, loc="center left")
     cost(axes[-1], [r for r in rows if r.kind == "scene" and "press 1 mm" in r.data])
     figure.suptitle(f"{rows[0].machine}, {rows[0].threads} threads, one frame", fontsize=9)
     return figure
@@ -85,7 +87,10 @@ def errors_against_time(axes: Any, rows: Sequence[bench.Row], error: str, label:
     axes.set_title(title, fontsize=9)
     axes.margins(x=0.3, y=0.2)
     axes.grid(which="both", alpha=0.25)
-    axes.legend(fontsize=7, loc="upper right")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
 
 
 def cost(axes: Any, rows: Sequence[bench.Row]) -> None:

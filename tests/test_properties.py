@@ -321,7 +321,10 @@ def test_threads_may_share_a_pipeline(by, mode):
 
 @pytest.mark.parametrize("name", sorted(SOLVERS))
 def test_threads_may_share_an_integrator_for_several_sizes(name):
-    """It keeps the tables of the last size: another thread's must not come between."""
+    """It keeps the tables of the last size: another thread's must not come between.
+
+    To some last bits: under load one FFT in 50,000 of 12 x 16 values ends in another.
+    """
     solve = SOLVERS[name][1](0.5)
     gradients = [
         random_gradient(h, w, 1).to(t) for h, w in ((12, 16), (13, 16), (32, 24), (31, 7)) for t in (torch.float32, torch.float64)
@@ -332,7 +335,10 @@ def test_threads_may_share_an_integrator_for_several_sizes(name):
         return [solve(gradients[(k + turn) % 8]) for turn in range(FRAMES // 5)]
 
     for k, found in enumerate(in_threads([lambda k=k: job(k) for k in range(6)])):
-        assert all(torch.equal(z, alone[(k + turn) % 8]) for turn, z in enumerate(found))
+        for turn, z in enumerate(found):
+            expected = alone[(k + turn) % 8]
+            assert z.dtype == expected.dtype
+            assert (z - expected).abs().max() <= 8 * torch.finfo(z.dtype).eps * expected.abs().max()
 
 
 def digest(mode, by):

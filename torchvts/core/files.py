@@ -289,7 +289,7 @@ def save_tensors(path: str | Path, tensors: dict[str, Tensor], metadata: dict[st
     """Write tensors and JSON metadata as one safetensors file, whole or not at all."""
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     with write_atomically(path) as temporary:
-        safetensors.torch.save_file(plain, str(temporary), {"torchvts": json.dumps(metadata, allow_nan=False)})
+        temporary.write_bytes(safetensors.torch.save(plain, {"torchvts": json.dumps(metadata, allow_nan=False)}))
 
 
 def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

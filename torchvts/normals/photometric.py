@@ -155,7 +155,8 @@ class NormalFromIntensity(nn.Module):
     also where the lights nearly lie in one plane, so that the inverse makes more of the noise than ``PRIOR_STD``, what is known of
     slopes beforehand: |n| = 1 and that prior then damp it, which the plain inverse does not know. Elsewhere nothing changes.
     While gradients are recorded for the lights (``requires_grad_(True)``), the matrix is built from them at every call. Given
-    ``window`` (top, left), the image is the part of the calibrated one whose first pixel is there.
+    ``window`` (top, left), the image is the part of the calibrated one whose first pixel is there. ``expected`` (B, 2, H, W) are
+    slopes to begin with where a light is blocked, in place of the plain inverse's; a depth counts before them.
 
     Args:
         lights: the three lights. height, width: pixels. mm_per_pixel: pixel pitch, mm.

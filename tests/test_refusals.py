@@ -541,7 +541,7 @@ TABLE = {
             lambda name=name: getattr(vts, name)(),
             named={"window": "gradient, window", "size": "gradient, window"},
         )
-        for name in ("PoissonDCT", "PoissonRest", "AdaptiveIntegration", "CliffIntegration")
+        for name in ("PoissonDCT", "AdaptiveIntegration", "CliffIntegration")
     },
     "Press": Entry(
         {"image": image(), "ball_diameter_mm": 6.0, "center_px": (4.0, 5.0), "contact_radius_px": 3.0},

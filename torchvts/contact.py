@@ -4,12 +4,12 @@ Fine pixels decide the rim; a grid of coarse cells decides what is a hole and wh
 """
 
 import math
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from .core import native
 from .core.checks import (
     QUANTISATION_STD,
     check_batch,
@@ -20,10 +20,9 @@ from .core.checks import (
     may_read_values,
     may_use_arrays,
 )
+from .core.native import may_use_native
 from .core.noise import noise_std as frame_noise_std
 from .record import Calibration, check_calibration
-
-Array = np.ndarray[Any, Any]
 
 CELLS = 80
 """Cells along the shorter side of the image."""
@@ -54,23 +53,17 @@ def reconstruct(seed: Tensor, mask: Tensor) -> Tensor:
 @torch.jit.unused
 def _reconstruct_by_labels(seed: Tensor, mask: Tensor) -> Tensor:
     """:func:`reconstruct` by OpenCV's connected components; on 80 x 107 cells 0.03 ms where sweeps take 0.28."""
-    reached = np.empty(mask.shape, np.bool_)
-    for found, seeded, inside in zip(reached, seed.numpy(), mask.numpy(), strict=True):
-        found[0] = _reach(seeded[0], inside[0])
-    return torch.from_numpy(reached)
-
-
-def _reach(seed: Array, mask: Array) -> Array:
-    """:func:`reconstruct` of one image, (H, W) arrays of bool."""
     import cv2
 
-    kind = cv2.CV_16U if mask.size < 2**17 - 8 else cv2.CV_32S  # every other pixel a label; labels of 16 bits wake no threads
-    count, label = cv2.connectedComponents(mask.view(np.uint8), connectivity=4, ltype=kind)
-    kept = np.zeros(count, np.bool_)
-    kept[label[seed]] = True
-    kept[0] = False  # what is not in the mask
-    reached: Array = kept[label]
-    return reached
+    reached = np.empty(mask.shape, np.bool_)
+    for found, seeded, inside in zip(reached, seed.numpy(), mask.numpy(), strict=True):
+        kind = cv2.CV_16U if inside.size < 2**17 - 8 else cv2.CV_32S  # every other pixel a label; labels of 16 bits wake no threads
+        count, label = cv2.connectedComponents(inside[0].view(np.uint8), connectivity=4, ltype=kind)
+        kept = np.zeros(count, np.bool_)
+        kept[label[seeded[0]]] = True
+        kept[0] = False  # what is not in the mask
+        found[0] = kept[label]
+    return torch.from_numpy(reached)
 
 
 def _reconstruct_by_sweeps(seed: Tensor, mask: Tensor) -> Tensor:
@@ -203,9 +196,11 @@ class ContactMask(nn.Module):
         self.least_cells = 0.6 * (min_size_px / self.cell) ** 2  # nearly the area of a disc of that size
         noise = noise_std.reshape(3, 1, 1) if noise_std.dim() == 1 else noise_std
         self.register_buffer("flat", flat.detach().clone())
-        self.register_buffer("per_noise", 1.0 / noise.detach().clamp_min(QUANTISATION_STD).to(flat.dtype))
+        per_noise = 1.0 / noise.detach().clamp_min(QUANTISATION_STD).to(flat.dtype)
+        self.register_buffer("per_noise", per_noise.expand_as(flat).clone())
         self.rounding = float((QUANTISATION_STD * self.per_noise).square().mean())
         self.register_buffer("rest", -self.flat * self.per_noise)
+        self.samples = 2000  # pixels that tell a frame's own noise
         self.step = max(1, min(flat.shape[1], flat.shape[2]) // 60)
         some = self.flat[:, self.step // 2 :: self.step, self.step // 2 :: self.step]
         self.register_buffer("dead_below", 0.05 * some.mean(dim=(1, 2)))
@@ -221,22 +216,37 @@ class ContactMask(nn.Module):
 
     def forward(self, compensated: Tensor) -> Tensor:
         """bool (B, 1, H, W)."""
-        change, squared, threshold = self._change(compensated)
-        return self._clean(change, squared > threshold, threshold)[0]
+        self._check(compensated)
+        return self._find(compensated.detach())[0]
 
     @torch.jit.export
     def soft(self, compensated: Tensor) -> Tensor:
         """Contact as a number in (0, 1), (B, 1, H, W), differentiable in the image: one half at the hard rim."""
+        self._check(compensated)
+        hard, interior = self._find(compensated.detach())
         change, squared, threshold = self._change(compensated)
-        hard, interior = self._clean(change.detach(), squared > threshold, threshold)
         length = self.sigmas * torch.sqrt(squared / threshold + 1e-12)
         near = _dilate(_dilate(hard)).to(change.dtype)
         return near * torch.maximum(torch.sigmoid(length - self.sigmas), interior.to(change.dtype))
 
-    def _change(self, compensated: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Change in units of the calibrated noise (B, 3, H, W), its square summed over channels, and that one's threshold."""
+    def _check(self, compensated: Tensor) -> None:
         check_batch("compensated", compensated, 3)
         check_same_size("compensated", compensated, "the calibration", self.flat.shape[1], self.flat.shape[2])
+
+    def _find(self, compensated: Tensor) -> tuple[Tensor, Tensor]:
+        """Hard contact, and where in it cells decide, not pixels."""
+        if compensated.shape[3] >= 3 and may_use_native([compensated, self.rest]):
+            return self._find_by_loops(compensated)
+        change, squared, threshold = self._change(compensated)
+        return self._clean(change, squared > threshold, threshold)
+
+    @torch.jit.unused
+    def _find_by_loops(self, compensated: Tensor) -> tuple[Tensor, Tensor]:
+        cells = (self.cell, self.reach, self.sigmas, self.rounding, self.least_cells)
+        return native.contact_mask(compensated, self.rest, self.per_noise, self.dead_below, self.step, self.samples, *cells)
+
+    def _change(self, compensated: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Change in units of the calibrated noise (B, 3, H, W), its square summed over channels, and that one's threshold."""
         change = torch.addcmul(self.rest, compensated, self.per_noise)
         step = self.step
         bright = compensated.detach()[:, :, step // 2 :: step, step // 2 :: step].mean(dim=(2, 3))  # (B, 3)
@@ -246,15 +256,13 @@ class ContactMask(nn.Module):
             change = change * (~broken)[:, :, None, None].to(change.dtype)
         r, g, b = change[:, 0:1], change[:, 1:2], change[:, 2:3]
         squared = torch.addcmul(torch.addcmul(r * r, g, g), b, b)
-        noise = frame_noise_std(change.detach(), 2000).amax(dim=1).clamp_min(1.0)  # a frame noisier than calibration
+        noise = frame_noise_std(change.detach(), self.samples).amax(dim=1).clamp_min(1.0)  # a frame noisier than calibration
         noise = torch.sqrt(
             noise * noise + self.rounding
         )  # of smooth light, rounding to 8 bits is no white noise, and not seen there
         return change, squared, (self.sigmas * noise).square()[:, None, None, None]
 
     def _clean(self, change: Tensor, strong: Tensor, threshold: Tensor) -> tuple[Tensor, Tensor]:
-        if change.shape[0] > 0 and may_use_arrays(change):
-            return self._clean_by_arrays(change, strong, threshold)
         strong = _erode(_dilate(strong))  # closing: pixels lost to noise at the rim
         counted = strong.to(change.dtype)  # ONNX sums no bytes
         if may_read_values():
@@ -280,49 +288,6 @@ class ContactMask(nn.Module):
         inner = self._to_pixels(interior)
         return (strong & self._to_pixels(kept)) | inner, inner
 
-    @torch.jit.unused
-    def _clean_by_arrays(self, change: Tensor, strong: Tensor, threshold: Tensor) -> tuple[Tensor, Tensor]:
-        """:meth:`_clean` by NumPy and OpenCV, to the same masks in half the time: 0.27 ms of 320 x 240 pixels, tensors 0.53."""
-        import cv2
-
-        fine = np.empty(strong.shape, np.uint8)
-        for seen, closed in zip(strong.numpy(), fine):
-            cv2.morphologyEx(seen[0].view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8), dst=closed[0])
-        area = float(self.cell * self.cell)
-        counted = fine if self.cell < 16 else fine.astype(np.int16)
-        density = _column_sums(_line_sums(torch.from_numpy(counted), self.cell).numpy(), self.cell)[:, 0]
-        mean = _column_sums(_line_sums(change.detach(), self.cell).numpy(), self.cell) / area
-        density = density.astype(mean.dtype) / area
-        any_strong = density > 0
-        step = max(1, max(mean.shape[2], mean.shape[3]) // 40)
-        some = np.abs(mean[:, :, step // 2 :: step, step // 2 :: step]).reshape(*mean.shape[:2], -1)
-        middle = (some.shape[2] - 1) // 2
-        spread = np.partition(some, middle)[:, :, middle] / 0.6745
-        least = torch.sqrt(threshold[:, :, 0, 0]).numpy() / (self.sigmas * self.cell)
-        mean /= np.maximum(spread, least)[..., None, None]
-        mean *= mean
-        faint = (mean[:, 0] + mean[:, 1] + mean[:, 2] > 25.0) & ~any_strong
-        cells = any_strong | faint
-        mask, inner = np.zeros(strong.shape, np.bool_), np.zeros(strong.shape, np.bool_)
-        for k in np.flatnonzero(cells.any(axis=(1, 2))):
-            walled = np.zeros((cells.shape[1] + 2, cells.shape[2] + 2), np.uint8)
-            walled[1:-1, 1:-1] = cells[k]
-            cv2.floodFill(walled, None, (0, 0), 2)
-            filled = walled[1:-1, 1:-1] != 2
-            weight = density[k]
-            weight[filled & ~any_strong[k]] = 1.0
-            weight[faint[k]] = min(1.0, 0.4 * self.least_cells)
-            kept = _reach(filled & (_box_sum_of_array(weight, self.reach) > self.least_cells), filled)
-            interior = kept & (cv2.erode(filled.view(np.uint8), np.ones((3, 3), np.uint8)).view(np.bool_) | faint[k])
-            left, top, columns, rows = cv2.boundingRect(kept.view(np.uint8))
-            votes = (kept.view(np.uint8) + interior.view(np.uint8))[top : top + rows, left : left + columns]
-            votes = votes.repeat(self.cell, axis=1).repeat(self.cell, axis=0)  # 2 in the interior, which needs no strong pixel
-            here = (k, 0, slice(top * self.cell, (top + rows) * self.cell), slice(left * self.cell, (left + columns) * self.cell))
-            votes = votes[: mask[here].shape[0], : mask[here].shape[1]]  # the last cells reach beyond the image
-            np.greater(fine[here] + votes, 1, out=mask[here])
-            np.equal(votes, 2, out=inner[here])
-        return torch.from_numpy(mask), torch.from_numpy(inner)
-
     def _to_pixels(self, cells: Tensor) -> Tensor:
         return cells.index_select(3, self.cell_column).index_select(2, self.cell_row)
 
@@ -347,21 +312,6 @@ def _line_sums(image: Tensor, cell: int) -> Tensor:
     return torch.cat((sums, last), dim=2)
 
 
-def _column_sums(image: Array, cell: int) -> Array:
-    """:func:`_line_sums` along the columns of an array."""
-    width = image.shape[-1]
-    whole = width // cell * cell
-    sums = image[..., 0:whole:cell]
-    for k in range(1, cell):
-        sums = sums + image[..., k:whole:cell]
-    if whole == width:
-        return sums
-    last = image[..., -cell : width - cell + 1]
-    for k in range(width - cell + 1, width):
-        last = last + image[..., k : k + 1]
-    return np.concatenate((sums, last), axis=-1)
-
-
 def _box_sum(image: Tensor, reach: int, dim: int) -> Tensor:
     """Sums over ``reach`` elements either way along a dimension; beyond the border all is zero."""
     pad = [0, 0, reach, reach] if dim == 2 else [reach, reach, 0, 0]
@@ -369,18 +319,4 @@ def _box_sum(image: Tensor, reach: int, dim: int) -> Tensor:
     total = padded.narrow(dim, 0, length)
     for k in range(1, 2 * reach + 1):
         total = total + padded.narrow(dim, k, length)
-    return total
-
-
-def _box_sum_of_array(image: Array, reach: int) -> Array:
-    """:func:`_box_sum` along both dimensions of an (H, W) array."""
-    height, width = image.shape
-    padded = np.zeros((height + 2 * reach, width + 2 * reach), image.dtype)
-    padded[reach : reach + height, reach : reach + width] = image
-    rows = padded[0:height] + padded[1 : height + 1]
-    for k in range(2, 2 * reach + 1):
-        rows += padded[k : k + height]
-    total: Array = rows[:, 0:width] + rows[:, 1 : width + 1]
-    for k in range(2, 2 * reach + 1):
-        total += rows[:, k : k + width]
     return total

@@ -34,6 +34,7 @@ from .core.checks import (
 )
 from .core.files import check_target, write_atomically
 from .core.geometry import pixel_grid_mm
+from .core.native import operators_only
 from .integration import PoissonDCT, PoissonRest, divergence
 from .integration.transforms import cosine_bases, fold, unfold
 from .pipeline import DepthPipeline
@@ -365,7 +366,8 @@ def export_checked(pipe: DepthPipeline, folder: str | Path, formats: Sequence[st
 def compare(path: str | Path, pipe: DepthPipeline, images: Tensor, name: str) -> float:
     """Largest difference of depth, mm, between an exported file and the pipeline, over batches of 1, 2, 3 and all images.
 
-    The file is run by a process in which torchvts cannot be imported.
+    The file is run by a process in which torchvts cannot be imported, the pipeline by the tensor operators that it was exported as:
+    compiled loops round otherwise, which wholly random frames, whose slopes mean nothing, make visible.
 
     Args:
         path: the file. pipe: what it was made from. images: (B, 3, H, W). name: its format.
@@ -380,7 +382,7 @@ def compare(path: str | Path, pipe: DepthPipeline, images: Tensor, name: str) ->
         raise FileNotFoundError(f"{path}: no such file")
     batches = sorted({size for size in (1, 2, 3, images.shape[0]) if size <= images.shape[0]})
     found = run_bare(path, images, name, batches)
-    with torch.no_grad():
+    with torch.no_grad(), operators_only():
         expected = [pipe(images[:size]).depth_mm for size in batches]
     differences = [float((one.double() - two.double()).abs().max()) for one, two in zip(found, expected, strict=True)]
     return max(differences) if all(np.isfinite(differences)) else float("inf")
@@ -457,9 +459,8 @@ def _size(pipe: DepthPipeline) -> tuple[int, int, torch.dtype]:
 def _trace(pipe: DepthPipeline, by_matrix: bool) -> torch.export.ExportedProgram:
     height, width, dtype = _size(pipe)
     pipe = copy.deepcopy(pipe).eval().requires_grad_(False)
-    if by_matrix and isinstance(pipe.integrate, PoissonRest | PoissonDCT):
-        levelled = isinstance(pipe.integrate, PoissonRest)
-        pipe.integrate = PoissonRestByMatrix(height, width, pipe.mm_per_pixel, dtype, levelled)
+    if by_matrix and isinstance(pipe.integrate, PoissonDCT):
+        pipe.integrate = PoissonRestByMatrix(height, width, pipe.mm_per_pixel, dtype, pipe.integrate.levelled)
     if by_matrix and isinstance(pipe.coarse_integrate, PoissonRest):
         rows, columns = (len(range(pipe.stride // 2, n, pipe.stride)) for n in (height, width))
         pipe.coarse_integrate = PoissonRestByMatrix(rows, columns, pipe.stride * pipe.mm_per_pixel, dtype)

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from .compensate import Compensate
 from .confidence import Bounds, Confidence
 from .contact import ContactMask
+from .core import native
 from .core.checks import (
     check_batch,
     check_choice,
@@ -20,6 +21,7 @@ from .core.checks import (
     may_use_arrays,
 )
 from .core.geometry import GradientFromNormal, normal_from_gradient
+from .core.native import may_use_native
 from .heights import HeightFromBrightness, Heights
 from .integration import AdaptiveIntegration, CliffIntegration, PoissonRest
 from .normals import NormalFromIntensity, NormalFromResponse
@@ -197,6 +199,9 @@ class DepthPipeline(nn.Module):
             if self.expects:
                 gradient, depth = self._guess_again(seen, touched, gradient, depth, active, (top, left))
             gradient, depth = self._refine(seen, touched, gradient, depth, active, (top, left))
+        if may_use_native([gradient]):
+            gradient, normal = _widen_by_loops(gradient, (top, left), (height, width))
+            return DepthOutput(depth, gradient, normal, contact)
         normal = normal_from_gradient(gradient)
         if bottom - top < height or right - left < width:
             gradient = nn.functional.pad(gradient, [left, width - right, top, height - bottom])
@@ -256,14 +261,16 @@ class DepthPipeline(nn.Module):
             if not bool(active.any()):
                 break
             index = torch.where(active)[0]
-            before = depth[index]
-            part, found = self._solve(seen[index], before[:, :, top:bottom, left:right], touched[index], window, size)
+            every = index.shape[0] == active.shape[0]
+            before = _at(depth, index, every)
+            z = before[:, :, top:bottom, left:right]
+            part, found = self._solve(_at(seen, index, every), z, _at(touched, index, every), window, size)
             change_px = (found - before).detach().abs().amax(dim=(1, 2, 3)) / self.mm_per_pixel
-            gradient, depth = gradient.index_copy(0, index, part), depth.index_copy(0, index, found)
             # what is left is the change times r / (1 - r), r being the ratio of this change to the one before
-            ratio = (change_px / last_px[index].clamp_min(1e-12)).clamp(0.0, 0.9)
-            active = active.index_copy(0, index, change_px * ratio / (1.0 - ratio) > self.tolerance_px)
-            last_px = last_px.index_copy(0, index, change_px)
+            ratio = (change_px / _at(last_px, index, every).clamp_min(1e-12)).clamp(0.0, 0.9)
+            gradient, depth = _with(gradient, index, part, every), _with(depth, index, found, every)
+            active = _with(active, index, change_px * ratio / (1.0 - ratio) > self.tolerance_px, every)
+            last_px = _with(last_px, index, change_px, every)
         return gradient, depth
 
     def _refine_in_graph(
@@ -444,11 +451,26 @@ class CliffPipeline(nn.Module):
         )
 
 
+@torch.jit.unused
+def _widen_by_loops(gradient: Tensor, window: tuple[int, int], size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    return native.widen(gradient, window, size)
+
+
 def _no_contact(compensated: Tensor, contact: Tensor) -> DepthOutput:
     zero = torch.zeros_like(compensated)
     normal = zero.clone()
     normal[:, 2] = 1.0
     return DepthOutput(zero[:, 0:1], zero[:, 0:2], normal, contact)
+
+
+def _at(frames: Tensor, index: Tensor, every: bool) -> Tensor:
+    """Some frames of a batch, or as they are where that is every frame."""
+    return frames if every else frames[index]
+
+
+def _with(frames: Tensor, index: Tensor, some: Tensor, every: bool) -> Tensor:
+    """A batch with some of its frames replaced."""
+    return some if every else frames.index_copy(0, index, some)
 
 
 def _as_factor(mask: Tensor, like: Tensor) -> Tensor:

@@ -8,7 +8,9 @@ exact inverses of one discrete operator.
 import torch
 from torch import Tensor, nn
 
+from ..core import native
 from ..core.checks import check_batch, check_positive, check_window
+from ..core.native import may_use_native
 from .transforms import (
     cosine_bases,
     cosine_tables,
@@ -90,7 +92,7 @@ def poisson_dct(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
     check_gradient(gradient, 2)
     if not torch.jit.is_scripting():
         check_positive("mm_per_pixel", mm_per_pixel)
-    return _integrate_dct(gradient, mm_per_pixel, _plan_dct(gradient, gradient.shape[2], gradient.shape[3]), 0, 0)
+    return _integrate_dct(gradient, mm_per_pixel, _plan_dct(gradient, gradient.shape[2], gradient.shape[3]), 0, 0, False)
 
 
 def poisson_rest(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
@@ -111,7 +113,10 @@ def poisson_rest(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
         >>> poisson_rest(torch.zeros(1, 2, 8, 8)).abs().max()
         tensor(0.)
     """
-    return _level(poisson_dct(gradient, mm_per_pixel), gradient, 0, 0)
+    check_gradient(gradient, 2)
+    if not torch.jit.is_scripting():
+        check_positive("mm_per_pixel", mm_per_pixel)
+    return _integrate_dct(gradient, mm_per_pixel, _plan_dct(gradient, gradient.shape[2], gradient.shape[3]), 0, 0, True)
 
 
 class PoissonDST(nn.Module):
@@ -143,6 +148,7 @@ class PoissonDCT(nn.Module):
     def __init__(self, mm_per_pixel: float = 1.0) -> None:
         super().__init__()
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
+        self.levelled = False
         self._plan: list[Tensor] = _plan_dct(torch.zeros(1, 2, 2, 2), 2, 2)
 
     def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
@@ -153,21 +159,15 @@ class PoissonDCT(nn.Module):
         if not _plan_fits(plan, gradient, height, width):
             plan = _kept(_plan_dct(gradient, height, width))
             self._plan = plan
-        return _integrate_dct(gradient, self.mm_per_pixel, plan, top, left)
+        return _integrate_dct(gradient, self.mm_per_pixel, plan, top, left, self.levelled)
 
 
-class PoissonRest(nn.Module):
+class PoissonRest(PoissonDCT):
     """Module face of :func:`poisson_rest`; keeps the plan and takes a window as :class:`PoissonDCT` does."""
 
-    takes_window: bool = True
-
     def __init__(self, mm_per_pixel: float = 1.0) -> None:
-        super().__init__()
-        self.dct = PoissonDCT(mm_per_pixel)
-
-    def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
-        top, left = (0, 0) if window is None else window
-        return _level(self.dct(gradient, window, size), gradient, top, left)
+        super().__init__(mm_per_pixel)
+        self.levelled = True
 
 
 def _level(depth: Tensor, gradient: Tensor, top: int, left: int) -> Tensor:
@@ -198,7 +198,19 @@ def _integrate_dst(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor]) ->
     return mm_per_pixel * nn.functional.pad(z, [1, 1, 1, 1])
 
 
-def _integrate_dct(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], top: int, left: int) -> Tensor:
+def _integrate_dct(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], top: int, left: int, levelled: bool) -> Tensor:
+    if len(plan) == 7 and may_use_native([gradient, plan[2]]):
+        return _by_loops(gradient, mm_per_pixel, plan, (top, left), levelled)
+    depth = _by_operators(gradient, mm_per_pixel, plan, top, left)
+    return _level(depth, gradient, top, left) if levelled else depth
+
+
+@torch.jit.unused
+def _by_loops(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], window: tuple[int, int], levelled: bool) -> Tensor:
+    return native.solve_poisson(gradient, mm_per_pixel, plan, window, levelled)
+
+
+def _by_operators(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], top: int, left: int) -> Tensor:
     height, width = int(plan[-2].shape[0]), int(plan[-1].shape[0])
     if gradient.shape[2] < height or gradient.shape[3] < width:  # one more pixel, where the edges out of the window end
         above, before = min(top, 1), min(left, 1)

@@ -5,6 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from ..core import native
 from ..core.checks import (
     QUANTISATION_STD,
     check_batch,
@@ -18,6 +19,7 @@ from ..core.checks import (
     may_read_values,
 )
 from ..core.geometry import gradient_from_normal, normal_from_gradient
+from ..core.native import may_use_native
 from ..record import Calibration, check_calibration
 from ..shading import PointLights, flat_image, gloss_lobe, inverse_light_matrix, light_matrix, normal_at_depth, seen_at
 
@@ -269,7 +271,17 @@ class NormalFromIntensity(nn.Module):
             axis = (-x, -y)
         if self.lights.glossy:
             compensated = self._matt(compensated, depth_mm, position, axis)
+        dark = self.dark_where[:, top:bottom, left:right]
+        full = self.full_above[:, top:bottom, left:right]
+        weak = self.weak[top:bottom, left:right]
+        tensors = [compensated, position, albedo, self.inverse]
         if depth_mm is not None:
+            tensors.append(depth_mm)
+        if may_use_native(tensors):
+            normal, sound = self._by_loops(compensated, depth_mm, (top, left), position, axis)
+            if sound and not (self.ill and bool(weak.any())):
+                return normal
+        elif depth_mm is not None:
             normal = normal_at_depth(compensated, depth_mm, position, albedo, self.mm_per_pixel, self.camera_height_mm, axis)
         elif torch.is_grad_enabled() and (position.requires_grad or albedo.requires_grad):
             rest = compensated.new_zeros(1, 1, compensated.shape[2], compensated.shape[3])
@@ -280,10 +292,15 @@ class NormalFromIntensity(nn.Module):
             normal = torch.addcmul(normal, inverse[:, :, 2], compensated[:, 2:3])
             n_x, n_y, n_z = normal[:, 0:1], normal[:, 1:2], normal[:, 2:3]
             normal = normal * torch.rsqrt(torch.addcmul(torch.addcmul(n_x * n_x, n_y, n_y), n_z, n_z) + 1e-24)
-        dark = self.dark_where[:, top:bottom, left:right]
-        full = self.full_above[:, top:bottom, left:right]
-        weak = self.weak[top:bottom, left:right]
         return self._relight(normal, compensated, depth_mm, position, albedo, dark, full, weak, axis, expected)
+
+    @torch.jit.unused
+    def _by_loops(
+        self, compensated: Tensor, depth_mm: Tensor | None, window: tuple[int, int], position: Tensor, axis: tuple[float, float]
+    ) -> tuple[Tensor, bool]:
+        tables = (self.dark_where, self.full_above, self.inverse, window)
+        camera = (self.mm_per_pixel, self.camera_height_mm, axis)
+        return native.normals(compensated, *tables, depth_mm, position, self.lights.albedo, *camera)
 
     def _matt(self, compensated: Tensor, depth_mm: Tensor | None, position: Tensor, axis: tuple[float, float]) -> Tensor:
         """What a matt skin would show: the specular lobe divided out, at the slope of the depth so far."""

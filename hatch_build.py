@@ -1,0 +1,41 @@
+"""Builds the compiled loops of torchvts/native with the C compiler at hand; without one, the package works by tensor operators."""
+
+import os
+import shlex
+import shutil
+import subprocess
+import sysconfig
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+
+FLAGS = ["-std=c11", "-O3", "-fno-math-errno", "-fPIC", "-shared", "-fvisibility=hidden"]
+PLAIN = "-DWIDE="  # compilers that cannot build a function for several kinds of processors
+
+
+class CompiledLoops(BuildHookInterface):
+    """Writes torchvts/native/libtorchvts.so before the files are collected."""
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        folder = Path(self.root) / "torchvts" / "native"
+        library = folder / "libtorchvts.so"
+        library.unlink(missing_ok=True)
+        compiler = shlex.split(os.environ.get("CC", "cc"))
+        if shutil.which(compiler[0]) is None:
+            self.app.display_warning(f"no C compiler {compiler[0]!r}: frames will take about twice as long")
+            return
+        sources = [str(source) for source in sorted(folder.glob("*.c"))]
+        with tempfile.TemporaryDirectory(dir=folder) as scratch:
+            built = Path(scratch) / library.name
+            for more in ([], [PLAIN]):
+                done = subprocess.run([*compiler, *FLAGS, *more, *sources, "-o", str(built), "-lm"], capture_output=True, text=True)
+                if done.returncode == 0:
+                    break
+            else:
+                self.app.display_warning(f"the C compiler failed, so frames will take about twice as long:\n{done.stderr}")
+                return
+            os.replace(built, library)
+        build_data["pure_python"] = False
+        build_data["tag"] = "py3-none-" + sysconfig.get_platform().replace("-", "_").replace(".", "_")

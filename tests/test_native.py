@@ -1,0 +1,167 @@
+"""Compiled loops against the tensor operators that they stand for."""
+
+import shutil
+import threading
+
+import pytest
+import torch
+
+import torchvts as vts
+from torchvts.core import native
+from torchvts.core.native import may_use_native, operators_only
+
+scenes = vts.scenes
+
+pytestmark = pytest.mark.skipif(native.library() is None and shutil.which("cc") is None, reason="no C compiler")
+
+
+def both(call, *arguments):
+    """What loops and operators make of one call."""
+    with operators_only():
+        operators = call(*arguments)
+    return call(*arguments), operators
+
+
+def test_the_loops_were_built():
+    assert native.library() is not None, f"{native.LIBRARY} is missing: install again (make setup)"
+
+
+@pytest.mark.parametrize("size", [(48, 64), (240, 320), (45, 63), (2, 2), (3, 7), (16, 5), (1, 9)])
+@pytest.mark.parametrize("module", [vts.PoissonDCT, vts.PoissonRest])
+def test_depth_of_any_window(module, size):
+    generator = torch.Generator().manual_seed(size[0])
+    solver = module(0.3)
+    if min(size) < 2:
+        with pytest.raises(ValueError, match="expected H and W of at least 2"):
+            solver(torch.zeros(1, 2, *size))
+        return
+    for top, left, height, width in windows(size, generator):
+        gradient = torch.randn(3, 2, height, width, generator=generator)
+        gradient[1, :, : height // 2] = 0.0
+        gradient[2] = 0.0
+        loops, operators = both(solver, gradient, (top, left), size)
+        assert float((loops - operators).abs().max()) < 3e-7 * (1.0 + float(operators.abs().max())) * max(size) ** 0.5
+
+
+def windows(size, generator):
+    """All of an image, its corners and sides, and parts inside."""
+    height, width = size
+    yield 0, 0, height, width
+    for _ in range(12):
+        rows, columns = (2 + int(torch.randint(max(1, n - 1), (1,), generator=generator)) for n in size)
+        rows, columns = min(rows, height), min(columns, width)
+        for top in {0, (height - rows) // 2, height - rows}:
+            for left in {0, (width - columns) // 2, width - columns}:
+                yield top, left, rows, columns
+
+
+@pytest.mark.parametrize("camera_height_mm", [float("inf"), 60.0])
+@pytest.mark.parametrize("height_mm", [15.0, 40.0])
+def test_normals_at_rest_and_at_a_depth(ring, height_mm, camera_height_mm):
+    """Of moderate slopes, of slopes that block lights, and of images that no slope makes."""
+    lights = ring(25.0, height_mm)
+    scene = scenes.sphere_press(10.0, 3.0, (2.0, -1.0), 60, 80, 0.4)
+    block = vts.NormalFromIntensity(lights, 60, 80, 0.4, camera_height_mm=camera_height_mm)
+    seen = scenes.render(scene, lights, noise_std=0.003, seed=1).repeat(2, 1, 1, 1)
+    seen[1] = 0.6 * seen[1] + 0.1
+    depth = scene.depth_mm + torch.tensor([0.0, 0.5]).reshape(2, 1, 1, 1)
+    bound = 5e-5 if height_mm < 20.0 else 2e-6  # steps of Gauss-Newton at blocked lights make much of the last bit
+    for rows, columns, window in ((slice(0, 60), slice(0, 80), None), (slice(8, 41), slice(16, 77), (8, 16))):
+        for given in (None, depth[:, :, rows, columns], depth[:1, :, rows, columns]):
+            for image in (seen[:, :, rows, columns], seen.transpose(2, 3).contiguous().transpose(2, 3)[:, :, rows, columns]):
+                loops, operators = both(block, image, given, window)
+                assert float((loops - operators).abs().max()) < bound
+                assert float((loops.norm(dim=1) - 1.0).abs().max()) < 1e-6
+
+
+def test_a_frame_of_every_mode(ring):
+    """Contact to the bit, depth to 2e-6 mm; two frames pressed, one at rest, one cut by the border."""
+    lights = ring()
+    places = [(1.0, (0.0, 0.0)), (0.0, (0.0, 0.0)), (0.6, (-3.0, 4.0)), (1.5, (18.0, 2.0))]
+    presses = [scenes.sphere_press(10.0, max(mm, 0.1), at, 120, 160, 0.25) for mm, at in places]
+    frames = torch.cat(
+        [
+            scenes.render(press if mm else scenes.at_rest(press), lights, noise_std=0.003, bits=8, seed=k)
+            for k, (press, (mm, _)) in enumerate(zip(presses, places, strict=True))
+        ]
+    ).detach()
+    rest = scenes.render(scenes.at_rest(presses[0]), lights, noise_std=0.003, bits=8, seed=9).detach()
+    calibration = vts.Calibration.from_lights(lights, vts.Sensor("rig", 120, 160, 0.25), rest[0])
+    for mode in ("fast", "precise", "auto"):
+        pipe = vts.DepthPipeline.from_calibration(calibration, mode)
+        for some in (frames, frames[:1], frames[1:2]):
+            loops, operators = both(pipe, some)
+            assert torch.equal(loops.contact, operators.contact)
+            assert float((loops.depth_mm - operators.depth_mm).abs().max()) < 2e-6
+            assert float((loops.gradient - operators.gradient).abs().max()) < 1e-5
+            assert float((loops.normal - operators.normal).abs().max()) < 1e-5
+    assert bool(calibration.model_image.min() > 0) and loops.contact.shape == (1, 1, 120, 160)
+
+
+def test_a_dead_lamp(ring):
+    lights = ring()
+    scene = scenes.sphere_press(10.0, 1.0, (0, 0), 120, 160, 0.25)
+    calibration = vts.Calibration.from_lights(lights, vts.Sensor("rig", 120, 160, 0.25))
+    image = scenes.render(scene, lights, noise_std=0.003, bits=8, seed=1).detach() * torch.tensor([1.0, 0.0, 1.0]).reshape(3, 1, 1)
+    loops, operators = both(vts.ContactMask.from_calibration(calibration), image)
+    assert torch.equal(loops, operators) and bool(loops.any())
+
+
+def test_what_loops_may_not_touch():
+    plain = torch.zeros(1, 2, 8, 8)
+    assert may_use_native([plain, plain])
+    with operators_only():
+        assert not may_use_native([plain])
+    assert not may_use_native([plain, plain.double()])
+    assert not may_use_native([plain.half()])
+    assert not may_use_native([plain.to("meta")])
+    recorded = plain.clone().requires_grad_(True)
+    assert not may_use_native([recorded])
+    with torch.no_grad():
+        assert may_use_native([recorded])
+
+
+def test_tangents_pass_through_operators():
+    """Forward differentiation records nothing on the tensor itself, so loops would lose it in silence."""
+    solver = vts.PoissonDCT(0.1)
+    gradient, tangent = torch.randn(2, 1, 2, 12, 16, generator=torch.Generator().manual_seed(0))
+    depth, change = torch.func.jvp(solver, (gradient,), (tangent,))
+    assert torch.allclose(depth, solver(gradient), atol=1e-6)
+    assert float((change - solver(tangent)).abs().max()) < 1e-5  # it is linear
+
+
+def test_threads_share_a_pipeline(ring, small_sensor, small_press):
+    lights = ring()
+    calibration = vts.Calibration.from_lights(lights, small_sensor)
+    pipe = vts.DepthPipeline.from_calibration(calibration)
+    image = scenes.render(small_press(1.0), lights, noise_std=0.003, bits=8, seed=1).detach()
+    alone, found = pipe(image), []
+
+    def work():
+        found.extend(pipe(image) for _ in range(30))
+
+    threads = [threading.Thread(target=work) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(found) == 120
+    assert all(torch.equal(out.contact, alone.contact) for out in found)
+    assert max(float((out.depth_mm - alone.depth_mm).abs().max()) for out in found) < 1e-6
+
+
+def test_without_them_all_works(monkeypatch, ring, small_sensor, small_press):
+    lights = ring()
+    pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, small_sensor), "precise")
+    image = scenes.render(small_press(1.0), lights).detach()
+    loops = pipe(image).depth_mm
+    monkeypatch.setattr(native, "library", lambda: None)
+    assert not may_use_native([image])
+    assert torch.allclose(pipe(image).depth_mm, loops, rtol=0, atol=2e-6)
+
+
+def test_a_library_that_is_missing_is_told(monkeypatch, tmp_path):
+    native.library.cache_clear()
+    monkeypatch.setattr(native, "LIBRARY", tmp_path / "nothing.so")
+    assert native.library() is None
+    native.library.cache_clear()

@@ -1,0 +1,220 @@
+"""Python's side of the compiled loops in torchvts/native: one function for each of theirs, and whether they may be used.
+
+They give the numbers of the tensor operators beside which they stand, to rounding, in a half to a tenth of the time: a frame passes
+through memory once instead of once per operator. They know neither gradients nor other devices nor other types than float32.
+"""
+
+import contextlib
+import contextvars
+import ctypes
+import functools
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+LIBRARY = Path(__file__).parents[1] / "native" / "libtorchvts.so"
+
+
+@functools.cache
+def library() -> ctypes.CDLL | None:
+    """The compiled loops; None where no C compiler was at hand when this package was installed, and operators do their work."""
+    try:
+        loaded = ctypes.CDLL(str(LIBRARY))
+    except OSError:
+        return None
+    pointer, whole, real, step = ctypes.c_void_p, ctypes.c_int, ctypes.c_float, ctypes.c_int64
+    loaded.contact_mask.argtypes = [*[pointer] * 4, *[whole] * 7, *[real] * 3, pointer, pointer]
+    loaded.normals.argtypes = [
+        pointer,
+        *[step] * 3,
+        *[pointer] * 3,
+        step,
+        *[whole] * 4,
+        pointer,
+        *[step] * 2,
+        *[pointer] * 2,
+        *[real] * 4,
+        pointer,
+    ]
+    loaded.divergence_lines.argtypes = [pointer, real, *[whole] * 9, pointer]
+    loaded.to_columns.argtypes = [pointer, pointer, *[whole] * 4, pointer]
+    loaded.divide.argtypes = [*[pointer] * 4, *[whole] * 3]
+    loaded.settle.argtypes = [*[pointer] * 3, *[whole] * 7, pointer]
+    loaded.widen.argtypes = [pointer, *[whole] * 7, pointer, pointer]
+    for name in ("to_columns", "settle", "widen"):
+        getattr(loaded, name).restype = None
+    return loaded
+
+
+_refused = contextvars.ContextVar("refused", default=False)
+
+
+@contextlib.contextmanager
+def operators_only() -> Iterator[None]:
+    """Within it, tensor operators do all the work, as they do in exported programs, while gradients are recorded, and on a GPU.
+
+    Example:
+        >>> from torchvts import PoissonRest
+        >>> solver, gradient = PoissonRest(0.1), torch.randn(1, 2, 48, 64)
+        >>> with operators_only():
+        ...     depth = solver(gradient)
+        >>> bool((solver(gradient) - depth).abs().max() < 1e-5)
+        True
+    """
+    before = _refused.set(True)
+    try:
+        yield
+    finally:
+        _refused.reset(before)
+
+
+def may_use_native(tensors: list[Tensor]) -> bool:
+    """Whether compiled loops may work on these: float32, on a CPU, run by Python, no gradient recorded. Scripts."""
+    if torch.jit.is_scripting():
+        return False
+    else:  # noqa: RET505, TorchScript leaves out the other branch only so
+        if torch.compiler.is_compiling() or torch.jit.is_tracing() or _refused.get() or library() is None:
+            return False
+        if forward_ad._current_level >= 0:  # under which a tangent would be lost
+            return False
+        recorded = torch.is_grad_enabled()
+        return all(
+            tensor.dtype == torch.float32
+            and tensor.device.type == "cpu"
+            and not (recorded and tensor.requires_grad)
+            and not torch._C._functorch.is_functorch_wrapped_tensor(tensor)
+            for tensor in tensors
+        )
+
+
+def _loops() -> ctypes.CDLL:
+    loaded = library()
+    assert loaded is not None, "asked without may_use_native"
+    return loaded
+
+
+def _check(short_of_memory: int) -> None:
+    if short_of_memory:
+        raise MemoryError("torchvts: no memory is left for a few rows of the image")
+
+
+def contact_mask(
+    compensated: Tensor,
+    rest: Tensor,
+    per_noise: Tensor,
+    dead_below: Tensor,
+    step: int,
+    samples: int,
+    cell: int,
+    reach: int,
+    sigmas: float,
+    rounding: float,
+    least_cells: float,
+) -> tuple[Tensor, Tensor]:
+    """Hard and inner contact, bool (B, 1, H, W): see :class:`~torchvts.contact.ContactMask`, whose attributes these are."""
+    compensated, rest, per_noise = compensated.contiguous(), rest.contiguous(), per_noise.contiguous()
+    count, _, height, width = compensated.shape
+    mask = torch.empty(count, 1, height, width, dtype=torch.bool)
+    inner = torch.empty_like(mask)
+    stride = max(1, math.ceil(math.sqrt(height * width / samples)))
+    inputs = (compensated.data_ptr(), rest.data_ptr(), per_noise.data_ptr(), dead_below.data_ptr())
+    grid = (count, height, width, step, stride, cell, reach, sigmas, rounding, least_cells)
+    _check(_loops().contact_mask(*inputs, *grid, mask.data_ptr(), inner.data_ptr()))
+    return mask, inner
+
+
+def normals(
+    compensated: Tensor,
+    dark: Tensor,
+    full: Tensor,
+    inverse: Tensor,
+    window: tuple[int, int],
+    depth_mm: Tensor | None,
+    position_mm: Tensor,
+    albedo: Tensor,
+    mm_per_pixel: float,
+    camera_height_mm: float,
+    axis_mm: tuple[float, float],
+) -> tuple[Tensor, bool]:
+    """Unit normals (B, 3, h, w) of a window, and whether no light is blocked there and no channel full.
+
+    See :class:`~torchvts.normals.NormalFromIntensity`: by the stored inverse, or at a depth by the lights as seen from the
+    window's middle. ``dark``, ``full`` (3, H, W) and ``inverse`` (3, 3, H, W) are those of the whole image.
+    """
+    dark, full, inverse = dark.contiguous(), full.contiguous(), inverse.contiguous()
+    compensated = compensated if compensated.stride(3) == 1 else compensated.contiguous()
+    position_mm, albedo = position_mm.contiguous(), albedo.contiguous()
+    count, _, rows, columns = compensated.shape
+    height, width = inverse.shape[2], inverse.shape[3]
+    at = 4 * (window[0] * width + window[1])
+    normal = torch.empty(count, 3, rows, columns)
+    depth, steps = None, (0, 0)
+    if depth_mm is not None:
+        depth_mm = depth_mm if depth_mm.stride(3) == 1 else depth_mm.contiguous()
+        depth, steps = depth_mm.data_ptr(), (0 if depth_mm.shape[0] == 1 else depth_mm.stride(0), depth_mm.stride(2))
+    unsound = _loops().normals(
+        compensated.data_ptr(),
+        *compensated.stride()[:3],
+        dark.data_ptr() + at,
+        full.data_ptr() + at,
+        inverse.data_ptr() + at,
+        height * width,
+        width,
+        count,
+        rows,
+        columns,
+        depth,
+        *steps,
+        position_mm.data_ptr(),
+        albedo.data_ptr(),
+        mm_per_pixel,
+        1.0 / camera_height_mm,
+        *axis_mm,
+        normal.data_ptr(),
+    )
+    return normal, not unsound
+
+
+def solve_poisson(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], window: tuple[int, int], levelled: bool) -> Tensor:
+    """Depth (B, 1, H, W) of a window's gradient, by the seven tables of a plan for the FFT.
+
+    See :mod:`torchvts.integration.poisson`. ``levelled``: zero on average where the gradient is zero, not over all of the image.
+    """
+    gradient = gradient.contiguous()
+    turns, of_sum, of_difference, order = plan[0], plan[2], plan[3], plan[5]
+    height, width = int(plan[5].shape[0]), int(plan[6].shape[0])
+    count, _, rows, columns = gradient.shape
+    part = (rows, columns, *window)
+    first, last = max(0, window[0] - 1), min(height, window[0] + rows + 1)
+    loops = _loops()
+    lines = torch.empty(count, last - first, width)
+    _check(
+        loops.divergence_lines(
+            gradient.data_ptr(), mm_per_pixel, count, *part, height, width, first, last - first, lines.data_ptr()
+        )
+    )
+    spectrum = torch.fft.rfft(lines).contiguous()
+    turned = torch.empty(count, spectrum.shape[2], height, dtype=torch.complex64)
+    places = order.data_ptr() + first * order.element_size()
+    loops.to_columns(spectrum.data_ptr(), places, count, last - first, spectrum.shape[2], height, turned.data_ptr())
+    spectrum = torch.fft.fft(turned).contiguous()
+    tables = (turns.data_ptr(), of_sum.data_ptr(), of_difference.data_ptr())
+    _check(loops.divide(spectrum.data_ptr(), *tables, count, spectrum.shape[1], height))
+    lines = torch.fft.irfft(torch.fft.ifft(spectrum), n=width, dim=1).transpose(1, 2).contiguous()
+    depth = torch.empty(count, 1, height, width)
+    slopes = gradient.data_ptr() if levelled else None
+    loops.settle(lines.data_ptr(), order.data_ptr(), slopes, count, *part, height, width, depth.data_ptr())
+    return depth
+
+
+def widen(gradient: Tensor, window: tuple[int, int], size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """A window's gradient in the whole image (B, 2, H, W), zero elsewhere, and the normals (B, 3, H, W)."""
+    gradient = gradient.contiguous()
+    count, _, rows, columns = gradient.shape
+    whole, normal = torch.empty(count, 2, *size), torch.empty(count, 3, *size)
+    _loops().widen(gradient.data_ptr(), count, rows, columns, *window, *size, whole.data_ptr(), normal.data_ptr())
+    return whole, normal

@@ -1,0 +1,339 @@
+/* The contact mask of compensated images: the same numbers as the operators of ContactMask in torchvts/contact.py, which say why. */
+#include "native.h"
+
+#include <math.h>
+
+/* Bits of a coarse cell. */
+enum { CELL = 1, FAINT = 2, OUTSIDE = 4, KEPT = 8 };
+
+/* The k-th smallest of n values, which it reorders: Hoare's selection. */
+static float kth_smallest(float *values, int n, int k) {
+    int low = 0, high = n - 1;
+    while (low < high) {
+        float pivot = values[low + (high - low) / 2];
+        int i = low, j = high;
+        while (i <= j) {
+            while (values[i] < pivot) i++;
+            while (values[j] > pivot) j--;
+            if (i <= j) {
+                float swapped = values[i];
+                values[i++] = values[j];
+                values[j--] = swapped;
+            }
+        }
+        if (k <= j)
+            high = j;
+        else if (k >= i)
+            low = i;
+        else
+            break;
+    }
+    return values[k];
+}
+
+/* noise_std() of torchvts/core/noise.py, of one channel's change: image * per_noise + rest. */
+static float noise_of(const float *image, const float *rest, const float *per_noise, int height, int width, int stride, float *some) {
+    int n = 0;
+    for (int y = stride / 2; y < height; y += stride)
+        for (int x = 0; x < width - 2; x += stride, n++) {
+            const float *i = image + (size_t)y * width + x, *r = rest + (size_t)y * width + x, *p = per_noise + (size_t)y * width + x;
+            float left = r[0] + i[0] * p[0], middle = r[1] + i[1] * p[1], right = r[2] + i[2] * p[2];
+            some[n] = fabsf(middle - 0.5f * (left + right));
+        }
+    float std = 1.5f * kth_smallest(some, n, (n - 1) / 2) / 0.6745f;
+    for (int pass = 0; pass < 2; pass++) {
+        float total = 0.0f;
+        int count = 0;
+        for (int k = 0; k < n; k++)
+            if (some[k] <= 3.0f * std) {
+                total += some[k] * some[k];
+                count++;
+            }
+        std = sqrtf(total / (float)(count > 0 ? count : 1) / 0.97334f);
+    }
+    return std / sqrtf(1.5f);
+}
+
+/* One row of one channel: its change is added to `sums`, its square to `squared`. */
+WIDE static void add_change(const float *restrict image, const float *restrict rest, const float *restrict per_noise, int width,
+                            float *restrict sums, float *restrict squared) {
+    for (int x = 0; x < width; x++) {
+        float change = rest[x] + image[x] * per_noise[x];
+        sums[x] += change;
+        squared[x] += change * change;
+    }
+}
+
+WIDE static void above(const float *restrict values, float threshold, int width, uint8_t *restrict result) {
+    for (int x = 0; x < width; x++) result[x] = values[x] > threshold;
+}
+
+WIDE static void either(const uint8_t *restrict a, const uint8_t *restrict b, const uint8_t *restrict c, int n, uint8_t *restrict result) {
+    for (int x = 0; x < n; x++) result[x] = a[x] | b[x] | c[x];
+}
+
+WIDE static void all(const uint8_t *restrict a, const uint8_t *restrict b, const uint8_t *restrict c, int n, uint8_t *restrict result) {
+    for (int x = 0; x < n; x++) result[x] = a[x] & b[x] & c[x];
+}
+
+WIDE static void keep_line(const uint8_t *restrict kept, const uint8_t *restrict inner, int n, uint8_t *restrict strong) {
+    for (int x = 0; x < n; x++) strong[x] = (strong[x] & kept[x]) | inner[x];
+}
+
+WIDE static void add_bytes(const uint8_t *restrict values, int n, uint16_t *restrict sums) {
+    for (int x = 0; x < n; x++) sums[x] = (uint16_t)(sums[x] + values[x]);
+}
+
+WIDE static void add_floats(const float *restrict values, int n, float *restrict sums) {
+    for (int x = 0; x < n; x++) sums[x] += values[x];
+}
+
+typedef void (*combine)(const uint8_t *restrict, const uint8_t *restrict, const uint8_t *restrict, int, uint8_t *restrict);
+
+/* Each pixel and its eight neighbours combined, in place; `beyond` is what lies outside. `scratch`: (height + 3) (width + 2) bytes. */
+static void combine_neighbours(uint8_t *image, int height, int width, combine how, uint8_t beyond, uint8_t *scratch) {
+    uint8_t *padded = scratch, *lines = scratch + width + 2;
+    memset(padded, beyond, (size_t)width + 2);
+    memset(lines, beyond, (size_t)width);
+    memset(lines + (size_t)(height + 1) * width, beyond, (size_t)width);
+    for (int y = 0; y < height; y++) {
+        memcpy(padded + 1, image + (size_t)y * width, (size_t)width);
+        how(padded, padded + 1, padded + 2, width, lines + (size_t)(y + 1) * width);
+    }
+    for (int y = 0; y < height; y++) {
+        const uint8_t *line = lines + (size_t)y * width;
+        how(line, line + width, line + 2 * (size_t)width, width, image + (size_t)y * width);
+    }
+}
+
+/* Marks all cells without any bit of `walls` that are connected, over edges, to those on the stack. */
+static void spread(uint8_t *cells, int wide, uint8_t walls, uint8_t mark, int32_t *stack, int top) {
+    const int way[4] = {1, -1, wide, -wide};
+    while (top > 0) {
+        int at = stack[--top];
+        for (int k = 0; k < 4; k++) {
+            int to = at + way[k];
+            if (!(cells[to] & walls)) {
+                cells[to] |= mark;
+                stack[top++] = to;
+            }
+        }
+    }
+}
+
+/* Whether a lamp is dead: 1 for each channel that counts. More than one dark channel is no dead lamp. */
+static void living_lamps(const float *image, const float *dead_below, int height, int width, int step, int lives[3]) {
+    int dead = 0;
+    for (int c = 0; c < 3; c++) {
+        double total = 0.0;
+        int count = 0;
+        for (int y = step / 2; y < height; y += step)
+            for (int x = step / 2; x < width; x += step, count++) total += image[((size_t)c * height + y) * width + x];
+        lives[c] = !(total / count < dead_below[c]);
+        dead += !lives[c];
+    }
+    if (dead != 1) lives[0] = lives[1] = lives[2] = 1;
+}
+
+/* What one frame needs besides its masks. */
+typedef struct {
+    float *some, *means, *density, *down, *sums, *squared;
+    uint8_t *state, *bytes;
+    uint16_t *counts;
+    int32_t *stack;
+} Scratch;
+
+/* The grid of coarse cells: their number, side, and how the model of ContactMask looks at them. */
+typedef struct {
+    int rows, columns, cell, reach;
+    float sigmas, least_cells;
+} Grid;
+
+/* Pixels whose change stands out, closed, and each cell's share of them and mean change; where the size is no multiple of the cell's
+   side, the last cells overlap others. */
+static void find_strong(const float *frame, const float *rest, const float *per_noise, const int lives[3], int height, int width,
+                        float threshold, Grid grid, Scratch at, uint8_t *strong) {
+    const size_t pixels = (size_t)height * width, cells = (size_t)grid.rows * grid.columns;
+    const int cell = grid.cell;
+    const float area = (float)(cell * cell);
+    for (int i = 0; i < grid.rows; i++) {
+        const int first = least(i * cell, height - cell);
+        memset(at.sums, 0, 3 * sizeof(float) * (size_t)width);
+        for (int y = first; y < first + cell; y++) {
+            const size_t row = (size_t)y * width;
+            memset(at.squared, 0, sizeof(float) * (size_t)width);
+            for (int c = 0; c < 3; c++)
+                if (lives[c])
+                    add_change(frame + pixels * c + row, rest + pixels * c + row, per_noise + pixels * c + row, width,
+                               at.sums + (size_t)c * width, at.squared);
+            above(at.squared, threshold, width, strong + row);
+        }
+        for (int c = 0; c < 3; c++)
+            for (int j = 0; j < grid.columns; j++) {
+                const float *start = at.sums + (size_t)c * width + least(j * cell, width - cell);
+                float sum = start[0];
+                for (int k = 1; k < cell; k++) sum += start[k];
+                at.means[c * cells + (size_t)i * grid.columns + j] = sum / area;
+            }
+    }
+    combine_neighbours(strong, height, width, either, 0, at.bytes);
+    combine_neighbours(strong, height, width, all, 1, at.bytes);
+    for (int i = 0; i < grid.rows; i++) {
+        const int first = least(i * cell, height - cell);
+        memset(at.counts, 0, sizeof(uint16_t) * (size_t)width);
+        for (int y = first; y < first + cell; y++) add_bytes(strong + (size_t)y * width, width, at.counts);
+        for (int j = 0; j < grid.columns; j++) {
+            const uint16_t *start = at.counts + least(j * cell, width - cell);
+            int sum = 0;
+            for (int k = 0; k < cell; k++) sum += start[k];
+            at.density[(size_t)i * grid.columns + j] = (float)sum / area;
+        }
+    }
+}
+
+/* Cells with strong pixels, and faint ones, whose mean change stands out of the frame's own spread of such means. Holes are what
+   then bears no OUTSIDE. The state has a border of one cell. Returns whether there is any cell. */
+static int find_cells(Grid grid, float threshold, Scratch at) {
+    const size_t cells = (size_t)grid.rows * grid.columns;
+    const int rows = grid.rows, columns = grid.columns, wide = columns + 2;
+    const int longer = rows > columns ? rows : columns, step = longer < 80 ? 1 : longer / 40;
+    const float least_std = sqrtf(threshold) / (grid.sigmas * (float)grid.cell);
+    float per[3];
+    for (int c = 0; c < 3; c++) {
+        int n = 0;
+        for (int i = step / 2; i < rows; i += step)
+            for (int j = step / 2; j < columns; j += step) at.some[n++] = fabsf(at.means[c * cells + (size_t)i * columns + j]);
+        const float std = kth_smallest(at.some, n, (n - 1) / 2) / 0.6745f;
+        per[c] = 1.0f / (std > least_std ? std : least_std);
+    }
+    memset(at.state, OUTSIDE, (size_t)(rows + 2) * wide);
+    int found = 0, top = 0;
+    for (int i = 0; i < rows; i++)
+        for (int j = 0; j < columns; j++) {
+            const size_t k = (size_t)i * columns + j;
+            const float r = at.means[k] * per[0], g = at.means[cells + k] * per[1], b = at.means[2 * cells + k] * per[2];
+            const uint8_t kind = at.density[k] > 0.0f ? CELL : r * r + g * g + b * b > 25.0f ? CELL | FAINT : 0;
+            const int place = (i + 1) * wide + j + 1;
+            at.state[place] = kind;
+            found |= kind;
+            if (!kind && (i == 0 || j == 0 || i == rows - 1 || j == columns - 1)) {
+                at.state[place] = OUTSIDE;
+                at.stack[top++] = place;
+            }
+        }
+    if (found) spread(at.state, wide, CELL | OUTSIDE, OUTSIDE, at.stack, top);
+    return found;
+}
+
+/* Keeps what is connected to a cell around which there is nearly a disc of the least size. A hole counts as contact; faint cells too,
+   but it takes three that lie together. */
+static void keep_large(Grid grid, Scratch at) {
+    const int rows = grid.rows, columns = grid.columns, wide = columns + 2, reach = grid.reach;
+    const float weak = 0.4f * grid.least_cells < 1.0f ? 0.4f * grid.least_cells : 1.0f;
+    float *weight = at.density;
+    for (int i = 0; i < rows; i++)
+        for (int j = 0; j < columns; j++) {
+            const uint8_t kind = at.state[(i + 1) * wide + j + 1];
+            float *w = weight + (size_t)i * columns + j;
+            *w = kind & OUTSIDE ? 0.0f : kind & FAINT ? weak : kind ? *w : 1.0f;
+        }
+    int top = 0;
+    memset(at.down, 0, sizeof(float) * (size_t)(columns + 2 * reach));
+    for (int i = 0; i < rows; i++) {
+        memset(at.down + reach, 0, sizeof(float) * (size_t)columns);
+        for (int k = i - reach < 0 ? 0 : i - reach; k <= i + reach && k < rows; k++)
+            add_floats(weight + (size_t)k * columns, columns, at.down + reach);
+        memset(at.sums, 0, sizeof(float) * (size_t)columns);
+        for (int k = 0; k <= 2 * reach; k++) add_floats(at.down + k, columns, at.sums);
+        for (int j = 0; j < columns; j++) {
+            const int place = (i + 1) * wide + j + 1;
+            if (at.sums[j] > grid.least_cells && !(at.state[place] & OUTSIDE)) {
+                at.state[place] |= KEPT;
+                at.stack[top++] = place;
+            }
+        }
+    }
+    spread(at.state, wide, OUTSIDE | KEPT, KEPT, at.stack, top);
+}
+
+/* Whether no neighbour of a cell lies outside of the contact; what is beyond the image counts as contact. */
+static int is_inner(Grid grid, const uint8_t *state, int i, int j) {
+    for (int y = i > 0 ? i - 1 : 0; y <= i + 1 && y < grid.rows; y++)
+        for (int x = j > 0 ? j - 1 : 0; x <= j + 1 && x < grid.columns; x++)
+            if (state[(y + 1) * (grid.columns + 2) + x + 1] & OUTSIDE) return 0;
+    return 1;
+}
+
+/* Strong pixels of kept cells, and all pixels of inner ones. */
+static void to_pixels(Grid grid, Scratch at, int height, int width, uint8_t *strong, uint8_t *inner) {
+    const int cell = grid.cell, wide = grid.columns + 2;
+    uint8_t *kept_line = at.bytes, *inner_line = at.bytes + width;
+    for (int i = 0; i < grid.rows; i++) {
+        int any = 0;
+        for (int j = 0; j < grid.columns; j++) {
+            const uint8_t kind = at.state[(i + 1) * wide + j + 1];
+            const uint8_t kept = (kind & KEPT) != 0, solid = kept && (kind & FAINT || is_inner(grid, at.state, i, j));
+            const int first = j * cell;
+            memset(kept_line + first, kept, (size_t)least(cell, width - first));
+            memset(inner_line + first, solid, (size_t)least(cell, width - first));
+            any |= kept;
+        }
+        for (int y = i * cell; y < least((i + 1) * cell, height); y++) {
+            const size_t row = (size_t)y * width;
+            if (any) {
+                keep_line(kept_line, inner_line, width, strong + row);
+                memcpy(inner + row, inner_line, (size_t)width);
+            } else {
+                memset(strong + row, 0, (size_t)width);
+                memset(inner + row, 0, (size_t)width);
+            }
+        }
+    }
+}
+
+/*
+ * image (frames, 3, height, width), with rest and per_noise (3, height, width): change = image * per_noise + rest. Writes mask and
+ * inner, bytes (frames, height, width); inner is where cells decide, not pixels. Returns 0, or 1 where memory is short.
+ */
+EXPORT int contact_mask(const float *image, const float *rest, const float *per_noise, const float *dead_below, int frames, int height,
+                        int width, int step, int stride, int cell, int reach, float sigmas, float rounding, float least_cells,
+                        uint8_t *mask, uint8_t *inner) {
+    const Grid grid = {(height + cell - 1) / cell, (width + cell - 1) / cell, cell, reach, sigmas, least_cells};
+    const size_t pixels = (size_t)height * width, cells = (size_t)grid.rows * grid.columns;
+    const size_t ringed = (size_t)(grid.rows + 2) * (grid.columns + 2);
+    const size_t samples = (size_t)((height + stride - 1) / stride) * ((width + stride - 1) / stride);
+    const size_t some = samples > cells ? samples : cells;
+    Scratch at;
+    float *floats = malloc(sizeof(float) * (some + 4 * cells + 5 * (size_t)width + 2 * (size_t)reach));
+    uint8_t *bytes = malloc(ringed + (size_t)(height + 3) * (width + 2));
+    uint16_t *counts = malloc(sizeof(uint16_t) * (size_t)width);
+    int32_t *stack = malloc(sizeof(int32_t) * ringed);
+    const int short_of_memory = !floats || !bytes || !counts || !stack;
+    if (!short_of_memory) {
+        at.some = floats, at.means = at.some + some, at.density = at.means + 3 * cells, at.sums = at.density + cells;
+        at.squared = at.sums + 3 * (size_t)width, at.down = at.squared + width;
+        at.state = bytes, at.bytes = bytes + ringed, at.counts = counts, at.stack = stack;
+    }
+    for (int b = 0; b < frames && !short_of_memory; b++) {
+        const float *frame = image + 3 * pixels * b;
+        int lives[3];
+        living_lamps(frame, dead_below, height, width, step, lives);
+        float noise = 1.0f;
+        for (int c = 0; c < 3; c++)
+            if (lives[c]) {
+                const float found = noise_of(frame + pixels * c, rest + pixels * c, per_noise + pixels * c, height, width, stride, at.some);
+                if (found > noise) noise = found;
+            }
+        const float threshold = sigmas * sigmas * (noise * noise + rounding);
+        find_strong(frame, rest, per_noise, lives, height, width, threshold, grid, at, mask + pixels * b);
+        if (find_cells(grid, threshold, at)) {
+            keep_large(grid, at);
+            to_pixels(grid, at, height, width, mask + pixels * b, inner + pixels * b);
+        } else {
+            memset(mask + pixels * b, 0, pixels);
+            memset(inner + pixels * b, 0, pixels);
+        }
+    }
+    free(floats), free(bytes), free(counts), free(stack);
+    return short_of_memory;
+}

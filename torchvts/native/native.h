@@ -1,0 +1,25 @@
+/* What the sources of this folder share. All arrays are float32 unless told otherwise, rows contiguous. */
+#ifndef TORCHVTS_NATIVE_H
+#define TORCHVTS_NATIVE_H
+
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#if defined(_WIN32)
+#define EXPORT __declspec(dllexport)
+#else
+#define EXPORT __attribute__((visibility("default")))
+#endif
+
+/* Loops that the compiler vectorises are built once per kind of processor; the loader of the library picks. */
+#if defined(WIDE)
+#elif defined(__x86_64__) && defined(__linux__) && defined(__GNUC__) && !defined(__clang__)
+#define WIDE __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
+#else
+#define WIDE
+#endif
+
+static inline int least(int a, int b) { return a < b ? a : b; }
+
+#endif

@@ -1,0 +1,132 @@
+/* Normals under three near lights: the same numbers as NormalFromIntensity in torchvts/normals/photometric.py and normal_at_depth in
+   torchvts/shading.py, which say why. */
+#include "native.h"
+
+#include <math.h>
+
+/* One row of normals (3, n) from intensities and the nine rows of the inverse light matrix; channels `plane` and `step` elements apart. */
+WIDE static void from_inverse(const float *restrict image, size_t step, const float *restrict inverse, size_t plane, int n,
+                              float *restrict x, float *restrict y, float *restrict z) {
+    for (int k = 0; k < n; k++) {
+        const float r = image[k], g = image[step + k], b = image[2 * step + k];
+        const float u = inverse[k] * r + inverse[plane + k] * g + inverse[2 * plane + k] * b;
+        const float v = inverse[3 * plane + k] * r + inverse[4 * plane + k] * g + inverse[5 * plane + k] * b;
+        const float w = inverse[6 * plane + k] * r + inverse[7 * plane + k] * g + inverse[8 * plane + k] * b;
+        const float scale = 1.0f / sqrtf(u * u + v * v + w * w + 1e-24f);
+        x[k] = u * scale, y[k] = v * scale, z[k] = w * scale;
+    }
+}
+
+/* The lights of one call: position and, for each, the six numbers that its share of the light is multiplied with. */
+typedef struct {
+    float place[3][3], table[3][6], plane[3], volume;
+} Lights;
+
+/* One row at a known depth, from where the first pixel sees the skin at rest. */
+WIDE static void at_depth(const float *restrict image, size_t step, const float *restrict depth, const Lights *restrict lights, float first_x,
+                          float row_y, float pitch, float per_height, float axis_x, float axis_y, int n, float *restrict nx,
+                          float *restrict ny, float *restrict nz) {
+    const Lights at = *lights;
+    for (int k = 0; k < n; k++) {
+        const float z = depth[k], nearer = z * per_height, rest_x = first_x + pitch * (float)k;
+        const float x = rest_x - (rest_x - axis_x) * nearer, y = row_y - (row_y - axis_y) * nearer;
+        float sums[6] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+        for (int j = 0; j < 3; j++) {
+            const float a = x - at.place[j][0], b = y - at.place[j][1], c = z - at.place[j][2];
+            const float squared = a * a + b * b + c * c, share = image[(size_t)j * step + k] * squared * sqrtf(squared);
+            for (int i = 0; i < 6; i++) sums[i] += at.table[j][i] * share;
+        }
+        const float u = sums[0] - y * sums[5] + z * sums[4], v = sums[1] + x * sums[5] - z * sums[3], w = sums[2] - x * sums[4] + y * sums[3];
+        const float volume = at.volume - at.plane[0] * x - at.plane[1] * y - at.plane[2] * z;
+        const float sign = volume > 0.0f ? 1.0f : volume < 0.0f ? -1.0f : 0.0f, scale = sign / sqrtf(u * u + v * v + w * w + 1e-24f);
+        nx[k] = u * scale, ny[k] = v * scale, nz[k] = w * scale;
+    }
+}
+
+/* Whether any of n intensities lies below `dark` or reaches `full`. */
+WIDE static int is_unsound(const float *restrict image, const float *restrict dark, const float *restrict full, int n) {
+    int found = 0;
+    for (int k = 0; k < n; k++) found |= (image[k] < dark[k]) | (image[k] >= full[k]);
+    return found;
+}
+
+static Lights lights_of(const float *position, const float *albedo) {
+    Lights lights;
+    double cross[3][3], table[3][6], largest = 0.0, squared = 0.0;
+    for (int j = 0; j < 3; j++) {
+        const float *p = position + 3 * ((j + 1) % 3), *q = position + 3 * ((j + 2) % 3);
+        for (int i = 0; i < 3; i++) {
+            const int k = (i + 1) % 3, l = (i + 2) % 3;
+            cross[j][i] = (double)p[k] * q[l] - (double)p[l] * q[k];
+            table[j][i] = cross[j][i] / albedo[j];
+            table[j][i + 3] = ((double)q[i] - p[i]) / albedo[j];
+            lights.place[j][i] = position[3 * j + i];
+            squared += (double)position[3 * j + i] * position[3 * j + i];
+        }
+        for (int i = 0; i < 6; i++)
+            if (fabs(table[j][i]) > largest) largest = fabs(table[j][i]);
+    }
+    for (int j = 0; j < 3; j++)
+        for (int i = 0; i < 6; i++) lights.table[j][i] = (float)(table[j][i] / (largest * squared * sqrt(squared)));
+    for (int i = 0; i < 3; i++) lights.plane[i] = (float)(cross[0][i] + cross[1][i] + cross[2][i]);
+    lights.volume = (float)(position[0] * cross[0][0] + position[1] * cross[0][1] + position[2] * cross[0][2]);
+    return lights;
+}
+
+/*
+ * Normals (frames, 3, rows, columns) of a window of an image. image (frames, 3, rows, columns), frames, channels and rows `per_frame`,
+ * `per_channel` and `per_row` elements apart. dark and full (3, height, width) and the inverse (3, 3, height, width) from the window's
+ * first pixel on, their rows `width` and planes `plane` elements apart. With depth, of the window, rows and frames `depth_row` and
+ * `depth_frame` elements apart, the inverse is not needed, but position and albedo of the lights, seen from the window's middle.
+ * Returns whether any light is blocked or channel full.
+ */
+EXPORT int normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *dark, const float *full,
+                   const float *inverse, int64_t plane, int width, int frames, int rows, int columns, const float *depth,
+                   int64_t depth_frame, int64_t depth_row, const float *position, const float *albedo, float pitch, float per_height,
+                   float axis_x, float axis_y, float *normal) {
+    const size_t pixels = (size_t)rows * columns;
+    int unsound = 0;
+    Lights lights;
+    if (depth) lights = lights_of(position, albedo);
+    for (int b = 0; b < frames; b++)
+        for (int y = 0; y < rows; y++) {
+            const float *row = image + per_frame * b + per_row * y;
+            const size_t at = (size_t)y * width;
+            float *to = normal + 3 * pixels * b + (size_t)y * columns;
+            if (depth)
+                at_depth(row, (size_t)per_channel, depth + depth_frame * b + depth_row * y, &lights, -0.5f * (float)(columns - 1) * pitch,
+                         ((float)y - 0.5f * (float)(rows - 1)) * pitch, pitch, per_height, axis_x, axis_y, columns, to, to + pixels,
+                         to + 2 * pixels);
+            else
+                from_inverse(row, (size_t)per_channel, inverse + at, (size_t)plane, columns, to, to + pixels, to + 2 * pixels);
+            for (int c = 0; c < 3; c++)
+                unsound |= is_unsound(row + per_channel * c, dark + plane * c + at, full + plane * c + at, columns);
+        }
+    return unsound;
+}
+
+WIDE static void normal_row(const float *restrict p, const float *restrict q, int n, float *restrict x, float *restrict y,
+                            float *restrict z) {
+    for (int k = 0; k < n; k++) {
+        const float scale = 1.0f / sqrtf(p[k] * p[k] + q[k] * q[k] + 1.0f);
+        x[k] = -p[k] * scale, y[k] = -q[k] * scale, z[k] = scale;
+    }
+}
+
+/* The gradient of a window (frames, 2, rows, columns) at (top, left) set into the whole image, zero elsewhere, and its normals. */
+EXPORT void widen(const float *gradient, int frames, int rows, int columns, int top, int left, int height, int width, float *whole,
+                  float *normal) {
+    const size_t pixels = (size_t)height * width, part = (size_t)rows * columns;
+    memset(whole, 0, sizeof(float) * 2 * pixels * (size_t)frames);
+    for (int b = 0; b < frames; b++, whole += 2 * pixels, normal += 3 * pixels, gradient += 2 * part) {
+        memset(normal, 0, sizeof(float) * 2 * pixels);
+        for (size_t k = 2 * pixels; k < 3 * pixels; k++) normal[k] = 1.0f;
+        for (int y = 0; y < rows; y++) {
+            const float *p = gradient + (size_t)y * columns, *q = p + part;
+            const size_t at = (size_t)(top + y) * width + left;
+            memcpy(whole + at, p, sizeof(float) * (size_t)columns);
+            memcpy(whole + pixels + at, q, sizeof(float) * (size_t)columns);
+            normal_row(p, q, columns, normal + at, normal + pixels + at, normal + 2 * pixels + at);
+        }
+    }
+}

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import torchvts as vts
+from torchvts.compensate import _some_means
 from torchvts.core import native
 from torchvts.core.native import may_use_native, operators_only
 
@@ -96,6 +97,13 @@ def test_a_frame_of_every_mode(ring):
             assert float((loops.gradient - operators.gradient).abs().max()) < 1e-5
             assert float((loops.normal - operators.normal).abs().max()) < 1e-5
     assert bool(calibration.model_image.min() > 0) and loops.contact.shape == (1, 1, 120, 160)
+
+
+@pytest.mark.parametrize("size", [(240, 320), (181, 200), (483, 640)])
+def test_means_on_a_grid(size):
+    image = torch.randn(2, 3, *size, generator=torch.Generator().manual_seed(0))
+    loops, operators = both(_some_means, image)
+    assert loops.shape == operators.shape and float((loops - operators).abs().max()) < 1e-6
 
 
 def test_a_dead_lamp(ring):

@@ -6,7 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from .core import native
 from .core.checks import check_batch, check_field, check_positive, check_record, check_same_size, check_tensor, may_read_values
+from .core.native import may_use_native
+from .core.noise import median
 from .markers import FillMarkers
 from .record import Calibration, check_calibration
 
@@ -204,9 +207,9 @@ def sure_level(light: Tensor, flat: Tensor, noise_std: Tensor, least: float = 0.
     flat = flat.clamp_min(1e-6)
     ratio = light.detach() / flat
     variance = (noise_std / flat) ** 2 + least**2
-    pixels = _sorted(ratio.flatten(2))
-    if may_read_values() and bool(((pixels[:, :, pixels.shape[2] // 2] - 1.0).abs() < 0.5 * least).all()):
+    if may_read_values() and bool(((median(ratio.flatten(2)) - 1.0).abs() < 0.5 * least).all()):
         return torch.ones_like(ratio[:, :, :1, :1])  # a lamp that drifts takes the middle of all pixels along
+    pixels = _sorted(ratio.flatten(2))
     level = (1.0 + _mode(pixels))[..., None, None]
     for _ in range(2):
         chi = ((ratio - level) ** 2 / variance).sum(dim=1, keepdim=True)
@@ -228,11 +231,19 @@ def _some_means(image: Tensor) -> Tensor:
     stride = max(1, min(image.shape[2], image.shape[3]) // 60)
     if stride < 3:
         return _some(image)
-    rows, columns, first = image.shape[2] // stride * stride, image.shape[3] // stride * stride, stride // 2 - 1
+    first = stride // 2 - 1
+    if may_use_native([image]):
+        return _means_by_loops(image, stride, first)
+    rows, columns = image.shape[2] // stride * stride, image.shape[3] // stride * stride
     total = image[:, :, first:rows:stride, first:columns:stride].clone()
     for k in range(1, 9):
         total += image[:, :, first + k // 3 : rows : stride, first + k % 3 : columns : stride]
     return total / 9.0
+
+
+@torch.jit.unused
+def _means_by_loops(image: Tensor, stride: int, first: int) -> Tensor:
+    return native.some_means(image, stride, first)
 
 
 def _some(image: Tensor) -> Tensor:

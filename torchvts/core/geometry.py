@@ -3,7 +3,9 @@
 import torch
 from torch import Tensor, nn
 
+from . import native
 from .checks import check_batch, check_positive, check_same_size, check_tensor
+from .native import may_use_native
 
 MAX_SLOPE = 10.0
 """Largest |dz/dx|, |dz/dy| that ``gradient_from_normal`` returns, mm per mm: 84.3 degrees from flat."""
@@ -64,9 +66,16 @@ def gradient_from_normal(normal: Tensor, max_slope: float = MAX_SLOPE) -> Tensor
     check_batch("normal", normal, 3)
     if not torch.jit.is_scripting():
         check_positive("max_slope", max_slope)
+    if may_use_native([normal]):
+        return _by_loops(normal, max_slope)
     n_xy = normal[:, 0:2]
     tilt = torch.sqrt((n_xy * n_xy).sum(1, keepdim=True) + 1e-24)  # the constant keeps the root's own slope finite at 0
     return -n_xy / torch.maximum(normal[:, 2:3], tilt / max_slope)
+
+
+@torch.jit.unused
+def _by_loops(normal: Tensor, max_slope: float) -> Tensor:
+    return native.slopes(normal, max_slope)
 
 
 class GradientFromNormal(nn.Module):

@@ -40,12 +40,14 @@ def library() -> ctypes.CDLL | None:
         *[real] * 4,
         pointer,
     ]
+    loaded.some_means.argtypes = [pointer, *[whole] * 7, pointer]
+    loaded.slopes.argtypes = [pointer, whole, whole, real, pointer]
     loaded.divergence_lines.argtypes = [pointer, real, *[whole] * 9, pointer]
     loaded.to_columns.argtypes = [pointer, pointer, *[whole] * 4, pointer]
     loaded.divide.argtypes = [*[pointer] * 4, *[whole] * 3]
     loaded.settle.argtypes = [*[pointer] * 3, *[whole] * 7, pointer]
     loaded.widen.argtypes = [pointer, *[whole] * 7, pointer, pointer]
-    for name in ("to_columns", "settle", "widen"):
+    for name in ("some_means", "slopes", "to_columns", "settle", "widen"):
         getattr(loaded, name).restype = None
     return loaded
 
@@ -102,6 +104,16 @@ def _check(short_of_memory: int) -> None:
         raise MemoryError("torchvts: no memory is left for a few rows of the image")
 
 
+def some_means(image: Tensor, stride: int, first: int) -> Tensor:
+    """Means of 3 x 3 pixels on a grid, (B, C, h, w): from (first, first) on every ``stride`` that is whole."""
+    image = image.contiguous()
+    count, channels, height, width = image.shape
+    rows, columns = (len(range(first, length // stride * stride, stride)) for length in (height, width))
+    means = torch.empty(count, channels, rows, columns)
+    _loops().some_means(image.data_ptr(), count * channels, height, width, stride, first, rows, columns, means.data_ptr())
+    return means
+
+
 def contact_mask(
     compensated: Tensor,
     rest: Tensor,
@@ -142,8 +154,9 @@ def normals(
 ) -> tuple[Tensor, bool]:
     """Unit normals (B, 3, h, w) of a window, and whether no light is blocked there and no channel full.
 
-    See :class:`~torchvts.normals.NormalFromIntensity`: by the stored inverse, or at a depth by the lights as seen from the
-    window's middle. ``dark``, ``full`` (3, H, W) and ``inverse`` (3, 3, H, W) are those of the whole image.
+    See :class:`~torchvts.normals.NormalFromIntensity`: by the stored inverse, or at a depth by the lights. ``axis_mm`` is where the
+    middle of the image lies as seen from that of the window. ``dark``, ``full`` (3, H, W) and ``inverse`` (3, 3, H, W) are those
+    of the whole image.
     """
     dark, full, inverse = dark.contiguous(), full.contiguous(), inverse.contiguous()
     compensated = compensated if compensated.stride(3) == 1 else compensated.contiguous()
@@ -177,6 +190,15 @@ def normals(
         normal.data_ptr(),
     )
     return normal, not unsound
+
+
+def slopes(normal: Tensor, max_slope: float) -> Tensor:
+    """Gradients (B, 2, H, W): see :func:`~torchvts.core.geometry.gradient_from_normal`."""
+    normal = normal.contiguous()
+    count, _, height, width = normal.shape
+    gradient = torch.empty(count, 2, height, width)
+    _loops().slopes(normal.data_ptr(), count, height * width, 1.0 / max_slope, gradient.data_ptr())
+    return gradient
 
 
 def solve_poisson(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], window: tuple[int, int], levelled: bool) -> Tensor:

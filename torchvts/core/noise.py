@@ -31,7 +31,7 @@ def noise_std(image: Tensor, samples: int = 8000) -> Tensor:
     rows = image[:, :, stride // 2 :: stride]
     left, middle, right = rows[..., :-2:stride], rows[..., 1:-1:stride], rows[..., 2::stride]
     second = (middle - 0.5 * (left + right)).abs().flatten(2)
-    std = 1.5 * _median(second) / 0.6745
+    std = 1.5 * median(second) / 0.6745
     squared = second * second
     for _ in range(2):
         near = (second <= 3.0 * std).to(second.dtype)
@@ -40,7 +40,7 @@ def noise_std(image: Tensor, samples: int = 8000) -> Tensor:
     return std[:, :, 0] / math.sqrt(1.5)
 
 
-def _median(values: Tensor) -> Tensor:
+def median(values: Tensor) -> Tensor:
     """Of the last dimension, the lower one of two; by NumPy where Python runs: 0.02 ms for 3 x 2,000 values, torch 0.07."""
     if not torch.jit.is_scripting():  # noqa: SIM102
         if may_use_arrays(values) and not values.requires_grad:

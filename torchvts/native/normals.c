@@ -50,18 +50,23 @@ WIDE static int is_unsound(const float *restrict image, const float *restrict da
     return found;
 }
 
-static Lights lights_of(const float *position, const float *albedo) {
+/* The lights from where (-axis_x, -axis_y) is the origin. */
+static Lights lights_of(const float *position, const float *albedo, float axis_x, float axis_y) {
     Lights lights;
-    double cross[3][3], table[3][6], largest = 0.0, squared = 0.0;
+    double at[3][3], cross[3][3], table[3][6], largest = 0.0, squared = 0.0;
+    for (int j = 0; j < 3; j++)
+        for (int i = 0; i < 3; i++) {
+            at[j][i] = (double)position[3 * j + i] + (i == 0 ? axis_x : i == 1 ? axis_y : 0.0f);
+            lights.place[j][i] = (float)at[j][i];
+            squared += at[j][i] * at[j][i];
+        }
     for (int j = 0; j < 3; j++) {
-        const float *p = position + 3 * ((j + 1) % 3), *q = position + 3 * ((j + 2) % 3);
+        const double *p = at[(j + 1) % 3], *q = at[(j + 2) % 3];
         for (int i = 0; i < 3; i++) {
             const int k = (i + 1) % 3, l = (i + 2) % 3;
-            cross[j][i] = (double)p[k] * q[l] - (double)p[l] * q[k];
+            cross[j][i] = p[k] * q[l] - p[l] * q[k];
             table[j][i] = cross[j][i] / albedo[j];
-            table[j][i + 3] = ((double)q[i] - p[i]) / albedo[j];
-            lights.place[j][i] = position[3 * j + i];
-            squared += (double)position[3 * j + i] * position[3 * j + i];
+            table[j][i + 3] = (q[i] - p[i]) / albedo[j];
         }
         for (int i = 0; i < 6; i++)
             if (fabs(table[j][i]) > largest) largest = fabs(table[j][i]);
@@ -69,7 +74,7 @@ static Lights lights_of(const float *position, const float *albedo) {
     for (int j = 0; j < 3; j++)
         for (int i = 0; i < 6; i++) lights.table[j][i] = (float)(table[j][i] / (largest * squared * sqrt(squared)));
     for (int i = 0; i < 3; i++) lights.plane[i] = (float)(cross[0][i] + cross[1][i] + cross[2][i]);
-    lights.volume = (float)(position[0] * cross[0][0] + position[1] * cross[0][1] + position[2] * cross[0][2]);
+    lights.volume = (float)(at[0][0] * cross[0][0] + at[0][1] * cross[0][1] + at[0][2] * cross[0][2]);
     return lights;
 }
 
@@ -77,7 +82,8 @@ static Lights lights_of(const float *position, const float *albedo) {
  * Normals (frames, 3, rows, columns) of a window of an image. image (frames, 3, rows, columns), frames, channels and rows `per_frame`,
  * `per_channel` and `per_row` elements apart. dark and full (3, height, width) and the inverse (3, 3, height, width) from the window's
  * first pixel on, their rows `width` and planes `plane` elements apart. With depth, of the window, rows and frames `depth_row` and
- * `depth_frame` elements apart, the inverse is not needed, but position and albedo of the lights, seen from the window's middle.
+ * `depth_frame` elements apart, the inverse is not needed, but position and albedo of the lights, and where the middle of the image lies
+ * as seen from that of the window (axis_x, axis_y), mm; `per_height` is 1 over the camera's height.
  * Returns whether any light is blocked or channel full.
  */
 EXPORT int normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *dark, const float *full,
@@ -87,7 +93,7 @@ EXPORT int normals(const float *image, int64_t per_frame, int64_t per_channel, i
     const size_t pixels = (size_t)rows * columns;
     int unsound = 0;
     Lights lights;
-    if (depth) lights = lights_of(position, albedo);
+    if (depth) lights = lights_of(position, albedo, axis_x, axis_y);
     for (int b = 0; b < frames; b++)
         for (int y = 0; y < rows; y++) {
             const float *row = image + per_frame * b + per_row * y;
@@ -103,6 +109,22 @@ EXPORT int normals(const float *image, int64_t per_frame, int64_t per_channel, i
                 unsound |= is_unsound(row + per_channel * c, dark + plane * c + at, full + plane * c + at, columns);
         }
     return unsound;
+}
+
+WIDE static void slope_row(const float *restrict x, const float *restrict y, const float *restrict z, float per_slope, int n,
+                           float *restrict p, float *restrict q) {
+    for (int k = 0; k < n; k++) {
+        const float steepest = sqrtf(x[k] * x[k] + y[k] * y[k] + 1e-24f) * per_slope, scale = -1.0f / (z[k] > steepest ? z[k] : steepest);
+        p[k] = x[k] * scale, q[k] = y[k] * scale;
+    }
+}
+
+/* Gradients (frames, 2, pixels) of normals (frames, 3, pixels), no steeper than 1 / per_slope. */
+EXPORT void slopes(const float *normal, int frames, int pixels, float per_slope, float *gradient) {
+    for (size_t b = 0; b < (size_t)frames; b++) {
+        const float *x = normal + 3 * b * pixels;
+        slope_row(x, x + pixels, x + 2 * (size_t)pixels, per_slope, pixels, gradient + 2 * b * pixels, gradient + (2 * b + 1) * pixels);
+    }
 }
 
 WIDE static void normal_row(const float *restrict p, const float *restrict q, int n, float *restrict x, float *restrict y,

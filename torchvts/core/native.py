@@ -40,6 +40,16 @@ def library() -> ctypes.CDLL | None:
         *[real] * 4,
         pointer,
     ]
+    loaded.relight.argtypes = [
+        pointer,
+        *[step] * 3,
+        *[pointer] * 3,
+        step,
+        *[whole] * 4,
+        pointer,
+        *[step] * 2,
+        *[pointer] * 5,
+    ]
     loaded.some_means.argtypes = [pointer, *[whole] * 7, pointer]
     loaded.slopes.argtypes = [pointer, whole, whole, real, pointer]
     loaded.divergence_lines.argtypes = [pointer, real, *[whole] * 9, pointer]
@@ -47,7 +57,7 @@ def library() -> ctypes.CDLL | None:
     loaded.divide.argtypes = [*[pointer] * 4, *[whole] * 3]
     loaded.settle.argtypes = [*[pointer] * 3, *[whole] * 7, pointer]
     loaded.widen.argtypes = [pointer, *[whole] * 7, pointer, pointer]
-    for name in ("some_means", "slopes", "to_columns", "settle", "widen"):
+    for name in ("some_means", "relight", "slopes", "to_columns", "settle", "widen"):
         getattr(loaded, name).restype = None
     return loaded
 
@@ -190,6 +200,57 @@ def normals(
         normal.data_ptr(),
     )
     return normal, not unsound
+
+
+def relight(
+    normal: Tensor,
+    compensated: Tensor,
+    dark: Tensor,
+    full: Tensor,
+    weak: Tensor,
+    window: tuple[int, int],
+    depth_mm: Tensor | None,
+    expected: Tensor | None,
+    position_mm: Tensor,
+    albedo: Tensor,
+    numbers: list[float],
+) -> None:
+    """Replaces normals, in place, where a light is blocked, a channel full or ``weak`` (H, W) true.
+
+    See :class:`~torchvts.normals.NormalFromIntensity`. ``position_mm`` is as seen from the window's middle. ``numbers``: noise,
+    weight of the prior, how much more brightness counts than noise, steps, pixel pitch, 1 / camera height, axis, cliff and largest
+    slope.
+    """
+    dark, full, weak = dark.contiguous(), full.contiguous(), weak.contiguous()
+    compensated = compensated if compensated.stride(3) == 1 else compensated.contiguous()
+    position_mm, albedo, model = position_mm.contiguous(), albedo.contiguous(), torch.tensor(numbers, dtype=torch.float32)
+    count, _, rows, columns = compensated.shape
+    height, width = dark.shape[1], dark.shape[2]
+    place = window[0] * width + window[1]
+    depth, steps = None, (0, 0)
+    if depth_mm is not None:
+        depth_mm = depth_mm if depth_mm.stride(3) == 1 else depth_mm.contiguous()
+        depth, steps = depth_mm.data_ptr(), (0 if depth_mm.shape[0] == 1 else depth_mm.stride(0), depth_mm.stride(2))
+    expected = None if expected is None else expected.contiguous()
+    _loops().relight(
+        compensated.data_ptr(),
+        *compensated.stride()[:3],
+        dark.data_ptr() + 4 * place,
+        full.data_ptr() + 4 * place,
+        weak.data_ptr() + place,
+        height * width,
+        width,
+        count,
+        rows,
+        columns,
+        depth,
+        *steps,
+        None if expected is None else expected.data_ptr(),
+        position_mm.data_ptr(),
+        albedo.data_ptr(),
+        model.data_ptr(),
+        normal.data_ptr(),
+    )
 
 
 def slopes(normal: Tensor, max_slope: float) -> Tensor:

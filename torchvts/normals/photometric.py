@@ -18,7 +18,7 @@ from ..core.checks import (
     check_window,
     may_read_values,
 )
-from ..core.geometry import gradient_from_normal, normal_from_gradient
+from ..core.geometry import MAX_SLOPE, gradient_from_normal, normal_from_gradient
 from ..core.native import may_use_native
 from ..record import Calibration, check_calibration
 from ..shading import PointLights, flat_image, gloss_lobe, inverse_light_matrix, light_matrix, normal_at_depth, seen_at
@@ -29,6 +29,9 @@ CLIFF_SLOPE = 2.0
 
 PRIOR_STD = 0.25
 """How far slopes spread about what is known of them beforehand."""
+
+STEPS = 3
+"""Of Gauss-Newton where a light is blocked."""
 
 BRIGHTNESS_NOISES = 1.5
 """Brightness counts to so many noises where a light is blocked. Trusted fully, a ball at a noise of 0.01 keeps a quarter of the
@@ -43,7 +46,7 @@ def slope_by_lit_lights(
     noise_std: float,
     prior_std: float = PRIOR_STD,
     brightness_std: float = 0.01,
-    steps: int = 3,
+    steps: int = STEPS,
 ) -> Tensor:
     """Slopes of pixels where a light is blocked or a channel is full: each pixel against the clamped model max(0, L n).
 
@@ -281,6 +284,9 @@ class NormalFromIntensity(nn.Module):
             position = torch.cat((position[:, 0:1] - x, position[:, 1:2] - y, position[:, 2:3]), dim=1)
         if self.lights.glossy:
             compensated = self._matt(compensated, depth_mm, position, axis)
+        if by_loops and (expected is None or may_use_native([expected])):
+            self._relight_by_loops(normal, compensated, depth_mm, (top, left), position, axis, expected)
+            return normal
         if not by_loops:
             normal = self._by_operators(compensated, depth_mm, position, axis, (top, left))
         dark = self.dark_where[:, top:bottom, left:right]
@@ -313,6 +319,23 @@ class NormalFromIntensity(nn.Module):
         lights = (self.lights.position_mm, self.lights.albedo, self.mm_per_pixel, self.camera_height_mm)
         return native.normals(compensated, *tables, depth_mm, *lights, axis)
 
+    @torch.jit.unused
+    def _relight_by_loops(
+        self,
+        normal: Tensor,
+        compensated: Tensor,
+        depth_mm: Tensor | None,
+        window: tuple[int, int],
+        position: Tensor,
+        axis: tuple[float, float],
+        expected: Tensor | None,
+    ) -> None:
+        weight, brightness = (self.noise_std / PRIOR_STD) ** 2, (self.brightness_std / self.noise_std) ** 2
+        numbers = [self.noise_std, weight, brightness, STEPS, self.mm_per_pixel, 1.0 / self.camera_height_mm, *axis]
+        tables = (self.dark_where, self.full_above, self.weak, window)
+        lights = (position, self.lights.albedo, [*numbers, CLIFF_SLOPE, MAX_SLOPE])
+        native.relight(normal, compensated, *tables, depth_mm, expected, *lights)
+
     def _matt(self, compensated: Tensor, depth_mm: Tensor | None, position: Tensor, axis: tuple[float, float]) -> Tensor:
         """What a matt skin would show: the specular lobe divided out, at the slope of the depth so far."""
         depth = compensated.new_zeros(1, 1, compensated.shape[2], compensated.shape[3]) if depth_mm is None else depth_mm
@@ -331,6 +354,42 @@ class NormalFromIntensity(nn.Module):
             return torch.zeros_like(compensated[:, 0:1], dtype=torch.bool)
         dark = compensated < below
         return (dark & ~_dead(dark)[:, :, None, None]).any(dim=1, keepdim=True)
+
+    @torch.jit.export
+    def beyond(self, gradient: Tensor, compensated: Tensor, depth_mm: Tensor, window: tuple[int, int] | None = None) -> Tensor:
+        """Slopes that fit as well where one light is blocked, but lie beyond the plane of the other two, away from it.
+
+        Two lights and |n| = 1 leave a normal and its mirror image. Of walls the one beyond the plane is right, and no start near a
+        depth that is still too low finds it.
+
+        Args:
+            gradient: (B, 2, h, w), slopes so far. compensated: (B, 3, h, w). depth_mm: (B, 1, h, w). window: as :meth:`forward`.
+        Returns:
+            (B, 2, h, w); as they are elsewhere.
+        """
+        check_batch("gradient", gradient, 2)
+        check_same_size("gradient", gradient, "compensated", compensated.shape[2], compensated.shape[3])
+        check_batch("depth_mm", depth_mm, 1)
+        check_same_size("depth_mm", depth_mm, "compensated", compensated.shape[2], compensated.shape[3])
+        height, width = self.inverse.shape[2], self.inverse.shape[3]
+        top, left = check_window("compensated", compensated, (height, width), window)
+        bottom, right = top + compensated.shape[2], left + compensated.shape[3]
+        x, y = 0.5 * (left + right - width) * self.mm_per_pixel, 0.5 * (top + bottom - height) * self.mm_per_pixel
+        rest = self.lights.position_mm
+        place = torch.cat((rest[:, 0:1] - x, rest[:, 1:2] - y, rest[:, 2:3]), dim=1)
+        matrix = light_matrix(depth_mm, place, self.lights.albedo, self.mm_per_pixel, self.camera_height_mm, (-x, -y))
+        dark = compensated < self.dark_where[:, top:bottom, left:right]
+        dark = dark & ~_dead(dark)[:, :, None, None]
+        one = dark.to(torch.uint8).sum(dim=1, keepdim=True) == 1
+        normal = normal_from_gradient(gradient)
+        result = normal
+        for light in range(3):
+            plane = torch.linalg.cross(matrix[:, (light + 1) % 3], matrix[:, (light + 2) % 3], dim=1)
+            along = (normal * plane).sum(dim=1, keepdim=True)
+            towards = along * (plane * matrix[:, light]).sum(dim=1, keepdim=True) > 0.0
+            mirrored = normal - plane * (2.0 * along / plane.square().sum(dim=1, keepdim=True).clamp_min(1e-30))
+            result = torch.where(one & towards & dark[:, light : light + 1], mirrored, result)
+        return gradient_from_normal(result)
 
     def coarse(self, stride: int) -> "NormalFromIntensity":
         """The same for an image of every ``stride``-th pixel."""

@@ -321,7 +321,7 @@ TABLE = {
         named={"window": "compensated, window"},
     ),
     "NormalFromIntensity.beyond": Entry(
-        {"gradient": torch.zeros(1, 2, 8, 8), "compensated": FLAT[None], "depth_mm": torch.zeros(1, 1, 8, 8), "window": (0, 0)},
+        {"gradient": torch.zeros(1, 2, HEIGHT, WIDTH), "compensated": FLAT[None], "depth_mm": DEPTH, "window": (0, 0)},
         {
             "gradient": [b for b in batches(2) if b is not None],
             "compensated": batches(3),

@@ -367,6 +367,7 @@ class NormalFromIntensity(nn.Module):
         Returns:
             (B, 2, h, w); as they are elsewhere.
         """
+        check_batch("compensated", compensated, 3)
         check_batch("gradient", gradient, 2)
         check_same_size("gradient", gradient, "compensated", compensated.shape[2], compensated.shape[3])
         check_batch("depth_mm", depth_mm, 1)

@@ -10,6 +10,7 @@ import torchvts as vts
 from torchvts.compensate import _some_means
 from torchvts.core import native
 from torchvts.core.native import may_use_native, operators_only
+from torchvts.pipeline import _largest_change
 
 scenes = vts.scenes
 
@@ -105,6 +106,13 @@ def test_means_on_a_grid(size):
     image = torch.randn(2, 3, *size, generator=torch.Generator().manual_seed(0))
     loops, operators = both(_some_means, image)
     assert loops.shape == operators.shape and float((loops - operators).abs().max()) < 1e-6
+
+
+def test_the_largest_change():
+    one, other = torch.randn(2, 3, 1, 7, 11, generator=torch.Generator().manual_seed(0))
+    loops, operators = both(_largest_change, one, other)
+    assert torch.equal(loops, operators) and loops.shape == (3,)
+    assert bool(native.largest_change(one, torch.full_like(one, torch.nan)).isnan().all())
 
 
 def test_a_dead_lamp(ring):

@@ -82,9 +82,7 @@ def test_of_two_slopes_that_fit_where_a_light_is_blocked_the_right_one_is_taken(
 def test_walls_beyond_the_plane_of_the_lit_lights_are_found(ring, radius_mm, press_mm, tilt_deg):
     """Of a punch with a flat top, whose foot lies beyond the plane, where no start near the shallow slope leads: it left 0.9."""
     lights = ring(31.0, 18.0, rotation_deg=42.0, level=0.21)
-    assert (
-        share_of_the_plain_inverse(lights, scenes.punch_press(radius_mm, press_mm, tilt_deg, 1.1, 480, 640, PITCH), 0.003) < 0.2
-    )
+    assert share_of_the_plain_inverse(lights, scenes.punch_press(radius_mm, press_mm, tilt_deg, 1.1, 480, 640, PITCH), 0.003) < 0.2
 
 
 def test_slopes_beyond_the_plane_fit_as_well(ring):

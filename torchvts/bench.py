@@ -23,6 +23,7 @@ from .calibration import CalibrationWarning, Press, calibrate, read_presses
 from .compensate import Compensate
 from .core import gs_sdk
 from .core.geometry import normal_from_gradient
+from .core.native import operators_only
 from .core.sensor import Sensor
 from .evaluate import Training, score_press, training_pixels
 from .gallery import roof, stamp
@@ -233,6 +234,11 @@ def _scenes(bench: Bench) -> Iterator[Row]:
                 errors = _errors(found.depth_mm, found.normal, scene)
                 yield bench.row("scene", method, data, size, partial(pipe, image), ours="SciPy" not in method, errors=errors)
             if press_mm == PRESSES_MM[0]:
+                fast = operators_only()(partial(pipes["fast"], image))
+                errors = _errors(fast().depth_mm, fast().normal, scene)
+                yield bench.row(
+                    "scene", "fast, tensor operators", data, size, fast, ours=True, errors=errors, note="no compiled loops"
+                )
                 flat = torch.zeros_like(scene.depth_mm)
                 upright = normal_from_gradient(torch.cat((flat, flat), dim=1))
                 yield bench.row(

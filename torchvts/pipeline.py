@@ -295,7 +295,7 @@ class DepthPipeline(nn.Module):
             before = _at(depth, index, every)
             z = before[:, :, top:bottom, left:right]
             part, found = self._solve(_at(seen, index, every), z, _at(touched, index, every), window, size)
-            change_px = (found - before).detach().abs().amax(dim=(1, 2, 3)) / self.mm_per_pixel
+            change_px = _largest_change(found.detach(), before.detach()) / self.mm_per_pixel
             # what is left is the change times r / (1 - r), r being the ratio of this change to the one before
             ratio = (change_px / _at(last_px, index, every).clamp_min(1e-12)).clamp(0.0, 0.9)
             gradient, depth = _with(gradient, index, part, every), _with(depth, index, found, every)
@@ -479,6 +479,18 @@ class CliffPipeline(nn.Module):
             out.normal.index_copy(0, index, normal),
             out.contact.index_copy(0, index, contact),
         )
+
+
+def _largest_change(one: Tensor, other: Tensor) -> Tensor:
+    """Of two batches of depths, per frame, (B,)."""
+    if may_use_native([one, other]):
+        return _largest_change_by_loops(one, other)
+    return (one - other).abs().amax(dim=(1, 2, 3))
+
+
+@torch.jit.unused
+def _largest_change_by_loops(one: Tensor, other: Tensor) -> Tensor:
+    return native.largest_change(one, other)
 
 
 @torch.jit.unused

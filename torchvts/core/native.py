@@ -56,8 +56,9 @@ def library() -> ctypes.CDLL | None:
     loaded.to_columns.argtypes = [pointer, pointer, *[whole] * 4, pointer]
     loaded.divide.argtypes = [*[pointer] * 4, *[whole] * 3]
     loaded.settle.argtypes = [*[pointer] * 3, *[whole] * 7, pointer]
+    loaded.largest_change.argtypes = [pointer, pointer, whole, step, pointer]
     loaded.widen.argtypes = [pointer, *[whole] * 7, pointer, pointer]
-    for name in ("some_means", "relight", "slopes", "to_columns", "settle", "widen"):
+    for name in ("some_means", "relight", "slopes", "to_columns", "settle", "largest_change", "widen"):
         getattr(loaded, name).restype = None
     return loaded
 
@@ -292,6 +293,14 @@ def solve_poisson(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], win
     slopes = gradient.data_ptr() if levelled else None
     loops.settle(lines.data_ptr(), order.data_ptr(), slopes, count, *part, height, width, depth.data_ptr())
     return depth
+
+
+def largest_change(one: Tensor, other: Tensor) -> Tensor:
+    """Largest difference of two batches of depths, per frame, (B,)."""
+    one, other = one.contiguous(), other.contiguous()
+    change = torch.empty(one.shape[0])
+    _loops().largest_change(one.data_ptr(), other.data_ptr(), one.shape[0], one[0].numel(), change.data_ptr())
+    return change
 
 
 def widen(gradient: Tensor, window: tuple[int, int], size: tuple[int, int]) -> tuple[Tensor, Tensor]:

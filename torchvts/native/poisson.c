@@ -153,3 +153,25 @@ EXPORT void settle(const float *lines, const int64_t *order, const float *gradie
         for (int y = 0; y < height; y++) restore(lines + (size_t)order[y] * width, width, (float)level, depth + (size_t)y * width);
     }
 }
+
+/* Largest magnitude of n differences. Compared as whole numbers, whose order is that of floats without sign, and which are vectorised. */
+WIDE static uint32_t largest(const float *restrict one, const float *restrict other, size_t n) {
+    uint32_t most = 0;
+    for (size_t k = 0; k < n; k++) {
+        union {
+            float value;
+            uint32_t bits;
+        } apart = {one[k] - other[k]};
+        apart.bits &= 0x7fffffffu;
+        most = apart.bits > most ? apart.bits : most;
+    }
+    return most;
+}
+
+/* Largest difference of each of `frames` pairs of depths of n pixels. */
+EXPORT void largest_change(const float *one, const float *other, int frames, int64_t n, float *change) {
+    for (int b = 0; b < frames; b++) {
+        const uint32_t bits = largest(one + b * n, other + b * n, (size_t)n);
+        memcpy(change + b, &bits, sizeof bits);
+    }
+}

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sysconfig
 import tempfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +28,14 @@ class CompiledLoops(BuildHookInterface):
             self.app.display_warning(f"no C compiler {compiler[0]!r}: frames will take about twice as long")
             return
         sources = [str(source) for source in sorted(folder.glob("*.c"))]
+        texts = b"".join(source.read_bytes() for source in sorted(folder.glob("*.[ch]")))
+        told = f"-DSOURCES={zlib.crc32(texts)}u"  # torchvts/core/native.py compares it
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
             built = Path(scratch) / library.name
             for more in ([], [PLAIN]):
-                done = subprocess.run([*compiler, *FLAGS, *more, *sources, "-o", str(built), "-lm"], capture_output=True, text=True)
+                done = subprocess.run(
+                    [*compiler, *FLAGS, told, *more, *sources, "-o", str(built), "-lm"], capture_output=True, text=True
+                )
                 if done.returncode == 0:
                     break
             else:

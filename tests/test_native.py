@@ -177,8 +177,18 @@ def test_without_them_all_works(monkeypatch, ring, small_sensor, small_press):
     assert torch.allclose(pipe(image).depth_mm, loops, rtol=0, atol=2e-6)
 
 
-def test_a_library_that_is_missing_is_told(monkeypatch, tmp_path):
-    native.library.cache_clear()
-    monkeypatch.setattr(native, "LIBRARY", tmp_path / "nothing.so")
-    assert native.library() is None
-    native.library.cache_clear()
+def test_a_library_that_is_missing_or_left_over_is_not_used(monkeypatch, tmp_path):
+    library = native.LIBRARY
+    monkeypatch.setattr(native, "LIBRARY", tmp_path / library.name)
+    try:
+        native.library.cache_clear()
+        assert native.library() is None
+        shutil.copytree(library.parent, tmp_path, dirs_exist_ok=True)
+        native.library.cache_clear()
+        assert native.library() is not None
+        (tmp_path / "native.h").write_text("/* changed since */")
+        native.library.cache_clear()
+        with pytest.warns(UserWarning, match="built from other sources than lie beside it, so it is not used: install again"):
+            assert native.library() is None
+    finally:
+        native.library.cache_clear()

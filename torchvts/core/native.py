@@ -9,6 +9,8 @@ import contextvars
 import ctypes
 import functools
 import math
+import warnings
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -24,7 +26,11 @@ def library() -> ctypes.CDLL | None:
     """The compiled loops; None where no C compiler was at hand when this package was installed, and operators do their work."""
     try:
         loaded = ctypes.CDLL(str(LIBRARY))
-    except OSError:
+        built_from = int(loaded.sources())
+    except (OSError, AttributeError):
+        return None
+    if built_from & 0xFFFFFFFF != zlib.crc32(b"".join(source.read_bytes() for source in sorted(LIBRARY.parent.glob("*.[ch]")))):
+        warnings.warn(f"{LIBRARY}: built from other sources than lie beside it, so it is not used: install again", stacklevel=2)
         return None
     pointer, whole, real, step = ctypes.c_void_p, ctypes.c_int, ctypes.c_float, ctypes.c_int64
     loaded.contact_mask.argtypes = [*[pointer] * 4, *[whole] * 7, *[real] * 3, pointer, pointer]

@@ -22,25 +22,26 @@ class CompiledLoops(BuildHookInterface):
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         folder = Path(self.root) / "torchvts" / "native"
         library = folder / "libtorchvts.so"
-        library.unlink(missing_ok=True)
-        compiler = shlex.split(os.environ.get("CC", "cc"))
+        compiler = shlex.split(os.environ.get("CC") or "cc")
         if shutil.which(compiler[0]) is None:
-            self.app.display_warning(f"no C compiler {compiler[0]!r}: frames will take about twice as long")
+            self.app.display_warning(f"no C compiler {compiler[0]!r}: frames will take two to three times as long")
+        else:
+            self.build(compiler, folder, library)
+        if not library.is_file():
             return
+        build_data["pure_python"] = False
+        build_data["tag"] = "py3-none-" + sysconfig.get_platform().replace("-", "_").replace(".", "_")
+
+    def build(self, compiler: list[str], folder: Path, library: Path) -> None:
         sources = [str(source) for source in sorted(folder.glob("*.c"))]
         texts = b"".join(source.read_bytes() for source in sorted(folder.glob("*.[ch]")))
         told = f"-DSOURCES={zlib.crc32(texts)}u"  # torchvts/core/native.py compares it
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
             built = Path(scratch) / library.name
             for more in ([], [PLAIN]):
-                done = subprocess.run(
-                    [*compiler, *FLAGS, told, *more, *sources, "-o", str(built), "-lm"], capture_output=True, text=True
-                )
+                command = [*compiler, *FLAGS, told, *more, *sources, "-o", str(built), "-lm"]
+                done = subprocess.run(command, capture_output=True, text=True)
                 if done.returncode == 0:
-                    break
-            else:
-                self.app.display_warning(f"the C compiler failed, so frames will take about twice as long:\n{done.stderr}")
-                return
-            os.replace(built, library)
-        build_data["pure_python"] = False
-        build_data["tag"] = "py3-none-" + sysconfig.get_platform().replace("-", "_").replace(".", "_")
+                    os.replace(built, library)
+                    return
+        self.app.display_warning(f"the C compiler failed, so frames will take two to three times as long:\n{done.stderr}")

@@ -138,6 +138,60 @@ def test_what_loops_may_not_touch():
         assert may_use_native([recorded])
 
 
+def test_batches_that_do_not_fit_are_refused(ring):
+    block = vts.NormalFromIntensity(ring(), 48, 64, 0.5)
+    image = torch.full((5, 3, 48, 64), 0.4)
+    for count in (0, 2):
+        with pytest.raises(ValueError, match=f"depth_mm: expected 5 frames like compensated, or one for all, got {count}"):
+            block(image, torch.zeros(count, 1, 48, 64))
+        with pytest.raises(ValueError, match=f"expected: expected 5 frames like compensated, or one for all, got {count}"):
+            block(image, None, None, torch.zeros(count, 2, 48, 64))
+    dark = image.clone()
+    dark[:, 0, :20] = 0.0
+    loops, operators = both(block, dark, None, None, torch.zeros(1, 2, 48, 64))
+    assert float((loops - operators).abs().max()) < 1e-4
+    assert block(image[:0]).shape == (0, 3, 48, 64) and vts.PoissonRest(0.1)(torch.zeros(0, 2, 48, 64)).shape == (0, 1, 48, 64)
+
+
+def test_defaults_of_torch_do_not_reach_the_loops(ring, small_sensor, small_press):
+    lights = ring()
+    pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, small_sensor), "precise")
+    image = scenes.render(small_press(1.0), lights).detach()
+    depth = pipe(image).depth_mm
+    try:
+        torch.set_default_dtype(torch.float64)
+        assert torch.equal(pipe(image).depth_mm, depth)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    with torch.device("meta"):
+        assert torch.equal(pipe(image).contact, pipe.contact(pipe.compensate(image)))
+        assert torch.equal(pipe(image).depth_mm, depth)
+
+
+def test_traces_see_operators():
+    from torch._subclasses.fake_tensor import FakeTensorMode
+    from torch.fx.experimental.proxy_tensor import make_fx
+
+    gradient = torch.randn(1, 2, 12, 16, generator=torch.Generator().manual_seed(0))
+    traced = make_fx(lambda part: vts.poisson_rest(part, 0.1))(gradient)
+    assert torch.allclose(traced(gradient), vts.poisson_rest(gradient, 0.1), atol=1e-6)
+    with FakeTensorMode():
+        assert vts.poisson_rest(torch.randn(1, 2, 12, 16), 0.1).shape == (1, 1, 12, 16)
+
+
+@pytest.mark.parametrize("size", [(48, 64), (2, 4000), (1, 81)])
+def test_contact_of_what_is_no_number(size):
+    block = vts.ContactMask(torch.full((3, *size), 0.5), torch.full((3,), 0.01))
+    for place in (slice(0, size[1] // 3), slice(size[1] // 2, size[1] // 2 + 1)):
+        image = torch.full((1, 3, *size), 0.5) + 0.01 * torch.randn(1, 3, *size, generator=torch.Generator().manual_seed(0))
+        image[0, 1, :, place] = torch.nan
+        if size[0] >= 48:
+            loops, operators = both(block, image)
+            assert torch.equal(loops, operators)
+        else:
+            assert block(image.nan_to_num(0.5)).shape == (1, 1, *size)
+
+
 def test_tangents_pass_through_operators():
     """Forward differentiation records nothing on the tensor itself, so loops would lose it in silence."""
     solver = vts.PoissonDCT(0.1)

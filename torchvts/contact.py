@@ -192,7 +192,8 @@ class ContactMask(nn.Module):
         self.sigmas = check_positive("sigmas", sigmas)
         self.min_size_px = check_positive("min_size_px", min_size_px)
         self.cell = max(1, min(flat.shape[1], flat.shape[2]) // CELLS)
-        self.reach = max(1, math.ceil(0.5 * min_size_px / self.cell))  # cells around one that a smallest contact may touch
+        # cells around one that a smallest contact may touch; none is farther away than the longer side
+        self.reach = min(max(1, math.ceil(0.5 * min_size_px / self.cell)), max(flat.shape[1], flat.shape[2]))
         self.least_cells = 0.6 * (min_size_px / self.cell) ** 2  # nearly the area of a disc of that size
         noise = noise_std.reshape(3, 1, 1) if noise_std.dim() == 1 else noise_std
         self.register_buffer("flat", flat.detach().clone())
@@ -201,6 +202,7 @@ class ContactMask(nn.Module):
         self.rounding = float((QUANTISATION_STD * self.per_noise).square().mean())
         self.register_buffer("rest", -self.flat * self.per_noise)
         self.samples = 2000  # pixels that tell a frame's own noise
+        self.stride = max(1, math.ceil(math.sqrt(flat.shape[1] * flat.shape[2] / self.samples)))
         self.step = max(1, min(flat.shape[1], flat.shape[2]) // 60)
         some = self.flat[:, self.step // 2 :: self.step, self.step // 2 :: self.step]
         self.register_buffer("dead_below", 0.05 * some.mean(dim=(1, 2)))
@@ -235,7 +237,8 @@ class ContactMask(nn.Module):
 
     def _find(self, compensated: Tensor) -> tuple[Tensor, Tensor]:
         """Hard contact, and where in it cells decide, not pixels."""
-        if compensated.shape[3] >= 3 and may_use_native([compensated, self.rest]):
+        sampled = compensated.shape[2] > self.stride // 2 and compensated.shape[3] >= 3
+        if sampled and may_use_native([compensated, self.rest]):
             return self._find_by_loops(compensated)
         change, squared, threshold = self._change(compensated)
         return self._clean(change, squared > threshold, threshold)
@@ -243,7 +246,7 @@ class ContactMask(nn.Module):
     @torch.jit.unused
     def _find_by_loops(self, compensated: Tensor) -> tuple[Tensor, Tensor]:
         cells = (self.cell, self.reach, self.sigmas, self.rounding, self.least_cells)
-        return native.contact_mask(compensated, self.rest, self.per_noise, self.dead_below, self.step, self.samples, *cells)
+        return native.contact_mask(compensated, self.rest, self.per_noise, self.dead_below, self.step, self.stride, *cells)
 
     def _change(self, compensated: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Change in units of the calibrated noise (B, 3, H, W), its square summed over channels, and that one's threshold."""

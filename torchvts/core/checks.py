@@ -121,6 +121,14 @@ def check_same_size(name: str, tensor: Tensor, other_name: str, height: int, wid
         )
 
 
+def check_same_count(name: str, tensor: Tensor, other_name: str, count: int) -> None:
+    """Raise unless ``tensor`` holds ``count`` frames, or one for all. Scripts."""
+    if tensor.shape[0] != count and tensor.shape[0] != 1:
+        raise ValueError(
+            f"{name}: expected {count} frames like {other_name}, or one for all, got {tensor.shape[0]}: were they of another batch?"
+        )
+
+
 def may_read_values() -> bool:
     """Whether Python may decide by the values of tensors: always, but while torch.export traces. Scripts."""
     if torch.jit.is_scripting():
@@ -134,8 +142,11 @@ def may_use_arrays(tensor: Tensor) -> bool:
     if torch.jit.is_scripting():
         return False
     else:  # noqa: RET505, TorchScript leaves out the other branch only so
+        if torch.compiler.is_compiling():
+            return False
         half = tensor.dtype in (torch.float16, torch.bfloat16)  # of which NumPy knows one and makes other sums
-        return tensor.device.type == "cpu" and not half and not torch.compiler.is_compiling()
+        wrapped = torch._C._functorch.is_functorch_wrapped_tensor(tensor)  # by torch.func
+        return tensor.device.type == "cpu" and not half and not wrapped
 
 
 def check_window(name: str, tensor: Tensor, size: tuple[int, int], window: tuple[int, int] | None) -> tuple[int, int]:

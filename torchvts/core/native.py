@@ -1,21 +1,21 @@
 """Python's side of the compiled loops in torchvts/native: one function for each of theirs, and whether they may be used.
 
-They give the numbers of the tensor operators beside which they stand, to rounding, in a half to a tenth of the time: a frame passes
-through memory once instead of once per operator. They know neither gradients nor other devices nor other types than float32.
+They give the numbers of the tensor operators beside which they stand, but for rounding, in a half to a tenth of the time: a frame
+passes through memory once instead of once per operator. (Where a problem is ill posed, as with a dead lamp, rounding shows: depth
+by either differs by 0.01 to 0.04 mm, and as much from float64's.) They know neither gradients nor other devices nor other types.
 """
 
 import contextlib
 import contextvars
 import ctypes
 import functools
-import math
 import warnings
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd import forward_ad
 
 LIBRARY = Path(__file__).parents[1] / "native" / "libtorchvts.so"
@@ -98,11 +98,12 @@ def may_use_native(tensors: list[Tensor]) -> bool:
     else:  # noqa: RET505, TorchScript leaves out the other branch only so
         if torch.compiler.is_compiling() or torch.jit.is_tracing() or _refused.get() or library() is None:
             return False
-        if forward_ad._current_level >= 0:  # under which a tangent would be lost
+        if forward_ad._current_level >= 0 or torch._C._len_torch_dispatch_stack() > 0:  # tangents and traces would be lost
             return False
         recorded = torch.is_grad_enabled()
         return all(
-            tensor.dtype == torch.float32
+            type(tensor) in (Tensor, nn.Parameter)
+            and tensor.dtype == torch.float32
             and tensor.device.type == "cpu"
             and not (recorded and tensor.requires_grad)
             and not torch._C._functorch.is_functorch_wrapped_tensor(tensor)
@@ -126,7 +127,7 @@ def some_means(image: Tensor, stride: int, first: int) -> Tensor:
     image = image.contiguous()
     count, channels, height, width = image.shape
     rows, columns = (len(range(first, length // stride * stride, stride)) for length in (height, width))
-    means = torch.empty(count, channels, rows, columns)
+    means = image.new_empty(count, channels, rows, columns)
     _loops().some_means(image.data_ptr(), count * channels, height, width, stride, first, rows, columns, means.data_ptr())
     return means
 
@@ -137,7 +138,7 @@ def contact_mask(
     per_noise: Tensor,
     dead_below: Tensor,
     step: int,
-    samples: int,
+    stride: int,
     cell: int,
     reach: int,
     sigmas: float,
@@ -147,9 +148,8 @@ def contact_mask(
     """Hard and inner contact, bool (B, 1, H, W): see :class:`~torchvts.contact.ContactMask`, whose attributes these are."""
     compensated, rest, per_noise = compensated.contiguous(), rest.contiguous(), per_noise.contiguous()
     count, _, height, width = compensated.shape
-    mask = torch.empty(count, 1, height, width, dtype=torch.bool)
+    mask = compensated.new_empty(count, 1, height, width, dtype=torch.bool)
     inner = torch.empty_like(mask)
-    stride = max(1, math.ceil(math.sqrt(height * width / samples)))
     inputs = (compensated.data_ptr(), rest.data_ptr(), per_noise.data_ptr(), dead_below.data_ptr())
     grid = (count, height, width, step, stride, cell, reach, sigmas, rounding, least_cells)
     _check(_loops().contact_mask(*inputs, *grid, mask.data_ptr(), inner.data_ptr()))
@@ -181,7 +181,7 @@ def normals(
     count, _, rows, columns = compensated.shape
     height, width = inverse.shape[2], inverse.shape[3]
     at = 4 * (window[0] * width + window[1])
-    normal = torch.empty(count, 3, rows, columns)
+    normal = compensated.new_empty(count, 3, rows, columns)
     depth, steps = None, (0, 0)
     if depth_mm is not None:
         depth_mm = depth_mm if depth_mm.stride(3) == 1 else depth_mm.contiguous()
@@ -230,7 +230,7 @@ def relight(
     """
     dark, full, weak = dark.contiguous(), full.contiguous(), weak.contiguous()
     compensated = compensated if compensated.stride(3) == 1 else compensated.contiguous()
-    position_mm, albedo, model = position_mm.contiguous(), albedo.contiguous(), torch.tensor(numbers, dtype=torch.float32)
+    position_mm, albedo, model = position_mm.contiguous(), albedo.contiguous(), albedo.new_tensor(numbers)
     count, _, rows, columns = compensated.shape
     height, width = dark.shape[1], dark.shape[2]
     place = window[0] * width + window[1]
@@ -264,7 +264,7 @@ def slopes(normal: Tensor, max_slope: float) -> Tensor:
     """Gradients (B, 2, H, W): see :func:`~torchvts.core.geometry.gradient_from_normal`."""
     normal = normal.contiguous()
     count, _, height, width = normal.shape
-    gradient = torch.empty(count, 2, height, width)
+    gradient = normal.new_empty(count, 2, height, width)
     _loops().slopes(normal.data_ptr(), count, height * width, 1.0 / max_slope, gradient.data_ptr())
     return gradient
 
@@ -281,21 +281,21 @@ def solve_poisson(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], win
     part = (rows, columns, *window)
     first, last = max(0, window[0] - 1), min(height, window[0] + rows + 1)
     loops = _loops()
-    lines = torch.empty(count, last - first, width)
+    lines = gradient.new_empty(count, last - first, width)
     _check(
         loops.divergence_lines(
             gradient.data_ptr(), mm_per_pixel, count, *part, height, width, first, last - first, lines.data_ptr()
         )
     )
     spectrum = torch.fft.rfft(lines).contiguous()
-    turned = torch.empty(count, spectrum.shape[2], height, dtype=torch.complex64)
+    turned = spectrum.new_empty(count, spectrum.shape[2], height)
     places = order.data_ptr() + first * order.element_size()
     loops.to_columns(spectrum.data_ptr(), places, count, last - first, spectrum.shape[2], height, turned.data_ptr())
     spectrum = torch.fft.fft(turned).contiguous()
     tables = (turns.data_ptr(), of_sum.data_ptr(), of_difference.data_ptr())
     _check(loops.divide(spectrum.data_ptr(), *tables, count, spectrum.shape[1], height))
     lines = torch.fft.irfft(torch.fft.ifft(spectrum), n=width, dim=1).transpose(1, 2).contiguous()
-    depth = torch.empty(count, 1, height, width)
+    depth = gradient.new_empty(count, 1, height, width)
     slopes = gradient.data_ptr() if levelled else None
     loops.settle(lines.data_ptr(), order.data_ptr(), slopes, count, *part, height, width, depth.data_ptr())
     return depth
@@ -304,7 +304,7 @@ def solve_poisson(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], win
 def largest_change(one: Tensor, other: Tensor) -> Tensor:
     """Largest difference of two batches of depths, per frame, (B,)."""
     one, other = one.contiguous(), other.contiguous()
-    change = torch.empty(one.shape[0])
+    change = one.new_empty(one.shape[0])
     _loops().largest_change(one.data_ptr(), other.data_ptr(), one.shape[0], one[0].numel(), change.data_ptr())
     return change
 
@@ -313,6 +313,6 @@ def widen(gradient: Tensor, window: tuple[int, int], size: tuple[int, int]) -> t
     """A window's gradient in the whole image (B, 2, H, W), zero elsewhere, and the normals (B, 3, H, W)."""
     gradient = gradient.contiguous()
     count, _, rows, columns = gradient.shape
-    whole, normal = torch.empty(count, 2, *size), torch.empty(count, 3, *size)
+    whole, normal = gradient.new_empty(count, 2, *size), gradient.new_empty(count, 3, *size)
     _loops().widen(gradient.data_ptr(), count, rows, columns, *window, *size, whole.data_ptr(), normal.data_ptr())
     return whole, normal

@@ -199,6 +199,8 @@ def _integrate_dst(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor]) ->
 
 
 def _integrate_dct(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], top: int, left: int, levelled: bool) -> Tensor:
+    if gradient.shape[0] == 0:
+        return gradient.new_zeros([0, 1, int(plan[-2].shape[0]), int(plan[-1].shape[0])])
     if len(plan) == 7 and may_use_native([gradient, plan[2]]):
         return _by_loops(gradient, mm_per_pixel, plan, (top, left), levelled)
     depth = _by_operators(gradient, mm_per_pixel, plan, top, left)

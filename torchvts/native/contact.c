@@ -1,6 +1,7 @@
 /* The contact mask of compensated images: the same numbers as the operators of ContactMask in torchvts/contact.py, which say why. */
 #include "native.h"
 
+#include <float.h>
 #include <math.h>
 
 /* Bits of a coarse cell. */
@@ -31,6 +32,13 @@ static float kth_smallest(float *values, int n, int k) {
     return values[k];
 }
 
+/* The same, or what is no number if one of them is none. */
+static float median(float *values, int n) {
+    for (int k = 0; k < n; k++)
+        if (!(values[k] <= FLT_MAX)) return NAN;
+    return kth_smallest(values, n, (n - 1) / 2);
+}
+
 /* noise_std() of torchvts/core/noise.py, of one channel's change: image * per_noise + rest. */
 static float noise_of(const float *image, const float *rest, const float *per_noise, int height, int width, int stride, float *some) {
     int n = 0;
@@ -40,8 +48,8 @@ static float noise_of(const float *image, const float *rest, const float *per_no
             float left = r[0] + i[0] * p[0], middle = r[1] + i[1] * p[1], right = r[2] + i[2] * p[2];
             some[n] = fabsf(middle - 0.5f * (left + right));
         }
-    float std = 1.5f * kth_smallest(some, n, (n - 1) / 2) / 0.6745f;
-    for (int pass = 0; pass < 2; pass++) {
+    float std = 1.5f * median(some, n) / 0.6745f;
+    for (int pass = 0; pass < 2 && std == std; pass++) {
         float total = 0.0f;
         int count = 0;
         for (int k = 0; k < n; k++)
@@ -203,8 +211,8 @@ static int find_cells(Grid grid, float threshold, Scratch at) {
         int n = 0;
         for (int i = step / 2; i < rows; i += step)
             for (int j = step / 2; j < columns; j += step) at.some[n++] = fabsf(at.means[c * cells + (size_t)i * columns + j]);
-        const float std = kth_smallest(at.some, n, (n - 1) / 2) / 0.6745f;
-        per[c] = 1.0f / (std > least_std ? std : least_std);
+        const float std = median(at.some, n) / 0.6745f;
+        per[c] = 1.0f / (std < least_std ? least_std : std);
     }
     memset(at.state, OUTSIDE, (size_t)(rows + 2) * wide);
     int found = 0, top = 0;
@@ -322,7 +330,7 @@ EXPORT int contact_mask(const float *image, const float *rest, const float *per_
         for (int c = 0; c < 3; c++)
             if (lives[c]) {
                 const float found = noise_of(frame + pixels * c, rest + pixels * c, per_noise + pixels * c, height, width, stride, at.some);
-                if (found > noise) noise = found;
+                if (!(found <= noise)) noise = found;
             }
         const float threshold = sigmas * sigmas * (noise * noise + rounding);
         find_strong(frame, rest, per_noise, lives, height, width, threshold, grid, at, mask + pixels * b);

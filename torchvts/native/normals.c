@@ -114,7 +114,7 @@ EXPORT int normals(const float *image, int64_t per_frame, int64_t per_channel, i
 WIDE static void slope_row(const float *restrict x, const float *restrict y, const float *restrict z, float per_slope, int n,
                            float *restrict p, float *restrict q) {
     for (int k = 0; k < n; k++) {
-        const float steepest = sqrtf(x[k] * x[k] + y[k] * y[k] + 1e-24f) * per_slope, scale = -1.0f / (z[k] > steepest ? z[k] : steepest);
+        const float steepest = sqrtf(x[k] * x[k] + y[k] * y[k] + 1e-24f) * per_slope, scale = -1.0f / (steepest > z[k] ? steepest : z[k]);
         p[k] = x[k] * scale, q[k] = y[k] * scale;
     }
 }

@@ -23,7 +23,10 @@ WIDE static void restore(const float *restrict line, int n, float level, float *
     if (n % 2) result[n - 1] = line[n / 2] - level;
 }
 
-static void place(const float *source, int columns, float sign, float *line) {
+/* Row y of the window, times `sign`; nothing where there is no such row. */
+static void place(const float *rows_of, int y, int rows, int columns, float sign, float *line) {
+    if (y < 0 || y >= rows) return;
+    const float *source = rows_of + (size_t)y * columns;
     for (int x = 0; x < columns; x++) line[x] = sign * source[x];
 }
 
@@ -47,14 +50,9 @@ EXPORT int divergence_lines(const float *gradient, float mm_per_pixel, int frame
                 padded[0] = -padded[1];
                 padded[width + 1] = -padded[width];
             }
-            if (first + k == height - 1)
-                place(q + (size_t)y * columns, y < rows ? columns : 0, -1.0f, below + left);
-            else if (y + 1 >= 0 && y + 1 < rows)
-                place(q + (size_t)(y + 1) * columns, columns, 1.0f, below + left);
-            if (first + k == 0)
-                place(q + (size_t)y * columns, y >= 0 ? columns : 0, -1.0f, above + left);
-            else if (y - 1 >= 0 && y - 1 < rows)
-                place(q + (size_t)(y - 1) * columns, columns, 1.0f, above + left);
+            const int lowest = first + k == height - 1, highest = first + k == 0;
+            place(q, lowest ? y : y + 1, rows, columns, lowest ? -1.0f : 1.0f, below + left);
+            place(q, highest ? y : y - 1, rows, columns, highest ? -1.0f : 1.0f, above + left);
             difference(padded, above, below, 0.5f * mm_per_pixel, width, line);
             reorder(line, width, lines + ((size_t)b * count + k) * width);
         }

@@ -117,7 +117,7 @@ EXPORT void relight(const float *image, int64_t per_frame, int64_t per_channel, 
                     slope[1] = expected[(2 * (size_t)b + 1) * pixels + here];
                 } else {
                     const float u = normal[here], v = normal[pixels + here], w = normal[2 * pixels + here];
-                    const float steepest = sqrtf(u * u + v * v + 1e-24f) / model.max_slope, down = w > steepest ? w : steepest;
+                    const float steepest = sqrtf(u * u + v * v + 1e-24f) / model.max_slope, down = steepest > w ? steepest : w;
                     slope[0] = -u / down;
                     slope[1] = -v / down;
                 }

@@ -12,6 +12,7 @@ from ..core.checks import (
     check_camera_height,
     check_integer,
     check_record,
+    check_same_count,
     check_same_size,
     check_shape,
     check_size,
@@ -258,12 +259,17 @@ class NormalFromIntensity(nn.Module):
         if expected is not None:
             check_batch("expected", expected, 2)
             check_same_size("expected", expected, "compensated", compensated.shape[2], compensated.shape[3])
+            check_same_count("expected", expected, "compensated", compensated.shape[0])
+            expected = expected.expand(compensated.shape[0], 2, compensated.shape[2], compensated.shape[3])
         height, width = self.inverse.shape[2], self.inverse.shape[3]
         top, left = check_window("compensated", compensated, (height, width), window)
         bottom, right = top + compensated.shape[2], left + compensated.shape[3]
         if depth_mm is not None:
             check_batch("depth_mm", depth_mm, 1)
             check_same_size("depth_mm", depth_mm, "compensated", compensated.shape[2], compensated.shape[3])
+            check_same_count("depth_mm", depth_mm, "compensated", compensated.shape[0])
+        if compensated.shape[0] == 0:
+            return compensated
         position: Tensor = self.lights.position_mm
         albedo = self.lights.albedo
         whole = bottom - top == height and right - left == width
@@ -370,8 +376,10 @@ class NormalFromIntensity(nn.Module):
         check_batch("compensated", compensated, 3)
         check_batch("gradient", gradient, 2)
         check_same_size("gradient", gradient, "compensated", compensated.shape[2], compensated.shape[3])
+        check_same_count("gradient", gradient, "compensated", compensated.shape[0])
         check_batch("depth_mm", depth_mm, 1)
         check_same_size("depth_mm", depth_mm, "compensated", compensated.shape[2], compensated.shape[3])
+        check_same_count("depth_mm", depth_mm, "compensated", compensated.shape[0])
         height, width = self.inverse.shape[2], self.inverse.shape[3]
         top, left = check_window("compensated", compensated, (height, width), window)
         bottom, right = top + compensated.shape[2], left + compensated.shape[3]

@@ -134,12 +134,13 @@ def test_a_program_takes_the_decisions_of_the_pipeline(low, mini, tmp_path, kind
         assert export.compare(tmp_path / "pipe.pt2", pipe, frames, "pt2") <= 1e-5
 
 
-@pytest.mark.parametrize("kind", ["lights fast", "response precise"])
+@pytest.mark.parametrize("kind", ["lights fast", "lights precise", "response precise"])
 def test_onnx_without_torchvts(low, mini, tmp_path, kind):
     if export.missing("onnx"):
         pytest.skip(export.missing("onnx"))
-    calibration, frames = low if kind == "lights fast" else mini
+    calibration, frames = mini if kind == "response precise" else low
     pipe = pipeline(calibration, kind.split()[1])
+    pipe.max_passes = min(pipe.max_passes, 2)  # loops in the graph take minutes to write
     path = export.export_onnx(pipe, tmp_path / "pipe.onnx")
     assert export.compare(path, pipe, frames, "onnx") <= 1e-3
 

@@ -122,6 +122,18 @@ def _check(short_of_memory: int) -> None:
         raise MemoryError("torchvts: no memory is left for a few rows of the image")
 
 
+def _of_whole_rows(tensor: Tensor) -> Tensor:
+    """The tensor, its rows in one piece; frames, channels and rows may lie anywhere."""
+    return tensor if tensor.stride(3) == 1 else tensor.contiguous()
+
+
+def _depth_arguments(depth_mm: Tensor | None) -> tuple[int | None, int, int]:
+    """Where a depth begins, and how far its frames and rows are apart; one frame serves all. The caller keeps the tensor."""
+    if depth_mm is None:
+        return None, 0, 0
+    return depth_mm.data_ptr(), 0 if depth_mm.shape[0] == 1 else depth_mm.stride(0), depth_mm.stride(2)
+
+
 def some_means(image: Tensor, stride: int, first: int) -> Tensor:
     """Means of 3 x 3 pixels on a grid, (B, C, h, w): from (first, first) on every ``stride`` that is whole."""
     image = image.contiguous()
@@ -176,16 +188,13 @@ def normals(
     of the whole image.
     """
     dark, full, inverse = dark.contiguous(), full.contiguous(), inverse.contiguous()
-    compensated = compensated if compensated.stride(3) == 1 else compensated.contiguous()
+    compensated = _of_whole_rows(compensated)
     position_mm, albedo = position_mm.contiguous(), albedo.contiguous()
     count, _, rows, columns = compensated.shape
     height, width = inverse.shape[2], inverse.shape[3]
     at = 4 * (window[0] * width + window[1])
     normal = compensated.new_empty(count, 3, rows, columns)
-    depth, steps = None, (0, 0)
-    if depth_mm is not None:
-        depth_mm = depth_mm if depth_mm.stride(3) == 1 else depth_mm.contiguous()
-        depth, steps = depth_mm.data_ptr(), (0 if depth_mm.shape[0] == 1 else depth_mm.stride(0), depth_mm.stride(2))
+    depth_mm = None if depth_mm is None else _of_whole_rows(depth_mm)
     unsound = _loops().normals(
         compensated.data_ptr(),
         *compensated.stride()[:3],
@@ -197,8 +206,7 @@ def normals(
         count,
         rows,
         columns,
-        depth,
-        *steps,
+        *_depth_arguments(depth_mm),
         position_mm.data_ptr(),
         albedo.data_ptr(),
         mm_per_pixel,
@@ -229,15 +237,12 @@ def relight(
     slope.
     """
     dark, full, weak = dark.contiguous(), full.contiguous(), weak.contiguous()
-    compensated = compensated if compensated.stride(3) == 1 else compensated.contiguous()
+    compensated = _of_whole_rows(compensated)
     position_mm, albedo, model = position_mm.contiguous(), albedo.contiguous(), albedo.new_tensor(numbers)
     count, _, rows, columns = compensated.shape
     height, width = dark.shape[1], dark.shape[2]
     place = window[0] * width + window[1]
-    depth, steps = None, (0, 0)
-    if depth_mm is not None:
-        depth_mm = depth_mm if depth_mm.stride(3) == 1 else depth_mm.contiguous()
-        depth, steps = depth_mm.data_ptr(), (0 if depth_mm.shape[0] == 1 else depth_mm.stride(0), depth_mm.stride(2))
+    depth_mm = None if depth_mm is None else _of_whole_rows(depth_mm)
     expected = None if expected is None else expected.contiguous()
     _loops().relight(
         compensated.data_ptr(),
@@ -250,8 +255,7 @@ def relight(
         count,
         rows,
         columns,
-        depth,
-        *steps,
+        *_depth_arguments(depth_mm),
         None if expected is None else expected.data_ptr(),
         position_mm.data_ptr(),
         albedo.data_ptr(),

@@ -277,10 +277,11 @@ class NormalFromIntensity(nn.Module):
         x = 0.0 if whole else 0.5 * (left + right - width) * self.mm_per_pixel
         y = 0.0 if whole else 0.5 * (top + bottom - height) * self.mm_per_pixel
         axis = (-x, -y)
-        normal = compensated
         tensors = [compensated, position, albedo, self.inverse]
         if depth_mm is not None:
             tensors.append(depth_mm)
+        if expected is not None:
+            tensors.append(expected)
         by_loops = not self.lights.glossy and may_use_native(tensors)
         if by_loops:
             normal, sound = self._by_loops(compensated, depth_mm, (top, left), axis)
@@ -290,11 +291,10 @@ class NormalFromIntensity(nn.Module):
             position = torch.cat((position[:, 0:1] - x, position[:, 1:2] - y, position[:, 2:3]), dim=1)
         if self.lights.glossy:
             compensated = self._matt(compensated, depth_mm, position, axis)
-        if by_loops and (expected is None or may_use_native([expected])):
+        if by_loops:
             self._relight_by_loops(normal, compensated, depth_mm, (top, left), position, axis, expected)
             return normal
-        if not by_loops:
-            normal = self._by_operators(compensated, depth_mm, position, axis, (top, left))
+        normal = self._by_operators(compensated, depth_mm, position, axis, (top, left))
         dark = self.dark_where[:, top:bottom, left:right]
         full = self.full_above[:, top:bottom, left:right]
         weak = self.weak[top:bottom, left:right]

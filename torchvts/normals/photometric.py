@@ -277,6 +277,7 @@ class NormalFromIntensity(nn.Module):
         x = 0.0 if whole else 0.5 * (left + right - width) * self.mm_per_pixel
         y = 0.0 if whole else 0.5 * (top + bottom - height) * self.mm_per_pixel
         axis = (-x, -y)
+        normal = compensated  # TorchScript asks for a value on every way
         tensors = [compensated, position, albedo, self.inverse]
         if depth_mm is not None:
             tensors.append(depth_mm)

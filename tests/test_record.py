@@ -63,7 +63,7 @@ def test_double_precision_survives(ring, tmp_path):
 def test_what_the_paper_keeps_is_in_the_file(saved):
     tensors, metadata = load_tensors(saved)
     assert {"light_position_mm", "light_albedo", "compensation", "inverse"} <= set(tensors)
-    assert metadata["format_version"] == 3 and metadata["sensor"]["mm_per_pixel"] == 1.25
+    assert metadata["format_version"] == 4 and metadata["sensor"]["mm_per_pixel"] == 1.25
 
 
 def no_tensor(name):
@@ -98,7 +98,7 @@ TENSORS = {
     "integers": (put("background", lambda t: t.to(torch.int32)), "tensor 'background': expected .* floats, got .* torch.int32"),
 }  # fmt: skip
 METADATA = {
-    "a later version": (lambda m: m.update(format_version=99), "format version 99, this torchvts reads 1 to 3: update torchvts"),
+    "a later version": (lambda m: m.update(format_version=99), "format version 99, this torchvts reads 1 to 4: update torchvts"),
     "version zero": (lambda m: m.update(format_version=0), "format version 0"),
     "version as text": (lambda m: m.update(format_version="1"), "format version '1'"),
     "no version": (lambda m: m.pop("format_version"), "format version None"),

@@ -28,10 +28,9 @@ def pairs(inputs):
 
 
 def count_by_hand(degree, product_degree, uses_depth):
-    inputs = 4 if uses_depth else 3
     monomials = [(d + 1) * (d + 2) // 2 for d in (degree, product_degree)]
-    products = len(pairs(inputs)) if product_degree >= 0 else 0
-    return inputs * monomials[0] + products * monomials[1]
+    products = len(pairs(4 if uses_depth else 3)) if product_degree >= 0 else 0
+    return (6 if uses_depth else 3) * monomials[0] + products * monomials[1]
 
 
 def random_field(degree, product_degree, uses_depth, half_mm=9.0, size=0.1, seed=0):
@@ -44,10 +43,9 @@ def random_field(degree, product_degree, uses_depth, half_mm=9.0, size=0.1, seed
 
 def maps_by_hand(field, height, width, pitch):
     """W_t(x, y) from the definition, pixel by pixel: (terms, 2, H, W)."""
-    inputs = range(4 if field.uses_depth else 3)
-    degrees = [field.degree for _ in inputs]
+    degrees = [field.degree] * (6 if field.uses_depth else 3)
     if field.product_degree >= 0:
-        degrees += [field.product_degree for _ in pairs(len(inputs))]
+        degrees += [field.product_degree for _ in pairs(4 if field.uses_depth else 3)]
     out = np.zeros((len(degrees), 2, height, width))
     for row in range(height):
         for column in range(width):
@@ -66,6 +64,8 @@ def slope_by_hand(field, change, depth, pitch):
     """Slope from the definition: change (3, H, W), depth (H, W) or None, to (2, H, W)."""
     inputs = [channel / CHANGE_SCALE for channel in change] + ([depth] if field.uses_depth else [])
     terms = list(inputs)
+    if field.uses_depth:  # its own slopes are inputs too, but have no products
+        terms += [np.gradient(depth, pitch, axis=1), np.gradient(depth, pitch, axis=0)]
     if field.product_degree >= 0:
         terms += [inputs[i] * inputs[k] for i, k in pairs(len(inputs))]
     maps = maps_by_hand(field, *change.shape[1:], pitch)
@@ -84,8 +84,8 @@ def test_the_terms_are_the_inputs_and_then_their_products():
     assert random_field(2, -1, False).terms() == [(0,), (1,), (2,)]
     assert random_field(1, 1, False).terms() == [(0,), (1,), (2,), (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
     deep = random_field(0, 0, True).terms()
-    assert deep[:4] == [(0,), (1,), (2,), (3,)] and deep[4:8] == [(0, 0), (0, 1), (0, 2), (0, 3)]
-    assert len(deep) == len(set(deep)) == 13 + DEPTH_SQUARED and ((3, 3) in deep) == DEPTH_SQUARED
+    assert deep[:6] == [(0,), (1,), (2,), (3,), (4,), (5,)] and deep[6:10] == [(0, 0), (0, 1), (0, 2), (0, 3)]
+    assert len(deep) == len(set(deep)) == 15 + DEPTH_SQUARED and ((3, 3) in deep) == DEPTH_SQUARED
     assert all(len(term) > 0 for term in deep)  # none is constant
 
 
@@ -252,12 +252,31 @@ def test_depth_changes_the_slope_as_its_terms_say():
     fast = random_field(1, -1, False, half_mm=1.4)
     deep = fast.lifted(1, 0, True)
     rows = [list(row) for row in deep.coefficient]
-    rows[0][4 * 3 + deep.terms()[4:].index((0, 3))] = 0.1
+    rows[0][6 * 3 + deep.terms()[6:].index((0, 3))] = 0.1
     block = vts.NormalFromResponse(fast, dataclasses.replace(deep, coefficient=rows), 6, 7, 0.4, dtype=torch.float64)
     image, depth = random_image()
     before, after = (vts.gradient_from_normal(block(image, d)) for d in (None, depth))
     assert torch.allclose(after[:, 0] - before[:, 0], 0.1 * (image[:, 0] - 1.0) / CHANGE_SCALE * depth[:, 0], atol=1e-12)
     assert torch.allclose(after[:, 1], before[:, 1], atol=1e-12)
+
+
+def test_slopes_of_the_depth_are_inputs():
+    """A field that heeds nothing but the depth's slopes, a half of one and a third of the other, gives just those."""
+    deep = ResponseField(0, -1, True, 1.4, ((0, 0, 0, 0, 0.5, 0), (0, 0, 0, 0, 0, 1 / 3)))
+    block = vts.NormalFromResponse(random_field(1, -1, False), deep, 6, 7, 0.4, dtype=torch.float64)
+    image, depth = random_image()
+    slope = vts.gradient_from_normal(block(image, depth)).numpy()
+    p, q = np.gradient(depth.numpy(), 0.4, axis=3)[:, 0] / 2, np.gradient(depth.numpy(), 0.4, axis=2)[:, 0] / 3
+    assert slope == pytest.approx(np.stack((p, q), axis=1), abs=1e-9)
+
+
+def test_fields_of_files_without_slopes_of_depth_heed_none():
+    field = random_field(1, 0, True)
+    rows = [
+        [0.0 if 12 <= k < 18 else v for k, v in enumerate(row)] for row in field.coefficient
+    ]  # 3 numbers each: 4 inputs, 2 slopes
+    before = field.to_dict() | {"coefficient": [row[:12] + row[18:] for row in rows]}
+    assert ResponseField.from_dict(before, "file") == dataclasses.replace(field, coefficient=tuple(map(tuple, rows)))
 
 
 def test_steepness_is_bounded_and_its_direction_kept():
@@ -299,12 +318,14 @@ def test_derivatives_are_those_of_the_slopes():
 
 def test_the_coarse_block_is_every_eighth_pixel():
     _, _, block = normals(height=41, width=50)
-    image, depth = random_image(2, 41, 50)
+    image, _ = random_image(2, 41, 50)
+    x, y = (torch.arange(n, dtype=torch.float64) for n in (50, 41))
+    depth = (0.3 * x - 0.2 * y[:, None]).expand(2, 1, 41, 50)  # the same slopes at any pitch
     coarse = block.coarse(8)
     assert coarse.uses_depth and coarse.max_slope == block.max_slope
     for d in (None, depth):
         small = None if d is None else d[..., 4::8, 4::8]
-        assert torch.equal(coarse(image[..., 4::8, 4::8], small), block(image, d)[..., 4::8, 4::8])
+        assert torch.allclose(coarse(image[..., 4::8, 4::8], small), block(image, d)[..., 4::8, 4::8], rtol=0, atol=1e-12)
 
 
 # files

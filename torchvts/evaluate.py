@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from .calibration import CalibrationWarning, Press, calibrate, read_presses
+from .calibration import CalibrationWarning, Press, calibrate, fit_prior, read_presses
 from .calibration.calibrate import RESPONSE_BLUR_PX, as_read, by_presses
 from .compensate import Compensate
 from .contact import ContactMask
@@ -257,11 +257,14 @@ class Training:
 
     Args:
         background: (3, H, W) in [0, 1], image at rest. presses: to learn from. sensor: the sensor; its prior is not looked at.
+    Attributes:
+        told: the presses with their labels, which only a prior may learn from.
     """
 
     def __init__(self, background: Tensor, presses: Sequence[Press], sensor: Sensor) -> None:
         self.background = background
         self.sensor = sensor.without_prior()
+        self.told = presses
         self.presses = [dataclasses.replace(press, center_px=None, contact_radius_px=None) for press in presses]
 
     @cached_property
@@ -352,6 +355,13 @@ def response(training: Training, background: Tensor, sensor: Sensor, mode: str =
     return _calibrated(training.calibration, training, background, sensor, mode)
 
 
+def response_with_own_prior(training: Training, background: Tensor, sensor: Sensor) -> Method:
+    """What ``calibrate`` makes of the presses and of a prior fitted with labels on the same, precise: what a sensor's prior is
+    worth on presses that it has not seen."""
+    prior = fit_prior(training.background, training.sensor, training.told, "the folds learned from, with their labels")
+    return response_with_prior(training, background, dataclasses.replace(sensor, prior=prior))
+
+
 def response_with_prior(training: Training, background: Tensor, sensor: Sensor) -> Method:
     """What ``calibrate`` makes of the presses and the prior of the sensor file, precise."""
     with warnings.catch_warnings():
@@ -390,6 +400,7 @@ METHODS: dict[str, Build] = {
     "MLP": network,
     "response fast": partial(response, mode="fast"),
     "response precise": response,
+    "response precise, prior by folds": response_with_own_prior,
     "response precise, prior": response_with_prior,
 }
 """Name in the table to function; "response precise, prior" needs a sensor with a prior."""
@@ -598,7 +609,7 @@ def _choose(methods: Sequence[str], sensor: Sensor, network_path: str | Path | N
             raise ValueError(f"methods: expected some of {', '.join(repr(m) for m in METHODS)}, got {name!r}")
         if name == "response precise, prior" and sensor.prior is None:
             raise ValueError(f"methods: {name!r} needs a prior, sensor '{sensor.name}' has none: scripts/fit_prior.py fits one")
-    chosen = {name: METHODS[name] for name in methods or METHODS if sensor.prior is not None or "prior" not in name}
+    chosen = {name: METHODS[name] for name in methods or METHODS if sensor.prior is not None or name != "response precise, prior"}
     if "MLP" in chosen:
         chosen["MLP"] = partial(network, seed=seed)
     if network_path is not None:

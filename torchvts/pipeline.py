@@ -541,15 +541,16 @@ def _box_by_array(contact: Tensor) -> tuple[int, int, int, int]:
 
 
 def _window(contact: Tensor, stride: int) -> tuple[int, int, int, int]:
-    """(top, bottom, left, right) of the part of the image that holds all contact, its corners multiples of ``stride``.
+    """(top, bottom, left, right) of the part of the image that holds all contact and the pixels beside it, from which depth has
+    slopes; its corners are multiples of ``stride``.
 
     All of the image where little would be saved, and at least two strides where there is no contact.
     """
     height, width = contact.shape[2], contact.shape[3]
     top, bottom, left, right = _box(contact)
-    top, left = top // stride * stride, left // stride * stride
-    bottom = min(height, max((bottom + stride - 1) // stride, top // stride + 2) * stride)
-    right = min(width, max((right + stride - 1) // stride, left // stride + 2) * stride)
+    top, left = max(0, top - 1) // stride * stride, max(0, left - 1) // stride * stride
+    bottom = min(height, max((bottom + stride) // stride, top // stride + 2) * stride)
+    right = min(width, max((right + stride) // stride, left // stride + 2) * stride)
     top, left = max(0, min(top, bottom - 2 * stride)), max(0, min(left, right - 2 * stride))
     if (bottom - top) * (right - left) > 0.8 * height * width or top % stride != 0 or left % stride != 0:
         return 0, height, 0, width

@@ -18,7 +18,7 @@ from .core.sensor import Sensor, check_sensor
 from .markers import FillMarkers
 from .shading import PointLights, flat_image, inverse_light_matrix
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 """Raised when a file of an older version can no longer be read as it is, or an older torchvts cannot read a new one."""
 
 DEFECT_RATIO = 4.0

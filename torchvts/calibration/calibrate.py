@@ -47,11 +47,10 @@ RESPONSE_BLUR_PX = 1.0
 READING_WORTH = 0.1
 """Another gamma or blur must lower the held-out error by this part: balls are smooth, and do not show what a wider blur loses."""
 
-PRIOR_FAMILY = ((3, 2),)
-PRIOR_PRODUCT_PENALTY = 40.0
-"""Free products fit their own unit better and another worse. With penalties of 10 and 40 presses of a GelSight Mini that the prior
-has not seen are 2.24 and 2.38 degrees off (degrees 2 and 1 with 40: 2.55), and a bead on a second Mini is 3.19 and 2.97 from that
-unit's own network (2.90)."""
+PRIOR_FAMILY = ((4, 3),)
+PRIOR_PRODUCT_PENALTY = 60.0
+"""Free products fit their own unit better and another worse. With penalties of 40, 60 and 200 presses of a GelSight Mini that the
+prior has not seen are 2.02, 2.06 and 2.24 degrees off; a bead on a second Mini is, with 40 and 60, 2.99 and 2.94 from that unit's own network."""
 
 TIE = 1.05
 """Point lights are preferred to response fields unless these are better by more than this."""
@@ -169,7 +168,7 @@ def calibrate(
 def fit_prior(background: Tensor, sensor: Sensor, presses: Sequence[Press], source: str = "") -> SensorPrior:
     """What presses on one unit say of every unit of its type: a field of a size that carries over to other units.
 
-    Linear terms of degree 3 and products of degree 2, the latter dear: free ones fit this unit better and others worse.
+    Linear terms of degree 4 and products of degree 3, the latter dear: free ones fit this unit better and others worse.
 
     Args:
         background, sensor, presses: as for :func:`calibrate`; a prior of the sensor is not looked at.

@@ -12,7 +12,7 @@ from torch import Tensor
 from ..compensate import blur, gaussian_weights
 from ..contact import ContactMask
 from ..core.checks import check_numbers, check_positive
-from ..core.geometry import gradient_from_normal, pixel_grid_mm
+from ..core.geometry import gradient_from_normal, gradient_of_depth, pixel_grid_mm
 from ..core.gs_sdk import read_calibration_folder, read_labels
 from ..core.response import ResponseField
 from ..core.sensor import Sensor
@@ -29,7 +29,7 @@ LEAST_INSIDE = 10
 ROUGH = 0.13
 """Structure between the channels of an image at rest from which it is taken for a contact: :func:`channel_structure`."""
 
-MAX_SAMPLES = 3000
+MAX_SAMPLES = 2000
 """Pixels of a press that enter the fit: more are as alike as neighbours are."""
 
 
@@ -111,7 +111,7 @@ class Contact:
         index: (N,) flat indices of the sampled pixels; their four neighbours lie in the image too.
         x, y: (N,), mm. radius_mm: of the ball; 0 for an unknown object.
         center_mm: (2,), contact_radius_mm: where the ball is, as far as known.
-        depth_mm: (H, W), what the field without depth led to; empty before.
+        deep: (3, H, W), the depth, mm, that the field without depth led to, and its slopes; empty before.
         known, radius_known: the center, the contact radius was given and is not to be sought.
         reason: why it is left out; empty if it is not. figures: what the report tells of it.
     """
@@ -125,7 +125,7 @@ class Contact:
     radius_mm: float
     center_mm: Tensor = field(default_factory=lambda: torch.zeros(2, dtype=torch.float64))
     contact_radius_mm: float = 0.0
-    depth_mm: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
+    deep: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
     known: bool = False
     radius_known: bool = False
     reason: str = ""
@@ -232,3 +232,9 @@ def depths(contacts: Sequence[Contact], fast: ResponseField, pitch_mm: float) ->
     normals = NormalFromResponse(fast, None, height, width, pitch_mm, dtype=torch.float64)
     gradients = (gradient_from_normal(normals(1.0 + contact.change[None])) * contact.mask for contact in contacts)
     return [poisson_rest(gradient, pitch_mm)[0, 0] for gradient in gradients]
+
+
+def go_deeper(contacts: Sequence[Contact], fast: ResponseField, pitch_mm: float) -> None:
+    """Keep with each contact what a second pass sees of the first one's depth: itself and its slopes."""
+    for contact, depth in zip(contacts, depths(contacts, fast, pitch_mm)):
+        contact.deep = torch.cat((depth[None], gradient_of_depth(depth[None, None], pitch_mm)[0]))

@@ -21,6 +21,10 @@ DEGREE_PENALTY = 2.0
 """Each degree in position makes a coefficient this many times dearer: slow fields are the likely ones."""
 PRODUCT_PENALTY = 10.0
 """Coefficients of products are this many times dearer: they fit one unit's own ways, and do not carry over to another."""
+DEPTH_PENALTY = 3.0
+"""Terms with the depth are this many times dearer: half a millimetre is a deep press, and depth alone can tell a ball's shape."""
+SLOPE_PENALTY = 0.3
+"""Slopes of the depth are this many times as dear: they are slopes already."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +45,14 @@ class Family:
     def penalty(self) -> Tensor:
         """(2 K,): what a unit of each coefficient costs; dz/dx first."""
         by_term = term_degrees_by_term(self.degree, self.product_degree, self.uses_depth)
-        dear = [self.product_penalty ** (len(term) - 1) for term, d in by_term.items() for _ in range((d + 1) * (d + 2) // 2)]
+        dear = [self._term_penalty(term) for term, d in by_term.items() for _ in range((d + 1) * (d + 2) // 2)]
         degrees = torch.tensor(term_degrees(self.degree, self.product_degree, self.uses_depth), dtype=torch.float64)
         return (torch.tensor(dear, dtype=torch.float64) * DEGREE_PENALTY**degrees).repeat(2)
+
+    def _term_penalty(self, term: tuple[int, ...]) -> float:
+        if len(term) == 2:
+            return self.product_penalty * (DEPTH_PENALTY if 3 in term else 1.0)
+        return (1.0, 1.0, 1.0, DEPTH_PENALTY, SLOPE_PENALTY, SLOPE_PENALTY)[term[0]]
 
     def size(self) -> int:
         """Numbers in a field of this family, both slopes."""
@@ -62,9 +71,9 @@ class Family:
     def terms(self, contact: Contact, shift: int = 0) -> Tensor:
         """(K, N): factors of the coefficients at the sampled pixels, or at neighbours ``shift`` further in memory."""
         index = contact.index + shift
-        depth = contact.depth_mm.flatten()[index] if self.uses_depth else None
+        deep = contact.deep.flatten(1)[:, index] if self.uses_depth else None
         change = contact.change.flatten(1)[:, index]
-        return term_values(change, depth, contact.x, contact.y, self.half_mm, self.degree, self.product_degree)
+        return term_values(change, deep, contact.x, contact.y, self.half_mm, self.degree, self.product_degree)
 
 
 class ContactForms:

@@ -14,10 +14,10 @@ from ..core.response import ResponseField, ResponseModel
 from ..core.sensor import Sensor
 from ..normals import NormalFromResponse
 from .balls import center_by_slope, guess_circle, update_radius
-from .contacts import LEAST_INSIDE, Contact, depths
+from .contacts import LEAST_INSIDE, Contact, depths, go_deeper
 from .field import PRODUCT_PENALTY, ContactForms, Family, solve, solve_with_centers
 
-FAMILIES = ((0, -1), (1, -1), (2, -1), (2, 1), (3, 2), (3, 3))
+FAMILIES = ((0, -1), (1, -1), (2, -1), (2, 1), (3, 2), (4, 3))
 """Degrees of candidates, linear terms and products, the smallest first."""
 
 OWN_PENALTIES = (0.03, 0.01, 0.003)
@@ -76,8 +76,7 @@ def fit_response(
         bar.update()
         bar.set_postfix(step="one pass")
         fast, fast_rows, fast_index = _choose(used, options, False, None if prior is None else prior.fast)
-        for contact, depth in zip(used, depths(used, fast, pitch)):
-            contact.depth_mm = depth
+        go_deeper(used, fast, pitch)
         bar.update()
         bar.set_postfix(step="second pass")
         given = None if prior is None else prior.precise or fast.lifted(fast.degree, fast.product_degree, True)
@@ -139,8 +138,7 @@ def _locate_jointly(contacts: list[Contact], pitch_mm: float, half_mm: float) ->
         if products >= 0 and anchors is None:
             anchors = [contact.center_mm.clone() for contact in contacts]
         if uses_depth and fast is not None:
-            for contact, depth in zip(contacts, depths(contacts, fast, pitch_mm)):
-                contact.depth_mm = depth
+            go_deeper(contacts, fast, pitch_mm)
         forms = [ContactForms(family, contact) for contact in contacts]
         coefficient = torch.zeros(family.size(), dtype=torch.float64)
         for _ in range(rounds):

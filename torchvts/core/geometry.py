@@ -78,6 +78,21 @@ def _by_loops(normal: Tensor, max_slope: float) -> Tensor:
     return native.slopes(normal, max_slope)
 
 
+def gradient_of_depth(depth_mm: Tensor, mm_per_pixel: float) -> Tensor:
+    """Central differences of depth, (B, 1, H, W) in mm, to (B, 2, H, W), mm per mm; one-sided in the image's first and last lines.
+
+    Example:
+        >>> gradient_of_depth(torch.tensor([[[[0.0, 1.0, 4.0]]]]), 0.5)[0, 0]
+        tensor([[2., 4., 6.]])
+    """
+    z = depth_mm * (0.5 / mm_per_pixel)
+    near, far = min(1, z.shape[3] - 1), max(0, z.shape[3] - 2)  # the lines next to the first and the last
+    z_x = torch.cat((2.0 * z[..., :1] - z[..., near : near + 1], z, 2.0 * z[..., -1:] - z[..., far : far + 1]), dim=3)
+    near, far = min(1, z.shape[2] - 1), max(0, z.shape[2] - 2)
+    z_y = torch.cat((2.0 * z[:, :, :1] - z[:, :, near : near + 1], z, 2.0 * z[:, :, -1:] - z[:, :, far : far + 1]), dim=2)
+    return torch.cat((z_x[..., 2:] - z_x[..., :-2], z_y[:, :, 2:] - z_y[:, :, :-2]), dim=1)
+
+
 class GradientFromNormal(nn.Module):
     """Module face of :func:`gradient_from_normal`."""
 

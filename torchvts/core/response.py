@@ -21,13 +21,17 @@ class ResponseField:
     r"""slope(x, y) = sum over terms of W_t(x, y) * term_t(change, depth).
 
     The inputs are the relative changes of R, G and B, image / background - 1, over :data:`CHANGE_SCALE`, and, if
-    ``uses_depth``, the depth in mm. The terms are the inputs themselves and, if ``product_degree`` is not -1, their products
-    of two but for depth squared. No term is constant: a skin at rest has slope zero. Each W_t is a polynomial of total degree
-    ``degree`` (products: ``product_degree``) in x / half_mm and y / half_mm.
+    ``uses_depth``, the depth that a first pass led to, in mm, and that depth's own slopes along x and y. The terms are the
+    inputs themselves and, if ``product_degree`` is not -1, the products of two of changes and depth but for depth squared. No
+    term is constant: a skin at rest has slope zero. Each W_t is a polynomial of total degree ``degree`` (products:
+    ``product_degree``) in x / half_mm and y / half_mm.
+
+    The depth's slopes carry less noise than the pixel's own, since integration has kept only what is the slope of some
+    surface; how far to trust either is fitted.
 
     Args:
         degree, product_degree: 0 to 6; product_degree -1 leaves products out.
-        uses_depth: depth is the fourth input.
+        uses_depth: depth and its slopes are inputs four to six.
         half_mm: half the width of the field of view, mm: what positions are scaled by.
         coefficient: 2 rows (dz/dx, dz/dy) of :meth:`size` numbers, term after term.
     Raises:
@@ -56,7 +60,7 @@ class ResponseField:
         object.__setattr__(self, "coefficient", (numbers[: self.size()], numbers[self.size() :]))
 
     def terms(self) -> list[tuple[int, ...]]:
-        """The terms as indices of their inputs: (0,) is the change of R, (0, 3) that times the depth."""
+        """The terms as indices of their inputs: (0,) is the change of R, (0, 3) that times the depth, (4,) the depth's dz/dx."""
         return field_terms(self.uses_depth, self.product_degree)
 
     def size(self) -> int:
@@ -106,8 +110,8 @@ class ResponseField:
 
     @classmethod
     def from_dict(cls, values: Any, source: str) -> "ResponseField":
-        """Read what :meth:`to_dict` gave; ``source`` names it in errors."""
-        return from_dict(cls, values, source)
+        """Read what :meth:`to_dict` gave, now or when there were no slopes of depth; ``source`` names it in errors."""
+        return from_dict(cls, _with_slopes(values), source)
 
 
 @dataclass(frozen=True)
@@ -213,11 +217,26 @@ def fit_log_background(background: Tensor, mm_per_pixel: float) -> tuple[tuple[f
 
 
 def field_terms(uses_depth: bool, product_degree: int) -> list[tuple[int, ...]]:
-    """Terms as indices of their inputs: the inputs, then their products of two, but for depth squared, which explains nothing."""
-    inputs = range(4 if uses_depth else 3)
-    single: list[tuple[int, ...]] = [(k,) for k in inputs]
-    pairs = [pair for pair in combinations_with_replacement(inputs, 2) if pair != (3, 3)]
+    """Terms as indices of their inputs: all inputs, then the products of two of changes and depth, but for depth squared, which
+    explains nothing."""
+    single: list[tuple[int, ...]] = [(k,) for k in range(6 if uses_depth else 3)]
+    pairs = [pair for pair in combinations_with_replacement(range(4 if uses_depth else 3), 2) if pair != (3, 3)]
     return single + (pairs if product_degree >= 0 else [])
+
+
+def _with_slopes(values: Any) -> Any:
+    """A field of a file from before depth's slopes were inputs, as one that does not heed them; anything else as it is."""
+    if not isinstance(values, dict) or values.get("uses_depth") is not True:
+        return values
+    degree, product_degree, rows = (values.get(name) for name in ("degree", "product_degree", "coefficient"))
+    if not (isinstance(degree, int) and isinstance(product_degree, int) and isinstance(rows, list)):
+        return values  # from_dict says what is wrong
+    if not (0 <= degree <= 6 and -1 <= product_degree <= 6):
+        return values
+    count, size = (degree + 1) * (degree + 2) // 2, len(term_degrees(degree, product_degree, True))
+    if not all(isinstance(row, list) and len(row) == size - 2 * count for row in rows):
+        return values
+    return values | {"coefficient": [[*row[: 4 * count], *[0.0] * (2 * count), *row[4 * count :]] for row in rows]}
 
 
 def term_degrees_by_term(degree: int, product_degree: int, uses_depth: bool) -> dict[tuple[int, ...], int]:
@@ -234,21 +253,26 @@ def term_degrees(degree: int, product_degree: int, uses_depth: bool) -> list[int
 def position_basis(x: Tensor, y: Tensor, half_mm: float, degree: int) -> Tensor:
     """Monomials of total degree up to ``degree`` in x / half_mm, y / half_mm: (n, *x.shape)."""
     u, v = x / half_mm, y / half_mm
-    return torch.stack([u**i * v**j for i in range(degree + 1) for j in range(degree + 1 - i)])
+    columns, rows = [torch.ones_like(u)], [torch.ones_like(v)]
+    for _ in range(degree):
+        columns.append(columns[-1] * u)
+        rows.append(rows[-1] * v)
+    return torch.stack([columns[i] * rows[j] for i in range(degree + 1) for j in range(degree + 1 - i)])
 
 
 def term_values(
-    change: Tensor, depth_mm: Tensor | None, x: Tensor, y: Tensor, half_mm: float, degree: int, product_degree: int
+    change: Tensor, deep: Tensor | None, x: Tensor, y: Tensor, half_mm: float, degree: int, product_degree: int
 ) -> Tensor:
     """Every coefficient's factor at N places: (size, N).
 
     Args:
-        change: (3, N), image / background - 1. depth_mm: (N,) for fields that use depth, else None. x, y: (N,), mm.
+        change: (3, N), image / background - 1. deep: (3, N), depth in mm and its two slopes, for fields that use depth, else
+            None. x, y: (N,), mm.
     """
-    inputs = [*(change / CHANGE_SCALE), *([] if depth_mm is None else [depth_mm])]
+    inputs = [*(change / CHANGE_SCALE), *([] if deep is None else deep)]
     bases = {d: position_basis(x, y, half_mm, d) for d in {degree, product_degree} if d >= 0}
     rows = []
-    for term in field_terms(depth_mm is not None, product_degree):
+    for term in field_terms(deep is not None, product_degree):
         value = math.prod([inputs[k] for k in term[1:]], start=inputs[term[0]])
         rows.append(value * bases[degree if len(term) == 1 else product_degree])
     return torch.cat(rows)

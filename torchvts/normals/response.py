@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from ..core.checks import check_batch, check_integer, check_positive, check_record, check_same_size, check_size, check_window
-from ..core.geometry import normal_from_gradient
+from ..core.geometry import gradient_of_depth, normal_from_gradient
 from ..core.response import CHANGE_SCALE, ResponseField
 from ..record import Calibration, check_calibration
 
@@ -14,8 +14,8 @@ from ..record import Calibration, check_calibration
 class NormalFromResponse(nn.Module):
     """Unit normals of a compensated image, which for a response field is image / background.
 
-    Without depth the field ``fast``; with the depth that pass led to, the field ``precise``, which was fitted on such depths:
-    a second pass is all there is to gain, and ``passes`` says so to the pipeline. Given ``window`` (top, left), the image is
+    Without depth the field ``fast``; with the depth that pass led to, the field ``precise``, which was fitted on such depths and
+    their slopes: a second pass is all there is to gain, and ``passes`` says so to the pipeline. Given ``window`` (top, left), the image is
     the part of the calibrated one whose first pixel is there.
 
     Args:
@@ -53,6 +53,7 @@ class NormalFromResponse(nn.Module):
             if field is not None and field.uses_depth != uses:
                 raise ValueError(f"{name}: expected a field with uses_depth={uses}, got uses_depth={field.uses_depth}")
         self.max_slope = check_positive("max_slope", max_slope)
+        self.mm_per_pixel = mm_per_pixel
         self.uses_depth = precise is not None
         self.passes = 2
         self.register_buffer("fast_maps", _maps(fast, height, width, mm_per_pixel).to(dtype))
@@ -81,7 +82,9 @@ class NormalFromResponse(nn.Module):
                 raise ValueError("depth_mm: expected None, because this response has no field with depth: use mode 'fast'")
             check_batch("depth_mm", depth_mm, 1)
             check_same_size("depth_mm", depth_mm, "compensated", compensated.shape[2], compensated.shape[3])
-            inputs.append(depth_mm.to(change.dtype).expand_as(inputs[0]))
+            depth = depth_mm.to(change.dtype).expand_as(inputs[0])
+            slope = gradient_of_depth(depth, self.mm_per_pixel)
+            inputs += [depth, slope[:, 0:1], slope[:, 1:2]]
             maps = self.precise_maps
         maps = maps[:, :, top : top + compensated.shape[2], left : left + compensated.shape[3]]
         gradient = maps[0] * inputs[0]  # (B, 2, H, W)
@@ -89,11 +92,10 @@ class NormalFromResponse(nn.Module):
             gradient = torch.addcmul(gradient, maps[k], inputs[k])
         place = len(inputs)
         if maps.shape[0] > place:
-            for i in range(len(inputs)):
-                for k in range(i, len(inputs)):
-                    if i < 3:  # depth squared is no term
-                        gradient = torch.addcmul(gradient, maps[place], inputs[i] * inputs[k])
-                        place += 1
+            for i in range(3):  # products of changes and depth, but for depth squared
+                for k in range(i, min(len(inputs), 4)):
+                    gradient = torch.addcmul(gradient, maps[place], inputs[i] * inputs[k])
+                    place += 1
         p, q = gradient[:, 0:1], gradient[:, 1:2]
         steepness = torch.sqrt(torch.addcmul(p * p, q, q) + 1e-12)
         return normal_from_gradient(gradient * (self.max_slope / steepness).clamp_max(1.0))
@@ -104,6 +106,7 @@ class NormalFromResponse(nn.Module):
         other = copy.deepcopy(self)
         for name in ("fast_maps", "precise_maps"):
             setattr(other, name, getattr(other, name)[..., stride // 2 :: stride, stride // 2 :: stride].clone())
+        other.mm_per_pixel = stride * self.mm_per_pixel
         return other
 
 

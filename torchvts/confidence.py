@@ -43,8 +43,8 @@ RESPONSE_SPREAD = 1.2
 """The same for normals of a response field, whose errors have longer tails."""
 
 PRIOR_DEG = 2.0
-"""Mean error of a sensor type's prior on a unit of its own: on a GelSight Mini 1.7 on the presses it was fitted on and 2.1 on others;
-a second Mini's own network is 2.9 from it, and some 2 from the truth itself."""
+"""Mean error of a sensor type's prior on a unit of its own: on a GelSight Mini 1.7 on the presses it was fitted on and 2.1 on
+others; a second Mini's own network is 2.9 from it, and some 2 from the truth itself."""
 
 FEW_DEG = 5.0
 """Mean error of a response field from presses too few to hold one out, or from touches: 4 to 6 on a GelSight Mini."""

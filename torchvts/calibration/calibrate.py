@@ -50,7 +50,8 @@ READING_WORTH = 0.1
 PRIOR_FAMILY = ((4, 3),)
 PRIOR_PRODUCT_PENALTY = 60.0
 """Free products fit their own unit better and another worse. With penalties of 40, 60 and 200 presses of a GelSight Mini that the
-prior has not seen are 2.02, 2.06 and 2.24 degrees off; a bead on a second Mini is, with 40 and 60, 2.99 and 2.94 from that unit's own network."""
+prior has not seen are 2.02, 2.06 and 2.24 degrees off; a bead on a second Mini is, with 40 and 60, 2.99 and 2.94 from that unit's
+own network."""
 
 TIE = 1.05
 """Point lights are preferred to response fields unless these are better by more than this."""

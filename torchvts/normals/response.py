@@ -15,8 +15,8 @@ class NormalFromResponse(nn.Module):
     """Unit normals of a compensated image, which for a response field is image / background.
 
     Without depth the field ``fast``; with the depth that pass led to, the field ``precise``, which was fitted on such depths and
-    their slopes: a second pass is all there is to gain, and ``passes`` says so to the pipeline. Given ``window`` (top, left), the image is
-    the part of the calibrated one whose first pixel is there.
+    their slopes: a second pass is all there is to gain, and ``passes`` says so to the pipeline. Given ``window`` (top, left), the
+    image is the part of the calibrated one whose first pixel is there.
 
     Args:
         fast: field without depth. precise: field with depth, or None.

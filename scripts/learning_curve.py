@@ -25,6 +25,9 @@ from torchvts.viz import save_figure
 
 matplotlib.use("Agg")
 
+FOLDS = 5
+"""Of each ball's presses, in the row that scores every one of them: each is left out once."""
+
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -54,6 +57,16 @@ def main() -> int:
                     bar.update()
             if found:
                 rows.append(("presses, prior of another ball", count, found))
+        found, used = [], []
+        for ball in balls if len(balls) > 1 else []:
+            own = [press for press in presses if press.ball_diameter_mm == ball]
+            for fold in range(FOLDS):
+                draw = [press for k, press in enumerate(own) if k % FOLDS != fold]
+                found += score(background, sensors[ball], draw, [], left(scored, draw, ball))
+                used.append(len(draw))
+                bar.update()
+        if found:
+            rows.append((f"presses, prior of another ball, {FOLDS}-fold", round(statistics.mean(used)), found))
         for count in (3, 5, 10, len(presses) - len(presses) // 5):
             found = []
             for draw in draws(presses, count, arguments.draws):

@@ -272,11 +272,19 @@ def test_slopes_of_the_depth_are_inputs():
 
 def test_fields_of_files_without_slopes_of_depth_heed_none():
     field = random_field(1, 0, True)
-    rows = [
-        [0.0 if 12 <= k < 18 else v for k, v in enumerate(row)] for row in field.coefficient
-    ]  # 3 numbers each: 4 inputs, 2 slopes
+    # three numbers each for four inputs, then those of the two slopes
+    rows = [[0.0 if 12 <= k < 18 else v for k, v in enumerate(row)] for row in field.coefficient]
     before = field.to_dict() | {"coefficient": [row[:12] + row[18:] for row in rows]}
     assert ResponseField.from_dict(before, "file") == dataclasses.replace(field, coefficient=tuple(map(tuple, rows)))
+
+
+def test_a_message_is_short_though_the_field_is_large():
+    field = random_field(4, 3, True)
+    rows = [list(row) for row in field.coefficient]
+    rows[0][7] = float("nan")
+    with pytest.raises(ValueError, match="coefficient: expected finite numbers, got") as caught:
+        dataclasses.replace(field, coefficient=tuple(map(tuple, rows)))
+    assert len(str(caught.value)) < 300
 
 
 def test_steepness_is_bounded_and_its_direction_kept():

@@ -9,7 +9,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from .core.checks import check_batch, check_field, check_integer, check_positive, check_range, check_same_size, check_tensor
+from .core.checks import brief, check_batch, check_field, check_integer, check_positive, check_range, check_same_size, check_tensor
 from .core.noise import noise_std
 
 
@@ -171,7 +171,7 @@ class FillMarkers(nn.Module):
             raise ValueError(f"{source}: expected keys and values, got {type(values).__name__}")
         for key in values:
             if key not in ("diameter_px", "contrast", "sigmas", "skirt"):
-                raise ValueError(f"{source}: key {key!r}: unknown; expected diameter_px, contrast, sigmas, skirt")
+                raise ValueError(f"{source}: key {brief(key)}: unknown; expected diameter_px, contrast, sigmas, skirt")
         try:
             return cls(**values)
         except (TypeError, ValueError) as error:

@@ -10,7 +10,7 @@ import kornia
 import torch
 from torch import Tensor
 
-from .core.checks import QUANTISATION_STD, check_image, check_record, check_tensor
+from .core.checks import QUANTISATION_STD, brief, check_image, check_record, check_tensor
 from .core.files import image_from_bytes, image_to_bytes, load_tensors, save_tensors
 from .core.noise import noise_std
 from .core.response import ResponseModel
@@ -286,10 +286,10 @@ class Calibration:
         """
         tensors, metadata = load_tensors(path)
         if metadata.get("kind") != "calibration":
-            raise ValueError(f"{path}: expected a calibration, got a file of kind {metadata.get('kind')!r}")
+            raise ValueError(f"{path}: expected a calibration, got a file of kind {brief(metadata.get('kind'))}")
         version = metadata.get("format_version")
         if not isinstance(version, int) or not 1 <= version <= FORMAT_VERSION:
-            raise ValueError(f"{path}: format version {version!r}, this torchvts reads 1 to {FORMAT_VERSION}: update torchvts")
+            raise ValueError(f"{path}: format version {brief(version)}, this torchvts reads 1 to {FORMAT_VERSION}: update torchvts")
         sensor = Sensor.from_dict(metadata.get("sensor"), str(path))
         measured, report = metadata.get("measured"), metadata.get("report")
         if not isinstance(measured, bool) or not isinstance(report, dict):

@@ -83,7 +83,7 @@ def check_sequence(name: str, value: object, items: str) -> None:
 def check_choice(name: str, value: object, choices: Sequence[str]) -> str:
     """Return ``value``, or raise unless it is one of ``choices``."""
     if not isinstance(value, str) or value not in choices:
-        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
+        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {brief(value)}")
     return value
 
 
@@ -265,10 +265,16 @@ def check_least(name: str, value: object, least: float = 0.0, most: float = math
 def check_integer(name: str, value: object, least: int) -> int:
     """Return ``value`` as an int, or raise unless it is an integer of at least ``least``."""
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):
-        raise TypeError(f"{name}: expected an integer, got {type(value).__name__} {value!r}")
+        raise TypeError(f"{name}: expected an integer, got {type(value).__name__} {brief(value)}")
     if int(value) < least:
         raise ValueError(f"{name}: expected at least {least}, got {value}")
     return int(value)
+
+
+def brief(value: object) -> str:
+    """``repr(value)`` for a message: cut where it would fill the screen."""
+    text = repr(value)
+    return text if len(text) <= 200 else f"{text[:160]} ... ({len(text)} characters)"
 
 
 def check_numbers(name: str, value: object, shape: Sequence[int]) -> tuple[float, ...]:
@@ -277,11 +283,11 @@ def check_numbers(name: str, value: object, shape: Sequence[int]) -> tuple[float
     try:
         tensor = torch.as_tensor(value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise TypeError(f"{name}: expected {text} numbers, got {value!r}") from error
+        raise TypeError(f"{name}: expected {text} numbers, got {brief(value)}") from error
     if tuple(tensor.shape) != tuple(shape):
         raise ValueError(f"{name}: expected {text} numbers, got shape {tuple(tensor.shape)}")
     if not bool(torch.isfinite(tensor).all()):
-        raise ValueError(f"{name}: expected finite numbers, got {value!r}")
+        raise ValueError(f"{name}: expected finite numbers, got {brief(value)}")
     return tuple(tensor.flatten().tolist())
 
 
@@ -297,7 +303,7 @@ def from_dict(cls: type[_Record], values: object, source: str) -> _Record:
     known = [field.name for field in fields]
     for key in values:
         if key not in known:
-            raise ValueError(f"{source}: key {key!r}: unknown; expected {', '.join(known)}")
+            raise ValueError(f"{source}: key {brief(key)}: unknown; expected {', '.join(known)}")
     for field in fields:
         if field.default is dataclasses.MISSING and field.name not in values:
             raise ValueError(f"{source}: key {field.name!r}: missing")

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .checks import check_batch, check_path, check_positive, check_tensor
+from .checks import brief, check_batch, check_path, check_positive, check_tensor
 from .files import read_image, rgb_from_bgr
 from .sensor import Sensor, _read_yaml
 
@@ -111,10 +111,10 @@ def read_calibration_folder(folder: str | Path) -> GsSdkFolder:
         name = row["experiment_reldir"]
         diameter = _number(where, "diameter(mm)", row["diameter(mm)"])
         if not 0.0 < diameter <= 1000.0:
-            raise ValueError(f"{where}: diameter(mm): expected a ball's diameter in mm, got {row['diameter(mm)']!r}")
+            raise ValueError(f"{where}: diameter(mm): expected a ball's diameter in mm, got {brief(row['diameter(mm)'])}")
         press = _inside(folder, name, where)
         if press in seen:
-            raise ValueError(f"{where}: experiment_reldir: {name!r} is given twice: remove one of the lines")
+            raise ValueError(f"{where}: experiment_reldir: {brief(name)} is given twice: remove one of the lines")
         seen.add(press)
         # a link may lead out of the folder as well as a name
         image_path, label_path = (_inside(folder, f"{name}/{file}", where) for file in ("gelsight.png", "label.npz"))
@@ -147,10 +147,10 @@ def read_labels(folder: str | Path) -> dict[str, tuple[float, float, float | Non
         where = f"{path}, line {line}"
         name, text = row["experiment_reldir"], row["contact_radius_px"]
         if name in labels:
-            raise ValueError(f"{where}: experiment_reldir: {name!r} is given twice: remove one of the lines")
+            raise ValueError(f"{where}: experiment_reldir: {brief(name)} is given twice: remove one of the lines")
         radius = _number(where, "contact_radius_px", text) if text else None
         if radius is not None and radius <= 0.0:
-            raise ValueError(f"{where}: contact_radius_px: expected a number above 0, or nothing, got {text!r}")
+            raise ValueError(f"{where}: contact_radius_px: expected a number above 0, or nothing, got {brief(text)}")
         x, y = (_number(where, column, row[column]) for column in ("center_x_px", "center_y_px"))
         labels[name] = (x, y, radius)
     return labels
@@ -188,10 +188,10 @@ def sensor_from_gs_sdk(config: dict[str, Any] | str | Path, name: str | None = N
         raise ValueError(f"{source}: expected keys and values of a gs_sdk sensor, got {type(values).__name__}")
     for key in values:
         if key not in SENSOR_KEYS + SENSOR_KEYS_UNUSED:
-            raise ValueError(f"{source}: key {key!r}: unknown; expected {', '.join(SENSOR_KEYS + SENSOR_KEYS_UNUSED)}")
+            raise ValueError(f"{source}: key {brief(key)}: unknown; expected {', '.join(SENSOR_KEYS + SENSOR_KEYS_UNUSED)}")
     for key in SENSOR_KEYS:
         if key not in values:
-            raise ValueError(f"{source}: key {key!r}: missing; a gs_sdk sensor file has {', '.join(SENSOR_KEYS)}")
+            raise ValueError(f"{source}: key {brief(key)}: missing; a gs_sdk sensor file has {', '.join(SENSOR_KEYS)}")
     try:
         pitch = check_positive("ppmm", values["ppmm"])
         if pitch > 1.0:
@@ -346,7 +346,7 @@ def _read_table(path: Path, columns: tuple[str, ...]) -> list[tuple[int, dict[st
         raise ValueError(f"{path}: no presses: expected one line for every press below {expected}")
     for line, cells in lines[1:]:
         if len(cells) != len(columns):
-            raise ValueError(f"{path}, line {line}: expected {len(columns)} values, got {len(cells)}: {','.join(cells)!r}")
+            raise ValueError(f"{path}, line {line}: expected {len(columns)} values, got {len(cells)}: {brief(','.join(cells))}")
         if not cells[header.index("experiment_reldir")]:
             raise ValueError(f"{path}, line {line}: experiment_reldir: expected the folder of the press, got nothing")
     return [(line, dict(zip(header, cells))) for line, cells in lines[1:]]
@@ -358,18 +358,18 @@ def _number(where: str, column: str, text: str) -> float:
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        raise ValueError(f"{where}: {column}: expected a number, got {text!r}")
+        raise ValueError(f"{where}: {column}: expected a number, got {brief(text)}")
     return number
 
 
 def _inside(folder: Path, name: str, where: str) -> Path:
     """``folder / name``, or raise when that lies outside of the folder: a catalog from elsewhere may name any file."""
     if "\0" in name:
-        raise ValueError(f"{where}: experiment_reldir: expected a folder inside {folder}, got {name!r}")
+        raise ValueError(f"{where}: experiment_reldir: expected a folder inside {folder}, got {brief(name)}")
     root = folder.resolve()
     path = (root / name.replace("\\", "/")).resolve()  # a catalog written on Windows
     if path == root or not path.is_relative_to(root):
-        raise ValueError(f"{where}: experiment_reldir: expected a folder inside {folder}, got {name!r}, which is not")
+        raise ValueError(f"{where}: experiment_reldir: expected a folder inside {folder}, got {brief(name)}, which is not")
     return path
 
 

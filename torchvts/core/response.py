@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .checks import check_integer, check_numbers, check_positive, from_dict
+from .checks import brief, check_integer, check_numbers, check_positive, from_dict
 from .geometry import pixel_grid_mm
 
 CHANGE_SCALE = 0.3
@@ -54,7 +54,7 @@ class ResponseField:
             if check_integer(name, getattr(self, name), least) > 6:
                 raise ValueError(f"{name}: expected at most 6, got {getattr(self, name)}")
         if not isinstance(self.uses_depth, bool):
-            raise TypeError(f"uses_depth: expected true or false, got {self.uses_depth!r}")
+            raise TypeError(f"uses_depth: expected true or false, got {brief(self.uses_depth)}")
         object.__setattr__(self, "half_mm", check_positive("half_mm", self.half_mm))
         numbers = check_numbers("coefficient", self.coefficient, (2, self.size()))
         object.__setattr__(self, "coefficient", (numbers[: self.size()], numbers[self.size() :]))
@@ -184,7 +184,7 @@ class SensorPrior:
         object.__setattr__(self, "log_background", (numbers[:15], numbers[15:30], numbers[30:]))
         object.__setattr__(self, "half_mm", check_positive("half_mm", self.half_mm))
         if not isinstance(self.source, str):
-            raise TypeError(f"source: expected a text, got {self.source!r}")
+            raise TypeError(f"source: expected a text, got {brief(self.source)}")
 
     def background(self, height: int, width: int, mm_per_pixel: float) -> Tensor:
         """The smooth background of the unit it was fitted on, (3, H, W) float64, linear light."""

@@ -11,7 +11,7 @@ import torch
 import yaml
 from torch import Tensor
 
-from .checks import check_batch, check_integer, check_numbers, check_path, check_positive, check_record, from_dict
+from .checks import brief, check_batch, check_integer, check_numbers, check_path, check_positive, check_record, from_dict
 from .files import write_atomically
 from .response import SensorPrior
 
@@ -56,7 +56,7 @@ class Sensor:
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip():
-            raise TypeError(f"name: expected a text, got {self.name!r}")
+            raise TypeError(f"name: expected a text, got {brief(self.name)}")
         self._set("height", check_integer("height", self.height, 8))
         self._set("width", check_integer("width", self.width, 8))
         self._set("mm_per_pixel", check_positive("mm_per_pixel", self.mm_per_pixel, 10.0))
@@ -93,7 +93,7 @@ class Sensor:
                 )
             self._set("corners_px", corners)
         if not isinstance(self.markers, bool):
-            raise TypeError(f"markers: expected true or false, got {self.markers!r}")
+            raise TypeError(f"markers: expected true or false, got {brief(self.markers)}")
         prior: object = self.prior
         if isinstance(prior, dict):  # as YAML gives it
             self._set("prior", SensorPrior.from_dict(prior, "prior"))

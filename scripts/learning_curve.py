@@ -2,7 +2,8 @@
 
 python scripts/learning_curve.py ../shared/data/gelsight_mini_a --sensor gelsight_mini
 
-Presses carry no labels; those left out are scored. Where a prior takes part it is fitted on the balls of all other diameters
+Presses carry no labels; those left out are scored. Touches are known by nothing but their images: all presses but the one for
+the scale are scored. Where a prior takes part it is fitted on the balls of all other diameters
 (with their labels), so it has not seen the ball that is scored.
 """
 
@@ -42,32 +43,24 @@ def main() -> int:
     scored = [press for press in presses if press.center_px is not None and press.contact_radius_px is not None]
     rows: list[tuple[str, int, list[PressScore]]] = []
     balls = sorted({press.ball_diameter_mm for press in presses})
-    counts = (0, 1, 3, 5, 10)
+    own = {ball: [press for press in presses if press.ball_diameter_mm == ball] for ball in balls}
     with tqdm(desc="learning curve", leave=False) as bar:
-        sensors = {}
-        for ball in balls:
-            others = [press for press in presses if press.ball_diameter_mm != ball]
-            sensors[ball] = dataclasses.replace(bare, prior=vts.fit_prior(background, bare, others)) if others else bare
-        for count in counts:
-            found: list[PressScore] = []
-            for ball in balls if len(balls) > 1 else []:
-                own = [press for press in presses if press.ball_diameter_mm == ball]
-                for draw in draws(own, count, arguments.draws):
+        if len(balls) > 1:
+            sensors = {}
+            for ball in balls:
+                others = [press for press in presses if press.ball_diameter_mm != ball]
+                sensors[ball] = dataclasses.replace(bare, prior=vts.fit_prior(background, bare, others))
+            by_number = {n: [(ball, d) for ball in balls for d in draws(own[ball], n, arguments.draws)] for n in (0, 1, 3, 5, 10)}
+            folds = [(ball, [p for k, p in enumerate(own[ball]) if k % FOLDS != fold]) for ball in balls for fold in range(FOLDS)]
+            named = [("presses, prior of another ball", number, jobs) for number, jobs in by_number.items()]
+            usual = round(statistics.mean(len(draw) for _, draw in folds))
+            for kind, number, jobs in [*named, (f"presses, prior of another ball, {FOLDS}-fold", usual, folds)]:
+                found: list[PressScore] = []
+                for ball, draw in jobs:
                     found += score(background, sensors[ball], draw, [], left(scored, draw, ball))
                     bar.update()
-            if found:
-                rows.append(("presses, prior of another ball", count, found))
-        found, used = [], []
-        for ball in balls if len(balls) > 1 else []:
-            own = [press for press in presses if press.ball_diameter_mm == ball]
-            for fold in range(FOLDS):
-                draw = [press for k, press in enumerate(own) if k % FOLDS != fold]
-                found += score(background, sensors[ball], draw, [], left(scored, draw, ball))
-                used.append(len(draw))
-                bar.update()
-        if found:
-            rows.append((f"presses, prior of another ball, {FOLDS}-fold", round(statistics.mean(used)), found))
-        for count in (3, 5, 10, len(presses) - len(presses) // 5):
+                rows.append((kind, number, found))
+        for count in (1, 2, 3, 5, 10, len(presses) - len(presses) // 5):
             found = []
             for draw in draws(presses, count, arguments.draws):
                 found += score(background, bare, draw, [], left(scored, draw))
@@ -77,7 +70,7 @@ def main() -> int:
             found = []
             for draw in draws(presses, count, arguments.draws):
                 one = random.Random(count).choice([press for press in scored if press not in draw] or scored)
-                found += score(background, bare, [one], draw, left(scored, [*draw, one]) or scored)
+                found += score(background, bare, [one], draw, left(scored, [one]))
                 bar.update()
             rows.append(("touches, and one press for the scale", count, found))
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -119,9 +112,9 @@ def score(
 
 
 def table(rows: Sequence[tuple[str, int, list[PressScore]]]) -> str:
-    lines = ["| given | number | normals deg | relief um | radius % | scored |", "|---|---|---|---|---|---|"]
+    lines = ["| given | number | normals deg | relief um | radius %, median | scored |", "|---|---|---|---|---|---|"]
     for kind, count, scores in rows:
-        radius = statistics.mean(s.radius_percent for s in scores if s.radius_percent is not None)
+        radius = statistics.median(s.radius_percent for s in scores if s.radius_percent is not None)
         angle, relief = statistics.mean(s.normal_deg for s in scores), statistics.mean(s.relief_um for s in scores)
         lines.append(f"| {kind} | {count} | {angle:.2f} | {relief:.1f} | {radius:.1f} | {len(scores)} |")
     return "\n".join(lines)

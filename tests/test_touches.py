@@ -1,5 +1,6 @@
 """Calibration from touches of unknown objects: the curl pins a field up to its scale."""
 
+import random
 import types
 import warnings
 
@@ -9,7 +10,8 @@ import torch
 import torchvts as vts
 import torchvts.evaluate
 from torchvts.calibration.field import Family
-from torchvts.core.response import ResponseField, ResponseModel, SensorPrior, fit_log_background
+from torchvts.calibration.touches import BRIGHTNESS_POWER, multiplied
+from torchvts.core.response import ResponseField, ResponseModel, SensorPrior, fit_log_background, position_basis
 
 PITCH, HEIGHT, WIDTH = 0.125, 120, 160
 SENSOR = vts.Sensor("touched", HEIGHT, WIDTH, PITCH, gamma=1.0)
@@ -72,9 +74,9 @@ def test_a_known_depth_gives_the_scale(rest, touches):
 
 def test_the_direction_of_the_field_is_that_of_the_truth(rest, touches):
     calibration = calibrate(rest, SENSOR, touches=[vts.Touch(touches[1], 0.5), *touches[2:]])
-    found = calibration.response.fast.tensor() / 0.3  # slope per relative change
-    product = found @ MIX.double()  # the identity if it is the inverse
-    assert calibration.response.fast.degree == 0
+    maps = calibration.response.fast.maps(HEIGHT, WIDTH, PITCH) / 0.3  # slope per relative change
+    assert torch.allclose(maps, maps.mean((2, 3), keepdim=True), atol=0.02)  # as even as the skin
+    product = maps.mean((2, 3)).t() @ MIX.double()  # the identity if it is the inverse
     assert torch.allclose(product / product.diagonal().mean(), torch.eye(2, dtype=torch.float64), atol=0.08)
 
 
@@ -148,10 +150,65 @@ def test_real_touches(data):
     for press in judged:
         out = pipe(press.image[None])
         scores.append(vts.evaluate.score_press(press, out.depth_mm, out.normal, sensor.mm_per_pixel).normal_deg)
-    assert sum(scores) / len(scores) < 6.2
+    assert sum(scores) / len(scores) < 5.5
 
 
 def test_the_family_of_touches_is_the_smallest_that_is_pinned(rest, touches):
     calibration = calibrate(rest, SENSOR, touches=[vts.Touch(touches[1], 0.5), *touches[2:]])
     tried = next(row for row in calibration.report["candidates"] if row["model"] == "touches")["tried"]
     assert tried[0]["numbers"] == Family(0, -1, False, 10.0).size() == 6 and tried[0]["gap"] > 4.0
+
+
+def under_stray_light(scene, seed):
+    """As seen, under lamps that fade towards the border and light from everywhere, which tells nothing of slopes."""
+    x, y = vts.core.geometry.pixel_grid_mm(HEIGHT, WIDTH, PITCH)
+    lamps = 0.5 * torch.exp(-(x**2 + y**2) / 120.0)
+    generator = torch.Generator().manual_seed(seed)
+    change = torch.einsum("cs,bshw->bchw", MIX, scene.gradient.float())[0]
+    image = lamps * (1.0 + change) + 0.12 + 0.002 * torch.randn(3, HEIGHT, WIDTH, generator=generator)
+    return (image.clamp(0, 1) * 255).round() / 255
+
+
+def test_dark_places_tell_less_of_slopes(monkeypatch):
+    """The curl does not see how the scale varies over the image; the brightness at rest does, where light is stray."""
+    rest = under_stray_light(vts.scenes.at_rest(ball()), 99)
+    places = [(-4.0, 1.0), (5.0, -2.0), (0.5, 3.0), (-6.0, -3.5), (6.0, 4.0)]
+    touches = [under_stray_light(ball(x, y, 0.5), k) for k, (x, y) in enumerate(places)]
+    press = vts.Press(under_stray_light(ball(0.5, -0.5), 20), 12.0)
+    judged = [ball(x, y, 0.5) for x, y in ((-6.5, 3.5), (6.5, -4.0), (0.0, 0.0))]
+    found = {}
+    for power in (0.0, BRIGHTNESS_POWER):
+        monkeypatch.setattr("torchvts.calibration.touches.BRIGHTNESS_POWER", power)
+        pipe = vts.DepthPipeline.from_calibration(calibrate(rest, SENSOR, [press], touches), "fast")
+        found[power] = 0.0
+        for k, scene in enumerate(judged):
+            inside = torch.nn.functional.avg_pool2d(scene.contact.float(), 9, 1, 4) > 0.999
+            normal = pipe(under_stray_light(scene, 50 + k)[None]).normal
+            found[power] += float(vts.metrics.normal_angle_deg(normal, scene.normal, inside).mean()) / len(judged)
+    assert found[BRIGHTNESS_POWER] < 0.6 * found[0.0]
+
+
+def test_a_field_times_a_polynomial():
+    generator = torch.Generator().manual_seed(3)
+    rows = torch.randn(2, 9, generator=generator, dtype=torch.float64)
+    field = ResponseField(1, -1, False, 9.0, tuple(map(tuple, rows.tolist())))
+    gain = torch.randn(6, generator=generator, dtype=torch.float64)
+    x, y = vts.core.geometry.pixel_grid_mm(12, 16, 0.5, torch.float64)
+    factor = torch.tensordot(gain, position_basis(x.expand(12, 16), y.expand(12, 16), 9.0, 2), 1)
+    assert torch.allclose(multiplied(field, gain).maps(12, 16, 0.5), factor * field.maps(12, 16, 0.5), atol=1e-12)
+
+
+def test_three_presses_without_a_prior_start_as_touches(data):
+    """From nothing these three gave 8.4 degrees."""
+    sensor = vts.Sensor.load("gelsight_mini").without_prior()
+    background, presses = vts.read_presses(data / "gelsight_mini_a")
+    drawn = random.Random(0).sample(presses, 3)
+    calibration = calibrate(background, sensor, [vts.Press(press.image, press.ball_diameter_mm) for press in drawn])
+    assert "field by curl" in calibration.report["reason"]
+    pipe = vts.DepthPipeline.from_calibration(calibration, "precise")
+    scores = []
+    for press in presses[::3]:
+        if press.contact_radius_px is not None and press not in drawn:
+            out = pipe(press.image[None])
+            scores.append(vts.evaluate.score_press(press, out.depth_mm, out.normal, sensor.mm_per_pixel).normal_deg)
+    assert sum(scores) / len(scores) < 5.5

@@ -27,7 +27,7 @@ from .light_candidates import choose_lights
 from .lights import LOOSE_DEG, check_exposure
 from .response import FAMILIES, ResponseFit, fit_response, held_out_deg
 from .rest_image import falloff, outwardness
-from .touches import TOUCH_BLUR_PX, fit_touches, moved_by_touches, scale_by_presses, scaled
+from .touches import fit_touches, moved_by_touches, scale_by_presses, scaled, touch_blur_px
 
 PINNED_DEG = 2.0
 """Point lights are believed beside a sensor's prior only if the image pins each of them this well."""
@@ -246,7 +246,8 @@ def by_presses(
     """A response model from presses: the fit, what became of each press, and the unit."""
     chosen = as_read(sensor, prior)
     contacts = _contacts(background, chosen, presses)
-    fit = fit_response(contacts, chosen, prior, progress, families, product_penalty)
+    light = _light_at_rest(background, chosen)
+    fit = fit_response(contacts, light, chosen, prior, progress, families, product_penalty)
     if prior is None and fit.error_deg is not None:
         open_to = (sensor.gamma is None, sensor.blur_px == 0)
         fit, chosen = _choose_reading(background, chosen, *open_to, presses, contacts, fit, families, product_penalty)
@@ -292,7 +293,7 @@ def _choose_reading(
             least, taken = score, (other, read)
     if taken is None:
         return fit, sensor
-    again = fit_response(taken[1], taken[0], None, False, families, product_penalty)
+    again = fit_response(taken[1], _light_at_rest(background, taken[0]), taken[0], None, False, families, product_penalty)
     again.candidates = fit.candidates + again.candidates
     return again, taken[0]
 
@@ -304,13 +305,18 @@ def _contacts(background: Tensor, sensor: Sensor, given: Sequence[Press | Touch]
     return read_contacts(given, background, compensate, contact, sensor)
 
 
+def _light_at_rest(background: Tensor, sensor: Sensor) -> Tensor:
+    """(3, H, W) linear light without contact, blurred and cleaned as frames are."""
+    return Calibration.from_response(ResponseModel.blank(sensor.exponent, sensor.blur_px), sensor, background.double()).background
+
+
 def _by_touches(
     background: Tensor, sensor: Sensor, presses: Sequence[Press], touches: Sequence[Touch], prior: ResponseModel | None
 ) -> tuple[ResponseModel, dict[str, Any]]:
     """A model from touches, scaled; and what to tell of it."""
     pitch = sensor.mm_per_pixel
     sharp = as_read(sensor, prior)
-    seen = dataclasses.replace(sharp, blur_px=TOUCH_BLUR_PX)
+    seen = dataclasses.replace(sharp, blur_px=touch_blur_px(sensor.height, sensor.width))
     contacts = _contacts(background, seen, touches)
     _warn_left_out(contacts)
     told = [{"name": contact.name, "used": not contact.reason, "reason": contact.reason} for contact in contacts]
@@ -321,7 +327,7 @@ def _by_touches(
     if prior is not None:
         row |= {"family": "the prior, moved", "numbers": 2 * prior.fast.size(), "note": f"the prior, moved by {len(used)} touches"}
         return moved_by_touches(prior, used), {"row": row, "touches": told}
-    fit = fit_touches(used, 0.5 * sensor.width * pitch, pitch)
+    fit = fit_touches(used, _light_at_rest(background, seen), 0.5 * sensor.width * pitch, pitch)
     told_depth = [(touch.depth_mm, c) for touch, c in zip(touches, contacts) if touch.depth_mm is not None and not c.reason]
     balls = [contact for contact in _contacts(background, sharp, presses) if not contact.reason]
     for ball in balls:
@@ -341,9 +347,9 @@ def _by_touches(
         )
     if not scale > 0:
         raise ValueError(f"touches: the scale by {by} came out as {scale:.3g}: the presses are no clean balls, or not of this unit")
-    numbers = 2 * fit.field.size()
+    numbers = fit.pinned.size()
     note = f"{len(used)} touches pin {numbers} numbers (eigenvalue gap {fit.gap:.1f}), the scale by {by}"
-    row |= {"family": f"linear {fit.field.degree}", "numbers": numbers, "note": note, "tried": fit.tried}
+    row |= {"family": fit.pinned.label(), "numbers": numbers, "note": note, "tried": fit.tried}
     field = scaled(fit.field, scale)
     precise = field.lifted(field.degree, field.product_degree, True)  # touches tell nothing of depth
     return ResponseModel(field, precise, sharp.exponent, sharp.blur_px), {"row": row, "touches": told}

@@ -2,17 +2,21 @@
 
 Slopes linear in the change of intensity make the mean squared curl over some frames a quadratic form in the coefficients. Its
 smallest generalised eigenvector, at unit mean squared slope, is the field; how far the next eigenvalue lies above says how well it
-is pinned. What the touches do not tell is the scale: a ball of known size, a known depth, or the sensor's prior does.
+is pinned. What the touches do not tell is the scale: a ball of known size, a known depth, or the sensor's prior does. Nor do
+they tell how the scale varies over the image, since a slope that is too long everywhere in a contact has no curl; of that the
+image at rest says something: where it is bright, more of the light comes straight from the lamps.
 """
 
+import dataclasses
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ..core.response import ResponseField, ResponseModel
-from .balls import update_radius
-from .contacts import Contact, depths
+from ..compensate import blur, gaussian_weights
+from ..core.geometry import pixel_grid_mm
+from ..core.response import ResponseField, ResponseModel, position_basis
+from .contacts import LEAST_INSIDE, Contact, depths
 from .field import Family, curl_form, solve
 
 TOUCH_BLUR_PX = 3.0
@@ -21,33 +25,53 @@ TOUCH_BLUR_PX = 3.0
 LEAST_GAP = 4.0
 """The second eigenvalue over the first from which a family counts as pinned."""
 
+BRIGHTNESS_POWER = -0.5
+"""Slope per relative change is taken to go as the brightness at rest to this power. Balls on a GelSight Mini say -0.75, the
+network of another Mini -1 or beyond, a lab sensor -0.25, point lights without stray light 0: half way costs none of them much."""
+
+BRIGHTNESS_DEGREE = 2
+"""Of the polynomial in position that stands for it."""
+
+NUMBERS_PER_TOUCH = 6
+"""A field that varies over the image takes touches at several places: one ball at the border pinned 18 numbers, 32 degrees off."""
+
 LEAST_SPREAD = 0.05
 """Mean squared slope across over along: below it the touches say nothing of one of the two slopes."""
 
 
 @dataclass(frozen=True)
 class TouchFit:
-    """A field up to scale: unit mean squared slope, contacts pressed in; how well it is pinned, and the degrees tried."""
+    """A field up to scale, contacts pressed in; the family that the touches pinned, how well, and the degrees tried."""
 
     field: ResponseField
+    pinned: Family
     gap: float
     tried: list[dict[str, float]]
 
 
-def fit_touches(contacts: list[Contact], half_mm: float, pitch_mm: float) -> TouchFit:
-    """The largest linear family that the touches pin, and its field.
+def touch_blur_px(height: int, width: int) -> float:
+    """Blur under which touches are read, pixels."""
+    return TOUCH_BLUR_PX * max(1.0, min(height, width) / 240)
+
+
+def fit_touches(contacts: list[Contact], light: Tensor, half_mm: float, pitch_mm: float) -> TouchFit:
+    """The largest linear family that the touches pin, times what the image at rest says of its scale over the image.
 
     Args:
-        contacts: usable ones, read with ``TOUCH_BLUR_PX``. half_mm, pitch_mm: as for fields, mm.
+        contacts: usable ones, read with :func:`touch_blur_px`. light: (3, H, W), linear light at rest. half_mm, pitch_mm: as
+            for fields, mm.
     Raises:
         ValueError: the touches pin not even one constant field; says the gap.
     """
     tried: list[dict[str, float]] = []
     best: tuple[Family, Tensor, float] | None = None
+    gain, even = evened(contacts, light, half_mm, pitch_mm)
     for degree in (0, 1, 2):
         family = Family(degree, -1, False, half_mm)
-        solution, gap = _smallest_eigenvector(family, contacts)
-        spread = _spread(family, solution, contacts)
+        if degree > 0 and family.size() > NUMBERS_PER_TOUCH * len(contacts):
+            break
+        solution, gap = _smallest_eigenvector(family, even)
+        spread = _spread(family, solution, even)
         tried.append({"degree": degree, "numbers": family.size(), "gap": gap, "spread": spread})
         if gap < LEAST_GAP or spread < LEAST_SPREAD:
             break
@@ -59,11 +83,21 @@ def fit_touches(contacts: list[Contact], half_mm: float, pitch_mm: float) -> Tou
             "alike, flat or faint; add objects with slopes in several directions"
         )
     family, solution, gap = best
-    field = family.field(solution)
+    field = multiplied(family.field(solution), gain)
     inward = sum(float(depth[contact.mask].sum()) for contact, depth in zip(contacts, depths(contacts, field, pitch_mm)))
-    if inward < 0:
-        field = family.field(-solution)
-    return TouchFit(field, gap, tried)
+    return TouchFit(scaled(field, -1.0) if inward < 0 else field, family, gap, tried)
+
+
+def evened(contacts: list[Contact], light: Tensor, half_mm: float, pitch_mm: float) -> tuple[Tensor, list[Contact]]:
+    """The contacts with their changes times what the image at rest says of the scale, and that as a polynomial in position."""
+    height, width = light.shape[1:]
+    x, y = pixel_grid_mm(height, width, pitch_mm, torch.float64)
+    basis = position_basis(x.expand(height, width), y.expand(height, width), half_mm, BRIGHTNESS_DEGREE)
+    bright = light.double().sum(0).clamp_min(1e-3)
+    wanted = (bright / bright.mean()) ** BRIGHTNESS_POWER
+    gain = torch.linalg.lstsq(basis.flatten(1).t(), wanted.flatten()[:, None]).solution[:, 0]
+    scale = torch.tensordot(gain, basis, 1)
+    return gain, [dataclasses.replace(contact, change=contact.change * scale) for contact in contacts]
 
 
 def _spread(family: Family, solution: Tensor, contacts: list[Contact]) -> float:
@@ -89,14 +123,31 @@ def _smallest_eigenvector(family: Family, contacts: list[Contact]) -> tuple[Tens
     return whiten.t() @ vectors[:, 0], float(values[1] / values[0].clamp_min(1e-30))
 
 
+def multiplied(field: ResponseField, gain: Tensor) -> ResponseField:
+    """A linear field without depth times a polynomial of degree ``BRIGHTNESS_DEGREE`` in position."""
+    degree = field.degree + BRIGHTNESS_DEGREE
+    powers, own, other = (_powers(d) for d in (degree, field.degree, BRIGHTNESS_DEGREE))
+    rows = field.tensor().reshape(2, -1, len(own))
+    product = torch.zeros(2, rows.shape[1], len(powers), dtype=torch.float64)
+    for k, (i, j) in enumerate(own):
+        for factor, (m, n) in zip(gain.tolist(), other):
+            product[:, :, powers.index((i + m, j + n))] += factor * rows[:, :, k]
+    return ResponseField(degree, -1, False, field.half_mm, tuple(tuple(row) for row in product.flatten(1).tolist()))
+
+
+def _powers(degree: int) -> list[tuple[int, int]]:
+    """Powers of x and y, in the order of :func:`position_basis`."""
+    return [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
+
+
 def scaled(field: ResponseField, scale: float) -> ResponseField:
     """The field times a number."""
     rows = tuple(tuple(scale * number for number in row) for row in field.coefficient)
-    return ResponseField(field.degree, field.product_degree, field.uses_depth, field.half_mm, rows)
+    return dataclasses.replace(field, coefficient=rows)
 
 
 def scale_by_presses(field: ResponseField, presses: list[Contact], pitch_mm: float, rounds: int = 12) -> float:
-    """The scale at which the field's slopes are those of the balls, whose centers it finds on the way.
+    """The scale at which the field's slopes are those of the balls, whose centers it finds on the way; contact radii stay.
 
     Slope = -(x - center) / down is linear in the scale and in a shift of the center together.
     """
@@ -108,6 +159,8 @@ def scale_by_presses(field: ResponseField, presses: list[Contact], pitch_mm: flo
         parts = []
         for press, slope in zip(presses, slopes):
             inside = press.inside()
+            if int(inside.sum()) < LEAST_INSIDE:
+                continue
             lean = 1.0 / press.down()[inside]
             found, ball = slope[:, inside], press.ball_slope()[:, inside]
             # eliminate the shift: project found off the lean
@@ -115,15 +168,29 @@ def scale_by_presses(field: ResponseField, presses: list[Contact], pitch_mm: flo
             free = found - (found @ across)[:, None] * across
             product += float((free * ball).sum()) / free.shape[1]
             square += float(free.square().sum()) / free.shape[1]
-            parts.append((found, ball, lean))
+            parts.append((press, found, ball, lean))
         scale = product / max(square, 1e-30)
-        for press, slope, (found, ball, lean) in zip(presses, slopes, parts):
+        for press, found, ball, lean in parts:
             if not press.known:
                 shift = ((scale * found - ball) * lean).sum(1) / lean.square().sum()
                 limit = 0.25 * press.radius_mm
                 press.center_mm = press.center_mm + shift.clamp(-limit, limit)
-            update_radius(press, scale * slope, pitch_mm)
     return scale
+
+
+def start_of_presses(presses: list[Contact], light: Tensor, half_mm: float, pitch_mm: float) -> ResponseField | None:
+    """The field that presses give as if they were touches, and its scale by their balls; None if they pin none.
+
+    It heeds no center, so that few presses whose centers are uncertain have something to start from.
+    """
+    wide = gaussian_weights(touch_blur_px(*light.shape[1:]))
+    smooth = [dataclasses.replace(press, change=blur(press.change[None], wide)[0]) for press in presses]
+    try:
+        field = fit_touches(smooth, light, half_mm, pitch_mm).field
+    except ValueError:
+        return None
+    scale = scale_by_presses(field, [dataclasses.replace(press) for press in presses], pitch_mm)
+    return scaled(field, scale) if scale > 0 else None
 
 
 def scale_by_prior(field: ResponseField, prior: ResponseField, contacts: list[Contact]) -> float:

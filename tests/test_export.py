@@ -1,6 +1,7 @@
 """Exported files give what the pipeline gives, in a process that cannot import torchvts."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ from torch import nn
 import torchvts as vts
 from torchvts import export
 
+LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
 ROOT = Path(__file__).resolve().parents[1]
 HEIGHT, WIDTH, PITCH = 48, 64, 0.6
 SENSOR = vts.Sensor("rig", HEIGHT, WIDTH, PITCH)
@@ -134,7 +136,7 @@ def test_a_program_takes_the_decisions_of_the_pipeline(low, mini, tmp_path, kind
         assert export.compare(tmp_path / "pipe.pt2", pipe, frames, "pt2") <= 1e-5
 
 
-@pytest.mark.parametrize("kind", ["lights fast", "lights precise", "response precise"])
+@pytest.mark.parametrize("kind", ["lights fast", "response precise"] + LONG * ["lights precise"])  # minutes to write
 def test_onnx_without_torchvts(low, mini, tmp_path, kind):
     if export.missing("onnx"):
         pytest.skip(export.missing("onnx"))

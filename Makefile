@@ -15,8 +15,9 @@ $(VENV)/.done: pyproject.toml constraints.txt hatch_build.py $(wildcard torchvts
 demo: setup
 	$(BIN)/python scripts/demo.py --out out/demo
 
+# Files in the order of their names: by number of tests the few long ones would come last, and one worker would wait.
 test: setup
-	$(BIN)/python -m pytest -n auto --dist loadfile
+	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 # Fuzzed files, drawn scenes and frames by the thousands, the largest ONNX graph; some tens of minutes.
 test-long: setup

@@ -392,7 +392,7 @@ def _sensor_pipes(
     for degree, products in ((0, -1), (2, -1)):
         small = training.of_family(degree, products)
         yield f"response linear {degree}, fast", DepthPipeline.from_calibration(small, "fast"), True, ""
-    yield "prior alone, precise", DepthPipeline.from_calibration(prior, "precise"), True, "has seen these presses"
+    yield "prior that has seen them, precise", DepthPipeline.from_calibration(prior, "precise"), True, "has seen these presses"
     yield "point lights, precise", DepthPipeline.from_calibration(lights, "precise"), True, "from the background alone"
     compensate = Compensate.from_calibration(fitted)
     value, _, slope, _ = training_pixels(compensate, training.located, sensor.mm_per_pixel)

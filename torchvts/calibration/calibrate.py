@@ -246,7 +246,7 @@ def by_presses(
     """A response model from presses: the fit, what became of each press, and the unit."""
     chosen = as_read(sensor, prior)
     contacts = _contacts(background, chosen, presses)
-    light = _light_at_rest(background, chosen)
+    light = _unit_at_rest(background, chosen).background
     fit = fit_response(contacts, light, chosen, prior, progress, families, product_penalty)
     if prior is None and fit.error_deg is not None:
         open_to = (sensor.gamma is None, sensor.blur_px == 0)
@@ -293,21 +293,22 @@ def _choose_reading(
             least, taken = score, (other, read)
     if taken is None:
         return fit, sensor
-    again = fit_response(taken[1], _light_at_rest(background, taken[0]), taken[0], None, False, families, product_penalty)
+    light = _unit_at_rest(background, taken[0]).background
+    again = fit_response(taken[1], light, taken[0], None, False, families, product_penalty)
     again.candidates = fit.candidates + again.candidates
     return again, taken[0]
 
 
+def _unit_at_rest(background: Tensor, sensor: Sensor) -> Calibration:
+    """The unit before anything is known of its response: its background in linear light, blurred and cleaned as frames are."""
+    return Calibration.from_response(ResponseModel.blank(sensor.exponent, sensor.blur_px), sensor, background.double())
+
+
 def _contacts(background: Tensor, sensor: Sensor, given: Sequence[Press | Touch]) -> list[Contact]:
     """Contacts as the pipeline would see them."""
-    unit = Calibration.from_response(ResponseModel.blank(sensor.exponent, sensor.blur_px), sensor, background.double())
+    unit = _unit_at_rest(background, sensor)
     compensate, contact = Compensate.from_calibration(unit).double(), ContactMask.from_calibration(unit).double()
     return read_contacts(given, background, compensate, contact, sensor)
-
-
-def _light_at_rest(background: Tensor, sensor: Sensor) -> Tensor:
-    """(3, H, W) linear light without contact, blurred and cleaned as frames are."""
-    return Calibration.from_response(ResponseModel.blank(sensor.exponent, sensor.blur_px), sensor, background.double()).background
 
 
 def _by_touches(
@@ -327,7 +328,7 @@ def _by_touches(
     if prior is not None:
         row |= {"family": "the prior, moved", "numbers": 2 * prior.fast.size(), "note": f"the prior, moved by {len(used)} touches"}
         return moved_by_touches(prior, used), {"row": row, "touches": told}
-    fit = fit_touches(used, _light_at_rest(background, seen), 0.5 * sensor.width * pitch, pitch)
+    fit = fit_touches(used, _unit_at_rest(background, seen).background, 0.5 * sensor.width * pitch, pitch)
     told_depth = [(touch.depth_mm, c) for touch, c in zip(touches, contacts) if touch.depth_mm is not None and not c.reason]
     balls = [contact for contact in _contacts(background, sharp, presses) if not contact.reason]
     for ball in balls:

@@ -80,6 +80,7 @@ def test_a_program_of_an_image_whose_cells_are_larger_than_pixels(cells_of_two):
     assert torch.equal(found[3], expected.contact) and (found[0] - expected.depth_mm).abs().max() < 1e-5
 
 
+@pytest.mark.skipif(not LONG, reason="minutes to write")
 def test_onnx_of_an_image_whose_cells_are_larger_than_pixels(cells_of_two, tmp_path):
     if export.missing("onnx"):
         pytest.skip(export.missing("onnx"))
@@ -123,7 +124,7 @@ def test_gradients_through_torchscript_without_torchvts(low, tmp_path):
     assert (said["mode"], said["mm_per_pixel"], said["height"], said["width"]) == ("precise", PITCH, HEIGHT, WIDTH)
 
 
-@pytest.mark.parametrize("kind", ["lights precise", "response auto", "own normals"])
+@pytest.mark.parametrize("kind", ["response auto", "own normals"] + LONG * ["lights precise"])  # minutes to write
 def test_a_program_takes_the_decisions_of_the_pipeline(low, mini, tmp_path, kind):
     """Loops, early ends and dark pixels in the graph, against the Python of the pipeline; then from its file, without torchvts."""
     calibration, frames = mini if kind == "response auto" else low

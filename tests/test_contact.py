@@ -100,6 +100,21 @@ def test_a_frame_noisier_than_the_calibration_does_not_flood(ring, small_sensor,
     assert metrics.mask_iou(pipeline(press).contact, scene.contact) > 0.97
 
 
+def test_skin_at_rest_in_a_shadow_is_shaded_and_a_press_is_not():
+    flat = torch.full((3, 64, 64), 0.5)
+    mask, image = vts.ContactMask(flat, torch.full((3,), 0.01)), flat.clone()
+    image[0, 8:24, 8:24] = 0.0  # one light kept off
+    image[:2, 8:24, 40:56] = 0.0  # two, which leaves too little to tell by
+    image[0, 40:56, 8:24], image[1, 40:56, 8:24] = 0.0, 0.6  # slopes
+    image[0, 40:56, 40:56] = 0.2  # half a shadow
+    found = mask.shaded(image[None])[0, 0]
+    expected = torch.zeros(64, 64, dtype=torch.bool)
+    expected[8:24, 8:24] = True
+    assert torch.equal(found, expected) and bool(mask(image[None])[0, 0][found].all())
+    dim = torch.full((3, 64, 64), 0.05)  # a channel that is never bright cannot go dark
+    assert not bool(vts.ContactMask(dim, torch.full((3,), 0.01)).shaded(torch.zeros(1, 3, 64, 64)).any())
+
+
 def test_items_of_a_batch_do_not_influence_one_another(ring, small_sensor, small_press):
     lights = ring()
     cal = vts.Calibration.from_lights(lights, small_sensor)

@@ -124,6 +124,18 @@ def test_a_dead_lamp(ring):
     assert torch.equal(loops, operators) and bool(loops.any())
 
 
+def test_channels_left_out(ring):
+    lights, scene = ring(20.0, 12.0), scenes.sphere_press(10.0, 3.0, (0, 0), 60, 80, 0.4)
+    block = vts.NormalFromIntensity(lights, 60, 80, 0.4)
+    seen = scenes.render(scene, lights, noise_std=0.002, bits=8, seed=1).detach()
+    apart = block.without_dark(seen)
+    assert bool((apart < 0).any()) and torch.equal(apart.clamp_min(0), seen.masked_fill(apart < 0, 0))
+    for depth in (None, scene.depth_mm):
+        loops, operators = both(block, apart, depth, None, torch.zeros(1, 2, 60, 80))
+        assert float((loops - operators).abs().max()) < 2e-5
+        assert float((loops - block(seen, depth)).abs().max()) > 0.1
+
+
 def test_what_loops_may_not_touch():
     plain = torch.zeros(1, 2, 8, 8)
     assert may_use_native([plain, plain])

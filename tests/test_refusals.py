@@ -237,6 +237,7 @@ TABLE = {
     ),
     "ContactMask.from_calibration": Entry({"calibration": unit()}, {"calibration": OTHERS}),
     "ContactMask.forward": forward(lambda: pipe().contact, 3, "compensated"),
+    "ContactMask.shaded": forward(lambda: pipe().contact.shaded, 3, "compensated"),
     "ContactMask.soft": forward(lambda: pipe().contact.soft, 3, "compensated"),
     "DepthPipeline": Entry(
         {
@@ -329,6 +330,12 @@ TABLE = {
             "window": [(20, 20), (-1, 0)],
         },
         lambda: pipe().normals.beyond,
+        named={"window": "compensated, window"},
+    ),
+    "NormalFromIntensity.without_dark": Entry(
+        {"compensated": FLAT[None], "window": (0, 0)},
+        {"compensated": batches(3), "window": [(20, 20), (-1, 0)]},
+        lambda: pipe().normals.without_dark,
         named={"window": "compensated, window"},
     ),
     "NormalFromIntensity.coarse": Entry({"stride": 8}, {"stride": INTEGER}, lambda: pipe().normals.coarse),

@@ -107,3 +107,13 @@ def test_reproduce_paper_prints_figure_3_beside_the_papers(tmp_path):
         assert float(row[3]) <= bound[press, row[1]], row
     assert len(list(tmp_path.glob("figure_3*.png"))) == 4 and len(list(tmp_path.glob("table_3*.png"))) == 3
     assert "| paper, three targets | 0.64, 2.35, 2.59 | below 1 | 6 to 8 |" in done.stdout
+
+
+def test_shadows_prints_a_row_for_each_shape_and_kind():
+    done = call("scripts/shadows.py", "--scenes", "1")
+    assert done.returncode == 0, done.stderr
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in done.stdout.splitlines()[2:]]
+    assert [row[:2] for row in rows] == [[k, s] for k in ("slope", "cast", "dirt") for s in ("ball", "capsule", "cone", "punch")]
+    assert all(0.0 < float(row[3]) <= float(row[4]) + 0.01 and bool(row[5]) == (row[0] == "cast") for row in rows)
+    done = call("scripts/shadows.py", "--scenes", "0")
+    assert done.returncode == 2 and "--scenes: expected at least 1, got 0" in done.stderr

@@ -27,6 +27,9 @@ from .record import Calibration, check_calibration
 CELLS = 80
 """Cells along the shorter side of the image."""
 
+DARK_NOISES = 3.0
+"""A channel below so many noises is dark, where the skin at rest is twice as bright."""
+
 LIGHT_DRIFT = 0.008
 """Least noise, relative to the background, with a response field: the lamps of real sensors drift by 1 to 2 % of their light."""
 
@@ -200,6 +203,7 @@ class ContactMask(nn.Module):
         per_noise = 1.0 / noise.detach().clamp_min(QUANTISATION_STD).to(flat.dtype)
         self.register_buffer("per_noise", per_noise.expand_as(flat).clone())
         self.rounding = float((QUANTISATION_STD * self.per_noise).square().mean())
+        self.dark_noises = DARK_NOISES
         self.register_buffer("rest", -self.flat * self.per_noise)
         self.samples = 2000  # pixels that tell a frame's own noise
         self.stride = max(1, math.ceil(math.sqrt(flat.shape[1] * flat.shape[2] / self.samples)))
@@ -230,6 +234,18 @@ class ContactMask(nn.Module):
         length = self.sigmas * torch.sqrt(squared / threshold + 1e-12)
         near = _dilate(_dilate(hard)).to(change.dtype)
         return near * torch.maximum(torch.sigmoid(length - self.sigmas), interior.to(change.dtype))
+
+    @torch.jit.export
+    def shaded(self, compensated: Tensor) -> Tensor:
+        """Where one channel has gone dark and the two others are as they were, bool (B, 1, H, W).
+
+        The skin may be at rest there, in the shadow of what is pressed in; or it has the one slope that looks the same.
+        """
+        self._check(compensated)
+        change, _, threshold = self._change(compensated.detach())
+        dark = (change - self.rest < self.dark_noises) & (self.rest < -2.0 * self.dark_noises)
+        lit = change.masked_fill(dark, 0.0).square().sum(dim=1, keepdim=True) <= threshold
+        return lit & (dark.to(torch.uint8).sum(dim=1, keepdim=True) == 1)
 
     def _check(self, compensated: Tensor) -> None:
         check_batch("compensated", compensated, 3)

@@ -75,8 +75,9 @@ class DepthPipeline(nn.Module):
             that has ``coarse(stride)``, itself for every stride-th pixel, lets ``auto`` foresee; ``passes`` bounds the loop.
             If normals and integrate set ``takes_window = True``, normals takes a third argument, the window's (top, left),
             and integrate takes that and the image's (height, width) after the gradient. One that also has ``blocked(compensated,
-            window)`` takes as a fourth the slopes (B, 2, H, W) expected where that is true, and tells by ``beyond(gradient,
-            compensated, depth_mm, window)`` which others would fit there.
+            window)`` takes as a fourth the slopes (B, 2, H, W) expected where that is true; ``beyond(gradient, compensated,
+            depth_mm, window)`` tells which others would fit there, ``without_dark(compensated, window)`` makes an image whose dark
+            channels say nothing. If contact has ``shaded(compensated)`` too, skin at rest in a shadow is no contact.
         mm_per_pixel: pixel pitch, mm. mode: "fast", "precise" or "auto".
         tolerance_px, worth_px: pixels of pitch. max_passes: bound of the precise loop.
     Source:
@@ -87,8 +88,10 @@ class DepthPipeline(nn.Module):
     skips: Final[bool]
     foresees: Final[bool]
     expects: Final[bool]
+    shades: Final[bool]
     windows: Final[bool]
     stride: Final[int] = 8  # auto foresees on every so many pixels, and windows begin at such
+    rounds: Final[int] = 3  # of doubt about dark channels
 
     def __init__(
         self,
@@ -131,8 +134,13 @@ class DepthPipeline(nn.Module):
         self.skips = mode == "auto"
         self.windows = bool(getattr(normals, "takes_window", False)) and bool(getattr(integrate, "takes_window", False))
         self.expects = (
-            self.refines and self.windows and all(callable(getattr(normals, name, None)) for name in ("blocked", "beyond"))
+            self.refines
+            and self.windows
+            and all(callable(getattr(normals, name, None)) for name in ("blocked", "beyond", "without_dark"))
         )
+        self.shades = self.expects and callable(getattr(contact, "shaded", None))
+        # what is a surface is judged by a solver without cliffs, which make one of anything
+        self.judge = PoissonRest(mm_per_pixel) if self.expects else nn.Identity()
         coarse = getattr(normals, "coarse", None)
         self.foresees = self.skips and self.refines and self.windows and callable(coarse)
         self.coarse_normals = coarse(self.stride) if self.foresees and callable(coarse) else nn.Identity()
@@ -205,6 +213,17 @@ class DepthPipeline(nn.Module):
                 torn = active & blocked.flatten(1).any(dim=1)
                 either = not may_read_values() or bool(torn.any())
                 if either:
+                    shaded = torch.zeros_like(blocked)
+                    if self.shades:
+                        found: Tensor = self.contact.shaded(compensated)  # type: ignore[operator]
+                        shaded = found[:, :, top:bottom, left:right] & blocked
+                    seen, resting, blocked, gradient = self._doubt_dark(
+                        seen, touched, shaded, blocked, gradient, torn, (top, left), (height, width)
+                    )
+                    touched = touched & ~resting
+                    contact = contact.clone()
+                    contact[:, :, top:bottom, left:right] = touched
+                    depth = self.integrate(gradient, (top, left), (height, width))
                     gradient, depth = self._guess_again(seen, touched, gradient, depth, blocked, torn, (top, left))
             gradient, depth = self._refine(seen, touched, gradient, depth, active, (top, left))
             if self.expects and either:
@@ -234,6 +253,61 @@ class DepthPipeline(nn.Module):
     def _normals_at(self, seen: Tensor, depth: Tensor) -> Tensor:
         normal: Tensor = self.normals(seen, depth) if self.refines else self.normals(seen)
         return normal
+
+    def _doubt_dark(
+        self,
+        seen: Tensor,
+        touched: Tensor,
+        shaded: Tensor,
+        blocked: Tensor,
+        gradient: Tensor,
+        torn: Tensor,
+        window: tuple[int, int],
+        size: tuple[int, int],
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Dark need not mean that the skin faces away: a shadow may fall on it, at rest or not, or dirt cover it. Where that leaves
+        less contradiction, the skin is taken to be at rest, or else the dark channels to say nothing.
+
+        Returns:
+            the image, without the channels that say nothing; where the skin is at rest; where dark still means facing away; slopes.
+        Source:
+            Onn and Bruckstein, Integrability disambiguates surface recovery in two-image photometric stereo, IJCV 5(1), 1990.
+        """
+        resting, gradient = self._take(torch.zeros_like(gradient), shaded, touched, gradient, torn, window, size)
+        blocked = blocked & ~resting
+        apart: Tensor = self.normals.without_dark(seen, window)  # type: ignore[operator]
+        other = self.gradient(self.normals(apart, None, window, torch.where(blocked, 0.0, gradient)))
+        cut, gradient = self._take(other, blocked, touched, gradient, torn, window, size)
+        return torch.where(cut, apart, seen), resting, blocked & ~cut, gradient
+
+    def _take(
+        self,
+        other: Tensor,
+        where: Tensor,
+        touched: Tensor,
+        gradient: Tensor,
+        torn: Tensor,
+        window: tuple[int, int],
+        size: tuple[int, int],
+    ) -> tuple[Tensor, Tensor]:
+        """Other slopes somewhere, taken where a surface contradicts them less around a pixel, if that leaves less contradiction in
+        the frame: where they were taken, and the slopes."""
+        taken = torch.zeros_like(where)
+        if may_read_values() and not bool(where.any()):
+            return taken, gradient
+        misfit = self._misfit(gradient, self.judge(gradient, window, size), touched, window)
+        for _ in range(self.rounds):
+            mixed = torch.where(where, other, gradient)
+            gained = self._misfit(mixed, self.judge(mixed, window, size), touched, window) - misfit
+            here = where & (nn.functional.avg_pool2d(gained, 17, 1, 8) < 0.0)
+            if may_read_values() and not bool(here.any()):
+                break
+            mixed = torch.where(here, other, gradient)
+            left = self._misfit(mixed, self.judge(mixed, window, size), touched, window)
+            better = (torn & ((left - misfit).sum(dim=(1, 2, 3)) < 0.0))[:, None, None, None]
+            gradient, misfit = torch.where(better, mixed, gradient), torch.where(better, left, misfit)
+            taken, where = taken | (here & better), where & ~here & better
+        return taken, gradient
 
     def _guess_again(
         self, seen: Tensor, touched: Tensor, gradient: Tensor, depth: Tensor, blocked: Tensor, torn: Tensor, window: tuple[int, int]

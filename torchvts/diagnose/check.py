@@ -484,7 +484,8 @@ class _Examination:
         cast = cast_shadow_share(relief, self.noise)
         if cast > 0.002:
             message = (
-                f"a shadow falls on {cast:.1%} of the image, on skin that is flat: it will be read as a slope; raise the lights"
+                f"a shadow falls on {cast:.1%} of the image, on skin that is flat: fast mode reads it as a slope; use precise "
+                "mode, or raise the lights"
             )
             found.append(Finding("cast_shadow", message, "warning", cast))
         skirt = skirt_mm(relief)

@@ -4,6 +4,9 @@
 
 #include <math.h>
 
+/* The intensity of a channel that says nothing. */
+#define LEFT_OUT -1.0f
+
 /* What does not change from pixel to pixel. */
 typedef struct {
     float noise_std, weight, brightness, steps;
@@ -102,7 +105,7 @@ EXPORT void relight(const float *image, int64_t per_frame, int64_t per_channel, 
                     const float value = image[per_frame * b + per_channel * j + per_row * y + x];
                     const int is_full = value >= full[plane * j + at];
                     wanted |= is_full || value < dark[plane * j + at];
-                    saturated[j] = is_full || dead[j];
+                    saturated[j] = is_full || dead[j] || value <= 0.5f * LEFT_OUT;
                     intensity[j] = dead[j] ? 0.0f : value;
                 }
                 if (!wanted) continue;

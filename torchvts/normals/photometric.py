@@ -24,6 +24,9 @@ from ..core.native import may_use_native
 from ..record import Calibration, check_calibration
 from ..shading import PointLights, flat_image, gloss_lobe, inverse_light_matrix, light_matrix, normal_at_depth, seen_at
 
+LEFT_OUT = -1.0
+"""Intensity of a channel that says nothing at a pixel, because something cuts its light off."""
+
 CLIFF_SLOPE = 2.0
 """Difference of neighbouring slopes from which depth is taken for a cliff."""
 
@@ -212,6 +215,7 @@ class NormalFromIntensity(nn.Module):
         check_shape("noise_std", noise, (3,))
         if not bool((noise >= 0).all()):
             raise ValueError(f"noise_std: expected values of at least 0, got {noise.tolist()}")
+        self.left_out = LEFT_OUT
         self.noise_std = max(float(noise.square().mean().sqrt()), 1e-6)
         self.brightness_std = max(0.005, BRIGHTNESS_NOISES * self.noise_std)
         self.register_buffer("inverse", inverse.detach().clone())
@@ -363,6 +367,14 @@ class NormalFromIntensity(nn.Module):
         return (dark & ~_dead(dark)[:, :, None, None]).any(dim=1, keepdim=True)
 
     @torch.jit.export
+    def without_dark(self, compensated: Tensor, window: tuple[int, int] | None = None) -> Tensor:
+        """The image (B, 3, h, w) with dark channels left out, as where something else than the skin's slope keeps light off."""
+        check_batch("compensated", compensated, 3)
+        top, left = check_window("compensated", compensated, (self.inverse.shape[2], self.inverse.shape[3]), window)
+        bottom, right = top + compensated.shape[2], left + compensated.shape[3]
+        return compensated.masked_fill(compensated < self.dark_where[:, top:bottom, left:right], self.left_out)
+
+    @torch.jit.export
     def beyond(self, gradient: Tensor, compensated: Tensor, depth_mm: Tensor, window: tuple[int, int] | None = None) -> Tensor:
         """Slopes that fit as well where one light is blocked, but lie beyond the plane of the other two, away from it.
 
@@ -466,7 +478,7 @@ class NormalFromIntensity(nn.Module):
         squared = (to_light * to_light).sum(2, keepdim=True)
         rows = albedo[None, :, None] * to_light * (squared.rsqrt() / squared)
         intensity, dead = compensated[b, :, row, column], broken[b]
-        full = (intensity >= full_above[:, row, column].t()) | dead
+        full = (intensity >= full_above[:, row, column].t()) | dead | (intensity <= 0.5 * self.left_out)
         slope = slope_by_lit_lights(
             start, intensity * (~dead).to(intensity.dtype), rows, full, self.noise_std, brightness_std=self.brightness_std
         )

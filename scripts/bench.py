@@ -55,20 +55,26 @@ def chart(rows: Sequence[bench.Row]) -> Figure:
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, 4 if sensor else 3)
     scene = [r for r in rows if r.kind == "scene" and r.height == 480 and "press 1 mm" in r.data]
-    errors_against_time(axes[0], scene, "rms_um", "depth RMS, um", "Exact scene, 640x480: ball pressed 1 mm")
-    if sensor:
-        errors_against_time(
-            axes[1], sensor, "normal_deg", "normals off by, degrees", "GelSight Mini, 320x240: balls not learned from"
-        )
     stamps = [row for row in rows if row.kind == "cliff" and row.data.startswith("stamp")]
-    errors_against_time(axes[-2], stamps, "rms_um", "depth RMS, um", "Exact scene, 320x240: stamp with upright walls, 1 mm")
+    panels = [
+        (axes[0], scene, "rms_um", "depth RMS, um", "Exact scene, 640x480: ball pressed 1 mm"),
+        (axes[-2], stamps, "rms_um", "depth RMS, um", "Exact scene, 320x240: stamp with upright walls, 1 mm"),
+    ]
+    if sensor:
+        title = "GelSight Mini, 320x240: balls not learned from"
+        panels.append((axes[1], sensor, "normal_deg", "normals off by, degrees", title))
+    drawn = [(panel[0], errors_against_time(*panel), panel[2]) for panel in panels]
     axes[0].legend(fontsize=7, loc="center left")
     cost(axes[-1], [r for r in rows if r.kind == "scene" and "press 1 mm" in r.data])
     figure.suptitle(f"{rows[0].machine}, {rows[0].threads} threads, one frame", fontsize=9)
+    figure.draw_without_rendering()  # places of the panels
+    for panel, shown, error in drawn:
+        name_points(panel, shown, error)
     return figure
 
 
-def errors_against_time(axes: Any, rows: Sequence[bench.Row], error: str, label: str, title: str) -> None:
+def errors_against_time(axes: Any, rows: Sequence[bench.Row], error: str, label: str, title: str) -> list[bench.Row]:
+    """Draws a panel; returns the rows in it, whose names come when its place is known."""
     known = [row for row in rows if getattr(row, error) is not None]
     beyond = 4.0 * statistics.median(getattr(row, error) for row in known)  # such as flat: told, not drawn
     shown = sorted((row for row in known if getattr(row, error) <= beyond), key=lambda row: row.ms_median)
@@ -77,10 +83,6 @@ def errors_against_time(axes: Any, rows: Sequence[bench.Row], error: str, label:
     for ours, color, marker, name in ((True, "tab:blue", "o", "torchvts"), (False, "tab:red", "s", "peers")):
         part = [row for row in shown if row.ours == ours]
         axes.plot([r.ms_median for r in part], [getattr(r, error) for r in part], marker, color=color, label=name, ls="none")
-    for k, row in enumerate(shown):
-        place, above = (row.ms_median, getattr(row, error)), (8, -14, 22, -28)[k % 4]
-        arrow = {"arrowstyle": "-", "lw": 0.4, "color": "0.5"}
-        axes.annotate(row.method, place, fontsize=6.5, xytext=(6, above), textcoords="offset points", arrowprops=arrow)
     told = [f"{row.method}: {getattr(row, error):.0f} at {row.ms_median:.2g} ms" for row in known if row not in shown]
     axes.text(0.02, 0.02, "\n".join(["not drawn:", *told] if told else []), transform=axes.transAxes, fontsize=6.5, color="0.35")
     axes.set(xscale="log", yscale="log", xlabel="ms a frame", ylabel=label)
@@ -91,6 +93,30 @@ def errors_against_time(axes: Any, rows: Sequence[bench.Row], error: str, label:
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(NullFormatter())
+    return shown
+
+
+def name_points(axes: Any, rows: Sequence[bench.Row], error: str) -> None:
+    """Method names beside their points, where they cover no other name or point and stay in the panel, whose place is known."""
+    size, scale = 6.5, axes.figure.dpi / 72.0
+    points = [axes.transData.transform((row.ms_median, getattr(row, error))) for row in rows]
+    taken = [(x - 4.0, y - 4.0, x + 4.0, y + 4.0) for x, y in points]
+    panel = axes.bbox
+    for row, (x, y) in zip(rows, points, strict=True):
+        wide, high = 0.6 * size * scale * len(row.method), 1.3 * size * scale
+        best = None
+        for k, (right, up) in enumerate((r, u) for u in (8, -14, 22, -28, 36, -42, 50, -56) for r in (True, False)):
+            left = x + 6 * scale if right else x - 6 * scale - wide
+            box = (left, y + up * scale, left + wide, y + up * scale + high)
+            covered = sum(box[0] < b[2] and b[0] < box[2] and box[1] < b[3] and b[1] < box[3] for b in taken)
+            outside = box[0] < panel.x0 or box[2] > panel.x1 or box[1] < panel.y0 or box[3] > panel.y1
+            if best is None or (covered + 2 * outside, k) < best[:2]:
+                best = (covered + 2 * outside, k, right, up, box)
+        assert best is not None
+        taken.append(best[4])
+        arrow = {"arrowstyle": "-", "lw": 0.4, "color": "0.5"}
+        offset = {"xytext": (6 if best[2] else -6, best[3]), "textcoords": "offset points", "ha": "left" if best[2] else "right"}
+        axes.annotate(row.method, (row.ms_median, getattr(row, error)), fontsize=size, arrowprops=arrow, **offset)
 
 
 def cost(axes: Any, rows: Sequence[bench.Row]) -> None:

@@ -2,19 +2,21 @@
 
 python scripts/learning_curve.py ../shared/data/gelsight_mini_a --sensor gelsight_mini
 
-Presses carry no labels; those left out are scored. Touches are known by nothing but their images: all presses but the one for
-the scale are scored. Where a prior takes part it is fitted on the balls of all other diameters
-(with their labels), so it has not seen the ball that is scored.
+Presses carry no labels; those left out are scored, and those given by how far the centers and contact radii that were found for
+them are from the labels. Touches are known by nothing but their images: all presses but the one for the scale are scored. Where a
+prior takes part it is fitted on the balls of all other diameters (with their labels), so it has not seen the ball that is scored.
 """
 
 import argparse
 import dataclasses
+import math
 import random
 import statistics
 import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib
 import torch
@@ -30,6 +32,17 @@ FOLDS = 5
 """Of each ball's presses, in the row that scores every one of them: each is left out once."""
 
 
+class Scores(NamedTuple):
+    """Of presses left out; and of those given, how far their centers and contact radii are from the labels, pixels."""
+
+    left_out: list[PressScore]
+    centers_px: list[float]
+    radii_px: list[float]
+
+    def __add__(self, other: "Scores") -> "Scores":  # type: ignore[override]
+        return Scores(*(one + more for one, more in zip(self, other)))
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="presses of balls of two or more diameters, in gs_sdk's layout")
@@ -41,7 +54,7 @@ def main() -> int:
     bare = vts.Sensor.load(arguments.sensor).without_prior()
     background, presses = vts.read_presses(arguments.folder)
     scored = [press for press in presses if press.center_px is not None and press.contact_radius_px is not None]
-    rows: list[tuple[str, int, list[PressScore]]] = []
+    rows: list[tuple[str, int, Scores]] = []
     balls = sorted({press.ball_diameter_mm for press in presses})
     own = {ball: [press for press in presses if press.ball_diameter_mm == ball] for ball in balls}
     with tqdm(desc="learning curve", leave=False) as bar:
@@ -55,19 +68,19 @@ def main() -> int:
             named = [("presses, prior of another ball", number, jobs) for number, jobs in by_number.items()]
             usual = round(statistics.mean(len(draw) for _, draw in folds))
             for kind, number, jobs in [*named, (f"presses, prior of another ball, {FOLDS}-fold", usual, folds)]:
-                found: list[PressScore] = []
+                found = Scores([], [], [])
                 for ball, draw in jobs:
                     found += score(background, sensors[ball], draw, [], left(scored, draw, ball))
                     bar.update()
                 rows.append((kind, number, found))
         for count in (1, 2, 3, 5, 10, len(presses) - len(presses) // 5):
-            found = []
+            found = Scores([], [], [])
             for draw in draws(presses, count, arguments.draws):
                 found += score(background, bare, draw, [], left(scored, draw))
                 bar.update()
             rows.append(("presses, no prior", count, found))
         for count in (1, 5, 10, min(30, len(presses) - 1)):
-            found = []
+            found = Scores([], [], [])
             for draw in draws(presses, count, arguments.draws):
                 one = random.Random(count).choice([press for press in scored if press not in draw] or scored)
                 found += score(background, bare, [one], draw, left(scored, [one]))
@@ -98,34 +111,44 @@ def score(
     presses: Sequence[vts.Press],
     touches: Sequence[vts.Press],
     judged: Sequence[vts.Press],
-) -> list[PressScore]:
+) -> Scores:
     """Calibrate with the labels forgotten, and score the precise depth of other presses."""
     blind = [dataclasses.replace(press, center_px=None, contact_radius_px=None) for press in presses]
     calibration = vts.calibrate(background, sensor, blind, [press.image for press in touches])
     pipe = vts.DepthPipeline.from_calibration(calibration, "precise")
-    scores = []
+    scores = Scores([], [], [])
     for press in judged:
         with torch.inference_mode():
             out = pipe(press.image[None])
-        scores.append(score_press(press, out.depth_mm, out.normal, sensor.mm_per_pixel))
+        scores.left_out.append(score_press(press, out.depth_mm, out.normal, sensor.mm_per_pixel))
+    labels = {press.name: press for press in presses}
+    for told in calibration.report.get("presses", []):
+        press = labels[told["name"]]
+        if told["used"] and press.center_px is not None and press.contact_radius_px is not None:
+            scores.centers_px.append(math.dist(told["center_px"], press.center_px))
+            scores.radii_px.append(abs(told["contact_radius_px"] - press.contact_radius_px))
     return scores
 
 
-def table(rows: Sequence[tuple[str, int, list[PressScore]]]) -> str:
-    lines = ["| given | number | normals deg | relief um | radius %, median | scored |", "|---|---|---|---|---|---|"]
-    for kind, count, scores in rows:
+def table(rows: Sequence[tuple[str, int, Scores]]) -> str:
+    lines = [
+        "| given | number | normals deg | relief um | radius %, median | scored | centers, radii found, px, median |",
+        "|---" * 7 + "|",
+    ]
+    for kind, count, (scores, centers, radii) in rows:
         radius = statistics.median(s.radius_percent for s in scores if s.radius_percent is not None)
         angle, relief = statistics.mean(s.normal_deg for s in scores), statistics.mean(s.relief_um for s in scores)
-        lines.append(f"| {kind} | {count} | {angle:.2f} | {relief:.1f} | {radius:.1f} | {len(scores)} |")
+        found = f"{statistics.median(centers):.2f}, {statistics.median(radii):.2f}" if centers and "touches" not in kind else ""
+        lines.append(f"| {kind} | {count} | {angle:.2f} | {relief:.1f} | {radius:.1f} | {len(scores)} | {found} |")
     return "\n".join(lines)
 
 
-def figure(rows: Sequence[tuple[str, int, list[PressScore]]]) -> "matplotlib.figure.Figure":
+def figure(rows: Sequence[tuple[str, int, Scores]]) -> "matplotlib.figure.Figure":
     import matplotlib.pyplot as plt
 
     drawn, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
     for kind in dict.fromkeys(kind for kind, _, _ in rows):
-        points = [(count, statistics.mean(s.normal_deg for s in scores)) for k, count, scores in rows if k == kind]
+        points = [(count, statistics.mean(s.normal_deg for s in found.left_out)) for k, count, found in rows if k == kind]
         axes.plot(*zip(*points), marker="o", label=kind)
     axes.set(xlabel="presses or touches", ylabel="mean angle of normals, deg", ylim=(0, None))
     axes.grid(alpha=0.3)

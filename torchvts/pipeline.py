@@ -277,7 +277,8 @@ class DepthPipeline(nn.Module):
         blocked = blocked & ~resting
         apart: Tensor = self.normals.without_dark(seen, window)  # type: ignore[operator]
         other = self.gradient(self.normals(apart, None, window, torch.where(blocked, 0.0, gradient)))
-        cut, gradient = self._take(other, blocked, touched, gradient, torn, window, size)
+        rim = nn.functional.max_pool2d(_as_factor(~touched, seen), 3, 1, 1) > 0.0  # walls of a pixel make no surface either
+        cut, gradient = self._take(other, blocked & ~rim, touched, gradient, torn, window, size)
         return torch.where(cut, apart, seen), resting, blocked & ~cut, gradient
 
     def _take(

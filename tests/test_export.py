@@ -124,15 +124,17 @@ def test_gradients_through_torchscript_without_torchvts(low, tmp_path):
     assert (said["mode"], said["mm_per_pixel"], said["height"], said["width"]) == ("precise", PITCH, HEIGHT, WIDTH)
 
 
-@pytest.mark.parametrize("kind", ["response auto", "own normals"] + LONG * ["lights precise"])  # minutes to write
+@pytest.mark.parametrize("kind", ["lights precise", "response auto", "own normals"])
 def test_a_program_takes_the_decisions_of_the_pipeline(low, mini, tmp_path, kind):
     """Loops, early ends and dark pixels in the graph, against the Python of the pipeline; then from its file, without torchvts."""
     calibration, frames = mini if kind == "response auto" else low
     pipe = pipeline(calibration, kind.split()[1]) if kind != "own normals" else pipeline(calibration, "fast", normals=learned())
+    if not LONG:
+        pipe.max_passes = min(pipe.max_passes, 2)  # loops in the graph take minutes to write
     program = export.export_program(pipe, tmp_path / "pipe.pt2").module()
     for batch in (frames[:1], frames[1:3], frames[:3], frames[3:], frames):
         for found, expected in zip(program(batch), pipe(batch), strict=True):
-            assert (found.double() - expected.double()).abs().max() <= 1e-5
+            assert (found.double() - expected.double()).abs().max() <= 2e-5  # slopes too, which are of the order of 1
     if kind != "response auto":
         assert export.compare(tmp_path / "pipe.pt2", pipe, frames, "pt2") <= 1e-5
 

@@ -130,6 +130,10 @@ def test_channels_left_out(ring):
     seen = scenes.render(scene, lights, noise_std=0.002, bits=8, seed=1).detach()
     apart = block.without_dark(seen)
     assert bool((apart < 0).any()) and torch.equal(apart.clamp_min(0), seen.masked_fill(apart < 0, 0))
+    shiny = vts.NormalFromIntensity(vts.PointLights(lights.position_mm, lights.albedo, [0.9] * 3), 60, 80, 0.4)
+    steep = scene.depth_mm * 1.5  # where the lobe is strong, what is left out is left out still
+    brighter = torch.where(apart < 0, apart * 0.8, apart)
+    assert torch.equal(shiny(apart, steep), shiny(brighter, steep))
     for depth in (None, scene.depth_mm):
         loops, operators = both(block, apart, depth, None, torch.zeros(1, 2, 60, 80))
         assert float((loops - operators).abs().max()) < 2e-5

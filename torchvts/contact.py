@@ -28,7 +28,7 @@ CELLS = 80
 """Cells along the shorter side of the image."""
 
 DARK_NOISES = 3.0
-"""A channel below so many noises is dark, where the skin at rest is twice as bright."""
+"""A channel below so many noises is dark, where the skin at rest is twice as bright: as in NormalFromIntensity."""
 
 LIGHT_DRIFT = 0.008
 """Least noise, relative to the background, with a response field: the lamps of real sensors drift by 1 to 2 % of their light."""
@@ -244,6 +244,9 @@ class ContactMask(nn.Module):
         self._check(compensated)
         change, _, threshold = self._change(compensated.detach())
         dark = (change - self.rest < self.dark_noises) & (self.rest < -2.0 * self.dark_noises)
+        step = self.step
+        bright = compensated.detach()[:, :, step // 2 :: step, step // 2 :: step].mean(dim=(2, 3))
+        dark = dark | (bright < self.dead_below).any(dim=1)[:, None, None, None]  # with a lamp dead, too little is left to tell by
         lit = change.masked_fill(dark, 0.0).square().sum(dim=1, keepdim=True) <= threshold
         return lit & (dark.to(torch.uint8).sum(dim=1, keepdim=True) == 1)
 

@@ -464,11 +464,15 @@ def _trace(pipe: DepthPipeline, by_matrix: bool) -> torch.export.ExportedProgram
     if by_matrix and isinstance(pipe.coarse_integrate, PoissonRest):
         rows, columns = (len(range(pipe.stride // 2, n, pipe.stride)) for n in (height, width))
         pipe.coarse_integrate = PoissonRestByMatrix(rows, columns, pipe.stride * pipe.mm_per_pixel, dtype)
+    if by_matrix and isinstance(pipe.judge, PoissonRest):
+        pipe.judge = PoissonRestByMatrix(height, width, pipe.mm_per_pixel, dtype)
     images = torch.full((2, 3, height, width), 0.5, dtype=dtype)
     batch = torch.export.Dim("batch", min=1, max=MAX_BATCH)
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        pipe(images)  # the integrator makes its tables, which then are constants of the graph
+        pipe(images)  # integrators make their tables, which then are constants of the graph
+        if pipe.expects:
+            pipe.judge(images[:, :2], (0, 0), (height, width))
         return torch.export.export(_PlainOutput(pipe), (images,), dynamic_shapes=({0: batch},), strict=False)
 
 

@@ -74,10 +74,11 @@ class DepthPipeline(nn.Module):
             normals (B, 3, H, W); one that sets ``uses_depth = True`` takes a second argument, the depth or None, and one
             that has ``coarse(stride)``, itself for every stride-th pixel, lets ``auto`` foresee; ``passes`` bounds the loop.
             If normals and integrate set ``takes_window = True``, normals takes a third argument, the window's (top, left),
-            and integrate takes that and the image's (height, width) after the gradient. One that also has ``blocked(compensated,
-            window)`` takes as a fourth the slopes (B, 2, H, W) expected where that is true; ``beyond(gradient, compensated,
-            depth_mm, window)`` tells which others would fit there, ``without_dark(compensated, window)`` makes an image whose dark
-            channels say nothing. If contact has ``shaded(compensated)`` too, skin at rest in a shadow is no contact.
+            and integrate takes that and the image's (height, width) after the gradient. One that also has all of ``blocked``,
+            ``beyond`` and ``without_dark`` is asked again where a light is kept off: where ``blocked(compensated, window)`` is true
+            it takes as a fourth argument slopes (B, 2, H, W) expected there, ``beyond(gradient, compensated, depth_mm, window)``
+            tells which others would fit, ``without_dark(compensated, window)`` makes an image whose dark channels say nothing.
+            If contact has ``shaded(compensated)`` too, skin at rest in a shadow is no contact.
         mm_per_pixel: pixel pitch, mm. mode: "fast", "precise" or "auto".
         tolerance_px, worth_px: pixels of pitch. max_passes: bound of the precise loop.
     Source:
@@ -139,8 +140,8 @@ class DepthPipeline(nn.Module):
             and all(callable(getattr(normals, name, None)) for name in ("blocked", "beyond", "without_dark"))
         )
         self.shades = self.expects and callable(getattr(contact, "shaded", None))
-        # what is a surface is judged by a solver without cliffs, which make one of anything
-        self.judge = PoissonRest(mm_per_pixel) if self.expects else nn.Identity()
+        # slopes are judged by a solver that cuts no edges: one that does makes a surface of anything
+        self.judge: nn.Module = PoissonRest(mm_per_pixel) if self.expects else nn.Identity()
         coarse = getattr(normals, "coarse", None)
         self.foresees = self.skips and self.refines and self.windows and callable(coarse)
         self.coarse_normals = coarse(self.stride) if self.foresees and callable(coarse) else nn.Identity()
@@ -221,8 +222,11 @@ class DepthPipeline(nn.Module):
                         seen, touched, shaded, blocked, gradient, torn, (top, left), (height, width)
                     )
                     touched = touched & ~resting
-                    contact = contact.clone()
-                    contact[:, :, top:bottom, left:right] = touched
+                    if bottom - top == height and right - left == width:
+                        contact = touched
+                    else:
+                        contact = contact.clone()
+                        contact[:, :, top:bottom, left:right] = touched
                     depth = self.integrate(gradient, (top, left), (height, width))
                     gradient, depth = self._guess_again(seen, touched, gradient, depth, blocked, torn, (top, left))
             gradient, depth = self._refine(seen, touched, gradient, depth, active, (top, left))
@@ -296,19 +300,20 @@ class DepthPipeline(nn.Module):
         taken = torch.zeros_like(where)
         if may_read_values() and not bool(where.any()):
             return taken, gradient
-        misfit = self._misfit(gradient, self.judge(gradient, window, size), touched, window)
+        slopes, others = gradient.detach(), other.detach()
+        misfit = self._misfit(slopes, self.judge(slopes, window, size), touched, window)
         for _ in range(self.rounds):
-            mixed = torch.where(where, other, gradient)
+            mixed = torch.where(where, others, slopes)
             gained = self._misfit(mixed, self.judge(mixed, window, size), touched, window) - misfit
             here = where & (nn.functional.avg_pool2d(gained, 17, 1, 8) < 0.0)
             if may_read_values() and not bool(here.any()):
                 break
-            mixed = torch.where(here, other, gradient)
-            left = self._misfit(mixed, self.judge(mixed, window, size), touched, window)
-            better = (torn & ((left - misfit).sum(dim=(1, 2, 3)) < 0.0))[:, None, None, None]
-            gradient, misfit = torch.where(better, mixed, gradient), torch.where(better, left, misfit)
+            mixed = torch.where(here, others, slopes)
+            after = self._misfit(mixed, self.judge(mixed, window, size), touched, window)
+            better = (torn & ((after - misfit).sum(dim=(1, 2, 3)) < 0.0))[:, None, None, None]
+            slopes, misfit = torch.where(better, mixed, slopes), torch.where(better, after, misfit)
             taken, where = taken | (here & better), where & ~here & better
-        return taken, gradient
+        return taken, torch.where(taken, other, gradient)
 
     def _guess_again(
         self, seen: Tensor, touched: Tensor, gradient: Tensor, depth: Tensor, blocked: Tensor, torn: Tensor, window: tuple[int, int]

@@ -483,10 +483,10 @@ class _Examination:
             found.append(Finding("shadow", message, "warning" if dark > 0.3 else "note", dark))
         cast = cast_shadow_share(relief, self.noise)
         if cast > 0.002:
-            message = (
-                f"a shadow falls on {cast:.1%} of the image, on skin that is flat: fast mode reads it as a slope; use precise "
-                "mode, or raise the lights"
-            )
+            cure = "fast mode reads it as a slope; use precise mode, or raise the lights"
+            if self.calibration.lights is None:
+                cure = "it will be read as a slope; raise the lights"
+            message = f"a shadow falls on {cast:.1%} of the image, on skin that is flat: {cure}"
             found.append(Finding("cast_shadow", message, "warning", cast))
         skirt = skirt_mm(relief)
         sharp = outlined and not names & {"blurred", "moved", "shadow"}

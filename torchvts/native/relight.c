@@ -4,7 +4,7 @@
 
 #include <math.h>
 
-/* The intensity of a channel that says nothing. */
+/* The intensity of a channel that says nothing, as in torchvts/normals/photometric.py; no camera gives half of it. */
 #define LEFT_OUT -1.0f
 
 /* What does not change from pixel to pixel. */

@@ -25,7 +25,8 @@ from ..record import Calibration, check_calibration
 from ..shading import PointLights, flat_image, gloss_lobe, inverse_light_matrix, light_matrix, normal_at_depth, seen_at
 
 LEFT_OUT = -1.0
-"""Intensity of a channel that says nothing at a pixel, because something cuts its light off."""
+"""Intensity of a channel that says nothing at a pixel, because something keeps its light off: relight.c knows it too. No camera
+gives half of it."""
 
 CLIFF_SLOPE = 2.0
 """Difference of neighbouring slopes from which depth is taken for a cliff."""
@@ -352,7 +353,8 @@ class NormalFromIntensity(nn.Module):
         depth = compensated.new_zeros(1, 1, compensated.shape[2], compensated.shape[3]) if depth_mm is None else depth_mm
         normal = normal_from_gradient(slope_of_depth(depth, self.mm_per_pixel))
         matrix = light_matrix(depth, position, self.lights.albedo, self.mm_per_pixel, self.camera_height_mm, axis)
-        return compensated / (1.0 + self.lights.gloss.reshape(1, 3, 1, 1) * gloss_lobe(matrix, normal))
+        matt = compensated / (1.0 + self.lights.gloss.reshape(1, 3, 1, 1) * gloss_lobe(matrix, normal))
+        return torch.where(compensated < 0.0, compensated, matt)  # channels left out stay so
 
     @torch.jit.export
     def blocked(self, compensated: Tensor, window: tuple[int, int] | None = None) -> Tensor:

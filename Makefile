@@ -19,7 +19,7 @@ demo: setup
 test: setup
 	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
-# Fuzzed files, drawn scenes and frames by the thousands, the largest ONNX graph; some tens of minutes.
+# Fuzzed files, drawn scenes and frames by the thousands, the largest graphs, compiled ones; some tens of minutes.
 test-long: setup
 	TORCHVTS_TEST_PROFILE=long $(BIN)/python -m pytest tests/test_properties.py tests/test_fuzz.py tests/test_export.py --no-cov -n auto
 

@@ -150,6 +150,7 @@ def test_onnx_without_torchvts(low, mini, tmp_path, kind):
     assert export.compare(path, pipe, frames, "onnx") <= 1e-3
 
 
+@pytest.mark.skipif(not LONG, reason="minutes to compile")
 def test_aoti_without_torchvts(mini, tmp_path):
     if export.missing("aoti"):
         pytest.skip(export.missing("aoti"))

@@ -11,6 +11,7 @@ Scenes where fewer than three pixels of contact in a hundred are dark are not dr
 
 import argparse
 import math
+import random
 from collections.abc import Iterator
 
 import torch
@@ -26,42 +27,32 @@ SIZE = (HEIGHT, WIDTH, MM_PER_PIXEL)
 SHAPES = ("ball", "capsule", "cone", "punch")
 
 
-class Draw:
-    """Numbers at random, the same for a seed."""
-
-    def __init__(self, seed: int) -> None:
-        self.generator = torch.Generator().manual_seed(seed)
-
-    def between(self, low: float, high: float) -> float:
-        return low + (high - low) * float(torch.rand((), generator=self.generator))
-
-
-def drawn_lights(draw: Draw) -> PointLights:
-    out, high, turn = draw.between(20.0, 32.0), draw.between(10.0, 22.0), draw.between(0.0, 120.0)
+def drawn_lights(draw: random.Random) -> PointLights:
+    out, high, turn = draw.uniform(20.0, 32.0), draw.uniform(10.0, 22.0), draw.uniform(0.0, 120.0)
     angles = [math.radians(turn + 120.0 * k) for k in range(3)]
     albedo = 0.2 * math.hypot(out, high) ** 3 / high  # a flat skin of value 0.2 in the middle
     return PointLights([[out * math.cos(a), out * math.sin(a), high] for a in angles], [albedo] * 3).requires_grad_(False)
 
 
-def drawn_scene(shape: str, draw: Draw) -> scenes.Scene:
-    place = (draw.between(-2.0, 2.0), draw.between(-1.5, 1.5))
+def drawn_scene(shape: str, draw: random.Random) -> scenes.Scene:
+    place = (draw.uniform(-2.0, 2.0), draw.uniform(-1.5, 1.5))
     if shape == "ball":
-        radius = draw.between(4.0, 8.0)
-        return scenes.sphere_press(radius, min(draw.between(0.8, 2.0), 0.45 * radius), place, *SIZE)
+        radius = draw.uniform(4.0, 8.0)
+        return scenes.sphere_press(radius, min(draw.uniform(0.8, 2.0), 0.45 * radius), place, *SIZE)
     if shape == "capsule":
-        radius, press = draw.between(3.0, 6.0), draw.between(0.8, 1.6)
-        return scenes.cylinder_press(radius, press, draw.between(6.0, 10.0), draw.between(0.0, 180.0), place, *SIZE)
+        radius, press = draw.uniform(3.0, 6.0), draw.uniform(0.8, 1.6)
+        return scenes.cylinder_press(radius, press, draw.uniform(6.0, 10.0), draw.uniform(0.0, 180.0), place, *SIZE)
     if shape == "cone":
-        return scenes.cone_press(draw.between(40.0, 70.0), draw.between(0.8, 1.8), 0.5, place, *SIZE)
-    radius, press, tilt = draw.between(2.5, 4.0), draw.between(0.6, 1.2), draw.between(0.0, 3.0)
-    return scenes.punch_press(radius, press, tilt, draw.between(0.6, 1.2), *SIZE)
+        return scenes.cone_press(draw.uniform(40.0, 70.0), draw.uniform(0.8, 1.8), 0.5, place, *SIZE)
+    radius, press, tilt = draw.uniform(2.5, 4.0), draw.uniform(0.6, 1.2), draw.uniform(0.0, 3.0)
+    return scenes.punch_press(radius, press, tilt, draw.uniform(0.6, 1.2), *SIZE)
 
 
-def dirty(image: Tensor, contact: Tensor, draw: Draw) -> Tensor:
+def dirty(image: Tensor, contact: Tensor, draw: random.Random) -> Tensor:
     """The image with a disc of 1 to 4 mm in diameter around a point of the contact, black in one channel."""
     places = torch.nonzero(contact[0, 0])
-    row, column = places[int(draw.between(0, len(places) - 1))].tolist()
-    radius, channel = draw.between(8.0, 30.0), int(draw.between(0, 2.999))
+    row, column = places[draw.randrange(len(places))].tolist()
+    radius, channel = draw.uniform(8.0, 30.0), draw.randrange(3)
     y, x = torch.arange(HEIGHT)[:, None] - row, torch.arange(WIDTH) - column
     image = image.clone()
     image[0, channel][x**2 + y**2 < radius**2] = 0.0
@@ -74,8 +65,8 @@ def rms_px(pipe: DepthPipeline, image: Tensor, scene: scenes.Scene) -> float:
 
 def errors(shape: str, kind: str, seed: int) -> tuple[float, float, float] | None:
     """RMS of depth in pixels: ours, the plain inverse's, and ours where no shadow is cast; None if hardly a light is blocked."""
-    draw = Draw(seed)
-    lights, scene, noise = drawn_lights(draw), drawn_scene(shape, draw), draw.between(0.001, 0.006)
+    draw = random.Random(f"{shape}, {kind}, {seed}")
+    lights, scene, noise = drawn_lights(draw), drawn_scene(shape, draw), draw.uniform(0.001, 0.006)
     camera = Conditions(lights, noise_std=noise, bits=8)
     rest = photograph(scenes.at_rest(scene), camera, 2 * seed)[0]
     image = without = photograph(scene, camera, 2 * seed + 1)

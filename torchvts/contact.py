@@ -244,9 +244,7 @@ class ContactMask(nn.Module):
         self._check(compensated)
         change, _, threshold = self._change(compensated.detach())
         dark = (change - self.rest < self.dark_noises) & (self.rest < -2.0 * self.dark_noises)
-        step = self.step
-        bright = compensated.detach()[:, :, step // 2 :: step, step // 2 :: step].mean(dim=(2, 3))
-        dark = dark | (bright < self.dead_below).any(dim=1)[:, None, None, None]  # with a lamp dead, too little is left to tell by
+        dark = dark | self._black(compensated).any(dim=1)[:, None, None, None]  # with a lamp dead, too little is left to tell by
         lit = change.masked_fill(dark, 0.0).square().sum(dim=1, keepdim=True) <= threshold
         return lit & (dark.to(torch.uint8).sum(dim=1, keepdim=True) == 1)
 
@@ -270,9 +268,7 @@ class ContactMask(nn.Module):
     def _change(self, compensated: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Change in units of the calibrated noise (B, 3, H, W), its square summed over channels, and that one's threshold."""
         change = torch.addcmul(self.rest, compensated, self.per_noise)
-        step = self.step
-        bright = compensated.detach()[:, :, step // 2 :: step, step // 2 :: step].mean(dim=(2, 3))  # (B, 3)
-        broken = bright < self.dead_below
+        broken = self._black(compensated)
         if not may_read_values() or bool(broken.any()):
             broken = broken & (broken.to(torch.uint8).sum(dim=1, keepdim=True) == 1)
             change = change * (~broken)[:, :, None, None].to(change.dtype)
@@ -283,6 +279,11 @@ class ContactMask(nn.Module):
             noise * noise + self.rounding
         )  # of smooth light, rounding to 8 bits is no white noise, and not seen there
         return change, squared, (self.sigmas * noise).square()[:, None, None, None]
+
+    def _black(self, compensated: Tensor) -> Tensor:
+        """Channels that are black in all of a frame, bool (B, 3)."""
+        step = self.step
+        return compensated.detach()[:, :, step // 2 :: step, step // 2 :: step].mean(dim=(2, 3)) < self.dead_below
 
     def _clean(self, change: Tensor, strong: Tensor, threshold: Tensor) -> tuple[Tensor, Tensor]:
         strong = _erode(_dilate(strong))  # closing: pixels lost to noise at the rim

@@ -222,11 +222,7 @@ class DepthPipeline(nn.Module):
                         seen, touched, shaded, blocked, gradient, torn, (top, left), (height, width)
                     )
                     touched = touched & ~resting
-                    if bottom - top == height and right - left == width:
-                        contact = touched
-                    else:
-                        contact = contact.clone()
-                        contact[:, :, top:bottom, left:right] = touched
+                    contact = nn.functional.pad(touched, [left, width - right, top, height - bottom])
                     depth = self.integrate(gradient, (top, left), (height, width))
                     gradient, depth = self._guess_again(seen, touched, gradient, depth, blocked, torn, (top, left))
             gradient, depth = self._refine(seen, touched, gradient, depth, active, (top, left))

@@ -39,9 +39,6 @@ class Scores(NamedTuple):
     centers_px: list[float]
     radii_px: list[float]
 
-    def __add__(self, other: "Scores") -> "Scores":  # type: ignore[override]
-        return Scores(*(one + more for one, more in zip(self, other)))
-
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -70,20 +67,20 @@ def main() -> int:
             for kind, number, jobs in [*named, (f"presses, prior of another ball, {FOLDS}-fold", usual, folds)]:
                 found = Scores([], [], [])
                 for ball, draw in jobs:
-                    found += score(background, sensors[ball], draw, [], left(scored, draw, ball))
+                    score(found, background, sensors[ball], draw, [], left(scored, draw, ball))
                     bar.update()
                 rows.append((kind, number, found))
         for count in (1, 2, 3, 5, 10, len(presses) - len(presses) // 5):
             found = Scores([], [], [])
             for draw in draws(presses, count, arguments.draws):
-                found += score(background, bare, draw, [], left(scored, draw))
+                score(found, background, bare, draw, [], left(scored, draw))
                 bar.update()
             rows.append(("presses, no prior", count, found))
         for count in (1, 5, 10, min(30, len(presses) - 1)):
             found = Scores([], [], [])
             for draw in draws(presses, count, arguments.draws):
                 one = random.Random(count).choice([press for press in scored if press not in draw] or scored)
-                found += score(background, bare, [one], draw, left(scored, [one]))
+                score(found, background, bare, [one], draw, left(scored, [one]))
                 bar.update()
             rows.append(("touches, and one press for the scale", count, found))
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -106,40 +103,39 @@ def left(scored: Sequence[vts.Press], used: Sequence[vts.Press], ball: float | N
 
 
 def score(
+    found: Scores,
     background: torch.Tensor,
     sensor: vts.Sensor,
     presses: Sequence[vts.Press],
     touches: Sequence[vts.Press],
     judged: Sequence[vts.Press],
-) -> Scores:
-    """Calibrate with the labels forgotten, and score the precise depth of other presses."""
+) -> None:
+    """Calibrate with the labels forgotten, and add to what was found the scores of other presses' precise depth."""
     blind = [dataclasses.replace(press, center_px=None, contact_radius_px=None) for press in presses]
     calibration = vts.calibrate(background, sensor, blind, [press.image for press in touches])
     pipe = vts.DepthPipeline.from_calibration(calibration, "precise")
-    scores = Scores([], [], [])
     for press in judged:
         with torch.inference_mode():
             out = pipe(press.image[None])
-        scores.left_out.append(score_press(press, out.depth_mm, out.normal, sensor.mm_per_pixel))
+        found.left_out.append(score_press(press, out.depth_mm, out.normal, sensor.mm_per_pixel))
     labels = {press.name: press for press in presses}
     for told in calibration.report.get("presses", []):
         press = labels[told["name"]]
         if told["used"] and press.center_px is not None and press.contact_radius_px is not None:
-            scores.centers_px.append(math.dist(told["center_px"], press.center_px))
-            scores.radii_px.append(abs(told["contact_radius_px"] - press.contact_radius_px))
-    return scores
+            found.centers_px.append(math.dist(told["center_px"], press.center_px))
+            found.radii_px.append(abs(told["contact_radius_px"] - press.contact_radius_px))
 
 
 def table(rows: Sequence[tuple[str, int, Scores]]) -> str:
     lines = [
-        "| given | number | normals deg | relief um | radius %, median | scored | centers, radii found, px, median |",
-        "|---" * 7 + "|",
+        "| given | number | normals deg | relief um | of it tilt | radius %, median | scored | centers, radii found, px, median |",
+        "|---" * 8 + "|",
     ]
     for kind, count, (scores, centers, radii) in rows:
         radius = statistics.median(s.radius_percent for s in scores if s.radius_percent is not None)
-        angle, relief = statistics.mean(s.normal_deg for s in scores), statistics.mean(s.relief_um for s in scores)
+        angle, relief, tilt = (statistics.mean(of) for of in zip(*((s.normal_deg, s.relief_um, s.tilt_um) for s in scores)))
         found = f"{statistics.median(centers):.2f}, {statistics.median(radii):.2f}" if centers and "touches" not in kind else ""
-        lines.append(f"| {kind} | {count} | {angle:.2f} | {relief:.1f} | {radius:.1f} | {len(scores)} | {found} |")
+        lines.append(f"| {kind} | {count} | {angle:.2f} | {relief:.1f} | {tilt:.1f} | {radius:.1f} | {len(scores)} | {found} |")
     return "\n".join(lines)
 
 

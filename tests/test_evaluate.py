@@ -111,6 +111,7 @@ def test_a_scaled_depth_is_off_by_its_scale(press):
     truth = ev.ball_truth(given, HEIGHT, WIDTH, PITCH)
     cap = truth.depth_mm[truth.region]
     assert score.relief_um == pytest.approx(100.0 * float(cap.std(correction=0)), rel=1e-3)
+    assert score.tilt_um < 1e-2 * score.relief_um  # a ball in the middle scaled is no plane
     assert score.apex_um == pytest.approx(
         100.0 * float(cap.max() - cap.min()), rel=0.15
     )  # middle and rim are means over a few pixels
@@ -125,6 +126,7 @@ def test_a_tilted_depth_moves_the_fitted_ball(press):
     score = ev.score_press(given, scene.depth_mm.double() + tilt, scene.normal, PITCH)
     truth = ev.ball_truth(given, HEIGHT, WIDTH, PITCH)
     assert score.relief_um == pytest.approx(1000.0 * float(tilt[truth.region].std(correction=0)), rel=1e-3)
+    assert score.tilt_um == pytest.approx(score.relief_um, rel=1e-3)
     assert score.center_px == pytest.approx(slope * 0.5 * BALL_MM / PITCH, rel=0.15)
 
 

@@ -243,6 +243,15 @@ def test_a_batch_of_mixed_frames_equals_single_frames(mixed, small_sensor, mode)
         assert (getattr(whole, name).double() - expected.double()).abs().max() < 2e-6, name
 
 
+@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
+def test_images_in_double_precision_need_no_other_pipeline(mixed, small_sensor, mode):
+    lights, frames = mixed
+    pipe = pipeline(lights, small_sensor, mode)
+    wide, usual = pipe(frames.double()), pipe(frames)
+    assert wide.depth_mm.dtype == torch.float64 and torch.equal(wide.contact, usual.contact)
+    assert (wide.depth_mm - usual.depth_mm).abs().max() < 1e-5
+
+
 def test_auto_is_precise_where_worth_it_and_fast_where_not(mixed, small_sensor):
     lights, frames = mixed
     fast, precise, auto = (pipeline(lights, small_sensor, mode)(frames).depth_mm for mode in ("fast", "precise", "auto"))

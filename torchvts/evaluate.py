@@ -62,6 +62,8 @@ class PressScore:
         press, method: names.
         normal_deg: mean angle between normals, degrees.
         relief_um: RMS difference of depth and ball, each less its own mean, micrometres.
+        tilt_um: the part of it that is a plane: all that a wrong label of the center does, and what fields get wrong alike all over
+            a contact.
         radius_percent: how far the radius of a sphere fitted to depth is from the ball's; None for a depth that is a plane.
         center_px: how far that sphere's center is from the ball's, pixels; None as well.
         apex_um: depth of the middle over the rim of the area less the ball's, micrometres; None if the image cuts off either.
@@ -74,6 +76,7 @@ class PressScore:
     method: str
     normal_deg: float
     relief_um: float
+    tilt_um: float
     radius_percent: float | None
     center_px: float | None
     apex_um: float | None
@@ -95,6 +98,7 @@ class MethodSummary:
     presses: int
     normal_deg: float
     relief_um: float
+    tilt_um: float
     radius_percent: float | None
     center_px: float | None
     apex_um: float | None
@@ -206,6 +210,7 @@ def score_press(press: Press, depth_mm: Tensor, normal: Tensor, mm_per_pixel: fl
         method,
         float(inside.mean()),
         1000.0 * float(error.std(correction=0)),
+        1000.0 * _tilt(error, torch.stack((columns, rows))),
         radius_percent,
         center_px,
         apex_um,
@@ -214,6 +219,13 @@ def score_press(press: Press, depth_mm: Tensor, normal: Tensor, mm_per_pixel: fl
         by_place,
         place_pixels,
     )
+
+
+def _tilt(error: Tensor, place: Tensor) -> float:
+    """RMS of the plane that fits error (N,) at places (2, N) best, less its mean."""
+    across = (place - place.double().mean(1, keepdim=True)).t()
+    plane = across @ torch.linalg.lstsq(across, (error - error.mean())[:, None]).solution
+    return float(plane.std(correction=0))
 
 
 def _sphere_error(press: Press, depth_mm: Tensor, truth: BallTruth, mm_per_pixel: float) -> tuple[float | None, float | None]:
@@ -650,6 +662,7 @@ def _summary(method: str, made: list[Method], scores: list[PressScore]) -> Metho
         len(scores),
         sum(score.normal_deg for score in scores) / len(scores),
         sum(score.relief_um for score in scores) / len(scores),
+        sum(score.tilt_um for score in scores) / len(scores),
         _median([score.radius_percent for score in scores]),
         _median([score.center_px for score in scores]),
         _mean([None if score.apex_um is None else abs(score.apex_um) for score in scores]),
@@ -672,15 +685,15 @@ def _median(values: Sequence[float | None]) -> float | None:
 def table(evaluation: Evaluation) -> str:
     """The summaries as a Markdown table; means over presses, but medians for the sphere; of the apex the absolute error."""
     lines = [
-        "| method | numbers | normal deg | relief um | radius % | center px | apex um | worst press | note |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| method | numbers | normal deg | relief um | of it tilt | radius % | center px | apex um | worst press | note |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in evaluation.summaries:
         tail = [
             f"{v:.{d}f}" if v is not None else "none" for v, d in ((row.radius_percent, 1), (row.center_px, 2), (row.apex_um, 0))
         ]
         lines.append(
-            f"| {row.method} | {row.numbers} | {row.normal_deg:.2f} | {row.relief_um:.1f} | {' | '.join(tail)} "
+            f"| {row.method} | {row.numbers} | {row.normal_deg:.2f} | {row.relief_um:.1f} | {row.tilt_um:.1f} | {' | '.join(tail)} "
             f"| {row.worst_press} ({row.worst_deg:.1f} deg) | {row.note} |"
         )
     return "\n".join(lines)

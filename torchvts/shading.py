@@ -325,7 +325,7 @@ def normal_at_depth(
     table = torch.cat((cross, third - second), dim=1) / albedo[:, None]  # (light, 6)
     # results near 1, however far the lights
     table = table / (table.detach().abs().amax(dim=(0, 1)) * position_mm.detach().norm() ** 3)
-    sums = (table.t() @ share.flatten(2)).unflatten(2, depth_mm.shape[2:])  # (B, 6, H, W)
+    sums = (table.t().to(share.dtype) @ share.flatten(2)).unflatten(2, depth_mm.shape[2:])  # (B, 6, H, W)
     u, v, w = sums[:, 3:4], sums[:, 4:5], sums[:, 5:6]
     n_x = torch.addcmul(torch.addcmul(sums[:, 0:1], y, w, value=-1.0), depth_mm, v)
     n_y = torch.addcmul(torch.addcmul(sums[:, 1:2], x, w), depth_mm, u, value=-1.0)

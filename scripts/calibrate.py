@@ -38,6 +38,10 @@ def main() -> int:
         image, presses = vts.read_presses(arguments.background)
         if not arguments.use_labels:
             presses = [dataclasses.replace(press, center_px=None, contact_radius_px=None) for press in presses]
+        elif all(press.center_px is None for press in presses):
+            parser.error(
+                f"--use-labels: {arguments.background} holds neither label.npz nor labels.csv: leave it out, centers are found"
+            )
     else:
         image = vts.read_image(arguments.background)
     if arguments.sensor is not None:
@@ -74,7 +78,9 @@ def print_candidates(candidates: list[dict[str, Any]]) -> None:
         misfit = f"{row['misfit']:.1%}" if "misfit" in row else ""
         family = row.get("family", "") + (f", gamma {row['gamma']:g}" if row.get("gamma", 1.0) != 1.0 else "")
         print(f"| {row['model']} | {family} | {row['pass']} | {row['numbers']} | {score} | {misfit} | {row.get('note', '')} |")
-    print("deg: of point lights without presses, how loose the image leaves them; else the mean angle on held-out presses")
+    print(
+        "deg: of point lights without a note of presses, how loose the image leaves them; else the mean angle on held-out presses"
+    )
     print("misfit: smooth relative structure of the image that the lights leave unexplained\n")
 
 
@@ -88,13 +94,14 @@ def print_lights(lights: vts.PointLights, report: dict[str, Any]) -> None:
 
 
 def print_presses(presses: list[dict[str, Any]]) -> None:
-    print("| press | center px | contact radius px | off by deg | |\n|---|---|---|---|---|")
+    print("| press | center px | contact radius px | off by deg | times as wide as said | |\n|---|---|---|---|---|---|")
     for press in presses:
         center = ", ".join(f"{v:.1f}" for v in press["center_px"]) if "center_px" in press else ""
         radius = f"{press['contact_radius_px']:.1f}" if "contact_radius_px" in press else ""
         off = f"{press['error_deg']:.1f}" if "error_deg" in press else ""
-        print(f"| {press['name']} | {center} | {radius} | {off} | {press['reason'] and 'left out: ' + press['reason']} |")
-    print()
+        wide = f"{1.0 / max(press['gain'], 1e-3):.2f}" if "gain" in press else ""
+        print(f"| {press['name']} | {center} | {radius} | {off} | {wide} | {press['reason'] and 'left out: ' + press['reason']} |")
+    print("off by, times as wide: of slopes by a first pass of the others' field, or of the prior's, against the ball's\n")
 
 
 if __name__ == "__main__":

@@ -556,6 +556,28 @@ def test_two_wrong_diameters_among_seven_are_left_out(good, rest):
     assert [row["used"] for row in calibration.report["presses"]] == [True] * 5 + [False] * 2
 
 
+@pytest.mark.parametrize("count", [3, 5, 9])
+@pytest.mark.parametrize("times", [1.5, 1 / 1.5])
+def test_one_wrong_diameter_costs_no_good_press_and_moves_no_ball(rest, count, times):
+    presses = take_presses(count=10)
+    kept, odd = presses[:count], dataclasses.replace(presses[9], ball_diameter_mm=times * BALL_MM, name="odd")
+    alone, _ = calibrate(rest, GIVEN, kept)
+    calibration, warned = calibrate(rest, GIVEN, [*kept[:2], odd, *kept[2:]])
+    rows = {row["name"]: row for row in calibration.report["presses"]}
+    assert [name for name, row in rows.items() if not row["used"]] == ["odd"]
+    assert [text for text in warned if text.startswith("odd: left out: by the other ")]
+    for row in alone.report["presses"]:
+        assert rows[row["name"]]["center_px"] == pytest.approx(row["center_px"], abs=1e-9)
+
+
+def test_a_prior_sees_which_of_three_diameters_is_wrong(prior):
+    sensor = dataclasses.replace(GIVEN, prior=prior)
+    presses = other_presses(3)
+    presses[1] = dataclasses.replace(presses[1], ball_diameter_mm=1.5 * presses[1].ball_diameter_mm)
+    calibration, _ = calibrate(background(seen_by_other_curve), sensor, presses)
+    assert [row["used"] for row in calibration.report["presses"]] == [True, False, True]
+
+
 @pytest.mark.parametrize("ball_mm", [60.0, 500.0])
 def test_an_absurd_diameter_is_left_out_like_any_other(good, rest, ball_mm):
     calibration, warned = calibrate(rest, GIVEN, [*good, dataclasses.replace(good[0], ball_diameter_mm=ball_mm, name="absurd")])

@@ -103,7 +103,9 @@ def center_by_slope(contact: Contact, slope_map: Tensor, pitch_mm: float, rounds
     for _ in range(rounds):
         inside = contact.inside()
         if int(inside.sum()) < LEAST_INSIDE:
-            contact.reason = "no ball fits the contact: too small, or not round"
+            contact.reason = (
+                f"no ball of {2 * contact.radius_mm:g} mm fits the contact: wrong diameter, too faint a press, or not round"
+            )
             return
         down = contact.down()[inside]
         # slope = -(x - center) / down, weighted so that a pixel counts by its normal rather than by its slope

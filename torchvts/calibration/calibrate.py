@@ -35,6 +35,9 @@ PINNED_DEG = 2.0
 USUAL_GAIN = 1.15
 """Slopes by a prior over those of the balls are within this factor: 0.93 to 1.00 on a GelSight Mini."""
 
+DOUBTFUL_GAIN = 1.25
+"""Slopes by the field of the other presses over those of a ball are within this factor where ten presses or more agree."""
+
 GIVEN_MISFIT = 0.2
 """RMS of log(background / what the sensor file's lights give) from which they are not this unit's."""
 
@@ -154,6 +157,8 @@ def calibrate(
     _warn_left_out(contacts)
     if prior is not None:
         _warn_of_diameters(used)
+    else:
+        _warn_of_doubt(used)
     told: dict[str, Any] = {} if touched is None else {"touches": touched["touches"]}
     told |= {"candidates": candidates, "presses": [_tell(contact, sensor) for contact in contacts]}
     # twelve numbers that do about as well as a hundred are the better model
@@ -392,6 +397,19 @@ def _warn_of_diameters(contacts: Sequence[Contact]) -> None:
         warnings.warn(
             f"presses: by the sensor's prior the balls seem {1.0 / gain:.2f} times as wide as was said: wrong diameter or pitch? "
             "if they are right, this unit differs from the prior's, and more presses tell",
+            CalibrationWarning,
+            stacklevel=3,
+        )
+
+
+def _warn_of_doubt(contacts: Sequence[Contact]) -> None:
+    """Diameters that the other presses neither contradict nor bear out: fields of few presses are too rough to tell."""
+    doubtful = [c for c in contacts if abs(math.log(max(c.figures.get("gain", 1.0), 1e-3))) > math.log(DOUBTFUL_GAIN)]
+    if doubtful:
+        named = ", ".join(f"{c.name} ({1.0 / c.figures['gain']:.2f})" for c in doubtful)
+        warnings.warn(
+            f"presses: by the others the balls of {named} seem so many times as wide as was said: a wrong diameter, or a skin that "
+            "differs from place to place; more presses tell",
             CalibrationWarning,
             stacklevel=3,
         )

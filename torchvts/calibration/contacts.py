@@ -194,11 +194,11 @@ def _unusable(image: Tensor, background: Tensor, mask: Tensor) -> str:
         return (
             f"no contact: only {share:.2%} of the image differs from the background; is it the background itself, or a faint press?"
         )
-    if share > 0.8 and float(border) > 0.6:
-        return f"{share:.0%} of the image differs from the background: another unit, other exposure, or the light has changed"
     full = ((image > 0.995).any(dim=0) & (background < 0.995).all(dim=0) & mask.cpu()).double().sum() / mask.double().sum()
     if float(full) > 0.2:
         return f"{float(full):.0%} of the contact is saturated: lower the exposure"
+    if share > 0.8 and float(border) > 0.6:
+        return f"{share:.0%} of the image differs from the background: another unit, other exposure, or the light has changed"
     return ""
 
 

@@ -1,5 +1,6 @@
 """A response model from presses: balls found, contradictions left out, the smallest family that explains them chosen."""
 
+import copy
 import dataclasses
 import math
 from dataclasses import dataclass, field
@@ -37,6 +38,14 @@ FEW_PENALTY = 3.0
 """Penalty on leaving a prior when there are too few presses to choose one: two presses or less."""
 
 
+FAR_FROM_PRIOR = 1.4
+FAR_FROM_OTHERS = 1.35
+FAR_FROM_ONE = 1.5
+"""A diameter is wrong where it seems so many times what was said: by a prior; beside all others, by the prior or by their field;
+by a single other press elsewhere. Right ones, GelSight Mini: by the prior of another ball 0.76 to 1.10, beside their median 0.82
+to 1.17. Six other presses or fewer, no prior, put up to two good ones in five draws beyond, and find three wrong ones in four."""
+
+
 @dataclass
 class ResponseFit:
     """What presses gave: the model, the candidates and the choice."""
@@ -72,13 +81,9 @@ def fit_response(
     pitch = sensor.mm_per_pixel
     half_mm = prior.fast.half_mm if prior is not None else 0.5 * sensor.width * pitch
     options = [Family(degree, products, False, half_mm, product_penalty) for degree, products in families]
-    with tqdm(total=4, desc="calibrating from presses", disable=not progress, leave=False) as bar:
+    with tqdm(total=3, desc="calibrating from presses", disable=not progress, leave=False) as bar:
         bar.set_postfix(step="balls")
-        locate(contacts, pitch, sensor, prior, half_mm)
-        bar.update()
-        bar.set_postfix(step="contradictions")
-        leave_out(contacts, light, pitch, prior, half_mm)
-        used = [contact for contact in contacts if not contact.reason]
+        used = _judged(contacts, light, pitch, sensor, prior, half_mm)
         if not used:
             raise ValueError("presses: none can be used: " + "; ".join(f"{c.name}: {c.reason}" for c in contacts))
         bar.update()
@@ -105,6 +110,18 @@ def fit_response(
     )
     reason = f"{chosen}, from {count} presses: {'too few to choose by holding some out' if score is None else how}"
     return ResponseFit(ResponseModel(fast, deep, sensor.exponent, sensor.blur_px), score, rows, reason)
+
+
+def _judged(
+    contacts: list[Contact], light: Tensor, pitch_mm: float, sensor: Sensor, prior: ResponseModel | None, half_mm: float
+) -> list[Contact]:
+    """Balls found and judged; found again without those left out, which have moved the others where there is no prior."""
+    found = None
+    while found is None or (prior is None and len(found) > sum(not contact.reason for contact in contacts)):
+        locate(contacts, pitch_mm, sensor, prior, half_mm)
+        found = [contact for contact in contacts if not contact.reason]
+        leave_out(contacts, light, pitch_mm, prior, half_mm)
+    return [contact for contact in contacts if not contact.reason]
 
 
 def held_out_deg(contacts: list[Contact], like: ResponseField) -> float:
@@ -174,40 +191,68 @@ def slope_maps(contacts: list[Contact], model: ResponseModel, pitch_mm: float) -
 
 
 def leave_out(contacts: list[Contact], light: Tensor, pitch_mm: float, prior: ResponseModel | None, half_mm: float) -> None:
-    """Give a reason to presses that the others, or the prior, contradict, the worst first."""
+    """Give a reason to presses that the others, or the prior, contradict, one after the other.
+
+    By the prior a ball seems so many times smaller than was said. Without one it is the field of the others that says so, and a
+    wrong press bends it for all: the press to leave out is the one without which the others agree best.
+    """
     while True:
         used = [contact for contact in contacts if not contact.reason]
         if len(used) < (1 if prior is not None else 2):
             return
-        small = Family.of(prior.fast) if prior is not None else Family(min(2, len(used) // 4), -1, False, half_mm)
-        # without a prior fields are small: let brightness tell what it can of the place
-        evidence = _Evidence(small, used if prior is not None else evened(used, light, half_mm, pitch_mm)[1])
-        forms = evidence.forms
+        judge = (
+            "the sensor's prior"
+            if prior is not None
+            else "the other press"
+            if len(used) == 2
+            else f"the other {len(used) - 1} presses"
+        )
         if prior is not None:
-            solutions = [prior.fast.tensor().reshape(-1)] * len(forms)
+            evidence = _Evidence(Family.of(prior.fast), used)
+            solutions = [prior.fast.tensor().reshape(-1)] * len(used)
         else:
+            # fields are small here: let brightness tell what it can of the place
+            small = Family(2 if len(used) >= 8 else 0, -1, False, half_mm)
+            evidence = _Evidence(small, evened(used, light, half_mm, pitch_mm)[1])
             solutions = evidence.held_out(0.01 * small.penalty(), None)
-        gains = torch.tensor([item.gain(solution) for item, solution in zip(forms, solutions)], dtype=torch.float64)
-        errors = torch.tensor([item.error_deg(solution) for item, solution in zip(forms, solutions)], dtype=torch.float64)
-        usual = float(errors.median())
+        gains = evidence.gains(solutions)
+        errors = torch.tensor([item.error_deg(solution) for item, solution in zip(evidence.forms, solutions)], dtype=torch.float64)
         for contact, gain, error in zip(used, gains.tolist(), errors.tolist()):
             contact.figures |= {"error_deg": error, "gain": gain}
-        log_gain = gains.clamp_min(1e-3).log()
-        worst = int(log_gain.abs().argmax())
-        if float(log_gain.abs()[worst]) > math.log(1.5):
-            seen = 2 * used[worst].radius_mm / max(float(gains[worst]), 1e-3)
-            others = "the other press" if len(used) == 2 else f"the other {len(used) - 1} presses"
-            judge = others if prior is None else "the sensor's prior"
-            used[worst].reason = f"by {judge} the ball seems {seen:.2f} mm wide, but {2 * used[worst].radius_mm:g} mm was given"
+        odd = _odd_diameter(evidence, gains, prior is not None)
+        if odd is not None:
+            press = used[odd]
+            seen = 2 * press.radius_mm / max(float(gains[odd]), 1e-3)
+            press.reason = f"by {judge} the ball seems {seen:.2f} mm wide, but {2 * press.radius_mm:g} mm was given"
             if prior is None and len(used) == 2:
-                used[1 - worst].reason = "contradicts the only other press: one of the two diameters is wrong"
+                used[1 - odd].reason = "contradicts the only other press: one of the two diameters is wrong"
             continue
-        worst = int(errors.argmax())
+        worst, usual = int(errors.argmax()), float(errors.median())
         if float(errors[worst]) > max(3.0 * usual, 8.0) or float(errors[worst]) > 15.0:
             off_deg = float(errors[worst])
             used[worst].reason = f"its slopes are {off_deg:.1f} degrees from a ball's, others' {usual:.1f}: not a clean press"
             continue
         return
+
+
+def _odd_diameter(evidence: "_Evidence", gains: Tensor, by_prior: bool) -> int | None:
+    """Which press to leave out for its diameter, if any; gains are slopes found over slopes expected."""
+    logs = gains.clamp_min(1e-3).log()
+    if by_prior:
+        beside = logs - logs.median() if len(logs) > 2 else logs
+        for far, limit in ((logs, FAR_FROM_PRIOR), (beside, FAR_FROM_OTHERS)):
+            worst = int(far.abs().argmax())
+            if float(far[worst].abs()) > math.log(limit):
+                return worst
+        return None
+    if float(logs.abs().max()) <= math.log(FAR_FROM_OTHERS if len(logs) > 2 else FAR_FROM_ONE):
+        return None
+    if len(logs) == 2:
+        return int(logs.abs().argmax())
+    left = [evidence.without(k) for k in range(len(logs))]
+    penalty = 0.01 * evidence.family.penalty()
+    agree = [float(rest.gains(rest.held_out(penalty, None)).clamp_min(1e-3).log().square().mean()) for rest in left]
+    return min(range(len(logs)), key=lambda k: agree[k])
 
 
 def _choose(
@@ -248,10 +293,25 @@ class _Evidence:
     """What all contacts say of a family's coefficients, together and without one."""
 
     def __init__(self, family: Family, contacts: list[Contact]) -> None:
+        self.family = family
         self.forms = [ContactForms(family, contact) for contact in contacts]
-        self.each = [item.ball() for item in self.forms]
-        self.form = torch.stack([form for form, _ in self.each]).sum(0)
-        self.right = torch.stack([right for _, right in self.each]).sum(0)
+        self._weigh([item.ball() for item in self.forms])
+
+    def _weigh(self, each: list[tuple[Tensor, Tensor]]) -> None:
+        self.each = each
+        self.form = torch.stack([form for form, _ in each]).sum(0)
+        self.right = torch.stack([right for _, right in each]).sum(0)
+
+    def without(self, place: int) -> "_Evidence":
+        """The same less one contact."""
+        other = copy.copy(self)
+        other.forms = self.forms[:place] + self.forms[place + 1 :]
+        other._weigh(self.each[:place] + self.each[place + 1 :])
+        return other
+
+    def gains(self, solutions: list[Tensor]) -> Tensor:
+        """For each contact the slopes its coefficients give over the ball's."""
+        return torch.tensor([item.gain(solution) for item, solution in zip(self.forms, solutions)], dtype=torch.float64)
 
     def solve(self, penalty: Tensor, start: Tensor | None) -> Tensor:
         """Coefficients by all contacts."""

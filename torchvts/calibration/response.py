@@ -43,7 +43,7 @@ FAR_FROM_OTHERS = 1.35
 FAR_FROM_ONE = 1.5
 """A diameter is wrong where it seems so many times what was said: by a prior; beside all others, by the prior or by their field;
 by a single other press elsewhere. Right ones, GelSight Mini: by the prior of another ball 0.76 to 1.10, beside their median 0.82
-to 1.17. Six other presses or fewer, no prior, put up to two good ones in five draws beyond, and find three wrong ones in four."""
+to 1.17. Fields of seven presses or fewer are rough: in two draws of five they leave out a good one."""
 
 
 @dataclass

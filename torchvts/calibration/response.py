@@ -1,6 +1,5 @@
 """A response model from presses: balls found, contradictions left out, the smallest family that explains them chosen."""
 
-import copy
 import dataclasses
 import math
 from dataclasses import dataclass, field
@@ -33,6 +32,9 @@ ENOUGH = 5
 """Presses from which a field starts from nothing. Fewer, without a prior, start from the field that they give as touches: their
 centers are too uncertain for more. A GelSight Mini by 2, 3, 5 and 7 presses, precise: from nothing 5.69, 6.27, 4.42 and 3.52
 degrees, from that field 5.22, 4.98, 4.65 and 4.11."""
+
+JUDGES_PENALTY = 0.01
+"""Penalty of the small fields by which presses without a prior judge each other."""
 
 FEW_PENALTY = 3.0
 """Penalty on leaving a prior when there are too few presses to choose one: two presses or less."""
@@ -127,7 +129,7 @@ def _judged(
 def held_out_deg(contacts: list[Contact], like: ResponseField) -> float:
     """Mean angle on each press by a field of that family that the others give, degrees."""
     family = Family.of(like)
-    evidence = _Evidence(family, contacts)
+    evidence = _Evidence.of(family, contacts)
     return evidence.mean_error(evidence.held_out(OWN_PENALTIES[1] * family.penalty(), None))
 
 
@@ -200,26 +202,20 @@ def leave_out(contacts: list[Contact], light: Tensor, pitch_mm: float, prior: Re
         used = [contact for contact in contacts if not contact.reason]
         if len(used) < (1 if prior is not None else 2):
             return
-        judge = (
-            "the sensor's prior"
-            if prior is not None
-            else "the other press"
-            if len(used) == 2
-            else f"the other {len(used) - 1} presses"
-        )
         if prior is not None:
-            evidence = _Evidence(Family.of(prior.fast), used)
+            judge, evidence = "the sensor's prior", _Evidence.of(Family.of(prior.fast), used)
             solutions = [prior.fast.tensor().reshape(-1)] * len(used)
         else:
+            judge = "the other press" if len(used) == 2 else f"the other {len(used) - 1} presses"
             # fields are small here: let brightness tell what it can of the place
             small = Family(2 if len(used) >= 8 else 0, -1, False, half_mm)
-            evidence = _Evidence(small, evened(used, light, half_mm, pitch_mm)[1])
-            solutions = evidence.held_out(0.01 * small.penalty(), None)
+            evidence = _Evidence.of(small, evened(used, light, half_mm, pitch_mm)[1])
+            solutions = evidence.held_out(JUDGES_PENALTY * small.penalty(), None)
         gains = evidence.gains(solutions)
         errors = torch.tensor([item.error_deg(solution) for item, solution in zip(evidence.forms, solutions)], dtype=torch.float64)
         for contact, gain, error in zip(used, gains.tolist(), errors.tolist()):
             contact.figures |= {"error_deg": error, "gain": gain}
-        odd = _odd_diameter(evidence, gains, prior is not None)
+        odd = _odd_by_others(evidence, gains) if prior is None else _odd_by_prior(gains)
         if odd is not None:
             press = used[odd]
             seen = 2 * press.radius_mm / max(float(gains[odd]), 1e-3)
@@ -235,24 +231,31 @@ def leave_out(contacts: list[Contact], light: Tensor, pitch_mm: float, prior: Re
         return
 
 
-def _odd_diameter(evidence: "_Evidence", gains: Tensor, by_prior: bool) -> int | None:
-    """Which press to leave out for its diameter, if any; gains are slopes found over slopes expected."""
+def _odd_by_prior(gains: Tensor) -> int | None:
+    """Which press to leave out for its diameter, if any; gains are slopes by the prior over slopes expected."""
     logs = gains.clamp_min(1e-3).log()
-    if by_prior:
-        beside = logs - logs.median() if len(logs) > 2 else logs
-        for far, limit in ((logs, FAR_FROM_PRIOR), (beside, FAR_FROM_OTHERS)):
-            worst = int(far.abs().argmax())
-            if float(far[worst].abs()) > math.log(limit):
-                return worst
-        return None
+    beside = logs - logs.median() if len(logs) > 2 else logs
+    for far, limit in ((logs, FAR_FROM_PRIOR), (beside, FAR_FROM_OTHERS)):
+        worst = int(far.abs().argmax())
+        if float(far[worst].abs()) > math.log(limit):
+            return worst
+    return None
+
+
+def _odd_by_others(evidence: "_Evidence", gains: Tensor) -> int | None:
+    """The same where each press's gain is by the field of the others."""
+    logs = gains.clamp_min(1e-3).log()
     if float(logs.abs().max()) <= math.log(FAR_FROM_OTHERS if len(logs) > 2 else FAR_FROM_ONE):
         return None
     if len(logs) == 2:
         return int(logs.abs().argmax())
-    left = [evidence.without(k) for k in range(len(logs))]
-    penalty = 0.01 * evidence.family.penalty()
-    agree = [float(rest.gains(rest.held_out(penalty, None)).clamp_min(1e-3).log().square().mean()) for rest in left]
-    return min(range(len(logs)), key=lambda k: agree[k])
+    penalty = JUDGES_PENALTY * evidence.family.penalty()
+
+    def disagreement(place: int) -> float:
+        rest = evidence.without(place)
+        return float(rest.gains(rest.held_out(penalty, None)).clamp_min(1e-3).log().square().mean())
+
+    return min(range(len(logs)), key=disagreement)
 
 
 def _choose(
@@ -268,7 +271,7 @@ def _choose(
     rows: list[dict[str, Any]] = []
     fields: list[ResponseField] = []
     for family in families:
-        evidence = _Evidence(family, contacts)
+        evidence = _Evidence.of(family, contacts)
         start: Tensor | None = None
         names: tuple[float, ...] = OWN_PENALTIES
         if prior is not None:
@@ -292,22 +295,21 @@ def _choose(
 class _Evidence:
     """What all contacts say of a family's coefficients, together and without one."""
 
-    def __init__(self, family: Family, contacts: list[Contact]) -> None:
-        self.family = family
-        self.forms = [ContactForms(family, contact) for contact in contacts]
-        self._weigh([item.ball() for item in self.forms])
-
-    def _weigh(self, each: list[tuple[Tensor, Tensor]]) -> None:
-        self.each = each
+    def __init__(self, family: Family, forms: list[ContactForms], each: list[tuple[Tensor, Tensor]]) -> None:
+        self.family, self.forms, self.each = family, forms, each
         self.form = torch.stack([form for form, _ in each]).sum(0)
         self.right = torch.stack([right for _, right in each]).sum(0)
 
+    @classmethod
+    def of(cls, family: Family, contacts: list[Contact]) -> "_Evidence":
+        """What contacts say, each with its center where it is."""
+        forms = [ContactForms(family, contact) for contact in contacts]
+        return cls(family, forms, [item.ball() for item in forms])
+
     def without(self, place: int) -> "_Evidence":
         """The same less one contact."""
-        other = copy.copy(self)
-        other.forms = self.forms[:place] + self.forms[place + 1 :]
-        other._weigh(self.each[:place] + self.each[place + 1 :])
-        return other
+        others = [k for k in range(len(self.forms)) if k != place]
+        return _Evidence(self.family, [self.forms[k] for k in others], [self.each[k] for k in others])
 
     def gains(self, solutions: list[Tensor]) -> Tensor:
         """For each contact the slopes its coefficients give over the ball's."""

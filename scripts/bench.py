@@ -18,8 +18,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 from tqdm import tqdm
 
-from torchvts import bench, viz
+from torchvts import viz
 from torchvts.core.files import write_atomically
+from torchvts.evaluation import speed as bench
 
 
 def main() -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 import torchvts as vts
-from torchvts import coverage
+from torchvts.evaluation import coverage
 from torchvts.viz import save_figure
 
 

@@ -16,7 +16,8 @@ import torch
 from tqdm import tqdm
 
 import torchvts as vts
-from torchvts import metrics, scenes, viz
+from torchvts import scenes, viz
+from torchvts.evaluation import metrics
 
 PITCH = 0.0625
 
@@ -38,7 +39,7 @@ def embedded(out: Path) -> list[str]:
     lights = vts.PointLights([[20.0, 9.3, 16.5], [-18.0, 12.6, 15.5], [-1.9, -21.9, 17.5]], [200.0, 200.0, 200.0])
     sensor = vts.Sensor("embedded", 480, 640, PITCH)
     worn = scenes.skin_spots(480, 640)
-    rest = scenes.at_rest(scenes.sphere_press())
+    rest = scenes.undeformed(scenes.sphere_press())
     background = scenes.render(rest, lights, noise_std=0.01, bits=8, spots=worn, seed=1)[0].detach()
     start = time.perf_counter()
     calibration = vts.calibrate(background, sensor, progress=True)

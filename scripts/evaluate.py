@@ -14,9 +14,9 @@ import time
 from pathlib import Path
 
 import torchvts as vts
-from torchvts import evaluate as ev
 from torchvts import viz
 from torchvts.core.files import write_atomically
+from torchvts.evaluation import score as ev
 
 
 def main() -> int:

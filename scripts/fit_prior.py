@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import torchvts as vts
+from torchvts.calibration import fit_prior
 
 
 def main() -> int:
@@ -23,7 +24,7 @@ def main() -> int:
     arguments = parser.parse_args()
     sensor = vts.Sensor.load(arguments.sensor)
     background, presses = vts.read_presses(arguments.folder)
-    prior = vts.fit_prior(background, sensor, presses, arguments.source or f"{len(presses)} presses of {arguments.folder.name}")
+    prior = fit_prior(background, sensor, presses, arguments.source or f"{len(presses)} presses of {arguments.folder.name}")
     before = arguments.out.read_text() if arguments.out.is_file() else ""
     comment = [line for line in before.splitlines() if line.startswith("#")]
     dataclasses.replace(sensor, prior=prior).save(arguments.out, comment)

@@ -23,7 +23,8 @@ import torch
 from tqdm import tqdm
 
 import torchvts as vts
-from torchvts.evaluate import PressScore, score_press
+from torchvts.calibration import fit_prior
+from torchvts.evaluation.score import PressScore, score_press
 from torchvts.viz import save_figure
 
 matplotlib.use("Agg")
@@ -59,7 +60,7 @@ def main() -> int:
             sensors = {}
             for ball in balls:
                 others = [press for press in presses if press.ball_diameter_mm != ball]
-                sensors[ball] = dataclasses.replace(bare, prior=vts.fit_prior(background, bare, others))
+                sensors[ball] = dataclasses.replace(bare, prior=fit_prior(background, bare, others))
             by_number = {n: [(ball, d) for ball in balls for d in draws(own[ball], n, arguments.draws)] for n in (0, 1, 3, 5, 10)}
             folds = [(ball, [p for k, p in enumerate(own[ball]) if k % FOLDS != fold]) for ball in balls for fold in range(FOLDS)]
             named = [("presses, prior of another ball", number, jobs) for number, jobs in by_number.items()]

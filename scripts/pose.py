@@ -18,7 +18,7 @@ from tqdm import tqdm
 import torchvts as vts
 from torchvts import viz
 from torchvts.core.files import count_frames, read_frames, write_atomically
-from torchvts.pose import read_point_cloud, write_point_cloud
+from torchvts.pose import contact_cloud, read_point_cloud, write_point_cloud
 from torchvts.pose.clouds import CLOUD_SUFFIXES
 
 
@@ -59,7 +59,7 @@ def of_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     pitch = calibration.sensor.mm_per_pixel
     with torch.inference_mode():
         target = pipe(calibration.sensor.rectify(vts.read_image(arguments.target)[None]))
-    target_points = vts.contact_cloud(target, pitch, 4000)[0]
+    target_points = contact_cloud(target, pitch, 4000)[0]
     results, last = [], None
     for name, image in tqdm(read_frames(arguments.source), total=count_frames(arguments.source), unit="frame", disable=None):
         with torch.inference_mode():
@@ -76,11 +76,11 @@ def of_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         if len(results) <= 20:
             tell(name, found)
         if count_frames(arguments.source) == 1:
-            draw(arguments, name, vts.contact_cloud(frame, pitch, 4000)[0], target_points, found)
+            draw(arguments, name, contact_cloud(frame, pitch, 4000)[0], target_points, found)
     return results
 
 
-def record(name: str, found: vts.Registration) -> dict[str, Any]:
+def record(name: str, found: vts.pose.Registration) -> dict[str, Any]:
     return {
         "frame": name,
         "T_target_source": found.T_target_source.tolist(),
@@ -95,7 +95,7 @@ def record(name: str, found: vts.Registration) -> dict[str, Any]:
     }
 
 
-def tell(name: str, found: vts.Registration) -> None:
+def tell(name: str, found: vts.pose.Registration) -> None:
     T = found.T_target_source
     turn = float(torch.rad2deg(torch.atan2(T[1, 0], T[0, 0])))
     tilt = float(torch.rad2deg(torch.acos(T[2, 2].clamp(-1, 1))))
@@ -105,7 +105,9 @@ def tell(name: str, found: vts.Registration) -> None:
     print(f"{name}: {which}turned {turn:.3f} degrees in the plane, tilted {tilt:.3f}, moved ({x:.4f}, {y:.4f}, {z:.4f}) mm")
 
 
-def draw(arguments: argparse.Namespace, name: str, source: torch.Tensor, target: torch.Tensor, found: vts.Registration) -> None:
+def draw(
+    arguments: argparse.Namespace, name: str, source: torch.Tensor, target: torch.Tensor, found: vts.pose.Registration
+) -> None:
     T = found.T_target_source
     if not arguments.no_pictures:
         viz.save_figure(viz.pose_figure(source, target, T, name), arguments.out / f"{name}_pose.png")

@@ -13,9 +13,11 @@ import torch
 from tqdm import tqdm
 
 import torchvts as vts
-from torchvts import objects, viz
+from torchvts import viz
 from torchvts.core.files import write_atomically
-from torchvts.pose_bench import PoseCase, ball_pairs, machine, pose_table, run_poses
+from torchvts.evaluation.pose_accuracy import PoseCase, ball_pairs, machine, pose_table, run_poses
+from torchvts.pose import Registration, contact_cloud
+from torchvts.scenes import objects
 
 
 def main() -> int:
@@ -35,8 +37,8 @@ def main() -> int:
     everything = {**objects.TARGETS, **objects.FREE_TARGETS}
     targets = {name: everything[name] for name in arguments.only or everything}
 
-    def by_clouds(case: PoseCase) -> vts.Registration:
-        (s, n_s), (t, n_t) = (vts.contact_cloud(f, case.mm_per_pixel, arguments.clouds or None) for f in (case.source, case.target))
+    def by_clouds(case: PoseCase) -> Registration:
+        (s, n_s), (t, n_t) = (contact_cloud(f, case.mm_per_pixel, arguments.clouds or None) for f in (case.source, case.target))
         return vts.register_points(s, t, source_normals=n_s, target_normals=n_t)
 
     options = {} if arguments.clouds is None else {"register": by_clouds}
@@ -44,7 +46,7 @@ def main() -> int:
     with tqdm(total=arguments.poses * len(targets), unit="pose") as bar:
         rows, shown = run_poses(targets, arguments.poses, size=size, noise_std=arguments.noise, progress=bar.update, **options)
     for name, (case, found) in shown.items():
-        clouds = [vts.contact_cloud(frame, case.mm_per_pixel, 4000)[0] for frame in (case.source, case.target)]
+        clouds = [contact_cloud(frame, case.mm_per_pixel, 4000)[0] for frame in (case.source, case.target)]
         figure = viz.pose_figure(clouds[0], clouds[1], found.T_target_source, f"{name}: {found.message}")
         viz.save_figure(figure, arguments.out / f"{name.replace(' ', '_')}.png")
     how = f"{arguments.poses} poses each, {size[1]} x {size[0]}, noise {arguments.noise:g} and 8 bits; {machine()}"

@@ -15,7 +15,11 @@ import torch
 from tqdm import tqdm
 
 import torchvts as vts
-from torchvts import evaluate, metrics, pose_bench, scenes, viz
+from torchvts import scenes, viz
+from torchvts.evaluation import metrics
+from torchvts.evaluation import pose_accuracy as pose_bench
+from torchvts.evaluation import score as evaluate
+from torchvts.pose import contact_cloud
 
 PITCH = 0.0625
 PAPER_3 = {16: (0.31, 0.09), 32: (1.21, 0.16)}
@@ -35,7 +39,7 @@ def figure_3(lights: vts.PointLights, out: Path) -> list[str]:
     for press_px, paper in PAPER_3.items():
         scene = scenes.sphere_press(10.0, press_px * PITCH)
         image = scenes.render(scene, lights).detach()
-        floor = metrics.depth_error(vts.poisson_rest(scene.gradient, PITCH), scene.depth_mm, PITCH)
+        floor = metrics.depth_error(vts.poisson_background(scene.gradient, PITCH), scene.depth_mm, PITCH)
         for mode, equation, reported in (("fast", "eq. 9", paper[0]), ("precise", "eq. 10", paper[1])):
             pipe = vts.DepthPipeline.from_calibration(calibration, mode)
             with torch.inference_mode():
@@ -109,10 +113,10 @@ def table_2(folder: Path, out: Path) -> list[str]:
 
 
 def table_3(out: Path) -> list[str]:
-    targets = {name: vts.objects.TARGETS[name] for name in ("tool handle", "bottle cap", "key")}
+    targets = {name: vts.scenes.objects.TARGETS[name] for name in ("tool handle", "bottle cap", "key")}
     rows, shown = pose_bench.run_poses(targets, 10)
     for name, (case, found) in shown.items():
-        source, target = (vts.contact_cloud(frame, case.mm_per_pixel, 4000)[0] for frame in (case.source, case.target))
+        source, target = (contact_cloud(frame, case.mm_per_pixel, 4000)[0] for frame in (case.source, case.target))
         figure = viz.pose_figure(source, target, found.T_target_source, f"table 3: {name}")
         viz.save_figure(figure, out / f"table_3_{name.replace(' ', '_')}.png")
     lines = []

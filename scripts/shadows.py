@@ -18,8 +18,9 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torchvts import Calibration, DepthPipeline, PointLights, Sensor, metrics, scenes
-from torchvts.faults import Conditions, photograph
+from torchvts import Calibration, DepthPipeline, PointLights, Sensor, scenes
+from torchvts.evaluation import metrics
+from torchvts.evaluation.faults import Conditions, photograph
 
 HEIGHT, WIDTH, MM_PER_PIXEL = 240, 320, 0.0625
 SENSOR = Sensor("rig", HEIGHT, WIDTH, MM_PER_PIXEL, gamma=1.0)
@@ -68,7 +69,7 @@ def errors(shape: str, kind: str, seed: int) -> tuple[float, float, float] | Non
     draw = random.Random(f"{shape}, {kind}, {seed}")
     lights, scene, noise = drawn_lights(draw), drawn_scene(shape, draw), draw.uniform(0.001, 0.006)
     camera = Conditions(lights, noise_std=noise, bits=8)
-    rest = photograph(scenes.at_rest(scene), camera, 2 * seed)[0]
+    rest = photograph(scenes.undeformed(scene), camera, 2 * seed)[0]
     image = without = photograph(scene, camera, 2 * seed + 1)
     if kind == "cast":
         image = photograph(scene, Conditions(lights, noise_std=noise, bits=8, shadows=True), 2 * seed + 1)

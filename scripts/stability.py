@@ -19,10 +19,10 @@ from matplotlib.figure import Figure
 from PIL import Image
 from tqdm import tqdm
 
-from torchvts import stability
 from torchvts.core.files import write_atomically
-from torchvts.gallery import DIALS, Dial
-from torchvts.stability import DEPTH_LIMIT, MASK, MASK_LIMIT, METHODS, NORMAL_LIMIT_DEG, Breaking, Row
+from torchvts.evaluation import stability
+from torchvts.evaluation.gallery import DIALS, Dial
+from torchvts.evaluation.stability import DEPTH_LIMIT, MASK, MASK_LIMIT, METHODS, NORMAL_LIMIT_DEG, Breaking, Row
 
 ROOT = Path(__file__).resolve().parents[1]
 # the two ways of the paper are broad lines, what goes almost the same way is drawn upon them
@@ -35,7 +35,6 @@ STYLES: dict[str, dict[str, Any]] = {
     "precise, plain inverse": {"color": "tab:purple", "lw": 1.4},
     "precise, blur 1 px": {"color": "tab:green", "lw": 1.4},
     "precise, cliffs": {"color": "saddlebrown", "lw": 1.4, "ls": "-."},
-    "auto, heights": {"color": "teal", "lw": 1.4, "ls": (0, (1, 1))},
     "precise, pinhole": {"color": "deeppink", "lw": 1.2, "ls": (0, (1, 2))},
     MASK: {"color": "black", "lw": 1.4, "marker": "o", "ms": 3},
 }

@@ -9,10 +9,17 @@ import references
 import torch
 
 import torchvts as vts
-from torchvts import metrics, scenes
-from torchvts.integration import cliff_share
+from torchvts import scenes
+from torchvts.evaluation import metrics
+from torchvts.integration import (
+    DiscontinuityIntegration,
+    PerspectiveIntegration,
+    discontinuity_share,
+    integrate_discontinuities,
+    integrate_perspective,
+)
+from torchvts.model.lights import inverse_light_matrix, light_matrix
 from torchvts.normals import NormalFromIntensity
-from torchvts.shading import inverse_light_matrix, light_matrix
 
 SIZE, PITCH = (120, 160), 0.25
 
@@ -62,7 +69,9 @@ def largest_px(depth, scene):
 def test_a_cliff_costs_at_most_a_tenth_of_poissons_error(name, std):
     scene = cliff(name)
     gradient = noisy(scene, std)
-    assert largest_px(vts.integrate_cliffs(gradient, PITCH), scene) < 0.1 * largest_px(vts.poisson_rest(gradient, PITCH), scene)
+    assert largest_px(integrate_discontinuities(gradient, PITCH), scene) < 0.1 * largest_px(
+        vts.poisson_background(gradient, PITCH), scene
+    )
 
 
 @every_smooth
@@ -70,7 +79,7 @@ def test_a_cliff_costs_at_most_a_tenth_of_poissons_error(name, std):
 def test_smooth_presses_lose_nothing(name, std):
     scene = SMOOTH[name]()
     gradient = noisy(scene, std)
-    smooth, robust = (solve(gradient, PITCH) for solve in (vts.poisson_rest, vts.integrate_cliffs))
+    smooth, robust = (solve(gradient, PITCH) for solve in (vts.poisson_background, integrate_discontinuities))
     errors = [metrics.depth_error(depth, scene.depth_mm, PITCH) for depth in (smooth, robust)]
     assert errors[1].rms_px < 1.15 * errors[0].rms_px
     assert errors[1].max_px < 1.25 * errors[0].max_px
@@ -79,21 +88,21 @@ def test_smooth_presses_lose_nothing(name, std):
 @pytest.mark.parametrize("noise_std", [0.002, 0.01])
 def test_a_wedge_from_an_image_of_eight_bits(noise_std, ring):
     scene = scenes.surface(CLIFFS["wedge"], *SIZE, PITCH)
-    rest = scenes.render(scenes.at_rest(scene), ring(), noise_std=noise_std, bits=8, seed=1)[0]
+    rest = scenes.render(scenes.undeformed(scene), ring(), noise_std=noise_std, bits=8, seed=1)[0]
     calibration = vts.Calibration.from_lights(ring(), vts.Sensor("rig", *SIZE, PITCH), rest)
     image = scenes.render(scene, ring(), noise_std=noise_std, bits=8)
     error = {}
-    for integrate in (None, vts.CliffIntegration(PITCH), vts.AdaptiveIntegration(PITCH)):
+    for integrate in (None, DiscontinuityIntegration(PITCH), vts.AdaptiveIntegration(PITCH)):
         pipe = vts.DepthPipeline.from_calibration(calibration, "precise", integrate=integrate)
         error[type(integrate)] = largest_px(pipe(image).depth_mm, scene)
-    assert error[vts.CliffIntegration] < error[type(None)] / 3
+    assert error[DiscontinuityIntegration] < error[type(None)] / 3
     assert error[vts.AdaptiveIntegration] < error[type(None)] / 3
 
 
 def test_it_equals_dense_weighted_least_squares_at_its_own_weights():
     scene = scenes.surface(prism(lambda t: 2.0 - t.abs(), 5.0, 0.0), 15, 18, 0.5, torch.float64)
     gradient = noisy(scene)
-    depth = vts.CliffIntegration(0.5, max_passes=100, tolerance_px=1e-7, residual=1e-9).solve(gradient).depth_mm
+    depth = DiscontinuityIntegration(0.5, max_passes=100, tolerance_px=1e-7, residual=1e-9).solve(gradient).depth_mm
     twin = references.cliffs(gradient[0].numpy(), scene.contact[0, 0].numpy(), 0.5, 0.05, 2.0, 0.1, depth[0, 0].numpy())
     assert np.abs(depth[0, 0].numpy() - twin).max() < 1e-6
 
@@ -101,33 +110,33 @@ def test_it_equals_dense_weighted_least_squares_at_its_own_weights():
 @every_cliff
 def test_depth_is_zero_at_rest(name):
     scene = cliff(name)
-    depth = vts.integrate_cliffs(noisy(scene), PITCH, scene.contact)
+    depth = integrate_discontinuities(noisy(scene), PITCH, scene.contact)
     assert depth[~scene.contact].abs().max() == 0
 
 
 def test_no_contact_and_all_contact():
-    assert vts.integrate_cliffs(torch.zeros(2, 2, 9, 12)).abs().max() == 0
+    assert integrate_discontinuities(torch.zeros(2, 2, 9, 12)).abs().max() == 0
     tilt = torch.full((1, 2, 9, 12), 0.1, dtype=torch.float64)
-    assert (vts.integrate_cliffs(tilt, 0.5) - vts.poisson_rest(tilt, 0.5)).abs().max() < 1e-3
+    assert (integrate_discontinuities(tilt, 0.5) - vts.poisson_background(tilt, 0.5)).abs().max() < 1e-3
 
 
 def test_items_of_a_batch_are_independent_and_report_their_own_status():
     gradient = torch.cat((cliff("wedge").gradient, torch.zeros(1, 2, *SIZE, dtype=torch.float64), SMOOTH["sphere"]().gradient))
-    solver = vts.CliffIntegration(PITCH)
+    solver = DiscontinuityIntegration(PITCH)
     whole = solver.solve(gradient)
     single = [solver.solve(gradient[i : i + 1]) for i in range(3)]
     assert torch.equal(whole.depth_mm, torch.cat([one.depth_mm for one in single]))
     assert whole.iterations.tolist() == [int(one.iterations) for one in single]
     assert whole.converged.all() and whole.passes.tolist()[1] == 0 and whole.passes.min() < whole.passes.max()
-    hurried = vts.CliffIntegration(PITCH, max_passes=1).solve(gradient[:1])
+    hurried = DiscontinuityIntegration(PITCH, max_passes=1).solve(gradient[:1])
     assert hurried.passes.tolist() == [1] and hurried.converged.tolist() == [False]
 
 
 @pytest.mark.parametrize("name", ["wedge", "cylinder"])
 def test_single_precision_follows_double_precision(name):
     gradient = noisy(cliff(name))
-    exact = vts.integrate_cliffs(gradient, PITCH)
-    single = vts.integrate_cliffs(gradient.float(), PITCH)
+    exact = integrate_discontinuities(gradient, PITCH)
+    single = integrate_discontinuities(gradient.float(), PITCH)
     assert single.dtype == torch.float32 and (single.double() - exact).abs().max() < 0.1 * PITCH
 
 
@@ -136,11 +145,15 @@ def test_a_flipped_image_gives_flipped_depth(axis):
     gradient = noisy(cliff("wedge"))
     flipped = gradient.flip(3 - axis)
     flipped[:, axis] *= -1
-    difference = vts.integrate_cliffs(flipped, PITCH) - vts.integrate_cliffs(gradient, PITCH).flip(3 - axis)
+    difference = integrate_discontinuities(flipped, PITCH) - integrate_discontinuities(gradient, PITCH).flip(3 - axis)
     assert difference.abs().max() < 0.05 * PITCH
 
 
-MODULES = [vts.CliffIntegration(PITCH), vts.AdaptiveIntegration(PITCH), vts.PerspectiveIntegration(PITCH, 40.0)]
+MODULES = [
+    DiscontinuityIntegration(PITCH),
+    vts.AdaptiveIntegration(PITCH),
+    PerspectiveIntegration(PITCH, 40.0),
+]
 
 
 @pytest.mark.parametrize("module", MODULES, ids=lambda module: type(module).__name__)
@@ -157,7 +170,10 @@ def test_pixels_without_weight_are_bridged():
     gradient, weight = scene.gradient.clone(), torch.ones_like(scene.depth_mm)
     gradient[:, :, 50:58, 70:90] = 5.0
     weight[:, :, 50:58, 70:90] = 0.0
-    bridged, misled = vts.integrate_cliffs(gradient, PITCH, weight=weight), vts.integrate_cliffs(gradient, PITCH)
+    bridged, misled = (
+        integrate_discontinuities(gradient, PITCH, weight=weight),
+        integrate_discontinuities(gradient, PITCH),
+    )
     sound = weight.bool()
     assert metrics.depth_error(bridged, scene.depth_mm, PITCH, sound).max_px < 0.1
     assert metrics.depth_error(bridged, scene.depth_mm, PITCH, ~sound).max_px < 0.7
@@ -166,11 +182,11 @@ def test_pixels_without_weight_are_bridged():
 
 def test_a_gradient_flows_back_with_the_weights_held():
     gradient = noisy(cliff("wedge")).requires_grad_()
-    depth = vts.CliffIntegration(PITCH, max_passes=1).solve(gradient).depth_mm
+    depth = DiscontinuityIntegration(PITCH, max_passes=1).solve(gradient).depth_mm
     (slope,) = torch.autograd.grad((depth * torch.sin(torch.arange(160.0, dtype=torch.float64))).sum(), gradient)
     assert bool(torch.isfinite(slope).all()) and slope.abs().max() > 0
     # with weights held, depth is linear in the gradient: its product with the derivative is the depth itself
-    depth = vts.CliffIntegration(PITCH, residual=1e-9).solve(gradient).depth_mm
+    depth = DiscontinuityIntegration(PITCH, residual=1e-9).solve(gradient).depth_mm
     (along,) = torch.autograd.grad(depth.sum(), gradient)
     assert float((along * gradient.detach()).sum()) == pytest.approx(float(depth.detach().sum()), rel=1e-6)
 
@@ -178,47 +194,47 @@ def test_a_gradient_flows_back_with_the_weights_held():
 @pytest.mark.parametrize("shape", [(1, 2, 1, 5), (1, 2, 5, 1)])
 def test_too_small_an_image_is_refused(shape):
     with pytest.raises(ValueError, match="gradient: expected H and W of at least 2"):
-        vts.integrate_cliffs(torch.zeros(shape))
+        integrate_discontinuities(torch.zeros(shape))
 
 
 def test_masks_and_weights_of_another_size_are_refused():
     gradient = torch.zeros(1, 2, 8, 9)
     for name in ("contact", "weight"):
         with pytest.raises(ValueError, match=rf"{name}: expected \(1, 1, 8, 9\) like gradient, got \(1, 1, 8, 8\)"):
-            vts.integrate_cliffs(gradient, **{name: torch.ones(1, 1, 8, 8)})
+            integrate_discontinuities(gradient, **{name: torch.ones(1, 1, 8, 8)})
 
 
 @every_smooth
 @pytest.mark.parametrize("std", [0.0, 0.02, 0.04])
 def test_the_sign_of_cliffs_is_silent_on_smooth_presses(name, std):
     gradient = noisy(SMOOTH[name](), std)
-    assert float(cliff_share(gradient, vts.poisson_rest(gradient, PITCH), PITCH)) < 0.0005
+    assert float(discontinuity_share(gradient, vts.poisson_background(gradient, PITCH), PITCH)) < 0.0005
 
 
 @every_cliff
 @pytest.mark.parametrize("std", [0.0, 0.02, 0.04])
 def test_the_sign_of_cliffs_fires_on_cliffs(name, std):
     gradient = noisy(cliff(name), std)
-    assert float(cliff_share(gradient, vts.poisson_rest(gradient, PITCH), PITCH)) > 0.003
+    assert float(discontinuity_share(gradient, vts.poisson_background(gradient, PITCH), PITCH)) > 0.003
 
 
 def test_adaptive_integration_is_poisson_on_smooth_frames_and_robust_on_others():
     smooth, steep = SMOOTH["sphere"]().gradient, cliff("wedge").gradient
     depth = vts.AdaptiveIntegration(PITCH)(torch.cat((smooth, steep)))
-    assert (depth[:1] - vts.poisson_rest(smooth, PITCH)).abs().max() < 1e-12
-    assert torch.equal(depth[1:], vts.integrate_cliffs(steep, PITCH))
+    assert (depth[:1] - vts.poisson_background(smooth, PITCH)).abs().max() < 1e-12
+    assert torch.equal(depth[1:], integrate_discontinuities(steep, PITCH))
 
 
 @pytest.mark.parametrize("center_mm", [(19.0, 0.0), (-17.0, 4.0), (0.0, 14.0), (3.0, -12.0), (18.0, -13.0)])
 def test_contact_at_the_image_border_wants_a_free_border(center_mm, ring):
     """From the image: the free border has at most half of the zero border's largest error (0.4 against 4 to 15 px)."""
     scene = scenes.sphere_press(10.0, 1.0, center_mm, *SIZE, PITCH)
-    rest = scenes.render(scenes.at_rest(scene), ring(), noise_std=0.005, bits=8, seed=1)[0]
+    rest = scenes.render(scenes.undeformed(scene), ring(), noise_std=0.005, bits=8, seed=1)[0]
     calibration = vts.Calibration.from_lights(ring(), vts.Sensor("rig", *SIZE, PITCH), rest)
     image = scenes.render(scene, ring(), noise_std=0.005, bits=8)
     free, zero = (
         largest_px(vts.DepthPipeline.from_calibration(calibration, "precise", integrate=integrate(PITCH))(image).depth_mm, scene)
-        for integrate in (vts.PoissonRest, vts.PoissonDST)
+        for integrate in (vts.PoissonBackground, vts.PoissonDST)
     )
     assert free < 0.5 * zero and free < 0.5
 
@@ -232,7 +248,7 @@ def test_perspective_integration_has_order_two():
     errors = []
     for n in (32, 64, 128):
         scene = scenes.surface(smooth_hill, n, n, 24.0 / n, torch.float64, camera_height_mm=30.0)
-        error = vts.integrate_perspective(scene.gradient, 24.0 / n, 30.0)
+        error = integrate_perspective(scene.gradient, 24.0 / n, 30.0)
         # the level of depth is not in the gradient: compare in log distance, where it is an added constant
         error = torch.log(30.0 - error) - torch.log(30.0 - scene.depth_mm)
         errors.append(float((error - error.mean()).square().mean().sqrt()))
@@ -248,7 +264,7 @@ def test_a_pinhole_is_as_good_as_an_orthographic_camera(camera_height_mm, center
     calibration = vts.Calibration.from_lights(ring(), vts.Sensor("rig", 240, 320, 0.125))
     image = scenes.render(scene, ring())
     normals = NormalFromIntensity.from_calibration(calibration, camera_height_mm)
-    integrate = vts.PerspectiveIntegration(0.125, camera_height_mm)
+    integrate = PerspectiveIntegration(0.125, camera_height_mm)
     right = vts.DepthPipeline.from_calibration(calibration, "precise", normals=normals, integrate=integrate)(image)
     wrong = vts.DepthPipeline.from_calibration(calibration, "precise")(image)
     error = [metrics.depth_error(out.depth_mm, scene.depth_mm, 0.125).max_px for out in (right, wrong)]
@@ -259,7 +275,7 @@ def test_a_far_pinhole_is_orthographic():
     near, far = (scenes.sphere_press(10.0, 1.0, (3.0, 2.0), *SIZE, PITCH, torch.float64, height) for height in (math.inf, 1e7))
     assert (near.depth_mm - far.depth_mm).abs().max() < 1e-5
     inside = near.contact & far.contact
-    depth = [vts.poisson_rest(near.gradient, PITCH), vts.integrate_perspective(far.gradient, PITCH, 1e7)]
+    depth = [vts.poisson_background(near.gradient, PITCH), integrate_perspective(far.gradient, PITCH, 1e7)]
     assert (depth[0] - depth[1])[inside].abs().max() < 1e-4
 
 
@@ -287,21 +303,24 @@ def test_a_surface_that_hides_parts_of_itself_from_a_pinhole_is_refused():
 
 def test_perspective_derivatives():
     gradient = 0.3 * torch.randn(1, 2, 5, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    assert torch.autograd.gradcheck(lambda g: vts.integrate_perspective(g, 0.5, 20.0), gradient.requires_grad_())
+    assert torch.autograd.gradcheck(lambda g: integrate_perspective(g, 0.5, 20.0), gradient.requires_grad_())
 
 
 @pytest.mark.parametrize("slope", [0.35, 0.25])
 def test_a_ramp_stands_on_its_low_end(slope):
     """Cliffs on three sides, as high at one end as the ramp is; upside down it would hang from there."""
     ramp = vts.scenes.surface(lambda x, y: torch.where((y.abs() < 2.5) & (x.abs() < 3), (x + 3) * slope, -1.0), 120, 160, 0.1)
-    smooth = (vts.poisson_rest(ramp.gradient, 0.1) - ramp.depth_mm).abs().max()
-    for found in (vts.integrate_cliffs(ramp.gradient, 0.1, ramp.contact), vts.AdaptiveIntegration(0.1)(ramp.gradient)):
+    smooth = (vts.poisson_background(ramp.gradient, 0.1) - ramp.depth_mm).abs().max()
+    for found in (
+        integrate_discontinuities(ramp.gradient, 0.1, ramp.contact),
+        vts.AdaptiveIntegration(0.1)(ramp.gradient),
+    ):
         assert (found - ramp.depth_mm).abs().max() < 0.02 * smooth
 
 
 def test_gradients_and_weights_that_are_none_are_refused():
     gradient, weight = torch.zeros(1, 2, 8, 8), torch.ones(1, 1, 8, 8)
     with pytest.raises(ValueError, match="gradient: expected finite values, got NaN"):
-        vts.integrate_cliffs(gradient * torch.nan)
+        integrate_discontinuities(gradient * torch.nan)
     with pytest.raises(ValueError, match="weight: expected values from 0 to 1, got 2 to 2"):
-        vts.integrate_cliffs(gradient, weight=2 * weight)
+        integrate_discontinuities(gradient, weight=2 * weight)

@@ -14,10 +14,11 @@ import torch
 from torch import nn
 
 import torchvts as vts
-from torchvts import coverage
-from torchvts.confidence import DEPTH_SPREAD, FACTORS, _length_95
+from torchvts.evaluation import coverage
+from torchvts.evaluation.metrics import normal_angle_deg
 from torchvts.export import sample_frames
-from torchvts.metrics import normal_angle_deg
+from torchvts.pipeline import bound_at
+from torchvts.pipeline.confidence import DEPTH_SPREAD, FACTORS, _length_95
 
 scenes = vts.scenes
 HEIGHT, WIDTH, PITCH = 48, 64, 0.6
@@ -28,7 +29,7 @@ def lights_unit(ring, noise_std=0.004, background=True, **options):
     """A unit of known lights on the tests' small rig, and a ball pressed into it, with and without noise."""
     lights = ring(**options)
     scene = scenes.sphere_press(10.0, 1.5, (1.0, 2.0), HEIGHT, WIDTH, PITCH)
-    rest = scenes.render(scenes.at_rest(scene), lights, noise_std=noise_std, seed=5)[0]
+    rest = scenes.render(scenes.undeformed(scene), lights, noise_std=noise_std, seed=5)[0]
     calibration = vts.Calibration.from_lights(lights, SENSOR, rest if background else None)
     return calibration, scene, lambda seed, std=noise_std: scenes.render(scene, lights, noise_std=std, seed=seed)
 
@@ -48,7 +49,7 @@ def test_levels_are_those_of_gaussian_errors(spread, dimensions):
     length = torch.randn(200_000, dimensions, generator=torch.Generator().manual_seed(0)).norm(dim=1)
     bound = length.quantile(0.95)
     for level in (0.5, 0.68, 0.8, 0.9, 0.95, 0.99):
-        found = float((length < vts.bound_at(bound, level, spread)).double().mean())
+        found = float((length < bound_at(bound, level, spread)).double().mean())
         assert found == pytest.approx(level, abs=0.02)
 
 
@@ -62,7 +63,7 @@ def test_the_length_of_an_error_around_a_bias(bias):
 @pytest.mark.parametrize("level", [0.0, 1.0, 95.0])
 def test_a_level_is_a_probability(level):
     with pytest.raises(ValueError, match=r"level: expected a probability between 0 and 1, got .*: 0\.95, not 95"):
-        vts.bound_at(torch.ones(1), level)
+        bound_at(torch.ones(1), level)
 
 
 @pytest.mark.parametrize("noise_std", [0.004, 0.016])
@@ -116,7 +117,7 @@ def test_attached_shadows_and_a_worn_skin(ring):
     sensor = vts.Sensor("rig", *size)
     camera = {"noise_std": 0.01, "bits": 8, "spots": scenes.skin_spots(120, 160)}
     scene = scenes.sphere_press(10.0, 2.0, (0.0, 0.0), *size)
-    rest = scenes.render(scenes.at_rest(scene), lights, **camera, seed=1)[0]
+    rest = scenes.render(scenes.undeformed(scene), lights, **camera, seed=1)[0]
     calibration = vts.Calibration.from_lights(lights, sensor, rest)
     for mode in ("fast", "precise"):
         pipe = vts.ConfidentPipeline.from_calibration(calibration, mode)
@@ -179,7 +180,7 @@ def test_the_held_out_error_of_presses_sets_the_bounds():
 
 def test_no_contact(ring):
     calibration, scene, _ = lights_unit(ring)
-    image = scenes.render(scenes.at_rest(scene), ring(), noise_std=0.004, seed=9)
+    image = scenes.render(scenes.undeformed(scene), ring(), noise_std=0.004, seed=9)
     for mode in ("fast", "precise", "auto"):
         out = vts.ConfidentPipeline.from_calibration(calibration, mode)(image)
         assert not bool(out.contact.any()) and out.frame_confidence.tolist() == [1.0]
@@ -191,7 +192,7 @@ def made(request, ring):
     kind, mode = request.param.split()
     if kind == "lights":
         calibration, _, camera = lights_unit(ring)
-        rest = scenes.render(scenes.at_rest(scenes.sphere_press(10.0, 1.0, (0, 0), HEIGHT, WIDTH, PITCH)), ring(), seed=3)
+        rest = scenes.render(scenes.undeformed(scenes.sphere_press(10.0, 1.0, (0, 0), HEIGHT, WIDTH, PITCH)), ring(), seed=3)
         frames = torch.cat([camera(1), camera(2, 0.02), rest, camera(3)])
     else:
         calibration, frames = response_unit()

@@ -7,15 +7,15 @@ import torch
 from kornia.morphology import dilation
 
 import torchvts as vts
-from torchvts.contact import _dilate, _erode, _reconstruct_by_sweeps, reconstruct
-from torchvts.core.native import operators_only
+from torchvts.contact.masks import _dilate, _erode, _reconstruct_by_sweeps, reconstruct
+from torchvts.core.native import reference_only
 
-scenes, metrics = vts.scenes, vts.metrics
+scenes, metrics = vts.scenes, vts.evaluation.metrics
 
 
 def found(scene, lights, sensor, noise_std=0.0, bits=None, seed=3):
     """Contact of one frame, judged with a background as noisy as the frame."""
-    background = scenes.render(scenes.at_rest(scene), lights, noise_std=noise_std, bits=bits, seed=seed + 1)[0]
+    background = scenes.render(scenes.undeformed(scene), lights, noise_std=noise_std, bits=bits, seed=seed + 1)[0]
     pipeline = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, sensor, background))
     return pipeline(scenes.render(scene, lights, noise_std=noise_std, bits=bits, seed=seed)).contact
 
@@ -82,7 +82,7 @@ def test_faint_wide_contact_below_the_noise_of_a_pixel_is_found():
 
 @pytest.mark.parametrize("noise_std", [0.005, 0.02])
 def test_pure_noise_is_no_contact(ring, small_sensor, small_press, noise_std):
-    rest, lights = scenes.at_rest(small_press()), ring()
+    rest, lights = scenes.undeformed(small_press()), ring()
     background = scenes.render(rest, lights, noise_std=noise_std, bits=8, seed=99)[0]
     pipeline = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, small_sensor, background))
     frames = torch.cat([scenes.render(rest, lights, noise_std=noise_std, bits=8, seed=seed) for seed in range(20)])
@@ -92,9 +92,9 @@ def test_pure_noise_is_no_contact(ring, small_sensor, small_press, noise_std):
 @pytest.mark.parametrize("times", [2, 4])
 def test_a_frame_noisier_than_the_calibration_does_not_flood(ring, small_sensor, small_press, times):
     scene, lights = small_press(1.0), ring()
-    background = scenes.render(scenes.at_rest(scene), lights, noise_std=0.005, bits=8)[0]
+    background = scenes.render(scenes.undeformed(scene), lights, noise_std=0.005, bits=8)[0]
     pipeline = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, small_sensor, background))
-    rest = scenes.render(scenes.at_rest(scene), lights, noise_std=0.005 * times, bits=8, seed=1)
+    rest = scenes.render(scenes.undeformed(scene), lights, noise_std=0.005 * times, bits=8, seed=1)
     press = scenes.render(scene, lights, noise_std=0.005 * times, bits=8, seed=2)
     assert int(pipeline(rest).contact.sum()) == 0
     assert metrics.mask_iou(pipeline(press).contact, scene.contact) > 0.97
@@ -121,7 +121,7 @@ def test_items_of_a_batch_do_not_influence_one_another(ring, small_sensor, small
     lights = ring()
     cal = vts.Calibration.from_lights(lights, small_sensor)
     block = vts.ContactMask(cal.model_image, cal.light_noise_std)
-    presses = [small_press(1.0), scenes.at_rest(small_press()), small_press(0.2, (8, 8))]
+    presses = [small_press(1.0), scenes.undeformed(small_press()), small_press(0.2, (8, 8))]
     frames = torch.cat([scenes.render(scene, lights, noise_std=0.01 * k, seed=k) for k, scene in enumerate(presses)])
     assert torch.equal(block(frames), torch.cat([block(frame[None]) for frame in frames]))
 
@@ -153,7 +153,7 @@ def test_loops_find_the_masks_that_operators_find(size):
         block = vts.ContactMask(flat, torch.full((3,), 0.01), min_size_px=min_size_px)
         frames = any_frame(generator, flat, 0.01, count)
         mask, soft = block(frames), block.soft(frames)
-        with operators_only():
+        with reference_only():
             assert torch.equal(mask, block(frames)) and torch.equal(soft, block.soft(frames))
         touched += int(mask.flatten(1).any(dim=1).sum())
     assert touched > 0 or min(size) < 20
@@ -212,7 +212,7 @@ def test_dilation_equals_kornia_and_the_twin(share):
 @pytest.fixture(scope="module")
 def soft_case(ring, small_sensor, small_press):
     lights, scene = ring(), small_press(1.0)
-    background = scenes.render(scenes.at_rest(scene), lights, noise_std=0.01, seed=1)[0]
+    background = scenes.render(scenes.undeformed(scene), lights, noise_std=0.01, seed=1)[0]
     cal = vts.Calibration.from_lights(lights, small_sensor, background)
     return vts.ContactMask(cal.model_image, cal.light_noise_std), scenes.render(scene, lights, noise_std=0.01, seed=2)
 

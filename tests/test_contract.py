@@ -9,6 +9,9 @@ import torch
 from torch import nn
 
 import torchvts as vts
+from torchvts.core.geometry import normal_from_gradient
+from torchvts.integration import PerspectiveIntegration
+from torchvts.model import FillMarkers
 
 HEIGHT, WIDTH, PITCH = 48, 64, 0.6
 SENSOR = vts.Sensor("rig", HEIGHT, WIDTH, PITCH)
@@ -18,7 +21,7 @@ def calibration(dtype):
     from conftest import ring_lights
 
     lights = ring_lights(dtype=dtype)
-    rest = vts.scenes.at_rest(vts.scenes.sphere_press(10.0, 1.0, (0, 0), HEIGHT, WIDTH, PITCH, dtype))
+    rest = vts.scenes.undeformed(vts.scenes.sphere_press(10.0, 1.0, (0, 0), HEIGHT, WIDTH, PITCH, dtype))
     background = vts.scenes.render(rest, lights, spots=vts.scenes.skin_spots(HEIGHT, WIDTH, 5, 5))[0]
     return vts.Calibration.from_lights(lights, SENSOR, background)
 
@@ -49,7 +52,7 @@ def response(dtype):
     numbers = torch.Generator().manual_seed(3)
     fields = [vts.calibration.field.Family(1, 1, deep, 20.0) for deep in (False, True)]
     fast, precise = (f.field(0.1 * torch.randn(f.size(), generator=numbers, dtype=torch.float64)) for f in fields)
-    model = vts.core.response.ResponseModel(fast, precise)
+    model = vts.model.response_field.ResponseModel(fast, precise)
     return vts.Calibration.from_response(model, SENSOR, calibration(dtype).background)
 
 
@@ -73,16 +76,16 @@ CASES = {
     "NormalFromResponse": (lambda dtype: vts.NormalFromResponse.from_calibration(response(dtype)), images, "compensated"),
     "NormalFromLookup": (lookup, images, "compensated"),
     "NormalFromMLP": (network, images, "compensated"),
-    "FillMarkers": (lambda dtype: vts.FillMarkers(5.0), images, "image"),
+    "FillMarkers": (lambda dtype: FillMarkers(5.0), images, "image"),
     "GradientFromNormal": (
         lambda dtype: vts.GradientFromNormal(),
-        lambda dtype: vts.normal_from_gradient(gradient(dtype)),
+        lambda dtype: normal_from_gradient(gradient(dtype)),
         "normal",
     ),
     "PoissonDST": (lambda dtype: vts.PoissonDST(PITCH), gradient, "gradient"),
     "PoissonDCT": (lambda dtype: vts.PoissonDCT(PITCH), gradient, "gradient"),
-    "PoissonRest": (lambda dtype: vts.PoissonRest(PITCH), gradient, "gradient"),
-    "PerspectiveIntegration": (lambda dtype: vts.PerspectiveIntegration(PITCH, 400.0), gradient, "gradient"),
+    "PoissonBackground": (lambda dtype: vts.PoissonBackground(PITCH), gradient, "gradient"),
+    "PerspectiveIntegration": (lambda dtype: PerspectiveIntegration(PITCH, 400.0), gradient, "gradient"),
     "DepthPipeline fast": (pipe("fast"), images, "images"),
     "DepthPipeline precise": (pipe("precise"), images, "images"),
     "DepthPipeline auto": (pipe("auto"), images, "images"),

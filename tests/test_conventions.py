@@ -4,7 +4,8 @@ import pytest
 import torch
 
 import torchvts as vts
-from torchvts.core.geometry import pixel_grid_mm
+from torchvts.core.geometry import gradient_from_normal, normal_from_gradient, pixel_grid_mm
+from torchvts.evaluation import metrics
 
 
 def flat(height, width):
@@ -63,9 +64,9 @@ def test_gradient_is_the_change_of_depth_per_mm_to_the_right_and_down():
 def test_normals_face_the_camera_and_lean_down_the_slope():
     gradient = torch.tensor([0.75, -0.5], dtype=torch.float64).reshape(1, 2, 1, 1)
     expected = torch.tensor([-0.75, 0.5, 1.0], dtype=torch.float64)
-    normal = vts.normal_from_gradient(gradient).flatten()
+    normal = normal_from_gradient(gradient).flatten()
     assert torch.allclose(normal, expected / expected.norm(), atol=1e-15)
-    assert torch.allclose(vts.gradient_from_normal(normal.reshape(1, 3, 1, 1)), gradient, atol=1e-15)
+    assert torch.allclose(gradient_from_normal(normal.reshape(1, 3, 1, 1)), gradient, atol=1e-15)
 
 
 def test_points_have_x_right_y_up_z_to_the_camera():
@@ -78,7 +79,7 @@ def test_points_have_x_right_y_up_z_to_the_camera():
 @pytest.mark.parametrize("center", [(0.0, 0.0), (3.0, 2.0)])
 def test_the_pressed_ball_has_its_centre_below_the_skin(center):
     scene = vts.scenes.sphere_press(10.0, 2.0, center, 120, 160, 0.25, torch.float64)
-    fit = vts.metrics.fit_sphere(scene.depth_mm, 0.25, scene.contact)
+    fit = metrics.fit_sphere(scene.depth_mm, 0.25, scene.contact)
     assert fit.center_mm == pytest.approx((center[0], -center[1], -8.0), abs=1e-9)
     assert fit.radius_mm == pytest.approx(10.0, abs=1e-9)
 
@@ -88,7 +89,7 @@ def test_depth_and_gradient_of_a_pipeline_follow_the_same_conventions(ring, smal
     out = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, small_sensor), "precise")(
         vts.scenes.render(scene, lights)
     )
-    fit = vts.metrics.fit_sphere(out.depth_mm, 0.25, out.contact)
+    fit = metrics.fit_sphere(out.depth_mm, 0.25, out.contact)
     assert fit.center_mm == pytest.approx((5.0, -3.0, -9.0), abs=0.06)
     assert torch.equal(out.normal[:, 2] > 0, torch.ones_like(out.contact[:, 0]))
-    assert torch.equal(out.normal, vts.normal_from_gradient(out.gradient))
+    assert torch.equal(out.normal, normal_from_gradient(out.gradient))

@@ -28,7 +28,7 @@ ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 def image(k):
     lights = vts.PointLights([[20.0, 9.0, 25.0], [-18.0, 13.0, 25.0], [-2.0, -22.0, 25.0]], [600.0, 600.0, 600.0])
     scene = vts.scenes.sphere_press(6.0 + k % 5, 0.5 + 0.01 * (k % 50), (0.1 * (k % 30) - 1.5, 0), HEIGHT, WIDTH, PITCH)
-    return vts.scenes.render(scene if k >= 0 else vts.scenes.at_rest(scene), lights, noise_std=0.002, bits=8, seed=abs(k))[0]
+    return vts.scenes.render(scene if k >= 0 else vts.scenes.undeformed(scene), lights, noise_std=0.002, bits=8, seed=abs(k))[0]
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,8 @@ import torchvts as vts
 from torchvts import scenes
 from torchvts.diagnose import Diagnosis, Finding
 from torchvts.diagnose.camera import blockiness, levels_of
-from torchvts.faults import jpeg
-from torchvts.gallery import DIALS, undisturbed
+from torchvts.evaluation.faults import jpeg
+from torchvts.evaluation.gallery import DIALS, undisturbed
 
 NAMED = {
     "deeper press": {"deep_press"},
@@ -108,7 +108,7 @@ def test_clean_frames_of_any_object_raise_no_alarm(ring, small_sensor, fitted):
     size = {"height": 120, "width": 160, "mm_per_pixel": 0.25}
     lights = ring(rotation_deg=40.0, level=0.4)
     sensor = small_sensor if fitted else vts.Sensor("rig", 120, 160, 0.25, gamma=1.0)
-    rest = scenes.at_rest(CLEAN["ball"](size))
+    rest = scenes.undeformed(CLEAN["ball"](size))
     background = scenes.render(rest, lights, noise_std=0.003, bits=8, seed=1)[0]
     unit = vts.calibrate(background, sensor) if fitted else vts.Calibration.from_lights(lights, sensor, background)
     for k, (name, press) in enumerate(CLEAN.items()):
@@ -123,7 +123,7 @@ def test_clean_frames_of_any_object_raise_no_alarm(ring, small_sensor, fitted):
 def test_dust_is_no_contact(ring, small_sensor, small_press, spots):
     """Spots of up to a twelfth of the height, at calibration already or since then; a contact is still called one."""
     lights, dust = ring(), vts.scenes.skin_spots(120, 160, spots, 0, seed=1)
-    rest, press = vts.scenes.at_rest(small_press()), small_press(0.5, (3.0, 2.0))
+    rest, press = vts.scenes.undeformed(small_press()), small_press(0.5, (3.0, 2.0))
     seen = {
         (scene, worn): vts.scenes.render(scene, lights, noise_std=0.004, bits=8, seed=k, spots=dust if worn else None)
         for k, (scene, worn) in enumerate(itertools.product((rest, press), (False, True)))

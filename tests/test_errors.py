@@ -11,7 +11,7 @@ SENSOR = vts.Sensor("rig", 24, 32, 1.25)
 @pytest.fixture(scope="module")
 def background(ring):
     lights = ring()
-    return vts.scenes.render(vts.scenes.at_rest(vts.scenes.sphere_press(10, 1, (0, 0), 24, 32, 1.25)), lights)[0]
+    return vts.scenes.render(vts.scenes.undeformed(vts.scenes.sphere_press(10, 1, (0, 0), 24, 32, 1.25)), lights)[0]
 
 
 def with_value(image, value, share=1.0, channel=1):

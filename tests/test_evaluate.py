@@ -12,8 +12,9 @@ import pytest
 import torch
 
 import torchvts as vts
-from torchvts import evaluate as ev
-from torchvts.core.gs_sdk import CATALOG_COLUMNS, LABEL_COLUMNS
+from torchvts.core.geometry import normal_from_gradient
+from torchvts.evaluation import score as ev
+from torchvts.model.gs_sdk import CATALOG_COLUMNS, LABEL_COLUMNS
 
 ROOT = Path(__file__).resolve().parents[1]
 HEIGHT, WIDTH, PITCH = 96, 128, 0.15
@@ -46,7 +47,7 @@ def folder(tmp_path_factory):
     for k, center_mm in enumerate(CENTERS):
         scene = ball(center_mm)
         if k == 0:
-            rest = vts.scenes.render(vts.scenes.at_rest(scene), lights, noise_std=0.002)
+            rest = vts.scenes.render(vts.scenes.undeformed(scene), lights, noise_std=0.002)
             vts.write_image(folder / "background.png", rest[0].detach())
         (folder / f"ball/{k}").mkdir(parents=True)
         image = vts.scenes.render(scene, lights, noise_std=0.002, seed=1 + k)[0].detach()
@@ -97,7 +98,7 @@ def test_a_turned_normal_is_off_by_its_angle(press):
     )
     # n_y keeps its length: a normal turns about y by less than the angle where it leans along y
     truth = ev.ball_truth(given, HEIGHT, WIDTH, PITCH)
-    normal = vts.normal_from_gradient(truth.gradient)
+    normal = normal_from_gradient(truth.gradient)
     n_y = normal[:, 1][truth.region[:, 0]]
     cosine = n_y**2 + (1 - n_y**2) * math.cos(angle)
     score = ev.score_press(given, scene.depth_mm, torch.einsum("ij,bjhw->bihw", turn, normal), PITCH)
@@ -132,7 +133,7 @@ def test_a_tilted_depth_moves_the_fitted_ball(press):
 
 def test_a_flat_depth_has_no_sphere(press):
     given, scene = press
-    rest = vts.scenes.at_rest(scene)
+    rest = vts.scenes.undeformed(scene)
     score = ev.score_press(given, rest.depth_mm, rest.normal, PITCH)
     assert score.radius_percent is None and score.center_px is None
     assert score.apex_um < -100.0 and score.normal_deg > 5.0

@@ -12,7 +12,7 @@ from torch import nn
 
 import torchvts as vts
 from torchvts import export
-from torchvts.core.native import operators_only
+from torchvts.core.native import reference_only
 
 LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
 ROOT = Path(__file__).resolve().parents[1]
@@ -26,7 +26,7 @@ def low(ring):
     lights = ring(20.0, 15.0)
     presses = [vts.scenes.sphere_press(10.0, mm, (x, 0), HEIGHT, WIDTH, PITCH) for mm, x in ((3.0, 0), (0.5, -6), (1.5, 5))]
     frames = [vts.scenes.render(scene, lights, noise_std=0.003, bits=8, seed=k) for k, scene in enumerate(presses)]
-    rest = vts.scenes.render(vts.scenes.at_rest(presses[0]), lights, noise_std=0.003, bits=8, seed=9)
+    rest = vts.scenes.render(vts.scenes.undeformed(presses[0]), lights, noise_std=0.003, bits=8, seed=9)
     return vts.Calibration.from_lights(lights, SENSOR, rest[0]), torch.cat([*frames, rest])
 
 
@@ -134,7 +134,7 @@ def test_a_program_takes_the_decisions_of_the_pipeline(low, mini, tmp_path, kind
         pipe.max_passes = min(pipe.max_passes, 2)  # loops in the graph take minutes to write
     program = export.export_program(pipe, tmp_path / "pipe.pt2").module()
     for batch in (frames[:1], frames[1:3], frames[:3], frames[3:], frames):
-        with operators_only():  # which are what the graph is made of
+        with reference_only():  # which are what the graph is made of
             wanted = pipe(batch)
         for found, expected in zip(program(batch), wanted, strict=True):
             assert (found.double() - expected.double()).abs().max() <= 1e-5
@@ -168,8 +168,8 @@ def test_aoti_without_torchvts(mini, tmp_path):
 def test_matrix_products_integrate_as_the_pipeline_does(height, width, levelled):
     gradient = torch.randn(3, 2, height, width, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     gradient[1:, :, :8] = 0.0
-    by_matrix = export.PoissonRestByMatrix(height, width, 0.3, torch.float64, levelled)(gradient)
-    expected = (vts.PoissonRest if levelled else vts.PoissonDCT)(0.3)(gradient)
+    by_matrix = export.PoissonBackgroundByMatrix(height, width, 0.3, torch.float64, levelled)(gradient)
+    expected = (vts.PoissonBackground if levelled else vts.PoissonDCT)(0.3)(gradient)
     assert (by_matrix - expected).abs().max() < 1e-12
 
 

@@ -17,7 +17,7 @@ LOW = {"radius_mm": 22.0, "height_mm": [15.0, 16.5, 18.0], "level": 0.2}
 
 def rest(lights, sensor, **camera):
     return scenes.render(
-        scenes.at_rest(scenes.sphere_press(10, 1, (0, 0), sensor.height, sensor.width, sensor.mm_per_pixel)), lights, **camera
+        scenes.undeformed(scenes.sphere_press(10, 1, (0, 0), sensor.height, sensor.width, sensor.mm_per_pixel)), lights, **camera
     )[0]
 
 
@@ -161,7 +161,7 @@ CAMERAS = {
 @pytest.mark.parametrize("name", CAMERAS)
 def test_the_camera_is_found_and_the_depth_does_not_feel_it(low_rig, small_sensor, name):
     camera, family, gamma = CAMERAS[name]
-    flat = scenes.at_rest(scenes.sphere_press(10, 1, (0, 0), 120, 160, 0.25))
+    flat = scenes.undeformed(scenes.sphere_press(10, 1, (0, 0), 120, 160, 0.25))
     with warnings.catch_warnings():
         warnings.simplefilter("error", vts.CalibrationWarning)
         calibration = vts.calibrate(seen(flat, low_rig, **camera)[0], small_sensor)
@@ -188,7 +188,7 @@ def test_the_table_of_candidates_says_what_was_tried_and_why_not(low_rig, small_
 
 
 def test_ambient_light_survives_the_file(tmp_path, low_rig, small_sensor):
-    flat = scenes.at_rest(scenes.sphere_press(10, 1, (0, 0), 120, 160, 0.25))
+    flat = scenes.undeformed(scenes.sphere_press(10, 1, (0, 0), 120, 160, 0.25))
     calibration = vts.calibrate(seen(flat, low_rig, ambient=0.1)[0], small_sensor)
     calibration.save(tmp_path / "unit.safetensors")
     loaded = vts.Calibration.load(tmp_path / "unit.safetensors")

@@ -30,7 +30,7 @@ from conftest import ring_lights
 
 import torchvts as vts
 from torchvts.core.files import read_depth_png, read_frames, write_atomically, write_depth_png
-from torchvts.core.response import ResponseField, ResponseModel
+from torchvts.model.response_field import ResponseField, ResponseModel
 
 LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
 DAMAGES = 3000 if LONG else 40

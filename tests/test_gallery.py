@@ -7,9 +7,10 @@ import pytest
 import torch
 
 import torchvts as vts
-from torchvts import faults, gallery
-from torchvts.gallery import DIALS, HEIGHT, MM_PER_PIXEL, USUAL, WIDTH
-from torchvts.shading import cast_shadows
+from torchvts.core.geometry import normal_from_gradient
+from torchvts.evaluation import faults, gallery
+from torchvts.evaluation.gallery import DIALS, HEIGHT, MM_PER_PIXEL, USUAL, WIDTH
+from torchvts.model.lights import cast_shadows
 
 # shape dials that begin with another shape, and dials whose harmless end is not the usual camera
 OTHER_START = {"steep walls", "cut ends", "cut by the border", "covers the image", "two contacts", "few bits", "JPEG"}
@@ -38,7 +39,7 @@ def test_every_severity_makes_a_valid_case(dial):
         assert case.calibration.measured and case.calibration.lights is not None
         assert [t.shape[1] for t in truth[:4]] == [1, 2, 3, 1] and all(t.shape[2:] == (HEIGHT, WIDTH) for t in truth[:4])
         assert all(torch.isfinite(t).all() for t in truth[:3])
-        assert (vts.normal_from_gradient(truth.gradient) - truth.normal).abs().max() < 1e-6
+        assert (normal_from_gradient(truth.gradient) - truth.normal).abs().max() < 1e-6
         assert float(truth.depth_mm.min()) >= 0.0 and bool((truth.depth_mm[truth.contact] > 0).all())
 
 

@@ -7,7 +7,7 @@ import torch
 import yaml
 
 import torchvts as vts
-from torchvts.core.gs_sdk import (
+from torchvts.model.gs_sdk import (
     depth_from_height_map,
     gradient_from_gs_sdk,
     gradient_to_gs_sdk,

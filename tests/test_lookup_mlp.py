@@ -12,7 +12,7 @@ from torch import nn
 
 from torchvts.core.files import save_tensors
 from torchvts.core.geometry import gradient_from_normal, normal_from_gradient
-from torchvts.core.gs_sdk import read_calibration_folder, read_labels
+from torchvts.model.gs_sdk import read_calibration_folder, read_labels
 from torchvts.normals.lookup import NormalFromLookup
 from torchvts.normals.mlp import MAX_GRADIENT, NormalFromMLP, fit_mlp
 

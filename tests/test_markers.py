@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 import torchvts as vts
-from torchvts.markers import FillMarkers, fill_markers, find_markers, marker_diameter_px
+from torchvts.model.markers import FillMarkers, fill_markers, find_markers, marker_diameter_px
 
 HEIGHT, WIDTH, PITCH, NOISE = 200, 264, 0.1, 0.004
 PRESSES = ("sample_8", "sample_13", "sample_34", "sample_43")
@@ -35,7 +35,7 @@ def frame(press_mm=0.0, depth=0.45, noise=NOISE, seed=0, dtype=torch.float32, **
     from conftest import ring_lights
 
     scene = vts.scenes.sphere_press(8.0, press_mm or 1.0, (1.0, -0.5), HEIGHT, WIDTH, PITCH, dtype)
-    scene = scene if press_mm else vts.scenes.at_rest(scene)
+    scene = scene if press_mm else vts.scenes.undeformed(scene)
     clean = vts.scenes.render(scene, ring_lights(dtype=dtype))
     cover = dots(push=4.0 * press_mm, dtype=dtype, **how)
     generator = torch.Generator().manual_seed(seed)

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 import torchvts as vts
-from torchvts.compensate import _some_means
+from torchvts.compensate.compensate import _some_means
 from torchvts.core import native
-from torchvts.core.native import may_use_native, operators_only
-from torchvts.pipeline import _largest_change
+from torchvts.core.native import may_use_native, reference_only
+from torchvts.pipeline.depth import _largest_change
 
 scenes = vts.scenes
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.skipif(native.library() is None and shutil.which("cc") 
 
 def both(call, *arguments):
     """What loops and operators make of one call."""
-    with operators_only():
+    with reference_only():
         operators = call(*arguments)
     return call(*arguments), operators
 
@@ -29,7 +29,7 @@ def test_the_loops_were_built():
 
 
 @pytest.mark.parametrize("size", [(48, 64), (240, 320), (45, 63), (2, 2), (3, 7), (16, 5), (1, 9)])
-@pytest.mark.parametrize("module", [vts.PoissonDCT, vts.PoissonRest])
+@pytest.mark.parametrize("module", [vts.PoissonDCT, vts.PoissonBackground])
 def test_depth_of_any_window(module, size):
     generator = torch.Generator().manual_seed(size[0])
     solver = module(0.3)
@@ -84,11 +84,11 @@ def test_a_frame_of_every_mode(ring):
     presses = [scenes.sphere_press(10.0, max(mm, 0.1), at, 120, 160, 0.25) for mm, at in places]
     frames = torch.cat(
         [
-            scenes.render(press if mm else scenes.at_rest(press), lights, noise_std=0.003, bits=8, seed=k)
+            scenes.render(press if mm else scenes.undeformed(press), lights, noise_std=0.003, bits=8, seed=k)
             for k, (press, (mm, _)) in enumerate(zip(presses, places, strict=True))
         ]
     ).detach()
-    rest = scenes.render(scenes.at_rest(presses[0]), lights, noise_std=0.003, bits=8, seed=9).detach()
+    rest = scenes.render(scenes.undeformed(presses[0]), lights, noise_std=0.003, bits=8, seed=9).detach()
     calibration = vts.Calibration.from_lights(lights, vts.Sensor("rig", 120, 160, 0.25), rest[0])
     for mode in ("fast", "precise", "auto"):
         pipe = vts.DepthPipeline.from_calibration(calibration, mode)
@@ -143,7 +143,7 @@ def test_channels_left_out(ring):
 def test_what_loops_may_not_touch():
     plain = torch.zeros(1, 2, 8, 8)
     assert may_use_native([plain, plain])
-    with operators_only():
+    with reference_only():
         assert not may_use_native([plain])
     assert not may_use_native([plain, plain.double()])
     assert not may_use_native([plain.half()])
@@ -166,7 +166,12 @@ def test_batches_that_do_not_fit_are_refused(ring):
     dark[:, 0, :20] = 0.0
     loops, operators = both(block, dark, None, None, torch.zeros(1, 2, 48, 64))
     assert float((loops - operators).abs().max()) < 1e-4
-    assert block(image[:0]).shape == (0, 3, 48, 64) and vts.PoissonRest(0.1)(torch.zeros(0, 2, 48, 64)).shape == (0, 1, 48, 64)
+    assert block(image[:0]).shape == (0, 3, 48, 64) and vts.PoissonBackground(0.1)(torch.zeros(0, 2, 48, 64)).shape == (
+        0,
+        1,
+        48,
+        64,
+    )
 
 
 def test_defaults_of_torch_do_not_reach_the_loops(ring, small_sensor, small_press):
@@ -189,10 +194,10 @@ def test_traces_see_operators():
     from torch.fx.experimental.proxy_tensor import make_fx
 
     gradient = torch.randn(1, 2, 12, 16, generator=torch.Generator().manual_seed(0))
-    traced = make_fx(lambda part: vts.poisson_rest(part, 0.1))(gradient)
-    assert torch.allclose(traced(gradient), vts.poisson_rest(gradient, 0.1), atol=1e-6)
+    traced = make_fx(lambda part: vts.poisson_background(part, 0.1))(gradient)
+    assert torch.allclose(traced(gradient), vts.poisson_background(gradient, 0.1), atol=1e-6)
     with FakeTensorMode():
-        assert vts.poisson_rest(torch.randn(1, 2, 12, 16), 0.1).shape == (1, 1, 12, 16)
+        assert vts.poisson_background(torch.randn(1, 2, 12, 16), 0.1).shape == (1, 1, 12, 16)
 
 
 @pytest.mark.parametrize("size", [(48, 64), (2, 4000), (1, 81)])

@@ -6,10 +6,10 @@ import references
 import torch
 
 import torchvts as vts
-from torchvts.core.geometry import MAX_SLOPE
+from torchvts.core.geometry import MAX_SLOPE, gradient_from_normal, normal_from_gradient
 from torchvts.normals.photometric import slope_by_lit_lights
 
-scenes, metrics = vts.scenes, vts.metrics
+scenes, metrics = vts.scenes, vts.evaluation.metrics
 
 
 def press(press_mm=1.0, dtype=torch.float64, height=60, width=80):
@@ -25,7 +25,7 @@ def rms_deg(normal, scene, region):
 
 
 def test_the_flat_inverse_is_exact_at_rest(ring):
-    scene, lights = scenes.at_rest(press()), ring(dtype=torch.float64)
+    scene, lights = scenes.undeformed(press()), ring(dtype=torch.float64)
     assert metrics.normal_angle_deg(block_for(lights, scene)(scenes.render(scene, lights)), scene.normal).max() < 1e-12
 
 
@@ -48,7 +48,7 @@ def test_the_inverse_at_the_true_depth_is_exact(ring):
 def test_gloss_is_divided_out_at_rest_and_nearly_so_in_contact(ring, gloss):
     lights, scene = ring(dtype=torch.float64, gloss=gloss), press()
     block = block_for(lights, scene)
-    rest = scenes.at_rest(scene)
+    rest = scenes.undeformed(scene)
     assert metrics.normal_angle_deg(block(scenes.render(rest, lights)), rest.normal).max() < 1e-12
     image = scenes.render(scene, lights)
     matt = block_for(ring(dtype=torch.float64), scene)
@@ -94,7 +94,7 @@ def test_two_lights_and_unit_length_give_the_slope(ring, brightness_std, toleran
     """The third light behind the wall; brightness trusted fully, or to 2 %, where the start keeps some of its say."""
     lights = ring(22.0, 16.0, level=0.2, dtype=torch.float64)
     slope = torch.tensor([[0.9, 0.1], [0.8, -0.2], [0.7, 0.3]], dtype=torch.float64)
-    rows = vts.shading.light_matrix(torch.zeros(1, 1, 1, 1), lights.position_mm, lights.albedo, 1.0)[:, :, :, 0, 0]
+    rows = vts.model.lights.light_matrix(torch.zeros(1, 1, 1, 1), lights.position_mm, lights.albedo, 1.0)[:, :, :, 0, 0]
     turned = torch.stack((-slope[:, 0], -slope[:, 1], torch.ones(3, dtype=torch.float64)), 1)
     light = (rows * (turned / turned.norm(dim=1, keepdim=True))[:, None]).sum(2)
     assert ((light <= 0).sum(1) == 1).all()
@@ -109,7 +109,7 @@ def test_two_lights_and_unit_length_give_the_slope(ring, brightness_std, toleran
 def test_two_lamps_go_on_when_one_is_dead(ring, press_mm, worst_px, dead):
     """What is left of the third channel is noise. The plain inverse errs by more than the press is deep."""
     lights, scene = ring(), press(press_mm, torch.float32, 120, 160)
-    rest = scenes.render(scenes.at_rest(scene), lights, noise_std=0.004, bits=8, seed=1)[0]
+    rest = scenes.render(scenes.undeformed(scene), lights, noise_std=0.004, bits=8, seed=1)[0]
     sensor = vts.Sensor("rig", 120, 160, scene.mm_per_pixel)
     image = scenes.render(scene, lights, noise_std=0.004, bits=8, seed=2)
     image[:, dead] = (0.004 * torch.randn(120, 160, generator=torch.Generator().manual_seed(3))).clamp_min(0.0)
@@ -133,7 +133,9 @@ def fan(azimuth_deg):
 def test_lights_that_nearly_lie_in_a_plane_are_damped(azimuth_deg, rms_px, share):
     """Where the inverse makes more of the noise than slopes are; else bit for bit the plain inverse."""
     lights, scene = fan(azimuth_deg), press(1.0, torch.float32, 120, 160)
-    rest, image = (scenes.render(s, lights, noise_std=0.004, bits=8, seed=k) for k, s in enumerate((scenes.at_rest(scene), scene)))
+    rest, image = (
+        scenes.render(s, lights, noise_std=0.004, bits=8, seed=k) for k, s in enumerate((scenes.undeformed(scene), scene))
+    )
     sensor = vts.Sensor("rig", 120, 160, scene.mm_per_pixel)
     pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, sensor, rest[0]), "precise")
     assert bool(pipe.normals.weak.all()) == (share is not None) and bool(pipe.normals.weak.any()) == (share is not None)
@@ -166,7 +168,7 @@ def test_slopes_are_bounded_however_wild_the_image():
     lights = vts.PointLights([[22, 0, 15], [-11, 19, 16.5], [-11, -19, 18]], [500, 500, 500])
     image = torch.rand(4, 3, 24, 32, generator=torch.Generator().manual_seed(0))
     image[0] = 0.0
-    gradient = vts.gradient_from_normal(vts.NormalFromIntensity(lights, 24, 32, 1.0)(image))
+    gradient = gradient_from_normal(vts.NormalFromIntensity(lights, 24, 32, 1.0)(image))
     assert bool(torch.isfinite(gradient).all())
     assert float(gradient.norm(dim=1).max()) < MAX_SLOPE * (1 + 1e-6)
 
@@ -174,7 +176,7 @@ def test_slopes_are_bounded_however_wild_the_image():
 @pytest.mark.parametrize("max_slope", [0.5, 10.0])
 def test_steepness_stops_at_the_bound_and_keeps_its_direction(max_slope):
     normal = torch.tensor([[3.0, 4.0, 0.01], [3.0, 4.0, -2.0], [0.0, 0.0, -1.0], [0.03, 0.04, 1.0]], dtype=torch.float64)
-    gradient = vts.gradient_from_normal(normal.reshape(4, 3, 1, 1), max_slope)[..., 0, 0]
+    gradient = gradient_from_normal(normal.reshape(4, 3, 1, 1), max_slope)[..., 0, 0]
     expected = torch.tensor([[-0.6, -0.8], [-0.6, -0.8], [0.0, 0.0]], dtype=torch.float64) * max_slope
     assert torch.allclose(gradient[:3], expected, atol=1e-11)
     assert torch.allclose(gradient[3], torch.tensor([-0.03, -0.04], dtype=torch.float64), atol=1e-12)
@@ -184,18 +186,18 @@ def test_steepness_stops_at_the_bound_and_keeps_its_direction(max_slope):
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float64, 1e-13), (torch.float32, 1e-5)])
 def test_gradient_to_normal_and_back(dtype, tolerance):
     gradient = torch.randn(2, 2, 20, 20, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(dtype)
-    normal = vts.normal_from_gradient(gradient)
+    normal = normal_from_gradient(gradient)
     assert (normal.norm(dim=1) - 1).abs().max() < tolerance
-    assert (vts.gradient_from_normal(normal) - gradient).abs().max() < tolerance
-    assert (vts.gradient_from_normal(7 * normal) - gradient).abs().max() < tolerance
+    assert (gradient_from_normal(normal) - gradient).abs().max() < tolerance
+    assert (gradient_from_normal(7 * normal) - gradient).abs().max() < tolerance
 
 
 def test_derivatives_of_gradient_and_normal():
     gradient = torch.randn(1, 2, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64).requires_grad_(True)
-    assert torch.autograd.gradcheck(vts.normal_from_gradient, gradient)
-    assert torch.autograd.gradcheck(vts.gradient_from_normal, vts.normal_from_gradient(gradient.detach()).requires_grad_(True))
+    assert torch.autograd.gradcheck(normal_from_gradient, gradient)
+    assert torch.autograd.gradcheck(gradient_from_normal, normal_from_gradient(gradient.detach()).requires_grad_(True))
     flat = torch.tensor([0.0, 0.0, 1.0]).reshape(1, 3, 1, 1).requires_grad_(True)
-    vts.gradient_from_normal(flat).sum().backward()
+    gradient_from_normal(flat).sum().backward()
     assert flat.grad.flatten().tolist() == [-1.0, -1.0, 0.0]
 
 

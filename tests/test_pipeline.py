@@ -7,8 +7,10 @@ import torch
 from torch import nn
 
 import torchvts as vts
+from torchvts.core.geometry import normal_from_gradient
+from torchvts.evaluation import metrics
 
-scenes, metrics = vts.scenes, vts.metrics
+scenes = vts.scenes
 PITCH = 0.0625
 FULL = vts.Sensor("rig", 480, 640, PITCH)
 
@@ -35,7 +37,7 @@ def worn_unit(request, ring):
     """Low lights, noise, 8 bits, a spotted skin: calibrated from its own image at rest."""
     lights = ring(22.0, [15.0, 16.5, 18.0], rotation_deg=90.0, level=request.param)
     camera = {"noise_std": 0.01, "bits": 8, "spots": scenes.skin_spots(480, 640)}
-    background = scenes.render(scenes.at_rest(scenes.sphere_press()), lights, **camera, seed=1)[0]
+    background = scenes.render(scenes.undeformed(scenes.sphere_press()), lights, **camera, seed=1)[0]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", vts.CalibrationWarning)  # judged in test_fit_lights
         calibration = vts.calibrate(background, FULL)
@@ -54,7 +56,7 @@ def test_a_worn_unit_with_low_lights(worn_unit, press_mm, largest_px, rms_px):
 
 def share_of_the_plain_inverse(lights, scene, noise_std):
     """RMS error of depth over that of the plain inverse; noise, 8 bits."""
-    rest = scenes.render(scenes.at_rest(scene), lights, noise_std=noise_std, bits=8, seed=1)[0]
+    rest = scenes.render(scenes.undeformed(scene), lights, noise_std=noise_std, bits=8, seed=1)[0]
     image = scenes.render(scene, lights, noise_std=noise_std, bits=8, seed=2)
     pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, FULL, rest), "precise")
     ours = metrics.depth_error(pipe(image).depth_mm, scene.depth_mm, PITCH).rms_px
@@ -91,7 +93,7 @@ def low_rig(scene, seed=0):
     position = torch.stack((25 * angles.cos(), 25 * angles.sin(), torch.full_like(angles, 13.0)), dim=1).float()
     lights = vts.PointLights(position, torch.full((3,), 0.2 * (25**2 + 13**2) ** 1.5 / 13)).requires_grad_(False)
     camera = {"noise_std": 0.003, "bits": 8}
-    rest = scenes.render(scenes.at_rest(scene), lights, **camera, seed=2 * seed)[0]
+    rest = scenes.render(scenes.undeformed(scene), lights, **camera, seed=2 * seed)[0]
     sensor = vts.Sensor("rig", *scene.depth_mm.shape[2:], scene.mm_per_pixel)
     pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, sensor, rest), "precise")
     return pipe, lambda shadows: scenes.render(scene, lights, **camera, seed=2 * seed + 1, shadows=shadows).detach()
@@ -143,8 +145,8 @@ def test_slopes_beyond_the_plane_fit_as_well(ring):
     dark = block.blocked(seen)
     assert bool(moved.any()) and bool((dark | ~moved).all())
     depth, pitch = scene.depth_mm, 0.4
-    matrix = vts.shading.light_matrix(depth, lights.position_mm, lights.albedo, pitch)  # (1, light, axis, H, W)
-    before, after = ((matrix * vts.normal_from_gradient(slope)[:, None]).sum(dim=2) for slope in (scene.gradient, found))
+    matrix = vts.model.lights.light_matrix(depth, lights.position_mm, lights.albedo, pitch)  # (1, light, axis, H, W)
+    before, after = ((matrix * normal_from_gradient(slope)[:, None]).sum(dim=2) for slope in (scene.gradient, found))
     lit = (seen > 0.01) & (found.norm(dim=1, keepdim=True) < 9.0)
     assert float(((before - after).abs() * lit).max()) < 1e-4
     assert bool((after[(seen <= 0) & moved] <= before[(seen <= 0) & moved] + 1e-4).all())
@@ -174,7 +176,7 @@ def dimmed(lights, factors):
 def test_auto_levels_lamps_that_have_dimmed(ring, small_sensor, small_press, factors, radius_mm, press_mm):
     """10 to 25 % off; contacts of 5 and 40 % of the image. Left as it is, the mask floods and the depth is far off."""
     lights, scene = ring(), small_press(press_mm, (2.0, 1.0), radius_mm)
-    rest = scenes.render(scenes.at_rest(scene), lights, noise_std=0.004, bits=8, seed=1)[0]
+    rest = scenes.render(scenes.undeformed(scene), lights, noise_std=0.004, bits=8, seed=1)[0]
     calibration = vts.Calibration.from_lights(lights, small_sensor, rest)
     before = scenes.render(scene, lights, noise_std=0.004, bits=8, seed=2)
     after = scenes.render(scene, dimmed(lights, factors), noise_std=0.004, bits=8, seed=2)
@@ -187,14 +189,14 @@ def test_auto_levels_lamps_that_have_dimmed(ring, small_sensor, small_press, fac
     )
     assert levelled < 1.3 * undisturbed and left > 20 * undisturbed
     assert metrics.mask_iou(auto(after).contact, scene.contact) > 0.98
-    nothing = auto(scenes.render(scenes.at_rest(scene), dimmed(lights, factors), noise_std=0.004, bits=8, seed=3))
+    nothing = auto(scenes.render(scenes.undeformed(scene), dimmed(lights, factors), noise_std=0.004, bits=8, seed=3))
     assert not bool(nothing.contact.any())
 
 
 @pytest.mark.parametrize("radius_mm, press_mm", [(8.0, 1.0), (12.0, 2.0)])
 def test_a_tilted_punch_larger_than_half_of_the_image_is_no_drift(ring, small_sensor, radius_mm, press_mm):
     lights, scene = ring(), scenes.punch_press(radius_mm, press_mm, 2.0, 1.0, 120, 160, 0.25)
-    rest = scenes.render(scenes.at_rest(scene), lights, noise_std=0.004, bits=8, seed=1)[0]
+    rest = scenes.render(scenes.undeformed(scene), lights, noise_std=0.004, bits=8, seed=1)[0]
     calibration = vts.Calibration.from_lights(lights, small_sensor, rest)
     image = scenes.render(scene, lights, noise_std=0.004, bits=8, seed=2)
     level = vts.Compensate.from_calibration(calibration, level=True)
@@ -204,8 +206,8 @@ def test_a_tilted_punch_larger_than_half_of_the_image_is_no_drift(ring, small_se
 @pytest.mark.parametrize("factor", [1.0, 0.9, 0.75])
 @pytest.mark.parametrize("touched", [0.0, 0.4])
 def test_a_response_field_levels_up_to_a_quarter(small_sensor, factor, touched):
-    field = vts.core.response.ResponseField(0, -1, False, 10.0, ((0.3, 0, 0), (0, 0.3, 0)))
-    model = vts.core.response.ResponseModel(field, None)
+    field = vts.model.response_field.ResponseField(0, -1, False, 10.0, ((0.3, 0, 0), (0, 0.3, 0)))
+    model = vts.model.response_field.ResponseModel(field, None)
     background = 0.5 + 0.004 * torch.randn(3, 120, 160, generator=torch.Generator().manual_seed(0))
     image = background + 0.004 * torch.randn(3, 120, 160, generator=torch.Generator().manual_seed(1))
     rows = int(touched * 120)
@@ -229,7 +231,7 @@ def test_a_lamp_that_is_out_is_no_drift(ring, small_sensor, small_press):
 def mixed(ring, small_sensor, small_press):
     """Frames at rest, hardly pressed and well pressed, and their lights."""
     lights = ring()
-    presses = [scenes.at_rest(small_press()), small_press(1.5), small_press(0.05, (6, 4), 4.0), small_press(1.0, (-8, 3))]
+    presses = [scenes.undeformed(small_press()), small_press(1.5), small_press(0.05, (6, 4), 4.0), small_press(1.0, (-8, 3))]
     return lights, torch.cat([scenes.render(scene, lights, bits=8) for scene in presses])
 
 
@@ -409,7 +411,7 @@ def test_another_integrator_takes_its_place(mixed, small_sensor):
 def test_spots_and_dead_pixels_are_compensated(ring, small_sensor, small_press):
     lights, scene = ring(), small_press(1.0)
     spots = scenes.skin_spots(120, 160)
-    background, image = (scenes.render(s, lights, spots=spots)[0] for s in (scenes.at_rest(scene), scene))
+    background, image = (scenes.render(s, lights, spots=spots)[0] for s in (scenes.undeformed(scene), scene))
     cal = vts.Calibration.from_lights(lights, small_sensor, background)
     clean = pipeline(lights, small_sensor)(scenes.render(scene, lights)).depth_mm
     assert int(cal.defects.sum()) >= 25
@@ -450,7 +452,7 @@ def test_a_dimmed_lamp_costs_nothing_on_rigs_that_saturate(height_mm, out_mm, al
     position = torch.stack((out_mm * angles.cos(), out_mm * angles.sin(), torch.full((3,), height_mm)), dim=1)
     lights = vts.PointLights(position, [albedo] * 3)
     scene = vts.scenes.sphere_press(10.0, 1.0, (0, 0), 120, 160, 0.25)
-    rest = vts.scenes.render(vts.scenes.at_rest(scene), lights, noise_std=noise_std, bits=8, seed=1)[0].detach()
+    rest = vts.scenes.render(vts.scenes.undeformed(scene), lights, noise_std=noise_std, bits=8, seed=1)[0].detach()
     assert float((rest > 0.98).any(dim=0).double().mean()) > 0.01
     calibration = vts.Calibration.from_lights(lights, vts.Sensor("rig", 120, 160, 0.25), rest)
     pipe = vts.DepthPipeline.from_calibration(calibration, "auto")
@@ -459,6 +461,6 @@ def test_a_dimmed_lamp_costs_nothing_on_rigs_that_saturate(height_mm, out_mm, al
         lamps = vts.PointLights(position, [albedo, gain * albedo, albedo])
         with torch.inference_mode():
             out = pipe(vts.scenes.render(scene, lamps, noise_std=noise_std, bits=8))
-        errors.append(vts.metrics.depth_error(out.depth_mm, scene.depth_mm, 0.25))
+        errors.append(metrics.depth_error(out.depth_mm, scene.depth_mm, 0.25))
     assert errors[1].rms_px < 1.3 * errors[0].rms_px
     assert errors[1].max_px < 1.3 * errors[0].max_px

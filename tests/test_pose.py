@@ -10,9 +10,10 @@ import pytest
 import torch
 
 import torchvts as vts
-from torchvts import objects, pose_bench
-from torchvts.pose import ambiguity, clouds, points
+from torchvts.evaluation import pose_accuracy as pose_bench
+from torchvts.pose import ambiguity, clouds, contact_cloud, points
 from torchvts.pose.result import invert, motion, turn_deg
+from torchvts.scenes import objects
 
 ROOT = Path(__file__).resolve().parents[1]
 PITCH = 0.125
@@ -172,7 +173,7 @@ def skirted_ball(x0, y0, press, seed):
     coarse = 0.03 * torch.randn(1, 2, 8, 10, generator=torch.Generator().manual_seed(seed))
     error = torch.nn.functional.interpolate(coarse, SIZE, mode="bicubic", align_corners=True)
     gradient = (scene.gradient + error) * scene.contact
-    return vts.DepthOutput(vts.integration.poisson_rest(gradient, PITCH), gradient, scene.normal, scene.contact)
+    return vts.DepthOutput(vts.integration.poisson_background(gradient, PITCH), gradient, scene.normal, scene.contact)
 
 
 def test_a_ball_in_its_skirt_is_still_a_ball():
@@ -276,11 +277,11 @@ def test_the_covariance_foretells_the_error():
 
 
 def test_the_contact_cloud_is_even_sure_and_has_the_cameras_normals(reference):
-    cloud, normals = vts.contact_cloud(reference, PITCH, 400)
+    cloud, normals = contact_cloud(reference, PITCH, 400)
     assert 320 <= len(cloud) <= 400 and normals.shape == cloud.shape
     assert float(cloud[:, 2].min()) > 0.03
     assert torch.allclose(normals.norm(dim=1), torch.ones(len(cloud), dtype=torch.float64))
-    whole, fine = vts.contact_cloud(reference, PITCH, None)
+    whole, fine = contact_cloud(reference, PITCH, None)
     assert len(whole) < int(reference.contact.sum())
     assert (torch.cdist(whole, cloud).min(1).values < 1.0).all()  # evenly spread: no part is far from a kept point
     row = (SIZE[0] - 1) / 2 - whole[:, 1] / PITCH
@@ -288,13 +289,13 @@ def test_the_contact_cloud_is_even_sure_and_has_the_cameras_normals(reference):
     seen = reference.normal[0, :, row.round().long(), column.round().long()].T * torch.tensor([1.0, -1.0, 1.0])
     assert (seen - fine).abs().max() < 1e-5
     with pytest.raises(ValueError, match="frame: expected a contact deeper than its own noise"):
-        vts.contact_cloud(reference._replace(depth_mm=0.01 * reference.depth_mm), PITCH)
+        contact_cloud(reference._replace(depth_mm=0.01 * reference.depth_mm), PITCH)
 
 
 @pytest.mark.parametrize("twist", [(0.02, -0.03, 2.0, 3.0, -2.0, 0.1), (1.2, -0.8, 2.0, 3.0, -2.0, 5.0)])
 @pytest.mark.parametrize("order", ["same", "mixed"])
 def test_a_known_motion_of_a_cloud_comes_back(reference, twist, order):
-    cloud = vts.contact_cloud(reference, PITCH, None)[0]
+    cloud = contact_cloud(reference, PITCH, None)[0]
     T = motion(torch.tensor(twist, dtype=torch.float64))
     moved = cloud @ T[:3, :3].T + T[:3, 3]
     if order == "mixed":
@@ -318,7 +319,7 @@ def test_a_cloud_that_is_no_relief_is_registered():
 def test_contact_clouds_of_two_presses(with_normals, most):
     shape = objects.textured_patch()
     T_t, T_s = objects.pose(0.0, press_mm=0.5), objects.pose(75.0, (1.0, -0.8), 0.6, (1.0, 0.5))
-    (s, n_s), (t, n_t) = (vts.contact_cloud(frame(shape, T), PITCH, most) for T in (T_s, T_t))
+    (s, n_s), (t, n_t) = (contact_cloud(frame(shape, T), PITCH, most) for T in (T_s, T_t))
     normals = {"source_normals": n_s, "target_normals": n_t} if with_normals else {}
     forth, back = vts.register_points(s, t, **normals), vts.register_points(t, s, **{
         "source_normals": n_t, "target_normals": n_s} if with_normals else {})  # fmt: skip
@@ -331,13 +332,13 @@ def test_contact_clouds_of_two_presses(with_normals, most):
 
 def test_clouds_of_spheres_are_ambiguous():
     one, two = (frame(objects.sphere(), objects.pose(press_mm=d)) for d in (0.5, 0.6))
-    found = vts.register_points(vts.contact_cloud(one, PITCH, None)[0], vts.contact_cloud(two, PITCH, None)[0])
+    found = vts.register_points(contact_cloud(one, PITCH, None)[0], contact_cloud(two, PITCH, None)[0])
     assert found.ambiguous == ["rotation about x", "rotation about y", "rotation about z"]
 
 
 def test_clouds_that_do_not_match_do_not_converge(reference):
     other = frame(objects.TARGETS["gear"].height_mm, objects.pose(20.0, (0.5, 0.0), 0.5))
-    found = vts.register_points(vts.contact_cloud(other, PITCH, None)[0], vts.contact_cloud(reference, PITCH, None)[0])
+    found = vts.register_points(contact_cloud(other, PITCH, None)[0], contact_cloud(reference, PITCH, None)[0])
     assert not found.converged and found.message
 
 
@@ -360,7 +361,7 @@ def test_impossible_clouds_are_refused():
 
 
 def test_duplicate_points_change_nothing(reference):
-    cloud = vts.contact_cloud(reference, PITCH, None)[0]
+    cloud = contact_cloud(reference, PITCH, None)[0]
     moved = cloud + torch.tensor([0.5, 0.2, 0.0], dtype=torch.float64)
     found = vts.register_points(torch.cat((cloud, cloud[:100])), moved)
     assert found.converged and (found.T_target_source[:3, 3] - (moved - cloud)[0]).abs().max() < 1e-4
@@ -368,10 +369,10 @@ def test_duplicate_points_change_nothing(reference):
 
 def test_without_open3d_clouds_register_and_files_say_what_to_install(monkeypatch, reference, tmp_path):
     monkeypatch.setitem(sys.modules, "open3d", None)
-    cloud = vts.contact_cloud(reference, PITCH, None)[0]
+    cloud = contact_cloud(reference, PITCH, None)[0]
     assert vts.register_points(cloud, cloud + 0.1).converged
     other = frame(objects.key(), objects.pose(20.0))
-    assert not vts.register_points(cloud, vts.contact_cloud(other, PITCH, None)[0]).converged
+    assert not vts.register_points(cloud, contact_cloud(other, PITCH, None)[0]).converged
     with pytest.raises(ImportError, match=r"pip install 'torchvts\[pose\]'"):
         clouds.write_point_cloud(tmp_path / "a.ply", cloud)
 
@@ -414,7 +415,7 @@ def test_the_script_writes_pose_and_picture(tmp_path):
     lights, pipe = pose_bench.rig(*SIZE, PITCH)
     del pipe
     T_t, T_s = objects.pose(0.0, press_mm=0.5), objects.pose(50.0, (1.0, 0.5), 0.55)
-    rest = vts.scenes.at_rest(objects.press(objects.stamp(), T_t, *SIZE, PITCH))
+    rest = vts.scenes.undeformed(objects.press(objects.stamp(), T_t, *SIZE, PITCH))
     background = vts.scenes.render(rest, lights)[0]
     sensor = vts.Sensor("pose rig", *SIZE, PITCH)
     vts.Calibration.from_lights(lights, sensor, background).save(tmp_path / "unit.safetensors")

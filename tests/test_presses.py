@@ -17,10 +17,12 @@ import torch
 from conftest import ring_lights
 
 import torchvts as vts
+from torchvts.calibration import fit_prior
 from torchvts.calibration.balls import guess_circle
 from torchvts.calibration.calibrate import CalibrationWarning
 from torchvts.calibration.contacts import read_contacts
-from torchvts.core.response import CHANGE_SCALE, ResponseField, ResponseModel
+from torchvts.evaluation import metrics
+from torchvts.model.response_field import CHANGE_SCALE, ResponseField, ResponseModel
 
 HEIGHT, WIDTH, PITCH = 120, 160, 0.125
 SIZE = (HEIGHT, WIDTH, PITCH)
@@ -95,7 +97,7 @@ CAMERAS = {"field": (seen_by_field, soft_ball), "curve": (seen_by_curve, ball), 
 
 
 def background(camera=seen_by_curve):
-    return camera(vts.scenes.at_rest(ball()), 99)
+    return camera(vts.scenes.undeformed(ball()), 99)
 
 
 def take_presses(camera=seen_by_curve, shape=ball, count=12, deeper=1.0):
@@ -146,7 +148,7 @@ def depth_errors(calibration, camera, shape, mode, places):
         inside = (((x - middle[0]) ** 2 + (y - middle[1]) ** 2) < (edge / PITCH - 2) ** 2)[None, None]
         out = pipe(camera(scene, 500 + k)[None])
         depths.append(float((out.depth_mm - scene.depth_mm).abs()[inside].mean()))
-        angles.append(float(vts.metrics.normal_angle_deg(out.normal, scene.normal, inside).mean()))
+        angles.append(float(metrics.normal_angle_deg(out.normal, scene.normal, inside).mean()))
     return sum(depths) / len(depths), sum(angles) / len(angles)
 
 
@@ -363,7 +365,7 @@ def test_on_clean_noisy_lights_the_choice_is_no_worse_than_the_lights():
 @pytest.fixture(scope="module")
 def prior():
     """From presses on the unit "curve" with a ball of 6 mm."""
-    return vts.fit_prior(background(), SENSOR, take_presses(), "unit A, ball of 6 mm")
+    return fit_prior(background(), SENSOR, take_presses(), "unit A, ball of 6 mm")
 
 
 def other_presses(count):
@@ -397,7 +399,7 @@ def test_a_prior_serves_another_unit_where_lights_are_not_pinned(prior, prior_al
 
 
 def test_pinned_lights_go_before_a_prior(prior):
-    sensor = dataclasses.replace(SENSOR, prior=vts.fit_prior(background(seen_by_lights), SENSOR, take_presses(seen_by_lights)))
+    sensor = dataclasses.replace(SENSOR, prior=fit_prior(background(seen_by_lights), SENSOR, take_presses(seen_by_lights)))
     calibration, warned = calibrate(background(seen_by_lights), sensor)
     assert warned == [] and calibration.report["model"] == "point_lights"
     assert "the image pins the lights to" in calibration.report["reason"]
@@ -496,7 +498,7 @@ def mixed(good, rest):
     tint = torch.tensor([1.3, 0.8, 1.2]).reshape(3, 1, 1)
     bad = {
         "the background": (rest, BALL_MM),
-        "another background": (seen_by_curve(vts.scenes.at_rest(ball()), 5), BALL_MM),
+        "another background": (seen_by_curve(vts.scenes.undeformed(ball()), 5), BALL_MM),
         "a hair's touch": (seen_by_curve(ball((1, -2), 0.004, 2.0), 6), 2.0),
         "twice the diameter": (image, 2 * BALL_MM),
         "half the diameter": (image, 0.5 * BALL_MM),
@@ -585,8 +587,8 @@ def test_an_absurd_diameter_is_left_out_like_any_other(good, rest, ball_mm):
 
 
 def test_only_bad_presses_are_an_error_that_names_each(rest):
-    empty = [vts.Press(rest, 6.0, "first"), vts.Press(seen_by_curve(vts.scenes.at_rest(ball()), 5), 6.0)]
-    for call in (lambda: vts.calibrate(rest, GIVEN, empty), lambda: vts.fit_prior(rest, SENSOR, empty)):
+    empty = [vts.Press(rest, 6.0, "first"), vts.Press(seen_by_curve(vts.scenes.undeformed(ball()), 5), 6.0)]
+    for call in (lambda: vts.calibrate(rest, GIVEN, empty), lambda: fit_prior(rest, SENSOR, empty)):
         with pytest.raises(ValueError, match=r"^presses: none can be used: first: no contact.*; presses\[1\]: no contact"):
             call()
 
@@ -611,7 +613,7 @@ BAD_IMAGES = {
 
 
 @pytest.mark.parametrize("kind", BAD_IMAGES)
-@pytest.mark.parametrize("call", [vts.calibrate, vts.fit_prior])
+@pytest.mark.parametrize("call", [vts.calibrate, fit_prior])
 def test_a_bad_image_is_refused_by_its_place(good, rest, call, kind):
     change, error, message = BAD_IMAGES[kind]
     unnamed = dataclasses.replace(good[0], name="", image=change(good[0].image))
@@ -642,7 +644,7 @@ def test_an_impossible_press_is_refused_by_name(rest, kind):
         vts.Press(**({"image": rest, "ball_diameter_mm": 6.0} | change))
 
 
-@pytest.mark.parametrize("call", [vts.calibrate, vts.fit_prior])
+@pytest.mark.parametrize("call", [vts.calibrate, fit_prior])
 def test_what_is_no_press_is_refused_by_its_place(good, rest, call):
     with pytest.raises(TypeError, match=r"^presses\[1\]: expected a Press, got Tensor: Press\(image, ball_diameter_mm\)"):
         call(rest, GIVEN, [good[0], good[1].image])

@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import torchvts as vts
-from torchvts.core.response import ResponseModel
+from torchvts.model.response_field import ResponseModel
 
 LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
 SLOW = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.large_base_example]
@@ -139,7 +139,7 @@ def random_gradient(height, width, seed, count=1):
     return torch.randn(count, 2, height, width, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-SOLVERS = {"PoissonDST": (3, vts.PoissonDST), "PoissonDCT": (2, vts.PoissonDCT), "PoissonRest": (2, vts.PoissonRest)}
+SOLVERS = {"PoissonDST": (3, vts.PoissonDST), "PoissonDCT": (2, vts.PoissonDCT), "PoissonBackground": (2, vts.PoissonBackground)}
 
 
 @given(st.integers(2, 40), st.integers(2, 40), small, small, st.integers(0, 99))
@@ -156,7 +156,7 @@ def test_integration_keeps_sums_pitch_mirror_and_turn(name, height, width, pitch
     solve = SOLVERS[name][1]
     one, two = random_gradient(height, width, seed, 2).split(1)
     whole = solve()(one)
-    if name != "PoissonRest":  # whose level depends on where the gradient is zero
+    if name != "PoissonBackground":  # whose level depends on where the gradient is zero
         assert gap_mm(solve()(one - 3.0 * two), whole - 3.0 * solve()(two)) < 1e-9
     assert gap_mm(solve(pitch)(one), pitch * whole) < 1e-9
     sign = torch.tensor([-1.0, 1.0], dtype=torch.float64).reshape(1, 2, 1, 1)
@@ -184,7 +184,7 @@ def test_every_size_is_integrated_or_refused(name, height, width, dtype):
 def unit(by, height=HEIGHT, width=WIDTH, pitch=PITCH, dtype=torch.float32):
     """A calibrated unit with an image at rest that has spots and a dead pixel."""
     lights, sensor = ring_lights(dtype=dtype), vts.Sensor("rig", height, width, pitch)
-    rest = vts.shading.flat_image(lights, height, width, pitch)
+    rest = vts.model.lights.flat_image(lights, height, width, pitch)
     rest = rest * vts.scenes.skin_spots(height, width, 2, 1)[0].to(dtype)
     if by == "lights":
         return vts.Calibration.from_lights(lights, sensor, rest)
@@ -201,7 +201,7 @@ def press_image(calibration, kind, seed=0):
     x = {"rest": 0.0, "border": 0.5 * field}.get(kind, 0.1 * field)
     scene = vts.scenes.sphere_press(0.4 * field, 0.1 * field, (x, 0.0), sensor.height, sensor.width, sensor.mm_per_pixel)
     lights = ring_lights()
-    image = vts.scenes.render(vts.scenes.at_rest(scene) if kind == "rest" else scene, lights)
+    image = vts.scenes.render(vts.scenes.undeformed(scene) if kind == "rest" else scene, lights)
     random = torch.Generator().manual_seed(seed)
     if kind == "holes":
         chance = torch.rand(image.shape, generator=random)

@@ -7,18 +7,18 @@ import sys
 import pytest
 
 import torchvts as vts
+from torchvts.calibration import LightFit, fit_prior
+from torchvts.diagnose import Finding
+from torchvts.pipeline import Confidence, ConfidentOutput, bound_at
+from torchvts.pose import contact_cloud
 
 NAMES = [
-    "AdaptiveIntegration", "Calibration", "CalibrationWarning", "CliffIntegration", "CliffPipeline", "Compensate", "Confidence",
-    "ConfidentOutput", "ConfidentPipeline", "ContactMask", "DepthOutput", "DepthPipeline", "Diagnosis", "FillMarkers", "Finding",
-    "GradientFromNormal", "HeightFromBrightness", "LightFit", "NormalFromIntensity", "NormalFromLookup", "NormalFromMLP",
-    "NormalFromResponse",
-    "PerspectiveIntegration", "PointLights", "PoissonDCT", "PoissonDST", "PoissonRest", "Press", "Registration", "Sensor",
-    "Touch", "bound_at", "calibrate", "contact_cloud", "depth_to_points", "diagnose", "divergence", "fill_markers",
-    "find_markers", "fit_lights", "fit_mlp", "fit_prior", "gradient_from_normal", "gs_sdk", "integrate_cliffs",
-    "integrate_perspective", "metrics", "near_field_shading", "normal_from_gradient", "objects", "poisson_dct", "poisson_dst",
-    "poisson_rest", "read_image", "read_presses", "register_depth", "register_points", "scenes", "shipped_sensors", "stream",
-    "write_image",
+    "AdaptiveIntegration", "Calibration", "CalibrationWarning", "Compensate", "ConfidentPipeline", "ContactMask",
+    "DepthOutput", "DepthPipeline", "GradientFromNormal", "NormalFromIntensity", "NormalFromLookup", "NormalFromMLP",
+    "NormalFromResponse", "PointLights", "PoissonBackground", "PoissonDCT", "PoissonDST", "Press", "Sensor", "Touch",
+    "calibrate", "depth_to_points", "diagnose", "fit_lights", "gs_sdk", "near_field_shading", "poisson_background",
+    "poisson_dct", "poisson_dst", "read_image", "read_presses", "register_depth", "register_points", "scenes",
+    "shipped_sensors", "stream", "write_image",
 ]  # fmt: skip
 ARGUMENTS = {
     vts.Sensor: ["name", "height", "width", "mm_per_pixel"],
@@ -28,7 +28,7 @@ ARGUMENTS = {
     vts.fit_lights: ["background", "sensor"],
     vts.calibrate: ["background", "sensor", "presses", "touches"],
     vts.Press: ["image", "ball_diameter_mm", "name"],
-    vts.fit_prior: ["background", "sensor", "presses", "source"],
+    fit_prior: ["background", "sensor", "presses", "source"],
     vts.NormalFromLookup.fit: ["flat", "change", "slope"],
     vts.NormalFromMLP: ["height", "width", "flat", "hidden"],
     vts.NormalFromMLP.load: ["path", "flat"],
@@ -38,9 +38,9 @@ ARGUMENTS = {
     vts.Calibration.save: ["self", "path"],
     vts.DepthPipeline.from_calibration: ["calibration", "mode"],
     vts.diagnose: ["background", "image", "calibration"],
-    vts.Finding: ["name", "message", "severity", "value"],
-    vts.Confidence.from_calibration: ["calibration", "normals"],
-    vts.bound_at: ["bound_95", "level", "spread"],
+    Finding: ["name", "message", "severity", "value"],
+    Confidence.from_calibration: ["calibration", "normals"],
+    bound_at: ["bound_95", "level", "spread"],
     vts.poisson_dst: ["gradient", "mm_per_pixel"],
     vts.poisson_dct: ["gradient", "mm_per_pixel"],
     vts.PoissonDST: ["mm_per_pixel"],
@@ -48,7 +48,7 @@ ARGUMENTS = {
     vts.depth_to_points: ["depth_mm", "mm_per_pixel", "contact"],
     vts.register_points: ["source", "target"],
     vts.register_depth: ["source", "target", "mm_per_pixel"],
-    vts.contact_cloud: ["frame", "mm_per_pixel", "most"],
+    contact_cloud: ["frame", "mm_per_pixel", "most"],
     vts.Compensate: ["gain", "offset", "gamma", "defects"],
     vts.ContactMask: ["flat", "noise_std", "sigmas", "min_size_px"],
     vts.NormalFromIntensity: ["lights", "height", "width", "mm_per_pixel", "noise_std", "inverse"],
@@ -68,9 +68,9 @@ def test_arguments_keep_their_names_and_order(call):
 
 def test_results_have_their_fields_in_order():
     assert vts.DepthOutput._fields == ("depth_mm", "gradient", "normal", "contact")
-    assert vts.ConfidentOutput._fields[:4] == vts.DepthOutput._fields
-    assert vts.ConfidentOutput._fields[4:] == vts.confidence.Bounds._fields
-    assert {"lights", "converged", "loss_history", "direction_std_deg", "message"} <= set(vts.LightFit.__dataclass_fields__)
+    assert ConfidentOutput._fields[:4] == vts.DepthOutput._fields
+    assert ConfidentOutput._fields[4:] == vts.pipeline.confidence.Bounds._fields
+    assert {"lights", "converged", "loss_history", "direction_std_deg", "message"} <= set(LightFit.__dataclass_fields__)
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if callable(getattr(vts, name))])

@@ -16,7 +16,7 @@ SENSOR = vts.Sensor("rig", 24, 32, 1.25, gamma=1.8)
 @pytest.fixture(scope="module")
 def calibration(ring):
     lights = ring(gloss=[0.0, 0.1, 0.2])
-    rest = vts.scenes.at_rest(vts.scenes.sphere_press(10, 1, (0, 0), 24, 32, 1.25))
+    rest = vts.scenes.undeformed(vts.scenes.sphere_press(10, 1, (0, 0), 24, 32, 1.25))
     background = vts.scenes.render(rest, lights, noise_std=0.01, bits=8, gamma=1.8)[0]
     return vts.Calibration.from_lights(lights, SENSOR, background, {"model": "point_lights", "note": "Grüße", "figures": [1, 2.5]})
 

@@ -20,7 +20,11 @@ from conftest import ring_lights
 
 import torchvts as vts
 import torchvts.export
-from torchvts.core.response import ResponseModel
+from torchvts.core.geometry import normal_from_gradient
+from torchvts.integration import DiscontinuityIntegration, PerspectiveIntegration
+from torchvts.model import FillMarkers
+from torchvts.model.response_field import ResponseModel
+from torchvts.pipeline import Confidence
 
 HEIGHT, WIDTH, PITCH = 24, 32, 1.25
 NAN, INF = float("nan"), float("inf")
@@ -29,9 +33,9 @@ MODULES = {
     "gs_sdk.": vts.gs_sdk,
     "export.": torchvts.export,
     "stream.": vts.stream,
-    "objects.": vts.objects,
+    "objects.": vts.scenes.objects,
     "scenes.": vts.scenes,
-    "metrics.": vts.metrics,
+    "metrics.": vts.evaluation.metrics,
 }
 RECORDS = {
     "Calibration", "CalibrationWarning", "ConfidentOutput", "DepthOutput", "Diagnosis", "Diagnosis.of", "Finding", "LightFit",
@@ -62,7 +66,7 @@ def scene():
 
 
 def image():
-    return vts.scenes.render(vts.scenes.at_rest(scene()), lights())[0]
+    return vts.scenes.render(vts.scenes.undeformed(scene()), lights())[0]
 
 
 def fields(deep=False):
@@ -204,7 +208,7 @@ TABLE = {
             "gamma": 2.2,
             "defects": FLAT[0] > 1,
             "blur_px": 1.0,
-            "markers": vts.FillMarkers(),
+            "markers": FillMarkers(),
             "level": True,
             "flat": FLAT,
             "noise_std": 0.01 * FLAT,
@@ -280,13 +284,13 @@ TABLE = {
         },
     ),
     "FillMarkers.from_dict": Entry(
-        {"values": vts.FillMarkers().to_dict(), "source": "file"},
+        {"values": FillMarkers().to_dict(), "source": "file"},
         {"values": [None, [], {"unknown": 1.0}, {"contrast": -1}]},
         label=("source",),
         named={"values": "file"},
         file=("values",),
     ),
-    "FillMarkers.forward": forward(lambda: vts.FillMarkers(), 3, "image"),
+    "FillMarkers.forward": forward(lambda: FillMarkers(), 3, "image"),
     "GradientFromNormal": Entry({"max_slope": 10.0}, {"max_slope": NUMBER}),
     "GradientFromNormal.forward": forward(lambda: vts.GradientFromNormal(), 3, "normal"),
     "NormalFromIntensity": Entry(
@@ -417,9 +421,9 @@ TABLE = {
         },
         lights,
     ),
-    **{name: Entry({"mm_per_pixel": 1.0}, {"mm_per_pixel": NUMBER}) for name in ("PoissonDCT", "PoissonDST", "PoissonRest")},
+    **{name: Entry({"mm_per_pixel": 1.0}, {"mm_per_pixel": NUMBER}) for name in ("PoissonDCT", "PoissonDST", "PoissonBackground")},
     "AdaptiveIntegration": Entry({"mm_per_pixel": 1.0, "share": 0.1}, {"mm_per_pixel": NUMBER, "share": [*NUMBER, 2.0]}),
-    "CliffIntegration": Entry(
+    "DiscontinuityIntegration": Entry(
         {"mm_per_pixel": 1.0, "slope_std": 0.05},
         {
             **dict.fromkeys(("mm_per_pixel", "slope_std", "threshold", "residual", "tolerance_px"), NUMBER),
@@ -428,20 +432,20 @@ TABLE = {
             "max_iterations": INTEGER,
         },
     ),
-    "CliffIntegration.solve": Entry(
+    "DiscontinuityIntegration.solve": Entry(
         {"gradient": GRADIENT, "contact": GRADIENT[:, :1] > 0, "weight": torch.ones(1, 1, 8, 8), **KNOWN},
         {"gradient": BAD_GRADIENT, "contact": BAD_MASKS, "weight": BAD_WEIGHTS, **BAD_KNOWN},
-        lambda: vts.CliffIntegration().solve,
+        lambda: DiscontinuityIntegration().solve,
         named={"known_mm": "known_mm", "known_weight": "known_weight|known_mm, known_weight"},
     ),
     "PerspectiveIntegration": Entry(
-        {"mm_per_pixel": 1.0, "camera_height_mm": 30.0, "integrate": vts.PoissonRest()},
+        {"mm_per_pixel": 1.0, "camera_height_mm": 30.0, "integrate": vts.PoissonBackground()},
         {"mm_per_pixel": NUMBER, "camera_height_mm": NUMBER, "integrate": ["rest", 3]},
     ),
     "PerspectiveIntegration.forward": Entry(
         {"gradient": GRADIENT, "window": (0, 0), "size": (16, 16)},
         {"gradient": BAD_GRADIENT, "window": [(9, 0), (-1, 0)], "size": [(4, 4)]},
-        lambda: vts.PerspectiveIntegration(1.0, 30.0),
+        lambda: PerspectiveIntegration(1.0, 30.0),
         named={"window": "gradient, window", "size": "gradient, window"},
     ),
     "Confidence": Entry(
@@ -481,10 +485,10 @@ TABLE = {
             "gradient": batches(2),
             "contact": [DEPTH[0] > 0, (DEPTH > 0)[:, :, 1:], None, "all", DEPTH],
         },
-        lambda: vts.Confidence.from_calibration(unit()),
+        lambda: Confidence.from_calibration(unit()),
     ),
     "ConfidentPipeline": Entry(
-        {"pipe": pipe(), "confidence": vts.Confidence.from_calibration(unit())},
+        {"pipe": pipe(), "confidence": Confidence.from_calibration(unit())},
         {"pipe": ["fast", None, unit()], "confidence": [True, None, unit()]},
     ),
     "ConfidentPipeline.from_calibration": Entry(
@@ -492,51 +496,6 @@ TABLE = {
         {"calibration": OTHERS, "mode": ["quick", None], "normals": ["mine", torch.nn.Identity()], "integrate": ["mine"]},
     ),
     "ConfidentPipeline.forward": forward(lambda: vts.ConfidentPipeline.from_calibration(unit()), 3, "images"),
-    "HeightFromBrightness": Entry(
-        {"lights": lights(), "noise_std": FLAT, "mm_per_pixel": 1.0, "misfit": 0.1, "full_above": FLAT},
-        {
-            "lights": [POSITION, None],
-            "noise_std": BAD_FLAT,
-            "mm_per_pixel": NUMBER,
-            "misfit": ["1", True, NAN, -1.0, [1.0]],
-            "full_above": [FLAT[None], FLAT[0], "255", FLAT.numpy()],
-        },
-    ),
-    "HeightFromBrightness.from_calibration": Entry({"calibration": unit()}, {"calibration": [*OTHERS, unit("response")]}),
-    **{
-        f"HeightFromBrightness.{name}": Entry(
-            {"compensated": torch.full_like(UP, 0.5), "normal": UP, "depth_mm": DEPTH, **dict.fromkeys(masks, DEPTH > 0)},
-            {
-                **{argument: batches(3) for argument in ("compensated", "normal")},
-                "depth_mm": batches(1),
-                **{mask: [DEPTH[0] > 0, (DEPTH > 0)[:, :, 1:], None, "all", DEPTH] for mask in masks},
-            },
-            lambda name=name: getattr(vts.HeightFromBrightness.from_calibration(unit()), name),
-        )
-        for name, masks in {"forward": ["contact"], "reach": ["contact", "apart"]}.items()
-    },
-    "CliffPipeline": Entry(
-        {
-            "pipe": pipe("precise"),
-            "heights": vts.HeightFromBrightness.from_calibration(unit()),
-            "cliffs": vts.CliffIntegration(PITCH),
-            "sure": 4.0,
-            "rounds": 3,
-        },
-        {
-            "pipe": ["precise", None, unit(), pipe("fast")],
-            "heights": [True, None, unit()],
-            "cliffs": ["mine", None, vts.PoissonRest(1.0)],
-            "sure": NUMBER,
-            "rounds": INTEGER,
-        },
-    ),
-    "CliffPipeline.from_calibration": Entry(
-        {"calibration": unit(), "mode": "auto"},
-        {"calibration": [*OTHERS, unit("response")], "mode": ["fast", "quick", None]},
-        named={"mode": "mode|pipe"},
-    ),
-    "CliffPipeline.forward": forward(lambda: vts.CliffPipeline.from_calibration(unit()), 3, "images"),
     "bound_at": Entry(
         {"bound_95": torch.ones(2), "level": 0.5, "spread": 1.0},
         {"bound_95": [1.0, None, np.ones(2)], "level": [0.0, 1.0, 95, NAN, "0.5", None], "spread": NUMBER},
@@ -559,7 +518,7 @@ TABLE = {
             lambda name=name: getattr(vts, name)(),
             named={"window": "gradient, window", "size": "gradient, window"},
         )
-        for name in ("PoissonDCT", "AdaptiveIntegration", "CliffIntegration")
+        for name in ("PoissonDCT", "AdaptiveIntegration", "DiscontinuityIntegration")
     },
     "Press": Entry(
         {"image": image(), "ball_diameter_mm": 6.0, "center_px": (4.0, 5.0), "contact_radius_px": 3.0},
@@ -639,7 +598,7 @@ TABLE = {
     ),
     "contact_cloud": Entry(
         {"frame": frame(), "mm_per_pixel": 0.4, "most": 100},
-        {"frame": [None, DEPTH, "frame", vts.scenes.at_rest(frame())], "mm_per_pixel": NUMBER, "most": ["9", 0, 1.5]},
+        {"frame": [None, DEPTH, "frame", vts.scenes.undeformed(frame())], "mm_per_pixel": NUMBER, "most": ["9", 0, 1.5]},
     ),
     "depth_to_points": Entry(
         {"depth_mm": DEPTH, "mm_per_pixel": 1.0, "contact": DEPTH > 0},
@@ -734,7 +693,7 @@ TABLE = {
             "camera_height_mm": HEIGHTS,
         },
     ),
-    "integrate_cliffs": Entry(
+    "integrate_discontinuities": Entry(
         {"gradient": GRADIENT, "mm_per_pixel": 1.0, "contact": GRADIENT[:, :1] > 0, "weight": torch.ones(1, 1, 8, 8), **KNOWN},
         {"gradient": BAD_GRADIENT, "mm_per_pixel": NUMBER, "contact": BAD_MASKS, "weight": BAD_WEIGHTS, **BAD_KNOWN},
     ),
@@ -742,20 +701,20 @@ TABLE = {
         {"gradient": GRADIENT, "mm_per_pixel": 1.0, "camera_height_mm": 30.0},
         {"gradient": BAD_GRADIENT, "mm_per_pixel": NUMBER, "camera_height_mm": NUMBER},
     ),
-    "normal_from_gradient": forward(lambda: vts.normal_from_gradient, 2, "gradient"),
+    "normal_from_gradient": forward(lambda: normal_from_gradient, 2, "gradient"),
     **{
         name: Entry(
             {"gradient": torch.zeros(1, 2, 8, 8), "mm_per_pixel": 1.0},
             {"gradient": [*batches(2), torch.zeros(1, 2, 1, 8)], "mm_per_pixel": NUMBER},
         )
-        for name in ("poisson_dct", "poisson_dst", "poisson_rest")
+        for name in ("poisson_dct", "poisson_dst", "poisson_background")
     },
     "read_image": Entry({"path": ...}, {"path": [Path("no/such.png"), ".", None, 3]}, file=("path",), run=False),
     "read_presses": Entry({"folder": ...}, {"folder": [Path("no/such"), ".", None, 3]}, file=("folder",), run=False),
     "register_depth": Entry(
         {"source": frame(), "target": frame(), "mm_per_pixel": 0.4, "initial": EYE},
         {
-            **{name: [None, DEPTH, "frame", vts.scenes.at_rest(frame())] for name in ("source", "target")},
+            **{name: [None, DEPTH, "frame", vts.scenes.undeformed(frame())] for name in ("source", "target")},
             "mm_per_pixel": NUMBER,
             "initial": BAD_POSE,
         },
@@ -923,7 +882,7 @@ TABLE = {
             "spots": [torch.ones(1, 1, 4, 4), "worn", 30],
         },
     ),
-    "scenes.at_rest": Entry({"scene": scene()}, {"scene": [None, DEPTH, "sphere"]}),
+    "scenes.undeformed": Entry({"scene": scene()}, {"scene": [None, DEPTH, "sphere"]}),
     "scenes.skin_spots": Entry(
         {"height": HEIGHT, "width": WIDTH, "spots": 3, "dead_pixels": 3},
         {"height": INTEGER, "width": INTEGER, "spots": ["3", -1, 1.5], "dead_pixels": ["3", -1, 1.5]},
@@ -940,10 +899,10 @@ TABLE = {
         {"angle_deg": ["1", None, NAN], "shift_mm": CENTER, "press_mm": ["1", None, NAN], "tilt_deg": CENTER},
     ),
     "objects.press": Entry(
-        {"height_mm": vts.objects.sphere(), "T_sensor_object": vts.objects.pose(), **SIZE, "fillet_mm": 0.02},
+        {"height_mm": vts.scenes.objects.sphere(), "T_sensor_object": vts.scenes.objects.pose(), **SIZE, "fillet_mm": 0.02},
         {
             "height_mm": [None, "stamp", DEPTH],
-            "T_sensor_object": [*BAD_POSE, vts.objects.pose(tilt_deg=(60.0, 0.0))],
+            "T_sensor_object": [*BAD_POSE, vts.scenes.objects.pose(tilt_deg=(60.0, 0.0))],
             **shaped(fillet_mm=NUMBER),
         },
     ),
@@ -955,11 +914,11 @@ TABLE = {
     "objects.sphere": Entry({"radius_mm": 10.0}, {"radius_mm": NUMBER}),
     "objects.cylinder": Entry({"radius_mm": 6.0}, {"radius_mm": NUMBER}),
     # ---- export ----
-    "export.PoissonRestByMatrix": Entry(SIZE, shaped()),
-    "export.PoissonRestByMatrix.forward": Entry(
+    "export.PoissonBackgroundByMatrix": Entry(SIZE, shaped()),
+    "export.PoissonBackgroundByMatrix.forward": Entry(
         {"gradient": torch.zeros(1, 2, HEIGHT, WIDTH), "window": (0, 0), "size": (HEIGHT, WIDTH)},
         {"gradient": batches(2), "window": [(9, 0), (-1, 0)], "size": [(4, 4)]},
-        lambda: torchvts.export.PoissonRestByMatrix(HEIGHT, WIDTH, 1.0),
+        lambda: torchvts.export.PoissonBackgroundByMatrix(HEIGHT, WIDTH, 1.0),
         named={"window": "gradient, window", "size": "gradient, window"},
     ),
     "export.describe": Entry({"pipe": pipe()}, {"pipe": [None, unit(), "pipeline.pt"]}),

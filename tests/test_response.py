@@ -13,9 +13,10 @@ import torch
 import yaml
 
 import torchvts as vts
-from torchvts.compensate import blur, gaussian_weights
+from torchvts.compensate.compensate import blur, gaussian_weights
 from torchvts.core.files import load_tensors
-from torchvts.core.response import ResponseField, ResponseModel, SensorPrior, fit_log_background
+from torchvts.core.geometry import gradient_from_normal
+from torchvts.model.response_field import ResponseField, ResponseModel, SensorPrior, fit_log_background
 
 FAMILIES = [(0, -1, False), (0, -1, True), (1, -1, False), (2, 1, False), (1, 2, True), (3, 3, True)]
 CHANGE_SCALE = 0.3  # stated in the definition
@@ -238,7 +239,7 @@ def test_normals_have_the_slopes_of_the_definition(with_depth):
     fast, precise, block = normals()
     image, depth = random_image()
     normal = block(image, depth if with_depth else None)
-    slope = vts.gradient_from_normal(normal)
+    slope = gradient_from_normal(normal)
     assert torch.allclose(normal.norm(dim=1), torch.ones(2, 6, 7, dtype=torch.float64), atol=1e-12)
     for b in range(2):
         field = precise if with_depth else fast
@@ -255,7 +256,7 @@ def test_depth_changes_the_slope_as_its_terms_say():
     rows[0][6 * 3 + deep.terms()[6:].index((0, 3))] = 0.1
     block = vts.NormalFromResponse(fast, dataclasses.replace(deep, coefficient=rows), 6, 7, 0.4, dtype=torch.float64)
     image, depth = random_image()
-    before, after = (vts.gradient_from_normal(block(image, d)) for d in (None, depth))
+    before, after = (gradient_from_normal(block(image, d)) for d in (None, depth))
     assert torch.allclose(after[:, 0] - before[:, 0], 0.1 * (image[:, 0] - 1.0) / CHANGE_SCALE * depth[:, 0], atol=1e-12)
     assert torch.allclose(after[:, 1], before[:, 1], atol=1e-12)
 
@@ -265,7 +266,7 @@ def test_slopes_of_the_depth_are_inputs():
     deep = ResponseField(0, -1, True, 1.4, ((0, 0, 0, 0, 0.5, 0), (0, 0, 0, 0, 0, 1 / 3)))
     block = vts.NormalFromResponse(random_field(1, -1, False), deep, 6, 7, 0.4, dtype=torch.float64)
     image, depth = random_image()
-    slope = vts.gradient_from_normal(block(image, depth)).numpy()
+    slope = gradient_from_normal(block(image, depth)).numpy()
     p, q = np.gradient(depth.numpy(), 0.4, axis=3)[:, 0] / 2, np.gradient(depth.numpy(), 0.4, axis=2)[:, 0] / 3
     assert slope == pytest.approx(np.stack((p, q), axis=1), abs=1e-9)
 
@@ -291,7 +292,7 @@ def test_steepness_is_bounded_and_its_direction_kept():
     _, _, block = normals(max_slope=0.7, size=1.0)
     _, _, free = normals(max_slope=1e9, size=1.0)
     image, depth = random_image(spread=0.9)
-    bound, wild = (vts.gradient_from_normal(b(image, depth), 1e9) for b in (block, free))
+    bound, wild = (gradient_from_normal(b(image, depth), 1e9) for b in (block, free))
     steep, length = wild.norm(dim=1), bound.norm(dim=1)
     assert float(steep.max()) > 2.0 and float(length.max()) <= 0.7 * (1 + 1e-9)
     expected = wild * (0.7 / steep).clamp_max(1.0)[:, None]

@@ -6,9 +6,10 @@ import pytest
 import torch
 
 import torchvts as vts
+from torchvts.core.geometry import normal_from_gradient
 from torchvts.core.noise import noise_std
 
-scenes, metrics = vts.scenes, vts.metrics
+scenes, metrics = vts.scenes, vts.evaluation.metrics
 SIZE = {"height": 241, "width": 321, "mm_per_pixel": 0.125, "dtype": torch.float64}
 PRESSES = {
     "sphere": lambda **size: scenes.sphere_press(10.0, 1.0, (2.0, -1.0), **size),
@@ -40,7 +41,7 @@ def test_contact_is_where_depth_is_positive_and_all_else_is_flat(name):
     scene = PRESSES[name](**SIZE)
     assert torch.equal(scene.contact, scene.depth_mm > 0) and 0 < float(scene.contact.double().mean()) < 0.6
     assert scene.gradient[(~scene.contact).expand_as(scene.gradient)].abs().max() == 0
-    assert torch.equal(scene.normal, vts.normal_from_gradient(scene.gradient))
+    assert torch.equal(scene.normal, normal_from_gradient(scene.gradient))
     assert (scene.normal.norm(dim=1) - 1).abs().max() < 1e-14
 
 
@@ -150,9 +151,9 @@ def test_spots_darken_and_dead_pixels_stay_black(rendered):
 
 
 def test_at_rest_there_is_no_contact(rendered):
-    scene = scenes.at_rest(rendered[0])
+    scene = scenes.undeformed(rendered[0])
     assert scene.depth_mm.abs().max() == 0 and not bool(scene.contact.any()) and scene.mm_per_pixel == 0.25
-    assert torch.equal(scene.normal, vts.normal_from_gradient(scene.gradient).abs())
+    assert torch.equal(scene.normal, normal_from_gradient(scene.gradient).abs())
 
 
 def test_depth_error_by_hand():

@@ -23,7 +23,7 @@ def images(tmp_path_factory):
     scene = vts.scenes.sphere_press(10.0, 1.0, height=120, width=160, mm_per_pixel=0.25)
     lights = vts.PointLights([[20.0, 9.0, 25.0], [-18.0, 13.0, 25.0], [-2.0, -22.0, 25.0]], [600.0, 600.0, 600.0])
     (folder / "presses").mkdir()
-    vts.write_image(folder / "background.png", vts.scenes.render(vts.scenes.at_rest(scene), lights, noise_std=0.002)[0])
+    vts.write_image(folder / "background.png", vts.scenes.render(vts.scenes.undeformed(scene), lights, noise_std=0.002)[0])
     for k in range(3):
         vts.write_image(folder / "presses" / f"{k}.png", vts.scenes.render(scene, lights, noise_std=0.002, seed=k)[0])
     return folder, scene

@@ -6,14 +6,15 @@ import references
 import torch
 
 import torchvts as vts
-from torchvts.shading import flat_image, gloss_lobe, inverse_light_matrix, light_matrix, normal_at_depth
+from torchvts.core.geometry import normal_from_gradient
+from torchvts.model.lights import flat_image, gloss_lobe, inverse_light_matrix, light_matrix, normal_at_depth
 
 
 def random_scene(batch=1, height=5, width=7, dtype=torch.float64, seed=0):
     generator = torch.Generator().manual_seed(seed)
     depth = torch.rand(batch, 1, height, width, generator=generator, dtype=torch.float64)
     gradient = torch.randn(batch, 2, height, width, generator=generator, dtype=torch.float64)
-    return depth.to(dtype), vts.normal_from_gradient(gradient).to(dtype)
+    return depth.to(dtype), normal_from_gradient(gradient).to(dtype)
 
 
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float64, 1e-13), (torch.float32, 1e-6)])

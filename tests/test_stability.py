@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchvts import stability
-from torchvts.gallery import DIALS, undisturbed
-from torchvts.stability import MASK, METHODS, Breaking, Row
+from torchvts.evaluation import stability
+from torchvts.evaluation.gallery import DIALS, undisturbed
+from torchvts.evaluation.stability import MASK, METHODS, Breaking, Row
 
 ROOT = Path(__file__).resolve().parents[1]
 POINTS, SEEDS = stability.from_json((ROOT / "tests" / "breaking_points.json").read_text())

@@ -43,9 +43,11 @@ class Frames:
 def unit(ring, small_sensor, small_press):
     """A calibrated unit, and a camera: press in mm and brightness to a picture (H, W, 3) B, G, R, 8 bits, with noise."""
     lights = ring()
-    rest = vts.scenes.render(vts.scenes.at_rest(small_press()), lights)
+    rest = vts.scenes.render(vts.scenes.undeformed(small_press()), lights)
     rendered = {0.0: rest} | {mm: vts.scenes.render(small_press(mm), lights) for mm in (0.5, 1.0)}
-    calibration = vts.Calibration.from_lights(lights, small_sensor, vts.scenes.render(vts.scenes.at_rest(small_press()), lights)[0])
+    calibration = vts.Calibration.from_lights(
+        lights, small_sensor, vts.scenes.render(vts.scenes.undeformed(small_press()), lights)[0]
+    )
     taken = []
 
     def camera(press_mm=0.0, brightness=1.0, noise=0.004):
@@ -414,12 +416,12 @@ def test_lights_that_do_not_fit_the_image_give_only_their_directions(ring, small
     sensor = vts.Sensor("rig", 120, 160, PITCH, light_position_mm=tuple(map(tuple, lights.position_mm.tolist())))
     x = torch.linspace(-1.0, 1.0, 160)
     uneven = torch.stack((0.6 + 0.4 * x, 0.6 - 0.4 * x, 0.5 + 0.4 * (1 - x**2)))[None, :, None]  # lamps that spread badly
-    rest, image = (vts.scenes.render(s, lights) * uneven for s in (vts.scenes.at_rest(scene), scene))
+    rest, image = (vts.scenes.render(s, lights) * uneven for s in (vts.scenes.undeformed(scene), scene))
     calibration, told, metric = streams.calibrate_at_rest(rest[0], sensor)
     assert calibration.report["response"] == "stand-in" and "NOT METRIC" in told and not metric
     out = vts.DepthPipeline.from_calibration(calibration)(image)
     assert float(out.depth_mm.max()) == pytest.approx(0.5, rel=0.25)
-    even, _, metric = streams.calibrate_at_rest(vts.scenes.render(vts.scenes.at_rest(scene), lights)[0], sensor)
+    even, _, metric = streams.calibrate_at_rest(vts.scenes.render(vts.scenes.undeformed(scene), lights)[0], sensor)
     assert even.lights is not None and not metric
 
 

@@ -8,10 +8,11 @@ import pytest
 import torch
 
 import torchvts as vts
-import torchvts.evaluate
+import torchvts.evaluation.score
 from torchvts.calibration.field import Family
 from torchvts.calibration.touches import BRIGHTNESS_POWER, multiplied
-from torchvts.core.response import ResponseField, ResponseModel, SensorPrior, fit_log_background, position_basis
+from torchvts.evaluation import metrics, score
+from torchvts.model.response_field import ResponseField, ResponseModel, SensorPrior, fit_log_background, position_basis
 
 PITCH, HEIGHT, WIDTH = 0.125, 120, 160
 SENSOR = vts.Sensor("touched", HEIGHT, WIDTH, PITCH, gamma=1.0)
@@ -37,7 +38,7 @@ def ball(x_mm=0.0, y_mm=0.0, press_mm=0.5, radius_mm=6.0):
 
 @pytest.fixture(scope="module")
 def rest():
-    return seen(vts.scenes.at_rest(ball()), seed=99)
+    return seen(vts.scenes.undeformed(ball()), seed=99)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +57,7 @@ def calibrate(*arguments, **named):
 def angle(calibration, scene, mode="precise"):
     out = vts.DepthPipeline.from_calibration(calibration, mode)(seen(scene, seed=50)[None])
     inside = torch.nn.functional.avg_pool2d(scene.contact.float(), 9, 1, 4) > 0.999
-    return float(vts.metrics.normal_angle_deg(out.normal, scene.normal, inside).mean())
+    return float(metrics.normal_angle_deg(out.normal, scene.normal, inside).mean())
 
 
 def test_touches_and_one_press_give_the_field(rest, touches):
@@ -149,7 +150,7 @@ def test_real_touches(data):
     scores = []
     for press in judged:
         out = pipe(press.image[None])
-        scores.append(vts.evaluate.score_press(press, out.depth_mm, out.normal, sensor.mm_per_pixel).normal_deg)
+        scores.append(score.score_press(press, out.depth_mm, out.normal, sensor.mm_per_pixel).normal_deg)
     assert sum(scores) / len(scores) < 5.5
 
 
@@ -171,7 +172,7 @@ def under_stray_light(scene, seed):
 
 def test_dark_places_tell_less_of_slopes(monkeypatch):
     """The curl does not see how the scale varies over the image; the brightness at rest does, where light is stray."""
-    rest = under_stray_light(vts.scenes.at_rest(ball()), 99)
+    rest = under_stray_light(vts.scenes.undeformed(ball()), 99)
     places = [(-4.0, 1.0), (5.0, -2.0), (0.5, 3.0), (-6.0, -3.5), (6.0, 4.0)]
     touches = [under_stray_light(ball(x, y, 0.5), k) for k, (x, y) in enumerate(places)]
     press = vts.Press(under_stray_light(ball(0.5, -0.5), 20), 12.0)
@@ -184,7 +185,7 @@ def test_dark_places_tell_less_of_slopes(monkeypatch):
         for k, scene in enumerate(judged):
             inside = torch.nn.functional.avg_pool2d(scene.contact.float(), 9, 1, 4) > 0.999
             normal = pipe(under_stray_light(scene, 50 + k)[None]).normal
-            found[power] += float(vts.metrics.normal_angle_deg(normal, scene.normal, inside).mean()) / len(judged)
+            found[power] += float(metrics.normal_angle_deg(normal, scene.normal, inside).mean()) / len(judged)
     assert found[BRIGHTNESS_POWER] < 0.6 * found[0.0]
 
 
@@ -210,5 +211,5 @@ def test_three_presses_without_a_prior_start_as_touches(data):
     for press in presses[::3]:
         if press.contact_radius_px is not None and press not in drawn:
             out = pipe(press.image[None])
-            scores.append(vts.evaluate.score_press(press, out.depth_mm, out.normal, sensor.mm_per_pixel).normal_deg)
+            scores.append(score.score_press(press, out.depth_mm, out.normal, sensor.mm_per_pixel).normal_deg)
     assert sum(scores) / len(scores) < 5.5

@@ -7,8 +7,10 @@ import pytest
 import torch
 
 import torchvts as vts
-from torchvts.compensate import blur, gaussian_weights
-from torchvts.evaluate import score_press
+from torchvts.calibration import fit_prior
+from torchvts.compensate.compensate import blur, gaussian_weights
+from torchvts.evaluation import metrics
+from torchvts.evaluation.score import score_press
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +33,7 @@ def test_a_second_unit_from_its_background_alone(data, mini, mode, limit_deg):
     out = vts.DepthPipeline.from_calibration(calibration, mode)(bead[None])
     changed = ((smooth - smooth_rest).abs().amax(1, keepdim=True) > 15 / 255) & out.contact
     assert float(changed.double().mean()) > 0.2
-    assert float(vts.metrics.normal_angle_deg(out.normal, own, changed).mean()) < limit_deg
+    assert float(metrics.normal_angle_deg(out.normal, own, changed).mean()) < limit_deg
 
 
 def test_the_contact_of_a_unit_whose_light_drifts_is_not_the_whole_frame(data, mini):
@@ -42,7 +44,7 @@ def test_the_contact_of_a_unit_whose_light_drifts_is_not_the_whole_frame(data, m
 def test_presses_of_one_ball_calibrate_for_another(data, mini):
     background, presses = vts.read_presses(data / "gelsight_mini_a")
     small, large = ([p for p in presses if (p.ball_diameter_mm > 8) is big and p.contact_radius_px] for big in (False, True))
-    prior = vts.fit_prior(background, mini, small)
+    prior = fit_prior(background, mini, small)
     sensor = dataclasses.replace(mini, prior=prior)
     blind = [dataclasses.replace(p, center_px=None, contact_radius_px=None) for p in large[::2]]
     with warnings.catch_warnings():

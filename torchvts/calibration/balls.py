@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..core.sensor import Sensor
+from ..model.sensor import Sensor
 from .contacts import LEAST_INSIDE, Contact, middle_px
 
 EDGE_SLOPE_RATIO = 0.6

@@ -10,23 +10,23 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..compensate import Compensate
-from ..contact import ContactMask
+from ..compensate.compensate import Compensate
+from ..contact.masks import ContactMask
 from ..core.checks import check_image, check_sequence
 from ..core.geometry import gradient_from_normal
-from ..core.response import ResponseModel, SensorPrior, fit_log_background
-from ..core.sensor import Sensor, check_sensor
-from ..integration import poisson_rest
+from ..integration import poisson_background
+from ..model.calibration import Calibration
+from ..model.lights import PointLights, flat_image
+from ..model.response_field import ResponseModel, SensorPrior, fit_log_background
+from ..model.sensor import Sensor, check_sensor
 from ..normals import NormalFromIntensity
-from ..record import Calibration
-from ..shading import PointLights, flat_image
+from .background import falloff, outwardness
 from .balls import center_by_slope, guess_circle
 from .contacts import ROUGH, Contact, Press, Touch, channel_structure, depths, middle_px, read_contacts
 from .field import PRODUCT_PENALTY, Family, angle_deg
 from .light_candidates import choose_lights
 from .lights import LOOSE_DEG, check_exposure
-from .response import FAMILIES, ResponseFit, fit_response, held_out_deg
-from .rest_image import falloff, outwardness
+from .response_fit import FAMILIES, ResponseFit, fit_response, held_out_deg
 from .touches import fit_touches, moved_by_touches, scale_by_presses, scaled, touch_blur_px
 
 PINNED_DEG = 2.0
@@ -435,7 +435,7 @@ def _lights_error(calibration: Calibration, presses: Sequence[Press], contacts: 
         if contact.reason:
             continue
         image = compensate(press.image.detach().cpu().to(calibration.background.dtype)[None])
-        depth = poisson_rest(gradient_from_normal(normals(image)) * contact.mask, pitch)
+        depth = poisson_background(gradient_from_normal(normals(image)) * contact.mask, pitch)
         slope = gradient_from_normal(normals(image, depth))[0].double()
         own = dataclasses.replace(contact)
         if not own.known:

@@ -9,16 +9,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..compensate import blur, gaussian_weights
-from ..contact import ContactMask
+from ..compensate.compensate import blur, gaussian_weights
+from ..contact.masks import ContactMask
 from ..core.checks import check_numbers, check_positive
 from ..core.geometry import gradient_from_normal, gradient_of_depth, pixel_grid_mm
-from ..core.gs_sdk import read_calibration_folder, read_labels
-from ..core.response import ResponseField
-from ..core.sensor import Sensor
-from ..integration import poisson_rest
+from ..integration import poisson_background
+from ..model.calibration import PEDESTAL
+from ..model.gs_sdk import read_calibration_folder, read_labels
+from ..model.response_field import ResponseField
+from ..model.sensor import Sensor
 from ..normals import NormalFromResponse
-from ..record import PEDESTAL
 
 INSIDE = 0.85
 """Part of the contact radius within which the skin is taken to lie on the ball; beyond it begins to leave."""
@@ -231,7 +231,7 @@ def depths(contacts: Sequence[Contact], fast: ResponseField, pitch_mm: float) ->
     height, width = contacts[0].mask.shape
     normals = NormalFromResponse(fast, None, height, width, pitch_mm, dtype=torch.float64)
     gradients = (gradient_from_normal(normals(1.0 + contact.change[None])) * contact.mask for contact in contacts)
-    return [poisson_rest(gradient, pitch_mm)[0, 0] for gradient in gradients]
+    return [poisson_background(gradient, pitch_mm)[0, 0] for gradient in gradients]
 
 
 def go_deeper(contacts: Sequence[Contact], fast: ResponseField, pitch_mm: float) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..core.response import ResponseField, term_degrees, term_degrees_by_term, term_values
+from ..model.response_field import ResponseField, term_degrees, term_degrees_by_term, term_values
 from .contacts import Contact
 
 CURL_WEIGHT = 3.0

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..core.sensor import Sensor
+from ..model.sensor import Sensor
 from .lights import LOOSE_DEG, LightFit, fit_lights
 
 WORTH = 0.01

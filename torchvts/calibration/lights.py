@@ -13,10 +13,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ..core.checks import check_image, check_integer, check_record
-from ..core.sensor import Sensor, check_sensor
-from ..shading import PointLights
-from .levenberg import LevenbergMarquardt, residual_and_jacobian
-from .rest_image import (
+from ..model.lights import PointLights
+from ..model.sensor import Sensor, check_sensor
+from .background import (
     AMBIENT,
     GLOSS,
     OF_THE_CAMERA,
@@ -30,6 +29,7 @@ from .rest_image import (
     paraboloid_start,
     to_lights,
 )
+from .levenberg import LevenbergMarquardt, residual_and_jacobian
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..compensate import blur, gaussian_weights
+from ..compensate.compensate import blur, gaussian_weights
 from ..core.geometry import pixel_grid_mm
-from ..core.response import ResponseField, ResponseModel, position_basis
+from ..model.response_field import ResponseField, ResponseModel, position_basis
 from .contacts import LEAST_INSIDE, Contact, depths
 from .field import Family, curl_form, solve
 

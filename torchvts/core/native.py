@@ -73,13 +73,13 @@ _refused = contextvars.ContextVar("refused", default=False)
 
 
 @contextlib.contextmanager
-def operators_only() -> Iterator[None]:
+def reference_only() -> Iterator[None]:
     """Within it, tensor operators do all the work, as they do in exported programs, while gradients are recorded, and on a GPU.
 
     Example:
-        >>> from torchvts import PoissonRest
-        >>> solver, gradient = PoissonRest(0.1), torch.randn(1, 2, 48, 64)
-        >>> with operators_only():
+        >>> from torchvts import PoissonBackground
+        >>> solver, gradient = PoissonBackground(0.1), torch.randn(1, 2, 48, 64)
+        >>> with reference_only():
         ...     depth = solver(gradient)
         >>> bool((solver(gradient) - depth).abs().max() < 1e-5)
         True
@@ -157,7 +157,7 @@ def contact_mask(
     rounding: float,
     least_cells: float,
 ) -> tuple[Tensor, Tensor]:
-    """Hard and inner contact, bool (B, 1, H, W): see :class:`~torchvts.contact.ContactMask`, whose attributes these are."""
+    """Hard and inner contact, bool (B, 1, H, W): see :class:`~torchvts.contact.masks.ContactMask`, whose attributes these are."""
     compensated, rest, per_noise = compensated.contiguous(), rest.contiguous(), per_noise.contiguous()
     count, _, height, width = compensated.shape
     mask = compensated.new_empty(count, 1, height, width, dtype=torch.bool)

@@ -8,16 +8,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..calibration.background import falloff, outwardness
 from ..calibration.contacts import ROUGH, channel_structure
-from ..calibration.rest_image import falloff, outwardness
 from ..core.checks import QUANTISATION_STD, check_field, check_range
 from ..core.noise import noise_std
 from ..integration import integrate_perspective
-from ..record import Calibration, check_calibration
-from ..shading import PointLights
+from ..model.calibration import Calibration, check_calibration
+from ..model.lights import PointLights
 from .camera import Spots, blockiness, levels_of, new_spots, texture_share
 from .findings import SEVERITIES, Diagnosis, Finding
-from .relief import (
+from .light_change import CHANNELS, FULL, SAME, Change, cell_means, compare
+from .surface import (
     Reader,
     Relief,
     angle_deg,
@@ -30,7 +31,6 @@ from .relief import (
     regions,
     skirt_mm,
 )
-from .rest import CHANNELS, FULL, SAME, Change, cell_means, compare
 from .words import THAN_AT_CALIBRATION, in_words
 
 USUAL_DRIFT = 0.05

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import torch
 
-from ..record import Calibration
-from .rest import CHANNELS, Change
+from ..model.calibration import Calibration
+from .light_change import CHANNELS, Change
 
 
 class Words(NamedTuple):

@@ -1,23 +1,30 @@
 """Floor 2: from gradient to depth."""
 
-from .cliffs import AdaptiveIntegration, CliffIntegration, CliffSolution, cliff_share, integrate_cliffs, label_contacts
+from .discontinuities import (
+    AdaptiveIntegration,
+    DiscontinuityIntegration,
+    DiscontinuitySolution,
+    discontinuity_share,
+    integrate_discontinuities,
+    label_contacts,
+)
 from .perspective import PerspectiveIntegration, integrate_perspective
-from .poisson import PoissonDCT, PoissonDST, PoissonRest, divergence, poisson_dct, poisson_dst, poisson_rest
+from .poisson import PoissonBackground, PoissonDCT, PoissonDST, divergence, poisson_background, poisson_dct, poisson_dst
 
 __all__ = [
     "AdaptiveIntegration",
-    "CliffIntegration",
-    "CliffSolution",
+    "DiscontinuityIntegration",
+    "DiscontinuitySolution",
     "PerspectiveIntegration",
+    "PoissonBackground",
     "PoissonDCT",
     "PoissonDST",
-    "PoissonRest",
-    "cliff_share",
+    "discontinuity_share",
     "divergence",
-    "integrate_cliffs",
+    "integrate_discontinuities",
     "integrate_perspective",
     "label_contacts",
+    "poisson_background",
     "poisson_dct",
     "poisson_dst",
-    "poisson_rest",
 ]

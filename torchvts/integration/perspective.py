@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ..core.checks import check_positive, check_record, check_window
 from ..core.geometry import pixel_grid_mm
-from .poisson import PoissonRest, check_gradient
+from .poisson import PoissonBackground, check_gradient
 
 LEAST_COSINE = 0.05
 """Of h + p u + q v, relative to h: a surface steeper than that turns away from the camera."""
@@ -27,7 +27,7 @@ def integrate_perspective(gradient: Tensor, mm_per_pixel: float, camera_height_m
         mm_per_pixel: pixel pitch in mm, on the skin at rest.
         camera_height_mm: of the camera above the skin at rest, over the image centre.
     Returns:
-        Depth in mm of the point that each pixel sees, (B, 1, H, W), levelled as by :func:`poisson_rest`.
+        Depth in mm of the point that each pixel sees, (B, 1, H, W), levelled as by :func:`poisson_background`.
     Raises:
         ValueError: wrong shape, or H or W below 2; pitch or height not above 0. TypeError: not floating point.
     Source:
@@ -42,13 +42,13 @@ def integrate_perspective(gradient: Tensor, mm_per_pixel: float, camera_height_m
 
 
 class PerspectiveIntegration(nn.Module):
-    """Module face of :func:`integrate_perspective`; takes PoissonRest's place in a pipeline, windows too.
+    """Module face of :func:`integrate_perspective`; takes PoissonBackground's place in a pipeline, windows too.
 
     Its normals should know of the camera as well: ``NormalFromIntensity.from_calibration(calibration, camera_height_mm)``.
 
     Args:
         mm_per_pixel, camera_height_mm: as the function's.
-        integrate: any integrator that takes windows; None for PoissonRest.
+        integrate: any integrator that takes windows; None for PoissonBackground.
     """
 
     takes_window: bool = True
@@ -59,8 +59,8 @@ class PerspectiveIntegration(nn.Module):
         self.camera_height_mm = check_positive("camera_height_mm", camera_height_mm)
         self.least_facing_mm = LEAST_COSINE * self.camera_height_mm
         if integrate is not None:
-            check_record("integrate", integrate, nn.Module, "PoissonRest(mm_per_pixel) is one")
-        self.integrate = PoissonRest(mm_per_pixel) if integrate is None else integrate
+            check_record("integrate", integrate, nn.Module, "PoissonBackground(mm_per_pixel) is one")
+        self.integrate = PoissonBackground(mm_per_pixel) if integrate is None else integrate
 
     def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
         check_gradient(gradient, 2)

@@ -95,7 +95,7 @@ def poisson_dct(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
     return _integrate_dct(gradient, mm_per_pixel, _plan_dct(gradient, gradient.shape[2], gradient.shape[3]), 0, 0, False)
 
 
-def poisson_rest(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
+def poisson_background(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
     r"""Integrate a gradient map into depth with a free border that is zero on average where the gradient is zero.
 
     :func:`poisson_dct`, levelled by the skin at rest: pixels whose gradient is exactly zero, as outside a contact mask. It
@@ -110,7 +110,7 @@ def poisson_rest(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
     Raises:
         ValueError: wrong shape, or H or W below 2. TypeError: not floating point.
     Example:
-        >>> poisson_rest(torch.zeros(1, 2, 8, 8)).abs().max()
+        >>> poisson_background(torch.zeros(1, 2, 8, 8)).abs().max()
         tensor(0.)
     """
     check_gradient(gradient, 2)
@@ -162,8 +162,8 @@ class PoissonDCT(nn.Module):
         return _integrate_dct(gradient, self.mm_per_pixel, plan, top, left, self.levelled)
 
 
-class PoissonRest(PoissonDCT):
-    """Module face of :func:`poisson_rest`; keeps the plan and takes a window as :class:`PoissonDCT` does."""
+class PoissonBackground(PoissonDCT):
+    """Module face of :func:`poisson_background`; keeps the plan and takes a window as :class:`PoissonDCT` does."""
 
     def __init__(self, mm_per_pixel: float = 1.0) -> None:
         super().__init__(mm_per_pixel)

@@ -21,8 +21,8 @@ from ..core.checks import (
 )
 from ..core.geometry import MAX_SLOPE, gradient_from_normal, normal_from_gradient
 from ..core.native import may_use_native
-from ..record import Calibration, check_calibration
-from ..shading import PointLights, flat_image, gloss_lobe, inverse_light_matrix, light_matrix, normal_at_depth, seen_at
+from ..model.calibration import Calibration, check_calibration
+from ..model.lights import PointLights, flat_image, gloss_lobe, inverse_light_matrix, light_matrix, normal_at_depth, seen_at
 
 LEFT_OUT = -1.0
 """Intensity of a channel that says nothing at a pixel, because something keeps its light off: relight.c knows it too. No camera

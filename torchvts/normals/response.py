@@ -7,8 +7,8 @@ from torch import Tensor, nn
 
 from ..core.checks import check_batch, check_integer, check_positive, check_record, check_same_size, check_size, check_window
 from ..core.geometry import gradient_of_depth, normal_from_gradient
-from ..core.response import CHANGE_SCALE, ResponseField
-from ..record import Calibration, check_calibration
+from ..model.calibration import Calibration, check_calibration
+from ..model.response_field import CHANGE_SCALE, ResponseField
 
 
 class NormalFromResponse(nn.Module):

@@ -1,8 +1,8 @@
 """Floor 4: frames as they come: a camera, a video or a folder of images in, depth out; late frames dropped, slow light followed."""
 
+from .background import FollowLight, calibrate_at_rest, rest_image
 from .live import StageClock, TactileFrame, TactileStream
 from .overlay import Overlay, StreamReport, VideoFile, Window, has_display
-from .rest import FollowLight, calibrate_at_rest, rest_image
 from .sources import NewestFrame, Reader, Rectify, open_source
 
 __all__ = [

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from ..core.checks import check_batch, check_integer, check_path
 from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, decode_image, image_files
-from ..core.sensor import Sensor, check_sensor
+from ..model.sensor import Sensor, check_sensor
 
 Pixels = np.ndarray[Any, Any]
 

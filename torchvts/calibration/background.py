@@ -1,0 +1,154 @@
+"""The image of a skin at rest as lights and camera make it: what calibration by point lights fits, pixel by pixel."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..core.checks import QUANTISATION_STD
+from ..core.geometry import pixel_grid_mm
+from ..core.noise import noise_std
+from ..model.lights import PointLights, microfacet
+from ..model.sensor import Sensor
+
+GLOSS, VIGNETTING, VIGNETTING_4, AMBIENT = "gloss", "vignetting", "vignetting of fourth order", "ambient"
+"""What a light's row of numbers may hold after x, y, log z, log albedo."""
+
+OF_THE_CAMERA = (VIGNETTING, VIGNETTING_4)
+"""Terms that the three lights share."""
+
+TUKEY = 4.685  # 95 % efficiency under Gaussian noise
+
+
+class RestPixels(NamedTuple):
+    """What is fitted: positions in mm (N,), squared distance from the image centre relative to the corner's (N,), image values
+    and which of them count (3, N), noise (3,), 1 / gamma, the terms of the model after position and albedo."""
+
+    x: Tensor
+    y: Tensor
+    outward: Tensor
+    image: Tensor
+    usable: Tensor
+    noise: Tensor
+    exponent: float
+    terms: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, value: Tensor, sensor: Sensor) -> "RestPixels":
+        x, y = pixel_grid_mm(sensor.height, sensor.width, sensor.mm_per_pixel, value.dtype)
+        x, y = (axis.expand(value.shape[1:]).flatten() for axis in (x, y))
+        noise = noise_std(value[None])[0].clamp_min(QUANTISATION_STD)
+        image, outward = value.flatten(1), outwardness(sensor).flatten().to(value.dtype)
+        every = cls(x, y, outward, image, image < 0.995, noise, 1.0 / sensor.exponent)
+        # a pixel that noise could clip at black or white is left out, judged by the model so that noise does not choose
+        expected, margin = every.model(paraboloid_start(every)), 2.5 * noise[:, None]
+        return every._replace(usable=every.usable & (expected > margin) & (expected < 1.0 - margin))
+
+    def every(self, count: int) -> "RestPixels":
+        """An even choice of about ``count`` pixels; an odd stride walks through all columns."""
+        stride = max(1, len(self.x) // count) | 1
+        part = {name: getattr(self, name)[..., ::stride] for name in ("x", "y", "outward", "image", "usable")}
+        return self._replace(**part)
+
+    def model(self, parameter: Tensor) -> Tensor:
+        """Image values (3, N) of lights (3, 4 + terms): x, y, log z, log albedo, then ``terms``."""
+        a, b, log_z, log_rho = (parameter[:, k : k + 1] for k in range(4))
+        squared = (self.x - a) ** 2 + (self.y - b) ** 2 + torch.exp(2.0 * log_z)
+        log_light = log_rho + log_z - 1.5 * torch.log(squared)  # eq. 1 at rest
+        extra = {name: parameter[:, 4 + k : 5 + k] for k, name in enumerate(self.terms)}
+        if GLOSS in extra:
+            n_l = torch.exp(log_z) * torch.rsqrt(squared)
+            lobe = microfacet(n_l, torch.ones_like(n_l), torch.sqrt(0.5 + 0.5 * n_l))
+            log_light = log_light + torch.log1p(extra[GLOSS].clamp_min(0.0) * lobe)
+        if VIGNETTING in extra:
+            fourth = extra.get(VIGNETTING_4, 0.0)
+            log_light = log_light + torch.log(falloff(self.outward, extra[VIGNETTING], fourth))
+        if AMBIENT not in extra:
+            return torch.exp(self.exponent * log_light)
+        return (torch.exp(log_light) + extra[AMBIENT]).clamp_min(1e-6) ** self.exponent
+
+    def residual(self, parameter: Tensor) -> Tensor:
+        """Model minus image in units of the noise, (3, N)."""
+        return (self.model(parameter) - self.image) / self.noise[:, None]
+
+
+def outwardness(sensor: Sensor) -> Tensor:
+    """(H, W): squared distance from the image centre, 1 in the corners."""
+    x, y = pixel_grid_mm(sensor.height, sensor.width, 1.0, torch.float64)
+    return (x**2 + y**2) / float(x.max() ** 2 + y.max() ** 2)
+
+
+def falloff(outward: Tensor, second: Tensor | float, fourth: Tensor | float = 0.0) -> Tensor:
+    """Share of the light that a lens with vignetting lets through: 1 in the middle, 1 - second - fourth in the corners.
+
+    Args:
+        outward: squared distance from the image centre, 1 in the corners.
+        second, fourth: coefficients of the second and fourth power of the distance.
+    Source:
+        the first terms of the usual even polynomial; cos^4 of the angle of view begins with them.
+    """
+    return (1.0 - outward * (second + fourth * outward)).clamp_min(0.05)
+
+
+def paraboloid_start(pixels: RestPixels) -> Tensor:
+    """I^(-2/3) = (rho z)^(-2/3) (x^2 + y^2 - 2 a x - 2 b y + a^2 + b^2 + z^2): weighted linear least squares per channel."""
+    x, y, image, exponent, noise = pixels.x, pixels.y, pixels.image, pixels.exponent, pixels.noise
+    span = float(x.abs().max().maximum(y.abs().max()))
+    u, v = x / span, y / span
+    columns = torch.stack((u * u + v * v, u, v, torch.ones_like(u)))  # (4, N)
+    light = image.clamp(1e-3, 1.0) ** (1.0 / exponent)
+    target = light ** (-2.0 / 3.0)
+    # d target / d value, inverted: what weighs residuals as in image value
+    weight = (
+        (image > 3.0 * noise[:, None]) * (image < 0.995) * (light ** (5.0 / 3.0) * image.clamp_min(1e-3) ** (1 - 1 / exponent)) ** 2
+    )
+    robust = torch.ones_like(weight)
+    solution = torch.zeros(3, 4, dtype=image.dtype)
+    for _ in range(8):
+        weighted = columns * (weight * robust)[:, None]  # (3, 4, N)
+        solution = torch.linalg.solve(weighted @ columns.t(), weighted @ target[:, :, None])[:, :, 0]
+        residual = (target - solution @ columns).abs() * weight.sqrt()
+        scale = residual.median(dim=1, keepdim=True).values.clamp_min(1e-12) / 0.6745
+        robust = (1.0 - (residual / (TUKEY * scale)) ** 2).clamp_min(0.0) ** 2
+    curvature = solution[:, 0].clamp_min(1e-6 * target.mean(1))  # a light infinitely far leaves no curvature
+    a, b = -0.5 * solution[:, 1] / curvature, -0.5 * solution[:, 2] / curvature
+    z = (solution[:, 3] / curvature - a * a - b * b).clamp_min(0.01).sqrt()
+    return torch.stack((a * span, b * span, (z * span).log(), -1.5 * (curvature / span**2).log() - (z * span).log()), dim=1)
+
+
+def from_lights(lights: PointLights) -> Tensor:
+    """Parameters (3, 4) of lights."""
+    position, albedo = lights.position_mm.detach().double().cpu(), lights.albedo.detach().double().cpu()
+    return torch.cat((position[:, :2], position[:, 2:].log(), albedo[:, None].log()), dim=1)
+
+
+def to_lights(parameter: Tensor, terms: tuple[str, ...], dtype: torch.dtype) -> PointLights:
+    """The lights of parameters (3, 4 + terms)."""
+    position = torch.cat((parameter[:, :2], parameter[:, 2:3].exp()), dim=1)
+    gloss = parameter[:, 4 + terms.index(GLOSS)].clamp_min(0.0).to(dtype) if GLOSS in terms else None
+    return PointLights(position.to(dtype), parameter[:, 3].exp().to(dtype), gloss)
+
+
+def free_numbers(terms: tuple[str, ...], azimuth: Tensor | None) -> Tensor:
+    """What the fit may move: (3, 4 + terms, F), parameters of the three lights per free number.
+
+    Vignetting is the camera's, shared by all lights; with known azimuths (3,), radians, a light moves along its ray.
+    """
+    columns = 4 + len(terms)
+    own = [k for k in range(columns) if k < 4 or terms[k - 4] not in OF_THE_CAMERA]
+    rows: list[Tensor] = []
+    for light in range(3):
+        for k in own:
+            row = torch.zeros(3, columns, dtype=torch.float64)
+            row[light, k] = 1.0
+            if azimuth is not None and k < 2:
+                if k == 1:
+                    continue
+                row[light, :2] = torch.stack((azimuth[light].cos(), azimuth[light].sin()))
+            rows.append(row)
+    for k, name in enumerate(terms):
+        if name in OF_THE_CAMERA:
+            row = torch.zeros(3, columns, dtype=torch.float64)
+            row[:, 4 + k] = 1.0
+            rows.append(row)
+    return torch.stack(rows, dim=2)

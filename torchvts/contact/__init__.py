@@ -1,0 +1,5 @@
+"""Where the skin is touched."""
+
+from .masks import ContactMask
+
+__all__ = ["ContactMask"]

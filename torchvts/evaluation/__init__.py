@@ -1,0 +1,1 @@
+"""How good methods are, how fast, and where they fail; no other room imports this one."""

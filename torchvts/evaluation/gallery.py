@@ -1,0 +1,362 @@
+"""Hard scenes with exact truth: each a dial that one turns from harmless to hopeless.
+
+The rig is small and quick: 160 x 120 pixels of 0.125 mm, three lights 40 mm away, 50 degrees above the skin and 120 degrees apart,
+noise of 0.002 and 8 bits. Its calibration is given the true lights and one image at rest, so whatever fails, fails by the fault the
+dial is about. Unless that is about shape, a ball of radius 6 mm is pressed in by 1 mm, somewhere near the middle. A case's truth is
+what each pixel sees.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..core.geometry import pixel_grid_mm
+from ..model.calibration import Calibration
+from ..model.lights import PointLights
+from ..model.sensor import Sensor
+from ..scenes.scenes import Scene, skin_spots, smooth_step, surface, surface_at, undeformed
+from .faults import Conditions, photograph
+
+HEIGHT, WIDTH, MM_PER_PIXEL = 120, 160, 0.125
+RADIUS_MM, PRESS_MM = 6.0, 1.0
+LIGHT_DISTANCE_MM, ELEVATION_DEG, SPACING_DEG = 40.0, 50.0, 120.0
+
+Relief = Callable[[Tensor, Tensor], Tensor]
+"""Depth in mm as a function of x and y in mm; negative where nothing touches."""
+
+
+class Case(NamedTuple):
+    """One hard scene.
+
+    Attributes:
+        calibration: what the user has. background: (3, H, W), the image it was made from.
+        image: (1, 3, H, W), the frame to reconstruct. truth: what each of its pixels sees; contact is where the object touches.
+    """
+
+    calibration: Calibration
+    background: Tensor
+    image: Tensor
+    truth: Scene
+
+
+@dataclass(frozen=True)
+class Dial:
+    """One way to fail.
+
+    Attributes:
+        name: the key in :data:`DIALS`. unit: of severity. severities: the first harmless, the last hopeless; they rise, or fall.
+        story: what happens physically. make: severity, which may lie between those, and a seed of noise and place, to a case.
+    """
+
+    name: str
+    unit: str
+    severities: tuple[float, ...]
+    story: str
+    make: Callable[[float, int], Case]
+
+
+def rig_lights(elevation_deg: float = ELEVATION_DEG, spacing_deg: float = SPACING_DEG) -> PointLights:
+    """The rig's lights, exposed for a flat skin of value 0.45; less where they stand lower, for what faces them is brighter."""
+    elevation = math.radians(elevation_deg)
+    azimuths = [math.radians(10.0 + k * spacing_deg) for k in range(3)]
+    across, up = LIGHT_DISTANCE_MM * math.cos(elevation), LIGHT_DISTANCE_MM * math.sin(elevation)
+    level = 0.45 * min(1.0, math.sin(elevation) / math.sin(math.radians(ELEVATION_DEG)))
+    albedo = level * LIGHT_DISTANCE_MM**3 / up
+    return PointLights([[across * math.cos(a), across * math.sin(a), up] for a in azimuths], [albedo] * 3).requires_grad_(False)
+
+
+LIGHTS = rig_lights()
+USUAL = Conditions(LIGHTS, noise_std=0.002, bits=8)
+SENSOR = Sensor("gallery", HEIGHT, WIDTH, MM_PER_PIXEL, gamma=1.0)
+
+
+def undisturbed(seed: int = 0) -> Case:
+    """The case that most dials begin with.
+
+    Example:
+        >>> case = undisturbed()
+        >>> case.image.shape, round(float(case.truth.depth_mm.max()), 2)
+        (torch.Size([1, 3, 120, 160]), 1.0)
+    """
+    return _case(_scene(_press(seed)), seed)
+
+
+# what is pressed in
+
+
+def ball(radius_mm: float, press_mm: float, x_mm: float, y_mm: float) -> Relief:
+    """A ball; far from its axis it stays at its equator's height."""
+    return lambda x, y: torch.sqrt((radius_mm**2 - (x - x_mm) ** 2 - (y - y_mm) ** 2).clamp_min(1e-12)) - (radius_mm - press_mm)
+
+
+def stamp(radius_mm: float, press_mm: float, slope: float, x_mm: float, y_mm: float) -> Relief:
+    """A flat round stamp whose smooth flank, half-way down at ``radius_mm``, is ``slope`` at its steepest."""
+    width = 1.875 * press_mm / slope
+
+    def depth(x: Tensor, y: Tensor) -> Tensor:
+        r = torch.sqrt((x - x_mm) ** 2 + (y - y_mm) ** 2 + 1e-18)
+        return press_mm * (1.0 - smooth_step((r - radius_mm) / width + 0.5))
+
+    return depth
+
+
+def roof(press_mm: float, slope: float, end_slope: float, length_mm: float, x_mm: float, y_mm: float) -> Relief:
+    """Two planes that meet in a ridge along x, turned by 20 degrees, cut off by ends of ``end_slope``."""
+    c, s = math.cos(math.radians(20.0)), math.sin(math.radians(20.0))
+
+    def depth(x: Tensor, y: Tensor) -> Tensor:
+        along, across = c * (x - x_mm) + s * (y - y_mm), c * (y - y_mm) - s * (x - x_mm)
+        return torch.minimum(press_mm - slope * across.abs(), end_slope * (0.5 * length_mm - along.abs()))
+
+    return depth
+
+
+def _place(seed: int) -> tuple[float, float]:
+    x, y = (1.6 * torch.rand(2, generator=torch.Generator().manual_seed(1000 + seed)) - 0.8).tolist()
+    return x, y
+
+
+def _press(seed: int, press_mm: float = PRESS_MM, radius_mm: float = RADIUS_MM) -> Relief:
+    return ball(radius_mm, press_mm, *_place(seed))
+
+
+def _scene(relief: Relief, mm_per_pixel: float = MM_PER_PIXEL) -> Scene:
+    return surface(relief, HEIGHT, WIDTH, mm_per_pixel)
+
+
+# cases
+
+
+def _case(
+    scene: Scene, seed: int, at_calibration: Conditions = USUAL, now: Conditions | None = None,
+    lights: PointLights = LIGHTS, sensor: Sensor = SENSOR,
+) -> Case:  # fmt: skip
+    """The user knows ``lights`` and ``sensor``; conditions are those of the background, and ``now`` of the frame, if others."""
+    background = photograph(undeformed(scene), at_calibration, 2 * seed)[0]
+    image = photograph(scene, now or at_calibration, 2 * seed + 1)
+    return Case(Calibration.from_lights(lights, sensor, background), background, image, scene)
+
+
+def _always(conditions: Callable[[float], Conditions]) -> Callable[[float, int], Case]:
+    """A fault of the rig, there at calibration too, that the calibration does not know of."""
+    return lambda severity, seed: _case(_scene(_press(seed)), seed, conditions(severity))
+
+
+def _since(change: Callable[[float, int], Conditions]) -> Callable[[float, int], Case]:
+    """A fault that came after calibration."""
+    return lambda severity, seed: _case(_scene(_press(seed)), seed, USUAL, change(severity, seed))
+
+
+def _deeper(severity: float, seed: int) -> Case:
+    return _case(_scene(_press(seed, severity)), seed)
+
+
+def _steep(severity: float, seed: int) -> Case:
+    return _case(_scene(stamp(3.5, PRESS_MM, severity, *_place(seed))), seed)
+
+
+def _ends(severity: float, seed: int) -> Case:
+    return _case(_scene(roof(PRESS_MM, 0.4, severity, 9.0, *_place(seed))), seed)
+
+
+def _lowered(shadows: bool) -> Callable[[float, int], Case]:
+    def make(severity: float, seed: int) -> Case:
+        lights = rig_lights(ELEVATION_DEG - severity)
+        return _case(_scene(_press(seed)), seed, replace(USUAL, lights=lights, shadows=shadows), lights=lights)
+
+    return make
+
+
+def _exposed(severity: float, seed: int) -> Case:
+    lights = PointLights(LIGHTS.position_mm, LIGHTS.albedo * severity)  # the user knows the exposure
+    return _case(_scene(_press(seed)), seed, replace(USUAL, lights=lights), lights=lights)
+
+
+def _specks(severity: float, seed: int) -> Conditions:
+    factor = skin_spots(HEIGHT, WIDTH, round(severity), round(severity), seed)
+    dead = factor == 0.0
+    return replace(USUAL, albedo=torch.where(dead, 1.0, factor), dead=dead)
+
+
+def _worn(severity: float, seed: int) -> Conditions:
+    """Smooth stains, darker by up to twice ``severity``: three parts of a common pattern to one of each channel's own."""
+    generator = torch.Generator().manual_seed(2000 + seed)
+    x, y = pixel_grid_mm(HEIGHT, WIDTH, MM_PER_PIXEL)
+    patterns = []
+    for _ in range(4):  # of unit amplitude and periods of 5 to 20 mm
+        pattern = torch.zeros(HEIGHT, WIDTH)
+        for draw in torch.rand(6, 3, generator=generator):
+            wave, angle = 2.0 * math.pi / (5.0 + 15.0 * float(draw[0])), 2.0 * math.pi * float(draw[1])
+            pattern += torch.sin(wave * (x * math.cos(angle) + y * math.sin(angle)) + 2.0 * math.pi * float(draw[2]))
+        patterns.append(pattern / pattern.abs().max())
+    stain = 0.75 * patterns[3] + 0.25 * torch.stack(patterns[:3])
+    return replace(USUAL, albedo=(1.0 - severity * (1.0 + stain)).clamp_min(0.0)[None])
+
+
+def _dimmed(severity: float, seed: int) -> Conditions:
+    return replace(USUAL, light_level=tuple(1.0 - severity if k == seed % 3 else 1.0 for k in range(3)))
+
+
+def _lost(severity: float, seed: int) -> Conditions:
+    level = [min(1.0, max(0.0, 1.0 - severity + k)) for k in range(3)]
+    return replace(USUAL, light_level=tuple(level[(k + seed) % 3] for k in range(3)))
+
+
+def _moved(severity: float, seed: int) -> Conditions:
+    position = LIGHTS.position_mm.clone()
+    angle = math.radians(10.0 + SPACING_DEG * (seed % 3) + 90.0)  # sideways, around the middle
+    position[seed % 3] += severity * torch.tensor([math.cos(angle), math.sin(angle), 0.0])
+    return replace(USUAL, lights=PointLights(position, LIGHTS.albedo))
+
+
+def _together(severity: float, seed: int) -> Case:
+    lights = rig_lights(spacing_deg=SPACING_DEG - severity)
+    return _case(_scene(_press(seed)), seed, replace(USUAL, lights=lights), lights=lights)
+
+
+def _wrong_pitch(severity: float, seed: int) -> Case:
+    return _case(_scene(_press(seed), MM_PER_PIXEL * (1.0 + severity)), seed)
+
+
+def _distorted(severity: float, seed: int) -> Case:
+    """Pixels see the skin at r (1 - k (r / R)^2), R reaching the corner: barrel distortion, with and without contact."""
+    x, y = _grid()
+    factor = 1.0 - severity * (x**2 + y**2) / float(x.max() ** 2 + y.max() ** 2)
+    at_mm = (x * factor, y * factor)
+    scene = surface_at(_press(seed), *at_mm, MM_PER_PIXEL)
+    background = photograph(undeformed(scene), USUAL, 2 * seed, at_mm)[0]
+    image = photograph(scene, USUAL, 2 * seed + 1, at_mm)
+    return Case(Calibration.from_lights(LIGHTS, SENSOR, background), background, image, scene)
+
+
+def _perspective(severity: float, seed: int) -> Case:
+    """A pinhole above the middle that sees the resting skin as an even grid; severity is half its horizontal angle of view.
+
+    The calibration's report tells how high it stands, to those who ask.
+    """
+    if severity == 0.0:
+        return undisturbed(seed)
+    height_mm = 0.5 * WIDTH * MM_PER_PIXEL / math.tan(math.radians(severity))
+    scene = surface(_press(seed), HEIGHT, WIDTH, MM_PER_PIXEL, camera_height_mm=height_mm)
+    case = _case(scene, seed)
+    report = case.calibration.report | {"camera_height_mm": height_mm}
+    return case._replace(calibration=replace(case.calibration, report=report))
+
+
+def _grid() -> tuple[Tensor, Tensor]:
+    x, y = pixel_grid_mm(HEIGHT, WIDTH, MM_PER_PIXEL, torch.float64)
+    return x.expand(HEIGHT, WIDTH), y.expand(HEIGHT, WIDTH)
+
+
+def _marked(severity: float, seed: int) -> Case:
+    """Dots every 2.5 mm that keep 30 % of the light; under the ball they move outward by up to 0.25 mm."""
+    scene = _scene(_press(seed))
+    center_x, center_y = _place(seed)
+    x, y = _grid()
+    away_x, away_y = x - center_x, y - center_y
+    pull = 0.25 * torch.exp(-(away_x**2 + away_y**2) / 18.0) / 3.0  # mm per mm from the ball's middle
+    rest, pressed = (
+        _dots(x - moved * pull * away_x, y - moved * pull * away_y, severity) if severity else None for moved in (0.0, 1.0)
+    )
+    sensor = replace(SENSOR, markers=True)
+    return _case(scene, seed, replace(USUAL, albedo=rest), replace(USUAL, albedo=pressed), sensor=sensor)
+
+
+def _dots(x: Tensor, y: Tensor, diameter_mm: float) -> Tensor:
+    away = torch.sqrt((torch.remainder(x, 2.5) - 1.25) ** 2 + (torch.remainder(y, 2.5) - 1.25) ** 2)
+    cover = ((0.5 * diameter_mm - away) / MM_PER_PIXEL + 0.5).clamp(0.0, 1.0)  # a rim one pixel wide
+    return (1.0 - 0.7 * cover)[None, None]
+
+
+def _cut(severity: float, seed: int) -> Case:
+    _, y = _place(seed)
+    return _case(_scene(ball(RADIUS_MM, PRESS_MM, severity, y)), seed)
+
+
+def _covering(severity: float, seed: int) -> Case:
+    return _case(_scene(_press(seed, severity, 40.0)), seed)
+
+
+def _two(severity: float, seed: int) -> Case:
+    x, y = _place(seed)
+    apart = 0.5 * (2.0 * math.sqrt(4.0**2 - 3.4**2) - severity)  # rims of balls of 4 mm, 0.6 mm deep
+    one, other = (ball(4.0, 0.6, x + side * apart, y + side * 0.3) for side in (-1.0, 1.0))
+    return _case(_scene(lambda x, y: torch.maximum(one(x, y), other(x, y))), seed)
+
+
+def _faint(severity: float, seed: int) -> Case:
+    return _case(_scene(_press(seed, severity) if severity else lambda x, y: 0.0 * x * y - 1.0), seed)
+
+
+def _sagging(severity: float, seed: int) -> Case:
+    """Where the ball lets go of the skin, depth falls off as exp(-r / severity), without a kink."""
+    x_mm, y_mm = _place(seed)
+    cap = ball(RADIUS_MM, PRESS_MM, 0.0, 0.0)
+    low, high = 0.0, math.sqrt(RADIUS_MM**2 - (RADIUS_MM - PRESS_MM) ** 2)
+    for _ in range(60):  # the depth where the skin lets go is the slope there times severity
+        leaves = 0.5 * (low + high)
+        depth = math.sqrt(RADIUS_MM**2 - leaves**2) - (RADIUS_MM - PRESS_MM)
+        falls_short = depth < severity * leaves / math.sqrt(RADIUS_MM**2 - leaves**2)
+        low, high = (low, leaves) if falls_short else (leaves, high)
+    if severity == 0.0:
+        return undisturbed(seed)
+
+    def relief(x: Tensor, y: Tensor) -> Tensor:
+        r = torch.sqrt((x - x_mm) ** 2 + (y - y_mm) ** 2 + 1e-18)
+        skirt = depth * torch.exp(-(r - leaves) / severity)
+        return torch.where(r < leaves, cap(r.clamp_max(leaves), torch.zeros_like(r)), skirt)
+
+    scene = _scene(relief)
+    x, y = _grid()
+    touched = ((x - x_mm) ** 2 + (y - y_mm) ** 2 < leaves**2)[None, None]
+    return _case(scene._replace(contact=touched), seed)
+
+
+DIALS: dict[str, Dial] = {
+    dial.name: dial
+    for dial in (
+        # shape
+        Dial("deeper press", "mm", (1.0, 1.5, 2.0, 3.0, 4.0, 5.0), "A ball of radius 6 mm goes deeper, and its rim steeper: a slope of 0.7 at 1 mm, 5.9 at 5 mm.", _deeper),  # noqa: E501
+        Dial("steep walls", "mm/mm", (0.5, 1.0, 2.0, 4.0, 8.0, 30.0), "A round stamp, 1 mm high, has ever narrower flanks, up to a cliff between two pixels.", _steep),  # noqa: E501
+        Dial("cut ends", "mm/mm", (0.4, 0.8, 1.5, 3.0, 8.0, 100.0), "A roof-shaped wedge, 1 mm high, ends in ever steeper faces, up to a vertical cut.", _ends),  # noqa: E501
+        Dial("cut by the border", "mm", (0.0, 5.0, 7.0, 8.0, 9.0, 10.0, 11.5), "The ball moves from the middle to the image border, until only its flank is seen.", _cut),  # noqa: E501
+        Dial("covers the image", "mm", (0.1, 0.3, 0.6, 1.0, 1.5, 2.2), "A ball of radius 40 mm goes deeper, until no skin at rest is in sight.", _covering),  # noqa: E501
+        Dial("two contacts", "mm", (-2.0, -0.5, 0.0, 0.5, 1.5, 3.0), "Two balls come closer, until their contacts overlap and meet in a crease.", _two),  # noqa: E501
+        Dial("faint contact", "mm", (1.0, 0.3, 0.1, 0.05, 0.02, 0.01, 0.0), "The ball presses ever less, until it does not touch at all.", _faint),  # noqa: E501
+        Dial("gel sag", "mm", (0.0, 0.25, 0.5, 1.0, 2.0, 4.0), "The gel goes down around the object too: a skirt that falls off over so many mm, which the object does not touch.", _sagging),  # noqa: E501
+        # light
+        Dial("attached shadows", "deg", (0.0, 10.0, 20.0, 30.0, 35.0, 40.0, 45.0), "The lights stand lower than 50 degrees: slopes that face away from one get none of it.", _lowered(False)),  # noqa: E501
+        Dial("cast shadows", "deg", (0.0, 10.0, 20.0, 30.0, 35.0, 40.0, 45.0), "The same, and the ball's shadow falls on the skin behind it.", _lowered(True)),  # noqa: E501
+        Dial("specular", "", (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), "The skin shines: a Blinn-Phong lobe of exponent 30 beside the matt light.", _always(lambda s: replace(USUAL, specular=s))),  # noqa: E501
+        Dial("inter-reflection", "share", (0.0, 0.05, 0.1, 0.2, 0.4, 0.7), "Light reaches the skin by way of the skin: one bounce, stood for by the image's own light blurred by 2 mm.", _always(lambda s: replace(USUAL, bounce=s))),  # noqa: E501
+        Dial("ambient light", "share", (0.0, 0.02, 0.05, 0.1, 0.2, 0.5), "Part of the light comes from everywhere, at calibration too.", _always(lambda s: replace(USUAL, ambient=s))),  # noqa: E501
+        Dial("a channel dims", "share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.2), "One lamp loses light after calibration.", _since(_dimmed)),  # noqa: E501
+        Dial("dead lights", "lights", (0.0, 0.3, 0.6, 1.0, 1.5, 2.0), "One lamp goes out after calibration, then a second.", _since(_lost)),  # noqa: E501
+        Dial("a light moves", "mm", (0.0, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0), "One lamp, 40 mm away, is shifted sideways after calibration.", _since(_moved)),  # noqa: E501
+        Dial("lights close together", "deg", (0.0, 40.0, 80.0, 100.0, 110.0, 116.0), "The lights stand less than 120 degrees apart by so much: the light matrix comes near to singular, and noise grows.", _together),  # noqa: E501
+        # skin
+        Dial("albedo drift", "share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.3), "The skin wears after calibration: smooth stains, darker by up to twice as much, three quarters of it alike in all channels.", _since(_worn)),  # noqa: E501
+        Dial("spots and dead pixels", "of each", (0.0, 10.0, 30.0, 100.0, 300.0, 1000.0), "Dirt on the skin and dead pixels come after calibration.", _since(_specks)),  # noqa: E501
+        Dial("markers", "mm", (0.0, 0.4, 0.7, 1.0, 1.4, 1.8), "Dots of this diameter, printed every 2.5 mm, move with the skin; the sensor file says that there are some.", _marked),  # noqa: E501
+        # lens
+        Dial("defocus", "px", (0.0, 0.7, 1.5, 3.0, 6.0, 12.0), "The lens is out of focus: a Gaussian of this standard deviation.", _always(lambda s: replace(USUAL, blur_px=s))),  # noqa: E501
+        Dial("motion blur", "px", (0.0, 2.0, 5.0, 10.0, 20.0, 40.0), "The ball slides while the shutter is open; truth is its middle position.", _since(lambda s, seed: replace(USUAL, motion_px=s))),  # noqa: E501
+        Dial("vignetting", "share", (0.0, 0.1, 0.3, 0.5, 0.7, 0.9), "The lens darkens the corners by so much, at calibration too.", _always(lambda s: replace(USUAL, vignetting=s))),  # noqa: E501
+        Dial("lens distortion", "share", (0.0, 0.05, 0.1, 0.2, 0.35, 0.5), "Barrel distortion: the corners show skin nearer to the middle by so much.", _distorted),  # noqa: E501
+        Dial("perspective", "deg", (0.0, 5.0, 10.0, 20.0, 30.0, 45.0), "The camera is a pin-hole with half this angle of view to either side, treated as if it looked straight down.", _perspective),  # noqa: E501
+        Dial("wrong pitch", "share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.2), "A pixel is larger than the sensor file says.", _wrong_pitch),  # noqa: E501
+        # sensor
+        Dial("saturation", "times", (1.0, 1.3, 1.6, 2.0, 2.5, 3.0), "The exposure is longer, which the user knows, and bright slopes, then the skin itself, clip.", _exposed),  # noqa: E501
+        Dial("black crush", "value", (0.0, 0.02, 0.05, 0.1, 0.2, 0.4), "The camera takes off a black level that nobody told: dark slopes become black.", _always(lambda s: replace(USUAL, black=s))),  # noqa: E501
+        Dial("wrong gamma", "exponent", (1.0, 1.05, 1.1, 1.2, 1.4, 1.8, 2.2), "The camera's values are light to the power 1 / gamma, and the user takes them for light.", _always(lambda s: replace(USUAL, gamma=s))),  # noqa: E501
+        Dial("channel order", "share", (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0), "Red and blue are mixed in the camera, up to swapped, as when B, G, R is read as R, G, B.", _always(lambda s: replace(USUAL, crosstalk=s))),  # noqa: E501
+        Dial("noise", "value", (0.002, 0.005, 0.01, 0.02, 0.05, 0.1), "Noise of the image value, in the background too.", _always(lambda s: replace(USUAL, noise_std=s))),  # noqa: E501
+        Dial("few bits", "bits", (12.0, 8.0, 6.0, 5.0, 4.0, 3.0, 2.0), "The image has fewer levels.", _always(lambda s: replace(USUAL, bits=round(s)))),  # noqa: E501
+        Dial("JPEG", "quality", (100.0, 95.0, 85.0, 70.0, 50.0, 30.0, 10.0), "Images are compressed, their colours at half resolution.", _always(lambda s: replace(USUAL, jpeg_quality=round(s)))),  # noqa: E501
+    )
+}  # fmt: skip
+"""Every dial by name."""

@@ -1,0 +1,122 @@
+"""How far a result is from the truth: depth, normals, contact mask, fitted sphere."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..core.checks import check_batch, check_integer, check_positive, check_shape, check_tensor
+from ..core.geometry import depth_to_points
+
+
+class DepthError(NamedTuple):
+    """Depth error of one or more frames, in mm and in pixels of pitch."""
+
+    max_mm: float
+    rms_mm: float
+    max_px: float
+    rms_px: float
+
+
+class SphereFit(NamedTuple):
+    """Least-squares sphere in the point frame (x right, y up, z to the camera), mm."""
+
+    center_mm: tuple[float, float, float]
+    radius_mm: float
+    rms_mm: float
+
+
+def depth_error(depth_mm: Tensor, truth_mm: Tensor, mm_per_pixel: float, region: Tensor | None = None) -> DepthError:
+    """Largest and RMS depth error, over the image or over ``region`` (bool, same shape).
+
+    Raises:
+        ValueError: shapes differ, or an empty region.
+    Example:
+        >>> depth_error(torch.full((1, 1, 4, 4), 0.5), torch.zeros(1, 1, 4, 4), 0.25).max_px
+        2.0
+    """
+    check_tensor("truth_mm", truth_mm)
+    check_positive("mm_per_pixel", mm_per_pixel)
+    error = (_inside("depth_mm", depth_mm, truth_mm, region) - _inside("truth_mm", truth_mm, truth_mm, region)).double()
+    largest, rms = float(error.abs().max()), float(error.square().mean().sqrt())
+    return DepthError(largest, rms, largest / mm_per_pixel, rms / mm_per_pixel)
+
+
+def normal_angle_deg(normal: Tensor, truth: Tensor, region: Tensor | None = None) -> Tensor:
+    """Angles between two unit normal maps (B, 3, H, W): (B, H, W), or (N,) inside ``region`` (B, 1, H, W).
+
+    Computed from the cross product too, so small angles keep their digits.
+    """
+    check_tensor("truth", truth)
+    check_batch("normal", normal, 3)
+    check_shape("normal", normal, truth.shape, "truth")
+    if region is not None:
+        check_shape("region", region, (normal.shape[0], 1, *normal.shape[2:]), "one channel of normal")
+    cross = torch.linalg.cross(normal, truth, dim=1).norm(dim=1)
+    angle = torch.rad2deg(torch.atan2(cross, (normal * truth).sum(1)))
+    return angle if region is None else angle[region[:, 0].bool()]
+
+
+def mask_iou(mask: Tensor, truth: Tensor) -> float:
+    """Intersection over union of two masks; 1 if both are empty."""
+    check_tensor("truth", truth)
+    check_shape("mask", mask, truth.shape, "truth")
+    union = int((mask.bool() | truth.bool()).sum())
+    return int((mask.bool() & truth.bool()).sum()) / union if union else 1.0
+
+
+def rim_distance_px(mask: Tensor, truth: Tensor) -> float:
+    """Mean distance of a mask's rim to the true rim, and back, in pixels, of one frame; infinite if one has no rim."""
+    for name, value in (("mask", mask), ("truth", truth)):
+        check_tensor(name, value)
+        if value.dim() < 2 or value.numel() != value.shape[-1] * value.shape[-2]:
+            raise ValueError(f"{name}: expected one frame, (H, W) or (1, 1, H, W), got {tuple(value.shape)}: loop over the batch")
+    rims = [torch.nonzero(_rim(m)).double() for m in (mask, truth)]
+    if not (len(rims[0]) and len(rims[1])):
+        return math.inf if len(rims[0]) + len(rims[1]) else 0.0
+    distance = torch.cdist(rims[0], rims[1])
+    return 0.5 * float(distance.min(0).values.mean() + distance.min(1).values.mean())
+
+
+def fit_sphere(depth_mm: Tensor, mm_per_pixel: float, contact: Tensor, steps: int = 20) -> SphereFit:
+    """Geometric least-squares sphere through the contact's points: algebraic start, then Gauss-Newton on the distance.
+
+    Raises:
+        ValueError: fewer than 4 points.
+    """
+    check_integer("steps", steps, 0)
+    check_tensor("contact", contact)
+    points = depth_to_points(depth_mm, mm_per_pixel, contact).double()
+    if len(points) < 4:
+        raise ValueError(f"contact: expected at least 4 pixels, got {len(points)}: no contact, no sphere")
+    mean = points.mean(0)
+    centred = points - mean
+    columns = torch.cat((2 * centred, torch.ones(len(points), 1, dtype=torch.float64)), 1)
+    solution = torch.linalg.lstsq(columns, centred.square().sum(1, keepdim=True)).solution[:, 0]
+    center, radius = solution[:3], (solution[3] + solution[:3].square().sum()).clamp_min(0).sqrt()
+    for _ in range(steps):
+        offset = centred - center
+        distance = offset.norm(dim=1, keepdim=True)
+        jacobian = torch.cat((-offset / distance, -torch.ones_like(distance)), 1)
+        step = torch.linalg.lstsq(jacobian, distance - radius).solution[:, 0]
+        center, radius = center - step[:3], radius - step[3]
+    rms = ((centred - center).norm(dim=1) - radius).square().mean().sqrt()
+    x, y, z = (center + mean).tolist()
+    return SphereFit((x, y, z), float(radius), float(rms))
+
+
+def _inside(name: str, values: Tensor, truth: Tensor, region: Tensor | None) -> Tensor:
+    check_shape(name, values, truth.shape, "truth_mm")
+    if region is None:
+        return values
+    check_shape("region", region, truth.shape, "truth_mm")
+    if not bool(region.any()):
+        raise ValueError("region: expected at least one pixel, got none: no contact was found")
+    return values[region.bool()]
+
+
+def _rim(mask: Tensor) -> Tensor:
+    frame = mask.reshape(mask.shape[-2], mask.shape[-1]).float()[None, None]
+    eroded = -torch.nn.functional.max_pool2d(-frame, 3, 1, 1)
+    return (frame - eroded)[0, 0] > 0

@@ -1,0 +1,25 @@
+"""What a sensor and a unit are: description, lights, response fields, the record of a calibration, gs_sdk's formats."""
+
+from . import gs_sdk
+from .calibration import Calibration, check_calibration
+from .lights import PointLights, near_field_shading
+from .markers import FillMarkers, fill_markers, find_markers
+from .response_field import ResponseField, ResponseModel, SensorPrior
+from .sensor import Sensor, check_sensor, shipped_sensors
+
+__all__ = [
+    "Calibration",
+    "FillMarkers",
+    "PointLights",
+    "ResponseField",
+    "ResponseModel",
+    "Sensor",
+    "SensorPrior",
+    "check_calibration",
+    "check_sensor",
+    "fill_markers",
+    "find_markers",
+    "gs_sdk",
+    "near_field_shading",
+    "shipped_sensors",
+]

@@ -1,0 +1,358 @@
+"""What is known of a calibrated unit: the paper's database, in memory and as one file."""
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import kornia
+import torch
+from torch import Tensor
+
+from ..core.checks import QUANTISATION_STD, brief, check_image, check_record, check_tensor
+from ..core.files import image_from_bytes, image_to_bytes, load_tensors, save_tensors
+from ..core.noise import noise_std
+from .lights import PointLights, flat_image, inverse_light_matrix
+from .markers import FillMarkers
+from .response_field import ResponseModel
+from .sensor import Sensor, check_sensor
+
+FORMAT_VERSION = 4
+"""Raised when a file of an older version can no longer be read as it is, or an older torchvts cannot read a new one."""
+
+DEFECT_RATIO = 4.0
+"""A pixel whose background is this factor darker or brighter than expected tells nothing: it is inpainted."""
+
+PEDESTAL = 0.03
+"""Added to image and background before response fields take their ratio: where a lamp does not reach, a ratio is all noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A calibrated unit: the sensor, its inverse model (three lights, or a response), and its image at rest.
+
+    Attributes:
+        sensor: the sensor it belongs to.
+        lights: the three lights (S and rho of the paper), if they are the model; else None.
+        background: (3, H, W) linear light of the unit at rest; the model's own where no image was given.
+        noise_std: (3,), noise of an image, in image value.
+        measured: whether ``background`` is an image of the unit.
+        report: how it was made, plain JSON: model, convergence, figures, warnings.
+        response: the response fields, if they are the model; else None.
+        markers: the block that fills printed markers before anything else, or None.
+        ambient: (3,), constant linear light that the lights do not give, taken off before the gain; None for none.
+    """
+
+    sensor: Sensor
+    lights: PointLights | None
+    background: Tensor
+    noise_std: Tensor
+    measured: bool
+    report: dict[str, Any] = field(default_factory=dict)
+    response: ResponseModel | None = None
+    markers: FillMarkers | None = None
+    ambient: Tensor | None = None
+
+    @classmethod
+    def from_lights(
+        cls,
+        lights: PointLights,
+        sensor: Sensor,
+        background: Tensor | None = None,
+        report: dict[str, Any] | None = None,
+        ambient: Tensor | None = None,
+    ) -> "Calibration":
+        """A calibration from known lights: nothing is fitted.
+
+        Args:
+            lights: the three lights. sensor: the sensor.
+            background: (3, H, W) image at rest in [0, 1], if there is one: it gives the constant defects and the noise.
+            report: kept with the calibration.
+            ambient: (3,) constant linear light per channel, at least 0; None for none.
+        Raises:
+            ValueError, TypeError: background or ambient of another shape or range.
+        Example:
+            >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
+            >>> Calibration.from_lights(lights, Sensor("rig", 48, 64, 0.5)).compensation.abs().max()
+            tensor(0.)
+        """
+        check_record("lights", lights, PointLights, "PointLights(position_mm, albedo) makes them")
+        check_sensor("sensor", sensor)
+        sensor = dataclasses.replace(sensor, gamma=sensor.exponent, prior=None)
+        frozen = PointLights(*(t.detach().cpu() for t in (lights.position_mm, lights.albedo, lights.gloss))).requires_grad_(False)
+        report = report or {"model": "point_lights", "lights": "given"}
+        if ambient is not None:
+            check_tensor("ambient", ambient)
+            ambient = ambient.detach().cpu().to(frozen.position_mm.dtype)
+            if tuple(ambient.shape) != (3,) or not bool((ambient >= 0).all() & torch.isfinite(ambient).all()):
+                raise ValueError(f"ambient: expected (3,) finite values of at least 0, got {ambient.tolist()}")
+        if background is None:
+            model = flat_image(frozen, sensor.height, sensor.width, sensor.mm_per_pixel)
+            model = model if ambient is None else model + ambient.reshape(3, 1, 1)
+            noise = torch.full((3,), QUANTISATION_STD, dtype=model.dtype)
+            return cls(sensor, frozen, model, noise, False, report, None, None, ambient)
+        light, noise, markers = _at_rest(background, sensor, frozen.position_mm.dtype)
+        return cls(sensor, frozen, light, noise, True, report, None, markers, ambient)
+
+    @classmethod
+    def from_response(
+        cls, response: ResponseModel, sensor: Sensor, background: Tensor, report: dict[str, Any] | None = None
+    ) -> "Calibration":
+        """A calibration from known response fields, such as another unit's of the same type: nothing is fitted.
+
+        Args:
+            response: the fields. sensor: the sensor; its gamma and blur give way to those of the response.
+            background: (3, H, W) image at rest in [0, 1].
+            report: kept with the calibration.
+        Raises:
+            ValueError, TypeError: background of another shape or range.
+        Example:
+            >>> from torchvts.model.response_field import ResponseField
+            >>> field = ResponseField(0, -1, False, 10.0, ((0.3, 0, 0), (0, 0.3, 0)))
+            >>> sensor = Sensor("rig", 48, 64, 0.5)
+            >>> Calibration.from_response(ResponseModel(field, None), sensor, torch.full((3, 48, 64), 0.5)).sensor.blur_px
+            1.0
+        """
+        check_record("response", response, ResponseModel, "a sensor's prior has one: sensor.prior.response")
+        check_sensor("sensor", sensor)
+        check_image("background", background, sensor.height, sensor.width, sensor.name)
+        sensor = dataclasses.replace(sensor, gamma=response.gamma, blur_px=response.blur_px, prior=None)
+        light, noise, markers = _at_rest(background, sensor, background.dtype)
+        return cls(sensor, None, light, noise, True, report or {"model": "response", "response": "given"}, response, markers)
+
+    def __repr__(self) -> str:
+        sensor, made = self.sensor, "an image" if self.measured else "the lights alone"
+        model = (
+            f"response fields ({self.report.get('response', 'given')})" if self.lights is None else f"point lights, {self.lights}"
+        )
+        size = f"{sensor.height} x {sensor.width}, {sensor.mm_per_pixel:g} mm per pixel"
+        return f"Calibration({sensor.name!r}, {size}, from {made}: {model})"
+
+    @property
+    def flat(self) -> Tensor:
+        """(3, H, W), what the compensated image is at rest: the lights' own image; 1 for a response field."""
+        return self.model_image if self.response is None else torch.ones_like(self.background)
+
+    @property
+    def gain(self) -> Tensor | None:
+        """(3, H, W), compensated / linear light; None where nothing was measured."""
+        if not self.measured:
+            return None
+        if self.response is not None:
+            return 1.0 / (self.background + PEDESTAL)
+        gain = (self.model_image / self.lit.clamp_min(1e-6)).clamp(1.0 / DEFECT_RATIO, DEFECT_RATIO)
+        full = self.beyond_full
+        if full is None:
+            return gain
+        usual = torch.stack([channel[beyond == 0].median() for channel, beyond in zip(gain, full, strict=True)])
+        return torch.where(full > 0, usual.nan_to_num(1.0)[:, None, None], gain)
+
+    @property
+    def full_light(self) -> float:
+        """Linear light from which a channel may be full: 99.5 % of what the camera can say, less its noise."""
+        return float(0.995**self.sensor.exponent) - 3.0 * float(self.light_noise_std.max())
+
+    @property
+    def beyond_full(self) -> Tensor | None:
+        """(3, H, W), what the lights give at rest where that is more than the camera can tell, 0 elsewhere; None if nowhere.
+
+        How bright the skin is there was not measured, so the usual gain of the channel stands for that of these pixels.
+        """
+        if not self.measured or self.lights is None:
+            return None
+        model = self.model_image
+        beyond = torch.where((self.background >= self.full_light) & (model >= self.full_light), model, 0.0)
+        return beyond if bool((beyond > 0).any()) else None
+
+    @property
+    def full_above(self) -> Tensor:
+        """(3, H, W), compensated intensity from which a channel counts as saturated: 99.5 % of what the camera can say."""
+        gain, offset = self.gain, self.offset
+        full: Tensor = (0.995**self.sensor.exponent) * (torch.ones_like(self.background) if gain is None else gain)
+        return full if offset is None else full + offset
+
+    @property
+    def offset(self) -> Tensor | None:
+        """(3, H, W), what is added after the gain: with a response field the pedestal, so that the skin at rest becomes 1; with
+        lights minus the ambient light, through the gain."""
+        if self.response is not None:
+            return PEDESTAL / (self.background + PEDESTAL)
+        if self.ambient is None:
+            return None
+        offset, gain = -self.ambient.reshape(3, 1, 1), self.gain
+        return offset.expand_as(self.background) if gain is None else offset * gain
+
+    @property
+    def lit(self) -> Tensor:
+        """(3, H, W), the background without ambient light."""
+        return self.background if self.ambient is None else self.background - self.ambient.reshape(3, 1, 1)
+
+    @property
+    def model_image(self) -> Tensor:
+        """(3, H, W), what the lights give at rest, linear light; with a response field, the background itself."""
+        if self.lights is None:
+            return self.background
+        return flat_image(self.lights, self.sensor.height, self.sensor.width, self.sensor.mm_per_pixel)
+
+    @property
+    def inverse(self) -> Tensor:
+        """Inverse of the light matrix at rest, (3, 3, H, W): normal axis, light, row, column (eq. 9 of the paper).
+
+        Raises:
+            ValueError: the model is a response field, which has none.
+        """
+        if self.lights is None:
+            raise ValueError("inverse: expected a calibration by lights, got one by response fields")
+        depth = self.background.new_zeros(1, 1, self.sensor.height, self.sensor.width)
+        return inverse_light_matrix(depth, self.lights.position_mm, self.lights.albedo, self.sensor.mm_per_pixel)[0]
+
+    @property
+    def compensation(self) -> Tensor:
+        """I_delta = model - background, (3, H, W), linear light (eq. 7-8 of the paper)."""
+        return self.model_image - self.background
+
+    @property
+    def defects(self) -> Tensor:
+        """(H, W) bool: pixels whose background is far from the model, or for a response field from the median around them."""
+        if not self.measured:
+            return torch.zeros(self.sensor.height, self.sensor.width, dtype=torch.bool)
+        expected, rest, floor = self.model_image, self.lit, 3.0 * self.light_noise_std
+        if self.lights is None:
+            expected = kornia.filters.median_blur(self.background[None], 7)[0]
+        # a pixel that the model itself leaves within the noise cannot be judged
+        far = (rest * DEFECT_RATIO < expected) | (rest > expected * DEFECT_RATIO)
+        found: Tensor = (far & (torch.maximum(expected, rest) > floor)).any(dim=0)
+        return found
+
+    @property
+    def light_noise_std(self) -> Tensor:
+        """(3, H, W), noise of an image in linear light: that of the image value, times the slope of the response."""
+        noise = self.noise_std.reshape(3, 1, 1)
+        gamma = self.sensor.exponent
+        if gamma == 1.0:
+            return noise.expand_as(self.background)
+        value = self.background.clamp_min(1e-6) ** (1.0 / gamma)
+        return gamma * torch.maximum(value, noise) ** (gamma - 1.0) * noise
+
+    @property
+    def compensated_noise_std(self) -> Tensor:
+        """(3, H, W), noise of a compensated image: the frame's own and the background's, after gain and blur."""
+        noise, gain = self.light_noise_std, self.gain
+        if gain is not None:
+            noise = noise * gain * 2.0**0.5
+        # white noise through a Gaussian of that width; a narrow one takes next to nothing
+        return noise * min(1.0, 1.0 / (2.0 * math.sqrt(math.pi) * max(self.sensor.blur_px, 0.1)))
+
+    def save(self, path: str | Path) -> None:
+        """Write one safetensors file, whole or not at all.
+
+        Tensors, by lights: S, rho, I_delta, the inverse light matrix at rest, the background, the noise, ambient light if there
+        is any. By response: the noise, and the background as a 16-bit PNG of the camera's values, which an 8-bit image survives
+        bit for bit. JSON metadata: the format version, the sensor, the response, the report.
+        """
+        markers = None if self.markers is None else self.markers.to_dict()
+        metadata = {
+            "format_version": FORMAT_VERSION,
+            "kind": "calibration",
+            "sensor": self.sensor.to_dict(),
+            "measured": self.measured,
+            "report": self.report,
+            "response": None if self.response is None else self.response.to_dict(),
+            "markers": markers,
+        }
+        tensors = {"noise_std": self.noise_std}
+        if self.lights is None:
+            tensors["background_png"] = image_to_bytes(self.background.clamp(0, 1) ** (1.0 / self.sensor.exponent))
+        else:
+            tensors |= {
+                "light_position_mm": self.lights.position_mm,
+                "light_albedo": self.lights.albedo,
+                "light_gloss": self.lights.gloss,
+                "background": self.background,
+                "compensation": self.compensation,
+                "inverse": self.inverse,
+            }
+            if self.ambient is not None:
+                tensors["ambient"] = self.ambient
+        save_tensors(path, tensors, metadata)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Calibration":
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            FileNotFoundError: no such file. ValueError: cut, foreign, of a later version, or inconsistent; says which.
+        """
+        tensors, metadata = load_tensors(path)
+        if metadata.get("kind") != "calibration":
+            raise ValueError(f"{path}: expected a calibration, got a file of kind {brief(metadata.get('kind'))}")
+        version = metadata.get("format_version")
+        if not isinstance(version, int) or not 1 <= version <= FORMAT_VERSION:
+            raise ValueError(f"{path}: format version {brief(version)}, this torchvts reads 1 to {FORMAT_VERSION}: update torchvts")
+        sensor = Sensor.from_dict(metadata.get("sensor"), str(path))
+        measured, report = metadata.get("measured"), metadata.get("report")
+        if not isinstance(measured, bool) or not isinstance(report, dict):
+            raise ValueError(f"{path}: its metadata is damaged: 'measured' or 'report' is missing")
+        markers = None if metadata.get("markers") is None else FillMarkers.from_dict(metadata["markers"], f"{path}: markers")
+        if metadata.get("response") is not None:
+            response = ResponseModel.from_dict(metadata["response"], f"{path}: response")
+            _check_tensors(path, tensors, {"noise_std": (3,)})
+            if "background_png" not in tensors:
+                raise ValueError(f"{path}: tensor 'background_png' is missing")
+            value = image_from_bytes(tensors["background_png"], (sensor.height, sensor.width), f"{path}: tensor 'background_png'")
+            light = value.to(tensors["noise_std"].dtype) ** sensor.exponent
+            if (sensor.exponent, sensor.blur_px) != (response.gamma, response.blur_px):
+                raise ValueError(f"{path}: sensor and response differ in gamma or blur_px: damaged or edited")
+            return cls(sensor, None, light, tensors["noise_std"], measured, report, response, markers)
+        size = (3, sensor.height, sensor.width)
+        expected: dict[str, tuple[int, ...]] = {
+            "light_position_mm": (3, 3), "light_albedo": (3,), "light_gloss": (3,), "noise_std": (3,),
+            "background": size, "compensation": size, "inverse": (3, *size),
+        }  # fmt: skip
+        if "ambient" in tensors:
+            expected["ambient"] = (3,)
+        _check_tensors(path, tensors, expected)
+        try:
+            lights = PointLights(*(tensors[f"light_{part}"] for part in ("position_mm", "albedo", "gloss"))).requires_grad_(False)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+        calibration = cls(
+            sensor, lights, tensors["background"], tensors["noise_std"], measured, report, None, markers, tensors.get("ambient")
+        )
+        for name, derived in (("compensation", calibration.compensation), ("inverse", calibration.inverse)):
+            if not torch.allclose(tensors[name], derived, rtol=1e-3, atol=1e-3 * float(derived.abs().max())):
+                raise ValueError(f"{path}: tensor {name!r} does not fit the lights in the same file: damaged or edited")
+        return calibration
+
+
+def check_calibration(name: str, value: object) -> None:
+    """Raise unless ``value`` is a Calibration."""
+    check_record(name, value, Calibration, "Calibration.load reads a file, calibrate makes one")
+
+
+def _at_rest(background: Tensor, sensor: Sensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, FillMarkers | None]:
+    """Linear light of an image at rest, its noise in image value, and what fills its markers."""
+    check_image("background", background, sensor.height, sensor.width, sensor.name)
+    image = background.detach().cpu().to(dtype)
+    markers = FillMarkers.from_background(image) if sensor.markers else None
+    if markers is not None and markers.diameter_px == 0:
+        markers = None
+    if markers is not None:
+        image = markers(image[None])[0]
+    noise = noise_std(image[None])[0].clamp_min(QUANTISATION_STD)
+    return image if sensor.exponent == 1.0 else image**sensor.exponent, noise, markers
+
+
+def _check_tensors(path: str | Path, tensors: dict[str, Tensor], expected: dict[str, tuple[int, ...]]) -> None:
+    for name, shape in expected.items():
+        if name not in tensors:
+            raise ValueError(f"{path}: tensor {name!r} is missing")
+        if tuple(tensors[name].shape) != shape or not tensors[name].is_floating_point():
+            raise ValueError(
+                f"{path}: tensor {name!r}: expected {shape} floats, got {tuple(tensors[name].shape)} {tensors[name].dtype}"
+            )
+        if not bool(torch.isfinite(tensors[name]).all()):
+            raise ValueError(f"{path}: tensor {name!r}: expected finite values, got NaN or infinite ones")
+    if not bool((tensors["noise_std"] > 0).all()):
+        raise ValueError(f"{path}: tensor 'noise_std': expected values above 0")

@@ -1,0 +1,421 @@
+"""What gs_sdk writes and reads: calibration folders, sensor files, height maps, gradients, images.
+
+Only the formats are known here, none of gs_sdk's code. Convention of gs_sdk: images are B, G, R uint8 (H, W, 3); the height
+map is H = -z / mm_per_pixel, so pixels, negative where the skin is pressed in; gradients are d(H)/dx and d(H)/dy per pixel.
+"""
+
+import csv
+import math
+import struct
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..core.checks import brief, check_batch, check_path, check_positive, check_tensor
+from ..core.files import read_image, rgb_from_bgr
+from .sensor import Sensor, _read_yaml
+
+CATALOG_COLUMNS = ("experiment_reldir", "diameter(mm)")
+LABEL_COLUMNS = ("experiment_reldir", "diameter_mm", "center_x_px", "center_y_px", "contact_radius_px")
+SENSOR_KEYS = ("ppmm", "imgh", "imgw")
+SENSOR_KEYS_UNUSED = ("raw_imgh", "raw_imgw", "framerate", "device_name")
+"""Keys of a gs_sdk sensor file that describe the camera behind the image, which :class:`Sensor` does not need."""
+
+
+MOST_TABLE_BYTES = 2**24
+"""A table of presses has some kilobytes."""
+
+
+@dataclass(frozen=True)
+class GsSdkPress:
+    """One ball pressed on the sensor.
+
+    Args:
+        name: its ``experiment_reldir`` in the catalog.
+        image_path: its ``gelsight.png``.
+        ball_diameter_mm: mm.
+        height, width: pixels of the background, which the image must have too.
+        center_px: (x, y) of the ball in pixels, from ``label.npz``; None without that file.
+        radius_px: radius of the contact in pixels, from ``label.npz``; None without that file.
+    """
+
+    name: str
+    image_path: Path
+    ball_diameter_mm: float
+    height: int
+    width: int
+    center_px: tuple[float, float] | None = None
+    radius_px: float | None = None
+
+    def image(self) -> Tensor:
+        """Read the image: (3, H, W) in [0, 1], R, G, B.
+
+        Raises:
+            FileNotFoundError: it has gone. ValueError: not an image, cut short, or of another size than the background.
+        """
+        image = read_image(self.image_path)
+        _check_size(self.image_path, image.shape[1], image.shape[2], self.height, self.width)
+        return image
+
+
+@dataclass(frozen=True, eq=False)
+class GsSdkFolder:
+    """A calibration folder of gs_sdk: ``background`` (3, H, W) in [0, 1], R, G, B; ``presses`` in the catalog's order."""
+
+    background: Tensor
+    presses: tuple[GsSdkPress, ...]
+
+
+def read_calibration_folder(folder: str | Path) -> GsSdkFolder:
+    """Read a calibration folder as gs_sdk collects it. The images of the presses are read when asked for.
+
+    The layout: ``catalog.csv`` with the columns ``experiment_reldir,diameter(mm)``, ``background.png``, and for every row
+    ``<experiment_reldir>/gelsight.png`` and, once labelled, ``<experiment_reldir>/label.npz`` with ``center`` (x, y) and
+    ``radius`` in pixels.
+
+    Args:
+        folder: the folder that holds ``catalog.csv``.
+    Returns:
+        A :class:`GsSdkFolder`.
+    Raises:
+        FileNotFoundError: the folder, the catalog, the background or the image of a press is missing.
+        ValueError: an empty catalog, other columns, a bad diameter, a press named twice or outside the folder, an image of
+            another size than the background, a damaged label. Names the file and the line.
+    Source:
+        the folder format of gs_sdk (Huang et al., NormalFlow, RA-L 2024).
+    Example:
+        >>> read_calibration_folder("no/such/folder")
+        Traceback (most recent call last):
+        ...
+        FileNotFoundError: no/such/folder: no such folder: expected one with catalog.csv and background.png
+    """
+    folder = check_path("folder", folder)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: no such folder: expected one with catalog.csv and background.png")
+    catalog, background_path = folder / "catalog.csv", folder / "background.png"
+    for path in (catalog, background_path):
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such file: a calibration folder of gs_sdk holds catalog.csv and background.png")
+    background = read_image(background_path)
+    height, width = background.shape[1], background.shape[2]
+    presses: list[GsSdkPress] = []
+    seen: set[Path] = set()
+    for line, row in _read_table(catalog, CATALOG_COLUMNS):
+        where = f"{catalog}, line {line}"
+        name = row["experiment_reldir"]
+        diameter = _number(where, "diameter(mm)", row["diameter(mm)"])
+        if not 0.0 < diameter <= 1000.0:
+            raise ValueError(f"{where}: diameter(mm): expected a ball's diameter in mm, got {brief(row['diameter(mm)'])}")
+        press = _inside(folder, name, where)
+        if press in seen:
+            raise ValueError(f"{where}: experiment_reldir: {brief(name)} is given twice: remove one of the lines")
+        seen.add(press)
+        # a link may lead out of the folder as well as a name
+        image_path, label_path = (_inside(folder, f"{name}/{file}", where) for file in ("gelsight.png", "label.npz"))
+        if not image_path.is_file():
+            raise FileNotFoundError(f"{folder / name / 'gelsight.png'}: no such image: {where} names it")
+        size = _png_size(image_path)
+        if size is not None:
+            _check_size(image_path, size[0], size[1], height, width)
+        center, radius = _read_label(label_path) if label_path.is_file() else (None, None)
+        presses.append(GsSdkPress(name, image_path, diameter, height, width, center, radius))
+    return GsSdkFolder(background, tuple(presses))
+
+
+def read_labels(folder: str | Path) -> dict[str, tuple[float, float, float | None]]:
+    """Read ``labels.csv`` of a folder: for every press the ball's centre and the radius of its contact.
+
+    Args:
+        folder: the folder that holds ``labels.csv``, with the columns ``experiment_reldir,diameter_mm,center_x_px,
+            center_y_px,contact_radius_px``; the last may be empty.
+    Returns:
+        {experiment_reldir: (x, y, radius or None)}, pixels.
+    Raises:
+        FileNotFoundError: no such file. ValueError: empty, other columns, a bad number, a press named twice.
+    """
+    path = check_path("folder", folder) / "labels.csv"
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file: expected a table of {','.join(LABEL_COLUMNS)}")
+    labels: dict[str, tuple[float, float, float | None]] = {}
+    for line, row in _read_table(path, LABEL_COLUMNS):
+        where = f"{path}, line {line}"
+        name, text = row["experiment_reldir"], row["contact_radius_px"]
+        if name in labels:
+            raise ValueError(f"{where}: experiment_reldir: {brief(name)} is given twice: remove one of the lines")
+        radius = _number(where, "contact_radius_px", text) if text else None
+        if radius is not None and radius <= 0.0:
+            raise ValueError(f"{where}: contact_radius_px: expected a number above 0, or nothing, got {brief(text)}")
+        x, y = (_number(where, column, row[column]) for column in ("center_x_px", "center_y_px"))
+        labels[name] = (x, y, radius)
+    return labels
+
+
+def sensor_from_gs_sdk(config: dict[str, Any] | str | Path, name: str | None = None) -> Sensor:
+    """Make a :class:`Sensor` of gs_sdk's sensor file.
+
+    ``ppmm`` is the pitch in **mm per pixel**, despite its name; ``imgh`` and ``imgw`` are the size of the image worked on.
+    ``raw_imgh``, ``raw_imgw``, ``framerate`` and ``device_name`` are accepted and left out.
+
+    Args:
+        config: the mapping, or the path of the YAML file.
+        name: of the sensor; None takes the name of the file, or "gs_sdk".
+    Returns:
+        The sensor, without blur, response 1 and unknown lights.
+    Raises:
+        FileNotFoundError: no such file. TypeError: neither mapping nor path. ValueError: not YAML, an unknown or a missing
+            key, a bad value.
+    Example:
+        >>> sensor_from_gs_sdk({"ppmm": 0.0634, "imgh": 240, "imgw": 320}, name="mini").mm_per_pixel
+        0.0634
+    """
+    source = "config"
+    values: Any = config
+    if isinstance(config, (str, Path)):
+        path = Path(config)
+        source = str(path)
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such sensor file")
+        values, name = _read_yaml(path), name or path.stem
+    if not isinstance(values, dict):
+        if source == "config":
+            raise TypeError(f"config: expected a mapping or the path of a YAML file, got {type(values).__name__}")
+        raise ValueError(f"{source}: expected keys and values of a gs_sdk sensor, got {type(values).__name__}")
+    for key in values:
+        if key not in SENSOR_KEYS + SENSOR_KEYS_UNUSED:
+            raise ValueError(f"{source}: key {brief(key)}: unknown; expected {', '.join(SENSOR_KEYS + SENSOR_KEYS_UNUSED)}")
+    for key in SENSOR_KEYS:
+        if key not in values:
+            raise ValueError(f"{source}: key {brief(key)}: missing; a gs_sdk sensor file has {', '.join(SENSOR_KEYS)}")
+    try:
+        pitch = check_positive("ppmm", values["ppmm"])
+        if pitch > 1.0:
+            raise ValueError(f"ppmm: expected mm per pixel in (0, 1], got {pitch:g}: the name misleads; invert pixels per mm")
+        return Sensor(name=name or "gs_sdk", height=values["imgh"], width=values["imgw"], mm_per_pixel=pitch)
+    except (TypeError, ValueError) as error:
+        text = str(error).replace("height:", "imgh:").replace("width:", "imgw:")
+        raise ValueError(f"{source}: key {text}") from error
+
+
+def depth_from_height_map(height_map_px: Tensor | np.ndarray[Any, Any], mm_per_pixel: float) -> Tensor:
+    """Depth of gs_sdk's height map: z = -H * mm_per_pixel.
+
+    Args:
+        height_map_px: (H, W), pixels, negative where the skin is pressed in; floating point.
+        mm_per_pixel: pixel pitch, mm (gs_sdk's ``ppmm``).
+    Returns:
+        (1, 1, H, W), mm, positive where the skin is pressed in; float32 or float64 as given.
+    Raises:
+        ValueError: wrong shape or pitch. TypeError: not floating point.
+    Example:
+        >>> depth_from_height_map(np.full((2, 2), -20.0), 0.05)[0, 0, 0]
+        tensor([1., 1.], dtype=torch.float64)
+    """
+    pitch = check_positive("mm_per_pixel", mm_per_pixel)
+    return (0.0 - _map("height_map_px", height_map_px) * pitch)[None, None]  # 0 - H, so that 0 does not become -0
+
+
+def height_map_from_depth(depth_mm: Tensor, mm_per_pixel: float) -> np.ndarray[Any, Any]:
+    """gs_sdk's height map of a depth: H = -z / mm_per_pixel; the inverse of :func:`depth_from_height_map`.
+
+    Args:
+        depth_mm: (1, 1, H, W), mm.
+        mm_per_pixel: pixel pitch, mm.
+    Returns:
+        numpy, (H, W), pixels.
+    Raises:
+        ValueError: more than one frame, or wrong pitch. TypeError: not floating point.
+    """
+    pitch = check_positive("mm_per_pixel", mm_per_pixel)
+    frame = _frame("depth_mm", depth_mm, 1)[0]
+    return np.asarray((0.0 - frame / pitch).numpy())
+
+
+def gradient_from_gs_sdk(gx: Tensor | np.ndarray[Any, Any], gy: Tensor | np.ndarray[Any, Any]) -> Tensor:
+    """Gradient of depth from gs_sdk's gradients of the height map: dz/dx = -d(H)/dx, since pixels cancel.
+
+    Args:
+        gx, gy: (H, W), d(H)/dx and d(H)/dy, pixels per pixel.
+    Returns:
+        (1, 2, H, W), (dz/dx, dz/dy), mm per mm.
+    Raises:
+        ValueError: wrong shape, or the two differ in it. TypeError: not floating point.
+    Example:
+        >>> gradient_from_gs_sdk(np.full((1, 1), 0.5), np.zeros((1, 1))).flatten()
+        tensor([-0.5000,  0.0000], dtype=torch.float64)
+    """
+    x, y = _map("gx", gx), _map("gy", gy)
+    if x.shape != y.shape:
+        raise ValueError(f"gy: expected {tuple(x.shape)} like gx, got {tuple(y.shape)}: both must come from one image")
+    return 0.0 - torch.stack((x, y))[None]
+
+
+def gradient_to_gs_sdk(gradient: Tensor) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """gs_sdk's gradients (d(H)/dx, d(H)/dy), numpy (H, W) each; the inverse of :func:`gradient_from_gs_sdk`.
+
+    Args:
+        gradient: (1, 2, H, W), (dz/dx, dz/dy), mm per mm.
+    Raises:
+        ValueError: wrong shape, or more than one frame. TypeError: not floating point.
+    """
+    turned = 0.0 - _frame("gradient", gradient, 2)
+    return np.asarray(turned[0].numpy()), np.asarray(turned[1].numpy())
+
+
+def image_from_bgr(pixels: np.ndarray[Any, Any]) -> Tensor:
+    """gs_sdk's and OpenCV's image, (H, W, 3) **B, G, R** uint8, as (3, H, W) **R, G, B** float32 in [0, 1].
+
+    Args:
+        pixels: (H, W, 3), uint8.
+    Raises:
+        TypeError: not a uint8 array. ValueError: wrong shape.
+    Example:
+        >>> image_from_bgr(np.array([[[0, 51, 255]]], dtype=np.uint8)).flatten()
+        tensor([1.0000, 0.2000, 0.0000])
+    """
+    if not isinstance(pixels, np.ndarray) or pixels.dtype != np.uint8:
+        kind = pixels.dtype if isinstance(pixels, np.ndarray) else type(pixels).__name__
+        raise TypeError(f"pixels: expected a numpy array of uint8 in B, G, R, got {kind}: cv2.imread and gs_sdk give one")
+    if pixels.ndim != 3 or pixels.shape[2] != 3:
+        cause = "channels stand first: it may be an image of torchvts already" if pixels.shape[:1] == (3,) else "not in colour"
+        raise ValueError(f"pixels: expected (H, W, 3), got {pixels.shape}: {cause}")
+    return rgb_from_bgr(pixels)
+
+
+def image_to_bgr(image: Tensor) -> np.ndarray[Any, Any]:
+    """(3, H, W) **R, G, B** in [0, 1] as gs_sdk's and OpenCV's (H, W, 3) **B, G, R** uint8, rounded and cut to 0-255.
+
+    Args:
+        image: (3, H, W), floating point.
+    Raises:
+        ValueError: wrong shape or not finite. TypeError: not floating point.
+    """
+    check_tensor("image", image)
+    if image.dim() != 3:
+        cause = "take one image of the batch with [0]" if image.dim() == 4 else "one RGB image is needed"
+        raise ValueError(f"image: expected (3, H, W), got {tuple(image.shape)}: {cause}")
+    check_batch("image", image[None], 3)
+    if not bool(torch.isfinite(image).all()):
+        raise ValueError("image: expected finite values, got NaN or infinite: an upstream division failed")
+    levels = torch.round(image.detach().cpu().clamp(0, 1) * 255).to(torch.uint8)
+    return np.ascontiguousarray(levels.flip(0).permute(1, 2, 0).numpy())
+
+
+def _map(name: str, values: Tensor | np.ndarray[Any, Any]) -> Tensor:
+    if not isinstance(values, Tensor | np.ndarray):
+        raise TypeError(f"{name}: expected an array or a tensor, got {type(values).__name__}: gs_sdk's maps are float32 arrays")
+    tensor = values if isinstance(values, Tensor) else torch.from_numpy(np.ascontiguousarray(values))
+    if tensor.dim() != 2:
+        raise ValueError(f"{name}: expected (H, W), got {tuple(tensor.shape)}: gs_sdk's maps have no batch and no channel")
+    if not tensor.is_floating_point():
+        raise TypeError(f"{name}: expected floating point, got {tensor.dtype}: gs_sdk's maps are float32")
+    return tensor
+
+
+def _frame(name: str, tensor: Tensor, channels: int) -> Tensor:
+    check_batch(name, tensor, channels)
+    if tensor.shape[0] != 1:
+        raise ValueError(f"{name}: expected one frame, (1, {channels}, H, W), got {tuple(tensor.shape)}: loop over the batch")
+    return tensor[0].detach().cpu()
+
+
+def _read_table(path: Path, columns: tuple[str, ...]) -> list[tuple[int, dict[str, str]]]:
+    """Rows of a CSV file with exactly these columns, each with its line number; blank lines are left out."""
+    if path.stat().st_size > MOST_TABLE_BYTES:
+        raise ValueError(
+            f"{path}: expected a table of at most {MOST_TABLE_BYTES} bytes, got {path.stat().st_size}: not a CSV table"
+        )
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            reader = csv.reader(stream, strict=True)
+            lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader if any(cell.strip() for cell in row)]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path}: not a CSV table: {error}") from error
+    expected = ",".join(columns)
+    if not lines:
+        raise ValueError(f"{path}: empty: expected the line {expected} and one line for every press")
+    header = lines[0][1]
+    if sorted(header) != sorted(columns):
+        raise ValueError(f"{path}: expected the columns {expected}, got {','.join(header)}: is it a table of another tool?")
+    if len(lines) == 1:
+        raise ValueError(f"{path}: no presses: expected one line for every press below {expected}")
+    for line, cells in lines[1:]:
+        if len(cells) != len(columns):
+            raise ValueError(f"{path}, line {line}: expected {len(columns)} values, got {len(cells)}: {brief(','.join(cells))}")
+        if not cells[header.index("experiment_reldir")]:
+            raise ValueError(f"{path}, line {line}: experiment_reldir: expected the folder of the press, got nothing")
+    return [(line, dict(zip(header, cells))) for line, cells in lines[1:]]
+
+
+def _number(where: str, column: str, text: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"{where}: {column}: expected a number, got {brief(text)}")
+    return number
+
+
+def _inside(folder: Path, name: str, where: str) -> Path:
+    """``folder / name``, or raise when that lies outside of the folder: a catalog from elsewhere may name any file."""
+    if "\0" in name:
+        raise ValueError(f"{where}: experiment_reldir: expected a folder inside {folder}, got {brief(name)}")
+    root = folder.resolve()
+    path = (root / name.replace("\\", "/")).resolve()  # a catalog written on Windows
+    if path == root or not path.is_relative_to(root):
+        raise ValueError(f"{where}: experiment_reldir: expected a folder inside {folder}, got {brief(name)}, which is not")
+    return path
+
+
+def _png_size(path: Path) -> tuple[int, int] | None:
+    """(height, width) in the head of a PNG file; None for anything else, which reading it will judge."""
+    with path.open("rb") as stream:
+        head = stream.read(24)
+    if len(head) < 24 or head[:8] != b"\x89PNG\r\n\x1a\n":
+        return None
+    width, height = struct.unpack(">II", head[16:24])
+    return height, width
+
+
+def _check_size(path: Path, height: int, width: int, expected_height: int, expected_width: int) -> None:
+    if (height, width) != (expected_height, expected_width):
+        raise ValueError(
+            f"{path}: expected {expected_height} x {expected_width} like background.png, got {height} x {width}: "
+            "both must come from the same sensor settings"
+        )
+
+
+def _read_label(path: Path) -> tuple[tuple[float, float], float]:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if max((entry.file_size for entry in archive.infolist()), default=0) > 65536:
+                raise ValueError("its arrays are larger than a centre and a radius")
+        with np.load(path, allow_pickle=False) as stored:
+            center = np.asarray(stored["center"], dtype=np.float64).ravel()
+            radius = np.asarray(stored["radius"], dtype=np.float64).ravel()
+    except KeyError as error:
+        raise ValueError(f"{path}: expected the arrays 'center' and 'radius', one is missing: {error}") from error
+    except (
+        ValueError,
+        TypeError,
+        OSError,
+        EOFError,
+        RuntimeError,
+        MemoryError,
+        OverflowError,
+        zipfile.BadZipFile,
+        struct.error,
+        zlib.error,
+    ) as error:
+        raise ValueError(f"{path}: not a label of gs_sdk, or cut short: {error}") from error
+    if center.shape != (2,) or radius.shape != (1,):
+        raise ValueError(f"{path}: expected center (x, y) and one radius, got shapes {center.shape} and {radius.shape}")
+    if not (np.isfinite(center).all() and np.isfinite(radius).all() and radius[0] > 0):
+        raise ValueError(f"{path}: expected finite pixels and a radius above 0, got {center.tolist()} and {radius.tolist()}")
+    return (float(center[0]), float(center[1])), float(radius[0])

@@ -1,0 +1,306 @@
+r"""Printed markers: dark dots on the skin are found in every frame, for they move with it, and filled from around them.
+
+A marker takes light from all three lights at once; a slope takes it from one and gives it to another. So a marker is what
+is darker than its surroundings on both sides, in every direction and in every channel.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from ..core.checks import brief, check_batch, check_field, check_integer, check_positive, check_range, check_same_size, check_tensor
+from ..core.noise import noise_std
+
+
+def find_markers(
+    image: Tensor, diameter_px: float = 9.0, contrast: float = 0.06, sigmas: float = 5.0, skirt: float = 0.2
+) -> Tensor:
+    r"""Pixels of printed markers: small, roundish, darker than their surroundings in all channels.
+
+    Over log light, the mean of the two pixels ``diameter_px`` away on either side, less the pixel itself: a ramp cancels,
+    however steep. The smallest of it over four directions (a line or rim is no darker than what follows along it) is a
+    channel's depth; a step, dark on one side only, is none. A marker is where the least of the three channels (shading darkens
+    some, not all) reaches ``contrast`` and ``sigmas`` times the frame's noise. In a frame that has some, a contact's shading
+    may hide one in one channel; then the mean of the channels decides, with at least twice that depth and 0.4 of what is usual
+    in the frame. What is near and darker than a first filling is the marker, grown by ``skirt``. Scripts.
+
+    Args:
+        image: (B, 3, H, W) in [0, 1], camera values or linear light.
+        diameter_px: longest extent of a marker at half its depth; a third more or less does little harm.
+        contrast: least depth of a marker, as the logarithm of value; 0.06 is 6 % darker than around.
+        sigmas: the same, in units of the noise of the logarithm of value.
+        skirt: how far the mask reaches beyond what is seen dark, in diameters. On a 427 x 320 sensor with a sharpening
+            camera 0.2, 0.3, 0.4 mark 30, 39, 51 % of the image and leave 21, 11, 4 % of the dots' pattern in the depth.
+    Returns:
+        (B, 1, H, W) bool; empty where there are none.
+    Raises:
+        ValueError: wrong shape, or an image not wider and higher than a marker.
+    Source:
+        The smallest second difference over directions is the blob measure "lesser eigenvalue of the Hessian" (Lindeberg,
+        Feature detection with automatic scale selection, IJCV 30(2), 1998) at a finite reach.
+    Example:
+        >>> image = torch.full((1, 3, 64, 64), 0.5); image[..., 20:26, 30:36] = 0.2
+        >>> mask = find_markers(image)
+        >>> bool(mask[..., 20:26, 30:36].all()), bool(mask[..., 40:, :].any())
+        (True, False)
+    """
+    check_batch("image", image, 3)
+    if not torch.jit.is_scripting():
+        check_positive("diameter_px", diameter_px), check_positive("contrast", contrast)
+        check_positive("sigmas", sigmas), check_positive("skirt", skirt, 2.0)
+    cell = max(1, int(diameter_px / 8.0))
+    diameter = diameter_px / cell
+    light = _log_light(image.detach(), cell)
+    strict, mean, least = _marker_depth(light, diameter, contrast, sigmas)
+    sure = torch.where(strict > least, strict, torch.zeros_like(strict))
+    count = (sure > 0).to(strict.dtype).sum((1, 2, 3), keepdim=True)
+    usual = sure.square().sum((1, 2, 3), keepdim=True) / sure.sum((1, 2, 3), keepdim=True).clamp_min(1e-6)
+    hidden = (mean > 2.0 * least) & (mean > 0.4 * usual) & (strict > -0.5 * mean) & (count > 4.0 * diameter * diameter)
+    candidate = torch.where((sure > 0) | hidden, mean, torch.zeros_like(mean))
+    half = max(1, int(0.5 * diameter + 0.5))
+    core = (candidate > 0) & (candidate > 0.5 * _square_max(candidate, half))
+    near = _octagon_max(core.to(mean.dtype), max(2, int(0.35 * diameter + 0.5))) > 0.5
+    # what is darker than a first filling of all that is near
+    grey = light.mean(dim=1, keepdim=True)
+    drop = torch.where(near, fill_markers(grey, near, 2) - grey, torch.zeros_like(grey))
+    mask = near & (drop > 0.2 * _square_max(drop, half))
+    seen = mask.to(mean.dtype)
+    if cell > 1:
+        seen = nn.functional.interpolate(seen, scale_factor=float(cell), mode="nearest")
+    # lenses and sharpening leave a bright edge around a marker: it goes too
+    return _octagon_max(seen[:, :, : image.shape[2], : image.shape[3]], max(1, int(skirt * diameter_px + 0.5))) > 0.5
+
+
+def fill_markers(image: Tensor, mask: Tensor, relaxations: int = 4) -> Tensor:
+    r"""Fill the pixels of ``mask`` smoothly from around them; all others keep their value.
+
+    Pull-push: means of the unmarked pixels on ever coarser grids, until no hole is left, then back to finer ones, where
+    each hole takes the coarser value and relaxes towards the membrane (Laplace) through its rim. Differentiable in the
+    unmarked pixels. Scripts.
+
+    Args:
+        image: (B, C, H, W). mask: (B, 1, H, W) bool.
+        relaxations: per grid; 4 leave about 3 % of a ramp's rise across a marker.
+    Returns:
+        (B, C, H, W); an image marked all over becomes zero.
+    Raises:
+        ValueError: shapes that do not match.
+    Source:
+        Gortler, Grzeszczuk, Szeliski, Cohen, The Lumigraph, SIGGRAPH 1996, section 3.4 (pull-push).
+    Example:
+        >>> image = torch.full((1, 3, 32, 32), 0.5); image[..., 8:14, 8:14] = 0.1
+        >>> bool((fill_markers(image, image[:, :1] < 0.3) - 0.5).abs().max() < 1e-6)
+        True
+    """
+    if not torch.jit.is_scripting():
+        check_tensor("image", image)
+        check_tensor("mask", mask)
+        check_integer("relaxations", relaxations, 0)
+    check_batch("image", image, image.shape[1] if image.dim() == 4 else 3)
+    if mask.dtype != torch.bool:
+        raise TypeError(f"mask: expected torch.bool, got {mask.dtype}: threshold it")
+    if mask.dim() != 4 or mask.shape[0] != image.shape[0] or mask.shape[1] != 1:
+        raise ValueError(f"mask: expected [{image.shape[0]}, 1, H, W] like image, got {list(mask.shape)}")
+    check_same_size("mask", mask, "the image", image.shape[2], image.shape[3])
+    value = torch.where(mask, torch.zeros_like(image), image)
+    weight = (~mask).to(image.dtype)
+    values, weights = [value], [weight]
+    while value.shape[2] > 1 or value.shape[3] > 1:  # pull
+        weight_coarse = nn.functional.avg_pool2d(weight, 2, ceil_mode=True)
+        value = nn.functional.avg_pool2d(value * weight, 2, ceil_mode=True) / weight_coarse.clamp_min(1e-6)
+        weight = weight_coarse
+        values.append(value)
+        weights.append(weight)
+    for level in range(len(values) - 2, -1, -1):  # push
+        coarse, value = value, values[level]
+        hole = weights[level] == 0
+        size = [value.shape[2], value.shape[3]]
+        value = torch.where(hole, nn.functional.interpolate(coarse, size=size, mode="bilinear", align_corners=False), value)
+        for _ in range(relaxations):
+            value = torch.where(hole, _neighbour_mean(value), value)
+    return value
+
+
+class FillMarkers(nn.Module):
+    """:func:`find_markers`, then :func:`fill_markers`; first in the chain, before the compensation.
+
+    With ``diameter_px`` 0 images pass as they are: what :meth:`from_background` gives for a skin without markers.
+
+    Example:
+        >>> image = torch.full((1, 3, 64, 64), 0.5); image[..., 20:26, 30:36] = 0.2
+        >>> bool((FillMarkers()(image) - 0.5).abs().max() < 1e-4)
+        True
+    """
+
+    def __init__(self, diameter_px: float = 9.0, contrast: float = 0.06, sigmas: float = 5.0, skirt: float = 0.2) -> None:
+        super().__init__()
+        self.diameter_px = 0.0 if diameter_px == 0 else check_positive("diameter_px", diameter_px)
+        self.contrast = check_positive("contrast", contrast)
+        self.sigmas = check_positive("sigmas", sigmas)
+        self.skirt = check_positive("skirt", skirt, 2.0)
+
+    @classmethod
+    def from_background(
+        cls, background: Tensor, contrast: float = 0.06, least_markers: int = 8, skirt: float = 0.2
+    ) -> "FillMarkers":
+        """The block for the sensor whose image without contact is ``background``, (3, H, W).
+
+        ``diameter_px`` by :func:`marker_diameter_px`; the least contrast, at least ``contrast``, is a fifth of that of all
+        but the faintest twentieth of the markers. Fewer than ``least_markers`` are taken for dust: nothing is filled.
+        """
+        check_positive("skirt", skirt, 2.0)
+        diameter_px, found = marker_diameter_px(background, contrast, least_markers)
+        return cls(diameter_px, max(contrast, found / 5.0), skirt=skirt)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(B, 3, H, W) to (B, 3, H, W)."""
+        check_batch("image", image, 3)
+        if self.diameter_px == 0.0:
+            return image
+        return fill_markers(image, find_markers(image, self.diameter_px, self.contrast, self.sigmas, self.skirt))
+
+    def to_dict(self) -> dict[str, float]:
+        """Plain numbers; :meth:`from_dict` reads them back."""
+        return {name: getattr(self, name) for name in ("diameter_px", "contrast", "sigmas", "skirt")}
+
+    @classmethod
+    def from_dict(cls, values: object, source: str) -> "FillMarkers":
+        """Build the block from what :meth:`to_dict` gave; ``source`` names it in errors."""
+        if not isinstance(values, dict):
+            raise ValueError(f"{source}: expected keys and values, got {type(values).__name__}")
+        for key in values:
+            if key not in ("diameter_px", "contrast", "sigmas", "skirt"):
+                raise ValueError(f"{source}: key {brief(key)}: unknown; expected diameter_px, contrast, sigmas, skirt")
+        try:
+            return cls(**values)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{source}: {error}") from error
+
+    def extra_repr(self) -> str:
+        return f"diameter_px={self.diameter_px:.3g}, contrast={self.contrast:.3g}, sigmas={self.sigmas:.3g}, skirt={self.skirt:.3g}"
+
+
+def marker_diameter_px(background: Tensor, contrast: float = 0.06, least_markers: int = 8) -> tuple[float, float]:
+    """How large and how dark the markers of a skin are: longest extent in pixels, and depth as the logarithm of value.
+
+    The reach at which the most is found dark shows the markers at their fullest; of their bounding boxes the 90th percentile
+    of the longer side is the diameter, of their depths the 5th percentile the contrast.
+
+    Args:
+        background: (3, H, W) in [0, 1], without contact.
+        contrast: least depth of a marker. least_markers: fewer are none.
+    Returns:
+        diameter_px, contrast; both 0 if there are no markers.
+    Example:
+        >>> marker_diameter_px(torch.full((3, 64, 64), 0.5))
+        (0.0, 0.0)
+    """
+    check_field("background", background)
+    check_range("background", background)
+    check_positive("contrast", contrast), check_integer("least_markers", least_markers, 1)
+    light, diameter, best = _log_light(background[None], 1), 0.0, 0.0
+    reach = 3.0
+    while reach < min(background.shape[1:]) / 8.0:
+        depth, _, least = _marker_depth(light, reach, contrast, 5.0)
+        found = float(torch.where(depth > least, depth, 0.0).sum())
+        if found > 1.1 * best:  # a longer reach has to be worth it: neighbours come into it
+            diameter, best = reach, found
+        reach *= 1.15
+    if diameter == 0.0:
+        return 0.0, 0.0
+    for _ in range(2):  # the reach is the diameter, so once more with what was measured
+        strict, mean, least = _marker_depth(light, diameter, contrast, 5.0)
+        peak = _square_max(torch.where(strict > least, mean, 0.0), max(1, math.ceil(0.5 * diameter)))
+        side, depth = _blobs(((peak > 0) & (mean > 0.5 * peak))[0, 0], mean[0, 0])
+        if len(side) < least_markers:
+            return 0.0, 0.0
+        diameter = float(side.quantile(0.9))
+    return diameter, float(depth.quantile(0.05))
+
+
+def _log_light(image: Tensor, cell: int) -> Tensor:
+    """Logarithm of value over cells of ``cell`` pixels, or over 3 x 3 pixels around each where cells are pixels."""
+    if cell > 1:
+        image = nn.functional.avg_pool2d(image, cell, ceil_mode=True)
+    else:
+        image = nn.functional.avg_pool2d(nn.functional.pad(image, [1, 1, 1, 1], mode="replicate"), 3, 1)
+    return torch.log(image.clamp_min(0.0) + 0.03)  # a pedestal: the dark corners of an image are all noise
+
+
+def _marker_depth(light: Tensor, diameter: float, contrast: float, sigmas: float) -> tuple[Tensor, Tensor, Tensor]:
+    """How much darker than both sides, as the logarithm of value: in the least channel and in the mean of them, (B, 1, H, W)
+    each, and the least that counts, (B, 1, 1, 1). The first is -9 on a step, dark on one side only."""
+    far = max(2, int(diameter + 0.5))
+    near = max(1, int(0.7071 * diameter + 0.5))
+    height, width = light.shape[2], light.shape[3]
+    if min(height, width) <= far:
+        raise ValueError(f"image: expected more than {far} cells of pixels each way for such markers, got {height} x {width}")
+    noise = noise_std(light).amax(dim=1)
+    grey = light.mean(dim=1, keepdim=True)
+    wide = torch.cat((light, grey), dim=1)
+    wide = nn.functional.pad(wide, [far, far, far, far], mode="reflect")  # a marker cut by the border is made whole
+    sides, darker = torch.full_like(light, math.inf), torch.full_like(grey, math.inf)
+    for dy, dx in [(0, far), (far, 0), (near, near), (near, -near)]:
+        one = wide[:, :, far + dy : far + dy + height, far + dx : far + dx + width]
+        other = wide[:, :, far - dy : far - dy + height, far - dx : far - dx + width]
+        sides = torch.minimum(sides, one[:, :3] + other[:, :3])
+        darker = torch.minimum(darker, torch.minimum(one[:, 3:], other[:, 3:]))
+    depth = 0.5 * sides - light  # (B, 3, H, W)
+    mean = depth.mean(dim=1, keepdim=True)
+    least = (sigmas * noise).clamp_min(contrast)[:, None, None, None]
+    closed = darker - grey > 0.2 * mean
+    return torch.where(closed, depth.amin(dim=1, keepdim=True), -9.0 * torch.ones_like(mean)), mean, least
+
+
+def _line_max(image: Tensor, half: int, dim: int) -> Tensor:
+    """Largest value within ``half`` pixels along ``dim``, by windows that double."""
+    size = 2 * half + 1
+    wide = nn.functional.pad(image, [half, half, 0, 0] if dim == 3 else [0, 0, half, half], value=-math.inf)
+    done = 1
+    while done < size:
+        step = min(done, size - done)
+        length = wide.shape[dim] - step
+        wide = torch.maximum(wide.narrow(dim, 0, length), wide.narrow(dim, step, length))
+        done += step
+    return wide
+
+
+def _square_max(image: Tensor, half: int) -> Tensor:
+    """Largest value in the square of 2 ``half`` + 1 pixels around each."""
+    return _line_max(_line_max(image, half, 3), half, 2)
+
+
+def _octagon_max(image: Tensor, reach: int) -> Tensor:
+    """Largest value in an octagon that reaches ``reach`` pixels."""
+    square = _square_max(image, reach // 2)
+    rest = reach - reach // 2
+    return torch.maximum(_line_max(square, rest, 3), _line_max(square, rest, 2))
+
+
+def _neighbour_mean(image: Tensor) -> Tensor:
+    wide = nn.functional.pad(image, [1, 1, 1, 1], mode="replicate")
+    across = wide[:, :, 1:-1, :-2] + wide[:, :, 1:-1, 2:]
+    return 0.25 * (across + wide[:, :, :-2, 1:-1] + wide[:, :, 2:, 1:-1])
+
+
+def _blobs(mask: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
+    """Of each connected blob (corners connect) of an (H, W) mask its longer side in pixels and its largest value, (N,) each."""
+    height, width = mask.shape
+    label = torch.where(
+        mask, torch.arange(1.0, height * width + 1.0, dtype=torch.float64, device=mask.device).reshape(height, width), 0.0
+    )
+    while True:
+        spread = torch.where(mask, _square_max(label[None, None], 1)[0, 0], 0.0)
+        if torch.equal(spread, label):
+            break
+        label = spread
+    rows, columns = torch.nonzero(mask, as_tuple=True)
+    names, blob = torch.unique(label[mask], return_inverse=True)
+    sides = []
+    for place in (rows, columns):
+        start = torch.full((len(names),), height + width, device=mask.device).scatter_reduce(0, blob, place, "amin")
+        end = torch.zeros_like(start).scatter_reduce(0, blob, place, "amax")
+        sides.append(end - start + 1)
+    peak = torch.zeros(len(names), dtype=value.dtype, device=mask.device).scatter_reduce(0, blob, value[mask], "amax")
+    return torch.maximum(sides[0], sides[1]).to(value.dtype), peak

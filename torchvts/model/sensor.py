@@ -1,0 +1,295 @@
+"""What is known of a sensor before it is calibrated: its size, pitch and camera response, where the gel lies in the frame."""
+
+import dataclasses
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import kornia
+import torch
+import yaml
+from torch import Tensor
+
+from ..core.checks import brief, check_batch, check_integer, check_numbers, check_path, check_positive, check_record, from_dict
+from ..core.files import write_atomically
+from .response_field import SensorPrior
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor type or unit.
+
+    Args:
+        name: any text.
+        height, width: pixels of the image that the pipeline works on.
+        mm_per_pixel: pixel pitch on the skin, mm.
+        gamma: response of the camera, value = light^(1 / gamma); None leaves it open: calibration chooses, all else takes 1.
+        blur_px: standard deviation of a Gaussian blur before normals, pixels; 0 for none.
+        light_position_mm: (3, 3), rows R, G, B, if the lights are known from the drawing.
+        light_azimuth_deg: (3,), R, G, B: where each light stands around the image centre, if only that is known, degrees from x
+            (right) towards y (down). Either this or ``light_position_mm``.
+        roi_px: (left, top, width, height) of the gel in the camera's frame, resized to the sensor's size.
+        corners_px: (4, 2), x and y of the gel's corners in the camera's frame: top left, top right, bottom right, bottom
+            left, rectified to the sensor's size. Either this or ``roi_px``.
+        markers: the skin carries printed markers, which are filled in every frame.
+        prior: what is known of every unit of this type, from presses on one.
+    Raises:
+        TypeError, ValueError: name the argument, what was expected and what came.
+    Example:
+        >>> Sensor(name="rig", height=480, width=640, mm_per_pixel=0.0625).field_mm
+        (30.0, 40.0)
+    """
+
+    name: str
+    height: int
+    width: int
+    mm_per_pixel: float
+    gamma: float | None = None
+    blur_px: float = 0.0
+    light_position_mm: tuple[tuple[float, float, float], ...] | None = None
+    light_azimuth_deg: tuple[float, float, float] | None = None
+    roi_px: tuple[int, int, int, int] | None = None
+    corners_px: tuple[tuple[float, float], ...] | None = None
+    markers: bool = False
+    prior: SensorPrior | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name.strip():
+            raise TypeError(f"name: expected a text, got {brief(self.name)}")
+        self._set("height", check_integer("height", self.height, 8))
+        self._set("width", check_integer("width", self.width, 8))
+        self._set("mm_per_pixel", check_positive("mm_per_pixel", self.mm_per_pixel, 10.0))
+        if self.gamma is not None:
+            self._set("gamma", check_positive("gamma", self.gamma, 10.0))
+        if self.gamma is not None and self.gamma < 0.1:
+            raise ValueError(f"gamma: expected a number in [0.1, 10], got {self.gamma}: value = light^(1/gamma), 2.2 for sRGB-like")
+        if self.blur_px != 0:
+            check_positive("blur_px", self.blur_px, 0.25 * min(self.height, self.width))
+        self._set("blur_px", float(self.blur_px))
+        if self.light_position_mm is not None:
+            numbers = check_numbers("light_position_mm", self.light_position_mm, (3, 3))
+            if min(numbers[2::3]) <= 0:
+                raise ValueError(f"light_position_mm: expected lights above the skin (z > 0), got {self.light_position_mm!r}")
+            self._set("light_position_mm", tuple(numbers[i : i + 3] for i in (0, 3, 6)))
+        if self.light_position_mm is not None and self.light_azimuth_deg is not None:
+            raise ValueError("light_position_mm, light_azimuth_deg: expected one of them, got both: positions hold the azimuths")
+        if self.light_azimuth_deg is not None:
+            self._set("light_azimuth_deg", _azimuths(self.light_azimuth_deg))
+        if self.roi_px is not None and self.corners_px is not None:
+            raise ValueError("roi_px, corners_px: expected one of them, got both")
+        if self.roi_px is not None:
+            roi = check_numbers("roi_px", self.roi_px, (4,))
+            if any(v != int(v) for v in roi) or min(roi[:2]) < 0 or min(roi[2:]) < 2:
+                raise ValueError(f"roi_px: expected whole numbers (left, top, width, height) in the frame, got {self.roi_px!r}")
+            self._set("roi_px", tuple(int(v) for v in roi))
+        if self.corners_px is not None:
+            numbers = check_numbers("corners_px", self.corners_px, (4, 2))
+            corners = tuple(numbers[i : i + 2] for i in (0, 2, 4, 6))
+            if not _convex_clockwise(corners):
+                raise ValueError(
+                    "corners_px: expected a convex quadrilateral in the order top left, top right, bottom right, "
+                    f"bottom left, got {self.corners_px!r}"
+                )
+            self._set("corners_px", corners)
+        if not isinstance(self.markers, bool):
+            raise TypeError(f"markers: expected true or false, got {brief(self.markers)}")
+        prior: object = self.prior
+        if isinstance(prior, dict):  # as YAML gives it
+            self._set("prior", SensorPrior.from_dict(prior, "prior"))
+        elif prior is not None and not isinstance(prior, SensorPrior):
+            raise TypeError(f"prior: expected a SensorPrior, got {type(prior).__name__}")
+
+    def _set(self, name: str, value: object) -> None:
+        object.__setattr__(self, name, value)
+
+    @property
+    def exponent(self) -> float:
+        """Linear light is value to this power: gamma, or 1 where it is left open."""
+        return 1.0 if self.gamma is None else self.gamma
+
+    @property
+    def field_mm(self) -> tuple[float, float]:
+        """Height and width of the field of view, mm."""
+        return self.height * self.mm_per_pixel, self.width * self.mm_per_pixel
+
+    def resized(self, height: int, width: int) -> "Sensor":
+        """The same sensor seen with other pixels: field of view, lights and response stay, pitch and blur follow.
+
+        Raises:
+            ValueError: another aspect ratio (beyond 1 %), because pixels would no longer be square.
+        Example:
+            >>> Sensor(name="rig", height=480, width=640, mm_per_pixel=0.0625).resized(240, 320).mm_per_pixel
+            0.125
+        """
+        check_integer("height", height, 8), check_integer("width", width, 8)
+        scale_y, scale_x = height / self.height, width / self.width
+        if abs(scale_x / scale_y - 1.0) > 0.01:
+            raise ValueError(
+                f"height, width: expected the aspect ratio of {self.height} x {self.width}, got {height} x {width}: "
+                "pixels must stay square; crop instead"
+            )
+        prior = self.prior
+        if prior is not None:
+            response = dataclasses.replace(prior.response, blur_px=prior.response.blur_px * scale_x)
+            prior = dataclasses.replace(prior, response=response)
+        pitch, blur_px = self.mm_per_pixel / scale_x, self.blur_px * scale_x
+        return dataclasses.replace(self, height=height, width=width, mm_per_pixel=pitch, blur_px=blur_px, prior=prior)
+
+    def without_prior(self) -> "Sensor":
+        """The same sensor as if nothing were known of its type."""
+        return dataclasses.replace(self, prior=None)
+
+    def rectify(self, frame: Tensor) -> Tensor:
+        """Camera frames (B, 3, H, W) as the sensor's images (B, 3, height, width): four corners, region of interest, or as is.
+
+        Raises:
+            ValueError: the frame does not hold the region, or has another size and the sensor names no region.
+        """
+        check_batch("frame", frame, 3)
+        size = (self.height, self.width)
+        height, width = frame.shape[2], frame.shape[3]
+        if self.corners_px is not None:
+            corners = torch.tensor(self.corners_px, dtype=frame.dtype, device=frame.device)[None]
+            if bool((corners < -0.5).any()) or bool((corners[..., 0] > width).any()) or bool((corners[..., 1] > height).any()):
+                raise ValueError(f"frame: {height} x {width} does not hold corners_px {self.corners_px} of sensor '{self.name}'")
+            right, bottom = self.width - 1.0, self.height - 1.0
+            target = torch.tensor(
+                [[[0.0, 0.0], [right, 0.0], [right, bottom], [0.0, bottom]]], dtype=frame.dtype, device=frame.device
+            )
+            homography = kornia.geometry.get_perspective_transform(corners, target).expand(frame.shape[0], 3, 3)
+            return kornia.geometry.warp_perspective(frame, homography, size, mode="bilinear", align_corners=True)
+        if self.roi_px is not None:
+            left, top, roi_width, roi_height = self.roi_px
+            if left + roi_width > width or top + roi_height > height:
+                raise ValueError(f"frame: {height} x {width} does not hold roi_px {self.roi_px} of sensor '{self.name}'")
+            frame = frame[:, :, top : top + roi_height, left : left + roi_width]
+            return frame if frame.shape[2:] == size else kornia.geometry.resize(frame, size, antialias=True)
+        if (height, width) != size:
+            raise ValueError(
+                f"frame: expected {self.height} x {self.width} for sensor '{self.name}', got {height} x {width}: "
+                f"resize it, or load the sensor with height={height}, width={width}"
+            )
+        return frame
+
+    @classmethod
+    def load(cls, source: str | Path, height: int | None = None, width: int | None = None) -> "Sensor":
+        """Read a sensor: the name of a shipped one, or the path of a YAML file; optionally resized.
+
+        Raises:
+            FileNotFoundError: no such name or file. ValueError: bad YAML, an unknown key, or a bad value; names file and key.
+        Example:
+            >>> Sensor.load("gelsight_mini").mm_per_pixel
+            0.0634
+        """
+        path = _find(source)
+        sensor = cls.from_dict(_read_yaml(path), str(path))
+        if height is None and width is None:
+            return sensor
+        if height is None or width is None:
+            raise ValueError("height, width: expected both or none")
+        return sensor.resized(height, width)
+
+    @classmethod
+    def from_dict(cls, values: Any, source: str) -> "Sensor":
+        """Build a sensor from a mapping; ``source`` names it in errors."""
+        return from_dict(cls, values, source)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain lists and numbers, defaults left out; :meth:`from_dict` reads it back."""
+        pairs = ((field, getattr(self, field.name)) for field in dataclasses.fields(self))
+        return {field.name: _plain(value) for field, value in pairs if value != field.default}
+
+    def save(self, path: str | Path, comment: Sequence[str] = ()) -> None:
+        """Write the sensor as YAML, whole or not at all, under lines of ``comment`` (each with its #)."""
+        text = yaml.safe_dump(self.to_dict(), sort_keys=False, width=128, default_flow_style=None, allow_unicode=True)
+        with write_atomically(path) as temporary:
+            temporary.write_text("".join(f"{line}\n" for line in comment) + text, encoding="utf-8")
+
+
+def check_sensor(name: str, value: object) -> None:
+    """Raise unless ``value`` is a Sensor; a name or path is told the way."""
+    text = str(value) if isinstance(value, str | Path) else "gelsight_mini"
+    check_record(name, value, Sensor, f"load it by Sensor.load({text!r})")
+
+
+def shipped_sensors() -> list[str]:
+    """Names that :meth:`Sensor.load` finds."""
+    return sorted(path.stem for path in _shipped_folder().glob("*.yaml"))
+
+
+def _shipped_folder() -> Path:
+    here = Path(__file__).resolve()
+    installed = here.parents[1] / "configs" / "sensors"  # in a wheel
+    return installed if installed.is_dir() else here.parents[2] / "configs" / "sensors"  # in a checkout
+
+
+def _find(source: str | Path) -> Path:
+    path = check_path("source", source)
+    if path.suffix in (".yaml", ".yml"):
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such sensor file")
+        return path
+    if str(source) in shipped_sensors():
+        return _shipped_folder() / f"{source}.yaml"
+    raise FileNotFoundError(
+        f"source: expected a path ending in .yaml, or one of {', '.join(shipped_sensors())}, got {str(source)!r}"
+    )
+
+
+MOST_YAML_BYTES = 2**17
+"""A sensor file has some kilobytes."""
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """Safe YAML that refuses a key given twice, and aliases, by which some lines stand for gigabytes."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.events.AliasEvent):
+            mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
+            raise yaml.composer.ComposerError(None, None, "an alias (*): write the value itself", mark)
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            name = repr(self.construct_object(key, deep=True))
+            if name in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"key {name}: given twice", node.start_mark)
+            seen.add(name)
+        return super().construct_mapping(node, deep)
+
+
+def _read_yaml(path: Path) -> Any:
+    if path.stat().st_size > MOST_YAML_BYTES:
+        raise ValueError(
+            f"{path}: expected a file of at most {MOST_YAML_BYTES} bytes, got {path.stat().st_size}: not a sensor file"
+        )
+    try:
+        return yaml.load(path.read_text(encoding="utf-8"), Loader=_StrictLoader)  # a SafeLoader
+    except (yaml.YAMLError, ValueError, RecursionError, AttributeError, TypeError) as error:
+        raise ValueError(f"{path}: not a YAML file: {error}") from error
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, SensorPrior):
+        return value.to_dict()
+    return [_plain(item) for item in value] if isinstance(value, tuple) else value
+
+
+def _azimuths(value: object) -> tuple[float, ...]:
+    azimuths = check_numbers("light_azimuth_deg", value, (3,))
+    if max(abs(angle) for angle in azimuths) > 360.0:
+        raise ValueError(f"light_azimuth_deg: expected degrees in [-360, 360], got {value!r}")
+    gaps = [abs((azimuths[k] - azimuths[k - 1] + 180.0) % 360.0 - 180.0) for k in range(3)]
+    if min(gaps) < 1.0:
+        raise ValueError(f"light_azimuth_deg: expected three lights in different places, got {value!r}")
+    return azimuths
+
+
+def _convex_clockwise(corners: tuple[tuple[float, ...], ...]) -> bool:
+    def turn(k: int) -> float:
+        (x0, y0), (x1, y1), (x2, y2) = (corners[(k + i) % 4] for i in range(3))
+        return (x1 - x0) * (y2 - y1) - (y1 - y0) * (x2 - x1)
+
+    return all(turn(k) > 0 for k in range(4))  # y points down, so clockwise on the screen is a positive turn

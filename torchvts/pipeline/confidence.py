@@ -1,0 +1,385 @@
+"""How far a frame's normals and depth may be off: bounds per pixel, a figure per frame, and what they are made of.
+
+The bounds come from what is known before the frame (noise of the camera, conditioning of the inverse model, how far held-out
+presses or the fit say the model is off) and from what the frame itself shows: its own noise, light that the model does not
+explain, slopes that no surface has, dark or full channels, contact too faint for the mask. What no frame shows they do not hold:
+a wrong pitch, a camera that is not orthographic, a calibration of another unit.
+"""
+
+import math
+from typing import Any, Final, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ..compensate.compensate import blur, gaussian_weights
+from ..core.checks import (
+    check_batch,
+    check_field,
+    check_least,
+    check_positive,
+    check_record,
+    check_same_size,
+    check_shape,
+    check_tensor,
+)
+from ..core.geometry import gradient_from_normal, gradient_of_depth
+from ..core.noise import noise_std as frame_noise_std
+from ..integration import PoissonBackground
+from ..model.calibration import Calibration, check_calibration
+from ..normals import NormalFromIntensity, NormalFromResponse
+
+FACTORS = ("noise", "model", "pass", "surface", "saturation")
+"""What ``factors_deg`` holds, in that order: noise through the inverse model, raised where the light does not fit; error of the
+model; what a pass with the depth found would change; slopes that no surface has, and blur; channels that are dark or full."""
+
+USEFUL_DEG = 10.0
+"""``confidence`` is the probability that a normal is within this of the truth."""
+
+DEPTH_SPREAD = 1.46
+"""Spread of depth errors for :func:`bound_at`: a Gaussian's in one dimension. Normals of point lights have 1, in two."""
+
+RESPONSE_SPREAD = 1.2
+"""The same for normals of a response field, whose errors have longer tails."""
+
+PRIOR_DEG = 2.0
+"""Mean error of a sensor type's prior on a unit of its own: on a GelSight Mini 1.7 on the presses it was fitted on and 2.1 on
+others; a second Mini's own network is 2.9 from it, and some 2 from the truth itself."""
+
+FEW_DEG = 5.0
+"""Mean error of a response field from presses too few to hold one out, or from touches: 4 to 6 on a GelSight Mini."""
+
+FEW_PRESSES = 4.0
+"""Held-out error of n presses is taken sqrt(1 + 4 / n) times as large: few balls leave places and slopes that none was on."""
+
+MODEL_SHARE = 1.2
+"""Error of a response field, relative to the one that spreads its held-out angle over the image as noise is spread."""
+
+BORDER_SHARE = 3.0
+"""Part of the held-out variance that is added in the image's corners, with the fourth power of the distance from the middle."""
+
+CURL_SHARE = 0.4
+"""Variance of a slope, over the square of its part that no surface has: half for white noise, less for what is smooth."""
+
+BLUR_SHARE = 3.0
+"""Variance of a slope, over the square of what another blur of the same width takes from it."""
+
+CLIPPED_DEG = 3.0
+"""Error of a normal, along one axis, where a light is blocked or a channel is full and the other two must do."""
+
+MISFIT_SHARE = 3.0
+"""Error of the light per unit of tilt, over the part of the background that fitted lights leave unexplained."""
+
+DETECTED_SIGMAS = 4.5
+"""A tilt of so many standard deviations of its noise is seen as contact: the threshold of :class:`ContactMask`."""
+
+SYSTEM_SHARE = 0.5
+"""Depth error by a response field, over what slopes that are off by one standard deviation all the same way would give."""
+
+KINK_PX = 0.08
+"""Depth error of the grid where the surface has a kink, pixels, for a contact as steep as 45 degrees."""
+
+BAND = 0.15
+"""Width of the ring around the contact that is searched for what the mask missed, over the shorter side of the image."""
+
+SPREAD_OF_MEAN = 1.2533
+"""Mean length of a two-dimensional Gaussian error, over its standard deviation along one axis."""
+
+
+class Bounds(NamedTuple):
+    """normal_95_deg, depth_95_mm, confidence (B, 1, H, W); frame_confidence (B,); factors_deg (B, 5, H, W).
+
+    ``normal_95_deg`` and ``depth_95_mm``: within these the errors lie with a probability of 95 %. ``confidence``: probability that
+    the normal is within :data:`USEFUL_DEG`. ``frame_confidence``: its mean over the contact, 1 without contact. ``factors_deg``:
+    standard deviations along one axis that the bound of the normal is made of, in the order of :data:`FACTORS`.
+    """
+
+    normal_95_deg: Tensor
+    depth_95_mm: Tensor
+    confidence: Tensor
+    frame_confidence: Tensor
+    factors_deg: Tensor
+
+
+def bound_at(bound_95: Tensor, level: float, spread: float = 1.0) -> Tensor:
+    """The bound for another probability than 95 %.
+
+    Args:
+        bound_95: bounds for 95 %. level: probability, above 0 and below 1.
+        spread: ``Confidence.spread`` for normals, :data:`DEPTH_SPREAD` for depth.
+    Raises:
+        ValueError: level out of range.
+    Source:
+        Weibull's distribution of shape 2 / spread: Rayleigh's (the length of a two-dimensional Gaussian error) at a spread of 1.
+    Example:
+        >>> [round(float(bound_at(torch.tensor(6.0), level)), 2) for level in (0.5, 0.68, 0.95)]
+        [2.89, 3.7, 6.0]
+    """
+    check_tensor("bound_95", bound_95)
+    if not 0.0 < check_least("level", level) < 1.0:
+        raise ValueError(f"level: expected a probability between 0 and 1, got {level}: 0.95, not 95")
+    check_positive("spread", spread)
+    factor: float = (math.log(1.0 - level) / math.log(0.05)) ** (0.5 * spread)
+    return bound_95 * factor
+
+
+class Confidence(nn.Module):
+    """Bounds of a frame's errors, from its image and what the pipeline made of it.
+
+    Normals. The noise of the image goes through the inverse model by differences: each channel is moved by its noise, and the
+    normal followed. So conditioning is measured, not assumed. The model's error goes the same way, as light that is off: for
+    point lights by how well calibration pinned each of them, for response fields by so much that it makes the angle that presses
+    held out of calibration had. On top come what the next pass would change, the part of the gradient that is no gradient of any
+    depth, blur at edges, and a fixed error where a channel is dark or full. Outside of the contact, where the normal is said to
+    be flat, the bound is the faintest tilt that the mask sees.
+
+    Depth. White errors of slope grow with the logarithm of the contact's size; errors of the model add up along the way, which
+    is taken from three integrations: all slopes too steep, and all tilted in x and in y. What the mask missed and what the next
+    pass would change are integrated as they are.
+
+    Args:
+        normals: the calibrated block of the pipeline.
+        noise_std: (3, H, W), of the compensated image. image_noise_std: (3,), of the image, in image value, at calibration.
+        light_std: (3, H, W), how far the light is off by the model's fault; for point lights per unit of ``|n - n_rest|``.
+        mm_per_pixel: pixel pitch, mm.
+        model_deg: mean error of a response field, degrees; 0 for lights. measured: whether the background was an image.
+        blur_px: of the compensated image. spread: of the errors of normals, for :func:`bound_at`.
+    Source:
+        propagation of noise through photometric stereo: Barsky and Petrou, Signal Processing 86(11), 2006; the rest is this
+        project's, its constants measured on random scenes and on a GelSight Mini (docs/confidence.md).
+    Example:
+        >>> from torchvts import ConfidentPipeline, PointLights, Sensor
+        >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
+        >>> cal = Calibration.from_lights(lights, Sensor("rig", 48, 64, 0.5))
+        >>> out = ConfidentPipeline.from_calibration(cal)(cal.model_image[None])
+        >>> out.normal_95_deg.shape, out.frame_confidence
+        (torch.Size([1, 1, 48, 64]), tensor([1.]))
+    """
+
+    uses_depth: Final[bool]
+    by_lights: Final[bool]
+    noise: Tensor
+    image_noise: Tensor
+    light_std: Tensor
+    border: Tensor
+
+    def __init__(
+        self,
+        normals: nn.Module,
+        noise_std: Tensor,
+        image_noise_std: Tensor,
+        light_std: Tensor,
+        mm_per_pixel: float,
+        *,
+        model_deg: float = 0.0,
+        measured: bool = True,
+        blur_px: float = 0.0,
+        spread: float = 1.0,
+    ) -> None:
+        super().__init__()
+        check_record("normals", normals, nn.Module, "the block of the pipeline")
+        check_field("noise_std", noise_std)
+        check_shape("image_noise_std", image_noise_std, (3,))
+        check_shape("light_std", light_std, noise_std.shape, "noise_std")
+        check_positive("mm_per_pixel", mm_per_pixel), check_positive("spread", spread)
+        check_least("model_deg", model_deg), check_least("blur_px", blur_px)
+        self.normals = normals
+        self.uses_depth = bool(getattr(normals, "uses_depth", False))
+        self.by_lights = isinstance(normals, NormalFromIntensity)
+        self.mm_per_pixel = mm_per_pixel
+        self.fixed = 1.0 if measured else 0.0
+        self.model_variance = (math.radians(model_deg) / SPREAD_OF_MEAN) ** 2
+        self.blur_px = blur_px
+        self.weights = gaussian_weights(blur_px)
+        self.reach = math.ceil(blur_px)
+        self.correlation = max(1.0, 2.0 * math.sqrt(math.pi) * blur_px)  # blurred noise is as much larger in the sums
+        self.spread = spread
+        # TorchScript sees no numbers of the module
+        self.clipped_variance = math.radians(CLIPPED_DEG) ** 2
+        self.detected, self.useful_deg = DETECTED_SIGMAS, USEFUL_DEG
+        self.curl_share, self.blur_share = CURL_SHARE, BLUR_SHARE
+        self.system_variance = 1.0 if self.by_lights else SYSTEM_SHARE**2  # lights that are off are off everywhere
+        self.kink_variance_mm = (KINK_PX * mm_per_pixel) ** 2
+        height, width = noise_std.shape[1], noise_std.shape[2]
+        self.band = max(3, round(BAND * min(height, width)))
+        x, y = torch.linspace(-1.0, 1.0, width) * width, torch.linspace(-1.0, 1.0, height) * height
+        place = (x.square() + y.square()[:, None]) / float(width**2 + height**2)
+        self.register_buffer("border", (BORDER_SHARE * self.model_variance * place.square())[None].to(noise_std.dtype))
+        self.register_buffer("noise", noise_std.detach().clone())
+        self.register_buffer("image_noise", image_noise_std.detach().clone())
+        self.register_buffer("light_std", light_std.detach().clone())
+        self.integrate = PoissonBackground(mm_per_pixel)
+
+    @classmethod
+    def from_calibration(cls, calibration: Calibration, normals: nn.Module | None = None) -> "Confidence":
+        """The block of a calibrated unit.
+
+        Args:
+            calibration: the unit. normals: its block in the pipeline, to share; None makes one.
+        Raises:
+            TypeError: normals that are not of the calibrated model, of whose errors calibration knows nothing.
+        """
+        check_calibration("calibration", calibration)
+        kind = NormalFromResponse if calibration.response is not None else NormalFromIntensity
+        block = kind.from_calibration(calibration) if normals is None else normals
+        if not isinstance(block, kind):
+            raise TypeError(
+                f"normals: expected the calibrated {kind.__name__}, got {type(block).__name__}: of a module put in its place "
+                "nothing is known that confidence could be told from"
+            )
+        sensor, noise = calibration.sensor, calibration.compensated_noise_std
+        common: dict[str, Any] = {"measured": calibration.measured, "blur_px": sensor.blur_px}
+        if isinstance(block, NormalFromIntensity):
+            return cls(block, noise, calibration.noise_std, _light_std_by_fit(calibration), sensor.mm_per_pixel, **common)
+        model_deg = _model_deg(calibration)
+        slope_of_change = 0.5 * block.fast_maps[:3].square().sum(dim=(0, 1))  # a relative change of one, in every channel
+        usual = float(slope_of_change.median().sqrt().clamp_min(1e-6))
+        light = torch.full_like(noise, MODEL_SHARE * math.radians(model_deg) / SPREAD_OF_MEAN / usual)
+        common |= {"model_deg": model_deg, "spread": RESPONSE_SPREAD}
+        return cls(block, noise, calibration.noise_std, light, sensor.mm_per_pixel, **common)
+
+    def forward(
+        self, images: Tensor, compensated: Tensor, depth_mm: Tensor, gradient: Tensor, normal: Tensor, contact: Tensor
+    ) -> Bounds:
+        """Bounds of a frame.
+
+        Args:
+            images: (B, 3, H, W), what the pipeline was given. compensated: the same after ``Compensate``.
+            depth_mm, gradient, normal, contact: what the pipeline gave.
+        Raises:
+            ValueError: wrong shapes, or another size than the calibrated one.
+        """
+        height, width = self.noise.shape[1], self.noise.shape[2]
+        for name, tensor, channels in (
+            ("images", images, 3),
+            ("compensated", compensated, 3),
+            ("depth_mm", depth_mm, 1),
+            ("gradient", gradient, 2),
+            ("normal", normal, 3),
+        ):
+            check_batch(name, tensor, channels)
+            check_same_size(name, tensor, "the calibration", height, width)
+        if not torch.jit.is_scripting():
+            check_tensor("contact", contact)
+        if contact.dtype != torch.bool or contact.shape != depth_mm.shape:
+            raise ValueError(f"contact: expected bool like depth_mm, got {contact.shape} {contact.dtype}")
+        sigma = self._noise_of(images)
+        base = self.normals(compensated)
+        noise, model = self._through_the_inverse(base, compensated, sigma)
+        n_z = normal[:, 2:3]
+        steep = n_z.square()  # an error of slope turns the normal by so much, at most along one axis
+        model = model * (2.0 - 2.0 * n_z) if self.by_lights else model + self.border  # |n - n_rest|^2
+        again = self.normals(compensated, depth_mm) if self.uses_depth else base
+        apart = torch.sqrt((again - normal).square().sum(1, keepdim=True) + 1e-12)
+        clipped = torch.zeros_like(noise)
+        if self.by_lights:
+            dark = (compensated < self.normals.dark_where) | (compensated >= self.normals.full_above)
+            clipped = self.clipped_variance * dark.any(dim=1, keepdim=True).to(noise.dtype)
+            # three channels give two slopes and a check: a third of the noise is left over, the rest is not noise
+            left = (compensated - self.normals.lights(depth_mm, again, self.mm_per_pixel)).masked_fill(dark, 0.0)
+            left = 3.0 * _smooth(left.square().sum(1, keepdim=True)) / sigma.square().sum(1, keepdim=True)
+            noise = noise * (left / 1.7).clamp_min(1.0)
+        surface = self._no_surface(depth_mm, gradient, steep, noise)
+        variance = noise + model + clipped if self.by_lights else noise + model + surface
+        bound = _length_95(apart, torch.sqrt(variance + 1e-12), 1.0 if self.by_lights else 1.06)
+        bound = torch.where(contact, bound, self.detected * torch.sqrt(noise + 1e-12))
+        normal_95 = torch.rad2deg(bound).clamp_max(180.0)
+        touched = contact.to(noise.dtype)
+        depth_95 = self._depth_95(depth_mm, gradient, again, touched, steep, noise + surface, model + clipped)
+        # the inverse of bound_at
+        likely = 1.0 - torch.exp(math.log(0.05) * (self.useful_deg / normal_95) ** (2.0 / self.spread))
+        count = touched.sum(dim=(1, 2, 3))
+        frame = torch.where(count > 0, (likely * touched).sum(dim=(1, 2, 3)) / count.clamp_min(1.0), torch.ones_like(count))
+        parts = torch.cat((noise.sqrt(), model.sqrt(), apart, surface.sqrt(), clipped.sqrt()), dim=1)
+        return Bounds(normal_95, depth_95, likely, frame, torch.rad2deg(parts))
+
+    def _noise_of(self, images: Tensor) -> Tensor:
+        """(B, 3, H, W): noise of the compensated frame, the calibrated one raised where the frame has more."""
+        seen = (frame_noise_std(images.detach()) / self.image_noise).clamp_min(1.0).square()
+        factor = torch.sqrt((seen + self.fixed) / (1.0 + self.fixed))  # the background's part is what it was
+        return self.noise[None] * factor[:, :, None, None]
+
+    def _through_the_inverse(self, base: Tensor, compensated: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
+        """Variances along one axis of the angle, radians^2, by noise and by the light's error."""
+        noise = torch.zeros_like(base[:, 0:1])
+        model = torch.zeros_like(noise)
+        for k in range(3):
+            step = torch.zeros_like(compensated)
+            step[:, k : k + 1] = sigma[:, k : k + 1]
+            turn = 0.5 * (self.normals(compensated + step) - base).square().sum(1, keepdim=True)
+            noise = noise + turn
+            model = model + turn * (self.light_std[k : k + 1] / sigma[:, k : k + 1]).square()
+        return noise, model
+
+    def _no_surface(self, depth_mm: Tensor, gradient: Tensor, steep: Tensor, noise: Tensor) -> Tensor:
+        """Variance of what is no gradient of any depth, beyond noise, and of what blur took."""
+        odd = _smooth((gradient_of_depth(depth_mm, self.mm_per_pixel) - gradient).square().sum(1, keepdim=True)) * steep.square()
+        odd = self.curl_share * (odd - 3.0 * noise).clamp_min(0.0)
+        if self.blur_px > 0.0:
+            taken = (blur(gradient, self.weights) - gradient).square().sum(1, keepdim=True)
+            taken = nn.functional.max_pool2d(taken, 2 * self.reach + 1, 1, self.reach)
+            odd = odd + self.blur_share * taken * steep.square()
+        return odd
+
+    def _depth_95(
+        self, depth_mm: Tensor, gradient: Tensor, again: Tensor, touched: Tensor, steep: Tensor, white: Tensor, model: Tensor
+    ) -> Tensor:
+        # the next pass inside, and around it what the mask has left out, smoothed
+        beyond = 1.0 - touched
+        better = gradient_from_normal(again)
+        around = _smooth(better * beyond) / _smooth(beyond).clamp_min(0.04) * _grown(touched, self.band)
+        better = torch.where(touched > 0, better, around)
+        std = torch.sqrt(model + 1e-14) / steep.clamp_min(0.05) * touched
+        length = torch.sqrt(gradient.square().sum(1, keepdim=True) + std.square() + 1e-12)
+        none = torch.zeros_like(std)
+        tilts = torch.cat((torch.cat((std, none), 1), torch.cat((none, std), 1)))
+        found: Tensor = self.integrate(torch.cat((better, std * gradient / length, tilts)))
+        found = found.reshape(4, depth_mm.shape[0], 1, depth_mm.shape[2], depth_mm.shape[3])
+        count = touched.sum(dim=(1, 2, 3), keepdim=True).clamp_min(1.0)
+        mean = (white / steep.square().clamp_min(0.01) * touched).sum(dim=(1, 2, 3), keepdim=True) / count
+        growth = 0.2 + torch.log1p(torch.sqrt(count / math.pi)) / (2.0 * math.pi)
+        scatter = mean * growth * (self.correlation * self.mm_per_pixel) ** 2
+        kink = self.kink_variance_mm * gradient.square().sum(dim=(1, 2, 3), keepdim=True) / count
+        system = self.system_variance * found[1:].square().sum(0)
+        return (found[0] - depth_mm).abs() + 1.96 * torch.sqrt(scatter + kink + system)
+
+
+def _length_95(bias: Tensor, std: Tensor, tail: float) -> Tensor:
+    """95 % quantile of the length of a two-dimensional Gaussian of that standard deviation around a bias."""
+    return bias + tail * std * (1.645 + 0.803 * std / (std + bias))
+
+
+def _light_std_by_fit(calibration: Calibration) -> Tensor:
+    """(3, H, W): light off by a direction that is off by its standard deviation, and by misfit, per unit of |n - n_rest|."""
+    assert calibration.lights is not None
+    none, dtype = [0.0, 0.0, 0.0], calibration.background.dtype
+    turned = torch.tensor(calibration.report.get("direction_std_deg", none), dtype=dtype).nan_to_num(45.0).clamp(0.0, 45.0)
+    misfit = torch.tensor(calibration.report.get("misfit", none), dtype=dtype).nan_to_num(1.0).clamp(0.0, 1.0)
+    rise = calibration.lights.direction[:, 2].detach().clamp_min(0.2)
+    off = torch.hypot(torch.deg2rad(turned) / rise, MISFIT_SHARE * misfit)
+    return calibration.model_image.detach() * off.reshape(3, 1, 1)
+
+
+def _model_deg(calibration: Calibration) -> float:
+    """Mean error of a response field to expect, degrees."""
+    report = calibration.report
+    held_out = report.get("held_out_deg")
+    if held_out:
+        used = sum(bool(row.get("used")) for row in report.get("presses", []))
+        return float(held_out) * math.sqrt(1.0 + FEW_PRESSES / max(used, 1))
+    return PRIOR_DEG if "prior" in str(report.get("response", "")) else FEW_DEG
+
+
+def _smooth(values: Tensor) -> Tensor:
+    """Mean over 5 x 5 pixels."""
+    return nn.functional.avg_pool2d(nn.functional.pad(values, [2, 2, 2, 2], mode="replicate"), 5, 1)
+
+
+def _grown(mask: Tensor, reach: int) -> Tensor:
+    """A mask of zeros and ones, wider by ``reach`` pixels along rows and columns; by running sums, whatever the reach."""
+    for dim in (3, 2):
+        pad = [reach + 1, reach, 0, 0] if dim == 3 else [0, 0, reach + 1, reach]
+        total = nn.functional.pad(mask, pad).cumsum(dim)
+        length = mask.shape[dim]
+        mask = (total.narrow(dim, 2 * reach + 1, length) - total.narrow(dim, 0, length) > 0.5).to(mask.dtype)
+    return mask

@@ -13,7 +13,7 @@ import torch
 import yaml
 
 import torchvts as vts
-from torchvts.compensate.compensate import blur, gaussian_weights
+from torchvts.core.blur import blur, gaussian_weights
 from torchvts.core.files import load_tensors
 from torchvts.core.geometry import gradient_from_normal
 from torchvts.model.response_field import ResponseField, ResponseModel, SensorPrior, fit_log_background

@@ -8,7 +8,7 @@ import torch
 
 import torchvts as vts
 from torchvts.calibration import fit_prior
-from torchvts.compensate.compensate import blur, gaussian_weights
+from torchvts.core.blur import blur, gaussian_weights
 from torchvts.evaluation import metrics
 from torchvts.evaluation.score import score_press
 

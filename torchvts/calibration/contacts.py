@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..compensate.compensate import blur, gaussian_weights
 from ..contact.masks import ContactMask
+from ..core.blur import blur, gaussian_weights
 from ..core.checks import check_numbers, check_positive
 from ..core.geometry import gradient_from_normal, gradient_of_depth, pixel_grid_mm
 from ..integration import poisson_background

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..compensate.compensate import blur, gaussian_weights
+from ..core.blur import blur, gaussian_weights
 from ..core.geometry import pixel_grid_mm
 from ..model.response_field import ResponseField, ResponseModel, position_basis
 from .contacts import LEAST_INSIDE, Contact, depths

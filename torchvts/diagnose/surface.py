@@ -11,8 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..compensate.compensate import Compensate, blur, gaussian_weights
+from ..compensate.compensate import Compensate
 from ..contact.masks import ContactMask
+from ..core.blur import blur, gaussian_weights
 from ..core.checks import QUANTISATION_STD
 from ..core.geometry import GradientFromNormal
 from ..integration import PoissonBackground

@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..compensate.compensate import blur, gaussian_weights
+from ..core.blur import blur, gaussian_weights
 from ..core.checks import (
     check_batch,
     check_field,

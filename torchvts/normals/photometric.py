@@ -126,9 +126,9 @@ class NormalFromIntensity(NormalModel):
             check_same_count("depth_mm", depth_mm, "compensated", image.shape[0])
         if image.shape[0] == 0:
             return image
-        return self.normals(image, depth_mm, place, expected)
+        return self.normals_of(image, depth_mm, place, expected)
 
-    def normals(self, image: Tensor, depth_mm: Tensor | None, window: tuple[int, int], expected: Tensor | None) -> Tensor:
+    def normals_of(self, image: Tensor, depth_mm: Tensor | None, window: tuple[int, int], expected: Tensor | None) -> Tensor:
         """Normals of checked arguments; compiled kernels take the place of this method."""
         view = self.view(image, window)
         if self.lights.glossy:

@@ -19,10 +19,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ..accelerated import reference_only
 from ..calibration import CalibrationWarning, Press, calibrate, read_presses
 from ..compensate.compensate import Compensate
 from ..core.geometry import normal_from_gradient
-from ..accelerated import reference_only
 from ..integration import AdaptiveIntegration, PoissonDST, divergence
 from ..model import gs_sdk
 from ..model.calibration import Calibration

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ..accelerated import reference, reference_only
 from ..core import __version__
 from ..core.checks import (
     check_batch,
@@ -30,13 +31,11 @@ from ..core.checks import (
     check_record,
     check_sequence,
     check_size,
-    check_window,
 )
 from ..core.files import check_target, write_atomically
-from ..core.geometry import pixel_grid_mm
-from ..accelerated import reference, reference_only
 from ..core.frame import Crop
-from ..integration import Integrator, PoissonBackground, PoissonDCT, divergence
+from ..core.geometry import pixel_grid_mm
+from ..integration import Integrator, PoissonDCT, divergence
 from ..integration.base import embedded
 from ..integration.transforms import cosine_bases, fold, unfold
 from ..model.calibration import Calibration, check_calibration

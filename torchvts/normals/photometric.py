@@ -103,7 +103,7 @@ class NormalFromIntensity(NormalModel):
             sensor.mm_per_pixel,
             noise_std=calibration.compensated_noise_std.flatten(1).median(dim=1).values,
             inverse=calibration.inverse,
-            saturated_above=calibration.full_above,
+            saturated_above=calibration.saturated_above,
             camera_height_mm=camera_height_mm,
         )
 

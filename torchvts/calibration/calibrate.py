@@ -10,8 +10,8 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from ..compensate.compensate import Compensate
-from ..contact.masks import ContactMask
+from ..compensate import Compensate
+from ..contact import ContactMask
 from ..core.checks import check_image, check_sequence
 from ..core.geometry import gradient_from_normal
 from ..integration import poisson_background

@@ -133,7 +133,8 @@ class NormalFromIntensity(NormalModel):
         view = self.view(image, window)
         if self.lights.glossy:
             image = self.without_gloss(image, depth_mm, view)
-        return self.shadowed(self.inverted(image, depth_mm, view), image, depth_mm, view, expected)
+        normal: Tensor = self.shadowed(self.inverted(image, depth_mm, view), image, depth_mm, view, expected)
+        return normal
 
     def inverted(self, image: Tensor, depth_mm: Tensor | None, view: LightView) -> Tensor:
         """The plain inverse at every pixel: eq. 9 without depth, eq. 10 with depth."""

@@ -11,7 +11,7 @@ from ..calibration import CalibrationWarning, calibrate
 from ..calibration.calibrate import GIVEN_MISFIT
 from ..calibration.contacts import ROUGH, channel_structure
 from ..calibration.lights import LOOSE_DEG
-from ..contact.masks import ContactMask
+from ..contact import ContactMask
 from ..core.checks import check_batch, check_field, check_least, check_positive, check_range, check_same_size, check_shape
 from ..core.geometry import pixel_grid_mm
 from ..model.calibration import PEDESTAL, Calibration

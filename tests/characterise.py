@@ -10,12 +10,11 @@ This is a script and no test module. It reads the public API only, so that it ru
 thread. ``compare`` prints Markdown tables: "equal" where all bits are equal, else the largest difference, absolute and relative to
 the largest value; it exits with 1 if any relative difference exceeds 1e-6, a mask differs in a pixel, or an entry is missing.
 
-The outputs are named ``section/row/column``. Sections: inputs (images and calibrations as they enter), pipelines (units by lights and
-by response fields, modes, and paths: compiled kernels, PyTorch reference, float64, TorchScript saved and loaded, torch.export),
-confidence, integrators, blocks, gradients by autograd, calibrations, diagnoses, stream, poses.
+The outputs are named ``section/row/column``. Sections: inputs (images and calibrations as they enter), pipelines (units by lights
+and by response fields, modes, and paths: compiled kernels, PyTorch reference, float64, TorchScript saved and loaded,
+torch.export), confidence, integrators, blocks, gradients by autograd, calibrations, diagnoses, stream, poses.
 
-Units need no data but for two, which are left out if there are no third-party images (``TORCHVTS_DATA``, or shared/data beside the
-checkout).
+The GelSight Mini is left out where there are no third-party images (``TORCHVTS_DATA``, or shared/data beside the checkout).
 """
 
 import argparse
@@ -30,7 +29,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import types
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path

@@ -65,9 +65,13 @@ class Names:
             "torchvts.accelerated:reference_only", "torchvts.core.native:reference_only", "torchvts.core.native:operators_only"
         )
         self.PoissonBackground = find("torchvts:PoissonBackground", "torchvts:PoissonRest")
-        self.PerspectiveIntegration = find("torchvts.integration:PerspectiveIntegration")
+        self.PerspectiveIntegration = find(
+            "torchvts.accelerated:PerspectiveIntegration", "torchvts.integration:PerspectiveIntegration"
+        )
         self.DiscontinuityIntegration = find(
-            "torchvts.integration:DiscontinuityIntegration", "torchvts.integration:CliffIntegration"
+            "torchvts.accelerated:DiscontinuityIntegration",
+            "torchvts.integration:DiscontinuityIntegration",
+            "torchvts.integration:CliffIntegration",
         )
         self.ResponseField = find("torchvts.model:ResponseField", "torchvts.core.response:ResponseField")
         self.ResponseModel = find("torchvts.model:ResponseModel", "torchvts.core.response:ResponseModel")
@@ -539,9 +543,11 @@ def difference(old: Tensor, new: Tensor) -> Cell:
 
 
 def load(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors, in the order in which they were recorded, and texts."""
     with safe_open(str(path), "pt") as file:
-        texts = json.loads(file.metadata()["texts"])
-    return load_file(path), texts
+        texts, order = (json.loads(file.metadata()[key]) for key in ("texts", "sha256"))
+    tensors = load_file(path)
+    return {key: tensors[key] for key in order}, texts
 
 
 def compare(old_path: Path, new_path: Path) -> int:

@@ -524,10 +524,10 @@ TABLE = {
         f"{name}.forward": Entry(
             {"gradient": torch.zeros(1, 2, 8, 8), "window": (0, 0), "size": (16, 16)},
             {"gradient": [*batches(2), torch.zeros(1, 2, 1, 8)], "window": [(9, 0), (-1, 0)], "size": [(4, 4)]},
-            lambda name=name: getattr(vts, name)(),
+            lambda name=name: callables()[name](),
             named={"window": "gradient, window", "size": "gradient, window"},
         )
-        for name in ("PoissonDCT", "AdaptiveIntegration", "DiscontinuityIntegration")
+        for name in ("PoissonBackground", "PoissonDCT", "AdaptiveIntegration", "DiscontinuityIntegration")
     },
     "Press": Entry(
         {"image": image(), "ball_diameter_mm": 6.0, "center_px": (4.0, 5.0), "contact_radius_px": 3.0},

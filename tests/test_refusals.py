@@ -1,8 +1,8 @@
-"""Every public function refuses bad input, and says so in one form: `argument: expected ..., got ...: cause`.
+"""Every public function refuses bad input with a message of one form: `argument: expected ..., got ...: cause`.
 
-TABLE holds, for every public callable, one call that is accepted and, for every one of its arguments, values that are not. A new
-public name, or a new argument, without an entry fails the last two tests. Said otherwise are only files: their own name stands
-for the argument's, and what is wrong with them for the rest (`FILE_FORMS`).
+TABLE holds for every public callable one call that is accepted, and for each of its arguments values that are refused. A new public
+name or a new argument without an entry fails the last two tests. Messages about files have another form: they begin with the name
+of the file, and say what is wrong with it (`FILE_FORMS`).
 """
 
 import functools
@@ -57,11 +57,11 @@ PARTS = {
 }  # fmt: skip
 """Names, and with a dot at the end methods, that other tests cover: records, base classes, parts of the pipeline and the stream."""
 FREE = {"dtype", "seed", "report", "comment", "clock", "sleep"}
-"""Arguments that Python or torch itself judges; switches (bool) are free too."""
+"""Arguments that Python or torch itself checks; switches (bool) are free too."""
 FILE_FORMS = (
     r"(no such|key '.*': (unknown|missing)|not an? |folder .* does not exist|expected .*, got |a safetensors file, but not)"
 )
-"""What errors say of a file after its name."""
+"""What a message says about a file after its name."""
 
 
 def lights():
@@ -122,7 +122,7 @@ OTHERS = ["unit.safetensors", None, 3]
 
 
 def batches(channels, height=HEIGHT, width=WIDTH):
-    """What is no (B, channels, H, W) batch of floats."""
+    """Values that are no (B, channels, H, W) batch of floats."""
     good = torch.full((2, channels, height, width), 0.5)
     return [
         good[0], good[:, :0], torch.cat((good, good), 1), good.permute(0, 2, 3, 1), good.to(torch.uint8), good.bool(),
@@ -131,7 +131,7 @@ def batches(channels, height=HEIGHT, width=WIDTH):
 
 
 def images(height=HEIGHT, width=WIDTH):
-    """What is no (3, H, W) image in [0, 1]."""
+    """Values that are no (3, H, W) image in [0, 1]."""
     good = torch.full((3, height, width), 0.5)
     return [
         good[None], good[:1], good[0], good[:, :0], good[:, :-1], good.permute(1, 2, 0), (255 * good).to(torch.uint8),
@@ -141,7 +141,7 @@ def images(height=HEIGHT, width=WIDTH):
 
 
 def of_other_size(frame):
-    """Whether it is a sound image, of a size or count that diagnose takes: another size is a finding."""
+    """Whether it is a valid image of a size that diagnose accepts: another size is a finding."""
     return isinstance(frame, torch.Tensor) and tuple(frame.shape) in {(1, 3, HEIGHT, WIDTH), (3, HEIGHT - 1, WIDTH)}
 
 
@@ -155,7 +155,7 @@ class Entry:
     good: dict[str, Any]
     bad: dict[str, list[Any]]
     call: Any = None
-    named: dict[str, str] = field(default_factory=dict)  # arguments that errors call otherwise
+    named: dict[str, str] = field(default_factory=dict)  # arguments that messages call by another name
     label: tuple[str, ...] = ()  # arguments that only name things in messages
     file: tuple[str, ...] = ()  # arguments that are files
     run: bool = True  # whether the accepted call is made: not where it would open a camera or take minutes
@@ -431,7 +431,7 @@ TABLE = {
     ),
     "PerspectiveIntegration": Entry(
         {"mm_per_pixel": 1.0, "camera_height_mm": 30.0, "integrate": vts.PoissonBackground()},
-        {"mm_per_pixel": NUMBER, "camera_height_mm": NUMBER, "integrate": ["rest", 3]},
+        {"mm_per_pixel": NUMBER, "camera_height_mm": NUMBER, "integrate": ["dct", 3]},
     ),
     "PerspectiveIntegration.forward": Entry(
         {"gradient": GRADIENT, "window": (0, 0), "size": (16, 16)},
@@ -521,12 +521,12 @@ TABLE = {
             "center_px": [(1.0,), "here", (NAN, 0.0)],
             "contact_radius_px": ["3", 0, -1.0, NAN],
         },
-        label=("name", "image"),  # calibrate judges the image: it knows the sensor's size
+        label=("name", "image"),  # calibrate checks the image: it knows the sensor's size
     ),
     "Touch": Entry(
         {"image": image(), "depth_mm": 1.0},
         {"depth_mm": ["1", 0, -1.0, NAN]},
-        label=("name", "image"),  # calibrate judges the image: it knows the sensor's size
+        label=("name", "image"),  # calibrate checks the image: it knows the sensor's size
     ),
     "Sensor": Entry(
         {

@@ -1,7 +1,6 @@
 """Large data sets: every frame once and the same, whatever the batch, the workers, the processes, and wherever a run was killed."""
 
 import contextlib
-import importlib.util
 import os
 import signal
 import subprocess
@@ -216,15 +215,12 @@ def test_unusable_images_are_named_and_left_out(unit, tmp_path, capsys):
     assert report.failed == [] and report.rows == 5 and not (out / "failed.csv").exists()
 
 
-def test_the_script_ends_with_status_1_where_a_frame_was_left_out(unit, tmp_path, capsys):
-    spec = importlib.util.spec_from_file_location("script_reconstruct", SCRIPT)
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
+def test_the_script_ends_with_status_1_where_a_frame_was_left_out(unit, tmp_path, run_script):
     source = fill(tmp_path / "in", ["a.png", "b.png"])
     (source / "b.png").write_bytes(b"")
-    assert script.main([str(unit), str(source), "--out", str(tmp_path / "out"), "--no-pictures"]) == 1
-    printed = capsys.readouterr().out
-    assert "| b.png | " in printed and "wrote 1 frames" in printed and "frames/s" in printed
+    done = run_script("reconstruct", unit, source, "--out", tmp_path / "out", "--no-pictures")
+    assert done.returncode == 1 and "| b.png | " in done.stdout and "wrote 1 frames" in done.stdout
+    assert "frames/s" in done.stdout
 
 
 def test_same_stems_keep_apart_and_folders_stay(unit, tmp_path):

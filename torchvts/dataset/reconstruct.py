@@ -1,8 +1,7 @@
 """Data sets larger than memory: a folder, an image or a video into depth files and one table, over processes, resumable.
 
 Every process lists the source in the same order, takes each N-th image and each N-th frame of every video, and passes over what is
-done already (:mod:`.records`). At the end rank 0 writes ``frames.csv``. Nothing in memory grows with the data set but the names of one
-folder.
+done already (:mod:`.records`). At the end rank 0 writes ``frames.csv``. Only the names of one folder are in memory at a time.
 
 A frame's result does not depend on batch size, loader workers or processes: each frame goes through the pipeline by itself, on the
 same number of threads everywhere. (More threads split sums otherwise: depth then differs by up to 3e-7 mm.)

@@ -29,14 +29,14 @@ NAMED = {
     "covers the image": {"contact_covers_image"},
     "two contacts": {"several_contacts"},
     "faint contact": {"faint_contact", "no_contact"},
-    "gel sag": {"skirt"},
+    "gel sag": {"transition_zone"},
     "attached shadows": {"shadow"},
     "cast shadows": {"cast_shadow"},
     "specular": {"specular"},
     "inter-reflection": {"inter_reflection"},
     "ambient light": {"ambient_light"},
     "a channel dims": {"channel_level"},
-    "dead lights": {"light_dead"},
+    "dead lights": {"led_failed"},
     "a light moves": {"light_moved"},
     "lights close together": {"lights_coplanar"},
     "albedo drift": {"skin_changed"},
@@ -183,12 +183,12 @@ def test_a_background_of_now_tells_the_same_as_the_image():
 
 def test_a_skin_touched_all_over_is_not_taken_for_other_light():
     smooth = DIALS["covers the image"].make(2.2, 3)
-    assert "nothing_at_rest" in vts.diagnose(smooth.background, smooth.image, smooth.calibration).names
+    assert "no_free_skin" in vts.diagnose(smooth.background, smooth.image, smooth.calibration).names
     size = {"height": 120, "width": 160, "mm_per_pixel": 0.125}
     waves = scenes.surface(lambda x, y: 1.0 + 0.15 * torch.sin(2.1 * x) * torch.sin(1.7 * y), **size)
     image = scenes.render(waves, smooth.calibration.lights, noise_std=0.002, bits=8, seed=1)
     found = vts.diagnose(smooth.background, image, smooth.calibration)
-    assert found.names[0] == "nothing_at_rest" and "channel_level" not in found.names, str(found)
+    assert found.names[0] == "no_free_skin" and "channel_level" not in found.names, str(found)
 
 
 def test_another_size_is_a_finding_and_another_shape_an_error():

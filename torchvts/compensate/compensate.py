@@ -117,7 +117,7 @@ class Compensate(nn.Module):
         sensor = calibration.sensor
         parts = (calibration.gain, calibration.offset, sensor.exponent, calibration.defects, sensor.blur_px, calibration.markers)
         by_response = calibration.response is not None
-        full = (calibration.beyond_full, calibration.full_light)
+        full = (calibration.saturated_model, calibration.saturation_light)
         if not level:
             return cls(*parts, by_response, None, None, False, *full)
         return cls(*parts, True, calibration.flat, calibration.compensated_noise_std, by_response, *full)

@@ -123,10 +123,10 @@ class Examination:
         if unit.lights is None or not unit.measured:
             return None
         model = unit.model_image.float()
-        vignetting = unit.report.get("vignetting", [])
-        if isinstance(vignetting, list) and any(vignetting):
-            model = model * falloff(outwardness(unit.sensor), *[float(v) for v in vignetting[:2]]).float()
-        lit = unit.lit.float().clamp(0.0, 1.0) ** (1.0 / self.exponent)
+        vignetting = unit.report.get("vignetting", 0.0)
+        if vignetting != 0.0:
+            model = model * falloff(outwardness(unit.sensor), vignetting).float()
+        lit = unit.background_without_ambient.float().clamp(0.0, 1.0) ** (1.0 / self.exponent)
         return compare(lit, model, self.calibrated_noise, unit, self.rounding)
 
     @cached_property
@@ -149,8 +149,9 @@ class Examination:
         unit, change = self.calibration, self._found_change
         if unit.lights is None or change.name not in ("light_field", "light_moved", "skin_changed", "pitch", "distortion"):
             return False
-        compensated = (unit.model_image / unit.lit.clamp_min(1e-6)).float() if unit.measured else torch.ones_like(self.light)
-        light = change.predicted(self.light, unit) * compensated
+        light = change.predicted(self.light, unit)
+        if unit.measured:
+            light = light * (unit.model_image / unit.background_without_ambient.clamp_min(1e-6)).float()
         normal = (unit.inverse.float() * light[None]).sum(1)
         length, tilt = normal.norm(dim=0) - 1.0, normal[:2].norm(dim=0)
         return float(length.square().mean().sqrt()) < 0.3 * float(tilt.square().mean().sqrt())

@@ -249,7 +249,7 @@ class NormalFromIntensity(nn.Module):
             sensor.mm_per_pixel,
             noise_std=calibration.compensated_noise_std.flatten(1).median(dim=1).values,
             inverse=calibration.inverse,
-            full_above=calibration.full_above,
+            full_above=calibration.saturated_above,
             camera_height_mm=camera_height_mm,
         )
 

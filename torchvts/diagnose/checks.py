@@ -126,15 +126,23 @@ def _block_steps(e: Examination) -> Figures | None:
     return {"value": steps, "which": "image" if e.steps > BLOCKY else "calibration's image"}
 
 
-def _more_noise(e: Examination) -> Figures | None:
-    if not e.is_fine or bool(e.black_channels(e.image).any()) or e.noise_deg <= WARNING_DEG:
+def _noise(e: Examination) -> Figures | None:
+    """Noise of the image, degrees of it, and how many times that at calibration it is."""
+    if not e.is_fine or bool(e.black_channels(e.image).any()):
         return None
-    return {"value": float((e.noise / e.calibrated_noise).max()), "degrees": e.noise_deg, "cost": 0.5 * e.noise_deg}
+    return {"value": float((e.noise / e.calibrated_noise).max()), "level": float(e.noise.max()), "cost": e.noise_deg}
+
+
+def _more_noise(e: Examination) -> Figures | None:
+    figures = _noise(e)
+    return figures if figures is not None and figures["cost"] > WARNING_DEG else None
 
 
 def _always_noisy(e: Examination) -> Figures | None:
-    applies = e.is_fine and not bool(e.black_channels(e.image).any()) and e.spread >= COPLANAR
-    return {"value": float(e.noise.max()), "cost": e.noise_deg} if applies and e.noise_deg > 3.0 * WARNING_DEG else None
+    figures = _noise(e)
+    if figures is None or figures["cost"] <= 3.0 * WARNING_DEG or e.spread < COPLANAR:
+        return None
+    return {**figures, "value": figures["level"]}
 
 
 def _empty(e: Examination) -> float | None:
@@ -253,7 +261,6 @@ def _perspective(e: Examination) -> Figures | None:
 # ---- the table -----------------------------------------------------------------------------------------------------------------
 
 _CONTACT = "contact in the {} image: take it again with nothing touching the skin"
-_NOISE = "changes normals by {{{}:.1f}} degrees{}: more light, less gain, or average several frames"
 _NO_FREE_SKIN = "contact covers the whole skin, or all light has changed: no free skin to compare with; leave some skin free"
 
 CHECKS = (
@@ -276,10 +283,10 @@ CHECKS = (
           "camera with 8 bits or more", _by_cost),
     Check("compressed", _block_steps, "the {which} was compressed: steps at the borders of 8 x 8 blocks are {value:.1f} times "
           "those inside; take uncompressed images, or JPEG of quality 95 and more", above=BLOCKY),
-    Check("noise", _more_noise, "noise is {value:.1f} times that at calibration and " + _NOISE.format("degrees", ""),
-          _by_cost, above=3.0),
-    Check("noise", _always_noisy, "noise of {value:.3f} " + _NOISE.format("cost", ", at calibration too"),
-          unless=frozenset({"noise"})),
+    Check("noise", _more_noise, "noise is {value:.1f} times that at calibration and changes normals by {cost:.1f} degrees: more "
+          "light, less gain, or average several frames", lambda figures: _by_cost({"cost": 0.5 * figures["cost"]}), above=3.0),
+    Check("noise", _always_noisy, "noise of {value:.3f} changes normals by {cost:.1f} degrees, at calibration too: more light, "
+          "less gain, or average several frames", unless=frozenset({"noise"})),
     Check("no_picture", _empty, "the image has one value everywhere: lens covered, no LEDs, or no picture from the camera",
           "fault", last=True),
     Check("led_failed", _failed_leds, "the {colors} LED has failed (its channel is black everywhere): check LED and cable; with "

@@ -76,7 +76,7 @@ def test_a_tilted_punch_has_the_slope_of_its_tilt():
 
 @pytest.mark.parametrize("text", ["", " ", "abc", "A1"])
 def test_letters_need_strokes(text):
-    with pytest.raises(ValueError, match="text: expected capital letters A-Z and blanks, got "):
+    with pytest.raises(ValueError, match="text: expected capital letters A-Z and spaces, got "):
         scenes.letters_press(text)
 
 
@@ -150,7 +150,7 @@ def test_spots_darken_and_dead_pixels_stay_black(rendered):
     assert torch.equal(spots, scenes.skin_spots(120, 160)) and not torch.equal(spots, scenes.skin_spots(120, 160, seed=1))
 
 
-def test_at_rest_there_is_no_contact(rendered):
+def test_an_undeformed_skin_has_no_contact(rendered):
     scene = scenes.undeformed(rendered[0])
     assert scene.depth_mm.abs().max() == 0 and not bool(scene.contact.any()) and scene.mm_per_pixel == 0.25
     assert torch.equal(scene.normal, normal_from_gradient(scene.gradient).abs())

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
+from .. import scenes
 from ..calibration import CalibrationWarning, Press, calibrate, read_presses
 from ..calibration.calibrate import by_presses
 from ..core.checks import check_integer
@@ -23,7 +24,6 @@ from ..model.lights import PointLights
 from ..model.sensor import Sensor
 from ..pipeline.confidence import DEPTH_SPREAD, bound_at
 from ..pipeline.depth import ConfidentOutput, ConfidentPipeline
-from ..scenes import scenes
 from .metrics import normal_angle_deg
 from .score import ball_truth
 

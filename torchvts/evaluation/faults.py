@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from ..core.files import rgb_from_bgr
 from ..core.geometry import pixel_grid_mm
 from ..model.lights import PointLights, cast_shadows, seen_at
-from ..scenes.scenes import Scene
+from ..scenes import Scene
 
 SHININESS = 30.0
 """Exponent of the specular lobe: half its height 12 degrees from the mirror direction."""

@@ -18,7 +18,7 @@ from ..core.geometry import pixel_grid_mm
 from ..model.calibration import Calibration
 from ..model.lights import PointLights
 from ..model.sensor import Sensor
-from ..scenes.scenes import Scene, skin_spots, smooth_step, surface, surface_at, undeformed
+from ..scenes import Scene, skin_spots, smooth_step, surface, surface_at, undeformed
 from .faults import Conditions, photograph
 
 HEIGHT, WIDTH, MM_PER_PIXEL = 120, 160, 0.125

@@ -17,8 +17,7 @@ from ..model.sensor import Sensor
 from ..pipeline.depth import DepthOutput, DepthPipeline
 from ..pose import Registration, register_depth
 from ..pose.result import invert, turn_deg
-from ..scenes import objects
-from ..scenes.scenes import render
+from ..scenes import objects, render
 
 GOAL_DEG, GOAL_MM = 1.0, 0.15
 """A pose within both counts as a success."""

@@ -30,7 +30,7 @@ from ..model.lights import PointLights
 from ..model.sensor import Sensor
 from ..normals import NormalFromLookup, NormalFromMLP
 from ..pipeline.depth import MODES, DepthPipeline
-from ..scenes.scenes import Scene, render, sphere_press, surface
+from ..scenes import Scene, render, sphere_press, surface
 from .gallery import roof, stamp
 from .metrics import depth_error, normal_angle_deg
 from .score import Training, score_press, training_pixels

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 import torchvts as vts
-from torchvts.evaluation.score import train_network
+from torchvts.evaluation.presses import train_network
 
 
 def main() -> int:

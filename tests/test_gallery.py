@@ -1,4 +1,4 @@
-"""The gallery of hard scenes: valid and repeatable at every severity, and each fault does what physics says."""
+"""The gallery of hard scenes: valid and repeatable at every severity, and each fault has its physical effect."""
 
 import math
 from dataclasses import replace
@@ -120,8 +120,8 @@ def test_a_ball_casts_no_shadow_on_its_lit_side():
 def test_shine_adds_light_and_none_is_matt():
     matt = _light()
     assert torch.equal(_light(specular=0.0), matt)
-    weak, strong = _light(specular=0.1), _light(specular=0.4)
-    assert bool((weak >= matt).all()) and torch.allclose(strong - matt, 4 * (weak - matt), atol=1e-6)
+    faint, strong = _light(specular=0.1), _light(specular=0.4)
+    assert bool((faint >= matt).all()) and torch.allclose(strong - matt, 4 * (faint - matt), atol=1e-6)
 
 
 def test_ambient_and_bounced_light_flatten_the_shading():
@@ -182,12 +182,12 @@ def test_spots_dim_the_skin_and_dead_pixels_read_zero():
     case, plain = CORRUPTIONS["spots and dead pixels"].make(30.0, 0), gallery.undisturbed()
     factor = vts.scenes.skin_spots(HEIGHT, WIDTH, 30, 30, 0).expand(1, 3, -1, -1)
     assert bool((case.image[factor == 0] == 0).all())
-    sound = factor == 1
-    assert torch.equal(case.image[sound], plain.image[sound])
+    clean = factor == 1
+    assert torch.equal(case.image[clean], plain.image[clean])
     assert float((case.image - plain.image)[(factor > 0) & (factor < 1)].mean()) < -0.05
 
 
-def test_the_skirt_of_sagging_gel_joins_the_ball_without_a_kink():
+def test_the_transition_zone_of_sagging_gel_joins_the_ball_without_a_kink():
     truth = CORRUPTIONS["gel sag"].make(1.0, 0).truth
     beyond = ~truth.contact
     assert float(truth.gradient.norm(dim=1, keepdim=True)[beyond].max()) > 0.1  # truth goes on outside the contact

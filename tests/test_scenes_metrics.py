@@ -1,4 +1,4 @@
-"""Exact presses, the camera that sees them, and the figures that judge results."""
+"""Exact presses, their camera images, and the metrics that score results."""
 
 import math
 
@@ -200,7 +200,7 @@ def test_the_sphere_of_exact_points_is_exact(radius_mm, press_mm, center_mm):
     assert fit.radius_mm == pytest.approx(radius_mm, abs=1e-8) and fit.rms_mm < 1e-9
 
 
-def test_figures_refuse_what_does_not_fit():
+def test_metrics_refuse_what_does_not_fit():
     one, other, none = torch.zeros(1, 1, 4, 4), torch.zeros(1, 1, 4, 5), torch.zeros(1, 1, 4, 4, dtype=torch.bool)
     with pytest.raises(ValueError, match=r"depth_mm: expected \(1, 1, 4, 5\) like truth_mm, got \(1, 1, 4, 4\)"):
         metrics.depth_error(one, other, 1.0)

@@ -18,7 +18,7 @@ from torch import Tensor
 from ..core.files import write_atomically
 from ..core.geometry import normal_from_gradient
 from ..pipeline import ConfidentPipeline
-from ..viz import draw_contours
+from ..viz import draw_contours, new_figure
 from .coverage import LEVELS, Coverage
 from .evaluate import Evaluation
 from .gallery import CORRUPTIONS, Corruption
@@ -29,13 +29,6 @@ from .rows import Row
 from .score import PLACES, RIM_PX, SLOPE_EDGES, ball_truth, label
 from .speed import front, ms
 from .stability import DEPTH_LIMIT, MASK, MASK_LIMIT, NORMAL_LIMIT_DEG, Breaking, depth_share, in_words
-
-
-def new_figure(width: float, height: float, dpi: int = 110) -> Figure:
-    """An empty figure of so many inches, with a canvas that needs no display."""
-    figure = Figure(figsize=(width, height), layout="constrained", dpi=dpi)
-    FigureCanvasAgg(figure)
-    return figure
 
 
 def save_small(figure: Figure, path: Path) -> None:

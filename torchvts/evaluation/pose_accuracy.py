@@ -258,7 +258,7 @@ def ball_pairs(
         most: largest number of pairs, evenly chosen.
         progress: called for each pair.
     Returns:
-        Numbers of pairs: "pairs", "converged", and of these "named" (three rotations reported), "named in part", "not named".
+        Counts: "pairs", "converged", and of these "named" (three rotations reported), "named in part", "not named".
     """
     pipe = DepthPipeline.from_calibration(calibrate(background, sensor), "precise")
     with torch.inference_mode():

@@ -55,7 +55,7 @@ class Timing(NamedTuple):
 
 
 class Call(NamedTuple):
-    """A call to time, and what its row says of it.
+    """A call to time, and the other fields of its row.
 
     Attributes:
         call: what is timed.

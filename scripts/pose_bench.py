@@ -4,6 +4,7 @@ python scripts/pose_bench.py --poses 100 --out out/pose_bench
 """
 
 import argparse
+import dataclasses
 import json
 import sys
 from collections.abc import Sequence
@@ -56,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with tqdm(total=100, unit="pair") as bar:
             counts = ball_pairs(background, presses, vts.Sensor.load(arguments.sensor), 100, bar.update)
         text += "\nreal presses of a ball: " + ", ".join(f"{name} {count}" for name, count in counts.items()) + "\n"
-    for name, content in (("table.md", text), ("poses.json", json.dumps([row.as_dict() for row in rows], indent=1))):
+    for name, content in (("table.md", text), ("poses.json", json.dumps([dataclasses.asdict(row) for row in rows], indent=1))):
         with write_atomically(arguments.out / name) as temporary:
             temporary.write_text(content)
     print(text)

@@ -231,7 +231,7 @@ def overview_figure(points: Sequence[Breaking]) -> Figure:
     held = np.array([[by_place[name, method].held for method in methods] for name in names])
     figure = new_figure(2.6 + 0.95 * len(methods), 1.3 + 0.24 * len(names), 88)
     axes = figure.subplots()
-    picture = axes.imshow(held, cmap="RdYlGn", vmin=0.0, vmax=1.0, aspect="auto", alpha=0.7)
+    picture = axes.imshow(held, cmap="RdBu", vmin=0.0, vmax=1.0, aspect="auto", alpha=0.7)
     for row, name in enumerate(names):
         for column, method in enumerate(methods):
             text = by_place[name, method].text

@@ -5,8 +5,7 @@ import math
 import platform
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -68,63 +67,33 @@ class PoseError:
         return self.deg <= GOAL_DEG and self.mm <= GOAL_MM
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class PoseRow:
     """One object over many poses.
 
     Attributes:
         name: name of the object.
         poses: number of poses.
-        ambiguous: whether part of its pose cannot be determined.
-        errors: the registrations that were not refused.
-        notes: those that were refused, one line each.
+        deg: angle of each registration, degrees.
+        mm: distance of each registration, mm.
+        seconds: time of each registration, s.
+        converged: number of registrations that report convergence.
+        success: share that converged within the goal.
+        wrong: number that converged, reports no unknown direction, and is outside of the goal.
+        named: share whose reported unknown directions are the true ones; None for objects that have none.
+        notes: registrations that were refused, one line each.
     """
 
     name: str
     poses: int
-    ambiguous: bool
-    errors: list[PoseError] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-
-    @property
-    def deg(self) -> list[float]:
-        """Angles, degrees."""
-        return [error.deg for error in self.errors]
-
-    @property
-    def mm(self) -> list[float]:
-        """Distances, mm."""
-        return [error.mm for error in self.errors]
-
-    @property
-    def seconds(self) -> list[float]:
-        """Times, s."""
-        return [error.seconds for error in self.errors]
-
-    @property
-    def converged(self) -> int:
-        """Number that reports convergence."""
-        return sum(error.converged for error in self.errors)
-
-    @property
-    def success(self) -> float:
-        """Share that converged within the goal."""
-        return sum(error.within and error.converged for error in self.errors) / self.poses
-
-    @property
-    def wrong(self) -> int:
-        """Number that converged, reports no unknown direction, and is outside of the goal."""
-        return sum(error.claimed and not error.within for error in self.errors)
-
-    @property
-    def named(self) -> float | None:
-        """Share whose reported unknown directions are the true ones; None for objects that have none."""
-        return sum(error.named for error in self.errors) / self.poses if self.ambiguous else None
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        names = ("name", "poses", "deg", "mm", "seconds", "converged", "success", "wrong", "named", "notes")
-        return {name: getattr(self, name) for name in names}
+    deg: list[float]
+    mm: list[float]
+    seconds: list[float]
+    converged: int
+    success: float
+    wrong: int
+    named: float | None
+    notes: list[str]
 
 
 def rig(height: int = 240, width: int = 320, mm_per_pixel: float = 0.0625) -> tuple[PointLights, DepthPipeline]:
@@ -222,20 +191,36 @@ def run_poses(
     rows: list[PoseRow] = []
     shown: dict[str, tuple[PoseCase, Registration]] = {}
     for name, target in targets.items():
-        row = PoseRow(name, poses, bool(target.free))
+        errors: list[PoseError] = []
+        notes: list[str] = []
         for seed in range(poses):
             case = pose_case(target, 1000 + seed, lights, pipe, size, noise_std)
             start = time.perf_counter()
             try:
                 found = register(case)
             except ValueError as error:
-                row.notes.append(f"pose {seed}: {error}")
+                notes.append(f"pose {seed}: {error}")
             else:
-                row.errors.append(_compare(found, case, target, time.perf_counter() - start))
+                errors.append(_compare(found, case, target, time.perf_counter() - start))
                 shown.setdefault(name, (case, found))
             progress()
-        rows.append(row)
+        rows.append(_row(name, target, poses, errors, notes))
     return rows, shown
+
+
+def _row(name: str, target: objects.Target, poses: int, errors: list[PoseError], notes: list[str]) -> PoseRow:
+    return PoseRow(
+        name=name,
+        poses=poses,
+        deg=[error.deg for error in errors],
+        mm=[error.mm for error in errors],
+        seconds=[error.seconds for error in errors],
+        converged=sum(error.converged for error in errors),
+        success=sum(error.within and error.converged for error in errors) / poses,
+        wrong=sum(error.claimed and not error.within for error in errors),
+        named=sum(error.named for error in errors) / poses if target.free else None,
+        notes=notes,
+    )
 
 
 def _compare(found: Registration, case: PoseCase, target: objects.Target, seconds: float) -> PoseError:

@@ -19,7 +19,8 @@ from torchvts import scenes
 from torchvts.diagnose import Diagnosis, Finding
 from torchvts.diagnose.camera import blockiness, levels_of
 from torchvts.evaluation.faults import jpeg
-from torchvts.evaluation.gallery import DIALS, undisturbed
+from torchvts.evaluation.gallery import CORRUPTIONS as DIALS
+from torchvts.evaluation.gallery import undisturbed
 
 NAMED = {
     "deeper press": {"deep_press"},

@@ -19,10 +19,10 @@ from conftest import ring_lights
 import torchvts as vts
 from torchvts.calibration import fit_prior
 from torchvts.calibration.balls import guess_circle
-from torchvts.calibration.calibrate import CalibrationWarning
+from torchvts.calibration.by_presses import with_preprocessing
 from torchvts.calibration.contacts import read_contacts
 from torchvts.evaluation import metrics
-from torchvts.model.response_field import CHANGE_SCALE, ResponseField, ResponseModel
+from torchvts.model.response_field import CHANGE_SCALE, ResponseField
 
 HEIGHT, WIDTH, PITCH = 120, 160, 0.125
 SIZE = (HEIGHT, WIDTH, PITCH)
@@ -114,7 +114,7 @@ def calibrate(image, sensor, presses=()):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         calibration = vts.calibrate(image, sensor, presses)
-    return calibration, [str(w.message) for w in caught if issubclass(w.category, CalibrationWarning)]
+    return calibration, [str(w.message) for w in caught if issubclass(w.category, vts.CalibrationWarning)]
 
 
 @pytest.fixture(scope="module", params=["field", "curve"])
@@ -173,9 +173,7 @@ def test_balls_are_found_without_labels(unit):
 def test_the_first_guess_of_a_ball_cut_by_the_border_leaves_the_border_out(rest, center_mm):
     """Its outline along the image border is none of the ball's: with it the guess is 3 to 5 px off."""
     press = vts.Press(seen_by_curve(ball(center_mm, 0.6), 3), BALL_MM)
-    unit = vts.Calibration.from_response(ResponseModel(true_field(), None), GIVEN, rest.double())
-    blocks = (vts.Compensate.from_calibration(unit).double(), vts.ContactMask.from_calibration(unit).double())
-    (contact,) = read_contacts([press], rest, *blocks, GIVEN)
+    (contact,) = read_contacts([press], rest, with_preprocessing(GIVEN, None))
     guess_circle(contact, GIVEN)
     assert contact.reason == "" and math.dist(contact.center_mm.tolist(), center_mm) / PITCH < 1.0
 
@@ -208,12 +206,12 @@ def test_the_candidates_are_told_with_their_scores(unit):
         assert {"model", "family", "parameters", "score_deg", "passes"} <= set(row)
         assert math.isfinite(row["score_deg"]) and row["score_deg"] > 0
     assert {row["passes"] for row in rows[1:]} == {1, 2}
-    fast = [row for row in rows[1:] if row["passes"] == 1 and "read with" not in row["model"]]
+    fast = [row for row in rows[1:] if row["passes"] == 1 and "preprocessed with" not in row["model"]]
     assert [row["parameters"] for row in fast] == sorted(row["parameters"] for row in fast)
     best = min(row["score_deg"] for row in fast)
     chosen = next(row for row in fast if row["parameters"] == 2 * calibration.response.fast.size())
     assert chosen["score_deg"] <= 1.02 * best
-    assert all(row["score_deg"] > 1.02 * best for row in fast if row["parameters"] < chosen["numbers"])
+    assert all(row["score_deg"] > 1.02 * best for row in fast if row["parameters"] < chosen["parameters"])
 
 
 @pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
@@ -402,7 +400,7 @@ def test_pinned_lights_go_before_a_prior(prior):
     sensor = dataclasses.replace(SENSOR, prior=fit_prior(background(seen_by_lights), SENSOR, take_presses(seen_by_lights)))
     calibration, warned = calibrate(background(seen_by_lights), sensor)
     assert warned == [] and calibration.report["model"] == "point_lights"
-    assert "the image pins the lights to" in calibration.report["reason"]
+    assert "the image constrains the lights to" in calibration.report["reason"]
 
 
 @pytest.mark.parametrize("mode", ["fast", "precise"])
@@ -410,7 +408,7 @@ def test_pinned_lights_go_before_a_prior(prior):
 def test_presses_of_another_ball_do_no_harm_to_a_prior(prior, prior_alone, count, mode):
     sensor = dataclasses.replace(GIVEN, prior=prior)
     calibration, warned = calibrate(background(seen_by_other_curve), sensor, other_presses(count))
-    assert warned == [] and "prior moved" in calibration.report["reason"]
+    assert warned == [] and "prior adapted" in calibration.report["reason"]
     alone = depth_errors(prior_alone[0], seen_by_other_curve, ball, mode, HELD_OUT)
     after = depth_errors(calibration, seen_by_other_curve, ball, mode, HELD_OUT)
     assert all(b < 1.1 * a for a, b in zip(alone, after)), (alone, after)
@@ -437,7 +435,7 @@ def test_a_background_of_another_type_is_warned_of(prior):
     """The light falls off to the right by 95 %."""
     ramp = torch.linspace(1.0, 0.05, WIDTH)
     _, warned = calibrate(background() * ramp, dataclasses.replace(SENSOR, prior=prior))
-    assert any("unlike that of the unit the prior of sensor 'rig' was fitted on" in text for text in warned)
+    assert any("from that of the unit on which the prior of sensor 'rig' was fitted" in text for text in warned)
 
 
 # known centers

@@ -8,8 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..calibration.background import falloff, outwardness
-from ..calibration.contacts import ROUGH, channel_structure
+from ..calibration import ROUGH, channel_structure, falloff, outwardness
 from ..core.checks import QUANTISATION_STD, check_field, check_range
 from ..core.noise import noise_std
 from ..integration import integrate_perspective

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from ..calibration.background import falloff
+from ..calibration import falloff
 from ..core.geometry import pixel_grid_mm
 from ..model.calibration import Calibration
 

@@ -14,8 +14,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
-from ..calibration import CalibrationWarning, Press, calibrate, read_presses
-from ..calibration.calibrate import by_presses
+from ..calibration import CalibrationWarning, Press, by_presses, calibrate, read_presses
 from ..core.checks import check_integer
 from ..core.geometry import normal_from_gradient
 from ..model.calibration import Calibration

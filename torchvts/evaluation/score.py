@@ -21,8 +21,16 @@ from matplotlib.figure import Figure
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from ..calibration import CalibrationWarning, Press, calibrate, fit_prior, read_presses
-from ..calibration.calibrate import RESPONSE_BLUR_PX, as_read, by_presses
+from ..calibration import (
+    RESPONSE_BLUR_PX,
+    CalibrationWarning,
+    Press,
+    by_presses,
+    calibrate,
+    fit_prior,
+    read_presses,
+    with_preprocessing,
+)
 from ..compensate.compensate import Compensate
 from ..contact.masks import ContactMask
 from ..core.checks import check_image, check_integer, check_same_size
@@ -293,7 +301,7 @@ class Training:
 
     def of_family(self, degree: int, product_degree: int) -> Calibration:
         """By the located presses and response fields of that size alone."""
-        return by_presses(self.background, self.sensor, self.located, None, False, ((degree, product_degree),))[2]
+        return by_presses(self.background, self.sensor, self.located, None, False, ((degree, product_degree),)).unit
 
 
 def _found(presses: Sequence[Press], calibration: Calibration) -> list[Press]:
@@ -457,8 +465,8 @@ class _OfSecond(nn.Module):
 
 def _unit(background: Tensor, sensor: Sensor) -> Calibration:
     """The unit as a response field sees it that says 0 everywhere: it gives every method's contact mask."""
-    blur_px = as_read(sensor, None).blur_px
-    return Calibration.from_response(ResponseModel.blank(sensor.exponent, blur_px), sensor, background)
+    blur_px = with_preprocessing(sensor, None).blur_px
+    return Calibration.from_response(ResponseModel.zero(sensor.exponent, blur_px), sensor, background)
 
 
 def _smooth(unit: Calibration) -> Compensate:

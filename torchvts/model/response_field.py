@@ -83,8 +83,8 @@ class ResponseField:
             start += len(basis)
         return torch.stack(maps)
 
-    def lifted(self, degree: int, product_degree: int, uses_depth: bool) -> "ResponseField":
-        """The same field as one of a larger family; what is new is zero.
+    def embedded(self, degree: int, product_degree: int, uses_depth: bool) -> "ResponseField":
+        """The same field as a member of a larger family; the new coefficients are zero.
 
         Raises:
             ValueError: the family is not larger.
@@ -140,8 +140,8 @@ class ResponseModel:
         object.__setattr__(self, "blur_px", float(self.blur_px))
 
     @classmethod
-    def blank(cls, gamma: float = 1.0, blur_px: float = 1.0) -> "ResponseModel":
-        """A model that says flat of everything: what an image is read with before there is another."""
+    def zero(cls, gamma: float = 1.0, blur_px: float = 1.0) -> "ResponseModel":
+        """A model whose slope is zero everywhere: for preprocessing before a model is fitted."""
         return cls(ResponseField(0, -1, False, 1.0, ((0.0,) * 3, (0.0,) * 3)), None, gamma, blur_px)
 
     def to_dict(self) -> dict[str, Any]:

@@ -7,10 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..calibration import CalibrationWarning, calibrate
-from ..calibration.calibrate import GIVEN_MISFIT
-from ..calibration.contacts import ROUGH, channel_structure
-from ..calibration.lights import LOOSE_DEG
+from ..calibration import GIVEN_MISFIT, LOOSE_DEG, ROUGH, CalibrationWarning, calibrate, channel_structure
 from ..contact.masks import ContactMask
 from ..core.checks import check_batch, check_field, check_least, check_positive, check_range, check_same_size, check_shape
 from ..core.geometry import pixel_grid_mm

@@ -1,7 +1,7 @@
 """Calibration from presses of balls nobody labelled: on sensors whose truth is a response field, lights, or neither.
 
 Three synthetic units of 120 x 160 pixels at 0.125 mm, all with noise of 0.003 and 8 bits:
-"field": light is background * (1 + what a known response field inverts), and the skin leaves the ball along a skirt;
+"field": light is background * (1 + what a known response field inverts), and the skin leaves the ball along a transition zone;
 "curve": a ring of lights seen with vignetting, channels mixed, value = light^0.6 + 0.05: no point lights explain it;
 "lights": a ring of point lights, as the paper has it.
 """
@@ -137,6 +137,11 @@ def rest():
     return background()
 
 
+@pytest.fixture(scope="module")
+def by_good(good, rest):
+    return calibrate(rest, GIVEN, good)[0]
+
+
 def depth_errors(calibration, camera, shape, mode, places):
     """Mean error inside the contact, mm, and mean angle on the ball two pixels inside of its rim, degrees, over presses."""
     pipe, depths, angles = vts.DepthPipeline.from_calibration(calibration, mode), [], []
@@ -197,7 +202,7 @@ def test_what_lights_cannot_explain_gets_a_response(unit):
     assert report["held_out_deg"] < 1.0, name
 
 
-def test_the_candidates_are_told_with_their_scores(unit):
+def test_the_candidates_are_reported_with_their_scores(unit):
     _, _, _, _, calibration, _ = unit
     text = json.dumps(calibration.report, allow_nan=False)
     rows = json.loads(text)["candidates"]
@@ -247,25 +252,25 @@ def test_the_calibration_survives_a_file(unit, tmp_path):
     assert float((one - two).abs().max()) < 1e-5  # coefficients are kept to seven digits
 
 
-def test_calibrating_twice_gives_the_same_numbers(good, rest):
-    one, two = (calibrate(rest, GIVEN, good)[0] for _ in range(2))
+def test_calibrating_twice_gives_the_same_parameters(by_good, good, rest):
+    one, two = by_good, calibrate(rest, GIVEN, good)[0]
     # LAPACK's last digit depends on where its arrays lie in memory
     for first, second in ((one.response.fast, two.response.fast), (one.response.precise, two.response.precise)):
         assert torch.allclose(first.tensor(), second.tensor(), rtol=1e-9, atol=1e-11)
     assert one.report["reason"] == two.report["reason"]
 
 
-def test_the_order_of_the_presses_does_not_matter(good, rest):
-    one, two = (calibrate(rest, GIVEN, presses)[0].response for presses in (good, good[::-1]))
+def test_the_order_of_the_presses_does_not_matter(by_good, good, rest):
+    one, two = by_good.response, calibrate(rest, GIVEN, good[::-1])[0].response
     for field in ("fast", "precise"):
         left, right = getattr(one, field), getattr(two, field)
         assert torch.allclose(left.tensor(), right.tensor(), rtol=0, atol=1e-6)
 
 
-def test_a_mirrored_unit_is_calibrated_alike(good, rest):
+def test_a_mirrored_unit_is_calibrated_alike(by_good, good, rest):
     """Images flipped left to right give the same depth, flipped."""
     scene_image = seen_by_curve(ball((1.5, -2)), 77)
-    plain, _ = calibrate(rest, GIVEN, good)
+    plain = by_good
     mirrored, _ = calibrate(rest.flip(2), GIVEN, [dataclasses.replace(p, image=p.image.flip(2)) for p in good])
     for row, other in zip(plain.report["presses"], mirrored.report["presses"]):
         assert other["center_px"] == pytest.approx([WIDTH - 1 - row["center_px"][0], row["center_px"][1]], abs=0.1)
@@ -276,10 +281,10 @@ def test_a_mirrored_unit_is_calibrated_alike(good, rest):
     assert float((depth - flipped.flip(3)).abs().max()) < 0.01
 
 
-def test_a_unit_of_length_does_not_matter(good, rest):
+def test_a_unit_of_length_does_not_matter(by_good, good, rest):
     """Pitch and balls twice as large: the same slopes."""
     double = dataclasses.replace(GIVEN, mm_per_pixel=2 * PITCH)
-    one, _ = calibrate(rest, GIVEN, good)
+    one = by_good
     two, _ = calibrate(rest, double, [dataclasses.replace(p, ball_diameter_mm=2 * BALL_MM) for p in good])
     for row, other in zip(one.report["presses"], two.report["presses"]):
         assert other["center_px"] == pytest.approx(row["center_px"], abs=1e-4)
@@ -321,7 +326,7 @@ def test_clean_lights_without_noise_keep_point_lights():
     json.dumps(report, allow_nan=False)
 
 
-def test_too_few_presses_for_a_response_keep_pinned_lights():
+def test_too_few_presses_for_a_response_keep_well_constrained_lights():
     calibration, _ = calibrate(background(seen_by_lights), SENSOR, take_presses(seen_by_lights, count=2))
     assert calibration.report["model"] == "point_lights" and "too few presses for a response field" in calibration.report["reason"]
     assert calibration.report["candidates"][0]["score_deg"] < 1.0
@@ -341,7 +346,7 @@ def test_near_lights_keep_point_lights_because_their_second_pass_is_better():
     assert calibration.report["model"] == "point_lights"
 
 
-def test_where_lights_and_response_are_level_the_twelve_numbers_are_taken():
+def test_where_lights_and_response_are_equal_lights_are_chosen():
     sensor = dataclasses.replace(SENSOR, blur_px=1.0)
     calibration, _ = calibrate(background(seen_by_lights), sensor, take_presses(seen_by_lights))
     scores = [row["score_deg"] for row in calibration.report["candidates"]]

@@ -72,6 +72,7 @@ def calibrate(
     Source:
         eq. 6-8 of the paper for lights; the rest is this project's.
     Example:
+        >>> from torchvts.model.lights import PointLights, flat_image
         >>> sensor = Sensor(name="rig", height=48, width=64, mm_per_pixel=0.6)
         >>> lights = PointLights([[25, 0, 30], [-12, 20, 30], [-12, -20, 30]], [900, 900, 900])
         >>> calibrate(flat_image(lights, 48, 64, 0.6).detach(), sensor).report["model"]

@@ -624,7 +624,7 @@ TABLE = {
         },
     ),
     "fit_lights": Entry(
-        {"background": image(), "sensor": sensor(), "start": None, "max_steps": 3, "vignetting": 0},
+        {"background": image(), "sensor": sensor(), "start": None, "max_steps": 3, "vignetting": False},
         {
             "background": [*images(), 0 * image(), torch.full_like(image(), 0.5), torch.ones_like(image())],
             "sensor": SENSOR,

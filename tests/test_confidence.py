@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 import torch
 from torch import nn
+from torchmetrics import normal_angle_deg
 
 import torchvts as vts
 from torchvts.evaluation import coverage
-from torchvts.evaluation.metrics import normal_angle_deg
 from torchvts.export import sample_frames
 from torchvts.pipeline import bound_at
 from torchvts.pipeline.confidence import DEPTH_SPREAD, FACTORS, _length_95

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from ..compensate.compensate import Compensate
+from ..compensate import Compensate
 from ..core.geometry import gradient_from_normal
 from ..integration import poisson_background
 from ..model.calibration import Calibration

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ..compensate.compensate import Compensate
-from ..contact.masks import ContactMask
+from ..compensate import Compensate
+from ..contact import ContactMask
 from ..core.blur import blur, gaussian_weights
 from ..core.geometry import gradient_from_normal, gradient_of_depth, pixel_grid_mm
 from ..integration import poisson_background

@@ -21,8 +21,8 @@ from ..model.calibration import Calibration
 from ..model.lights import PointLights
 from ..model.report import PressRow
 from ..model.sensor import Sensor
+from ..pipeline import ConfidentOutput, ConfidentPipeline
 from ..pipeline.confidence import DEPTH_SPREAD, bound_at
-from ..pipeline.depth import ConfidentOutput, ConfidentPipeline
 from ..scenes import scenes
 from .metrics import normal_angle_deg
 from .score import ball_truth

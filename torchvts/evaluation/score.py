@@ -31,8 +31,8 @@ from ..calibration import (
     read_presses,
     with_preprocessing,
 )
-from ..compensate.compensate import Compensate
-from ..contact.masks import ContactMask
+from ..compensate import Compensate
+from ..contact import ContactMask
 from ..core.checks import check_image, check_integer, check_same_size
 from ..core.geometry import GradientFromNormal, normal_from_gradient, pixel_grid_mm
 from ..integration import PoissonBackground
@@ -40,7 +40,7 @@ from ..model.calibration import Calibration
 from ..model.response_field import ResponseModel
 from ..model.sensor import Sensor
 from ..normals import MlpFit, NormalFromIntensity, NormalFromLookup, NormalFromMLP, NormalFromResponse, fit_mlp
-from ..pipeline.depth import DepthOutput, DepthPipeline
+from ..pipeline import DepthOutput, DepthPipeline
 from ..viz import draw_contours
 from .metrics import fit_sphere, normal_angle_deg
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ..calibration import GIVEN_MISFIT, LOOSE_DEG, ROUGH, CalibrationWarning, calibrate, channel_structure
-from ..contact.masks import ContactMask
+from ..contact import ContactMask
 from ..core.checks import check_batch, check_field, check_least, check_positive, check_range, check_same_size, check_shape
 from ..core.geometry import pixel_grid_mm
 from ..model.calibration import PEDESTAL, Calibration

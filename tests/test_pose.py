@@ -11,7 +11,7 @@ import torch
 
 import torchvts as vts
 from torchvts.evaluation import pose_accuracy as pose_bench
-from torchvts.pose import ambiguity, clouds, contact_cloud, points
+from torchvts.pose import ambiguity, clouds, contact_cloud, icp
 from torchvts.pose.result import invert, motion, turn_deg
 from torchvts.scenes import objects
 
@@ -403,7 +403,7 @@ def test_thinning_is_even():
 def test_nearest_points_are_the_nearest():
     cloud = torch.rand(300, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     probe = torch.rand(40, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    distance, index = points._Tree(cloud).nearest(probe)
+    distance, index = icp.Tree(cloud).nearest(probe)
     true = torch.cdist(probe, cloud).min(1)
     assert torch.equal(index, true.indices) and torch.allclose(distance, true.values)
 

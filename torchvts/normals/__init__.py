@@ -1,8 +1,8 @@
-"""Floor 2: from compensated image to normals."""
+"""Normals from compensated images."""
 
 from .lookup import NormalFromLookup
-from .mlp import MlpFit, NormalFromMLP, fit_mlp
+from .mlp import NormalFromMLP
 from .photometric import NormalFromIntensity
 from .response import NormalFromResponse
 
-__all__ = ["MlpFit", "NormalFromIntensity", "NormalFromLookup", "NormalFromMLP", "NormalFromResponse", "fit_mlp"]
+__all__ = ["NormalFromIntensity", "NormalFromLookup", "NormalFromMLP", "NormalFromResponse"]

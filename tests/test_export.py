@@ -2,10 +2,8 @@
 
 import json
 import os
-import runpy
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -17,7 +15,6 @@ from torchvts.core.native import reference_only
 from torchvts.export import onnx_operators
 
 LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
-ROOT = Path(__file__).resolve().parents[1]
 HEIGHT, WIDTH, PITCH = 48, 64, 0.6
 SENSOR = vts.Sensor("rig", HEIGHT, WIDTH, PITCH)
 
@@ -40,6 +37,11 @@ def mini():
     background = (prior.background(48, 64, sensor.mm_per_pixel) ** (1.0 / prior.response.gamma)).float().clamp(0.0, 1.0)
     calibration = vts.Calibration.from_response(prior.response, sensor, background)
     return calibration, export.sample_frames(calibration)
+
+
+def long_to_write(*kinds):
+    """Pipelines whose graphs take minutes to write."""
+    return [pytest.param(kind, marks=pytest.mark.long) for kind in kinds]
 
 
 def pipeline(calibration, mode, **options):
@@ -83,7 +85,7 @@ def test_a_program_of_an_image_whose_cells_are_larger_than_pixels(cells_of_two):
     assert torch.equal(found[3], expected.contact) and (found[0] - expected.depth_mm).abs().max() < 1e-5
 
 
-@pytest.mark.skipif(not LONG, reason="minutes to write")
+@pytest.mark.long
 def test_onnx_of_an_image_whose_cells_are_larger_than_pixels(cells_of_two, tmp_path):
     if export.missing("onnx"):
         pytest.skip(export.missing("onnx"))
@@ -132,7 +134,7 @@ def test_gradients_through_torchscript_without_torchvts(low, tmp_path):
     )
 
 
-@pytest.mark.parametrize("kind", ["lights precise", "response auto", "own normals"])
+@pytest.mark.parametrize("kind", ["response auto", "own normals", *long_to_write("lights precise")])
 def test_a_program_takes_the_decisions_of_the_pipeline(low, mini, tmp_path, kind):
     """Loops, early ends and dark pixels in the graph, against the Python of the pipeline; then from its file, without torchvts."""
     calibration, frames = mini if kind == "response auto" else low
@@ -149,7 +151,7 @@ def test_a_program_takes_the_decisions_of_the_pipeline(low, mini, tmp_path, kind
         assert export.compare(tmp_path / "pipe.pt2", pipe, frames, "pt2") <= 1e-5
 
 
-@pytest.mark.parametrize("kind", ["lights fast", "response precise"] + LONG * ["lights precise"])  # minutes to write
+@pytest.mark.parametrize("kind", ["response precise", *long_to_write("lights fast", "lights precise")])
 def test_onnx_without_torchvts(low, mini, tmp_path, kind):
     if export.missing("onnx"):
         pytest.skip(export.missing("onnx"))
@@ -160,7 +162,7 @@ def test_onnx_without_torchvts(low, mini, tmp_path, kind):
     assert export.compare(path, pipe, frames, "onnx") <= 1e-3
 
 
-@pytest.mark.skipif(not LONG, reason="minutes to compile")
+@pytest.mark.long
 def test_aoti_without_torchvts(mini, tmp_path):
     if export.missing("aoti"):
         pytest.skip(export.missing("aoti"))
@@ -237,14 +239,13 @@ def test_errors_are_sentences(low, tmp_path, monkeypatch):
         export.export_onnx(pipe, tmp_path / "pipe.onnx")
 
 
-def test_the_script(low, tmp_path, capsys):
+def test_the_script(run_script, low, tmp_path):
     low[0].save(tmp_path / "unit.safetensors")
     vts.write_image(tmp_path / "press.png", low[1][0])
-    main = runpy.run_path(str(ROOT / "scripts" / "export.py"))["main"]
-    arguments = [str(tmp_path / "unit.safetensors"), "--out", str(tmp_path / "out"), "--mode", "auto", "--format"]
-    assert main([*arguments, "torchscript", "--frames", str(tmp_path / "press.png")]) == 0
-    output = capsys.readouterr().out
-    assert "| torchscript |" in output and output.rstrip().endswith("| ok |")
+    arguments = (tmp_path / "unit.safetensors", "--out", tmp_path / "out", "--format")
+    done = run_script("export", *arguments, "torchscript", "--frames", tmp_path / "press.png")
+    assert done.returncode == 0, done.stderr
+    assert "| torchscript |" in done.stdout and done.stdout.rstrip().endswith("| ok |")
     assert [file.name for file in (tmp_path / "out").iterdir()] == ["pipeline.pt"]
-    with pytest.raises(ValueError, match="format: expected one of torchscript"):
-        main([*arguments, "tflite"])
+    done = run_script("export", *arguments, "tflite")
+    assert done.returncode != 0 and "error: format: expected one of torchscript" in done.stderr

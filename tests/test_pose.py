@@ -2,9 +2,7 @@
 
 import json
 import math
-import runpy
 import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -15,7 +13,6 @@ from torchvts.pose import ambiguity, clouds, contact_cloud, icp
 from torchvts.pose.result import invert, motion, turn_deg
 from torchvts.scenes import objects
 
-ROOT = Path(__file__).resolve().parents[1]
 PITCH = 0.125
 SIZE = (120, 160)
 
@@ -89,7 +86,7 @@ def test_impossible_presses_are_refused():
 # two depth frames
 
 
-@pytest.mark.parametrize("angle_deg", [17.0, 144.0, 260.0])
+@pytest.mark.parametrize("angle_deg", [17.0, 260.0])
 def test_a_press_turned_moved_tilted_and_deeper_is_found(letters, reference, angle_deg):
     T = objects.pose(angle_deg, (2.0, -1.2), 0.6, (-1.5, 1.0))
     truth = objects.pose(0.0, (0.2, -0.1), 0.45, (1.0, -0.5)) @ invert(T)
@@ -178,14 +175,14 @@ def hanging_ball(x0, y0, press, seed):
 def test_a_ball_with_skin_hanging_around_it_is_still_a_ball():
     """The skin around a ball moves with the contact: only its deep part shows that it rolls."""
     target = hanging_ball(0.0, 0.0, 0.9, 0)
-    for seed, (x, y, press) in enumerate([(1.5, 0.5, 0.9), (-2.0, 1.0, 0.75), (0.5, -1.0, 1.0), (-1.0, -1.5, 0.85)], 1):
+    for seed, (x, y, press) in enumerate([(1.5, 0.5, 0.9), (-2.0, 1.0, 0.75)], 1):
         found = vts.register_depth(hanging_ball(x, y, press, seed), target, PITCH)
         assert found.converged and found.ambiguous == ["rotation about x", "rotation about y", "rotation about z"], found.message
 
 
-def test_real_presses_of_a_ball_are_ambiguous(data):
-    background, presses = vts.read_presses(data / "gelsight_mini_a")
-    counts = pose_bench.ball_pairs(background, presses[:25:5], vts.Sensor.load("gelsight_mini"))
+def test_real_presses_of_a_ball_are_ambiguous(mini_presses):
+    background, presses = mini_presses
+    counts = pose_bench.ball_pairs(background, presses[:20:5], vts.Sensor.load("gelsight_mini"))
     assert counts["pairs"] >= 6 and counts["converged"] >= 4
     assert counts["not named"] == 0 and counts["named"] >= counts["converged"] - 1
 
@@ -210,7 +207,7 @@ def test_a_surface_of_revolution_hides_its_turn_only():
 
 
 def test_different_objects_do_not_fit(reference):
-    for name in ("gear", "key", "textured patch"):
+    for name in ("gear", "textured patch"):
         other = frame(objects.TARGETS[name].height_mm, objects.pose(20.0, (0.5, 0.0), 0.5))
         found = vts.register_depth(other, reference, PITCH)
         assert not found.converged and not found.ambiguous and "nothing fits" in found.message
@@ -250,14 +247,12 @@ def test_impossible_frames_are_refused(reference):
 
 
 def test_the_whole_chain_keeps_within_its_goal():
-    targets = {name: objects.TARGETS[name] for name in ("stamp", "bottle cap", "tool handle")} | {
-        "plane": objects.FREE_TARGETS["plane"]
-    }
-    rows, shown = pose_bench.run_poses(targets, 3, size=(180, 240), noise_std=0.005)
-    for row in rows[:3]:
+    targets = {name: objects.TARGETS[name] for name in ("stamp", "tool handle")} | {"plane": objects.FREE_TARGETS["plane"]}
+    rows, shown = pose_bench.run_poses(targets, 2, size=(180, 240), noise_std=0.005)
+    for row in rows[:2]:
         assert row.success == 1.0 and row.wrong == 0 and max(row.deg) < 0.3 and max(row.mm) < 0.05
-    assert rows[3].named == 1.0 and rows[3].wrong == 0
-    assert pose_bench.pose_table(rows).count("\n") == 5 and set(shown) == set(targets)
+    assert rows[2].named == 1.0 and rows[2].wrong == 0
+    assert pose_bench.pose_table(rows).count("\n") == 4 and set(shown) == set(targets)
 
 
 def test_the_covariance_predicts_the_error():
@@ -291,8 +286,9 @@ def test_the_contact_cloud_is_even_sure_and_has_the_cameras_normals(reference):
         contact_cloud(reference._replace(depth_mm=0.01 * reference.depth_mm), PITCH)
 
 
-@pytest.mark.parametrize("twist", [(0.02, -0.03, 2.0, 3.0, -2.0, 0.1), (1.2, -0.8, 2.0, 3.0, -2.0, 5.0)])
-@pytest.mark.parametrize("order", ["same", "mixed"])
+@pytest.mark.parametrize(
+    "twist, order", [((0.02, -0.03, 2.0, 3.0, -2.0, 0.1), "same"), ((1.2, -0.8, 2.0, 3.0, -2.0, 5.0), "mixed")]
+)
 def test_a_known_motion_of_a_cloud_comes_back(reference, twist, order):
     cloud = contact_cloud(reference, PITCH, None)[0]
     T = motion(torch.tensor(twist, dtype=torch.float64))
@@ -313,8 +309,7 @@ def test_a_cloud_that_is_no_relief_is_registered():
     assert found.converged and (found.T_target_source - T).abs().max() < 1e-4
 
 
-@pytest.mark.parametrize("with_normals", [False, True])
-@pytest.mark.parametrize("most", [None, 1200])
+@pytest.mark.parametrize("with_normals, most", [(False, None), (True, 1200)])
 def test_contact_clouds_of_two_presses(with_normals, most):
     shape = objects.textured_patch()
     T_t, T_s = objects.pose(0.0, press_mm=0.5), objects.pose(75.0, (1.0, -0.8), 0.6, (1.0, 0.5))
@@ -410,7 +405,7 @@ def test_nearest_points_are_the_nearest():
 # the script
 
 
-def test_the_script_writes_pose_and_picture(tmp_path):
+def test_the_script_writes_pose_and_picture(run_script, tmp_path):
     lights, pipe = pose_bench.rig(*SIZE, PITCH)
     del pipe
     T_t, T_s = objects.pose(0.0, press_mm=0.5), objects.pose(50.0, (1.0, 0.5), 0.55)
@@ -424,20 +419,20 @@ def test_the_script_writes_pose_and_picture(tmp_path):
         scene = objects.press(objects.stamp(), T, *SIZE, PITCH)
         vts.write_image(tmp_path / f"{name}.png", vts.scenes.render(scene, lights, noise_std=0.003)[0])
 
-    main = runpy.run_path(str(ROOT / "scripts" / "pose.py"))["main"]
-
     def call(source, target, out, *options):
-        return main([str(tmp_path / source), str(tmp_path / target), "--out", str(tmp_path / out), *options])
+        return run_script("pose", tmp_path / source, tmp_path / target, "--out", tmp_path / out, *options)
 
-    unit = ("--calibration", str(tmp_path / "unit.safetensors"))
-    assert call("film/a.png", "target.png", "one", *unit) == 0
+    unit = ("--calibration", tmp_path / "unit.safetensors")
+    done = call("film/a.png", "target.png", "one", *unit)
+    assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "one" / "pose.json").read_text())
     deg, mm = off(torch.tensor(result["T_target_source"], dtype=torch.float64), T_t @ invert(T_s))
     assert result["converged"] and deg < 0.3 and mm < 0.05
     assert (tmp_path / "one" / "a_pose.png").stat().st_size > 10_000
-    assert call("film", "target.png", "track", *unit) == 0
+    done = call("film", "target.png", "track", *unit, "--no-pictures")
+    assert done.returncode == 0, done.stderr
     assert [entry["converged"] for entry in json.loads((tmp_path / "track" / "pose.json").read_text())] == [True, True]
-    with pytest.raises(ValueError, match="touched"):
-        call("background.png", "target.png", "none", *unit)
-    with pytest.raises(ValueError, match="got one of each"):
-        call("target.png", "target.ply", "none")
+    done = call("background.png", "target.png", "none", *unit)
+    assert done.returncode == 1 and done.stderr.strip().splitlines()[-1].startswith("error: ") and "touched" in done.stderr
+    done = call("target.png", "target.ply", "none")
+    assert done.returncode == 1 and "got one of each" in done.stderr

@@ -175,6 +175,23 @@ def test_the_fields_words_are_used():
     assert not found, f"{len(found)} private words:\n" + "\n".join(found)
 
 
+NAMES = re.compile(
+    r"(^|_)(lamps?|dials?|relight|heeds?|skirts?|levelled|torn|told|tells?|foresees?|judged?|judges|dear|evened|lifted|blank)(_|$)"
+    r"|(^|_)(at_rest|rest_image|worth_px)(_|$)",
+    re.IGNORECASE,
+)
+
+
+def test_identifiers_are_the_fields_words():
+    found = set()
+    for path in files():
+        if path.suffix == ".py":
+            name = path.relative_to(ROOT).as_posix()
+            tokens = tokenize.generate_tokens(io.StringIO(path.read_text(encoding="utf-8")).readline)
+            found |= {f"{name}: {token.string}" for token in tokens if token.type == tokenize.NAME and NAMES.search(token.string)}
+    assert not found, "\n".join(sorted(found))
+
+
 def test_files_are_named_by_the_fields_words():
     named = re.compile(r"(^|_)(rest|relight|dials?|lamps?|told|judge|skirt|loops|cliffs?|lean|figures_dict)(_|\.|$)")
     places = [path for folder in ("torchvts", "scripts", "docs", "configs") for path in (ROOT / folder).rglob("*")]

@@ -7,8 +7,8 @@ import torch
 from kornia.morphology import dilation
 
 import torchvts as vts
+from torchvts.accelerated import reference_only
 from torchvts.contact.masks import _dilate, _erode, _reconstruct_by_sweeps, reconstruct
-from torchvts.core.native import reference_only
 
 scenes, metrics = vts.scenes, vts.evaluation.metrics
 

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from ..calibration import CalibrationWarning, Press, calibrate, read_presses
 from ..compensate.compensate import Compensate
 from ..core.geometry import normal_from_gradient
-from ..core.native import reference_only
+from ..accelerated import reference_only
 from ..integration import AdaptiveIntegration, PoissonDST, divergence
 from ..model import gs_sdk
 from ..model.calibration import Calibration

@@ -18,7 +18,8 @@ import torch
 from ..core import __version__
 from ..core.checks import check_choice, check_record
 from ..core.files import check_target, write_atomically
-from ..pipeline.depth import DepthPipeline
+from ..normals import WrappedNormals
+from ..pipeline import DepthPipeline
 from .onnx_operators import decompositions
 from .trace import size_and_dtype, trace
 
@@ -32,11 +33,12 @@ def describe(pipe: DepthPipeline) -> dict[str, Any]:
     """The metadata of an exported file: plain JSON."""
     check_pipeline(pipe)
     height, width, dtype = size_and_dtype(pipe)
+    normals = pipe.normals.module if isinstance(pipe.normals, WrappedNormals) else pipe.normals
     return {
         "torchvts": __version__,
         "torch": str(torch.__version__),
         "mode": pipe.mode,
-        "normals": type(pipe.normals).__name__,
+        "normals": type(normals).__name__,
         "height": height,
         "width": width,
         "mm_per_pixel": pipe.mm_per_pixel,

@@ -6,16 +6,19 @@ import warnings
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_batch, check_size, check_window
-from ..integration import PoissonBackground, PoissonDCT, divergence
+from ..accelerated import reference
+from ..core.checks import check_batch, check_size
+from ..core.frame import Crop
+from ..integration import Integrator, PoissonDCT, divergence
+from ..integration.base import embedded
 from ..integration.transforms import cosine_bases, fold, unfold
-from ..pipeline.depth import DepthPipeline
+from ..pipeline import Adaptive, DepthPipeline, Shadows
 
 MAX_BATCH = 1024
 """Largest batch that the graph formats accept."""
 
 
-class PoissonBackgroundByMatrix(nn.Module):
+class PoissonBackgroundByMatrix(Integrator):
     """:class:`PoissonBackground` for one size, by matrix products alone, because ONNX has no such FFT.
 
     Args:
@@ -23,25 +26,24 @@ class PoissonBackgroundByMatrix(nn.Module):
         width: columns, pixels.
         mm_per_pixel: pixel pitch, mm.
         dtype: dtype of the matrices.
-        zero_background: zero on the background, as :class:`PoissonBackground`; else zero mean, as :class:`PoissonDCT`.
+        zero_in_background: zero where the gradient is zero, as :class:`PoissonBackground`; else zero mean, as :class:`PoissonDCT`.
     Source:
         As :func:`poisson_dct`; a test compares them.
     Example:
+        >>> from torchvts import PoissonBackground
         >>> gradient = torch.randn(2, 2, 24, 32)
         >>> bool((PoissonBackgroundByMatrix(24, 32, 0.5)(gradient) - PoissonBackground(0.5)(gradient)).abs().max() < 1e-5)
         True
     """
 
-    takes_window: bool = True
-
     def __init__(
-        self, height: int, width: int, mm_per_pixel: float, dtype: torch.dtype = torch.float32, zero_background: bool = True
+        self, height: int, width: int, mm_per_pixel: float, dtype: torch.dtype = torch.float32, zero_in_background: bool = True
     ) -> None:
         super().__init__()
         check_size(height, width, mm_per_pixel)
         self.size = (height, width)
         self.mm_per_pixel = mm_per_pixel
-        self.zero_background = zero_background
+        self.zero_in_background = zero_in_background
         even_y, odd_y, value_even_y, value_odd_y = cosine_bases(height)
         even_x, odd_x, value_even_x, value_odd_x = cosine_bases(width)
         for name, basis in (("even_y", even_y), ("odd_y", odd_y), ("even_x", even_x), ("odd_x", odd_x)):
@@ -52,14 +54,11 @@ class PoissonBackgroundByMatrix(nn.Module):
                 inverse = torch.where(value == 0.0, torch.zeros_like(value), 1.0 / value)  # zero: the mean
                 self.register_buffer(f"inverse_{y}_{x}", inverse.to(dtype))
 
-    def forward(self, gradient: Tensor, window: tuple[int, int] = (0, 0), size: tuple[int, int] | None = None) -> Tensor:
+    def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
         check_batch("gradient", gradient, 2)
         if size is not None and size != self.size:
             raise ValueError(f"gradient, window: expected size {self.size}, for which the matrices are, got {size}")
-        check_window("gradient", gradient, self.size, None if size is None and window == (0, 0) else window)
-        if size is not None and size != (gradient.shape[2], gradient.shape[3]):
-            after = [size[k] - window[k] - gradient.shape[2 + k] for k in (0, 1)]
-            gradient = nn.functional.pad(gradient, [window[1], after[1], window[0], after[0]])
+        gradient = embedded(gradient, window, self.size)
         up, down = fold(divergence(gradient), -2)
         rows = []
         for y, part in (("even", up), ("odd", down)):
@@ -70,7 +69,7 @@ class PoissonBackgroundByMatrix(nn.Module):
                 lines.append(basis_y.t() @ ((basis_y @ block @ basis_x.t()) * inverse) @ basis_x)
             rows.append(unfold(lines[0], lines[1], -1))
         depth = self.mm_per_pixel * unfold(rows[0], rows[1], -2)
-        if not self.zero_background:
+        if not self.zero_in_background:
             return depth
         background = ((gradient[:, 0:1] == 0) & (gradient[:, 1:2] == 0)).to(depth.dtype)
         count = background.sum(dim=(2, 3), keepdim=True)
@@ -104,19 +103,39 @@ def size_and_dtype(pipe: DepthPipeline) -> tuple[int, int, torch.dtype]:
 def trace(pipe: DepthPipeline, by_matrix: bool) -> torch.export.ExportedProgram:
     """Trace a copy of a pipeline for any batch; ``by_matrix`` replaces its Poisson solvers by matrix products."""
     height, width, dtype = size_and_dtype(pipe)
-    pipe = copy.deepcopy(pipe).eval().requires_grad_(False)
-    if by_matrix and isinstance(pipe.integrate, PoissonDCT):
-        pipe.integrate = PoissonBackgroundByMatrix(height, width, pipe.mm_per_pixel, dtype, pipe.integrate.levelled)
-    if by_matrix and isinstance(pipe.coarse_integrate, PoissonBackground):
-        rows, columns = (len(range(pipe.stride // 2, n, pipe.stride)) for n in (height, width))
-        pipe.coarse_integrate = PoissonBackgroundByMatrix(rows, columns, pipe.stride * pipe.mm_per_pixel, dtype)
-    if by_matrix and isinstance(pipe.judge, PoissonBackground):
-        pipe.judge = PoissonBackgroundByMatrix(height, width, pipe.mm_per_pixel, dtype)
+    pipe = copy.deepcopy(reference(pipe)).eval().requires_grad_(False)
+    if by_matrix:
+        _use_matrices(pipe, height, width, dtype)
     images = torch.full((2, 3, height, width), 0.5, dtype=dtype)
     batch = torch.export.Dim("batch", min=1, max=MAX_BATCH)
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        pipe(images)  # integrators make their tables, which then are constants of the graph
-        if pipe.expects:
-            pipe.judge(images[:, :2], (0, 0), (height, width))
+        _make_tables(pipe, images)  # which then are constants of the graph
         return torch.export.export(_PlainOutput(pipe), (images,), dynamic_shapes=({0: batch},), strict=False)
+
+
+def _use_matrices(pipe: DepthPipeline, height: int, width: int, dtype: torch.dtype) -> None:
+    """Replace the FFT solvers of a pipeline by matrix products."""
+    solve, policy = pipe.solve, pipe.refine
+    if isinstance(solve.integrate, PoissonDCT):
+        zero = solve.integrate.zero_in_background
+        solve.integrate = PoissonBackgroundByMatrix(height, width, pipe.mm_per_pixel, dtype, zero)
+    if isinstance(policy, Shadows):
+        policy.residual_integrator = PoissonBackgroundByMatrix(height, width, pipe.mm_per_pixel, dtype)
+        policy = policy.policy
+    if isinstance(policy, Adaptive):
+        rows, columns = (len(range(policy.stride // 2, n, policy.stride)) for n in (height, width))
+        policy.coarse_integrate = PoissonBackgroundByMatrix(rows, columns, policy.stride * pipe.mm_per_pixel, dtype)
+
+
+def _make_tables(pipe: DepthPipeline, images: Tensor) -> None:
+    """Let each integrator make the tables of its size."""
+    height, width = images.shape[2], images.shape[3]
+    pipe(images)
+    policy = pipe.refine
+    if isinstance(policy, Shadows):
+        policy.residual_integrator(images[:, :2], (0, 0), (height, width))
+        policy = policy.policy
+    if isinstance(policy, Adaptive):
+        frame = Crop(policy.stride, False)(images, torch.ones_like(images[:, :1], dtype=torch.bool))
+        policy.predicted_change_px(frame, pipe.solve(frame))

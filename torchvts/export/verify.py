@@ -13,11 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..accelerated import reference_only
 from ..core.checks import check_batch, check_choice, check_integer, check_path, check_sequence
 from ..core.geometry import pixel_grid_mm
-from ..core.native import reference_only
 from ..model.calibration import Calibration, check_calibration
-from ..pipeline.depth import DepthPipeline
+from ..pipeline import DepthPipeline
 from . import bare_process
 from .formats import FORMATS, check_pipeline
 

@@ -9,11 +9,12 @@ from torch import Tensor, nn
 from ..core.checks import check_batch, check_field, check_integer, check_least, check_same_size, check_tensor
 from ..core.files import load_tensors, save_tensors
 from ..core.geometry import normal_from_gradient
+from .base import NormalModel
 
 LOOKUP_KIND = "lookup_table"
 
 
-class NormalFromLookup(nn.Module):
+class NormalFromLookup(NormalModel):
     """Unit normals by a table from the change of R, G, B against the flat skin to the slope, one table for all pixels.
 
     The slope is interpolated between the nodes of the table (trilinear), so that it is differentiable in the image; outside of the
@@ -38,7 +39,6 @@ class NormalFromLookup(nn.Module):
         tensor([0., 0., 1.])
     """
 
-    uses_depth: bool = False
     flat: Tensor
     table: Tensor
     step: Tensor
@@ -65,7 +65,7 @@ class NormalFromLookup(nn.Module):
         self.register_buffer("step", step.detach().to(flat).clone())
         self.register_buffer("zero_index", zero.to(flat.device).clone())
 
-    def forward(self, compensated: Tensor) -> Tensor:
+    def forward(self, compensated: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
         """(B, 3, H, W) compensated image to (B, 3, H, W) unit normals that face the camera."""
         check_batch("compensated", compensated, 3)
         check_same_size("compensated", compensated, "the calibration", self.flat.shape[1], self.flat.shape[2])

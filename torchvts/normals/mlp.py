@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from ..core.checks import check_batch, check_field, check_integer, check_path, check_range, check_same_size
 from ..core.files import load_tensors, save_tensors
 from ..core.geometry import normal_from_gradient
+from .base import NormalModel
 
 MLP_KIND = "mlp"
 OUTPUTS = ("angle", "gradient")
@@ -21,7 +22,7 @@ MAX_GRADIENT = math.tan(MAX_ANGLE_RAD)
 """Its tangent, 9.5 mm per mm."""
 
 
-class NormalFromMLP(nn.Module):
+class NormalFromMLP(NormalModel):
     """Unit normals by gs_sdk's RGBXY network, from the colour and position of a pixel.
 
     Inputs are B, G, R in [0, 1], then x / width, y / height in [0, 1). The two outputs are angles whose tangents are gs_sdk's
@@ -50,7 +51,6 @@ class NormalFromMLP(nn.Module):
         tensor([0., 0., 1.])
     """
 
-    uses_depth: bool = False
     flat: Tensor
     flat_gradient: Tensor
 
@@ -88,7 +88,7 @@ class NormalFromMLP(nn.Module):
         self.register_buffer("flat_gradient", torch.zeros_like(flat[0:2]))
         self.set_flat(flat)
 
-    def forward(self, compensated: Tensor) -> Tensor:
+    def forward(self, compensated: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
         """(B, 3, H, W) images, R, G, B, to (B, 3, H, W) unit normals that face the camera."""
         check_batch("compensated", compensated, 3)
         check_same_size("compensated", compensated, "the calibration", self.height, self.width)

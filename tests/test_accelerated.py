@@ -7,14 +7,13 @@ import pytest
 import torch
 
 import torchvts as vts
-from torchvts.compensate.compensate import _some_means
-from torchvts.core import native
-from torchvts.core.native import may_use_native, reference_only
-from torchvts.pipeline.depth import _largest_change
+from torchvts.accelerated import kernels, reference_only
+from torchvts.accelerated.blocks import Drift, LargestChange
+from torchvts.accelerated.gate import usable
 
 scenes = vts.scenes
 
-pytestmark = pytest.mark.skipif(native.library() is None and shutil.which("cc") is None, reason="no C compiler")
+pytestmark = pytest.mark.skipif(kernels.library() is None and shutil.which("cc") is None, reason="no C compiler")
 
 
 def both(call, *arguments):
@@ -25,7 +24,7 @@ def both(call, *arguments):
 
 
 def test_the_loops_were_built():
-    assert native.library() is not None, f"{native.LIBRARY} is missing: install again (make setup)"
+    assert kernels.library() is not None, f"{kernels.LIBRARY} is missing: install again (make setup)"
 
 
 @pytest.mark.parametrize("size", [(48, 64), (240, 320), (45, 63), (2, 2), (3, 7), (16, 5), (1, 9)])
@@ -104,15 +103,15 @@ def test_a_frame_of_every_mode(ring):
 @pytest.mark.parametrize("size", [(240, 320), (181, 200), (483, 640)])
 def test_means_on_a_grid(size):
     image = torch.randn(2, 3, *size, generator=torch.Generator().manual_seed(0))
-    loops, operators = both(_some_means, image)
+    loops, operators = both(Drift().samples, image)
     assert loops.shape == operators.shape and float((loops - operators).abs().max()) < 1e-6
 
 
 def test_the_largest_change():
     one, other = torch.randn(2, 3, 1, 7, 11, generator=torch.Generator().manual_seed(0))
-    loops, operators = both(_largest_change, one, other)
+    loops, operators = both(LargestChange(), one, other)
     assert torch.equal(loops, operators) and loops.shape == (3,)
-    assert bool(native.largest_change(one, torch.full_like(one, torch.nan)).isnan().all())
+    assert bool(kernels.largest_change(one, torch.full_like(one, torch.nan)).isnan().all())
 
 
 def test_a_dead_lamp(ring):
@@ -142,16 +141,16 @@ def test_channels_left_out(ring):
 
 def test_what_loops_may_not_touch():
     plain = torch.zeros(1, 2, 8, 8)
-    assert may_use_native([plain, plain])
+    assert usable(plain, plain)
     with reference_only():
-        assert not may_use_native([plain])
-    assert not may_use_native([plain, plain.double()])
-    assert not may_use_native([plain.half()])
-    assert not may_use_native([plain.to("meta")])
+        assert not usable(plain)
+    assert not usable(plain, plain.double())
+    assert not usable(plain.half())
+    assert not usable(plain.to("meta"))
     recorded = plain.clone().requires_grad_(True)
-    assert not may_use_native([recorded])
+    assert not usable(recorded)
     with torch.no_grad():
-        assert may_use_native([recorded])
+        assert usable(recorded)
 
 
 def test_batches_that_do_not_fit_are_refused(ring):
@@ -248,22 +247,22 @@ def test_without_them_all_works(monkeypatch, ring, small_sensor, small_press):
     image = scenes.render(small_press(1.0), lights).detach()
     loops = pipe(image).depth_mm
     monkeypatch.setattr(native, "library", lambda: None)
-    assert not may_use_native([image])
+    assert not usable(image)
     assert torch.allclose(pipe(image).depth_mm, loops, rtol=0, atol=2e-6)
 
 
 def test_a_library_that_is_missing_or_left_over_is_not_used(monkeypatch, tmp_path):
-    library = native.LIBRARY
+    library = kernels.LIBRARY
     monkeypatch.setattr(native, "LIBRARY", tmp_path / library.name)
     try:
-        native.library.cache_clear()
-        assert native.library() is None
+        kernels.library.cache_clear()
+        assert kernels.library() is None
         shutil.copytree(library.parent, tmp_path, dirs_exist_ok=True)
-        native.library.cache_clear()
-        assert native.library() is not None
-        (tmp_path / "native.h").write_text("/* changed since */")
-        native.library.cache_clear()
+        kernels.library.cache_clear()
+        assert kernels.library() is not None
+        (tmp_path / "kernels.h").write_text("/* changed since */")
+        kernels.library.cache_clear()
         with pytest.warns(UserWarning, match="built from other sources than lie beside it, so it is not used: install again"):
-            assert native.library() is None
+            assert kernels.library() is None
     finally:
-        native.library.cache_clear()
+        kernels.library.cache_clear()

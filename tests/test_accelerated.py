@@ -127,14 +127,14 @@ def test_channels_left_out(ring):
     lights, scene = ring(20.0, 12.0), scenes.sphere_press(10.0, 3.0, (0, 0), 60, 80, 0.4)
     block = vts.NormalFromIntensity(lights, 60, 80, 0.4)
     seen = scenes.render(scene, lights, noise_std=0.002, bits=8, seed=1).detach()
-    apart = block.without_dark(seen)
+    apart = block.shadowed.without_dark(seen, (0, 0))
     assert bool((apart < 0).any()) and torch.equal(apart.clamp_min(0), seen.masked_fill(apart < 0, 0))
     shiny = vts.NormalFromIntensity(vts.PointLights(lights.position_mm, lights.albedo, [0.9] * 3), 60, 80, 0.4)
     steep = scene.depth_mm * 1.5  # where the lobe is strong, what is left out is left out still
     brighter = torch.where(apart < 0, apart * 0.8, apart)
     assert torch.equal(shiny(apart, steep), shiny(brighter, steep))
     for depth in (None, scene.depth_mm):
-        loops, operators = both(block, apart, depth, None, torch.zeros(1, 2, 60, 80))
+        loops, operators = both(block.solve, apart, depth, None, torch.zeros(1, 2, 60, 80))
         assert float((loops - operators).abs().max()) < 2e-5
         assert float((loops - block(seen, depth)).abs().max()) > 0.1
 
@@ -160,10 +160,10 @@ def test_batches_that_do_not_fit_are_refused(ring):
         with pytest.raises(ValueError, match=f"depth_mm: expected 5 frames like compensated, or one for all, got {count}"):
             block(image, torch.zeros(count, 1, 48, 64))
         with pytest.raises(ValueError, match=f"expected: expected 5 frames like compensated, or one for all, got {count}"):
-            block(image, None, None, torch.zeros(count, 2, 48, 64))
+            block.solve(image, None, None, torch.zeros(count, 2, 48, 64))
     dark = image.clone()
     dark[:, 0, :20] = 0.0
-    loops, operators = both(block, dark, None, None, torch.zeros(1, 2, 48, 64))
+    loops, operators = both(block.solve, dark, None, None, torch.zeros(1, 2, 48, 64))
     assert float((loops - operators).abs().max()) < 1e-4
     assert block(image[:0]).shape == (0, 3, 48, 64) and vts.PoissonBackground(0.1)(torch.zeros(0, 2, 48, 64)).shape == (
         0,
@@ -246,14 +246,14 @@ def test_without_them_all_works(monkeypatch, ring, small_sensor, small_press):
     pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, small_sensor), "precise")
     image = scenes.render(small_press(1.0), lights).detach()
     loops = pipe(image).depth_mm
-    monkeypatch.setattr(native, "library", lambda: None)
+    monkeypatch.setattr(kernels, "library", lambda: None)
     assert not usable(image)
     assert torch.allclose(pipe(image).depth_mm, loops, rtol=0, atol=2e-6)
 
 
 def test_a_library_that_is_missing_or_left_over_is_not_used(monkeypatch, tmp_path):
     library = kernels.LIBRARY
-    monkeypatch.setattr(native, "LIBRARY", tmp_path / library.name)
+    monkeypatch.setattr(kernels, "LIBRARY", tmp_path / library.name)
     try:
         kernels.library.cache_clear()
         assert kernels.library() is None

@@ -21,6 +21,7 @@ from conftest import ring_lights
 import torchvts as vts
 import torchvts.export
 from torchvts.core.geometry import normal_from_gradient
+from torchvts.evaluation import metrics
 from torchvts.integration import DiscontinuityIntegration, PerspectiveIntegration
 from torchvts.model import FillMarkers
 from torchvts.model.response_field import ResponseModel
@@ -35,7 +36,7 @@ MODULES = {
     "stream.": vts.stream,
     "objects.": vts.scenes.objects,
     "scenes.": vts.scenes,
-    "metrics.": vts.evaluation.metrics,
+    "metrics.": metrics,
 }
 RECORDS = {
     "Calibration", "CalibrationWarning", "ConfidentOutput", "DepthOutput", "Diagnosis", "Diagnosis.of", "Finding", "LightFit",

@@ -98,11 +98,11 @@ class NormalFromIntensity(Twin, normals.NormalFromIntensity):
 
     plain = normals.NormalFromIntensity
 
-    def normals(self, image: Tensor, depth_mm: Tensor | None, window: tuple[int, int], expected: Tensor | None) -> Tensor:
+    def normals_of(self, image: Tensor, depth_mm: Tensor | None, window: tuple[int, int], expected: Tensor | None) -> Tensor:
         position, albedo = self.lights.position_mm, self.lights.albedo
         given = [tensor for tensor in (depth_mm, expected) if tensor is not None]
         if self.lights.glossy or not usable(image, position, albedo, self.inverse, *given):
-            return super().normals(image, depth_mm, window, expected)
+            return super().normals_of(image, depth_mm, window, expected)
         x, y = self.middle_mm(image, window)
         whole = LightView(position, albedo, self.mm_per_pixel, self.camera_height_mm, (-x, -y), window)
         shadowed = self.shadowed

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd import forward_ad
 
-from .kernels import library
+from . import kernels
 
 _refused = contextvars.ContextVar("refused", default=False)
 
@@ -51,6 +51,6 @@ def arrays_usable(*tensors: Tensor) -> bool:
 
 def usable(*tensors: Tensor) -> bool:
     """Whether compiled kernels may work on these tensors: as :func:`arrays_usable`, and float32, and the kernels are there."""
-    if _refused.get() or library() is None:
+    if torch.compiler.is_compiling() or _refused.get() or kernels.library() is None:
         return False
     return all(tensor.dtype == torch.float32 for tensor in tensors) and arrays_usable(*tensors)

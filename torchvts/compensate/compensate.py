@@ -84,8 +84,8 @@ class Compensate(nn.Module):
             sensor.blur_px,
             calibration.markers,
             block,
-            calibration.beyond_full,
-            calibration.full_light,
+            calibration.saturated_model,
+            calibration.saturation_light,
         )
 
     drift_block = Drift

@@ -39,7 +39,8 @@ class Drift(nn.Module):
         self.by_mode_first = by_mode_first
         samples, noise = None, None
         if background is not None and noise_std is not None:
-            check_field("background", background), check_field("noise_std", noise_std)
+            check_field("background", background)
+            check_field("noise_std", noise_std)
             samples, noise = self.samples(background[None])[0], self.samples(noise_std[None])[0]
             if not blurred and min(background.shape[1], background.shape[2]) >= 180:
                 noise = noise / 3.0  # of a mean of nine

@@ -20,9 +20,10 @@ from ..core.checks import check_integer
 from ..core.geometry import normal_from_gradient
 from ..model.calibration import Calibration
 from ..model.lights import PointLights
+from ..model.report import PressRow
 from ..model.sensor import Sensor
+from ..pipeline import ConfidentOutput, ConfidentPipeline
 from ..pipeline.confidence import DEPTH_SPREAD, bound_at
-from ..pipeline.depth import ConfidentOutput, ConfidentPipeline
 from ..scenes import scenes
 from .metrics import normal_angle_deg
 from .score import ball_truth
@@ -298,5 +299,7 @@ def _by_random_balls(
         image = scenes.render(ball, lights, noise_std=noise, bits=8, seed=100 * seed + k)[0]
         presses.append(Press(image, 2.0 * radius, f"ball {k}"))
     fit, contacts, unit = by_presses(rest, sensor, presses, None, False)
-    told = [{"name": contact.name, "used": not contact.reason} for contact in contacts]
-    return dataclasses.replace(unit, report={"model": "response", "held_out_deg": fit.error_deg, "presses": told})
+    told: list[PressRow] = [{"name": contact.name, "used": not contact.reason} for contact in contacts]
+    return dataclasses.replace(
+        unit, report={"model": "response", "source": "presses", "held_out_deg": fit.error_deg, "presses": told}
+    )

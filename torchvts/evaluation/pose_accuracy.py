@@ -14,7 +14,7 @@ from ..calibration import Press, calibrate
 from ..model.calibration import Calibration
 from ..model.lights import PointLights
 from ..model.sensor import Sensor
-from ..pipeline.depth import DepthOutput, DepthPipeline
+from ..pipeline import DepthOutput, DepthPipeline
 from ..pose import Registration, register_depth
 from ..pose.result import invert, turn_deg
 from ..scenes import objects

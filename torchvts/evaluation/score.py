@@ -23,8 +23,8 @@ from tqdm import tqdm
 
 from ..calibration import CalibrationWarning, Press, calibrate, fit_prior, read_presses
 from ..calibration.calibrate import RESPONSE_BLUR_PX, as_read, by_presses
-from ..compensate.compensate import Compensate
-from ..contact.masks import ContactMask
+from ..compensate import Compensate
+from ..contact import ContactMask
 from ..core.checks import check_image, check_integer, check_same_size
 from ..core.geometry import GradientFromNormal, normal_from_gradient, pixel_grid_mm
 from ..integration import PoissonBackground
@@ -32,7 +32,7 @@ from ..model.calibration import Calibration
 from ..model.response_field import ResponseModel
 from ..model.sensor import Sensor
 from ..normals import NormalFromIntensity, NormalFromLookup, NormalFromMLP, NormalFromResponse
-from ..pipeline.depth import DepthOutput, DepthPipeline
+from ..pipeline import DepthOutput, DepthPipeline
 from ..training import MlpFit, fit_mlp
 from ..viz import draw_contours
 from .metrics import fit_sphere, normal_angle_deg

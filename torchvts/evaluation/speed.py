@@ -19,17 +19,17 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..calibration import CalibrationWarning, Press, calibrate, read_presses
-from ..compensate.compensate import Compensate
-from ..core.geometry import normal_from_gradient
 from ..accelerated import reference_only
+from ..calibration import CalibrationWarning, Press, calibrate, read_presses
+from ..compensate import Compensate
+from ..core.geometry import normal_from_gradient
 from ..integration import AdaptiveIntegration, PoissonDST, divergence
 from ..model import gs_sdk
 from ..model.calibration import Calibration
 from ..model.lights import PointLights
 from ..model.sensor import Sensor
 from ..normals import NormalFromLookup, NormalFromMLP
-from ..pipeline.depth import MODES, DepthPipeline
+from ..pipeline import MODES, DepthPipeline
 from ..scenes.scenes import Scene, render, sphere_press, surface
 from .gallery import roof, stamp
 from .metrics import depth_error, normal_angle_deg

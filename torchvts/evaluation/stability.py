@@ -23,7 +23,7 @@ from ..core.geometry import normal_from_gradient
 from ..integration import AdaptiveIntegration, PerspectiveIntegration, PoissonDST
 from ..model.calibration import Calibration
 from ..normals import NormalFromIntensity
-from ..pipeline.depth import DepthOutput, DepthPipeline
+from ..pipeline import DepthOutput, DepthPipeline
 from .gallery import DIALS, Case, Dial
 from .metrics import depth_error, mask_iou, normal_angle_deg
 

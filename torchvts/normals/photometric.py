@@ -103,7 +103,7 @@ class NormalFromIntensity(NormalModel):
             sensor.mm_per_pixel,
             noise_std=calibration.compensated_noise_std.flatten(1).median(dim=1).values,
             inverse=calibration.inverse,
-            saturated_above=calibration.full_above,
+            saturated_above=calibration.saturated_above,
             camera_height_mm=camera_height_mm,
         )
 
@@ -126,14 +126,15 @@ class NormalFromIntensity(NormalModel):
             check_same_count("depth_mm", depth_mm, "compensated", image.shape[0])
         if image.shape[0] == 0:
             return image
-        return self.normals(image, depth_mm, place, expected)
+        return self.normals_of(image, depth_mm, place, expected)
 
-    def normals(self, image: Tensor, depth_mm: Tensor | None, window: tuple[int, int], expected: Tensor | None) -> Tensor:
+    def normals_of(self, image: Tensor, depth_mm: Tensor | None, window: tuple[int, int], expected: Tensor | None) -> Tensor:
         """Normals of checked arguments; compiled kernels take the place of this method."""
         view = self.view(image, window)
         if self.lights.glossy:
             image = self.without_gloss(image, depth_mm, view)
-        return self.shadowed(self.inverted(image, depth_mm, view), image, depth_mm, view, expected)
+        normal: Tensor = self.shadowed(self.inverted(image, depth_mm, view), image, depth_mm, view, expected)
+        return normal
 
     def inverted(self, image: Tensor, depth_mm: Tensor | None, view: LightView) -> Tensor:
         """The plain inverse at every pixel: eq. 9 without depth, eq. 10 with depth."""

@@ -434,7 +434,7 @@ def _model_deg(calibration: Calibration) -> float:
     if held_out:
         used = sum(bool(row.get("used")) for row in report.get("presses", []))
         return float(held_out) * math.sqrt(1.0 + FEW_PRESSES / max(used, 1))
-    return PRIOR_DEG if "prior" in str(report.get("response", "")) else FEW_DEG
+    return PRIOR_DEG if report.get("source") == "prior" else FEW_DEG
 
 
 def _smooth(values: Tensor) -> Tensor:

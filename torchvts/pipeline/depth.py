@@ -28,10 +28,10 @@ from ..core.checks import (
     may_read_values,
 )
 from ..core.frame import DepthOutput, undeformed_output
-from ..integration import Integrator, as_integrator
+from ..integration import WrappedIntegrator, as_integrator
 from ..model import Calibration, check_calibration
 from ..normals import NormalFromIntensity as PlainNormalFromIntensity
-from ..normals import NormalFromResponse, NormalModel, as_normal_model
+from ..normals import NormalFromResponse, WrappedNormals, as_normal_model
 from .refine import Adaptive, Once, Repeat
 from .shadows import Shadows
 from .solve import Solve
@@ -178,9 +178,10 @@ class DepthPipeline(nn.Module):
     __jit_unused_properties__: ClassVar[list[str]] = ["gradient", "integrate", "normals"]
 
     @property
-    def normals(self) -> NormalModel:
-        """The model of normals."""
-        return self.solve.normals
+    def normals(self) -> nn.Module:
+        """The model of normals, as it was given."""
+        model = self.solve.normals
+        return model.module if isinstance(model, WrappedNormals) else model
 
     @property
     def gradient(self) -> nn.Module:
@@ -188,9 +189,10 @@ class DepthPipeline(nn.Module):
         return self.solve.gradient
 
     @property
-    def integrate(self) -> Integrator:
-        """The integrator."""
-        return self.solve.integrate
+    def integrate(self) -> nn.Module:
+        """The integrator, as it was given."""
+        integrator = self.solve.integrate
+        return integrator.module if isinstance(integrator, WrappedIntegrator) else integrator
 
     def __prepare_scriptable__(self) -> nn.Module:
         return reference(self)

@@ -47,7 +47,12 @@ RULES = [
         "Args: ``seen``: (B, 3, H, W).",
         "Nothing is touched?",
     ),
-    Rule(r"\bapart\b|\btorn\b", "residual, difference, has_shadow, separately", "How far both are apart.", "A part of it."),
+    Rule(
+        r"\b(?<!degrees\s)(?<!elements\s)(?<!pixels\s)(?<!mm\s)apart\b|\btorn\b",
+        "residual, difference, has_shadow, separately",
+        "How far both are apart.",
+        "Lights 120 degrees apart.",
+    ),
     Rule(
         r"\bdoubt(s|ed|ing)?\b|\bguess(es|ed|ing)? again\b|\blook(s|ed|ing)? beyond\b",
         "classify dark pixels, restart from lit neighbours, test the mirrored normal",
@@ -80,10 +85,10 @@ RULES = [
         "The full image.",
     ),
     Rule(
-        r"\bweak (matri(x|ces)|lights?|pixels?|solve)\b|\bill (matri(x|ces)|lights?|pixels?)\b|\b(is|are) ill\b",
+        r"\bweak (matri(x|ces)|lights?|pixels?|solve)\b|\bill (matri(x|ces)|lights?|pixels?)\b|\b(is|are) ill\b(?!-)",
         "ill-conditioned",
         "Where the lights are ill.",
-        "An ill-conditioned matrix; a weak prior.",
+        "The matrix is ill-conditioned; a weak prior.",
     ),
     Rule(
         r"\bpin(s|ned|ning)?\b(?![- ]memory)|\bloose (direction|light|motion|center)s?\b",
@@ -119,7 +124,7 @@ RULES = [
     Rule(r"\blevell(ed|ing)\b", "normalised (light), zeroed (depth)", "A levelled frame.", "The level."),
 ]  # fmt: skip
 PIPELINE = Rule(r"\bmisfits?\b", "integrability residual", "The misfit.", "It fits.")
-"""Holds in pipeline/ only: the fit of lights may have a misfit."""
+"""Holds where frames are solved: the fit of lights may have a misfit."""
 
 
 def compiled(rule):
@@ -160,7 +165,7 @@ def files():
 def hits(path):
     """Private words in a file, one line of text each."""
     name = path.relative_to(ROOT).as_posix()
-    rules = [*RULES, PIPELINE] if name.startswith("torchvts/pipeline/") else RULES
+    rules = [*RULES, PIPELINE] if re.match(r"torchvts/pipeline/(?!confidence)", name) else RULES
     patterns = [(compiled(rule), rule) for rule in rules]
     for first, text in sorted(set(written(path))):
         for pattern, rule in patterns:

@@ -137,18 +137,6 @@ def may_read_values() -> bool:
         return not torch.compiler.is_exporting()
 
 
-def may_use_arrays(tensor: Tensor) -> bool:
-    """Whether NumPy may replace operators on ``tensor``: on a CPU, where Python runs them one by one. Scripts."""
-    if torch.jit.is_scripting():
-        return False
-    else:  # noqa: RET505, TorchScript needs the else to skip this branch
-        if torch.compiler.is_compiling():
-            return False
-        half = tensor.dtype in (torch.float16, torch.bfloat16)  # NumPy lacks one of them and sums the other differently
-        wrapped = torch._C._functorch.is_functorch_wrapped_tensor(tensor)  # by torch.func
-        return tensor.device.type == "cpu" and not half and not wrapped
-
-
 def check_window(name: str, tensor: Tensor, size: tuple[int, int], window: tuple[int, int] | None) -> tuple[int, int]:
     """Return (top, left) of ``tensor`` in an image of ``size``; without a window it must be the whole image. Scripts."""
     if window is None:

@@ -128,7 +128,7 @@ def test_gradients_through_torchscript_without_torchvts(low, tmp_path):
     assert done.returncode == 0, done.stderr
     found = torch.load(tmp_path / "grad", weights_only=True)
     expected = {name: p.grad for name, p in pipe.named_parameters()} | {"image": image.grad}
-    assert {"image", "normals.lights.position_mm", "normals.lights.albedo"} <= set(found)
+    assert {"image", "solve.normals.lights.position_mm", "solve.normals.lights.albedo"} <= set(found)
     for name, gradient in found.items():
         assert float(gradient.abs().max()) > 0
         assert torch.allclose(gradient, expected[name], rtol=1e-3, atol=1e-4 * float(expected[name].abs().max())), name

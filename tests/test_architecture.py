@@ -5,11 +5,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
 
 import torchvts as vts
-from torchvts.core.checks import check_batch, check_same_size
-from torchvts.core.geometry import normal_from_gradient
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
@@ -28,8 +25,8 @@ def test_the_rooms_are_those_of_the_package():
 
 def test_the_example_is_a_model_of_normals():
     code = re.search(r"```python\n(.*?)```", PAGE, re.DOTALL).group(1)
-    names = {"torch": torch, "vts": vts, "Tensor": Tensor, "normal_from_gradient": normal_from_gradient}
-    exec(code, names | {"check_batch": check_batch, "check_same_size": check_same_size}, names)
+    names = {"__package__": "torchvts.normals", "__name__": "torchvts.normals.change"}
+    exec(code, names)
     scene = vts.scenes.sphere_press(10.0, 1.0, (0.0, 0.0), 48, 64, 0.6)
     lights = vts.PointLights([[20.0, 9.0, 30.0], [-18.0, 13.0, 30.0], [-2.0, -22.0, 30.0]], [900.0, 900.0, 900.0])
     background = vts.scenes.render(vts.scenes.undeformed(scene), lights).detach()

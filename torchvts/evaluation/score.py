@@ -25,8 +25,9 @@ from ..integration import PoissonBackground
 from ..model.calibration import Calibration
 from ..model.response_field import ResponseModel
 from ..model.sensor import Sensor
-from ..normals import MlpFit, NormalFromIntensity, NormalFromLookup, NormalFromMLP, NormalFromResponse, fit_mlp
+from ..normals import NormalFromIntensity, NormalFromLookup, NormalFromMLP, NormalFromResponse
 from ..pipeline import DepthOutput, DepthPipeline
+from ..training import MlpFit, fit_mlp
 from ..viz import draw_contours
 from .metrics import fit_sphere, normal_angle_deg
 

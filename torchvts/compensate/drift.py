@@ -12,8 +12,8 @@ class Drift(nn.Module):
 
     Two estimators. :meth:`by_mode`, for response fields, whose compensated image is 1 where the skin is undeformed: the mode of all
     pixels, up to 15 %. :meth:`by_statistics`, for lights: the undeformed pixels are found by all three channels, up to 35 %, and
-    the estimator refuses where it cannot tell them from contact. Given ``background`` and ``by_mode_first``, the second takes over
-    where the first reaches its limit. No gradient flows through either.
+    the estimator refuses where it cannot distinguish them from contact. Given ``background`` and ``by_mode_first``, the second
+    takes over where the first reaches its limit. No gradient flows through either.
 
     Args:
         background: (3, H, W), the compensated image of the undeformed skin; None: by mode alone.
@@ -76,7 +76,7 @@ class Drift(nn.Module):
     def by_statistics(
         self, light: Tensor, background: Tensor, noise_std: Tensor, least: float = 0.01, most: float = 0.35
     ) -> Tensor:
-        """Brightness of each channel (B, 3, 1, 1), 1 where the undeformed skin cannot be told from contact.
+        """Brightness of each channel (B, 3, 1, 1), 1 where the undeformed skin cannot be distinguished from contact.
 
         At the modes of the three channels, pixels that are undeformed in all three at once are counted, each by exp(-chi^2 / 2),
         chi in units of noise; their means refine the modes. There must be 5 % of such pixels, and a channel's drift is believed

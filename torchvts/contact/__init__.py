@@ -1,4 +1,4 @@
-"""Where the skin is touched."""
+"""From a compensated image to the contact mask."""
 
 from .masks import ContactMask
 

@@ -90,7 +90,7 @@ def gradient_of_depth(depth_mm: Tensor, mm_per_pixel: float) -> Tensor:
 def slope_of_depth(depth_mm: Tensor, mm_per_pixel: float) -> Tensor:
     """Central differences of depth that do not reach across a cliff.
 
-    Where the differences to the two neighbours are more than :data:`CLIFF_SLOPE` apart, the smaller one counts. At the image's
+    Where the differences to the two neighbours differ by more than :data:`CLIFF_SLOPE`, the smaller one counts. At the image's
     border the outer difference is zero.
 
     Args:

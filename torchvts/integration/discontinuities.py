@@ -1,8 +1,8 @@
-r"""Integration across cliffs: edges that the rest of the map contradicts lose their say.
+r"""Integration that preserves discontinuities: edges that contradict the rest of the map lose their weight.
 
 A wall that is parallel to the view carries no slope, so least squares smears its height over the whole contact. Here each edge
-between two pixels has a weight: the inverse variance of its slope to begin with, less and less the more the depth found disagrees
-with it (iteratively reweighted least squares). Where the skin is at rest the depth is zero.
+between two pixels has a weight: first the inverse variance of its slope, then less the more the depth disagrees with it
+(iteratively reweighted least squares). Where the skin is undeformed the depth is zero.
 """
 
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from .base import Integrator
 from .poisson import PoissonBackground, check_gradient, laplace_plan, solve_laplace
 
 SLOPE_STD = 0.05
-"""Noise of the slope of flat pixels; a factor of two either way changes little."""
+"""Noise of the slope of flat pixels; a factor of two up or down changes little."""
 
 LEAST_WEIGHT = 1e-6
 """Of an edge, relative to one between two flat pixels: keeps the system regular where all around a pixel is cut."""
@@ -24,19 +24,21 @@ LEAST_WEIGHT = 1e-6
 RIM_TOLERANCE_PX = 0.1
 """Added to the standard deviation of a rim edge when it votes for the height of a contact."""
 
-BELOW_REST_PX, BELOW_REST = 1.0, 0.1
-"""Skin lower than that is unlikely to be what touches, and costs so much: enough to decide where a rim agrees with two heights."""
+BELOW_ZERO_PX, BELOW_ZERO = 1.0, 0.1
+"""Skin lower than that is unlikely to touch the object, and costs so much: enough to decide between two heights of a rim."""
 
 MARGIN_PX = 2
-"""Pixels at rest kept around the contacts when the rest of the image is left out."""
+"""Undeformed pixels kept around the contacts when the others are left out."""
 
 
 class DiscontinuitySolution(NamedTuple):
     """What :meth:`DiscontinuityIntegration.solve` found.
 
     Attributes:
-        depth_mm: (B, 1, H, W). converged: (B,) bool, whether the depth stood still before the passes ran out.
-        passes: (B,) int64, times that the weights were set. iterations: (B,) int64, conjugate-gradient steps in all.
+        depth_mm: (B, 1, H, W).
+        converged: (B,) bool, whether the depth settled before the passes ran out.
+        passes: (B,) int64, times that the weights were set.
+        iterations: (B,) int64, conjugate-gradient steps in all.
     """
 
     depth_mm: Tensor
@@ -53,41 +55,42 @@ def integrate_discontinuities(
     known_mm: Tensor | None = None,
     known_weight: Tensor | None = None,
 ) -> Tensor:
-    r"""Integrate a gradient map into depth that may have cliffs, zero where the skin is at rest.
+    r"""Integrate a gradient map into depth that may have cliffs, zero where the skin is undeformed.
 
     1. An edge's slope is the mean of its two pixels', as in :func:`poisson_background`; its variance v is the mean of theirs,
        s^2 (1 + |g|^2)^2 (a slope g whose angle is off), plus a twelfth of the square of their difference (a crease may lie
        anywhere between them).
     2. Each contact is solved by itself, cut off along its rim, and set to the height that most of its rim agrees with: a roof
-       between two vertical ends stands on its eaves. Of two that as much of the rim agrees with, the one is taken that
-       leaves less of the contact below rest: a ramp stands on its low end, not on the cliff at its high one. (Pixels on the rim
-       whose slope is less than half of that further in are seen half beside the object; the rim is then taken to lie within them.)
-    3. All is solved together with weights 1 / (v (1 + r^2 / (c^2 v))), r being what edge and depth disagree by, until the depth
-       stands still. Edges across the rim weigh a tenth: that is where cliffs are.
+       between two vertical ends stands on its eaves. If as much of the rim agrees with two heights, the one is taken that leaves
+       less of the contact below zero: a ramp stands on its low end, not on the cliff at its high one. (The slope of a pixel on
+       the rim that is less than half of that further in is an average with the skin beside the object; the rim is then taken to
+       lie within such pixels.)
+    3. All is solved together with weights 1 / (v (1 + r^2 / (c^2 v))), r being the difference of edge and depth, until the depth
+       no longer changes. Edges across the rim have a tenth of the weight: cliffs are there.
 
-    Each solve is by conjugate gradients without a matrix, from the depth so far, the cosine solver of :func:`poisson_dct` as
+    Each solve is by conjugate gradients without a matrix, from the depth so far, with the cosine solver of :func:`poisson_dct` as
     preconditioner. Differentiable with the weights held constant.
 
-    What slopes cannot tell remains untold: a flat piece with cliffs all around has no height, and is left at rest's, unless
-    depths known from elsewhere say more (``known_mm``): a contact that has such stands where they say, not where its rim does.
+    Slopes do not determine the height of a flat piece with cliffs all around. It stays at the height of the undeformed skin, unless
+    ``known_mm`` gives depths from elsewhere: a contact with such depths stands where they say, not where its rim does.
 
     Args:
         gradient: (B, 2, H, W), (dz/dx, dz/dy), mm per mm.
         mm_per_pixel: pixel pitch in mm.
         contact: bool (B, 1, H, W); None takes pixels whose gradient is not exactly zero, and gaps of one or two pixels between
-            them. Rest that does not reach the image border (a hole) counts as contact, unless none does.
+            them. Undeformed skin that does not reach the image border (a hole) counts as contact, unless none does.
         weight: (B, 1, H, W) in [0, 1], how far each pixel's slope is to be trusted; 0 for missing: bridged as by a membrane.
             None for 1.
-        known_mm: (B, 1, H, W), depth of pixels as known from elsewhere, mm. known_weight: (B, 1, H, W), at least 0, how much each
-            counts beside the others of its contact. All of a contact together weigh as one edge between two flat pixels: they
-            say how high it stands, slopes what shape it has. Both or neither.
+        known_mm: (B, 1, H, W), depth of pixels that is known from elsewhere, mm; needs ``known_weight``.
+        known_weight: (B, 1, H, W), at least 0, how much each counts beside the others of its contact. All of a contact together
+            weigh as one edge between two flat pixels: they give its height, the slopes its shape.
     Returns:
-        Depth in mm, (B, 1, H, W). Without any pixel at rest, the lowest depth is zero.
+        Depth in mm, (B, 1, H, W). Without any undeformed pixel, the lowest depth is zero.
     Raises:
         ValueError: wrong shape, or H or W below 2, or one of two arguments that go together. TypeError: not floating point.
     Source:
         Holland and Welsch, Communications in Statistics 6(9), 1977, for the weights (Cauchy's); Queau, Durou, Aujol,
-        Variational methods for normal integration, JMIV 60, 2018, for edges that the others contradict. Variances, levelling
+        Variational methods for normal integration, JMIV 60, 2018, for edges that the others contradict. Variances, heights
         and rim are this project's.
     Example:
         >>> from torchvts import poisson_background
@@ -101,16 +104,17 @@ def integrate_discontinuities(
 
 
 class DiscontinuityIntegration(Integrator):
-    """Module face of :func:`integrate_discontinuities`; takes a window as :class:`PoissonDCT` does.
+    """Module for :func:`integrate_discontinuities`; takes a window as :class:`PoissonDCT` does.
 
     Args:
         mm_per_pixel: pixel pitch in mm.
         slope_std: s, noise of the slope of flat pixels.
         threshold: c, standard deviations from which an edge counts as contradicted.
         rim_weight: of an edge across the rim of the contact, in (0, 1].
-        max_passes: bound of step 3. max_iterations: bound of the conjugate-gradient steps of each solve.
+        max_passes: bound of step 3.
+        max_iterations: bound of the conjugate-gradient steps of each solve.
         residual: of a solve, relative, in the preconditioner's norm.
-        tolerance_px: the depth stands still when no pixel moves by more, in pixels of pitch.
+        tolerance_px: the depth has settled when no pixel moves by more, in pixels of pitch.
     """
 
     def __init__(
@@ -156,9 +160,9 @@ class DiscontinuityIntegration(Integrator):
         if not bool(torch.isfinite(gradient).all()):
             raise ValueError("gradient: expected finite values, got NaN or infinite ones: set them to 0 and give them the weight 0")
         height, width = gradient.shape[2], gradient.shape[3]
-        touched = _without_gaps((gradient != 0).any(dim=1, keepdim=True)) if contact is None else contact
+        deformed = _without_gaps((gradient != 0).any(dim=1, keepdim=True)) if contact is None else contact
         trust = torch.ones_like(gradient[:, 0:1]) if weight is None else weight
-        for name, value in (("contact", touched), ("weight", trust)):
+        for name, value in (("contact", deformed), ("weight", trust)):
             check_shape(name, value, (gradient.shape[0], 1, height, width), "gradient")
             if (value.dtype == torch.bool) != (name == "contact"):
                 kind = "bool: threshold it" if name == "contact" else "a number from 0 to 1: weight.float() of a mask"
@@ -168,7 +172,7 @@ class DiscontinuityIntegration(Integrator):
         trust = trust.to(gradient.dtype)
         known = self._known(gradient, known_mm, known_weight)
         depths, status = [], []
-        for frame, mask, sure, data in zip(*(each.unsqueeze(1) for each in (gradient, touched, trust, known)), strict=True):
+        for frame, mask, sure, data in zip(*(each.unsqueeze(1) for each in (gradient, deformed, trust, known)), strict=True):
             contacts = label_contacts(mask)
             if not bool(contacts.any()):
                 depths.append(torch.zeros_like(sure) + 0.0 * frame[:, 0:1])
@@ -199,7 +203,7 @@ class DiscontinuityIntegration(Integrator):
         return torch.cat((known_mm / self.mm_per_pixel, known_weight), dim=1).to(gradient.dtype)
 
     def _solve_frame(self, gradient: Tensor, contacts: Tensor, trust: Tensor, known: Tensor) -> tuple[Tensor, bool, int, int]:
-        """Depth at unit pitch, whether it stood still, passes, conjugate-gradient steps."""
+        """Depth at unit pitch, whether it settled, passes, conjugate-gradient steps."""
         free = contacts > 0
         covered = self._covered(gradient.detach(), free)
         slopes, variances = _edges(gradient, self.slope_std)
@@ -224,7 +228,7 @@ class DiscontinuityIntegration(Integrator):
             start = solve_laplace(-_adjoint(*right), system.plan) * system.free
             depth = system.solve(cut, _adjoint(cut[0] * right[0], cut[1] * right[1]), start, 1e-2)
             by_rim = torch.where(covered & (known_in[contacts.long()] == 0), contacts, 0)
-            depth = self._level(depth, by_rim, right, variances, rims)
+            depth = self._set_heights(depth, by_rim, right, variances, rims)
             weights, passes, moved = bases, 0, float("inf")
             while passes < self.max_passes and moved > self.tolerance_px:
                 weights = []
@@ -252,9 +256,11 @@ class DiscontinuityIntegration(Integrator):
         covered: Tensor = free & (inner | ~beside)
         return covered
 
-    def _level(self, depth: Tensor, contacts: Tensor, slopes: list[Tensor], variances: list[Tensor], rims: list[Tensor]) -> Tensor:
+    def _set_heights(
+        self, depth: Tensor, contacts: Tensor, slopes: list[Tensor], variances: list[Tensor], rims: list[Tensor]
+    ) -> Tensor:
         """Each contact set to the height at which its rim disagrees least with depth zero outside, by the same robust measure."""
-        levelled = depth
+        placed = depth
         for number in range(1, int(contacts.amax()) + 1):
             mine = contacts == number
             votes, spread = [], []
@@ -272,13 +278,13 @@ class DiscontinuityIntegration(Integrator):
                 cost = torch.log1p(((candidates[:, None] - vote) / scale).square()).mean(1)
                 inside = depth[mine]
                 inside = inside[:: 1 + inside.numel() // 400]
-                cost = cost + BELOW_REST * (candidates[:, None] + inside < -BELOW_REST_PX).to(cost.dtype).mean(1)
+                cost = cost + BELOW_ZERO * (candidates[:, None] + inside < -BELOW_ZERO_PX).to(cost.dtype).mean(1)
                 height = candidates[cost.argmin()]
                 for _ in range(5):
                     weight = 1.0 / (scale.square() + (height - vote).square())
                     height = (weight * vote).sum() / weight.sum()
-            levelled = torch.where(mine, depth + height, levelled)
-        return levelled
+            placed = torch.where(mine, depth + height, placed)
+        return placed
 
     def extra_repr(self) -> str:
         return f"mm_per_pixel={self.mm_per_pixel}, slope_std={self.slope_std}"
@@ -288,10 +294,12 @@ def discontinuity_share(gradient: Tensor, depth_mm: Tensor, mm_per_pixel: float 
     """Share of the contact's edges on which a depth contradicts the gradient it was integrated from: the sign of cliffs.
 
     An edge is contradicted if both differ by more than three standard deviations of its slope, as :func:`integrate_discontinuities`
-    estimates them; ten that differ by more than two count as one, for a low cliff is smeared over many. Cheap.
+    estimates them; ten that differ by more than two count as one, for a low cliff is smeared over many.
 
     Args:
-        gradient: (B, 2, H, W), mm per mm. depth_mm: (B, 1, H, W), of :func:`poisson_background`. mm_per_pixel: pixel pitch, mm.
+        gradient: (B, 2, H, W), mm per mm.
+        depth_mm: (B, 1, H, W), of :func:`poisson_background`.
+        mm_per_pixel: pixel pitch, mm.
     Returns:
         (B,), 0 to 1; 0 without contact. Measured: 0 on spheres, sines, cones, capsules, letters with soft flanks, with noise up
         to 4 grey levels, and on real balls of a GelSight Mini; 0.016 to 0.028 on wedges and cylinders with vertical ends;
@@ -306,12 +314,12 @@ def discontinuity_share(gradient: Tensor, depth_mm: Tensor, mm_per_pixel: float 
     check_batch("depth_mm", depth_mm, 1)
     check_same_size("depth_mm", depth_mm, "gradient", gradient.shape[2], gradient.shape[3])
     gradient, depth = gradient.detach(), depth_mm.detach() / mm_per_pixel
-    touched = (gradient != 0).any(dim=1, keepdim=True)
+    deformed = (gradient != 0).any(dim=1, keepdim=True)
     slopes, variances = _edges(gradient, SLOPE_STD)
     wrong, odd, count = (gradient.new_zeros(gradient.shape[0]) for _ in range(3))
     for dim, slope, variance in zip((3, 2), slopes, variances, strict=True):
         before, after = _ends(depth, dim)
-        one, other = _ends(touched, dim)
+        one, other = _ends(deformed, dim)
         counts = one | other
         surprise = (after - before - slope).square() / variance * counts
         wrong = wrong + (surprise > 9.0).sum(dim=(1, 2, 3))
@@ -430,22 +438,22 @@ def _adjoint(along_x: Tensor, along_y: Tensor) -> Tensor:
     return pad(along_x, [1, 0]) - pad(along_x, [0, 1]) + pad(along_y, [0, 0, 1, 0]) - pad(along_y, [0, 0, 0, 1])
 
 
-def _without_gaps(touched: Tensor) -> Tensor:
-    """Gaps of one or two pixels closed: a crest whose slope happens to be exactly zero is no rest."""
-    grown = nn.functional.max_pool2d(touched.to(torch.float32), 3, 1, 1)
+def _without_gaps(deformed: Tensor) -> Tensor:
+    """Gaps of one or two pixels closed: a crest whose slope happens to be exactly zero is in contact."""
+    grown = nn.functional.max_pool2d(deformed.to(torch.float32), 3, 1, 1)
     return nn.functional.max_pool2d(-grown, 3, 1, 1) < 0
 
 
-def label_contacts(touched: Tensor) -> Tensor:
-    """Contacts of a bool mask (1, 1, H, W) numbered from 1 on, int32; rest is 0. Holes belong to the contact around them."""
+def label_contacts(deformed: Tensor) -> Tensor:
+    """Contacts of a bool mask (1, 1, H, W) numbered from 1 on, int32; the others are 0. Holes belong to the contact around them."""
     import cv2
 
-    mask = touched[0, 0].cpu().numpy()
-    _, rest = cv2.connectedComponents((~mask).astype(np.uint8), connectivity=4)
-    border = np.concatenate((rest[0], rest[-1], rest[:, 0], rest[:, -1]))
-    open_rest = np.isin(rest, border[border > 0]) if border.any() else ~mask
-    _, label = cv2.connectedComponents((~open_rest).astype(np.uint8), connectivity=4)
-    return torch.from_numpy(label)[None, None].to(touched.device)
+    mask = deformed[0, 0].cpu().numpy()
+    _, outside = cv2.connectedComponents((~mask).astype(np.uint8), connectivity=4)
+    border = np.concatenate((outside[0], outside[-1], outside[:, 0], outside[:, -1]))
+    open_outside = np.isin(outside, border[border > 0]) if border.any() else ~mask
+    _, label = cv2.connectedComponents((~open_outside).astype(np.uint8), connectivity=4)
+    return torch.from_numpy(label)[None, None].to(deformed.device)
 
 
 def _box(mask: Tensor) -> tuple[int, int, int, int]:

@@ -1,6 +1,6 @@
 r"""Depth as a pinhole camera sees it: the logarithm of distance has an exact gradient, so any integrator serves.
 
-A pinhole at height h above the image centre, whose pixels see (u, v) of the skin at rest, sees the surface z(X, Y) at
+A pinhole at height h above the image centre, whose pixels see (u, v) of the undeformed skin, sees the surface z(X, Y) at
 X = u (h - z) / h, Y = v (h - z) / h. With p = dz/dX, q = dz/dY, differentiating z(X(u, v), Y(u, v)) gives
 
     dz/du (h + p u + q v) = p (h - z),   so   w = -h ln((h - z) / h)   has   dw/du = h p / (h + p u + q v),
@@ -25,10 +25,10 @@ def integrate_perspective(gradient: Tensor, mm_per_pixel: float, camera_height_m
 
     Args:
         gradient: (B, 2, H, W), (dz/dx, dz/dy) of the surface at the point that each pixel sees, mm per mm.
-        mm_per_pixel: pixel pitch in mm, on the skin at rest.
-        camera_height_mm: of the camera above the skin at rest, over the image centre.
+        mm_per_pixel: pixel pitch in mm, on the undeformed skin.
+        camera_height_mm: of the camera above the undeformed skin, over the image centre.
     Returns:
-        Depth in mm of the point that each pixel sees, (B, 1, H, W), levelled as by :func:`poisson_background`.
+        Depth in mm of the point that each pixel sees, (B, 1, H, W), with its zero as by :func:`poisson_background`.
     Raises:
         ValueError: wrong shape, or H or W below 2; pitch or height not above 0. TypeError: not floating point.
     Source:

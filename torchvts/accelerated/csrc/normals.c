@@ -17,12 +17,12 @@ WIDE static void from_inverse(const float *restrict image, size_t step, const fl
     }
 }
 
-/* The lights of one call: position and, for each, the six numbers that its share of the light is multiplied with. */
+/* The lights of one call: position and, for each, the six factors of its share of the light. */
 typedef struct {
     float place[3][3], table[3][6], plane[3], volume;
 } Lights;
 
-/* One row at a known depth, from where the first pixel sees the skin at rest. */
+/* One row at a known depth, from where the first pixel sees the undeformed skin. */
 WIDE static void at_depth(const float *restrict image, size_t step, const float *restrict depth, const Lights *restrict lights, float first_x,
                           float row_y, float pitch, float per_height, float axis_x, float axis_y, int n, float *restrict nx,
                           float *restrict ny, float *restrict nz) {

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..calibration import GIVEN_MISFIT, LOOSE_DEG, ROUGH, CalibrationWarning, calibrate, channel_structure
+from ..calibration import GIVEN_MISFIT, POORLY_CONSTRAINED_DEG, ROUGH, CalibrationWarning, calibrate, channel_structure
 from ..contact import ContactMask
 from ..core.checks import check_batch, check_field, check_least, check_positive, check_range, check_same_size, check_shape
 from ..core.geometry import pixel_grid_mm
@@ -262,7 +262,7 @@ def given_at_rest(calibration: Calibration) -> AtRest:
     """A calibration that was given, and what is to be told of it."""
     report = calibration.report
     told = f"calibration given: {report.get('reason', report.get('model', 'lights'))}"
-    metric = max(report.get("direction_std_deg", [0.0])) <= LOOSE_DEG
+    metric = max(report.get("direction_std_deg", [0.0])) <= POORLY_CONSTRAINED_DEG
     return AtRest(calibration, told if metric else f"{told}; depth is NOT METRIC: calibrate with presses of a ball", metric)
 
 

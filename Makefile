@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup demo test test-long check bench clean
+.PHONY: setup demo test test-coverage test-long characterise check bench clean
 
 setup: $(VENV)/.done
 
@@ -15,13 +15,24 @@ $(VENV)/.done: pyproject.toml constraints.txt hatch_build.py $(wildcard torchvts
 demo: setup
 	$(BIN)/python scripts/demo.py --out out/demo
 
-# Files in the order of their names: by number of tests the few long ones would come last, and one worker would wait.
-test: setup
-	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+# A few minutes on two cores. A worker that has no tests left takes some of another's, so that none waits.
+PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 
-# Fuzzed files, drawn scenes and frames by the thousands, the largest graphs, compiled ones; some tens of minutes.
+test: setup
+	$(PYTEST) -m "not long"
+
+# What CI runs: the same tests, with coverage.
+test-coverage: setup
+	$(PYTEST) -m "not long" --cov=torchvts --cov-report=term --cov-fail-under=90
+
+# The tests marked long; then fuzzed files, drawn scenes and frames by the thousands, the largest graphs; some tens of minutes.
 test-long: setup
-	TORCHVTS_TEST_PROFILE=long $(BIN)/python -m pytest tests/test_properties.py tests/test_fuzz.py tests/test_export.py --no-cov -n auto
+	$(PYTEST) -m long
+	TORCHVTS_TEST_PROFILE=long $(PYTEST) -m "not long" tests/test_properties.py tests/test_fuzz.py tests/test_export.py
+
+# Whether results are those of another commit, bit by bit: make characterise BASE=530e295
+characterise: setup
+	$(BIN)/python tests/characterise.py against $(BASE)
 
 check: setup
 	$(BIN)/ruff check .

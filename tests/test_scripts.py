@@ -1,20 +1,10 @@
 """The scripts do their job from the command line, and refuse bad input in a sentence."""
 
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 import torch
 
 import torchvts as vts
 from torchvts.core.files import read_depth_png
-
-ROOT = Path(__file__).resolve().parents[1]
-
-
-def call(*arguments):
-    return subprocess.run([sys.executable, *map(str, arguments)], capture_output=True, text=True, cwd=ROOT, timeout=300)
 
 
 @pytest.fixture(scope="module")
@@ -30,18 +20,18 @@ def images(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def calibration(images):
+def calibration(run_script, images):
     folder, _ = images
     out = folder / "unit.safetensors"
-    done = call("scripts/calibrate.py", folder / "background.png", "--mm-per-pixel", "0.25", "--out", out)
+    done = run_script("calibrate", folder / "background.png", "--mm-per-pixel", "0.25", "--out", out)
     assert done.returncode == 0, done.stderr
     assert "wrote" in done.stdout and "point lights: the image constrains the lights" in done.stdout
     return out
 
 
-def test_reconstruct_writes_depth_pictures_and_table(images, calibration, tmp_path):
+def test_reconstruct_writes_depth_pictures_and_table(run_script, images, calibration, tmp_path):
     folder, scene = images
-    done = call("scripts/reconstruct.py", calibration, folder / "presses", "--out", tmp_path, "--mode", "precise")
+    done = run_script("reconstruct", calibration, folder / "presses", "--out", tmp_path, "--mode", "precise")
     assert done.returncode == 0, done.stderr
     assert len((tmp_path / "frames.csv").read_text().splitlines()) == 4
     for k in range(3):
@@ -49,17 +39,17 @@ def test_reconstruct_writes_depth_pictures_and_table(images, calibration, tmp_pa
         assert (read_depth_png(tmp_path / f"{k}_depth.png") - scene.depth_mm).abs().max() < 0.25 * 0.25
 
 
-def test_reconstruct_tells_what_is_wrong_with_the_first_frame(images, calibration, tmp_path):
+def test_reconstruct_names_what_is_wrong_with_the_first_frame(run_script, images, calibration, tmp_path):
     folder, _ = images
-    sound = call("scripts/reconstruct.py", calibration, folder / "presses", "--out", tmp_path / "sound")
+    valid = run_script("reconstruct", calibration, folder / "presses", "--out", tmp_path / "valid")
     image = vts.read_image(folder / "presses" / "0.png") * torch.tensor([1.0, 0.85, 1.0])[:, None, None]
     vts.write_image(tmp_path / "dimmed.png", image)
-    dimmed = call("scripts/reconstruct.py", calibration, tmp_path / "dimmed.png", "--out", tmp_path / "out")
-    assert sound.returncode == dimmed.returncode == 0, sound.stderr + dimmed.stderr
-    assert "first frame" not in sound.stdout and "first frame: fault: green channel 15" in dimmed.stdout
+    dimmed = run_script("reconstruct", calibration, tmp_path / "dimmed.png", "--out", tmp_path / "out")
+    assert valid.returncode == dimmed.returncode == 0, valid.stderr + dimmed.stderr
+    assert "first frame" not in valid.stdout and "first frame: fault: green channel 15" in dimmed.stdout
 
 
-def test_reconstruct_writes_clouds(images, calibration, tmp_path):
+def test_reconstruct_writes_clouds(run_script, images, calibration, tmp_path):
     try:
         from torchvts.pose import read_point_cloud
         from torchvts.pose.clouds import open3d
@@ -69,7 +59,7 @@ def test_reconstruct_writes_clouds(images, calibration, tmp_path):
         pytest.skip(str(error))
     folder, scene = images
     arguments = ["--out", tmp_path, "--depth", "npy", "--cloud", "ply", "--no-pictures"]
-    done = call("scripts/reconstruct.py", calibration, folder / "presses" / "0.png", *arguments)
+    done = run_script("reconstruct", calibration, folder / "presses" / "0.png", *arguments)
     assert done.returncode == 0, done.stderr
     points, normals = read_point_cloud(tmp_path / "0.ply")
     assert abs(len(points) - int(scene.contact.sum())) < 0.03 * len(points)
@@ -79,23 +69,24 @@ def test_reconstruct_writes_clouds(images, calibration, tmp_path):
     assert (normals * outward).sum(1).median() > 0.999
 
 
-def test_missing_and_foreign_files_are_refused_in_a_sentence(images, calibration, tmp_path):
+def test_missing_and_foreign_files_are_refused_in_a_sentence(run_script, images, calibration, tmp_path):
     folder, _ = images
     for arguments, part in (
-        (["scripts/calibrate.py", folder / "none.png", "--sensor", "tacto", "--out", tmp_path / "a.safetensors"], "no such image"),
-        (["scripts/calibrate.py", folder / "background.png", "--sensor", "tacto", "--out", tmp_path / "a.safetensors"], "tacto"),
-        (["scripts/reconstruct.py", folder / "background.png", folder, "--out", tmp_path], "safetensors"),
-        (["scripts/reconstruct.py", calibration, tmp_path / "nothing", "--out", tmp_path], "no such file"),
+        (["calibrate", folder / "none.png", "--sensor", "tacto", "--out", tmp_path / "a.safetensors"], "no such image"),
+        (["calibrate", folder / "background.png", "--sensor", "tacto", "--out", tmp_path / "a.safetensors"], "tacto"),
+        (["reconstruct", folder / "background.png", folder, "--out", tmp_path], "safetensors"),
+        (["reconstruct", calibration, tmp_path / "nothing", "--out", tmp_path], "no such file"),
     ):
-        done = call(*arguments)
+        done = run_script(*arguments)
         assert done.returncode == 1
         assert done.stderr.startswith("error: ") and part in done.stderr, done.stderr
         assert "Traceback" not in done.stderr
     assert not (tmp_path / "a.safetensors").exists()
 
 
-def test_reproduce_paper_prints_figure_3_beside_the_papers(tmp_path):
-    done = call("scripts/reproduce_paper.py", "--out", tmp_path, "--data", tmp_path / "none")
+@pytest.mark.long
+def test_reproduce_paper_prints_figure_3_beside_the_papers(run_script, tmp_path):
+    done = run_script("reproduce_paper", "--out", tmp_path, "--data", tmp_path / "none")
     assert done.returncode == 0, done.stderr
     rows = [
         [cell.strip() for cell in line.split("|")[1:-1]] for line in done.stdout.splitlines() if "press" in line and "eq." in line
@@ -109,11 +100,15 @@ def test_reproduce_paper_prints_figure_3_beside_the_papers(tmp_path):
     assert "| paper, three targets | 0.64, 2.35, 2.59 | below 1 | 6 to 8 |" in done.stdout
 
 
-def test_shadows_prints_a_row_for_each_shape_and_kind():
-    done = call("scripts/shadows.py", "--scenes", "1")
+@pytest.mark.long
+def test_shadows_prints_a_row_for_each_shape_and_kind(run_script):
+    done = run_script("shadows", "--scenes", "1")
     assert done.returncode == 0, done.stderr
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in done.stdout.splitlines()[2:]]
     assert [row[:2] for row in rows] == [[k, s] for k in ("slope", "cast", "dirt") for s in ("ball", "capsule", "cone", "punch")]
     assert all(0.0 < float(row[3]) <= float(row[4]) + 0.01 and bool(row[5]) == (row[0] == "cast") for row in rows)
-    done = call("scripts/shadows.py", "--scenes", "0")
+
+
+def test_shadows_refuses_no_scenes(run_script):
+    done = run_script("shadows", "--scenes", "0")
     assert done.returncode == 2 and "--scenes: expected at least 1, got 0" in done.stderr

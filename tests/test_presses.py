@@ -187,7 +187,7 @@ def test_contact_radii_are_found_without_labels(unit):
     name, _, _, _, calibration, _ = unit
     for row, depth in zip(calibration.report["presses"], DEPTHS_MM):
         bare = math.sqrt(BALL_MM * depth - depth**2) / PITCH
-        # a bare ball ends at its rim; on a skirt half the slope is lost a little outside of where the skirt begins
+        # a bare ball ends at its rim; in a transition zone half the slope is lost a little outside of where the zone begins
         expected, tolerance = (0.88 * bare, 1.5) if name == "field" else (bare, 1.5)
         assert row["contact_radius_px"] == pytest.approx(expected, abs=tolerance)
 

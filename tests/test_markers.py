@@ -189,8 +189,8 @@ def test_unmarked_pixels_keep_their_value_and_a_full_mask_its_shape():
 
 def test_gradient_flows_through_unmarked_pixels_alone():
     generator = torch.Generator().manual_seed(0)
-    image = torch.rand(2, 2, 9, 11, generator=generator, dtype=torch.float64).requires_grad_()
-    mask = torch.rand(2, 1, 9, 11, generator=generator) < 0.3
+    image = torch.rand(1, 2, 7, 9, generator=generator, dtype=torch.float64).requires_grad_()
+    mask = torch.rand(1, 1, 7, 9, generator=generator) < 0.3
     assert torch.autograd.gradcheck(lambda i: fill_markers(i, mask), (image,))
     (slope,) = torch.autograd.grad(fill_markers(image, mask).sum(), image)
     assert bool((slope[mask.expand_as(image)] == 0).all()) and float(slope.sum()) == pytest.approx(image.numel())
@@ -199,9 +199,8 @@ def test_gradient_flows_through_unmarked_pixels_alone():
     assert bool(torch.isfinite(picture.grad).all()) and float(picture.grad.abs().sum()) > 0
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("diameter_px", [0.0, 9.0, 17.0])
-def test_scripted_exported_and_pickled_blocks_agree_and_batches_are_independent(dtype, diameter_px):
+@pytest.mark.parametrize("diameter_px, dtype", [(0.0, torch.float32), (17.0, torch.float64)])
+def test_scripted_exported_and_pickled_blocks_agree_and_batches_are_independent(diameter_px, dtype):
     batch = torch.cat([frame(p, seed=k, dtype=dtype)[0] for k, p in enumerate((0.0, 0.3, 0.8))])
     block = FillMarkers(diameter_px)
     whole = block(batch)

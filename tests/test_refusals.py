@@ -279,16 +279,16 @@ TABLE = {
         lambda: pipe(),
     ),
     "FillMarkers": Entry(
-        {"diameter_px": 9.0, "contrast": 0.06, "sigmas": 5.0, "skirt": 0.2},
-        {"diameter_px": ["9", None, NAN, -1], "contrast": NUMBER, "sigmas": NUMBER, "skirt": NUMBER},
+        {"diameter_px": 9.0, "contrast": 0.06, "sigmas": 5.0, "margin": 0.2},
+        {"diameter_px": ["9", None, NAN, -1], "contrast": NUMBER, "sigmas": NUMBER, "margin": NUMBER},
     ),
     "FillMarkers.from_background": Entry(
-        {"background": torch.full((3, 64, 64), 0.5), "contrast": 0.06, "least_markers": 8, "skirt": 0.2},
+        {"background": torch.full((3, 64, 64), 0.5), "contrast": 0.06, "least_markers": 8, "margin": 0.2},
         {
             "background": [b for b in images(64, 64) if not (isinstance(b, torch.Tensor) and tuple(b.shape) == (3, 63, 64))],
             "contrast": NUMBER,
             "least_markers": INTEGER,
-            "skirt": NUMBER,
+            "margin": NUMBER,
         },
     ),
     "FillMarkers.from_dict": Entry(
@@ -608,17 +608,17 @@ TABLE = {
         },
     ),
     "find_markers": Entry(
-        {"image": image()[None], "diameter_px": 5.0, "contrast": 0.06, "sigmas": 5.0, "skirt": 0.2},
+        {"image": image()[None], "diameter_px": 5.0, "contrast": 0.06, "sigmas": 5.0, "margin": 0.2},
         {
             "image": [*batches(3), torch.zeros(1, 3, 4, 4)],
             "diameter_px": NUMBER,
             "contrast": NUMBER,
             "sigmas": NUMBER,
-            "skirt": NUMBER,
+            "margin": NUMBER,
         },
     ),
     "fit_lights": Entry(
-        {"background": image(), "sensor": sensor(), "start": None, "max_steps": 3, "vignetting": 0},
+        {"background": image(), "sensor": sensor(), "start": None, "max_steps": 3, "vignetting": False},
         {
             "background": [*images(), 0 * image(), torch.full_like(image(), 0.5), torch.ones_like(image())],
             "sensor": SENSOR,

@@ -191,8 +191,8 @@ def test_rectify_straightens_a_quadrilateral():
 @pytest.mark.parametrize(
     "options, size, message",
     [
-        ({"roi_px": (100, 0, 70, 50)}, (120, 160), r"frame: 120 x 160 does not hold roi_px \(100, 0, 70, 50\) of sensor 'rig'"),
-        ({"corners_px": ((0, 0), (300, 0), (300, 90), (0, 90))}, (120, 160), "frame: 120 x 160 does not hold corners_px"),
+        ({"roi_px": (100, 0, 70, 50)}, (120, 160), r"frame: 120 x 160 does not contain roi_px \(100, 0, 70, 50\) of sensor 'rig'"),
+        ({"corners_px": ((0, 0), (300, 0), (300, 90), (0, 90))}, (120, 160), "frame: 120 x 160 does not contain corners_px"),
         (
             {},
             (48, 64),

@@ -100,7 +100,7 @@ def test_rectify_equals_the_sensors(region):
 def test_rectify_refuses_frames_of_another_size():
     with pytest.raises(ValueError, match="the source has changed"):
         streams.Rectify(vts.Sensor("rig", 24, 32, 0.1), 24, 32)(torch.zeros(1, 3, 48, 64))
-    with pytest.raises(ValueError, match="does not hold corners_px"):
+    with pytest.raises(ValueError, match="does not contain corners_px"):
         streams.Rectify(vts.Sensor.load("gelsight_wedge"), 240, 320)
 
 
@@ -179,7 +179,7 @@ def test_a_folder_gives_the_same_and_calibrates_itself(unit, small_sensor, small
     for k in range(35):
         cv2.imwrite(str(tmp_path / f"{k:03d}.png"), camera(1.0 if 15 <= k < 25 else 0.0))
     with streams.TactileStream(str(tmp_path), small_sensor, mode="precise") as stream:
-        assert "pins the lights" in stream.note and stream.metric
+        assert "constrains the lights" in stream.note and stream.metric
         check_press(stream, small_press)
 
 

@@ -6,12 +6,12 @@ from .by_presses import RESPONSE_BLUR_PX, by_presses, with_preprocessing
 from .calibrate import calibrate, fit_prior
 from .complaints import CalibrationWarning
 from .contacts import ROUGH, channel_structure
-from .lights import LOOSE_DEG, LightFit, fit_lights
+from .lights import POORLY_CONSTRAINED_DEG, LightFit, fit_lights
 from .presses import Press, Touch, read_presses
 
 __all__ = [
     "GIVEN_MISFIT",
-    "LOOSE_DEG",
+    "POORLY_CONSTRAINED_DEG",
     "RESPONSE_BLUR_PX",
     "ROUGH",
     "CalibrationWarning",

@@ -48,10 +48,10 @@ def locate(contacts: list[Contact], sensor: Sensor, prior: ResponseModel | None,
         _locate_jointly(usable, pitch_mm, half_mm)
     for contact in usable:
         if not contact.reason and int(contact.inside().sum()) < LEAST_INSIDE:
-            contact.reason = "no ball of this diameter fits what is seen"
+            contact.reason = "no ball of this diameter fits the contact"
         if not contact.reason and contact.contact_radius_mm > 0.89 * contact.radius_mm:
             wide_mm, ball_mm = 2 * contact.contact_radius_mm, 2 * contact.radius_mm
-            contact.reason = f"the contact seen is {wide_mm:.2f} mm wide, too wide for a ball of {ball_mm:g} mm"
+            contact.reason = f"the contact is {wide_mm:.2f} mm wide, too wide for a ball of {ball_mm:g} mm"
 
 
 def _locate_jointly(contacts: list[Contact], pitch_mm: float, half_mm: float) -> None:

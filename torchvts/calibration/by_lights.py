@@ -35,7 +35,7 @@ def by_lights(background: Tensor, sensor: Sensor, other_models: bool, progress: 
     Args:
         background: (3, H, W) in [0, 1].
         sensor: of the unit; where it gives the lights' positions, only the albedo is fitted.
-        other_models: other models than lights exist, so hopeless lights are not refined.
+        other_models: other models than lights exist, so lights with a large misfit are not refined.
         progress: show a bar.
     Raises:
         ValueError: as :func:`fit_lights`.

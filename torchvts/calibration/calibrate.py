@@ -19,7 +19,7 @@ from .by_presses import by_presses, error_of_lights_deg
 from .by_touches import TouchResult, by_touches
 from .complaints import CalibrationWarning
 from .contacts import press_row, touch_row, used
-from .lights import LOOSE_DEG, check_exposure
+from .lights import POORLY_CONSTRAINED_DEG, check_exposure
 from .presses import Press, Touch, check_presses, check_touches
 
 WELL_CONSTRAINED_DEG = 2.0
@@ -204,7 +204,7 @@ def _with_presses(
     of_diameters = complaints.of_diameters_by_others if start is None else complaints.of_diameters_by_prior
     found = complaints.of_contacts(contacts) + of_diameters(balls)
     # twelve parameters that do about as well as a hundred are the better model
-    lights_win = error_deg < (math.inf if fit.error_deg is None else TIE * fit.error_deg) and error_deg < LOOSE_DEG
+    lights_win = error_deg < (math.inf if fit.error_deg is None else TIE * fit.error_deg) and error_deg < POORLY_CONSTRAINED_DEG
     if lights_win:
         other = "too few presses for a response field" if fit.error_deg is None else f"response fields {fit.error_deg:.2f}"
         report = lights.unit.report.copy()

@@ -1,4 +1,4 @@
-"""A torch optimiser for small least-squares problems: Levenberg-Marquardt with forward-mode derivatives."""
+"""Levenberg-Marquardt as a torch optimiser for small least-squares problems, with forward-mode derivatives."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,8 +14,7 @@ class LevenbergMarquardt(Optimizer):
     Args:
         parameter: one tensor (G, K): K parameters of each of G independent problems.
         damping: start of the damping, relative to the diagonal of J^T J.
-        tie: (G, K, F) or None: the groups' parameters move only as ``tie @ step`` of F free numbers, which couples the groups;
-            None leaves every parameter free.
+        tie: (G, K, F): parameters move by ``tie @ step`` of F free parameters, which couples the groups; None leaves all free.
     Source:
         More, The Levenberg-Marquardt algorithm, LNM 630, 1978; damping by the gain as in Nielsen, IMM-REP-1999-05.
     Example:
@@ -36,13 +35,13 @@ class LevenbergMarquardt(Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[Tensor], Tensor], weight: Tensor | None = None) -> Tensor:  # type: ignore[override]
-        """One step; a group whose loss would rise keeps its parameters and raises its damping.
+        """Take one step; a group whose loss would rise keeps its parameters and raises its damping.
 
         Args:
             closure: maps parameters (G, K) to residuals (G, N).
-            weight: (G, N) or None, weights of the squared residuals.
+            weight: (G, N), weights of the squared residuals; None for ones.
         Returns:
-            (G,), half the weighted sum of squares before the step; (1,) of all groups where they are tied.
+            (G,), half the weighted sum of squares before the step; (1,), their sum, where the groups are tied.
         """
         parameter = self.param_groups[0]["params"][0]
         residual, jacobian = residual_and_jacobian(closure, parameter)
@@ -69,13 +68,13 @@ class LevenbergMarquardt(Optimizer):
 
 
 def residual_and_jacobian(closure: Callable[[Tensor], Tensor], parameter: Tensor) -> tuple[Tensor, Tensor]:
-    """Residuals (G, N) and their derivatives (G, K, N) at parameters (G, K); group g depends on row g alone."""
-    groups, numbers = parameter.shape
+    """Residuals (G, N) and their derivatives (G, K, N) at parameters (G, K); group g depends only on row g."""
+    groups, count = parameter.shape
 
     def along(tangent: Tensor) -> Any:
         return torch.func.jvp(closure, (parameter.detach(),), (tangent,))[:2]
 
-    tangents = torch.eye(numbers, dtype=parameter.dtype, device=parameter.device)[:, None].expand(numbers, groups, numbers)
+    tangents = torch.eye(count, dtype=parameter.dtype, device=parameter.device)[:, None].expand(count, groups, count)
     residual, columns = torch.func.vmap(along, out_dims=(None, 1))(tangents)  # type: ignore[arg-type]
     return residual, columns
 

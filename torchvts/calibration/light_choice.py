@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..model.report import CandidateRow
 from ..model.sensor import Sensor
-from .lights import LOOSE_DEG, LightFit, fit_lights
+from .lights import POORLY_CONSTRAINED_DEG, LightFit, fit_lights
 
 WORTH = 0.01
 """The smallest model wins whose held-out loss is within this share of the best one's. Unneeded parameters change that loss by
@@ -22,7 +22,7 @@ EXPLAINED = 0.01
 """Vignetting and ambient light are accepted only if they leave less relative structure than this. They imitate other causes:
 ambient light reduces the structure of a camera's gamma of 2.2 to 3 %, with lights that are 11 degrees off and seem good to 1.5."""
 
-HOPELESS_MISFIT = 0.2
+LARGE_MISFIT = 0.2
 """Relative structure left unexplained from which lights are no candidate beside another model."""
 
 AZIMUTH_SLACK_DEG = 5.0
@@ -103,7 +103,7 @@ def choose_lights(background: Tensor, sensor: Sensor, other_models: bool = False
     linear = dataclasses.replace(sensor, gamma=sensor.exponent, prior=None)
     sparse, small = _sparse(background, linear, 30 if other_models else 60)
     tried = _try(sparse, small, [], progress)
-    if other_models and min(candidate.misfit for candidate in tried) <= HOPELESS_MISFIT:  # refine
+    if other_models and min(candidate.misfit for candidate in tried) <= LARGE_MISFIT:  # refine
         sparse, small = _sparse(background, linear, 60)
         tried = _try(sparse, small, [], progress)
     if sensor.gamma is None and tried[0].misfit > 0.005:
@@ -112,12 +112,12 @@ def choose_lights(background: Tensor, sensor: Sensor, other_models: bool = False
         candidate.objection = _objection(candidate, tried, sensor)
     chosen = _choose(tried)
     fit, linear = chosen.fit, dataclasses.replace(linear, gamma=chosen.gamma)
-    if not (other_models and chosen.misfit > HOPELESS_MISFIT):
+    if not (other_models and chosen.misfit > LARGE_MISFIT):
         fit = _fit(background, linear, chosen.vignetting, chosen.ambient, chosen.known_azimuth, progress)
     final = dataclasses.replace(chosen, fit=fit)
     row = _row(final)
     row |= {"held_out": chosen.held_out, "note": _note(final)}
-    complaint = f"background: {fit.message}" if not fit.converged or (row["score_deg"] or 0.0) > LOOSE_DEG else ""
+    complaint = f"background: {fit.message}" if not fit.converged or (row["score_deg"] or 0.0) > POORLY_CONSTRAINED_DEG else ""
     if not complaint and chosen.objection:
         complaint = f"background: {chosen.family}: {chosen.objection}"
     rows = [row, *(_row(candidate) for candidate in tried if candidate is not chosen)]
@@ -181,7 +181,7 @@ def _objection(candidate: _Candidate, tried: list[_Candidate], sensor: Sensor) -
         return ""
     if not candidate.known_azimuth:
         loosest = float(fit.direction_std_deg.max())
-        if loosest > LOOSE_DEG:
+        if loosest > POORLY_CONSTRAINED_DEG:
             return f"the image alone constrains the lights to {loosest:.1f} deg only"
         return _off_the_drawing(fit, sensor.light_azimuth_deg)
     if candidate.misfit > 2.0 * EXPLAINED:

@@ -41,7 +41,7 @@ NOT_GLOSS = 0.1
 STEP_TOLERANCE_MM = 1e-4
 """The loop ends after three steps that move no light further than this."""
 
-LOOSE_DEG = 5.0
+POORLY_CONSTRAINED_DEG = 5.0
 """A light whose direction has a larger standard deviation than this is reported as poorly constrained by the image."""
 
 
@@ -330,10 +330,12 @@ def _message(best: _Solution, direction_std: Tensor, relative_residual: Tensor, 
             "raise max_steps, or the image does not constrain the lights"
         )
     message = f"converged in {len(best.history)} steps"
-    loose = [f"{name} +-{float(std):.1f} deg" for name, std in zip("RGB", direction_std, strict=True) if std > LOOSE_DEG]
-    if not loose:
+    poor = [
+        f"{name} +-{float(std):.1f} deg" for name, std in zip("RGB", direction_std, strict=True) if std > POORLY_CONSTRAINED_DEG
+    ]
+    if not poor:
         return message
     return (
-        f"{message}, but one image does not constrain {', '.join(loose)}: a smooth misfit of {float(relative_residual.max()):.1%} "
+        f"{message}, but one image does not constrain {', '.join(poor)}: a smooth misfit of {float(relative_residual.max()):.1%} "
         "is left (vignetting or scattered light); calibrate with presses or known lights"
     )

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from ..accelerated import ContactMask
-from ..calibration import GIVEN_MISFIT, LOOSE_DEG, ROUGH, CalibrationWarning, calibrate, channel_structure
+from ..calibration import GIVEN_MISFIT, POORLY_CONSTRAINED_DEG, ROUGH, CalibrationWarning, calibrate, channel_structure
 from ..core.checks import check_batch
 from ..model import Calibration, ResponseField, ResponseModel, Sensor, check_sensor
 from ..model.calibration import PEDESTAL
@@ -144,7 +144,7 @@ def use_calibration(calibration: Calibration) -> StreamCalibration:
     """A calibration that was given, as that of a stream."""
     report = calibration.report
     note = f"calibration given: {report.get('reason', report.get('model', 'lights'))}"
-    metric = max(report.get("direction_std_deg", [0.0])) <= LOOSE_DEG
+    metric = max(report.get("direction_std_deg", [0.0])) <= POORLY_CONSTRAINED_DEG
     return StreamCalibration(calibration, note if metric else f"{note}; {NOT_METRIC}", metric)
 
 

@@ -106,9 +106,9 @@ def test_maps_are_those_of_the_definition(family):
 def test_a_larger_family_holds_the_same_field(family):
     field = random_field(*family, half_mm=2.0)
     for larger in ((3, 3, True), (4, 5, True)):
-        lifted = field.embedded(*larger)
-        assert (lifted.degree, lifted.product_degree, lifted.uses_depth, lifted.half_mm) == (*larger, 2.0)
-        maps, old = dict(zip(lifted.terms(), lifted.maps(6, 8, 0.5))), dict(zip(field.terms(), field.maps(6, 8, 0.5)))
+        larger_field = field.embedded(*larger)
+        assert (larger_field.degree, larger_field.product_degree, larger_field.uses_depth, larger_field.half_mm) == (*larger, 2.0)
+        maps, old = dict(zip(larger_field.terms(), larger_field.maps(6, 8, 0.5))), dict(zip(field.terms(), field.maps(6, 8, 0.5)))
         for term, values in maps.items():
             expected = old.get(term, torch.zeros(2, 6, 8, dtype=torch.float64))
             assert torch.allclose(values, expected, rtol=0, atol=1e-12), term

@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 
 setup: $(VENV)/.done
 
-$(VENV)/.done: pyproject.toml constraints.txt hatch_build.py $(wildcard torchvts/native/*.[ch])
+$(VENV)/.done: pyproject.toml constraints.txt hatch_build.py $(wildcard torchvts/accelerated/csrc/*.[ch])
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[pose,onnx,test]"
 	touch $@

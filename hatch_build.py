@@ -1,4 +1,4 @@
-"""Builds the compiled loops of torchvts/native with the C compiler at hand; without one, the package works by tensor operators."""
+"""Builds the compiled kernels in torchvts/accelerated/csrc with the C compiler at hand; without one, PyTorch does their work."""
 
 import os
 import shlex
@@ -16,11 +16,11 @@ FLAGS = ["-std=c11", "-O3", "-fno-math-errno", "-fPIC", "-shared", "-fvisibility
 PLAIN = "-DWIDE="  # compilers that cannot build a function for several kinds of processors
 
 
-class CompiledLoops(BuildHookInterface):
-    """Writes torchvts/native/libtorchvts.so before the files are collected."""
+class CompiledKernels(BuildHookInterface):
+    """Writes torchvts/accelerated/csrc/libtorchvts.so before the files are collected."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        folder = Path(self.root) / "torchvts" / "native"
+        folder = Path(self.root) / "torchvts" / "accelerated" / "csrc"
         library = folder / "libtorchvts.so"
         compiler = shlex.split(os.environ.get("CC") or "cc")
         if shutil.which(compiler[0]) is None:
@@ -35,11 +35,11 @@ class CompiledLoops(BuildHookInterface):
     def build(self, compiler: list[str], folder: Path, library: Path) -> None:
         sources = [str(source) for source in sorted(folder.glob("*.c"))]
         texts = b"".join(source.read_bytes() for source in sorted(folder.glob("*.[ch]")))
-        told = f"-DSOURCES={zlib.crc32(texts)}u"  # torchvts/core/native.py compares it
+        define = f"-DSOURCES={zlib.crc32(texts)}u"  # torchvts/accelerated/kernels.py compares it
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
             built = Path(scratch) / library.name
             for more in ([], [PLAIN]):
-                command = [*compiler, *FLAGS, told, *more, *sources, "-o", str(built), "-lm"]
+                command = [*compiler, *FLAGS, define, *more, *sources, "-o", str(built), "-lm"]
                 done = subprocess.run(command, capture_output=True, text=True)
                 if done.returncode == 0:
                     os.replace(built, library)

@@ -72,12 +72,12 @@ def main() -> int:
 
 
 def print_candidates(candidates: list[dict[str, Any]]) -> None:
-    print("| model | family | pass | numbers | deg | misfit | note |\n|---|---|---|---|---|---|---|")
+    print("| model | family | passes | parameters | deg | misfit | note |\n|---|---|---|---|---|---|---|")
     for row in candidates:
         score = "" if row["score_deg"] is None else f"{row['score_deg']:.2f}"
         misfit = f"{row['misfit']:.1%}" if "misfit" in row else ""
         family = row.get("family", "") + (f", gamma {row['gamma']:g}" if row.get("gamma", 1.0) != 1.0 else "")
-        print(f"| {row['model']} | {family} | {row['pass']} | {row['numbers']} | {score} | {misfit} | {row.get('note', '')} |")
+        print(f"| {row['model']} | {family} | {row['passes']} | {row['parameters']} | {score} | {misfit} | {row.get('note', '')} |")
     print(
         "deg: of point lights without a note of presses, how loose the image leaves them; else the mean angle on held-out presses"
     )

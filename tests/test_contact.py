@@ -7,10 +7,11 @@ import torch
 from kornia.morphology import dilation
 
 import torchvts as vts
-from torchvts.contact.masks import _dilate, _erode, _reconstruct_by_sweeps, reconstruct
-from torchvts.core.native import reference_only
+from torchvts.accelerated import reference_only
+from torchvts.contact.morphology import dilate, erode, reconstruct
+from torchvts.evaluation import metrics
 
-scenes, metrics = vts.scenes, vts.evaluation.metrics
+scenes = vts.scenes
 
 
 def found(scene, lights, sensor, noise_std=0.0, bits=None, seed=3):
@@ -107,14 +108,14 @@ def test_skin_at_rest_in_a_shadow_is_shaded_and_a_press_is_not():
     image[:2, 8:24, 40:56] = 0.0  # two, which leaves too little to tell by
     image[0, 40:56, 8:24], image[1, 40:56, 8:24] = 0.0, 0.6  # slopes
     image[0, 40:56, 40:56] = 0.2  # half a shadow
-    found = mask.shaded(image[None])[0, 0]
+    found = mask.shadowed(image[None])[0, 0]
     expected = torch.zeros(64, 64, dtype=torch.bool)
     expected[8:24, 8:24] = True
     assert torch.equal(found, expected) and bool(mask(image[None])[0, 0][found].all())
     image[2] = 0.0  # a lamp that is dead
-    assert not bool(mask.shaded(image[None]).any())
+    assert not bool(mask.shadowed(image[None]).any())
     dim = torch.full((3, 64, 64), 0.05)  # a channel that is never bright cannot go dark
-    assert not bool(vts.ContactMask(dim, torch.full((3,), 0.01)).shaded(torch.zeros(1, 3, 64, 64)).any())
+    assert not bool(vts.ContactMask(dim, torch.full((3,), 0.01)).shadowed(torch.zeros(1, 3, 64, 64)).any())
 
 
 def test_items_of_a_batch_do_not_influence_one_another(ring, small_sensor, small_press):
@@ -173,7 +174,7 @@ def spiral(n):
 
 @pytest.mark.parametrize("share", [0.3, 0.5, 0.6, 0.8])
 @pytest.mark.parametrize("size", [(17, 23), (40, 31)])
-@pytest.mark.parametrize("way", [reconstruct, _reconstruct_by_sweeps])
+@pytest.mark.parametrize("way", [vts.ContactMask(torch.full((3, 8, 8), 0.5), torch.full((3,), 0.01)).reconstruct, reconstruct])
 def test_reconstruct_equals_a_flood_fill_on_random_masks(share, size, way):
     generator = np.random.default_rng(int(100 * share))
     mask = generator.random((3, 1, *size)) < share
@@ -183,7 +184,7 @@ def test_reconstruct_equals_a_flood_fill_on_random_masks(share, size, way):
         assert np.array_equal(result[item, 0], references.flood(seed[item, 0], mask[item, 0]))
 
 
-@pytest.mark.parametrize("way", [reconstruct, _reconstruct_by_sweeps])
+@pytest.mark.parametrize("way", [vts.ContactMask(torch.full((3, 8, 8), 0.5), torch.full((3,), 0.01)).reconstruct, reconstruct])
 def test_reconstruct_follows_a_spiral_to_its_end(way):
     mask = spiral(21)
     seed = np.zeros_like(mask)
@@ -203,10 +204,10 @@ def test_filling_from_the_border_equals_the_twin():
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.9])
 def test_dilation_equals_kornia_and_the_twin(share):
     mask = torch.rand(2, 1, 33, 47, generator=torch.Generator().manual_seed(0)) < share
-    grown = _dilate(mask)
+    grown = dilate(mask)
     assert torch.equal(grown, dilation(mask.float(), torch.ones(3, 3)) > 0.5)
     assert np.array_equal(grown[0, 0].numpy(), references.dilate(mask[0, 0].numpy()))
-    assert torch.equal(_erode(mask), ~_dilate(~mask))
+    assert torch.equal(erode(mask), ~dilate(~mask))
 
 
 @pytest.fixture(scope="module")
@@ -230,7 +231,7 @@ def test_soft_contact_has_a_slope_at_the_rim_only(soft_case):
     block.soft(frame).sum().backward()
     moved = frame.grad.abs().sum(1, keepdim=True) > 1e-3
     assert bool(torch.isfinite(frame.grad).all()) and bool(moved.any())
-    assert not bool((moved & ~_dilate(_dilate(block(frame.detach())))).any())
+    assert not bool((moved & ~dilate(dilate(block(frame.detach())))).any())
 
 
 def test_the_slope_of_soft_contact_equals_differences():

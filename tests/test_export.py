@@ -12,7 +12,7 @@ from torch import nn
 
 import torchvts as vts
 from torchvts import export
-from torchvts.core.native import reference_only
+from torchvts.accelerated import reference_only
 
 LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
 ROOT = Path(__file__).resolve().parents[1]

@@ -7,9 +7,10 @@ import torch
 
 import torchvts as vts
 from torchvts.core.geometry import MAX_SLOPE, gradient_from_normal, normal_from_gradient
-from torchvts.normals.photometric import slope_by_lit_lights
+from torchvts.evaluation import metrics
+from torchvts.normals.shadowed import Pixels, slope_by_lit_lights
 
-scenes, metrics = vts.scenes, vts.evaluation.metrics
+scenes = vts.scenes
 
 
 def press(press_mm=1.0, dtype=torch.float64, height=60, width=80):
@@ -99,7 +100,7 @@ def test_two_lights_and_unit_length_give_the_slope(ring, brightness_std, toleran
     light = (rows * (turned / turned.norm(dim=1, keepdim=True))[:, None]).sum(2)
     assert ((light <= 0).sum(1) == 1).all()
     found = slope_by_lit_lights(
-        slope + 0.1, light.clamp_min(0.0), rows.expand(3, 3, 3), light > 1e9, 1e-3, brightness_std=brightness_std, steps=30
+        Pixels(slope + 0.1, light.clamp_min(0.0), rows.expand(3, 3, 3), light > 1e9), 1e-3, brightness_std, steps=30
     )
     assert (found - slope).norm(dim=1).max() < tolerance
 
@@ -138,10 +139,12 @@ def test_lights_that_nearly_lie_in_a_plane_are_damped(azimuth_deg, rms_px, share
     )
     sensor = vts.Sensor("rig", 120, 160, scene.mm_per_pixel)
     pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, sensor, rest[0]), "precise")
-    assert bool(pipe.normals.weak.all()) == (share is not None) and bool(pipe.normals.weak.any()) == (share is not None)
+    assert bool(pipe.normals.shadowed.ill_conditioned.all()) == (share is not None) and bool(
+        pipe.normals.shadowed.ill_conditioned.any()
+    ) == (share is not None)
     out = pipe(image)
-    pipe.normals.weak.fill_(False)
-    pipe.normals.ill = False
+    pipe.normals.shadowed.ill_conditioned.fill_(False)
+    pipe.normals.shadowed.any_ill_conditioned = False
     plain = pipe(image)
     ours = metrics.depth_error(out.depth_mm, scene.depth_mm, 0.0625).rms_px
     assert ours < rms_px
@@ -157,9 +160,9 @@ def test_without_noise_the_damped_slope_is_the_true_one(azimuth_deg):
     """The limit of small noise, at the true depth."""
     lights, scene = fan(azimuth_deg).double(), press(1.0, height=24, width=32)
     block = block_for(lights, scene, noise_std=torch.full((3,), 1e-9, dtype=torch.float64))
-    assert not bool(block.weak.any())
-    block.weak.fill_(True)
-    block.ill = True
+    assert not bool(block.shadowed.ill_conditioned.any())
+    block.shadowed.ill_conditioned.fill_(True)
+    block.shadowed.any_ill_conditioned = True
     inside = scene.contact & (scene.depth_mm > 0.2)
     assert rms_deg(block(scenes.render(scene, lights), scene.depth_mm), scene, inside) < 0.5
 

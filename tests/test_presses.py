@@ -205,15 +205,15 @@ def test_the_candidates_are_told_with_their_scores(unit):
     rows = json.loads(text)["candidates"]
     assert len(rows) >= 9
     for row in rows:
-        assert {"model", "family", "numbers", "score_deg", "pass"} <= set(row)
+        assert {"model", "family", "parameters", "score_deg", "passes"} <= set(row)
         assert math.isfinite(row["score_deg"]) and row["score_deg"] > 0
-    assert {row["pass"] for row in rows[1:]} == {1, 2}
-    fast = [row for row in rows[1:] if row["pass"] == 1 and "read with" not in row["model"]]
-    assert [row["numbers"] for row in fast] == sorted(row["numbers"] for row in fast)
+    assert {row["passes"] for row in rows[1:]} == {1, 2}
+    fast = [row for row in rows[1:] if row["passes"] == 1 and "read with" not in row["model"]]
+    assert [row["parameters"] for row in fast] == sorted(row["parameters"] for row in fast)
     best = min(row["score_deg"] for row in fast)
-    chosen = next(row for row in fast if row["numbers"] == 2 * calibration.response.fast.size())
+    chosen = next(row for row in fast if row["parameters"] == 2 * calibration.response.fast.size())
     assert chosen["score_deg"] <= 1.02 * best
-    assert all(row["score_deg"] > 1.02 * best for row in fast if row["numbers"] < chosen["numbers"])
+    assert all(row["score_deg"] > 1.02 * best for row in fast if row["parameters"] < chosen["numbers"])
 
 
 @pytest.mark.parametrize("mode", ["fast", "precise", "auto"])

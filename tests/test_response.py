@@ -271,14 +271,6 @@ def test_slopes_of_the_depth_are_inputs():
     assert slope == pytest.approx(np.stack((p, q), axis=1), abs=1e-9)
 
 
-def test_fields_of_files_without_slopes_of_depth_heed_none():
-    field = random_field(1, 0, True)
-    # three numbers each for four inputs, then those of the two slopes
-    rows = [[0.0 if 12 <= k < 18 else v for k, v in enumerate(row)] for row in field.coefficient]
-    before = field.to_dict() | {"coefficient": [row[:12] + row[18:] for row in rows]}
-    assert ResponseField.from_dict(before, "file") == dataclasses.replace(field, coefficient=tuple(map(tuple, rows)))
-
-
 def test_a_message_is_short_though_the_field_is_large():
     field = random_field(4, 3, True)
     rows = [list(row) for row in field.coefficient]
@@ -519,23 +511,6 @@ def test_a_file_whose_sensor_and_response_disagree_is_refused(saved, where, key,
     rewritten(saved, change_metadata=put(value, where, key))
     with pytest.raises(ValueError, match=key):
         vts.Calibration.load(saved)
-
-
-def test_a_file_of_lights_of_version_one_still_loads(ring, tmp_path):
-    """As the first release wrote it: no response, no markers."""
-    sensor = vts.Sensor("rig", 24, 32, 0.5)
-    calibration = vts.Calibration.from_lights(ring(), sensor, smooth_background(24, 32))
-    path = tmp_path / "unit.safetensors"
-    calibration.save(path)
-
-    def older(metadata):
-        metadata["format_version"] = 1
-        del metadata["response"], metadata["markers"]
-
-    rewritten(path, change_metadata=older)
-    loaded = vts.Calibration.load(path)
-    assert loaded.response is None and loaded.markers is None and torch.equal(loaded.background, calibration.background)
-    assert torch.equal(loaded.inverse, calibration.inverse) and loaded.sensor == calibration.sensor
 
 
 def test_a_response_has_no_light_matrix_and_is_one_at_rest():

@@ -8,8 +8,9 @@ import torch
 import torchvts as vts
 from torchvts.core.geometry import normal_from_gradient
 from torchvts.core.noise import noise_std
+from torchvts.evaluation import metrics
 
-scenes, metrics = vts.scenes, vts.evaluation.metrics
+scenes = vts.scenes
 SIZE = {"height": 241, "width": 321, "mm_per_pixel": 0.125, "dtype": torch.float64}
 PRESSES = {
     "sphere": lambda **size: scenes.sphere_press(10.0, 1.0, (2.0, -1.0), **size),

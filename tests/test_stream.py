@@ -418,7 +418,7 @@ def test_lights_that_do_not_fit_the_image_give_only_their_directions(ring, small
     uneven = torch.stack((0.6 + 0.4 * x, 0.6 - 0.4 * x, 0.5 + 0.4 * (1 - x**2)))[None, :, None]  # lamps that spread badly
     rest, image = (vts.scenes.render(s, lights) * uneven for s in (vts.scenes.undeformed(scene), scene))
     calibration, told, metric = streams.calibrate_at_rest(rest[0], sensor)
-    assert calibration.report["response"] == "stand-in" and "NOT METRIC" in told and not metric
+    assert calibration.report["source"] == "stand_in" and "NOT METRIC" in told and not metric
     out = vts.DepthPipeline.from_calibration(calibration)(image)
     assert float(out.depth_mm.max()) == pytest.approx(0.5, rel=0.25)
     even, _, metric = streams.calibrate_at_rest(vts.scenes.render(vts.scenes.undeformed(scene), lights)[0], sensor)

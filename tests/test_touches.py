@@ -157,7 +157,7 @@ def test_real_touches(data):
 def test_the_family_of_touches_is_the_smallest_that_is_pinned(rest, touches):
     calibration = calibrate(rest, SENSOR, touches=[vts.Touch(touches[1], 0.5), *touches[2:]])
     tried = next(row for row in calibration.report["candidates"] if row["model"] == "touches")["tried"]
-    assert tried[0]["numbers"] == Family(0, -1, False, 10.0).size() == 6 and tried[0]["gap"] > 4.0
+    assert tried[0]["parameters"] == Family(0, -1, False, 10.0).size() == 6 and tried[0]["gap"] > 4.0
 
 
 def under_stray_light(scene, seed):

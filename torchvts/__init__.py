@@ -1,24 +1,23 @@
 """torchvts: camera images of visual-tactile sensors into depth, normals, contact and pose, as differentiable PyTorch modules."""
 
 from . import scenes, stream
-from .calibration import CalibrationWarning, Press, Touch, calibrate, fit_lights, read_presses
-from .compensate import Compensate
-from .contact import ContactMask
-from .core import __version__ as __version__
-from .core.files import read_image, write_image
-from .core.geometry import GradientFromNormal, depth_to_points
-from .diagnose import diagnose
-from .integration import (
+from .accelerated import (
     AdaptiveIntegration,
+    Compensate,
+    ContactMask,
+    GradientFromNormal,
+    NormalFromIntensity,
     PoissonBackground,
     PoissonDCT,
-    PoissonDST,
-    poisson_background,
-    poisson_dct,
-    poisson_dst,
 )
+from .calibration import CalibrationWarning, Press, Touch, calibrate, fit_lights, read_presses
+from .core import __version__ as __version__
+from .core.files import read_image, write_image
+from .core.geometry import depth_to_points
+from .diagnose import diagnose
+from .integration import Integrator, PoissonDST, poisson_background, poisson_dct, poisson_dst
 from .model import Calibration, PointLights, Sensor, gs_sdk, near_field_shading, shipped_sensors
-from .normals import NormalFromIntensity, NormalFromLookup, NormalFromMLP, NormalFromResponse
+from .normals import NormalFromLookup, NormalFromMLP, NormalFromResponse, NormalModel
 from .pipeline import ConfidentPipeline, DepthOutput, DepthPipeline
 from .pose import register_depth, register_points
 
@@ -32,10 +31,12 @@ __all__ = [
     "DepthOutput",
     "DepthPipeline",
     "GradientFromNormal",
+    "Integrator",
     "NormalFromIntensity",
     "NormalFromLookup",
     "NormalFromMLP",
     "NormalFromResponse",
+    "NormalModel",
     "PointLights",
     "PoissonBackground",
     "PoissonDCT",

@@ -5,18 +5,19 @@ import math
 import statistics
 import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
-from ..compensate.compensate import Compensate
-from ..contact.masks import ContactMask
+from ..compensate import Compensate
+from ..contact import ContactMask
 from ..core.checks import check_image, check_sequence
 from ..core.geometry import gradient_from_normal
 from ..integration import poisson_background
 from ..model.calibration import Calibration
 from ..model.lights import PointLights, flat_image
+from ..model.report import Report
 from ..model.response_field import ResponseModel, SensorPrior, fit_log_background
 from ..model.sensor import Sensor, check_sensor
 from ..normals import NormalFromIntensity
@@ -140,15 +141,17 @@ def calibrate(
             reason = f"the image pins the lights to {lights_row['score_deg']:.2f} deg" if pins else lights_row["note"]
             if len(light_rows) > 1:
                 reason += f"; {by_lights.report['chosen_because']}"
-            report = by_lights.report | {"reason": f"point lights: {reason}", "candidates": candidates}
+            report: Any = by_lights.report | {"reason": f"point lights: {reason}", "candidates": candidates}
             return _judge_rest(dataclasses.replace(by_lights, report=report))
         if touched is not None:
             reason = f"{touched['row']['note']}; point lights rejected: {lights_row['note']}"
-            report = {"model": "response", "response": "fitted to touches", "reason": reason, "candidates": candidates}
-            return Calibration.from_response(prior, sensor, background, report | {"touches": touched["touches"]})
-        candidates.append({"model": "prior", "family": "response of the sensor type", "numbers": 0, "score_deg": None, "pass": 2})
+            report = {"model": "response", "source": "touches", "reason": reason, "candidates": candidates}
+            return Calibration.from_response(prior, sensor, background, {**report, "touches": touched["touches"]})
+        candidates.append(
+            {"model": "prior", "family": "response of the sensor type", "parameters": 0, "score_deg": None, "passes": 2}
+        )
         reason = f"the sensor's prior, carried to this unit by its background; point lights rejected: {lights_row['note']}"
-        report = {"model": "response", "response": "the sensor's prior", "reason": reason, "candidates": candidates}
+        report = {"model": "response", "source": "prior", "reason": reason, "candidates": candidates}
         return Calibration.from_response(prior, sensor, background, report)
     fit, contacts, by_response = by_presses(background, sensor, presses, prior, progress)
     candidates += fit.candidates
@@ -165,9 +168,9 @@ def calibrate(
     if lights_error < (math.inf if fit.error_deg is None else TIE * fit.error_deg) and lights_error < LOOSE_DEG:
         other = "too few presses for a response field" if fit.error_deg is None else f"response fields {fit.error_deg:.2f}"
         reason = f"point lights: on {len(used)} presses their normals are {lights_error:.2f} deg off, {other}"
-        return _judge_rest(dataclasses.replace(by_lights, report=by_lights.report | {"reason": reason} | told))
+        return _judge_rest(dataclasses.replace(by_lights, report=cast(Report, by_lights.report | {"reason": reason} | told)))
     lights_row["note"] = f"rejected: on {len(used)} presses their normals are {lights_error:.1f} deg off; {lights_row['note']}"
-    report = {"model": "response", "response": "fitted to presses", "reason": fit.reason, "held_out_deg": fit.error_deg} | told
+    report = {"model": "response", "source": "presses", "reason": fit.reason, "held_out_deg": fit.error_deg} | told
     return dataclasses.replace(by_response, report=report)
 
 
@@ -204,16 +207,16 @@ def _by_lights(
     background: Tensor, sensor: Sensor, other_models: bool, progress: bool
 ) -> tuple[Calibration, list[dict[str, Any]], str]:
     """Point lights from the image, their rows in the table of candidates, chosen one first, and what there is to complain of."""
-    report: dict[str, Any] = {"model": "point_lights", "lights": "fitted"}
+    report: dict[str, Any] = {"model": "point_lights", "source": "background"}
     if sensor.light_position_mm is not None:
         lights = _scale_albedo(PointLights([list(row) for row in sensor.light_position_mm], [1.0, 1.0, 1.0]), background, sensor)
         family = "three lights at known positions"
-        report |= {"lights": "positions from the sensor file, albedo fitted", "converged": True, "family": family}
+        report |= {"source": "sensor_file", "converged": True, "family": family}
         given = Calibration.from_lights(lights, sensor, background, report)
         cell = max(1, min(sensor.height, sensor.width) // 30)
         log = [torch.nn.functional.avg_pool2d(i[None], cell).clamp_min(1e-3).log() for i in (given.background, given.model_image)]
         misfit = float((log[0] - log[1]).std(dim=(2, 3)).max())
-        row: dict[str, Any] = {"model": "point lights", "family": family, "numbers": 3, "pass": 2, "misfit": misfit}
+        row: dict[str, Any] = {"model": "point lights", "family": family, "parameters": 3, "passes": 2, "misfit": misfit}
         note = f"given by the sensor file; the background departs from them by {misfit:.1%} (RMS)"
         complaint = "" if misfit < GIVEN_MISFIT else f"background: lights {note}: not this unit's lights, and depth is not metric"
         return given, [row | {"score_deg": 0.0, "note": note}], complaint
@@ -232,7 +235,7 @@ def _by_lights(
         "misfit": fit.misfit.tolist(),
         "inlier_fraction": fit.inlier_fraction,
         "gloss": fit.lights.gloss.tolist(),
-        "vignetting": list(fit.falloff),
+        "vignetting": fit.vignetting,
         "ambient": fit.ambient.tolist(),
     }
     ambient = fit.ambient.clamp_min(0.0) if bool((fit.ambient > 0).any()) else None
@@ -293,7 +296,7 @@ def _choose_reading(
         score = held_out_deg(read, fit.model.fast)
         label = f"response, read with gamma {gamma:g} and a blur of {blur_px:g} px"
         family, numbers = Family.of(fit.model.fast).label(), 2 * fit.model.fast.size()
-        fit.candidates.append({"model": label, "family": family, "numbers": numbers, "score_deg": score, "pass": 1})
+        fit.candidates.append({"model": label, "family": family, "parameters": numbers, "score_deg": score, "passes": 1})
         if score < least:
             least, taken = score, (other, read)
     if taken is None:
@@ -329,9 +332,13 @@ def _by_touches(
     used = [contact for contact in contacts if not contact.reason]
     if not used:
         raise ValueError("touches: none can be used: " + "; ".join(f"{c.name}: {c.reason}" for c in contacts))
-    row: dict[str, Any] = {"model": "touches", "score_deg": None, "pass": 1}
+    row: dict[str, Any] = {"model": "touches", "score_deg": None, "passes": 1}
     if prior is not None:
-        row |= {"family": "the prior, moved", "numbers": 2 * prior.fast.size(), "note": f"the prior, moved by {len(used)} touches"}
+        row |= {
+            "family": "the prior, moved",
+            "parameters": 2 * prior.fast.size(),
+            "note": f"the prior, moved by {len(used)} touches",
+        }
         return moved_by_touches(prior, used), {"row": row, "touches": told}
     fit = fit_touches(used, _unit_at_rest(background, seen).background, 0.5 * sensor.width * pitch, pitch)
     told_depth = [(touch.depth_mm, c) for touch, c in zip(touches, contacts) if touch.depth_mm is not None and not c.reason]
@@ -355,7 +362,7 @@ def _by_touches(
         raise ValueError(f"touches: the scale by {by} came out as {scale:.3g}: the presses are no clean balls, or not of this unit")
     numbers = fit.pinned.size()
     note = f"{len(used)} touches pin {numbers} numbers (eigenvalue gap {fit.gap:.1f}), the scale by {by}"
-    row |= {"family": fit.pinned.label(), "numbers": numbers, "note": note, "tried": fit.tried}
+    row |= {"family": fit.pinned.label(), "parameters": numbers, "note": note, "tried": fit.tried}
     field = scaled(fit.field, scale)
     precise = field.lifted(field.degree, field.product_degree, True)  # touches tell nothing of depth
     return ResponseModel(field, precise, sharp.exponent, sharp.blur_px), {"row": row, "touches": told}
@@ -474,9 +481,9 @@ def _check_type(background: Tensor, sensor: Sensor) -> None:
 
 def _judge_rest(calibration: Calibration) -> Calibration:
     """Add how far the background is from the lights' model, and warn if it seems to hold a contact."""
-    model, report = calibration.model_image, dict(calibration.report)
+    model, report = calibration.model_image, calibration.report.copy()
     if "vignetting" in report:  # the camera's, which the gain takes out
-        model = model * falloff(outwardness(calibration.sensor), *report["vignetting"]).to(model.dtype)
+        model = model * falloff(outwardness(calibration.sensor), report["vignetting"]).to(model.dtype)
     if calibration.ambient is not None:
         model = model + calibration.ambient.reshape(3, 1, 1)
     spread = (model - calibration.background).abs().flatten(1).median(dim=1).values / 0.6745

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..contact.masks import ContactMask
+from ..contact import ContactMask
 from ..core.blur import blur, gaussian_weights
 from ..core.checks import check_numbers, check_positive
 from ..core.geometry import gradient_from_normal, gradient_of_depth, pixel_grid_mm

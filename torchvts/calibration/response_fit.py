@@ -330,4 +330,4 @@ class _Evidence:
 
 def _row(model: str, family: Family, numbers: int, score: float | None) -> dict[str, Any]:
     two = 2 if family.uses_depth else 1
-    return {"model": model, "family": family.label(), "numbers": numbers, "score_deg": score, "pass": two}
+    return {"model": model, "family": family.label(), "parameters": numbers, "score_deg": score, "passes": two}

@@ -72,7 +72,7 @@ def fit_touches(contacts: list[Contact], light: Tensor, half_mm: float, pitch_mm
             break
         solution, gap = _smallest_eigenvector(family, even)
         spread = _spread(family, solution, even)
-        tried.append({"degree": degree, "numbers": family.size(), "gap": gap, "spread": spread})
+        tried.append({"degree": degree, "parameters": family.size(), "gap": gap, "spread": spread})
         if gap < LEAST_GAP or spread < LEAST_SPREAD:
             break
         best = (family, solution, gap)

@@ -1,5 +1,6 @@
 """From a camera's image to the compensated image that models speak of."""
 
 from .compensate import Compensate
+from .drift import Drift
 
-__all__ = ["Compensate"]
+__all__ = ["Compensate", "Drift"]

@@ -1,14 +1,15 @@
-"""Axes, and the ways between depth, gradient, normal and points. The conventions themselves stand in docs/conventions.md."""
+"""Conversions between depth, gradient, normal and points, in the axes of docs/conventions.md."""
 
 import torch
 from torch import Tensor, nn
 
-from . import native
 from .checks import check_batch, check_positive, check_same_size, check_tensor
-from .native import may_use_native
 
 MAX_SLOPE = 10.0
 """Largest |dz/dx|, |dz/dy| that ``gradient_from_normal`` returns, mm per mm: 84.3 degrees from flat."""
+
+CLIFF_SLOPE = 2.0
+"""Difference of neighbouring slopes from which depth counts as a cliff, mm per mm."""
 
 
 def pixel_grid_mm(
@@ -66,20 +67,13 @@ def gradient_from_normal(normal: Tensor, max_slope: float = MAX_SLOPE) -> Tensor
     check_batch("normal", normal, 3)
     if not torch.jit.is_scripting():
         check_positive("max_slope", max_slope)
-    if may_use_native([normal]):
-        return _by_loops(normal, max_slope)
     n_xy = normal[:, 0:2]
     tilt = torch.sqrt((n_xy * n_xy).sum(1, keepdim=True) + 1e-24)  # the constant keeps the root's own slope finite at 0
     return -n_xy / torch.maximum(normal[:, 2:3], tilt / max_slope)
 
 
-@torch.jit.unused
-def _by_loops(normal: Tensor, max_slope: float) -> Tensor:
-    return native.slopes(normal, max_slope)
-
-
 def gradient_of_depth(depth_mm: Tensor, mm_per_pixel: float) -> Tensor:
-    """Central differences of depth, (B, 1, H, W) in mm, to (B, 2, H, W), mm per mm; one-sided in the image's first and last lines.
+    """Central differences of depth, (B, 1, H, W) in mm, to (B, 2, H, W), mm per mm; one-sided at the border.
 
     Example:
         >>> gradient_of_depth(torch.tensor([[[[0.0, 1.0, 4.0]]]]), 0.5)[0, 0]
@@ -93,8 +87,33 @@ def gradient_of_depth(depth_mm: Tensor, mm_per_pixel: float) -> Tensor:
     return torch.cat((z_x[..., 2:] - z_x[..., :-2], z_y[:, :, 2:] - z_y[:, :, :-2]), dim=1)
 
 
+def slope_of_depth(depth_mm: Tensor, mm_per_pixel: float) -> Tensor:
+    """Central differences of depth that do not reach across a cliff.
+
+    Where the differences to the two neighbours are more than :data:`CLIFF_SLOPE` apart, the smaller one counts. At the image's
+    border the outer difference is zero.
+
+    Args:
+        depth_mm: (B, 1, H, W), mm.
+        mm_per_pixel: pixel pitch, mm.
+    Returns:
+        (B, 2, H, W), mm per mm.
+    """
+    padded = nn.functional.pad(depth_mm, [1, 1, 1, 1], mode="replicate") / mm_per_pixel
+    along_x, along_y = padded[..., 1:-1, 1:] - padded[..., 1:-1, :-1], padded[..., 1:, 1:-1] - padded[..., :-1, 1:-1]
+    p = slope_beside_cliff(along_x[..., :-1], along_x[..., 1:])
+    q = slope_beside_cliff(along_y[..., :-1, :], along_y[..., 1:, :])
+    return torch.cat((p, q), dim=1)
+
+
+def slope_beside_cliff(one: Tensor, other: Tensor, most: float = CLIFF_SLOPE) -> Tensor:
+    """The mean of two slopes, or the smaller one where they differ by more than ``most``: a cliff must lie on one side."""
+    smaller = torch.where(one.abs() < other.abs(), one, other)
+    return torch.where((one - other).abs() < most, 0.5 * (one + other), smaller)
+
+
 class GradientFromNormal(nn.Module):
-    """Module face of :func:`gradient_from_normal`."""
+    """Module for :func:`gradient_from_normal`."""
 
     def __init__(self, max_slope: float = MAX_SLOPE) -> None:
         super().__init__()

@@ -37,7 +37,7 @@ from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, count_frames, read_imag
 from ..core.geometry import depth_to_points
 from ..model.calibration import Calibration
 from ..model.sensor import Sensor
-from ..pipeline.depth import MODES, DepthOutput, DepthPipeline
+from ..pipeline import MODES, DepthOutput, DepthPipeline
 from .ranks import Ranks
 
 STATE = ".torchvts"

@@ -195,7 +195,11 @@ class _Examination:
         unit = self.calibration
         if unit.lights is None or change.name not in ("light_field", "light_moved", "skin_changed", "pitch", "distortion"):
             return False
-        compensated = (unit.model_image / unit.lit.clamp_min(1e-6)).float() if unit.measured else torch.ones_like(self.light)
+        compensated = (
+            (unit.model_image / unit.background_without_ambient.clamp_min(1e-6)).float()
+            if unit.measured
+            else torch.ones_like(self.light)
+        )
         light = change.predicted(self.light, unit) * compensated
         normal = (unit.inverse.float() * light[None]).sum(1)
         length, tilt = normal.norm(dim=0) - 1.0, normal[:2].norm(dim=0)
@@ -237,15 +241,15 @@ class _Examination:
         return found
 
     def _lit_value(self) -> Tensor:
-        return self.calibration.lit.float().clamp(0.0, 1.0) ** (1.0 / self.exponent)
+        return self.calibration.background_without_ambient.float().clamp(0.0, 1.0) ** (1.0 / self.exponent)
 
     def _model(self) -> Tensor:
         """The lights' own image, with the fall-off of the lens that calibration found."""
         unit = self.calibration
         model = unit.model_image.float()
-        told = unit.report.get("vignetting", [])
-        if isinstance(told, list) and any(told):
-            model = model * falloff(outwardness(unit.sensor), *[float(v) for v in told[:2]]).float()
+        vignetting = unit.report.get("vignetting", 0.0)
+        if vignetting != 0.0:
+            model = model * falloff(outwardness(unit.sensor), vignetting).float()
         return model
 
     def _contact_at_rest(self, which: str, value: float) -> Finding:

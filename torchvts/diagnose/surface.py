@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..compensate.compensate import Compensate
-from ..contact.masks import ContactMask
+from ..compensate import Compensate
+from ..contact import ContactMask
 from ..core.blur import blur, gaussian_weights
 from ..core.checks import QUANTISATION_STD
 from ..core.geometry import GradientFromNormal
@@ -20,7 +20,7 @@ from ..integration import PoissonBackground
 from ..model.calibration import Calibration
 from ..model.lights import PointLights, inverse_light_matrix
 from ..normals import NormalFromIntensity, NormalFromResponse
-from ..pipeline.depth import DepthOutput, DepthPipeline
+from ..pipeline import DepthOutput, DepthPipeline
 
 SPREADS_PX = (1.5, 3.0, 6.0)
 """Blurs that the normals are looked at for, pixels of a 160 x 120 image and in proportion of others."""

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ..accelerated import reference, reference_only
 from ..core import __version__
 from ..core.checks import (
     check_batch,
@@ -30,15 +31,15 @@ from ..core.checks import (
     check_record,
     check_sequence,
     check_size,
-    check_window,
 )
 from ..core.files import check_target, write_atomically
+from ..core.frame import Crop
 from ..core.geometry import pixel_grid_mm
-from ..core.native import reference_only
-from ..integration import PoissonBackground, PoissonDCT, divergence
+from ..integration import Integrator, PoissonDCT, divergence
+from ..integration.base import embedded
 from ..integration.transforms import cosine_bases, fold, unfold
 from ..model.calibration import Calibration, check_calibration
-from ..pipeline.depth import DepthPipeline
+from ..pipeline import Adaptive, DepthPipeline, Shadows
 
 METADATA_KEY = "torchvts"
 """Under this name the files keep what they are, as JSON: :func:`describe`."""
@@ -49,7 +50,7 @@ MAX_BATCH = 1024
 """Largest batch that the graph formats promise to take."""
 
 
-class PoissonBackgroundByMatrix(nn.Module):
+class PoissonBackgroundByMatrix(Integrator):
     """:class:`PoissonBackground` for one size, by matrix products alone: ONNX has no such FFT.
 
     Args:
@@ -82,16 +83,11 @@ class PoissonBackgroundByMatrix(nn.Module):
                 inverse = torch.where(value == 0.0, torch.zeros_like(value), 1.0 / value)  # zero: the mean
                 self.register_buffer(f"inverse_{y}_{x}", inverse.to(dtype))
 
-    takes_window: bool = True
-
-    def forward(self, gradient: Tensor, window: tuple[int, int] = (0, 0), size: tuple[int, int] | None = None) -> Tensor:
+    def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
         check_batch("gradient", gradient, 2)
         if size is not None and size != self.size:
             raise ValueError(f"gradient, window: expected size {self.size}, for which the matrices are, got {size}")
-        check_window("gradient", gradient, self.size, None if size is None and window == (0, 0) else window)
-        if size is not None and size != (gradient.shape[2], gradient.shape[3]):
-            after = [size[k] - window[k] - gradient.shape[2 + k] for k in (0, 1)]
-            gradient = nn.functional.pad(gradient, [window[1], after[1], window[0], after[0]])
+        gradient = embedded(gradient, window, self.size)
         up, down = fold(divergence(gradient), -2)
         rows = []
         for y, part in (("even", up), ("odd", down)):
@@ -458,22 +454,42 @@ def _size(pipe: DepthPipeline) -> tuple[int, int, torch.dtype]:
 
 def _trace(pipe: DepthPipeline, by_matrix: bool) -> torch.export.ExportedProgram:
     height, width, dtype = _size(pipe)
-    pipe = copy.deepcopy(pipe).eval().requires_grad_(False)
-    if by_matrix and isinstance(pipe.integrate, PoissonDCT):
-        pipe.integrate = PoissonBackgroundByMatrix(height, width, pipe.mm_per_pixel, dtype, pipe.integrate.levelled)
-    if by_matrix and isinstance(pipe.coarse_integrate, PoissonBackground):
-        rows, columns = (len(range(pipe.stride // 2, n, pipe.stride)) for n in (height, width))
-        pipe.coarse_integrate = PoissonBackgroundByMatrix(rows, columns, pipe.stride * pipe.mm_per_pixel, dtype)
-    if by_matrix and isinstance(pipe.judge, PoissonBackground):
-        pipe.judge = PoissonBackgroundByMatrix(height, width, pipe.mm_per_pixel, dtype)
+    pipe = copy.deepcopy(reference(pipe)).eval().requires_grad_(False)
+    if by_matrix:
+        _use_matrices(pipe, height, width, dtype)
     images = torch.full((2, 3, height, width), 0.5, dtype=dtype)
     batch = torch.export.Dim("batch", min=1, max=MAX_BATCH)
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        pipe(images)  # integrators make their tables, which then are constants of the graph
-        if pipe.expects:
-            pipe.judge(images[:, :2], (0, 0), (height, width))
+        _make_tables(pipe, images)  # which then are constants of the graph
         return torch.export.export(_PlainOutput(pipe), (images,), dynamic_shapes=({0: batch},), strict=False)
+
+
+def _use_matrices(pipe: DepthPipeline, height: int, width: int, dtype: torch.dtype) -> None:
+    """Put matrix products in place of the FFT solvers of a pipeline."""
+    solve, policy = pipe.solve, pipe.refine
+    if isinstance(solve.integrate, PoissonDCT):
+        zero = solve.integrate.zero_in_background
+        solve.integrate = PoissonBackgroundByMatrix(height, width, pipe.mm_per_pixel, dtype, zero)
+    if isinstance(policy, Shadows):
+        policy.residual_integrator = PoissonBackgroundByMatrix(height, width, pipe.mm_per_pixel, dtype)
+        policy = policy.policy
+    if isinstance(policy, Adaptive):
+        rows, columns = (len(range(policy.stride // 2, n, policy.stride)) for n in (height, width))
+        policy.coarse_integrate = PoissonBackgroundByMatrix(rows, columns, policy.stride * pipe.mm_per_pixel, dtype)
+
+
+def _make_tables(pipe: DepthPipeline, images: Tensor) -> None:
+    """Let each integrator make the tables of its size."""
+    height, width = images.shape[2], images.shape[3]
+    pipe(images)
+    policy = pipe.refine
+    if isinstance(policy, Shadows):
+        policy.residual_integrator(images[:, :2], (0, 0), (height, width))
+        policy = policy.policy
+    if isinstance(policy, Adaptive):
+        frame = Crop(policy.stride, False)(images, torch.ones_like(images[:, :1], dtype=torch.bool))
+        policy.predicted_change_px(frame, pipe.solve(frame))
 
 
 def _onnx_decompositions() -> dict[Any, Callable[..., Any]]:

@@ -1,5 +1,6 @@
-"""Floor 2: from gradient to depth."""
+"""From gradient to depth."""
 
+from .base import Integrator, WrappedIntegrator, as_integrator
 from .discontinuities import (
     AdaptiveIntegration,
     DiscontinuityIntegration,
@@ -15,10 +16,13 @@ __all__ = [
     "AdaptiveIntegration",
     "DiscontinuityIntegration",
     "DiscontinuitySolution",
+    "Integrator",
     "PerspectiveIntegration",
     "PoissonBackground",
     "PoissonDCT",
     "PoissonDST",
+    "WrappedIntegrator",
+    "as_integrator",
     "discontinuity_share",
     "divergence",
     "integrate_discontinuities",

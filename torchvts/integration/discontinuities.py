@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from ..core.checks import check_batch, check_integer, check_positive, check_same_size, check_shape, check_window
+from .base import Integrator
 from .poisson import PoissonBackground, check_gradient, laplace_plan, solve_laplace
 
 SLOPE_STD = 0.05
@@ -99,7 +100,7 @@ def integrate_discontinuities(
     return DiscontinuityIntegration(mm_per_pixel).solve(gradient, contact, weight, known_mm, known_weight).depth_mm
 
 
-class DiscontinuityIntegration(nn.Module):
+class DiscontinuityIntegration(Integrator):
     """Module face of :func:`integrate_discontinuities`; takes a window as :class:`PoissonDCT` does.
 
     Args:
@@ -111,8 +112,6 @@ class DiscontinuityIntegration(nn.Module):
         residual: of a solve, relative, in the preconditioner's norm.
         tolerance_px: the depth stands still when no pixel moves by more, in pixels of pitch.
     """
-
-    takes_window: bool = True
 
     def __init__(
         self,
@@ -321,7 +320,7 @@ def discontinuity_share(gradient: Tensor, depth_mm: Tensor, mm_per_pixel: float 
     return torch.maximum(wrong, 0.1 * odd) / count.clamp_min(1.0)
 
 
-class AdaptiveIntegration(nn.Module):
+class AdaptiveIntegration(Integrator):
     """PoissonBackground, and :class:`DiscontinuityIntegration` for frames whose :func:`discontinuity_share` is above ``share``.
 
     Takes PoissonBackground's place in a pipeline, windows too. Frames of a batch do not influence one another.
@@ -331,13 +330,13 @@ class AdaptiveIntegration(nn.Module):
         torch.Size([1, 1, 8, 8])
     """
 
-    takes_window: bool = True
+    poisson = PoissonBackground
 
     def __init__(self, mm_per_pixel: float = 1.0, *, share: float = 0.001) -> None:
         super().__init__()
         self.share = check_positive("share", share, 1.0)
         self.mm_per_pixel = mm_per_pixel
-        self.smooth = PoissonBackground(mm_per_pixel)
+        self.smooth = self.poisson(mm_per_pixel)
         self.cliffs = DiscontinuityIntegration(mm_per_pixel)
 
     def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:

@@ -11,8 +11,9 @@ dw/dv likewise with q. w is depth to first order, zero where z is, and z = h (1 
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_positive, check_record, check_window
+from ..core.checks import check_positive, check_window
 from ..core.geometry import pixel_grid_mm
+from .base import Integrator, as_integrator
 from .poisson import PoissonBackground, check_gradient
 
 LEAST_COSINE = 0.05
@@ -41,26 +42,25 @@ def integrate_perspective(gradient: Tensor, mm_per_pixel: float, camera_height_m
     return depth
 
 
-class PerspectiveIntegration(nn.Module):
-    """Module face of :func:`integrate_perspective`; takes PoissonBackground's place in a pipeline, windows too.
+class PerspectiveIntegration(Integrator):
+    """Module for :func:`integrate_perspective`; takes PoissonBackground's place in a pipeline.
 
     Its normals should know of the camera as well: ``NormalFromIntensity.from_calibration(calibration, camera_height_mm)``.
 
     Args:
-        mm_per_pixel, camera_height_mm: as the function's.
-        integrate: any integrator that takes windows; None for PoissonBackground.
+        mm_per_pixel: pixel pitch in mm, on the undeformed skin.
+        camera_height_mm: of the camera above the undeformed skin.
+        integrate: any integrator; None for PoissonBackground.
     """
 
-    takes_window: bool = True
+    poisson = PoissonBackground
 
     def __init__(self, mm_per_pixel: float, camera_height_mm: float, integrate: nn.Module | None = None) -> None:
         super().__init__()
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         self.camera_height_mm = check_positive("camera_height_mm", camera_height_mm)
         self.least_facing_mm = LEAST_COSINE * self.camera_height_mm
-        if integrate is not None:
-            check_record("integrate", integrate, nn.Module, "PoissonBackground(mm_per_pixel) is one")
-        self.integrate = PoissonBackground(mm_per_pixel) if integrate is None else integrate
+        self.integrate = self.poisson(mm_per_pixel) if integrate is None else as_integrator(integrate)
 
     def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
         check_gradient(gradient, 2)

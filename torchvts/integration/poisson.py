@@ -8,14 +8,11 @@ exact inverses of one discrete operator.
 import torch
 from torch import Tensor, nn
 
-from ..core import native
 from ..core.checks import check_batch, check_positive, check_window
-from ..core.native import may_use_native
+from .base import Integrator, embedded
 from .transforms import (
-    cosine_bases,
     cosine_tables,
     deinterleave,
-    fft_is_fast,
     fold,
     interleave,
     inverse_or_zero,
@@ -96,11 +93,11 @@ def poisson_dct(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
 
 
 def poisson_background(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
-    r"""Integrate a gradient map into depth with a free border that is zero on average where the gradient is zero.
+    r"""Integrate a gradient map into depth with a free border that is zero on average in the background.
 
-    :func:`poisson_dct`, levelled by the skin at rest: pixels whose gradient is exactly zero, as outside a contact mask. It
+    :func:`poisson_dct` with its zero at the undeformed skin: pixels whose gradient is exactly zero, as outside a contact mask. It
     equals :func:`poisson_dst` for contact inside the image and stays right for contact that the image border cuts. Without
-    any pixel at rest, the lowest depth is zero.
+    any such pixel, the lowest depth is zero.
 
     Args:
         gradient: (B, 2, H, W), (dz/dx, dz/dy), mm per mm.
@@ -119,15 +116,16 @@ def poisson_background(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
     return _integrate_dct(gradient, mm_per_pixel, _plan_dct(gradient, gradient.shape[2], gradient.shape[3]), 0, 0, True)
 
 
-class PoissonDST(nn.Module):
-    """Module face of :func:`poisson_dst`; keeps the plan of the last size, so that a stream of frames makes it once."""
+class PoissonDST(Integrator):
+    """Module for :func:`poisson_dst`; keeps the tables of the last size, so that a stream of frames makes them once."""
 
     def __init__(self, mm_per_pixel: float = 1.0) -> None:
         super().__init__()
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         self._plan: list[Tensor] = _plan_dst(torch.zeros(1, 2, 3, 3))
 
-    def forward(self, gradient: Tensor) -> Tensor:
+    def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
+        gradient = embedded(gradient, window, size)
         check_gradient(gradient, 3)
         plan = self._plan
         if not _plan_fits(plan, gradient, gradient.shape[2], gradient.shape[3]):
@@ -136,19 +134,17 @@ class PoissonDST(nn.Module):
         return _integrate_dst(gradient, self.mm_per_pixel, plan)
 
 
-class PoissonDCT(nn.Module):
-    """Module face of :func:`poisson_dct`; keeps the plan of the last size, so that a stream of frames makes it once.
+class PoissonDCT(Integrator):
+    """Module for :func:`poisson_dct`; keeps the tables of the last size, so that a stream of frames makes them once.
 
     Given ``window`` (top, left) and ``size`` (height, width), the gradient is that of a part of an image of that size whose first
     pixel is there, and zero elsewhere; the depth is that of the whole image, exactly: only work on zeros is saved.
     """
 
-    takes_window: bool = True
-
     def __init__(self, mm_per_pixel: float = 1.0) -> None:
         super().__init__()
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
-        self.levelled = False
+        self.zero_in_background = False
         self._plan: list[Tensor] = _plan_dct(torch.zeros(1, 2, 2, 2), 2, 2)
 
     def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
@@ -159,24 +155,30 @@ class PoissonDCT(nn.Module):
         if not _plan_fits(plan, gradient, height, width):
             plan = _kept(_plan_dct(gradient, height, width))
             self._plan = plan
-        return _integrate_dct(gradient, self.mm_per_pixel, plan, top, left, self.levelled)
+        if gradient.shape[0] == 0:
+            return gradient.new_zeros([0, 1, height, width])
+        return self.integrate(gradient, plan, top, left)
+
+    def integrate(self, gradient: Tensor, plan: list[Tensor], top: int, left: int) -> Tensor:
+        """Depth by the tables of a plan; compiled kernels take the place of this method."""
+        return _integrate_dct(gradient, self.mm_per_pixel, plan, top, left, self.zero_in_background)
 
 
 class PoissonBackground(PoissonDCT):
-    """Module face of :func:`poisson_background`; keeps the plan and takes a window as :class:`PoissonDCT` does."""
+    """Module for :func:`poisson_background`; keeps the tables and takes a window as :class:`PoissonDCT` does."""
 
     def __init__(self, mm_per_pixel: float = 1.0) -> None:
         super().__init__(mm_per_pixel)
-        self.levelled = True
+        self.zero_in_background = True
 
 
-def _level(depth: Tensor, gradient: Tensor, top: int, left: int) -> Tensor:
+def _zero_in_background(depth: Tensor, gradient: Tensor, top: int, left: int) -> Tensor:
     """Zero on average where the gradient is; ``gradient`` is that of a window, zero elsewhere. The depth has zero mean."""
     height, width = gradient.shape[2], gradient.shape[3]
-    touched = ((gradient[:, 0:1] != 0) | (gradient[:, 1:2] != 0)).to(depth.dtype)
+    inclined = ((gradient[:, 0:1] != 0) | (gradient[:, 1:2] != 0)).to(depth.dtype)
     pixels = float(depth.shape[2] * depth.shape[3])
-    inside = depth[..., top : top + height, left : left + width] * touched
-    count = pixels - touched.sum(dim=(2, 3), keepdim=True)
+    inside = depth[..., top : top + height, left : left + width] * inclined
+    count = pixels - inclined.sum(dim=(2, 3), keepdim=True)
     mean = -inside.sum(dim=(2, 3), keepdim=True) / count.clamp_min(1.0)
     if height == depth.shape[2] and width == depth.shape[3]:
         mean = torch.where(count > 0, mean, depth.amin(dim=(2, 3), keepdim=True))
@@ -198,36 +200,25 @@ def _integrate_dst(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor]) ->
     return mm_per_pixel * nn.functional.pad(z, [1, 1, 1, 1])
 
 
-def _integrate_dct(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], top: int, left: int, levelled: bool) -> Tensor:
-    if gradient.shape[0] == 0:
-        return gradient.new_zeros([0, 1, int(plan[-2].shape[0]), int(plan[-1].shape[0])])
-    if len(plan) == 7 and may_use_native([gradient, plan[2]]):
-        return _by_loops(gradient, mm_per_pixel, plan, (top, left), levelled)
-    depth = _by_operators(gradient, mm_per_pixel, plan, top, left)
-    return _level(depth, gradient, top, left) if levelled else depth
+def _integrate_dct(
+    gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], top: int, left: int, zero_in_background: bool
+) -> Tensor:
+    right = _right_side(gradient, mm_per_pixel, top, left, int(plan[-2].shape[0]), int(plan[-1].shape[0]))
+    depth = _solve_by_fft(right, plan, max(0, top - 1))
+    return _zero_in_background(depth, gradient, top, left) if zero_in_background else depth
 
 
-@torch.jit.unused
-def _by_loops(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], window: tuple[int, int], levelled: bool) -> Tensor:
-    return native.solve_poisson(gradient, mm_per_pixel, plan, window, levelled)
-
-
-def _by_operators(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], top: int, left: int) -> Tensor:
-    height, width = int(plan[-2].shape[0]), int(plan[-1].shape[0])
+def _right_side(gradient: Tensor, mm_per_pixel: float, top: int, left: int, height: int, width: int) -> Tensor:
+    """The divergence of a window's gradient, in the rows that are not zero and all columns of the whole image."""
     if gradient.shape[2] < height or gradient.shape[3] < width:  # one more pixel, where the edges out of the window end
         above, before = min(top, 1), min(left, 1)
         below = min(height - top - gradient.shape[2], 1)
         after = min(width - left - gradient.shape[3], 1)
         gradient = nn.functional.pad(gradient, [before, after, above, below])
-        top, left = top - above, left - before
+        left = left - before
     right = mm_per_pixel * divergence(gradient)
     after = width - left - right.shape[3]
-    if left > 0 or after > 0:
-        right = nn.functional.pad(right, [left, after])
-    if len(plan) == 7:
-        return _solve_by_fft(right, plan, top)
-    below = height - top - right.shape[2]
-    return _solve(nn.functional.pad(right, [0, 0, top, below]), plan)
+    return nn.functional.pad(right, [left, after]) if left > 0 or after > 0 else right
 
 
 def laplace_plan(like: Tensor) -> list[Tensor]:
@@ -237,21 +228,16 @@ def laplace_plan(like: Tensor) -> list[Tensor]:
 
 def solve_laplace(right: Tensor, plan: list[Tensor]) -> Tensor:
     """(B, 1, H, W) of zero mean whose five-point Laplacian with a free border is ``right`` less its mean."""
-    return _solve_by_fft(right, plan, 0) if len(plan) == 7 else _solve(right, plan)
+    return _solve_by_fft(right, plan, 0)
 
 
 def _kept(plan: list[Tensor]) -> list[Tensor]:
-    """A plan as calls keep it that come later and may record gradients: made under inference mode, tensors would refuse to."""
+    """A plan that later calls, which may record gradients, can use: tensors made under inference mode refuse that."""
     if not torch.jit.is_scripting():  # noqa: SIM102
         if torch.is_inference_mode_enabled():
-            return _outside_of_inference_mode(plan)
+            with torch.inference_mode(False):
+                return [table.clone() for table in plan]
     return plan
-
-
-@torch.jit.unused
-def _outside_of_inference_mode(plan: list[Tensor]) -> list[Tensor]:
-    with torch.inference_mode(False):
-        return [table.clone() for table in plan]
 
 
 def _plan_dst(gradient: Tensor) -> list[Tensor]:
@@ -261,16 +247,12 @@ def _plan_dst(gradient: Tensor) -> list[Tensor]:
 
 
 def _plan_dct(gradient: Tensor, height: int, width: int) -> list[Tensor]:
-    """Tables for the FFT where both lengths suit it, else matrices; 480 x 640: 1.7 against 3.1 ms on two cores."""
+    """The seven tables of :func:`_solve_by_fft`."""
     order = [reordering(height).to(gradient.device), reordering(width).to(gradient.device)]
-    if fft_is_fast(height) and fft_is_fast(width):
-        kind = torch.complex128 if gradient.dtype == torch.float64 else torch.complex64
-        there, back, of_sum, of_difference, back_y = cosine_tables(height, width)
-        tables = [there.to(kind), back.to(kind), of_sum.to(gradient.dtype), of_difference.to(gradient.dtype), back_y]
-        return [table.to(gradient.device) for table in tables] + order
-    even_y, odd_y, value_even_y, value_odd_y = cosine_bases(height)
-    even_x, odd_x, value_even_x, value_odd_x = cosine_bases(width)
-    return _plan([even_y, odd_y], [value_even_y, value_odd_y], [even_x, odd_x], [value_even_x, value_odd_x], gradient) + order
+    kind = torch.complex128 if gradient.dtype == torch.float64 else torch.complex64
+    there, back, of_sum, of_difference, back_y = cosine_tables(height, width)
+    tables = [there.to(kind), back.to(kind), of_sum.to(gradient.dtype), of_difference.to(gradient.dtype), back_y]
+    return [table.to(gradient.device) for table in tables] + order
 
 
 def _plan(
@@ -295,7 +277,7 @@ def _plan_fits(plan: list[Tensor], gradient: Tensor, height: int, width: int) ->
 
 
 def _solve(right: Tensor, plan: list[Tensor]) -> Tensor:
-    """Depth of unit pitch whose Laplacian is ``right``: transform, divide, transform back, each parity by itself."""
+    """Depth of unit pitch whose Laplacian is ``right``, zero on the border: each parity is transformed and divided by itself."""
     up, down = fold(right, -2)
     up_even, up_odd = fold(up, -1)
     down_even, down_odd = fold(down, -1)
@@ -307,7 +289,7 @@ def _solve(right: Tensor, plan: list[Tensor]) -> Tensor:
 
 
 def _solve_by_fft(right: Tensor, plan: list[Tensor], top: int) -> Tensor:
-    """The same as :func:`_solve` for the cosine family, by one real FFT there and one back; rows not given are zero."""
+    """The same with a free border, by one real FFT there and one back; ``right`` starts at row ``top``, other rows are zero."""
     there, back, of_sum, of_difference, back_y, order_y = plan[0], plan[1], plan[2], plan[3], plan[4], plan[5]
     height, width = int(order_y.shape[0]), right.shape[-1]
     lines = torch.fft.rfft(interleave(right)).transpose(2, 3)  # (B, 1, W // 2 + 1, h): columns are contiguous from here on

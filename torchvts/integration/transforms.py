@@ -63,14 +63,6 @@ def unfold(even: Tensor, odd: Tensor, dim: int) -> Tensor:
     return torch.cat((paired + odd, middle, (paired - odd).flip(dim)), dim=dim)
 
 
-def fft_is_fast(length: int) -> bool:
-    """Whether a length has no prime factor above 7."""
-    for prime in [2, 3, 5, 7]:
-        while length % prime == 0:
-            length = length // prime
-    return length == 1
-
-
 def cosine_tables(height: int, width: int) -> list[Tensor]:
     r"""Tables for solving with the cosine family by one real FFT there and one back.
 

@@ -1,9 +1,10 @@
-"""What a sensor and a unit are: description, lights, response fields, the record of a calibration, gs_sdk's formats."""
+"""What a sensor and a unit are: description, lights, response fields, a calibration and its report, gs_sdk's formats."""
 
 from . import gs_sdk
 from .calibration import Calibration, check_calibration
 from .lights import PointLights, near_field_shading
 from .markers import FillMarkers, fill_markers, find_markers
+from .report import Report
 from .response_field import ResponseField, ResponseModel, SensorPrior
 from .sensor import Sensor, check_sensor, shipped_sensors
 
@@ -11,6 +12,7 @@ __all__ = [
     "Calibration",
     "FillMarkers",
     "PointLights",
+    "Report",
     "ResponseField",
     "ResponseModel",
     "Sensor",

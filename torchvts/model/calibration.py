@@ -1,8 +1,9 @@
-"""What is known of a calibrated unit: the paper's database, in memory and as one file."""
+"""A calibrated unit: sensor, background and inverse model, in memory and as one file (the paper's database)."""
 
 import dataclasses
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,33 +16,40 @@ from ..core.files import image_from_bytes, image_to_bytes, load_tensors, save_te
 from ..core.noise import noise_std
 from .lights import PointLights, flat_image, inverse_light_matrix
 from .markers import FillMarkers
+from .report import Report, read_report
 from .response_field import ResponseModel
 from .sensor import Sensor, check_sensor
 
-FORMAT_VERSION = 4
-"""Raised when a file of an older version can no longer be read as it is, or an older torchvts cannot read a new one."""
+FORMAT_VERSION = 5
+"""Version of the calibration file. A file of another version is refused."""
 
 DEFECT_RATIO = 4.0
-"""A pixel whose background is this factor darker or brighter than expected tells nothing: it is inpainted."""
+"""A pixel whose background is this factor darker or brighter than expected is a defect: it is inpainted."""
 
 PEDESTAL = 0.03
-"""Added to image and background before response fields take their ratio: where a lamp does not reach, a ratio is all noise."""
+"""Added to image and background before response fields take their ratio: where an LED does not reach, a ratio is all noise."""
+
+SATURATED = 0.995
+"""Image value from which a channel is saturated."""
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A calibrated unit: the sensor, its inverse model (three lights, or a response), and its image at rest.
+    """A calibrated unit: the sensor, its inverse model (three lights, or a response), and its background.
+
+    Derived arrays (``gain``, ``inverse`` and so on) are computed once, at first use. Treat all tensors as read-only:
+    ``dataclasses.replace`` makes a changed calibration.
 
     Attributes:
         sensor: the sensor it belongs to.
         lights: the three lights (S and rho of the paper), if they are the model; else None.
-        background: (3, H, W) linear light of the unit at rest; the model's own where no image was given.
+        background: (3, H, W), linear light without contact; the image of the model where no image was given.
         noise_std: (3,), noise of an image, in image value.
-        measured: whether ``background`` is an image of the unit.
-        report: how it was made, plain JSON: model, convergence, figures, warnings.
+        measured: whether ``background`` comes from an image of the unit.
+        report: how the calibration was made, see :class:`torchvts.model.report.Report`.
         response: the response fields, if they are the model; else None.
         markers: the block that fills printed markers before anything else, or None.
-        ambient: (3,), constant linear light that the lights do not give, taken off before the gain; None for none.
+        ambient: (3,), constant linear light that the lights do not give, subtracted before the gain; None for none.
     """
 
     sensor: Sensor
@@ -49,7 +57,7 @@ class Calibration:
     background: Tensor
     noise_std: Tensor
     measured: bool
-    report: dict[str, Any] = field(default_factory=dict)
+    report: Report
     response: ResponseModel | None = None
     markers: FillMarkers | None = None
     ambient: Tensor | None = None
@@ -60,16 +68,17 @@ class Calibration:
         lights: PointLights,
         sensor: Sensor,
         background: Tensor | None = None,
-        report: dict[str, Any] | None = None,
+        report: Report | dict[str, Any] | None = None,
         ambient: Tensor | None = None,
     ) -> "Calibration":
-        """A calibration from known lights: nothing is fitted.
+        """Make a calibration from known lights. Nothing is fitted.
 
         Args:
-            lights: the three lights. sensor: the sensor.
-            background: (3, H, W) image at rest in [0, 1], if there is one: it gives the constant defects and the noise.
-            report: kept with the calibration.
-            ambient: (3,) constant linear light per channel, at least 0; None for none.
+            lights: the three lights.
+            sensor: the sensor.
+            background: (3, H, W), image without contact in [0, 1], if there is one. It gives defects, gain and noise.
+            report: kept with the calibration; model "point_lights" and source "given" unless it says otherwise.
+            ambient: (3,), constant linear light per channel, at least 0; None for none.
         Raises:
             ValueError, TypeError: background or ambient of another shape or range.
         Example:
@@ -81,7 +90,7 @@ class Calibration:
         check_sensor("sensor", sensor)
         sensor = dataclasses.replace(sensor, gamma=sensor.exponent, prior=None)
         frozen = PointLights(*(t.detach().cpu() for t in (lights.position_mm, lights.albedo, lights.gloss))).requires_grad_(False)
-        report = report or {"model": "point_lights", "lights": "given"}
+        summary = read_report({"model": "point_lights", "source": "given"} | dict(report or {}), "report")
         if ambient is not None:
             check_tensor("ambient", ambient)
             ambient = ambient.detach().cpu().to(frozen.position_mm.dtype)
@@ -91,20 +100,21 @@ class Calibration:
             model = flat_image(frozen, sensor.height, sensor.width, sensor.mm_per_pixel)
             model = model if ambient is None else model + ambient.reshape(3, 1, 1)
             noise = torch.full((3,), QUANTISATION_STD, dtype=model.dtype)
-            return cls(sensor, frozen, model, noise, False, report, None, None, ambient)
-        light, noise, markers = _at_rest(background, sensor, frozen.position_mm.dtype)
-        return cls(sensor, frozen, light, noise, True, report, None, markers, ambient)
+            return cls(sensor, frozen, model, noise, False, summary, None, None, ambient)
+        light, noise, markers = _measure(background, sensor, frozen.position_mm.dtype)
+        return cls(sensor, frozen, light, noise, True, summary, None, markers, ambient)
 
     @classmethod
     def from_response(
-        cls, response: ResponseModel, sensor: Sensor, background: Tensor, report: dict[str, Any] | None = None
+        cls, response: ResponseModel, sensor: Sensor, background: Tensor, report: Report | dict[str, Any] | None = None
     ) -> "Calibration":
-        """A calibration from known response fields, such as another unit's of the same type: nothing is fitted.
+        """Make a calibration from known response fields, such as those of another unit of the same type. Nothing is fitted.
 
         Args:
-            response: the fields. sensor: the sensor; its gamma and blur give way to those of the response.
-            background: (3, H, W) image at rest in [0, 1].
-            report: kept with the calibration.
+            response: the fields.
+            sensor: the sensor; gamma and blur of the response replace its own.
+            background: (3, H, W), image without contact in [0, 1].
+            report: kept with the calibration; model "response" and source "given" unless it says otherwise.
         Raises:
             ValueError, TypeError: background of another shape or range.
         Example:
@@ -118,64 +128,73 @@ class Calibration:
         check_sensor("sensor", sensor)
         check_image("background", background, sensor.height, sensor.width, sensor.name)
         sensor = dataclasses.replace(sensor, gamma=response.gamma, blur_px=response.blur_px, prior=None)
-        light, noise, markers = _at_rest(background, sensor, background.dtype)
-        return cls(sensor, None, light, noise, True, report or {"model": "response", "response": "given"}, response, markers)
+        summary = read_report({"model": "response", "source": "given"} | dict(report or {}), "report")
+        light, noise, markers = _measure(background, sensor, background.dtype)
+        return cls(sensor, None, light, noise, True, summary, response, markers)
 
     def __repr__(self) -> str:
-        sensor, made = self.sensor, "an image" if self.measured else "the lights alone"
-        model = (
-            f"response fields ({self.report.get('response', 'given')})" if self.lights is None else f"point lights, {self.lights}"
-        )
+        sensor, origin = self.sensor, "an image" if self.measured else "the lights alone"
+        source = self.report.get("source", "given").replace("_", " ")
+        model = f"response fields ({source})" if self.lights is None else f"point lights, {self.lights}"
         size = f"{sensor.height} x {sensor.width}, {sensor.mm_per_pixel:g} mm per pixel"
-        return f"Calibration({sensor.name!r}, {size}, from {made}: {model})"
+        return f"Calibration({sensor.name!r}, {size}, from {origin}: {model})"
 
-    @property
+    def __getstate__(self) -> dict[str, Any]:
+        """The fields without the cached arrays, so that pickles and copies stay small."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
+    @cached_property
     def flat(self) -> Tensor:
-        """(3, H, W), what the compensated image is at rest: the lights' own image; 1 for a response field."""
+        """(3, H, W), compensated image of the undeformed skin: ``model_image`` for lights, 1 for a response field."""
         return self.model_image if self.response is None else torch.ones_like(self.background)
 
-    @property
+    @cached_property
     def gain(self) -> Tensor | None:
-        """(3, H, W), compensated / linear light; None where nothing was measured."""
+        """(3, H, W), compensated / linear light; None where no background was measured."""
         if not self.measured:
             return None
         if self.response is not None:
             return 1.0 / (self.background + PEDESTAL)
-        gain = (self.model_image / self.lit.clamp_min(1e-6)).clamp(1.0 / DEFECT_RATIO, DEFECT_RATIO)
-        full = self.beyond_full
-        if full is None:
+        light = self.background_without_ambient.clamp_min(1e-6)
+        gain = (self.model_image / light).clamp(1.0 / DEFECT_RATIO, DEFECT_RATIO)
+        saturated = self.saturated_model
+        if saturated is None:
             return gain
-        usual = torch.stack([channel[beyond == 0].median() for channel, beyond in zip(gain, full, strict=True)])
-        return torch.where(full > 0, usual.nan_to_num(1.0)[:, None, None], gain)
+        usual = torch.stack([channel[model == 0].median() for channel, model in zip(gain, saturated, strict=True)])
+        return torch.where(saturated > 0, usual.nan_to_num(1.0)[:, None, None], gain)
 
-    @property
-    def full_light(self) -> float:
-        """Linear light from which a channel may be full: 99.5 % of what the camera can say, less its noise."""
-        return float(0.995**self.sensor.exponent) - 3.0 * float(self.light_noise_std.max())
+    @cached_property
+    def saturation_light(self) -> float:
+        """Linear light from which a channel may be saturated: that of 99.5 % of the largest image value, less the noise."""
+        return float(SATURATED**self.sensor.exponent) - 3.0 * float(self.light_noise_std.max())
 
-    @property
-    def beyond_full(self) -> Tensor | None:
-        """(3, H, W), what the lights give at rest where that is more than the camera can tell, 0 elsewhere; None if nowhere.
+    @cached_property
+    def saturated_model(self) -> Tensor | None:
+        """(3, H, W), ``model_image`` where background and model are saturated, 0 elsewhere; None if that is nowhere.
 
-        How bright the skin is there was not measured, so the usual gain of the channel stands for that of these pixels.
+        The brightness of the skin was not measured there, so ``gain`` takes the median of the channel for these pixels.
         """
         if not self.measured or self.lights is None:
             return None
         model = self.model_image
-        beyond = torch.where((self.background >= self.full_light) & (model >= self.full_light), model, 0.0)
-        return beyond if bool((beyond > 0).any()) else None
+        both = (self.background >= self.saturation_light) & (model >= self.saturation_light)
+        saturated = torch.where(both, model, 0.0)
+        return saturated if bool((saturated > 0).any()) else None
 
-    @property
-    def full_above(self) -> Tensor:
-        """(3, H, W), compensated intensity from which a channel counts as saturated: 99.5 % of what the camera can say."""
+    @cached_property
+    def saturated_above(self) -> Tensor:
+        """(3, H, W), compensated intensity from which a channel is saturated: that of 99.5 % of the largest image value."""
         gain, offset = self.gain, self.offset
-        full: Tensor = (0.995**self.sensor.exponent) * (torch.ones_like(self.background) if gain is None else gain)
-        return full if offset is None else full + offset
+        limit: Tensor = (SATURATED**self.sensor.exponent) * (torch.ones_like(self.background) if gain is None else gain)
+        return limit if offset is None else limit + offset
 
-    @property
+    @cached_property
     def offset(self) -> Tensor | None:
-        """(3, H, W), what is added after the gain: with a response field the pedestal, so that the skin at rest becomes 1; with
-        lights minus the ambient light, through the gain."""
+        """(3, H, W), added after the gain; None for none.
+
+        With a response field it is the pedestal's part, so that the background becomes 1. With lights it is minus the
+        ambient light, times the gain.
+        """
         if self.response is not None:
             return PEDESTAL / (self.background + PEDESTAL)
         if self.ambient is None:
@@ -183,21 +202,21 @@ class Calibration:
         offset, gain = -self.ambient.reshape(3, 1, 1), self.gain
         return offset.expand_as(self.background) if gain is None else offset * gain
 
-    @property
-    def lit(self) -> Tensor:
-        """(3, H, W), the background without ambient light."""
+    @cached_property
+    def background_without_ambient(self) -> Tensor:
+        """(3, H, W), background minus ambient light, linear light."""
         return self.background if self.ambient is None else self.background - self.ambient.reshape(3, 1, 1)
 
-    @property
+    @cached_property
     def model_image(self) -> Tensor:
-        """(3, H, W), what the lights give at rest, linear light; with a response field, the background itself."""
+        """(3, H, W), image of the undeformed skin under the lights, linear light; with a response field, the background."""
         if self.lights is None:
             return self.background
         return flat_image(self.lights, self.sensor.height, self.sensor.width, self.sensor.mm_per_pixel)
 
-    @property
+    @cached_property
     def inverse(self) -> Tensor:
-        """Inverse of the light matrix at rest, (3, 3, H, W): normal axis, light, row, column (eq. 9 of the paper).
+        """Inverse of the light matrix of the undeformed skin, (3, 3, H, W): normal axis, light, row, column (eq. 9 of the paper).
 
         Raises:
             ValueError: the model is a response field, which has none.
@@ -207,27 +226,27 @@ class Calibration:
         depth = self.background.new_zeros(1, 1, self.sensor.height, self.sensor.width)
         return inverse_light_matrix(depth, self.lights.position_mm, self.lights.albedo, self.sensor.mm_per_pixel)[0]
 
-    @property
+    @cached_property
     def compensation(self) -> Tensor:
         """I_delta = model - background, (3, H, W), linear light (eq. 7-8 of the paper)."""
         return self.model_image - self.background
 
-    @property
+    @cached_property
     def defects(self) -> Tensor:
         """(H, W) bool: pixels whose background is far from the model, or for a response field from the median around them."""
         if not self.measured:
             return torch.zeros(self.sensor.height, self.sensor.width, dtype=torch.bool)
-        expected, rest, floor = self.model_image, self.lit, 3.0 * self.light_noise_std
+        expected, light, floor = self.model_image, self.background_without_ambient, 3.0 * self.light_noise_std
         if self.lights is None:
             expected = kornia.filters.median_blur(self.background[None], 7)[0]
-        # a pixel that the model itself leaves within the noise cannot be judged
-        far = (rest * DEFECT_RATIO < expected) | (rest > expected * DEFECT_RATIO)
-        found: Tensor = (far & (torch.maximum(expected, rest) > floor)).any(dim=0)
+        # where both model and background are within the noise, nothing can be said
+        far = (light * DEFECT_RATIO < expected) | (light > expected * DEFECT_RATIO)
+        found: Tensor = (far & (torch.maximum(expected, light) > floor)).any(dim=0)
         return found
 
-    @property
+    @cached_property
     def light_noise_std(self) -> Tensor:
-        """(3, H, W), noise of an image in linear light: that of the image value, times the slope of the response."""
+        """(3, H, W), noise of an image in linear light: noise of the image value times the slope of the camera response."""
         noise = self.noise_std.reshape(3, 1, 1)
         gamma = self.sensor.exponent
         if gamma == 1.0:
@@ -235,23 +254,22 @@ class Calibration:
         value = self.background.clamp_min(1e-6) ** (1.0 / gamma)
         return gamma * torch.maximum(value, noise) ** (gamma - 1.0) * noise
 
-    @property
+    @cached_property
     def compensated_noise_std(self) -> Tensor:
-        """(3, H, W), noise of a compensated image: the frame's own and the background's, after gain and blur."""
+        """(3, H, W), noise of a compensated image: that of the frame and of the background, after gain and blur."""
         noise, gain = self.light_noise_std, self.gain
         if gain is not None:
             noise = noise * gain * 2.0**0.5
-        # white noise through a Gaussian of that width; a narrow one takes next to nothing
+        # standard deviation of white noise after a Gaussian blur; a narrow blur changes almost nothing
         return noise * min(1.0, 1.0 / (2.0 * math.sqrt(math.pi) * max(self.sensor.blur_px, 0.1)))
 
     def save(self, path: str | Path) -> None:
         """Write one safetensors file, whole or not at all.
 
-        Tensors, by lights: S, rho, I_delta, the inverse light matrix at rest, the background, the noise, ambient light if there
-        is any. By response: the noise, and the background as a 16-bit PNG of the camera's values, which an 8-bit image survives
-        bit for bit. JSON metadata: the format version, the sensor, the response, the report.
+        Tensors by lights: S, rho, I_delta, the inverse light matrix, the background, the noise, and ambient light if there is
+        any. Tensors by response: the noise, and the background as a 16-bit PNG of the camera's values, which keeps an 8-bit
+        image bit for bit. JSON metadata: format version, sensor, response, markers, report.
         """
-        markers = None if self.markers is None else self.markers.to_dict()
         metadata = {
             "format_version": FORMAT_VERSION,
             "kind": "calibration",
@@ -259,7 +277,7 @@ class Calibration:
             "measured": self.measured,
             "report": self.report,
             "response": None if self.response is None else self.response.to_dict(),
-            "markers": markers,
+            "markers": None if self.markers is None else self.markers.to_dict(),
         }
         tensors = {"noise_std": self.noise_std}
         if self.lights is None:
@@ -279,51 +297,28 @@ class Calibration:
 
     @classmethod
     def load(cls, path: str | Path) -> "Calibration":
-        """Read what :meth:`save` wrote.
+        """Read a file written by :meth:`save`.
 
         Raises:
-            FileNotFoundError: no such file. ValueError: cut, foreign, of a later version, or inconsistent; says which.
+            FileNotFoundError: no such file.
+            ValueError: cut short, of another kind or version, or inconsistent; says which.
         """
         tensors, metadata = load_tensors(path)
         if metadata.get("kind") != "calibration":
             raise ValueError(f"{path}: expected a calibration, got a file of kind {brief(metadata.get('kind'))}")
         version = metadata.get("format_version")
-        if not isinstance(version, int) or not 1 <= version <= FORMAT_VERSION:
-            raise ValueError(f"{path}: format version {brief(version)}, this torchvts reads 1 to {FORMAT_VERSION}: update torchvts")
+        if version != FORMAT_VERSION or isinstance(version, bool):
+            raise ValueError(
+                f"{path}: expected format version {FORMAT_VERSION}, got {brief(version)}: written by another torchvts; "
+                "calibrate again, or update torchvts"
+            )
         sensor = Sensor.from_dict(metadata.get("sensor"), str(path))
-        measured, report = metadata.get("measured"), metadata.get("report")
-        if not isinstance(measured, bool) or not isinstance(report, dict):
-            raise ValueError(f"{path}: its metadata is damaged: 'measured' or 'report' is missing")
-        markers = None if metadata.get("markers") is None else FillMarkers.from_dict(metadata["markers"], f"{path}: markers")
+        if not isinstance(metadata.get("measured"), bool):
+            raise ValueError(f"{path}: measured: expected true or false, got {brief(metadata.get('measured'))}: damaged metadata")
+        read_report(metadata.get("report"), f"{path}: report")
         if metadata.get("response") is not None:
-            response = ResponseModel.from_dict(metadata["response"], f"{path}: response")
-            _check_tensors(path, tensors, {"noise_std": (3,)})
-            if "background_png" not in tensors:
-                raise ValueError(f"{path}: tensor 'background_png' is missing")
-            value = image_from_bytes(tensors["background_png"], (sensor.height, sensor.width), f"{path}: tensor 'background_png'")
-            light = value.to(tensors["noise_std"].dtype) ** sensor.exponent
-            if (sensor.exponent, sensor.blur_px) != (response.gamma, response.blur_px):
-                raise ValueError(f"{path}: sensor and response differ in gamma or blur_px: damaged or edited")
-            return cls(sensor, None, light, tensors["noise_std"], measured, report, response, markers)
-        size = (3, sensor.height, sensor.width)
-        expected: dict[str, tuple[int, ...]] = {
-            "light_position_mm": (3, 3), "light_albedo": (3,), "light_gloss": (3,), "noise_std": (3,),
-            "background": size, "compensation": size, "inverse": (3, *size),
-        }  # fmt: skip
-        if "ambient" in tensors:
-            expected["ambient"] = (3,)
-        _check_tensors(path, tensors, expected)
-        try:
-            lights = PointLights(*(tensors[f"light_{part}"] for part in ("position_mm", "albedo", "gloss"))).requires_grad_(False)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
-        calibration = cls(
-            sensor, lights, tensors["background"], tensors["noise_std"], measured, report, None, markers, tensors.get("ambient")
-        )
-        for name, derived in (("compensation", calibration.compensation), ("inverse", calibration.inverse)):
-            if not torch.allclose(tensors[name], derived, rtol=1e-3, atol=1e-3 * float(derived.abs().max())):
-                raise ValueError(f"{path}: tensor {name!r} does not fit the lights in the same file: damaged or edited")
-        return calibration
+            return _load_by_response(path, tensors, metadata, sensor)
+        return _load_by_lights(path, tensors, metadata, sensor)
 
 
 def check_calibration(name: str, value: object) -> None:
@@ -331,8 +326,8 @@ def check_calibration(name: str, value: object) -> None:
     check_record(name, value, Calibration, "Calibration.load reads a file, calibrate makes one")
 
 
-def _at_rest(background: Tensor, sensor: Sensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, FillMarkers | None]:
-    """Linear light of an image at rest, its noise in image value, and what fills its markers."""
+def _measure(background: Tensor, sensor: Sensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, FillMarkers | None]:
+    """Linear light of a background image, its noise in image value, and the block that fills its markers."""
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     image = background.detach().cpu().to(dtype)
     markers = FillMarkers.from_background(image) if sensor.markers else None
@@ -342,6 +337,47 @@ def _at_rest(background: Tensor, sensor: Sensor, dtype: torch.dtype) -> tuple[Te
         image = markers(image[None])[0]
     noise = noise_std(image[None])[0].clamp_min(QUANTISATION_STD)
     return image if sensor.exponent == 1.0 else image**sensor.exponent, noise, markers
+
+
+def _load_by_response(path: str | Path, tensors: dict[str, Tensor], metadata: dict[str, Any], sensor: Sensor) -> Calibration:
+    response = ResponseModel.from_dict(metadata["response"], f"{path}: response")
+    markers = _load_markers(path, metadata)
+    _check_tensors(path, tensors, {"noise_std": (3,)})
+    if "background_png" not in tensors:
+        raise ValueError(f"{path}: tensor 'background_png' is missing")
+    value = image_from_bytes(tensors["background_png"], (sensor.height, sensor.width), f"{path}: tensor 'background_png'")
+    light = value.to(tensors["noise_std"].dtype) ** sensor.exponent
+    if (sensor.exponent, sensor.blur_px) != (response.gamma, response.blur_px):
+        raise ValueError(f"{path}: sensor and response differ in gamma or blur_px: damaged or edited")
+    return Calibration(sensor, None, light, tensors["noise_std"], metadata["measured"], metadata["report"], response, markers)
+
+
+def _load_by_lights(path: str | Path, tensors: dict[str, Tensor], metadata: dict[str, Any], sensor: Sensor) -> Calibration:
+    markers = _load_markers(path, metadata)
+    size = (3, sensor.height, sensor.width)
+    expected: dict[str, tuple[int, ...]] = {
+        "light_position_mm": (3, 3), "light_albedo": (3,), "light_gloss": (3,), "noise_std": (3,),
+        "background": size, "compensation": size, "inverse": (3, *size),
+    }  # fmt: skip
+    if "ambient" in tensors:
+        expected["ambient"] = (3,)
+    _check_tensors(path, tensors, expected)
+    try:
+        lights = PointLights(*(tensors[f"light_{part}"] for part in ("position_mm", "albedo", "gloss"))).requires_grad_(False)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    background, noise, ambient = tensors["background"], tensors["noise_std"], tensors.get("ambient")
+    calibration = Calibration(
+        sensor, lights, background, noise, metadata["measured"], metadata["report"], markers=markers, ambient=ambient
+    )
+    for name, derived in (("compensation", calibration.compensation), ("inverse", calibration.inverse)):
+        if not torch.allclose(tensors[name], derived, rtol=1e-3, atol=1e-3 * float(derived.abs().max())):
+            raise ValueError(f"{path}: tensor {name!r} does not fit the lights in the same file: damaged or edited")
+    return calibration
+
+
+def _load_markers(path: str | Path, metadata: dict[str, Any]) -> FillMarkers | None:
+    return None if metadata.get("markers") is None else FillMarkers.from_dict(metadata["markers"], f"{path}: markers")
 
 
 def _check_tensors(path: str | Path, tensors: dict[str, Tensor], expected: dict[str, tuple[int, ...]]) -> None:

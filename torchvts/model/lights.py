@@ -335,10 +335,3 @@ def normal_at_depth(
     squared = torch.addcmul(torch.addcmul(n_x * n_x, n_y, n_y), n_z, n_z)
     scale = torch.rsqrt(squared + 1e-24) * determinant.sign()
     return torch.cat((n_x * scale, n_y * scale, n_z * scale), dim=1)
-
-
-def _shade(depth_mm: Tensor, normal: Tensor, position_mm: Tensor, albedo: Tensor, mm_per_pixel: float) -> Tensor:
-    check_batch("depth_mm", depth_mm, 1)
-    check_batch("normal", normal, 3)
-    check_same_size("normal", normal, "depth_mm", depth_mm.shape[2], depth_mm.shape[3])
-    return (light_matrix(depth_mm, position_mm, albedo, mm_per_pixel) * normal.unsqueeze(1)).sum(2)

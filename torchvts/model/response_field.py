@@ -110,8 +110,8 @@ class ResponseField:
 
     @classmethod
     def from_dict(cls, values: Any, source: str) -> "ResponseField":
-        """Read what :meth:`to_dict` gave, now or when there were no slopes of depth; ``source`` names it in errors."""
-        return from_dict(cls, _with_slopes(values), source)
+        """Read the output of :meth:`to_dict`; ``source`` names it in errors."""
+        return from_dict(cls, values, source)
 
 
 @dataclass(frozen=True)
@@ -222,21 +222,6 @@ def field_terms(uses_depth: bool, product_degree: int) -> list[tuple[int, ...]]:
     single: list[tuple[int, ...]] = [(k,) for k in range(6 if uses_depth else 3)]
     pairs = [pair for pair in combinations_with_replacement(range(4 if uses_depth else 3), 2) if pair != (3, 3)]
     return single + (pairs if product_degree >= 0 else [])
-
-
-def _with_slopes(values: Any) -> Any:
-    """A field of a file from before depth's slopes were inputs, as one that does not heed them; anything else as it is."""
-    if not isinstance(values, dict) or values.get("uses_depth") is not True:
-        return values
-    degree, product_degree, rows = (values.get(name) for name in ("degree", "product_degree", "coefficient"))
-    if not (isinstance(degree, int) and isinstance(product_degree, int) and isinstance(rows, list)):
-        return values  # from_dict says what is wrong
-    if not (0 <= degree <= 6 and -1 <= product_degree <= 6):
-        return values
-    count, size = (degree + 1) * (degree + 2) // 2, len(term_degrees(degree, product_degree, True))
-    if not all(isinstance(row, list) and len(row) == size - 2 * count for row in rows):
-        return values
-    return values | {"coefficient": [[*row[: 4 * count], *[0.0] * (2 * count), *row[4 * count :]] for row in rows]}
 
 
 def term_degrees_by_term(degree: int, product_degree: int, uses_depth: bool) -> dict[tuple[int, ...], int]:

@@ -3,24 +3,27 @@
 import copy
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ..core.checks import check_batch, check_integer, check_positive, check_record, check_same_size, check_size, check_window
 from ..core.geometry import gradient_of_depth, normal_from_gradient
 from ..model.calibration import Calibration, check_calibration
 from ..model.response_field import CHANGE_SCALE, ResponseField
+from .base import NormalModel
 
 
-class NormalFromResponse(nn.Module):
+class NormalFromResponse(NormalModel):
     """Unit normals of a compensated image, which for a response field is image / background.
 
-    Without depth the field ``fast``; with the depth that pass led to, the field ``precise``, which was fitted on such depths and
-    their slopes: a second pass is all there is to gain, and ``passes`` says so to the pipeline. Given ``window`` (top, left), the
-    image is the part of the calibrated one whose first pixel is there.
+    Without depth by the field ``fast``; with the depth of that pass by the field ``precise``, which was fitted on such depths and
+    their slopes. A second pass is all there is to gain.
 
     Args:
-        fast: field without depth. precise: field with depth, or None.
-        height, width: pixels. mm_per_pixel: pixel pitch, mm.
+        fast: field without depth.
+        precise: field with depth, or None.
+        height: pixels.
+        width: pixels.
+        mm_per_pixel: pixel pitch, mm.
         max_slope: largest steepness, mm per mm: polynomials run away outside of what they were fitted on.
         dtype: of the coefficients.
     Example:
@@ -29,7 +32,7 @@ class NormalFromResponse(nn.Module):
         tensor([0., 0., 1.])
     """
 
-    uses_depth: bool
+    max_passes: int = 2
     takes_window: bool = True
     fast_maps: Tensor
     precise_maps: Tensor
@@ -55,7 +58,6 @@ class NormalFromResponse(nn.Module):
         self.max_slope = check_positive("max_slope", max_slope)
         self.mm_per_pixel = mm_per_pixel
         self.uses_depth = precise is not None
-        self.passes = 2
         self.register_buffer("fast_maps", _maps(fast, height, width, mm_per_pixel).to(dtype))
         deep = torch.zeros(0, 2, height, width) if precise is None else _maps(precise, height, width, mm_per_pixel)
         self.register_buffer("precise_maps", deep.to(dtype))
@@ -70,23 +72,23 @@ class NormalFromResponse(nn.Module):
         size = (sensor.height, sensor.width, sensor.mm_per_pixel)
         return cls(response.fast, response.precise, *size, dtype=calibration.background.dtype)
 
-    def forward(self, compensated: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
-        check_batch("compensated", compensated, 3)
+    def forward(self, image: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
+        check_batch("compensated", image, 3)
         size = (self.fast_maps.shape[2], self.fast_maps.shape[3])
-        top, left = check_window("compensated", compensated, size, window)
-        change = compensated - 1.0
+        top, left = check_window("compensated", image, size, window)
+        change = image - 1.0
         inputs = [change[:, 0:1], change[:, 1:2], change[:, 2:3]]
         maps = self.fast_maps
         if depth_mm is not None:
             if not self.uses_depth:
                 raise ValueError("depth_mm: expected None, because this response has no field with depth: use mode 'fast'")
             check_batch("depth_mm", depth_mm, 1)
-            check_same_size("depth_mm", depth_mm, "compensated", compensated.shape[2], compensated.shape[3])
+            check_same_size("depth_mm", depth_mm, "compensated", image.shape[2], image.shape[3])
             depth = depth_mm.to(change.dtype).expand_as(inputs[0])
             slope = gradient_of_depth(depth, self.mm_per_pixel)
             inputs += [depth, slope[:, 0:1], slope[:, 1:2]]
             maps = self.precise_maps
-        maps = maps[:, :, top : top + compensated.shape[2], left : left + compensated.shape[3]]
+        maps = maps[:, :, top : top + image.shape[2], left : left + image.shape[3]]
         gradient = maps[0] * inputs[0]  # (B, 2, H, W)
         for k in range(1, len(inputs)):
             gradient = torch.addcmul(gradient, maps[k], inputs[k])

@@ -1,15 +1,24 @@
 """Online: a calibration made into a chain of modules that turns images into depth, and how far that may be off."""
 
-from .confidence import Bounds, Confidence, bound_at
-from .depth import MODES, ConfidentOutput, ConfidentPipeline, DepthOutput, DepthPipeline
+from ..core.frame import DepthOutput
+from .confidence import Bounds, Confidence, ConfidentOutput, ConfidentPipeline, bound_at
+from .depth import MODES, DepthPipeline
+from .refine import Adaptive, Once, Repeat
+from .shadows import Shadows
+from .solve import Solve
 
 __all__ = [
     "MODES",
+    "Adaptive",
     "Bounds",
     "Confidence",
     "ConfidentOutput",
     "ConfidentPipeline",
     "DepthOutput",
     "DepthPipeline",
+    "Once",
+    "Repeat",
+    "Shadows",
+    "Solve",
     "bound_at",
 ]

@@ -12,6 +12,7 @@ from typing import Any, Final, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from ..accelerated import GradientFromNormal, PoissonBackground
 from ..core.blur import blur, gaussian_weights
 from ..core.checks import (
     check_batch,
@@ -23,11 +24,11 @@ from ..core.checks import (
     check_shape,
     check_tensor,
 )
-from ..core.geometry import gradient_from_normal, gradient_of_depth
+from ..core.geometry import gradient_of_depth
 from ..core.noise import noise_std as frame_noise_std
-from ..integration import PoissonBackground
 from ..model.calibration import Calibration, check_calibration
-from ..normals import NormalFromIntensity, NormalFromResponse
+from ..normals import NormalFromIntensity, NormalFromResponse, as_normal_model
+from .depth import DepthOutput, DepthPipeline
 
 FACTORS = ("noise", "model", "pass", "surface", "saturation")
 """What ``factors_deg`` holds, in that order: noise through the inverse model, raised where the light does not fit; error of the
@@ -94,6 +95,20 @@ class Bounds(NamedTuple):
     standard deviations along one axis that the bound of the normal is made of, in the order of :data:`FACTORS`.
     """
 
+    normal_95_deg: Tensor
+    depth_95_mm: Tensor
+    confidence: Tensor
+    frame_confidence: Tensor
+    factors_deg: Tensor
+
+
+class ConfidentOutput(NamedTuple):
+    """The fields of :class:`DepthOutput`, then those of :class:`Bounds`: how far the former may be off."""
+
+    depth_mm: Tensor
+    gradient: Tensor
+    normal: Tensor
+    contact: Tensor
     normal_95_deg: Tensor
     depth_95_mm: Tensor
     confidence: Tensor
@@ -183,8 +198,8 @@ class Confidence(nn.Module):
         check_shape("light_std", light_std, noise_std.shape, "noise_std")
         check_positive("mm_per_pixel", mm_per_pixel), check_positive("spread", spread)
         check_least("model_deg", model_deg), check_least("blur_px", blur_px)
-        self.normals = normals
-        self.uses_depth = bool(getattr(normals, "uses_depth", False))
+        self.normals = as_normal_model(normals)
+        self.uses_depth = self.normals.uses_depth
         self.by_lights = isinstance(normals, NormalFromIntensity)
         self.mm_per_pixel = mm_per_pixel
         self.fixed = 1.0 if measured else 0.0
@@ -208,6 +223,7 @@ class Confidence(nn.Module):
         self.register_buffer("noise", noise_std.detach().clone())
         self.register_buffer("image_noise", image_noise_std.detach().clone())
         self.register_buffer("light_std", light_std.detach().clone())
+        self.gradient = GradientFromNormal()
         self.integrate = PoissonBackground(mm_per_pixel)
 
     @classmethod
@@ -273,7 +289,7 @@ class Confidence(nn.Module):
         apart = torch.sqrt((again - normal).square().sum(1, keepdim=True) + 1e-12)
         clipped = torch.zeros_like(noise)
         if self.by_lights:
-            dark = (compensated < self.normals.dark_where) | (compensated >= self.normals.full_above)
+            dark = (compensated < self.normals.shadowed.dark_where) | (compensated >= self.normals.shadowed.saturated_above)
             clipped = self.clipped_variance * dark.any(dim=1, keepdim=True).to(noise.dtype)
             # three channels give two slopes and a check: a third of the noise is left over, the rest is not noise
             left = (compensated - self.normals.lights(depth_mm, again, self.mm_per_pixel)).masked_fill(dark, 0.0)
@@ -326,7 +342,7 @@ class Confidence(nn.Module):
     ) -> Tensor:
         # the next pass inside, and around it what the mask has left out, smoothed
         beyond = 1.0 - touched
-        better = gradient_from_normal(again)
+        better = self.gradient(again)
         around = _smooth(better * beyond) / _smooth(beyond).clamp_min(0.04) * _grown(touched, self.band)
         better = torch.where(touched > 0, better, around)
         std = torch.sqrt(model + 1e-14) / steep.clamp_min(0.05) * touched
@@ -342,6 +358,57 @@ class Confidence(nn.Module):
         kink = self.kink_variance_mm * gradient.square().sum(dim=(1, 2, 3), keepdim=True) / count
         system = self.system_variance * found[1:].square().sum(0)
         return (found[0] - depth_mm).abs() + 1.96 * torch.sqrt(scatter + kink + system)
+
+
+class ConfidentPipeline(nn.Module):
+    """A pipeline that also bounds its errors: images (B, 3, H, W) to a :class:`ConfidentOutput`.
+
+    Args:
+        pipe: the pipeline.
+        confidence: from the same calibration.
+    Example:
+        >>> from torchvts import PointLights, Sensor
+        >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
+        >>> cal = Calibration.from_lights(lights, Sensor("rig", 48, 64, 0.5))
+        >>> pipe = ConfidentPipeline(DepthPipeline.from_calibration(cal), Confidence.from_calibration(cal))
+        >>> pipe(cal.model_image[None])._fields[4:]
+        ('normal_95_deg', 'depth_95_mm', 'confidence', 'frame_confidence', 'factors_deg')
+    """
+
+    def __init__(self, pipe: DepthPipeline, confidence: Confidence) -> None:
+        super().__init__()
+        check_record("pipe", pipe, DepthPipeline, "DepthPipeline.from_calibration makes one")
+        check_record("confidence", confidence, Confidence, "Confidence.from_calibration makes one")
+        self.pipe = pipe
+        self.confidence = confidence
+
+    @classmethod
+    def from_calibration(
+        cls, calibration: Calibration, mode: str = "fast", *, normals: nn.Module | None = None, integrate: nn.Module | None = None
+    ) -> "ConfidentPipeline":
+        """As :meth:`DepthPipeline.from_calibration`.
+
+        Raises:
+            TypeError: no Calibration; or ``normals`` that are not the calibrated model.
+        """
+        pipe = DepthPipeline.from_calibration(calibration, mode, normals=normals, integrate=integrate)
+        return cls(pipe, Confidence.from_calibration(calibration, pipe.normals)).eval()
+
+    def forward(self, images: Tensor) -> ConfidentOutput:
+        """As :meth:`DepthPipeline.forward`."""
+        out: DepthOutput = self.pipe(images)
+        bounds: Bounds = self.confidence(images, self.pipe.compensate(images), out.depth_mm, out.gradient, out.normal, out.contact)
+        return ConfidentOutput(
+            out.depth_mm,
+            out.gradient,
+            out.normal,
+            out.contact,
+            bounds.normal_95_deg,
+            bounds.depth_95_mm,
+            bounds.confidence,
+            bounds.frame_confidence,
+            bounds.factors_deg,
+        )
 
 
 def _length_95(bias: Tensor, std: Tensor, tail: float) -> Tensor:
@@ -367,7 +434,7 @@ def _model_deg(calibration: Calibration) -> float:
     if held_out:
         used = sum(bool(row.get("used")) for row in report.get("presses", []))
         return float(held_out) * math.sqrt(1.0 + FEW_PRESSES / max(used, 1))
-    return PRIOR_DEG if "prior" in str(report.get("response", "")) else FEW_DEG
+    return PRIOR_DEG if report.get("source") == "prior" else FEW_DEG
 
 
 def _smooth(values: Tensor) -> Tensor:

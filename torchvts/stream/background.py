@@ -11,7 +11,7 @@ from ..calibration import CalibrationWarning, calibrate
 from ..calibration.calibrate import GIVEN_MISFIT
 from ..calibration.contacts import ROUGH, channel_structure
 from ..calibration.lights import LOOSE_DEG
-from ..contact.masks import ContactMask
+from ..contact import ContactMask
 from ..core.checks import check_batch, check_field, check_least, check_positive, check_range, check_same_size, check_shape
 from ..core.geometry import pixel_grid_mm
 from ..model.calibration import PEDESTAL, Calibration
@@ -244,7 +244,7 @@ def calibrate_at_rest(background: Tensor, sensor: Sensor) -> AtRest:
         calibration = calibrate(background, sensor)
     told = [str(w.message) for w in caught if issubclass(w.category, CalibrationWarning)]
     reason = str(calibration.report["reason"])
-    if calibration.lights is not None and sensor.light_position_mm is not None:
+    if calibration.report["source"] == "sensor_file":
         misfit = calibration.report["candidates"][0]["misfit"]
         if misfit > GIVEN_MISFIT:
             lights = torch.tensor(sensor.light_position_mm, dtype=torch.float64)
@@ -253,7 +253,7 @@ def calibrate_at_rest(background: Tensor, sensor: Sensor) -> AtRest:
             half_mm = 0.5 * sensor.width * sensor.mm_per_pixel
             model = ResponseModel(ResponseField(0, -1, False, half_mm, rows), None, sensor.exponent, max(1.0, sensor.blur_px))
             reason = f"directions of the sensor file's lights; as point lights they miss the background by {misfit:.0%}"
-            report = {"model": "response", "response": "stand-in", "reason": reason}
+            report = {"model": "response", "source": "stand_in", "reason": reason}
             calibration = Calibration.from_response(model, sensor, background, report)
         told.append("the lights are the sensor file's, not this unit's")
     metric = not told
@@ -277,6 +277,6 @@ def contact_in_video(calibration: Calibration, noise: Tensor) -> ContactMask:
     compensated = noise.float() * sensor.exponent * torch.maximum(value, noise.float()) ** (sensor.exponent - 1.0)
     if calibration.gain is not None:
         compensated = compensated * calibration.gain.float() * 2.0**0.5
-    least = STAND_IN_NOISE if calibration.report.get("response") == "stand-in" else 0.0
+    least = STAND_IN_NOISE if calibration.report.get("source") == "stand_in" else 0.0
     most = torch.maximum(1.0 / calibrated.per_noise.float(), compensated).clamp_min(least)
     return ContactMask(calibrated.flat.float(), most).eval()

@@ -15,7 +15,7 @@ from ..core.checks import check_choice, check_integer, check_positive
 from ..core.files import rgb_from_bgr
 from ..model.calibration import Calibration
 from ..model.sensor import Sensor
-from ..pipeline.depth import MODES, DepthOutput, DepthPipeline
+from ..pipeline import MODES, DepthOutput, DepthPipeline
 from .background import TIME_CONSTANT_S, FollowLight, calibrate_at_rest, contact_in_video, given_at_rest, rest_image
 from .sources import NewestFrame, Pixels, Reader, Rectify, Replay, open_source
 

@@ -1,8 +1,8 @@
-/* Samples of compensated images: the same numbers as torchvts/compensate.py. */
-#include "native.h"
+/* Samples of compensated images: the same results as torchvts/compensate/drift.py. */
+#include "kernels.h"
 
 /* Means of 3 x 3 pixels, the first from (first, first) on and then every `stride`, of `planes` images: (planes, rows, columns). */
-EXPORT void some_means(const float *image, int planes, int height, int width, int stride, int first, int rows, int columns, float *means) {
+EXPORT void grid_means(const float *image, int planes, int height, int width, int stride, int first, int rows, int columns, float *means) {
     for (int plane = 0; plane < planes; plane++, image += (size_t)height * width)
         for (int i = 0; i < rows; i++)
             for (int j = 0; j < columns; j++) {

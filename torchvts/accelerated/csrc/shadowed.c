@@ -1,10 +1,9 @@
-/* Slopes where a light is blocked or a channel full: the same numbers as slope_by_lit_lights() and NormalFromIntensity._relight() in
-   torchvts/normals/photometric.py, which say why. */
-#include "native.h"
+/* Slopes where a light is blocked or a channel saturated: the same results as torchvts/normals/shadowed.py, which explains them. */
+#include "kernels.h"
 
 #include <math.h>
 
-/* The intensity of a channel that says nothing, as in torchvts/normals/photometric.py; no camera gives half of it. */
+/* The intensity of a channel that is left out, as in torchvts/normals/shadowed.py; no camera gives half of it. */
 #define LEFT_OUT -1.0f
 
 /* What does not change from pixel to pixel. */
@@ -13,31 +12,31 @@ typedef struct {
     float pitch, per_height, axis_x, axis_y, cliff_slope, max_slope;
 } Model;
 
-/* Gauss-Newton from slope[2], which it replaces; rows are the light matrix, full the channels that are saturated or dead. */
-static void fit_slope(const float rows[3][3], const float intensity[3], const int full[3], const Model *model, float slope[2]) {
+/* Gauss-Newton from slope[2], which it replaces; rows are the light matrix, saturated: channels that are saturated or failed. */
+static void fit_slope(const float rows[3][3], const float intensity[3], const int saturated[3], const Model *model, float slope[2]) {
     const float start_p = slope[0], start_q = slope[1], weight = model->weight;
     for (int step = 0; step < (int)model->steps; step++) {
         const float p = slope[0], q = slope[1], n_z = 1.0f / sqrtf(1.0f + p * p + q * q);
         const float normal[3] = {-p * n_z, -q * n_z, n_z};
-        float across[3][2], seen[3], residual[3], energy = 0.0f;
+        float across[3][2], model_light[3], residual[3], energy = 0.0f;
         for (int j = 0; j < 3; j++) {
             const float light = rows[j][0] * normal[0] + rows[j][1] * normal[1] + rows[j][2] * normal[2];
-            const float lit = light > 0.1f * model->noise_std && !(full[j] && light >= intensity[j]) ? 1.0f : 0.0f;
+            const float lit = light > 0.1f * model->noise_std && !(saturated[j] && light >= intensity[j]) ? 1.0f : 0.0f;
             for (int i = 0; i < 2; i++) across[j][i] = -n_z * (rows[j][i] - light * normal[i]) * lit;
-            seen[j] = light * lit;
-            residual[j] = intensity[j] * lit - seen[j];
-            energy += seen[j] * seen[j];
+            model_light[j] = light * lit;
+            residual[j] = intensity[j] * lit - model_light[j];
+            energy += model_light[j] * model_light[j];
         }
         const float common = (1.0f - 1.0f / sqrtf(1.0f + model->brightness * energy)) / (energy > 1e-12f ? energy : 1e-12f);
         float shared = 0.0f, along[2] = {0.0f, 0.0f};
         for (int j = 0; j < 3; j++) {
-            shared += seen[j] * residual[j];
-            for (int i = 0; i < 2; i++) along[i] += seen[j] * across[j][i];
+            shared += model_light[j] * residual[j];
+            for (int i = 0; i < 2; i++) along[i] += model_light[j] * across[j][i];
         }
         float a = weight, b = 0.0f, c = weight, right_p = weight * (start_p - p), right_q = weight * (start_q - q);
         for (int j = 0; j < 3; j++) {
-            const float whitened = residual[j] - common * seen[j] * shared;
-            for (int i = 0; i < 2; i++) across[j][i] -= common * seen[j] * along[i];
+            const float whitened = residual[j] - common * model_light[j] * shared;
+            for (int i = 0; i < 2; i++) across[j][i] -= common * model_light[j] * along[i];
             a += across[j][0] * across[j][0];
             b += across[j][0] * across[j][1];
             c += across[j][1] * across[j][1];
@@ -59,8 +58,8 @@ static void fit_slope(const float rows[3][3], const float intensity[3], const in
 }
 
 /* The mean of two slopes, or the smaller where they are so far apart that a cliff must lie on one side. */
-static float beside_cliffs(float one, float other, float apart) {
-    if (fabsf(one - other) < apart) return 0.5f * (one + other);
+static float slope_beside_cliff(float one, float other, float most) {
+    if (fabsf(one - other) < most) return 0.5f * (one + other);
     return fabsf(one) < fabsf(other) ? one : other;
 }
 
@@ -68,66 +67,67 @@ static float beside_cliffs(float one, float other, float apart) {
 static void slope_of_depth(const float *z, int64_t row, int y, int x, int rows, int columns, const Model *model, float slope[2]) {
     const float left = x > 0 ? z[-1] : *z, right = x < columns - 1 ? z[1] : *z;
     const float above = y > 0 ? z[-row] : *z, below = y < rows - 1 ? z[row] : *z;
-    slope[0] = beside_cliffs((*z - left) / model->pitch, (right - *z) / model->pitch, model->cliff_slope);
-    slope[1] = beside_cliffs((*z - above) / model->pitch, (below - *z) / model->pitch, model->cliff_slope);
+    slope[0] = slope_beside_cliff((*z - left) / model->pitch, (right - *z) / model->pitch, model->cliff_slope);
+    slope[1] = slope_beside_cliff((*z - above) / model->pitch, (below - *z) / model->pitch, model->cliff_slope);
 }
 
 /*
- * Replaces the normals (frames, 3, rows, columns) of a window where a light that shines on the flat skin is dark, a channel is full,
- * a lamp is dead (black in 98 % of the window) or `weak` says so. image and depth as normals() takes them; weak (height, width) bytes
- * from the window's first pixel on; expected (frames, 2, rows, columns) or null. Without depth a pixel starts from what was expected, or
- * from its own normal, and from the flat skin where that says nothing; with depth, from its slope.
+ * Replaces the normals (frames, 3, rows, columns) of a window where a light that shines on the flat skin is dark, a channel is
+ * saturated, an LED has failed (black in 98 % of the window), or `ill_conditioned` is set. image and depth as normals() takes them;
+ * ill_conditioned: (height, width) bytes from the window's first pixel on; expected: (frames, 2, rows, columns) or null. With depth, a
+ * pixel starts from the slope of the depth; without, from the expected slope or its own normal, or from the flat skin where an LED
+ * has failed or the matrix is ill-conditioned.
  */
-EXPORT void relight(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *dark, const float *full,
-                    const uint8_t *weak, int64_t plane, int width, int frames, int rows, int columns, const float *depth,
+EXPORT void solve_shadowed(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *dark, const float *saturated_above,
+                    const uint8_t *ill_conditioned, int64_t plane, int width, int frames, int rows, int columns, const float *depth,
                     int64_t depth_frame, int64_t depth_row, const float *expected, const float *position, const float *albedo,
                     const float *model_numbers, float *normal) {
     const Model model = {model_numbers[0], model_numbers[1], model_numbers[2], model_numbers[3], model_numbers[4],
                          model_numbers[5], model_numbers[6], model_numbers[7], model_numbers[8], model_numbers[9]};
     const size_t pixels = (size_t)rows * columns;
     for (int b = 0; b < frames; b++, normal += 3 * pixels) {
-        int dead[3], any_dead = 0;
+        int failed[3], any_failed = 0;
         for (int j = 0; j < 3; j++) {
             size_t count = 0;
             for (int y = 0; y < rows; y++) {
                 const float *line = image + per_frame * b + per_channel * j + per_row * y, *below = dark + plane * j + (size_t)y * width;
                 for (int x = 0; x < columns; x++) count += line[x] < below[x];
             }
-            dead[j] = (float)count / (float)pixels > 0.98f;
-            any_dead |= dead[j];
+            failed[j] = (float)count / (float)pixels > 0.98f;
+            any_failed |= failed[j];
         }
         for (int y = 0; y < rows; y++)
             for (int x = 0; x < columns; x++) {
                 const size_t at = (size_t)y * width + x, here = (size_t)y * columns + x;
                 float intensity[3], slope[2], z = 0.0f;
-                int saturated[3], wanted = weak[at] || any_dead;
+                int saturated[3], wanted = ill_conditioned[at] || any_failed;
                 for (int j = 0; j < 3; j++) {
                     const float value = image[per_frame * b + per_channel * j + per_row * y + x];
-                    const int is_full = value >= full[plane * j + at];
-                    wanted |= is_full || value < dark[plane * j + at];
-                    saturated[j] = is_full || dead[j] || value <= 0.5f * LEFT_OUT;
-                    intensity[j] = dead[j] ? 0.0f : value;
+                    const int is_saturated = value >= saturated_above[plane * j + at];
+                    wanted |= is_saturated || value < dark[plane * j + at];
+                    saturated[j] = is_saturated || failed[j] || value <= 0.5f * LEFT_OUT;
+                    intensity[j] = failed[j] ? 0.0f : value;
                 }
                 if (!wanted) continue;
                 if (depth) {
                     const float *place = depth + depth_frame * b + depth_row * y + x;
                     z = *place;
                     slope_of_depth(place, depth_row, y, x, rows, columns, &model, slope);
-                } else if (any_dead || weak[at]) {
+                } else if (any_failed || ill_conditioned[at]) {
                     slope[0] = slope[1] = 0.0f;
                 } else if (expected) {
                     slope[0] = expected[2 * pixels * b + here];
                     slope[1] = expected[(2 * (size_t)b + 1) * pixels + here];
                 } else {
                     const float u = normal[here], v = normal[pixels + here], w = normal[2 * pixels + here];
-                    const float steepest = sqrtf(u * u + v * v + 1e-24f) / model.max_slope, down = steepest > w ? steepest : w;
-                    slope[0] = -u / down;
-                    slope[1] = -v / down;
+                    const float steepest = sqrtf(u * u + v * v + 1e-24f) / model.max_slope, height = steepest > w ? steepest : w;
+                    slope[0] = -u / height;
+                    slope[1] = -v / height;
                 }
-                const float rest_x = ((float)x - 0.5f * (float)(columns - 1)) * model.pitch;
-                const float rest_y = ((float)y - 0.5f * (float)(rows - 1)) * model.pitch;
-                const float see_x = rest_x - (rest_x - model.axis_x) * z * model.per_height;
-                const float see_y = rest_y - (rest_y - model.axis_y) * z * model.per_height;
+                const float flat_x = ((float)x - 0.5f * (float)(columns - 1)) * model.pitch;
+                const float flat_y = ((float)y - 0.5f * (float)(rows - 1)) * model.pitch;
+                const float see_x = flat_x - (flat_x - model.axis_x) * z * model.per_height;
+                const float see_y = flat_y - (flat_y - model.axis_y) * z * model.per_height;
                 float lights[3][3];
                 for (int j = 0; j < 3; j++) {
                     const float to[3] = {position[3 * j] - see_x, position[3 * j + 1] - see_y, position[3 * j + 2] - z};

@@ -1,6 +1,6 @@
 /* What lies between the Fourier transforms of the cosine-family Poisson solver: the same numbers as torchvts/integration/poisson.py and
    transforms.py, which say why. Complex numbers are pairs of floats. */
-#include "native.h"
+#include "kernels.h"
 
 /* Half the difference of what lies after and before each element, and below and above it: a line of the divergence. */
 WIDE static void difference(const float *restrict padded, const float *restrict above, const float *restrict below, float half, int n,
@@ -81,11 +81,11 @@ WIDE static void scale(float *restrict here, float *restrict back, const float *
         const float u = 0.5f * (a * here[2 * k] - b * here[2 * k + 1]), v = 0.5f * (a * here[2 * k + 1] + b * here[2 * k]);
         const float r = 0.5f * (c * back[2 * k] - d * back[2 * k + 1]), s = 0.5f * (c * back[2 * k + 1] + d * back[2 * k]);
         const float sum = (u + r) * of_sum[2 * k], sum_i = (v + s) * of_sum[2 * k + 1];
-        const float apart = (u - r) * of_difference[2 * k], apart_i = (v - s) * of_difference[2 * k + 1];
-        here[2 * k] = a * (sum + apart) + b * (sum_i + apart_i);
-        here[2 * k + 1] = a * (sum_i + apart_i) - b * (sum + apart);
-        back[2 * k] = c * (sum - apart) + d * (sum_i - apart_i);
-        back[2 * k + 1] = c * (sum_i - apart_i) - d * (sum - apart);
+        const float residual = (u - r) * of_difference[2 * k], residual_i = (v - s) * of_difference[2 * k + 1];
+        here[2 * k] = a * (sum + residual) + b * (sum_i + residual_i);
+        here[2 * k + 1] = a * (sum_i + residual_i) - b * (sum + residual);
+        back[2 * k] = c * (sum - residual) + d * (sum_i - residual_i);
+        back[2 * k + 1] = c * (sum_i - residual_i) - d * (sum - residual);
     }
 }
 
@@ -110,9 +110,9 @@ EXPORT int divide(float *spectrum, const float *turns, const float *of_sum, cons
     return 0;
 }
 
-/* Sum of the depth where the gradient is, and how many pixels that are; lines as in settle(). */
-static double touched_sum(const float *lines, const float *gradient, const int64_t *order, int rows, int columns, int top, int left,
-                          int width, size_t *touched) {
+/* Sum of the depth where the gradient is, and how many pixels that are; lines as in finish_depth(). */
+static double deformed_sum(const float *lines, const float *gradient, const int64_t *order, int rows, int columns, int top, int left,
+                          int width, size_t *deformed) {
     const float *p = gradient, *q = gradient + (size_t)rows * columns;
     double sum = 0.0;
     for (int y = 0; y < rows; y++) {
@@ -121,7 +121,7 @@ static double touched_sum(const float *lines, const float *gradient, const int64
             if (*p != 0.0f || *q != 0.0f) {
                 const int at = left + x;
                 sum += line[at % 2 ? width - 1 - at / 2 : at / 2];
-                ++*touched;
+                ++*deformed;
             }
     }
     return sum;
@@ -129,19 +129,19 @@ static double touched_sum(const float *lines, const float *gradient, const int64
 
 /*
  * Depth (frames, height, width) from lines of that size whose rows and columns are reordered. Given the gradient of the window
- * (frames, 2, rows, columns) at (top, left), it is levelled: zero on average where the gradient is zero, and where that is nowhere, zero
+ * (frames, 2, rows, columns) at (top, left), the depth is zero on average where the gradient is zero, and where that is nowhere, zero
  * at its lowest.
  */
-EXPORT void settle(const float *lines, const int64_t *order, const float *gradient, int frames, int rows, int columns, int top, int left,
+EXPORT void finish_depth(const float *lines, const int64_t *order, const float *gradient, int frames, int rows, int columns, int top, int left,
                    int height, int width, float *depth) {
     const size_t pixels = (size_t)height * width;
     for (int b = 0; b < frames; b++, lines += pixels, depth += pixels) {
         double level = 0.0;
         if (gradient) {
-            size_t touched = 0;
-            const double sum = touched_sum(lines, gradient + 2 * (size_t)b * rows * columns, order, rows, columns, top, left, width, &touched);
-            if (touched < pixels)
-                level = -sum / (double)(pixels - touched);
+            size_t deformed = 0;
+            const double sum = deformed_sum(lines, gradient + 2 * (size_t)b * rows * columns, order, rows, columns, top, left, width, &deformed);
+            if (deformed < pixels)
+                level = -sum / (double)(pixels - deformed);
             else {
                 level = lines[0];
                 for (size_t k = 1; k < pixels; k++)
@@ -159,9 +159,9 @@ WIDE static uint32_t largest(const float *restrict one, const float *restrict ot
         union {
             float value;
             uint32_t bits;
-        } apart = {one[k] - other[k]};
-        apart.bits &= 0x7fffffffu;
-        most = apart.bits > most ? apart.bits : most;
+        } residual = {one[k] - other[k]};
+        residual.bits &= 0x7fffffffu;
+        most = residual.bits > most ? residual.bits : most;
     }
     return most;
 }

@@ -7,14 +7,13 @@ import pytest
 import torch
 
 import torchvts as vts
-from torchvts.compensate.compensate import _some_means
-from torchvts.core import native
-from torchvts.core.native import may_use_native, reference_only
-from torchvts.pipeline.depth import _largest_change
+from torchvts.accelerated import kernels, reference_only
+from torchvts.accelerated.blocks import Drift, LargestChange
+from torchvts.accelerated.gate import usable
 
 scenes = vts.scenes
 
-pytestmark = pytest.mark.skipif(native.library() is None and shutil.which("cc") is None, reason="no C compiler")
+pytestmark = pytest.mark.skipif(kernels.library() is None and shutil.which("cc") is None, reason="no C compiler")
 
 
 def both(call, *arguments):
@@ -25,7 +24,7 @@ def both(call, *arguments):
 
 
 def test_the_loops_were_built():
-    assert native.library() is not None, f"{native.LIBRARY} is missing: install again (make setup)"
+    assert kernels.library() is not None, f"{kernels.LIBRARY} is missing: install again (make setup)"
 
 
 @pytest.mark.parametrize("size", [(48, 64), (240, 320), (45, 63), (2, 2), (3, 7), (16, 5), (1, 9)])
@@ -104,15 +103,15 @@ def test_a_frame_of_every_mode(ring):
 @pytest.mark.parametrize("size", [(240, 320), (181, 200), (483, 640)])
 def test_means_on_a_grid(size):
     image = torch.randn(2, 3, *size, generator=torch.Generator().manual_seed(0))
-    loops, operators = both(_some_means, image)
+    loops, operators = both(Drift().samples, image)
     assert loops.shape == operators.shape and float((loops - operators).abs().max()) < 1e-6
 
 
 def test_the_largest_change():
     one, other = torch.randn(2, 3, 1, 7, 11, generator=torch.Generator().manual_seed(0))
-    loops, operators = both(_largest_change, one, other)
+    loops, operators = both(LargestChange(), one, other)
     assert torch.equal(loops, operators) and loops.shape == (3,)
-    assert bool(native.largest_change(one, torch.full_like(one, torch.nan)).isnan().all())
+    assert bool(kernels.largest_change(one, torch.full_like(one, torch.nan)).isnan().all())
 
 
 def test_a_dead_lamp(ring):
@@ -128,30 +127,30 @@ def test_channels_left_out(ring):
     lights, scene = ring(20.0, 12.0), scenes.sphere_press(10.0, 3.0, (0, 0), 60, 80, 0.4)
     block = vts.NormalFromIntensity(lights, 60, 80, 0.4)
     seen = scenes.render(scene, lights, noise_std=0.002, bits=8, seed=1).detach()
-    apart = block.without_dark(seen)
+    apart = block.shadowed.without_dark(seen, (0, 0))
     assert bool((apart < 0).any()) and torch.equal(apart.clamp_min(0), seen.masked_fill(apart < 0, 0))
     shiny = vts.NormalFromIntensity(vts.PointLights(lights.position_mm, lights.albedo, [0.9] * 3), 60, 80, 0.4)
     steep = scene.depth_mm * 1.5  # where the lobe is strong, what is left out is left out still
     brighter = torch.where(apart < 0, apart * 0.8, apart)
     assert torch.equal(shiny(apart, steep), shiny(brighter, steep))
     for depth in (None, scene.depth_mm):
-        loops, operators = both(block, apart, depth, None, torch.zeros(1, 2, 60, 80))
+        loops, operators = both(block.solve, apart, depth, None, torch.zeros(1, 2, 60, 80))
         assert float((loops - operators).abs().max()) < 2e-5
         assert float((loops - block(seen, depth)).abs().max()) > 0.1
 
 
 def test_what_loops_may_not_touch():
     plain = torch.zeros(1, 2, 8, 8)
-    assert may_use_native([plain, plain])
+    assert usable(plain, plain)
     with reference_only():
-        assert not may_use_native([plain])
-    assert not may_use_native([plain, plain.double()])
-    assert not may_use_native([plain.half()])
-    assert not may_use_native([plain.to("meta")])
+        assert not usable(plain)
+    assert not usable(plain, plain.double())
+    assert not usable(plain.half())
+    assert not usable(plain.to("meta"))
     recorded = plain.clone().requires_grad_(True)
-    assert not may_use_native([recorded])
+    assert not usable(recorded)
     with torch.no_grad():
-        assert may_use_native([recorded])
+        assert usable(recorded)
 
 
 def test_batches_that_do_not_fit_are_refused(ring):
@@ -161,10 +160,10 @@ def test_batches_that_do_not_fit_are_refused(ring):
         with pytest.raises(ValueError, match=f"depth_mm: expected 5 frames like compensated, or one for all, got {count}"):
             block(image, torch.zeros(count, 1, 48, 64))
         with pytest.raises(ValueError, match=f"expected: expected 5 frames like compensated, or one for all, got {count}"):
-            block(image, None, None, torch.zeros(count, 2, 48, 64))
+            block.solve(image, None, None, torch.zeros(count, 2, 48, 64))
     dark = image.clone()
     dark[:, 0, :20] = 0.0
-    loops, operators = both(block, dark, None, None, torch.zeros(1, 2, 48, 64))
+    loops, operators = both(block.solve, dark, None, None, torch.zeros(1, 2, 48, 64))
     assert float((loops - operators).abs().max()) < 1e-4
     assert block(image[:0]).shape == (0, 3, 48, 64) and vts.PoissonBackground(0.1)(torch.zeros(0, 2, 48, 64)).shape == (
         0,
@@ -247,23 +246,23 @@ def test_without_them_all_works(monkeypatch, ring, small_sensor, small_press):
     pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, small_sensor), "precise")
     image = scenes.render(small_press(1.0), lights).detach()
     loops = pipe(image).depth_mm
-    monkeypatch.setattr(native, "library", lambda: None)
-    assert not may_use_native([image])
+    monkeypatch.setattr(kernels, "library", lambda: None)
+    assert not usable(image)
     assert torch.allclose(pipe(image).depth_mm, loops, rtol=0, atol=2e-6)
 
 
 def test_a_library_that_is_missing_or_left_over_is_not_used(monkeypatch, tmp_path):
-    library = native.LIBRARY
-    monkeypatch.setattr(native, "LIBRARY", tmp_path / library.name)
+    library = kernels.LIBRARY
+    monkeypatch.setattr(kernels, "LIBRARY", tmp_path / library.name)
     try:
-        native.library.cache_clear()
-        assert native.library() is None
+        kernels.library.cache_clear()
+        assert kernels.library() is None
         shutil.copytree(library.parent, tmp_path, dirs_exist_ok=True)
-        native.library.cache_clear()
-        assert native.library() is not None
-        (tmp_path / "native.h").write_text("/* changed since */")
-        native.library.cache_clear()
+        kernels.library.cache_clear()
+        assert kernels.library() is not None
+        (tmp_path / "kernels.h").write_text("/* changed since */")
+        kernels.library.cache_clear()
         with pytest.warns(UserWarning, match="built from other sources than lie beside it, so it is not used: install again"):
-            assert native.library() is None
+            assert kernels.library() is None
     finally:
-        native.library.cache_clear()
+        kernels.library.cache_clear()

@@ -27,7 +27,7 @@ def precise(calibration, image):
 def test_a_second_unit_from_its_background_alone(data, mini, mode, limit_deg):
     background, bead = (vts.read_image(data / "gelsight_mini_b" / name) for name in ("background.png", "bead.png"))
     calibration = vts.calibrate(background, mini)
-    assert calibration.report["response"] == "the sensor's prior" and "point lights rejected" in calibration.report["reason"]
+    assert calibration.report["source"] == "prior" and "point lights rejected" in calibration.report["reason"]
     smooth_rest, smooth = (blur(image[None], gaussian_weights(1.0)) for image in (background, bead))
     own = vts.NormalFromMLP.load(data / "gelsight_mini_b" / "model" / "nnmodel.pth", smooth_rest[0])(smooth)
     out = vts.DepthPipeline.from_calibration(calibration, mode)(bead[None])

@@ -1,5 +1,5 @@
-/* The contact mask of compensated images: the same numbers as the operators of ContactMask in torchvts/contact.py, which say why. */
-#include "native.h"
+/* The contact mask of compensated images: the same results as torchvts/contact/masks.py, which explains them. */
+#include "kernels.h"
 
 #include <float.h>
 #include <math.h>
@@ -39,12 +39,12 @@ static float median(float *values, int n) {
     return kth_smallest(values, n, (n - 1) / 2);
 }
 
-/* noise_std() of torchvts/core/noise.py, of one channel's change: image * per_noise + rest. */
-static float noise_of(const float *image, const float *rest, const float *per_noise, int height, int width, int stride, float *some) {
+/* noise_std() of torchvts/core/noise.py, of one channel's change: image * per_noise + offset. */
+static float noise_of(const float *image, const float *offset, const float *per_noise, int height, int width, int stride, float *some) {
     int n = 0;
     for (int y = stride / 2; y < height; y += stride)
         for (int x = 0; x < width - 2; x += stride, n++) {
-            const float *i = image + (size_t)y * width + x, *r = rest + (size_t)y * width + x, *p = per_noise + (size_t)y * width + x;
+            const float *i = image + (size_t)y * width + x, *r = offset + (size_t)y * width + x, *p = per_noise + (size_t)y * width + x;
             float left = r[0] + i[0] * p[0], middle = r[1] + i[1] * p[1], right = r[2] + i[2] * p[2];
             some[n] = fabsf(middle - 0.5f * (left + right));
         }
@@ -63,10 +63,10 @@ static float noise_of(const float *image, const float *rest, const float *per_no
 }
 
 /* One row of one channel: its change is added to `sums`, its square to `squared`. */
-WIDE static void add_change(const float *restrict image, const float *restrict rest, const float *restrict per_noise, int width,
+WIDE static void add_change(const float *restrict image, const float *restrict offset, const float *restrict per_noise, int width,
                             float *restrict sums, float *restrict squared) {
     for (int x = 0; x < width; x++) {
-        float change = rest[x] + image[x] * per_noise[x];
+        float change = offset[x] + image[x] * per_noise[x];
         sums[x] += change;
         squared[x] += change * change;
     }
@@ -129,18 +129,18 @@ static void spread(uint8_t *cells, int wide, uint8_t walls, uint8_t mark, int32_
     }
 }
 
-/* Whether a lamp is dead: 1 for each channel that counts. More than one dark channel is no dead lamp. */
-static void living_lamps(const float *image, const float *dead_below, int height, int width, int step, int lives[3]) {
-    int dead = 0;
+/* Whether an LED has failed: 1 for each channel that counts. More than one dark channel is no failed LED. */
+static void working_leds(const float *image, const float *failed_below, int height, int width, int step, int works[3]) {
+    int failed = 0;
     for (int c = 0; c < 3; c++) {
         double total = 0.0;
         int count = 0;
         for (int y = step / 2; y < height; y += step)
             for (int x = step / 2; x < width; x += step, count++) total += image[((size_t)c * height + y) * width + x];
-        lives[c] = !(total / count < dead_below[c]);
-        dead += !lives[c];
+        works[c] = !(total / count < failed_below[c]);
+        failed += !works[c];
     }
-    if (dead != 1) lives[0] = lives[1] = lives[2] = 1;
+    if (failed != 1) works[0] = works[1] = works[2] = 1;
 }
 
 /* What one frame needs besides its masks. */
@@ -159,7 +159,7 @@ typedef struct {
 
 /* Pixels whose change stands out, closed, and each cell's share of them and mean change; where the size is no multiple of the cell's
    side, the last cells overlap others. */
-static void find_strong(const float *frame, const float *rest, const float *per_noise, const int lives[3], int height, int width,
+static void find_strong(const float *frame, const float *offset, const float *per_noise, const int works[3], int height, int width,
                         float threshold, Grid grid, Scratch at, uint8_t *strong) {
     const size_t pixels = (size_t)height * width, cells = (size_t)grid.rows * grid.columns;
     const int cell = grid.cell;
@@ -171,8 +171,8 @@ static void find_strong(const float *frame, const float *rest, const float *per_
             const size_t row = (size_t)y * width;
             memset(at.squared, 0, sizeof(float) * (size_t)width);
             for (int c = 0; c < 3; c++)
-                if (lives[c])
-                    add_change(frame + pixels * c + row, rest + pixels * c + row, per_noise + pixels * c + row, width,
+                if (works[c])
+                    add_change(frame + pixels * c + row, offset + pixels * c + row, per_noise + pixels * c + row, width,
                                at.sums + (size_t)c * width, at.squared);
             above(at.squared, threshold, width, strong + row);
         }
@@ -237,13 +237,13 @@ static int find_cells(Grid grid, float threshold, Scratch at) {
    but it takes three that lie together. */
 static void keep_large(Grid grid, Scratch at) {
     const int rows = grid.rows, columns = grid.columns, wide = columns + 2, reach = grid.reach;
-    const float weak = 0.4f * grid.least_cells < 1.0f ? 0.4f * grid.least_cells : 1.0f;
+    const float faint_weight = 0.4f * grid.least_cells < 1.0f ? 0.4f * grid.least_cells : 1.0f;
     float *weight = at.density;
     for (int i = 0; i < rows; i++)
         for (int j = 0; j < columns; j++) {
             const uint8_t kind = at.state[(i + 1) * wide + j + 1];
             float *w = weight + (size_t)i * columns + j;
-            *w = kind & OUTSIDE ? 0.0f : kind & FAINT ? weak : kind ? *w : 1.0f;
+            *w = kind & OUTSIDE ? 0.0f : kind & FAINT ? faint_weight : kind ? *w : 1.0f;
         }
     int top = 0;
     memset(at.down, 0, sizeof(float) * (size_t)(columns + 2 * reach));
@@ -300,10 +300,10 @@ static void to_pixels(Grid grid, Scratch at, int height, int width, uint8_t *str
 }
 
 /*
- * image (frames, 3, height, width), with rest and per_noise (3, height, width): change = image * per_noise + rest. Writes mask and
+ * image (frames, 3, height, width), with offset and per_noise (3, height, width): change = image * per_noise + offset. Writes mask and
  * inner, bytes (frames, height, width); inner is where cells decide, not pixels. Returns 0, or 1 where memory is short.
  */
-EXPORT int contact_mask(const float *image, const float *rest, const float *per_noise, const float *dead_below, int frames, int height,
+EXPORT int contact_mask(const float *image, const float *offset, const float *per_noise, const float *failed_below, int frames, int height,
                         int width, int step, int stride, int cell, int reach, float sigmas, float rounding, float least_cells,
                         uint8_t *mask, uint8_t *inner) {
     const Grid grid = {(height + cell - 1) / cell, (width + cell - 1) / cell, cell, reach, sigmas, least_cells};
@@ -324,16 +324,16 @@ EXPORT int contact_mask(const float *image, const float *rest, const float *per_
     }
     for (int b = 0; b < frames && !short_of_memory; b++) {
         const float *frame = image + 3 * pixels * b;
-        int lives[3];
-        living_lamps(frame, dead_below, height, width, step, lives);
+        int works[3];
+        working_leds(frame, failed_below, height, width, step, works);
         float noise = 1.0f;
         for (int c = 0; c < 3; c++)
-            if (lives[c]) {
-                const float found = noise_of(frame + pixels * c, rest + pixels * c, per_noise + pixels * c, height, width, stride, at.some);
+            if (works[c]) {
+                const float found = noise_of(frame + pixels * c, offset + pixels * c, per_noise + pixels * c, height, width, stride, at.some);
                 if (!(found <= noise)) noise = found;
             }
         const float threshold = sigmas * sigmas * (noise * noise + rounding);
-        find_strong(frame, rest, per_noise, lives, height, width, threshold, grid, at, mask + pixels * b);
+        find_strong(frame, offset, per_noise, works, height, width, threshold, grid, at, mask + pixels * b);
         if (find_cells(grid, threshold, at)) {
             keep_large(grid, at);
             to_pixels(grid, at, height, width, mask + pixels * b, inner + pixels * b);

@@ -1,7 +1,10 @@
-"""The record of a calibrated unit on disk."""
+"""A calibration on disk."""
 
+import copy
+import dataclasses
 import json
 import os
+import pickle
 
 import pytest
 import safetensors.torch
@@ -63,7 +66,7 @@ def test_double_precision_survives(ring, tmp_path):
 def test_what_the_paper_keeps_is_in_the_file(saved):
     tensors, metadata = load_tensors(saved)
     assert {"light_position_mm", "light_albedo", "compensation", "inverse"} <= set(tensors)
-    assert metadata["format_version"] == 4 and metadata["sensor"]["mm_per_pixel"] == 1.25
+    assert metadata["format_version"] == 5 and metadata["sensor"]["mm_per_pixel"] == 1.25
 
 
 def no_tensor(name):
@@ -98,17 +101,19 @@ TENSORS = {
     "integers": (put("background", lambda t: t.to(torch.int32)), "tensor 'background': expected .* floats, got .* torch.int32"),
 }  # fmt: skip
 METADATA = {
-    "a later version": (lambda m: m.update(format_version=99), "format version 99, this torchvts reads 1 to 4: update torchvts"),
-    "version zero": (lambda m: m.update(format_version=0), "format version 0"),
-    "version as text": (lambda m: m.update(format_version="1"), "format version '1'"),
-    "no version": (lambda m: m.pop("format_version"), "format version None"),
+    "a later version": (lambda m: m.update(format_version=99), "expected format version 5, got 99: .*update torchvts"),
+    "an earlier version": (lambda m: m.update(format_version=4), "expected format version 5, got 4"),
+    "version as text": (lambda m: m.update(format_version="1"), "format version 5, got '1'"),
+    "no version": (lambda m: m.pop("format_version"), "format version 5, got None"),
     "another kind": (lambda m: m.update(kind="mesh"), "expected a calibration, got a file of kind 'mesh'"),
     "no sensor": (lambda m: m.pop("sensor"), "expected keys and values, got NoneType"),
     "another sensor": (lambda m: m["sensor"].update(height=48), r"expected \(3, 48, 32\) floats, got \(3, 24, 32\)"),
     "another pitch": (lambda m: m["sensor"].update(mm_per_pixel=0.1), "does not fit the lights in the same file"),
     "unknown key of the sensor": (lambda m: m["sensor"].update(colour=1), "key 'colour': unknown"),
-    "no report": (lambda m: m.pop("report"), "'measured' or 'report' is missing"),
-    "measured as text": (lambda m: m.update(measured="yes"), "'measured' or 'report' is missing"),
+    "no report": (lambda m: m.pop("report"), "report: expected keys and values, got NoneType"),
+    "measured as text": (lambda m: m.update(measured="yes"), "measured: expected true or false, got 'yes'"),
+    "a report without a source": (lambda m: m["report"].pop("source"), "report: source: expected one of given, .*, got None"),
+    "a report of another model": (lambda m: m["report"].update(model="mesh"), "report: model: expected one of .*, got 'mesh'"),
 }
 
 
@@ -230,3 +235,17 @@ def test_lights_of_a_calibration_are_a_frozen_copy(ring):
     with torch.no_grad():
         lights.albedo.zero_()
     assert float(cal.lights.albedo.min()) > 0
+
+
+def test_derived_arrays_are_computed_once_and_anew_for_a_changed_calibration(calibration):
+    for name in ("model_image", "gain", "inverse", "defects", "flat", "saturated_above"):
+        assert getattr(calibration, name) is getattr(calibration, name), name
+    brighter = dataclasses.replace(calibration, background=2.0 * calibration.background)
+    assert not torch.equal(brighter.gain, calibration.gain) and "gain" not in pickle.loads(pickle.dumps(calibration)).__dict__
+    assert torch.equal(copy.deepcopy(calibration).gain, calibration.gain)
+
+
+def test_a_report_says_where_the_model_comes_from(calibration):
+    assert calibration.report["source"] == "given" and calibration.report["note"] == "Grüße"
+    with pytest.raises(ValueError, match=r"report: source: expected one of given, .*, got 'elsewhere'"):
+        vts.Calibration.from_lights(calibration.lights, SENSOR, None, {"source": "elsewhere"})

@@ -1,6 +1,6 @@
-/* What the sources of this folder share. All arrays are float32 unless told otherwise, rows contiguous. */
-#ifndef TORCHVTS_NATIVE_H
-#define TORCHVTS_NATIVE_H
+/* What the sources of this folder share. All arrays are float32 unless stated otherwise, rows contiguous. */
+#ifndef TORCHVTS_KERNELS_H
+#define TORCHVTS_KERNELS_H
 
 #include <stdint.h>
 #include <stdlib.h>

@@ -1,6 +1,6 @@
 /* Normals under three near lights: the same numbers as NormalFromIntensity in torchvts/normals/photometric.py and normal_at_depth in
    torchvts/shading.py, which say why. */
-#include "native.h"
+#include "kernels.h"
 
 #include <math.h>
 
@@ -43,10 +43,10 @@ WIDE static void at_depth(const float *restrict image, size_t step, const float 
     }
 }
 
-/* Whether any of n intensities lies below `dark` or reaches `full`. */
-WIDE static int is_unsound(const float *restrict image, const float *restrict dark, const float *restrict full, int n) {
+/* Whether any of n intensities lies below `dark` or reaches `saturated`. */
+WIDE static int any_invalid(const float *restrict image, const float *restrict dark, const float *restrict saturated, int n) {
     int found = 0;
-    for (int k = 0; k < n; k++) found |= (image[k] < dark[k]) | (image[k] >= full[k]);
+    for (int k = 0; k < n; k++) found |= (image[k] < dark[k]) | (image[k] >= saturated[k]);
     return found;
 }
 
@@ -80,18 +80,18 @@ static Lights lights_of(const float *position, const float *albedo, float axis_x
 
 /*
  * Normals (frames, 3, rows, columns) of a window of an image. image (frames, 3, rows, columns), frames, channels and rows `per_frame`,
- * `per_channel` and `per_row` elements apart. dark and full (3, height, width) and the inverse (3, 3, height, width) from the window's
+ * `per_channel` and `per_row` elements apart. dark and saturated (3, height, width) and the inverse (3, 3, height, width) from the window's
  * first pixel on, their rows `width` and planes `plane` elements apart. With depth, of the window, rows and frames `depth_row` and
  * `depth_frame` elements apart, the inverse is not needed, but position and albedo of the lights, and where the middle of the image lies
  * as seen from that of the window (axis_x, axis_y), mm; `per_height` is 1 over the camera's height.
- * Returns whether any light is blocked or channel full.
+ * Returns whether any light is blocked or channel saturated.
  */
-EXPORT int normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *dark, const float *full,
+EXPORT int normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *dark, const float *saturated,
                    const float *inverse, int64_t plane, int width, int frames, int rows, int columns, const float *depth,
                    int64_t depth_frame, int64_t depth_row, const float *position, const float *albedo, float pitch, float per_height,
                    float axis_x, float axis_y, float *normal) {
     const size_t pixels = (size_t)rows * columns;
-    int unsound = 0;
+    int invalid = 0;
     Lights lights;
     if (depth) lights = lights_of(position, albedo, axis_x, axis_y);
     for (int b = 0; b < frames; b++)
@@ -106,9 +106,9 @@ EXPORT int normals(const float *image, int64_t per_frame, int64_t per_channel, i
             else
                 from_inverse(row, (size_t)per_channel, inverse + at, (size_t)plane, columns, to, to + pixels, to + 2 * pixels);
             for (int c = 0; c < 3; c++)
-                unsound |= is_unsound(row + per_channel * c, dark + plane * c + at, full + plane * c + at, columns);
+                invalid |= any_invalid(row + per_channel * c, dark + plane * c + at, saturated + plane * c + at, columns);
         }
-    return unsound;
+    return invalid;
 }
 
 WIDE static void slope_row(const float *restrict x, const float *restrict y, const float *restrict z, float per_slope, int n,
@@ -136,7 +136,7 @@ WIDE static void normal_row(const float *restrict p, const float *restrict q, in
 }
 
 /* The gradient of a window (frames, 2, rows, columns) at (top, left) set into the whole image, zero elsewhere, and its normals. */
-EXPORT void widen(const float *gradient, int frames, int rows, int columns, int top, int left, int height, int width, float *whole,
+EXPORT void uncrop(const float *gradient, int frames, int rows, int columns, int top, int left, int height, int width, float *whole,
                   float *normal) {
     const size_t pixels = (size_t)height * width, part = (size_t)rows * columns;
     memset(whole, 0, sizeof(float) * 2 * pixels * (size_t)frames);

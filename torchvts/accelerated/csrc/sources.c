@@ -1,4 +1,4 @@
 /* Which sources the library was built from, so that one left over from others is not called. */
-#include "native.h"
+#include "kernels.h"
 
 EXPORT uint32_t sources(void) { return SOURCES; }

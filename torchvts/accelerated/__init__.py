@@ -1,0 +1,39 @@
+"""The blocks with compiled kernels, NumPy or OpenCV in their place where these may work: the same names, the same results.
+
+Each class here inherits from the plain block of the same name, overrides one method, and asks one gate. TorchScript,
+torch.export and torch.compile get the plain block.
+"""
+
+from .blocks import (
+    AdaptiveIntegration,
+    Compensate,
+    ContactMask,
+    Crop,
+    GradientFromNormal,
+    LargestChange,
+    NormalFromIntensity,
+    PerspectiveIntegration,
+    PoissonBackground,
+    PoissonDCT,
+    Uncrop,
+)
+from .gate import reference_only
+from .kernels import library
+from .twin import reference
+
+__all__ = [
+    "AdaptiveIntegration",
+    "Compensate",
+    "ContactMask",
+    "Crop",
+    "GradientFromNormal",
+    "LargestChange",
+    "NormalFromIntensity",
+    "PerspectiveIntegration",
+    "PoissonBackground",
+    "PoissonDCT",
+    "Uncrop",
+    "library",
+    "reference",
+    "reference_only",
+]

@@ -1,0 +1,187 @@
+"""Accelerated twins of the blocks of the online path."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .. import compensate, contact, integration, normals
+from ..compensate.drift import grid_stride
+from ..core import frame as frames
+from ..core import geometry
+from ..core.noise import second_differences, std_from_median
+from ..normals.shadowed import PRIOR_STD, STEPS, LightView
+from . import kernels
+from .gate import arrays_usable, usable
+from .twin import Twin
+
+
+class Drift(Twin, compensate.Drift):
+    """Samples by a compiled kernel; sorts and medians by NumPy: 0.03 ms for 3 x 4,800 values, torch 0.7."""
+
+    plain = compensate.Drift
+
+    def samples(self, image: Tensor) -> Tensor:
+        stride = grid_stride(image)
+        if stride < 3 or not usable(image):
+            return super().samples(image)
+        return kernels.grid_means(image, stride, stride // 2 - 1)
+
+    def ordered(self, values: Tensor) -> Tensor:
+        if not arrays_usable(values):
+            return super().ordered(values)
+        return torch.from_numpy(np.sort(values.numpy(), axis=-1))
+
+    def median(self, values: Tensor) -> Tensor:
+        return _median(values) if arrays_usable(values) else super().median(values)
+
+
+class Compensate(Twin, compensate.Compensate):
+    """With the accelerated estimator of drift."""
+
+    plain = compensate.Compensate
+    drift_block = Drift
+
+
+class ContactMask(Twin, contact.ContactMask):
+    """One compiled kernel for the whole mask; else medians by NumPy and connected components by OpenCV: 0.03 ms for 80 x 107 cells
+    where sweeps of tensors take 0.28."""
+
+    plain = contact.ContactMask
+
+    def find(self, compensated: Tensor) -> tuple[Tensor, Tensor]:
+        sampled = compensated.shape[2] > self.stride // 2 and compensated.shape[3] >= 3
+        if not (sampled and usable(compensated, self.offset)):
+            return super().find(compensated)
+        grid = kernels.ContactGrid(self.step, self.stride, self.cell, self.reach, self.sigmas, self.rounding, self.least_cells)
+        return kernels.contact_mask(compensated, self.offset, self.per_noise, self.failed_below, grid)
+
+    def noise(self, change: Tensor) -> Tensor:
+        if not arrays_usable(change):
+            return super().noise(change)
+        second = second_differences(change, self.samples)
+        return std_from_median(second, _median(second))
+
+    def reconstruct(self, seed: Tensor, mask: Tensor) -> Tensor:
+        if not arrays_usable(seed, mask):
+            return super().reconstruct(seed, mask)
+        import cv2
+
+        reached = np.empty(mask.shape, np.bool_)
+        for found, seeded, inside in zip(reached, seed.numpy(), mask.numpy(), strict=True):
+            # every other pixel a label; labels of 16 bits wake no threads
+            kind = cv2.CV_16U if inside.size < 2**17 - 8 else cv2.CV_32S
+            count, label = cv2.connectedComponents(inside[0].view(np.uint8), connectivity=4, ltype=kind)
+            kept = np.zeros(count, np.bool_)
+            kept[label[seeded[0]]] = True
+            kept[0] = False  # what is not in the mask
+            found[0] = kept[label]
+        return torch.from_numpy(reached)
+
+
+class Crop(Twin, frames.Crop):
+    """The box by OpenCV; of 320 x 240 pixels in 0.01 ms where tensors take 0.05."""
+
+    plain = frames.Crop
+
+    def box(self, contact: Tensor) -> tuple[int, int, int, int]:
+        if not arrays_usable(contact):
+            return super().box(contact)
+        import cv2
+
+        inside = contact[:, 0].to(torch.uint8).numpy()
+        left, top, columns, rows = cv2.boundingRect(inside[0] if len(inside) == 1 else inside.max(axis=0))
+        return top, top + rows, left, left + columns
+
+
+class NormalFromIntensity(Twin, normals.NormalFromIntensity):
+    """Normals, and whether all pixels are valid, in one pass; shadowed pixels in a second kernel."""
+
+    plain = normals.NormalFromIntensity
+
+    def normals_of(self, image: Tensor, depth_mm: Tensor | None, window: tuple[int, int], expected: Tensor | None) -> Tensor:
+        position, albedo = self.lights.position_mm, self.lights.albedo
+        given = [tensor for tensor in (depth_mm, expected) if tensor is not None]
+        if self.lights.glossy or not usable(image, position, albedo, self.inverse, *given):
+            return super().normals_of(image, depth_mm, window, expected)
+        x, y = self.middle_mm(image, window)
+        whole = LightView(position, albedo, self.mm_per_pixel, self.camera_height_mm, (-x, -y), window)
+        shadowed = self.shadowed
+        limits = normals.shadowed.Limits(shadowed.dark_where, shadowed.saturated_above, shadowed.ill_conditioned)
+        normal, valid = kernels.normals(image, limits, self.inverse, depth_mm, whole)
+        ill_conditioned = shadowed.any_ill_conditioned and bool(shadowed.limits(image, window).ill_conditioned.any())
+        if valid and not ill_conditioned:
+            return normal
+        noise = shadowed.noise_std
+        constants = [noise, (noise / PRIOR_STD) ** 2, (shadowed.brightness_std / noise) ** 2, STEPS]
+        constants += [geometry.CLIFF_SLOPE, geometry.MAX_SLOPE]
+        kernels.solve_shadowed(normal, image, limits, depth_mm, expected, self.view(image, window), constants)
+        return normal
+
+
+class GradientFromNormal(Twin, geometry.GradientFromNormal):
+    """One compiled pass."""
+
+    plain = geometry.GradientFromNormal
+
+    def forward(self, normal: Tensor) -> Tensor:
+        if not (isinstance(normal, Tensor) and normal.dim() == 4 and normal.shape[1] == 3 and usable(normal)):
+            return super().forward(normal)
+        return kernels.slopes(normal, self.max_slope)
+
+
+class PoissonDCT(Twin, integration.PoissonDCT):
+    """Compiled passes around the FFTs, which stay with torch."""
+
+    plain = integration.PoissonDCT
+
+    def integrate(self, gradient: Tensor, plan: list[Tensor], top: int, left: int) -> Tensor:
+        if not usable(gradient, plan[2]):
+            return super().integrate(gradient, plan, top, left)
+        return kernels.solve_poisson(gradient, self.mm_per_pixel, plan, (top, left), self.zero_in_background)
+
+
+class PoissonBackground(PoissonDCT, integration.PoissonBackground):
+    """As :class:`PoissonDCT`."""
+
+    plain = integration.PoissonBackground
+
+
+class AdaptiveIntegration(Twin, integration.AdaptiveIntegration):
+    """With the accelerated Poisson solver."""
+
+    plain = integration.AdaptiveIntegration
+    poisson = PoissonBackground
+
+
+class PerspectiveIntegration(Twin, integration.PerspectiveIntegration):
+    """With the accelerated Poisson solver."""
+
+    plain = integration.PerspectiveIntegration
+    poisson = PoissonBackground
+
+
+class LargestChange(Twin, frames.LargestChange):
+    """One compiled pass."""
+
+    plain = frames.LargestChange
+
+    def forward(self, one: Tensor, other: Tensor) -> Tensor:
+        return kernels.largest_change(one, other) if usable(one, other) else super().forward(one, other)
+
+
+class Uncrop(Twin, frames.Uncrop):
+    """Gradient and normals of the whole image in one compiled pass."""
+
+    plain = frames.Uncrop
+
+    def forward(self, frame: frames.Frame, solution: frames.Solution) -> frames.DepthOutput:
+        if not usable(solution.gradient):
+            return super().forward(frame, solution)
+        gradient, normal = kernels.uncrop(solution.gradient, frame.window, frame.size)
+        return frames.DepthOutput(solution.depth_mm, gradient, normal, frame.contact)
+
+
+def _median(values: Tensor) -> Tensor:
+    """Of the last dimension, the lower one of two; 0.02 ms for 3 x 2,000 values, torch 0.07."""
+    middle = (values.shape[-1] - 1) // 2
+    return torch.from_numpy(np.partition(values.numpy(), middle)[..., middle : middle + 1])

@@ -1,0 +1,56 @@
+"""The one gate: whether compiled kernels, or NumPy and OpenCV, may stand in for PyTorch on given tensors."""
+
+import contextlib
+import contextvars
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor, nn
+from torch.autograd import forward_ad
+
+from . import kernels
+
+_refused = contextvars.ContextVar("refused", default=False)
+
+
+@contextlib.contextmanager
+def reference_only() -> Iterator[None]:
+    """Within it, no compiled kernel runs: PyTorch does all the work, as in exported programs and on a GPU.
+
+    Example:
+        >>> from torchvts import PoissonBackground
+        >>> solver, gradient = PoissonBackground(0.1), torch.randn(1, 2, 48, 64)
+        >>> with reference_only():
+        ...     depth = solver(gradient)
+        >>> bool((solver(gradient) - depth).abs().max() < 1e-5)
+        True
+    """
+    before = _refused.set(True)
+    try:
+        yield
+    finally:
+        _refused.reset(before)
+
+
+def arrays_usable(*tensors: Tensor) -> bool:
+    """Whether NumPy and OpenCV may read these tensors: plain ones on a CPU, in eager mode, with no derivative recorded."""
+    if torch.compiler.is_compiling() or torch.jit.is_tracing():
+        return False
+    if forward_ad._current_level >= 0 or torch._C._len_torch_dispatch_stack() > 0:  # tangents and traces would be lost
+        return False
+    recorded = torch.is_grad_enabled()
+    return all(
+        type(tensor) in (Tensor, nn.Parameter)
+        and tensor.device.type == "cpu"
+        and tensor.dtype not in (torch.float16, torch.bfloat16)
+        and not (recorded and tensor.requires_grad)
+        and not torch._C._functorch.is_functorch_wrapped_tensor(tensor)
+        for tensor in tensors
+    )
+
+
+def usable(*tensors: Tensor) -> bool:
+    """Whether compiled kernels may work on these tensors: as :func:`arrays_usable`, and float32, and the kernels are there."""
+    if torch.compiler.is_compiling() or _refused.get() or kernels.library() is None:
+        return False
+    return all(tensor.dtype == torch.float32 for tensor in tensors) and arrays_usable(*tensors)

@@ -1,0 +1,39 @@
+"""How a block and its accelerated twin belong together: the twin knows its plain class, and a tree of modules can be made plain."""
+
+from typing import TypeVar
+
+from torch import nn
+
+_Module = TypeVar("_Module", bound=nn.Module)
+
+
+class Twin(nn.Module):
+    """Mix-in of accelerated blocks; ``plain`` is the class that TorchScript gets in their place."""
+
+    plain: type[nn.Module]
+
+    def __prepare_scriptable__(self) -> nn.Module:
+        return reference(self)
+
+
+def reference(module: _Module, memo: dict[int, nn.Module] | None = None) -> _Module:
+    """The same module of plain blocks: a tree of its own that shares all parameters, buffers and settings.
+
+    Args:
+        module: any module; parts that are no twins are copied as they are.
+        memo: modules already made plain, by identity.
+    Example:
+        >>> from torchvts import PoissonDCT
+        >>> type(reference(PoissonDCT(0.1))).__module__
+        'torchvts.integration.poisson'
+    """
+    memo = {} if memo is None else memo
+    if id(module) not in memo:
+        kind = module.plain if isinstance(module, Twin) else type(module)
+        copy = kind.__new__(kind)
+        copy.__dict__.update(module.__dict__)
+        memo[id(module)] = copy
+        copy.__dict__["_modules"] = {
+            name: None if child is None else reference(child, memo) for name, child in module._modules.items()
+        }
+    return memo[id(module)]  # type: ignore[return-value]

@@ -1,0 +1,142 @@
+"""How much the light of each LED has drifted since calibration, found in the undeformed part of a frame and divided out."""
+
+import torch
+from torch import Tensor, nn
+
+from ..core.checks import check_field, may_read_values
+from ..core.robust import half_sample_mode
+
+
+class Drift(nn.Module):
+    """Divide each channel of compensated images (B, 3, H, W) by its brightness relative to calibration.
+
+    Two estimators. :meth:`by_mode`, for response fields, whose compensated image is 1 where the skin is undeformed: the mode of all
+    pixels, up to 15 %. :meth:`by_statistics`, for lights: the undeformed pixels are found by all three channels, up to 35 %, and
+    the estimator refuses where it cannot tell them from contact. Given ``background`` and ``by_mode_first``, the second takes over
+    where the first reaches its limit. No gradient flows through either.
+
+    Args:
+        background: (3, H, W), the compensated image of the undeformed skin; None: by mode alone.
+        noise_std: (3, H, W), noise of the compensated image; needed with ``background``.
+        by_mode_first: whether a press changes the light of the whole skin a little, as with response fields on real sensors.
+        blurred: whether the compensated image is blurred; else the samples are means of 3 x 3 pixels, which have less noise.
+    Source:
+        the half-sample mode: Bickel and Fruhwirth, Computational Statistics and Data Analysis 50(12), 2006; the rest is this
+        project's.
+    """
+
+    background: Tensor | None
+    noise: Tensor | None
+
+    def __init__(
+        self,
+        background: Tensor | None = None,
+        noise_std: Tensor | None = None,
+        by_mode_first: bool = False,
+        blurred: bool = False,
+    ) -> None:
+        super().__init__()
+        self.by_mode_first = by_mode_first
+        samples, noise = None, None
+        if background is not None and noise_std is not None:
+            check_field("background", background)
+            check_field("noise_std", noise_std)
+            samples, noise = self.samples(background[None])[0], self.samples(noise_std[None])[0]
+            if not blurred and min(background.shape[1], background.shape[2]) >= 180:
+                noise = noise / 3.0  # of a mean of nine
+        self.register_buffer("background", None if samples is None else samples.detach().clone())
+        self.register_buffer("noise", None if noise is None else noise.detach().clone())
+
+    def forward(self, light: Tensor) -> Tensor:
+        background, noise = self.background, self.noise
+        if background is None or noise is None:
+            return light / self.by_mode(light)
+        if self.by_mode_first:
+            near = self.by_mode(light)
+            if may_read_values() and float((near - 1.0).abs().amax()) < 0.149:
+                return light / near
+            far = self.by_statistics(light, background, noise)
+            return light / torch.where((far - 1.0).abs() > 0.15, far, near)
+        level = self.by_statistics(light, background, noise)
+        if may_read_values() and bool((level == 1.0).all()):
+            return light
+        return light / level
+
+    def by_mode(self, ratio: Tensor, least: float = 0.01, most: float = 0.15) -> Tensor:
+        """Brightness of each channel (B, 3, 1, 1): the mode of image / background, held to 1 +- ``most``.
+
+        A press scatters light over the whole skin and LEDs drift: on a GelSight Mini up to 1 %, on another 5 %. Where no channel is
+        ``least`` off it is left at 1, because there the error of the mode is no smaller (relief 26 against 28 um on the first
+        Mini); from twice that it counts in full.
+        """
+        drift = (half_sample_mode(self.ordered(_grid(ratio.detach()).flatten(2))) - 1.0).clamp(-most, most)  # (B, 3)
+        weight = (drift.abs().amax(dim=1, keepdim=True) / least - 1.0).clamp(0.0, 1.0)
+        return (1.0 + weight * drift)[..., None, None]
+
+    def by_statistics(
+        self, light: Tensor, background: Tensor, noise_std: Tensor, least: float = 0.01, most: float = 0.35
+    ) -> Tensor:
+        """Brightness of each channel (B, 3, 1, 1), 1 where the undeformed skin cannot be told from contact.
+
+        At the modes of the three channels, pixels that are undeformed in all three at once are counted, each by exp(-chi^2 / 2),
+        chi in units of noise; their means refine the modes. There must be 5 % of such pixels, and a channel's drift is believed
+        only if they become less than 0.4 times as many without it, or 0.7 times if they are more than half of all: the flat top
+        of a tilted punch larger than half of the image has a mode of its own in one channel, but the skin around it is
+        undeformed without the drift.
+
+        Args:
+            light: (B, 3, H, W), compensated frames.
+            background: (3, h, w), samples of the compensated background.
+            noise_std: (3, h, w), their noise.
+            least: drift that counts, and least noise, relative.
+            most: largest drift that is believed.
+        """
+        background = background.clamp_min(1e-6)
+        ratio = self.samples(light.detach()) / background
+        variance = (noise_std / background) ** 2 + least**2
+        if may_read_values() and bool(((self.median(ratio.flatten(2)) - 1.0).abs() < 0.5 * least).all()):
+            return torch.ones_like(ratio[:, :, :1, :1])  # an LED that drifts takes the middle of all pixels along
+        level = half_sample_mode(self.ordered(ratio.flatten(2)))[..., None, None]
+        for _ in range(2):
+            chi = ((ratio - level) ** 2 / variance).sum(dim=1, keepdim=True)
+            weight = torch.exp(-0.5 * chi) / variance
+            level = (weight * ratio).sum(dim=(2, 3), keepdim=True) / weight.sum(dim=(2, 3), keepdim=True).clamp_min(1e-12)
+        off = (ratio - level) ** 2 / variance
+        chi = off.sum(dim=1, keepdim=True)
+        # a Gaussian in three channels has a mean exp(-chi^2 / 2) of 2^(-3/2)
+        undeformed = torch.exp(-0.5 * chi).mean(dim=(2, 3), keepdim=True) * 2.0**1.5
+        without = torch.exp(-0.5 * (chi - off + (ratio - 1.0) ** 2 / variance)).mean(dim=(2, 3), keepdim=True) * 2.0**1.5
+        drift = (level - 1.0).abs()
+        share = torch.where(undeformed > 0.5, 0.7, 0.4)
+        sure = (drift > least) & (drift < most) & (undeformed > 0.05) & (without < share * undeformed)
+        return torch.where(sure, level, torch.ones_like(level))
+
+    def samples(self, image: Tensor) -> Tensor:
+        """Some thousand pixels of an image on a grid, each the mean of 3 x 3 pixels where these do not overlap."""
+        stride = grid_stride(image)
+        if stride < 3:
+            return _grid(image)
+        first = stride // 2 - 1
+        rows, columns = image.shape[2] // stride * stride, image.shape[3] // stride * stride
+        total = image[:, :, first:rows:stride, first:columns:stride].clone()
+        for k in range(1, 9):
+            total += image[:, :, first + k // 3 : rows : stride, first + k % 3 : columns : stride]
+        return total / 9.0
+
+    def ordered(self, values: Tensor) -> Tensor:
+        """Values (B, 3, N) sorted along the last dimension."""
+        return values.sort(dim=-1).values
+
+    def median(self, values: Tensor) -> Tensor:
+        """Median of values (B, 3, N), the lower one of two, (B, 3, 1)."""
+        return values.median(dim=-1, keepdim=True).values
+
+
+def grid_stride(image: Tensor) -> int:
+    """Distance of the samples: 60 of them along the shorter side."""
+    return max(1, min(image.shape[2], image.shape[3]) // 60)
+
+
+def _grid(image: Tensor) -> Tensor:
+    stride = grid_stride(image)
+    return image[:, :, stride // 2 :: stride, stride // 2 :: stride]

@@ -1,0 +1,141 @@
+"""What the blocks of the online path hand to each other: a frame cut to the window around its contact, and its solution."""
+
+from typing import Final, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from .checks import may_read_values
+from .geometry import normal_from_gradient
+
+
+class Frame(NamedTuple):
+    """A batch of compensated images and the window that holds all of their contact.
+
+    Attributes:
+        compensated: (B, 3, H, W), the whole compensated image.
+        contact: (B, 1, H, W) bool, the whole contact mask.
+        image: (B, 3, h, w), the window of ``compensated``.
+        mask: (B, 1, h, w) bool, the window of ``contact``.
+        window: (top, left), the place of the window's first pixel.
+        size: (H, W).
+    """
+
+    compensated: Tensor
+    contact: Tensor
+    image: Tensor
+    mask: Tensor
+    window: tuple[int, int]
+    size: tuple[int, int]
+
+
+class Solution(NamedTuple):
+    """gradient (B, 2, h, w) in the window, mm per mm; depth_mm (B, 1, H, W) of the whole image."""
+
+    gradient: Tensor
+    depth_mm: Tensor
+
+
+class DepthOutput(NamedTuple):
+    """depth_mm (B, 1, H, W); gradient (B, 2, H, W), mm per mm; normal (B, 3, H, W), unit; contact (B, 1, H, W) bool."""
+
+    depth_mm: Tensor
+    gradient: Tensor
+    normal: Tensor
+    contact: Tensor
+
+
+def as_factor(mask: Tensor, like: Tensor) -> Tensor:
+    """A bool mask as zeros and ones of the dtype of ``like``."""
+    return mask.to(torch.uint8).to(like.dtype)  # four times as fast as straight from bool
+
+
+def depth_in_window(frame: Frame, depth_mm: Tensor) -> Tensor:
+    """The window's part (B, 1, h, w) of a depth (B, 1, H, W)."""
+    top, left = frame.window
+    return depth_mm[:, :, top : top + frame.image.shape[2], left : left + frame.image.shape[3]]
+
+
+def with_contact(frame: Frame, image: Tensor, mask: Tensor) -> Frame:
+    """The frame with another image and another contact mask in its window."""
+    (top, left), (height, width) = frame.window, frame.size
+    outside = [left, width - left - mask.shape[3], top, height - top - mask.shape[2]]
+    return Frame(frame.compensated, nn.functional.pad(mask, outside), image, mask, frame.window, frame.size)
+
+
+class Crop(nn.Module):
+    """Cut a compensated image (B, 3, H, W) and its contact (B, 1, H, W) to the smallest window that holds all contact.
+
+    Outside of the contact the gradient is zero, so the window changes nothing but the time. Elsewhere than on a CPU, in exported
+    programs, and where little would be saved, the window is the whole image: finding it would wait for the device.
+
+    Args:
+        stride: the corners of the window are multiples of it.
+        enabled: False for models that need the whole image.
+    """
+
+    enabled: Final[bool]
+
+    def __init__(self, stride: int = 8, enabled: bool = True) -> None:
+        super().__init__()
+        self.stride = stride
+        self.enabled = enabled
+
+    def forward(self, compensated: Tensor, contact: Tensor) -> Frame:
+        height, width = compensated.shape[2], compensated.shape[3]
+        top, bottom, left, right = 0, height, 0, width
+        if self.enabled and may_read_values() and compensated.device.type == "cpu" and contact.shape[0] > 0:
+            top, bottom, left, right = self.window(self.box(contact), height, width)
+        image, mask = compensated[:, :, top:bottom, left:right], contact[:, :, top:bottom, left:right]
+        return Frame(compensated, contact, image, mask, (top, left), (height, width))
+
+    def box(self, contact: Tensor) -> tuple[int, int, int, int]:
+        """(top, bottom, left, right) of the smallest box that holds all contact of all frames; zeros without contact."""
+        inside = as_factor(contact, torch.zeros(1))
+        rows, columns = inside.sum(dim=(0, 1, 3)).nonzero(), inside.sum(dim=(0, 1, 2)).nonzero()
+        if rows.shape[0] == 0:
+            return 0, 0, 0, 0
+        return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+
+    def window(self, box: tuple[int, int, int, int], height: int, width: int) -> tuple[int, int, int, int]:
+        """The box and the pixels beside it, from which depth has slopes, at least two strides wide, with corners on the stride."""
+        stride = self.stride
+        top, bottom, left, right = box
+        top, left = max(0, top - 1) // stride * stride, max(0, left - 1) // stride * stride
+        bottom = min(height, max((bottom + stride) // stride, top // stride + 2) * stride)
+        right = min(width, max((right + stride) // stride, left // stride + 2) * stride)
+        top, left = max(0, min(top, bottom - 2 * stride)), max(0, min(left, right - 2 * stride))
+        if (bottom - top) * (right - left) > 0.8 * height * width or top % stride != 0 or left % stride != 0:
+            return 0, height, 0, width
+        return top, bottom, left, right
+
+
+class Uncrop(nn.Module):
+    """Embed the solution of a window in the whole image: (frame, solution) to :class:`DepthOutput`."""
+
+    def forward(self, frame: Frame, solution: Solution) -> DepthOutput:
+        (top, left), (height, width) = frame.window, frame.size
+        gradient = solution.gradient
+        rows, columns = gradient.shape[2], gradient.shape[3]
+        normal = normal_from_gradient(gradient)
+        if rows < height or columns < width:
+            gradient = nn.functional.pad(gradient, [left, width - left - columns, top, height - top - rows])
+            inside, normal = normal, normal.new_zeros([gradient.shape[0], 3, height, width])
+            normal[:, 2].fill_(1.0)
+            normal[:, :, top : top + rows, left : left + columns] = inside
+        return DepthOutput(solution.depth_mm, gradient, normal, frame.contact)
+
+
+class LargestChange(nn.Module):
+    """Largest difference of two batches of depths, per frame, (B,)."""
+
+    def forward(self, one: Tensor, other: Tensor) -> Tensor:
+        return (one - other).abs().amax(dim=(1, 2, 3))
+
+
+def undeformed_output(frame: Frame) -> DepthOutput:
+    """The output for frames without contact: depth zero, normals towards the camera."""
+    zero = torch.zeros_like(frame.compensated)
+    normal = zero.clone()
+    normal[:, 2] = 1.0
+    return DepthOutput(zero[:, 0:1], zero[:, 0:2], normal, frame.contact)

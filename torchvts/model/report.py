@@ -1,0 +1,172 @@
+"""The typed summary of a calibration: which model it is, where that comes from, and how far to trust it."""
+
+from typing import Any, Literal, TypedDict, cast, get_args
+
+from ..core.checks import brief
+
+Model = Literal["point_lights", "response"]
+
+Source = Literal["given", "sensor_file", "background", "prior", "touches", "presses", "stand_in"]
+"""Where the model comes from.
+
+* given: the caller gave the model.
+* sensor_file: the sensor file gives the positions of the lights.
+* background: lights were fitted to the image without contact.
+* prior: the response of the sensor type.
+* touches: a response was fitted to touches by unknown objects.
+* presses: a response was fitted to presses of balls.
+* stand_in: a rough response from the directions of lights whose positions do not fit the image; depth is not metric.
+"""
+
+
+class _CandidateKeys(TypedDict):
+    model: str
+
+
+class CandidateRow(_CandidateKeys, total=False):
+    """One model that calibration considered.
+
+    Attributes:
+        model: its kind, in words.
+        family: its size, in words.
+        parameters: number of fitted parameters.
+        passes: 1 for normals from the image alone, 2 for normals that also use the depth of a first pass.
+        score_deg: error or standard deviation that the choice used, degrees; None where none could be computed.
+        misfit: relative structure of the background that lights leave unexplained.
+        held_out: loss of lights on blocks of the background that were held out.
+        gamma: camera response it was fitted with.
+        vignetting: share of the light that the lens loses in the image corners.
+        ambient: (3,), constant linear light.
+        tried: degrees of fields that touches were tried with.
+        note: why it was chosen or rejected.
+    """
+
+    family: str
+    parameters: int
+    passes: int
+    score_deg: float | None
+    misfit: float
+    held_out: float
+    gamma: float
+    vignetting: float
+    ambient: list[float]
+    tried: list[dict[str, float]]
+    note: str
+
+
+class _PressKeys(TypedDict):
+    name: str
+    used: bool
+
+
+class PressRow(_PressKeys, total=False):
+    """What became of one press.
+
+    Attributes:
+        name: of the press.
+        used: whether the fit used it.
+        reason: why it was left out, else "".
+        center_px: (x, y) of the ball.
+        contact_radius_px: radius of the contact.
+        error_deg: mean angle between the ball's normals and those of the prior, or of the other presses, degrees.
+        gain: slopes of the prior, or of the other presses, divided by the ball's slopes.
+    """
+
+    reason: str
+    center_px: Any  # two numbers
+    contact_radius_px: float
+    error_deg: float
+    gain: float
+
+
+class TouchRow(TypedDict):
+    """What became of one touch.
+
+    Attributes:
+        name: of the touch.
+        used: whether the fit used it.
+        reason: why it was left out, else "".
+    """
+
+    name: str
+    used: bool
+    reason: str
+
+
+class _ReportKeys(TypedDict):
+    model: Model
+    source: Source
+
+
+class Report(_ReportKeys, total=False):
+    """Summary of a calibration: a dict of plain JSON values. Only ``model`` and ``source`` are always there.
+
+    Attributes:
+        model: which model the calibration holds.
+        source: where the model comes from, see :data:`Source`.
+        reason: why this model was chosen.
+        candidates: all models that were considered.
+        presses: one row per press.
+        touches: one row per touch.
+        held_out_deg: mean error on presses by a response fitted to the other presses, degrees; None with too few presses.
+        family: of the lights, in words.
+        chosen_because: why these lights, among the candidates.
+        converged: whether the fit of the lights converged.
+        message: how that fit ended, and what to do if it did not converge.
+        steps: its number of steps.
+        loss: its last loss.
+        gamma: camera response of the lights.
+        direction_std_deg: (3,), standard deviation of each light's direction, degrees.
+        position_std_mm: (3, 3), standard deviation of each coordinate, mm.
+        misfit: (3,), relative structure that the lights leave unexplained.
+        inlier_fraction: share of the pixels that the robust fit kept.
+        gloss: (3,), strength of the specular lobe.
+        vignetting: share of the light that the lens loses in the image corners.
+        ambient: (3,), constant linear light.
+        residual_std: (3,), robust standard deviation of background minus model, linear light.
+        standing_out: share of the background that differs clearly from the lights' model.
+        camera_height_mm: height of a pinhole camera above the skin, where it is known.
+    """
+
+    reason: str
+    candidates: list[CandidateRow]
+    presses: list[PressRow]
+    touches: list[TouchRow]
+    held_out_deg: float | None
+    family: str
+    chosen_because: str
+    converged: bool
+    message: str
+    steps: int
+    loss: float
+    gamma: float
+    direction_std_deg: list[float]
+    position_std_mm: list[list[float]]
+    misfit: list[float]
+    inlier_fraction: float
+    gloss: list[float]
+    vignetting: float
+    ambient: list[float]
+    residual_std: list[float]
+    standing_out: float
+    camera_height_mm: float
+
+
+def read_report(values: Any, source: str) -> Report:
+    """Check a report read from a file.
+
+    Args:
+        values: what the file holds.
+        source: names the file in errors.
+    Raises:
+        ValueError: not a mapping, or ``model`` or ``source`` is missing or unknown.
+    Example:
+        >>> read_report({"model": "response", "source": "prior"}, "file")["source"]
+        'prior'
+    """
+    if not isinstance(values, dict):
+        raise ValueError(f"{source}: expected keys and values, got {type(values).__name__}")
+    for key, known in (("model", get_args(Model)), ("source", get_args(Source))):
+        if values.get(key) not in known:
+            raise ValueError(f"{source}: {key}: expected one of {', '.join(known)}, got {brief(values.get(key))}")
+    return cast(Report, values)

@@ -1,0 +1,291 @@
+"""Normals of pixels where a light is blocked, a channel is saturated, or the light matrix is ill-conditioned."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ..core.checks import check_shape, may_read_values
+from ..core.geometry import gradient_from_normal, normal_from_gradient, slope_beside_cliff
+from ..model.lights import light_matrix, seen_at
+
+LEFT_OUT = -1.0
+"""Intensity of a channel that is left out at a pixel because something else than the skin's slope blocks its light; shadowed.c has
+it too. No camera gives half of it."""
+
+PRIOR_STD = 0.25
+"""Spread of slopes about what is known of them beforehand."""
+
+STEPS = 3
+"""Gauss-Newton steps where a light is blocked."""
+
+BRIGHTNESS_NOISES = 1.5
+"""Standard deviation of the common brightness, in units of noise, where a light is blocked. At a noise of 0.01 a ball keeps a
+fifth of the plain inverse's error, and a quarter if the brightness counts in full; with 2 % at any noise, walls of slope 4 at a
+noise of 0.002 are twice as wrong."""
+
+FAILED_SHARE = 0.98
+"""A channel that is dark on a larger part of the window has lost its LED, for no shadow is so large."""
+
+
+class LightView(NamedTuple):
+    """Lights and camera as seen from the middle of a window.
+
+    Attributes:
+        position_mm: (3, 3), of the lights.
+        albedo: (3,).
+        mm_per_pixel: pixel pitch, mm.
+        camera_height_mm: infinite for an orthographic camera.
+        axis_mm: the middle of the image, x and y.
+        window: (top, left), the place of the window's first pixel in the image.
+    """
+
+    position_mm: Tensor
+    albedo: Tensor
+    mm_per_pixel: float
+    camera_height_mm: float
+    axis_mm: tuple[float, float]
+    window: tuple[int, int]
+
+
+def matrix_in_view(depth_mm: Tensor, view: LightView) -> Tensor:
+    """The light matrix at a depth (B, 1, h, w): (B, 3, 3, h, w)."""
+    return light_matrix(depth_mm, view.position_mm, view.albedo, view.mm_per_pixel, view.camera_height_mm, view.axis_mm)
+
+
+class Limits(NamedTuple):
+    """Between which intensities a channel is valid, and where the light matrix is ill-conditioned.
+
+    Attributes:
+        dark_below: (3, h, w); minus infinity where the flat skin is not lit.
+        saturated_above: (3, h, w).
+        ill_conditioned: (h, w) bool.
+    """
+
+    dark_below: Tensor
+    saturated_above: Tensor
+    ill_conditioned: Tensor
+
+
+class Pixels(NamedTuple):
+    """N pixels to solve by themselves.
+
+    Attributes:
+        start: (N, 2), slopes (dz/dx, dz/dy) to start from.
+        intensity: (N, 3), compensated.
+        rows: (N, 3, 3), light matrix.
+        saturated: (N, 3) bool, channels that are saturated; one that is left out is a saturated one of intensity 0.
+    """
+
+    start: Tensor
+    intensity: Tensor
+    rows: Tensor
+    saturated: Tensor
+
+
+def slope_by_lit_lights(
+    pixels: Pixels, noise_std: float, brightness_std: float = 0.01, prior_std: float = PRIOR_STD, steps: int = STEPS
+) -> Tensor:
+    """Slopes of pixels where a light is blocked or a channel is saturated: each pixel against the clamped model max(0, L n).
+
+    n is of unit length. A blocked channel says no more than that it is dark, a saturated one that it is at least so bright. That
+    leaves two intensities for two slopes and, near |n| = 1, a direction that is poorly constrained. A weak prior of standard
+    deviation ``prior_std`` about ``start`` holds that direction; where ``start`` comes from a depth map, the neighbours enter
+    through it. The brightness that all channels share counts only to ``brightness_std``: a depth 0.1 mm off changes it by a
+    hundredth, and near the plane of two lights, where |n| = 1 bends away from it, noise in it would push the slope. Gauss-Newton
+    in closed form, steps of at most 0.5.
+
+    Args:
+        pixels: the pixels.
+        noise_std: noise of the compensated image, against which the prior is weighed.
+        brightness_std: of the common brightness, relative.
+        prior_std: of the slope about ``start``.
+        steps: of Gauss-Newton.
+    Returns:
+        (N, 2).
+    Source:
+        the shadowed pixels of Barsky and Petrou, TPAMI 25(10), 2003, as a maximum a posteriori estimate.
+    """
+    start, compensated, rows = pixels.start, pixels.intensity, pixels.rows
+    weight = (noise_std / prior_std) ** 2
+    slope = start
+    for _ in range(steps):
+        p, q = slope[:, 0:1], slope[:, 1:2]
+        n_z = torch.rsqrt(1.0 + p * p + q * q)
+        normal = torch.cat((-p * n_z, -q * n_z, n_z), dim=1)
+        light = (rows * normal[:, None]).sum(2)  # (N, 3)
+        # 0.1 sigma above zero, because a black channel starts exactly on the terminator
+        lit = ((light > 0.1 * noise_std) & ~(pixels.saturated & (light >= compensated))).to(light.dtype)
+        # d normal / d slope is -n_z (e - n (n.e)) along x and y: the part of the light row across the normal
+        across = -n_z[:, :, None] * (rows - light[:, :, None] * normal[:, None])[:, :, 0:2] * lit[:, :, None]
+        model = light * lit
+        residual = compensated * lit - model
+        # whitened by the covariance noise^2 1 + brightness^2 model model^T
+        energy = (model * model).sum(1, keepdim=True)
+        common = (1.0 - torch.rsqrt(1.0 + (brightness_std / noise_std) ** 2 * energy)) / energy.clamp_min(1e-12)
+        along = common * model
+        residual = residual - along * (model * residual).sum(1, keepdim=True)
+        across = across - along[:, :, None] * (model[:, :, None] * across).sum(1, keepdim=True)
+        a = (across[:, :, 0] ** 2).sum(1) + weight
+        b = (across[:, :, 0] * across[:, :, 1]).sum(1)
+        c = (across[:, :, 1] ** 2).sum(1) + weight
+        right = (across * residual[:, :, None]).sum(1) + weight * (start - slope)
+        step = torch.stack((c * right[:, 0] - b * right[:, 1], a * right[:, 1] - b * right[:, 0]), dim=1)
+        p_q = torch.linalg.cross(across[:, :, 0], across[:, :, 1], dim=1)
+        # a c - b^2 without cancellation (Cauchy-Binet): one lit channel leaves a determinant of the prior's size
+        determinant = (p_q * p_q).sum(1) + weight * (a + c - weight)
+        step = step / determinant[:, None]
+        length = torch.sqrt((step * step).sum(1, keepdim=True) + 1e-18)
+        slope = slope + step * (0.5 / length).clamp_max(1.0)
+    return slope
+
+
+def failed_leds(dark: Tensor, share: float = FAILED_SHARE) -> Tensor:
+    """Channels whose LED has failed, bool (B, 3): dark (B, 3, h, w) on more than that share of the window."""
+    return dark.to(torch.float32).mean(dim=(2, 3)) > share
+
+
+class ShadowedPixels(nn.Module):
+    """Replaces normals where the plain inverse does not hold; the others stay as they are.
+
+    That is where a light that shines on the flat skin is dark, where a channel is saturated, and where the matrix is so
+    ill-conditioned that its inverse makes more of the noise than slopes vary (``PRIOR_STD``). Where an LED has failed, the other
+    two and |n| = 1 are left, so all pixels go this way, starting from the flat skin.
+
+    Args:
+        flat: (3, H, W), what the lights give on the flat skin.
+        noise_std: (3,), noise of the compensated image.
+        ill_conditioned: (H, W) bool.
+        saturated_above: (3, H, W), intensity from which a channel counts as saturated; None for never.
+    """
+
+    dark_below: Tensor
+    dark_where: Tensor
+    saturated_above: Tensor
+    ill_conditioned: Tensor
+
+    def __init__(self, flat: Tensor, noise_std: Tensor, ill_conditioned: Tensor, saturated_above: Tensor | None) -> None:
+        super().__init__()
+        self.left_out = LEFT_OUT
+        self.noise_std = max(float(noise_std.square().mean().sqrt()), 1e-6)
+        self.brightness_std = max(0.005, BRIGHTNESS_NOISES * self.noise_std)
+        self.register_buffer("dark_below", 3.0 * noise_std.detach().to(flat.dtype))
+        self.any_ill_conditioned = bool(ill_conditioned.any())
+        self.register_buffer("ill_conditioned", ill_conditioned)
+        # a channel can only be called dark where its light shines on the flat skin
+        below = self.dark_below.reshape(3, 1, 1)
+        self.register_buffer("dark_where", torch.where(flat > 2.0 * below, below, -torch.inf))
+        if saturated_above is not None:
+            check_shape("saturated_above", saturated_above, flat.shape)
+        above = torch.full_like(flat, torch.inf) if saturated_above is None else saturated_above.detach().to(flat.dtype)
+        self.register_buffer("saturated_above", above)
+
+    def limits(self, image: Tensor, window: tuple[int, int]) -> Limits:
+        """The limits in the window of an image (B, 3, h, w)."""
+        top, left = window
+        bottom, right = top + image.shape[2], left + image.shape[3]
+        return Limits(
+            self.dark_where[:, top:bottom, left:right],
+            self.saturated_above[:, top:bottom, left:right],
+            self.ill_conditioned[top:bottom, left:right],
+        )
+
+    def all_valid(self, image: Tensor, limits: Limits) -> bool:
+        """Whether no pixel of the image needs this module."""
+        image = image.detach()  # asked by subtraction, which is three times as fast as comparison
+        valid = float((image - limits.dark_below).amin()) >= 0.0 and float((image - limits.saturated_above).amax()) < 0.0
+        return valid and not (self.any_ill_conditioned and bool(limits.ill_conditioned.any()))
+
+    def forward(self, normal: Tensor, image: Tensor, depth_mm: Tensor | None, view: LightView, expected: Tensor | None) -> Tensor:
+        """Normals (B, 3, h, w) with those replaced that the plain inverse got wrong.
+
+        Args:
+            normal: (B, 3, h, w), by the plain inverse.
+            image: (B, 3, h, w), compensated.
+            depth_mm: (B or 1, 1, h, w), the depth so far; its slopes are the start.
+            view: lights and camera.
+            expected: (B, 2, h, w), slopes to start from where there is no depth; None for those of ``normal``.
+        """
+        limits = self.limits(image, view.window)
+        if may_read_values() and self.all_valid(image, limits):
+            return normal
+        dark = image < limits.dark_below
+        failed = failed_leds(dark)
+        invalid = dark | (image >= limits.saturated_above) | failed[:, :, None, None]
+        b, row, column = torch.where(invalid.any(dim=1) | limits.ill_conditioned)
+        start = gradient_from_normal(normal[b, :, row, column][:, :, None, None])[:, :, 0, 0]
+        if expected is not None:
+            start = expected[b, :, row, column]
+        start = torch.where((failed.any(dim=1)[b] | limits.ill_conditioned[row, column])[:, None], torch.zeros_like(start), start)
+        z = torch.zeros_like(start[:, 0])
+        if depth_mm is not None:  # its neighbours enter through it
+            depth = depth_mm[:, 0].expand(image.shape[0], image.shape[2], image.shape[3])
+            z = depth[b, row, column]
+            start = _slope_at(depth, b, row, column, view.mm_per_pixel)
+        x = (column.to(normal.dtype) - 0.5 * (image.shape[3] - 1)) * view.mm_per_pixel
+        y = (row.to(normal.dtype) - 0.5 * (image.shape[2] - 1)) * view.mm_per_pixel
+        if depth_mm is not None:
+            x, y = seen_at(x, z, view.camera_height_mm, view.axis_mm[0]), seen_at(y, z, view.camera_height_mm, view.axis_mm[1])
+        to_light = view.position_mm - torch.stack((x, y, z), dim=1)[:, None]  # (N, light, axis)
+        squared = (to_light * to_light).sum(2, keepdim=True)
+        rows = view.albedo[None, :, None] * to_light * (squared.rsqrt() / squared)
+        intensity, lost = image[b, :, row, column], failed[b]
+        saturated = (intensity >= limits.saturated_above[:, row, column].t()) | lost | (intensity <= 0.5 * self.left_out)
+        pixels = Pixels(start, intensity * (~lost).to(intensity.dtype), rows, saturated)
+        slope = slope_by_lit_lights(pixels, self.noise_std, self.brightness_std)
+        solution = normal_from_gradient(slope[:, :, None, None])[:, :, 0, 0]
+        return normal.permute(0, 2, 3, 1).index_put((b, row, column), solution).permute(0, 3, 1, 2)
+
+    @torch.jit.export
+    def blocked(self, image: Tensor, window: tuple[int, int]) -> Tensor:
+        """Where one or two of the lights that shine on the flat skin are dark, (B, 1, h, w) bool; a failed LED is not counted."""
+        below = self.limits(image, window).dark_below
+        if may_read_values() and bool((image.detach() - below).amin() >= 0.0):
+            return torch.zeros_like(image[:, 0:1], dtype=torch.bool)
+        dark = image < below
+        return (dark & ~failed_leds(dark)[:, :, None, None]).any(dim=1, keepdim=True)
+
+    @torch.jit.export
+    def without_dark(self, image: Tensor, window: tuple[int, int]) -> Tensor:
+        """The image (B, 3, h, w) with dark channels left out, as where something else than the skin's slope blocks the light."""
+        return image.masked_fill(image < self.limits(image, window).dark_below, self.left_out)
+
+    @torch.jit.export
+    def mirrored(self, gradient: Tensor, image: Tensor, depth_mm: Tensor, view: LightView) -> Tensor:
+        """Slopes that fit as well where one light is blocked, but lie beyond the plane of the other two.
+
+        Two lights and |n| = 1 leave a normal and its mirror image. On walls the one beyond the plane is right, and no start near a
+        depth that is still too low finds it.
+
+        Args:
+            gradient: (B, 2, h, w), slopes so far.
+            image: (B, 3, h, w), compensated.
+            depth_mm: (B, 1, h, w).
+            view: lights and camera.
+        Returns:
+            (B, 2, h, w); as they are elsewhere.
+        """
+        matrix = matrix_in_view(depth_mm, view)
+        dark = image < self.limits(image, view.window).dark_below
+        dark = dark & ~failed_leds(dark)[:, :, None, None]
+        one = dark.to(torch.uint8).sum(dim=1, keepdim=True) == 1
+        normal = normal_from_gradient(gradient)
+        result = normal
+        for light in range(3):
+            plane = torch.linalg.cross(matrix[:, (light + 1) % 3], matrix[:, (light + 2) % 3], dim=1)
+            along = (normal * plane).sum(dim=1, keepdim=True)
+            towards = along * (plane * matrix[:, light]).sum(dim=1, keepdim=True) > 0.0
+            reflected = normal - plane * (2.0 * along / plane.square().sum(dim=1, keepdim=True).clamp_min(1e-30))
+            result = torch.where(one & towards & dark[:, light : light + 1], reflected, result)
+        return gradient_from_normal(result)
+
+
+def _slope_at(depth_mm: Tensor, b: Tensor, row: Tensor, column: Tensor, mm_per_pixel: float) -> Tensor:
+    """:func:`~torchvts.core.geometry.slope_of_depth` of a depth (B, h, w) at N pixels, (N, 2)."""
+    height, width = depth_mm.shape[1], depth_mm.shape[2]
+    z = depth_mm[b, row, column]
+    left, right = depth_mm[b, row, (column - 1).clamp_min(0)], depth_mm[b, row, (column + 1).clamp_max(width - 1)]
+    above, below = depth_mm[b, (row - 1).clamp_min(0), column], depth_mm[b, (row + 1).clamp_max(height - 1), column]
+    p = slope_beside_cliff((z - left) / mm_per_pixel, (right - z) / mm_per_pixel)
+    q = slope_beside_cliff((z - above) / mm_per_pixel, (below - z) / mm_per_pixel)
+    return torch.stack((p, q), dim=1)

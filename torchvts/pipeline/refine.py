@@ -1,0 +1,179 @@
+"""Refinement policies: whether and how often a frame is solved again with the depth found (eq. 10 of the paper)."""
+
+import torch
+from torch import Tensor, nn
+
+from ..core.frame import Frame, Solution, as_factor, depth_in_window
+from ..integration import Integrator
+from ..normals import NormalModel
+from .solve import Solve
+
+
+class Once(nn.Module):
+    """No refinement: the first pass stands."""
+
+    def forward(self, frame: Frame, solution: Solution) -> tuple[Frame, Solution]:
+        return frame, solution
+
+
+class Repeat(nn.Module):
+    """Solve again until the change that is still missing falls below a tolerance.
+
+    What is missing is extrapolated from how fast the change of depth shrinks from pass to pass. Frames of a batch do not influence
+    one another: each stops by itself.
+
+    Args:
+        solve: one pass.
+        largest_change: of two depths, per frame.
+        mm_per_pixel: pixel pitch, mm.
+        tolerance_px: pixels of pitch.
+        max_passes: bound on all passes, the first among them.
+    """
+
+    def __init__(
+        self, solve: Solve, largest_change: nn.Module, mm_per_pixel: float, tolerance_px: float = 0.002, max_passes: int = 8
+    ) -> None:
+        super().__init__()
+        self.solve = solve
+        self.largest_change = largest_change
+        self.mm_per_pixel = mm_per_pixel
+        self.tolerance_px = tolerance_px
+        self.max_passes = max_passes
+
+    def forward(self, frame: Frame, solution: Solution) -> tuple[Frame, Solution]:
+        return frame, self.repeat(frame, solution, self.unsettled(frame, solution))
+
+    @torch.jit.export
+    def unsettled(self, frame: Frame, solution: Solution) -> Tensor:
+        """The frames of a batch that are to be solved again, bool (B,): all of them."""
+        return torch.ones(frame.image.shape[0], dtype=torch.bool, device=frame.image.device)
+
+    @torch.jit.export
+    def repeat(self, frame: Frame, solution: Solution, active: Tensor) -> Solution:
+        """Solve the active frames again until each has settled."""
+        if not torch.jit.is_scripting():  # noqa: SIM102
+            if torch.compiler.is_exporting():
+                return self._repeat_in_graph(frame, solution, active)
+        gradient, depth = solution.gradient, solution.depth_mm
+        last_px = depth.detach().abs().amax(dim=(1, 2, 3)) / self.mm_per_pixel
+        for _ in range(1, self.max_passes):
+            if not bool(active.any()):
+                break
+            index = torch.where(active)[0]
+            every = index.shape[0] == active.shape[0]
+            before = _some(depth, index, every)
+            found = self.solve(_some_frames(frame, index, every), before)
+            change_px = self.largest_change(found.depth_mm.detach(), before.detach()) / self.mm_per_pixel
+            missing_px = still_missing_px(change_px, _some(last_px, index, every))
+            gradient = _with_some(gradient, index, found.gradient, every)
+            depth = _with_some(depth, index, found.depth_mm, every)
+            active = _with_some(active, index, missing_px > self.tolerance_px, every)
+            last_px = _with_some(last_px, index, change_px, every)
+        return Solution(gradient, depth)
+
+    def _repeat_in_graph(self, frame: Frame, solution: Solution, active: Tensor) -> Solution:
+        """:meth:`repeat` for torch.export: the loop as one operator; settled frames are computed along and left as they are."""
+        from torch._higher_order_ops.while_loop import while_loop
+
+        def unsettled(step: Tensor, gradient: Tensor, depth: Tensor, active: Tensor, last_px: Tensor) -> Tensor:
+            return active.any() & (step < self.max_passes)
+
+        def go_again(step: Tensor, gradient: Tensor, depth: Tensor, active: Tensor, last_px: Tensor) -> tuple[Tensor, ...]:
+            found = self.solve(frame, depth)
+            change_px = self.largest_change(found.depth_mm, depth) / self.mm_per_pixel
+            left = active & (still_missing_px(change_px, last_px) > self.tolerance_px)
+            where = active[:, None, None, None]
+            gradient, depth = torch.where(where, found.gradient, gradient), torch.where(where, found.depth_mm, depth)
+            return step + 1, gradient.contiguous(), depth.contiguous(), left, torch.where(active, change_px, last_px)
+
+        gradient, depth = solution.gradient.contiguous(), solution.depth_mm.contiguous()
+        last_px = depth.abs().amax(dim=(1, 2, 3)) / self.mm_per_pixel
+        step = torch.ones((), dtype=torch.int64, device=depth.device)
+        state: tuple[Tensor, ...] = (step, gradient, depth, active, last_px)
+        if self.max_passes == 2:  # one pass needs no loop, and stays differentiable
+            state = go_again(*state)
+        elif self.max_passes > 2:
+            state = while_loop(unsettled, go_again, state)  # type: ignore[no-untyped-call]
+        return Solution(state[1], state[2])
+
+
+class Adaptive(Repeat):
+    """Solve again only frames for which a second pass is predicted to change the depth by more than a threshold.
+
+    The prediction is a second pass on every ``stride``-th pixel.
+
+    Args:
+        solve: one pass.
+        largest_change: of two depths, per frame.
+        coarse_normals: the model of normals for every ``stride``-th pixel.
+        coarse_integrate: the integrator for that grid.
+        mm_per_pixel: pixel pitch, mm.
+        tolerance_px: pixels of pitch.
+        max_passes: bound on all passes.
+        refine_threshold_px: predicted change from which a frame is solved again, pixels of pitch.
+        stride: pixels.
+    Source:
+        this project.
+    """
+
+    def __init__(
+        self,
+        solve: Solve,
+        largest_change: nn.Module,
+        coarse_normals: NormalModel,
+        coarse_integrate: Integrator,
+        mm_per_pixel: float,
+        tolerance_px: float = 0.01,
+        max_passes: int = 8,
+        refine_threshold_px: float = 0.05,
+        stride: int = 8,
+    ) -> None:
+        super().__init__(solve, largest_change, mm_per_pixel, tolerance_px, max_passes)
+        self.coarse_normals = coarse_normals
+        self.coarse_integrate = coarse_integrate
+        self.refine_threshold_px = refine_threshold_px
+        self.stride = stride
+
+    @torch.jit.export
+    def unsettled(self, frame: Frame, solution: Solution) -> Tensor:
+        """The frames for which a second pass is predicted to change the depth by more than the threshold, bool (B,)."""
+        if min(frame.size[0], frame.size[1]) <= self.stride + self.stride // 2:  # the grid would have one pixel a line
+            return torch.ones(frame.image.shape[0], dtype=torch.bool, device=frame.image.device)
+        return self.predicted_change_px(frame, solution) > self.refine_threshold_px
+
+    @torch.jit.export
+    def predicted_change_px(self, frame: Frame, solution: Solution) -> Tensor:
+        """Largest change of depth that a second pass would bring, per frame (B,), in pixels of pitch."""
+        (top, left), (height, width) = frame.window, frame.size
+        first, step = self.stride // 2, self.stride
+        image = frame.image.detach()[:, :, first::step, first::step]
+        depth = depth_in_window(frame, solution.depth_mm.detach())[:, :, first::step, first::step]
+        inside = as_factor(frame.mask[:, :, first::step, first::step], image)
+        before = solution.gradient.detach()[:, :, first::step, first::step]
+        corner = (top // step, left // step)
+        size = ((height + step - first - 1) // step, (width + step - first - 1) // step)
+        change = self.solve.gradient(self.coarse_normals(image, depth, corner)) * inside - before
+        found: Tensor = self.coarse_integrate(change, corner, size)
+        return found.abs().amax(dim=(1, 2, 3)) / self.mm_per_pixel
+
+
+def still_missing_px(change_px: Tensor, last_px: Tensor) -> Tensor:
+    """The stopping rule: what is missing after a change that shrank by r from the one before, change * r / (1 - r)."""
+    ratio = (change_px / last_px.clamp_min(1e-12)).clamp(0.0, 0.9)
+    return change_px * ratio / (1.0 - ratio)
+
+
+def _some_frames(frame: Frame, index: Tensor, every: bool) -> Frame:
+    if every:
+        return frame
+    return Frame(frame.compensated[index], frame.contact[index], frame.image[index], frame.mask[index], frame.window, frame.size)
+
+
+def _some(frames: Tensor, index: Tensor, every: bool) -> Tensor:
+    """Some frames of a batch, or all as they are."""
+    return frames if every else frames[index]
+
+
+def _with_some(frames: Tensor, index: Tensor, some: Tensor, every: bool) -> Tensor:
+    """A batch with some of its frames replaced."""
+    return some if every else frames.index_copy(0, index, some)

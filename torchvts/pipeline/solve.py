@@ -1,0 +1,40 @@
+"""One pass: from a compensated window to normals, gradient and depth (eq. 9 or 10, 5 and 4 of the paper)."""
+
+from torch import Tensor, nn
+
+from ..core.frame import Frame, Solution, as_factor, depth_in_window
+from ..integration import Integrator
+from ..normals import NormalModel
+
+
+class Solve(nn.Module):
+    """Normals, gradient and depth of a :class:`~torchvts.core.frame.Frame`.
+
+    Args:
+        normals: compensated image to normals.
+        gradient: normals to gradient.
+        integrate: gradient to depth.
+    """
+
+    def __init__(self, normals: NormalModel, gradient: nn.Module, integrate: Integrator) -> None:
+        super().__init__()
+        self.normals = normals
+        self.gradient = gradient
+        self.integrate = integrate
+
+    def forward(self, frame: Frame, depth_mm: Tensor | None = None) -> Solution:
+        """Solve a frame.
+
+        Args:
+            frame: the frame.
+            depth_mm: (B, 1, H, W), the depth so far, which eq. 10 takes; None for eq. 9.
+        """
+        if depth_mm is None:
+            normal = self.normals(frame.image, None, frame.window)
+        else:
+            normal = self.normals(frame.image, depth_in_window(frame, depth_mm), frame.window)
+        return self.integrated(frame, self.gradient(normal) * as_factor(frame.mask, frame.image))
+
+    def integrated(self, frame: Frame, gradient: Tensor) -> Solution:
+        """The solution with a gradient (B, 2, h, w) that is known."""
+        return Solution(gradient, self.integrate(gradient, frame.window, frame.size))

@@ -17,7 +17,7 @@ import torchvts as vts
 from torchvts.core.files import read_frames
 from torchvts.dataset import CLOUD_FORMATS, DEPTH_FORMATS, PICTURES_UP_TO, Report, list_items, reconstruct_dataset
 from torchvts.diagnose import Finding
-from torchvts.pipeline.depth import MODES
+from torchvts.pipeline import MODES
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:

@@ -19,8 +19,7 @@ from torchvts import scenes
 from torchvts.diagnose import Diagnosis, Finding
 from torchvts.diagnose.camera import blockiness, levels_of
 from torchvts.evaluation.faults import jpeg
-from torchvts.evaluation.gallery import CORRUPTIONS as DIALS
-from torchvts.evaluation.gallery import undisturbed
+from torchvts.evaluation.gallery import CORRUPTIONS, undisturbed
 
 NAMED = {
     "deeper press": {"deep_press"},
@@ -63,12 +62,12 @@ NEVER_HARMLESS = {"two contacts", "markers", "JPEG"}
 """Corruptions whose first severity is no clean image, such as a JPEG, which halves the resolution of colours."""
 
 
-def middle(dial):
-    return dial.severities[len(dial.severities) // 2]
+def middle(corruption):
+    return corruption.severities[len(corruption.severities) // 2]
 
 
 def named(name, seed):
-    case = DIALS[name].make(middle(DIALS[name]), seed)
+    case = CORRUPTIONS[name].make(middle(CORRUPTIONS[name]), seed)
     found = vts.diagnose(case.background, case.image, case.calibration)
     return bool(NAMED[name] & set(found.names)), found
 
@@ -92,7 +91,7 @@ CASES = {}
 @pytest.mark.parametrize("name", [name for name in NAMED if name not in NEVER_HARMLESS])
 def test_findings_come_from_the_fault_and_from_nothing_else(name):
     """A corruption of no severity is not found."""
-    case = DIALS[name].make(DIALS[name].severities[0], 7)
+    case = CORRUPTIONS[name].make(CORRUPTIONS[name].severities[0], 7)
     unit = case.calibration
     tensors = (case.background, case.image, unit.background, unit.lights.position_mm.detach(), unit.lights.albedo.detach())
     key = (*(hash(tensor.numpy().tobytes()) for tensor in tensors), repr(unit.sensor), repr(unit.report), repr(unit.markers))
@@ -102,7 +101,7 @@ def test_findings_come_from_the_fault_and_from_nothing_else(name):
 
 
 def test_perspective_is_known_from_the_calibration_only():
-    case = DIALS["perspective"].make(20.0, 0)
+    case = CORRUPTIONS["perspective"].make(20.0, 0)
     without = dataclasses.replace(case.calibration, report={})
     assert vts.diagnose(case.background, case.image, without).findings == ()
     assert vts.diagnose(case.background, case.image, case.calibration).names == ("perspective",)
@@ -184,7 +183,7 @@ def test_every_wrong_order_of_channels_is_seen(order):
 
 
 def test_contact_in_the_background_and_at_calibration():
-    case, other = undisturbed(1), DIALS["cut by the border"].make(8.0, 2)
+    case, other = undisturbed(1), CORRUPTIONS["cut by the border"].make(8.0, 2)
     assert "contact_in_background" in vts.diagnose(other.image[0], case.image, case.calibration).names
     unit = vts.Calibration.from_lights(case.calibration.lights, case.calibration.sensor, other.image[0])
     assert "contact_in_calibration" in vts.diagnose(None, case.image, unit).names
@@ -198,7 +197,7 @@ def test_a_background_of_now_shows_the_same_as_the_image():
 
 
 def test_a_contact_over_the_whole_skin_is_not_taken_for_other_light():
-    smooth = DIALS["covers the image"].make(2.2, 3)
+    smooth = CORRUPTIONS["covers the image"].make(2.2, 3)
     assert "no_free_skin" in vts.diagnose(smooth.background, smooth.image, smooth.calibration).names
     size = {"height": 120, "width": 160, "mm_per_pixel": 0.125}
     waves = scenes.surface(lambda x, y: 1.0 + 0.15 * torch.sin(2.1 * x) * torch.sin(1.7 * y), **size)
@@ -315,11 +314,11 @@ def test_a_real_contact_in_the_calibration_image_is_found(mini_presses):
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--dials", nargs="+", default=list(DIALS))
+    parser.add_argument("--corruptions", nargs="+", default=list(CORRUPTIONS))
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     hits = total = 0
-    for name in arguments.dials:
+    for name in arguments.corruptions:
         beside: dict[str, int] = {}
         right = 0
         for seed in range(arguments.seeds):
@@ -328,7 +327,8 @@ def main():
             for finding in found:
                 if finding.name not in NAMED[name] and finding.severity != "note":
                     beside[finding.name] = beside.get(finding.name, 0) + 1
-        print(f"| {name} | {middle(DIALS[name]):g} {DIALS[name].unit} | {right}/{arguments.seeds} | {beside or ''} |", flush=True)
+        severity = f"{middle(CORRUPTIONS[name]):g} {CORRUPTIONS[name].unit}"
+        print(f"| {name} | {severity} | {right}/{arguments.seeds} | {beside or ''} |", flush=True)
         hits, total = hits + right, total + arguments.seeds
     clean = [vts.diagnose(c.background, c.image, c.calibration) for c in map(undisturbed, range(100, 100 + arguments.seeds))]
     print(

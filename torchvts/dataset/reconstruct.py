@@ -30,7 +30,7 @@ from ..core.checks import check_integer
 from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, count_frames, write_atomically, write_depth_png
 from ..core.geometry import depth_to_points
 from ..model import Calibration
-from ..pipeline.depth import MODES, DepthOutput, DepthPipeline
+from ..pipeline import MODES, DepthOutput, DepthPipeline
 from .items import list_items
 from .loading import Frame, load_frames
 from .records import Records, Settings, begin, join, locked

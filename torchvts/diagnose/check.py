@@ -2,58 +2,11 @@
 
 from torch import Tensor
 
-from ..calibration import ROUGH, channel_structure, falloff, outwardness
-from ..core.checks import QUANTISATION_STD, check_field, check_range
-from ..core.noise import noise_std
-from ..integration import integrate_perspective
-from ..model.calibration import Calibration, check_calibration
-from ..model.lights import PointLights
-from .camera import Spots, blockiness, levels_of, new_spots, texture_share
-from .findings import SEVERITIES, Diagnosis, Finding
-from .light_change import CHANNELS, FULL, SAME, Change, cell_means, compare
-from .surface import (
-    Reader,
-    Relief,
-    angle_deg,
-    cast_shadow_share,
-    least_spread,
-    length_misfit,
-    lit_noise,
-    normal_noise_deg,
-    peaks,
-    regions,
-    skirt_mm,
-)
-from .words import THAN_AT_CALIBRATION, in_words
-
-USUAL_DRIFT = 0.05
-"""Light of real lamps drifts, and a press scatters light over the skin: by 2 % on one GelSight Mini, by 5 % on another. What a
-response field, which levels every frame, sees below this is worth no more than a note."""
-
-NO_DRIFT = 0.01
-"""Below this a smooth change of light is not worth a word."""
-
-OF_THE_MODEL = {
-    "ambient_light", "black_level", "gamma", "channels_mixed", "channels_swapped", "specular", "lights_misfit", "other_unit",
-    "skin_changed", "light_changed",
-}  # fmt: skip
-"""What makes normals longer or shorter than one by itself: then their length says nothing more."""
-
-FLOODED = {"skin_changed", "new_spots", "few_bits", "compressed", "other_unit", "light_changed", "noise"}
-"""What may pass for contact: then its outline and number mean nothing."""
-
-BLOCKY = 1.18
-"""Steps at the borders of 8 x 8 blocks over those inside from which an image was compressed; noise alone stays below 1.1, a
-JPEG of quality 95 is at 1.2 to 1.3."""
-
-LEAST_REST = 0.15
-"""Part of the image that must follow a change of light for it to be believed."""
-
-COPLANAR = 0.3
-"""Smallest singular value of the lights' directions below which they nearly lie in one plane."""
-
-WORTH_DEG = 0.5
-"""Error of normals from which a change is a warning; from six times that it is a fault."""
+from ..core.checks import check_field, check_range
+from ..model import Calibration, check_calibration
+from .checks import run_checks
+from .examination import Examination
+from .findings import Diagnosis, Finding
 
 
 def diagnose(background: Tensor | None, image: Tensor, calibration: Calibration) -> Diagnosis:

@@ -9,8 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..calibration.background import falloff, outwardness
-from ..calibration.contacts import ROUGH, channel_structure
+from ..calibration import ROUGH, channel_structure, falloff, outwardness
 from ..core.checks import QUANTISATION_STD
 from ..core.noise import noise_std
 from ..model import Calibration, PointLights

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..calibration.background import falloff
+from ..calibration import falloff
 from ..core.geometry import pixel_grid_mm
 from ..model import Calibration
 

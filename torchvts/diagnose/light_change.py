@@ -12,9 +12,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..calibration import falloff
-from ..core.geometry import pixel_grid_mm
-from ..model.calibration import Calibration
+from ..core.robust import TUKEY, tukey_weight
+from ..model import Calibration
+from .hypotheses import Grid, Hypothesis, list_hypotheses
 
 CELLS = 60
 """Cells along the shorter side."""

@@ -8,23 +8,10 @@ from torch import Tensor, nn
 
 from ..calibration import GIVEN_MISFIT, LOOSE_DEG, ROUGH, CalibrationWarning, calibrate, channel_structure
 from ..contact import ContactMask
-from ..core.checks import check_batch, check_field, check_least, check_positive, check_range, check_same_size, check_shape
-from ..core.geometry import pixel_grid_mm
-from ..model.calibration import PEDESTAL, Calibration
-from ..model.response_field import CHANGE_SCALE, ResponseField, ResponseModel
-from ..model.sensor import Sensor, check_sensor
-
-TIME_CONSTANT_S = 1.0
-"""The light is followed with this time constant: a lamp that fades by 1 % a second is followed 1 % behind."""
-
-LIGHT_STEP = 0.03
-"""Light that departs further than this from what was followed so far has stepped: told, and not learned."""
-
-RECOVERY_S = 1.0
-"""After a contact the gel takes this long to come back; what the light seems to do until then is no step."""
-
-LEAST_FREE = 0.25
-"""Part of the skin that must be out of contact for the light to be judged by it."""
+from ..core.checks import check_batch
+from ..model import Calibration, ResponseField, ResponseModel, Sensor, check_sensor
+from ..model.calibration import PEDESTAL
+from ..model.response_field import CHANGE_SCALE
 
 MOVED = 0.02
 """Relative change of a cell of 1/20 of the frame that counts as movement among the first frames."""

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from ..core.checks import check_choice, check_integer, check_positive
 from ..core.files import rgb_from_bgr
 from ..model import Calibration, Sensor
-from ..pipeline.depth import MODES, DepthOutput, DepthPipeline
+from ..pipeline import MODES, DepthOutput, DepthPipeline
 from .background import calibrate_background, contact_in_video, find_background, use_calibration
 from .follow_light import TIME_CONSTANT_S, FollowLight
 from .sources import NewestFrame, Pixels, Reader, Rectify, Replay, open_source

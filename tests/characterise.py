@@ -411,6 +411,8 @@ def record_calibrations(record: Record, data: Path | None) -> None:
     )
     out = vts.DepthPipeline.from_calibration(by_presses, "precise")(presses[0].image[None])
     record.add_output("fitted to 6 presses, precise, compiled", out)
+    bounds = vts.ConfidentPipeline.from_calibration(by_presses, "precise")(presses[0].image[None])
+    record.add("confidence", "fitted to 6 presses, precise", **bounds._asdict())
     mix = torch.tensor([[0.35, -0.05], [-0.2, 0.3], [-0.1, -0.33]])
 
     def linear_camera(scene: Any, seed: int) -> Tensor:
@@ -423,7 +425,10 @@ def record_calibrations(record: Record, data: Path | None) -> None:
     touches = [vts.Touch(linear_camera(soft[0], 0), 0.3), *(linear_camera(scene, 7 + k) for k, scene in enumerate(soft[1:]))]
     record_calibration(record, "3 touches", vts.calibrate(linear_camera(rest, 99), small, touches=touches))
     if data is not None:
-        record_calibration(record, "GelSight Mini, background and prior", real_mini(data).calibration)
+        mini, images = real_mini(data)
+        record_calibration(record, "GelSight Mini, background and prior", mini)
+        bounds = vts.ConfidentPipeline.from_calibration(mini, "precise")(images)
+        record.add("confidence", "GelSight Mini by the prior, precise", **bounds._asdict())
 
 
 def record_diagnoses(record: Record) -> None:

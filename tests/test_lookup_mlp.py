@@ -14,7 +14,8 @@ from torchvts.core.files import save_tensors
 from torchvts.core.geometry import gradient_from_normal, normal_from_gradient
 from torchvts.model.gs_sdk import read_calibration_folder, read_labels
 from torchvts.normals.lookup import NormalFromLookup
-from torchvts.normals.mlp import MAX_GRADIENT, NormalFromMLP, fit_mlp
+from torchvts.normals.mlp import MAX_GRADIENT, NormalFromMLP
+from torchvts.training import fit_mlp
 
 HEIGHT, WIDTH = 24, 32
 # what a rig of three lights 120 degrees apart shows of a slope, and its inverse on the plane that the colours fill

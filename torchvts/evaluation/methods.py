@@ -13,8 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from ..accelerated import reference_only
-from ..calibration import fit_prior
-from ..calibration.calibrate import as_read
+from ..calibration import fit_prior, with_preprocessing
 from ..compensate import Compensate
 from ..contact import ContactMask
 from ..core.geometry import GradientFromNormal, normal_from_gradient
@@ -306,8 +305,8 @@ class _NormalsOfSecond(NormalModel):
 
 def _unit(background: Tensor, sensor: Sensor) -> Calibration:
     """The unit with a response field that is zero everywhere: every method uses its contact mask."""
-    blur_px = as_read(sensor, None).blur_px
-    return Calibration.from_response(ResponseModel.blank(sensor.exponent, blur_px), sensor, background)
+    blur_px = with_preprocessing(sensor, None).blur_px
+    return Calibration.from_response(ResponseModel.zero(sensor.exponent, blur_px), sensor, background)
 
 
 def _smooth(unit: Calibration) -> Compensate:

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from .. import scenes
-from ..calibration import CalibrationWarning, Press, calibrate
-from ..calibration.calibrate import by_presses
+from ..calibration import CalibrationWarning, Press, by_presses, calibrate
 from ..model import Calibration, PointLights, Sensor
 from ..model.report import PressRow, Report
 

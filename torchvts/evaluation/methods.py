@@ -12,21 +12,21 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..accelerated import reference_only
-from ..calibration import fit_prior, with_preprocessing
-from ..compensate import Compensate
-from ..contact import ContactMask
-from ..core.geometry import GradientFromNormal, normal_from_gradient
-from ..integration import AdaptiveIntegration, PerspectiveIntegration, PoissonBackground, PoissonDST
-from ..model import Calibration, ResponseModel, Sensor
-from ..normals import (
+from ..accelerated import (
+    AdaptiveIntegration,
+    Compensate,
+    ContactMask,
+    GradientFromNormal,
     NormalFromIntensity,
-    NormalFromLookup,
-    NormalFromMLP,
-    NormalFromResponse,
-    NormalModel,
-    as_normal_model,
+    PerspectiveIntegration,
+    PoissonBackground,
+    reference_only,
 )
+from ..calibration import fit_prior, with_preprocessing
+from ..core.geometry import normal_from_gradient
+from ..integration import PoissonDST
+from ..model import Calibration, ResponseModel, Sensor
+from ..normals import NormalFromLookup, NormalFromMLP, NormalFromResponse, NormalModel, as_normal_model
 from ..pipeline import DepthOutput, DepthPipeline
 from ..scenes import render, sphere_press
 from .peers import PoissonSciPy

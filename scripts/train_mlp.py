@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torchvts as vts
-from torchvts.evaluation.presses import train_network
+from torchvts.evaluation.score import train_network
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -33,12 +33,12 @@ def lights_unit(ring, noise_std=0.004, background=True, **options):
     return calibration, scene, lambda seed, std=noise_std: scenes.render(scene, lights, noise_std=std, seed=seed)
 
 
-def response_unit(held_out_deg=2.0, presses=20, source="fitted to presses"):
+def response_unit(held_out_deg=2.0, presses=20, source="presses"):
     """A GelSight Mini by its prior, with the report of a fit to so many presses with that error."""
     sensor = vts.Sensor.load("gelsight_mini", height=48, width=64)
     prior = sensor.prior
     background = (prior.background(48, 64, sensor.mm_per_pixel) ** (1.0 / prior.response.gamma)).float().clamp(0.0, 1.0)
-    report = {"model": "response", "response": source, "held_out_deg": held_out_deg, "presses": [{"used": True}] * presses}
+    report = {"model": "response", "source": source, "held_out_deg": held_out_deg, "presses": [{"used": True}] * presses}
     calibration = vts.Calibration.from_response(prior.response, sensor, background, report)
     return calibration, sample_frames(calibration)
 
@@ -175,7 +175,7 @@ def test_the_held_out_error_of_presses_sets_the_bounds():
 
     good, bad, few = bound(held_out_deg=1.0), bound(held_out_deg=4.0), bound(held_out_deg=1.0, presses=3)
     assert good < few < bad and bad / good == pytest.approx(4.0, abs=0.1)
-    assert good < bound(held_out_deg=None, source="the sensor's prior") < bound(held_out_deg=None, source="fitted to touches")
+    assert good < bound(held_out_deg=None, source="prior") < bound(held_out_deg=None, source="touches")
 
 
 def test_no_contact(ring):

@@ -279,16 +279,16 @@ TABLE = {
         lambda: pipe(),
     ),
     "FillMarkers": Entry(
-        {"diameter_px": 9.0, "contrast": 0.06, "sigmas": 5.0, "margin": 0.2},
-        {"diameter_px": ["9", None, NAN, -1], "contrast": NUMBER, "sigmas": NUMBER, "margin": NUMBER},
+        {"diameter_px": 9.0, "contrast": 0.06, "sigmas": 5.0, "skirt": 0.2},
+        {"diameter_px": ["9", None, NAN, -1], "contrast": NUMBER, "sigmas": NUMBER, "skirt": NUMBER},
     ),
     "FillMarkers.from_background": Entry(
-        {"background": torch.full((3, 64, 64), 0.5), "contrast": 0.06, "least_markers": 8, "margin": 0.2},
+        {"background": torch.full((3, 64, 64), 0.5), "contrast": 0.06, "least_markers": 8, "skirt": 0.2},
         {
             "background": [b for b in images(64, 64) if not (isinstance(b, torch.Tensor) and tuple(b.shape) == (3, 63, 64))],
             "contrast": NUMBER,
             "least_markers": INTEGER,
-            "margin": NUMBER,
+            "skirt": NUMBER,
         },
     ),
     "FillMarkers.from_dict": Entry(
@@ -608,17 +608,17 @@ TABLE = {
         },
     ),
     "find_markers": Entry(
-        {"image": image()[None], "diameter_px": 5.0, "contrast": 0.06, "sigmas": 5.0, "margin": 0.2},
+        {"image": image()[None], "diameter_px": 5.0, "contrast": 0.06, "sigmas": 5.0, "skirt": 0.2},
         {
             "image": [*batches(3), torch.zeros(1, 3, 4, 4)],
             "diameter_px": NUMBER,
             "contrast": NUMBER,
             "sigmas": NUMBER,
-            "margin": NUMBER,
+            "skirt": NUMBER,
         },
     ),
     "fit_lights": Entry(
-        {"background": image(), "sensor": sensor(), "start": None, "max_steps": 3, "vignetting": False},
+        {"background": image(), "sensor": sensor(), "start": None, "max_steps": 3, "vignetting": 0},
         {
             "background": [*images(), 0 * image(), torch.full_like(image(), 0.5), torch.ones_like(image())],
             "sensor": SENSOR,
@@ -963,7 +963,7 @@ TABLE = {
             {"image": batches(3)},
             lambda name=name: getattr(vts.stream.FollowLight(image()), name),
         )
-        for name in ("correct", "set_background", "start")
+        for name in ("correct", "set_rest", "start")
     },
     "stream.FollowLight.update": Entry(
         {"image": image()[None], "contact": DEPTH > 0, "seconds": 0.1},
@@ -991,9 +991,9 @@ TABLE = {
     "stream.VideoFile": Entry(
         {"path": "film.avi", "fps": 10.0}, {"path": ["film.gif", "film"], "fps": NUMBER}, named={"path": "video"}
     ),
-    "stream.calibrate_background": Entry({"background": image(), "sensor": sensor()}, {"background": images(), "sensor": SENSOR}),
+    "stream.calibrate_at_rest": Entry({"background": image(), "sensor": sensor()}, {"background": images(), "sensor": SENSOR}),
     "stream.open_source": Entry({"source": ...}, {"source": ["no/such.mp4", ".", None, 2.5]}, run=False),
-    "stream.find_background": Entry({"images": image()[None].expand(5, -1, -1, -1)}, {"images": [*batches(3), image()[None]]}),
+    "stream.rest_image": Entry({"images": image()[None].expand(5, -1, -1, -1)}, {"images": [*batches(3), image()[None]]}),
 }
 
 

@@ -100,7 +100,7 @@ def test_rectify_equals_the_sensors(region):
 def test_rectify_refuses_frames_of_another_size():
     with pytest.raises(ValueError, match="the source has changed"):
         streams.Rectify(vts.Sensor("rig", 24, 32, 0.1), 24, 32)(torch.zeros(1, 3, 48, 64))
-    with pytest.raises(ValueError, match="does not hold corners_px"):
+    with pytest.raises(ValueError, match="does not contain corners_px"):
         streams.Rectify(vts.Sensor.load("gelsight_wedge"), 240, 320)
 
 

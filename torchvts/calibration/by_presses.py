@@ -6,13 +6,12 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from ..compensate import Compensate
+from ..accelerated import Compensate, NormalFromIntensity
 from ..core.geometry import gradient_from_normal
 from ..integration import poisson_background
 from ..model.calibration import Calibration
 from ..model.response_field import ResponseModel
 from ..model.sensor import Sensor
-from ..normals import NormalFromIntensity
 from .balls import center_by_slope
 from .contacts import Contact, middle_px, read_contacts, unit_without_model
 from .field import PRODUCT_PENALTY, Family, angle_deg

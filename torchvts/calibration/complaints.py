@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import torch
 
-from ..contact import ContactMask
+from ..accelerated import ContactMask
 from ..model.calibration import Calibration
 from ..model.sensor import Sensor
 from .background import falloff, outwardness

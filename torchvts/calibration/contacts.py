@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ..compensate import Compensate
-from ..contact import ContactMask
+from ..accelerated import Compensate, ContactMask
 from ..core.blur import blur, gaussian_weights
 from ..core.geometry import gradient_from_normal, gradient_of_depth, pixel_grid_mm
 from ..integration import poisson_background

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from ..calibration import CalibrationWarning, Press, by_presses, calibrate, read_presses
+from ..calibration import Press, read_presses
 from ..core.checks import check_integer
 from ..core.geometry import normal_from_gradient
 from ..model import Sensor

@@ -12,15 +12,21 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..calibration import fit_prior
-from ..calibration.calibrate import as_read
-from ..compensate import Compensate
-from ..contact import ContactMask
-from ..core.geometry import GradientFromNormal, normal_from_gradient
-from ..core.native import reference_only
-from ..integration import AdaptiveIntegration, PerspectiveIntegration, PoissonBackground, PoissonDST
+from ..accelerated import (
+    AdaptiveIntegration,
+    Compensate,
+    ContactMask,
+    GradientFromNormal,
+    NormalFromIntensity,
+    PerspectiveIntegration,
+    PoissonBackground,
+    reference_only,
+)
+from ..calibration import fit_prior, with_preprocessing
+from ..core.geometry import normal_from_gradient
+from ..integration import PoissonDST
 from ..model import Calibration, ResponseModel, Sensor
-from ..normals import NormalFromIntensity, NormalFromLookup, NormalFromMLP, NormalFromResponse
+from ..normals import NormalFromLookup, NormalFromMLP, NormalFromResponse, NormalModel, as_normal_model
 from ..pipeline import DepthOutput, DepthPipeline
 from ..scenes import render, sphere_press
 from .peers import PoissonSciPy
@@ -286,22 +292,21 @@ class _ContactOfFirst(nn.Module):
         return contact
 
 
-class _NormalsOfSecond(nn.Module):
+class _NormalsOfSecond(NormalModel):
     def __init__(self, normals: nn.Module) -> None:
         super().__init__()
-        self.normals = normals
-        self.uses_depth = bool(getattr(normals, "uses_depth", False))
-        self.passes = int(getattr(normals, "passes", 8))
+        self.normals = as_normal_model(normals)
+        self.uses_depth, self.max_passes = self.normals.uses_depth, self.normals.max_passes
 
-    def forward(self, both: Tensor, depth_mm: Tensor | None = None) -> Tensor:
-        normal: Tensor = self.normals(both[:, 3:]) if depth_mm is None else self.normals(both[:, 3:], depth_mm)
+    def forward(self, image: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
+        normal: Tensor = self.normals(image[:, 3:], depth_mm)
         return normal
 
 
 def _unit(background: Tensor, sensor: Sensor) -> Calibration:
     """The unit with a response field that is zero everywhere: every method uses its contact mask."""
-    blur_px = as_read(sensor, None).blur_px
-    return Calibration.from_response(ResponseModel.blank(sensor.exponent, blur_px), sensor, background)
+    blur_px = with_preprocessing(sensor, None).blur_px
+    return Calibration.from_response(ResponseModel.zero(sensor.exponent, blur_px), sensor, background)
 
 
 def _smooth(unit: Calibration) -> Compensate:

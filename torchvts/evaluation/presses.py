@@ -9,12 +9,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..calibration import CalibrationWarning, Press, calibrate
-from ..calibration.calibrate import RESPONSE_BLUR_PX, by_presses
-from ..compensate import Compensate
+from ..accelerated import Compensate
+from ..calibration import RESPONSE_BLUR_PX, CalibrationWarning, Press, by_presses, calibrate
 from ..core.checks import check_image
 from ..model import Calibration, Sensor
-from ..normals import MlpFit, fit_mlp
+from ..training import MlpFit, fit_mlp
 from .score import ball_truth
 
 
@@ -55,7 +54,7 @@ class Training:
 
     def of_family(self, degree: int, product_degree: int) -> Calibration:
         """Calibration by the located presses and response fields of that size alone."""
-        return by_presses(self.background, self.sensor, self.located, None, False, ((degree, product_degree),))[2]
+        return by_presses(self.background, self.sensor, self.located, None, False, ((degree, product_degree),)).unit
 
 
 class TrainingPixels(NamedTuple):
@@ -135,7 +134,7 @@ def train_network(
     Returns:
         The trained network and its history.
     Raises:
-        ValueError, TypeError: see :func:`torchvts.calibrate` and :func:`torchvts.normals.fit_mlp`.
+        ValueError, TypeError: see :func:`torchvts.calibrate` and :func:`torchvts.training.fit_mlp`.
     """
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     for press in presses:

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from .. import scenes
-from ..calibration import CalibrationWarning, Press, calibrate
-from ..calibration.calibrate import by_presses
+from ..calibration import CalibrationWarning, Press, by_presses, calibrate
 from ..model import Calibration, PointLights, Sensor
+from ..model.report import PressRow, Report
 
 SHAPES = ("sphere", "cylinder", "cone", "sine", "punch", "letters")
 """Shapes that are pressed in."""
@@ -148,5 +148,6 @@ def _by_random_balls(draw: random.Random, camera: _Camera, background: Tensor, s
         ball = scenes.sphere_press(radius, draw.uniform(0.06, 0.2) * radius, (x, y), *size)
         presses.append(Press(camera.photograph(ball, 100 * seed + k)[0], 2.0 * radius, f"ball {k}"))
     fit, contacts, unit = by_presses(background, sensor, presses, None, False)
-    used = [{"name": contact.name, "used": not contact.reason} for contact in contacts]
-    return dataclasses.replace(unit, report={"model": "response", "held_out_deg": fit.error_deg, "presses": used})
+    used: list[PressRow] = [{"name": contact.name, "used": not contact.reason} for contact in contacts]
+    report: Report = {"model": "response", "source": "presses", "held_out_deg": fit.error_deg, "presses": used}
+    return dataclasses.replace(unit, report=report)

@@ -179,7 +179,7 @@ def test_a_folder_gives_the_same_and_calibrates_itself(unit, small_sensor, small
     for k in range(35):
         cv2.imwrite(str(tmp_path / f"{k:03d}.png"), camera(1.0 if 15 <= k < 25 else 0.0))
     with streams.TactileStream(str(tmp_path), small_sensor, mode="precise") as stream:
-        assert "pins the lights" in stream.note and stream.metric
+        assert "constrains the lights" in stream.note and stream.metric
         check_press(stream, small_press)
 
 

@@ -963,7 +963,7 @@ TABLE = {
             {"image": batches(3)},
             lambda name=name: getattr(vts.stream.FollowLight(image()), name),
         )
-        for name in ("correct", "set_rest", "start")
+        for name in ("correct", "set_background", "start")
     },
     "stream.FollowLight.update": Entry(
         {"image": image()[None], "contact": DEPTH > 0, "seconds": 0.1},
@@ -991,9 +991,9 @@ TABLE = {
     "stream.VideoFile": Entry(
         {"path": "film.avi", "fps": 10.0}, {"path": ["film.gif", "film"], "fps": NUMBER}, named={"path": "video"}
     ),
-    "stream.calibrate_at_rest": Entry({"background": image(), "sensor": sensor()}, {"background": images(), "sensor": SENSOR}),
+    "stream.calibrate_background": Entry({"background": image(), "sensor": sensor()}, {"background": images(), "sensor": SENSOR}),
     "stream.open_source": Entry({"source": ...}, {"source": ["no/such.mp4", ".", None, 2.5]}, run=False),
-    "stream.rest_image": Entry({"images": image()[None].expand(5, -1, -1, -1)}, {"images": [*batches(3), image()[None]]}),
+    "stream.find_background": Entry({"images": image()[None].expand(5, -1, -1, -1)}, {"images": [*batches(3), image()[None]]}),
 }
 
 

@@ -40,7 +40,7 @@ class Settings:
 
 
 def begin(out: Path, settings: Settings, overwrite: bool) -> Settings:
-    """Begin or continue a run in ``out``: write the settings, or compare them with those that are there; remove torn files.
+    """Begin or continue a run in ``out``: write the settings, or compare them with those that are there; remove incomplete files.
 
     Raises:
         ValueError: the run was begun with other settings.
@@ -56,10 +56,10 @@ def begin(out: Path, settings: Settings, overwrite: bool) -> Settings:
             settings = replace(settings, pictures=has_few_frames(Path(settings.source)))
         with write_atomically(out / STATE / "settings.json") as temporary:
             temporary.write_text(json.dumps(asdict(settings), indent=1), encoding="utf-8")
-    torn = re.compile(r"\..+-[0-9a-f]{8}\.(png|npy|pcd|ply|csv|json)")  # names of write_atomically
+    incomplete = re.compile(r"\..+-[0-9a-f]{8}\.(png|npy|pcd|ply|csv|json)")  # names of write_atomically
     for folder, folders, names in os.walk(out):
         folders[:] = [name for name in folders if name != STATE]
-        for name in filter(torn.fullmatch, names):
+        for name in filter(incomplete.fullmatch, names):
             Path(folder, name).unlink(missing_ok=True)
     return settings
 
@@ -127,7 +127,7 @@ class Records:
         path.write_text(json.dumps({"mark": item.mark, **figures}), encoding="utf-8")
 
     def read(self, item: Item, frame: int) -> Record | None:
-        """The record of a frame; None where there is none, a kill has torn it, or the source file has changed since."""
+        """The record of a frame; None where there is none, a kill has cut it short, or the source file has changed since."""
         try:
             record = json.loads(self._path(item, frame).read_bytes())
         except (OSError, ValueError):

@@ -271,7 +271,7 @@ CHECKS = (
     Check("markers", _markers, "printed markers cover {value:.0%} of the image: they are filled from the pixels around them, which "
           "hides details", "note"),
     Check("lights_coplanar", _coplanar, "the lights lie nearly in one plane (smallest singular value of their directions "
-          "{value:.2f}, usual is 0.8): noise alone changes normals by {cost:.1f} degrees; move the LEDs apart"),
+          "{value:.2f}, usual is 0.8): noise alone changes normals by {cost:.1f} degrees; increase the distance of the LEDs"),
     Check("lights_misfit", lambda e: _light_change(e.calibration_change, "calibration", e)),
     Check("contact_in_calibration", lambda e: _contact(e.calibration_change, 0.5), _CONTACT.format("calibration"), "fault"),
     # the background of now

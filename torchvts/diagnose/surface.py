@@ -11,15 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..compensate import Compensate
-from ..contact import ContactMask
+from ..accelerated import Compensate, ContactMask, GradientFromNormal, NormalFromIntensity, PoissonBackground
 from ..core.blur import blur, gaussian_weights
 from ..core.checks import QUANTISATION_STD
-from ..core.geometry import GradientFromNormal
-from ..integration import PoissonBackground
 from ..model import Calibration, PointLights
 from ..model.lights import inverse_light_matrix
-from ..normals import NormalFromIntensity, NormalFromResponse
+from ..normals import NormalFromResponse
 from ..pipeline import DepthOutput, DepthPipeline
 
 SPREADS_PX = (1.5, 3.0, 6.0)
@@ -31,8 +28,8 @@ class Blocks:
     """The blocks that turn a unit's images into normals, made once: finding the defects of a background takes longest."""
 
     calibration: Calibration
-    compensate: Compensate
-    normals: NormalFromIntensity | NormalFromResponse
+    compensate: nn.Module
+    normals: nn.Module
 
     @classmethod
     def of(cls, calibration: Calibration) -> "Blocks":

@@ -198,7 +198,7 @@ class Rectify(nn.Module):
         height: pixels of the camera's frames.
         width: pixels of the camera's frames.
     Raises:
-        ValueError: the frame does not hold the region that the sensor names.
+        ValueError: the frame does not contain the region that the sensor names.
     Example:
         >>> corners = ((1, 1), (14, 2), (13, 10), (2, 9))
         >>> Rectify(Sensor("rig", 8, 10, 0.1, corners_px=corners), 12, 16)(torch.zeros(1, 3, 12, 16)).shape

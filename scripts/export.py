@@ -1,4 +1,4 @@
-"""A calibrated unit as files that run without torchvts, each held against the pipeline in a process that cannot import it.
+"""Export a calibrated unit to files that run without torchvts, and compare each with the pipeline in a process without it.
 
 python scripts/export.py unit.safetensors --out folder
 python scripts/export.py unit.safetensors --out folder --mode precise --format torchscript onnx --frames presses/
@@ -7,6 +7,7 @@ python scripts/export.py unit.safetensors --out folder --mode precise --format t
 import argparse
 import itertools
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -16,14 +17,14 @@ from torchvts import export
 from torchvts.core.files import read_frames
 
 
-def main() -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("calibration", type=Path, help="file that calibrate.py wrote")
     parser.add_argument("--out", type=Path, required=True, help="folder for the files")
     parser.add_argument("--mode", choices=["fast", "precise", "auto"], default="fast")
     parser.add_argument("--format", nargs="+", default=list(export.FORMATS), metavar="NAME", help=", ".join(export.FORMATS))
-    parser.add_argument("--frames", type=Path, help="image, folder or video to compare on, beside made-up frames; 8 at most")
-    arguments = parser.parse_args()
+    parser.add_argument("--frames", type=Path, help="image, folder or video to compare on, with synthetic frames; 8 at most")
+    arguments = parser.parse_args(argv)
     calibration = vts.Calibration.load(arguments.calibration)
     pipe = vts.DepthPipeline.from_calibration(calibration, arguments.mode)
     images = export.sample_frames(calibration)

@@ -9,6 +9,7 @@ import argparse
 import json
 import math
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from torchvts.pose import contact_cloud, read_point_cloud, write_point_cloud
 from torchvts.pose.clouds import CLOUD_SUFFIXES
 
 
-def main() -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", type=Path, help="image, or .pcd / .ply; a folder of images or a video is tracked frame by frame")
     parser.add_argument("target", type=Path, help="the reference: an image, or .pcd / .ply")
@@ -31,7 +32,7 @@ def main() -> int:
     parser.add_argument("--mode", choices=["fast", "precise", "auto"], default="precise")
     parser.add_argument("--cloud", choices=["pcd", "ply", "none"], default="none", help="write both contacts, the source moved")
     parser.add_argument("--no-pictures", action="store_true")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(argv)
     clouds = [path.suffix.lower() in CLOUD_SUFFIXES for path in (arguments.source, arguments.target)]
     if any(clouds) and not all(clouds):
         raise ValueError("source and target: expected two images or two clouds, got one of each")
@@ -46,7 +47,7 @@ def main() -> int:
 def of_clouds(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     (source, source_normals), (target, target_normals) = (read_point_cloud(p) for p in (arguments.source, arguments.target))
     found = vts.register_points(source, target, source_normals=source_normals, target_normals=target_normals)
-    tell(arguments.source.stem, found)
+    print_result(arguments.source.stem, found)
     draw(arguments, arguments.source.stem, source, target, found)
     return [record(arguments.source.stem, found)]
 
@@ -60,7 +61,8 @@ def of_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     with torch.inference_mode():
         target = pipe(calibration.sensor.rectify(vts.read_image(arguments.target)[None]))
     target_points = contact_cloud(target, pitch, 4000)[0]
-    results, last = [], None
+    results: list[dict[str, Any]] = []
+    last = None
     for name, image in tqdm(read_frames(arguments.source), total=count_frames(arguments.source), unit="frame", disable=None):
         with torch.inference_mode():
             frame = pipe(calibration.sensor.rectify(image[None]))
@@ -74,7 +76,7 @@ def of_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         last = found.T_target_source if found.converged else last
         results.append(record(name, found))
         if len(results) <= 20:
-            tell(name, found)
+            print_result(name, found)
         if count_frames(arguments.source) == 1:
             draw(arguments, name, contact_cloud(frame, pitch, 4000)[0], target_points, found)
     return results
@@ -95,7 +97,7 @@ def record(name: str, found: vts.pose.Registration) -> dict[str, Any]:
     }
 
 
-def tell(name: str, found: vts.pose.Registration) -> None:
+def print_result(name: str, found: vts.pose.Registration) -> None:
     T = found.T_target_source
     turn = float(torch.rad2deg(torch.atan2(T[1, 0], T[0, 0])))
     tilt = float(torch.rad2deg(torch.acos(T[2, 2].clamp(-1, 1))))

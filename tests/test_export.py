@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -13,9 +12,9 @@ from torch import nn
 import torchvts as vts
 from torchvts import export
 from torchvts.accelerated import reference_only
+from torchvts.export import onnx_operators
 
 LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
-ROOT = Path(__file__).resolve().parents[1]
 HEIGHT, WIDTH, PITCH = 48, 64, 0.6
 SENSOR = vts.Sensor("rig", HEIGHT, WIDTH, PITCH)
 
@@ -26,8 +25,8 @@ def low(ring):
     lights = ring(20.0, 15.0)
     presses = [vts.scenes.sphere_press(10.0, mm, (x, 0), HEIGHT, WIDTH, PITCH) for mm, x in ((3.0, 0), (0.5, -6), (1.5, 5))]
     frames = [vts.scenes.render(scene, lights, noise_std=0.003, bits=8, seed=k) for k, scene in enumerate(presses)]
-    rest = vts.scenes.render(vts.scenes.undeformed(presses[0]), lights, noise_std=0.003, bits=8, seed=9)
-    return vts.Calibration.from_lights(lights, SENSOR, rest[0]), torch.cat([*frames, rest])
+    background = vts.scenes.render(vts.scenes.undeformed(presses[0]), lights, noise_std=0.003, bits=8, seed=9)
+    return vts.Calibration.from_lights(lights, SENSOR, background[0]), torch.cat([*frames, background])
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +39,19 @@ def mini():
     return calibration, export.sample_frames(calibration)
 
 
+def long_to_write(*kinds):
+    """Pipelines whose graphs take minutes to write."""
+    return [pytest.param(kind, marks=pytest.mark.long) for kind in kinds]
+
+
 def pipeline(calibration, mode, **options):
     return vts.DepthPipeline.from_calibration(calibration, mode, **options)
+
+
+def at_most_two_passes(pipe):
+    """Loops in the graph take minutes to write."""
+    policy = getattr(pipe.refine, "policy", pipe.refine)
+    policy.max_passes = min(getattr(policy, "max_passes", 2), 2)
 
 
 def learned():
@@ -56,7 +66,8 @@ def test_the_scenes_are_hard_enough(low, mini):
     calibration, frames = low
     pipe = pipeline(calibration, "precise")
     compensated = pipe.compensate(frames)
-    blocked = (compensated < pipe.normals.dark_where) | (compensated >= pipe.normals.full_above)
+    shadowed = pipe.normals.shadowed
+    blocked = (compensated < shadowed.dark_where) | (compensated >= shadowed.saturated_above)
     assert int(blocked[0].sum()) > 10
     assert pipe(frames).contact.flatten(1).any(1).tolist() == [True, True, True, False]
     assert (pipe(frames).depth_mm - pipeline(calibration, "fast")(frames).depth_mm).abs().max() > 0.05
@@ -81,7 +92,7 @@ def test_a_program_of_an_image_whose_cells_are_larger_than_pixels(cells_of_two):
     assert torch.equal(found[3], expected.contact) and (found[0] - expected.depth_mm).abs().max() < 1e-5
 
 
-@pytest.mark.skipif(not LONG, reason="minutes to write")
+@pytest.mark.long
 def test_onnx_of_an_image_whose_cells_are_larger_than_pixels(cells_of_two, tmp_path):
     if export.missing("onnx"):
         pytest.skip(export.missing("onnx"))
@@ -105,33 +116,38 @@ def test_gradients_through_torchscript_without_torchvts(low, tmp_path):
     export.export_torchscript(pipe, tmp_path / "pipe.pt")
     torch.save(frames[:1], tmp_path / "image")
     code = (
-        "import sys, json, torch; sys.modules['torchvts'] = None; said = {'torchvts.json': ''}\n"
-        "pipe = torch.jit.load('pipe.pt', _extra_files=said)\n"
+        "import sys, json, torch; sys.modules['torchvts'] = None; metadata = {'torchvts.json': ''}\n"
+        "pipe = torch.jit.load('pipe.pt', _extra_files=metadata)\n"
         "image = torch.load('image', weights_only=True).requires_grad_(True)\n"
         "pipe(image).depth_mm.square().sum().backward()\n"
         "found = {name: p.grad for name, p in pipe.named_parameters() if p.grad is not None}\n"
-        "torch.save(found | {'image': image.grad}, 'grad'); print(said['torchvts.json'].decode())\n"
+        "torch.save(found | {'image': image.grad}, 'grad'); print(metadata['torchvts.json'].decode())\n"
     )
     command = [sys.executable, "-I", "-W", "ignore", "-c", code]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     found = torch.load(tmp_path / "grad", weights_only=True)
     expected = {name: p.grad for name, p in pipe.named_parameters()} | {"image": image.grad}
-    assert {"image", "normals.lights.position_mm", "normals.lights.albedo"} <= set(found)
+    assert {"image", "solve.normals.lights.position_mm", "solve.normals.lights.albedo"} <= set(found)
     for name, gradient in found.items():
         assert float(gradient.abs().max()) > 0
         assert torch.allclose(gradient, expected[name], rtol=1e-3, atol=1e-4 * float(expected[name].abs().max())), name
-    said = json.loads(done.stdout)
-    assert (said["mode"], said["mm_per_pixel"], said["height"], said["width"]) == ("precise", PITCH, HEIGHT, WIDTH)
+    found = json.loads(done.stdout)
+    assert (found["mode"], found["mm_per_pixel"], found["height"], found["width"]) == (
+        "precise",
+        PITCH,
+        HEIGHT,
+        WIDTH,
+    )
 
 
-@pytest.mark.parametrize("kind", ["lights precise", "response auto", "own normals"])
+@pytest.mark.parametrize("kind", ["response auto", "own normals", *long_to_write("lights precise")])
 def test_a_program_takes_the_decisions_of_the_pipeline(low, mini, tmp_path, kind):
     """Loops, early ends and dark pixels in the graph, against the Python of the pipeline; then from its file, without torchvts."""
     calibration, frames = mini if kind == "response auto" else low
     pipe = pipeline(calibration, kind.split()[1]) if kind != "own normals" else pipeline(calibration, "fast", normals=learned())
     if not LONG:
-        pipe.max_passes = min(pipe.max_passes, 2)  # loops in the graph take minutes to write
+        at_most_two_passes(pipe)
     program = export.export_program(pipe, tmp_path / "pipe.pt2").module()
     for batch in (frames[:1], frames[1:3], frames[:3], frames[3:], frames):
         with reference_only():  # which are what the graph is made of
@@ -142,18 +158,18 @@ def test_a_program_takes_the_decisions_of_the_pipeline(low, mini, tmp_path, kind
         assert export.compare(tmp_path / "pipe.pt2", pipe, frames, "pt2") <= 1e-5
 
 
-@pytest.mark.parametrize("kind", ["lights fast", "response precise"] + LONG * ["lights precise"])  # minutes to write
+@pytest.mark.parametrize("kind", ["response precise", *long_to_write("lights fast", "lights precise")])
 def test_onnx_without_torchvts(low, mini, tmp_path, kind):
     if export.missing("onnx"):
         pytest.skip(export.missing("onnx"))
     calibration, frames = mini if kind == "response precise" else low
     pipe = pipeline(calibration, kind.split()[1])
-    pipe.max_passes = min(pipe.max_passes, 2)  # loops in the graph take minutes to write
+    at_most_two_passes(pipe)
     path = export.export_onnx(pipe, tmp_path / "pipe.onnx")
     assert export.compare(path, pipe, frames, "onnx") <= 1e-3
 
 
-@pytest.mark.skipif(not LONG, reason="minutes to compile")
+@pytest.mark.long
 def test_aoti_without_torchvts(mini, tmp_path):
     if export.missing("aoti"):
         pytest.skip(export.missing("aoti"))
@@ -164,12 +180,12 @@ def test_aoti_without_torchvts(mini, tmp_path):
 
 
 @pytest.mark.parametrize("height, width", [(24, 32), (23, 35)])
-@pytest.mark.parametrize("levelled", [True, False])
-def test_matrix_products_integrate_as_the_pipeline_does(height, width, levelled):
+@pytest.mark.parametrize("zero_in_background", [True, False])
+def test_matrix_products_integrate_as_the_pipeline_does(height, width, zero_in_background):
     gradient = torch.randn(3, 2, height, width, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     gradient[1:, :, :8] = 0.0
-    by_matrix = export.PoissonBackgroundByMatrix(height, width, 0.3, torch.float64, levelled)(gradient)
-    expected = (vts.PoissonBackground if levelled else vts.PoissonDCT)(0.3)(gradient)
+    by_matrix = export.PoissonBackgroundByMatrix(height, width, 0.3, torch.float64, zero_in_background)(gradient)
+    expected = (vts.PoissonBackground if zero_in_background else vts.PoissonDCT)(0.3)(gradient)
     assert (by_matrix - expected).abs().max() < 1e-12
 
 
@@ -178,13 +194,13 @@ def test_what_stands_in_for_operators_that_onnx_lacks(length):
     values = torch.randn(3, length, 2, generator=torch.Generator().manual_seed(length))
     some = torch.where(values > 0.3, torch.nan, values)
     for keep in (True, False):
-        assert torch.equal(export._median(values, 1, keep)[0], values.median(1, keep).values)
-        found, expected = export._nanmedian(some, 1, keep)[0], some.nanmedian(1, keep).values
+        assert torch.equal(onnx_operators.median(values, 1, keep)[0], values.median(1, keep).values)
+        found, expected = onnx_operators.nanmedian(some, 1, keep)[0], some.nanmedian(1, keep).values
         assert torch.equal(found.nan_to_num(9.0), expected.nan_to_num(9.0))
-    assert torch.equal(export._cummax(values, 1)[0], values.cummax(1).values)
+    assert torch.equal(onnx_operators.cummax(values, 1)[0], values.cummax(1).values)
 
 
-def test_a_file_that_does_not_agree_or_does_not_run_is_told(low, tmp_path):
+def test_a_file_that_does_not_agree_or_does_not_run_is_reported(low, tmp_path):
     calibration, frames = low
     pipe = pipeline(calibration, "precise")
     path = export.export_torchscript(pipeline(calibration, "fast"), tmp_path / "pipe.pt")
@@ -201,7 +217,7 @@ class Unscriptable(nn.Module):
 
 def test_one_format_that_fails_leaves_the_others(low, tmp_path, monkeypatch):
     calibration, frames = low
-    monkeypatch.setattr(export, "find_spec", lambda name: None)
+    monkeypatch.setattr(export.formats, "find_spec", lambda name: None)
     rows = export.export_checked(pipeline(calibration, "fast"), tmp_path / "new", ["onnx", "torchscript"], frames)
     assert [row.ok for row in rows] == [False, True]
     assert rows[0].reason == "onnx: onnx, onnxscript, onnxruntime not found: pip install 'torchvts[onnx]'"
@@ -222,27 +238,21 @@ def test_errors_are_sentences(low, tmp_path, monkeypatch):
         export.export_aoti(pipe, tmp_path / "pipe.bin")
     with pytest.raises(FileNotFoundError, match="no such file"):
         export.compare(tmp_path / "nothing.pt", pipe, low[1], "torchscript")
-    monkeypatch.setattr(export.shutil, "which", lambda name: None)
+    monkeypatch.setattr(export.formats.shutil, "which", lambda name: None)
     with pytest.raises(RuntimeError, match=r"aoti: expected a C\+\+ compiler, got none .*: install g\+\+ or clang\+\+, or set CXX"):
         export.export_aoti(pipe, tmp_path / "pipe.pt2")
-    monkeypatch.setattr(export, "find_spec", lambda name: None)
+    monkeypatch.setattr(export.formats, "find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'torchvts\[onnx\]'"):
         export.export_onnx(pipe, tmp_path / "pipe.onnx")
 
 
-def call(*arguments):
-    return subprocess.run(
-        [sys.executable, *map(str, arguments)], capture_output=True, text=True, cwd=ROOT, timeout=300, check=False
-    )
-
-
-def test_the_script(low, tmp_path):
+def test_the_script(run_script, low, tmp_path):
     low[0].save(tmp_path / "unit.safetensors")
     vts.write_image(tmp_path / "press.png", low[1][0])
-    script = ("scripts/export.py", tmp_path / "unit.safetensors", "--out", tmp_path / "out", "--mode", "auto")
-    done = call(*script, "--format", "torchscript", "--frames", tmp_path / "press.png")
+    arguments = (tmp_path / "unit.safetensors", "--out", tmp_path / "out", "--format")
+    done = run_script("export", *arguments, "torchscript", "--frames", tmp_path / "press.png")
     assert done.returncode == 0, done.stderr
     assert "| torchscript |" in done.stdout and done.stdout.rstrip().endswith("| ok |")
     assert [file.name for file in (tmp_path / "out").iterdir()] == ["pipeline.pt"]
-    done = call(*script, "--format", "tflite")
+    done = run_script("export", *arguments, "tflite")
     assert done.returncode != 0 and "error: format: expected one of torchscript" in done.stderr

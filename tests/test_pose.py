@@ -1,21 +1,18 @@
-"""Pose from touch: known motions come back, what cannot be known is named, what does not fit is said."""
+"""Pose from touch: known motions come back, motions that the data do not determine are named, misfits do not converge."""
 
 import json
 import math
-import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import torch
 
 import torchvts as vts
 from torchvts.evaluation import pose_accuracy as pose_bench
-from torchvts.pose import ambiguity, clouds, contact_cloud, points
+from torchvts.pose import ambiguity, clouds, contact_cloud, icp
 from torchvts.pose.result import invert, motion, turn_deg
 from torchvts.scenes import objects
 
-ROOT = Path(__file__).resolve().parents[1]
 PITCH = 0.125
 SIZE = (120, 160)
 
@@ -28,9 +25,9 @@ def frame(height_mm, T):
 
 def off(found, truth, middle=(0.0, 0.0, 0.0)):
     """Degrees, and mm at a point of the target."""
-    rest = found @ invert(truth)
+    difference = found @ invert(truth)
     at = torch.tensor(middle, dtype=torch.float64)
-    return float(turn_deg(rest)), float((rest[:3, :3] @ at + rest[:3, 3] - at).norm())
+    return float(turn_deg(difference)), float((difference[:3, :3] @ at + difference[:3, 3] - at).norm())
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +86,7 @@ def test_impossible_presses_are_refused():
 # two depth frames
 
 
-@pytest.mark.parametrize("angle_deg", [17.0, 144.0, 260.0])
+@pytest.mark.parametrize("angle_deg", [17.0, 260.0])
 def test_a_press_turned_moved_tilted_and_deeper_is_found(letters, reference, angle_deg):
     T = objects.pose(angle_deg, (2.0, -1.2), 0.6, (-1.5, 1.0))
     truth = objects.pose(0.0, (0.2, -0.1), 0.45, (1.0, -0.5)) @ invert(T)
@@ -137,29 +134,28 @@ def test_a_symmetric_object_lists_its_other_poses():
 
 
 @pytest.mark.parametrize(
-    "name, shape, names",
+    "shape, names",
     [
-        ("sphere", objects.sphere(), ["rotation about x", "rotation about y", "rotation about z"]),
-        ("cylinder", objects.cylinder(), ["translation along 30 degrees", "rotation about 30 degrees"]),
-        ("plane", objects.plane(), ["translation along x", "translation along y", "rotation about z"]),
+        (objects.sphere(), ["rotation about x", "rotation about y", "rotation about z"]),
+        (objects.cylinder(), ["translation along 30 degrees", "rotation about 30 degrees"]),
+        (objects.plane(), ["translation along x", "translation along y", "rotation about z"]),
     ],
 )
-def test_surfaces_that_slide_on_themselves_are_ambiguous(name, shape, names):
-    del name
+def test_surfaces_that_slide_on_themselves_are_ambiguous(shape, names):
     tilt = (2.5, 1.0)
     one = frame(shape, objects.pose(30.0, (0.3, 0.2), 0.3, tilt))
     two = frame(shape, objects.pose(75.0, (-0.5, 0.6), 0.35, (-1.0, 2.0)))
     found = vts.register_depth(two, one, PITCH)
     assert found.converged and not found.alternatives
-    for said, expected in zip(found.ambiguous, names, strict=True):
-        kind, angle = said.rsplit(" ", 2)[0], said.split()[2]
-        assert expected.startswith(kind.split(" degrees")[0].rsplit(" ", 1)[0]) or said == expected
+    for name, expected in zip(found.ambiguous, names, strict=True):
+        kind, angle = name.rsplit(" ", 2)[0], name.split()[2]
+        assert expected.startswith(kind.split(" degrees")[0].rsplit(" ", 1)[0]) or name == expected
         if "degrees" in expected:
             assert abs(float(angle) - 30.0) <= 3.0
     assert found.covariance.diagonal().max() > 1.0 and torch.linalg.eigvalsh(found.covariance).min() > 0
 
 
-def skirted_ball(x0, y0, press, seed):
+def hanging_ball(x0, y0, press, seed):
     """A ball as a sensor shows it: the skin leaves it at a slope of 0.6 and sinks slowly, and slopes are off by 0.03."""
 
     def depth(x, y):
@@ -176,17 +172,17 @@ def skirted_ball(x0, y0, press, seed):
     return vts.DepthOutput(vts.integration.poisson_background(gradient, PITCH), gradient, scene.normal, scene.contact)
 
 
-def test_a_ball_in_its_skirt_is_still_a_ball():
-    """The skin around a ball moves with the contact: only its deep part tells that it rolls."""
-    target = skirted_ball(0.0, 0.0, 0.9, 0)
-    for seed, (x, y, press) in enumerate([(1.5, 0.5, 0.9), (-2.0, 1.0, 0.75), (0.5, -1.0, 1.0), (-1.0, -1.5, 0.85)], 1):
-        found = vts.register_depth(skirted_ball(x, y, press, seed), target, PITCH)
+def test_a_ball_with_skin_hanging_around_it_is_still_a_ball():
+    """The skin around a ball moves with the contact: only its deep part shows that it rolls."""
+    target = hanging_ball(0.0, 0.0, 0.9, 0)
+    for seed, (x, y, press) in enumerate([(1.5, 0.5, 0.9), (-2.0, 1.0, 0.75)], 1):
+        found = vts.register_depth(hanging_ball(x, y, press, seed), target, PITCH)
         assert found.converged and found.ambiguous == ["rotation about x", "rotation about y", "rotation about z"], found.message
 
 
-def test_real_presses_of_a_ball_are_ambiguous(data):
-    background, presses = vts.read_presses(data / "gelsight_mini_a")
-    counts = pose_bench.ball_pairs(background, presses[:25:5], vts.Sensor.load("gelsight_mini"))
+def test_real_presses_of_a_ball_are_ambiguous(mini_presses):
+    background, presses = mini_presses
+    counts = pose_bench.ball_pairs(background, presses[:20:5], vts.Sensor.load("gelsight_mini"))
     assert counts["pairs"] >= 6 and counts["converged"] >= 4
     assert counts["not named"] == 0 and counts["named"] >= counts["converged"] - 1
 
@@ -211,7 +207,7 @@ def test_a_surface_of_revolution_hides_its_turn_only():
 
 
 def test_different_objects_do_not_fit(reference):
-    for name in ("gear", "key", "textured patch"):
+    for name in ("gear", "textured patch"):
         other = frame(objects.TARGETS[name].height_mm, objects.pose(20.0, (0.5, 0.0), 0.5))
         found = vts.register_depth(other, reference, PITCH)
         assert not found.converged and not found.ambiguous and "nothing fits" in found.message
@@ -251,17 +247,15 @@ def test_impossible_frames_are_refused(reference):
 
 
 def test_the_whole_chain_keeps_within_its_goal():
-    targets = {name: objects.TARGETS[name] for name in ("stamp", "bottle cap", "tool handle")} | {
-        "plane": objects.FREE_TARGETS["plane"]
-    }
-    rows, shown = pose_bench.run_poses(targets, 3, size=(180, 240), noise_std=0.005)
-    for row in rows[:3]:
+    targets = {name: objects.TARGETS[name] for name in ("stamp", "tool handle")} | {"plane": objects.FREE_TARGETS["plane"]}
+    rows, shown = pose_bench.run_poses(targets, 2, size=(180, 240), noise_std=0.005)
+    for row in rows[:2]:
         assert row.success == 1.0 and row.wrong == 0 and max(row.deg) < 0.3 and max(row.mm) < 0.05
-    assert rows[3].named == 1.0 and rows[3].wrong == 0
-    assert pose_bench.pose_table(rows).count("\n") == 5 and set(shown) == set(targets)
+    assert rows[2].named == 1.0 and rows[2].wrong == 0
+    assert pose_bench.pose_table(rows).count("\n") == 4 and set(shown) == set(targets)
 
 
-def test_the_covariance_foretells_the_error():
+def test_the_covariance_predicts_the_error():
     rows = []
     lights, pipe = pose_bench.rig(120, 160, PITCH)
     for seed in range(6):
@@ -286,14 +280,15 @@ def test_the_contact_cloud_is_even_sure_and_has_the_cameras_normals(reference):
     assert (torch.cdist(whole, cloud).min(1).values < 1.0).all()  # evenly spread: no part is far from a kept point
     row = (SIZE[0] - 1) / 2 - whole[:, 1] / PITCH
     column = whole[:, 0] / PITCH + (SIZE[1] - 1) / 2
-    seen = reference.normal[0, :, row.round().long(), column.round().long()].T * torch.tensor([1.0, -1.0, 1.0])
-    assert (seen - fine).abs().max() < 1e-5
+    measured = reference.normal[0, :, row.round().long(), column.round().long()].T * torch.tensor([1.0, -1.0, 1.0])
+    assert (measured - fine).abs().max() < 1e-5
     with pytest.raises(ValueError, match="frame: expected a contact deeper than its own noise"):
         contact_cloud(reference._replace(depth_mm=0.01 * reference.depth_mm), PITCH)
 
 
-@pytest.mark.parametrize("twist", [(0.02, -0.03, 2.0, 3.0, -2.0, 0.1), (1.2, -0.8, 2.0, 3.0, -2.0, 5.0)])
-@pytest.mark.parametrize("order", ["same", "mixed"])
+@pytest.mark.parametrize(
+    "twist, order", [((0.02, -0.03, 2.0, 3.0, -2.0, 0.1), "same"), ((1.2, -0.8, 2.0, 3.0, -2.0, 5.0), "mixed")]
+)
 def test_a_known_motion_of_a_cloud_comes_back(reference, twist, order):
     cloud = contact_cloud(reference, PITCH, None)[0]
     T = motion(torch.tensor(twist, dtype=torch.float64))
@@ -314,8 +309,7 @@ def test_a_cloud_that_is_no_relief_is_registered():
     assert found.converged and (found.T_target_source - T).abs().max() < 1e-4
 
 
-@pytest.mark.parametrize("with_normals", [False, True])
-@pytest.mark.parametrize("most", [None, 1200])
+@pytest.mark.parametrize("with_normals, most", [(False, None), (True, 1200)])
 def test_contact_clouds_of_two_presses(with_normals, most):
     shape = objects.textured_patch()
     T_t, T_s = objects.pose(0.0, press_mm=0.5), objects.pose(75.0, (1.0, -0.8), 0.6, (1.0, 0.5))
@@ -403,7 +397,7 @@ def test_thinning_is_even():
 def test_nearest_points_are_the_nearest():
     cloud = torch.rand(300, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     probe = torch.rand(40, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    distance, index = points._Tree(cloud).nearest(probe)
+    distance, index = icp.Tree(cloud).nearest(probe)
     true = torch.cdist(probe, cloud).min(1)
     assert torch.equal(index, true.indices) and torch.allclose(distance, true.values)
 
@@ -411,35 +405,34 @@ def test_nearest_points_are_the_nearest():
 # the script
 
 
-def test_the_script_writes_pose_and_picture(tmp_path):
+def test_the_script_writes_pose_and_picture(run_script, tmp_path):
     lights, pipe = pose_bench.rig(*SIZE, PITCH)
     del pipe
     T_t, T_s = objects.pose(0.0, press_mm=0.5), objects.pose(50.0, (1.0, 0.5), 0.55)
-    rest = vts.scenes.undeformed(objects.press(objects.stamp(), T_t, *SIZE, PITCH))
-    background = vts.scenes.render(rest, lights)[0]
+    undeformed = vts.scenes.undeformed(objects.press(objects.stamp(), T_t, *SIZE, PITCH))
+    background = vts.scenes.render(undeformed, lights)[0]
     sensor = vts.Sensor("pose rig", *SIZE, PITCH)
     vts.Calibration.from_lights(lights, sensor, background).save(tmp_path / "unit.safetensors")
     (tmp_path / "film").mkdir()
-    vts.write_image(tmp_path / "rest.png", background)
+    vts.write_image(tmp_path / "background.png", background)
     for name, T in (("target", T_t), ("film/a", T_s), ("film/b", objects.pose(54.0, (1.1, 0.5), 0.55))):
         scene = objects.press(objects.stamp(), T, *SIZE, PITCH)
         vts.write_image(tmp_path / f"{name}.png", vts.scenes.render(scene, lights, noise_std=0.003)[0])
 
-    def call(*arguments):
-        command = [sys.executable, "scripts/pose.py", *map(str, arguments)]
-        return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=120)
+    def call(source, target, out, *options):
+        return run_script("pose", tmp_path / source, tmp_path / target, "--out", tmp_path / out, *options)
 
-    unit = ["--calibration", tmp_path / "unit.safetensors"]
-    done = call(tmp_path / "film" / "a.png", tmp_path / "target.png", *unit, "--out", tmp_path / "one")
+    unit = ("--calibration", tmp_path / "unit.safetensors")
+    done = call("film/a.png", "target.png", "one", *unit)
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "one" / "pose.json").read_text())
     deg, mm = off(torch.tensor(result["T_target_source"], dtype=torch.float64), T_t @ invert(T_s))
     assert result["converged"] and deg < 0.3 and mm < 0.05
     assert (tmp_path / "one" / "a_pose.png").stat().st_size > 10_000
-    done = call(tmp_path / "film", tmp_path / "target.png", *unit, "--out", tmp_path / "track")
+    done = call("film", "target.png", "track", *unit, "--no-pictures")
     assert done.returncode == 0, done.stderr
     assert [entry["converged"] for entry in json.loads((tmp_path / "track" / "pose.json").read_text())] == [True, True]
-    done = call(tmp_path / "rest.png", tmp_path / "target.png", *unit, "--out", tmp_path / "none")
+    done = call("background.png", "target.png", "none", *unit)
     assert done.returncode == 1 and done.stderr.strip().splitlines()[-1].startswith("error: ") and "touched" in done.stderr
-    done = call(tmp_path / "target.png", tmp_path / "target.ply", "--out", tmp_path / "none")
+    done = call("target.png", "target.ply", "none")
     assert done.returncode == 1 and "got one of each" in done.stderr

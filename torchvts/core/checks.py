@@ -1,7 +1,7 @@
-"""Argument checks whose messages name the argument, what was expected, what came, and the usual cause.
+"""Argument checks whose messages name the argument, the expected value, the actual value, and the usual cause.
 
-Checks of shape and dtype are TorchScript and may stand in a ``forward``. Checks that read values are for constructors,
-calibration and the door of the pipeline: on a GPU they would wait for the device.
+Checks of shape and dtype script and may be used in ``forward``. Checks that read values are for constructors and calibration,
+because on a GPU they wait for the device.
 """
 
 import dataclasses
@@ -19,11 +19,11 @@ from torch import Tensor
 _Record = TypeVar("_Record")
 
 QUANTISATION_STD = 1.0 / 255.0 / math.sqrt(12.0)
-"""Noise of rounding to 8 bits, the least that a camera image has."""
+"""Standard deviation of rounding to 8 bits, the least noise of a camera image."""
 
 
 def check_tensor(name: str, value: object) -> None:
-    """Raise unless ``value`` is a tensor; arrays, as OpenCV and NumPy give them, are told the way.
+    """Raise unless ``value`` is a tensor; for an array of NumPy or OpenCV the message says how to convert it.
 
     Example:
         >>> import numpy as np
@@ -51,37 +51,37 @@ def check_tensor(name: str, value: object) -> None:
 
 
 def check_record(name: str, value: object, kind: type, cause: str = "") -> None:
-    """Raise unless ``value`` is a ``kind``; ``cause`` says how to come by one."""
+    """Raise unless ``value`` is a ``kind``; ``cause`` says how to make one."""
     if not isinstance(value, kind):
         what = kind.__name__ if kind.__name__.endswith("Lights") else f"a {kind.__name__}"
         raise TypeError(f"{name}: expected {what}, got {type(value).__name__}{f': {cause}' if cause else ''}")
 
 
 def check_path(name: str, value: object) -> Path:
-    """Return ``value`` as a Path, or raise unless it is the name of a file or folder."""
+    """Return ``value`` as a Path, or raise if it is not the name of a file or folder."""
     if not isinstance(value, str | os.PathLike):
         raise TypeError(f"{name}: expected a path, got {type(value).__name__}")
     if "\0" in str(value):
-        raise ValueError(f"{name}: expected a path, got {str(value)!r}: no file's name holds a NUL")
+        raise ValueError(f"{name}: expected a path, got {str(value)!r}: file names cannot contain NUL")
     return Path(value)
 
 
 def check_size(height: object, width: object, mm_per_pixel: object, least: int = 1) -> None:
-    """Raise unless these are a size in pixels of at least ``least`` each way, and a pitch in mm."""
+    """Raise unless height and width are at least ``least`` pixels, and the pitch is a positive number of mm."""
     check_integer("height", height, least)
     check_integer("width", width, least)
     check_positive("mm_per_pixel", mm_per_pixel)
 
 
 def check_sequence(name: str, value: object, items: str) -> None:
-    """Raise unless ``value`` is a sequence, or a batch of images; ``items`` says of what."""
+    """Raise unless ``value`` is a sequence of ``items`` (their name), or a batch of images."""
     batch = isinstance(value, Tensor) and value.dim() == 4
     if isinstance(value, str) or not (batch or isinstance(value, Sequence)):
-        raise TypeError(f"{name}: expected a list of {items}, got {type(value).__name__}: put a single one into [ ]")
+        raise TypeError(f"{name}: expected a list of {items}, got {type(value).__name__}: write [item] for a single one")
 
 
 def check_choice(name: str, value: object, choices: Sequence[str]) -> str:
-    """Return ``value``, or raise unless it is one of ``choices``."""
+    """Return ``value``, or raise if it is none of ``choices``."""
     if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {brief(value)}")
     return value
@@ -107,7 +107,7 @@ def check_batch(name: str, tensor: Tensor, channels: int) -> None:
             cause = "channels stand last: permute(0, 3, 1, 2)"
         raise ValueError(f"{name}: expected (B, {channels}, H, W), got {list(tensor.shape)}: {cause}")
     if tensor.shape[2] == 0 or tensor.shape[3] == 0:
-        raise ValueError(f"{name}: expected images of at least one pixel, got {list(tensor.shape)}: nothing was read?")
+        raise ValueError(f"{name}: expected images of at least one pixel, got {list(tensor.shape)}: was the file empty?")
     if not tensor.is_floating_point():
         raise TypeError(f"{name}: expected a floating-point tensor, got {tensor.dtype}: images are value / 255 in [0, 1]")
 
@@ -122,35 +122,23 @@ def check_same_size(name: str, tensor: Tensor, other_name: str, height: int, wid
 
 
 def check_same_count(name: str, tensor: Tensor, other_name: str, count: int) -> None:
-    """Raise unless ``tensor`` holds ``count`` frames, or one for all. Scripts."""
+    """Raise unless ``tensor`` holds ``count`` frames, or one frame for all. Scripts."""
     if tensor.shape[0] != count and tensor.shape[0] != 1:
         raise ValueError(
-            f"{name}: expected {count} frames like {other_name}, or one for all, got {tensor.shape[0]}: were they of another batch?"
+            f"{name}: expected {count} frames like {other_name}, or one for all, got {tensor.shape[0]}: of another batch?"
         )
 
 
 def may_read_values() -> bool:
-    """Whether Python may decide by the values of tensors: always, but while torch.export traces. Scripts."""
+    """Whether Python may branch on values of tensors: always, except while torch.export traces. Scripts."""
     if torch.jit.is_scripting():
         return True
-    else:  # noqa: RET505, TorchScript leaves out the other branch only so
+    else:  # noqa: RET505, TorchScript needs the else to skip this branch
         return not torch.compiler.is_exporting()
 
 
-def may_use_arrays(tensor: Tensor) -> bool:
-    """Whether NumPy may stand in for operators on ``tensor``: on a CPU, where Python runs them one by one. Scripts."""
-    if torch.jit.is_scripting():
-        return False
-    else:  # noqa: RET505, TorchScript leaves out the other branch only so
-        if torch.compiler.is_compiling():
-            return False
-        half = tensor.dtype in (torch.float16, torch.bfloat16)  # of which NumPy knows one and makes other sums
-        wrapped = torch._C._functorch.is_functorch_wrapped_tensor(tensor)  # by torch.func
-        return tensor.device.type == "cpu" and not half and not wrapped
-
-
 def check_window(name: str, tensor: Tensor, size: tuple[int, int], window: tuple[int, int] | None) -> tuple[int, int]:
-    """(top, left) of the part of an image of ``size`` that ``tensor`` is; without a window it must be all of it. Scripts."""
+    """Return (top, left) of ``tensor`` in an image of ``size``; without a window it must be the whole image. Scripts."""
     if window is None:
         check_same_size(name, tensor, "the calibration", size[0], size[1])
         return 0, 0
@@ -168,18 +156,22 @@ def check_image(name: str, image: Tensor, height: int, width: int, sensor_name: 
     check_tensor(name, image)
     if tuple(image.shape) != (3, height, width):
         shape = tuple(image.shape)
-        if len(shape) == 4 and shape[0] == 1:
-            cause = "take one image of the batch with [0]"
-        elif len(shape) == 3 and shape[2] == 3:
-            cause = "channels stand last: permute(2, 0, 1)"
-        elif len(shape) == 3 and shape[0] == 3:
+        cause = _cause_of_shape(image)
+        if len(shape) == 3 and shape[0] == 3 and shape[2] != 3:
             cause = f"resize it, or load the sensor with height={shape[1]}, width={shape[2]}"
-        else:
-            cause = "one RGB image is needed"
         raise ValueError(f"{name}: expected (3, {height}, {width}) for sensor '{sensor_name}', got {shape}: {cause}")
     if not image.is_floating_point():
         raise TypeError(f"{name}: expected a floating-point image, got {image.dtype}: divide by 255")
     check_range(name, image)
+
+
+def _cause_of_shape(image: Tensor) -> str:
+    """Why ``image`` is not (3, H, W)."""
+    if image.dim() == 4:
+        return "take one image of the batch with [0]"
+    if image.dim() == 3 and image.shape[2] == 3:
+        return "channels stand last: permute(2, 0, 1)"
+    return "one RGB image is needed"
 
 
 def check_field(name: str, value: object) -> None:
@@ -187,12 +179,7 @@ def check_field(name: str, value: object) -> None:
     check_tensor(name, value)
     assert isinstance(value, Tensor)
     if value.dim() != 3 or value.shape[0] != 3 or value.numel() == 0:
-        cause = "one RGB image is needed"
-        if value.dim() == 4:
-            cause = "take one image of the batch with [0]"
-        elif value.dim() == 3 and value.shape[2] == 3:
-            cause = "channels stand last: permute(2, 0, 1)"
-        raise ValueError(f"{name}: expected (3, H, W), got {tuple(value.shape)}: {cause}")
+        raise ValueError(f"{name}: expected (3, H, W), got {tuple(value.shape)}: {_cause_of_shape(value)}")
     if not value.is_floating_point():
         raise TypeError(f"{name}: expected a floating-point image, got {value.dtype}: divide by 255")
     if not bool(torch.isfinite(value).all()):
@@ -200,7 +187,7 @@ def check_field(name: str, value: object) -> None:
 
 
 def check_shape(name: str, value: object, shape: Sequence[int], like: str = "") -> None:
-    """Raise unless ``value`` is a tensor of ``shape``, which is that of ``like``."""
+    """Raise unless ``value`` is a tensor of ``shape``, the shape of ``like``."""
     check_tensor(name, value)
     assert isinstance(value, Tensor)
     if tuple(value.shape) != tuple(shape):
@@ -221,7 +208,7 @@ def check_range(name: str, image: Tensor) -> None:
 
 
 def check_positive(name: str, value: object, most: float = math.inf) -> float:
-    """Return ``value`` as a float, or raise unless it is a finite number in (0, ``most``]."""
+    """Return ``value`` as a float, or raise if it is no finite number in (0, ``most``]."""
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
     number = _float(value)
@@ -232,7 +219,7 @@ def check_positive(name: str, value: object, most: float = math.inf) -> float:
 
 
 def check_camera_height(value: object) -> float:
-    """Return ``value`` as a float, or raise unless it is above 0; infinite is an orthographic camera's."""
+    """Return ``value`` as a float, or raise unless it is above 0; infinity means an orthographic camera."""
     if isinstance(value, float) and value == math.inf:
         return value
     return check_positive("camera_height_mm", value)
@@ -241,29 +228,25 @@ def check_camera_height(value: object) -> float:
 def _float(value: numbers.Real) -> float:
     try:
         return float(value)
-    except OverflowError:  # of an integer of hundreds of digits
+    except OverflowError:  # an integer of hundreds of digits
         return math.inf
 
 
 def check_least(name: str, value: object, least: float = 0.0, most: float = math.inf) -> float:
-    """Return ``value`` as a float, or raise unless it is a finite number in [``least``, ``most``]."""
+    """Return ``value`` as a float, or raise if it is no finite number in [``least``, ``most``]."""
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
     number = _float(value)
     if not math.isfinite(number) or not least <= number <= most:
-        bound = (
-            f"in [{least:g}, {most:g}]"
-            if math.isfinite(most)
-            else f"of at least {least:g}"
-            if math.isfinite(least)
-            else "that is finite"
-        )
+        bound = f"of at least {least:g}" if math.isfinite(least) else "that is finite"
+        if math.isfinite(most):
+            bound = f"in [{least:g}, {most:g}]"
         raise ValueError(f"{name}: expected a number {bound}, got {value}")
     return number
 
 
 def check_integer(name: str, value: object, least: int) -> int:
-    """Return ``value`` as an int, or raise unless it is an integer of at least ``least``."""
+    """Return ``value`` as an int, or raise if it is no integer of at least ``least``."""
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):
         raise TypeError(f"{name}: expected an integer, got {type(value).__name__} {brief(value)}")
     if int(value) < least:
@@ -272,7 +255,7 @@ def check_integer(name: str, value: object, least: int) -> int:
 
 
 def brief(value: object) -> str:
-    """``repr(value)`` for a message: cut where it would fill the screen."""
+    """``repr(value)`` for a message, shortened to 200 characters."""
     text = repr(value)
     return text if len(text) <= 200 else f"{text[:160]} ... ({len(text)} characters)"
 
@@ -292,10 +275,16 @@ def check_numbers(name: str, value: object, shape: Sequence[int]) -> tuple[float
 
 
 def from_dict(cls: type[_Record], values: object, source: str) -> _Record:
-    """Make a dataclass of keys and values that came from a file; errors name ``source`` and the key.
+    """Make a dataclass from the keys and values of a file; errors name ``source`` and the key.
 
+    Args:
+        cls: the dataclass.
+        values: keys and values.
+        source: name of the file, for messages.
+    Returns:
+        The dataclass.
     Raises:
-        ValueError: not keys and values, a key that is unknown or missing, or a value that the class refuses.
+        ValueError: no dict, an unknown or missing key, or a value that the class rejects.
     """
     if not isinstance(values, dict):
         raise ValueError(f"{source}: expected keys and values, got {type(values).__name__}")

@@ -1,13 +1,12 @@
-"""From a compensated image to normals."""
+"""Normals from compensated images."""
 
 from .base import NormalModel, WrappedNormals, as_normal_model
 from .lookup import NormalFromLookup
-from .mlp import MlpFit, NormalFromMLP, fit_mlp
+from .mlp import NormalFromMLP
 from .photometric import NormalFromIntensity
 from .response import NormalFromResponse
 
 __all__ = [
-    "MlpFit",
     "NormalFromIntensity",
     "NormalFromLookup",
     "NormalFromMLP",
@@ -15,5 +14,4 @@ __all__ = [
     "NormalModel",
     "WrappedNormals",
     "as_normal_model",
-    "fit_mlp",
 ]

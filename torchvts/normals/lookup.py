@@ -1,4 +1,4 @@
-"""Normals by a look-up table from colour to slope."""
+"""Normals by a look-up table from the change of colour to the slope."""
 
 import math
 from pathlib import Path
@@ -9,24 +9,27 @@ from torch import Tensor, nn
 from ..core.checks import check_batch, check_field, check_integer, check_least, check_same_size, check_tensor
 from ..core.files import load_tensors, save_tensors
 from ..core.geometry import normal_from_gradient
+from .base import NormalModel
 
 LOOKUP_KIND = "lookup_table"
 
 
-class NormalFromLookup(nn.Module):
+class NormalFromLookup(NormalModel):
     """Unit normals by a table from the change of R, G, B against the flat skin to the slope, one table for all pixels.
 
-    Between the nodes of the table the slope is interpolated (trilinear), so it can be differentiated by the image; beyond the
-    table the slope of its border holds. No change of colour gives exactly no slope. The table knows nothing of the place in the
-    image, so it suits lights that are far from the skin compared with its size, and a unit that was calibrated with a ball;
-    :class:`NormalFromMLP` also sees the place. Make one with :meth:`fit`.
+    The slope is interpolated between the nodes of the table (trilinear), so that it is differentiable in the image; outside of the
+    table the slope of its border holds. No change of colour gives exactly no slope. The table does not depend on the position in
+    the image, so it suits lights that are far from the skin compared with its size, and a unit that was calibrated with a ball;
+    :class:`NormalFromMLP` also uses the position. Make one with :meth:`fit`.
 
     Args:
         flat: (3, H, W), compensated image of the flat skin.
         table: (n, n, n, 2), slope (dz/dx, dz/dy) at change of R, G, B = (index - zero_index) * step.
-        step: (3,), spacing of the nodes along R, G, B. zero_index: (3,) int64, the node of no change.
+        step: (3,), spacing of the nodes along R, G, B.
+        zero_index: (3,) int64, the node of no change.
     Raises:
-        ValueError: wrong shapes, not finite, a step that is not positive. TypeError: not floating point.
+        ValueError: wrong shapes, not finite, a step that is not positive.
+        TypeError: not floating point.
     Source:
         Johnson, Adelson, CVPR 2009; Yuan, Dong, Adelson, Sensors 17(12) 2762, 2017, section 4.
     Example:
@@ -36,7 +39,6 @@ class NormalFromLookup(nn.Module):
         tensor([0., 0., 1.])
     """
 
-    uses_depth: bool = False
     flat: Tensor
     table: Tensor
     step: Tensor
@@ -63,7 +65,7 @@ class NormalFromLookup(nn.Module):
         self.register_buffer("step", step.detach().to(flat).clone())
         self.register_buffer("zero_index", zero.to(flat.device).clone())
 
-    def forward(self, compensated: Tensor) -> Tensor:
+    def forward(self, compensated: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
         """(B, 3, H, W) compensated image to (B, 3, H, W) unit normals that face the camera."""
         check_batch("compensated", compensated, 3)
         check_same_size("compensated", compensated, "the calibration", self.flat.shape[1], self.flat.shape[2])
@@ -71,7 +73,7 @@ class NormalFromLookup(nn.Module):
         zero = self.zero_index.to(compensated.dtype).reshape(1, 3, 1, 1)
         place = (compensated - self.flat) / self.step.reshape(1, 3, 1, 1) + zero
         place = place.clamp(0.0, bins - 1.0)
-        # the index is bounded once more, because NaN passes the line above
+        # the index is clamped again, because NaN passes the line above
         low = place.detach().floor().to(torch.int64).clamp(0, bins - 2)
         upper = place - low
         lower = 1.0 - upper
@@ -92,10 +94,10 @@ class NormalFromLookup(nn.Module):
     def fit(cls, flat: Tensor, change: Tensor, slope: Tensor, *, bins: int = 32, smoothing: float = 1.0) -> "NormalFromLookup":
         """Make the table from pixels of known slope, such as those inside presses of a ball.
 
-        Every bin takes the mean slope of its pixels. Sums and counts are smoothed by a Gaussian in colour; where it finds
-        little evidence (below about one pixel), a Gaussian of twice the width decides, and so on, until every bin is filled
-        from the nearest ones. Flat skin, no change at slope 0, is added as a tenth of the pixels: the slope of the table at no
-        change, which is subtracted from all of it, is then small. (Without it, that costs 1.8 degrees on a GelSight Mini.)
+        Every bin holds the mean slope of its pixels. Sums and counts are smoothed by a Gaussian in colour; where the smoothed count
+        is below about one pixel, a Gaussian of twice the width decides, and so on, until every bin is filled from the nearest
+        ones. Flat skin, no change at slope 0, is added as a tenth of the pixels, so that the slope of the table at no change,
+        which is subtracted from the whole table, is small. (Without it, the error grows by 1.8 degrees on a GelSight Mini.)
 
         Args:
             flat: (3, H, W), compensated image of the flat skin.
@@ -106,8 +108,8 @@ class NormalFromLookup(nn.Module):
         Returns:
             The block, of the dtype of ``flat``.
         Raises:
-            ValueError: wrong shapes, no pixels, not finite, all of one colour, bad bins or smoothing. TypeError: not floating
-                point.
+            ValueError: wrong shapes, no pixels, not finite, all of one colour, bad bins or smoothing.
+            TypeError: not floating point.
         Source:
             Yuan, Dong, Adelson, Sensors 17(12) 2762, 2017; the filling is normalised convolution, Knutsson and Westin,
             CVPR 1993.
@@ -127,21 +129,14 @@ class NormalFromLookup(nn.Module):
             raise ValueError(
                 "change: expected colours that vary in R, G and B, got a channel that is 0 throughout: is it a contact?"
             )
-        step = (high - low) / (bins - 2.0)  # one bin less: zero falls on a node, which moves the range by part of one
+        step = (high - low) / (bins - 2.0)  # one bin less, because zero is moved to a node
         zero = torch.ceil(-low / step).to(torch.int64)
         node = (torch.round(colour / step).to(torch.int64) + zero).clamp(0, bins - 1)
         index = (node[:, 0] * bins + node[:, 1]) * bins + node[:, 2]
         evidence = torch.cat((known, known.new_ones(known.shape[0], 1)), dim=1)  # sums of p and q, and the count
         volume = known.new_zeros(bins**3, 3).index_add_(0, index, evidence)
         volume[(zero[0] * bins + zero[1]) * bins + zero[2], 2] += max(1.0, 0.1 * known.shape[0])  # flat skin: slope 0
-        sums = volume.T.reshape(3, bins, bins, bins)
-        widths = [float(smoothing)]
-        while widths[-1] < bins:
-            widths.append(max(1.0, 2.0 * widths[-1]))
-        table = known.mean(0).reshape(2, 1, 1, 1).expand(2, bins, bins, bins)
-        for width in reversed(widths):
-            smooth = _gaussian(sums, width)
-            table = (smooth[0:2] + table) / (smooth[2:3] + 1.0)  # the wider table weighs as one pixel
+        table = _fill(volume.T.reshape(3, bins, bins, bins), known.mean(0), smoothing)
         return cls(flat, table.permute(1, 2, 3, 0), step, zero)
 
     def save(self, path: str | Path) -> None:
@@ -153,7 +148,8 @@ class NormalFromLookup(nn.Module):
         """Read what :meth:`save` wrote. Nothing is unpickled.
 
         Raises:
-            FileNotFoundError: no such file. ValueError: not a look-up table, damaged, or cut short.
+            FileNotFoundError: no such file.
+            ValueError: not a look-up table, damaged, or cut short.
         """
         tensors, described = load_tensors(path)
         names = ("flat", "table", "step", "zero_index")
@@ -168,8 +164,21 @@ class NormalFromLookup(nn.Module):
         return f"bins={self.table.shape[0]}, height={self.flat.shape[1]}, width={self.flat.shape[2]}"
 
 
+def _fill(sums: Tensor, mean: Tensor, smoothing: float) -> Tensor:
+    """Slopes (2, n, n, n) from sums of p and q and counts (3, n, n, n), the widest Gaussian first; ``mean``: slope (2,) of all."""
+    bins = sums.shape[1]
+    widths = [float(smoothing)]
+    while widths[-1] < bins:
+        widths.append(max(1.0, 2.0 * widths[-1]))
+    table = mean.reshape(2, 1, 1, 1).expand(2, bins, bins, bins)
+    for width in reversed(widths):
+        smooth = _gaussian(sums, width)
+        table = (smooth[0:2] + table) / (smooth[2:3] + 1.0)  # the wider table weighs as one pixel
+    return table
+
+
 def _gaussian(volume: Tensor, width: float) -> Tensor:
-    """Each channel of (C, n, n, n) under a Gaussian of peak 1: what counts is the evidence near a bin, not a density."""
+    """Smooth each channel of (C, n, n, n) by a Gaussian of peak 1, which keeps counts of pixels comparable."""
     if width == 0.0:
         return volume
     reach = min(volume.shape[1] - 1, math.ceil(4.0 * width))

@@ -1,46 +1,46 @@
-"""Normals by a small network from colour and place to slope."""
+"""Normals by a small network from the colour and position of a pixel to its slope."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
-from ..core.checks import check_batch, check_field, check_integer, check_least, check_path, check_range, check_same_size
+from ..core.checks import check_batch, check_field, check_integer, check_path, check_range, check_same_size
 from ..core.files import load_tensors, save_tensors
 from ..core.geometry import normal_from_gradient
+from .base import NormalModel
 
 MLP_KIND = "mlp"
 OUTPUTS = ("angle", "gradient")
 MAX_ANGLE_RAD = math.radians(84.0)
-"""Steepest slope that the network may say."""
+"""Angle of the steepest slope that the network returns."""
 MAX_GRADIENT = math.tan(MAX_ANGLE_RAD)
 """Its tangent, 9.5 mm per mm."""
 
 
-class NormalFromMLP(nn.Module):
-    """Unit normals by gs_sdk's RGBXY network: a pixel's colour and place in, its slope out.
+class NormalFromMLP(NormalModel):
+    """Unit normals by gs_sdk's RGBXY network, from the colour and position of a pixel.
 
     Inputs are B, G, R in [0, 1], then x / width, y / height in [0, 1). The two outputs are angles whose tangents are gs_sdk's
     gradients d(H)/dx, d(H)/dy of H = -z / mm_per_pixel (``output="angle"``), or those gradients themselves
-    (``output="gradient"``). What the network says of the flat skin is subtracted; it is computed when the flat image is set,
-    so call :meth:`set_flat` again after the weights have changed.
+    (``output="gradient"``). The network's output for the flat skin is subtracted; it is computed when the flat image is
+    set, so call :meth:`set_flat` again after the weights have changed.
 
-    Make one with :meth:`load` or :func:`fit_mlp`. A new one holds random weights. The images must be treated as those that
-    trained the network were: gs_sdk's networks see raw images, so put one behind ``Compensate()`` without gain. (On a GelSight
-    Mini, a gain before it and the raw flat image cost 1.8 degrees, a gain before both 0.4.)
+    Make one with :meth:`load` or :func:`torchvts.training.fit_mlp`. A new one holds random weights. The images must be preprocessed
+    as those on which the network was trained: gs_sdk's networks take raw images, so put one behind ``Compensate()`` without gain.
+    (On a GelSight Mini, a gain before it and the raw flat image cost 1.8 degrees, a gain before both 0.4.)
 
     Args:
-        height, width: pixels.
+        height: rows, pixels.
+        width: columns, pixels.
         flat: (3, H, W), image of the flat skin in [0, 1], R, G, B.
         hidden: widths of the hidden layers.
         output: "angle" or "gradient".
-        seed: of the random weights; the global generator is left alone.
+        seed: of the random weights; the global generator is not used.
     Raises:
         ValueError, TypeError: bad sizes, a flat image of another size, range or type.
     Source:
@@ -51,7 +51,6 @@ class NormalFromMLP(nn.Module):
         tensor([0., 0., 1.])
     """
 
-    uses_depth: bool = False
     flat: Tensor
     flat_gradient: Tensor
 
@@ -89,7 +88,7 @@ class NormalFromMLP(nn.Module):
         self.register_buffer("flat_gradient", torch.zeros_like(flat[0:2]))
         self.set_flat(flat)
 
-    def forward(self, compensated: Tensor) -> Tensor:
+    def forward(self, compensated: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
         """(B, 3, H, W) images, R, G, B, to (B, 3, H, W) unit normals that face the camera."""
         check_batch("compensated", compensated, 3)
         check_same_size("compensated", compensated, "the calibration", self.height, self.width)
@@ -97,7 +96,7 @@ class NormalFromMLP(nn.Module):
         return normal_from_gradient(self.flat_gradient - self.gradient_px(compensated))
 
     def gradient_px(self, image: Tensor) -> Tensor:
-        """What the network says, (B, 2, H, W): gs_sdk's d(H)/dx, d(H)/dy, before the flat skin's is subtracted."""
+        """The network's output, (B, 2, H, W): gs_sdk's d(H)/dx, d(H)/dy, before that of the flat skin is subtracted."""
         check_batch("image", image, 3)
         check_same_size("image", image, "the calibration", self.height, self.width)
         x = torch.arange(self.width, dtype=image.dtype, device=image.device) / self.width
@@ -116,10 +115,11 @@ class NormalFromMLP(nn.Module):
         return torch.tan(value) if self.output == "angle" else value
 
     def set_flat(self, flat: Tensor) -> None:
-        """Take another image of the flat skin, (3, H, W) in [0, 1], or the same one after the weights have changed.
+        """Set the image of the flat skin, (3, H, W) in [0, 1], or the same one again after the weights have changed.
 
         Raises:
-            ValueError: another size, range or not finite. TypeError: not floating point.
+            ValueError: another size, range or not finite.
+            TypeError: not floating point.
         """
         self.check_flat(flat)
         with torch.no_grad():
@@ -145,7 +145,7 @@ class NormalFromMLP(nn.Module):
 
         A state dict holds ``fc1.weight``, ``fc1.bias``, ``fc2.weight`` ... of layers that follow one another, the first of 5
         inputs, the last of 2 outputs, ReLU between; also within a dict under ``state_dict``, as gsrobotics has it. Widths are
-        free. gsrobotics' network says gradients, not angles: load it with ``output="gradient"``. Its inputs are taken in the
+        free. gsrobotics' network returns gradients, not angles: load it with ``output="gradient"``. Its inputs are taken in the
         same order as gs_sdk's, its gradients in the same sense; check that with an image of a known contact.
 
         Args:
@@ -156,8 +156,10 @@ class NormalFromMLP(nn.Module):
         Returns:
             The network in eval mode, its weights frozen (``requires_grad_(True)`` frees them).
         Raises:
-            FileNotFoundError: no such file. ValueError: cut short or no file of weights, wrong names or shapes, not finite, no
-                flat image or one of a wrong shape or range. TypeError: flat is not floating point.
+            FileNotFoundError: no such file.
+            ValueError: cut short or no file of weights, wrong names or shapes, not finite, no flat image or one of a wrong shape
+                or range.
+            TypeError: flat is not floating point.
         """
         path = check_path("path", path)
         if not path.is_file():
@@ -180,9 +182,7 @@ class NormalFromMLP(nn.Module):
             state = _read_state(path)
         if flat is None:
             raise ValueError("flat: expected the image of the flat skin, (3, H, W), got None: a bare state dict holds none")
-        if not isinstance(flat, Tensor) or flat.dim() != 3:
-            got = tuple(flat.shape) if isinstance(flat, Tensor) else type(flat).__name__
-            raise ValueError(f"flat: expected one image of the flat skin, (3, H, W), got {got}: take one of the batch with [0]")
+        check_flat_shape(flat)
         weights = _check_state(path, state)
         widths = [weight.shape[0] for weight, _ in weights[:-1]]
         block = cls(flat.shape[1], flat.shape[2], flat, widths, output=output or str(described.get("output", "angle")))
@@ -193,7 +193,8 @@ class NormalFromMLP(nn.Module):
         """Write weights and flat image as one safetensors file, whole or not at all.
 
         Raises:
-            ValueError: the name does not end in .safetensors. FileNotFoundError: the folder is missing.
+            ValueError: the name does not end in .safetensors.
+            FileNotFoundError: the folder is missing.
         """
         if Path(path).suffix != ".safetensors":
             raise ValueError(f"{path}: expected a name ending in .safetensors, got {Path(path).suffix!r}")
@@ -215,151 +216,11 @@ class NormalFromMLP(nn.Module):
         return f"height={self.height}, width={self.width}, output={self.output}"
 
 
-@dataclass(frozen=True, eq=False)
-class MlpFit:
-    """A trained network and how it came about.
-
-    Args:
-        module: the network of the best epoch, in eval mode, its weights frozen.
-        history: per epoch (training, held-out) root mean square error of the angles, degrees.
-        best_epoch: index into ``history``.
-        converged: whether the held-out error stopped falling before ``max_epochs``.
-        message: what happened, and the remedy.
-    """
-
-    module: NormalFromMLP
-    history: list[tuple[float, float]]
-    best_epoch: int
-    converged: bool
-    message: str
-
-
-def fit_mlp(
-    intensity: Tensor,
-    xy: Tensor,
-    slope: Tensor,
-    flat: Tensor,
-    *,
-    groups: Tensor,
-    hidden: Sequence[int] = (32, 32, 32),
-    seed: int = 0,
-    max_epochs: int = 60,
-    patience: int = 10,
-    batch_size: int = 256,
-    held_out: float = 0.15,
-    weight_decay: float = 0.2,
-    progress: bool = False,
-) -> MlpFit:
-    """Train :class:`NormalFromMLP` on pixels of known slope, such as those inside presses of a ball.
-
-    AdamW on the mean square error of the two angles. Pixels of the flat skin are added with slope 0, one for every two given, so
-    that the network knows rest everywhere in the image. Whole presses are held out, and the epoch that does best on them is
-    taken: pixels of one press resemble each other too much to judge by. The step size is halved where the held-out error
-    stalls. The same arguments give the same network on the same machine; the global generator is left alone.
-
-    Args:
-        intensity: (N, 3), R, G, B in [0, 1], treated (blur, compensation) as the images will be.
-        xy: (N, 2), column and row of each pixel.
-        slope: (N, 2), true (dz/dx, dz/dy), mm per mm.
-        flat: (3, H, W), image of the flat skin, treated alike.
-        groups: (N,), number of the press that each pixel belongs to.
-        hidden: widths of the hidden layers. seed: of weights, order and held-out presses.
-        max_epochs: bound. patience: epochs without a better held-out error before it stops.
-        batch_size: pixels per step. held_out: share of the presses to hold out; at least one.
-        weight_decay: pull of the weights towards 0 (AdamW). A few dozen presses leave most places of the image without one; on a
-            GelSight Mini the error on presses not seen is 3.0 to 3.3 degrees at 0.2, 5 without.
-        progress: show a bar.
-    Returns:
-        A :class:`MlpFit`; ``message`` says what to do where it did not converge.
-    Raises:
-        ValueError: wrong shapes, values that are not finite or out of range, fewer than two presses. TypeError: wrong dtype.
-    Source:
-        Wang, She, Romero, Adelson, ICRA 2021, for network and inputs; Loshchilov, Hutter, ICLR 2019, for AdamW.
-    """
-    _check_samples(intensity, xy, slope, groups)
-    for name, value in (("max_epochs", max_epochs), ("patience", patience), ("batch_size", batch_size)):
-        check_integer(name, value, 1)
-    check_least("weight_decay", weight_decay), check_least("held_out", held_out, 0.0, 1.0)
-    if not 0.0 < held_out < 1.0:
-        raise ValueError(f"held_out: expected a share of the presses in (0, 1), got {held_out}")
+def check_flat_shape(flat: object) -> None:
+    """Raise unless ``flat`` is a tensor (3, H, W)."""
     if not isinstance(flat, Tensor) or flat.dim() != 3:
         got = tuple(flat.shape) if isinstance(flat, Tensor) else type(flat).__name__
         raise ValueError(f"flat: expected one image of the flat skin, (3, H, W), got {got}: take one of the batch with [0]")
-    height, width = flat.shape[1], flat.shape[2]
-    module = NormalFromMLP(height, width, flat, hidden, seed=seed)
-    low, high = xy.amin(0).tolist(), xy.amax(0).tolist()
-    if min(low) < 0 or high[0] > width - 1 or high[1] > height - 1:
-        raise ValueError(
-            f"xy: expected columns in [0, {width - 1}] and rows in [0, {height - 1}] like flat, "
-            f"got x {low[0]:g} to {high[0]:g}, y {low[1]:g} to {high[1]:g}: x stands first"
-        )
-    generator = torch.Generator().manual_seed(seed)
-
-    # gs_sdk's inputs and sense: B, G, R, x, y; H = -z
-    extent = torch.tensor([width, height], dtype=flat.dtype)
-    feature = torch.cat((intensity.flip(1).to(flat.dtype), xy.to(flat.dtype) / extent), dim=1)
-    angle = torch.atan(-slope.to(flat.dtype))
-    presses = torch.unique(groups)
-    if presses.numel() < 2:
-        raise ValueError(f"groups: expected two presses or more, got {presses.numel()}: one is held out to know when to stop")
-    count = min(presses.numel() - 1, max(1, round(held_out * presses.numel())))
-    chosen = presses[torch.randperm(presses.numel(), generator=generator)[:count]]
-    is_held = torch.isin(groups, chosen)
-    rest = torch.randint(height * width, (max(1, feature.shape[0] // 2),), generator=generator)
-    row, column = rest // width, rest % width
-    place = torch.stack((column, row), dim=1).to(flat.dtype) / extent
-    rest_feature = torch.cat((flat.detach().flip(0)[:, row, column].T, place), dim=1)
-    train_feature = torch.cat((feature[~is_held], rest_feature))
-    train_angle = torch.cat((angle[~is_held], angle.new_zeros(rest.numel(), 2)))
-    held_feature, held_angle = feature[is_held], angle[is_held]
-
-    # inputs of mean 0 and deviation 1 train faster; the first layer takes the scale up again below
-    mean, std = train_feature.mean(0), train_feature.std(0).clamp_min(1e-3)
-    train_feature, held_feature = (train_feature - mean) / std, (held_feature - mean) / std
-    parameters = [parameter.detach().clone().requires_grad_(True) for parameter in module.layers.parameters()]
-    optimiser = torch.optim.AdamW(parameters, lr=3e-3, weight_decay=weight_decay)
-    schedule = torch.optim.lr_scheduler.ReduceLROnPlateau(optimiser, factor=0.5, patience=max(1, patience // 4), threshold=0.0)
-
-    history: list[tuple[float, float]] = []
-    best, best_epoch = [parameter.detach().clone() for parameter in parameters], -1
-    total = train_feature.shape[0]
-    with tqdm(total=max_epochs, desc=f"network, {total} pixels", disable=not progress, leave=False) as bar:
-        for epoch in range(max_epochs):
-            order = torch.randperm(total, generator=generator)
-            squares = 0.0
-            for part in torch.split(order, batch_size):
-                loss = nn.functional.mse_loss(_run(parameters, train_feature[part]), train_angle[part])
-                for parameter, slant in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
-                    parameter.grad = slant
-                optimiser.step()
-                squares += float(loss.detach()) * part.numel()
-            with torch.no_grad():
-                error = float(nn.functional.mse_loss(_run(parameters, held_feature), held_angle))
-            history.append((math.degrees(math.sqrt(squares / total)), math.degrees(math.sqrt(error))))
-            schedule.step(error)
-            bar.update()
-            bar.set_postfix(held_out=f"{history[-1][1]:.2f} deg")
-            if best_epoch < 0 or history[-1][1] < history[best_epoch][1]:
-                best, best_epoch = [parameter.detach().clone() for parameter in parameters], epoch
-            elif epoch - best_epoch >= patience:
-                break
-    converged = len(history) - 1 - best_epoch >= patience
-    score = f"{history[best_epoch][1]:.2f} degrees on {count} of {presses.numel()} presses held out"
-    message = f"held-out error stopped falling after epoch {best_epoch + 1}: {score}"
-    if not converged:
-        message = f"stopped at {len(history)} epochs, held-out error may still fall: {score}: raise max_epochs"
-    weights = [(best[k], best[k + 1]) for k in range(0, len(best), 2)]
-    first, bias = weights[0]
-    weights[0] = (first / std, bias - (first / std) @ mean)
-    module._set_weights(weights)
-    return MlpFit(module.requires_grad_(False).eval(), history, best_epoch, converged, message)
-
-
-def _run(parameters: Sequence[Tensor], feature: Tensor) -> Tensor:
-    value = feature
-    for k in range(0, len(parameters), 2):
-        value = nn.functional.linear(torch.relu(value) if k else value, parameters[k], parameters[k + 1])
-    return value
 
 
 def _read_state(path: Path) -> object:
@@ -376,7 +237,7 @@ def _read_state(path: Path) -> object:
 
 
 def _check_state(path: Path, state: object) -> list[tuple[Tensor, Tensor]]:
-    """Weight and bias of fc1, fc2, ... or raise."""
+    """Return weight and bias of fc1, fc2, ..., or raise."""
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
         raise ValueError(f"{path}: expected a state dict of tensors fc1.weight, fc1.bias, ..., got {type(state).__name__}")
     count = len(state) // 2
@@ -402,26 +263,3 @@ def _check_state(path: Path, state: object) -> list[tuple[Tensor, Tensor]]:
         weights.append((weight, bias))
         inputs = outputs
     return weights
-
-
-def _check_samples(intensity: Tensor, xy: Tensor, slope: Tensor, groups: Tensor) -> None:
-    count = intensity.shape[0] if isinstance(intensity, Tensor) and intensity.dim() == 2 else 0
-    if count == 0 or intensity.shape[1] != 3:
-        got = tuple(intensity.shape) if isinstance(intensity, Tensor) else type(intensity).__name__
-        raise ValueError(f"intensity: expected (N, 3), R, G, B of each pixel, got {got}")
-    for name, values, shape in (("xy", xy, (count, 2)), ("slope", slope, (count, 2)), ("groups", groups, (count,))):
-        if not isinstance(values, Tensor) or tuple(values.shape) != shape:
-            got = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
-            raise ValueError(f"{name}: expected {shape}, one row for each of the {count} pixels of intensity, got {got}")
-    if not intensity.is_floating_point() or not slope.is_floating_point():
-        name, values = ("slope", slope) if intensity.is_floating_point() else ("intensity", intensity)
-        raise TypeError(f"{name}: expected floating point, got {values.dtype}: images are value / 255")
-    check_range("intensity", intensity)
-    if not bool(torch.isfinite(xy).all()):
-        raise ValueError("xy: expected finite pixels, got NaN or infinite")
-    steepest = float(slope.abs().max())
-    if not steepest <= MAX_GRADIENT:
-        raise ValueError(
-            f"slope: expected finite slopes up to {MAX_GRADIENT:.1f}, got {steepest:.4g}: "
-            "keep 3 pixels inside the rim of the ball's contact"
-        )

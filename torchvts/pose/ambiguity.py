@@ -1,24 +1,94 @@
-"""Which motions a surface cannot tell, in words: those under which it slides on itself."""
+"""Ambiguity: the motions under which a surface slides on itself, their names, and the covariance of a pose."""
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d, unfold
 
-FLAT = 0.3
-"""Sine of the angle to an axis up to which a direction counts as that axis."""
+from .alignment import CUT, DEPTH_NOISE_MM, SLOPE_NOISE, linearise, twist_units
+from .relief import Relief
+from .result import invert, motion
+
+SINE_OF_AXIS = 0.3
+"""Sine of the angle to the z axis up to which a direction is called z."""
+
+LEAST_INFORMATION = 0.05
+"""Squared change of slope, in units of its noise, per squared mm of motion, below which a motion is unknown: 0.013 a mm."""
+
+DEEP, ROLL = 0.6, 0.5
+"""Share of the largest depth above which the skin certainly lies on the object; and share of the contact's radius by which a
+motion is tried. The deep part of a ball on a GelSight Mini, rolled by 0.35 of the radius, fits worse by 0.00 to 0.03 of slope where
+frames disagree by 0.03 to 0.06; moved in the three other ways by 0.14 and more."""
+
+ALIKE_PIXELS = 25.0
+"""Number of pixels over which slope errors are alike; with it the covariance predicts the errors measured on rendered scenes."""
+
+UNKNOWN_VARIANCE = 100.0
+"""Variance of a motion that the surface does not determine, mm^2."""
+
+
+class Unknown(NamedTuple):
+    """Motions that the contact does not determine.
+
+    Attributes:
+        motions: (6, k), columns, about the target's origin, rad and mm.
+        names: one per motion.
+    """
+
+    motions: Tensor
+    names: list[str]
+
+
+def find_unknown(source: Relief, target: Relief, pose: Tensor, noise: float) -> Unknown:
+    """Find the motions of a pose (1, 4, 4) that the contact does not determine, on the coarse grids, which are least noisy.
+
+    Two tests: whether slopes and heights of the whole contact change with a motion; and, where the contact is a single hill,
+    whether its deep part rolls on itself: its normals turn by more than the frames disagree, and it still fits no worse. The deep
+    part lies on the object; the skin around a ball moves with the contact, not with the ball, and hides that the ball can roll.
+
+    Args:
+        source: the relief that is moved.
+        target: the relief that stays.
+        pose: (1, 4, 4) float64.
+        noise: of the target's slopes.
+    """
+    points, slopes = target.points, target.slopes
+    back = invert(pose)[0].float()
+    _, inside, _, _ = source.sample((points @ back[:3, :3].T + back[:3, 3])[:, :2])
+    bent = target._replace(field=_field_with_fitted_curvature(target))
+    bend = 1.5 / 6.0 * (noise / target.pitch / SLOPE_NOISE) ** 2  # of planes through 3 x 3 noisy slopes
+    bias = torch.diag(bend * torch.tensor([0.1, 0.1, 1.0, 1.0, 1.0, 0.1], dtype=torch.float64))
+    found = Unknown(torch.zeros(6, 0, dtype=torch.float64), [])
+    for part in (inside, inside & (points[:, 2] > DEEP * points[:, 2].max())):
+        if int(part.sum()) < 6 or (part is not inside and not _is_one_hill(target)):
+            continue
+        common = target._replace(points=points[part], slopes=slopes[part])
+        center, units = common.points.double().mean(0), twist_units(common)
+        information = _information(common, bent, center, units)
+        free, shifts = free_directions(information, bias, LEAST_INFORMATION)
+        if part is not inside:
+            motions = torch.linalg.eigh(information).eigenvectors
+            rolls = _rolls(source, target, pose, _Trial(common.slopes, center, units, motions))
+            free, shifts = motions[:, rolls], shifts[:, :0]
+        if free.shape[1] > found.motions.shape[1]:
+            moved = units[:, None] * free  # rad and mm; rotations about the center become rotations about the origin and shifts
+            moved[3:] = moved[3:] - torch.linalg.cross(moved[:3], center[:, None].expand_as(moved[:3]), dim=0)
+            found = Unknown(moved, name_directions(free, shifts))
+    return found
 
 
 def free_directions(information: Tensor, bias: Tensor, least: float) -> tuple[Tensor, Tensor]:
-    """Motions of which a surface says next to nothing.
+    """Motions about which a surface holds hardly any information.
 
     Args:
-        information: (6, 6), mean over the contact's pixels of J^T J in units of the noise; turns in units of the contact's size,
-            shifts in mm, so that all six are lengths.
-        bias: (6, 6), what noise alone puts there.
+        information: (6, 6), mean over the contact's pixels of J^T J in units of the noise; rotations in units of the contact's
+            size, shifts in mm, so that all six are lengths.
+        bias: (6, 6), the part of it that noise alone causes.
         least: information below which a direction counts as unknown, 1/mm^2.
     Returns:
-        Orthonormal columns: all free motions (6, k), and those of them that are pure shifts (3, m).
+        Orthonormal columns: all free motions (6, k), and those that are pure shifts (3, m).
     """
     return _below(information, bias, least), _below(information[3:, 3:], bias[3:, 3:], least)
 
@@ -31,7 +101,7 @@ def _below(information: Tensor, bias: Tensor, least: float) -> Tensor:
 
 
 def name_directions(free: Tensor, shifts: Tensor) -> list[str]:
-    """Words for what :func:`free_directions` found.
+    """Names of the motions that :func:`free_directions` found.
 
     Example:
         >>> name_directions(torch.eye(6)[:, 2:5], torch.eye(3)[:, :2])
@@ -52,15 +122,99 @@ def name_directions(free: Tensor, shifts: Tensor) -> list[str]:
     turns = min(free.shape[1] - count, 3)
     if turns == 3:
         return names + [f"rotation about {axis}" for axis in "xyz"]
-    axes = torch.linalg.svd(free[:3], full_matrices=False).U  # by how much the free motions turn about them, most first
+    axes = torch.linalg.svd(free[:3], full_matrices=False).U  # the axes of the free rotations, largest first
     return names + [f"rotation about {_line(axes[:, k])}" for k in range(turns)]
 
 
 def _line(direction: Tensor) -> str:
     x, y, z = direction.tolist()
-    if math.hypot(x, y) < FLAT * abs(z) / math.sqrt(1 - FLAT**2):
+    if math.hypot(x, y) < SINE_OF_AXIS * abs(z) / math.sqrt(1 - SINE_OF_AXIS**2):
         return "z"
     angle = round(math.degrees(math.atan2(y, x))) % 180
     if min(angle, 180 - angle) <= 2:
         return "x"
     return "y" if abs(angle - 90) <= 2 else f"{angle} degrees"
+
+
+def _is_one_hill(relief: Relief) -> bool:
+    """Whether no path from the contact's deep part climbs by more than a tenth of the depth: there is no second hill."""
+    depth = torch.where(relief.inside, relief.field[0], 0.0)[None, None]
+    highest = float(depth.amax())
+    reached, before = torch.where(depth > DEEP * highest, depth, 0.0), torch.zeros_like(depth)
+    while not torch.equal(reached, before):
+        before, reached = reached, torch.minimum(max_pool2d(reached, 3, 1, 1), depth)
+    return float((depth - reached).amax()) < 0.1 * highest
+
+
+def _information(common: Relief, target: Relief, center: Tensor, units: Tensor) -> Tensor:
+    """(6, 6), mean over pixels of J^T J in units of the noise, for motions of ``common`` on the target about ``center``."""
+    lin = linearise(common, target, torch.eye(4, dtype=torch.float64)[None], center[None, None])
+    slope_by = (lin.slope_by_twist[0].double() * units / SLOPE_NOISE).flatten(0, 1)
+    height_by = lin.height_by_twist[0].double() * units / (5.0 * DEPTH_NOISE_MM)
+    information: Tensor = (slope_by.T @ slope_by + height_by.T @ height_by) / len(common.points)
+    return information
+
+
+class _Trial(NamedTuple):
+    """Motions (6, K), columns, to try on the deep part: its slopes (N, 2), its centre (3,), and the motions' units (6,)."""
+
+    slopes: Tensor
+    center: Tensor
+    units: Tensor
+    motions: Tensor
+
+
+def _rolls(source: Relief, target: Relief, pose: Tensor, trial: _Trial) -> Tensor:
+    """Which motions turn the deep part's normals and leave its fit unchanged; bool (K,)."""
+    step = ROLL / float(trial.units[0])  # mm: a share of the contact's radius
+    twists = (trial.motions * trial.units[:, None]).T
+    poses = torch.cat([pose] + [motion(share * step * twists, trial.center) @ pose for share in (1.0, -1.0, 0.5, -0.5)])
+    lin = linearise(source, target, poses, torch.zeros(1, 1, 3, dtype=torch.float64))
+    deep = source.points[:, 2] > DEEP * source.points[:, 2].max()
+    squared = lin.slope.square().sum(-1) + (lin.height * (SLOPE_NOISE / (5.0 * DEPTH_NOISE_MM))).square()
+    squared = squared[:, deep].clamp_max((CUT * SLOPE_NOISE) ** 2)
+    tried = squared[1:].reshape(4, len(twists), -1)  # (4, K, N)
+    compared = (lin.counts[1:, deep].reshape(tried.shape) & lin.counts[0, deep]).double()
+    count = compared.sum(-1)
+    rise = (((tried - squared[0]) * compared).sum(-1) / count.clamp_min(1.0)).amax(0)
+    p, q = trial.slopes.double().T
+    turn = torch.stack((torch.stack((p * q, -(1 + p * p), -q), -1), torch.stack((1 + q * q, -p * q, p), -1)), 1)  # (N, 2, 3)
+    turned = (turn @ twists[:, :3].T).square().sum(1).mean(0) * step**2
+    noise = 2.0 * max(float(squared[0][lin.counts[0, deep]].mean()), SLOPE_NOISE**2)
+    whole = count.amin(0) > 0.5 * int(deep.sum())
+    return whole & (rise < noise) & (turned > (3.0 * rise).clamp_min(noise))
+
+
+def _field_with_fitted_curvature(relief: Relief) -> Tensor:
+    """The field with second derivatives from planes through the slopes of 3 x 3 pixels inside: the skin bends beyond the rim."""
+    side = (-1.0, 0.0, 1.0)
+    place = torch.tensor([[1.0, x, -y] for y in side for x in side])  # rows go down, y up
+    place[:, 1:] *= relief.pitch
+    weight = unfold(relief.inside.float()[None, None], 3, padding=1)[0].T  # (H W, 9)
+    slopes = unfold(relief.field[1:3, None], 3, padding=1).permute(2, 1, 0)  # (H W, 9, 2)
+    weighted = place.T * weight[:, None]  # (H W, 3, 9)
+    ridge = 1e-3 * torch.diag(torch.tensor([0.0, 1.0, 1.0])) * relief.pitch**2 + 1e-9 * torch.eye(3)
+    plane = torch.linalg.solve(weighted @ place + ridge, weighted @ slopes)  # (H W, 3, 2)
+    p_x, p_y, q_x, q_y = plane[:, 1, 0], plane[:, 2, 0], plane[:, 1, 1], plane[:, 2, 1]
+    bend = torch.stack((p_x, 0.5 * (p_y + q_x), q_y)).reshape(3, *relief.inside.shape)
+    return torch.cat((relief.field[:3], bend))
+
+
+def pose_covariance(source: Relief, target: Relief, pose: Tensor) -> tuple[float, Tensor]:
+    """RMS distance along the normal over the pixels that agree, mm, and the covariance (6, 6) about the target's origin."""
+    center = torch.zeros(1, 1, 3, dtype=torch.float64)
+    lin = linearise(source, target, pose, center)
+    squared = (lin.slope.square().sum(-1) / SLOPE_NOISE**2 + (lin.height / DEPTH_NOISE_MM) ** 2)[0]
+    agrees = lin.counts[0] & (squared < CUT**2)
+    if int(agrees.sum()) < 6:
+        return math.inf, torch.diag(torch.tensor([1.0] * 3 + [100.0] * 3, dtype=torch.float64))
+    upright = 1.0 / torch.sqrt(1.0 + source.slopes[agrees].square().sum(1))
+    rmse_mm = float((lin.height[0][agrees] * upright).square().mean().sqrt())
+    slope_noise = float(lin.slope[0][agrees].square().mean().sqrt())
+    depth_noise = float(lin.height[0][agrees].square().mean().sqrt())
+    slope_by = (lin.slope_by_twist[0][agrees].double() / max(slope_noise, 1e-4)).flatten(0, 1)
+    # depth errors are alike over the whole contact: all its pixels together count as four
+    height_by = lin.height_by_twist[0][agrees].double() / max(depth_noise, 1e-4) * math.sqrt(4.0 / int(agrees.sum()))
+    information = slope_by.T @ slope_by / ALIKE_PIXELS + height_by.T @ height_by
+    information = information + torch.diag(torch.tensor([1.0] * 3 + [0.01] * 3, dtype=torch.float64))
+    return rmse_mm, torch.linalg.inv(information)

@@ -1,6 +1,6 @@
-"""PCD and PLY files read without trust: every number of a head is held against the bytes that are there before it is believed.
+"""Readers of PCD and PLY files that trust nothing: every number of a header is checked against the size of the file.
 
-(Open3D's own readers crash on damaged files, and take whatever memory a head asks for.)
+(Open3D's own readers crash on damaged files, and allocate whatever memory a header asks for.)
 """
 
 import struct
@@ -12,10 +12,10 @@ import numpy as np
 Columns = dict[str, "np.ndarray[Any, Any]"]
 
 MOST_BYTES = 2**31
-"""A larger file is not read."""
+"""Largest file that is read."""
 
 HEAD_BYTES = 2**16
-"""A head that does not end within so many is none."""
+"""Largest header."""
 
 PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
@@ -24,12 +24,12 @@ PLY_TYPES = {
 
 
 def read_columns(path: Path) -> Columns:
-    """The columns of a .pcd or .ply file's points by name, float64, all of one length.
+    """Read the columns of a .pcd or .ply file's points by name, float64, all of one length.
 
     PCD: text, binary, compressed. PLY: text, binary of both byte orders; points come first and are plain numbers.
 
     Raises:
-        ValueError: says what is wrong.
+        ValueError: the file is too large, damaged or no point cloud.
     """
     size = path.stat().st_size
     if size > MOST_BYTES:
@@ -38,7 +38,7 @@ def read_columns(path: Path) -> Columns:
     try:
         columns = _read_pcd(data) if path.suffix.lower() == ".pcd" else _read_ply(data)
     except (struct.error, LookupError, OverflowError, TypeError) as error:
-        raise ValueError(f"its head is damaged: {error!r}") from error
+        raise ValueError(f"its header is damaged: {error!r}") from error
     return {name: column.astype(np.float64) for name, column in columns.items()}
 
 
@@ -48,7 +48,7 @@ def _read_pcd(data: bytes) -> Columns:
     while "DATA" not in head:
         end = data.find(b"\n", place, HEAD_BYTES)
         if end < 0:
-            raise ValueError("not a point cloud, or cut short in its head")
+            raise ValueError("not a point cloud, or cut short in its header")
         words = data[place:end].decode("ascii", "replace").split()
         place = end + 1
         if words and not words[0].startswith("#"):
@@ -67,7 +67,7 @@ def _read_pcd(data: bytes) -> Columns:
     if way == "binary_compressed":
         packed, size = struct.unpack("<II", body[:8])
         _check_count(points, width, size)
-        if packed > len(body) - 8 or size > 256 * packed:  # what LZF makes of a byte is less
+        if packed > len(body) - 8 or size > 256 * packed:  # LZF expands a byte by less
             raise ValueError(f"cut short: {packed} bytes are announced, {len(body) - 8} are there")
         body = _unpack_lzf(body[8 : 8 + packed], size)
         columns, place = {}, 0
@@ -86,7 +86,7 @@ def _read_pcd(data: bytes) -> Columns:
 def _read_ply(data: bytes) -> Columns:
     end = data.find(b"end_header", 0, HEAD_BYTES)
     if not data.startswith(b"ply") or end < 0:
-        raise ValueError("not a point cloud, or cut short in its head")
+        raise ValueError("not a point cloud, or cut short in its header")
     start = data.find(b"\n", end) + 1
     way, element, points = "", "", 0
     names: list[str] = []
@@ -101,12 +101,12 @@ def _read_ply(data: bytes) -> Columns:
             points = points if element else int(words[2])
             element = element or "vertex"
             if words[1] != "vertex":
-                break  # what follows the points is not read
+                break  # elements after the points are not read
         elif words[:1] == ["property"]:
             names.append(words[2])
             types.append(PLY_TYPES[words[1]])
     if not names or len(set(names)) < len(names) or start == 0:
-        raise ValueError("its points have no numbers")
+        raise ValueError("its points have no properties")
     if way == "ascii":
         return _text_columns(data[start:], points, names, [1] * len(names))
     row = np.dtype(
@@ -119,7 +119,7 @@ def _read_ply(data: bytes) -> Columns:
 
 def _text_columns(body: bytes, points: int, names: list[str], counts: list[int]) -> Columns:
     width = sum(counts)
-    _check_count(points, 2 * width - 1, len(body) + 1)  # a digit and a blank each
+    _check_count(points, 2 * width - 1, len(body) + 1)  # a digit and a space each
     words = body.split(maxsplit=points * width)[: points * width]
     if len(words) < points * width:
         raise ValueError(f"cut short: {points * width} numbers are announced, {len(words)} are there")
@@ -130,13 +130,13 @@ def _text_columns(body: bytes, points: int, names: list[str], counts: list[int])
 
 def _check_count(points: int, width: int, there: int) -> None:
     if points < 1:
-        raise ValueError(f"it says that it has {points} points")
+        raise ValueError(f"expected at least one point, got {points}")
     if points * width > there:
         raise ValueError(f"cut short: {points} points of {width} bytes are announced, {there} bytes are there")
 
 
 def _unpack_lzf(packed: bytes, size: int) -> bytes:
-    """Undo LZF (Marc Lehmann's liblzf): runs of plain bytes, and references back to what is there already."""
+    """Decompress LZF (Marc Lehmann's liblzf): runs of plain bytes, and references to bytes already written."""
     out = bytearray()
     place = 0
     while place < len(packed):
@@ -155,7 +155,7 @@ def _unpack_lzf(packed: bytes, size: int) -> bytes:
         first = len(out) - back
         if first < 0 or len(out) > size:
             raise ValueError("its compressed bytes are damaged")
-        for k in range(length + 2):  # one by one: it may reach into what it writes
+        for k in range(length + 2):  # one by one: the reference may overlap the bytes it writes
             out.append(out[first + k])
     if len(out) != size:
         raise ValueError(f"its compressed bytes are damaged: {size} are announced, {len(out)} came")

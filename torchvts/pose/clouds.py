@@ -13,21 +13,24 @@ from ..core.checks import check_integer, check_path, check_positive, check_tenso
 from ..core.files import write_atomically
 from ..core.geometry import depth_to_points
 from .cloud_formats import read_columns
-from .relief import Frame, contact_of, sure_contact
+from .relief import DepthFrame, contact_of, sure_contact
 
 CLOUD_SUFFIXES = (".pcd", ".ply")
 NORMAL_NAMES = {".pcd": ("normal_x", "normal_y", "normal_z"), ".ply": ("nx", "ny", "nz")}
 
 
-def contact_cloud(frame: Frame, mm_per_pixel: float, most: int | None = 1000) -> tuple[Tensor, Tensor]:
+def contact_cloud(frame: DepthFrame, mm_per_pixel: float, most: int | None = 1000) -> tuple[Tensor, Tensor]:
     """The contact of one depth frame as points and normals, in the right-handed frame (x right, y up, z to the camera).
 
-    Kept is what is deeper than the noise of depth and than the skirt around a contact, less a rim of one pixel; the normals are
-    those of the slopes that the camera saw (of 3 x 3 pixels where the cloud is thinned), not estimates from the points.
+    The cloud holds the pixels that are deeper than the noise of depth and than the transition zone around a contact, without a rim
+    of one pixel. The normals are those of the measured slopes (means of 3 x 3 pixels where the cloud is thinned), not estimates
+    from the points.
 
     Args:
-        frame: a :class:`torchvts.DepthOutput`. mm_per_pixel: pitch, mm.
-        most: thin evenly, one point of each cube of a grid, to at most so many and seldom fewer than 0.9 of it; None keeps all.
+        frame: a :class:`torchvts.DepthOutput`.
+        mm_per_pixel: pitch, mm.
+        most: largest number of points; a larger cloud is thinned evenly, one point of each cube of a grid, seldom to fewer than 0.9
+            of it. None keeps all.
     Returns:
         Points (N, 3), mm, and unit normals (N, 3), float64.
     Raises:
@@ -39,7 +42,7 @@ def contact_cloud(frame: Frame, mm_per_pixel: float, most: int | None = 1000) ->
     if not bool(inside.any()):
         raise ValueError("frame: expected a contact deeper than its own noise, got none: pressed too faintly")
     points = depth_to_points(depth, mm_per_pixel, inside).double()
-    if most is not None:  # fewer points: each speaks for its neighbours
+    if most is not None:  # fewer points: each stands for its neighbours
         share = avg_pool2d(contact.float()[None], 3, 1, 1)
         gradient = avg_pool2d(gradient * contact, 3, 1, 1) / share.clamp_min(1e-6)
     normals = torch.stack((-gradient[0], gradient[1], torch.ones_like(depth)), dim=-1)[inside].double()
@@ -78,7 +81,7 @@ def voxel_first(points: Tensor, size: float) -> Tensor:
 
 
 def open3d() -> Any:
-    """Import Open3D, lending it libusb from the package ``libusb-package`` where the system has none.
+    """Import Open3D, with libusb of the package ``libusb-package`` where the system has none.
 
     Raises:
         ImportError: says what to install.
@@ -97,10 +100,15 @@ def open3d() -> Any:
 
 
 def write_point_cloud(path: str | Path, points: Tensor, normals: Tensor | None = None) -> None:
-    """Write points (N, 3) in mm, right-handed (see :func:`torchvts.depth_to_points`), as .pcd or .ply, whole or not at all.
+    """Write a point cloud as .pcd or .ply, whole or not at all.
 
+    Args:
+        path: the file.
+        points: (N, 3), mm, right-handed (see :func:`torchvts.depth_to_points`).
+        normals: (N, 3), or None.
     Raises:
-        ValueError: wrong shape, no points, values not finite, or another suffix. ImportError: without the extra ``pose``.
+        ValueError: wrong shape, no points, values not finite, or another suffix.
+        ImportError: without the extra ``pose``.
     """
     path = check_path("path", path)
     if path.suffix.lower() not in CLOUD_SUFFIXES:
@@ -118,7 +126,8 @@ def read_point_cloud(path: str | Path) -> tuple[Tensor, Tensor | None]:
     """Read a .pcd or .ply file: points (N, 3) float64, and normals (N, 3) if it has them.
 
     Raises:
-        FileNotFoundError: no such file. ValueError: not a cloud, cut short, or an empty one.
+        FileNotFoundError: no such file.
+        ValueError: not a cloud, cut short, or an empty one.
     """
     path = check_path("path", path)
     if not path.is_file():

@@ -1,4 +1,4 @@
-"""A depth frame made ready to be compared: relief, slope and contact on a pyramid of grids, in the right-handed frame."""
+"""Reliefs: height, slope and contact of one depth frame on a pyramid of grids, in the right-handed frame."""
 
 import math
 from typing import NamedTuple, Protocol
@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, max_pool2d
 
 LEAST_DEPTH_MM = 0.03
-"""Skin less deep than this is taken for skirt: it bends away from the object before it leaves it."""
+"""Skin less deep than this counts as the transition zone around a contact, where it does not lie on the object."""
 
 LEAST_SIDE = 16
 """Pixels along the shorter side of a frame."""
@@ -17,8 +17,8 @@ LEAST_PIXELS = 60
 """A contact of fewer pixels has no pose."""
 
 
-class Frame(Protocol):
-    """What :class:`torchvts.DepthOutput` has."""
+class DepthFrame(Protocol):
+    """The fields of :class:`torchvts.DepthOutput` that a registration uses."""
 
     @property
     def depth_mm(self) -> Tensor: ...
@@ -34,9 +34,12 @@ class Relief(NamedTuple):
     Attributes:
         field: the six channels, mm, mm per mm, 1/mm.
         inside: (H, W) bool, where the skin lies on the object.
-        near: (H, W) bool, the same, grown by a pixel: beyond it there is surely no contact.
-        x0, y0: position of the upper left pixel, mm, y up. pitch: mm.
-        points: (N, 3), the pixels inside. slopes: (N, 2), theirs.
+        near: (H, W) bool, possible contact, grown by a pixel: there is certainly no contact beyond it.
+        x0: position of the upper left pixel, mm.
+        y0: the same, y up.
+        pitch: distance of pixels, mm.
+        points: (N, 3), positions of the pixels inside, mm.
+        slopes: (N, 2), slopes of the same pixels.
     """
 
     field: Tensor
@@ -49,7 +52,7 @@ class Relief(NamedTuple):
     slopes: Tensor
 
     def sample(self, xy: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """At positions (..., 2): the channels (6, ...), whether inside, whether near, whether in the image."""
+        """Sample at positions (..., 2): the channels (6, ...), and three masks (...): inside, near, in the image."""
         height, width = self.inside.shape
         column = (xy[..., 0] - self.x0) / self.pitch
         row = (self.y0 - xy[..., 1]) / self.pitch
@@ -57,12 +60,12 @@ class Relief(NamedTuple):
         flat = grid.reshape(1, 1, -1, 2)
         channels = torch.cat((self.field, self.inside[None].to(self.field.dtype), self.near[None].to(self.field.dtype)))
         values = grid_sample(channels[None], flat, align_corners=True)[0, :, 0].reshape(8, *xy.shape[:-1])
-        seen = (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
-        return values[:6], (values[6] > 0.999) & seen, values[7] > 0.001, seen
+        in_image = (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
+        return values[:6], (values[6] > 0.999) & in_image, values[7] > 0.001, in_image
 
 
 class Levels(NamedTuple):
-    """A frame on three grids, from fine to coarse, and the noise of slopes on the coarse one."""
+    """A frame on three grids, from fine to coarse, and the slope noise on the coarse one."""
 
     fine: Relief
     middle: Relief
@@ -70,11 +73,12 @@ class Levels(NamedTuple):
     noise: float
 
 
-def contact_of(frame: Frame, name: str) -> tuple[Tensor, Tensor, Tensor]:
+def contact_of(frame: DepthFrame, name: str) -> tuple[Tensor, Tensor, Tensor]:
     """Depth (H, W), gradient (2, H, W) (y down) and contact (H, W) bool of one frame, checked.
 
     Raises:
-        ValueError: not one frame, shapes that differ, values not finite, or next to no contact.
+        TypeError: no DepthOutput.
+        ValueError: not one frame, shapes that differ, values not finite, or a contact of a few pixels.
     """
     for part in ("depth_mm", "gradient", "contact"):
         if not isinstance(getattr(frame, part, None), Tensor):
@@ -96,8 +100,8 @@ def contact_of(frame: Frame, name: str) -> tuple[Tensor, Tensor, Tensor]:
     return depth.reshape(height, width).float(), gradient.reshape(2, height, width).float(), inside
 
 
-def levels(frame: Frame, mm_per_pixel: float, name: str) -> Levels:
-    """The frame on grids of at most 320, 160 and 80 columns; each pixel there is the mean of all it covers."""
+def levels(frame: DepthFrame, mm_per_pixel: float, name: str) -> Levels:
+    """Resample a frame to grids of at most 320, 160 and 80 columns, each pixel the mean of those that it covers."""
     depth, gradient, contact = contact_of(frame, name)
     if min(depth.shape) < LEAST_SIDE:
         raise ValueError(
@@ -105,7 +109,7 @@ def levels(frame: Frame, mm_per_pixel: float, name: str) -> Levels:
         )
     noise = slope_noise(gradient, contact)
     inside = contact & (depth > least_depth_mm(noise, mm_per_pixel))
-    # flat faces whose outline the image cuts off may be missing from the mask: of these nothing is said, not even "no contact"
+    # flat faces whose outline the image border cuts may be missing from the mask: they count as possible contact
     deep = depth > 0.3 * float(depth[contact].max())
     slope = torch.stack((gradient[0], -gradient[1]))  # y up
     longest = max(depth.shape)
@@ -123,24 +127,24 @@ def levels(frame: Frame, mm_per_pixel: float, name: str) -> Levels:
 
 
 def without_rim(mask: Tensor) -> Tensor:
-    """A mask (1, H, W) less its outermost pixels, or as it is where it has hardly any others."""
+    """Remove the outermost pixels of a mask (1, H, W), unless hardly any others remain."""
     core = -max_pool2d(-mask.float()[None], 3, 1, 1)[0] > 0.5
     return core if 5 * int(core.sum()) > 2 * int(mask.sum()) else mask
 
 
 def least_depth_mm(noise: float, mm_per_pixel: float) -> float:
-    """Depth that is surely contact: above the skirt, and above what noise of slopes adds up to over some pixels."""
+    """Least depth that is certainly contact: above the transition zone, and above the noise of slopes summed over some pixels."""
     return max(LEAST_DEPTH_MM, 4.0 * noise * mm_per_pixel)
 
 
 def sure_contact(depth: Tensor, gradient: Tensor, contact: Tensor, mm_per_pixel: float) -> Tensor:
-    """(H, W) bool: contact deeper than that, less its rim of one pixel."""
+    """Contact deeper than :func:`least_depth_mm` without its rim of one pixel, (H, W) bool."""
     inside = contact & (depth > least_depth_mm(slope_noise(gradient, contact), mm_per_pixel))
     return without_rim(inside[None])[0]
 
 
 def slope_noise(gradient: Tensor, contact: Tensor) -> float:
-    """Noise of slopes inside the contact, from second differences along rows, as :func:`torchvts.core.noise.noise_std`."""
+    """Noise of slopes inside the contact, from second differences along rows, as in :func:`torchvts.core.noise.noise_std`."""
     whole = contact[:, :-2] & contact[:, 1:-1] & contact[:, 2:]
     second = (gradient[..., 1:-1] - 0.5 * (gradient[..., :-2] + gradient[..., 2:]))[:, whole].abs()
     return float(second.median()) / (0.6745 * math.sqrt(1.5)) if second.numel() else 0.0
@@ -149,7 +153,17 @@ def slope_noise(gradient: Tensor, contact: Tensor) -> float:
 def relief(
     depth: Tensor, slope: Tensor, inside: Tensor, perhaps: Tensor, mm_per_pixel: float, times: int, corner: tuple[float, float]
 ) -> Relief:
-    """One grid: means of ``times`` x ``times`` pixels of depth (H, W) and slope (2, H, W), y up; ``corner``: first pixel, mm."""
+    """One grid of a pyramid: means of ``times`` x ``times`` pixels.
+
+    Args:
+        depth: (H, W), mm.
+        slope: (2, H, W), y up.
+        inside: (H, W) bool, where the skin certainly lies on the object.
+        perhaps: (H, W) bool, where it may lie on the object.
+        mm_per_pixel: pitch of the input, mm.
+        times: pixels per side that are averaged.
+        corner: (x, y) of the first pixel, mm, y up.
+    """
     height, width = depth.shape
     rows, columns = height // times * times, width // times * times
     stack = torch.cat((depth[None], slope))[:, :rows, :columns]
@@ -162,7 +176,7 @@ def relief(
     x0, y0 = corner[0] + 0.5 * (times - 1) * mm_per_pixel, corner[1] - 0.5 * (times - 1) * mm_per_pixel
     whole = share[:1] > (0.99 if times <= 2 else 0.5)
     if times <= 2:
-        whole = without_rim(whole)  # half of it is skirt
+        whole = without_rim(whole)  # half of the rim is transition zone
     near = max_pool2d((share[1:] > 0.01).float()[None], 3, 1, 1)[0] > 0.5
     smooth = _blur(stack[1:])
     p_y, p_x = torch.gradient(smooth[0], spacing=pitch)

@@ -1,4 +1,4 @@
-"""What a registration tells: a pose, how good it is, and what it cannot know."""
+"""The result of a registration: a pose, its quality, and the motions that the data do not determine."""
 
 from dataclasses import dataclass, field
 
@@ -8,19 +8,19 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """Where a source lies in the target's frame: ``p_target = T_target_source p_source``, mm, x right, y up, z to the camera.
+    """Pose of a source in the target's frame: ``p_target = T_target_source p_source``, mm, x right, y up, z to the camera.
 
     Attributes:
         T_target_source: (4, 4) float64, a rigid motion.
-        rmse_mm: root mean square distance along the surface's normal, over the part where both agree.
-        fitness: share of what both should show (the common contact) that agrees, 0 to 1.
-        converged: whether the pose is to be trusted, up to what ``ambiguous`` and ``alternatives`` say.
-        message: why, in a sentence.
+        rmse_mm: root mean square distance along the surface normal, over the part where both agree, mm.
+        fitness: share of the common contact that agrees, 0 to 1.
+        converged: whether the pose can be trusted, except for what ``ambiguous`` and ``alternatives`` list.
+        message: the reason, in one sentence.
         covariance: (6, 6) of a small motion ``p -> p + w x p + t`` after the pose, order (w_x, w_y, w_z, t_x, t_y, t_z), rad
             and mm; a direction that is not observable has a variance of 100 mm^2 or more at the contact.
-        ambiguous: directions in which the surface slides on itself, in words; empty if there is none.
-        alternatives: (4, 4) poses that fit as well, the object being symmetric; the best one is not among them.
-        overlap: share of the smaller contact that could be compared, 0 to 1; 1 for clouds that are no reliefs.
+        ambiguous: names of the motions under which the surface slides on itself; empty if there is none.
+        alternatives: (4, 4) poses that fit equally well because the object is symmetric; the best pose is not among them.
+        overlap: share of the smaller contact that could be compared, 0 to 1; 1 for clouds that are no height maps.
     """
 
     T_target_source: Tensor
@@ -49,7 +49,7 @@ def invert(T: Tensor) -> Tensor:
 
 
 def motion(twist: Tensor, center: Tensor | None = None) -> Tensor:
-    """Rigid motions (..., 4, 4) of twists (..., 6): turned by w about an axis through ``center`` (the origin), then moved by t."""
+    """Rigid motions (..., 4, 4) of twists (..., 6): rotation by w about ``center`` (default: the origin), then shift by t."""
     w, t = twist[..., :3], twist[..., 3:]
     zero = torch.zeros_like(w[..., 0])
     cross = torch.stack((zero, -w[..., 2], w[..., 1], w[..., 2], zero, -w[..., 0], -w[..., 1], w[..., 0], zero), -1)
@@ -62,7 +62,7 @@ def motion(twist: Tensor, center: Tensor | None = None) -> Tensor:
 
 
 def turn_deg(T: Tensor) -> Tensor:
-    """Angle of the rotation of rigid motions (..., 4, 4), degrees; small angles keep their digits."""
+    """Rotation angle of rigid motions (..., 4, 4), degrees; accurate for small angles too."""
     r = T[..., :3, :3]
     skew = torch.stack((r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]), -1)
     return torch.rad2deg(torch.atan2(skew.norm(dim=-1), r.diagonal(dim1=-2, dim2=-1).sum(-1) - 1.0))

@@ -1,0 +1,218 @@
+"""The writers: a pipeline as one file in TorchScript, torch.export, AOTInductor or ONNX.
+
+Every file takes images (B, 3, H, W) of the pipeline's size, any B, and returns depth_mm, gradient, normal, contact in that order.
+"""
+
+import copy
+import json
+import shutil
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ..core import __version__
+from ..core.checks import check_choice, check_record
+from ..core.files import check_target, write_atomically
+from ..normals import WrappedNormals
+from ..pipeline import DepthPipeline
+from .onnx_operators import decompositions
+from .trace import size_and_dtype, trace
+
+METADATA_KEY = "torchvts"
+"""Name under which a file keeps its metadata (:func:`describe`) as JSON."""
+
+OUTPUTS = ("depth_mm", "gradient", "normal", "contact")
+
+
+def describe(pipe: DepthPipeline) -> dict[str, Any]:
+    """The metadata of an exported file: plain JSON."""
+    check_pipeline(pipe)
+    height, width, dtype = size_and_dtype(pipe)
+    normals = pipe.normals.module if isinstance(pipe.normals, WrappedNormals) else pipe.normals
+    return {
+        "torchvts": __version__,
+        "torch": str(torch.__version__),
+        "mode": pipe.mode,
+        "normals": type(normals).__name__,
+        "height": height,
+        "width": width,
+        "mm_per_pixel": pipe.mm_per_pixel,
+        "dtype": str(dtype).removeprefix("torch."),
+        "input": "images (B, 3, H, W) in [0, 1], channels R, G, B, rectified",
+        "outputs": list(OUTPUTS),
+    }
+
+
+def check_pipeline(pipe: object) -> None:
+    """Raise unless ``pipe`` is a DepthPipeline."""
+    check_record("pipe", pipe, DepthPipeline, "DepthPipeline.from_calibration makes one")
+
+
+def export_torchscript(pipe: DepthPipeline, path: str | Path) -> Path:
+    """Write a pipeline as TorchScript (.pt), for ``torch.jit.load`` and C++ libtorch. It stays differentiable.
+
+    Its extra file ``torchvts.json`` is :func:`describe`.
+
+    Args:
+        pipe: the pipeline.
+        path: the file.
+    Returns:
+        The path.
+    Raises:
+        RuntimeError: a module of the pipeline does not script.
+        TypeError: no pipeline.
+    """
+    check_pipeline(pipe)
+    path = check_target(path)
+    with warnings.catch_warnings(), write_atomically(path) as temporary:
+        warnings.simplefilter("ignore")  # that TorchScript is deprecated
+        scripted = torch.jit.script(copy.deepcopy(pipe))
+        metadata = {f"{METADATA_KEY}.json": json.dumps(describe(pipe))}
+        scripted.save(str(temporary), _extra_files=metadata)  # type: ignore[no-untyped-call]
+    return path
+
+
+def export_program(pipe: DepthPipeline, path: str | Path | None = None) -> torch.export.ExportedProgram:
+    """Trace a pipeline by torch.export, in any mode, for any batch, and write it (.pt2) for ``torch.export.load``.
+
+    Loops (precise passes, hole filling) become operators of the graph, so that the program takes as many turns as the pipeline.
+
+    Args:
+        pipe: the pipeline.
+        path: the file; None writes none.
+    Returns:
+        The program.
+    Raises:
+        TypeError: no pipeline.
+        Exception: what torch.export raises for a module of yours that it cannot trace.
+    """
+    check_pipeline(pipe)
+    if path is not None:
+        check_target(path)
+    program = trace(pipe, by_matrix=False)
+    if path is not None:
+        with write_atomically(path) as temporary, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            metadata = {f"{METADATA_KEY}.json": json.dumps(describe(pipe))}
+            torch.export.save(program, temporary, extra_files=metadata)
+    return program
+
+
+def export_aoti(pipe: DepthPipeline, path: str | Path) -> Path:
+    """Compile a pipeline to machine code for this kind of CPU (.pt2 package), for ``torch._inductor.aoti_load_package`` and C++.
+
+    Args:
+        pipe: the pipeline.
+        path: the file.
+    Returns:
+        The path.
+    Raises:
+        RuntimeError: there is no C++ compiler.
+        TypeError: no pipeline.
+    """
+    check_pipeline(pipe)
+    path = check_target(path)
+    complaint = missing("aoti")
+    if complaint:
+        raise RuntimeError(complaint)
+    if path.suffix != ".pt2":
+        raise ValueError(f"path: expected a name ending in .pt2, got {path}: AOTInductor packages have no other")
+    program = trace(pipe, by_matrix=False)
+    settings: dict[str, Any] = {"aot_inductor.metadata": {METADATA_KEY: json.dumps(describe(pipe))}}
+    with warnings.catch_warnings(), write_atomically(path) as temporary:
+        warnings.simplefilter("ignore")
+        try:
+            torch._inductor.aoti_compile_and_package(program, package_path=str(temporary), inductor_configs=settings)
+        except Exception as error:
+            if "CppCompileError" not in str(error):
+                raise
+            # Inductor (torch 2.13) writes some vectors of bool that no compiler accepts: without vectors it is slower and correct
+            settings = settings | {"cpp.simdlen": 1}
+            torch._inductor.aoti_compile_and_package(program, package_path=str(temporary), inductor_configs=settings)
+    return path
+
+
+def export_onnx(pipe: DepthPipeline, path: str | Path) -> Path:
+    """Write a pipeline as ONNX, for ONNX Runtime and other readers. Its metadata entry ``torchvts`` is :func:`describe`.
+
+    Args:
+        pipe: the pipeline.
+        path: the file.
+    Returns:
+        The path.
+    Raises:
+        ModuleNotFoundError: the extra ``onnx`` is not installed.
+        TypeError: no pipeline.
+    """
+    check_pipeline(pipe)
+    path = check_target(path)
+    complaint = missing("onnx")
+    if complaint:
+        raise ModuleNotFoundError(complaint)
+    program = trace(pipe, by_matrix=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        program = program.run_decompositions(torch.export.default_decompositions() | decompositions())
+        model = torch.onnx.export(
+            program, dynamo=True, input_names=["images"], output_names=list(OUTPUTS), external_data=False, verbose=False
+        )
+        if model is None:
+            raise RuntimeError("onnx: the exporter returned no model")
+        model.model.metadata_props[METADATA_KEY] = json.dumps(describe(pipe))
+        with write_atomically(path) as temporary:
+            model.save(temporary, external_data=False)
+    return path
+
+
+@dataclass(frozen=True)
+class Format:
+    """A file format.
+
+    Attributes:
+        file_name: name of the file in a folder of exports.
+        write: its writer.
+        tolerance_mm: largest difference of depth to the pipeline, mm.
+    """
+
+    file_name: str
+    write: Callable[[DepthPipeline, Path], object]
+    tolerance_mm: float
+
+
+FORMATS = {
+    "torchscript": Format("pipeline.pt", export_torchscript, 1e-5),
+    "pt2": Format("pipeline.pt2", export_program, 1e-5),
+    "aoti": Format("pipeline_aoti.pt2", export_aoti, 1e-5),
+    "onnx": Format("pipeline.onnx", export_onnx, 1e-3),
+}
+"""The formats by name."""
+
+
+def missing(name: str) -> str:
+    """What a format needs and this machine lacks, as a sentence; empty if nothing.
+
+    Raises:
+        ValueError: unknown format.
+    """
+    check_choice("format", name, list(FORMATS))
+    if name == "onnx":
+        absent = [package for package in ("onnx", "onnxscript", "onnxruntime") if find_spec(package) is None]
+        if absent:
+            return f"onnx: {', '.join(absent)} not found: pip install 'torchvts[onnx]'"
+    if name == "aoti":
+        from torch._inductor.cpp_builder import get_cpp_compiler
+
+        try:
+            compiler = get_cpp_compiler()
+        except Exception as error:  # InvalidCxxCompiler, whose place in torch has moved
+            compiler, reason = "", str(error).splitlines()[0]
+        else:
+            reason = f"{compiler!r} is not there"
+        if not compiler or shutil.which(compiler) is None:
+            return f"aoti: expected a C++ compiler, got none ({reason}): install g++ or clang++, or set CXX"
+    return ""

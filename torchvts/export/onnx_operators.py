@@ -1,0 +1,41 @@
+"""PyTorch operators that ONNX lacks, written in operators that it has."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def decompositions() -> dict[Any, Callable[..., Any]]:
+    """The replacements by operator, for ``ExportedProgram.run_decompositions``."""
+    aten = torch.ops.aten
+    return {aten.median.dim: median, aten.nanmedian.dim: nanmedian, aten.cummax.default: cummax}
+
+
+def median(values: Tensor, dim: int, keepdim: bool = False) -> tuple[Tensor, Tensor]:
+    """``torch.median`` along a dimension, by sorting."""
+    ordered, index = torch.sort(values, dim=dim)
+    middle = (values.shape[dim] - 1) // 2
+    ordered, index = ordered.narrow(dim, middle, 1), index.narrow(dim, middle, 1)
+    return (ordered, index) if keepdim else (ordered.squeeze(dim), index.squeeze(dim))
+
+
+def nanmedian(values: Tensor, dim: int, keepdim: bool = False) -> tuple[Tensor, Tensor]:
+    """``torch.nanmedian`` along a dimension, by sorting."""
+    known = ~torch.isnan(values)
+    ordered, index = torch.sort(torch.where(known, values, torch.inf), dim=dim)
+    middle = ((known.to(torch.int64).sum(dim, keepdim=True) - 1) // 2).clamp_min(0)
+    ordered, index = ordered.gather(dim, middle), index.gather(dim, middle)
+    ordered = torch.where(known.any(dim, keepdim=True), ordered, torch.nan)
+    return (ordered, index) if keepdim else (ordered.squeeze(dim), index.squeeze(dim))
+
+
+def cummax(values: Tensor, dim: int) -> tuple[Tensor, Tensor]:
+    """``torch.cummax`` by shifts that double; the indices of the maxima, which no block uses, stay zero."""
+    length, step = values.shape[dim], 1
+    while step < length:
+        later, earlier = values.narrow(dim, step, length - step), values.narrow(dim, 0, length - step)
+        values = torch.cat((values.narrow(dim, 0, step), torch.maximum(later, earlier)), dim=dim)
+        step *= 2
+    return values, torch.zeros_like(values, dtype=torch.int64)

@@ -1,0 +1,141 @@
+"""A pipeline as one graph of PyTorch operators, by torch.export; for ONNX with the Poisson solver by matrix products."""
+
+import copy
+import warnings
+
+import torch
+from torch import Tensor, nn
+
+from ..accelerated import reference
+from ..core.checks import check_batch, check_size
+from ..core.frame import Crop
+from ..integration import Integrator, PoissonDCT, divergence
+from ..integration.base import embedded
+from ..integration.transforms import cosine_bases, fold, unfold
+from ..pipeline import Adaptive, DepthPipeline, Shadows
+
+MAX_BATCH = 1024
+"""Largest batch that the graph formats accept."""
+
+
+class PoissonBackgroundByMatrix(Integrator):
+    """:class:`PoissonBackground` for one size, by matrix products alone, because ONNX has no such FFT.
+
+    Args:
+        height: rows, pixels.
+        width: columns, pixels.
+        mm_per_pixel: pixel pitch, mm.
+        dtype: dtype of the matrices.
+        zero_in_background: zero where the gradient is zero, as :class:`PoissonBackground`; else zero mean, as :class:`PoissonDCT`.
+    Source:
+        As :func:`poisson_dct`; a test compares them.
+    Example:
+        >>> from torchvts import PoissonBackground
+        >>> gradient = torch.randn(2, 2, 24, 32)
+        >>> bool((PoissonBackgroundByMatrix(24, 32, 0.5)(gradient) - PoissonBackground(0.5)(gradient)).abs().max() < 1e-5)
+        True
+    """
+
+    def __init__(
+        self, height: int, width: int, mm_per_pixel: float, dtype: torch.dtype = torch.float32, zero_in_background: bool = True
+    ) -> None:
+        super().__init__()
+        check_size(height, width, mm_per_pixel)
+        self.size = (height, width)
+        self.mm_per_pixel = mm_per_pixel
+        self.zero_in_background = zero_in_background
+        even_y, odd_y, value_even_y, value_odd_y = cosine_bases(height)
+        even_x, odd_x, value_even_x, value_odd_x = cosine_bases(width)
+        for name, basis in (("even_y", even_y), ("odd_y", odd_y), ("even_x", even_x), ("odd_x", odd_x)):
+            self.register_buffer(name, basis.to(dtype))
+        for y, value_y in (("even", value_even_y), ("odd", value_odd_y)):
+            for x, value_x in (("even", value_even_x), ("odd", value_odd_x)):
+                value = value_y[:, None] + value_x[None, :]
+                inverse = torch.where(value == 0.0, torch.zeros_like(value), 1.0 / value)  # zero: the mean
+                self.register_buffer(f"inverse_{y}_{x}", inverse.to(dtype))
+
+    def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
+        check_batch("gradient", gradient, 2)
+        if size is not None and size != self.size:
+            raise ValueError(f"gradient, window: expected size {self.size}, for which the matrices are, got {size}")
+        gradient = embedded(gradient, window, self.size)
+        up, down = fold(divergence(gradient), -2)
+        rows = []
+        for y, part in (("even", up), ("odd", down)):
+            basis_y = self.get_buffer(f"{y}_y")
+            lines = []
+            for x, block in zip(("even", "odd"), fold(part, -1)):
+                basis_x, inverse = self.get_buffer(f"{x}_x"), self.get_buffer(f"inverse_{y}_{x}")
+                lines.append(basis_y.t() @ ((basis_y @ block @ basis_x.t()) * inverse) @ basis_x)
+            rows.append(unfold(lines[0], lines[1], -1))
+        depth = self.mm_per_pixel * unfold(rows[0], rows[1], -2)
+        if not self.zero_in_background:
+            return depth
+        background = ((gradient[:, 0:1] == 0) & (gradient[:, 1:2] == 0)).to(depth.dtype)
+        count = background.sum(dim=(2, 3), keepdim=True)
+        mean = (depth * background).sum(dim=(2, 3), keepdim=True) / count.clamp_min(1.0)
+        return depth - torch.where(count > 0, mean, depth.amin(dim=(2, 3), keepdim=True))
+
+
+class _PlainOutput(nn.Module):
+    """A pipeline that returns a plain tuple: a file with a NamedTuple of torchvts would need torchvts to be read."""
+
+    def __init__(self, pipe: DepthPipeline) -> None:
+        super().__init__()
+        self.pipe = pipe
+
+    def forward(self, images: Tensor) -> tuple[Tensor, ...]:
+        return tuple(self.pipe(images))
+
+
+def size_and_dtype(pipe: DepthPipeline) -> tuple[int, int, torch.dtype]:
+    """Height, width and dtype for which the pipeline was calibrated.
+
+    Raises:
+        ValueError: no block knows them.
+    """
+    for tensor in (*pipe.contact.buffers(), *pipe.compensate.buffers()):
+        if tensor.dim() == 3 and tensor.shape[0] == 3 and tensor.is_floating_point():
+            return tensor.shape[1], tensor.shape[2], tensor.dtype
+    raise ValueError("pipe: expected blocks that know the size of the calibration, as from_calibration makes them, got none")
+
+
+def trace(pipe: DepthPipeline, by_matrix: bool) -> torch.export.ExportedProgram:
+    """Trace a copy of a pipeline for any batch; ``by_matrix`` replaces its Poisson solvers by matrix products."""
+    height, width, dtype = size_and_dtype(pipe)
+    pipe = copy.deepcopy(reference(pipe)).eval().requires_grad_(False)
+    if by_matrix:
+        _use_matrices(pipe, height, width, dtype)
+    images = torch.full((2, 3, height, width), 0.5, dtype=dtype)
+    batch = torch.export.Dim("batch", min=1, max=MAX_BATCH)
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        _make_tables(pipe, images)  # which then are constants of the graph
+        return torch.export.export(_PlainOutput(pipe), (images,), dynamic_shapes=({0: batch},), strict=False)
+
+
+def _use_matrices(pipe: DepthPipeline, height: int, width: int, dtype: torch.dtype) -> None:
+    """Replace the FFT solvers of a pipeline by matrix products."""
+    solve, policy = pipe.solve, pipe.refine
+    if isinstance(solve.integrate, PoissonDCT):
+        zero = solve.integrate.zero_in_background
+        solve.integrate = PoissonBackgroundByMatrix(height, width, pipe.mm_per_pixel, dtype, zero)
+    if isinstance(policy, Shadows):
+        policy.residual_integrator = PoissonBackgroundByMatrix(height, width, pipe.mm_per_pixel, dtype)
+        policy = policy.policy
+    if isinstance(policy, Adaptive):
+        rows, columns = (len(range(policy.stride // 2, n, policy.stride)) for n in (height, width))
+        policy.coarse_integrate = PoissonBackgroundByMatrix(rows, columns, policy.stride * pipe.mm_per_pixel, dtype)
+
+
+def _make_tables(pipe: DepthPipeline, images: Tensor) -> None:
+    """Let each integrator make the tables of its size."""
+    height, width = images.shape[2], images.shape[3]
+    pipe(images)
+    policy = pipe.refine
+    if isinstance(policy, Shadows):
+        policy.residual_integrator(images[:, :2], (0, 0), (height, width))
+        policy = policy.policy
+    if isinstance(policy, Adaptive):
+        frame = Crop(policy.stride, False)(images, torch.ones_like(images[:, :1], dtype=torch.bool))
+        policy.predicted_change_px(frame, pipe.solve(frame))

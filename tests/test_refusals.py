@@ -51,11 +51,12 @@ RECORDS = {
 """Results that users get and do not make: their constructors keep what they are given. (Their methods are in the table.)"""
 PARTS = {
     "Adaptive", "Integrator", "NormalModel", "Once", "Repeat", "ResponseField", "ResponseModel", "SensorPrior", "Shadows", "Solve",
-    "WrappedIntegrator", "WrappedNormals", "as_integrator", "as_normal_model", "check_calibration", "check_sensor",
-    "discontinuity_share", "label_contacts", "read_point_cloud", "write_point_cloud", "stream.NewestFrame", "stream.Overlay",
-    "stream.StageClock", "stream.StreamReport.", "stream.VideoFile.", "stream.Window",
+    "WrappedIntegrator", "WrappedNormals", "as_integrator", "as_normal_model", "by_presses", "channel_structure",
+    "check_calibration", "check_sensor", "discontinuity_share", "falloff", "label_contacts", "outwardness", "read_point_cloud", "with_preprocessing",
+    "write_point_cloud", "stream.NewestFrame", "stream.Overlay", "stream.StageClock", "stream.StreamReport.", "stream.VideoFile.",
+    "stream.Window",
 }  # fmt: skip
-"""Names, and with a dot at the end methods, that other tests cover: records, base classes, parts of the pipeline and the stream."""
+"""Names, and with a dot at the end methods, that other tests cover: records, base classes, what one room does for another."""
 FREE = {"dtype", "seed", "report", "comment", "clock", "sleep"}
 """Arguments that Python or torch itself checks; switches (bool) are free too."""
 FILE_FORMS = (
@@ -156,13 +157,13 @@ class Entry:
     bad: dict[str, list[Any]]
     call: Any = None
     named: dict[str, str] = field(default_factory=dict)  # arguments that messages call by another name
-    label: tuple[str, ...] = ()  # arguments that only name things in messages
+    label: tuple[str, ...] = ()  # arguments that are not used, or only name things in messages
     file: tuple[str, ...] = ()  # arguments that are files
     run: bool = True  # whether the accepted call is made: not where it would open a camera or take minutes
 
 
-def forward(make, channels, argument, size=(HEIGHT, WIDTH)):
-    return Entry({argument: torch.full((1, channels, *size), 0.5)}, {argument: batches(channels, *size)}, make)
+def forward(make, channels, argument, label=()):
+    return Entry({argument: torch.full((1, channels, HEIGHT, WIDTH), 0.5)}, {argument: batches(channels)}, make, label=label)
 
 
 def shaped(**more):
@@ -186,6 +187,7 @@ EYE = torch.eye(4, dtype=torch.float64)
 BAD_POSE = [EYE[:3], 2 * EYE, EYE + NAN, np.eye(4), "pose"]
 
 UP = torch.tensor([0.0, 0.0, 1.0]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)
+OUT = vts.DepthOutput(DEPTH, torch.zeros(1, 2, HEIGHT, WIDTH), UP, DEPTH > 0)
 GRADIENT = torch.zeros(1, 2, 8, 8)
 BAD_GRADIENT = [*batches(2), torch.zeros(1, 2, 1, 8)]
 BAD_MASKS = [torch.zeros(1, 1, 4, 4) > 0, torch.zeros(1, 1, 8, 8), torch.zeros(8, 8) > 0, "all", np.zeros((1, 1, 8, 8), bool)]
@@ -279,16 +281,16 @@ TABLE = {
         lambda: pipe(),
     ),
     "FillMarkers": Entry(
-        {"diameter_px": 9.0, "contrast": 0.06, "sigmas": 5.0, "skirt": 0.2},
-        {"diameter_px": ["9", None, NAN, -1], "contrast": NUMBER, "sigmas": NUMBER, "skirt": NUMBER},
+        {"diameter_px": 9.0, "contrast": 0.06, "sigmas": 5.0, "margin": 0.2},
+        {"diameter_px": ["9", None, NAN, -1], "contrast": NUMBER, "sigmas": NUMBER, "margin": NUMBER},
     ),
     "FillMarkers.from_background": Entry(
-        {"background": torch.full((3, 64, 64), 0.5), "contrast": 0.06, "least_markers": 8, "skirt": 0.2},
+        {"background": torch.full((3, 64, 64), 0.5), "contrast": 0.06, "least_markers": 8, "margin": 0.2},
         {
             "background": [b for b in images(64, 64) if not (isinstance(b, torch.Tensor) and tuple(b.shape) == (3, 63, 64))],
             "contrast": NUMBER,
             "least_markers": INTEGER,
-            "skirt": NUMBER,
+            "margin": NUMBER,
         },
     ),
     "FillMarkers.from_dict": Entry(
@@ -362,7 +364,7 @@ TABLE = {
     ),
     "NormalFromLookup.load": Entry({"path": ...}, {"path": [*MISSING, "."]}, file=("path",), run=False),
     "NormalFromLookup.save": Entry({"path": ...}, {"path": [*MISSING, "."]}, lambda: lookup().save, file=("path",), run=False),
-    "NormalFromLookup.forward": forward(lookup, 3, "compensated"),
+    "NormalFromLookup.forward": forward(lookup, 3, "compensated", label=("depth_mm", "window")),
     "NormalFromMLP": Entry(
         {"height": HEIGHT, "width": WIDTH, "flat": FLAT, "hidden": (4,), "output": "angle"},
         {"height": INTEGER, "width": INTEGER, "flat": images(), "hidden": [(), (0,), ("4",)], "output": ["slope", None]},
@@ -379,7 +381,7 @@ TABLE = {
     "NormalFromMLP.set_flat": Entry({"flat": FLAT}, {"flat": images()}, lambda: network().set_flat),
     "NormalFromMLP.check_flat": Entry({"flat": FLAT}, {"flat": images()}, lambda: network().check_flat),
     "NormalFromMLP.gradient_px": forward(lambda: network().gradient_px, 3, "image"),
-    "NormalFromMLP.forward": forward(network, 3, "compensated"),
+    "NormalFromMLP.forward": forward(network, 3, "compensated", label=("depth_mm", "window")),
     "NormalFromResponse": Entry(
         {"fast": fields(), "precise": fields(True), **SIZE, "max_slope": 3.0},
         {"fast": [None, "field", fields(True)], "precise": ["field", fields()], **shaped(max_slope=NUMBER)},
@@ -462,21 +464,19 @@ TABLE = {
         {"calibration": unit(), "normals": pipe().normals}, {"calibration": OTHERS, "normals": ["mine", torch.nn.Identity()]}
     ),
     "Confidence.forward": Entry(
+        {"images": FLAT[None], "compensated": FLAT[None], "out": OUT},
         {
-            "images": FLAT[None],
-            "compensated": FLAT[None],
-            "depth_mm": DEPTH,
-            "gradient": torch.zeros(1, 2, HEIGHT, WIDTH),
-            "normal": UP,
-            "contact": DEPTH > 0,
-        },
-        {
-            **{name: batches(3) for name in ("images", "compensated", "normal")},
-            "depth_mm": batches(1),
-            "gradient": batches(2),
-            "contact": [DEPTH[0] > 0, (DEPTH > 0)[:, :, 1:], None, "all", DEPTH],
+            "images": batches(3),
+            "compensated": batches(3),
+            "out": [
+                *(OUT._replace(depth_mm=bad) for bad in batches(1)),
+                *(OUT._replace(gradient=bad) for bad in batches(2)),
+                *(OUT._replace(normal=bad) for bad in batches(3)),
+                *(OUT._replace(contact=bad) for bad in (DEPTH[0] > 0, (DEPTH > 0)[:, :, 1:], None, "all", DEPTH)),
+            ],
         },
         lambda: Confidence.from_calibration(unit()),
+        named={"out": "depth_mm|gradient|normal|contact"},
     ),
     "ConfidentPipeline": Entry(
         {"pipe": pipe(), "confidence": Confidence.from_calibration(unit())},
@@ -608,23 +608,22 @@ TABLE = {
         },
     ),
     "find_markers": Entry(
-        {"image": image()[None], "diameter_px": 5.0, "contrast": 0.06, "sigmas": 5.0, "skirt": 0.2},
+        {"image": image()[None], "diameter_px": 5.0, "contrast": 0.06, "sigmas": 5.0, "margin": 0.2},
         {
             "image": [*batches(3), torch.zeros(1, 3, 4, 4)],
             "diameter_px": NUMBER,
             "contrast": NUMBER,
             "sigmas": NUMBER,
-            "skirt": NUMBER,
+            "margin": NUMBER,
         },
     ),
     "fit_lights": Entry(
-        {"background": image(), "sensor": sensor(), "start": None, "max_steps": 3, "vignetting": 0},
+        {"background": image(), "sensor": sensor(), "start": None, "max_steps": 3},
         {
             "background": [*images(), 0 * image(), torch.full_like(image(), 0.5), torch.ones_like(image())],
             "sensor": SENSOR,
             "start": [POSITION, "lights"],
             "max_steps": INTEGER,
-            "vignetting": [3, -1, "one", None],
         },
     ),
     "fit_mlp": Entry(
@@ -963,7 +962,7 @@ TABLE = {
             {"image": batches(3)},
             lambda name=name: getattr(vts.stream.FollowLight(image()), name),
         )
-        for name in ("correct", "set_rest", "start")
+        for name in ("correct", "set_background", "start")
     },
     "stream.FollowLight.update": Entry(
         {"image": image()[None], "contact": DEPTH > 0, "seconds": 0.1},
@@ -991,9 +990,9 @@ TABLE = {
     "stream.VideoFile": Entry(
         {"path": "film.avi", "fps": 10.0}, {"path": ["film.gif", "film"], "fps": NUMBER}, named={"path": "video"}
     ),
-    "stream.calibrate_at_rest": Entry({"background": image(), "sensor": sensor()}, {"background": images(), "sensor": SENSOR}),
+    "stream.calibrate_background": Entry({"background": image(), "sensor": sensor()}, {"background": images(), "sensor": SENSOR}),
     "stream.open_source": Entry({"source": ...}, {"source": ["no/such.mp4", ".", None, 2.5]}, run=False),
-    "stream.rest_image": Entry({"images": image()[None].expand(5, -1, -1, -1)}, {"images": [*batches(3), image()[None]]}),
+    "stream.find_background": Entry({"images": image()[None].expand(5, -1, -1, -1)}, {"images": [*batches(3), image()[None]]}),
 }
 
 

@@ -56,6 +56,10 @@ def find(*places: str) -> Any:
     raise ImportError(f"none of {', '.join(places)}")
 
 
+RENAMED_FINDINGS = {"nothing_at_rest": "no_free_skin"}
+"""Findings of a diagnosis, old and new name."""
+
+
 class Names:
     """What is called differently, or stands elsewhere, in some commits."""
 
@@ -447,8 +451,8 @@ def record_diagnoses(record: Record) -> None:
         }
         for case, (now, image) in cases.items():
             findings = vts.diagnose(now, image, calibration).findings
-            said = ", ".join(f"{finding.severity}: {finding.name}" for finding in findings)
-            record.add("diagnoses", f"{name}, {case}", findings=said, values=[finding.value for finding in findings] or [0.0])
+            text = ", ".join(f"{finding.severity}: {RENAMED_FINDINGS.get(finding.name, finding.name)}" for finding in findings)
+            record.add("diagnoses", f"{name}, {case}", findings=text, values=[finding.value for finding in findings] or [0.0])
 
 
 class Pictures:

@@ -23,6 +23,7 @@ import tempfile
 import types
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 PITCH_MM, HEIGHT, WIDTH = 0.0625, 480, 640
 SPHERES = {"sphere_R10_d2": (10.0, 2.0, 0.0, 0.0), "sphere_R5_d1_off": (5.0, 1.0, 8.0, 5.0)}  # mm: radius, press, right, down
@@ -41,6 +42,29 @@ def config(yfov: float, distance_m: float) -> dict:
     return {"sensor": {"camera": [camera], "gel": gel, "lights": lights, "noise": noise, "force": {"enable": False}}}
 
 
+def tacto_renderer(yfov: float, distance_mm: float) -> Any:
+    """TACTO's renderer of the scene, without an object.
+
+    Raises:
+        ImportError: TACTO or what it needs is not installed.
+    """
+    os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
+    for name in ("pybullet", "urdfpy"):  # TACTO imports them for robots, which are not needed here
+        stub = types.ModuleType(name)
+        stub.URDF = object  # type: ignore[attr-defined]
+        sys.modules.setdefault(name, stub)
+    import numpy as np
+
+    np.infty = np.inf  # type: ignore[attr-defined]  # noqa: NPY201 - pyrender 0.1.45 uses the name that numpy 2 dropped
+    from omegaconf import OmegaConf
+    from tacto.renderer import Renderer
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "sensor.yaml"
+        OmegaConf.save(OmegaConf.create(config(yfov, distance_mm / 1000)), path)
+        return Renderer(width=WIDTH, height=HEIGHT, background=None, config_path=str(path))
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--camera", choices=sorted(YFOV_DEG), default="perspective")
@@ -50,26 +74,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.compare and not (arguments.compare / "background.png").is_file():
         print(f"error: no background.png in {arguments.compare}", file=sys.stderr)
         return 2
-    os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
-    for name in ("pybullet", "urdfpy"):  # TACTO imports them for robots, which are not needed here
-        stub = types.ModuleType(name)
-        stub.URDF = object  # type: ignore[attr-defined]
-        sys.modules.setdefault(name, stub)
     yfov = YFOV_DEG[arguments.camera]
     distance_mm = HEIGHT * PITCH_MM / 2 / math.tan(math.radians(yfov) / 2)  # the gel then has PITCH_MM per pixel
     try:
+        renderer = tacto_renderer(yfov, distance_mm)
         import cv2
         import numpy as np
-
-        np.infty = np.inf  # type: ignore[attr-defined]  # noqa: NPY201 - pyrender 0.1.45 uses the name that numpy 2 dropped
         import trimesh
-        from omegaconf import OmegaConf
-        from tacto.renderer import Renderer
-
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "sensor.yaml"
-            OmegaConf.save(OmegaConf.create(config(yfov, distance_mm / 1000)), path)
-            renderer = Renderer(width=WIDTH, height=HEIGHT, background=None, config_path=str(path))
     except ImportError as error:
         print(f"error: {error}; the first lines of this file say what to install", file=sys.stderr)
         return 1

@@ -249,6 +249,7 @@ def test_it_scripts_with_both_faces(soft_case):
     assert (scripted.soft(frame) - block.soft(frame)).abs().max() < 1e-6
 
 
+@pytest.mark.long
 def test_it_compiles(soft_case):
     block, frame = soft_case
     assert torch.equal(torch.compile(block, backend="eager")(frame), block(frame))

@@ -1,6 +1,7 @@
 """What every block promises: scripts, batches, dtypes, pickles, state dicts, Sequential, errors that name the argument."""
 
 import copy
+import functools
 import io
 import pickle
 
@@ -17,15 +18,17 @@ HEIGHT, WIDTH, PITCH = 48, 64, 0.6
 SENSOR = vts.Sensor("rig", HEIGHT, WIDTH, PITCH)
 
 
+@functools.cache
 def calibration(dtype):
     from conftest import ring_lights
 
     lights = ring_lights(dtype=dtype)
-    rest = vts.scenes.undeformed(vts.scenes.sphere_press(10.0, 1.0, (0, 0), HEIGHT, WIDTH, PITCH, dtype))
-    background = vts.scenes.render(rest, lights, spots=vts.scenes.skin_spots(HEIGHT, WIDTH, 5, 5))[0]
+    undeformed = vts.scenes.undeformed(vts.scenes.sphere_press(10.0, 1.0, (0, 0), HEIGHT, WIDTH, PITCH, dtype))
+    background = vts.scenes.render(undeformed, lights, spots=vts.scenes.skin_spots(HEIGHT, WIDTH, 5, 5))[0]
     return vts.Calibration.from_lights(lights, SENSOR, background)
 
 
+@functools.cache
 def images(dtype):
     from conftest import ring_lights
 
@@ -49,9 +52,9 @@ def pipe(mode):
 
 
 def response(dtype):
-    numbers = torch.Generator().manual_seed(3)
+    random = torch.Generator().manual_seed(3)
     fields = [vts.calibration.field.Family(1, 1, deep, 20.0) for deep in (False, True)]
-    fast, precise = (f.field(0.1 * torch.randn(f.size(), generator=numbers, dtype=torch.float64)) for f in fields)
+    fast, precise = (f.field(0.1 * torch.randn(f.size(), generator=random, dtype=torch.float64)) for f in fields)
     model = vts.model.response_field.ResponseModel(fast, precise)
     return vts.Calibration.from_response(model, SENSOR, calibration(dtype).background)
 
@@ -97,9 +100,21 @@ SIZED = [name for name in CASES if not any(part in name for part in ("Poisson", 
 every_block = pytest.mark.parametrize("name", CASES)
 
 
-def build(name, dtype=torch.float32):
+@functools.cache
+def made(name, dtype):
     make, example, _ = CASES[name]
     return make(dtype), example(dtype)
+
+
+def build(name, dtype=torch.float32):
+    """A block and an example of its input, a copy for each test."""
+    block, example = made(name, dtype)
+    return copy.deepcopy(block), example.clone()
+
+
+@functools.cache
+def scripted(name, dtype):
+    return torch.jit.script(made(name, dtype)[0])
 
 
 def outputs(result):
@@ -116,14 +131,14 @@ def assert_same(one, two, tolerance=0.0):
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float64, 1e-11), (torch.float32, 2e-4)])
 def test_torchscript_gives_what_eager_gives(name, dtype, tolerance):
     block, example = build(name, dtype)
-    assert_same(torch.jit.script(block)(example), block(example), tolerance)
+    assert_same(scripted(name, dtype)(example), block(example), tolerance)
 
 
 @every_block
 def test_a_script_survives_its_file(name):
     block, example = build(name, torch.float64)
     stream = io.BytesIO()
-    torch.jit.save(torch.jit.script(block), stream)
+    torch.jit.save(scripted(name, torch.float64), stream)
     stream.seek(0)
     assert_same(torch.jit.load(stream)(example), block(example), 1e-11)
 

@@ -25,7 +25,7 @@ def calibration(run_script, images):
     out = folder / "unit.safetensors"
     done = run_script("calibrate", folder / "background.png", "--mm-per-pixel", "0.25", "--out", out)
     assert done.returncode == 0, done.stderr
-    assert "wrote" in done.stdout and "point lights: the image constrains the lights" in done.stdout
+    assert "wrote" in done.stdout and "chosen: point_lights" in done.stdout
     return out
 
 

@@ -1,0 +1,609 @@
+"""Accepted and refused arguments of calibrations, blocks, pipelines and poses: a table for test_refusals."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from refusals_values import (
+    BAD_DEPTH,
+    BAD_FLAT,
+    BAD_GRADIENT,
+    BAD_KNOWN,
+    BAD_MASKS,
+    BAD_POINTS,
+    BAD_POSE,
+    BAD_POSITION,
+    BAD_WEIGHTS,
+    DEPTH,
+    EYE,
+    FLAT,
+    GRADIENT,
+    HEIGHT,
+    HEIGHTS,
+    INF,
+    INTEGER,
+    KNOWN,
+    MISSING,
+    NAN,
+    NUMBER,
+    OTHERS,
+    OUT,
+    POSITION,
+    PRESS,
+    SENSOR,
+    SIZE,
+    WIDTH,
+    Entry,
+    batches,
+    cloud,
+    fields,
+    forward,
+    frame,
+    image,
+    images,
+    lights,
+    lookup,
+    network,
+    of_other_size,
+    pipe,
+    sensor,
+    shaped,
+    unit,
+)
+
+import torchvts as vts
+import torchvts.integration
+from torchvts.core.geometry import normal_from_gradient
+from torchvts.integration import DiscontinuityIntegration, PerspectiveIntegration
+from torchvts.model import FillMarkers
+from torchvts.model.response_field import ResponseModel
+from torchvts.pipeline import Confidence
+
+
+def integrator(name):
+    """A class of integrators, the public one if there is one."""
+    return getattr(vts, name, None) or getattr(torchvts.integration, name)
+
+
+TABLE = {
+    "Calibration.from_lights": Entry(
+        {"lights": lights(), "sensor": sensor(), "background": image(), "ambient": torch.zeros(3)},
+        {
+            "lights": [POSITION, None, "lights"],
+            "sensor": SENSOR,
+            "background": images()[:-2] + ["image.png"],
+            "ambient": [torch.zeros(2), torch.full((3,), -1.0), torch.full((3,), NAN), [0.0, 0.0, 0.0], 0.1],
+        },
+    ),
+    "Calibration.from_response": Entry(
+        {"response": ResponseModel(fields(), None), "sensor": sensor(), "background": image()},
+        {"response": [None, fields(), "prior"], "sensor": SENSOR, "background": images()},
+    ),
+    "Calibration.load": Entry({"path": ...}, {"path": [*MISSING, ".", 3, None]}, file=("path",), run=False),
+    "Calibration.save": Entry({"path": ...}, {"path": [*MISSING, ".", 3, None]}, lambda: unit().save, file=("path",), run=False),
+    "Compensate": Entry(
+        {
+            "gain": FLAT,
+            "offset": FLAT,
+            "gamma": 2.2,
+            "defects": FLAT[0] > 1,
+            "blur_px": 1.0,
+            "markers": FillMarkers(),
+            "drift": None,
+            "saturated_model": FLAT,
+            "saturation_light": 0.99,
+        },
+        {
+            "drift": [True, "mode", torch.nn.Identity()],
+            "saturated_model": BAD_FLAT[:-1],
+            "saturation_light": NUMBER,
+            "gain": BAD_FLAT[:-1],
+            "offset": BAD_FLAT[:-1],
+            "gamma": NUMBER,
+            "defects": [FLAT[0], FLAT > 1, torch.ones(HEIGHT, WIDTH, dtype=torch.bool), (FLAT[0] > 1).numpy(), "none"],
+            "blur_px": ["1", None, NAN, INF, -1.0],
+            "markers": [True, 9.0, "markers"],
+        },
+    ),
+    "Compensate.from_calibration": Entry({"calibration": unit()}, {"calibration": OTHERS}),
+    "Compensate.forward": forward(lambda: vts.Compensate.from_calibration(unit()), 3, "image"),
+    "ContactMask": Entry(
+        {"flat": FLAT, "noise_std": torch.full((3,), 0.01), "sigmas": 4.5, "min_size_px": 8.0},
+        {
+            "flat": BAD_FLAT,
+            "noise_std": [torch.zeros(2), FLAT[:, 1:], torch.full((3,), NAN), 0.01, None, np.zeros(3)],
+            "sigmas": NUMBER,
+            "min_size_px": NUMBER,
+        },
+    ),
+    "ContactMask.from_calibration": Entry({"calibration": unit()}, {"calibration": OTHERS}),
+    "ContactMask.forward": forward(lambda: pipe().contact, 3, "compensated"),
+    "ContactMask.shadowed": forward(lambda: pipe().contact.shadowed, 3, "compensated"),
+    "ContactMask.soft": forward(lambda: pipe().contact.soft, 3, "compensated"),
+    "DepthPipeline": Entry(
+        {
+            **{name: getattr(pipe(), name) for name in ("compensate", "contact", "normals", "gradient", "integrate")},
+            "mode": "fast",
+            "mm_per_pixel": 1.0,
+            "tolerance_px": 0.002,
+            "refine_threshold_px": 0.05,
+            "max_passes": 8,
+        },
+        {
+            **{name: [None, lambda x: x] for name in ("compensate", "contact", "normals", "gradient", "integrate")},
+            "mm_per_pixel": NUMBER,
+            "mode": ["slow", None, 1],
+            "tolerance_px": NUMBER,
+            "refine_threshold_px": ["1", None, NAN, -1.0],
+            "max_passes": INTEGER,
+        },
+    ),
+    "DepthPipeline.from_calibration": Entry(
+        {"calibration": unit(), "mode": "fast", "normals": None, "integrate": None},
+        {"calibration": OTHERS, "mode": ["slow", None, 1], "normals": ["lookup", 3], "integrate": ["dct", 3]},
+    ),
+    "DepthPipeline.forward": Entry(
+        {"images": image()[None]},
+        {"images": [*batches(3), 255 * image()[None], image()[None] + NAN, image()[None] - 1.0]},
+        lambda: pipe(),
+    ),
+    "FillMarkers": Entry(
+        {"diameter_px": 9.0, "contrast": 0.06, "sigmas": 5.0, "margin": 0.2},
+        {"diameter_px": ["9", None, NAN, -1], "contrast": NUMBER, "sigmas": NUMBER, "margin": NUMBER},
+    ),
+    "FillMarkers.from_background": Entry(
+        {"background": torch.full((3, 64, 64), 0.5), "contrast": 0.06, "least_markers": 8, "margin": 0.2},
+        {
+            "background": [b for b in images(64, 64) if not (isinstance(b, torch.Tensor) and tuple(b.shape) == (3, 63, 64))],
+            "contrast": NUMBER,
+            "least_markers": INTEGER,
+            "margin": NUMBER,
+        },
+    ),
+    "FillMarkers.from_dict": Entry(
+        {"values": FillMarkers().to_dict(), "source": "file"},
+        {"values": [None, [], {"unknown": 1.0}, {"contrast": -1}]},
+        label=("source",),
+        named={"values": "file"},
+        file=("values",),
+    ),
+    "FillMarkers.forward": forward(lambda: FillMarkers(), 3, "image"),
+    "GradientFromNormal": Entry({"max_slope": 10.0}, {"max_slope": NUMBER}),
+    "GradientFromNormal.forward": forward(lambda: vts.GradientFromNormal(), 3, "normal"),
+    "NormalFromIntensity": Entry(
+        {"lights": lights(), **SIZE, "noise_std": torch.full((3,), 0.01), "inverse": unit().inverse, "saturated_above": FLAT},
+        {
+            "lights": [POSITION, None],
+            **shaped(),
+            "noise_std": [torch.zeros(2), torch.full((3,), NAN), 0.01],
+            "inverse": [unit().inverse[None], "inverse"],
+            "camera_height_mm": HEIGHTS,
+            "saturated_above": [FLAT[None], FLAT[:, 1:], "full"],
+        },
+    ),
+    "NormalFromIntensity.from_calibration": Entry(
+        {"calibration": unit(), "camera_height_mm": 30.0},
+        {"calibration": [*OTHERS, unit("response")], "camera_height_mm": HEIGHTS},
+    ),
+    "NormalFromIntensity.forward": Entry(
+        {"image": FLAT[None], "depth_mm": DEPTH, "window": (0, 0)},
+        {"image": batches(3), "depth_mm": [b for b in batches(1) if b is not None], "window": [(20, 20), (-1, 0)]},
+        lambda: pipe().normals,
+        named={"image": "compensated", "window": "compensated, window"},
+    ),
+    "NormalFromIntensity.solve": Entry(
+        {"image": FLAT[None], "depth_mm": None, "window": (0, 0), "expected": torch.zeros(1, 2, HEIGHT, WIDTH)},
+        {
+            "image": batches(3),
+            "depth_mm": [b for b in batches(1) if b is not None],
+            "window": [(20, 20), (-1, 0)],
+            "expected": [b for b in batches(2) if b is not None],
+        },
+        lambda: pipe().normals.solve,
+        named={"image": "compensated", "window": "compensated, window"},
+    ),
+    "NormalFromIntensity.coarse": Entry({"stride": 8}, {"stride": INTEGER}, lambda: pipe().normals.coarse),
+    "NormalFromLookup": Entry(
+        {"flat": FLAT, "table": torch.zeros(4, 4, 4, 2), "step": torch.ones(3), "zero_index": torch.ones(3, dtype=torch.int64)},
+        {
+            "flat": BAD_FLAT,
+            "table": [torch.zeros(4, 4, 2), torch.full((4, 4, 4, 2), NAN), None, np.zeros((4, 4, 4, 2))],
+            "step": [torch.ones(2), torch.zeros(3), torch.full((3,), NAN), None, 1.0],
+            "zero_index": [torch.ones(2), torch.full((3,), 9), None, 1],
+        },
+    ),
+    "NormalFromLookup.fit": Entry(
+        {"flat": FLAT, "change": 0.1 * torch.randn(50, 3), "slope": torch.randn(50, 2), "bins": 4, "smoothing": 1.0},
+        {
+            "flat": BAD_FLAT,
+            "change": [
+                torch.zeros(50, 2),
+                torch.zeros(0, 3),
+                torch.zeros(50, 3),
+                torch.full((50, 3), NAN),
+                None,
+                np.zeros((50, 3)),
+            ],
+            "slope": [torch.zeros(49, 2), torch.full((50, 2), INF), torch.zeros(50, 2, dtype=torch.int64), None],
+            "bins": [2, 500, 4.5, "4"],
+            "smoothing": [-1.0, NAN, 99.0, "1"],
+        },
+    ),
+    "NormalFromLookup.load": Entry({"path": ...}, {"path": [*MISSING, "."]}, file=("path",), run=False),
+    "NormalFromLookup.save": Entry({"path": ...}, {"path": [*MISSING, "."]}, lambda: lookup().save, file=("path",), run=False),
+    "NormalFromLookup.forward": forward(lookup, 3, "compensated", label=("depth_mm", "window")),
+    "NormalFromMLP": Entry(
+        {"height": HEIGHT, "width": WIDTH, "flat": FLAT, "hidden": (4,), "output": "angle"},
+        {"height": INTEGER, "width": INTEGER, "flat": images(), "hidden": [(), (0,), ("4",)], "output": ["slope", None]},
+    ),
+    "NormalFromMLP.load": Entry(
+        {"path": ..., "flat": None, "output": None},
+        {"path": [Path("no/such/nnmodel.pth"), "."], "flat": [], "output": []},
+        file=("path",),
+        run=False,
+    ),
+    "NormalFromMLP.save": Entry(
+        {"path": ...}, {"path": [*MISSING, "weights.pth"]}, lambda: network().save, file=("path",), run=False
+    ),
+    "NormalFromMLP.set_flat": Entry({"flat": FLAT}, {"flat": images()}, lambda: network().set_flat),
+    "NormalFromMLP.check_flat": Entry({"flat": FLAT}, {"flat": images()}, lambda: network().check_flat),
+    "NormalFromMLP.gradient_px": forward(lambda: network().gradient_px, 3, "image"),
+    "NormalFromMLP.forward": forward(network, 3, "compensated", label=("depth_mm", "window")),
+    "NormalFromResponse": Entry(
+        {"fast": fields(), "precise": fields(True), **SIZE, "max_slope": 3.0},
+        {"fast": [None, "field", fields(True)], "precise": ["field", fields()], **shaped(max_slope=NUMBER)},
+    ),
+    "NormalFromResponse.from_calibration": Entry({"calibration": unit("response")}, {"calibration": [*OTHERS, unit()]}),
+    "NormalFromResponse.forward": Entry(
+        {"image": FLAT[None], "depth_mm": DEPTH, "window": (0, 0)},
+        {"image": batches(3), "depth_mm": [b for b in batches(1) if b is not None], "window": [(20, 20), (-1, 0)]},
+        lambda: vts.NormalFromResponse.from_calibration(unit("response")),
+        named={"image": "compensated", "window": "compensated, window"},
+    ),
+    "NormalFromResponse.coarse": Entry(
+        {"stride": 8}, {"stride": INTEGER}, lambda: vts.NormalFromResponse.from_calibration(unit("response")).coarse
+    ),
+    "PointLights": Entry(
+        {"position_mm": POSITION, "albedo": [900.0] * 3, "gloss": [0.1] * 3},
+        {
+            "position_mm": BAD_POSITION,
+            "albedo": [[900.0] * 2, [0.0] * 3, [NAN] * 3, None, "bright"],
+            "gloss": [[0.1] * 2, [-0.1] * 3, [NAN] * 3, "satin"],
+        },
+    ),
+    "PointLights.forward": Entry(
+        {"depth_mm": DEPTH, "normal": torch.zeros(1, 3, HEIGHT, WIDTH), "mm_per_pixel": 1.0},
+        {
+            "depth_mm": batches(1),
+            "normal": [*batches(3), torch.zeros(1, 3, 8, 8)],
+            "mm_per_pixel": NUMBER,
+            "camera_height_mm": HEIGHTS,
+        },
+        lights,
+    ),
+    **{name: Entry({"mm_per_pixel": 1.0}, {"mm_per_pixel": NUMBER}) for name in ("PoissonDCT", "PoissonDST", "PoissonBackground")},
+    "AdaptiveIntegration": Entry({"mm_per_pixel": 1.0, "share": 0.1}, {"mm_per_pixel": NUMBER, "share": [*NUMBER, 2.0]}),
+    "DiscontinuityIntegration": Entry(
+        {"mm_per_pixel": 1.0, "slope_std": 0.05},
+        {
+            **dict.fromkeys(("mm_per_pixel", "slope_std", "threshold", "residual", "tolerance_px"), NUMBER),
+            "rim_weight": [*NUMBER, 2.0],
+            "max_passes": INTEGER,
+            "max_iterations": INTEGER,
+        },
+    ),
+    "DiscontinuityIntegration.solve": Entry(
+        {"gradient": GRADIENT, "contact": GRADIENT[:, :1] > 0, "weight": torch.ones(1, 1, 8, 8), **KNOWN},
+        {"gradient": BAD_GRADIENT, "contact": BAD_MASKS, "weight": BAD_WEIGHTS, **BAD_KNOWN},
+        lambda: DiscontinuityIntegration().solve,
+        named={"known_mm": "known_mm", "known_weight": "known_weight|known_mm, known_weight"},
+    ),
+    "PerspectiveIntegration": Entry(
+        {"mm_per_pixel": 1.0, "camera_height_mm": 30.0, "integrate": vts.PoissonBackground()},
+        {"mm_per_pixel": NUMBER, "camera_height_mm": NUMBER, "integrate": ["dct", 3]},
+    ),
+    "PerspectiveIntegration.forward": Entry(
+        {"gradient": GRADIENT, "window": (0, 0), "size": (16, 16)},
+        {"gradient": BAD_GRADIENT, "window": [(9, 0), (-1, 0)], "size": [(4, 4)]},
+        lambda: PerspectiveIntegration(1.0, 30.0),
+        named={"window": "gradient, window", "size": "gradient, window"},
+    ),
+    "Confidence": Entry(
+        {
+            "normals": pipe().normals,
+            "noise_std": 0.01 * FLAT,
+            "image_noise_std": torch.full((3,), 0.01),
+            "light_std": 0.01 * FLAT,
+            "mm_per_pixel": 1.0,
+        },
+        {
+            "normals": ["lights", None],
+            "noise_std": BAD_FLAT,
+            "image_noise_std": [torch.zeros(2), None, 0.01],
+            "light_std": [FLAT[None], None, 0.01],
+            "mm_per_pixel": NUMBER,
+            "model_deg": ["1", None, NAN, -1.0],
+            "blur_px": ["1", None, NAN, -1.0],
+            "spread": NUMBER,
+        },
+    ),
+    "Confidence.from_calibration": Entry(
+        {"calibration": unit(), "normals": pipe().normals}, {"calibration": OTHERS, "normals": ["mine", torch.nn.Identity()]}
+    ),
+    "Confidence.forward": Entry(
+        {"images": FLAT[None], "compensated": FLAT[None], "out": OUT},
+        {
+            "images": batches(3),
+            "compensated": batches(3),
+            "out": [
+                *(OUT._replace(depth_mm=bad) for bad in batches(1)),
+                *(OUT._replace(gradient=bad) for bad in batches(2)),
+                *(OUT._replace(normal=bad) for bad in batches(3)),
+                *(OUT._replace(contact=bad) for bad in (DEPTH[0] > 0, (DEPTH > 0)[:, :, 1:], None, "all", DEPTH)),
+            ],
+        },
+        lambda: Confidence.from_calibration(unit()),
+        named={"out": "depth_mm|gradient|normal|contact"},
+    ),
+    "ConfidentPipeline": Entry(
+        {"pipe": pipe(), "confidence": Confidence.from_calibration(unit())},
+        {"pipe": ["fast", None, unit()], "confidence": [True, None, unit()]},
+    ),
+    "ConfidentPipeline.from_calibration": Entry(
+        {"calibration": unit(), "mode": "fast"},
+        {"calibration": OTHERS, "mode": ["quick", None], "normals": ["mine", torch.nn.Identity()], "integrate": ["mine"]},
+    ),
+    "ConfidentPipeline.forward": forward(lambda: vts.ConfidentPipeline.from_calibration(unit()), 3, "images"),
+    "bound_at": Entry(
+        {"bound_95": torch.ones(2), "level": 0.5, "spread": 1.0},
+        {"bound_95": [1.0, None, np.ones(2)], "level": [0.0, 1.0, 95, NAN, "0.5", None], "spread": NUMBER},
+    ),
+    "diagnose": Entry(
+        {"background": image(), "image": image(), "calibration": unit()},
+        {
+            "background": [bad for bad in images() if bad is not None and not of_other_size(bad)],
+            "image": [bad for bad in images() if not of_other_size(bad)],
+            "calibration": OTHERS,
+        },
+    ),
+    "PoissonDST.forward": Entry(
+        {"gradient": GRADIENT, "window": (0, 0), "size": (16, 16)},
+        {"gradient": batches(2), "window": [(9, 0), (-1, 0)], "size": [(4, 4)]},
+        lambda: vts.PoissonDST(),
+        named={"window": "gradient, window", "size": "gradient, window"},
+    ),
+    **{
+        f"{name}.forward": Entry(
+            {"gradient": torch.zeros(1, 2, 8, 8), "window": (0, 0), "size": (16, 16)},
+            {"gradient": [*batches(2), torch.zeros(1, 2, 1, 8)], "window": [(9, 0), (-1, 0)], "size": [(4, 4)]},
+            lambda name=name: integrator(name)(),
+            named={"window": "gradient, window", "size": "gradient, window"},
+        )
+        for name in ("PoissonBackground", "PoissonDCT", "AdaptiveIntegration", "DiscontinuityIntegration")
+    },
+    "Press": Entry(
+        {"image": image(), "ball_diameter_mm": 6.0, "center_px": (4.0, 5.0), "contact_radius_px": 3.0},
+        {
+            "ball_diameter_mm": NUMBER,
+            "center_px": [(1.0,), "here", (NAN, 0.0)],
+            "contact_radius_px": ["3", 0, -1.0, NAN],
+        },
+        label=("name", "image"),  # calibrate checks the image: it knows the sensor's size
+    ),
+    "Touch": Entry(
+        {"image": image(), "depth_mm": 1.0},
+        {"depth_mm": ["1", 0, -1.0, NAN]},
+        label=("name", "image"),  # calibrate checks the image: it knows the sensor's size
+    ),
+    "Sensor": Entry(
+        {
+            "name": "rig",
+            "height": 24,
+            "width": 32,
+            "mm_per_pixel": 0.1,
+            "gamma": 1.0,
+            "blur_px": 0.0,
+            "light_position_mm": None,
+            "light_azimuth_deg": None,
+            "roi_px": None,
+            "corners_px": None,
+            "markers": False,
+            "prior": None,
+        },
+        {
+            "name": ["", None, 3],
+            "height": INTEGER,
+            "width": INTEGER,
+            "mm_per_pixel": [*NUMBER, 11.0],
+            "gamma": ["2", 0, NAN, 0.01, 99.0],
+            "blur_px": ["1", None, NAN, -1.0, 99.0],
+            "light_position_mm": [[[0, 0, 1]], "lights", [[20.0, 0.0, -30.0]] * 3, [[20.0, 0.0, NAN]] * 3],
+            "light_azimuth_deg": [(0, 120), (0, 0, 0), (0, 120, 999), "around", (0, 120, NAN)],
+            "roi_px": [(1, 2), (0, 0, 1.5, 9), (-1, 0, 9, 9), "all"],
+            "corners_px": [((0, 0),), ((0, 0), (0, 1), (1, 1), (1, 0)), "all"],
+            "markers": ["yes", 1, None],
+            "prior": ["prior", 3],
+        },
+    ),
+    "Sensor.load": Entry(
+        {"source": "gelsight_mini", "height": 240, "width": 320},
+        {"source": ["no_such_sensor", "no/such.yaml", None, 3], "height": ["240", 100, 0], "width": ["320", 100, 0]},
+        named={"width": "(height, )?width"},
+        file=("source",),
+    ),
+    "Sensor.resized": Entry(
+        {"height": 48, "width": 64},
+        {"height": [*INTEGER, 50], "width": [*INTEGER, 99]},
+        lambda: sensor().resized,
+        named={"width": "(height, )?width"},
+    ),
+    "Sensor.rectify": Entry({"frame": image()[None]}, {"frame": [*batches(3), torch.zeros(1, 3, 8, 8)]}, lambda: sensor().rectify),
+    "Sensor.from_dict": Entry(
+        {"values": sensor().to_dict(), "source": "file"},
+        {"values": [None, [], {"unknown": 1.0}, {"name": "rig"}, {**sensor().to_dict(), "height": -1}]},
+        label=("source",),
+        named={"values": "file"},
+        file=("values",),
+    ),
+    "Sensor.save": Entry(
+        {"path": ...}, {"path": [Path("no/such/rig.yaml"), "."]}, lambda: sensor().save, file=("path",), run=False
+    ),
+    "calibrate": Entry(
+        {"background": image(), "sensor": sensor(), "presses": (), "touches": ()},
+        {
+            "background": [*images(), 0 * image(), torch.full_like(image(), 0.5), torch.ones_like(image())],
+            "sensor": SENSOR,
+            "presses": [PRESS, [image()], ["press.png"], None, "presses", 3],
+            "touches": [image(), [image()[0]], ["touch.png"], None, 3],
+        },
+    ),
+    "contact_cloud": Entry(
+        {"frame": frame(), "mm_per_pixel": 0.4, "most": 100},
+        {"frame": [None, DEPTH, "frame", vts.scenes.undeformed(frame())], "mm_per_pixel": NUMBER, "most": ["9", 0, 1.5]},
+    ),
+    "depth_to_points": Entry(
+        {"depth_mm": DEPTH, "mm_per_pixel": 1.0, "contact": DEPTH > 0},
+        {"depth_mm": BAD_DEPTH[:-1], "mm_per_pixel": NUMBER, "contact": [torch.ones(4, 4), np.ones((HEIGHT, WIDTH)), "all"]},
+    ),
+    "divergence": Entry({"gradient": torch.zeros(1, 2, 8, 8)}, {"gradient": [*batches(2), torch.zeros(1, 2, 1, 8)]}),
+    "fill_markers": Entry(
+        {"image": image()[None], "mask": DEPTH > 0, "relaxations": 4},
+        {
+            "image": [b for k, b in enumerate(batches(3)) if k not in (1, 2, 3)],
+            "mask": [DEPTH, DEPTH[0] > 0, torch.ones(1, 1, 4, 4, dtype=torch.bool), (DEPTH > 0).numpy(), None],
+            "relaxations": ["4", -1, 1.5],
+        },
+    ),
+    "find_markers": Entry(
+        {"image": image()[None], "diameter_px": 5.0, "contrast": 0.06, "sigmas": 5.0, "margin": 0.2},
+        {
+            "image": [*batches(3), torch.zeros(1, 3, 4, 4)],
+            "diameter_px": NUMBER,
+            "contrast": NUMBER,
+            "sigmas": NUMBER,
+            "margin": NUMBER,
+        },
+    ),
+    "fit_lights": Entry(
+        {"background": image(), "sensor": sensor(), "start": None, "max_steps": 3},
+        {
+            "background": [*images(), 0 * image(), torch.full_like(image(), 0.5), torch.ones_like(image())],
+            "sensor": SENSOR,
+            "start": [POSITION, "lights"],
+            "max_steps": INTEGER,
+        },
+    ),
+    "fit_mlp": Entry(
+        {
+            "intensity": torch.full((9, 3), 0.5),
+            "xy": torch.zeros(9, 2),
+            "slope": torch.zeros(9, 2),
+            "flat": FLAT,
+            "groups": torch.arange(9),
+            "hidden": (4,),
+            "max_epochs": 1,
+            "patience": 1,
+            "batch_size": 9,
+            "held_out": 0.2,
+            "weight_decay": 0.2,
+        },
+        {
+            "intensity": [
+                torch.zeros(9),
+                torch.zeros(0, 3),
+                torch.full((9, 3), 255.0),
+                torch.full((9, 3), NAN),
+                None,
+                np.zeros((9, 3)),
+                torch.zeros(9, 3, dtype=torch.uint8),
+            ],
+            "xy": [torch.zeros(8, 2), torch.full((9, 2), NAN), torch.full((9, 2), 999.0), None],
+            "slope": [
+                torch.zeros(8, 2),
+                torch.full((9, 2), NAN),
+                torch.full((9, 2), 99.0),
+                None,
+                torch.zeros(9, 2, dtype=torch.int64),
+            ],
+            "flat": [b for k, b in enumerate(images()) if k not in (3, 4)],
+            "groups": [torch.zeros(8), torch.zeros(9, dtype=torch.int64), None],
+            "hidden": [(), (0,), ("4",)],
+            "max_epochs": INTEGER,
+            "patience": INTEGER,
+            "batch_size": INTEGER,
+            "held_out": [0.0, 1.0, NAN, "some"],
+            "weight_decay": [-1.0, NAN, "some"],
+        },
+    ),
+    "fit_prior": Entry(
+        {"background": image(), "sensor": sensor(), "presses": [PRESS], "source": ""},
+        {"background": images(), "sensor": SENSOR, "presses": [PRESS, [], [image()], None, "presses"], "source": [None, 3]},
+        run=False,
+    ),
+    "gradient_from_normal": Entry(
+        {"normal": torch.ones(1, 3, 8, 8), "max_slope": 10.0}, {"normal": batches(3), "max_slope": NUMBER}
+    ),
+    "near_field_shading": Entry(
+        {"depth_mm": DEPTH, "normal": torch.zeros(1, 3, HEIGHT, WIDTH), "lights": lights(), "mm_per_pixel": 1.0},
+        {
+            "depth_mm": batches(1),
+            "normal": [*batches(3), torch.zeros(1, 3, 8, 8)],
+            "lights": [POSITION, None],
+            "mm_per_pixel": NUMBER,
+            "camera_height_mm": HEIGHTS,
+        },
+    ),
+    "integrate_discontinuities": Entry(
+        {"gradient": GRADIENT, "mm_per_pixel": 1.0, "contact": GRADIENT[:, :1] > 0, "weight": torch.ones(1, 1, 8, 8), **KNOWN},
+        {"gradient": BAD_GRADIENT, "mm_per_pixel": NUMBER, "contact": BAD_MASKS, "weight": BAD_WEIGHTS, **BAD_KNOWN},
+    ),
+    "integrate_perspective": Entry(
+        {"gradient": GRADIENT, "mm_per_pixel": 1.0, "camera_height_mm": 30.0},
+        {"gradient": BAD_GRADIENT, "mm_per_pixel": NUMBER, "camera_height_mm": NUMBER},
+    ),
+    "normal_from_gradient": forward(lambda: normal_from_gradient, 2, "gradient"),
+    **{
+        name: Entry(
+            {"gradient": torch.zeros(1, 2, 8, 8), "mm_per_pixel": 1.0},
+            {"gradient": [*batches(2), torch.zeros(1, 2, 1, 8)], "mm_per_pixel": NUMBER},
+        )
+        for name in ("poisson_dct", "poisson_dst", "poisson_background")
+    },
+    "read_image": Entry({"path": ...}, {"path": [Path("no/such.png"), ".", None, 3]}, file=("path",), run=False),
+    "read_presses": Entry({"folder": ...}, {"folder": [Path("no/such"), ".", None, 3]}, file=("folder",), run=False),
+    "register_depth": Entry(
+        {"source": frame(), "target": frame(), "mm_per_pixel": 0.4, "initial": EYE},
+        {
+            **{name: [None, DEPTH, "frame", vts.scenes.undeformed(frame())] for name in ("source", "target")},
+            "mm_per_pixel": NUMBER,
+            "initial": BAD_POSE,
+        },
+    ),
+    "register_points": Entry(
+        {"source": cloud(), "target": cloud(), "source_normals": None, "target_normals": None, "initial": EYE},
+        {
+            "source": BAD_POINTS,
+            "target": BAD_POINTS,
+            "source_normals": [torch.zeros(9, 3), cloud() + NAN, cloud().numpy(), "up"],
+            "target_normals": [torch.zeros(9, 3), cloud() + NAN, cloud().numpy(), "up"],
+            "initial": BAD_POSE,
+        },
+    ),
+    "write_image": Entry(
+        {"path": Path("no/such.png"), "image": image()},
+        {
+            "path": [Path("no/such.png"), ".", "image.gif", None, 3],
+            "image": [
+                image()[None],
+                image()[:1],
+                image().permute(1, 2, 0),
+                (255 * image()).to(torch.uint8),
+                image().numpy(),
+                None,
+                image() + NAN,
+            ],
+        },
+        file=("path",),
+        run=False,
+    ),
+}

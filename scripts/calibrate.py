@@ -1,4 +1,4 @@
-"""Calibrate a unit from one image without contact, and from presses of balls or touches of anything, if there are any.
+"""Calibrate a unit from one image without contact, and from presses of balls or touches by any object, if there are any.
 
 python scripts/calibrate.py background.png --sensor gelsight_mini --out unit.safetensors
 python scripts/calibrate.py background.png --mm-per-pixel 0.05 --out unit.safetensors
@@ -11,55 +11,40 @@ import argparse
 import dataclasses
 import sys
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+
+import torch
 
 import torchvts as vts
+from torchvts.model.report import CandidateRow, PressRow, Report
 
 
-def main() -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("background", type=Path, help="image of the sensor at rest, or a calibration folder of gs_sdk")
+    parser.add_argument("background", type=Path, help="image without contact, or a calibration folder of gs_sdk")
     parser.add_argument("--sensor", help=f"YAML file, or one of {', '.join(vts.shipped_sensors())}")
-    parser.add_argument("--mm-per-pixel", type=float, help="in place of --sensor: pixel pitch of an unknown sensor")
-    parser.add_argument("--gamma", type=float, help="with --mm-per-pixel: value = light^(1/gamma); left out, it is chosen")
+    parser.add_argument("--mm-per-pixel", type=float, help="instead of --sensor: pixel pitch of an unknown sensor")
+    parser.add_argument("--gamma", type=float, help="with --mm-per-pixel: value = light^(1/gamma); chosen if not given")
     parser.add_argument("--touches", type=Path, nargs="+", default=[], help="images of unknown objects pressed in")
     parser.add_argument(
-        "--use-labels", action="store_true", help="take centers from the folder's label.npz or labels.csv instead of finding them"
+        "--use-labels", action="store_true", help="use centers of the folder's label.npz or labels.csv instead of finding them"
     )
-    parser.add_argument("--no-prior", action="store_true", help="do as if the sensor file had no prior")
+    parser.add_argument("--no-prior", action="store_true", help="ignore the prior of the sensor file")
     parser.add_argument("--out", type=Path, required=True, help="calibration file to write, .safetensors")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(argv)
     if (arguments.sensor is None) == (arguments.mm_per_pixel is None):
         parser.error("give either --sensor or --mm-per-pixel")
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    presses: list[vts.Press] = []
-    if arguments.background.is_dir():
-        image, presses = vts.read_presses(arguments.background)
-        if not arguments.use_labels:
-            presses = [dataclasses.replace(press, center_px=None, contact_radius_px=None) for press in presses]
-        elif all(press.center_px is None for press in presses):
-            parser.error(
-                f"--use-labels: {arguments.background} holds neither label.npz nor labels.csv: leave it out, centers are found"
-            )
-    else:
-        image = vts.read_image(arguments.background)
-    if arguments.sensor is not None:
-        sensor = vts.Sensor.load(arguments.sensor)
-        image = sensor.rectify(image[None])[0]
-    else:
-        pitch, gamma = arguments.mm_per_pixel, arguments.gamma
-        sensor = vts.Sensor(arguments.background.stem or "sensor", image.shape[1], image.shape[2], pitch, gamma=gamma)
-    if arguments.no_prior:
-        sensor = sensor.without_prior()
+    image, sensor, presses = read_given(arguments, parser)
     touches = [vts.Touch(sensor.rectify(vts.read_image(path)[None])[0], None, path.name) for path in arguments.touches]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", vts.CalibrationWarning)
         calibration = vts.calibrate(image, sensor, presses, touches, progress=True)
     calibration.save(arguments.out)
     report, sensor = calibration.report, calibration.sensor
-    print(f"sensor {sensor.name}: {sensor.height} x {sensor.width} px, {sensor.mm_per_pixel} mm a pixel, gamma {sensor.exponent}")
-    print(f"chosen: {report['model']}: {report['reason']}\n")
+    print(f"sensor {sensor.name}: {sensor.height} x {sensor.width} px, {sensor.mm_per_pixel} mm per pixel, gamma {sensor.exponent}")
+    print(f"chosen: {report['model']} ({report['source']}): {report['reason']}\n")
     print_candidates(report["candidates"])
     if report["model"] == "point_lights" and calibration.lights is not None:
         print_lights(calibration.lights, report)
@@ -71,20 +56,41 @@ def main() -> int:
     return 0
 
 
-def print_candidates(candidates: list[dict[str, Any]]) -> None:
+def read_given(arguments: argparse.Namespace, parser: argparse.ArgumentParser) -> tuple[torch.Tensor, vts.Sensor, list[vts.Press]]:
+    """Background, sensor and presses that the arguments name."""
+    presses: list[vts.Press] = []
+    if arguments.background.is_dir():
+        image, presses = vts.read_presses(arguments.background)
+        if not arguments.use_labels:
+            presses = [dataclasses.replace(press, center_px=None, contact_radius_px=None) for press in presses]
+        elif all(press.center_px is None for press in presses):
+            parser.error(
+                f"--use-labels: {arguments.background} has neither label.npz nor labels.csv: leave --use-labels out, "
+                "centers are found"
+            )
+    else:
+        image = vts.read_image(arguments.background)
+    if arguments.sensor is not None:
+        sensor = vts.Sensor.load(arguments.sensor)
+        image = sensor.rectify(image[None])[0]
+    else:
+        pitch, gamma = arguments.mm_per_pixel, arguments.gamma
+        sensor = vts.Sensor(arguments.background.stem or "sensor", image.shape[1], image.shape[2], pitch, gamma=gamma)
+    return image, sensor.without_prior() if arguments.no_prior else sensor, presses
+
+
+def print_candidates(candidates: list[CandidateRow]) -> None:
     print("| model | family | passes | parameters | deg | misfit | note |\n|---|---|---|---|---|---|---|")
     for row in candidates:
         score = "" if row["score_deg"] is None else f"{row['score_deg']:.2f}"
         misfit = f"{row['misfit']:.1%}" if "misfit" in row else ""
         family = row.get("family", "") + (f", gamma {row['gamma']:g}" if row.get("gamma", 1.0) != 1.0 else "")
         print(f"| {row['model']} | {family} | {row['passes']} | {row['parameters']} | {score} | {misfit} | {row.get('note', '')} |")
-    print(
-        "deg: of point lights without a note of presses, how loose the image leaves them; else the mean angle on held-out presses"
-    )
+    print("deg: mean angle on held-out presses; for point lights without presses the standard deviation of the worst direction")
     print("misfit: smooth relative structure of the image that the lights leave unexplained\n")
 
 
-def print_lights(lights: vts.PointLights, report: dict[str, Any]) -> None:
+def print_lights(lights: vts.PointLights, report: Report) -> None:
     print("| light | x mm | y mm | z mm | direction +- deg | gloss |\n|---|---|---|---|---|---|")
     position, gloss = lights.position_mm.tolist(), lights.gloss.tolist()
     for j, name in enumerate("RGB"):
@@ -93,15 +99,15 @@ def print_lights(lights: vts.PointLights, report: dict[str, Any]) -> None:
     print()
 
 
-def print_presses(presses: list[dict[str, Any]]) -> None:
-    print("| press | center px | contact radius px | off by deg | times as wide as said | |\n|---|---|---|---|---|---|")
+def print_presses(presses: list[PressRow]) -> None:
+    print("| press | center px | contact radius px | error deg | times as wide as given | |\n|---|---|---|---|---|---|")
     for press in presses:
         center = ", ".join(f"{v:.1f}" for v in press["center_px"]) if "center_px" in press else ""
         radius = f"{press['contact_radius_px']:.1f}" if "contact_radius_px" in press else ""
         off = f"{press['error_deg']:.1f}" if "error_deg" in press else ""
         wide = f"{1.0 / max(press['gain'], 1e-3):.2f}" if "gain" in press else ""
         print(f"| {press['name']} | {center} | {radius} | {off} | {wide} | {press['reason'] and 'left out: ' + press['reason']} |")
-    print("off by, times as wide: of slopes by a first pass of the others' field, or of the prior's, against the ball's\n")
+    print("error, times as wide: slopes by the field of the other presses, or by the prior, compared with the ball's\n")
 
 
 if __name__ == "__main__":

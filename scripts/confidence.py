@@ -6,31 +6,44 @@ Random exact scenes of four kinds of units, and presses of balls that calibratio
 """
 
 import argparse
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 
 import torchvts as vts
 from torchvts.evaluation import coverage
+from torchvts.evaluation.figures import coverage_figure
+from torchvts.evaluation.random_scenes import SHAPES, UNITS
 from torchvts.viz import save_figure
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--presses", type=Path, help="folder of ball presses in gs_sdk's layout, with labels")
-    parser.add_argument("--sensor", default="gelsight_mini", help="of the presses: YAML file or shipped name")
+    parser.add_argument("--sensor", default="gelsight_mini", help="sensor of the presses: YAML file or shipped name")
     parser.add_argument("--frames", type=int, default=100, help="random scenes of each kind of unit")
-    parser.add_argument("--seed", type=int, default=10000, help="of the first scene")
+    parser.add_argument("--seed", type=int, default=10000, help="seed of the first scene")
     parser.add_argument("--out", type=Path, default=Path("out/confidence.png"), help="the picture")
-    arguments = parser.parse_args()
-    torch.set_grad_enabled(False)
+    parser.add_argument("--units", nargs="+", choices=UNITS, default=UNITS, metavar="UNIT", help=", ".join(UNITS))
+    arguments = parser.parse_args(argv)
+    with torch.no_grad():
+        print(measure(arguments))
+    return 0
+
+
+def measure(arguments: argparse.Namespace) -> str:
+    """Measure, save the picture, and return the table."""
     rows, every = [], []
-    for number, unit in enumerate(coverage.UNITS):
+    for number, unit in enumerate(UNITS):
+        if unit not in arguments.units:
+            continue
         first = arguments.seed + number * arguments.frames
         found = coverage.of_scenes(range(first, first + arguments.frames), unit, progress=True)
         rows += [coverage.mean(found, f"scenes, {unit}")] if found else []
         every += found
-    for shape in coverage.SHAPES:
+    for shape in SHAPES:
         found = [row for row in every if row.shape == shape]
         rows += [coverage.mean(found, f"scenes of all units, {shape}")] if found else []
     curves = [coverage.mean(every, "scenes")]
@@ -46,9 +59,9 @@ def main() -> None:
             found = coverage.of_presses(arguments.presses, kind, learn=learn, mode=mode, progress=True)
             rows.append(coverage.mean(found, f"{arguments.presses.name}, {name}"))
             curves.append(rows[-1])
-    print(coverage.table([*rows, curves[0]]))
-    save_figure(coverage.figure(curves), arguments.out)
+    save_figure(coverage_figure(curves), arguments.out)
+    return coverage.table([*rows, curves[0]])
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -1,4 +1,4 @@
-"""The main job on an embedded scene, and on real images where they are: calibrate from one image, reconstruct, look.
+"""Calibrate from one image and reconstruct: a rendered scene, and real images where they are available.
 
 python scripts/demo.py [--out out/demo]
 """
@@ -7,8 +7,10 @@ import argparse
 import dataclasses
 import os
 import statistics
+import sys
 import time
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import kornia
@@ -22,25 +24,26 @@ from torchvts.evaluation import metrics
 PITCH = 0.0625
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/demo"))
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(argv)
     arguments.out.mkdir(parents=True, exist_ok=True)
     lines = embedded(arguments.out)
     folder = Path(os.environ.get("TORCHVTS_DATA", Path(__file__).resolve().parents[1] / ".." / "shared" / "data"))
     lines += real(folder, arguments.out) if folder.is_dir() else [f"real images: none at {folder} (set TORCHVTS_DATA)"]
     print("\n".join(lines))
     print(f"\npictures in {arguments.out}")
+    return 0
 
 
 def embedded(out: Path) -> list[str]:
-    """A sensor with low lights, a worn skin, noise and 8 bits; calibrated from one image of it."""
+    """A rendered sensor with low lights, a worn skin, noise and 8 bits, calibrated from one image."""
     lights = vts.PointLights([[20.0, 9.3, 16.5], [-18.0, 12.6, 15.5], [-1.9, -21.9, 17.5]], [200.0, 200.0, 200.0])
     sensor = vts.Sensor("embedded", 480, 640, PITCH)
     worn = scenes.skin_spots(480, 640)
-    rest = scenes.undeformed(scenes.sphere_press())
-    background = scenes.render(rest, lights, noise_std=0.01, bits=8, spots=worn, seed=1)[0].detach()
+    undeformed = scenes.undeformed(scenes.sphere_press())
+    background = scenes.render(undeformed, lights, noise_std=0.01, bits=8, spots=worn, seed=1)[0].detach()
     start = time.perf_counter()
     calibration = vts.calibrate(background, sensor, progress=True)
     seconds = time.perf_counter() - start
@@ -48,7 +51,7 @@ def embedded(out: Path) -> list[str]:
     calibration = vts.Calibration.load(out / "embedded.safetensors")
     off = float((calibration.lights.position_mm - lights.position_mm).abs().max().detach())
     lines = [
-        f"Embedded scene: 640 x 480, noise 0.01, 8 bits, spots; lights found within {off:.3f} mm in {seconds:.1f} s",
+        f"Rendered scene: 640 x 480, noise 0.01, 8 bits, spots; lights found within {off:.3f} mm in {seconds:.1f} s",
         "",
         "| press | mode | largest error px | RMS px | normals deg | mask IoU |",
         "|---|---|---|---|---|---|",
@@ -74,7 +77,7 @@ def embedded(out: Path) -> list[str]:
 
 
 def real(folder: Path, out: Path) -> list[str]:
-    """Renders and photographs of other people; calibrated from the one background of each, one also from a few presses."""
+    """Renderings and photographs by others, each sensor calibrated from its background, one also from a few presses."""
     lines = [
         f"Images of {folder.name}/, each sensor calibrated from its one background",
         "",
@@ -97,9 +100,7 @@ def real(folder: Path, out: Path) -> list[str]:
             calibration = vts.calibrate(vts.read_image(folder / place / background), sensor, progress=True)
         notes += [f"{place}: {warning.message}" for warning in caught]
         pipe = vts.DepthPipeline.from_calibration(calibration, "precise")
-        model = {"point_lights": "point lights", "response": "the type's prior, carried by the background"}[
-            calibration.report["model"]
-        ]
+        model = {"point_lights": "point lights", "response": "prior of the sensor type"}[calibration.report["model"]]
         for name in images:
             if not (folder / place / name).is_file():
                 continue
@@ -116,13 +117,13 @@ def real(folder: Path, out: Path) -> list[str]:
             )
     if (folder / "gelslim_markers" / "ref.jpg").is_file():
         lines += marked(folder / "gelslim_markers", out)
-    return lines + (["", "What the library itself says of these calibrations:"] + [f"* {note}" for note in notes] if notes else [])
+    return lines + (["", "Warnings of these calibrations:"] + [f"* {note}" for note in notes] if notes else [])
 
 
 def marked(folder: Path, out: Path) -> list[str]:
-    """A lab sensor with printed markers, calibrated from four presses, the markers filled and left in.
+    """A lab sensor with printed markers, calibrated from four presses; depth with the markers filled and with them left in.
 
-    The pitch and the ball's diameter are not known: 0.05 mm and 5 mm are assumed, so depth has no true scale.
+    Pitch and ball diameter are unknown. 0.05 mm and 5 mm are assumed, so the depth has no true scale.
     """
     background = vts.read_image(folder / "ref.jpg")
     sensor = vts.Sensor("lab sensor with markers", background.shape[1], background.shape[2], 0.05, markers=True)
@@ -167,4 +168,4 @@ def truth_error(path: Path, depth_mm: torch.Tensor, mm_per_pixel: float) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

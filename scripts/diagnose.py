@@ -1,4 +1,4 @@
-"""Name what is wrong with an image, or with the calibration it would be read by; docs/diagnose.md explains every finding.
+"""Find what is wrong with an image or with the calibration for it; docs/diagnose.md explains every finding.
 
 python scripts/diagnose.py unit.safetensors image.png
 python scripts/diagnose.py unit.safetensors image.png --background now.png --json
@@ -10,6 +10,7 @@ import argparse
 import dataclasses
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -17,13 +18,13 @@ import torch
 import torchvts as vts
 
 
-def main() -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("calibration", type=Path, help="calibration file, .safetensors")
     parser.add_argument("image", type=Path, help="the frame in question, as the camera gives it")
-    parser.add_argument("--background", type=Path, help="a frame of now without contact, if there is one")
+    parser.add_argument("--background", type=Path, help="an image without contact of now, if there is one")
     parser.add_argument("--json", action="store_true", help="print JSON")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(argv)
     calibration = vts.Calibration.load(arguments.calibration)
 
     def read(path: Path) -> torch.Tensor:

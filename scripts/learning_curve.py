@@ -2,9 +2,9 @@
 
 python scripts/learning_curve.py ../shared/data/gelsight_mini_a --sensor gelsight_mini
 
-Presses carry no labels; those left out are scored, and those given by how far the centers and contact radii that were found for
-them are from the labels. Touches are known by nothing but their images: all presses but the one for the scale are scored. Where a
-prior takes part it is fitted on the balls of all other diameters (with their labels), so it has not seen the ball that is scored.
+The presses are given without labels. Those left out are scored; for those given, the centers and contact radii found are compared
+with the labels. Touches are given by their images alone, so all presses except the one for the scale are scored. Where there is a
+prior, it is fitted to the balls of all other diameters (with their labels), so it has not seen the ball that is scored.
 """
 
 import argparse
@@ -14,7 +14,7 @@ import random
 import statistics
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,60 +30,51 @@ from torchvts.viz import save_figure
 matplotlib.use("Agg")
 
 FOLDS = 5
-"""Of each ball's presses, in the row that scores every one of them: each is left out once."""
+"""Folds of each ball's presses in the row that scores all of them: each press is left out once."""
 
 
 class Scores(NamedTuple):
-    """Of presses left out; and of those given, how far their centers and contact radii are from the labels, pixels."""
+    """Scores of presses left out; distances of found centers and contact radii from the labels, pixels, of presses given."""
 
     left_out: list[PressScore]
     centers_px: list[float]
     radii_px: list[float]
 
 
-def main() -> int:
+class Row(NamedTuple):
+    """One row of the table: what was given, how many, and the scores."""
+
+    kind: str
+    count: int
+    scores: Scores
+
+
+class Unit(NamedTuple):
+    """The images: background, sensor without prior, all presses, those with labels."""
+
+    background: torch.Tensor
+    sensor: vts.Sensor
+    presses: list[vts.Press]
+    scored: list[vts.Press]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="presses of balls of two or more diameters, in gs_sdk's layout")
     parser.add_argument("--sensor", required=True, help=f"YAML file, or one of {', '.join(vts.shipped_sensors())}")
-    parser.add_argument("--draws", type=int, default=4, help="choices of presses per figure")
+    parser.add_argument("--draws", type=int, default=4, help="choices of presses per row")
     parser.add_argument("--out", type=Path, default=Path("out/learning_curve"), help="folder for table.md and the picture")
-    arguments = parser.parse_args()
-    warnings.simplefilter("ignore", vts.CalibrationWarning)
-    bare = vts.Sensor.load(arguments.sensor).without_prior()
+    arguments = parser.parse_args(argv)
     background, presses = vts.read_presses(arguments.folder)
     scored = [press for press in presses if press.center_px is not None and press.contact_radius_px is not None]
-    rows: list[tuple[str, int, Scores]] = []
-    balls = sorted({press.ball_diameter_mm for press in presses})
-    own = {ball: [press for press in presses if press.ball_diameter_mm == ball] for ball in balls}
-    with tqdm(desc="learning curve", leave=False) as bar:
-        if len(balls) > 1:
-            sensors = {}
-            for ball in balls:
-                others = [press for press in presses if press.ball_diameter_mm != ball]
-                sensors[ball] = dataclasses.replace(bare, prior=fit_prior(background, bare, others))
-            by_number = {n: [(ball, d) for ball in balls for d in draws(own[ball], n, arguments.draws)] for n in (0, 1, 3, 5, 10)}
-            folds = [(ball, [p for k, p in enumerate(own[ball]) if k % FOLDS != fold]) for ball in balls for fold in range(FOLDS)]
-            named = [("presses, prior of another ball", number, jobs) for number, jobs in by_number.items()]
-            usual = round(statistics.mean(len(draw) for _, draw in folds))
-            for kind, number, jobs in [*named, (f"presses, prior of another ball, {FOLDS}-fold", usual, folds)]:
-                found = Scores([], [], [])
-                for ball, draw in jobs:
-                    score(found, background, sensors[ball], draw, [], left(scored, draw, ball))
-                    bar.update()
-                rows.append((kind, number, found))
-        for count in (1, 2, 3, 5, 10, len(presses) - len(presses) // 5):
-            found = Scores([], [], [])
-            for draw in draws(presses, count, arguments.draws):
-                score(found, background, bare, draw, [], left(scored, draw))
-                bar.update()
-            rows.append(("presses, no prior", count, found))
-        for count in (1, 5, 10, min(30, len(presses) - 1)):
-            found = Scores([], [], [])
-            for draw in draws(presses, count, arguments.draws):
-                one = random.Random(count).choice([press for press in scored if press not in draw] or scored)
-                score(found, background, bare, [one], draw, left(scored, [one]))
-                bar.update()
-            rows.append(("touches, and one press for the scale", count, found))
+    unit = Unit(background, vts.Sensor.load(arguments.sensor).without_prior(), presses, scored)
+    with warnings.catch_warnings(), tqdm(desc="learning curve", leave=False) as bar:
+        warnings.simplefilter("ignore", vts.CalibrationWarning)
+        rows = [
+            *rows_with_prior(unit, arguments.draws, bar),
+            *rows_without_prior(unit, arguments.draws, bar),
+            *rows_of_touches(unit, arguments.draws, bar),
+        ]
     arguments.out.mkdir(parents=True, exist_ok=True)
     text = table(rows)
     (arguments.out / "table.md").write_text(text + "\n")
@@ -91,6 +82,49 @@ def main() -> int:
     print(text)
     print(f"\nwrote {arguments.out}/table.md and learning_curve.png")
     return 0
+
+
+def rows_with_prior(unit: Unit, count_of_draws: int, bar: "tqdm[None]") -> Iterator[Row]:
+    """Presses of each ball, with a prior fitted to the other balls."""
+    balls = sorted({press.ball_diameter_mm for press in unit.presses})
+    if len(balls) < 2:
+        return
+    own = {ball: [press for press in unit.presses if press.ball_diameter_mm == ball] for ball in balls}
+    sensors = {}
+    for ball in balls:
+        others = [press for press in unit.presses if press.ball_diameter_mm != ball]
+        sensors[ball] = dataclasses.replace(unit.sensor, prior=fit_prior(unit.background, unit.sensor, others))
+    folds = [(ball, [p for k, p in enumerate(own[ball]) if k % FOLDS != fold]) for ball in balls for fold in range(FOLDS)]
+    usual = round(statistics.mean(len(draw) for _, draw in folds))
+    kind = "presses, prior of another ball"
+    jobs = [(kind, n, [(ball, d) for ball in balls for d in draws(own[ball], n, count_of_draws)]) for n in (0, 1, 3, 5, 10)]
+    for name, count, pairs in [*jobs, (f"{kind}, {FOLDS}-fold", usual, folds)]:
+        found = Scores([], [], [])
+        for ball, draw in pairs:
+            score(found, unit._replace(sensor=sensors[ball]), draw, [], left(unit.scored, draw, ball))
+            bar.update()
+        yield Row(name, count, found)
+
+
+def rows_without_prior(unit: Unit, count_of_draws: int, bar: "tqdm[None]") -> Iterator[Row]:
+    """Presses of all balls."""
+    for count in (1, 2, 3, 5, 10, len(unit.presses) - len(unit.presses) // 5):
+        found = Scores([], [], [])
+        for draw in draws(unit.presses, count, count_of_draws):
+            score(found, unit, draw, [], left(unit.scored, draw))
+            bar.update()
+        yield Row("presses, no prior", count, found)
+
+
+def rows_of_touches(unit: Unit, count_of_draws: int, bar: "tqdm[None]") -> Iterator[Row]:
+    """Presses used as touches, and one press for the scale."""
+    for count in (1, 5, 10, min(30, len(unit.presses) - 1)):
+        found = Scores([], [], [])
+        for draw in draws(unit.presses, count, count_of_draws):
+            one = random.Random(count).choice([press for press in unit.scored if press not in draw] or unit.scored)
+            score(found, unit, [one], draw, left(unit.scored, [one]))
+            bar.update()
+        yield Row("touches, and one press for the scale", count, found)
 
 
 def draws(presses: Sequence[vts.Press], count: int, number: int) -> list[list[vts.Press]]:
@@ -104,30 +138,25 @@ def left(scored: Sequence[vts.Press], used: Sequence[vts.Press], ball: float | N
 
 
 def score(
-    found: Scores,
-    background: torch.Tensor,
-    sensor: vts.Sensor,
-    presses: Sequence[vts.Press],
-    touches: Sequence[vts.Press],
-    judged: Sequence[vts.Press],
+    found: Scores, unit: Unit, presses: Sequence[vts.Press], touches: Sequence[vts.Press], scored: Sequence[vts.Press]
 ) -> None:
-    """Calibrate with the labels forgotten, and add to what was found the scores of other presses' precise depth."""
+    """Calibrate without the labels, and add the scores of other presses' precise depth to ``found``."""
     blind = [dataclasses.replace(press, center_px=None, contact_radius_px=None) for press in presses]
-    calibration = vts.calibrate(background, sensor, blind, [press.image for press in touches])
+    calibration = vts.calibrate(unit.background, unit.sensor, blind, [press.image for press in touches])
     pipe = vts.DepthPipeline.from_calibration(calibration, "precise")
-    for press in judged:
+    for press in scored:
         with torch.inference_mode():
             out = pipe(press.image[None])
-        found.left_out.append(score_press(press, out.depth_mm, out.normal, sensor.mm_per_pixel))
+        found.left_out.append(score_press(press, out.depth_mm, out.normal, unit.sensor.mm_per_pixel))
     labels = {press.name: press for press in presses}
-    for told in calibration.report.get("presses", []):
-        press = labels[told["name"]]
-        if told["used"] and press.center_px is not None and press.contact_radius_px is not None:
-            found.centers_px.append(math.dist(told["center_px"], press.center_px))
-            found.radii_px.append(abs(told["contact_radius_px"] - press.contact_radius_px))
+    for row in calibration.report.get("presses", []):
+        press = labels[row["name"]]
+        if row["used"] and press.center_px is not None and press.contact_radius_px is not None:
+            found.centers_px.append(math.dist(row["center_px"], press.center_px))
+            found.radii_px.append(abs(row["contact_radius_px"] - press.contact_radius_px))
 
 
-def table(rows: Sequence[tuple[str, int, Scores]]) -> str:
+def table(rows: Sequence[Row]) -> str:
     lines = [
         "| given | number | normals deg | relief um | of it tilt | radius %, median | scored | centers, radii found, px, median |",
         "|---" * 8 + "|",
@@ -140,7 +169,7 @@ def table(rows: Sequence[tuple[str, int, Scores]]) -> str:
     return "\n".join(lines)
 
 
-def figure(rows: Sequence[tuple[str, int, Scores]]) -> "matplotlib.figure.Figure":
+def figure(rows: Sequence[Row]) -> "matplotlib.figure.Figure":
     import matplotlib.pyplot as plt
 
     drawn, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")

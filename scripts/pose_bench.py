@@ -1,12 +1,13 @@
-"""Pose bench: seven objects, and three whose pose cannot be known, from rendered noisy images to pose; table, JSON, pictures.
+"""Pose bench: from rendered noisy images to pose, for seven objects and three whose pose is ambiguous; table, JSON, pictures.
 
 python scripts/pose_bench.py --poses 100 --out out/pose_bench
 """
 
 import argparse
+import dataclasses
 import json
 import sys
-from dataclasses import asdict
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -20,18 +21,18 @@ from torchvts.pose import Registration, contact_cloud
 from torchvts.scenes import objects
 
 
-def main() -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--poses", type=int, default=100, help="of each object")
+    parser.add_argument("--poses", type=int, default=100, help="poses of each object")
     parser.add_argument("--size", type=int, nargs=2, default=(320, 240), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--noise", type=float, default=0.005, help="standard deviation of image noise; 8 bits on top")
     parser.add_argument("--only", nargs="+", choices=[*objects.TARGETS, *objects.FREE_TARGETS], help="these objects")
     parser.add_argument("--clouds", type=int, metavar="POINTS", help="register clouds of so many points instead (0: all pixels)")
     parser.add_argument("--presses", type=Path, metavar="FOLDER", help="also pairs of real presses of a ball: a calibration folder")
-    parser.add_argument("--sensor", default="gelsight_mini", help="of that folder; needs a prior")
+    parser.add_argument("--sensor", default="gelsight_mini", help="sensor of that folder, with a prior")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--out", type=Path, required=True)
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(argv)
     torch.set_num_threads(arguments.threads)
     arguments.out.mkdir(parents=True, exist_ok=True)
     everything = {**objects.TARGETS, **objects.FREE_TARGETS}
@@ -55,8 +56,8 @@ def main() -> int:
         background, presses = vts.read_presses(arguments.presses)
         with tqdm(total=100, unit="pair") as bar:
             counts = ball_pairs(background, presses, vts.Sensor.load(arguments.sensor), 100, bar.update)
-        text += "\nreal presses of a ball: " + ", ".join(f"{name} {number}" for name, number in counts.items()) + "\n"
-    for name, content in (("table.md", text), ("poses.json", json.dumps([asdict(row) for row in rows], indent=1))):
+        text += "\nreal presses of a ball: " + ", ".join(f"{name} {count}" for name, count in counts.items()) + "\n"
+    for name, content in (("table.md", text), ("poses.json", json.dumps([dataclasses.asdict(row) for row in rows], indent=1))):
         with write_atomically(arguments.out / name) as temporary:
             temporary.write_text(content)
     print(text)

@@ -9,16 +9,18 @@ Stopped, the same command goes on where it was. Exit status 1 if a frame had to 
 
 import argparse
 import sys
+from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 
 import torchvts as vts
 from torchvts.core.files import read_frames
 from torchvts.dataset import CLOUD_FORMATS, DEPTH_FORMATS, PICTURES_UP_TO, Report, list_items, reconstruct_dataset
-from torchvts.pipeline import MODES
+from torchvts.diagnose import Finding
+from torchvts.pipeline.depth import MODES
 
 
-def main() -> int:
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("calibration", type=Path, help="file that calibrate.py wrote")
     parser.add_argument("source", type=Path, help="image, folder of images and videos, or video")
@@ -29,36 +31,25 @@ def main() -> int:
     parser.add_argument(
         "--pictures",
         action=argparse.BooleanOptionalAction,
-        help=f"contour and surface pictures; left out: of at most {PICTURES_UP_TO} frames",
+        help=f"contour and surface pictures; by default for at most {PICTURES_UP_TO} frames",
     )
     parser.add_argument("--batch", type=int, default=8, help="frames that a loader worker hands over at once")
-    parser.add_argument("--workers", type=int, help="loader processes for each rank; left out, up to 4")
+    parser.add_argument("--workers", type=int, help="loader processes of each rank; by default up to 4")
     parser.add_argument("--threads", type=int, default=1, help="of each rank; results are bit for bit equal for equal numbers only")
     parser.add_argument("--overwrite", action="store_true", help="begin anew, whatever --out holds")
     parser.add_argument("--strict", action="store_true", help="stop at the first frame that cannot be used")
-    parser.add_argument("--timeout", type=float, default=60.0, help="seconds after which a silent process counts as dead")
-    arguments = parser.parse_args()
-    sys.stdout.reconfigure(errors="backslashreplace")  # names of files may be no text
-    report = reconstruct_dataset(
-        arguments.calibration,
-        arguments.source,
-        arguments.out,
-        mode=arguments.mode,
-        depth=arguments.depth,
-        cloud=arguments.cloud,
-        pictures=arguments.pictures,
-        batch=arguments.batch,
-        workers=arguments.workers,
-        threads=arguments.threads,
-        overwrite=arguments.overwrite,
-        strict=arguments.strict,
-        timeout_s=arguments.timeout,
-    )
+    return parser.parse_args(argv)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    arguments = parse(argv)
+    sys.stdout.reconfigure(errors="backslashreplace")  # names of files may not be text
+    report = reconstruct_dataset(**vars(arguments))
     if report.rank > 0:
         return 0
     print_report(report, arguments.out)
-    for symptom in symptoms(arguments.calibration, arguments.source):
-        print(f"first frame: {symptom}")
+    for finding in diagnose_first(arguments.calibration, arguments.source):
+        print(f"first frame: {finding}")
     return 1 if report.failed else 0
 
 
@@ -70,11 +61,9 @@ def print_report(report: Report, out: Path) -> None:
             print(f"| {name} | {float(deepest):.3f} | {float(area):.2f} |")
     if report.rows > 20:
         print(f"... {report.rows - 20} more")
-    print("\n| rank | frames | left out | s | frames/s |\n|---|---|---|---|---|")
-    for rank, (frames, failed, seconds) in enumerate(report.ranks):
-        print(f"| {rank} | {frames:.0f} | {failed:.0f} | {seconds:.1f} | {frames / max(seconds, 1e-9):.1f} |")
-    frames, slowest = sum(row[0] for row in report.ranks), max(row[2] for row in report.ranks)
-    print(f"{frames:.0f} frames in {slowest:.1f} s: {frames / max(slowest, 1e-9):.1f} frames/s; {report.before} were there before")
+    frames = report.rows - report.before
+    rate = frames / max(report.seconds, 1e-9)
+    print(f"\n{frames} frames in {report.seconds:.1f} s: {rate:.1f} frames/s; {report.before} were there before")
     if report.failed:
         print("\n| left out | reason |\n|---|---|")
         for name, reason in report.failed[:20]:
@@ -83,12 +72,12 @@ def print_report(report: Report, out: Path) -> None:
     print(f"wrote {report.rows} frames to {out}")
 
 
-def symptoms(calibration: Path, source: Path) -> list[vts.Finding]:
-    """What is wrong with the first frame, such as that it is another unit's; that it cannot be read is told above."""
+def diagnose_first(calibration: Path, source: Path) -> list[Finding]:
+    """What is wrong with the first frame, such as that it is from another unit; one that cannot be read is reported above."""
     unit = vts.Calibration.load(calibration)
     try:
         first = next(list_items(source))
-        _, image = next(iter(read_frames(source / first.path if source.is_dir() else source)))
+        _, image = next(iter(read_frames(first.file(source))))
         found = vts.diagnose(None, unit.sensor.rectify(image[None])[0], unit)
     except (OSError, ValueError, StopIteration):
         return []

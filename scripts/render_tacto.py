@@ -1,6 +1,6 @@
 """Optional: render the TACTO scenes of the paper's figure 4: the background, and two spheres pressed into a flat gel.
 
-TACTO 0.0.3 pins packages that collide with torch's, so give it an environment of its own:
+TACTO 0.0.3 pins packages that conflict with torch's, so it needs an environment of its own:
 
     python -m venv tacto && . tacto/bin/activate
     pip install pyrender omegaconf trimesh scipy opencv-python-headless && pip install --no-deps tacto==0.0.3
@@ -21,6 +21,7 @@ import os
 import sys
 import tempfile
 import types
+from collections.abc import Sequence
 from pathlib import Path
 
 PITCH_MM, HEIGHT, WIDTH = 0.0625, 480, 640
@@ -40,12 +41,12 @@ def config(yfov: float, distance_m: float) -> dict:
     return {"sensor": {"camera": [camera], "gel": gel, "lights": lights, "noise": noise, "force": {"enable": False}}}
 
 
-def main() -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--camera", choices=sorted(YFOV_DEG), default="perspective")
     parser.add_argument("--out", type=Path, required=True, help="folder to write to")
     parser.add_argument("--compare", type=Path, help="folder with a set of the same camera")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(argv)
     if arguments.compare and not (arguments.compare / "background.png").is_file():
         print(f"error: no background.png in {arguments.compare}", file=sys.stderr)
         return 2

@@ -1,4 +1,4 @@
-"""Reproduce the paper's figures 3 and 4 and its tables 2 and 3, beside the figures it reports.
+"""Reproduce the paper's figures 3 and 4 and its tables 2 and 3, beside the values that it reports.
 
 Ji, Liu, Ma: Model-Based 3D Contact Geometry Perception for Visual Tactile Sensor, Sensors 2022, 22(17), 6470.
 
@@ -9,6 +9,8 @@ import argparse
 import math
 import os
 import statistics
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -16,9 +18,8 @@ from tqdm import tqdm
 
 import torchvts as vts
 from torchvts import scenes, viz
-from torchvts.evaluation import metrics
-from torchvts.evaluation import pose_accuracy as pose_bench
-from torchvts.evaluation import score as evaluate
+from torchvts.evaluation import methods, metrics, pose_accuracy
+from torchvts.evaluation.presses import Training
 from torchvts.pose import contact_cloud
 
 PITCH = 0.0625
@@ -92,12 +93,12 @@ def table_2(folder: Path, out: Path) -> list[str]:
     sensor = vts.Sensor.load("gelsight_mini").without_prior()
     background, presses = vts.read_presses(folder)
     kept = [press for k, press in enumerate(presses) if k % 5 == 0 and press.contact_radius_px is not None]
-    training = evaluate.Training(background, [press for press in presses if press not in kept], sensor)
-    table = evaluate.lookup_table(training, background, sensor).pipeline
-    models = {"response, precise": evaluate.response(training, background, sensor).pipeline}
-    models["point lights (the paper's)"] = evaluate.point_lights(training, background, sensor).pipeline
+    training = Training(background, [press for press in presses if press not in kept], sensor)
+    table = methods.lookup_table(training, background, sensor).reconstruct
+    compared = {"response, precise": methods.response(training, background, sensor).reconstruct}
+    compared["point lights (the paper's)"] = methods.point_lights(training, background, sensor).reconstruct
     rows = []
-    for name, pipe in models.items():
+    for name, pipe in compared.items():
         for press in tqdm(kept, desc="table 2", leave=False):
             with torch.inference_mode():
                 one, other = pipe(press.image[None]), table(press.image[None])
@@ -114,7 +115,7 @@ def table_2(folder: Path, out: Path) -> list[str]:
 
 def table_3(out: Path) -> list[str]:
     targets = {name: vts.scenes.objects.TARGETS[name] for name in ("tool handle", "bottle cap", "key")}
-    rows, shown = pose_bench.run_poses(targets, 10)
+    rows, shown = pose_accuracy.run_poses(targets, 10)
     for name, (case, found) in shown.items():
         source, target = (contact_cloud(frame, case.mm_per_pixel, 4000)[0] for frame in (case.source, case.target))
         figure = viz.pose_figure(source, target, found.T_target_source, f"table 3: {name}")
@@ -127,12 +128,12 @@ def table_3(out: Path) -> list[str]:
     return [head, "|---|---|---|---|", *lines, "| paper, three targets | 0.64, 2.35, 2.59 | below 1 | 6 to 8 |"]
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/paper"), help="folder for pictures and table.md")
     parser.add_argument("--data", type=Path, default=data_folder(), help="folder that holds tacto/ (default: TORCHVTS_DATA)")
     parser.add_argument("--lights", type=float, nargs=2, default=(31.25, 39.375), metavar=("RADIUS_MM", "HEIGHT_MM"))
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(argv)
     arguments.out.mkdir(parents=True, exist_ok=True)
     lines = [
         "Figure 3: exact lights known, 640 x 480, depth error over the whole image",
@@ -155,12 +156,13 @@ def main() -> None:
     (arguments.out / "table.md").write_text(text + "\n")
     print(text)
     print(f"\npictures and table.md in {arguments.out}")
+    return 0
 
 
 def data_folder() -> Path:
-    """Where third-party images lie: TORCHVTS_DATA, else ../shared/data beside the checkout."""
+    """Folder of third-party images: TORCHVTS_DATA, else ../shared/data beside the checkout."""
     return Path(os.environ.get("TORCHVTS_DATA", Path(__file__).resolve().parents[1] / ".." / "shared" / "data"))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -4,14 +4,16 @@ python scripts/stream.py --source 0 --sensor gelsight_mini
 python scripts/stream.py --source video.avi --sensor gelsight_wedge --out out/ball
 python scripts/stream.py --source folder/ --calibration unit.safetensors --out out/run
 
-The first frames must be free of contact. Ctrl-C ends it and finishes what is written.
+The first frames must be without contact. Ctrl-C ends it and finishes the files.
 """
 
 import argparse
+import contextlib
 import dataclasses
 import signal
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -21,26 +23,31 @@ import torchvts as vts
 from torchvts.stream import Overlay, StreamReport, TactileStream, VideoFile, Window, has_display
 
 
-def main() -> int:
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--source", required=True, help="a camera's index (digits), a video file, or a folder of images")
     parser.add_argument("--sensor", help=f"YAML file, or one of {', '.join(vts.shipped_sensors())}")
-    parser.add_argument("--calibration", type=Path, help="file that calibrate.py wrote; left out, the first frames calibrate")
+    parser.add_argument("--calibration", type=Path, help="file that calibrate.py wrote; by default the first frames calibrate")
     parser.add_argument(
         "--corners", help='in place of the sensor\'s: "x y x y x y x y", top left, top right, bottom right, bottom left'
     )
     parser.add_argument("--out", type=Path, help="folder for overlay video, frames.csv and summary.json")
     parser.add_argument("--video", choices=["mp4", "avi", "none"], default="mp4", help="kind of overlay video in --out")
     parser.add_argument("--mode", choices=["fast", "precise", "auto"], default="auto")
-    parser.add_argument("--background-frames", type=int, default=12, help="first frames, free of contact")
+    parser.add_argument("--background-frames", type=int, default=12, help="number of first frames, which are without contact")
     parser.add_argument("--realtime", action="store_true", help="play a recording at its own rate, dropping late frames")
     parser.add_argument("--no-follow", action="store_true", help="do not follow slow drift of the light")
-    parser.add_argument("--threads", type=int, default=1, help="of PyTorch and OpenCV; one leaves a core to the reading")
-    arguments = parser.parse_args()
-    torch.set_num_threads(max(1, arguments.threads))
-    cv2.setNumThreads(max(1, arguments.threads))
+    parser.add_argument("--threads", type=int, default=1, help="of PyTorch and OpenCV; one leaves a core for reading")
+    arguments = parser.parse_args(argv)
     if (arguments.sensor is None) == (arguments.calibration is None):
         parser.error("give either --sensor or --calibration")
+    return arguments
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    arguments = parse(argv)
+    torch.set_num_threads(max(1, arguments.threads))
+    cv2.setNumThreads(max(1, arguments.threads))
     unit = vts.Sensor.load(arguments.sensor) if arguments.sensor else vts.Calibration.load(arguments.calibration)
     if arguments.corners is not None:
         unit = with_corners(unit, arguments.corners)
@@ -50,24 +57,25 @@ def main() -> int:
     if not show:
         print("no display: no live view" + ("" if arguments.out else "; give --out for an overlay video"))
     started = time.perf_counter()
-    with TactileStream(
-        arguments.source,
-        unit,
-        mode=arguments.mode,
-        background_frames=arguments.background_frames,
-        realtime=arguments.realtime,
-        follow=not arguments.no_follow,
-    ) as stream:
-        print(f"{stream.reader.name}: {stream.fps:g} frames a second; first {arguments.background_frames} frames are at rest")
-        print(f"{stream.told}\nready after {time.perf_counter() - started:.1f} s")
+    with contextlib.ExitStack() as stack:
+        stream = stack.enter_context(
+            TactileStream(
+                arguments.source,
+                unit,
+                mode=arguments.mode,
+                background_frames=arguments.background_frames,
+                realtime=arguments.realtime,
+                follow=not arguments.no_follow,
+            )
+        )
+        print(f"{stream.reader.name}: {stream.fps:g} frames a second; the first {arguments.background_frames} are without contact")
+        print(f"{stream.note}\nready after {time.perf_counter() - started:.1f} s")
         report = StreamReport(stream)
-        overlay = Overlay(stream.metric) if show or (arguments.out and arguments.video != "none") else None
-        window = Window() if show else None
+        video = None
         if arguments.out is not None and arguments.video != "none":
-            with VideoFile(arguments.out / f"overlay.{arguments.video}", stream.fps) as video:
-                play(stream, report, overlay, window, video)
-        else:
-            play(stream, report, overlay, window, None)
+            video = stack.enter_context(VideoFile(arguments.out / f"overlay.{arguments.video}", stream.fps))
+        overlay = Overlay(stream.metric) if show or video is not None else None
+        play(stream, report, overlay, Window() if show else None, video)
     print(report.table())
     if arguments.out is not None:
         report.save(arguments.out)
@@ -78,12 +86,12 @@ def main() -> int:
 def play(
     stream: TactileStream, report: StreamReport, overlay: Overlay | None, window: Window | None, video: VideoFile | None
 ) -> None:
-    """Every frame until the source ends, the window is closed, or Ctrl-C; what was dropped is shown by the next frame again."""
+    """Show every frame until the source ends, the window is closed, or Ctrl-C; the next frame stands in for dropped ones."""
     shown = -1
     asked: list[int] = []
 
     def interrupt(number: int, _: object) -> None:
-        asked.append(number)  # the exception is lost where it meets a destructor or a callback
+        asked.append(number)  # the exception is lost if a destructor or a callback is running
         raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGINT, interrupt)
@@ -103,13 +111,13 @@ def play(
                 if window is not None and not window.show(picture):
                     break
     except KeyboardInterrupt:
-        print("interrupted: what came until now is kept")
+        print("interrupted: the frames until now are kept")
     finally:
         signal.signal(signal.SIGINT, before)
 
 
 def with_corners(unit: vts.Sensor | vts.Calibration, text: str) -> vts.Sensor | vts.Calibration:
-    """The sensor, or the calibration's, with other corners."""
+    """The sensor or calibration with other corners."""
     try:
         numbers = [float(part) for part in text.replace(",", " ").split()]
     except ValueError:

@@ -2,19 +2,20 @@
 
 python scripts/train_mlp.py ../shared/data/gelsight_mini_a --sensor gelsight_mini --out mlp.safetensors
 
-The folder is one of gs_sdk's (catalog.csv, background.png, N/gelsight.png); centers and contact radii come from label.npz or
-labels.csv, and where there are none from calibrate. Whole presses are held out; the epoch that does best on them is written.
+The folder has gs_sdk's layout (catalog.csv, background.png, N/gelsight.png). Centers and contact radii come from label.npz or
+labels.csv, otherwise from calibrate. Whole presses are held out, and the epoch with the least error on them is written.
 """
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import torchvts as vts
-from torchvts.evaluation.score import train_network
+from torchvts.evaluation.presses import train_network
 
 
-def main() -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="presses of balls, in gs_sdk's layout")
     parser.add_argument("--sensor", required=True, help=f"YAML file, or one of {', '.join(vts.shipped_sensors())}")
@@ -22,7 +23,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of weights, order and held-out presses")
     parser.add_argument("--max-epochs", type=int, default=60, help="bound; it stops when the held-out error no longer falls")
     parser.add_argument("--blur-px", type=float, default=1.0, help="blur of the images, which must be the same in use")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(argv)
     if arguments.out.suffix != ".safetensors":
         parser.error(f"--out: expected a name ending in .safetensors, got {arguments.out}")
     sensor = vts.Sensor.load(arguments.sensor)

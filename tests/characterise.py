@@ -65,9 +65,13 @@ class Names:
             "torchvts.accelerated:reference_only", "torchvts.core.native:reference_only", "torchvts.core.native:operators_only"
         )
         self.PoissonBackground = find("torchvts:PoissonBackground", "torchvts:PoissonRest")
-        self.PerspectiveIntegration = find("torchvts.integration:PerspectiveIntegration")
+        self.PerspectiveIntegration = find(
+            "torchvts.accelerated:PerspectiveIntegration", "torchvts.integration:PerspectiveIntegration"
+        )
         self.DiscontinuityIntegration = find(
-            "torchvts.integration:DiscontinuityIntegration", "torchvts.integration:CliffIntegration"
+            "torchvts.accelerated:DiscontinuityIntegration",
+            "torchvts.integration:DiscontinuityIntegration",
+            "torchvts.integration:CliffIntegration",
         )
         self.ResponseField = find("torchvts.model:ResponseField", "torchvts.core.response:ResponseField")
         self.ResponseModel = find("torchvts.model:ResponseModel", "torchvts.core.response:ResponseModel")
@@ -407,6 +411,8 @@ def record_calibrations(record: Record, data: Path | None) -> None:
     )
     out = vts.DepthPipeline.from_calibration(by_presses, "precise")(presses[0].image[None])
     record.add_output("fitted to 6 presses, precise, compiled", out)
+    bounds = vts.ConfidentPipeline.from_calibration(by_presses, "precise")(presses[0].image[None])
+    record.add("confidence", "fitted to 6 presses, precise", **bounds._asdict())
     mix = torch.tensor([[0.35, -0.05], [-0.2, 0.3], [-0.1, -0.33]])
 
     def linear_camera(scene: Any, seed: int) -> Tensor:
@@ -419,7 +425,10 @@ def record_calibrations(record: Record, data: Path | None) -> None:
     touches = [vts.Touch(linear_camera(soft[0], 0), 0.3), *(linear_camera(scene, 7 + k) for k, scene in enumerate(soft[1:]))]
     record_calibration(record, "3 touches", vts.calibrate(linear_camera(rest, 99), small, touches=touches))
     if data is not None:
-        record_calibration(record, "GelSight Mini, background and prior", real_mini(data).calibration)
+        mini, images = real_mini(data)
+        record_calibration(record, "GelSight Mini, background and prior", mini)
+        bounds = vts.ConfidentPipeline.from_calibration(mini, "precise")(images)
+        record.add("confidence", "GelSight Mini by the prior, precise", **bounds._asdict())
 
 
 def record_diagnoses(record: Record) -> None:
@@ -539,9 +548,11 @@ def difference(old: Tensor, new: Tensor) -> Cell:
 
 
 def load(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors, in the order in which they were recorded, and texts."""
     with safe_open(str(path), "pt") as file:
-        texts = json.loads(file.metadata()["texts"])
-    return load_file(path), texts
+        texts, order = (json.loads(file.metadata()[key]) for key in ("texts", "sha256"))
+    tensors = load_file(path)
+    return {key: tensors[key] for key in order}, texts
 
 
 def compare(old_path: Path, new_path: Path) -> int:

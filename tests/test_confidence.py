@@ -4,18 +4,17 @@ import copy
 import dataclasses
 import io
 import pickle
-import subprocess
-import sys
 import warnings
-from pathlib import Path
 
 import pytest
 import torch
 from torch import nn
-from torchmetrics import normal_angle_deg
 
 import torchvts as vts
 from torchvts.evaluation import coverage
+from torchvts.evaluation.coverage import Truth
+from torchvts.evaluation.metrics import normal_angle_deg
+from torchvts.evaluation.random_scenes import random_frame
 from torchvts.export import sample_frames
 from torchvts.pipeline import bound_at
 from torchvts.pipeline.confidence import DEPTH_SPREAD, FACTORS, _length_95
@@ -29,17 +28,17 @@ def lights_unit(ring, noise_std=0.004, background=True, **options):
     """A unit of known lights on the tests' small rig, and a ball pressed into it, with and without noise."""
     lights = ring(**options)
     scene = scenes.sphere_press(10.0, 1.5, (1.0, 2.0), HEIGHT, WIDTH, PITCH)
-    rest = scenes.render(scenes.undeformed(scene), lights, noise_std=noise_std, seed=5)[0]
-    calibration = vts.Calibration.from_lights(lights, SENSOR, rest if background else None)
+    image = scenes.render(scenes.undeformed(scene), lights, noise_std=noise_std, seed=5)[0]
+    calibration = vts.Calibration.from_lights(lights, SENSOR, image if background else None)
     return calibration, scene, lambda seed, std=noise_std: scenes.render(scene, lights, noise_std=std, seed=seed)
 
 
-def response_unit(held_out_deg=2.0, presses=20, source="presses"):
-    """A GelSight Mini by its prior, as if so many presses had left that error."""
+def response_unit(held_out_deg=2.0, presses=20, source="fitted to presses"):
+    """A GelSight Mini by its prior, with the report of a fit to so many presses with that error."""
     sensor = vts.Sensor.load("gelsight_mini", height=48, width=64)
     prior = sensor.prior
     background = (prior.background(48, 64, sensor.mm_per_pixel) ** (1.0 / prior.response.gamma)).float().clamp(0.0, 1.0)
-    report = {"model": "response", "source": source, "held_out_deg": held_out_deg, "presses": [{"used": True}] * presses}
+    report = {"model": "response", "response": source, "held_out_deg": held_out_deg, "presses": [{"used": True}] * presses}
     calibration = vts.Calibration.from_response(prior.response, sensor, background, report)
     return calibration, sample_frames(calibration)
 
@@ -78,26 +77,26 @@ def test_noise_and_conditioning_against_many_noisy_frames(ring, noise_std, rise)
     out = pipe(frames)
     angle = normal_angle_deg(out.normal, still.normal.expand_as(out.normal))
     found = (0.5 * angle.square().mean(0)).sqrt()[(inside & quiet)[0, 0]]
-    told = out.factors_deg[:, 0].median(dim=0).values[(inside & quiet)[0, 0]]
+    stated = out.factors_deg[:, 0].median(dim=0).values[(inside & quiet)[0, 0]]
     assert len(found) > 50
-    assert (told / found).median() == pytest.approx(1.0, abs=0.12)
-    assert float((told / found).quantile(0.02)) > 0.6 and float((told / found).quantile(0.98)) < 1.6
+    assert (stated / found).median() == pytest.approx(1.0, abs=0.12)
+    assert float((stated / found).quantile(0.02)) > 0.6 and float((stated / found).quantile(0.98)) < 1.6
 
 
 SEEDS = {"lights known": 20000, "lights known, background": 21000, "lights fitted": 22000}
 
 
-@pytest.fixture(scope="module", params=SEEDS)
+@pytest.fixture(scope="module", params=[*list(SEEDS)[:2], pytest.param("lights fitted", marks=pytest.mark.long)])
 def covered(request):
     first = SEEDS[request.param]
     return coverage.of_scenes(range(first, first + (10 if "fitted" in request.param else 24)), request.param)
 
 
-def test_of_random_scenes_95_percent_lie_within_the_bounds(covered):
+def test_95_percent_of_random_scenes_lie_within_the_bounds(covered):
     mean = coverage.mean(covered)
     assert len(covered) >= 9
     assert 0.90 <= float(mean.normal[-1]) <= 0.995 and 0.90 <= float(mean.depth[-1]) <= 0.999
-    assert float(mean.normal[0]) < 0.75  # bounds that hold everything tell nothing
+    assert float(mean.normal[0]) < 0.75  # bounds that contain everything are useless
 
 
 def test_a_frame_by_itself_lies_within_its_bounds(covered):
@@ -105,25 +104,26 @@ def test_a_frame_by_itself_lies_within_its_bounds(covered):
     assert sum(float(row.depth[-1]) >= 0.8 for row in covered) >= 0.85 * len(covered)
 
 
-def test_of_scenes_calibrated_by_presses_95_percent_lie_within_the_bounds():
+@pytest.mark.long
+def test_95_percent_of_scenes_calibrated_by_presses_lie_within_the_bounds():
     rows = coverage.of_scenes(range(23000, 23004), "presses")
     mean = coverage.mean(rows)
     assert float(mean.normal[-1]) >= 0.88 and float(mean.depth[-1]) >= 0.88
 
 
 def test_attached_shadows_and_a_worn_skin(ring):
-    """The failing scene of fast photometric stereo: its bounds must say so."""
+    """A scene where fast photometric stereo fails: the bounds must be wide there."""
     lights, size = ring(22.0, [15.0, 16.5, 18.0], rotation_deg=90.0, level=0.3), (120, 160, 0.25)
     sensor = vts.Sensor("rig", *size)
     camera = {"noise_std": 0.01, "bits": 8, "spots": scenes.skin_spots(120, 160)}
     scene = scenes.sphere_press(10.0, 2.0, (0.0, 0.0), *size)
-    rest = scenes.render(scenes.undeformed(scene), lights, **camera, seed=1)[0]
-    calibration = vts.Calibration.from_lights(lights, sensor, rest)
+    background = scenes.render(scenes.undeformed(scene), lights, **camera, seed=1)[0]
+    calibration = vts.Calibration.from_lights(lights, sensor, background)
     for mode in ("fast", "precise"):
         pipe = vts.ConfidentPipeline.from_calibration(calibration, mode)
         out = pipe(scenes.render(scene, lights, **camera, seed=2))
         assert bool((out.factors_deg[:, FACTORS.index("saturation")] > 0).any())
-        row = coverage.coverage(out, scene.depth_mm, scene.normal, out.contact | scene.contact, pipe.confidence.spread)
+        row = coverage.coverage(out, Truth(scene.depth_mm, scene.normal, out.contact | scene.contact), pipe.confidence.spread)
         assert float(row.normal[-1]) > 0.9 and float(row.depth[-1]) > 0.9
 
 
@@ -137,7 +137,7 @@ def test_a_noisier_frame_has_wider_bounds(ring):
     assert float(noisy.frame_confidence) <= float(quiet.frame_confidence) <= 1.0
 
 
-def test_light_that_the_model_does_not_explain_widens_the_bounds(ring):
+def test_unexplained_light_widens_the_bounds(ring):
     calibration, _, camera = lights_unit(ring)
     pipe = vts.ConfidentPipeline.from_calibration(calibration, "precise")
     right, image = pipe(camera(1)), camera(1)
@@ -148,7 +148,7 @@ def test_light_that_the_model_does_not_explain_widens_the_bounds(ring):
     assert float((wrong.normal_95_deg / right.normal_95_deg)[shaded].median()) > 1.5
 
 
-def test_fast_knows_what_precise_would_change(ring):
+def test_fast_predicts_what_precise_would_change(ring):
     calibration, _, camera = lights_unit(ring, 0.001)
     fast, precise = (vts.ConfidentPipeline.from_calibration(calibration, mode)(camera(1)) for mode in ("fast", "precise"))
     inside, change = fast.contact, FACTORS.index("pass")
@@ -158,24 +158,24 @@ def test_fast_knows_what_precise_would_change(ring):
     assert float(fast.depth_95_mm[inside].median()) > float(precise.depth_95_mm[inside].median())
 
 
-def test_loosely_pinned_lights_widen_the_bounds(ring):
+def test_poorly_constrained_lights_widen_the_bounds(ring):
     calibration, _, camera = lights_unit(ring)
-    loose = dataclasses.replace(calibration, report=calibration.report | {"direction_std_deg": [5.0, 5.0, 5.0]})
-    pinned, unpinned = (vts.ConfidentPipeline.from_calibration(c)(camera(1)) for c in (calibration, loose))
-    steep = (pinned.gradient.norm(dim=1, keepdim=True) > 0.3) & pinned.contact
-    assert float((unpinned.normal_95_deg / pinned.normal_95_deg)[steep].median()) > 1.3
-    assert float((unpinned.depth_95_mm / pinned.depth_95_mm)[steep].median()) > 1.3
+    poor = dataclasses.replace(calibration, report=calibration.report | {"direction_std_deg": [5.0, 5.0, 5.0]})
+    well, poorly = (vts.ConfidentPipeline.from_calibration(c)(camera(1)) for c in (calibration, poor))
+    steep = (well.gradient.norm(dim=1, keepdim=True) > 0.3) & well.contact
+    assert float((poorly.normal_95_deg / well.normal_95_deg)[steep].median()) > 1.3
+    assert float((poorly.depth_95_mm / well.depth_95_mm)[steep].median()) > 1.3
 
 
 def test_the_held_out_error_of_presses_sets_the_bounds():
-    def bound(**said):
-        calibration, frames = response_unit(**said)
+    def bound(**options):
+        calibration, frames = response_unit(**options)
         out = vts.ConfidentPipeline.from_calibration(calibration, "precise")(frames[:1])
         return float(out.factors_deg[:, FACTORS.index("model")][out.contact[:, 0]].median())
 
     good, bad, few = bound(held_out_deg=1.0), bound(held_out_deg=4.0), bound(held_out_deg=1.0, presses=3)
     assert good < few < bad and bad / good == pytest.approx(4.0, abs=0.1)
-    assert good < bound(held_out_deg=None, source="prior") < bound(held_out_deg=None, source="touches")
+    assert good < bound(held_out_deg=None, source="the sensor's prior") < bound(held_out_deg=None, source="fitted to touches")
 
 
 def test_no_contact(ring):
@@ -192,8 +192,8 @@ def made(request, ring):
     kind, mode = request.param.split()
     if kind == "lights":
         calibration, _, camera = lights_unit(ring)
-        rest = scenes.render(scenes.undeformed(scenes.sphere_press(10.0, 1.0, (0, 0), HEIGHT, WIDTH, PITCH)), ring(), seed=3)
-        frames = torch.cat([camera(1), camera(2, 0.02), rest, camera(3)])
+        untouched = scenes.render(scenes.undeformed(scenes.sphere_press(10.0, 1.0, (0, 0), HEIGHT, WIDTH, PITCH)), ring(), seed=3)
+        frames = torch.cat([camera(1), camera(2, 0.02), untouched, camera(3)])
     else:
         calibration, frames = response_unit()
     return calibration, mode, vts.ConfidentPipeline.from_calibration(calibration, mode), frames
@@ -203,8 +203,8 @@ def test_the_first_four_fields_are_those_of_the_pipeline(made):
     calibration, mode, pipe, frames = made
     out, plain = pipe(frames), vts.DepthPipeline.from_calibration(calibration, mode)(frames)
     assert out._fields[:4] == plain._fields
-    for told, expected in zip(out, plain):
-        assert torch.equal(told, expected)
+    for found, expected in zip(out, plain):
+        assert torch.equal(found, expected)
     assert out.normal_95_deg.shape == out.depth_95_mm.shape == out.confidence.shape == out.contact.shape
     assert out.frame_confidence.shape == (4,) and out.factors_deg.shape == (4, len(FACTORS), *frames.shape[2:])
     assert bool((out.confidence >= 0).all() and (out.confidence <= 1).all() and (out.depth_95_mm >= 0).all())
@@ -234,10 +234,10 @@ def test_it_scripts_and_pickles_and_keeps_its_state(made):
             assert torch.allclose(found.double(), wanted.double(), rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.parametrize("made", ["response precise", pytest.param("lights fast", marks=pytest.mark.long)], indirect=True)
 def test_it_goes_through_torch_export(made):
-    calibration, mode, pipe, frames = made
-    if mode == "auto" or (mode == "precise" and calibration.lights is not None):
-        pytest.skip("the loops of the modes are tested in test_export")
+    """The loops of the other modes are tested in test_export."""
+    *_, pipe, frames = made
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         program = torch.export.export(pipe, (frames,)).module()
@@ -245,7 +245,7 @@ def test_it_goes_through_torch_export(made):
             assert torch.allclose(found.double(), wanted.double(), rtol=1e-2, atol=1e-3)
 
 
-def test_a_calibration_read_from_its_file_tells_the_same(ring, tmp_path):
+def test_a_calibration_read_from_its_file_gives_the_same_bounds(ring, tmp_path):
     for calibration, frames in ((lights_unit(ring)[0], lights_unit(ring)[2](1)), response_unit()):
         calibration.save(tmp_path / "unit.safetensors")
         read = vts.Calibration.load(tmp_path / "unit.safetensors")
@@ -253,41 +253,39 @@ def test_a_calibration_read_from_its_file_tells_the_same(ring, tmp_path):
         assert torch.allclose(now.normal_95_deg, then.normal_95_deg, rtol=1e-3)
 
 
-def test_of_a_learned_module_nothing_is_known(ring):
+def test_a_learned_module_is_refused(ring):
     with pytest.raises(TypeError, match="normals: expected the calibrated NormalFromIntensity, got Conv2d"):
         vts.ConfidentPipeline.from_calibration(lights_unit(ring)[0], normals=nn.Conv2d(3, 3, 1))
 
 
 def test_coverage_says_what_is_missing(ring):
     with pytest.raises(ValueError, match="unit, shape: expected one of"):
-        coverage.random_frame(0, "a guess")
+        random_frame(0, "a guess")
     with pytest.raises(ValueError, match="rows: expected at least one frame"):
         coverage.mean([])
     calibration, scene, camera = lights_unit(ring)
     out = vts.ConfidentPipeline.from_calibration(calibration)(camera(1))
     with pytest.raises(ValueError, match="region: expected at least one pixel"):
-        coverage.coverage(out, scene.depth_mm, scene.normal, torch.zeros_like(out.contact), 1.0)
+        coverage.coverage(out, Truth(scene.depth_mm, scene.normal, torch.zeros_like(out.contact)), 1.0)
 
 
-def test_the_script_makes_table_and_picture(tmp_path):
-    root = Path(__file__).resolve().parents[1]
-    command = [sys.executable, "scripts/confidence.py", "--frames", "1", "--out", str(tmp_path / "coverage.png")]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=root, timeout=300, check=False)
+def test_the_script_makes_table_and_picture(run_script, tmp_path):
+    arguments = ["--frames", 1, "--units", "lights known", "--out", tmp_path / "coverage.png"]
+    done = run_script("confidence", *arguments)
     assert done.returncode == 0, done.stderr
-    assert "| scenes, lights fitted |" in done.stdout and (tmp_path / "coverage.png").stat().st_size > 10_000
+    assert "| scenes, lights known |" in done.stdout and (tmp_path / "coverage.png").stat().st_size > 10_000
 
 
-def test_presses_of_a_real_sensor(data):
-    """By the prior alone, and by a few presses without any: half of the folder is calibrated on, the other half judged."""
-    folder, sensor = data / "gelsight_mini_a", vts.Sensor.load("gelsight_mini")
-    background, presses = vts.read_presses(folder)
-    known = [press for press in presses if press.contact_radius_px is not None]
+@pytest.mark.parametrize("learn", [False, pytest.param(True, marks=pytest.mark.long)])
+def test_presses_of_a_real_sensor(mini_presses, mini_by_prior, learn):
+    """By the prior alone, or by a quarter of the presses without a prior; presses that were not learned from are scored."""
+    background, presses = mini_presses
     learned = [dataclasses.replace(press, center_px=None, contact_radius_px=None) for press in presses[::4]]
     names = {press.name for press in learned}
-    for calibration in (vts.calibrate(background, sensor), vts.calibrate(background, sensor.without_prior(), learned)):
-        pipe = vts.ConfidentPipeline.from_calibration(calibration, "precise")
-        judged = [press for press in known if press.name not in names]
-        rows = [coverage.of_press(pipe(p.image[None]), p, sensor.mm_per_pixel, pipe.confidence.spread) for p in judged]
-        mean = coverage.mean(rows)
-        assert 0.85 <= float(mean.normal[-1]) <= 0.99 and float(mean.depth[-1]) >= 0.85
-        assert float(mean.normal[0]) < 0.8
+    sensor = vts.Sensor.load("gelsight_mini")
+    calibration = vts.calibrate(background, sensor.without_prior(), learned) if learn else mini_by_prior
+    pipe = vts.ConfidentPipeline.from_calibration(calibration, "precise")
+    scored = [press for press in presses if press.contact_radius_px is not None and press.name not in names]
+    mean = coverage.mean([coverage.of_press(pipe(p.image[None]), p, sensor.mm_per_pixel, pipe.confidence.spread) for p in scored])
+    assert 0.85 <= float(mean.normal[-1]) <= 0.99 and float(mean.depth[-1]) >= 0.85
+    assert float(mean.normal[0]) < 0.8

@@ -1,7 +1,6 @@
 """Large data sets: every frame once and the same, whatever the batch, the workers, the processes, and wherever a run was killed."""
 
 import contextlib
-import json
 import os
 import signal
 import subprocess
@@ -15,9 +14,8 @@ import pytest
 import torch
 
 import torchvts as vts
-from torchvts import dataset
 from torchvts.core.files import read_depth_png
-from torchvts.dataset import STATE, list_items, output_stems, reconstruct_dataset
+from torchvts.dataset import STATE, list_items, output_stems, reconstruct, reconstruct_dataset
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPT = ROOT / "scripts" / "reconstruct.py"
@@ -46,27 +44,39 @@ def fill(folder, names):
     return folder
 
 
+def write_film(path, count):
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (WIDTH, HEIGHT))
+    for k in range(count):
+        writer.write(np.ascontiguousarray((image(k) * 255).round().byte().flip(0).permute(1, 2, 0).numpy()))
+    writer.release()
+
+
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory):
-    return fill(tmp_path_factory.mktemp("frames"), [f"{k // 40}/{k:03d}.png" for k in range(120)])
+    """100 images in folders and a film of 20 frames."""
+    folder = fill(tmp_path_factory.mktemp("frames"), [f"{k // 40}/{k:03d}.png" for k in range(100)])
+    write_film(folder / "film.avi", 20)
+    return folder
 
 
 @pytest.fixture(scope="module")
 def whole(unit, frames, tmp_path_factory):
-    """What one process makes of the frames without being disturbed."""
+    """What one process makes of the frames when nothing disturbs it."""
     out = tmp_path_factory.mktemp("whole")
     report = reconstruct_dataset(unit, frames, out, workers=0)
     assert (report.rows, report.before, report.failed) == (120, 0, [])
+    assert (out / "film_000019_depth.png").is_file()
     return contents(out)
 
 
 def contents(out):
-    """Every result with its bytes; nothing half written beside them."""
+    """Every result with its bytes; nothing half written is beside them."""
     return {str(p.relative_to(out)): p.read_bytes() for p in sorted(out.rglob("*")) if p.is_file() and STATE not in p.parts}
 
 
-def logged(out):
-    return sum(path.read_bytes().count(b"\n") for path in (out / STATE).glob("log-*.jsonl"))
+def finished(out):
+    """Number of frames that are done."""
+    return len(list(out.rglob("*_depth.png")))
 
 
 def torchrun(*arguments):
@@ -85,8 +95,8 @@ def family(pid):
     return found
 
 
-def until(condition, process, limit_s=60.0):
-    deadline = time.monotonic() + limit_s
+def wait_for(condition, process):
+    deadline = time.monotonic() + 900.0
     while not condition():
         assert process.poll() is None, process.communicate()[0]
         assert time.monotonic() < deadline
@@ -94,10 +104,8 @@ def until(condition, process, limit_s=60.0):
 
 
 def test_batch_and_workers_do_not_matter(unit, frames, whole, tmp_path):
-    for batch, workers in ((1, 0), (7, 2)):
-        out = tmp_path / f"{batch}"
-        reconstruct_dataset(unit, frames, out, batch=batch, workers=workers)
-        assert contents(out) == whole
+    reconstruct_dataset(unit, frames, tmp_path, batch=7, workers=2)
+    assert contents(tmp_path) == whole
 
 
 @pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
@@ -115,97 +123,55 @@ def test_one_thread_gives_the_same_bits_for_any_batch(unit, mode):
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="finds processes through /proc")
-def test_two_processes_killed_half_way_and_started_again_give_the_same_bytes(unit, frames, whole, tmp_path):
+@pytest.mark.parametrize("killed", ["all", pytest.param("one", marks=pytest.mark.long)])
+def test_killed_processes_lose_nothing_and_the_next_run_goes_on(unit, frames, whole, tmp_path, killed):
     out = tmp_path / "out"
-    first = torchrun(unit, frames, "--out", out, "--batch", 2)
-    until(lambda: logged(out) >= 40, first)
-    for pid in family(first.pid):
+    first = torchrun(unit, frames, "--out", out, "--batch", 2, "--workers", 0)
+    wait_for(lambda: finished(out) >= 20, first)
+    processes = family(first.pid)
+    for pid in processes if killed == "all" else [max(processes)]:
         with contextlib.suppress(ProcessLookupError):  # its parent's death may have ended it
             os.kill(pid, signal.SIGKILL)
     first.communicate()
-    assert 40 <= logged(out) < 120 and not (out / "frames.csv").exists()
-    second = torchrun(unit, frames, "--out", out)
-    printed = second.communicate(timeout=60)[0]
-    assert second.returncode == 0, printed
-    assert "wrote 120 frames" in printed and "; 0 were there before" not in printed
+    done = finished(out)
+    assert first.returncode != 0 and 20 <= done < 120 and not (out / "frames.csv").exists()
+    if killed == "one":  # any number of processes may go on
+        report = reconstruct_dataset(unit, frames, out, workers=0)
+        assert report.rows == 120 and 0 < report.before <= done
+    else:
+        second = torchrun(unit, frames, "--out", out)
+        printed = second.communicate()[0]
+        assert second.returncode == 0, printed
+        assert "wrote 120 frames" in printed and "; 0 were there before" not in printed
     assert contents(out) == whole
 
 
-@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="finds processes through /proc")
-def test_one_killed_process_ends_the_run_and_the_next_one_goes_on(unit, frames, whole, tmp_path):
-    out = tmp_path / "out"
-    first = torchrun(unit, frames, "--out", out, "--workers", 0)
-    until(lambda: logged(out) >= 20, first)
-    last = max(pid for pid in family(first.pid) if pid != first.pid)
-    os.kill(last, signal.SIGKILL)
-    first.communicate(timeout=60)
-    assert first.returncode != 0 and not (out / "frames.csv").exists()
-    report = reconstruct_dataset(unit, frames, out)  # other numbers of processes may go on
-    assert report.before >= 20 and contents(out) == whole
+def test_every_frame_is_in_one_share(unit, frames, whole, tmp_path):
+    """Three ranks one after the other: what each does between the first and the last exchange of counts."""
+    records = reconstruct.Records(frames, tmp_path, reconstruct.Settings("", str(frames), "auto", "png", "none", False, 1, "", ""))
+    calibration = vts.Calibration.load(unit)
+    done = 0
+    for rank in (2, 1, 0):
+        worker = reconstruct._Worker(calibration, records, (rank, 3), strict=True)
+        report = worker.run(4, 0)
+        done += worker.done
+    assert (done, report.rows) == (120, 120) and contents(tmp_path) == whole
 
 
-@pytest.fixture
-def pair(unit, frames, tmp_path):
-    """Two processes without torchrun, which nobody stops if one of them dies."""
-    started = []
-
-    def start(rank, out, port, *options):
-        environment = {**ENVIRONMENT, "RANK": f"{rank}", "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": f"{port}"}
-        command = [sys.executable, SCRIPT, unit, frames, "--out", out, "--workers", 0, *options]
-        started.append(subprocess.Popen(
-            list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-        ))  # fmt: skip
-        return started[-1]
-
-    yield start
-    for process in started:
-        if process.poll() is None:
-            process.kill()
-            process.communicate()
-
-
-def free_port():
-    import socket
-
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
-def test_a_silent_process_is_named_and_does_not_hold_up_the_others(pair, tmp_path):
-    out, port = tmp_path / "out", free_port()
-    first, second = (pair(rank, out, port, "--timeout", 10) for rank in (0, 1))
-    until(lambda: len(list((out / STATE).glob("log-*-1.jsonl"))) == 1, second)
-    second.kill()
-    second.communicate()
-    start = time.monotonic()
-    printed = first.communicate(timeout=60)[1]
-    assert first.returncode == 1 and time.monotonic() - start < 40
-    assert "error: rank 1 has not been heard of for 10 s" in printed, printed
-    assert not (out / "frames.csv").exists()
-
-
-def test_a_process_that_fails_stops_the_others(pair, frames, unit, tmp_path):
-    out, port = tmp_path / "out", free_port()
-    first, second = pair(0, out, port, "--mode", "fast"), pair(1, out, port, "--mode", "precise")
-    errors = [process.communicate(timeout=60)[1] for process in (first, second)]
-    assert (first.returncode, second.returncode) == (1, 1)
-    assert "mode 'fast' then, 'precise' now" in errors[1], errors
-    assert "error: rank 1 stopped" in errors[0], errors
-
-
-def test_a_torn_line_a_lost_file_and_a_changed_image_are_computed_again(unit, whole, frames, tmp_path):
+def test_a_torn_record_a_lost_file_and_a_changed_image_are_computed_again(unit, tmp_path):
     source = fill(tmp_path / "in", [f"{k}.png" for k in range(6)])
+    write_film(source / "film.avi", 6)
     out = tmp_path / "out"
     reconstruct_dataset(unit, source, out, pictures=False)
     before = contents(out)
-    log = next((out / STATE).glob("log-*-0.jsonl"))
-    log.write_bytes(log.read_bytes()[:-10])  # 5.png
+    record = out / STATE / "frames" / "5.json"
+    record.write_bytes(record.read_bytes()[:-10])
     (out / "2_depth.png").unlink()
-    (out / ".3_depth-abcd_123.png").write_bytes(b"left half written")
+    (out / "film_000003_depth.png").unlink()
+    (out / ".3_depth-abcd0123.png").write_bytes(b"left half written")
     vts.write_image(source / "4.png", image(17))
     report = reconstruct_dataset(unit, source, out, pictures=False)
-    assert (report.rows, report.before, report.ranks[0][0]) == (6, 3, 3)
+    assert (report.rows, report.before) == (12, 8)
     after = contents(out)
     assert after.keys() == before.keys()
     changed = {name for name in before if after[name] != before[name]}
@@ -249,11 +215,10 @@ def test_unusable_images_are_named_and_left_out(unit, tmp_path, capsys):
     assert report.failed == [] and report.rows == 5 and not (out / "failed.csv").exists()
 
 
-def test_the_script_ends_with_status_1_where_a_frame_was_left_out(unit, tmp_path):
+def test_the_script_ends_with_status_1_where_a_frame_was_left_out(unit, tmp_path, run_script):
     source = fill(tmp_path / "in", ["a.png", "b.png"])
     (source / "b.png").write_bytes(b"")
-    command = [sys.executable, SCRIPT, unit, source, "--out", tmp_path / "out", "--no-pictures"]
-    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, env=ENVIRONMENT)
+    done = run_script("reconstruct", unit, source, "--out", tmp_path / "out", "--no-pictures")
     assert done.returncode == 1 and "| b.png | " in done.stdout and "wrote 1 frames" in done.stdout
     assert "frames/s" in done.stdout
 
@@ -297,39 +262,17 @@ def test_a_name_that_is_no_text_is_left_out(unit, tmp_path):
     assert '"a, b.png",' in (tmp_path / "out" / "frames.csv").read_text()
 
 
-def write_film(path, count):
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (WIDTH, HEIGHT))
-    for k in range(count):
-        writer.write(np.ascontiguousarray((image(k) * 255).round().byte().flip(0).permute(1, 2, 0).numpy()))
-    writer.release()
-
-
-def test_a_film_is_shared_and_continued(unit, pair, tmp_path):
-    write_film(tmp_path / "film.avi", 12)
-    single, shared = tmp_path / "single", tmp_path / "shared"
-    report = reconstruct_dataset(unit, tmp_path / "film.avi", single, pictures=False)
-    assert report.rows == 12 and (single / "film_000011_depth.png").is_file()
-    process = torchrun(unit, tmp_path / "film.avi", "--out", shared, "--no-pictures")
-    assert process.communicate(timeout=60)[0] is not None and process.returncode == 0
-    assert contents(shared) == contents(single)
-    for name in ("film_000003_depth.png", "film_000004_depth.png", "film_000009_depth.png"):
-        (shared / name).unlink()
-    report = reconstruct_dataset(unit, tmp_path / "film.avi", shared, pictures=False, workers=1)
-    assert (report.rows, report.before, report.ranks[0][0]) == (12, 9, 3) and contents(shared) == contents(single)
-
-
 def test_depth_beyond_a_png_is_left_out_and_a_full_disk_stops(unit, tmp_path, monkeypatch):
     source = fill(tmp_path / "in", ["a.png", "b.png"])
 
     def refuse(path, depth_mm):
         raise ValueError("depth_mm: too deep") if Path(path).name.startswith("a_") else OSError("no space left")
 
-    monkeypatch.setattr(dataset, "write_depth_png", refuse)
+    monkeypatch.setattr(reconstruct, "write_depth_png", refuse)
     with pytest.raises(OSError, match="no space left"):
         reconstruct_dataset(unit, source, tmp_path / "out", pictures=False)
     monkeypatch.undo()
-    lines = [json.loads(line) for log in (tmp_path / "out" / STATE).glob("log-*-0.jsonl") for line in log.read_text().splitlines()]
-    assert lines[0]["failed"] == "depth_mm: too deep"
+    assert '"failed": "depth_mm: too deep"' in (tmp_path / "out" / STATE / "frames" / "a.json").read_text()
     report = reconstruct_dataset(unit, source, tmp_path / "out", pictures=False)
     assert report.rows == 2 and read_depth_png(tmp_path / "out" / "a_depth.png").shape == (1, 1, HEIGHT, WIDTH)
 

@@ -1,29 +1,26 @@
-"""Scores against balls: exact for exact presses, of known error for wrong ones; both scripts at small scale."""
+"""Scores against balls: zero for exact presses, of known size for wrong ones; both scripts at small scale."""
 
 import csv
 import json
 import math
 import shutil
-import subprocess
-import sys
-from pathlib import Path
+from functools import partial
 
 import pytest
 import torch
 
 import torchvts as vts
 from torchvts.core.geometry import normal_from_gradient
-from torchvts.evaluation import score as ev
+from torchvts.evaluation import evaluate as ev
+from torchvts.evaluation import methods, rows
+from torchvts.evaluation.figures import error_figure, error_map_name, press_figure
+from torchvts.evaluation.presses import Training, train_network
+from torchvts.evaluation.score import ball_truth, score_press
 from torchvts.model.gs_sdk import CATALOG_COLUMNS, LABEL_COLUMNS
 
-ROOT = Path(__file__).resolve().parents[1]
 HEIGHT, WIDTH, PITCH = 96, 128, 0.15
 CENTERS = ((-3.0, -2.0), (3.5, -2.5), (0.0, 0.5), (-4.0, 2.5), (3.0, 2.5), (0.5, -3.0))
 BALL_MM, PRESS_MM = 10.0, 0.6
-
-
-def call(*arguments):
-    return subprocess.run([sys.executable, *map(str, arguments)], capture_output=True, text=True, cwd=ROOT, timeout=300)
 
 
 def ball(center_mm):
@@ -47,16 +44,16 @@ def folder(tmp_path_factory):
     for k, center_mm in enumerate(CENTERS):
         scene = ball(center_mm)
         if k == 0:
-            rest = vts.scenes.render(vts.scenes.undeformed(scene), lights, noise_std=0.002)
-            vts.write_image(folder / "background.png", rest[0].detach())
+            background = vts.scenes.render(vts.scenes.undeformed(scene), lights, noise_std=0.002)
+            vts.write_image(folder / "background.png", background[0].detach())
         (folder / f"ball/{k}").mkdir(parents=True)
         image = vts.scenes.render(scene, lights, noise_std=0.002, seed=1 + k)[0].detach()
         vts.write_image(folder / f"ball/{k}" / "gelsight.png", image)
         catalog.append((f"ball/{k}", BALL_MM))
         labels.append((f"ball/{k}", BALL_MM, *center_px(center_mm), "" if k == 5 else contact_radius_px()))
-    for name, rows in (("catalog.csv", catalog), ("labels.csv", labels)):
+    for name, lines in (("catalog.csv", catalog), ("labels.csv", labels)):
         with (folder / name).open("w", newline="") as stream:
-            csv.writer(stream).writerows(rows)
+            csv.writer(stream).writerows(lines)
     vts.Sensor("rig", HEIGHT, WIDTH, PITCH, gamma=1.0).save(folder / "rig.yaml")
     return folder
 
@@ -70,18 +67,18 @@ def press():
 
 def test_an_exact_press_has_no_error(press):
     given, scene = press
-    score = ev.score_press(given, scene.depth_mm, scene.normal, PITCH, "exact")
+    score = score_press(given, scene.depth_mm, scene.normal, PITCH, "exact")
     assert score.normal_deg < 1e-3 and score.relief_um < 1e-2
     assert score.radius_percent < 1e-2 and score.center_px < 1e-2 and abs(score.apex_um) < 1e-2
     assert (score.press, score.method) == ("exact", "exact")
-    region = ev.ball_truth(given, HEIGHT, WIDTH, PITCH).region
+    region = ball_truth(given, HEIGHT, WIDTH, PITCH).region
     assert sum(score.by_slope_pixels) == sum(score.by_place_pixels) == int(region.sum())
     assert bool(scene.contact[region].all())
 
 
 def test_truth_is_the_scenes_own(press):
     given, scene = press
-    truth = ev.ball_truth(given, HEIGHT, WIDTH, PITCH)
+    truth = ball_truth(given, HEIGHT, WIDTH, PITCH)
     torch.testing.assert_close(
         truth.gradient.float()[truth.region.expand(1, 2, -1, -1)],
         scene.gradient[truth.region.expand(1, 2, -1, -1)],
@@ -96,20 +93,20 @@ def test_a_turned_normal_is_off_by_its_angle(press):
     turn = torch.tensor(
         [[math.cos(angle), 0.0, math.sin(angle)], [0.0, 1.0, 0.0], [-math.sin(angle), 0.0, math.cos(angle)]], dtype=torch.float64
     )
-    # n_y keeps its length: a normal turns about y by less than the angle where it leans along y
-    truth = ev.ball_truth(given, HEIGHT, WIDTH, PITCH)
+    # n_y keeps its length: a normal turns about y by less than the angle where it tilts along y
+    truth = ball_truth(given, HEIGHT, WIDTH, PITCH)
     normal = normal_from_gradient(truth.gradient)
     n_y = normal[:, 1][truth.region[:, 0]]
     cosine = n_y**2 + (1 - n_y**2) * math.cos(angle)
-    score = ev.score_press(given, scene.depth_mm, torch.einsum("ij,bjhw->bihw", turn, normal), PITCH)
+    score = score_press(given, scene.depth_mm, torch.einsum("ij,bjhw->bihw", turn, normal), PITCH)
     assert score.normal_deg == pytest.approx(float(torch.rad2deg(torch.acos(cosine)).mean()), abs=1e-6)
     assert 6.0 < score.normal_deg < 7.0 and score.relief_um < 1e-2
 
 
 def test_a_scaled_depth_is_off_by_its_scale(press):
     given, scene = press
-    score = ev.score_press(given, 1.1 * scene.depth_mm.double(), scene.normal, PITCH)
-    truth = ev.ball_truth(given, HEIGHT, WIDTH, PITCH)
+    score = score_press(given, 1.1 * scene.depth_mm.double(), scene.normal, PITCH)
+    truth = ball_truth(given, HEIGHT, WIDTH, PITCH)
     cap = truth.depth_mm[truth.region]
     assert score.relief_um == pytest.approx(100.0 * float(cap.std(correction=0)), rel=1e-3)
     assert score.tilt_um < 1e-2 * score.relief_um  # a ball in the middle scaled is no plane
@@ -124,8 +121,8 @@ def test_a_tilted_depth_moves_the_fitted_ball(press):
     given, scene = press
     slope = 0.05
     tilt = slope * PITCH * torch.arange(WIDTH, dtype=torch.float64).expand(1, 1, HEIGHT, WIDTH)
-    score = ev.score_press(given, scene.depth_mm.double() + tilt, scene.normal, PITCH)
-    truth = ev.ball_truth(given, HEIGHT, WIDTH, PITCH)
+    score = score_press(given, scene.depth_mm.double() + tilt, scene.normal, PITCH)
+    truth = ball_truth(given, HEIGHT, WIDTH, PITCH)
     assert score.relief_um == pytest.approx(1000.0 * float(tilt[truth.region].std(correction=0)), rel=1e-3)
     assert score.tilt_um == pytest.approx(score.relief_um, rel=1e-3)
     assert score.center_px == pytest.approx(slope * 0.5 * BALL_MM / PITCH, rel=0.15)
@@ -133,8 +130,8 @@ def test_a_tilted_depth_moves_the_fitted_ball(press):
 
 def test_a_flat_depth_has_no_sphere(press):
     given, scene = press
-    rest = vts.scenes.undeformed(scene)
-    score = ev.score_press(given, rest.depth_mm, rest.normal, PITCH)
+    flat = vts.scenes.undeformed(scene)
+    score = score_press(given, flat.depth_mm, flat.normal, PITCH)
     assert score.radius_percent is None and score.center_px is None
     assert score.apex_um < -100.0 and score.normal_deg > 5.0
     means = [value for value in score.by_slope_deg if value is not None]
@@ -144,14 +141,14 @@ def test_a_flat_depth_has_no_sphere(press):
 def test_bad_arguments_are_named(press, folder):
     given, scene = press
     with pytest.raises(ValueError, match="press: expected one with center_px"):
-        ev.ball_truth(vts.Press(given.image, BALL_MM, "bare"), HEIGHT, WIDTH, PITCH)
+        ball_truth(vts.Press(given.image, BALL_MM, "bare"), HEIGHT, WIDTH, PITCH)
     with pytest.raises(ValueError, match="normal: expected"):
-        ev.score_press(given, scene.depth_mm, scene.normal[..., :-1], PITCH)
+        score_press(given, scene.depth_mm, scene.normal[..., :-1], PITCH)
     with pytest.raises(ValueError, match="depth_mm: expected one frame"):
-        ev.score_press(given, scene.depth_mm.expand(2, 1, -1, -1), scene.normal, PITCH)
+        score_press(given, scene.depth_mm.expand(2, 1, -1, -1), scene.normal, PITCH)
     with pytest.raises(ValueError, match="10 are needed"):
         faint = vts.Press(given.image, BALL_MM, "faint", given.center_px, 4.0)
-        ev.score_press(faint, scene.depth_mm, scene.normal, PITCH)
+        score_press(faint, scene.depth_mm, scene.normal, PITCH)
     sensor = vts.Sensor.load(folder / "rig.yaml")
     for arguments, message in (
         ({"methods": ["magic"]}, "methods: expected some of"),
@@ -163,65 +160,65 @@ def test_bad_arguments_are_named(press, folder):
             ev.evaluate(folder, sensor, **arguments)
 
 
-def test_evaluate_writes_table_rows_and_pictures(folder, tmp_path):
-    arguments = ["--sensor", folder / "rig.yaml", "--folds", 2, "--out", tmp_path]
-    done = call("scripts/evaluate.py", folder, *arguments)
+def test_evaluate_writes_table_rows_and_pictures(run_script, monkeypatch, folder, tmp_path):
+    monkeypatch.setattr(methods, "train_network", partial(train_network, max_epochs=15))
+    done = run_script("evaluate", folder, "--sensor", folder / "rig.yaml", "--folds", 2, "--out", tmp_path)
     assert done.returncode == 0, done.stderr
-    rows = json.loads((tmp_path / "scores.json").read_text())
-    summary = {row["method"]: row for row in rows if row["kind"] == "method"}
-    assert list(summary) == [name for name in ev.METHODS if name != "response precise, prior"]  # the file has none
-    assert sum(row["kind"] == "press" for row in rows) == 5 * len(summary)
-    assert all("scripts/evaluate.py" in row["command"] for row in rows)
-    # exact lights, little noise: the model is right, and learning from three presses beats saying nothing
-    assert summary["point lights"]["normal_deg"] < 1.5
-    assert summary["response precise"]["normal_deg"] < 3.0
+    document = json.loads((tmp_path / "scores.json").read_text())
+    summary = {row.method: row for row in rows.from_json(json.dumps(document["rows"]))}
+    assert list(summary) == [name for name in ev.COMPARED if name != "response precise, prior"]  # the file has none
+    assert len(document["scores"]) == 5 * len(summary) and "scripts/evaluate.py" in document["command"]
+    # exact lights, little noise: the model is right, and learning from three presses beats zero depth
+    assert summary["point lights"].errors["normal_deg"] < 1.5
+    assert summary["response precise"].errors["normal_deg"] < 3.0
     for name in ("look-up table", "MLP"):
-        assert summary[name]["normal_deg"] < 0.8 * summary["flat"]["normal_deg"]
-    assert summary["flat"]["radius_percent"] is None and summary["flat"]["numbers"] == 0
+        assert summary[name].errors["normal_deg"] < 0.8 * summary["flat"].errors["normal_deg"]
+    assert summary["flat"].error("radius_percent") is None and summary["flat"].parameters == 0
     assert "not scored, no contact radius: ball/5" in done.stdout
     assert done.stdout.splitlines()[2].startswith("| flat | 0 |")
     assert (tmp_path / "table.md").read_text().startswith("| method |")
     pictures = sorted(path.name for path in tmp_path.glob("*.png"))
-    assert pictures == sorted([ev.error_map_name(name) for name in summary] + ["press.png"])
+    assert pictures == sorted([error_map_name(name) for name in summary] + ["press.png"])
 
 
-def test_evaluate_on_a_second_folder_and_with_a_trained_network(folder, tmp_path):
+def test_evaluate_on_a_second_folder_and_with_a_trained_network(run_script, folder, tmp_path):
     network = tmp_path / "mlp.safetensors"
-    done = call("scripts/train_mlp.py", folder, "--sensor", folder / "rig.yaml", "--out", network, "--max-epochs", 3)
+    done = run_script("train_mlp", folder, "--sensor", folder / "rig.yaml", "--out", network, "--max-epochs", 3)
     assert done.returncode == 0, done.stderr
     assert "held out" in done.stdout and "2370 weights" in done.stdout
     sensor = vts.Sensor.load(folder / "rig.yaml")
     result = ev.evaluate(folder, sensor, ["response fast"], test=folder, network_path=network, limit=4)
-    assert [row.method for row in result.summaries] == ["response fast", ev.GIVEN_NETWORK]
-    assert "4 presses learned from" in result.how and "very presses" in result.summaries[1].note
-    assert result.summaries[0].normal_deg < 3.0
+    assert [row.method for row in result.rows] == ["response fast", ev.GIVEN_NETWORK]
+    assert "4 presses learned from" in result.how and "very presses" in result.rows[1].note
+    assert result.rows[0].errors["normal_deg"] < 3.0
     with pytest.raises(ValueError, match="method: expected one that was evaluated"):
-        ev.error_figure(result, "MLP")
+        error_figure(result, "MLP")
     with pytest.raises(ValueError, match="methods: expected some of response fast"):
-        ev.press_figure(result)
+        press_figure(result)
 
 
-def test_without_labels_balls_are_found(folder, tmp_path):
+def test_without_labels_balls_are_found(folder, monkeypatch, tmp_path):
     sensor = vts.Sensor.load(folder / "rig.yaml")
-    background, presses = vts.read_presses(folder)
+    _, presses = vts.read_presses(folder)
     assert presses[0].center_px is not None and presses[5].contact_radius_px is None
-    training = ev.Training(background, presses, sensor)
+    bare = shutil.copytree(folder, tmp_path / "bare", ignore=shutil.ignore_patterns("labels.csv"))
+    training = Training(*vts.read_presses(bare), sensor)
     for found, given in zip(training.located, presses, strict=True):
         assert math.dist(found.center_px, given.center_px) < 1.5
-    bare = shutil.copytree(folder, tmp_path / "bare", ignore=shutil.ignore_patterns("labels.csv"))
+    monkeypatch.setattr(Training, "located", training.located)  # the same presses again
     result = ev.evaluate(bare, sensor, ["flat"], folds=1)
-    assert "centers from calibrate, which saw all presses (6)" in result.how and result.summaries[0].presses == 6
-    fit = ev.train_network(*vts.read_presses(bare), sensor, max_epochs=2)
+    assert "centers from calibrate, which saw all presses (6)" in result.how and result.rows[0].frames == 6
+    fit = train_network(*vts.read_presses(bare), sensor, max_epochs=2)
     assert len(fit.history) == 2 and "raise max_epochs" in fit.message
 
 
-def test_scripts_refuse_bad_input_in_a_sentence(folder, tmp_path):
+def test_scripts_refuse_bad_input_in_a_sentence(run_script, folder, tmp_path):
     for arguments, part in (
-        (["scripts/evaluate.py", tmp_path / "none", "--out", tmp_path], "no such folder"),
-        (["scripts/evaluate.py", folder, "--methods", "magic", "--out", tmp_path], "methods"),
-        (["scripts/train_mlp.py", folder, "--sensor", "gelsight_mini", "--out", tmp_path / "a.safetensors"], "gelsight_mini"),
+        (["evaluate", tmp_path / "none", "--out", tmp_path], "no such folder"),
+        (["evaluate", folder, "--methods", "magic", "--out", tmp_path], "methods"),
+        (["train_mlp", folder, "--sensor", "gelsight_mini", "--out", tmp_path / "a.safetensors"], "gelsight_mini"),
     ):
-        done = call(*arguments)
+        done = run_script(*arguments)
         assert done.returncode == 1
         assert done.stderr.startswith("error: ") and part in done.stderr, done.stderr
         assert "Traceback" not in done.stderr

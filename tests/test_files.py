@@ -60,7 +60,7 @@ def test_what_is_no_image_is_refused(tmp_path, content):
         vts.read_image(tmp_path / "image.png")
 
 
-def test_a_missing_image_is_said_to_be_missing(tmp_path):
+def test_a_missing_image_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match="expected an image, got a folder"):
         vts.read_image(tmp_path)
     with pytest.raises(FileNotFoundError, match=r"nowhere\.png: no such image"):
@@ -200,12 +200,12 @@ def test_broken_clouds_are_refused(tmp_path, clouds):
 @pytest.mark.parametrize("suffix", [".ply", ".pcd"])
 def test_clouds_are_read_as_open3d_reads_them(tmp_path, clouds, suffix, form):
     o3d, path = clouds.open3d(), tmp_path / f"cloud{suffix}"
-    numbers = np.random.default_rng(0).integers(0, 4, (300, 3)).astype(float)  # which repeat, so that there is what to compress
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(numbers))
-    cloud.colors = o3d.utility.Vector3dVector(numbers / 4)
-    cloud.normals = o3d.utility.Vector3dVector(numbers)
+    points = np.random.default_rng(0).integers(0, 4, (300, 3)).astype(float)  # values repeat, so that the file can be compressed
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    cloud.colors = o3d.utility.Vector3dVector(points / 4)
+    cloud.normals = o3d.utility.Vector3dVector(points)
     o3d.io.write_point_cloud(str(path), cloud, **form)
-    points, normals = clouds.read_point_cloud(path)
+    found, normals = clouds.read_point_cloud(path)
     expected = o3d.io.read_point_cloud(str(path))
-    assert np.array_equal(points.numpy(), np.asarray(expected.points))
+    assert np.array_equal(found.numpy(), np.asarray(expected.points))
     assert np.array_equal(normals.numpy(), np.asarray(expected.normals))

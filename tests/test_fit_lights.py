@@ -1,4 +1,4 @@
-"""Lights from one image without contact, and how honestly the fit speaks of itself."""
+"""Point lights from one background: the fit, its stated uncertainty, and the choice of a model."""
 
 import dataclasses
 import json
@@ -45,10 +45,10 @@ def small_fit(small_background, small_sensor):
 
 
 def test_low_lights_of_a_worn_unit(low_rig):
-    sensor = vts.Sensor("rig", 480, 640, 0.0625)
-    fit = vts.fit_lights(rest(low_rig, sensor, noise_std=0.01, bits=8, spots=scenes.skin_spots(480, 640), seed=1), sensor)
+    sensor = vts.Sensor("rig", 240, 320, 0.125)
+    fit = vts.fit_lights(rest(low_rig, sensor, noise_std=0.01, bits=8, spots=scenes.skin_spots(240, 320), seed=1), sensor)
     assert fit.converged
-    assert furthest_mm(fit.lights, low_rig) < 0.02  # the aim is 0.1
+    assert furthest_mm(fit.lights, low_rig) < 0.04  # the aim is 0.1
     assert float((fit.lights.albedo.detach() / low_rig.albedo - 1).abs().max()) < 0.002
     assert fit.noise_std.tolist() == pytest.approx([0.01] * 3, rel=0.06)
     assert 0.8 < fit.inlier_fraction < 1.0
@@ -79,7 +79,7 @@ def tiny(low_rig):
     return sensor, background, vts.fit_lights(background, sensor)
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_a_random_start_ends_at_the_same_lights_or_says_that_it_did_not(tiny, seed):
     sensor, background, reference = tiny
     fit = vts.fit_lights(background, sensor, start=random_start(seed))
@@ -129,7 +129,7 @@ def test_the_response_of_the_camera_is_part_of_the_model(ring, small_sensor):
     assert furthest_mm(vts.fit_lights(image, small_sensor).lights, lights) > 5.0
 
 
-VIGNETTED, LIT, BOTH = ("three lights, vignetting", "three lights, ambient light", "three lights, vignetting, ambient light")
+VIGNETTED, LIT = "three lights, vignetting", "three lights, ambient light"
 
 
 def seen(scene, lights, vignetting=0.0, ambient=0.0, gamma=1.0, noise_std=0.003, bits=8):
@@ -152,7 +152,6 @@ CAMERAS = {
     "clean": ({}, "three lights", 1.0),
     "vignetting": ({"vignetting": 0.2}, VIGNETTED, 1.0),
     "ambient": ({"ambient": 0.1}, LIT, 1.0),
-    "both": ({"vignetting": 0.2, "ambient": 0.1}, BOTH, 1.0),
     "gamma": ({"gamma": 2.2}, "three lights", 2.2),
     "gamma, vignetting": ({"gamma": 2.2, "vignetting": 0.2}, VIGNETTED, 2.2),
 }
@@ -180,11 +179,11 @@ def test_the_table_of_candidates_says_what_was_tried_and_why_not(low_rig, small_
     assert (
         first["family"] == VIGNETTED
         and first["parameters"] == 13
-        and first["note"].startswith("one image leaves the lights 0.0 deg")
+        and first["note"].startswith("one image constrains the lights to 0.0 deg")
     )
-    assert {row["family"] for row in others} >= {"three lights", LIT, BOTH}
+    assert {row["family"] for row in others} >= {"three lights", LIT}
     assert all(row["model"] == "point lights" and row["held_out"] > 0 for row in others)
-    assert next(row for row in others if row["family"] == LIT)["note"].startswith("not taken: ")
+    assert next(row for row in others if row["family"] == LIT)["note"].startswith("rejected: ")
     assert "three lights, vignetting: the smallest within 1%" in calibration.report["reason"]
     assert "-> 0.0%" in calibration.report["reason"]
 
@@ -217,19 +216,19 @@ def test_azimuths_in_the_wrong_order_are_complained_of(low_rig):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", vts.CalibrationWarning)
         calibration = vts.calibrate(rest(low_rig, sensor, noise_std=0.005, bits=8), sensor)
-    assert any("one image does not pin R" in str(warning.message) for warning in caught)
+    assert any("one image does not constrain R" in str(warning.message) for warning in caught)
     free = next(row for row in calibration.report["candidates"] if row["family"] == "three lights")
-    assert "not taken: light R stands -120 deg off the azimuth in the sensor file" in free["note"]
+    assert "rejected: light R is -120 deg off the azimuth in the sensor file" in free["note"]
 
 
 def test_an_azimuth_that_no_file_names_is_refused(tiny):
     with pytest.raises(ValueError, match="known_azimuth: sensor 'rig' names no light_azimuth_deg"):
         vts.fit_lights(tiny[1], tiny[0], known_azimuth=True)
-    with pytest.raises(ValueError, match="vignetting: expected 0, 1 or 2 numbers"):
+    with pytest.raises(TypeError, match="vignetting: expected true or false, got 3"):
         vts.fit_lights(tiny[1], tiny[0], vignetting=3)
 
 
-@pytest.mark.parametrize("extra", [{"vignetting": 1}, {"ambient": True}, {"vignetting": 1, "ambient": True}])
+@pytest.mark.parametrize("extra", [{"vignetting": True}, {"ambient": True}])
 def test_the_stated_spread_of_a_larger_model_is_the_true_one(low_rig, small_sensor, extra):
     scores = []
     for seed in range(4):
@@ -277,9 +276,7 @@ def test_a_clean_background_warns_of_nothing(small_background, small_sensor):
 def test_contact_in_the_background_is_noticed(low_rig, small_sensor, press_mm, center_mm):
     scene = scenes.sphere_press(10.0, press_mm, center_mm, 120, 160, 0.25)
     image = scenes.render(scene, low_rig, noise_std=0.005, bits=8)[0]
-    with pytest.warns(
-        vts.CalibrationWarning, match=r"background: .*% of the image stands out .* contact in the calibration image\?"
-    ):
+    with pytest.warns(vts.CalibrationWarning, match=r"background: .*% of the image differs .* contact in the calibration image\?"):
         vts.calibrate(image, small_sensor)
 
 

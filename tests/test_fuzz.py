@@ -1,8 +1,9 @@
-"""Files from elsewhere: cut, flipped, lying about their size, hostile. They are refused in words, or read; nothing else happens.
+"""Damaged and hostile files: they are read, or refused with a message that names the file, and nothing else happens.
 
-Every file that torchvts reads is damaged many times by chance and a few times on purpose, and read in a child process whose memory
-is bounded. It must neither crash, nor hang, nor run anything, nor grow; what it raises must be ValueError, TypeError or OSError and
-name the file. A process killed while it saves leaves the old file or the new one, whole.
+Every kind of file that torchvts reads is damaged many times at random and a few times on purpose, and read in a child process whose
+memory is bounded. The child must neither crash nor hang, run no code of the file, and stay within its memory; it may raise
+ValueError, TypeError or OSError, and the message must name the file. A process that is killed while it saves leaves either the old
+file or the new one, complete.
 
 `make test` damages each file some dozens of times; `make test-long` (TORCHVTS_TEST_PROFILE=long) some thousands.
 """
@@ -34,7 +35,7 @@ from torchvts.model.response_field import ResponseField, ResponseModel
 
 LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
 DAMAGES = 3000 if LONG else 40
-KILLS = 60 if LONG else 5
+KILLS = 60 if LONG else 20
 MEMORY = 2**30
 """Bytes of address space that reading one damaged file may take beyond what the process has."""
 SENSOR = vts.Sensor("rig", 24, 32, 1.25)
@@ -176,14 +177,20 @@ def damaged(content, rng):
     return bytes(data)
 
 
-def child(folder, names, count, seed):
-    """Read damaged files, and say after each what came of it. Runs in a process of its own."""
+def child(damaged_folder, claims_folder, count, seed):
+    """Read damaged files, then files with false claims, and print the outcome of each. Runs in a process of its own."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    folder = Path(folder)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
-    for name in names:
+    read_damaged(Path(damaged_folder), count, seed)
+    for label, (name, _) in CLAIMS.items():
+        print(json.dumps([label, None]), end=" ", flush=True)
+        print(json.dumps(outcome(READERS[name][1], Path(claims_folder) / label / name)), flush=True)
+
+
+def read_damaged(folder, count, seed):
+    for name in READERS:
         read = READERS[name][1]
         content = (folder / name).read_bytes()
         rng = random.Random(f"{seed} {name}")
@@ -193,11 +200,11 @@ def child(folder, names, count, seed):
                 path = folder / f"gs_sdk_{name}" / name
             path.write_bytes(damaged(content, rng))
             print(json.dumps([name, number]), end=" ", flush=True)
-            print(json.dumps(told(read, path)), flush=True)
+            print(json.dumps(outcome(read, path)), flush=True)
 
 
-def told(read, path):
-    """What reading a file came to: kind of the error, and its text."""
+def outcome(read, path):
+    """What reading a file led to: kind of the error, its text, and the text's length."""
     try:
         read(path)
     except (ValueError, TypeError, OSError) as error:
@@ -207,8 +214,8 @@ def told(read, path):
     return ["read", "", 0]
 
 
-def prepare(folder, names):
-    for name in names:
+def write_whole_files(folder):
+    for name in READERS:
         if name in ("catalog.csv", "labels.csv", "label.npz", "gelsight.png"):
             (folder / f"gs_sdk_{name}").mkdir()
             READERS[name][0](folder / f"gs_sdk_{name}" / name)
@@ -217,37 +224,61 @@ def prepare(folder, names):
             READERS[name][0](folder / name)
 
 
-def run_child(program, timeout_s=120, check=True):
-    """A Python process with this file imported."""
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
-    command = [sys.executable, "-W", "ignore", "-c", f"import test_fuzz\n{program}"]
+def write_claims(folder):
+    for label, (name, content) in CLAIMS.items():
+        (folder / label).mkdir()
+        if name == "catalog.csv":
+            write_folder(folder / label / name)
+        with (folder / label / name).open("wb") as stream:
+            if content is None:
+                stream.truncate(2**40)
+            else:
+                stream.write(content)
+
+
+ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+
+
+@pytest.fixture(scope="module")
+def outcomes(tmp_path_factory):
+    """What reading came to in a child process: (name, number or None, kind of error, text, length of the text) for each file."""
+    damaged_folder, claims_folder = (tmp_path_factory.mktemp(name) for name in ("damaged", "claims"))
+    write_whole_files(damaged_folder)
+    write_claims(claims_folder)
+    program = f"import test_fuzz\ntest_fuzz.child({str(damaged_folder)!r}, {str(claims_folder)!r}, {DAMAGES}, 0)"
     done = subprocess.run(
-        command, env=environment, capture_output=True, text=True, errors="replace", timeout=timeout_s, check=False
-    )
-    if check:
-        assert done.returncode == 0, f"{done.stdout[-300:]}\n{done.stderr[-1500:]}"
-    return done
-
-
-def test_damaged_files_are_refused_in_words(tmp_path):
-    names = list(READERS)
-    prepare(tmp_path, names)
-    run = f"test_fuzz.child({str(tmp_path)!r}, {names!r}, {DAMAGES}, 0)"
-    done = run_child(run, 1800 if LONG else 120, check=False)
-    assert done.returncode == 0, f"died of {done.stdout.splitlines()[-1:]} (its file is in {tmp_path}): {done.stderr[-800:]}"
+        [sys.executable, "-W", "ignore", "-c", program],
+        env=ENVIRONMENT, capture_output=True, text=True, errors="replace", timeout=3600, check=False,
+    )  # fmt: skip
     lines = [line.split("] ", 1) for line in done.stdout.splitlines() if line.startswith('["')]
-    assert len(lines) == DAMAGES * len(names)
-    wrong = []
-    for head, tail in lines:
-        (name, number), (kind, text, length) = json.loads(head + "]"), json.loads(tail)
-        if (
-            kind.startswith("UNEXPECTED")
-            or (kind != "read" and (str(tmp_path) not in text or text.startswith("[Errno")))
-            or length > 5000
-        ):
-            wrong.append((name, number, kind, text[:300]))
+    last = f"{lines[-1:]} (its file is in {damaged_folder} or {claims_folder})"
+    assert done.returncode == 0, f"the child died at {last}: {done.stderr[-800:]}"
+    return [(*json.loads(head + "]"), *json.loads(tail)) for head, tail in lines]
+
+
+def test_damaged_files_are_refused_with_a_message(outcomes):
+    damaged_files = [row for row in outcomes if row[1] is not None]
+    assert len(damaged_files) == DAMAGES * len(READERS)
+    wrong = [
+        row
+        for row in damaged_files
+        if row[2].startswith("UNEXPECTED") or row[4] > 5000 or (row[2] != "read" and not names_its_file(row[3], "damaged"))
+    ]
     assert wrong == []
-    assert sum(json.loads(tail)[0] != "read" for _, tail in lines) > 0.1 * len(lines)  # the damage does harm
+    assert sum(row[2] != "read" for row in damaged_files) > 0.1 * len(damaged_files)  # the damage does harm
+
+
+def test_claims_beyond_all_memory_are_refused_with_a_message(outcomes):
+    claims = [row for row in outcomes if row[1] is None]
+    assert [row[0] for row in claims] == list(CLAIMS)
+    wrong = [
+        row for row in claims if row[2] not in ("ValueError", "TypeError") or row[4] > 5000 or not names_its_file(row[3], "claims")
+    ]
+    assert wrong == []
+
+
+def names_its_file(text, folder):
+    return f"{os.sep}{folder}" in text and not text.startswith("[Errno")
 
 
 # ---- claims ----
@@ -331,32 +362,6 @@ CLAIMS = {
     },
     "numbers for weights": ("nnmodel.pth", b"\x80\x02" + b"(" * 100_000),
 }
-
-
-def all_told(folder):
-    """Tell of the claims, one after another, with memory bounded."""
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
-    for label, (name, _) in CLAIMS.items():
-        print(json.dumps([label, *told(READERS[name][1], Path(folder) / label / name)]), flush=True)
-
-
-def test_claims_beyond_all_memory_are_refused_in_words(tmp_path):
-    for label, (name, content) in CLAIMS.items():
-        (tmp_path / label).mkdir()
-        if name == "catalog.csv":
-            write_folder(tmp_path / label / name)
-        with (tmp_path / label / name).open("wb") as stream:
-            if content is None:
-                stream.truncate(2**40)
-            else:
-                stream.write(content)
-    done = run_child(f"test_fuzz.all_told({str(tmp_path)!r})", 100, check=False)
-    lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[")]
-    assert done.returncode == 0, f"died after {lines[-1:]}: {done.stderr[-800:]}"
-    assert [line[0] for line in lines] == list(CLAIMS)
-    bad = [line for line in lines if line[1] not in ("ValueError", "TypeError") or str(tmp_path) not in line[2] or line[3] > 5000]
-    assert bad == []
 
 
 def test_a_label_that_claims_a_terabyte_is_refused(tmp_path):
@@ -452,8 +457,8 @@ def special(tmp_path, kind, suffix):
 )
 def test_what_is_no_plain_file_is_refused(tmp_path, kind, name):
     path = special(tmp_path, kind, Path(name).suffix)
-    done = told(READERS[name][1], path)
-    assert done[0] in ("FileNotFoundError", "ValueError") and "special" in done[1] and not done[1].startswith("[Errno"), done
+    kind_of_error, text, _ = outcome(READERS[name][1], path)
+    assert kind_of_error in ("FileNotFoundError", "ValueError") and "special" in text and not text.startswith("[Errno"), text
 
 
 @pytest.mark.parametrize("kind", ["folder", "device", "loop", "NUL"])
@@ -473,10 +478,10 @@ def test_nothing_is_written_over_what_is_no_plain_file(tmp_path, kind, name):
 # ---- saving ----
 
 
-def save_for_ever(path, kind):
-    """Save two contents by turns until killed."""
+def save_for_ever(folder, kinds):
+    """Save two contents of each kind by turns until killed."""
     torch.set_num_threads(1)
-    savers = {
+    all_savers = {
         "unit.safetensors": [by_lights().save, by_response().save],
         "rig.yaml": [vts.Sensor("one", 24, 32, 1.25).save, vts.Sensor.load("gelsight_mini").save],
         "image.png": [lambda path: vts.write_image(path, image()), lambda path: vts.write_image(path, 1.0 - image())],
@@ -484,13 +489,14 @@ def save_for_ever(path, kind):
         "frames.csv": [lambda path: write_text(path, "a\n" * 200_000), lambda path: write_text(path, "b\n" * 300_000)],
         "cloud.ply": [lambda path: save_cloud(path, 20_000), lambda path: save_cloud(path, 9_000)],
         "cloud.pcd": [lambda path: save_cloud(path, 20_000), lambda path: save_cloud(path, 9_000)],
-    }[kind]
-    for save in savers:
+    }
+    turns = [(all_savers[kind][k], Path(folder) / kind, k) for k in range(2) for kind in kinds.split()]
+    for save, path, k in turns:
         save(path)
-        Path(f"{path}.{savers.index(save)}").write_bytes(Path(path).read_bytes())
+        Path(f"{path}.{k}").write_bytes(path.read_bytes())
     print("ready", flush=True)
     while True:
-        for save in savers:
+        for save, path, _ in turns:
             save(path)
 
 
@@ -506,35 +512,36 @@ def save_cloud(path, count):
     write_point_cloud(path, torch.rand(count, 3, generator=torch.Generator().manual_seed(count)))
 
 
-SAVED = ["unit.safetensors", "image.png", "cloud.ply"] + LONG * ["rig.yaml", "depth.png", "frames.csv", "cloud.pcd"]
+EVERY_KIND = "unit.safetensors rig.yaml image.png depth.png frames.csv cloud.ply cloud.pcd"
 
 
-@pytest.mark.parametrize("kind", SAVED)
-def test_a_kill_in_the_middle_of_a_save_leaves_a_whole_file(tmp_path, kind):
-    path, rng = tmp_path / kind, random.Random(kind)
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
-    program = f"import test_fuzz\ntest_fuzz.save_for_ever({str(path)!r}, {kind!r})"
+@pytest.mark.parametrize("kinds", EVERY_KIND.split() if LONG else [EVERY_KIND])
+def test_a_kill_in_the_middle_of_a_save_leaves_a_whole_file(tmp_path, kinds):
+    random_pause, paths = random.Random(kinds), [tmp_path / kind for kind in kinds.split()]
+    program = f"import test_fuzz\ntest_fuzz.save_for_ever({str(tmp_path)!r}, {kinds!r})"
     for _ in range(KILLS if LONG else 1):
-        writer = subprocess.Popen([sys.executable, "-W", "ignore", "-c", program], env=environment, stdout=subprocess.PIPE)
+        writer = subprocess.Popen([sys.executable, "-W", "ignore", "-c", program], env=ENVIRONMENT, stdout=subprocess.PIPE)
         try:
             assert writer.stdout.readline() == b"ready\n"
-            whole = [Path(f"{path}.{k}").read_bytes() for k in range(2)]
-            seen = set()
-            for _ in range(KILLS):  # stopped at any point, the name stands for a whole file
-                time.sleep(0.002 + 0.02 * rng.random())
+            whole = {path: [Path(f"{path}.{k}").read_bytes() for k in range(2)] for path in paths}
+            for _ in range(KILLS):  # whenever the writer is stopped, each name stands for a whole file
+                time.sleep(0.002 + 0.02 * random_pause.random())
                 writer.send_signal(signal.SIGSTOP)
-                seen.add(path.read_bytes())
+                assert all(path.read_bytes() in whole[path] for path in paths)
                 writer.send_signal(signal.SIGCONT)
-            time.sleep(0.02 * rng.random())
+            time.sleep(0.02 * random_pause.random())
         finally:
             writer.kill()
             writer.wait()
             writer.stdout.close()
-        assert path.read_bytes() in whole and seen <= set(whole)
-        left = [p.name for p in tmp_path.iterdir() if p.name not in (kind, f"{kind}.0", f"{kind}.1")]
-        assert len(left) <= 1 and all(name.startswith(f".{path.stem}-") and name.endswith(path.suffix) for name in left)
-        for name in left:
-            (tmp_path / name).unlink()
+        assert all(path.read_bytes() in whole[path] for path in paths)
+        kept = {f"{path.name}{end}" for path in paths for end in ("", ".0", ".1")}
+        left = [path for path in tmp_path.iterdir() if path.name not in kept]
+        scratch = [(f".{path.stem}-", path.suffix) for path in paths]
+        assert len(left) <= 1
+        assert all(any(path.name.startswith(head) and path.suffix == end for head, end in scratch) for path in left)
+        for path in left:
+            path.unlink()
 
 
 def test_what_a_killed_writer_leaves_is_no_frame(tmp_path):

@@ -1,4 +1,4 @@
-"""The gallery of hard scenes: valid and repeatable at every severity, and each fault does what physics says."""
+"""The gallery of hard scenes: valid and repeatable at every severity, and each fault has its physical effect."""
 
 import math
 from dataclasses import replace
@@ -9,10 +9,10 @@ import torch
 import torchvts as vts
 from torchvts.core.geometry import normal_from_gradient
 from torchvts.evaluation import faults, gallery
-from torchvts.evaluation.gallery import DIALS, HEIGHT, MM_PER_PIXEL, USUAL, WIDTH
+from torchvts.evaluation.gallery import CORRUPTIONS, HEIGHT, MM_PER_PIXEL, USUAL, WIDTH
 from torchvts.model.lights import cast_shadows
 
-# shape dials that begin with another shape, and dials whose harmless end is not the usual camera
+# corruptions that begin with another shape or camera than the undisturbed case
 OTHER_START = {"steep walls", "cut ends", "cut by the border", "covers the image", "two contacts", "few bits", "JPEG"}
 
 
@@ -25,13 +25,13 @@ def _same(one, other):
     )
 
 
-@pytest.mark.parametrize("dial", DIALS.values(), ids=lambda dial: dial.name)
-def test_every_severity_makes_a_valid_case(dial):
-    assert 5 <= len(dial.severities) <= 7 and dial.story.endswith(".")
-    rises = [b > a for a, b in zip(dial.severities, dial.severities[1:])]
+@pytest.mark.parametrize("corruption", CORRUPTIONS.values(), ids=lambda corruption: corruption.name)
+def test_every_severity_makes_a_valid_case(corruption):
+    assert 5 <= len(corruption.severities) <= 7 and corruption.story.endswith(".")
+    rises = [b > a for a, b in zip(corruption.severities, corruption.severities[1:])]
     assert all(rises) or not any(rises)
-    for severity in dial.severities:
-        case = dial.make(severity, 3)
+    for severity in corruption.severities:
+        case = corruption.make(severity, 3)
         truth = case.truth
         assert case.background.shape == (3, HEIGHT, WIDTH) and case.image.shape == (1, 3, HEIGHT, WIDTH)
         for image in (case.background, case.image):
@@ -43,21 +43,21 @@ def test_every_severity_makes_a_valid_case(dial):
         assert float(truth.depth_mm.min()) >= 0.0 and bool((truth.depth_mm[truth.contact] > 0).all())
 
 
-@pytest.mark.parametrize("dial", DIALS.values(), ids=lambda dial: dial.name)
-def test_cases_repeat_by_seed_and_severities_differ(dial):
-    middle, last = dial.severities[len(dial.severities) // 2], dial.severities[-1]
-    assert _same(dial.make(middle, 1), dial.make(middle, 1))
-    assert not torch.equal(dial.make(middle, 1).image, dial.make(middle, 2).image)
-    assert not torch.equal(dial.make(middle, 1).image, dial.make(last, 1).image)
+@pytest.mark.parametrize("corruption", CORRUPTIONS.values(), ids=lambda corruption: corruption.name)
+def test_cases_repeat_by_seed_and_severities_differ(corruption):
+    middle, last = corruption.severities[len(corruption.severities) // 2], corruption.severities[-1]
+    assert _same(corruption.make(middle, 1), corruption.make(middle, 1))
+    assert not torch.equal(corruption.make(middle, 1).image, corruption.make(middle, 2).image)
+    assert not torch.equal(corruption.make(middle, 1).image, corruption.make(last, 1).image)
 
 
-@pytest.mark.parametrize("name", sorted(set(DIALS) - OTHER_START))
-def test_the_harmless_end_is_the_undisturbed_case(name):
-    assert _same(DIALS[name].make(DIALS[name].severities[0], 5), gallery.undisturbed(5))
+@pytest.mark.parametrize("name", sorted(set(CORRUPTIONS) - OTHER_START))
+def test_the_first_severity_is_the_undisturbed_case(name):
+    assert _same(CORRUPTIONS[name].make(CORRUPTIONS[name].severities[0], 5), gallery.undisturbed(5))
 
 
 def test_eight_bits_are_the_undisturbed_case():
-    assert _same(DIALS["few bits"].make(8.0, 5), gallery.undisturbed(5))
+    assert _same(CORRUPTIONS["few bits"].make(8.0, 5), gallery.undisturbed(5))
 
 
 SMOOTH = {"deeper press", "covers the image", "gel sag", "faint contact"}
@@ -66,7 +66,7 @@ SMOOTH = {"deeper press", "covers the image", "gel sag", "faint contact"}
 @pytest.mark.parametrize("name", sorted(SMOOTH))
 def test_true_gradients_are_the_slopes_of_the_true_depth(name):
     """Central differences err by a sixth of the third derivative, which the middle of a ball hardly has."""
-    truth = DIALS[name].make(DIALS[name].severities[1], 0).truth
+    truth = CORRUPTIONS[name].make(CORRUPTIONS[name].severities[1], 0).truth
     z, pitch = truth.depth_mm.double(), truth.mm_per_pixel
     slope = (z[..., 2:] - z[..., :-2]) / (2 * pitch)
     steep = truth.gradient.norm(dim=1)[:, :, 1:-1]
@@ -120,8 +120,8 @@ def test_a_ball_casts_no_shadow_on_its_lit_side():
 def test_shine_adds_light_and_none_is_matt():
     matt = _light()
     assert torch.equal(_light(specular=0.0), matt)
-    weak, strong = _light(specular=0.1), _light(specular=0.4)
-    assert bool((weak >= matt).all()) and torch.allclose(strong - matt, 4 * (weak - matt), atol=1e-6)
+    faint, strong = _light(specular=0.1), _light(specular=0.4)
+    assert bool((faint >= matt).all()) and torch.allclose(strong - matt, 4 * (faint - matt), atol=1e-6)
 
 
 def test_ambient_and_bounced_light_flatten_the_shading():
@@ -137,7 +137,7 @@ def test_a_far_pinhole_looks_straight_down():
     """The error of calling it so is in proportion to one over the distance: half the angle, half the error."""
     plain = gallery.undisturbed(2)
     change = [
-        float((gallery.DIALS["perspective"].make(angle, 2).truth.depth_mm - plain.truth.depth_mm).abs().max())
+        float((gallery.CORRUPTIONS["perspective"].make(angle, 2).truth.depth_mm - plain.truth.depth_mm).abs().max())
         for angle in (0.05, 4.0, 8.0)
     ]
     assert change[0] < 2e-3
@@ -179,16 +179,16 @@ def test_jpeg_loses_more_the_lower_its_quality():
 
 
 def test_spots_dim_the_skin_and_dead_pixels_read_zero():
-    case, plain = DIALS["spots and dead pixels"].make(30.0, 0), gallery.undisturbed()
+    case, plain = CORRUPTIONS["spots and dead pixels"].make(30.0, 0), gallery.undisturbed()
     factor = vts.scenes.skin_spots(HEIGHT, WIDTH, 30, 30, 0).expand(1, 3, -1, -1)
     assert bool((case.image[factor == 0] == 0).all())
-    sound = factor == 1
-    assert torch.equal(case.image[sound], plain.image[sound])
+    clean = factor == 1
+    assert torch.equal(case.image[clean], plain.image[clean])
     assert float((case.image - plain.image)[(factor > 0) & (factor < 1)].mean()) < -0.05
 
 
-def test_the_skirt_of_sagging_gel_joins_the_ball_without_a_kink():
-    truth = DIALS["gel sag"].make(1.0, 0).truth
+def test_the_transition_zone_of_sagging_gel_joins_the_ball_without_a_kink():
+    truth = CORRUPTIONS["gel sag"].make(1.0, 0).truth
     beyond = ~truth.contact
     assert float(truth.gradient.norm(dim=1, keepdim=True)[beyond].max()) > 0.1  # truth goes on outside the contact
     step = (truth.gradient[..., 1:] - truth.gradient[..., :-1]).abs().max()

@@ -150,7 +150,7 @@ def test_an_image_of_another_size_is_refused(folder):
         read_calibration_folder(folder)
     image = folder / "4.000mm/1" / "gelsight.png"
     cv2.imwrite(str(image.with_suffix(".jpg")), pixels(1, width=WIDTH + 2))
-    image.with_suffix(".jpg").rename(image)  # no PNG, so only reading it tells
+    image.with_suffix(".jpg").rename(image)  # no PNG: its size is known only when it is read
     with pytest.raises(ValueError, match=r"expected 12 x 16 like background\.png, got 12 x 18"):
         read_calibration_folder(folder).presses[1].image()
 

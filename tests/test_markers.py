@@ -253,10 +253,10 @@ def test_the_grid_of_a_real_sensor_is_found(data):
 
 
 @pytest.mark.parametrize("name", FRAMES)
-@pytest.mark.parametrize("skirt, left_in_light, left_in_depth", [(0.2, 0.06, 0.28), (0.4, 0.025, 0.12)])
-def test_no_dots_are_left_in_a_real_sensors_image_and_depth(data, name, skirt, left_in_light, left_in_depth):
+@pytest.mark.parametrize("margin, left_in_light, left_in_depth", [(0.2, 0.06, 0.28), (0.4, 0.025, 0.12)])
+def test_no_dots_are_left_in_a_real_sensors_image_and_depth(data, name, margin, left_in_light, left_in_depth):
     rest, image = gelslim(data, "ref"), gelslim(data, name)
-    block = FillMarkers.from_background(rest[0], skirt=skirt)
+    block = FillMarkers.from_background(rest[0], margin=margin)
     places, _ = centers(find_markers(image, block.diameter_px, block.contrast))
     filled = block(image)
     flat = nn.functional.interpolate(nn.functional.avg_pool2d(block(rest), 20, ceil_mode=True), rest.shape[2:], mode="bilinear")

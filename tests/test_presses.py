@@ -1,7 +1,7 @@
 """Calibration from presses of balls nobody labelled: on sensors whose truth is a response field, lights, or neither.
 
 Three synthetic units of 120 x 160 pixels at 0.125 mm, all with noise of 0.003 and 8 bits:
-"field": light is background * (1 + what a known response field inverts), and the skin leaves the ball along a skirt;
+"field": light is background * (1 + what a known response field inverts), and the skin leaves the ball along a transition zone;
 "curve": a ring of lights seen with vignetting, channels mixed, value = light^0.6 + 0.05: no point lights explain it;
 "lights": a ring of point lights, as the paper has it.
 """
@@ -19,10 +19,10 @@ from conftest import ring_lights
 import torchvts as vts
 from torchvts.calibration import fit_prior
 from torchvts.calibration.balls import guess_circle
-from torchvts.calibration.calibrate import CalibrationWarning
+from torchvts.calibration.by_presses import with_preprocessing
 from torchvts.calibration.contacts import read_contacts
 from torchvts.evaluation import metrics
-from torchvts.model.response_field import CHANGE_SCALE, ResponseField, ResponseModel
+from torchvts.model.response_field import CHANGE_SCALE, ResponseField
 
 HEIGHT, WIDTH, PITCH = 120, 160, 0.125
 SIZE = (HEIGHT, WIDTH, PITCH)
@@ -114,7 +114,7 @@ def calibrate(image, sensor, presses=()):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         calibration = vts.calibrate(image, sensor, presses)
-    return calibration, [str(w.message) for w in caught if issubclass(w.category, CalibrationWarning)]
+    return calibration, [str(w.message) for w in caught if issubclass(w.category, vts.CalibrationWarning)]
 
 
 @pytest.fixture(scope="module", params=["field", "curve"])
@@ -135,6 +135,11 @@ def good():
 @pytest.fixture(scope="module")
 def rest():
     return background()
+
+
+@pytest.fixture(scope="module")
+def by_good(good, rest):
+    return calibrate(rest, GIVEN, good)[0]
 
 
 def depth_errors(calibration, camera, shape, mode, places):
@@ -173,9 +178,7 @@ def test_balls_are_found_without_labels(unit):
 def test_the_first_guess_of_a_ball_cut_by_the_border_leaves_the_border_out(rest, center_mm):
     """Its outline along the image border is none of the ball's: with it the guess is 3 to 5 px off."""
     press = vts.Press(seen_by_curve(ball(center_mm, 0.6), 3), BALL_MM)
-    unit = vts.Calibration.from_response(ResponseModel(true_field(), None), GIVEN, rest.double())
-    blocks = (vts.Compensate.from_calibration(unit).double(), vts.ContactMask.from_calibration(unit).double())
-    (contact,) = read_contacts([press], rest, *blocks, GIVEN)
+    (contact,) = read_contacts([press], rest, with_preprocessing(GIVEN, None))
     guess_circle(contact, GIVEN)
     assert contact.reason == "" and math.dist(contact.center_mm.tolist(), center_mm) / PITCH < 1.0
 
@@ -199,7 +202,7 @@ def test_what_lights_cannot_explain_gets_a_response(unit):
     assert report["held_out_deg"] < 1.0, name
 
 
-def test_the_candidates_are_told_with_their_scores(unit):
+def test_the_candidates_are_reported_with_their_scores(unit):
     _, _, _, _, calibration, _ = unit
     text = json.dumps(calibration.report, allow_nan=False)
     rows = json.loads(text)["candidates"]
@@ -208,12 +211,12 @@ def test_the_candidates_are_told_with_their_scores(unit):
         assert {"model", "family", "parameters", "score_deg", "passes"} <= set(row)
         assert math.isfinite(row["score_deg"]) and row["score_deg"] > 0
     assert {row["passes"] for row in rows[1:]} == {1, 2}
-    fast = [row for row in rows[1:] if row["passes"] == 1 and "read with" not in row["model"]]
+    fast = [row for row in rows[1:] if row["passes"] == 1 and "preprocessed with" not in row["model"]]
     assert [row["parameters"] for row in fast] == sorted(row["parameters"] for row in fast)
     best = min(row["score_deg"] for row in fast)
     chosen = next(row for row in fast if row["parameters"] == 2 * calibration.response.fast.size())
     assert chosen["score_deg"] <= 1.02 * best
-    assert all(row["score_deg"] > 1.02 * best for row in fast if row["parameters"] < chosen["numbers"])
+    assert all(row["score_deg"] > 1.02 * best for row in fast if row["parameters"] < chosen["parameters"])
 
 
 @pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
@@ -249,25 +252,25 @@ def test_the_calibration_survives_a_file(unit, tmp_path):
     assert float((one - two).abs().max()) < 1e-5  # coefficients are kept to seven digits
 
 
-def test_calibrating_twice_gives_the_same_numbers(good, rest):
-    one, two = (calibrate(rest, GIVEN, good)[0] for _ in range(2))
+def test_calibrating_twice_gives_the_same_parameters(by_good, good, rest):
+    one, two = by_good, calibrate(rest, GIVEN, good)[0]
     # LAPACK's last digit depends on where its arrays lie in memory
     for first, second in ((one.response.fast, two.response.fast), (one.response.precise, two.response.precise)):
         assert torch.allclose(first.tensor(), second.tensor(), rtol=1e-9, atol=1e-11)
     assert one.report["reason"] == two.report["reason"]
 
 
-def test_the_order_of_the_presses_does_not_matter(good, rest):
-    one, two = (calibrate(rest, GIVEN, presses)[0].response for presses in (good, good[::-1]))
+def test_the_order_of_the_presses_does_not_matter(by_good, good, rest):
+    one, two = by_good.response, calibrate(rest, GIVEN, good[::-1])[0].response
     for field in ("fast", "precise"):
         left, right = getattr(one, field), getattr(two, field)
         assert torch.allclose(left.tensor(), right.tensor(), rtol=0, atol=1e-6)
 
 
-def test_a_mirrored_unit_is_calibrated_alike(good, rest):
+def test_a_mirrored_unit_is_calibrated_alike(by_good, good, rest):
     """Images flipped left to right give the same depth, flipped."""
     scene_image = seen_by_curve(ball((1.5, -2)), 77)
-    plain, _ = calibrate(rest, GIVEN, good)
+    plain = by_good
     mirrored, _ = calibrate(rest.flip(2), GIVEN, [dataclasses.replace(p, image=p.image.flip(2)) for p in good])
     for row, other in zip(plain.report["presses"], mirrored.report["presses"]):
         assert other["center_px"] == pytest.approx([WIDTH - 1 - row["center_px"][0], row["center_px"][1]], abs=0.1)
@@ -278,10 +281,10 @@ def test_a_mirrored_unit_is_calibrated_alike(good, rest):
     assert float((depth - flipped.flip(3)).abs().max()) < 0.01
 
 
-def test_a_unit_of_length_does_not_matter(good, rest):
+def test_a_unit_of_length_does_not_matter(by_good, good, rest):
     """Pitch and balls twice as large: the same slopes."""
     double = dataclasses.replace(GIVEN, mm_per_pixel=2 * PITCH)
-    one, _ = calibrate(rest, GIVEN, good)
+    one = by_good
     two, _ = calibrate(rest, double, [dataclasses.replace(p, ball_diameter_mm=2 * BALL_MM) for p in good])
     for row, other in zip(one.report["presses"], two.report["presses"]):
         assert other["center_px"] == pytest.approx(row["center_px"], abs=1e-4)
@@ -323,7 +326,7 @@ def test_clean_lights_without_noise_keep_point_lights():
     json.dumps(report, allow_nan=False)
 
 
-def test_too_few_presses_for_a_response_keep_pinned_lights():
+def test_too_few_presses_for_a_response_keep_well_constrained_lights():
     calibration, _ = calibrate(background(seen_by_lights), SENSOR, take_presses(seen_by_lights, count=2))
     assert calibration.report["model"] == "point_lights" and "too few presses for a response field" in calibration.report["reason"]
     assert calibration.report["candidates"][0]["score_deg"] < 1.0
@@ -343,7 +346,7 @@ def test_near_lights_keep_point_lights_because_their_second_pass_is_better():
     assert calibration.report["model"] == "point_lights"
 
 
-def test_where_lights_and_response_are_level_the_twelve_numbers_are_taken():
+def test_where_lights_and_response_are_equal_lights_are_chosen():
     sensor = dataclasses.replace(SENSOR, blur_px=1.0)
     calibration, _ = calibrate(background(seen_by_lights), sensor, take_presses(seen_by_lights))
     scores = [row["score_deg"] for row in calibration.report["candidates"]]
@@ -402,7 +405,7 @@ def test_pinned_lights_go_before_a_prior(prior):
     sensor = dataclasses.replace(SENSOR, prior=fit_prior(background(seen_by_lights), SENSOR, take_presses(seen_by_lights)))
     calibration, warned = calibrate(background(seen_by_lights), sensor)
     assert warned == [] and calibration.report["model"] == "point_lights"
-    assert "the image pins the lights to" in calibration.report["reason"]
+    assert "the image constrains the lights to" in calibration.report["reason"]
 
 
 @pytest.mark.parametrize("mode", ["fast", "precise"])
@@ -410,7 +413,7 @@ def test_pinned_lights_go_before_a_prior(prior):
 def test_presses_of_another_ball_do_no_harm_to_a_prior(prior, prior_alone, count, mode):
     sensor = dataclasses.replace(GIVEN, prior=prior)
     calibration, warned = calibrate(background(seen_by_other_curve), sensor, other_presses(count))
-    assert warned == [] and "prior moved" in calibration.report["reason"]
+    assert warned == [] and "prior adapted" in calibration.report["reason"]
     alone = depth_errors(prior_alone[0], seen_by_other_curve, ball, mode, HELD_OUT)
     after = depth_errors(calibration, seen_by_other_curve, ball, mode, HELD_OUT)
     assert all(b < 1.1 * a for a, b in zip(alone, after)), (alone, after)
@@ -437,7 +440,7 @@ def test_a_background_of_another_type_is_warned_of(prior):
     """The light falls off to the right by 95 %."""
     ramp = torch.linspace(1.0, 0.05, WIDTH)
     _, warned = calibrate(background() * ramp, dataclasses.replace(SENSOR, prior=prior))
-    assert any("unlike that of the unit the prior of sensor 'rig' was fitted on" in text for text in warned)
+    assert any("from that of the unit on which the prior of sensor 'rig' was fitted" in text for text in warned)
 
 
 # known centers

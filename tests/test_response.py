@@ -106,7 +106,7 @@ def test_maps_are_those_of_the_definition(family):
 def test_a_larger_family_holds_the_same_field(family):
     field = random_field(*family, half_mm=2.0)
     for larger in ((3, 3, True), (4, 5, True)):
-        lifted = field.lifted(*larger)
+        lifted = field.embedded(*larger)
         assert (lifted.degree, lifted.product_degree, lifted.uses_depth, lifted.half_mm) == (*larger, 2.0)
         maps, old = dict(zip(lifted.terms(), lifted.maps(6, 8, 0.5))), dict(zip(field.terms(), field.maps(6, 8, 0.5)))
         for term, values in maps.items():
@@ -117,9 +117,9 @@ def test_a_larger_family_holds_the_same_field(family):
 @pytest.mark.parametrize("smaller", [(0, 1, False), (1, -1, False), (1, 0, False)])
 def test_a_smaller_family_is_refused(smaller):
     with pytest.raises(ValueError, match="degree, product_degree, uses_depth: expected a family that holds"):
-        random_field(1, 1, False).lifted(*smaller)
+        random_field(1, 1, False).embedded(*smaller)
     with pytest.raises(ValueError, match="expected a family that holds"):
-        random_field(1, 1, True).lifted(3, 3, False)
+        random_field(1, 1, True).embedded(3, 3, False)
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -251,7 +251,7 @@ def test_normals_have_the_slopes_of_the_definition(with_depth):
 def test_depth_changes_the_slope_as_its_terms_say():
     """A field that repeats the fast one, and adds a tenth of R's change times the depth to dz/dx."""
     fast = random_field(1, -1, False, half_mm=1.4)
-    deep = fast.lifted(1, 0, True)
+    deep = fast.embedded(1, 0, True)
     rows = [list(row) for row in deep.coefficient]
     rows[0][6 * 3 + deep.terms()[6:].index((0, 3))] = 0.1
     block = vts.NormalFromResponse(fast, dataclasses.replace(deep, coefficient=rows), 6, 7, 0.4, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Exact presses, the camera that sees them, and the figures that judge results."""
+"""Exact presses, their camera images, and the metrics that score results."""
 
 import math
 
@@ -77,7 +77,7 @@ def test_a_tilted_punch_has_the_slope_of_its_tilt():
 
 @pytest.mark.parametrize("text", ["", " ", "abc", "A1"])
 def test_letters_need_strokes(text):
-    with pytest.raises(ValueError, match="text: expected capital letters A-Z and blanks, got "):
+    with pytest.raises(ValueError, match="text: expected capital letters A-Z and spaces, got "):
         scenes.letters_press(text)
 
 
@@ -151,7 +151,7 @@ def test_spots_darken_and_dead_pixels_stay_black(rendered):
     assert torch.equal(spots, scenes.skin_spots(120, 160)) and not torch.equal(spots, scenes.skin_spots(120, 160, seed=1))
 
 
-def test_at_rest_there_is_no_contact(rendered):
+def test_an_undeformed_skin_has_no_contact(rendered):
     scene = scenes.undeformed(rendered[0])
     assert scene.depth_mm.abs().max() == 0 and not bool(scene.contact.any()) and scene.mm_per_pixel == 0.25
     assert torch.equal(scene.normal, normal_from_gradient(scene.gradient).abs())
@@ -201,7 +201,7 @@ def test_the_sphere_of_exact_points_is_exact(radius_mm, press_mm, center_mm):
     assert fit.radius_mm == pytest.approx(radius_mm, abs=1e-8) and fit.rms_mm < 1e-9
 
 
-def test_figures_refuse_what_does_not_fit():
+def test_metrics_refuse_what_does_not_fit():
     one, other, none = torch.zeros(1, 1, 4, 4), torch.zeros(1, 1, 4, 5), torch.zeros(1, 1, 4, 4, dtype=torch.bool)
     with pytest.raises(ValueError, match=r"depth_mm: expected \(1, 1, 4, 5\) like truth_mm, got \(1, 1, 4, 4\)"):
         metrics.depth_error(one, other, 1.0)

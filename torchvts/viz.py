@@ -1,4 +1,4 @@
-"""Pictures that one wants to look at: depth as contours and as a shaded surface, error maps; made without a display."""
+"""Pictures of frames: depth as contours and as a shaded surface, errors, registered clouds; made without a display."""
 
 from pathlib import Path
 from typing import Any
@@ -6,13 +6,23 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import LightSource
+from matplotlib.colors import LightSource, LinearSegmentedColormap
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from .core.files import write_atomically
 
+Array = np.ndarray[Any, Any]
+
 _MAP = "viridis"
+_SKIN = LinearSegmentedColormap.from_list("skin", ["#9a8f86", "#d9cfc5"])
+
+
+def new_figure(width: float, height: float, dpi: int = 110) -> Figure:
+    """An empty figure of so many inches, with a canvas that needs no display."""
+    figure = Figure(figsize=(width, height), layout="constrained", dpi=dpi)
+    FigureCanvasAgg(figure)
+    return figure
 
 
 def depth_figure(
@@ -21,12 +31,16 @@ def depth_figure(
     """One frame as three panels: the camera's image with the contact outlined, depth contours, the shaded surface.
 
     Args:
-        depth_mm: one frame, (1, 1, H, W) or (H, W), mm. mm_per_pixel: pitch, mm.
-        image: (1, 3, H, W) or (3, H, W) in [0, 1]. contact: bool, as depth. title: above the panels.
+        depth_mm: one frame, (1, 1, H, W) or (H, W), mm.
+        mm_per_pixel: pixel pitch, mm.
+        image: (1, 3, H, W) or (3, H, W) in [0, 1]; None leaves its panel out.
+        contact: bool, the same shape as depth.
+        title: text above the panels.
+    Returns:
+        The figure.
     """
     depth = _plane(depth_mm)
-    figure = Figure(figsize=(13.5 if image is not None else 9.0, 4.1), layout="constrained", dpi=110)
-    FigureCanvasAgg(figure)
+    figure = new_figure(13.5 if image is not None else 9.0, 4.1)
     panels = 3 if image is not None else 2
     extent = _extent(depth, mm_per_pixel)
     if image is not None:
@@ -45,16 +59,22 @@ def depth_figure(
     return figure
 
 
-def draw_contours(
-    figure: Figure, axes: Any, depth: "np.ndarray[Any, Any]", mm_per_pixel: float, step_um: float | None = None
-) -> None:
-    """Depth as filled colour with contour lines every round number of micrometres, and a colour bar."""
+def draw_contours(figure: Figure, axes: Any, depth: Array, mm_per_pixel: float, step_um: float | None = None) -> None:
+    """Draw depth in colour, with contour lines every round number of micrometres and a colour bar.
+
+    Args:
+        figure: the figure, for the colour bar.
+        axes: the panel.
+        depth: (H, W), mm.
+        mm_per_pixel: pixel pitch, mm.
+        step_um: distance of the lines, micrometres; None chooses it.
+    """
     extent = _extent(depth, mm_per_pixel)
     low, high = float(depth.min()) * 1000.0, float(depth.max()) * 1000.0
     picture = axes.imshow(depth * 1000.0, cmap=_MAP, extent=extent, vmin=min(low, 0.0), vmax=max(high, 1.0))
     step = step_um or _round_step(max(high, 1.0) - min(low, 0.0))
     levels = np.arange(np.ceil(low / step) * step, high, step)
-    levels = levels[np.abs(levels) > 0.25 * step]  # the skin at rest has no line
+    levels = levels[np.abs(levels) > 0.25 * step]  # no line on the undeformed skin
     if len(levels):
         axes.contour(depth * 1000.0, levels, colors="white", linewidths=0.6, extent=extent, origin="upper")
     figure.colorbar(picture, ax=axes, shrink=0.75, label="depth, um")
@@ -62,13 +82,20 @@ def draw_contours(
     _millimetres(axes)
 
 
-def draw_surface(axes: Any, depth: "np.ndarray[Any, Any]", mm_per_pixel: float, most: int = 220) -> None:
-    """Depth as a surface lit from the upper left, relief exaggerated to be seen; at most ``most`` points a side."""
+def draw_surface(axes: Any, depth: Array, mm_per_pixel: float, most: int = 220) -> None:
+    """Draw depth as a surface lit from the upper left, with exaggerated relief.
+
+    Args:
+        axes: a 3D panel.
+        depth: (H, W), mm.
+        mm_per_pixel: pixel pitch, mm.
+        most: largest number of points in each direction.
+    """
     stride = max(1, int(np.ceil(max(depth.shape) / most)))
     z = depth[::stride, ::stride]
     y, x = np.mgrid[0 : z.shape[0], 0 : z.shape[1]] * mm_per_pixel * stride
     shades = LightSource(azdeg=315, altdeg=45).shade(
-        z, cmap=_plain_map(), vert_exag=1.0, dx=mm_per_pixel * stride, dy=mm_per_pixel * stride, blend_mode="soft"
+        z, cmap=_SKIN, vert_exag=1.0, dx=mm_per_pixel * stride, dy=mm_per_pixel * stride, blend_mode="soft"
     )
     axes.plot_surface(x, y.max() - y, z, facecolors=shades, rstride=1, cstride=1, linewidth=0, antialiased=False, shade=False)
     axes.set_box_aspect((x.max(), y.max(), max(0.22 * x.max(), float(np.ptp(z)))))
@@ -82,8 +109,7 @@ def draw_surface(axes: Any, depth: "np.ndarray[Any, Any]", mm_per_pixel: float, 
 def comparison_figure(depth_mm: Tensor, truth_mm: Tensor, mm_per_pixel: float, title: str = "") -> Figure:
     """Depth, truth, and their difference in pixels of pitch, side by side."""
     depth, truth = _plane(depth_mm), _plane(truth_mm)
-    figure = Figure(figsize=(13.5, 3.9), layout="constrained", dpi=110)
-    FigureCanvasAgg(figure)
+    figure = new_figure(13.5, 3.9)
     axes = figure.subplots(1, 3)
     step = _round_step(max(1000.0 * float(truth.max()), 1.0))
     for panel, values, name in ((axes[0], truth, "truth"), (axes[1], depth, "measured")):
@@ -101,12 +127,11 @@ def comparison_figure(depth_mm: Tensor, truth_mm: Tensor, mm_per_pixel: float, t
 
 
 def pose_figure(source: Tensor, target: Tensor, T_target_source: Tensor, title: str = "", most: int = 4000) -> Figure:
-    """Two clouds (N, 3) before and after registration, each from above and in space, as the paper's figure 8."""
+    """Two clouds (N, 3) before and after registration, each from above and in space, as in figure 8 of the paper."""
     clouds = [points.detach().cpu().double()[:: max(1, len(points) // most)] for points in (source, target)]
     T = T_target_source.detach().cpu().double()
     moved = clouds[0] @ T[:3, :3].T + T[:3, 3]
-    figure = Figure(figsize=(13.5, 3.8), layout="constrained", dpi=110)
-    FigureCanvasAgg(figure)
+    figure = new_figure(13.5, 3.8)
     for k, (name, points) in enumerate((("before", clouds[0]), ("after", moved))):
         above = figure.add_subplot(1, 4, 2 * k + 1)
         space = figure.add_subplot(1, 4, 2 * k + 2, projection="3d")
@@ -130,17 +155,17 @@ def pose_figure(source: Tensor, target: Tensor, T_target_source: Tensor, title: 
 
 
 def save_figure(figure: Figure, path: str | Path) -> None:
-    """Write a figure, whole or not at all; the suffix names the format."""
+    """Write a figure in the format of the suffix; an interrupted write leaves no file."""
     with write_atomically(path) as temporary:
         figure.savefig(str(temporary))
 
 
-def _plane(tensor: Tensor) -> "np.ndarray[Any, Any]":
+def _plane(tensor: Tensor) -> Array:
     height, width = tensor.shape[-2:]
     return tensor.detach().to(device="cpu", dtype=torch.float64).reshape(height, width).numpy()
 
 
-def _extent(depth: "np.ndarray[Any, Any]", mm_per_pixel: float) -> tuple[float, float, float, float]:
+def _extent(depth: Array, mm_per_pixel: float) -> tuple[float, float, float, float]:
     half_y, half_x = (0.5 * n * mm_per_pixel for n in depth.shape)
     return -half_x, half_x, half_y, -half_y
 
@@ -151,13 +176,7 @@ def _millimetres(axes: Any) -> None:
 
 
 def _round_step(span: float) -> float:
-    """A step of 1, 2 or 5 times a power of ten that cuts ``span`` into about ten."""
+    """A step of 1, 2 or 5 times a power of ten that divides ``span`` into about ten parts."""
     raw = span / 10.0
     power = 10.0 ** np.floor(np.log10(raw))
     return float(min((s for s in (power, 2 * power, 5 * power, 10 * power) if s >= raw - 1e-12), default=10 * power))
-
-
-def _plain_map() -> Any:
-    from matplotlib.colors import LinearSegmentedColormap
-
-    return LinearSegmentedColormap.from_list("skin", ["#9a8f86", "#d9cfc5"])

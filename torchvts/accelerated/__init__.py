@@ -19,7 +19,7 @@ from .blocks import (
 )
 from .gate import reference_only
 from .kernels import library
-from .twin import reference
+from .twin import reference, scriptable
 
 __all__ = [
     "AdaptiveIntegration",
@@ -36,4 +36,5 @@ __all__ = [
     "library",
     "reference",
     "reference_only",
+    "scriptable",
 ]

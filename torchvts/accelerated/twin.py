@@ -13,7 +13,7 @@ class Twin(nn.Module):
     plain: type[nn.Module]
 
     def __prepare_scriptable__(self) -> nn.Module:
-        return reference(self)
+        return scriptable(self)
 
 
 def reference(module: _Module, memo: dict[int, nn.Module] | None = None) -> _Module:
@@ -37,3 +37,14 @@ def reference(module: _Module, memo: dict[int, nn.Module] | None = None) -> _Mod
             name: None if child is None else reference(child, memo) for name, child in module._modules.items()
         }
     return memo[id(module)]  # type: ignore[return-value]
+
+
+def scriptable(module: _Module) -> _Module:
+    """:func:`reference` for ``__prepare_scriptable__``.
+
+    ``torch.jit.script`` remembers modules by their identity and puts the copy in the module's place, so the copy keeps the module
+    alive: another object could be created with its identity.
+    """
+    copy = reference(module)
+    copy.__dict__["_module_of_this_copy"] = (module,)
+    return copy

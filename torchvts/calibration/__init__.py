@@ -1,7 +1,30 @@
-"""Floor 3, offline: from images to the record of a calibrated unit."""
+"""Offline calibration: from images of a unit to its Calibration."""
 
-from .calibrate import CalibrationWarning, calibrate, fit_prior
-from .contacts import Press, Touch, read_presses
-from .lights import LightFit, fit_lights
+from .background import falloff, outwardness
+from .by_lights import GIVEN_MISFIT
+from .by_presses import RESPONSE_BLUR_PX, by_presses, with_preprocessing
+from .calibrate import calibrate, fit_prior
+from .complaints import CalibrationWarning
+from .contacts import ROUGH, channel_structure
+from .lights import LOOSE_DEG, LightFit, fit_lights
+from .presses import Press, Touch, read_presses
 
-__all__ = ["CalibrationWarning", "LightFit", "Press", "Touch", "calibrate", "fit_lights", "fit_prior", "read_presses"]
+__all__ = [
+    "GIVEN_MISFIT",
+    "LOOSE_DEG",
+    "RESPONSE_BLUR_PX",
+    "ROUGH",
+    "CalibrationWarning",
+    "LightFit",
+    "Press",
+    "Touch",
+    "by_presses",
+    "calibrate",
+    "channel_structure",
+    "falloff",
+    "fit_lights",
+    "fit_prior",
+    "outwardness",
+    "read_presses",
+    "with_preprocessing",
+]

@@ -1,4 +1,4 @@
-"""The image of a skin at rest as lights and camera make it: what calibration by point lights fits, pixel by pixel."""
+"""The model of a background image: lights and camera over an undeformed skin, pixel by pixel, as the fit of lights needs it."""
 
 from typing import NamedTuple
 
@@ -8,21 +8,30 @@ from torch import Tensor
 from ..core.checks import QUANTISATION_STD
 from ..core.geometry import pixel_grid_mm
 from ..core.noise import noise_std
+from ..core.robust import TUKEY, tukey_weight
 from ..model.lights import PointLights, microfacet
 from ..model.sensor import Sensor
 
-GLOSS, VIGNETTING, VIGNETTING_4, AMBIENT = "gloss", "vignetting", "vignetting of fourth order", "ambient"
-"""What a light's row of numbers may hold after x, y, log z, log albedo."""
+GLOSS, VIGNETTING, AMBIENT = "gloss", "vignetting", "ambient"
+"""Optional terms: each adds one column to a light's parameters, after x, y, log z, log albedo."""
 
-OF_THE_CAMERA = (VIGNETTING, VIGNETTING_4)
-"""Terms that the three lights share."""
-
-TUKEY = 4.685  # 95 % efficiency under Gaussian noise
+POSITION_AND_ALBEDO = 4
+"""Columns of a light's parameters before the optional terms."""
 
 
-class RestPixels(NamedTuple):
-    """What is fitted: positions in mm (N,), squared distance from the image centre relative to the corner's (N,), image values
-    and which of them count (3, N), noise (3,), 1 / gamma, the terms of the model after position and albedo."""
+class BackgroundPixels(NamedTuple):
+    """The pixels of a background, and the terms of the model that is fitted to them.
+
+    Attributes:
+        x: (N,), mm.
+        y: (N,), mm.
+        outward: (N,), squared distance from the image centre, 1 in the corners.
+        image: (3, N), image values.
+        usable: (3, N) bool, neither saturated nor near black.
+        noise: (3,), standard deviation of the image values.
+        exponent: 1 / gamma.
+        terms: optional terms of the model.
+    """
 
     x: Tensor
     y: Tensor
@@ -34,35 +43,35 @@ class RestPixels(NamedTuple):
     terms: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, value: Tensor, sensor: Sensor) -> "RestPixels":
+    def of(cls, value: Tensor, sensor: Sensor) -> "BackgroundPixels":
+        """All pixels of an image (3, H, W)."""
         x, y = pixel_grid_mm(sensor.height, sensor.width, sensor.mm_per_pixel, value.dtype)
         x, y = (axis.expand(value.shape[1:]).flatten() for axis in (x, y))
         noise = noise_std(value[None])[0].clamp_min(QUANTISATION_STD)
         image, outward = value.flatten(1), outwardness(sensor).flatten().to(value.dtype)
-        every = cls(x, y, outward, image, image < 0.995, noise, 1.0 / sensor.exponent)
-        # a pixel that noise could clip at black or white is left out, judged by the model so that noise does not choose
-        expected, margin = every.model(paraboloid_start(every)), 2.5 * noise[:, None]
-        return every._replace(usable=every.usable & (expected > margin) & (expected < 1.0 - margin))
+        pixels = cls(x, y, outward, image, image < 0.995, noise, 1.0 / sensor.exponent)
+        # leave out pixels that noise could clip at black or white; the model decides, so that noise does not select
+        expected, margin = pixels.model(paraboloid_start(pixels)), 2.5 * noise[:, None]
+        return pixels._replace(usable=pixels.usable & (expected > margin) & (expected < 1.0 - margin))
 
-    def every(self, count: int) -> "RestPixels":
-        """An even choice of about ``count`` pixels; an odd stride walks through all columns."""
+    def sample(self, count: int) -> "BackgroundPixels":
+        """About ``count`` evenly chosen pixels. The stride is odd, so that all columns occur."""
         stride = max(1, len(self.x) // count) | 1
         part = {name: getattr(self, name)[..., ::stride] for name in ("x", "y", "outward", "image", "usable")}
         return self._replace(**part)
 
     def model(self, parameter: Tensor) -> Tensor:
         """Image values (3, N) of lights (3, 4 + terms): x, y, log z, log albedo, then ``terms``."""
-        a, b, log_z, log_rho = (parameter[:, k : k + 1] for k in range(4))
+        a, b, log_z, log_rho = (parameter[:, k : k + 1] for k in range(POSITION_AND_ALBEDO))
         squared = (self.x - a) ** 2 + (self.y - b) ** 2 + torch.exp(2.0 * log_z)
-        log_light = log_rho + log_z - 1.5 * torch.log(squared)  # eq. 1 at rest
+        log_light = log_rho + log_z - 1.5 * torch.log(squared)  # eq. 1 on a flat skin
         extra = {name: parameter[:, 4 + k : 5 + k] for k, name in enumerate(self.terms)}
         if GLOSS in extra:
             n_l = torch.exp(log_z) * torch.rsqrt(squared)
             lobe = microfacet(n_l, torch.ones_like(n_l), torch.sqrt(0.5 + 0.5 * n_l))
             log_light = log_light + torch.log1p(extra[GLOSS].clamp_min(0.0) * lobe)
         if VIGNETTING in extra:
-            fourth = extra.get(VIGNETTING_4, 0.0)
-            log_light = log_light + torch.log(falloff(self.outward, extra[VIGNETTING], fourth))
+            log_light = log_light + torch.log(falloff(self.outward, extra[VIGNETTING]))
         if AMBIENT not in extra:
             return torch.exp(self.exponent * log_light)
         return (torch.exp(log_light) + extra[AMBIENT]).clamp_min(1e-6) ** self.exponent
@@ -78,27 +87,30 @@ def outwardness(sensor: Sensor) -> Tensor:
     return (x**2 + y**2) / float(x.max() ** 2 + y.max() ** 2)
 
 
-def falloff(outward: Tensor, second: Tensor | float, fourth: Tensor | float = 0.0) -> Tensor:
-    """Share of the light that a lens with vignetting lets through: 1 in the middle, 1 - second - fourth in the corners.
+def falloff(outward: Tensor, vignetting: Tensor | float) -> Tensor:
+    """Share of the light that a lens with vignetting lets through: 1 in the middle, 1 - vignetting in the corners.
 
     Args:
         outward: squared distance from the image centre, 1 in the corners.
-        second, fourth: coefficients of the second and fourth power of the distance.
+        vignetting: share of the light lost in the corners.
     Source:
-        the first terms of the usual even polynomial; cos^4 of the angle of view begins with them.
+        the first term of the usual even polynomial; cos^4 of the angle of view begins with it.
     """
-    return (1.0 - outward * (second + fourth * outward)).clamp_min(0.05)
+    return (1.0 - outward * vignetting).clamp_min(0.05)
 
 
-def paraboloid_start(pixels: RestPixels) -> Tensor:
-    """I^(-2/3) = (rho z)^(-2/3) (x^2 + y^2 - 2 a x - 2 b y + a^2 + b^2 + z^2): weighted linear least squares per channel."""
+def paraboloid_start(pixels: BackgroundPixels) -> Tensor:
+    """Closed-form lights (3, 4), from weighted linear least squares per channel.
+
+    I^(-2/3) = (rho z)^(-2/3) (x^2 + y^2 - 2 a x - 2 b y + a^2 + b^2 + z^2) is linear in x^2 + y^2, x, y and 1.
+    """
     x, y, image, exponent, noise = pixels.x, pixels.y, pixels.image, pixels.exponent, pixels.noise
     span = float(x.abs().max().maximum(y.abs().max()))
     u, v = x / span, y / span
     columns = torch.stack((u * u + v * v, u, v, torch.ones_like(u)))  # (4, N)
     light = image.clamp(1e-3, 1.0) ** (1.0 / exponent)
     target = light ** (-2.0 / 3.0)
-    # d target / d value, inverted: what weighs residuals as in image value
+    # (d value / d target)^2: weights residuals as residuals in image value
     weight = (
         (image > 3.0 * noise[:, None]) * (image < 0.995) * (light ** (5.0 / 3.0) * image.clamp_min(1e-3) ** (1 - 1 / exponent)) ** 2
     )
@@ -109,8 +121,8 @@ def paraboloid_start(pixels: RestPixels) -> Tensor:
         solution = torch.linalg.solve(weighted @ columns.t(), weighted @ target[:, :, None])[:, :, 0]
         residual = (target - solution @ columns).abs() * weight.sqrt()
         scale = residual.median(dim=1, keepdim=True).values.clamp_min(1e-12) / 0.6745
-        robust = (1.0 - (residual / (TUKEY * scale)) ** 2).clamp_min(0.0) ** 2
-    curvature = solution[:, 0].clamp_min(1e-6 * target.mean(1))  # a light infinitely far leaves no curvature
+        robust = tukey_weight(residual / (TUKEY * scale))
+    curvature = solution[:, 0].clamp_min(1e-6 * target.mean(1))  # a light at infinity leaves no curvature
     a, b = -0.5 * solution[:, 1] / curvature, -0.5 * solution[:, 2] / curvature
     z = (solution[:, 3] / curvature - a * a - b * b).clamp_min(0.01).sqrt()
     return torch.stack((a * span, b * span, (z * span).log(), -1.5 * (curvature / span**2).log() - (z * span).log()), dim=1)
@@ -129,13 +141,13 @@ def to_lights(parameter: Tensor, terms: tuple[str, ...], dtype: torch.dtype) -> 
     return PointLights(position.to(dtype), parameter[:, 3].exp().to(dtype), gloss)
 
 
-def free_numbers(terms: tuple[str, ...], azimuth: Tensor | None) -> Tensor:
-    """What the fit may move: (3, 4 + terms, F), parameters of the three lights per free number.
+def free_parameters(terms: tuple[str, ...], azimuth: Tensor | None) -> Tensor:
+    """What the fit may move: (3, 4 + terms, F), the parameters of the three lights per free parameter.
 
-    Vignetting is the camera's, shared by all lights; with known azimuths (3,), radians, a light moves along its ray.
+    Vignetting belongs to the camera, so the lights share it. With known azimuths (3,), radians, a light moves along its ray.
     """
-    columns = 4 + len(terms)
-    own = [k for k in range(columns) if k < 4 or terms[k - 4] not in OF_THE_CAMERA]
+    columns = POSITION_AND_ALBEDO + len(terms)
+    own = [k for k in range(columns) if k < 4 or terms[k - 4] != VIGNETTING]
     rows: list[Tensor] = []
     for light in range(3):
         for k in own:
@@ -146,9 +158,8 @@ def free_numbers(terms: tuple[str, ...], azimuth: Tensor | None) -> Tensor:
                     continue
                 row[light, :2] = torch.stack((azimuth[light].cos(), azimuth[light].sin()))
             rows.append(row)
-    for k, name in enumerate(terms):
-        if name in OF_THE_CAMERA:
-            row = torch.zeros(3, columns, dtype=torch.float64)
-            row[:, 4 + k] = 1.0
-            rows.append(row)
+    if VIGNETTING in terms:
+        row = torch.zeros(3, columns, dtype=torch.float64)
+        row[:, 4 + terms.index(VIGNETTING)] = 1.0
+        rows.append(row)
     return torch.stack(rows, dim=2)

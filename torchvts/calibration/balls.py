@@ -1,4 +1,4 @@
-"""Where a ball lies in a contact: by its outline, by how fast the skin's slope falls off, by known slopes."""
+"""Locate the ball in each press: by its outline, by slopes that are known, or jointly with response fields of rising size."""
 
 from typing import Any
 
@@ -6,29 +6,102 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..core.geometry import gradient_from_normal
+from ..core.robust import tukey_weight
+from ..model.response_field import ResponseField, ResponseModel
 from ..model.sensor import Sensor
-from .contacts import LEAST_INSIDE, Contact, middle_px
+from ..normals import NormalFromResponse
+from .contacts import LEAST_INSIDE, Contact, first_pass_depths, middle_px, prepare_second_pass, used
+from .field import ContactForms, Family, solve_with_centers
 
 EDGE_SLOPE_RATIO = 0.6
-"""The contact ends where the skin's slope has fallen to this part of the ball's: about half way down from ball to skirt."""
+"""The contact ends where the skin's slope has fallen to this part of the ball's: about the middle of the fall."""
+
+JOINT_STAGES = ((0, -1, False, 3), (1, -1, False, 3), (2, -1, False, 6), (3, 2, False, 4), (3, 2, True, 4))
+"""Families and rounds in which balls are located jointly. Linear fields come first: with products or depth the field can imitate
+a shift of all centers, so these stages only refine, each center regularised to the linear result by a third of a press."""
+
+
+def locate(contacts: list[Contact], sensor: Sensor, prior: ResponseModel | None, half_mm: float) -> None:
+    """Find center and contact radius of every usable contact, in place. Contacts that no ball fits get a reason.
+
+    Args:
+        contacts: of presses.
+        sensor: of the unit.
+        prior: gives the slopes; without one balls and fields are found jointly.
+        half_mm: scale of positions of these fields, mm.
+    """
+    pitch_mm = sensor.mm_per_pixel
+    for contact in contacts:
+        if not contact.reason and 0.0 < contact.radius_mm < 2.0 * pitch_mm:
+            contact.reason = f"a ball of {2 * contact.radius_mm:g} mm is smaller than four pixels: is its diameter in mm?"
+        if not contact.reason and not contact.known:
+            guess_circle(contact, sensor)
+    usable = used(contacts)
+    if prior is not None:
+        for contact, slopes in zip(usable, _slope_maps(usable, prior, pitch_mm)):
+            if not contact.known:
+                center_by_slope(contact, slopes, pitch_mm)
+            for _ in range(6):
+                update_radius(contact, slopes.flatten(1)[:, contact.index], pitch_mm)
+    elif not all(contact.known and contact.radius_known for contact in usable):
+        _locate_jointly(usable, pitch_mm, half_mm)
+    for contact in usable:
+        if not contact.reason and int(contact.inside().sum()) < LEAST_INSIDE:
+            contact.reason = "no ball of this diameter fits what is seen"
+        if not contact.reason and contact.contact_radius_mm > 0.89 * contact.radius_mm:
+            wide_mm, ball_mm = 2 * contact.contact_radius_mm, 2 * contact.radius_mm
+            contact.reason = f"the contact seen is {wide_mm:.2f} mm wide, too wide for a ball of {ball_mm:g} mm"
+
+
+def _locate_jointly(contacts: list[Contact], pitch_mm: float, half_mm: float) -> None:
+    most = 1 if len(contacts) < 4 else 2 if len(contacts) < 10 else 3
+    anchors = None
+    fast: ResponseField | None = None
+    for degree, products, uses_depth, rounds in [stage for stage in JOINT_STAGES if stage[0] <= most]:
+        family = Family(degree, products, uses_depth, half_mm)
+        if products >= 0 and anchors is None:
+            anchors = [contact.center_mm.clone() for contact in contacts]
+        if uses_depth and fast is not None:
+            prepare_second_pass(contacts, fast, pitch_mm)
+        forms = [ContactForms(family, contact) for contact in contacts]
+        coefficient = torch.zeros(family.size(), dtype=torch.float64)
+        for _ in range(rounds):
+            coefficient = solve_with_centers(forms, 0.01 * family.penalty(), anchors, 0.3)
+            for item in forms:
+                update_radius(item.contact, item.slope(coefficient), pitch_mm)
+        fast = family.field(coefficient)
+
+
+def _slope_maps(contacts: list[Contact], model: ResponseModel, pitch_mm: float) -> list[Tensor]:
+    """(2, H, W) each: slopes by the model's last pass."""
+    if not contacts:
+        return []
+    height, width = contacts[0].mask.shape
+    normals = NormalFromResponse(model.fast, model.precise, height, width, pitch_mm, dtype=torch.float64)
+    images = [1.0 + contact.change[None] for contact in contacts]
+    if model.precise is None:
+        return [gradient_from_normal(normals(image))[0] for image in images]
+    first = first_pass_depths(contacts, model.fast, pitch_mm)
+    return [gradient_from_normal(normals(image, depth[None, None]))[0] for image, depth in zip(images, first)]
 
 
 def guess_circle(contact: Contact, sensor: Sensor) -> None:
-    """A first center and contact radius from the outline of what has changed most; blobs of like size are a second contact.
+    """Set a first center and contact radius from the outline of the largest change. Two blobs of similar size are an error.
 
-    The outline that runs along the image border is left out, so that a ball cut by it is found where it is.
+    The outline along the image border is left out, so that a ball cut by the border is found where it is.
     """
     import cv2
 
     length = contact.change.square().sum(0).sqrt()[None, None]
     length = torch.nn.functional.avg_pool2d(length, 7, 1, 3, count_include_pad=False)[0, 0]
     peak = 0.9 * length.max()
-    apart = _blob_areas((length > 0.2 * peak) & contact.mask)[0]
+    wide_areas = _blob_areas((length > 0.2 * peak) & contact.mask)[0]
     areas, labels = _blob_areas((length > 0.4 * peak) & contact.mask)
     if len(areas) == 0:
-        contact.reason = "no contact: nothing stands out from the noise"
+        contact.reason = "no contact: nothing is above the noise"
         return
-    several = int((apart > 0.3 * apart.max()).sum())
+    several = int((wide_areas > 0.3 * wide_areas.max()).sum())
     if several > 1:
         contact.reason = f"{several} contacts in one image: press one ball at a time"
         return
@@ -36,7 +109,7 @@ def guess_circle(contact: Contact, sensor: Sensor) -> None:
     outlines, _ = cv2.findContours(blob, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     longest = max(outlines, key=len)
     hull = cv2.convexHull(longest)
-    # a ball's outline is convex: where the border cuts it, that of the faint middle opens to the outside
+    # a ball's outline is convex; where the border cuts the ball, the outline of its faint middle opens to the border
     convex = [abs(cv2.pointPolygonTest(hull, (float(x), float(y)), True)) < 2.0 for x, y in longest[:, 0]]
     outline = torch.from_numpy(longest[:, 0][convex].astype(np.float64))
     free = (outline > 1).all(1) & (outline[:, 0] < sensor.width - 2) & (outline[:, 1] < sensor.height - 2)
@@ -45,7 +118,7 @@ def guess_circle(contact: Contact, sensor: Sensor) -> None:
         return
     center_px, radius_px = _circle(outline[free])
     contact.center_mm = (center_px - middle_px(sensor)) * sensor.mm_per_pixel
-    # the outline runs outside of the contact, about a fifth of its radius
+    # the outline lies outside of the contact, by about a fifth of its radius
     contact.contact_radius_mm = min(0.8 * radius_px * sensor.mm_per_pixel, 0.9 * contact.radius_mm)
 
 
@@ -58,20 +131,20 @@ def _blob_areas(mask: Tensor) -> tuple[Any, Any]:
 
 
 def _circle(points: Tensor) -> tuple[Tensor, float]:
-    """Robust circle through points (N, 2): Kasa's linear fit, re-weighted."""
+    """Robust circle through points (N, 2): Kasa's linear fit, iteratively reweighted."""
     origin = points.mean(0)
     xy = points - origin
     columns = torch.cat((xy, torch.ones_like(xy[:, :1])), dim=1)
     weight = torch.ones_like(xy[:, 0])
     center, radius = torch.zeros(2, dtype=points.dtype), torch.zeros((), dtype=points.dtype)
     for _ in range(10):
-        weighted = columns * weight[:, None] ** 2
+        weighted = columns * weight[:, None]
         solution = torch.linalg.solve(weighted.t() @ columns, weighted.t() @ xy.square().sum(1))
         center = 0.5 * solution[:2]
         radius = (solution[2] + center.square().sum()).clamp_min(1.0).sqrt()
         residual = (xy - center).norm(dim=1) - radius
         scale = residual.abs().median() / 0.6745 + 0.3
-        weight = (1.0 - (residual / (4.0 * scale)) ** 2).clamp_min(0.0)
+        weight = tukey_weight(residual / (4.0 * scale))
     return center + origin, float(radius)
 
 
@@ -97,7 +170,7 @@ def update_radius(contact: Contact, slope: Tensor, pitch_mm: float, damping: flo
 
 
 def center_by_slope(contact: Contact, slope_map: Tensor, pitch_mm: float, rounds: int = 12) -> None:
-    """Center and contact radius from slopes (2, H, W) that are already known: the ball that fits them best."""
+    """Center and contact radius from known slopes (2, H, W): the ball that fits them best."""
     slope = slope_map.flatten(1)[:, contact.index]
     limit = 0.25 * contact.radius_mm
     for _ in range(rounds):
@@ -107,10 +180,10 @@ def center_by_slope(contact: Contact, slope_map: Tensor, pitch_mm: float, rounds
                 f"no ball of {2 * contact.radius_mm:g} mm fits the contact: wrong diameter, too faint a press, or not round"
             )
             return
-        down = contact.down()[inside]
-        # slope = -(x - center) / down, weighted so that a pixel counts by its normal rather than by its slope
-        weight = down**2
-        miss = slope[:, inside] - contact.ball_slope()[:, inside]
-        step = (weight / down * miss).sum(1) / (weight / down**2).sum()
+        height = contact.height_above_equator()[inside]
+        # slope = -(x - center) / height; the weight makes a pixel count by its normal rather than by its slope
+        weight = height**2
+        residual = slope[:, inside] - contact.ball_slope()[:, inside]
+        step = (weight / height * residual).sum(1) / (weight / height**2).sum()
         contact.center_mm = contact.center_mm + step.clamp(-limit, limit)
         update_radius(contact, slope, pitch_mm)

@@ -1,8 +1,8 @@
-"""Response fields by linear least squares: from presses of known balls, and from what every true surface obeys.
+"""Response fields by linear least squares: from presses of known balls, and from the curl, which every surface has zero.
 
-A field is linear in its coefficients, so each contact contributes a quadratic form, and all of them, a prior and a penalty on
-coefficients of high degree add up. The forms: on the ball its slope is known; around it, on the skirt, the slope points to
-the center; and everywhere the slope of a surface has no curl.
+A field is linear in its coefficients, so each contact contributes a quadratic form, and contacts, a prior and a regularisation
+add up. The forms: inside the contact the ball's slope is known; in the transition zone around it the slope points to the center;
+and everywhere the slope of a surface has no curl.
 """
 
 from dataclasses import dataclass
@@ -14,22 +14,31 @@ from ..model.response_field import ResponseField, term_degrees, term_degrees_by_
 from .contacts import Contact
 
 CURL_WEIGHT = 3.0
-SKIRT_WEIGHT = 0.3
-SKIRT_REACH = 2.0
-"""The skirt ends at this many contact radii."""
+TRANSITION_WEIGHT = 0.3
+TRANSITION_REACH = 2.0
+"""The transition zone between ball and undeformed skin ends at this many contact radii."""
 DEGREE_PENALTY = 2.0
-"""Each degree in position makes a coefficient this many times dearer: slow fields are the likely ones."""
+"""Each degree in position regularises a coefficient this many times more: slowly varying fields are likely."""
 PRODUCT_PENALTY = 10.0
-"""Coefficients of products are this many times dearer: they fit one unit's own ways, and do not carry over to another."""
+"""Coefficients of products are regularised this many times more: they fit one unit and do not carry over to another."""
 DEPTH_PENALTY = 3.0
-"""Terms with the depth are this many times dearer: half a millimetre is a deep press, and depth alone can tell a ball's shape."""
+"""Terms with the depth are regularised this many times more: half a millimetre is a deep press, and depth alone can imitate a
+ball's shape."""
 SLOPE_PENALTY = 0.3
-"""Slopes of the depth are this many times as dear: they are slopes already."""
+"""Slopes of the depth are regularised by this factor: they are slopes already."""
 
 
 @dataclass(frozen=True)
 class Family:
-    """What kind of field: its degrees, whether depth is an input, and the scale of positions."""
+    """The size of a field.
+
+    Attributes:
+        degree: of linear terms in position.
+        product_degree: of products in position; -1 for none.
+        uses_depth: depth and its slopes are inputs.
+        half_mm: scale of positions, mm.
+        product_penalty: regularisation of products relative to linear terms.
+    """
 
     degree: int
     product_degree: int
@@ -43,11 +52,11 @@ class Family:
         return f"linear {self.degree}{products}{', with depth' if self.uses_depth else ''}"
 
     def penalty(self) -> Tensor:
-        """(2 K,): what a unit of each coefficient costs; dz/dx first."""
+        """(2 K,): regularisation of each coefficient; dz/dx first."""
         by_term = term_degrees_by_term(self.degree, self.product_degree, self.uses_depth)
-        dear = [self._term_penalty(term) for term, d in by_term.items() for _ in range((d + 1) * (d + 2) // 2)]
+        factors = [self._term_penalty(term) for term, d in by_term.items() for _ in range((d + 1) * (d + 2) // 2)]
         degrees = torch.tensor(term_degrees(self.degree, self.product_degree, self.uses_depth), dtype=torch.float64)
-        return (torch.tensor(dear, dtype=torch.float64) * DEGREE_PENALTY**degrees).repeat(2)
+        return (torch.tensor(factors, dtype=torch.float64) * DEGREE_PENALTY**degrees).repeat(2)
 
     def _term_penalty(self, term: tuple[int, ...]) -> float:
         if len(term) == 2:
@@ -55,7 +64,7 @@ class Family:
         return (1.0, 1.0, 1.0, DEPTH_PENALTY, SLOPE_PENALTY, SLOPE_PENALTY)[term[0]]
 
     def size(self) -> int:
-        """Numbers in a field of this family, both slopes."""
+        """Number of parameters of a field of this family, both slopes."""
         return 2 * len(term_degrees(self.degree, self.product_degree, self.uses_depth))
 
     def field(self, coefficient: Tensor) -> ResponseField:
@@ -69,15 +78,15 @@ class Family:
         return cls(field.degree, field.product_degree, field.uses_depth, field.half_mm)
 
     def terms(self, contact: Contact, shift: int = 0) -> Tensor:
-        """(K, N): factors of the coefficients at the sampled pixels, or at neighbours ``shift`` further in memory."""
+        """(K, N): factors of the coefficients at the sampled pixels, or at pixels ``shift`` further in memory."""
         index = contact.index + shift
-        deep = contact.deep.flatten(1)[:, index] if self.uses_depth else None
+        deep = contact.second_pass.flatten(1)[:, index] if self.uses_depth else None
         change = contact.change.flatten(1)[:, index]
         return term_values(change, deep, contact.x, contact.y, self.half_mm, self.degree, self.product_degree)
 
 
 class ContactForms:
-    """What one contact says of a family's coefficients."""
+    """The quadratic forms that one contact contributes to a family's coefficients."""
 
     def __init__(self, family: Family, contact: Contact) -> None:
         self.contact = contact
@@ -85,45 +94,45 @@ class ContactForms:
         self.curl = curl_form(family, contact)
 
     def ball(self) -> tuple[Tensor, Tensor]:
-        """Quadratic form (2 K, 2 K) and linear part (2 K,) of a press with its center where it is, over one press's weight."""
+        """Quadratic form (2 K, 2 K) and linear part (2 K,) of a press with its center fixed, of weight one per press."""
         inside = self.contact.inside()
         terms = self.terms[:, inside]
         count = max(1, int(inside.sum()))
         gram = terms @ terms.t() / count
         right = (terms @ self.contact.ball_slope()[:, inside].t() / count).t().reshape(-1)
-        form = self.skirt()
+        form = self.transition_and_curl()
         half = len(gram)
         form[:half, :half] += gram
         form[half:, half:] += gram
         return form, right
 
-    def skirt(self) -> Tensor:
-        """(2 K, 2 K): slopes across the way to the center, on the skirt, and the curl everywhere."""
+    def transition_and_curl(self) -> Tensor:
+        """(2 K, 2 K): slopes across the direction to the center in the transition zone, and the curl everywhere."""
         dx, dy, r = self.contact.polar()
-        on_skirt = (r > self.contact.contact_radius_mm) & (r < SKIRT_REACH * self.contact.contact_radius_mm)
+        zone = (r > self.contact.contact_radius_mm) & (r < TRANSITION_REACH * self.contact.contact_radius_mm)
         form = CURL_WEIGHT * self.curl
-        count = int(on_skirt.sum())
+        count = int(zone.sum())
         if count < 10:
             return form
-        terms = self.terms[:, on_skirt]
-        across = torch.cat((-terms * (dy / r)[on_skirt], terms * (dx / r)[on_skirt]))
-        return form + SKIRT_WEIGHT * across @ across.t() / count
+        terms = self.terms[:, zone]
+        across = torch.cat((-terms * (dy / r)[zone], terms * (dx / r)[zone]))
+        return form + TRANSITION_WEIGHT * across @ across.t() / count
 
     def center(self) -> tuple[Tensor, Tensor, Tensor]:
-        """How slope and center go together: coupling (2, K), weight of a shift, and the right side it has by itself (2,).
+        """How slope and center depend on each other: coupling (2, K), weight of a shift, and the shift's own right side (2,).
 
-        Around the present center the ball's slope is -(x - c) / down, so a shift of the center by d adds d / down.
+        Around the present center the ball's slope is -(x - c) / height, so a shift of the center by d adds d / height.
         """
         inside = self.contact.inside()
-        lean = 1.0 / self.contact.down()[inside]
-        count = max(1, len(lean))
-        coupling = -(self.terms[:, inside] * lean).sum(1) / count
-        weight = lean.square().sum().clamp_min(1e-12) / count
-        own = -(self.contact.ball_slope()[:, inside] * lean).sum(1) / count
+        slope_per_shift = 1.0 / self.contact.height_above_equator()[inside]
+        count = max(1, len(slope_per_shift))
+        coupling = -(self.terms[:, inside] * slope_per_shift).sum(1) / count
+        weight = slope_per_shift.square().sum().clamp_min(1e-12) / count
+        own = -(self.contact.ball_slope()[:, inside] * slope_per_shift).sum(1) / count
         return coupling, weight, own
 
     def slope(self, coefficient: Tensor) -> Tensor:
-        """(2, N) slopes that coefficients (2 K,) give at the sampled pixels."""
+        """(2, N) slopes by coefficients (2 K,) at the sampled pixels."""
         return coefficient.reshape(2, -1) @ self.terms
 
     def error_deg(self, coefficient: Tensor) -> float:
@@ -132,10 +141,50 @@ class ContactForms:
         return angle_deg(self.slope(coefficient)[:, inside], self.contact.ball_slope()[:, inside])
 
     def gain(self, coefficient: Tensor) -> float:
-        """Slope found over slope expected: the ball seems this many times smaller than it was said to be."""
+        """Slope found divided by slope expected: the ball seems this many times smaller than given."""
         inside = self.contact.inside()
         ball = self.contact.ball_slope()[:, inside]
         return float((self.slope(coefficient)[:, inside] * ball).sum() / ball.square().sum().clamp_min(1e-12))
+
+
+class Evidence:
+    """The forms of all contacts for a family's coefficients, together and without one."""
+
+    def __init__(self, family: Family, forms: list[ContactForms], each: list[tuple[Tensor, Tensor]]) -> None:
+        self.family, self.forms, self.each = family, forms, each
+        self.form = torch.stack([form for form, _ in each]).sum(0)
+        self.right = torch.stack([right for _, right in each]).sum(0)
+
+    @classmethod
+    def of(cls, family: Family, contacts: list[Contact]) -> "Evidence":
+        """The forms of contacts, each with its center fixed."""
+        forms = [ContactForms(family, contact) for contact in contacts]
+        return cls(family, forms, [item.ball() for item in forms])
+
+    def without(self, place: int) -> "Evidence":
+        """The same without one contact."""
+        others = [k for k in range(len(self.forms)) if k != place]
+        return Evidence(self.family, [self.forms[k] for k in others], [self.each[k] for k in others])
+
+    def gains(self, solutions: list[Tensor]) -> Tensor:
+        """For each contact the slopes by its coefficients divided by the ball's."""
+        return torch.tensor([item.gain(solution) for item, solution in zip(self.forms, solutions)], dtype=torch.float64)
+
+    def errors_deg(self, solutions: list[Tensor]) -> list[float]:
+        """For each contact the mean angle under its coefficients, degrees."""
+        return [item.error_deg(solution) for item, solution in zip(self.forms, solutions)]
+
+    def mean_error_deg(self, solutions: list[Tensor]) -> float:
+        """Mean of :meth:`errors_deg`."""
+        return sum(self.errors_deg(solutions)) / len(self.forms)
+
+    def solve(self, penalty: Tensor, start: Tensor | None) -> Tensor:
+        """Coefficients by all contacts."""
+        return solve(self.form, self.right, penalty, start)
+
+    def held_out(self, penalty: Tensor, start: Tensor | None) -> list[Tensor]:
+        """For each contact the coefficients by all others."""
+        return [solve(self.form - form, self.right - right, penalty, start) for form, right in self.each]
 
 
 def curl_form(family: Family, contact: Contact) -> Tensor:
@@ -155,14 +204,23 @@ def angle_deg(slope: Tensor, other: Tensor) -> float:
 
 
 def solve(form: Tensor, right: Tensor, penalty: Tensor, prior: Tensor | None = None) -> Tensor:
-    """Coefficients (2 K,) that minimise w' form w - 2 right' w + penalty (w - prior)^2."""
+    """Coefficients w (2 K,) that minimise w' form w - 2 right' w + penalty (w - prior)^2."""
     target = right if prior is None else right + penalty * prior
     solution: Tensor = torch.linalg.solve(form + torch.diag(penalty), target)
     return solution
 
 
 def solve_with_centers(forms: list[ContactForms], penalty: Tensor, anchors: list[Tensor] | None, anchor_weight: float) -> Tensor:
-    """Coefficients and all centers at once; moves the centers. ``anchors`` (mm) hold them by ``anchor_weight`` of a press."""
+    """Solve for the coefficients and all centers at once, and move the centers.
+
+    Args:
+        forms: one per press.
+        penalty: (2 K,), regularisation.
+        anchors: positions (2,), mm, that regularise the centers; None for none.
+        anchor_weight: weight of that regularisation, in presses.
+    Returns:
+        Coefficients (2 K,).
+    """
     size = len(penalty)
     half, count = size // 2, len(forms)
     matrix = torch.zeros(size + 2 * count, size + 2 * count, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Images, video, tensors on disk: read with plain errors, written whole or not at all."""
+"""Reads and writes images, videos, depth and tensors: errors name the file, files are written whole or not at all."""
 
 import json
 import os
@@ -21,17 +21,19 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mov", ".mkv", ".webm")
 
 MOST_PIXELS = 2**26
-"""An image that says it has more, 8192 x 8192, is not decoded: some kilobytes can claim gigabytes."""
+"""An image whose header gives more, 8192 x 8192, is not decoded: a file of some kilobytes can claim gigabytes."""
 
 MOST_BYTES = 2**29
-"""A file of an image that is larger is not read."""
+"""A larger image file is not read."""
 
 
 def check_target(path: str | Path) -> Path:
-    """The path of a file that may be written, or raise: said before the work that leads to it.
+    """Check that a file can be written there, before the work that leads to it.
 
     Raises:
-        TypeError: no path. FileNotFoundError: the folder is missing. IsADirectoryError: it is one itself.
+        TypeError: not a path.
+        FileNotFoundError: the folder is missing.
+        IsADirectoryError: the path is a folder.
     """
     path = check_path("path", path)
     if not path.parent.is_dir():
@@ -43,20 +45,19 @@ def check_target(path: str | Path) -> Path:
 
 @contextmanager
 def write_atomically(path: str | Path) -> Iterator[Path]:
-    """Give a temporary file beside ``path``; when the block ends well it takes the place of ``path``, else it is removed.
+    """Give a temporary file beside ``path``; it replaces ``path`` when the block ends without an error, and is removed otherwise.
 
-    The temporary file keeps the suffix, so that writers which look at it work. A process that is killed in between leaves the old
-    file as it was and one hidden ``.stem-xxxxxxxx.suffix`` beside it, which nothing reads.
+    The temporary file keeps the suffix, because some writers look at it. A process that is killed in between leaves the old
+    file as it was and a hidden ``.stem-xxxxxxxx.suffix`` beside it, which nothing reads.
 
     Raises:
-        FileNotFoundError: the folder is missing. PermissionError: it cannot be written.
+        FileNotFoundError: the folder is missing.
+        PermissionError: the folder cannot be written.
     """
     path = check_target(path)
     temporary = path.with_name(f".{path.stem}-{secrets.token_hex(4)}{path.suffix}")
     try:
-        temporary.open(
-            "xb"
-        ).close()  # not by tempfile: whose mode would be private, and asking for the umask is no thread's business
+        temporary.open("xb").close()  # not by tempfile, whose files are private; reading the umask is not safe in threads
     except OSError as error:
         raise type(error)(f"{path}: cannot write into {path.parent}: {error.strerror}") from error
     try:
@@ -83,7 +84,8 @@ def read_image(path: str | Path) -> Tensor:
     """Read an image file as (3, H, W) float32 in [0, 1], channels R, G, B; 8 and 16 bits.
 
     Raises:
-        FileNotFoundError: no such file. ValueError: not an image, or not in colour.
+        FileNotFoundError: no such file.
+        ValueError: not an image, or not in colour.
     """
     import cv2
 
@@ -102,7 +104,7 @@ def decode_image(path: Path, flags: int) -> np.ndarray[Any, Any] | None:
     """An image file as OpenCV decodes it; None if it does not.
 
     Raises:
-        ValueError: larger than :data:`MOST_BYTES`, or says that it has more than :data:`MOST_PIXELS`.
+        ValueError: larger than :data:`MOST_BYTES`, or its header gives more than :data:`MOST_PIXELS`.
     """
     size = path.stat().st_size
     if size > MOST_BYTES:
@@ -111,7 +113,7 @@ def decode_image(path: Path, flags: int) -> np.ndarray[Any, Any] | None:
 
 
 def decode_bytes(data: np.ndarray[Any, Any], flags: int, source: str) -> np.ndarray[Any, Any] | None:
-    """:func:`decode_image` of bytes (N,) that are in memory; ``source`` names them in errors."""
+    """:func:`decode_image` for bytes (N,) in memory; ``source`` names them in errors."""
     import cv2
 
     width, height = _claimed_size(data[: 2**16].tobytes())
@@ -119,12 +121,12 @@ def decode_bytes(data: np.ndarray[Any, Any], flags: int, source: str) -> np.ndar
         raise ValueError(f"{source}: expected an image of at most {MOST_PIXELS} pixels, got one that says {height} x {width}")
     try:
         return cv2.imdecode(data, flags)
-    except cv2.error:  # of damaged files, and of those that claim still more
+    except cv2.error:  # damaged, or the claim is still larger
         return None
 
 
 def _claimed_size(head: bytes) -> tuple[int, int]:
-    """Width and height in the head of a PNG, BMP or JPEG file; 0 for what OpenCV judges alone."""
+    """Width and height in the header of a PNG, BMP or JPEG file; 0 for other formats, which OpenCV checks itself."""
     if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) >= 24:
         width, height = struct.unpack(">II", head[16:24])
         return width, height
@@ -158,7 +160,7 @@ def write_image(path: str | Path, image: Tensor) -> None:
 
 
 def image_to_bytes(image: Tensor) -> Tensor:
-    """(3, H, W) R, G, B in [0, 1] as the bytes of a PNG, (N,) uint8: of 8 bits where they hold it exactly, else of 16."""
+    """(3, H, W) R, G, B in [0, 1] as the bytes of a PNG, (N,) uint8: with 8 bits where they are exact, else with 16."""
     import cv2
 
     levels = image.detach().cpu().double() * 255.0
@@ -174,7 +176,7 @@ def image_from_bytes(data: Tensor, size: tuple[int, int], source: str) -> Tensor
     """Read what :func:`image_to_bytes` gave, (3, H, W) float64.
 
     Raises:
-        ValueError: not a PNG, or of another size than ``size``, which its header is held against before it is decoded.
+        ValueError: not a PNG, or of another size than ``size``; the header is compared with it before decoding.
     """
     import cv2
 
@@ -235,7 +237,8 @@ def read_frames(source: str | Path) -> Iterator[tuple[str, Tensor]]:
     """Frames of an image file, a folder of images (by name) or a video: pairs of a name and (3, H, W) in [0, 1], R, G, B.
 
     Raises:
-        FileNotFoundError: nothing there. ValueError: a file that cannot be read, or a folder without images.
+        FileNotFoundError: no such file or folder.
+        ValueError: a file that cannot be read, or a folder without images.
     """
     path = Path(source)
     if path.is_dir():
@@ -251,12 +254,12 @@ def read_frames(source: str | Path) -> Iterator[tuple[str, Tensor]]:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """Images of a folder by name; hidden ones, such as a killed writer leaves, are none."""
+    """Images of a folder, sorted by name, without hidden ones, which a killed writer may leave."""
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
 
 
 def count_frames(source: str | Path) -> int:
-    """Number of frames that :func:`read_frames` will give (a video's own claim), for progress bars."""
+    """Number of frames that :func:`read_frames` will give, for progress bars; of a video the number in its header."""
     import cv2
 
     path = Path(source)
@@ -296,7 +299,8 @@ def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read what :func:`save_tensors` wrote. Nothing is unpickled.
 
     Raises:
-        FileNotFoundError: no such file. ValueError: not a safetensors file, cut short, or not written by torchvts.
+        FileNotFoundError: no such file.
+        ValueError: not a safetensors file, cut short, or not written by torchvts.
     """
     path = check_path("path", path)
     if not path.is_file():

@@ -36,7 +36,7 @@ def half_sample_mode(ordered: Tensor, halvings: int = 4) -> Tensor:
         Bickel and Fruhwirth, Computational Statistics and Data Analysis 50(12), 2006.
     Example:
         >>> half_sample_mode(torch.tensor([[[0.0, 4.9, 5.0, 5.05, 5.1, 9.0, 20.0]]]), 2)
-        tensor([[5.0500]])
+        tensor([[5.1000]])
     """
     for _ in range(halvings):
         half = (ordered.shape[2] + 1) // 2

@@ -12,16 +12,16 @@ BLOCK = 8
 
 
 def levels_of(image: Tensor) -> float:
-    """How many levels a full range would have: 255 for 8 bits, inf for floats.
+    """Number of grey levels of the full range: 255 for 8 bits, inf for floats.
 
-    The values' common step: the widest spacing that at least 99 % of the values keep to.
+    It follows from the widest spacing that at least 99 % of the values keep to.
 
     Example:
         >>> levels_of(torch.round(torch.rand(3, 32, 32) * 63) / 63)
         63.0
     """
     values = image.detach().double().flatten()
-    values = values[(values > 0.0) & (values < 1.0)]  # clipped ones tell nothing
+    values = values[(values > 0.0) & (values < 1.0)]  # without clipped ones
     if len(values) < 100:
         return math.inf
     for bits in range(1, 9):
@@ -33,10 +33,10 @@ def levels_of(image: Tensor) -> float:
 
 
 def blockiness(image: Tensor) -> float:
-    """Second differences across the borders of 8 x 8 blocks over those elsewhere, the largest over channels; 1 for none.
+    """Ratio of second differences across the borders of 8 x 8 blocks to those elsewhere; 1 for an uncompressed image.
 
-    Along rows and columns, at every phase of the grid, so that a cropped image is seen too. What is smooth cancels, and a median
-    filter of the means leaves rims out.
+    Measured along rows and columns and at every phase of the grid, so that it works for cropped images too. Smooth structure
+    cancels in second differences, and a median leaves out the rims of objects.
 
     Args:
         image: (3, H, W).
@@ -58,7 +58,14 @@ def blockiness(image: Tensor) -> float:
 
 
 class Spots(NamedTuple):
-    """New spots: how many, how many pixels, how many of those read nothing, and which they are, (H, W) bool."""
+    """New spots on the skin or the lens.
+
+    Attributes:
+        number: how many.
+        pixels: how many pixels they have.
+        dead: how many of these pixels are black.
+        mask: (H, W) bool, their pixels.
+    """
 
     number: int
     pixels: int
@@ -67,34 +74,37 @@ class Spots(NamedTuple):
 
 
 def new_spots(image: Tensor, expected: Tensor, noise_std: Tensor, widest_px: int, contact: Tensor) -> Spots:
-    """Small places that are darker or brighter than the image at rest foretells, in all channels alike.
+    """Find small places that are darker or brighter than the background predicts, in all channels alike.
 
-    Slopes take light from one lamp and give it to another; a spot takes it from all. The ratio of image and expectation is
-    compared with its median over a window as wide as the widest spot. In a contact nothing is sought: cliffs are dark in all
+    A slope takes light from one LED and gives it to another; a spot takes it from all. The ratio of image and expectation is
+    compared with its median over a window as wide as the widest spot. Contacts are left out: steep walls are dark in all
     channels too.
 
     Args:
-        image, expected: (3, H, W), values. noise_std: (3,), of their difference. widest_px: diameter of the widest spot.
-        contact: (H, W) bool; parts of it no wider than a spot do not count as such.
+        image: (3, H, W), values.
+        expected: (3, H, W), values predicted from the background.
+        noise_std: (3,), of their difference.
+        widest_px: diameter of the widest spot.
+        contact: (H, W) bool; parts of it no wider than a spot do not count as contact.
     """
     import cv2
 
     number, label, stats, _ = cv2.connectedComponentsWithStats(contact.numpy().astype(np.uint8), connectivity=8)
     wide = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]) > 1.5 * widest_px
-    touched = cv2.dilate((wide & (np.arange(number) > 0))[label].astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
-    value, rest = image.double().numpy(), expected.double().numpy()
+    pressed = cv2.dilate((wide & (np.arange(number) > 0))[label].astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    value, predicted = image.double().numpy(), expected.double().numpy()
     noise = noise_std.double().numpy()[:, None, None]
-    dead = (value < 3.0 * noise).all(0) & (rest > 12.0 * noise).all(0)
-    log_ratio = np.log(np.maximum(value, 1e-3) / np.maximum(rest, 1e-3)).astype(np.float32)
+    dead = (value < 3.0 * noise).all(0) & (predicted > 12.0 * noise).all(0)
+    log_ratio = np.log(np.maximum(value, 1e-3) / np.maximum(predicted, 1e-3)).astype(np.float32)
     window = 2 * (max(3, widest_px) // 2) + 1
     bytes_of = np.clip((log_ratio + 1.0) * 127.5, 0, 255).astype(np.uint8)
     smooth = np.stack([cv2.medianBlur(plane, window) for plane in bytes_of]).astype(np.float32) / 127.5 - 1.0
     smooth = np.stack([cv2.GaussianBlur(plane, (0, 0), 0.25 * window) for plane in smooth])
-    departs = log_ratio - smooth
+    residual = log_ratio - smooth
     least = np.maximum(0.04, 5.0 * noise / np.maximum(value, 3.0 * noise))
-    dark = ((departs < -least) & (rest > 6.0 * noise)).all(0)
-    bright = ((departs > least) & (rest > 6.0 * noise)).all(0)
-    found = ((dark | bright | dead) & ~touched).astype(np.uint8)
+    dark = ((residual < -least) & (predicted > 6.0 * noise)).all(0)
+    bright = ((residual > least) & (predicted > 6.0 * noise)).all(0)
+    found = ((dark | bright | dead) & ~pressed).astype(np.uint8)
     number, label, stats, _ = cv2.connectedComponentsWithStats(found, connectivity=8)
     extent = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT])
     kept = (extent <= widest_px) & (np.arange(number) > 0)
@@ -103,13 +113,16 @@ def new_spots(image: Tensor, expected: Tensor, noise_std: Tensor, widest_px: int
 
 
 def texture_share(image: Tensor, expected: Tensor, noise_std: Tensor, where: Tensor) -> tuple[float, float]:
-    """How much of the reference's fine texture is left in an image, and the standard error of that figure.
+    """Share of the background's fine texture that is left in an image, and the standard error of this share.
 
-    The regression of the band-passed image on the band-passed reference over pixels at rest: 1 for a sharp image, 0 where blur has
-    taken the texture. Where the reference has no texture beyond its noise, the standard error is infinite.
+    It is the regression of the band-passed image on the band-passed background: 1 for a sharp image, 0 where blur has
+    removed the texture. Where the background has no texture beyond its noise, the standard error is infinite.
 
     Args:
-        image, expected: (3, H, W), values. noise_std: (3,), of each. where: (H, W) bool, at rest.
+        image: (3, H, W), values.
+        expected: (3, H, W), values predicted from the background.
+        noise_std: (3,), of each.
+        where: (H, W) bool, pixels without contact.
     """
     fine, same = _band(image), _band(expected)
     inside = where.flatten()

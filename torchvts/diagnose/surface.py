@@ -1,7 +1,7 @@
-"""What a frame's relief and its normals say: contacts, steepness, shadows, and where the light does not fit any surface.
+"""A frame's surface and its normals: contacts, steepness, shadows, and where the light does not fit any surface.
 
-Three lights over-determine a slope by one number: the normal that the light matrix gives must be of length one. Gloss makes it
-longer, bounced light and mixed pixels (blur) shorter, and each does so at its own places.
+Three lights over-determine a slope by one value: the normal that the light matrix gives must have length one. Gloss makes it
+longer; inter-reflection and mixed pixels (blur) make it shorter, each at places of its own.
 """
 
 import math
@@ -17,25 +17,25 @@ from ..core.blur import blur, gaussian_weights
 from ..core.checks import QUANTISATION_STD
 from ..core.geometry import GradientFromNormal
 from ..integration import PoissonBackground
-from ..model.calibration import Calibration
-from ..model.lights import PointLights, inverse_light_matrix
+from ..model import Calibration, PointLights
+from ..model.lights import inverse_light_matrix
 from ..normals import NormalFromIntensity, NormalFromResponse
 from ..pipeline import DepthOutput, DepthPipeline
 
 SPREADS_PX = (1.5, 3.0, 6.0)
-"""Blurs that the normals are looked at for, pixels of a 160 x 120 image and in proportion of others."""
+"""Blurs that the normals are compared with, in pixels of a 160 x 120 image and in proportion for others."""
 
 
 @dataclass(frozen=True)
-class Reader:
-    """What turns a unit's images into normals, made once: finding the defects of a background takes longer than all else."""
+class Blocks:
+    """The blocks that turn a unit's images into normals, made once: finding the defects of a background takes longest."""
 
     calibration: Calibration
     compensate: Compensate
     normals: NormalFromIntensity | NormalFromResponse
 
     @classmethod
-    def of(cls, calibration: Calibration) -> "Reader":
+    def of(cls, calibration: Calibration) -> "Blocks":
         """The blocks of a unit."""
         block = NormalFromIntensity if calibration.lights is not None else NormalFromResponse
         return cls(calibration, Compensate.from_calibration(calibration).eval(), block.from_calibration(calibration).eval())
@@ -62,13 +62,16 @@ class Reader:
 
 
 @dataclass(frozen=True)
-class Relief:
-    """A frame through the pipeline: output, compensated image (1, 3, H, W), and the length of the normals.
+class Surface:
+    """A frame after the pipeline.
 
     Attributes:
-        length_error: (1, 1, H, W), length less one, or None with response fields.
-        length_noise: (1, 1, H, W), its noise.
-        dark: (1, 3, H, W) bool, channels without light where the skin at rest has some.
+        calibration: of the unit.
+        output: of the pipeline.
+        compensated: (1, 3, H, W), compensated image.
+        length_error: (1, 1, H, W), length of the normals less one; None with response fields.
+        length_noise: (1, 1, H, W), its noise; None with response fields.
+        dark: (1, 3, H, W) bool, channels without light where the background has some.
     """
 
     calibration: Calibration
@@ -79,28 +82,28 @@ class Relief:
     dark: Tensor
 
     @classmethod
-    def of(cls, light: Tensor, reader: Reader, noise_std: Tensor) -> "Relief":
-        """Of linear light (3, H, W), with the noise (3,) of its value."""
-        calibration = reader.calibration
+    def of(cls, light: Tensor, blocks: Blocks, noise_std: Tensor) -> "Surface":
+        """From linear light (3, H, W), with the noise (3,) of its value."""
+        calibration = blocks.calibration
         value = light.clamp(0.0, 1.0) ** (1.0 / calibration.sensor.exponent)
         image = value[None].to(calibration.background.dtype)
         refines = calibration.lights is not None or (calibration.response is not None and calibration.response.precise is not None)
-        output = reader.output(image, "precise" if refines else "fast")
+        output = blocks.output(image, "precise" if refines else "fast")
         with torch.no_grad():
-            compensated = reader.compensate(image)
-        rest = calibration.background.clamp_min(0.0) ** (1.0 / calibration.sensor.exponent)
-        black = (3.0 * noise_std.reshape(3, 1, 1)).clamp_min(1.5 / 255.0).to(rest.dtype)
+            compensated = blocks.compensate(image)
+        background = calibration.background.clamp_min(0.0) ** (1.0 / calibration.sensor.exponent)
+        black = (3.0 * noise_std.reshape(3, 1, 1)).clamp_min(1.5 / 255.0).to(background.dtype)
         filled = value if calibration.markers is None else calibration.markers(image)[0]
-        dark = ((filled < black) & (rest > 4.0 * black))[None]
+        dark = ((filled < black) & (background > 4.0 * black))[None]
         if calibration.lights is None:
             return cls(calibration, output, compensated, None, None, dark)
         lights = calibration.lights
         inverse = inverse_light_matrix(output.depth_mm, lights.position_mm, lights.albedo, calibration.sensor.mm_per_pixel)
         normal = (inverse * compensated[:, None]).sum(2)
         error = normal.norm(dim=1, keepdim=True) - 1.0
-        ratio = noise_std.to(rest.dtype).reshape(3, 1, 1) / calibration.noise_std.reshape(3, 1, 1)
+        ratio = noise_std.to(background.dtype).reshape(3, 1, 1) / calibration.noise_std.reshape(3, 1, 1)
         noise = calibration.compensated_noise_std * ratio.clamp_min(1.0)
-        share = (output.normal[:, :, None] * inverse).sum(1)  # how the length follows each light
+        share = (output.normal[:, :, None] * inverse).sum(1)  # derivative of the length by each channel
         spread = torch.sqrt((share * noise[None]).square().sum(1, keepdim=True))
         return cls(calibration, output, compensated, error, spread, dark)
 
@@ -118,70 +121,81 @@ class Relief:
 
 
 @dataclass(frozen=True)
-class LengthMisfit:
-    """How the normals' length fails: share of it per template, and how many standard deviations that is."""
+class LengthError:
+    """How the normals' length deviates from one.
 
-    sigmas: dict[str, float]
-    amount: dict[str, float]
+    Attributes:
+        pattern: the template that explains most of it: "blur", "move" or "bounce" and its size.
+        sigmas: how many standard deviations the template explains.
+        amount: share of the template that is in the error.
+        narrow: whether a blur of 1.5 pixels explains nearly as much.
+        longer: share of the contact where the length is above one by more than 6 standard deviations.
+        mean: mean error in the contact.
+    """
+
+    pattern: str
+    sigmas: float
+    amount: float
+    narrow: bool
     longer: float
-    shorter: float
     mean: float
 
 
-def length_misfit(relief: Relief, unsound: Tensor) -> LengthMisfit | None:
-    """Regress the length error on what blur, movement and bounced light would leave; None with response fields.
+def fit_length_error(surface: Surface, invalid: Tensor) -> LengthError | None:
+    """Regress the error of the length on what blur, movement and inter-reflection would leave.
 
-    Pixels of ``unsound`` (H, W) and next to them do not count.
-
-    ``longer`` and ``shorter`` are the shares of the contact where the length is off by more than 6 standard deviations.
+    Args:
+        surface: the frame.
+        invalid: (H, W) bool, pixels that, with their neighbours, are not used.
+    Returns:
+        None with response fields, and where the contact is too small.
     """
-    error, noise = relief.length_error, relief.length_noise
+    error, noise = surface.length_error, surface.length_noise
     if error is None or noise is None:
         return None
-    normal = relief.output.normal
-    left_out = relief.dark.any(1, keepdim=True) | unsound
-    sound = ~(nn.functional.max_pool2d(left_out.to(normal.dtype), 5, 1, 2) > 0) & torch.isfinite(error)
-    inside = sound & relief.output.contact
+    left_out = surface.dark.any(1, keepdim=True) | invalid
+    valid = ~(nn.functional.max_pool2d(left_out.to(error.dtype), 5, 1, 2) > 0) & torch.isfinite(error)
+    inside = valid & surface.output.contact
     if int(inside.sum()) < 20:
         return None
-    scale = normal.shape[2] / 120.0
-    sigma = noise[sound].median()
-    templates: dict[str, Tensor] = {}
-    for spread in SPREADS_PX:
-        templates[f"blur {spread:g}"] = _smoothed(normal, spread * scale) - 1.0
-    for name, shift in (("x", (0, 1)), ("y", (1, 0)), ("down", (1, 1)), ("up", (1, -1))):
-        for length in (5, 9, 17):
-            templates[f"move {name} {length}"] = _moved(normal, shift, max(3, int(length * scale))) - 1.0
-    for spread in (1.0, 2.0, 4.0):
-        spread_px = spread / relief.calibration.sensor.mm_per_pixel
-        if spread_px < 0.2 * normal.shape[2]:
-            mean = nn.functional.normalize(_gaussian(normal, spread_px), dim=1)
-            templates[f"bounce {spread:g}"] = (normal * mean).sum(1, keepdim=True) - 1.0
-    # a bounded error: one spot is not a blur
-    bounded = error.clamp(-12.0 * sigma, 12.0 * sigma) * sound
-    sigmas, amount = {}, {}
-    for name, template in templates.items():
-        shape = template * sound
+    sigma = noise[valid].median()
+    bounded = error.clamp(-12.0 * sigma, 12.0 * sigma) * valid  # so that one spot is not taken for a blur
+    sigmas: dict[str, float] = {}
+    amount: dict[str, float] = {}
+    for name, template in _templates(surface).items():
+        shape = template * valid
         power = shape.square().sum().clamp_min(1e-12)
         along = (bounded * shape).sum()
         sigmas[name] = float(along / (power.sqrt() * sigma))
         amount[name] = float(along / power)
-    return LengthMisfit(
-        sigmas,
-        amount,
-        float((error[inside] > 6.0 * noise[inside]).double().mean()),
-        float((error[inside] < -6.0 * noise[inside]).double().mean()),
-        float(error[inside].mean()),
+    best = max(sigmas, key=lambda name: sigmas[name])
+    longer = float((error[inside] > 6.0 * noise[inside]).double().mean())
+    return LengthError(
+        best, sigmas[best], amount[best], sigmas["blur 1.5"] > 0.85 * sigmas[best], longer, float(error[inside].mean())
     )
+
+
+def _templates(surface: Surface) -> dict[str, Tensor]:
+    """Errors of the length (1, 1, H, W) that blur, movement along four directions, and inter-reflection would leave."""
+    normal = surface.output.normal
+    scale = normal.shape[2] / 120.0
+    templates: dict[str, Tensor] = {}
+    for spread in SPREADS_PX:
+        templates[f"blur {spread:g}"] = _length(_gaussian(normal, spread * scale)) - 1.0
+    for name, shift in (("x", (0, 1)), ("y", (1, 0)), ("down", (1, 1)), ("up", (1, -1))):
+        for length in (5, 9, 17):
+            templates[f"move {name} {length}"] = _moved(normal, shift, max(3, int(length * scale))) - 1.0
+    for spread in (1.0, 2.0, 4.0):
+        spread_px = spread / surface.calibration.sensor.mm_per_pixel
+        if spread_px < 0.2 * normal.shape[2]:
+            mean = nn.functional.normalize(_gaussian(normal, spread_px), dim=1)
+            templates[f"bounce {spread:g}"] = (normal * mean).sum(1, keepdim=True) - 1.0
+    return templates
 
 
 def _gaussian(planes: Tensor, std_px: float) -> Tensor:
     blurred: Tensor = blur(planes, gaussian_weights(std_px))
     return blurred
-
-
-def _smoothed(normal: Tensor, std_px: float) -> Tensor:
-    return _length(_gaussian(normal, std_px))
 
 
 def _moved(normal: Tensor, shift: tuple[int, int], length: int) -> Tensor:
@@ -201,14 +215,13 @@ def _length(vectors: Tensor) -> Tensor:
     return length
 
 
-def normal_noise_deg(reader: Reader, noise_std: Tensor) -> float:
-    """How much the normal of flat skin wavers under noise (3,) of the image value: the median angle, degrees."""
-    unit = reader.calibration
-    rest = (unit.background.clamp_min(0.0) ** (1.0 / unit.sensor.exponent))[None]
-    noise = torch.randn(rest.shape, generator=torch.Generator().manual_seed(0)).to(rest.dtype)
-    return float(
-        angle_deg(reader.normal(rest), reader.normal(rest + noise * noise_std.to(rest.dtype).reshape(1, 3, 1, 1))).median()
-    )
+def normal_noise_deg(blocks: Blocks, noise_std: Tensor) -> float:
+    """Median angle in degrees by which noise (3,) of the image value changes the normal of undeformed skin."""
+    unit = blocks.calibration
+    background = (unit.background.clamp_min(0.0) ** (1.0 / unit.sensor.exponent))[None]
+    noise = torch.randn(background.shape, generator=torch.Generator().manual_seed(0)).to(background.dtype)
+    noisy = background + noise * noise_std.to(background.dtype).reshape(1, 3, 1, 1)
+    return float(angle_deg(blocks.normal(background), blocks.normal(noisy)).median())
 
 
 def angle_deg(normal: Tensor, other: Tensor) -> Tensor:
@@ -225,16 +238,21 @@ def least_spread(lights: PointLights) -> float:
 
 @dataclass(frozen=True)
 class Regions:
-    """Contacts: how many, the share of the image they cover, whether one meets the border, and pixels of the largest."""
+    """The contacts of a frame.
+
+    Attributes:
+        count: how many.
+        share: of the image that they cover.
+        at_border: whether one of them meets the border.
+    """
 
     count: int
     share: float
     at_border: bool
-    largest_px: int
 
 
 def regions(contact: Tensor, least_px: int) -> Regions:
-    """Connected parts of a mask (H, W) of at least ``least_px`` pixels and a twentieth of the largest."""
+    """Connected parts of a mask (H, W) with at least ``least_px`` pixels and a twentieth of the largest part."""
     import cv2
 
     number, _, stats, _ = cv2.connectedComponentsWithStats(contact.numpy().astype(np.uint8), connectivity=8)
@@ -247,7 +265,7 @@ def regions(contact: Tensor, least_px: int) -> Regions:
         return left == 0 or top == 0 or left + wide == width or top + high == height
 
     sizes = [int(stats[k, cv2.CC_STAT_AREA]) for k in kept]
-    return Regions(len(kept), sum(sizes) / contact.numel(), any(meets_border(k) for k in kept), max(sizes, default=0))
+    return Regions(len(kept), sum(sizes) / contact.numel(), any(meets_border(k) for k in kept))
 
 
 def peaks(depth_mm: Tensor, contact: Tensor, noise_mm: float) -> int:
@@ -264,7 +282,7 @@ def peaks(depth_mm: Tensor, contact: Tensor, noise_mm: float) -> int:
     if top <= prominence:
         return 0
     marker, kernel = depth - prominence, np.ones((3, 3), np.uint8)
-    for _ in range(4 * max(depth.shape)):  # flood from (depth - prominence) under depth: what is left standing out are domes
+    for _ in range(4 * max(depth.shape)):  # flood from (depth - prominence) under depth; what stands out are domes
         grown = np.minimum(cv2.dilate(marker, kernel), depth)
         if float(np.abs(grown - marker).max()) < 1e-9:
             break
@@ -275,37 +293,37 @@ def peaks(depth_mm: Tensor, contact: Tensor, noise_mm: float) -> int:
     return max(1, sum(height > 0.999 * prominence for height in heights))
 
 
-def skirt_mm(relief: Relief) -> float:
-    """How far from the rim of the contact the skin is steepest, mm: next to nothing where an object lets go with a kink."""
+def transition_width_mm(surface: Surface) -> float:
+    """Distance from the rim of the mask to where the skin is steepest, mm: nearly zero where the object ends with a kink."""
     import cv2
 
-    contact = relief.contact.numpy().astype(np.uint8)
+    contact = surface.contact.numpy().astype(np.uint8)
     padded = np.pad(contact, 1, mode="edge")
     inward = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
     deepest = int(min(float(inward.max()), float(sum(contact.shape))))
     if deepest < 3 or bool(contact.all()):
         return 0.0
     ring = np.clip(np.ceil(inward).astype(int), 0, deepest)
-    steep = relief.steepness.double().numpy()
+    steep = surface.steepness.double().numpy()
     count = np.bincount(ring.ravel(), minlength=deepest + 1)[1:]
     mean = np.bincount(ring.ravel(), weights=steep.ravel(), minlength=deepest + 1)[1:] / np.maximum(count, 1)
     mean = np.where(count >= 8, mean, 0.0)
     reached = np.argmax(mean >= 0.9 * mean.max())
-    return float(reached) * relief.calibration.sensor.mm_per_pixel
+    return float(reached) * surface.calibration.sensor.mm_per_pixel
 
 
-def cast_shadow_share(relief: Relief, noise_std: Tensor) -> float:
-    """Share of the image where one light is gone while the others shine as on flat skin: in the shadow of something."""
-    if not bool(relief.dark.any()):
+def cast_shadow_share(surface: Surface, noise_std: Tensor) -> float:
+    """Share of the image where one light is missing while the two others are as on undeformed skin: in a cast shadow."""
+    if not bool(surface.dark.any()):
         return 0.0
-    flat = relief.calibration.flat[None]
-    off = (relief.compensated / flat.clamp_min(1e-6) - 1.0).abs()
-    like_rest = off < (6.0 * relief.calibration.compensated_noise_std / flat.clamp_min(1e-6)).clamp_min(0.03)
-    lost = relief.dark & like_rest.roll(1, 1) & like_rest.roll(2, 1)
+    flat = surface.calibration.flat[None]
+    off = (surface.compensated / flat.clamp_min(1e-6) - 1.0).abs()
+    undeformed = off < (6.0 * surface.calibration.compensated_noise_std / flat.clamp_min(1e-6)).clamp_min(0.03)
+    lost = surface.dark & undeformed.roll(1, 1) & undeformed.roll(2, 1)
     return float(lost.any(1).double().mean())
 
 
-def lit_noise(frame_noise: Tensor, levels: float) -> Tensor:
+def noise_with_rounding(frame_noise: Tensor, levels: float) -> Tensor:
     """Noise (3,) of a frame, not below that of rounding to its levels."""
     least = 0.0 if math.isinf(levels) else 1.0 / levels / math.sqrt(12.0)
     return frame_noise.clamp_min(max(QUANTISATION_STD, least))

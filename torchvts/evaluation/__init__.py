@@ -1,1 +1,6 @@
-"""How good methods are, how fast, and where they fail; no other room imports this one."""
+"""How accurate methods are, how fast, and where they fail. No other room imports this one.
+
+``metrics`` and ``score`` compare a frame with the truth. ``methods`` lists what is compared, and ``rows`` records it. ``speed``,
+``stability`` (on the corruptions of ``gallery``) and ``evaluate`` (on presses) measure methods; ``coverage`` measures confidence,
+and ``pose_accuracy`` registration. ``figures`` draws all of it.
+"""

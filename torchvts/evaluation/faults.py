@@ -1,4 +1,4 @@
-"""What light, skin, lens and sensor do that the shading model does not know: an exact scene's image, with any of it."""
+"""Camera images of exact scenes with effects of light, skin, lens and sensor that the shading model does not contain."""
 
 import math
 from collections.abc import Sequence
@@ -11,29 +11,38 @@ from torch import Tensor, nn
 from ..core.files import rgb_from_bgr
 from ..core.geometry import pixel_grid_mm
 from ..model.lights import PointLights, cast_shadows, seen_at
-from ..scenes.scenes import Scene
+from ..scenes import Scene
 
 SHININESS = 30.0
-"""Exponent of the specular lobe: half its height 12 degrees from the mirror direction."""
+"""Exponent of the specular lobe, which has half its height 12 degrees from the mirror direction."""
 
 BOUNCE_MM = 2.0
-"""How far light spreads from skin to skin: standard deviation of the Gaussian that stands for the bounce."""
+"""Standard deviation of the Gaussian that models the bounce of light from skin to skin, mm."""
 
 
 @dataclass(frozen=True, eq=False)
 class Conditions:
-    """Under what an image is taken; the defaults add nothing to the shading model.
+    """Conditions of an image; the defaults add nothing to the shading model.
 
     Attributes:
-        lights: the three lights as they are. light_level: (R, G, B) factor on each.
-        albedo: (1, 1, H, W) or (1, 3, H, W) factor on the skin's; None for 1.
-        shadows: whether relief casts shadows. specular: strength of a Blinn-Phong lobe, relative to the matt skin.
-        bounce: share of the light that arrives by way of other skin. ambient: share that comes from nowhere in particular.
-        vignetting: relative loss in the corners. blur_px: defocus, standard deviation. motion_px: way along x while exposing.
-        crosstalk: share of red that is read as blue, and back; 1 swaps the channels.
-        exposure: factor on the light. black: light below this is black. gamma: value = light^(1/gamma).
-        noise_std: of the image value. bits: levels; None for floats. dead: (1, 1, H, W) bool, pixels that read zero.
-        jpeg_quality: of OpenCV, 4:2:0; None for none.
+        lights: the three lights.
+        light_level: (R, G, B) factor on each light.
+        albedo: (1, 1, H, W) or (1, 3, H, W) factor on the albedo of the skin; None for 1.
+        shadows: whether the relief casts shadows.
+        specular: strength of a Blinn-Phong lobe, relative to the diffuse light.
+        bounce: share of the light that arrives from other skin.
+        ambient: share of the light that comes from all directions.
+        vignetting: relative loss in the corners.
+        blur_px: defocus, standard deviation, pixels.
+        motion_px: motion along x during the exposure, pixels.
+        crosstalk: share of red that is read as blue, and of blue that is read as red; 1 swaps the channels.
+        exposure: factor on the light.
+        black: light below this level is black.
+        gamma: value = light^(1/gamma).
+        noise_std: standard deviation of the noise of the image value.
+        bits: bits of a value; None for floats.
+        dead: (1, 1, H, W) bool, pixels whose value is zero.
+        jpeg_quality: quality of OpenCV's JPEG, 4:2:0; None for no compression.
     """
 
     lights: PointLights
@@ -57,13 +66,15 @@ class Conditions:
 
 
 def photograph(scene: Scene, conditions: Conditions, seed: int = 0, at_mm: tuple[Tensor, Tensor] | None = None) -> Tensor:
-    """The camera image of a scene under given conditions: light and skin, then the lens, then the sensor, then the file.
+    """The camera image of a scene: light and skin, then the lens, then the sensor, then the file.
 
     Args:
-        scene: what each pixel sees. conditions: under what. seed: of the noise.
+        scene: what each pixel sees.
+        conditions: conditions of the image.
+        seed: seed of the noise.
         at_mm: x and y (H, W) of the skin that each pixel sees; None for those of the scene's camera.
     Returns:
-        (1, 3, H, W) in [0, 1].
+        The image (1, 3, H, W) in [0, 1].
     Example:
         >>> from torchvts.scenes import sphere_press
         >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [500, 500, 500])
@@ -74,38 +85,57 @@ def photograph(scene: Scene, conditions: Conditions, seed: int = 0, at_mm: tuple
 
 
 def radiance(scene: Scene, conditions: Conditions, at_mm: tuple[Tensor, Tensor] | None = None) -> Tensor:
-    """Light that leaves the skin towards the camera, (1, 3, H, W), linear, before lens and sensor."""
-    depth, normal, lights = scene.depth_mm, scene.normal, conditions.lights
+    """Light that leaves the skin towards the camera, (1, 3, H, W), linear, before lens and sensor.
+
+    Args:
+        scene: what each pixel sees.
+        conditions: conditions of the image.
+        at_mm: x and y (H, W) of the skin that each pixel sees; None for those of the scene's camera.
+    Raises:
+        ValueError: cast shadows with a camera that is not orthographic.
+    """
+    depth, lights = scene.depth_mm, conditions.lights
+    place = _place(scene, at_mm)  # (3, H, W)
+    to_light = lights.position_mm.detach().to(depth.dtype)[:, :, None, None] - place  # (light, axis, H, W)
+    distance = to_light.norm(dim=1)
+    direction = to_light / distance[:, None]
+    strength = lights.albedo.detach().to(depth.dtype)[:, None, None] / distance**2
+    strength = strength * torch.tensor(conditions.light_level, dtype=depth.dtype)[:, None, None]
+    facing = (direction * scene.normal).sum(1)
+    light: Tensor = strength * facing.clamp_min(0.0)
+    if conditions.specular:
+        half_way = nn.functional.normalize(direction + torch.tensor([0.0, 0.0, 1.0], dtype=depth.dtype)[:, None, None], dim=1)
+        lobe = (half_way * scene.normal).sum(1).clamp_min(0.0) ** SHININESS * (facing > 0)
+        light = light + conditions.specular * strength * lobe
+    if conditions.shadows:
+        if at_mm is not None or not math.isinf(scene.camera_height_mm):
+            raise ValueError("shadows: expected a camera that looks straight down, whose depth lies on an even grid, got another")
+        light = light * cast_shadows(depth, lights, scene.mm_per_pixel)[0]
+    return _with_indirect_light(light[None], conditions, scene.mm_per_pixel)
+
+
+def _place(scene: Scene, at_mm: tuple[Tensor, Tensor] | None) -> Tensor:
+    """Position (3, H, W) of the skin that each pixel sees, mm."""
+    depth = scene.depth_mm
     height, width = depth.shape[2], depth.shape[3]
     if at_mm is None:
         x, y = pixel_grid_mm(height, width, scene.mm_per_pixel, depth.dtype)
         x, y = seen_at(x, depth[0, 0], scene.camera_height_mm), seen_at(y, depth[0, 0], scene.camera_height_mm)
     else:
         x, y = (t.to(depth.dtype) for t in at_mm)
-    place = torch.stack((x.expand(height, width), y.expand(height, width), depth[0, 0]))  # (3, H, W)
-    to_light = lights.position_mm.detach().to(depth.dtype)[:, :, None, None] - place  # (light, axis, H, W)
-    distance = to_light.norm(dim=1)
-    direction = to_light / distance[:, None]
-    strength = lights.albedo.detach().to(depth.dtype)[:, None, None] / distance**2
-    strength = strength * torch.tensor(conditions.light_level, dtype=depth.dtype)[:, None, None]
-    facing = (direction * normal).sum(1)
-    light: Tensor = strength * facing.clamp_min(0.0)
-    if conditions.specular:
-        half_way = nn.functional.normalize(direction + torch.tensor([0.0, 0.0, 1.0], dtype=depth.dtype)[:, None, None], dim=1)
-        lobe = (half_way * normal).sum(1).clamp_min(0.0) ** SHININESS * (facing > 0)
-        light = light + conditions.specular * strength * lobe
-    if conditions.shadows:
-        if at_mm is not None or not math.isinf(scene.camera_height_mm):
-            raise ValueError("shadows: expected a camera that looks straight down, whose depth lies on an even grid, got another")
-        light = light * cast_shadows(depth, lights, scene.mm_per_pixel)[0]
-    light = light[None]
+    return torch.stack((x.expand(height, width), y.expand(height, width), depth[0, 0]))
+
+
+def _with_indirect_light(light: Tensor, conditions: Conditions, mm_per_pixel: float) -> Tensor:
+    """Albedo, then light that comes from other skin and from all directions."""
     if conditions.albedo is not None:
-        light = light * conditions.albedo.to(depth.dtype)
+        light = light * conditions.albedo.to(light.dtype)
     if conditions.bounce:
-        light = (1.0 - conditions.bounce) * light + conditions.bounce * gaussian_blur(light, BOUNCE_MM / scene.mm_per_pixel)
+        light = (1.0 - conditions.bounce) * light + conditions.bounce * gaussian_blur(light, BOUNCE_MM / mm_per_pixel)
     if conditions.ambient:
+        lights = conditions.lights
         upright = lights.position_mm[:, 2] * lights.albedo / lights.position_mm.norm(dim=1) ** 3  # of flat skin in the middle
-        light = (1.0 - conditions.ambient) * light + conditions.ambient * upright.detach().to(depth.dtype)[None, :, None, None]
+        light = (1.0 - conditions.ambient) * light + conditions.ambient * upright.detach().to(light.dtype)[None, :, None, None]
     return light
 
 
@@ -143,7 +173,7 @@ def gaussian_blur(image: Tensor, std_px: float) -> Tensor:
 
 
 def smear(image: Tensor, length_px: float) -> Tensor:
-    """Mean over a way of ``length_px`` along x, the border repeated: what moves while the shutter is open."""
+    """Mean over ``length_px`` along x, the border repeated: the blur of an object that moves during the exposure."""
     reach = math.ceil(0.5 * length_px + 0.5) - 1
     place = torch.arange(-reach, reach + 1, dtype=torch.float64)
     weight = (0.5 * length_px - place.abs() + 0.5).clamp(0.0, min(1.0, length_px))
@@ -154,7 +184,7 @@ def smear(image: Tensor, length_px: float) -> Tensor:
 
 
 def jpeg(image: Tensor, quality: int) -> Tensor:
-    """An image (1, 3, H, W) as it comes back from a JPEG of 8 bits, its colours at half resolution as cameras store them."""
+    """An image (1, 3, H, W) after JPEG compression with 8 bits and colours at half resolution, as cameras store it."""
     import cv2
 
     levels = torch.round(image[0].clamp(0, 1) * 255).to(torch.uint8).flip(0).permute(1, 2, 0).contiguous().numpy()

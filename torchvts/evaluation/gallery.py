@@ -1,9 +1,8 @@
-"""Hard scenes with exact truth: each a dial that one turns from harmless to hopeless.
+"""Hard scenes with exact truth: one corruption each, in steps of severity.
 
 The rig is small and quick: 160 x 120 pixels of 0.125 mm, three lights 40 mm away, 50 degrees above the skin and 120 degrees apart,
-noise of 0.002 and 8 bits. Its calibration is given the true lights and one image at rest, so whatever fails, fails by the fault the
-dial is about. Unless that is about shape, a ball of radius 6 mm is pressed in by 1 mm, somewhere near the middle. A case's truth is
-what each pixel sees.
+noise of 0.002 and 8 bits. Its calibration has the true lights and one background image, so a method fails only because of
+the corruption. Unless the corruption changes the shape, a ball of radius 6 mm is pressed in by 1 mm, near the middle.
 """
 
 import math
@@ -18,7 +17,7 @@ from ..core.geometry import pixel_grid_mm
 from ..model.calibration import Calibration
 from ..model.lights import PointLights
 from ..model.sensor import Sensor
-from ..scenes.scenes import Scene, skin_spots, smooth_step, surface, surface_at, undeformed
+from ..scenes import Scene, skin_spots, smooth_step, surface, surface_at, undeformed
 from .faults import Conditions, photograph
 
 HEIGHT, WIDTH, MM_PER_PIXEL = 120, 160, 0.125
@@ -26,15 +25,17 @@ RADIUS_MM, PRESS_MM = 6.0, 1.0
 LIGHT_DISTANCE_MM, ELEVATION_DEG, SPACING_DEG = 40.0, 50.0, 120.0
 
 Relief = Callable[[Tensor, Tensor], Tensor]
-"""Depth in mm as a function of x and y in mm; negative where nothing touches."""
+"""Depth in mm as a function of x and y in mm; negative where there is no contact."""
 
 
 class Case(NamedTuple):
     """One hard scene.
 
     Attributes:
-        calibration: what the user has. background: (3, H, W), the image it was made from.
-        image: (1, 3, H, W), the frame to reconstruct. truth: what each of its pixels sees; contact is where the object touches.
+        calibration: calibration that the user has.
+        background: (3, H, W), the image that it was made from.
+        image: (1, 3, H, W), the frame to reconstruct.
+        truth: what each pixel of the frame sees; its contact is where the object touches the skin.
     """
 
     calibration: Calibration
@@ -44,23 +45,26 @@ class Case(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Dial:
-    """One way to fail.
+class Corruption:
+    """One way to make a scene harder.
 
     Attributes:
-        name: the key in :data:`DIALS`. unit: of severity. severities: the first harmless, the last hopeless; they rise, or fall.
-        story: what happens physically. make: severity, which may lie between those, and a seed of noise and place, to a case.
+        name: key in :data:`CORRUPTIONS`.
+        unit: unit of the severity.
+        severities: rising or falling; no method fails at the first, most fail at the last.
+        make: makes a case from a severity, which may lie between those, and a seed of noise and place.
+        story: what happens physically.
     """
 
     name: str
     unit: str
     severities: tuple[float, ...]
-    story: str
     make: Callable[[float, int], Case]
+    story: str
 
 
 def rig_lights(elevation_deg: float = ELEVATION_DEG, spacing_deg: float = SPACING_DEG) -> PointLights:
-    """The rig's lights, exposed for a flat skin of value 0.45; less where they stand lower, for what faces them is brighter."""
+    """Lights that give a flat skin the value 0.45, or less if they stand lower: then slopes that face them are brighter."""
     elevation = math.radians(elevation_deg)
     azimuths = [math.radians(10.0 + k * spacing_deg) for k in range(3)]
     across, up = LIGHT_DISTANCE_MM * math.cos(elevation), LIGHT_DISTANCE_MM * math.sin(elevation)
@@ -75,7 +79,7 @@ SENSOR = Sensor("gallery", HEIGHT, WIDTH, MM_PER_PIXEL, gamma=1.0)
 
 
 def undisturbed(seed: int = 0) -> Case:
-    """The case that most dials begin with.
+    """The case without corruption.
 
     Example:
         >>> case = undisturbed()
@@ -85,16 +89,16 @@ def undisturbed(seed: int = 0) -> Case:
     return _case(_scene(_press(seed)), seed)
 
 
-# what is pressed in
+# shapes
 
 
 def ball(radius_mm: float, press_mm: float, x_mm: float, y_mm: float) -> Relief:
-    """A ball; far from its axis it stays at its equator's height."""
+    """A ball; beyond its equator the height stays constant."""
     return lambda x, y: torch.sqrt((radius_mm**2 - (x - x_mm) ** 2 - (y - y_mm) ** 2).clamp_min(1e-12)) - (radius_mm - press_mm)
 
 
 def stamp(radius_mm: float, press_mm: float, slope: float, x_mm: float, y_mm: float) -> Relief:
-    """A flat round stamp whose smooth flank, half-way down at ``radius_mm``, is ``slope`` at its steepest."""
+    """A flat round stamp with a smooth flank: at half height its radius is ``radius_mm``, and its largest slope is ``slope``."""
     width = 1.875 * press_mm / slope
 
     def depth(x: Tensor, y: Tensor) -> Tensor:
@@ -105,7 +109,7 @@ def stamp(radius_mm: float, press_mm: float, slope: float, x_mm: float, y_mm: fl
 
 
 def roof(press_mm: float, slope: float, end_slope: float, length_mm: float, x_mm: float, y_mm: float) -> Relief:
-    """Two planes that meet in a ridge along x, turned by 20 degrees, cut off by ends of ``end_slope``."""
+    """Two planes that meet in a ridge along x, turned by 20 degrees; the slope of its ends is ``end_slope``."""
     c, s = math.cos(math.radians(20.0)), math.sin(math.radians(20.0))
 
     def depth(x: Tensor, y: Tensor) -> Tensor:
@@ -135,19 +139,19 @@ def _case(
     scene: Scene, seed: int, at_calibration: Conditions = USUAL, now: Conditions | None = None,
     lights: PointLights = LIGHTS, sensor: Sensor = SENSOR,
 ) -> Case:  # fmt: skip
-    """The user knows ``lights`` and ``sensor``; conditions are those of the background, and ``now`` of the frame, if others."""
+    """Photograph the background ``at_calibration`` and the frame ``now``; the user knows ``lights`` and ``sensor``."""
     background = photograph(undeformed(scene), at_calibration, 2 * seed)[0]
     image = photograph(scene, now or at_calibration, 2 * seed + 1)
     return Case(Calibration.from_lights(lights, sensor, background), background, image, scene)
 
 
 def _always(conditions: Callable[[float], Conditions]) -> Callable[[float, int], Case]:
-    """A fault of the rig, there at calibration too, that the calibration does not know of."""
+    """A fault that is present at calibration too, and that the calibration does not model."""
     return lambda severity, seed: _case(_scene(_press(seed)), seed, conditions(severity))
 
 
 def _since(change: Callable[[float, int], Conditions]) -> Callable[[float, int], Case]:
-    """A fault that came after calibration."""
+    """A fault that appears after calibration."""
     return lambda severity, seed: _case(_scene(_press(seed)), seed, USUAL, change(severity, seed))
 
 
@@ -183,7 +187,7 @@ def _specks(severity: float, seed: int) -> Conditions:
 
 
 def _worn(severity: float, seed: int) -> Conditions:
-    """Smooth stains, darker by up to twice ``severity``: three parts of a common pattern to one of each channel's own."""
+    """Smooth stains, darker by up to twice ``severity``: three quarters in all channels alike, one quarter in each alone."""
     generator = torch.Generator().manual_seed(2000 + seed)
     x, y = pixel_grid_mm(HEIGHT, WIDTH, MM_PER_PIXEL)
     patterns = []
@@ -234,9 +238,9 @@ def _distorted(severity: float, seed: int) -> Case:
 
 
 def _perspective(severity: float, seed: int) -> Case:
-    """A pinhole above the middle that sees the resting skin as an even grid; severity is half its horizontal angle of view.
+    """A pinhole above the middle that sees the undeformed skin as an even grid; severity is half its horizontal angle of view.
 
-    The calibration's report tells how high it stands, to those who ask.
+    The report of the calibration contains its height.
     """
     if severity == 0.0:
         return undisturbed(seed)
@@ -259,11 +263,11 @@ def _marked(severity: float, seed: int) -> Case:
     x, y = _grid()
     away_x, away_y = x - center_x, y - center_y
     pull = 0.25 * torch.exp(-(away_x**2 + away_y**2) / 18.0) / 3.0  # mm per mm from the ball's middle
-    rest, pressed = (
+    undeformed_dots, pressed_dots = (
         _dots(x - moved * pull * away_x, y - moved * pull * away_y, severity) if severity else None for moved in (0.0, 1.0)
     )
     sensor = replace(SENSOR, markers=True)
-    return _case(scene, seed, replace(USUAL, albedo=rest), replace(USUAL, albedo=pressed), sensor=sensor)
+    return _case(scene, seed, replace(USUAL, albedo=undeformed_dots), replace(USUAL, albedo=pressed_dots), sensor=sensor)
 
 
 def _dots(x: Tensor, y: Tensor, diameter_mm: float) -> Tensor:
@@ -283,8 +287,8 @@ def _covering(severity: float, seed: int) -> Case:
 
 def _two(severity: float, seed: int) -> Case:
     x, y = _place(seed)
-    apart = 0.5 * (2.0 * math.sqrt(4.0**2 - 3.4**2) - severity)  # rims of balls of 4 mm, 0.6 mm deep
-    one, other = (ball(4.0, 0.6, x + side * apart, y + side * 0.3) for side in (-1.0, 1.0))
+    half_distance = 0.5 * (2.0 * math.sqrt(4.0**2 - 3.4**2) - severity)  # rims of balls of 4 mm, 0.6 mm deep
+    one, other = (ball(4.0, 0.6, x + side * half_distance, y + side * 0.3) for side in (-1.0, 1.0))
     return _case(_scene(lambda x, y: torch.maximum(one(x, y), other(x, y))), seed)
 
 
@@ -293,11 +297,11 @@ def _faint(severity: float, seed: int) -> Case:
 
 
 def _sagging(severity: float, seed: int) -> Case:
-    """Where the ball lets go of the skin, depth falls off as exp(-r / severity), without a kink."""
+    """Where the skin leaves the ball, depth falls off as exp(-r / severity), without a kink."""
     x_mm, y_mm = _place(seed)
     cap = ball(RADIUS_MM, PRESS_MM, 0.0, 0.0)
     low, high = 0.0, math.sqrt(RADIUS_MM**2 - (RADIUS_MM - PRESS_MM) ** 2)
-    for _ in range(60):  # the depth where the skin lets go is the slope there times severity
+    for _ in range(60):  # depth = slope * severity where the skin leaves the ball
         leaves = 0.5 * (low + high)
         depth = math.sqrt(RADIUS_MM**2 - leaves**2) - (RADIUS_MM - PRESS_MM)
         falls_short = depth < severity * leaves / math.sqrt(RADIUS_MM**2 - leaves**2)
@@ -307,8 +311,8 @@ def _sagging(severity: float, seed: int) -> Case:
 
     def relief(x: Tensor, y: Tensor) -> Tensor:
         r = torch.sqrt((x - x_mm) ** 2 + (y - y_mm) ** 2 + 1e-18)
-        skirt = depth * torch.exp(-(r - leaves) / severity)
-        return torch.where(r < leaves, cap(r.clamp_max(leaves), torch.zeros_like(r)), skirt)
+        transition = depth * torch.exp(-(r - leaves) / severity)
+        return torch.where(r < leaves, cap(r.clamp_max(leaves), torch.zeros_like(r)), transition)
 
     scene = _scene(relief)
     x, y = _grid()
@@ -316,47 +320,83 @@ def _sagging(severity: float, seed: int) -> Case:
     return _case(scene._replace(contact=touched), seed)
 
 
-DIALS: dict[str, Dial] = {
-    dial.name: dial
-    for dial in (
+# fmt: off
+CORRUPTIONS: dict[str, Corruption] = {
+    corruption.name: corruption
+    for corruption in (
         # shape
-        Dial("deeper press", "mm", (1.0, 1.5, 2.0, 3.0, 4.0, 5.0), "A ball of radius 6 mm goes deeper, and its rim steeper: a slope of 0.7 at 1 mm, 5.9 at 5 mm.", _deeper),  # noqa: E501
-        Dial("steep walls", "mm/mm", (0.5, 1.0, 2.0, 4.0, 8.0, 30.0), "A round stamp, 1 mm high, has ever narrower flanks, up to a cliff between two pixels.", _steep),  # noqa: E501
-        Dial("cut ends", "mm/mm", (0.4, 0.8, 1.5, 3.0, 8.0, 100.0), "A roof-shaped wedge, 1 mm high, ends in ever steeper faces, up to a vertical cut.", _ends),  # noqa: E501
-        Dial("cut by the border", "mm", (0.0, 5.0, 7.0, 8.0, 9.0, 10.0, 11.5), "The ball moves from the middle to the image border, until only its flank is seen.", _cut),  # noqa: E501
-        Dial("covers the image", "mm", (0.1, 0.3, 0.6, 1.0, 1.5, 2.2), "A ball of radius 40 mm goes deeper, until no skin at rest is in sight.", _covering),  # noqa: E501
-        Dial("two contacts", "mm", (-2.0, -0.5, 0.0, 0.5, 1.5, 3.0), "Two balls come closer, until their contacts overlap and meet in a crease.", _two),  # noqa: E501
-        Dial("faint contact", "mm", (1.0, 0.3, 0.1, 0.05, 0.02, 0.01, 0.0), "The ball presses ever less, until it does not touch at all.", _faint),  # noqa: E501
-        Dial("gel sag", "mm", (0.0, 0.25, 0.5, 1.0, 2.0, 4.0), "The gel goes down around the object too: a skirt that falls off over so many mm, which the object does not touch.", _sagging),  # noqa: E501
+        Corruption("deeper press", "mm", (1.0, 1.5, 2.0, 3.0, 4.0, 5.0), _deeper,
+            "A ball of radius 6 mm goes deeper: the slope at its rim is 0.7 at 1 mm and 5.9 at 5 mm."),
+        Corruption("steep walls", "mm/mm", (0.5, 1.0, 2.0, 4.0, 8.0, 30.0), _steep,
+            "The flanks of a round stamp, 1 mm high, become narrower, up to a step between two pixels."),
+        Corruption("cut ends", "mm/mm", (0.4, 0.8, 1.5, 3.0, 8.0, 100.0), _ends,
+            "The ends of a roof-shaped wedge, 1 mm high, become steeper, up to vertical."),
+        Corruption("cut by the border", "mm", (0.0, 5.0, 7.0, 8.0, 9.0, 10.0, 11.5), _cut,
+            "The ball moves from the middle to the image border, until only its flank is visible."),
+        Corruption("covers the image", "mm", (0.1, 0.3, 0.6, 1.0, 1.5, 2.2), _covering,
+            "A ball of radius 40 mm goes deeper, until no undeformed skin is visible."),
+        Corruption("two contacts", "mm", (-2.0, -0.5, 0.0, 0.5, 1.5, 3.0), _two,
+            "Two balls come closer, until their contacts overlap and meet in a crease."),
+        Corruption("faint contact", "mm", (1.0, 0.3, 0.1, 0.05, 0.02, 0.01, 0.0), _faint,
+            "The ball presses less and less, until it does not touch at all."),
+        Corruption("gel sag", "mm", (0.0, 0.25, 0.5, 1.0, 2.0, 4.0), _sagging,
+            "The gel goes down around the object too: a transition zone of this length, which the object does not touch."),
         # light
-        Dial("attached shadows", "deg", (0.0, 10.0, 20.0, 30.0, 35.0, 40.0, 45.0), "The lights stand lower than 50 degrees: slopes that face away from one get none of it.", _lowered(False)),  # noqa: E501
-        Dial("cast shadows", "deg", (0.0, 10.0, 20.0, 30.0, 35.0, 40.0, 45.0), "The same, and the ball's shadow falls on the skin behind it.", _lowered(True)),  # noqa: E501
-        Dial("specular", "", (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), "The skin shines: a Blinn-Phong lobe of exponent 30 beside the matt light.", _always(lambda s: replace(USUAL, specular=s))),  # noqa: E501
-        Dial("inter-reflection", "share", (0.0, 0.05, 0.1, 0.2, 0.4, 0.7), "Light reaches the skin by way of the skin: one bounce, stood for by the image's own light blurred by 2 mm.", _always(lambda s: replace(USUAL, bounce=s))),  # noqa: E501
-        Dial("ambient light", "share", (0.0, 0.02, 0.05, 0.1, 0.2, 0.5), "Part of the light comes from everywhere, at calibration too.", _always(lambda s: replace(USUAL, ambient=s))),  # noqa: E501
-        Dial("a channel dims", "share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.2), "One lamp loses light after calibration.", _since(_dimmed)),  # noqa: E501
-        Dial("dead lights", "lights", (0.0, 0.3, 0.6, 1.0, 1.5, 2.0), "One lamp goes out after calibration, then a second.", _since(_lost)),  # noqa: E501
-        Dial("a light moves", "mm", (0.0, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0), "One lamp, 40 mm away, is shifted sideways after calibration.", _since(_moved)),  # noqa: E501
-        Dial("lights close together", "deg", (0.0, 40.0, 80.0, 100.0, 110.0, 116.0), "The lights stand less than 120 degrees apart by so much: the light matrix comes near to singular, and noise grows.", _together),  # noqa: E501
+        Corruption("attached shadows", "deg", (0.0, 10.0, 20.0, 30.0, 35.0, 40.0, 45.0), _lowered(False),
+            "The lights stand lower than 50 degrees by this angle: slopes that face away from a light get none of it."),
+        Corruption("cast shadows", "deg", (0.0, 10.0, 20.0, 30.0, 35.0, 40.0, 45.0), _lowered(True),
+            "The same, and the ball casts its shadow on the skin behind it."),
+        Corruption("specular", "", (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), _always(lambda s: replace(USUAL, specular=s)),
+            "The skin shines: a Blinn-Phong lobe of exponent 30 in addition to the diffuse light."),
+        Corruption("inter-reflection", "share", (0.0, 0.05, 0.1, 0.2, 0.4, 0.7), _always(lambda s: replace(USUAL, bounce=s)),
+            "Skin lights skin: one bounce, modelled by the light of the image itself, blurred by 2 mm."),
+        Corruption("ambient light", "share", (0.0, 0.02, 0.05, 0.1, 0.2, 0.5), _always(lambda s: replace(USUAL, ambient=s)),
+            "Part of the light comes from everywhere, at calibration too."),
+        Corruption("a channel dims", "share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.2), _since(_dimmed),
+            "One LED loses light after calibration."),
+        Corruption("dead lights", "lights", (0.0, 0.3, 0.6, 1.0, 1.5, 2.0), _since(_lost),
+            "One LED fails after calibration, then a second."),
+        Corruption("a light moves", "mm", (0.0, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0), _since(_moved),
+            "One LED, 40 mm away, is shifted sideways after calibration."),
+        Corruption("lights close together", "deg", (0.0, 40.0, 80.0, 100.0, 110.0, 116.0), _together,
+            "The angle between the lights is less than 120 degrees by this much: the light matrix becomes ill-conditioned."),
         # skin
-        Dial("albedo drift", "share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.3), "The skin wears after calibration: smooth stains, darker by up to twice as much, three quarters of it alike in all channels.", _since(_worn)),  # noqa: E501
-        Dial("spots and dead pixels", "of each", (0.0, 10.0, 30.0, 100.0, 300.0, 1000.0), "Dirt on the skin and dead pixels come after calibration.", _since(_specks)),  # noqa: E501
-        Dial("markers", "mm", (0.0, 0.4, 0.7, 1.0, 1.4, 1.8), "Dots of this diameter, printed every 2.5 mm, move with the skin; the sensor file says that there are some.", _marked),  # noqa: E501
+        Corruption("albedo drift", "share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.3), _since(_worn),
+            "The skin wears after calibration: smooth stains, darker by up to twice the severity, three quarters of it grey."),
+        Corruption("spots and dead pixels", "of each", (0.0, 10.0, 30.0, 100.0, 300.0, 1000.0), _since(_specks),
+            "Dirt on the skin and dead pixels appear after calibration."),
+        Corruption("markers", "mm", (0.0, 0.4, 0.7, 1.0, 1.4, 1.8), _marked,
+            "Dots of this diameter, printed every 2.5 mm, move with the skin; the sensor file says that there are markers."),
         # lens
-        Dial("defocus", "px", (0.0, 0.7, 1.5, 3.0, 6.0, 12.0), "The lens is out of focus: a Gaussian of this standard deviation.", _always(lambda s: replace(USUAL, blur_px=s))),  # noqa: E501
-        Dial("motion blur", "px", (0.0, 2.0, 5.0, 10.0, 20.0, 40.0), "The ball slides while the shutter is open; truth is its middle position.", _since(lambda s, seed: replace(USUAL, motion_px=s))),  # noqa: E501
-        Dial("vignetting", "share", (0.0, 0.1, 0.3, 0.5, 0.7, 0.9), "The lens darkens the corners by so much, at calibration too.", _always(lambda s: replace(USUAL, vignetting=s))),  # noqa: E501
-        Dial("lens distortion", "share", (0.0, 0.05, 0.1, 0.2, 0.35, 0.5), "Barrel distortion: the corners show skin nearer to the middle by so much.", _distorted),  # noqa: E501
-        Dial("perspective", "deg", (0.0, 5.0, 10.0, 20.0, 30.0, 45.0), "The camera is a pin-hole with half this angle of view to either side, treated as if it looked straight down.", _perspective),  # noqa: E501
-        Dial("wrong pitch", "share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.2), "A pixel is larger than the sensor file says.", _wrong_pitch),  # noqa: E501
+        Corruption("defocus", "px", (0.0, 0.7, 1.5, 3.0, 6.0, 12.0), _always(lambda s: replace(USUAL, blur_px=s)),
+            "The lens is out of focus: a Gaussian of this standard deviation."),
+        Corruption("motion blur", "px", (0.0, 2.0, 5.0, 10.0, 20.0, 40.0), _since(lambda s, seed: replace(USUAL, motion_px=s)),
+            "The ball slides while the shutter is open; the truth is its middle position."),
+        Corruption("vignetting", "share", (0.0, 0.1, 0.3, 0.5, 0.7, 0.9), _always(lambda s: replace(USUAL, vignetting=s)),
+            "The lens darkens the corners by this share, at calibration too."),
+        Corruption("lens distortion", "share", (0.0, 0.05, 0.1, 0.2, 0.35, 0.5), _distorted,
+            "Barrel distortion: the corners show skin that is nearer to the middle by this share."),
+        Corruption("perspective", "deg", (0.0, 5.0, 10.0, 20.0, 30.0, 45.0), _perspective,
+            "The camera is a pinhole with this angle of view to either side, and is treated as orthographic."),
+        Corruption("wrong pitch", "share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.2), _wrong_pitch,
+            "A pixel is larger than the sensor file says."),
         # sensor
-        Dial("saturation", "times", (1.0, 1.3, 1.6, 2.0, 2.5, 3.0), "The exposure is longer, which the user knows, and bright slopes, then the skin itself, clip.", _exposed),  # noqa: E501
-        Dial("black crush", "value", (0.0, 0.02, 0.05, 0.1, 0.2, 0.4), "The camera takes off a black level that nobody told: dark slopes become black.", _always(lambda s: replace(USUAL, black=s))),  # noqa: E501
-        Dial("wrong gamma", "exponent", (1.0, 1.05, 1.1, 1.2, 1.4, 1.8, 2.2), "The camera's values are light to the power 1 / gamma, and the user takes them for light.", _always(lambda s: replace(USUAL, gamma=s))),  # noqa: E501
-        Dial("channel order", "share", (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0), "Red and blue are mixed in the camera, up to swapped, as when B, G, R is read as R, G, B.", _always(lambda s: replace(USUAL, crosstalk=s))),  # noqa: E501
-        Dial("noise", "value", (0.002, 0.005, 0.01, 0.02, 0.05, 0.1), "Noise of the image value, in the background too.", _always(lambda s: replace(USUAL, noise_std=s))),  # noqa: E501
-        Dial("few bits", "bits", (12.0, 8.0, 6.0, 5.0, 4.0, 3.0, 2.0), "The image has fewer levels.", _always(lambda s: replace(USUAL, bits=round(s)))),  # noqa: E501
-        Dial("JPEG", "quality", (100.0, 95.0, 85.0, 70.0, 50.0, 30.0, 10.0), "Images are compressed, their colours at half resolution.", _always(lambda s: replace(USUAL, jpeg_quality=round(s)))),  # noqa: E501
+        Corruption("saturation", "times", (1.0, 1.3, 1.6, 2.0, 2.5, 3.0), _exposed,
+            "The exposure is longer, which the user knows: bright slopes clip, then the skin itself."),
+        Corruption("black crush", "value", (0.0, 0.02, 0.05, 0.1, 0.2, 0.4), _always(lambda s: replace(USUAL, black=s)),
+            "The camera subtracts a black level that the calibration does not know: dark slopes become black."),
+        Corruption("wrong gamma", "exponent", (1.0, 1.05, 1.1, 1.2, 1.4, 1.8, 2.2), _always(lambda s: replace(USUAL, gamma=s)),
+            "The values of the camera are light^(1 / gamma), and the user takes them for light."),
+        Corruption("channel order", "share", (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0), _always(lambda s: replace(USUAL, crosstalk=s)),
+            "Red and blue are mixed in the camera, up to swapped, as when B, G, R is read as R, G, B."),
+        Corruption("noise", "value", (0.002, 0.005, 0.01, 0.02, 0.05, 0.1), _always(lambda s: replace(USUAL, noise_std=s)),
+            "Noise of the image value, in the background too."),
+        Corruption("few bits", "bits", (12.0, 8.0, 6.0, 5.0, 4.0, 3.0, 2.0), _always(lambda s: replace(USUAL, bits=round(s))),
+            "The image has fewer levels."),
+        Corruption("JPEG", "quality", (100.0, 95.0, 85.0, 70.0, 50.0, 30.0, 10.0),
+            _always(lambda s: replace(USUAL, jpeg_quality=round(s))),
+            "Images are compressed, with colours at half resolution."),
     )
-}  # fmt: skip
-"""Every dial by name."""
+}
+# fmt: on
+"""Every corruption by name."""

@@ -1,4 +1,4 @@
-"""How far a result is from the truth: depth, normals, contact mask, fitted sphere."""
+"""Metrics of frames against an exact truth: depth, normals, contact mask, fitted sphere."""
 
 import math
 from typing import NamedTuple
@@ -11,7 +11,14 @@ from ..core.geometry import depth_to_points
 
 
 class DepthError(NamedTuple):
-    """Depth error of one or more frames, in mm and in pixels of pitch."""
+    """Depth error of one or more frames.
+
+    Attributes:
+        max_mm: largest absolute error, mm.
+        rms_mm: RMS error, mm.
+        max_px: largest absolute error, pixels of pitch.
+        rms_px: RMS error, pixels of pitch.
+    """
 
     max_mm: float
     rms_mm: float
@@ -20,7 +27,13 @@ class DepthError(NamedTuple):
 
 
 class SphereFit(NamedTuple):
-    """Least-squares sphere in the point frame (x right, y up, z to the camera), mm."""
+    """Least-squares sphere in the point frame (x right, y up, z towards the camera).
+
+    Attributes:
+        center_mm: its centre (x, y, z), mm.
+        radius_mm: its radius, mm.
+        rms_mm: RMS distance of the points from it, mm.
+    """
 
     center_mm: tuple[float, float, float]
     radius_mm: float
@@ -28,10 +41,17 @@ class SphereFit(NamedTuple):
 
 
 def depth_error(depth_mm: Tensor, truth_mm: Tensor, mm_per_pixel: float, region: Tensor | None = None) -> DepthError:
-    """Largest and RMS depth error, over the image or over ``region`` (bool, same shape).
+    """Largest and RMS depth error.
 
+    Args:
+        depth_mm: measured depth, mm.
+        truth_mm: true depth, the same shape, mm.
+        mm_per_pixel: pixel pitch, mm.
+        region: bool, the same shape, the pixels to compare; None for all.
+    Returns:
+        The errors in mm and in pixels.
     Raises:
-        ValueError: shapes differ, or an empty region.
+        ValueError: shapes differ, or the region is empty.
     Example:
         >>> depth_error(torch.full((1, 1, 4, 4), 0.5), torch.zeros(1, 1, 4, 4), 0.25).max_px
         2.0
@@ -44,9 +64,16 @@ def depth_error(depth_mm: Tensor, truth_mm: Tensor, mm_per_pixel: float, region:
 
 
 def normal_angle_deg(normal: Tensor, truth: Tensor, region: Tensor | None = None) -> Tensor:
-    """Angles between two unit normal maps (B, 3, H, W): (B, H, W), or (N,) inside ``region`` (B, 1, H, W).
+    """Angles between two maps of unit normals.
 
-    Computed from the cross product too, so small angles keep their digits.
+    The cross product enters too, so small angles keep their digits.
+
+    Args:
+        normal: (B, 3, H, W), measured normals.
+        truth: (B, 3, H, W), true normals.
+        region: (B, 1, H, W) bool, the pixels to compare; None for all.
+    Returns:
+        Degrees, (B, H, W), or (N,) inside the region.
     """
     check_tensor("truth", truth)
     check_batch("normal", normal, 3)
@@ -67,7 +94,7 @@ def mask_iou(mask: Tensor, truth: Tensor) -> float:
 
 
 def rim_distance_px(mask: Tensor, truth: Tensor) -> float:
-    """Mean distance of a mask's rim to the true rim, and back, in pixels, of one frame; infinite if one has no rim."""
+    """Mean distance between the rims of two masks of one frame, in both directions, pixels; infinite if only one has a rim."""
     for name, value in (("mask", mask), ("truth", truth)):
         check_tensor(name, value)
         if value.dim() < 2 or value.numel() != value.shape[-1] * value.shape[-2]:
@@ -80,8 +107,15 @@ def rim_distance_px(mask: Tensor, truth: Tensor) -> float:
 
 
 def fit_sphere(depth_mm: Tensor, mm_per_pixel: float, contact: Tensor, steps: int = 20) -> SphereFit:
-    """Geometric least-squares sphere through the contact's points: algebraic start, then Gauss-Newton on the distance.
+    """Geometric least-squares sphere through the points of the contact: algebraic start, then Gauss-Newton on the distance.
 
+    Args:
+        depth_mm: depth of one frame, mm.
+        mm_per_pixel: pixel pitch, mm.
+        contact: bool, the same shape, the pixels to fit.
+        steps: Gauss-Newton steps.
+    Returns:
+        The sphere.
     Raises:
         ValueError: fewer than 4 points.
     """

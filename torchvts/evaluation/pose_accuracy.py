@@ -1,32 +1,38 @@
-"""Pose through the whole chain: objects of known pose rendered, calibrated depth from the images, registration, errors."""
+"""Accuracy of pose through the whole chain: render objects of known pose, measure depth, register, compare."""
 
 import itertools
 import math
 import platform
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ..calibration import Press, calibrate
-from ..model.calibration import Calibration
-from ..model.lights import PointLights
-from ..model.sensor import Sensor
+from ..model import Calibration, PointLights, Sensor
 from ..pipeline import DepthOutput, DepthPipeline
 from ..pose import Registration, register_depth
 from ..pose.result import invert, turn_deg
-from ..scenes import objects
-from ..scenes.scenes import render
+from ..scenes import objects, render
+from .rows import markdown
 
 GOAL_DEG, GOAL_MM = 1.0, 0.15
-"""A pose within both counts as a success."""
+"""A pose within both limits is a success."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseCase:
-    """Two presses of one object: its poses in both, the depth measured from their images, the pitch, mm."""
+    """Two presses of one object.
+
+    Attributes:
+        T_sensor_source: pose of the object in the first press, (4, 4).
+        T_sensor_target: pose of the object in the second press, (4, 4).
+        source: depth measured in the first press.
+        target: depth measured in the second press.
+        mm_per_pixel: pixel pitch, mm.
+    """
 
     T_sensor_source: Tensor
     T_sensor_target: Tensor
@@ -35,33 +41,63 @@ class PoseCase:
     mm_per_pixel: float
 
 
+@dataclass(frozen=True)
+class PoseError:
+    """One registration that was not refused.
+
+    Attributes:
+        deg: angle to the nearest true pose, degrees.
+        mm: distance of the object's origin to its true place in the target, mm.
+        seconds: time of the registration, s.
+        converged: whether it reports convergence.
+        claimed: whether it converged and reports no unknown direction.
+        named: whether it converged and the unknown directions that it reports are the true ones.
+    """
+
+    deg: float
+    mm: float
+    seconds: float
+    converged: bool
+    claimed: bool
+    named: bool
+
+    @property
+    def within(self) -> bool:
+        """Whether the pose is within the goal."""
+        return self.deg <= GOAL_DEG and self.mm <= GOAL_MM
+
+
 @dataclass(frozen=True, eq=False)
 class PoseRow:
     """One object over many poses.
 
     Attributes:
-        name: of the object. poses: number.
-        deg, mm: errors of each pose modulo the object's symmetry; of the object's origin, where it lies in the target.
-        seconds: of each registration. converged: how many. success: share within a degree and 0.15 mm.
-        wrong: poses that came as converged, with nothing said to be unknown, and are off by more than that.
-        named: share whose unknown directions are the true ones; None for objects that have none.
-        notes: what registration refused, one line each.
+        name: name of the object.
+        poses: number of poses.
+        deg: angle of each registration, degrees.
+        mm: distance of each registration, mm.
+        seconds: time of each registration, s.
+        converged: number of registrations that report convergence.
+        success: share that converged within the goal.
+        wrong: number that converged, reports no unknown direction, and is outside of the goal.
+        named: share whose reported unknown directions are the true ones; None for objects that have none.
+        notes: registrations that were refused, one line each.
     """
 
     name: str
     poses: int
-    deg: list[float] = field(default_factory=list)
-    mm: list[float] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
-    converged: int = 0
-    success: float = 0.0
-    wrong: int = 0
-    named: float | None = None
-    notes: list[str] = field(default_factory=list)
+    deg: list[float]
+    mm: list[float]
+    seconds: list[float]
+    converged: int
+    success: float
+    wrong: int
+    named: float | None
+    notes: list[str]
 
 
 def rig(height: int = 240, width: int = 320, mm_per_pixel: float = 0.0625) -> tuple[PointLights, DepthPipeline]:
-    """Three lights at 120 degrees over the sensor, and the precise pipeline that knows them."""
+    """Three lights at 120 degrees over the sensor, and the pipeline of this unit in mode precise."""
     angles = [math.radians(10.0 + 120.0 * k) for k in range(3)]
     position = [[31.0 * math.cos(a), 31.0 * math.sin(a), 40.0] for a in angles]
     lights = PointLights(position, [0.45 * math.hypot(31.0, 40.0) ** 3 / 40.0] * 3).requires_grad_(False)
@@ -72,36 +108,47 @@ def rig(height: int = 240, width: int = 320, mm_per_pixel: float = 0.0625) -> tu
 def pose_case(
     target: objects.Target, seed: int, lights: PointLights, pipe: DepthPipeline, size: tuple[int, int], noise_std: float
 ) -> PoseCase:
-    """A reference press near the middle, and one turned by any angle and moved by up to 4 mm; noisy, 8 bits.
+    """A reference press near the middle, and a second one turned by any angle and moved by up to 4 mm.
 
     Both are 0.3 to 0.6 mm deep and tilted by up to 3 degrees; a plane, which touches only where it is tilted, by 2.8 to 3.
+
+    Args:
+        target: the object.
+        seed: seed of both poses and of the noise.
+        lights: lights of the unit.
+        pipe: pipeline of the unit.
+        size: rows and columns of the image.
+        noise_std: standard deviation of the noise; images have 8 bits.
     """
     generator = torch.Generator().manual_seed(seed)
-
-    def between(low: float, high: float) -> float:
-        return low + (high - low) * float(torch.rand((), generator=generator))
-
-    flat = "translation along x" in target.free and "translation along y" in target.free
     presses = []
     for k in range(2):
-        reach = 4.0 * math.sqrt(between(0.0, 1.0)) if k else between(0.0, 0.3)
-        way, slant = between(0.0, 2.0 * math.pi), between(0.0, 2.0 * math.pi)
-        tilt = between(2.8, 3.0) if flat else between(0.0, 3.0)
-        depth = between(-0.1, 0.1) if flat else between(0.3, 0.6)
-        T = objects.pose(
-            between(0.0, 360.0) if k else 0.0,
-            (reach * math.cos(way), reach * math.sin(way)),
-            depth,
-            (tilt * math.cos(slant), tilt * math.sin(slant)),
-        )
+        T = _random_pose(target, generator, moved=k == 1)
         scene = objects.press(target.height_mm, T, size[0], size[1], pipe.mm_per_pixel)
         with torch.inference_mode():
             presses.append((T, pipe(render(scene, lights, noise_std=noise_std, bits=8, seed=2 * seed + k))))
     return PoseCase(presses[1][0], presses[0][0], presses[1][1], presses[0][1], pipe.mm_per_pixel)
 
 
+def _random_pose(target: objects.Target, generator: torch.Generator, moved: bool) -> Tensor:
+    def between(low: float, high: float) -> float:
+        return low + (high - low) * float(torch.rand((), generator=generator))
+
+    flat = "translation along x" in target.free and "translation along y" in target.free
+    reach = 4.0 * math.sqrt(between(0.0, 1.0)) if moved else between(0.0, 0.3)
+    way, slant = between(0.0, 2.0 * math.pi), between(0.0, 2.0 * math.pi)
+    tilt = between(2.8, 3.0) if flat else between(0.0, 3.0)
+    depth = between(-0.1, 0.1) if flat else between(0.3, 0.6)
+    return objects.pose(
+        between(0.0, 360.0) if moved else 0.0,
+        (reach * math.cos(way), reach * math.sin(way)),
+        depth,
+        (tilt * math.cos(slant), tilt * math.sin(slant)),
+    )
+
+
 def pose_error(found: Tensor, case: PoseCase, period_deg: float) -> tuple[float, float]:
-    """Degrees and mm between a pose and the nearest of the true ones, the object being as good turned by its period."""
+    """Degrees and mm between a pose and the nearest true pose of an object that looks the same after a turn by its period."""
     errors = []
     for k in range(round(360.0 / period_deg)):
         truth = case.T_sensor_target @ objects.pose(k * period_deg, press_mm=0.0) @ invert(case.T_sensor_source)
@@ -111,6 +158,14 @@ def pose_error(found: Tensor, case: PoseCase, period_deg: float) -> tuple[float,
     return min(errors)
 
 
+Register = Callable[[PoseCase], Registration]
+
+
+def by_depth(case: PoseCase) -> Registration:
+    """Register the two depth maps."""
+    return register_depth(case.source, case.target, case.mm_per_pixel)
+
+
 def run_poses(
     targets: dict[str, objects.Target],
     poses: int,
@@ -118,63 +173,77 @@ def run_poses(
     size: tuple[int, int] = (240, 320),
     noise_std: float = 0.005,
     progress: Callable[[], object] = lambda: None,
-    register: Callable[[PoseCase], Registration] = lambda case: register_depth(case.source, case.target, case.mm_per_pixel),
+    register: Register = by_depth,
 ) -> tuple[list[PoseRow], dict[str, tuple[PoseCase, Registration]]]:
-    """All objects in ``poses`` poses each; the rows, and the first pose of each for a picture. The field is 20 mm wide."""
+    """Register all objects in a number of poses each; the field is 20 mm wide.
+
+    Args:
+        targets: objects by name.
+        poses: poses of each.
+        size: rows and columns of the image.
+        noise_std: standard deviation of the noise; images have 8 bits.
+        progress: called for each pose.
+        register: registers the two presses of a case.
+    Returns:
+        The rows, and the first pose of each object for a picture.
+    """
     lights, pipe = rig(*size, 20.0 / size[1])
     rows: list[PoseRow] = []
     shown: dict[str, tuple[PoseCase, Registration]] = {}
     for name, target in targets.items():
-        row = PoseRow(name, poses)
-        named = good = wrong = converged = 0
+        errors: list[PoseError] = []
+        notes: list[str] = []
         for seed in range(poses):
             case = pose_case(target, 1000 + seed, lights, pipe, size, noise_std)
             start = time.perf_counter()
             try:
                 found = register(case)
             except ValueError as error:
-                row.notes.append(f"pose {seed}: {error}")
-                progress()
-                continue
-            row.seconds.append(time.perf_counter() - start)
-            shown.setdefault(name, (case, found))
-            deg, mm = pose_error(found.T_target_source, case, target.period_deg)
-            row.deg.append(deg)
-            row.mm.append(mm)
-            within = deg <= GOAL_DEG and mm <= GOAL_MM
-            converged += found.converged
-            good += within and found.converged
-            wrong += found.converged and not found.ambiguous and not within
-            kinds = {kind for name_ in found.ambiguous for kind in target.free if name_.startswith(kind)}
-            named += found.converged and kinds == set(target.free) and len(found.ambiguous) == max(len(target.free), target.freedom)
+                notes.append(f"pose {seed}: {error}")
+            else:
+                errors.append(_compare(found, case, target, time.perf_counter() - start))
+                shown.setdefault(name, (case, found))
             progress()
-        rows.append(
-            PoseRow(
-                name,
-                poses,
-                row.deg,
-                row.mm,
-                row.seconds,
-                converged,
-                good / poses,
-                wrong,
-                named / poses if target.free else None,
-                row.notes,
-            )
-        )
+        rows.append(_row(name, target, poses, errors, notes))
     return rows, shown
+
+
+def _row(name: str, target: objects.Target, poses: int, errors: list[PoseError], notes: list[str]) -> PoseRow:
+    return PoseRow(
+        name=name,
+        poses=poses,
+        deg=[error.deg for error in errors],
+        mm=[error.mm for error in errors],
+        seconds=[error.seconds for error in errors],
+        converged=sum(error.converged for error in errors),
+        success=sum(error.within and error.converged for error in errors) / poses,
+        wrong=sum(error.claimed and not error.within for error in errors),
+        named=sum(error.named for error in errors) / poses if target.free else None,
+        notes=notes,
+    )
+
+
+def _compare(found: Registration, case: PoseCase, target: objects.Target, seconds: float) -> PoseError:
+    deg, mm = pose_error(found.T_target_source, case, target.period_deg)
+    kinds = {kind for name in found.ambiguous for kind in target.free if name.startswith(kind)}
+    true_kinds = kinds == set(target.free) and len(found.ambiguous) == max(len(target.free), target.freedom)
+    converged = bool(found.converged)
+    return PoseError(deg, mm, seconds, converged, converged and not found.ambiguous, converged and true_kinds)
 
 
 def ball_pairs(
     background: Tensor, presses: Sequence[Press], sensor: Sensor, most: int = 100, progress: Callable[[], object] = lambda: None
 ) -> dict[str, int]:
-    """What registration says of real presses of one ball against each other, of which it can know no rotation.
+    """Register real presses of the same ball with each other: no rotation of a ball can be determined.
 
     Args:
-        background: (3, H, W). presses: of balls. sensor: with a prior, by which the unit is calibrated, no press being used.
-        most: pairs, evenly chosen of all with the same ball.
+        background: (3, H, W), image without contact.
+        presses: presses of balls.
+        sensor: sensor with a prior, which calibrates the unit without the presses.
+        most: largest number of pairs, evenly chosen.
+        progress: called for each pair.
     Returns:
-        Numbers of pairs: "pairs", "converged", and of these "named" (three rotations), "named in part", "not named".
+        Counts: "pairs", "converged", and of these "named" (three rotations reported), "named in part", "not named".
     """
     pipe = DepthPipeline.from_calibration(calibrate(background, sensor), "precise")
     with torch.inference_mode():
@@ -198,26 +267,21 @@ def ball_pairs(
 
 def pose_table(rows: list[PoseRow]) -> str:
     """The rows as a Markdown table."""
-    lines = [
-        "| object | poses | angle deg, median / 95 % | position mm, median / 95 % | within 1 deg and 0.15 mm "
-        "| confident and wrong | unknown directions named | s, median |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    titles = ["object", "poses", "angle deg, median / 95 %", "position mm, median / 95 %", "within 1 deg and 0.15 mm"]
+    titles += ["confident and wrong", "unknown directions named", "s, median"]
+    lines = []
     for row in rows:
+        errors = ["", "", "", str(row.wrong), "" if row.named is None else f"{100 * row.named:.0f} %"]
         if row.named is None:
-            angle = f"{_quantile(row.deg, 0.5):.3f} / {_quantile(row.deg, 0.95):.3f}"
-            errors = f"{angle} | {_quantile(row.mm, 0.5):.4f} / {_quantile(row.mm, 0.95):.4f}"
-            share, named = f"{100 * row.success:.0f} %", ""
-        else:
-            errors, share, named = " | ", "", f"{100 * row.named:.0f} %"
-        lines.append(
-            f"| {row.name} | {row.poses} | {errors} | {share} | {row.wrong} | {named} | {_quantile(row.seconds, 0.5):.2f} |"
-        )
-    return "\n".join(lines)
+            errors[0] = f"{_quantile(row.deg, 0.5):.3f} / {_quantile(row.deg, 0.95):.3f}"
+            errors[1] = f"{_quantile(row.mm, 0.5):.4f} / {_quantile(row.mm, 0.95):.4f}"
+            errors[2] = f"{100 * row.success:.0f} %"
+        lines.append([row.name, str(row.poses), *errors, f"{_quantile(row.seconds, 0.5):.2f}"])
+    return markdown(titles, lines)
 
 
 def machine() -> str:
-    """What a time was measured on."""
+    """Processor, threads and version of torch."""
     return f"{platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__}"
 
 

@@ -1,28 +1,22 @@
-"""How far any method is from balls of known size: scores, a table, error maps.
+"""Score of one frame against the ball of known size that was pressed."""
 
-Methods learn from presses without their labels: calibration by response fields finds the balls itself, and the look-up table
-and the network learn from the balls it found, so that all know the same. All share one contact mask and one integrator.
-"""
-
-import dataclasses
-import json
 import math
-import statistics
-import warnings
-from collections.abc import Callable, Sequence
-from functools import cached_property, partial
-from itertools import pairwise
-from pathlib import Path
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from torch import Tensor, nn
-from tqdm import tqdm
+from torch import Tensor
 
-from ..calibration import CalibrationWarning, Press, calibrate, fit_prior, read_presses
-from ..calibration.calibrate import RESPONSE_BLUR_PX, as_read, by_presses
+from ..calibration import (
+    RESPONSE_BLUR_PX,
+    CalibrationWarning,
+    Press,
+    by_presses,
+    calibrate,
+    fit_prior,
+    read_presses,
+    with_preprocessing,
+)
 from ..compensate import Compensate
 from ..contact import ContactMask
 from ..core.checks import check_image, check_integer, check_same_size
@@ -38,39 +32,47 @@ from ..viz import draw_contours
 from .metrics import fit_sphere, normal_angle_deg
 
 RIM_PX = 3.0
-"""Width of the ring inside the contact radius that is left out: there the skin leaves the ball, and labels are a pixel off."""
+"""Width of the ring inside the contact radius that is not scored: there the skin leaves the ball, and labels are a pixel off."""
 
 SLOPE_EDGES = (0.2, 0.4, 0.6)
-"""True steepness, mm per mm, that parts the bins of ``by_slope_deg``."""
+"""Edges of the bins of true slope in ``by_slope_deg``, mm per mm."""
 
 PLACES = 3
-"""The image is cut into so many rows and columns for ``by_place_deg``."""
+"""Number of rows and of columns of image parts in ``by_place_deg``."""
 
 
 class BallTruth(NamedTuple):
-    """The ball under a press: depth_mm (1, 1, H, W) from its equator, gradient (1, 2, H, W), region (1, 1, H, W) bool to score."""
+    """The ball under a press, float64.
+
+    Attributes:
+        depth_mm: (1, 1, H, W), height of the ball above its equator, mm.
+        gradient: (1, 2, H, W), its slope, mm per mm.
+        region: (1, 1, H, W) bool, the pixels to score.
+    """
 
     depth_mm: Tensor
     gradient: Tensor
     region: Tensor
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class PressScore:
-    """What one method made of one press, inside the contact radius less :data:`RIM_PX`.
+    """Errors of one method on one press, inside the contact radius less :data:`RIM_PX`.
 
     Attributes:
-        press, method: names.
+        press: name of the press.
+        method: name of the method.
         normal_deg: mean angle between normals, degrees.
         relief_um: RMS difference of depth and ball, each less its own mean, micrometres.
-        tilt_um: the part of it that is a plane: all that a wrong label of the center does, and what fields get wrong alike all over
-            a contact.
-        radius_percent: how far the radius of a sphere fitted to depth is from the ball's; None for a depth that is a plane.
-        center_px: how far that sphere's center is from the ball's, pixels; None as well.
-        apex_um: depth of the middle over the rim of the area less the ball's, micrometres; None if the image cuts off either.
-        by_slope_deg: mean angle where the ball's steepness is below 0.2, 0.4, 0.6, and above; None where there is no pixel.
-        by_slope_pixels: their numbers.
-        by_place_deg, by_place_pixels: the same for 3 x 3 parts of the image, row by row.
+        tilt_um: the part of ``relief_um`` that is a plane: the effect of a wrong label of the centre, and of errors that a
+            response field makes alike all over a contact.
+        radius_percent: error of the radius of a sphere fitted to the depth, percent; None where the depth is a plane.
+        center_px: error of the centre of that sphere, pixels; None where the depth is a plane.
+        apex_um: error of the depth of the middle above the rim of the region, micrometres; None if the image cuts off either.
+        by_slope_deg: mean angle where the slope of the ball is below 0.2, 0.4, 0.6, and above; None without pixels.
+        by_slope_pixels: number of pixels in each bin of slope.
+        by_place_deg: mean angle in 3 x 3 parts of the image, row by row; None without pixels.
+        by_place_pixels: number of pixels in each part.
     """
 
     press: str
@@ -87,89 +89,61 @@ class PressScore:
     by_place_pixels: tuple[int, ...]
 
 
-@dataclasses.dataclass(frozen=True)
-class MethodSummary:
-    """One method over all presses: means, the worst press, and how many numbers it learned; None where nothing was fitted.
-
-    ``radius_percent`` and ``center_px`` are medians: the sphere through a badly wrong relief may lie anywhere.
-    """
-
-    method: str
-    numbers: int
-    presses: int
-    normal_deg: float
-    relief_um: float
-    tilt_um: float
-    radius_percent: float | None
-    center_px: float | None
-    apex_um: float | None
-    worst_press: str
-    worst_deg: float
-    note: str
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Evaluation:
-    """Scores of methods on a folder.
-
-    Attributes:
-        summaries: one per method. scores: one per method and press.
-        not_scored: presses without a contact radius.
-        how: what was held out, and where centers come from.
-        shown: the press of ``outputs``. outputs: what each method made of it.
-        mm_per_pixel: pitch, mm.
-    """
-
-    summaries: list[MethodSummary]
-    scores: list[PressScore]
-    not_scored: list[str]
-    how: str
-    shown: Press
-    outputs: dict[str, DepthOutput]
-    mm_per_pixel: float
-
-    def of(self, method: str) -> list[PressScore]:
-        """Scores of one method."""
-        return [score for score in self.scores if score.method == method]
-
-
 def ball_truth(press: Press, height: int, width: int, mm_per_pixel: float) -> BallTruth:
-    """The sphere that the skin lies on inside the contact.
+    """The sphere that the skin follows inside the contact.
 
     Args:
-        press: with center and contact radius. height, width: pixels. mm_per_pixel: pitch, mm.
+        press: press with centre and contact radius.
+        height: rows of the image.
+        width: columns of the image.
+        mm_per_pixel: pixel pitch, mm.
     Returns:
-        A :class:`BallTruth`, float64.
+        Depth, slope and the region to score.
     Raises:
-        ValueError: center or contact radius is missing.
+        ValueError: the press has no centre or no contact radius.
     Example:
         >>> press = Press(torch.zeros(3, 31, 31), 6.0, "middle", (15.0, 15.0), 13.0)
         >>> truth = ball_truth(press, 31, 31, 0.1)
         >>> round(float(truth.depth_mm[0, 0, 15, 15]), 3), int(truth.region.sum())
         (3.0, 305)
     """
-    if press.center_px is None or press.contact_radius_px is None:
-        raise ValueError(f"press: expected one with center_px and contact_radius_px, '{press.name}' has none: it cannot be scored")
+    (center_x, center_y), contact_radius_px = label(press)
     x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
-    dx = x - (press.center_px[0] - (width - 1) / 2) * mm_per_pixel
-    dy = y - (press.center_px[1] - (height - 1) / 2) * mm_per_pixel
+    dx = x - (center_x - (width - 1) / 2) * mm_per_pixel
+    dy = y - (center_y - (height - 1) / 2) * mm_per_pixel
     radius_mm = 0.5 * press.ball_diameter_mm
     r_squared = dx**2 + dy**2
     depth = torch.sqrt((radius_mm**2 - r_squared).clamp_min((0.2 * radius_mm) ** 2))
     gradient = -torch.stack((dx.expand_as(depth), dy.expand_as(depth))) / depth
-    reach_mm = min((press.contact_radius_px - RIM_PX) * mm_per_pixel, 0.95 * radius_mm)
+    reach_mm = min((contact_radius_px - RIM_PX) * mm_per_pixel, 0.95 * radius_mm)
     region = (r_squared < reach_mm**2) if reach_mm > 0 else torch.zeros_like(depth, dtype=torch.bool)
     return BallTruth(depth[None, None], gradient[None], region[None, None])
+
+
+def label(press: Press) -> tuple[tuple[float, float], float]:
+    """Centre (x, y) and contact radius of a press, pixels.
+
+    Raises:
+        ValueError: one of them is missing.
+    """
+    if press.center_px is None or press.contact_radius_px is None:
+        raise ValueError(f"press: expected one with center_px and contact_radius_px, '{press.name}' has none: it cannot be scored")
+    return press.center_px, press.contact_radius_px
 
 
 def score_press(press: Press, depth_mm: Tensor, normal: Tensor, mm_per_pixel: float, method: str = "") -> PressScore:
     """Compare one frame with the ball that was pressed.
 
     Args:
-        press: with center and contact radius. depth_mm: (1, 1, H, W), mm. normal: (1, 3, H, W), unit.
-        mm_per_pixel: pitch, mm. method: name, kept with the score.
+        press: press with centre and contact radius.
+        depth_mm: (1, 1, H, W), measured depth, mm.
+        normal: (1, 3, H, W), measured unit normals.
+        mm_per_pixel: pixel pitch, mm.
+        method: name that is kept with the score.
+    Returns:
+        The errors.
     Raises:
-        ValueError: wrong shapes, center or contact radius missing, or an area too small to fit a sphere to.
+        ValueError: wrong shapes, a missing centre or contact radius, or a region too small for a sphere.
     Example:
         >>> press = Press(torch.zeros(3, 31, 31), 6.0, "middle", (15.0, 15.0), 13.0)
         >>> truth = ball_truth(press, 31, 31, 0.1)
@@ -177,6 +151,37 @@ def score_press(press: Press, depth_mm: Tensor, normal: Tensor, mm_per_pixel: fl
         >>> round(score.normal_deg, 6), round(score.relief_um, 6), round(abs(score.radius_percent), 6)
         (0.0, 0.0, 0.0)
     """
+    truth = _checked_truth(press, depth_mm, normal, mm_per_pixel)
+    region = truth.region[0, 0]
+    depth = depth_mm.detach().cpu().double()
+    angle = normal_angle_deg(normal.detach().cpu().double(), normal_from_gradient(truth.gradient))[0][region]  # (N,)
+    error = (depth - truth.depth_mm)[0, 0][region]
+    rows, columns = torch.nonzero(region, as_tuple=True)
+    steepness = truth.gradient[0].norm(dim=0)[region]
+    slope_bin = torch.bucketize(steepness, torch.tensor(SLOPE_EDGES, dtype=torch.float64), right=True)
+    height, width = region.shape
+    place_bin = (rows * PLACES // height) * PLACES + columns * PLACES // width
+    by_slope, slope_pixels = _by_bin(angle, slope_bin, len(SLOPE_EDGES) + 1)
+    by_place, place_pixels = _by_bin(angle, place_bin, PLACES * PLACES)
+    radius_percent, center_px = _sphere_error(press, depth, truth, mm_per_pixel)
+    return PressScore(
+        press=press.name,
+        method=method,
+        normal_deg=float(angle.mean()),
+        relief_um=1000.0 * float(error.std(correction=0)),
+        tilt_um=1000.0 * _tilt(error, torch.stack((columns, rows))),
+        radius_percent=radius_percent,
+        center_px=center_px,
+        apex_um=_apex_um(press, error, columns, rows),
+        by_slope_deg=by_slope,
+        by_slope_pixels=slope_pixels,
+        by_place_deg=by_place,
+        by_place_pixels=place_pixels,
+    )
+
+
+def _checked_truth(press: Press, depth_mm: Tensor, normal: Tensor, mm_per_pixel: float) -> BallTruth:
+    """The ball, after a check that one frame was given and that its region is large enough."""
     if depth_mm.dim() != 4 or tuple(depth_mm.shape[:2]) != (1, 1):
         raise ValueError(f"depth_mm: expected one frame, (1, 1, H, W), got {tuple(depth_mm.shape)}: loop over the batch")
     height, width = depth_mm.shape[2], depth_mm.shape[3]
@@ -184,42 +189,12 @@ def score_press(press: Press, depth_mm: Tensor, normal: Tensor, mm_per_pixel: fl
         raise ValueError(f"normal: expected one frame, (1, 3, H, W), got {tuple(normal.shape)}: loop over the batch")
     check_same_size("normal", normal, "depth_mm", height, width)
     truth = ball_truth(press, height, width, mm_per_pixel)
-    region = truth.region[0, 0]
-    if int(region.sum()) < 10:
+    if int(truth.region.sum()) < 10:
         raise ValueError(
-            f"press: '{press.name}' has {int(region.sum())} pixels {RIM_PX:g} px inside its contact radius of "
+            f"press: '{press.name}' has {int(truth.region.sum())} pixels {RIM_PX:g} px inside its contact radius of "
             f"{press.contact_radius_px:g} px, 10 are needed: pressed too faintly, or outside of the image"
         )
-    depth = depth_mm.detach().cpu().double()
-    angle = normal_angle_deg(normal.detach().cpu().double(), normal_from_gradient(truth.gradient))[0]  # (H, W)
-    error = (depth - truth.depth_mm)[0, 0][region]
-    radius_percent, center_px = _sphere_error(press, depth, truth, mm_per_pixel)
-
-    rows, columns = torch.nonzero(region, as_tuple=True)
-    away = torch.hypot(columns - _center(press)[0], rows - _center(press)[1])
-    middle, rim = away < 2.0, away > _radius(press) - RIM_PX - 1.5
-    apex_um = 1000.0 * float(error[middle].mean() - error[rim].mean()) if bool(middle.any() and rim.any()) else None
-
-    inside = angle[region]
-    steepness = truth.gradient[0].norm(dim=0)[region]
-    slope_bin = torch.bucketize(steepness, torch.tensor(SLOPE_EDGES, dtype=torch.float64), right=True)
-    place_bin = (rows * PLACES // height) * PLACES + columns * PLACES // width
-    by_slope, slope_pixels = _by_bin(inside, slope_bin, len(SLOPE_EDGES) + 1)
-    by_place, place_pixels = _by_bin(inside, place_bin, PLACES * PLACES)
-    return PressScore(
-        press.name,
-        method,
-        float(inside.mean()),
-        1000.0 * float(error.std(correction=0)),
-        1000.0 * _tilt(error, torch.stack((columns, rows))),
-        radius_percent,
-        center_px,
-        apex_um,
-        by_slope,
-        slope_pixels,
-        by_place,
-        place_pixels,
-    )
+    return truth
 
 
 def _tilt(error: Tensor, place: Tensor) -> float:
@@ -229,8 +204,16 @@ def _tilt(error: Tensor, place: Tensor) -> float:
     return float(plane.std(correction=0))
 
 
+def _apex_um(press: Press, error: Tensor, columns: Tensor, rows: Tensor) -> float | None:
+    """Mean error of the middle less that of the rim; None if the image cuts off either."""
+    (center_x, center_y), contact_radius_px = label(press)
+    away = torch.hypot(columns - center_x, rows - center_y)
+    middle, rim = away < 2.0, away > contact_radius_px - RIM_PX - 1.5
+    return 1000.0 * float(error[middle].mean() - error[rim].mean()) if bool(middle.any() and rim.any()) else None
+
+
 def _sphere_error(press: Press, depth_mm: Tensor, truth: BallTruth, mm_per_pixel: float) -> tuple[float | None, float | None]:
-    """Radius error in percent and center error in pixels of the sphere through the depth; None for a plane."""
+    """Radius error in percent and centre error in pixels of the sphere through the depth; None for a plane."""
     height, width = depth_mm.shape[2:]
     x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
     columns = torch.stack((x.expand(height, width), y.expand(height, width), torch.ones(height, width, dtype=torch.float64)), -1)
@@ -242,24 +225,16 @@ def _sphere_error(press: Press, depth_mm: Tensor, truth: BallTruth, mm_per_pixel
     sphere = fit_sphere(depth_mm, mm_per_pixel, truth.region)
     if not math.isfinite(sphere.radius_mm):
         return None, None
+    (center_x, center_y), _ = label(press)
     # the point frame has y up
     at_x = sphere.center_mm[0] / mm_per_pixel + (width - 1) / 2
     at_y = -sphere.center_mm[1] / mm_per_pixel + (height - 1) / 2
-    away_px = math.hypot(at_x - _center(press)[0], at_y - _center(press)[1])
+    away_px = math.hypot(at_x - center_x, at_y - center_y)
     return 100.0 * abs(sphere.radius_mm / (0.5 * press.ball_diameter_mm) - 1.0), away_px
 
 
-def _center(press: Press) -> tuple[float, float]:
-    assert press.center_px is not None
-    return press.center_px
-
-
-def _radius(press: Press) -> float:
-    assert press.contact_radius_px is not None
-    return press.contact_radius_px
-
-
 def _by_bin(values: Tensor, index: Tensor, bins: int) -> tuple[tuple[float | None, ...], tuple[int, ...]]:
+    """Mean of the values in each bin, None where there is none, and their number."""
     counts = torch.bincount(index, minlength=bins)
     sums = torch.bincount(index, weights=values, minlength=bins)
     return tuple(float(s / n) if n else None for s, n in zip(sums, counts)), tuple(counts.tolist())
@@ -294,7 +269,7 @@ class Training:
 
     def of_family(self, degree: int, product_degree: int) -> Calibration:
         """By the located presses and response fields of that size alone."""
-        return by_presses(self.background, self.sensor, self.located, None, False, ((degree, product_degree),))[2]
+        return by_presses(self.background, self.sensor, self.located, None, False, ((degree, product_degree),)).unit
 
 
 def _found(presses: Sequence[Press], calibration: Calibration) -> list[Press]:
@@ -458,8 +433,8 @@ class _OfSecond(nn.Module):
 
 def _unit(background: Tensor, sensor: Sensor) -> Calibration:
     """The unit as a response field sees it that says 0 everywhere: it gives every method's contact mask."""
-    blur_px = as_read(sensor, None).blur_px
-    return Calibration.from_response(ResponseModel.blank(sensor.exponent, blur_px), sensor, background)
+    blur_px = with_preprocessing(sensor, None).blur_px
+    return Calibration.from_response(ResponseModel.zero(sensor.exponent, blur_px), sensor, background)
 
 
 def _smooth(unit: Calibration) -> Compensate:

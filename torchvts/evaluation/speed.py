@@ -1,91 +1,91 @@
-"""Speed and error of every method in one table: rows for a chart of one against the other."""
+"""Speed and error of every method in the same run: on exact scenes, on a real sensor, for the stages of a frame."""
 
 import dataclasses
-import importlib
-import json
 import os
 import platform
 import statistics
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
-import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from ..accelerated import reference_only
-from ..calibration import CalibrationWarning, Press, calibrate, read_presses
-from ..compensate import Compensate
-from ..core.geometry import normal_from_gradient
-from ..integration import AdaptiveIntegration, PoissonDST, divergence
-from ..model import gs_sdk
-from ..model.calibration import Calibration
-from ..model.lights import PointLights
-from ..model.sensor import Sensor
-from ..normals import NormalFromLookup, NormalFromMLP
+from ..calibration import Press, read_presses
+from ..model import Calibration, PointLights, Sensor, gs_sdk
+from ..normals import NormalFromMLP
 from ..pipeline import MODES, DepthPipeline
-from ..scenes.scenes import Scene, render, sphere_press, surface
+from ..scenes import Scene, render, sphere_press, surface
+from . import rows as records
 from .gallery import roof, stamp
+from .methods import METHODS, Built, Reconstruct, lookup_on
 from .metrics import depth_error, normal_angle_deg
-from .score import Training, score_press, training_pixels
+from .peers import GsSdkPipeline, installed_gs_sdk
+from .presses import Training, quiet_calibrate
+from .rows import Column, Row, Size, Time, error_column, number
+from .score import score_press
 
 SIZES = ((120, 160), (240, 320), (480, 640), (960, 1280))
 PRESSES_MM = (1.0, 2.0)
+GS_SDK = "gs_sdk's pipeline"
+
+TIMED = ("fast", "precise", "auto", "fast, zero border", "fast, SciPy's DCT")
+"""Methods that are timed on every exact scene."""
+
+TIMED_ONCE = ("fast, PyTorch reference", "flat", "look-up table")
+"""Methods that are timed on the scenes of the first press only."""
+
+Errors = Mapping[str, float | None]
 
 
-@dataclass(frozen=True)
-class Row:
-    """One measurement; errors are those of the very frames that were timed, None where there is nothing to compare with.
+class Timing(NamedTuple):
+    """Time of a call.
 
     Attributes:
-        kind: "scene" (exact truth), "cliff" (the same, with walls), "sensor" (balls on a real sensor), "stage" (part of a frame),
-            "batch", "threads".
-        method, data: names. ours: whether it is this library's, and not a peer's.
-        height, width: pixels. batch, threads: as said. machine: kind, cores, torch.
-        ms_median, ms_iqr: of one frame, milliseconds. frames_per_second: by the median.
-        memory_mb: most that one call holds beside its inputs.
-        normal_deg, rms_um, largest_px: mean angle between normals; RMS and largest error of depth.
-        floor_ms: what the memory traffic or the FFT of a stage takes by itself.
-        command: what made the row. note: what there is to say.
+        median: median, ms.
+        iqr: interquartile range, ms.
     """
-
-    kind: str
-    method: str
-    data: str
-    ours: bool
-    height: int
-    width: int
-    batch: int
-    threads: int
-    machine: str
-    ms_median: float
-    ms_iqr: float
-    frames_per_second: float
-    memory_mb: float | None
-    normal_deg: float | None
-    rms_um: float | None
-    largest_px: float | None
-    floor_ms: float | None
-    command: str
-    note: str = ""
-
-
-@dataclass(frozen=True)
-class Timing:
-    """Median and interquartile range of the time of a call, ms."""
 
     median: float
     iqr: float
 
 
+class Call(NamedTuple):
+    """A call to time, and the other fields of its row.
+
+    Attributes:
+        call: what is timed.
+        errors: errors of the same frames.
+        batch: frames in the call.
+        ours: whether it is a method of this library.
+        parameters: number of parameters of the method.
+        floor_ms: time of the memory traffic or of the FFT alone, ms.
+        note: a remark.
+    """
+
+    call: Callable[[], object]
+    errors: Errors | None = None
+    batch: int = 1
+    ours: bool = True
+    parameters: int | None = None
+    floor_ms: float | None = None
+    note: str = ""
+
+
 def time_ms(call: Callable[[], object], repeats: int = 40, most_s: float = 2.0) -> Timing:
-    """Time a call: five to warm up, then ``repeats`` or as many as fit into ``most_s`` seconds, at least five."""
+    """Time a call.
+
+    Args:
+        call: what is timed, after five calls to warm up.
+        repeats: number of calls.
+        most_s: bound on the time of all calls, s; there are at least five.
+    Returns:
+        Median and interquartile range.
+    """
     for _ in range(5):
         call()
     times: list[float] = []
@@ -99,7 +99,7 @@ def time_ms(call: Callable[[], object], repeats: int = 40, most_s: float = 2.0) 
 
 
 def memory_mb(call: Callable[[], object]) -> float:
-    """Most memory of tensors that a call holds at any moment, MB, by the allocator's own record."""
+    """Largest memory of tensors that a call holds at any moment, MB, by the record of the allocator."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU], profile_memory=True) as profile:
@@ -113,58 +113,76 @@ def memory_mb(call: Callable[[], object]) -> float:
 
 
 class Bench:
-    """Measures; every row carries machine, threads and command.
+    """Times calls; every row has the machine, the threads and the command.
 
     Args:
-        command: what was typed. progress: called with what is measured next.
+        command: the command as typed.
+        progress: called with the name of what is measured next.
     """
 
     def __init__(self, command: str, progress: Callable[[str], None]) -> None:
         self.command, self.progress = command, progress
         self.machine = f"{platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}"
 
-    def row(
-        self,
-        kind: str,
-        method: str,
-        data: str,
-        size: Sequence[int],
-        call: Callable[[], object],
-        *,
-        ours: bool = True,
-        batch: int = 1,
-        errors: tuple[float | None, float | None, float | None] = (None, None, None),
-        floor_ms: float | None = None,
-        note: str = "",
-    ) -> Row:
-        """Time a call and make its row."""
+    def row(self, kind: str, method: str, data: str, size: tuple[int, int], timed: Call) -> Row:
+        """Time a call and make its row.
+
+        Args:
+            kind: kind of the row.
+            method: name of the method.
+            data: name of the data.
+            size: rows and columns of the frame.
+            timed: the call.
+        """
         self.progress(f"{method}, {data or kind}, {size[1]}x{size[0]}")
         with torch.inference_mode():
-            timing = time_ms(call)
-            held = memory_mb(call)
-        ms = timing.median / batch
+            timing = time_ms(timed.call)
+            held = memory_mb(timed.call)
+        ms = timing.median / timed.batch
+        threads = torch.get_num_threads()
         return Row(
-            kind, method, data, ours, size[0], size[1], batch, torch.get_num_threads(), self.machine, ms, timing.iqr / batch,
-            1000.0 / ms, held, *errors, floor_ms, self.command, note,
-        )  # fmt: skip
+            kind=kind,
+            method=method,
+            data=data,
+            errors=timed.errors or {},
+            size=Size(*size, timed.batch),
+            time=Time(ms, timing.iqr / timed.batch, 1000.0 / ms, held, threads, self.machine, timed.floor_ms),
+            parameters=timed.parameters,
+            ours=timed.ours,
+            command=self.command,
+            note=timed.note,
+        )
 
 
 def run(command: str, progress: Callable[[str], None], data: Path | None) -> list[Row]:
-    """All rows: exact scenes, a real sensor if ``data`` holds it, stages with their floors, batches and threads."""
+    """All rows: exact scenes, walls, stages, batches and threads, and a real sensor if there are data of one.
+
+    Args:
+        command: the command as typed.
+        progress: called with the name of what is measured next.
+        data: folder with ``gelsight_mini_a``; None without.
+    """
     bench = Bench(command, progress)
-    rows = [*_scenes(bench), *_cliffs(bench), *_stages(bench), *_scaling(bench)]
+    rows = [*_scenes(bench), *_walls(bench), *_stages(bench), *_scaling(bench)]
     if data is not None and (data / "gelsight_mini_a").is_dir():
         rows += list(_sensor(bench, data))
     return rows
 
 
+def ms(row: Row) -> float:
+    """Median time of a row's frame, ms."""
+    if row.time is None:
+        raise ValueError(f"row: expected one with a time, got '{row.method}' on '{row.data}' without")
+    return row.time.ms_median
+
+
 def peer_ratios(rows: Sequence[Row]) -> list[str]:
-    """How many times faster than gs_sdk's pipeline the fast frame is, and how many times slower precise, by size."""
+    """Sentences by size: the fast frame compared with gs_sdk's pipeline, and precise compared with fast."""
     lines = []
     for height, width in SIZES:
-        shown = [row for row in rows if (row.height, row.width) == (height, width) and f"press {PRESSES_MM[0]:g} mm" in row.data]
-        times = {row.method: row.ms_median for row in shown if row.kind == "scene"}
-        peer = next((ms for method, ms in times.items() if method.startswith("gs_sdk")), None)
+        shown = [row for row in rows if row.size == Size(height, width) and f"press {PRESSES_MM[0]:g} mm" in row.data]
+        times = {row.method: ms(row) for row in shown if row.kind == "scene"}
+        peer = times.get(GS_SDK)
         if peer is not None and "fast" in times:
             slower = times["precise"] / times["fast"]
             lines.append(
@@ -175,171 +193,153 @@ def peer_ratios(rows: Sequence[Row]) -> list[str]:
 
 
 def front(rows: Sequence[Row], error: str) -> list[Row]:
-    """The rows that no other beats in both time and ``error`` ("rms_um", "normal_deg"), by rising time."""
-    known = sorted((row for row in rows if getattr(row, error) is not None), key=lambda row: (row.ms_median, getattr(row, error)))
+    """The Pareto front of time and of an error ("rms_um", "normal_deg"), by rising time."""
+    known = sorted(((ms(row), value, k) for k, row in enumerate(rows) if (value := row.error(error)) is not None))
     best: list[Row] = []
-    for row in known:
-        if not best or getattr(row, error) < getattr(best[-1], error):
-            best.append(row)
+    least = float("inf")
+    for _, value, k in known:
+        if value < least:
+            best.append(rows[k])
+            least = value
     return best
+
+
+def _size(row: Row) -> str:
+    assert row.size is not None and row.time is not None
+    batch = f", batch {row.size.batch}" if row.size.batch > 1 else ""
+    threads = f", {row.time.threads} threads" if row.kind == "threads" else ""
+    return f"{row.size.width}x{row.size.height}{batch}{threads}"
+
+
+COLUMNS = (
+    Column("method", lambda row: row.method),
+    Column("data", lambda row: row.data),
+    Column("size", _size),
+    Column("ms, median (IQR)", lambda row: f"{row.time.ms_median:.2f} ({row.time.ms_iqr:.2f})" if row.time else ""),
+    Column("frames/s", lambda row: f"{row.time.frames_per_second:.0f}" if row.time else ""),
+    Column("MB", lambda row: number(row.time.memory_mb, 0) if row.time else ""),
+    error_column("normals deg", "normal_deg", 3),
+    error_column("RMS um", "rms_um", 3),
+    error_column("largest px", "largest_px", 3),
+    Column("floor ms", lambda row: number(row.time.floor_ms, 3) if row.time else ""),
+    Column("", lambda row: row.note),
+)
+"""Columns of :func:`table`."""
 
 
 def table(rows: Sequence[Row]) -> str:
     """The rows as a Markdown table."""
-    lines = [
-        "| method | data | size | ms, median (IQR) | frames/s | MB | normals deg | RMS um | largest px | floor ms | |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    for row in rows:
-        errors = " | ".join(f"{v:.3f}" if v is not None else "" for v in (row.normal_deg, row.rms_um, row.largest_px, row.floor_ms))
-        batch = f", batch {row.batch}" if row.batch > 1 else ""
-        threads = f", {row.threads} threads" if row.kind == "threads" else ""
-        held = "" if row.memory_mb is None else f"{row.memory_mb:.0f}"
-        speed = f"{row.width}x{row.height}{batch}{threads} | {row.ms_median:.2f} ({row.ms_iqr:.2f}) | {row.frames_per_second:.0f}"
-        lines.append(f"| {row.method} | {row.data} | {speed} | {held} | {errors} | {row.note} |")
-    return "\n".join(lines)
-
-
-def to_json(rows: Sequence[Row]) -> str:
-    """The rows as JSON, one object each."""
-    return json.dumps([asdict(row) for row in rows], indent=1)
+    return records.table(rows, COLUMNS)
 
 
 # exact scenes
 
 
-def _rig(height: int, width: int, press_mm: float) -> tuple[Calibration, Tensor, Scene]:
+class _Rig(NamedTuple):
+    """A unit of known lights, an exact press, and its image."""
+
+    calibration: Calibration
+    scene: Scene
+    image: Tensor
+
+
+def _rig(height: int, width: int, press_mm: float) -> _Rig:
     pitch = 40.0 / width
     lights = PointLights([[24.6, 15.0, 34.0], [-25.4, 14.1, 33.0], [0.9, -29.1, 35.0]], [1000.0, 1000.0, 1000.0])
     scene = sphere_press(10.0, press_mm, height=height, width=width, mm_per_pixel=pitch)
     image = render(scene, lights, noise_std=0.003, bits=8).detach()
-    return Calibration.from_lights(lights, Sensor("bench", height, width, pitch)), image, scene
+    return _Rig(Calibration.from_lights(lights, Sensor("bench", height, width, pitch)), scene, image)
+
+
+def _on_scene(name: str, rig: _Rig) -> Call:
+    """A method built for a rig, and its errors on the scene."""
+    method = METHODS[name]
+    built = method.calibrated(rig.calibration)
+    with torch.inference_mode():
+        found = built.reconstruct(rig.image)
+    error = depth_error(found.depth_mm, rig.scene.depth_mm, rig.scene.mm_per_pixel)
+    angle = float(normal_angle_deg(found.normal, rig.scene.normal, rig.scene.contact).mean())
+    errors = {"normal_deg": angle, "rms_um": 1000.0 * error.rms_mm, "largest_px": error.max_px}
+    return Call(partial(built.reconstruct, rig.image), errors, 1, method.ours, built.parameters, None, built.note)
 
 
 def _scenes(bench: Bench) -> Iterator[Row]:
-    for height, width in SIZES:
+    for size in SIZES:
         for press_mm in PRESSES_MM:
-            calibration, image, scene = _rig(height, width, press_mm)
+            rig = _rig(*size, press_mm)
             data = f"sphere R 10 mm, press {press_mm:g} mm, noise 0.003"
-            size = (height, width)
-            pipes = {mode: DepthPipeline.from_calibration(calibration, mode) for mode in MODES}
-            solvers: dict[str, nn.Module] = {"zero border (DST)": PoissonDST(scene.mm_per_pixel)}
-            if find_spec("scipy") is not None:
-                solvers["SciPy's DCT"] = _PoissonSciPy(scene.mm_per_pixel)
-            for name, solver in solvers.items():
-                pipes[f"fast, {name}"] = DepthPipeline.from_calibration(calibration, integrate=solver)
-            for method, pipe in pipes.items():
-                with torch.inference_mode():
-                    found = pipe(image)
-                errors = _errors(found.depth_mm, found.normal, scene)
-                yield bench.row("scene", method, data, size, partial(pipe, image), ours="SciPy" not in method, errors=errors)
-            if press_mm == PRESSES_MM[0]:
-                fast = reference_only()(partial(pipes["fast"], image))
-                errors = _errors(fast().depth_mm, fast().normal, scene)
-                yield bench.row(
-                    "scene", "fast, tensor operators", data, size, fast, ours=True, errors=errors, note="no compiled loops"
-                )
-                flat = torch.zeros_like(scene.depth_mm)
-                upright = normal_from_gradient(torch.cat((flat, flat), dim=1))
-                yield bench.row(
-                    "scene", "flat", data, size, partial(torch.zeros_like, scene.depth_mm), ours=False,
-                    errors=_errors(flat, upright, scene), note="what errors are worth",
-                )  # fmt: skip
-                yield from _lookup_on_scenes(bench, calibration, image, scene, data)
-                if find_spec("scipy") is not None and height <= 480:
-                    peer = _GsSdkPipeline(NormalFromMLP(height, width, calibration.model_image), calibration.model_image)
-                    pixels = gs_sdk.image_to_bgr(image[0])
-                    note = "its network untrained here: time only"
-                    yield bench.row("scene", "gs_sdk's pipeline", data, size, partial(peer, pixels), ours=False, note=note)
+            for name in TIMED if press_mm != PRESSES_MM[0] else TIMED + TIMED_ONCE:
+                if METHODS[name].installed:
+                    yield bench.row("scene", name, data, size, _on_scene(name, rig))
+            if press_mm == PRESSES_MM[0] and find_spec("scipy") is not None and size[0] <= 480:
+                flat = rig.calibration.model_image
+                peer, pixels = GsSdkPipeline(NormalFromMLP(*size, flat), flat), gs_sdk.image_to_bgr(rig.image[0])
+                call = Call(partial(peer, pixels), ours=False, note="its network untrained here: time only")
+                yield bench.row("scene", GS_SDK, data, size, call)
 
 
-def _lookup_on_scenes(bench: Bench, calibration: Calibration, image: Tensor, scene: Scene, data: str) -> Iterator[Row]:
-    """The look-up table, filled by other balls on the same rig."""
-    assert calibration.lights is not None
-    height, width, pitch = calibration.sensor.height, calibration.sensor.width, calibration.sensor.mm_per_pixel
-    values, slopes = [], []
-    for x, y in ((-5.0, -4.0), (5.0, 3.0), (0.0, 0.0)):
-        ball = sphere_press(8.0, 1.2, (x, y), height=height, width=width, mm_per_pixel=pitch)
-        seen = (render(ball, calibration.lights).detach() - calibration.model_image)[0]
-        inside = ball.contact[0, 0]
-        values.append(seen[:, inside].t())
-        slopes.append(ball.gradient[0][:, inside].t())
-    block = NormalFromLookup.fit(calibration.model_image, torch.cat(values), torch.cat(slopes))
-    pipe = DepthPipeline.from_calibration(calibration, normals=block)
-    with torch.inference_mode():
-        found = pipe(image)
-    errors = _errors(found.depth_mm, found.normal, scene)
-    yield bench.row("scene", "look-up table", data, (height, width), partial(pipe, image), ours=False, errors=errors)
-
-
-def _errors(depth_mm: Tensor, normal: Tensor, scene: Scene) -> tuple[float, float, float]:
-    error = depth_error(depth_mm, scene.depth_mm, scene.mm_per_pixel)
-    return float(normal_angle_deg(normal, scene.normal, scene.contact).mean()), 1000.0 * error.rms_mm, error.max_px
-
-
-def _cliffs(bench: Bench) -> Iterator[Row]:
-    """What each robust variant costs and gains on walls: a roof with upright ends, a stamp."""
-    height, width = 240, 320
-    reliefs = {"roof, upright ends": roof(1.0, 0.4, 100.0, 9.0, 0.0, 0.0), "stamp, upright walls": stamp(3.5, 1.0, 100.0, 0.0, 0.0)}
-    for name, relief in reliefs.items():
-        calibration, _, ball = _rig(height, width, 1.0)
+def _walls(bench: Bench) -> Iterator[Row]:
+    """Time and error on vertical walls: a roof with vertical ends, a stamp."""
+    size = (240, 320)
+    reliefs = {
+        "roof, upright ends": roof(1.0, 0.4, 100.0, 9.0, 0.0, 0.0),
+        "stamp, upright walls": stamp(3.5, 1.0, 100.0, 0.0, 0.0),
+    }
+    for data, relief in reliefs.items():
+        calibration, ball, _ = _rig(*size, 1.0)
         assert calibration.lights is not None
-        pitch = ball.mm_per_pixel
-        scene = surface(relief, height, width, pitch)
-        image = render(scene, calibration.lights, noise_std=0.003, bits=8).detach()
-        pipes = {
-            "precise": DepthPipeline.from_calibration(calibration, "precise"),
-            "precise, cliffs": DepthPipeline.from_calibration(calibration, "precise", integrate=AdaptiveIntegration(pitch)),
-        }
-        for method, pipe in pipes.items():
-            with torch.inference_mode():
-                found = pipe(image)
-            errors = _errors(found.depth_mm, found.normal, scene)
-            yield bench.row("cliff", method, name, (height, width), partial(pipe, image), errors=errors)
+        scene = surface(relief, *size, ball.mm_per_pixel)
+        rig = _Rig(calibration, scene, render(scene, calibration.lights, noise_std=0.003, bits=8).detach())
+        for name in ("precise", "precise, discontinuities"):
+            yield bench.row("wall", name, data, size, _on_scene(name, rig))
 
 
-# parts of a frame, and how cost grows
+# stages of a frame, batches and threads
+
+
+def _fast(rig: _Rig) -> DepthPipeline:
+    return DepthPipeline.from_calibration(rig.calibration, "fast")
 
 
 def _stages(bench: Bench) -> Iterator[Row]:
-    for height, width in ((240, 320), (480, 640)):
-        calibration, image, _ = _rig(height, width, 1.0)
-        pipe = DepthPipeline.from_calibration(calibration, "fast")
+    for size in ((240, 320), (480, 640)):
+        rig = _rig(*size, 1.0)
+        pipe, image = _fast(rig), rig.image
         with torch.inference_mode():
             contact = pipe.contact(pipe.compensate(image))
             gradient = pipe.gradient(pipe.normals(image)) * contact
             depth = pipe.integrate(gradient)
-        plane, spectrum = torch.rand(1, 1, height, width), torch.fft.rfft2(torch.rand(1, 1, height, width))
+        plane, spectrum = torch.rand(1, 1, *size), torch.fft.rfft2(torch.rand(1, 1, *size))
         with torch.inference_mode():
             read = time_ms(partial(torch.aminmax, image)).median
             copy = time_ms(partial(torch.add, image, 1.0)).median
             transform = time_ms(partial(torch.fft.rfft2, plane)).median
-            transform += time_ms(partial(torch.fft.irfft2, spectrum, s=(height, width))).median
+            transform += time_ms(partial(torch.fft.irfft2, spectrum, s=size)).median
         calls: dict[str, tuple[Callable[[], object], float, str]] = {
             "contact": (partial(pipe.contact, image), copy, "floor: one pass over the image"),
-            "normals, eq. 9, whole frame": (partial(pipe.normals, image), 3.0 * copy, "floor: a pass for each light's column"),
+            "normals, eq. 9, whole frame": (partial(pipe.normals, image), 3.0 * copy, "floor: one pass for each light"),
             "normals, eq. 10, whole frame": (partial(pipe.normals, image, depth), 3.0 * copy, "the same floor"),
-            "integrate, whole frame": (partial(pipe.integrate, gradient), transform, "floor: one real FFT there and one back"),
-            "check of values": (partial(torch.aminmax, image), read, "its own floor"),
+            "integrate, whole frame": (partial(pipe.integrate, gradient), transform, "floor: one real FFT and its inverse"),
+            "check of values": (partial(torch.aminmax, image), read, "floor: itself"),
         }
         for name, (call, floor, note) in calls.items():
-            yield bench.row("stage", name, "", (height, width), call, floor_ms=floor, note=note)
+            yield bench.row("stage", name, "", size, Call(call, floor_ms=floor, note=note))
 
 
 def _scaling(bench: Bench) -> Iterator[Row]:
-    calibration, image, _ = _rig(240, 320, 1.0)
-    pipe = DepthPipeline.from_calibration(calibration, "fast")
+    """Mode fast by batch size and by number of threads."""
+    size = (240, 320)
+    rig = _rig(*size, 1.0)
+    pipe = _fast(rig)
     for batch in (1, 4, 16):
-        call = partial(pipe, image.repeat(batch, 1, 1, 1))
-        yield bench.row("batch", "fast", "", (240, 320), call, batch=batch)
+        yield bench.row("batch", "fast", "", size, Call(partial(pipe, rig.image.repeat(batch, 1, 1, 1)), batch=batch))
     before = torch.get_num_threads()
     try:
         for threads in range(1, before + 1):
             torch.set_num_threads(threads)
-            for height, width in ((240, 320), (480, 640)):
-                calibration, image, _ = _rig(height, width, 1.0)
-                pipe = DepthPipeline.from_calibration(calibration, "fast")
-                yield bench.row("threads", "fast", "", (height, width), partial(pipe, image))
+            for size in ((240, 320), (480, 640)):
+                rig = _rig(*size, 1.0)
+                yield bench.row("threads", "fast", "", size, Call(partial(_fast(rig), rig.image)))
     finally:
         torch.set_num_threads(before)
 
@@ -348,140 +348,51 @@ def _scaling(bench: Bench) -> Iterator[Row]:
 
 
 def _sensor(bench: Bench, data: Path) -> Iterator[Row]:
-    """Methods fitted on every other press of a GelSight Mini, judged on the rest."""
-    background, presses = read_presses(data / "gelsight_mini_a")
+    """Methods that learned from every other press of a GelSight Mini, scored on the rest."""
+    folder, sensor = data / "gelsight_mini_a", Sensor.load("gelsight_mini")
+    background, presses = read_presses(folder)
     labelled = [press for press in presses if press.contact_radius_px is not None]
-    learn, judge = labelled[::2], labelled[1::2]
-    sensor = Sensor.load("gelsight_mini")
+    learned, scored = labelled[::2], labelled[1::2]
+    size, name, image = (sensor.height, sensor.width), "GelSight Mini, balls", scored[0].image
     bench.progress("fitting the methods to presses of a GelSight Mini")
-    training = Training(background, learn, sensor)
-    size = (sensor.height, sensor.width)
-    for method, pipe, ours, note in _sensor_pipes(training, background, sensor, data):
-        yield bench.row(
-            "sensor", method, "GelSight Mini, balls", size, partial(pipe, judge[0].image[None]), ours=ours,
-            errors=_ball_errors(pipe, judge, sensor.mm_per_pixel), note=note,
-        )  # fmt: skip
-    weights = data / "gelsight_mini_a" / "model" / "nnmodel.pth"
-    pixels, rest = gs_sdk.image_to_bgr(judge[0].image), gs_sdk.image_to_bgr(background)
+    for method, built, ours in _sensor_methods(Training(background, learned, sensor), sensor):
+        errors = _ball_errors(built.reconstruct, scored, sensor.mm_per_pixel)
+        call = Call(partial(built.reconstruct, image[None]), errors, 1, ours, built.parameters, None, built.note)
+        yield bench.row("sensor", method, name, size, call)
+    weights = folder / "model" / "nnmodel.pth"
+    pixels = gs_sdk.image_to_bgr(image)
     if find_spec("scipy") is not None:
-        peer = _GsSdkPipeline(NormalFromMLP.load(weights, background), background)
-        errors = _ball_errors(peer.as_output, judge, sensor.mm_per_pixel)
+        peer = GsSdkPipeline(NormalFromMLP.load(weights, background), background)
+        errors = _ball_errors(peer.as_output, scored, sensor.mm_per_pixel)
         note = "its network, trained on these very presses; its steps by its published format"
-        yield bench.row(
-            "sensor", "gs_sdk's pipeline", "GelSight Mini, balls", size, partial(peer, pixels), ours=False, errors=errors, note=note
-        )
-    own = _installed_gs_sdk(weights, rest, sensor.mm_per_pixel)
+        yield bench.row("sensor", GS_SDK, name, size, Call(partial(peer, pixels), errors, ours=False, note=note))
+    own = installed_gs_sdk(weights, gs_sdk.image_to_bgr(background), sensor.mm_per_pixel)
     if own is not None:
-        yield bench.row(
-            "sensor", "gs_sdk, installed", "GelSight Mini, balls", size, partial(own, pixels), ours=False, note="time only"
-        )
+        yield bench.row("sensor", "gs_sdk, installed", name, size, Call(partial(own, pixels), ours=False, note="time only"))
 
 
-def _sensor_pipes(
-    training: Training, background: Tensor, sensor: Sensor, data: Path
-) -> Iterator[tuple[str, Callable[[Tensor], Any], bool, str]]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CalibrationWarning)
-        lights = calibrate(background, dataclasses.replace(sensor.without_prior(), blur_px=1.0))
-        prior = calibrate(background, sensor)
+def _sensor_methods(training: Training, sensor: Sensor) -> Iterator[tuple[str, Built, bool]]:
+    """Name, method, and whether it is ours."""
+    background = training.background
+    lights = quiet_calibrate(background, dataclasses.replace(sensor.without_prior(), blur_px=1.0))
+    prior = quiet_calibrate(background, sensor)
     fitted = training.calibration
+    candidates = f"of {len(fitted.report['candidates'])} candidates"
     for mode in MODES:
-        numbers = fitted.report["candidates"]
-        yield f"response, {mode}", DepthPipeline.from_calibration(fitted, mode), True, f"of {len(numbers)} candidates"
-    for degree, products in ((0, -1), (2, -1)):
-        small = training.of_family(degree, products)
-        yield f"response linear {degree}, fast", DepthPipeline.from_calibration(small, "fast"), True, ""
-    yield "prior that has seen them, precise", DepthPipeline.from_calibration(prior, "precise"), True, "has seen these presses"
-    yield "point lights, precise", DepthPipeline.from_calibration(lights, "precise"), True, "from the background alone"
-    compensate = Compensate.from_calibration(fitted)
-    value, _, slope, _ = training_pixels(compensate, training.located, sensor.mm_per_pixel)
-    block = NormalFromLookup.fit(torch.ones_like(background), value - 1.0, slope)
-    yield "look-up table", DepthPipeline.from_calibration(fitted, normals=block), False, ""
+        yield f"response, {mode}", METHODS[mode].calibrated(fitted)._replace(note=candidates), True
+    for degree in (0, 2):
+        yield f"response linear {degree}, fast", METHODS["fast"].calibrated(training.of_family(degree, -1)), True
+    precise = METHODS["precise"]
+    yield "prior that has seen them, precise", precise.calibrated(prior)._replace(note="has seen these presses"), True
+    yield "point lights, precise", precise.calibrated(lights)._replace(note="from the background alone"), True
+    yield "look-up table", lookup_on(fitted, training), False
 
 
-def _ball_errors(pipe: Callable[[Tensor], Any], presses: Sequence[Press], pitch: float) -> tuple[float, float, None]:
-    scores = []
+def _ball_errors(reconstruct: Reconstruct, presses: Sequence[Press], mm_per_pixel: float) -> Errors:
     with torch.inference_mode():
-        for press in presses:
-            found = pipe(press.image[None])
-            scores.append(score_press(press, found.depth_mm, found.normal, pitch))
-    count = len(scores)
-    return sum(s.normal_deg for s in scores) / count, sum(s.relief_um for s in scores) / count, None
-
-
-# peers
-
-
-class _PoissonSciPy(nn.Module):
-    """The free border of :class:`PoissonBackground` by SciPy's cosine transform."""
-
-    def __init__(self, mm_per_pixel: float) -> None:
-        super().__init__()
-        self.mm_per_pixel = mm_per_pixel
-
-    def forward(self, gradient: Tensor) -> Tensor:
-        depth = _scipy_solve(divergence(gradient)[0, 0].numpy()) * self.mm_per_pixel
-        rest = (gradient == 0).all(dim=1)[0]
-        found = torch.from_numpy(depth)
-        return (found - found[rest].mean())[None, None]
-
-
-def _scipy_solve(right: "np.ndarray[Any, Any]") -> "np.ndarray[Any, Any]":
-    from scipy import fft
-
-    spectrum = fft.dctn(right, type=2)
-    wave = [np.cos(np.pi * np.arange(n) / n) for n in right.shape]
-    value = (2.0 * wave[0][:, None] + 2.0 * wave[1][None, :] - 4.0).astype(right.dtype)
-    value[0, 0] = 1.0
-    spectrum[0, 0] = 0.0
-    solved: np.ndarray[Any, Any] = fft.idctn(spectrum / value, type=2)
-    return solved
-
-
-class _GsSdkPipeline:
-    """A frame in the shape of gs_sdk's: its network at every pixel, SciPy's DCT in double precision, a mask by color and height.
-
-    By its published formats (network, gradients, height map) and what its documentation tells of the steps; none of its code.
-    """
-
-    def __init__(self, network: NormalFromMLP, background: Tensor) -> None:
-        self.network = network.eval()
-        self.background = gs_sdk.image_to_bgr(background).astype(np.int16)
-        with torch.inference_mode():
-            self.rest = self.network.gradient_px(background[None])
-
-    def __call__(self, pixels: "np.ndarray[Any, Any]") -> tuple[Any, Any, Any]:
-        """B, G, R uint8 (H, W, 3) to gradients (2, H, W), height map in pixels, and mask."""
-        import cv2
-
-        with torch.inference_mode():
-            gradient = (self.network.gradient_px(gs_sdk.image_from_bgr(pixels)[None]) - self.rest)[0].double()
-        height = _scipy_solve(divergence(gradient[None])[0, 0].numpy())
-        change = np.abs(pixels.astype(np.int16) - self.background).max(axis=2)
-        mask = ((change > 15) & (height < -0.2)).astype(np.uint8)
-        mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-        mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
-        return gradient.numpy(), height, mask
-
-    def as_output(self, images: Tensor) -> Any:
-        """As a pipeline would give it; the pitch cancels in gradients, the height map's is that of a GelSight Mini."""
-        gradient, height, _ = self(gs_sdk.image_to_bgr(images[0]))
-        pitch = Sensor.load("gelsight_mini").mm_per_pixel
-        slope = -torch.from_numpy(gradient)[None]
-        return _Output(-pitch * torch.from_numpy(height)[None, None], normal_from_gradient(slope))
-
-
-@dataclass(frozen=True)
-class _Output:
-    depth_mm: Tensor
-    normal: Tensor
-
-
-def _installed_gs_sdk(weights: Path, background: "np.ndarray[Any, Any]", pitch: float) -> Callable[[Any], object] | None:
-    """gs_sdk's own frame, if the user has it installed (not on PyPI: the package of that name there is another one)."""
-    try:
-        reconstructor = importlib.import_module("gs_sdk.gs_reconstruct").Reconstructor(str(weights))
-        reconstructor.load_bg(background)
-    except ImportError:
-        return None
-    return lambda pixels: reconstructor.get_surface_info(pixels, pitch)
+        found = [(press, reconstruct(press.image[None])) for press in presses]
+    scores = [score_press(press, out.depth_mm, out.normal, mm_per_pixel) for press, out in found]
+    return {
+        "normal_deg": sum(s.normal_deg for s in scores) / len(scores),
+        "rms_um": sum(s.relief_um for s in scores) / len(scores),
+    }

@@ -2,7 +2,7 @@
 
 from torch import Tensor, nn
 
-from ..core.checks import check_record, check_window
+from ..core.checks import check_batch, check_record, check_window
 
 
 class Integrator(nn.Module):
@@ -47,6 +47,7 @@ def embedded(gradient: Tensor, window: tuple[int, int] | None, size: tuple[int, 
     """The gradient of a window embedded in the whole image (B, 2, H, W), zero elsewhere."""
     if size is None:
         return gradient
+    check_batch("gradient", gradient, 2)
     rows, columns = gradient.shape[2], gradient.shape[3]
     top, left = check_window("gradient", gradient, size, window)
     if rows == size[0] and columns == size[1]:

@@ -1,6 +1,6 @@
-"""What gs_sdk writes and reads: calibration folders, sensor files, height maps, gradients, images.
+"""Read and write the formats of gs_sdk: calibration folders, sensor files, height maps, gradients, images.
 
-Only the formats are known here, none of gs_sdk's code. Convention of gs_sdk: images are B, G, R uint8 (H, W, 3); the height
+Only the formats are used, none of gs_sdk's code. Convention of gs_sdk: images are B, G, R uint8 (H, W, 3); the height
 map is H = -z / mm_per_pixel, so pixels, negative where the skin is pressed in; gradients are d(H)/dx and d(H)/dy per pixel.
 """
 
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ..core.checks import brief, check_batch, check_path, check_positive, check_tensor
 from ..core.files import read_image, rgb_from_bgr
-from .sensor import Sensor, _read_yaml
+from .sensor import Sensor, read_yaml
 
 CATALOG_COLUMNS = ("experiment_reldir", "diameter(mm)")
 LABEL_COLUMNS = ("experiment_reldir", "diameter_mm", "center_x_px", "center_y_px", "contact_radius_px")
@@ -29,7 +29,7 @@ SENSOR_KEYS_UNUSED = ("raw_imgh", "raw_imgw", "framerate", "device_name")
 
 
 MOST_TABLE_BYTES = 2**24
-"""A table of presses has some kilobytes."""
+"""Limit for tables of presses, which have some kilobytes."""
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,11 @@ class GsSdkPress:
     """One ball pressed on the sensor.
 
     Args:
-        name: its ``experiment_reldir`` in the catalog.
-        image_path: its ``gelsight.png``.
+        name: ``experiment_reldir`` in the catalog.
+        image_path: path of ``gelsight.png``.
         ball_diameter_mm: mm.
-        height, width: pixels of the background, which the image must have too.
+        height: rows of the background, which the image must have too.
+        width: columns of the background, which the image must have too.
         center_px: (x, y) of the ball in pixels, from ``label.npz``; None without that file.
         radius_px: radius of the contact in pixels, from ``label.npz``; None without that file.
     """
@@ -57,7 +58,8 @@ class GsSdkPress:
         """Read the image: (3, H, W) in [0, 1], R, G, B.
 
         Raises:
-            FileNotFoundError: it has gone. ValueError: not an image, cut short, or of another size than the background.
+            FileNotFoundError: the file does not exist any more.
+            ValueError: not an image, cut short, or of another size than the background.
         """
         image = read_image(self.image_path)
         _check_size(self.image_path, image.shape[1], image.shape[2], self.height, self.width)
@@ -66,14 +68,19 @@ class GsSdkPress:
 
 @dataclass(frozen=True, eq=False)
 class GsSdkFolder:
-    """A calibration folder of gs_sdk: ``background`` (3, H, W) in [0, 1], R, G, B; ``presses`` in the catalog's order."""
+    """A calibration folder of gs_sdk.
+
+    Attributes:
+        background: (3, H, W) in [0, 1], R, G, B.
+        presses: in the catalog's order.
+    """
 
     background: Tensor
     presses: tuple[GsSdkPress, ...]
 
 
 def read_calibration_folder(folder: str | Path) -> GsSdkFolder:
-    """Read a calibration folder as gs_sdk collects it. The images of the presses are read when asked for.
+    """Read a calibration folder in gs_sdk's layout. Images of presses are read by :meth:`GsSdkPress.image`.
 
     The layout: ``catalog.csv`` with the columns ``experiment_reldir,diameter(mm)``, ``background.png``, and for every row
     ``<experiment_reldir>/gelsight.png`` and, once labelled, ``<experiment_reldir>/label.npz`` with ``center`` (x, y) and
@@ -137,7 +144,8 @@ def read_labels(folder: str | Path) -> dict[str, tuple[float, float, float | Non
     Returns:
         {experiment_reldir: (x, y, radius or None)}, pixels.
     Raises:
-        FileNotFoundError: no such file. ValueError: empty, other columns, a bad number, a press named twice.
+        FileNotFoundError: no such file.
+        ValueError: empty, other columns, a bad number, a press named twice.
     """
     path = check_path("folder", folder) / "labels.csv"
     if not path.is_file():
@@ -157,19 +165,20 @@ def read_labels(folder: str | Path) -> dict[str, tuple[float, float, float | Non
 
 
 def sensor_from_gs_sdk(config: dict[str, Any] | str | Path, name: str | None = None) -> Sensor:
-    """Make a :class:`Sensor` of gs_sdk's sensor file.
+    """Make a :class:`Sensor` from gs_sdk's sensor file.
 
     ``ppmm`` is the pitch in **mm per pixel**, despite its name; ``imgh`` and ``imgw`` are the size of the image worked on.
-    ``raw_imgh``, ``raw_imgw``, ``framerate`` and ``device_name`` are accepted and left out.
+    ``raw_imgh``, ``raw_imgw``, ``framerate`` and ``device_name`` are accepted and ignored.
 
     Args:
         config: the mapping, or the path of the YAML file.
-        name: of the sensor; None takes the name of the file, or "gs_sdk".
+        name: of the sensor; None uses the name of the file, or "gs_sdk".
     Returns:
         The sensor, without blur, response 1 and unknown lights.
     Raises:
-        FileNotFoundError: no such file. TypeError: neither mapping nor path. ValueError: not YAML, an unknown or a missing
-            key, a bad value.
+        FileNotFoundError: no such file.
+        TypeError: neither mapping nor path.
+        ValueError: not YAML, an unknown or a missing key, a bad value.
     Example:
         >>> sensor_from_gs_sdk({"ppmm": 0.0634, "imgh": 240, "imgw": 320}, name="mini").mm_per_pixel
         0.0634
@@ -181,7 +190,7 @@ def sensor_from_gs_sdk(config: dict[str, Any] | str | Path, name: str | None = N
         source = str(path)
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such sensor file")
-        values, name = _read_yaml(path), name or path.stem
+        values, name = read_yaml(path), name or path.stem
     if not isinstance(values, dict):
         if source == "config":
             raise TypeError(f"config: expected a mapping or the path of a YAML file, got {type(values).__name__}")
@@ -203,7 +212,7 @@ def sensor_from_gs_sdk(config: dict[str, Any] | str | Path, name: str | None = N
 
 
 def depth_from_height_map(height_map_px: Tensor | np.ndarray[Any, Any], mm_per_pixel: float) -> Tensor:
-    """Depth of gs_sdk's height map: z = -H * mm_per_pixel.
+    """Depth from gs_sdk's height map: z = -H * mm_per_pixel.
 
     Args:
         height_map_px: (H, W), pixels, negative where the skin is pressed in; floating point.
@@ -211,7 +220,8 @@ def depth_from_height_map(height_map_px: Tensor | np.ndarray[Any, Any], mm_per_p
     Returns:
         (1, 1, H, W), mm, positive where the skin is pressed in; float32 or float64 as given.
     Raises:
-        ValueError: wrong shape or pitch. TypeError: not floating point.
+        ValueError: wrong shape or pitch.
+        TypeError: not floating point.
     Example:
         >>> depth_from_height_map(np.full((2, 2), -20.0), 0.05)[0, 0, 0]
         tensor([1., 1.], dtype=torch.float64)
@@ -221,7 +231,7 @@ def depth_from_height_map(height_map_px: Tensor | np.ndarray[Any, Any], mm_per_p
 
 
 def height_map_from_depth(depth_mm: Tensor, mm_per_pixel: float) -> np.ndarray[Any, Any]:
-    """gs_sdk's height map of a depth: H = -z / mm_per_pixel; the inverse of :func:`depth_from_height_map`.
+    """gs_sdk's height map from a depth: H = -z / mm_per_pixel; the inverse of :func:`depth_from_height_map`.
 
     Args:
         depth_mm: (1, 1, H, W), mm.
@@ -229,7 +239,8 @@ def height_map_from_depth(depth_mm: Tensor, mm_per_pixel: float) -> np.ndarray[A
     Returns:
         numpy, (H, W), pixels.
     Raises:
-        ValueError: more than one frame, or wrong pitch. TypeError: not floating point.
+        ValueError: more than one frame, or wrong pitch.
+        TypeError: not floating point.
     """
     pitch = check_positive("mm_per_pixel", mm_per_pixel)
     frame = _frame("depth_mm", depth_mm, 1)[0]
@@ -240,11 +251,13 @@ def gradient_from_gs_sdk(gx: Tensor | np.ndarray[Any, Any], gy: Tensor | np.ndar
     """Gradient of depth from gs_sdk's gradients of the height map: dz/dx = -d(H)/dx, since pixels cancel.
 
     Args:
-        gx, gy: (H, W), d(H)/dx and d(H)/dy, pixels per pixel.
+        gx: (H, W), d(H)/dx, pixels per pixel.
+        gy: (H, W), d(H)/dy, pixels per pixel.
     Returns:
         (1, 2, H, W), (dz/dx, dz/dy), mm per mm.
     Raises:
-        ValueError: wrong shape, or the two differ in it. TypeError: not floating point.
+        ValueError: wrong shape, or two different shapes.
+        TypeError: not floating point.
     Example:
         >>> gradient_from_gs_sdk(np.full((1, 1), 0.5), np.zeros((1, 1))).flatten()
         tensor([-0.5000,  0.0000], dtype=torch.float64)
@@ -256,24 +269,30 @@ def gradient_from_gs_sdk(gx: Tensor | np.ndarray[Any, Any], gy: Tensor | np.ndar
 
 
 def gradient_to_gs_sdk(gradient: Tensor) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """gs_sdk's gradients (d(H)/dx, d(H)/dy), numpy (H, W) each; the inverse of :func:`gradient_from_gs_sdk`.
+    """gs_sdk's gradients from a gradient of depth; the inverse of :func:`gradient_from_gs_sdk`.
 
     Args:
         gradient: (1, 2, H, W), (dz/dx, dz/dy), mm per mm.
+    Returns:
+        d(H)/dx and d(H)/dy, numpy, (H, W) each, pixels per pixel.
     Raises:
-        ValueError: wrong shape, or more than one frame. TypeError: not floating point.
+        ValueError: wrong shape, or more than one frame.
+        TypeError: not floating point.
     """
     turned = 0.0 - _frame("gradient", gradient, 2)
     return np.asarray(turned[0].numpy()), np.asarray(turned[1].numpy())
 
 
 def image_from_bgr(pixels: np.ndarray[Any, Any]) -> Tensor:
-    """gs_sdk's and OpenCV's image, (H, W, 3) **B, G, R** uint8, as (3, H, W) **R, G, B** float32 in [0, 1].
+    """Convert an image of gs_sdk or OpenCV.
 
     Args:
-        pixels: (H, W, 3), uint8.
+        pixels: (H, W, 3) uint8, **B, G, R**.
+    Returns:
+        (3, H, W) float32 in [0, 1], **R, G, B**.
     Raises:
-        TypeError: not a uint8 array. ValueError: wrong shape.
+        TypeError: not a uint8 array.
+        ValueError: wrong shape.
     Example:
         >>> image_from_bgr(np.array([[[0, 51, 255]]], dtype=np.uint8)).flatten()
         tensor([1.0000, 0.2000, 0.0000])
@@ -288,12 +307,15 @@ def image_from_bgr(pixels: np.ndarray[Any, Any]) -> Tensor:
 
 
 def image_to_bgr(image: Tensor) -> np.ndarray[Any, Any]:
-    """(3, H, W) **R, G, B** in [0, 1] as gs_sdk's and OpenCV's (H, W, 3) **B, G, R** uint8, rounded and cut to 0-255.
+    """Convert an image for gs_sdk or OpenCV.
 
     Args:
-        image: (3, H, W), floating point.
+        image: (3, H, W), floating point in [0, 1], **R, G, B**.
+    Returns:
+        (H, W, 3) uint8, **B, G, R**, rounded and clamped to 0-255.
     Raises:
-        ValueError: wrong shape or not finite. TypeError: not floating point.
+        ValueError: wrong shape or not finite.
+        TypeError: not floating point.
     """
     check_tensor("image", image)
     if image.dim() != 3:
@@ -325,7 +347,7 @@ def _frame(name: str, tensor: Tensor, channels: int) -> Tensor:
 
 
 def _read_table(path: Path, columns: tuple[str, ...]) -> list[tuple[int, dict[str, str]]]:
-    """Rows of a CSV file with exactly these columns, each with its line number; blank lines are left out."""
+    """Rows of a CSV file with exactly these columns, each with its line number; empty lines are skipped."""
     if path.stat().st_size > MOST_TABLE_BYTES:
         raise ValueError(
             f"{path}: expected a table of at most {MOST_TABLE_BYTES} bytes, got {path.stat().st_size}: not a CSV table"
@@ -363,7 +385,7 @@ def _number(where: str, column: str, text: str) -> float:
 
 
 def _inside(folder: Path, name: str, where: str) -> Path:
-    """``folder / name``, or raise when that lies outside of the folder: a catalog from elsewhere may name any file."""
+    """``folder / name``, or raise if that is outside of the folder: a foreign catalog may name any file."""
     if "\0" in name:
         raise ValueError(f"{where}: experiment_reldir: expected a folder inside {folder}, got {brief(name)}")
     root = folder.resolve()
@@ -374,7 +396,7 @@ def _inside(folder: Path, name: str, where: str) -> Path:
 
 
 def _png_size(path: Path) -> tuple[int, int] | None:
-    """(height, width) in the head of a PNG file; None for anything else, which reading it will judge."""
+    """(height, width) from the header of a PNG file; None for anything else, which is checked when it is read."""
     with path.open("rb") as stream:
         head = stream.read(24)
     if len(head) < 24 or head[:8] != b"\x89PNG\r\n\x1a\n":

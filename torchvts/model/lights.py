@@ -1,4 +1,4 @@
-"""The forward model: what a camera sees of a shaded skin under one near point light per colour channel."""
+"""The forward model: image of a skin under one near point light per colour channel, and its inverse at known depth."""
 
 import math
 
@@ -15,8 +15,7 @@ class PointLights(nn.Module):
     Args:
         position_mm: (3, 3), rows R, G, B; columns x right, y down, z towards the camera, from the image centre.
         albedo: (3,), skin albedo times light power per channel, in image value times mm^2.
-        gloss: (3,), strength of a broad specular lobe per channel (:func:`gloss_lobe`), or None for a matt skin, as in the
-            paper.
+        gloss: (3,), strength of a broad specular lobe per channel (:func:`gloss_lobe`); None for a matt skin, as in the paper.
     Raises:
         ValueError: wrong shape, values not finite, albedo not positive, gloss negative, or a light not above the skin
             (z <= 0).
@@ -90,7 +89,7 @@ def _numbers(name: str, values: object) -> Tensor:
 def near_field_shading(
     depth_mm: Tensor, normal: Tensor, lights: PointLights, mm_per_pixel: float, camera_height_mm: float = math.inf
 ) -> Tensor:
-    """Image of a skin under near point lights; attached shadows clamp at zero.
+    """Image of a skin under near point lights; attached shadows are clamped to zero.
 
     ``I^j = max(0, rho^j (S^j - P) . n / |S^j - P|^3)`` at P = (x, y, depth), where x and y are the pixel's (:func:`seen_at`).
 
@@ -98,12 +97,13 @@ def near_field_shading(
         depth_mm: (B, 1, H, W), positive towards the camera.
         normal: (B, 3, H, W), unit, n_z > 0.
         lights: the three lights.
-        mm_per_pixel: pixel pitch, mm, on the skin at rest.
+        mm_per_pixel: pixel pitch on the undeformed skin, mm.
         camera_height_mm: of a pinhole camera above the image centre; infinite for an orthographic camera.
     Returns:
         Linear light, (B, 3, H, W), channels R, G, B; not clamped at 1. Differentiable in every input.
     Raises:
-        ValueError: wrong shapes. TypeError: not floating point.
+        ValueError: wrong shapes.
+        TypeError: not floating point.
     Source:
         eq. 1-2 of the paper.
     Example:
@@ -118,20 +118,22 @@ def near_field_shading(
 
 
 def cast_shadows(depth_mm: Tensor, lights: PointLights, mm_per_pixel: float) -> Tensor:
-    """Which pixels each light reaches past the relief that stands in its way: 1 where it does, 0 in a cast shadow.
+    """Find cast shadows: 1 where a light reaches a pixel, 0 where the relief blocks it.
 
-    From every pixel a ray goes to the light in steps of one pixel, until it is above all relief; where the depth map, between
-    pixels bilinear, is above the ray by more than a twentieth of a pixel, the light is blocked. Beyond the image the skin is
-    at rest. Attached shadows are the clamp of :func:`near_field_shading`, not found here.
+    From every pixel a ray goes to the light in steps of one pixel, until it is above all relief. Where the depth map (bilinear
+    between pixels) is above the ray by more than a twentieth of a pixel, the light is blocked. Beyond the image the skin is
+    undeformed. Attached shadows are not included: :func:`near_field_shading` clamps them.
 
     Args:
-        depth_mm: (B, 1, H, W), positive towards the camera. lights: the three lights. mm_per_pixel: pixel pitch, mm.
+        depth_mm: (B, 1, H, W), positive towards the camera.
+        lights: the three lights.
+        mm_per_pixel: pixel pitch, mm.
     Returns:
-        (B, 3, H, W), a factor on the image of each light. Not differentiable: its edges are sharp.
+        (B, 3, H, W), a factor for the image of each light. Not differentiable, because its edges are sharp.
     Example:
         >>> wall = torch.zeros(1, 1, 8, 16); wall[..., 8] = 2.0
         >>> lights = PointLights([[40, 0, 20], [-40, 0, 20], [0, 40, 20]], [900, 900, 900])
-        >>> cast_shadows(wall, lights, 0.5)[0, :, 4].int()[:, 4:12]  # to the left of the wall no light from the right
+        >>> cast_shadows(wall, lights, 0.5)[0, :, 4].int()[:, 4:12]  # no light from the right to the left of the wall
         tensor([[0, 0, 0, 0, 1, 1, 1, 1],
                 [1, 1, 1, 1, 1, 0, 0, 0],
                 [1, 1, 1, 1, 1, 1, 1, 1]], dtype=torch.int32)
@@ -162,7 +164,7 @@ def cast_shadows(depth_mm: Tensor, lights: PointLights, mm_per_pixel: float) -> 
 
 
 def flat_image(lights: PointLights, height: int, width: int, mm_per_pixel: float) -> Tensor:
-    """What the model sees of the skin at rest: (3, H, W), linear light."""
+    """Image of the undeformed skin: (3, H, W), linear light."""
     reference = lights.position_mm
     depth_mm = torch.zeros(1, 1, height, width, dtype=reference.dtype, device=reference.device)
     flat = torch.zeros(1, 3, 1, 1, dtype=reference.dtype, device=reference.device)
@@ -170,19 +172,21 @@ def flat_image(lights: PointLights, height: int, width: int, mm_per_pixel: float
     return near_field_shading(depth_mm, flat.expand(1, 3, height, width), lights, mm_per_pixel)[0]
 
 
-def seen_at(at_rest_mm: Tensor, depth_mm: Tensor, camera_height_mm: float, axis_mm: float = 0.0) -> Tensor:
-    """x or y of what a pixel sees, from where it sees the skin at rest: a pinhole at height h sees X = u (h - z) / h.
+def seen_at(undeformed_mm: Tensor, depth_mm: Tensor, camera_height_mm: float, axis_mm: float = 0.0) -> Tensor:
+    """x or y of the point that a pixel sees. A pinhole camera at height h sees X = u (h - z) / h.
 
     Args:
-        at_rest_mm: u, broadcast against depth_mm. camera_height_mm: h; infinite for an orthographic camera, X = u.
-        axis_mm: where the camera stands, if not at 0.
+        undeformed_mm: u, x or y of the point of the undeformed skin that the pixel sees; broadcast against depth_mm.
+        depth_mm: z.
+        camera_height_mm: h; infinite for an orthographic camera, X = u.
+        axis_mm: position of the camera, if not at 0.
     Example:
         >>> seen_at(torch.tensor([-10.0, 10.0]), torch.tensor(2.0), 20.0)
         tensor([-9.,  9.])
     """
     if math.isinf(camera_height_mm):
-        return at_rest_mm
-    return at_rest_mm - (at_rest_mm - axis_mm) * (depth_mm / camera_height_mm)
+        return undeformed_mm
+    return undeformed_mm - (undeformed_mm - axis_mm) * (depth_mm / camera_height_mm)
 
 
 def light_matrix(
@@ -197,8 +201,11 @@ def light_matrix(
 
     Args:
         depth_mm: (B, 1, H, W), mm.
-        position_mm: (3, 3), mm. albedo: (3,).
-        mm_per_pixel: pixel pitch, mm. camera_height_mm, axis_mm: as :func:`seen_at` takes them, the latter's x and y.
+        position_mm: (3, 3), mm.
+        albedo: (3,).
+        mm_per_pixel: pixel pitch, mm.
+        camera_height_mm: as for :func:`seen_at`.
+        axis_mm: x and y of the camera, as for :func:`seen_at`.
     Returns:
         (B, 3, 3, H, W): light, axis, row, column.
     Source:
@@ -225,10 +232,11 @@ GLOSS_ROUGHNESS = 0.6
 
 
 def gloss_lobe(matrix: Tensor, normal: Tensor) -> Tensor:
-    """What a rough specular lobe adds to matt shading, relative to it, at unit gloss; the camera looks along z.
+    """Rough specular lobe relative to matt shading, at unit gloss; the camera looks along z.
 
     Args:
-        matrix: (B, 3, 3, H, W), light matrix, or anything whose rows point to the lights. normal: (B, 3, H, W), unit.
+        matrix: (B, 3, 3, H, W), light matrix, or anything whose rows point to the lights.
+        normal: (B, 3, H, W), unit.
     Returns:
         (B, 3, H, W), D V of the microfacet model, at least 0.
     Source:
@@ -264,8 +272,11 @@ def inverse_light_matrix(
 
     Args:
         depth_mm: (B, 1, H, W), mm.
-        position_mm: (3, 3), mm. albedo: (3,).
-        mm_per_pixel: pixel pitch, mm. camera_height_mm, axis_mm: as :func:`light_matrix` takes them.
+        position_mm: (3, 3), mm.
+        albedo: (3,).
+        mm_per_pixel: pixel pitch, mm.
+        camera_height_mm: as for :func:`light_matrix`.
+        axis_mm: as for :func:`light_matrix`.
     Returns:
         (B, 3, 3, H, W): normal axis, light, row, column.
     Source:
@@ -304,13 +315,19 @@ def normal_at_depth(
 ) -> Tensor:
     r"""Unit normals along L^-1 I at a known depth, without the inverse: a third of its operations.
 
-    The columns of L^-1 (:func:`inverse_light_matrix`) share the determinant, whose sign is all that a direction needs of it. With
+    The columns of L^-1 (:func:`inverse_light_matrix`) share the determinant, of which a direction needs the sign only. With
     t_j = I^j |a_j|^3 / rho^j the rest is sum_j t_j S^k x S^l - P x sum_j t_j (S^l - S^k), j, k, l cyclic.
 
     Args:
-        image: (B, 3, H, W), linear light. The others as :func:`inverse_light_matrix` takes them.
+        image: (B, 3, H, W), linear light.
+        depth_mm: (B, 1, H, W), mm.
+        position_mm: as for :func:`inverse_light_matrix`.
+        albedo: as for :func:`inverse_light_matrix`.
+        mm_per_pixel: pixel pitch, mm.
+        camera_height_mm: as for :func:`light_matrix`.
+        axis_mm: as for :func:`light_matrix`.
     Returns:
-        (B, 3, H, W); zero where the image is.
+        (B, 3, H, W); zero where the image is zero.
     Source:
         eq. 10 of the paper.
     """

@@ -1,7 +1,7 @@
-r"""Printed markers: dark dots on the skin are found in every frame, for they move with it, and filled from around them.
+r"""Printed markers: dark dots that move with the skin are found in every frame and filled from around them.
 
-A marker takes light from all three lights at once; a slope takes it from one and gives it to another. So a marker is what
-is darker than its surroundings on both sides, in every direction and in every channel.
+A marker is dark under all three lights at once; a slope is darker under one and brighter under another. So a marker is darker
+than its surroundings on both sides, in every direction and in every channel.
 """
 
 import math
@@ -14,23 +14,24 @@ from ..core.noise import noise_std
 
 
 def find_markers(
-    image: Tensor, diameter_px: float = 9.0, contrast: float = 0.06, sigmas: float = 5.0, skirt: float = 0.2
+    image: Tensor, diameter_px: float = 9.0, contrast: float = 0.06, sigmas: float = 5.0, margin: float = 0.2
 ) -> Tensor:
-    r"""Pixels of printed markers: small, roundish, darker than their surroundings in all channels.
+    r"""Find the pixels of printed markers: small, roundish, darker than their surroundings in all channels. Scripts.
 
-    Over log light, the mean of the two pixels ``diameter_px`` away on either side, less the pixel itself: a ramp cancels,
-    however steep. The smallest of it over four directions (a line or rim is no darker than what follows along it) is a
-    channel's depth; a step, dark on one side only, is none. A marker is where the least of the three channels (shading darkens
-    some, not all) reaches ``contrast`` and ``sigmas`` times the frame's noise. In a frame that has some, a contact's shading
-    may hide one in one channel; then the mean of the channels decides, with at least twice that depth and 0.4 of what is usual
-    in the frame. What is near and darker than a first filling is the marker, grown by ``skirt``. Scripts.
+    On log light, take the mean of the two pixels ``diameter_px`` away on either side, minus the pixel itself: a ramp cancels,
+    however steep. The smallest value over four directions is a channel's marker depth, because a line or rim is not darker than
+    what follows along it; a step, which is dark on one side only, has none. A marker is where the least of the three channels
+    reaches ``contrast`` and ``sigmas`` times the noise of the frame (shading darkens some channels, not all). The shading of a
+    contact may hide a marker in one channel. In a frame with other markers the mean of the channels then decides, with at least
+    twice that depth and 0.4 of the frame's usual depth. Pixels nearby that are darker than a first filling belong to the marker,
+    and the mask grows by ``margin``.
 
     Args:
         image: (B, 3, H, W) in [0, 1], camera values or linear light.
-        diameter_px: longest extent of a marker at half its depth; a third more or less does little harm.
+        diameter_px: longest extent of a marker at half its depth; an error of a third has little effect.
         contrast: least depth of a marker, as the logarithm of value; 0.06 is 6 % darker than around.
         sigmas: the same, in units of the noise of the logarithm of value.
-        skirt: how far the mask reaches beyond what is seen dark, in diameters. On a 427 x 320 sensor with a sharpening
+        margin: how far the mask reaches beyond the dark pixels, in diameters. On a 427 x 320 sensor with a sharpening
             camera 0.2, 0.3, 0.4 mark 30, 39, 51 % of the image and leave 21, 11, 4 % of the dots' pattern in the depth.
     Returns:
         (B, 1, H, W) bool; empty where there are none.
@@ -48,7 +49,7 @@ def find_markers(
     check_batch("image", image, 3)
     if not torch.jit.is_scripting():
         check_positive("diameter_px", diameter_px), check_positive("contrast", contrast)
-        check_positive("sigmas", sigmas), check_positive("skirt", skirt, 2.0)
+        check_positive("sigmas", sigmas), check_positive("margin", margin, 2.0)
     cell = max(1, int(diameter_px / 8.0))
     diameter = diameter_px / cell
     light = _log_light(image.detach(), cell)
@@ -61,29 +62,30 @@ def find_markers(
     half = max(1, int(0.5 * diameter + 0.5))
     core = (candidate > 0) & (candidate > 0.5 * _square_max(candidate, half))
     near = _octagon_max(core.to(mean.dtype), max(2, int(0.35 * diameter + 0.5))) > 0.5
-    # what is darker than a first filling of all that is near
+    # nearby pixels that are darker than a first filling
     grey = light.mean(dim=1, keepdim=True)
     drop = torch.where(near, fill_markers(grey, near, 2) - grey, torch.zeros_like(grey))
     mask = near & (drop > 0.2 * _square_max(drop, half))
-    seen = mask.to(mean.dtype)
+    grown = mask.to(mean.dtype)
     if cell > 1:
-        seen = nn.functional.interpolate(seen, scale_factor=float(cell), mode="nearest")
-    # lenses and sharpening leave a bright edge around a marker: it goes too
-    return _octagon_max(seen[:, :, : image.shape[2], : image.shape[3]], max(1, int(skirt * diameter_px + 0.5))) > 0.5
+        grown = nn.functional.interpolate(grown, scale_factor=float(cell), mode="nearest")
+    # lenses and sharpening leave a bright edge around a marker: include it
+    return _octagon_max(grown[:, :, : image.shape[2], : image.shape[3]], max(1, int(margin * diameter_px + 0.5))) > 0.5
 
 
 def fill_markers(image: Tensor, mask: Tensor, relaxations: int = 4) -> Tensor:
-    r"""Fill the pixels of ``mask`` smoothly from around them; all others keep their value.
+    r"""Fill the pixels of ``mask`` smoothly from around them; all others keep their value. Scripts.
 
-    Pull-push: means of the unmarked pixels on ever coarser grids, until no hole is left, then back to finer ones, where
-    each hole takes the coarser value and relaxes towards the membrane (Laplace) through its rim. Differentiable in the
-    unmarked pixels. Scripts.
+    Pull-push: means of the unmarked pixels on coarser and coarser grids until no hole is left, then back to finer grids, where
+    each hole takes the coarser value and relaxes towards the membrane (Laplace) through its rim. Differentiable in the unmarked
+    pixels.
 
     Args:
-        image: (B, C, H, W). mask: (B, 1, H, W) bool.
+        image: (B, C, H, W).
+        mask: (B, 1, H, W) bool.
         relaxations: per grid; 4 leave about 3 % of a ramp's rise across a marker.
     Returns:
-        (B, C, H, W); an image marked all over becomes zero.
+        (B, C, H, W); an image that is all mask becomes zero.
     Raises:
         ValueError: shapes that do not match.
     Source:
@@ -125,7 +127,13 @@ def fill_markers(image: Tensor, mask: Tensor, relaxations: int = 4) -> Tensor:
 class FillMarkers(nn.Module):
     """:func:`find_markers`, then :func:`fill_markers`; first in the chain, before the compensation.
 
-    With ``diameter_px`` 0 images pass as they are: what :meth:`from_background` gives for a skin without markers.
+    With ``diameter_px`` 0, which :meth:`from_background` sets for a skin without markers, images are unchanged.
+
+    Args:
+        diameter_px: as for :func:`find_markers`, or 0.
+        contrast: as for :func:`find_markers`.
+        sigmas: as for :func:`find_markers`.
+        margin: as for :func:`find_markers`.
 
     Example:
         >>> image = torch.full((1, 3, 64, 64), 0.5); image[..., 20:26, 30:36] = 0.2
@@ -133,65 +141,74 @@ class FillMarkers(nn.Module):
         True
     """
 
-    def __init__(self, diameter_px: float = 9.0, contrast: float = 0.06, sigmas: float = 5.0, skirt: float = 0.2) -> None:
+    def __init__(self, diameter_px: float = 9.0, contrast: float = 0.06, sigmas: float = 5.0, margin: float = 0.2) -> None:
         super().__init__()
         self.diameter_px = 0.0 if diameter_px == 0 else check_positive("diameter_px", diameter_px)
         self.contrast = check_positive("contrast", contrast)
         self.sigmas = check_positive("sigmas", sigmas)
-        self.skirt = check_positive("skirt", skirt, 2.0)
+        self.margin = check_positive("margin", margin, 2.0)
 
     @classmethod
     def from_background(
-        cls, background: Tensor, contrast: float = 0.06, least_markers: int = 8, skirt: float = 0.2
+        cls, background: Tensor, contrast: float = 0.06, least_markers: int = 8, margin: float = 0.2
     ) -> "FillMarkers":
-        """The block for the sensor whose image without contact is ``background``, (3, H, W).
+        """Make the block for a unit.
 
-        ``diameter_px`` by :func:`marker_diameter_px`; the least contrast, at least ``contrast``, is a fifth of that of all
-        but the faintest twentieth of the markers. Fewer than ``least_markers`` are taken for dust: nothing is filled.
+        ``diameter_px`` comes from :func:`marker_diameter_px`. The contrast is a fifth of that of the markers, without the
+        faintest twentieth of them, and at least ``contrast``.
+
+        Args:
+            background: (3, H, W), image without contact.
+            contrast: least depth of a marker.
+            least_markers: fewer are taken for dust, and nothing is filled.
+            margin: as for :func:`find_markers`.
         """
-        check_positive("skirt", skirt, 2.0)
+        check_positive("margin", margin, 2.0)
         diameter_px, found = marker_diameter_px(background, contrast, least_markers)
-        return cls(diameter_px, max(contrast, found / 5.0), skirt=skirt)
+        return cls(diameter_px, max(contrast, found / 5.0), margin=margin)
 
     def forward(self, image: Tensor) -> Tensor:
         """(B, 3, H, W) to (B, 3, H, W)."""
         check_batch("image", image, 3)
         if self.diameter_px == 0.0:
             return image
-        return fill_markers(image, find_markers(image, self.diameter_px, self.contrast, self.sigmas, self.skirt))
+        return fill_markers(image, find_markers(image, self.diameter_px, self.contrast, self.sigmas, self.margin))
 
     def to_dict(self) -> dict[str, float]:
         """Plain numbers; :meth:`from_dict` reads them back."""
-        return {name: getattr(self, name) for name in ("diameter_px", "contrast", "sigmas", "skirt")}
+        return {name: getattr(self, name) for name in ("diameter_px", "contrast", "sigmas", "margin")}
 
     @classmethod
     def from_dict(cls, values: object, source: str) -> "FillMarkers":
-        """Build the block from what :meth:`to_dict` gave; ``source`` names it in errors."""
+        """Make the block from the output of :meth:`to_dict`; ``source`` names it in errors."""
         if not isinstance(values, dict):
             raise ValueError(f"{source}: expected keys and values, got {type(values).__name__}")
         for key in values:
-            if key not in ("diameter_px", "contrast", "sigmas", "skirt"):
-                raise ValueError(f"{source}: key {brief(key)}: unknown; expected diameter_px, contrast, sigmas, skirt")
+            if key not in ("diameter_px", "contrast", "sigmas", "margin"):
+                raise ValueError(f"{source}: key {brief(key)}: unknown; expected diameter_px, contrast, sigmas, margin")
         try:
             return cls(**values)
         except (TypeError, ValueError) as error:
             raise ValueError(f"{source}: {error}") from error
 
     def extra_repr(self) -> str:
-        return f"diameter_px={self.diameter_px:.3g}, contrast={self.contrast:.3g}, sigmas={self.sigmas:.3g}, skirt={self.skirt:.3g}"
+        return (
+            f"diameter_px={self.diameter_px:.3g}, contrast={self.contrast:.3g}, sigmas={self.sigmas:.3g}, margin={self.margin:.3g}"
+        )
 
 
 def marker_diameter_px(background: Tensor, contrast: float = 0.06, least_markers: int = 8) -> tuple[float, float]:
-    """How large and how dark the markers of a skin are: longest extent in pixels, and depth as the logarithm of value.
+    """Size and contrast of the markers of a skin.
 
-    The reach at which the most is found dark shows the markers at their fullest; of their bounding boxes the 90th percentile
-    of the longer side is the diameter, of their depths the 5th percentile the contrast.
+    The reach at which most is found dark shows the markers completely. The 90th percentile of the longer sides of their bounding
+    boxes is the diameter, the 5th percentile of their depths the contrast.
 
     Args:
         background: (3, H, W) in [0, 1], without contact.
-        contrast: least depth of a marker. least_markers: fewer are none.
+        contrast: least depth of a marker, as the logarithm of value.
+        least_markers: fewer count as none.
     Returns:
-        diameter_px, contrast; both 0 if there are no markers.
+        diameter_px and contrast (logarithm of value); both 0 if there are no markers.
     Example:
         >>> marker_diameter_px(torch.full((3, 64, 64), 0.5))
         (0.0, 0.0)
@@ -204,12 +221,12 @@ def marker_diameter_px(background: Tensor, contrast: float = 0.06, least_markers
     while reach < min(background.shape[1:]) / 8.0:
         depth, _, least = _marker_depth(light, reach, contrast, 5.0)
         found = float(torch.where(depth > least, depth, 0.0).sum())
-        if found > 1.1 * best:  # a longer reach has to be worth it: neighbours come into it
+        if found > 1.1 * best:  # a longer reach must find clearly more, because it includes neighbours
             diameter, best = reach, found
         reach *= 1.15
     if diameter == 0.0:
         return 0.0, 0.0
-    for _ in range(2):  # the reach is the diameter, so once more with what was measured
+    for _ in range(2):  # the reach is the diameter, so repeat with the measured one
         strict, mean, least = _marker_depth(light, diameter, contrast, 5.0)
         peak = _square_max(torch.where(strict > least, mean, 0.0), max(1, math.ceil(0.5 * diameter)))
         side, depth = _blobs(((peak > 0) & (mean > 0.5 * peak))[0, 0], mean[0, 0])
@@ -225,12 +242,16 @@ def _log_light(image: Tensor, cell: int) -> Tensor:
         image = nn.functional.avg_pool2d(image, cell, ceil_mode=True)
     else:
         image = nn.functional.avg_pool2d(nn.functional.pad(image, [1, 1, 1, 1], mode="replicate"), 3, 1)
-    return torch.log(image.clamp_min(0.0) + 0.03)  # a pedestal: the dark corners of an image are all noise
+    return torch.log(image.clamp_min(0.0) + 0.03)  # a pedestal, because the dark corners of an image are all noise
 
 
 def _marker_depth(light: Tensor, diameter: float, contrast: float, sigmas: float) -> tuple[Tensor, Tensor, Tensor]:
-    """How much darker than both sides, as the logarithm of value: in the least channel and in the mean of them, (B, 1, H, W)
-    each, and the least that counts, (B, 1, 1, 1). The first is -9 on a step, dark on one side only."""
+    """How much darker a pixel is than both sides, as the logarithm of value.
+
+    Returns:
+        The depth of the least channel and of the mean of channels, (B, 1, H, W) each, the first -9 on a step, which is dark on
+        one side only; and the least depth that counts, (B, 1, 1, 1).
+    """
     far = max(2, int(diameter + 0.5))
     near = max(1, int(0.7071 * diameter + 0.5))
     height, width = light.shape[2], light.shape[3]
@@ -239,7 +260,7 @@ def _marker_depth(light: Tensor, diameter: float, contrast: float, sigmas: float
     noise = noise_std(light).amax(dim=1)
     grey = light.mean(dim=1, keepdim=True)
     wide = torch.cat((light, grey), dim=1)
-    wide = nn.functional.pad(wide, [far, far, far, far], mode="reflect")  # a marker cut by the border is made whole
+    wide = nn.functional.pad(wide, [far, far, far, far], mode="reflect")  # completes a marker cut by the border
     sides, darker = torch.full_like(light, math.inf), torch.full_like(grey, math.inf)
     for dy, dx in [(0, far), (far, 0), (near, near), (near, -near)]:
         one = wide[:, :, far + dy : far + dy + height, far + dx : far + dx + width]
@@ -272,7 +293,7 @@ def _square_max(image: Tensor, half: int) -> Tensor:
 
 
 def _octagon_max(image: Tensor, reach: int) -> Tensor:
-    """Largest value in an octagon that reaches ``reach`` pixels."""
+    """Largest value in an octagon of radius ``reach`` pixels."""
     square = _square_max(image, reach // 2)
     rest = reach - reach // 2
     return torch.maximum(_line_max(square, rest, 3), _line_max(square, rest, 2))
@@ -285,7 +306,7 @@ def _neighbour_mean(image: Tensor) -> Tensor:
 
 
 def _blobs(mask: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
-    """Of each connected blob (corners connect) of an (H, W) mask its longer side in pixels and its largest value, (N,) each."""
+    """Longer side in pixels and largest value of each connected blob (corners connect) of an (H, W) mask, (N,) each."""
     height, width = mask.shape
     label = torch.where(
         mask, torch.arange(1.0, height * width + 1.0, dtype=torch.float64, device=mask.device).reshape(height, width), 0.0

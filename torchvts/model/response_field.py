@@ -13,31 +13,32 @@ from ..core.checks import brief, check_integer, check_numbers, check_positive, f
 from ..core.geometry import pixel_grid_mm
 
 CHANGE_SCALE = 0.3
-"""Relative change of intensity that counts as one; with it and depth in mm the inputs are of order one."""
+"""Relative change of intensity that counts as one, so that the inputs are of order one like depth in mm."""
 
 
 @dataclass(frozen=True)
 class ResponseField:
     r"""slope(x, y) = sum over terms of W_t(x, y) * term_t(change, depth).
 
-    The inputs are the relative changes of R, G and B, image / background - 1, over :data:`CHANGE_SCALE`, and, if
-    ``uses_depth``, the depth that a first pass led to, in mm, and that depth's own slopes along x and y. The terms are the
-    inputs themselves and, if ``product_degree`` is not -1, the products of two of changes and depth but for depth squared. No
-    term is constant: a skin at rest has slope zero. Each W_t is a polynomial of total degree ``degree`` (products:
-    ``product_degree``) in x / half_mm and y / half_mm.
+    The inputs are the relative changes of R, G and B, image / background - 1, divided by :data:`CHANGE_SCALE`, and, if
+    ``uses_depth``, the depth of a first pass in mm and its slopes along x and y. The terms are the inputs and, if
+    ``product_degree`` is not -1, the products of two of changes and depth, except depth squared. No term is constant: the
+    undeformed skin has slope zero. Each W_t is a polynomial of total degree ``degree`` (products: ``product_degree``) in
+    x / half_mm and y / half_mm.
 
-    The depth's slopes carry less noise than the pixel's own, since integration has kept only what is the slope of some
-    surface; how far to trust either is fitted.
+    The slopes of the depth have less noise than those of a single pixel, because integration keeps only what is the slope of a
+    surface. The fit decides how much each of them counts.
 
     Args:
-        degree, product_degree: 0 to 6; product_degree -1 leaves products out.
+        degree: of the linear terms, 0 to 6.
+        product_degree: of the products, 0 to 6; -1 for no products.
         uses_depth: depth and its slopes are inputs four to six.
-        half_mm: half the width of the field of view, mm: what positions are scaled by.
+        half_mm: scale of positions, mm: half the width of the field of view.
         coefficient: 2 rows (dz/dx, dz/dy) of :meth:`size` numbers, term after term.
     Raises:
         ValueError, TypeError: names the argument.
     Source:
-        the idea of a linear slope response: Johnson and Adelson, CVPR 2009, who tabulate it; as a polynomial field: this project.
+        linear slope response: Johnson and Adelson, CVPR 2009, who tabulate it; as a polynomial field: this project.
     Example:
         >>> ResponseField(0, -1, False, 10.0, ((1, 0, 0), (0, 1, 0))).size()
         3
@@ -60,7 +61,7 @@ class ResponseField:
         object.__setattr__(self, "coefficient", (numbers[: self.size()], numbers[self.size() :]))
 
     def terms(self) -> list[tuple[int, ...]]:
-        """The terms as indices of their inputs: (0,) is the change of R, (0, 3) that times the depth, (4,) the depth's dz/dx."""
+        """Terms as indices of their inputs: (0,) is the change of R, (0, 3) that change times depth, (4,) dz/dx of the depth."""
         return field_terms(self.uses_depth, self.product_degree)
 
     def size(self) -> int:
@@ -83,8 +84,8 @@ class ResponseField:
             start += len(basis)
         return torch.stack(maps)
 
-    def lifted(self, degree: int, product_degree: int, uses_depth: bool) -> "ResponseField":
-        """The same field as one of a larger family; what is new is zero.
+    def embedded(self, degree: int, product_degree: int, uses_depth: bool) -> "ResponseField":
+        """The same field as a member of a larger family; the new coefficients are zero.
 
         Raises:
             ValueError: the family is not larger.
@@ -103,7 +104,7 @@ class ResponseField:
         return ResponseField(degree, product_degree, uses_depth, self.half_mm, tuple(rows))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, to seven digits: more than any press bears out."""
+        """Plain numbers, to seven digits, which is more than presses determine."""
         values = dataclasses.asdict(self)
         values["coefficient"] = [[float(f"{number:.7g}") for number in row] for row in self.coefficient]
         return values
@@ -116,12 +117,15 @@ class ResponseField:
 
 @dataclass(frozen=True)
 class ResponseModel:
-    """What a sensor's presses say of it: the field for one pass, the one for a second pass with depth, and how images enter.
+    """Response of a sensor: a field for one pass, one for a second pass with depth, and the preprocessing of images.
 
     Args:
-        fast: without depth. precise: with the depth that ``fast`` gave, or None.
-        gamma: of the images it was fitted on, value = light^(1/gamma).
-        blur_px: standard deviation of the Gaussian blur it was fitted under, pixels of the calibrated size.
+        fast: field without depth.
+        precise: field that uses the depth by ``fast``, or None.
+        gamma: of the images it was fitted to, value = light^(1/gamma).
+        blur_px: standard deviation of the Gaussian blur it was fitted with, pixels of the calibrated size.
+    Raises:
+        ValueError, TypeError: names the argument.
     """
 
     fast: ResponseField
@@ -140,8 +144,8 @@ class ResponseModel:
         object.__setattr__(self, "blur_px", float(self.blur_px))
 
     @classmethod
-    def blank(cls, gamma: float = 1.0, blur_px: float = 1.0) -> "ResponseModel":
-        """A model that says flat of everything: what an image is read with before there is another."""
+    def zero(cls, gamma: float = 1.0, blur_px: float = 1.0) -> "ResponseModel":
+        """A model whose slope is zero everywhere: for preprocessing before a model is fitted."""
         return cls(ResponseField(0, -1, False, 1.0, ((0.0,) * 3, (0.0,) * 3)), None, gamma, blur_px)
 
     def to_dict(self) -> dict[str, Any]:
@@ -151,7 +155,7 @@ class ResponseModel:
 
     @classmethod
     def from_dict(cls, values: Any, source: str) -> "ResponseModel":
-        """Read what :meth:`to_dict` gave; ``source`` names it in errors."""
+        """Read the output of :meth:`to_dict`; ``source`` names it in errors."""
         if not isinstance(values, dict):
             raise ValueError(f"{source}: expected keys and values, got {type(values).__name__}")
         values = dict(values)
@@ -163,13 +167,15 @@ class ResponseModel:
 
 @dataclass(frozen=True)
 class SensorPrior:
-    """What is known of every unit of a sensor type: a response model, and the background it was fitted under.
+    """Response that all units of a sensor type share, and the background it was fitted with.
 
     Args:
         response: the model.
         log_background: (3, 15), R, G, B: coefficients of :func:`position_basis` of degree 4 that give log(background).
         half_mm: scale of the positions of ``log_background``, mm.
-        source: whose images it was fitted on, and how.
+        source: whose images it was fitted to, and how.
+    Raises:
+        ValueError, TypeError: names the argument.
     """
 
     response: ResponseModel
@@ -187,7 +193,7 @@ class SensorPrior:
             raise TypeError(f"source: expected a text, got {brief(self.source)}")
 
     def background(self, height: int, width: int, mm_per_pixel: float) -> Tensor:
-        """The smooth background of the unit it was fitted on, (3, H, W) float64, linear light."""
+        """The smooth background of the unit it was fitted to, (3, H, W) float64, linear light."""
         x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
         basis = position_basis(x.expand(height, width), y.expand(height, width), self.half_mm, 4)
         log_light: Tensor = torch.tensordot(torch.tensor(self.log_background, dtype=torch.float64), basis, 1)
@@ -200,14 +206,19 @@ class SensorPrior:
 
     @classmethod
     def from_dict(cls, values: Any, source: str) -> "SensorPrior":
-        """Read what :meth:`to_dict` gave; ``source`` names it in errors."""
+        """Read the output of :meth:`to_dict`; ``source`` names it in errors."""
         if isinstance(values, dict) and "response" in values:
             values = values | {"response": ResponseModel.from_dict(values["response"], f"{source}: response")}
         return from_dict(cls, values, source)
 
 
 def fit_log_background(background: Tensor, mm_per_pixel: float) -> tuple[tuple[float, ...], ...]:
-    """``log_background`` of a :class:`SensorPrior`: least squares over a linear-light background (3, H, W)."""
+    """``log_background`` of a :class:`SensorPrior`, by least squares.
+
+    Args:
+        background: (3, H, W), linear light.
+        mm_per_pixel: pixel pitch, mm.
+    """
     height, width = background.shape[1:]
     x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
     basis = position_basis(x.expand(height, width), y.expand(height, width), 0.5 * width * mm_per_pixel, 4).flatten(1)
@@ -217,7 +228,7 @@ def fit_log_background(background: Tensor, mm_per_pixel: float) -> tuple[tuple[f
 
 
 def field_terms(uses_depth: bool, product_degree: int) -> list[tuple[int, ...]]:
-    """Terms as indices of their inputs: all inputs, then the products of two of changes and depth, but for depth squared, which
+    """Terms as indices of their inputs: all inputs, then products of two of changes and depth, except depth squared, which
     explains nothing."""
     single: list[tuple[int, ...]] = [(k,) for k in range(6 if uses_depth else 3)]
     pairs = [pair for pair in combinations_with_replacement(range(4 if uses_depth else 3), 2) if pair != (3, 3)]
@@ -225,12 +236,12 @@ def field_terms(uses_depth: bool, product_degree: int) -> list[tuple[int, ...]]:
 
 
 def term_degrees_by_term(degree: int, product_degree: int, uses_depth: bool) -> dict[tuple[int, ...], int]:
-    """Degree in position of every term, in their order."""
+    """Degree in position of every term, in order."""
     return {term: degree if len(term) == 1 else product_degree for term in field_terms(uses_depth, product_degree)}
 
 
 def term_degrees(degree: int, product_degree: int, uses_depth: bool) -> list[int]:
-    """Total degree in position of every coefficient, in their order."""
+    """Total degree in position of every coefficient, in order."""
     by_term = term_degrees_by_term(degree, product_degree, uses_depth)
     return [i + j for d in by_term.values() for i in range(d + 1) for j in range(d + 1 - i)]
 
@@ -248,11 +259,16 @@ def position_basis(x: Tensor, y: Tensor, half_mm: float, degree: int) -> Tensor:
 def term_values(
     change: Tensor, deep: Tensor | None, x: Tensor, y: Tensor, half_mm: float, degree: int, product_degree: int
 ) -> Tensor:
-    """Every coefficient's factor at N places: (size, N).
+    """Factor of every coefficient at N places: (size, N).
 
     Args:
-        change: (3, N), image / background - 1. deep: (3, N), depth in mm and its two slopes, for fields that use depth, else
-            None. x, y: (N,), mm.
+        change: (3, N), image / background - 1.
+        deep: (3, N), depth in mm and its two slopes, for fields that use depth; else None.
+        x: (N,), mm.
+        y: (N,), mm.
+        half_mm: scale of positions, mm.
+        degree: of linear terms.
+        product_degree: of products; -1 for none.
     """
     inputs = [*(change / CHANGE_SCALE), *([] if deep is None else deep)]
     bases = {d: position_basis(x, y, half_mm, d) for d in {degree, product_degree} if d >= 0}

@@ -1,4 +1,4 @@
-"""What is known of a sensor before it is calibrated: its size, pitch and camera response, where the gel lies in the frame."""
+"""Description of a sensor type or unit: size, pitch, camera response, and where the gel lies in the camera's frame."""
 
 import dataclasses
 from collections.abc import Hashable, Sequence
@@ -22,20 +22,21 @@ class Sensor:
 
     Args:
         name: any text.
-        height, width: pixels of the image that the pipeline works on.
+        height: rows of the image that the pipeline works on.
+        width: columns of that image.
         mm_per_pixel: pixel pitch on the skin, mm.
-        gamma: response of the camera, value = light^(1 / gamma); None leaves it open: calibration chooses, all else takes 1.
+        gamma: response of the camera, value = light^(1 / gamma); None leaves it open: calibration chooses it, all else uses 1.
         blur_px: standard deviation of a Gaussian blur before normals, pixels; 0 for none.
-        light_position_mm: (3, 3), rows R, G, B, if the lights are known from the drawing.
-        light_azimuth_deg: (3,), R, G, B: where each light stands around the image centre, if only that is known, degrees from x
+        light_position_mm: (3, 3), rows R, G, B, if the positions of the lights are known.
+        light_azimuth_deg: (3,), R, G, B: azimuth of each light around the image centre, if only that is known, degrees from x
             (right) towards y (down). Either this or ``light_position_mm``.
         roi_px: (left, top, width, height) of the gel in the camera's frame, resized to the sensor's size.
         corners_px: (4, 2), x and y of the gel's corners in the camera's frame: top left, top right, bottom right, bottom
             left, rectified to the sensor's size. Either this or ``roi_px``.
-        markers: the skin carries printed markers, which are filled in every frame.
-        prior: what is known of every unit of this type, from presses on one.
+        markers: the skin has printed markers, which are filled in every frame.
+        prior: response that all units of this type share, fitted to presses on one.
     Raises:
-        TypeError, ValueError: name the argument, what was expected and what came.
+        TypeError, ValueError: name the argument, what was expected and what was given.
     Example:
         >>> Sensor(name="rig", height=480, width=640, mm_per_pixel=0.0625).field_mm
         (30.0, 40.0)
@@ -105,7 +106,7 @@ class Sensor:
 
     @property
     def exponent(self) -> float:
-        """Linear light is value to this power: gamma, or 1 where it is left open."""
+        """Linear light = value^exponent: gamma, or 1 where it is left open."""
         return 1.0 if self.gamma is None else self.gamma
 
     @property
@@ -114,8 +115,11 @@ class Sensor:
         return self.height * self.mm_per_pixel, self.width * self.mm_per_pixel
 
     def resized(self, height: int, width: int) -> "Sensor":
-        """The same sensor seen with other pixels: field of view, lights and response stay, pitch and blur follow.
+        """The same sensor with other pixels: field of view, lights and response stay; pitch and blur are scaled.
 
+        Args:
+            height: new number of rows.
+            width: new number of columns.
         Raises:
             ValueError: another aspect ratio (beyond 1 %), because pixels would no longer be square.
         Example:
@@ -137,14 +141,18 @@ class Sensor:
         return dataclasses.replace(self, height=height, width=width, mm_per_pixel=pitch, blur_px=blur_px, prior=prior)
 
     def without_prior(self) -> "Sensor":
-        """The same sensor as if nothing were known of its type."""
+        """The same sensor without its prior."""
         return dataclasses.replace(self, prior=None)
 
     def rectify(self, frame: Tensor) -> Tensor:
-        """Camera frames (B, 3, H, W) as the sensor's images (B, 3, height, width): four corners, region of interest, or as is.
+        """Cut the sensor's images out of camera frames: by four corners, by a region of interest, or unchanged.
 
+        Args:
+            frame: (B, 3, H, W).
+        Returns:
+            (B, 3, height, width).
         Raises:
-            ValueError: the frame does not hold the region, or has another size and the sensor names no region.
+            ValueError: the frame does not contain the region, or has another size and the sensor has no region.
         """
         check_batch("frame", frame, 3)
         size = (self.height, self.width)
@@ -152,7 +160,7 @@ class Sensor:
         if self.corners_px is not None:
             corners = torch.tensor(self.corners_px, dtype=frame.dtype, device=frame.device)[None]
             if bool((corners < -0.5).any()) or bool((corners[..., 0] > width).any()) or bool((corners[..., 1] > height).any()):
-                raise ValueError(f"frame: {height} x {width} does not hold corners_px {self.corners_px} of sensor '{self.name}'")
+                raise ValueError(f"frame: {height} x {width} does not contain corners_px {self.corners_px} of sensor '{self.name}'")
             right, bottom = self.width - 1.0, self.height - 1.0
             target = torch.tensor(
                 [[[0.0, 0.0], [right, 0.0], [right, bottom], [0.0, bottom]]], dtype=frame.dtype, device=frame.device
@@ -162,7 +170,7 @@ class Sensor:
         if self.roi_px is not None:
             left, top, roi_width, roi_height = self.roi_px
             if left + roi_width > width or top + roi_height > height:
-                raise ValueError(f"frame: {height} x {width} does not hold roi_px {self.roi_px} of sensor '{self.name}'")
+                raise ValueError(f"frame: {height} x {width} does not contain roi_px {self.roi_px} of sensor '{self.name}'")
             frame = frame[:, :, top : top + roi_height, left : left + roi_width]
             return frame if frame.shape[2:] == size else kornia.geometry.resize(frame, size, antialias=True)
         if (height, width) != size:
@@ -174,16 +182,21 @@ class Sensor:
 
     @classmethod
     def load(cls, source: str | Path, height: int | None = None, width: int | None = None) -> "Sensor":
-        """Read a sensor: the name of a shipped one, or the path of a YAML file; optionally resized.
+        """Read a sensor.
 
+        Args:
+            source: name of a shipped sensor, or path of a YAML file.
+            height: resize to this many rows; None keeps the size.
+            width: resize to this many columns; None keeps the size.
         Raises:
-            FileNotFoundError: no such name or file. ValueError: bad YAML, an unknown key, or a bad value; names file and key.
+            FileNotFoundError: no such name or file.
+            ValueError: bad YAML, an unknown key, or a bad value; names file and key.
         Example:
             >>> Sensor.load("gelsight_mini").mm_per_pixel
             0.0634
         """
         path = _find(source)
-        sensor = cls.from_dict(_read_yaml(path), str(path))
+        sensor = cls.from_dict(read_yaml(path), str(path))
         if height is None and width is None:
             return sensor
         if height is None or width is None:
@@ -192,23 +205,28 @@ class Sensor:
 
     @classmethod
     def from_dict(cls, values: Any, source: str) -> "Sensor":
-        """Build a sensor from a mapping; ``source`` names it in errors."""
+        """Make a sensor from a mapping; ``source`` names it in errors."""
         return from_dict(cls, values, source)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain lists and numbers, defaults left out; :meth:`from_dict` reads it back."""
+        """Plain lists and numbers without defaults; :meth:`from_dict` reads it back."""
         pairs = ((field, getattr(self, field.name)) for field in dataclasses.fields(self))
         return {field.name: _plain(value) for field, value in pairs if value != field.default}
 
     def save(self, path: str | Path, comment: Sequence[str] = ()) -> None:
-        """Write the sensor as YAML, whole or not at all, under lines of ``comment`` (each with its #)."""
+        """Write the sensor as YAML, whole or not at all.
+
+        Args:
+            path: file to write.
+            comment: lines to put before it, each with its #.
+        """
         text = yaml.safe_dump(self.to_dict(), sort_keys=False, width=128, default_flow_style=None, allow_unicode=True)
         with write_atomically(path) as temporary:
             temporary.write_text("".join(f"{line}\n" for line in comment) + text, encoding="utf-8")
 
 
 def check_sensor(name: str, value: object) -> None:
-    """Raise unless ``value`` is a Sensor; a name or path is told the way."""
+    """Raise unless ``value`` is a Sensor; for a name or path the message shows how to load it."""
     text = str(value) if isinstance(value, str | Path) else "gelsight_mini"
     check_record(name, value, Sensor, f"load it by Sensor.load({text!r})")
 
@@ -238,11 +256,11 @@ def _find(source: str | Path) -> Path:
 
 
 MOST_YAML_BYTES = 2**17
-"""A sensor file has some kilobytes."""
+"""Limit for sensor files, which have some kilobytes."""
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """Safe YAML that refuses a key given twice, and aliases, by which some lines stand for gigabytes."""
+    """Safe YAML that refuses duplicate keys, and aliases, with which a few lines can expand to gigabytes."""
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         if self.check_event(yaml.events.AliasEvent):
@@ -260,7 +278,12 @@ class _StrictLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def _read_yaml(path: Path) -> Any:
+def read_yaml(path: Path) -> Any:
+    """The content of a YAML file, read safely.
+
+    Raises:
+        ValueError: too large, or not YAML.
+    """
     if path.stat().st_size > MOST_YAML_BYTES:
         raise ValueError(
             f"{path}: expected a file of at most {MOST_YAML_BYTES} bytes, got {path.stat().st_size}: not a sensor file"

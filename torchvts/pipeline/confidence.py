@@ -1,9 +1,9 @@
-"""How far a frame's normals and depth may be off: bounds per pixel, a figure per frame, and what they are made of.
+"""Confidence: bounds of the error of normals and depth, per pixel and per frame, and what they are made of.
 
-The bounds come from what is known before the frame (noise of the camera, conditioning of the inverse model, how far held-out
-presses or the fit say the model is off) and from what the frame itself shows: its own noise, light that the model does not
-explain, slopes that no surface has, dark or full channels, contact too faint for the mask. What no frame shows they do not hold:
-a wrong pitch, a camera that is not orthographic, a calibration of another unit.
+The bounds come from what is known before the frame (noise of the camera, conditioning of the inverse model, error of the model on
+held-out presses or of its fit) and from what the frame itself shows: its own noise, light that the model does not explain, slopes
+that are not integrable, dark or saturated channels, contact too faint for the mask. They do not cover what no frame shows: a wrong
+pitch, a camera that is not orthographic, a calibration of another unit.
 """
 
 import math
@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..accelerated import GradientFromNormal, PoissonBackground
+from ..accelerated import GradientFromNormal, PoissonBackground, scriptable
 from ..core.blur import blur, gaussian_weights
 from ..core.checks import (
     check_batch,
@@ -31,14 +31,14 @@ from ..normals import NormalFromIntensity, NormalFromResponse, as_normal_model
 from .depth import DepthOutput, DepthPipeline
 
 FACTORS = ("noise", "model", "pass", "surface", "saturation")
-"""What ``factors_deg`` holds, in that order: noise through the inverse model, raised where the light does not fit; error of the
-model; what a pass with the depth found would change; slopes that no surface has, and blur; channels that are dark or full."""
+"""The order of ``factors_deg``: noise through the inverse model, raised where the light does not fit; error of the model; what a
+pass with the depth found would change; slopes that are not integrable, and blur; channels that are dark or saturated."""
 
 USEFUL_DEG = 10.0
 """``confidence`` is the probability that a normal is within this of the truth."""
 
 DEPTH_SPREAD = 1.46
-"""Spread of depth errors for :func:`bound_at`: a Gaussian's in one dimension. Normals of point lights have 1, in two."""
+"""Spread of depth errors for :func:`bound_at`: that of a Gaussian in one dimension. Normals of point lights have 1, in two."""
 
 RESPONSE_SPREAD = 1.2
 """The same for normals of a response field, whose errors have longer tails."""
@@ -51,48 +51,52 @@ FEW_DEG = 5.0
 """Mean error of a response field from presses too few to hold one out, or from touches: 4 to 6 on a GelSight Mini."""
 
 FEW_PRESSES = 4.0
-"""Held-out error of n presses is taken sqrt(1 + 4 / n) times as large: few balls leave places and slopes that none was on."""
+"""The held-out error of n presses is multiplied by sqrt(1 + 4 / n): few balls leave places and slopes without any."""
 
 MODEL_SHARE = 1.2
-"""Error of a response field, relative to the one that spreads its held-out angle over the image as noise is spread."""
+"""Error of a response field, relative to the one that spreads its held-out angle over the image in the way of noise."""
 
 BORDER_SHARE = 3.0
-"""Part of the held-out variance that is added in the image's corners, with the fourth power of the distance from the middle."""
+"""Share of the held-out variance that is added in the image's corners, by the fourth power of the distance from the middle."""
 
 CURL_SHARE = 0.4
-"""Variance of a slope, over the square of its part that no surface has: half for white noise, less for what is smooth."""
+"""Variance of a slope, over the square of its part that is not integrable: half for white noise, less for what is smooth."""
 
 BLUR_SHARE = 3.0
 """Variance of a slope, over the square of what another blur of the same width takes from it."""
 
 CLIPPED_DEG = 3.0
-"""Error of a normal, along one axis, where a light is blocked or a channel is full and the other two must do."""
+"""Error of a normal, along one axis, where a light is blocked or a channel is saturated and the other two must do."""
 
 MISFIT_SHARE = 3.0
 """Error of the light per unit of tilt, over the part of the background that fitted lights leave unexplained."""
 
 DETECTED_SIGMAS = 4.5
-"""A tilt of so many standard deviations of its noise is seen as contact: the threshold of :class:`ContactMask`."""
+"""A tilt of so many standard deviations of its noise is detected as contact: the threshold of :class:`ContactMask`."""
 
 SYSTEM_SHARE = 0.5
-"""Depth error by a response field, over what slopes that are off by one standard deviation all the same way would give."""
+"""Depth error by a response field, over that of slopes that are all off by one standard deviation in the same direction."""
 
 KINK_PX = 0.08
 """Depth error of the grid where the surface has a kink, pixels, for a contact as steep as 45 degrees."""
 
 BAND = 0.15
-"""Width of the ring around the contact that is searched for what the mask missed, over the shorter side of the image."""
+"""Width of the ring around the contact that is searched for contact that the mask missed, over the shorter side of the image."""
 
 SPREAD_OF_MEAN = 1.2533
 """Mean length of a two-dimensional Gaussian error, over its standard deviation along one axis."""
 
 
 class Bounds(NamedTuple):
-    """normal_95_deg, depth_95_mm, confidence (B, 1, H, W); frame_confidence (B,); factors_deg (B, 5, H, W).
+    """Bounds of the errors of a frame.
 
-    ``normal_95_deg`` and ``depth_95_mm``: within these the errors lie with a probability of 95 %. ``confidence``: probability that
-    the normal is within :data:`USEFUL_DEG`. ``frame_confidence``: its mean over the contact, 1 without contact. ``factors_deg``:
-    standard deviations along one axis that the bound of the normal is made of, in the order of :data:`FACTORS`.
+    Attributes:
+        normal_95_deg: (B, 1, H, W), within which the error of the normal lies with a probability of 95 %.
+        depth_95_mm: (B, 1, H, W), the same for depth.
+        confidence: (B, 1, H, W), probability that the normal is within :data:`USEFUL_DEG` of the truth.
+        frame_confidence: (B,), mean of ``confidence`` over the contact; 1 without contact.
+        factors_deg: (B, 5, H, W), the standard deviations along one axis that the bound of the normal is made of, in the order of
+            :data:`FACTORS`.
     """
 
     normal_95_deg: Tensor
@@ -120,7 +124,8 @@ def bound_at(bound_95: Tensor, level: float, spread: float = 1.0) -> Tensor:
     """The bound for another probability than 95 %.
 
     Args:
-        bound_95: bounds for 95 %. level: probability, above 0 and below 1.
+        bound_95: bounds for 95 %.
+        level: probability, above 0 and below 1.
         spread: ``Confidence.spread`` for normals, :data:`DEPTH_SPREAD` for depth.
     Raises:
         ValueError: level out of range.
@@ -138,27 +143,38 @@ def bound_at(bound_95: Tensor, level: float, spread: float = 1.0) -> Tensor:
     return bound_95 * factor
 
 
+class SlopeErrors(NamedTuple):
+    """steep (B, 1, H, W), square of n_z; white and model (B, 1, H, W), variances of the angle along one axis, radians^2."""
+
+    steep: Tensor
+    white: Tensor
+    model: Tensor
+
+
 class Confidence(nn.Module):
-    """Bounds of a frame's errors, from its image and what the pipeline made of it.
+    """Bounds of a frame's errors, from its image and the output of the pipeline.
 
     Normals. The noise of the image goes through the inverse model by differences: each channel is moved by its noise, and the
-    normal followed. So conditioning is measured, not assumed. The model's error goes the same way, as light that is off: for
-    point lights by how well calibration pinned each of them, for response fields by so much that it makes the angle that presses
-    held out of calibration had. On top come what the next pass would change, the part of the gradient that is no gradient of any
-    depth, blur at edges, and a fixed error where a channel is dark or full. Outside of the contact, where the normal is said to
-    be flat, the bound is the faintest tilt that the mask sees.
+    normal is followed. So conditioning is measured, not assumed. The model's error goes the same way, as light that is off: for
+    point lights by how well calibration constrained each of them, for response fields by as much as gives the held-out angle.
+    Added to this are the change that the next pass would bring, the part of the gradient that is not integrable, blur at edges,
+    and a fixed error where a channel is dark or saturated. Outside of the contact, where the normal is said to be flat, the
+    bound is the faintest tilt that the mask detects.
 
     Depth. White errors of slope grow with the logarithm of the contact's size; errors of the model add up along the way, which
-    is taken from three integrations: all slopes too steep, and all tilted in x and in y. What the mask missed and what the next
+    is computed by three integrations: all slopes too steep, and all tilted in x and in y. What the mask missed and what the next
     pass would change are integrated as they are.
 
     Args:
         normals: the calibrated block of the pipeline.
-        noise_std: (3, H, W), of the compensated image. image_noise_std: (3,), of the image, in image value, at calibration.
-        light_std: (3, H, W), how far the light is off by the model's fault; for point lights per unit of ``|n - n_rest|``.
+        noise_std: (3, H, W), of the compensated image.
+        image_noise_std: (3,), of the image, in image value, at calibration.
+        light_std: (3, H, W), error of the light due to the model; for point lights per unit of ``|n - n_flat|``.
         mm_per_pixel: pixel pitch, mm.
-        model_deg: mean error of a response field, degrees; 0 for lights. measured: whether the background was an image.
-        blur_px: of the compensated image. spread: of the errors of normals, for :func:`bound_at`.
+        model_deg: mean error of a response field, degrees; 0 for lights.
+        measured: whether the background was an image.
+        blur_px: of the compensated image.
+        spread: of the errors of normals, for :func:`bound_at`.
     Source:
         propagation of noise through photometric stereo: Barsky and Petrou, Signal Processing 86(11), 2006; the rest is this
         project's, its constants measured on random scenes and on a GelSight Mini (docs/confidence.md).
@@ -231,7 +247,8 @@ class Confidence(nn.Module):
         """The block of a calibrated unit.
 
         Args:
-            calibration: the unit. normals: its block in the pipeline, to share; None makes one.
+            calibration: the unit.
+            normals: its block in the pipeline, to share; None makes one.
         Raises:
             TypeError: normals that are not of the calibrated model, of whose errors calibration knows nothing.
         """
@@ -241,7 +258,7 @@ class Confidence(nn.Module):
         if not isinstance(block, kind):
             raise TypeError(
                 f"normals: expected the calibrated {kind.__name__}, got {type(block).__name__}: of a module put in its place "
-                "nothing is known that confidence could be told from"
+                "no error is known"
             )
         sensor, noise = calibration.sensor, calibration.compensated_noise_std
         common: dict[str, Any] = {"measured": calibration.measured, "blur_px": sensor.blur_px}
@@ -254,65 +271,77 @@ class Confidence(nn.Module):
         common |= {"model_deg": model_deg, "spread": RESPONSE_SPREAD}
         return cls(block, noise, calibration.noise_std, light, sensor.mm_per_pixel, **common)
 
-    def forward(
-        self, images: Tensor, compensated: Tensor, depth_mm: Tensor, gradient: Tensor, normal: Tensor, contact: Tensor
-    ) -> Bounds:
+    def forward(self, images: Tensor, compensated: Tensor, out: DepthOutput) -> Bounds:
         """Bounds of a frame.
 
         Args:
-            images: (B, 3, H, W), what the pipeline was given. compensated: the same after ``Compensate``.
-            depth_mm, gradient, normal, contact: what the pipeline gave.
+            images: (B, 3, H, W), the input of the pipeline.
+            compensated: the same after ``Compensate``.
+            out: the output of the pipeline.
         Raises:
             ValueError: wrong shapes, or another size than the calibrated one.
         """
-        height, width = self.noise.shape[1], self.noise.shape[2]
-        for name, tensor, channels in (
-            ("images", images, 3),
-            ("compensated", compensated, 3),
-            ("depth_mm", depth_mm, 1),
-            ("gradient", gradient, 2),
-            ("normal", normal, 3),
-        ):
-            check_batch(name, tensor, channels)
-            check_same_size(name, tensor, "the calibration", height, width)
-        if not torch.jit.is_scripting():
-            check_tensor("contact", contact)
-        if contact.dtype != torch.bool or contact.shape != depth_mm.shape:
-            raise ValueError(f"contact: expected bool like depth_mm, got {contact.shape} {contact.dtype}")
+        self._check(images, compensated, out)
         sigma = self._noise_of(images)
-        base = self.normals(compensated)
+        base = self.normals(compensated, None, None)
         noise, model = self._through_the_inverse(base, compensated, sigma)
-        n_z = normal[:, 2:3]
+        n_z = out.normal[:, 2:3]
         steep = n_z.square()  # an error of slope turns the normal by so much, at most along one axis
-        model = model * (2.0 - 2.0 * n_z) if self.by_lights else model + self.border  # |n - n_rest|^2
-        again = self.normals(compensated, depth_mm) if self.uses_depth else base
-        apart = torch.sqrt((again - normal).square().sum(1, keepdim=True) + 1e-12)
+        model = model * (2.0 - 2.0 * n_z) if self.by_lights else model + self.border  # |n - n_flat|^2
+        again = self.normals(compensated, out.depth_mm, None) if self.uses_depth else base
+        change = torch.sqrt((again - out.normal).square().sum(1, keepdim=True) + 1e-12)
         clipped = torch.zeros_like(noise)
         if self.by_lights:
             dark = (compensated < self.normals.shadowed.dark_where) | (compensated >= self.normals.shadowed.saturated_above)
             clipped = self.clipped_variance * dark.any(dim=1, keepdim=True).to(noise.dtype)
-            # three channels give two slopes and a check: a third of the noise is left over, the rest is not noise
-            left = (compensated - self.normals.lights(depth_mm, again, self.mm_per_pixel)).masked_fill(dark, 0.0)
-            left = 3.0 * _smooth(left.square().sum(1, keepdim=True)) / sigma.square().sum(1, keepdim=True)
-            noise = noise * (left / 1.7).clamp_min(1.0)
-        surface = self._no_surface(depth_mm, gradient, steep, noise)
+            noise = noise * self._unexplained(compensated, out.depth_mm, again, dark, sigma)
+        surface = self._not_integrable(out.depth_mm, out.gradient, steep, noise)
         variance = noise + model + clipped if self.by_lights else noise + model + surface
-        bound = _length_95(apart, torch.sqrt(variance + 1e-12), 1.0 if self.by_lights else 1.06)
-        bound = torch.where(contact, bound, self.detected * torch.sqrt(noise + 1e-12))
+        bound = _length_95(change, torch.sqrt(variance + 1e-12), 1.0 if self.by_lights else 1.06)
+        bound = torch.where(out.contact, bound, self.detected * torch.sqrt(noise + 1e-12))
         normal_95 = torch.rad2deg(bound).clamp_max(180.0)
-        touched = contact.to(noise.dtype)
-        depth_95 = self._depth_95(depth_mm, gradient, again, touched, steep, noise + surface, model + clipped)
+        inside = out.contact.to(noise.dtype)
+        slopes = SlopeErrors(steep, noise + surface, model + clipped)
+        depth_95 = self._depth_95(out.depth_mm, out.gradient, again, inside, slopes)
         # the inverse of bound_at
         likely = 1.0 - torch.exp(math.log(0.05) * (self.useful_deg / normal_95) ** (2.0 / self.spread))
-        count = touched.sum(dim=(1, 2, 3))
-        frame = torch.where(count > 0, (likely * touched).sum(dim=(1, 2, 3)) / count.clamp_min(1.0), torch.ones_like(count))
-        parts = torch.cat((noise.sqrt(), model.sqrt(), apart, surface.sqrt(), clipped.sqrt()), dim=1)
+        count = inside.sum(dim=(1, 2, 3))
+        frame = torch.where(count > 0, (likely * inside).sum(dim=(1, 2, 3)) / count.clamp_min(1.0), torch.ones_like(count))
+        parts = torch.cat((noise.sqrt(), model.sqrt(), change, surface.sqrt(), clipped.sqrt()), dim=1)
         return Bounds(normal_95, depth_95, likely, frame, torch.rad2deg(parts))
+
+    def _check(self, images: Tensor, compensated: Tensor, out: DepthOutput) -> None:
+        height, width = self.noise.shape[1], self.noise.shape[2]
+        for name, tensor, channels in (
+            ("images", images, 3),
+            ("compensated", compensated, 3),
+            ("depth_mm", out.depth_mm, 1),
+            ("gradient", out.gradient, 2),
+            ("normal", out.normal, 3),
+        ):
+            check_batch(name, tensor, channels)
+            check_same_size(name, tensor, "the calibration", height, width)
+        if not torch.jit.is_scripting():
+            check_tensor("contact", out.contact)
+        if out.contact.dtype != torch.bool or out.contact.shape != out.depth_mm.shape:
+            raise ValueError(f"contact: expected bool like depth_mm, got {out.contact.shape} {out.contact.dtype}")
+
+    def _unexplained(self, compensated: Tensor, depth_mm: Tensor, normal: Tensor, dark: Tensor, sigma: Tensor) -> Tensor:
+        """Factor by which light that no normal explains exceeds the noise, at least 1: (B, 1, H, W).
+
+        Three channels give two slopes and a check: a third of the noise is left over.
+        """
+        left = (compensated - self.normals.lights(depth_mm, normal, self.mm_per_pixel)).masked_fill(dark, 0.0)
+        left = 3.0 * _smooth(left.square().sum(1, keepdim=True)) / sigma.square().sum(1, keepdim=True)
+        return (left / 1.7).clamp_min(1.0)
+
+    def __prepare_scriptable__(self) -> nn.Module:
+        return scriptable(self)
 
     def _noise_of(self, images: Tensor) -> Tensor:
         """(B, 3, H, W): noise of the compensated frame, the calibrated one raised where the frame has more."""
-        seen = (frame_noise_std(images.detach()) / self.image_noise).clamp_min(1.0).square()
-        factor = torch.sqrt((seen + self.fixed) / (1.0 + self.fixed))  # the background's part is what it was
+        more = (frame_noise_std(images.detach()) / self.image_noise).clamp_min(1.0).square()
+        factor = torch.sqrt((more + self.fixed) / (1.0 + self.fixed))  # the background's part is what it was
         return self.noise[None] * factor[:, :, None, None]
 
     def _through_the_inverse(self, base: Tensor, compensated: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
@@ -322,13 +351,13 @@ class Confidence(nn.Module):
         for k in range(3):
             step = torch.zeros_like(compensated)
             step[:, k : k + 1] = sigma[:, k : k + 1]
-            turn = 0.5 * (self.normals(compensated + step) - base).square().sum(1, keepdim=True)
+            turn = 0.5 * (self.normals(compensated + step, None, None) - base).square().sum(1, keepdim=True)
             noise = noise + turn
             model = model + turn * (self.light_std[k : k + 1] / sigma[:, k : k + 1]).square()
         return noise, model
 
-    def _no_surface(self, depth_mm: Tensor, gradient: Tensor, steep: Tensor, noise: Tensor) -> Tensor:
-        """Variance of what is no gradient of any depth, beyond noise, and of what blur took."""
+    def _not_integrable(self, depth_mm: Tensor, gradient: Tensor, steep: Tensor, noise: Tensor) -> Tensor:
+        """Variance of the part of the gradient that is not integrable, beyond noise, and of what the blur took."""
         odd = _smooth((gradient_of_depth(depth_mm, self.mm_per_pixel) - gradient).square().sum(1, keepdim=True)) * steep.square()
         odd = self.curl_share * (odd - 3.0 * noise).clamp_min(0.0)
         if self.blur_px > 0.0:
@@ -337,22 +366,21 @@ class Confidence(nn.Module):
             odd = odd + self.blur_share * taken * steep.square()
         return odd
 
-    def _depth_95(
-        self, depth_mm: Tensor, gradient: Tensor, again: Tensor, touched: Tensor, steep: Tensor, white: Tensor, model: Tensor
-    ) -> Tensor:
-        # the next pass inside, and around it what the mask has left out, smoothed
-        beyond = 1.0 - touched
+    def _depth_95(self, depth_mm: Tensor, gradient: Tensor, again: Tensor, inside: Tensor, errors: SlopeErrors) -> Tensor:
+        steep = errors.steep
+        # the next pass inside the contact, and around it what the mask has missed, smoothed
+        beyond = 1.0 - inside
         better = self.gradient(again)
-        around = _smooth(better * beyond) / _smooth(beyond).clamp_min(0.04) * _grown(touched, self.band)
-        better = torch.where(touched > 0, better, around)
-        std = torch.sqrt(model + 1e-14) / steep.clamp_min(0.05) * touched
+        around = _smooth(better * beyond) / _smooth(beyond).clamp_min(0.04) * _grown(inside, self.band)
+        better = torch.where(inside > 0, better, around)
+        std = torch.sqrt(errors.model + 1e-14) / steep.clamp_min(0.05) * inside
         length = torch.sqrt(gradient.square().sum(1, keepdim=True) + std.square() + 1e-12)
         none = torch.zeros_like(std)
         tilts = torch.cat((torch.cat((std, none), 1), torch.cat((none, std), 1)))
         found: Tensor = self.integrate(torch.cat((better, std * gradient / length, tilts)))
         found = found.reshape(4, depth_mm.shape[0], 1, depth_mm.shape[2], depth_mm.shape[3])
-        count = touched.sum(dim=(1, 2, 3), keepdim=True).clamp_min(1.0)
-        mean = (white / steep.square().clamp_min(0.01) * touched).sum(dim=(1, 2, 3), keepdim=True) / count
+        count = inside.sum(dim=(1, 2, 3), keepdim=True).clamp_min(1.0)
+        mean = (errors.white / steep.square().clamp_min(0.01) * inside).sum(dim=(1, 2, 3), keepdim=True) / count
         growth = 0.2 + torch.log1p(torch.sqrt(count / math.pi)) / (2.0 * math.pi)
         scatter = mean * growth * (self.correlation * self.mm_per_pixel) ** 2
         kink = self.kink_variance_mm * gradient.square().sum(dim=(1, 2, 3), keepdim=True) / count
@@ -397,7 +425,7 @@ class ConfidentPipeline(nn.Module):
     def forward(self, images: Tensor) -> ConfidentOutput:
         """As :meth:`DepthPipeline.forward`."""
         out: DepthOutput = self.pipe(images)
-        bounds: Bounds = self.confidence(images, self.pipe.compensate(images), out.depth_mm, out.gradient, out.normal, out.contact)
+        bounds: Bounds = self.confidence(images, self.pipe.compensate(images), out)
         return ConfidentOutput(
             out.depth_mm,
             out.gradient,
@@ -410,6 +438,9 @@ class ConfidentPipeline(nn.Module):
             bounds.factors_deg,
         )
 
+    def __prepare_scriptable__(self) -> nn.Module:
+        return scriptable(self)
+
 
 def _length_95(bias: Tensor, std: Tensor, tail: float) -> Tensor:
     """95 % quantile of the length of a two-dimensional Gaussian of that standard deviation around a bias."""
@@ -417,13 +448,13 @@ def _length_95(bias: Tensor, std: Tensor, tail: float) -> Tensor:
 
 
 def _light_std_by_fit(calibration: Calibration) -> Tensor:
-    """(3, H, W): light off by a direction that is off by its standard deviation, and by misfit, per unit of |n - n_rest|."""
+    """(3, H, W), error of the light from that of its direction and from the misfit of its fit, per unit of |n - n_flat|."""
     assert calibration.lights is not None
     none, dtype = [0.0, 0.0, 0.0], calibration.background.dtype
-    turned = torch.tensor(calibration.report.get("direction_std_deg", none), dtype=dtype).nan_to_num(45.0).clamp(0.0, 45.0)
+    direction = torch.tensor(calibration.report.get("direction_std_deg", none), dtype=dtype).nan_to_num(45.0).clamp(0.0, 45.0)
     misfit = torch.tensor(calibration.report.get("misfit", none), dtype=dtype).nan_to_num(1.0).clamp(0.0, 1.0)
     rise = calibration.lights.direction[:, 2].detach().clamp_min(0.2)
-    off = torch.hypot(torch.deg2rad(turned) / rise, MISFIT_SHARE * misfit)
+    off = torch.hypot(torch.deg2rad(direction) / rise, MISFIT_SHARE * misfit)
     return calibration.model_image.detach() * off.reshape(3, 1, 1)
 
 

@@ -14,7 +14,7 @@ from ..accelerated import (
     NormalFromIntensity,
     PoissonBackground,
     Uncrop,
-    reference,
+    scriptable,
 )
 from ..contact import ContactMask as PlainContactMask
 from ..core.checks import (
@@ -195,7 +195,7 @@ class DepthPipeline(nn.Module):
         return integrator.module if isinstance(integrator, WrappedIntegrator) else integrator
 
     def __prepare_scriptable__(self) -> nn.Module:
-        return reference(self)
+        return scriptable(self)
 
     def extra_repr(self) -> str:
         return f"mode={self.mode}, mm_per_pixel={self.mm_per_pixel}"

@@ -1,23 +1,10 @@
-"""Exact scenes and objects for tests, demos and training data."""
+"""Exact scenes and objects with known depth, normals and contact, and their camera images: for tests, demos and training data."""
 
 from . import objects
-from .scenes import (
-    Scene,
-    cone_press,
-    cylinder_press,
-    distance_to_segments,
-    letter_segments,
-    letters_press,
-    punch_press,
-    render,
-    sine_press,
-    skin_spots,
-    smooth_step,
-    sphere_press,
-    surface,
-    surface_at,
-    undeformed,
-)
+from .camera import render, skin_spots
+from .letters import distance_to_segments, letter_segments
+from .presses import cone_press, cylinder_press, letters_press, punch_press, sine_press, sphere_press
+from .surfaces import Scene, smooth_step, surface, surface_at, undeformed
 
 __all__ = [
     "Scene",

@@ -1,7 +1,7 @@
-"""Objects with a pose: surfaces in their own coordinates, pressed into the skin anywhere, turned and tilted; exact.
+"""Objects with a pose: surfaces in their own coordinates, pressed into the skin at any place, turned and tilted; exact.
 
-An object is its height over its own plane, in mm, in a right-handed frame whose z axis points out of it, towards the camera
-when it is pressed: u to the right, v up, the highest parts near height 0.
+An object is a function that gives its height over its own plane, mm. Its frame is right-handed: u to the right, v up, z out of the
+object, towards the camera when the object is pressed. The highest parts are near height 0.
 """
 
 import math
@@ -13,19 +13,22 @@ from torch import Tensor
 
 from ..core.checks import check_integer, check_least, check_numbers, check_positive, check_shape, check_size
 from ..core.geometry import normal_from_gradient, pixel_grid_mm
-from .scenes import Scene, distance_to_segments, letter_segments, smooth_step
+from .letters import Segment, distance_to_segments, letter_segments
+from .surfaces import Scene, smooth_step
 
 Height = Callable[[Tensor, Tensor], Tensor]
+"""Height of an object, mm, as a function of u and v, mm."""
 
 
 class Target(NamedTuple):
-    """An object to find the pose of.
+    """An object whose pose is to be found.
 
     Attributes:
-        height_mm: maps u and v, mm, to height, mm.
-        period_deg: the object looks the same when turned by this about its z axis; 360 if by no less.
-        free: what no measurement of its surface can tell: how the names in :attr:`torchvts.Registration.ambiguous` begin.
-        freedom: how many such directions there are.
+        height_mm: function of u and v, mm, that returns the height, mm.
+        period_deg: the object looks the same after a turn by this angle about its z axis; 360 without symmetry.
+        free: motions that its surface does not determine, as the first words of the names in
+            :attr:`torchvts.pose.Registration.ambiguous`.
+        freedom: number of such motions.
     """
 
     height_mm: Height
@@ -43,8 +46,12 @@ def pose(
     """T_sensor_object (4, 4) float64: turned in the plane, tilted about the sensor's x and y, moved.
 
     Args:
-        angle_deg: about z, from x (right) to y (up). shift_mm: along x (right) and y (up).
-        press_mm: how far the object's origin is pressed in. tilt_deg: about x and about y.
+        angle_deg: turn about z, from x (right) to y (up), degrees.
+        shift_mm: shift along x (right) and y (up), mm.
+        press_mm: how far the origin of the object is pressed in, mm.
+        tilt_deg: tilt about x and about y, degrees.
+    Returns:
+        The transform from the frame of the object to that of the sensor.
     Example:
         >>> pose(90.0, (1.0, 2.0))[:2] + 0.0
         tensor([[ 0., -1.,  0.,  1.],
@@ -77,17 +84,22 @@ def press(
 ) -> Scene:
     """The skin over an object in a pose: exact depth and gradient, with a smooth fillet where the skin leaves the object.
 
-    The tilted surface is brought back over the sensor's grid by fixed-point iteration, which converges as long as tilt times
-    steepness is well below 1.
+    The tilted surface is sampled on the grid of the sensor by fixed-point iteration, which converges if tilt times steepness is
+    well below 1.
 
     Args:
-        height_mm: the object, as :class:`Target.height_mm`. T_sensor_object: (4, 4), as :func:`pose`.
-        height, width: pixels. mm_per_pixel: pitch, mm. dtype: of the result.
-        fillet_mm: depth over which the skin bends away from the object; there it lies at most a quarter of it off.
+        height_mm: height of the object, see :class:`Target`.
+        T_sensor_object: pose (4, 4), see :func:`pose`.
+        height: rows of the image.
+        width: columns of the image.
+        mm_per_pixel: pixel pitch, mm.
+        fillet_mm: depth over which the skin bends away from the object, mm; there it is off by at most a quarter of this.
+        dtype: type of the returned maps.
     Returns:
-        The scene; its contact is where the object is below the skin at rest.
+        The scene; its contact is where the object reaches below the undeformed skin.
     Raises:
-        ValueError: T_sensor_object is not (4, 4), or tilted so far that the iteration would not converge.
+        TypeError: ``height_mm`` is no function.
+        ValueError: T_sensor_object is not (4, 4), not rigid, or tilted too far for the iteration.
     Example:
         >>> scene = press(lambda u, v: -(u**2 + v**2), pose(press_mm=0.5), 9, 9, 0.25)
         >>> round(float(scene.depth_mm.max()), 6)
@@ -214,7 +226,7 @@ def gear(teeth: int = 12) -> Height:
 
 
 def textured_patch(bumps: int = 60, radius_mm: float = 5.5, seed: int = 3) -> Height:
-    """A round pad with bumps and dents of many sizes, strewn by chance."""
+    """A round pad with bumps and dents of random sizes at random places."""
     check_integer("bumps", bumps, 1), check_positive("radius_mm", radius_mm)
     generator = torch.Generator().manual_seed(seed)
     draws = torch.rand(bumps, 5, generator=generator, dtype=torch.float64)
@@ -233,7 +245,7 @@ def textured_patch(bumps: int = 60, radius_mm: float = 5.5, seed: int = 3) -> He
 
 
 def sphere(radius_mm: float = 10.0) -> Height:
-    """A ball; beyond its equator's neighbourhood it stays at that height."""
+    """A ball; near its equator and beyond, the height stays constant."""
     check_positive("radius_mm", radius_mm)
 
     def height(u: Tensor, v: Tensor) -> Tensor:
@@ -253,7 +265,7 @@ def cylinder(radius_mm: float = 6.0) -> Height:
 
 
 def plane() -> Height:
-    """An endless plane: only a tilt lets part of it touch."""
+    """An endless plane: it touches only where it is tilted."""
 
     def height(u: Tensor, v: Tensor) -> Tensor:
         return 0.0 * (u + v)
@@ -270,28 +282,28 @@ TARGETS: dict[str, Target] = {
     "gear": Target(gear(), 30.0),
     "textured patch": Target(textured_patch()),
 }
-"""The seven targets of the pose bench."""
+"""The seven objects of the pose bench."""
 
 FREE_TARGETS: dict[str, Target] = {
     "sphere": Target(sphere(), free=("rotation about",), freedom=3),
     "cylinder": Target(cylinder(), 180.0, free=("translation along", "rotation about"), freedom=2),
     "plane": Target(plane(), free=("translation along x", "translation along y", "rotation about z"), freedom=3),
 }
-"""Surfaces that slide on themselves: part of their pose cannot be known."""
+"""Surfaces that can slide along themselves, so part of their pose cannot be determined."""
 
 
 def _wall(outside: Tensor, high_mm: float, wide_mm: float) -> Tensor:
-    """Drop beyond an outline: 0 inside, a smooth flank over ``wide_mm``, then ``high_mm``."""
+    """Drop outside of an outline: 0 inside, a smooth flank of ``wide_mm``, then ``high_mm``."""
     return high_mm * smooth_step(outside / wide_mm)
 
 
 def _fold(u: Tensor, v: Tensor, times: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Radius, and the coordinates along and across the nearest of ``times`` even rays."""
+    """Radius, and coordinates along and across the nearest of ``times`` evenly spaced rays."""
     r = torch.sqrt(u**2 + v**2 + 1e-18)
     angle = torch.atan2(v, u + 1e-30)
     step = 2.0 * math.pi / times
-    rest = angle - step * torch.round(angle / step)
-    return r, r * torch.cos(rest), r * torch.sin(rest)
+    offset = angle - step * torch.round(angle / step)
+    return r, r * torch.cos(offset), r * torch.sin(offset)
 
 
 def _box(along: Tensor, across: Tensor, half_along: float, half_across: Tensor | float) -> Tensor:
@@ -301,7 +313,7 @@ def _box(along: Tensor, across: Tensor, half_along: float, half_across: Tensor |
     return outside + torch.maximum(a, b).clamp_max(0.0)
 
 
-def _polygon(u: Tensor, v: Tensor, sides: list[tuple[tuple[float, float], tuple[float, float]]]) -> Tensor:
+def _polygon(u: Tensor, v: Tensor, sides: list[Segment]) -> Tensor:
     """Signed distance to a closed polygon, negative inside."""
     inside = torch.zeros(u.shape, dtype=torch.bool)
     for (x0, y0), (x1, y1) in sides:

@@ -1,6 +1,7 @@
-"""Floor 4: frames as they come: a camera, a video or a folder of images in, depth out; late frames dropped, slow light followed."""
+"""Depth of cameras, videos and folders of images, frame by frame; late frames are dropped, slow drift of the light is followed."""
 
-from .background import FollowLight, calibrate_at_rest, rest_image
+from .background import calibrate_background, find_background
+from .follow_light import FollowLight
 from .live import StageClock, TactileFrame, TactileStream
 from .overlay import Overlay, StreamReport, VideoFile, Window, has_display
 from .sources import NewestFrame, Reader, Rectify, open_source
@@ -17,8 +18,8 @@ __all__ = [
     "TactileStream",
     "VideoFile",
     "Window",
-    "calibrate_at_rest",
+    "calibrate_background",
+    "find_background",
     "has_display",
     "open_source",
-    "rest_image",
 ]

@@ -13,15 +13,22 @@ from torch import Tensor, nn
 
 from ..core.checks import check_choice, check_integer, check_positive
 from ..core.files import rgb_from_bgr
-from ..model.calibration import Calibration
-from ..model.sensor import Sensor
-from ..pipeline import MODES, DepthOutput, DepthPipeline
-from .background import TIME_CONSTANT_S, FollowLight, calibrate_at_rest, contact_in_video, given_at_rest, rest_image
+from ..model import Calibration, Sensor
+from ..pipeline.depth import MODES, DepthOutput, DepthPipeline
+from .background import calibrate_background, contact_in_video, find_background, use_calibration
+from .follow_light import TIME_CONSTANT_S, FollowLight
 from .sources import NewestFrame, Pixels, Reader, Rectify, Replay, open_source
 
 
 class TactileFrame(NamedTuple):
-    """number in the source, from 0; time_s since its start; image (3, H, W), rectified, in the background's light; the depth."""
+    """A frame and its depth.
+
+    Attributes:
+        number: in the source, from 0.
+        time_s: since the start of the source.
+        image: (3, H, W), rectified, in the background's light.
+        output: of the pipeline.
+    """
 
     number: int
     time_s: float
@@ -30,7 +37,7 @@ class TactileFrame(NamedTuple):
 
 
 class StageClock:
-    """Milliseconds by stage, of the last 10,000 frames."""
+    """Measures the milliseconds of each stage, of the last 10,000 frames."""
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self._clock = clock
@@ -40,7 +47,7 @@ class StageClock:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time what is done inside."""
+        """Measure the time of the block."""
         start = self._clock()
         try:
             yield
@@ -48,7 +55,7 @@ class StageClock:
             self._now[name] = self._now.get(name, 0.0) + 1000.0 * (self._clock() - start)
 
     def watch(self, pipe: DepthPipeline) -> list[Any]:
-        """Time the blocks of a pipeline; returns what ``remove()`` ends it."""
+        """Measure the blocks of a pipeline; returns handles whose ``remove()`` ends it."""
         handles: list[Any] = []
         for name in ("compensate", "contact", "normals", "gradient", "integrate"):
             block = getattr(pipe, name)
@@ -63,7 +70,7 @@ class StageClock:
         return handles
 
     def end_frame(self) -> None:
-        """What was timed since the last call was one frame."""
+        """Close a frame: what was measured since the last call belongs to it."""
         self._frames.append(self._now)
         self._now = {}
 
@@ -87,23 +94,31 @@ def _reader(source: Reader) -> Reader:
 class TactileStream:
     """Depth of every frame of a camera, a video or a folder of images.
 
-    The first frames are taken at rest (:func:`rest_image`); without a calibration the unit is calibrated from them
-    (:func:`calibrate_at_rest`), with one they are held against its background and must be free of contact. Then each frame is
-    rectified, brought into the background's light (:class:`FollowLight`), and sent through the pipeline. Of cameras, and of
-    recordings with ``realtime``, only the newest frame is taken and late ones are dropped; of recordings else all.
+    The first frames must be without contact (:func:`find_background`). Without a calibration the unit is calibrated from them
+    (:func:`calibrate_background`); with one they are compared with its background. Then each frame is
+    rectified, corrected to the background's light (:class:`FollowLight`), and sent through the pipeline. Of cameras, and of
+    recordings with ``realtime``, only the newest frame is taken and late ones are dropped; of other recordings all are.
 
     Args:
         source: a camera's index, a video file, a folder of images, or a :class:`Reader`.
-        sensor_or_calibration: what rectifies, and the calibration, if there is one.
-        mode: "fast", "precise" or "auto". background_frames: how many frames are at rest at the start.
-        realtime: play a recording at its own rate as if it were a camera. follow: follow slow drift of the light.
+        sensor_or_calibration: the sensor, which rectifies; or a calibration, if there is one.
+        mode: "fast", "precise" or "auto".
+        background_frames: number of frames without contact at the start.
+        realtime: play a recording at its own rate as if it were a camera.
+        follow: follow slow drift of the light.
         time_constant_s: of following.
+        clock: for tests.
     Attributes:
-        calibration; told: what is to be known of it, in words; metric: whether depth is, as far as it knows;
-        dropped: frames nobody took; stages: :class:`StageClock`;
-        light: :class:`FollowLight`; fps: rate of the source.
+        calibration: of the unit.
+        note: where the calibration comes from and what to expect of it, in words.
+        metric: whether depth is in mm, as far as is known.
+        dropped: number of frames that nobody took.
+        stages: :class:`StageClock`.
+        light: :class:`FollowLight`.
+        fps: rate of the source.
     Raises:
-        ValueError, OSError: the source, or contact or changing light in the first frames; says which.
+        ValueError: contact or changing light in the first frames, or a source that cannot be read.
+        OSError: no such source.
     Example:
         >>> with TactileStream(0, Sensor.load("gelsight_mini")) as stream:  # doctest: +SKIP
         ...     for number, time_s, image, out in stream:
@@ -125,42 +140,44 @@ class TactileStream:
         check_choice("mode", mode, MODES)
         check_integer("background_frames", background_frames, 3)
         check_positive("time_constant_s", time_constant_s)
-        given = sensor_or_calibration if isinstance(sensor_or_calibration, Calibration) else None
-        if given is None and not isinstance(sensor_or_calibration, Sensor):
+        if not isinstance(sensor_or_calibration, Sensor | Calibration):
             raise TypeError(
                 f"sensor_or_calibration: expected a Sensor or a Calibration, got {type(sensor_or_calibration).__name__}"
             )
-        sensor = sensor_or_calibration.sensor if isinstance(sensor_or_calibration, Calibration) else sensor_or_calibration
         self.reader: Reader = open_source(source) if isinstance(source, str | int | Path) else _reader(source)
         self._newest: NewestFrame | None = None
         self._hooks: list[Any] = []
+        self._clock, self._follow = clock, follow
+        self._realtime = realtime or self.reader.live
+        self.fps = self.reader.fps
+        self.stages = StageClock()
         try:
-            self._clock, self._follow = clock, follow
-            self._realtime = realtime or self.reader.live
-            self.fps = self.reader.fps
-            self.stages = StageClock()
             self._waiting = self._first_frames(background_frames)
-            self.rectify = Rectify(sensor, *self._waiting[0].shape[:2])
-            rest = torch.cat([self.rectify(rgb_from_bgr(pixels)[None]) for pixels in self._waiting])
-            image, noise = rest_image(rest)
-            at_rest = calibrate_at_rest(image, sensor) if given is None else given_at_rest(given)
-            self.calibration, self.told, self.metric = at_rest
-            value = self.calibration.background.float() ** (1.0 / self.calibration.sensor.exponent)
-            self.light = FollowLight(value, time_constant_s)
-            self.pipe = DepthPipeline.from_calibration(self.calibration, mode).float()
-            self.pipe.contact = contact_in_video(self.calibration, noise)
-            image = image[None].clamp(0.0, 1.0)
-            if given is not None:
-                self._check_rest(image)
-            self.light.set_rest(self.light.correct(image))
-            self._hooks = self.stages.watch(self.pipe)
+            self._calibrate(sensor_or_calibration, mode, time_constant_s)
         except BaseException:
             self.reader.close()
             raise
 
+    def _calibrate(self, unit: Sensor | Calibration, mode: str, time_constant_s: float) -> None:
+        """Set up the pipeline and the light from the first frames."""
+        sensor = unit if isinstance(unit, Sensor) else unit.sensor
+        self.rectify = Rectify(sensor, *self._waiting[0].shape[:2])
+        image, noise = find_background(torch.cat([self.rectify(rgb_from_bgr(pixels)[None]) for pixels in self._waiting]))
+        found = calibrate_background(image, unit) if isinstance(unit, Sensor) else use_calibration(unit)
+        self.calibration, self.note, self.metric = found
+        value = self.calibration.background.float() ** (1.0 / self.calibration.sensor.exponent)
+        self.light = FollowLight(value, time_constant_s)
+        self.pipe = DepthPipeline.from_calibration(self.calibration, mode).float()
+        self.pipe.contact = contact_in_video(self.calibration, noise)
+        image = image[None].clamp(0.0, 1.0)
+        if isinstance(unit, Calibration):
+            self._compare_with_calibration(image)
+        self.light.set_background(self.light.correct(image))
+        self._hooks = self.stages.watch(self.pipe)
+
     @property
     def dropped(self) -> int:
-        """Frames that came while another was worked on, and were left out."""
+        """Number of frames that arrived while another was being worked on, and were left out."""
         return 0 if self._newest is None else self._newest.dropped
 
     def _first_frames(self, count: int) -> list[Pixels]:
@@ -179,14 +196,14 @@ class TactileStream:
             )
         return frames
 
-    def _check_rest(self, image: Tensor) -> None:
-        """Bring the first frames into the calibration's light, and refuse a contact in them."""
+    def _compare_with_calibration(self, image: Tensor) -> None:
+        """Start from the light of the first frames, and refuse another unit and a contact in them."""
         light = self.light
         light.start(image if self.calibration.markers is None else self.calibration.markers(image))
         level = max(abs(v - 1.0) for v in light.level)
         if level > 0.15:
             raise ValueError(
-                f"background: the light is {level:.0%} off the calibration's: another unit, exposure or lamps; calibrate again"
+                f"background: the light is {level:.0%} off the calibration's: another unit, exposure or LEDs; calibrate again"
             )
         with torch.inference_mode():
             contact = self.pipe.contact(self.pipe.compensate(light.correct(image)))
@@ -203,7 +220,7 @@ class TactileStream:
         self.close()
 
     def close(self) -> None:
-        """End the reading and let go of the source."""
+        """Stop reading and release the source."""
         for handle in self._hooks:
             handle.remove()
         self._hooks = []

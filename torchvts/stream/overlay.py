@@ -1,4 +1,4 @@
-"""A stream shown: image beside depth with contours, as a video, in a window, and what it came to in figures."""
+"""Shows a stream: the image beside depth with contours, as a video or in a window, and a report of all frames."""
 
 import json
 import os
@@ -18,19 +18,18 @@ from .live import TactileFrame, TactileStream
 from .sources import Pixels
 
 CODES = {".mp4": "mp4v", ".avi": "MJPG"}
-"""What videos can be written, and OpenCV's code for it."""
-
+"""Suffixes of the videos that can be written, and OpenCV's code for each."""
 
 _RANGES = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 
 
 class Overlay:
-    """Draws a frame: the image with its contact outlined, beside it depth in colour with contour lines, figures beneath.
+    """Draws a frame: the image with its contact outlined, beside it depth in colour with contour lines, text beneath.
 
-    The range of colours grows with the deepest press so far, over round numbers; ten lines fill it.
+    The range of colours grows with the deepest press so far, over round values; ten lines fill it.
 
     Args:
-        metric: whether depth is in mm; if not, it says so.
+        metric: whether depth is in mm; otherwise the overlay says that it is not.
     """
 
     TEXT_HEIGHT = 86
@@ -64,23 +63,18 @@ class Overlay:
         return picture
 
     def __call__(self, frame: TactileFrame, lines: Sequence[str] = ()) -> Pixels:
-        """The overlay, B, G, R, with up to three lines of text under it; images narrower than 300 pixels are shown larger."""
+        """The overlay, B, G, R, with up to three lines of text; images narrower than 300 pixels are shown larger."""
         import cv2
 
         height, width = frame.image.shape[1:]
-        left = np.ascontiguousarray((frame.image.flip(0).permute(1, 2, 0) * 255.0 + 0.5).to(torch.uint8).numpy())
-        contact = frame.output.contact[0, 0].numpy().view(np.uint8)
-        if contact.any():
-            smooth = (cv2.blur(contact * 255, (7, 7)) > 127).view(np.uint8)
-            outline, _ = cv2.findContours(smooth, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-            cv2.drawContours(left, outline, -1, (255, 255, 255), 1, cv2.LINE_AA)
-        right, larger = self.depth(frame.output.depth_mm), -(-300 // width)
+        left, right = _outlined(frame), self.depth(frame.output.depth_mm)
+        larger = -(-300 // width)
         height, width = height * larger, width * larger
         out = np.zeros((height + self.TEXT_HEIGHT + height % 2, 2 * width, 3), np.uint8)
-        for picture, place in ((left, 0), (right, width)):
+        for picture, x in ((left, 0), (right, width)):
             if larger > 1:
                 picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_NEAREST)
-            out[:height, place : place + width] = picture
+            out[:height, x : x + width] = picture
         unit = "mm" if self.metric else "mm, NOT METRIC"
         texts = [f"depth 0 to {self.range_mm:g} {unit}, a line each {self.range_mm / 10:g}", *lines][:4]
         for k, text in enumerate(texts):
@@ -88,13 +82,28 @@ class Overlay:
         return out
 
 
+def _outlined(frame: TactileFrame) -> Pixels:
+    """The image (H, W, 3) B, G, R with the outline of the contact."""
+    import cv2
+
+    picture = np.ascontiguousarray((frame.image.flip(0).permute(1, 2, 0) * 255.0 + 0.5).to(torch.uint8).numpy())
+    contact = frame.output.contact[0, 0].numpy().view(np.uint8)
+    if contact.any():
+        smooth = (cv2.blur(contact * 255, (7, 7)) > 127).view(np.uint8)
+        outline, _ = cv2.findContours(smooth, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(picture, outline, -1, (255, 255, 255), 1, cv2.LINE_AA)
+    return picture
+
+
 class VideoFile:
-    """A video that is there whole or not at all: written beside its name, renamed when the block ends well.
+    """Writes a video whole or not at all: under a temporary name, renamed when the block ends without an error.
 
     Args:
-        path: .mp4 (mp4v) or .avi (MJPG). fps: frames a second.
+        path: .mp4 (mp4v) or .avi (MJPG).
+        fps: frames a second.
     Raises:
-        ValueError: another suffix. OSError: OpenCV cannot write it.
+        ValueError: another suffix.
+        OSError: OpenCV cannot write it.
     """
 
     def __init__(self, path: str | Path, fps: float) -> None:
@@ -125,17 +134,18 @@ class VideoFile:
         if self._writer is not None:
             self._writer.release()
         if self._writer is None and error[0] is None:
-            nothing = OSError(f"video: {self.path}: no frame came, so none is written")
+            nothing = OSError(f"video: {self.path}: there was no frame, so none is written")
             self._file.__exit__(OSError, nothing, None)  # removes the temporary file
             return
         self._file.__exit__(*error)
 
 
 class StreamReport:
-    """What is kept of every frame, for a table at the end and two files.
+    """Keeps the contact area, the largest depth and the state of the light of every frame, for a table and two files.
 
     Args:
-        stream: told of by its frames.
+        stream: whose frames are added.
+        clock: for tests.
     """
 
     HEADER = "frame,time_s,contact_mm2,deepest_mm,light"
@@ -148,7 +158,7 @@ class StreamReport:
         self._pixel_mm2 = stream.calibration.sensor.mm_per_pixel**2
 
     def add(self, frame: TactileFrame) -> list[str]:
-        """Keep a frame's figures; returns them as lines of text."""
+        """Add a frame; returns its figures as lines of text."""
         self._end = self._clock()
         area = float(frame.output.contact.sum()) * self._pixel_mm2
         deepest = float(frame.output.depth_mm.max())
@@ -170,7 +180,7 @@ class StreamReport:
         return len(self.rows) / max(self._end - self._begin, 1e-9)
 
     def summary(self) -> dict[str, Any]:
-        """Plain JSON: frames, dropped, fps, stages_ms, and what the stream is."""
+        """For JSON: the source, frames, dropped, fps, stages_ms, light and calibration."""
         stream = self.stream
         return {
             "source": stream.reader.name,
@@ -184,7 +194,7 @@ class StreamReport:
             "light_level": [round(v, 5) for v in stream.light.level],
             "light_steps": stream.light.steps,
             "metric": stream.metric,
-            "calibration": stream.told,
+            "calibration": stream.note,
         }
 
     def table(self) -> str:
@@ -210,7 +220,7 @@ class StreamReport:
 
 
 def has_display() -> bool:
-    """Whether a window could be opened: a screen is named, and Matplotlib finds a toolkit for it."""
+    """Whether a window can be opened: a screen is named, and Matplotlib finds a toolkit for it."""
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         return False
     import matplotlib
@@ -220,13 +230,13 @@ def has_display() -> bool:
 
         plt.figure().clear()
         plt.close("all")
-    except Exception:  # toolkits raise of their own when the screen does not answer
+    except Exception:  # toolkits raise errors of their own when the screen does not answer
         return False
     return str(matplotlib.get_backend()).lower() not in ("agg", "pdf", "ps", "svg", "cairo", "template")
 
 
 class Window:
-    """A live view by Matplotlib, because OpenCV without a screen has none."""
+    """A live view by Matplotlib, because the OpenCV that is installed has none."""
 
     def __init__(self) -> None:
         import matplotlib.pyplot as plt

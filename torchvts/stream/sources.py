@@ -1,4 +1,4 @@
-"""Where frames come from: cameras, videos, folders; the newest frame of those that do not wait; rectified to the sensor's view."""
+"""Reads frames of cameras, videos and folders, keeps the newest one of those that do not wait, and rectifies them."""
 
 import threading
 import time
@@ -14,13 +14,19 @@ from torch import Tensor, nn
 
 from ..core.checks import check_batch, check_integer, check_path
 from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, decode_image, image_files
-from ..model.sensor import Sensor, check_sensor
+from ..model import Sensor, check_sensor
 
 Pixels = np.ndarray[Any, Any]
 
 
 class Reader(Protocol):
-    """Where frames come from. ``live`` sources do not wait; ``fps`` is their rate, or what is assumed of it."""
+    """A source of frames.
+
+    Attributes:
+        name: shown to the user.
+        live: whether it does not wait for who reads.
+        fps: frames a second, known or assumed.
+    """
 
     name: str
     live: bool
@@ -30,7 +36,7 @@ class Reader(Protocol):
         """The next frame, (H, W, 3) B, G, R, 8 or 16 bits; None at the end."""
 
     def close(self) -> None:
-        """Let go of the device or file."""
+        """Release the device or file."""
 
 
 class CaptureReader:
@@ -90,10 +96,12 @@ class FolderReader:
 
 
 def open_source(source: str | int | Path) -> Reader:
-    """A camera by its index (digits), a video file, or a folder of images.
+    """Open a camera by its index (digits), a video file, or a folder of images.
 
     Raises:
-        FileNotFoundError: nothing there. OSError: no such camera. ValueError: not a video, or no images; all name ``source``.
+        FileNotFoundError: no such file or folder.
+        OSError: no such camera.
+        ValueError: not a video, or no images.
     """
     if not isinstance(source, int) or isinstance(source, bool):
         check_path("source", source)
@@ -112,12 +120,13 @@ def open_source(source: str | int | Path) -> Reader:
 
 
 class NewestFrame:
-    """The newest frame of a reader that does not wait: a thread reads, who comes late finds only the last one.
+    """Keeps the newest frame of a source that does not wait: a thread reads, and who comes late finds only the last frame.
 
     Args:
         reader: read by the thread until it ends or :meth:`close`.
         rate: frames a second at which a recording is played; None for a camera, which has its own.
-        clock, sleep: for tests.
+        clock: for tests.
+        sleep: for tests.
     """
 
     def __init__(
@@ -150,7 +159,7 @@ class NewestFrame:
                         self._sleep(wait)
                 self.put(index, self._clock() - start, pixels)
                 index += 1
-        except Exception as error:  # handed to who takes the frames
+        except Exception as error:  # raised by take()
             self._error = error
         finally:
             with self._changed:
@@ -158,34 +167,36 @@ class NewestFrame:
                 self._changed.notify_all()
 
     def put(self, index: int, time_s: float, pixels: Pixels) -> None:
-        """Lay down a frame; one that nobody took is dropped."""
+        """Put a frame in place of the last one, which is dropped if nobody took it."""
         with self._changed:
             self.dropped += self._newest is not None
             self._newest = (index, time_s, pixels)
             self._changed.notify_all()
 
     def take(self) -> tuple[int, float, Pixels] | None:
-        """The newest frame that was not yet taken: waits for it; None at the end. Raises what the reader raised."""
+        """The newest frame that was not taken yet; waits for it; None at the end. Raises what the reader raised."""
         with self._changed:
             while self._newest is None and not self._ended:
-                self._changed.wait(0.2)  # so that Ctrl-C comes through
+                self._changed.wait(0.2)  # so that Ctrl-C interrupts it
             newest, self._newest = self._newest, None
             if newest is None and self._error is not None:
                 raise self._error
             return newest
 
     def close(self) -> None:
-        """End the thread, then let go of the source."""
+        """End the thread, then release the source."""
         self._stop.set()
         self._thread.join(timeout=5.0)
         self._reader.close()
 
 
 class Rectify(nn.Module):
-    """:meth:`Sensor.rectify` for frames of one size, its sampling grid made once.
+    """:meth:`Sensor.rectify` for frames of one size, with a sampling grid that is made once.
 
     Args:
-        sensor: the sensor. height, width: pixels of the camera's frames.
+        sensor: the sensor.
+        height: pixels of the camera's frames.
+        width: pixels of the camera's frames.
     Raises:
         ValueError: the frame does not hold the region that the sensor names.
     Example:
@@ -211,9 +222,9 @@ class Rectify(nn.Module):
             to_frame = kornia.geometry.get_perspective_transform(target, corners)[0]
             x = torch.arange(sensor.width, dtype=torch.float64).expand(sensor.height, -1)
             y = torch.arange(sensor.height, dtype=torch.float64)[:, None].expand(-1, sensor.width)
-            place = torch.stack((x, y, torch.ones_like(x)), 2) @ to_frame.T
-            place = place[..., :2] / place[..., 2:]
-            grid = (2.0 * place / torch.tensor([width - 1.0, height - 1.0], dtype=torch.float64) - 1.0)[None].float()
+            position = torch.stack((x, y, torch.ones_like(x)), 2) @ to_frame.T
+            position = position[..., :2] / position[..., 2:]
+            grid = (2.0 * position / torch.tensor([width - 1.0, height - 1.0], dtype=torch.float64) - 1.0)[None].float()
         self.register_buffer("grid", grid)
 
     def forward(self, frame: Tensor) -> Tensor:
@@ -230,7 +241,7 @@ class Rectify(nn.Module):
 
 
 class Replay:
-    """The frames that were already read, then the rest of a reader."""
+    """A reader that gives frames that were already read, then those of another reader."""
 
     def __init__(self, reader: Reader, first: Sequence[Pixels]) -> None:
         self.name, self.live, self.fps = reader.name, reader.live, reader.fps

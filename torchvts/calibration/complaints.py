@@ -1,0 +1,102 @@
+"""What calibration warns of: presses left out, doubtful diameters, a background with a contact or of another sensor type."""
+
+import dataclasses
+import math
+import statistics
+from collections.abc import Sequence
+
+import torch
+
+from ..contact import ContactMask
+from ..model.calibration import Calibration
+from ..model.sensor import Sensor
+from .background import falloff, outwardness
+from .contacts import ROUGH, Contact, channel_structure
+
+USUAL_GAIN = 1.15
+"""The prior's slopes divided by those of the balls are within this factor: 0.93 to 1.00 on a GelSight Mini."""
+
+DOUBTFUL_GAIN = 1.25
+"""Slopes by the field of the other presses divided by those of a ball are within this factor where ten presses or more agree."""
+
+FOREIGN_SPREAD = 0.35
+"""A background whose logarithm differs this much (RMS) from that of the prior's unit, brightness aside, is of another type."""
+
+
+class CalibrationWarning(UserWarning):
+    """A calibration was made but should not be trusted as it is."""
+
+
+def of_contacts(contacts: Sequence[Contact]) -> list[str]:
+    """Presses and touches that were left out."""
+    return [f"{contact.name}: left out: {contact.reason}" for contact in contacts if contact.reason]
+
+
+def of_diameters_by_prior(used: Sequence[Contact]) -> list[str]:
+    """Diameters that are all wrong by the same factor, which only the prior can show."""
+    gain = statistics.median(contact.metrics["gain"] for contact in used)
+    if abs(math.log(max(gain, 1e-3))) <= math.log(USUAL_GAIN):
+        return []
+    return [
+        f"presses: by the sensor's prior the balls seem {1.0 / gain:.2f} times as wide as given: wrong diameter or pitch? "
+        "if they are right, this unit differs from the prior's, and more presses will show it"
+    ]
+
+
+def of_diameters_by_others(used: Sequence[Contact]) -> list[str]:
+    """Diameters that the other presses neither contradict nor confirm: fields of few presses are too rough to decide."""
+    doubtful = [c for c in used if abs(math.log(max(c.metrics.get("gain", 1.0), 1e-3))) > math.log(DOUBTFUL_GAIN)]
+    if not doubtful:
+        return []
+    named = ", ".join(f"{c.name} ({1.0 / c.metrics['gain']:.2f})" for c in doubtful)
+    return [
+        f"presses: by the others the balls of {named} seem so many times as wide as given: a wrong diameter, or a skin that "
+        "differs from place to place; more presses will show which"
+    ]
+
+
+def of_background_with_prior(background: torch.Tensor, sensor: Sensor) -> list[str]:
+    """A background of another sensor type than the prior's, or one with a contact."""
+    assert sensor.prior is not None
+    found = []
+    gamma = sensor.prior.response.gamma
+    usual = sensor.prior.background(sensor.height, sensor.width, sensor.mm_per_pixel).log()
+    ratio = gamma * background.double().clamp_min(1e-3).log() - usual
+    spread = float((ratio - ratio.mean()).square().mean().sqrt())
+    if spread > FOREIGN_SPREAD:
+        found.append(
+            f"background: its light differs by {spread:.0%} (RMS) from that of the unit on which the prior of sensor "
+            f"'{sensor.name}' was fitted, at most {FOREIGN_SPREAD:.0%} is usual: another sensor type, channels swapped, or an LED "
+            "failed"
+        )
+    structure = channel_structure(background)
+    if structure > ROUGH and not sensor.markers:
+        found.append(
+            f"background: structure between the channels of {structure:.2f}, a background stays below {ROUGH}: contact in the "
+            "calibration image? take it again without"
+        )
+    return found
+
+
+def of_background_by_lights(calibration: Calibration) -> tuple[Calibration, list[str]]:
+    """A background that differs from the lights' model in places; the calibration with that in its report."""
+    model = calibration.model_image
+    vignetting = calibration.report.get("vignetting", 0.0)
+    if vignetting != 0.0:  # of the camera: the gain removes it
+        model = model * falloff(outwardness(calibration.sensor), vignetting).to(model.dtype)
+    if calibration.ambient is not None:
+        model = model + calibration.ambient.reshape(3, 1, 1)
+    spread = (model - calibration.background).abs().flatten(1).median(dim=1).values / 0.6745
+    # contact changes the light by more than 5 % and is wider than dirt: 5 sigmas of the residual and of 1 % of the model
+    find = ContactMask(model, spread.reshape(3, 1, 1) + 0.01 * model, min_size_px=0.05 * calibration.sensor.height)
+    saturated = (calibration.background > 0.995) | (model > 0.95)
+    standing_out = float(find(torch.where(saturated, model, calibration.background)[None]).double().mean())
+    report = calibration.report.copy()
+    report["residual_std"], report["standing_out"] = spread.tolist(), standing_out
+    found = []
+    if standing_out > 0.01:
+        found.append(
+            f"background: {standing_out:.1%} of the image differs from the fitted lights by more than 5 times their residual "
+            f"({', '.join(f'{v:.4f}' for v in spread.tolist())}): contact in the calibration image? take it again without"
+        )
+    return dataclasses.replace(calibration, report=report), found

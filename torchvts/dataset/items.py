@@ -1,0 +1,112 @@
+"""What a data set holds: its images and videos in a fixed order, and the names of their results."""
+
+import os
+import re
+from collections import Counter
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, count_frames
+
+STATE = ".torchvts"
+"""Folder inside the results that holds the settings and one record per frame; a folder that has one is never read as a source."""
+
+PICTURES_UP_TO = 20
+"""Sources of at most this many frames get pictures by default: one picture takes longer than a hundred frames."""
+
+
+class Item(NamedTuple):
+    """One image or video of a source.
+
+    Attributes:
+        path: path inside the source, with "/".
+        stem: path of its results inside the output folder, without suffix.
+        mark: size in bytes and time of modification in ns; another mark means another file.
+    """
+
+    path: str
+    stem: str
+    mark: tuple[int, int]
+
+    @property
+    def is_video(self) -> bool:
+        """Whether it is a video."""
+        return self.is_text and self.path.lower().endswith(VIDEO_SUFFIXES)
+
+    @property
+    def is_text(self) -> bool:
+        """Whether the name is UTF-8; OpenCV crashes on others."""
+        return not any("\ud800" <= letter <= "\udfff" for letter in self.path)
+
+    def file(self, source: Path) -> Path:
+        """The file itself; ``source`` is the folder, or the file where the source is a single one."""
+        return source / self.path if source.is_dir() else source
+
+    def frame_name(self, number: int) -> str:
+        """Name of a frame in tables and messages; ``number`` is negative for an image."""
+        return self.path if number < 0 else f"{self.path}/{number:06d}"
+
+    def frame_stem(self, number: int) -> str:
+        """Stem of the results of a frame; ``number`` is negative for an image."""
+        return self.stem if number < 0 else f"{self.stem}_{number:06d}"
+
+
+def list_items(source: str | Path) -> Iterator[Item]:
+    """List the images and videos of a source, sorted by folder and name; only the names of one folder are in memory.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for name in ("b.png", "a.png", "a.jpg", "notes.txt"):
+        ...         Path(folder, name).touch()
+        ...     [(item.path, item.stem) for item in list_items(folder)]
+        [('a.jpg', 'a.jpg'), ('a.png', 'a.png'), ('b.png', 'b')]
+    """
+    source = Path(source)
+    if source.is_dir():
+        yield from _walk(source, "")
+    else:
+        status = source.stat()
+        yield Item(source.name, source.stem, (status.st_size, status.st_mtime_ns))
+
+
+def _walk(folder: Path, prefix: str) -> Iterator[Item]:
+    with os.scandir(folder) as entries:
+        kept = sorted((entry for entry in entries if not entry.name.startswith(".")), key=lambda entry: entry.name)
+    suffixes = IMAGE_SUFFIXES + VIDEO_SUFFIXES
+    stems = output_stems([entry.name for entry in kept if entry.name.lower().endswith(suffixes) and entry.is_file()])
+    for entry in kept:
+        if entry.name in stems:
+            status = entry.stat()
+            yield Item(prefix + entry.name, prefix + stems[entry.name], (status.st_size, status.st_mtime_ns))
+        elif entry.is_dir(follow_symlinks=False) and not (folder / entry.name / STATE).is_dir():
+            yield from _walk(folder / entry.name, f"{prefix}{entry.name}/")
+
+
+def output_stems(names: list[str]) -> dict[str, str]:
+    """Choose the stem of the results of each file of one folder; no two files share one.
+
+    Frame n of a video adds ``_n`` in six digits to its stem.
+
+    Example:
+        >>> output_stems(["a.png", "b.png", "b.jpg"])
+        {'a.png': 'a', 'b.png': 'b.png', 'b.jpg': 'b.jpg'}
+    """
+    plain = {name: os.path.splitext(name)[0] for name in names}
+    count = Counter(stem.casefold() for stem in plain.values())
+    videos = {plain[name].casefold() for name in names if name.lower().endswith(VIDEO_SUFFIXES)}
+
+    def clashes(name: str) -> bool:
+        stem = plain[name].casefold()
+        return count[stem] > 1 or (re.sub(r"_\d{6,}$", "", stem) in videos and re.search(r"_\d{6,}$", stem) is not None)
+
+    stems = {name: name if clashes(name) else stem for name, stem in plain.items()}
+    return stems if len(set(stems.values())) == len(stems) else {name: name for name in names}
+
+
+def has_few_frames(source: Path) -> bool:
+    """Whether a source holds at most :data:`PICTURES_UP_TO` frames."""
+    items = islice(list_items(source), PICTURES_UP_TO + 1)
+    return sum(count_frames(item.file(source)) if item.is_video else 1 for item in items) <= PICTURES_UP_TO

@@ -1,0 +1,136 @@
+"""Reads the frames of a data set in loader processes: images and videos in order, each process its share."""
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, IterableDataset, get_worker_info
+
+from ..core.files import read_image, rgb_from_bgr
+from ..model import Sensor
+from .items import Item, list_items
+from .records import Records
+
+
+class Frame(NamedTuple):
+    """A frame as a loader hands it over; without image where it is done already or cannot be used.
+
+    Attributes:
+        item: the file that it is from.
+        number: of a video's frame; -1 for an image.
+        done: whether its result is there.
+        failed: why it cannot be used; empty where it can.
+        length: the number of frames of a video, in an entry of its own at the end; None in all others.
+    """
+
+    item: Item
+    number: int = -1
+    done: bool = False
+    failed: str = ""
+    length: int | None = None
+
+
+Batch = tuple[list[tuple[Frame, bool]], Tensor]
+"""Frames, whether each has an image, and these images in one tensor: one shared-memory file a batch, however large the data set."""
+
+
+def load_frames(
+    records: Records, sensor: Sensor, share: tuple[int, int], batch: int, workers: int
+) -> Iterator[tuple[Frame, Tensor | None]]:
+    """The frames of one rank's share, each with its image (1, 3, H, W), rectified, if it has one.
+
+    Args:
+        records: of the run: which source it reads and which frames are done.
+        sensor: rectifies the frames.
+        share: rank of this process, number of processes.
+        batch: frames that a loader process hands over at once.
+        workers: number of loader processes; 0 reads in this process.
+    """
+    loader = DataLoader(_Frames(records, sensor, share, batch), batch_size=None, num_workers=workers, collate_fn=_as_is)
+    for frames, images in loader:
+        left = iter(images.split(1))
+        for frame, has_image in frames:
+            yield frame, next(left) if has_image else None
+
+
+def _as_is(batch: Any) -> Any:
+    return batch
+
+
+class _Frames(IterableDataset[Batch]):
+    """Every N-th image and every N-th frame of every video; of videos one loader process of each rank decodes all, in order.
+
+    Decoding in order is exact for any codec; seeking is not.
+    """
+
+    def __init__(self, records: Records, sensor: Sensor, share: tuple[int, int], batch: int) -> None:
+        self.records, self.sensor, self.share, self.batch = records, sensor, share, batch
+
+    def __iter__(self) -> Iterator[Batch]:
+        frames: list[tuple[Frame, bool]] = []
+        images: list[Tensor] = []
+        for frame, read in self._share():
+            image, failed = self._load(read) if read is not None else ([], frame.failed)
+            frames.append((frame._replace(failed=failed), bool(image)))
+            images += image
+            if len(frames) == self.batch:
+                yield frames, torch.cat(images) if images else torch.empty(0)
+                frames, images = [], []
+        yield frames, torch.cat(images) if images else torch.empty(0)
+
+    def _load(self, read: "partial[Tensor]") -> tuple[list[Tensor], str]:
+        """An image rectified, in a list; or an empty list and why there is none."""
+        import cv2
+
+        try:
+            return [self.sensor.rectify(read()[None])], ""
+        except (OSError, ValueError, cv2.error) as error:
+            return [], " ".join(str(error).split()) or type(error).__name__
+
+    def _share(self) -> Iterator[tuple[Frame, "partial[Tensor] | None"]]:
+        """Frames of this loader process, each with what reads its image if it is to be read."""
+        rank, world = self.share
+        worker = get_worker_info()
+        number, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        count = 0
+        for item in list_items(self.records.source):
+            if item.is_video:
+                if number == 0:
+                    yield from self._video(item)
+                continue
+            count += 1
+            if (count - 1) % (world * workers) != rank * workers + number:
+                continue
+            if self.records.is_done(item, -1):
+                yield Frame(item, done=True), None
+            elif item.is_text:
+                yield Frame(item), partial(read_image, item.file(self.records.source))
+            else:
+                yield Frame(item, failed="its name is not UTF-8: rename it"), None
+
+    def _video(self, item: Item) -> Iterator[tuple[Frame, "partial[Tensor] | None"]]:
+        import cv2
+
+        rank, world = self.share
+        length = self.records.length(item)
+        if length is not None and all(self.records.is_done(item, number) for number in range(rank, length, world)):
+            yield from ((Frame(item, number, done=True), None) for number in range(rank, length, world))
+            return
+        capture = cv2.VideoCapture(str(item.file(self.records.source)))
+        number = 0
+        while capture.grab():
+            if number % world == rank:
+                if self.records.is_done(item, number):
+                    yield Frame(item, number, done=True), None
+                else:
+                    decoded, pixels = capture.retrieve()
+                    failed = "" if decoded else "not decoded"
+                    yield Frame(item, number, failed=failed), partial(rgb_from_bgr, pixels) if decoded else None
+            number += 1
+        capture.release()
+        if number == 0:
+            yield Frame(item, failed="not a video, or cut short: no frame could be read"), None
+        else:
+            yield Frame(item, length=number), None

@@ -1,0 +1,206 @@
+"""What a run keeps beside its results: the settings that it began with, one record per finished frame, and the tables made of them.
+
+A record is written after the files of its frame are in place, each of them whole. So a frame is done when its record can be read,
+was made of the same source file, and its files are there. Nothing else has to be kept or merged, and a kill loses only the
+frames that were being worked on.
+"""
+
+import csv
+import json
+import os
+import re
+import shutil
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from ..core.files import write_atomically
+from .items import STATE, Item, has_few_frames, list_items
+
+Record = dict[str, Any]
+"""``mark`` of the source file; then ``deepest_mm`` and ``contact_mm2`` of a frame, ``frames`` of a whole video, or ``failed``, the
+reason why there is no result."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the results of a run depend on; a run is only continued with the same. ``pictures`` may be None when it begins."""
+
+    calibration_sha256: str
+    source: str
+    mode: str
+    depth: str
+    cloud: str
+    pictures: bool | None
+    threads: int
+    torchvts: str
+    torch: str
+
+
+def begin(out: Path, settings: Settings, overwrite: bool) -> Settings:
+    """Begin or continue a run in ``out``: write the settings, or compare them with those that are there; remove torn files.
+
+    Raises:
+        ValueError: the run was begun with other settings.
+    """
+    if overwrite:
+        shutil.rmtree(out / STATE / "frames", ignore_errors=True)
+        for path in (out / STATE / "settings.json", out / "frames.csv", out / "failed.csv"):
+            path.unlink(missing_ok=True)
+    if (out / STATE / "settings.json").exists():
+        settings = join(out, settings)
+    else:
+        if settings.pictures is None:
+            settings = replace(settings, pictures=has_few_frames(Path(settings.source)))
+        with write_atomically(out / STATE / "settings.json") as temporary:
+            temporary.write_text(json.dumps(asdict(settings), indent=1), encoding="utf-8")
+    torn = re.compile(r"\..+-[0-9a-f]{8}\.(png|npy|pcd|ply|csv|json)")  # names of write_atomically
+    for folder, folders, names in os.walk(out):
+        folders[:] = [name for name in folders if name != STATE]
+        for name in filter(torn.fullmatch, names):
+            Path(folder, name).unlink(missing_ok=True)
+    return settings
+
+
+def join(out: Path, settings: Settings) -> Settings:
+    """The settings with which a run was begun.
+
+    Raises:
+        ValueError: they differ from ``settings``, or cannot be read.
+    """
+    path = out / STATE / "settings.json"
+    try:
+        begun = Settings(**json.loads(path.read_text(encoding="utf-8")))
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path}: not the settings of a run ({error}): give another --out, or --overwrite") from error
+    if settings.pictures is None:
+        settings = replace(settings, pictures=begun.pictures)
+    names = {"calibration_sha256": "calibration file"}
+    other = [
+        f"{names.get(field.name, field.name)} {str(getattr(begun, field.name))[:60]!r} then, "
+        f"{str(getattr(settings, field.name))[:60]!r} now"
+        for field in fields(Settings)
+        if getattr(begun, field.name) != getattr(settings, field.name)
+    ]
+    if other:
+        raise ValueError(
+            f"out: {out} was begun with other settings: {'; '.join(other)}: give another --out, or --overwrite to begin anew"
+        )
+    return begun
+
+
+@contextmanager
+def locked(out: Path) -> Iterator[None]:
+    """Hold ``out`` for one run; the system releases it when the process ends, however that happens.
+
+    Raises:
+        RuntimeError: another run holds it.
+    """
+    (out / STATE).mkdir(parents=True, exist_ok=True)
+    try:
+        import fcntl
+    except ImportError:  # no such locks on this system
+        yield
+        return
+    with (out / STATE / "lock").open("w") as stream:
+        try:
+            fcntl.lockf(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise RuntimeError(f"out: another run is writing into {out}: wait for it, or stop it") from error
+        yield
+
+
+@dataclass(frozen=True)
+class Records:
+    """The records of a run, and the files that each frame must have."""
+
+    source: Path
+    out: Path
+    settings: Settings
+
+    def write(self, item: Item, frame: int, **figures: Any) -> None:
+        """Write the record of a frame (-1 for an image, or for a whole video) after its files are in place."""
+        path = self._path(item, frame)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps({"mark": item.mark, **figures}), encoding="utf-8")
+
+    def read(self, item: Item, frame: int) -> Record | None:
+        """The record of a frame; None where there is none, a kill has torn it, or the source file has changed since."""
+        try:
+            record = json.loads(self._path(item, frame).read_bytes())
+        except (OSError, ValueError):
+            return None
+        return record if isinstance(record, dict) and record.get("mark") == list(item.mark) else None
+
+    def is_done(self, item: Item, frame: int) -> bool:
+        """Whether the result of a frame is there, whole."""
+        record = self.read(item, frame)
+        return record is not None and "failed" not in record and all(map(os.path.isfile, self._files(item, frame, record)))
+
+    def length(self, video: Item) -> int | None:
+        """Number of frames of a video; None where no process has decoded it to its end."""
+        record = self.read(video, -1)
+        return None if record is None else record.get("frames")
+
+    def _path(self, item: Item, frame: int) -> Path:
+        return self.out / STATE / "frames" / f"{item.frame_stem(frame)}.json"
+
+    def _files(self, item: Item, frame: int, record: Record) -> Iterator[str]:
+        stem = self.out / item.frame_stem(frame)
+        if self.settings.depth != "none":
+            yield f"{stem}_depth.{self.settings.depth}"
+        if self.settings.cloud != "none" and record["contact_mm2"] > 0.0:
+            yield f"{stem}.{self.settings.cloud}"
+        if self.settings.pictures:
+            yield f"{stem}_picture.png"
+
+    def _rows(self, item: Item) -> Iterator[tuple[str, Record | None]]:
+        frames: Iterable[int] = (-1,)
+        if item.is_video and (length := self.length(item)) is not None:
+            frames = range(length)
+        return ((item.frame_name(frame), self.read(item, frame)) for frame in frames)
+
+    def write_tables(self) -> tuple[int, list[tuple[str, str]]]:
+        """Write frames.csv, and failed.csv where frames were left out.
+
+        Returns:
+            Number of rows of frames.csv, and (name, reason) of the frames that were left out.
+        Raises:
+            RuntimeError: frames without a record, which a process that died was to do.
+        """
+        count = 0
+        failed: list[tuple[str, str]] = []
+        missing: list[str] = []
+
+        def rows() -> Iterator[tuple[str, ...]]:
+            nonlocal count
+            for item in list_items(self.source):
+                for name, record in self._rows(item):
+                    if record is None:
+                        missing.append(name)
+                    elif "failed" in record:
+                        failed.append((name, record["failed"]))
+                    else:
+                        count += 1
+                        yield name, f"{record['deepest_mm']:.6f}", f"{record['contact_mm2']:.6f}"
+            if missing:
+                raise RuntimeError(f"{len(missing)} frames have no result, the first is {missing[0]}: run the same command again")
+
+        _write_csv(self.out / "frames.csv", ("frame", "deepest_mm", "contact_mm2"), rows())
+        if failed:
+            _write_csv(self.out / "failed.csv", ("frame", "reason"), failed)
+        else:
+            (self.out / "failed.csv").unlink(missing_ok=True)
+        return count, failed
+
+
+def _write_csv(path: Path, head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> None:
+    with (
+        write_atomically(path) as temporary,
+        temporary.open("w", encoding="utf-8", errors="surrogateescape", newline="") as stream,
+    ):
+        table = csv.writer(stream, lineterminator="\n")
+        table.writerow(head)
+        table.writerows(rows)

@@ -1,0 +1,91 @@
+"""Methods of other libraries to compare with: SciPy's cosine transform, and a frame as gs_sdk computes it."""
+
+import importlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ..core.geometry import normal_from_gradient
+from ..integration import divergence
+from ..model import Sensor, gs_sdk
+from ..normals import NormalFromMLP
+from ..pipeline import DepthOutput
+
+
+class PoissonSciPy(nn.Module):
+    """The free border of :class:`torchvts.PoissonBackground` by SciPy's cosine transform."""
+
+    def __init__(self, mm_per_pixel: float) -> None:
+        super().__init__()
+        self.mm_per_pixel = mm_per_pixel
+
+    def forward(self, gradient: Tensor) -> Tensor:
+        depth = torch.from_numpy(scipy_solve(divergence(gradient)[0, 0].numpy()) * self.mm_per_pixel)
+        background = (gradient == 0).all(dim=1)[0]
+        return (depth - depth[background].mean())[None, None]
+
+
+def scipy_solve(right: "np.ndarray[Any, Any]") -> "np.ndarray[Any, Any]":
+    """Solve Poisson's equation with a free border by SciPy's DCT of type 2."""
+    from scipy import fft
+
+    spectrum = fft.dctn(right, type=2)
+    wave = [np.cos(np.pi * np.arange(n) / n) for n in right.shape]
+    value = (2.0 * wave[0][:, None] + 2.0 * wave[1][None, :] - 4.0).astype(right.dtype)
+    value[0, 0] = 1.0
+    spectrum[0, 0] = 0.0
+    solved: np.ndarray[Any, Any] = fft.idctn(spectrum / value, type=2)
+    return solved
+
+
+class GsSdkPipeline:
+    """A frame in the steps of gs_sdk: its network at every pixel, SciPy's DCT in double precision, a mask by colour and height.
+
+    It follows gs_sdk's published formats (network, gradients, height map) and the steps in its documentation; it holds none of its
+    code.
+
+    Args:
+        network: the network.
+        background: (3, H, W) in [0, 1], image without contact.
+    """
+
+    def __init__(self, network: NormalFromMLP, background: Tensor) -> None:
+        self.network = network.eval()
+        self.background = gs_sdk.image_to_bgr(background).astype(np.int16)
+        with torch.inference_mode():
+            self.background_gradient = self.network.gradient_px(background[None])
+
+    def __call__(self, pixels: "np.ndarray[Any, Any]") -> tuple[Any, Any, Any]:
+        """B, G, R uint8 (H, W, 3) to gradients (2, H, W), height map in pixels, and mask."""
+        import cv2
+
+        with torch.inference_mode():
+            gradient = (self.network.gradient_px(gs_sdk.image_from_bgr(pixels)[None]) - self.background_gradient)[0].double()
+        height = scipy_solve(divergence(gradient[None])[0, 0].numpy())
+        change = np.abs(pixels.astype(np.int16) - self.background).max(axis=2)
+        mask = ((change > 15) & (height < -0.2)).astype(np.uint8)
+        mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+        mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+        return gradient.numpy(), height, mask
+
+    def as_output(self, images: Tensor) -> DepthOutput:
+        """The result in the form of a pipeline; gradients need no pitch, and the height map has that of a GelSight Mini."""
+        gradient, height, mask = self(gs_sdk.image_to_bgr(images[0]))
+        pitch = Sensor.load("gelsight_mini").mm_per_pixel
+        slope = -torch.from_numpy(gradient)[None]
+        depth = -pitch * torch.from_numpy(height)[None, None]
+        return DepthOutput(depth, slope, normal_from_gradient(slope), torch.from_numpy(mask)[None, None].bool())
+
+
+def installed_gs_sdk(weights: Path, background: "np.ndarray[Any, Any]", mm_per_pixel: float) -> Callable[[Any], object] | None:
+    """A frame of gs_sdk itself, if it is installed (it is not on PyPI: the package of that name there is another one)."""
+    try:
+        reconstructor = importlib.import_module("gs_sdk.gs_reconstruct").Reconstructor(str(weights))
+        reconstructor.load_bg(background)
+    except ImportError:
+        return None
+    return lambda pixels: reconstructor.get_surface_info(pixels, mm_per_pixel)

@@ -1,0 +1,151 @@
+"""Presses to learn from: without their labels, located by calibration, as pixels of known slope, and for gs_sdk's network."""
+
+import dataclasses
+import warnings
+from collections.abc import Sequence
+from functools import cached_property
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ..calibration import CalibrationWarning, Press, calibrate
+from ..calibration.calibrate import RESPONSE_BLUR_PX, by_presses
+from ..compensate import Compensate
+from ..core.checks import check_image
+from ..model import Calibration, Sensor
+from ..normals import MlpFit, fit_mlp
+from .score import ball_truth
+
+
+class Training:
+    """Presses to learn from, without their labels, and the calibration by response fields that they give without a prior.
+
+    Args:
+        background: (3, H, W) in [0, 1], image without contact.
+        presses: presses to learn from.
+        sensor: the sensor; its prior is not used.
+    Attributes:
+        labelled: the presses as given, with their labels, which only the fit of a prior may use.
+        presses: the presses without their labels.
+    """
+
+    def __init__(self, background: Tensor, presses: Sequence[Press], sensor: Sensor) -> None:
+        self.background = background
+        self.sensor = sensor.without_prior()
+        self.labelled = presses
+        self.presses = [without_labels(press) for press in presses]
+
+    @cached_property
+    def calibration(self) -> Calibration:
+        """Calibration by all presses, made when first needed."""
+        return quiet_calibrate(self.background, self.sensor, self.presses)
+
+    @cached_property
+    def located(self) -> list[Press]:
+        """The presses that the calibration used, with the centres and contact radii that it found."""
+        used = {row["name"]: row for row in self.calibration.report["presses"] if row["used"]}
+        return [
+            dataclasses.replace(
+                press, center_px=tuple(used[press.name]["center_px"]), contact_radius_px=used[press.name]["contact_radius_px"]
+            )
+            for press in self.presses
+            if press.name in used
+        ]
+
+    def of_family(self, degree: int, product_degree: int) -> Calibration:
+        """Calibration by the located presses and response fields of that size alone."""
+        return by_presses(self.background, self.sensor, self.located, None, False, ((degree, product_degree),))[2]
+
+
+class TrainingPixels(NamedTuple):
+    """Pixels on balls.
+
+    Attributes:
+        intensity: (N, 3).
+        xy: (N, 2), column and row.
+        slope: (N, 2), mm per mm.
+        press: (N,), index of the press.
+    """
+
+    intensity: Tensor
+    xy: Tensor
+    slope: Tensor
+    press: Tensor
+
+
+def without_labels(press: Press) -> Press:
+    """The press without centre and contact radius."""
+    return dataclasses.replace(press, center_px=None, contact_radius_px=None)
+
+
+def quiet_calibrate(background: Tensor, sensor: Sensor, presses: Sequence[Press] = ()) -> Calibration:
+    """``calibrate`` without its warnings: an evaluation reports the errors themselves."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CalibrationWarning)
+        return calibrate(background, sensor, presses)
+
+
+def training_pixels(compensate: nn.Module, presses: Sequence[Press], mm_per_pixel: float) -> TrainingPixels:
+    """Pixels on balls, :data:`torchvts.evaluation.score.RIM_PX` inside their contact radius, and the slope there.
+
+    Args:
+        compensate: module that prepares the images.
+        presses: presses with centres and contact radii.
+        mm_per_pixel: pixel pitch, mm.
+    Returns:
+        The pixels of all presses.
+    Raises:
+        ValueError: no presses, or one without centre or contact radius.
+    """
+    if not presses:
+        raise ValueError("presses: expected one or more with center and contact radius, got none: label some, or press deeper")
+    parts: list[TrainingPixels] = []
+    for index, press in enumerate(presses):
+        height, width = press.image.shape[1:]
+        truth = ball_truth(press, height, width, mm_per_pixel)
+        rows, columns = torch.nonzero(truth.region[0, 0], as_tuple=True)
+        with torch.inference_mode():
+            value = compensate(press.image[None])[0][:, rows, columns].T
+        slope = truth.gradient[0][:, rows, columns].T.to(value.dtype)
+        xy = torch.stack((columns, rows), 1).to(value.dtype)
+        parts.append(TrainingPixels(value.clone(), xy, slope, torch.full_like(rows, index)))
+    return TrainingPixels(*(torch.cat(column) for column in zip(*parts)))
+
+
+def train_network(
+    background: Tensor,
+    presses: Sequence[Press],
+    sensor: Sensor,
+    blur_px: float = RESPONSE_BLUR_PX,
+    seed: int = 0,
+    max_epochs: int = 60,
+    progress: bool = False,
+) -> MlpFit:
+    """Train gs_sdk's RGBXY network on presses, on raw images behind ``Compensate(blur_px=blur_px)``.
+
+    Args:
+        background: (3, H, W) in [0, 1], image without contact.
+        presses: at least two; where a contact radius is missing, ``calibrate`` without the prior finds centre and radius.
+        sensor: the sensor.
+        blur_px: blur of the images, pixels.
+        seed: seed of weights, order and held-out presses.
+        max_epochs: largest number of epochs.
+        progress: show a bar.
+    Returns:
+        The trained network and its history.
+    Raises:
+        ValueError, TypeError: see :func:`torchvts.calibrate` and :func:`torchvts.normals.fit_mlp`.
+    """
+    check_image("background", background, sensor.height, sensor.width, sensor.name)
+    for press in presses:
+        check_image(f"{press.name}: image", press.image, sensor.height, sensor.width, sensor.name)
+    unlabelled = {press.name for press in presses if press.center_px is None}
+    known = [press for press in presses if press.center_px is not None and press.contact_radius_px is not None]
+    if unlabelled:
+        known += [press for press in Training(background, presses, sensor).located if press.name in unlabelled]
+    compensate = Compensate(blur_px=blur_px)
+    pixels = training_pixels(compensate, known, sensor.mm_per_pixel)
+    flat = compensate(background[None])[0].clamp(0, 1)
+    intensity, xy, slope, group = pixels
+    return fit_mlp(intensity.clamp(0, 1), xy, slope, flat, groups=group, seed=seed, max_epochs=max_epochs, progress=progress)

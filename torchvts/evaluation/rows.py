@@ -1,0 +1,151 @@
+"""The one record of a measurement, a :class:`Row`: speed, stability and evaluation write it as Markdown and as JSON."""
+
+import dataclasses
+import json
+import statistics
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+
+@dataclass(frozen=True)
+class Size:
+    """Size of the frames.
+
+    Attributes:
+        height: rows.
+        width: columns.
+        batch: frames in one call.
+    """
+
+    height: int
+    width: int
+    batch: int = 1
+
+
+@dataclass(frozen=True)
+class Time:
+    """Time and memory of one frame.
+
+    Attributes:
+        ms_median: median time, ms.
+        ms_iqr: interquartile range of the time, ms.
+        frames_per_second: by the median.
+        memory_mb: largest memory that one call holds beside its inputs, MB.
+        threads: number of threads.
+        machine: kind of processor, number of cores, version of torch.
+        floor_ms: time of the memory traffic or of the FFT of a stage alone, ms.
+    """
+
+    ms_median: float
+    ms_iqr: float
+    frames_per_second: float
+    memory_mb: float | None
+    threads: int
+    machine: str
+    floor_ms: float | None = None
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method on one set of data.
+
+    Attributes:
+        kind: what was measured: "scene" (exact truth), "wall" (exact truth, vertical walls), "sensor" (balls on a real sensor),
+            "stage" (part of a frame), "batch", "threads", "corruption" (a scene of the gallery) or "presses" (cross-validation).
+        method: its name.
+        data: name of the scene, the corruption or the presses.
+        errors: value by name, such as "normal_deg"; None where nothing could be measured.
+        size: of the frames; None if they differ.
+        time: of one frame; None if it was not measured.
+        parameters: number of parameters that the method learned or was given; None if unknown.
+        severity: of the corruption.
+        seed: of noise and place.
+        frames: number of frames behind the errors.
+        worst: name of the frame with the largest error.
+        ours: whether it is a method of this library, and not of a peer.
+        command: command that made the row.
+        note: an error, a warning or a remark.
+    """
+
+    kind: str
+    method: str
+    data: str
+    errors: Mapping[str, float | None] = field(default_factory=dict)
+    size: Size | None = None
+    time: Time | None = None
+    parameters: int | None = None
+    severity: float | None = None
+    seed: int | None = None
+    frames: int = 1
+    worst: str = ""
+    ours: bool = True
+    command: str = ""
+    note: str = ""
+
+    def error(self, name: str) -> float | None:
+        """One error; None if it was not measured."""
+        return self.errors.get(name)
+
+
+class Column(NamedTuple):
+    """Column of a table: its title, and the text of its cell in a row."""
+
+    title: str
+    cell: Callable[[Row], str]
+
+
+def number(value: float | None, digits: int, missing: str = "") -> str:
+    """A value with so many digits after the point."""
+    return missing if value is None else f"{value:.{digits}f}"
+
+
+def error_column(title: str, name: str, digits: int, missing: str = "") -> Column:
+    """Column of one of a row's errors."""
+    return Column(title, lambda row: number(row.error(name), digits, missing))
+
+
+def table(rows: Iterable[Row], columns: Sequence[Column]) -> str:
+    """Rows as a Markdown table."""
+    return markdown([column.title for column in columns], [[column.cell(row) for column in columns] for row in rows])
+
+
+def markdown(titles: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    """A Markdown table of texts.
+
+    Example:
+        >>> print(markdown(["method", "ms"], [["fast", "2.0"]]))
+        | method | ms |
+        |---|---|
+        | fast | 2.0 |
+    """
+    head = ["| " + " | ".join(titles) + " |", "|" + "---|" * len(titles)]
+    return "\n".join(head + ["| " + " | ".join(cells) + " |" for cells in lines])
+
+
+def to_json(rows: Iterable[Row]) -> str:
+    """Rows as a JSON list, one object each."""
+    return json.dumps([dataclasses.asdict(row) for row in rows], indent=1)
+
+
+def from_json(text: str) -> list[Row]:
+    """The rows that :func:`to_json` wrote."""
+    return [row_from_dict(values) for values in json.loads(text)]
+
+
+def row_from_dict(values: dict[str, Any]) -> Row:
+    """The row whose ``dataclasses.asdict`` is given."""
+    size, time = values["size"], values["time"]
+    return Row(**(values | {"size": size and Size(**size), "time": time and Time(**time)}))
+
+
+def mean(values: Iterable[float | None]) -> float | None:
+    """Mean of the known values; None if there is none."""
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
+
+
+def median(values: Iterable[float | None]) -> float | None:
+    """Median of the known values; None if there is none."""
+    known = [value for value in values if value is not None]
+    return statistics.median(known) if known else None

@@ -1,0 +1,152 @@
+"""Follows slow drift of the light by the skin without contact, and divides it out of every frame."""
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ..core.checks import check_batch, check_field, check_least, check_positive, check_range, check_same_size, check_shape
+from ..core.geometry import pixel_grid_mm
+from ..core.robust import tukey_weight
+from ..model.calibration import PEDESTAL
+
+TIME_CONSTANT_S = 1.0
+"""The light is followed with this time constant: an LED that fades by 1 % a second is followed 1 % behind."""
+
+LIGHT_STEP = 0.03
+"""A larger difference to the light followed so far is a step: it is reported, and not learned."""
+
+RECOVERY_S = 1.0
+"""After a contact the gel takes this long to come back; an apparent change of light until then is not a step."""
+
+LEAST_FREE = 0.25
+"""Share of the skin that must be free of contact for the light to be measured on it."""
+
+
+class FollowLight:
+    """Follows slow drift of the light by the skin without contact, and divides it out of every frame.
+
+    In each channel the light relative to the background is a plane over the image (a level and two tilts): LEDs fade, one side
+    perhaps more. Three parameters cannot take the shape of an object, and they reach under a contact from the skin around it.
+
+    * Cells (1/24 of the height) in contact or next to it, dark cells and saturated ones are never used, so that an object that lies
+      on the skin is never learned.
+    * The plane is fitted to the other cells robustly (Tukey) and moves by 1 - exp(-dt / time_constant_s) of the difference.
+    * With less than a quarter of the cells free, nothing is learned ("held").
+    * A difference of more than 3 % to the light followed so far is not drift. Without contact, or where one plane explains 90 % of
+      all cells to 1 %, it is reported as a step ("stepped"). With a contact, which scatters light, and for a second after it, while
+      the gel comes back, it is "held". Neither is learned; when the light comes back, following goes on.
+
+    Args:
+        background: (3, H, W), image value of the unit without contact.
+        time_constant_s: of the following.
+    Attributes:
+        state: "following", "held" or "stepped".
+        steps: how often the light has stepped.
+        plane: (3, 3) float64, level and tilts of each channel; 1, 0, 0 at the start.
+    """
+
+    def __init__(self, background: Tensor, time_constant_s: float = TIME_CONSTANT_S) -> None:
+        self.time_constant_s = check_positive("time_constant_s", time_constant_s)
+        check_field("background", background)
+        check_range("background", background)
+        if min(background.shape[1:]) < 4:
+            raise ValueError(f"background: expected H and W of at least 4, got {tuple(background.shape)}: too small for cells")
+        height, width = self.size = (background.shape[1], background.shape[2])
+        self.cell = max(2, height // 24)
+        self.plane = torch.tensor([[1.0, 0.0, 0.0]] * 3, dtype=torch.float64)
+        self.set_background(background[None])
+        rows, columns = self._background.shape[1:]
+        x = torch.linspace(-1.0, 1.0, columns, dtype=torch.float64).expand(rows, columns)
+        y = torch.linspace(-1.0, 1.0, rows, dtype=torch.float64)[:, None].expand(rows, columns)
+        self._basis = torch.stack((torch.ones_like(x), x, y)).flatten(1)  # (3, cells)
+        reach_x, reach_y = width / (columns * self.cell), height / (rows * self.cell)  # some pixels lie beyond the last cells
+        x_mm, y_mm = pixel_grid_mm(height, width, 1.0, background.dtype)
+        self._x, self._y = (x_mm * 2.0 / width * reach_x)[None], (y_mm * 2.0 / height * reach_y)[None]
+        self.state = "following"
+        self.steps = 0
+        self._since_contact_s = RECOVERY_S
+
+    @property
+    def level(self) -> list[float]:
+        """The light in R, G, B relative to the background, at the image centre."""
+        return [float(v) for v in self.plane[:, 0]]
+
+    def correct(self, image: Tensor) -> Tensor:
+        """The image (1, 3, H, W) as it would be in the background's light."""
+        self._check(image)
+        if float((self.plane - torch.tensor([1.0, 0.0, 0.0])).abs().max()) < 1e-5:
+            return image
+        level, tilt_x, tilt_y = (self.plane[:, k, None, None].to(image.dtype) for k in range(3))
+        return (image / (level + tilt_x * self._x + tilt_y * self._y)).clamp_(0.0, 1.0)
+
+    def update(self, image: Tensor, contact: Tensor, seconds: float) -> str:
+        """Learn from a frame.
+
+        Args:
+            image: (1, 3, H, W), as the camera gave it.
+            contact: (1, 1, H, W), its contact.
+            seconds: time since the last frame.
+        Returns:
+            The state.
+        """
+        self._check(image)
+        check_shape("contact", contact, (1, 1, *self.size), "image")
+        check_least("seconds", seconds, -np.inf)
+        cells, difference = self._difference(image)
+        pressed = nn.functional.max_pool2d(contact.float(), self.cell)
+        near = nn.functional.max_pool2d(pressed, 3, 1, 1)[0, 0] > 0
+        usable = self._usable & (cells < 0.97)
+        before = self.state
+        self._since_contact_s = 0.0 if bool(pressed.any()) else self._since_contact_s + seconds
+        free = usable & ~near
+        enough = bool((free.flatten(1).double().mean(1) >= LEAST_FREE * usable.flatten(1).double().mean(1)).all())
+        change = self._fit(difference, free if enough else usable)
+        if float(change.abs().sum(1).max()) > LIGHT_STEP:
+            residual = (difference.flatten(1) - change @ self._basis).abs()[usable.flatten(1)]
+            smooth = residual.numel() > 0 and float((residual < 0.01).double().mean()) > 0.9
+            self.state = "stepped" if smooth or self._since_contact_s >= RECOVERY_S else "held"
+        elif not enough:
+            self.state = "held"
+        else:
+            self.state = "following"
+            self.plane += (1.0 - float(np.exp(-max(0.0, seconds) / self.time_constant_s))) * change * self.plane[:, :1]
+        self.steps += self.state == "stepped" and before != "stepped"
+        return self.state
+
+    def set_background(self, image: Tensor) -> None:
+        """Take an image (1, 3, H, W) without contact, in the background's light, as what the cells look like."""
+        self._check(image)
+        background = nn.functional.avg_pool2d(image, self.cell)[0].double()
+        self._background = background + PEDESTAL
+        self._usable = (background > 0.06) & (background < 0.97)
+
+    def start(self, image: Tensor) -> None:
+        """Take over the light of an image (1, 3, H, W) that is known to be without contact."""
+        self._check(image)
+        for _ in range(3):
+            cells, difference = self._difference(image)
+            self.plane += self._fit(difference, self._usable & (cells < 0.97)) * self.plane[:, :1]
+
+    def _check(self, image: Tensor) -> None:
+        check_batch("image", image, 3)
+        check_same_size("image", image, "the background", *self.size)
+
+    def _difference(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Cells of an image, and their relative difference to the light followed so far."""
+        cells = nn.functional.avg_pool2d(image, self.cell)[0].double()
+        now = (self.plane @ self._basis).reshape(cells.shape)
+        return cells, (cells / now + PEDESTAL) / self._background - 1.0
+
+    def _fit(self, values: Tensor, used: Tensor) -> Tensor:
+        """A plane for each channel, (3, 3), by three rounds of Tukey's weights; tilts are regularised where few cells are used."""
+        target, used = values.flatten(1), used.flatten(1)
+        ridge = torch.diag(torch.tensor([1e-9, 0.02, 0.02], dtype=torch.float64)) * target.shape[1]
+        plane = torch.zeros(3, 3, dtype=torch.float64)
+        plane[:, 0] = torch.where(used, target, torch.nan).nanmedian(1).values.nan_to_num()
+        for _ in range(3):
+            residual = (target - plane @ self._basis).abs()
+            scale = torch.where(used, residual, torch.nan).nanmedian(1, keepdim=True).values.nan_to_num(1.0)
+            weight = used.double() * tukey_weight(residual / (6.0 * scale).clamp_min(2e-3))
+            normal = torch.einsum("cn,in,jn->cij", weight, self._basis, self._basis) + ridge
+            plane = torch.linalg.solve(normal, torch.einsum("cn,in->ci", weight * target, self._basis))
+        return plane

@@ -48,7 +48,7 @@ RULES = [
         "Nothing is touched?",
     ),
     Rule(
-        r"\b(?<!degrees\s)(?<!elements\s)(?<!pixels\s)(?<!mm\s)apart\b|\btorn\b",
+        r"\b(?<!degrees\s)(?<!elements\s)(?<!pixels\s)(?<!mm\s)(?<!far\s)(?<!them\s)apart\b|\btorn\b(?! (file|write)s?)",
         "residual, difference, has_shadow, separately",
         "How far both are apart.",
         "Lights 120 degrees apart.",
@@ -91,7 +91,7 @@ RULES = [
         "The matrix is ill-conditioned; a weak prior.",
     ),
     Rule(
-        r"\bpin(s|ned|ning)?\b(?![- ]memory)|\bloose (direction|light|motion|center)s?\b",
+        r"\bpin(s|ned|ning)?\b(?!-memory| (memory|packages|versions))|\bloose (direction|light|motion|center)s?\b",
         "constrains, well / poorly constrained; held by a test",
         "The image pins the lights.",
         "A pinhole camera.",

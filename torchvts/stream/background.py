@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from ..accelerated import ContactMask
-from ..calibration import GIVEN_MISFIT, LOOSE_DEG, ROUGH, CalibrationWarning, calibrate, channel_structure
+from ..calibration import GIVEN_MISFIT, POORLY_CONSTRAINED_DEG, ROUGH, CalibrationWarning, calibrate, channel_structure
 from ..core.checks import check_batch
 from ..model import Calibration, ResponseField, ResponseModel, Sensor, check_sensor
 from ..model.calibration import PEDESTAL

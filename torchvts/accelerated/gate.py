@@ -10,6 +10,9 @@ from torch.autograd import forward_ad
 
 from . import kernels
 
+HALF = (torch.float16, torch.bfloat16)
+"""Of these NumPy knows one, and sums it otherwise."""
+
 _refused = contextvars.ContextVar("refused", default=False)
 
 
@@ -39,18 +42,21 @@ def arrays_usable(*tensors: Tensor) -> bool:
     if forward_ad._current_level >= 0 or torch._C._len_torch_dispatch_stack() > 0:  # tangents and traces would be lost
         return False
     recorded = torch.is_grad_enabled()
-    return all(
-        type(tensor) in (Tensor, nn.Parameter)
-        and tensor.device.type == "cpu"
-        and tensor.dtype not in (torch.float16, torch.bfloat16)
-        and not (recorded and tensor.requires_grad)
-        and not torch._C._functorch.is_functorch_wrapped_tensor(tensor)
-        for tensor in tensors
-    )
+    for tensor in tensors:  # a loop, because it runs some ten times a frame
+        if type(tensor) is not Tensor and type(tensor) is not nn.Parameter:
+            return False
+        if tensor.device.type != "cpu" or tensor.dtype in HALF or (recorded and tensor.requires_grad):
+            return False
+        if torch._C._functorch.is_functorch_wrapped_tensor(tensor):
+            return False
+    return True
 
 
 def usable(*tensors: Tensor) -> bool:
     """Whether compiled kernels may work on these tensors: as :func:`arrays_usable`, and float32, and the kernels are there."""
     if torch.compiler.is_compiling() or _refused.get() or kernels.library() is None:
         return False
-    return all(tensor.dtype == torch.float32 for tensor in tensors) and arrays_usable(*tensors)
+    for tensor in tensors:
+        if tensor.dtype is not torch.float32:
+            return False
+    return arrays_usable(*tensors)

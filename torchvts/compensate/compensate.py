@@ -95,8 +95,12 @@ class Compensate(nn.Module):
         check_batch("image", image, 3)
         light = self.linear(self.markers(image))
         saturated = self.gain.saturated(light)
-        light = self.drift(self.blur(self.defects(self.gain(light, saturated))))
-        return self.gain.restored(light, saturated) if self.restores else light
+        light = self.blur(self.defects(self.gain(light, saturated)))
+        normalised: Tensor = self.drift(light)
+        if not torch.jit.is_scripting():  # noqa: SIM102
+            if normalised is light:
+                return light
+        return self.gain.restored(normalised, saturated) if self.restores else normalised
 
 
 class Linearise(nn.Module):

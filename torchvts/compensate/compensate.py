@@ -52,13 +52,13 @@ class Compensate(nn.Module):
             check_record("markers", markers, nn.Module, "FillMarkers() makes one")
         if drift is not None:
             check_record("drift", drift, Drift)
-        self.markers = nn.Identity() if markers is None else markers
-        self.linear = Linearise(gamma)
+        linear, fill, smooth = Linearise(gamma), FillDefects(defects), Blur(blur_px)
+        self.linear = nn.ModuleList(([] if markers is None else [markers]) + ([] if linear.gamma == 1.0 else [linear]))
         self.gain = Gain(gain, offset, saturated_model, saturation_light)
-        self.defects = FillDefects(defects)
-        self.blur = Blur(blur_px)
+        self.clean = nn.ModuleList(([] if fill.defect.shape[0] == 0 else [fill]) + ([] if smooth.std_px == 0.0 else [smooth]))
         self.drift = nn.Identity() if drift is None else drift
-        self.restores = drift is not None and saturated_model is not None
+        self.saturates = saturated_model is not None
+        self.restores = drift is not None and self.saturates
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, drift: bool = False) -> "Compensate":
@@ -93,14 +93,20 @@ class Compensate(nn.Module):
     def forward(self, image: Tensor) -> Tensor:
         """(B, 3, H, W) image in [0, 1] to (B, 3, H, W) linear light."""
         check_batch("image", image, 3)
-        light = self.linear(self.markers(image))
-        saturated = self.gain.saturated(light)
-        light = self.blur(self.defects(self.gain(light, saturated)))
+        light = image
+        for block in self.linear:  # only the blocks that the unit needs
+            light = block(light)
+        saturated = self.gain.saturated(light) if self.saturates else None
+        light = self.gain(light, saturated)
+        for block in self.clean:
+            light = block(light)
         normalised: Tensor = self.drift(light)
         if not torch.jit.is_scripting():  # noqa: SIM102
             if normalised is light:
                 return light
-        return self.gain.restored(normalised, saturated) if self.restores else normalised
+        if self.restores and saturated is not None:
+            return self.gain.restored(normalised, saturated)
+        return normalised
 
 
 class Linearise(nn.Module):
@@ -140,10 +146,10 @@ class Gain(nn.Module):
 
     @torch.jit.export
     def saturated(self, light: Tensor) -> Tensor:
-        """Where the frame and the background are both saturated, bool (B, 3, H, W); empty where the background never is."""
+        """Where the frame and the background are both saturated, bool (B, 3, H, W)."""
         model = self.saturated_model
         if model is None:
-            return torch.zeros(0, dtype=torch.bool)
+            return torch.zeros_like(light, dtype=torch.bool)
         check_same_size("image", light, "the calibration", model.shape[1], model.shape[2])
         return (light >= self.saturation_light) & (model > 0)
 
@@ -153,7 +159,7 @@ class Gain(nn.Module):
         model = self.saturated_model
         return light if model is None else torch.where(saturated, model, light)
 
-    def forward(self, light: Tensor, saturated: Tensor) -> Tensor:
+    def forward(self, light: Tensor, saturated: Tensor | None = None) -> Tensor:
         gain, offset = self.gain, self.offset
         if gain is not None:
             check_same_size("image", light, "the calibration", gain.shape[1], gain.shape[2])
@@ -161,7 +167,7 @@ class Gain(nn.Module):
         if offset is not None:
             check_same_size("image", light, "the calibration", offset.shape[1], offset.shape[2])
             light = light + offset
-        return self.restored(light, saturated)
+        return light if saturated is None else self.restored(light, saturated)
 
 
 class Blur(nn.Module):

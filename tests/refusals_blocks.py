@@ -117,12 +117,12 @@ TABLE = {
         },
     ),
     "ContactMask.from_calibration": Entry({"calibration": unit()}, {"calibration": OTHERS}),
-    "ContactMask.forward": forward(lambda: pipe().contact, 3, "compensated"),
-    "ContactMask.shadowed": forward(lambda: pipe().contact.shadowed, 3, "compensated"),
-    "ContactMask.soft": forward(lambda: pipe().contact.soft, 3, "compensated"),
+    "ContactMask.forward": forward(lambda: pipe().deformed, 3, "compensated"),
+    "ContactMask.shadowed": forward(lambda: pipe().deformed.shadowed, 3, "compensated"),
+    "ContactMask.soft": forward(lambda: pipe().deformed.soft, 3, "compensated"),
     "DepthPipeline": Entry(
         {
-            **{name: getattr(pipe(), name) for name in ("compensate", "contact", "normals", "gradient", "integrate")},
+            **{name: getattr(pipe(), name) for name in ("compensate", "deformed", "normals", "gradient", "integrate")},
             "mode": "fast",
             "mm_per_pixel": 1.0,
             "tolerance_px": 0.002,
@@ -130,7 +130,7 @@ TABLE = {
             "max_passes": 8,
         },
         {
-            **{name: [None, lambda x: x] for name in ("compensate", "contact", "normals", "gradient", "integrate")},
+            **{name: [None, lambda x: x] for name in ("compensate", "deformed", "normals", "gradient", "integrate")},
             "mm_per_pixel": NUMBER,
             "mode": ["slow", None, 1],
             "tolerance_px": NUMBER,

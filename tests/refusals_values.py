@@ -137,7 +137,7 @@ EYE = torch.eye(4, dtype=torch.float64)
 BAD_POSE = [EYE[:3], 2 * EYE, EYE + NAN, np.eye(4), "pose"]
 
 UP = torch.tensor([0.0, 0.0, 1.0]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)
-OUT = vts.DepthOutput(DEPTH, torch.zeros(1, 2, HEIGHT, WIDTH), UP, DEPTH > 0)
+OUT = vts.DepthOutput(DEPTH, torch.zeros(1, 2, HEIGHT, WIDTH), UP, DEPTH > 0, DEPTH > 0)
 GRADIENT = torch.zeros(1, 2, 8, 8)
 BAD_GRADIENT = [*batches(2), torch.zeros(1, 2, 1, 8)]
 BAD_MASKS = [torch.zeros(1, 1, 4, 4) > 0, torch.zeros(1, 1, 8, 8), torch.zeros(8, 8) > 0, "all", np.zeros((1, 1, 8, 8), bool)]

@@ -74,7 +74,7 @@ def network(dtype):
 
 CASES = {
     "Compensate": (part("compensate"), images, "image"),
-    "ContactMask": (part("contact"), images, "compensated"),
+    "ContactMask": (part("deformed"), images, "compensated"),
     "NormalFromIntensity": (part("normals"), images, "compensated"),
     "NormalFromResponse": (lambda dtype: vts.NormalFromResponse.from_calibration(response(dtype)), images, "compensated"),
     "NormalFromLookup": (lookup, images, "compensated"),
@@ -224,7 +224,7 @@ def test_a_block_works_in_sequential(name):
 def test_blocks_chain_by_hand_in_sequential():
     whole, example = build("DepthPipeline fast")
     normals = nn.Sequential(whole.compensate, whole.normals, whole.gradient)(example)
-    depth = whole.integrate(normals * whole.contact(whole.compensate(example)))
+    depth = whole.integrate(normals * whole.deformed(whole.compensate(example)))
     assert_same(depth, whole(example).depth_mm, 1e-6)  # the pipeline sees normals in a window only
 
 

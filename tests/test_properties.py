@@ -256,7 +256,7 @@ def test_gradients_through_single_blocks_are_finite(kind, by):
     compensated = pipe.compensate(image)
     depth_mm = torch.zeros(1, 1, HEIGHT, WIDTH).requires_grad_()
     normals = [pipe.normals(compensated), pipe.normals(compensated, depth_mm)]
-    total = sum(normal.sum() for normal in normals) + pipe.contact.soft(compensated).sum()
+    total = sum(normal.sum() for normal in normals) + pipe.deformed.soft(compensated).sum()
     for slope in torch.autograd.grad(total, (image, depth_mm)):
         assert bool(torch.isfinite(slope).all())
 

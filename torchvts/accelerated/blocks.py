@@ -83,12 +83,12 @@ class Crop(Twin, frames.Crop):
 
     plain = frames.Crop
 
-    def box(self, contact: Tensor) -> tuple[int, int, int, int]:
-        if not arrays_usable(contact):
-            return super().box(contact)
+    def box(self, deformed: Tensor) -> tuple[int, int, int, int]:
+        if not arrays_usable(deformed):
+            return super().box(deformed)
         import cv2
 
-        inside = contact[:, 0].to(torch.uint8).numpy()
+        inside = deformed[:, 0].to(torch.uint8).numpy()
         left, top, columns, rows = cv2.boundingRect(inside[0] if len(inside) == 1 else inside.max(axis=0))
         return top, top + rows, left, left + columns
 
@@ -174,11 +174,15 @@ class Uncrop(Twin, frames.Uncrop):
 
     plain = frames.Uncrop
 
-    def forward(self, frame: frames.Frame, solution: frames.Solution) -> frames.DepthOutput:
+    def forward(self, frame: frames.Frame, solution: frames.Solution, contact: Tensor) -> frames.DepthOutput:
         if not usable(solution.gradient):
-            return super().forward(frame, solution)
+            return super().forward(frame, solution, contact)
         gradient, normal = kernels.uncrop(solution.gradient, frame.window, frame.size)
-        return frames.DepthOutput(solution.depth_mm, gradient, normal, frame.contact)
+        (top, left), (height, width) = frame.window, frame.size
+        rows, columns = contact.shape[2], contact.shape[3]
+        if rows < height or columns < width:
+            contact = torch.nn.functional.pad(contact, [left, width - left - columns, top, height - top - rows])
+        return frames.DepthOutput(solution.depth_mm, gradient, normal, contact, frame.deformed)
 
 
 def _median(values: Tensor) -> Tensor:

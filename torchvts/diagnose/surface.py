@@ -107,8 +107,8 @@ class Surface:
     @property
     def contact(self) -> Tensor:
         """(H, W) bool."""
-        contact: Tensor = self.output.contact[0, 0]
-        return contact
+        deformed: Tensor = self.output.deformed[0, 0]
+        return deformed
 
     @property
     def steepness(self) -> Tensor:
@@ -152,7 +152,7 @@ def fit_length_error(surface: Surface, invalid: Tensor) -> LengthError | None:
         return None
     left_out = surface.dark.any(1, keepdim=True) | invalid
     valid = ~(nn.functional.max_pool2d(left_out.to(error.dtype), 5, 1, 2) > 0) & torch.isfinite(error)
-    inside = valid & surface.output.contact
+    inside = valid & surface.output.deformed
     if int(inside.sum()) < 20:
         return None
     sigma = noise[valid].median()

@@ -118,7 +118,8 @@ def _flat(calibration: Calibration) -> Built:
 
     def reconstruct(image: Tensor) -> DepthOutput:
         zero = torch.zeros_like(image)
-        return DepthOutput(zero[:, :1], zero[:, :2], normal_from_gradient(zero[:, :2]), torch.zeros_like(zero[:, :1]).bool())
+        nowhere = torch.zeros_like(zero[:, :1], dtype=torch.bool)
+        return DepthOutput(zero[:, :1], zero[:, :2], normal_from_gradient(zero[:, :2]), nowhere, nowhere)
 
     return Built(reconstruct, 0, "zero depth, for comparison")
 

@@ -78,7 +78,8 @@ class GsSdkPipeline:
         pitch = Sensor.load("gelsight_mini").mm_per_pixel
         slope = -torch.from_numpy(gradient)[None]
         depth = -pitch * torch.from_numpy(height)[None, None]
-        return DepthOutput(depth, slope, normal_from_gradient(slope), torch.from_numpy(mask)[None, None].bool())
+        contact = torch.from_numpy(mask)[None, None].bool()  # gs_sdk knows one mask
+        return DepthOutput(depth, slope, normal_from_gradient(slope), contact, contact)
 
 
 def installed_gs_sdk(weights: Path, background: "np.ndarray[Any, Any]", mm_per_pixel: float) -> Callable[[Any], object] | None:

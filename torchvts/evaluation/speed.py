@@ -306,8 +306,8 @@ def _stages(bench: Bench) -> Iterator[Row]:
         rig = _rig(*size, 1.0)
         pipe, image = _fast(rig), rig.image
         with torch.inference_mode():
-            contact = pipe.contact(pipe.compensate(image))
-            gradient = pipe.gradient(pipe.normals(image)) * contact
+            deformed = pipe.deformed(pipe.compensate(image))
+            gradient = pipe.gradient(pipe.normals(image)) * deformed
             depth = pipe.integrate(gradient)
         plane, spectrum = torch.rand(1, 1, *size), torch.fft.rfft2(torch.rand(1, 1, *size))
         with torch.inference_mode():
@@ -316,7 +316,7 @@ def _stages(bench: Bench) -> Iterator[Row]:
             transform = time_ms(partial(torch.fft.rfft2, plane)).median
             transform += time_ms(partial(torch.fft.irfft2, spectrum, s=size)).median
         calls: dict[str, tuple[Callable[[], object], float, str]] = {
-            "contact": (partial(pipe.contact, image), copy, "floor: one pass over the image"),
+            "deformed": (partial(pipe.deformed, image), copy, "floor: one pass over the image"),
             "normals, eq. 9, whole frame": (partial(pipe.normals, image), 3.0 * copy, "floor: one pass for each light"),
             "normals, eq. 10, whole frame": (partial(pipe.normals, image, depth), 3.0 * copy, "the same floor"),
             "integrate, whole frame": (partial(pipe.integrate, gradient), transform, "floor: one real FFT and its inverse"),

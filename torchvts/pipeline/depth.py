@@ -16,6 +16,7 @@ from ..accelerated import (
     Uncrop,
     scriptable,
 )
+from ..contact import ContactFromDepth
 from ..contact import ContactMask as PlainContactMask
 from ..core.checks import (
     check_batch,
@@ -27,7 +28,7 @@ from ..core.checks import (
     check_record,
     may_read_values,
 )
-from ..core.frame import DepthOutput, undeformed_output
+from ..core.frame import DepthOutput, depth_in_window, undeformed_output
 from ..integration import WrappedIntegrator, as_integrator
 from ..model import Calibration, check_calibration
 from ..normals import NormalFromIntensity as PlainNormalFromIntensity
@@ -43,16 +44,16 @@ STRIDE = 8
 
 
 class DepthPipeline(nn.Module):
-    """Images (B, 3, H, W) to a :class:`DepthOutput`: compensate, contact, crop, solve, refine, uncrop.
+    """Images (B, 3, H, W) to a :class:`DepthOutput`: compensate, deformed, crop, solve, refine, contact, uncrop.
 
     ``fast`` solves once (eq. 9). ``precise`` solves again with the depth found (eq. 10), until what is still missing falls below
-    ``tolerance_px``. ``auto`` skips frames without contact, predicts on every eighth pixel what a second pass would change, and
+    ``tolerance_px``. ``auto`` skips frames without deformed skin, predicts on every eighth pixel what a second pass would change, and
     solves only those frames again for which that exceeds ``refine_threshold_px``, until what is missing is below a fifth of it.
     Frames of a batch do not influence one another.
 
     Args:
         compensate: camera image to compensated image.
-        contact: compensated image to contact, bool (B, 1, H, W).
+        deformed: compensated image to where the skin has moved, bool (B, 1, H, W).
         normals: a :class:`~torchvts.normals.NormalModel`, or any module from a compensated image (B, 3, H, W) to normals (B, 3,
             H, W).
         gradient: normals to gradient.
@@ -62,6 +63,7 @@ class DepthPipeline(nn.Module):
         tolerance_px: pixels of pitch.
         refine_threshold_px: pixels of pitch.
         max_passes: bound on all passes.
+        contact: depth, gradient and deformed area to contact, bool (B, 1, H, W); None for :class:`ContactFromDepth`.
     Source:
         figure 2 and eq. 3-10 of the paper; "auto" and the stopping rule are this project's.
     """
@@ -71,7 +73,7 @@ class DepthPipeline(nn.Module):
     def __init__(
         self,
         compensate: nn.Module,
-        contact: nn.Module,
+        deformed: nn.Module,
         normals: nn.Module,
         gradient: nn.Module,
         integrate: nn.Module,
@@ -81,10 +83,11 @@ class DepthPipeline(nn.Module):
         tolerance_px: float = 0.002,
         refine_threshold_px: float = 0.05,
         max_passes: int = 8,
+        contact: nn.Module | None = None,
     ) -> None:
         super().__init__()
         check_choice("mode", mode, MODES)
-        for name, block in (("compensate", compensate), ("contact", contact), ("gradient", gradient)):
+        for name, block in (("compensate", compensate), ("deformed", deformed), ("gradient", gradient)):
             check_record(name, block, nn.Module)
         model, integrator = as_normal_model(normals), as_integrator(integrate)
         check_positive("mm_per_pixel", mm_per_pixel), check_positive("tolerance_px", tolerance_px)
@@ -98,10 +101,11 @@ class DepthPipeline(nn.Module):
         self.mm_per_pixel = mm_per_pixel
         self.skips_undeformed = mode == "auto"
         self.compensate = compensate
-        self.contact = contact
+        self.deformed = deformed
         self.crop = Crop(STRIDE, model.takes_window)
         self.solve = Solve(model, gradient, integrator)
         self.refine = self._policy(mode, tolerance_px, refine_threshold_px, min(max_passes, model.max_passes))
+        self.contact = ContactFromDepth(mm_per_pixel) if contact is None else contact
         self.uncrop = Uncrop()
 
     def _policy(self, mode: str, tolerance_px: float, refine_threshold_px: float, max_passes: int) -> nn.Module:
@@ -119,8 +123,8 @@ class DepthPipeline(nn.Module):
             policy = Adaptive(self.solve, LargestChange(), *grid, tolerance_px, max_passes, refine_threshold_px, STRIDE)
         if not isinstance(model, PlainNormalFromIntensity):
             return policy
-        contact = self.contact if isinstance(self.contact, PlainContactMask) else None
-        return Shadows(policy, contact, PoissonBackground(pitch), pitch)
+        deformed = self.deformed if isinstance(self.deformed, PlainContactMask) else None
+        return Shadows(policy, deformed, PoissonBackground(pitch), pitch)
 
     @classmethod
     def from_calibration(
@@ -167,12 +171,13 @@ class DepthPipeline(nn.Module):
         """
         check_images(images)
         compensated = self.compensate(images)
-        frame = self.crop(compensated, self.contact(compensated))
-        if may_read_values() and (images.shape[0] == 0 or (self.skips_undeformed and not bool(frame.contact.any()))):
+        frame = self.crop(compensated, self.deformed(compensated))
+        if may_read_values() and (images.shape[0] == 0 or (self.skips_undeformed and not bool(frame.deformed.any()))):
             return undeformed_output(frame)
         solution = self.solve(frame)  # eq. 9, 5, 4
         frame, solution = self.refine(frame, solution)  # eq. 10
-        out: DepthOutput = self.uncrop(frame, solution)
+        contact = self.contact(depth_in_window(frame, solution.depth_mm), solution.gradient, frame.mask)
+        out: DepthOutput = self.uncrop(frame, solution, contact)
         return out
 
     __jit_unused_properties__: ClassVar[list[str]] = ["gradient", "integrate", "normals"]

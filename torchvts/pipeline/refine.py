@@ -166,7 +166,7 @@ def still_missing_px(change_px: Tensor, last_px: Tensor) -> Tensor:
 def _some_frames(frame: Frame, index: Tensor, every: bool) -> Frame:
     if every:
         return frame
-    return Frame(frame.compensated[index], frame.contact[index], frame.image[index], frame.mask[index], frame.window, frame.size)
+    return Frame(frame.compensated[index], frame.deformed[index], frame.image[index], frame.mask[index], frame.window, frame.size)
 
 
 def _some(frames: Tensor, index: Tensor, every: bool) -> Tensor:

@@ -57,7 +57,7 @@ class StageClock:
     def watch(self, pipe: DepthPipeline) -> list[Any]:
         """Measure the blocks of a pipeline; returns handles whose ``remove()`` ends it."""
         handles: list[Any] = []
-        for name in ("compensate", "contact", "normals", "gradient", "integrate"):
+        for name in ("compensate", "deformed", "normals", "gradient", "integrate", "contact"):
             block = getattr(pipe, name)
 
             def before(_module: nn.Module, _inputs: Any, name: str = name) -> None:
@@ -168,7 +168,7 @@ class TactileStream:
         value = self.calibration.background.float() ** (1.0 / self.calibration.sensor.exponent)
         self.light = FollowLight(value, time_constant_s)
         self.pipe = DepthPipeline.from_calibration(self.calibration, mode).float()
-        self.pipe.contact = contact_in_video(self.calibration, noise)
+        self.pipe.deformed = contact_in_video(self.calibration, noise)
         image = image[None].clamp(0.0, 1.0)
         if isinstance(unit, Calibration):
             self._compare_with_calibration(image)
@@ -206,10 +206,10 @@ class TactileStream:
                 f"background: the light is {level:.0%} off the calibration's: another unit, exposure or LEDs; calibrate again"
             )
         with torch.inference_mode():
-            contact = self.pipe.contact(self.pipe.compensate(light.correct(image)))
-        if bool(contact.any()):
+            deformed = self.pipe.deformed(self.pipe.compensate(light.correct(image)))
+        if bool(deformed.any()):
             raise ValueError(
-                f"background: the first frames show contact on {float(contact.float().mean()):.1%} of the skin against the "
+                f"background: the first frames show contact on {float(deformed.float().mean()):.1%} of the skin against the "
                 "calibration's background: start without contact, or calibrate again if the skin has changed"
             )
 
@@ -240,7 +240,7 @@ class TactileStream:
                 output = self.pipe(image)
                 if self._follow:
                     with self.stages.stage("light"):
-                        self.light.update(raw, output.contact, 1.0 / self.fps if before is None else time_s - before)
+                        self.light.update(raw, output.deformed, 1.0 / self.fps if before is None else time_s - before)
             before = time_s
             yield TactileFrame(index, time_s, image[0], output)
             self.stages.end_frame()

@@ -53,13 +53,19 @@ class ContactMask(Twin, contact.ContactMask):
         if not (sampled and usable(compensated, self.offset)):
             return super().find(compensated)
         grid = kernels.ContactGrid(self.step, self.stride, self.cell, self.reach, self.sigmas, self.rounding, self.least_cells)
-        return kernels.contact_mask(compensated, self.offset, self.per_noise, self.failed_below, grid)
+        return kernels.contact_mask(compensated, self.offset, self.per_noise, (self.failed_below, self.most_far_field), grid)
 
     def noise(self, change: Tensor) -> Tensor:
         if not arrays_usable(change):
             return super().noise(change)
         second = second_differences(change, self.samples)
         return std_from_median(second, _median(second))
+
+    def quarter(self, some: Tensor) -> Tensor:
+        if not arrays_usable(some):
+            return super().quarter(some)
+        place = some.shape[-1] // 4
+        return torch.from_numpy(np.partition(some.numpy(), place)[..., place : place + 1])
 
     def reconstruct(self, seed: Tensor, mask: Tensor) -> Tensor:
         if not arrays_usable(seed, mask):

@@ -28,8 +28,8 @@ from ..core.checks import (
     check_record,
     may_read_values,
 )
-from ..core.frame import DepthOutput, depth_in_window, undeformed_output
-from ..integration import WrappedIntegrator, as_integrator
+from ..core.frame import DepthOutput, Solution, depth_in_window, undeformed_output
+from ..integration import WrappedIntegrator, ZeroBackground, as_integrator
 from ..model import Calibration, check_calibration
 from ..normals import NormalFromIntensity as PlainNormalFromIntensity
 from ..normals import NormalFromResponse, WrappedNormals, as_normal_model
@@ -44,7 +44,7 @@ STRIDE = 8
 
 
 class DepthPipeline(nn.Module):
-    """Images (B, 3, H, W) to a :class:`DepthOutput`: compensate, deformed, crop, solve, refine, contact, uncrop.
+    """Images (B, 3, H, W) to a :class:`DepthOutput`: compensate, deformed, crop, solve, refine, zero, contact, uncrop.
 
     ``fast`` solves once (eq. 9). ``precise`` solves again with the depth found (eq. 10), until what is still missing falls below
     ``tolerance_px``. ``auto`` skips frames without deformed skin, predicts on every eighth pixel what a second pass would change, and
@@ -105,6 +105,7 @@ class DepthPipeline(nn.Module):
         self.crop = Crop(STRIDE, model.takes_window)
         self.solve = Solve(model, gradient, integrator)
         self.refine = self._policy(mode, tolerance_px, refine_threshold_px, min(max_passes, model.max_passes))
+        self.zero = ZeroBackground()
         self.contact = ContactFromDepth(mm_per_pixel) if contact is None else contact
         self.uncrop = Uncrop()
 
@@ -176,6 +177,7 @@ class DepthPipeline(nn.Module):
             return undeformed_output(frame)
         solution = self.solve(frame)  # eq. 9, 5, 4
         frame, solution = self.refine(frame, solution)  # eq. 10
+        solution = Solution(solution.gradient, self.zero(solution.depth_mm, frame.deformed))
         contact = self.contact(depth_in_window(frame, solution.depth_mm), solution.gradient, frame.mask)
         out: DepthOutput = self.uncrop(frame, solution, contact)
         return out

@@ -10,7 +10,7 @@ from torch import Tensor
 from ..accelerated import Compensate, ContactMask
 from ..core.blur import blur, gaussian_weights
 from ..core.geometry import gradient_from_normal, pixel_grid_mm
-from ..integration import poisson_background
+from ..integration import PoissonBackground
 from ..model.calibration import PEDESTAL, Calibration
 from ..model.report import PressRow, TouchRow
 from ..model.response_field import ResponseField, ResponseModel
@@ -185,8 +185,9 @@ def first_pass_depths(contacts: Sequence[Contact], response: ResponseField, pitc
         return []
     height, width = contacts[0].mask.shape
     normals = NormalFromResponse(response, None, height, width, pitch_mm, dtype=torch.float64)
+    integrate = PoissonBackground(pitch_mm)  # keeps its tables
     gradients = (gradient_from_normal(normals(1.0 + contact.change[None])) * contact.mask for contact in contacts)
-    return [poisson_background(gradient, pitch_mm)[0, 0] for gradient in gradients]
+    return [integrate(gradient)[0, 0] for gradient in gradients]
 
 
 def press_row(contact: Contact, sensor: Sensor) -> PressRow:

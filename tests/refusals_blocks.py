@@ -35,6 +35,7 @@ from refusals_values import (
     WIDTH,
     Entry,
     batches,
+    by_depth,
     cloud,
     fields,
     forward,
@@ -250,8 +251,8 @@ TABLE = {
     "NormalFromMLP.gradient_px": forward(lambda: network().gradient_px, 3, "image"),
     "NormalFromMLP.forward": forward(network, 3, "compensated", label=("depth_mm", "window")),
     "NormalFromResponse": Entry(
-        {"fast": fields(), "precise": fields(True), **SIZE, "max_slope": 3.0},
-        {"fast": [None, "field", fields(True)], "precise": ["field", fields()], **shaped(max_slope=NUMBER)},
+        {"field": fields(), "by_depth": by_depth(), **SIZE},
+        {"field": [None, "field", by_depth()], "by_depth": ["field", fields()], **shaped()},
     ),
     "NormalFromResponse.from_calibration": Entry({"calibration": unit("response")}, {"calibration": [*OTHERS, unit()]}),
     "NormalFromResponse.forward": Entry(

@@ -206,7 +206,7 @@ def test_a_tilted_punch_larger_than_half_of_the_image_is_no_drift(ring, small_se
 @pytest.mark.parametrize("factor", [1.0, 0.9, 0.75])
 @pytest.mark.parametrize("touched", [0.0, 0.4])
 def test_a_response_field_levels_up_to_a_quarter(small_sensor, factor, touched):
-    field = vts.model.response_field.ResponseField(0, -1, False, 10.0, ((0.3, 0, 0), (0, 0.3, 0)))
+    field = vts.model.response_field.ResponseField(0, -1, 10.0, ((0.3, 0, 0), (0, 0.3, 0)))
     model = vts.model.response_field.ResponseModel(field, None)
     background = 0.5 + 0.004 * torch.randn(3, 120, 160, generator=torch.Generator().manual_seed(0))
     image = background + 0.004 * torch.randn(3, 120, 160, generator=torch.Generator().manual_seed(1))

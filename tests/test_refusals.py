@@ -42,11 +42,12 @@ RECORDS = {
 }  # fmt: skip
 """Results that users get and do not make: their constructors keep what they are given. (Their methods are in the table.)"""
 PARTS = {
-    "Adaptive", "Integrator", "NormalModel", "Once", "Repeat", "ResponseField", "ResponseModel", "SensorPrior", "Shadows", "Solve",
-    "WrappedIntegrator", "WrappedNormals", "as_integrator", "as_normal_model", "by_presses", "channel_structure",
-    "check_calibration", "check_sensor", "discontinuity_share", "falloff", "label_contacts", "outwardness", "read_point_cloud",
-    "with_preprocessing", "write_point_cloud", "stream.NewestFrame", "stream.Overlay", "stream.StageClock", "stream.StreamReport.",
-    "stream.VideoFile.", "stream.Window",
+    "Adaptive", "DepthBrightness", "Integrator", "NormalModel", "Once", "Repeat", "ResponseField", "ResponseModel",
+    "SensorPrior", "Shadows", "SlopesOfDepth", "Solve", "WrappedIntegrator", "WrappedNormals", "as_integrator",
+    "as_normal_model", "by_presses", "channel_structure", "check_calibration", "check_sensor", "discontinuity_share",
+    "falloff", "label_contacts", "outwardness", "read_point_cloud", "with_preprocessing", "write_point_cloud",
+    "stream.NewestFrame", "stream.Overlay", "stream.StageClock", "stream.StreamReport.", "stream.VideoFile.",
+    "stream.Window",
 }  # fmt: skip
 """Names, and with a dot at the end methods, that other tests cover: records, base classes, what one room does for another."""
 FREE = {"dtype", "seed", "report", "comment", "clock", "sleep"}

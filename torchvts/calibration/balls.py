@@ -8,18 +8,18 @@ from torch import Tensor
 
 from ..core.geometry import gradient_from_normal
 from ..core.robust import tukey_weight
-from ..model.response_field import ResponseField, ResponseModel
+from ..model.response_field import ResponseModel
 from ..model.sensor import Sensor
 from ..normals import NormalFromResponse
-from .contacts import LEAST_INSIDE, Contact, first_pass_depths, middle_px, prepare_second_pass, used
+from .contacts import LEAST_INSIDE, Contact, first_pass_depths, middle_px, used
 from .field import ContactForms, Family, solve_with_centers
 
 EDGE_SLOPE_RATIO = 0.6
 """The contact ends where the skin's slope has fallen to this part of the ball's: about the middle of the fall."""
 
-JOINT_STAGES = ((0, -1, False, 3), (1, -1, False, 3), (2, -1, False, 6), (3, 2, False, 4), (3, 2, True, 4))
-"""Families and rounds in which balls are located jointly. Linear fields come first: with products or depth the field can imitate
-a shift of all centers, so these stages only refine, each center regularised to the linear result by a third of a press."""
+JOINT_STAGES = ((0, -1, 3), (1, -1, 3), (2, -1, 6), (3, 2, 4))
+"""Families and rounds in which balls are located jointly. Linear fields come first: with products the field can imitate a shift of
+all centers, so that stage only refines, each center regularised to the linear result by a third of a press."""
 
 
 def locate(contacts: list[Contact], sensor: Sensor, prior: ResponseModel | None, half_mm: float) -> None:
@@ -57,20 +57,16 @@ def locate(contacts: list[Contact], sensor: Sensor, prior: ResponseModel | None,
 def _locate_jointly(contacts: list[Contact], pitch_mm: float, half_mm: float) -> None:
     most = 1 if len(contacts) < 4 else 2 if len(contacts) < 10 else 3
     anchors = None
-    fast: ResponseField | None = None
-    for degree, products, uses_depth, rounds in [stage for stage in JOINT_STAGES if stage[0] <= most]:
-        family = Family(degree, products, uses_depth, half_mm)
+    for degree, products, rounds in [stage for stage in JOINT_STAGES if stage[0] <= most]:
+        family = Family(degree, products, half_mm)
         if products >= 0 and anchors is None:
             anchors = [contact.center_mm.clone() for contact in contacts]
-        if uses_depth and fast is not None:
-            prepare_second_pass(contacts, fast, pitch_mm)
         forms = [ContactForms(family, contact) for contact in contacts]
         coefficient = torch.zeros(family.size(), dtype=torch.float64)
         for _ in range(rounds):
             coefficient = solve_with_centers(forms, 0.01 * family.penalty(), anchors, 0.3)
             for item in forms:
                 update_radius(item.contact, item.slope(coefficient), pitch_mm)
-        fast = family.field(coefficient)
 
 
 def _slope_maps(contacts: list[Contact], model: ResponseModel, pitch_mm: float) -> list[Tensor]:
@@ -78,11 +74,11 @@ def _slope_maps(contacts: list[Contact], model: ResponseModel, pitch_mm: float) 
     if not contacts:
         return []
     height, width = contacts[0].mask.shape
-    normals = NormalFromResponse(model.fast, model.precise, height, width, pitch_mm, dtype=torch.float64)
+    normals = NormalFromResponse(model.field, model.by_depth, height, width, pitch_mm, dtype=torch.float64)
     images = [1.0 + contact.change[None] for contact in contacts]
-    if model.precise is None:
+    if model.by_depth is None:
         return [gradient_from_normal(normals(image))[0] for image in images]
-    first = first_pass_depths(contacts, model.fast, pitch_mm)
+    first = first_pass_depths(contacts, model.field, pitch_mm)
     return [gradient_from_normal(normals(image, depth[None, None]))[0] for image, depth in zip(images, first)]
 
 

@@ -25,11 +25,8 @@ from .presses import Press, Touch, check_presses, check_touches
 WELL_CONSTRAINED_DEG = 2.0
 """Point lights replace a sensor's prior only if the image constrains each of them this well."""
 
-PRIOR_FAMILY = ((4, 3),)
-PRIOR_PRODUCT_PENALTY = 60.0
-"""Weakly regularised products fit their own unit better and another worse. With penalties of 40, 60 and 200 presses of a GelSight
-Mini that the prior has not seen are 2.02, 2.06 and 2.24 degrees off; a bead on a second Mini is, with 40 and 60, 2.99 and 2.94
-from that unit's own network."""
+PRIOR_FAMILY = ((2, 0),)
+"""Chosen by other units: larger families fit the unit of the presses better and others worse (docs/decisions.md)."""
 
 TIE = 1.05
 """Point lights are preferred to response fields unless these are better by more than this factor."""
@@ -98,8 +95,7 @@ def calibrate(
 def fit_prior(background: Tensor, sensor: Sensor, presses: Sequence[Press], source: str = "") -> SensorPrior:
     """Fit a prior for every unit of a sensor type to presses on one unit.
 
-    Linear terms have degree 4, products degree 3. Products are strongly regularised, because otherwise they fit this unit
-    better and others worse.
+    Linear terms have degree 2 and products degree 0: larger fields fit this unit better and others worse.
 
     Args:
         background: as for :func:`calibrate`.
@@ -119,7 +115,7 @@ def fit_prior(background: Tensor, sensor: Sensor, presses: Sequence[Press], sour
         raise ValueError("presses: expected one or more, got none: a prior is fitted to presses")
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     named = check_presses(presses, sensor)
-    result = by_presses(background, sensor.without_prior(), named, None, False, PRIOR_FAMILY, PRIOR_PRODUCT_PENALTY)
+    result = by_presses(background, sensor.without_prior(), named, None, False, PRIOR_FAMILY)
     for message in complaints.of_contacts(result.contacts):
         warnings.warn(message, CalibrationWarning, stacklevel=2)
     log_background = fit_log_background(result.unit.background, sensor.mm_per_pixel)

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from ..accelerated import Compensate, ContactMask
 from ..core.blur import blur, gaussian_weights
-from ..core.geometry import gradient_from_normal, gradient_of_depth, pixel_grid_mm
-from ..integration import poisson_background
+from ..core.geometry import gradient_from_normal, pixel_grid_mm
+from ..integration import PoissonBackground
 from ..model.calibration import PEDESTAL, Calibration
 from ..model.report import PressRow, TouchRow
 from ..model.response_field import ResponseField, ResponseModel
@@ -45,7 +45,6 @@ class Contact:
         radius_mm: of the ball; 0 for an unknown object.
         center_mm: (2,), center of the ball, as far as known.
         contact_radius_mm: radius of the contact, as far as known.
-        second_pass: (3, H, W), depth of the first pass in mm, and its two slopes; empty before the first pass.
         known: the center was given and is not searched.
         radius_known: the contact radius was given and is not searched.
         reason: why the contact is left out; empty if it is used.
@@ -61,7 +60,6 @@ class Contact:
     radius_mm: float
     center_mm: Tensor = field(default_factory=lambda: torch.zeros(2, dtype=torch.float64))
     contact_radius_mm: float = 0.0
-    second_pass: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
     known: bool = False
     radius_known: bool = False
     reason: str = ""
@@ -181,20 +179,15 @@ def channel_structure(image: Tensor) -> float:
     return float(inner.square().sum(0).sqrt().flatten().quantile(0.99))
 
 
-def first_pass_depths(contacts: Sequence[Contact], fast: ResponseField, pitch_mm: float) -> list[Tensor]:
-    """(H, W) depth, mm, by a field without depth for each contact, as the pipeline computes it."""
+def first_pass_depths(contacts: Sequence[Contact], response: ResponseField, pitch_mm: float) -> list[Tensor]:
+    """(H, W) depth, mm, by a field for each contact, as the pipeline computes it in one pass."""
     if not contacts:
         return []
     height, width = contacts[0].mask.shape
-    normals = NormalFromResponse(fast, None, height, width, pitch_mm, dtype=torch.float64)
+    normals = NormalFromResponse(response, None, height, width, pitch_mm, dtype=torch.float64)
+    integrate = PoissonBackground(pitch_mm)  # keeps its tables
     gradients = (gradient_from_normal(normals(1.0 + contact.change[None])) * contact.mask for contact in contacts)
-    return [poisson_background(gradient, pitch_mm)[0, 0] for gradient in gradients]
-
-
-def prepare_second_pass(contacts: Sequence[Contact], fast: ResponseField, pitch_mm: float) -> None:
-    """Keep with each contact the inputs of a second pass: depth of the first pass and its slopes."""
-    for contact, depth in zip(contacts, first_pass_depths(contacts, fast, pitch_mm)):
-        contact.second_pass = torch.cat((depth[None], gradient_of_depth(depth[None, None], pitch_mm)[0]))
+    return [integrate(gradient)[0, 0] for gradient in gradients]
 
 
 def press_row(contact: Contact, sensor: Sensor) -> PressRow:

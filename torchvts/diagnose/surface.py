@@ -84,7 +84,7 @@ class Surface:
         calibration = blocks.calibration
         value = light.clamp(0.0, 1.0) ** (1.0 / calibration.sensor.exponent)
         image = value[None].to(calibration.background.dtype)
-        refines = calibration.lights is not None or (calibration.response is not None and calibration.response.precise is not None)
+        refines = calibration.lights is not None or (calibration.response is not None)
         output = blocks.output(image, "precise" if refines else "fast")
         with torch.no_grad():
             compensated = blocks.compensate(image)

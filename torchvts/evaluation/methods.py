@@ -105,12 +105,12 @@ def pipeline(calibration: Calibration, mode: str, normals: nn.Module | None = No
 
 
 def parameters(calibration: Calibration, mode: str) -> int:
-    """Number of parameters of a calibration: 12 of three lights, or all coefficients of the response fields that a mode uses."""
+    """Number of parameters of a calibration: 12 of three lights, or all coefficients of the response that a mode uses."""
     model = calibration.response
     if model is None:
         return 12
-    fields = (model.fast, model.precise if mode != "fast" else None)
-    return sum(2 * field.size() for field in fields if field is not None)
+    by_depth = None if mode == "fast" else model.by_depth
+    return 2 * model.field.size() + (0 if by_depth is None else by_depth.tensor().numel())
 
 
 def _flat(calibration: Calibration) -> Built:

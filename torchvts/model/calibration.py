@@ -20,7 +20,7 @@ from .report import Report, read_report
 from .response_field import ResponseModel
 from .sensor import Sensor, check_sensor
 
-FORMAT_VERSION = 5
+FORMAT_VERSION = 6
 """Version of the calibration file. A file of another version is refused."""
 
 DEFECT_RATIO = 4.0
@@ -119,7 +119,7 @@ class Calibration:
             ValueError, TypeError: background of another shape or range.
         Example:
             >>> from torchvts.model.response_field import ResponseField
-            >>> field = ResponseField(0, -1, False, 10.0, ((0.3, 0, 0), (0, 0.3, 0)))
+            >>> field = ResponseField(0, -1, 10.0, ((0.3, 0, 0), (0, 0.3, 0)))
             >>> sensor = Sensor("rig", 48, 64, 0.5)
             >>> Calibration.from_response(ResponseModel(field, None), sensor, torch.full((3, 48, 64), 0.5)).sensor.blur_px
             1.0

@@ -266,7 +266,7 @@ class Confidence(nn.Module):
         if isinstance(block, NormalFromIntensity):
             return cls(block, noise, calibration.noise_std, _light_std_by_fit(calibration), sensor.mm_per_pixel, **common)
         model_deg = _model_deg(calibration)
-        slope_of_change = 0.5 * block.fast_maps[:3].square().sum(dim=(0, 1))  # a relative change of one, in every channel
+        slope_of_change = 0.5 * block.maps[:3].square().sum(dim=(0, 1))  # a relative change of one, in every channel
         usual = float(slope_of_change.median().sqrt().clamp_min(1e-6))
         light = torch.full_like(noise, MODEL_SHARE * math.radians(model_deg) / SPREAD_OF_MEAN / usual)
         common |= {"model_deg": model_deg, "spread": RESPONSE_SPREAD}

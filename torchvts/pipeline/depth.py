@@ -33,7 +33,7 @@ from ..integration import WrappedIntegrator, ZeroBackground, as_integrator
 from ..model import Calibration, check_calibration
 from ..normals import NormalFromIntensity as PlainNormalFromIntensity
 from ..normals import NormalFromResponse, WrappedNormals, as_normal_model
-from .refine import Adaptive, Once, Repeat
+from .refine import Adaptive, Once, Repeat, SlopesOfDepth
 from .shadows import Shadows
 from .solve import Solve
 
@@ -47,8 +47,9 @@ class DepthPipeline(nn.Module):
     """Images (B, 3, H, W) to a :class:`DepthOutput`: compensate, deformed, crop, solve, refine, zero, contact, uncrop.
 
     ``fast`` solves once (eq. 9). ``precise`` solves again with the depth found (eq. 10), until what is still missing falls below
-    ``tolerance_px``. ``auto`` skips frames without deformed skin, predicts on every eighth pixel what a second pass would change, and
-    solves only those frames again for which that exceeds ``refine_threshold_px``, until what is missing is below a fifth of it.
+    ``tolerance_px``; for response fields gradient and normals are then those of the depth. ``auto`` skips frames without deformed
+    skin, predicts on every eighth pixel what a second pass would change, and solves only those frames again for which that exceeds
+    ``refine_threshold_px``, until what is missing is below a fifth of it.
     Frames of a batch do not influence one another.
 
     Args:
@@ -92,7 +93,7 @@ class DepthPipeline(nn.Module):
         model, integrator = as_normal_model(normals), as_integrator(integrate)
         check_positive("mm_per_pixel", mm_per_pixel), check_positive("tolerance_px", tolerance_px)
         check_least("refine_threshold_px", refine_threshold_px), check_integer("max_passes", max_passes, 1)
-        if mode == "precise" and not model.uses_depth:
+        if mode == "precise" and not (model.uses_depth or model.normals_from_depth):
             raise ValueError(
                 f"mode: 'precise' hands the depth back to the normals, but {type(normals).__name__} does not take it: "
                 "use 'fast', or make it a NormalModel with uses_depth = True"
@@ -110,10 +111,12 @@ class DepthPipeline(nn.Module):
         self.uncrop = Uncrop()
 
     def _policy(self, mode: str, tolerance_px: float, refine_threshold_px: float, max_passes: int) -> nn.Module:
-        """The refinement of a mode: Once, Repeat, Adaptive, or for lights Shadows around one of the latter."""
+        """The refinement of a mode: Once, Repeat, Adaptive; around it for lights Shadows, for response fields SlopesOfDepth."""
         model, pitch = self.solve.normals, self.mm_per_pixel
-        if mode == "fast" or not model.uses_depth:
+        if mode == "fast" or not (model.uses_depth or model.normals_from_depth):
             return Once()
+        if not model.uses_depth:
+            return SlopesOfDepth(Once(), pitch)
         coarse = model.coarse(STRIDE) if mode == "auto" and model.takes_window else None
         if mode == "auto":
             tolerance_px = max(tolerance_px, 0.2 * refine_threshold_px)
@@ -122,6 +125,8 @@ class DepthPipeline(nn.Module):
         else:
             grid = (coarse, PoissonBackground(STRIDE * pitch), pitch)
             policy = Adaptive(self.solve, LargestChange(), *grid, tolerance_px, max_passes, refine_threshold_px, STRIDE)
+        if model.normals_from_depth:
+            return SlopesOfDepth(policy, pitch)
         if not isinstance(model, PlainNormalFromIntensity):
             return policy
         deformed = self.deformed if isinstance(self.deformed, PlainContactMask) else None

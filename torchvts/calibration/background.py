@@ -136,7 +136,7 @@ def paraboloid_start(pixels: BackgroundPixels) -> Tensor:
     z = (solution[:, 3] / curvature - a * a - b * b).clamp_min(0.01).sqrt()
     log_rho = -1.5 * (curvature / span**2).log() - (z * span).log()
     start = bounded(torch.stack((a * span, b * span, (z * span).log(), log_rho), dim=1), span)
-    level = (light.log() - pixels.model(start).clamp_min(1e-30).log() / exponent).median(dim=1).values
+    level: Tensor = (light.log() - pixels.model(start).clamp_min(1e-30).log() / exponent).median(dim=1).values
     # where no paraboloid fits, the closed form misses the brightness as well
     start[:, 3] += torch.where(level.abs() > math.log(2.0), level, torch.zeros_like(level))
     return start
@@ -170,7 +170,9 @@ def misfit_of_paraboloid(pixels: BackgroundPixels) -> tuple[Tensor, Tensor]:
     """
     start = paraboloid_start(pixels)
     log = pixels.image.clamp_min(1e-3).log() - pixels.model(start).clamp_min(1e-9).log()
-    spread = [float((c[u] - c[u].median()).abs().median()) / 0.6745 if bool(u.any()) else math.inf for c, u in zip(log, pixels.usable)]
+    spread = [
+        float((c[u] - c[u].median()).abs().median()) / 0.6745 if bool(u.any()) else math.inf for c, u in zip(log, pixels.usable)
+    ]
     noise = pixels.noise / pixels.image.median(dim=1).values.clamp_min(1e-3)
     left = (torch.tensor(spread, dtype=noise.dtype).square() - noise.square()).clamp_min(0.0).sqrt()
     return left, at_bound(start, pixels.span_mm())

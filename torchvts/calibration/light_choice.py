@@ -121,7 +121,9 @@ def choose_lights(background: Tensor, sensor: Sensor, other_models: bool = False
         fit = _fit(background, linear, chosen.vignetting, chosen.ambient, chosen.known_azimuth, progress)
     final = dataclasses.replace(chosen, fit=fit)
     row = _row(final)
-    row |= {"note": _note(final)} | ({} if fit.failed else {"held_out": chosen.held_out})
+    row["note"] = _note(final)
+    if not fit.failed:
+        row["held_out"] = chosen.held_out
     complaint = f"background: {fit.message}" if not fit.converged or (row["score_deg"] or 0.0) > POORLY_CONSTRAINED_DEG else ""
     if not complaint and chosen.objection:
         complaint = f"background: {chosen.family}: {chosen.objection}"

@@ -44,6 +44,9 @@ NOT_GLOSS = 0.1
 LEAST_USABLE = 0.02
 """Share of each channel's pixels that a fit needs."""
 
+ENOUGH_STEPS = 20
+"""Steps after which one would have lowered the loss: each that does not is followed by one a tenth as long."""
+
 STEP_TOLERANCE_MM = 1e-4
 """The loop ends after three steps that move no light further than this."""
 
@@ -288,7 +291,7 @@ def _solve(pixels: BackgroundPixels, start: Tensor, loop: _Loop) -> _Solution:
     residual, jacobian = residual_and_jacobian(pixels.residual, parameter)
     weight, scale = _robust_weight(residual, pixels.usable)
     fit = Linearisation(pixels, parameter, residual, jacobian, weight / scale.square(), tie)
-    failure = _failure(fit, scale, moved)
+    failure = _failure(fit, scale, math.isinf(moved) and len(history) >= ENOUGH_STEPS)
     if failure:  # nothing is known, nothing explained
         unknown = torch.full_like(start, 1e12).diag_embed()
         nothing = torch.full((3,), torch.inf), torch.full((16,), torch.inf)
@@ -298,13 +301,13 @@ def _solve(pixels: BackgroundPixels, start: Tensor, loop: _Loop) -> _Solution:
     return _Solution(parameter, history, converged, "", moved, weight, scale, covariance, misfit, held_out_loss(fit))
 
 
-def _failure(fit: Linearisation, scale: Tensor, moved_mm: float) -> str:
+def _failure(fit: Linearisation, scale: Tensor, never_moved: bool) -> str:
     """Why an end of the loop is no fit at all, or ""."""
     usable = fit.pixels.usable.double().mean(dim=1)
     if float(usable.min()) < LEAST_USABLE:
         channel = "RGB"[int(usable.argmin())]
         return f"only {float(usable.min()):.1%} of channel {channel} is neither saturated nor near black: set the exposure by it"
-    if not (fit.is_finite() and bool(torch.isfinite(scale).all())) or math.isinf(moved_mm):
+    if not (fit.is_finite() and bool(torch.isfinite(scale).all())) or never_moved:
         return "the fit of point lights found no step that lowers the loss: the background is no image of point lights"
     return ""
 
@@ -365,10 +368,8 @@ def _message(best: _Solution, direction_std: Tensor, relative_residual: Tensor, 
             "allowed; calibrate with presses or known lights"
         )
     if not best.converged:
-        return (
-            f"stopped at {max_steps} steps, lights still moving {best.moved_mm:.3g} mm per step: "
-            "raise max_steps, or the image does not constrain the lights"
-        )
+        moving = "" if math.isinf(best.moved_mm) else f", lights still moving {best.moved_mm:.3g} mm per step"
+        return f"stopped at {max_steps} steps{moving}: raise max_steps, or the image does not constrain the lights"
     message = f"converged in {len(best.history)} steps"
     poor = [
         f"{name} +-{float(std):.1f} deg" for name, std in zip("RGB", direction_std, strict=True) if std > POORLY_CONSTRAINED_DEG

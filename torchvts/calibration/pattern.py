@@ -86,7 +86,9 @@ def compare_patterns(background: Tensor, sensor: Sensor) -> PatternMatch:
     seen = _Seen(sensor.prior.response.gamma * log, x, y, sensor.prior)
     plain = seen.shifted(_Hypothesis())
     others = [
-        _Hypothesis(turn, channels) for turn, channels in product(range(8), permutations(range(3))) if (turn, channels) != (0, (0, 1, 2))
+        _Hypothesis(turn, channels)
+        for turn, channels in product(range(8), permutations(range(3)))
+        if (turn, channels) != (0, (0, 1, 2))
     ]
     other = max(others, key=lambda one: seen.likeness(one).whole)
     found = [(other, seen.shifted(other), seen.shifted(_Hypothesis(in_square=True)) if other.turn > 3 else plain)]

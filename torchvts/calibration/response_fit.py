@@ -13,6 +13,7 @@ from ..model.sensor import Sensor
 from .contacts import Contact, prepare_second_pass
 from .field import PRODUCT_PENALTY, Evidence, Family
 from .outliers import locate_and_screen
+from .refusals import NoUsablePress
 from .touches import presses_as_touches
 
 FAMILIES = ((0, -1), (1, -1), (2, -1), (2, 1), (3, 2), (4, 3))
@@ -104,7 +105,7 @@ def fit_response(
         progress: show a bar.
         candidates: the fields to try.
     Raises:
-        ValueError: no press is left; says what became of each.
+        NoUsablePress: no press is left; says what became of each.
     """
     pitch = sensor.mm_per_pixel
     half_mm = prior.fast.half_mm if prior is not None else 0.5 * sensor.width * pitch
@@ -113,7 +114,7 @@ def fit_response(
         bar.set_postfix(step="balls")
         presses = locate_and_screen(contacts, light, sensor, prior, half_mm)
         if not presses:
-            raise ValueError("presses: none can be used: " + "; ".join(f"{c.name}: {c.reason}" for c in contacts))
+            raise NoUsablePress(contacts)
         bar.update()
         bar.set_postfix(step="one pass")
         start = None if prior is None else _Start(prior.fast, "prior")

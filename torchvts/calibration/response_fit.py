@@ -13,6 +13,7 @@ from ..model.sensor import Sensor
 from .contacts import Contact, first_pass_depths
 from .field import Evidence, Family, ball_sine
 from .outliers import locate_and_screen
+from .refusals import NoUsablePress
 from .touches import presses_as_touches
 
 FAMILIES = ((0, -1), (1, -1), (2, -1), (2, 1), (3, 2), (4, 3))
@@ -94,7 +95,7 @@ def fit_response(
         progress: show a bar.
         degrees: of linear terms and products of the fields to try, the smallest first.
     Raises:
-        ValueError: no press is left; says what became of each.
+        NoUsablePress: no press is left; says what became of each.
     """
     pitch = sensor.mm_per_pixel
     half_mm = prior.field.half_mm if prior is not None else 0.5 * sensor.width * pitch
@@ -103,7 +104,7 @@ def fit_response(
         bar.set_postfix(step="balls")
         presses = locate_and_screen(contacts, light, sensor, prior, half_mm)
         if not presses:
-            raise ValueError("presses: none can be used: " + "; ".join(f"{c.name}: {c.reason}" for c in contacts))
+            raise NoUsablePress(contacts)
         bar.update()
         bar.set_postfix(step="fields")
         start = None if prior is None else _Start(prior.field, "prior")

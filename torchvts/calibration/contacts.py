@@ -17,6 +17,7 @@ from ..model.response_field import ResponseField, ResponseModel
 from ..model.sensor import Sensor
 from ..normals import NormalFromResponse
 from .presses import Press, Touch
+from .regions import FarField, contact_region, far_field
 
 INSIDE = 0.85
 """Share of the contact radius within which the skin lies on the ball; further out it begins to leave it."""
@@ -26,6 +27,9 @@ LEAST_INSIDE = 10
 
 ROUGH = 0.13
 """Structure between the channels of a background from which it is taken for a contact: :func:`channel_structure`."""
+
+DARK = 0.25
+"""An image of less light than this part of the background's is no press: 12 bits in a file of 16 give 1/16."""
 
 MAX_SAMPLES = 2000
 """Pixels of a press that enter the fit. More add little, because neighbours are alike."""
@@ -109,8 +113,11 @@ def read_contacts(given: Sequence[Press | Touch], background: Tensor, sensor: Se
     contacts = []
     for item in given:
         ratio = compensate(item.image.detach().cpu().double()[None])
-        contact = _sampled(item, ratio[0] - 1.0, mask(ratio)[0, 0], sensor)
-        contact.reason = _unusable(item.image, background, contact.mask)
+        change, differs = ratio[0] - 1.0, mask(ratio)[0, 0]
+        far = far_field(change)
+        ball_px = 0.5 * item.ball_diameter_mm / sensor.mm_per_pixel if isinstance(item, Press) else 0.0
+        contact = _sampled(item, change, contact_region(far, differs, ball_px), sensor)
+        contact.reason = _unusable(item.image, background, differs, far) or _saturated(item.image, background, contact.mask)
         if isinstance(item, Press) and item.center_px is not None:
             _place(contact, item, sensor)
         contacts.append(contact)
@@ -141,21 +148,28 @@ def _place(contact: Contact, press: Press, sensor: Sensor) -> None:
         contact.reason = "no contact is seen at the given center and contact radius: a mistake in the label?"
 
 
-def _unusable(image: Tensor, background: Tensor, mask: Tensor) -> str:
-    """Why an image cannot be used, or ""."""
-    share = float(mask.double().mean())
-    border = torch.cat((mask[0], mask[-1], mask[:, 0], mask[:, -1])).double().mean()
+def _unusable(image: Tensor, background: Tensor, differs: Tensor, far: FarField) -> str:
+    """Why an image cannot be used, or "". ``differs``: (H, W), where it differs from the background."""
+    share = float(differs.double().mean())
+    level = float(image.double().mean() / background.double().mean())
+    if level < DARK:
+        depth = "black" if level < 1e-3 else f"{1 / level:.0f} times darker than the background"
+        return f"the image is {depth}: a dropped frame, or 12 bits in a file of 16?"
+    border = torch.cat((differs[0], differs[-1], differs[:, 0], differs[:, -1])).double().mean()
     if share < 0.002:
         return (
             f"no contact: only {share:.2%} of the image differs from the background; is it the background itself, or a faint press?"
         )
-    saturated = (image > 0.995).any(dim=0) & (background < 0.995).all(dim=0) & mask.cpu()
-    saturated_share = float(saturated.double().sum() / mask.double().sum())
-    if saturated_share > 0.2:
-        return f"{saturated_share:.0%} of the contact is saturated: lower the exposure"
-    if share > 0.8 and float(border) > 0.6:
+    if float(border) > 0.6 and far.is_other_light():
         return f"{share:.0%} of the image differs from the background: another unit, other exposure, or the light has changed"
     return ""
+
+
+def _saturated(image: Tensor, background: Tensor, contact: Tensor) -> str:
+    """That too much of the contact is saturated, or ""."""
+    saturated = (image > 0.995).any(dim=0) & (background < 0.995).all(dim=0) & contact.to(image.device)
+    share = float(saturated.double().sum() / contact.double().sum())
+    return f"{share:.0%} of the contact is saturated: lower the exposure" if share > 0.2 else ""
 
 
 def middle_px(sensor: Sensor) -> Tensor:

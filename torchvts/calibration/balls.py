@@ -9,12 +9,18 @@ from ..core.robust import tukey_weight
 from ..model.response_field import ResponseField, ResponseModel
 from ..model.sensor import Sensor
 from ..normals import NormalFromResponse
-from .contacts import LEAST_INSIDE, Contact, first_pass_depths, middle_px, prepare_second_pass, used
+from .contacts import INSIDE, LEAST_INSIDE, Contact, first_pass_depths, middle_px, prepare_second_pass, used
 from .field import ContactForms, Family, solve_with_centers
 from .regions import one_ball, strong_blobs
 
 EDGE_SLOPE_RATIO = 0.6
 """The contact ends where the skin's slope has fallen to this part of the ball's: about the middle of the fall."""
+
+WIDEST = 0.95
+"""Largest contact radius that is searched, in radii of the ball: at 0.95 its slope is 3."""
+
+CLOSURE_REACH = 1.5
+"""Radius of the disc of loop closure, in contact radii."""
 
 JOINT_STAGES = ((0, -1, False, 3), (1, -1, False, 3), (2, -1, False, 6), (3, 2, False, 4), (3, 2, True, 4))
 """Families and rounds in which balls are located jointly. Linear fields come first: with products or depth the field can imitate
@@ -48,12 +54,44 @@ def locate(contacts: list[Contact], sensor: Sensor, prior: ResponseModel | None,
     for contact in usable:
         if not contact.reason and int(contact.inside().sum()) < LEAST_INSIDE:
             contact.reason = "no ball of this diameter fits the contact"
-        if not contact.reason and contact.contact_radius_mm > 0.89 * contact.radius_mm:
+        if not contact.reason and contact.contact_radius_mm > 0.99 * WIDEST * contact.radius_mm:
             wide_mm, ball_mm = 2 * contact.contact_radius_mm, 2 * contact.radius_mm
             contact.reason = f"the contact is {wide_mm:.2f} mm wide, too wide for a ball of {ball_mm:g} mm"
 
 
-def _locate_jointly(contacts: list[Contact], pitch_mm: float, half_mm: float) -> None:
+class ClosedForms(ContactForms):
+    """The forms of a press, and loop closure: skin that is undeformed all around has no net slope over a disc around the ball.
+
+    Within the ball's contact that holds once its center is right, so the ring around the contact counts. The mean is relative to
+    the area of the contact, which makes it an error of the center over the ball's radius. A disc that the image border cuts says
+    nothing.
+    """
+
+    def __init__(self, family: Family, contact: Contact, weight: float) -> None:
+        super().__init__(family, contact)
+        self.weight = weight
+
+    def ball(self) -> tuple[Tensor, Tensor]:
+        """As the base class, with the weighted square of the net slope."""
+        form, right = super().ball()
+        if self.weight > 0.0 and self._is_whole():
+            r = self.contact.polar()[2]
+            ring = (r > INSIDE * self.contact.contact_radius_mm) & (r < CLOSURE_REACH * self.contact.contact_radius_mm)
+            net = self.terms[:, ring].sum(1) / max(1, int((r < self.contact.contact_radius_mm).sum()))
+            half = len(net)
+            outer = self.weight * net[:, None] * net[None]
+            form[:half, :half] += outer
+            form[half:, half:] += outer
+        return form, right
+
+    def _is_whole(self) -> bool:
+        contact = self.contact
+        reach = CLOSURE_REACH * contact.contact_radius_mm
+        half_mm = contact.half_size_mm - reach
+        return bool((contact.center_mm.abs() < half_mm).all())
+
+
+def _locate_jointly(contacts: list[Contact], pitch_mm: float, half_mm: float, closure: float = 0.0) -> None:
     most = 1 if len(contacts) < 4 else 2 if len(contacts) < 10 else 3
     anchors = None
     fast: ResponseField | None = None
@@ -63,7 +101,7 @@ def _locate_jointly(contacts: list[Contact], pitch_mm: float, half_mm: float) ->
             anchors = [contact.center_mm.clone() for contact in contacts]
         if uses_depth and fast is not None:
             prepare_second_pass(contacts, fast, pitch_mm)
-        forms = [ContactForms(family, contact) for contact in contacts]
+        forms = [ClosedForms(family, contact, closure) for contact in contacts]
         coefficient = torch.zeros(family.size(), dtype=torch.float64)
         for _ in range(rounds):
             coefficient = solve_with_centers(forms, 0.01 * family.penalty(), anchors, 0.3)
@@ -118,7 +156,7 @@ def guess_circle(contact: Contact, sensor: Sensor) -> None:
     center_px, radius_px = _circle(outline[free])
     contact.center_mm = (center_px - middle_px(sensor)) * sensor.mm_per_pixel
     # the outline lies outside of the contact, by about a fifth of its radius
-    contact.contact_radius_mm = min(0.8 * radius_px * sensor.mm_per_pixel, 0.9 * contact.radius_mm)
+    contact.contact_radius_mm = min(0.8 * radius_px * sensor.mm_per_pixel, WIDEST * contact.radius_mm)
 
 
 def _circle(points: Tensor) -> tuple[Tensor, float]:
@@ -146,7 +184,7 @@ def update_radius(contact: Contact, slope: Tensor, pitch_mm: float, damping: flo
     dx, dy, r = contact.polar()
     ring = (r / pitch_mm).round().long()
     count = int(0.95 * contact.radius_mm / pitch_mm)
-    near = (ring < count) & (ring > 0)
+    near = (ring < count) & (ring > 0) & ~contact.saturated
     outward = torch.stack((dx, dy)) / r.clamp_min(1e-9)
     measured, ball = -(slope * outward).sum(0), -(contact.ball_slope() * outward).sum(0)
     total = torch.zeros(2, count, dtype=torch.float64).index_add_(1, ring[near], torch.stack((measured, ball))[:, near])
@@ -156,7 +194,7 @@ def update_radius(contact: Contact, slope: Tensor, pitch_mm: float, damping: flo
     for k in range(start, count - 1):
         if ratio[k] >= EDGE_SLOPE_RATIO > ratio[k + 1]:
             found = (k + float((ratio[k] - EDGE_SLOPE_RATIO) / (ratio[k] - ratio[k + 1]))) * pitch_mm
-            contact.contact_radius_mm += (1.0 - damping) * (min(found, 0.9 * contact.radius_mm) - contact.contact_radius_mm)
+            contact.contact_radius_mm += (1.0 - damping) * (min(found, WIDEST * contact.radius_mm) - contact.contact_radius_mm)
             return
 
 

@@ -9,7 +9,8 @@ from ..core.robust import tukey_weight
 from ..model.response_field import ResponseField, ResponseModel
 from ..model.sensor import Sensor
 from ..normals import NormalFromResponse
-from .contacts import INSIDE, LEAST_INSIDE, Contact, first_pass_depths, middle_px, prepare_second_pass, used
+from .closure import close_loops
+from .contacts import LEAST_INSIDE, Contact, first_pass_depths, middle_px, prepare_second_pass, used
 from .field import ContactForms, Family, solve_with_centers
 from .regions import one_ball, strong_blobs
 
@@ -18,9 +19,6 @@ EDGE_SLOPE_RATIO = 0.6
 
 WIDEST = 0.95
 """Largest contact radius that is searched, in radii of the ball: at 0.95 its slope is 3."""
-
-CLOSURE_REACH = 1.5
-"""Radius of the disc of loop closure, in contact radii."""
 
 JOINT_STAGES = ((0, -1, False, 3), (1, -1, False, 3), (2, -1, False, 6), (3, 2, False, 4), (3, 2, True, 4))
 """Families and rounds in which balls are located jointly. Linear fields come first: with products or depth the field can imitate
@@ -51,6 +49,7 @@ def locate(contacts: list[Contact], sensor: Sensor, prior: ResponseModel | None,
                 update_radius(contact, slopes.flatten(1)[:, contact.index], pitch_mm)
     elif not all(contact.known and contact.radius_known for contact in usable):
         _locate_jointly(usable, pitch_mm, half_mm)
+        close_loops(usable, half_mm)
     for contact in usable:
         if not contact.reason and int(contact.inside().sum()) < LEAST_INSIDE:
             contact.reason = "no ball of this diameter fits the contact"
@@ -59,39 +58,7 @@ def locate(contacts: list[Contact], sensor: Sensor, prior: ResponseModel | None,
             contact.reason = f"the contact is {wide_mm:.2f} mm wide, too wide for a ball of {ball_mm:g} mm"
 
 
-class ClosedForms(ContactForms):
-    """The forms of a press, and loop closure: skin that is undeformed all around has no net slope over a disc around the ball.
-
-    Within the ball's contact that holds once its center is right, so the ring around the contact counts. The mean is relative to
-    the area of the contact, which makes it an error of the center over the ball's radius. A disc that the image border cuts says
-    nothing.
-    """
-
-    def __init__(self, family: Family, contact: Contact, weight: float) -> None:
-        super().__init__(family, contact)
-        self.weight = weight
-
-    def ball(self) -> tuple[Tensor, Tensor]:
-        """As the base class, with the weighted square of the net slope."""
-        form, right = super().ball()
-        if self.weight > 0.0 and self._is_whole():
-            r = self.contact.polar()[2]
-            ring = (r > INSIDE * self.contact.contact_radius_mm) & (r < CLOSURE_REACH * self.contact.contact_radius_mm)
-            net = self.terms[:, ring].sum(1) / max(1, int((r < self.contact.contact_radius_mm).sum()))
-            half = len(net)
-            outer = self.weight * net[:, None] * net[None]
-            form[:half, :half] += outer
-            form[half:, half:] += outer
-        return form, right
-
-    def _is_whole(self) -> bool:
-        contact = self.contact
-        reach = CLOSURE_REACH * contact.contact_radius_mm
-        half_mm = contact.half_size_mm - reach
-        return bool((contact.center_mm.abs() < half_mm).all())
-
-
-def _locate_jointly(contacts: list[Contact], pitch_mm: float, half_mm: float, closure: float = 0.0) -> None:
+def _locate_jointly(contacts: list[Contact], pitch_mm: float, half_mm: float) -> None:
     most = 1 if len(contacts) < 4 else 2 if len(contacts) < 10 else 3
     anchors = None
     fast: ResponseField | None = None
@@ -101,7 +68,7 @@ def _locate_jointly(contacts: list[Contact], pitch_mm: float, half_mm: float, cl
             anchors = [contact.center_mm.clone() for contact in contacts]
         if uses_depth and fast is not None:
             prepare_second_pass(contacts, fast, pitch_mm)
-        forms = [ClosedForms(family, contact, closure) for contact in contacts]
+        forms = [ContactForms(family, contact) for contact in contacts]
         coefficient = torch.zeros(family.size(), dtype=torch.float64)
         for _ in range(rounds):
             coefficient = solve_with_centers(forms, 0.01 * family.penalty(), anchors, 0.3)

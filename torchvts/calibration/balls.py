@@ -1,7 +1,5 @@
 """Locate the ball in each press: by its outline, by slopes that are known, or jointly with response fields of rising size."""
 
-from typing import Any
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -11,11 +9,16 @@ from ..core.robust import tukey_weight
 from ..model.response_field import ResponseModel
 from ..model.sensor import Sensor
 from ..normals import NormalFromResponse
+from .closure import close_loops
 from .contacts import LEAST_INSIDE, Contact, first_pass_depths, middle_px, used
 from .field import ContactForms, Family, solve_with_centers
+from .regions import one_ball, strong_blobs
 
 EDGE_SLOPE_RATIO = 0.6
 """The contact ends where the skin's slope has fallen to this part of the ball's: about the middle of the fall."""
+
+WIDEST = 0.95
+"""Largest contact radius that is searched, in radii of the ball: at 0.95 its slope is 3."""
 
 JOINT_STAGES = ((0, -1, 3), (1, -1, 3), (2, -1, 6), (3, 2, 4))
 """Families and rounds in which balls are located jointly. Linear fields come first: with products the field can imitate a shift of
@@ -46,10 +49,11 @@ def locate(contacts: list[Contact], sensor: Sensor, prior: ResponseModel | None,
                 update_radius(contact, slopes.flatten(1)[:, contact.index], pitch_mm)
     elif not all(contact.known and contact.radius_known for contact in usable):
         _locate_jointly(usable, pitch_mm, half_mm)
+        close_loops(usable, half_mm)
     for contact in usable:
         if not contact.reason and int(contact.inside().sum()) < LEAST_INSIDE:
             contact.reason = "no ball of this diameter fits the contact"
-        if not contact.reason and contact.contact_radius_mm > 0.89 * contact.radius_mm:
+        if not contact.reason and contact.contact_radius_mm > 0.99 * WIDEST * contact.radius_mm:
             wide_mm, ball_mm = 2 * contact.contact_radius_mm, 2 * contact.radius_mm
             contact.reason = f"the contact is {wide_mm:.2f} mm wide, too wide for a ball of {ball_mm:g} mm"
 
@@ -92,22 +96,22 @@ def guess_circle(contact: Contact, sensor: Sensor) -> None:
     length = contact.change.square().sum(0).sqrt()[None, None]
     length = torch.nn.functional.avg_pool2d(length, 7, 1, 3, count_include_pad=False)[0, 0]
     peak = 0.9 * length.max()
-    wide_areas = _blob_areas((length > 0.2 * peak) & contact.mask)[0]
-    areas, labels = _blob_areas((length > 0.4 * peak) & contact.mask)
-    if len(areas) == 0:
+    ball_px = contact.radius_mm / sensor.mm_per_pixel
+    wide = strong_blobs((length > 0.2 * peak) & contact.mask, torch.ones_like(length))
+    if not wide:
         contact.reason = "no contact: nothing is above the noise"
         return
-    several = int((wide_areas > 0.3 * wide_areas.max()).sum())
-    if several > 1:
-        contact.reason = f"{several} contacts in one image: press one ball at a time"
+    if not one_ball(wide, ball_px):
+        contact.reason = f"{len(wide)} contacts in one image: press one ball at a time"
         return
-    blob = (labels == 1 + int(areas.argmax())).astype(np.uint8)
-    outlines, _ = cv2.findContours(blob, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    longest = max(outlines, key=len)
-    hull = cv2.convexHull(longest)
+    blobs = strong_blobs((length > 0.4 * peak) & contact.mask, torch.ones_like(length), 0.1)
+    lobes = np.maximum.reduce([blob.mask for blob in blobs if one_ball([blobs[0], blob], ball_px)])
+    outlines, _ = cv2.findContours(lobes, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    points = np.concatenate(outlines)
+    hull = cv2.convexHull(points)
     # a ball's outline is convex; where the border cuts the ball, the outline of its faint middle opens to the border
-    convex = [abs(cv2.pointPolygonTest(hull, (float(x), float(y)), True)) < 2.0 for x, y in longest[:, 0]]
-    outline = torch.from_numpy(longest[:, 0][convex].astype(np.float64))
+    convex = [abs(cv2.pointPolygonTest(hull, (float(x), float(y)), True)) < 2.0 for x, y in points[:, 0]]
+    outline = torch.from_numpy(points[:, 0][convex].astype(np.float64))
     free = (outline > 1).all(1) & (outline[:, 0] < sensor.width - 2) & (outline[:, 1] < sensor.height - 2)
     if int(free.sum()) < 12:
         contact.reason = "the contact has no outline within the image: press nearer to the middle"
@@ -115,15 +119,7 @@ def guess_circle(contact: Contact, sensor: Sensor) -> None:
     center_px, radius_px = _circle(outline[free])
     contact.center_mm = (center_px - middle_px(sensor)) * sensor.mm_per_pixel
     # the outline lies outside of the contact, by about a fifth of its radius
-    contact.contact_radius_mm = min(0.8 * radius_px * sensor.mm_per_pixel, 0.9 * contact.radius_mm)
-
-
-def _blob_areas(mask: Tensor) -> tuple[Any, Any]:
-    """Areas of the connected blobs of an (H, W) mask, and their labels from 1."""
-    import cv2
-
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.numpy().astype(np.uint8))
-    return stats[1:, cv2.CC_STAT_AREA], labels
+    contact.contact_radius_mm = min(0.8 * radius_px * sensor.mm_per_pixel, WIDEST * contact.radius_mm)
 
 
 def _circle(points: Tensor) -> tuple[Tensor, float]:
@@ -151,7 +147,7 @@ def update_radius(contact: Contact, slope: Tensor, pitch_mm: float, damping: flo
     dx, dy, r = contact.polar()
     ring = (r / pitch_mm).round().long()
     count = int(0.95 * contact.radius_mm / pitch_mm)
-    near = (ring < count) & (ring > 0)
+    near = (ring < count) & (ring > 0) & ~contact.saturated
     outward = torch.stack((dx, dy)) / r.clamp_min(1e-9)
     measured, ball = -(slope * outward).sum(0), -(contact.ball_slope() * outward).sum(0)
     total = torch.zeros(2, count, dtype=torch.float64).index_add_(1, ring[near], torch.stack((measured, ball))[:, near])
@@ -161,7 +157,7 @@ def update_radius(contact: Contact, slope: Tensor, pitch_mm: float, damping: flo
     for k in range(start, count - 1):
         if ratio[k] >= EDGE_SLOPE_RATIO > ratio[k + 1]:
             found = (k + float((ratio[k] - EDGE_SLOPE_RATIO) / (ratio[k] - ratio[k + 1]))) * pitch_mm
-            contact.contact_radius_mm += (1.0 - damping) * (min(found, 0.9 * contact.radius_mm) - contact.contact_radius_mm)
+            contact.contact_radius_mm += (1.0 - damping) * (min(found, WIDEST * contact.radius_mm) - contact.contact_radius_mm)
             return
 
 

@@ -203,11 +203,15 @@ CONFIG = {"ppmm": 0.0634, "imgh": 240, "imgw": 320, "raw_imgh": 2464, "raw_imgw"
 
 
 def test_a_sensor_file_is_read(tmp_path):
-    expected = vts.Sensor("mini", 240, 320, 0.0634)
+    expected = vts.Sensor("mini", 240, 320, 0.0634, raw_size_px=((2464, 3280),), raw_crop=1 / 7)
     assert sensor_from_gs_sdk(CONFIG, name="mini") == expected
     (tmp_path / "mini.yaml").write_text(yaml.safe_dump(CONFIG))
     assert sensor_from_gs_sdk(tmp_path / "mini.yaml") == expected
     assert sensor_from_gs_sdk(str(tmp_path / "mini.yaml"), name="left").name == "left"
+    assert vts.Sensor.load(tmp_path / "mini.yaml") == expected
+    cropped = sensor_from_gs_sdk(CONFIG | {"raw_imgh": 240, "raw_imgw": 320})
+    assert cropped.raw_size_px == ()  # frames of the working size are cropped already
+    assert sensor_from_gs_sdk({"ppmm": 0.0634, "imgh": 240, "imgw": 320}).raw_size_px == ()
 
 
 @pytest.mark.parametrize(
@@ -219,6 +223,7 @@ def test_a_sensor_file_is_read(tmp_path):
         ({"ppmm": -1}, "key ppmm: expected a number above 0"),
         ({"imgh": 240.5}, "key imgh: expected an integer"),
         ({"imgw": 0}, "key imgw: expected at least 8"),
+        ({"raw_imgh": "tall"}, "key raw_imgh: expected an integer"),
     ],
 )
 def test_a_bad_sensor_file_is_refused(change, message):

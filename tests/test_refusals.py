@@ -44,7 +44,8 @@ RECORDS = {
 PARTS = {
     "Adaptive", "Integrator", "NormalModel", "Once", "Repeat", "ResponseField", "ResponseModel", "SensorPrior", "Shadows", "Solve",
     "WrappedIntegrator", "WrappedNormals", "as_integrator", "as_normal_model", "by_presses", "channel_structure",
-    "check_calibration", "check_sensor", "discontinuity_share", "falloff", "label_contacts", "outwardness", "read_point_cloud",
+    "check_calibration", "check_domain",
+    "check_sensor", "discontinuity_share", "falloff", "label_contacts", "outwardness", "read_point_cloud",
     "with_preprocessing", "write_point_cloud", "stream.NewestFrame", "stream.Overlay", "stream.StageClock", "stream.StreamReport.",
     "stream.VideoFile.", "stream.Window",
 }  # fmt: skip

@@ -34,6 +34,7 @@ class NormalFromResponse(NormalModel):
 
     max_passes: int = 2
     takes_window: bool = True
+    input_domain: str | None = "ratio"
     fast_maps: Tensor
     precise_maps: Tensor
 

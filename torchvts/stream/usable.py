@@ -97,7 +97,7 @@ class FrameCheck:
 
 
 def _likeness(one: Tensor, other: Tensor) -> float:
-    """Share of the cells (3, h, w) that differ by less than :data:`NEAR` in all channels, after each channel is scaled as a whole."""
+    """Share of the cells (3, h, w) that differ by less than :data:`NEAR` in all channels, each channel scaled as a whole."""
     ratio = one / other.clamp_min(1e-3)
     relative = ratio / ratio.flatten(1).median(1).values.clamp_min(1e-3)[:, None, None]
     return float(((relative - 1.0).abs().amax(0) < NEAR).double().mean())

@@ -166,14 +166,21 @@ class TactileStream:
             sensor = sensor_or_calibration if isinstance(sensor_or_calibration, Sensor) else sensor_or_calibration.sensor
             readable = [pixels for pixels in self._waiting if not isinstance(pixels, Unreadable)]
             self.rectify = Rectify(sensor, *readable[0].shape[:2])
-            first = torch.cat([self._rectified(pixels) for pixels in readable]) if background_frames > 0 else None
+            first = torch.cat([self._rectified(pixels) for pixels in readable])
             if isinstance(sensor_or_calibration, Sensor):
                 found = calibrate_background(find_background(first)[0].clamp(0.0, 1.0), sensor, presses)
             else:
                 found = use_calibration(sensor_or_calibration)
             self.calibration, self.note, self.metric = found
-            options = {"follow": follow, "time_constant_s": time_constant_s, "stage": self.stages.stage}
-            self.recording = Recording(self.calibration, mode, first, fps=self.fps, **options)
+            self.recording = Recording(
+                self.calibration,
+                mode,
+                first if background_frames > 0 else None,
+                fps=self.fps,
+                follow=follow,
+                time_constant_s=time_constant_s,
+                stage=self.stages.stage,
+            )
             self.light, self.pipe = self.recording.light, self.recording.pipe
             self._hooks = self.stages.watch(self.pipe)
         except BaseException:
@@ -181,7 +188,8 @@ class TactileStream:
             raise
 
     def _rectified(self, pixels: Pixels) -> Tensor:
-        return self.rectify(rgb_from_bgr(pixels)[None]).clamp_(0.0, 1.0)
+        frame: Tensor = self.rectify(rgb_from_bgr(pixels)[None])
+        return frame.clamp_(0.0, 1.0)
 
     @property
     def dropped(self) -> int:

@@ -264,7 +264,8 @@ class RectifySizes:
         size = (frame.shape[2], frame.shape[3])
         if size not in self._of_size:
             self._of_size[size] = Rectify(self.sensor, *size)
-        return self._of_size[size](frame).clamp(0.0, 1.0)
+        rectified: Tensor = self._of_size[size](frame)
+        return rectified.clamp(0.0, 1.0)
 
 
 class Replay:

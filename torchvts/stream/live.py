@@ -168,7 +168,7 @@ class TactileStream:
             self.rectify = Rectify(sensor, *readable[0].shape[:2])
             first = torch.cat([self._rectified(pixels) for pixels in readable])
             if isinstance(sensor_or_calibration, Sensor):
-                found = calibrate_background(find_background(first)[0].clamp(0.0, 1.0), sensor, presses)
+                found = calibrate_background(find_background(first, sensor)[0].clamp(0.0, 1.0), sensor, presses)
             else:
                 found = use_calibration(sensor_or_calibration)
             self.calibration, self.note, self.metric = found

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..model import Calibration
+from ..model import Calibration, check_calibration
 from ..pipeline import DepthOutput, DepthPipeline
 from .background import contact_in_video, find_background
 from .follow_light import TIME_CONSTANT_S, FollowLight
@@ -49,6 +49,7 @@ class Recording:
         time_constant_s: float = TIME_CONSTANT_S,
         stage: Callable[[str], AbstractContextManager[Any]] = lambda name: nullcontext(),
     ) -> None:
+        check_calibration("calibration", calibration)
         value = calibration.background.float() ** (1.0 / calibration.sensor.exponent)
         value = value.clamp(0.0, 1.0)
         self.light = FollowLight(value, time_constant_s)

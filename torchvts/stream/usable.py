@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_batch, check_field, check_same_size
+from ..core.checks import check_batch, check_field, check_range, check_same_size
 
 DARK = 0.25
 """A frame whose median brightness, in all channels, is below this share of the background's shows no skin."""
@@ -55,6 +55,7 @@ class FrameCheck:
 
     def __init__(self, background: Tensor) -> None:
         check_field("background", background)
+        check_range("background", background)
         self.size = (background.shape[1], background.shape[2])
         self.cell = max(1, min(self.size) // 24)
         self.background = self._cells(background[None].float())

@@ -2,8 +2,10 @@
 
 python scripts/calibrate.py background.png --sensor gelsight_mini --out unit.safetensors
 python scripts/calibrate.py background.png --mm-per-pixel 0.05 --out unit.safetensors
+python scripts/calibrate.py background.png --press 1.png 6.31 --press 2.png 6.31 --sensor gelsight_mini --out unit.safetensors
 python scripts/calibrate.py FOLDER --sensor gelsight_mini --out unit.safetensors
 
+The background is one image, several (their median), or a video whose first frames show the skin without contact.
 FOLDER is a calibration folder of gs_sdk: catalog.csv, background.png, N/gelsight.png. Centers of the balls are found.
 """
 
@@ -17,15 +19,21 @@ from pathlib import Path
 import torch
 
 import torchvts as vts
+from torchvts.core.files import read_frames
 from torchvts.model.report import CandidateRow, PressRow, Report
+from torchvts.stream import FIRST_FRAMES, calibrate_unit, read_background, read_press_images
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("background", type=Path, help="image without contact, or a calibration folder of gs_sdk")
+    parser.add_argument("background", type=Path, nargs="+", help="image without contact, several, a video, or a folder of gs_sdk")
     parser.add_argument("--sensor", help=f"YAML file, or one of {', '.join(vts.shipped_sensors())}")
     parser.add_argument("--mm-per-pixel", type=float, help="instead of --sensor: pixel pitch of an unknown sensor")
     parser.add_argument("--gamma", type=float, help="with --mm-per-pixel: value = light^(1/gamma); chosen if not given")
+    parser.add_argument("--background-frames", type=int, default=FIRST_FRAMES, help="of a video: first frames without contact")
+    parser.add_argument(
+        "--press", nargs=2, action="append", default=[], metavar=("IMAGE", "MM"), help="a ball pressed in, and its diameter"
+    )
     parser.add_argument("--touches", type=Path, nargs="+", default=[], help="images of unknown objects pressed in")
     parser.add_argument(
         "--use-labels", action="store_true", help="use centers of the folder's label.npz or labels.csv instead of finding them"
@@ -37,10 +45,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error("give either --sensor or --mm-per-pixel")
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     image, sensor, presses = read_given(arguments, parser)
-    touches = [vts.Touch(sensor.rectify(vts.read_image(path)[None])[0], None, path.name) for path in arguments.touches]
+    presses += read_press_images(arguments.press, sensor)
+    touches = [vts.Touch(sensor.read_image(path), None, path.name) for path in arguments.touches]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", vts.CalibrationWarning)
-        calibration = vts.calibrate(image, sensor, presses, touches, progress=True)
+        calibration = calibrate_unit(image, sensor, presses, touches, progress=True)
     calibration.save(arguments.out)
     report, sensor = calibration.report, calibration.sensor
     print(f"sensor {sensor.name}: {sensor.height} x {sensor.width} px, {sensor.mm_per_pixel} mm per pixel, gamma {sensor.exponent}")
@@ -58,25 +67,28 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def read_given(arguments: argparse.Namespace, parser: argparse.ArgumentParser) -> tuple[torch.Tensor, vts.Sensor, list[vts.Press]]:
     """Background, sensor and presses that the arguments name."""
-    presses: list[vts.Press] = []
-    if arguments.background.is_dir():
-        image, presses = vts.read_presses(arguments.background)
-        if not arguments.use_labels:
-            presses = [dataclasses.replace(press, center_px=None, contact_radius_px=None) for press in presses]
-        elif all(press.center_px is None for press in presses):
-            parser.error(
-                f"--use-labels: {arguments.background} has neither label.npz nor labels.csv: leave --use-labels out, "
-                "centers are found"
-            )
-    else:
-        image = vts.read_image(arguments.background)
-    if arguments.sensor is not None:
-        sensor = vts.Sensor.load(arguments.sensor)
-        image = sensor.rectify(image[None])[0]
-    else:
-        pitch, gamma = arguments.mm_per_pixel, arguments.gamma
-        sensor = vts.Sensor(arguments.background.stem or "sensor", image.shape[1], image.shape[2], pitch, gamma=gamma)
-    return image, sensor.without_prior() if arguments.no_prior else sensor, presses
+    first = arguments.background[0]
+    sensor = vts.Sensor.load(arguments.sensor) if arguments.sensor is not None else unknown_sensor(arguments)
+    sensor = sensor.without_prior() if arguments.no_prior else sensor
+    if not (len(arguments.background) == 1 and first.is_dir()):
+        return read_background(arguments.background, sensor, arguments.background_frames), sensor, []
+    image, presses = vts.read_presses(first)
+    if not arguments.use_labels:
+        presses = [dataclasses.replace(press, center_px=None, contact_radius_px=None) for press in presses]
+    elif all(press.center_px is None for press in presses):
+        parser.error(f"--use-labels: {first} has neither label.npz nor labels.csv: leave --use-labels out, centers are found")
+    elif tuple(image.shape[1:]) != (sensor.height, sensor.width):
+        parser.error(f"--use-labels: the images of {first} are raw frames, labels are for cropped ones: leave --use-labels out")
+    presses = [dataclasses.replace(press, image=sensor.rectify(press.image[None])[0]) for press in presses]
+    return sensor.rectify(image[None])[0], sensor, presses
+
+
+def unknown_sensor(arguments: argparse.Namespace) -> vts.Sensor:
+    """The sensor of which only the pitch is known: its images have the size of the background."""
+    path = arguments.background[0] / "background.png" if arguments.background[0].is_dir() else arguments.background[0]
+    _, image = next(iter(read_frames(path)))
+    name, pitch = arguments.background[0].stem or "sensor", arguments.mm_per_pixel
+    return vts.Sensor(name, image.shape[1], image.shape[2], pitch, gamma=arguments.gamma)
 
 
 def print_candidates(candidates: list[CandidateRow]) -> None:

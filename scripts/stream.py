@@ -3,8 +3,9 @@
 python scripts/stream.py --source 0 --sensor gelsight_mini
 python scripts/stream.py --source video.avi --sensor gelsight_wedge --out out/ball
 python scripts/stream.py --source folder/ --calibration unit.safetensors --out out/run
+python scripts/stream.py --source 0 --sensor gelsight_mini --press ball.png 6.31 --save-calibration unit.safetensors
 
-The first frames must be without contact. Ctrl-C ends it and finishes the files.
+The first frames must be without contact. Ctrl-C ends it and finishes the files. Exit status 1 if a frame had to be left out.
 """
 
 import argparse
@@ -20,7 +21,19 @@ import cv2
 import torch
 
 import torchvts as vts
-from torchvts.stream import Overlay, StreamReport, TactileStream, VideoFile, Window, has_display
+from torchvts.core.files import check_target
+from torchvts.stream import (
+    FIRST_FRAMES,
+    Overlay,
+    StreamReport,
+    TactileStream,
+    VideoFile,
+    Window,
+    calibrate_background,
+    has_display,
+    read_background,
+    read_press_images,
+)
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -29,18 +42,34 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--sensor", help=f"YAML file, or one of {', '.join(vts.shipped_sensors())}")
     parser.add_argument("--calibration", type=Path, help="file that calibrate.py wrote; by default the first frames calibrate")
     parser.add_argument(
+        "--background", type=Path, nargs="+", help="calibrate by this image without contact, by several, or by a video"
+    )
+    parser.add_argument(
+        "--press",
+        nargs=2,
+        action="append",
+        default=[],
+        metavar=("IMAGE", "MM"),
+        help="calibrate by a ball pressed in, its diameter too",
+    )
+    parser.add_argument(
+        "--save-calibration", type=Path, help="write the calibration, .safetensors, for reconstruct.py and later streams"
+    )
+    parser.add_argument(
         "--corners", help='in place of the sensor\'s: "x y x y x y x y", top left, top right, bottom right, bottom left'
     )
     parser.add_argument("--out", type=Path, help="folder for overlay video, frames.csv and summary.json")
     parser.add_argument("--video", choices=["mp4", "avi", "none"], default="mp4", help="kind of overlay video in --out")
     parser.add_argument("--mode", choices=["fast", "precise", "auto"], default="auto")
-    parser.add_argument("--background-frames", type=int, default=12, help="number of first frames, which are without contact")
+    parser.add_argument("--background-frames", type=int, default=FIRST_FRAMES, help="first frames, without contact")
     parser.add_argument("--realtime", action="store_true", help="play a recording at its own rate, dropping late frames")
     parser.add_argument("--no-follow", action="store_true", help="do not follow slow drift of the light")
     parser.add_argument("--threads", type=int, default=1, help="of PyTorch and OpenCV; one leaves a core for reading")
     arguments = parser.parse_args(argv)
     if (arguments.sensor is None) == (arguments.calibration is None):
         parser.error("give either --sensor or --calibration")
+    if arguments.calibration is not None and (arguments.background or arguments.press):
+        parser.error("--background, --press: they are to calibrate with --sensor, not beside --calibration")
     return arguments
 
 
@@ -51,12 +80,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     unit = vts.Sensor.load(arguments.sensor) if arguments.sensor else vts.Calibration.load(arguments.calibration)
     if arguments.corners is not None:
         unit = with_corners(unit, arguments.corners)
+    if arguments.save_calibration is not None:
+        check_target(arguments.save_calibration)
     if arguments.out is not None:
         arguments.out.mkdir(parents=True, exist_ok=True)
     show = has_display()
     if not show:
         print("no display: no live view" + ("" if arguments.out else "; give --out for an overlay video"))
     started = time.perf_counter()
+    presses: Sequence[vts.Press] = ()
+    if isinstance(unit, vts.Sensor):
+        presses = read_press_images(arguments.press, unit)
+    if isinstance(unit, vts.Sensor) and arguments.background:
+        found = calibrate_background(read_background(arguments.background, unit, arguments.background_frames), unit, presses)
+        print(found.note)
+        unit, presses = found.calibration, ()
     with contextlib.ExitStack() as stack:
         stream = stack.enter_context(
             TactileStream(
@@ -64,12 +102,16 @@ def main(argv: Sequence[str] | None = None) -> int:
                 unit,
                 mode=arguments.mode,
                 background_frames=arguments.background_frames,
+                presses=presses,
                 realtime=arguments.realtime,
                 follow=not arguments.no_follow,
             )
         )
         print(f"{stream.reader.name}: {stream.fps:g} frames a second; the first {arguments.background_frames} are without contact")
         print(f"{stream.note}\nready after {time.perf_counter() - started:.1f} s")
+        if arguments.save_calibration is not None:
+            stream.calibration.save(arguments.save_calibration)
+            print(f"wrote {arguments.save_calibration}")
         report = StreamReport(stream)
         video = None
         if arguments.out is not None and arguments.video != "none":
@@ -80,7 +122,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.out is not None:
         report.save(arguments.out)
         print(f"wrote {len(report.rows)} frames to {arguments.out}")
-    return 0
+    return 1 if stream.left_out else 0
 
 
 def play(

@@ -36,7 +36,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"{len(presses)} presses, {sum(p.numel() for p in fit.module.parameters())} weights, seed {arguments.seed}")
     print(f"RMS error of the slopes' angles: training {training:.2f} deg, held out {held_out:.2f} deg")
     print(fit.message)
-    print(f"wrote {arguments.out}: use it behind Compensate(blur_px={arguments.blur_px:g}), without gain")
+    print(
+        f"wrote {arguments.out}: vts.DepthPipeline.from_gs_sdk({str(arguments.out)!r}, background, sensor) makes a pipeline of it"
+    )
     return 0
 
 

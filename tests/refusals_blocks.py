@@ -143,6 +143,17 @@ TABLE = {
         {"calibration": unit(), "mode": "fast", "normals": None, "integrate": None},
         {"calibration": OTHERS, "mode": ["slow", None, 1], "normals": ["lookup", 3], "integrate": ["dct", 3]},
     ),
+    "DepthPipeline.from_gs_sdk": Entry(
+        {"weights": ..., "background": image(), "sensor": sensor(), "mode": "fast"},
+        {
+            "weights": [Path("no/such/nnmodel.pth"), "."],
+            "background": images(),
+            "sensor": ["no_such_sensor", "no/such.yaml"],
+            "mode": [],
+        },
+        file=("weights", "sensor"),
+        run=False,
+    ),
     "DepthPipeline.forward": Entry(
         {"images": image()[None]},
         {"images": [*batches(3), 255 * image()[None], image()[None] + NAN, image()[None] - 1.0]},
@@ -234,8 +245,24 @@ TABLE = {
     "NormalFromLookup.save": Entry({"path": ...}, {"path": [*MISSING, "."]}, lambda: lookup().save, file=("path",), run=False),
     "NormalFromLookup.forward": forward(lookup, 3, "compensated", label=("depth_mm", "window")),
     "NormalFromMLP": Entry(
-        {"height": HEIGHT, "width": WIDTH, "flat": FLAT, "hidden": (4,), "output": "angle"},
-        {"height": INTEGER, "width": INTEGER, "flat": images(), "hidden": [(), (0,), ("4",)], "output": ["slope", None]},
+        {
+            "height": HEIGHT,
+            "width": WIDTH,
+            "flat": FLAT,
+            "hidden": (4,),
+            "output": "angle",
+            "input_domain": "image",
+            "blur_px": 0.0,
+        },
+        {
+            "height": INTEGER,
+            "width": INTEGER,
+            "flat": images(),
+            "hidden": [(), (0,), ("4",)],
+            "output": ["slope", None],
+            "input_domain": ["raw", None],
+            "blur_px": [-1.0, NAN, "1"],
+        },
     ),
     "NormalFromMLP.load": Entry(
         {"path": ..., "flat": None, "output": None},
@@ -408,6 +435,8 @@ TABLE = {
             "light_azimuth_deg": None,
             "roi_px": None,
             "corners_px": None,
+            "raw_size_px": ((48, 64),),
+            "raw_crop": 0.1,
             "markers": False,
             "prior": None,
         },
@@ -422,6 +451,8 @@ TABLE = {
             "light_azimuth_deg": [(0, 120), (0, 0, 0), (0, 120, 999), "around", (0, 120, NAN)],
             "roi_px": [(1, 2), (0, 0, 1.5, 9), (-1, 0, 9, 9), "all"],
             "corners_px": [((0, 0),), ((0, 0), (0, 1), (1, 1), (1, 0)), "all"],
+            "raw_size_px": ["all", None, (48, 64), ((48,),), ((4.5, 64),), ((2, 64),)],
+            "raw_crop": ["1", None, NAN, -0.1, 0.5],
             "markers": ["yes", 1, None],
             "prior": ["prior", 3],
         },
@@ -439,6 +470,7 @@ TABLE = {
         named={"width": "(height, )?width"},
     ),
     "Sensor.rectify": Entry({"frame": image()[None]}, {"frame": [*batches(3), torch.zeros(1, 3, 8, 8)]}, lambda: sensor().rectify),
+    "Sensor.read_image": Entry({"path": ...}, {"path": [*MISSING, "."]}, lambda: sensor().read_image, file=("path",), run=False),
     "Sensor.from_dict": Entry(
         {"values": sensor().to_dict(), "source": "file"},
         {"values": [None, [], {"unknown": 1.0}, {"name": "rig"}, {**sensor().to_dict(), "height": -1}]},
@@ -507,8 +539,12 @@ TABLE = {
             "batch_size": 9,
             "held_out": 0.2,
             "weight_decay": 0.2,
+            "input_domain": "image",
+            "blur_px": 0.0,
         },
         {
+            "input_domain": ["raw", None],
+            "blur_px": [-1.0, NAN, "1"],
             "intensity": [
                 torch.zeros(9),
                 torch.zeros(0, 3),

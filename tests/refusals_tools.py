@@ -1,5 +1,6 @@
 """Accepted and refused arguments of gs_sdk's formats, metrics, scenes, objects, export and stream: a table for test_refusals."""
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -269,6 +270,11 @@ TABLE = {
         {"image": batches(3), "contact": [None, torch.ones(1, 1, 4, 4), (DEPTH > 0).numpy()], "seconds": ["1", None, NAN]},
         lambda: vts.stream.FollowLight(image()).update,
     ),
+    "stream.FrameCheck": Entry({"background": image()}, {"background": [b for k, b in enumerate(images()) if k not in (3, 4)]}),
+    "stream.Recording": Entry(
+        {"calibration": unit(), "mode": "fast", "first": None, "fps": 30.0, "time_constant_s": 1.0, "stage": nullcontext},
+        {"calibration": [None, "unit"], "mode": ["slow"], "first": [], "fps": [], "time_constant_s": NUMBER, "stage": []},
+    ),
     "stream.Rectify": Entry(
         {"sensor": sensor(), "height": HEIGHT, "width": WIDTH},
         {"sensor": SENSOR, "height": [*INTEGER, 10], "width": [*INTEGER, 10]},
@@ -277,12 +283,20 @@ TABLE = {
     "stream.Rectify.forward": forward(lambda: vts.stream.Rectify(sensor(), HEIGHT, WIDTH), 3, "frame"),
     "stream.StreamReport": Entry({"stream": ...}, {"stream": [None, "camera"]}, run=False),
     "stream.TactileStream": Entry(
-        {"source": ..., "sensor_or_calibration": sensor(), "mode": "auto", "background_frames": 12, "time_constant_s": 1.0},
+        {
+            "source": ...,
+            "sensor_or_calibration": sensor(),
+            "mode": "auto",
+            "background_frames": 12,
+            "presses": (),
+            "time_constant_s": 1.0,
+        },
         {
             "source": ["no/such.mp4", None, 2.5],
             "sensor_or_calibration": [None, "gelsight_mini"],
             "mode": ["slow", None],
             "background_frames": INTEGER,
+            "presses": [],
             "time_constant_s": NUMBER,
         },
         run=False,
@@ -290,7 +304,12 @@ TABLE = {
     "stream.VideoFile": Entry(
         {"path": "film.avi", "fps": 10.0}, {"path": ["film.gif", "film"], "fps": NUMBER}, named={"path": "video"}
     ),
-    "stream.calibrate_background": Entry({"background": image(), "sensor": sensor()}, {"background": images(), "sensor": SENSOR}),
+    "stream.calibrate_background": Entry(
+        {"background": image(), "sensor": sensor(), "presses": ()},
+        {"background": images(), "sensor": SENSOR, "presses": [[image()], None]},
+    ),
     "stream.open_source": Entry({"source": ...}, {"source": ["no/such.mp4", ".", None, 2.5]}, run=False),
-    "stream.find_background": Entry({"images": image()[None].expand(5, -1, -1, -1)}, {"images": [*batches(3), image()[None]]}),
+    "stream.find_background": Entry(
+        {"images": image()[None].expand(5, -1, -1, -1), "sensor": None}, {"images": [*batches(3), image()[None]], "sensor": []}
+    ),
 }

@@ -215,6 +215,32 @@ def test_unusable_images_are_named_and_left_out(unit, tmp_path, capsys):
     assert report.failed == [] and report.rows == 5 and not (out / "failed.csv").exists()
 
 
+def test_a_video_of_unusable_frames_goes_on(unit, tmp_path):
+    source = fill(tmp_path / "in", ["a.png"])
+    vts.write_image(source / "b.png", image(3) / 16)
+    writer = cv2.VideoWriter(str(source / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (WIDTH, HEIGHT))
+    for k in range(18):
+        picture = image(k if k > 13 else -1 - k) * (k != 15)
+        writer.write(np.ascontiguousarray((picture * 255).round().byte().flip(0).permute(1, 2, 0).numpy()))
+    writer.release()
+    report = reconstruct_dataset(unit, source, tmp_path / "out", pictures=False)
+    assert [name for name, _ in report.failed] == ["b.png", "film.avi/000015"] and report.rows == 18
+    assert "6% of the background's brightness" in report.failed[0][1] and "one colour" in report.failed[1][1]
+    rows = [line.split(",") for line in (tmp_path / "out" / "frames.csv").read_text().splitlines()[2:]]
+    assert [float(row[1]) > 0 for row in rows] == [False] * 14 + [True] * 3
+
+
+def test_a_video_that_starts_in_contact_is_noted_and_loses_nothing(unit, tmp_path):
+    (tmp_path / "in").mkdir()
+    write_film(tmp_path / "in" / "film.avi", 14)
+    report = reconstruct_dataset(unit, tmp_path / "in", tmp_path / "out", pictures=False)
+    assert report.rows == 14 and report.failed == []
+    ((name, note),) = report.notes
+    assert name == "film.avi" and "the calibration is used as it is: background: " in note
+    short = reconstruct_dataset(unit, tmp_path / "in", tmp_path / "long", pictures=False, background_frames=40)
+    assert "expected at least 40 frames, got 14" in short.notes[0][1] and short.rows == 14
+
+
 def test_the_script_ends_with_status_1_where_a_frame_was_left_out(unit, tmp_path, run_script):
     source = fill(tmp_path / "in", ["a.png", "b.png"])
     (source / "b.png").write_bytes(b"")

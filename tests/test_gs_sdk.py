@@ -1,5 +1,8 @@
 """gs_sdk's folders, sensor files, height maps, gradients and images."""
 
+import re
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -203,11 +206,15 @@ CONFIG = {"ppmm": 0.0634, "imgh": 240, "imgw": 320, "raw_imgh": 2464, "raw_imgw"
 
 
 def test_a_sensor_file_is_read(tmp_path):
-    expected = vts.Sensor("mini", 240, 320, 0.0634)
+    expected = vts.Sensor("mini", 240, 320, 0.0634, raw_size_px=((2464, 3280),), raw_crop=1 / 7)
     assert sensor_from_gs_sdk(CONFIG, name="mini") == expected
     (tmp_path / "mini.yaml").write_text(yaml.safe_dump(CONFIG))
     assert sensor_from_gs_sdk(tmp_path / "mini.yaml") == expected
     assert sensor_from_gs_sdk(str(tmp_path / "mini.yaml"), name="left").name == "left"
+    assert vts.Sensor.load(tmp_path / "mini.yaml") == expected
+    cropped = sensor_from_gs_sdk(CONFIG | {"raw_imgh": 240, "raw_imgw": 320})
+    assert cropped.raw_size_px == ()  # frames of the working size are cropped already
+    assert sensor_from_gs_sdk({"ppmm": 0.0634, "imgh": 240, "imgw": 320}).raw_size_px == ()
 
 
 @pytest.mark.parametrize(
@@ -219,6 +226,7 @@ def test_a_sensor_file_is_read(tmp_path):
         ({"ppmm": -1}, "key ppmm: expected a number above 0"),
         ({"imgh": 240.5}, "key imgh: expected an integer"),
         ({"imgw": 0}, "key imgw: expected at least 8"),
+        ({"raw_imgh": "tall"}, "key raw_imgh: expected an integer"),
     ],
 )
 def test_a_bad_sensor_file_is_refused(change, message):
@@ -310,3 +318,20 @@ def test_a_real_folder(data):
     assert sorted({press.ball_diameter_mm for press in read.presses}) == [6.31, 9.5]
     assert sum(radius is None for _, _, radius in labels.values()) == 4
     assert read.presses[0].image().shape == (3, 240, 320)
+
+
+def test_the_page_for_users_of_gs_sdk_runs(tmp_path, monkeypatch):
+    page = (Path(__file__).resolve().parents[1] / "docs" / "from_gs_sdk.md").read_text()
+    code = re.search(r"```python\n(.*?)```", page, re.DOTALL).group(1)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "gsmini.yaml").write_text(yaml.safe_dump({"ppmm": 0.25, "imgh": 60, "imgw": 80, "raw_imgh": 168, "raw_imgw": 224}))
+    lights = vts.PointLights([[20.0, 9.0, 25.0], [-18.0, 13.0, 25.0], [-2.0, -22.0, 25.0]], [600.0, 600.0, 600.0])
+    scene = vts.scenes.sphere_press(6.0, 1.0, (0.0, 0.0), 168, 224, 0.125)
+    vts.write_image("background.png", vts.scenes.render(vts.scenes.undeformed(scene), lights)[0])
+    vts.write_image("press.png", vts.scenes.render(scene, lights)[0])
+    network = vts.NormalFromMLP(60, 80, torch.full((3, 60, 80), 0.5), (8,))
+    torch.save(network.gs_sdk_state(), "nnmodel.pth")
+    names: dict[str, object] = {}
+    exec(code, names)
+    assert names["out"].depth_mm.shape == (1, 1, 60, 80) and bool(names["out"].contact[0, 0, 28:32, 38:42].all())
+    assert np.array_equal(names["height_map"], height_map_from_depth(names["out"].depth_mm, 0.25))

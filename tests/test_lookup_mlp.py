@@ -10,9 +10,13 @@ import pytest
 import torch
 from torch import nn
 
+import torchvts as vts
 from torchvts.core.files import save_tensors
 from torchvts.core.geometry import gradient_from_normal, normal_from_gradient
+from torchvts.evaluation.metrics import normal_angle_deg
+from torchvts.evaluation.score import ball_truth
 from torchvts.model.gs_sdk import read_calibration_folder, read_labels
+from torchvts.model.response_field import ResponseField, ResponseModel
 from torchvts.normals.lookup import NormalFromLookup
 from torchvts.normals.mlp import MAX_GRADIENT, NormalFromMLP
 from torchvts.training import fit_mlp
@@ -345,6 +349,73 @@ def test_wrapped_and_wider_state_dicts_are_read(tmp_path):
     loaded = NormalFromMLP.load(tmp_path / "nnmini.pt", flat_skin(), output="gradient")
     assert torch.equal(loaded(random_images()), wide(random_images()))
     assert {name: tuple(tensor.shape) for name, tensor in loaded.gs_sdk_state().items()}["fc1.weight"] == (64, 5)
+
+
+def test_a_network_declares_what_it_was_trained_on(tmp_path):
+    unit = response_unit()
+    block = NormalFromMLP(HEIGHT, WIDTH, flat_skin(), (4,), input_domain="ratio", blur_px=1.5)
+    block.save(tmp_path / "ratio.safetensors")
+    loaded = NormalFromMLP.load(tmp_path / "ratio.safetensors")
+    assert (loaded.input_domain, loaded.blur_px) == ("ratio", 1.5)
+    assert vts.DepthPipeline.from_calibration(unit, normals=loaded).normals is loaded
+    with pytest.raises(ValueError, match="input_domain: expected one of image, ratio, light, got 'raw'"):
+        NormalFromMLP(HEIGHT, WIDTH, flat_skin(), input_domain="raw")
+
+
+def test_a_network_on_images_that_it_was_not_trained_on_is_refused(tmp_path):
+    unit, block = response_unit(), network()
+    torch.save(block.gs_sdk_state(), tmp_path / "nnmodel.pth")
+    loaded = NormalFromMLP.load(tmp_path / "nnmodel.pth", flat_skin())
+    with pytest.raises(
+        ValueError, match=r"(?s)NormalFromMLP works on images as the camera .*; its input here is image / background"
+    ) as caught:
+        vts.DepthPipeline.from_calibration(unit, normals=loaded)
+    assert str(caught.value).count("\n") == 5 and "DepthPipeline.from_gs_sdk(" in str(caught.value)
+    by_light = vts.Calibration.from_lights(vts.PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900] * 3), unit.sensor)
+    with pytest.raises(ValueError, match="its input here is linear light"):
+        vts.DepthPipeline.from_calibration(by_light, normals=loaded)
+    with pytest.raises(
+        ValueError, match=r"NormalFromResponse works on image / background.*; its input here is images as the camera"
+    ):
+        own = vts.DepthPipeline.from_calibration(unit)
+        vts.DepthPipeline(vts.Compensate(), own.contact, own.normals, own.gradient, own.integrate, mm_per_pixel=0.5)
+
+
+def response_unit():
+    field = ResponseField(0, -1, False, 10.0, ((0.3, 0, 0), (0, 0.3, 0)))
+    return vts.Calibration.from_response(ResponseModel(field, None), vts.Sensor("rig", HEIGHT, WIDTH, 0.5), flat_skin())
+
+
+@pytest.mark.parametrize("mode", ["fast", "auto"])
+def test_from_gs_sdk_gives_the_network_its_own_images(tmp_path, mode):
+    block, sensor = network(), vts.Sensor("rig", HEIGHT, WIDTH, 0.5)
+    torch.save(block.gs_sdk_state(), tmp_path / "nnmodel.pth")
+    pipe = vts.DepthPipeline.from_gs_sdk(tmp_path / "nnmodel.pth", flat_skin(), sensor, mode)
+    image = flat_skin().clone()[None]
+    image[:, :, 8:20, 8:20] *= torch.tensor([1.4, 0.7, 1.2])[:, None, None]
+    out = pipe(image)
+    assert bool(out.contact[0, 0, 10:18, 10:18].all())
+    alone = NormalFromMLP.load(tmp_path / "nnmodel.pth", flat_skin())(image)
+    assert torch.allclose(out.normal[0, :, 10:18, 10:18], alone[0, :, 10:18, 10:18], atol=1e-5)
+    assert float(pipe(flat_skin()[None]).depth_mm.abs().max()) == 0.0
+    block.blur_px = 2.0
+    block.save(tmp_path / "blurred.safetensors")
+    assert vts.DepthPipeline.from_gs_sdk(str(tmp_path / "blurred.safetensors"), flat_skin(), sensor).normals.blur_px == 2.0
+    with pytest.raises(ValueError, match=r"background: expected \(3, 24, 32\) for sensor 'rig'"):
+        vts.DepthPipeline.from_gs_sdk(tmp_path / "nnmodel.pth", flat_skin()[:, :20], sensor)
+    with pytest.raises(ValueError, match="mode: 'precise'"):
+        vts.DepthPipeline.from_gs_sdk(tmp_path / "nnmodel.pth", flat_skin(), sensor, "precise")
+
+
+def test_from_gs_sdk_on_a_real_unit_equals_the_network(data, mini_presses):
+    background, presses = mini_presses
+    weights = data / "gelsight_mini_a" / "model" / "nnmodel.pth"
+    pipe, alone = vts.DepthPipeline.from_gs_sdk(weights, background, "gelsight_mini"), NormalFromMLP.load(weights, background)
+    for press in [p for p in presses if p.contact_radius_px][::6]:
+        inside = ball_truth(press, 240, 320, 0.0634).region
+        with torch.inference_mode():
+            angle = normal_angle_deg(pipe(press.image[None]).normal, alone(press.image[None]), inside)
+        assert float(angle.mean()) < 0.3
 
 
 def test_another_flat_image_is_taken():

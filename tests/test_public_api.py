@@ -37,6 +37,7 @@ ARGUMENTS = {
     vts.Calibration.load: ["path"],
     vts.Calibration.save: ["self", "path"],
     vts.DepthPipeline.from_calibration: ["calibration", "mode"],
+    vts.DepthPipeline.from_gs_sdk: ["weights", "background", "sensor", "mode"],
     vts.diagnose: ["background", "image", "calibration"],
     Finding: ["name", "message", "severity", "value"],
     Confidence.from_calibration: ["calibration", "normals"],

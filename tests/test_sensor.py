@@ -61,6 +61,9 @@ def as_text(**changes):
         ),
         (as_text(roi_px="[0, 0, 10]"), r"key roi_px: expected 4 numbers, got shape \(3,\)"),
         (as_text(roi_px="[-1, 0, 10, 10]"), "key roi_px: expected whole numbers"),
+        (as_text(raw_size_px="[48, 64]"), r"key raw_size_px: expected 2 x 2 numbers"),
+        (as_text(raw_size_px="[[48, 64]]", raw_crop=0.5), r"key raw_crop: expected a number in \[0, 0.49\], got 0.5"),
+        (as_text(raw_size_px="[[48, 64]]", roi_px="[0, 0, 9, 9]"), "key raw_size_px: expected none beside roi_px"),
         (as_text(corners_px="[[0, 0], [0, 9], [9, 9], [9, 0]]"), "key corners_px: expected a convex quadrilateral"),
         (as_text(corners_px="[[0, 0], [9, 0], [9, 9], [0, 9]]", roi_px="[0, 0, 9, 9]"), "expected one of them, got both"),
         ("- 1\n- 2\n", "expected keys and values, got list"),
@@ -139,6 +142,7 @@ def test_another_aspect_ratio_is_refused():
         {"light_azimuth_deg": [-90, 30, 150.5]},
         {"roi_px": [4, 5, 60, 45]},
         {"corners_px": [[1, 2], [30, 3.5], [31, 22], [0, 23]]},
+        {"raw_size_px": [[48, 64], [96, 128]], "raw_crop": 0.125},
     ],
 )
 def test_a_saved_sensor_loads_as_it_was(tmp_path, extra):
@@ -243,3 +247,37 @@ def test_shipped_sensors_are_found_from_an_installed_wheel(tmp_path):
 
 def test_field_of_view():
     assert math.isclose(vts.Sensor.load("gelsight_mini").field_mm[1], 320 * 0.0634)
+
+
+def test_raw_frames_are_cropped_and_resized():
+    sensor = vts.Sensor(**GOOD, raw_size_px=((56, 70), (240, 320)), raw_crop=1 / 7)
+    y, x = torch.meshgrid(torch.arange(56.0), torch.arange(70.0), indexing="ij")
+    frame = (torch.stack((x / 70, y / 56, 0 * x + 0.5)))[None]
+    image = sensor.rectify(frame)[0]  # 8 rows and 10 columns are cut off each side; 40 x 50 become 24 x 32
+    assert image.shape == (3, 24, 32)
+    assert float(image[0, 12].diff().mean()) == pytest.approx(50 / 70 / 32, rel=0.02)
+    assert float(image[0, :, 0].mean()) == pytest.approx((10 + 50 / 64 - 0.5) / 70, abs=0.005)
+    assert float(image[1, 0].mean()) == pytest.approx((8 + 40 / 48 - 0.5) / 56, abs=0.005)
+    cropped = torch.rand(1, 3, 24, 32, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(sensor.rectify(cropped), cropped)
+    with pytest.raises(
+        ValueError,
+        match="frame: expected 24 x 32, or raw frames of 56 x 70 or 240 x 320, for sensor 'rig', got 30 x 32: another aspect",
+    ):
+        sensor.rectify(torch.zeros(1, 3, 30, 32))
+    assert sensor.resized(240, 320).raw_size_px == ((56, 70),)  # images of this size are cropped already
+
+
+def test_frames_of_the_mini_as_its_camera_gives_them(data, tmp_path):
+    raw = vts.read_image(data / "gelsight_mini_c" / "frame_1.jpg")  # 240 x 320, with the frame of the gel around it
+    sensor = vts.Sensor.load("gelsight_mini")
+    top, left = 240 / 7, 320 / 7
+    box = [round(left), round(top), round(320 - 2 * left), round(240 - 2 * top)]
+    direct = vts.Sensor("mini", 240, 320, 0.0634, roi_px=box).rectify(raw[None])
+    for size in sensor.raw_size_px:
+        larger = torch.nn.functional.interpolate(raw[None], size, mode="bilinear", align_corners=False)
+        vts.write_image(tmp_path / "raw.png", larger[0])
+        assert float((sensor.read_image(tmp_path / "raw.png") - direct).abs().mean()) < 0.005
+    vts.write_image(tmp_path / "wide.png", torch.rand(3, 90, 160))
+    with pytest.raises(ValueError, match=r"wide\.png: frame: expected 240 x 320, or raw frames of 2464 x 3280 or 480 x 640"):
+        sensor.read_image(tmp_path / "wide.png")

@@ -3,6 +3,7 @@
 import itertools
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -19,7 +20,7 @@ import torch
 
 import torchvts as vts
 from torchvts import stream as streams
-from torchvts.core.files import read_frames, rgb_from_bgr
+from torchvts.core.files import read_depth_png, read_frames, rgb_from_bgr
 
 ROOT = Path(__file__).resolve().parents[1]
 PITCH = 0.25
@@ -274,6 +275,134 @@ def test_a_sudden_step_is_reported_and_not_learned(unit):
     assert states == ["following"] * 20 + ["stepped"] * 60 + ["following"] * 20
     assert stream.light.level == pytest.approx([1.0] * 3, abs=0.003)
     assert stream.light.steps == 1 and "stepped 1 times" in report.table()
+
+
+def test_flickering_cells_are_no_movement_and_a_growing_contact_is(unit):
+    _, camera = unit
+    pressed, free = (images([camera(mm, noise=0.0)])[0] for mm in (0.5, 0.0))
+    generator = torch.Generator().manual_seed(0)
+    dark = torch.zeros(1, 1, 120, 160)
+    dark[..., 20:26, 30:60] = 0.08  # five cells that flicker, as compression makes dark ones do
+    flicker = free + dark * torch.randn(12, 1, 1, 1, generator=generator)
+    streams.find_background(flicker.clamp(0, 1))
+    growing = [torch.lerp(free, pressed, k / 11) + 0.002 * torch.randn(free.shape, generator=generator) for k in range(12)]
+    with pytest.raises(ValueError, match="differs from the others"):
+        streams.find_background(torch.stack(growing).clamp(0, 1))
+
+
+def test_unusable_frames_are_named_and_left_out(unit, run_stream, unit_file, tmp_path):
+    _, camera = unit
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for k in range(26):
+        cv2.imwrite(str(folder / f"{k:03d}.png"), camera(1.0 if k >= 20 else 0.0))
+    black = np.zeros((120, 160, 3), np.uint8)
+    bad = {
+        14: (black, "one colour everywhere"),
+        15: (camera().astype(np.uint16) * 16, "12 bits stored in 16"),
+        16: (camera()[:100], r"expected \(120, 160\) like the first, got \(100, 160\)"),
+        17: (camera()[::-1], "mirrored top to bottom"),
+        18: (cv2.resize(camera()[17:-17, 23:-23], (160, 120)), "shows less than the background"),
+        21: (np.full_like(black, 255), "one colour everywhere"),
+    }
+    for k, (picture, _) in bad.items():
+        cv2.imwrite(str(folder / f"{k:03d}.png"), picture)
+    (folder / "019.png").write_bytes(b"no image")
+    done = run_stream("--source", folder, "--calibration", unit_file, "--out", tmp_path / "out", "--video", "none")
+    assert done.returncode == 1, done.stderr
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert [number for number, _ in summary["left_out"]] == [14, 15, 16, 17, 18, 19, 21] and summary["frames"] == 19
+    reasons = dict(summary["left_out"]) | {19: "not an image"}
+    for k, (_, part) in bad.items():
+        assert re.search(part, reasons[k]), (k, reasons[k])
+        assert f"left out frame {k}: " in done.stdout
+    rows = (tmp_path / "out" / "frames.csv").read_text().splitlines()[1:]
+    assert len(rows) == 26 and rows[15] == "15,,,,left out"
+    assert [float(row.split(",")[2]) > 0 for row in rows if not row.endswith("left out")] == [False] * 14 + [True] * 5
+
+
+@pytest.mark.parametrize("change", [0.3, -0.25])
+def test_a_large_contact_is_no_other_view(unit, change):
+    check = streams.FrameCheck(unit[0].background)
+    frame = unit[0].background[None].clone()
+    frame[:, 0, 5:115, 5:155] *= 1 + change
+    frame[:, 1, 5:115, 5:155] *= 1 - change
+    assert check(frame) == ""
+
+
+def test_both_scripts_give_the_same_depth_for_a_video(unit, run_stream, run_script, small_sensor, tmp_path):
+    _, camera = unit
+    video = write_video(
+        tmp_path / "press.avi", [camera(1.0 if 15 <= k < 20 else 0.0, 1.0 - 0.002 * max(0, k - 12)) for k in range(24)]
+    )
+    small_sensor.save(tmp_path / "rig.yaml")
+    sensor, saved = ("--sensor", tmp_path / "rig.yaml"), tmp_path / "unit.safetensors"
+    options = ("--out", tmp_path / "stream", "--video", "none", "--save-calibration", saved)
+    done = run_stream("--source", video, *sensor, *options)
+    assert done.returncode == 0, done.stderr
+    by_sensor = run_script("reconstruct", video, *sensor, "--out", tmp_path / "sensor", "--no-pictures")
+    by_file = run_script("reconstruct", saved, video, "--out", tmp_path / "file", "--no-pictures")
+    own = run_script("calibrate", video, *sensor, "--out", tmp_path / "own.safetensors")
+    assert (by_sensor.returncode, by_file.returncode, own.returncode) == (0, 0, 0), by_sensor.stderr + by_file.stderr + own.stderr
+    assert "first frames not used" not in by_file.stdout + by_sensor.stdout
+    assert saved.read_bytes() == (tmp_path / "own.safetensors").read_bytes()
+    streamed = [row.split(",") for row in (tmp_path / "stream" / "frames.csv").read_text().splitlines()[1:]]
+    for folder in ("sensor", "file"):
+        rows = [row.split(",") for row in (tmp_path / folder / "frames.csv").read_text().splitlines()[1:]]
+        assert [float(row[1]) for row in rows] == pytest.approx([float(row[3]) for row in streamed], abs=1e-6)
+        assert [float(row[2]) for row in rows] == pytest.approx([float(row[2]) for row in streamed], abs=1e-4)
+        assert [float(row[1]) > 0 for row in rows] == [15 <= k < 20 for k in range(24)]
+    with streams.TactileStream(video, small_sensor) as stream:
+        depth = {frame.number: frame.output.depth_mm for frame in stream}
+    for k in (3, 16, 19):
+        assert float((read_depth_png(tmp_path / "file" / f"press_{k:06d}_depth.png") - depth[k]).abs().max()) < 1e-3
+
+
+def test_backgrounds_of_several_images_and_own_presses(unit, run_script, small_sensor, tmp_path):
+    _, camera = unit
+    small_sensor.save(tmp_path / "rig.yaml")
+    for k, mm in enumerate((0.0, 0.0, 1.0)):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), camera(mm))
+    names = [tmp_path / f"{k}.png" for k in range(3)]
+    background = streams.read_background(names, small_sensor)
+    truth = unit[0].background
+    assert float((background - truth).abs().max()) < 0.03  # the press is gone
+    press = ("--press", tmp_path / "2.png", "20")
+    done = run_script("calibrate", *names, *press, "--sensor", tmp_path / "rig.yaml", "--out", tmp_path / "unit.safetensors")
+    assert done.returncode == 0 and "| 2.png |" in done.stdout, done.stderr
+    sensor = ("--sensor", tmp_path / "rig.yaml", "--out", tmp_path / "out")
+    done = run_script("reconstruct", names[2], *sensor, "--background", *names, *press, "--no-pictures", "--depth", "none")
+    assert done.returncode == 0 and "| 2.png |" in done.stdout, done.stderr
+    for arguments, part in (
+        ((names[2], *sensor), "--background: expected images without contact, got none"),
+        (
+            (names[2], *sensor, "--background", names[0], "--press", names[2], "wide"),
+            "press: expected the diameter of the ball in mm",
+        ),
+        ((names[2], "--out", tmp_path / "out"), "give either a calibration file or --sensor"),
+    ):
+        done = run_script("reconstruct", *arguments)
+        assert done.returncode != 0 and part in done.stderr, done.stderr
+    pressed = write_video(tmp_path / "pressed.avi", [camera(1.0) for _ in range(12)])
+    with pytest.raises(ValueError, match=r"pressed\.avi: background: the first 12 frames show structure"):
+        streams.read_background([pressed], small_sensor)
+    for paths, error, message in (
+        ([pressed, names[0]], ValueError, "background: expected images or one video, got 2 files"),
+        ([], ValueError, "background: expected one image or more, or a video, got none"),
+        (names[0], TypeError, "background: expected"),
+        ([tmp_path / "none.png"], FileNotFoundError, "no such image"),
+        ([tmp_path / "none.avi"], FileNotFoundError, "no such file"),
+    ):
+        with pytest.raises(error, match=message):
+            streams.read_background(paths, small_sensor)
+
+
+def test_a_calibration_is_used_as_it_is_without_first_frames(unit):
+    calibration, camera = unit
+    with streams.TactileStream(Frames([camera(0.5) for _ in range(4)]), calibration, background_frames=0) as stream:
+        assert all(bool(frame.output.contact.any()) for frame in stream)
+    with pytest.raises(ValueError, match="background_frames: expected at least 3, got 0"):
+        streams.TactileStream(Frames([]), calibration.sensor, background_frames=0)
 
 
 def test_printed_markers_do_not_pass_for_other_light(unit, small_sensor):
@@ -535,3 +664,35 @@ def test_the_golf_ball_appears_and_vanishes(data):
     assert min(depth for depth, _ in rows[25:40]) > 0.5 and min(area for _, area in rows[25:40]) > 20_000
     assert max(depth for depth, _ in rows[-6:]) < 0.02 and max(area for _, area in rows[-6:]) < 200  # after
     assert stream.light.steps == 0
+
+
+def test_presses_of_a_known_sensor_are_no_background(mini_presses):
+    background, presses = mini_presses
+    sensor = vts.Sensor.load("gelsight_mini")
+    generator = torch.Generator().manual_seed(0)
+
+    def held(image):
+        return (image[None] + 0.002 * torch.randn(12, *image.shape, generator=generator)).clamp(0, 1)
+
+    streams.find_background(held(background), sensor)
+    refused = 0
+    for press in presses[::4]:
+        try:
+            streams.find_background(held(press.image), sensor)
+        except ValueError as error:
+            refused += "something touches the skin" in str(error)
+    assert refused >= len(presses[::4]) - 1
+
+
+@pytest.mark.parametrize("size", [(640, 480), pytest.param((3280, 2464), marks=pytest.mark.long)])
+def test_a_raw_video_of_a_mini_runs_without_a_camera(data, run_stream, tmp_path, size):
+    pictures = np.stack([cv2.imread(str(data / "gelsight_mini_c" / f"frame_{k}.jpg")) for k in range(1, 50)])
+    free = np.median(pictures, 0)
+    generator = np.random.default_rng(0)
+    sequence = [(free + 0.6 * generator.standard_normal(free.shape)).clip(0, 255).round().astype(np.uint8) for _ in range(16)]
+    sequence[14:14] = [pictures[k] for k in (0, 10, 20)]
+    video = write_video(tmp_path / "raw.avi", [cv2.resize(picture, size) for picture in sequence])
+    done = run_stream("--source", video, "--sensor", "gelsight_mini", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    rows = [row.split(",") for row in (tmp_path / "out" / "frames.csv").read_text().splitlines()[1:]]
+    assert min(float(row[3]) for row in rows[14:17]) > 0.3 and max(float(row[3]) for row in rows[:14] + rows[17:]) < 0.02

@@ -28,12 +28,16 @@ class Compensate(nn.Module):
         drift: divides out the drift of the LEDs; None for nothing.
         saturated_model: (3, H, W), the model's light where a channel is saturated in the background, 0 elsewhere; None for nowhere.
         saturation_light: linear light from which a channel is saturated.
+    Attributes:
+        output_domain: what the compensated images are, a key of ``torchvts.normals.DOMAINS``; None where that is not known.
     Source:
         eq. 8 of the paper for the offset.
     Example:
         >>> Compensate(offset=torch.full((3, 4, 4), 0.1))(torch.zeros(1, 3, 4, 4)).max()
         tensor(0.1000)
     """
+
+    output_domain: str | None
 
     def __init__(
         self,
@@ -59,6 +63,7 @@ class Compensate(nn.Module):
         self.drift = nn.Identity() if drift is None else drift
         self.saturates = saturated_model is not None
         self.restores = drift is not None and self.saturates
+        self.output_domain = "image" if gain is None and offset is None and linear.gamma == 1.0 else None
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, drift: bool = False) -> "Compensate":
@@ -76,7 +81,7 @@ class Compensate(nn.Module):
             block = cls.drift_block(calibration.flat, calibration.compensated_noise_std, by_response, sensor.blur_px > 0.0)
         elif by_response:
             block = cls.drift_block()
-        return cls(
+        compensate = cls(
             calibration.gain,
             calibration.offset,
             sensor.exponent,
@@ -87,6 +92,8 @@ class Compensate(nn.Module):
             calibration.saturated_model,
             calibration.saturation_light,
         )
+        compensate.output_domain = "ratio" if by_response else "light"
+        return compensate
 
     drift_block = Drift
 

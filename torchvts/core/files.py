@@ -87,6 +87,11 @@ def read_image(path: str | Path) -> Tensor:
         FileNotFoundError: no such file.
         ValueError: not an image, or not in colour.
     """
+    return rgb_from_bgr(read_pixels(path))
+
+
+def read_pixels(path: str | Path) -> np.ndarray[Any, Any]:
+    """Read an image file as OpenCV gives it, (H, W, 3) B, G, R, 8 or 16 bits; raises as :func:`read_image`."""
     import cv2
 
     path = _image_path(path)
@@ -97,7 +102,7 @@ def read_image(path: str | Path) -> Tensor:
         raise ValueError(f"{path}: expected a colour image, got one of shape {pixels.shape}: three lights need three channels")
     if pixels.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{path}: expected 8 or 16 bits per channel, got {pixels.dtype}")
-    return rgb_from_bgr(pixels[:, :, :3])
+    return pixels[:, :, :3]
 
 
 def decode_image(path: Path, flags: int) -> np.ndarray[Any, Any] | None:

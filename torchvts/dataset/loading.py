@@ -1,4 +1,4 @@
-"""Reads the frames of a data set in loader processes: images and videos in order, each process its share."""
+"""Reads the frames of a data set in loader processes: images, each process its share, and whole videos in order."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -10,12 +10,13 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from ..core.files import read_image, rgb_from_bgr
 from ..model import Sensor
+from ..stream import RectifySizes, frames_a_second
 from .items import Item, list_items
 from .records import Records
 
 
 class Frame(NamedTuple):
-    """A frame as a loader hands it over; without image where it is done already or cannot be used.
+    """A frame as a loader hands it over; without image where it cannot be used, or is not needed any more.
 
     Attributes:
         item: the file that it is from.
@@ -23,6 +24,9 @@ class Frame(NamedTuple):
         done: whether its result is there.
         failed: why it cannot be used; empty where it can.
         length: the number of frames of a video, in an entry of its own at the end; None in all others.
+        mine: whether its depth is this rank's to find. Other frames of a video are there because its light is followed.
+        time_s: since the start of the video.
+        fps: frames a second of the video.
     """
 
     item: Item
@@ -30,6 +34,9 @@ class Frame(NamedTuple):
     done: bool = False
     failed: str = ""
     length: int | None = None
+    mine: bool = True
+    time_s: float = 0.0
+    fps: float = 30.0
 
 
 Batch = tuple[list[tuple[Frame, bool]], Tensor]
@@ -39,7 +46,7 @@ Batch = tuple[list[tuple[Frame, bool]], Tensor]
 def load_frames(
     records: Records, sensor: Sensor, share: tuple[int, int], batch: int, workers: int
 ) -> Iterator[tuple[Frame, Tensor | None]]:
-    """The frames of one rank's share, each with its image (1, 3, H, W), rectified, if it has one.
+    """The images of one rank's share and all frames of videos, each with its image (1, 3, H, W), rectified, if it has one.
 
     Args:
         records: of the run: which source it reads and which frames are done.
@@ -60,13 +67,14 @@ def _as_is(batch: Any) -> Any:
 
 
 class _Frames(IterableDataset[Batch]):
-    """Every N-th image and every N-th frame of every video; of videos one loader process of each rank decodes all, in order.
+    """Every N-th image and every frame of every video, which one loader process of each rank decodes, in order.
 
     Decoding in order is exact for any codec; seeking is not.
     """
 
     def __init__(self, records: Records, sensor: Sensor, share: tuple[int, int], batch: int) -> None:
-        self.records, self.sensor, self.share, self.batch = records, sensor, share, batch
+        self.records, self.share, self.batch = records, share, batch
+        self.rectify = RectifySizes(sensor)
 
     def __iter__(self) -> Iterator[Batch]:
         frames: list[tuple[Frame, bool]] = []
@@ -85,7 +93,7 @@ class _Frames(IterableDataset[Batch]):
         import cv2
 
         try:
-            return [self.sensor.rectify(read()[None])], ""
+            return [self.rectify(read()[None])], ""
         except (OSError, ValueError, cv2.error) as error:
             return [], " ".join(str(error).split()) or type(error).__name__
 
@@ -119,15 +127,14 @@ class _Frames(IterableDataset[Batch]):
             yield from ((Frame(item, number, done=True), None) for number in range(rank, length, world))
             return
         capture = cv2.VideoCapture(str(item.file(self.records.source)))
+        fps = frames_a_second(capture)
         number = 0
         while capture.grab():
-            if number % world == rank:
-                if self.records.is_done(item, number):
-                    yield Frame(item, number, done=True), None
-                else:
-                    decoded, pixels = capture.retrieve()
-                    failed = "" if decoded else "not decoded"
-                    yield Frame(item, number, failed=failed), partial(rgb_from_bgr, pixels) if decoded else None
+            mine = number % world == rank
+            done = mine and self.records.is_done(item, number)
+            decoded, pixels = capture.retrieve()
+            frame = Frame(item, number, done, "" if decoded else "not decoded", None, mine, number / fps, fps)
+            yield frame, partial(rgb_from_bgr, pixels) if decoded else None
             number += 1
         capture.release()
         if number == 0:

@@ -3,8 +3,10 @@
 Every process lists the source in the same order, takes each N-th image and each N-th frame of every video, and passes over what is
 done already (:mod:`.records`). At the end rank 0 writes ``frames.csv``. Only the names of one folder are in memory at a time.
 
-A frame's result does not depend on batch size, loader workers or processes: each frame goes through the pipeline by itself, on the
-same number of threads everywhere. (More threads split sums otherwise: depth then differs by up to 3e-7 mm.)
+Frames of a video go the way of a stream (:class:`torchvts.stream.Recording`): every process follows the light of all of them, and
+finds the depth of its own. An image is a recording of one frame. A frame's result does not depend on batch size, loader workers or
+processes: each goes through the pipeline by itself, on the same number of threads everywhere. (More threads split sums otherwise:
+depth then differs by up to 3e-7 mm.)
 """
 
 import hashlib
@@ -12,7 +14,7 @@ import os
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from datetime import timedelta
@@ -30,8 +32,9 @@ from ..core.checks import check_integer
 from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, count_frames, write_atomically, write_depth_png
 from ..core.geometry import depth_to_points
 from ..model import Calibration
-from ..pipeline import MODES, DepthOutput, DepthPipeline
-from .items import list_items
+from ..pipeline import MODES, DepthOutput
+from ..stream import FIRST_FRAMES, Recording
+from .items import Item, list_items
 from .loading import Frame, load_frames
 from .records import Records, Settings, begin, join, locked
 
@@ -51,6 +54,7 @@ class Report(NamedTuple):
         before: how many of them an earlier run had done.
         failed: (name, reason) of the frames that were left out.
         seconds: from the first frame until all processes had finished.
+        notes: (name, text) of videos whose first frames were not used, and why.
     """
 
     rank: int
@@ -58,6 +62,7 @@ class Report(NamedTuple):
     before: int
     failed: list[tuple[str, str]]
     seconds: float
+    notes: Sequence[tuple[str, str]] = ()
 
 
 def reconstruct_dataset(
@@ -69,6 +74,7 @@ def reconstruct_dataset(
     depth: str = "png",
     cloud: str = "none",
     pictures: bool | None = None,
+    background_frames: int = FIRST_FRAMES,
     batch: int = 8,
     workers: int | None = None,
     threads: int = 1,
@@ -89,6 +95,8 @@ def reconstruct_dataset(
         depth: "png", "npy" or "none".
         cloud: "pcd", "ply" or "none".
         pictures: whether to draw each frame; None draws where there are at most ``PICTURES_UP_TO``.
+        background_frames: first frames of a video, which show the skin without contact; 0 uses the calibration as it is, and so
+            does a video where they show contact or that is shorter, with a note.
         batch: frames that a loader worker hands over at once.
         workers: loader processes of each rank; None chooses.
         threads: of each rank. Results are bit for bit the same only for the same number, so it is one of the settings kept.
@@ -103,7 +111,7 @@ def reconstruct_dataset(
     for name, value, allowed in (("mode", mode, MODES), ("depth", depth, DEPTH_FORMATS), ("cloud", cloud, CLOUD_FORMATS)):
         if value not in allowed:
             raise ValueError(f"{name}: expected one of {', '.join(allowed)}, got {value!r}")
-    check_integer("batch", batch, 1), check_integer("threads", threads, 1)
+    check_integer("batch", batch, 1), check_integer("threads", threads, 1), check_integer("background_frames", background_frames, 0)
     if workers is not None:
         check_integer("workers", workers, 0)
     unit = Calibration.load(calibration)
@@ -114,7 +122,8 @@ def reconstruct_dataset(
         open3d()  # missing packages are reported before the first frame
     torch.set_num_threads(threads)
     digest = hashlib.sha256(Path(calibration).read_bytes()).hexdigest()
-    settings = Settings(digest, str(source.resolve()), mode, depth, cloud, pictures, threads, __version__, str(torch.__version__))
+    versions = __version__, str(torch.__version__)
+    settings = Settings(digest, str(source.resolve()), mode, depth, cloud, pictures, threads, *versions, background_frames)
     with _processes() as (rank, world), locked(out) if rank == 0 else nullcontext():
         if rank == 0:
             settings = begin(out, settings, overwrite)
@@ -165,12 +174,18 @@ def _sum_over_processes(count: int) -> int:
     return int(total)
 
 
+_Reconstructed = tuple[Frame, Tensor | None, DepthOutput | None]
+"""A frame, its image in the light of the background, and its depth."""
+
+
 class _Worker:
     """One rank's share of a data set: read, reconstruct, write."""
 
     def __init__(self, unit: Calibration, records: Records, share: tuple[int, int], strict: bool) -> None:
-        self.sensor, self.records, self.settings, self.share, self.strict = unit.sensor, records, records.settings, share, strict
-        self.pipe = DepthPipeline.from_calibration(unit, self.settings.mode)
+        self.unit, self.records, self.settings, self.share, self.strict = unit, records, records.settings, share, strict
+        self.sensor = unit.sensor
+        self.image = Recording(unit, self.settings.mode, follow=False)
+        self.notes: list[tuple[str, str]] = []
         self.done = 0
 
     def run(self, batch: int, workers: int | None) -> Report:
@@ -185,10 +200,10 @@ class _Worker:
         waiting: deque[tuple[Frame, Future[str]]] = deque()
         start = time.perf_counter()
         with tqdm(total=total, unit="frame", disable=rank > 0, smoothing=0.05) as bar, ThreadPoolExecutor(writers) as pool:
-            for frame, image in load_frames(self.records, self.sensor, self.share, batch, workers):
+            for frame, image, output in self._depths(load_frames(self.records, self.sensor, self.share, batch, workers)):
                 bar.update(frame.length is None)
                 if not frame.done:
-                    waiting.append((frame, self._reconstruct(frame, image, pool)))
+                    waiting.append((frame, self._written(frame, image, output, pool)))
                 while len(waiting) > 4 * writers:
                     self._settle(*waiting.popleft())
             while waiting:
@@ -198,20 +213,65 @@ class _Worker:
         if rank > 0:
             return Report(rank, 0, 0, [], seconds)
         rows, failed = self.records.write_tables()
-        return Report(0, rows, rows - done, failed, seconds)
+        return Report(0, rows, rows - done, failed, seconds, self.notes)
 
-    def _reconstruct(self, frame: Frame, image: Tensor | None, pool: ThreadPoolExecutor) -> "Future[str]":
-        """Depth of one frame; its files are written by the pool, which returns why there are none, or an empty text."""
-        failed = frame.failed
-        if image is not None:
-            try:
-                with torch.inference_mode():
-                    return pool.submit(self._finish, frame, image, self.pipe(image))
-            except ValueError as error:
-                failed = _in_one_line(error)
-        elif frame.length is not None:
+    def _depths(self, loaded: Iterable[tuple[Frame, Tensor | None]]) -> Iterator[_Reconstructed]:
+        """The frames of this rank with image and depth; those of a video once its first frames are there."""
+        recording: Recording | None = None
+        held: list[tuple[Frame, Tensor]] = []
+        video: Item | None = None
+        for frame, image in loaded:
+            if not frame.item.is_video or (image is None and frame.length is None):
+                if frame.mine:
+                    yield self._depth(self.image, frame, image)
+                continue
+            if frame.item != video:
+                video, recording, held = frame.item, None, []
+            if image is not None:
+                held.append((frame, image))
+            if recording is None and (frame.length is not None or len(held) >= self.settings.background_frames):
+                recording = self._recording(frame.item, held)
+            if recording is not None:
+                for one, of_video in held:
+                    found = self._depth(recording, one, of_video)
+                    if one.mine:
+                        yield found
+                held = []
+            if frame.length is not None:
+                yield frame, None, None
+
+    def _recording(self, item: Item, held: Sequence[tuple[Frame, Tensor]]) -> Recording:
+        """The recording of a video that begins with these frames."""
+        fps, count = held[0][0].fps if held else 30.0, self.settings.background_frames
+        try:
+            if 0 < count <= len(held):
+                return Recording(self.unit, self.settings.mode, torch.cat([image for _, image in held]), fps=fps)
+            reason = f"background_frames: expected at least {count} frames, got {len(held)}" if count > 0 else ""
+        except ValueError as error:
+            reason = _in_one_line(error)
+        if reason:
+            self.notes.append((item.path, f"first frames not used, the calibration is used as it is: {reason}"))
+        return Recording(self.unit, self.settings.mode, fps=fps)
+
+    def _depth(self, recording: Recording, frame: Frame, image: Tensor | None) -> _Reconstructed:
+        """Depth of one frame if it is wanted, or why there is none."""
+        if image is None:
+            return frame, None, None
+        try:
+            reason = recording.unusable(image)
+            if reason:
+                return frame._replace(failed=reason), None, None
+            return frame, *recording(image, frame.time_s, solve=frame.mine and not frame.done)
+        except ValueError as error:
+            return frame._replace(failed=_in_one_line(error)), None, None
+
+    def _written(self, frame: Frame, image: Tensor | None, output: DepthOutput | None, pool: ThreadPoolExecutor) -> "Future[str]":
+        """Files of one frame, by the pool, which returns why there are none, or an empty text."""
+        if image is not None and output is not None:
+            return pool.submit(self._finish, frame, image, output)
+        if frame.length is not None:
             return pool.submit(self._record, frame, frames=frame.length)
-        return pool.submit(self._record, frame, failed=failed)
+        return pool.submit(self._record, frame, failed=frame.failed)
 
     def _settle(self, frame: Frame, written: "Future[str]") -> None:
         """Count a frame whose files are in place, or report why there are none."""

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.files import write_atomically
+from ..stream import FIRST_FRAMES
 from .items import STATE, Item, has_few_frames, list_items
 
 Record = dict[str, Any]
@@ -37,6 +38,7 @@ class Settings:
     threads: int
     torchvts: str
     torch: str
+    background_frames: int = FIRST_FRAMES
 
 
 def begin(out: Path, settings: Settings, overwrite: bool) -> Settings:

@@ -4,7 +4,7 @@ import dataclasses
 import warnings
 from collections.abc import Sequence
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -147,4 +147,5 @@ def train_network(
     pixels = training_pixels(compensate, known, sensor.mm_per_pixel)
     flat = compensate(background[None])[0].clamp(0, 1)
     intensity, xy, slope, group = pixels
-    return fit_mlp(intensity.clamp(0, 1), xy, slope, flat, groups=group, seed=seed, max_epochs=max_epochs, progress=progress)
+    options: dict[str, Any] = {"seed": seed, "max_epochs": max_epochs, "progress": progress, "blur_px": blur_px}
+    return fit_mlp(intensity.clamp(0, 1), xy, slope, flat, groups=group, **options)

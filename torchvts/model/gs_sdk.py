@@ -19,14 +19,11 @@ from torch import Tensor
 
 from ..core.checks import brief, check_batch, check_path, check_positive, check_tensor
 from ..core.files import read_image, rgb_from_bgr
+from .gs_sdk_sensor import values_from_gs_sdk
 from .sensor import Sensor, read_yaml
 
 CATALOG_COLUMNS = ("experiment_reldir", "diameter(mm)")
 LABEL_COLUMNS = ("experiment_reldir", "diameter_mm", "center_x_px", "center_y_px", "contact_radius_px")
-SENSOR_KEYS = ("ppmm", "imgh", "imgw")
-SENSOR_KEYS_UNUSED = ("raw_imgh", "raw_imgw", "framerate", "device_name")
-"""Keys of a gs_sdk sensor file that describe the camera behind the image, which :class:`Sensor` does not need."""
-
 
 MOST_TABLE_BYTES = 2**24
 """Limit for tables of presses, which have some kilobytes."""
@@ -167,8 +164,9 @@ def read_labels(folder: str | Path) -> dict[str, tuple[float, float, float | Non
 def sensor_from_gs_sdk(config: dict[str, Any] | str | Path, name: str | None = None) -> Sensor:
     """Make a :class:`Sensor` from gs_sdk's sensor file.
 
-    ``ppmm`` is the pitch in **mm per pixel**, despite its name; ``imgh`` and ``imgw`` are the size of the image worked on.
-    ``raw_imgh``, ``raw_imgw``, ``framerate`` and ``device_name`` are accepted and ignored.
+    ``ppmm`` is the pitch in **mm per pixel**, despite its name; ``imgh`` and ``imgw`` are the size of the image worked on. Frames
+    of ``raw_imgh`` x ``raw_imgw`` are cropped by a seventh of their size on each side, then resized. ``framerate`` and
+    ``device_name`` are accepted and ignored. :meth:`Sensor.load` reads such files too.
 
     Args:
         config: the mapping, or the path of the YAML file.
@@ -195,20 +193,7 @@ def sensor_from_gs_sdk(config: dict[str, Any] | str | Path, name: str | None = N
         if source == "config":
             raise TypeError(f"config: expected a mapping or the path of a YAML file, got {type(values).__name__}")
         raise ValueError(f"{source}: expected keys and values of a gs_sdk sensor, got {type(values).__name__}")
-    for key in values:
-        if key not in SENSOR_KEYS + SENSOR_KEYS_UNUSED:
-            raise ValueError(f"{source}: key {brief(key)}: unknown; expected {', '.join(SENSOR_KEYS + SENSOR_KEYS_UNUSED)}")
-    for key in SENSOR_KEYS:
-        if key not in values:
-            raise ValueError(f"{source}: key {brief(key)}: missing; a gs_sdk sensor file has {', '.join(SENSOR_KEYS)}")
-    try:
-        pitch = check_positive("ppmm", values["ppmm"])
-        if pitch > 1.0:
-            raise ValueError(f"ppmm: expected mm per pixel in (0, 1], got {pitch:g}: the name misleads; invert pixels per mm")
-        return Sensor(name=name or "gs_sdk", height=values["imgh"], width=values["imgw"], mm_per_pixel=pitch)
-    except (TypeError, ValueError) as error:
-        text = str(error).replace("height:", "imgh:").replace("width:", "imgw:")
-        raise ValueError(f"{source}: key {text}") from error
+    return Sensor.from_dict(values_from_gs_sdk(values, source, name or "gs_sdk"), source)
 
 
 def depth_from_height_map(height_map_px: Tensor | np.ndarray[Any, Any], mm_per_pixel: float) -> Tensor:

@@ -11,8 +11,19 @@ import torch
 import yaml
 from torch import Tensor
 
-from ..core.checks import brief, check_batch, check_integer, check_numbers, check_path, check_positive, check_record, from_dict
-from ..core.files import write_atomically
+from ..core.checks import (
+    brief,
+    check_batch,
+    check_integer,
+    check_least,
+    check_numbers,
+    check_path,
+    check_positive,
+    check_record,
+    from_dict,
+)
+from ..core.files import read_image, write_atomically
+from .gs_sdk_sensor import is_gs_sdk_sensor, values_from_gs_sdk
 from .response_field import SensorPrior
 
 
@@ -33,6 +44,9 @@ class Sensor:
         roi_px: (left, top, width, height) of the gel in the camera's frame, resized to the sensor's size.
         corners_px: (4, 2), x and y of the gel's corners in the camera's frame: top left, top right, bottom right, bottom
             left, rectified to the sensor's size. Either this or ``roi_px``.
+        raw_size_px: (N, 2), (height, width) of the frames that the camera gives, if images are usually stored cropped: a frame of
+            such a size is cropped by ``raw_crop``, then resized to the sensor's size; one of the sensor's size is kept as it is.
+        raw_crop: share of a raw frame's height and width to cut off each side, in [0, 0.5).
         markers: the skin has printed markers, which are filled in every frame.
         prior: response that all units of this type share, fitted to presses on one.
     Raises:
@@ -52,6 +66,8 @@ class Sensor:
     light_azimuth_deg: tuple[float, float, float] | None = None
     roi_px: tuple[int, int, int, int] | None = None
     corners_px: tuple[tuple[float, float], ...] | None = None
+    raw_size_px: tuple[tuple[int, int], ...] = ()
+    raw_crop: float = 0.0
     markers: bool = False
     prior: SensorPrior | None = None
 
@@ -93,6 +109,10 @@ class Sensor:
                     f"bottom left, got {self.corners_px!r}"
                 )
             self._set("corners_px", corners)
+        self._set("raw_size_px", _raw_sizes(self.raw_size_px))
+        self._set("raw_crop", check_least("raw_crop", self.raw_crop, 0.0, 0.49))
+        if self.raw_size_px and (self.roi_px is not None or self.corners_px is not None):
+            raise ValueError("raw_size_px: expected none beside roi_px or corners_px, which say where the gel lies in raw frames")
         if not isinstance(self.markers, bool):
             raise TypeError(f"markers: expected true or false, got {brief(self.markers)}")
         prior: object = self.prior
@@ -117,6 +137,8 @@ class Sensor:
     def resized(self, height: int, width: int) -> "Sensor":
         """The same sensor with other pixels: field of view, lights and response stay; pitch and blur are scaled.
 
+        Frames of the new size are taken as images that are cropped already, also where the camera gives raw frames of that size.
+
         Args:
             height: new number of rows.
             width: new number of columns.
@@ -138,21 +160,23 @@ class Sensor:
             response = dataclasses.replace(prior.response, blur_px=prior.response.blur_px * scale_x)
             prior = dataclasses.replace(prior, response=response)
         pitch, blur_px = self.mm_per_pixel / scale_x, self.blur_px * scale_x
-        return dataclasses.replace(self, height=height, width=width, mm_per_pixel=pitch, blur_px=blur_px, prior=prior)
+        raw = tuple(size for size in self.raw_size_px if size != (height, width))
+        changes: dict[str, Any] = {"mm_per_pixel": pitch, "blur_px": blur_px, "prior": prior, "raw_size_px": raw}
+        return dataclasses.replace(self, height=height, width=width, **changes)
 
     def without_prior(self) -> "Sensor":
         """The same sensor without its prior."""
         return dataclasses.replace(self, prior=None)
 
     def rectify(self, frame: Tensor) -> Tensor:
-        """Cut the sensor's images out of camera frames: by four corners, by a region of interest, or unchanged.
+        """Cut the sensor's images out of camera frames: by corners, a region of interest, the crop of raw frames, or not at all.
 
         Args:
             frame: (B, 3, H, W).
         Returns:
             (B, 3, height, width).
         Raises:
-            ValueError: the frame does not contain the region, or has another size and the sensor has no region.
+            ValueError: the frame does not contain the region, or has a size that is neither the sensor's nor that of raw frames.
         """
         check_batch("frame", frame, 3)
         size = (self.height, self.width)
@@ -173,19 +197,39 @@ class Sensor:
                 raise ValueError(f"frame: {height} x {width} does not contain roi_px {self.roi_px} of sensor '{self.name}'")
             frame = frame[:, :, top : top + roi_height, left : left + roi_width]
             return frame if frame.shape[2:] == size else kornia.geometry.resize(frame, size, antialias=True)
+        if (height, width) in self.raw_size_px:
+            top, left = int(self.raw_crop * height), int(self.raw_crop * width)
+            return _resized(frame[:, :, top : height - top, left : width - left], size)
         if (height, width) != size:
+            raw = " or ".join(f"{rows} x {columns}" for rows, columns in self.raw_size_px)
+            cause = f"resize it, or load the sensor with height={height}, width={width}"
+            if abs(height * self.width / (width * self.height) - 1.0) > 0.01:
+                cause = "another aspect ratio, so another sensor, crop or mode of the camera"
             raise ValueError(
-                f"frame: expected {self.height} x {self.width} for sensor '{self.name}', got {height} x {width}: "
-                f"resize it, or load the sensor with height={height}, width={width}"
+                f"frame: expected {self.height} x {self.width}{raw and f', or raw frames of {raw},'} for sensor '{self.name}', "
+                f"got {height} x {width}: {cause}"
             )
         return frame
+
+    def read_image(self, path: str | Path) -> Tensor:
+        """Read an image file and rectify it: (3, height, width) in [0, 1], R, G, B.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: not an image, or of a size that is not the sensor's; names the file.
+        """
+        image = read_image(path)
+        try:
+            return self.rectify(image[None])[0]
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
 
     @classmethod
     def load(cls, source: str | Path, height: int | None = None, width: int | None = None) -> "Sensor":
         """Read a sensor.
 
         Args:
-            source: name of a shipped sensor, or path of a YAML file.
+            source: name of a shipped sensor, or path of a YAML file, of torchvts or of gs_sdk (``ppmm``, ``imgh``, ``imgw``).
             height: resize to this many rows; None keeps the size.
             width: resize to this many columns; None keeps the size.
         Raises:
@@ -196,7 +240,10 @@ class Sensor:
             0.0634
         """
         path = _find(source)
-        sensor = cls.from_dict(read_yaml(path), str(path))
+        values = read_yaml(path)
+        if is_gs_sdk_sensor(values):
+            values = values_from_gs_sdk(values, str(path), path.stem)
+        sensor = cls.from_dict(values, str(path))
         if height is None and width is None:
             return sensor
         if height is None or width is None:
@@ -308,6 +355,21 @@ def _azimuths(value: object) -> tuple[float, ...]:
     if min(gaps) < 1.0:
         raise ValueError(f"light_azimuth_deg: expected three lights in different places, got {value!r}")
     return azimuths
+
+
+def _raw_sizes(value: object) -> tuple[tuple[int, int], ...]:
+    if not isinstance(value, list | tuple):
+        raise TypeError(f"raw_size_px: expected sizes [[height, width], ...] of raw frames, got {brief(value)}")
+    numbers = check_numbers("raw_size_px", value, (len(value), 2)) if value else ()
+    if any(v != int(v) or v < 8 for v in numbers):
+        raise ValueError(f"raw_size_px: expected whole numbers (height, width) of at least 8, got {value!r}")
+    return tuple((int(numbers[k]), int(numbers[k + 1])) for k in range(0, len(numbers), 2))
+
+
+def _resized(frame: Tensor, size: tuple[int, int]) -> Tensor:
+    """Frames (B, 3, H, W) at another size, smoothed where they become smaller."""
+    resized = torch.nn.functional.interpolate(frame, size, mode="bilinear", align_corners=False, antialias=True)
+    return resized.clamp(0.0, 1.0)
 
 
 def _convex_clockwise(corners: tuple[tuple[float, ...], ...]) -> bool:

@@ -1,12 +1,13 @@
 """Normals from compensated images."""
 
-from .base import NormalModel, WrappedNormals, as_normal_model
+from .base import DOMAINS, NormalModel, WrappedNormals, as_normal_model, check_domain
 from .lookup import NormalFromLookup
 from .mlp import NormalFromMLP
 from .photometric import NormalFromIntensity
 from .response import NormalFromResponse
 
 __all__ = [
+    "DOMAINS",
     "NormalFromIntensity",
     "NormalFromLookup",
     "NormalFromMLP",
@@ -14,4 +15,5 @@ __all__ = [
     "NormalModel",
     "WrappedNormals",
     "as_normal_model",
+    "check_domain",
 ]

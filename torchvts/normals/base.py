@@ -4,6 +4,21 @@ from torch import Tensor, nn
 
 from ..core.checks import check_record
 
+DOMAINS = {
+    "image": "images as the camera gives them, value / 255",
+    "ratio": "image / background, 1 without contact, as a calibration by response fields gives",
+    "light": "linear light scaled to that of the light model, as a calibration by lights gives",
+}
+"""What a model of normals may work on, in words."""
+
+FROM_GS_SDK = """
+    import torchvts as vts
+    sensor = vts.Sensor.load("gelsight_mini")
+    background = vts.read_image("background.png")
+    pipe = vts.DepthPipeline.from_gs_sdk("nnmodel.pth", background, sensor)
+    out = pipe(vts.read_image("press.png")[None])"""
+"""How a network that was trained on camera images becomes a pipeline."""
+
 
 class NormalModel(nn.Module):
     """Base of modules that map compensated images to normals. A subclass declares what it can do and overrides ``forward``.
@@ -14,6 +29,8 @@ class NormalModel(nn.Module):
             a surface, so it has less noise and smaller errors than the slopes of single pixels.
         max_passes: passes after which nothing more is gained.
         takes_window: ``forward`` can work on a window of the calibrated image; else it always gets the whole image.
+        input_domain: what ``forward`` works on, a key of :data:`DOMAINS`; a pipeline whose compensated images are something else
+            is refused. None: it gets what the pipeline gives.
     Example:
         >>> import torch
         >>> class Flat(NormalModel):
@@ -28,6 +45,7 @@ class NormalModel(nn.Module):
     normals_from_depth: bool = False
     max_passes: int = 1000
     takes_window: bool = False
+    input_domain: str | None = None
 
     def forward(self, image: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
         """Normals of a compensated image.
@@ -66,3 +84,26 @@ def as_normal_model(module: nn.Module) -> NormalModel:
     """
     check_record("normals", module, nn.Module)
     return module if isinstance(module, NormalModel) else WrappedNormals(module)
+
+
+def check_domain(model: NormalModel, given: str | None) -> None:
+    """Raise unless a model works on what the compensation before it gives; where one of them declares nothing, all is accepted.
+
+    A camera's image is accepted for light: with a linear camera and without a background it is the same.
+
+    Args:
+        model: the model of normals.
+        given: key of :data:`DOMAINS`, what the compensated images are.
+    Raises:
+        ValueError: another domain; names both, and what to do.
+    """
+    wanted = model.input_domain
+    if wanted is None or given is None or wanted == given or (wanted, given) == ("light", "image"):
+        return
+    name = type(model).__name__
+    cure = {
+        "image": f"take the pipeline of such networks:{FROM_GS_SDK}",
+        "ratio": "put it behind Compensate.from_calibration of a unit that is calibrated by response fields",
+        "light": "put it behind Compensate.from_calibration of a unit that is calibrated by lights",
+    }[wanted]
+    raise ValueError(f"normals: {name} works on {DOMAINS[wanted]}; its input here is {DOMAINS[given]}: {cure}")

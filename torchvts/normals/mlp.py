@@ -9,10 +9,19 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_batch, check_field, check_integer, check_path, check_range, check_same_size
+from ..core.checks import (
+    check_batch,
+    check_choice,
+    check_field,
+    check_integer,
+    check_least,
+    check_path,
+    check_range,
+    check_same_size,
+)
 from ..core.files import load_tensors, save_tensors
 from ..core.geometry import normal_from_gradient
-from .base import NormalModel
+from .base import DOMAINS, NormalModel
 
 MLP_KIND = "mlp"
 OUTPUTS = ("angle", "gradient")
@@ -31,8 +40,9 @@ class NormalFromMLP(NormalModel):
     set, so call :meth:`set_flat` again after the weights have changed.
 
     Make one with :meth:`load` or :func:`torchvts.training.fit_mlp`. A new one holds random weights. The images must be preprocessed
-    as those on which the network was trained: gs_sdk's networks take raw images, so put one behind ``Compensate()`` without gain.
-    (On a GelSight Mini, a gain before it and the raw flat image cost 1.8 degrees, a gain before both 0.4.)
+    as those on which the network was trained, which it declares in ``input_domain`` and ``blur_px``. gs_sdk's networks take raw
+    images: :meth:`torchvts.DepthPipeline.from_gs_sdk` makes a pipeline of one, and a pipeline with other images refuses it. (On a
+    GelSight Mini its normals behind image / background are 50 degrees off.)
 
     Args:
         height: rows, pixels.
@@ -41,6 +51,8 @@ class NormalFromMLP(NormalModel):
         hidden: widths of the hidden layers.
         output: "angle" or "gradient".
         seed: of the random weights; the global generator is not used.
+        input_domain: what the images are, a key of ``torchvts.normals.DOMAINS``.
+        blur_px: standard deviation of the Gaussian blur of the images on which it was trained, pixels.
     Raises:
         ValueError, TypeError: bad sizes, a flat image of another size, range or type.
     Source:
@@ -63,8 +75,13 @@ class NormalFromMLP(NormalModel):
         *,
         output: str = "angle",
         seed: int = 0,
+        input_domain: str = "image",
+        blur_px: float = 0.0,
     ) -> None:
         super().__init__()
+        check_choice("input_domain", input_domain, tuple(DOMAINS))
+        self.input_domain = input_domain
+        self.blur_px = check_least("blur_px", blur_px)
         if output not in OUTPUTS:
             raise ValueError(f"output: expected one of {', '.join(OUTPUTS)}, got {output!r}")
         self.height = check_integer("height", height, 1)
@@ -170,6 +187,11 @@ class NormalFromMLP(NormalModel):
             state, described = load_tensors(path)
             if described.get("kind") != MLP_KIND or "flat" not in state or described.get("output") not in OUTPUTS:
                 raise ValueError(f"{path}: expected a network that NormalFromMLP.save wrote, got {described.get('kind')!r}")
+            try:
+                check_choice("input_domain", described.get("input_domain", "image"), tuple(DOMAINS))
+                check_least("blur_px", described.get("blur_px", 0.0))
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"{path}: damaged: {error}") from error
             stored = state.pop("flat")
             if flat is None:
                 flat = stored
@@ -180,12 +202,14 @@ class NormalFromMLP(NormalModel):
                     raise ValueError(f"{path}: damaged: {error}") from error
         else:
             state = _read_state(path)
+        domain, blur_px = str(described.get("input_domain", "image")), described.get("blur_px", 0.0)
         if flat is None:
             raise ValueError("flat: expected the image of the flat skin, (3, H, W), got None: a bare state dict holds none")
         check_flat_shape(flat)
         weights = _check_state(path, state)
         widths = [weight.shape[0] for weight, _ in weights[:-1]]
-        block = cls(flat.shape[1], flat.shape[2], flat, widths, output=output or str(described.get("output", "angle")))
+        kind = output or str(described.get("output", "angle"))
+        block = cls(flat.shape[1], flat.shape[2], flat, widths, output=kind, input_domain=domain, blur_px=blur_px)
         block._set_weights(weights)
         return block.requires_grad_(False).eval()
 
@@ -198,7 +222,8 @@ class NormalFromMLP(NormalModel):
         """
         if Path(path).suffix != ".safetensors":
             raise ValueError(f"{path}: expected a name ending in .safetensors, got {Path(path).suffix!r}")
-        save_tensors(path, {**self.gs_sdk_state(), "flat": self.flat}, {"kind": MLP_KIND, "output": self.output})
+        described = {"kind": MLP_KIND, "output": self.output, "input_domain": self.input_domain, "blur_px": self.blur_px}
+        save_tensors(path, {**self.gs_sdk_state(), "flat": self.flat}, described)
 
     def gs_sdk_state(self) -> dict[str, Tensor]:
         """The weights under gs_sdk's names, ``fc1.weight`` and so on; ``torch.save`` of it is a file that gs_sdk reads."""

@@ -52,6 +52,7 @@ class NormalFromIntensity(NormalModel):
 
     uses_depth: bool = True
     takes_window: bool = True
+    input_domain: str | None = "light"
     inverse: Tensor
 
     def __init__(

@@ -33,6 +33,7 @@ class NormalFromResponse(NormalModel):
     max_passes: int = 2
     takes_window: bool = True
     normals_from_depth: bool = True
+    input_domain: str | None = "ratio"
     maps: Tensor
     per_mm: Tensor
 

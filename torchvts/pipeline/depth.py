@@ -1,5 +1,6 @@
 """The depth pipeline: a calibration made into a chain of modules that turns images into depth."""
 
+from pathlib import Path
 from typing import ClassVar, Final
 
 import torch
@@ -16,6 +17,7 @@ from ..accelerated import (
     Uncrop,
     scriptable,
 )
+from ..compensate import Compensate as PlainCompensate
 from ..contact import ContactFromDepth
 from ..contact import ContactMask as PlainContactMask
 from ..core.checks import (
@@ -30,9 +32,10 @@ from ..core.checks import (
 )
 from ..core.frame import DepthOutput, Solution, depth_in_window, undeformed_output
 from ..integration import WrappedIntegrator, ZeroBackground, as_integrator
-from ..model import Calibration, check_calibration
+from ..model import Calibration, Sensor, check_calibration
 from ..normals import NormalFromIntensity as PlainNormalFromIntensity
-from ..normals import NormalFromResponse, WrappedNormals, as_normal_model
+from ..normals import NormalFromResponse, WrappedNormals, as_normal_model, check_domain
+from .gs_sdk import gs_sdk_blocks
 from .refine import Adaptive, Once, Repeat, SlopesOfDepth
 from .shadows import Shadows
 from .solve import Solve
@@ -91,6 +94,7 @@ class DepthPipeline(nn.Module):
         for name, block in (("compensate", compensate), ("deformed", deformed), ("gradient", gradient)):
             check_record(name, block, nn.Module)
         model, integrator = as_normal_model(normals), as_integrator(integrate)
+        check_domain(model, compensate.output_domain if isinstance(compensate, PlainCompensate) else None)
         check_positive("mm_per_pixel", mm_per_pixel), check_positive("tolerance_px", tolerance_px)
         check_least("refine_threshold_px", refine_threshold_px), check_integer("max_passes", max_passes, 1)
         if mode == "precise" and not (model.uses_depth or model.normals_from_depth):
@@ -142,10 +146,11 @@ class DepthPipeline(nn.Module):
             calibration: from :func:`calibrate`, :meth:`Calibration.from_lights` or :meth:`Calibration.load`.
             mode: "fast", "precise" or "auto".
             normals: module to put in place of the calibrated inverse model. It gets what that model would: the image scaled to the
-                light model's, or image / background for a response field.
+                light model's, or image / background for a response field. One that declares another ``input_domain`` is refused.
             integrate: module to put in place of PoissonBackground.
         Raises:
             TypeError: no Calibration.
+            ValueError: normals that work on other images.
         Example:
             >>> from torchvts import PointLights, Sensor
             >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
@@ -167,6 +172,24 @@ class DepthPipeline(nn.Module):
             integrate or PoissonBackground(sensor.mm_per_pixel),
         )
         return cls(*modules, mm_per_pixel=sensor.mm_per_pixel, mode=mode).eval()
+
+    @classmethod
+    def from_gs_sdk(cls, weights: str | Path, background: Tensor, sensor: Sensor | str, mode: str = "fast") -> "DepthPipeline":
+        """The pipeline of a network that gs_sdk trained, on the images that it was trained on.
+
+        Args:
+            weights: gs_sdk's ``nnmodel.pth``, of which nothing but tensors is unpickled; or what ``scripts/train_mlp.py`` wrote.
+            background: (3, H, W), image of the unit without contact in [0, 1], R, G, B; the network's gradients there are zero.
+            sensor: the sensor, or what :meth:`Sensor.load` takes.
+            mode: "fast", or "auto", which skips frames without contact.
+        Raises:
+            FileNotFoundError: no such weights or sensor.
+            ValueError, TypeError: no weights of such a network, or a background of another size, type or range.
+        Example:
+            >>> pipe = DepthPipeline.from_gs_sdk("nnmodel.pth", background, "gelsight_mini")  # doctest: +SKIP
+        """
+        sensor = sensor if isinstance(sensor, Sensor) else Sensor.load(sensor)
+        return cls(*gs_sdk_blocks(weights, background, sensor), mm_per_pixel=sensor.mm_per_pixel, mode=mode).eval()
 
     def forward(self, images: Tensor) -> DepthOutput:
         """(B, 3, H, W) images in [0, 1], R, G, B.

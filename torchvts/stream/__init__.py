@@ -1,25 +1,45 @@
 """Depth of cameras, videos and folders of images, frame by frame; late frames are dropped, slow drift of the light is followed."""
 
-from .background import calibrate_background, find_background
+from .background import (
+    FIRST_FRAMES,
+    calibrate_background,
+    calibrate_unit,
+    find_background,
+    read_background,
+    read_press_images,
+    use_calibration,
+)
 from .follow_light import FollowLight
 from .live import StageClock, TactileFrame, TactileStream
 from .overlay import Overlay, StreamReport, VideoFile, Window, has_display
-from .sources import NewestFrame, Reader, Rectify, open_source
+from .recording import Recording
+from .sources import NewestFrame, Reader, Rectify, RectifySizes, Unreadable, frames_a_second, open_source
+from .usable import FrameCheck
 
 __all__ = [
+    "FIRST_FRAMES",
     "FollowLight",
+    "FrameCheck",
     "NewestFrame",
     "Overlay",
     "Reader",
+    "Recording",
     "Rectify",
+    "RectifySizes",
     "StageClock",
     "StreamReport",
     "TactileFrame",
     "TactileStream",
+    "Unreadable",
     "VideoFile",
     "Window",
     "calibrate_background",
+    "calibrate_unit",
     "find_background",
+    "frames_a_second",
     "has_display",
     "open_source",
+    "read_background",
+    "read_press_images",
+    "use_calibration",
 ]

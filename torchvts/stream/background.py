@@ -1,49 +1,76 @@
 """The first frames of a stream: the background is found in them, and the unit is calibrated from it."""
 
+import math
 import warnings
+from collections.abc import Sequence
+from itertools import islice
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from ..accelerated import ContactMask
-from ..calibration import GIVEN_MISFIT, POORLY_CONSTRAINED_DEG, ROUGH, CalibrationWarning, calibrate, channel_structure
-from ..core.checks import check_batch
-from ..model import Calibration, ResponseField, ResponseModel, Sensor, check_sensor
+from ..calibration import (
+    GIVEN_MISFIT,
+    POORLY_CONSTRAINED_DEG,
+    ROUGH,
+    CalibrationWarning,
+    Press,
+    Touch,
+    calibrate,
+    channel_structure,
+)
+from ..contact import ContactMask as PlainContactMask
+from ..core.blur import blur, gaussian_weights
+from ..core.checks import check_batch, check_integer, check_path, check_sequence
+from ..core.files import VIDEO_SUFFIXES, read_frames
+from ..model import Calibration, ResponseField, ResponseModel, Sensor, SensorPrior, check_sensor
 from ..model.calibration import PEDESTAL
 from ..model.response_field import CHANGE_SCALE
+from ..normals import NormalFromResponse
+from .sources import RectifySizes
 
 MOVED = 0.02
 """Relative change of a cell of 1/20 of the frame that counts as movement among the first frames."""
 
+ROUGH_DEG = 4.0
+"""Slopes for which a prior takes the structure of an image; more is a contact."""
+
 NOT_METRIC = "depth is NOT METRIC: calibrate with presses of a ball"
+
+ASSUMED = ("sensor_file", "stand_in")
+"""Sources of a model that is not of this unit."""
 
 STAND_IN_NOISE = 0.02
 """Least noise, relative to the background, under a stand-in model: a press scatters light that no calibration has measured."""
 
 
-def find_background(images: Tensor) -> tuple[Tensor, Tensor]:
+def find_background(images: Tensor, sensor: Sensor | None = None) -> tuple[Tensor, Tensor]:
     """Find the image of the skin without contact in the first frames, or refuse and say why.
 
     The image is the median over the frames, averaged with the half of the values next to it. The frames are divided into cells of
     1/20 of their height, and the cells by their median over time. Refused are
 
     * frames whose level (median over the cells) changes by more than 2 % in a channel: the light changes;
-    * frames in which three cells or more differ from the level by more than 2 % and by 8 times the spread of all cells (median
-      absolute deviation): something moves, or a contact begins;
+    * frames in which three cells or more differ from the level by more than 2 %, by 8 times the spread of all cells (median
+      absolute deviation) and by 4 times their own median change from frame to frame: something moves, or a contact begins;
     * frames with structure between the channels. The fall-off of an LED is smooth, and a spot is dark in all channels; a contact is
       bright in one channel where it is dark in another, within a few millimetres. The log ratios of the channels, band-passed
       (Gaussians of 1/40 and 1/16 of the height), are below 0.11 at the 99th percentile without contact on every sensor at hand
       (0.01 to 0.03 on four of six; 0.10 on a Wedge, whose LEDs are in the picture), and 0.06 to 0.36 under clear contact; 0.13 is
       refused. So a faint contact that stays from the first frame to the last is not found: without a calibration it cannot be
-      distinguished from the skin.
+      distinguished from the skin;
+    * with a sensor that has a prior, frames whose structure the prior takes for slopes of more than 4 degrees at the 99th
+      percentile (2.1 to 2.6 on three units of the GelSight Mini without contact, 3.8 to 25 under balls).
 
     Args:
         images: (N, 3, H, W) in [0, 1], rectified, at least 3.
+        sensor: of the images; its prior is used if it has one.
     Returns:
-        The image (3, H, W), and per pixel the noise that videos have between frames (3, H, W): the RMS over frames of the mean of
-        3 x 3 pixels, times 3, smoothed. It equals the noise of the pixels where that is white, and is larger where compression
-        correlates it.
+        The image (3, H, W) in steps of 1/65535, which a calibration file keeps, and per pixel the noise that videos have between
+        frames (3, H, W): the RMS over frames of the mean of 3 x 3 pixels, times 3, smoothed. It equals the noise of the pixels
+        where that is white, and is larger where compression correlates it.
     Raises:
         ValueError: with the reason.
     """
@@ -53,16 +80,104 @@ def find_background(images: Tensor) -> tuple[Tensor, Tensor]:
     _check_steady(images)
     rank = images.sort(0).values
     quarter = len(images) // 4
-    image = rank[quarter : len(images) - quarter].mean(0)
+    image = _in_16_bits(rank[quarter : len(images) - quarter].mean(0))
     structure = channel_structure(image)
     if structure > ROUGH:
         raise ValueError(
             f"background: the first {len(images)} frames show structure between the channels of {structure:.2f}, without contact "
             f"it is below {ROUGH}: something touches the skin; start without contact, or give a calibration"
         )
+    if sensor is not None and sensor.prior is not None:
+        slope_deg = _structure_deg(image, sensor, sensor.prior)
+        if slope_deg > ROUGH_DEG:
+            raise ValueError(
+                f"background: the first {len(images)} frames show structure that looks like slopes of {slope_deg:.1f} degrees, "
+                f"without contact it is below {ROUGH_DEG:g}: something touches the skin; start without contact, or give a "
+                "calibration"
+            )
     deviation = nn.functional.avg_pool2d(images - image, 3, 1, 1, count_include_pad=False).square().mean(0)
     smooth = nn.functional.avg_pool2d(deviation[None], 15, 1, 7, count_include_pad=False)[0]
     return image, 3.0 * torch.sqrt(smooth)
+
+
+def _structure_deg(image: Tensor, sensor: Sensor, prior: SensorPrior) -> float:
+    """Slopes, degrees, for which a sensor's prior takes the structure between the channels of an image without contact."""
+    log = (image[None].float() ** sensor.exponent + PEDESTAL).log()
+    log = log - log.mean(1, keepdim=True)
+    height = sensor.height
+    band = blur(log, gaussian_weights(height / 40.0)) - blur(log, gaussian_weights(height / 16.0))
+    normals = NormalFromResponse(prior.response.fast, None, height, sensor.width, sensor.mm_per_pixel)
+    margin = round(0.14 * height)
+    upright = normals(band.exp())[0, 2, margin:-margin, margin:-margin]
+    return math.degrees(math.acos(min(1.0, float(upright.flatten().quantile(0.01)))))
+
+
+def _in_16_bits(image: Tensor) -> Tensor:
+    """Values that a calibration file keeps exactly."""
+    return (image.double() * 65535.0).round().div(65535.0).to(image.dtype)
+
+
+FIRST_FRAMES = 12
+"""So many first frames of a recording show the skin without contact, unless the user says otherwise."""
+
+
+def read_background(paths: Sequence[str | Path], sensor: Sensor, first_frames: int = FIRST_FRAMES) -> Tensor:
+    """The image without contact from files, rectified, (3, height, width).
+
+    * One image: as it is.
+    * Several images: the median of each pixel. Contacts vanish from it where each pixel is free of contact in most of the images.
+    * A video: its first frames, by :func:`find_background`, which refuses those with contact.
+
+    Args:
+        paths: one or more images, or one video.
+        sensor: rectifies.
+        first_frames: of a video, at least 3.
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not an image, sizes that the sensor does not accept, contact or movement in the first frames. Names the file.
+    """
+    check_sequence("background", paths, "paths of images, or of one video")
+    check_integer("first_frames", first_frames, 3)
+    if len(paths) == 0:
+        raise ValueError("background: expected one image or more, or a video, got none")
+    files = [check_path("background", path) for path in paths]
+    if any(file.suffix.lower() in VIDEO_SUFFIXES for file in files):
+        if len(files) > 1:
+            raise ValueError(f"background: expected images or one video, got {len(files)} files with a video among them")
+        return _background_of_video(files[0], sensor, first_frames)
+    images = torch.stack([sensor.read_image(file) for file in files])
+    if len(images) == 1:
+        return images[0]
+    rank = images.sort(0).values
+    return _in_16_bits(rank[(len(images) - 1) // 2 : len(images) // 2 + 1].mean(0))
+
+
+def _background_of_video(path: Path, sensor: Sensor, first_frames: int) -> Tensor:
+    rectify = RectifySizes(sensor)
+    try:
+        frames = [rectify(frame[None]) for _, frame in islice(read_frames(path), first_frames)]
+        if len(frames) < first_frames:
+            raise ValueError(f"background: expected at least {first_frames} frames, got {len(frames)}: ask for fewer")
+        return find_background(torch.cat(frames), sensor)[0]
+    except ValueError as error:
+        raise ValueError(str(error) if str(error).startswith(str(path)) else f"{path}: {error}") from error
+
+
+def read_press_images(presses: Sequence[tuple[str | Path, float | str]], sensor: Sensor) -> list[Press]:
+    """Presses from image files and ball diameters in mm.
+
+    Raises:
+        FileNotFoundError: no such image.
+        ValueError: not an image, a size that the sensor does not accept, or no diameter; names the file.
+    """
+    found = []
+    for path, diameter in presses:
+        try:
+            diameter_mm = float(diameter)
+        except ValueError:
+            raise ValueError(f"press: expected the diameter of the ball in mm after {path}, got {diameter!r}") from None
+        found.append(Press(sensor.read_image(path), diameter_mm, Path(path).name))
+    return found
 
 
 def _check_steady(images: Tensor) -> None:
@@ -77,13 +192,16 @@ def _check_steady(images: Tensor) -> None:
             f"background: the light changes by {float(change):.1%} during the first {len(images)} frames: wait until the LEDs and "
             "the camera's exposure have settled"
         )
-    difference = (ratio / level[..., None, None] - 1.0).abs().amax(1)  # (N, h, w)
-    spread = 1.4826 * float(difference.median())
-    moved = (difference > max(MOVED, 8.0 * spread)).flatten(1).sum(1)
+    relative = ratio / level[..., None, None]
+    difference = (relative - 1.0).abs()  # (N, 3, h, w)
+    spread = 1.4826 * float(difference.amax(1).median())
+    # compression makes dark cells flicker; a step, or steady growth, is larger than four times what changes from frame to frame
+    flicker = 4.0 * relative.diff(dim=0).abs().median(0).values
+    moved = (difference > flicker.clamp_min(max(MOVED, 8.0 * spread))).any(1).flatten(1).sum(1)
     if int(moved.max()) >= 3:
         raise ValueError(
             f"background: frame {int(moved.argmax())} of the first {len(images)} differs from the others in {int(moved.max())} of "
-            f"{difference[0].numel()} places: a contact, or the sensor moves; start without contact, or take fewer frames"
+            f"{difference[0, 0].numel()} places: a contact, or the sensor moves; start without contact, or take fewer frames"
         )
 
 
@@ -101,8 +219,15 @@ class StreamCalibration(NamedTuple):
     metric: bool
 
 
-def calibrate_background(background: Tensor, sensor: Sensor) -> StreamCalibration:
-    """Calibrate from one image without contact.
+def calibrate_unit(
+    background: Tensor,
+    sensor: Sensor,
+    presses: Sequence[Press] = (),
+    touches: Sequence[Touch | Tensor] = (),
+    *,
+    progress: bool = False,
+) -> Calibration:
+    """Calibrate from an image without contact, and from presses and touches if there are any: what all scripts do.
 
     As :func:`torchvts.calibrate` does; but if the sensor file gives the lights and their light does not look like the
     background (:data:`GIVEN_MISFIT`), only their directions are used: slope = - pinv(D) change, D being the lights' x / z and
@@ -111,33 +236,48 @@ def calibrate_background(background: Tensor, sensor: Sensor) -> StreamCalibratio
     Args:
         background: (3, H, W) in [0, 1].
         sensor: what the image is of.
+        presses: of balls.
+        touches: by unknown objects.
+        progress: show a bar.
     Example:
         >>> from torchvts.model.lights import PointLights, flat_image
         >>> lights = PointLights([[25, 0, 30], [-12, 20, 30], [-12, -20, 30]], [900, 900, 900])
-        >>> calibrate_background(flat_image(lights, 48, 64, 0.6).detach(), Sensor("rig", 48, 64, 0.6)).metric
-        True
+        >>> calibrate_unit(flat_image(lights, 48, 64, 0.6).detach(), Sensor("rig", 48, 64, 0.6)).report["model"]
+        'point_lights'
     """
     check_sensor("sensor", sensor)
+    calibration = calibrate(background, sensor, presses, touches, progress=progress)
+    report = calibration.report
+    if report["source"] != "sensor_file" or report["candidates"][0]["misfit"] <= GIVEN_MISFIT:
+        return calibration
+    lights = torch.tensor(sensor.light_position_mm, dtype=torch.float64)
+    slope = -torch.linalg.pinv(lights[:, :2] / lights[:, 2:]) * CHANGE_SCALE
+    rows = tuple(tuple(row) for row in slope.tolist())
+    half_mm = 0.5 * sensor.width * sensor.mm_per_pixel
+    model = ResponseModel(ResponseField(0, -1, half_mm, rows), None, sensor.exponent, max(1.0, sensor.blur_px))
+    misfit = report["candidates"][0]["misfit"]
+    reason = f"directions of the sensor file's lights; as point lights they miss the background by {misfit:.0%}"
+    stand_in = {"model": "response", "source": "stand_in", "reason": reason, "candidates": report["candidates"]}
+    return Calibration.from_response(model, sensor, background, stand_in)
+
+
+def calibrate_background(background: Tensor, sensor: Sensor, presses: Sequence[Press] = ()) -> StreamCalibration:
+    """:func:`calibrate_unit`, with its warnings as a note.
+
+    Args:
+        background: (3, H, W) in [0, 1].
+        sensor: what the image is of.
+        presses: of balls.
+    """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        calibration = calibrate(background, sensor)
+        calibration = calibrate_unit(background, sensor, presses)
     notes = [str(w.message) for w in caught if issubclass(w.category, CalibrationWarning)]
-    reason = str(calibration.report["reason"])
-    if calibration.report["source"] == "sensor_file":
-        misfit = calibration.report["candidates"][0]["misfit"]
-        if misfit > GIVEN_MISFIT:
-            lights = torch.tensor(sensor.light_position_mm, dtype=torch.float64)
-            slope = -torch.linalg.pinv(lights[:, :2] / lights[:, 2:]) * CHANGE_SCALE
-            rows = tuple(tuple(row) for row in slope.tolist())
-            half_mm = 0.5 * sensor.width * sensor.mm_per_pixel
-            model = ResponseModel(ResponseField(0, -1, half_mm, rows), None, sensor.exponent, max(1.0, sensor.blur_px))
-            reason = f"directions of the sensor file's lights; as point lights they miss the background by {misfit:.0%}"
-            report = {"model": "response", "source": "stand_in", "reason": reason}
-            calibration = Calibration.from_response(model, sensor, background, report)
+    if calibration.report["source"] in ASSUMED:
         notes.append("the lights are the sensor file's, not this unit's")
     metric = not notes
-    notes = [reason, *notes] + ([] if metric else [NOT_METRIC])
-    return StreamCalibration(calibration, "; ".join(notes), metric)
+    text = "; ".join([str(calibration.report["reason"]), *notes] + ([] if metric else [NOT_METRIC]))
+    return StreamCalibration(calibration, text, metric)
 
 
 def use_calibration(calibration: Calibration) -> StreamCalibration:
@@ -145,17 +285,22 @@ def use_calibration(calibration: Calibration) -> StreamCalibration:
     report = calibration.report
     note = f"calibration given: {report.get('reason', report.get('model', 'lights'))}"
     metric = max(report.get("direction_std_deg", [0.0])) <= POORLY_CONSTRAINED_DEG
+    metric = metric and report.get("source") not in ASSUMED
     return StreamCalibration(calibration, note if metric else f"{note}; {NOT_METRIC}", metric)
 
 
-def contact_in_video(calibration: Calibration, noise: Tensor) -> ContactMask:
-    """The unit's contact mask, with the noise (3, H, W) that a video has between frames."""
+def contact_in_video(calibration: Calibration, noise: Tensor | None = None) -> PlainContactMask:
+    """The unit's contact mask, with the noise (3, H, W) that a video has between frames; None where it was not measured."""
     calibrated = ContactMask.from_calibration(calibration)
+    stand_in = calibration.report.get("source") == "stand_in"
+    if noise is None and not stand_in:
+        return calibrated
+    noise = torch.zeros_like(calibration.background) if noise is None else noise
     sensor = calibration.sensor
     value = calibration.background.float().clamp_min(1e-6) ** (1.0 / sensor.exponent)
     compensated = noise.float() * sensor.exponent * torch.maximum(value, noise.float()) ** (sensor.exponent - 1.0)
     if calibration.gain is not None:
         compensated = compensated * calibration.gain.float() * 2.0**0.5
-    least = STAND_IN_NOISE if calibration.report.get("source") == "stand_in" else 0.0
+    least = STAND_IN_NOISE if stand_in else 0.0
     most = torch.maximum(1.0 / calibrated.per_noise.float(), compensated).clamp_min(least)
     return ContactMask(calibrated.flat.float(), most).eval()

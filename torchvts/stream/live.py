@@ -1,8 +1,9 @@
 """Depth of every frame of a source, with the time of each stage."""
 
 import time
+import warnings
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,13 +12,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ..calibration import Press
 from ..core.checks import check_choice, check_integer, check_positive
 from ..core.files import rgb_from_bgr
 from ..model import Calibration, Sensor
 from ..pipeline import MODES, DepthOutput, DepthPipeline
-from .background import calibrate_background, contact_in_video, find_background, use_calibration
-from .follow_light import TIME_CONSTANT_S, FollowLight
-from .sources import NewestFrame, Pixels, Reader, Rectify, Replay, open_source
+from .background import FIRST_FRAMES, calibrate_background, find_background, use_calibration
+from .follow_light import TIME_CONSTANT_S
+from .recording import Recording
+from .sources import NewestFrame, Pixels, Reader, Rectify, Replay, Unreadable, open_source
 
 
 class TactileFrame(NamedTuple):
@@ -95,15 +98,16 @@ class TactileStream:
     """Depth of every frame of a camera, a video or a folder of images.
 
     The first frames must be without contact (:func:`find_background`). Without a calibration the unit is calibrated from them
-    (:func:`calibrate_background`); with one they are compared with its background. Then each frame is
-    rectified, corrected to the background's light (:class:`FollowLight`), and sent through the pipeline. Of cameras, and of
-    recordings with ``realtime``, only the newest frame is taken and late ones are dropped; of other recordings all are.
+    (:func:`calibrate_background`); with one they are compared with its background. Then each frame is rectified and goes the way
+    of :class:`Recording`, which data sets share. Of cameras, and of recordings with ``realtime``, only the newest frame is taken
+    and late ones are dropped; of other recordings all are. A frame that cannot be used (:class:`FrameCheck`) is left out.
 
     Args:
         source: a camera's index, a video file, a folder of images, or a :class:`Reader`.
         sensor_or_calibration: the sensor, which rectifies; or a calibration, if there is one.
         mode: "fast", "precise" or "auto".
-        background_frames: number of frames without contact at the start.
+        background_frames: number of frames without contact at the start; 0, with a calibration, uses that as it is.
+        presses: of balls, to calibrate with; only without a calibration.
         realtime: play a recording at its own rate as if it were a camera.
         follow: follow slow drift of the light.
         time_constant_s: of following.
@@ -113,6 +117,7 @@ class TactileStream:
         note: where the calibration comes from and what to expect of it, in words.
         metric: whether depth is in mm, as far as is known.
         dropped: number of frames that nobody took.
+        left_out: (number, reason) of the frames that could not be used.
         stages: :class:`StageClock`.
         light: :class:`FollowLight`.
         fps: rate of the source.
@@ -131,87 +136,84 @@ class TactileStream:
         sensor_or_calibration: Sensor | Calibration,
         *,
         mode: str = "auto",
-        background_frames: int = 12,
+        background_frames: int = FIRST_FRAMES,
+        presses: Sequence[Press] = (),
         realtime: bool = False,
         follow: bool = True,
         time_constant_s: float = TIME_CONSTANT_S,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         check_choice("mode", mode, MODES)
-        check_integer("background_frames", background_frames, 3)
         check_positive("time_constant_s", time_constant_s)
         if not isinstance(sensor_or_calibration, Sensor | Calibration):
             raise TypeError(
                 f"sensor_or_calibration: expected a Sensor or a Calibration, got {type(sensor_or_calibration).__name__}"
             )
+        given = isinstance(sensor_or_calibration, Calibration)
+        check_integer("background_frames", background_frames, 0 if given else 3)
+        if given and len(presses) > 0:
+            raise ValueError(f"presses: expected none beside a calibration, got {len(presses)}: they are for calibrating")
         self.reader: Reader = open_source(source) if isinstance(source, str | int | Path) else _reader(source)
         self._newest: NewestFrame | None = None
         self._hooks: list[Any] = []
-        self._clock, self._follow = clock, follow
+        self._clock = clock
+        self.left_out: list[tuple[int, str]] = []
         self._realtime = realtime or self.reader.live
         self.fps = self.reader.fps
         self.stages = StageClock()
         try:
             self._waiting = self._first_frames(background_frames)
-            self._calibrate(sensor_or_calibration, mode, time_constant_s)
+            sensor = sensor_or_calibration if isinstance(sensor_or_calibration, Sensor) else sensor_or_calibration.sensor
+            readable = [pixels for pixels in self._waiting if not isinstance(pixels, Unreadable)]
+            self.rectify = Rectify(sensor, *readable[0].shape[:2])
+            first = torch.cat([self._rectified(pixels) for pixels in readable])
+            if isinstance(sensor_or_calibration, Sensor):
+                found = calibrate_background(find_background(first, sensor)[0].clamp(0.0, 1.0), sensor, presses)
+            else:
+                found = use_calibration(sensor_or_calibration)
+            self.calibration, self.note, self.metric = found
+            self.recording = Recording(
+                self.calibration,
+                mode,
+                first if background_frames > 0 else None,
+                fps=self.fps,
+                follow=follow,
+                time_constant_s=time_constant_s,
+                stage=self.stages.stage,
+            )
+            self.light, self.pipe = self.recording.light, self.recording.pipe
+            self._hooks = self.stages.watch(self.pipe)
         except BaseException:
             self.reader.close()
             raise
 
-    def _calibrate(self, unit: Sensor | Calibration, mode: str, time_constant_s: float) -> None:
-        """Set up the pipeline and the light from the first frames."""
-        sensor = unit if isinstance(unit, Sensor) else unit.sensor
-        self.rectify = Rectify(sensor, *self._waiting[0].shape[:2])
-        image, noise = find_background(torch.cat([self.rectify(rgb_from_bgr(pixels)[None]) for pixels in self._waiting]))
-        found = calibrate_background(image, unit) if isinstance(unit, Sensor) else use_calibration(unit)
-        self.calibration, self.note, self.metric = found
-        value = self.calibration.background.float() ** (1.0 / self.calibration.sensor.exponent)
-        self.light = FollowLight(value, time_constant_s)
-        self.pipe = DepthPipeline.from_calibration(self.calibration, mode).float()
-        self.pipe.deformed = contact_in_video(self.calibration, noise)
-        image = image[None].clamp(0.0, 1.0)
-        if isinstance(unit, Calibration):
-            self._compare_with_calibration(image)
-        self.light.set_background(self.light.correct(image))
-        self._hooks = self.stages.watch(self.pipe)
+    def _rectified(self, pixels: Pixels) -> Tensor:
+        frame: Tensor = self.rectify(rgb_from_bgr(pixels)[None])
+        return frame.clamp_(0.0, 1.0)
 
     @property
     def dropped(self) -> int:
         """Number of frames that arrived while another was being worked on, and were left out."""
         return 0 if self._newest is None else self._newest.dropped
 
-    def _first_frames(self, count: int) -> list[Pixels]:
+    def _first_frames(self, count: int) -> list[Pixels | Unreadable]:
+        """The first frames, of which ``count`` can be read, at least one."""
         if self.reader.live:  # exposure settles
             for _ in range(5):
                 self.reader.read()
-        frames: list[Pixels] = []
-        while len(frames) < count:
+        frames: list[Pixels | Unreadable] = []
+        readable = 0
+        while readable < max(1, count):
             pixels = self.reader.read()
             if pixels is None:
                 break
             frames.append(pixels)
-        if len(frames) < count:
+            readable += not isinstance(pixels, Unreadable)
+        if readable < max(1, count):
             raise ValueError(
-                f"background_frames: expected at least {count} frames from {self.reader.name}, got {len(frames)}: ask for fewer"
+                f"background_frames: expected at least {count} frames from {self.reader.name}, got {readable}: ask for fewer"
             )
         return frames
-
-    def _compare_with_calibration(self, image: Tensor) -> None:
-        """Start from the light of the first frames, and refuse another unit and a contact in them."""
-        light = self.light
-        light.start(image if self.calibration.markers is None else self.calibration.markers(image))
-        level = max(abs(v - 1.0) for v in light.level)
-        if level > 0.15:
-            raise ValueError(
-                f"background: the light is {level:.0%} off the calibration's: another unit, exposure or LEDs; calibrate again"
-            )
-        with torch.inference_mode():
-            deformed = self.pipe.deformed(self.pipe.compensate(light.correct(image)))
-        if bool(deformed.any()):
-            raise ValueError(
-                f"background: the first frames show contact on {float(deformed.float().mean()):.1%} of the skin against the "
-                "calibration's background: start without contact, or calibrate again if the skin has changed"
-            )
 
     def __enter__(self) -> "TactileStream":
         return self
@@ -230,22 +232,30 @@ class TactileStream:
             self.reader.close()
 
     def __iter__(self) -> Iterator[TactileFrame]:
-        before = None
         for index, time_s, pixels in self._frames():
-            with torch.inference_mode():
-                with self.stages.stage("rectify"):
-                    raw = self.rectify(rgb_from_bgr(pixels)[None]).clamp_(0.0, 1.0)
-                with self.stages.stage("light"):
-                    image = self.light.correct(raw)
-                output = self.pipe(image)
-                if self._follow:
-                    with self.stages.stage("light"):
-                        self.light.update(raw, output.deformed, 1.0 / self.fps if before is None else time_s - before)
-            before = time_s
+            with self.stages.stage("rectify"):
+                raw, reason = self._usable(pixels)
+            if raw is None:
+                self.left_out.append((index, reason))
+                warnings.warn(f"frame {index} left out: {reason}", stacklevel=2)
+                continue
+            image, output = self.recording(raw, time_s)
+            assert output is not None
             yield TactileFrame(index, time_s, image[0], output)
             self.stages.end_frame()
 
-    def _frames(self) -> Iterator[tuple[int, float, Pixels]]:
+    def _usable(self, pixels: Pixels | Unreadable) -> tuple[Tensor | None, str]:
+        """A frame rectified; or None, and why it cannot be used."""
+        if isinstance(pixels, Unreadable):
+            return None, pixels.reason
+        try:
+            raw = self._rectified(pixels)
+        except ValueError as error:
+            return None, str(error)
+        reason = self.recording.unusable(raw)
+        return (None, reason) if reason else (raw, "")
+
+    def _frames(self) -> Iterator[tuple[int, float, Pixels | Unreadable]]:
         if self._realtime:
             reader = self.reader if self.reader.live else Replay(self.reader, self._waiting)
             self._waiting = []
@@ -265,7 +275,7 @@ class TactileStream:
             yield index, index / self.fps, pixels_or_end
             index += 1
 
-    def _take(self) -> tuple[int, float, Pixels] | None:
+    def _take(self) -> tuple[int, float, Pixels | Unreadable] | None:
         assert self._newest is not None
         with self.stages.stage("wait"):
             return self._newest.take()

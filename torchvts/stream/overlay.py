@@ -187,6 +187,7 @@ class StreamReport:
             "source_fps": stream.fps,
             "frames": len(self.rows),
             "dropped": stream.dropped,
+            "left_out": [[number, reason] for number, reason in stream.left_out],
             "fps": round(self.fps, 2),
             "stages_ms": {name: round(ms, 3) for name, ms in stream.stages.median_ms().items()},
             "contact_frames": sum(row[2] > 0 for row in self.rows),
@@ -201,6 +202,9 @@ class StreamReport:
         """The summary as text."""
         values = self.summary()
         lines = [f"{values['frames']} frames, {values['dropped']} dropped, {values['fps']:.1f} frames a second"]
+        lines += [f"left out frame {number}: {reason}" for number, reason in values["left_out"][:20]]
+        if len(values["left_out"]) > 20:
+            lines.append(f"{len(values['left_out'])} frames left out, all of them in summary.json")
         lines.append("| stage | median ms |\n|---|---|")
         lines += [f"| {name} | {ms:.2f} |" for name, ms in values["stages_ms"].items()]
         unit = "mm" if values["metric"] else "mm (NOT METRIC)"
@@ -215,8 +219,9 @@ class StreamReport:
         with write_atomically(folder / "summary.json") as temporary:
             temporary.write_text(json.dumps(self.summary(), indent=2) + "\n", encoding="utf-8")
         with write_atomically(folder / "frames.csv") as temporary:
-            rows = (f"{i},{t:.4f},{area:.4f},{deepest:.6f},{state}\n" for i, t, area, deepest, state in self.rows)
-            temporary.write_text(f"{self.HEADER}\n" + "".join(rows), encoding="utf-8")
+            rows = {i: f"{i},{t:.4f},{area:.4f},{deepest:.6f},{state}\n" for i, t, area, deepest, state in self.rows}
+            rows |= {i: f"{i},,,,left out\n" for i, _ in self.stream.left_out}
+            temporary.write_text(f"{self.HEADER}\n" + "".join(rows[i] for i in sorted(rows)), encoding="utf-8")
 
 
 def has_display() -> bool:

@@ -2,10 +2,9 @@
 
 import threading
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import kornia
 import numpy as np
@@ -13,10 +12,20 @@ import torch
 from torch import Tensor, nn
 
 from ..core.checks import check_batch, check_integer, check_path
-from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, decode_image, image_files
+from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, image_files, read_pixels
 from ..model import Sensor, check_sensor
 
 Pixels = np.ndarray[Any, Any]
+
+
+class Unreadable(NamedTuple):
+    """A frame that cannot be read.
+
+    Attributes:
+        reason: why.
+    """
+
+    reason: str
 
 
 class Reader(Protocol):
@@ -32,8 +41,8 @@ class Reader(Protocol):
     live: bool
     fps: float
 
-    def read(self) -> Pixels | None:
-        """The next frame, (H, W, 3) B, G, R, 8 or 16 bits; None at the end."""
+    def read(self) -> Pixels | Unreadable | None:
+        """The next frame, (H, W, 3) B, G, R, 8 or 16 bits; why it cannot be read; None at the end."""
 
     def close(self) -> None:
         """Release the device or file."""
@@ -55,8 +64,7 @@ class CaptureReader:
             raise ValueError(f"source: {source}: not a video, or cut short: it does not open")
         if self.live:
             self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-        fps = float(self._capture.get(cv2.CAP_PROP_FPS))
-        self.fps = fps if 0.5 <= fps <= 1000.0 else 30.0
+        self.fps = frames_a_second(self._capture)
 
     def read(self) -> Pixels | None:
         there, pixels = self._capture.read()
@@ -64,6 +72,14 @@ class CaptureReader:
 
     def close(self) -> None:
         self._capture.release()
+
+
+def frames_a_second(capture: Any) -> float:
+    """Rate of an OpenCV capture; 30 where it does not know."""
+    import cv2
+
+    fps = float(capture.get(cv2.CAP_PROP_FPS))
+    return fps if 0.5 <= fps <= 1000.0 else 30.0
 
 
 class FolderReader:
@@ -78,18 +94,14 @@ class FolderReader:
             )
         self._files = iter(files)
 
-    def read(self) -> Pixels | None:
-        import cv2
-
-        for path in self._files:
-            try:
-                pixels = decode_image(path, cv2.IMREAD_COLOR)
-            except (ValueError, OSError):
-                pixels = None
-            if pixels is not None:
-                return pixels
-            warnings.warn(f"source: {path}: left out: not an image, or cut short", stacklevel=2)
-        return None
+    def read(self) -> Pixels | Unreadable | None:
+        path = next(self._files, None)
+        if path is None:
+            return None
+        try:
+            return read_pixels(path)
+        except (ValueError, OSError) as error:
+            return Unreadable(str(error))
 
     def close(self) -> None:
         self._files = iter(())
@@ -140,7 +152,7 @@ class NewestFrame:
         self._reader, self._rate, self._clock = reader, rate, clock
         self._changed, self._stop = threading.Condition(), threading.Event()
         self._sleep = sleep or self._stop.wait
-        self._newest: tuple[int, float, Pixels] | None = None
+        self._newest: tuple[int, float, Pixels | Unreadable] | None = None
         self._error: BaseException | None = None
         self._ended = False
         self._thread = threading.Thread(target=self._run, name="torchvts-reader", daemon=True)
@@ -166,14 +178,14 @@ class NewestFrame:
                 self._ended = True
                 self._changed.notify_all()
 
-    def put(self, index: int, time_s: float, pixels: Pixels) -> None:
+    def put(self, index: int, time_s: float, pixels: Pixels | Unreadable) -> None:
         """Put a frame in place of the last one, which is dropped if nobody took it."""
         with self._changed:
             self.dropped += self._newest is not None
             self._newest = (index, time_s, pixels)
             self._changed.notify_all()
 
-    def take(self) -> tuple[int, float, Pixels] | None:
+    def take(self) -> tuple[int, float, Pixels | Unreadable] | None:
         """The newest frame that was not taken yet; waits for it; None at the end. Raises what the reader raised."""
         with self._changed:
             while self._newest is None and not self._ended:
@@ -240,14 +252,30 @@ class Rectify(nn.Module):
         return nn.functional.grid_sample(frame, grid, mode="bilinear", padding_mode="zeros", align_corners=True)
 
 
+class RectifySizes:
+    """:class:`Rectify` for frames of any size that the sensor accepts; each size is prepared once."""
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor = sensor
+        self._of_size: dict[tuple[int, int], Rectify] = {}
+
+    def __call__(self, frame: Tensor) -> Tensor:
+        """(B, 3, H, W) to (B, 3, sensor.height, sensor.width), in [0, 1]."""
+        size = (frame.shape[2], frame.shape[3])
+        if size not in self._of_size:
+            self._of_size[size] = Rectify(self.sensor, *size)
+        rectified: Tensor = self._of_size[size](frame)
+        return rectified.clamp(0.0, 1.0)
+
+
 class Replay:
     """A reader that gives frames that were already read, then those of another reader."""
 
-    def __init__(self, reader: Reader, first: Sequence[Pixels]) -> None:
+    def __init__(self, reader: Reader, first: Sequence[Pixels | Unreadable]) -> None:
         self.name, self.live, self.fps = reader.name, reader.live, reader.fps
         self._reader, self._first = reader, iter(list(first))
 
-    def read(self) -> Pixels | None:
+    def read(self) -> Pixels | Unreadable | None:
         pixels = next(self._first, None)
         return self._reader.read() if pixels is None else pixels
 

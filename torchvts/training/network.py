@@ -67,6 +67,8 @@ def fit_mlp(
     held_out: float = 0.15,
     weight_decay: float = 0.2,
     progress: bool = False,
+    input_domain: str = "image",
+    blur_px: float = 0.0,
 ) -> MlpFit:
     """Train :class:`NormalFromMLP` on pixels of known slope, such as those inside presses of a ball.
 
@@ -90,6 +92,8 @@ def fit_mlp(
         weight_decay: pull of the weights towards 0 (AdamW). A few dozen presses leave most places of the image without one; on a
             GelSight Mini the error on unseen presses is 3.0 to 3.3 degrees at 0.2, 5 without.
         progress: show a bar.
+        input_domain: what the preprocessed images are, a key of ``torchvts.normals.DOMAINS``; kept with the network.
+        blur_px: blur that belongs to the preprocessing, pixels; kept with the network.
     Returns:
         A :class:`MlpFit`; ``message`` gives the remedy where it did not converge.
     Raises:
@@ -105,7 +109,7 @@ def fit_mlp(
     if not 0.0 < held_out < 1.0:
         raise ValueError(f"held_out: expected a share of the presses in (0, 1), got {held_out}")
     check_flat_shape(flat)
-    module = NormalFromMLP(flat.shape[1], flat.shape[2], flat, hidden, seed=seed)
+    module = NormalFromMLP(flat.shape[1], flat.shape[2], flat, hidden, seed=seed, input_domain=input_domain, blur_px=blur_px)
     _check_places(xy, flat)
     generator = torch.Generator().manual_seed(seed)
     samples = _split((intensity, xy, slope), flat, groups, held_out, generator)

@@ -1,0 +1,31 @@
+"""The blocks of a pipeline around a network that gs_sdk trained."""
+
+from pathlib import Path
+
+from torch import Tensor, nn
+
+from ..accelerated import Compensate, ContactMask, GradientFromNormal, PoissonBackground
+from ..core.checks import check_image
+from ..core.noise import noise_std
+from ..model import Sensor
+from ..normals import NormalFromMLP
+
+
+def gs_sdk_blocks(weights: str | Path, background: Tensor, sensor: Sensor) -> tuple[nn.Module, ...]:
+    """Compensation, deformed area, normals, gradient and integrator of a network, on camera images as it was trained on.
+
+    Args:
+        weights: ``nnmodel.pth``, or a file of ``NormalFromMLP.save``.
+        background: (3, H, W) in [0, 1], image of the unit without contact.
+        sensor: the sensor.
+    Raises:
+        FileNotFoundError: no such weights.
+        ValueError, TypeError: no such network, one that works on other images, or a background of another size, type or range.
+    """
+    check_image("background", background, sensor.height, sensor.width, sensor.name)
+    network = NormalFromMLP.load(weights, background)
+    compensate = Compensate(blur_px=network.blur_px)
+    flat = compensate(background[None])[0].clamp(0.0, 1.0)
+    network.set_flat(flat)
+    noise = 2.0**0.5 * noise_std(background[None])[0]  # of the frame and of the background
+    return compensate, ContactMask(flat, noise), network, GradientFromNormal(), PoissonBackground(sensor.mm_per_pixel)

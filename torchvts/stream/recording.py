@@ -1,0 +1,116 @@
+"""The way of each frame of a recording: is it usable, the light of the background, depth. Live streams and data sets share it."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ..model import Calibration, check_calibration
+from ..pipeline import DepthOutput, DepthPipeline
+from .background import contact_in_video, find_background
+from .follow_light import TIME_CONSTANT_S, FollowLight
+from .usable import FrameCheck
+
+MOST_LIGHT_CHANGE = 0.15
+"""First frames whose light differs more from the calibration's are those of another unit or exposure."""
+
+
+class Recording:
+    """Depth of the frames of one recording, in order, by one calibration.
+
+    The first frames show the skin without contact. The noise of the contact mask and the light of the recording are measured in
+    them, and they are compared with the background of the calibration. Without first frames the calibration is used as it is.
+
+    Args:
+        calibration: of the unit.
+        mode: "fast", "precise" or "auto".
+        first: (N, 3, H, W), the first frames, rectified; None for none.
+        fps: frames a second.
+        follow: follow slow drift of the light.
+        time_constant_s: of following.
+        stage: makes a context in which a stage of that name runs, to measure its time.
+    Attributes:
+        pipe: the pipeline.
+        light: :class:`FollowLight`.
+    Raises:
+        ValueError: contact or changing light in the first frames, or those of another unit.
+    """
+
+    def __init__(
+        self,
+        calibration: Calibration,
+        mode: str = "auto",
+        first: Tensor | None = None,
+        *,
+        fps: float = 30.0,
+        follow: bool = True,
+        time_constant_s: float = TIME_CONSTANT_S,
+        stage: Callable[[str], AbstractContextManager[Any]] = lambda name: nullcontext(),
+    ) -> None:
+        check_calibration("calibration", calibration)
+        value = calibration.background.float() ** (1.0 / calibration.sensor.exponent)
+        value = value.clamp(0.0, 1.0)
+        self.light = FollowLight(value, time_constant_s)
+        self.pipe = DepthPipeline.from_calibration(calibration, mode).float()
+        self.check = FrameCheck(value) if calibration.measured else None
+        self._fps, self._follow, self._stage = fps, follow, stage
+        self._before: float | None = None
+        image, noise = (None, None) if first is None else find_background(first)
+        self.pipe.deformed = contact_in_video(calibration, noise)
+        if image is not None:
+            self._start(calibration, image[None])
+        self._deformed: Tensor | None = None
+        self.pipe.deformed.register_forward_hook(self._keep)
+
+    def unusable(self, frame: Tensor) -> str:
+        """Why a frame (1, 3, H, W), rectified, cannot be used; an empty text where it can."""
+        return "" if self.check is None else self.check(frame)
+
+    def __call__(self, frame: Tensor, time_s: float, solve: bool = True) -> tuple[Tensor, DepthOutput | None]:
+        """Take the next frame.
+
+        Args:
+            frame: (1, 3, H, W) in [0, 1], rectified, usable.
+            time_s: its time.
+            solve: whether its depth is wanted; else only the light is followed.
+        Returns:
+            The frame in the background's light, and its depth.
+        """
+        with torch.inference_mode():
+            with self._stage("light"):
+                image = self.light.correct(frame)
+            output: DepthOutput | None = None
+            if solve:
+                output = self.pipe(image)
+            elif self._follow:
+                self.pipe.deformed(self.pipe.compensate(image))
+            if self._follow and self._deformed is not None:
+                with self._stage("light"):
+                    seconds = 1.0 / self._fps if self._before is None else time_s - self._before
+                    self.light.update(frame, self._deformed, seconds)
+        self._before = time_s
+        return image, output
+
+    def _keep(self, _module: nn.Module, _inputs: Any, deformed: Tensor) -> None:
+        self._deformed = deformed  # also of frames whose depth is not wanted
+
+    def _start(self, calibration: Calibration, image: Tensor) -> None:
+        """Start from the light of the first frames, and refuse another unit and a contact in them."""
+        light = self.light
+        light.start(image if calibration.markers is None else calibration.markers(image))
+        level = max(abs(v - 1.0) for v in light.level)
+        if level > MOST_LIGHT_CHANGE:
+            raise ValueError(
+                f"background: the light is {level:.0%} off the calibration's: another unit, exposure or LEDs; calibrate again"
+            )
+        corrected = light.correct(image)
+        with torch.inference_mode():
+            deformed = self.pipe.deformed(self.pipe.compensate(corrected))
+        if bool(deformed.any()):
+            raise ValueError(
+                f"background: the first frames show contact on {float(deformed.float().mean()):.1%} of the skin against the "
+                "calibration's background: start without contact, or calibrate again if the skin has changed"
+            )
+        light.set_background(corrected)

@@ -1,0 +1,104 @@
+"""Frames that cannot be used: black, of one colour, overexposed, 12 bits in 16, cropped or turned otherwise than the background."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from ..core.checks import check_batch, check_field, check_range, check_same_size
+
+DARK = 0.25
+"""A frame whose median brightness, in all channels, is below this share of the background's shows no skin."""
+
+BRIGHT = 0.985
+"""Image value above which a cell is overexposed."""
+
+TWELVE_BITS = 4095.0 / 65535.0
+"""Largest value of 12 bits stored in 16."""
+
+CROP = 1.0 / 7.0
+"""Share that is cut off each side of raw frames of a GelSight Mini."""
+
+NEAR = 0.1
+"""Relative difference below which a cell looks like the background."""
+
+
+def _centre(cells: Tensor) -> Tensor:
+    """The middle of (3, h, w) cells, without :data:`CROP` a side, at their own size."""
+    top, left = round(CROP * cells.shape[1]), round(CROP * cells.shape[2])
+    middle = cells[None, :, top : cells.shape[1] - top, left : cells.shape[2] - left]
+    return nn.functional.interpolate(middle, cells.shape[1:], mode="bilinear", align_corners=False)[0]
+
+
+_TURNED: tuple[tuple[str, Callable[[Tensor], Tensor]], ...] = (
+    ("turned by 180 degrees", lambda cells: cells.flip(1, 2)),
+    ("mirrored left to right", lambda cells: cells.flip(2)),
+    ("mirrored top to bottom", lambda cells: cells.flip(1)),
+    ("with red and blue swapped", lambda cells: cells.flip(0)),
+)
+
+
+class FrameCheck:
+    """Says why a frame cannot be a frame of this unit; an empty text where it can.
+
+    A frame is compared with the background in cells of 1/24 of its height. It shows another view if more than half of the cells are
+    like the background's when it is cropped, turned or mirrored, and 1.5 times as many as without that. A contact changes the frame
+    where it lies, and does not make it similar to another view.
+
+    Args:
+        background: (3, H, W), image value of the unit without contact.
+    Example:
+        >>> check = FrameCheck(torch.rand(3, 48, 64) * 0.2 + 0.4)
+        >>> check(torch.zeros(1, 3, 48, 64))
+        'the frame has one colour everywhere: black, or not decoded'
+    """
+
+    def __init__(self, background: Tensor) -> None:
+        check_field("background", background)
+        check_range("background", background)
+        self.size = (background.shape[1], background.shape[2])
+        self.cell = max(1, min(self.size) // 24)
+        self.background = self._cells(background[None].float())
+        self.lit = self.background > 0.06
+
+    def __call__(self, frame: Tensor) -> str:
+        """Why a frame (1, 3, H, W), rectified, in [0, 1], cannot be used."""
+        check_batch("frame", frame, 3)
+        check_same_size("frame", frame, "the background", *self.size)
+        if float((frame.amax((2, 3)) - frame.amin((2, 3))).max()) < 2.0 / 255.0:
+            return "the frame has one colour everywhere: black, or not decoded"
+        cells = self._cells(frame.float())
+        ratio = cells / self.background.clamp_min(1e-3)
+        level = torch.stack([of_channel[lit].median() for of_channel, lit in zip(ratio, self.lit) if bool(lit.any())])
+        if level.numel() > 0 and float(level.max()) < DARK:
+            cause = "black, or the LEDs were off"
+            if float(frame.max()) <= TWELVE_BITS + 1e-6:
+                cause = f"its largest value is {round(65535 * float(frame.max()))} of 65535: 12 bits stored in 16?"
+            return f"the frame is dark, {float(level.max()):.0%} of the background's brightness: {cause}"
+        bright, bright_before = (float((one.amin(0) > BRIGHT).double().mean()) for one in (cells, self.background))
+        if bright > 0.8 > bright_before:
+            return "the frame is overexposed: nearly all of it is saturated"
+        as_it_is = _likeness(cells, self.background)
+        return "" if as_it_is > 0.55 else self._other_view(cells, as_it_is)
+
+    def _cells(self, frame: Tensor) -> Tensor:
+        return nn.functional.avg_pool2d(frame, self.cell)[0]
+
+    def _other_view(self, cells: Tensor, as_it_is: float) -> str:
+        """What would make the cells similar to the background; an empty text where nothing does."""
+        views = [
+            ("cropped otherwise, it shows more than the background", _centre(cells), self.background),
+            ("cropped otherwise, it shows less than the background", cells, _centre(self.background)),
+            *((what, turn(cells), self.background) for what, turn in _TURNED),
+        ]
+        best, what = max((_likeness(one, other), what) for what, one, other in views)
+        if best < 0.5 or best < 1.5 * as_it_is:
+            return ""
+        return f"the frame is {what}: then {best:.0%} of it is like the background, as it is {as_it_is:.0%}"
+
+
+def _likeness(one: Tensor, other: Tensor) -> float:
+    """Share of the cells (3, h, w) that differ by less than :data:`NEAR` in all channels, each channel scaled as a whole."""
+    ratio = one / other.clamp_min(1e-3)
+    relative = ratio / ratio.flatten(1).median(1).values.clamp_min(1e-3)[:, None, None]
+    return float(((relative - 1.0).abs().amax(0) < NEAR).double().mean())

@@ -18,27 +18,36 @@ from .score import ball_truth
 
 
 class Training:
-    """Presses to learn from, without their labels, and the calibration by response fields that they give without a prior.
+    """Presses to learn from, without their labels, and the calibration that they give.
 
     Args:
         background: (3, H, W) in [0, 1], image without contact.
         presses: presses to learn from.
-        sensor: the sensor; its prior is not used.
-    Attributes:
-        labelled: the presses as given, with their labels, which only the fit of a prior may use.
-        presses: the presses without their labels.
+        sensor: the sensor; its prior is used if it has one.
     """
 
     def __init__(self, background: Tensor, presses: Sequence[Press], sensor: Sensor) -> None:
-        self.background = background
-        self.sensor = sensor.without_prior()
-        self.labelled = presses
+        self.background, self.sensor = background, sensor
         self.presses = [without_labels(press) for press in presses]
 
     @cached_property
+    def _attempt(self) -> Calibration | Exception:
+        try:
+            return quiet_calibrate(self.background, self.sensor, self.presses)
+        except Exception as error:  # kept, because every method that asks would wait for it again
+            return error
+
+    @property
     def calibration(self) -> Calibration:
         """Calibration by all presses, made when first needed."""
-        return quiet_calibrate(self.background, self.sensor, self.presses)
+        if isinstance(self._attempt, Exception):
+            raise self._attempt
+        return self._attempt
+
+    @cached_property
+    def without_prior(self) -> "Training":
+        """The same presses, and a sensor without a prior."""
+        return self if self.sensor.prior is None else Training(self.background, self.presses, self.sensor.without_prior())
 
     @cached_property
     def located(self) -> list[Press]:
@@ -142,7 +151,7 @@ def train_network(
     unlabelled = {press.name for press in presses if press.center_px is None}
     known = [press for press in presses if press.center_px is not None and press.contact_radius_px is not None]
     if unlabelled:
-        known += [press for press in Training(background, presses, sensor).located if press.name in unlabelled]
+        known += [press for press in Training(background, presses, sensor.without_prior()).located if press.name in unlabelled]
     compensate = Compensate(blur_px=blur_px)
     pixels = training_pixels(compensate, known, sensor.mm_per_pixel)
     flat = compensate(background[None])[0].clamp(0, 1)

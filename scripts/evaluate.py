@@ -39,7 +39,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     own = parser.add_argument_group("of a folder")
     own.add_argument("--sensor", default="gelsight_mini", help=f"YAML file, or one of {', '.join(vts.shipped_sensors())}")
     own.add_argument("--folds", type=int, default=5, help="cross-validation over presses; 1 scores what was learned from")
-    own.add_argument("--test", type=Path, help="a second folder: learn from all of the first, score on this one")
     own.add_argument("--network", type=Path, help="a trained network to score too: gs_sdk's nnmodel.pth, or .safetensors")
     arguments = parser.parse_args(argv)
     start = time.perf_counter()
@@ -58,8 +57,8 @@ def measure(arguments: argparse.Namespace) -> list[ev.Evaluation]:
     if arguments.folder is None:
         names = sets.SETS if arguments.all else arguments.sets
         return ev.evaluate_all(names, sets.data_folder(__file__), methods, limit=limit, seed=seed, progress=True)
-    options = {"folds": arguments.folds, "test": arguments.test, "network": arguments.network, "limit": limit}
-    data = sets.from_folder(arguments.folder, vts.Sensor.load(arguments.sensor), **options)
+    sensor = vts.Sensor.load(arguments.sensor)
+    data = sets.from_folder(arguments.folder, sensor, folds=arguments.folds, network=arguments.network, limit=limit)
     with tqdm(desc="evaluating", leave=False) as bar:
         return [ev.evaluate(data, methods, seed=seed, bar=bar)]
 

@@ -94,9 +94,9 @@ def table_2(folder: Path, out: Path) -> list[str]:
     background, presses = vts.read_presses(folder)
     kept = [press for k, press in enumerate(presses) if k % 5 == 0 and press.contact_radius_px is not None]
     training = Training(background, [press for press in presses if press not in kept], sensor)
-    table = methods.lookup_table(training, background, sensor).reconstruct
-    compared = {"response, precise": methods.by_calibration(training, background, sensor, "precise").reconstruct}
-    compared["point lights (the paper's)"] = methods.point_lights(training, background, sensor).reconstruct
+    table = methods.lookup_table(training).reconstruct
+    compared = {"response, precise": methods.by_calibration(training, "precise").reconstruct}
+    compared["point lights (the paper's)"] = methods.point_lights(training).reconstruct
     rows = []
     for name, pipe in compared.items():
         for press in tqdm(kept, desc="table 2", leave=False):

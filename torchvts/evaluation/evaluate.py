@@ -6,7 +6,7 @@ network learn from the balls that this calibration located. A method that fails 
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -71,17 +71,21 @@ def evaluate(data: DataSet, methods: Sequence[str] = (), *, seed: int = 0, bar: 
         >>> evaluate(data, ["flat"]).rows[0].error("relief_um")
         0.0
     """
-    run = _Run(data, _choose(data, methods, seed))
+    scored = [target for target in data.folds[0].scored if target.truth is not None] or data.folds[0].scored
+    shown = scored[len(scored) // 2] if scored else None
+    records = [_Record(method, data) for method in _choose(data, methods, seed)]
+    outputs: dict[str, DepthOutput] = {}
     for fold in data.folds:
         training = Training(data.background, fold.learned, fold.sensor)
-        for method in run.methods:
+        for record in records:
             if bar is not None:
-                bar.set_postfix_str(f"{data.name}, {method.name}")
-            run.score(fold, training, method)
+                bar.set_postfix_str(f"{data.name}, {record.method.name}")
+            for target, out in record.score(fold, training):
+                if target is shown:
+                    outputs[record.method.name] = out
             if bar is not None:
                 bar.update()
-    scores = [score for method in run.methods for score in run.scores[method.name]]
-    return Evaluation(data, [run.row(method) for method in run.methods], scores, run.shown, run.outputs)
+    return Evaluation(data, [record.row() for record in records], [s for record in records for s in record.scores], shown, outputs)
 
 
 def evaluate_all(
@@ -117,58 +121,47 @@ def evaluate_all(
             else:
                 fewer = 1 if data.refused else 2 if not data.folds[0].learned else len(IN_TABLE)
                 chosen = methods or IN_TABLE[:fewer]
-                bar.total += len(data.folds) * (len(chosen) + len(data.methods)) - 1
+                bar.total = (bar.total or 0) + len(data.folds) * (len(chosen) + len(data.methods)) - 1
                 done.append(evaluate(data, chosen, seed=seed, bar=bar))
     return done
 
 
-class _Run:
-    """Builds methods, and keeps their scores and what they make of the shown frame."""
+class _Record:
+    """What became of one method on the folds of a set."""
 
-    def __init__(self, data: DataSet, methods: Sequence[Method]) -> None:
-        self.data, self.methods = data, methods
-        scored = [target for target in data.folds[0].scored if target.truth is not None] or data.folds[0].scored
-        self.shown = scored[len(scored) // 2] if scored else None
-        self.background = data.background if data.scored_background is None else data.scored_background
-        self.built: dict[str, list[Built]] = {method.name: [] for method in methods}
-        self.scores: dict[str, list[PressScore]] = {method.name: [] for method in methods}
-        self.failures: dict[str, list[str]] = {method.name: [] for method in methods}
-        self.used: dict[str, list[tuple[int, int]]] = {method.name: [] for method in methods}
-        self.outputs: dict[str, DepthOutput] = {}
+    def __init__(self, method: Method, data: DataSet) -> None:
+        self.method, self.data = method, data
+        self.built: list[Built] = []
+        self.scores: list[PressScore] = []
+        self.failures: list[str] = []
 
-    def score(self, fold: Fold, training: Training, method: Method) -> None:
-        """Build a method from a fold and score it on the frames of the fold; a failure is kept."""
-        built, used = self.built[method.name], 0
-        assert method.from_presses is not None
+    def score(self, fold: Fold, training: Training) -> Iterator[tuple[Target, DepthOutput]]:
+        """Build the method from a fold, score it on the frames of the fold and yield its results; a failure is kept."""
         try:
-            built.append(built[0] if built and not method.learns else method.from_presses(training, self.background, fold.sensor))
-            used = built[-1].used
+            if self.method.learns or not self.built:
+                self.built.append(self.method.learned(training))
             for target in fold.scored:
                 with torch.inference_mode():
-                    out = built[-1].reconstruct(target.image[None])
-                self.scores[method.name].append(_score(target, out, fold.sensor.mm_per_pixel, method.name))
-                if target is self.shown:
-                    self.outputs[method.name] = out
+                    out = self.built[-1].reconstruct(target.image[None])
+                self.scores.append(_score(target, out, fold.sensor.mm_per_pixel, self.method.name))
+                yield target, out
         except Exception as error:  # one method or set that fails must not end a run over all
-            self.failures[method.name].append(_reason(error))
-        if method.learns and fold.learned:
-            self.used[method.name].append((used, len(fold.learned)))
+            self.failures.append(_reason(error))
 
-    def row(self, method: Method) -> Row:
-        """Summary of a method over all frames."""
-        built, notes = self.built[method.name], list(dict.fromkeys(self.failures[method.name]))
+    def row(self) -> Row:
+        """Summary over all frames."""
+        method, built, notes, errors = self.method, self.built, list(dict.fromkeys(self.failures)), summary(self.scores)
         if self.data.refused and method.learns:
             notes = ["refused, as is right: " + notes[0] if notes else "not refused, though no depth is possible"]
-        errors = summary(self.scores[method.name])
-        if self.used[method.name]:
-            errors["used"], errors["given"] = (float(sum(counts)) for counts in zip(*self.used[method.name]))
+        if method.learns and (given := sum(len(fold.learned) for fold in self.data.folds)):
+            errors |= {"used": float(sum(ready.used for ready in built)), "given": float(given)}
         return Row(
             kind="presses",
             method=method.name,
             data=self.data.name,
             errors=errors,
             parameters=max((ready.parameters for ready in built), default=None),
-            frames=len(self.scores[method.name]),
+            frames=len(self.scores),
             ours=method.ours,
             seen=method.seen,
             note="; ".join([*notes, *dict.fromkeys(ready.note for ready in built if ready.note)]),
@@ -179,7 +172,6 @@ def summary(scores: Sequence[PressScore]) -> dict[str, float | None]:
     """Means over frames; medians of the fitted sphere, the contact and the lowest depth, and the worst of these two."""
     columns = {name: [getattr(score, name) for score in scores] for name in _MEANS + _MEDIANS}
     errors = {name: mean(columns[name]) for name in _MEANS} | {name: median(columns[name]) for name in _MEDIANS}
-    errors["apex_um"] = mean(None if score.apex_um is None else abs(score.apex_um) for score in scores)
     for name in ("iou", "lowest_mm"):
         errors[f"worst_{name}"] = min((value for value in columns[name] if value is not None), default=None)
     return errors

@@ -277,7 +277,7 @@ def set_figure(evaluation: Evaluation, methods: Sequence[str] = ()) -> Figure:
         extent = contours.get_images()[0].get_extent()
         for mask, style in ((out.contact, "-"), (shown.truth.contact if shown.truth else None, ":")):
             if mask is not None and bool(mask.any()) and not bool(mask.all()):
-                lines = {"colors": "tab:red", "linestyles": style, "extent": extent, "origin": "upper"}
+                lines: dict[str, Any] = {"colors": "tab:red", "linestyles": style, "extent": extent, "origin": "upper"}
                 contours.contour(mask[0, 0].float().numpy(), [0.5], linewidths=1.2, **lines)
         contours.set_title(f"{name}: {contours.get_title()}")
         surface = figure.add_subplot(len(chosen), 3, 3 * k + 2, projection="3d")

@@ -46,8 +46,7 @@ class Built(NamedTuple):
 
 
 FromCalibration = Callable[[Calibration], Built]
-FromPresses = Callable[[Training, Tensor, Sensor], Built]
-"""(presses to learn from, background of the unit that is scored, its sensor) to the method."""
+FromPresses = Callable[[Training], Built]
 
 
 @dataclass(frozen=True)
@@ -90,6 +89,16 @@ class Method:
         if self.from_calibration is None:
             raise ValueError(f"method: expected one that a calibration is enough for, got '{self.name}', which learns from presses")
         return self.from_calibration(calibration)
+
+    def learned(self, training: Training) -> Built:
+        """The method built from presses.
+
+        Raises:
+            ValueError: a method that is not compared on presses, or presses that cannot be used.
+        """
+        if self.from_presses is None:
+            raise ValueError(f"method: expected one that presses are enough for, got '{self.name}', which needs a calibration")
+        return self.from_presses(training)
 
 
 # built from a calibration
@@ -181,59 +190,51 @@ def _lookup_by_rendered_balls(calibration: Calibration) -> Built:
 # built from presses
 
 
-def flat(training: Training, background: Tensor, sensor: Sensor) -> Built:
+def flat(training: Training) -> Built:
     """No depth at all: the error of every method must be below this one's."""
     return Built(_zero, 0)
 
 
-def point_lights(training: Training, background: Tensor, sensor: Sensor) -> Built:
+def point_lights(training: Training) -> Built:
     """Three lights fitted to the background alone, mode precise."""
-    found = quiet_calibrate(background, _blurred_sensor(sensor.without_prior()))
+    found = quiet_calibrate(training.background, _blurred_sensor(training.sensor.without_prior()))
     return pipeline(found, "precise")._replace(note="from the background alone")
 
 
-def lookup_table(training: Training, background: Tensor, sensor: Sensor) -> Built:
-    """One table from the relative change of R, G, B to slope."""
-    pixels = training_pixels(
-        Compensate.from_calibration(_zero_response(training.background, sensor)), training.located, sensor.mm_per_pixel
-    )
+def lookup_table(training: Training) -> Built:
+    """One table from the relative change of R, G, B to slope, behind the preprocessing of a response field that is zero."""
+    background, sensor = training.background, _blurred_sensor(training.sensor)
+    unit = Calibration.from_response(ResponseModel.zero(sensor.exponent, sensor.blur_px), training.sensor, background)
+    pixels = training_pixels(Compensate.from_calibration(unit), training.located, sensor.mm_per_pixel)
     block = NormalFromLookup.fit(torch.ones_like(background), pixels.intensity - 1.0, pixels.slope)
-    return pipeline(_zero_response(background, sensor), "fast", block)._replace(
-        parameters=block.table.numel(), used=len(training.located)
-    )
+    return pipeline(unit, "fast", block)._replace(parameters=block.table.numel(), used=len(training.located))
 
 
-def network(training: Training, background: Tensor, sensor: Sensor, seed: int = 0) -> Built:
+def network(training: Training, seed: int = 0) -> Built:
     """gs_sdk's RGBXY network, trained on these presses, and a frame in the steps of gs_sdk."""
-    fit = train_network(training.background, training.located, sensor, seed=seed)
-    built = _as_gs_sdk(fit.module, background, sensor, "" if fit.converged else "stopped before it converged")
-    return built._replace(used=len(training.located))
+    fit = train_network(training.background, training.located, training.sensor, seed=seed)
+    note = "" if fit.converged else "stopped before it converged"
+    return _as_gs_sdk(fit.module, training, note)._replace(used=len(training.located))
 
 
-def given_network(training: Training, background: Tensor, sensor: Sensor, path: str | Path) -> Built:
+def given_network(training: Training, path: str | Path) -> Built:
     """A network that was trained before, gs_sdk's ``nnmodel.pth`` or a file of torchvts, and a frame in the steps of gs_sdk."""
-    return _as_gs_sdk(NormalFromMLP.load(path, background), background, sensor, f"{Path(path).name}: trained before")
+    return _as_gs_sdk(NormalFromMLP.load(path, training.background), training, f"{Path(path).name}: trained before")
 
 
-def by_calibration(training: Training, background: Tensor, sensor: Sensor, mode: str, prior: bool = True) -> Built:
+def by_calibration(training: Training, mode: str, prior: bool = True) -> Built:
     """What a user gets: calibration by the presses, with or without the prior of the sensor."""
     training = training if prior else training.without_prior
-    found = training.calibration
-    if background is not training.background:
-        if found.response is not None:
-            found = Calibration.from_response(found.response, sensor, background)
-        elif found.lights is not None:
-            found = Calibration.from_lights(found.lights, found.sensor, background)
-    notes = ["calibrate chose point lights"] * (found.response is None)
+    notes = ["calibrate chose point lights"] * (training.calibration.response is None)
     if training.sensor.prior is not None:
         notes.append(f"prior fitted on {training.sensor.prior.source or 'a unit that it does not name'}")
     used = len(training.located) if training.presses else 0
-    return pipeline(found, mode)._replace(note="; ".join(notes), used=used)
+    return pipeline(training.calibration, mode)._replace(note="; ".join(notes), used=used)
 
 
-def shipped_prior(training: Training, background: Tensor, sensor: Sensor, shipped: Sensor) -> Built:
+def shipped_prior(training: Training, sensor: Sensor) -> Built:
     """The prior of another description of the sensor, and no presses, mode precise."""
-    return by_calibration(Training(training.background, (), shipped), background, shipped, "precise")
+    return by_calibration(Training(training.background, (), sensor), "precise")
 
 
 def with_network(path: Path) -> Method:
@@ -241,20 +242,15 @@ def with_network(path: Path) -> Method:
     return Method(GIVEN_NETWORK, from_presses=partial(given_network, path=path), ours=False, learns=False, seen=True)
 
 
-def _as_gs_sdk(module: NormalFromMLP, background: Tensor, sensor: Sensor, note: str) -> Built:
-    peer = GsSdkPipeline(module, background, RESPONSE_BLUR_PX)
+def _as_gs_sdk(module: NormalFromMLP, training: Training, note: str) -> Built:
+    peer = GsSdkPipeline(module, training.background, RESPONSE_BLUR_PX)
     count = sum(p.numel() for p in module.parameters())
-    return Built(partial(peer.as_output, mm_per_pixel=sensor.mm_per_pixel), count, note)
+    return Built(partial(peer.as_output, mm_per_pixel=training.sensor.mm_per_pixel), count, note)
 
 
 def _blurred_sensor(sensor: Sensor) -> Sensor:
     """The sensor with the blur that calibration by presses uses."""
     return dataclasses.replace(sensor, blur_px=with_preprocessing(sensor, None).blur_px)
-
-
-def _zero_response(background: Tensor, sensor: Sensor) -> Calibration:
-    """The unit with a response field that is zero everywhere: preprocessing and contact of a table."""
-    return Calibration.from_response(ResponseModel.zero(sensor.exponent, _blurred_sensor(sensor).blur_px), sensor, background)
 
 
 # the registry; in charts the two modes of the paper are broad lines, and methods that give almost the same are drawn upon them

@@ -87,6 +87,14 @@ def without_labels(press: Press) -> Press:
     return dataclasses.replace(press, center_px=None, contact_radius_px=None)
 
 
+def with_centers(background: Tensor, sensor: Sensor, presses: Sequence[Press]) -> list[Press]:
+    """The presses with centre and contact radius; where there is no centre, ``calibrate`` locates the balls."""
+    bare = [press for press in presses if press.center_px is None]
+    located = {press.name: press for press in Training(background, bare, sensor).located} if bare else {}
+    known = [located.get(press.name, press) for press in presses]
+    return [press for press in known if press.center_px is not None and press.contact_radius_px is not None]
+
+
 def quiet_calibrate(background: Tensor, sensor: Sensor, presses: Sequence[Press] = ()) -> Calibration:
     """``calibrate`` without its warnings: an evaluation reports the errors themselves."""
     with warnings.catch_warnings():
@@ -148,10 +156,7 @@ def train_network(
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     for press in presses:
         check_image(f"{press.name}: image", press.image, sensor.height, sensor.width, sensor.name)
-    unlabelled = {press.name for press in presses if press.center_px is None}
-    known = [press for press in presses if press.center_px is not None and press.contact_radius_px is not None]
-    if unlabelled:
-        known += [press for press in Training(background, presses, sensor.without_prior()).located if press.name in unlabelled]
+    known = with_centers(background, sensor.without_prior(), presses)
     compensate = Compensate(blur_px=blur_px)
     pixels = training_pixels(compensate, known, sensor.mm_per_pixel)
     flat = compensate(background[None])[0].clamp(0, 1)

@@ -49,8 +49,6 @@ class PressScore:
         iou: intersection over union of the contact found and the true one.
         radius_percent: error of the radius of a sphere fitted to the depth of a ball, percent; None where the depth is a plane.
         center_px: error of the centre of that sphere, pixels.
-        apex_um: error of the depth of the middle of a ball above the rim of the region, micrometres; None if the image cuts off
-            either.
     """
 
     press: str
@@ -63,7 +61,6 @@ class PressScore:
     iou: float | None = None
     radius_percent: float | None = None
     center_px: float | None = None
-    apex_um: float | None = None
 
     @property
     def level_um(self) -> float | None:
@@ -153,12 +150,8 @@ def score_press(
             f"{press.contact_radius_px:g} px, 10 are needed: pressed too faintly, or outside of the image"
         )
     radius_percent, center_px = _sphere_error(press, depth_mm.detach().cpu().double(), truth, mm_per_pixel)
-    return dataclasses.replace(
-        score_surface(truth, depth_mm, normal, mm_per_pixel, press.name, method, contact),
-        radius_percent=radius_percent,
-        center_px=center_px,
-        apex_um=_apex_um(press, depth_mm.detach().cpu().double(), truth),
-    )
+    score = score_surface(truth, depth_mm, normal, mm_per_pixel, press.name, method, contact)
+    return dataclasses.replace(score, radius_percent=radius_percent, center_px=center_px)
 
 
 def score_surface(
@@ -215,16 +208,6 @@ def _tilt(error: Tensor, place: Tensor) -> float:
     across = (place - place.double().mean(1, keepdim=True)).t()
     plane = across @ torch.linalg.lstsq(across, (error - error.mean())[:, None]).solution
     return float(plane.std(correction=0))
-
-
-def _apex_um(press: Press, depth_mm: Tensor, truth: Truth) -> float | None:
-    """Mean error of the middle less that of the rim; None if the image cuts off either."""
-    (center_x, center_y), contact_radius_px = label(press)
-    rows, columns = torch.nonzero(truth.region[0, 0], as_tuple=True)
-    error = (depth_mm - truth.depth_mm)[truth.region]
-    away = torch.hypot(columns - center_x, rows - center_y)
-    middle, rim = away < 2.0, away > contact_radius_px - RIM_PX - 1.5
-    return 1000.0 * float(error[middle].mean() - error[rim].mean()) if bool(middle.any() and rim.any()) else None
 
 
 def _sphere_error(press: Press, depth_mm: Tensor, truth: Truth, mm_per_pixel: float) -> tuple[float | None, float | None]:

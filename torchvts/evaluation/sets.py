@@ -6,11 +6,11 @@ No set is scored on presses that were learned from, and no prior is used that ha
 import dataclasses
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -25,11 +25,14 @@ from ..normals import NormalFromMLP
 from ..scenes import Scene
 from ..stream.sources import open_source
 from .methods import Method, shipped_prior, with_network
-from .presses import Training
+from .presses import with_centers
 from .score import Truth, ball_truth, undeformed_truth
 
 CHANGED = 15.0 / 255.0
 """A pixel of gelsight_mini_b is scored where a channel has changed by more than this."""
+
+
+T = TypeVar("T")
 
 
 class Target(NamedTuple):
@@ -73,7 +76,6 @@ class DataSet:
         how: what is held out, and where the truth comes from.
         methods: methods that only this set has.
         refused: the right answer is a refusal.
-        scored_background: background of the frames that are scored, if they are of another unit or day.
     """
 
     name: str
@@ -82,20 +84,13 @@ class DataSet:
     how: str
     methods: tuple[Method, ...] = ()
     refused: bool = False
-    scored_background: Tensor | None = None
 
 
 # a folder of presses
 
 
 def from_folder(
-    folder: str | Path,
-    sensor: Sensor,
-    *,
-    folds: int = 5,
-    test: str | Path | None = None,
-    network: str | Path | None = None,
-    limit: int | None = None,
+    folder: str | Path, sensor: Sensor, *, folds: int = 5, network: str | Path | None = None, limit: int | None = None
 ) -> DataSet:
     """Presses of balls in gs_sdk's layout; press i is in fold i % folds.
 
@@ -103,49 +98,33 @@ def from_folder(
         folder: the folder.
         sensor: the sensor.
         folds: parts of the cross-validation; with 1 the presses that were learned from are scored.
-        test: a second folder, scored by what all presses of the first taught; there is no cross-validation then.
         network: file of a trained network that is to be scored too.
         limit: use only so many presses, spread over the catalog.
     Raises:
         ValueError: too few presses, or none that can be scored.
         FileNotFoundError: no such folder or file.
     """
-    check_integer("folds", folds, 1)
     background, presses = read_presses(folder)
+    check_image("background", background, sensor.height, sensor.width, sensor.name)
     presses = spread(presses, limit)
-    scored_background, scored = (background, presses) if test is None else read_presses(test)
-    for image in (background, scored_background):
-        check_image("background", image, sensor.height, sensor.width, sensor.name)
-    if test is None and folds > len(presses):
+    if check_integer("folds", folds, 1) > len(presses):
         raise ValueError(f"folds: expected at most the number of presses, {len(presses)}, got {folds}")
-    scored = spread(scored, limit)
-    targets, source = with_truth(scored_background, sensor, scored)
+    targets, source = with_truth(background, sensor, presses)
     if not targets:
-        raise ValueError(f"folder: none of {len(scored)} presses has a contact radius: nothing can be scored")
-    if test is not None or folds == 1:
-        split = [Fold(sensor, presses, targets)]
-        how = f"{len(presses)} presses learned from" + ("" if test else " and scored")
-    else:
-        split = cross_validation(sensor, presses, targets, folds)
-        how = f"{folds}-fold cross-validation over {len(presses)} presses"
+        raise ValueError(f"folder: none of {len(presses)} presses has a contact radius: nothing can be scored")
     names = {target.name for target in targets}
-    if left_out := [press.name for press in scored if press.name not in names]:
+    if left_out := [press.name for press in presses if press.name not in names]:
         source += f"; not scored, no contact radius: {', '.join(left_out)}"
+    split = [Fold(sensor, presses, targets)] if folds == 1 else cross_validation(sensor, presses, targets, folds)
+    how = f"{folds}-fold cross-validation over" if folds > 1 else "learned from and scored:"
     methods = () if network is None else (with_network(Path(network)),)
-    return DataSet(
-        Path(test or folder).name,
-        background,
-        split,
-        f"{how}, without labels; {source}",
-        methods,
-        scored_background=None if test is None else scored_background,
-    )
+    return DataSet(Path(folder).name, background, split, f"{how} {len(presses)} presses, without labels; {source}", methods)
 
 
-def spread(presses: Sequence[Press], limit: int | None) -> list[Press]:
-    """``limit`` presses at equal steps of the catalog, which lists one ball after the other; None for all."""
-    count = len(presses) if limit is None else min(check_integer("limit", limit, 1), len(presses))
-    return [presses[k * len(presses) // count] for k in range(count)]
+def spread(items: Sequence[T], limit: int | None) -> list[T]:
+    """``limit`` items at equal steps of the catalog, which lists one ball after the other; None for all."""
+    count = len(items) if limit is None else min(check_integer("limit", limit, 1), len(items))
+    return [items[k * len(items) // count] for k in range(count)]
 
 
 def cross_validation(sensor: Sensor, presses: Sequence[Press], targets: Sequence[Target], folds: int) -> list[Fold]:
@@ -163,17 +142,12 @@ def cross_validation(sensor: Sensor, presses: Sequence[Press], targets: Sequence
 
 def with_truth(background: Tensor, sensor: Sensor, presses: Sequence[Press]) -> tuple[list[Target], str]:
     """The presses that can be scored: labelled ones, and without a label those that ``calibrate`` locates; and the source."""
-    bare = [press for press in presses if press.center_px is None]
-    located = {press.name: press for press in Training(background, presses, sensor).located} if bare else {}
-    known = [located.get(press.name, press) if press.center_px is None else press for press in presses]
-    counts = {"labels": len(presses) - len(bare), "calibrate on the scored presses": len(bare)}
+    bare = sum(press.center_px is None for press in presses)
+    counts = {"labels": len(presses) - bare, "calibrate on the scored presses": bare}
     how = "centers from " + " and ".join(f"{source} ({count})" for source, count in counts.items() if count)
     size = (sensor.height, sensor.width, sensor.mm_per_pixel)
-    return [
-        Target(press.name, press.image, ball_truth(press, *size), press)
-        for press in known
-        if press.center_px is not None and press.contact_radius_px is not None
-    ], how
+    known = with_centers(background, sensor, presses)
+    return [Target(press.name, press.image, ball_truth(press, *size), press) for press in known], how
 
 
 # the real sensors
@@ -190,7 +164,7 @@ def _mini_a(folder: Path, limit: int | None) -> DataSet:
         prior = fit_prior(background, shipped, others, "the presses of the other ball, with their labels")
         targets, how = with_truth(background, shipped, own)
         folds += cross_validation(dataclasses.replace(shipped, prior=prior), own, targets, min(5, len(own)))
-    seen = Method("precise, shipped prior", from_presses=partial(shipped_prior, shipped=shipped), learns=False, seen=True)
+    seen = Method("precise, shipped prior", from_presses=partial(shipped_prior, sensor=shipped), learns=False, seen=True)
     how = f"each ball by five folds, prior of the other ball; {how}"
     return DataSet(folder.name, background, folds, how, (with_network(folder / "model" / "nnmodel.pth"), seen))
 
@@ -234,24 +208,24 @@ def _pale(folder: Path, limit: int | None) -> DataSet:
 
 
 def _fots(
-    name: str, folder: Path, labels: dict[str, tuple[tuple[float, float], float]], limit: int | None
+    name: str, folder: Path, labels: Mapping[str, tuple[tuple[float, float] | None, float | None]], limit: int | None
 ) -> tuple[Tensor, Sensor, list[Press]]:
     """A sensor of FOTS: presses of a ball of 4.70 mm; its code says 19.58 pixels per mm."""
     files = spread(sorted(folder.glob("ball_*.png")), limit)
-    presses = [Press(read_image(file), 4.70, file.stem, *labels.get(file.stem, ())) for file in files]
+    presses = [Press(read_image(file), 4.70, file.stem, *labels.get(file.stem, (None, None))) for file in files]
     return read_image(folder / "background.png"), Sensor(name, 320, 240, 1.0 / 19.58), presses
 
 
 def _gelslim(folder: Path, limit: int | None) -> DataSet:
     background = read_image(folder / "ref.jpg")
-    sensor = Sensor("gelslim_markers", *background.shape[1:], 0.05, markers=True)
+    sensor = Sensor("gelslim_markers", background.shape[1], background.shape[2], 0.05, markers=True)
     presses = [Press(read_image(file), 5.0, file.stem) for file in sorted(folder.glob("sample_*.jpg"), key=_number)]
     return _halves(folder.name, background, sensor, presses, "pitch of 0.05 mm and ball of 5 mm are assumed")
 
 
 def _ninedtact(folder: Path, limit: int | None) -> DataSet:
     background, image = (read_image(folder / name) for name in ("background.png", "ball_8mm.png"))
-    sensor = Sensor("ninedtact", *background.shape[1:], 0.05)
+    sensor = Sensor("ninedtact", background.shape[1], background.shape[2], 0.05)
     folds = [Fold(sensor, (Press(image, 8.0, "ball_8mm"),), (Target("ball_8mm", image),))]
     return DataSet(
         folder.name, background, folds, "white light: photometric stereo is not possible, a refusal is right", refused=True

@@ -376,16 +376,15 @@ def _sensor(bench: Bench, data: Path) -> Iterator[Row]:
 
 def _sensor_methods(training: Training, sensor: Sensor) -> Iterator[tuple[str, Built, bool]]:
     """Name, method, and whether it has learned from the presses that are scored."""
-    background = training.background
     fitted = training.calibration
     candidates = f"of {len(fitted.report['candidates'])} candidates"
     for mode in MODES:
         yield f"response, {mode}", METHODS[mode].calibrated(fitted)._replace(note=candidates), False
     for degree in (0, 2):
         yield f"response linear {degree}, fast", METHODS["fast"].calibrated(training.of_family(degree, -1)), False
-    yield "prior that has seen them, precise", shipped_prior(training, background, sensor, sensor), True
-    yield "point lights, precise", point_lights(training, background, sensor), False
-    yield "look-up table", lookup_table(training, background, sensor), False
+    yield "prior that has seen them, precise", shipped_prior(training, sensor), True
+    yield "point lights, precise", point_lights(training), False
+    yield "look-up table", lookup_table(training), False
 
 
 def _ball_errors(reconstruct: Reconstruct, presses: Sequence[Press], mm_per_pixel: float) -> Errors:

@@ -255,6 +255,20 @@ def test_drawn_sensors_are_scored_on_objects_and_averaged(folder):
     assert means[1].errors["relief_um"] == pytest.approx(expected)
 
 
+def test_the_learning_curve_of_a_set(run_script, monkeypatch, folder, tmp_path):
+    data = sets.from_folder(folder, vts.Sensor.load(folder / "rig.yaml"), folds=2)
+    monkeypatch.setattr(sets, "load", lambda *arguments: data)
+    done = run_script("learning_curve", "digit_a", "--draws", 2, "--mode", "fast", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in (tmp_path / "table.md").read_text().splitlines()[2:]]
+    assert [(line[1], line[2], line[7]) for line in lines] == [
+        ("presses", "1", "5"),
+        ("presses", "3", "5"),
+        ("touches, and one press for the scale", "1", "5"),
+    ]
+    assert all(0.0 < float(line[3]) < 10.0 for line in lines) and (tmp_path / "learning_curve.png").stat().st_size > 5000
+
+
 def test_latex_and_csv_keep_what_is_special():
     assert rows.latex(["a_b", "50 %"], [["x & y", "{1}"]]).splitlines()[2:5] == [
         r"a\_b & 50 \% \\",

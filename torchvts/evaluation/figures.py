@@ -269,27 +269,40 @@ def set_figure(evaluation: Evaluation, methods: Sequence[str] = ()) -> Figure:
     figure = new_figure(13.5, 3.9 * len(chosen))
     errors = {name: _relief_error(evaluation.outputs[name].depth_mm, shown.truth) for name in chosen}
     most = max(float(error.nan_to_num().abs().quantile(0.998)) for error in errors.values()) or 1.0
-    for k, (name, error) in enumerate(errors.items()):
-        out = evaluation.outputs[name]
-        depth = out.depth_mm[0, 0].double().numpy()
-        contours = figure.add_subplot(len(chosen), 3, 3 * k + 1)
+    depths = {name: evaluation.outputs[name].depth_mm[0, 0].double().numpy() for name in chosen}
+    low, high = (1000.0 * float(of([of(depth) for depth in depths.values()])) for of in (np.min, np.max))
+    for k, (name, depth) in enumerate(depths.items()):
+        contours, panel = (figure.add_subplot(len(chosen), 3, 3 * k + column) for column in (1, 3))
         draw_contours(figure, contours, depth, pitch)
+        contours.get_images()[0].set_clim(min(low, 0.0), max(high, 1.0))
         extent = contours.get_images()[0].get_extent()
-        for mask, style in ((out.contact, "-"), (shown.truth.contact if shown.truth else None, ":")):
+        for mask, style in ((evaluation.outputs[name].contact, "-"), (shown.truth.contact if shown.truth else None, ":")):
             if mask is not None and bool(mask.any()) and not bool(mask.all()):
                 lines: dict[str, Any] = {"colors": "tab:red", "linestyles": style, "extent": extent, "origin": "upper"}
                 contours.contour(mask[0, 0].float().numpy(), [0.5], linewidths=1.2, **lines)
         contours.set_title(f"{name}: {contours.get_title()}")
         surface = figure.add_subplot(len(chosen), 3, 3 * k + 2, projection="3d")
         draw_surface(surface, depth, pitch)
-        panel = figure.add_subplot(len(chosen), 3, 3 * k + 3)
-        picture = panel.imshow(error.numpy(), cmap="RdBu_r", vmin=-most, vmax=most, extent=extent)
-        figure.colorbar(picture, ax=panel, shrink=0.75, label="um")
-        rms = float(error.square().nanmean().sqrt())
-        panel.set_title("no truth" if math.isnan(rms) else f"error of relief, RMS {rms:.1f} um")
-        panel.set(xlabel="x, mm", ylabel="y, mm (down)")
+        _draw_error(panel, errors[name], most, extent)
     figure.suptitle(f"{evaluation.data.name}, {shown.name}; contact in red, the true one dotted")
     return figure
+
+
+def _draw_error(panel: Any, error: Tensor, most: float, extent: Sequence[float]) -> None:
+    """The error of relief in colour, cut to the pixels that are scored."""
+    known = ~error.isnan()
+    if not bool(known.any()):
+        panel.set_axis_off()
+        panel.text(0.5, 0.5, "no truth", ha="center")
+        return
+    picture = panel.imshow(error.numpy(), cmap="RdBu_r", vmin=-most, vmax=most, extent=extent)
+    panel.figure.colorbar(picture, ax=panel, shrink=0.75, label="um")
+    (left, right, low, high), (rows, columns) = extent, error.shape
+    x = [left + (right - left) * float(k) / columns for k in known.any(0).nonzero()[[0, -1], 0]]
+    y = [high + (low - high) * float(k) / rows for k in known.any(1).nonzero()[[0, -1], 0]]
+    reach = 0.6 * max(x[1] - x[0], y[1] - y[0]) + 0.02 * (right - left)
+    panel.set(xlim=(sum(x) / 2 - reach, sum(x) / 2 + reach), ylim=(sum(y) / 2 + reach, sum(y) / 2 - reach))
+    panel.set(xlabel="x, mm", ylabel="y, mm (down)", title=f"error of relief, RMS {float(error.square().nanmean().sqrt()):.1f} um")
 
 
 def _relief_error(depth_mm: Tensor, truth: Truth | None) -> Tensor:

@@ -95,11 +95,13 @@ def with_centers(background: Tensor, sensor: Sensor, presses: Sequence[Press]) -
     return [press for press in known if press.center_px is not None and press.contact_radius_px is not None]
 
 
-def quiet_calibrate(background: Tensor, sensor: Sensor, presses: Sequence[Press] = ()) -> Calibration:
+def quiet_calibrate(
+    background: Tensor, sensor: Sensor, presses: Sequence[Press] = (), touches: Sequence[Tensor] = ()
+) -> Calibration:
     """``calibrate`` without its warnings: an evaluation reports the errors themselves."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CalibrationWarning)
-        return calibrate(background, sensor, presses)
+        return calibrate(background, sensor, presses, touches)
 
 
 def training_pixels(compensate: nn.Module, presses: Sequence[Press], mm_per_pixel: float) -> TrainingPixels:

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 import torch
@@ -233,7 +234,7 @@ COLUMNS = (
     Column("presses used", _used),
     _with_worst("lowest mm", "lowest_mm", 3),
     Column("frames", lambda row: str(row.frames)),
-    Column("note", lambda row: row.note),
+    Column("note", lambda row: shorten(row.note, 200, placeholder=" ...")),
 )
 """Columns of the tables."""
 
@@ -257,13 +258,13 @@ def write_tables(evaluations: Sequence[Evaluation], out: Path, command: str) -> 
     rows += means_of_drawn(rows)
     text = "\n".join(
         [records.table(rows, COLUMNS), ""]
-        + [f"* {evaluation.data.name}: {evaluation.data.how}" for evaluation in evaluations if evaluation.data.how]
+        + [f"* {e.data.name}: {shorten(e.data.how, 300, placeholder=' ...')}" for e in evaluations if e.data.how]
         + ["", "means over frames; medians of the radius of the sphere fitted to depth, of the contact and of the lowest depth"]
     )
     cells = [[column.cell(row) for column in COLUMNS[:-1]] for row in rows]
     document = {
         "command": command,
-        "how": {evaluation.data.name: evaluation.data.how for evaluation in evaluations},
+        "how": {e.data.name: e.data.how for e in evaluations},
         "rows": [dataclasses.asdict(row) for row in rows],
         "scores": [dataclasses.asdict(score) | {"data": e.data.name} for e in evaluations for score in e.scores],
     }

@@ -74,11 +74,11 @@ def evaluate(data: DataSet, methods: Sequence[str] = (), *, seed: int = 0, bar: 
     """
     scored = [target for target in data.folds[0].scored if target.truth is not None] or data.folds[0].scored
     shown = scored[len(scored) // 2] if scored else None
-    records = [_Record(method, data) for method in _choose(data, methods, seed)]
+    of_methods = [_Record(method, data) for method in _choose(data, methods, seed)]
     outputs: dict[str, DepthOutput] = {}
     for fold in data.folds:
         training = Training(data.background, fold.learned, fold.sensor)
-        for record in records:
+        for record in of_methods:
             if bar is not None:
                 bar.set_postfix_str(f"{data.name}, {record.method.name}")
             for target, out in record.score(fold, training):
@@ -86,7 +86,8 @@ def evaluate(data: DataSet, methods: Sequence[str] = (), *, seed: int = 0, bar: 
                     outputs[record.method.name] = out
             if bar is not None:
                 bar.update()
-    return Evaluation(data, [record.row() for record in records], [s for record in records for s in record.scores], shown, outputs)
+    scores = [score for record in of_methods for score in record.scores]
+    return Evaluation(data, [record.row() for record in of_methods], scores, shown, outputs)
 
 
 def evaluate_all(
@@ -108,7 +109,7 @@ def evaluate_all(
         seed: seed of the networks that are trained.
         progress: show a bar.
     Raises:
-        ValueError: an unknown set or method.
+        ValueError: an unknown method.
     """
     done = []
     with tqdm(total=len(names), desc="evaluating", disable=not progress, leave=False) as bar:
@@ -116,7 +117,7 @@ def evaluate_all(
             bar.set_postfix_str(f"{name}, reading")
             try:
                 data = load(name, folder, limit)
-            except (FileNotFoundError, ModuleNotFoundError) as error:
+            except Exception as error:  # the other sets are still scored
                 row = Row("presses", "", name, note=_reason(error))
                 done.append(Evaluation(DataSet(name, torch.zeros(3, 1, 1), (), ""), [row], [], None, {}))
             else:

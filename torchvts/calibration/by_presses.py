@@ -16,7 +16,7 @@ from .balls import center_by_slope
 from .contacts import Contact, middle_px, read_contacts, unit_without_model
 from .field import Family, angle_deg
 from .presses import Press
-from .response_fit import FAMILIES, ResponseFit, fit_response, held_out_deg
+from .response_fit import Candidates, ResponseFit, fit_response, held_out_deg
 
 RESPONSE_BLUR_PX = 1.0
 """Blur of a response field at 320 x 240: it reduces the error of normals on a GelSight Mini by a third; more blur gains nothing."""
@@ -25,6 +25,8 @@ PREPROCESSING_WORTH = 0.1
 """Another gamma or blur must lower the held-out error by this part: balls are smooth and do not show what a wider blur loses."""
 
 OTHER_GAMMA = 2.2
+
+ALL_CANDIDATES = Candidates()
 
 
 class PressResult(NamedTuple):
@@ -47,7 +49,7 @@ def by_presses(
     presses: Sequence[Press],
     prior: ResponseModel | None,
     progress: bool,
-    families: tuple[tuple[int, int], ...] = FAMILIES,
+    candidates: Candidates = ALL_CANDIDATES,
 ) -> PressResult:
     """Fit a response model to presses.
 
@@ -57,17 +59,17 @@ def by_presses(
         presses: of balls.
         prior: fields of the sensor's type, or None.
         progress: show a bar.
-        families: degrees of the fields to try.
+        candidates: the fields to try.
     Raises:
         ValueError: no press can be used.
     """
     chosen = with_preprocessing(sensor, prior)
     contacts = read_contacts(presses, background, chosen)
     light = unit_without_model(background, chosen).background
-    fit = fit_response(contacts, light, chosen, prior, progress, families)
+    fit = fit_response(contacts, light, chosen, prior, progress, candidates)
     if prior is None and fit.error_deg is not None:
         others = _other_preprocessing(sensor, chosen)
-        fit, chosen = _choose_preprocessing(background, chosen, others, list(zip(presses, contacts)), fit, families)
+        fit, chosen = _choose_preprocessing(background, chosen, others, list(zip(presses, contacts)), fit, candidates)
     return PressResult(fit, contacts, Calibration.from_response(fit.model, chosen, background))
 
 
@@ -91,7 +93,7 @@ def _choose_preprocessing(
     others: list[Sensor],
     read: list[tuple[Press, Contact]],
     fit: ResponseFit,
-    families: tuple[tuple[int, int], ...],
+    candidates: Candidates,
 ) -> tuple[ResponseFit, Sensor]:
     """Another gamma or blur if the first pass of the same family is clearly better with it on held-out presses; then refit.
 
@@ -117,7 +119,7 @@ def _choose_preprocessing(
     if taken is None:
         return fit, sensor
     chosen, contacts = taken
-    again = fit_response(contacts, unit_without_model(background, chosen).background, chosen, None, False, families)
+    again = fit_response(contacts, unit_without_model(background, chosen).background, chosen, None, False, candidates)
     again.candidates = fit.candidates + again.candidates
     return again, chosen
 

@@ -24,6 +24,9 @@ RESPONSE_BLUR_PX = 1.0
 PREPROCESSING_WORTH = 0.1
 """Another gamma or blur must lower the held-out error by this part: balls are smooth and do not show what a wider blur loses."""
 
+PREPROCESSING_PRESSES = 10
+"""About so many presses choose it: reading them again takes most of the time."""
+
 OTHER_GAMMA = 2.2
 
 ALL_CANDIDATES = Candidates()
@@ -99,9 +102,11 @@ def _choose_preprocessing(
 
     The balls stay where they were found: preprocessing moves a center by less than its uncertainty.
     """
-    located = [_located(press, contact, sensor) for press, contact in read if not contact.reason]
-    best = (1.0 - PREPROCESSING_WORTH) * held_out_deg([contact for _, contact in read if not contact.reason], fit.model.field)
-    taken: tuple[Sensor, list[Contact]] | None = None
+    usable = [(press, contact) for press, contact in read if not contact.reason]
+    some = usable[:: max(1, len(usable) // PREPROCESSING_PRESSES)]
+    located = [_located(press, contact, sensor) for press, contact in some]
+    best = (1.0 - PREPROCESSING_WORTH) * held_out_deg([contact for _, contact in some], fit.model.field)
+    taken: Sensor | None = None
     for other in others:
         contacts = read_contacts(located, background, other)
         score = held_out_deg(contacts, fit.model.field)
@@ -115,10 +120,11 @@ def _choose_preprocessing(
             }
         )
         if score < best:
-            best, taken = score, (other, contacts)
+            best, taken = score, other
     if taken is None:
         return fit, sensor
-    chosen, contacts = taken
+    chosen = taken
+    contacts = read_contacts([_located(press, contact, sensor) for press, contact in usable], background, chosen)
     again = fit_response(contacts, unit_without_model(background, chosen).background, chosen, None, False, candidates)
     again.candidates = fit.candidates + again.candidates
     return again, chosen

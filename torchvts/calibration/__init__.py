@@ -8,7 +8,6 @@ from .complaints import CalibrationWarning
 from .contacts import ROUGH, channel_structure
 from .lights import POORLY_CONSTRAINED_DEG, LightFit, fit_lights
 from .presses import Press, Touch, read_presses
-from .response_fit import Candidates
 
 __all__ = [
     "GIVEN_MISFIT",
@@ -16,7 +15,6 @@ __all__ = [
     "RESPONSE_BLUR_PX",
     "ROUGH",
     "CalibrationWarning",
-    "Candidates",
     "LightFit",
     "Press",
     "Touch",

@@ -139,10 +139,11 @@ class ContactForms:
         return angle_deg(self.slope(coefficient)[:, inside], self.contact.ball_slope()[:, inside])
 
     def gain(self, coefficient: Tensor) -> float:
-        """Slope found divided by slope expected: the ball seems this many times smaller than given."""
+        """Sine found divided by sine expected: the ball seems this many times smaller than given."""
         inside = self.contact.inside()
-        ball = self.contact.ball_slope()[:, inside]
-        return float((self.slope(coefficient)[:, inside] * ball).sum() / ball.square().sum().clamp_min(1e-12))
+        ball = ball_sine(self.contact)[:, inside]
+        found = coefficient.reshape(2, -1) @ self.terms[:, inside]
+        return float((found * ball).sum() / ball.square().sum().clamp_min(1e-12))
 
 
 class Evidence:

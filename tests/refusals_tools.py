@@ -177,6 +177,10 @@ TABLE = {
         },
     ),
     "scenes.undeformed": Entry({"scene": scene()}, {"scene": [None, DEPTH, "sphere"]}),
+    "scenes.hanging_skin": Entry(
+        {"object_mm": torch.zeros(1, 1, 8, 8), "reach_mm": 0.5, "mm_per_pixel": 0.1, "sweeps": 2},
+        {"object_mm": batches(1), "reach_mm": NUMBER, "mm_per_pixel": NUMBER, "sweeps": INTEGER},
+    ),
     "scenes.skin_spots": Entry(
         {"height": HEIGHT, "width": WIDTH, "spots": 3, "dead_pixels": 3},
         {"height": INTEGER, "width": INTEGER, "spots": ["3", -1, 1.5], "dead_pixels": ["3", -1, 1.5]},
@@ -205,6 +209,8 @@ TABLE = {
     "objects.bolt_head": Entry({"across_flats_mm": 9.0}, {"across_flats_mm": NUMBER}),
     "objects.gear": Entry({"teeth": 12}, {"teeth": INTEGER}),
     "objects.textured_patch": Entry({"bumps": 60, "radius_mm": 5.5}, {"bumps": INTEGER, "radius_mm": NUMBER}),
+    "objects.capsule": Entry({"radius_mm": 1.0, "length_mm": 4.0}, {"radius_mm": NUMBER, "length_mm": NUMBER}),
+    "objects.prism": Entry({"slope": 0.4, "length_mm": 6.0}, {"slope": NUMBER, "length_mm": NUMBER}),
     "objects.sphere": Entry({"radius_mm": 10.0}, {"radius_mm": NUMBER}),
     "objects.cylinder": Entry({"radius_mm": 6.0}, {"radius_mm": NUMBER}),
     # ---- export ----

@@ -32,7 +32,7 @@ ARGUMENTS = {
     vts.NormalFromLookup.fit: ["flat", "change", "slope"],
     vts.NormalFromMLP: ["height", "width", "flat", "hidden"],
     vts.NormalFromMLP.load: ["path", "flat"],
-    vts.NormalFromResponse: ["fast", "precise", "height", "width", "mm_per_pixel"],
+    vts.NormalFromResponse: ["field", "by_depth", "height", "width", "mm_per_pixel"],
     vts.Calibration.from_lights: ["lights", "sensor", "background", "report"],
     vts.Calibration.load: ["path"],
     vts.Calibration.save: ["self", "path"],

@@ -161,7 +161,7 @@ def test_real_touches(data):
 
 def test_the_family_of_touches_is_well_constrained(of_known_depth):
     tried = next(row for row in of_known_depth.report["candidates"] if row["model"] == "touches")["tried"]
-    assert tried[0]["parameters"] == Family(0, -1, False, 10.0).size() == 6 and tried[0]["gap"] > 4.0
+    assert tried[0]["parameters"] == Family(0, -1, 10.0).size() == 6 and tried[0]["gap"] > 4.0
 
 
 def under_stray_light(scene, seed):

@@ -16,7 +16,7 @@ from .balls import center_by_slope
 from .contacts import Contact, middle_px, read_contacts, unit_without_model
 from .field import Family, angle_deg
 from .presses import Press
-from .response_fit import FAMILIES, ResponseFit, fit_response, held_out_deg
+from .response_fit import Candidates, ResponseFit, fit_response, held_out_deg
 
 RESPONSE_BLUR_PX = 1.0
 """Blur of a response field at 320 x 240: it reduces the error of normals on a GelSight Mini by a third; more blur gains nothing."""
@@ -24,7 +24,12 @@ RESPONSE_BLUR_PX = 1.0
 PREPROCESSING_WORTH = 0.1
 """Another gamma or blur must lower the held-out error by this part: balls are smooth and do not show what a wider blur loses."""
 
+PREPROCESSING_PRESSES = 10
+"""About so many presses choose it: reading them again takes most of the time."""
+
 OTHER_GAMMA = 2.2
+
+ALL_CANDIDATES = Candidates()
 
 
 class PressResult(NamedTuple):
@@ -47,7 +52,7 @@ def by_presses(
     presses: Sequence[Press],
     prior: ResponseModel | None,
     progress: bool,
-    families: tuple[tuple[int, int], ...] = FAMILIES,
+    candidates: Candidates = ALL_CANDIDATES,
 ) -> PressResult:
     """Fit a response model to presses.
 
@@ -57,17 +62,17 @@ def by_presses(
         presses: of balls.
         prior: fields of the sensor's type, or None.
         progress: show a bar.
-        families: degrees of the fields to try.
+        candidates: the fields to try.
     Raises:
         ValueError: no press can be used.
     """
     chosen = with_preprocessing(sensor, prior)
     contacts = read_contacts(presses, background, chosen)
     light = unit_without_model(background, chosen).background
-    fit = fit_response(contacts, light, chosen, prior, progress, families)
+    fit = fit_response(contacts, light, chosen, prior, progress, candidates)
     if prior is None and fit.error_deg is not None:
         others = _other_preprocessing(sensor, chosen)
-        fit, chosen = _choose_preprocessing(background, chosen, others, list(zip(presses, contacts)), fit, families)
+        fit, chosen = _choose_preprocessing(background, chosen, others, list(zip(presses, contacts)), fit, candidates)
     return PressResult(fit, contacts, Calibration.from_response(fit.model, chosen, background))
 
 
@@ -91,15 +96,17 @@ def _choose_preprocessing(
     others: list[Sensor],
     read: list[tuple[Press, Contact]],
     fit: ResponseFit,
-    families: tuple[tuple[int, int], ...],
+    candidates: Candidates,
 ) -> tuple[ResponseFit, Sensor]:
     """Another gamma or blur if the first pass of the same family is clearly better with it on held-out presses; then refit.
 
     The balls stay where they were found: preprocessing moves a center by less than its uncertainty.
     """
-    located = [_located(press, contact, sensor) for press, contact in read if not contact.reason]
-    best = (1.0 - PREPROCESSING_WORTH) * held_out_deg([contact for _, contact in read if not contact.reason], fit.model.field)
-    taken: tuple[Sensor, list[Contact]] | None = None
+    usable = [(press, contact) for press, contact in read if not contact.reason]
+    some = usable[:: max(1, len(usable) // PREPROCESSING_PRESSES)]
+    located = [_located(press, contact, sensor) for press, contact in some]
+    best = (1.0 - PREPROCESSING_WORTH) * held_out_deg([contact for _, contact in some], fit.model.field)
+    taken: Sensor | None = None
     for other in others:
         contacts = read_contacts(located, background, other)
         score = held_out_deg(contacts, fit.model.field)
@@ -113,11 +120,12 @@ def _choose_preprocessing(
             }
         )
         if score < best:
-            best, taken = score, (other, contacts)
+            best, taken = score, other
     if taken is None:
         return fit, sensor
-    chosen, contacts = taken
-    again = fit_response(contacts, unit_without_model(background, chosen).background, chosen, None, False, families)
+    chosen = taken
+    contacts = read_contacts([_located(press, contact, sensor) for press, contact in usable], background, chosen)
+    again = fit_response(contacts, unit_without_model(background, chosen).background, chosen, None, False, candidates)
     again.candidates = fit.candidates + again.candidates
     return again, chosen
 

@@ -80,9 +80,7 @@ def _scale(field: ResponseField, balls: list[Contact], known: list[tuple[float, 
     if balls:
         scale, reference = scale_by_presses(field, balls), f"{len(balls)} presses"
     elif known:
-        deepest = [float(depth.max()) for depth in first_pass_depths([contact for _, contact in known], field, pitch_mm)]
-        scale = statistics.median(depth / max(found, 1e-9) for (depth, _), found in zip(known, deepest))
-        reference = f"{len(known)} known depths"
+        scale, reference = _scale_by_depths(field, known, pitch_mm), f"{len(known)} known depths"
     else:
         raise ValueError(
             "touches: expected something that gives their scale, got only touches: add a press of a ball of known diameter, "
@@ -93,3 +91,13 @@ def _scale(field: ResponseField, balls: list[Contact], known: list[tuple[float, 
             f"touches: the scale by {reference} came out as {scale:.3g}: the presses are no clean balls, or not of this unit"
         )
     return scale, reference
+
+
+def _scale_by_depths(field: ResponseField, known: list[tuple[float, Contact]], pitch_mm: float, rounds: int = 8) -> float:
+    """The scale at which the deepest points lie as deep as given. Depth grows a little faster than sines, so it is iterated."""
+    contacts = [contact for _, contact in known]
+    scale = 0.1  # of sines whose mean square is one
+    for _ in range(rounds):
+        deepest = [float(depth.max()) for depth in first_pass_depths(contacts, scaled(field, scale), pitch_mm)]
+        scale *= statistics.median(depth / max(found, 1e-9) for (depth, _), found in zip(known, deepest))
+    return scale

@@ -25,12 +25,14 @@ from .pattern import compare_patterns
 from .presses import Press, Touch, check_presses, check_touches
 from .prior_choice import FromPresses, fit_with_or_without
 from .refusals import NoUsablePress, check_colour, check_coloured_background, check_coloured_contacts, other_crop
+from .response_fit import Candidates
 
 WELL_CONSTRAINED_DEG = 2.0
 """Point lights replace a sensor's prior only if the image constrains each of them this well."""
 
-PRIOR_FAMILY = ((2, 0),)
-"""Chosen by other units: larger families fit the unit of the presses better and others worse (docs/decisions.md)."""
+PRIOR_CANDIDATES = Candidates(((2, 1),), 60.0)
+"""Chosen by other units: larger fields, and weakly regularised products, fit the unit of the presses better and others worse
+(docs/decisions.md)."""
 
 TIE = 1.05
 """Point lights are preferred to response fields unless these are better by more than this factor."""
@@ -105,7 +107,8 @@ def calibrate(
 def fit_prior(background: Tensor, sensor: Sensor, presses: Sequence[Press], source: str = "") -> SensorPrior:
     """Fit a prior for every unit of a sensor type to presses on one unit.
 
-    Linear terms have degree 2 and products degree 0: larger fields fit this unit better and others worse.
+    Linear terms have degree 2, products degree 1. Products are strongly regularised, because otherwise they fit this unit
+    better and others worse.
 
     Args:
         background: as for :func:`calibrate`.
@@ -125,7 +128,7 @@ def fit_prior(background: Tensor, sensor: Sensor, presses: Sequence[Press], sour
         raise ValueError("presses: expected one or more, got none: a prior is fitted to presses")
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     named = check_presses(presses, sensor)
-    result = by_presses(background, sensor.without_prior(), named, None, False, PRIOR_FAMILY)
+    result = by_presses(background, sensor.without_prior(), named, None, False, PRIOR_CANDIDATES)
     for message in complaints.of_contacts(result.contacts):
         warnings.warn(message, CalibrationWarning, stacklevel=2)
     log_background = fit_log_background(result.unit.background, sensor.mm_per_pixel)

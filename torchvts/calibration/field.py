@@ -38,11 +38,13 @@ class Family:
         degree: of linear terms in position.
         product_degree: of products in position; -1 for none.
         half_mm: scale of positions, mm.
+        product_penalty: regularisation of products relative to linear terms.
     """
 
     degree: int
     product_degree: int
     half_mm: float
+    product_penalty: float = PRODUCT_PENALTY
 
     def label(self) -> str:
         """Such as "linear 2, products 1"."""
@@ -51,7 +53,9 @@ class Family:
     def penalty(self) -> Tensor:
         """(2 K,): regularisation of each coefficient; along x first."""
         by_term = term_degrees_by_term(self.degree, self.product_degree)
-        factors = [1.0 if len(term) == 1 else PRODUCT_PENALTY for term, d in by_term.items() for _ in range((d + 1) * (d + 2) // 2)]
+        factors = [
+            1.0 if len(term) == 1 else self.product_penalty for term, d in by_term.items() for _ in range((d + 1) * (d + 2) // 2)
+        ]
         degrees = torch.tensor(term_degrees(self.degree, self.product_degree), dtype=torch.float64)
         return (torch.tensor(factors, dtype=torch.float64) * DEGREE_PENALTY**degrees).repeat(2)
 
@@ -135,10 +139,11 @@ class ContactForms:
         return angle_deg(self.slope(coefficient)[:, inside], self.contact.ball_slope()[:, inside])
 
     def gain(self, coefficient: Tensor) -> float:
-        """Slope found divided by slope expected: the ball seems this many times smaller than given."""
+        """Sine found divided by sine expected: the ball seems this many times smaller than given."""
         inside = self.contact.inside()
-        ball = self.contact.ball_slope()[:, inside]
-        return float((self.slope(coefficient)[:, inside] * ball).sum() / ball.square().sum().clamp_min(1e-12))
+        ball = ball_sine(self.contact)[:, inside]
+        found = coefficient.reshape(2, -1) @ self.terms[:, inside]
+        return float((found * ball).sum() / ball.square().sum().clamp_min(1e-12))
 
 
 class Evidence:

@@ -11,7 +11,7 @@ from ..model.report import CandidateRow
 from ..model.response_field import DepthBrightness, ResponseField, ResponseModel, position_basis
 from ..model.sensor import Sensor
 from .contacts import Contact, first_pass_depths
-from .field import Evidence, Family, ball_sine
+from .field import PRODUCT_PENALTY, Evidence, Family, ball_sine
 from .outliers import locate_and_screen
 from .refusals import NoUsablePress
 from .touches import presses_as_touches
@@ -43,6 +43,23 @@ DEPTH_DEGREE = 2
 DEPTH_PENALTY = 0.1
 """Regularisation of it, in presses times mm^2: (0.03 / 0.1)^2, because sines are right to about 0.03, and a skin that comes 1 mm
 nearer to lights about 10 mm away changes its brightness by about 0.1."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Which fields are tried.
+
+    Attributes:
+        degrees: of linear terms and products, the smallest first.
+        product_penalty: regularisation of products relative to linear terms.
+    """
+
+    degrees: tuple[tuple[int, int], ...] = FAMILIES
+    product_penalty: float = PRODUCT_PENALTY
+
+    def families(self, half_mm: float) -> list[Family]:
+        """The families."""
+        return [Family(degree, products, half_mm, self.product_penalty) for degree, products in self.degrees]
 
 
 @dataclass
@@ -83,7 +100,7 @@ def fit_response(
     sensor: Sensor,
     prior: ResponseModel | None,
     progress: bool = False,
-    degrees: tuple[tuple[int, int], ...] = FAMILIES,
+    candidates: Candidates = Candidates(),
 ) -> ResponseFit:
     """Locate the balls, leave out presses that contradict, and fit.
 
@@ -93,13 +110,13 @@ def fit_response(
         sensor: the sensor, with the gamma and blur of the contacts' preprocessing.
         prior: fields of the sensor's type, or None.
         progress: show a bar.
-        degrees: of linear terms and products of the fields to try, the smallest first.
+        candidates: the fields to try.
     Raises:
         NoUsablePress: no press is left; says what became of each.
     """
     pitch = sensor.mm_per_pixel
     half_mm = prior.field.half_mm if prior is not None else 0.5 * sensor.width * pitch
-    families = [Family(degree, products, half_mm) for degree, products in degrees]
+    families = candidates.families(half_mm)
     with tqdm(total=3, desc="calibrating from presses", disable=not progress, leave=False) as bar:
         bar.set_postfix(step="balls")
         presses = locate_and_screen(contacts, light, sensor, prior, half_mm)

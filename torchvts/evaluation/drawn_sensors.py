@@ -113,10 +113,11 @@ class DrawnSensor:
             >>> round(float(pressed.scene.depth_mm.max()), 2)
             0.4
         """
-        sensor = self.sensor
-        reached = solids.press(height_mm, T_sensor_object, sensor.height, sensor.width, sensor.mm_per_pixel, fillet_mm=1e-4)
-        scene = hanging_skin(torch.where(reached.contact, reached.depth_mm, -1.0), self.reach_mm, sensor.mm_per_pixel)
-        return DrawnPress(name, self._images(scene, seed)[0], scene)
+        sensor, pitch = self.sensor, self.sensor.mm_per_pixel
+        with torch.inference_mode(False):  # slopes of objects are derivatives, also where a pipeline is being scored
+            reached = solids.press(height_mm, T_sensor_object, sensor.height, sensor.width, pitch, fillet_mm=1e-4)
+            scene = hanging_skin(torch.where(reached.contact, reached.depth_mm, -1.0), self.reach_mm, pitch)
+            return DrawnPress(name, self._images(scene, seed)[0], scene)
 
     def ball(self, diameter_mm: float, depth_mm: float, at_mm: tuple[float, float], name: str = "", seed: int = 0) -> Press:
         """Press a ball; the press carries its exact label.

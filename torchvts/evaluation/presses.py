@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from ..accelerated import Compensate
 from ..calibration import RESPONSE_BLUR_PX, CalibrationWarning, Press, by_presses, calibrate
+from ..calibration.response_fit import Candidates
 from ..core.checks import check_image
 from ..model import Calibration, Sensor
 from ..training import MlpFit, fit_mlp
@@ -63,7 +64,7 @@ class Training:
 
     def of_family(self, degree: int, product_degree: int) -> Calibration:
         """Calibration by the located presses and response fields of that size alone."""
-        return by_presses(self.background, self.sensor, self.located, None, False, ((degree, product_degree),)).unit
+        return by_presses(self.background, self.sensor, self.located, None, False, Candidates(((degree, product_degree),))).unit
 
 
 class TrainingPixels(NamedTuple):

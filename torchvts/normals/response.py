@@ -52,6 +52,7 @@ class NormalFromResponse(NormalModel):
         if by_depth is not None:
             check_record("by_depth", by_depth, DepthBrightness)
         self.uses_depth = by_depth is not None
+        self.max_sine = MAX_SINE
         scale = torch.tensor([CHANGE_SCALE ** -len(term) for term in field.terms()], dtype=torch.float64)
         self.register_buffer("maps", (field.maps(height, width, mm_per_pixel) * scale[:, None, None, None]).to(dtype))
         per_mm = torch.zeros(0, height, width) if by_depth is None else by_depth.maps(height, width, mm_per_pixel)
@@ -90,7 +91,7 @@ class NormalFromResponse(NormalModel):
                     sine = torch.addcmul(sine, maps[place], inputs[i] * inputs[k])
                     place += 1
         squared = torch.addcmul(sine[:, 0:1] * sine[:, 0:1], sine[:, 1:2], sine[:, 1:2])
-        kept = (MAX_SINE / torch.sqrt(squared + 1e-12)).clamp_max(1.0)
+        kept = (self.max_sine / torch.sqrt(squared + 1e-12)).clamp_max(1.0)
         up = torch.sqrt(1.0 - squared * (kept * kept))
         return torch.cat((-kept * sine, up), dim=1)
 

@@ -68,7 +68,7 @@ def curve(data: sets.DataSet, draws: int, mode: str) -> Iterator[Row]:
         for count in COUNTS:
             given = count + (method == "touches")
             if given <= most and (count or kind == "presses, prior"):
-                folds = [drawn(data.folds[k * len(data.folds) // draws], given, k, primed) for k in range(draws if count else 1)]
+                folds = [drawn(data.folds[k * len(data.folds) // draws], given, k, primed) for k in range(draws)]
                 row = evaluate(dataclasses.replace(data, folds=folds, methods=()), [method]).rows[0]
                 yield dataclasses.replace(row, method=kind, errors={**row.errors, "count": float(count)})
 

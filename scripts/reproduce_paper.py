@@ -19,6 +19,7 @@ import torchvts as vts
 from torchvts import scenes, viz
 from torchvts.evaluation import methods, metrics, pose_accuracy
 from torchvts.evaluation.presses import Training
+from torchvts.evaluation.rows import markdown
 from torchvts.evaluation.sets import data_folder
 from torchvts.pose import contact_cloud
 
@@ -46,17 +47,12 @@ def figure_3(lights: vts.PointLights, out: Path) -> list[str]:
             with torch.inference_mode():
                 result = pipe(image)
             error = metrics.depth_error(result.depth_mm, scene.depth_mm, PITCH)
-            rows.append(
-                f"| sphere R 160 px, press {press_px} px | {equation} | {reported:.2f} | {error.max_px:.3f} | {error.rms_px:.4f} "
-                f"| {floor.max_px:.3f} / {floor.rms_px:.4f} |"
-            )
+            cells = [f"{reported:.2f}", f"{error.max_px:.3f}", f"{error.rms_px:.4f}", f"{floor.max_px:.3f} / {floor.rms_px:.4f}"]
+            rows.append([f"sphere R 160 px, press {press_px} px", equation, *cells])
             figure = viz.comparison_figure(result.depth_mm, scene.depth_mm, PITCH, f"figure 3: press {press_px} px, {equation}")
             viz.save_figure(figure, out / f"figure_3_press_{press_px}_{mode}.png")
-    return [
-        "| scene | method | paper, largest px | ours, largest px | RMS px | integrator alone, largest / RMS px |",
-        "|---|---|---|---|---|---|",
-        *rows,
-    ]
+    titles = ["scene", "method", "paper, largest px", "ours, largest px", "RMS px", "integrator alone, largest / RMS px"]
+    return [markdown(titles, rows)]
 
 
 def figure_4(folder: Path, out: Path) -> list[str]:

@@ -12,9 +12,9 @@ from torch import nn
 
 import torchvts as vts
 from torchvts.evaluation import coverage
-from torchvts.evaluation.coverage import Truth
 from torchvts.evaluation.metrics import normal_angle_deg
 from torchvts.evaluation.random_scenes import random_frame
+from torchvts.evaluation.score import Truth
 from torchvts.export import sample_frames
 from torchvts.pipeline import bound_at
 from torchvts.pipeline.confidence import DEPTH_SPREAD, FACTORS, _length_95
@@ -123,7 +123,7 @@ def test_attached_shadows_and_a_worn_skin(ring):
         pipe = vts.ConfidentPipeline.from_calibration(calibration, mode)
         out = pipe(scenes.render(scene, lights, **camera, seed=2))
         assert bool((out.factors_deg[:, FACTORS.index("saturation")] > 0).any())
-        row = coverage.coverage(out, Truth(scene.depth_mm, scene.normal, out.contact | scene.contact), pipe.confidence.spread)
+        row = coverage.coverage(out, Truth(scene.depth_mm, scene.gradient, out.contact | scene.contact), pipe.confidence.spread)
         assert float(row.normal[-1]) > 0.9 and float(row.depth[-1]) > 0.9
 
 
@@ -266,7 +266,7 @@ def test_coverage_says_what_is_missing(ring):
     calibration, scene, camera = lights_unit(ring)
     out = vts.ConfidentPipeline.from_calibration(calibration)(camera(1))
     with pytest.raises(ValueError, match="region: expected at least one pixel"):
-        coverage.coverage(out, Truth(scene.depth_mm, scene.normal, torch.zeros_like(out.contact)), 1.0)
+        coverage.coverage(out, Truth(scene.depth_mm, scene.gradient, torch.zeros_like(out.contact)), 1.0)
 
 
 def test_the_script_makes_table_and_picture(run_script, tmp_path):

@@ -255,6 +255,15 @@ def test_drawn_sensors_are_scored_on_objects_and_averaged(folder):
     assert means[1].errors["relief_um"] == pytest.approx(expected)
 
 
+def test_drawn_sensors_are_read(tmp_path):
+    pytest.importorskip("torchvts.evaluation.drawn_sensors")
+    read = sets.load("drawn_0", tmp_path, 2)
+    fold = read.folds[0]
+    assert len(fold.learned) == 2 and read.background.shape == (3, fold.sensor.height, fold.sensor.width)
+    assert all(target.ball is None and target.truth.contact.any() for target in fold.scored)
+    assert all(target.truth.depth_mm.max() > 0.1 and target.image.shape == read.background.shape for target in fold.scored)
+
+
 def test_the_learning_curve_of_a_set(run_script, monkeypatch, folder, tmp_path):
     data = sets.from_folder(folder, vts.Sensor.load(folder / "rig.yaml"), folds=2)
     monkeypatch.setattr(sets, "load", lambda *arguments: data)

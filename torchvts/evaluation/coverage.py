@@ -18,7 +18,7 @@ from .metrics import normal_angle_deg
 from .presses import Training
 from .random_scenes import random_frame
 from .rows import markdown
-from .score import ball_truth
+from .score import Truth, ball_truth
 from .sets import from_folder
 
 LEVELS = (0.5, 0.68, 0.8, 0.9, 0.95)
@@ -41,20 +41,6 @@ class Coverage(NamedTuple):
     depth: Tensor
 
 
-class Truth(NamedTuple):
-    """The truth of a frame.
-
-    Attributes:
-        depth_mm: (B, 1, H, W), mm.
-        normal: (B, 3, H, W), unit normals.
-        region: (B, 1, H, W) bool, the pixels to compare.
-    """
-
-    depth_mm: Tensor
-    normal: Tensor
-    region: Tensor
-
-
 def coverage(out: ConfidentOutput, truth: Truth, spread: float, name: str = "", shape: str = "") -> Coverage:
     """Shares of the pixels of a region whose errors are within their bounds.
 
@@ -71,7 +57,8 @@ def coverage(out: ConfidentOutput, truth: Truth, spread: float, name: str = "", 
     """
     if not bool(truth.region.any()):
         raise ValueError("region: expected at least one pixel, got none: no contact was found")
-    angle = normal_angle_deg(out.normal.to(truth.normal.dtype), truth.normal)[:, None]
+    normal = normal_from_gradient(truth.gradient)
+    angle = normal_angle_deg(out.normal.to(normal.dtype), normal)[:, None]
     error = (out.depth_mm - truth.depth_mm).abs()
     of_normal = [(angle <= bound_at(out.normal_95_deg, level, spread))[truth.region].double().mean() for level in LEVELS]
     of_depth = [(error <= bound_at(out.depth_95_mm, level, DEPTH_SPREAD))[truth.region].double().mean() for level in LEVELS]
@@ -95,7 +82,7 @@ def of_scenes(seeds: Sequence[int], unit: str | None = None, progress: bool = Fa
         with torch.inference_mode():
             out = pipe(frame.image)
         if int(out.contact.sum()) >= 20:
-            truth = Truth(frame.scene.depth_mm, frame.scene.normal, out.contact | frame.scene.contact)
+            truth = Truth(frame.scene.depth_mm, frame.scene.gradient, out.contact | frame.scene.contact)
             rows.append(coverage(out, truth, pipe.confidence.spread, frame.unit, frame.shape))
     return rows
 
@@ -141,8 +128,7 @@ def of_press(out: ConfidentOutput, press: Press, mm_per_pixel: float, spread: fl
     """
     ball = ball_truth(press, out.depth_mm.shape[2], out.depth_mm.shape[3], mm_per_pixel)
     offset = (out.depth_mm - ball.depth_mm)[ball.region].mean()
-    truth = Truth(ball.depth_mm + offset, normal_from_gradient(ball.gradient), ball.region)
-    return coverage(out, truth, spread, press.name, "ball")
+    return coverage(out, ball._replace(depth_mm=ball.depth_mm + offset), spread, press.name, "ball")
 
 
 def mean(rows: Sequence[Coverage], name: str = "") -> Coverage:

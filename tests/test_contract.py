@@ -164,6 +164,9 @@ def test_single_precision_follows_double_precision(name):
         assert torch.equal(single(example), double(exact))
         return
     for left, right in zip(outputs(single(example)), outputs(double(exact)), strict=True):
+        if left.dtype == torch.bool:  # a pixel may lie on a threshold
+            assert float((left ^ right).double().mean()) < 2e-3
+            continue
         assert float((left.double() - right.double()).abs().max()) < 2e-4 * max(1.0, float(right.double().abs().max()))
 
 

@@ -14,11 +14,12 @@ from torchvts.pose import contact_cloud
 
 NAMES = [
     "AdaptiveIntegration", "Calibration", "CalibrationWarning", "Compensate", "ConfidentPipeline", "ContactFromDepth",
-    "ContactMask", "ContactSettings", "DepthOutput", "DepthPipeline", "GradientFromNormal", "Integrator", "NormalFromIntensity",
-    "NormalFromLookup", "NormalFromMLP", "NormalFromResponse", "NormalModel", "PointLights", "PoissonBackground", "PoissonDCT", "PoissonDST",
-    "Press", "Sensor", "Touch", "calibrate", "depth_to_points", "diagnose", "fit_lights", "gs_sdk", "near_field_shading",
-    "poisson_background", "poisson_dct", "poisson_dst", "read_image", "read_presses", "register_depth", "register_points",
-    "scenes", "shipped_sensors", "stream", "write_image",
+    "ContactMask", "ContactSettings", "DepthOutput", "DepthPipeline", "GradientFromNormal", "Integrator",
+    "NormalFromIntensity", "NormalFromLookup", "NormalFromMLP", "NormalFromResponse", "NormalModel", "PointLights",
+    "PoissonBackground", "PoissonDCT", "PoissonDST", "Press", "Sensor", "Touch", "calibrate", "depth_to_points",
+    "diagnose", "fit_lights", "gs_sdk", "near_field_shading", "poisson_background", "poisson_dct", "poisson_dst",
+    "read_image", "read_presses", "register_depth", "register_points", "scenes", "shipped_sensors", "stream",
+    "write_image",
 ]  # fmt: skip
 ARGUMENTS = {
     vts.Sensor: ["name", "height", "width", "mm_per_pixel"],

@@ -117,6 +117,10 @@ TABLE = {
         },
     ),
     "ContactMask.from_calibration": Entry({"calibration": unit()}, {"calibration": OTHERS}),
+    "ContactFromDepth": Entry({"mm_per_pixel": 1.0, "share": 0.8}, {"mm_per_pixel": NUMBER, "share": NUMBER}),
+    "ContactSettings": Entry(
+        {"sigmas": 4.5, "min_size_px": 8.0, "share": 0.8}, {"sigmas": NUMBER, "min_size_px": NUMBER, "share": NUMBER}
+    ),
     "ContactMask.forward": forward(lambda: pipe().deformed, 3, "compensated"),
     "ContactMask.shadowed": forward(lambda: pipe().deformed.shadowed, 3, "compensated"),
     "ContactMask.soft": forward(lambda: pipe().deformed.soft, 3, "compensated"),

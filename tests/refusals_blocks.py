@@ -116,8 +116,19 @@ TABLE = {
             "min_size_px": NUMBER,
         },
     ),
-    "ContactMask.from_calibration": Entry({"calibration": unit()}, {"calibration": OTHERS}),
+    "ContactMask.from_calibration": Entry(
+        {"calibration": unit()}, {"calibration": OTHERS, "settings": ["4.5", 4.5, torch.ones(3)]}
+    ),
     "ContactFromDepth": Entry({"mm_per_pixel": 1.0, "share": 0.8}, {"mm_per_pixel": NUMBER, "share": NUMBER}),
+    "ContactFromDepth.forward": Entry(
+        {"depth_mm": DEPTH, "gradient": GRADIENT, "deformed": DEPTH > 0},
+        {
+            "depth_mm": BAD_DEPTH[:-1],
+            "gradient": [GRADIENT[0], GRADIENT[:, :1], GRADIENT[..., 1:]],
+            "deformed": [DEPTH[..., 1:] > 0],
+        },
+        lambda: vts.ContactFromDepth(1.0),
+    ),
     "ContactSettings": Entry(
         {"sigmas": 4.5, "min_size_px": 8.0, "share": 0.8}, {"sigmas": NUMBER, "min_size_px": NUMBER, "share": NUMBER}
     ),
@@ -135,6 +146,7 @@ TABLE = {
         },
         {
             **{name: [None, lambda x: x] for name in ("compensate", "deformed", "normals", "gradient", "integrate")},
+            "contact": [lambda x: x, 0.8],
             "mm_per_pixel": NUMBER,
             "mode": ["slow", None, 1],
             "tolerance_px": NUMBER,
@@ -144,7 +156,13 @@ TABLE = {
     ),
     "DepthPipeline.from_calibration": Entry(
         {"calibration": unit(), "mode": "fast", "normals": None, "integrate": None},
-        {"calibration": OTHERS, "mode": ["slow", None, 1], "normals": ["lookup", 3], "integrate": ["dct", 3]},
+        {
+            "calibration": OTHERS,
+            "mode": ["slow", None, 1],
+            "normals": ["lookup", 3],
+            "integrate": ["dct", 3],
+            "contact": ["4.5", 4.5, torch.ones(3)],
+        },
     ),
     "DepthPipeline.forward": Entry(
         {"images": image()[None]},
@@ -355,7 +373,13 @@ TABLE = {
     ),
     "ConfidentPipeline.from_calibration": Entry(
         {"calibration": unit(), "mode": "fast"},
-        {"calibration": OTHERS, "mode": ["quick", None], "normals": ["mine", torch.nn.Identity()], "integrate": ["mine"]},
+        {
+            "calibration": OTHERS,
+            "mode": ["quick", None],
+            "normals": ["mine", torch.nn.Identity()],
+            "integrate": ["mine"],
+            "contact": ["4.5", 4.5, torch.ones(3)],
+        },
     ),
     "ConfidentPipeline.forward": forward(lambda: vts.ConfidentPipeline.from_calibration(unit()), 3, "images"),
     "bound_at": Entry(

@@ -117,7 +117,22 @@ TABLE = {
             "min_size_px": NUMBER,
         },
     ),
-    "ContactMask.from_calibration": Entry({"calibration": unit()}, {"calibration": OTHERS}),
+    "ContactMask.from_calibration": Entry(
+        {"calibration": unit()}, {"calibration": OTHERS, "settings": ["4.5", 4.5, torch.ones(3)]}
+    ),
+    "ContactFromDepth": Entry({"mm_per_pixel": 1.0, "share": 0.8}, {"mm_per_pixel": NUMBER, "share": NUMBER}),
+    "ContactFromDepth.forward": Entry(
+        {"depth_mm": DEPTH, "gradient": GRADIENT, "deformed": DEPTH > 0},
+        {
+            "depth_mm": BAD_DEPTH[:-1],
+            "gradient": [GRADIENT[0], GRADIENT[:, :1], GRADIENT[..., 1:]],
+            "deformed": [DEPTH[..., 1:] > 0],
+        },
+        lambda: vts.ContactFromDepth(1.0),
+    ),
+    "ContactSettings": Entry(
+        {"sigmas": 4.5, "min_size_px": 8.0, "share": 0.8}, {"sigmas": NUMBER, "min_size_px": NUMBER, "share": NUMBER}
+    ),
     "ContactMask.forward": forward(lambda: pipe().deformed, 3, "compensated"),
     "ContactMask.shadowed": forward(lambda: pipe().deformed.shadowed, 3, "compensated"),
     "ContactMask.soft": forward(lambda: pipe().deformed.soft, 3, "compensated"),
@@ -132,6 +147,7 @@ TABLE = {
         },
         {
             **{name: [None, lambda x: x] for name in ("compensate", "deformed", "normals", "gradient", "integrate")},
+            "contact": [lambda x: x, 0.8],
             "mm_per_pixel": NUMBER,
             "mode": ["slow", None, 1],
             "tolerance_px": NUMBER,
@@ -141,7 +157,13 @@ TABLE = {
     ),
     "DepthPipeline.from_calibration": Entry(
         {"calibration": unit(), "mode": "fast", "normals": None, "integrate": None},
-        {"calibration": OTHERS, "mode": ["slow", None, 1], "normals": ["lookup", 3], "integrate": ["dct", 3]},
+        {
+            "calibration": OTHERS,
+            "mode": ["slow", None, 1],
+            "normals": ["lookup", 3],
+            "integrate": ["dct", 3],
+            "contact": ["4.5", 4.5, torch.ones(3)],
+        },
     ),
     "DepthPipeline.from_gs_sdk": Entry(
         {"weights": ..., "background": image(), "sensor": sensor(), "mode": "fast"},
@@ -379,7 +401,13 @@ TABLE = {
     ),
     "ConfidentPipeline.from_calibration": Entry(
         {"calibration": unit(), "mode": "fast"},
-        {"calibration": OTHERS, "mode": ["quick", None], "normals": ["mine", torch.nn.Identity()], "integrate": ["mine"]},
+        {
+            "calibration": OTHERS,
+            "mode": ["quick", None],
+            "normals": ["mine", torch.nn.Identity()],
+            "integrate": ["mine"],
+            "contact": ["4.5", 4.5, torch.ones(3)],
+        },
     ),
     "ConfidentPipeline.forward": forward(lambda: vts.ConfidentPipeline.from_calibration(unit()), 3, "images"),
     "bound_at": Entry(

@@ -273,7 +273,7 @@ TABLE = {
     },
     "stream.FollowLight.update": Entry(
         {"image": image()[None], "deformed": DEPTH > 0, "seconds": 0.1},
-        {"image": batches(3), "contact": [None, torch.ones(1, 1, 4, 4), (DEPTH > 0).numpy()], "seconds": ["1", None, NAN]},
+        {"image": batches(3), "deformed": [None, torch.ones(1, 1, 4, 4), (DEPTH > 0).numpy()], "seconds": ["1", None, NAN]},
         lambda: vts.stream.FollowLight(image()).update,
     ),
     "stream.FrameCheck": Entry({"background": image()}, {"background": [b for k, b in enumerate(images()) if k not in (3, 4)]}),

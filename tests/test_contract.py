@@ -165,6 +165,9 @@ def test_single_precision_follows_double_precision(name):
         assert torch.equal(single(example), double(exact))
         return
     for left, right in zip(outputs(single(example)), outputs(double(exact)), strict=True):
+        if left.dtype == torch.bool:  # a pixel may lie on a threshold
+            assert float((left ^ right).double().mean()) < 2e-3
+            continue
         assert float((left.double() - right.double()).abs().max()) < 2e-4 * max(1.0, float(right.double().abs().max()))
 
 
@@ -225,7 +228,8 @@ def test_a_block_works_in_sequential(name):
 def test_blocks_chain_by_hand_in_sequential():
     whole, example = build("DepthPipeline fast")
     normals = nn.Sequential(whole.compensate, whole.normals, whole.gradient)(example)
-    depth = whole.integrate(normals * whole.deformed(whole.compensate(example)))
+    deformed = whole.deformed(whole.compensate(example))
+    depth = whole.zero(whole.integrate(normals * deformed), deformed)
     assert_same(depth, whole(example).depth_mm, 1e-6)  # the pipeline sees normals in a window only
 
 

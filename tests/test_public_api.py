@@ -13,12 +13,13 @@ from torchvts.pipeline import Confidence, ConfidentOutput, bound_at
 from torchvts.pose import contact_cloud
 
 NAMES = [
-    "AdaptiveIntegration", "Calibration", "CalibrationWarning", "Compensate", "ConfidentPipeline", "ContactMask",
-    "DepthOutput", "DepthPipeline", "GradientFromNormal", "Integrator", "NormalFromIntensity", "NormalFromLookup",
-    "NormalFromMLP", "NormalFromResponse", "NormalModel", "PointLights", "PoissonBackground", "PoissonDCT", "PoissonDST",
-    "Press", "Sensor", "Touch", "calibrate", "depth_to_points", "diagnose", "fit_lights", "gs_sdk", "near_field_shading",
-    "poisson_background", "poisson_dct", "poisson_dst", "read_image", "read_presses", "register_depth", "register_points",
-    "scenes", "shipped_sensors", "stream", "write_image",
+    "AdaptiveIntegration", "Calibration", "CalibrationWarning", "Compensate", "ConfidentPipeline", "ContactFromDepth",
+    "ContactMask", "ContactSettings", "DepthOutput", "DepthPipeline", "GradientFromNormal", "Integrator",
+    "NormalFromIntensity", "NormalFromLookup", "NormalFromMLP", "NormalFromResponse", "NormalModel", "PointLights",
+    "PoissonBackground", "PoissonDCT", "PoissonDST", "Press", "Sensor", "Touch", "calibrate", "depth_to_points",
+    "diagnose", "fit_lights", "gs_sdk", "near_field_shading", "poisson_background", "poisson_dct", "poisson_dst",
+    "read_image", "read_presses", "register_depth", "register_points", "scenes", "shipped_sensors", "stream",
+    "write_image",
 ]  # fmt: skip
 ARGUMENTS = {
     vts.Sensor: ["name", "height", "width", "mm_per_pixel"],
@@ -52,6 +53,8 @@ ARGUMENTS = {
     contact_cloud: ["frame", "mm_per_pixel", "most"],
     vts.Compensate: ["gain", "offset", "gamma", "defects"],
     vts.ContactMask: ["flat", "noise_std", "sigmas", "min_size_px"],
+    vts.ContactFromDepth: ["mm_per_pixel", "share"],
+    vts.ContactSettings: ["sigmas", "min_size_px", "share"],
     vts.NormalFromIntensity: ["lights", "height", "width", "mm_per_pixel", "noise_std", "inverse"],
 }
 

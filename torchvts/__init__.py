@@ -11,6 +11,7 @@ from .accelerated import (
     PoissonDCT,
 )
 from .calibration import CalibrationWarning, Press, Touch, calibrate, fit_lights, read_presses
+from .contact import ContactFromDepth, ContactSettings
 from .core import __version__ as __version__
 from .core.files import read_image, write_image
 from .core.geometry import depth_to_points
@@ -27,7 +28,9 @@ __all__ = [
     "CalibrationWarning",
     "Compensate",
     "ConfidentPipeline",
+    "ContactFromDepth",
     "ContactMask",
+    "ContactSettings",
     "DepthOutput",
     "DepthPipeline",
     "GradientFromNormal",

@@ -1,4 +1,4 @@
-"""The contact mask: pixels whose change stands out of the frame's noise, with holes filled and specks removed.
+"""The deformed area: pixels whose change stands out of the frame's noise, with holes filled and specks removed.
 
 Fine pixels decide the rim; a grid of coarse cells decides what is a hole and what is a speck, because there it is cheap.
 """
@@ -9,11 +9,21 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import QUANTISATION_STD, check_batch, check_field, check_positive, check_same_size, check_tensor, may_read_values
+from ..core.checks import (
+    QUANTISATION_STD,
+    check_batch,
+    check_field,
+    check_positive,
+    check_record,
+    check_same_size,
+    check_tensor,
+    may_read_values,
+)
 from ..core.noise import clipped_std
 from ..core.noise import noise_std as frame_noise_std
 from ..model.calibration import Calibration, check_calibration
 from .morphology import dilate, dilate_cross, erode, reconstruct
+from .settings import ContactSettings
 
 CELLS = 80
 """Cells along the shorter side of the image."""
@@ -34,12 +44,13 @@ class Change(NamedTuple):
 
 
 class ContactMask(nn.Module):
-    """Contact of compensated images.
+    """Where the skin has moved, from compensated images: the contact and the skin around it that hangs free.
 
-    A pixel is in contact if its change over the three channels, each in units of its noise, is longer than ``sigmas``; a coarse
-    cell also if its mean change is, in units of the frame's own spread of cell means (faint contact). The noise is the larger of
-    the calibrated one and the frame's own. Holes are filled; components smaller than a disc of ``min_size_px`` are removed. A
-    channel that is black in all of the frame (below 5 % of its background) has lost its LED: the other two decide.
+    A pixel has moved if its change over the three channels, each in units of its noise, is longer than ``sigmas``; a coarse
+    cell also if its mean change is, in units of the frame's own spread of cell means (faint contact). The noise of a channel is
+    the largest of the calibrated one, the frame's own, and the frame's spread of change far from the contact. Holes are filled;
+    components smaller than a disc of ``min_size_px`` are removed. A channel that is black in all of the frame (below 5 % of its
+    background) has lost its LED: the other two decide.
 
     Args:
         flat: (3, H, W), the compensated image of the undeformed skin.
@@ -90,20 +101,21 @@ class ContactMask(nn.Module):
         self.register_buffer("cell_column", torch.arange(flat.shape[2]) // self.cell)
 
     @classmethod
-    def from_calibration(cls, calibration: Calibration) -> "ContactMask":
+    def from_calibration(cls, calibration: Calibration, settings: ContactSettings | None = None) -> "ContactMask":
         """The mask of a calibrated unit's compensated images."""
         check_calibration("calibration", calibration)
-        noise = calibration.compensated_noise_std
-        return cls(calibration.flat, noise)
+        settings = ContactSettings() if settings is None else settings
+        check_record("settings", settings, ContactSettings, "ContactSettings() makes one")
+        return cls(calibration.flat, calibration.compensated_noise_std, settings.sigmas, settings.min_size_px)
 
     def forward(self, compensated: Tensor) -> Tensor:
-        """Contact of compensated images (B, 3, H, W), bool (B, 1, H, W)."""
+        """Where the skin has moved in compensated images (B, 3, H, W), bool (B, 1, H, W)."""
         self._check(compensated)
         return self.find(compensated.detach())[0]
 
     @torch.jit.export
     def soft(self, compensated: Tensor) -> Tensor:
-        """Contact as a number in (0, 1), (B, 1, H, W), differentiable in the image: one half at the hard rim."""
+        """The same as a number in (0, 1), (B, 1, H, W), differentiable in the image: one half at the hard rim."""
         self._check(compensated)
         hard, interior = self.find(compensated.detach())
         found = self.change(compensated)
@@ -129,7 +141,7 @@ class ContactMask(nn.Module):
         check_same_size("compensated", compensated, "the calibration", self.flat.shape[1], self.flat.shape[2])
 
     def find(self, compensated: Tensor) -> tuple[Tensor, Tensor]:
-        """Contact, and its interior, where cells decide and not pixels; compiled kernels take the place of this method."""
+        """The deformed area, and its interior, where cells decide and not pixels; compiled kernels replace this method."""
         found = self.change(compensated)
         return self.clean(found.change, found.squared > found.threshold)
 
@@ -171,7 +183,7 @@ class ContactMask(nn.Module):
         return compensated.detach()[:, :, step // 2 :: step, step // 2 :: step].mean(dim=(2, 3)) < self.failed_below
 
     def clean(self, change: Tensor, strong: Tensor) -> tuple[Tensor, Tensor]:
-        """Contact and its interior from pixels that stand out: gaps closed, holes filled, specks removed, faint cells added."""
+        """The same from pixels that stand out: gaps closed, holes filled, specks removed, faint cells added."""
         strong = erode(dilate(strong))  # closing: pixels lost to noise at the rim
         counted = strong.to(change.dtype)  # ONNX sums no bytes
         if may_read_values():

@@ -12,7 +12,7 @@ from ..core.checks import check_batch, check_positive, check_same_size
 CELL_MM = 0.13
 """Side of the cells in which pressure is found, at most; finer, the noise of slopes hides it."""
 
-RIM_MM = 2.5
+RIM_MM = 3.5
 """Length of rim along which its depth is averaged, either way."""
 
 DECAY_MM = (0.1, 2.0)
@@ -27,11 +27,12 @@ class ContactFromDepth(nn.Module):
 
     The decay length L of a frame is the regression of its convex skin. A cell is pressed if its pressure exceeds a share of what
     lifts free skin of the slope nearby, slope * L: at the rim of any contact pressure falls from at least that to zero. The rim
-    of the pressed cells then gets one depth along each 2.5 mm of it, since depth has less noise than its curvature.
+    of the pressed cells then gets one depth along 3.5 mm of it, since depth has less noise than its curvature.
 
     Args:
         mm_per_pixel: pixel pitch, mm.
-        share: of slope * L, from which a cell is pressed; one half is the middle of the step.
+        share: of slope * L, from which a cell is pressed. One half is the middle of a sharp step; smoothing carries
+            pressure outward, hence more.
     Source:
         membrane on an elastic foundation: Timoshenko and Woinowsky-Krieger, Theory of Plates and Shells, 1959; level from the
         rim: Yanowitz and Bruckstein, CVGIP 46(1), 1989; the rest is this project's.
@@ -43,7 +44,7 @@ class ContactFromDepth(nn.Module):
         False
     """
 
-    def __init__(self, mm_per_pixel: float, share: float = 0.5) -> None:
+    def __init__(self, mm_per_pixel: float, share: float = 0.8) -> None:
         super().__init__()
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         self.share = check_positive("share", share)
@@ -81,22 +82,27 @@ class ContactFromDepth(nn.Module):
         return deformed & (depth > level)
 
     def rim_depth(self, fields: Tensor) -> Tensor:
-        """Depth of the rim of the contact nearby, (B, 1, h, w), infinite where there is none, from share, depth and slopes of cells."""
+        """Depth of the rim of the contact nearby, (B, 1, h, w), infinite where there is none.
+
+        Args:
+            fields: (B, 4, h, w): the deformed share of a cell, its depth and its two slopes times that share.
+        """
         mass, some = fields[:, 0:1], fields[:, 0:1] > 0.0
         slope = fields[:, 2:4] / mass.clamp_min(1e-6)
         curvature = self.divergence(slope, some)
-        smooth = _box(_box(torch.cat((mass, fields[:, 1:2], curvature * mass), dim=1), 1), 1)
+        smooth = _box(torch.cat((mass, fields[:, 1:2], curvature * mass), dim=1), 2)
         smooth = smooth / smooth[:, 0:1].clamp_min(1e-6)
         depth, curvature = smooth[:, 1:2], smooth[:, 2:3]
         decay = self.squared_decay(depth, curvature, some)
         pressure = (depth - decay * curvature).masked_fill(~some, 0.0)
         steep = slope.square().sum(dim=1, keepdim=True)
-        nearby = _box(_box(torch.cat((steep, steep * torch.sqrt(steep)), dim=1), self.reach // 2), self.reach // 2)
+        nearby = _box(torch.cat((steep, steep * torch.sqrt(steep)), dim=1), self.reach // 2)
         least = self.share * torch.sqrt(decay) * nearby[:, 1:2] / nearby[:, 0:1].clamp_min(1e-9)
         pressed = (pressure > least) & (pressure > 0.1 * pressure.amax(dim=(2, 3), keepdim=True))
-        pressed_share = _box(pressed.to(depth.dtype), 1)
-        rim = ((pressed_share > 0.2) & (pressed_share < 0.8) & some).to(depth.dtype)
-        found = _box(_box(torch.cat((rim, rim * fields[:, 1:2] / mass.clamp_min(1e-6)), dim=1), self.reach // 2), self.reach // 2)
+        around = _box(torch.cat((pressed, some), dim=1).to(depth.dtype), 1)
+        share = around[:, 0:1] / around[:, 1:2].clamp_min(1e-6)  # of deformed cells: none lie beyond the image
+        rim = ((share > 0.2) & (share < 0.8) & some).to(depth.dtype)
+        found = _box(torch.cat((rim, rim * fields[:, 1:2] / mass.clamp_min(1e-6)), dim=1), self.reach)
         level = found[:, 1:2] / found[:, 0:1].clamp_min(1e-9)
         far = torch.full_like(level, float("inf")).masked_fill(pressed, 0.0)
         return torch.where(found[:, 0:1] > 1e-9, level, far)

@@ -75,8 +75,8 @@ def with_deformed(frame: Frame, image: Tensor, mask: Tensor) -> Frame:
 class Crop(nn.Module):
     """Cut a compensated image (B, 3, H, W) and its deformed area (B, 1, H, W) to the smallest window that holds it.
 
-    Outside of the deformed area the gradient is zero, so the window changes nothing but the time. Elsewhere than on a CPU, in exported
-    programs, and where little would be saved, the window is the whole image: finding it would wait for the device.
+    Outside of the deformed area the gradient is zero, so the window changes nothing but the time. Elsewhere than on a CPU,
+    in exported programs, and where little would be saved, the window is the whole image: finding it would wait for the device.
 
     Args:
         stride: the corners of the window are multiples of it.

@@ -1,6 +1,7 @@
 """The writers: a pipeline as one file in TorchScript, torch.export, AOTInductor or ONNX.
 
-Every file takes images (B, 3, H, W) of the pipeline's size, any B, and returns depth_mm, gradient, normal, contact, deformed in that order.
+Every file takes images (B, 3, H, W) of the pipeline's size, any B, and returns depth_mm, gradient, normal, contact and
+deformed in that order.
 """
 
 import copy

@@ -1,6 +1,6 @@
 """From gradient to depth."""
 
-from .background import ZeroBackground
+from .background import DepthAsIs, ZeroBackground
 from .base import Integrator, WrappedIntegrator, as_integrator
 from .discontinuities import (
     AdaptiveIntegration,
@@ -15,6 +15,7 @@ from .poisson import PoissonBackground, PoissonDCT, PoissonDST, divergence, pois
 
 __all__ = [
     "AdaptiveIntegration",
+    "DepthAsIs",
     "DiscontinuityIntegration",
     "DiscontinuitySolution",
     "Integrator",

@@ -8,12 +8,15 @@ from ..core.checks import check_batch, check_same_size
 STIFF = 30.0
 """How much less the deepest skin bends to the continuation than undeformed skin: slopes are calibrated in contact only."""
 
+TOLERANCE = 0.01
+"""Depth below zero that is left, as a share of the largest depth."""
+
 SWEEPS = 4
 """Relaxations on each grid."""
 
 
 class ZeroBackground(nn.Module):
-    """Set depth to zero where the skin is undeformed, and take a smooth continuation of what was there out of the deformed skin.
+    """Set depth to zero where the skin is undeformed, two pixels beside ``deformed``, and take a continuation of what was there out of it.
 
     Slopes that are off by a few per cent do not sum to zero over a contact. Integrated, they leave a pit on one side of it and a
     rise on the other, which go on as a harmonic function over the undeformed skin. That function is known there, since
@@ -32,13 +35,13 @@ class ZeroBackground(nn.Module):
         >>> deformed = torch.zeros(1, 1, 48, 64, dtype=torch.bool)
         >>> deformed[..., 12:36, 16:48] = True
         >>> tilt = torch.linspace(-0.1, 0.1, 64).expand(1, 1, 48, 64)
-        >>> bool(ZeroBackground()(tilt + deformed.float(), deformed)[~deformed].any())
+        >>> bool(ZeroBackground()(tilt + deformed.float(), deformed)[..., :10, :].any())
         False
     """
 
     def __init__(self) -> None:
         super().__init__()
-        self.stiff = STIFF
+        self.stiff, self.tolerance = STIFF, TOLERANCE
         self.sweeps = SWEEPS
 
     def forward(self, depth_mm: Tensor, deformed: Tensor) -> Tensor:
@@ -50,19 +53,19 @@ class ZeroBackground(nn.Module):
         check_batch("depth_mm", depth_mm, 1)
         height, width = depth_mm.shape[2], depth_mm.shape[3]
         check_same_size("deformed", deformed, "depth_mm", height, width)
-        free = _as(~deformed, depth_mm)
-        values = depth_mm.detach()
-        low, high = values.amin(dim=(2, 3), keepdim=True), values.amax(dim=(2, 3), keepdim=True)
-        flat = free * _as(values < 0.5 * (low + high), values)
+        # a steep rim may be two pixels wider than the mask
+        free = 1.0 - nn.functional.max_pool2d(_as(deformed, depth_mm), 5, 1, 2)
+        low, high = depth_mm.amin(dim=(2, 3), keepdim=True), depth_mm.amax(dim=(2, 3), keepdim=True)
+        flat = free * _as(depth_mm < 0.5 * (low + high), depth_mm)
         count = flat.sum(dim=(2, 3), keepdim=True)
         level = (depth_mm * flat).sum(dim=(2, 3), keepdim=True) / count.clamp_min(1.0)
         raised = free - flat  # a face of the object: only the frame's mean is taken out
-        zero = flat
-        offset = torch.zeros_like(depth_mm)
-        weight = 1.0 + self.stiff * ((values - level.detach()) / (high - level.detach()).clamp_min(1e-9)).clamp_min(0.0).square()
-        for _ in range(2):  # then, where depth is below zero, that too is an error
-            offset = self.continued(torch.cat((zero + raised, depth_mm * zero + level * raised, weight), dim=1))
-            zero = torch.maximum(zero, (1.0 - free) * _as(values < offset.detach(), values))
+        range_mm = (high - level).clamp_min(1e-9)
+        weight = 1.0 + self.stiff * ((depth_mm - level) / range_mm).clamp_min(0.0).square()
+        fields = torch.cat((free, depth_mm * flat + level * raised, weight), dim=1)
+        offset = self.continued(fields)
+        below = (1.0 - free) * _as(depth_mm < offset - self.tolerance * range_mm, depth_mm)  # that too is an error
+        offset = self.continued(fields + torch.cat((below, depth_mm * below, torch.zeros_like(below)), dim=1))
         return (depth_mm - offset) * (1.0 - flat)
 
     def continued(self, fields: Tensor) -> Tensor:
@@ -96,6 +99,13 @@ class ZeroBackground(nn.Module):
         if cell > 1:
             found = nn.functional.interpolate(found, scale_factor=float(cell), mode="bilinear", align_corners=False)
         return found[:, :, :height, :width]
+
+
+class DepthAsIs(nn.Module):
+    """Depth (B, 1, H, W) as it was integrated."""
+
+    def forward(self, depth_mm: Tensor, deformed: Tensor) -> Tensor:
+        return depth_mm
 
 
 def _as(mask: Tensor, like: Tensor) -> Tensor:

@@ -2,8 +2,8 @@
 
 The bounds come from what is known before the frame (noise of the camera, conditioning of the inverse model, error of the model on
 held-out presses or of its fit) and from what the frame itself shows: its own noise, light that the model does not explain, slopes
-that are not integrable, dark or saturated channels, deformation too faint for the mask. They do not cover what no frame shows: a wrong
-pitch, a camera that is not orthographic, a calibration of another unit.
+that are not integrable, dark or saturated channels, deformation too faint for the mask. They do not cover what no frame shows: a
+wrong pitch, a camera that is not orthographic, a calibration of another unit.
 """
 
 import math
@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from ..accelerated import GradientFromNormal, PoissonBackground, scriptable
+from ..contact import ContactSettings
 from ..core.blur import blur, gaussian_weights
 from ..core.checks import (
     check_batch,
@@ -324,7 +325,8 @@ class Confidence(nn.Module):
             check_batch(name, tensor, channels)
             check_same_size(name, tensor, "the calibration", height, width)
         if not torch.jit.is_scripting():
-            check_tensor("contact", out.contact), check_tensor("deformed", out.deformed)
+            check_tensor("contact", out.contact)
+            check_tensor("deformed", out.deformed)
         for name, mask in (("contact", out.contact), ("deformed", out.deformed)):
             if mask.dtype != torch.bool or mask.shape != out.depth_mm.shape:
                 raise ValueError(f"{name}: expected bool like depth_mm, got {mask.shape} {mask.dtype}")
@@ -415,14 +417,20 @@ class ConfidentPipeline(nn.Module):
 
     @classmethod
     def from_calibration(
-        cls, calibration: Calibration, mode: str = "fast", *, normals: nn.Module | None = None, integrate: nn.Module | None = None
+        cls,
+        calibration: Calibration,
+        mode: str = "fast",
+        *,
+        normals: nn.Module | None = None,
+        integrate: nn.Module | None = None,
+        contact: ContactSettings | None = None,
     ) -> "ConfidentPipeline":
         """As :meth:`DepthPipeline.from_calibration`.
 
         Raises:
             TypeError: no Calibration; or ``normals`` that are not the calibrated model.
         """
-        pipe = DepthPipeline.from_calibration(calibration, mode, normals=normals, integrate=integrate)
+        pipe = DepthPipeline.from_calibration(calibration, mode, normals=normals, integrate=integrate, contact=contact)
         return cls(pipe, Confidence.from_calibration(calibration, pipe.normals)).eval()
 
     def forward(self, images: Tensor) -> ConfidentOutput:

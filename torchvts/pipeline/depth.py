@@ -18,7 +18,7 @@ from ..accelerated import (
     scriptable,
 )
 from ..compensate import Compensate as PlainCompensate
-from ..contact import ContactFromDepth
+from ..contact import ContactFromDepth, ContactSettings
 from ..contact import ContactMask as PlainContactMask
 from ..core.checks import (
     check_batch,
@@ -31,7 +31,8 @@ from ..core.checks import (
     may_read_values,
 )
 from ..core.frame import DepthOutput, Solution, depth_in_window, undeformed_output
-from ..integration import WrappedIntegrator, ZeroBackground, as_integrator
+from ..integration import DepthAsIs, WrappedIntegrator, ZeroBackground, as_integrator
+from ..integration import PoissonBackground as PlainPoissonBackground
 from ..model import Calibration, Sensor, check_calibration
 from ..normals import NormalFromIntensity as PlainNormalFromIntensity
 from ..normals import NormalFromResponse, WrappedNormals, as_normal_model, check_domain
@@ -91,7 +92,8 @@ class DepthPipeline(nn.Module):
     ) -> None:
         super().__init__()
         check_choice("mode", mode, MODES)
-        for name, block in (("compensate", compensate), ("deformed", deformed), ("gradient", gradient)):
+        touching = ContactFromDepth(mm_per_pixel) if contact is None else contact
+        for name, block in (("compensate", compensate), ("deformed", deformed), ("gradient", gradient), ("contact", touching)):
             check_record(name, block, nn.Module)
         model, integrator = as_normal_model(normals), as_integrator(integrate)
         check_domain(model, compensate.output_domain if isinstance(compensate, PlainCompensate) else None)
@@ -110,8 +112,9 @@ class DepthPipeline(nn.Module):
         self.crop = Crop(STRIDE, model.takes_window)
         self.solve = Solve(model, gradient, integrator)
         self.refine = self._policy(mode, tolerance_px, refine_threshold_px, min(max_passes, model.max_passes))
-        self.zero = ZeroBackground()
-        self.contact = ContactFromDepth(mm_per_pixel) if contact is None else contact
+        # anyone else's integrator decides by itself where depth is zero
+        self.zero = ZeroBackground() if isinstance(integrator, PlainPoissonBackground) else DepthAsIs()
+        self.contact = touching
         self.uncrop = Uncrop()
 
     def _policy(self, mode: str, tolerance_px: float, refine_threshold_px: float, max_passes: int) -> nn.Module:
@@ -138,7 +141,13 @@ class DepthPipeline(nn.Module):
 
     @classmethod
     def from_calibration(
-        cls, calibration: Calibration, mode: str = "fast", *, normals: nn.Module | None = None, integrate: nn.Module | None = None
+        cls,
+        calibration: Calibration,
+        mode: str = "fast",
+        *,
+        normals: nn.Module | None = None,
+        integrate: nn.Module | None = None,
+        contact: ContactSettings | None = None,
     ) -> "DepthPipeline":
         """The pipeline of a calibrated unit, in eval mode, its lights frozen (``requires_grad_(True)`` frees them).
 
@@ -148,8 +157,9 @@ class DepthPipeline(nn.Module):
             normals: module to put in place of the calibrated inverse model. It gets what that model would: the image scaled to the
                 light model's, or image / background for a response field. One that declares another ``input_domain`` is refused.
             integrate: module to put in place of PoissonBackground.
+            contact: thresholds of ``deformed`` and ``contact``; None for the usual ones.
         Raises:
-            TypeError: no Calibration.
+            TypeError: no Calibration, or no ContactSettings.
             ValueError: normals that work on other images.
         Example:
             >>> from torchvts import PointLights, Sensor
@@ -160,18 +170,21 @@ class DepthPipeline(nn.Module):
             (torch.Size([1, 1, 48, 64]), False)
         """
         check_calibration("calibration", calibration)
+        settings = ContactSettings() if contact is None else contact
+        check_record("contact", settings, ContactSettings, "ContactSettings(sigmas=...) makes one")
         sensor = calibration.sensor
         if normals is None:
             by_response = calibration.response is not None
             normals = (NormalFromResponse if by_response else NormalFromIntensity).from_calibration(calibration)
         modules = (
             Compensate.from_calibration(calibration, drift=mode == "auto"),
-            ContactMask.from_calibration(calibration),
+            ContactMask.from_calibration(calibration, settings),
             normals,
             GradientFromNormal(),
             integrate or PoissonBackground(sensor.mm_per_pixel),
         )
-        return cls(*modules, mm_per_pixel=sensor.mm_per_pixel, mode=mode).eval()
+        touching = ContactFromDepth(sensor.mm_per_pixel, settings.share)
+        return cls(*modules, mm_per_pixel=sensor.mm_per_pixel, mode=mode, contact=touching).eval()
 
     @classmethod
     def from_gs_sdk(cls, weights: str | Path, background: Tensor, sensor: Sensor | str, mode: str = "fast") -> "DepthPipeline":

@@ -1,7 +1,7 @@
 """Dark pixels: a dark channel may be an attached shadow, a cast shadow or dirt; what leaves the most integrable surface decides.
 
-A frame enters this room only where a light that shines on the flat skin is dark inside the deformed area, and only for units that are
-calibrated by lights.
+A frame enters this room only where a light that shines on the flat skin is dark inside the deformed area, and only for units that
+are calibrated by lights.
 """
 
 from typing import NamedTuple
@@ -71,7 +71,8 @@ class Shadows(nn.Module):
         """Dark pixels as undeformed skin, or as pixels whose dark channels are left out, where that improves integrability.
 
         Returns:
-            The frame with its image and deformed area changed accordingly; where dark still means a slope that faces away; the solution.
+            The frame with its image and deformed area changed accordingly; where dark still means a slope that faces away; the
+            solution.
         """
         (top, left), normals = frame.window, self.policy.solve.normals
         shadowed = torch.zeros_like(blocked)

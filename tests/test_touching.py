@@ -1,0 +1,126 @@
+"""Where an object touches, apart from where the skin has moved: on drawn skin that hangs free, and on labelled presses."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+import torchvts as vts
+from torchvts.calibration import fit_prior
+from torchvts.core.geometry import gradient_of_depth
+from torchvts.integration import ZeroBackground
+
+PITCH, HEIGHT, WIDTH = 0.0634, 240, 320
+
+
+def membrane(object_mm, decay_mm=0.6, steps=250):
+    """Depth of skin that hangs free around an object, and where it is pressed: the obstacle problem, by accelerated projection."""
+    height, width = object_mm.shape
+    ky, kx = (2.0 * math.pi * f for f in (torch.fft.fftfreq(2 * height, PITCH), torch.fft.rfftfreq(2 * width, PITCH)))
+    kernel = 1.0 / (1.0 + decay_mm**2 * (ky[:, None] ** 2 + kx**2))
+
+    def depth_under(pressure):
+        spectrum = torch.fft.rfft2(pressure, s=(2 * height, 2 * width)) * kernel
+        return torch.fft.irfft2(spectrum, s=(2 * height, 2 * width))[:height, :width]
+
+    pressure = momentum = torch.zeros_like(object_mm)
+    for k in range(steps):
+        after = (momentum - (depth_under(momentum) - object_mm)).clamp_min(0.0)
+        momentum, pressure = after + k / (k + 3.0) * (after - pressure), after
+    return depth_under(pressure)[None, None], (pressure > 0.02 * float(object_mm.max()))[None, None]
+
+
+def objects():
+    y, x = torch.meshgrid((torch.arange(HEIGHT) - 119.5) * PITCH, (torch.arange(WIDTH) - 159.5) * PITCH, indexing="ij")
+    away = torch.hypot(x, y)
+    ball = torch.sqrt((3.15**2 - away**2).clamp_min(0.01)) - 3.15 + 0.8
+    flat = 0.5 - ((away - 3.0) / 0.15 + 0.5).clamp(0.0, 1.0) * 4.0
+    rod = torch.sqrt((9.0 - (0.6 * x - 0.8 * y) ** 2).clamp_min(0.01)) - 2.5
+    return {"ball": ball, "flat punch": flat, "cone": 0.8 - 0.45 * away, "rod": rod}
+
+
+def found(depth):
+    deformed = depth > 0.02
+    gradient = gradient_of_depth(depth, PITCH) * deformed
+    return vts.ContactFromDepth(PITCH)(depth, gradient, deformed), deformed
+
+
+def iou(one, other):
+    return float((one & other).sum() / (one | other).sum())
+
+
+@pytest.mark.parametrize("name, least", [("ball", 0.85), ("flat punch", 0.7), ("cone", 0.75), ("rod", 0.85)])
+def test_contact_of_skin_that_hangs_free(name, least):
+    depth, truth = membrane(objects()[name])
+    contact, deformed = found(depth)
+    assert iou(contact, truth) > least > iou(deformed, truth) + 0.15
+
+
+def test_contact_does_not_depend_on_units_of_length():
+    depth, _ = membrane(objects()["ball"])
+    contact, deformed = found(depth)
+    turned = [t.transpose(2, 3) for t in (depth, gradient_of_depth(depth, PITCH).flip(1) * deformed, deformed)]
+    assert torch.equal(vts.ContactFromDepth(PITCH)(*turned).transpose(2, 3), contact)
+
+
+def test_script_export_windows_and_batches_agree():
+    depth, _ = membrane(objects()["ball"], steps=60)
+    depth = torch.cat((depth, 0.5 * depth.roll(16, 3)))
+    deformed = depth > 0.02
+    inputs = (depth, gradient_of_depth(depth, PITCH) * deformed, deformed)
+    block = vts.ContactFromDepth(PITCH)
+    contact = block(*inputs)
+    assert torch.equal(torch.jit.script(block)(*inputs), contact) and not bool((contact & ~deformed).any())
+    assert torch.equal(torch.export.export(block, inputs, strict=False).module()(*inputs), contact)
+    assert torch.equal(torch.cat([block(*(t[k : k + 1] for t in inputs)) for k in range(2)]), contact)
+    rows, columns = deformed.any(0)[0].nonzero().unbind(1)
+    top, left = int(rows.min() - 1) // 8 * 8, int(columns.min() - 1) // 8 * 8
+    window = (slice(None), slice(None), slice(top, int(rows.max()) + 10), slice(left, int(columns.max()) + 10))
+    assert torch.equal(block(*(t[window] for t in inputs)), contact[window])
+
+
+def test_a_constant_error_of_slope_leaves_no_pit():
+    depth, truth = membrane(objects()["ball"], steps=60)
+    deformed = depth > 0.02
+    gradient = (gradient_of_depth(depth, PITCH) + torch.tensor([0.05, 0.03])[:, None, None]) * deformed
+    before = vts.poisson_background(gradient, PITCH)
+    after = ZeroBackground()(before, deformed)
+    assert float(before.min()) < -0.05 and float(after.min()) > -0.02
+    assert float((after - depth)[truth].abs().mean()) < float((before - depth)[truth].abs().mean()) + 0.01
+    assert torch.equal(torch.jit.script(ZeroBackground())(before, deformed), after)
+
+
+def test_thresholds_can_be_set(ring, small_sensor, small_press):
+    cal = vts.Calibration.from_lights(ring(), small_sensor)
+    image = vts.scenes.render(small_press(1.0), ring())
+    usual, strict = (vts.DepthPipeline.from_calibration(cal, contact=s) for s in (None, vts.ContactSettings(9.0, 200.0, 2.0)))
+    assert bool(usual(image).deformed.any()) and not bool(strict(image).deformed.any())
+    assert (strict.deformed.sigmas, strict.deformed.min_size_px, strict.contact.share) == (9.0, 200.0, 2.0)
+    depth, _ = membrane(objects()["ball"], steps=60)
+    inputs = (depth, gradient_of_depth(depth, PITCH), depth > 0.02)
+    assert int(vts.ContactFromDepth(PITCH, 2.0)(*inputs).sum()) < int(vts.ContactFromDepth(PITCH)(*inputs).sum())
+    with pytest.raises(TypeError, match="contact: expected a ContactSettings"):
+        vts.DepthPipeline.from_calibration(cal, contact=4.5)
+
+
+@pytest.mark.long
+def test_labelled_contacts_of_a_real_sensor(data):
+    """The prior is that of the other ball; before, contact was what deformed is: 0.27 in the median."""
+    background, presses = vts.read_presses(data / "gelsight_mini_a")
+    sensor, score, low = vts.Sensor.load("gelsight_mini"), [], []
+    y, x = torch.meshgrid(torch.arange(240.0), torch.arange(320.0), indexing="ij")
+    for diameter in (6.31, 9.5):
+        other = [p for p in presses if abs(p.ball_diameter_mm - diameter) > 0.1]
+        own = dataclasses.replace(sensor, prior=fit_prior(background, sensor, other))
+        pipe = vts.DepthPipeline.from_calibration(vts.calibrate(background, own)).float()
+        for press in presses:
+            if press.contact_radius_px is None or press in other:
+                continue
+            out = pipe(press.image[None].float())
+            circle = torch.hypot(x - press.center_px[0], y - press.center_px[1]) <= press.contact_radius_px
+            score.append(iou(out.contact[0, 0], circle))
+            low.append(float(out.depth_mm.min()))
+    score, low = torch.tensor(score), torch.tensor(low)
+    assert float(score.median()) > 0.88 and float(score.min()) > 0.7
+    assert float(low.median()) > -0.05 and float(low.min()) > -0.15

@@ -83,6 +83,11 @@ class _Candidate:
     def misfit(self) -> float:
         return float(self.fit.misfit.max())
 
+    def can_win(self, stride: int) -> bool:
+        """Whether lights fitted to every ``stride``-th row and column may be good ones on all: noise is that much less there."""
+        loosest = float(self.fit.direction_std_deg.max())
+        return self.misfit <= LARGE_MISFIT and loosest <= POORLY_CONSTRAINED_DEG * stride
+
     @property
     def held_out(self) -> float:
         return float(self.fit.held_out.mean())
@@ -98,7 +103,8 @@ def choose_lights(background: Tensor, sensor: Sensor, other_models: bool = False
     Args:
         background: (3, H, W) in [0, 1].
         sensor: its gamma is chosen where it is left open.
-        other_models: models other than lights exist: lights with a large misfit on 30 rows are then not refined.
+        other_models: models other than lights exist: lights that 30 rows show to have a large misfit, or to be constrained so
+            poorly that less noise does not help, are then not refined.
         progress: show a bar.
     Raises:
         ValueError: as :func:`fit_lights`.
@@ -108,7 +114,9 @@ def choose_lights(background: Tensor, sensor: Sensor, other_models: bool = False
     linear = dataclasses.replace(sensor, gamma=sensor.exponent, prior=None)
     sparse, small = _sparse(background, linear, 30 if other_models else 60)
     tried = _try(sparse, small, [], progress)
-    if other_models and min(candidate.misfit for candidate in tried) <= LARGE_MISFIT:  # refine
+    stride = round(small.mm_per_pixel / sensor.mm_per_pixel)
+    refine = not other_models or any(candidate.can_win(stride) for candidate in tried)
+    if other_models and refine:
         sparse, small = _sparse(background, linear, 60)
         tried = _try(sparse, small, [], progress)
     if sensor.gamma is None and tried[0].misfit > 0.005:
@@ -117,7 +125,7 @@ def choose_lights(background: Tensor, sensor: Sensor, other_models: bool = False
         candidate.objection = _objection(candidate, tried, sensor)
     chosen = _choose(tried)
     fit, linear = chosen.fit, dataclasses.replace(linear, gamma=chosen.gamma)
-    if not fit.failed and not (other_models and chosen.misfit > LARGE_MISFIT):
+    if not fit.failed and refine and not (other_models and chosen.misfit > LARGE_MISFIT):
         fit = _fit(background, linear, chosen.vignetting, chosen.ambient, chosen.known_azimuth, progress)
     final = dataclasses.replace(chosen, fit=fit)
     row = _row(final)

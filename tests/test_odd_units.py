@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import torchvts as vts
-from torchvts.calibration.light_choice import hopeless
+from torchvts.calibration.light_choice import objection_to_lights
 from torchvts.calibration.pattern import compare_patterns
 from torchvts.calibration.refusals import NoUsablePress, colour_share, colour_variation, other_crop
 from torchvts.model.response_field import CHANGE_SCALE, ResponseField, ResponseModel, SensorPrior, fit_log_background
@@ -148,7 +148,7 @@ def test_lights_that_can_win_are_not_hopeless(ring):
         (ring(), ring(22.0, [15.0, 16.5, 18.0], level=0.2)), (0.0, 0.4), (0.0, 0.2)
     ):
         image = camera(vts.scenes.render(scene, lights, vignetting=vignetting)[0] + ambient)
-        assert hopeless(image, dataclasses.replace(rig, gamma=None)) == ""
+        assert objection_to_lights(image, dataclasses.replace(rig, gamma=None)) == ""
 
 
 def test_a_fit_that_fails_says_so_and_has_no_figures():

@@ -19,7 +19,7 @@ from .by_presses import by_presses, error_of_lights_deg
 from .by_touches import TouchResult, by_touches
 from .complaints import CalibrationWarning
 from .contacts import press_row, touch_row, used
-from .light_choice import hopeless
+from .light_choice import objection_to_lights
 from .lights import POORLY_CONSTRAINED_DEG, check_exposure
 from .pattern import compare_patterns
 from .presses import Press, Touch, check_presses, check_touches
@@ -90,7 +90,7 @@ def calibrate(
     given = _Given(background, sensor, check_presses(presses, sensor), check_touches(touches, sensor), progress)
     check_colour(background)
     check_coloured_contacts(background, given.presses or given.touches)
-    if not (presses or touches or sensor.prior or sensor.light_position_mm) and hopeless(background, sensor):
+    if not (presses or touches or sensor.prior or sensor.light_position_mm) and objection_to_lights(background, sensor):
         check_coloured_background(background)
     lights = by_lights(background, sensor, bool(presses or touches or sensor.prior), progress)
     prior, messages = _prior(given)

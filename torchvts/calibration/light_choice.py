@@ -26,7 +26,7 @@ ambient light reduces the structure of a camera's gamma of 2.2 to 3 %, with ligh
 LARGE_MISFIT = 0.2
 """Relative structure left unexplained from which lights are no candidate beside another model."""
 
-HOPELESS = 0.1
+CLOSED_FORM_MISFIT = 0.1
 """Misfit of the closed-form lights from which no fit is tried beside another model. It is 0.125 to 0.20 on five real sensors; on
 drawn rigs at most 0.07, with an ambient light as bright as the lights (0.3), and 0.05 with half of the corners' light lost."""
 
@@ -139,7 +139,7 @@ def choose_lights(background: Tensor, sensor: Sensor, other_models: bool = False
     return LightChoice(linear, fit, rows, _reason(chosen, tried), complaint)
 
 
-def hopeless(background: Tensor, sensor: Sensor) -> str:
+def objection_to_lights(background: Tensor, sensor: Sensor) -> str:
     """Why point lights cannot explain a background, by their closed form on a sparse image and without any fit, or "".
 
     Fitted lights are chosen beside another model only if they leave next to nothing of the background. The closed form leaves
@@ -152,7 +152,7 @@ def hopeless(background: Tensor, sensor: Sensor) -> str:
         >>> from torchvts.model.lights import PointLights, flat_image
         >>> lights = PointLights([[25, 0, 30], [-12, 20, 30], [-12, -20, 30]], [900, 900, 900])
         >>> image, sensor = flat_image(lights, 48, 64, 0.6).detach(), Sensor("rig", 48, 64, 0.6)
-        >>> hopeless(image, sensor), hopeless(1.0 - image, sensor)
+        >>> objection_to_lights(image, sensor), objection_to_lights(1.0 - image, sensor)
         ('', 'the background of R, G, B falls off as under no near point light')
     """
     objections = []
@@ -162,7 +162,7 @@ def hopeless(background: Tensor, sensor: Sensor) -> str:
         if bool(far.any()):
             named = ", ".join(name for name, one in zip("RGB", far.tolist(), strict=True) if one)
             objections.append(f"the background of {named} falls off as under no near point light")
-        elif float(left.max()) > HOPELESS:
+        elif float(left.max()) > CLOSED_FORM_MISFIT:
             objections.append(f"the closed-form lights leave a misfit of {float(left.max()):.0%} of the background")
         else:
             return ""

@@ -88,7 +88,7 @@ def compare_patterns(background: Tensor, sensor: Sensor) -> PatternMatch:
     log, x, y = cells_of_log(background, sensor)
     seen = _Seen(sensor.prior.response.gamma * log, x, y, sensor.prior)
     plain = seen.shifted(_Hypothesis())
-    if plain.pattern < FLAT:  # no turn can be told from another
+    if plain.pattern < FLAT:  # all turns look alike
         return PatternMatch(plain.least, plain.contrast, plain.difference < FLAT, "", plain.least)
     others = [
         _Hypothesis(turn, channels)

@@ -153,7 +153,7 @@ def objection_to_lights(background: Tensor, sensor: Sensor) -> str:
         >>> lights = PointLights([[25, 0, 30], [-12, 20, 30], [-12, -20, 30]], [900, 900, 900])
         >>> image, sensor = flat_image(lights, 48, 64, 0.6).detach(), Sensor("rig", 48, 64, 0.6)
         >>> objection_to_lights(image, sensor), objection_to_lights(1.0 - image, sensor)
-        ('', 'the background of R, G, B falls off as under no near point light')
+        ('', 'the background of G, B falls off as under no near point light')
     """
     objections = []
     for gamma in (sensor.exponent,) if sensor.gamma is not None else (1.0, OTHER_GAMMA):

@@ -143,7 +143,7 @@ def paraboloid_start(pixels: BackgroundPixels) -> Tensor:
 
 
 def bounded(parameter: Tensor, span: float) -> Tensor:
-    """Parameters (3, 4 + terms) with lights beyond ``FURTHEST`` times ``span`` (mm) moved there, as bright at the centre as before."""
+    """Parameters (3, 4 + terms) with lights beyond ``FURTHEST`` times ``span`` (mm) moved there, as bright at the centre."""
     position = torch.cat((parameter[:, :2], parameter[:, 2:3].exp()), dim=1)
     factor = (position.norm(dim=1) / (FURTHEST * span)).clamp_min(1.0)[:, None]
     moved = parameter.clone()
@@ -159,7 +159,8 @@ def bounded(parameter: Tensor, span: float) -> Tensor:
 def at_bound(parameter: Tensor, span: float) -> Tensor:
     """(3,) bool: lights that :func:`bounded` holds."""
     position = torch.cat((parameter[:, :2], parameter[:, 2:3].exp()), dim=1)
-    return position.norm(dim=1) > 0.99 * FURTHEST * span
+    held: Tensor = position.norm(dim=1) > 0.99 * FURTHEST * span
+    return held
 
 
 def misfit_of_paraboloid(pixels: BackgroundPixels) -> tuple[Tensor, Tensor]:

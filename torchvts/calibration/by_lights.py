@@ -9,7 +9,7 @@ from ..model.calibration import Calibration
 from ..model.lights import PointLights, flat_image
 from ..model.report import CandidateRow, Report
 from ..model.sensor import Sensor
-from .light_choice import choose_lights, hopeless
+from .light_choice import choose_lights, objection_to_lights
 
 GIVEN_MISFIT = 0.2
 """RMS of log(background / image of the sensor file's lights) from which they are not this unit's."""
@@ -43,7 +43,7 @@ def by_lights(background: Tensor, sensor: Sensor, other_models: bool, progress: 
     """
     if sensor.light_position_mm is not None:
         return _given(background, sensor, sensor.light_position_mm)
-    objection = hopeless(background, sensor) if other_models else ""
+    objection = objection_to_lights(background, sensor) if other_models else ""
     if objection:
         note = f"not fitted: {objection}"
         return LightsResult(None, [{"model": "point lights", "family": "three lights", "score_deg": None, "note": note}], "")

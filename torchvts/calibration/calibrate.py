@@ -19,7 +19,7 @@ from .by_presses import by_presses, error_of_lights_deg
 from .by_touches import TouchResult, by_touches
 from .complaints import CalibrationWarning
 from .contacts import press_row, touch_row, used
-from .light_choice import hopeless
+from .light_choice import objection_to_lights
 from .lights import POORLY_CONSTRAINED_DEG, check_exposure
 from .pattern import compare_patterns
 from .presses import Press, Touch, check_presses, check_touches
@@ -67,9 +67,9 @@ def calibrate(
         A :class:`Calibration`. Its ``report`` (:class:`torchvts.model.report.Report`) says which model was chosen and why, and
         what became of each press.
     Raises:
-        ValueError, TypeError: bad image: shape, dtype, range, black, saturated, greyscale; a sensor without coloured lights; presses
-            or touches of which none can be used, and whether they are cropped otherwise than the background; touches that do not
-            constrain a field, or have no scale; nothing but lights to calibrate from, and their fit failed.
+        ValueError, TypeError: bad image: shape, dtype, range, black, saturated, greyscale; a sensor without coloured lights;
+            presses or touches of which none can be used, and whether they are cropped otherwise than the background; touches that
+            do not constrain a field, or have no scale; nothing but lights to calibrate from, and their fit failed.
     Warns:
         CalibrationWarning: what was left out and why; the fit did not converge, the image does not constrain the lights, it
             seems to hold a contact, or it does not have the pattern of light of the prior's sensor type. Presses then decide
@@ -89,7 +89,7 @@ def calibrate(
     given = _Given(background, sensor, check_presses(presses, sensor), check_touches(touches, sensor), progress)
     check_colour(background)
     check_coloured_contacts(background, given.presses or given.touches)
-    if not (presses or touches) and sensor.light_position_mm is None and hopeless(background, sensor):
+    if not (presses or touches or sensor.prior or sensor.light_position_mm) and objection_to_lights(background, sensor):
         check_coloured_background(background)
     lights = by_lights(background, sensor, bool(presses or touches or sensor.prior), progress)
     prior, messages = _prior(given)
@@ -195,7 +195,8 @@ def _without_presses(
         }
         return Calibration.from_response(touched.model, given.sensor, given.background, report), []
     constrained = lights.unit is not None and _constrained(row)
-    if not constrained and given.sensor.light_position_mm is None:
+    foreign = prior.model is None or prior.objection != ""
+    if foreign and not constrained and not given.touches and given.sensor.light_position_mm is None:
         check_coloured_background(given.background)
     if prior.model is not None and not constrained:
         family = "response of the sensor type"
@@ -205,8 +206,8 @@ def _without_presses(
         return Calibration.from_response(prior.model, given.sensor, given.background, report), []
     if lights.unit is None:
         raise ValueError(
-            f"{lights.complaint or row['note']}; nothing else is there to calibrate from: give presses of balls, or a sensor with a "
-            "prior"
+            f"{lights.complaint or row['note']}; nothing else is there to calibrate from: give presses of balls, or a sensor with "
+            "a prior"
         )
     fitted = constrained and row["score_deg"] != 0.0
     reason = f"the image constrains the lights to {row['score_deg']:.2f} deg" if fitted else row["note"]

@@ -83,7 +83,7 @@ def of_pattern(match: PatternMatch, sensor: Sensor) -> str:
         alike = f"correlation {match.named_likeness:.2f}, as it is {match.likeness:.2f}"
         return f"{seen}, but looks like that pattern {match.named} ({alike}): turn, swap or crop the images as the sensor's are"
     if match.likeness >= ALIKE:
-        return f"{seen}: it has {match.contrast:.2f} times its contrast, at least {FAINTEST} is usual: another sensor type, or pale light"
+        return f"{seen}: it has {match.contrast:.2f} times its contrast, at least {FAINTEST} is usual: another sensor type"
     return (
         f"{seen}: a correlation of {match.likeness:.2f}, at least {ALIKE} is usual, and no turned, mirrored or channel-swapped one "
         "fits: another sensor type, or an LED failed"

@@ -26,7 +26,7 @@ ambient light reduces the structure of a camera's gamma of 2.2 to 3 %, with ligh
 LARGE_MISFIT = 0.2
 """Relative structure left unexplained from which lights are no candidate beside another model."""
 
-HOPELESS = 0.1
+CLOSED_FORM_MISFIT = 0.1
 """Misfit of the closed-form lights from which no fit is tried beside another model. It is 0.125 to 0.20 on five real sensors; on
 drawn rigs at most 0.07, with an ambient light as bright as the lights (0.3), and 0.05 with half of the corners' light lost."""
 
@@ -83,6 +83,11 @@ class _Candidate:
     def misfit(self) -> float:
         return float(self.fit.misfit.max())
 
+    def can_win(self, stride: int) -> bool:
+        """Whether lights fitted to every ``stride``-th row and column may be good ones on all: noise is that much less there."""
+        loosest = float(self.fit.direction_std_deg.max())
+        return self.misfit <= LARGE_MISFIT and loosest <= POORLY_CONSTRAINED_DEG * stride
+
     @property
     def held_out(self) -> float:
         return float(self.fit.held_out.mean())
@@ -98,7 +103,8 @@ def choose_lights(background: Tensor, sensor: Sensor, other_models: bool = False
     Args:
         background: (3, H, W) in [0, 1].
         sensor: its gamma is chosen where it is left open.
-        other_models: models other than lights exist: lights with a large misfit on 30 rows are then not refined.
+        other_models: models other than lights exist: lights that 30 rows show to have a large misfit, or to be constrained so
+            poorly that less noise does not help, are then not refined.
         progress: show a bar.
     Raises:
         ValueError: as :func:`fit_lights`.
@@ -108,7 +114,9 @@ def choose_lights(background: Tensor, sensor: Sensor, other_models: bool = False
     linear = dataclasses.replace(sensor, gamma=sensor.exponent, prior=None)
     sparse, small = _sparse(background, linear, 30 if other_models else 60)
     tried = _try(sparse, small, [], progress)
-    if other_models and min(candidate.misfit for candidate in tried) <= LARGE_MISFIT:  # refine
+    stride = round(small.mm_per_pixel / sensor.mm_per_pixel)
+    refine = not other_models or any(candidate.can_win(stride) for candidate in tried)
+    if other_models and refine:
         sparse, small = _sparse(background, linear, 60)
         tried = _try(sparse, small, [], progress)
     if sensor.gamma is None and tried[0].misfit > 0.005:
@@ -117,7 +125,7 @@ def choose_lights(background: Tensor, sensor: Sensor, other_models: bool = False
         candidate.objection = _objection(candidate, tried, sensor)
     chosen = _choose(tried)
     fit, linear = chosen.fit, dataclasses.replace(linear, gamma=chosen.gamma)
-    if not fit.failed and not (other_models and chosen.misfit > LARGE_MISFIT):
+    if not fit.failed and refine and not (other_models and chosen.misfit > LARGE_MISFIT):
         fit = _fit(background, linear, chosen.vignetting, chosen.ambient, chosen.known_azimuth, progress)
     final = dataclasses.replace(chosen, fit=fit)
     row = _row(final)
@@ -131,7 +139,7 @@ def choose_lights(background: Tensor, sensor: Sensor, other_models: bool = False
     return LightChoice(linear, fit, rows, _reason(chosen, tried), complaint)
 
 
-def hopeless(background: Tensor, sensor: Sensor) -> str:
+def objection_to_lights(background: Tensor, sensor: Sensor) -> str:
     """Why point lights cannot explain a background, by their closed form on a sparse image and without any fit, or "".
 
     Fitted lights are chosen beside another model only if they leave next to nothing of the background. The closed form leaves
@@ -144,8 +152,8 @@ def hopeless(background: Tensor, sensor: Sensor) -> str:
         >>> from torchvts.model.lights import PointLights, flat_image
         >>> lights = PointLights([[25, 0, 30], [-12, 20, 30], [-12, -20, 30]], [900, 900, 900])
         >>> image, sensor = flat_image(lights, 48, 64, 0.6).detach(), Sensor("rig", 48, 64, 0.6)
-        >>> hopeless(image, sensor), hopeless(1.0 - image, sensor)
-        ('', 'the background of R, G, B falls off as under no near point light')
+        >>> objection_to_lights(image, sensor), objection_to_lights(1.0 - image, sensor)
+        ('', 'the background of G, B falls off as under no near point light')
     """
     objections = []
     for gamma in (sensor.exponent,) if sensor.gamma is not None else (1.0, OTHER_GAMMA):
@@ -154,7 +162,7 @@ def hopeless(background: Tensor, sensor: Sensor) -> str:
         if bool(far.any()):
             named = ", ".join(name for name, one in zip("RGB", far.tolist(), strict=True) if one)
             objections.append(f"the background of {named} falls off as under no near point light")
-        elif float(left.max()) > HOPELESS:
+        elif float(left.max()) > CLOSED_FORM_MISFIT:
             objections.append(f"the closed-form lights leave a misfit of {float(left.max()):.0%} of the background")
         else:
             return ""

@@ -41,6 +41,9 @@ GLOSS_MISFIT = 0.01
 NOT_GLOSS = 0.1
 """A matt skin that leaves more relative structure than this is not tried as a glossy one: no gloss of this lobe width helps."""
 
+HELD_STEPS = 10
+"""Steps with a light at the bound after which it will not come back."""
+
 LEAST_USABLE = 0.02
 """Share of each channel's pixels that a fit needs."""
 
@@ -271,14 +274,15 @@ def _solve(pixels: BackgroundPixels, start: Tensor, loop: _Loop) -> _Solution:
     tied = loop.azimuth is not None or VIGNETTING in pixels.terms
     optimiser = LevenbergMarquardt(parameter, tie=tie if tied else None)
     history: list[float] = []
-    still, moved, span = 0, math.inf, pixels.span_mm()
+    still, held, moved, span = 0, 0, math.inf, pixels.span_mm()
     most = loop.max_steps if float(pixels.usable.double().mean(dim=1).min()) >= LEAST_USABLE else 0
     with tqdm(total=loop.max_steps, desc=f"lights, {len(pixels.x)} pixels", disable=not loop.progress, leave=False) as bar:
-        while len(history) < most and still < 3:
+        while len(history) < most and still < 3 and held < HELD_STEPS:
             weight, scale = _robust_weight(pixels.residual(parameter.detach()), pixels.usable)
             before = parameter.detach().clone()
             optimiser.step(pixels.residual, weight / scale.square() if tied else weight)
-            if bool(at_bound(parameter.detach(), span).any()):
+            held = held + 1 if bool(at_bound(parameter.detach(), span).any()) else 0
+            if held:
                 with torch.no_grad():
                     parameter.copy_(bounded(parameter, span))
                 optimiser.last_step = parameter.detach() - before

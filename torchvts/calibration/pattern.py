@@ -20,6 +20,9 @@ most 0.57 for five other sensors and 0.25 for Minis turned by 180 degrees."""
 FAINTEST = 0.4
 """Least contrast of the pattern relative to the prior's."""
 
+FLAT = 0.1
+"""RMS of a pattern, logarithm of light, below which it is none: light that comes from far away."""
+
 BETTER = 0.8
 """A changed pattern is named if it leaves less than this part of what the prior's pattern as it is leaves unexplained. A GelSight
 Mini looks almost the same mirrored left to right: the mirrored pattern leaves 1.7 to 4.8 times as much on three units, 1.1 to 4.6
@@ -85,6 +88,8 @@ def compare_patterns(background: Tensor, sensor: Sensor) -> PatternMatch:
     log, x, y = cells_of_log(background, sensor)
     seen = _Seen(sensor.prior.response.gamma * log, x, y, sensor.prior)
     plain = seen.shifted(_Hypothesis())
+    if plain.pattern < FLAT:  # all turns look alike
+        return PatternMatch(plain.least, plain.contrast, plain.difference < FLAT, "", plain.least)
     others = [
         _Hypothesis(turn, channels)
         for turn, channels in product(range(8), permutations(range(3)))
@@ -110,11 +115,16 @@ def cells_of_log(background: Tensor, sensor: Sensor) -> tuple[Tensor, Tensor, Te
 
 
 class _Likeness(NamedTuple):
-    """Correlation of the channels' shapes and of their differences, of both together, and the relative contrast."""
+    """Correlation of the channels' shapes and of their differences, of both together, and the relative contrast.
+
+    ``pattern`` and ``difference`` are the RMS of the prior's pattern and of its difference from the background's.
+    """
 
     least: float
     whole: float
     contrast: float
+    pattern: float
+    difference: float
 
     def better_than(self, other: "_Likeness") -> bool:
         return self.whole > 0.0 and 1.0 - self.whole**2 < BETTER * (1.0 - max(other.whole, 0.0) ** 2)
@@ -170,7 +180,9 @@ def _compare(one: Tensor, other: Tensor) -> _Likeness:
     colours = [torch.stack((values[0] - values[1], values[2] - values[1])) for values in (one, other)]
     whole = [torch.cat((values, colour)) for values, colour in zip((one, other), colours, strict=True)]
     least = min(_correlation(one, other), _correlation(*colours))
-    return _Likeness(least, _correlation(*whole), float(whole[0].norm() / whole[1].norm().clamp_min(1e-12)))
+    contrast = float(whole[0].norm() / whole[1].norm().clamp_min(1e-12))
+    pattern, difference = (float(values.square().mean().sqrt()) for values in (whole[1], whole[0] - whole[1]))
+    return _Likeness(least, _correlation(*whole), contrast, pattern, difference)
 
 
 def _correlation(one: Tensor, other: Tensor) -> float:

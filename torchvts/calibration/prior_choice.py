@@ -18,7 +18,7 @@ LEAST_USED = 0.5
 """Share of the presses that a prior must be able to use."""
 
 SAME_FACTOR = 1.15
-"""Presses whose slopes by the prior differ from the balls' by the same factor, to within this one, have a wrong diameter or pitch."""
+"""Presses whose slopes by the prior are those of the balls times one factor, to within this one, have a wrong diameter or pitch."""
 
 
 class FromPresses(NamedTuple):

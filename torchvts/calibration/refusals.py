@@ -63,9 +63,9 @@ def check_coloured_contacts(background: Tensor, given: Sequence[Press | Touch]) 
     shares = [share for share in (colour_share(item.image, background) for item in given) if share is not None]
     if shares and statistics.median(shares) < ACHROMATIC:
         raise ValueError(
-            f"{'presses' if isinstance(given[0], Press) else 'touches'}: expected contacts that change the colour of the skin, got R, "
-            f"G and B that change alike (the change of colour is {statistics.median(shares):.2f} of the change of light, 1 and more "
-            "under coloured lights): this sensor has no coloured lights: photometric depth is not possible"
+            f"{'presses' if isinstance(given[0], Press) else 'touches'}: expected contacts that change the colour of the skin, got "
+            f"R, G and B that change alike (the change of colour is {statistics.median(shares):.2f} of the change of light, 1 and "
+            "more under coloured lights): this sensor has no coloured lights: photometric depth is not possible"
         )
 
 
@@ -79,8 +79,8 @@ def check_coloured_background(background: Tensor) -> None:
     if variation < UNIFORM_COLOUR:
         raise ValueError(
             f"background: expected light whose colour varies over the image, got a variation of {variation:.1%}, at least "
-            f"{UNIFORM_COLOUR:.0%} is usual: this sensor has no coloured lights: photometric depth is not possible; if it has them, give "
-            "presses, which show it"
+            f"{UNIFORM_COLOUR:.0%} is usual: this sensor has no coloured lights: photometric depth is not possible; if it has "
+            "them, give presses, which show it"
         )
 
 
@@ -135,7 +135,6 @@ def other_crop(background: Tensor, frames: Sequence[Tensor]) -> Crop | None:
     stride = max(1, len(frames) // 15)
     seen = torch.stack([_cells(frame, 60) for frame in frames[::stride]]).median(dim=0).values[None].float()
     own = _cells(background, 60)[None].float()
-    unit = min(background.shape[1:]) / 60.0
     best, least = (1.0, 0.0, 0.0), math.inf
     plain = _difference(seen, own, torch.tensor([[1.0, 0.0, 0.0]]))[0]
     for reach in (1.0, 0.25, 0.08):
@@ -149,8 +148,8 @@ def other_crop(background: Tensor, frames: Sequence[Tensor]) -> Crop | None:
     moved = max(abs(math.log(best[0])), abs(best[1]), abs(best[2]))
     if least > CHANGED_FRAME * float(plain) or moved < 0.02:
         return None
-    height, width = own.shape[2:]
-    return Crop(best[0], (0.5 * width * unit * best[1], 0.5 * height * unit * best[2]))
+    height, width = background.shape[1:]
+    return Crop(best[0], (0.5 * width * best[1], 0.5 * height * best[2]))
 
 
 def _difference(seen: Tensor, own: Tensor, tried: Tensor) -> Tensor:

@@ -25,9 +25,6 @@ FORMAT_VERSION = 6
 DEFECT_RATIO = 4.0
 """A pixel whose background is this factor darker or brighter than expected is a defect: it is inpainted."""
 
-MODEL_AT_FAULT = 0.1
-"""Share of the image from which defects by the lights' model are the model's fault: those by the median around them are taken."""
-
 DEFECT_WINDOW_PX = 7
 """Width of the square of which that median is taken."""
 
@@ -265,14 +262,14 @@ class Calibration:
     def defects(self) -> Tensor:
         """(H, W) bool: pixels whose background is far from the lights' model, or for a response field from the median around them.
 
-        That median is taken for lights, too, where their model is far from more than a tenth of the image.
+        Where a hundredth of the image or more is far from the lights' model, the model may be a poor one. Then defects must be
+        far from the median of a quarter of the image around them, too.
         """
         if not self.measured:
             return torch.zeros(self.sensor.height, self.sensor.width, dtype=torch.bool)
         if self.lights is not None:
             found = self._far(self.model_image)
-            if float(found.double().mean()) <= MODEL_AT_FAULT:
-                return found
+            return found if float(found.double().mean()) < 0.01 else found & self._far(self._median_of_quarter())
         return self._far(self._median_around())
 
     def _far(self, expected: Tensor) -> Tensor:
@@ -282,6 +279,16 @@ class Calibration:
         far = (light * DEFECT_RATIO < expected) | (light > expected * DEFECT_RATIO)
         found: Tensor = (far & (torch.maximum(expected, light) > floor)).any(dim=0)
         return found
+
+    def _median_of_quarter(self) -> Tensor:
+        """(3, H, W): median of the background in a quarter of the image around each pixel, on a grid of about 20 cells a side."""
+        light = self.background_without_ambient[None]
+        cell = max(1, min(self.sensor.height, self.sensor.width) // 20)
+        cells = torch.nn.functional.pad(light[:, :, cell // 2 :: cell, cell // 2 :: cell], [5] * 4, mode="replicate")
+        size = (cells.shape[2] - 10, cells.shape[3] - 10)
+        median = torch.nn.functional.unfold(cells.transpose(0, 1), 11).median(dim=1).values.reshape(1, 3, *size)
+        wide: Tensor = torch.nn.functional.interpolate(median, light.shape[2:], mode="nearest")[0]
+        return wide
 
     def _median_around(self) -> Tensor:
         """(3, H, W): the background where the extremes around a pixel show that it is no defect; else the median around it."""

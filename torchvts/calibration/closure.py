@@ -1,8 +1,8 @@
-"""Move located balls so that the skin around them closes: skin that is undeformed all around a contact has no net slope over a disc.
+"""Move located balls so that the skin around them closes: undeformed skin all around a contact means no net slope over a disc.
 
-Balls that are located jointly with a response field drift together where pressed skin is darker or brighter for its depth alone: the
-field takes the part of it that is alike in all presses for a slope, and the centers follow. Held-out angles inside the contacts do
-not show that; they are even better with the drift. A tilt does, because it leaves the skin around the contact on different heights.
+Balls that are located jointly with a response field drift where pressed skin is darker or brighter for its depth alone: the field
+takes that for a slope, and the centers follow. Held-out angles inside the contacts do not show it; they are even better with the
+drift. The tilt does, because it leaves the skin around the contact on different heights.
 """
 
 import dataclasses
@@ -39,8 +39,8 @@ PENALTY = 0.01
 def close_loops(contacts: list[Contact], half_mm: float) -> None:
     """Move the centers by what loop closure predicts, as long as slopes in and around the contacts agree better; in place.
 
-    Tried are one common shift, and then a shift of each ball. The score is the held-out angle inside the contact and the angle of the
-    net slope over the disc, both as root mean squares over the presses, added in squares. The contact radii stay.
+    Tried are one common shift, and then a shift of each ball. The score is the held-out angle inside the contact and the angle of
+    the net slope over the disc, both as root mean squares over the presses, added in squares. The contact radii stay.
 
     Args:
         contacts: of presses with located balls.

@@ -25,7 +25,7 @@ to their median 0.82 to 1.17. Fields of seven presses or fewer are rough: in two
 
 FAR_IN_SPREADS = 3.0
 SPREAD_FROM = 8
-"""The gain of a wrong diameter also differs from 1 by so many spreads of the other presses' gains, from this number of presses on."""
+"""A gain by the others is also wrong only by so many spreads of their own gains, from this number of presses on."""
 
 
 def locate_and_screen(
@@ -62,16 +62,12 @@ def _leave_out(contacts: list[Contact], light: Tensor, pitch_mm: float, prior: R
         else:
             # small fields, helped by what the background's brightness says of the place
             family = Family(2 if len(left) >= 8 else 0, -1, False, half_mm)
-            normalised = brightness_normalised(left, light, half_mm, pitch_mm)[1]
-            evidence = Evidence.of(family, normalised)
+            evidence = Evidence.of(family, brightness_normalised(left, light, half_mm, pitch_mm)[1])
             solutions = evidence.held_out(SCREENING_PENALTY * family.penalty(), None)
         gains, errors = evidence.gains(solutions), evidence.errors_deg(solutions)
         for contact, gain, error in zip(left, gains.tolist(), errors):
             contact.metrics |= {"error_deg": error, "gain": gain}
-        if prior is None:
-            wrong = _wrong_by_others(evidence, gains, _uncertainty(normalised, half_mm))
-        else:
-            wrong = _wrong_by_prior(gains)
+        wrong = _wrong_by_prior(gains) if prior is not None else _wrong_by_others(evidence, gains, left, half_mm)
         if wrong is not None:
             _reject_diameter(left, wrong, float(gains[wrong]), prior is not None)
         elif not _reject_slopes(left, errors, prior is not None):
@@ -132,7 +128,7 @@ def _uncertainty(contacts: list[Contact], half_mm: float) -> Tensor:
     return (spread / spread.median().clamp_min(1e-12)).clamp_min(1.0)
 
 
-def _wrong_by_others(evidence: Evidence, gains: Tensor, uncertainty: Tensor) -> int | None:
+def _wrong_by_others(evidence: Evidence, gains: Tensor, contacts: list[Contact], half_mm: float) -> int | None:
     """The press with a wrong diameter, if any; each gain is by the field of the other presses.
 
     A wrong press bends the field for all, so the wrong one is that without which the others agree best. It must differ from them
@@ -151,5 +147,5 @@ def _wrong_by_others(evidence: Evidence, gains: Tensor, uncertainty: Tensor) -> 
         others.append(rest.gains(rest.held_out(penalty, None)).clamp_min(1e-3).log())
     wrong = min(range(len(logs)), key=lambda place: float(others[place].square().mean()))
     spread = float(others[wrong].abs().median()) / 0.6745 if len(logs) >= SPREAD_FROM else 0.0
-    limit = max(math.log(FAR_FROM_OTHERS), FAR_IN_SPREADS * spread) * float(uncertainty[wrong])
+    limit = max(math.log(FAR_FROM_OTHERS), FAR_IN_SPREADS * spread) * float(_uncertainty(contacts, half_mm)[wrong])
     return wrong if float(logs[wrong].abs()) > limit else None

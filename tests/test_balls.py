@@ -58,7 +58,9 @@ def test_the_far_field_is_fitted_beside_the_contact():
     assert float(found.above[:, 100:].max()) < 5.0 < float(found.above[35:65, 45:85].min()) and not found.is_other_light()
 
 
-@pytest.mark.parametrize("level, cause", [(1 / 16, "16 times darker than the background: .*12 bits in a file of 16"), (0.0, "black")])
+@pytest.mark.parametrize(
+    "level, cause", [(1 / 16, "16 times darker than the background: .*12 bits in a file of 16"), (0.0, "black")]
+)
 def test_a_dark_press_is_named(level, cause):
     (contact,) = read(vts.Press(level * seen_by_curve(ball(), 3), BALL_MM))
     assert re.search(cause, contact.reason), contact.reason

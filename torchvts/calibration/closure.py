@@ -32,6 +32,9 @@ ENOUGH = 3
 MOST_SATURATED = 0.05
 """Saturated part of the disc from which its net slope says nothing."""
 
+MOST_CUT = 0.5
+"""Share of the presses that may be without a net slope: cut by the image border, or saturated."""
+
 PENALTY = 0.01
 """Regularisation of the fields, in presses."""
 
@@ -51,10 +54,10 @@ def close_loops(contacts: list[Contact], half_mm: float) -> None:
     degrees = ((1, -1), (2, -1), (2, 1)) if len(contacts) >= 5 else ((0, -1), (1, -1))
     before = [_Rating(Family(degree, products, False, half_mm), contacts) for degree, products in degrees]
     found = min(before, key=lambda rating: rating.inside_deg)
+    if float(found.errors_mm.isnan().any(1).double().mean()) > MOST_CUT:
+        return
     for common in (True, False):
         for _ in range(ROUNDS):
-            if bool(found.errors_mm.isnan().all()):
-                return
             moved = _Rating(found.family, _moved(found.contacts, found.errors_mm, common))
             if moved.score() >= found.score():
                 break

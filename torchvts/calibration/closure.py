@@ -1,8 +1,8 @@
-"""Move located balls so that the skin around them closes: skin that is undeformed all around a contact has no net slope over a disc.
+"""Move located balls so that the skin around them closes: undeformed skin all around a contact means no net slope over a disc.
 
-Balls that are located jointly with a response field drift together where pressed skin is darker or brighter for its depth alone: the
-field takes the part of it that is alike in all presses for a slope, and the centers follow. Held-out angles inside the contacts do
-not show that; they are even better with the drift. A tilt does, because it leaves the skin around the contact on different heights.
+Balls that are located jointly with a response field drift where pressed skin is darker or brighter for its depth alone: the field
+takes that for a slope, and the centers follow. Held-out angles inside the contacts do not show it; they are even better with the
+drift. The tilt does, because it leaves the skin around the contact on different heights.
 """
 
 import dataclasses
@@ -32,6 +32,9 @@ ENOUGH = 3
 MOST_SATURATED = 0.05
 """Saturated part of the disc from which its net slope says nothing."""
 
+MOST_CUT = 0.5
+"""Share of the presses that may be without a net slope: cut by the image border, or saturated."""
+
 PENALTY = 0.01
 """Regularisation of the fields, in presses."""
 
@@ -39,8 +42,8 @@ PENALTY = 0.01
 def close_loops(contacts: list[Contact], half_mm: float) -> None:
     """Move the centers by what loop closure predicts, as long as slopes in and around the contacts agree better; in place.
 
-    Tried are one common shift, and then a shift of each ball. The score is the held-out angle inside the contact and the angle of the
-    net slope over the disc, both as root mean squares over the presses, added in squares. The contact radii stay.
+    Tried are one common shift, and then a shift of each ball. The score is the held-out angle inside the contact and the angle of
+    the net slope over the disc, both as root mean squares over the presses, added in squares. The contact radii stay.
 
     Args:
         contacts: of presses with located balls.
@@ -51,10 +54,10 @@ def close_loops(contacts: list[Contact], half_mm: float) -> None:
     degrees = ((1, -1), (2, -1), (2, 1)) if len(contacts) >= 5 else ((0, -1), (1, -1))
     before = [_Rating(Family(degree, products, half_mm), contacts) for degree, products in degrees]
     found = min(before, key=lambda rating: rating.inside_deg)
+    if float(found.errors_mm.isnan().any(1).double().mean()) > MOST_CUT:
+        return
     for common in (True, False):
         for _ in range(ROUNDS):
-            if bool(found.errors_mm.isnan().all()):
-                return
             moved = _Rating(found.family, _moved(found.contacts, found.errors_mm, common))
             if moved.score() >= found.score():
                 break

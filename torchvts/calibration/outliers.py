@@ -23,6 +23,11 @@ their field; by a single other press elsewhere. Correct ones on a GelSight Mini:
 to their median 0.82 to 1.17. Fields of seven presses or fewer are rough: in two draws of five they leave out a good one."""
 
 
+FAR_IN_SPREADS = 3.0
+SPREAD_FROM = 8
+"""A gain by the others is also wrong only by so many spreads of their own gains, from this number of presses on."""
+
+
 def locate_and_screen(
     contacts: list[Contact], light: Tensor, sensor: Sensor, prior: ResponseModel | None, half_mm: float
 ) -> list[Contact]:
@@ -62,10 +67,10 @@ def _leave_out(contacts: list[Contact], light: Tensor, pitch_mm: float, prior: R
         gains, errors = evidence.gains(solutions), evidence.errors_deg(solutions)
         for contact, gain, error in zip(left, gains.tolist(), errors):
             contact.metrics |= {"error_deg": error, "gain": gain}
-        wrong = _wrong_by_others(evidence, gains) if prior is None else _wrong_by_prior(gains)
+        wrong = _wrong_by_prior(gains) if prior is not None else _wrong_by_others(evidence, gains, left, half_mm)
         if wrong is not None:
             _reject_diameter(left, wrong, float(gains[wrong]), prior is not None)
-        elif not _reject_slopes(left, errors):
+        elif not _reject_slopes(left, errors, prior is not None):
             return
 
 
@@ -78,12 +83,14 @@ def _reject_diameter(left: list[Contact], wrong: int, gain: float, by_prior: boo
         left[1 - wrong].reason = "contradicts the only other press: one of the two diameters is wrong"
 
 
-def _reject_slopes(left: list[Contact], errors_deg: list[float]) -> bool:
+def _reject_slopes(left: list[Contact], errors_deg: list[float], by_prior: bool) -> bool:
     """Reject the worst press if its slopes are far from those of a ball."""
     errors = torch.tensor(errors_deg, dtype=torch.float64)
     worst, usual = int(errors.argmax()), float(errors.median())
     error = float(errors[worst])
-    if not (error > max(3.0 * usual, 8.0) or error > 15.0):
+    # fields too small for a sensor are far off on all presses alike
+    far = 15.0 if by_prior or len(left) < 3 else max(15.0, 2.0 * usual)
+    if not (error > max(3.0 * usual, 8.0) or error > far):
         return False
     left[worst].reason = f"its slopes are {error:.1f} degrees from a ball's, others' {usual:.1f}: not a clean press"
     return True
@@ -100,10 +107,33 @@ def _wrong_by_prior(gains: Tensor) -> int | None:
     return None
 
 
-def _wrong_by_others(evidence: Evidence, gains: Tensor) -> int | None:
+def _uncertainty(contacts: list[Contact], half_mm: float) -> Tensor:
+    """(N,): how uncertain the slopes of each press are by a field of the others, relative to the usual press; at least 1.
+
+    The standard deviation of the slopes along the ball's, by the normal equations of the others. It is large where no other press
+    lies near, and where little light changes.
+    """
+    family = Family(2 if len(contacts) >= 8 else 1, -1, False, half_mm)
+    evidence = Evidence.of(family, contacts)
+    penalty = torch.diag(SCREENING_PENALTY * family.penalty())
+    spreads = []
+    for item, (form, _) in zip(evidence.forms, evidence.each):
+        inside = item.contact.inside()
+        ball = item.contact.ball_slope()[:, inside]
+        along = (
+            (item.terms[:, inside] @ ball.t()).t().reshape(-1) / ball.square().sum().sqrt().clamp_min(1e-12) / len(ball[0]) ** 0.5
+        )
+        spreads.append(along @ torch.linalg.solve(evidence.form - form + penalty, along))
+    spread = torch.stack(spreads).sqrt()
+    return (spread / spread.median().clamp_min(1e-12)).clamp_min(1.0)
+
+
+def _wrong_by_others(evidence: Evidence, gains: Tensor, contacts: list[Contact], half_mm: float) -> int | None:
     """The press with a wrong diameter, if any; each gain is by the field of the other presses.
 
-    A wrong press bends the field for all, so the wrong one is that without which the others agree best.
+    A wrong press bends the field for all, so the wrong one is that without which the others agree best. It must differ from them
+    by more than they differ from each other, and by more where the field is uncertain: where an LED hardly reaches, gains of good
+    presses vary.
     """
     logs = gains.clamp_min(1e-3).log()
     if float(logs.abs().max()) <= math.log(FAR_FROM_OTHERS if len(logs) > 2 else FAR_FROM_ONE):
@@ -111,9 +141,11 @@ def _wrong_by_others(evidence: Evidence, gains: Tensor) -> int | None:
     if len(logs) == 2:
         return int(logs.abs().argmax())
     penalty = SCREENING_PENALTY * evidence.family.penalty()
-
-    def disagreement(place: int) -> float:
-        others = evidence.without(place)
-        return float(others.gains(others.held_out(penalty, None)).clamp_min(1e-3).log().square().mean())
-
-    return min(range(len(logs)), key=disagreement)
+    others = []
+    for place in range(len(logs)):
+        rest = evidence.without(place)
+        others.append(rest.gains(rest.held_out(penalty, None)).clamp_min(1e-3).log())
+    wrong = min(range(len(logs)), key=lambda place: float(others[place].square().mean()))
+    spread = float(others[wrong].abs().median()) / 0.6745 if len(logs) >= SPREAD_FROM else 0.0
+    limit = max(math.log(FAR_FROM_OTHERS), FAR_IN_SPREADS * spread) * float(_uncertainty(contacts, half_mm)[wrong])
+    return wrong if float(logs[wrong].abs()) > limit else None

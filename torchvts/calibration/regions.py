@@ -25,9 +25,8 @@ SAME_BALL = 1.5
 """Blobs whose centroids lie within so many radii of the ball are lobes of one: two equal balls cannot come nearer than two."""
 
 OTHER_LIGHT = 0.1
-OTHER_LIGHT_SHARE = 0.25
-"""Undeformed skin changes by at most 6 % under presses of four real sensors, brightness aside; other exposure, lights or units
-change it by 13 to 30 %. A frame with more than this, and more than this share of its largest change, is not of the unit."""
+"""Undeformed skin changes by at most 6 % under presses of five real sensors, brightness aside. Other exposure, lights or units
+change it by 13 to 30 %."""
 
 
 class FarField(NamedTuple):
@@ -36,16 +35,14 @@ class FarField(NamedTuple):
     Attributes:
         rms: length of its smooth part over the three channels, root mean square over the image.
         above: (H, W), change that is left, in spreads of the undeformed skin.
-        peak: largest change of the frame.
     """
 
     rms: float
     above: Tensor
-    peak: float
 
     def is_other_light(self) -> bool:
         """Whether the light of the whole frame differs from the background's more than a contact explains."""
-        return self.rms > max(OTHER_LIGHT, OTHER_LIGHT_SHARE * self.peak)
+        return self.rms > OTHER_LIGHT
 
 
 def far_field(change: Tensor) -> FarField:
@@ -75,7 +72,7 @@ def far_field(change: Tensor) -> FarField:
             break
     field = torch.einsum("khw,kc->chw", basis, coefficient)
     above = ((smooth - field) / spread[:, None, None]).norm(dim=0)
-    return FarField(float(field.square().sum(0).mean().sqrt()), above, float(smooth.norm(dim=0).max()))
+    return FarField(float(field.square().sum(0).mean().sqrt()), above)
 
 
 def contact_region(far: FarField, mask: Tensor, ball_radius_px: float) -> Tensor:

@@ -1,0 +1,120 @@
+"""Where balls are in presses of sensors whose light changes far from the contact, and where loop closure moves them."""
+
+import dataclasses
+import math
+import re
+
+import pytest
+import torch
+from test_presses import BALL_MM, CENTERS_MM, GIVEN, HEIGHT, PITCH, WIDTH, background, ball, seen_by_curve, take_presses
+
+import torchvts as vts
+from torchvts.calibration import closure
+from torchvts.calibration.by_presses import by_presses, with_preprocessing
+from torchvts.calibration.contacts import read_contacts
+from torchvts.calibration.regions import contact_region, far_field, one_ball, strong_blobs
+
+PREPARED = with_preprocessing(GIVEN, None)
+
+
+def far(level):
+    """A smooth change of light over the whole image, another one in each channel."""
+    y, x = torch.meshgrid(torch.linspace(-1, 1, HEIGHT), torch.linspace(-1, 1, WIDTH), indexing="ij")
+    return 1.0 + level * torch.stack((x, y - 0.3 * x * y, 0.5 * x * x - y))
+
+
+def changed(press, level):
+    return dataclasses.replace(press, image=(press.image * far(level)).clamp(0, 1))
+
+
+def read(*presses):
+    return read_contacts(presses, background(), PREPARED)
+
+
+@pytest.mark.parametrize("level", [0.0, 0.03, 0.07])
+def test_a_far_field_is_not_contact(level):
+    """The region holds the contact and stays near it, though the mask is most of the image."""
+    center = (5, 3)
+    (contact,) = read(changed(vts.Press(seen_by_curve(ball(center, 0.5), 3), BALL_MM), level))
+    y, x = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
+    r = torch.hypot((x - (WIDTH - 1) / 2) * PITCH - center[0], (y - (HEIGHT - 1) / 2) * PITCH - center[1])
+    bare = math.sqrt(BALL_MM * 0.5 - 0.25)
+    assert contact.reason == ""
+    assert bool(contact.mask[r < 0.85 * bare].all()) and not bool(contact.mask[r > 2.0 * bare].any())
+
+
+def test_presses_with_a_far_field_are_all_used_and_located():
+    presses = [changed(press, 0.02 * (-1) ** k) for k, press in enumerate(take_presses(count=9))]
+    result = by_presses(background(), GIVEN, presses, None, False)
+    off = [math.dist(c.center_mm.tolist(), at) / PITCH for c, at in zip(result.contacts, CENTERS_MM)]
+    assert [c.reason for c in result.contacts] == [""] * 9 and max(off) < 2.0, off
+
+
+def test_the_far_field_is_fitted_beside_the_contact():
+    change = far(0.05).double() - 1.0
+    change[:, 30:70, 40:90] += 0.5
+    found = far_field(change)
+    assert found.rms == pytest.approx(float((far(0.05) - 1.0).square().sum(0).mean().sqrt()), rel=0.05)
+    assert float(found.above[:, 100:].max()) < 5.0 < float(found.above[35:65, 45:85].min()) and not found.is_other_light()
+
+
+@pytest.mark.parametrize(
+    "level, cause", [(1 / 16, "16 times darker than the background: .*12 bits in a file of 16"), (0.0, "black")]
+)
+def test_a_dark_press_is_named(level, cause):
+    (contact,) = read(vts.Press(level * seen_by_curve(ball(), 3), BALL_MM))
+    assert re.search(cause, contact.reason), contact.reason
+
+
+def test_lobes_of_one_ball_are_one_contact_and_two_balls_are_two():
+    strength = torch.zeros(100, 100, dtype=torch.float64)
+    strength[30:40, 30:50] = strength[60:70, 30:50] = 20.0
+    blobs = strong_blobs(strength > 5, strength)
+    assert len(blobs) == 2 and one_ball(blobs, 30.0) and not one_ball(blobs, 8.0)
+    seen = far_field(torch.zeros(3, 100, 100, dtype=torch.float64))._replace(above=strength)
+    assert bool(contact_region(seen, strength > 5, 30.0)[46:54, 35:45].all())
+    assert not bool(contact_region(seen, strength > 5, 8.0)[46:54, 35:45].any())
+
+
+def test_saturated_pixels_are_not_fitted():
+    image = seen_by_curve(ball((0, 0), 0.5), 3)
+    image[0, 55:65, 70:76] = 1.0
+    (contact,) = read(vts.Press(image, BALL_MM, center_px=((WIDTH - 1) / 2, (HEIGHT - 1) / 2)))
+    rows, columns = contact.index // WIDTH, contact.index % WIDTH
+    clipped = (rows >= 55) & (rows < 65) & (columns >= 70) & (columns < 76)
+    assert contact.reason == "" and bool(clipped.any()) and torch.equal(contact.saturated, clipped)
+    assert not bool((contact.inside() & clipped).any())
+
+
+def located(shift_px):
+    """Presses with centers that are all off by the same shift."""
+    contacts = read(*take_presses(count=10))
+    for contact, at, depth in zip(contacts, CENTERS_MM, [0.5, 0.4, 0.6, 0.45, 0.55, 0.5, 0.4, 0.6, 0.5, 0.35]):
+        contact.center_mm = torch.tensor(at, dtype=torch.float64) + PITCH * torch.tensor(shift_px, dtype=torch.float64)
+        contact.contact_radius_mm = math.sqrt(BALL_MM * depth - depth**2)
+    return contacts
+
+
+def test_loop_closure_predicts_a_common_drift():
+    """Changes between the two predictions are the shift, to a third: the field has taken over most of it."""
+    family = closure.Family(2, -1, False, 10.0)
+    errors = [closure._Rating(family, located(shift)).errors_mm.nanmedian(dim=0).values / PITCH for shift in ((0, 0), (0, 3))]
+    moved = errors[1] - errors[0]
+    assert abs(float(moved[0])) < 0.7 and float(moved[1]) > 0.7
+
+
+def test_loop_closure_never_moves_known_balls_or_right_ones_far():
+    contacts = located((0, 0))
+    contacts[0].known = True
+    closure.close_loops(contacts, 10.0)
+    off = [math.dist(c.center_mm.tolist(), at) / PITCH for c, at in zip(contacts, CENTERS_MM)]
+    assert off[0] == 0.0 and max(off) < 1.0, off
+
+
+def test_presses_of_a_digit_are_used(data):
+    folder = data / "digit_a"
+    sensor = vts.Sensor("digit", 320, 240, 1 / 19.58, gamma=1.0)
+    presses = [vts.Press(vts.read_image(folder / f"ball_{k:04d}.png"), 4.70, f"ball {k}") for k in range(0, 40, 5)]
+    contacts = read_contacts(presses, vts.read_image(folder / "background.png"), with_preprocessing(sensor, None))
+    assert [contact.reason for contact in contacts] == [""] * len(presses)
+    assert all(0.05 < float(contact.mask.double().mean()) < 0.4 for contact in contacts)

@@ -6,7 +6,6 @@ Methods of other libraries are timed in the same run. Rows of a real sensor need
 """
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,8 +14,8 @@ import torch
 from tqdm import tqdm
 
 from torchvts import viz
-from torchvts.core.files import write_atomically
 from torchvts.evaluation import figures, rows, speed
+from torchvts.evaluation.sets import data_folder
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -26,17 +25,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--chart", type=Path, help="write the chart here too")
     arguments = parser.parse_args(argv)
     torch.set_num_threads(arguments.threads)
-    data = Path(os.environ.get("TORCHVTS_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
-    arguments.out.mkdir(parents=True, exist_ok=True)
+    data = data_folder(__file__)
     command = f"python scripts/bench.py --threads {arguments.threads}"
     with tqdm(unit="row") as bar:
         measured = speed.run(command, lambda name: (bar.set_postfix_str(name), bar.update())[0], data if data.is_dir() else None)
     time = measured[0].time
     machine = f"{time.machine}, {arguments.threads} threads, float32" if time else ""
     text = "\n".join([speed.table(measured), "", machine, *speed.peer_ratios(measured)])
-    for name, content in (("bench.md", text + "\n"), ("bench.json", rows.to_json(measured))):
-        with write_atomically(arguments.out / name) as temporary:
-            temporary.write_text(content)
+    rows.write_files(arguments.out, {"bench.md": text + "\n", "bench.json": rows.to_json(measured)})
     print(text)
     figure = figures.speed_figure(measured)
     for path in filter(None, (arguments.out / "speed_accuracy.png", arguments.chart)):

@@ -5,7 +5,6 @@ python scripts/demo.py [--out out/demo]
 
 import argparse
 import dataclasses
-import os
 import statistics
 import sys
 import time
@@ -20,6 +19,7 @@ from tqdm import tqdm
 import torchvts as vts
 from torchvts import scenes, viz
 from torchvts.evaluation import metrics
+from torchvts.evaluation.sets import data_folder
 
 PITCH = 0.0625
 
@@ -30,7 +30,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     arguments.out.mkdir(parents=True, exist_ok=True)
     lines = embedded(arguments.out)
-    folder = Path(os.environ.get("TORCHVTS_DATA", Path(__file__).resolve().parents[1] / ".." / "shared" / "data"))
+    folder = data_folder(__file__)
     lines += real(folder, arguments.out) if folder.is_dir() else [f"real images: none at {folder} (set TORCHVTS_DATA)"]
     print("\n".join(lines))
     print(f"\npictures in {arguments.out}")

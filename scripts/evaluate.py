@@ -1,10 +1,12 @@
-"""Score methods on presses of balls of known size: a table, JSON rows, error maps.
+"""Score methods on presses: tables (Markdown, CSV, LaTeX), JSON, pictures.
 
-python scripts/evaluate.py ../shared/data/gelsight_mini_a --out out/evaluate
-python scripts/evaluate.py presses --test other_presses --methods "response precise" MLP
+python scripts/evaluate.py --all --out out/evaluate
+python scripts/evaluate.py --sets digit_a gelsight_pale
+python scripts/evaluate.py ../shared/data/gelsight_mini_a --sensor gelsight_mini --methods precise MLP
 
-The folder is in gs_sdk's layout (catalog.csv, background.png, N/gelsight.png). True centers and contact radii come from label.npz
-or labels.csv, and without these from calibrate. Methods do not use them: they learn from the balls that calibrate finds.
+--all scores every real sensor in ../shared/data, or in the folder TORCHVTS_DATA, and the drawn sensors. A folder of your own is in
+gs_sdk's layout (catalog.csv, background.png, N/gelsight.png); true centers and contact radii come from label.npz or labels.csv, and
+without these from calibrate. Methods do not use them: they learn from the balls that calibrate finds.
 """
 
 import argparse
@@ -14,54 +16,51 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from tqdm import tqdm
+
 import torchvts as vts
 from torchvts import viz
-from torchvts.core.files import write_atomically
 from torchvts.evaluation import evaluate as ev
-from torchvts.evaluation.figures import error_figure, error_map_name, press_figure
+from torchvts.evaluation import sets
+from torchvts.evaluation.figures import set_figure
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="presses of balls, in gs_sdk's layout")
-    parser.add_argument("--sensor", default="gelsight_mini", help=f"YAML file, or one of {', '.join(vts.shipped_sensors())}")
-    parser.add_argument("--methods", nargs="+", default=[], metavar="METHOD", help=", ".join(f'"{m}"' for m in ev.COMPARED))
-    parser.add_argument("--folds", type=int, default=5, help="cross-validation over presses; 1 scores what was learned from")
-    parser.add_argument("--test", type=Path, help="a second folder: learn from all of the first, score on this one")
-    parser.add_argument("--network", type=Path, help="a trained network to score too: gs_sdk's nnmodel.pth, or .safetensors")
-    parser.add_argument("--limit", type=int, help="use only so many presses, spread over the catalog")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("folder", nargs="?", type=Path, help="presses of balls, in gs_sdk's layout")
+    what.add_argument("--all", action="store_true", help="every real sensor and the drawn sensors")
+    what.add_argument("--sets", nargs="+", choices=sets.SETS, metavar="SET", help=", ".join(sets.SETS))
+    names = ", ".join(f'"{name}"' for name in ev.COMPARED)
+    parser.add_argument("--methods", nargs="+", default=[], choices=ev.COMPARED, metavar="METHOD", help=names)
+    parser.add_argument("--limit", type=int, help="use only so many presses (of each ball of --sets), spread over the catalog")
     parser.add_argument("--seed", type=int, default=0, help="seed of the network that is trained")
-    parser.add_argument("--out", type=Path, default=Path("out/evaluate"), help="folder for table.md, scores.json and pictures")
+    parser.add_argument("--out", type=Path, default=Path("out/evaluate"), help="folder for tables, scores.json and pictures")
+    own = parser.add_argument_group("of a folder")
+    own.add_argument("--sensor", default="gelsight_mini", help=f"YAML file, or one of {', '.join(vts.shipped_sensors())}")
+    own.add_argument("--folds", type=int, default=5, help="cross-validation over presses; 1 scores what was learned from")
+    own.add_argument("--network", type=Path, help="a trained network to score too: gs_sdk's nnmodel.pth, or .safetensors")
     arguments = parser.parse_args(argv)
-    sensor = vts.Sensor.load(arguments.sensor)
     start = time.perf_counter()
-    result = ev.evaluate(
-        arguments.folder,
-        sensor,
-        arguments.methods,
-        folds=arguments.folds,
-        test=arguments.test,
-        network_path=arguments.network,
-        limit=arguments.limit,
-        seed=arguments.seed,
-        progress=True,
-    )
     command = f"python {shlex.join(sys.argv if argv is None else ['scripts/evaluate.py', *argv])}"
-    lines = [ev.table(result), "", f"{result.how}; {result.rows[0].frames} presses scored"]
-    lines.append("means over presses; medians for radius and center of the sphere fitted to depth; absolute error of the apex")
-    if result.not_scored:
-        lines.append(f"not scored, no contact radius: {', '.join(result.not_scored)}")
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    for name, text in (("table.md", "\n".join([*lines, "", f"`{command}`"])), ("scores.json", ev.to_json(result, command))):
-        with write_atomically(arguments.out / name) as temporary:
-            temporary.write_text(text + "\n", encoding="utf-8")
-    for row in result.rows:
-        viz.save_figure(error_figure(result, row.method), arguments.out / error_map_name(row.method))
-    compared = [name for name in ("response precise", "MLP") if name in result.outputs] or list(result.outputs)[:2]
-    viz.save_figure(press_figure(result, compared), arguments.out / "press.png")
-    print("\n".join(lines))
-    print(f"{time.perf_counter() - start:.0f} s; table.md, scores.json and pictures in {arguments.out}")
+    done = measure(arguments)
+    print(ev.write_tables(done, arguments.out, command))
+    for evaluation in done:
+        if any(name != "flat" for name in evaluation.outputs):
+            viz.save_figure(set_figure(evaluation), arguments.out / f"{evaluation.data.name}.png")
+    print(f"{time.perf_counter() - start:.0f} s; tables, scores.json and pictures in {arguments.out}")
     return 0
+
+
+def measure(arguments: argparse.Namespace) -> list[ev.Evaluation]:
+    methods, limit, seed = arguments.methods, arguments.limit, arguments.seed
+    if arguments.folder is None:
+        names = sets.SETS if arguments.all else arguments.sets
+        return ev.evaluate_all(names, sets.data_folder(__file__), methods, limit=limit, seed=seed, progress=True)
+    sensor = vts.Sensor.load(arguments.sensor)
+    data = sets.from_folder(arguments.folder, sensor, folds=arguments.folds, network=arguments.network, limit=limit)
+    with tqdm(desc="evaluating", leave=False) as bar:
+        return [ev.evaluate(data, methods, seed=seed, bar=bar)]
 
 
 if __name__ == "__main__":

@@ -41,8 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     before = arguments.out.read_text() if arguments.out.is_file() else ""
     comment = [line for line in before.splitlines() if line.startswith("#")]
     dataclasses.replace(sensor, prior=prior).save(arguments.out, comment)
-    fields = (prior.response.fast, prior.response.precise)
-    print(f"{len(presses)} presses; parameters of the fields: {', '.join(str(2 * f.size()) for f in fields if f is not None)}")
+    print(f"{len(presses)} presses; {2 * prior.response.field.size()} parameters of the field")
     print(f"wrote {arguments.out}")
     return 0
 

@@ -15,8 +15,8 @@ from tqdm import tqdm
 
 import torchvts as vts
 from torchvts import viz
-from torchvts.core.files import write_atomically
 from torchvts.evaluation.pose_accuracy import PoseCase, ball_pairs, machine, pose_table, run_poses
+from torchvts.evaluation.rows import write_files
 from torchvts.pose import Registration, contact_cloud
 from torchvts.scenes import objects
 
@@ -57,9 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with tqdm(total=100, unit="pair") as bar:
             counts = ball_pairs(background, presses, vts.Sensor.load(arguments.sensor), 100, bar.update)
         text += "\nreal presses of a ball: " + ", ".join(f"{name} {count}" for name, count in counts.items()) + "\n"
-    for name, content in (("table.md", text), ("poses.json", json.dumps([dataclasses.asdict(row) for row in rows], indent=1))):
-        with write_atomically(arguments.out / name) as temporary:
-            temporary.write_text(content)
+    write_files(arguments.out, {"table.md": text, "poses.json": json.dumps([dataclasses.asdict(row) for row in rows], indent=1)})
     print(text)
     for row in rows:
         for note in row.notes[:5]:

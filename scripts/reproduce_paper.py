@@ -7,7 +7,6 @@ Ji, Liu, Ma: Model-Based 3D Contact Geometry Perception for Visual Tactile Senso
 
 import argparse
 import math
-import os
 import statistics
 import sys
 from collections.abc import Sequence
@@ -20,6 +19,7 @@ import torchvts as vts
 from torchvts import scenes, viz
 from torchvts.evaluation import methods, metrics, pose_accuracy
 from torchvts.evaluation.presses import Training
+from torchvts.evaluation.sets import data_folder
 from torchvts.pose import contact_cloud
 
 PITCH = 0.0625
@@ -94,9 +94,9 @@ def table_2(folder: Path, out: Path) -> list[str]:
     background, presses = vts.read_presses(folder)
     kept = [press for k, press in enumerate(presses) if k % 5 == 0 and press.contact_radius_px is not None]
     training = Training(background, [press for press in presses if press not in kept], sensor)
-    table = methods.lookup_table(training, background, sensor).reconstruct
-    compared = {"response, precise": methods.response(training, background, sensor).reconstruct}
-    compared["point lights (the paper's)"] = methods.point_lights(training, background, sensor).reconstruct
+    table = methods.lookup_table(training).reconstruct
+    compared = {"response, precise": methods.by_calibration(training, "precise").reconstruct}
+    compared["point lights (the paper's)"] = methods.point_lights(training).reconstruct
     rows = []
     for name, pipe in compared.items():
         for press in tqdm(kept, desc="table 2", leave=False):
@@ -131,7 +131,9 @@ def table_3(out: Path) -> list[str]:
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/paper"), help="folder for pictures and table.md")
-    parser.add_argument("--data", type=Path, default=data_folder(), help="folder that holds tacto/ (default: TORCHVTS_DATA)")
+    parser.add_argument(
+        "--data", type=Path, default=data_folder(__file__), help="folder that holds tacto/ (default: TORCHVTS_DATA)"
+    )
     parser.add_argument("--lights", type=float, nargs=2, default=(31.25, 39.375), metavar=("RADIUS_MM", "HEIGHT_MM"))
     arguments = parser.parse_args(argv)
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -157,11 +159,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(text)
     print(f"\npictures and table.md in {arguments.out}")
     return 0
-
-
-def data_folder() -> Path:
-    """Folder of third-party images: TORCHVTS_DATA, else ../shared/data beside the checkout."""
-    return Path(os.environ.get("TORCHVTS_DATA", Path(__file__).resolve().parents[1] / ".." / "shared" / "data"))
 
 
 if __name__ == "__main__":

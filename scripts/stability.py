@@ -14,11 +14,10 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from torchvts.core.files import write_atomically
 from torchvts.evaluation import stability
 from torchvts.evaluation.figures import corruption_figure, overview_figure, save_small
 from torchvts.evaluation.gallery import CORRUPTIONS
-from torchvts.evaluation.rows import Row
+from torchvts.evaluation.rows import Row, write_files
 from torchvts.evaluation.stability import SWEPT, Breaking
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -65,8 +64,7 @@ def write_tables(rows: Sequence[Row], points: Sequence[Breaking], seeds: int, ou
         written[ROOT / "tests" / "breaking_points.json"] = kept
         written[page] = stability.updated_page(page.read_text(encoding="utf-8"), points)
     for path, content in written.items():
-        with write_atomically(path) as temporary:
-            temporary.write_text(content, encoding="utf-8")
+        write_files(path.parent, {path.name: content})
     return text
 
 

@@ -79,6 +79,7 @@ class Names:
             "torchvts.integration:CliffIntegration",
         )
         self.ResponseField = find("torchvts.model:ResponseField", "torchvts.core.response:ResponseField")
+        self.DepthBrightness = find("torchvts.model:DepthBrightness")
         self.ResponseModel = find("torchvts.model:ResponseModel", "torchvts.core.response:ResponseModel")
         self.FillMarkers = find("torchvts.model:FillMarkers", "torchvts.compensate:FillMarkers", "torchvts:FillMarkers")
         self.export_program = find("torchvts.export:export_program")
@@ -133,18 +134,16 @@ def by_lights(lights: Any, height: int, width: int, failed: int | None = None, *
 
 
 def response_model() -> Any:
-    """Response fields of degree 1 with products, of one pass and of two, with fixed coefficients near those of a ring of lights."""
+    """A response field of degree 1 with products, and what depth does to brightness, near those of a ring of lights."""
     draw = torch.Generator().manual_seed(3)
     angle = torch.deg2rad(torch.tensor([10.0, 130.0, 250.0], dtype=torch.float64))
     slope_of_change = -0.26 * torch.stack((angle.cos(), angle.sin()))
 
-    def field(uses_depth: bool) -> Any:
-        linear, products = (6, 9) if uses_depth else (3, 6)
-        rows = 0.01 * torch.randn(2, linear + products, 3, generator=draw, dtype=torch.float64)
-        rows[:, :3, 0] += slope_of_change
-        return names.ResponseField(1, 1, uses_depth, 20.0, tuple(map(tuple, rows.flatten(1).tolist())))
-
-    return names.ResponseModel(field(False), field(True))
+    rows = 0.01 * torch.randn(2, 9, 3, generator=draw, dtype=torch.float64)
+    rows[:, :3, 0] += slope_of_change
+    field = names.ResponseField(1, 1, 20.0, tuple(map(tuple, rows.flatten(1).tolist())))
+    per_mm = 0.05 * torch.randn(3, 3, generator=draw, dtype=torch.float64)
+    return names.ResponseModel(field, names.DepthBrightness(1, 20.0, tuple(map(tuple, per_mm.tolist()))))
 
 
 def by_response(height: int, width: int) -> Unit:

@@ -35,6 +35,7 @@ from refusals_values import (
     WIDTH,
     Entry,
     batches,
+    by_depth,
     cloud,
     fields,
     forward,
@@ -117,12 +118,12 @@ TABLE = {
         },
     ),
     "ContactMask.from_calibration": Entry({"calibration": unit()}, {"calibration": OTHERS}),
-    "ContactMask.forward": forward(lambda: pipe().contact, 3, "compensated"),
-    "ContactMask.shadowed": forward(lambda: pipe().contact.shadowed, 3, "compensated"),
-    "ContactMask.soft": forward(lambda: pipe().contact.soft, 3, "compensated"),
+    "ContactMask.forward": forward(lambda: pipe().deformed, 3, "compensated"),
+    "ContactMask.shadowed": forward(lambda: pipe().deformed.shadowed, 3, "compensated"),
+    "ContactMask.soft": forward(lambda: pipe().deformed.soft, 3, "compensated"),
     "DepthPipeline": Entry(
         {
-            **{name: getattr(pipe(), name) for name in ("compensate", "contact", "normals", "gradient", "integrate")},
+            **{name: getattr(pipe(), name) for name in ("compensate", "deformed", "normals", "gradient", "integrate")},
             "mode": "fast",
             "mm_per_pixel": 1.0,
             "tolerance_px": 0.002,
@@ -130,7 +131,7 @@ TABLE = {
             "max_passes": 8,
         },
         {
-            **{name: [None, lambda x: x] for name in ("compensate", "contact", "normals", "gradient", "integrate")},
+            **{name: [None, lambda x: x] for name in ("compensate", "deformed", "normals", "gradient", "integrate")},
             "mm_per_pixel": NUMBER,
             "mode": ["slow", None, 1],
             "tolerance_px": NUMBER,
@@ -277,8 +278,8 @@ TABLE = {
     "NormalFromMLP.gradient_px": forward(lambda: network().gradient_px, 3, "image"),
     "NormalFromMLP.forward": forward(network, 3, "compensated", label=("depth_mm", "window")),
     "NormalFromResponse": Entry(
-        {"fast": fields(), "precise": fields(True), **SIZE, "max_slope": 3.0},
-        {"fast": [None, "field", fields(True)], "precise": ["field", fields()], **shaped(max_slope=NUMBER)},
+        {"field": fields(), "by_depth": by_depth(), **SIZE},
+        {"field": [None, "field", by_depth()], "by_depth": ["field", fields()], **shaped()},
     ),
     "NormalFromResponse.from_calibration": Entry({"calibration": unit("response")}, {"calibration": [*OTHERS, unit()]}),
     "NormalFromResponse.forward": Entry(

@@ -266,7 +266,7 @@ TABLE = {
         for name in ("correct", "set_background", "start")
     },
     "stream.FollowLight.update": Entry(
-        {"image": image()[None], "contact": DEPTH > 0, "seconds": 0.1},
+        {"image": image()[None], "deformed": DEPTH > 0, "seconds": 0.1},
         {"image": batches(3), "contact": [None, torch.ones(1, 1, 4, 4), (DEPTH > 0).numpy()], "seconds": ["1", None, NAN]},
         lambda: vts.stream.FollowLight(image()).update,
     ),

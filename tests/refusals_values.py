@@ -9,7 +9,7 @@ import torch
 from conftest import ring_lights
 
 import torchvts as vts
-from torchvts.model.response_field import ResponseModel
+from torchvts.model.response_field import DepthBrightness, ResponseModel
 
 HEIGHT, WIDTH, PITCH = 24, 32, 1.25
 NAN, INF = float("nan"), float("inf")
@@ -31,15 +31,19 @@ def image():
     return vts.scenes.render(vts.scenes.undeformed(scene()), lights())[0]
 
 
-def fields(deep=False):
-    family = vts.calibration.field.Family(0, -1, deep, 20.0)
+def fields():
+    family = vts.calibration.field.Family(0, -1, 20.0)
     return family.field(torch.linspace(-0.2, 0.3, family.size(), dtype=torch.float64))
+
+
+def by_depth():
+    return DepthBrightness(0, 20.0, ((0.05,), (-0.02,), (0.1,)))
 
 
 def unit(by="lights"):
     if by == "lights":
         return vts.Calibration.from_lights(lights(), sensor(), image())
-    return vts.Calibration.from_response(ResponseModel(fields(), fields(True)), sensor(), image())
+    return vts.Calibration.from_response(ResponseModel(fields(), by_depth()), sensor(), image())
 
 
 def pipe(mode="fast"):
@@ -137,7 +141,7 @@ EYE = torch.eye(4, dtype=torch.float64)
 BAD_POSE = [EYE[:3], 2 * EYE, EYE + NAN, np.eye(4), "pose"]
 
 UP = torch.tensor([0.0, 0.0, 1.0]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)
-OUT = vts.DepthOutput(DEPTH, torch.zeros(1, 2, HEIGHT, WIDTH), UP, DEPTH > 0)
+OUT = vts.DepthOutput(DEPTH, torch.zeros(1, 2, HEIGHT, WIDTH), UP, DEPTH > 0, DEPTH > 0)
 GRADIENT = torch.zeros(1, 2, 8, 8)
 BAD_GRADIENT = [*batches(2), torch.zeros(1, 2, 1, 8)]
 BAD_MASKS = [torch.zeros(1, 1, 4, 4) > 0, torch.zeros(1, 1, 8, 8), torch.zeros(8, 8) > 0, "all", np.zeros((1, 1, 8, 8), bool)]

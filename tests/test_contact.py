@@ -18,7 +18,7 @@ def found(scene, lights, sensor, noise_std=0.0, bits=None, seed=3):
     """Contact of one frame, judged with a background as noisy as the frame."""
     background = scenes.render(scenes.undeformed(scene), lights, noise_std=noise_std, bits=bits, seed=seed + 1)[0]
     pipeline = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, sensor, background))
-    return pipeline(scenes.render(scene, lights, noise_std=noise_std, bits=bits, seed=seed)).contact
+    return pipeline(scenes.render(scene, lights, noise_std=noise_std, bits=bits, seed=seed)).deformed
 
 
 @pytest.mark.parametrize("noise_std, bits, least, rim_px", [(0.0, None, 0.999, 0.01), (0.01, 8, 0.99, 0.1)])
@@ -87,7 +87,7 @@ def test_pure_noise_is_no_contact(ring, small_sensor, small_press, noise_std):
     background = scenes.render(rest, lights, noise_std=noise_std, bits=8, seed=99)[0]
     pipeline = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, small_sensor, background))
     frames = torch.cat([scenes.render(rest, lights, noise_std=noise_std, bits=8, seed=seed) for seed in range(20)])
-    assert int(pipeline(frames).contact.sum()) == 0
+    assert int(pipeline(frames).deformed.sum()) == 0
 
 
 @pytest.mark.parametrize("times", [2, 4])
@@ -97,8 +97,8 @@ def test_a_frame_noisier_than_the_calibration_does_not_flood(ring, small_sensor,
     pipeline = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, small_sensor, background))
     rest = scenes.render(scenes.undeformed(scene), lights, noise_std=0.005 * times, bits=8, seed=1)
     press = scenes.render(scene, lights, noise_std=0.005 * times, bits=8, seed=2)
-    assert int(pipeline(rest).contact.sum()) == 0
-    assert metrics.mask_iou(pipeline(press).contact, scene.contact) > 0.97
+    assert int(pipeline(rest).deformed.sum()) == 0
+    assert metrics.mask_iou(pipeline(press).deformed, scene.contact) > 0.97
 
 
 def test_skin_at_rest_in_a_shadow_is_shaded_and_a_press_is_not():

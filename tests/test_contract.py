@@ -53,9 +53,10 @@ def pipe(mode):
 
 def response(dtype):
     random = torch.Generator().manual_seed(3)
-    fields = [vts.calibration.field.Family(1, 1, deep, 20.0) for deep in (False, True)]
-    fast, precise = (f.field(0.1 * torch.randn(f.size(), generator=random, dtype=torch.float64)) for f in fields)
-    model = vts.model.response_field.ResponseModel(fast, precise)
+    family = vts.calibration.field.Family(1, 1, 20.0)
+    field = family.field(0.1 * torch.randn(family.size(), generator=random, dtype=torch.float64))
+    by_depth = vts.model.DepthBrightness(1, 20.0, 0.1 * torch.randn(3, 3, generator=random, dtype=torch.float64))
+    model = vts.model.response_field.ResponseModel(field, by_depth)
     return vts.Calibration.from_response(model, SENSOR, calibration(dtype).background)
 
 
@@ -74,7 +75,7 @@ def network(dtype):
 
 CASES = {
     "Compensate": (part("compensate"), images, "image"),
-    "ContactMask": (part("contact"), images, "compensated"),
+    "ContactMask": (part("deformed"), images, "compensated"),
     "NormalFromIntensity": (part("normals"), images, "compensated"),
     "NormalFromResponse": (lambda dtype: vts.NormalFromResponse.from_calibration(response(dtype)), images, "compensated"),
     "NormalFromLookup": (lookup, images, "compensated"),
@@ -224,7 +225,7 @@ def test_a_block_works_in_sequential(name):
 def test_blocks_chain_by_hand_in_sequential():
     whole, example = build("DepthPipeline fast")
     normals = nn.Sequential(whole.compensate, whole.normals, whole.gradient)(example)
-    depth = whole.integrate(normals * whole.contact(whole.compensate(example)))
+    depth = whole.integrate(normals * whole.deformed(whole.compensate(example)))
     assert_same(depth, whole(example).depth_mm, 1e-6)  # the pipeline sees normals in a window only
 
 

@@ -1,19 +1,23 @@
 """Scores against balls: zero for exact presses, of known size for wrong ones; both scripts at small scale."""
 
 import csv
+import dataclasses
 import json
 import math
 import shutil
+import warnings
 from functools import partial
 
 import pytest
 import torch
 
 import torchvts as vts
+from torchvts.calibration import fit_prior
 from torchvts.core.geometry import normal_from_gradient
 from torchvts.evaluation import evaluate as ev
-from torchvts.evaluation import methods, rows
-from torchvts.evaluation.figures import error_figure, error_map_name, press_figure
+from torchvts.evaluation import methods, rows, sets
+from torchvts.evaluation import presses as presses_room
+from torchvts.evaluation.figures import set_figure
 from torchvts.evaluation.presses import Training, train_network
 from torchvts.evaluation.score import ball_truth, score_press
 from torchvts.model.gs_sdk import CATALOG_COLUMNS, LABEL_COLUMNS
@@ -69,11 +73,11 @@ def test_an_exact_press_has_no_error(press):
     given, scene = press
     score = score_press(given, scene.depth_mm, scene.normal, PITCH, "exact")
     assert score.normal_deg < 1e-3 and score.relief_um < 1e-2
-    assert score.radius_percent < 1e-2 and score.center_px < 1e-2 and abs(score.apex_um) < 1e-2
+    assert score.radius_percent < 1e-2 and score.center_px < 1e-2
     assert (score.press, score.method) == ("exact", "exact")
-    region = ball_truth(given, HEIGHT, WIDTH, PITCH).region
-    assert sum(score.by_slope_pixels) == sum(score.by_place_pixels) == int(region.sum())
-    assert bool(scene.contact[region].all())
+    assert bool(scene.contact[ball_truth(given, HEIGHT, WIDTH, PITCH).region].all())
+    assert score.depth_normal_deg < 0.05 and score.lowest_mm == 0.0 and score.iou is None
+    assert score_press(given, scene.depth_mm, scene.normal, PITCH, contact=scene.contact).iou > 0.97
 
 
 def test_truth_is_the_scenes_own(press):
@@ -110,9 +114,6 @@ def test_a_scaled_depth_is_off_by_its_scale(press):
     cap = truth.depth_mm[truth.region]
     assert score.relief_um == pytest.approx(100.0 * float(cap.std(correction=0)), rel=1e-3)
     assert score.tilt_um < 1e-2 * score.relief_um  # a ball in the middle scaled is no plane
-    assert score.apex_um == pytest.approx(
-        100.0 * float(cap.max() - cap.min()), rel=0.15
-    )  # middle and rim are means over a few pixels
     # a flat cap of height h over a circle a has radius a^2 / 2h: 10 % higher, a tenth smaller
     assert score.radius_percent == pytest.approx(9.0, abs=1.5) and score.center_px < 1e-2
 
@@ -124,7 +125,7 @@ def test_a_tilted_depth_moves_the_fitted_ball(press):
     score = score_press(given, scene.depth_mm.double() + tilt, scene.normal, PITCH)
     truth = ball_truth(given, HEIGHT, WIDTH, PITCH)
     assert score.relief_um == pytest.approx(1000.0 * float(tilt[truth.region].std(correction=0)), rel=1e-3)
-    assert score.tilt_um == pytest.approx(score.relief_um, rel=1e-3)
+    assert score.tilt_um == pytest.approx(score.relief_um, rel=1e-3) and score.level_um < 0.05 * score.relief_um
     assert score.center_px == pytest.approx(slope * 0.5 * BALL_MM / PITCH, rel=0.15)
 
 
@@ -133,9 +134,8 @@ def test_a_flat_depth_has_no_sphere(press):
     flat = vts.scenes.undeformed(scene)
     score = score_press(given, flat.depth_mm, flat.normal, PITCH)
     assert score.radius_percent is None and score.center_px is None
-    assert score.apex_um < -100.0 and score.normal_deg > 5.0
-    means = [value for value in score.by_slope_deg if value is not None]
-    assert means == sorted(means) and len(means) >= 2  # what is steep is far from flat
+    assert score.normal_deg > 5.0
+    assert score.depth_normal_deg == pytest.approx(score.normal_deg)
 
 
 def test_bad_arguments_are_named(press, folder):
@@ -150,51 +150,147 @@ def test_bad_arguments_are_named(press, folder):
         faint = vts.Press(given.image, BALL_MM, "faint", given.center_px, 4.0)
         score_press(faint, scene.depth_mm, scene.normal, PITCH)
     sensor = vts.Sensor.load(folder / "rig.yaml")
-    for arguments, message in (
-        ({"methods": ["magic"]}, "methods: expected some of"),
-        ({"methods": ["response precise, prior"]}, "has none: scripts/fit_prior.py"),
-        ({"methods": ["flat"], "folds": 7}, "folds: expected at most"),
-        ({"methods": ["flat"], "folds": 0}, "folds"),
-    ):
+    with pytest.raises(ValueError, match="methods: expected some of"):
+        ev.evaluate(sets.from_folder(folder, sensor), ["magic"])
+    for folds, message in ((7, "folds: expected at most"), (0, "folds")):
         with pytest.raises(ValueError, match=message):
-            ev.evaluate(folder, sensor, **arguments)
+            sets.from_folder(folder, sensor, folds=folds)
+    with pytest.raises(ValueError, match="sets: expected some of gelsight_mini_a"):
+        sets.load("gelsight_mini_z", folder)
 
 
-def test_evaluate_writes_table_rows_and_pictures(run_script, monkeypatch, folder, tmp_path):
+def test_evaluate_writes_tables_rows_and_pictures(run_script, monkeypatch, folder, tmp_path):
     monkeypatch.setattr(methods, "train_network", partial(train_network, max_epochs=15))
     done = run_script("evaluate", folder, "--sensor", folder / "rig.yaml", "--folds", 2, "--out", tmp_path)
     assert done.returncode == 0, done.stderr
     document = json.loads((tmp_path / "scores.json").read_text())
     summary = {row.method: row for row in rows.from_json(json.dumps(document["rows"]))}
-    assert list(summary) == [name for name in ev.COMPARED if name != "response precise, prior"]  # the file has none
+    assert list(summary) == [name for name in ev.COMPARED if "no prior" not in name]  # the file has none
     assert len(document["scores"]) == 5 * len(summary) and "scripts/evaluate.py" in document["command"]
     # exact lights, little noise: the model is right, and learning from three presses beats zero depth
     assert summary["point lights"].errors["normal_deg"] < 1.5
-    assert summary["response precise"].errors["normal_deg"] < 3.0
+    assert summary["precise"].errors["normal_deg"] < 3.0 and summary["precise"].errors["level_um"] < 20.0
     for name in ("look-up table", "MLP"):
         assert summary[name].errors["normal_deg"] < 0.8 * summary["flat"].errors["normal_deg"]
-    assert summary["flat"].error("radius_percent") is None and summary["flat"].parameters == 0
+    for name in ("fast", "precise", "look-up table", "MLP"):
+        assert (summary[name].errors["used"], summary[name].errors["given"]) == (6, 6) and not summary[name].note.count("Error")
+    assert summary["flat"].error("radius_percent") is None and summary["flat"].error("iou") == 0.0
     assert "not scored, no contact radius: ball/5" in done.stdout
-    assert done.stdout.splitlines()[2].startswith("| flat | 0 |")
-    assert (tmp_path / "table.md").read_text().startswith("| method |")
-    pictures = sorted(path.name for path in tmp_path.glob("*.png"))
-    assert pictures == sorted([error_map_name(name) for name in summary] + ["press.png"])
+    assert done.stdout.splitlines()[2].startswith("|") and "| flat |" in done.stdout.splitlines()[2]
+    assert (tmp_path / "table.md").read_text().startswith("| data | method |")
+    with (tmp_path / "table.csv").open(newline="") as stream:
+        lines = list(csv.DictReader(stream))
+    assert [line["method"] for line in lines] == list(summary)
+    assert float(lines[-1]["normal_deg"]) == summary[lines[-1]["method"]].errors["normal_deg"]
+    assert (tmp_path / "table.tex").read_text().count(r"\\") == 1 + len(summary)
+    assert [path.name for path in tmp_path.glob("*.png")] == [f"{folder.name}.png"]
 
 
-def test_evaluate_on_a_second_folder_and_with_a_trained_network(run_script, folder, tmp_path):
+def test_evaluate_with_a_trained_network(run_script, folder, tmp_path):
     network = tmp_path / "mlp.safetensors"
     done = run_script("train_mlp", folder, "--sensor", folder / "rig.yaml", "--out", network, "--max-epochs", 3)
     assert done.returncode == 0, done.stderr
     assert "held out" in done.stdout and "2370 weights" in done.stdout
     sensor = vts.Sensor.load(folder / "rig.yaml")
-    result = ev.evaluate(folder, sensor, ["response fast"], test=folder, network_path=network, limit=4)
-    assert [row.method for row in result.rows] == ["response fast", ev.GIVEN_NETWORK]
-    assert "4 presses learned from" in result.how and "very presses" in result.rows[1].note
-    assert result.rows[0].errors["normal_deg"] < 3.0
-    with pytest.raises(ValueError, match="method: expected one that was evaluated"):
-        error_figure(result, "MLP")
-    with pytest.raises(ValueError, match="methods: expected some of response fast"):
-        press_figure(result)
+    result = ev.evaluate(sets.from_folder(folder, sensor, folds=1, network=network, limit=4), ["fast"])
+    assert [row.method for row in result.rows] == ["fast", methods.GIVEN_NETWORK]
+    assert "learned from and scored: 4 presses" in result.data.how and [row.seen for row in result.rows] == [False, True]
+    assert result.rows[0].errors["normal_deg"] < 3.0 and result.rows[1].frames == 4
+    with pytest.raises(ValueError, match="methods: expected some of fast"):
+        set_figure(result, ["MLP"])
+
+
+def test_a_prior_that_has_seen_the_presses_is_compared_with_none(folder):
+    sensor = vts.Sensor.load(folder / "rig.yaml")
+    background, presses = vts.read_presses(folder)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", vts.CalibrationWarning)
+        primed = dataclasses.replace(sensor, prior=fit_prior(background, sensor, presses, "these"))
+    result = ev.evaluate(sets.from_folder(folder, primed, folds=1), ["fast", "fast, no prior"])
+    assert "prior fitted on these" in result.rows[0].note and result.rows[1].note.count("prior") == 0
+
+
+class FailingUnit:
+    """A calibration that cannot be made."""
+
+    def __init__(self, *arguments):
+        raise ValueError("presses: no contact|\nin any of them")
+
+
+def test_a_method_or_a_set_that_fails_is_a_row_with_its_reason(folder, monkeypatch, tmp_path):
+    sensor = vts.Sensor.load(folder / "rig.yaml")
+    data = sets.from_folder(folder, sensor, folds=2)
+    calls = []
+    monkeypatch.setattr(presses_room, "calibrate", lambda *arguments: FailingUnit(calls.append(1)))
+    result = ev.evaluate(data, ["flat", "fast", "precise"])
+    assert len(calls) == 2  # once for each fold, not for each method
+    assert [row.note for row in result.rows[1:]] == ["presses: no contact/ in any of them"] * 2
+    assert result.rows[1].frames == 0 and result.rows[1].errors["used"] == 0.0 and result.rows[0].frames == 5
+    refused = ev.evaluate(dataclasses.replace(data, refused=True), ["fast"])
+    assert refused.rows[0].note == "refused, as is right: presses: no contact/ in any of them"
+    missing = ev.evaluate_all(["digit_a"], tmp_path)
+    assert "no such folder: set TORCHVTS_DATA" in missing[0].rows[0].note
+    text = ev.write_tables([result, *missing], tmp_path, "a command")
+    assert (
+        "| digit_a |" in text
+        and "| no contact/ in any" not in text
+        and len({line.count("|") for line in text.splitlines()[:6]}) == 1
+    )
+
+
+def test_drawn_sensors_are_scored_on_objects_and_averaged(folder):
+    sensor = vts.Sensor.load(folder / "rig.yaml")
+    background, presses = vts.read_presses(folder)
+    scene = vts.scenes.cylinder_press(4.0, 0.5, 6.0, 30.0, (0.0, 0.0), HEIGHT, WIDTH, PITCH)
+    lights = vts.PointLights([[25.0, 9.0, 22.0], [-20.0, 15.0, 22.0], [-3.0, -25.0, 22.0]], [500.0, 500.0, 500.0])
+    objects = [("cylinder", vts.scenes.render(scene, lights, noise_std=0.002)[0].detach(), scene)]
+    units = [sets.drawn_set(name, sensor, background, presses, objects) for name in sets.DRAWN[:2]]
+    done = [ev.evaluate(unit, ["flat", "precise"]) for unit in units]
+    rows_of_units = [row for evaluation in done for row in evaluation.rows]
+    assert done[0].rows[1].errors["normal_deg"] < 0.5 * done[0].rows[0].errors["normal_deg"]
+    assert done[0].rows[1].errors["iou"] > 0.7 and done[0].rows[1].error("radius_percent") is None
+    means = ev.means_of_drawn(rows_of_units)
+    assert [(row.data, row.method) for row in means] == [("drawn, mean of 2", "flat"), ("drawn, mean of 2", "precise")]
+    expected = sum(evaluation.rows[1].errors["relief_um"] for evaluation in done) / 2
+    assert means[1].errors["relief_um"] == pytest.approx(expected)
+
+
+def test_the_learning_curve_of_a_set(run_script, monkeypatch, folder, tmp_path):
+    data = sets.from_folder(folder, vts.Sensor.load(folder / "rig.yaml"), folds=2)
+    monkeypatch.setattr(sets, "load", lambda *arguments: data)
+    done = run_script("learning_curve", "digit_a", "--draws", 2, "--mode", "fast", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in (tmp_path / "table.md").read_text().splitlines()[2:]]
+    assert [(line[1], line[2], line[7]) for line in lines] == [
+        ("presses", "1", "5"),
+        ("presses", "3", "5"),
+        ("touches, and one press for the scale", "1", "5"),
+    ]
+    assert all(0.0 < float(line[3]) < 10.0 for line in lines) and (tmp_path / "learning_curve.png").stat().st_size > 5000
+
+
+def test_latex_and_csv_keep_what_is_special():
+    assert rows.latex(["a_b", "50 %"], [["x & y", "{1}"]]).splitlines()[2:5] == [
+        r"a\_b & 50 \% \\",
+        r"\midrule",
+        r"x \& y & \{1\} \\",
+    ]
+    row = rows.Row("presses", "fast", "a, b", {"normal_deg": None, "iou": 0.5}, note='says "no"')
+    text = rows.to_csv([row])
+    read = next(csv.DictReader(text.splitlines()))
+    assert (read["data"], read["normal_deg"], read["iou"], read["note"]) == ("a, b", "", "0.5", 'says "no"')
+
+
+@pytest.mark.parametrize("name", sets.REAL)
+def test_real_sets_are_read(data, monkeypatch, name):
+    monkeypatch.setattr(presses_room, "calibrate", FailingUnit)  # balls without a label are not located here
+    monkeypatch.setattr(sets, "fit_prior", lambda *arguments: None)
+    read = sets.load(name, data, 4)
+    sensor = read.folds[0].sensor
+    assert read.background.shape == (3, sensor.height, sensor.width) and read.how
+    names = [{press.name for press in fold.learned} & {target.name for target in fold.scored} for fold in read.folds]
+    assert read.refused or not any(names)
+    assert all(target.image.shape == read.background.shape for fold in read.folds for target in fold.scored)
 
 
 def test_without_labels_balls_are_found(folder, monkeypatch, tmp_path):
@@ -206,8 +302,8 @@ def test_without_labels_balls_are_found(folder, monkeypatch, tmp_path):
     for found, given in zip(training.located, presses, strict=True):
         assert math.dist(found.center_px, given.center_px) < 1.5
     monkeypatch.setattr(Training, "located", training.located)  # the same presses again
-    result = ev.evaluate(bare, sensor, ["flat"], folds=1)
-    assert "centers from calibrate, which saw all presses (6)" in result.how and result.rows[0].frames == 6
+    result = ev.evaluate(sets.from_folder(bare, sensor, folds=1), ["flat"])
+    assert "centers from calibrate on the scored presses (6)" in result.data.how and result.rows[0].frames == 6
     fit = train_network(*vts.read_presses(bare), sensor, max_epochs=2)
     assert len(fit.history) == 2 and "raise max_epochs" in fit.message
 
@@ -215,7 +311,6 @@ def test_without_labels_balls_are_found(folder, monkeypatch, tmp_path):
 def test_scripts_refuse_bad_input_in_a_sentence(run_script, folder, tmp_path):
     for arguments, part in (
         (["evaluate", tmp_path / "none", "--out", tmp_path], "no such folder"),
-        (["evaluate", folder, "--methods", "magic", "--out", tmp_path], "methods"),
         (["train_mlp", folder, "--sensor", "gelsight_mini", "--out", tmp_path / "a.safetensors"], "gelsight_mini"),
     ):
         done = run_script(*arguments)
@@ -223,3 +318,6 @@ def test_scripts_refuse_bad_input_in_a_sentence(run_script, folder, tmp_path):
         assert done.stderr.startswith("error: ") and part in done.stderr, done.stderr
         assert "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == []
+    for arguments in (["--methods", "magic"], ["--all"]):
+        done = run_script("evaluate", folder, *arguments, "--out", tmp_path)
+        assert done.returncode == 2 and "error: argument" in done.stderr and list(tmp_path.iterdir()) == []

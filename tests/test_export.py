@@ -81,7 +81,7 @@ def cells_of_two(ring):
     scene = vts.scenes.sphere_press(10.0, 1.5, (3.0, 1.0), height, width, 0.17)
     frames = vts.scenes.render(scene, lights, noise_std=0.003, bits=8, seed=1).detach().repeat(3, 1, 1, 1)
     pipe = pipeline(vts.Calibration.from_lights(lights, vts.Sensor("rig", height, width, 0.17)), "fast")
-    assert pipe.contact.cell == 2
+    assert pipe.deformed.cell == 2
     return pipe, frames
 
 
@@ -89,7 +89,11 @@ def test_a_program_of_an_image_whose_cells_are_larger_than_pixels(cells_of_two):
     pipe, frames = cells_of_two
     with torch.no_grad():
         found, expected = export.export_program(pipe).module()(frames), pipe(frames)
-    assert torch.equal(found[3], expected.contact) and (found[0] - expected.depth_mm).abs().max() < 1e-5
+    assert (
+        torch.equal(found[3], expected.contact)
+        and torch.equal(found[4], expected.deformed)
+        and (found[0] - expected.depth_mm).abs().max() < 1e-5
+    )
 
 
 @pytest.mark.long

@@ -50,7 +50,7 @@ def by_lights():
 
 
 def by_response():
-    field = ResponseField(0, -1, False, 10.0, ((0.3, 0, 0), (0, 0.3, 0)))
+    field = ResponseField(0, -1, 10.0, ((0.3, 0, 0), (0, 0.3, 0)))
     return vts.Calibration.from_response(ResponseModel(field, None), SENSOR, image())
 
 

@@ -106,7 +106,7 @@ def test_a_cast_shadow_is_no_contact_and_no_slope(shape):
     )
     pipe, camera = low_rig(scene)
     plain, shadowed = pipe(camera(False)), pipe(camera(True))
-    assert metrics.mask_iou(pipe.contact(pipe.compensate(camera(True))), scene.contact) < 0.92
+    assert metrics.mask_iou(pipe.deformed(pipe.compensate(camera(True))), scene.contact) < 0.92
     assert metrics.mask_iou(shadowed.contact, scene.contact) > 0.99
     error, expected = (metrics.depth_error(out.depth_mm, scene.depth_mm, 0.0625).rms_px for out in (shadowed, plain))
     assert error < 1.1 * expected + 0.005
@@ -130,7 +130,7 @@ def test_frames_with_and_without_shadows_do_not_influence_one_another():
     frames = torch.cat((camera(True), camera(False)))
     together, alone = pipe(frames), [pipe(frame[None]) for frame in frames]
     for k, one in enumerate(alone):
-        assert torch.equal(together.contact[k], one.contact[0])
+        assert torch.equal(together.deformed[k], one.deformed[0])
         assert float((together.depth_mm[k] - one.depth_mm[0]).abs().max()) < 1e-4
 
 
@@ -206,7 +206,7 @@ def test_a_tilted_punch_larger_than_half_of_the_image_is_no_drift(ring, small_se
 @pytest.mark.parametrize("factor", [1.0, 0.9, 0.75])
 @pytest.mark.parametrize("touched", [0.0, 0.4])
 def test_a_response_field_levels_up_to_a_quarter(small_sensor, factor, touched):
-    field = vts.model.response_field.ResponseField(0, -1, False, 10.0, ((0.3, 0, 0), (0, 0.3, 0)))
+    field = vts.model.response_field.ResponseField(0, -1, 10.0, ((0.3, 0, 0), (0, 0.3, 0)))
     model = vts.model.response_field.ResponseModel(field, None)
     background = 0.5 + 0.004 * torch.randn(3, 120, 160, generator=torch.Generator().manual_seed(0))
     image = background + 0.004 * torch.randn(3, 120, 160, generator=torch.Generator().manual_seed(1))
@@ -277,7 +277,7 @@ def test_no_contact_is_exactly_zero(mixed, small_sensor, mode):
 def test_gradients_outside_contact_are_zero(mixed, small_sensor):
     lights, frames = mixed
     out = pipeline(lights, small_sensor)(frames)
-    assert out.gradient[(~out.contact).expand_as(out.gradient)].abs().max() == 0
+    assert out.gradient[(~out.deformed).expand_as(out.gradient)].abs().max() == 0
 
 
 def loop(pipe):

@@ -20,7 +20,7 @@ SIZE = (120, 160)
 def frame(height_mm, T):
     """An exact press as a DepthOutput."""
     scene = objects.press(height_mm, T, *SIZE, PITCH)
-    return vts.DepthOutput(scene.depth_mm, scene.gradient, scene.normal, scene.contact)
+    return vts.DepthOutput(scene.depth_mm, scene.gradient, scene.normal, scene.contact, scene.contact)
 
 
 def off(found, truth, middle=(0.0, 0.0, 0.0)):
@@ -113,7 +113,9 @@ def test_turning_both_frames_turns_the_pose(letters, reference):
     found = vts.register_depth(moved, reference, PITCH)
 
     def half_turn(f):
-        return vts.DepthOutput(*(t.flip((2, 3)) * s for t, s in zip(f, (1, -1, torch.tensor([-1, -1, 1])[:, None, None], True))))
+        return vts.DepthOutput(
+            *(t.flip((2, 3)) * s for t, s in zip(f, (1, -1, torch.tensor([-1, -1, 1])[:, None, None], True, True)))
+        )
 
     other = vts.register_depth(half_turn(moved), half_turn(reference), PITCH)
     half = objects.pose(180.0, press_mm=0.0)
@@ -169,7 +171,9 @@ def hanging_ball(x0, y0, press, seed):
     coarse = 0.03 * torch.randn(1, 2, 8, 10, generator=torch.Generator().manual_seed(seed))
     error = torch.nn.functional.interpolate(coarse, SIZE, mode="bicubic", align_corners=True)
     gradient = (scene.gradient + error) * scene.contact
-    return vts.DepthOutput(vts.integration.poisson_background(gradient, PITCH), gradient, scene.normal, scene.contact)
+    return vts.DepthOutput(
+        vts.integration.poisson_background(gradient, PITCH), gradient, scene.normal, scene.contact, scene.contact
+    )
 
 
 def test_a_ball_with_skin_hanging_around_it_is_still_a_ball():

@@ -22,7 +22,7 @@ from torchvts.calibration.balls import guess_circle
 from torchvts.calibration.by_presses import with_preprocessing
 from torchvts.calibration.contacts import read_contacts
 from torchvts.evaluation import metrics
-from torchvts.model.response_field import CHANGE_SCALE, ResponseField, fit_log_background
+from torchvts.model.response_field import CHANGE_SCALE, ResponseField, fit_log_background, sine_from_slope
 
 HEIGHT, WIDTH, PITCH = 120, 160, 0.125
 SIZE = (HEIGHT, WIDTH, PITCH)
@@ -63,18 +63,19 @@ def noisy(image, seed):
 
 
 def true_field():
-    """dz/dx from R against G and B, dz/dy from G against B, varying linearly over the image."""
+    """Sine along x from R against G and B, along y from G against B, varying linearly over the image."""
     base = 0.7 * torch.tensor([[0.5, -0.25, -0.25], [0.0, 0.43, -0.43]], dtype=torch.float64)
     rows = torch.zeros(2, 3, 3, dtype=torch.float64)
     rows[:, :, 0] = base
     rows[:, :, 1:] = 0.1 * torch.randn(2, 3, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    return ResponseField(1, -1, False, 0.5 * WIDTH * PITCH, rows.reshape(2, 9).tolist())
+    return ResponseField(1, -1, 0.5 * WIDTH * PITCH, rows.reshape(2, 9).tolist())
 
 
 def seen_by_field(scene, seed):
-    """The smallest change of the three channels that the true field makes this slope of."""
+    """The smallest change of the three channels that the true field makes this sine of."""
     maps = true_field().maps(*SIZE).permute(2, 3, 1, 0)  # (H, W, 2, 3)
-    change = CHANGE_SCALE * torch.einsum("hwki,ihw->khw", torch.linalg.pinv(maps), scene.gradient[0].double())
+    sine = sine_from_slope(scene.gradient[0].double())
+    change = CHANGE_SCALE * torch.einsum("hwki,ihw->khw", torch.linalg.pinv(maps), sine)
     y, x = torch.meshgrid(torch.linspace(-1, 1, HEIGHT), torch.linspace(-1, 1, WIDTH), indexing="ij")
     return noisy(torch.stack((0.45 + 0.1 * x, 0.4 - 0.1 * y, 0.42 - 0.1 * x * y)) * (1 + change.float()), seed)
 
@@ -214,7 +215,7 @@ def test_the_candidates_are_reported_with_their_scores(unit):
     fast = [row for row in rows[1:] if row["passes"] == 1 and "preprocessed with" not in row["model"]]
     assert [row["parameters"] for row in fast] == sorted(row["parameters"] for row in fast)
     best = min(row["score_deg"] for row in fast)
-    chosen = next(row for row in fast if row["parameters"] == 2 * calibration.response.fast.size())
+    chosen = next(row for row in fast if row["parameters"] == 2 * calibration.response.field.size())
     assert chosen["score_deg"] <= 1.02 * best
     assert all(row["score_deg"] > 1.02 * best for row in fast if row["parameters"] < chosen["parameters"])
 
@@ -232,7 +233,7 @@ def test_the_true_field_is_found_where_the_balls_were(unit):
     name, _, _, _, calibration, _ = unit
     if name != "field":
         pytest.skip("the other unit has no field for its truth")
-    truth, found = true_field(), calibration.response.fast
+    truth, found = true_field(), calibration.response.field
     assert found.half_mm == truth.half_mm
     maps, want = found.maps(*SIZE)[:3], truth.maps(*SIZE)
     inverse = torch.linalg.pinv(want.permute(2, 3, 1, 0))  # changes as they occur on this unit
@@ -255,14 +256,14 @@ def test_the_calibration_survives_a_file(unit, tmp_path):
 def test_calibrating_twice_gives_the_same_parameters(by_good, good, rest):
     one, two = by_good, calibrate(rest, GIVEN, good)[0]
     # LAPACK's last digit depends on where its arrays lie in memory
-    for first, second in ((one.response.fast, two.response.fast), (one.response.precise, two.response.precise)):
+    for first, second in ((one.response.field, two.response.field), (one.response.by_depth, two.response.by_depth)):
         assert torch.allclose(first.tensor(), second.tensor(), rtol=1e-9, atol=1e-11)
     assert one.report["reason"] == two.report["reason"]
 
 
 def test_the_order_of_the_presses_does_not_matter(by_good, good, rest):
     one, two = by_good.response, calibrate(rest, GIVEN, good[::-1])[0].response
-    for field in ("fast", "precise"):
+    for field in ("field", "by_depth"):
         left, right = getattr(one, field), getattr(two, field)
         assert torch.allclose(left.tensor(), right.tensor(), rtol=0, atol=1e-6)
 
@@ -288,7 +289,7 @@ def test_a_unit_of_length_does_not_matter(by_good, good, rest):
     two, _ = calibrate(rest, double, [dataclasses.replace(p, ball_diameter_mm=2 * BALL_MM) for p in good])
     for row, other in zip(one.report["presses"], two.report["presses"]):
         assert other["center_px"] == pytest.approx(row["center_px"], abs=1e-4)
-    left, right = one.response.fast, two.response.fast
+    left, right = one.response.field, two.response.field
     assert (left.degree, left.product_degree, 2 * left.half_mm) == (right.degree, right.product_degree, right.half_mm)
     assert torch.allclose(left.tensor(), right.tensor(), rtol=0, atol=1e-5)
 
@@ -308,7 +309,7 @@ def test_double_precision_and_gradients_in_images_do_no_harm(good, rest):
     presses = [dataclasses.replace(p, image=p.image.double().requires_grad_()) for p in good[:3]]
     double, _ = calibrate(rest.double(), GIVEN, presses)
     assert double.background.dtype == torch.float64
-    assert torch.allclose(double.response.fast.tensor(), plain.response.fast.tensor(), rtol=0, atol=1e-5)
+    assert torch.allclose(double.response.field.tensor(), plain.response.field.tensor(), rtol=0, atol=1e-5)
 
 
 # point lights
@@ -385,7 +386,7 @@ def prior_alone(prior):
 
 
 def test_a_prior_tells_what_it_was_fitted_on(prior):
-    assert prior.source == "unit A, ball of 6 mm" and prior.response.gamma == 1.0 and prior.response.precise is not None
+    assert prior.source == "unit A, ball of 6 mm" and prior.response.gamma == 1.0 and prior.response.by_depth is not None
     assert prior.half_mm == pytest.approx(0.5 * WIDTH * PITCH)
     smooth = prior.background(*SIZE)
     assert float((smooth / background() - 1).abs().mean()) < 0.02

@@ -189,9 +189,10 @@ def unit(by, height=HEIGHT, width=WIDTH, pitch=PITCH, dtype=torch.float32):
     if by == "lights":
         return vts.Calibration.from_lights(lights, sensor, background)
     random = torch.Generator().manual_seed(3)
-    families = [vts.calibration.field.Family(1, 1, deep, 20.0) for deep in (False, True)]
-    fast, precise = (f.field(0.1 * torch.randn(f.size(), generator=random, dtype=torch.float64)) for f in families)
-    return vts.Calibration.from_response(ResponseModel(fast, precise), sensor, background)
+    family = vts.calibration.field.Family(1, 1, 20.0)
+    field = family.field(0.1 * torch.randn(family.size(), generator=random, dtype=torch.float64))
+    by_depth = vts.model.DepthBrightness(1, 20.0, 0.1 * torch.randn(3, 3, generator=random, dtype=torch.float64))
+    return vts.Calibration.from_response(ResponseModel(field, by_depth), sensor, background)
 
 
 def press_image(calibration, kind, seed=0):
@@ -256,7 +257,7 @@ def test_gradients_through_single_blocks_are_finite(kind, by):
     compensated = pipe.compensate(image)
     depth_mm = torch.zeros(1, 1, HEIGHT, WIDTH).requires_grad_()
     normals = [pipe.normals(compensated), pipe.normals(compensated, depth_mm)]
-    total = sum(normal.sum() for normal in normals) + pipe.contact.soft(compensated).sum()
+    total = sum(normal.sum() for normal in normals) + pipe.deformed.soft(compensated).sum()
     for slope in torch.autograd.grad(total, (image, depth_mm)):
         assert bool(torch.isfinite(slope).all())
 

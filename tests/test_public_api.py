@@ -68,9 +68,9 @@ def test_arguments_keep_their_names_and_order(call):
 
 
 def test_results_have_their_fields_in_order():
-    assert vts.DepthOutput._fields == ("depth_mm", "gradient", "normal", "contact")
-    assert ConfidentOutput._fields[:4] == vts.DepthOutput._fields
-    assert ConfidentOutput._fields[4:] == vts.pipeline.confidence.Bounds._fields
+    assert vts.DepthOutput._fields == ("depth_mm", "gradient", "normal", "contact", "deformed")
+    assert ConfidentOutput._fields[:5] == vts.DepthOutput._fields
+    assert ConfidentOutput._fields[5:] == vts.pipeline.confidence.Bounds._fields
     assert {"lights", "converged", "loss_history", "direction_std_deg", "message"} <= set(LightFit.__dataclass_fields__)
 
 

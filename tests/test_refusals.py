@@ -42,13 +42,13 @@ RECORDS = {
 }  # fmt: skip
 """Results that users get and do not make: their constructors keep what they are given. (Their methods are in the table.)"""
 PARTS = {
-    "Adaptive", "Integrator", "NormalModel", "Once", "Repeat", "ResponseField", "ResponseModel", "SensorPrior", "Shadows", "Solve",
-    "WrappedIntegrator", "WrappedNormals", "as_integrator", "as_normal_model", "by_presses", "channel_structure",
-    "check_calibration", "check_domain",
-    "check_sensor", "discontinuity_share", "falloff", "label_contacts", "outwardness", "read_point_cloud",
-    "with_preprocessing", "write_point_cloud", "stream.NewestFrame", "stream.Overlay", "stream.StageClock", "stream.StreamReport.",
-    "stream.VideoFile.", "stream.Window", "stream.Recording.", "stream.RectifySizes", "stream.FrameCheck.", "stream.calibrate_unit",
-    "stream.frames_a_second", "stream.read_background", "stream.read_press_images", "stream.use_calibration",
+    "Adaptive", "DepthBrightness", "Integrator", "NormalModel", "Once", "Repeat", "ResponseField", "ResponseModel",
+    "SensorPrior", "Shadows", "SlopesOfDepth", "Solve", "WrappedIntegrator", "WrappedNormals", "as_integrator",
+    "as_normal_model", "by_presses", "channel_structure", "check_calibration", "check_domain", "check_sensor",
+    "discontinuity_share", "falloff", "label_contacts", "outwardness", "read_point_cloud", "stream.FrameCheck.",
+    "stream.NewestFrame", "stream.Overlay", "stream.Recording.", "stream.RectifySizes", "stream.StageClock",
+    "stream.StreamReport.", "stream.VideoFile.", "stream.Window", "stream.calibrate_unit", "stream.frames_a_second",
+    "stream.read_background", "stream.read_press_images", "stream.use_calibration", "with_preprocessing", "write_point_cloud",
 }  # fmt: skip
 """Names, and with a dot at the end methods, that other tests cover: records, base classes, what one room does for another."""
 FREE = {"dtype", "seed", "report", "comment", "clock", "sleep"}

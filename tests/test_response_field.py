@@ -15,79 +15,89 @@ import yaml
 import torchvts as vts
 from torchvts.core.blur import blur, gaussian_weights
 from torchvts.core.files import load_tensors
-from torchvts.core.geometry import gradient_from_normal
-from torchvts.model.response_field import ResponseField, ResponseModel, SensorPrior, fit_log_background
+from torchvts.core.geometry import gradient_from_normal, gradient_of_depth
+from torchvts.model.response_field import (
+    MAX_SLOPE,
+    DepthBrightness,
+    ResponseField,
+    ResponseModel,
+    SensorPrior,
+    fit_log_background,
+    sine_from_slope,
+    slope_from_sine,
+)
 
-FAMILIES = [(0, -1, False), (0, -1, True), (1, -1, False), (2, 1, False), (1, 2, True), (3, 3, True)]
+FAMILIES = [(0, -1), (1, -1), (2, 1), (1, 2), (3, 3)]
 CHANGE_SCALE = 0.3  # stated in the definition
-DEPTH_SQUARED = False  # whether the depth times itself is a term
+PAIRS = [(i, k) for i in range(3) for k in range(i, 3)]
 
 
-def pairs(inputs):
-    """Products of two inputs, in order."""
-    return [(i, k) for i in range(inputs) for k in range(i, inputs) if DEPTH_SQUARED or i < 3]
-
-
-def count_by_hand(degree, product_degree, uses_depth):
+def count_by_hand(degree, product_degree):
     monomials = [(d + 1) * (d + 2) // 2 for d in (degree, product_degree)]
-    products = len(pairs(4 if uses_depth else 3)) if product_degree >= 0 else 0
-    return (6 if uses_depth else 3) * monomials[0] + products * monomials[1]
+    return 3 * monomials[0] + (len(PAIRS) * monomials[1] if product_degree >= 0 else 0)
 
 
-def random_field(degree, product_degree, uses_depth, half_mm=9.0, size=0.1, seed=0):
-    """Coefficients of six digits, which plain text keeps."""
-    count = count_by_hand(degree, product_degree, uses_depth)
-    numbers = torch.randn(2, count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * size
-    rows = tuple(tuple(float(f"{v:.6g}") for v in row) for row in numbers.tolist())
-    return ResponseField(degree, product_degree, uses_depth, half_mm, rows)
+def random_rows(rows, count, size, seed):
+    """Numbers of six digits, which plain text keeps."""
+    numbers = torch.randn(rows, count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * size
+    return tuple(tuple(float(f"{v:.6g}") for v in row) for row in numbers.tolist())
+
+
+def random_field(degree, product_degree, half_mm=9.0, size=0.1, seed=0):
+    return ResponseField(degree, product_degree, half_mm, random_rows(2, count_by_hand(degree, product_degree), size, seed))
+
+
+def random_by_depth(degree=2, half_mm=9.0, size=0.1, seed=1):
+    return DepthBrightness(degree, half_mm, random_rows(3, (degree + 1) * (degree + 2) // 2, size, seed))
+
+
+def polynomial_by_hand(numbers, degree, row, column, height, width, pitch, half_mm):
+    u, v = ((place - (size - 1) / 2) * pitch / half_mm for place, size in ((column, width), (row, height)))
+    return sum(next(numbers) * u**i * v**j for i in range(degree + 1) for j in range(degree + 1 - i))
 
 
 def maps_by_hand(field, height, width, pitch):
     """W_t(x, y) from the definition, pixel by pixel: (terms, 2, H, W)."""
-    degrees = [field.degree] * (6 if field.uses_depth else 3)
-    if field.product_degree >= 0:
-        degrees += [field.product_degree for _ in pairs(4 if field.uses_depth else 3)]
+    degrees = [field.degree] * 3 + ([field.product_degree] * len(PAIRS) if field.product_degree >= 0 else [])
     out = np.zeros((len(degrees), 2, height, width))
     for row in range(height):
         for column in range(width):
-            u = (column - (width - 1) / 2) * pitch / field.half_mm
-            v = (row - (height - 1) / 2) * pitch / field.half_mm
             for axis in range(2):
                 numbers = iter(field.coefficient[axis])
                 for term, degree in enumerate(degrees):
-                    for i in range(degree + 1):
-                        for j in range(degree + 1 - i):
-                            out[term, axis, row, column] += next(numbers) * u**i * v**j
+                    place = (row, column, height, width, pitch, field.half_mm)
+                    out[term, axis, row, column] = polynomial_by_hand(numbers, degree, *place)
     return out
 
 
-def slope_by_hand(field, change, depth, pitch):
-    """Slope from the definition: change (3, H, W), depth (H, W) or None, to (2, H, W)."""
-    inputs = [channel / CHANGE_SCALE for channel in change] + ([depth] if field.uses_depth else [])
-    terms = list(inputs)
-    if field.uses_depth:  # its own slopes are inputs too, but have no products
-        terms += [np.gradient(depth, pitch, axis=1), np.gradient(depth, pitch, axis=0)]
+def sine_by_hand(field, change, pitch):
+    """Sine from the definition: change (3, H, W) to (2, H, W)."""
+    terms = [channel / CHANGE_SCALE for channel in change]
     if field.product_degree >= 0:
-        terms += [inputs[i] * inputs[k] for i, k in pairs(len(inputs))]
+        terms += [terms[i] * terms[k] for i, k in PAIRS]
     maps = maps_by_hand(field, *change.shape[1:], pitch)
     assert len(terms) == len(maps)
     return sum(map_of_term * term for map_of_term, term in zip(maps, terms))
 
 
+def per_mm_by_hand(by_depth, height, width, pitch):
+    out = np.zeros((3, height, width))
+    for channel, row, column in np.ndindex(*out.shape):
+        place = (row, column, height, width, pitch, by_depth.half_mm)
+        out[channel, row, column] = polynomial_by_hand(iter(by_depth.coefficient[channel]), by_depth.degree, *place)
+    return out
+
+
 def model(gamma=1.0, blur_px=1.0, **kwargs):
-    return ResponseModel(random_field(2, 1, False, **kwargs), random_field(2, 1, True, seed=1, **kwargs), gamma, blur_px)
+    return ResponseModel(random_field(2, 1, **kwargs), random_by_depth(), gamma, blur_px)
 
 
 # the field
 
 
 def test_the_terms_are_the_inputs_and_then_their_products():
-    assert random_field(2, -1, False).terms() == [(0,), (1,), (2,)]
-    assert random_field(1, 1, False).terms() == [(0,), (1,), (2,), (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
-    deep = random_field(0, 0, True).terms()
-    assert deep[:6] == [(0,), (1,), (2,), (3,), (4,), (5,)] and deep[6:10] == [(0, 0), (0, 1), (0, 2), (0, 3)]
-    assert len(deep) == len(set(deep)) == 15 + DEPTH_SQUARED and ((3, 3) in deep) == DEPTH_SQUARED
-    assert all(len(term) > 0 for term in deep)  # none is constant
+    assert random_field(2, -1).terms() == [(0,), (1,), (2,)]
+    assert random_field(1, 1).terms() == [(0,), (1,), (2,), (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]  # none is constant
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -102,24 +112,42 @@ def test_maps_are_those_of_the_definition(family):
     assert field.maps(5, 7, 0.3).numpy() == pytest.approx(maps_by_hand(field, 5, 7, 0.3), abs=1e-12)
 
 
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_maps_of_depth_are_those_of_the_definition(degree):
+    by_depth = random_by_depth(degree, half_mm=0.9)
+    assert by_depth.maps(5, 7, 0.3).numpy() == pytest.approx(per_mm_by_hand(by_depth, 5, 7, 0.3), abs=1e-12)
+
+
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_larger_family_holds_the_same_field(family):
     field = random_field(*family, half_mm=2.0)
-    for larger in ((3, 3, True), (4, 5, True)):
+    for larger in ((3, 3), (4, 5)):
         larger_field = field.embedded(*larger)
-        assert (larger_field.degree, larger_field.product_degree, larger_field.uses_depth, larger_field.half_mm) == (*larger, 2.0)
+        assert (larger_field.degree, larger_field.product_degree, larger_field.half_mm) == (*larger, 2.0)
         maps, old = dict(zip(larger_field.terms(), larger_field.maps(6, 8, 0.5))), dict(zip(field.terms(), field.maps(6, 8, 0.5)))
         for term, values in maps.items():
             expected = old.get(term, torch.zeros(2, 6, 8, dtype=torch.float64))
             assert torch.allclose(values, expected, rtol=0, atol=1e-12), term
 
 
-@pytest.mark.parametrize("smaller", [(0, 1, False), (1, -1, False), (1, 0, False)])
+@pytest.mark.parametrize("smaller", [(0, 1), (1, -1), (1, 0)])
 def test_a_smaller_family_is_refused(smaller):
-    with pytest.raises(ValueError, match="degree, product_degree, uses_depth: expected a family that holds"):
-        random_field(1, 1, False).embedded(*smaller)
-    with pytest.raises(ValueError, match="expected a family that holds"):
-        random_field(1, 1, True).embedded(3, 3, False)
+    with pytest.raises(ValueError, match="degree, product_degree: expected a family that holds"):
+        random_field(1, 1).embedded(*smaller)
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.1, 1.0, 3.0])
+def test_slope_and_sine_are_those_of_one_angle(scale):
+    slope = scale * torch.randn(2, 50, generator=torch.Generator().manual_seed(1), dtype=torch.float64).clamp(-0.6, 0.6)
+    sine, length = sine_from_slope(slope), slope.norm(dim=0)
+    assert torch.allclose(sine.norm(dim=0), torch.sin(torch.atan(length)), atol=1e-12)
+    assert torch.allclose(slope_from_sine(sine), slope, atol=1e-9)
+
+
+def test_a_sine_beyond_the_steepest_counts_as_the_steepest():
+    slope = slope_from_sine(torch.tensor([[0.0, 3.0], [2.0, -4.0]], dtype=torch.float64))
+    assert slope.norm(dim=0).tolist() == pytest.approx([MAX_SLOPE, MAX_SLOPE])
+    assert slope[:, 1].tolist() == pytest.approx([0.6 * MAX_SLOPE, -0.8 * MAX_SLOPE])
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -127,16 +155,18 @@ def test_a_field_survives_plain_text(family):
     field = random_field(*family)
     assert ResponseField.from_dict(json.loads(json.dumps(field.to_dict())), "file") == field
     assert ResponseField.from_dict(yaml.safe_load(yaml.safe_dump(field.to_dict())), "file") == field
+    by_depth = random_by_depth(seed=3)
+    assert DepthBrightness.from_dict(json.loads(json.dumps(by_depth.to_dict())), "file") == by_depth
 
 
 def test_a_field_of_any_numbers_survives_to_seven_digits():
-    fine = ResponseField(0, -1, False, 1 / 3, ((1 / 3, 2 / 3, -1e-9 / 7), (1e9 / 7, 0, 1)))
+    fine = ResponseField(0, -1, 1 / 3, ((1 / 3, 2 / 3, -1e-9 / 7), (1e9 / 7, 0, 1)))
     again = ResponseField.from_dict(fine.to_dict(), "file")
     assert torch.allclose(again.tensor(), fine.tensor(), rtol=1e-6, atol=0)
     assert again.to_dict() == fine.to_dict()
 
 
-REST = {"degree": 0, "product_degree": -1, "uses_depth": False, "half_mm": 1.0, "coefficient": [[0, 0, 0], [0, 0, 0]]}
+REST = {"degree": 0, "product_degree": -1, "half_mm": 1.0, "coefficient": [[0, 0, 0], [0, 0, 0]]}
 BAD_FIELDS = {
     "degree too high": ({"degree": 7}, "degree: expected at most 6, got 7"),
     "degree below zero": ({"degree": -1}, "degree: expected at least 0, got -1"),
@@ -144,7 +174,6 @@ BAD_FIELDS = {
     "degree a truth value": ({"degree": True}, "degree: expected an integer, got bool"),
     "product degree too high": ({"product_degree": 7}, "product_degree: expected at most 6, got 7"),
     "product degree below -1": ({"product_degree": -2}, "product_degree: expected at least -1, got -2"),
-    "depth as a number": ({"uses_depth": 1}, "uses_depth: expected true or false, got 1"),
     "no scale": ({"half_mm": 0}, "half_mm: expected a number above 0"),
     "NaN scale": ({"half_mm": float("nan")}, "half_mm: expected a number above 0 and finite"),
     "scale as text": ({"half_mm": "10"}, "half_mm: expected a number, got str"),
@@ -182,12 +211,16 @@ def test_unknown_and_missing_keys_are_named():
             SensorPrior.from_dict(values, "unit.yaml")
 
 
-def test_a_model_wants_its_fields_in_their_places():
-    shallow, deep = random_field(1, -1, False), random_field(1, -1, True)
-    with pytest.raises(ValueError, match="fast: expected a field that does not use depth"):
+def test_a_model_wants_its_parts_in_their_places():
+    shallow, deep = random_field(1, -1), random_by_depth(1)
+    with pytest.raises(TypeError, match="field: expected a ResponseField"):
         ResponseModel(deep, None)
-    with pytest.raises(ValueError, match="precise: expected a field that uses depth"):
+    with pytest.raises(TypeError, match="by_depth: expected a DepthBrightness or None"):
         ResponseModel(shallow, shallow)
+    with pytest.raises(ValueError, match="degree: expected at most 2, got 3"):
+        DepthBrightness(3, 1.0, ((0.0,) * 10,) * 3)
+    with pytest.raises(ValueError, match="coefficient: expected 3 x 3 numbers"):
+        DepthBrightness(1, 1.0, ((0.0,) * 6,) * 3)
     for value in (0, -1, float("nan"), 11):
         with pytest.raises(ValueError, match="gamma: expected a number in"):
             ResponseModel(shallow, deep, gamma=value)
@@ -206,7 +239,7 @@ def test_three_times_the_pixels_see_the_same_field(family):
 
 
 def test_twice_the_pixels_see_the_same_field():
-    field = random_field(1, 1, True, half_mm=2.0)  # linear in position: the mean of four is the value in their middle
+    field = random_field(1, 1, half_mm=2.0)  # linear in position: the mean of four is the value in their middle
     coarse, fine = field.maps(6, 8, 0.5), field.maps(12, 16, 0.25)
     mean = torch.nn.functional.avg_pool2d(fine.flatten(0, 1), 2).reshape(coarse.shape)
     assert torch.allclose(mean, coarse, rtol=0, atol=1e-12)
@@ -215,10 +248,10 @@ def test_twice_the_pixels_see_the_same_field():
 # normals
 
 
-def normals(uses_precise=True, dtype=torch.float64, height=6, width=7, pitch=0.4, max_slope=3.0, size=0.1):
-    fast = random_field(2, 1, False, half_mm=1.4, size=size)
-    precise = random_field(2, 2, True, half_mm=1.4, size=size, seed=1) if uses_precise else None
-    return fast, precise, vts.NormalFromResponse(fast, precise, height, width, pitch, max_slope, dtype)
+def normals(uses_depth=True, dtype=torch.float64, height=6, width=7, pitch=0.4, size=0.1):
+    field = random_field(2, 1, half_mm=1.4, size=size)
+    by_depth = random_by_depth(2, 1.4, 0.03) if uses_depth else None
+    return field, by_depth, vts.NormalFromResponse(field, by_depth, height, width, pitch, dtype)
 
 
 def random_image(batch=2, height=6, width=7, spread=0.2):
@@ -235,44 +268,29 @@ def test_an_unchanged_image_has_slope_zero_exactly():
 
 
 @pytest.mark.parametrize("with_depth", [False, True])
-def test_normals_have_the_slopes_of_the_definition(with_depth):
-    fast, precise, block = normals()
+def test_normals_have_the_sines_of_the_definition(with_depth):
+    field, by_depth, block = normals()
     image, depth = random_image()
     normal = block(image, depth if with_depth else None)
-    slope = gradient_from_normal(normal)
     assert torch.allclose(normal.norm(dim=1), torch.ones(2, 6, 7, dtype=torch.float64), atol=1e-12)
     for b in range(2):
-        field = precise if with_depth else fast
-        expected = slope_by_hand(field, image[b].numpy() - 1.0, depth[b, 0].numpy(), 0.4)
-        assert np.hypot(*expected).max() < 3.0  # nothing is cut
-        assert slope[b].numpy() == pytest.approx(expected, abs=1e-9)
+        change = image[b].numpy() - 1.0
+        if with_depth:
+            change = change - per_mm_by_hand(by_depth, 6, 7, 0.4) * depth[b].numpy()
+        expected = sine_by_hand(field, change, 0.4)
+        assert np.hypot(*expected).max() < 0.9  # nothing is cut
+        assert -normal[b, :2].numpy() == pytest.approx(expected, abs=1e-9)
 
 
-def test_depth_changes_the_slope_as_its_terms_say():
-    """A field that repeats the fast one, and adds a tenth of R's change times the depth to dz/dx."""
-    fast = random_field(1, -1, False, half_mm=1.4)
-    deep = fast.embedded(1, 0, True)
-    rows = [list(row) for row in deep.coefficient]
-    rows[0][6 * 3 + deep.terms()[6:].index((0, 3))] = 0.1
-    block = vts.NormalFromResponse(fast, dataclasses.replace(deep, coefficient=rows), 6, 7, 0.4, dtype=torch.float64)
-    image, depth = random_image()
-    before, after = (gradient_from_normal(block(image, d)) for d in (None, depth))
-    assert torch.allclose(after[:, 0] - before[:, 0], 0.1 * (image[:, 0] - 1.0) / CHANGE_SCALE * depth[:, 0], atol=1e-12)
-    assert torch.allclose(after[:, 1], before[:, 1], atol=1e-12)
-
-
-def test_slopes_of_the_depth_are_inputs():
-    """A field that heeds nothing but the depth's slopes, a half of one and a third of the other, gives just those."""
-    deep = ResponseField(0, -1, True, 1.4, ((0, 0, 0, 0, 0.5, 0), (0, 0, 0, 0, 0, 1 / 3)))
-    block = vts.NormalFromResponse(random_field(1, -1, False), deep, 6, 7, 0.4, dtype=torch.float64)
-    image, depth = random_image()
-    slope = gradient_from_normal(block(image, depth)).numpy()
-    p, q = np.gradient(depth.numpy(), 0.4, axis=3)[:, 0] / 2, np.gradient(depth.numpy(), 0.4, axis=2)[:, 0] / 3
-    assert slope == pytest.approx(np.stack((p, q), axis=1), abs=1e-9)
+def test_a_flat_skin_at_a_depth_is_flat_in_the_second_pass():
+    _, by_depth, block = normals()
+    image = 1.0 + 0.7 * by_depth.maps(6, 7, 0.4)[None]
+    assert float(block(image)[:, :2].abs().max()) > 1e-3
+    assert float(block(image, torch.full((1, 1, 6, 7), 0.7, dtype=torch.float64))[:, :2].abs().max()) < 1e-12
 
 
 def test_a_message_is_short_though_the_field_is_large():
-    field = random_field(4, 3, True)
+    field = random_field(4, 3)
     rows = [list(row) for row in field.coefficient]
     rows[0][7] = float("nan")
     with pytest.raises(ValueError, match="coefficient: expected finite numbers, got") as caught:
@@ -281,22 +299,44 @@ def test_a_message_is_short_though_the_field_is_large():
 
 
 def test_steepness_is_bounded_and_its_direction_kept():
-    _, _, block = normals(max_slope=0.7, size=1.0)
-    _, _, free = normals(max_slope=1e9, size=1.0)
-    image, depth = random_image(spread=0.9)
-    bound, wild = (gradient_from_normal(b(image, depth), 1e9) for b in (block, free))
-    steep, length = wild.norm(dim=1), bound.norm(dim=1)
-    assert float(steep.max()) > 2.0 and float(length.max()) <= 0.7 * (1 + 1e-9)
-    expected = wild * (0.7 / steep).clamp_max(1.0)[:, None]
-    assert torch.allclose(bound, expected, atol=1e-9)
+    field, _, block = normals(size=1.0)
+    image, _ = random_image(spread=0.9)
+    normal = block(image)
+    expected = np.stack([sine_by_hand(field, one.numpy() - 1.0, 0.4) for one in image])
+    length, found = np.hypot(expected[:, 0], expected[:, 1]), gradient_from_normal(normal, 1e9).norm(dim=1).numpy()
+    assert length.max() > 2.0 and found.max() == pytest.approx(MAX_SLOPE)
+    direction = -normal[:, :2].numpy() / np.hypot(*normal[:, :2].numpy().swapaxes(0, 1))[:, None]
+    assert direction == pytest.approx(expected / length[:, None], abs=1e-9)
 
 
-def test_depth_is_refused_where_no_field_takes_it():
-    _, _, block = normals(uses_precise=False)
+def test_depth_is_refused_where_nothing_is_known_about_it():
+    _, _, block = normals(uses_depth=False)
     image, depth = random_image()
     assert block.uses_depth is False
-    with pytest.raises(ValueError, match="depth_mm: expected None, because this response has no field with depth: use mode 'fast'"):
+    with pytest.raises(
+        ValueError, match="depth_mm: expected None, because this response does not say what depth does to brightness"
+    ):
         block(image, depth)
+
+
+@pytest.mark.parametrize("mode", ["precise", "auto"])
+@pytest.mark.parametrize("by_depth", [None, random_by_depth(2, 1.4)])
+def test_normals_of_the_output_are_those_of_the_depth(mode, by_depth):
+    """Also of a unit of whose depth nothing is known: its second pass is integration alone."""
+    sensor = vts.Sensor("small", 48, 64, 0.1)
+    background = torch.full((3, 48, 64), 0.4)
+    unit = vts.Calibration.from_response(
+        ResponseModel(ResponseField(0, -1, 1.4, ((0.6, 0, 0), (0, 0.6, 0))), by_depth), sensor, background
+    )
+    image = background.clone()
+    image[:, 15:35, 20:45] += 0.1 * torch.rand(3, 20, 25, generator=torch.Generator().manual_seed(0))
+    fast, again = (vts.DepthPipeline.from_calibration(unit, m)(image[None]) for m in ("fast", mode))
+    inside = fast.contact.expand(-1, 2, -1, -1)
+    slope = gradient_of_depth(again.depth_mm, 0.1)
+    assert bool(fast.contact.any()) and torch.allclose(again.gradient[inside], slope[inside], atol=1e-6)
+    assert float((again.gradient - fast.gradient).abs().max()) > 0.01  # a rough image is no surface
+    if by_depth is None:
+        assert torch.allclose(again.depth_mm, fast.depth_mm, atol=1e-6)
 
 
 def test_an_image_of_another_shape_is_refused():
@@ -323,7 +363,7 @@ def test_the_coarse_block_is_every_eighth_pixel():
     x, y = (torch.arange(n, dtype=torch.float64) for n in (50, 41))
     depth = (0.3 * x - 0.2 * y[:, None]).expand(2, 1, 41, 50)  # the same slopes at any pitch
     coarse = block.coarse(8)
-    assert coarse.uses_depth and coarse.max_slope == block.max_slope
+    assert coarse.uses_depth
     for d in (None, depth):
         small = None if d is None else d[..., 4::8, 4::8]
         assert torch.allclose(coarse(image[..., 4::8, 4::8], small), block(image, d)[..., 4::8, 4::8], rtol=0, atol=1e-12)
@@ -468,25 +508,24 @@ def put(value, *path):
 NAN = float("nan")
 METADATA = {
     "a list": (put([1], "response"), "response: expected keys and values, got list"),
-    "empty": (put({}, "response"), "response: key 'fast': missing"),
+    "empty": (put({}, "response"), "response: key 'field': missing"),
     "a text": (put("x", "response"), "response: expected keys and values, got str"),
     "none, and no lights": (put(None, "response"), "tensor 'light_position_mm' is missing"),
-    "no first field": (put(None, "response", "fast"), "response: key fast: expected a field that does not use depth"),
-    "first field missing": (put(KeyError, "response", "fast"), "response: key 'fast': missing"),
-    "second field missing": (put(KeyError, "response", "precise"), "response: key 'precise': missing"),
+    "no field": (put(None, "response", "field"), "response: key field: expected a ResponseField"),
+    "field missing": (put(KeyError, "response", "field"), "response: key 'field': missing"),
+    "depth missing": (put(KeyError, "response", "by_depth"), "response: key 'by_depth': missing"),
     "an unknown key": (put(1, "response", "colour"), "response: key 'colour': unknown"),
-    "an unknown key of a field": (put(1, "response", "fast", "colour"), "response: fast: key 'colour': unknown"),
-    "NaN": (put(NAN, "response", "fast", "coefficient", 0, 3), "response: fast: key coefficient: expected finite numbers"),
-    "infinite": (put(-1e999, "response", "precise", "coefficient", 1, 3), "response: precise: key coefficient: expected finite"),
-    "a number missing": (put([[0.0] * 35] * 2, "response", "fast", "coefficient"), "fast: key coefficient: expected 2 x 36"),
-    "another degree": (put(1, "response", "fast", "degree"), "response: fast: key coefficient: expected 2 x 27 numbers"),
-    "a huge degree": (put(10**9, "response", "fast", "degree"), "response: fast: key degree: expected at most 6"),
-    "no scale": (put(0, "response", "fast", "half_mm"), "response: fast: key half_mm: expected a number above 0"),
+    "an unknown key of a field": (put(1, "response", "field", "colour"), "response: field: key 'colour': unknown"),
+    "NaN": (put(NAN, "response", "field", "coefficient", 0, 3), "response: field: key coefficient: expected finite numbers"),
+    "infinite": (put(-1e999, "response", "by_depth", "coefficient", 1, 3), "response: by_depth: key coefficient: expected finite"),
+    "a number missing": (put([[0.0] * 35] * 2, "response", "field", "coefficient"), "field: key coefficient: expected 2 x 36"),
+    "another degree": (put(1, "response", "field", "degree"), "response: field: key coefficient: expected 2 x 27 numbers"),
+    "a huge degree": (put(10**9, "response", "field", "degree"), "response: field: key degree: expected at most 6"),
+    "no scale": (put(0, "response", "field", "half_mm"), "response: field: key half_mm: expected a number above 0"),
     "gamma of zero": (put(0, "response", "gamma"), "response: key gamma: expected a number in"),
     "NaN gamma": (put(NAN, "response", "gamma"), "response: key gamma: expected a number in"),
     "a negative blur": (put(-1, "response", "blur_px"), "response: key blur_px: expected a number above 0"),
     "no blur": (put(None, "response", "blur_px"), "response: key blur_px: expected a number, got NoneType"),
-    "depth where none is": (put(True, "response", "fast", "uses_depth"), r"fast: key coefficient: expected 2 x \d+ numbers"),
 }
 
 
@@ -527,7 +566,7 @@ def test_a_response_has_no_light_matrix_and_is_one_at_rest():
 def test_depth_does_not_depend_on_the_sensor_s_pixels():
     """The same skin seen with three times the pixels: the same depth at the same millimetres."""
     sensor = vts.Sensor("rig", 40, 56, 0.3)
-    field = random_field(1, 0, False, half_mm=8.0, size=0.2)
+    field = random_field(1, 0, half_mm=8.0, size=0.2)
     depths = []
     for scale in (1, 3):
         seen = sensor.resized(40 * scale, 56 * scale)
@@ -562,14 +601,14 @@ def test_a_prior_survives_yaml(tmp_path):
 BAD_PRIORS = {
     "unknown key": (put(1, "colour"), "key prior: key 'colour': unknown; expected response, log_background, half_mm, source"),
     "unknown key of the model": (put(1, "response", "colour"), "key prior: response: key 'colour': unknown"),
-    "unknown key of a field": (put(1, "response", "fast", "colour"), "key prior: response: fast: key 'colour': unknown"),
+    "unknown key of a field": (put(1, "response", "field", "colour"), "key prior: response: field: key 'colour': unknown"),
     "no source": (put(KeyError, "source"), "key prior: key 'source': missing"),
     "no response": (put(KeyError, "response"), "key prior: key 'response': missing"),
     "no text": (put(3, "source"), "key prior: key source: expected a text"),
     "NaN": (put(NAN, "log_background", 0, 0), "key prior: key log_background: expected finite numbers"),
     "too few": (put([[0.0] * 14 for _ in range(3)], "log_background"), "key prior: key log_background: expected 3 x 15 numbers"),
     "no scale": (put(0, "half_mm"), "key prior: key half_mm: expected a number above 0"),
-    "NaN coefficient": (put(NAN, "response", "precise", "coefficient", 0, 0), "response: precise: key coefficient: expected"),
+    "NaN coefficient": (put(NAN, "response", "by_depth", "coefficient", 0, 0), "response: by_depth: key coefficient: expected"),
 }
 
 
@@ -597,7 +636,7 @@ def test_another_number_of_pixels_scales_the_blur_and_nothing_else():
     assert double.prior.response.blur_px == pytest.approx(2.5) and double.blur_px == pytest.approx(1.0)
     back = double.resized(24, 32)
     assert back == sensor
-    assert double.prior.response.fast == sensor.prior.response.fast and double.prior.log_background == sensor.prior.log_background
+    assert double.prior.response.field == sensor.prior.response.field and double.prior.log_background == sensor.prior.log_background
 
 
 def test_the_smooth_background_of_a_prior_is_found_again():
@@ -611,11 +650,11 @@ def test_the_smooth_background_of_a_prior_is_found_again():
 
 def test_the_gelsight_mini_ships_with_a_prior():
     sensor = vts.Sensor.load("gelsight_mini")
-    assert isinstance(sensor.prior, SensorPrior) and sensor.prior.response.precise is not None and sensor.prior.source
+    assert isinstance(sensor.prior, SensorPrior) and sensor.prior.response.by_depth is not None and sensor.prior.source
     background = sensor.prior.background(sensor.height, sensor.width, sensor.mm_per_pixel)
     assert bool(torch.isfinite(background).all()) and 0.005 < float(background.min()) < float(background.max()) < 1.5
-    fast, precise = sensor.prior.response.fast, sensor.prior.response.precise
-    assert fast.half_mm == pytest.approx(0.5 * sensor.width * sensor.mm_per_pixel, rel=1e-3) and precise.half_mm == fast.half_mm
+    field, by_depth = sensor.prior.response.field, sensor.prior.response.by_depth
+    assert field.half_mm == pytest.approx(0.5 * sensor.width * sensor.mm_per_pixel, rel=1e-3) and by_depth.half_mm == field.half_mm
     path = Path(__file__).resolve().parents[1] / "configs" / "sensors" / "gelsight_mini.yaml"
     assert path.stat().st_size < 10_000
 

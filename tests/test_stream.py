@@ -171,7 +171,7 @@ def test_a_video_gives_contact_and_depth(unit, video, small_press):
     with streams.TactileStream(video, unit[0], mode="precise") as stream:
         check_press(stream, small_press)
     times = stream.stages.median_ms()
-    assert {"read", "rectify", "compensate", "contact", "normals", "gradient", "integrate"} <= set(times)
+    assert {"read", "rectify", "compensate", "deformed", "contact", "normals", "gradient", "integrate"} <= set(times)
     assert stream.metric
 
 
@@ -530,7 +530,7 @@ def test_a_video_file_is_whole_or_not_there(tmp_path, suffix):
 
 def test_the_overlay_shows_contours_and_grows_its_range(unit, small_press):
     scene = small_press(1.0)
-    output = vts.DepthOutput(scene.depth_mm, scene.gradient, scene.normal, scene.contact)
+    output = vts.DepthOutput(scene.depth_mm, scene.gradient, scene.normal, scene.contact, scene.contact)
     overlay = streams.Overlay(metric=False)
     picture = overlay(streams.TactileFrame(0, 0.0, torch.zeros(3, 120, 160), output), ["one", "two"])
     assert picture.shape == (240 + 86, 640, 3) and picture.dtype == np.uint8

@@ -81,7 +81,7 @@ def test_a_known_depth_gives_the_scale(of_known_depth):
 
 
 def test_the_direction_of_the_field_is_that_of_the_truth(of_known_depth):
-    maps = of_known_depth.response.fast.maps(HEIGHT, WIDTH, PITCH) / 0.3  # slope per relative change
+    maps = of_known_depth.response.field.maps(HEIGHT, WIDTH, PITCH) / 0.3  # slope per relative change
     assert torch.allclose(maps, maps.mean((2, 3), keepdim=True), atol=0.02)  # as even as the skin
     product = maps.mean((2, 3)).t() @ MIX.double()  # the identity if it is the inverse
     assert torch.allclose(product / product.diagonal().mean(), torch.eye(2, dtype=torch.float64), atol=0.08)
@@ -95,7 +95,7 @@ def test_contacts_press_inward(of_known_depth, touches):
 def test_with_a_prior_touches_are_not_used_and_a_warning_says_so(rest, touches):
     truth = torch.linalg.pinv(MIX.double()) * 0.3
     rows = tuple(tuple(row) for row in truth.tolist())
-    response = ResponseModel(ResponseField(0, -1, False, 10.0, rows), None)
+    response = ResponseModel(ResponseField(0, -1, 10.0, rows), None)
     prior = SensorPrior(response, fit_log_background(rest, PITCH), 10.0, "made up")
     sensor = dataclasses.replace(SENSOR, gamma=None, prior=prior)
     with pytest.warns(vts.CalibrationWarning, match="touches: not used: they add nothing to the sensor's prior"):
@@ -196,7 +196,7 @@ def test_brightness_gives_the_scale_where_light_is_stray(monkeypatch):
 def test_a_field_times_a_polynomial():
     generator = torch.Generator().manual_seed(3)
     rows = torch.randn(2, 9, generator=generator, dtype=torch.float64)
-    field = ResponseField(1, -1, False, 9.0, tuple(map(tuple, rows.tolist())))
+    field = ResponseField(1, -1, 9.0, tuple(map(tuple, rows.tolist())))
     gain = torch.randn(6, generator=generator, dtype=torch.float64)
     x, y = vts.core.geometry.pixel_grid_mm(12, 16, 0.5, torch.float64)
     factor = torch.tensordot(gain, position_basis(x.expand(12, 16), y.expand(12, 16), 9.0, 2), 1)

@@ -53,13 +53,19 @@ class ContactMask(Twin, contact.ContactMask):
         if not (sampled and usable(compensated, self.offset)):
             return super().find(compensated)
         grid = kernels.ContactGrid(self.step, self.stride, self.cell, self.reach, self.sigmas, self.rounding, self.least_cells)
-        return kernels.contact_mask(compensated, self.offset, self.per_noise, self.failed_below, grid)
+        return kernels.contact_mask(compensated, self.offset, self.per_noise, (self.failed_below, self.most_far_field), grid)
 
     def noise(self, change: Tensor) -> Tensor:
         if not arrays_usable(change):
             return super().noise(change)
         second = second_differences(change, self.samples)
         return std_from_median(second, _median(second))
+
+    def quarter(self, some: Tensor) -> Tensor:
+        if not arrays_usable(some):
+            return super().quarter(some)
+        place = some.shape[-1] // 4
+        return torch.from_numpy(np.partition(some.numpy(), place)[..., place : place + 1])
 
     def reconstruct(self, seed: Tensor, mask: Tensor) -> Tensor:
         if not arrays_usable(seed, mask):
@@ -83,12 +89,12 @@ class Crop(Twin, frames.Crop):
 
     plain = frames.Crop
 
-    def box(self, contact: Tensor) -> tuple[int, int, int, int]:
-        if not arrays_usable(contact):
-            return super().box(contact)
+    def box(self, deformed: Tensor) -> tuple[int, int, int, int]:
+        if not arrays_usable(deformed):
+            return super().box(deformed)
         import cv2
 
-        inside = contact[:, 0].to(torch.uint8).numpy()
+        inside = deformed[:, 0].to(torch.uint8).numpy()
         left, top, columns, rows = cv2.boundingRect(inside[0] if len(inside) == 1 else inside.max(axis=0))
         return top, top + rows, left, left + columns
 
@@ -174,11 +180,15 @@ class Uncrop(Twin, frames.Uncrop):
 
     plain = frames.Uncrop
 
-    def forward(self, frame: frames.Frame, solution: frames.Solution) -> frames.DepthOutput:
+    def forward(self, frame: frames.Frame, solution: frames.Solution, contact: Tensor) -> frames.DepthOutput:
         if not usable(solution.gradient):
-            return super().forward(frame, solution)
+            return super().forward(frame, solution, contact)
         gradient, normal = kernels.uncrop(solution.gradient, frame.window, frame.size)
-        return frames.DepthOutput(solution.depth_mm, gradient, normal, frame.contact)
+        (top, left), (height, width) = frame.window, frame.size
+        rows, columns = contact.shape[2], contact.shape[3]
+        if rows < height or columns < width:
+            contact = torch.nn.functional.pad(contact, [left, width - left - columns, top, height - top - rows])
+        return frames.DepthOutput(solution.depth_mm, gradient, normal, contact, frame.deformed)
 
 
 def _median(values: Tensor) -> Tensor:

@@ -33,7 +33,7 @@ def library() -> ctypes.CDLL | None:
         warnings.warn(f"{LIBRARY}: built from other sources than lie beside it, so it is not used: install again", stacklevel=2)
         return None
     pointer, whole, real, step = ctypes.c_void_p, ctypes.c_int, ctypes.c_float, ctypes.c_int64
-    loaded.contact_mask.argtypes = [*[pointer] * 4, *[whole] * 7, *[real] * 3, pointer, pointer]
+    loaded.contact_mask.argtypes = [*[pointer] * 5, *[whole] * 7, *[real] * 3, pointer, pointer]
     loaded.normals.argtypes = [
         pointer,
         *[step] * 3,
@@ -115,14 +115,17 @@ def grid_means(image: Tensor, stride: int, first: int) -> Tensor:
 
 
 def contact_mask(
-    compensated: Tensor, offset: Tensor, per_noise: Tensor, failed_below: Tensor, grid: ContactGrid
+    compensated: Tensor, offset: Tensor, per_noise: Tensor, limits: tuple[Tensor, Tensor], grid: ContactGrid
 ) -> tuple[Tensor, Tensor]:
-    """Contact and its interior, bool (B, 1, H, W): see :class:`~torchvts.contact.ContactMask`, whose attributes these are."""
+    """Deformed area and its interior, bool (B, 1, H, W): see :class:`~torchvts.contact.ContactMask`, whose attributes these are.
+
+    ``limits``: ``failed_below`` and ``most_far_field``.
+    """
     compensated, offset, per_noise = compensated.contiguous(), offset.contiguous(), per_noise.contiguous()
     count, _, height, width = compensated.shape
     mask = compensated.new_empty(count, 1, height, width, dtype=torch.bool)
     interior = torch.empty_like(mask)
-    inputs = (compensated.data_ptr(), offset.data_ptr(), per_noise.data_ptr(), failed_below.data_ptr())
+    inputs = (compensated.data_ptr(), offset.data_ptr(), per_noise.data_ptr(), limits[0].data_ptr(), limits[1].data_ptr())
     _check(_loaded().contact_mask(*inputs, count, height, width, *grid, mask.data_ptr(), interior.data_ptr()))
     return mask, interior
 

@@ -1,5 +1,6 @@
 """The model of a background image: lights and camera over an undeformed skin, pixel by pixel, as the fit of lights needs it."""
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -17,6 +18,10 @@ GLOSS, VIGNETTING, AMBIENT = "gloss", "vignetting", "ambient"
 
 POSITION_AND_ALBEDO = 4
 """Columns of a light's parameters before the optional terms."""
+
+FURTHEST = 30.0
+"""Most distant light, in half-widths of the image. The fall-off of one further away curves by less than 0.2 % over the image,
+which no lens is flat to; a background that is no paraboloid at all sends its light there."""
 
 
 class BackgroundPixels(NamedTuple):
@@ -59,6 +64,10 @@ class BackgroundPixels(NamedTuple):
         stride = max(1, len(self.x) // count) | 1
         part = {name: getattr(self, name)[..., ::stride] for name in ("x", "y", "outward", "image", "usable")}
         return self._replace(**part)
+
+    def span_mm(self) -> float:
+        """Half of the longer side of the image, mm."""
+        return float(self.x.abs().max().maximum(self.y.abs().max()))
 
     def model(self, parameter: Tensor) -> Tensor:
         """Image values (3, N) of lights (3, 4 + terms): x, y, log z, log albedo, then ``terms``."""
@@ -105,7 +114,7 @@ def paraboloid_start(pixels: BackgroundPixels) -> Tensor:
     I^(-2/3) = (rho z)^(-2/3) (x^2 + y^2 - 2 a x - 2 b y + a^2 + b^2 + z^2) is linear in x^2 + y^2, x, y and 1.
     """
     x, y, image, exponent, noise = pixels.x, pixels.y, pixels.image, pixels.exponent, pixels.noise
-    span = float(x.abs().max().maximum(y.abs().max()))
+    span = pixels.span_mm()
     u, v = x / span, y / span
     columns = torch.stack((u * u + v * v, u, v, torch.ones_like(u)))  # (4, N)
     light = image.clamp(1e-3, 1.0) ** (1.0 / exponent)
@@ -125,7 +134,48 @@ def paraboloid_start(pixels: BackgroundPixels) -> Tensor:
     curvature = solution[:, 0].clamp_min(1e-6 * target.mean(1))  # a light at infinity leaves no curvature
     a, b = -0.5 * solution[:, 1] / curvature, -0.5 * solution[:, 2] / curvature
     z = (solution[:, 3] / curvature - a * a - b * b).clamp_min(0.01).sqrt()
-    return torch.stack((a * span, b * span, (z * span).log(), -1.5 * (curvature / span**2).log() - (z * span).log()), dim=1)
+    log_rho = -1.5 * (curvature / span**2).log() - (z * span).log()
+    start = bounded(torch.stack((a * span, b * span, (z * span).log(), log_rho), dim=1), span)
+    level: Tensor = (light.log() - pixels.model(start).clamp_min(1e-30).log() / exponent).median(dim=1).values
+    # where no paraboloid fits, the closed form misses the brightness as well
+    start[:, 3] += torch.where(level.abs() > math.log(2.0), level, torch.zeros_like(level))
+    return start
+
+
+def bounded(parameter: Tensor, span: float) -> Tensor:
+    """Parameters (3, 4 + terms) with lights beyond ``FURTHEST`` times ``span`` (mm) moved there, as bright at the centre as before."""
+    position = torch.cat((parameter[:, :2], parameter[:, 2:3].exp()), dim=1)
+    factor = (position.norm(dim=1) / (FURTHEST * span)).clamp_min(1.0)[:, None]
+    moved = parameter.clone()
+    moved[:, :2] = parameter[:, :2] / factor
+    # at least 5 degrees above the skin: a lower light there lights nothing
+    moved[:, 2:3] = torch.where(
+        factor > 1.0, (parameter[:, 2:3] - factor.log()).clamp_min(math.log(0.09 * FURTHEST * span)), parameter[:, 2:3]
+    )
+    moved[:, 3:4] = parameter[:, 3:4] - 2.0 * factor.log()  # I = rho z / |S|^3 at the centre
+    return moved
+
+
+def at_bound(parameter: Tensor, span: float) -> Tensor:
+    """(3,) bool: lights that :func:`bounded` holds."""
+    position = torch.cat((parameter[:, :2], parameter[:, 2:3].exp()), dim=1)
+    return position.norm(dim=1) > 0.99 * FURTHEST * span
+
+
+def misfit_of_paraboloid(pixels: BackgroundPixels) -> tuple[Tensor, Tensor]:
+    """What the closed-form lights leave of a background, and which of them no image of a near light gives.
+
+    Returns:
+        (3,) robust standard deviation of log(image / lights) beyond the noise; (3,) bool, lights at the bound.
+    """
+    start = paraboloid_start(pixels)
+    log = pixels.image.clamp_min(1e-3).log() - pixels.model(start).clamp_min(1e-9).log()
+    spread = [
+        float((c[u] - c[u].median()).abs().median()) / 0.6745 if bool(u.any()) else math.inf for c, u in zip(log, pixels.usable)
+    ]
+    noise = pixels.noise / pixels.image.median(dim=1).values.clamp_min(1e-3)
+    left = (torch.tensor(spread, dtype=noise.dtype).square() - noise.square()).clamp_min(0.0).sqrt()
+    return left, at_bound(start, pixels.span_mm())
 
 
 def from_lights(lights: PointLights) -> Tensor:

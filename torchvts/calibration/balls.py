@@ -1,25 +1,28 @@
 """Locate the ball in each press: by its outline, by slopes that are known, or jointly with response fields of rising size."""
 
-from typing import Any
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..core.geometry import gradient_from_normal
 from ..core.robust import tukey_weight
-from ..model.response_field import ResponseField, ResponseModel
+from ..model.response_field import ResponseModel
 from ..model.sensor import Sensor
 from ..normals import NormalFromResponse
-from .contacts import LEAST_INSIDE, Contact, first_pass_depths, middle_px, prepare_second_pass, used
+from .closure import close_loops
+from .contacts import LEAST_INSIDE, Contact, first_pass_depths, middle_px, used
 from .field import ContactForms, Family, solve_with_centers
+from .regions import one_ball, strong_blobs
 
 EDGE_SLOPE_RATIO = 0.6
 """The contact ends where the skin's slope has fallen to this part of the ball's: about the middle of the fall."""
 
-JOINT_STAGES = ((0, -1, False, 3), (1, -1, False, 3), (2, -1, False, 6), (3, 2, False, 4), (3, 2, True, 4))
-"""Families and rounds in which balls are located jointly. Linear fields come first: with products or depth the field can imitate
-a shift of all centers, so these stages only refine, each center regularised to the linear result by a third of a press."""
+WIDEST = 0.95
+"""Largest contact radius that is searched, in radii of the ball: at 0.95 its slope is 3."""
+
+JOINT_STAGES = ((0, -1, 3), (1, -1, 3), (2, -1, 6), (3, 2, 4))
+"""Families and rounds in which balls are located jointly. Linear fields come first: with products the field can imitate a shift of
+all centers, so that stage only refines, each center regularised to the linear result by a third of a press."""
 
 
 def locate(contacts: list[Contact], sensor: Sensor, prior: ResponseModel | None, half_mm: float) -> None:
@@ -46,10 +49,11 @@ def locate(contacts: list[Contact], sensor: Sensor, prior: ResponseModel | None,
                 update_radius(contact, slopes.flatten(1)[:, contact.index], pitch_mm)
     elif not all(contact.known and contact.radius_known for contact in usable):
         _locate_jointly(usable, pitch_mm, half_mm)
+        close_loops(usable, half_mm)
     for contact in usable:
         if not contact.reason and int(contact.inside().sum()) < LEAST_INSIDE:
             contact.reason = "no ball of this diameter fits the contact"
-        if not contact.reason and contact.contact_radius_mm > 0.89 * contact.radius_mm:
+        if not contact.reason and contact.contact_radius_mm > 0.99 * WIDEST * contact.radius_mm:
             wide_mm, ball_mm = 2 * contact.contact_radius_mm, 2 * contact.radius_mm
             contact.reason = f"the contact is {wide_mm:.2f} mm wide, too wide for a ball of {ball_mm:g} mm"
 
@@ -57,20 +61,16 @@ def locate(contacts: list[Contact], sensor: Sensor, prior: ResponseModel | None,
 def _locate_jointly(contacts: list[Contact], pitch_mm: float, half_mm: float) -> None:
     most = 1 if len(contacts) < 4 else 2 if len(contacts) < 10 else 3
     anchors = None
-    fast: ResponseField | None = None
-    for degree, products, uses_depth, rounds in [stage for stage in JOINT_STAGES if stage[0] <= most]:
-        family = Family(degree, products, uses_depth, half_mm)
+    for degree, products, rounds in [stage for stage in JOINT_STAGES if stage[0] <= most]:
+        family = Family(degree, products, half_mm)
         if products >= 0 and anchors is None:
             anchors = [contact.center_mm.clone() for contact in contacts]
-        if uses_depth and fast is not None:
-            prepare_second_pass(contacts, fast, pitch_mm)
         forms = [ContactForms(family, contact) for contact in contacts]
         coefficient = torch.zeros(family.size(), dtype=torch.float64)
         for _ in range(rounds):
             coefficient = solve_with_centers(forms, 0.01 * family.penalty(), anchors, 0.3)
             for item in forms:
                 update_radius(item.contact, item.slope(coefficient), pitch_mm)
-        fast = family.field(coefficient)
 
 
 def _slope_maps(contacts: list[Contact], model: ResponseModel, pitch_mm: float) -> list[Tensor]:
@@ -78,11 +78,11 @@ def _slope_maps(contacts: list[Contact], model: ResponseModel, pitch_mm: float) 
     if not contacts:
         return []
     height, width = contacts[0].mask.shape
-    normals = NormalFromResponse(model.fast, model.precise, height, width, pitch_mm, dtype=torch.float64)
+    normals = NormalFromResponse(model.field, model.by_depth, height, width, pitch_mm, dtype=torch.float64)
     images = [1.0 + contact.change[None] for contact in contacts]
-    if model.precise is None:
+    if model.by_depth is None:
         return [gradient_from_normal(normals(image))[0] for image in images]
-    first = first_pass_depths(contacts, model.fast, pitch_mm)
+    first = first_pass_depths(contacts, model.field, pitch_mm)
     return [gradient_from_normal(normals(image, depth[None, None]))[0] for image, depth in zip(images, first)]
 
 
@@ -96,22 +96,22 @@ def guess_circle(contact: Contact, sensor: Sensor) -> None:
     length = contact.change.square().sum(0).sqrt()[None, None]
     length = torch.nn.functional.avg_pool2d(length, 7, 1, 3, count_include_pad=False)[0, 0]
     peak = 0.9 * length.max()
-    wide_areas = _blob_areas((length > 0.2 * peak) & contact.mask)[0]
-    areas, labels = _blob_areas((length > 0.4 * peak) & contact.mask)
-    if len(areas) == 0:
+    ball_px = contact.radius_mm / sensor.mm_per_pixel
+    wide = strong_blobs((length > 0.2 * peak) & contact.mask, torch.ones_like(length))
+    if not wide:
         contact.reason = "no contact: nothing is above the noise"
         return
-    several = int((wide_areas > 0.3 * wide_areas.max()).sum())
-    if several > 1:
-        contact.reason = f"{several} contacts in one image: press one ball at a time"
+    if not one_ball(wide, ball_px):
+        contact.reason = f"{len(wide)} contacts in one image: press one ball at a time"
         return
-    blob = (labels == 1 + int(areas.argmax())).astype(np.uint8)
-    outlines, _ = cv2.findContours(blob, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    longest = max(outlines, key=len)
-    hull = cv2.convexHull(longest)
+    blobs = strong_blobs((length > 0.4 * peak) & contact.mask, torch.ones_like(length), 0.1)
+    lobes = np.maximum.reduce([blob.mask for blob in blobs if one_ball([blobs[0], blob], ball_px)])
+    outlines, _ = cv2.findContours(lobes, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    points = np.concatenate(outlines)
+    hull = cv2.convexHull(points)
     # a ball's outline is convex; where the border cuts the ball, the outline of its faint middle opens to the border
-    convex = [abs(cv2.pointPolygonTest(hull, (float(x), float(y)), True)) < 2.0 for x, y in longest[:, 0]]
-    outline = torch.from_numpy(longest[:, 0][convex].astype(np.float64))
+    convex = [abs(cv2.pointPolygonTest(hull, (float(x), float(y)), True)) < 2.0 for x, y in points[:, 0]]
+    outline = torch.from_numpy(points[:, 0][convex].astype(np.float64))
     free = (outline > 1).all(1) & (outline[:, 0] < sensor.width - 2) & (outline[:, 1] < sensor.height - 2)
     if int(free.sum()) < 12:
         contact.reason = "the contact has no outline within the image: press nearer to the middle"
@@ -119,15 +119,7 @@ def guess_circle(contact: Contact, sensor: Sensor) -> None:
     center_px, radius_px = _circle(outline[free])
     contact.center_mm = (center_px - middle_px(sensor)) * sensor.mm_per_pixel
     # the outline lies outside of the contact, by about a fifth of its radius
-    contact.contact_radius_mm = min(0.8 * radius_px * sensor.mm_per_pixel, 0.9 * contact.radius_mm)
-
-
-def _blob_areas(mask: Tensor) -> tuple[Any, Any]:
-    """Areas of the connected blobs of an (H, W) mask, and their labels from 1."""
-    import cv2
-
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.numpy().astype(np.uint8))
-    return stats[1:, cv2.CC_STAT_AREA], labels
+    contact.contact_radius_mm = min(0.8 * radius_px * sensor.mm_per_pixel, WIDEST * contact.radius_mm)
 
 
 def _circle(points: Tensor) -> tuple[Tensor, float]:
@@ -155,7 +147,7 @@ def update_radius(contact: Contact, slope: Tensor, pitch_mm: float, damping: flo
     dx, dy, r = contact.polar()
     ring = (r / pitch_mm).round().long()
     count = int(0.95 * contact.radius_mm / pitch_mm)
-    near = (ring < count) & (ring > 0)
+    near = (ring < count) & (ring > 0) & ~contact.saturated
     outward = torch.stack((dx, dy)) / r.clamp_min(1e-9)
     measured, ball = -(slope * outward).sum(0), -(contact.ball_slope() * outward).sum(0)
     total = torch.zeros(2, count, dtype=torch.float64).index_add_(1, ring[near], torch.stack((measured, ball))[:, near])
@@ -165,7 +157,7 @@ def update_radius(contact: Contact, slope: Tensor, pitch_mm: float, damping: flo
     for k in range(start, count - 1):
         if ratio[k] >= EDGE_SLOPE_RATIO > ratio[k + 1]:
             found = (k + float((ratio[k] - EDGE_SLOPE_RATIO) / (ratio[k] - ratio[k + 1]))) * pitch_mm
-            contact.contact_radius_mm += (1.0 - damping) * (min(found, 0.9 * contact.radius_mm) - contact.contact_radius_mm)
+            contact.contact_radius_mm += (1.0 - damping) * (min(found, WIDEST * contact.radius_mm) - contact.contact_radius_mm)
             return
 
 

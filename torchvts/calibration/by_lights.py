@@ -9,7 +9,7 @@ from ..model.calibration import Calibration
 from ..model.lights import PointLights, flat_image
 from ..model.report import CandidateRow, Report
 from ..model.sensor import Sensor
-from .light_choice import choose_lights
+from .light_choice import choose_lights, hopeless
 
 GIVEN_MISFIT = 0.2
 """RMS of log(background / image of the sensor file's lights) from which they are not this unit's."""
@@ -19,12 +19,12 @@ class LightsResult(NamedTuple):
     """What point lights gave.
 
     Attributes:
-        unit: the calibrated unit.
+        unit: the calibrated unit; None where the lights were not fitted or the fit failed.
         rows: the table of candidates, the chosen one first.
         complaint: why not to trust them, or "".
     """
 
-    unit: Calibration
+    unit: Calibration | None
     rows: list[CandidateRow]
     complaint: str
 
@@ -35,15 +35,22 @@ def by_lights(background: Tensor, sensor: Sensor, other_models: bool, progress: 
     Args:
         background: (3, H, W) in [0, 1].
         sensor: of the unit; where it gives the lights' positions, only the albedo is fitted.
-        other_models: other models than lights exist, so lights with a large misfit are not refined.
+        other_models: other models than lights exist, so lights that cannot win are not fitted, and those with a large misfit are
+            not refined.
         progress: show a bar.
     Raises:
         ValueError: as :func:`fit_lights`.
     """
     if sensor.light_position_mm is not None:
         return _given(background, sensor, sensor.light_position_mm)
+    objection = hopeless(background, sensor) if other_models else ""
+    if objection:
+        note = f"not fitted: {objection}"
+        return LightsResult(None, [{"model": "point lights", "family": "three lights", "score_deg": None, "note": note}], "")
     choice = choose_lights(background, sensor, other_models, progress)
     fit, row = choice.fit, choice.rows[0]
+    if fit.failed:
+        return LightsResult(None, choice.rows, f"background: {fit.message}")
     report: Report = {
         "model": "point_lights",
         "source": "background",

@@ -14,9 +14,9 @@ from ..model.response_field import ResponseModel
 from ..model.sensor import Sensor
 from .balls import center_by_slope
 from .contacts import Contact, middle_px, read_contacts, unit_without_model
-from .field import PRODUCT_PENALTY, Family, angle_deg
+from .field import Family, angle_deg
 from .presses import Press
-from .response_fit import FAMILIES, Candidates, ResponseFit, fit_response, held_out_deg
+from .response_fit import FAMILIES, ResponseFit, fit_response, held_out_deg
 
 RESPONSE_BLUR_PX = 1.0
 """Blur of a response field at 320 x 240: it reduces the error of normals on a GelSight Mini by a third; more blur gains nothing."""
@@ -48,7 +48,6 @@ def by_presses(
     prior: ResponseModel | None,
     progress: bool,
     families: tuple[tuple[int, int], ...] = FAMILIES,
-    product_penalty: float = PRODUCT_PENALTY,
 ) -> PressResult:
     """Fit a response model to presses.
 
@@ -59,18 +58,16 @@ def by_presses(
         prior: fields of the sensor's type, or None.
         progress: show a bar.
         families: degrees of the fields to try.
-        product_penalty: regularisation of products relative to linear terms.
     Raises:
         ValueError: no press can be used.
     """
-    candidates = Candidates(families, product_penalty)
     chosen = with_preprocessing(sensor, prior)
     contacts = read_contacts(presses, background, chosen)
     light = unit_without_model(background, chosen).background
-    fit = fit_response(contacts, light, chosen, prior, progress, candidates)
+    fit = fit_response(contacts, light, chosen, prior, progress, families)
     if prior is None and fit.error_deg is not None:
         others = _other_preprocessing(sensor, chosen)
-        fit, chosen = _choose_preprocessing(background, chosen, others, list(zip(presses, contacts)), fit, candidates)
+        fit, chosen = _choose_preprocessing(background, chosen, others, list(zip(presses, contacts)), fit, families)
     return PressResult(fit, contacts, Calibration.from_response(fit.model, chosen, background))
 
 
@@ -94,23 +91,23 @@ def _choose_preprocessing(
     others: list[Sensor],
     read: list[tuple[Press, Contact]],
     fit: ResponseFit,
-    candidates: Candidates,
+    families: tuple[tuple[int, int], ...],
 ) -> tuple[ResponseFit, Sensor]:
     """Another gamma or blur if the first pass of the same family is clearly better with it on held-out presses; then refit.
 
     The balls stay where they were found: preprocessing moves a center by less than its uncertainty.
     """
     located = [_located(press, contact, sensor) for press, contact in read if not contact.reason]
-    best = (1.0 - PREPROCESSING_WORTH) * held_out_deg([contact for _, contact in read if not contact.reason], fit.model.fast)
+    best = (1.0 - PREPROCESSING_WORTH) * held_out_deg([contact for _, contact in read if not contact.reason], fit.model.field)
     taken: tuple[Sensor, list[Contact]] | None = None
     for other in others:
         contacts = read_contacts(located, background, other)
-        score = held_out_deg(contacts, fit.model.fast)
+        score = held_out_deg(contacts, fit.model.field)
         fit.candidates.append(
             {
                 "model": f"response, preprocessed with gamma {other.exponent:g} and a blur of {other.blur_px:g} px",
-                "family": Family.of(fit.model.fast).label(),
-                "parameters": 2 * fit.model.fast.size(),
+                "family": Family.of(fit.model.field).label(),
+                "parameters": 2 * fit.model.field.size(),
                 "score_deg": score,
                 "passes": 1,
             }
@@ -120,7 +117,7 @@ def _choose_preprocessing(
     if taken is None:
         return fit, sensor
     chosen, contacts = taken
-    again = fit_response(contacts, unit_without_model(background, chosen).background, chosen, None, False, candidates)
+    again = fit_response(contacts, unit_without_model(background, chosen).background, chosen, None, False, families)
     again.candidates = fit.candidates + again.candidates
     return again, chosen
 

@@ -53,7 +53,6 @@ def by_touches(background: Tensor, sensor: Sensor, touches: Sequence[Touch], pre
     known = [(touch.depth_mm, c) for touch, c in zip(touches, contacts) if touch.depth_mm is not None and not c.reason]
     scale, reference = _scale(fit.field, _balls(presses, background, sharp), known, pitch)
     field = scaled(fit.field, scale)
-    precise = field.embedded(field.degree, field.product_degree, True)  # touches do not show how slopes depend on depth
     parameters = fit.family.size()
     row: CandidateRow = {
         "model": "touches",
@@ -64,7 +63,7 @@ def by_touches(background: Tensor, sensor: Sensor, touches: Sequence[Touch], pre
         "tried": fit.tried,
         "note": f"{len(usable)} touches constrain {parameters} parameters (eigenvalue gap {fit.gap:.1f}), the scale by {reference}",
     }
-    return TouchResult(ResponseModel(field, precise, sharp.exponent, sharp.blur_px), row, contacts)
+    return TouchResult(ResponseModel(field, None, sharp.exponent, sharp.blur_px), row, contacts)
 
 
 def _balls(presses: Sequence[Press], background: Tensor, sensor: Sensor) -> list[Contact]:

@@ -19,17 +19,18 @@ from .by_presses import by_presses, error_of_lights_deg
 from .by_touches import TouchResult, by_touches
 from .complaints import CalibrationWarning
 from .contacts import press_row, touch_row, used
+from .light_choice import hopeless
 from .lights import POORLY_CONSTRAINED_DEG, check_exposure
+from .pattern import compare_patterns
 from .presses import Press, Touch, check_presses, check_touches
+from .prior_choice import FromPresses, fit_with_or_without
+from .refusals import NoUsablePress, check_colour, check_coloured_background, check_coloured_contacts, other_crop
 
 WELL_CONSTRAINED_DEG = 2.0
 """Point lights replace a sensor's prior only if the image constrains each of them this well."""
 
-PRIOR_FAMILY = ((4, 3),)
-PRIOR_PRODUCT_PENALTY = 60.0
-"""Weakly regularised products fit their own unit better and another worse. With penalties of 40, 60 and 200 presses of a GelSight
-Mini that the prior has not seen are 2.02, 2.06 and 2.24 degrees off; a bead on a second Mini is, with 40 and 60, 2.99 and 2.94
-from that unit's own network."""
+PRIOR_FAMILY = ((2, 0),)
+"""Chosen by other units: larger families fit the unit of the presses better and others worse (docs/decisions.md)."""
 
 TIE = 1.05
 """Point lights are preferred to response fields unless these are better by more than this factor."""
@@ -64,11 +65,13 @@ def calibrate(
         A :class:`Calibration`. Its ``report`` (:class:`torchvts.model.report.Report`) says which model was chosen and why, and
         what became of each press.
     Raises:
-        ValueError, TypeError: bad image: shape, dtype, range, black, saturated; presses or touches of which none can be used;
-            touches that do not constrain a field, or have no scale.
+        ValueError, TypeError: bad image: shape, dtype, range, black, saturated, greyscale; a sensor without coloured lights; presses
+            or touches of which none can be used, and whether they are cropped otherwise than the background; touches that do not
+            constrain a field, or have no scale; nothing but lights to calibrate from, and their fit failed.
     Warns:
         CalibrationWarning: what was left out and why; the fit did not converge, the image does not constrain the lights, it
-            seems to hold a contact, or it is not of the prior's sensor type.
+            seems to hold a contact, or it does not have the pattern of light of the prior's sensor type. Presses then decide
+            whether the prior is used.
     Source:
         eq. 6-8 of the paper for lights; the rest is this project's.
     Example:
@@ -82,9 +85,13 @@ def calibrate(
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     check_exposure(background)
     given = _Given(background, sensor, check_presses(presses, sensor), check_touches(touches, sensor), progress)
+    check_colour(background)
+    check_coloured_contacts(background, given.presses or given.touches)
+    if not (presses or touches) and sensor.light_position_mm is None and hopeless(background, sensor):
+        check_coloured_background(background)
     lights = by_lights(background, sensor, bool(presses or touches or sensor.prior), progress)
     prior, messages = _prior(given)
-    touched, more = _touched(given, prior)
+    touched, more = _touched(given, prior.model)
     messages += more
     if presses:
         calibration, more = _with_presses(given, lights, prior, touched)
@@ -98,8 +105,7 @@ def calibrate(
 def fit_prior(background: Tensor, sensor: Sensor, presses: Sequence[Press], source: str = "") -> SensorPrior:
     """Fit a prior for every unit of a sensor type to presses on one unit.
 
-    Linear terms have degree 4, products degree 3. Products are strongly regularised, because otherwise they fit this unit
-    better and others worse.
+    Linear terms have degree 2 and products degree 0: larger fields fit this unit better and others worse.
 
     Args:
         background: as for :func:`calibrate`.
@@ -119,7 +125,7 @@ def fit_prior(background: Tensor, sensor: Sensor, presses: Sequence[Press], sour
         raise ValueError("presses: expected one or more, got none: a prior is fitted to presses")
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     named = check_presses(presses, sensor)
-    result = by_presses(background, sensor.without_prior(), named, None, False, PRIOR_FAMILY, PRIOR_PRODUCT_PENALTY)
+    result = by_presses(background, sensor.without_prior(), named, None, False, PRIOR_FAMILY)
     for message in complaints.of_contacts(result.contacts):
         warnings.warn(message, CalibrationWarning, stacklevel=2)
     log_background = fit_log_background(result.unit.background, sensor.mm_per_pixel)
@@ -136,14 +142,23 @@ class _Given(NamedTuple):
     progress: bool
 
 
-def _prior(given: _Given) -> tuple[ResponseModel | None, list[str]]:
-    """The sensor's prior, with the sensor's blur if it has one, and complaints about the background."""
+class _Prior(NamedTuple):
+    """The sensor's prior, with the sensor's blur if it has one; None for none. What the background has against it, or ""."""
+
+    model: ResponseModel | None
+    objection: str
+
+
+def _prior(given: _Given) -> tuple[_Prior, list[str]]:
+    """The prior, and complaints about the background."""
     if given.sensor.prior is None:
-        return None, []
+        return _Prior(None, ""), []
     prior = given.sensor.prior.response
     if given.sensor.blur_px > 0:
         prior = dataclasses.replace(prior, blur_px=given.sensor.blur_px)
-    return prior, complaints.of_background_with_prior(given.background, given.sensor)
+    match = compare_patterns(given.background, given.sensor)
+    objection = complaints.of_pattern(match, given.sensor)
+    return _Prior(prior, objection), complaints.of_background_with_prior(given.background, given.sensor, match)
 
 
 def _touched(given: _Given, prior: ResponseModel | None) -> tuple[TouchResult | None, list[str]]:
@@ -162,7 +177,7 @@ def _touched(given: _Given, prior: ResponseModel | None) -> tuple[TouchResult | 
 
 
 def _without_presses(
-    given: _Given, lights: LightsResult, prior: ResponseModel | None, touched: TouchResult | None
+    given: _Given, lights: LightsResult, prior: _Prior, touched: TouchResult | None
 ) -> tuple[Calibration, list[str]]:
     """The calibration by touches, the prior or point lights, and complaints."""
     row = lights.rows[0]
@@ -176,13 +191,20 @@ def _without_presses(
             "touches": [touch_row(contact) for contact in touched.contacts],
         }
         return Calibration.from_response(touched.model, given.sensor, given.background, report), []
-    constrained = row["score_deg"] is not None and row["score_deg"] <= WELL_CONSTRAINED_DEG and row["misfit"] < 0.02
-    if prior is not None and not constrained:
+    constrained = lights.unit is not None and _constrained(row)
+    if not constrained and given.sensor.light_position_mm is None:
+        check_coloured_background(given.background)
+    if prior.model is not None and not constrained:
         family = "response of the sensor type"
         candidate: CandidateRow = {"model": "prior", "family": family, "parameters": 0, "score_deg": None, "passes": 2}
         reason = f"the sensor's prior, transferred to this unit by its background; point lights rejected: {row['note']}"
         report = {"model": "response", "source": "prior", "reason": reason, "candidates": [*lights.rows, candidate]}
-        return Calibration.from_response(prior, given.sensor, given.background, report), []
+        return Calibration.from_response(prior.model, given.sensor, given.background, report), []
+    if lights.unit is None:
+        raise ValueError(
+            f"{lights.complaint or row['note']}; nothing else is there to calibrate from: give presses of balls, or a sensor with a "
+            "prior"
+        )
     fitted = constrained and row["score_deg"] != 0.0
     reason = f"the image constrains the lights to {row['score_deg']:.2f} deg" if fitted else row["note"]
     if len(lights.rows) > 1:
@@ -192,32 +214,59 @@ def _without_presses(
     return unit, [lights.complaint] * bool(lights.complaint) + found
 
 
-def _with_presses(
-    given: _Given, lights: LightsResult, prior: ResponseModel | None, touched: TouchResult | None
-) -> tuple[Calibration, list[str]]:
+def _constrained(row: CandidateRow) -> bool:
+    """Whether the image constrains the lights so well that they replace a prior."""
+    score, misfit = row.get("score_deg"), row.get("misfit")
+    return score is not None and misfit is not None and score <= WELL_CONSTRAINED_DEG and misfit < 0.02
+
+
+def _fit_presses(given: _Given, prior: _Prior, touched: TouchResult | None) -> FromPresses:
+    """The response fit, from the prior unless it is contradicted, or from touches.
+
+    Raises:
+        ValueError: no press can be used; names another crop if that is why.
+    """
+    background, sensor, presses = given.background, given.sensor, given.presses
+    try:
+        if prior.model is not None and touched is None:
+            return fit_with_or_without(background, sensor, presses, prior.model, prior.objection, given.progress)
+        start = None if touched is None else touched.model
+        return FromPresses(by_presses(background, sensor, presses, start, given.progress), "")
+    except NoUsablePress as error:
+        crop = other_crop(background, [press.image for press in presses])
+        if crop is None:
+            raise
+        raise ValueError(
+            f"presses: expected the crop of the background, got images that show it {crop.in_words()}; {error}"
+        ) from error
+
+
+def _with_presses(given: _Given, lights: LightsResult, prior: _Prior, touched: TouchResult | None) -> tuple[Calibration, list[str]]:
     """The calibration by response fields or by point lights, whichever is better on the presses, and complaints."""
-    start = prior if touched is None else touched.model
-    fit, contacts, unit = by_presses(given.background, given.sensor, given.presses, start, given.progress)
-    balls = used(contacts)
-    error_deg = error_of_lights_deg(lights.unit, given.presses, contacts, unit.sensor.blur_px)
-    lights.rows[0]["score_deg"] = error_deg
-    of_diameters = complaints.of_diameters_by_others if start is None else complaints.of_diameters_by_prior
-    found = complaints.of_contacts(contacts) + of_diameters(balls)
+    (fit, contacts, unit), dropped = _fit_presses(given, prior, touched)
+    balls, row = used(contacts), lights.rows[0]
+    if lights.unit is not None:
+        row["score_deg"] = error_of_lights_deg(lights.unit, given.presses, contacts, unit.sensor.blur_px)
+    error_deg = math.inf if lights.unit is None or row["score_deg"] is None else row["score_deg"]
+    by_itself = (prior.model is None or bool(dropped)) and touched is None
+    of_diameters = complaints.of_diameters_by_others if by_itself else complaints.of_diameters_by_prior
+    found = [dropped] * bool(dropped) + complaints.of_contacts(contacts) + of_diameters(balls)
     # twelve parameters that do about as well as a hundred are the better model
     lights_win = error_deg < (math.inf if fit.error_deg is None else TIE * fit.error_deg) and error_deg < POORLY_CONSTRAINED_DEG
-    if lights_win:
+    if lights_win and lights.unit is not None:
         other = "too few presses for a response field" if fit.error_deg is None else f"response fields {fit.error_deg:.2f}"
         report = lights.unit.report.copy()
         report["reason"] = f"point lights: on {len(balls)} presses their normals are {error_deg:.2f} deg off, {other}"
     else:
-        note = f"rejected: on {len(balls)} presses their normals are {error_deg:.1f} deg off; {lights.rows[0]['note']}"
-        lights.rows[0]["note"] = note
-        report = {"model": "response", "source": "presses", "reason": fit.reason, "held_out_deg": fit.error_deg}
+        if math.isfinite(error_deg):
+            row["note"] = f"rejected: on {len(balls)} presses their normals are {error_deg:.1f} deg off; {row['note']}"
+        reason = f"{fit.reason}; {dropped}" if dropped else fit.reason
+        report = {"model": "response", "source": "presses", "reason": reason, "held_out_deg": fit.error_deg}
     report["candidates"] = [*lights.rows, *([] if touched is None else [touched.row]), *fit.candidates]
     report["presses"] = [press_row(contact, given.sensor) for contact in contacts]
     if touched is not None:
         report["touches"] = [touch_row(contact) for contact in touched.contacts]
-    if not lights_win:
+    if not lights_win or lights.unit is None:
         return dataclasses.replace(unit, report=report), found
     unit, more = complaints.of_background_by_lights(dataclasses.replace(lights.unit, report=report))
     return unit, found + more

@@ -12,15 +12,13 @@ from ..model.calibration import Calibration
 from ..model.sensor import Sensor
 from .background import falloff, outwardness
 from .contacts import ROUGH, Contact, channel_structure
+from .pattern import ALIKE, FAINTEST, PatternMatch
 
 USUAL_GAIN = 1.15
 """The prior's slopes divided by those of the balls are within this factor: 0.93 to 1.00 on a GelSight Mini."""
 
 DOUBTFUL_GAIN = 1.25
 """Slopes by the field of the other presses divided by those of a ball are within this factor where ten presses or more agree."""
-
-FOREIGN_SPREAD = 0.35
-"""A background whose logarithm differs this much (RMS) from that of the prior's unit, brightness aside, is of another type."""
 
 
 class CalibrationWarning(UserWarning):
@@ -55,20 +53,18 @@ def of_diameters_by_others(used: Sequence[Contact]) -> list[str]:
     ]
 
 
-def of_background_with_prior(background: torch.Tensor, sensor: Sensor) -> list[str]:
-    """A background of another sensor type than the prior's, or one with a contact."""
-    assert sensor.prior is not None
+def of_background_with_prior(background: torch.Tensor, sensor: Sensor, match: PatternMatch) -> list[str]:
+    """A background of another sensor type than the prior's, turned, swapped or cropped otherwise, or one with a contact.
+
+    Args:
+        background: (3, H, W) in [0, 1].
+        sensor: with a prior.
+        match: how the background compares with the prior's.
+    """
     found = []
-    gamma = sensor.prior.response.gamma
-    usual = sensor.prior.background(sensor.height, sensor.width, sensor.mm_per_pixel).log()
-    ratio = gamma * background.double().clamp_min(1e-3).log() - usual
-    spread = float((ratio - ratio.mean()).square().mean().sqrt())
-    if spread > FOREIGN_SPREAD:
-        found.append(
-            f"background: its light differs by {spread:.0%} (RMS) from that of the unit on which the prior of sensor "
-            f"'{sensor.name}' was fitted, at most {FOREIGN_SPREAD:.0%} is usual: another sensor type, channels swapped, or an LED "
-            "failed"
-        )
+    text = of_pattern(match, sensor)
+    if text:
+        found.append(f"background: {text}")
     structure = channel_structure(background)
     if structure > ROUGH and not sensor.markers:
         found.append(
@@ -76,6 +72,22 @@ def of_background_with_prior(background: torch.Tensor, sensor: Sensor) -> list[s
             "calibration image? take it again without"
         )
     return found
+
+
+def of_pattern(match: PatternMatch, sensor: Sensor) -> str:
+    """In which way a background is not that of the prior's sensor type, or ""."""
+    if match.fits:
+        return ""
+    seen = f"its pattern of light is not that of the unit on which the prior of sensor '{sensor.name}' was fitted"
+    if match.named:
+        alike = f"correlation {match.named_likeness:.2f}, as it is {match.likeness:.2f}"
+        return f"{seen}, but looks like that pattern {match.named} ({alike}): turn, swap or crop the images as the sensor's are"
+    if match.likeness >= ALIKE:
+        return f"{seen}: it has {match.contrast:.2f} times its contrast, at least {FAINTEST} is usual: another sensor type, or pale light"
+    return (
+        f"{seen}: a correlation of {match.likeness:.2f}, at least {ALIKE} is usual, and no turned, mirrored or channel-swapped one "
+        "fits: another sensor type, or an LED failed"
+    )
 
 
 def of_background_by_lights(calibration: Calibration) -> tuple[Calibration, list[str]]:

@@ -9,14 +9,15 @@ from torch import Tensor
 
 from ..accelerated import Compensate, ContactMask
 from ..core.blur import blur, gaussian_weights
-from ..core.geometry import gradient_from_normal, gradient_of_depth, pixel_grid_mm
-from ..integration import poisson_background
+from ..core.geometry import gradient_from_normal, pixel_grid_mm
+from ..integration import PoissonBackground
 from ..model.calibration import PEDESTAL, Calibration
 from ..model.report import PressRow, TouchRow
 from ..model.response_field import ResponseField, ResponseModel
 from ..model.sensor import Sensor
 from ..normals import NormalFromResponse
 from .presses import Press, Touch
+from .regions import FarField, contact_region, far_field
 
 INSIDE = 0.85
 """Share of the contact radius within which the skin lies on the ball; further out it begins to leave it."""
@@ -26,6 +27,12 @@ LEAST_INSIDE = 10
 
 ROUGH = 0.13
 """Structure between the channels of a background from which it is taken for a contact: :func:`channel_structure`."""
+
+DARK = 0.25
+"""An image of less light than this part of the background's is no press: 12 bits in a file of 16 give 1/16."""
+
+MOST_SATURATED = 0.5
+"""A contact with more of it saturated in some channel is left out."""
 
 MAX_SAMPLES = 2000
 """Pixels of a press that enter the fit. More add little, because neighbours are alike."""
@@ -42,10 +49,11 @@ class Contact:
         index: (N,), flat indices of the sampled pixels; their four neighbours lie in the image too.
         x: (N,), mm.
         y: (N,), mm.
+        saturated: (N,) bool, pixels that no slope can be fitted to.
         radius_mm: of the ball; 0 for an unknown object.
+        half_size_mm: (2,), half the width and height of the image, mm.
         center_mm: (2,), center of the ball, as far as known.
         contact_radius_mm: radius of the contact, as far as known.
-        second_pass: (3, H, W), depth of the first pass in mm, and its two slopes; empty before the first pass.
         known: the center was given and is not searched.
         radius_known: the contact radius was given and is not searched.
         reason: why the contact is left out; empty if it is used.
@@ -58,10 +66,11 @@ class Contact:
     index: Tensor
     x: Tensor
     y: Tensor
+    saturated: Tensor
     radius_mm: float
+    half_size_mm: Tensor
     center_mm: Tensor = field(default_factory=lambda: torch.zeros(2, dtype=torch.float64))
     contact_radius_mm: float = 0.0
-    second_pass: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
     known: bool = False
     radius_known: bool = False
     reason: str = ""
@@ -73,8 +82,8 @@ class Contact:
         return dx, dy, torch.sqrt(dx * dx + dy * dy)
 
     def inside(self) -> Tensor:
-        """(N,) bool: sampled pixels where the skin lies on the ball."""
-        return self.polar()[2] < INSIDE * self.contact_radius_mm
+        """(N,) bool: sampled pixels where the skin lies on the ball and no channel is saturated."""
+        return (self.polar()[2] < INSIDE * self.contact_radius_mm) & ~self.saturated
 
     def height_above_equator(self) -> Tensor:
         """(N,) mm: height of the ball's surface above its equator; beyond 0.95 of the radius, that at 0.95."""
@@ -109,15 +118,20 @@ def read_contacts(given: Sequence[Press | Touch], background: Tensor, sensor: Se
     contacts = []
     for item in given:
         ratio = compensate(item.image.detach().cpu().double()[None])
-        contact = _sampled(item, ratio[0] - 1.0, mask(ratio)[0, 0], sensor)
-        contact.reason = _unusable(item.image, background, contact.mask)
+        change, differs = ratio[0] - 1.0, mask(ratio)[0, 0]
+        far = far_field(change)
+        ball_px = 0.5 * item.ball_diameter_mm / sensor.mm_per_pixel if isinstance(item, Press) else 0.0
+        region = contact_region(far, differs, ball_px)
+        saturated = ((item.image > 0.995) & (background < 0.995)).any(dim=0).cpu()
+        contact = _sampled(item, change, region, saturated, sensor)
+        contact.reason = _unusable(item.image, background, differs, far) or _saturated(float(saturated[region].double().mean()))
         if isinstance(item, Press) and item.center_px is not None:
             _place(contact, item, sensor)
         contacts.append(contact)
     return contacts
 
 
-def _sampled(given: Press | Touch, change: Tensor, mask: Tensor, sensor: Sensor) -> Contact:
+def _sampled(given: Press | Touch, change: Tensor, mask: Tensor, saturated: Tensor, sensor: Sensor) -> Contact:
     # one pixel of margin, for the neighbours that derivatives use
     core = torch.zeros_like(mask)
     core[1:-1, 1:-1] = mask[1:-1, 1:-1]
@@ -127,7 +141,8 @@ def _sampled(given: Press | Touch, change: Tensor, mask: Tensor, sensor: Sensor)
     rows, columns = rows[kept], columns[kept]
     x, y = pixel_grid_mm(sensor.height, sensor.width, sensor.mm_per_pixel, torch.float64)
     radius_mm = 0.5 * given.ball_diameter_mm if isinstance(given, Press) else 0.0
-    return Contact(given.name, change, mask, rows * sensor.width + columns, x[0, columns], y[rows, 0], radius_mm)
+    index, half = rows * sensor.width + columns, middle_px(sensor) * sensor.mm_per_pixel
+    return Contact(given.name, change, mask, index, x[0, columns], y[rows, 0], saturated.flatten()[index], radius_mm, half)
 
 
 def _place(contact: Contact, press: Press, sensor: Sensor) -> None:
@@ -141,21 +156,26 @@ def _place(contact: Contact, press: Press, sensor: Sensor) -> None:
         contact.reason = "no contact is seen at the given center and contact radius: a mistake in the label?"
 
 
-def _unusable(image: Tensor, background: Tensor, mask: Tensor) -> str:
-    """Why an image cannot be used, or ""."""
-    share = float(mask.double().mean())
-    border = torch.cat((mask[0], mask[-1], mask[:, 0], mask[:, -1])).double().mean()
+def _unusable(image: Tensor, background: Tensor, differs: Tensor, far: FarField) -> str:
+    """Why an image cannot be used, or "". ``differs``: (H, W), where it differs from the background."""
+    share = float(differs.double().mean())
+    level = float(image.double().mean() / background.double().mean())
+    if level < DARK:
+        depth = "black" if level < 1e-3 else f"{1 / level:.0f} times darker than the background"
+        return f"the image is {depth}: a dropped frame, or 12 bits in a file of 16?"
+    border = torch.cat((differs[0], differs[-1], differs[:, 0], differs[:, -1])).double().mean()
     if share < 0.002:
         return (
             f"no contact: only {share:.2%} of the image differs from the background; is it the background itself, or a faint press?"
         )
-    saturated = (image > 0.995).any(dim=0) & (background < 0.995).all(dim=0) & mask.cpu()
-    saturated_share = float(saturated.double().sum() / mask.double().sum())
-    if saturated_share > 0.2:
-        return f"{saturated_share:.0%} of the contact is saturated: lower the exposure"
-    if share > 0.8 and float(border) > 0.6:
+    if float(border) > 0.6 and far.is_other_light():
         return f"{share:.0%} of the image differs from the background: another unit, other exposure, or the light has changed"
     return ""
+
+
+def _saturated(share: float) -> str:
+    """That too much of the contact is saturated, or ""."""
+    return f"{share:.0%} of the contact is saturated: lower the exposure" if share > MOST_SATURATED else ""
 
 
 def middle_px(sensor: Sensor) -> Tensor:
@@ -181,20 +201,15 @@ def channel_structure(image: Tensor) -> float:
     return float(inner.square().sum(0).sqrt().flatten().quantile(0.99))
 
 
-def first_pass_depths(contacts: Sequence[Contact], fast: ResponseField, pitch_mm: float) -> list[Tensor]:
-    """(H, W) depth, mm, by a field without depth for each contact, as the pipeline computes it."""
+def first_pass_depths(contacts: Sequence[Contact], response: ResponseField, pitch_mm: float) -> list[Tensor]:
+    """(H, W) depth, mm, by a field for each contact, as the pipeline computes it in one pass."""
     if not contacts:
         return []
     height, width = contacts[0].mask.shape
-    normals = NormalFromResponse(fast, None, height, width, pitch_mm, dtype=torch.float64)
+    normals = NormalFromResponse(response, None, height, width, pitch_mm, dtype=torch.float64)
+    integrate = PoissonBackground(pitch_mm)  # keeps its tables
     gradients = (gradient_from_normal(normals(1.0 + contact.change[None])) * contact.mask for contact in contacts)
-    return [poisson_background(gradient, pitch_mm)[0, 0] for gradient in gradients]
-
-
-def prepare_second_pass(contacts: Sequence[Contact], fast: ResponseField, pitch_mm: float) -> None:
-    """Keep with each contact the inputs of a second pass: depth of the first pass and its slopes."""
-    for contact, depth in zip(contacts, first_pass_depths(contacts, fast, pitch_mm)):
-        contact.second_pass = torch.cat((depth[None], gradient_of_depth(depth[None, None], pitch_mm)[0]))
+    return [integrate(gradient)[0, 0] for gradient in gradients]
 
 
 def press_row(contact: Contact, sensor: Sensor) -> PressRow:

@@ -1,8 +1,8 @@
 """Response fields by linear least squares: from presses of known balls, and from the curl, which every surface has zero.
 
 A field is linear in its coefficients, so each contact contributes a quadratic form, and contacts, a prior and a regularisation
-add up. The forms: inside the contact the ball's slope is known; in the transition zone around it the slope points to the center;
-and everywhere the slope of a surface has no curl.
+add up. The forms: inside the contact the ball's sine (slope / sqrt(1 + |slope|^2)) is known; in the transition zone around it the
+slope points to the center; and everywhere the slope of a surface has no curl, nor, nearly, have sines.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..model.response_field import ResponseField, term_degrees, term_degrees_by_term, term_values
+from ..model.response_field import (
+    ResponseField,
+    sine_from_slope,
+    slope_from_sine,
+    term_degrees,
+    term_degrees_by_term,
+    term_values,
+)
 from .contacts import Contact
 
 CURL_WEIGHT = 3.0
@@ -21,11 +28,6 @@ DEGREE_PENALTY = 2.0
 """Each degree in position regularises a coefficient this many times more: slowly varying fields are likely."""
 PRODUCT_PENALTY = 10.0
 """Coefficients of products are regularised this many times more: they fit one unit and do not carry over to another."""
-DEPTH_PENALTY = 3.0
-"""Terms with the depth are regularised this many times more: half a millimetre is a deep press, and depth alone can imitate a
-ball's shape."""
-SLOPE_PENALTY = 0.3
-"""Slopes of the depth are regularised by this factor: they are slopes already."""
 
 
 @dataclass(frozen=True)
@@ -35,54 +37,46 @@ class Family:
     Attributes:
         degree: of linear terms in position.
         product_degree: of products in position; -1 for none.
-        uses_depth: depth and its slopes are inputs.
         half_mm: scale of positions, mm.
-        product_penalty: regularisation of products relative to linear terms.
     """
 
     degree: int
     product_degree: int
-    uses_depth: bool
     half_mm: float
-    product_penalty: float = PRODUCT_PENALTY
 
     def label(self) -> str:
-        """Such as "linear 2, products 1, with depth"."""
-        products = "" if self.product_degree < 0 else f", products {self.product_degree}"
-        return f"linear {self.degree}{products}{', with depth' if self.uses_depth else ''}"
+        """Such as "linear 2, products 1"."""
+        return f"linear {self.degree}" + ("" if self.product_degree < 0 else f", products {self.product_degree}")
 
     def penalty(self) -> Tensor:
-        """(2 K,): regularisation of each coefficient; dz/dx first."""
-        by_term = term_degrees_by_term(self.degree, self.product_degree, self.uses_depth)
-        factors = [self._term_penalty(term) for term, d in by_term.items() for _ in range((d + 1) * (d + 2) // 2)]
-        degrees = torch.tensor(term_degrees(self.degree, self.product_degree, self.uses_depth), dtype=torch.float64)
+        """(2 K,): regularisation of each coefficient; along x first."""
+        by_term = term_degrees_by_term(self.degree, self.product_degree)
+        factors = [1.0 if len(term) == 1 else PRODUCT_PENALTY for term, d in by_term.items() for _ in range((d + 1) * (d + 2) // 2)]
+        degrees = torch.tensor(term_degrees(self.degree, self.product_degree), dtype=torch.float64)
         return (torch.tensor(factors, dtype=torch.float64) * DEGREE_PENALTY**degrees).repeat(2)
-
-    def _term_penalty(self, term: tuple[int, ...]) -> float:
-        if len(term) == 2:
-            return self.product_penalty * (DEPTH_PENALTY if 3 in term else 1.0)
-        return (1.0, 1.0, 1.0, DEPTH_PENALTY, SLOPE_PENALTY, SLOPE_PENALTY)[term[0]]
 
     def size(self) -> int:
         """Number of parameters of a field of this family, both slopes."""
-        return 2 * len(term_degrees(self.degree, self.product_degree, self.uses_depth))
+        return 2 * len(term_degrees(self.degree, self.product_degree))
 
     def field(self, coefficient: Tensor) -> ResponseField:
         """The field of coefficients (2 K,)."""
         rows = coefficient.reshape(2, -1).tolist()
-        return ResponseField(self.degree, self.product_degree, self.uses_depth, self.half_mm, tuple(tuple(row) for row in rows))
+        return ResponseField(self.degree, self.product_degree, self.half_mm, tuple(tuple(row) for row in rows))
 
     @classmethod
     def of(cls, field: ResponseField) -> "Family":
         """The family of a field."""
-        return cls(field.degree, field.product_degree, field.uses_depth, field.half_mm)
+        return cls(field.degree, field.product_degree, field.half_mm)
 
-    def terms(self, contact: Contact, shift: int = 0) -> Tensor:
-        """(K, N): factors of the coefficients at the sampled pixels, or at pixels ``shift`` further in memory."""
-        index = contact.index + shift
-        deep = contact.second_pass.flatten(1)[:, index] if self.uses_depth else None
-        change = contact.change.flatten(1)[:, index]
-        return term_values(change, deep, contact.x, contact.y, self.half_mm, self.degree, self.product_degree)
+    def terms(self, contact: Contact, shift: int = 0, every: int = 1) -> Tensor:
+        """(K, N): factors of the coefficients at the sampled pixels, or every so many, or at pixels ``shift`` further in memory."""
+        change = contact.change.flatten(1)[:, contact.index[::every] + shift]
+        return term_values(change, contact.x[::every], contact.y[::every], self.half_mm, self.degree, self.product_degree)
+
+    def terms_of(self, contact: Contact, change: Tensor) -> Tensor:
+        """(K, N): the same for another change (3, N) at the sampled pixels."""
+        return term_values(change, contact.x, contact.y, self.half_mm, self.degree, self.product_degree)
 
 
 class ContactForms:
@@ -99,7 +93,7 @@ class ContactForms:
         terms = self.terms[:, inside]
         count = max(1, int(inside.sum()))
         gram = terms @ terms.t() / count
-        right = (terms @ self.contact.ball_slope()[:, inside].t() / count).t().reshape(-1)
+        right = (terms @ ball_sine(self.contact)[:, inside].t() / count).t().reshape(-1)
         form = self.transition_and_curl()
         half = len(gram)
         form[:half, :half] += gram
@@ -119,21 +113,21 @@ class ContactForms:
         return form + TRANSITION_WEIGHT * across @ across.t() / count
 
     def center(self) -> tuple[Tensor, Tensor, Tensor]:
-        """How slope and center depend on each other: coupling (2, K), weight of a shift, and the shift's own right side (2,).
+        """How sine and center depend on each other: coupling (2, K), weight of a shift, and the shift's own right side (2,).
 
-        Around the present center the ball's slope is -(x - c) / height, so a shift of the center by d adds d / height.
+        The ball's sine is -(x - c) / radius, so a shift of the center by d adds d / radius, everywhere.
         """
         inside = self.contact.inside()
-        slope_per_shift = 1.0 / self.contact.height_above_equator()[inside]
-        count = max(1, len(slope_per_shift))
-        coupling = -(self.terms[:, inside] * slope_per_shift).sum(1) / count
-        weight = slope_per_shift.square().sum().clamp_min(1e-12) / count
-        own = -(self.contact.ball_slope()[:, inside] * slope_per_shift).sum(1) / count
+        per_shift = 1.0 / max(self.contact.radius_mm, 1e-6)
+        count = max(1, int(inside.sum()))
+        coupling = -self.terms[:, inside].sum(1) * per_shift / count
+        weight = torch.tensor(per_shift**2, dtype=torch.float64)
+        own = -ball_sine(self.contact)[:, inside].sum(1) * per_shift / count
         return coupling, weight, own
 
     def slope(self, coefficient: Tensor) -> Tensor:
         """(2, N) slopes by coefficients (2 K,) at the sampled pixels."""
-        return coefficient.reshape(2, -1) @ self.terms
+        return slope_from_sine(coefficient.reshape(2, -1) @ self.terms)
 
     def error_deg(self, coefficient: Tensor) -> float:
         """Mean angle between the normals of these slopes and of the ball, inside the contact, degrees."""
@@ -187,11 +181,16 @@ class Evidence:
         return [solve(self.form - form, self.right - right, penalty, start) for form, right in self.each]
 
 
+def ball_sine(contact: Contact) -> Tensor:
+    """(2, N): sine of the ball's surface at the sampled pixels, -(x - center) / radius."""
+    return sine_from_slope(contact.ball_slope())
+
+
 def curl_form(family: Family, contact: Contact) -> Tensor:
-    """(2 K, 2 K): mean squared curl over the sampled pixels, per pixel pitch."""
+    """(2 K, 2 K): mean squared curl over every third sampled pixel, per pixel pitch. All of them give nothing more."""
     width = contact.mask.shape[1]
-    across = 0.5 * (family.terms(contact, width) - family.terms(contact, -width))  # d / dy for dz/dx
-    along = 0.5 * (family.terms(contact, 1) - family.terms(contact, -1))
+    across = 0.5 * (family.terms(contact, width, 3) - family.terms(contact, -width, 3))  # d / dy for dz/dx
+    along = 0.5 * (family.terms(contact, 1, 3) - family.terms(contact, -1, 3))
     rows = torch.cat((across, -along))
     return rows @ rows.t() / max(1, rows.shape[1])
 

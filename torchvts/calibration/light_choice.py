@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..model.report import CandidateRow
 from ..model.sensor import Sensor
+from .background import BackgroundPixels, misfit_of_paraboloid
 from .lights import POORLY_CONSTRAINED_DEG, LightFit, fit_lights
 
 WORTH = 0.01
@@ -24,6 +25,10 @@ ambient light reduces the structure of a camera's gamma of 2.2 to 3 %, with ligh
 
 LARGE_MISFIT = 0.2
 """Relative structure left unexplained from which lights are no candidate beside another model."""
+
+HOPELESS = 0.1
+"""Misfit of the closed-form lights from which no fit is tried beside another model. It is 0.125 to 0.20 on five real sensors; on
+drawn rigs at most 0.07, with an ambient light as bright as the lights (0.3), and 0.05 with half of the corners' light lost."""
 
 AZIMUTH_SLACK_DEG = 5.0
 """Free lights further than this, and three standard deviations, from the azimuths in the sensor file are not the sensor's."""
@@ -112,16 +117,48 @@ def choose_lights(background: Tensor, sensor: Sensor, other_models: bool = False
         candidate.objection = _objection(candidate, tried, sensor)
     chosen = _choose(tried)
     fit, linear = chosen.fit, dataclasses.replace(linear, gamma=chosen.gamma)
-    if not (other_models and chosen.misfit > LARGE_MISFIT):
+    if not fit.failed and not (other_models and chosen.misfit > LARGE_MISFIT):
         fit = _fit(background, linear, chosen.vignetting, chosen.ambient, chosen.known_azimuth, progress)
     final = dataclasses.replace(chosen, fit=fit)
     row = _row(final)
-    row |= {"held_out": chosen.held_out, "note": _note(final)}
+    row["note"] = _note(final)
+    if not fit.failed:
+        row["held_out"] = chosen.held_out
     complaint = f"background: {fit.message}" if not fit.converged or (row["score_deg"] or 0.0) > POORLY_CONSTRAINED_DEG else ""
     if not complaint and chosen.objection:
         complaint = f"background: {chosen.family}: {chosen.objection}"
     rows = [row, *(_row(candidate) for candidate in tried if candidate is not chosen)]
     return LightChoice(linear, fit, rows, _reason(chosen, tried), complaint)
+
+
+def hopeless(background: Tensor, sensor: Sensor) -> str:
+    """Why point lights cannot explain a background, by their closed form on a sparse image and without any fit, or "".
+
+    Fitted lights are chosen beside another model only if they leave next to nothing of the background. The closed form leaves
+    more than they do, but not by orders: vignetting and ambient light bend the fall-off of a light, they do not turn it over.
+
+    Args:
+        background: (3, H, W) in [0, 1].
+        sensor: both gammas are tried where it leaves gamma open.
+    Example:
+        >>> from torchvts.model.lights import PointLights, flat_image
+        >>> lights = PointLights([[25, 0, 30], [-12, 20, 30], [-12, -20, 30]], [900, 900, 900])
+        >>> image, sensor = flat_image(lights, 48, 64, 0.6).detach(), Sensor("rig", 48, 64, 0.6)
+        >>> hopeless(image, sensor), hopeless(1.0 - image, sensor)
+        ('', 'the background of R, G, B falls off as under no near point light')
+    """
+    objections = []
+    for gamma in (sensor.exponent,) if sensor.gamma is not None else (1.0, OTHER_GAMMA):
+        image, small = _sparse(background, dataclasses.replace(sensor, gamma=gamma, prior=None), 30)
+        left, far = misfit_of_paraboloid(BackgroundPixels.of(image.detach().to(torch.float64).cpu(), small))
+        if bool(far.any()):
+            named = ", ".join(name for name, one in zip("RGB", far.tolist(), strict=True) if one)
+            objections.append(f"the background of {named} falls off as under no near point light")
+        elif float(left.max()) > HOPELESS:
+            objections.append(f"the closed-form lights leave a misfit of {float(left.max()):.0%} of the background")
+        else:
+            return ""
+    return objections[0]
 
 
 def _sparse(background: Tensor, sensor: Sensor, rows: int) -> tuple[Tensor, Sensor]:
@@ -239,20 +276,23 @@ def _reason(chosen: _Candidate, tried: list[_Candidate]) -> str:
 
 def _row(candidate: _Candidate) -> CandidateRow:
     fit = candidate.fit
-    note = f"rejected: {candidate.objection}" if candidate.objection else f"held-out loss {candidate.held_out:.4f}"
-    return {
+    row: CandidateRow = {
         "model": "point lights",
         "family": candidate.family,
         "gamma": candidate.gamma,
         "parameters": candidate.parameters,
         "passes": 2,
-        "score_deg": float(fit.direction_std_deg.max()) if fit.converged else 90.0,
-        "misfit": candidate.misfit,
-        "held_out": candidate.held_out,
-        "vignetting": fit.vignetting,
-        "ambient": fit.ambient.tolist(),
-        "note": note,
+        "score_deg": None if fit.failed else float(fit.direction_std_deg.max()) if fit.converged else 90.0,
+        "note": f"rejected: {candidate.objection}" if candidate.objection else f"held-out loss {candidate.held_out:.4f}",
     }
+    if not fit.failed:  # a failed fit has no figures
+        row |= {
+            "misfit": candidate.misfit,
+            "held_out": candidate.held_out,
+            "vignetting": fit.vignetting,
+            "ambient": fit.ambient.tolist(),
+        }
+    return row
 
 
 def _note(chosen: _Candidate) -> str:

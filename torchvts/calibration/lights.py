@@ -4,6 +4,7 @@ A point light over a flat skin gives I = rho z / |S - P|^3, so I^(-2/3) is a par
 A robust least-squares loop in image value then finds the lights that fit best.
 """
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -20,6 +21,8 @@ from .background import (
     GLOSS,
     VIGNETTING,
     BackgroundPixels,
+    at_bound,
+    bounded,
     falloff,
     free_parameters,
     from_lights,
@@ -38,6 +41,12 @@ GLOSS_MISFIT = 0.01
 NOT_GLOSS = 0.1
 """A matt skin that leaves more relative structure than this is not tried as a glossy one: no gloss of this lobe width helps."""
 
+LEAST_USABLE = 0.02
+"""Share of each channel's pixels that a fit needs."""
+
+ENOUGH_STEPS = 20
+"""Steps after which one would have lowered the loss: each that does not is followed by one a tenth as long."""
+
 STEP_TOLERANCE_MM = 1e-4
 """The loop ends after three steps that move no light further than this."""
 
@@ -53,6 +62,8 @@ class LightFit:
         lights: the three lights.
         converged: the loop ended because the lights stopped moving.
         message: how it ended, and the remedy if it did not converge.
+        failed: the loop found no lights: it diverged or never moved, or a channel has hardly a usable pixel. ``lights`` are then
+            those of the start, and all figures of merit are infinite.
         loss_history: robust loss per step, in units of the noise.
         direction_std_deg: (3,), standard deviation of each light's direction seen from the image centre.
         position_std_mm: (3, 3), of each position coordinate.
@@ -84,6 +95,7 @@ class LightFit:
     ambient: Tensor = field(default_factory=lambda: torch.zeros(3), repr=False)
     ambient_std: Tensor = field(default_factory=lambda: torch.full((3,), torch.inf), repr=False)
     parameters: int = 12
+    failed: bool = False
     held_out: Tensor = field(default_factory=lambda: torch.zeros(16), repr=False)
 
 
@@ -196,6 +208,7 @@ class _Solution(NamedTuple):
     parameter: Tensor
     history: list[float]
     converged: bool
+    failure: str
     moved_mm: float
     weight: Tensor
     scale: Tensor
@@ -258,11 +271,17 @@ def _solve(pixels: BackgroundPixels, start: Tensor, loop: _Loop) -> _Solution:
     tied = loop.azimuth is not None or VIGNETTING in pixels.terms
     optimiser = LevenbergMarquardt(parameter, tie=tie if tied else None)
     history: list[float] = []
-    still, moved = 0, float("inf")
+    still, moved, span = 0, math.inf, pixels.span_mm()
+    most = loop.max_steps if float(pixels.usable.double().mean(dim=1).min()) >= LEAST_USABLE else 0
     with tqdm(total=loop.max_steps, desc=f"lights, {len(pixels.x)} pixels", disable=not loop.progress, leave=False) as bar:
-        while len(history) < loop.max_steps and still < 3:
+        while len(history) < most and still < 3:
             weight, scale = _robust_weight(pixels.residual(parameter.detach()), pixels.usable)
+            before = parameter.detach().clone()
             optimiser.step(pixels.residual, weight / scale.square() if tied else weight)
+            if bool(at_bound(parameter.detach(), span).any()):
+                with torch.no_grad():
+                    parameter.copy_(bounded(parameter, span))
+                optimiser.last_step = parameter.detach() - before
             history.append(float(_tukey_loss(pixels.residual(parameter.detach()), scale)))
             moved = _moved_mm(optimiser.last_step, parameter.detach())
             still = still + 1 if moved < STEP_TOLERANCE_MM else 0
@@ -272,11 +291,25 @@ def _solve(pixels: BackgroundPixels, start: Tensor, loop: _Loop) -> _Solution:
     residual, jacobian = residual_and_jacobian(pixels.residual, parameter)
     weight, scale = _robust_weight(residual, pixels.usable)
     fit = Linearisation(pixels, parameter, residual, jacobian, weight / scale.square(), tie)
-    if not (fit.is_finite() and bool(torch.isfinite(scale).all())):  # diverged: nothing is known, nothing explained
-        unknown = 1e6 * torch.eye(parameter.shape[1], dtype=parameter.dtype).expand(3, -1, -1)
-        return _Solution(start, [*history, 1e6], False, 1e6, weight, scale, unknown, torch.ones(3), torch.full((16,), 1e6))
+    failure = _failure(fit, scale, math.isinf(moved) and len(history) >= ENOUGH_STEPS)
+    if failure:  # nothing is known, nothing explained
+        unknown = torch.full_like(start, 1e12).diag_embed()
+        nothing = torch.full((3,), torch.inf), torch.full((16,), torch.inf)
+        return _Solution(start, [*history, math.inf], False, failure, math.inf, weight, scale, unknown, *nothing)
     covariance, misfit = covariance_and_misfit(fit)
-    return _Solution(parameter, history, still == 3, moved, weight, scale, covariance, misfit, held_out_loss(fit))
+    converged = still == 3 and not bool(at_bound(parameter, span).any())
+    return _Solution(parameter, history, converged, "", moved, weight, scale, covariance, misfit, held_out_loss(fit))
+
+
+def _failure(fit: Linearisation, scale: Tensor, never_moved: bool) -> str:
+    """Why an end of the loop is no fit at all, or ""."""
+    usable = fit.pixels.usable.double().mean(dim=1)
+    if float(usable.min()) < LEAST_USABLE:
+        channel = "RGB"[int(usable.argmin())]
+        return f"only {float(usable.min()):.1%} of channel {channel} is neither saturated nor near black: set the exposure by it"
+    if not (fit.is_finite() and bool(torch.isfinite(scale).all())) or never_moved:
+        return "the fit of point lights found no step that lowers the loss: the background is no image of point lights"
+    return ""
 
 
 def _robust_weight(residual: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:
@@ -309,7 +342,8 @@ def _light_fit(dtype: torch.dtype, pixels: BackgroundPixels, best: _Solution, lo
     return LightFit(
         lights=to_lights(parameter, terms, dtype),
         converged=best.converged,
-        message=_message(best, direction_std, residual_std / pixels.image.median(dim=1).values, loop.max_steps),
+        message=_message(best, direction_std, residual_std / pixels.image.median(dim=1).values, pixels, loop.max_steps),
+        failed=bool(best.failure),
         loss_history=best.history,
         direction_std_deg=direction_std,
         position_std_mm=position_std,
@@ -323,12 +357,19 @@ def _light_fit(dtype: torch.dtype, pixels: BackgroundPixels, best: _Solution, lo
     )
 
 
-def _message(best: _Solution, direction_std: Tensor, relative_residual: Tensor, max_steps: int) -> str:
-    if not best.converged:
+def _message(best: _Solution, direction_std: Tensor, relative_residual: Tensor, pixels: BackgroundPixels, max_steps: int) -> str:
+    if best.failure:
+        return best.failure
+    held = at_bound(best.parameter, pixels.span_mm())
+    if bool(held.any()):
+        named = ", ".join(name for name, one in zip("RGB", held.tolist(), strict=True) if one)
         return (
-            f"stopped at {max_steps} steps, lights still moving {best.moved_mm:.3g} mm per step: "
-            "raise max_steps, or the image does not constrain the lights"
+            f"the background of {named} falls off as under no near point light: the fit ends at the most distant one that is "
+            "allowed; calibrate with presses or known lights"
         )
+    if not best.converged:
+        moving = "" if math.isinf(best.moved_mm) else f", lights still moving {best.moved_mm:.3g} mm per step"
+        return f"stopped at {max_steps} steps{moving}: raise max_steps, or the image does not constrain the lights"
     message = f"converged in {len(best.history)} steps"
     poor = [
         f"{name} +-{float(std):.1f} deg" for name, std in zip("RGB", direction_std, strict=True) if std > POORLY_CONSTRAINED_DEG

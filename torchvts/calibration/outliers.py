@@ -52,11 +52,11 @@ def _leave_out(contacts: list[Contact], light: Tensor, pitch_mm: float, prior: R
         if len(left) < (1 if prior is not None else 2):
             return
         if prior is not None:
-            evidence = Evidence.of(Family.of(prior.fast), left)
-            solutions = [prior.fast.tensor().reshape(-1)] * len(left)
+            evidence = Evidence.of(Family.of(prior.field), left)
+            solutions = [prior.field.tensor().reshape(-1)] * len(left)
         else:
             # small fields, helped by what the background's brightness says of the place
-            family = Family(2 if len(left) >= 8 else 0, -1, False, half_mm)
+            family = Family(2 if len(left) >= 8 else 0, -1, half_mm)
             evidence = Evidence.of(family, brightness_normalised(left, light, half_mm, pitch_mm)[1])
             solutions = evidence.held_out(SCREENING_PENALTY * family.penalty(), None)
         gains, errors = evidence.gains(solutions), evidence.errors_deg(solutions)

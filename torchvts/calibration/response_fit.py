@@ -1,18 +1,19 @@
 """Fit response fields to located presses: the smallest family that explains each press by the others."""
 
-import dataclasses
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from ..model.report import CandidateRow
-from ..model.response_field import ResponseField, ResponseModel
+from ..model.response_field import DepthBrightness, ResponseField, ResponseModel, position_basis
 from ..model.sensor import Sensor
-from .contacts import Contact, prepare_second_pass
-from .field import PRODUCT_PENALTY, Evidence, Family
+from .contacts import Contact, first_pass_depths
+from .field import Evidence, Family, ball_sine
 from .outliers import locate_and_screen
+from .refusals import NoUsablePress
 from .touches import presses_as_touches
 
 FAMILIES = ((0, -1), (1, -1), (2, -1), (2, 1), (3, 2), (4, 3))
@@ -27,8 +28,7 @@ WORTH = 0.02
 
 ENOUGH = 5
 """Presses from which a field is fitted without a start. Fewer, without a prior, start from the field that they give as touches,
-because their centers are too uncertain. A GelSight Mini by 2, 3, 5 and 7 presses, precise: without a start 5.69, 6.27, 4.42 and
-3.52 degrees, from that field 5.22, 4.98, 4.65 and 4.11."""
+because their centers are too uncertain."""
 
 FEW = 3
 """Presses from which a regularisation strength is chosen by holding presses out."""
@@ -37,21 +37,12 @@ FEW_PENALTY = 3.0
 """Regularisation towards a start with fewer than these."""
 
 
-@dataclass(frozen=True)
-class Candidates:
-    """Which fields are tried.
+DEPTH_DEGREE = 2
+"""Degree in position of what depth does to brightness."""
 
-    Attributes:
-        degrees: of linear terms and products, the smallest first.
-        product_penalty: regularisation of products relative to linear terms.
-    """
-
-    degrees: tuple[tuple[int, int], ...] = FAMILIES
-    product_penalty: float = PRODUCT_PENALTY
-
-    def families(self, half_mm: float) -> list[Family]:
-        """The families, without depth."""
-        return [Family(degree, products, False, half_mm, self.product_penalty) for degree, products in self.degrees]
+DEPTH_PENALTY = 0.1
+"""Regularisation of it, in presses times mm^2: (0.03 / 0.1)^2, because sines are right to about 0.03, and a skin that comes 1 mm
+nearer to lights about 10 mm away changes its brightness by about 0.1."""
 
 
 @dataclass
@@ -92,7 +83,7 @@ def fit_response(
     sensor: Sensor,
     prior: ResponseModel | None,
     progress: bool = False,
-    candidates: Candidates = Candidates(),
+    degrees: tuple[tuple[int, int], ...] = FAMILIES,
 ) -> ResponseFit:
     """Locate the balls, leave out presses that contradict, and fit.
 
@@ -102,40 +93,74 @@ def fit_response(
         sensor: the sensor, with the gamma and blur of the contacts' preprocessing.
         prior: fields of the sensor's type, or None.
         progress: show a bar.
-        candidates: the fields to try.
+        degrees: of linear terms and products of the fields to try, the smallest first.
     Raises:
-        ValueError: no press is left; says what became of each.
+        NoUsablePress: no press is left; says what became of each.
     """
     pitch = sensor.mm_per_pixel
-    half_mm = prior.fast.half_mm if prior is not None else 0.5 * sensor.width * pitch
-    families = candidates.families(half_mm)
+    half_mm = prior.field.half_mm if prior is not None else 0.5 * sensor.width * pitch
+    families = [Family(degree, products, half_mm) for degree, products in degrees]
     with tqdm(total=3, desc="calibrating from presses", disable=not progress, leave=False) as bar:
         bar.set_postfix(step="balls")
         presses = locate_and_screen(contacts, light, sensor, prior, half_mm)
         if not presses:
-            raise ValueError("presses: none can be used: " + "; ".join(f"{c.name}: {c.reason}" for c in contacts))
+            raise NoUsablePress(contacts)
         bar.update()
-        bar.set_postfix(step="one pass")
-        start = None if prior is None else _Start(prior.fast, "prior")
+        bar.set_postfix(step="fields")
+        start = None if prior is None else _Start(prior.field, "prior")
         if prior is None and 2 <= len(presses) < ENOUGH:
             by_curl = presses_as_touches(presses, light, half_mm, pitch)
             start = None if by_curl is None else _Start(by_curl, "field by curl")
-        fast = _choose(presses, families, False, start)
-        prepare_second_pass(presses, fast.field, pitch)
+        chosen = _choose(presses, families, start)
         bar.update()
-        bar.set_postfix(step="second pass")
-        repeated = fast.field.embedded(fast.field.degree, fast.field.product_degree, True)
-        if start is not None:
-            start = start._replace(field=(None if prior is None else prior.precise) or repeated)
-        precise = _choose(presses, families, True, start)
+        bar.set_postfix(step="depth")
+        by_depth = fit_depth_brightness(presses, chosen.field, pitch, None if prior is None else prior.by_depth)
         bar.update()
-    score, before = precise.row["score_deg"], fast.row["score_deg"]
-    field = precise.field
-    if score is not None and before is not None and score > before:  # depth explains nothing: the second pass repeats the first
-        field, score = repeated, before
-    rows = fast.rows + precise.rows
-    reason = f"{fast.row['model']}; {precise.row['model']}, from {len(presses)} presses: {_how(score, len(rows))}"
-    return ResponseFit(ResponseModel(fast.field, field, sensor.exponent, sensor.blur_px), score, rows, reason)
+    score = chosen.row["score_deg"]
+    reason = f"{chosen.row['model']}, from {len(presses)} presses: {_how(score, len(chosen.rows))}"
+    return ResponseFit(ResponseModel(chosen.field, by_depth, sensor.exponent, sensor.blur_px), score, chosen.rows, reason)
+
+
+def fit_depth_brightness(
+    contacts: list[Contact], field: ResponseField, pitch_mm: float, prior: DepthBrightness | None = None
+) -> DepthBrightness:
+    """What depth does to brightness, by presses that are located: linear least squares on what a field leaves of their sines.
+
+    Balls could teach a second pass much more, but what it learns beyond this holds for balls only (docs/decisions.md).
+
+    Args:
+        contacts: of presses.
+        field: of the first pass.
+        pitch_mm: pixel pitch, mm.
+        prior: regularises the result; None regularises it to zero.
+    """
+    size = (DEPTH_DEGREE + 1) * (DEPTH_DEGREE + 2) // 2
+    start = torch.zeros(3, size, dtype=torch.float64)
+    if prior is not None:
+        start[:, : prior.tensor().shape[1]] = prior.tensor()
+    form = DEPTH_PENALTY * torch.eye(3 * size, dtype=torch.float64)
+    right = torch.zeros(3 * size, dtype=torch.float64)
+    for contact, depth in zip(contacts, first_pass_depths(contacts, field, pitch_mm)):
+        inside = contact.inside()
+        effect, left = _effect_of_depth(contact, field, depth, start)
+        columns = effect[:, :, inside].reshape(3 * size, -1)
+        form += columns @ columns.t() / int(inside.sum())
+        right += columns @ left[:, inside].reshape(-1) / int(inside.sum())
+    found = start + torch.linalg.solve(form, right).reshape(3, size)
+    return DepthBrightness(DEPTH_DEGREE, field.half_mm, tuple(tuple(row) for row in found.tolist()))
+
+
+def _effect_of_depth(contact: Contact, field: ResponseField, depth: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
+    """At the sampled pixels the derivative (3 K, 2, N) of the sines by the coefficients of a :class:`DepthBrightness`, and what the
+    sines lack of the ball's with the coefficients ``start`` (3, K)."""
+    family, weight, step = Family.of(field), field.tensor(), 1e-4
+    basis = position_basis(contact.x, contact.y, field.half_mm, DEPTH_DEGREE) * depth.flatten()[contact.index]  # (K, N)
+    change = contact.change.flatten(1)[:, contact.index] - start @ basis
+    sine = weight @ family.terms_of(contact, change)
+    shifts = step * torch.eye(3, dtype=torch.float64)[:, :, None]
+    slopes = [(weight @ family.terms_of(contact, change + shift) - sine) / step for shift in shifts]
+    effect = torch.cat([-slope[None] * basis[:, None] for slope in slopes])
+    return effect, ball_sine(contact) - sine
 
 
 def _how(score_deg: float | None, count: int) -> str:
@@ -151,10 +176,10 @@ def held_out_deg(contacts: list[Contact], like: ResponseField) -> float:
     return evidence.mean_error_deg(evidence.held_out(PENALTIES[1] * family.penalty(), None))
 
 
-def _choose(contacts: list[Contact], families: list[Family], uses_depth: bool, start: _Start | None) -> _Choice:
+def _choose(contacts: list[Contact], families: list[Family], start: _Start | None) -> _Choice:
     """The field of the smallest family within WORTH of the best held-out angle."""
     few = len(contacts) < FEW
-    families = [dataclasses.replace(family, uses_depth=uses_depth) for family in families[: 1 if few else None]]
+    families = families[: 1 if few else None]
     rows: list[CandidateRow] = []
     fields: list[ResponseField] = []
     if start is not None:
@@ -183,7 +208,7 @@ def _fit_family(evidence: Evidence, start: _Start | None, few: bool) -> tuple[Ca
     origin: Tensor | None = None
     strengths: tuple[float, ...] = PENALTIES
     if start is not None:
-        origin = start.field.embedded(family.degree, family.product_degree, family.uses_depth).tensor().reshape(-1)
+        origin = start.field.embedded(family.degree, family.product_degree).tensor().reshape(-1)
         strengths = (FEW_PENALTY,) if few else PENALTIES_ON_START
     penalties = {strength: strength * family.penalty() for strength in strengths}
     scores = {} if few else {s: evidence.mean_error_deg(evidence.held_out(p, origin)) for s, p in penalties.items()}
@@ -196,5 +221,4 @@ def _fit_family(evidence: Evidence, start: _Start | None, few: bool) -> tuple[Ca
 
 
 def _row(model: str, family: Family, parameters: int, score_deg: float | None) -> CandidateRow:
-    passes = 2 if family.uses_depth else 1
-    return {"model": model, "family": family.label(), "parameters": parameters, "score_deg": score_deg, "passes": passes}
+    return {"model": model, "family": family.label(), "parameters": parameters, "score_deg": score_deg, "passes": 1}

@@ -17,7 +17,7 @@ from ..core.blur import blur, gaussian_weights
 from ..core.geometry import pixel_grid_mm
 from ..model.response_field import ResponseField, position_basis
 from .contacts import LEAST_INSIDE, Contact, first_pass_depths
-from .field import Family, curl_form
+from .field import Family, ball_sine, curl_form
 
 TOUCH_BLUR_PX = 3.0
 """Blur of touches at 320 x 240: the curl is a derivative, and its noise biases the field towards smooth channels."""
@@ -77,7 +77,7 @@ def fit_touches(contacts: list[Contact], light: Tensor, half_mm: float, pitch_mm
     best: tuple[Family, Tensor, float] | None = None
     gain, normalised = brightness_normalised(contacts, light, half_mm, pitch_mm)
     for degree in (0, 1, 2):
-        family = Family(degree, -1, False, half_mm)
+        family = Family(degree, -1, half_mm)
         if degree > 0 and family.size() > PARAMETERS_PER_TOUCH * len(contacts):
             break
         solution, gap = _smallest_eigenvector(family, normalised)
@@ -153,7 +153,7 @@ def multiplied(field: ResponseField, gain: Tensor) -> ResponseField:
     for k, (i, j) in enumerate(own):
         for factor, (m, n) in zip(gain.tolist(), other):
             product[:, :, powers.index((i + m, j + n))] += factor * rows[:, :, k]
-    return ResponseField(degree, -1, False, field.half_mm, tuple(tuple(row) for row in product.flatten(1).tolist()))
+    return ResponseField(degree, -1, field.half_mm, tuple(tuple(row) for row in product.flatten(1).tolist()))
 
 
 def _powers(degree: int) -> list[tuple[int, int]]:
@@ -168,32 +168,29 @@ def scaled(field: ResponseField, scale: float) -> ResponseField:
 
 
 def scale_by_presses(field: ResponseField, presses: list[Contact], rounds: int = 12) -> float:
-    """The scale at which the field's slopes are those of the balls. The centers move with it; the contact radii stay.
+    """The scale at which the field's sines are those of the balls. The centers move with it; the contact radii stay.
 
-    Slope = -(x - center) / height above the equator is linear in the scale and in a shift of the center together.
+    The sine -(x - center) / radius is linear in the scale and in a shift of the center together.
     """
     family = Family.of(field)
-    slopes = [field.tensor() @ family.terms(press) for press in presses]
+    sines = [field.tensor() @ family.terms(press) for press in presses]
     scale = 0.0
     for _ in range(rounds):
         product = square = 0.0
         parts = []
-        for press, slope in zip(presses, slopes):
+        for press, sine in zip(presses, sines):
             inside = press.inside()
             if int(inside.sum()) < LEAST_INSIDE:
                 continue
-            slope_per_shift = 1.0 / press.height_above_equator()[inside]
-            found, ball = slope[:, inside], press.ball_slope()[:, inside]
-            # eliminate the shift: project it out of the slopes found
-            shift_direction = slope_per_shift / slope_per_shift.square().sum().sqrt()
-            free = found - (found @ shift_direction)[:, None] * shift_direction
+            found, ball = sine[:, inside], ball_sine(press)[:, inside]
+            free = found - found.mean(1, keepdim=True)  # a shift of the center adds a constant
             product += float((free * ball).sum()) / free.shape[1]
             square += float(free.square().sum()) / free.shape[1]
-            parts.append((press, found, ball, slope_per_shift))
+            parts.append((press, found, ball))
         scale = product / max(square, 1e-30)
-        for press, found, ball, slope_per_shift in parts:
+        for press, found, ball in parts:
             if not press.known:
-                shift = ((scale * found - ball) * slope_per_shift).sum(1) / slope_per_shift.square().sum()
+                shift = press.radius_mm * (scale * found - ball).mean(1)
                 limit = 0.25 * press.radius_mm
                 press.center_mm = press.center_mm + shift.clamp(-limit, limit)
     return scale

@@ -1,5 +1,6 @@
-"""From a compensated image to the contact mask."""
+"""Where the skin has moved, from a compensated image; where an object touches it, from the depth."""
 
 from .masks import ContactMask
+from .touching import ContactFromDepth
 
-__all__ = ["ContactMask"]
+__all__ = ["ContactFromDepth", "ContactMask"]

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ..core.checks import QUANTISATION_STD, check_batch, check_field, check_positive, check_same_size, check_tensor, may_read_values
+from ..core.noise import clipped_std
 from ..core.noise import noise_std as frame_noise_std
 from ..model.calibration import Calibration, check_calibration
 from .morphology import dilate, dilate_cross, erode, reconstruct
@@ -20,8 +21,8 @@ CELLS = 80
 DARK_NOISES = 3.0
 """A channel below so many noises is dark, where the undeformed skin is twice as bright: as in NormalFromIntensity."""
 
-LIGHT_DRIFT = 0.008
-"""Least noise, relative to the background, with a response field: the LEDs of real sensors drift by 1 to 2 % of their light."""
+MOST_FAR_FIELD = 0.06
+"""Largest change, relative to the background, that a press elsewhere is believed to make in a channel of undeformed skin."""
 
 
 class Change(NamedTuple):
@@ -29,7 +30,7 @@ class Change(NamedTuple):
 
     change: Tensor
     squared: Tensor
-    threshold: Tensor
+    threshold: float
 
 
 class ContactMask(nn.Module):
@@ -56,6 +57,7 @@ class ContactMask(nn.Module):
     per_noise: Tensor
     offset: Tensor
     failed_below: Tensor
+    most_far_field: Tensor
     cell_row: Tensor
     cell_column: Tensor
 
@@ -76,6 +78,7 @@ class ContactMask(nn.Module):
         per_noise = 1.0 / noise.detach().clamp_min(QUANTISATION_STD).to(flat.dtype)
         self.register_buffer("per_noise", per_noise.expand_as(flat).clone())
         self.rounding = float((QUANTISATION_STD * self.per_noise).square().mean())
+        self.register_buffer("most_far_field", MOST_FAR_FIELD * (self.flat * self.per_noise).mean(dim=(1, 2)))
         self.dark_noises = DARK_NOISES
         self.register_buffer("offset", -self.flat * self.per_noise)
         self.samples = 2000  # pixels from which a frame's own noise is estimated
@@ -91,7 +94,7 @@ class ContactMask(nn.Module):
         """The mask of a calibrated unit's compensated images."""
         check_calibration("calibration", calibration)
         noise = calibration.compensated_noise_std
-        return cls(calibration.flat, noise if calibration.response is None else noise.clamp_min(LIGHT_DRIFT))
+        return cls(calibration.flat, noise)
 
     def forward(self, compensated: Tensor) -> Tensor:
         """Contact of compensated images (B, 3, H, W), bool (B, 1, H, W)."""
@@ -116,7 +119,7 @@ class ContactMask(nn.Module):
         """
         self._check(compensated)
         found = self.change(compensated.detach())
-        dark = (found.change - self.offset < self.dark_noises) & (self.offset < -2.0 * self.dark_noises)
+        dark = (compensated.detach() * self.per_noise < self.dark_noises) & (self.offset < -2.0 * self.dark_noises)
         dark = dark | self.black(compensated).any(dim=1)[:, None, None, None]  # with a failed LED, too little is left to decide
         lit = found.change.masked_fill(dark, 0.0).square().sum(dim=1, keepdim=True) <= found.threshold
         return lit & (dark.to(torch.uint8).sum(dim=1, keepdim=True) == 1)
@@ -128,7 +131,7 @@ class ContactMask(nn.Module):
     def find(self, compensated: Tensor) -> tuple[Tensor, Tensor]:
         """Contact, and its interior, where cells decide and not pixels; compiled kernels take the place of this method."""
         found = self.change(compensated)
-        return self.clean(found.change, found.squared > found.threshold, found.threshold)
+        return self.clean(found.change, found.squared > found.threshold)
 
     def change(self, compensated: Tensor) -> Change:
         """The change of a compensated image, in units of the calibrated noise."""
@@ -137,23 +140,37 @@ class ContactMask(nn.Module):
         if not may_read_values() or bool(failed.any()):
             failed = failed & (failed.to(torch.uint8).sum(dim=1, keepdim=True) == 1)
             change = change * (~failed)[:, :, None, None].to(change.dtype)
+        noise = torch.maximum(self.noise(change.detach()), self.far_field(change.detach())).clamp_min(1.0)
+        # rounding to 8 bits of smooth light is no white noise, and second differences miss it
+        change = change / torch.sqrt(noise * noise + self.rounding)[:, :, None, None]
         r, g, b = change[:, 0:1], change[:, 1:2], change[:, 2:3]
         squared = torch.addcmul(torch.addcmul(r * r, g, g), b, b)
-        noise = self.noise(change.detach()).amax(dim=1).clamp_min(1.0)  # a frame noisier than calibration
-        # rounding to 8 bits of smooth light is no white noise, and second differences miss it
-        noise = torch.sqrt(noise * noise + self.rounding)
-        return Change(change, squared, (self.sigmas * noise).square()[:, None, None, None])
+        return Change(change, squared, self.sigmas**2)
 
     def noise(self, change: Tensor) -> Tensor:
         """Noise of the frame itself, (B, 3)."""
         return frame_noise_std(change, self.samples)
+
+    def far_field(self, change: Tensor) -> Tensor:
+        """Spread of the change of undeformed skin, (B, 3), which a press changes everywhere on a real sensor.
+
+        From the least changed quarter of all pixels, then from all within three standard deviations: an object may press on
+        about two thirds of the skin before it counts.
+        """
+        half = self.stride // 2
+        some = change[:, :, half :: self.stride, half :: self.stride].abs().flatten(2)
+        return torch.minimum(clipped_std(some, self.quarter(some) / 0.3186)[:, :, 0], self.most_far_field)
+
+    def quarter(self, some: Tensor) -> Tensor:
+        """The value below which a quarter of (B, 3, N) lies, (B, 3, 1)."""
+        return some.kthvalue(some.shape[2] // 4 + 1, dim=2, keepdim=True).values
 
     def black(self, compensated: Tensor) -> Tensor:
         """Channels that are black in all of a frame, bool (B, 3)."""
         step = self.step
         return compensated.detach()[:, :, step // 2 :: step, step // 2 :: step].mean(dim=(2, 3)) < self.failed_below
 
-    def clean(self, change: Tensor, strong: Tensor, threshold: Tensor) -> tuple[Tensor, Tensor]:
+    def clean(self, change: Tensor, strong: Tensor) -> tuple[Tensor, Tensor]:
         """Contact and its interior from pixels that stand out: gaps closed, holes filled, specks removed, faint cells added."""
         strong = erode(dilate(strong))  # closing: pixels lost to noise at the rim
         counted = strong.to(change.dtype)  # ONNX sums no bytes
@@ -161,7 +178,7 @@ class ContactMask(nn.Module):
             counted = strong.to(torch.uint8 if self.cell < 16 else torch.int16)
         density = _cell_sums(counted, self.cell).to(change.dtype) / float(self.cell * self.cell)
         any_strong = density > 0
-        faint = self.faint(change, threshold) & ~any_strong  # where single pixels stand out, as at a rim, they decide
+        faint = self.faint(change) & ~any_strong  # where single pixels stand out, as at a rim, they decide
         cells = any_strong | faint
         if may_read_values() and not bool(cells.any()):
             return strong, strong
@@ -174,13 +191,12 @@ class ContactMask(nn.Module):
         interior = self._to_pixels(kept & (erode(filled) | faint))
         return (strong & self._to_pixels(kept)) | interior, interior
 
-    def faint(self, change: Tensor, threshold: Tensor) -> Tensor:
+    def faint(self, change: Tensor) -> Tensor:
         """Cells whose mean change stands out of the spread of all cells by 5 sigmas, bool."""
         mean = _cell_sums(change, self.cell) / float(self.cell * self.cell)
         step = max(1, max(mean.shape[2], mean.shape[3]) // 40)  # a median of some thousand cells is as good
         spread = mean[:, :, step // 2 :: step, step // 2 :: step].abs().flatten(2).median(dim=2).values / 0.6745
-        least = torch.sqrt(threshold[:, :, 0, 0]) / (self.sigmas * self.cell)  # white noise in the mean of a cell
-        return (mean / torch.maximum(spread, least)[..., None, None]).square().sum(1, keepdim=True) > 25.0
+        return (mean / spread.clamp_min(1.0 / self.cell)[..., None, None]).square().sum(1, keepdim=True) > 25.0
 
     def filled(self, mask: Tensor) -> Tensor:
         """The mask without its holes: background that the border does not reach."""

@@ -1,4 +1,4 @@
-"""What the blocks of the online path hand to each other: a frame cut to the window around its contact, and its solution."""
+"""What the blocks of the online path hand to each other: a frame cut to the window around its deformed area, and its solution."""
 
 from typing import Final, NamedTuple
 
@@ -10,19 +10,19 @@ from .geometry import normal_from_gradient
 
 
 class Frame(NamedTuple):
-    """A batch of compensated images and the window that holds all of their contact.
+    """A batch of compensated images and the window that holds all deformed skin.
 
     Attributes:
         compensated: (B, 3, H, W), the whole compensated image.
-        contact: (B, 1, H, W) bool, the whole contact mask.
+        deformed: (B, 1, H, W) bool, where the skin has moved.
         image: (B, 3, h, w), the window of ``compensated``.
-        mask: (B, 1, h, w) bool, the window of ``contact``.
+        mask: (B, 1, h, w) bool, the window of ``deformed``.
         window: (top, left), the place of the window's first pixel.
         size: (H, W).
     """
 
     compensated: Tensor
-    contact: Tensor
+    deformed: Tensor
     image: Tensor
     mask: Tensor
     window: tuple[int, int]
@@ -37,12 +37,21 @@ class Solution(NamedTuple):
 
 
 class DepthOutput(NamedTuple):
-    """depth_mm (B, 1, H, W); gradient (B, 2, H, W), mm per mm; normal (B, 3, H, W), unit; contact (B, 1, H, W) bool."""
+    """Depth, its slopes and two masks of each frame.
+
+    Attributes:
+        depth_mm: (B, 1, H, W), positive where the skin is pressed in.
+        gradient: (B, 2, H, W), mm per mm.
+        normal: (B, 3, H, W), unit.
+        contact: (B, 1, H, W) bool, where the object touches the skin.
+        deformed: (B, 1, H, W) bool, where the skin has moved: the contact and the skin that hangs free around it.
+    """
 
     depth_mm: Tensor
     gradient: Tensor
     normal: Tensor
     contact: Tensor
+    deformed: Tensor
 
 
 def as_factor(mask: Tensor, like: Tensor) -> Tensor:
@@ -56,17 +65,17 @@ def depth_in_window(frame: Frame, depth_mm: Tensor) -> Tensor:
     return depth_mm[:, :, top : top + frame.image.shape[2], left : left + frame.image.shape[3]]
 
 
-def with_contact(frame: Frame, image: Tensor, mask: Tensor) -> Frame:
-    """The frame with another image and another contact mask in its window."""
+def with_deformed(frame: Frame, image: Tensor, mask: Tensor) -> Frame:
+    """The frame with another image and another deformed area in its window."""
     (top, left), (height, width) = frame.window, frame.size
     outside = [left, width - left - mask.shape[3], top, height - top - mask.shape[2]]
     return Frame(frame.compensated, nn.functional.pad(mask, outside), image, mask, frame.window, frame.size)
 
 
 class Crop(nn.Module):
-    """Cut a compensated image (B, 3, H, W) and its contact (B, 1, H, W) to the smallest window that holds all contact.
+    """Cut a compensated image (B, 3, H, W) and its deformed area (B, 1, H, W) to the smallest window that holds it.
 
-    Outside of the contact the gradient is zero, so the window changes nothing but the time. Elsewhere than on a CPU, in exported
+    Outside of the deformed area the gradient is zero, so the window changes nothing but the time. Elsewhere than on a CPU, in exported
     programs, and where little would be saved, the window is the whole image: finding it would wait for the device.
 
     Args:
@@ -81,17 +90,17 @@ class Crop(nn.Module):
         self.stride = stride
         self.enabled = enabled
 
-    def forward(self, compensated: Tensor, contact: Tensor) -> Frame:
+    def forward(self, compensated: Tensor, deformed: Tensor) -> Frame:
         height, width = compensated.shape[2], compensated.shape[3]
         top, bottom, left, right = 0, height, 0, width
-        if self.enabled and may_read_values() and compensated.device.type == "cpu" and contact.shape[0] > 0:
-            top, bottom, left, right = self.window(self.box(contact), height, width)
-        image, mask = compensated[:, :, top:bottom, left:right], contact[:, :, top:bottom, left:right]
-        return Frame(compensated, contact, image, mask, (top, left), (height, width))
+        if self.enabled and may_read_values() and compensated.device.type == "cpu" and deformed.shape[0] > 0:
+            top, bottom, left, right = self.window(self.box(deformed), height, width)
+        image, mask = compensated[:, :, top:bottom, left:right], deformed[:, :, top:bottom, left:right]
+        return Frame(compensated, deformed, image, mask, (top, left), (height, width))
 
-    def box(self, contact: Tensor) -> tuple[int, int, int, int]:
-        """(top, bottom, left, right) of the smallest box that holds all contact of all frames; zeros without contact."""
-        inside = as_factor(contact, torch.zeros(1))
+    def box(self, deformed: Tensor) -> tuple[int, int, int, int]:
+        """(top, bottom, left, right) of the smallest box that holds all deformed skin of all frames; zeros without any."""
+        inside = as_factor(deformed, torch.zeros(1))
         rows, columns = inside.sum(dim=(0, 1, 3)).nonzero(), inside.sum(dim=(0, 1, 2)).nonzero()
         if rows.shape[0] == 0:
             return 0, 0, 0, 0
@@ -111,19 +120,20 @@ class Crop(nn.Module):
 
 
 class Uncrop(nn.Module):
-    """Embed the solution of a window in the whole image: (frame, solution) to :class:`DepthOutput`."""
+    """Embed the solution and the contact of a window in the whole image: (frame, solution, contact) to :class:`DepthOutput`."""
 
-    def forward(self, frame: Frame, solution: Solution) -> DepthOutput:
+    def forward(self, frame: Frame, solution: Solution, contact: Tensor) -> DepthOutput:
         (top, left), (height, width) = frame.window, frame.size
         gradient = solution.gradient
         rows, columns = gradient.shape[2], gradient.shape[3]
         normal = normal_from_gradient(gradient)
         if rows < height or columns < width:
-            gradient = nn.functional.pad(gradient, [left, width - left - columns, top, height - top - rows])
+            outside = [left, width - left - columns, top, height - top - rows]
+            gradient, contact = nn.functional.pad(gradient, outside), nn.functional.pad(contact, outside)
             inside, normal = normal, normal.new_zeros([gradient.shape[0], 3, height, width])
             normal[:, 2].fill_(1.0)
             normal[:, :, top : top + rows, left : left + columns] = inside
-        return DepthOutput(solution.depth_mm, gradient, normal, frame.contact)
+        return DepthOutput(solution.depth_mm, gradient, normal, contact, frame.deformed)
 
 
 class LargestChange(nn.Module):
@@ -134,8 +144,8 @@ class LargestChange(nn.Module):
 
 
 def undeformed_output(frame: Frame) -> DepthOutput:
-    """The output for frames without contact: depth zero, normals towards the camera."""
+    """The output for frames without deformed skin: depth zero, normals towards the camera."""
     zero = torch.zeros_like(frame.compensated)
     normal = zero.clone()
     normal[:, 2] = 1.0
-    return DepthOutput(zero[:, 0:1], zero[:, 0:2], normal, frame.contact)
+    return DepthOutput(zero[:, 0:1], zero[:, 0:2], normal, torch.zeros_like(frame.deformed), frame.deformed)

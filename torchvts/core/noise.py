@@ -39,10 +39,14 @@ def second_differences(image: Tensor, samples: int) -> Tensor:
 
 def std_from_median(second: Tensor, median: Tensor) -> Tensor:
     """Noise (B, C) from second differences (B, C, N) and their medians (B, C, 1)."""
-    std = 1.5 * median / 0.6745
-    squared = second * second
+    return clipped_std(second, 1.5 * median / 0.6745)[:, :, 0] / math.sqrt(1.5)
+
+
+def clipped_std(values: Tensor, std: Tensor) -> Tensor:
+    """Standard deviation (B, C, 1) of the absolute values (B, C, N) within three standard deviations, from a first estimate."""
+    squared = values * values
     for _ in range(2):
-        near = (second <= 3.0 * std).to(second.dtype)
+        near = (values <= 3.0 * std).to(values.dtype)
         mean = (squared * near).sum(dim=2, keepdim=True) / near.sum(dim=2, keepdim=True).clamp_min(1.0)
         std = torch.sqrt(mean / 0.97334)  # mean of x^2 of a standard Gaussian x within three standard deviations
-    return std[:, :, 0] / math.sqrt(1.5)
+    return std

@@ -84,7 +84,7 @@ class Surface:
         calibration = blocks.calibration
         value = light.clamp(0.0, 1.0) ** (1.0 / calibration.sensor.exponent)
         image = value[None].to(calibration.background.dtype)
-        refines = calibration.lights is not None or (calibration.response is not None and calibration.response.precise is not None)
+        refines = calibration.lights is not None or (calibration.response is not None)
         output = blocks.output(image, "precise" if refines else "fast")
         with torch.no_grad():
             compensated = blocks.compensate(image)
@@ -107,8 +107,8 @@ class Surface:
     @property
     def contact(self) -> Tensor:
         """(H, W) bool."""
-        contact: Tensor = self.output.contact[0, 0]
-        return contact
+        deformed: Tensor = self.output.deformed[0, 0]
+        return deformed
 
     @property
     def steepness(self) -> Tensor:
@@ -152,7 +152,7 @@ def fit_length_error(surface: Surface, invalid: Tensor) -> LengthError | None:
         return None
     left_out = surface.dark.any(1, keepdim=True) | invalid
     valid = ~(nn.functional.max_pool2d(left_out.to(error.dtype), 5, 1, 2) > 0) & torch.isfinite(error)
-    inside = valid & surface.output.contact
+    inside = valid & surface.output.deformed
     if int(inside.sum()) < 20:
         return None
     sigma = noise[valid].median()

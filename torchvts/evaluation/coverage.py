@@ -8,17 +8,18 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from ..calibration import Press, read_presses
+from ..calibration import Press
 from ..core.checks import check_integer
 from ..core.geometry import normal_from_gradient
 from ..model import Sensor
 from ..pipeline import ConfidentOutput, ConfidentPipeline, bound_at
 from ..pipeline.confidence import DEPTH_SPREAD
 from .metrics import normal_angle_deg
-from .presses import quiet_calibrate, without_labels
+from .presses import Training
 from .random_scenes import random_frame
 from .rows import markdown
 from .score import ball_truth
+from .sets import from_folder
 
 LEVELS = (0.5, 0.68, 0.8, 0.9, 0.95)
 """Probabilities at which coverage is measured."""
@@ -116,21 +117,16 @@ def of_presses(
     Returns:
         One row for each labelled press.
     Raises:
-        ValueError: no press has a label.
+        ValueError: no press can be scored.
     """
     check_integer("folds", folds, 2)
-    background, presses = read_presses(folder)
-    unlabelled = [without_labels(press) for press in presses]
-    rows = []
-    for fold in tqdm(range(folds), desc="presses", disable=not progress, leave=False):
-        others = [press for k, press in enumerate(unlabelled) if k % folds != fold] if learn else []
-        pipe = ConfidentPipeline.from_calibration(quiet_calibrate(background, sensor, others), mode)
-        for press in presses[fold::folds]:
-            if press.center_px is None or press.contact_radius_px is None:
-                continue
-            rows.append(of_press(pipe(press.image[None]), press, sensor.mm_per_pixel, pipe.confidence.spread))
-    if not rows:
-        raise ValueError(f"folder: none of {len(presses)} presses has a center and a contact radius: nothing can be scored")
+    data, rows = from_folder(folder, sensor, folds=folds), []
+    for fold in tqdm(data.folds, desc="presses", disable=not progress, leave=False):
+        unit = Training(data.background, fold.learned if learn else (), sensor).calibration
+        pipe = ConfidentPipeline.from_calibration(unit, mode)
+        for target in fold.scored:
+            if target.ball is not None:
+                rows.append(of_press(pipe(target.image[None]), target.ball, sensor.mm_per_pixel, pipe.confidence.spread))
     return rows
 
 

@@ -1,283 +1,279 @@
-"""Cross-validation of methods on presses of balls of known size.
+"""Score methods on sets of data: each learns from presses without their labels, and is scored on frames that it has not seen.
 
-Methods learn from presses without their labels: calibration by response fields finds the balls itself, and the look-up table and
-the network learn from the balls that it found. All share one contact mask and one integrator.
+The modes of the pipeline are what a user gets: ``calibrate``, then ``DepthPipeline.from_calibration``. The look-up table and the
+network learn from the balls that this calibration located. A method that fails is a row with the reason.
 """
 
 import dataclasses
 import json
-import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from textwrap import shorten
+from typing import Any
 
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
-from ..calibration import Press, read_presses
-from ..core.checks import check_image, check_integer
-from ..model import Sensor
+from ..core.checks import check_integer
 from ..pipeline import DepthOutput
 from . import rows as records
-from .methods import METHODS, Built, Method, given_network, network
+from .methods import METHODS, Built, Method, network
 from .presses import Training
-from .rows import Column, Row, error_column, mean, median
-from .score import PressScore, label, score_press
-
-GIVEN_NETWORK = "given network"
-"""Name of the network that was trained before."""
+from .rows import Column, Row, error_column, mean, median, number
+from .score import PressScore, score_press, score_surface
+from .sets import DRAWN, DataSet, Fold, Target, load
 
 COMPARED = tuple(name for name, method in METHODS.items() if method.from_presses is not None)
-"""Names of the methods that presses can score."""
+"""Names of the methods that sets can score."""
 
-COLUMNS = (
-    Column("method", lambda row: row.method),
-    Column("parameters", lambda row: str(row.parameters)),
-    error_column("normal deg", "normal_deg", 2),
-    error_column("relief um", "relief_um", 1),
-    error_column("of it tilt", "tilt_um", 1),
-    error_column("radius %", "radius_percent", 1, "none"),
-    error_column("center px", "center_px", 2, "none"),
-    error_column("apex um", "apex_um", 0, "none"),
-    Column("worst press", lambda row: f"{row.worst} ({row.errors['worst_deg']:.1f} deg)"),
-    Column("note", lambda row: row.note),
-)
-"""Columns of :func:`table`."""
+IN_TABLE = ("fast", "precise", "look-up table", "MLP")
+"""The methods of the table over all sets."""
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Scores of methods on a folder.
+    """Scores of methods on a set.
 
     Attributes:
-        rows: one row per method: means over presses, medians for the fitted sphere, the mean absolute error of the apex.
-        scores: one score per method and press.
-        not_scored: names of the presses without a contact radius.
-        how: what was held out, and the source of the true centres.
-        shown: the press of ``outputs``.
-        outputs: result of each method on that press.
-        mm_per_pixel: pixel pitch, mm.
+        data: the set.
+        rows: one row per method, see :func:`summary`.
+        scores: one score per method and frame.
+        shown: the frame of ``outputs``; None if there is none.
+        outputs: result of each method on that frame.
     """
 
+    data: DataSet
     rows: list[Row]
     scores: list[PressScore]
-    not_scored: list[str]
-    how: str
-    shown: Press
+    shown: Target | None
     outputs: dict[str, DepthOutput]
-    mm_per_pixel: float
-
-    def of(self, method: str) -> list[PressScore]:
-        """Scores of one method."""
-        return [score for score in self.scores if score.method == method]
 
 
-class _Data(NamedTuple):
-    """Presses to learn from and presses to score."""
+def evaluate(data: DataSet, methods: Sequence[str] = (), *, seed: int = 0, bar: "tqdm[Any] | None" = None) -> Evaluation:
+    """Score methods on a set.
 
-    background: Tensor
-    presses: list[Press]
-    scored_background: Tensor
-    scored: list[Press]
+    Args:
+        data: the set.
+        methods: names out of :data:`COMPARED`; empty for all that are possible. Methods of the set itself come last.
+        seed: seed of the network that is trained.
+        bar: advanced by one for each fold and method.
+    Returns:
+        The scores. A method that fails has a row with the reason, and no errors.
+    Raises:
+        ValueError: an unknown method.
+    Example:
+        >>> from .sets import DataSet, Fold, Target
+        >>> from ..model import Sensor
+        >>> from .score import undeformed_truth
+        >>> target = Target("nothing", torch.full((3, 48, 64), 0.4), undeformed_truth(48, 64))
+        >>> data = DataSet("example", target.image, [Fold(Sensor("rig", 48, 64, 0.5), (), [target])], "")
+        >>> evaluate(data, ["flat"]).rows[0].error("relief_um")
+        0.0
+    """
+    scored = [target for target in data.folds[0].scored if target.truth is not None] or data.folds[0].scored
+    shown = scored[len(scored) // 2] if scored else None
+    of_methods = [_Record(method, data) for method in _choose(data, methods, seed)]
+    outputs: dict[str, DepthOutput] = {}
+    for fold in data.folds:
+        training = Training(data.background, fold.learned, fold.sensor)
+        for record in of_methods:
+            if bar is not None:
+                bar.set_postfix_str(f"{data.name}, {record.method.name}")
+            for target, out in record.score(fold, training):
+                if target is shown:
+                    outputs[record.method.name] = out
+            if bar is not None:
+                bar.update()
+    scores = [score for record in of_methods for score in record.scores]
+    return Evaluation(data, [record.row() for record in of_methods], scores, shown, outputs)
 
 
-class _Fold(NamedTuple):
-    """Presses to learn from, and the presses that they score."""
-
-    training: Training
-    held_out: list[Press]
-
-
-def evaluate(
-    folder: str | Path,
-    sensor: Sensor,
+def evaluate_all(
+    names: Sequence[str],
+    folder: Path,
     methods: Sequence[str] = (),
     *,
-    folds: int = 5,
-    test: str | Path | None = None,
-    network_path: str | Path | None = None,
     limit: int | None = None,
     seed: int = 0,
     progress: bool = False,
-) -> Evaluation:
-    """Score methods on a folder of ball presses.
-
-    Cross-validation: press i is in fold i % folds, and is scored by what was learned from the presses of the other folds.
+) -> list[Evaluation]:
+    """Score methods on several sets; a set that cannot be read is one row with the reason.
 
     Args:
-        folder: presses in gs_sdk's layout.
-        sensor: the sensor.
-        methods: names out of :data:`COMPARED`; empty for all that are possible.
-        folds: parts of the cross-validation; with 1 the presses that were learned from are scored.
-        test: a second folder, to be scored by what all presses of the first taught; there is no cross-validation then.
-        network_path: file of a trained network that is to be scored too.
-        limit: use only so many presses, spread over the catalog.
-        seed: seed of the network that is trained.
+        names: names out of :data:`torchvts.evaluation.sets.SETS`.
+        folder: folder of the real sets.
+        methods: names out of :data:`COMPARED`; empty for :data:`IN_TABLE`.
+        limit: use only so many presses of each ball.
+        seed: seed of the networks that are trained.
         progress: show a bar.
-    Returns:
-        The scores.
     Raises:
-        ValueError: unknown method, a prior that the sensor does not have, too few presses, or none that can be scored.
-        FileNotFoundError: no such folder or file.
+        ValueError: an unknown method.
     """
-    chosen = _choose(methods, sensor, network_path, seed)
-    check_integer("folds", folds, 1)
-    data = _read(folder, test, limit)
-    if test is None and folds > len(data.presses):
-        raise ValueError(f"folds: expected at most the number of presses, {len(data.presses)}, got {folds}")
-    for image in (data.background, data.scored_background):
-        check_image("background", image, sensor.height, sensor.width, sensor.name)
-    whole = Training(data.background, data.presses, sensor)
-    truth, source = _with_truth(data.scored, whole if test is None else Training(data.scored_background, data.scored, sensor))
-    if not truth:
-        raise ValueError(f"folder: none of {len(data.scored)} presses has a contact radius: nothing can be scored")
-    parts, split = _split(data, whole, 0 if test is not None else folds)
-    run = _Run(truth, _nearest_to_median(list(truth.values()), sensor), data.scored_background, sensor)
-    with tqdm(total=len(parts) * len(chosen), desc="evaluating", disable=not progress, leave=False) as bar:
-        for part in parts:
-            for method in chosen:
-                bar.set_postfix(method=method.name)
-                run.score(part, method)
-                bar.update()
-    order = list(truth)
-    scores = [s for m in chosen for s in sorted(run.scores[m.name], key=lambda score: order.index(score.press))]
-    how = f"{split}, learned without labels; scored by {source}"
-    return Evaluation(
-        [_row(m.name, Path(test or folder).name, run.built[m.name], [s for s in scores if s.method == m.name]) for m in chosen],
-        scores,
-        [press.name for press in data.scored if press.name not in truth],
-        how,
-        run.shown,
-        run.outputs,
-        sensor.mm_per_pixel,
-    )
+    done = []
+    with tqdm(total=len(names), desc="evaluating", disable=not progress, leave=False) as bar:
+        for name in names:
+            bar.set_postfix_str(f"{name}, reading")
+            try:
+                data = load(name, folder, limit)
+            except Exception as error:  # the other sets are still scored
+                row = Row("presses", "", name, note=_reason(error))
+                done.append(Evaluation(DataSet(name, torch.zeros(3, 1, 1), (), ""), [row], [], None, {}))
+            else:
+                fewer = 1 if data.refused else 2 if not data.folds[0].learned else len(IN_TABLE)
+                chosen = methods or IN_TABLE[:fewer]
+                bar.total = (bar.total or 0) + len(data.folds) * (len(chosen) + len(data.methods)) - 1
+                done.append(evaluate(data, chosen, seed=seed, bar=bar))
+    return done
 
 
-class _Run:
-    """Builds methods, and keeps their scores and what they make of the shown press."""
+class _Record:
+    """What became of one method on the folds of a set."""
 
-    def __init__(self, truth: dict[str, Press], shown: Press, background: Tensor, sensor: Sensor) -> None:
-        self.truth, self.shown, self.background, self.sensor = truth, shown, background, sensor
-        self.built: dict[str, list[Built]] = {}
-        self.scores: dict[str, list[PressScore]] = {}
-        self.outputs: dict[str, DepthOutput] = {}
+    def __init__(self, method: Method, data: DataSet) -> None:
+        self.method, self.data = method, data
+        self.built: list[Built] = []
+        self.scores: list[PressScore] = []
+        self.failures: list[str] = []
 
-    def score(self, fold: _Fold, method: Method) -> None:
-        """Build a method from a fold and score it on the presses that were held out."""
-        built, scores = self.built.setdefault(method.name, []), self.scores.setdefault(method.name, [])
-        assert method.from_presses is not None
-        built.append(built[0] if built and not method.learns else method.from_presses(fold.training, self.background, self.sensor))
-        for press in fold.held_out:
-            if press.name not in self.truth:
-                continue
-            with torch.inference_mode():
-                out = built[-1].reconstruct(press.image[None])
-            scores.append(score_press(self.truth[press.name], out.depth_mm, out.normal, self.sensor.mm_per_pixel, method.name))
-            if press.name == self.shown.name:
-                self.outputs[method.name] = out
+    def score(self, fold: Fold, training: Training) -> Iterator[tuple[Target, DepthOutput]]:
+        """Build the method from a fold, score it on the frames of the fold and yield its results; a failure is kept."""
+        try:
+            if self.method.learns or not self.built:
+                self.built.append(self.method.learned(training))
+            for target in fold.scored:
+                with torch.inference_mode():
+                    out = self.built[-1].reconstruct(target.image[None])
+                self.scores.append(_score(target, out, fold.sensor.mm_per_pixel, self.method.name))
+                yield target, out
+        except Exception as error:  # one method or set that fails must not end a run over all
+            self.failures.append(_reason(error))
+
+    def row(self) -> Row:
+        """Summary over all frames."""
+        method, built, notes, errors = self.method, self.built, list(dict.fromkeys(self.failures)), summary(self.scores)
+        if self.data.refused and method.learns:
+            notes = ["refused, as is right: " + notes[0] if notes else "not refused, though no depth is possible"]
+        if method.learns and (given := sum(len(fold.learned) for fold in self.data.folds)):
+            errors |= {"used": float(sum(ready.used for ready in built)), "given": float(given)}
+        return Row(
+            kind="presses",
+            method=method.name,
+            data=self.data.name,
+            errors=errors,
+            parameters=max((ready.parameters for ready in built), default=None),
+            frames=len(self.scores),
+            ours=method.ours,
+            seen=method.seen,
+            note="; ".join([*notes, *dict.fromkeys(ready.note for ready in built if ready.note)]),
+        )
 
 
-def _choose(methods: Sequence[str], sensor: Sensor, network_path: str | Path | None, seed: int) -> list[Method]:
+def summary(scores: Sequence[PressScore]) -> dict[str, float | None]:
+    """Means over frames; medians of the fitted sphere, the contact and the lowest depth, and the worst of these two."""
+    columns = {name: [getattr(score, name) for score in scores] for name in _MEANS + _MEDIANS}
+    errors = {name: mean(columns[name]) for name in _MEANS} | {name: median(columns[name]) for name in _MEDIANS}
+    for name in ("iou", "lowest_mm"):
+        errors[f"worst_{name}"] = min((value for value in columns[name] if value is not None), default=None)
+    return errors
+
+
+_MEANS = ("normal_deg", "depth_normal_deg", "relief_um", "tilt_um", "level_um")
+_MEDIANS = ("radius_percent", "center_px", "iou", "lowest_mm")
+
+
+def _score(target: Target, out: DepthOutput, mm_per_pixel: float, method: str) -> PressScore:
+    if target.ball is not None:
+        return score_press(target.ball, out.depth_mm, out.normal, mm_per_pixel, method, out.contact)
+    if target.truth is None:
+        return PressScore(target.name, method, float(out.depth_mm.min()))
+    return score_surface(target.truth, out.depth_mm, out.normal, mm_per_pixel, target.name, method, out.contact)
+
+
+def _choose(data: DataSet, methods: Sequence[str], seed: int) -> list[Method]:
     for name in methods:
         if name not in COMPARED:
             raise ValueError(f"methods: expected some of {', '.join(repr(m) for m in COMPARED)}, got {name!r}")
-        if METHODS[name].needs_prior and sensor.prior is None:
-            raise ValueError(f"methods: {name!r} needs a prior, sensor '{sensor.name}' has none: scripts/fit_prior.py fits one")
-    possible = [METHODS[name] for name in methods or COMPARED if sensor.prior is not None or not METHODS[name].needs_prior]
-    seeded = partial(network, seed=seed)
-    chosen = [dataclasses.replace(m, from_presses=seeded) if m.name == "MLP" else m for m in possible]
-    if network_path is not None:
-        chosen.append(Method(GIVEN_NETWORK, from_presses=partial(given_network, path=network_path), learns=False))
-    return chosen
+    prior = data.folds[0].sensor.prior is not None
+    names = methods or [name for name in COMPARED if prior or not METHODS[name].needs_prior]
+    seeded = dataclasses.replace(METHODS["MLP"], from_presses=partial(network, seed=check_integer("seed", seed, 0)))
+    return [seeded if name == "MLP" else METHODS[name] for name in names] + list(data.methods)
 
 
-def _read(folder: str | Path, test: str | Path | None, limit: int | None) -> _Data:
-    background, presses = read_presses(folder)
-    if limit is not None:
-        presses = _spread(presses, check_integer("limit", limit, 1))
-    if test is None:
-        return _Data(background, presses, background, presses)
-    scored_background, scored = read_presses(test)
-    return _Data(background, presses, scored_background, scored if limit is None else _spread(scored, limit))
+def _reason(error: Exception) -> str:
+    """An error on one line, without the bar of tables."""
+    kind = "" if isinstance(error, ValueError | FileNotFoundError) else f"{type(error).__name__}: "
+    return kind + " ".join(str(error).replace("|", "/").split())
 
 
-def _spread(presses: list[Press], limit: int) -> list[Press]:
-    """``limit`` presses at equal steps of the catalog, which lists one ball after the other."""
-    count = min(limit, len(presses))
-    return [presses[k * len(presses) // count] for k in range(count)]
+# tables
 
 
-def _split(data: _Data, whole: Training, folds: int) -> tuple[list[_Fold], str]:
-    """The folds, and the same in words; 0 folds for presses of a second folder."""
-    count = len(data.presses)
-    if folds == 0:
-        return [_Fold(whole, data.scored)], f"{count} presses learned from"
-    if folds == 1:
-        return [_Fold(whole, data.scored)], f"all {count} presses learned from and scored"
-    parts = []
-    for fold in range(folds):
-        others = [press for i, press in enumerate(data.presses) if i % folds != fold]
-        parts.append(_Fold(Training(data.background, others, whole.sensor), data.presses[fold::folds]))
-    return parts, f"{folds}-fold cross-validation over {count} presses"
+def _with_worst(title: str, name: str, digits: int) -> Column:
+    def cell(row: Row) -> str:
+        value, worst = row.error(name), row.error(f"worst_{name}")
+        return "" if value is None else f"{number(value, digits)} ({number(worst, digits)})"
+
+    return Column(f"{title}, median (worst)", cell)
 
 
-def _with_truth(presses: list[Press], training: Training) -> tuple[dict[str, Press], str]:
-    """Presses that can be scored, by name: labelled ones, and without a label those that ``calibrate`` locates; and the source."""
-    unlabelled = {press.name for press in presses if press.center_px is None}
-    truth = {press.name: press for press in presses if press.center_px is not None and press.contact_radius_px is not None}
-    if unlabelled:
-        truth |= {press.name: press for press in training.located if press.name in unlabelled}
-    counts = {"labels": len(presses) - len(unlabelled), "calibrate, which saw all presses": len(unlabelled)}
-    how = "centers from " + " and ".join(f"{source} ({count})" for source, count in counts.items() if count)
-    return {press.name: truth[press.name] for press in presses if press.name in truth}, how
+def _used(row: Row) -> str:
+    used, given = row.error("used"), row.error("given")
+    return "" if used is None or given is None else f"{used:.0f} of {given:.0f}"
 
 
-def _nearest_to_median(presses: list[Press], sensor: Sensor) -> Press:
-    """The press whose distance from the middle of the image is the median, so that the picture is typical."""
-    x, y = (sensor.width - 1) / 2, (sensor.height - 1) / 2
-    ordered = sorted(presses, key=lambda press: math.hypot(label(press)[0][0] - x, label(press)[0][1] - y))
-    return ordered[len(ordered) // 2]
+COLUMNS = (
+    Column("data", lambda row: row.data),
+    Column("method", lambda row: f"{row.method} (has seen these)" if row.seen else row.method),
+    error_column("normals deg", "normal_deg", 2),
+    error_column("of depth deg", "depth_normal_deg", 2),
+    error_column("relief um", "relief_um", 1),
+    error_column("without tilt um", "level_um", 1),
+    error_column("radius %", "radius_percent", 1),
+    _with_worst("contact IoU", "iou", 2),
+    Column("presses used", _used),
+    _with_worst("lowest mm", "lowest_mm", 3),
+    Column("frames", lambda row: str(row.frames)),
+    Column("note", lambda row: shorten(row.note, 200, placeholder=" ...")),
+)
+"""Columns of the tables."""
 
 
-def _row(method: str, data: str, built: list[Built], scores: list[PressScore]) -> Row:
-    """Summary of a method over all presses."""
-    worst = max(scores, key=lambda score: score.normal_deg)
-    errors = {
-        "normal_deg": mean(score.normal_deg for score in scores),
-        "relief_um": mean(score.relief_um for score in scores),
-        "tilt_um": mean(score.tilt_um for score in scores),
-        "radius_percent": median(score.radius_percent for score in scores),
-        "center_px": median(score.center_px for score in scores),
-        "apex_um": mean(None if score.apex_um is None else abs(score.apex_um) for score in scores),
-        "worst_deg": worst.normal_deg,
-    }
-    return Row(
-        kind="presses",
-        method=method,
-        data=data,
-        errors=errors,
-        parameters=max(ready.parameters for ready in built),
-        frames=len(scores),
-        worst=worst.press,
-        ours=method in METHODS and METHODS[method].ours,
-        note="; ".join(dict.fromkeys(ready.note for ready in built if ready.note)),
+def means_of_drawn(rows: Sequence[Row]) -> list[Row]:
+    """For each method a row of the means over all drawn sensors."""
+    drawn = [row for row in rows if row.data in DRAWN]
+    means = []
+    for method in dict.fromkeys(row.method for row in drawn):
+        own = [row for row in drawn if row.method == method]
+        names = dict.fromkeys(name for row in own for name in row.errors)
+        errors = {name: mean(row.error(name) for row in own) for name in names}
+        frames = sum(row.frames for row in own)
+        means.append(dataclasses.replace(own[0], data=f"drawn, mean of {len(own)}", errors=errors, frames=frames, note=""))
+    return means
+
+
+def write_tables(evaluations: Sequence[Evaluation], out: Path, command: str) -> str:
+    """Write table.md, table.csv, table.tex and scores.json; returns the Markdown."""
+    rows = [dataclasses.replace(row, command=command) for evaluation in evaluations for row in evaluation.rows]
+    rows += means_of_drawn(rows)
+    text = "\n".join(
+        [records.table(rows, COLUMNS), ""]
+        + [f"* {e.data.name}: {shorten(e.data.how, 300, placeholder=' ...')}" for e in evaluations if e.data.how]
+        + ["", "means over frames; medians of the radius of the sphere fitted to depth, of the contact and of the lowest depth"]
     )
-
-
-def table(evaluation: Evaluation) -> str:
-    """The rows as a Markdown table."""
-    return records.table(evaluation.rows, COLUMNS)
-
-
-def to_json(evaluation: Evaluation, command: str) -> str:
-    """One JSON document: the command, how it was measured, the rows, and the score of each method on each press."""
-    document: dict[str, Any] = {
+    cells = [[column.cell(row) for column in COLUMNS[:-1]] for row in rows]
+    document = {
         "command": command,
-        "how": evaluation.how,
-        "rows": [dataclasses.asdict(dataclasses.replace(row, command=command)) for row in evaluation.rows],
-        "scores": [dataclasses.asdict(score) for score in evaluation.scores],
+        "how": {e.data.name: e.data.how for e in evaluations},
+        "rows": [dataclasses.asdict(row) for row in rows],
+        "scores": [dataclasses.asdict(score) | {"data": e.data.name} for e in evaluations for score in e.scores],
     }
-    return json.dumps(document, indent=1)
+    files = {
+        "table.md": f"{text}\n\n`{command}`\n",
+        "table.csv": records.to_csv(rows),
+        "table.tex": records.latex([column.title for column in COLUMNS[:-1]], cells) + "\n",
+        "scores.json": json.dumps(document, indent=1) + "\n",
+    }
+    records.write_files(out, files)
+    return text

@@ -2,8 +2,7 @@
 
 import math
 import statistics
-from collections.abc import Callable, Sequence
-from itertools import pairwise
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,9 +15,8 @@ from PIL import Image
 from torch import Tensor
 
 from ..core.files import write_atomically
-from ..core.geometry import normal_from_gradient
 from ..pipeline import ConfidentPipeline
-from ..viz import draw_contours, new_figure
+from ..viz import draw_contours, draw_surface, new_figure
 from .coverage import LEVELS, Coverage
 from .evaluate import Evaluation
 from .gallery import CORRUPTIONS, Corruption
@@ -26,7 +24,7 @@ from .methods import MASK_STYLE, METHODS
 from .metrics import normal_angle_deg
 from .random_scenes import random_frame
 from .rows import Row
-from .score import PLACES, RIM_PX, SLOPE_EDGES, ball_truth, label
+from .score import Truth
 from .speed import front, ms
 from .stability import DEPTH_LIMIT, MASK, MASK_LIMIT, NORMAL_LIMIT_DEG, Breaking, depth_share, in_words
 
@@ -69,7 +67,8 @@ def speed_figure(rows: Sequence[Row]) -> Figure:
         title = "GelSight Mini, 320x240: balls not learned from"
         panels.append(_Panel(axes[1], sensor, "normal_deg", "mean error of normals, degrees", title))
     drawn = [panel._replace(rows=_error_against_time(panel)) for panel in panels]
-    axes[0].legend(fontsize=7, loc="center left")
+    for legend_of in axes[: 2 if sensor else 1]:
+        legend_of.legend(fontsize=7, loc="center left")
     _cost_against_size(axes[-1], scenes)
     time = rows[0].time
     figure.suptitle(f"{time.machine}, {time.threads} threads, one frame" if time else "", fontsize=9)
@@ -88,7 +87,11 @@ def _error_against_time(panel: _Panel) -> list[Row]:
     best = front(shown, error)
     axes.step(*_points(best, error), where="post", color="0.6", lw=1, label="Pareto front")
     for ours, color, marker, name in ((True, "tab:blue", "o", "torchvts"), (False, "tab:red", "s", "peers")):
-        axes.plot(*_points([row for row in shown if row.ours == ours], error), marker, color=color, label=name, ls="none")
+        for seen, fill in ((False, color), (True, "none")):
+            points = [row for row in shown if row.ours == ours and row.seen == seen]
+            text = f"{name}, has seen these frames" if seen else name
+            if points:
+                axes.plot(*_points(points, error), marker, color=color, markerfacecolor=fill, label=text, ls="none")
     beyond = [f"{row.method}: {row.error(error):.0f} at {ms(row):.2g} ms" for row in known if row not in shown]
     if beyond:
         axes.text(0.02, 0.02, "\n".join(["not drawn:", *beyond]), transform=axes.transAxes, fontsize=6.5, color="0.35")
@@ -247,137 +250,67 @@ def overview_figure(points: Sequence[Breaking]) -> Figure:
     return figure
 
 
-# presses of balls
+# presses
 
 
-def error_figure(evaluation: Evaluation, method: str) -> Figure:
-    """Mean angle between normals of one method, by slope of the ball and by place in the image.
+def set_figure(evaluation: Evaluation, methods: Sequence[str] = ()) -> Figure:
+    """The shown frame by several methods, a row each: depth contours with the contact, the shaded surface, the error of relief.
 
+    Args:
+        evaluation: with a shown frame.
+        methods: names of methods; empty for all but zero depth.
     Raises:
-        ValueError: a method that was not evaluated.
+        ValueError: a method without a result.
     """
-    scores = evaluation.of(method)
-    if not scores:
-        raise ValueError(f"method: expected one that was evaluated, got {method!r}")
-    figure = new_figure(9.0, 3.8)
-    bars, places = figure.subplots(1, 2)
-    _draw_by_slope(bars, _pooled([s.by_slope_deg for s in scores], [s.by_slope_pixels for s in scores]))
-    _draw_by_place(places, _pooled([s.by_place_deg for s in scores], [s.by_place_pixels for s in scores]))
-    mean = sum(score.normal_deg for score in scores) / len(scores)
-    figure.suptitle(f"{method}: {mean:.2f} deg over {len(scores)} presses")
+    shown, pitch = evaluation.shown, evaluation.data.folds[0].sensor.mm_per_pixel
+    chosen = list(methods) or [name for name in evaluation.outputs if name != "flat"]
+    if shown is None or not chosen or any(name not in evaluation.outputs for name in chosen):
+        raise ValueError(f"methods: expected some of {', '.join(evaluation.outputs) or 'none'}, got {', '.join(chosen) or 'none'}")
+    figure = new_figure(13.5, 3.9 * len(chosen))
+    errors = {name: _relief_error(evaluation.outputs[name].depth_mm, shown.truth) for name in chosen}
+    most = max(float(error.nan_to_num().abs().quantile(0.998)) for error in errors.values()) or 1.0
+    depths = {name: evaluation.outputs[name].depth_mm[0, 0].double().numpy() for name in chosen}
+    low, high = (1000.0 * float(of([of(depth) for depth in depths.values()])) for of in (np.min, np.max))
+    for k, (name, depth) in enumerate(depths.items()):
+        contours, panel = (figure.add_subplot(len(chosen), 3, 3 * k + column) for column in (1, 3))
+        draw_contours(figure, contours, depth, pitch)
+        contours.get_images()[0].set_clim(min(low, 0.0), max(high, 1.0))
+        extent = contours.get_images()[0].get_extent()
+        for mask, style in ((evaluation.outputs[name].contact, "-"), (shown.truth.contact if shown.truth else None, ":")):
+            if mask is not None and bool(mask.any()) and not bool(mask.all()):
+                lines: dict[str, Any] = {"colors": "tab:red", "linestyles": style, "extent": extent, "origin": "upper"}
+                contours.contour(mask[0, 0].float().numpy(), [0.5], linewidths=1.2, **lines)
+        contours.set_title(f"{name}: {contours.get_title()}")
+        surface = figure.add_subplot(len(chosen), 3, 3 * k + 2, projection="3d")
+        draw_surface(surface, depth, pitch)
+        _draw_error(panel, errors[name], most, extent)
+    figure.suptitle(f"{evaluation.data.name}, {shown.name}; contact in red, the true one dotted")
     return figure
 
 
-def _draw_by_slope(bars: Any, by_slope: list[float]) -> None:
-    edges = [f"{edge:g}" for edge in (0.0, *SLOPE_EDGES)]
-    names = [f"{low} to {high}" for low, high in pairwise(edges)] + [f"over {edges[-1]}"]
-    heights = [0.0 if math.isnan(v) else v for v in by_slope]
-    bars.bar(names, heights, color="#4c72b0")
-    for k, value in enumerate(by_slope):
-        bars.text(k, heights[k], _cell(value), ha="center", va="bottom")
-    bars.set_ylim(0.0, 1.15 * max(*heights, 0.1))
-    bars.set_xlabel("slope of the ball, mm per mm")
-    bars.set_ylabel("mean angle between normals, deg")
+def _draw_error(panel: Any, error: Tensor, most: float, extent: Sequence[float]) -> None:
+    """The error of relief in colour, cut to the pixels that are scored."""
+    known = ~error.isnan()
+    if not bool(known.any()):
+        panel.set_axis_off()
+        panel.text(0.5, 0.5, "no truth", ha="center")
+        return
+    picture = panel.imshow(error.numpy(), cmap="RdBu_r", vmin=-most, vmax=most, extent=extent)
+    panel.figure.colorbar(picture, ax=panel, shrink=0.75, label="um")
+    (left, right, low, high), (rows, columns) = extent, error.shape
+    x = [left + (right - left) * float(k) / columns for k in known.any(0).nonzero()[[0, -1], 0]]
+    y = [high + (low - high) * float(k) / rows for k in known.any(1).nonzero()[[0, -1], 0]]
+    reach = 0.6 * max(x[1] - x[0], y[1] - y[0]) + 0.02 * (right - left)
+    panel.set(xlim=(sum(x) / 2 - reach, sum(x) / 2 + reach), ylim=(sum(y) / 2 + reach, sum(y) / 2 - reach))
+    panel.set(xlabel="x, mm", ylabel="y, mm (down)", title=f"error of relief, RMS {float(error.square().nanmean().sqrt()):.1f} um")
 
 
-def _draw_by_place(places: Any, by_place: list[float]) -> None:
-    grid = torch.tensor(by_place, dtype=torch.float64).reshape(PLACES, PLACES).numpy()
-    most = max([v for v in by_place if not math.isnan(v)] + [0.1])
-    picture = places.imshow(grid, cmap="viridis", vmin=0.0, vmax=most, aspect="auto")
-    for k, value in enumerate(by_place):
-        color = "black" if value > 0.6 * most or math.isnan(value) else "white"
-        places.text(k % PLACES, k // PLACES, _cell(value), ha="center", va="center", color=color)
-    places.set_xticks(range(PLACES), ["left", "middle", "right"])
-    places.set_yticks(range(PLACES), ["top", "middle", "bottom"])
-    places.set_title("by place in the image")
-    places.figure.colorbar(picture, ax=places, shrink=0.85, label="deg")
-
-
-def _cell(value: float) -> str:
-    return "no pixels" if math.isnan(value) else f"{value:.1f}"
-
-
-def _pooled(means: Sequence[tuple[float | None, ...]], counts: Sequence[tuple[int, ...]]) -> list[float]:
-    """Mean over the pixels of all presses in each bin; NaN where there is none."""
-    pooled = []
-    for values, pixels in zip(zip(*means), zip(*counts)):
-        total = sum(pixels)
-        pooled.append(sum(v * n for v, n in zip(values, pixels) if v is not None) / total if total else math.nan)
-    return pooled
-
-
-class _Maps(NamedTuple):
-    """Depth, and inside the region the angle between normals and the error of relief; NaN outside."""
-
-    depth_mm: Tensor
-    angle_deg: Tensor
-    relief_um: Tensor
-
-
-def press_figure(evaluation: Evaluation, methods: Sequence[str] = ("response precise", "MLP")) -> Figure:
-    """The shown press by several methods, a row each: depth contours, angle between normals, error of relief.
-
-    Raises:
-        ValueError: a method that was not evaluated.
-    """
-    for name in methods:
-        if name not in evaluation.outputs:
-            raise ValueError(f"methods: expected some of {', '.join(evaluation.outputs)}, got {name!r}")
-    press, pitch = evaluation.shown, evaluation.mm_per_pixel
-    maps = {name: _error_maps(evaluation, name) for name in methods}
-    most_deg = max(float(m.angle_deg.nanquantile(0.99)) for m in maps.values())
-    most_um = max(float(m.relief_um.nan_to_num().abs().max()) for m in maps.values())
-    figure = new_figure(13.5, 3.7 * len(maps))
-    show = _zoomed_on(press.image.shape[1:], *label(press), pitch)
-    for axes, (name, m) in zip(figure.subplots(len(maps), 3, squeeze=False), maps.items()):
-        draw_contours(figure, axes[0], m.depth_mm.numpy(), pitch)
-        axes[0].set_title(f"{name}: {axes[0].get_title()}")
-        show(axes[1], m.angle_deg, {"cmap": "magma", "vmin": 0.0, "vmax": most_deg}, "deg")
-        show(axes[2], m.relief_um, {"cmap": "RdBu_r", "vmin": -most_um, "vmax": most_um}, "um")
-        axes[1].set_title(f"angle between normals, mean {float(m.angle_deg.nanmean()):.2f} deg")
-        axes[2].set_title(f"error of relief, RMS {float(m.relief_um.square().nanmean().sqrt()):.1f} um")
-    figure.suptitle(f"press {press.name}, ball of {press.ball_diameter_mm:g} mm; scored {RIM_PX:g} px inside the contact radius")
-    return figure
-
-
-def _error_maps(evaluation: Evaluation, method: str) -> _Maps:
-    press, out = evaluation.shown, evaluation.outputs[method]
-    truth = ball_truth(press, press.image.shape[1], press.image.shape[2], evaluation.mm_per_pixel)
-    inside = truth.region[0, 0]
-    angle = normal_angle_deg(out.normal.double(), normal_from_gradient(truth.gradient))[0]
-    error = 1000.0 * (out.depth_mm.double() - truth.depth_mm)[0, 0]
-    error = error - error[inside].mean()
-    return _Maps(out.depth_mm[0, 0].double(), *(torch.where(inside, values, math.nan) for values in (angle, error)))
-
-
-def _zoomed_on(
-    size: Sequence[int], center_px: tuple[float, float], radius_px: float, pitch: float
-) -> Callable[[Any, Tensor, dict[str, Any], str], None]:
-    """A function that draws a map around a contact."""
-    height, width = size
-    half_x, half_y = 0.5 * width * pitch, 0.5 * height * pitch
-    at_x, at_y = ((c - (n - 1) / 2) * pitch for c, n in zip(center_px, (width, height)))
-    reach = 1.15 * radius_px * pitch
-
-    def show(panel: Any, values: Tensor, colours: dict[str, Any], unit: str) -> None:
-        picture = panel.imshow(values.numpy(), extent=(-half_x, half_x, half_y, -half_y), **colours)
-        panel.figure.colorbar(picture, ax=panel, shrink=0.75, label=unit)
-        panel.set_xlim(max(at_x - reach, -half_x), min(at_x + reach, half_x))
-        panel.set_ylim(min(at_y + reach, half_y), max(at_y - reach, -half_y))
-        panel.set_xlabel("x, mm")
-        panel.set_ylabel("y, mm (down)")
-
-    return show
-
-
-def error_map_name(method: str) -> str:
-    """File name of the picture of a method.
-
-    Example:
-        >>> error_map_name("response precise, prior")
-        'errors_response_precise_prior.png'
-    """
-    return f"errors_{method.replace(',', '').replace(' ', '_').replace('-', '_').lower()}.png"
+def _relief_error(depth_mm: Tensor, truth: Truth | None) -> Tensor:
+    """Depth less truth, less their mean, micrometres, (H, W); NaN where nothing is scored."""
+    if truth is None:
+        return torch.full(depth_mm.shape[2:], math.nan)
+    error = 1000.0 * (depth_mm.double() - truth.depth_mm)
+    return torch.where(truth.region, error - error[truth.region].mean(), math.nan)[0, 0]
 
 
 # coverage of confidence

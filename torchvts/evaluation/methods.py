@@ -12,25 +12,18 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..accelerated import (
-    AdaptiveIntegration,
-    Compensate,
-    ContactMask,
-    GradientFromNormal,
-    NormalFromIntensity,
-    PerspectiveIntegration,
-    PoissonBackground,
-    reference_only,
-)
-from ..calibration import fit_prior, with_preprocessing
-from ..core.geometry import normal_from_gradient
+from ..accelerated import AdaptiveIntegration, Compensate, NormalFromIntensity, PerspectiveIntegration, reference_only
+from ..calibration import RESPONSE_BLUR_PX, with_preprocessing
 from ..integration import PoissonDST
 from ..model import Calibration, ResponseModel, Sensor
-from ..normals import NormalFromLookup, NormalFromMLP, NormalFromResponse, NormalModel, as_normal_model
+from ..normals import NormalFromLookup, NormalFromMLP
 from ..pipeline import DepthOutput, DepthPipeline
 from ..scenes import render, sphere_press
-from .peers import PoissonSciPy
+from .peers import GsSdkPipeline, PoissonSciPy, as_output
 from .presses import Training, quiet_calibrate, train_network, training_pixels
+
+GIVEN_NETWORK = "given network"
+"""Name of a network that was trained before."""
 
 Reconstruct = Callable[[Tensor], DepthOutput]
 """Images (B, 3, H, W) to depth."""
@@ -43,16 +36,17 @@ class Built(NamedTuple):
         reconstruct: maps images to depth; a :class:`torchvts.DepthPipeline` for most methods.
         parameters: number of parameters that it learned or was given.
         note: a remark for the table.
+        used: number of presses that it learned from.
     """
 
     reconstruct: Reconstruct
     parameters: int
     note: str = ""
+    used: int = 0
 
 
 FromCalibration = Callable[[Calibration], Built]
-FromPresses = Callable[[Training, Tensor, Sensor], Built]
-"""(presses to learn from, background of the unit that is scored, its sensor) to the method."""
+FromPresses = Callable[[Training], Built]
 
 
 @dataclass(frozen=True)
@@ -66,7 +60,8 @@ class Method:
         style: arguments of Matplotlib's ``plot``.
         ours: whether it is a method of this library, and not of a peer.
         learns: whether the presses influence it, so that every fold of a cross-validation needs its own.
-        needs_prior: whether the sensor must have a prior.
+        seen: whether it may have learned from the very presses that it is scored on.
+        needs_prior: whether it is a variant for sensors that have a prior.
         needs_module: package that must be installed.
     """
 
@@ -76,6 +71,7 @@ class Method:
     style: Mapping[str, Any] = field(default_factory=dict)
     ours: bool = True
     learns: bool = True
+    seen: bool = False
     needs_prior: bool = False
     needs_module: str = ""
 
@@ -94,6 +90,16 @@ class Method:
             raise ValueError(f"method: expected one that a calibration is enough for, got '{self.name}', which learns from presses")
         return self.from_calibration(calibration)
 
+    def learned(self, training: Training) -> Built:
+        """The method built from presses.
+
+        Raises:
+            ValueError: a method that is not compared on presses, or presses that cannot be used.
+        """
+        if self.from_presses is None:
+            raise ValueError(f"method: expected one that presses are enough for, got '{self.name}', which needs a calibration")
+        return self.from_presses(training)
+
 
 # built from a calibration
 
@@ -105,22 +111,21 @@ def pipeline(calibration: Calibration, mode: str, normals: nn.Module | None = No
 
 
 def parameters(calibration: Calibration, mode: str) -> int:
-    """Number of parameters of a calibration: 12 of three lights, or all coefficients of the response fields that a mode uses."""
+    """Number of parameters of a calibration: 12 of three lights, or all coefficients of the response that a mode uses."""
     model = calibration.response
     if model is None:
         return 12
-    fields = (model.fast, model.precise if mode != "fast" else None)
-    return sum(2 * field.size() for field in fields if field is not None)
+    by_depth = None if mode == "fast" else model.by_depth
+    return 2 * model.field.size() + (0 if by_depth is None else by_depth.tensor().numel())
 
 
 def _flat(calibration: Calibration) -> Built:
-    """No depth at all: the error of every method must be below this one's."""
+    return Built(_zero, 0, "zero depth, for comparison")
 
-    def reconstruct(image: Tensor) -> DepthOutput:
-        zero = torch.zeros_like(image)
-        return DepthOutput(zero[:, :1], zero[:, :2], normal_from_gradient(zero[:, :2]), torch.zeros_like(zero[:, :1]).bool())
 
-    return Built(reconstruct, 0, "zero depth, for comparison")
+def _zero(image: Tensor) -> DepthOutput:
+    zero = torch.zeros_like(image)
+    return as_output(zero[:, :1], zero[:, :2], zero[:, :1].bool())
 
 
 def _reference(calibration: Calibration) -> Built:
@@ -182,148 +187,78 @@ def _lookup_by_rendered_balls(calibration: Calibration) -> Built:
     return pipeline(calibration, "fast", normals=block)._replace(parameters=block.table.numel())
 
 
-def lookup_on(calibration: Calibration, training: Training) -> Built:
-    """A look-up table behind the preprocessing of a calibration by response fields, filled by the located presses."""
-    pixels = training_pixels(Compensate.from_calibration(calibration), training.located, calibration.sensor.mm_per_pixel)
-    block = NormalFromLookup.fit(torch.ones_like(training.background), pixels.intensity - 1.0, pixels.slope)
-    return pipeline(calibration, "fast", normals=block)._replace(parameters=block.table.numel())
+# built from presses
 
 
-# built from presses: all share one contact mask and one integrator
-
-
-def flat(training: Training, background: Tensor, sensor: Sensor) -> Built:
+def flat(training: Training) -> Built:
     """No depth at all: the error of every method must be below this one's."""
-    unit = _unit(background, sensor)
-    return Built(_chain(unit, Compensate.from_calibration(unit), NormalFromResponse.from_calibration(unit)), 0)
+    return Built(_zero, 0)
 
 
-def point_lights(training: Training, background: Tensor, sensor: Sensor) -> Built:
+def point_lights(training: Training) -> Built:
     """Three lights fitted to the background alone, mode precise."""
-    unit = _unit(background, sensor)
-    found = quiet_calibrate(background, dataclasses.replace(sensor.without_prior(), blur_px=unit.sensor.blur_px))
-    normals = NormalFromIntensity.from_calibration(found)
-    return Built(_chain(unit, Compensate.from_calibration(found), normals, "precise"), 12, "from the background alone")
+    found = quiet_calibrate(training.background, _blurred_sensor(training.sensor.without_prior()))
+    return pipeline(found, "precise")._replace(note="from the background alone")
 
 
-def lookup_table(training: Training, background: Tensor, sensor: Sensor) -> Built:
-    """One table from the relative change of R, G, B to slope."""
-    learned, unit = _unit(training.background, sensor), _unit(background, sensor)
-    pixels = training_pixels(Compensate.from_calibration(learned), training.located, sensor.mm_per_pixel)
+def lookup_table(training: Training) -> Built:
+    """One table from the relative change of R, G, B to slope, behind the preprocessing of a response field that is zero."""
+    background, sensor = training.background, _blurred_sensor(training.sensor)
+    unit = Calibration.from_response(ResponseModel.zero(sensor.exponent, sensor.blur_px), training.sensor, background)
+    pixels = training_pixels(Compensate.from_calibration(unit), training.located, sensor.mm_per_pixel)
     block = NormalFromLookup.fit(torch.ones_like(background), pixels.intensity - 1.0, pixels.slope)
-    return Built(_chain(unit, Compensate.from_calibration(unit), block), block.table.numel(), "one table for all pixels")
+    return pipeline(unit, "fast", block)._replace(parameters=block.table.numel(), used=len(training.located))
 
 
-def network(training: Training, background: Tensor, sensor: Sensor, seed: int = 0) -> Built:
-    """gs_sdk's RGBXY network, trained on these presses."""
-    unit = _unit(background, sensor)
-    fit = train_network(training.background, training.located, sensor, unit.sensor.blur_px, seed)
-    smooth = _smooth(unit)
-    fit.module.set_flat(smooth(background[None])[0].clamp(0, 1))
+def network(training: Training, seed: int = 0) -> Built:
+    """gs_sdk's RGBXY network, trained on these presses, and a frame in the steps of gs_sdk."""
+    fit = train_network(training.background, training.located, training.sensor, seed=seed)
     note = "" if fit.converged else "stopped before it converged"
-    return Built(_chain(unit, smooth, fit.module), sum(p.numel() for p in fit.module.parameters()), note)
+    return _as_gs_sdk(fit.module, training, note)._replace(used=len(training.located))
 
 
-def given_network(training: Training, background: Tensor, sensor: Sensor, path: str | Path) -> Built:
-    """A network that was trained before: gs_sdk's ``nnmodel.pth``, or a file of torchvts."""
-    unit = _unit(background, sensor)
-    smooth = _smooth(unit)
-    block = NormalFromMLP.load(path, smooth(background[None])[0].clamp(0, 1))
-    note = f"{Path(path).name}: may have been trained on these very presses"
-    return Built(_chain(unit, smooth, block), sum(p.numel() for p in block.parameters()), note)
+def given_network(training: Training, path: str | Path) -> Built:
+    """A network that was trained before, gs_sdk's ``nnmodel.pth`` or a file of torchvts, and a frame in the steps of gs_sdk."""
+    return _as_gs_sdk(NormalFromMLP.load(path, training.background), training, f"{Path(path).name}: trained before")
 
 
-def response(training: Training, background: Tensor, sensor: Sensor, mode: str = "precise") -> Built:
-    """Calibration by the presses without a prior."""
-    return _calibrated(training.calibration, training, background, sensor, mode)
+def by_calibration(training: Training, mode: str, prior: bool = True) -> Built:
+    """What a user gets: calibration by the presses, with or without the prior of the sensor."""
+    training = training if prior else training.without_prior
+    notes = ["calibrate chose point lights"] * (training.calibration.response is None)
+    if training.sensor.prior is not None:
+        notes.append(f"prior fitted on {training.sensor.prior.source or 'a unit that it does not name'}")
+    used = len(training.located) if training.presses else 0
+    return pipeline(training.calibration, mode)._replace(note="; ".join(notes), used=used)
 
 
-def response_with_own_prior(training: Training, background: Tensor, sensor: Sensor) -> Built:
-    """Calibration by the presses and by a prior that is fitted to the same presses with their labels, mode precise.
-
-    It shows what a prior of the sensor is worth on presses that the prior has not seen.
-    """
-    prior = fit_prior(training.background, training.sensor, training.labelled, "the folds learned from, with their labels")
-    return response_with_prior(training, background, dataclasses.replace(sensor, prior=prior))
-
-
-def response_with_prior(training: Training, background: Tensor, sensor: Sensor) -> Built:
-    """Calibration by the presses and by the prior of the sensor file, mode precise."""
-    found = quiet_calibrate(training.background, sensor, training.presses)
-    built = _calibrated(found, training, background, sensor, "precise")
-    source = "" if sensor.prior is None else f"prior fitted on {sensor.prior.source or 'a unit that it does not name'}"
-    return built._replace(note="; ".join(part for part in (built.note, source) if part))
+def by_touches(training: Training) -> Built:
+    """Calibration by one press, for the scale, and by the images of the others as touches of unknown objects; mode precise."""
+    training, touches = training.without_prior, [press.image for press in training.presses[1:]]
+    found = quiet_calibrate(training.background, training.sensor, training.presses[:1], touches)
+    counted = [*found.report.get("presses", []), *found.report.get("touches", [])]
+    return pipeline(found, "precise")._replace(used=sum(row["used"] for row in counted))
 
 
-def _calibrated(found: Calibration, training: Training, background: Tensor, sensor: Sensor, mode: str) -> Built:
-    """The method of a calibration, on the unit of ``background``."""
-    left_out = sum(not row["used"] for row in found.report["presses"])
-    notes = [f"left out {left_out} of {len(training.presses)} presses"] if left_out else []
-    if background is not training.background:
-        if found.response is not None:
-            found = Calibration.from_response(found.response, sensor, background)
-        elif found.lights is not None:
-            found = Calibration.from_lights(found.lights, found.sensor, background)
-    if found.response is None:
-        notes.append("calibrate chose point lights")
-    normals = (NormalFromIntensity if found.response is None else NormalFromResponse).from_calibration(found)
-    chain = _chain(_unit(background, sensor), Compensate.from_calibration(found), normals, mode)
-    return Built(chain, parameters(found, mode), "; ".join(notes))
+def shipped_prior(training: Training, sensor: Sensor) -> Built:
+    """The prior of another description of the sensor, and no presses, mode precise."""
+    return by_calibration(Training(training.background, (), sensor), "precise")
 
 
-class _BothImages(nn.Module):
-    """Two compensated images of a frame in one tensor, (B, 6, H, W): one for the contact mask, one for the normals."""
-
-    def __init__(self, first: nn.Module, second: nn.Module) -> None:
-        super().__init__()
-        self.first, self.second = first, second
-
-    def forward(self, images: Tensor) -> Tensor:
-        return torch.cat((self.first(images), self.second(images)), dim=1)
+def with_network(path: Path) -> Method:
+    """The method of a network that was trained before on the unit, perhaps on the very presses."""
+    return Method(GIVEN_NETWORK, from_presses=partial(given_network, path=path), ours=False, learns=False, seen=True)
 
 
-class _ContactOfFirst(nn.Module):
-    def __init__(self, contact: nn.Module) -> None:
-        super().__init__()
-        self.contact = contact
-
-    def forward(self, both: Tensor) -> Tensor:
-        contact: Tensor = self.contact(both[:, :3])
-        return contact
+def _as_gs_sdk(module: NormalFromMLP, training: Training, note: str) -> Built:
+    peer = GsSdkPipeline(module, training.background, RESPONSE_BLUR_PX)
+    count = sum(p.numel() for p in module.parameters())
+    return Built(partial(peer.as_output, mm_per_pixel=training.sensor.mm_per_pixel), count, note)
 
 
-class _NormalsOfSecond(NormalModel):
-    def __init__(self, normals: nn.Module) -> None:
-        super().__init__()
-        self.normals = as_normal_model(normals)
-        self.uses_depth, self.max_passes = self.normals.uses_depth, self.normals.max_passes
-
-    def forward(self, image: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
-        normal: Tensor = self.normals(image[:, 3:], depth_mm)
-        return normal
-
-
-def _unit(background: Tensor, sensor: Sensor) -> Calibration:
-    """The unit with a response field that is zero everywhere: every method uses its contact mask."""
-    blur_px = with_preprocessing(sensor, None).blur_px
-    return Calibration.from_response(ResponseModel.zero(sensor.exponent, blur_px), sensor, background)
-
-
-def _smooth(unit: Calibration) -> Compensate:
-    """Raw intensity, blurred as for all methods: the input of a network."""
-    return Compensate(blur_px=unit.sensor.blur_px, markers=unit.markers)
-
-
-def _chain(unit: Calibration, compensate: nn.Module, normals: nn.Module, mode: str = "fast") -> DepthPipeline:
-    pitch = unit.sensor.mm_per_pixel
-    modules = (
-        _BothImages(Compensate.from_calibration(unit), compensate),
-        _ContactOfFirst(ContactMask.from_calibration(unit)),
-        _NormalsOfSecond(normals),
-        GradientFromNormal(),
-        PoissonBackground(pitch),
-    )
-    return DepthPipeline(*modules, mm_per_pixel=pitch, mode=mode).eval()
+def _blurred_sensor(sensor: Sensor) -> Sensor:
+    """The sensor with the blur that calibration by presses uses."""
+    return dataclasses.replace(sensor, blur_px=with_preprocessing(sensor, None).blur_px)
 
 
 # the registry; in charts the two modes of the paper are broad lines, and methods that give almost the same are drawn upon them
@@ -335,8 +270,18 @@ METHODS: dict[str, Method] = {
     method.name: method
     for method in (
         Method("flat", _flat, flat, {"color": "0.6", "lw": 1.2, "ls": "--"}, ours=False, learns=False),
-        Method("fast", partial(pipeline, mode="fast"), style={"color": "tab:blue", "lw": 4.0, "alpha": 0.55}),
-        Method("precise", partial(pipeline, mode="precise"), style={"color": "tab:orange", "lw": 4.0, "alpha": 0.7}),
+        Method(
+            "fast",
+            partial(pipeline, mode="fast"),
+            partial(by_calibration, mode="fast"),
+            {"color": "tab:blue", "lw": 4.0, "alpha": 0.55},
+        ),
+        Method(
+            "precise",
+            partial(pipeline, mode="precise"),
+            partial(by_calibration, mode="precise"),
+            {"color": "tab:orange", "lw": 4.0, "alpha": 0.7},
+        ),
         Method("auto", partial(pipeline, mode="auto"), style={"color": "tab:red", "lw": 1.4, "ls": ":"}),
         Method("fast, zero border", _zero_border, style={"color": "navy", "lw": 1.2, "ls": "--"}),
         Method("fast, SciPy's DCT", _scipy, ours=False, needs_module="scipy"),
@@ -348,10 +293,9 @@ METHODS: dict[str, Method] = {
         Method("point lights", from_presses=point_lights, learns=False),
         Method("look-up table", _lookup_by_rendered_balls, lookup_table, ours=False),
         Method("MLP", from_presses=network, ours=False),
-        Method("response fast", from_presses=partial(response, mode="fast")),
-        Method("response precise", from_presses=response),
-        Method("response precise, prior by folds", from_presses=response_with_own_prior),
-        Method("response precise, prior", from_presses=response_with_prior, needs_prior=True),
+        Method("touches", from_presses=by_touches),
+        Method("fast, no prior", from_presses=partial(by_calibration, mode="fast", prior=False), needs_prior=True),
+        Method("precise, no prior", from_presses=partial(by_calibration, mode="precise", prior=False), needs_prior=True),
     )
 }
 """Every method by its name."""

@@ -9,9 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ..accelerated import Compensate
 from ..core.geometry import normal_from_gradient
 from ..integration import divergence
-from ..model import Sensor, gs_sdk
+from ..model import gs_sdk
 from ..normals import NormalFromMLP
 from ..pipeline import DepthOutput
 
@@ -51,20 +52,23 @@ class GsSdkPipeline:
     Args:
         network: the network.
         background: (3, H, W) in [0, 1], image without contact.
+        blur_px: blur of the images before the network, pixels; gs_sdk has none.
     """
 
-    def __init__(self, network: NormalFromMLP, background: Tensor) -> None:
+    def __init__(self, network: NormalFromMLP, background: Tensor, blur_px: float = 0.0) -> None:
         self.network = network.eval()
+        self.smooth = Compensate(blur_px=blur_px)
         self.background = gs_sdk.image_to_bgr(background).astype(np.int16)
         with torch.inference_mode():
-            self.background_gradient = self.network.gradient_px(background[None])
+            self.background_gradient = self.network.gradient_px(self.smooth(background[None]))
 
     def __call__(self, pixels: "np.ndarray[Any, Any]") -> tuple[Any, Any, Any]:
         """B, G, R uint8 (H, W, 3) to gradients (2, H, W), height map in pixels, and mask."""
         import cv2
 
         with torch.inference_mode():
-            gradient = (self.network.gradient_px(gs_sdk.image_from_bgr(pixels)[None]) - self.background_gradient)[0].double()
+            image = self.smooth(gs_sdk.image_from_bgr(pixels)[None])
+            gradient = (self.network.gradient_px(image) - self.background_gradient)[0].double()
         height = scipy_solve(divergence(gradient[None])[0, 0].numpy())
         change = np.abs(pixels.astype(np.int16) - self.background).max(axis=2)
         mask = ((change > 15) & (height < -0.2)).astype(np.uint8)
@@ -72,13 +76,17 @@ class GsSdkPipeline:
         mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
         return gradient.numpy(), height, mask
 
-    def as_output(self, images: Tensor) -> DepthOutput:
-        """The result in the form of a pipeline; gradients need no pitch, and the height map has that of a GelSight Mini."""
+    def as_output(self, images: Tensor, mm_per_pixel: float) -> DepthOutput:
+        """The result in the form of a pipeline, for one frame (1, 3, H, W) and the pitch; depth is zero beside the contact."""
         gradient, height, mask = self(gs_sdk.image_to_bgr(images[0]))
-        pitch = Sensor.load("gelsight_mini").mm_per_pixel
-        slope = -torch.from_numpy(gradient)[None]
-        depth = -pitch * torch.from_numpy(height)[None, None]
-        return DepthOutput(depth, slope, normal_from_gradient(slope), torch.from_numpy(mask)[None, None].bool())
+        depth, contact = -mm_per_pixel * torch.from_numpy(height), torch.from_numpy(mask).bool()
+        level = depth[~contact].median() if not bool(contact.all()) else depth.min()
+        return as_output((depth - level)[None, None], -torch.from_numpy(gradient)[None], contact[None, None])
+
+
+def as_output(depth_mm: Tensor, gradient: Tensor, contact: Tensor) -> DepthOutput:
+    """Depth (B, 1, H, W), gradient (B, 2, H, W) and contact (B, 1, H, W) in the form of a pipeline."""
+    return DepthOutput(depth_mm, gradient, normal_from_gradient(gradient), contact, contact)  # gs_sdk knows one mask
 
 
 def installed_gs_sdk(weights: Path, background: "np.ndarray[Any, Any]", mm_per_pixel: float) -> Callable[[Any], object] | None:

@@ -18,27 +18,36 @@ from .score import ball_truth
 
 
 class Training:
-    """Presses to learn from, without their labels, and the calibration by response fields that they give without a prior.
+    """Presses to learn from, without their labels, and the calibration that they give.
 
     Args:
         background: (3, H, W) in [0, 1], image without contact.
         presses: presses to learn from.
-        sensor: the sensor; its prior is not used.
-    Attributes:
-        labelled: the presses as given, with their labels, which only the fit of a prior may use.
-        presses: the presses without their labels.
+        sensor: the sensor; its prior is used if it has one.
     """
 
     def __init__(self, background: Tensor, presses: Sequence[Press], sensor: Sensor) -> None:
-        self.background = background
-        self.sensor = sensor.without_prior()
-        self.labelled = presses
+        self.background, self.sensor = background, sensor
         self.presses = [without_labels(press) for press in presses]
 
     @cached_property
+    def _attempt(self) -> Calibration | Exception:
+        try:
+            return quiet_calibrate(self.background, self.sensor, self.presses)
+        except Exception as error:  # kept, because every method that asks would wait for it again
+            return error
+
+    @property
     def calibration(self) -> Calibration:
         """Calibration by all presses, made when first needed."""
-        return quiet_calibrate(self.background, self.sensor, self.presses)
+        if isinstance(self._attempt, Exception):
+            raise self._attempt
+        return self._attempt
+
+    @cached_property
+    def without_prior(self) -> "Training":
+        """The same presses, and a sensor without a prior."""
+        return self if self.sensor.prior is None else Training(self.background, self.presses, self.sensor.without_prior())
 
     @cached_property
     def located(self) -> list[Press]:
@@ -78,11 +87,21 @@ def without_labels(press: Press) -> Press:
     return dataclasses.replace(press, center_px=None, contact_radius_px=None)
 
 
-def quiet_calibrate(background: Tensor, sensor: Sensor, presses: Sequence[Press] = ()) -> Calibration:
+def with_centers(background: Tensor, sensor: Sensor, presses: Sequence[Press]) -> list[Press]:
+    """The presses with centre and contact radius; where there is no centre, ``calibrate`` locates the balls."""
+    bare = [press for press in presses if press.center_px is None]
+    located = {press.name: press for press in Training(background, bare, sensor).located} if bare else {}
+    known = [located.get(press.name, press) for press in presses]
+    return [press for press in known if press.center_px is not None and press.contact_radius_px is not None]
+
+
+def quiet_calibrate(
+    background: Tensor, sensor: Sensor, presses: Sequence[Press] = (), touches: Sequence[Tensor] = ()
+) -> Calibration:
     """``calibrate`` without its warnings: an evaluation reports the errors themselves."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CalibrationWarning)
-        return calibrate(background, sensor, presses)
+        return calibrate(background, sensor, presses, touches)
 
 
 def training_pixels(compensate: nn.Module, presses: Sequence[Press], mm_per_pixel: float) -> TrainingPixels:
@@ -139,10 +158,7 @@ def train_network(
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     for press in presses:
         check_image(f"{press.name}: image", press.image, sensor.height, sensor.width, sensor.name)
-    unlabelled = {press.name for press in presses if press.center_px is None}
-    known = [press for press in presses if press.center_px is not None and press.contact_radius_px is not None]
-    if unlabelled:
-        known += [press for press in Training(background, presses, sensor).located if press.name in unlabelled]
+    known = with_centers(background, sensor.without_prior(), presses)
     compensate = Compensate(blur_px=blur_px)
     pixels = training_pixels(compensate, known, sensor.mm_per_pixel)
     flat = compensate(background[None])[0].clamp(0, 1)

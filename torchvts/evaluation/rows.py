@@ -1,11 +1,16 @@
 """The one record of a measurement, a :class:`Row`: speed, stability and evaluation write it as Markdown and as JSON."""
 
+import csv
 import dataclasses
+import io
 import json
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
+
+from ..core.files import write_atomically
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,7 @@ class Row:
 
     Attributes:
         kind: what was measured: "scene" (exact truth), "wall" (exact truth, vertical walls), "sensor" (balls on a real sensor),
-            "stage" (part of a frame), "batch", "threads", "corruption" (a scene of the gallery) or "presses" (cross-validation).
+            "stage" (part of a frame), "batch", "threads", "corruption" (a scene of the gallery) or "presses" (balls, objects).
         method: its name.
         data: name of the scene, the corruption or the presses.
         errors: value by name, such as "normal_deg"; None where nothing could be measured.
@@ -64,6 +69,7 @@ class Row:
         frames: number of frames behind the errors.
         worst: name of the frame with the largest error.
         ours: whether it is a method of this library, and not of a peer.
+        seen: whether the method has learned from the very frames that it is scored on.
         command: command that made the row.
         note: an error, a warning or a remark.
     """
@@ -80,6 +86,7 @@ class Row:
     frames: int = 1
     worst: str = ""
     ours: bool = True
+    seen: bool = False
     command: str = ""
     note: str = ""
 
@@ -123,6 +130,39 @@ def markdown(titles: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
     return "\n".join(head + ["| " + " | ".join(cells) + " |" for cells in lines])
 
 
+def to_csv(rows: Sequence[Row]) -> str:
+    """Rows as comma-separated values: a column for each error that a row has."""
+    text = io.StringIO()
+    names = list(dict.fromkeys(name for row in rows for name in row.errors))
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["data", "method", *names, "parameters", "frames", "seen", "note"])
+    for row in rows:
+        errors = [row.error(name) for name in names]
+        table.writerow([row.data, row.method, *errors, row.parameters, row.frames, int(row.seen), row.note])
+    return text.getvalue()
+
+
+def latex(titles: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    r"""A LaTeX table of texts, for the package booktabs.
+
+    Example:
+        >>> print(latex(["method", "radius %"], [["fast", "2.0"]]))
+        \begin{tabular}{ll}
+        \toprule
+        method & radius \% \\
+        \midrule
+        fast & 2.0 \\
+        \bottomrule
+        \end{tabular}
+    """
+    special = str.maketrans(
+        {"\\": r"\textbackslash{}", **{c: "\\" + c for c in "%_&#${}"}, "<": r"\textless{}", ">": r"\textgreater{}"}
+    )
+    head, *body = [" & ".join(cell.translate(special) for cell in cells) + r" \\" for cells in (titles, *lines)]
+    rules = (rf"\begin{{tabular}}{{{'l' * len(titles)}}}", r"\toprule", head, r"\midrule", *body, r"\bottomrule", r"\end{tabular}")
+    return "\n".join(rules)
+
+
 def to_json(rows: Iterable[Row]) -> str:
     """Rows as a JSON list, one object each."""
     return json.dumps([dataclasses.asdict(row) for row in rows], indent=1)
@@ -137,6 +177,14 @@ def row_from_dict(values: dict[str, Any]) -> Row:
     """The row whose ``dataclasses.asdict`` is given."""
     size, time = values["size"], values["time"]
     return Row(**(values | {"size": size and Size(**size), "time": time and Time(**time)}))
+
+
+def write_files(folder: Path, files: Mapping[str, str]) -> None:
+    """Write texts by file name into a folder, which is made if missing; an interrupted write leaves no file."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in files.items():
+        with write_atomically(folder / name) as temporary:
+            temporary.write_text(text, encoding="utf-8")
 
 
 def mean(values: Iterable[float | None]) -> float | None:

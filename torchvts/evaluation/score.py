@@ -1,5 +1,6 @@
-"""Score of one frame against the ball of known size that was pressed."""
+"""Score of one frame: against the ball of known size that was pressed, or against an exact surface."""
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -8,70 +9,69 @@ import torch
 from torch import Tensor
 
 from ..calibration import Press
-from ..core.checks import check_same_size
+from ..core.checks import check_batch, check_same_size
 from ..core.geometry import normal_from_gradient, pixel_grid_mm
-from .metrics import fit_sphere, normal_angle_deg
+from .metrics import fit_sphere, mask_iou, normal_angle_deg
 
 RIM_PX = 3.0
 """Width of the ring inside the contact radius that is not scored: there the skin leaves the ball, and labels are a pixel off."""
 
-SLOPE_EDGES = (0.2, 0.4, 0.6)
-"""Edges of the bins of true slope in ``by_slope_deg``, mm per mm."""
 
-PLACES = 3
-"""Number of rows and of columns of image parts in ``by_place_deg``."""
-
-
-class BallTruth(NamedTuple):
-    """The ball under a press, float64.
+class Truth(NamedTuple):
+    """What a frame shows, float64.
 
     Attributes:
-        depth_mm: (1, 1, H, W), height of the ball above its equator, mm.
+        depth_mm: (1, 1, H, W), mm, up to a constant: of a ball the height above its equator.
         gradient: (1, 2, H, W), its slope, mm per mm.
-        region: (1, 1, H, W) bool, the pixels to score.
+        region: (1, 1, H, W) bool, the pixels where depth and normals are scored.
+        contact: (1, 1, H, W) bool, where the object touches; None if that is unknown.
     """
 
     depth_mm: Tensor
     gradient: Tensor
     region: Tensor
+    contact: Tensor | None = None
 
 
 @dataclass(frozen=True)
 class PressScore:
-    """Errors of one method on one press, inside the contact radius less :data:`RIM_PX`.
+    """Errors of one method on one press, in the region of its truth.
 
     Attributes:
         press: name of the press.
         method: name of the method.
-        normal_deg: mean angle between normals, degrees.
-        relief_um: RMS difference of depth and ball, each less its own mean, micrometres.
+        lowest_mm: least depth of the whole frame, mm: below zero the skin seems to bulge out.
+        normal_deg: mean angle between normals, degrees; None, as all that follows, where it is not known.
+        depth_normal_deg: the same of the normals of the depth.
+        relief_um: RMS difference of depth and truth, each less its own mean, micrometres.
         tilt_um: the part of ``relief_um`` that is a plane: the effect of a wrong label of the centre, and of errors that a
             response field makes alike all over a contact.
-        radius_percent: error of the radius of a sphere fitted to the depth, percent; None where the depth is a plane.
-        center_px: error of the centre of that sphere, pixels; None where the depth is a plane.
-        apex_um: error of the depth of the middle above the rim of the region, micrometres; None if the image cuts off either.
-        by_slope_deg: mean angle where the slope of the ball is below 0.2, 0.4, 0.6, and above; None without pixels.
-        by_slope_pixels: number of pixels in each bin of slope.
-        by_place_deg: mean angle in 3 x 3 parts of the image, row by row; None without pixels.
-        by_place_pixels: number of pixels in each part.
+        iou: intersection over union of the contact found and the true one.
+        radius_percent: error of the radius of a sphere fitted to the depth of a ball, percent; None where the depth is a plane.
+        center_px: error of the centre of that sphere, pixels.
     """
 
     press: str
     method: str
-    normal_deg: float
-    relief_um: float
-    tilt_um: float
-    radius_percent: float | None
-    center_px: float | None
-    apex_um: float | None
-    by_slope_deg: tuple[float | None, ...]
-    by_slope_pixels: tuple[int, ...]
-    by_place_deg: tuple[float | None, ...]
-    by_place_pixels: tuple[int, ...]
+    lowest_mm: float
+    normal_deg: float | None = None
+    depth_normal_deg: float | None = None
+    relief_um: float | None = None
+    tilt_um: float | None = None
+    iou: float | None = None
+    radius_percent: float | None = None
+    center_px: float | None = None
+
+    @property
+    def level_um(self) -> float | None:
+        """The part of ``relief_um`` that is no tilt, micrometres."""
+        if self.relief_um is None or self.tilt_um is None:
+            return None
+        return math.sqrt(max(0.0, self.relief_um**2 - self.tilt_um**2))
 
 
-def ball_truth(press: Press, height: int, width: int, mm_per_pixel: float) -> BallTruth:
-    """The sphere that the skin follows inside the contact.
+def ball_truth(press: Press, height: int, width: int, mm_per_pixel: float) -> Truth:
+    """The sphere that the skin follows inside the contact; the region is :data:`RIM_PX` smaller than the contact.
 
     Args:
         press: press with centre and contact radius.
@@ -79,7 +79,7 @@ def ball_truth(press: Press, height: int, width: int, mm_per_pixel: float) -> Ba
         width: columns of the image.
         mm_per_pixel: pixel pitch, mm.
     Returns:
-        Depth, slope and the region to score.
+        Depth, slope, the region to score, and the contact.
     Raises:
         ValueError: the press has no centre or no contact radius.
     Example:
@@ -98,7 +98,14 @@ def ball_truth(press: Press, height: int, width: int, mm_per_pixel: float) -> Ba
     gradient = -torch.stack((dx.expand_as(depth), dy.expand_as(depth))) / depth
     reach_mm = min((contact_radius_px - RIM_PX) * mm_per_pixel, 0.95 * radius_mm)
     region = (r_squared < reach_mm**2) if reach_mm > 0 else torch.zeros_like(depth, dtype=torch.bool)
-    return BallTruth(depth[None, None], gradient[None], region[None, None])
+    contact = r_squared < (contact_radius_px * mm_per_pixel) ** 2
+    return Truth(depth[None, None], gradient[None], region[None, None], contact[None, None])
+
+
+def undeformed_truth(height: int, width: int) -> Truth:
+    """The truth of a frame that nothing touches: zero everywhere."""
+    zero = torch.zeros(1, 2, height, width, dtype=torch.float64)
+    return Truth(zero[:, :1], zero, zero[:, :1] == 0, zero[:, :1] != 0)
 
 
 def label(press: Press) -> tuple[tuple[float, float], float]:
@@ -112,7 +119,9 @@ def label(press: Press) -> tuple[tuple[float, float], float]:
     return press.center_px, press.contact_radius_px
 
 
-def score_press(press: Press, depth_mm: Tensor, normal: Tensor, mm_per_pixel: float, method: str = "") -> PressScore:
+def score_press(
+    press: Press, depth_mm: Tensor, normal: Tensor, mm_per_pixel: float, method: str = "", contact: Tensor | None = None
+) -> PressScore:
     """Compare one frame with the ball that was pressed.
 
     Args:
@@ -121,6 +130,7 @@ def score_press(press: Press, depth_mm: Tensor, normal: Tensor, mm_per_pixel: fl
         normal: (1, 3, H, W), measured unit normals.
         mm_per_pixel: pixel pitch, mm.
         method: name that is kept with the score.
+        contact: (1, 1, H, W) bool, measured contact; None leaves it out.
     Returns:
         The errors.
     Raises:
@@ -132,50 +142,65 @@ def score_press(press: Press, depth_mm: Tensor, normal: Tensor, mm_per_pixel: fl
         >>> round(score.normal_deg, 6), round(score.relief_um, 6), round(abs(score.radius_percent), 6)
         (0.0, 0.0, 0.0)
     """
-    truth = _checked_truth(press, depth_mm, normal, mm_per_pixel)
-    region = truth.region[0, 0]
-    depth = depth_mm.detach().cpu().double()
-    angle = normal_angle_deg(normal.detach().cpu().double(), normal_from_gradient(truth.gradient))[0][region]  # (N,)
-    error = (depth - truth.depth_mm)[0, 0][region]
-    rows, columns = torch.nonzero(region, as_tuple=True)
-    steepness = truth.gradient[0].norm(dim=0)[region]
-    slope_bin = torch.bucketize(steepness, torch.tensor(SLOPE_EDGES, dtype=torch.float64), right=True)
-    height, width = region.shape
-    place_bin = (rows * PLACES // height) * PLACES + columns * PLACES // width
-    by_slope, slope_pixels = _by_bin(angle, slope_bin, len(SLOPE_EDGES) + 1)
-    by_place, place_pixels = _by_bin(angle, place_bin, PLACES * PLACES)
-    radius_percent, center_px = _sphere_error(press, depth, truth, mm_per_pixel)
-    return PressScore(
-        press=press.name,
-        method=method,
-        normal_deg=float(angle.mean()),
-        relief_um=1000.0 * float(error.std(correction=0)),
-        tilt_um=1000.0 * _tilt(error, torch.stack((columns, rows))),
-        radius_percent=radius_percent,
-        center_px=center_px,
-        apex_um=_apex_um(press, error, columns, rows),
-        by_slope_deg=by_slope,
-        by_slope_pixels=slope_pixels,
-        by_place_deg=by_place,
-        by_place_pixels=place_pixels,
-    )
-
-
-def _checked_truth(press: Press, depth_mm: Tensor, normal: Tensor, mm_per_pixel: float) -> BallTruth:
-    """The ball, after a check that one frame was given and that its region is large enough."""
-    if depth_mm.dim() != 4 or tuple(depth_mm.shape[:2]) != (1, 1):
-        raise ValueError(f"depth_mm: expected one frame, (1, 1, H, W), got {tuple(depth_mm.shape)}: loop over the batch")
-    height, width = depth_mm.shape[2], depth_mm.shape[3]
-    if tuple(normal.shape[:2]) != (1, 3):
-        raise ValueError(f"normal: expected one frame, (1, 3, H, W), got {tuple(normal.shape)}: loop over the batch")
-    check_same_size("normal", normal, "depth_mm", height, width)
-    truth = ball_truth(press, height, width, mm_per_pixel)
+    _check_frame(depth_mm, normal)
+    truth = ball_truth(press, depth_mm.shape[2], depth_mm.shape[3], mm_per_pixel)
     if int(truth.region.sum()) < 10:
         raise ValueError(
             f"press: '{press.name}' has {int(truth.region.sum())} pixels {RIM_PX:g} px inside its contact radius of "
             f"{press.contact_radius_px:g} px, 10 are needed: pressed too faintly, or outside of the image"
         )
-    return truth
+    radius_percent, center_px = _sphere_error(press, depth_mm.detach().cpu().double(), truth, mm_per_pixel)
+    score = score_surface(truth, depth_mm, normal, mm_per_pixel, press.name, method, contact)
+    return dataclasses.replace(score, radius_percent=radius_percent, center_px=center_px)
+
+
+def score_surface(
+    truth: Truth, depth_mm: Tensor, normal: Tensor, mm_per_pixel: float, name: str, method: str = "", contact: Tensor | None = None
+) -> PressScore:
+    """Compare one frame with a known surface: :func:`score_press` without what only a ball has.
+
+    Args:
+        truth: the surface, with at least one pixel to score.
+        depth_mm: (1, 1, H, W), measured depth, mm.
+        normal: (1, 3, H, W), measured unit normals.
+        mm_per_pixel: pixel pitch, mm.
+        name: name of the press that is kept with the score.
+        method: name that is kept with the score.
+        contact: (1, 1, H, W) bool, measured contact; None leaves it out.
+    Raises:
+        ValueError: wrong shapes, or an empty region.
+    Example:
+        >>> flat = undeformed_truth(8, 8)
+        >>> score = score_surface(flat, torch.full((1, 1, 8, 8), -0.1), normal_from_gradient(flat.gradient), 0.1, "nothing")
+        >>> round(score.lowest_mm, 3), score.relief_um, score.normal_deg
+        (-0.1, 0.0, 0.0)
+    """
+    _check_frame(depth_mm, normal)
+    check_same_size("truth", truth.depth_mm, "depth_mm", depth_mm.shape[2], depth_mm.shape[3])
+    if not bool(truth.region.any()):
+        raise ValueError(f"truth: expected at least one pixel to score, '{name}' has none: nothing touches")
+    depth, region = depth_mm.detach().cpu().double(), truth.region[0, 0]
+    true_normal = normal_from_gradient(truth.gradient)
+    slope = torch.stack(torch.gradient(depth[0, 0], spacing=mm_per_pixel)[::-1])[None]  # torch gives rows first
+    error = (depth - truth.depth_mm)[0, 0][region]
+    return PressScore(
+        press=name,
+        method=method,
+        lowest_mm=float(depth.min()),
+        normal_deg=float(normal_angle_deg(normal.detach().cpu().double(), true_normal, truth.region).mean()),
+        depth_normal_deg=float(normal_angle_deg(normal_from_gradient(slope), true_normal, truth.region).mean()),
+        relief_um=1000.0 * float(error.std(correction=0)),
+        tilt_um=1000.0 * _tilt(error, torch.nonzero(region).t()),
+        iou=None if contact is None or truth.contact is None else mask_iou(contact.cpu(), truth.contact),
+    )
+
+
+def _check_frame(depth_mm: Tensor, normal: Tensor) -> None:
+    for name, value, channels in (("depth_mm", depth_mm, 1), ("normal", normal, 3)):
+        check_batch(name, value, channels)
+        if value.shape[0] != 1:
+            raise ValueError(f"{name}: expected one frame, (1, {channels}, H, W), got {tuple(value.shape)}: loop over the batch")
+    check_same_size("normal", normal, "depth_mm", depth_mm.shape[2], depth_mm.shape[3])
 
 
 def _tilt(error: Tensor, place: Tensor) -> float:
@@ -185,15 +210,7 @@ def _tilt(error: Tensor, place: Tensor) -> float:
     return float(plane.std(correction=0))
 
 
-def _apex_um(press: Press, error: Tensor, columns: Tensor, rows: Tensor) -> float | None:
-    """Mean error of the middle less that of the rim; None if the image cuts off either."""
-    (center_x, center_y), contact_radius_px = label(press)
-    away = torch.hypot(columns - center_x, rows - center_y)
-    middle, rim = away < 2.0, away > contact_radius_px - RIM_PX - 1.5
-    return 1000.0 * float(error[middle].mean() - error[rim].mean()) if bool(middle.any() and rim.any()) else None
-
-
-def _sphere_error(press: Press, depth_mm: Tensor, truth: BallTruth, mm_per_pixel: float) -> tuple[float | None, float | None]:
+def _sphere_error(press: Press, depth_mm: Tensor, truth: Truth, mm_per_pixel: float) -> tuple[float | None, float | None]:
     """Radius error in percent and centre error in pixels of the sphere through the depth; None for a plane."""
     height, width = depth_mm.shape[2:]
     x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
@@ -212,10 +229,3 @@ def _sphere_error(press: Press, depth_mm: Tensor, truth: BallTruth, mm_per_pixel
     at_y = -sphere.center_mm[1] / mm_per_pixel + (height - 1) / 2
     away_px = math.hypot(at_x - center_x, at_y - center_y)
     return 100.0 * abs(sphere.radius_mm / (0.5 * press.ball_diameter_mm) - 1.0), away_px
-
-
-def _by_bin(values: Tensor, index: Tensor, bins: int) -> tuple[tuple[float | None, ...], tuple[int, ...]]:
-    """Mean of the values in each bin, None where there is none, and their number."""
-    counts = torch.bincount(index, minlength=bins)
-    sums = torch.bincount(index, weights=values, minlength=bins)
-    return tuple(float(s / n) if n else None for s, n in zip(sums, counts)), tuple(counts.tolist())

@@ -1,6 +1,5 @@
 """Speed and error of every method in the same run: on exact scenes, on a real sensor, for the stages of a frame."""
 
-import dataclasses
 import os
 import platform
 import statistics
@@ -22,11 +21,11 @@ from ..pipeline import MODES, DepthPipeline
 from ..scenes import Scene, render, sphere_press, surface
 from . import rows as records
 from .gallery import roof, stamp
-from .methods import METHODS, Built, Reconstruct, lookup_on
+from .methods import METHODS, Built, Reconstruct, lookup_table, point_lights, shipped_prior
 from .metrics import depth_error, normal_angle_deg
 from .peers import GsSdkPipeline, installed_gs_sdk
-from .presses import Training, quiet_calibrate
-from .rows import Column, Row, Size, Time, error_column, number
+from .presses import Training
+from .rows import Column, Row, Size, Time, error_column, mean, number
 from .score import score_press
 
 SIZES = ((120, 160), (240, 320), (480, 640), (960, 1280))
@@ -62,6 +61,7 @@ class Call(NamedTuple):
         errors: errors of the same frames.
         batch: frames in the call.
         ours: whether it is a method of this library.
+        seen: whether the method has learned from the very frames that it is scored on.
         parameters: number of parameters of the method.
         floor_ms: time of the memory traffic or of the FFT alone, ms.
         note: a remark.
@@ -71,6 +71,7 @@ class Call(NamedTuple):
     errors: Errors | None = None
     batch: int = 1
     ours: bool = True
+    seen: bool = False
     parameters: int | None = None
     floor_ms: float | None = None
     note: str = ""
@@ -149,6 +150,7 @@ class Bench:
             time=Time(ms, timing.iqr / timed.batch, 1000.0 / ms, held, threads, self.machine, timed.floor_ms),
             parameters=timed.parameters,
             ours=timed.ours,
+            seen=timed.seen,
             command=self.command,
             note=timed.note,
         )
@@ -193,8 +195,8 @@ def peer_ratios(rows: Sequence[Row]) -> list[str]:
 
 
 def front(rows: Sequence[Row], error: str) -> list[Row]:
-    """The Pareto front of time and of an error ("rms_um", "normal_deg"), by rising time."""
-    known = sorted(((ms(row), value, k) for k, row in enumerate(rows) if (value := row.error(error)) is not None))
+    """The Pareto front of time and of an error ("rms_um", "normal_deg"), by rising time, of what has not seen the frames before."""
+    known = sorted((ms(row), value, k) for k, row in enumerate(rows) if not row.seen and (value := row.error(error)) is not None)
     best: list[Row] = []
     least = float("inf")
     for _, value, k in known:
@@ -260,7 +262,7 @@ def _on_scene(name: str, rig: _Rig) -> Call:
     error = depth_error(found.depth_mm, rig.scene.depth_mm, rig.scene.mm_per_pixel)
     angle = float(normal_angle_deg(found.normal, rig.scene.normal, rig.scene.contact).mean())
     errors = {"normal_deg": angle, "rms_um": 1000.0 * error.rms_mm, "largest_px": error.max_px}
-    return Call(partial(built.reconstruct, rig.image), errors, 1, method.ours, built.parameters, None, built.note)
+    return Call(partial(built.reconstruct, rig.image), errors, 1, method.ours, parameters=built.parameters, note=built.note)
 
 
 def _scenes(bench: Bench) -> Iterator[Row]:
@@ -306,8 +308,8 @@ def _stages(bench: Bench) -> Iterator[Row]:
         rig = _rig(*size, 1.0)
         pipe, image = _fast(rig), rig.image
         with torch.inference_mode():
-            contact = pipe.contact(pipe.compensate(image))
-            gradient = pipe.gradient(pipe.normals(image)) * contact
+            deformed = pipe.deformed(pipe.compensate(image))
+            gradient = pipe.gradient(pipe.normals(image)) * deformed
             depth = pipe.integrate(gradient)
         plane, spectrum = torch.rand(1, 1, *size), torch.fft.rfft2(torch.rand(1, 1, *size))
         with torch.inference_mode():
@@ -316,7 +318,7 @@ def _stages(bench: Bench) -> Iterator[Row]:
             transform = time_ms(partial(torch.fft.rfft2, plane)).median
             transform += time_ms(partial(torch.fft.irfft2, spectrum, s=size)).median
         calls: dict[str, tuple[Callable[[], object], float, str]] = {
-            "contact": (partial(pipe.contact, image), copy, "floor: one pass over the image"),
+            "deformed": (partial(pipe.deformed, image), copy, "floor: one pass over the image"),
             "normals, eq. 9, whole frame": (partial(pipe.normals, image), 3.0 * copy, "floor: one pass for each light"),
             "normals, eq. 10, whole frame": (partial(pipe.normals, image, depth), 3.0 * copy, "the same floor"),
             "integrate, whole frame": (partial(pipe.integrate, gradient), transform, "floor: one real FFT and its inverse"),
@@ -355,44 +357,38 @@ def _sensor(bench: Bench, data: Path) -> Iterator[Row]:
     learned, scored = labelled[::2], labelled[1::2]
     size, name, image = (sensor.height, sensor.width), "GelSight Mini, balls", scored[0].image
     bench.progress("fitting the methods to presses of a GelSight Mini")
-    for method, built, ours in _sensor_methods(Training(background, learned, sensor), sensor):
+    for method, built, seen in _sensor_methods(Training(background, learned, sensor.without_prior()), sensor):
         errors = _ball_errors(built.reconstruct, scored, sensor.mm_per_pixel)
-        call = Call(partial(built.reconstruct, image[None]), errors, 1, ours, built.parameters, None, built.note)
+        ours = method != "look-up table"
+        call = Call(partial(built.reconstruct, image[None]), errors, 1, ours, seen, built.parameters, note=built.note)
         yield bench.row("sensor", method, name, size, call)
     weights = folder / "model" / "nnmodel.pth"
     pixels = gs_sdk.image_to_bgr(image)
     if find_spec("scipy") is not None:
         peer = GsSdkPipeline(NormalFromMLP.load(weights, background), background)
-        errors = _ball_errors(peer.as_output, scored, sensor.mm_per_pixel)
+        errors = _ball_errors(partial(peer.as_output, mm_per_pixel=sensor.mm_per_pixel), scored, sensor.mm_per_pixel)
         note = "its network, trained on these very presses; its steps by its published format"
-        yield bench.row("sensor", GS_SDK, name, size, Call(partial(peer, pixels), errors, ours=False, note=note))
+        yield bench.row("sensor", GS_SDK, name, size, Call(partial(peer, pixels), errors, ours=False, seen=True, note=note))
     own = installed_gs_sdk(weights, gs_sdk.image_to_bgr(background), sensor.mm_per_pixel)
     if own is not None:
         yield bench.row("sensor", "gs_sdk, installed", name, size, Call(partial(own, pixels), ours=False, note="time only"))
 
 
 def _sensor_methods(training: Training, sensor: Sensor) -> Iterator[tuple[str, Built, bool]]:
-    """Name, method, and whether it is ours."""
-    background = training.background
-    lights = quiet_calibrate(background, dataclasses.replace(sensor.without_prior(), blur_px=1.0))
-    prior = quiet_calibrate(background, sensor)
+    """Name, method, and whether it has learned from the presses that are scored."""
     fitted = training.calibration
     candidates = f"of {len(fitted.report['candidates'])} candidates"
     for mode in MODES:
-        yield f"response, {mode}", METHODS[mode].calibrated(fitted)._replace(note=candidates), True
+        yield f"response, {mode}", METHODS[mode].calibrated(fitted)._replace(note=candidates), False
     for degree in (0, 2):
-        yield f"response linear {degree}, fast", METHODS["fast"].calibrated(training.of_family(degree, -1)), True
-    precise = METHODS["precise"]
-    yield "prior that has seen them, precise", precise.calibrated(prior)._replace(note="has seen these presses"), True
-    yield "point lights, precise", precise.calibrated(lights)._replace(note="from the background alone"), True
-    yield "look-up table", lookup_on(fitted, training), False
+        yield f"response linear {degree}, fast", METHODS["fast"].calibrated(training.of_family(degree, -1)), False
+    yield "prior that has seen them, precise", shipped_prior(training, sensor), True
+    yield "point lights, precise", point_lights(training), False
+    yield "look-up table", lookup_table(training), False
 
 
 def _ball_errors(reconstruct: Reconstruct, presses: Sequence[Press], mm_per_pixel: float) -> Errors:
     with torch.inference_mode():
         found = [(press, reconstruct(press.image[None])) for press in presses]
     scores = [score_press(press, out.depth_mm, out.normal, mm_per_pixel) for press, out in found]
-    return {
-        "normal_deg": sum(s.normal_deg for s in scores) / len(scores),
-        "rms_um": sum(s.relief_um for s in scores) / len(scores),
-    }
+    return {"normal_deg": mean(s.normal_deg for s in scores), "rms_um": mean(s.relief_um for s in scores)}

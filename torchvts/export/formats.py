@@ -1,6 +1,6 @@
 """The writers: a pipeline as one file in TorchScript, torch.export, AOTInductor or ONNX.
 
-Every file takes images (B, 3, H, W) of the pipeline's size, any B, and returns depth_mm, gradient, normal, contact in that order.
+Every file takes images (B, 3, H, W) of the pipeline's size, any B, and returns depth_mm, gradient, normal, contact, deformed in that order.
 """
 
 import copy
@@ -26,7 +26,7 @@ from .trace import size_and_dtype, trace
 METADATA_KEY = "torchvts"
 """Name under which a file keeps its metadata (:func:`describe`) as JSON."""
 
-OUTPUTS = ("depth_mm", "gradient", "normal", "contact")
+OUTPUTS = ("depth_mm", "gradient", "normal", "contact", "deformed")
 
 
 def describe(pipe: DepthPipeline) -> dict[str, Any]:

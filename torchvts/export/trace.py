@@ -94,7 +94,7 @@ def size_and_dtype(pipe: DepthPipeline) -> tuple[int, int, torch.dtype]:
     Raises:
         ValueError: no block knows them.
     """
-    for tensor in (*pipe.contact.buffers(), *pipe.compensate.buffers()):
+    for tensor in (*pipe.deformed.buffers(), *pipe.compensate.buffers()):
         if tensor.dim() == 3 and tensor.shape[0] == 3 and tensor.is_floating_point():
             return tensor.shape[1], tensor.shape[2], tensor.dtype
     raise ValueError("pipe: expected blocks that know the size of the calibration, as from_calibration makes them, got none")

@@ -1,5 +1,6 @@
 """From gradient to depth."""
 
+from .background import ZeroBackground
 from .base import Integrator, WrappedIntegrator, as_integrator
 from .discontinuities import (
     AdaptiveIntegration,
@@ -22,6 +23,7 @@ __all__ = [
     "PoissonDCT",
     "PoissonDST",
     "WrappedIntegrator",
+    "ZeroBackground",
     "as_integrator",
     "discontinuity_share",
     "divergence",

@@ -5,11 +5,12 @@ from .calibration import Calibration, check_calibration
 from .lights import PointLights, near_field_shading
 from .markers import FillMarkers, fill_markers, find_markers
 from .report import Report
-from .response_field import ResponseField, ResponseModel, SensorPrior
+from .response_field import DepthBrightness, ResponseField, ResponseModel, SensorPrior
 from .sensor import Sensor, check_sensor, shipped_sensors
 
 __all__ = [
     "Calibration",
+    "DepthBrightness",
     "FillMarkers",
     "PointLights",
     "Report",

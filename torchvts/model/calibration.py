@@ -7,11 +7,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import kornia
 import torch
 from torch import Tensor
 
-from ..core.checks import QUANTISATION_STD, brief, check_image, check_record, check_tensor
+from ..core.checks import QUANTISATION_STD, brief, check_field, check_image, check_record, check_shape, check_tensor
 from ..core.files import image_from_bytes, image_to_bytes, load_tensors, save_tensors
 from ..core.noise import noise_std
 from .lights import PointLights, flat_image, inverse_light_matrix
@@ -20,11 +19,17 @@ from .report import Report, read_report
 from .response_field import ResponseModel
 from .sensor import Sensor, check_sensor
 
-FORMAT_VERSION = 5
+FORMAT_VERSION = 6
 """Version of the calibration file. A file of another version is refused."""
 
 DEFECT_RATIO = 4.0
 """A pixel whose background is this factor darker or brighter than expected is a defect: it is inpainted."""
+
+MODEL_AT_FAULT = 0.1
+"""Share of the image from which defects by the lights' model are the model's fault: those by the median around them are taken."""
+
+DEFECT_WINDOW_PX = 7
+"""Width of the square of which that median is taken."""
 
 PEDESTAL = 0.03
 """Added to image and background before response fields take their ratio: where an LED does not reach, a ratio is all noise."""
@@ -50,6 +55,9 @@ class Calibration:
         response: the response fields, if they are the model; else None.
         markers: the block that fills printed markers before anything else, or None.
         ambient: (3,), constant linear light that the lights do not give, subtracted before the gain; None for none.
+    Raises:
+        ValueError: background, noise or ambient light of another shape, or not finite; a background without light; lights whose
+            image has nothing to do with the background.
     """
 
     sensor: Sensor
@@ -61,6 +69,28 @@ class Calibration:
     response: ResponseModel | None = None
     markers: FillMarkers | None = None
     ambient: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        check_field("background", self.background)
+        check_shape("background", self.background, (3, self.sensor.height, self.sensor.width), f"sensor '{self.sensor.name}'")
+        check_shape("noise_std", self.noise_std, (3,))
+        if not bool((torch.isfinite(self.noise_std) & (self.noise_std > 0)).all()):
+            raise ValueError(f"noise_std: expected finite values above 0, got {self.noise_std.tolist()}")
+        if self.lights is None and self.response is None:
+            raise ValueError("lights, response: expected one of them, got none: a calibration without a model")
+        if not self.measured:
+            return
+        if not bool((self.background > self.light_noise_std).any()):
+            raise ValueError(
+                f"background: expected light above the noise, got at most {float(self.background.max()):.3g}: black image, LEDs or "
+                "exposure off"
+            )
+        if self.lights is not None and float(self._far(self.model_image).double().mean()) > 0.5:
+            share = float(self._far(self.model_image).double().mean())
+            raise ValueError(
+                f"lights: expected those under which the background was taken, got lights whose image is a factor of "
+                f"{DEFECT_RATIO:g} off in {share:.0%} of it: another unit's, or their albedo is in other units"
+            )
 
     @classmethod
     def from_lights(
@@ -119,7 +149,7 @@ class Calibration:
             ValueError, TypeError: background of another shape or range.
         Example:
             >>> from torchvts.model.response_field import ResponseField
-            >>> field = ResponseField(0, -1, False, 10.0, ((0.3, 0, 0), (0, 0.3, 0)))
+            >>> field = ResponseField(0, -1, 10.0, ((0.3, 0, 0), (0, 0.3, 0)))
             >>> sensor = Sensor("rig", 48, 64, 0.5)
             >>> Calibration.from_response(ResponseModel(field, None), sensor, torch.full((3, 48, 64), 0.5)).sensor.blur_px
             1.0
@@ -233,16 +263,40 @@ class Calibration:
 
     @cached_property
     def defects(self) -> Tensor:
-        """(H, W) bool: pixels whose background is far from the model, or for a response field from the median around them."""
+        """(H, W) bool: pixels whose background is far from the lights' model, or for a response field from the median around them.
+
+        That median is taken for lights, too, where their model is far from more than a tenth of the image.
+        """
         if not self.measured:
             return torch.zeros(self.sensor.height, self.sensor.width, dtype=torch.bool)
-        expected, light, floor = self.model_image, self.background_without_ambient, 3.0 * self.light_noise_std
-        if self.lights is None:
-            expected = kornia.filters.median_blur(self.background[None], 7)[0]
-        # where both model and background are within the noise, nothing can be said
+        if self.lights is not None:
+            found = self._far(self.model_image)
+            if float(found.double().mean()) <= MODEL_AT_FAULT:
+                return found
+        return self._far(self._median_around())
+
+    def _far(self, expected: Tensor) -> Tensor:
+        """(H, W) bool: pixels whose background is far from what is expected, (3, H, W), in any channel."""
+        light, floor = self.background_without_ambient, 3.0 * self.light_noise_std
+        # where both are within the noise, nothing can be said
         far = (light * DEFECT_RATIO < expected) | (light > expected * DEFECT_RATIO)
         found: Tensor = (far & (torch.maximum(expected, light) > floor)).any(dim=0)
         return found
+
+    def _median_around(self) -> Tensor:
+        """(3, H, W): the background where the extremes around a pixel show that it is no defect; else the median around it."""
+        light, reach = self.background_without_ambient, DEFECT_WINDOW_PX // 2
+        pool = torch.nn.functional.max_pool2d
+        most = pool(light[None], DEFECT_WINDOW_PX, 1, reach)[0]
+        least = -pool(-light[None], DEFECT_WINDOW_PX, 1, reach)[0]
+        # the median lies between the extremes
+        channel, row, column = torch.nonzero((light * DEFECT_RATIO < most) | (light > least * DEFECT_RATIO), as_tuple=True)
+        padded = torch.nn.functional.pad(light[None], [reach] * 4, mode="replicate")[0]
+        steps = torch.arange(DEFECT_WINDOW_PX)
+        rows, columns = row[:, None, None] + steps[:, None], column[:, None, None] + steps
+        around = light.clone()
+        around[channel, row, column] = padded[channel[:, None, None], rows, columns].flatten(1).median(dim=1).values
+        return around
 
     @cached_property
     def light_noise_std(self) -> Tensor:

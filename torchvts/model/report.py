@@ -32,7 +32,8 @@ class CandidateRow(_CandidateKeys, total=False):
         parameters: number of fitted parameters.
         passes: 1 for normals from the image alone, 2 for normals that also use the depth of a first pass.
         score_deg: error or standard deviation that the choice used, degrees; None where none could be computed.
-        misfit: relative structure of the background that lights leave unexplained.
+        misfit: relative structure of the background that lights leave unexplained; absent where lights were not fitted, or the
+            fit failed.
         held_out: loss of lights on blocks of the background that were held out.
         gamma: camera response it was fitted with.
         vignetting: share of the light that the lens loses in the image corners.

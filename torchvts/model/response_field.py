@@ -1,4 +1,4 @@
-"""Response fields: slope of the skin as a polynomial in the change of intensity whose coefficients vary over the image."""
+"""Response fields: inclination of the skin as a polynomial in the change of intensity whose coefficients vary over the image."""
 
 import dataclasses
 import math
@@ -13,40 +13,40 @@ from ..core.checks import brief, check_integer, check_numbers, check_positive, f
 from ..core.geometry import pixel_grid_mm
 
 CHANGE_SCALE = 0.3
-"""Relative change of intensity that counts as one, so that the inputs are of order one like depth in mm."""
+"""Relative change of intensity that counts as one, so that the inputs are of order one."""
+
+MAX_SLOPE = 3.0
+"""Largest steepness that a field gives, mm per mm: polynomials run away outside of what they were fitted on."""
+
+MAX_SINE = MAX_SLOPE / math.sqrt(1.0 + MAX_SLOPE**2)
 
 
 @dataclass(frozen=True)
 class ResponseField:
-    r"""slope(x, y) = sum over terms of W_t(x, y) * term_t(change, depth).
+    r"""sine(x, y) = sum over terms of W_t(x, y) * term_t(change).
 
-    The inputs are the relative changes of R, G and B, image / background - 1, divided by :data:`CHANGE_SCALE`, and, if
-    ``uses_depth``, the depth of a first pass in mm and its slopes along x and y. The terms are the inputs and, if
-    ``product_degree`` is not -1, the products of two of changes and depth, except depth squared. No term is constant: the
-    undeformed skin has slope zero. Each W_t is a polynomial of total degree ``degree`` (products: ``product_degree``) in
-    x / half_mm and y / half_mm.
-
-    The slopes of the depth have less noise than those of a single pixel, because integration keeps only what is the slope of a
-    surface. The fit decides how much each of them counts.
+    The sine is slope / sqrt(1 + |slope|^2), the part of the unit normal that lies in the plane of the undeformed skin: the light
+    on a matt skin is linear in its normal, not in its slope. The inputs are the relative changes of R, G and B,
+    image / background - 1, divided by :data:`CHANGE_SCALE`. The terms are the inputs and, if ``product_degree`` is not -1, the
+    products of two of them. No term is constant: the undeformed skin has slope zero. Each W_t is a polynomial of total degree
+    ``degree`` (products: ``product_degree``) in x / half_mm and y / half_mm.
 
     Args:
         degree: of the linear terms, 0 to 6.
         product_degree: of the products, 0 to 6; -1 for no products.
-        uses_depth: depth and its slopes are inputs four to six.
         half_mm: scale of positions, mm: half the width of the field of view.
-        coefficient: 2 rows (dz/dx, dz/dy) of :meth:`size` numbers, term after term.
+        coefficient: 2 rows (along x, along y) of :meth:`size` numbers, term after term.
     Raises:
         ValueError, TypeError: names the argument.
     Source:
-        linear slope response: Johnson and Adelson, CVPR 2009, who tabulate it; as a polynomial field: this project.
+        linear slope response: Johnson and Adelson, CVPR 2009, who tabulate it; as a polynomial field for sines: this project.
     Example:
-        >>> ResponseField(0, -1, False, 10.0, ((1, 0, 0), (0, 1, 0))).size()
+        >>> ResponseField(0, -1, 10.0, ((1, 0, 0), (0, 1, 0))).size()
         3
     """
 
     degree: int
     product_degree: int
-    uses_depth: bool
     half_mm: float
     coefficient: tuple[tuple[float, ...], ...]
 
@@ -54,46 +54,44 @@ class ResponseField:
         for name, least in (("degree", 0), ("product_degree", -1)):
             if check_integer(name, getattr(self, name), least) > 6:
                 raise ValueError(f"{name}: expected at most 6, got {getattr(self, name)}")
-        if not isinstance(self.uses_depth, bool):
-            raise TypeError(f"uses_depth: expected true or false, got {brief(self.uses_depth)}")
         object.__setattr__(self, "half_mm", check_positive("half_mm", self.half_mm))
         numbers = check_numbers("coefficient", self.coefficient, (2, self.size()))
         object.__setattr__(self, "coefficient", (numbers[: self.size()], numbers[self.size() :]))
 
     def terms(self) -> list[tuple[int, ...]]:
-        """Terms as indices of their inputs: (0,) is the change of R, (0, 3) that change times depth, (4,) dz/dx of the depth."""
-        return field_terms(self.uses_depth, self.product_degree)
+        """Terms as indices of their inputs: (0,) is the change of R, (0, 2) that change times the change of B."""
+        return field_terms(self.product_degree)
 
     def size(self) -> int:
         """Number of coefficients of one slope."""
-        return len(term_degrees(self.degree, self.product_degree, self.uses_depth))
+        return len(term_degrees(self.degree, self.product_degree))
 
     def tensor(self) -> Tensor:
         """(2, size) float64."""
         return torch.tensor(self.coefficient, dtype=torch.float64)
 
     def maps(self, height: int, width: int, mm_per_pixel: float) -> Tensor:
-        """W at every pixel: (terms, 2, H, W) float64, for slopes in mm per mm."""
+        """W at every pixel: (terms, 2, H, W) float64."""
         x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
         x, y = x.expand(height, width), y.expand(height, width)
         weight, start = self.tensor(), 0
         maps = []
-        for degree in term_degrees_by_term(self.degree, self.product_degree, self.uses_depth).values():
+        for degree in term_degrees_by_term(self.degree, self.product_degree).values():
             basis = position_basis(x, y, self.half_mm, degree)
             maps.append(torch.tensordot(weight[:, start : start + len(basis)], basis, 1))
             start += len(basis)
         return torch.stack(maps)
 
-    def embedded(self, degree: int, product_degree: int, uses_depth: bool) -> "ResponseField":
+    def embedded(self, degree: int, product_degree: int) -> "ResponseField":
         """The same field as a member of a larger family; the new coefficients are zero.
 
         Raises:
             ValueError: the family is not larger.
         """
-        new = term_degrees_by_term(degree, product_degree, uses_depth)
-        old = term_degrees_by_term(self.degree, self.product_degree, self.uses_depth)
+        new = term_degrees_by_term(degree, product_degree)
+        old = term_degrees_by_term(self.degree, self.product_degree)
         if any(term not in new or new[term] < d for term, d in old.items()):
-            raise ValueError(f"degree, product_degree, uses_depth: expected a family that holds {old}, got {new}")
+            raise ValueError(f"degree, product_degree: expected a family that holds {old}, got {new}")
         rows: list[tuple[float, ...]] = []
         for row in self.coefficient:
             numbers = iter(row)
@@ -101,13 +99,11 @@ class ResponseField:
             rows.append(
                 tuple(known.get((term, i, j), 0.0) for term, d in new.items() for i in range(d + 1) for j in range(d + 1 - i))
             )
-        return ResponseField(degree, product_degree, uses_depth, self.half_mm, tuple(rows))
+        return ResponseField(degree, product_degree, self.half_mm, tuple(rows))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, to seven digits, which is more than presses determine."""
-        values = dataclasses.asdict(self)
-        values["coefficient"] = [[float(f"{number:.7g}") for number in row] for row in self.coefficient]
-        return values
+        return _plain(self)
 
     @classmethod
     def from_dict(cls, values: Any, source: str) -> "ResponseField":
@@ -116,28 +112,78 @@ class ResponseField:
 
 
 @dataclass(frozen=True)
-class ResponseModel:
-    """Response of a sensor: a field for one pass, one for a second pass with depth, and the preprocessing of images.
+class DepthBrightness:
+    """Relative change of brightness of a flat skin per mm of depth: it comes nearer to the lights.
 
     Args:
-        fast: field without depth.
-        precise: field that uses the depth by ``fast``, or None.
+        degree: in position, 0 to 2.
+        half_mm: scale of positions, mm.
+        coefficient: 3 rows (R, G, B) of coefficients of :func:`position_basis`, 1 / mm.
+    Raises:
+        ValueError, TypeError: names the argument.
+    Source:
+        what eq. 1 of the paper gives for a flat skin, with a free polynomial in place of its lights: this project.
+    Example:
+        >>> DepthBrightness(0, 10.0, ((0.1,), (0.0,), (0.0,))).maps(2, 2, 0.1)[:, 0, 0]
+        tensor([0.1000, 0.0000, 0.0000], dtype=torch.float64)
+    """
+
+    degree: int
+    half_mm: float
+    coefficient: tuple[tuple[float, ...], ...]
+
+    def __post_init__(self) -> None:
+        if check_integer("degree", self.degree, 0) > 2:
+            raise ValueError(f"degree: expected at most 2, got {self.degree}")
+        object.__setattr__(self, "half_mm", check_positive("half_mm", self.half_mm))
+        size = (self.degree + 1) * (self.degree + 2) // 2
+        numbers = check_numbers("coefficient", self.coefficient, (3, size))
+        object.__setattr__(self, "coefficient", tuple(numbers[k * size : (k + 1) * size] for k in range(3)))
+
+    def tensor(self) -> Tensor:
+        """(3, size) float64."""
+        return torch.tensor(self.coefficient, dtype=torch.float64)
+
+    def maps(self, height: int, width: int, mm_per_pixel: float) -> Tensor:
+        """The change at every pixel, (3, H, W) float64, 1 / mm."""
+        x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
+        basis = position_basis(x.expand(height, width), y.expand(height, width), self.half_mm, self.degree)
+        maps: Tensor = torch.tensordot(self.tensor(), basis, 1)
+        return maps
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, to seven digits."""
+        return _plain(self)
+
+    @classmethod
+    def from_dict(cls, values: Any, source: str) -> "DepthBrightness":
+        """Read the output of :meth:`to_dict`; ``source`` names it in errors."""
+        return from_dict(cls, values, source)
+
+
+@dataclass(frozen=True)
+class ResponseModel:
+    """Response of a sensor: a field, what depth alone does to brightness, and the preprocessing of images.
+
+    Args:
+        field: sine by brightness.
+        by_depth: subtracted from the change of brightness in a second pass, with the depth of the first; None if not known.
         gamma: of the images it was fitted to, value = light^(1/gamma).
         blur_px: standard deviation of the Gaussian blur it was fitted with, pixels of the calibrated size.
     Raises:
         ValueError, TypeError: names the argument.
     """
 
-    fast: ResponseField
-    precise: ResponseField | None
+    field: ResponseField
+    by_depth: DepthBrightness | None
     gamma: float = 1.0
     blur_px: float = 1.0
 
     def __post_init__(self) -> None:
-        if not isinstance(self.fast, ResponseField) or self.fast.uses_depth:
-            raise ValueError("fast: expected a field that does not use depth")
-        if self.precise is not None and not (isinstance(self.precise, ResponseField) and self.precise.uses_depth):
-            raise ValueError("precise: expected a field that uses depth")
+        if not isinstance(self.field, ResponseField):
+            raise TypeError(f"field: expected a ResponseField, got {brief(self.field)}")
+        if self.by_depth is not None and not isinstance(self.by_depth, DepthBrightness):
+            raise TypeError(f"by_depth: expected a DepthBrightness or None, got {brief(self.by_depth)}")
         object.__setattr__(self, "gamma", check_positive("gamma", self.gamma, 10.0))
         if self.blur_px != 0:
             check_positive("blur_px", self.blur_px)
@@ -146,12 +192,12 @@ class ResponseModel:
     @classmethod
     def zero(cls, gamma: float = 1.0, blur_px: float = 1.0) -> "ResponseModel":
         """A model whose slope is zero everywhere: for preprocessing before a model is fitted."""
-        return cls(ResponseField(0, -1, False, 1.0, ((0.0,) * 3, (0.0,) * 3)), None, gamma, blur_px)
+        return cls(ResponseField(0, -1, 1.0, ((0.0,) * 3, (0.0,) * 3)), None, gamma, blur_px)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers."""
-        precise = None if self.precise is None else self.precise.to_dict()
-        return {"gamma": self.gamma, "blur_px": self.blur_px, "fast": self.fast.to_dict(), "precise": precise}
+        by_depth = None if self.by_depth is None else self.by_depth.to_dict()
+        return {"gamma": self.gamma, "blur_px": self.blur_px, "field": self.field.to_dict(), "by_depth": by_depth}
 
     @classmethod
     def from_dict(cls, values: Any, source: str) -> "ResponseModel":
@@ -159,10 +205,29 @@ class ResponseModel:
         if not isinstance(values, dict):
             raise ValueError(f"{source}: expected keys and values, got {type(values).__name__}")
         values = dict(values)
-        for name in ("fast", "precise"):
-            if values.get(name) is not None:
-                values[name] = ResponseField.from_dict(values[name], f"{source}: {name}")
+        if values.get("field") is not None:
+            values["field"] = ResponseField.from_dict(values["field"], f"{source}: field")
+        if values.get("by_depth") is not None:
+            values["by_depth"] = DepthBrightness.from_dict(values["by_depth"], f"{source}: by_depth")
         return from_dict(cls, values, source)
+
+
+def _plain(field: ResponseField | DepthBrightness) -> dict[str, Any]:
+    values = dataclasses.asdict(field)
+    values["coefficient"] = [[float(f"{number:.7g}") for number in row] for row in field.coefficient]
+    return values
+
+
+def sine_from_slope(slope: Tensor) -> Tensor:
+    """slope / sqrt(1 + |slope|^2) of slopes (2, N)."""
+    return slope / (1.0 + slope.square().sum(0)).sqrt()
+
+
+def slope_from_sine(sine: Tensor) -> Tensor:
+    """The slopes of sines (2, N); a sine beyond that of :data:`MAX_SLOPE` counts as that: polynomials run away."""
+    length = sine.square().sum(0).sqrt().clamp_min(1e-12)
+    kept = sine * (MAX_SINE / length).clamp_max(1.0)
+    return kept / (1.0 - kept.square().sum(0)).sqrt()
 
 
 @dataclass(frozen=True)
@@ -227,22 +292,20 @@ def fit_log_background(background: Tensor, mm_per_pixel: float) -> tuple[tuple[f
     return tuple(tuple(float(v) for v in column) for column in solution.t())
 
 
-def field_terms(uses_depth: bool, product_degree: int) -> list[tuple[int, ...]]:
-    """Terms as indices of their inputs: all inputs, then products of two of changes and depth, except depth squared, which
-    explains nothing."""
-    single: list[tuple[int, ...]] = [(k,) for k in range(6 if uses_depth else 3)]
-    pairs = [pair for pair in combinations_with_replacement(range(4 if uses_depth else 3), 2) if pair != (3, 3)]
-    return single + (pairs if product_degree >= 0 else [])
+def field_terms(product_degree: int) -> list[tuple[int, ...]]:
+    """Terms as indices of their inputs: the three changes, then their products."""
+    single: list[tuple[int, ...]] = [(k,) for k in range(3)]
+    return single + (list(combinations_with_replacement(range(3), 2)) if product_degree >= 0 else [])
 
 
-def term_degrees_by_term(degree: int, product_degree: int, uses_depth: bool) -> dict[tuple[int, ...], int]:
+def term_degrees_by_term(degree: int, product_degree: int) -> dict[tuple[int, ...], int]:
     """Degree in position of every term, in order."""
-    return {term: degree if len(term) == 1 else product_degree for term in field_terms(uses_depth, product_degree)}
+    return {term: degree if len(term) == 1 else product_degree for term in field_terms(product_degree)}
 
 
-def term_degrees(degree: int, product_degree: int, uses_depth: bool) -> list[int]:
+def term_degrees(degree: int, product_degree: int) -> list[int]:
     """Total degree in position of every coefficient, in order."""
-    by_term = term_degrees_by_term(degree, product_degree, uses_depth)
+    by_term = term_degrees_by_term(degree, product_degree)
     return [i + j for d in by_term.values() for i in range(d + 1) for j in range(d + 1 - i)]
 
 
@@ -256,24 +319,21 @@ def position_basis(x: Tensor, y: Tensor, half_mm: float, degree: int) -> Tensor:
     return torch.stack([columns[i] * rows[j] for i in range(degree + 1) for j in range(degree + 1 - i)])
 
 
-def term_values(
-    change: Tensor, deep: Tensor | None, x: Tensor, y: Tensor, half_mm: float, degree: int, product_degree: int
-) -> Tensor:
+def term_values(change: Tensor, x: Tensor, y: Tensor, half_mm: float, degree: int, product_degree: int) -> Tensor:
     """Factor of every coefficient at N places: (size, N).
 
     Args:
         change: (3, N), image / background - 1.
-        deep: (3, N), depth in mm and its two slopes, for fields that use depth; else None.
         x: (N,), mm.
         y: (N,), mm.
         half_mm: scale of positions, mm.
         degree: of linear terms.
         product_degree: of products; -1 for none.
     """
-    inputs = [*(change / CHANGE_SCALE), *([] if deep is None else deep)]
+    inputs = change / CHANGE_SCALE
     bases = {d: position_basis(x, y, half_mm, d) for d in {degree, product_degree} if d >= 0}
     rows = []
-    for term in field_terms(deep is not None, product_degree):
+    for term in field_terms(product_degree):
         value = math.prod([inputs[k] for k in term[1:]], start=inputs[term[0]])
         rows.append(value * bases[degree if len(term) == 1 else product_degree])
     return torch.cat(rows)

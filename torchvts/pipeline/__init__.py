@@ -3,7 +3,7 @@
 from ..core.frame import DepthOutput
 from .confidence import Bounds, Confidence, ConfidentOutput, ConfidentPipeline, bound_at
 from .depth import MODES, DepthPipeline
-from .refine import Adaptive, Once, Repeat
+from .refine import Adaptive, Once, Repeat, SlopesOfDepth
 from .shadows import Shadows
 from .solve import Solve
 
@@ -19,6 +19,7 @@ __all__ = [
     "Once",
     "Repeat",
     "Shadows",
+    "SlopesOfDepth",
     "Solve",
     "bound_at",
 ]

@@ -2,7 +2,7 @@
 
 The bounds come from what is known before the frame (noise of the camera, conditioning of the inverse model, error of the model on
 held-out presses or of its fit) and from what the frame itself shows: its own noise, light that the model does not explain, slopes
-that are not integrable, dark or saturated channels, contact too faint for the mask. They do not cover what no frame shows: a wrong
+that are not integrable, dark or saturated channels, deformation too faint for the mask. They do not cover what no frame shows: a wrong
 pitch, a camera that is not orthographic, a calibration of another unit.
 """
 
@@ -72,7 +72,7 @@ MISFIT_SHARE = 3.0
 """Error of the light per unit of tilt, over the part of the background that fitted lights leave unexplained."""
 
 DETECTED_SIGMAS = 4.5
-"""A tilt of so many standard deviations of its noise is detected as contact: the threshold of :class:`ContactMask`."""
+"""A tilt of so many standard deviations of its noise is detected: the threshold of :class:`ContactMask`."""
 
 SYSTEM_SHARE = 0.5
 """Depth error by a response field, over that of slopes that are all off by one standard deviation in the same direction."""
@@ -81,7 +81,7 @@ KINK_PX = 0.08
 """Depth error of the grid where the surface has a kink, pixels, for a contact as steep as 45 degrees."""
 
 BAND = 0.15
-"""Width of the ring around the contact that is searched for contact that the mask missed, over the shorter side of the image."""
+"""Width of the ring around the deformed area that is searched for what the mask missed, over the shorter side of the image."""
 
 SPREAD_OF_MEAN = 1.2533
 """Mean length of a two-dimensional Gaussian error, over its standard deviation along one axis."""
@@ -113,6 +113,7 @@ class ConfidentOutput(NamedTuple):
     gradient: Tensor
     normal: Tensor
     contact: Tensor
+    deformed: Tensor
     normal_95_deg: Tensor
     depth_95_mm: Tensor
     confidence: Tensor
@@ -158,7 +159,7 @@ class Confidence(nn.Module):
     normal is followed. So conditioning is measured, not assumed. The model's error goes the same way, as light that is off: for
     point lights by how well calibration constrained each of them, for response fields by as much as gives the held-out angle.
     Added to this are the change that the next pass would bring, the part of the gradient that is not integrable, blur at edges,
-    and a fixed error where a channel is dark or saturated. Outside of the contact, where the normal is said to be flat, the
+    and a fixed error where a channel is dark or saturated. Outside of the deformed area, where the normal is said to be flat, the
     bound is the faintest tilt that the mask detects.
 
     Depth. White errors of slope grow with the logarithm of the contact's size; errors of the model add up along the way, which
@@ -265,7 +266,7 @@ class Confidence(nn.Module):
         if isinstance(block, NormalFromIntensity):
             return cls(block, noise, calibration.noise_std, _light_std_by_fit(calibration), sensor.mm_per_pixel, **common)
         model_deg = _model_deg(calibration)
-        slope_of_change = 0.5 * block.fast_maps[:3].square().sum(dim=(0, 1))  # a relative change of one, in every channel
+        slope_of_change = 0.5 * block.maps[:3].square().sum(dim=(0, 1))  # a relative change of one, in every channel
         usual = float(slope_of_change.median().sqrt().clamp_min(1e-6))
         light = torch.full_like(noise, MODEL_SHARE * math.radians(model_deg) / SPREAD_OF_MEAN / usual)
         common |= {"model_deg": model_deg, "spread": RESPONSE_SPREAD}
@@ -298,15 +299,16 @@ class Confidence(nn.Module):
         surface = self._not_integrable(out.depth_mm, out.gradient, steep, noise)
         variance = noise + model + clipped if self.by_lights else noise + model + surface
         bound = _length_95(change, torch.sqrt(variance + 1e-12), 1.0 if self.by_lights else 1.06)
-        bound = torch.where(out.contact, bound, self.detected * torch.sqrt(noise + 1e-12))
+        bound = torch.where(out.deformed, bound, self.detected * torch.sqrt(noise + 1e-12))
         normal_95 = torch.rad2deg(bound).clamp_max(180.0)
-        inside = out.contact.to(noise.dtype)
+        inside = out.deformed.to(noise.dtype)
         slopes = SlopeErrors(steep, noise + surface, model + clipped)
         depth_95 = self._depth_95(out.depth_mm, out.gradient, again, inside, slopes)
         # the inverse of bound_at
         likely = 1.0 - torch.exp(math.log(0.05) * (self.useful_deg / normal_95) ** (2.0 / self.spread))
-        count = inside.sum(dim=(1, 2, 3))
-        frame = torch.where(count > 0, (likely * inside).sum(dim=(1, 2, 3)) / count.clamp_min(1.0), torch.ones_like(count))
+        contact = out.contact.to(noise.dtype)
+        count = contact.sum(dim=(1, 2, 3))
+        frame = torch.where(count > 0, (likely * contact).sum(dim=(1, 2, 3)) / count.clamp_min(1.0), torch.ones_like(count))
         parts = torch.cat((noise.sqrt(), model.sqrt(), change, surface.sqrt(), clipped.sqrt()), dim=1)
         return Bounds(normal_95, depth_95, likely, frame, torch.rad2deg(parts))
 
@@ -322,9 +324,10 @@ class Confidence(nn.Module):
             check_batch(name, tensor, channels)
             check_same_size(name, tensor, "the calibration", height, width)
         if not torch.jit.is_scripting():
-            check_tensor("contact", out.contact)
-        if out.contact.dtype != torch.bool or out.contact.shape != out.depth_mm.shape:
-            raise ValueError(f"contact: expected bool like depth_mm, got {out.contact.shape} {out.contact.dtype}")
+            check_tensor("contact", out.contact), check_tensor("deformed", out.deformed)
+        for name, mask in (("contact", out.contact), ("deformed", out.deformed)):
+            if mask.dtype != torch.bool or mask.shape != out.depth_mm.shape:
+                raise ValueError(f"{name}: expected bool like depth_mm, got {mask.shape} {mask.dtype}")
 
     def _unexplained(self, compensated: Tensor, depth_mm: Tensor, normal: Tensor, dark: Tensor, sigma: Tensor) -> Tensor:
         """Factor by which light that no normal explains exceeds the noise, at least 1: (B, 1, H, W).
@@ -368,7 +371,7 @@ class Confidence(nn.Module):
 
     def _depth_95(self, depth_mm: Tensor, gradient: Tensor, again: Tensor, inside: Tensor, errors: SlopeErrors) -> Tensor:
         steep = errors.steep
-        # the next pass inside the contact, and around it what the mask has missed, smoothed
+        # the next pass inside the deformed area, and around it what the mask has missed, smoothed
         beyond = 1.0 - inside
         better = self.gradient(again)
         around = _smooth(better * beyond) / _smooth(beyond).clamp_min(0.04) * _grown(inside, self.band)
@@ -399,7 +402,7 @@ class ConfidentPipeline(nn.Module):
         >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
         >>> cal = Calibration.from_lights(lights, Sensor("rig", 48, 64, 0.5))
         >>> pipe = ConfidentPipeline(DepthPipeline.from_calibration(cal), Confidence.from_calibration(cal))
-        >>> pipe(cal.model_image[None])._fields[4:]
+        >>> pipe(cal.model_image[None])._fields[5:]
         ('normal_95_deg', 'depth_95_mm', 'confidence', 'frame_confidence', 'factors_deg')
     """
 
@@ -431,6 +434,7 @@ class ConfidentPipeline(nn.Module):
             out.gradient,
             out.normal,
             out.contact,
+            out.deformed,
             bounds.normal_95_deg,
             bounds.depth_95_mm,
             bounds.confidence,

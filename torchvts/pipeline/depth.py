@@ -18,6 +18,7 @@ from ..accelerated import (
     scriptable,
 )
 from ..compensate import Compensate as PlainCompensate
+from ..contact import ContactFromDepth
 from ..contact import ContactMask as PlainContactMask
 from ..core.checks import (
     check_batch,
@@ -29,13 +30,13 @@ from ..core.checks import (
     check_record,
     may_read_values,
 )
-from ..core.frame import DepthOutput, undeformed_output
-from ..integration import WrappedIntegrator, as_integrator
+from ..core.frame import DepthOutput, Solution, depth_in_window, undeformed_output
+from ..integration import WrappedIntegrator, ZeroBackground, as_integrator
 from ..model import Calibration, Sensor, check_calibration
 from ..normals import NormalFromIntensity as PlainNormalFromIntensity
 from ..normals import NormalFromResponse, WrappedNormals, as_normal_model, check_domain
 from .gs_sdk import gs_sdk_blocks
-from .refine import Adaptive, Once, Repeat
+from .refine import Adaptive, Once, Repeat, SlopesOfDepth
 from .shadows import Shadows
 from .solve import Solve
 
@@ -46,16 +47,17 @@ STRIDE = 8
 
 
 class DepthPipeline(nn.Module):
-    """Images (B, 3, H, W) to a :class:`DepthOutput`: compensate, contact, crop, solve, refine, uncrop.
+    """Images (B, 3, H, W) to a :class:`DepthOutput`: compensate, deformed, crop, solve, refine, zero, contact, uncrop.
 
     ``fast`` solves once (eq. 9). ``precise`` solves again with the depth found (eq. 10), until what is still missing falls below
-    ``tolerance_px``. ``auto`` skips frames without contact, predicts on every eighth pixel what a second pass would change, and
-    solves only those frames again for which that exceeds ``refine_threshold_px``, until what is missing is below a fifth of it.
+    ``tolerance_px``; for response fields gradient and normals are then those of the depth. ``auto`` skips frames without deformed
+    skin, predicts on every eighth pixel what a second pass would change, and solves only those frames again for which that exceeds
+    ``refine_threshold_px``, until what is missing is below a fifth of it.
     Frames of a batch do not influence one another.
 
     Args:
         compensate: camera image to compensated image.
-        contact: compensated image to contact, bool (B, 1, H, W).
+        deformed: compensated image to where the skin has moved, bool (B, 1, H, W).
         normals: a :class:`~torchvts.normals.NormalModel`, or any module from a compensated image (B, 3, H, W) to normals (B, 3,
             H, W).
         gradient: normals to gradient.
@@ -65,6 +67,7 @@ class DepthPipeline(nn.Module):
         tolerance_px: pixels of pitch.
         refine_threshold_px: pixels of pitch.
         max_passes: bound on all passes.
+        contact: depth, gradient and deformed area to contact, bool (B, 1, H, W); None for :class:`ContactFromDepth`.
     Source:
         figure 2 and eq. 3-10 of the paper; "auto" and the stopping rule are this project's.
     """
@@ -74,7 +77,7 @@ class DepthPipeline(nn.Module):
     def __init__(
         self,
         compensate: nn.Module,
-        contact: nn.Module,
+        deformed: nn.Module,
         normals: nn.Module,
         gradient: nn.Module,
         integrate: nn.Module,
@@ -84,16 +87,17 @@ class DepthPipeline(nn.Module):
         tolerance_px: float = 0.002,
         refine_threshold_px: float = 0.05,
         max_passes: int = 8,
+        contact: nn.Module | None = None,
     ) -> None:
         super().__init__()
         check_choice("mode", mode, MODES)
-        for name, block in (("compensate", compensate), ("contact", contact), ("gradient", gradient)):
+        for name, block in (("compensate", compensate), ("deformed", deformed), ("gradient", gradient)):
             check_record(name, block, nn.Module)
         model, integrator = as_normal_model(normals), as_integrator(integrate)
         check_domain(model, compensate.output_domain if isinstance(compensate, PlainCompensate) else None)
         check_positive("mm_per_pixel", mm_per_pixel), check_positive("tolerance_px", tolerance_px)
         check_least("refine_threshold_px", refine_threshold_px), check_integer("max_passes", max_passes, 1)
-        if mode == "precise" and not model.uses_depth:
+        if mode == "precise" and not (model.uses_depth or model.normals_from_depth):
             raise ValueError(
                 f"mode: 'precise' hands the depth back to the normals, but {type(normals).__name__} does not take it: "
                 "use 'fast', or make it a NormalModel with uses_depth = True"
@@ -102,17 +106,21 @@ class DepthPipeline(nn.Module):
         self.mm_per_pixel = mm_per_pixel
         self.skips_undeformed = mode == "auto"
         self.compensate = compensate
-        self.contact = contact
+        self.deformed = deformed
         self.crop = Crop(STRIDE, model.takes_window)
         self.solve = Solve(model, gradient, integrator)
         self.refine = self._policy(mode, tolerance_px, refine_threshold_px, min(max_passes, model.max_passes))
+        self.zero = ZeroBackground()
+        self.contact = ContactFromDepth(mm_per_pixel) if contact is None else contact
         self.uncrop = Uncrop()
 
     def _policy(self, mode: str, tolerance_px: float, refine_threshold_px: float, max_passes: int) -> nn.Module:
-        """The refinement of a mode: Once, Repeat, Adaptive, or for lights Shadows around one of the latter."""
+        """The refinement of a mode: Once, Repeat, Adaptive; around it for lights Shadows, for response fields SlopesOfDepth."""
         model, pitch = self.solve.normals, self.mm_per_pixel
-        if mode == "fast" or not model.uses_depth:
+        if mode == "fast" or not (model.uses_depth or model.normals_from_depth):
             return Once()
+        if not model.uses_depth:
+            return SlopesOfDepth(Once(), pitch)
         coarse = model.coarse(STRIDE) if mode == "auto" and model.takes_window else None
         if mode == "auto":
             tolerance_px = max(tolerance_px, 0.2 * refine_threshold_px)
@@ -121,10 +129,12 @@ class DepthPipeline(nn.Module):
         else:
             grid = (coarse, PoissonBackground(STRIDE * pitch), pitch)
             policy = Adaptive(self.solve, LargestChange(), *grid, tolerance_px, max_passes, refine_threshold_px, STRIDE)
+        if model.normals_from_depth:
+            return SlopesOfDepth(policy, pitch)
         if not isinstance(model, PlainNormalFromIntensity):
             return policy
-        contact = self.contact if isinstance(self.contact, PlainContactMask) else None
-        return Shadows(policy, contact, PoissonBackground(pitch), pitch)
+        deformed = self.deformed if isinstance(self.deformed, PlainContactMask) else None
+        return Shadows(policy, deformed, PoissonBackground(pitch), pitch)
 
     @classmethod
     def from_calibration(
@@ -190,12 +200,14 @@ class DepthPipeline(nn.Module):
         """
         check_images(images)
         compensated = self.compensate(images)
-        frame = self.crop(compensated, self.contact(compensated))
-        if may_read_values() and (images.shape[0] == 0 or (self.skips_undeformed and not bool(frame.contact.any()))):
+        frame = self.crop(compensated, self.deformed(compensated))
+        if may_read_values() and (images.shape[0] == 0 or (self.skips_undeformed and not bool(frame.deformed.any()))):
             return undeformed_output(frame)
         solution = self.solve(frame)  # eq. 9, 5, 4
         frame, solution = self.refine(frame, solution)  # eq. 10
-        out: DepthOutput = self.uncrop(frame, solution)
+        solution = Solution(solution.gradient, self.zero(solution.depth_mm, frame.deformed))
+        contact = self.contact(depth_in_window(frame, solution.depth_mm), solution.gradient, frame.mask)
+        out: DepthOutput = self.uncrop(frame, solution, contact)
         return out
 
     __jit_unused_properties__: ClassVar[list[str]] = ["gradient", "integrate", "normals"]

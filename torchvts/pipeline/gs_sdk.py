@@ -5,16 +5,14 @@ from pathlib import Path
 from torch import Tensor, nn
 
 from ..accelerated import Compensate, ContactMask, GradientFromNormal, PoissonBackground
-from ..contact.masks import LIGHT_DRIFT
 from ..core.checks import check_image
 from ..core.noise import noise_std
 from ..model import Sensor
-from ..model.calibration import PEDESTAL
 from ..normals import NormalFromMLP
 
 
 def gs_sdk_blocks(weights: str | Path, background: Tensor, sensor: Sensor) -> tuple[nn.Module, ...]:
-    """Compensation, contact, normals, gradient and integrator of a network, on camera images as it was trained on.
+    """Compensation, deformed area, normals, gradient and integrator of a network, on camera images as it was trained on.
 
     Args:
         weights: ``nnmodel.pth``, or a file of ``NormalFromMLP.save``.
@@ -29,6 +27,5 @@ def gs_sdk_blocks(weights: str | Path, background: Tensor, sensor: Sensor) -> tu
     compensate = Compensate(blur_px=network.blur_px)
     flat = compensate(background[None])[0].clamp(0.0, 1.0)
     network.set_flat(flat)
-    noise = 2.0**0.5 * noise_std(background[None])[0].reshape(3, 1, 1)  # of the frame and of the background
-    noise = noise.maximum(LIGHT_DRIFT * (flat + PEDESTAL))  # as with response fields
+    noise = 2.0**0.5 * noise_std(background[None])[0]  # of the frame and of the background
     return compensate, ContactMask(flat, noise), network, GradientFromNormal(), PoissonBackground(sensor.mm_per_pixel)

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from ..core.frame import Frame, Solution, as_factor, depth_in_window
+from ..core.geometry import gradient_of_depth
 from ..integration import Integrator
 from ..normals import NormalModel
 from .solve import Solve
@@ -97,6 +98,25 @@ class Repeat(nn.Module):
         return Solution(state[1], state[2])
 
 
+class SlopesOfDepth(nn.Module):
+    """A policy, and then the gradient of the depth in place of that of single pixels: it is the slope of a surface.
+
+    Args:
+        policy: a refinement.
+        mm_per_pixel: pixel pitch, mm.
+    """
+
+    def __init__(self, policy: nn.Module, mm_per_pixel: float) -> None:
+        super().__init__()
+        self.policy = policy
+        self.mm_per_pixel = mm_per_pixel
+
+    def forward(self, frame: Frame, solution: Solution) -> tuple[Frame, Solution]:
+        frame, solution = self.policy(frame, solution)
+        gradient = gradient_of_depth(depth_in_window(frame, solution.depth_mm), self.mm_per_pixel)
+        return frame, Solution(gradient * as_factor(frame.mask, gradient), solution.depth_mm)
+
+
 class Adaptive(Repeat):
     """Solve again only frames for which a second pass is predicted to change the depth by more than a threshold.
 
@@ -166,7 +186,7 @@ def still_missing_px(change_px: Tensor, last_px: Tensor) -> Tensor:
 def _some_frames(frame: Frame, index: Tensor, every: bool) -> Frame:
     if every:
         return frame
-    return Frame(frame.compensated[index], frame.contact[index], frame.image[index], frame.mask[index], frame.window, frame.size)
+    return Frame(frame.compensated[index], frame.deformed[index], frame.image[index], frame.mask[index], frame.window, frame.size)
 
 
 def _some(frames: Tensor, index: Tensor, every: bool) -> Tensor:

@@ -1,6 +1,6 @@
 """Dark pixels: a dark channel may be an attached shadow, a cast shadow or dirt; what leaves the most integrable surface decides.
 
-A frame enters this room only where a light that shines on the flat skin is dark inside the contact, and only for units that are
+A frame enters this room only where a light that shines on the flat skin is dark inside the deformed area, and only for units that are
 calibrated by lights.
 """
 
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from ..contact import ContactMask
 from ..core.checks import may_read_values
-from ..core.frame import Frame, Solution, as_factor, depth_in_window, with_contact
+from ..core.frame import Frame, Solution, as_factor, depth_in_window, with_deformed
 from ..core.geometry import slope_of_depth
 from ..integration import Integrator
 from .refine import Repeat
@@ -35,7 +35,7 @@ class Shadows(nn.Module):
 
     Args:
         policy: how often frames are solved again.
-        contact: the contact mask of the pipeline; None: no pixel is taken for undeformed skin.
+        deformed: the block of the pipeline that finds the deformed skin; None: no pixel is taken for undeformed skin.
         residual_integrator: a solver that cuts no edges; one that does would make a surface of any slopes.
         mm_per_pixel: pixel pitch, mm.
         rounds: how often pixels are classified again beside those that were accepted.
@@ -45,11 +45,11 @@ class Shadows(nn.Module):
     """
 
     def __init__(
-        self, policy: Repeat, contact: ContactMask | None, residual_integrator: Integrator, mm_per_pixel: float, rounds: int = 3
+        self, policy: Repeat, deformed: ContactMask | None, residual_integrator: Integrator, mm_per_pixel: float, rounds: int = 3
     ) -> None:
         super().__init__()
         self.policy = policy
-        self.contact = contact
+        self.deformed = deformed
         self.residual_integrator = residual_integrator
         self.mm_per_pixel = mm_per_pixel
         self.rounds = rounds
@@ -71,12 +71,12 @@ class Shadows(nn.Module):
         """Dark pixels as undeformed skin, or as pixels whose dark channels are left out, where that improves integrability.
 
         Returns:
-            The frame with its image and contact changed accordingly; where dark still means a slope that faces away; the solution.
+            The frame with its image and deformed area changed accordingly; where dark still means a slope that faces away; the solution.
         """
         (top, left), normals = frame.window, self.policy.solve.normals
         shadowed = torch.zeros_like(blocked)
-        if self.contact is not None:
-            found: Tensor = self.contact.shadowed(frame.compensated)
+        if self.deformed is not None:
+            found: Tensor = self.deformed.shadowed(frame.compensated)
             shadowed = found[:, :, top : top + blocked.shape[2], left : left + blocked.shape[3]] & blocked
         flat = self.accept(frame, solution.gradient, torch.zeros_like(solution.gradient), shadowed, has_shadow)
         blocked = blocked & ~flat.where
@@ -87,7 +87,7 @@ class Shadows(nn.Module):
             nn.functional.max_pool2d(as_factor(~frame.mask, frame.image), 3, 1, 1) > 0.0
         )  # walls of a pixel make no surface either
         cut = self.accept(frame, flat.gradient, other, blocked & ~rim, has_shadow)
-        frame = with_contact(frame, torch.where(cut.where, without, frame.image), frame.mask & ~flat.where)
+        frame = with_deformed(frame, torch.where(cut.where, without, frame.image), frame.mask & ~flat.where)
         return frame, blocked & ~cut.where, self.policy.solve.integrated(frame, cut.gradient)
 
     def restart_from_lit_neighbours(self, frame: Frame, blocked: Tensor, solution: Solution, has_shadow: Tensor) -> Solution:

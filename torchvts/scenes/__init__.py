@@ -4,6 +4,7 @@ from . import objects
 from .camera import render, skin_spots
 from .letters import distance_to_segments, letter_segments
 from .presses import cone_press, cylinder_press, letters_press, punch_press, sine_press, sphere_press
+from .skin import hanging_skin
 from .surfaces import Scene, smooth_step, surface, surface_at, undeformed
 
 __all__ = [
@@ -11,6 +12,7 @@ __all__ = [
     "cone_press",
     "cylinder_press",
     "distance_to_segments",
+    "hanging_skin",
     "letter_segments",
     "letters_press",
     "objects",

@@ -264,6 +264,29 @@ def cylinder(radius_mm: float = 6.0) -> Height:
     return height
 
 
+def capsule(radius_mm: float = 1.0, length_mm: float = 4.0) -> Height:
+    """A cylinder with round ends, lying along u; ``length_mm`` is between the centers of its ends."""
+    check_positive("radius_mm", radius_mm), check_positive("length_mm", length_mm)
+
+    def height(u: Tensor, v: Tensor) -> Tensor:
+        beyond = (u.abs() - 0.5 * length_mm).clamp_min(0.0)
+        return torch.sqrt((radius_mm**2 - beyond**2 - v**2).clamp_min(0.05 * radius_mm**2)) - radius_mm
+
+    return height
+
+
+def prism(slope: float = 0.4, length_mm: float = 6.0) -> Height:
+    """A roof: a ridge along u, flat faces of constant slope on both sides, ends at the same slope."""
+    check_positive("slope", slope), check_positive("length_mm", length_mm)
+
+    def height(u: Tensor, v: Tensor) -> Tensor:
+        beyond = (u.abs() - 0.5 * length_mm).clamp_min(0.0)
+        ridge = 0.1  # the radius of the edge, mm: no tool is sharper
+        return slope * (ridge - torch.sqrt(v**2 + beyond**2 + ridge**2))
+
+    return height
+
+
 def plane() -> Height:
     """An endless plane: it touches only where it is tilted."""
 

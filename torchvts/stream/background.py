@@ -254,7 +254,7 @@ def calibrate_unit(
     slope = -torch.linalg.pinv(lights[:, :2] / lights[:, 2:]) * CHANGE_SCALE
     rows = tuple(tuple(row) for row in slope.tolist())
     half_mm = 0.5 * sensor.width * sensor.mm_per_pixel
-    model = ResponseModel(ResponseField(0, -1, False, half_mm, rows), None, sensor.exponent, max(1.0, sensor.blur_px))
+    model = ResponseModel(ResponseField(0, -1, half_mm, rows), None, sensor.exponent, max(1.0, sensor.blur_px))
     misfit = report["candidates"][0]["misfit"]
     reason = f"directions of the sensor file's lights; as point lights they miss the background by {misfit:.0%}"
     stand_in = {"model": "response", "source": "stand_in", "reason": reason, "candidates": report["candidates"]}

@@ -79,21 +79,21 @@ class FollowLight:
         level, tilt_x, tilt_y = (self.plane[:, k, None, None].to(image.dtype) for k in range(3))
         return (image / (level + tilt_x * self._x + tilt_y * self._y)).clamp_(0.0, 1.0)
 
-    def update(self, image: Tensor, contact: Tensor, seconds: float) -> str:
+    def update(self, image: Tensor, deformed: Tensor, seconds: float) -> str:
         """Learn from a frame.
 
         Args:
             image: (1, 3, H, W), as the camera gave it.
-            contact: (1, 1, H, W), its contact.
+            deformed: (1, 1, H, W), where its skin has moved.
             seconds: time since the last frame.
         Returns:
             The state.
         """
         self._check(image)
-        check_shape("contact", contact, (1, 1, *self.size), "image")
+        check_shape("deformed", deformed, (1, 1, *self.size), "image")
         check_least("seconds", seconds, -np.inf)
         cells, difference = self._difference(image)
-        pressed = nn.functional.max_pool2d(contact.float(), self.cell)
+        pressed = nn.functional.max_pool2d(deformed.float(), self.cell)
         near = nn.functional.max_pool2d(pressed, 3, 1, 1)[0, 0] > 0
         usable = self._usable & (cells < 0.97)
         before = self.state

@@ -60,7 +60,7 @@ class StageClock:
     def watch(self, pipe: DepthPipeline) -> list[Any]:
         """Measure the blocks of a pipeline; returns handles whose ``remove()`` ends it."""
         handles: list[Any] = []
-        for name in ("compensate", "contact", "normals", "gradient", "integrate"):
+        for name in ("compensate", "deformed", "normals", "gradient", "integrate", "contact"):
             block = getattr(pipe, name)
 
             def before(_module: nn.Module, _inputs: Any, name: str = name) -> None:

@@ -58,11 +58,11 @@ class Recording:
         self._fps, self._follow, self._stage = fps, follow, stage
         self._before: float | None = None
         image, noise = (None, None) if first is None else find_background(first)
-        self.pipe.contact = contact_in_video(calibration, noise)
+        self.pipe.deformed = contact_in_video(calibration, noise)
         if image is not None:
             self._start(calibration, image[None])
         self._deformed: Tensor | None = None
-        self.pipe.contact.register_forward_hook(self._keep)
+        self.pipe.deformed.register_forward_hook(self._keep)
 
     def unusable(self, frame: Tensor) -> str:
         """Why a frame (1, 3, H, W), rectified, cannot be used; an empty text where it can."""
@@ -85,7 +85,7 @@ class Recording:
             if solve:
                 output = self.pipe(image)
             elif self._follow:
-                self.pipe.contact(self.pipe.compensate(image))
+                self.pipe.deformed(self.pipe.compensate(image))
             if self._follow and self._deformed is not None:
                 with self._stage("light"):
                     seconds = 1.0 / self._fps if self._before is None else time_s - self._before
@@ -107,10 +107,10 @@ class Recording:
             )
         corrected = light.correct(image)
         with torch.inference_mode():
-            contact = self.pipe.contact(self.pipe.compensate(corrected))
-        if bool(contact.any()):
+            deformed = self.pipe.deformed(self.pipe.compensate(corrected))
+        if bool(deformed.any()):
             raise ValueError(
-                f"background: the first frames show contact on {float(contact.float().mean()):.1%} of the skin against the "
+                f"background: the first frames show contact on {float(deformed.float().mean()):.1%} of the skin against the "
                 "calibration's background: start without contact, or calibrate again if the skin has changed"
             )
         light.set_background(corrected)

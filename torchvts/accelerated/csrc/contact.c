@@ -39,6 +39,18 @@ static float median(float *values, int n) {
     return kth_smallest(values, n, (n - 1) / 2);
 }
 
+/* Standard deviation of the values within three standard deviations. */
+static float clipped_std(const float *values, int n, float std) {
+    float total = 0.0f;
+    int count = 0;
+    for (int k = 0; k < n; k++)
+        if (values[k] <= 3.0f * std) {
+            total += values[k] * values[k];
+            count++;
+        }
+    return sqrtf(total / (float)(count > 0 ? count : 1) / 0.97334f);
+}
+
 /* noise_std() of torchvts/core/noise.py, of one channel's change: image * per_noise + offset. */
 static float noise_of(const float *image, const float *offset, const float *per_noise, int height, int width, int stride, float *some) {
     int n = 0;
@@ -49,24 +61,29 @@ static float noise_of(const float *image, const float *offset, const float *per_
             some[n] = fabsf(middle - 0.5f * (left + right));
         }
     float std = 1.5f * median(some, n) / 0.6745f;
-    for (int pass = 0; pass < 2 && std == std; pass++) {
-        float total = 0.0f;
-        int count = 0;
-        for (int k = 0; k < n; k++)
-            if (some[k] <= 3.0f * std) {
-                total += some[k] * some[k];
-                count++;
-            }
-        std = sqrtf(total / (float)(count > 0 ? count : 1) / 0.97334f);
-    }
+    for (int pass = 0; pass < 2 && std == std; pass++) std = clipped_std(some, n, std);
     return std / sqrtf(1.5f);
 }
 
+/* far_field() of torchvts/contact/masks.py, of one channel's change. */
+static float far_field_of(const float *image, const float *offset, const float *per_noise, int height, int width, int stride, float *some) {
+    int n = 0;
+    for (int y = stride / 2; y < height; y += stride)
+        for (int x = stride / 2; x < width; x += stride, n++) {
+            const size_t i = (size_t)y * width + x;
+            some[n] = fabsf(offset[i] + image[i] * per_noise[i]);
+            if (!(some[n] <= FLT_MAX)) return NAN;
+        }
+    float std = kth_smallest(some, n, n / 4) / 0.3186f;
+    for (int pass = 0; pass < 2; pass++) std = clipped_std(some, n, std);
+    return std;
+}
+
 /* One row of one channel: its change is added to `sums`, its square to `squared`. */
-WIDE static void add_change(const float *restrict image, const float *restrict offset, const float *restrict per_noise, int width,
+WIDE static void add_change(const float *restrict image, const float *restrict offset, const float *restrict per_noise, float scale, int width,
                             float *restrict sums, float *restrict squared) {
     for (int x = 0; x < width; x++) {
-        float change = offset[x] + image[x] * per_noise[x];
+        float change = (offset[x] + image[x] * per_noise[x]) * scale;
         sums[x] += change;
         squared[x] += change * change;
     }
@@ -154,12 +171,12 @@ typedef struct {
 /* The grid of coarse cells: their number, side, and how the model of ContactMask looks at them. */
 typedef struct {
     int rows, columns, cell, reach;
-    float sigmas, least_cells;
+    float least_cells;
 } Grid;
 
 /* Pixels whose change stands out, closed, and each cell's share of them and mean change; where the size is no multiple of the cell's
    side, the last cells overlap others. */
-static void find_strong(const float *frame, const float *offset, const float *per_noise, const int works[3], int height, int width,
+static void find_strong(const float *frame, const float *offset, const float *per_noise, const float scale[3], int height, int width,
                         float threshold, Grid grid, Scratch at, uint8_t *strong) {
     const size_t pixels = (size_t)height * width, cells = (size_t)grid.rows * grid.columns;
     const int cell = grid.cell;
@@ -171,8 +188,8 @@ static void find_strong(const float *frame, const float *offset, const float *pe
             const size_t row = (size_t)y * width;
             memset(at.squared, 0, sizeof(float) * (size_t)width);
             for (int c = 0; c < 3; c++)
-                if (works[c])
-                    add_change(frame + pixels * c + row, offset + pixels * c + row, per_noise + pixels * c + row, width,
+                if (scale[c] != 0.0f)
+                    add_change(frame + pixels * c + row, offset + pixels * c + row, per_noise + pixels * c + row, scale[c], width,
                                at.sums + (size_t)c * width, at.squared);
             above(at.squared, threshold, width, strong + row);
         }
@@ -201,11 +218,11 @@ static void find_strong(const float *frame, const float *offset, const float *pe
 
 /* Cells with strong pixels, and faint ones, whose mean change stands out of the frame's own spread of such means. Holes are what
    then bears no OUTSIDE. The state has a border of one cell. Returns whether there is any cell. */
-static int find_cells(Grid grid, float threshold, Scratch at) {
+static int find_cells(Grid grid, Scratch at) {
     const size_t cells = (size_t)grid.rows * grid.columns;
     const int rows = grid.rows, columns = grid.columns, wide = columns + 2;
     const int longer = rows > columns ? rows : columns, step = longer < 80 ? 1 : longer / 40;
-    const float least_std = sqrtf(threshold) / (grid.sigmas * (float)grid.cell);
+    const float least_std = 1.0f / (float)grid.cell;
     float per[3];
     for (int c = 0; c < 3; c++) {
         int n = 0;
@@ -303,10 +320,10 @@ static void to_pixels(Grid grid, Scratch at, int height, int width, uint8_t *str
  * image (frames, 3, height, width), with offset and per_noise (3, height, width): change = image * per_noise + offset. Writes mask and
  * inner, bytes (frames, height, width); inner is where cells decide, not pixels. Returns 0, or 1 where memory is short.
  */
-EXPORT int contact_mask(const float *image, const float *offset, const float *per_noise, const float *failed_below, int frames, int height,
-                        int width, int step, int stride, int cell, int reach, float sigmas, float rounding, float least_cells,
-                        uint8_t *mask, uint8_t *inner) {
-    const Grid grid = {(height + cell - 1) / cell, (width + cell - 1) / cell, cell, reach, sigmas, least_cells};
+EXPORT int contact_mask(const float *image, const float *offset, const float *per_noise, const float *failed_below,
+                        const float *most_far_field, int frames, int height, int width, int step, int stride, int cell, int reach,
+                        float sigmas, float rounding, float least_cells, uint8_t *mask, uint8_t *inner) {
+    const Grid grid = {(height + cell - 1) / cell, (width + cell - 1) / cell, cell, reach, least_cells};
     const size_t pixels = (size_t)height * width, cells = (size_t)grid.rows * grid.columns;
     const size_t ringed = (size_t)(grid.rows + 2) * (grid.columns + 2);
     const size_t samples = (size_t)((height + stride - 1) / stride) * ((width + stride - 1) / stride);
@@ -326,15 +343,19 @@ EXPORT int contact_mask(const float *image, const float *offset, const float *pe
         const float *frame = image + 3 * pixels * b;
         int works[3];
         working_leds(frame, failed_below, height, width, step, works);
-        float noise = 1.0f;
+        float scale[3] = {0.0f, 0.0f, 0.0f};
         for (int c = 0; c < 3; c++)
             if (works[c]) {
-                const float found = noise_of(frame + pixels * c, offset + pixels * c, per_noise + pixels * c, height, width, stride, at.some);
-                if (!(found <= noise)) noise = found;
+                const float *image_c = frame + pixels * c, *offset_c = offset + pixels * c, *per_noise_c = per_noise + pixels * c;
+                float noise = noise_of(image_c, offset_c, per_noise_c, height, width, stride, at.some);
+                float far = far_field_of(image_c, offset_c, per_noise_c, height, width, stride, at.some);
+                if (far > most_far_field[c]) far = most_far_field[c];
+                if (!(far <= noise)) noise = far;
+                if (noise < 1.0f) noise = 1.0f;
+                scale[c] = 1.0f / sqrtf(noise * noise + rounding);
             }
-        const float threshold = sigmas * sigmas * (noise * noise + rounding);
-        find_strong(frame, offset, per_noise, works, height, width, threshold, grid, at, mask + pixels * b);
-        if (find_cells(grid, threshold, at)) {
+        find_strong(frame, offset, per_noise, scale, height, width, sigmas * sigmas, grid, at, mask + pixels * b);
+        if (find_cells(grid, at)) {
             keep_large(grid, at);
             to_pixels(grid, at, height, width, mask + pixels * b, inner + pixels * b);
         } else {

@@ -1,0 +1,124 @@
+"""Sensors drawn at random: the truth is a surface that hangs free around its contact, and a seed gives the same sensor again."""
+
+import math
+
+import pytest
+import torch
+
+from torchvts import DepthPipeline, Sensor, poisson_background
+from torchvts.calibration import by_presses
+from torchvts.evaluation import drawn_sensors
+from torchvts.evaluation.drawn_sensors import OBJECTS, drawn_sensor
+from torchvts.evaluation.metrics import normal_angle_deg
+from torchvts.scenes import hanging_skin, objects
+
+
+@pytest.fixture(scope="module")
+def unit():
+    return drawn_sensor(3)
+
+
+def test_free_skin_falls_exponentially_beside_a_straight_edge():
+    # beside a half plane pressed by 1 the membrane is exp(-x / reach)
+    edge = torch.full((1, 1, 12, 200), -1.0, dtype=torch.float64)
+    edge[..., :20] = 1.0
+    scene = hanging_skin(edge, 0.8, 0.05, sweeps=300)
+    x = 0.05 * torch.arange(100, dtype=torch.float64)
+    assert float((scene.depth_mm[0, 0, 6, 19:119] - torch.exp(-x / 0.8)).abs().max()) < 1e-3
+    assert torch.equal(scene.contact, edge > 0)
+
+
+def test_skin_solves_the_obstacle_problem():
+    height_mm, pitch, reach = 5.0, 0.1, 0.6
+    ball = objects.press(objects.sphere(height_mm), objects.pose(press_mm=0.6), 80, 100, pitch, 1e-4, torch.float64)
+    target = torch.where(ball.contact, ball.depth_mm, -1.0)
+    scene = hanging_skin(target, reach, pitch, sweeps=400)
+    z = scene.depth_mm
+    laplacian = (z[..., 1:-1, 2:] + z[..., 1:-1, :-2] + z[..., 2:, 1:-1] + z[..., :-2, 1:-1] - 4 * z[..., 1:-1, 1:-1]) / pitch**2
+    pressure = z[..., 1:-1, 1:-1] - reach**2 * laplacian
+    free = ~scene.contact[..., 1:-1, 1:-1]
+    assert float(pressure[free].abs().max()) < 1e-2 and float(pressure.min()) > -1e-2
+    assert bool((z >= target - 1e-12).all())
+    assert bool((~ball.contact & scene.contact).sum() == 0) and 0 < int(scene.contact.sum()) < int(ball.contact.sum())
+
+
+def test_more_sweeps_change_nothing():
+    ball = objects.press(objects.sphere(3.0), objects.pose(press_mm=0.6), 240, 320, 0.0634, 1e-4)
+    few, many = (hanging_skin(ball.depth_mm, 0.7, 0.0634, sweeps).depth_mm for sweeps in (60, 300))
+    assert float((few - many).abs().max()) < 1e-4
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_depth_agrees_with_its_gradient_and_touches_only_where_it_is_deformed(unit, name):
+    scene = next(pressed for pressed in unit.objects if pressed.name == name).scene
+    middle = scene.depth_mm - scene.depth_mm.mean()
+    again = poisson_background(scene.gradient, unit.sensor.mm_per_pixel)
+    # central differences and the trapezoid rule differ at the edges of walls only
+    assert float((again - again.mean() - middle).square().mean().sqrt()) < 0.02 * float(scene.depth_mm.max())
+    assert bool((scene.depth_mm[scene.contact] > 0.02).all()) and 0.005 < float(scene.contact.float().mean()) < 0.5
+    assert float(scene.depth_mm.max()) > 0.3
+
+
+def test_a_seed_gives_the_same_sensor(unit):
+    drawn_sensor.cache_clear()
+    again = drawn_sensor(3)
+    assert again is not unit and again.sensor == unit.sensor
+    assert torch.equal(again.background, unit.background)
+    assert torch.equal(again.balls[1].image, unit.balls[1].image)
+    assert torch.equal(again.objects[2].image, unit.objects[2].image)
+    assert drawn_sensor(3) is again and not torch.equal(drawn_sensor(4).background, again.background)
+
+
+def test_images_are_those_of_a_camera(unit):
+    images = [unit.background, *(ball.image for ball in unit.balls), *(pressed.image for pressed in unit.objects)]
+    for image in images:
+        assert image.shape == (3, unit.sensor.height, unit.sensor.width)
+        assert torch.equal((255 * image).round() / 255, image)  # 8 bits
+        assert float((image > 0.995).double().mean()) == 0.0
+    beside = unit.objects[0].scene.depth_mm[0, 0] < 1e-3
+    noise = (unit.press(objects.plane(), objects.pose(press_mm=-1.0), seed=9).image - unit.background)[:, beside]
+    far = (unit.objects[0].image - unit.background)[:, beside]
+    assert float(far.mean(1).abs().max()) > 5 * float(noise.mean(1).abs().max())  # brightness changes far from the contact too
+
+
+def test_labels_of_balls_are_exact(unit):
+    press = unit.ball(5.0, 0.5, (2.0, -1.0), seed=5)
+    pitch = unit.sensor.mm_per_pixel
+    scene = unit.press(objects.sphere(2.5), objects.pose(shift_mm=(2.0, 1.0), press_mm=0.5), seed=5).scene
+    rows, columns = torch.nonzero(scene.contact[0, 0], as_tuple=True)
+    assert (float(columns.double().mean()), float(rows.double().mean())) == pytest.approx(press.center_px, abs=0.1)
+    assert press.contact_radius_px == pytest.approx(math.sqrt(len(rows) / math.pi))
+    assert press.contact_radius_px * pitch < math.sqrt(2.5**2 - 2.0**2)  # the skin leaves the ball before the undeformed plane
+
+
+def test_a_ball_is_steeper_by_its_own_formula(unit):
+    scene = unit.press(objects.sphere(2.5), objects.pose(press_mm=0.5)).scene
+    steepest = float(scene.gradient.norm(dim=1)[0][scene.contact[0, 0]].max())
+    radius = math.sqrt(float(scene.contact.sum()) / math.pi) * unit.sensor.mm_per_pixel
+    assert steepest == pytest.approx(radius / math.sqrt(2.5**2 - radius**2), rel=0.1)
+
+
+def test_sizes_and_refusals():
+    sizes = {(drawn_sensor(seed).sensor.height, drawn_sensor(seed).sensor.width) for seed in drawn_sensors.SEEDS}
+    assert sizes == {(240, 320), (320, 240)} and len(drawn_sensors.SEEDS) >= 8
+    assert all(isinstance(drawn_sensor(seed).sensor, Sensor) and drawn_sensor(seed).sensor.prior is None for seed in (0, 1))
+    with pytest.raises(ValueError, match="seed"):
+        drawn_sensor(-1)
+    with pytest.raises(ValueError, match="reach_mm"):
+        hanging_skin(torch.zeros(1, 1, 8, 8), 0.0, 0.1)
+
+
+@pytest.mark.parametrize("seed", [3, 5])
+def test_the_second_pass_learned_from_balls_carries_over_to_other_objects(seed):
+    """Better in the mean than the first, and on no object worse by 5 %: a second pass that balls teach shapes would be."""
+    unit = drawn_sensor(seed)
+    calibrated = by_presses(unit.background, unit.sensor, unit.balls, None, False).unit
+    errors = {}
+    for mode in ("fast", "precise"):
+        pipe = DepthPipeline.from_calibration(calibrated, mode)
+        with torch.inference_mode():
+            normals = [pipe(pressed.image[None]).normal for pressed in unit.objects]
+        pairs = zip(normals, unit.objects, strict=True)
+        errors[mode] = [float(normal_angle_deg(n, p.scene.normal, p.scene.contact).mean()) for n, p in pairs]
+    assert sum(errors["precise"]) < 0.95 * sum(errors["fast"]) and sum(errors["fast"]) / len(OBJECTS) < 4.5
+    assert all(second < 1.05 * first for first, second in zip(errors["fast"], errors["precise"], strict=True))

@@ -1,0 +1,128 @@
+"""Where the object touches the skin, from the depth of a frame: the part of the deformed area that bears a pressure.
+
+Skin in contact follows the object; around the contact it hangs free, down to where it is undeformed. A stretched skin on a soft
+gel obeys p = z - L^2 laplace z, p being the pressure on it, as a depth, and L the length on which free skin decays.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from ..core.checks import check_batch, check_positive, check_same_size
+
+CELL_MM = 0.13
+"""Side of the cells in which pressure is found, at most; finer, the noise of slopes hides it."""
+
+RIM_MM = 2.5
+"""Length of rim along which its depth is averaged, either way."""
+
+DECAY_MM = (0.1, 2.0)
+"""Bounds of the length on which free skin decays."""
+
+TAIL = (0.03, 0.4)
+"""Depths of free skin from which that length is found, as shares of a frame's largest depth."""
+
+
+class ContactFromDepth(nn.Module):
+    """Contact of depth frames: the part of the deformed area that bears a pressure.
+
+    The decay length L of a frame is the regression of its convex skin. A cell is pressed if its pressure exceeds a share of what
+    lifts free skin of the slope nearby, slope * L: at the rim of any contact pressure falls from at least that to zero. The rim
+    of the pressed cells then gets one depth along each 2.5 mm of it, since depth has less noise than its curvature.
+
+    Args:
+        mm_per_pixel: pixel pitch, mm.
+        share: of slope * L, from which a cell is pressed; one half is the middle of the step.
+    Source:
+        membrane on an elastic foundation: Timoshenko and Woinowsky-Krieger, Theory of Plates and Shells, 1959; level from the
+        rim: Yanowitz and Bruckstein, CVGIP 46(1), 1989; the rest is this project's.
+    Example:
+        >>> from torchvts.scenes import sphere_press
+        >>> ball = sphere_press(10.0, 1.0, height=120, width=160, mm_per_pixel=0.1)
+        >>> found = ContactFromDepth(0.1)(ball.depth_mm, ball.gradient, ball.contact)
+        >>> bool((found & ~ball.contact).any())
+        False
+    """
+
+    def __init__(self, mm_per_pixel: float, share: float = 0.5) -> None:
+        super().__init__()
+        self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
+        self.share = check_positive("share", share)
+        # a power of two, as the corners of windows are multiples of eight
+        self.cell = 1
+        while self.cell < 8 and 2 * self.cell * mm_per_pixel <= CELL_MM:
+            self.cell *= 2
+        self.reach = min(60, max(1, round(RIM_MM / (self.cell * mm_per_pixel))))
+        self.decay, self.tail = DECAY_MM, TAIL
+
+    def forward(self, depth_mm: Tensor, gradient: Tensor, deformed: Tensor) -> Tensor:
+        """Contact of frames, or of windows of them.
+
+        Args:
+            depth_mm: (B, 1, H, W).
+            gradient: (B, 2, H, W), mm per mm.
+            deformed: (B, 1, H, W) bool, where the skin has moved; all of it lies within the window.
+        Returns:
+            (B, 1, H, W) bool, part of ``deformed``.
+        Raises:
+            ValueError: shapes that differ.
+        """
+        check_batch("depth_mm", depth_mm, 1)
+        check_batch("gradient", gradient, 2)
+        height, width, cell = depth_mm.shape[2], depth_mm.shape[3], self.cell
+        check_same_size("gradient", gradient, "depth_mm", height, width)
+        check_same_size("deformed", deformed, "depth_mm", height, width)
+        depth, inside = depth_mm.detach(), deformed.to(torch.uint8).to(depth_mm.dtype)
+        fields = torch.cat((inside, depth * inside, gradient.detach() * inside), dim=1)
+        fields = nn.functional.pad(fields, [0, -width % cell, 0, -height % cell])
+        fields = nn.functional.avg_pool2d(fields, cell) if cell > 1 else fields
+        level = self.rim_depth(fields)
+        if cell > 1:
+            level = level.repeat_interleave(cell, dim=2).repeat_interleave(cell, dim=3)[:, :, :height, :width]
+        return deformed & (depth > level)
+
+    def rim_depth(self, fields: Tensor) -> Tensor:
+        """Depth of the rim of the contact nearby, (B, 1, h, w), infinite where there is none, from share, depth and slopes of cells."""
+        mass, some = fields[:, 0:1], fields[:, 0:1] > 0.0
+        slope = fields[:, 2:4] / mass.clamp_min(1e-6)
+        curvature = self.divergence(slope, some)
+        smooth = _box(_box(torch.cat((mass, fields[:, 1:2], curvature * mass), dim=1), 1), 1)
+        smooth = smooth / smooth[:, 0:1].clamp_min(1e-6)
+        depth, curvature = smooth[:, 1:2], smooth[:, 2:3]
+        decay = self.squared_decay(depth, curvature, some)
+        pressure = (depth - decay * curvature).masked_fill(~some, 0.0)
+        steep = slope.square().sum(dim=1, keepdim=True)
+        nearby = _box(_box(torch.cat((steep, steep * torch.sqrt(steep)), dim=1), self.reach // 2), self.reach // 2)
+        least = self.share * torch.sqrt(decay) * nearby[:, 1:2] / nearby[:, 0:1].clamp_min(1e-9)
+        pressed = (pressure > least) & (pressure > 0.1 * pressure.amax(dim=(2, 3), keepdim=True))
+        pressed_share = _box(pressed.to(depth.dtype), 1)
+        rim = ((pressed_share > 0.2) & (pressed_share < 0.8) & some).to(depth.dtype)
+        found = _box(_box(torch.cat((rim, rim * fields[:, 1:2] / mass.clamp_min(1e-6)), dim=1), self.reach // 2), self.reach // 2)
+        level = found[:, 1:2] / found[:, 0:1].clamp_min(1e-9)
+        far = torch.full_like(level, float("inf")).masked_fill(pressed, 0.0)
+        return torch.where(found[:, 0:1] > 1e-9, level, far)
+
+    def divergence(self, slope: Tensor, some: Tensor) -> Tensor:
+        """Of slopes (B, 2, h, w), per mm; beyond cells without deformed skin, and beyond the border, slopes go on as they are."""
+        cell_mm = self.cell * self.mm_per_pixel
+        along_x, along_y = slope[:, 0:1], slope[:, 1:2]
+        right = torch.where(some[..., 1:], along_x[..., 1:], along_x[..., :-1])
+        left = torch.where(some[..., :-1], along_x[..., :-1], along_x[..., 1:])
+        below = torch.where(some[..., 1:, :], along_y[..., 1:, :], along_y[..., :-1, :])
+        above = torch.where(some[..., :-1, :], along_y[..., :-1, :], along_y[..., 1:, :])
+        right, left = torch.cat((right, along_x[..., -1:]), 3), torch.cat((along_x[..., :1], left), 3)
+        below, above = torch.cat((below, along_y[..., -1:, :]), 2), torch.cat((along_y[..., :1, :], above), 2)
+        return (right - left + below - above) / (2.0 * cell_mm)
+
+    def squared_decay(self, depth: Tensor, curvature: Tensor, some: Tensor) -> Tensor:
+        """L^2 of each frame, (B, 1, 1, 1): that of laplace z = z / L^2 in convex skin of little depth."""
+        most = depth.amax(dim=(2, 3), keepdim=True)
+        free = some & (curvature > 0.0) & (depth > self.tail[0] * most) & (depth < self.tail[1] * most)
+        kept = depth.masked_fill(~free, 0.0)
+        squared = kept.square().sum(dim=(2, 3), keepdim=True) / (kept * curvature).sum(dim=(2, 3), keepdim=True).clamp_min(1e-9)
+        return squared.clamp(self.decay[0] ** 2, self.decay[1] ** 2)
+
+
+def _box(image: Tensor, reach: int) -> Tensor:
+    """Mean over ``reach`` cells either way; zero beyond the border."""
+    side = 2 * reach + 1
+    return nn.functional.avg_pool2d(nn.functional.avg_pool2d(image, [1, side], 1, [0, reach]), [side, 1], 1, [reach, 0])

@@ -1,0 +1,334 @@
+"""The data that methods are scored on: a folder of presses, the real sensors of the data folder, and drawn sensors.
+
+No set is scored on presses that were learned from, and no prior is used that has seen the presses that are scored.
+"""
+
+import dataclasses
+import os
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import torch
+from torch import Tensor
+
+from ..accelerated import Compensate, GradientFromNormal
+from ..calibration import RESPONSE_BLUR_PX, Press, fit_prior, read_presses
+from ..core.checks import check_image, check_integer
+from ..core.files import read_image, rgb_from_bgr
+from ..integration import poisson_dct
+from ..model import Sensor
+from ..normals import NormalFromMLP
+from ..scenes import Scene
+from ..stream.sources import open_source
+from .methods import Method, shipped_prior, with_network
+from .presses import with_centers
+from .score import Truth, ball_truth, undeformed_truth
+
+CHANGED = 15.0 / 255.0
+"""A pixel of gelsight_mini_b is scored where a channel has changed by more than this."""
+
+
+T = TypeVar("T")
+
+
+class Target(NamedTuple):
+    """A frame to score.
+
+    Attributes:
+        name: name of the press.
+        image: (3, H, W) in [0, 1], R, G, B.
+        truth: what it shows; None where that is unknown.
+        ball: the ball that was pressed, with centre and contact radius; None for other objects.
+    """
+
+    name: str
+    image: Tensor
+    truth: Truth | None = None
+    ball: Press | None = None
+
+
+class Fold(NamedTuple):
+    """Presses to learn from, and frames of other presses to score.
+
+    Attributes:
+        sensor: the sensor, with a prior if one may be used.
+        learned: presses to learn from; without any, the background alone.
+        scored: the frames.
+    """
+
+    sensor: Sensor
+    learned: Sequence[Press]
+    scored: Sequence[Target]
+
+
+@dataclass(frozen=True, eq=False)
+class DataSet:
+    """A unit and its presses.
+
+    Attributes:
+        name: its name in tables.
+        background: (3, H, W) in [0, 1], image without contact, to learn from.
+        folds: one fold or more.
+        how: what is held out, and where the truth comes from.
+        methods: methods that only this set has.
+        refused: the right answer is a refusal.
+    """
+
+    name: str
+    background: Tensor
+    folds: Sequence[Fold]
+    how: str
+    methods: tuple[Method, ...] = ()
+    refused: bool = False
+
+
+# a folder of presses
+
+
+def from_folder(
+    folder: str | Path, sensor: Sensor, *, folds: int = 5, network: str | Path | None = None, limit: int | None = None
+) -> DataSet:
+    """Presses of balls in gs_sdk's layout; press i is in fold i % folds.
+
+    Args:
+        folder: the folder.
+        sensor: the sensor.
+        folds: parts of the cross-validation; with 1 the presses that were learned from are scored.
+        network: file of a trained network that is to be scored too.
+        limit: use only so many presses, spread over the catalog.
+    Raises:
+        ValueError: too few presses, or none that can be scored.
+        FileNotFoundError: no such folder or file.
+    """
+    background, presses = read_presses(folder)
+    check_image("background", background, sensor.height, sensor.width, sensor.name)
+    presses = spread(presses, limit)
+    if check_integer("folds", folds, 1) > len(presses):
+        raise ValueError(f"folds: expected at most the number of presses, {len(presses)}, got {folds}")
+    targets, source = with_truth(background, sensor, presses)
+    if not targets:
+        raise ValueError(f"folder: none of {len(presses)} presses has a contact radius: nothing can be scored")
+    names = {target.name for target in targets}
+    if left_out := [press.name for press in presses if press.name not in names]:
+        source += f"; not scored, no contact radius: {', '.join(left_out)}"
+    split = [Fold(sensor, presses, targets)] if folds == 1 else cross_validation(sensor, presses, targets, folds)
+    how = f"{folds}-fold cross-validation over" if folds > 1 else "learned from and scored:"
+    methods = () if network is None else (with_network(Path(network)),)
+    return DataSet(Path(folder).name, background, split, f"{how} {len(presses)} presses, without labels; {source}", methods)
+
+
+def spread(items: Sequence[T], limit: int | None) -> list[T]:
+    """``limit`` items at equal steps of the catalog, which lists one ball after the other; None for all."""
+    count = len(items) if limit is None else min(check_integer("limit", limit, 1), len(items))
+    return [items[k * len(items) // count] for k in range(count)]
+
+
+def cross_validation(sensor: Sensor, presses: Sequence[Press], targets: Sequence[Target], folds: int) -> list[Fold]:
+    """Press i is scored in fold i % folds, and learned from in all others."""
+    by_name = {target.name: target for target in targets}
+    return [
+        Fold(
+            sensor,
+            [press for i, press in enumerate(presses) if i % folds != fold],
+            [by_name[press.name] for press in presses[fold::folds] if press.name in by_name],
+        )
+        for fold in range(folds)
+    ]
+
+
+def with_truth(background: Tensor, sensor: Sensor, presses: Sequence[Press]) -> tuple[list[Target], str]:
+    """The presses that can be scored: labelled ones, and without a label those that ``calibrate`` locates; and the source."""
+    bare = sum(press.center_px is None for press in presses)
+    counts = {"labels": len(presses) - bare, "calibrate on the scored presses": bare}
+    how = "centers from " + " and ".join(f"{source} ({count})" for source, count in counts.items() if count)
+    size = (sensor.height, sensor.width, sensor.mm_per_pixel)
+    known = with_centers(background, sensor, presses)
+    return [Target(press.name, press.image, ball_truth(press, *size), press) for press in known], how
+
+
+# the real sensors
+
+
+def _mini_a(folder: Path, limit: int | None) -> DataSet:
+    """The balls of each diameter by five folds, with a prior that is fitted to those of the other."""
+    background, presses = read_presses(folder)
+    shipped = Sensor.load("gelsight_mini")
+    folds: list[Fold] = []
+    for ball in sorted({press.ball_diameter_mm for press in presses}):
+        own = spread([press for press in presses if press.ball_diameter_mm == ball], limit)
+        others = [press for press in presses if press.ball_diameter_mm != ball]
+        prior = fit_prior(background, shipped, others, "the presses of the other ball, with their labels")
+        targets, how = with_truth(background, shipped, own)
+        folds += cross_validation(dataclasses.replace(shipped, prior=prior), own, targets, min(5, len(own)))
+    seen = Method("precise, shipped prior", from_presses=partial(shipped_prior, sensor=shipped), learns=False, seen=True)
+    how = f"each ball by five folds, prior of the other ball; {how}"
+    return DataSet(folder.name, background, folds, how, (with_network(folder / "model" / "nnmodel.pth"), seen))
+
+
+def _mini_b(folder: Path, limit: int | None) -> DataSet:
+    """A bead, from the background alone; the truth is the integrable part of the unit's own network where the image has changed."""
+    background, bead = (read_image(folder / name) for name in ("background.png", "bead.png"))
+    sensor, smooth = Sensor.load("gelsight_mini"), Compensate(blur_px=RESPONSE_BLUR_PX)
+    with torch.inference_mode():
+        before, image = smooth(background[None]), smooth(bead[None])
+        own = GradientFromNormal()(NormalFromMLP.load(folder / "model" / "nnmodel.pth", before[0].clamp(0, 1))(image))
+        depth = poisson_dct(own.double(), sensor.mm_per_pixel)
+    changed = (image - before).abs().amax(1, keepdim=True) > CHANGED
+    gradient = torch.stack(torch.gradient(depth[0, 0], spacing=sensor.mm_per_pixel)[::-1])[None]  # torch gives rows first
+    target = Target("bead", bead, Truth(depth, gradient, changed))
+    how = "from the background and the shipped prior; truth: the integrable part of the unit's own network, in the changed part"
+    return DataSet(folder.name, background, [Fold(sensor, (), (target,))], how)
+
+
+def _mini_c(folder: Path, limit: int | None) -> DataSet:
+    """Raw frames, cut by a seventh on each side as gs_sdk does; the background is the median of the presses."""
+    sensor = Sensor.load("gelsight_mini")
+    files = spread(sorted(folder.glob("frame_*.jpg"), key=_number), limit)
+    images = torch.stack([read_image(file) for file in files])
+    height, width = images.shape[2:]
+    top, left = round(height / 7), round(width / 7)
+    roi = (left, top, width - 2 * left, height - 2 * top)
+    images = dataclasses.replace(sensor, roi_px=roi).rectify(images)
+    presses = [Press(image, 4.0, file.stem) for image, file in zip(images, files, strict=True)]
+    return _halves(folder.name, images.median(0).values, sensor, presses, "background: median of the presses")
+
+
+def _digit_a(folder: Path, limit: int | None) -> DataSet:
+    return _halves(folder.name, *_fots("digit", folder, {}, limit))
+
+
+def _pale(folder: Path, limit: int | None) -> DataSet:
+    lines = [line.split(",") for line in (folder / "labels.csv").read_text(encoding="utf-8").split()[1:]]
+    labels = {name: ((float(x), float(y)), float(radius)) for name, x, y, radius in lines}
+    return _halves(folder.name, *_fots("gelsight_pale", folder, labels, limit), "labels by hand, good to 1 to 2 px")
+
+
+def _fots(
+    name: str, folder: Path, labels: Mapping[str, tuple[tuple[float, float] | None, float | None]], limit: int | None
+) -> tuple[Tensor, Sensor, list[Press]]:
+    """A sensor of FOTS: presses of a ball of 4.70 mm; its code says 19.58 pixels per mm."""
+    files = spread(sorted(folder.glob("ball_*.png")), limit)
+    presses = [Press(read_image(file), 4.70, file.stem, *labels.get(file.stem, (None, None))) for file in files]
+    return read_image(folder / "background.png"), Sensor(name, 320, 240, 1.0 / 19.58), presses
+
+
+def _gelslim(folder: Path, limit: int | None) -> DataSet:
+    background = read_image(folder / "ref.jpg")
+    sensor = Sensor("gelslim_markers", background.shape[1], background.shape[2], 0.05, markers=True)
+    presses = [Press(read_image(file), 5.0, file.stem) for file in sorted(folder.glob("sample_*.jpg"), key=_number)]
+    return _halves(folder.name, background, sensor, presses, "pitch of 0.05 mm and ball of 5 mm are assumed")
+
+
+def _ninedtact(folder: Path, limit: int | None) -> DataSet:
+    background, image = (read_image(folder / name) for name in ("background.png", "ball_8mm.png"))
+    sensor = Sensor("ninedtact", background.shape[1], background.shape[2], 0.05)
+    folds = [Fold(sensor, (Press(image, 8.0, "ball_8mm"),), (Target("ball_8mm", image),))]
+    return DataSet(
+        folder.name, background, folds, "white light: photometric stereo is not possible, a refusal is right", refused=True
+    )
+
+
+def _wedge(folder: Path, limit: int | None) -> DataSet:
+    """The ten frames before the contact: five make the background, the others must read zero."""
+    sensor, reader = Sensor.load("gelsight_wedge"), open_source(folder / "golf_ball.avi")
+    read = [pixels for pixels in (reader.read() for _ in range(10)) if pixels is not None]
+    reader.close()
+    frames = sensor.rectify(torch.stack([rgb_from_bgr(pixels) for pixels in read]))
+    truth = undeformed_truth(sensor.height, sensor.width)
+    targets = [Target(f"frame {k}", frames[k], truth) for k in range(5, len(frames))]
+    how = "frames before the contact: depth and contact must be zero; background: median of the first five"
+    return DataSet(folder.name, frames[:5].median(0).values, [Fold(sensor, (), targets)], how)
+
+
+def _halves(name: str, background: Tensor, sensor: Sensor, presses: Sequence[Press], remark: str = "") -> DataSet:
+    """Half of the presses is learned from and the other half scored, and the other way round."""
+    folds, notes = [], [remark] if remark else []
+    for half in (0, 1):
+        scored = presses[1 - half :: 2]
+        try:
+            targets, how = with_truth(background, sensor, scored)
+        except ValueError as error:
+            targets, how = [], f"no truth: {' '.join(str(error).split())}"
+        known = {target.name for target in targets}
+        targets += [Target(press.name, press.image) for press in scored if press.name not in known]
+        folds.append(Fold(sensor, presses[half::2], targets))
+        notes.append(how)
+    return DataSet(
+        name, background, folds, f"half learned from, half scored, and the other way round; {'; '.join(dict.fromkeys(notes))}"
+    )
+
+
+def _number(file: Path) -> int:
+    return int(re.findall(r"\d+", file.stem)[-1])
+
+
+REAL: dict[str, Callable[[Path, int | None], DataSet]] = {
+    "gelsight_mini_a": _mini_a,
+    "gelsight_mini_b": _mini_b,
+    "gelsight_mini_c": _mini_c,
+    "gelsight_pale": _pale,
+    "digit_a": _digit_a,
+    "gelslim_markers": _gelslim,
+    "ninedtact_white": _ninedtact,
+    "wedge_video": _wedge,
+}
+"""How the folder of each real sensor is read: (the folder, at most so many presses) to a :class:`DataSet`."""
+
+
+# drawn sensors
+
+
+def drawn_set(
+    name: str, sensor: Sensor, background: Tensor, balls: Sequence[Press], objects: Sequence[tuple[str, Tensor, Scene]]
+) -> DataSet:
+    """A drawn sensor: balls are learned from, without labels; name, image and truth of objects that are no balls are scored."""
+    targets = []
+    for press, image, scene in objects:
+        truth = Truth(scene.depth_mm.double(), scene.gradient.double(), scene.contact, scene.contact)
+        targets.append(Target(press, image, truth))
+    return DataSet(
+        name, background, [Fold(sensor, balls, targets)], "balls learned from without labels; other objects, exact truth"
+    )
+
+
+def _drawn(name: str, limit: int | None) -> DataSet:
+    from .drawn_sensors import drawn_sensor
+
+    unit = drawn_sensor(int(name.split("_")[1]))
+    return drawn_set(name, unit.sensor, unit.background, spread(unit.balls, limit), unit.objects)
+
+
+DRAWN = tuple(f"drawn_{seed}" for seed in range(8))
+"""Names of the drawn sensors, by their seeds."""
+
+SETS = (*REAL, *DRAWN)
+"""Names of all sets."""
+
+
+def data_folder(script: str) -> Path:
+    """Folder of third-party images: TORCHVTS_DATA, else ../shared/data beside the checkout that holds a script."""
+    return Path(os.environ.get("TORCHVTS_DATA", Path(script).resolve().parents[2] / "shared" / "data"))
+
+
+def load(name: str, data: Path, limit: int | None = None) -> DataSet:
+    """Read a real set, or draw one.
+
+    Args:
+        name: one of :data:`SETS`.
+        data: folder of the real sets.
+        limit: use only so many presses (of each ball).
+    Raises:
+        ValueError: an unknown name, or bad data.
+        FileNotFoundError: no such folder.
+    """
+    if name in DRAWN:
+        return _drawn(name, limit)
+    if name not in REAL:
+        raise ValueError(f"sets: expected some of {', '.join(SETS)}, got {name!r}")
+    if not (data / name).is_dir():
+        raise FileNotFoundError(f"{data / name}: no such folder: set TORCHVTS_DATA to the folder of the real sensors")
+    return REAL[name](data / name, limit)

@@ -1,0 +1,110 @@
+"""Depth that is zero where the skin is undeformed: what errors of slope add up to beside a contact is taken out."""
+
+import torch
+from torch import Tensor, nn
+
+from ..core.checks import check_batch, check_same_size
+
+STIFF = 30.0
+"""How much less the deepest skin bends to the continuation than undeformed skin: slopes are calibrated in contact only."""
+
+SWEEPS = 4
+"""Relaxations on each grid."""
+
+
+class ZeroBackground(nn.Module):
+    """Set depth to zero where the skin is undeformed, and take a smooth continuation of what was there out of the deformed skin.
+
+    Slopes that are off by a few per cent do not sum to zero over a contact. Integrated, they leave a pit on one side of it and a
+    rise on the other, which go on as a harmonic function over the undeformed skin. That function is known there, since
+    depth is zero; its harmonic continuation into the deformed area is subtracted. Deep skin is stiff against it: slopes are
+    right within contacts, from which they are calibrated, and least known around them.
+    Skin is pressed in and never pulled out: where depth would be below zero, as beside a contact that the image border
+    cuts, it is held at zero as undeformed skin is, and the continuation is found again.
+    A flat face that the image border cuts shows no change and is no part of ``deformed``: undeformed skin is what lies below half
+    of the frame's depth; above, depth stays as it is.
+
+    Source:
+        successive grids for the continuation: Gortler, Grzeszczuk, Szeliski and Cohen, The Lumigraph, SIGGRAPH 1996; the rest is
+        this project's.
+    Example:
+        >>> import torch
+        >>> deformed = torch.zeros(1, 1, 48, 64, dtype=torch.bool)
+        >>> deformed[..., 12:36, 16:48] = True
+        >>> tilt = torch.linspace(-0.1, 0.1, 64).expand(1, 1, 48, 64)
+        >>> bool(ZeroBackground()(tilt + deformed.float(), deformed)[~deformed].any())
+        False
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stiff = STIFF
+        self.sweeps = SWEEPS
+
+    def forward(self, depth_mm: Tensor, deformed: Tensor) -> Tensor:
+        """Depth (B, 1, H, W), and where the skin has moved, bool (B, 1, H, W), to depth.
+
+        Raises:
+            ValueError: shapes that differ.
+        """
+        check_batch("depth_mm", depth_mm, 1)
+        height, width = depth_mm.shape[2], depth_mm.shape[3]
+        check_same_size("deformed", deformed, "depth_mm", height, width)
+        free = _as(~deformed, depth_mm)
+        values = depth_mm.detach()
+        low, high = values.amin(dim=(2, 3), keepdim=True), values.amax(dim=(2, 3), keepdim=True)
+        flat = free * _as(values < 0.5 * (low + high), values)
+        count = flat.sum(dim=(2, 3), keepdim=True)
+        level = (depth_mm * flat).sum(dim=(2, 3), keepdim=True) / count.clamp_min(1.0)
+        raised = free - flat  # a face of the object: only the frame's mean is taken out
+        zero = flat
+        offset = torch.zeros_like(depth_mm)
+        weight = 1.0 + self.stiff * ((values - level.detach()) / (high - level.detach()).clamp_min(1e-9)).clamp_min(0.0).square()
+        for _ in range(2):  # then, where depth is below zero, that too is an error
+            offset = self.continued(torch.cat((zero + raised, depth_mm * zero + level * raised, weight), dim=1))
+            zero = torch.maximum(zero, (1.0 - free) * _as(values < offset.detach(), values))
+        return (depth_mm - offset) * (1.0 - flat)
+
+    def continued(self, fields: Tensor) -> Tensor:
+        """Values continued to all pixels, (B, 1, H, W).
+
+        Args:
+            fields: (B, 3, H, W): the share of a pixel on which the value is known, 0 or 1; the value, 0 where it is unknown; the
+                weight of the pixel, whose square is the stiffness against the continuation.
+        """
+        height, width = fields.shape[2], fields.shape[3]
+        cell = max(1, min(height, width) // 60)
+        fields = _coarser(fields, cell)
+        grids = [fields]
+        while min(grids[-1].shape[2], grids[-1].shape[3]) > 2:
+            grids.append(_coarser(grids[-1], 2))
+        share, values = grids[-1][:, 0:1], grids[-1][:, 1:2]
+        mean = values.sum(dim=(2, 3), keepdim=True) / share.sum(dim=(2, 3), keepdim=True).clamp_min(1e-9)
+        found = mean.expand_as(values)
+        for k in range(len(grids)):
+            grid = grids[len(grids) - 1 - k]
+            share, values, weight = grid[:, 0:1], grid[:, 1:2], grid[:, 2:3]
+            if k > 0:
+                found = nn.functional.interpolate(found, scale_factor=2.0, mode="bilinear", align_corners=False)
+                found = found[:, :, : share.shape[2], : share.shape[3]]
+            known, values = share > 0.0, values / share.clamp_min(1e-9)
+            found = torch.where(known, values, found)
+            total = nn.functional.avg_pool2d(weight, 3, 1, 1).clamp_min(1e-9)
+            for _ in range(self.sweeps):
+                around = nn.functional.avg_pool2d(weight * found, 3, 1, 1) / total
+                found = torch.where(known, values, around)
+        if cell > 1:
+            found = nn.functional.interpolate(found, scale_factor=float(cell), mode="bilinear", align_corners=False)
+        return found[:, :, :height, :width]
+
+
+def _as(mask: Tensor, like: Tensor) -> Tensor:
+    return mask.to(torch.uint8).to(like.dtype)
+
+
+def _coarser(fields: Tensor, cell: int) -> Tensor:
+    """Means over cells; beyond the border nothing is known."""
+    if cell == 1:
+        return fields
+    height, width = fields.shape[2], fields.shape[3]
+    return nn.functional.avg_pool2d(nn.functional.pad(fields, [0, -width % cell, 0, -height % cell]), cell)

@@ -106,7 +106,7 @@ def _structure_deg(image: Tensor, sensor: Sensor, prior: SensorPrior) -> float:
     log = log - log.mean(1, keepdim=True)
     height = sensor.height
     band = blur(log, gaussian_weights(height / 40.0)) - blur(log, gaussian_weights(height / 16.0))
-    normals = NormalFromResponse(prior.response.fast, None, height, sensor.width, sensor.mm_per_pixel)
+    normals = NormalFromResponse(prior.response.field, None, height, sensor.width, sensor.mm_per_pixel)
     margin = round(0.14 * height)
     upright = normals(band.exp())[0, 2, margin:-margin, margin:-margin]
     return math.degrees(math.acos(min(1.0, float(upright.flatten().quantile(0.01)))))

@@ -194,7 +194,7 @@ def test_corners_are_rectified(unit, small_sensor, tmp_path):
     sensor = replace(small_sensor, corners_px=tuple(corners))
     background = sensor.rectify(torch.stack([frame for _, frame in read_frames(video)])[:12]).mean(0)
     with streams.TactileStream(video, vts.Calibration.from_lights(calibration.lights, sensor, background)) as stream:
-        areas = [float(frame.output.contact.double().mean()) for frame in stream]
+        areas = [float(frame.output.deformed.double().mean()) for frame in stream]
     assert max(areas[:14]) == 0 and min(areas[14:]) > 0.05
 
 

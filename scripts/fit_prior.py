@@ -2,8 +2,10 @@
 
 python scripts/fit_prior.py ../shared/data/gelsight_mini_a --sensor gelsight_mini --out configs/sensors/gelsight_mini.yaml
 
+python scripts/fit_prior.py background.png --press 1.png 4.7 --press 2.png 4.7 ... --sensor digit --out configs/sensors/digit.yaml
+
 The folder is one of gs_sdk's (catalog.csv, background.png, N/gelsight.png); centers come from label.npz or labels.csv where they
-exist, otherwise they are found.
+exist, otherwise they are found. Without a folder: an image without contact, several (their median), or a video, and presses.
 """
 
 import argparse
@@ -14,18 +16,28 @@ from pathlib import Path
 
 import torchvts as vts
 from torchvts.calibration import fit_prior
+from torchvts.stream import read_background, read_press_images
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="presses of balls, in gs_sdk's layout")
+    parser.add_argument(
+        "background", type=Path, nargs="+", help="folder in gs_sdk's layout, or image without contact, several, a video"
+    )
+    parser.add_argument(
+        "--press", nargs=2, action="append", default=[], metavar=("IMAGE", "MM"), help="a ball pressed in, and its diameter"
+    )
     parser.add_argument("--sensor", required=True, help=f"YAML file, or one of {', '.join(vts.shipped_sensors())}")
     parser.add_argument("--source", default="", help="whose images these are; kept in the file")
     parser.add_argument("--out", type=Path, required=True, help="sensor file to write, .yaml; its leading comment is kept")
     arguments = parser.parse_args(argv)
     sensor = vts.Sensor.load(arguments.sensor)
-    background, presses = vts.read_presses(arguments.folder)
-    prior = fit_prior(background, sensor, presses, arguments.source or f"{len(presses)} presses of {arguments.folder.name}")
+    first = arguments.background[0]
+    if len(arguments.background) == 1 and first.is_dir():
+        background, presses = vts.read_presses(first)
+    else:
+        background, presses = read_background(arguments.background, sensor), read_press_images(arguments.press, sensor)
+    prior = fit_prior(background, sensor, presses, arguments.source or f"{len(presses)} presses of {first.name}")
     before = arguments.out.read_text() if arguments.out.is_file() else ""
     comment = [line for line in before.splitlines() if line.startswith("#")]
     dataclasses.replace(sensor, prior=prior).save(arguments.out, comment)

@@ -382,7 +382,7 @@ def test_a_network_on_images_that_it_was_not_trained_on_is_refused(tmp_path):
 
 
 def response_unit():
-    field = ResponseField(0, -1, False, 10.0, ((0.3, 0, 0), (0, 0.3, 0)))
+    field = ResponseField(0, -1, 10.0, ((0.3, 0, 0), (0, 0.3, 0)))
     return vts.Calibration.from_response(ResponseModel(field, None), vts.Sensor("rig", HEIGHT, WIDTH, 0.5), flat_skin())
 
 
@@ -394,7 +394,7 @@ def test_from_gs_sdk_gives_the_network_its_own_images(tmp_path, mode):
     image = flat_skin().clone()[None]
     image[:, :, 8:20, 8:20] *= torch.tensor([1.4, 0.7, 1.2])[:, None, None]
     out = pipe(image)
-    assert bool(out.contact[0, 0, 10:18, 10:18].all())
+    assert bool(out.deformed[0, 0, 10:18, 10:18].all())
     alone = NormalFromMLP.load(tmp_path / "nnmodel.pth", flat_skin())(image)
     assert torch.allclose(out.normal[0, :, 10:18, 10:18], alone[0, :, 10:18, 10:18], atol=1e-5)
     assert float(pipe(flat_skin()[None]).depth_mm.abs().max()) == 0.0

@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -235,7 +236,7 @@ def _ninedtact(folder: Path, limit: int | None) -> DataSet:
 def _wedge(folder: Path, limit: int | None) -> DataSet:
     """The ten frames before the contact: five make the background, the others must read zero."""
     sensor, reader = Sensor.load("gelsight_wedge"), open_source(folder / "golf_ball.avi")
-    read = [pixels for pixels in (reader.read() for _ in range(10)) if pixels is not None]
+    read = [pixels for pixels in (reader.read() for _ in range(10)) if isinstance(pixels, np.ndarray)]
     reader.close()
     frames = sensor.rectify(torch.stack([rgb_from_bgr(pixels) for pixels in read]))
     truth = undeformed_truth(sensor.height, sensor.width)

@@ -34,7 +34,7 @@ from .sources import RectifySizes
 MOVED = 0.02
 """Relative change of a cell of 1/20 of the frame that counts as movement among the first frames."""
 
-ROUGH_DEG = 4.0
+ROUGH_DEG = 3.3
 """Slopes for which a prior takes the structure of an image; more is a contact."""
 
 NOT_METRIC = "depth is NOT METRIC: calibrate with presses of a ball"
@@ -61,8 +61,8 @@ def find_background(images: Tensor, sensor: Sensor | None = None) -> tuple[Tenso
       (0.01 to 0.03 on four of six; 0.10 on a Wedge, whose LEDs are in the picture), and 0.06 to 0.36 under clear contact; 0.13 is
       refused. So a faint contact that stays from the first frame to the last is not found: without a calibration it cannot be
       distinguished from the skin;
-    * with a sensor that has a prior, frames whose structure the prior takes for slopes of more than 4 degrees at the 99th
-      percentile (2.1 to 2.6 on three units of the GelSight Mini without contact, 3.8 to 25 under balls).
+    * with a sensor that has a prior, frames whose structure the prior takes for slopes of more than 3.3 degrees at the 99th
+      percentile (1.8 to 2.2 on three units of the GelSight Mini without contact, 3.2 to 15 under balls).
 
     Args:
         images: (N, 3, H, W) in [0, 1], rectified, at least 3.
@@ -303,4 +303,7 @@ def contact_in_video(calibration: Calibration, noise: Tensor | None = None) -> P
         compensated = compensated * calibration.gain.float() * 2.0**0.5
     least = STAND_IN_NOISE if stand_in else 0.0
     most = torch.maximum(1.0 / calibrated.per_noise.float(), compensated).clamp_min(least)
-    return ContactMask(calibrated.flat.float(), most).eval()
+    mask = ContactMask(calibrated.flat.float(), most).eval()
+    if stand_in:
+        mask.most_far_field.clamp_(max=1.0)  # STAND_IN_NOISE is what a press may scatter
+    return mask

@@ -76,7 +76,7 @@ def far_field(change: Tensor) -> FarField:
 
 
 def contact_region(far: FarField, mask: Tensor, ball_radius_px: float) -> Tensor:
-    """The part of a mask that a contact takes, with the skirt around it, bool (H, W).
+    """The part of a mask that a contact takes, with the transition zone around it, bool (H, W).
 
     Blobs that stand out of the far field: the largest one, and others that are as strong. Of a ball, lobes are joined by their
     convex hull, because its contact is convex. Where nothing stands out, the mask itself.
@@ -137,7 +137,7 @@ def _hull(blobs: list[Blob]) -> Any:
 
 
 def _grown(mask: Any) -> Any:
-    """A uint8 mask grown by a fifth of its radius: the skirt fades below the floor."""
+    """A uint8 mask grown by a fifth of its radius: the transition zone fades below the floor."""
     import cv2
 
     reach = max(1, round(0.2 * (float(mask.sum()) / np.pi) ** 0.5))

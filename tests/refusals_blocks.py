@@ -122,12 +122,8 @@ TABLE = {
     ),
     "ContactFromDepth": Entry({"mm_per_pixel": 1.0, "share": 0.8}, {"mm_per_pixel": NUMBER, "share": NUMBER}),
     "ContactFromDepth.forward": Entry(
-        {"depth_mm": DEPTH, "gradient": GRADIENT, "deformed": DEPTH > 0},
-        {
-            "depth_mm": BAD_DEPTH[:-1],
-            "gradient": [GRADIENT[0], GRADIENT[:, :1], GRADIENT[..., 1:]],
-            "deformed": [DEPTH[..., 1:] > 0],
-        },
+        {"depth_mm": DEPTH, "gradient": DEPTH.repeat(1, 2, 1, 1), "deformed": DEPTH > 0},
+        {"depth_mm": [DEPTH[0]], "gradient": [DEPTH, DEPTH.repeat(1, 2, 1, 1)[..., 1:]], "deformed": [DEPTH[..., 1:] > 0]},
         lambda: vts.ContactFromDepth(1.0),
     ),
     "ContactSettings": Entry(

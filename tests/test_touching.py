@@ -9,7 +9,7 @@ import torch
 import torchvts as vts
 from torchvts.calibration import fit_prior
 from torchvts.core.geometry import gradient_of_depth
-from torchvts.integration import ZeroBackground
+from torchvts.integration.background import ZeroBackground
 
 PITCH, HEIGHT, WIDTH = 0.0634, 240, 320
 

@@ -1,6 +1,5 @@
 """From gradient to depth."""
 
-from .background import DepthAsIs, ZeroBackground
 from .base import Integrator, WrappedIntegrator, as_integrator
 from .discontinuities import (
     AdaptiveIntegration,
@@ -15,7 +14,6 @@ from .poisson import PoissonBackground, PoissonDCT, PoissonDST, divergence, pois
 
 __all__ = [
     "AdaptiveIntegration",
-    "DepthAsIs",
     "DiscontinuityIntegration",
     "DiscontinuitySolution",
     "Integrator",
@@ -24,7 +22,6 @@ __all__ = [
     "PoissonDCT",
     "PoissonDST",
     "WrappedIntegrator",
-    "ZeroBackground",
     "as_integrator",
     "discontinuity_share",
     "divergence",

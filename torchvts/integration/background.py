@@ -16,7 +16,7 @@ SWEEPS = 4
 
 
 class ZeroBackground(nn.Module):
-    """Set depth to zero where the skin is undeformed, two pixels beside ``deformed``, and take a continuation of it out.
+    """Set depth to zero where the skin is undeformed, and take a continuation of what was there out of the deformed skin.
 
     Slopes that are off by a few per cent do not sum to zero over a contact. Integrated, they leave a pit on one side of it and a
     rise on the other, which go on as a harmonic function over the undeformed skin. That function is known there, since

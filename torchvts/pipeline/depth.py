@@ -31,8 +31,9 @@ from ..core.checks import (
     may_read_values,
 )
 from ..core.frame import DepthOutput, Solution, depth_in_window, undeformed_output
-from ..integration import DepthAsIs, WrappedIntegrator, ZeroBackground, as_integrator
 from ..integration import PoissonBackground as PlainPoissonBackground
+from ..integration import WrappedIntegrator, as_integrator
+from ..integration.background import DepthAsIs, ZeroBackground
 from ..model import Calibration, Sensor, check_calibration
 from ..normals import NormalFromIntensity as PlainNormalFromIntensity
 from ..normals import NormalFromResponse, WrappedNormals, as_normal_model, check_domain

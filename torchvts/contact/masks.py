@@ -13,6 +13,7 @@ from ..core.checks import (
     QUANTISATION_STD,
     check_batch,
     check_field,
+    check_least,
     check_positive,
     check_record,
     check_same_size,
@@ -57,6 +58,8 @@ class ContactMask(nn.Module):
         noise_std: (3,) or (3, H, W), noise of the compensated image at calibration.
         sigmas: threshold of a pixel; 4.5 leaves some 40 false pixels in a 640 x 480 frame, all specks.
         min_size_px: diameter of the smallest contact.
+        far_field: largest change, relative to the light, that a press makes in undeformed skin; up to it, the spread of the least
+            changed skin of a frame counts as noise. 0 for rigs in which light does not scatter.
     Example:
         >>> flat = torch.full((3, 64, 64), 0.5)
         >>> image = flat.clone(); image[0, 20:40, 20:40] += 0.2
@@ -72,9 +75,12 @@ class ContactMask(nn.Module):
     cell_row: Tensor
     cell_column: Tensor
 
-    def __init__(self, flat: Tensor, noise_std: Tensor, sigmas: float = 4.5, min_size_px: float = 8.0) -> None:
+    def __init__(
+        self, flat: Tensor, noise_std: Tensor, sigmas: float = 4.5, min_size_px: float = 8.0, far_field: float = 0.0
+    ) -> None:
         super().__init__()
         check_field("flat", flat)
+        check_least("far_field", far_field)
         check_tensor("noise_std", noise_std)
         if tuple(noise_std.shape) not in ((3,), tuple(flat.shape)) or not bool(torch.isfinite(noise_std).all()):
             raise ValueError(f"noise_std: expected (3,) or {tuple(flat.shape)} finite values, got {tuple(noise_std.shape)}")
@@ -89,7 +95,7 @@ class ContactMask(nn.Module):
         per_noise = 1.0 / noise.detach().clamp_min(QUANTISATION_STD).to(flat.dtype)
         self.register_buffer("per_noise", per_noise.expand_as(flat).clone())
         self.rounding = float((QUANTISATION_STD * self.per_noise).square().mean())
-        self.register_buffer("most_far_field", MOST_FAR_FIELD * (self.flat * self.per_noise).mean(dim=(1, 2)))
+        self.register_buffer("most_far_field", far_field * (self.flat * self.per_noise).mean(dim=(1, 2)))
         self.dark_noises = DARK_NOISES
         self.register_buffer("offset", -self.flat * self.per_noise)
         self.samples = 2000  # pixels from which a frame's own noise is estimated
@@ -106,7 +112,8 @@ class ContactMask(nn.Module):
         check_calibration("calibration", calibration)
         settings = ContactSettings() if settings is None else settings
         check_record("settings", settings, ContactSettings, "ContactSettings() makes one")
-        return cls(calibration.flat, calibration.compensated_noise_std, settings.sigmas, settings.min_size_px)
+        far_field = 0.0 if calibration.response is None else MOST_FAR_FIELD  # a rig that lights explain scatters none
+        return cls(calibration.flat, calibration.compensated_noise_std, settings.sigmas, settings.min_size_px, far_field)
 
     def forward(self, compensated: Tensor) -> Tensor:
         """Where the skin has moved in compensated images (B, 3, H, W), bool (B, 1, H, W)."""
@@ -167,11 +174,13 @@ class ContactMask(nn.Module):
         """Spread of the change of undeformed skin, (B, 3), which a press changes everywhere on a real sensor.
 
         From the least changed quarter of all pixels, then from all within three standard deviations: an object may press on
-        about two thirds of the skin before it counts.
+        about two thirds of the skin before it counts. What exceeds ``most_far_field`` is the object, and the more it does, the
+        less of it is believed.
         """
         half = self.stride // 2
         some = change[:, :, half :: self.stride, half :: self.stride].abs().flatten(2)
-        return torch.minimum(clipped_std(some, self.quarter(some) / 0.3186)[:, :, 0], self.most_far_field)
+        spread = clipped_std(some, self.quarter(some) / 0.3186)[:, :, 0]
+        return torch.minimum(spread, self.most_far_field.square() / spread.clamp_min(1e-9))
 
     def quarter(self, some: Tensor) -> Tensor:
         """The value below which a quarter of (B, 3, N) lies, (B, 3, 1)."""

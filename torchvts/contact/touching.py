@@ -21,6 +21,10 @@ DECAY_MM = (0.1, 2.0)
 TAIL = (0.03, 0.4)
 """Depths of free skin from which that length is found, as shares of a frame's largest depth."""
 
+LEAST_FREE = 0.15
+"""Share of the deformed skin that is free where skin hangs around a contact: 0.30 to 0.7 on real and drawn sensors with such skin,
+at most 0.05 on drawn objects without. Below, all deformed skin lies on the object."""
+
 
 class ContactFromDepth(nn.Module):
     """Contact of depth frames: the part of the deformed area that bears a pressure.
@@ -53,7 +57,7 @@ class ContactFromDepth(nn.Module):
         while self.cell < 8 and 2 * self.cell * mm_per_pixel <= CELL_MM:
             self.cell *= 2
         self.reach = min(60, max(1, round(RIM_MM / (self.cell * mm_per_pixel))))
-        self.decay, self.tail = DECAY_MM, TAIL
+        self.decay, self.tail, self.least_free = DECAY_MM, TAIL, LEAST_FREE
 
     def forward(self, depth_mm: Tensor, gradient: Tensor, deformed: Tensor) -> Tensor:
         """Contact of frames, or of windows of them.
@@ -82,7 +86,8 @@ class ContactFromDepth(nn.Module):
         return deformed & (depth > level)
 
     def rim_depth(self, fields: Tensor) -> Tensor:
-        """Depth of the rim of the contact nearby, (B, 1, h, w), infinite where there is none.
+        """Depth of the rim of the contact nearby, (B, 1, h, w), infinite where there is none, and minus infinity
+        where no skin hangs free.
 
         Args:
             fields: (B, 4, h, w): the deformed share of a cell, its depth and its two slopes times that share.
@@ -93,7 +98,13 @@ class ContactFromDepth(nn.Module):
         smooth = _box(torch.cat((mass, fields[:, 1:2], curvature * mass), dim=1), 2)
         smooth = smooth / smooth[:, 0:1].clamp_min(1e-6)
         depth, curvature = smooth[:, 1:2], smooth[:, 2:3]
-        decay = self.squared_decay(depth, curvature, some)
+        most = depth.amax(dim=(2, 3), keepdim=True)
+        convex = curvature > depth / self.decay[1] ** 2  # a plane is not free
+        free = some & convex & (depth > self.tail[0] * most) & (depth < self.tail[1] * most)
+        hangs = free.sum(dim=(2, 3), keepdim=True) > self.least_free * (some & (depth > self.tail[0] * most)).sum(
+            dim=(2, 3), keepdim=True
+        )
+        decay = self.squared_decay(depth.masked_fill(~free, 0.0), curvature)
         pressure = (depth - decay * curvature).masked_fill(~some, 0.0)
         steep = slope.square().sum(dim=1, keepdim=True)
         nearby = _box(torch.cat((steep, steep * torch.sqrt(steep)), dim=1), self.reach // 2)
@@ -105,7 +116,7 @@ class ContactFromDepth(nn.Module):
         found = _box(torch.cat((rim, rim * fields[:, 1:2] / mass.clamp_min(1e-6)), dim=1), self.reach)
         level = found[:, 1:2] / found[:, 0:1].clamp_min(1e-9)
         far = torch.full_like(level, float("inf")).masked_fill(pressed, 0.0)
-        return torch.where(found[:, 0:1] > 1e-9, level, far)
+        return torch.where(hangs, torch.where(found[:, 0:1] > 1e-9, level, far), torch.full_like(level, -float("inf")))
 
     def divergence(self, slope: Tensor, some: Tensor) -> Tensor:
         """Of slopes (B, 2, h, w), per mm; beyond cells without deformed skin, and beyond the border, slopes go on as they are."""
@@ -119,12 +130,9 @@ class ContactFromDepth(nn.Module):
         below, above = torch.cat((below, along_y[..., -1:, :]), 2), torch.cat((along_y[..., :1, :], above), 2)
         return (right - left + below - above) / (2.0 * cell_mm)
 
-    def squared_decay(self, depth: Tensor, curvature: Tensor, some: Tensor) -> Tensor:
-        """L^2 of each frame, (B, 1, 1, 1): that of laplace z = z / L^2 in convex skin of little depth."""
-        most = depth.amax(dim=(2, 3), keepdim=True)
-        free = some & (curvature > 0.0) & (depth > self.tail[0] * most) & (depth < self.tail[1] * most)
-        kept = depth.masked_fill(~free, 0.0)
-        squared = kept.square().sum(dim=(2, 3), keepdim=True) / (kept * curvature).sum(dim=(2, 3), keepdim=True).clamp_min(1e-9)
+    def squared_decay(self, free: Tensor, curvature: Tensor) -> Tensor:
+        """L^2 of each frame, (B, 1, 1, 1): that of laplace z = z / L^2 in free skin, whose depth is given and zero elsewhere."""
+        squared = free.square().sum(dim=(2, 3), keepdim=True) / (free * curvature).sum(dim=(2, 3), keepdim=True).clamp_min(1e-9)
         return squared.clamp(self.decay[0] ** 2, self.decay[1] ** 2)
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 from torch import Tensor, nn
 
 from ..accelerated import Compensate, ContactMask, GradientFromNormal, PoissonBackground
+from ..contact.masks import MOST_FAR_FIELD
 from ..core.checks import check_image
 from ..core.noise import noise_std
 from ..model import Sensor
@@ -28,4 +29,10 @@ def gs_sdk_blocks(weights: str | Path, background: Tensor, sensor: Sensor) -> tu
     flat = compensate(background[None])[0].clamp(0.0, 1.0)
     network.set_flat(flat)
     noise = 2.0**0.5 * noise_std(background[None])[0]  # of the frame and of the background
-    return compensate, ContactMask(flat, noise), network, GradientFromNormal(), PoissonBackground(sensor.mm_per_pixel)
+    return (
+        compensate,
+        ContactMask(flat, noise, far_field=MOST_FAR_FIELD),
+        network,
+        GradientFromNormal(),
+        PoissonBackground(sensor.mm_per_pixel),
+    )

@@ -22,6 +22,7 @@ from ..calibration import (
     channel_structure,
 )
 from ..contact import ContactMask as PlainContactMask
+from ..contact.masks import MOST_FAR_FIELD
 from ..core.blur import blur, gaussian_weights
 from ..core.checks import check_batch, check_integer, check_path, check_sequence
 from ..core.files import VIDEO_SUFFIXES, read_frames
@@ -303,7 +304,5 @@ def contact_in_video(calibration: Calibration, noise: Tensor | None = None) -> P
         compensated = compensated * calibration.gain.float() * 2.0**0.5
     least = STAND_IN_NOISE if stand_in else 0.0
     most = torch.maximum(1.0 / calibrated.per_noise.float(), compensated).clamp_min(least)
-    mask = ContactMask(calibrated.flat.float(), most).eval()
-    if stand_in:
-        mask.most_far_field.clamp_(max=1.0)  # STAND_IN_NOISE is what a press may scatter
-    return mask
+    far_field = 0.0 if stand_in or calibration.response is None else MOST_FAR_FIELD  # STAND_IN_NOISE is what a press may scatter
+    return ContactMask(calibrated.flat.float(), most, far_field=far_field).eval()

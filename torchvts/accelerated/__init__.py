@@ -16,6 +16,7 @@ from .blocks import (
     PoissonBackground,
     PoissonDCT,
     Uncrop,
+    ZeroBackground,
 )
 from .gate import reference_only
 from .kernels import library
@@ -33,6 +34,7 @@ __all__ = [
     "PoissonBackground",
     "PoissonDCT",
     "Uncrop",
+    "ZeroBackground",
     "library",
     "reference",
     "reference_only",

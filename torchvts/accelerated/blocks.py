@@ -9,6 +9,7 @@ from ..compensate.drift import grid_stride
 from ..core import frame as frames
 from ..core import geometry
 from ..core.noise import second_differences, std_from_median
+from ..integration import background
 from ..normals.shadowed import PRIOR_STD, STEPS, LightView
 from . import kernels
 from .gate import arrays_usable, usable
@@ -164,6 +165,17 @@ class PerspectiveIntegration(Twin, integration.PerspectiveIntegration):
 
     plain = integration.PerspectiveIntegration
     poisson = PoissonBackground
+
+
+class ZeroBackground(Twin, background.ZeroBackground):
+    """All grids in one compiled kernel."""
+
+    plain = background.ZeroBackground
+
+    def forward(self, depth_mm: Tensor, deformed: Tensor) -> Tensor:
+        if depth_mm.shape != deformed.shape or not usable(depth_mm):
+            return super().forward(depth_mm, deformed)
+        return kernels.zero_background(depth_mm, deformed, self.stiff, self.tolerance, self.sweeps)
 
 
 class LargestChange(Twin, frames.LargestChange):

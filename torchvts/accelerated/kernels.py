@@ -56,6 +56,7 @@ def library() -> ctypes.CDLL | None:
         *[step] * 2,
         *[pointer] * 5,
     ]
+    loaded.zero_background.argtypes = [pointer, pointer, *[whole] * 3, *[real] * 2, whole, pointer]
     loaded.grid_means.argtypes = [pointer, *[whole] * 7, pointer]
     loaded.slopes.argtypes = [pointer, whole, whole, real, pointer]
     loaded.divergence_lines.argtypes = [pointer, real, *[whole] * 9, pointer]
@@ -267,3 +268,14 @@ def uncrop(gradient: Tensor, window: tuple[int, int], size: tuple[int, int]) -> 
     whole, normal = gradient.new_empty(count, 2, *size), gradient.new_empty(count, 3, *size)
     _loaded().uncrop(gradient.data_ptr(), count, rows, columns, *window, *size, whole.data_ptr(), normal.data_ptr())
     return whole, normal
+
+
+def zero_background(depth_mm: Tensor, deformed: Tensor, stiff: float, tolerance: float, sweeps: int) -> Tensor:
+    """:class:`torchvts.integration.background.ZeroBackground` of depth (B, 1, H, W) and deformed skin, bool (B, 1, H, W)."""
+    depth_mm, deformed = depth_mm.contiguous(), deformed.contiguous()
+    count, _, height, width = depth_mm.shape
+    out = torch.empty_like(depth_mm)
+    numbers = (count, height, width, stiff, tolerance, sweeps)
+    if _loaded().zero_background(depth_mm.data_ptr(), deformed.data_ptr(), *numbers, out.data_ptr()):
+        raise MemoryError(f"depth_mm: no memory for grids of {height} x {width} pixels")
+    return out

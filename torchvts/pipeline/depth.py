@@ -15,6 +15,7 @@ from ..accelerated import (
     NormalFromIntensity,
     PoissonBackground,
     Uncrop,
+    ZeroBackground,
     scriptable,
 )
 from ..compensate import Compensate as PlainCompensate
@@ -33,7 +34,7 @@ from ..core.checks import (
 from ..core.frame import DepthOutput, Solution, depth_in_window, undeformed_output
 from ..integration import PoissonBackground as PlainPoissonBackground
 from ..integration import WrappedIntegrator, as_integrator
-from ..integration.background import DepthAsIs, ZeroBackground
+from ..integration.background import DepthAsIs
 from ..model import Calibration, Sensor, check_calibration
 from ..normals import NormalFromIntensity as PlainNormalFromIntensity
 from ..normals import NormalFromResponse, WrappedNormals, as_normal_model, check_domain
@@ -114,7 +115,9 @@ class DepthPipeline(nn.Module):
         self.solve = Solve(model, gradient, integrator)
         self.refine = self._policy(mode, tolerance_px, refine_threshold_px, min(max_passes, model.max_passes))
         # anyone else's integrator decides by itself where depth is zero
-        self.zero = ZeroBackground() if isinstance(integrator, PlainPoissonBackground) else DepthAsIs()
+        # known lights give slopes that sum to zero around a contact; slopes that were learned within contacts do not
+        exact = isinstance(model, PlainNormalFromIntensity) or not isinstance(integrator, PlainPoissonBackground)
+        self.zero = DepthAsIs() if exact else ZeroBackground()
         self.contact = touching
         self.uncrop = Uncrop()
 

@@ -97,7 +97,7 @@ def located(shift_px):
 
 def test_loop_closure_predicts_a_common_drift():
     """Changes between the two predictions are the shift, to a third: the field has taken over most of it."""
-    family = closure.Family(2, -1, False, 10.0)
+    family = closure.Family(2, -1, 10.0)
     errors = [closure._Rating(family, located(shift)).errors_mm.nanmedian(dim=0).values / PITCH for shift in ((0, 0), (0, 3))]
     moved = errors[1] - errors[0]
     assert abs(float(moved[0])) < 0.7 and float(moved[1]) > 0.7

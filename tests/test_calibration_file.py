@@ -66,7 +66,7 @@ def test_double_precision_survives(ring, tmp_path):
 def test_what_the_paper_keeps_is_in_the_file(saved):
     tensors, metadata = load_tensors(saved)
     assert {"light_position_mm", "light_albedo", "compensation", "inverse"} <= set(tensors)
-    assert metadata["format_version"] == 5 and metadata["sensor"]["mm_per_pixel"] == 1.25
+    assert metadata["format_version"] == 6 and metadata["sensor"]["mm_per_pixel"] == 1.25
 
 
 def no_tensor(name):
@@ -101,10 +101,10 @@ TENSORS = {
     "integers": (put("background", lambda t: t.to(torch.int32)), "tensor 'background': expected .* floats, got .* torch.int32"),
 }  # fmt: skip
 METADATA = {
-    "a later version": (lambda m: m.update(format_version=99), "expected format version 5, got 99: .*update torchvts"),
-    "an earlier version": (lambda m: m.update(format_version=4), "expected format version 5, got 4"),
-    "version as text": (lambda m: m.update(format_version="1"), "format version 5, got '1'"),
-    "no version": (lambda m: m.pop("format_version"), "format version 5, got None"),
+    "a later version": (lambda m: m.update(format_version=99), "expected format version 6, got 99: .*update torchvts"),
+    "an earlier version": (lambda m: m.update(format_version=5), "expected format version 6, got 5"),
+    "version as text": (lambda m: m.update(format_version="1"), "format version 6, got '1'"),
+    "no version": (lambda m: m.pop("format_version"), "format version 6, got None"),
     "another kind": (lambda m: m.update(kind="mesh"), "expected a calibration, got a file of kind 'mesh'"),
     "no sensor": (lambda m: m.pop("sensor"), "expected keys and values, got NoneType"),
     "another sensor": (lambda m: m["sensor"].update(height=48), r"expected \(3, 48, 32\) floats, got \(3, 24, 32\)"),

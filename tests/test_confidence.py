@@ -199,10 +199,10 @@ def made(request, ring):
     return calibration, mode, vts.ConfidentPipeline.from_calibration(calibration, mode), frames
 
 
-def test_the_first_four_fields_are_those_of_the_pipeline(made):
+def test_the_first_five_fields_are_those_of_the_pipeline(made):
     calibration, mode, pipe, frames = made
     out, plain = pipe(frames), vts.DepthPipeline.from_calibration(calibration, mode)(frames)
-    assert out._fields[:4] == plain._fields
+    assert out._fields[:5] == plain._fields
     for found, expected in zip(out, plain):
         assert torch.equal(found, expected)
     assert out.normal_95_deg.shape == out.depth_95_mm.shape == out.confidence.shape == out.contact.shape
@@ -230,8 +230,8 @@ def test_it_scripts_and_pickles_and_keeps_its_state(made):
     buffer.seek(0)
     other.load_state_dict(torch.load(buffer, weights_only=True))
     for again in (scripted(frames), pickle.loads(pickle.dumps(pipe))(frames), other(frames)):
-        for found, wanted in zip(again, expected, strict=True):
-            assert torch.allclose(found.double(), wanted.double(), rtol=1e-3, atol=1e-4)
+        for name, found, wanted in zip(expected._fields, again, expected, strict=True):
+            assert torch.allclose(found.double(), wanted.double(), rtol=1e-3, atol=1e-4), name
 
 
 @pytest.mark.parametrize("made", ["response precise", pytest.param("lights fast", marks=pytest.mark.long)], indirect=True)

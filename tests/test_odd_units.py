@@ -87,7 +87,7 @@ def presses(light, turned=False):
 
 
 def prior(light):
-    field = ResponseField(0, -1, False, 0.5 * WIDTH * PITCH, tuple(map(tuple, RESPONSE.tolist())))
+    field = ResponseField(0, -1, 0.5 * WIDTH * PITCH, tuple(map(tuple, RESPONSE.tolist())))
     return SensorPrior(ResponseModel(field, None), fit_log_background(light, PITCH), 0.5 * WIDTH * PITCH, "drawn")
 
 

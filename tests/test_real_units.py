@@ -25,7 +25,7 @@ def precise(calibration, image):
         return vts.DepthPipeline.from_calibration(calibration, "precise")(image[None])
 
 
-@pytest.mark.parametrize("mode, limit_deg", [("fast", 2.7), ("precise", 3.0)])
+@pytest.mark.parametrize("mode, limit_deg", [("fast", 2.4), ("precise", 2.75)])
 def test_a_second_unit_from_its_background_alone(data, mini, mode, limit_deg):
     background, bead = (vts.read_image(data / "gelsight_mini_b" / name) for name in ("background.png", "bead.png"))
     calibration = vts.calibrate(background, mini)
@@ -33,14 +33,15 @@ def test_a_second_unit_from_its_background_alone(data, mini, mode, limit_deg):
     smooth_rest, smooth = (blur(image[None], gaussian_weights(1.0)) for image in (background, bead))
     own = vts.NormalFromMLP.load(data / "gelsight_mini_b" / "model" / "nnmodel.pth", smooth_rest[0])(smooth)
     out = vts.DepthPipeline.from_calibration(calibration, mode)(bead[None])
-    changed = ((smooth - smooth_rest).abs().amax(1, keepdim=True) > 15 / 255) & out.contact
+    changed = ((smooth - smooth_rest).abs().amax(1, keepdim=True) > 15 / 255) & out.deformed
     assert float(changed.double().mean()) > 0.2
     assert float(metrics.normal_angle_deg(out.normal, own, changed).mean()) < limit_deg
 
 
 def test_the_contact_of_a_unit_whose_light_drifts_is_not_the_whole_frame(data, mini):
     background, bead = (vts.read_image(data / "gelsight_mini_b" / name) for name in ("background.png", "bead.png"))
-    assert float(precise(vts.calibrate(background, mini), bead).contact.double().mean()) < 0.6
+    out = precise(vts.calibrate(background, mini), bead)
+    assert 0.05 < float(out.contact.double().mean()) < 0.2 and float(out.deformed.double().mean()) < 0.4
 
 
 def test_presses_of_one_ball_calibrate_for_another(data, mini):

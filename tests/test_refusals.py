@@ -43,7 +43,7 @@ RECORDS = {
 """Results that users get and do not make: their constructors keep what they are given. (Their methods are in the table.)"""
 PARTS = {
     "Adaptive", "DepthBrightness", "Integrator", "NormalModel", "Once", "Repeat", "ResponseField", "ResponseModel",
-    "SensorPrior", "Shadows", "SlopesOfDepth", "Solve", "WrappedIntegrator", "WrappedNormals", "as_integrator",
+    "SensorPrior", "Shadows", "SlopesOfDepth", "SlopesOfPixels", "Solve", "WrappedIntegrator", "WrappedNormals", "as_integrator",
     "as_normal_model", "by_presses", "channel_structure", "check_calibration", "check_domain", "check_sensor",
     "discontinuity_share", "falloff", "label_contacts", "outwardness", "read_point_cloud", "stream.FrameCheck.",
     "stream.NewestFrame", "stream.Overlay", "stream.Recording.", "stream.RectifySizes", "stream.StageClock",

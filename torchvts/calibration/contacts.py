@@ -34,6 +34,9 @@ DARK = 0.25
 MOST_SATURATED = 0.5
 """A contact with more of it saturated in some channel is left out."""
 
+LIGHT_DRIFT = 0.008
+"""Least noise by which a press differs from the background, relative to it: the LEDs of real sensors drift by 1 to 2 %."""
+
 MAX_SAMPLES = 2000
 """Pixels of a press that enter the fit. More add little, because neighbours are alike."""
 
@@ -114,7 +117,7 @@ def read_contacts(given: Sequence[Press | Touch], background: Tensor, sensor: Se
         sensor: of the unit, with the gamma and blur of the preprocessing.
     """
     unit = unit_without_model(background, sensor)
-    compensate, mask = Compensate.from_calibration(unit).double(), ContactMask.from_calibration(unit).double()
+    compensate, mask = Compensate.from_calibration(unit).double(), _difference(unit)
     contacts = []
     for item in given:
         ratio = compensate(item.image.detach().cpu().double()[None])
@@ -129,6 +132,16 @@ def read_contacts(given: Sequence[Press | Touch], background: Tensor, sensor: Se
             _place(contact, item, sensor)
         contacts.append(contact)
     return contacts
+
+
+def _difference(unit: Calibration) -> ContactMask:
+    """The mask of what differs from the background by the noise of calibration alone: what changes far from a contact counts too.
+
+    From that, :func:`far_field` tells a contact from light that has changed everywhere.
+    """
+    mask = ContactMask(unit.flat, unit.compensated_noise_std.clamp_min(LIGHT_DRIFT)).double()
+    mask.most_far_field.zero_()
+    return mask
 
 
 def _sampled(given: Press | Touch, change: Tensor, mask: Tensor, saturated: Tensor, sensor: Sensor) -> Contact:

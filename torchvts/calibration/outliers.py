@@ -113,7 +113,7 @@ def _uncertainty(contacts: list[Contact], half_mm: float) -> Tensor:
     The standard deviation of the slopes along the ball's, by the normal equations of the others. It is large where no other press
     lies near, and where little light changes.
     """
-    family = Family(2 if len(contacts) >= 8 else 1, -1, False, half_mm)
+    family = Family(2 if len(contacts) >= 8 else 1, -1, half_mm)
     evidence = Evidence.of(family, contacts)
     penalty = torch.diag(SCREENING_PENALTY * family.penalty())
     spreads = []

@@ -193,7 +193,7 @@ def _mini_c(folder: Path, limit: int | None) -> DataSet:
     height, width = images.shape[2:]
     top, left = round(height / 7), round(width / 7)
     roi = (left, top, width - 2 * left, height - 2 * top)
-    images = dataclasses.replace(sensor, roi_px=roi).rectify(images)
+    images = dataclasses.replace(sensor, roi_px=roi, raw_size_px=()).rectify(images)
     presses = [Press(image, 4.0, file.stem) for image, file in zip(images, files, strict=True)]
     return _halves(folder.name, images.median(0).values, sensor, presses, "background: median of the presses")
 

@@ -3,7 +3,7 @@
 from ..core.frame import DepthOutput
 from .confidence import Bounds, Confidence, ConfidentOutput, ConfidentPipeline, bound_at
 from .depth import MODES, DepthPipeline
-from .refine import Adaptive, Once, Repeat, SlopesOfDepth
+from .refine import Adaptive, Once, Repeat, SlopesOfDepth, SlopesOfPixels
 from .shadows import Shadows
 from .solve import Solve
 
@@ -20,6 +20,7 @@ __all__ = [
     "Repeat",
     "Shadows",
     "SlopesOfDepth",
+    "SlopesOfPixels",
     "Solve",
     "bound_at",
 ]

@@ -39,7 +39,7 @@ from ..model import Calibration, Sensor, check_calibration
 from ..normals import NormalFromIntensity as PlainNormalFromIntensity
 from ..normals import NormalFromResponse, WrappedNormals, as_normal_model, check_domain
 from .gs_sdk import gs_sdk_blocks
-from .refine import Adaptive, Once, Repeat, SlopesOfDepth
+from .refine import Adaptive, Once, Repeat, SlopesOfDepth, SlopesOfPixels
 from .shadows import Shadows
 from .solve import Solve
 
@@ -50,7 +50,8 @@ STRIDE = 8
 
 
 class DepthPipeline(nn.Module):
-    """Images (B, 3, H, W) to a :class:`DepthOutput`: compensate, deformed, crop, solve, refine, zero, contact, uncrop.
+    """Images (B, 3, H, W) to a :class:`DepthOutput`: compensate, deformed, crop, solve, refine, zero, slopes, contact,
+    uncrop.
 
     ``fast`` solves once (eq. 9). ``precise`` solves again with the depth found (eq. 10), until what is still missing falls below
     ``tolerance_px``; for response fields gradient and normals are then those of the depth. ``auto`` skips frames without deformed
@@ -118,16 +119,15 @@ class DepthPipeline(nn.Module):
         # known lights give slopes that sum to zero around a contact; slopes that were learned within contacts do not
         exact = isinstance(model, PlainNormalFromIntensity) or not isinstance(integrator, PlainPoissonBackground)
         self.zero = DepthAsIs() if exact else ZeroBackground()
+        self.slopes = SlopesOfDepth(mm_per_pixel) if mode != "fast" and model.normals_from_depth else SlopesOfPixels()
         self.contact = touching
         self.uncrop = Uncrop()
 
     def _policy(self, mode: str, tolerance_px: float, refine_threshold_px: float, max_passes: int) -> nn.Module:
-        """The refinement of a mode: Once, Repeat, Adaptive; around it for lights Shadows, for response fields SlopesOfDepth."""
+        """The refinement of a mode: Once, Repeat, Adaptive; around it for lights Shadows."""
         model, pitch = self.solve.normals, self.mm_per_pixel
-        if mode == "fast" or not (model.uses_depth or model.normals_from_depth):
+        if mode == "fast" or not model.uses_depth:
             return Once()
-        if not model.uses_depth:
-            return SlopesOfDepth(Once(), pitch)
         coarse = model.coarse(STRIDE) if mode == "auto" and model.takes_window else None
         if mode == "auto":
             tolerance_px = max(tolerance_px, 0.2 * refine_threshold_px)
@@ -136,8 +136,6 @@ class DepthPipeline(nn.Module):
         else:
             grid = (coarse, PoissonBackground(STRIDE * pitch), pitch)
             policy = Adaptive(self.solve, LargestChange(), *grid, tolerance_px, max_passes, refine_threshold_px, STRIDE)
-        if model.normals_from_depth:
-            return SlopesOfDepth(policy, pitch)
         if not isinstance(model, PlainNormalFromIntensity):
             return policy
         deformed = self.deformed if isinstance(self.deformed, PlainContactMask) else None
@@ -223,6 +221,7 @@ class DepthPipeline(nn.Module):
         solution = self.solve(frame)  # eq. 9, 5, 4
         frame, solution = self.refine(frame, solution)  # eq. 10
         solution = Solution(solution.gradient, self.zero(solution.depth_mm, frame.deformed))
+        solution = self.slopes(frame, solution)
         contact = self.contact(depth_in_window(frame, solution.depth_mm), solution.gradient, frame.mask)
         out: DepthOutput = self.uncrop(frame, solution, contact)
         return out

@@ -99,22 +99,26 @@ class Repeat(nn.Module):
 
 
 class SlopesOfDepth(nn.Module):
-    """A policy, and then the gradient of the depth in place of that of single pixels: it is the slope of a surface.
+    """The gradient of the depth in place of that of single pixels: it is the slope of a surface.
 
     Args:
-        policy: a refinement.
         mm_per_pixel: pixel pitch, mm.
     """
 
-    def __init__(self, policy: nn.Module, mm_per_pixel: float) -> None:
+    def __init__(self, mm_per_pixel: float) -> None:
         super().__init__()
-        self.policy = policy
         self.mm_per_pixel = mm_per_pixel
 
-    def forward(self, frame: Frame, solution: Solution) -> tuple[Frame, Solution]:
-        frame, solution = self.policy(frame, solution)
+    def forward(self, frame: Frame, solution: Solution) -> Solution:
         gradient = gradient_of_depth(depth_in_window(frame, solution.depth_mm), self.mm_per_pixel)
-        return frame, Solution(gradient * as_factor(frame.mask, gradient), solution.depth_mm)
+        return Solution(gradient * as_factor(frame.mask, gradient), solution.depth_mm)
+
+
+class SlopesOfPixels(nn.Module):
+    """The gradient as it was found, pixel by pixel."""
+
+    def forward(self, frame: Frame, solution: Solution) -> Solution:
+        return solution
 
 
 class Adaptive(Repeat):

@@ -137,6 +137,15 @@ def may_read_values() -> bool:
         return not torch.compiler.is_exporting()
 
 
+def reads_freely(tensor: Tensor) -> bool:
+    """Whether Python may compare the values of a tensor at once: a plain one on a CPU, in eager mode."""
+    if torch.compiler.is_compiling() or tensor.device.type != "cpu" or torch._C._get_tracing_state() is not None:
+        return False
+    if torch._C._len_torch_dispatch_stack() > 0:  # tensors without values
+        return False
+    return not torch._C._functorch.is_functorch_wrapped_tensor(tensor)
+
+
 def check_window(name: str, tensor: Tensor, size: tuple[int, int], window: tuple[int, int] | None) -> tuple[int, int]:
     """Return (top, left) of ``tensor`` in an image of ``size``; without a window it must be the whole image. Scripts."""
     if window is None:

@@ -39,3 +39,13 @@ def test_trained_lights_count_without_gradients(mode: str, without_gradients: ty
     assert float((found - recorded).abs().max()) < 1e-5
     assert float((pipe.requires_grad_(False)(image).depth_mm - recorded).abs().max()) < 1e-5
     assert float((torch.jit.script(pipe)(image).depth_mm - recorded).abs().max()) < 1e-5
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
+def test_compiles_with_inductor(mode: str) -> None:
+    pipe, image = vts.DepthPipeline.from_calibration(rig(), mode), press()
+    with torch.no_grad():
+        compiled = torch.compile(pipe, fullgraph=mode == "fast")(image)
+        for found, expected in zip(compiled, pipe(image), strict=True):
+            assert float((found.double() - expected.double()).abs().max()) < 1e-5

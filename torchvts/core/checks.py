@@ -130,11 +130,11 @@ def check_same_count(name: str, tensor: Tensor, other_name: str, count: int) -> 
 
 
 def may_read_values() -> bool:
-    """Whether Python may branch on values of tensors: always, except while torch.export traces. Scripts."""
+    """Whether Python may branch on values of tensors: always, except while torch.export or torch.compile traces. Scripts."""
     if torch.jit.is_scripting():
         return True
     else:  # noqa: RET505, TorchScript needs the else to skip this branch
-        return not torch.compiler.is_exporting()
+        return not torch.compiler.is_compiling()
 
 
 def reads_freely(tensor: Tensor) -> bool:

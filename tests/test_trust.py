@@ -1,8 +1,13 @@
 """Defects found by an attack on the library: wrong answers without a word, and what PyTorch's own tools could not do."""
 
+import copy
+import pickle
+from collections.abc import Callable
+
 import pytest
 import torch
 from torch import Tensor
+from torch._subclasses import FakeTensorMode
 
 import torchvts as vts
 
@@ -49,3 +54,54 @@ def test_compiles_with_inductor(mode: str) -> None:
         compiled = torch.compile(pipe, fullgraph=mode == "fast")(image)
         for found, expected in zip(compiled, pipe(image), strict=True):
             assert float((found.double() - expected.double()).abs().max()) < 1e-5
+
+
+@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_refused(mode: str, dtype: torch.dtype) -> None:
+    for pipe in (vts.DepthPipeline.from_calibration(rig(), mode), vts.DepthPipeline.from_calibration(rig(), mode).to(dtype)):
+        with pytest.raises(TypeError, match=r"images: expected float32 or float64, got torch\..*float16: .*use \.float\(\)"):
+            pipe(press().to(dtype))
+
+
+def _derivatives(module: torch.nn.Module, image: Tensor) -> list[Callable[[], object]]:
+    def loss(given: Tensor) -> Tensor:
+        out = module(given)
+        return (out.depth_mm if isinstance(out, vts.DepthOutput) else out).square().mean()
+
+    return [
+        lambda: torch.func.grad(loss)(image),
+        lambda: torch.func.vjp(loss, image)[1](torch.ones(())),
+        lambda: torch.func.jvp(loss, (image,), (torch.ones_like(image),)),
+        lambda: torch.func.jacrev(loss)(image),
+    ]
+
+
+@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
+def test_transforms_leave_a_pipeline_as_it_was(mode: str) -> None:
+    image = press()
+    pipe = vts.DepthPipeline.from_calibration(rig(), mode)
+    expected = torch.func.grad(lambda x: pipe(x).depth_mm.square().mean())(image)
+    recorded = image.clone().requires_grad_(True)
+    vts.DepthPipeline.from_calibration(rig(), mode)(recorded).depth_mm.square().mean().backward()
+    assert recorded.grad is not None
+    assert float((recorded.grad - expected).abs().max()) < 1e-6 * float(expected.abs().max())
+    for transform in range(4):
+        pipe = vts.DepthPipeline.from_calibration(rig(), mode)
+        _derivatives(pipe, image)[transform]()
+        assert torch.equal(copy.deepcopy(pipe)(image).depth_mm, pipe(image).depth_mm)
+        pickle.dumps(pipe)
+
+
+@pytest.mark.filterwarnings("ignore:There is a performance drop")  # of vmap, whose rule for one operator PyTorch lacks
+@pytest.mark.parametrize("kind", [vts.PoissonDST, vts.PoissonDCT, vts.PoissonBackground])
+def test_transforms_leave_a_solver_as_it_was(kind: type[vts.PoissonDCT]) -> None:
+    gradient = torch.randn(3, 2, 24, 32, generator=torch.Generator().manual_seed(0))
+    for transform in range(5):
+        solver = kind(0.1)
+        calls = [*_derivatives(solver, gradient), lambda solver=solver: torch.func.vmap(lambda x: solver(x[None])[0])(gradient)]
+        calls[transform]()
+        with FakeTensorMode() as mode:
+            assert solver(mode.from_tensor(gradient)).shape == (3, 1, 24, 32)
+        pickle.dumps(solver)
+        assert torch.equal(copy.deepcopy(solver)(gradient), kind(0.1)(gradient))

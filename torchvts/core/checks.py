@@ -110,6 +110,8 @@ def check_batch(name: str, tensor: Tensor, channels: int) -> None:
         raise ValueError(f"{name}: expected images of at least one pixel, got {list(tensor.shape)}: was the file empty?")
     if not tensor.is_floating_point():
         raise TypeError(f"{name}: expected a floating-point tensor, got {tensor.dtype}: images are value / 255 in [0, 1]")
+    if tensor.dtype == torch.float16 or tensor.dtype == torch.bfloat16:
+        raise TypeError(f"{name}: expected float32 or float64, got {tensor.dtype}: too few bits for depth; use .float()")
 
 
 def check_same_size(name: str, tensor: Tensor, other_name: str, height: int, width: int) -> None:

@@ -140,7 +140,9 @@ class NormalFromIntensity(NormalModel):
         In eager mode on a CPU, where reading twelve numbers costs nothing; elsewhere nothing that is stored is used.
         """
         position, albedo = self.lights.position_mm, self.lights.albedo
-        if not reads_freely(position) or (torch.equal(position, self.stored_position_mm) and torch.equal(albedo, self.stored_albedo)):
+        if not reads_freely(position) or (
+            torch.equal(position, self.stored_position_mm) and torch.equal(albedo, self.stored_albedo)
+        ):
             return
         with torch.inference_mode(False), torch.no_grad():
             height, width = self.inverse.shape[2], self.inverse.shape[3]

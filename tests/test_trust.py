@@ -3,6 +3,7 @@
 import copy
 import pickle
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
@@ -105,3 +106,33 @@ def test_transforms_leave_a_solver_as_it_was(kind: type[vts.PoissonDCT]) -> None
             assert solver(mode.from_tensor(gradient)).shape == (3, 1, 24, 32)
         pickle.dumps(solver)
         assert torch.equal(copy.deepcopy(solver)(gradient), kind(0.1)(gradient))
+
+
+@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
+@pytest.mark.parametrize(
+    ("other", "named"),
+    [
+        ({"gamma": 2.2}, "gamma"),
+        ({"mm_per_pixel": 0.5}, "mm_per_pixel"),
+        ({"blur_px": 2.0}, "std_px"),
+    ],
+)
+def test_a_state_of_another_unit_is_refused(mode: str, other: dict[str, float], named: str) -> None:
+    lights = rig().lights
+    assert lights is not None
+    kinds = {"mm_per_pixel": PITCH, **other}
+    state = vts.DepthPipeline.from_calibration(
+        vts.Calibration.from_lights(lights, vts.Sensor("rig", HEIGHT, WIDTH, **kinds)), mode
+    ).state_dict()
+    with pytest.raises((ValueError, RuntimeError), match=named):
+        vts.DepthPipeline.from_calibration(rig(), mode).load_state_dict(state)
+
+
+def test_a_state_of_the_same_unit_loads(tmp_path: Path) -> None:
+    trained = vts.DepthPipeline.from_calibration(rig(), "precise")
+    with torch.no_grad():
+        trained.normals.lights.position_mm.add_(0.5)
+    torch.save(trained.state_dict(), tmp_path / "state.pt")
+    pipe = vts.DepthPipeline.from_calibration(rig(), "precise")
+    pipe.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
+    assert torch.equal(pipe(press()).depth_mm, trained(press()).depth_mm)

@@ -28,6 +28,7 @@ from ..core.checks import (
     may_read_values,
 )
 from ..core.frame import DepthOutput, undeformed_output
+from ..core.settings import check_settings, settings_as_tensor
 from ..integration import WrappedIntegrator, as_integrator
 from ..model import Calibration, check_calibration
 from ..normals import NormalFromIntensity as PlainNormalFromIntensity
@@ -196,6 +197,14 @@ class DepthPipeline(nn.Module):
 
     def __prepare_scriptable__(self) -> nn.Module:
         return scriptable(self)
+
+    def get_extra_state(self) -> Tensor:
+        """Numbers that determine the output and are no parameters, such as gamma and the pitch: part of ``state_dict()``."""
+        return settings_as_tensor(self)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Refuse the state of a pipeline with other settings, such as another unit's."""
+        check_settings(self, state)
 
     def extra_repr(self) -> str:
         return f"mode={self.mode}, mm_per_pixel={self.mm_per_pixel}"

@@ -4,6 +4,8 @@ from typing import TypeVar
 
 from torch import nn
 
+from ..normals import NormalFromIntensity as PlainNormalFromIntensity
+
 _Module = TypeVar("_Module", bound=nn.Module)
 
 
@@ -29,6 +31,8 @@ def reference(module: _Module, memo: dict[int, nn.Module] | None = None) -> _Mod
     """
     memo = {} if memo is None else memo
     if id(module) not in memo:
+        if isinstance(module, PlainNormalFromIntensity):
+            module.follow_lights()  # a copy may be a graph's, in which what is stored of the lights stands
         kind = module.plain if isinstance(module, Twin) else type(module)
         copy = kind.__new__(kind)
         copy.__dict__.update(module.__dict__)

@@ -1,5 +1,7 @@
 """From a camera's image to the compensated image: a chain of blocks that each do one thing."""
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor, nn
 
@@ -96,6 +98,10 @@ class Compensate(nn.Module):
         return compensate
 
     drift_block = Drift
+
+    if TYPE_CHECKING:
+
+        def __call__(self, image: Tensor) -> Tensor: ...
 
     def forward(self, image: Tensor) -> Tensor:
         """(B, 3, H, W) image in [0, 1] to (B, 3, H, W) linear light."""

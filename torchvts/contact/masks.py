@@ -4,7 +4,7 @@ Fine pixels decide the rim; a grid of coarse cells decides what is a hole and wh
 """
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -114,6 +114,10 @@ class ContactMask(nn.Module):
         check_record("settings", settings, ContactSettings, "ContactSettings() makes one")
         far_field = 0.0 if calibration.response is None else MOST_FAR_FIELD  # a rig that lights explain scatters none
         return cls(calibration.flat, calibration.compensated_noise_std, settings.sigmas, settings.min_size_px, far_field)
+
+    if TYPE_CHECKING:
+
+        def __call__(self, compensated: Tensor) -> Tensor: ...
 
     def forward(self, compensated: Tensor) -> Tensor:
         """Where the skin has moved in compensated images (B, 3, H, W), bool (B, 1, H, W)."""

@@ -4,6 +4,8 @@ Skin in contact follows the object; around the contact it hangs free, down to wh
 gel obeys p = z - L^2 laplace z, p being the pressure on it, as a depth, and L the length on which free skin decays.
 """
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor, nn
 
@@ -58,6 +60,10 @@ class ContactFromDepth(nn.Module):
             self.cell *= 2
         self.reach = min(60, max(1, round(RIM_MM / (self.cell * mm_per_pixel))))
         self.decay, self.tail, self.least_free = DECAY_MM, TAIL, LEAST_FREE
+
+    if TYPE_CHECKING:
+
+        def __call__(self, depth_mm: Tensor, gradient: Tensor, deformed: Tensor) -> Tensor: ...
 
     def forward(self, depth_mm: Tensor, gradient: Tensor, deformed: Tensor) -> Tensor:
         """Contact of frames, or of windows of them.

@@ -110,6 +110,8 @@ def check_batch(name: str, tensor: Tensor, channels: int) -> None:
         raise ValueError(f"{name}: expected images of at least one pixel, got {list(tensor.shape)}: was the file empty?")
     if not tensor.is_floating_point():
         raise TypeError(f"{name}: expected a floating-point tensor, got {tensor.dtype}: images are value / 255 in [0, 1]")
+    if tensor.dtype == torch.float16 or tensor.dtype == torch.bfloat16:
+        raise TypeError(f"{name}: expected float32 or float64, got {tensor.dtype}: too few bits for depth; use .float()")
 
 
 def check_same_size(name: str, tensor: Tensor, other_name: str, height: int, width: int) -> None:
@@ -130,11 +132,20 @@ def check_same_count(name: str, tensor: Tensor, other_name: str, count: int) -> 
 
 
 def may_read_values() -> bool:
-    """Whether Python may branch on values of tensors: always, except while torch.export traces. Scripts."""
+    """Whether Python may branch on values of tensors: always, except while torch.export or torch.compile traces. Scripts."""
     if torch.jit.is_scripting():
         return True
     else:  # noqa: RET505, TorchScript needs the else to skip this branch
-        return not torch.compiler.is_exporting()
+        return not torch.compiler.is_compiling()
+
+
+def reads_freely(tensor: Tensor) -> bool:
+    """Whether Python may compare the values of a tensor at once: a plain one on a CPU, in eager mode."""
+    if torch.compiler.is_compiling() or tensor.device.type != "cpu" or torch._C._get_tracing_state() is not None:
+        return False
+    if torch._C._len_torch_dispatch_stack() > 0:  # tensors without values
+        return False
+    return not torch._C._functorch.is_functorch_wrapped_tensor(tensor)
 
 
 def check_window(name: str, tensor: Tensor, size: tuple[int, int], window: tuple[int, int] | None) -> tuple[int, int]:

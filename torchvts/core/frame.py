@@ -145,7 +145,8 @@ class LargestChange(nn.Module):
 
 def undeformed_output(frame: Frame) -> DepthOutput:
     """The output for frames without deformed skin: depth zero, normals towards the camera."""
-    zero = torch.zeros_like(frame.compensated)
-    normal = zero.clone()
+    like = frame.compensated
+    normal = torch.zeros_like(like)
     normal[:, 2] = 1.0
-    return DepthOutput(zero[:, 0:1], zero[:, 0:2], normal, torch.zeros_like(frame.deformed), frame.deformed)
+    contact = torch.zeros_like(frame.deformed)
+    return DepthOutput(torch.zeros_like(like[:, 0:1]), torch.zeros_like(like[:, 0:2]), normal, contact, frame.deformed)

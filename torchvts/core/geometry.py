@@ -1,5 +1,7 @@
 """Conversions between depth, gradient, normal and points, in the axes of docs/conventions.md."""
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor, nn
 
@@ -118,6 +120,10 @@ class GradientFromNormal(nn.Module):
     def __init__(self, max_slope: float = MAX_SLOPE) -> None:
         super().__init__()
         self.max_slope = check_positive("max_slope", max_slope)
+
+    if TYPE_CHECKING:
+
+        def __call__(self, normal: Tensor) -> Tensor: ...
 
     def forward(self, normal: Tensor) -> Tensor:
         return gradient_from_normal(normal, self.max_slope)

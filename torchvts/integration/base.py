@@ -1,5 +1,7 @@
 """What an integrator declares, and the adapter that makes an integrator of any ``nn.Module``."""
 
+from typing import TYPE_CHECKING
+
 from torch import Tensor, nn
 
 from ..core.checks import check_batch, check_record, check_window
@@ -7,6 +9,12 @@ from ..core.checks import check_batch, check_record, check_window
 
 class Integrator(nn.Module):
     """Base of modules that map a gradient to depth. A subclass overrides ``forward``."""
+
+    if TYPE_CHECKING:
+
+        def __call__(
+            self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None
+        ) -> Tensor: ...
 
     def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
         """Depth of the whole image from the gradient of a window, which is zero elsewhere.

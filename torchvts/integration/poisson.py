@@ -130,7 +130,8 @@ class PoissonDST(Integrator):
         plan = self._plan
         if not _plan_fits(plan, gradient, gradient.shape[2], gradient.shape[3]):
             plan = _kept(_plan_dst(gradient))
-            self._plan = plan
+            if _plain(plan[2]):
+                self._plan = plan
         return _integrate_dst(gradient, self.mm_per_pixel, plan)
 
 
@@ -154,7 +155,8 @@ class PoissonDCT(Integrator):
         plan = self._plan
         if not _plan_fits(plan, gradient, height, width):
             plan = _kept(_plan_dct(gradient, height, width))
-            self._plan = plan
+            if _plain(plan[2]):
+                self._plan = plan
         if gradient.shape[0] == 0:
             return gradient.new_zeros([0, 1, height, width])
         return self.integrate(gradient, plan, top, left)
@@ -240,6 +242,16 @@ def _kept(plan: list[Tensor]) -> list[Tensor]:
     return plan
 
 
+def _plain(table: Tensor) -> bool:
+    """Whether a table outlives this call: not one of a transform of torch.func, or without values. Scripts."""
+    if torch.jit.is_scripting():
+        return True
+    else:  # noqa: RET505, TorchScript needs the else to skip this branch
+        if torch.compiler.is_compiling():
+            return True
+        return torch._C._len_torch_dispatch_stack() == 0 and not torch._C._functorch.is_functorch_wrapped_tensor(table)
+
+
 def _plan_dst(gradient: Tensor) -> list[Tensor]:
     even_y, odd_y, value_even_y, value_odd_y = sine_bases(gradient.shape[2] - 2)
     even_x, odd_x, value_even_x, value_odd_x = sine_bases(gradient.shape[3] - 2)
@@ -270,7 +282,7 @@ def _plan(
 
 def _plan_fits(plan: list[Tensor], gradient: Tensor, height: int, width: int) -> bool:
     table = plan[2]  # real: inverse eigenvalues
-    same_kind = table.dtype == gradient.dtype and table.device == gradient.device
+    same_kind = table.dtype == gradient.dtype and table.device == gradient.device and _plain(table)
     if len(plan) == 12:
         return same_kind and plan[0].shape[0] + plan[6].shape[0] == height - 2 and plan[1].shape[0] + plan[4].shape[0] == width - 2
     return same_kind and plan[-2].shape[0] == height and plan[-1].shape[0] == width

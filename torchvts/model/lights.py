@@ -1,6 +1,7 @@
 """The forward model: image of a skin under one near point light per colour channel, and its inverse at known depth."""
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -56,6 +57,10 @@ class PointLights(nn.Module):
         self.albedo = nn.Parameter(rho.detach().clone())
         self.register_buffer("gloss", shine.clone())
         self.glossy = bool((shine > 0).any())
+
+    if TYPE_CHECKING:
+
+        def __call__(self, depth_mm: Tensor, normal: Tensor, mm_per_pixel: float, camera_height_mm: float = math.inf) -> Tensor: ...
 
     def forward(self, depth_mm: Tensor, normal: Tensor, mm_per_pixel: float, camera_height_mm: float = math.inf) -> Tensor:
         check_batch("depth_mm", depth_mm, 1)

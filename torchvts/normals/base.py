@@ -1,5 +1,7 @@
 """What a model of normals declares, and the adapter that makes a model of any ``nn.Module``."""
 
+from typing import TYPE_CHECKING
+
 from torch import Tensor, nn
 
 from ..core.checks import check_record
@@ -46,6 +48,10 @@ class NormalModel(nn.Module):
     max_passes: int = 1000
     takes_window: bool = False
     input_domain: str | None = None
+
+    if TYPE_CHECKING:
+
+        def __call__(self, image: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor: ...
 
     def forward(self, image: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
         """Normals of a compensated image.

@@ -16,12 +16,14 @@ from ..core.checks import (
     check_shape,
     check_size,
     check_window,
+    may_read_values,
+    reads_freely,
 )
 from ..core.geometry import normal_from_gradient, slope_of_depth
 from ..model.calibration import Calibration, check_calibration
 from ..model.lights import PointLights, flat_image, gloss_lobe, inverse_light_matrix, normal_at_depth
 from .base import NormalModel
-from .shadowed import PRIOR_STD, LightView, ShadowedPixels, matrix_in_view
+from .shadowed import LightView, ShadowedPixels, matrix_in_view
 
 
 class NormalFromIntensity(NormalModel):
@@ -31,6 +33,7 @@ class NormalFromIntensity(NormalModel):
     depth (eq. 10). Where a light is blocked (its channel below three times its noise), a channel is saturated or the light
     matrix is ill-conditioned, :class:`~torchvts.normals.shadowed.ShadowedPixels` replaces that normal; elsewhere nothing
     changes. While gradients are recorded for the lights (``requires_grad_(True)``), the matrix is built from them at every call.
+    The stored inverse follows the lights: it is computed again where they are no longer those that it was made of.
 
     Args:
         lights: the three lights.
@@ -54,6 +57,8 @@ class NormalFromIntensity(NormalModel):
     takes_window: bool = True
     input_domain: str | None = "light"
     inverse: Tensor
+    stored_position_mm: Tensor
+    stored_albedo: Tensor
 
     def __init__(
         self,
@@ -71,20 +76,19 @@ class NormalFromIntensity(NormalModel):
         check_size(height, width, mm_per_pixel)
         self.mm_per_pixel = mm_per_pixel
         self.camera_height_mm = check_camera_height(camera_height_mm)
-        position, albedo = lights.position_mm.detach(), lights.albedo.detach()
+        self.lights = PointLights(lights.position_mm.detach(), lights.albedo.detach(), lights.gloss).requires_grad_(False)
         if inverse is None:
-            inverse = inverse_light_matrix(position.new_zeros(1, 1, height, width), position, albedo, mm_per_pixel)[0]
+            inverse = self._inverse_of_lights(height, width)
         check_shape("inverse", inverse, (3, 3, height, width))
-        self.lights = PointLights(position, albedo, lights.gloss).requires_grad_(False)
         noise = torch.full((3,), QUANTISATION_STD) if noise_std is None else noise_std
         check_shape("noise_std", noise, (3,))
         if not bool((noise >= 0).all()):
             raise ValueError(f"noise_std: expected values of at least 0, got {noise.tolist()}")
         self.register_buffer("inverse", inverse.detach().clone())
-        noise_level = max(float(noise.square().mean().sqrt()), 1e-6)
-        ill_conditioned = ~(noise_level * inverse.detach().square().sum(dim=(0, 1)).sqrt() <= PRIOR_STD)  # infinite ones too
+        self.register_buffer("stored_position_mm", self.lights.position_mm.detach().clone(), persistent=False)
+        self.register_buffer("stored_albedo", self.lights.albedo.detach().clone(), persistent=False)
         flat = flat_image(self.lights, height, width, mm_per_pixel).to(inverse.dtype)
-        self.shadowed = ShadowedPixels(flat, noise, ill_conditioned, saturated_above)
+        self.shadowed = ShadowedPixels(flat, noise, self.inverse, saturated_above)
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, camera_height_mm: float = math.inf) -> "NormalFromIntensity":
@@ -120,6 +124,8 @@ class NormalFromIntensity(NormalModel):
             check_same_size("expected", expected, "compensated", image.shape[2], image.shape[3])
             check_same_count("expected", expected, "compensated", image.shape[0])
             expected = expected.expand(image.shape[0], 2, image.shape[2], image.shape[3])
+        if not torch.jit.is_scripting():
+            self.follow_lights()
         place = check_window("compensated", image, (self.inverse.shape[2], self.inverse.shape[3]), window)
         if depth_mm is not None:
             check_batch("depth_mm", depth_mm, 1)
@@ -128,6 +134,28 @@ class NormalFromIntensity(NormalModel):
         if image.shape[0] == 0:
             return image
         return self.normals_of(image, depth_mm, place, expected)
+
+    def follow_lights(self) -> None:
+        """Compute what is stored of the lights again if they have changed since, as by an optimiser.
+
+        In eager mode on a CPU, where reading twelve numbers costs nothing; elsewhere nothing that is stored is used.
+        """
+        position, albedo = self.lights.position_mm, self.lights.albedo
+        if not reads_freely(position) or (
+            torch.equal(position, self.stored_position_mm) and torch.equal(albedo, self.stored_albedo)
+        ):
+            return
+        with torch.inference_mode(False), torch.no_grad():
+            height, width = self.inverse.shape[2], self.inverse.shape[3]
+            self.inverse = self._inverse_of_lights(height, width).to(self.inverse.dtype)
+            flat = flat_image(self.lights, height, width, self.mm_per_pixel).detach().to(self.inverse.dtype)
+            self.shadowed.follow(flat, self.inverse)
+            self.stored_position_mm, self.stored_albedo = position.detach().clone(), albedo.detach().clone()
+
+    def _inverse_of_lights(self, height: int, width: int) -> Tensor:
+        """(3, 3, H, W): the inverse light matrix at the undeformed skin."""
+        position, albedo = self.lights.position_mm.detach(), self.lights.albedo.detach()
+        return inverse_light_matrix(position.new_zeros(1, 1, height, width), position, albedo, self.mm_per_pixel)[0]
 
     def normals_of(self, image: Tensor, depth_mm: Tensor | None, window: tuple[int, int], expected: Tensor | None) -> Tensor:
         """Normals of checked arguments; compiled kernels take the place of this method."""
@@ -143,7 +171,7 @@ class NormalFromIntensity(NormalModel):
         if depth_mm is not None:
             return normal_at_depth(image, depth_mm, position, albedo, pitch, view.camera_height_mm, view.axis_mm)
         height, width = image.shape[2], image.shape[3]
-        if torch.is_grad_enabled() and (position.requires_grad or albedo.requires_grad):
+        if self.built_from_lights(image):
             return normal_at_depth(image, image.new_zeros(1, 1, height, width), position, albedo, pitch)
         top, left = view.window
         inverse = self.inverse[None, :, :, top : top + height, left : left + width]
@@ -151,6 +179,16 @@ class NormalFromIntensity(NormalModel):
         normal = torch.addcmul(normal, inverse[:, :, 2], image[:, 2:3])
         n_x, n_y, n_z = normal[:, 0:1], normal[:, 1:2], normal[:, 2:3]
         return normal * torch.rsqrt(torch.addcmul(torch.addcmul(n_x * n_x, n_y, n_y), n_z, n_z) + 1e-24)
+
+    def built_from_lights(self, image: Tensor) -> bool:
+        """Whether the matrix is built at this call: gradients are recorded, or the stored one may not follow the lights."""
+        lights = self.lights
+        if torch.is_grad_enabled() and (lights.position_mm.requires_grad or lights.albedo.requires_grad):
+            return True
+        if torch.jit.is_scripting():
+            return False
+        else:  # noqa: RET505, TorchScript needs the else to skip this branch
+            return may_read_values() and not reads_freely(lights.position_mm)
 
     def without_gloss(self, image: Tensor, depth_mm: Tensor | None, view: LightView) -> Tensor:
         """What a matt skin would show: the specular lobe divided out, at the slope of the depth so far."""

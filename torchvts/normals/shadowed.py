@@ -155,7 +155,7 @@ class ShadowedPixels(nn.Module):
     Args:
         flat: (3, H, W), what the lights give on the flat skin.
         noise_std: (3,), noise of the compensated image.
-        ill_conditioned: (H, W) bool.
+        inverse: (3, 3, H, W), the inverse light matrix at the flat skin.
         saturated_above: (3, H, W), intensity from which a channel counts as saturated; None for never.
     """
 
@@ -164,21 +164,26 @@ class ShadowedPixels(nn.Module):
     saturated_above: Tensor
     ill_conditioned: Tensor
 
-    def __init__(self, flat: Tensor, noise_std: Tensor, ill_conditioned: Tensor, saturated_above: Tensor | None) -> None:
+    def __init__(self, flat: Tensor, noise_std: Tensor, inverse: Tensor, saturated_above: Tensor | None) -> None:
         super().__init__()
         self.left_out = LEFT_OUT
         self.noise_std = max(float(noise_std.square().mean().sqrt()), 1e-6)
         self.brightness_std = max(0.005, BRIGHTNESS_NOISES * self.noise_std)
         self.register_buffer("dark_below", 3.0 * noise_std.detach().to(flat.dtype))
+        self.follow(flat, inverse)
+        if saturated_above is not None:
+            check_shape("saturated_above", saturated_above, flat.shape)
+        above = torch.full_like(flat, torch.inf) if saturated_above is None else saturated_above.detach().to(flat.dtype)
+        self.register_buffer("saturated_above", above)
+
+    def follow(self, flat: Tensor, inverse: Tensor) -> None:
+        """Take over what depends on the lights: where the flat skin is lit, and where the matrix is ill-conditioned."""
+        ill_conditioned = ~(self.noise_std * inverse.square().sum(dim=(0, 1)).sqrt() <= PRIOR_STD)  # infinite ones too
         self.any_ill_conditioned = bool(ill_conditioned.any())
         self.register_buffer("ill_conditioned", ill_conditioned)
         # a channel can only be called dark where its light shines on the flat skin
         below = self.dark_below.reshape(3, 1, 1)
         self.register_buffer("dark_where", torch.where(flat > 2.0 * below, below, -torch.inf))
-        if saturated_above is not None:
-            check_shape("saturated_above", saturated_above, flat.shape)
-        above = torch.full_like(flat, torch.inf) if saturated_above is None else saturated_above.detach().to(flat.dtype)
-        self.register_buffer("saturated_above", above)
 
     def limits(self, image: Tensor, window: tuple[int, int]) -> Limits:
         """The limits in the window of an image (B, 3, h, w)."""

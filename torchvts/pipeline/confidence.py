@@ -7,7 +7,7 @@ wrong pitch, a camera that is not orthographic, a calibration of another unit.
 """
 
 import math
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -432,6 +432,10 @@ class ConfidentPipeline(nn.Module):
         """
         pipe = DepthPipeline.from_calibration(calibration, mode, normals=normals, integrate=integrate, contact=contact)
         return cls(pipe, Confidence.from_calibration(calibration, pipe.normals)).eval()
+
+    if TYPE_CHECKING:
+
+        def __call__(self, images: Tensor) -> ConfidentOutput: ...
 
     def forward(self, images: Tensor) -> ConfidentOutput:
         """As :meth:`DepthPipeline.forward`."""

@@ -1,7 +1,7 @@
 """The depth pipeline: a calibration made into a chain of modules that turns images into depth."""
 
 from pathlib import Path
-from typing import ClassVar, Final
+from typing import TYPE_CHECKING, ClassVar, Final
 
 import torch
 from torch import Tensor, nn
@@ -31,7 +31,8 @@ from ..core.checks import (
     check_record,
     may_read_values,
 )
-from ..core.frame import DepthOutput, Solution, depth_in_window, undeformed_output
+from ..core.frame import DepthOutput, Frame, Solution, depth_in_window, undeformed_output
+from ..core.settings import check_settings, settings_as_tensor
 from ..integration import PoissonBackground as PlainPoissonBackground
 from ..integration import WrappedIntegrator, as_integrator
 from ..integration.background import DepthAsIs
@@ -206,6 +207,10 @@ class DepthPipeline(nn.Module):
         sensor = sensor if isinstance(sensor, Sensor) else Sensor.load(sensor)
         return cls(*gs_sdk_blocks(weights, background, sensor), mm_per_pixel=sensor.mm_per_pixel, mode=mode).eval()
 
+    if TYPE_CHECKING:
+
+        def __call__(self, images: Tensor) -> DepthOutput: ...
+
     def forward(self, images: Tensor) -> DepthOutput:
         """(B, 3, H, W) images in [0, 1], R, G, B.
 
@@ -216,7 +221,7 @@ class DepthPipeline(nn.Module):
         check_images(images)
         compensated = self.compensate(images)
         frame = self.crop(compensated, self.deformed(compensated))
-        if may_read_values() and (images.shape[0] == 0 or (self.skips_undeformed and not bool(frame.deformed.any()))):
+        if may_read_values() and (images.shape[0] == 0 or (self.skips_undeformed and self.nothing_to_solve(frame))):
             return undeformed_output(frame)
         solution = self.solve(frame)  # eq. 9, 5, 4
         frame, solution = self.refine(frame, solution)  # eq. 10
@@ -225,6 +230,16 @@ class DepthPipeline(nn.Module):
         contact = self.contact(depth_in_window(frame, solution.depth_mm), solution.gradient, frame.mask)
         out: DepthOutput = self.uncrop(frame, solution, contact)
         return out
+
+    def nothing_to_solve(self, frame: Frame) -> bool:
+        """Whether no skin has moved and no gradients are recorded, which would need a graph."""
+        if bool(frame.deformed.any()):
+            return False
+        if torch.jit.is_scripting():
+            return True
+        else:  # noqa: RET505, TorchScript needs the else to skip this branch
+            recorded = frame.compensated.requires_grad or any(weight.requires_grad for weight in self.parameters())
+            return not (torch.is_grad_enabled() and recorded)
 
     __jit_unused_properties__: ClassVar[list[str]] = ["gradient", "integrate", "normals"]
 
@@ -247,6 +262,14 @@ class DepthPipeline(nn.Module):
 
     def __prepare_scriptable__(self) -> nn.Module:
         return scriptable(self)
+
+    def get_extra_state(self) -> Tensor:
+        """Numbers that determine the output and are no parameters, such as gamma and the pitch: part of ``state_dict()``."""
+        return settings_as_tensor(self)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Refuse the state of a pipeline with other settings, such as another unit's."""
+        check_settings(self, state)
 
     def extra_repr(self) -> str:
         return f"mode={self.mode}, mm_per_pixel={self.mm_per_pixel}"

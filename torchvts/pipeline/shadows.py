@@ -95,7 +95,9 @@ class Shadows(nn.Module):
         """Where a light is blocked, two slopes may fit: one near the plain inverse's, one near those of the lit pixels around."""
         (top, left), (height, width) = frame.window, frame.size
         lit = frame.mask & ~blocked
-        expected = extrapolated_slope(solution.gradient, lit, max(1, min(height, width) // 30), top, left)
+        expected = extrapolated_slope(
+            solution.gradient, lit, max(1, (min(height, width) + 15) // 30), top, left
+        )  # some 30 x 40 cells
         normal = self.policy.solve.normals.solve(frame.image, None, frame.window, expected)
         other = self.policy.solve.integrated(frame, self.policy.solve.gradient(normal) * as_factor(frame.mask, frame.image))
         gained = self.residual(frame, other) - self.residual(frame, solution)

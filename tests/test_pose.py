@@ -230,7 +230,7 @@ def test_a_start_that_is_wrong_is_left(letters, reference):
 
 
 def test_impossible_frames_are_refused(reference):
-    nothing = reference._replace(contact=torch.zeros_like(reference.contact))
+    nothing = reference._replace(deformed=torch.zeros_like(reference.deformed))
     with pytest.raises(ValueError, match="source: expected a contact of at least 60 pixels, got 0: nothing is touched"):
         vts.register_depth(nothing, reference, PITCH)
     faint = reference._replace(depth_mm=0.01 * reference.depth_mm)

@@ -231,7 +231,8 @@ def test_it_scripts_and_pickles_and_keeps_its_state(made):
     other.load_state_dict(torch.load(buffer, weights_only=True))
     for again in (scripted(frames), pickle.loads(pickle.dumps(pipe))(frames), other(frames)):
         for name, found, wanted in zip(expected._fields, again, expected, strict=True):
-            assert torch.allclose(found.double(), wanted.double(), rtol=1e-3, atol=1e-4), name
+            atol = 1e-3 if name == "factors_deg" else 1e-4  # roots of differences of variances, which may be near zero
+            assert torch.allclose(found.double(), wanted.double(), rtol=1e-3, atol=atol), name
 
 
 @pytest.mark.parametrize("made", ["response precise", pytest.param("lights fast", marks=pytest.mark.long)], indirect=True)

@@ -71,7 +71,10 @@ def test_the_scenes_are_hard_enough(low, mini):
     assert int(blocked[0].sum()) > 10
     assert pipe(frames).contact.flatten(1).any(1).tolist() == [True, True, True, False]
     assert (pipe(frames).depth_mm - pipeline(calibration, "fast")(frames).depth_mm).abs().max() > 0.05
-    assert pipeline(mini[0], "fast")(mini[1]).contact[:3].flatten(1).any(1).tolist() == [True, False, True]
+    for mode in ("fast", "precise", "auto"):
+        assert pipeline(mini[0], mode)(mini[1]).deformed[:3].flatten(1).any(1).tolist() == [True, False, True]
+    # its slopes are no surface: only those of the depth show a contact
+    assert pipeline(mini[0], "precise")(mini[1]).contact[:3].flatten(1).any(1).tolist() == [True, False, True]
 
 
 @pytest.fixture(scope="module")

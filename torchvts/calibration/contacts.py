@@ -137,7 +137,7 @@ def read_contacts(given: Sequence[Press | Touch], background: Tensor, sensor: Se
 def _difference(unit: Calibration) -> ContactMask:
     """The mask of what differs from the background by the noise of calibration alone: what changes far from a contact counts too.
 
-    From that, :func:`far_field` tells a contact from light that has changed everywhere.
+    From that, :func:`far_field` separates a contact from light that has changed everywhere.
     """
     mask = ContactMask(unit.flat, unit.compensated_noise_std.clamp_min(LIGHT_DRIFT)).double()
     mask.most_far_field.zero_()

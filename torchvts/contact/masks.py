@@ -188,7 +188,8 @@ class ContactMask(nn.Module):
 
     def quarter(self, some: Tensor) -> Tensor:
         """The value below which a quarter of (B, 3, N) lies, (B, 3, 1)."""
-        return some.kthvalue(some.shape[2] // 4 + 1, dim=2, keepdim=True).values
+        # ONNX has no kthvalue
+        return some.topk(some.shape[2] // 4 + 1, dim=2, largest=False, sorted=False).values.amax(dim=2, keepdim=True)
 
     def black(self, compensated: Tensor) -> Tensor:
         """Channels that are black in all of a frame, bool (B, 3)."""

@@ -382,7 +382,8 @@ class Confidence(nn.Module):
         length = torch.sqrt(gradient.square().sum(1, keepdim=True) + std.square() + 1e-12)
         none = torch.zeros_like(std)
         tilts = torch.cat((torch.cat((std, none), 1), torch.cat((none, std), 1)))
-        found: Tensor = self.integrate(torch.cat((better, std * gradient / length, tilts)))
+        # what the next pass would change, without what the pipeline's zero has taken out of depth
+        found: Tensor = self.integrate(torch.cat((better - gradient, std * gradient / length, tilts)))
         found = found.reshape(4, depth_mm.shape[0], 1, depth_mm.shape[2], depth_mm.shape[3])
         count = inside.sum(dim=(1, 2, 3), keepdim=True).clamp_min(1.0)
         mean = (errors.white / steep.square().clamp_min(0.01) * inside).sum(dim=(1, 2, 3), keepdim=True) / count
@@ -390,7 +391,7 @@ class Confidence(nn.Module):
         scatter = mean * growth * (self.correlation * self.mm_per_pixel) ** 2
         kink = self.kink_variance_mm * gradient.square().sum(dim=(1, 2, 3), keepdim=True) / count
         system = self.system_variance * found[1:].square().sum(0)
-        return (found[0] - depth_mm).abs() + 1.96 * torch.sqrt(scatter + kink + system)
+        return found[0].abs() + 1.96 * torch.sqrt(scatter + kink + system)
 
 
 class ConfidentPipeline(nn.Module):

@@ -25,7 +25,7 @@ class DepthFrame(Protocol):
     @property
     def gradient(self) -> Tensor: ...
     @property
-    def contact(self) -> Tensor: ...
+    def deformed(self) -> Tensor: ...
 
 
 class Relief(NamedTuple):
@@ -74,25 +74,27 @@ class Levels(NamedTuple):
 
 
 def contact_of(frame: DepthFrame, name: str) -> tuple[Tensor, Tensor, Tensor]:
-    """Depth (H, W), gradient (2, H, W) (y down) and contact (H, W) bool of one frame, checked.
+    """Depth (H, W), gradient (2, H, W) (y down) and deformed area (H, W) bool of one frame, checked.
+
+    All deformed skin counts: that beside the contact, as on the flanks of a stamp, moves with it and tells its turn.
 
     Raises:
         TypeError: no DepthOutput.
         ValueError: not one frame, shapes that differ, values not finite, or a contact of a few pixels.
     """
-    for part in ("depth_mm", "gradient", "contact"):
+    for part in ("depth_mm", "gradient", "deformed"):
         if not isinstance(getattr(frame, part, None), Tensor):
             raise TypeError(f"{name}: expected a DepthOutput, as a DepthPipeline returns, got {type(frame).__name__}")
-    depth, gradient, contact = frame.depth_mm.detach(), frame.gradient.detach(), frame.contact.detach()
+    depth, gradient, deformed = frame.depth_mm.detach(), frame.gradient.detach(), frame.deformed.detach()
     height, width = depth.shape[-2:] if depth.dim() >= 2 else (0, 0)
-    if depth.numel() != height * width or gradient.numel() != 2 * height * width or contact.numel() != height * width:
+    if depth.numel() != height * width or gradient.numel() != 2 * height * width or deformed.numel() != height * width:
         raise ValueError(
-            f"{name}: expected one frame, depth (1, 1, H, W), gradient (1, 2, H, W), contact (1, 1, H, W), got "
-            f"{tuple(depth.shape)}, {tuple(gradient.shape)}, {tuple(contact.shape)}: loop over the batch"
+            f"{name}: expected one frame, depth (1, 1, H, W), gradient (1, 2, H, W), deformed (1, 1, H, W), got "
+            f"{tuple(depth.shape)}, {tuple(gradient.shape)}, {tuple(deformed.shape)}: loop over the batch"
         )
     if not bool(torch.isfinite(depth).all() and torch.isfinite(gradient).all()):
         raise ValueError(f"{name}: expected finite depth and gradient, got NaN or infinite ones")
-    inside = contact.reshape(height, width).bool()
+    inside = deformed.reshape(height, width).bool()
     if int(inside.sum()) < LEAST_PIXELS:
         raise ValueError(
             f"{name}: expected a contact of at least {LEAST_PIXELS} pixels, got {int(inside.sum())}: nothing is touched?"

@@ -139,9 +139,7 @@ def _difference(unit: Calibration) -> ContactMask:
 
     From that, :func:`far_field` separates a contact from light that has changed everywhere.
     """
-    mask = ContactMask(unit.flat, unit.compensated_noise_std.clamp_min(LIGHT_DRIFT)).double()
-    mask.most_far_field.zero_()
-    return mask
+    return ContactMask(unit.flat, unit.compensated_noise_std.clamp_min(LIGHT_DRIFT)).double()
 
 
 def _sampled(given: Press | Touch, change: Tensor, mask: Tensor, saturated: Tensor, sensor: Sensor) -> Contact:

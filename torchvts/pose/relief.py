@@ -76,7 +76,7 @@ class Levels(NamedTuple):
 def contact_of(frame: DepthFrame, name: str) -> tuple[Tensor, Tensor, Tensor]:
     """Depth (H, W), gradient (2, H, W) (y down) and deformed area (H, W) bool of one frame, checked.
 
-    All deformed skin counts: that beside the contact, as on the flanks of a stamp, moves with it and tells its turn.
+    All deformed skin counts: that beside the contact, as on the flanks of a stamp, moves with it and shows its rotation.
 
     Raises:
         TypeError: no DepthOutput.

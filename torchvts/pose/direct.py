@@ -19,7 +19,7 @@ def register_depth(source: DepthFrame, target: DepthFrame, mm_per_pixel: float, 
     degrees of freedom. Parts that are pressed deeper in one frame than in the other, or lie outside of one image, are ignored.
 
     Args:
-        source: one frame, a :class:`torchvts.DepthOutput` or any object with its depth_mm, gradient and deformed.
+        source: one frame, a :class:`torchvts.DepthOutput` or any object with its depth_mm, gradient and contact.
         target: the reference frame, likewise.
         mm_per_pixel: pitch of both, mm.
         initial: T_target_source (4, 4) to start from, such as the pose of the previous frame; if it leads to a good fit, no

@@ -25,7 +25,7 @@ class DepthFrame(Protocol):
     @property
     def gradient(self) -> Tensor: ...
     @property
-    def deformed(self) -> Tensor: ...
+    def contact(self) -> Tensor: ...
 
 
 class Relief(NamedTuple):
@@ -76,16 +76,18 @@ class Levels(NamedTuple):
 def contact_of(frame: DepthFrame, name: str) -> tuple[Tensor, Tensor, Tensor]:
     """Depth (H, W), gradient (2, H, W) (y down) and deformed area (H, W) bool of one frame, checked.
 
-    All deformed skin counts: that beside the contact, as on the flanks of a stamp, moves with it and tells its turn.
+    All deformed skin counts: that beside the contact, as on the flanks of a stamp, moves with it and shows its rotation. A frame
+    without a deformed area, as a scene is, has its contact in place of it.
 
     Raises:
         TypeError: no DepthOutput.
         ValueError: not one frame, shapes that differ, values not finite, or a contact of a few pixels.
     """
-    for part in ("depth_mm", "gradient", "deformed"):
+    for part in ("depth_mm", "gradient", "contact"):
         if not isinstance(getattr(frame, part, None), Tensor):
             raise TypeError(f"{name}: expected a DepthOutput, as a DepthPipeline returns, got {type(frame).__name__}")
-    depth, gradient, deformed = frame.depth_mm.detach(), frame.gradient.detach(), frame.deformed.detach()
+    depth, gradient = frame.depth_mm.detach(), frame.gradient.detach()
+    deformed: Tensor = getattr(frame, "deformed", frame.contact).detach()
     height, width = depth.shape[-2:] if depth.dim() >= 2 else (0, 0)
     if depth.numel() != height * width or gradient.numel() != 2 * height * width or deformed.numel() != height * width:
         raise ValueError(

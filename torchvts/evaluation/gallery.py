@@ -383,7 +383,7 @@ CORRUPTIONS: dict[str, Corruption] = {
         # sensor
         Corruption("saturation", "times", (1.0, 1.3, 1.6, 2.0, 2.5, 3.0), _exposed,
             "The exposure is longer, which the user knows: bright slopes clip, then the skin itself."),
-        Corruption("black crush", "value", (0.0, 0.02, 0.05, 0.1, 0.2, 0.25), _always(lambda s: replace(USUAL, black=s)),
+        Corruption("black crush", "value", (0.0, 0.02, 0.05, 0.1, 0.2, 0.4), _always(lambda s: replace(USUAL, black=s)),
             "The camera subtracts a black level that the calibration does not know: dark slopes become black."),
         Corruption("wrong gamma", "exponent", (1.0, 1.05, 1.1, 1.2, 1.4, 1.8, 2.2), _always(lambda s: replace(USUAL, gamma=s)),
             "The values of the camera are light^(1 / gamma), and the user takes them for light."),

@@ -138,7 +138,7 @@ class NormalFromIntensity(NormalModel):
     def follow_lights(self) -> None:
         """Compute what is stored of the lights again if they have changed since, as by an optimiser.
 
-        In eager mode on a CPU, where reading twelve numbers costs nothing; elsewhere nothing that is stored is used.
+        In eager mode on a CPU, where reading twelve parameters costs nothing; elsewhere nothing that is stored is used.
         """
         position, albedo = self.lights.position_mm, self.lights.albedo
         if not reads_freely(position) or (

@@ -348,7 +348,7 @@ EXPORT int contact_mask(const float *image, const float *offset, const float *pe
             if (works[c]) {
                 const float *image_c = frame + pixels * c, *offset_c = offset + pixels * c, *per_noise_c = per_noise + pixels * c;
                 float noise = noise_of(image_c, offset_c, per_noise_c, height, width, stride, at.some);
-                float far = far_field_of(image_c, offset_c, per_noise_c, height, width, stride, at.some);
+                float far = most_far_field[c] > 0.0f ? far_field_of(image_c, offset_c, per_noise_c, height, width, stride, at.some) : 0.0f;
                 if (far > most_far_field[c]) far = most_far_field[c] * most_far_field[c] / far;
                 if (!(far <= noise)) noise = far;
                 if (noise < 1.0f) noise = 1.0f;

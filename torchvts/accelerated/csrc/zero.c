@@ -85,7 +85,7 @@ static void continued(Grid *grids, int count, int sweeps, float *scratch) {
     }
 }
 
-/* Pixels at which no deformed one is within two, as 1; else 0. scratch: as large as an image. */
+/* 1 at pixels within two of which none is deformed, else 0. scratch: as large as an image. */
 static void not_beside(const uint8_t *deformed, int height, int width, uint8_t *scratch, uint8_t *flat) {
     for (int y = 0; y < height; y++)
         for (int x = 0; x < width; x++) {
@@ -102,8 +102,8 @@ static void not_beside(const uint8_t *deformed, int height, int width, uint8_t *
 }
 
 /*
- * depth (frames, height, width) with what slopes leave beside a contact taken out, to out. deformed: bytes. known: where the error of
- * the depth is known; 1 where the skin is flat, 2 on a face above it. Returns 1 where memory is short.
+ * depth (frames, height, width) with what slopes leave beside a contact taken out, to out. deformed: bytes. Returns 1 where memory is
+ * short.
  */
 EXPORT int zero_background(const float *depth, const uint8_t *deformed, int frames, int height, int width, float stiff, float tolerance,
                            int sweeps, float *out) {

@@ -1,5 +1,6 @@
 """Defects found by an attack on the library: wrong answers without a word, and what PyTorch's own tools could not do."""
 
+import contextlib
 import copy
 import pickle
 from collections.abc import Callable
@@ -11,6 +12,8 @@ from torch import Tensor
 from torch._subclasses import FakeTensorMode
 
 import torchvts as vts
+from torchvts.accelerated import reference_only
+from torchvts.model.response_field import ResponseField, ResponseModel
 
 HEIGHT, WIDTH, PITCH = 96, 128, 0.25
 
@@ -48,6 +51,7 @@ def test_trained_lights_count_without_gradients(mode: str, without_gradients: ty
 
 
 @pytest.mark.long
+@pytest.mark.filterwarnings("ignore:Torchinductor does not support code generation for complex")  # FFTs stay operators
 @pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
 def test_compiles_with_inductor(mode: str) -> None:
     pipe, image = vts.DepthPipeline.from_calibration(rig(), mode), press()
@@ -170,3 +174,70 @@ def test_calls_are_typed(tmp_path: Path) -> None:
     assert len(revealed) == len(modules), found
     for line, kind in zip(revealed, modules.values(), strict=True):
         assert kind in line, line
+
+
+def unit_of(kind: str) -> vts.Calibration:
+    """A unit with low lights, which cast shadows, or one by a response field."""
+    lights = vts.PointLights([[22, 4, 16], [-14, 17, 15], [-8, -20, 17]], [300, 300, 300])
+    sensor = vts.Sensor("rig", HEIGHT, WIDTH, PITCH)
+    unit = vts.Calibration.from_lights(lights, sensor)
+    if kind == "lights":
+        return unit
+    field = ResponseField(0, -1, 16.0, ((0.3, 0.0, 0.1), (0.1, 0.3, 0.0)))
+    return vts.Calibration.from_response(ResponseModel(field, None), sensor, unit.model_image.clamp(max=1.0))
+
+
+def dissimilar() -> Tensor:
+    """Noisy frames of that rig: none, small and wide contacts, dirt, a failed LED."""
+    lights = unit_of("lights").lights
+    assert lights is not None
+    balls = [
+        (8.0, 1.0, (0.0, 0.0)),
+        (4.0, 0.5, (-10.0, 5.0)),
+        (10.0, 3.0, (6.0, -3.0)),
+        (2.0, 1.0, (13.0, 9.0)),
+        (6.0, 1.0, (3.0, 3.0)),
+    ]
+    scenes = [vts.scenes.sphere_press(*ball, HEIGHT, WIDTH, PITCH) for ball in balls]
+    scenes.insert(0, vts.scenes.undeformed(scenes[0]))
+    images = torch.cat([vts.scenes.render(scene, lights).detach() for scene in scenes])
+    images = images + 0.004 * torch.randn(images.shape, generator=torch.Generator().manual_seed(0))
+    images[2, :, 40:44, 30:40] = 0.0
+    images[5, 1] = 0.0
+    return images.clamp(0.0, 1.0)
+
+
+@pytest.mark.parametrize("kind", ["lights", "response"])
+@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
+def test_a_frame_of_a_batch_is_that_frame_alone(kind: str, mode: str) -> None:
+    plain = (contextlib.nullcontext, torch.float32)
+    for kernels, dtype in (plain, (reference_only, torch.float32), (reference_only, torch.float64)) if mode == "auto" else (plain,):
+        pipe = vts.DepthPipeline.from_calibration(unit_of(kind), mode).to(dtype)
+        images = dissimilar().to(dtype)
+        with kernels():
+            batch = pipe(images)
+            for i in range(len(images)):
+                for whole, alone in zip(batch, pipe(images[i : i + 1]), strict=True):
+                    assert torch.equal(whole[i : i + 1], alone), (i, kernels, dtype)
+        assert bool(batch.deformed[1:].flatten(1).any(dim=1).all())
+
+
+@pytest.mark.parametrize("mode", ["fast", "precise"])
+def test_recording_gradients_changes_no_frame_of_a_batch(mode: str) -> None:
+    pipe, images = vts.DepthPipeline.from_calibration(unit_of("response"), mode), dissimilar()[:3]
+    recorded = images.clone().requires_grad_(True)
+    out = pipe(recorded).depth_mm
+    assert float((out.detach() - pipe(images).depth_mm).abs().max()) < 1e-5
+    out[1].sum().backward()
+    assert recorded.grad is not None
+    assert bool(recorded.grad[1].any())
+    assert not bool(recorded.grad[[0, 2]].any())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("mode", ["fast", "precise"])
+def test_a_scripted_batch_is_its_frames(mode: str) -> None:
+    images = dissimilar()[4:]
+    pipe = torch.jit.script(vts.DepthPipeline.from_calibration(unit_of("lights"), mode))
+    batch = pipe(images).depth_mm
+    assert all(torch.equal(batch[i : i + 1], pipe(images[i : i + 1]).depth_mm) for i in range(len(images)))

@@ -93,10 +93,14 @@ class Crop(nn.Module):
     def forward(self, compensated: Tensor, deformed: Tensor) -> Frame:
         height, width = compensated.shape[2], compensated.shape[3]
         top, bottom, left, right = 0, height, 0, width
-        if self.enabled and may_read_values() and compensated.device.type == "cpu" and deformed.shape[0] > 0:
+        if self.finds_window(compensated) and deformed.shape[0] > 0:
             top, bottom, left, right = self.window(self.box(deformed), height, width)
         image, mask = compensated[:, :, top:bottom, left:right], deformed[:, :, top:bottom, left:right]
         return Frame(compensated, deformed, image, mask, (top, left), (height, width))
+
+    def finds_window(self, images: Tensor) -> bool:
+        """Whether the window depends on the images, and so on the batch."""
+        return self.enabled and may_read_values() and images.device.type == "cpu"
 
     def box(self, deformed: Tensor) -> tuple[int, int, int, int]:
         """(top, bottom, left, right) of the smallest box that holds all deformed skin of all frames; zeros without any."""
@@ -150,3 +154,38 @@ def undeformed_output(frame: Frame) -> DepthOutput:
     normal[:, 2] = 1.0
     contact = torch.zeros_like(frame.deformed)
     return DepthOutput(torch.zeros_like(like[:, 0:1]), torch.zeros_like(like[:, 0:2]), normal, contact, frame.deformed)
+
+
+def joined(outputs: list[DepthOutput]) -> DepthOutput:
+    """The outputs of batches as that of one."""
+    return DepthOutput(
+        torch.cat([out.depth_mm for out in outputs]),
+        torch.cat([out.gradient for out in outputs]),
+        torch.cat([out.normal for out in outputs]),
+        torch.cat([out.contact for out in outputs]),
+        torch.cat([out.deformed for out in outputs]),
+    )
+
+
+def batch_like(one: DepthOutput, count: int) -> DepthOutput:
+    """Memory for the output of that many frames; its values are not set."""
+    return DepthOutput(
+        _empty(one.depth_mm, count),
+        _empty(one.gradient, count),
+        _empty(one.normal, count),
+        _empty(one.contact, count),
+        _empty(one.deformed, count),
+    )
+
+
+def _empty(like: Tensor, count: int) -> Tensor:
+    return torch.empty_like(like.expand(count, -1, -1, -1), memory_format=torch.contiguous_format)
+
+
+def write_frame(out: DepthOutput, i: int, one: DepthOutput) -> None:
+    """Write the output of one frame into that of a batch."""
+    out.depth_mm[i].copy_(one.depth_mm[0])
+    out.gradient[i].copy_(one.gradient[0])
+    out.normal[i].copy_(one.normal[0])
+    out.contact[i].copy_(one.contact[0])
+    out.deformed[i].copy_(one.deformed[0])

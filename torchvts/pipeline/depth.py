@@ -31,7 +31,7 @@ from ..core.checks import (
     check_record,
     may_read_values,
 )
-from ..core.frame import DepthOutput, Frame, Solution, depth_in_window, undeformed_output
+from ..core.frame import DepthOutput, Frame, Solution, batch_like, depth_in_window, joined, undeformed_output, write_frame
 from ..core.settings import check_settings, settings_as_tensor
 from ..integration import PoissonBackground as PlainPoissonBackground
 from ..integration import WrappedIntegrator, as_integrator
@@ -58,7 +58,9 @@ class DepthPipeline(nn.Module):
     ``tolerance_px``; for response fields gradient and normals are then those of the depth. ``auto`` skips frames without deformed
     skin, predicts on every eighth pixel what a second pass would change, and solves only those frames again for which that exceeds
     ``refine_threshold_px``, until what is missing is below a fifth of it.
-    Frames of a batch do not influence one another.
+    Frames of a batch do not influence one another: on a CPU each is solved by itself, and is equal bit for bit to that frame alone.
+    On a GPU, in an exported program, and with a module of your own that needs the whole image, the batch is solved as one, which
+    may change the rounding of sums.
 
     Args:
         compensate: camera image to compensated image.
@@ -219,6 +221,24 @@ class DepthPipeline(nn.Module):
             TypeError: not floating point.
         """
         check_images(images)
+        if images.shape[0] > 1 and self.crop.finds_window(images):  # each in its own window, else one would round another's depth
+            return self.depth_of_each(images)
+        return self.depth_of(images)
+
+    def depth_of_each(self, images: Tensor) -> DepthOutput:
+        """The same of checked images, frame by frame."""
+        one = self.depth_of(images[0:1])
+        if one.depth_mm.requires_grad:
+            return joined([one] + [self.depth_of(images[i : i + 1]) for i in range(1, images.shape[0])])
+        out = batch_like(one, images.shape[0])  # half the memory of all frames and their copy
+        for i in range(images.shape[0]):
+            if i > 0:
+                one = self.depth_of(images[i : i + 1])
+            write_frame(out, i, one)
+        return out
+
+    def depth_of(self, images: Tensor) -> DepthOutput:
+        """The same of checked images, in one window."""
         compensated = self.compensate(images)
         frame = self.crop(compensated, self.deformed(compensated))
         if may_read_values() and (images.shape[0] == 0 or (self.skips_undeformed and self.nothing_to_solve(frame))):

@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 from torch._subclasses import FakeTensorMode
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchvts as vts
 from torchvts.accelerated import reference_only
@@ -241,3 +242,53 @@ def test_a_scripted_batch_is_its_frames(mode: str) -> None:
     pipe = torch.jit.script(vts.DepthPipeline.from_calibration(unit_of("lights"), mode))
     batch = pipe(images).depth_mm
     assert all(torch.equal(batch[i : i + 1], pipe(images[i : i + 1]).depth_mm) for i in range(len(images)))
+
+
+@pytest.mark.parametrize("size", [(8, 640), (640, 8), (8, 5000)])
+def test_thin_sensors(size: tuple[int, int]) -> None:
+    lights = rig().lights
+    assert lights is not None
+    unit = vts.Calibration.from_lights(lights, vts.Sensor("thin", *size, 0.05))
+    image = vts.scenes.render(vts.scenes.sphere_press(2.0, 0.1, (0.0, 0.0), *size, 0.05), lights).detach()
+    pipe = vts.DepthPipeline.from_calibration(unit)
+    out = pipe(image)
+    with reference_only():
+        by_operators = pipe(image)
+    assert float((out.depth_mm - by_operators.depth_mm).abs().max()) < 1e-5
+    assert torch.equal(out.deformed, by_operators.deformed)
+    assert bool(out.contact[0, 0, size[0] // 2, size[1] // 2])
+    assert not bool(out.deformed[..., 0, 0])
+
+
+def test_a_mask_of_two_columns_is_refused() -> None:
+    with pytest.raises(ValueError, match="flat: expected at least 3 columns"):
+        vts.ContactMask(torch.full((3, 20, 2), 0.5), torch.full((3,), 0.01))
+
+
+class LargestTensor(TorchDispatchMode):
+    """Keeps the number of elements of the largest tensor that an operator makes."""
+
+    elements = 0
+
+    def __torch_dispatch__(self, operator, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
+        made = operator(*args, **(kwargs or {}))
+        for one in made if isinstance(made, tuple | list) else (made,):
+            if isinstance(one, Tensor):
+                self.elements = max(self.elements, one.numel())
+        return made
+
+
+@pytest.mark.parametrize(("count", "height", "width"), [(3, 59, 79), (1, 8, 3000)])
+def test_memory_for_shadows_grows_with_the_image(count: int, height: int, width: int) -> None:
+    lights = unit_of("lights").lights
+    assert lights is not None
+    unit = vts.Calibration.from_lights(lights, vts.Sensor("rig", height, width, PITCH))
+    image = unit.model_image[None].repeat(count, 1, 1, 1).clamp(0.0, 1.0)
+    middle = width // 2
+    image[:, 1, : height // 2, middle - 10 : middle] = 0.0  # one light is blocked
+    image[:, 0, :, middle : middle + 10] *= 0.7
+    pipe = vts.DepthPipeline.from_calibration(unit, "precise")
+    with LargestTensor() as largest:
+        out = pipe(image)
+    assert bool(out.deformed.any())
+    assert largest.elements < (2e6 if count > 1 else 1e7)  # 4e6 of a batch in one tensor, 6e8 of the thin one in cells of a pixel

@@ -50,8 +50,7 @@ class ContactMask(Twin, contact.ContactMask):
     plain = contact.ContactMask
 
     def find(self, compensated: Tensor) -> tuple[Tensor, Tensor]:
-        sampled = compensated.shape[2] > self.stride // 2 and compensated.shape[3] >= 3
-        if not (sampled and usable(compensated, self.offset)):
+        if not usable(compensated, self.offset):
             return super().find(compensated)
         grid = kernels.ContactGrid(self.step, self.stride, self.cell, self.reach, self.sigmas, self.rounding, self.least_cells)
         return kernels.contact_mask(compensated, self.offset, self.per_noise, (self.failed_below, self.most_far_field), grid)

@@ -20,7 +20,7 @@ from ..core.checks import (
     check_tensor,
     may_read_values,
 )
-from ..core.noise import clipped_std
+from ..core.noise import clipped_std, sample_stride
 from ..core.noise import noise_std as frame_noise_std
 from ..model.calibration import Calibration, check_calibration
 from .morphology import dilate, dilate_cross, erode, reconstruct
@@ -80,6 +80,8 @@ class ContactMask(nn.Module):
     ) -> None:
         super().__init__()
         check_field("flat", flat)
+        if flat.shape[2] < 3:
+            raise ValueError(f"flat: expected at least 3 columns, for the noise of a frame, got {flat.shape[2]}")
         check_least("far_field", far_field)
         check_tensor("noise_std", noise_std)
         if tuple(noise_std.shape) not in ((3,), tuple(flat.shape)) or not bool(torch.isfinite(noise_std).all()):
@@ -99,7 +101,7 @@ class ContactMask(nn.Module):
         self.dark_noises = DARK_NOISES
         self.register_buffer("offset", -self.flat * self.per_noise)
         self.samples = 2000  # pixels from which a frame's own noise is estimated
-        self.stride = max(1, math.ceil(math.sqrt(flat.shape[1] * flat.shape[2] / self.samples)))
+        self.stride = sample_stride(flat.shape[1], flat.shape[2], self.samples)
         self.step = max(1, min(flat.shape[1], flat.shape[2]) // 60)
         some = self.flat[:, self.step // 2 :: self.step, self.step // 2 :: self.step]
         self.register_buffer("failed_below", 0.05 * some.mean(dim=(1, 2)))
@@ -220,7 +222,8 @@ class ContactMask(nn.Module):
     def faint(self, change: Tensor) -> Tensor:
         """Cells whose mean change stands out of the spread of all cells by 5 sigmas, bool."""
         mean = _cell_sums(change, self.cell) / float(self.cell * self.cell)
-        step = max(1, max(mean.shape[2], mean.shape[3]) // 40)  # a median of some thousand cells is as good
+        rows, columns = mean.shape[2], mean.shape[3]
+        step = max(1, min(max(rows, columns) // 40, rows, columns))  # a median of some thousand cells is as good
         spread = mean[:, :, step // 2 :: step, step // 2 :: step].abs().flatten(2).median(dim=2).values / 0.6745
         return (mean / spread.clamp_min(1.0 / self.cell)[..., None, None]).square().sum(1, keepdim=True) > 25.0
 

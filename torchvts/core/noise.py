@@ -29,9 +29,14 @@ def noise_std(image: Tensor, samples: int = 8000) -> Tensor:
     return std_from_median(second, second.median(dim=-1, keepdim=True).values)
 
 
+def sample_stride(height: int, width: int, samples: int) -> int:
+    """Distance of at most that many samples, spread evenly over an image; of a thin one at least one line is sampled."""
+    return max(1, min(math.ceil(math.sqrt(height * width / float(samples))), height, width))
+
+
 def second_differences(image: Tensor, samples: int) -> Tensor:
     """Absolute second differences along rows at no more than ``samples`` evenly chosen pixels, (B, C, N)."""
-    stride = max(1, math.ceil(math.sqrt(image.shape[2] * image.shape[3] / float(samples))))
+    stride = sample_stride(image.shape[2], image.shape[3], samples)
     rows = image[:, :, stride // 2 :: stride]
     left, middle, right = rows[..., :-2:stride], rows[..., 1:-1:stride], rows[..., 2::stride]
     return (middle - 0.5 * (left + right)).abs().flatten(2)

@@ -4,6 +4,7 @@ A frame enters this room only where a light that shines on the flat skin is dark
 are calibrated by lights.
 """
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -95,9 +96,9 @@ class Shadows(nn.Module):
         """Where a light is blocked, two slopes may fit: one near the plain inverse's, one near those of the lit pixels around."""
         (top, left), (height, width) = frame.window, frame.size
         lit = frame.mask & ~blocked
-        expected = extrapolated_slope(
-            solution.gradient, lit, max(1, (min(height, width) + 15) // 30), top, left
-        )  # some 30 x 40 cells
+        # some 30 x 40 cells, and of a thin or small image no more than 3,000: the work grows with their square
+        cell = max(1, (min(height, width) + 15) // 30, math.ceil(math.sqrt(height * width / 3000.0)))
+        expected = extrapolated_slope(solution.gradient, lit, cell, top, left)
         normal = self.policy.solve.normals.solve(frame.image, None, frame.window, expected)
         other = self.policy.solve.integrated(frame, self.policy.solve.gradient(normal) * as_factor(frame.mask, frame.image))
         gained = self.residual(frame, other) - self.residual(frame, solution)
@@ -164,7 +165,8 @@ def extrapolated_slope(slope: Tensor, known: Tensor, cell: int, top: int = 0, le
     """Slopes of all pixels extrapolated from those that are known: planes through them, weighted by nearness.
 
     Moving least squares over cells of pixels, with weights that fall with the fourth power of the distance: free of any scale,
-    so that a plane spans a gap of any width by what is as wide around it.
+    so that a plane spans a gap of any width by what is as wide around it. Memory and time grow with the square of the number of
+    cells.
 
     Args:
         slope: (B, 2, H, W).

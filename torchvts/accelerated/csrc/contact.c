@@ -221,7 +221,8 @@ static void find_strong(const float *frame, const float *offset, const float *pe
 static int find_cells(Grid grid, Scratch at) {
     const size_t cells = (size_t)grid.rows * grid.columns;
     const int rows = grid.rows, columns = grid.columns, wide = columns + 2;
-    const int longer = rows > columns ? rows : columns, step = longer < 80 ? 1 : longer / 40;
+    const int longer = rows > columns ? rows : columns, shorter = rows + columns - longer;
+    const int step = longer < 80 ? 1 : least(longer / 40, shorter); /* at least one line of a thin grid */
     const float least_std = 1.0f / (float)grid.cell;
     float per[3];
     for (int c = 0; c < 3; c++) {

@@ -292,3 +292,51 @@ def test_memory_for_shadows_grows_with_the_image(count: int, height: int, width:
         out = pipe(image)
     assert bool(out.deformed.any())
     assert largest.elements < (2e6 if count > 1 else 1e7)  # 4e6 of a batch in one tensor, 6e8 of the thin one in cells of a pixel
+
+
+class SmallNetwork(torch.nn.Module):
+    """A learned model of normals."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.slope = torch.nn.Sequential(torch.nn.Conv2d(3, 4, 1), torch.nn.BatchNorm2d(4), torch.nn.Conv2d(4, 2, 1))
+
+    def forward(self, compensated: Tensor) -> Tensor:
+        slope = self.slope(compensated)
+        return torch.nn.functional.normalize(torch.cat((slope, torch.ones_like(slope[:, :1])), dim=1), dim=1)
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_given_modules_keep_their_mode(training: bool) -> None:
+    network, solver = SmallNetwork().train(training), vts.PoissonDCT(PITCH).train(training)
+    network.slope[1].train(not training)  # a mode of its own, as of a frozen layer
+    pipe = vts.DepthPipeline.from_calibration(rig(), normals=network, integrate=solver)
+    assert not pipe.training
+    assert not pipe.compensate.training
+    assert network.training == solver.training == network.slope[2].training == training
+    assert network.slope[1].training != training
+    assert all(weight.requires_grad for weight in network.parameters())
+    confident = vts.ConfidentPipeline.from_calibration(rig(), integrate=solver)
+    assert not confident.training
+    assert solver.training == training
+
+
+def test_gradients_stop_outside_the_deformed_area() -> None:
+    class Slopes(torch.nn.Module):
+        """Normals that are a parameter."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.normal = torch.nn.Parameter(torch.tensor([0.1, 0.1, 1.0])[None, :, None, None].repeat(1, 1, HEIGHT, WIDTH))
+
+        def forward(self, compensated: Tensor) -> Tensor:
+            return self.normal * torch.ones_like(compensated)
+
+    model = Slopes()
+    out = vts.DepthPipeline.from_calibration(rig(), normals=model)(press())
+    out.depth_mm.square().sum().backward()
+    assert model.normal.grad is not None
+    reached = (model.normal.grad != 0.0).any(dim=1, keepdim=True)
+    assert bool(reached.any())
+    assert not bool((reached & ~out.deformed).any())
+    assert "reaches them from outside ``deformed``" in (vts.DepthPipeline.from_calibration.__doc__ or "")

@@ -29,7 +29,7 @@ from ..core.geometry import gradient_of_depth
 from ..core.noise import noise_std as frame_noise_std
 from ..model.calibration import Calibration, check_calibration
 from ..normals import NormalFromIntensity, NormalFromResponse, as_normal_model
-from .depth import DepthOutput, DepthPipeline
+from .depth import DepthOutput, DepthPipeline, eval_around
 
 FACTORS = ("noise", "model", "pass", "surface", "saturation")
 """The order of ``factors_deg``: noise through the inverse model, raised where the light does not fit; error of the model; what a
@@ -432,7 +432,7 @@ class ConfidentPipeline(nn.Module):
             TypeError: no Calibration; or ``normals`` that are not the calibrated model.
         """
         pipe = DepthPipeline.from_calibration(calibration, mode, normals=normals, integrate=integrate, contact=contact)
-        return cls(pipe, Confidence.from_calibration(calibration, pipe.normals)).eval()
+        return eval_around(cls(pipe, Confidence.from_calibration(calibration, pipe.normals)), normals, integrate)
 
     if TYPE_CHECKING:
 

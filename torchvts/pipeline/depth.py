@@ -1,7 +1,7 @@
 """The depth pipeline: a calibration made into a chain of modules that turns images into depth."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import TYPE_CHECKING, ClassVar, Final, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -43,6 +43,8 @@ from .gs_sdk import gs_sdk_blocks
 from .refine import Adaptive, Once, Repeat, SlopesOfDepth, SlopesOfPixels
 from .shadows import Shadows
 from .solve import Solve
+
+_Module = TypeVar("_Module", bound=nn.Module)
 
 MODES = ("fast", "precise", "auto")
 
@@ -156,6 +158,9 @@ class DepthPipeline(nn.Module):
     ) -> "DepthPipeline":
         """The pipeline of a calibrated unit, in eval mode, its lights frozen (``requires_grad_(True)`` frees them).
 
+        Modules that are given keep the mode that they are in, train or eval, and their parameters stay trainable. No gradient
+        reaches them from outside ``deformed``: slopes are set to zero there.
+
         Args:
             calibration: from :func:`calibrate`, :meth:`Calibration.from_lights` or :meth:`Calibration.load`.
             mode: "fast", "precise" or "auto".
@@ -177,7 +182,7 @@ class DepthPipeline(nn.Module):
         check_calibration("calibration", calibration)
         settings = ContactSettings() if contact is None else contact
         check_record("contact", settings, ContactSettings, "ContactSettings(sigmas=...) makes one")
-        sensor = calibration.sensor
+        sensor, given = calibration.sensor, (normals, integrate)
         if normals is None:
             by_response = calibration.response is not None
             normals = (NormalFromResponse if by_response else NormalFromIntensity).from_calibration(calibration)
@@ -189,7 +194,8 @@ class DepthPipeline(nn.Module):
             integrate or PoissonBackground(sensor.mm_per_pixel),
         )
         touching = ContactFromDepth(sensor.mm_per_pixel, settings.share)
-        return cls(*modules, mm_per_pixel=sensor.mm_per_pixel, mode=mode, contact=touching).eval()
+        pipe = cls(*modules, mm_per_pixel=sensor.mm_per_pixel, mode=mode, contact=touching)
+        return eval_around(pipe, *given)
 
     @classmethod
     def from_gs_sdk(cls, weights: str | Path, background: Tensor, sensor: Sensor | str, mode: str = "fast") -> "DepthPipeline":
@@ -293,6 +299,15 @@ class DepthPipeline(nn.Module):
 
     def extra_repr(self) -> str:
         return f"mode={self.mode}, mm_per_pixel={self.mm_per_pixel}"
+
+
+def eval_around(module: _Module, *given: nn.Module | None) -> _Module:
+    """Put a module into eval mode, except the parts that were given to it, which keep the mode that they are in."""
+    modes = [(part, part.training) for block in given if block is not None for part in block.modules()]
+    module.eval()
+    for part, training in modes:
+        part.training = training
+    return module
 
 
 def check_images(images: Tensor) -> None:

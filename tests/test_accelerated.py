@@ -8,8 +8,9 @@ import torch
 
 import torchvts as vts
 from torchvts.accelerated import kernels, reference_only
-from torchvts.accelerated.blocks import Drift, LargestChange
+from torchvts.accelerated.blocks import ContactFromDepth, Drift, LargestChange, ZeroBackground
 from torchvts.accelerated.gate import usable
+from torchvts.core.geometry import gradient_of_depth
 
 scenes = vts.scenes
 
@@ -266,3 +267,41 @@ def test_a_library_that_is_missing_or_left_over_is_not_used(monkeypatch, tmp_pat
             assert kernels.library() is None
     finally:
         kernels.library.cache_clear()
+
+
+def rough_presses(size, count, seed):
+    """Depth, gradient and deformed skin of frames as no sensor gives them: noise on top of balls, holes, and a frame without."""
+    generator = torch.Generator().manual_seed(seed)
+    height, width = size
+    y, x = torch.arange(height)[:, None], torch.arange(width)[None, :]
+    depth = torch.zeros(count, 1, *size)
+    for frame in range(count - 1):
+        middle = torch.rand(2, generator=generator) * torch.tensor([height, width])
+        squared = (y - middle[0]) ** 2 + (x - middle[1]) ** 2
+        depth[frame, 0] = (1.0 - squared / (0.3 * min(size) + 2.0) ** 2).clamp_min(-0.1 * frame)
+    depth += 0.01 * torch.randn(depth.shape, generator=generator)
+    deformed = (depth > 0.05) & (torch.rand(depth.shape, generator=generator) > 0.01)
+    return depth, 0.2 * torch.randn(count, 2, *size, generator=generator) * deformed, deformed
+
+
+@pytest.mark.parametrize("size", [(48, 64), (240, 320), (121, 163), (45, 63), (2, 3), (1, 9), (3, 1), (480, 70)])
+def test_zero_in_the_background(size):
+    block = ZeroBackground()
+    depth, _, deformed = rough_presses(size, 4, size[0])
+    loops, operators = both(block, depth, deformed)
+    assert float((loops - operators).abs().max()) < 1e-6
+    loops, operators = both(block, depth, torch.ones_like(deformed))
+    assert float((loops - operators).abs().max()) < 1e-6
+
+
+@pytest.mark.parametrize("mm_per_pixel", [0.02, 0.0634, 0.2])
+@pytest.mark.parametrize("size", [(48, 64), (240, 320), (45, 63), (2, 3), (1, 9), (9, 1)])
+def test_contact_from_depth(size, mm_per_pixel):
+    """As it is in the pipeline: depth and deformed skin are windows of whole images."""
+    block = ContactFromDepth(mm_per_pixel)
+    depth, _, deformed = rough_presses((size[0] + 8, size[1] + 16), 4, size[0])
+    slopes = gradient_of_depth(depth, mm_per_pixel) * deformed
+    part = (slice(None), slice(None), slice(8, None), slice(16, None))
+    loops, operators = both(block, depth[part], slopes[part], deformed[part])
+    assert loops.shape == operators.shape and loops.dtype == torch.bool
+    assert int((loops != operators).sum()) <= 1e-4 * loops.numel()

@@ -7,6 +7,7 @@ torch.export and torch.compile get the plain block.
 from .blocks import (
     AdaptiveIntegration,
     Compensate,
+    ContactFromDepth,
     ContactMask,
     Crop,
     GradientFromNormal,
@@ -25,6 +26,7 @@ from .twin import reference, scriptable
 __all__ = [
     "AdaptiveIntegration",
     "Compensate",
+    "ContactFromDepth",
     "ContactMask",
     "Crop",
     "GradientFromNormal",

@@ -1,5 +1,7 @@
 """Accelerated twins of the blocks of the online path."""
 
+import ctypes
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -83,6 +85,18 @@ class ContactMask(Twin, contact.ContactMask):
             kept[0] = False  # what is not in the mask
             found[0] = kept[label]
         return torch.from_numpy(reached)
+
+
+class ContactFromDepth(Twin, contact.ContactFromDepth):
+    """One compiled kernel."""
+
+    plain = contact.ContactFromDepth
+
+    def find(self, depth_mm: Tensor, gradient: Tensor, deformed: Tensor) -> Tensor:
+        if not usable(depth_mm, gradient):
+            return super().find(depth_mm, gradient, deformed)
+        numbers = (self.cell * self.mm_per_pixel, self.share, *self.decay, *self.tail, self.least_free)
+        return kernels.contact_from_depth(depth_mm, gradient, deformed, (self.cell, self.reach), (ctypes.c_float * 7)(*numbers))
 
 
 class Crop(Twin, frames.Crop):

@@ -57,6 +57,7 @@ def library() -> ctypes.CDLL | None:
         *[pointer] * 5,
     ]
     loaded.zero_background.argtypes = [pointer, pointer, *[whole] * 3, *[real] * 2, whole, pointer]
+    loaded.contact_from_depth.argtypes = [pointer, step, step, pointer, pointer, step, step, *[whole] * 5, pointer, pointer]
     loaded.grid_means.argtypes = [pointer, *[whole] * 7, pointer]
     loaded.slopes.argtypes = [pointer, whole, whole, real, pointer]
     loaded.divergence_lines.argtypes = [pointer, real, *[whole] * 9, pointer]
@@ -129,6 +130,22 @@ def contact_mask(
     inputs = (compensated.data_ptr(), offset.data_ptr(), per_noise.data_ptr(), limits[0].data_ptr(), limits[1].data_ptr())
     _check(_loaded().contact_mask(*inputs, count, height, width, *grid, mask.data_ptr(), interior.data_ptr()))
     return mask, interior
+
+
+def contact_from_depth(
+    depth_mm: Tensor, gradient: Tensor, deformed: Tensor, cells: tuple[int, int], model: "ctypes.Array[ctypes.c_float]"
+) -> Tensor:
+    """Contact, bool (B, 1, h, w), of a window: see :class:`~torchvts.contact.ContactFromDepth`.
+
+    ``cells``: side and reach; ``model``: side of a cell in mm, share, bounds of the decay length and of the tail, least free share.
+    """
+    depth_mm, deformed, gradient = _with_whole_rows(depth_mm), _with_whole_rows(deformed), gradient.contiguous()
+    count, _, rows, columns = depth_mm.shape
+    contact = depth_mm.new_empty(count, 1, rows, columns, dtype=torch.bool)
+    inputs = (depth_mm.data_ptr(), depth_mm.stride(0), depth_mm.stride(2), gradient.data_ptr())
+    mask = (deformed.data_ptr(), deformed.stride(0), deformed.stride(2))
+    _check(_loaded().contact_from_depth(*inputs, *mask, count, rows, columns, *cells, model, contact.data_ptr()))
+    return contact
 
 
 def normals(compensated: Tensor, limits: Limits, inverse: Tensor, depth_mm: Tensor | None, view: LightView) -> tuple[Tensor, bool]:

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from ..accelerated import (
     Compensate,
+    ContactFromDepth,
     ContactMask,
     Crop,
     GradientFromNormal,
@@ -19,8 +20,8 @@ from ..accelerated import (
     scriptable,
 )
 from ..compensate import Compensate as PlainCompensate
-from ..contact import ContactFromDepth, ContactSettings
 from ..contact import ContactMask as PlainContactMask
+from ..contact import ContactSettings
 from ..core.checks import (
     check_batch,
     check_choice,

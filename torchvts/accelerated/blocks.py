@@ -10,6 +10,7 @@ from .. import compensate, contact, integration, normals
 from ..compensate.drift import grid_stride
 from ..core import frame as frames
 from ..core import geometry
+from ..core.checks import check_same_size
 from ..core.noise import second_differences, std_from_median
 from ..integration import background
 from ..normals.shadowed import PRIOR_STD, STEPS, LightView
@@ -34,15 +35,39 @@ class Drift(Twin, compensate.Drift):
             return super().ordered(values)
         return torch.from_numpy(np.sort(values.numpy(), axis=-1))
 
+    def mode(self, image: Tensor) -> Tensor:
+        return kernels.modes(image, grid_stride(image)) if usable(image) else super().mode(image)
+
+    def divided(self, light: Tensor, level: Tensor) -> Tensor:
+        if not usable(light, level):
+            return super().divided(light, level)
+        return light if level.eq(1.0).all() else kernels.divided(light, level)
+
     def median(self, values: Tensor) -> Tensor:
         return _median(values) if arrays_usable(values) else super().median(values)
 
 
 class Compensate(Twin, compensate.Compensate):
-    """With the accelerated estimator of drift."""
+    """One compiled kernel for all that stands between linear light and the drift, and the accelerated estimator of that."""
 
     plain = compensate.Compensate
     drift_block = Drift
+
+    def cleaned(self, light: Tensor, saturated: Tensor | None) -> Tensor:
+        gain, offset = self.gain.gain, self.gain.offset
+        maps = [field for field in (gain, offset) if field is not None]
+        if saturated is not None or not (maps or len(self.clean)) or not usable(light, *maps):
+            return super().cleaned(light, saturated)
+        for field in maps:
+            check_same_size("image", light, "the calibration", field.shape[1], field.shape[2])
+        empty = torch.empty(0, dtype=torch.int64)
+        defects, weights = (empty, empty), []
+        for block in self.clean:
+            if isinstance(block, compensate.FillDefects):
+                defects = (block.defect, block.neighbours)
+            else:
+                weights = block.weights
+        return kernels.clean(light, gain, offset, defects, (ctypes.c_float * len(weights))(*weights))
 
 
 class ContactMask(Twin, contact.ContactMask):

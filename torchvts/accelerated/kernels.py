@@ -58,6 +58,10 @@ def library() -> ctypes.CDLL | None:
     ]
     loaded.zero_background.argtypes = [pointer, pointer, *[whole] * 3, *[real] * 2, whole, pointer]
     loaded.contact_from_depth.argtypes = [pointer, step, step, pointer, pointer, step, step, *[whole] * 5, pointer, pointer]
+    loaded.clean.argtypes = [*[pointer] * 5, step, pointer, *[whole] * 4, pointer]
+    loaded.modes.argtypes = [pointer, *[whole] * 5, pointer]
+    loaded.divide_planes.argtypes = [pointer, pointer, whole, step, pointer]
+    loaded.divide_planes.restype = None
     loaded.grid_means.argtypes = [pointer, *[whole] * 7, pointer]
     loaded.slopes.argtypes = [pointer, whole, whole, real, pointer]
     loaded.divergence_lines.argtypes = [pointer, real, *[whole] * 9, pointer]
@@ -114,6 +118,50 @@ def grid_means(image: Tensor, stride: int, first: int) -> Tensor:
     means = image.new_empty(count, channels, rows, columns)
     _loaded().grid_means(image.data_ptr(), count * channels, height, width, stride, first, rows, columns, means.data_ptr())
     return means
+
+
+def clean(
+    light: Tensor, gain: Tensor | None, offset: Tensor | None, defects: tuple[Tensor, Tensor], weights: "ctypes.Array[ctypes.c_float]"
+) -> Tensor:
+    """light * gain + offset, (B, 3, H, W), its defects filled, blurred by an odd number of weights: see
+    :class:`~torchvts.compensate.Compensate`. ``defects``: their indices (N,) and those of their neighbours (N, 4)."""
+    light = light.contiguous()
+    count, _, height, width = light.shape
+    maps = [None if field is None else field.contiguous() for field in (gain, offset)]
+    out = torch.empty_like(light)
+    _check(
+        _loaded().clean(
+            light.data_ptr(),
+            *[None if field is None else field.data_ptr() for field in maps],
+            *[index.data_ptr() for index in defects],
+            defects[0].shape[0],
+            weights,
+            len(weights),
+            count,
+            height,
+            width,
+            out.data_ptr(),
+        )
+    )
+    return out
+
+
+def modes(image: Tensor, stride: int, halvings: int = 4) -> Tensor:
+    """:func:`~torchvts.core.robust.half_sample_mode` of each channel of (B, C, H, W), of every ``stride``-th pixel: (B, C)."""
+    image = image.contiguous()
+    count, channels, height, width = image.shape
+    found = image.new_empty(count, channels)
+    _check(_loaded().modes(image.data_ptr(), count * channels, height, width, stride, halvings, found.data_ptr()))
+    return found
+
+
+def divided(image: Tensor, level: Tensor) -> Tensor:
+    """Images (B, C, H, W) over levels (B, C, 1, 1)."""
+    image, level = image.contiguous(), level.contiguous()
+    out = torch.empty_like(image)
+    planes = image.shape[0] * image.shape[1]
+    _loaded().divide_planes(image.data_ptr(), level.data_ptr(), planes, image.shape[2] * image.shape[3], out.data_ptr())
+    return out
 
 
 def contact_mask(

@@ -50,16 +50,20 @@ class Drift(nn.Module):
     def forward(self, light: Tensor) -> Tensor:
         background, noise = self.background, self.noise
         if background is None or noise is None:
-            return light / self.by_mode(light)
+            return self.divided(light, self.by_mode(light))
         if self.by_mode_first:
             near = self.by_mode(light)
             if may_read_values() and float((near - 1.0).abs().amax()) < 0.149:
-                return light / near
+                return self.divided(light, near)
             far = self.by_statistics(light, background, noise)
-            return light / torch.where((far - 1.0).abs() > 0.15, far, near)
+            return self.divided(light, torch.where((far - 1.0).abs() > 0.15, far, near))
         level = self.by_statistics(light, background, noise)
         if may_read_values() and bool((level == 1.0).all()):
             return light
+        return self.divided(light, level)
+
+    def divided(self, light: Tensor, level: Tensor) -> Tensor:
+        """Light (B, 3, H, W) over levels (B, 3, 1, 1)."""
         return light / level
 
     def by_mode(self, ratio: Tensor, least: float = 0.01, most: float = 0.15) -> Tensor:
@@ -69,7 +73,7 @@ class Drift(nn.Module):
         ``least`` off it is left at 1, because there the error of the mode is no smaller (relief 26 against 28 um on the first
         Mini); from twice that it counts in full.
         """
-        drift = (half_sample_mode(self.ordered(_grid(ratio.detach()).flatten(2))) - 1.0).clamp(-most, most)  # (B, 3)
+        drift = (self.mode(ratio.detach()) - 1.0).clamp(-most, most)  # (B, 3)
         weight = (drift.abs().amax(dim=1, keepdim=True) / least - 1.0).clamp(0.0, 1.0)
         return (1.0 + weight * drift)[..., None, None]
 
@@ -122,6 +126,10 @@ class Drift(nn.Module):
         for k in range(1, 9):
             total += image[:, :, first + k // 3 : rows : stride, first + k % 3 : columns : stride]
         return total / 9.0
+
+    def mode(self, image: Tensor) -> Tensor:
+        """The mode of each channel, (B, 3), of some thousand pixels."""
+        return half_sample_mode(self.ordered(_grid(image).flatten(2)))
 
     def ordered(self, values: Tensor) -> Tensor:
         """Values (B, 3, N) sorted along the last dimension."""

@@ -15,6 +15,7 @@ from ..core.noise import second_differences, std_from_median
 from ..integration import background
 from ..normals.shadowed import PRIOR_STD, STEPS, LightView
 from . import kernels
+from .derived import response_lines
 from .gate import arrays_usable, usable
 from .twin import Twin
 
@@ -162,6 +163,28 @@ class NormalFromIntensity(Twin, normals.NormalFromIntensity):
         constants += [geometry.CLIFF_SLOPE, geometry.MAX_SLOPE]
         kernels.solve_shadowed(normal, image, limits, depth_mm, expected, self.view(image, window), constants)
         return normal
+
+
+class NormalFromResponse(Twin, normals.NormalFromResponse):
+    """One compiled pass, by rows of polynomials in place of maps."""
+
+    plain = normals.NormalFromResponse
+
+    def normals_of(self, image: Tensor, depth_mm: Tensor | None, window: tuple[int, int]) -> Tensor:
+        given = () if depth_mm is None else (depth_mm,)
+        lines = response_lines(self) if usable(image, self.maps, self.per_mm, *given) else None
+        if lines is None:
+            return super().normals_of(image, depth_mm, window)
+        return kernels.response_normals(image, depth_mm, lines, window, self.max_sine)
+
+
+class Masked(Twin, frames.Masked):
+    """One compiled pass."""
+
+    plain = frames.Masked
+
+    def forward(self, gradient: Tensor, mask: Tensor) -> Tensor:
+        return kernels.masked(gradient, mask) if usable(gradient) else super().forward(gradient, mask)
 
 
 class GradientFromNormal(Twin, geometry.GradientFromNormal):

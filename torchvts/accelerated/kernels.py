@@ -62,6 +62,20 @@ def library() -> ctypes.CDLL | None:
     loaded.modes.argtypes = [pointer, *[whole] * 5, pointer]
     loaded.divide_planes.argtypes = [pointer, pointer, whole, step, pointer]
     loaded.divide_planes.restype = None
+    loaded.response_normals.argtypes = [
+        pointer,
+        *[step] * 3,
+        *[pointer] * 2,
+        *[whole] * 2,
+        pointer,
+        *[step] * 2,
+        pointer,
+        real,
+        *[whole] * 3,
+        pointer,
+    ]
+    loaded.mask_values.argtypes = [pointer, pointer, *[step] * 2, *[whole] * 4, pointer]
+    loaded.response_normals.restype = loaded.mask_values.restype = None
     loaded.grid_means.argtypes = [pointer, *[whole] * 7, pointer]
     loaded.slopes.argtypes = [pointer, whole, whole, real, pointer]
     loaded.divergence_lines.argtypes = [pointer, real, *[whole] * 9, pointer]
@@ -194,6 +208,57 @@ def contact_from_depth(
     mask = (deformed.data_ptr(), deformed.stride(0), deformed.stride(2))
     _check(_loaded().contact_from_depth(*inputs, *mask, count, rows, columns, *cells, model, contact.data_ptr()))
     return contact
+
+
+class ResponseLines(NamedTuple):
+    """A response field whose coefficients are polynomials along each row of the image.
+
+    Attributes:
+        place: (W,), of each column, from -1 to 1.
+        weight: (H, degree + 1, 2, terms), the lowest power first; degree 2, 4 or 6.
+        per_mm: (H, 3, 3), what depth does to R, G and B, degree 2; None if that is not known.
+    """
+
+    place: Tensor
+    weight: Tensor
+    per_mm: Tensor | None
+
+
+def response_normals(
+    compensated: Tensor, depth_mm: Tensor | None, lines: ResponseLines, window: tuple[int, int], max_sine: float
+) -> Tensor:
+    """Unit normals (B, 3, h, w) of a window: see :class:`~torchvts.normals.NormalFromResponse`."""
+    compensated = _with_whole_rows(compensated)
+    depth_mm = None if depth_mm is None else _with_whole_rows(depth_mm)
+    (top, left), (count, _, rows, columns) = window, compensated.shape
+    weight, per_mm = lines.weight, None if depth_mm is None else lines.per_mm
+    normal = compensated.new_empty(count, 3, rows, columns)
+    _loaded().response_normals(
+        compensated.data_ptr(),
+        *compensated.stride()[:3],
+        lines.place.data_ptr() + 4 * left,
+        weight.data_ptr() + 4 * top * weight.stride(0),
+        weight.shape[1] - 1,
+        weight.shape[3],
+        *_depth_arguments(depth_mm),
+        None if per_mm is None else per_mm.data_ptr() + 36 * top,
+        max_sine,
+        count,
+        rows,
+        columns,
+        normal.data_ptr(),
+    )
+    return normal
+
+
+def masked(gradient: Tensor, mask: Tensor) -> Tensor:
+    """A gradient (B, 2, h, w), zero outside of a mask, bool (B, 1, h, w)."""
+    gradient, mask = gradient.contiguous(), _with_whole_rows(mask)
+    out = torch.empty_like(gradient)
+    _loaded().mask_values(
+        gradient.data_ptr(), mask.data_ptr(), mask.stride(0), mask.stride(2), *gradient.shape, out.data_ptr()
+    )
+    return out
 
 
 def normals(compensated: Tensor, limits: Limits, inverse: Tensor, depth_mm: Tensor | None, view: LightView) -> tuple[Tensor, bool]:

@@ -14,6 +14,7 @@ from ..accelerated import (
     GradientFromNormal,
     LargestChange,
     NormalFromIntensity,
+    NormalFromResponse,
     PoissonBackground,
     Uncrop,
     ZeroBackground,
@@ -39,7 +40,7 @@ from ..integration import WrappedIntegrator, as_integrator
 from ..integration.background import DepthAsIs
 from ..model import Calibration, Sensor, check_calibration
 from ..normals import NormalFromIntensity as PlainNormalFromIntensity
-from ..normals import NormalFromResponse, WrappedNormals, as_normal_model, check_domain
+from ..normals import WrappedNormals, as_normal_model, check_domain
 from .gs_sdk import gs_sdk_blocks
 from .refine import Adaptive, Once, Repeat, SlopesOfDepth, SlopesOfPixels
 from .shadows import Shadows

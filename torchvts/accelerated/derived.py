@@ -1,5 +1,6 @@
 """What kernels need of a block's buffers in another form, worked out once and kept until a buffer changes."""
 
+import ctypes
 from collections.abc import Callable
 from typing import TypeVar, cast
 from weakref import WeakKeyDictionary
@@ -7,6 +8,8 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor, nn
 
+from ..compensate.compensate import Gain
+from ..contact import ContactMask
 from ..normals import NormalFromResponse
 from .kernels import ResponseLines
 
@@ -35,6 +38,28 @@ def kept(module: nn.Module, name: str, buffers: tuple[Tensor, ...], make: Callab
     return cast(_Value, note[2])
 
 
+def flat_is_one(block: ContactMask) -> bool:
+    """Whether the undeformed skin is 1 everywhere, as of response fields: the offset of its change is then known."""
+    buffers = (block.offset, block.per_noise)
+    return bool(kept(block, "flat", buffers, lambda: torch.equal(block.offset, -block.per_noise)))
+
+
+def pedestals(block: Gain) -> "ctypes.Array[ctypes.c_float] | None":
+    """What the offset is of the gain, where it is one number a channel, but for rounding; else None."""
+    gain, offset = block.gain, block.offset
+    if gain is None or offset is None:
+        return None
+    return kept(block, "pedestals", (gain, offset), lambda: _pedestals(gain, offset))
+
+
+def _pedestals(gain: Tensor, offset: Tensor) -> "ctypes.Array[ctypes.c_float] | None":
+    ratio = offset.double() / gain.double()
+    middle = ratio.flatten(1).mean(dim=1)
+    if not bool(((ratio - middle[:, None, None]).abs() <= 3e-7 * middle.abs()[:, None, None]).all()):
+        return None
+    return (ctypes.c_float * 3)(*middle.tolist())
+
+
 def response_lines(block: NormalFromResponse) -> ResponseLines | None:
     """The coefficients of a response field as polynomials along rows; None where its maps are none."""
     return kept(block, "lines", (block.maps, block.per_mm), lambda: _lines(block.maps, block.per_mm))
@@ -46,7 +71,9 @@ def _lines(maps: Tensor, per_mm: Tensor) -> ResponseLines | None:
     by_depth = _polynomials(per_mm, place, 2)
     if weight is None or by_depth is None or maps.shape[0] not in (3, 9):
         return None
-    return ResponseLines(place.float(), weight.permute(2, 3, 1, 0).float().contiguous(), by_depth.transpose(0, 1).float().contiguous())
+    return ResponseLines(
+        place.float(), weight.permute(2, 3, 1, 0).float().contiguous(), by_depth.transpose(0, 1).float().contiguous()
+    )
 
 
 def _polynomials(maps: Tensor, place: Tensor, degree: int) -> Tensor | None:

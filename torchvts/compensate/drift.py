@@ -73,7 +73,7 @@ class Drift(nn.Module):
         ``least`` off it is left at 1, because there the error of the mode is no smaller (relief 26 against 28 um on the first
         Mini); from twice that it counts in full.
         """
-        drift = (self.mode(ratio.detach()) - 1.0).clamp(-most, most)  # (B, 3)
+        drift = (half_sample_mode(self.ordered(_grid(ratio.detach()).flatten(2))) - 1.0).clamp(-most, most)  # (B, 3)
         weight = (drift.abs().amax(dim=1, keepdim=True) / least - 1.0).clamp(0.0, 1.0)
         return (1.0 + weight * drift)[..., None, None]
 
@@ -126,10 +126,6 @@ class Drift(nn.Module):
         for k in range(1, 9):
             total += image[:, :, first + k // 3 : rows : stride, first + k % 3 : columns : stride]
         return total / 9.0
-
-    def mode(self, image: Tensor) -> Tensor:
-        """The mode of each channel, (B, 3), of some thousand pixels."""
-        return half_sample_mode(self.ordered(_grid(image).flatten(2)))
 
     def ordered(self, values: Tensor) -> Tensor:
         """Values (B, 3, N) sorted along the last dimension."""

@@ -20,6 +20,7 @@ from ..accelerated import (
     ZeroBackground,
     scriptable,
 )
+from ..accelerated.threads import OneThread, one_suffices
 from ..compensate import Compensate as PlainCompensate
 from ..contact import ContactMask as PlainContactMask
 from ..contact import ContactSettings
@@ -220,6 +221,14 @@ class DepthPipeline(nn.Module):
             ValueError: wrong shape, or, for eager tensors on a CPU, values outside [0, 1] or not finite.
             TypeError: not floating point.
         """
+        if not torch.jit.is_scripting():  # noqa: SIM102
+            if one_suffices(images):
+                with OneThread():
+                    return self.reconstructed(images)
+        return self.reconstructed(images)
+
+    def reconstructed(self, images: Tensor) -> DepthOutput:
+        """:meth:`forward` in the threads that torch now uses."""
         check_images(images)
         compensated = self.compensate(images)
         frame = self.crop(compensated, self.deformed(compensated))

@@ -1,6 +1,8 @@
 /* Compensated images and the drift of their light: the same results as torchvts/compensate, which explains them. */
 #include "kernels.h"
 
+#include <math.h>
+
 /* Means of 3 x 3 pixels, the first from (first, first) on and then every `stride`, of `planes` images: (planes, rows, columns). */
 EXPORT void grid_means(const float *image, int planes, int height, int width, int stride, int first, int rows, int columns, float *means) {
     for (int plane = 0; plane < planes; plane++, image += (size_t)height * width)
@@ -11,8 +13,12 @@ EXPORT void grid_means(const float *image, int planes, int height, int width, in
             }
 }
 
-WIDE static void multiply_add(const float *restrict image, const float *restrict gain, const float *restrict offset, int n, float *restrict light) {
-    if (gain && offset)
+/* image * gain + offset, either of which may be null; without offset (image + pedestal) * gain. */
+WIDE static void multiply_add(const float *restrict image, const float *restrict gain, const float *restrict offset, float pedestal, int n,
+                              float *restrict light) {
+    if (gain && !offset && pedestal != 0.0f)
+        for (int x = 0; x < n; x++) light[x] = (image[x] + pedestal) * gain[x];
+    else if (gain && offset)
         for (int x = 0; x < n; x++) light[x] = image[x] * gain[x] + offset[x];
     else if (gain)
         for (int x = 0; x < n; x++) light[x] = image[x] * gain[x];
@@ -98,9 +104,9 @@ static void fill(float *plane, const int64_t *defect, const int64_t *neighbours,
 
 /*
  * light (frames, 3, height, width) = image * gain + offset, its `defects` filled, blurred by `taps` weights. gain and offset (3, height,
- * width) may be null, taps and defects 0. Returns 1 where memory is short.
+ * width) may be null, taps and defects 0; without offset it is pedestal (3) * gain. Returns 1 where memory is short.
  */
-EXPORT int clean(const float *image, const float *gain, const float *offset, const int64_t *defect, const int64_t *neighbours, int64_t defects,
+EXPORT int clean(const float *image, const float *gain, const float *offset, const float *pedestal, const int64_t *defect, const int64_t *neighbours, int64_t defects,
                  const float *weight, int taps, int frames, int height, int width, float *light) {
     const size_t pixels = (size_t)height * width, lines = (size_t)taps * width + width + taps;
     float *scratch = malloc(sizeof(float) * (lines + (taps ? pixels : 0) + (size_t)defects + 1));
@@ -113,7 +119,7 @@ EXPORT int clean(const float *image, const float *gain, const float *offset, con
     for (int plane = 0; plane < 3 * frames; plane++, image += pixels, light += pixels) {
         const size_t at = pixels * (size_t)(plane % 3);
         float *to = taps ? scratch + lines : light;
-        multiply_add(image, gain ? gain + at : NULL, offset ? offset + at : NULL, (int)pixels, to);
+        multiply_add(image, gain ? gain + at : NULL, offset ? offset + at : NULL, pedestal[plane % 3], (int)pixels, to);
         if (defects) fill(to, defect, neighbours, defects, repaired);
         if (taps) blur_plane(to, weight, taps, height, width, scratch, line, light);
     }
@@ -121,39 +127,61 @@ EXPORT int clean(const float *image, const float *gain, const float *offset, con
     return 0;
 }
 
-/* Sorts n values by the bits of their floats, eleven at a time; other: as many more. Returns where the sorted values lie. */
+/* Sorts n values by the bits of their floats, at most twelve at a time; other: as many more. Returns where the sorted values lie. */
 static float *sorted(float *values, float *other, int n) {
-    uint32_t counts[3][2048] = {{0}};
-    uint32_t *from = (uint32_t *)values, *to = (uint32_t *)other;
+    uint32_t counts[3][4096], *from = (uint32_t *)values, *to = (uint32_t *)other, low = 0xffffffffu, high = 0;
     for (int k = 0; k < n; k++) { /* an order of whole numbers: negative floats run backwards */
-        const uint32_t bits = from[k] ^ ((from[k] >> 31) ? 0xffffffffu : 0x80000000u);
-        from[k] = bits;
-        counts[0][bits & 2047]++, counts[1][bits >> 11 & 2047]++, counts[2][bits >> 22]++;
+        from[k] ^= (uint32_t)((int32_t)from[k] >> 31) | 0x80000000u;
+        low = from[k] < low ? from[k] : low;
+        high = from[k] > high ? from[k] : high;
     }
-    for (int pass = 0; pass < 3; pass++) {
+    int bits = 0;
+    while (bits < 32 && (high - low) >> bits) bits++;
+    const int passes = bits > 24 ? 3 : bits > 12 ? 2 : 1, digit = (bits + passes - 1) / passes;
+    const uint32_t most = (1u << digit) - 1u;
+    memset(counts, 0, sizeof counts[0] * (size_t)passes);
+    for (int pass = 0; pass < passes; pass++)
+        for (int k = 0; k < n; k++) counts[pass][(from[k] - low) >> (digit * pass) & most]++;
+    for (int pass = 0; pass < passes; pass++) {
         uint32_t *count = counts[pass], total = 0;
-        const int shift = 11 * pass;
-        for (int k = 0; k < 2048; k++) {
+        for (uint32_t k = 0; k <= most; k++) {
             const uint32_t here = count[k];
             count[k] = total;
             total += here;
         }
-        for (int k = 0; k < n; k++) to[count[from[k] >> shift & 2047]++] = from[k];
+        for (int k = 0; k < n; k++) to[count[(from[k] - low) >> (digit * pass) & most]++] = from[k];
         uint32_t *swapped = from;
         from = to, to = swapped;
     }
-    for (int k = 0; k < n; k++) from[k] ^= (from[k] >> 31) ? 0x80000000u : 0xffffffffu;
+    for (int k = 0; k < n; k++) from[k] ^= (uint32_t)~((int32_t)from[k] >> 31) | 0x80000000u;
     return (float *)from;
+}
+
+enum { LANES = 16 };
+
+/* The smallest of values[k + apart] - values[k] for k below n. */
+WIDE static float narrowest(const float *restrict values, int apart, int n) {
+    float least_of[LANES], found;
+    int k = 0;
+    for (int j = 0; j < LANES; j++) least_of[j] = values[apart] - values[0];
+    for (; k + LANES <= n; k += LANES)
+        for (int j = 0; j < LANES; j++) {
+            const float width = values[k + j + apart] - values[k + j];
+            least_of[j] = width < least_of[j] ? width : least_of[j];
+        }
+    found = least_of[0];
+    for (; k < n; k++) found = values[k + apart] - values[k] < found ? values[k + apart] - values[k] : found;
+    for (int j = 1; j < LANES; j++) found = least_of[j] < found ? least_of[j] : found;
+    return found;
 }
 
 /* half_sample_mode() of torchvts/core/robust.py. */
 static float half_sample_mode(const float *ordered, int n, int halvings) {
     for (; halvings > 0; halvings--) {
         const int half = (n + 1) / 2;
+        const float width = narrowest(ordered, half - 1, n - half + 1);
         int start = 0;
-        float narrowest = ordered[half - 1] - ordered[0];
-        for (int k = 1; k <= n - half; k++)
-            if (ordered[k + half - 1] - ordered[k] < narrowest) narrowest = ordered[k + half - 1] - ordered[k], start = k;
+        while (start < n - half && ordered[start + half - 1] - ordered[start] != width) start++;
         ordered += start;
         n = half;
     }
@@ -172,6 +200,23 @@ EXPORT int modes(const float *image, int planes, int height, int width, int stri
         mode[plane] = half_sample_mode(sorted(some, some + n, n), n, halvings);
     }
     free(some);
+    return 0;
+}
+
+/* The same made the levels that Drift.by_mode() divides by, (frames, 3). */
+EXPORT int levels(const float *image, int frames, int height, int width, int stride, int halvings, float least_drift, float most, float *level) {
+    if (modes(image, 3 * frames, height, width, stride, halvings, level)) return 1;
+    for (int b = 0; b < frames; b++, level += 3) {
+        float largest = 0.0f;
+        for (int c = 0; c < 3; c++) {
+            level[c] -= 1.0f;
+            level[c] = level[c] < -most ? -most : level[c] > most ? most : level[c];
+            largest = fabsf(level[c]) > largest ? fabsf(level[c]) : largest;
+        }
+        float weight = largest / least_drift - 1.0f;
+        weight = weight < 0.0f ? 0.0f : weight > 1.0f ? 1.0f : weight;
+        for (int c = 0; c < 3; c++) level[c] = 1.0f + weight * level[c];
+    }
     return 0;
 }
 

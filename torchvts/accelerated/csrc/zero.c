@@ -373,7 +373,7 @@ EXPORT int zero_background(const float *depth, const uint8_t *deformed, int fram
         known_cells(&work, depth, height, width, stiff, &range);
         const Box box = not_flat(work.kind, height, width);
         memset(out, 0, sizeof(float) * pixels);
-        if (box.bottom == 0) continue;
+        if (box.bottom == 0) continue; /* all skin is flat */
         continued(work.grids, work.count, sweeps, work.line);
         if (add_known(&work, depth, width, box, tolerance * range)) continued(work.grids, work.count, sweeps, work.line);
         for (int y = box.top; y < box.bottom; y++) {

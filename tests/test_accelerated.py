@@ -8,8 +8,10 @@ import torch
 
 import torchvts as vts
 from torchvts.accelerated import kernels, reference_only
-from torchvts.accelerated.blocks import Drift, LargestChange
+from torchvts.accelerated.blocks import Compensate, ContactFromDepth, Drift, LargestChange, NormalFromResponse, ZeroBackground
 from torchvts.accelerated.gate import usable
+from torchvts.core.geometry import gradient_of_depth
+from torchvts.model.response_field import DepthBrightness, ResponseField, ResponseModel
 
 scenes = vts.scenes
 
@@ -266,3 +268,131 @@ def test_a_library_that_is_missing_or_left_over_is_not_used(monkeypatch, tmp_pat
             assert kernels.library() is None
     finally:
         kernels.library.cache_clear()
+
+
+def rough_presses(size, count, seed):
+    """Depth, gradient and deformed skin of frames as no sensor gives them: noise on top of balls, holes, and a frame without."""
+    generator = torch.Generator().manual_seed(seed)
+    height, width = size
+    y, x = torch.arange(height)[:, None], torch.arange(width)[None, :]
+    depth = torch.zeros(count, 1, *size)
+    for frame in range(count - 1):
+        middle = torch.rand(2, generator=generator) * torch.tensor([height, width])
+        squared = (y - middle[0]) ** 2 + (x - middle[1]) ** 2
+        depth[frame, 0] = (1.0 - squared / (0.3 * min(size) + 2.0) ** 2).clamp_min(-0.1 * frame)
+    depth += 0.01 * torch.randn(depth.shape, generator=generator)
+    deformed = (depth > 0.05) & (torch.rand(depth.shape, generator=generator) > 0.01)
+    return depth, 0.2 * torch.randn(count, 2, *size, generator=generator) * deformed, deformed
+
+
+@pytest.mark.parametrize("size", [(48, 64), (240, 320), (121, 163), (45, 63), (2, 3), (1, 9), (3, 1), (480, 70)])
+def test_zero_in_the_background(size):
+    block = ZeroBackground()
+    depth, _, deformed = rough_presses(size, 4, size[0])
+    loops, operators = both(block, depth, deformed)
+    assert float((loops - operators).abs().max()) < 1e-6
+    loops, operators = both(block, depth, torch.ones_like(deformed))
+    assert float((loops - operators).abs().max()) < 1e-6
+
+
+@pytest.mark.parametrize("mm_per_pixel", [0.02, 0.0634, 0.2])
+@pytest.mark.parametrize("size", [(48, 64), (240, 320), (45, 63), (2, 3), (1, 9), (9, 1)])
+def test_contact_from_depth(size, mm_per_pixel):
+    """As it is in the pipeline: depth and deformed skin are windows of whole images."""
+    block = ContactFromDepth(mm_per_pixel)
+    depth, _, deformed = rough_presses((size[0] + 8, size[1] + 16), 4, size[0])
+    slopes = gradient_of_depth(depth, mm_per_pixel) * deformed
+    part = (slice(None), slice(None), slice(8, None), slice(16, None))
+    loops, operators = both(block, depth[part], slopes[part], deformed[part])
+    assert loops.shape == operators.shape and loops.dtype == torch.bool
+    assert int((loops != operators).sum()) <= 1e-4 * loops.numel()
+
+
+@pytest.fixture(scope="module")
+def response_unit():
+    """A unit calibrated by a response field with products, a blur and a drift of the light, and its frames."""
+    generator = torch.Generator().manual_seed(3)
+    field = ResponseField(3, 2, 8.0, tuple(tuple((0.3 * torch.randn(66, generator=generator)).tolist()) for _ in range(2)))
+    by_depth = DepthBrightness(2, 8.0, tuple(tuple((0.05 * torch.randn(6, generator=generator)).tolist()) for _ in range(3)))
+    sensor = vts.Sensor("soft", 120, 160, 0.1, blur_px=1.0)
+    background = 0.4 + 0.1 * torch.rand(3, 120, 160, generator=generator)
+    background[:, 40, 50] = 0.0  # a defect
+    calibration = vts.Calibration(
+        sensor,
+        None,
+        background,
+        torch.full((3,), 0.004),
+        True,
+        {"model": "response_field", "source": "given"},
+        ResponseModel(field, by_depth),
+    )
+    y, x = torch.arange(120.0)[:, None] - 50.0, torch.arange(160.0)[None, :] - 90.0
+    bump = torch.exp(-(x * x + y * y) / 600.0)
+    change = torch.stack([bump * x / 60.0, -bump * x / 60.0, bump * y / 60.0])
+    frames = torch.stack([background * (1.0 + level * change) * (1.0 + drift) for level, drift in ((1, 0), (0.6, 0.05), (0, 0))])
+    noisy = frames + 0.004 * torch.randn(frames.shape, generator=generator)
+    return calibration, (noisy.clamp(0.0, 1.0) * 255.0).round() / 255.0
+
+
+@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
+def test_a_frame_by_response_fields(response_unit, mode):
+    calibration, frames = response_unit
+    pipe = vts.DepthPipeline.from_calibration(calibration, mode)
+    assert "PoissonBackground" in str(pipe) and bool(pipe(frames).deformed[0].any())
+    for some in (frames, frames[:1], frames[1:]):
+        loops, operators = both(pipe, some)
+        assert torch.equal(loops.deformed, operators.deformed) and torch.equal(loops.contact, operators.contact)
+        assert float((loops.depth_mm - operators.depth_mm).abs().max()) < 1e-6
+        assert float((loops.normal - operators.normal).abs().max()) < 2e-5
+
+
+def test_loops_follow_what_is_loaded(response_unit):
+    """The tables of the loops are made of a block's maps, and made again when these change."""
+    calibration, frames = response_unit
+    block = NormalFromResponse.from_calibration(calibration)
+    ratio = Compensate.from_calibration(calibration)(frames)
+    before = block(ratio)
+    state = {name: 0.5 * value for name, value in block.state_dict().items()}
+    block.load_state_dict(state)
+    loops, operators = both(block, ratio)
+    assert float((loops - operators).abs().max()) < 2e-6 and float((loops - before).abs().max()) > 0.01
+    block.maps.copy_(torch.rand(block.maps.shape, generator=torch.Generator().manual_seed(0)))  # no polynomial at all
+    loops, operators = both(block, ratio)
+    assert torch.equal(loops, operators)
+
+
+@pytest.mark.parametrize("size", [(240, 320), (45, 63), (7, 9)])
+@pytest.mark.parametrize("blur_px", [0.0, 0.6, 1.0, 2.5])
+def test_compensated_images(size, blur_px):
+    generator = torch.Generator().manual_seed(size[0])
+    gain, image = 0.5 + torch.rand(3, *size, generator=generator), torch.rand(2, 3, *size, generator=generator)
+    defects = torch.rand(size, generator=generator) > 0.98
+    for offset in (None, 0.03 * gain, torch.rand(3, *size, generator=generator)):
+        for given in ((gain, offset), (None, offset)):
+            block = Compensate(*given, defects=defects, blur_px=blur_px, drift=Drift())
+            loops, operators = both(block, image)
+            assert float((loops - operators).abs().max()) < 1e-6
+
+
+def test_small_batches_take_one_thread_and_large_ones_all(ring):
+    """Whatever the number of threads, results are the same, and torch's number of threads is what it was."""
+    lights = ring()
+    scene = scenes.sphere_press(10.0, 1.0, (0, 0), 240, 320, 0.1)
+    calibration = vts.Calibration.from_lights(lights, vts.Sensor("rig", 240, 320, 0.1))
+    pipe = vts.DepthPipeline.from_calibration(calibration)
+    inside = []
+    pipe.deformed.register_forward_hook(lambda *_: inside.append(torch.get_num_threads()))
+    image = scenes.render(scene, lights, noise_std=0.003, bits=8, seed=1).detach()
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        alone, five = pipe(image), pipe(image.repeat(5, 1, 1, 1))
+        assert inside == [1, 2] and torch.get_num_threads() == 2
+        assert float((five.depth_mm - alone.depth_mm).abs().max()) < 1e-6
+        with pytest.raises(ValueError, match="images"):
+            pipe(image[0])
+        with pytest.raises(ValueError, match="images"):
+            pipe(2.0 * image)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)

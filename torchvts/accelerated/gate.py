@@ -37,7 +37,7 @@ def reference_only() -> Iterator[None]:
 
 def arrays_usable(*tensors: Tensor) -> bool:
     """Whether NumPy and OpenCV may read these tensors: plain ones on a CPU, in eager mode, with no derivative recorded."""
-    if torch.compiler.is_compiling() or torch.jit.is_tracing():
+    if torch.compiler.is_compiling() or torch._C._get_tracing_state() is not None:
         return False
     if forward_ad._current_level >= 0 or torch._C._len_torch_dispatch_stack() > 0:  # tangents and traces would be lost
         return False
@@ -45,7 +45,7 @@ def arrays_usable(*tensors: Tensor) -> bool:
     for tensor in tensors:  # a loop, because it runs some ten times a frame
         if type(tensor) is not Tensor and type(tensor) is not nn.Parameter:
             return False
-        if tensor.device.type != "cpu" or tensor.dtype in HALF or (recorded and tensor.requires_grad):
+        if not tensor.is_cpu or tensor.dtype in HALF or (recorded and tensor.requires_grad):
             return False
         if torch._C._functorch.is_functorch_wrapped_tensor(tensor):
             return False

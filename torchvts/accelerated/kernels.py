@@ -17,8 +17,11 @@ import torch
 from torch import Tensor
 
 from ..normals.shadowed import LightView, Limits
+from .threads import by_frames
 
 LIBRARY = Path(__file__).parent / "csrc" / "libtorchvts.so"
+
+NO_PEDESTAL = (ctypes.c_float * 3)()
 
 
 @functools.cache
@@ -57,6 +60,27 @@ def library() -> ctypes.CDLL | None:
         *[pointer] * 5,
     ]
     loaded.zero_background.argtypes = [pointer, pointer, *[whole] * 3, *[real] * 2, whole, pointer]
+    loaded.contact_from_depth.argtypes = [pointer, step, step, pointer, pointer, step, step, *[whole] * 5, pointer, pointer]
+    loaded.clean.argtypes = [*[pointer] * 6, step, pointer, *[whole] * 4, pointer]
+    loaded.levels.argtypes = [pointer, *[whole] * 5, *[real] * 2, pointer]
+    loaded.box_of.argtypes = [pointer, *[whole] * 3, pointer]
+    loaded.box_of.restype = None
+    loaded.divide_planes.argtypes = [pointer, pointer, whole, step, pointer]
+    loaded.divide_planes.restype = None
+    loaded.response_normals.argtypes = [
+        pointer,
+        *[step] * 3,
+        *[pointer] * 2,
+        *[whole] * 2,
+        pointer,
+        *[step] * 2,
+        pointer,
+        real,
+        *[whole] * 3,
+        pointer,
+    ]
+    loaded.mask_values.argtypes = [pointer, pointer, *[step] * 2, *[whole] * 4, pointer]
+    loaded.response_normals.restype = loaded.mask_values.restype = None
     loaded.grid_means.argtypes = [pointer, *[whole] * 7, pointer]
     loaded.slopes.argtypes = [pointer, whole, whole, real, pointer]
     loaded.divergence_lines.argtypes = [pointer, real, *[whole] * 9, pointer]
@@ -64,7 +88,7 @@ def library() -> ctypes.CDLL | None:
     loaded.divide.argtypes = [*[pointer] * 4, *[whole] * 3]
     loaded.finish_depth.argtypes = [*[pointer] * 3, *[whole] * 7, pointer]
     loaded.largest_change.argtypes = [pointer, pointer, whole, step, pointer]
-    loaded.uncrop.argtypes = [pointer, *[whole] * 7, pointer, pointer]
+    loaded.uncrop.argtypes = [*[pointer] * 2, *[whole] * 7, *[pointer] * 3]
     for name in ("grid_means", "solve_shadowed", "slopes", "to_columns", "finish_depth", "largest_change", "uncrop"):
         getattr(loaded, name).restype = None
     return loaded
@@ -93,6 +117,13 @@ def _check(short_of_memory: int) -> None:
         raise MemoryError("torchvts: no memory is left for a few rows of the image")
 
 
+def _at(tensor: Tensor | None, frame: int) -> int | None:
+    """Address of a frame of a batch; of the only one, where one serves all."""
+    if tensor is None:
+        return None
+    return tensor.data_ptr() + (0 if tensor.shape[0] == 1 else frame * tensor.stride(0) * tensor.element_size())
+
+
 def _with_whole_rows(tensor: Tensor) -> Tensor:
     """The tensor with each row contiguous; frames, channels and rows may lie anywhere."""
     return tensor if tensor.stride(3) == 1 else tensor.contiguous()
@@ -115,20 +146,172 @@ def grid_means(image: Tensor, stride: int, first: int) -> Tensor:
     return means
 
 
+def clean(
+    light: Tensor,
+    gain: Tensor | None,
+    offset: "Tensor | ctypes.Array[ctypes.c_float]",
+    defects: tuple[Tensor, Tensor],
+    weights: "ctypes.Array[ctypes.c_float]",
+) -> Tensor:
+    """light * gain + offset, (B, 3, H, W), its defects filled, blurred by an odd number of weights: see
+    :class:`~torchvts.compensate.Compensate`.
+
+    ``offset``: of every pixel, (3, H, W); or three pedestals, and the offset is pedestal * gain. ``defects``: their indices (N,)
+    and those of their neighbours (N, 4).
+    """
+    light = light.contiguous()
+    count, _, height, width = light.shape
+    gain = None if gain is None else gain.contiguous()
+    by_pixel = offset.contiguous() if isinstance(offset, Tensor) else None
+    out = torch.empty_like(light)
+    maps = (None if gain is None else gain.data_ptr(), None if by_pixel is None else by_pixel.data_ptr())
+    pedestal = NO_PEDESTAL if isinstance(offset, Tensor) else offset
+    filled = (*[index.data_ptr() for index in defects], defects[0].shape[0])
+    kernel = _loaded().clean
+    _check(
+        by_frames(
+            count,
+            height * width,
+            lambda first, many: kernel(
+                _at(light, first), *maps, pedestal, *filled, weights, len(weights), many, height, width, _at(out, first)
+            ),
+        )
+    )
+    return out
+
+
+def levels(image: Tensor, stride: int, least: float, most: float, halvings: int = 4) -> Tensor:
+    """Brightness of each channel, (B, 3, 1, 1): see :meth:`~torchvts.compensate.Drift.by_mode`."""
+    image = image.contiguous()
+    count, _, height, width = image.shape
+    found = image.new_empty(count, 3, 1, 1)
+    size, limits, kernel = (height, width, stride, halvings), (least, most), _loaded().levels
+    _check(by_frames(count, height * width, lambda first, many: kernel(_at(image, first), many, *size, *limits, _at(found, first))))
+    return found
+
+
+def box_of(mask: Tensor) -> tuple[int, int, int, int]:
+    """(top, bottom, left, right) of the smallest box that holds all of a bool (B, 1, H, W); zeros without any."""
+    mask = mask.contiguous()
+    box = (ctypes.c_int * 4)()
+    _loaded().box_of(mask.data_ptr(), mask.shape[0], mask.shape[2], mask.shape[3], box)
+    return box[0], box[1], box[2], box[3]
+
+
+def divided(image: Tensor, level: Tensor) -> Tensor:
+    """Images (B, C, H, W) over levels (B, C, 1, 1)."""
+    image, level = image.contiguous(), level.contiguous()
+    level, out = level.expand(image.shape[0], -1, -1, -1).contiguous(), torch.empty_like(image)
+    count, planes, pixels, kernel = image.shape[0], image.shape[1], image.shape[2] * image.shape[3], _loaded().divide_planes
+    by_frames(
+        count,
+        pixels,
+        lambda first, many: kernel(_at(image, first), _at(level, first), many * planes, pixels, _at(out, first)),
+    )
+    return out
+
+
 def contact_mask(
-    compensated: Tensor, offset: Tensor, per_noise: Tensor, limits: tuple[Tensor, Tensor], grid: ContactGrid
+    compensated: Tensor, offset: Tensor | None, per_noise: Tensor, limits: tuple[Tensor, Tensor], grid: ContactGrid
 ) -> tuple[Tensor, Tensor]:
     """Deformed area and its interior, bool (B, 1, H, W): see :class:`~torchvts.contact.ContactMask`, whose attributes these are.
 
-    ``limits``: ``failed_below`` and ``most_far_field``.
+    ``offset``: None where it is ``-per_noise``, as the undeformed skin is 1. ``limits``: ``failed_below`` and ``most_far_field``.
     """
-    compensated, offset, per_noise = compensated.contiguous(), offset.contiguous(), per_noise.contiguous()
+    compensated, per_noise = compensated.contiguous(), per_noise.contiguous()
+    offset = None if offset is None else offset.contiguous()
+    offsets = None if offset is None else offset.data_ptr()
     count, _, height, width = compensated.shape
     mask = compensated.new_empty(count, 1, height, width, dtype=torch.bool)
     interior = torch.empty_like(mask)
-    inputs = (compensated.data_ptr(), offset.data_ptr(), per_noise.data_ptr(), limits[0].data_ptr(), limits[1].data_ptr())
-    _check(_loaded().contact_mask(*inputs, count, height, width, *grid, mask.data_ptr(), interior.data_ptr()))
+    fields = (offsets, per_noise.data_ptr(), limits[0].data_ptr(), limits[1].data_ptr())
+    kernel = _loaded().contact_mask
+    _check(
+        by_frames(
+            count,
+            height * width,
+            lambda first, many: kernel(
+                _at(compensated, first), *fields, many, height, width, *grid, _at(mask, first), _at(interior, first)
+            ),
+        )
+    )
     return mask, interior
+
+
+def contact_from_depth(
+    depth_mm: Tensor, gradient: Tensor, deformed: Tensor, cells: tuple[int, int], model: "ctypes.Array[ctypes.c_float]"
+) -> Tensor:
+    """Contact, bool (B, 1, h, w), of a window: see :class:`~torchvts.contact.ContactFromDepth`.
+
+    ``cells``: side and reach; ``model``: side of a cell in mm, share, bounds of the decay length and of the tail, least free share.
+    """
+    depth_mm, deformed, gradient = _with_whole_rows(depth_mm), _with_whole_rows(deformed), gradient.contiguous()
+    count, _, rows, columns = depth_mm.shape
+    contact = depth_mm.new_empty(count, 1, rows, columns, dtype=torch.bool)
+    strides = (depth_mm.stride(0), depth_mm.stride(2)), (deformed.stride(0), deformed.stride(2))
+    kernel = _loaded().contact_from_depth
+    _check(
+        by_frames(
+            count,
+            rows * columns,
+            lambda first, many: kernel(
+                *(_at(depth_mm, first), *strides[0], _at(gradient, first), _at(deformed, first), *strides[1]),
+                *(many, rows, columns, *cells, model, _at(contact, first)),
+            ),
+        )
+    )
+    return contact
+
+
+class ResponseLines(NamedTuple):
+    """A response field whose coefficients are polynomials along each row of the image.
+
+    Attributes:
+        place: (W,), of each column, from -1 to 1.
+        weight: (H, degree + 1, 2, terms), the lowest power first; degree 2, 4 or 6.
+        per_mm: (H, 3, 3), what depth does to R, G and B, degree 2; None if that is not known.
+    """
+
+    place: Tensor
+    weight: Tensor
+    per_mm: Tensor | None
+
+
+def response_normals(
+    compensated: Tensor, depth_mm: Tensor | None, lines: ResponseLines, window: tuple[int, int], max_sine: float
+) -> Tensor:
+    """Unit normals (B, 3, h, w) of a window: see :class:`~torchvts.normals.NormalFromResponse`."""
+    compensated = _with_whole_rows(compensated)
+    depth_mm = None if depth_mm is None else _with_whole_rows(depth_mm)
+    (top, left), (count, _, rows, columns) = window, compensated.shape
+    weight, per_mm = lines.weight, None if depth_mm is None else lines.per_mm
+    normal = compensated.new_empty(count, 3, rows, columns)
+    field = (
+        lines.place.data_ptr() + 4 * left,
+        weight.data_ptr() + 4 * top * weight.stride(0),
+        weight.shape[1] - 1,
+        weight.shape[3],
+    )
+    by_depth = (None if per_mm is None else per_mm.data_ptr() + 36 * top, max_sine)
+    steps = (0, 0) if depth_mm is None else (0 if depth_mm.shape[0] == 1 else depth_mm.stride(0), depth_mm.stride(2))
+    kernel, strides = _loaded().response_normals, compensated.stride()[:3]
+    by_frames(
+        count,
+        rows * columns,
+        lambda first, many: kernel(
+            *(_at(compensated, first), *strides, *field, _at(depth_mm, first), *steps, *by_depth),
+            *(many, rows, columns, _at(normal, first)),
+        ),
+    )
+    return normal
+
+
+def masked(gradient: Tensor, mask: Tensor) -> Tensor:
+    """A gradient (B, 2, h, w), zero outside of a mask, bool (B, 1, h, w)."""
+    gradient, mask = gradient.contiguous(), _with_whole_rows(mask)
+    out = torch.empty_like(gradient)
+    _loaded().mask_values(gradient.data_ptr(), mask.data_ptr(), mask.stride(0), mask.stride(2), *gradient.shape, out.data_ptr())
+    return out
 
 
 def normals(compensated: Tensor, limits: Limits, inverse: Tensor, depth_mm: Tensor | None, view: LightView) -> tuple[Tensor, bool]:
@@ -145,24 +328,16 @@ def normals(compensated: Tensor, limits: Limits, inverse: Tensor, depth_mm: Tens
     at = 4 * (view.window[0] * width + view.window[1])
     normal = compensated.new_empty(count, 3, rows, columns)
     depth_mm = None if depth_mm is None else _with_whole_rows(depth_mm)
-    invalid = _loaded().normals(
-        compensated.data_ptr(),
-        *compensated.stride()[:3],
-        dark.data_ptr() + at,
-        saturated.data_ptr() + at,
-        inverse.data_ptr() + at,
-        height * width,
-        width,
+    fields = (dark.data_ptr() + at, saturated.data_ptr() + at, inverse.data_ptr() + at, height * width, width)
+    lights = (position_mm.data_ptr(), albedo.data_ptr(), view.mm_per_pixel, 1.0 / view.camera_height_mm, *view.axis_mm)
+    kernel, strides, steps = _loaded().normals, compensated.stride()[:3], _depth_arguments(depth_mm)[1:]
+    invalid = by_frames(
         count,
-        rows,
-        columns,
-        *_depth_arguments(depth_mm),
-        position_mm.data_ptr(),
-        albedo.data_ptr(),
-        view.mm_per_pixel,
-        1.0 / view.camera_height_mm,
-        *view.axis_mm,
-        normal.data_ptr(),
+        rows * columns,
+        lambda first, many: kernel(
+            *(_at(compensated, first), *strides, *fields, many, rows, columns),
+            *(_at(depth_mm, first), *steps, *lights, _at(normal, first)),
+        ),
     )
     return normal, not invalid
 
@@ -230,26 +405,40 @@ def solve_poisson(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], win
     turns, of_sum, of_difference, order = plan[0], plan[2], plan[3], plan[5]
     height, width = int(plan[5].shape[0]), int(plan[6].shape[0])
     count, _, rows, columns = gradient.shape
-    part = (rows, columns, *window)
-    first, last = max(0, window[0] - 1), min(height, window[0] + rows + 1)
-    loaded = _loaded()
-    lines = gradient.new_empty(count, last - first, width)
+    part, pixels = (rows, columns, *window), height * width
+    first_row, last_row = max(0, window[0] - 1), min(height, window[0] + rows + 1)
+    loaded, many_rows = _loaded(), last_row - first_row
+    lines = gradient.new_empty(count, many_rows, width)
+    ends = (*part, height, width, first_row, many_rows)
     _check(
-        loaded.divergence_lines(
-            gradient.data_ptr(), mm_per_pixel, count, *part, height, width, first, last - first, lines.data_ptr()
+        by_frames(
+            count,
+            pixels,
+            lambda first, many: loaded.divergence_lines(_at(gradient, first), mm_per_pixel, many, *ends, _at(lines, first)),
         )
     )
     spectrum = torch.fft.rfft(lines).contiguous()
-    turned = spectrum.new_empty(count, spectrum.shape[2], height)
-    places = order.data_ptr() + first * order.element_size()
-    loaded.to_columns(spectrum.data_ptr(), places, count, last - first, spectrum.shape[2], height, turned.data_ptr())
-    spectrum = torch.fft.fft(turned).contiguous()
+    waves = spectrum.shape[2]
+    turned = spectrum.new_empty(count, waves, height)
+    places = order.data_ptr() + first_row * order.element_size()
+    by_frames(
+        count,
+        pixels,
+        lambda first, many: loaded.to_columns(_at(spectrum, first), places, many, many_rows, waves, height, _at(turned, first)),
+    )
+    divided = torch.fft.fft(turned).contiguous()
     tables = (turns.data_ptr(), of_sum.data_ptr(), of_difference.data_ptr())
-    _check(loaded.divide(spectrum.data_ptr(), *tables, count, spectrum.shape[1], height))
-    lines = torch.fft.irfft(torch.fft.ifft(spectrum), n=width, dim=1).transpose(1, 2).contiguous()
+    _check(by_frames(count, pixels, lambda first, many: loaded.divide(_at(divided, first), *tables, many, waves, height)))
+    found = torch.fft.irfft(torch.fft.ifft(divided), n=width, dim=1).transpose(1, 2).contiguous()
     depth = gradient.new_empty(count, 1, height, width)
-    zeroed_by = gradient.data_ptr() if zeroed else None
-    loaded.finish_depth(lines.data_ptr(), order.data_ptr(), zeroed_by, count, *part, height, width, depth.data_ptr())
+    by_frames(
+        count,
+        pixels,
+        lambda first, many: loaded.finish_depth(
+            *(_at(found, first), order.data_ptr(), _at(gradient, first) if zeroed else None),
+            *(many, *part, height, width, _at(depth, first)),
+        ),
+    )
     return depth
 
 
@@ -261,13 +450,22 @@ def largest_change(one: Tensor, other: Tensor) -> Tensor:
     return change
 
 
-def uncrop(gradient: Tensor, window: tuple[int, int], size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """The gradient of a window embedded in the whole image (B, 2, H, W), zero elsewhere, and its normals (B, 3, H, W)."""
-    gradient = gradient.contiguous()
+def uncrop(gradient: Tensor, contact: Tensor, window: tuple[int, int], size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+    """The gradient of a window embedded in the whole image (B, 2, H, W), zero elsewhere, its normals (B, 3, H, W), the contact."""
+    gradient, contact = gradient.contiguous(), contact.contiguous()
     count, _, rows, columns = gradient.shape
     whole, normal = gradient.new_empty(count, 2, *size), gradient.new_empty(count, 3, *size)
-    _loaded().uncrop(gradient.data_ptr(), count, rows, columns, *window, *size, whole.data_ptr(), normal.data_ptr())
-    return whole, normal
+    touching = contact.new_empty(count, 1, *size)
+    part, kernel = (rows, columns, *window, *size), _loaded().uncrop
+    by_frames(
+        count,
+        size[0] * size[1],
+        lambda first, many: kernel(
+            *(_at(gradient, first), _at(contact, first), many, *part),
+            *(_at(whole, first), _at(normal, first), _at(touching, first)),
+        ),
+    )
+    return whole, normal, touching
 
 
 def zero_background(depth_mm: Tensor, deformed: Tensor, stiff: float, tolerance: float, sweeps: int) -> Tensor:
@@ -275,7 +473,12 @@ def zero_background(depth_mm: Tensor, deformed: Tensor, stiff: float, tolerance:
     depth_mm, deformed = depth_mm.contiguous(), deformed.contiguous()
     count, _, height, width = depth_mm.shape
     out = torch.empty_like(depth_mm)
-    numbers = (count, height, width, stiff, tolerance, sweeps)
-    if _loaded().zero_background(depth_mm.data_ptr(), deformed.data_ptr(), *numbers, out.data_ptr()):
-        raise MemoryError(f"depth_mm: no memory for grids of {height} x {width} pixels")
+    kernel, settings = _loaded().zero_background, (height, width, stiff, tolerance, sweeps)
+    _check(
+        by_frames(
+            count,
+            height * width,
+            lambda first, many: kernel(_at(depth_mm, first), _at(deformed, first), many, *settings, _at(out, first)),
+        )
+    )
     return out

@@ -1,6 +1,7 @@
 """From a camera's image to the compensated image that models speak of."""
 
-from .compensate import Compensate
+from .compensate import Blur, Compensate
+from .defects import FillDefects
 from .drift import Drift
 
-__all__ = ["Compensate", "Drift"]
+__all__ = ["Blur", "Compensate", "Drift", "FillDefects"]

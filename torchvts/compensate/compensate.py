@@ -110,9 +110,7 @@ class Compensate(nn.Module):
         for block in self.linear:  # only the blocks that the unit needs
             light = block(light)
         saturated = self.gain.saturated(light) if self.saturates else None
-        light = self.gain(light, saturated)
-        for block in self.clean:
-            light = block(light)
+        light = self.cleaned(light, saturated)
         normalised: Tensor = self.drift(light)
         if not torch.jit.is_scripting():  # noqa: SIM102
             if normalised is light:
@@ -120,6 +118,13 @@ class Compensate(nn.Module):
         if self.restores and saturated is not None:
             return self.gain.restored(normalised, saturated)
         return normalised
+
+    def cleaned(self, light: Tensor, saturated: Tensor | None) -> Tensor:
+        """Gain, offset, defects and blur of linear light; compiled kernels replace this method."""
+        light = self.gain(light, saturated)
+        for block in self.clean:
+            light = block(light)
+        return light
 
 
 class Linearise(nn.Module):

@@ -50,16 +50,20 @@ class Drift(nn.Module):
     def forward(self, light: Tensor) -> Tensor:
         background, noise = self.background, self.noise
         if background is None or noise is None:
-            return light / self.by_mode(light)
+            return self.divided(light, self.by_mode(light))
         if self.by_mode_first:
             near = self.by_mode(light)
             if may_read_values() and float((near - 1.0).abs().amax()) < 0.149:
-                return light / near
+                return self.divided(light, near)
             far = self.by_statistics(light, background, noise)
-            return light / torch.where((far - 1.0).abs() > 0.15, far, near)
+            return self.divided(light, torch.where((far - 1.0).abs() > 0.15, far, near))
         level = self.by_statistics(light, background, noise)
         if may_read_values() and bool((level == 1.0).all()):
             return light
+        return self.divided(light, level)
+
+    def divided(self, light: Tensor, level: Tensor) -> Tensor:
+        """Light (B, 3, H, W) over levels (B, 3, 1, 1)."""
         return light / level
 
     def by_mode(self, ratio: Tensor, least: float = 0.01, most: float = 0.15) -> Tensor:

@@ -79,11 +79,16 @@ class ContactFromDepth(nn.Module):
         """
         check_batch("depth_mm", depth_mm, 1)
         check_batch("gradient", gradient, 2)
-        height, width, cell = depth_mm.shape[2], depth_mm.shape[3], self.cell
+        height, width = depth_mm.shape[2], depth_mm.shape[3]
         check_same_size("gradient", gradient, "depth_mm", height, width)
         check_same_size("deformed", deformed, "depth_mm", height, width)
-        depth, inside = depth_mm.detach(), deformed.to(torch.uint8).to(depth_mm.dtype)
-        fields = torch.cat((inside, depth * inside, gradient.detach() * inside), dim=1)
+        return self.find(depth_mm.detach(), gradient.detach(), deformed)
+
+    def find(self, depth: Tensor, gradient: Tensor, deformed: Tensor) -> Tensor:
+        """The same of checked inputs; compiled kernels replace this method."""
+        height, width, cell = depth.shape[2], depth.shape[3], self.cell
+        inside = deformed.to(torch.uint8).to(depth.dtype)
+        fields = torch.cat((inside, depth * inside, gradient * inside), dim=1)
         fields = nn.functional.pad(fields, [0, -width % cell, 0, -height % cell])
         fields = nn.functional.avg_pool2d(fields, cell) if cell > 1 else fields
         level = self.rim_depth(fields)

@@ -71,13 +71,19 @@ class NormalFromResponse(NormalModel):
     def forward(self, image: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
         check_batch("compensated", image, 3)
         top, left = check_window("compensated", image, (self.maps.shape[2], self.maps.shape[3]), window)
-        bottom, right = top + image.shape[2], left + image.shape[3]
-        change = image - 1.0
         if depth_mm is not None:
             if not self.uses_depth:
                 raise ValueError("depth_mm: expected None, because this response does not say what depth does to brightness")
             check_batch("depth_mm", depth_mm, 1)
             check_same_size("depth_mm", depth_mm, "compensated", image.shape[2], image.shape[3])
+        return self.normals_of(image, depth_mm, (top, left))
+
+    def normals_of(self, image: Tensor, depth_mm: Tensor | None, window: tuple[int, int]) -> Tensor:
+        """The same of checked inputs; compiled kernels replace this method."""
+        top, left = window
+        bottom, right = top + image.shape[2], left + image.shape[3]
+        change = image - 1.0
+        if depth_mm is not None:
             change = change - self.per_mm[:, top:bottom, left:right] * depth_mm.to(change.dtype)
         inputs = [change[:, 0:1], change[:, 1:2], change[:, 2:3]]
         maps = self.maps[:, :, top:bottom, left:right]

@@ -8,19 +8,22 @@ from torch import Tensor, nn
 
 from ..accelerated import (
     Compensate,
+    ContactFromDepth,
     ContactMask,
     Crop,
     GradientFromNormal,
     LargestChange,
     NormalFromIntensity,
+    NormalFromResponse,
     PoissonBackground,
     Uncrop,
     ZeroBackground,
     scriptable,
 )
+from ..accelerated.threads import OneThread, one_suffices
 from ..compensate import Compensate as PlainCompensate
-from ..contact import ContactFromDepth, ContactSettings
 from ..contact import ContactMask as PlainContactMask
+from ..contact import ContactSettings
 from ..core.checks import (
     check_batch,
     check_choice,
@@ -38,7 +41,7 @@ from ..integration import WrappedIntegrator, as_integrator
 from ..integration.background import DepthAsIs
 from ..model import Calibration, Sensor, check_calibration
 from ..normals import NormalFromIntensity as PlainNormalFromIntensity
-from ..normals import NormalFromResponse, WrappedNormals, as_normal_model, check_domain
+from ..normals import WrappedNormals, as_normal_model, check_domain
 from .gs_sdk import gs_sdk_blocks
 from .refine import Adaptive, Once, Repeat, SlopesOfDepth, SlopesOfPixels
 from .shadows import Shadows
@@ -226,6 +229,14 @@ class DepthPipeline(nn.Module):
             ValueError: wrong shape, or, for eager tensors on a CPU, values outside [0, 1] or not finite.
             TypeError: not floating point.
         """
+        if not torch.jit.is_scripting():  # noqa: SIM102
+            if one_suffices(images):
+                with OneThread():
+                    return self.reconstructed(images)
+        return self.reconstructed(images)
+
+    def reconstructed(self, images: Tensor) -> DepthOutput:
+        """:meth:`forward` in the threads that torch now uses."""
         check_images(images)
         if images.shape[0] > 1 and self.crop.finds_window(images):  # each in its own window, else one would round another's depth
             return self.depth_of_each(images)

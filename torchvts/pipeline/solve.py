@@ -2,7 +2,8 @@
 
 from torch import Tensor, nn
 
-from ..core.frame import Frame, Solution, as_factor, depth_in_window
+from ..accelerated import Masked
+from ..core.frame import Frame, Solution, depth_in_window
 from ..integration import Integrator
 from ..normals import NormalModel
 
@@ -21,6 +22,7 @@ class Solve(nn.Module):
         self.normals = normals
         self.gradient = gradient
         self.integrate = integrate
+        self.masked = Masked()
 
     def forward(self, frame: Frame, depth_mm: Tensor | None = None) -> Solution:
         """Solve a frame.
@@ -33,7 +35,7 @@ class Solve(nn.Module):
             normal = self.normals(frame.image, None, frame.window)
         else:
             normal = self.normals(frame.image, depth_in_window(frame, depth_mm), frame.window)
-        return self.integrated(frame, self.gradient(normal) * as_factor(frame.mask, frame.image))
+        return self.integrated(frame, self.masked(self.gradient(normal), frame.mask))
 
     def integrated(self, frame: Frame, gradient: Tensor) -> Solution:
         """The solution with a gradient (B, 2, h, w) that is known."""

@@ -1,5 +1,7 @@
-/* Samples of compensated images: the same results as torchvts/compensate/drift.py. */
+/* Compensated images and the drift of their light: the same results as torchvts/compensate, which explains them. */
 #include "kernels.h"
+
+#include <math.h>
 
 /* Means of 3 x 3 pixels, the first from (first, first) on and then every `stride`, of `planes` images: (planes, rows, columns). */
 EXPORT void grid_means(const float *image, int planes, int height, int width, int stride, int first, int rows, int columns, float *means) {
@@ -9,4 +11,220 @@ EXPORT void grid_means(const float *image, int planes, int height, int width, in
                 const float *a = image + (size_t)(first + i * stride) * width + first + j * stride, *b = a + width, *c = b + width;
                 *means++ = (a[0] + a[1] + a[2] + b[0] + b[1] + b[2] + c[0] + c[1] + c[2]) / 9.0f;
             }
+}
+
+/* image * gain + offset, either of which may be null; without offset (image + pedestal) * gain. */
+WIDE static void multiply_add(const float *restrict image, const float *restrict gain, const float *restrict offset, float pedestal, int n,
+                              float *restrict light) {
+    if (gain && !offset && pedestal != 0.0f)
+        for (int x = 0; x < n; x++) light[x] = (image[x] + pedestal) * gain[x];
+    else if (gain && offset)
+        for (int x = 0; x < n; x++) light[x] = image[x] * gain[x] + offset[x];
+    else if (gain)
+        for (int x = 0; x < n; x++) light[x] = image[x] * gain[x];
+    else if (offset)
+        for (int x = 0; x < n; x++) light[x] = image[x] + offset[x];
+    else
+        memcpy(light, image, sizeof(float) * (size_t)n);
+}
+
+/* Sums over `taps` values from each on. Fused, as torch adds a multiple. */
+WIDE FUSED static void blur_along(const float *restrict padded, const float *restrict weight, int taps, int n, float *restrict line) {
+    if (taps == 7) { /* one pixel of standard deviation: all in registers */
+        const float a = weight[0], b = weight[1], c = weight[2], d = weight[3], e = weight[4], f = weight[5], g = weight[6];
+        for (int x = 0; x < n; x++) {
+            float sum = padded[x] * a;
+            sum += padded[x + 1] * b;
+            sum += padded[x + 2] * c;
+            sum += padded[x + 3] * d;
+            sum += padded[x + 4] * e;
+            sum += padded[x + 5] * f;
+            sum += padded[x + 6] * g;
+            line[x] = sum;
+        }
+        return;
+    }
+    for (int x = 0; x < n; x++) line[x] = padded[x] * weight[0];
+    for (int k = 1; k < taps; k++)
+        for (int x = 0; x < n; x++) line[x] += padded[x + k] * weight[k];
+}
+
+/* The same of `taps` lines. */
+WIDE FUSED static void blur_down(const float *const *lines, const float *restrict weight, int taps, int n, float *restrict result) {
+    const float *restrict first = lines[0];
+    if (taps == 7) {
+        const float *restrict l1 = lines[1], *restrict l2 = lines[2], *restrict l3 = lines[3], *restrict l4 = lines[4];
+        const float *restrict l5 = lines[5], *restrict l6 = lines[6];
+        const float a = weight[0], b = weight[1], c = weight[2], d = weight[3], e = weight[4], f = weight[5], g = weight[6];
+        for (int x = 0; x < n; x++) {
+            float sum = first[x] * a;
+            sum += l1[x] * b;
+            sum += l2[x] * c;
+            sum += l3[x] * d;
+            sum += l4[x] * e;
+            sum += l5[x] * f;
+            sum += l6[x] * g;
+            result[x] = sum;
+        }
+        return;
+    }
+    for (int x = 0; x < n; x++) result[x] = first[x] * weight[0];
+    for (int k = 1; k < taps; k++) {
+        const float *restrict line = lines[k];
+        for (int x = 0; x < n; x++) result[x] += line[x] * weight[k];
+    }
+}
+
+/* A plane blurred, its border repeated. scratch: taps lines, and one that is `taps` longer; `lines`: taps pointers. */
+static void blur_plane(const float *plane, const float *weight, int taps, int height, int width, float *scratch, const float **lines, float *out) {
+    const int reach = taps / 2;
+    float *padded = scratch + (size_t)taps * width;
+    for (int y = -reach, next = 0; y < height; y++) {
+        for (; next < height && next <= y + reach; next++) { /* row `next` of the plane lies in line next % taps */
+            const float *row = plane + (size_t)next * width;
+            for (int k = 0; k < reach; k++) padded[k] = row[0], padded[reach + width + k] = row[width - 1];
+            memcpy(padded + reach, row, sizeof(float) * (size_t)width);
+            blur_along(padded, weight, taps, width, scratch + (size_t)(next % taps) * width);
+        }
+        if (y < 0) continue;
+        for (int k = 0; k < taps; k++) {
+            const int at = y + k - reach < 0 ? 0 : least(y + k - reach, height - 1);
+            lines[k] = scratch + (size_t)(at % taps) * width;
+        }
+        blur_down(lines, weight, taps, width, out + (size_t)y * width);
+    }
+}
+
+/* Defective pixels of a plane become the mean of four others. */
+static void fill(float *plane, const int64_t *defect, const int64_t *neighbours, int64_t count, float *scratch) {
+    for (int64_t k = 0; k < count; k++, neighbours += 4)
+        scratch[k] = (plane[neighbours[0]] + plane[neighbours[1]] + plane[neighbours[2]] + plane[neighbours[3]]) / 4.0f;
+    for (int64_t k = 0; k < count; k++) plane[defect[k]] = scratch[k];
+}
+
+/*
+ * light (frames, 3, height, width) = image * gain + offset, its `defects` filled, blurred by `taps` weights. gain and offset (3, height,
+ * width) may be null, taps and defects 0; without offset it is pedestal (3) * gain. Returns 1 where memory is short.
+ */
+EXPORT int clean(const float *image, const float *gain, const float *offset, const float *pedestal, const int64_t *defect, const int64_t *neighbours, int64_t defects,
+                 const float *weight, int taps, int frames, int height, int width, float *light) {
+    const size_t pixels = (size_t)height * width, lines = (size_t)taps * width + width + taps;
+    float *scratch = malloc(sizeof(float) * (lines + (taps ? pixels : 0) + (size_t)defects + 1));
+    const float **line = malloc(sizeof(float *) * (size_t)(taps + 1));
+    if (!scratch || !line) {
+        free(scratch), free(line);
+        return 1;
+    }
+    float *repaired = scratch + lines + (taps ? pixels : 0);
+    for (int plane = 0; plane < 3 * frames; plane++, image += pixels, light += pixels) {
+        const size_t at = pixels * (size_t)(plane % 3);
+        float *to = taps ? scratch + lines : light;
+        multiply_add(image, gain ? gain + at : NULL, offset ? offset + at : NULL, pedestal[plane % 3], (int)pixels, to);
+        if (defects) fill(to, defect, neighbours, defects, repaired);
+        if (taps) blur_plane(to, weight, taps, height, width, scratch, line, light);
+    }
+    free(scratch), free(line);
+    return 0;
+}
+
+/* Sorts n values by the bits of their floats, at most twelve at a time; other: as many more. Returns where the sorted values lie. */
+static float *sorted(float *values, float *other, int n) {
+    uint32_t counts[3][4096], *from = (uint32_t *)values, *to = (uint32_t *)other, low = 0xffffffffu, high = 0;
+    for (int k = 0; k < n; k++) { /* an order of whole numbers: negative floats run backwards */
+        from[k] ^= (uint32_t)((int32_t)from[k] >> 31) | 0x80000000u;
+        low = from[k] < low ? from[k] : low;
+        high = from[k] > high ? from[k] : high;
+    }
+    int bits = 0;
+    while (bits < 32 && (high - low) >> bits) bits++;
+    const int passes = bits > 24 ? 3 : bits > 12 ? 2 : 1, digit = (bits + passes - 1) / passes;
+    const uint32_t most = (1u << digit) - 1u;
+    memset(counts, 0, sizeof counts[0] * (size_t)passes);
+    for (int pass = 0; pass < passes; pass++)
+        for (int k = 0; k < n; k++) counts[pass][(from[k] - low) >> (digit * pass) & most]++;
+    for (int pass = 0; pass < passes; pass++) {
+        uint32_t *count = counts[pass], total = 0;
+        for (uint32_t k = 0; k <= most; k++) {
+            const uint32_t here = count[k];
+            count[k] = total;
+            total += here;
+        }
+        for (int k = 0; k < n; k++) to[count[(from[k] - low) >> (digit * pass) & most]++] = from[k];
+        uint32_t *swapped = from;
+        from = to, to = swapped;
+    }
+    for (int k = 0; k < n; k++) from[k] ^= (uint32_t)~((int32_t)from[k] >> 31) | 0x80000000u;
+    return (float *)from;
+}
+
+enum { LANES = 16 };
+
+/* The smallest of values[k + apart] - values[k] for k below n. */
+WIDE static float narrowest(const float *restrict values, int apart, int n) {
+    float least_of[LANES], found;
+    int k = 0;
+    for (int j = 0; j < LANES; j++) least_of[j] = values[apart] - values[0];
+    for (; k + LANES <= n; k += LANES)
+        for (int j = 0; j < LANES; j++) {
+            const float width = values[k + j + apart] - values[k + j];
+            least_of[j] = width < least_of[j] ? width : least_of[j];
+        }
+    found = least_of[0];
+    for (; k < n; k++) found = values[k + apart] - values[k] < found ? values[k + apart] - values[k] : found;
+    for (int j = 1; j < LANES; j++) found = least_of[j] < found ? least_of[j] : found;
+    return found;
+}
+
+/* half_sample_mode() of torchvts/core/robust.py. */
+static float half_sample_mode(const float *ordered, int n, int halvings) {
+    for (; halvings > 0; halvings--) {
+        const int half = (n + 1) / 2;
+        const float width = narrowest(ordered, half - 1, n - half + 1);
+        int start = 0;
+        while (start < n - half && ordered[start + half - 1] - ordered[start] != width) start++;
+        ordered += start;
+        n = half;
+    }
+    return ordered[n / 2];
+}
+
+/* The mode of every stride-th pixel of each of `planes` images. Returns 1 where memory is short. */
+EXPORT int modes(const float *image, int planes, int height, int width, int stride, int halvings, float *mode) {
+    const int rows = (height - stride / 2 + stride - 1) / stride, columns = (width - stride / 2 + stride - 1) / stride;
+    float *some = malloc(2 * sizeof(float) * (size_t)rows * columns);
+    if (!some) return 1;
+    for (int plane = 0; plane < planes; plane++, image += (size_t)height * width) {
+        int n = 0;
+        for (int y = stride / 2; y < height; y += stride)
+            for (int x = stride / 2; x < width; x += stride) some[n++] = image[(size_t)y * width + x];
+        mode[plane] = half_sample_mode(sorted(some, some + n, n), n, halvings);
+    }
+    free(some);
+    return 0;
+}
+
+/* The same made the levels that Drift.by_mode() divides by, (frames, 3). */
+EXPORT int levels(const float *image, int frames, int height, int width, int stride, int halvings, float least_drift, float most, float *level) {
+    if (modes(image, 3 * frames, height, width, stride, halvings, level)) return 1;
+    for (int b = 0; b < frames; b++, level += 3) {
+        float largest = 0.0f;
+        for (int c = 0; c < 3; c++) {
+            level[c] -= 1.0f;
+            level[c] = level[c] < -most ? -most : level[c] > most ? most : level[c];
+            largest = fabsf(level[c]) > largest ? fabsf(level[c]) : largest;
+        }
+        float weight = largest / least_drift - 1.0f;
+        weight = weight < 0.0f ? 0.0f : weight > 1.0f ? 1.0f : weight;
+        for (int c = 0; c < 3; c++) level[c] = 1.0f + weight * level[c];
+    }
+    return 0;
+}
+
+WIDE static void divide_all(const float *restrict values, float by, size_t n, float *restrict result) {
+    for (size_t k = 0; k < n; k++) result[k] = values[k] / by;
+}
+
+/* Each of `planes` images of n pixels divided by its level. */
+EXPORT void divide_planes(const float *image, const float *level, int planes, int64_t n, float *result) {
+    for (int plane = 0; plane < planes; plane++) divide_all(image + n * plane, level[plane], (size_t)n, result + n * plane);
 }

@@ -8,7 +8,7 @@
 enum { CELL = 1, FAINT = 2, OUTSIDE = 4, KEPT = 8 };
 
 /* The k-th smallest of n values, which it reorders: Hoare's selection. */
-static float kth_smallest(float *values, int n, int k) {
+static float kth_of_few(float *values, int n, int k) {
     int low = 0, high = n - 1;
     while (low < high) {
         float pivot = values[low + (high - low) / 2];
@@ -32,35 +32,67 @@ static float kth_smallest(float *values, int n, int k) {
     return values[k];
 }
 
-/* The same, or what is no number if one of them is none. */
-static float median(float *values, int n) {
-    for (int k = 0; k < n; k++)
-        if (!(values[k] <= FLT_MAX)) return NAN;
-    return kth_smallest(values, n, (n - 1) / 2);
+/* The k-th smallest of n values, none of them negative, whose bits then have their order: the eleven highest bits leave a few. */
+static float kth_smallest(const float *values, int n, int k, float *few) {
+    uint16_t counts[2048] = {0};
+    const uint32_t *bits = (const uint32_t *)values;
+    if (n >= 65536) {
+        memcpy(few, values, sizeof(float) * (size_t)n);
+        return kth_of_few(few, n, k);
+    }
+    for (int i = 0; i < n; i++) counts[bits[i] >> 20]++;
+    uint32_t bucket = 0;
+    for (; k >= counts[bucket]; bucket++) k -= counts[bucket];
+    int found = 0;
+    for (int i = 0; i < n; i++) {
+        few[found] = values[i];
+        found += bits[i] >> 20 == bucket;
+    }
+    return kth_of_few(few, found, k);
 }
 
+/* The same for k in the middle, or what is no number if one of them is none. few: n + 1 floats. */
+static float median(const float *values, int n, float *few) {
+    int numbers = 1;
+    for (int k = 0; k < n; k++) numbers &= values[k] <= FLT_MAX;
+    return numbers ? kth_smallest(values, n, (n - 1) / 2, few) : NAN;
+}
+
+enum { LANES = 16 };
+
 /* Standard deviation of the values within three standard deviations. */
-static float clipped_std(const float *values, int n, float std) {
-    float total = 0.0f;
-    int count = 0;
-    for (int k = 0; k < n; k++)
-        if (values[k] <= 3.0f * std) {
-            total += values[k] * values[k];
-            count++;
+WIDE static float clipped_std(const float *restrict values, int n, float std) {
+    float totals[LANES] = {0.0f}, most = 3.0f * std, total = 0.0f;
+    int counts[LANES] = {0}, count = 0, k = 0;
+    for (; k + LANES <= n; k += LANES)
+        for (int j = 0; j < LANES; j++) {
+            const float value = values[k + j];
+            totals[j] += value <= most ? value * value : 0.0f;
+            counts[j] += value <= most;
         }
+    for (; k < n; k++) {
+        total += values[k] <= most ? values[k] * values[k] : 0.0f;
+        count += values[k] <= most;
+    }
+    for (int j = 0; j < LANES; j++) total += totals[j], count += counts[j];
     return sqrtf(total / (float)(count > 0 ? count : 1) / 0.97334f);
 }
 
-/* noise_std() of torchvts/core/noise.py, of one channel's change: image * per_noise + offset. */
+/* The change of a pixel, in units of the calibrated noise. offset may be null: then the undeformed skin is 1. */
+static inline float change_of(float image, const float *offset, float per_noise, size_t at) {
+    return (offset ? offset[at] : -per_noise) + image * per_noise;
+}
+
+/* noise_std() of torchvts/core/noise.py, of one channel's change. some: of so many samples, twice the memory, and one more. */
 static float noise_of(const float *image, const float *offset, const float *per_noise, int height, int width, int stride, float *some) {
     int n = 0;
     for (int y = stride / 2; y < height; y += stride)
         for (int x = 0; x < width - 2; x += stride, n++) {
-            const float *i = image + (size_t)y * width + x, *r = offset + (size_t)y * width + x, *p = per_noise + (size_t)y * width + x;
-            float left = r[0] + i[0] * p[0], middle = r[1] + i[1] * p[1], right = r[2] + i[2] * p[2];
-            some[n] = fabsf(middle - 0.5f * (left + right));
+            const size_t i = (size_t)y * width + x;
+            const float left = change_of(image[i], offset, per_noise[i], i), middle = change_of(image[i + 1], offset, per_noise[i + 1], i + 1);
+            some[n] = fabsf(middle - 0.5f * (left + change_of(image[i + 2], offset, per_noise[i + 2], i + 2)));
         }
-    float std = 1.5f * median(some, n) / 0.6745f;
+    float std = 1.5f * median(some, n, some + n) / 0.6745f;
     for (int pass = 0; pass < 2 && std == std; pass++) std = clipped_std(some, n, std);
     return std / sqrtf(1.5f);
 }
@@ -71,10 +103,10 @@ static float far_field_of(const float *image, const float *offset, const float *
     for (int y = stride / 2; y < height; y += stride)
         for (int x = stride / 2; x < width; x += stride, n++) {
             const size_t i = (size_t)y * width + x;
-            some[n] = fabsf(offset[i] + image[i] * per_noise[i]);
+            some[n] = fabsf(change_of(image[i], offset, per_noise[i], i));
             if (!(some[n] <= FLT_MAX)) return NAN;
         }
-    float std = kth_smallest(some, n, n / 4) / 0.3186f;
+    float std = kth_smallest(some, n, n / 4, some + n) / 0.3186f;
     for (int pass = 0; pass < 2; pass++) std = clipped_std(some, n, std);
     return std;
 }
@@ -82,11 +114,18 @@ static float far_field_of(const float *image, const float *offset, const float *
 /* One row of one channel: its change is added to `sums`, its square to `squared`. */
 WIDE static void add_change(const float *restrict image, const float *restrict offset, const float *restrict per_noise, float scale, int width,
                             float *restrict sums, float *restrict squared) {
-    for (int x = 0; x < width; x++) {
-        float change = (offset[x] + image[x] * per_noise[x]) * scale;
-        sums[x] += change;
-        squared[x] += change * change;
-    }
+    if (offset)
+        for (int x = 0; x < width; x++) {
+            const float change = (offset[x] + image[x] * per_noise[x]) * scale;
+            sums[x] += change;
+            squared[x] += change * change;
+        }
+    else
+        for (int x = 0; x < width; x++) {
+            const float change = (image[x] * per_noise[x] - per_noise[x]) * scale;
+            sums[x] += change;
+            squared[x] += change * change;
+        }
 }
 
 WIDE static void above(const float *restrict values, float threshold, int width, uint8_t *restrict result) {
@@ -150,14 +189,60 @@ static void spread(uint8_t *cells, int wide, uint8_t walls, uint8_t mark, int32_
 static void working_leds(const float *image, const float *failed_below, int height, int width, int step, int works[3]) {
     int failed = 0;
     for (int c = 0; c < 3; c++) {
-        double total = 0.0;
+        double total[4] = {0.0}; /* four sums that do not wait for one another */
         int count = 0;
-        for (int y = step / 2; y < height; y += step)
-            for (int x = step / 2; x < width; x += step, count++) total += image[((size_t)c * height + y) * width + x];
-        works[c] = !(total / count < failed_below[c]);
+        for (int y = step / 2; y < height; y += step) {
+            const float *line = image + ((size_t)c * height + y) * width;
+            for (int x = step / 2; x < width; x += step, count++) total[count % 4] += line[x];
+        }
+        works[c] = !((total[0] + total[1] + total[2] + total[3]) / count < failed_below[c]);
         failed += !works[c];
     }
     if (failed != 1) works[0] = works[1] = works[2] = 1;
+}
+
+/* Sums of `cell` values each, times `scale`, for n cells that lie side by side. */
+#define SUMS(name, type, cell)                                                                                                          \
+    WIDE static void name(const type *restrict values, float scale, int n, float *restrict sums) {                                        \
+        for (int j = 0; j < n; j++) {                                                                                                   \
+            type sum = values[j * (cell)];                                                                                              \
+            for (int k = 1; k < (cell); k++) sum = (type)(sum + values[j * (cell) + k]);                                                 \
+            sums[j] = (float)sum * scale;                                                                                               \
+        }                                                                                                                               \
+    }
+
+SUMS(sums_1, float, 1)
+SUMS(sums_3, float, 3)
+SUMS(sums_6, float, 6)
+SUMS(counts_1, uint16_t, 1)
+SUMS(counts_3, uint16_t, 3)
+SUMS(counts_6, uint16_t, 6)
+
+/* The same of cells of any size; where the size is no multiple, the last one overlaps another. Divided, as torch does, by the area. */
+static void cell_means(const float *values, int width, int cell, int columns, float *means) {
+    const int whole = width / cell;
+    if (cell == 1 || cell == 3 || cell == 6)
+        (cell == 1 ? sums_1 : cell == 3 ? sums_3 : sums_6)(values, 1.0f, whole, means);
+    for (int j = cell == 1 || cell == 3 || cell == 6 ? whole : 0; j < columns; j++) {
+        const float *start = values + least(j * cell, width - cell);
+        float sum = start[0];
+        for (int k = 1; k < cell; k++) sum += start[k];
+        means[j] = sum;
+    }
+    for (int j = 0; j < columns; j++) means[j] /= (float)(cell * cell);
+}
+
+static void cell_shares(const uint16_t *values, int width, int cell, int columns, float *shares) {
+    const int whole = width / cell;
+    if (cell == 1 || cell == 3 || cell == 6)
+        (cell == 1 ? counts_1 : cell == 3 ? counts_3 : counts_6)(values, 1.0f, whole, shares);
+    for (int j = cell == 1 || cell == 3 || cell == 6 ? whole : 0; j < columns; j++) {
+        const uint16_t *start = values + least(j * cell, width - cell);
+        int sum = 0;
+        for (int k = 0; k < cell; k++) sum += start[k];
+        shares[j] = (float)sum;
+    }
+    for (int j = 0; j < columns; j++) shares[j] /= (float)(cell * cell);
 }
 
 /* What one frame needs besides its masks. */
@@ -180,7 +265,6 @@ static void find_strong(const float *frame, const float *offset, const float *pe
                         float threshold, Grid grid, Scratch at, uint8_t *strong) {
     const size_t pixels = (size_t)height * width, cells = (size_t)grid.rows * grid.columns;
     const int cell = grid.cell;
-    const float area = (float)(cell * cell);
     for (int i = 0; i < grid.rows; i++) {
         const int first = least(i * cell, height - cell);
         memset(at.sums, 0, 3 * sizeof(float) * (size_t)width);
@@ -189,17 +273,12 @@ static void find_strong(const float *frame, const float *offset, const float *pe
             memset(at.squared, 0, sizeof(float) * (size_t)width);
             for (int c = 0; c < 3; c++)
                 if (scale[c] != 0.0f)
-                    add_change(frame + pixels * c + row, offset + pixels * c + row, per_noise + pixels * c + row, scale[c], width,
+                    add_change(frame + pixels * c + row, offset ? offset + pixels * c + row : NULL, per_noise + pixels * c + row, scale[c], width,
                                at.sums + (size_t)c * width, at.squared);
             above(at.squared, threshold, width, strong + row);
         }
         for (int c = 0; c < 3; c++)
-            for (int j = 0; j < grid.columns; j++) {
-                const float *start = at.sums + (size_t)c * width + least(j * cell, width - cell);
-                float sum = start[0];
-                for (int k = 1; k < cell; k++) sum += start[k];
-                at.means[c * cells + (size_t)i * grid.columns + j] = sum / area;
-            }
+            cell_means(at.sums + (size_t)c * width, width, cell, grid.columns, at.means + c * cells + (size_t)i * grid.columns);
     }
     combine_neighbours(strong, height, width, either, 0, at.bytes);
     combine_neighbours(strong, height, width, all, 1, at.bytes);
@@ -207,12 +286,7 @@ static void find_strong(const float *frame, const float *offset, const float *pe
         const int first = least(i * cell, height - cell);
         memset(at.counts, 0, sizeof(uint16_t) * (size_t)width);
         for (int y = first; y < first + cell; y++) add_bytes(strong + (size_t)y * width, width, at.counts);
-        for (int j = 0; j < grid.columns; j++) {
-            const uint16_t *start = at.counts + least(j * cell, width - cell);
-            int sum = 0;
-            for (int k = 0; k < cell; k++) sum += start[k];
-            at.density[(size_t)i * grid.columns + j] = (float)sum / area;
-        }
+        cell_shares(at.counts, width, cell, grid.columns, at.density + (size_t)i * grid.columns);
     }
 }
 
@@ -229,7 +303,7 @@ static int find_cells(Grid grid, Scratch at) {
         int n = 0;
         for (int i = step / 2; i < rows; i += step)
             for (int j = step / 2; j < columns; j += step) at.some[n++] = fabsf(at.means[c * cells + (size_t)i * columns + j]);
-        const float std = median(at.some, n) / 0.6745f;
+        const float std = median(at.some, n, at.some + n) / 0.6745f;
         per[c] = 1.0f / (std < least_std ? least_std : std);
     }
     memset(at.state, OUTSIDE, (size_t)(rows + 2) * wide);
@@ -318,7 +392,7 @@ static void to_pixels(Grid grid, Scratch at, int height, int width, uint8_t *str
 }
 
 /*
- * image (frames, 3, height, width), with offset and per_noise (3, height, width): change = image * per_noise + offset. Writes mask and
+ * image (frames, 3, height, width), with offset and per_noise (3, height, width): change = image * per_noise + offset; offset null where it is -per_noise. Writes mask and
  * inner, bytes (frames, height, width); inner is where cells decide, not pixels. Returns 0, or 1 where memory is short.
  */
 EXPORT int contact_mask(const float *image, const float *offset, const float *per_noise, const float *failed_below,
@@ -330,13 +404,13 @@ EXPORT int contact_mask(const float *image, const float *offset, const float *pe
     const size_t samples = (size_t)((height + stride - 1) / stride) * ((width + stride - 1) / stride);
     const size_t some = samples > cells ? samples : cells;
     Scratch at;
-    float *floats = malloc(sizeof(float) * (some + 4 * cells + 5 * (size_t)width + 2 * (size_t)reach));
+    float *floats = malloc(sizeof(float) * (2 * some + 1 + 4 * cells + 5 * (size_t)width + 2 * (size_t)reach));
     uint8_t *bytes = malloc(ringed + (size_t)(height + 3) * (width + 2));
     uint16_t *counts = malloc(sizeof(uint16_t) * (size_t)width);
     int32_t *stack = malloc(sizeof(int32_t) * ringed);
     const int short_of_memory = !floats || !bytes || !counts || !stack;
     if (!short_of_memory) {
-        at.some = floats, at.means = at.some + some, at.density = at.means + 3 * cells, at.sums = at.density + cells;
+        at.some = floats, at.means = at.some + 2 * some + 1, at.density = at.means + 3 * cells, at.sums = at.density + cells;
         at.squared = at.sums + 3 * (size_t)width, at.down = at.squared + width;
         at.state = bytes, at.bytes = bytes + ringed, at.counts = counts, at.stack = stack;
     }
@@ -347,7 +421,7 @@ EXPORT int contact_mask(const float *image, const float *offset, const float *pe
         float scale[3] = {0.0f, 0.0f, 0.0f};
         for (int c = 0; c < 3; c++)
             if (works[c]) {
-                const float *image_c = frame + pixels * c, *offset_c = offset + pixels * c, *per_noise_c = per_noise + pixels * c;
+                const float *image_c = frame + pixels * c, *offset_c = offset ? offset + pixels * c : NULL, *per_noise_c = per_noise + pixels * c;
                 float noise = noise_of(image_c, offset_c, per_noise_c, height, width, stride, at.some);
                 float far = most_far_field[c] > 0.0f ? far_field_of(image_c, offset_c, per_noise_c, height, width, stride, at.some) : 0.0f;
                 if (far > most_far_field[c]) far = most_far_field[c] * most_far_field[c] / far;

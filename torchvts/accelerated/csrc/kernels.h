@@ -20,6 +20,13 @@
 #define WIDE
 #endif
 
+/* Products and sums rounded once, where the processor can, as torch's own loops do for some operators. */
+#if defined(__GNUC__) && !defined(__clang__)
+#define FUSED __attribute__((optimize("fp-contract=fast")))
+#else
+#define FUSED
+#endif
+
 static inline int least(int a, int b) { return a < b ? a : b; }
 
 #endif

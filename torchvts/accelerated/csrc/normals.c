@@ -135,20 +135,56 @@ WIDE static void normal_row(const float *restrict p, const float *restrict q, in
     }
 }
 
-/* The gradient of a window (frames, 2, rows, columns) at (top, left) set into the whole image, zero elsewhere, and its normals. */
-EXPORT void uncrop(const float *gradient, int frames, int rows, int columns, int top, int left, int height, int width, float *whole,
-                  float *normal) {
-    const size_t pixels = (size_t)height * width, part = (size_t)rows * columns;
-    memset(whole, 0, sizeof(float) * 2 * pixels * (size_t)frames);
-    for (int b = 0; b < frames; b++, whole += 2 * pixels, normal += 3 * pixels, gradient += 2 * part) {
-        memset(normal, 0, sizeof(float) * 2 * pixels);
-        for (size_t k = 2 * pixels; k < 3 * pixels; k++) normal[k] = 1.0f;
+static void fill(float *values, float value, size_t n) {
+    for (size_t k = 0; k < n; k++) values[k] = value;
+}
+
+/* The gradient of a window (frames, 2, rows, columns) at (top, left) and its contact (bytes) set into the whole image, zero elsewhere, and the
+   normals; what is outside of the window is written once, what is inside too. */
+EXPORT void uncrop(const float *gradient, const uint8_t *contact, int frames, int rows, int columns, int top, int left, int height, int width,
+                   float *whole, float *normal, uint8_t *touching) {
+    const size_t pixels = (size_t)height * width, part = (size_t)rows * columns, above = (size_t)top * width;
+    const size_t right = (size_t)(width - left - columns), below = (size_t)(top + rows) * width;
+    for (int b = 0; b < frames; b++) {
+        float *planes[5] = {whole, whole + pixels, normal, normal + pixels, normal + 2 * pixels};
+        for (int k = 0; k < 5; k++) {
+            const float value = k < 4 ? 0.0f : 1.0f;
+            fill(planes[k], value, above);
+            for (int y = top; y < top + rows; y++) {
+                fill(planes[k] + (size_t)y * width, value, (size_t)left);
+                fill(planes[k] + (size_t)y * width + left + columns, value, right);
+            }
+            fill(planes[k] + below, value, pixels - below);
+        }
+        memset(touching, 0, pixels);
         for (int y = 0; y < rows; y++) {
             const float *p = gradient + (size_t)y * columns, *q = p + part;
             const size_t at = (size_t)(top + y) * width + left;
             memcpy(whole + at, p, sizeof(float) * (size_t)columns);
             memcpy(whole + pixels + at, q, sizeof(float) * (size_t)columns);
+            memcpy(touching + at, contact + (size_t)y * columns, (size_t)columns);
             normal_row(p, q, columns, normal + at, normal + pixels + at, normal + 2 * pixels + at);
         }
+        whole += 2 * pixels, normal += 3 * pixels, touching += pixels, gradient += 2 * part, contact += part;
     }
+}
+
+/* top, bottom, left, right of the smallest box that holds all bytes that are not zero, of all frames; zeros without any. */
+EXPORT void box_of(const uint8_t *mask, int frames, int height, int width, int *box) {
+    box[0] = height, box[1] = 0, box[2] = width, box[3] = 0;
+    for (int y = 0; y < height * frames; y++) {
+        const uint8_t *row = mask + (size_t)y * width;
+        const int line = y % height;
+        int first = 0, last = width;
+        for (uint64_t eight = 0; first + 8 <= width; first += 8) {
+            memcpy(&eight, row + first, sizeof eight);
+            if (eight) break;
+        }
+        while (first < width && !row[first]) first++;
+        if (first == width) continue;
+        while (!row[last - 1]) last--;
+        box[0] = least(box[0], line), box[1] = line + 1 > box[1] ? line + 1 : box[1];
+        box[2] = least(box[2], first), box[3] = last > box[3] ? last : box[3];
+    }
+    if (box[1] == 0) box[0] = box[2] = 0;
 }

@@ -5,100 +5,357 @@
 
 #define MOST_GRIDS 24
 
-/* One grid: rows x columns cells; share on which the value is known, the value, the weight, and what was found. */
+/* What is known of a pixel. */
+enum { DEFORMED = 0, FLAT = 1, RAISED = 2 };
+
+/* One grid: rows x columns cells and a border of zeros around them, `wide` cells from row to row. Share on which the value is known, sum of
+   known values, weight; then 1 over the mean weight of nine cells, weight * found, and what was found. */
 typedef struct {
-    int rows, columns;
-    float *share, *value, *weight, *found;
+    int rows, columns, wide;
+    float *share, *value, *weight, *per_weight, *product, *found;
 } Grid;
 
-/* The value at a pixel of a grid that is `scale` times finer, between the middles of cells. */
-static float between(const Grid *grid, const float *found, int y, int x, float scale) {
-    float at_y = ((float)y + 0.5f) / scale - 0.5f, at_x = ((float)x + 0.5f) / scale - 0.5f;
-    if (at_y < 0.0f) at_y = 0.0f;
-    if (at_x < 0.0f) at_x = 0.0f;
-    const int top = least((int)at_y, grid->rows - 1), left = least((int)at_x, grid->columns - 1);
-    const int bottom = least(top + 1, grid->rows - 1), right = least(left + 1, grid->columns - 1);
-    const float down = at_y - (float)top, along = at_x - (float)left;
-    const float *upper = found + (size_t)top * grid->columns, *lower = found + (size_t)bottom * grid->columns;
-    return (1.0f - down) * ((1.0f - along) * upper[left] + along * upper[right]) +
-           down * ((1.0f - along) * lower[left] + along * lower[right]);
+/* Pixels of a box: rows top to bottom, columns left to right, the ends outside. */
+typedef struct {
+    int top, bottom, left, right;
+} Box;
+
+static float *cell_of(const Grid *grid, float *field, int y) { return field + (size_t)(y + 1) * grid->wide + 1; }
+
+/* Means over 2 x 2 cells of one field; beyond the border nothing is known. */
+WIDE static void coarser(const Grid *fine, float *from, const Grid *grid, float *to) {
+    for (int y = 0; y < grid->rows; y++) {
+        const float *restrict upper = cell_of(fine, from, 2 * y), *restrict lower = cell_of(fine, from, 2 * y + 1);
+        float *restrict line = cell_of(grid, to, y);
+        for (int x = 0; x < grid->columns; x++) line[x] = 0.25f * (upper[2 * x] + upper[2 * x + 1] + lower[2 * x] + lower[2 * x + 1]);
+    }
 }
 
-/* Means over 2 x 2 cells; beyond the border nothing is known. */
-static void coarser(const Grid *fine, Grid *grid) {
-    for (int y = 0; y < grid->rows; y++)
+/* 1 over the weighted mean's weight, of nine cells each. */
+WIDE static void weigh(Grid *grid) {
+    const int wide = grid->wide;
+    for (int y = 0; y < grid->rows; y++) {
+        const float *w = cell_of(grid, grid->weight, y);
+        float *restrict line = cell_of(grid, grid->per_weight, y);
         for (int x = 0; x < grid->columns; x++) {
-            float share = 0.0f, value = 0.0f, weight = 0.0f;
-            for (int i = 2 * y; i < least(2 * y + 2, fine->rows); i++)
-                for (int j = 2 * x; j < least(2 * x + 2, fine->columns); j++) {
-                    const size_t at = (size_t)i * fine->columns + j;
-                    share += fine->share[at], value += fine->value[at], weight += fine->weight[at];
-                }
-            const size_t here = (size_t)y * grid->columns + x;
-            grid->share[here] = 0.25f * share, grid->value[here] = 0.25f * value, grid->weight[here] = 0.25f * weight;
+            const float *at = w + x;
+            const float mean = (at[-wide - 1] + at[-wide] + at[-wide + 1] + at[-1] + at[0] + at[1] + at[wide - 1] + at[wide] + at[wide + 1]) / 9.0f;
+            line[x] = (1.0f / 9.0f) / (mean > 1e-9f ? mean : 1e-9f);
         }
+    }
 }
 
-/* Unknown cells become the weighted mean of the nine around them, `sweeps` times; scratch holds twice the cells of the grid. */
-static void relax(Grid *grid, int sweeps, float *scratch) {
-    const int rows = grid->rows, columns = grid->columns;
-    const size_t cells = (size_t)rows * columns;
-    float *product = scratch, *next = scratch + cells;
-    for (int sweep = 0; sweep < sweeps; sweep++) {
-        for (size_t k = 0; k < cells; k++) product[k] = grid->weight[k] * grid->found[k];
-        for (int y = 0; y < rows; y++)
-            for (int x = 0; x < columns; x++) {
-                const size_t here = (size_t)y * columns + x;
-                next[here] = grid->found[here];
-                if (grid->share[here] > 0.0f) continue;
-                float sum = 0.0f, total = 0.0f;
-                for (int i = y > 0 ? y - 1 : 0; i < least(y + 2, rows); i++)
-                    for (int j = x > 0 ? x - 1 : 0; j < least(x + 2, columns); j++) {
-                        sum += product[(size_t)i * columns + j];
-                        total += grid->weight[(size_t)i * columns + j];
-                    }
-                total /= 9.0f;
-                next[here] = sum / 9.0f / (total > 1e-9f ? total : 1e-9f);
-            }
-        memcpy(grid->found, next, cells * sizeof(float));
+/* Known cells get their value. */
+WIDE static void set_known(Grid *grid) {
+    const size_t cells = (size_t)(grid->rows + 2) * grid->wide;
+    const float *restrict share = grid->share, *restrict value = grid->value;
+    float *restrict found = grid->found;
+    for (size_t k = 0; k < cells; k++) {
+        const float known = value[k] / (share[k] > 1e-9f ? share[k] : 1e-9f);
+        found[k] = share[k] > 0.0f ? known : found[k];
+    }
+}
+
+/* Unknown cells become the weighted mean of the nine around them, once. */
+WIDE static void relax(Grid *grid) {
+    const int wide = grid->wide, columns = grid->columns;
+    const size_t cells = (size_t)(grid->rows + 2) * wide;
+    const float *restrict weight = grid->weight, *restrict before = grid->found;
+    float *restrict product = grid->product;
+    for (size_t k = 0; k < cells; k++) product[k] = weight[k] * before[k];
+    for (int y = 0; y < grid->rows; y++) {
+        const float *p = cell_of(grid, grid->product, y), *restrict share = cell_of(grid, grid->share, y);
+        const float *restrict per_weight = cell_of(grid, grid->per_weight, y);
+        float *restrict found = cell_of(grid, grid->found, y);
+        for (int x = 0; x < columns; x++) {
+            const float *at = p + x;
+            const float sum = at[-wide - 1] + at[-wide] + at[-wide + 1] + at[-1] + at[0] + at[1] + at[wide - 1] + at[wide] + at[wide + 1];
+            found[x] = share[x] > 0.0f ? found[x] : sum * per_weight[x];
+        }
+    }
+}
+
+/* A line between the two rows of a grid around pixel row y of one that is `scale` times finer; a cell beyond either end repeats it. */
+static void between_rows(const Grid *grid, int y, float scale, float *line) {
+    float at = ((float)y + 0.5f) / scale - 0.5f;
+    if (at < 0.0f) at = 0.0f;
+    const int top = least((int)at, grid->rows - 1);
+    const float down = at - (float)top, up = 1.0f - down;
+    const float *upper = cell_of(grid, grid->found, top), *lower = cell_of(grid, grid->found, least(top + 1, grid->rows - 1));
+    for (int x = 0; x < grid->columns; x++) line[x + 1] = up * upper[x] + down * lower[x];
+    line[0] = line[1], line[grid->columns + 1] = line[grid->columns];
+}
+
+/* What was found on the next coarser grid. `line`: as many floats as that has columns, and two more. */
+WIDE static void refine(const Grid *coarse, Grid *grid, float *restrict line) {
+    for (int y = 0; y < grid->rows; y++) {
+        between_rows(coarse, y, 2.0f, line);
+        float *restrict found = cell_of(grid, grid->found, y);
+        for (int x = 0; x < grid->columns / 2; x++) {
+            found[2 * x] = 0.25f * line[x] + 0.75f * line[x + 1];
+            found[2 * x + 1] = 0.75f * line[x + 1] + 0.25f * line[x + 2];
+        }
+        if (grid->columns % 2) found[grid->columns - 1] = 0.25f * line[grid->columns / 2] + 0.75f * line[grid->columns / 2 + 1];
     }
 }
 
 /* Fills grids[0].found from its known cells, by way of the coarser grids. */
-static void continued(Grid *grids, int count, int sweeps, float *scratch) {
-    for (int k = 1; k < count; k++) coarser(&grids[k - 1], &grids[k]);
+static void continued(Grid *grids, int count, int sweeps, float *line) {
+    for (int k = 1; k < count; k++) {
+        coarser(&grids[k - 1], grids[k - 1].share, &grids[k], grids[k].share);
+        coarser(&grids[k - 1], grids[k - 1].value, &grids[k], grids[k].value);
+    }
     for (int k = count - 1; k >= 0; k--) {
         Grid *grid = &grids[k];
-        const size_t cells = (size_t)grid->rows * grid->columns;
         if (k == count - 1) {
             float share = 0.0f, value = 0.0f;
-            for (size_t c = 0; c < cells; c++) share += grid->share[c], value += grid->value[c];
-            for (size_t c = 0; c < cells; c++) grid->found[c] = value / (share > 1e-9f ? share : 1e-9f);
-        } else {
             for (int y = 0; y < grid->rows; y++)
-                for (int x = 0; x < grid->columns; x++)
-                    grid->found[(size_t)y * grid->columns + x] = between(&grids[k + 1], grids[k + 1].found, y, x, 2.0f);
+                for (int x = 0; x < grid->columns; x++) share += cell_of(grid, grid->share, y)[x], value += cell_of(grid, grid->value, y)[x];
+            for (int y = 0; y < grid->rows; y++)
+                for (int x = 0; x < grid->columns; x++) cell_of(grid, grid->found, y)[x] = value / (share > 1e-9f ? share : 1e-9f);
+        } else {
+            refine(&grids[k + 1], grid, line);
         }
-        for (size_t c = 0; c < cells; c++)
-            if (grid->share[c] > 0.0f) grid->found[c] = grid->value[c] / (grid->share[c] > 1e-9f ? grid->share[c] : 1e-9f);
-        relax(grid, sweeps, scratch);
+        set_known(grid);
+        for (int sweep = 0; sweep < sweeps; sweep++) relax(grid);
     }
 }
 
-/* 1 at pixels within two of which none is deformed, else 0. scratch: as large as an image. */
-static void not_beside(const uint8_t *deformed, int height, int width, uint8_t *scratch, uint8_t *flat) {
-    for (int y = 0; y < height; y++)
-        for (int x = 0; x < width; x++) {
-            uint8_t any = 0;
-            for (int j = x > 1 ? x - 2 : 0; j < least(x + 3, width); j++) any |= deformed[(size_t)y * width + j];
-            scratch[(size_t)y * width + x] = any;
+WIDE static void any_of_five(const uint8_t *restrict a, const uint8_t *restrict b, const uint8_t *restrict c, const uint8_t *restrict d,
+                             const uint8_t *restrict e, uint8_t flipped, int n, uint8_t *restrict result) {
+    for (int x = 0; x < n; x++) result[x] = (a[x] | b[x] | c[x] | d[x] | e[x]) ^ flipped;
+}
+
+/* 1 at pixels within two of which none is deformed, else 0. padded: (height + 5) lines, each two bytes longer on either side. */
+static void not_beside(const uint8_t *deformed, int height, int width, uint8_t *padded, uint8_t *flat) {
+    const size_t wide = (size_t)width + 4;
+    uint8_t *column = padded + wide * (size_t)(height + 4);
+    memset(padded, 0, wide * (size_t)(height + 4));
+    for (int y = 0; y < height; y++) memcpy(padded + (size_t)(y + 2) * wide + 2, deformed + (size_t)y * width, (size_t)width);
+    for (int y = 0; y < height; y++) {
+        const uint8_t *line = padded + (size_t)y * wide;
+        any_of_five(line, line + wide, line + 2 * wide, line + 3 * wide, line + 4 * wide, 0, (int)wide, column);
+        any_of_five(column, column + 1, column + 2, column + 3, column + 4, 1, width, flat + (size_t)y * width);
+    }
+}
+
+enum { LANES = 16 };
+
+/* Smallest and largest of n values. */
+WIDE static void range_of(const float *values, size_t n, float *lowest, float *highest) {
+    float low[LANES], high[LANES];
+    for (int j = 0; j < LANES; j++) low[j] = high[j] = values[0];
+    size_t k = 0;
+    for (; k + LANES <= n; k += LANES)
+        for (int j = 0; j < LANES; j++) {
+            low[j] = values[k + j] < low[j] ? values[k + j] : low[j];
+            high[j] = values[k + j] > high[j] ? values[k + j] : high[j];
         }
-    for (int y = 0; y < height; y++)
-        for (int x = 0; x < width; x++) {
-            uint8_t any = 0;
-            for (int i = y > 1 ? y - 2 : 0; i < least(y + 3, height); i++) any |= scratch[(size_t)i * width + x];
-            flat[(size_t)y * width + x] = !any;
+    for (; k < n; k++) {
+        low[0] = values[k] < low[0] ? values[k] : low[0];
+        high[0] = values[k] > high[0] ? values[k] : high[0];
+    }
+    *lowest = low[0], *highest = high[0];
+    for (int j = 1; j < LANES; j++) {
+        *lowest = low[j] < *lowest ? low[j] : *lowest;
+        *highest = high[j] > *highest ? high[j] : *highest;
+    }
+}
+
+/* Sum and count of a row's undeformed pixels below `middle`; others of them are marked as raised: a face of the object. */
+WIDE static void flat_row(const float *restrict depth, uint8_t *restrict kind, float middle, int n, float *sum, int *count) {
+    float total = 0.0f, lanes[LANES] = {0.0f};
+    int found = 0, x = 0;
+    for (int k = 0; k < n; k++) {
+        found += kind[k] != DEFORMED && depth[k] < middle;
+        kind[k] = kind[k] == DEFORMED ? DEFORMED : depth[k] < middle ? FLAT : RAISED;
+    }
+    for (; x + LANES <= n; x += LANES)
+        for (int j = 0; j < LANES; j++) lanes[j] += kind[x + j] == FLAT ? depth[x + j] : 0.0f;
+    for (; x < n; x++) total += kind[x] == FLAT ? depth[x] : 0.0f;
+    for (int j = 0; j < LANES; j++) total += lanes[j];
+    *sum = total, *count = found;
+}
+
+/* A row of pixels added to the sums of cells' columns. */
+WIDE static void add_row(const float *restrict depth, const uint8_t *restrict kind, float level, float per_range, float stiff, int n,
+                         float *restrict share, float *restrict value, float *restrict weight) {
+    for (int x = 0; x < n; x++) {
+        float above = (depth[x] - level) * per_range;
+        above = above > 0.0f ? above : 0.0f;
+        share[x] += kind[x] == DEFORMED ? 0.0f : 1.0f;
+        value[x] += kind[x] == FLAT ? depth[x] : kind[x] == RAISED ? level : 0.0f;
+        weight[x] += 1.0f + stiff * above * above;
+    }
+}
+
+/* Deformed pixels of a row that lie below what was found less `most`, added in the same way. Returns whether there are any. */
+WIDE static int add_below(const float *restrict depth, const uint8_t *restrict kind, const float *restrict found, float most, int n,
+                          float *restrict share, float *restrict value) {
+    int any = 0;
+    for (int x = 0; x < n; x++) {
+        const int below = kind[x] == DEFORMED && depth[x] < found[x] - most;
+        share[x] += below ? 1.0f : 0.0f;
+        value[x] += below ? depth[x] : 0.0f;
+        any |= below;
+    }
+    return any;
+}
+
+WIDE static void take_out(const float *restrict depth, const uint8_t *restrict kind, const float *restrict found, int n, float *restrict out) {
+    for (int x = 0; x < n; x++) out[x] = kind[x] == FLAT ? 0.0f : depth[x] - found[x];
+}
+
+/* Sums of `cell` columns each, times `scale`, added. */
+static void add_columns(const float *columns, int n, int cell, float scale, float *sums) {
+    if (cell == 1)
+        for (int x = 0; x < n; x++) sums[x] += scale * columns[x];
+    else if (cell == 4)
+        for (int x = 0; x < n; x++) sums[x] += scale * (columns[4 * x] + columns[4 * x + 1] + columns[4 * x + 2] + columns[4 * x + 3]);
+    else
+        for (int x = 0; x < n; x++) {
+            float sum = 0.0f;
+            for (int k = 0; k < cell; k++) sum += columns[x * cell + k];
+            sums[x] += scale * sum;
         }
+}
+
+/* Between the middles of cells, pixel by pixel: the cell to the left, and how far to the next. */
+WIDE static void along_row(const float *restrict line, const int32_t *restrict place, const float *restrict along, int n, float *restrict found) {
+    for (int x = 0; x < n; x++) {
+        const float here = line[place[x]], next = line[place[x] + 1];
+        found[x] = here + along[x] * (next - here);
+    }
+}
+
+/* The smallest box of all pixels that are not flat. */
+static Box not_flat(const uint8_t *kind, int height, int width) {
+    Box box = {height, 0, width, 0};
+    for (int y = 0; y < height; y++) {
+        const uint8_t *row = kind + (size_t)y * width;
+        int left = 0, right = width;
+        while (left < width && row[left] == FLAT) left++;
+        if (left == width) continue;
+        while (row[right - 1] == FLAT) right--;
+        box.top = least(box.top, y), box.bottom = y + 1;
+        box.left = least(box.left, left), box.right = right > box.right ? right : box.right;
+    }
+    return box;
+}
+
+/* Memory of one call: grids, pixels' kinds, sums of columns, lines, and where pixels lie between cells. */
+typedef struct {
+    Grid grids[MOST_GRIDS];
+    int count, cell;
+    float *memory, *share, *value, *weight, *line, *found, *along;
+    int32_t *place;
+    uint8_t *kind, *padded;
+} Work;
+
+static int allocate(Work *work, int height, int width) {
+    const int cell = least(height, width) / 60 > 1 ? least(height, width) / 60 : 1;
+    int rows = (height + cell - 1) / cell, columns = (width + cell - 1) / cell;
+    const size_t lines = (size_t)columns * cell, first = (size_t)columns + 2;
+    size_t cells = 0;
+    work->cell = cell, work->count = 0;
+    for (; work->count < MOST_GRIDS; rows = (rows + 1) / 2, columns = (columns + 1) / 2) {
+        Grid *grid = &work->grids[work->count++];
+        /* an odd number gets a cell of zeros more, so that every cell of the next grid has four */
+        grid->rows = rows, grid->columns = columns, grid->wide = columns + 3;
+        cells += (size_t)(rows + 3) * grid->wide;
+        if (least(rows, columns) <= 2) break;
+    }
+    work->memory = calloc(6 * cells + 3 * lines + first + 3 * (size_t)width, sizeof(float));
+    work->kind = malloc((size_t)height * width + (size_t)(height + 5) * (width + 4));
+    if (!work->memory || !work->kind) return 1;
+    work->padded = work->kind + (size_t)height * width;
+    float *place = work->memory;
+    for (int k = 0; k < work->count; k++) {
+        Grid *grid = &work->grids[k];
+        const size_t size = (size_t)(grid->rows + 3) * grid->wide;
+        grid->share = place, grid->value = place + size, grid->weight = place + 2 * size, grid->per_weight = place + 3 * size;
+        grid->product = place + 4 * size, grid->found = place + 5 * size;
+        place += 6 * size;
+    }
+    work->share = place, work->value = place + lines, work->weight = place + 2 * lines, work->line = place + 3 * lines;
+    work->found = work->line + first, work->along = work->found + width, work->place = (int32_t *)(work->along + width);
+    for (int x = 0; x < width; x++) {
+        float at = ((float)x + 0.5f) / (float)cell - 0.5f;
+        if (at < 0.0f) at = 0.0f;
+        work->place[x] = (int)at + 1; /* the line begins with a cell more */
+        work->along[x] = at - (float)(int)at;
+    }
+    return 0;
+}
+
+/* The continuation at the pixels of row y from `left` to `right`, in work->found. */
+static const float *continuation(Work *work, int y, int left, int right) {
+    Grid *grid = &work->grids[0];
+    if (work->cell == 1) return cell_of(grid, grid->found, y) + left;
+    between_rows(grid, y, (float)work->cell, work->line);
+    along_row(work->line, work->place + left, work->along + left, right - left, work->found);
+    return work->found;
+}
+
+/* The undeformed skin's shares, values and weights of cells; all weights. Returns the mean depth of flat skin, and the range above it. */
+static float known_cells(Work *work, const float *depth, int height, int width, float stiff, float *range) {
+    Grid *grid = &work->grids[0];
+    const int cell = work->cell;
+    const float per_cell = 1.0f / (float)(cell * cell);
+    float low, high;
+    range_of(depth, (size_t)height * width, &low, &high);
+    double sum = 0.0;
+    int64_t flat = 0;
+    for (int y = 0; y < height; y++) {
+        float part;
+        int count;
+        flat_row(depth + (size_t)y * width, work->kind + (size_t)y * width, 0.5f * (low + high), width, &part, &count);
+        sum += part, flat += count;
+    }
+    const float level = flat ? (float)(sum / (double)flat) : 0.0f;
+    *range = high - level > 1e-9f ? high - level : 1e-9f;
+    const size_t lines = (size_t)grid->columns * cell;
+    for (int i = 0; i < grid->rows; i++) {
+        memset(work->share, 0, 3 * sizeof(float) * lines);
+        for (int y = i * cell; y < least((i + 1) * cell, height); y++)
+            add_row(depth + (size_t)y * width, work->kind + (size_t)y * width, level, 1.0f / *range, stiff, width, work->share, work->value,
+                    work->weight);
+        float *share = cell_of(grid, grid->share, i), *value = cell_of(grid, grid->value, i), *weight = cell_of(grid, grid->weight, i);
+        memset(share, 0, sizeof(float) * (size_t)grid->columns);
+        memset(value, 0, sizeof(float) * (size_t)grid->columns);
+        memset(weight, 0, sizeof(float) * (size_t)grid->columns);
+        add_columns(work->share, grid->columns, cell, per_cell, share);
+        add_columns(work->value, grid->columns, cell, per_cell, value);
+        add_columns(work->weight, grid->columns, cell, per_cell, weight);
+    }
+    for (int k = 0; k < work->count; k++) {
+        if (k > 0) coarser(&work->grids[k - 1], work->grids[k - 1].weight, &work->grids[k], work->grids[k].weight);
+        weigh(&work->grids[k]);
+    }
+    return level;
+}
+
+/* Deformed skin that lies below the continuation counts as known too. Returns whether there is any. */
+static int add_known(Work *work, const float *depth, int width, Box box, float most) {
+    Grid *grid = &work->grids[0];
+    const int cell = work->cell, first = box.top / cell, last = (box.bottom + cell - 1) / cell;
+    const size_t lines = (size_t)grid->columns * cell;
+    const float per_cell = 1.0f / (float)(cell * cell);
+    int any = 0;
+    for (int i = first; i < last; i++) {
+        memset(work->share, 0, 2 * sizeof(float) * lines);
+        int here = 0;
+        for (int y = i * cell > box.top ? i * cell : box.top; y < least((i + 1) * cell, box.bottom); y++) {
+            const float *found = continuation(work, y, box.left, box.right);
+            const size_t at = (size_t)y * width + box.left;
+            here |= add_below(depth + at, work->kind + at, found, most, box.right - box.left, work->share + box.left, work->value + box.left);
+        }
+        if (!here) continue;
+        any = 1;
+        add_columns(work->share, grid->columns, cell, per_cell, cell_of(grid, grid->share, i));
+        add_columns(work->value, grid->columns, cell, per_cell, cell_of(grid, grid->value, i));
+    }
+    return any;
 }
 
 /*
@@ -107,75 +364,23 @@ static void not_beside(const uint8_t *deformed, int height, int width, uint8_t *
  */
 EXPORT int zero_background(const float *depth, const uint8_t *deformed, int frames, int height, int width, float stiff, float tolerance,
                            int sweeps, float *out) {
-    const int cell = least(height, width) / 60 > 1 ? least(height, width) / 60 : 1;
     const size_t pixels = (size_t)height * width;
-    Grid grids[MOST_GRIDS];
-    int count = 0, rows = (height + cell - 1) / cell, columns = (width + cell - 1) / cell;
-    size_t cells = 0;
-    for (; count < MOST_GRIDS; rows = (rows + 1) / 2, columns = (columns + 1) / 2) {
-        grids[count].rows = rows, grids[count].columns = columns;
-        cells += (size_t)rows * columns;
-        count++;
-        if (least(rows, columns) <= 2) break;
-    }
-    const size_t first = (size_t)grids[0].rows * grids[0].columns;
-    float *memory = malloc((4 * cells + 2 * first) * sizeof(float)), *scratch = memory + 4 * cells;
-    uint8_t *bytes = malloc(2 * pixels), *free_skin = bytes + pixels;
-    if (!memory || !bytes) {
-        free(memory), free(bytes);
-        return 1;
-    }
-    float *place = memory;
-    for (int k = 0; k < count; k++) {
-        const size_t size = (size_t)grids[k].rows * grids[k].columns;
-        grids[k].share = place, grids[k].value = place + size, grids[k].weight = place + 2 * size, grids[k].found = place + 3 * size;
-        place += 4 * size;
-    }
-    const float per_cell = 1.0f / (float)(cell * cell);
-    for (int b = 0; b < frames; b++, depth += pixels, deformed += pixels, out += pixels) {
-        not_beside(deformed, height, width, bytes, free_skin);
-        float low = depth[0], high = depth[0];
-        for (size_t k = 1; k < pixels; k++) {
-            low = depth[k] < low ? depth[k] : low;
-            high = depth[k] > high ? depth[k] : high;
+    Work work;
+    const int short_of_memory = allocate(&work, height, width);
+    for (int b = 0; b < frames && !short_of_memory; b++, depth += pixels, deformed += pixels, out += pixels) {
+        float range;
+        not_beside(deformed, height, width, work.padded, work.kind);
+        known_cells(&work, depth, height, width, stiff, &range);
+        const Box box = not_flat(work.kind, height, width);
+        memset(out, 0, sizeof(float) * pixels);
+        if (box.bottom == 0) continue; /* all skin is flat */
+        continued(work.grids, work.count, sweeps, work.line);
+        if (add_known(&work, depth, width, box, tolerance * range)) continued(work.grids, work.count, sweeps, work.line);
+        for (int y = box.top; y < box.bottom; y++) {
+            const size_t at = (size_t)y * width + box.left;
+            take_out(depth + at, work.kind + at, continuation(&work, y, box.left, box.right), box.right - box.left, out + at);
         }
-        const float middle = 0.5f * (low + high);
-        double sum = 0.0;
-        size_t flat = 0;
-        for (size_t k = 0; k < pixels; k++)
-            if (free_skin[k]) {
-                if (depth[k] < middle) sum += depth[k], flat++;
-                else free_skin[k] = 2; /* a face of the object */
-            }
-        const float level = flat ? (float)(sum / (double)flat) : 0.0f;
-        const float range = high - level > 1e-9f ? high - level : 1e-9f;
-        for (int pass = 0; pass < 2; pass++) {
-            memset(grids[0].share, 0, (pass ? 2 : 3) * first * sizeof(float));
-            for (int y = 0; y < height; y++)
-                for (int x = 0; x < width; x++) {
-                    const size_t k = (size_t)y * width + x, here = (size_t)(y / cell) * grids[0].columns + x / cell;
-                    const int known = free_skin[k] != 0;
-                    if (known) {
-                        grids[0].share[here] += per_cell;
-                        grids[0].value[here] += per_cell * (free_skin[k] == 2 ? level : depth[k]);
-                    } else if (pass && depth[k] < out[k] - tolerance * range) { /* below zero: that too is an error */
-                        grids[0].share[here] += per_cell;
-                        grids[0].value[here] += per_cell * depth[k];
-                    }
-                    if (!pass) {
-                        const float above = depth[k] > level ? (depth[k] - level) / range : 0.0f;
-                        grids[0].weight[here] += per_cell * (1.0f + stiff * above * above);
-                    }
-                }
-            continued(grids, count, sweeps, scratch);
-            for (int y = 0; y < height; y++)
-                for (int x = 0; x < width; x++) {
-                    const size_t k = (size_t)y * width + x;
-                    out[k] = cell > 1 ? between(&grids[0], grids[0].found, y, x, (float)cell) : grids[0].found[k];
-                }
-        }
-        for (size_t k = 0; k < pixels; k++) out[k] = free_skin[k] == 1 ? 0.0f : depth[k] - out[k];
     }
-    free(memory), free(bytes);
-    return 0;
+    free(work.memory), free(work.kind);
+    return short_of_memory;
 }

@@ -1,0 +1,92 @@
+/* Normals by a response field: the same results as torchvts/normals/response.py, which explains them. Along a row each coefficient of the
+   field is a polynomial in position, so a row needs a few numbers in place of maps. */
+#include "kernels.h"
+
+#include <math.h>
+
+enum { SINGLE = 3, ALL = 9 };
+
+/* One row: sines along x and y from the changes of brightness; weight (degree + 1, 2, terms), highest power last. Both numbers are constants
+   of the callers, so that all loops but one unroll. */
+static inline __attribute__((always_inline)) void sines(const float *restrict image, size_t step, const float *restrict place,
+                                                        const float *restrict weight, const float *restrict depth,
+                                                        const float *restrict per_mm, int degree, int terms, int n, float *restrict sine_x,
+                                                        float *restrict sine_y) {
+    for (int k = 0; k < n; k++) {
+        const float u = place[k];
+        float term[ALL] = {image[k] - 1.0f, image[step + k] - 1.0f, image[2 * step + k] - 1.0f};
+        if (depth)
+            for (int c = 0; c < 3; c++) term[c] -= ((per_mm[3 * c + 2] * u + per_mm[3 * c + 1]) * u + per_mm[3 * c]) * depth[k];
+        if (terms == ALL) {
+            term[3] = term[0] * term[0], term[4] = term[0] * term[1], term[5] = term[0] * term[2];
+            term[6] = term[1] * term[1], term[7] = term[1] * term[2], term[8] = term[2] * term[2];
+        }
+        float x = 0.0f, y = 0.0f;
+        for (int power = degree; power >= 0; power--) {
+            const float *at = weight + 2 * terms * power;
+            float along = at[0] * term[0], down = at[terms] * term[0];
+            for (int t = 1; t < terms; t++) along += at[t] * term[t], down += at[terms + t] * term[t];
+            x = x * u + along, y = y * u + down;
+        }
+        sine_x[k] = x, sine_y[k] = y;
+    }
+}
+
+typedef void (*row_of)(const float *, size_t, const float *, const float *, const float *, const float *, int, float *, float *);
+
+#define ROW(name, degree, terms)                                                                                                        \
+    WIDE FUSED static void name(const float *image, size_t step, const float *place, const float *weight, const float *depth,            \
+                                const float *per_mm, int n, float *sine_x, float *sine_y) {                                               \
+        if (depth)                                                                                                                      \
+            sines(image, step, place, weight, depth, per_mm, degree, terms, n, sine_x, sine_y);                                           \
+        else                                                                                                                            \
+            sines(image, step, place, weight, 0, 0, degree, terms, n, sine_x, sine_y);                                                    \
+    }
+
+ROW(single_2, 2, SINGLE)
+ROW(single_4, 4, SINGLE)
+ROW(single_6, 6, SINGLE)
+ROW(all_2, 2, ALL)
+ROW(all_4, 4, ALL)
+ROW(all_6, 6, ALL)
+
+/* Normals of sines, which are held to the largest. */
+WIDE static void to_normal(float max_sine, int n, float *restrict x, float *restrict y, float *restrict z) {
+    for (int k = 0; k < n; k++) {
+        const float squared = x[k] * x[k] + y[k] * y[k], most = max_sine / sqrtf(squared + 1e-12f), kept = most < 1.0f ? most : 1.0f;
+        x[k] *= -kept, y[k] *= -kept;
+        z[k] = sqrtf(1.0f - squared * (kept * kept));
+    }
+}
+
+/*
+ * Normals (frames, 3, rows, columns) of a window whose frames, channels and rows lie as far apart as said. place: of each column, in [-1, 1];
+ * weight (rows, degree + 1, 2, terms) with degree 2, 4 or 6; depth of the window, or null; per_mm (rows, 3, 3).
+ */
+EXPORT void response_normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *place,
+                             const float *weight, int degree, int terms, const float *depth, int64_t depth_frame, int64_t depth_row,
+                             const float *per_mm, float max_sine, int frames, int rows, int columns, float *normal) {
+    const row_of single[3] = {single_2, single_4, single_6}, all[3] = {all_2, all_4, all_6};
+    const row_of row = (terms == ALL ? all : single)[degree / 2 - 1];
+    const size_t pixels = (size_t)rows * columns;
+    for (int b = 0; b < frames; b++)
+        for (int y = 0; y < rows; y++) {
+            float *to = normal + 3 * pixels * b + (size_t)y * columns;
+            row(image + per_frame * b + per_row * y, (size_t)per_channel, place, weight + (size_t)2 * terms * (degree + 1) * y,
+                depth ? depth + depth_frame * b + depth_row * y : NULL, per_mm ? per_mm + 9 * y : NULL, columns, to, to + pixels);
+            to_normal(max_sine, columns, to, to + pixels, to + 2 * pixels);
+        }
+}
+
+WIDE static void mask_row(const uint8_t *restrict mask, const float *restrict values, int n, float *restrict masked) {
+    for (int x = 0; x < n; x++) masked[x] = values[x] * (float)mask[x];
+}
+
+/* Values (frames, channels, rows, columns) times a mask of ones and zeros, bytes whose frames and rows lie as far apart as said. */
+EXPORT void mask_values(const float *values, const uint8_t *mask, int64_t per_frame, int64_t per_row, int frames, int channels, int rows,
+                        int columns, float *masked) {
+    for (int b = 0; b < frames; b++)
+        for (int c = 0; c < channels; c++)
+            for (int y = 0; y < rows; y++, values += columns, masked += columns)
+                mask_row(mask + per_frame * b + per_row * y, values, columns, masked);
+}

@@ -1,5 +1,6 @@
 """Depth of cameras, videos and folders of images, frame by frame; late frames are dropped, slow drift of the light is followed."""
 
+from . import messages
 from .background import (
     FIRST_FRAMES,
     calibrate_background,
@@ -38,6 +39,7 @@ __all__ = [
     "find_background",
     "frames_a_second",
     "has_display",
+    "messages",
     "open_source",
     "read_background",
     "read_press_images",

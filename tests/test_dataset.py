@@ -18,7 +18,6 @@ from torchvts.core.files import read_depth_png
 from torchvts.dataset import STATE, list_items, output_stems, reconstruct, reconstruct_dataset
 
 ROOT = Path(__file__).resolve().parents[1]
-SCRIPT = ROOT / "scripts" / "reconstruct.py"
 HEIGHT, WIDTH, PITCH = 48, 64, 0.6
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 
@@ -80,7 +79,8 @@ def finished(out):
 
 
 def torchrun(*arguments):
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", SCRIPT, *arguments]
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
+    command += ["-m", "torchvts", "reconstruct", *arguments]
     return subprocess.Popen(
         list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT, env=ENVIRONMENT
     )

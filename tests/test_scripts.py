@@ -78,8 +78,8 @@ def test_missing_and_foreign_files_are_refused_in_a_sentence(run_script, images,
         (["reconstruct", calibration, tmp_path / "nothing", "--out", tmp_path], "no such file"),
     ):
         done = run_script(*arguments)
-        assert done.returncode == 1
-        assert done.stderr.startswith("error: ") and part in done.stderr, done.stderr
+        assert done.returncode == 2
+        assert done.stderr.startswith("torchvts: error: ") and part in done.stderr, done.stderr
         assert "Traceback" not in done.stderr
     assert not (tmp_path / "a.safetensors").exists()
 

@@ -199,7 +199,7 @@ class _Worker:
         writers = 1 if self.settings.pictures else 4  # matplotlib draws in one thread only
         waiting: deque[tuple[Frame, Future[str]]] = deque()
         start = time.perf_counter()
-        with tqdm(total=total, unit="frame", disable=rank > 0, smoothing=0.05) as bar, ThreadPoolExecutor(writers) as pool:
+        with tqdm(total=total, unit="frame", disable=rank > 0 or None, smoothing=0.05) as bar, ThreadPoolExecutor(writers) as pool:
             for frame, image, output in self._depths(load_frames(self.records, self.sensor, self.share, batch, workers)):
                 bar.update(frame.length is None)
                 if not frame.done:

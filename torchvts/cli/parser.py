@@ -1,0 +1,32 @@
+"""argparse with one-line errors that name the option that was probably meant."""
+
+import argparse
+import difflib
+from collections.abc import Iterable
+from typing import Any, NoReturn
+
+
+class UsageError(ValueError):
+    """A request that a subcommand does not understand."""
+
+
+def suggest(word: str, known: Iterable[str]) -> str:
+    """``: did you mean 'x'?`` where a known word is close, else nothing."""
+    close = difflib.get_close_matches(word, list(known), 1)
+    return f": did you mean {close[0]!r}?" if close else ""
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that raises :class:`UsageError` instead of printing its usage and ending the process."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise with the message, the option that was probably meant, and where the options are explained."""
+        if message.startswith("unrecognized arguments: "):
+            word = message.split()[2]
+            message = f"unknown option {word!r}{suggest(word, self._option_string_actions)}"
+        raise UsageError(f"{message} ({self.prog} --help explains)")
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            choices = [str(choice) for choice in action.choices]
+            raise argparse.ArgumentError(action, f"expected {', '.join(choices)}, got {value!r}{suggest(str(value), choices)}")

@@ -12,7 +12,8 @@ from types import ModuleType
 from typing import TextIO
 
 from ..core import __version__
-from .parser import Parser, UsageError, suggest
+from ..core.spelling import suggest
+from .parser import Parser, UsageError
 
 COMMANDS = {
     "calibrate": "calibrate a unit from its own images",
@@ -23,6 +24,7 @@ COMMANDS = {
     "export": "files that run without torchvts: TorchScript, ONNX and others",
     "train": "train gs_sdk's network on presses of balls",
     "evaluate": "score methods on presses, in tables",
+    "samples": "images of a real sensor to try the commands on",
     "bench": "measure speed and error of all methods",
 }
 """Subcommand: what it does. Its module has its name; it is imported only where it is asked for."""
@@ -56,9 +58,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         The exit status: 0; 1 where frames were left out or a fault was found; 2 for a wrong request or input; 130 after Ctrl-C.
     Example:
-        >>> main(["--version"]).__class__
+        >>> main(["--version"])  # doctest: +ELLIPSIS
         torchvts ...
-        <class 'int'>
+        0
     """
     words = list(sys.argv[1:] if argv is None else argv)
     if not words or words[0] in ("-h", "--help", "help"):

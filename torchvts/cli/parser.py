@@ -1,19 +1,13 @@
 """argparse with one-line errors that name the option that was probably meant."""
 
 import argparse
-import difflib
-from collections.abc import Iterable
 from typing import Any, NoReturn
+
+from ..core.spelling import suggest
 
 
 class UsageError(ValueError):
     """A request that a subcommand does not understand."""
-
-
-def suggest(word: str, known: Iterable[str]) -> str:
-    """``: did you mean 'x'?`` where a known word is close, else nothing."""
-    close = difflib.get_close_matches(word, list(known), 1)
-    return f": did you mean {close[0]!r}?" if close else ""
 
 
 class Parser(argparse.ArgumentParser):

@@ -1,9 +1,11 @@
 """Sphinx settings of the documentation: `make docs` builds it from the pages here and the docstrings of the package."""
 
+import sys
 import warnings
 from typing import Any
 
 from docutils import nodes
+from sphinx.pycode import ModuleAnalyzer
 
 import torchvts
 
@@ -21,7 +23,6 @@ html_title = "torchvts"
 html_show_sphinx = False
 html_static_path: list[str] = []
 
-myst_enable_extensions = ["colon_fence"]
 myst_fence_as_directive = ["mermaid"]
 myst_heading_anchors = 3
 
@@ -43,7 +44,19 @@ def skip(app: Any, what: str, name: str, obj: Any, skipped: bool, options: Any) 
         return True
     if what == "module" and app.env.docname != "api/torchvts" and name in torchvts.__all__:
         return True
-    return None
+    return False if what == "module" else None  # a room's public names only: constants have their texts elsewhere
+
+
+def describe_constants(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Give a constant that a room exports the text beneath its definition, which stands in a module of the room."""
+    room, _, constant = name.rpartition(".")
+    if what not in ("data", "attribute") or not room.startswith("torchvts"):
+        return
+    for module in [module for module in sys.modules if module.startswith("torchvts.") and hasattr(sys.modules[module], constant)]:
+        text = ModuleAnalyzer.for_module(module).find_attr_docs().get(("", constant))
+        if text:
+            lines[:] = text
+            return
 
 
 def name_the_others(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
@@ -77,5 +90,6 @@ def resolve(app: Any, env: Any, node: Any, contnode: Any) -> Any:
 def setup(app: Any) -> None:
     """Register the hooks."""
     app.connect("autodoc-skip-member", skip)
+    app.connect("autodoc-process-docstring", describe_constants)
     app.connect("autodoc-process-docstring", name_the_others)
     app.connect("missing-reference", resolve)

@@ -44,7 +44,7 @@ def skip(app: Any, what: str, name: str, obj: Any, skipped: bool, options: Any) 
         return True
     if what == "module" and app.env.docname != "api/torchvts" and name in torchvts.__all__:
         return True
-    return False if what == "module" else None  # a room's public names only: constants have their texts elsewhere
+    return None
 
 
 def describe_constants(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:

@@ -25,13 +25,13 @@ def calibration(run_script, images):
     out = folder / "unit.safetensors"
     done = run_script("calibrate", folder / "background.png", "--mm-per-pixel", "0.25", "--out", out)
     assert done.returncode == 0, done.stderr
-    assert "wrote" in done.stdout and "chosen: point_lights" in done.stdout
+    assert "wrote" in done.stdout and "chosen: point lights" in done.stdout
     return out
 
 
 def test_reconstruct_writes_depth_pictures_and_table(run_script, images, calibration, tmp_path):
     folder, scene = images
-    done = run_script("reconstruct", calibration, folder / "presses", "--out", tmp_path, "--mode", "precise")
+    done = run_script("reconstruct", calibration, folder / "presses", "--out", tmp_path, "--mode", "precise", "--format", "png16")
     assert done.returncode == 0, done.stderr
     assert len((tmp_path / "frames.csv").read_text().splitlines()) == 4
     for k in range(3):
@@ -58,7 +58,7 @@ def test_reconstruct_writes_clouds(run_script, images, calibration, tmp_path):
     except ImportError as error:
         pytest.skip(str(error))
     folder, scene = images
-    arguments = ["--out", tmp_path, "--depth", "npy", "--cloud", "ply", "--no-pictures"]
+    arguments = ["--out", tmp_path, "--format", "npy", "--cloud", "ply", "--no-pictures"]
     done = run_script("reconstruct", calibration, folder / "presses" / "0.png", *arguments)
     assert done.returncode == 0, done.stderr
     points, normals = read_point_cloud(tmp_path / "0.ply")

@@ -20,7 +20,7 @@ import torch
 
 import torchvts as vts
 from torchvts import stream as streams
-from torchvts.core.files import read_depth_png, read_frames, rgb_from_bgr
+from torchvts.core.files import read_frames, rgb_from_bgr
 
 ROOT = Path(__file__).resolve().parents[1]
 PITCH = 0.25
@@ -355,7 +355,7 @@ def test_both_scripts_give_the_same_depth_for_a_video(unit, run_stream, run_scri
     with streams.TactileStream(video, small_sensor) as stream:
         depth = {frame.number: frame.output.depth_mm for frame in stream}
     for k in (3, 16, 19):
-        assert float((read_depth_png(tmp_path / "file" / f"press_{k:06d}_depth.png") - depth[k]).abs().max()) < 1e-3
+        assert float((vts.read_result(tmp_path / "file" / f"press_{k:06d}.npz").depth_mm - depth[k]).abs().max()) < 1e-5
 
 
 def test_backgrounds_of_several_images_and_own_presses(unit, run_script, small_sensor, tmp_path):
@@ -373,8 +373,8 @@ def test_backgrounds_of_several_images_and_own_presses(unit, run_script, small_s
     )
     assert done.returncode == 0 and "| 2.png |" in done.stdout, done.stderr
     sensor = ("--sensor", tmp_path / "rig.yaml", "--out", tmp_path / "out")
-    done = run_script("reconstruct", names[2], *sensor, "--background", *names, *press, "--no-pictures", "--depth", "none")
-    assert done.returncode == 0 and "| 2.png |" in done.stdout, done.stderr
+    done = run_script("reconstruct", names[2], *sensor, "--background", *names, *press, "--no-pictures", "--format", "none")
+    assert done.returncode == 0 and "2.png: deepest " in done.stdout, done.stderr
     for arguments, part in (
         ((names[2], *sensor), "--background: expected images without contact, got none"),
         (

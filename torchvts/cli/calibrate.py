@@ -11,19 +11,17 @@ examples:
 
 import argparse
 import dataclasses
-import sys
-import warnings
 from pathlib import Path
 
 import torch
 
-from ..calibration import CalibrationWarning, Press, Touch, read_presses
+from ..calibration import Press, Touch, read_presses
 from ..core.files import read_frames
-from ..model import PointLights, Sensor
-from ..model.report import CandidateRow, PressRow, Report
+from ..model import Sensor
 from ..stream import calibrate_unit, read_background, read_press_images
 from .options import add_background_frames, add_press, add_sensor
 from .parser import UsageError
+from .summary import print_calibration
 
 USAGE = "SOURCE... (--sensor NAME | --mm-per-pixel MM) [--press IMAGE MM]... [--out FILE]"
 
@@ -51,27 +49,22 @@ def run(arguments: argparse.Namespace) -> int:
     """Calibrate, write the file, and print what was chosen."""
     if (arguments.sensor is None) == (arguments.mm_per_pixel is None):
         raise UsageError("expected either --sensor or --mm-per-pixel")
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    check_target_of(arguments.out)
     image, sensor, presses = read_given(arguments)
     presses += read_press_images(arguments.press, sensor)
     touches = [Touch(sensor.read_image(path), None, path.name) for path in arguments.touches]
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", CalibrationWarning)
-        calibration = calibrate_unit(image, sensor, presses, touches, progress=True)
+    calibration = calibrate_unit(image, sensor, presses, touches, progress=True)
     calibration.save(arguments.out)
-    report, sensor = calibration.report, calibration.sensor
-    print(f"sensor {sensor.name}: {sensor.height} x {sensor.width} px, {sensor.mm_per_pixel} mm per pixel, gamma {sensor.exponent}")
-    print(f"chosen: {report['model']} ({report['source']}): {report['reason']}\n")
-    if arguments.candidates:
-        print_candidates(report["candidates"])
-    if report["model"] == "point_lights" and calibration.lights is not None:
-        print_lights(calibration.lights, report)
-    if arguments.candidates and "presses" in report:
-        print_presses(report["presses"])
-    for warning in caught:
-        print(f"warning: {warning.message}", file=sys.stderr)
+    print_calibration(calibration, arguments.candidates)
     print(f"wrote {arguments.out} ({arguments.out.stat().st_size / 1000:.0f} kB)")
     return 0
+
+
+def check_target_of(out: Path) -> None:
+    """Refuse a name that is no calibration's before the work that leads to it."""
+    if out.suffix != ".safetensors":
+        raise UsageError(f"--out: expected a name ending in .safetensors, got {out}")
+    out.parent.mkdir(parents=True, exist_ok=True)
 
 
 def read_given(arguments: argparse.Namespace) -> tuple[torch.Tensor, Sensor, list[Press]]:
@@ -98,37 +91,3 @@ def unknown_sensor(arguments: argparse.Namespace) -> Sensor:
     _, image = next(iter(read_frames(path)))
     name, pitch = arguments.source[0].stem or "sensor", arguments.mm_per_pixel
     return Sensor(name, image.shape[1], image.shape[2], pitch, gamma=arguments.gamma)
-
-
-def print_candidates(candidates: list[CandidateRow]) -> None:
-    """Print a row for each model that was fitted."""
-    print("| model | family | passes | parameters | deg | misfit | note |\n|---|---|---|---|---|---|---|")
-    for row in candidates:
-        score = "" if row["score_deg"] is None else f"{row['score_deg']:.2f}"
-        misfit = f"{row['misfit']:.1%}" if "misfit" in row else ""
-        family = row.get("family", "") + (f", gamma {row['gamma']:g}" if row.get("gamma", 1.0) != 1.0 else "")
-        print(f"| {row['model']} | {family} | {row['passes']} | {row['parameters']} | {score} | {misfit} | {row.get('note', '')} |")
-    print("deg: mean angle on held-out presses; for point lights without presses the standard deviation of the worst direction")
-    print("misfit: smooth relative structure of the image that the lights leave unexplained\n")
-
-
-def print_lights(lights: PointLights, report: Report) -> None:
-    """Print where the lights are."""
-    print("| light | x mm | y mm | z mm | direction +- deg | gloss |\n|---|---|---|---|---|---|")
-    position, gloss = lights.position_mm.tolist(), lights.gloss.tolist()
-    for j, name in enumerate("RGB"):
-        spread = f"{report['direction_std_deg'][j]:.2f}" if "direction_std_deg" in report else "given"
-        print(f"| {name} | " + " | ".join(f"{v:.2f}" for v in position[j]) + f" | {spread} | {gloss[j]:.3f} |")
-    print()
-
-
-def print_presses(presses: list[PressRow]) -> None:
-    """Print a row for each press."""
-    print("| press | center px | contact radius px | error deg | times as wide as given | |\n|---|---|---|---|---|---|")
-    for press in presses:
-        center = ", ".join(f"{v:.1f}" for v in press["center_px"]) if "center_px" in press else ""
-        radius = f"{press['contact_radius_px']:.1f}" if "contact_radius_px" in press else ""
-        off = f"{press['error_deg']:.1f}" if "error_deg" in press else ""
-        wide = f"{1.0 / max(press['gain'], 1e-3):.2f}" if "gain" in press else ""
-        print(f"| {press['name']} | {center} | {radius} | {off} | {wide} | {press['reason'] and 'left out: ' + press['reason']} |")
-    print("error, times as wide: slopes by the field of the other presses, or by the prior, compared with the ball's\n")

@@ -36,6 +36,14 @@ def add_mode(parser: argparse._ActionsContainer, default: str = "auto") -> None:
     parser.add_argument("--mode", choices=MODES, default=default, help=f"{default} if not given")
 
 
+def add_pipeline(parser: argparse._ActionsContainer) -> None:
+    """``--network`` and ``--device``: what finds the normals, and where."""
+    parser.add_argument(
+        "--network", type=Path, metavar="FILE", help="normals by gs_sdk's nnmodel.pth, or by what torchvts train wrote"
+    )
+    parser.add_argument("--device", default="cpu", help="cpu (if not given), cuda, cuda:1")
+
+
 def add_out(parser: argparse._ActionsContainer, text: str, default: str | None = None) -> None:
     """``--out``: where results go; required where there is no default."""
     path = None if default is None else Path(default)

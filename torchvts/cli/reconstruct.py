@@ -12,18 +12,24 @@ examples:
 """
 
 import argparse
+import csv
 import os
-from collections.abc import Sequence
-from itertools import islice
 from pathlib import Path
 
 from ..core.files import VIDEO_SUFFIXES, read_frames
-from ..dataset import CLOUD_FORMATS, DEPTH_FORMATS, PICTURES_UP_TO, Report, list_items, reconstruct_dataset
+from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, Report, list_items, reconstruct_dataset
 from ..diagnose import Finding, diagnose
 from ..model import Calibration, Sensor
 from ..stream import calibrate_background, read_background, read_press_images
-from .options import add_background_frames, add_mode, add_out, add_press, add_sensor
+from .options import add_background_frames, add_mode, add_out, add_pipeline, add_press, add_sensor
 from .parser import UsageError
+from .summary import SHOWN, left_out, print_calibration
+
+PASSED = (
+    "mode", "format", "cloud", "pictures", "every", "network", "device", "background_frames", "batch", "workers", "threads",
+    "overwrite", "strict",
+)  # fmt: skip
+"""Options that :func:`reconstruct_dataset` has under the same names."""
 
 USAGE = "CALIBRATION INPUT... --out FOLDER"
 
@@ -39,8 +45,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_press(parser)
     add_background_frames(parser)
     add_mode(parser)
-    parser.add_argument("--depth", choices=DEPTH_FORMATS, default="png", help="png: 16 bits, 32768 + depth / 0.0001 mm")
-    parser.add_argument("--cloud", choices=CLOUD_FORMATS, default="none", help="contact points in mm, y up")
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="each N-th frame of a video, each N-th image")
+    add_pipeline(parser)
+    parser.add_argument("--format", choices=FORMATS, default="npz", help="npz if not given; video-npz: one file a video")
+    parser.add_argument("--cloud", choices=CLOUD_FORMATS, default="none", help="contact in mm, y up; obj is a surface")
     parser.add_argument("--pictures", action=argparse.BooleanOptionalAction, help=f"by default for at most {PICTURES_UP_TO} frames")
     parser.add_argument("--batch", type=int, default=8, metavar="N", help="frames that a loader process hands over at once (8)")
     parser.add_argument("--workers", type=int, metavar="N", help="loader processes of each rank; up to 4 if not given")
@@ -51,85 +59,77 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--strict", action="store_true", help="stop at the first frame that cannot be used")
 
 
-def calibrate(
-    sensor: str, background: Sequence[Path] | None, presses: Sequence[tuple[str, str]], arguments: argparse.Namespace
-) -> Path:
-    """Calibrate as stream.py does, and keep the file with the results."""
+def run(arguments: argparse.Namespace) -> int:
+    """Reconstruct, and print a summary."""
+    calibration, inputs = split_files(arguments)
+    if calibration is None:
+        calibration = calibrate_first(arguments, inputs)
+    report = reconstruct_dataset(calibration, inputs, arguments.out, **{name: getattr(arguments, name) for name in PASSED})
+    if report.rank > 0:
+        return 0
+    print_report(report, arguments.out)
+    for finding in diagnose_first(calibration, inputs):
+        print(f"first frame: {finding}")
+    return 1 if report.failed else 0
+
+
+def split_files(arguments: argparse.Namespace) -> tuple[Path | None, list[Path]]:
+    """The calibration, if it is named, and the inputs."""
+    files = list(arguments.files)
+    if arguments.sensor is not None:
+        if files[0].suffix == ".safetensors":
+            raise UsageError(f"expected inputs only beside --sensor, which calibrates, got {files[0]}: leave one of them out")
+        return None, files
+    if arguments.background or arguments.press:
+        raise UsageError("--background, --press: they are to calibrate with --sensor, not beside a calibration file")
+    if len(files) < 2:
+        raise UsageError(f"expected a calibration file and an input, got {files[0]}: name both, or --sensor to calibrate")
+    return files[0], files[1:]
+
+
+def calibrate_first(arguments: argparse.Namespace, inputs: list[Path]) -> Path:
+    """Calibrate as ``torchvts stream`` does, and keep the file with the results."""
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        raise ValueError("--sensor: expected one process, got more: calibrate first, by torchvts calibrate, and give the file")
-    if background is None and arguments.source.suffix.lower() not in VIDEO_SUFFIXES:
-        raise ValueError(
-            f"--background: expected images without contact, got none: {arguments.source} is no video that begins with them"
-        )
-    unit = Sensor.load(sensor)
-    image = read_background(background or [arguments.source], unit, arguments.background_frames)
-    found = calibrate_background(image, unit, read_press_images(presses, unit))
-    print(found.note)
+        raise UsageError("--sensor: expected one process, got more: calibrate first, by torchvts calibrate, and give the file")
+    video = next((path for path in inputs if path.suffix.lower() in VIDEO_SUFFIXES), None)
+    if arguments.background is None and video is None:
+        raise UsageError(f"--background: expected images without contact, got none: {inputs[0]} is no video that begins with them")
+    unit = Sensor.load(arguments.sensor)
+    image = read_background(arguments.background or [video], unit, arguments.background_frames)
+    found = calibrate_background(image, unit, read_press_images(arguments.press, unit))
+    print_calibration(found.calibration)
     path: Path = arguments.out / "calibration.safetensors"
     path.parent.mkdir(parents=True, exist_ok=True)
     found.calibration.save(path)
     return path
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Reconstruct, and print a summary."""
-    read_files(arguments)
-    given = vars(arguments).pop("sensor"), vars(arguments).pop("background"), vars(arguments).pop("press")
-    if arguments.calibration is None:
-        arguments.calibration = calibrate(*given, arguments)
-    report = reconstruct_dataset(**vars(arguments))
-    if report.rank > 0:
-        return 0
-    print_report(report, arguments.out)
+def print_report(report: Report, out: Path) -> None:
+    """Print the deepest frames, what was left out, and where the results are."""
+    with (out / "frames.csv").open(encoding="utf-8", errors="replace", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    rows.sort(key=lambda row: -float(row["deepest_mm"]))
+    shown = rows[:SHOWN]
+    for row in shown:
+        print(f"{row['frame']}: deepest {float(row['deepest_mm']):.3f} mm, contact {float(row['contact_mm2']):.2f} mm2")
+    if len(rows) > SHOWN:
+        print(f"... the deepest {SHOWN} of {len(rows)}; contact in {sum(float(row['contact_mm2']) > 0 for row in rows)}")
     for name, note in report.notes:
         print(f"{name}: {note}")
-    for finding in diagnose_first(arguments.calibration, arguments.source):
-        print(f"first frame: {finding}")
-    return 1 if report.failed else 0
-
-
-def read_files(arguments: argparse.Namespace) -> None:
-    """Split the files into the calibration and the input."""
-    files = vars(arguments).pop("files")
-    if arguments.sensor is None and (arguments.background or arguments.press):
-        raise UsageError("--background, --press: they are to calibrate with --sensor, not beside a calibration file")
-    if arguments.sensor is None and len(files) < 2:
-        raise UsageError(
-            f"expected a calibration file and an input, got {files[0]}: name both, or give --sensor to calibrate first"
-        )
-    arguments.calibration = files.pop(0) if arguments.sensor is None else None
-    if len(files) > 1:
-        raise UsageError(f"expected one input, got {len(files)}")
-    arguments.source = files[0]
-    del arguments.debug
-
-
-def print_report(report: Report, out: Path) -> None:
-    """Print the first frames, and what was left out."""
-    print("| frame | deepest mm | contact mm^2 |\n|---|---|---|")
-    with (out / "frames.csv").open(encoding="utf-8", errors="replace") as stream:
-        for line in islice(stream, 1, 21):
-            name, deepest, area = line.rstrip("\n").rsplit(",", 2)
-            print(f"| {name} | {float(deepest):.3f} | {float(area):.2f} |")
-    if report.rows > 20:
-        print(f"... {report.rows - 20} more")
-    frames = report.rows - report.before
-    rate = frames / max(report.seconds, 1e-9)
-    print(f"\n{frames} frames in {report.seconds:.1f} s: {rate:.1f} frames/s; {report.before} were there before")
+    for line in left_out("frame", report.failed):
+        print(line)
     if report.failed:
-        print("\n| left out | reason |\n|---|---|")
-        for name, reason in report.failed[:20]:
-            print(f"| {name} | {reason} |")
         print(f"{len(report.failed)} left out, all of them in {out / 'failed.csv'}")
-    print(f"wrote {report.rows} frames to {out}")
+    before = f", {report.before} of them by an earlier run" if report.before else ""
+    print(f"wrote {report.rows} frames to {out}{before}; table in frames.csv, units in summary.json")
 
 
-def diagnose_first(calibration: Path, source: Path) -> list[Finding]:
+def diagnose_first(calibration: Path, inputs: list[Path]) -> list[Finding]:
     """What is wrong with the first frame, such as that it is from another unit; one that cannot be read is reported above."""
     unit = Calibration.load(calibration)
     try:
-        first = next(list_items(source))
-        _, image = next(iter(read_frames(first.file(source))))
+        first = next(list_items(tuple(inputs) if len(inputs) > 1 else inputs[0]))
+        _, image = next(iter(read_frames(first.file)))
         found = diagnose(None, unit.sensor.rectify(image[None])[0], unit)
     except (OSError, ValueError, StopIteration):
         return []

@@ -33,7 +33,7 @@ from ..stream import (
     read_background,
     read_press_images,
 )
-from .options import add_background_frames, add_mode, add_press, add_sensor
+from .options import add_background_frames, add_mode, add_pipeline, add_press, add_sensor
 from .parser import UsageError
 
 USAGE = "--source SOURCE (--sensor NAME | --calibration FILE) [--out FOLDER]"
@@ -52,6 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="for overlay video, frames.csv and summary.json")
     parser.add_argument("--video", choices=["mp4", "avi", "none"], default="mp4", help="kind of overlay video in --out")
     add_mode(parser)
+    add_pipeline(parser)
     parser.add_argument("--realtime", action="store_true", help="play a recording at its own rate, dropping late frames")
     parser.add_argument("--no-follow", action="store_true", help="do not follow slow drift of the light")
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="of PyTorch and OpenCV (1)")
@@ -93,6 +94,8 @@ def run(arguments: argparse.Namespace) -> int:
                 presses=presses,
                 realtime=arguments.realtime,
                 follow=not arguments.no_follow,
+                network=arguments.network,
+                device=arguments.device,
             )
         )
         print(f"{stream.reader.name}: {stream.fps:g} frames a second; the first {arguments.background_frames} are without contact")

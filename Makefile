@@ -3,13 +3,13 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup demo test test-coverage test-long characterise check bench clean
+.PHONY: setup demo test test-coverage test-long characterise check bench docs clean
 
 setup: $(VENV)/.done
 
 $(VENV)/.done: pyproject.toml constraints.txt hatch_build.py $(wildcard torchvts/accelerated/csrc/*.[ch])
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[pose,onnx,test]"
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[pose,onnx,test,docs]"
 	touch $@
 
 demo: setup
@@ -41,7 +41,11 @@ check: setup
 	$(BIN)/lint-imports
 
 bench: setup
-	$(BIN)/python scripts/bench.py --out out/bench
+	$(BIN)/torchvts bench --out out/bench
+
+# The documentation as HTML in out/docs, from docs/ and the docstrings; a warning is an error.
+docs: setup
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet docs out/docs
 
 clean:
 	rm -rf $(VENV) out .mypy_cache .ruff_cache .pytest_cache

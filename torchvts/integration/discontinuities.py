@@ -58,7 +58,7 @@ def integrate_discontinuities(
     r"""Integrate a gradient map into depth that may have cliffs, zero where the skin is undeformed.
 
     1. An edge's slope is the mean of its two pixels', as in :func:`poisson_background`; its variance v is the mean of theirs,
-       s^2 (1 + |g|^2)^2 (a slope g whose angle is off), plus a twelfth of the square of their difference (a crease may lie
+       ``s^2 (1 + |g|^2)^2`` (a slope g whose angle is off), plus a twelfth of the square of their difference (a crease may lie
        anywhere between them).
     2. Each contact is solved by itself, cut off along its rim, and set to the height that most of its rim agrees with: a roof
        between two vertical ends stands on its eaves. If as much of the rim agrees with two heights, the one is taken that leaves

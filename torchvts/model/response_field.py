@@ -25,8 +25,8 @@ MAX_SINE = MAX_SLOPE / math.sqrt(1.0 + MAX_SLOPE**2)
 class ResponseField:
     r"""sine(x, y) = sum over terms of W_t(x, y) * term_t(change).
 
-    The sine is slope / sqrt(1 + |slope|^2), the part of the unit normal that lies in the plane of the undeformed skin: the light
-    on a matt skin is linear in its normal, not in its slope. The inputs are the relative changes of R, G and B,
+    The sine is ``slope / sqrt(1 + |slope|^2)``, the part of the unit normal that lies in the plane of the undeformed skin: the
+    light on a matt skin is linear in its normal, not in its slope. The inputs are the relative changes of R, G and B,
     image / background - 1, divided by :data:`CHANGE_SCALE`. The terms are the inputs and, if ``product_degree`` is not -1, the
     products of two of them. No term is constant: the undeformed skin has slope zero. Each W_t is a polynomial of total degree
     ``degree`` (products: ``product_degree``) in x / half_mm and y / half_mm.

@@ -1,0 +1,95 @@
+"""Sphinx settings of the documentation: `make docs` builds it from the pages here and the docstrings of the package."""
+
+import sys
+import warnings
+from typing import Any
+
+from docutils import nodes
+from sphinx.pycode import ModuleAnalyzer
+
+import torchvts
+
+warnings.filterwarnings("ignore")  # of libraries that autodoc imports; Sphinx's own stay errors
+
+project = "torchvts"
+author = "the authors of torchvts"
+project_copyright = "the authors of torchvts, Apache-2.0"
+version = release = torchvts.__version__
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "sphinxcontrib.mermaid"]
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_title = "torchvts"
+html_show_sphinx = False
+html_static_path: list[str] = []
+
+myst_fence_as_directive = ["mermaid"]
+myst_heading_anchors = 3
+
+autodoc_member_order = "groupwise"
+autodoc_typehints_format = "short"
+autodoc_default_options = {"members": True, "show-inheritance": True}
+python_maximum_signature_line_length = 100
+napoleon_custom_sections = ["Source"]
+napoleon_use_ivar = True
+
+
+def _short(name: str) -> str:
+    return name.rpartition(".")[2]
+
+
+def skip(app: Any, what: str, name: str, obj: Any, skipped: bool, options: Any) -> bool | None:
+    """Leave out fields of tuples, which the class describes, and names of a room that torchvts exports."""
+    if type(obj).__name__ == "_tuplegetter":
+        return True
+    if what == "module" and app.env.docname != "api/torchvts" and name in torchvts.__all__:
+        return True
+    return None
+
+
+def describe_constants(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Give a constant that a room exports the text beneath its definition, which stands in a module of the room."""
+    room, _, constant = name.rpartition(".")
+    if what not in ("data", "attribute") or not room.startswith("torchvts"):
+        return
+    for module in [module for module in sys.modules if module.startswith("torchvts.") and hasattr(sys.modules[module], constant)]:
+        text = ModuleAnalyzer.for_module(module).find_attr_docs().get(("", constant))
+        if text:
+            lines[:] = text
+            return
+
+
+def name_the_others(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Say on a room's page which of its names stand on the page of torchvts."""
+    if what != "module" or name == "torchvts":
+        return
+    others = [other for other in getattr(obj, "__all__", []) if other in torchvts.__all__]
+    if others:
+        lines += ["", "Documented with :doc:`torchvts <torchvts>`: " + ", ".join(f":obj:`~torchvts.{o}`" for o in others) + ".", ""]
+
+
+def resolve(app: Any, env: Any, node: Any, contnode: Any) -> Any:
+    """Find the one object that a docstring means by a name without its module, or by the module that defines it."""
+    if node.get("refdomain") != "py":
+        return None
+    python = env.domains["py"]
+    found = [name for name in python.objects if _short(name) == _short(node["reftarget"]) and name.count(".") <= 2]
+    if not found:
+        return None
+    target = min(found, key=lambda name: (name.count("."), name))
+    entry = python.objects[target]
+    try:
+        uri = app.builder.get_relative_uri(node.get("refdoc", env.docname), entry.docname)
+    except Exception:
+        return None
+    reference = nodes.reference("", "", contnode, internal=True, reftitle=target)
+    reference["refuri"] = f"{uri}#{entry.node_id}"
+    return reference
+
+
+def setup(app: Any) -> None:
+    """Register the hooks."""
+    app.connect("autodoc-skip-member", skip)
+    app.connect("autodoc-process-docstring", describe_constants)
+    app.connect("autodoc-process-docstring", name_the_others)
+    app.connect("missing-reference", resolve)

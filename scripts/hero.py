@@ -1,0 +1,117 @@
+"""Draw README's picture: a ball on a real GelSight Mini, its depth, normals, surface and profile, beside the ball's true shape.
+
+The unit is calibrated by its background and presses of the other ball, so nothing was learned from the ball that is drawn.
+
+    python scripts/hero.py [--data FOLDER] [--out docs/hero.png]
+"""
+
+import argparse
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from matplotlib.colors import LightSource, LinearSegmentedColormap
+from matplotlib.figure import Figure
+
+import torchvts as vts
+from torchvts import viz
+from torchvts.evaluation.sets import data_folder
+
+SHOWN = "6.310mm/10"
+EXAGGERATION = 2.0
+HALF_MM = 4.2
+SKIN = LinearSegmentedColormap.from_list("skin", ["#9a8f86", "#d9cfc5"])
+
+
+class Contact(NamedTuple):
+    """What is drawn: depth (H, W) in mm, normals (H, W, 3), contact (H, W), the ball's center in px and its radius in mm."""
+
+    depth_mm: Any
+    normal: Any
+    contact: Any
+    center_px: tuple[float, float]
+    radius_mm: float
+
+
+def reconstruct(folder: Path, sensor: vts.Sensor) -> tuple[Contact, int]:
+    """The contact that is drawn, and the number of presses of the other ball that the unit was calibrated by."""
+    background, presses = vts.read_presses(folder)
+    shown = next(press for press in presses if press.name == SHOWN)
+    known = [vts.Press(p.image, p.ball_diameter_mm, p.name) for p in presses if p.ball_diameter_mm != shown.ball_diameter_mm]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", vts.CalibrationWarning)
+        calibration = vts.calibrate(background, sensor.without_prior(), known)
+    pipe = vts.DepthPipeline.from_calibration(calibration, mode="precise")
+    with torch.inference_mode():
+        out = pipe(shown.image[None])
+    depth, normal, contact = out.depth_mm[0, 0], out.normal[0].permute(1, 2, 0), out.contact[0, 0]
+    assert shown.center_px is not None
+    center = (float(shown.center_px[0]), float(shown.center_px[1]))
+    return Contact(depth.numpy(), normal.numpy(), contact.numpy(), center, 0.5 * shown.ball_diameter_mm), len(known)
+
+
+def draw(contact: Contact, pitch: float) -> Figure:
+    """Depth, normals, surface, and the profile through the ball's center; all in mm, cut to the contact."""
+    column, row = (round(value) for value in contact.center_px)
+    half = round(HALF_MM / pitch)
+    cut = np.s_[max(0, row - half) : row + half + 1, max(0, column - half) : column + half + 1]
+    depth_mm, inside = contact.depth_mm[cut], contact.contact[cut]
+    x = (np.arange(contact.depth_mm.shape[1])[cut[1]] - contact.center_px[0]) * pitch
+    y = (np.arange(contact.depth_mm.shape[0])[cut[0]] - contact.center_px[1]) * pitch
+    extent = (x[0] - pitch / 2, x[-1] + pitch / 2, y[-1] + pitch / 2, y[0] - pitch / 2)
+    figure = viz.new_figure(12.0, 3.4, dpi=125)
+    depth, normal, profile = (figure.add_subplot(1, 4, k) for k in (1, 2, 4))
+    picture = depth.imshow(depth_mm, extent=extent, cmap="viridis", vmin=0.0)
+    figure.colorbar(picture, ax=depth, label="mm", shrink=0.7)
+    depth.contour(x, y, inside, [0.5], colors="white", linewidths=1.5)
+    depth.set_title("depth, contact outlined")
+    normal.imshow(0.5 + 0.5 * contact.normal[cut], extent=extent)
+    normal.set_title("normals as colour")
+    for axes in (depth, normal):
+        axes.set(xlabel="x, mm", ylabel="y, mm (down)")
+    _draw_surface(figure.add_subplot(1, 4, 3, projection="3d"), depth_mm, x, y)
+    measured, touched = depth_mm[row - max(0, row - half)], inside[row - max(0, row - half)]
+    ball = np.sqrt(np.clip(contact.radius_mm**2 - x**2, 0.0, None))
+    ball += (measured - ball)[touched].mean()  # labels hold no depth
+    profile.plot(x, np.where(touched, ball, np.nan), color="#e69f00", lw=6, label="true ball")
+    profile.plot(x, measured, color="#0072b2", lw=1.8, label="measured")
+    profile.set(xlabel="x, mm", ylabel="depth, mm", title="profile at y = 0")
+    profile.legend(loc="lower center", fontsize=8, handlelength=1.2)
+    profile.grid(alpha=0.3)
+    return figure
+
+
+def _draw_surface(axes: Any, depth_mm: Any, x: Any, y: Any) -> None:
+    """Draw depth as a surface lit from the upper left."""
+    pitch = float(x[1] - x[0])
+    shades = LightSource(315, 45).shade(depth_mm, cmap=SKIN, dx=pitch, dy=pitch, blend_mode="soft")
+    axes.plot_surface(
+        *np.meshgrid(x, -y), depth_mm, facecolors=shades, rstride=1, cstride=1, linewidth=0, antialiased=False, shade=False
+    )
+    axes.set_box_aspect((np.ptp(x), np.ptp(y), EXAGGERATION * np.ptp(depth_mm)), zoom=1.25)
+    axes.view_init(elev=35, azim=-60)
+    axes.set_axis_off()
+    axes.set_title(f"surface, depth times {EXAGGERATION:g}")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=data_folder(__file__), help="folder that holds gelsight_mini_a/")
+    parser.add_argument("--out", type=Path, default=Path("docs/hero.png"))
+    arguments = parser.parse_args(argv)
+    folder = arguments.data / "gelsight_mini_a"
+    if not folder.is_dir():
+        parser.error(f"expected presses in {folder}, got no such folder: set TORCHVTS_DATA, or give --data")
+    sensor = vts.Sensor.load("gelsight_mini")
+    contact, presses = reconstruct(folder, sensor)
+    viz.save_figure(draw(contact, sensor.mm_per_pixel), arguments.out)
+    print(f"{arguments.out}: press {SHOWN}, calibrated by {presses} presses of the other ball")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,77 @@
+"""The documentation: every page and picture exists, every public name is in the reference, and it builds without a warning."""
+
+import importlib
+import pkgutil
+import re
+import subprocess
+import sys
+import zlib
+from types import ModuleType
+
+import pytest
+from documents import ROOT
+
+import torchvts as vts
+from torchvts.cli.main import COMMANDS, make_parser
+
+DOCS = ROOT / "docs"
+
+
+def rooms():
+    """Every package of torchvts, and every module that its package exports, with what is public there: (name, public names)."""
+    found = [vts, *(importlib.import_module(one.name) for one in pkgutil.walk_packages(vts.__path__, "torchvts.") if one.ispkg)]
+    found += [value for room in found for value in vars(room).values() if isinstance(value, ModuleType)]
+    named = {room.__name__: list(getattr(room, "__all__", [])) for room in found if room.__name__.startswith("torchvts")}
+    return {name: public for name, public in named.items() if public and name != "torchvts.cli"}
+
+
+def names_of(room, public):
+    """Where the reference may have each name of a room, its submodules left out: they are rooms of their own."""
+    for name in public:
+        if not isinstance(getattr(importlib.import_module(room), name), ModuleType):
+            yield {f"torchvts.{name}", f"{room}.{name}"} if name in vts.__all__ else {f"{room}.{name}"}
+
+
+def test_every_room_has_a_page_of_the_reference():
+    pages = "\n".join(path.read_text() for path in (DOCS / "api").glob("*.md"))
+    shown = set(re.findall(r"(?:automodule|currentmodule):: (\S+)", pages))
+    assert set(rooms()) <= shown
+
+
+def test_links_and_pictures_exist():
+    for path in [*DOCS.glob("*.md"), *DOCS.glob("api/*.md")]:
+        for link in re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", path.read_text()):
+            assert (path.parent / link).exists(), f"{path.name}: {link}"
+
+
+def commands(text):
+    """What a document says to type: (subcommand of torchvts, the words after it)."""
+    fenced = re.findall(r"^```(?:bash)?\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    code = "\n".join([*fenced, *re.findall(r"^ {4}(.*)$", text, re.MULTILINE), *re.findall(r"`([^`\n]+)`", text)])
+    return re.findall(r"(?:^|\$\(|-m )torchvts ([a-z]+)(.*)$", code, re.MULTILINE)
+
+
+def test_commands_of_the_documents_can_be_typed():
+    documents = [*DOCS.glob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+    found = [(path.name, *words) for path in documents for words in commands(path.read_text())]
+    assert len(found) > 20
+    for name, subcommand, rest in found:
+        assert subcommand in COMMANDS, f"{name}: torchvts {subcommand}"
+        options = make_parser(subcommand, importlib.import_module(f"torchvts.cli.{subcommand}"))._option_string_actions
+        assert set(re.findall(r"(?<!\S)--[a-z-]+", rest)) <= set(options), f"{name}: torchvts {subcommand}{rest}"
+    for path in documents:
+        for script in re.findall(r"scripts/\w+\.py", path.read_text()):
+            assert (ROOT / script).is_file(), f"{path.name}: {script}"
+
+
+@pytest.mark.long
+def test_every_public_name_is_in_the_reference(tmp_path):
+    pytest.importorskip("sphinx", reason="Sphinx is not installed: make setup installs it")
+    command = [sys.executable, "-m", "sphinx", "--fail-on-warning", "--keep-going", "--quiet", str(DOCS), str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-4000:]
+    inventory = zlib.decompress((tmp_path / "objects.inv").read_bytes().split(b"\n", 4)[4]).decode()
+    shown = {line.split()[0] for line in inventory.splitlines() if " py:" in line}
+    wanted = [places for room, public in rooms().items() for places in names_of(room, public)]
+    assert len(wanted) > 100
+    assert [places for places in wanted if not places & shown] == []

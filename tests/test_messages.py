@@ -1,0 +1,147 @@
+"""Frames as records for robots: layouts that NumPy reads back, and features that a data set of LeRobot's form accepts."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+import torchvts as vts
+from torchvts.stream import TactileFrame, TactileStream, messages
+
+PITCH = 0.25
+
+
+@pytest.fixture(scope="module")
+def frame(ring, small_sensor, small_press):
+    """A ball on a sensor, reconstructed, as a stream gives it."""
+    lights = ring()
+    scene = small_press(center_mm=(4.0, -3.0))
+    image = vts.scenes.render(scene, lights)
+    pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, small_sensor), mode="precise")
+    with torch.inference_mode():
+        return TactileFrame(7, 0.25, image[0], pipe(image))
+
+
+def cloud_of(message):
+    """The points of a message, read by nothing but its own layout."""
+    order = ">" if message.is_bigendian else "<"
+    dtype = np.dtype({
+        "names": [field.name for field in message.fields],
+        "formats": [f"{order}f4" for _ in message.fields],
+        "offsets": [field.offset for field in message.fields],
+        "itemsize": message.point_step,
+    })  # fmt: skip
+    return np.frombuffer(message.data, dtype)
+
+
+def test_the_image_message_holds_the_cameras_pixels(frame):
+    message = messages.image_message(frame, "finger", start_s=100.0)
+    assert (message.height, message.width, message.encoding, message.step) == (120, 160, "rgb8", 480)
+    assert message.header == messages.Header(100, 250_000_000, "finger")
+    pixels = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)[:, : 3 * message.width]
+    seen = torch.from_numpy(pixels.copy()).reshape(120, 160, 3).permute(2, 0, 1) / 255.0
+    assert float((seen - frame.image).abs().max()) <= 0.5 / 255.0 + 1e-6
+
+
+def test_the_depth_message_is_in_metres(frame):
+    message = messages.depth_message(frame)
+    assert (message.encoding, message.step, message.is_bigendian) == ("32FC1", 4 * 160, 0)
+    depth_m = np.frombuffer(message.data, "<f4").reshape(120, 160)
+    np.testing.assert_allclose(1000.0 * depth_m, frame.output.depth_mm[0, 0].numpy(), atol=1e-6)
+    assert 0.0009 < depth_m.max() < 0.0011
+
+
+def test_the_cloud_message_lies_on_the_ball_with_y_up(frame):
+    message = messages.cloud_message(frame, PITCH)
+    assert (message.height, message.is_dense, message.point_step) == (1, True, 24)
+    assert message.row_step == message.width * message.point_step == len(message.data)
+    assert message.width == int(frame.output.contact.sum())
+    assert {field.datatype for field in message.fields} == {messages.FLOAT32}
+    cloud = cloud_of(message)
+    points = np.stack([cloud[name] for name in "xyz"], axis=1)
+    normals = np.stack([cloud[f"normal_{name}"] for name in "xyz"], axis=1)
+    center = np.array([0.004, 0.003, -0.009])  # image y down, point y up: the ball of 10 mm, pressed in by 1 mm
+    from_center = points - center
+    distance = np.linalg.norm(from_center, axis=1)
+    assert abs(float(np.median(distance)) - 0.010) < 5e-5
+    assert float(np.median((normals * from_center).sum(1) / distance)) > 0.999
+
+
+def test_no_contact_is_an_empty_cloud(frame):
+    nothing = frame.output._replace(contact=torch.zeros_like(frame.output.contact))
+    message = messages.cloud_message(frame._replace(output=nothing), PITCH)
+    assert (message.width, message.row_step, message.data) == (0, 0, b"")
+    assert messages.lerobot_frame(frame._replace(output=nothing), PITCH)["observation.tactile.state"][0] == 0.0
+
+
+def test_messages_become_dictionaries(frame):
+    record = dataclasses.asdict(messages.cloud_message(frame, PITCH))
+    assert set(record) == {"header", "height", "width", "fields", "is_bigendian", "point_step", "row_step", "data", "is_dense"}
+    assert record["fields"][3] == {"name": "normal_x", "offset": 12, "datatype": 7, "count": 1}
+
+
+class CheckedDataset:
+    """Accepts frames as LeRobot's ``add_frame`` does: all features and a task, each array of its dtype and shape."""
+
+    def __init__(self, features):
+        self.features, self.frames, self.episodes = features, [], 0
+
+    def add_frame(self, frame):
+        arrays = {name: value for name, value in frame.items() if name != "task"}
+        assert set(arrays) == set(self.features) and isinstance(frame["task"], str)
+        for name, value in arrays.items():
+            feature = self.features[name]
+            dtype = "uint8" if feature["dtype"] in ("image", "video") else feature["dtype"]
+            assert isinstance(value, np.ndarray) and value.dtype == dtype and value.shape == feature["shape"], name
+            assert "/" not in name and len(feature["names"]) in (len(value.shape), value.size)
+        self.frames.append(arrays)
+
+    def save_episode(self):
+        self.episodes += 1
+
+
+def test_an_episode_has_the_features_of_its_data_set(frame, small_sensor):
+    dataset = CheckedDataset(messages.lerobot_features(small_sensor, "left_finger", image_dtype="image"))
+    later = frame._replace(number=8, time_s=0.5, output=frame.output._replace(depth_mm=0.5 * frame.output.depth_mm))
+    assert messages.record_episode([frame, later], PITCH, dataset, "press a ball", "left_finger") == 2
+    assert dataset.episodes == 1
+    area, deepest = dataset.frames[0]["observation.left_finger.state"]
+    assert area == pytest.approx(int(frame.output.contact.sum()) * PITCH**2)
+    assert deepest == pytest.approx(float(frame.output.depth_mm.max()))
+    np.testing.assert_array_equal(dataset.frames[1]["observation.left_finger.depth_mm"], later.output.depth_mm[0, 0].numpy())
+
+
+def test_an_episode_without_frames_is_not_saved(small_sensor):
+    dataset = CheckedDataset(messages.lerobot_features(small_sensor))
+    assert messages.record_episode([], PITCH, dataset, "nothing") == 0
+    assert dataset.episodes == 0
+
+
+def test_a_stream_of_files_becomes_an_episode(tmp_path, ring, small_sensor, small_press):
+    lights = ring()
+    still = vts.scenes.render(vts.scenes.undeformed(small_press()), lights)[0]
+    pressed = vts.scenes.render(small_press(), lights)[0]
+    for number in range(6):
+        vts.write_image(tmp_path / f"{number}.png", still if number < 4 else pressed)
+    dataset = CheckedDataset(messages.lerobot_features(small_sensor))
+    calibration = vts.Calibration.from_lights(lights, small_sensor, still)
+    with TactileStream(tmp_path, calibration, background_frames=4) as stream, torch.inference_mode():
+        assert messages.record_episode(stream, PITCH, dataset, "press a ball") == 6
+    areas = [frame["observation.tactile.state"][0] for frame in dataset.frames]
+    assert areas[:4] == [0.0] * 4 and min(areas[4:]) > 10.0
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda frame: messages.cloud_message(frame, 0.0), "mm_per_pixel: expected"),
+        (lambda frame: messages.lerobot_frame(frame, float("nan")), "mm_per_pixel: expected"),
+        (lambda frame: messages.header(frame, "finger", start_s=-1.0), "start_s: expected frame 7 at 0 s or later, got -0.75"),
+        (lambda frame: messages.header(frame, "finger", start_s=float("inf")), "start_s: expected"),
+        (lambda frame: messages.lerobot_features(vts.Sensor("rig", 8, 8, 0.1), image_dtype="png"), "image_dtype: expected"),
+    ],
+)
+def test_bad_values_are_named(frame, call, message):
+    with pytest.raises(ValueError, match=message):
+        call(frame)

@@ -80,7 +80,7 @@ class ContactMask(nn.Module):
     ) -> None:
         super().__init__()
         check_field("flat", flat)
-        check_least("far_field", far_field)
+        far_field = check_least("far_field", far_field)
         check_tensor("noise_std", noise_std)
         if tuple(noise_std.shape) not in ((3,), tuple(flat.shape)) or not bool(torch.isfinite(noise_std).all()):
             raise ValueError(f"noise_std: expected (3,) or {tuple(flat.shape)} finite values, got {tuple(noise_std.shape)}")

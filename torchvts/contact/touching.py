@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_batch, check_positive, check_same_size
+from ..core.checks import check_batch, check_mask, check_positive, check_same_size
 
 CELL_MM = 0.13
 """Side of the cells in which pressure is found, at most; finer, the noise of slopes hides it."""
@@ -81,6 +81,7 @@ class ContactFromDepth(nn.Module):
         check_batch("gradient", gradient, 2)
         height, width, cell = depth_mm.shape[2], depth_mm.shape[3], self.cell
         check_same_size("gradient", gradient, "depth_mm", height, width)
+        check_mask("deformed", deformed)
         check_same_size("deformed", deformed, "depth_mm", height, width)
         depth, inside = depth_mm.detach(), deformed.to(torch.uint8).to(depth_mm.dtype)
         fields = torch.cat((inside, depth * inside, gradient.detach() * inside), dim=1)

@@ -15,13 +15,10 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from .checks import check_field, check_path
+from .checks import MOST_PIXELS, check_field, check_path
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mov", ".mkv", ".webm")
-
-MOST_PIXELS = 2**26
-"""An image whose header gives more, 8192 x 8192, is not decoded: a file of some kilobytes can claim gigabytes."""
 
 MOST_BYTES = 2**29
 """A larger image file is not read."""
@@ -109,7 +106,8 @@ def decode_image(path: Path, flags: int) -> np.ndarray[Any, Any] | None:
     """An image file as OpenCV decodes it; None if it does not.
 
     Raises:
-        ValueError: larger than :data:`MOST_BYTES`, or its header gives more than :data:`MOST_PIXELS`.
+        ValueError: larger than :data:`MOST_BYTES`, or its header gives more than :data:`MOST_PIXELS`, as a
+            file of some kilobytes can.
     """
     size = path.stat().st_size
     if size > MOST_BYTES:

@@ -62,7 +62,7 @@ def poisson_dst(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
     """
     check_gradient(gradient, 3)
     if not torch.jit.is_scripting():
-        check_positive("mm_per_pixel", mm_per_pixel)
+        mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
     return _integrate_dst(gradient, mm_per_pixel, _plan_dst(gradient))
 
 
@@ -88,7 +88,7 @@ def poisson_dct(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
     """
     check_gradient(gradient, 2)
     if not torch.jit.is_scripting():
-        check_positive("mm_per_pixel", mm_per_pixel)
+        mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
     return _integrate_dct(gradient, mm_per_pixel, _plan_dct(gradient, gradient.shape[2], gradient.shape[3]), 0, 0, False)
 
 
@@ -112,7 +112,7 @@ def poisson_background(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
     """
     check_gradient(gradient, 2)
     if not torch.jit.is_scripting():
-        check_positive("mm_per_pixel", mm_per_pixel)
+        mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
     return _integrate_dct(gradient, mm_per_pixel, _plan_dct(gradient, gradient.shape[2], gradient.shape[3]), 0, 0, True)
 
 
@@ -236,7 +236,7 @@ def solve_laplace(right: Tensor, plan: list[Tensor]) -> Tensor:
 def _kept(plan: list[Tensor]) -> list[Tensor]:
     """A plan that later calls, which may record gradients, can use: tensors made under inference mode refuse that."""
     if not torch.jit.is_scripting():  # noqa: SIM102
-        if torch.is_inference_mode_enabled():
+        if not torch.compiler.is_compiling() and torch.is_inference_mode_enabled():
             with torch.inference_mode(False):
                 return [table.clone() for table in plan]
     return plan

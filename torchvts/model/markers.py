@@ -163,7 +163,7 @@ class FillMarkers(nn.Module):
             least_markers: fewer are taken for dust, and nothing is filled.
             margin: as for :func:`find_markers`.
         """
-        check_positive("margin", margin, 2.0)
+        margin = check_positive("margin", margin, 2.0)
         diameter_px, found = marker_diameter_px(background, contrast, least_markers)
         return cls(diameter_px, max(contrast, found / 5.0), margin=margin)
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from ..core.checks import (
     brief,
     check_batch,
-    check_integer,
+    check_image_size,
     check_least,
     check_numbers,
     check_path,
@@ -74,8 +74,9 @@ class Sensor:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip():
             raise TypeError(f"name: expected a text, got {brief(self.name)}")
-        self._set("height", check_integer("height", self.height, 8))
-        self._set("width", check_integer("width", self.width, 8))
+        height, width = check_image_size("height", self.height, "width", self.width, 8)
+        self._set("height", height)
+        self._set("width", width)
         self._set("mm_per_pixel", check_positive("mm_per_pixel", self.mm_per_pixel, 10.0))
         if self.gamma is not None:
             self._set("gamma", check_positive("gamma", self.gamma, 10.0))
@@ -148,7 +149,7 @@ class Sensor:
             >>> Sensor(name="rig", height=480, width=640, mm_per_pixel=0.0625).resized(240, 320).mm_per_pixel
             0.125
         """
-        check_integer("height", height, 8), check_integer("width", width, 8)
+        height, width = check_image_size("height", height, "width", width, 8)
         scale_y, scale_x = height / self.height, width / self.width
         if abs(scale_x / scale_y - 1.0) > 0.01:
             raise ValueError(

@@ -43,7 +43,7 @@ def register_depth(source: DepthFrame, target: DepthFrame, mm_per_pixel: float, 
         >>> reg.converged, round(math.degrees(math.acos(float(reg.T_target_source[0, 0]))), 1)
         (True, 30.0)
     """
-    check_positive("mm_per_pixel", mm_per_pixel)
+    mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
     a, b = levels(source, mm_per_pixel, "source"), levels(target, mm_per_pixel, "target")
     sizes = [tuple(frame.depth_mm.shape[-2:]) for frame in (source, target)]
     if sizes[0] != sizes[1]:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from ..core.checks import check_integer, check_least, check_range
+from ..core.checks import check_float_tensor, check_integer, check_least, check_range, check_switch, check_tensor
 from ..normals import NormalFromMLP
 from ..normals.mlp import MAX_GRADIENT, check_flat_shape
 
@@ -103,6 +103,7 @@ def fit_mlp(
         Wang, She, Romero, Adelson, ICRA 2021, for network and inputs; Loshchilov, Hutter, ICLR 2019, for AdamW.
     """
     _check_samples(intensity, xy, slope, groups)
+    check_switch("progress", progress)
     for name, value in (("max_epochs", max_epochs), ("patience", patience), ("batch_size", batch_size)):
         check_integer(name, value, 1)
     check_least("weight_decay", weight_decay), check_least("held_out", held_out, 0.0, 1.0)
@@ -222,9 +223,12 @@ def _check_samples(intensity: Tensor, xy: Tensor, slope: Tensor, groups: Tensor)
         if not isinstance(values, Tensor) or tuple(values.shape) != shape:
             got = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
             raise ValueError(f"{name}: expected {shape}, one row for each of the {count} pixels of intensity, got {got}")
-    if not intensity.is_floating_point() or not slope.is_floating_point():
-        name, values = ("slope", slope) if intensity.is_floating_point() else ("intensity", intensity)
-        raise TypeError(f"{name}: expected floating point, got {values.dtype}: images are value / 255")
+    for name, values in (("intensity", intensity), ("slope", slope)):
+        check_float_tensor(name, values)
+    for name, values in (("xy", xy), ("groups", groups)):
+        check_tensor(name, values)
+    if groups.is_floating_point() or groups.is_complex() or xy.is_complex():
+        raise TypeError(f"groups: expected integers, the press of each pixel, got {groups.dtype}; xy: pixels, got {xy.dtype}")
     check_range("intensity", intensity)
     if not bool(torch.isfinite(xy).all()):
         raise ValueError("xy: expected finite pixels, got NaN or infinite")

@@ -48,6 +48,7 @@ def test_trained_lights_count_without_gradients(mode: str, without_gradients: ty
 
 
 @pytest.mark.long
+@pytest.mark.filterwarnings("ignore:Torchinductor does not support code generation for complex")
 @pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
 def test_compiles_with_inductor(mode: str) -> None:
     pipe, image = vts.DepthPipeline.from_calibration(rig(), mode), press()

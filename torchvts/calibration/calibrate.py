@@ -90,9 +90,9 @@ def calibrate(
     given = _Given(background, sensor, check_presses(presses, sensor), check_touches(touches, sensor), progress)
     check_colour(background)
     check_coloured_contacts(background, given.presses or given.touches)
-    if not (presses or touches or sensor.prior or sensor.light_position_mm) and objection_to_lights(background, sensor):
+    if not (len(presses) or len(touches) or sensor.prior or sensor.light_position_mm) and objection_to_lights(background, sensor):
         check_coloured_background(background)
-    lights = by_lights(background, sensor, bool(presses or touches or sensor.prior), progress)
+    lights = by_lights(background, sensor, bool(len(presses) or len(touches) or sensor.prior), progress)
     prior, messages = _prior(given)
     touched, more = _touched(given, prior.model)
     messages += more

@@ -82,6 +82,11 @@ class ContactFromDepth(nn.Module):
         height, width, cell = depth_mm.shape[2], depth_mm.shape[3], self.cell
         check_same_size("gradient", gradient, "depth_mm", height, width)
         check_mask("deformed", deformed)
+        count = depth_mm.shape[0]
+        if deformed.dim() != 4 or deformed.shape[1] != 1 or deformed.shape[0] != count or gradient.shape[0] != count:
+            raise ValueError(
+                f"gradient, deformed: expected {count} frames like depth_mm, got {list(gradient.shape)} and {list(deformed.shape)}"
+            )
         check_same_size("deformed", deformed, "depth_mm", height, width)
         depth, inside = depth_mm.detach(), deformed.to(torch.uint8).to(depth_mm.dtype)
         fields = torch.cat((inside, depth * inside, gradient.detach() * inside), dim=1)

@@ -24,8 +24,8 @@ MOST_PIXELS = 2**26
 MOST_COUNT = 2**31 - 1
 """No count of anything here is larger; larger integers are refused before they reach an operator, which overflows."""
 
-MOST_NUMBER = float(torch.finfo(torch.float32).max)
-"""A number beyond this is infinite in float32."""
+LEAST_NUMBER, MOST_NUMBER = float(torch.finfo(torch.float32).tiny), float(torch.finfo(torch.float32).max)
+"""A smaller number is zero in float32, a larger one infinite."""
 
 QUANTISATION_STD = 1.0 / 255.0 / math.sqrt(12.0)
 """Standard deviation of rounding to 8 bits, the least noise of a camera image."""
@@ -311,11 +311,14 @@ def check_camera_height(value: object) -> float:
 
 
 def _float(value: numbers.Real) -> float:
+    """The number as a float; infinite or zero where float32 is, and where operators cannot take the integer."""
     try:
         number = float(value)
     except OverflowError:  # an integer of hundreds of digits
         return math.inf
-    return number if abs(number) <= MOST_NUMBER else math.copysign(math.inf, number)
+    if abs(number) > MOST_NUMBER or (isinstance(value, numbers.Integral) and abs(number) >= 2.0**63):
+        return math.copysign(math.inf, number)
+    return 0.0 if abs(number) < LEAST_NUMBER else number  # NaN stays NaN
 
 
 def check_least(name: str, value: object, least: float = 0.0, most: float = math.inf) -> float:

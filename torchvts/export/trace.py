@@ -58,6 +58,8 @@ class PoissonBackgroundByMatrix(Integrator):
 
     def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
         check_batch("gradient", gradient, 2)
+        if gradient.dtype != self.get_buffer("even_y").dtype:
+            raise TypeError(f"gradient: expected {self.get_buffer('even_y').dtype} like the matrices, got {gradient.dtype}")
         if size is not None and size != self.size:
             raise ValueError(f"gradient, window: expected size {self.size}, for which the matrices are, got {size}")
         gradient = embedded(gradient, window, self.size)

@@ -82,9 +82,7 @@ class Sensor:
             self._set("gamma", check_positive("gamma", self.gamma, 10.0))
         if self.gamma is not None and self.gamma < 0.1:
             raise ValueError(f"gamma: expected a number in [0.1, 10], got {self.gamma}: value = light^(1/gamma), 2.2 for sRGB-like")
-        if self.blur_px != 0:
-            check_positive("blur_px", self.blur_px, 0.25 * min(self.height, self.width))
-        self._set("blur_px", float(self.blur_px))
+        self._set("blur_px", check_least("blur_px", self.blur_px, 0.0, 0.25 * min(self.height, self.width)))
         if self.light_position_mm is not None:
             numbers = check_numbers("light_position_mm", self.light_position_mm, (3, 3))
             if min(numbers[2::3]) <= 0:

@@ -49,6 +49,10 @@ class NormalFromLookup(NormalModel):
         check_field("flat", flat)
         for name, value in (("table", table), ("step", step), ("zero_index", zero_index)):
             check_tensor(name, value)
+            if value.is_complex() or value.dtype == torch.bool:
+                raise TypeError(f"{name}: expected numbers, got {value.dtype}")
+        check_float_tensor("table", table)
+        check_float_tensor("step", step)
         if table.dim() != 4 or tuple(table.shape) != (table.shape[0],) * 3 + (2,) or table.shape[0] < 3:
             raise ValueError(f"table: expected (n, n, n, 2) with n of 3 or more, got {tuple(table.shape)}")
         if tuple(step.shape) != (3,) or not bool((step > 0).all()) or not bool(torch.isfinite(step).all()):

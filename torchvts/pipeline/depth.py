@@ -185,7 +185,7 @@ class DepthPipeline(nn.Module):
             ContactMask.from_calibration(calibration, settings),
             normals,
             GradientFromNormal(),
-            integrate or PoissonBackground(sensor.mm_per_pixel),
+            PoissonBackground(sensor.mm_per_pixel) if integrate is None else integrate,
         )
         touching = ContactFromDepth(sensor.mm_per_pixel, settings.share)
         return cls(*modules, mm_per_pixel=sensor.mm_per_pixel, mode=mode, contact=touching).eval()

@@ -148,6 +148,9 @@ def press(
     u, v = (t.clone().requires_grad_() for t in at)
     with torch.enable_grad():
         relief = height_mm(u, v)
+        if not isinstance(relief, Tensor) or relief.shape != u.shape or not relief.requires_grad:
+            got = tuple(relief.shape) if isinstance(relief, Tensor) else type(relief).__name__
+            raise ValueError(f"height_mm: expected a function that gives {tuple(u.shape)} computed from u and v, got {got}")
         slope = torch.autograd.grad(relief.sum(), (u, v))
     relief = relief.detach()
     z = rotation[2, 0] * at[0] + rotation[2, 1] * at[1] + rotation[2, 2] * relief + shift[2]

@@ -220,17 +220,19 @@ def _check_samples(intensity: Tensor, xy: Tensor, slope: Tensor, groups: Tensor)
         got = tuple(intensity.shape) if isinstance(intensity, Tensor) else type(intensity).__name__
         raise ValueError(f"intensity: expected (N, 3), R, G, B of each pixel, got {got}")
     for name, values, shape in (("xy", xy, (count, 2)), ("slope", slope, (count, 2)), ("groups", groups, (count,))):
-        if not isinstance(values, Tensor) or tuple(values.shape) != shape:
-            got = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
-            raise ValueError(f"{name}: expected {shape}, one row for each of the {count} pixels of intensity, got {got}")
+        if not isinstance(values, Tensor) or values.is_nested or tuple(values.shape) != shape:
+            shown = str(tuple(values.shape)) if isinstance(values, Tensor) and not values.is_nested else type(values).__name__
+            raise ValueError(f"{name}: expected {shape}, one row for each of the {count} pixels of intensity, got {shown}")
     for name, values in (("intensity", intensity), ("slope", slope)):
         check_float_tensor(name, values)
-    for name, values in (("xy", xy), ("groups", groups)):
-        check_tensor(name, values)
-    if groups.is_floating_point() or groups.is_complex() or xy.is_complex():
-        raise TypeError(f"groups: expected integers, the press of each pixel, got {groups.dtype}; xy: pixels, got {xy.dtype}")
+    check_tensor("xy", xy)
+    check_tensor("groups", groups)
+    if xy.is_complex():
+        raise TypeError(f"xy: expected columns and rows, got {xy.dtype}")
+    if groups.dtype not in (torch.int64, torch.int32):
+        raise TypeError(f"groups: expected int64, the press of each pixel, got {groups.dtype}")
     check_range("intensity", intensity)
-    if not bool(torch.isfinite(xy).all()):
+    if not bool(torch.isfinite(xy.double()).all()):
         raise ValueError("xy: expected finite pixels, got NaN or infinite")
     steepest = float(slope.abs().max())
     if not steepest <= MAX_GRADIENT:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from ..core.blur import MOST_BLUR_PX, blur, gaussian_weights
-from ..core.checks import check_batch, check_field, check_positive, check_record, check_same_size, check_switch
+from ..core.checks import check_batch, check_field, check_least, check_positive, check_record, check_same_size, check_switch
 from ..model import Calibration, FillMarkers, check_calibration
 from .defects import FillDefects
 from .drift import Drift
@@ -189,7 +189,7 @@ class Blur(nn.Module):
 
     def __init__(self, std_px: float = 0.0) -> None:
         super().__init__()
-        self.std_px = 0.0 if isinstance(std_px, int | float) and std_px == 0 else check_positive("blur_px", std_px, MOST_BLUR_PX)
+        self.std_px = check_least("blur_px", std_px, 0.0, MOST_BLUR_PX)
         self.weights = gaussian_weights(self.std_px)
 
     def forward(self, image: Tensor) -> Tensor:

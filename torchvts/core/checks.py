@@ -76,9 +76,10 @@ def check_float_tensor(name: str, value: object) -> None:
     """Raise unless ``value`` is a dense tensor of float32 or float64."""
     check_tensor(name, value)
     assert isinstance(value, Tensor)
+    if not value.is_floating_point():
+        raise TypeError(f"{name}: expected floating point, got {value.dtype}: use .float()")
     if value.dtype not in (torch.float32, torch.float64):
-        cause = "too few bits for depth; use .float()" if value.is_floating_point() else "use .float()"
-        raise TypeError(f"{name}: expected float32 or float64, got {value.dtype}: {cause}")
+        raise TypeError(f"{name}: expected float32 or float64, got {value.dtype}: too few bits for depth; use .float()")
 
 
 def check_mask(name: str, value: Tensor) -> None:

@@ -236,7 +236,7 @@ def solve_laplace(right: Tensor, plan: list[Tensor]) -> Tensor:
 def _kept(plan: list[Tensor]) -> list[Tensor]:
     """A plan that later calls, which may record gradients, can use: tensors made under inference mode refuse that."""
     if not torch.jit.is_scripting():  # noqa: SIM102
-        if not torch.compiler.is_compiling() and torch.is_inference_mode_enabled():
+        if not torch.compiler.is_compiling() and torch.is_inference_mode_enabled():  # which torch.compile cannot ask
             with torch.inference_mode(False):
                 return [table.clone() for table in plan]
     return plan

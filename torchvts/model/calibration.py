@@ -29,7 +29,7 @@ from .report import Report, read_report
 from .response_field import ResponseModel
 from .sensor import Sensor, check_sensor
 
-FORMAT_VERSION = 6
+FORMAT_VERSION = 7
 """Version of the calibration file. A file of another version is refused."""
 
 DEFECT_RATIO = 4.0

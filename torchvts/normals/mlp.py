@@ -14,7 +14,6 @@ from ..core.checks import (
     check_batch,
     check_choice,
     check_field,
-    check_float_tensor,
     check_image_size,
     check_integer,
     check_least,
@@ -22,6 +21,7 @@ from ..core.checks import (
     check_range,
     check_same_size,
     check_seed,
+    check_tensor,
 )
 from ..core.files import load_tensors, save_tensors
 from ..core.geometry import normal_from_gradient
@@ -152,7 +152,7 @@ class NormalFromMLP(NormalModel):
     def check_flat(self, flat: Tensor) -> None:
         """Raise unless ``flat`` is one finite (3, height, width) image in [0, 1]."""
         if isinstance(flat, Tensor):
-            check_float_tensor("flat", flat)
+            check_tensor("flat", flat)
         if not isinstance(flat, Tensor) or tuple(flat.shape) != (3, self.height, self.width):
             got = tuple(flat.shape) if isinstance(flat, Tensor) else type(flat).__name__
             raise ValueError(

@@ -81,6 +81,7 @@ class NormalFromIntensity(NormalModel):
         self.lights = PointLights(lights.position_mm.detach(), lights.albedo.detach(), lights.gloss).requires_grad_(False)
         if inverse is None:
             inverse = self._inverse_of_lights(height, width)
+        check_float_tensor("inverse", inverse)
         check_shape("inverse", inverse, (3, 3, height, width))
         noise = torch.full((3,), QUANTISATION_STD) if noise_std is None else noise_std
         check_float_tensor("noise_std", noise)

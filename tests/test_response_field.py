@@ -14,7 +14,7 @@ import yaml
 
 import torchvts as vts
 from torchvts.core.blur import blur, gaussian_weights
-from torchvts.core.files import load_tensors
+from torchvts.core.files import checksum, load_tensors
 from torchvts.core.geometry import gradient_from_normal, gradient_of_depth
 from torchvts.model.response_field import (
     MAX_SLOPE,
@@ -446,11 +446,12 @@ def test_a_loaded_response_gives_the_same_depth(saved, mode):
 
 
 def rewritten(path, change_tensors=None, change_metadata=None):
-    """The same file with something changed, written by safetensors itself."""
+    """The same file with something changed, and a checksum that fits."""
     tensors, metadata = load_tensors(path)
     (change_tensors or (lambda t: None))(tensors)
     (change_metadata or (lambda m: None))(metadata)
-    safetensors.torch.save_file(tensors, str(path), {"torchvts": json.dumps(metadata)})
+    described = {**metadata, "checksum": checksum(tensors, metadata)}
+    safetensors.torch.save_file(tensors, str(path), {"torchvts": json.dumps(described)})
 
 
 def png(shape, dtype=np.uint8, suffix=".png"):
@@ -691,5 +692,5 @@ def test_the_blur_keeps_a_constant_and_the_sum_of_a_point(std_px):
 def test_no_blur_leaves_the_image():
     image = torch.rand(1, 3, 9, 9)
     assert torch.equal(vts.Compensate(blur_px=0)(image), image)
-    with pytest.raises(ValueError, match="blur_px: expected a number above 0 and finite, got -1"):
+    with pytest.raises(ValueError, match=r"blur_px: expected a number in \[0, 1000\], got -1"):
         vts.Compensate(blur_px=-1)

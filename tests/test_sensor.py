@@ -43,7 +43,7 @@ def as_text(**changes):
         (as_text(mm_per_pixel="0.1 mm"), "key mm_per_pixel: expected a number, got str"),
         (as_text(gamma=0.01), r"key gamma: expected a number in \[0.1, 10\], got 0.01"),
         (as_text(blur_px=-1), "key blur_px: expected a number in"),
-        (as_text(blur_px=100), r"key blur_px: expected a number in \(0, 6\], got 100"),
+        (as_text(blur_px=100), r"key blur_px: expected a number in \[0, 6\], got 100"),
         (as_text(name=7), "key name: expected a text, got 7"),
         (as_text(name="' '"), "key name: expected a text, got ' '"),
         (as_text(light_position_mm="[[1, 2, 3]]"), r"key light_position_mm: expected 3 x 3 numbers, got shape \(1, 3\)"),

@@ -11,6 +11,7 @@ from ..compensate.drift import grid_stride
 from ..core import frame as frames
 from ..core import geometry
 from ..core.checks import check_same_size
+from ..core.checks import check_batch
 from ..core.noise import second_differences, std_from_median
 from ..integration import background
 from ..normals.shadowed import PRIOR_STD, STEPS, LightView
@@ -194,7 +195,8 @@ class GradientFromNormal(Twin, geometry.GradientFromNormal):
     plain = geometry.GradientFromNormal
 
     def forward(self, normal: Tensor) -> Tensor:
-        if not (isinstance(normal, Tensor) and normal.dim() == 4 and normal.shape[1] == 3 and usable(normal)):
+        check_batch("normal", normal, 3)
+        if not usable(normal):
             return super().forward(normal)
         return kernels.slopes(normal, self.max_slope)
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from ..core.checks import check_image, check_sequence
+from ..core.checks import check_image, check_sequence, check_switch
 from ..model.calibration import Calibration
 from ..model.report import CandidateRow, Report
 from ..model.response_field import ResponseModel, SensorPrior, fit_log_background
@@ -86,12 +86,13 @@ def calibrate(
     check_sensor("sensor", sensor)
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     check_exposure(background)
+    check_switch("progress", progress)
     given = _Given(background, sensor, check_presses(presses, sensor), check_touches(touches, sensor), progress)
     check_colour(background)
     check_coloured_contacts(background, given.presses or given.touches)
-    if not (presses or touches or sensor.prior or sensor.light_position_mm) and objection_to_lights(background, sensor):
+    if not (len(presses) or len(touches) or sensor.prior or sensor.light_position_mm) and objection_to_lights(background, sensor):
         check_coloured_background(background)
-    lights = by_lights(background, sensor, bool(presses or touches or sensor.prior), progress)
+    lights = by_lights(background, sensor, bool(len(presses) or len(touches) or sensor.prior), progress)
     prior, messages = _prior(given)
     touched, more = _touched(given, prior.model)
     messages += more

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from ..core.checks import check_image, check_integer, check_record
+from ..core.checks import check_image, check_integer, check_record, check_switch
 from ..core.robust import TUKEY, tukey_weight
 from ..model.lights import PointLights
 from ..model.sensor import Sensor, check_sensor
@@ -150,8 +150,9 @@ def fit_lights(
         check_record("start", start, PointLights, "PointLights(position_mm, albedo) makes them")
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     check_integer("max_steps", max_steps, 1)
-    if not isinstance(vignetting, bool):
-        raise TypeError(f"vignetting: expected true or false, got {vignetting!r}")
+    switches = {"progress": progress, "vignetting": vignetting, "ambient": ambient, "known_azimuth": known_azimuth, "gloss": gloss}
+    for name, switch in switches.items():
+        check_switch(name, switch)
     check_exposure(background)
     if known_azimuth and sensor.light_azimuth_deg is None:
         raise ValueError(f"known_azimuth: sensor '{sensor.name}' names no light_azimuth_deg: add it to the sensor file")

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from ..core.blur import blur, gaussian_weights
-from ..core.checks import check_batch, check_field, check_positive, check_record, check_same_size
+from ..core.blur import MOST_BLUR_PX, blur, gaussian_weights
+from ..core.checks import check_batch, check_field, check_least, check_positive, check_record, check_same_size, check_switch
 from ..model import Calibration, FillMarkers, check_calibration
 from .defects import FillDefects
 from .drift import Drift
@@ -76,6 +76,7 @@ class Compensate(nn.Module):
             drift: divide out the drift of the LEDs. With response fields up to 15 % always is.
         """
         check_calibration("calibration", calibration)
+        check_switch("drift", drift)
         sensor = calibration.sensor
         by_response = calibration.response is not None
         block: Drift | None = None
@@ -193,7 +194,7 @@ class Blur(nn.Module):
 
     def __init__(self, std_px: float = 0.0) -> None:
         super().__init__()
-        self.std_px = float(std_px) if std_px == 0 else check_positive("blur_px", std_px)
+        self.std_px = check_least("blur_px", std_px, 0.0, MOST_BLUR_PX)
         self.weights = gaussian_weights(self.std_px)
 
     def forward(self, image: Tensor) -> Tensor:

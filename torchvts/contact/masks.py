@@ -13,11 +13,11 @@ from ..core.checks import (
     QUANTISATION_STD,
     check_batch,
     check_field,
+    check_float_tensor,
     check_least,
     check_positive,
     check_record,
     check_same_size,
-    check_tensor,
     may_read_values,
 )
 from ..core.noise import clipped_std, sample_stride
@@ -82,8 +82,8 @@ class ContactMask(nn.Module):
         check_field("flat", flat)
         if flat.shape[2] < 3:
             raise ValueError(f"flat: expected at least 3 columns, for the noise of a frame, got {flat.shape[2]}")
-        check_least("far_field", far_field)
-        check_tensor("noise_std", noise_std)
+        far_field = check_least("far_field", far_field)
+        check_float_tensor("noise_std", noise_std)
         if tuple(noise_std.shape) not in ((3,), tuple(flat.shape)) or not bool(torch.isfinite(noise_std).all()):
             raise ValueError(f"noise_std: expected (3,) or {tuple(flat.shape)} finite values, got {tuple(noise_std.shape)}")
         self.sigmas = check_positive("sigmas", sigmas)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_batch, check_positive, check_same_size
+from ..core.checks import check_batch, check_mask, check_positive, check_same_size
 
 CELL_MM = 0.13
 """Side of the cells in which pressure is found, at most; finer, the noise of slopes hides it."""
@@ -81,6 +81,12 @@ class ContactFromDepth(nn.Module):
         check_batch("gradient", gradient, 2)
         height, width = depth_mm.shape[2], depth_mm.shape[3]
         check_same_size("gradient", gradient, "depth_mm", height, width)
+        check_mask("deformed", deformed)
+        count = depth_mm.shape[0]
+        if deformed.dim() != 4 or deformed.shape[1] != 1 or deformed.shape[0] != count or gradient.shape[0] != count:
+            raise ValueError(
+                f"gradient, deformed: expected {count} frames like depth_mm, got {list(gradient.shape)} and {list(deformed.shape)}"
+            )
         check_same_size("deformed", deformed, "depth_mm", height, width)
         return self.find(depth_mm.detach(), gradient.detach(), deformed)
 

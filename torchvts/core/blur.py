@@ -4,12 +4,16 @@ import math
 
 from torch import Tensor, nn
 
+MOST_BLUR_PX = 1000.0
+"""A wider Gaussian than this is none that an image needs, and takes minutes."""
+
 
 def gaussian_weights(std_px: float) -> list[float]:
     """Weights of a Gaussian at whole pixels up to three standard deviations, summing to one: 2 * ceil(3 std) + 1 of them."""
     reach = math.ceil(3.0 * std_px)
     weights = [math.exp(-0.5 * (place / max(std_px, 1e-6)) ** 2) for place in range(-reach, reach + 1)]
-    return [weight / sum(weights) for weight in weights]
+    total = sum(weights)
+    return [weight / total for weight in weights]
 
 
 def blur(image: Tensor, weights: list[float]) -> Tensor:

@@ -20,6 +20,15 @@ from .spelling import suggest
 
 _Record = TypeVar("_Record")
 
+MOST_PIXELS = 2**26
+"""An image of more pixels, 8192 x 8192, is neither read nor made."""
+
+MOST_COUNT = 2**31 - 1
+"""No count of anything here is larger; larger integers are refused before they reach an operator, which overflows."""
+
+LEAST_NUMBER, MOST_NUMBER = float(torch.finfo(torch.float32).tiny), float(torch.finfo(torch.float32).max)
+"""A smaller number is zero in float32, a larger one infinite."""
+
 QUANTISATION_STD = 1.0 / 255.0 / math.sqrt(12.0)
 """Standard deviation of rounding to 8 bits, the least noise of a camera image."""
 
@@ -35,6 +44,8 @@ def check_tensor(name: str, value: object) -> None:
         TypeError: depth_mm: expected a torch.Tensor, got ndarray: torch.from_numpy(array) makes one
     """
     if isinstance(value, Tensor):
+        if value.layout != torch.strided or value.is_nested or value.is_quantized or value.device.type == "meta":
+            raise TypeError(f"{name}: expected a dense tensor, got {_what_it_is(value)}")
         return
     cause = "torch.tensor(...) makes one"
     if isinstance(value, str | os.PathLike):
@@ -50,6 +61,53 @@ def check_tensor(name: str, value: object) -> None:
                 "torchvts.read_image reads a file"
             )
     raise TypeError(f"{name}: expected a torch.Tensor, got {type(value).__name__}: {cause}")
+
+
+def _what_it_is(tensor: Tensor) -> str:
+    """Why a tensor holds no plain values, and what to do."""
+    if tensor.device.type == "meta":
+        return "one on the device meta, which has no values: move it to a CPU or a GPU"
+    if tensor.is_nested:
+        return "a nested one: stack images of one size"
+    if tensor.is_quantized:
+        return f"a quantised one, {tensor.dtype}: use .dequantize()"
+    return f"one of layout {tensor.layout}: use .to_dense()"
+
+
+def check_float_tensor(name: str, value: object) -> None:
+    """Raise unless ``value`` is a dense tensor of float32 or float64."""
+    check_tensor(name, value)
+    assert isinstance(value, Tensor)
+    if not value.is_floating_point():
+        raise TypeError(f"{name}: expected floating point, got {value.dtype}: use .float()")
+    if value.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"{name}: expected float32 or float64, got {value.dtype}: too few bits for depth; use .float()")
+
+
+def check_mask(name: str, value: Tensor) -> None:
+    """Raise unless ``value`` is a dense tensor of bool. Scripts."""
+    if not torch.jit.is_scripting():
+        check_tensor(name, value)
+    if value.dtype != torch.bool:
+        raise TypeError(f"{name}: expected a tensor of bool, got {value.dtype}: compare it, mask > 0")
+
+
+def check_dtype(name: str, value: object) -> None:
+    """Raise unless ``value`` is float32 or float64."""
+    if value not in (torch.float32, torch.float64) or not isinstance(value, torch.dtype):
+        raise TypeError(f"{name}: expected torch.float32 or torch.float64, got {brief(value)}: too few bits for depth")
+
+
+def check_switch(name: str, value: object) -> bool:
+    """Return ``value``, or raise unless it is True or False."""
+    if not isinstance(value, bool):
+        raise TypeError(f"{name}: expected True or False, got {type(value).__name__}")
+    return value
+
+
+def check_seed(name: str, value: object) -> int:
+    """Return ``value`` as an int, or raise if it is no integer from 0 to 2**63 - 1."""
+    return check_integer(name, value, 0, 2**63 - 1)
 
 
 def check_record(name: str, value: object, kind: type, cause: str = "") -> None:
@@ -69,10 +127,19 @@ def check_path(name: str, value: object) -> Path:
 
 
 def check_size(height: object, width: object, mm_per_pixel: object, least: int = 1) -> None:
-    """Raise unless height and width are at least ``least`` pixels, and the pitch is a positive number of mm."""
-    check_integer("height", height, least)
-    check_integer("width", width, least)
-    check_positive("mm_per_pixel", mm_per_pixel)
+    """Raise unless height and width are those of an image of at least ``least`` pixels each way, and the pitch is above 0."""
+    check_image_size("height", height, "width", width, least)
+    mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
+
+
+def check_image_size(height_name: str, height: object, width_name: str, width: object, least: int = 1) -> tuple[int, int]:
+    """Return height and width as ints, or raise if they are no integers of at least ``least``, or no image holds so many pixels."""
+    size = check_integer(height_name, height, least, MOST_PIXELS), check_integer(width_name, width, least, MOST_PIXELS)
+    if size[0] * size[1] > MOST_PIXELS:
+        raise ValueError(
+            f"{height_name}, {width_name}: expected at most {MOST_PIXELS} pixels, got {size[0]} x {size[1]}: in pixels, not in mm"
+        )
+    return size
 
 
 def check_sequence(name: str, value: object, items: str) -> None:
@@ -112,7 +179,7 @@ def check_batch(name: str, tensor: Tensor, channels: int) -> None:
         raise ValueError(f"{name}: expected images of at least one pixel, got {list(tensor.shape)}: was the file empty?")
     if not tensor.is_floating_point():
         raise TypeError(f"{name}: expected a floating-point tensor, got {tensor.dtype}: images are value / 255 in [0, 1]")
-    if tensor.dtype == torch.float16 or tensor.dtype == torch.bfloat16:
+    if tensor.dtype != torch.float32 and tensor.dtype != torch.float64:
         raise TypeError(f"{name}: expected float32 or float64, got {tensor.dtype}: too few bits for depth; use .float()")
 
 
@@ -152,6 +219,10 @@ def reads_freely(tensor: Tensor) -> bool:
 
 def check_window(name: str, tensor: Tensor, size: tuple[int, int], window: tuple[int, int] | None) -> tuple[int, int]:
     """Return (top, left) of ``tensor`` in an image of ``size``; without a window it must be the whole image. Scripts."""
+    if not torch.jit.is_scripting():
+        for part, pair in (("size", size), ("window", (0, 0) if window is None else window)):
+            if not isinstance(pair, tuple | list) or len(pair) != 2 or any(isinstance(v, Tensor | float | str) for v in pair):
+                raise TypeError(f"{name}, {part}: expected two integers, got {brief(pair)}")
     if window is None:
         check_same_size(name, tensor, "the calibration", size[0], size[1])
         return 0, 0
@@ -173,9 +244,14 @@ def check_image(name: str, image: Tensor, height: int, width: int, sensor_name: 
         if len(shape) == 3 and shape[0] == 3 and shape[2] != 3:
             cause = f"resize it, or load the sensor with height={shape[1]}, width={shape[2]}"
         raise ValueError(f"{name}: expected (3, {height}, {width}) for sensor '{sensor_name}', got {shape}: {cause}")
+    _check_float_image(name, image)
+    check_range(name, image)
+
+
+def _check_float_image(name: str, image: Tensor) -> None:
     if not image.is_floating_point():
         raise TypeError(f"{name}: expected a floating-point image, got {image.dtype}: divide by 255")
-    check_range(name, image)
+    check_float_tensor(name, image)
 
 
 def _cause_of_shape(image: Tensor) -> str:
@@ -193,8 +269,7 @@ def check_field(name: str, value: object) -> None:
     assert isinstance(value, Tensor)
     if value.dim() != 3 or value.shape[0] != 3 or value.numel() == 0:
         raise ValueError(f"{name}: expected (3, H, W), got {tuple(value.shape)}: {_cause_of_shape(value)}")
-    if not value.is_floating_point():
-        raise TypeError(f"{name}: expected a floating-point image, got {value.dtype}: divide by 255")
+    _check_float_image(name, value)
     if not bool(torch.isfinite(value).all()):
         raise ValueError(f"{name}: expected finite values, got NaN or infinite: a camera or an upstream division failed")
 
@@ -227,7 +302,7 @@ def check_positive(name: str, value: object, most: float = math.inf) -> float:
     number = _float(value)
     if not math.isfinite(number) or number <= 0 or number > most:
         bound = f"in (0, {most:g}]" if math.isfinite(most) else "above 0 and finite"
-        raise ValueError(f"{name}: expected a number {bound}, got {value}")
+        raise ValueError(f"{name}: expected a number {bound}, got {brief(value)}")
     return number
 
 
@@ -239,10 +314,14 @@ def check_camera_height(value: object) -> float:
 
 
 def _float(value: numbers.Real) -> float:
+    """The number as a float; infinite or zero where float32 is, and where operators cannot take the integer."""
     try:
-        return float(value)
+        number = float(value)
     except OverflowError:  # an integer of hundreds of digits
         return math.inf
+    if abs(number) > MOST_NUMBER or (isinstance(value, numbers.Integral) and abs(number) >= 2.0**63):
+        return math.copysign(math.inf, number)
+    return 0.0 if abs(number) < LEAST_NUMBER else number  # NaN stays NaN
 
 
 def check_least(name: str, value: object, least: float = 0.0, most: float = math.inf) -> float:
@@ -254,22 +333,27 @@ def check_least(name: str, value: object, least: float = 0.0, most: float = math
         bound = f"of at least {least:g}" if math.isfinite(least) else "that is finite"
         if math.isfinite(most):
             bound = f"in [{least:g}, {most:g}]"
-        raise ValueError(f"{name}: expected a number {bound}, got {value}")
+        raise ValueError(f"{name}: expected a number {bound}, got {brief(value)}")
     return number
 
 
-def check_integer(name: str, value: object, least: int) -> int:
-    """Return ``value`` as an int, or raise if it is no integer of at least ``least``."""
+def check_integer(name: str, value: object, least: int, most: int = MOST_COUNT) -> int:
+    """Return ``value`` as an int, or raise if it is no integer from ``least`` to ``most``."""
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):
         raise TypeError(f"{name}: expected an integer, got {type(value).__name__} {brief(value)}")
     if int(value) < least:
-        raise ValueError(f"{name}: expected at least {least}, got {value}")
+        raise ValueError(f"{name}: expected at least {least}, got {brief(value)}")
+    if int(value) > most:
+        raise ValueError(f"{name}: expected at most {most}, got {brief(value)}")
     return int(value)
 
 
 def brief(value: object) -> str:
     """``repr(value)`` for a message, shortened to 200 characters."""
-    text = repr(value)
+    try:
+        text = repr(value)
+    except Exception:  # of an integer of more than 4,300 digits, or of an object that fails
+        return f"{type(value).__name__} without a text"
     return text if len(text) <= 200 else f"{text[:160]} ... ({len(text)} characters)"
 
 

@@ -1,5 +1,7 @@
 """Reads and writes images, videos, depth and tensors: errors name the file, files are written whole or not at all."""
 
+import errno
+import hashlib
 import json
 import os
 import secrets
@@ -15,16 +17,16 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from .checks import check_field, check_path
+from .checks import MOST_PIXELS, check_field, check_path
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mov", ".mkv", ".webm")
 
-MOST_PIXELS = 2**26
-"""An image whose header gives more, 8192 x 8192, is not decoded: a file of some kilobytes can claim gigabytes."""
-
 MOST_BYTES = 2**29
 """A larger image file is not read."""
+
+MOST_TENSOR_BYTES = 2**31
+"""A larger file of tensors is not read."""
 
 
 def check_target(path: str | Path) -> Path:
@@ -43,6 +45,41 @@ def check_target(path: str | Path) -> Path:
     return path
 
 
+def check_text_name(name: str, path: str | Path, reader: str = "OpenCV") -> str:
+    """Return a path as text for a library that crashes on names that are not UTF-8, or raise.
+
+    Raises:
+        ValueError: the name is not UTF-8.
+    """
+    text = str(path)
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise ValueError(f"{name}: expected a name in UTF-8, which {reader} needs, got {text!a}: rename it") from None
+    return text
+
+
+@contextmanager
+def naming(path: str | Path) -> Iterator[None]:
+    """Let errors of the block name the file that was to be written, as those of a full disk do not by themselves.
+
+    Raises:
+        OSError: of the block, with the name of the file.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None and error.errno not in _DISK:
+            raise
+        renamed = type(error)(f"{path}: cannot be written: {error.strerror or error}")
+        renamed.errno = error.errno
+        raise renamed from error
+
+
+_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
+"""The disk is full, a quota is used up, a limit of size is reached, the device fails, or may only be read."""
+
+
 @contextmanager
 def write_atomically(path: str | Path) -> Iterator[Path]:
     """Give a temporary file beside ``path``; it replaces ``path`` when the block ends without an error, and is removed otherwise.
@@ -53,6 +90,7 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
     Raises:
         FileNotFoundError: the folder is missing.
         PermissionError: the folder cannot be written.
+        OSError: the disk is full; names the file.
     """
     path = check_target(path)
     temporary = path.with_name(f".{path.stem}-{secrets.token_hex(4)}{path.suffix}")
@@ -61,12 +99,13 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
     except OSError as error:
         raise type(error)(f"{path}: cannot write into {path.parent}: {error.strerror}") from error
     try:
-        yield temporary
-        with temporary.open("rb") as stream:
-            os.fsync(stream.fileno())
-        if path.exists():
-            temporary.chmod(path.stat().st_mode & 0o777)
-        temporary.replace(path)
+        with naming(path):
+            yield temporary
+            with temporary.open("rb") as stream:
+                os.fsync(stream.fileno())
+            if path.exists():
+                temporary.chmod(path.stat().st_mode & 0o777)
+            temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -109,7 +148,8 @@ def decode_image(path: Path, flags: int) -> np.ndarray[Any, Any] | None:
     """An image file as OpenCV decodes it; None if it does not.
 
     Raises:
-        ValueError: larger than :data:`MOST_BYTES`, or its header gives more than :data:`MOST_PIXELS`.
+        ValueError: larger than :data:`MOST_BYTES`, or its header gives more than :data:`MOST_PIXELS`, as a
+            file of some kilobytes can.
     """
     size = path.stat().st_size
     if size > MOST_BYTES:
@@ -233,9 +273,11 @@ def _write_pixels(path: Path, pixels: np.ndarray[Any, Any]) -> None:
 
     if path.suffix.lower() not in IMAGE_SUFFIXES:
         raise ValueError(f"{path}: expected a name ending in {', '.join(IMAGE_SUFFIXES)}, got {path.suffix!r}")
+    done, data = cv2.imencode(path.suffix.lower(), pixels)  # the bytes are written here: names need not be UTF-8
+    if not done:
+        raise OSError(f"{path}: OpenCV could not encode it")
     with write_atomically(path) as temporary:
-        if not cv2.imwrite(str(temporary), pixels):
-            raise OSError(f"{path}: OpenCV could not write it")
+        temporary.write_bytes(data.tobytes())
 
 
 def read_frames(source: str | Path) -> Iterator[tuple[str, Tensor]]:
@@ -271,14 +313,26 @@ def count_frames(source: str | Path) -> int:
     if path.is_dir():
         return len(image_files(path))
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        return max(0, int(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT)))
+        try:
+            return max(0, int(open_video(path).get(cv2.CAP_PROP_FRAME_COUNT)))
+        except ValueError:  # its name
+            return 1
     return 1
 
 
-def _read_video(path: Path) -> Iterator[tuple[str, Tensor]]:
+def open_video(path: Path) -> Any:
+    """OpenCV's capture of a video file, which may not be opened.
+
+    Raises:
+        ValueError: the name is not UTF-8.
+    """
     import cv2
 
-    capture = cv2.VideoCapture(str(path))
+    return cv2.VideoCapture(check_text_name("video", path))
+
+
+def _read_video(path: Path) -> Iterator[tuple[str, Tensor]]:
+    capture = open_video(path)
     number = 0
     try:
         while True:
@@ -294,10 +348,21 @@ def _read_video(path: Path) -> Iterator[tuple[str, Tensor]]:
 
 
 def save_tensors(path: str | Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> None:
-    """Write tensors and JSON metadata as one safetensors file, whole or not at all."""
+    """Write tensors and JSON metadata as one safetensors file with a checksum of both, whole or not at all."""
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    described = json.dumps({**metadata, "checksum": checksum(plain, metadata)}, allow_nan=False)
     with write_atomically(path) as temporary:
-        temporary.write_bytes(safetensors.torch.save(plain, {"torchvts": json.dumps(metadata, allow_nan=False)}))
+        temporary.write_bytes(safetensors.torch.save(plain, {"torchvts": described}))
+
+
+def checksum(tensors: dict[str, Tensor], metadata: dict[str, Any]) -> str:
+    """SHA-256 of the names, types, shapes and bytes of tensors, and of the metadata."""
+    digest = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
+    for name in sorted(tensors):
+        tensor = tensors[name].contiguous()
+        digest.update(f"{name} {tensor.dtype} {list(tensor.shape)}".encode())
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().tobytes() if tensor.numel() else b"")
+    return digest.hexdigest()
 
 
 def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -305,15 +370,18 @@ def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: not a safetensors file, cut short, or not written by torchvts.
+        ValueError: not a safetensors file, cut short, damaged, or not written by torchvts.
     """
     path = check_path("path", path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
+    if (size := path.stat().st_size) > MOST_TENSOR_BYTES:
+        raise ValueError(f"{path}: not a safetensors file of torchvts: expected at most {MOST_TENSOR_BYTES} bytes, got {size}")
     try:
-        with safetensors.safe_open(str(path), framework="pt") as stream:
-            metadata = stream.metadata() or {}
-            tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
+        content = path.read_bytes()  # read here: safetensors opens no names that are not UTF-8
+        tensors = safetensors.torch.load(content)
+        (length,) = struct.unpack("<Q", content[:8])
+        metadata = json.loads(content[8 : 8 + length]).get("__metadata__") or {}
     except (
         safetensors.SafetensorError,
         struct.error,
@@ -323,6 +391,7 @@ def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         AttributeError,
         RuntimeError,
         MemoryError,
+        RecursionError,
     ) as error:
         raise ValueError(f"{path}: not a safetensors file, or cut short: {error}") from error
     if "torchvts" not in metadata:
@@ -333,4 +402,9 @@ def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise ValueError(f"{path}: its metadata is damaged: {error}") from error
     if not isinstance(described, dict):
         raise ValueError(f"{path}: its metadata is damaged: expected an object")
+    given = described.pop("checksum", None)
+    if given is None:
+        raise ValueError(f"{path}: it has no checksum: written by another torchvts; make it again")
+    if given != checksum(tensors, described):
+        raise ValueError(f"{path}: damaged: its content is not what the checksum says; copy it again, or make it again")
     return tensors, described

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from .checks import check_batch, check_positive, check_same_size, check_tensor
+from .checks import check_batch, check_float_tensor, check_positive, check_same_size, check_tensor
 
 MAX_SLOPE = 10.0
 """Largest |dz/dx|, |dz/dy| that ``gradient_from_normal`` returns, mm per mm: 84.3 degrees from flat."""
@@ -68,7 +68,7 @@ def gradient_from_normal(normal: Tensor, max_slope: float = MAX_SLOPE) -> Tensor
     """
     check_batch("normal", normal, 3)
     if not torch.jit.is_scripting():
-        check_positive("max_slope", max_slope)
+        max_slope = check_positive("max_slope", max_slope)
     n_xy = normal[:, 0:2]
     tilt = torch.sqrt((n_xy * n_xy).sum(1, keepdim=True) + 1e-24)  # the constant keeps the root's own slope finite at 0
     return -n_xy / torch.maximum(normal[:, 2:3], tilt / max_slope)
@@ -145,7 +145,8 @@ def depth_to_points(depth_mm: Tensor, mm_per_pixel: float, contact: Tensor | Non
         tensor([-0.5000,  0.5000,  0.0000])
     """
     z = _one_frame("depth_mm", depth_mm)
-    check_positive("mm_per_pixel", mm_per_pixel)
+    check_float_tensor("depth_mm", z)
+    mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
     x, y = pixel_grid_mm(z.shape[0], z.shape[1], mm_per_pixel, z.dtype, z.device)
     points = torch.stack((x.expand_as(z), -y.expand_as(z), z), dim=-1)  # (H, W, 3)
     if contact is None:

@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from ..core.checks import check_field, check_range
+from ..core.checks import check_field, check_range, check_tensor
 from ..model import Calibration, check_calibration
 from .checks import run_checks
 from .examination import Examination
@@ -51,7 +51,8 @@ def diagnose(background: Tensor | None, image: Tensor, calibration: Calibration)
 
 
 def _one_image(name: str, image: Tensor) -> Tensor:
-    if isinstance(image, Tensor) and image.dim() == 4 and image.shape[0] == 1:
+    check_tensor(name, image)
+    if image.dim() == 4 and image.shape[0] == 1:
         image = image[0]
     check_field(name, image)
     check_range(name, image)

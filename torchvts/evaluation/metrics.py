@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..core.checks import check_batch, check_integer, check_positive, check_shape, check_tensor
+from ..core.checks import check_batch, check_float_tensor, check_integer, check_positive, check_shape, check_tensor
 from ..core.geometry import depth_to_points
 
 
@@ -56,8 +56,9 @@ def depth_error(depth_mm: Tensor, truth_mm: Tensor, mm_per_pixel: float, region:
         >>> depth_error(torch.full((1, 1, 4, 4), 0.5), torch.zeros(1, 1, 4, 4), 0.25).max_px
         2.0
     """
-    check_tensor("truth_mm", truth_mm)
-    check_positive("mm_per_pixel", mm_per_pixel)
+    check_float_tensor("truth_mm", truth_mm)
+    check_float_tensor("depth_mm", depth_mm)
+    mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
     error = (_inside("depth_mm", depth_mm, truth_mm, region) - _inside("truth_mm", truth_mm, truth_mm, region)).double()
     largest, rms = float(error.abs().max()), float(error.square().mean().sqrt())
     return DepthError(largest, rms, largest / mm_per_pixel, rms / mm_per_pixel)
@@ -75,9 +76,11 @@ def normal_angle_deg(normal: Tensor, truth: Tensor, region: Tensor | None = None
     Returns:
         Degrees, (B, H, W), or (N,) inside the region.
     """
-    check_tensor("truth", truth)
+    check_batch("truth", truth, 3)
     check_batch("normal", normal, 3)
     check_shape("normal", normal, truth.shape, "truth")
+    if truth.dtype != normal.dtype:
+        raise TypeError(f"truth: expected {normal.dtype} like normal, got {truth.dtype}: convert one of them")
     if region is not None:
         check_shape("region", region, (normal.shape[0], 1, *normal.shape[2:]), "one channel of normal")
     cross = torch.linalg.cross(normal, truth, dim=1).norm(dim=1)
@@ -97,7 +100,7 @@ def rim_distance_px(mask: Tensor, truth: Tensor) -> float:
     """Mean distance between the rims of two masks of one frame, in both directions, pixels; infinite if only one has a rim."""
     for name, value in (("mask", mask), ("truth", truth)):
         check_tensor(name, value)
-        if value.dim() < 2 or value.numel() != value.shape[-1] * value.shape[-2]:
+        if value.dim() < 2 or value.numel() == 0 or value.numel() != value.shape[-1] * value.shape[-2]:
             raise ValueError(f"{name}: expected one frame, (H, W) or (1, 1, H, W), got {tuple(value.shape)}: loop over the batch")
     rims = [torch.nonzero(_rim(m)).double() for m in (mask, truth)]
     if not (len(rims[0]) and len(rims[1])):
@@ -113,15 +116,19 @@ def fit_sphere(depth_mm: Tensor, mm_per_pixel: float, contact: Tensor, steps: in
         depth_mm: depth of one frame, mm.
         mm_per_pixel: pixel pitch, mm.
         contact: bool, the same shape, the pixels to fit.
-        steps: Gauss-Newton steps.
+        steps: most Gauss-Newton steps; fewer are made where the sphere does not move any more.
     Returns:
         The sphere.
     Raises:
-        ValueError: fewer than 4 points.
+        ValueError: fewer than 4 points, or depth that is not finite or beyond 1e6 mm.
     """
     check_integer("steps", steps, 0)
     check_tensor("contact", contact)
     points = depth_to_points(depth_mm, mm_per_pixel, contact).double()
+    if not bool((points.abs() <= 1e6).all()):  # also NaN
+        raise ValueError(
+            "depth_mm: expected finite values of at most 1e6 mm, got others in the contact: an upstream division failed"
+        )
     if len(points) < 4:
         raise ValueError(f"contact: expected at least 4 pixels, got {len(points)}: no contact, no sphere")
     mean = points.mean(0)
@@ -135,6 +142,8 @@ def fit_sphere(depth_mm: Tensor, mm_per_pixel: float, contact: Tensor, steps: in
         jacobian = torch.cat((-offset / distance, -torch.ones_like(distance)), 1)
         step = torch.linalg.lstsq(jacobian, distance - radius).solution[:, 0]
         center, radius = center - step[:3], radius - step[3]
+        if not float(step.abs().max()) > 1e-14 * float(radius.abs()):  # also NaN, where the points lie in a plane
+            break
     rms = ((centred - center).norm(dim=1) - radius).square().mean().sqrt()
     x, y, z = (center + mean).tolist()
     return SphereFit((x, y, z), float(radius), float(rms))

@@ -243,8 +243,14 @@ def _read(path: Path) -> dict[Key, Row]:
         with path.open("r+", encoding="utf-8") as stream:
             stream.truncate(len(whole.encode()))
             os.fsync(stream.fileno())
-    rows = [row_from_dict(json.loads(line)) for line in lines[1:]]
-    return {_key(row): row for row in rows}
+    rows = {}
+    for place, line in enumerate(lines[1:], 2):
+        try:
+            row = row_from_dict(json.loads(line))
+            rows[_key(row)] = row
+        except (ValueError, TypeError, KeyError, AssertionError, AttributeError) as error:
+            raise ValueError(f"{path}, line {place}: not a row of this sweep: {error}: remove it to measure it again") from error
+    return rows
 
 
 # breaking points

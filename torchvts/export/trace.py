@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from ..accelerated import reference
-from ..core.checks import check_batch, check_size
+from ..core.checks import check_batch, check_dtype, check_size, check_switch
 from ..core.frame import Crop
 from ..integration import Integrator, PoissonDCT, divergence
 from ..integration.base import embedded
@@ -41,6 +41,8 @@ class PoissonBackgroundByMatrix(Integrator):
     ) -> None:
         super().__init__()
         check_size(height, width, mm_per_pixel)
+        check_dtype("dtype", dtype)
+        check_switch("zero_in_background", zero_in_background)
         self.size = (height, width)
         self.mm_per_pixel = mm_per_pixel
         self.zero_in_background = zero_in_background
@@ -56,6 +58,8 @@ class PoissonBackgroundByMatrix(Integrator):
 
     def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
         check_batch("gradient", gradient, 2)
+        if gradient.dtype != self.get_buffer("even_y").dtype:
+            raise TypeError(f"gradient: expected {self.get_buffer('even_y').dtype} like the matrices, got {gradient.dtype}")
         if size is not None and size != self.size:
             raise ValueError(f"gradient, window: expected size {self.size}, for which the matrices are, got {size}")
         gradient = embedded(gradient, window, self.size)

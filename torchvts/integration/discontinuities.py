@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_batch, check_integer, check_positive, check_same_size, check_shape, check_window
+from ..core.checks import check_batch, check_float_tensor, check_integer, check_positive, check_same_size, check_shape, check_window
 from .base import Integrator
 from .poisson import PoissonBackground, check_gradient, laplace_plan, solve_laplace
 
@@ -167,6 +167,7 @@ class DiscontinuityIntegration(Integrator):
             if (value.dtype == torch.bool) != (name == "contact"):
                 kind = "bool: threshold it" if name == "contact" else "a number from 0 to 1: weight.float() of a mask"
                 raise TypeError(f"{name}: expected {kind.split(':')[0]}, got {value.dtype}:{kind.split(':')[1]}")
+        check_float_tensor("weight", trust)
         if not bool(((trust >= 0) & (trust <= 1)).all()):
             raise ValueError(f"weight: expected values from 0 to 1, got {float(trust.min()):g} to {float(trust.max()):g}")
         trust = trust.to(gradient.dtype)
@@ -194,8 +195,7 @@ class DiscontinuityIntegration(Integrator):
             return torch.zeros_like(gradient)
         for name, value in (("known_mm", known_mm), ("known_weight", known_weight)):
             check_shape(name, value, (gradient.shape[0], 1, *gradient.shape[2:]), "gradient")
-            if not value.dtype.is_floating_point:
-                raise TypeError(f"{name}: expected floating point, got {value.dtype}: .float() converts it")
+            check_float_tensor(name, value)
             if not bool(torch.isfinite(value).all()):
                 raise ValueError(f"{name}: expected finite values, got NaN or infinite ones: give unknown pixels the weight 0")
         if not bool((known_weight >= 0).all()):

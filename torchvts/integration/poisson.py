@@ -62,7 +62,7 @@ def poisson_dst(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
     """
     check_gradient(gradient, 3)
     if not torch.jit.is_scripting():
-        check_positive("mm_per_pixel", mm_per_pixel)
+        mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
     return _integrate_dst(gradient, mm_per_pixel, _plan_dst(gradient))
 
 
@@ -88,7 +88,7 @@ def poisson_dct(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
     """
     check_gradient(gradient, 2)
     if not torch.jit.is_scripting():
-        check_positive("mm_per_pixel", mm_per_pixel)
+        mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
     return _integrate_dct(gradient, mm_per_pixel, _plan_dct(gradient, gradient.shape[2], gradient.shape[3]), 0, 0, False)
 
 
@@ -112,7 +112,7 @@ def poisson_background(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
     """
     check_gradient(gradient, 2)
     if not torch.jit.is_scripting():
-        check_positive("mm_per_pixel", mm_per_pixel)
+        mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
     return _integrate_dct(gradient, mm_per_pixel, _plan_dct(gradient, gradient.shape[2], gradient.shape[3]), 0, 0, True)
 
 

@@ -10,7 +10,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..core.checks import QUANTISATION_STD, brief, check_field, check_image, check_record, check_shape, check_tensor
+from ..core.checks import (
+    QUANTISATION_STD,
+    brief,
+    check_field,
+    check_float_tensor,
+    check_image,
+    check_record,
+    check_shape,
+    check_switch,
+    check_tensor,
+)
 from ..core.files import image_from_bytes, image_to_bytes, load_tensors, save_tensors
 from ..core.noise import noise_std
 from .lights import PointLights, flat_image, inverse_light_matrix
@@ -19,7 +29,7 @@ from .report import Report, read_report
 from .response_field import ResponseModel
 from .sensor import Sensor, check_sensor
 
-FORMAT_VERSION = 6
+FORMAT_VERSION = 7
 """Version of the calibration file. A file of another version is refused."""
 
 DEFECT_RATIO = 4.0
@@ -53,8 +63,9 @@ class Calibration:
         markers: the block that fills printed markers before anything else, or None.
         ambient: (3,), constant linear light that the lights do not give, subtracted before the gain; None for none.
     Raises:
-        ValueError: background, noise or ambient light of another shape, or not finite; a background without light; lights whose
-            image has nothing to do with the background.
+        TypeError: a field of another type.
+        ValueError: lights, background, noise or ambient light of another shape, or not finite; a background without light; lights
+            whose image has nothing to do with the background.
     """
 
     sensor: Sensor
@@ -68,8 +79,27 @@ class Calibration:
     ambient: Tensor | None = None
 
     def __post_init__(self) -> None:
+        check_sensor("sensor", self.sensor)
+        for name, part, kind in (
+            ("lights", self.lights, PointLights),
+            ("response", self.response, ResponseModel),
+            ("markers", self.markers, FillMarkers),
+        ):
+            if part is not None:
+                check_record(name, part, kind)
+        check_switch("measured", self.measured)
+        read_report(self.report, "report")
+        if self.lights is not None:
+            for name, values in (("position_mm", self.lights.position_mm), ("albedo", self.lights.albedo)):
+                if not bool(torch.isfinite(values).all()):
+                    raise ValueError(f"lights.{name}: expected finite values, got {values.tolist()}: did a fit diverge?")
+        if self.ambient is not None:
+            check_float_tensor("ambient", self.ambient)
+            if tuple(self.ambient.shape) != (3,) or not bool((self.ambient >= 0).all() & torch.isfinite(self.ambient).all()):
+                raise ValueError(f"ambient: expected (3,) finite values of at least 0, got {brief(self.ambient.tolist())}")
         check_field("background", self.background)
         check_shape("background", self.background, (3, self.sensor.height, self.sensor.width), f"sensor '{self.sensor.name}'")
+        check_float_tensor("noise_std", self.noise_std)
         check_shape("noise_std", self.noise_std, (3,))
         if not bool((torch.isfinite(self.noise_std) & (self.noise_std > 0)).all()):
             raise ValueError(f"noise_std: expected finite values above 0, got {self.noise_std.tolist()}")
@@ -111,12 +141,12 @@ class Calibration:
         check_sensor("sensor", sensor)
         sensor = dataclasses.replace(sensor, gamma=sensor.exponent, prior=None)
         frozen = PointLights(*(t.detach().cpu() for t in (lights.position_mm, lights.albedo, lights.gloss))).requires_grad_(False)
-        summary = read_report({"model": "point_lights", "source": "given"} | dict(report or {}), "report")
+        summary = read_report({"model": "point_lights", "source": "given"} | ({} if report is None else dict(report)), "report")
         if ambient is not None:
             check_tensor("ambient", ambient)
             ambient = ambient.detach().cpu().to(frozen.position_mm.dtype)
-            if tuple(ambient.shape) != (3,) or not bool((ambient >= 0).all() & torch.isfinite(ambient).all()):
-                raise ValueError(f"ambient: expected (3,) finite values of at least 0, got {ambient.tolist()}")
+            if tuple(ambient.shape) != (3,):
+                raise ValueError(f"ambient: expected (3,), got {tuple(ambient.shape)}")
         if background is None:
             model = flat_image(frozen, sensor.height, sensor.width, sensor.mm_per_pixel)
             model = model if ambient is None else model + ambient.reshape(3, 1, 1)
@@ -149,7 +179,7 @@ class Calibration:
         check_sensor("sensor", sensor)
         check_image("background", background, sensor.height, sensor.width, sensor.name)
         sensor = dataclasses.replace(sensor, gamma=response.gamma, blur_px=response.blur_px, prior=None)
-        summary = read_report({"model": "response", "source": "given"} | dict(report or {}), "report")
+        summary = read_report({"model": "response", "source": "given"} | ({} if report is None else dict(report)), "report")
         light, noise, markers = _measure(background, sensor, background.dtype)
         return cls(sensor, None, light, noise, True, summary, response, markers)
 

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..core.checks import brief, check_batch, check_path, check_positive, check_tensor
+from ..core.checks import brief, check_batch, check_float_tensor, check_path, check_positive, check_tensor
 from ..core.files import read_image, rgb_from_bgr
 from .gs_sdk_sensor import values_from_gs_sdk
 from .sensor import Sensor, read_yaml
@@ -182,6 +182,8 @@ def sensor_from_gs_sdk(config: dict[str, Any] | str | Path, name: str | None = N
         0.0634
     """
     source = "config"
+    if name is not None and not isinstance(name, str):
+        raise TypeError(f"name: expected a text, got {type(name).__name__}")
     values: Any = config
     if isinstance(config, (str, Path)):
         path = Path(config)
@@ -319,8 +321,7 @@ def _map(name: str, values: Tensor | np.ndarray[Any, Any]) -> Tensor:
     tensor = values if isinstance(values, Tensor) else torch.from_numpy(np.ascontiguousarray(values))
     if tensor.dim() != 2:
         raise ValueError(f"{name}: expected (H, W), got {tuple(tensor.shape)}: gs_sdk's maps have no batch and no channel")
-    if not tensor.is_floating_point():
-        raise TypeError(f"{name}: expected floating point, got {tensor.dtype}: gs_sdk's maps are float32")
+    check_float_tensor(name, tensor)
     return tensor
 
 

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from ..core.checks import brief, check_integer, check_positive
+from ..core.checks import brief, check_image_size, check_positive
 
 SENSOR_KEYS = ("ppmm", "imgh", "imgw")
 SENSOR_KEYS_OPTIONAL = ("raw_imgh", "raw_imgw", "framerate", "device_name")
@@ -43,10 +43,10 @@ def values_from_gs_sdk(values: dict[Any, Any], source: str, name: str) -> dict[s
         pitch = check_positive("ppmm", values["ppmm"])
         if pitch > 1.0:
             raise ValueError(f"ppmm: expected mm per pixel in (0, 1], got {pitch:g}: the name misleads; invert pixels per mm")
-        size = check_integer("imgh", values["imgh"], 8), check_integer("imgw", values["imgw"], 8)
+        size = check_image_size("imgh", values["imgh"], "imgw", values["imgw"], 8)
         found: dict[str, Any] = {"name": name, "height": size[0], "width": size[1], "mm_per_pixel": pitch}
         if "raw_imgh" in values:
-            raw = check_integer("raw_imgh", values["raw_imgh"], 8), check_integer("raw_imgw", values["raw_imgw"], 8)
+            raw = check_image_size("raw_imgh", values["raw_imgh"], "raw_imgw", values["raw_imgw"], 8)
             if raw != size:
                 found |= {"raw_size_px": (raw,), "raw_crop": RAW_CROP}
     except (TypeError, ValueError) as error:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_batch, check_camera_height, check_positive, check_record, check_same_size
+from ..core.checks import brief, check_batch, check_camera_height, check_positive, check_record, check_same_size, check_tensor
 from ..core.geometry import pixel_grid_mm
 
 
@@ -67,7 +67,7 @@ class PointLights(nn.Module):
         check_batch("normal", normal, 3)
         check_same_size("normal", normal, "depth_mm", depth_mm.shape[2], depth_mm.shape[3])
         if not torch.jit.is_scripting():
-            check_positive("mm_per_pixel", mm_per_pixel), check_camera_height(camera_height_mm)
+            mm_per_pixel, camera_height_mm = check_positive("mm_per_pixel", mm_per_pixel), check_camera_height(camera_height_mm)
         matrix = light_matrix(depth_mm, self.position_mm, self.albedo, mm_per_pixel, camera_height_mm)
         light = (matrix * normal.unsqueeze(1)).sum(2).clamp_min(0.0)
         if self.glossy:
@@ -86,9 +86,13 @@ class PointLights(nn.Module):
 
 def _numbers(name: str, values: object) -> Tensor:
     try:
-        return torch.as_tensor(values)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise TypeError(f"{name}: expected numbers, got {values!r}: a tensor, or lists of floats") from error
+        tensor = torch.as_tensor(values)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise TypeError(f"{name}: expected numbers, got {brief(values)}: a tensor, or lists of floats") from error
+    check_tensor(name, tensor)
+    if tensor.is_complex() or tensor.element_size() < 2:
+        raise TypeError(f"{name}: expected float32 or float64, got {tensor.dtype}: use .float()")
+    return tensor
 
 
 def near_field_shading(

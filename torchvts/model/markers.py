@@ -9,7 +9,17 @@ import math
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import brief, check_batch, check_field, check_integer, check_positive, check_range, check_same_size, check_tensor
+from ..core.checks import (
+    brief,
+    check_batch,
+    check_field,
+    check_integer,
+    check_least,
+    check_positive,
+    check_range,
+    check_same_size,
+    check_tensor,
+)
 from ..core.noise import noise_std
 
 
@@ -98,7 +108,7 @@ def fill_markers(image: Tensor, mask: Tensor, relaxations: int = 4) -> Tensor:
     if not torch.jit.is_scripting():
         check_tensor("image", image)
         check_tensor("mask", mask)
-        check_integer("relaxations", relaxations, 0)
+        check_integer("relaxations", relaxations, 0, 1000)
     check_batch("image", image, image.shape[1] if image.dim() == 4 else 3)
     if mask.dtype != torch.bool:
         raise TypeError(f"mask: expected torch.bool, got {mask.dtype}: threshold it")
@@ -143,7 +153,7 @@ class FillMarkers(nn.Module):
 
     def __init__(self, diameter_px: float = 9.0, contrast: float = 0.06, sigmas: float = 5.0, margin: float = 0.2) -> None:
         super().__init__()
-        self.diameter_px = 0.0 if diameter_px == 0 else check_positive("diameter_px", diameter_px)
+        self.diameter_px = check_least("diameter_px", diameter_px, 0.0, 1000.0)
         self.contrast = check_positive("contrast", contrast)
         self.sigmas = check_positive("sigmas", sigmas)
         self.margin = check_positive("margin", margin, 2.0)
@@ -163,7 +173,7 @@ class FillMarkers(nn.Module):
             least_markers: fewer are taken for dust, and nothing is filled.
             margin: as for :func:`find_markers`.
         """
-        check_positive("margin", margin, 2.0)
+        margin = check_positive("margin", margin, 2.0)
         diameter_px, found = marker_diameter_px(background, contrast, least_markers)
         return cls(diameter_px, max(contrast, found / 5.0), margin=margin)
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from ..core.checks import (
     brief,
     check_batch,
-    check_integer,
+    check_image_size,
     check_least,
     check_numbers,
     check_path,
@@ -75,16 +75,15 @@ class Sensor:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip():
             raise TypeError(f"name: expected a text, got {brief(self.name)}")
-        self._set("height", check_integer("height", self.height, 8))
-        self._set("width", check_integer("width", self.width, 8))
+        height, width = check_image_size("height", self.height, "width", self.width, 8)
+        self._set("height", height)
+        self._set("width", width)
         self._set("mm_per_pixel", check_positive("mm_per_pixel", self.mm_per_pixel, 10.0))
         if self.gamma is not None:
             self._set("gamma", check_positive("gamma", self.gamma, 10.0))
         if self.gamma is not None and self.gamma < 0.1:
             raise ValueError(f"gamma: expected a number in [0.1, 10], got {self.gamma}: value = light^(1/gamma), 2.2 for sRGB-like")
-        if self.blur_px != 0:
-            check_positive("blur_px", self.blur_px, 0.25 * min(self.height, self.width))
-        self._set("blur_px", float(self.blur_px))
+        self._set("blur_px", check_least("blur_px", self.blur_px, 0.0, 0.25 * min(self.height, self.width)))
         if self.light_position_mm is not None:
             numbers = check_numbers("light_position_mm", self.light_position_mm, (3, 3))
             if min(numbers[2::3]) <= 0:
@@ -149,7 +148,7 @@ class Sensor:
             >>> Sensor(name="rig", height=480, width=640, mm_per_pixel=0.0625).resized(240, 320).mm_per_pixel
             0.125
         """
-        check_integer("height", height, 8), check_integer("width", width, 8)
+        height, width = check_image_size("height", height, "width", width, 8)
         scale_y, scale_x = height / self.height, width / self.width
         if abs(scale_x / scale_y - 1.0) > 0.01:
             raise ValueError(

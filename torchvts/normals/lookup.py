@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_batch, check_field, check_integer, check_least, check_same_size, check_tensor
+from ..core.checks import check_batch, check_field, check_float_tensor, check_integer, check_least, check_same_size, check_tensor
 from ..core.files import load_tensors, save_tensors
 from ..core.geometry import normal_from_gradient
 from .base import NormalModel
@@ -49,6 +49,10 @@ class NormalFromLookup(NormalModel):
         check_field("flat", flat)
         for name, value in (("table", table), ("step", step), ("zero_index", zero_index)):
             check_tensor(name, value)
+            if value.is_complex() or value.dtype == torch.bool:
+                raise TypeError(f"{name}: expected numbers, got {value.dtype}")
+        check_float_tensor("table", table)
+        check_float_tensor("step", step)
         if table.dim() != 4 or tuple(table.shape) != (table.shape[0],) * 3 + (2,) or table.shape[0] < 3:
             raise ValueError(f"table: expected (n, n, n, 2) with n of 3 or more, got {tuple(table.shape)}")
         if tuple(step.shape) != (3,) or not bool((step > 0).all()) or not bool(torch.isfinite(step).all()):
@@ -192,10 +196,9 @@ def _gaussian(volume: Tensor, width: float) -> Tensor:
 
 
 def _check_samples(name: str, values: Tensor, columns: int) -> None:
-    if not isinstance(values, Tensor) or values.dim() != 2 or values.shape[1] != columns or values.shape[0] == 0:
-        got = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
+    if not isinstance(values, Tensor) or values.is_nested or values.dim() != 2 or values.shape[1] != columns or not len(values):
+        got = tuple(values.shape) if isinstance(values, Tensor) and not values.is_nested else type(values).__name__
         raise ValueError(f"{name}: expected (N, {columns}), one row per pixel, got {got}")
-    if not values.is_floating_point():
-        raise TypeError(f"{name}: expected floating point, got {values.dtype}: images are value / 255")
+    check_float_tensor(name, values)
     if not bool(torch.isfinite(values).all()):
         raise ValueError(f"{name}: expected finite values, got NaN or infinite: keep 3 pixels inside the rim of the ball's contact")

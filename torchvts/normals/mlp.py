@@ -9,15 +9,19 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ..core.blur import MOST_BLUR_PX
 from ..core.checks import (
     check_batch,
     check_choice,
     check_field,
+    check_image_size,
     check_integer,
     check_least,
     check_path,
     check_range,
     check_same_size,
+    check_seed,
+    check_tensor,
 )
 from ..core.files import load_tensors, save_tensors
 from ..core.geometry import normal_from_gradient
@@ -81,18 +85,17 @@ class NormalFromMLP(NormalModel):
         super().__init__()
         check_choice("input_domain", input_domain, tuple(DOMAINS))
         self.input_domain = input_domain
-        self.blur_px = check_least("blur_px", blur_px)
+        self.blur_px = check_least("blur_px", blur_px, 0.0, MOST_BLUR_PX)
         if output not in OUTPUTS:
             raise ValueError(f"output: expected one of {', '.join(OUTPUTS)}, got {output!r}")
-        self.height = check_integer("height", height, 1)
-        self.width = check_integer("width", width, 1)
+        self.height, self.width = check_image_size("height", height, "width", width)
         self.output = output
         self.most = MAX_ANGLE_RAD if output == "angle" else MAX_GRADIENT
         widths = [5, *(check_integer("hidden", n, 1) for n in hidden), 2]
         if len(widths) < 3:
             raise ValueError("hidden: expected one width or more, got none")
         self.check_flat(flat)
-        generator = torch.Generator().manual_seed(check_integer("seed", seed, 0))
+        generator = torch.Generator().manual_seed(check_seed("seed", seed))
         self.layers = nn.ModuleList()
         for fan_in, fan_out in pairwise(widths):
             layer = nn.Linear(fan_in, fan_out, device="meta", dtype=flat.dtype).to_empty(device=flat.device)
@@ -116,6 +119,8 @@ class NormalFromMLP(NormalModel):
         """The network's output, (B, 2, H, W): gs_sdk's d(H)/dx, d(H)/dy, before that of the flat skin is subtracted."""
         check_batch("image", image, 3)
         check_same_size("image", image, "the calibration", self.height, self.width)
+        if image.dtype != self.flat.dtype:
+            raise TypeError(f"image: expected {self.flat.dtype} like the network, got {image.dtype}: convert one of them")
         x = torch.arange(self.width, dtype=image.dtype, device=image.device) / self.width
         y = torch.arange(self.height, dtype=image.dtype, device=image.device) / self.height
         shape = (image.shape[0], 1, self.height, self.width)
@@ -146,14 +151,15 @@ class NormalFromMLP(NormalModel):
 
     def check_flat(self, flat: Tensor) -> None:
         """Raise unless ``flat`` is one finite (3, height, width) image in [0, 1]."""
+        if isinstance(flat, Tensor):
+            check_tensor("flat", flat)
         if not isinstance(flat, Tensor) or tuple(flat.shape) != (3, self.height, self.width):
             got = tuple(flat.shape) if isinstance(flat, Tensor) else type(flat).__name__
             raise ValueError(
                 f"flat: expected one image of the flat skin, (3, {self.height}, {self.width}), got {got}: "
                 "it must have the size of the images"
             )
-        if not flat.is_floating_point():
-            raise TypeError(f"flat: expected a floating-point image, got {flat.dtype}: divide by 255")
+        check_field("flat", flat)
         check_range("flat", flat)
 
     @classmethod

@@ -9,7 +9,9 @@ from ..core.checks import (
     QUANTISATION_STD,
     check_batch,
     check_camera_height,
+    check_float_tensor,
     check_integer,
+    check_positive,
     check_record,
     check_same_count,
     check_same_size,
@@ -74,13 +76,15 @@ class NormalFromIntensity(NormalModel):
         super().__init__()
         check_record("lights", lights, PointLights, "PointLights(position_mm, albedo) makes them")
         check_size(height, width, mm_per_pixel)
-        self.mm_per_pixel = mm_per_pixel
+        self.mm_per_pixel = mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         self.camera_height_mm = check_camera_height(camera_height_mm)
         self.lights = PointLights(lights.position_mm.detach(), lights.albedo.detach(), lights.gloss).requires_grad_(False)
         if inverse is None:
             inverse = self._inverse_of_lights(height, width)
+        check_float_tensor("inverse", inverse)
         check_shape("inverse", inverse, (3, 3, height, width))
         noise = torch.full((3,), QUANTISATION_STD) if noise_std is None else noise_std
+        check_float_tensor("noise_std", noise)
         check_shape("noise_std", noise, (3,))
         if not bool((noise >= 0).all()):
             raise ValueError(f"noise_std: expected values of at least 0, got {noise.tolist()}")

@@ -5,7 +5,7 @@ import copy
 import torch
 from torch import Tensor
 
-from ..core.checks import check_batch, check_integer, check_record, check_same_size, check_size, check_window
+from ..core.checks import check_batch, check_dtype, check_integer, check_record, check_same_size, check_size, check_window
 from ..model.calibration import Calibration, check_calibration
 from ..model.response_field import CHANGE_SCALE, MAX_SINE, DepthBrightness, ResponseField
 from .base import NormalModel
@@ -49,6 +49,7 @@ class NormalFromResponse(NormalModel):
         super().__init__()
         check_record("field", field, ResponseField)
         check_size(height, width, mm_per_pixel)
+        check_dtype("dtype", dtype)
         if by_depth is not None:
             check_record("by_depth", by_depth, DepthBrightness)
         self.uses_depth = by_depth is not None

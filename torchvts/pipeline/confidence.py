@@ -14,16 +14,18 @@ from torch import Tensor, nn
 
 from ..accelerated import GradientFromNormal, PoissonBackground, scriptable
 from ..contact import ContactSettings
-from ..core.blur import blur, gaussian_weights
+from ..core.blur import MOST_BLUR_PX, blur, gaussian_weights
 from ..core.checks import (
     check_batch,
     check_field,
+    check_float_tensor,
     check_least,
+    check_mask,
     check_positive,
     check_record,
     check_same_size,
     check_shape,
-    check_tensor,
+    check_switch,
 )
 from ..core.geometry import gradient_of_depth
 from ..core.noise import noise_std as frame_noise_std
@@ -137,10 +139,10 @@ def bound_at(bound_95: Tensor, level: float, spread: float = 1.0) -> Tensor:
         >>> [round(float(bound_at(torch.tensor(6.0), level)), 2) for level in (0.5, 0.68, 0.95)]
         [2.89, 3.7, 6.0]
     """
-    check_tensor("bound_95", bound_95)
+    check_float_tensor("bound_95", bound_95)
     if not 0.0 < check_least("level", level) < 1.0:
         raise ValueError(f"level: expected a probability between 0 and 1, got {level}: 0.95, not 95")
-    check_positive("spread", spread)
+    spread = check_positive("spread", spread)
     factor: float = (math.log(1.0 - level) / math.log(0.05)) ** (0.5 * spread)
     return bound_95 * factor
 
@@ -214,8 +216,9 @@ class Confidence(nn.Module):
         check_field("noise_std", noise_std)
         check_shape("image_noise_std", image_noise_std, (3,))
         check_shape("light_std", light_std, noise_std.shape, "noise_std")
-        check_positive("mm_per_pixel", mm_per_pixel), check_positive("spread", spread)
-        check_least("model_deg", model_deg), check_least("blur_px", blur_px)
+        mm_per_pixel, spread = check_positive("mm_per_pixel", mm_per_pixel), check_positive("spread", spread)
+        check_switch("measured", measured)
+        model_deg, blur_px = check_least("model_deg", model_deg), check_least("blur_px", blur_px, 0.0, MOST_BLUR_PX)
         self.normals = as_normal_model(normals)
         self.uses_depth = self.normals.uses_depth
         self.by_lights = isinstance(normals, NormalFromIntensity)
@@ -315,6 +318,8 @@ class Confidence(nn.Module):
 
     def _check(self, images: Tensor, compensated: Tensor, out: DepthOutput) -> None:
         height, width = self.noise.shape[1], self.noise.shape[2]
+        if not torch.jit.is_scripting():
+            check_record("out", out, DepthOutput, "what the pipeline returns")
         for name, tensor, channels in (
             ("images", images, 3),
             ("compensated", compensated, 3),
@@ -324,11 +329,11 @@ class Confidence(nn.Module):
         ):
             check_batch(name, tensor, channels)
             check_same_size(name, tensor, "the calibration", height, width)
-        if not torch.jit.is_scripting():
-            check_tensor("contact", out.contact)
-            check_tensor("deformed", out.deformed)
+            if tensor.shape[0] != images.shape[0]:
+                raise ValueError(f"{name}: expected {images.shape[0]} frames like images, got {tensor.shape[0]}: of another batch?")
         for name, mask in (("contact", out.contact), ("deformed", out.deformed)):
-            if mask.dtype != torch.bool or mask.shape != out.depth_mm.shape:
+            check_mask(name, mask)
+            if mask.shape != out.depth_mm.shape:
                 raise ValueError(f"{name}: expected bool like depth_mm, got {mask.shape} {mask.dtype}")
 
     def _unexplained(self, compensated: Tensor, depth_mm: Tensor, normal: Tensor, dark: Tensor, sigma: Tensor) -> Tensor:

@@ -108,8 +108,9 @@ class DepthPipeline(nn.Module):
             check_record(name, block, nn.Module)
         model, integrator = as_normal_model(normals), as_integrator(integrate)
         check_domain(model, compensate.output_domain if isinstance(compensate, PlainCompensate) else None)
-        check_positive("mm_per_pixel", mm_per_pixel), check_positive("tolerance_px", tolerance_px)
-        check_least("refine_threshold_px", refine_threshold_px), check_integer("max_passes", max_passes, 1)
+        mm_per_pixel, tolerance_px = check_positive("mm_per_pixel", mm_per_pixel), check_positive("tolerance_px", tolerance_px)
+        refine_threshold_px = check_least("refine_threshold_px", refine_threshold_px)
+        check_integer("max_passes", max_passes, 1)
         if mode == "precise" and not (model.uses_depth or model.normals_from_depth):
             raise ValueError(
                 f"mode: 'precise' hands the depth back to the normals, but {type(normals).__name__} does not take it: "
@@ -194,7 +195,7 @@ class DepthPipeline(nn.Module):
             ContactMask.from_calibration(calibration, settings),
             normals,
             GradientFromNormal(),
-            integrate or PoissonBackground(sensor.mm_per_pixel),
+            PoissonBackground(sensor.mm_per_pixel) if integrate is None else integrate,
         )
         touching = ContactFromDepth(sensor.mm_per_pixel, settings.share)
         pipe = cls(*modules, mm_per_pixel=sensor.mm_per_pixel, mode=mode, contact=touching)

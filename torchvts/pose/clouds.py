@@ -36,7 +36,7 @@ def contact_cloud(frame: DepthFrame, mm_per_pixel: float, most: int | None = 100
     Raises:
         ValueError: not one frame, values not finite, or no contact deeper than the noise.
     """
-    check_positive("mm_per_pixel", mm_per_pixel)
+    mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
     depth, gradient, contact = contact_of(frame, "frame")
     inside = sure_contact(depth, gradient, contact, mm_per_pixel)
     if not bool(inside.any()):

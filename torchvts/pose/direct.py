@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from ..core.checks import check_positive
+from ..core.checks import check_float_tensor, check_positive
 from .alignment import Fit, distinct, equally_good, is_trusted, rank, refine, score_poses
 from .ambiguity import UNKNOWN_VARIANCE, Unknown, find_unknown, pose_covariance
 from .relief import DepthFrame, Levels, levels
@@ -43,7 +43,7 @@ def register_depth(source: DepthFrame, target: DepthFrame, mm_per_pixel: float, 
         >>> reg.converged, round(math.degrees(math.acos(float(reg.T_target_source[0, 0]))), 1)
         (True, 30.0)
     """
-    check_positive("mm_per_pixel", mm_per_pixel)
+    mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
     a, b = levels(source, mm_per_pixel, "source"), levels(target, mm_per_pixel, "target")
     sizes = [tuple(frame.depth_mm.shape[-2:]) for frame in (source, target)]
     if sizes[0] != sizes[1]:
@@ -124,9 +124,9 @@ def check_rigid(name: str, T: Tensor) -> Tensor:
     Raises:
         ValueError: no rigid motion.
     """
-    if not isinstance(T, Tensor) or tuple(T.shape) != (4, 4) or not bool(torch.isfinite(T).all()):
-        got = tuple(T.shape) if isinstance(T, Tensor) else type(T).__name__
-        raise ValueError(f"{name}: expected a finite (4, 4) tensor, got {got}")
+    check_float_tensor(name, T)
+    if tuple(T.shape) != (4, 4) or not bool(torch.isfinite(T).all()):
+        raise ValueError(f"{name}: expected a finite (4, 4) tensor, got {tuple(T.shape)}")
     T = T.detach().cpu().double()
     last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
     off = float((T[:3, :3] @ T[:3, :3].T - torch.eye(3, dtype=torch.float64)).abs().max())

@@ -102,8 +102,7 @@ def _register_any_shape(a: Cloud, b: Cloud, clouds: Correspondence, start: Tenso
 
 def _check_cloud(name: str, points: Tensor, normals: Tensor | None) -> Cloud:
     """A cloud in float64 without duplicate points, or raise."""
-    if not isinstance(points, Tensor):
-        raise TypeError(f"{name}: expected a tensor (N, 3), got {type(points).__name__}")
+    check_tensor(name, points)
     if points.dim() != 2 or points.shape[1] != 3:
         raise ValueError(f"{name}: expected (N, 3), got {tuple(points.shape)}")
     if len(points) == 0:

@@ -5,10 +5,23 @@ import math
 import torch
 from torch import Tensor
 
-from ..core.checks import check_integer, check_least, check_positive, check_record, check_shape
+from ..core.checks import (
+    check_float_tensor,
+    check_image_size,
+    check_integer,
+    check_least,
+    check_positive,
+    check_record,
+    check_seed,
+    check_shape,
+    check_switch,
+)
 from ..core.geometry import pixel_grid_mm
 from ..model.lights import PointLights, cast_shadows, near_field_shading
 from .surfaces import Scene
+
+MOST_SPOTS = 100_000
+"""So many spots wear out any skin."""
 
 
 def render(
@@ -41,13 +54,15 @@ def render(
         ValueError: ``shadows`` with a pinhole camera.
     """
     check_record("scene", scene, Scene, "sphere_press and the other presses make one")
-    check_least("noise_std", noise_std), check_positive("gamma", gamma), check_least("vignetting", vignetting, 0.0, 1.0)
+    noise_std, gamma = check_least("noise_std", noise_std), check_positive("gamma", gamma)
+    vignetting, seed = check_least("vignetting", vignetting, 0.0, 1.0), check_seed("seed", seed)
     if bits is not None and check_integer("bits", bits, 1) > 16:
         raise ValueError(f"bits: expected 1 to 16, got {bits}")
     if spots is not None:
+        check_float_tensor("spots", spots)
         check_shape("spots", spots, scene.depth_mm.shape, "the scene")
     image = near_field_shading(scene.depth_mm, scene.normal, lights, scene.mm_per_pixel, scene.camera_height_mm)
-    if shadows:
+    if check_switch("shadows", shadows):
         if not math.isinf(scene.camera_height_mm):
             raise ValueError("shadows: expected an orthographic camera, whose depth lies on an even grid; got a pinhole")
         image = image * cast_shadows(scene.depth_mm, lights, scene.mm_per_pixel)
@@ -80,9 +95,9 @@ def skin_spots(height: int, width: int, spots: int = 30, dead_pixels: int = 30, 
     Returns:
         The factor (1, 1, H, W) in [0, 1].
     """
-    check_integer("height", height, 1), check_integer("width", width, 1)
-    check_integer("spots", spots, 0), check_integer("dead_pixels", dead_pixels, 0)
-    generator = torch.Generator().manual_seed(seed)
+    check_image_size("height", height, "width", width)
+    check_integer("spots", spots, 0, MOST_SPOTS), check_integer("dead_pixels", dead_pixels, 0, MOST_SPOTS)
+    generator = torch.Generator().manual_seed(check_seed("seed", seed))
     x, y = pixel_grid_mm(height, width, 1.0)
     factor = torch.ones(height, width)
     for draw in torch.rand(spots, 4, generator=generator):

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..core.checks import check_numbers, check_positive, check_sequence, check_shape, check_tensor
+from ..core.checks import check_float_tensor, check_numbers, check_positive, check_sequence, check_shape
 
 Segment = tuple[tuple[float, float], tuple[float, float]]
 """Start and end of a stroke, (x, y) in mm."""
@@ -25,7 +25,7 @@ def letter_segments(text: str, size_mm: float) -> list[Segment]:
     """
     if not isinstance(text, str):
         raise TypeError(f"text: expected capital letters A-Z and spaces, got {type(text).__name__}")
-    check_positive("size_mm", size_mm)
+    size_mm = check_positive("size_mm", size_mm)
     unknown = sorted({letter for letter in text if letter != " " and letter not in _STROKES})
     if unknown or not text.strip():
         raise ValueError(f"text: expected capital letters A-Z and spaces, got {text!r}")
@@ -43,7 +43,8 @@ def letter_segments(text: str, size_mm: float) -> list[Segment]:
 
 def distance_to_segments(x: Tensor, y: Tensor, segments: Sequence[Segment]) -> Tensor:
     """Distance of each point (x, y) to the nearest segment, mm."""
-    check_tensor("x", x)
+    check_float_tensor("x", x)
+    check_float_tensor("y", y)
     check_sequence("segments", segments, "segments")
     check_shape("y", y, x.shape, "x")
     check_numbers("segments", list(segments), (max(1, len(segments)), 2, 2))

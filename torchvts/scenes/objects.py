@@ -11,10 +11,23 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..core.checks import check_integer, check_least, check_numbers, check_positive, check_shape, check_size
+from ..core.checks import (
+    check_dtype,
+    check_float_tensor,
+    check_integer,
+    check_least,
+    check_numbers,
+    check_positive,
+    check_seed,
+    check_shape,
+    check_size,
+)
 from ..core.geometry import normal_from_gradient, pixel_grid_mm
 from .letters import Segment, distance_to_segments, letter_segments
 from .surfaces import Scene, smooth_step
+
+MOST_PARTS = 10_000
+"""Most ribs, teeth or bumps of an object."""
 
 Height = Callable[[Tensor, Tensor], Tensor]
 """Height of an object, mm, as a function of u and v, mm."""
@@ -106,9 +119,11 @@ def press(
         0.5
     """
     check_size(height, width, mm_per_pixel, 3)
-    check_positive("fillet_mm", fillet_mm)
+    fillet_mm = check_positive("fillet_mm", fillet_mm)
+    check_dtype("dtype", dtype)
     if not callable(height_mm):
         raise TypeError(f"height_mm: expected a function of u and v, got {type(height_mm).__name__}: objects.stamp() makes one")
+    check_float_tensor("T_sensor_object", T_sensor_object)
     check_shape("T_sensor_object", T_sensor_object, (4, 4))
     transform = T_sensor_object.detach().double()
     turned = transform[:3, :3]
@@ -133,6 +148,9 @@ def press(
     u, v = (t.clone().requires_grad_() for t in at)
     with torch.enable_grad():
         relief = height_mm(u, v)
+        if not isinstance(relief, Tensor) or relief.shape != u.shape or not relief.requires_grad:
+            got = tuple(relief.shape) if isinstance(relief, Tensor) else type(relief).__name__
+            raise ValueError(f"height_mm: expected a function that gives {tuple(u.shape)} computed from u and v, got {got}")
         slope = torch.autograd.grad(relief.sum(), (u, v))
     relief = relief.detach()
     z = rotation[2, 0] * at[0] + rotation[2, 1] * at[1] + rotation[2, 2] * relief + shift[2]
@@ -161,7 +179,7 @@ def tool_handle() -> Height:
 
 def bottle_cap(ribs: int = 18) -> Height:
     """A round cap with a raised ring and ribs around it, 12 mm across."""
-    check_integer("ribs", ribs, 1)
+    check_integer("ribs", ribs, 1, MOST_PARTS)
 
     def height(u: Tensor, v: Tensor) -> Tensor:
         r, along, across = _fold(u, v, ribs)
@@ -185,7 +203,7 @@ def stamp(text: str = "VTS", size_mm: float = 4.2) -> Height:
 
 def bolt_head(across_flats_mm: float = 9.0) -> Height:
     """A hexagon head, slightly domed, with a round chamfer."""
-    check_positive("across_flats_mm", across_flats_mm)
+    across_flats_mm = check_positive("across_flats_mm", across_flats_mm)
 
     def height(u: Tensor, v: Tensor) -> Tensor:
         r, along, across = _fold(u, v, 6)
@@ -215,7 +233,7 @@ def key() -> Height:
 
 def gear(teeth: int = 12) -> Height:
     """A flat gear with a bore, 11 mm across."""
-    check_integer("teeth", teeth, 1)
+    check_integer("teeth", teeth, 1, MOST_PARTS)
 
     def height(u: Tensor, v: Tensor) -> Tensor:
         r, along, across = _fold(u, v, teeth)
@@ -227,8 +245,8 @@ def gear(teeth: int = 12) -> Height:
 
 def textured_patch(bumps: int = 60, radius_mm: float = 5.5, seed: int = 3) -> Height:
     """A round pad with bumps and dents of random sizes at random places."""
-    check_integer("bumps", bumps, 1), check_positive("radius_mm", radius_mm)
-    generator = torch.Generator().manual_seed(seed)
+    check_integer("bumps", bumps, 1, MOST_PARTS), check_positive("radius_mm", radius_mm)
+    generator = torch.Generator().manual_seed(check_seed("seed", seed))
     draws = torch.rand(bumps, 5, generator=generator, dtype=torch.float64)
     reach, turn = radius_mm * draws[:, 0].sqrt(), 2.0 * math.pi * draws[:, 1]
     places = torch.stack(
@@ -246,7 +264,7 @@ def textured_patch(bumps: int = 60, radius_mm: float = 5.5, seed: int = 3) -> He
 
 def sphere(radius_mm: float = 10.0) -> Height:
     """A ball; near its equator and beyond, the height stays constant."""
-    check_positive("radius_mm", radius_mm)
+    radius_mm = check_positive("radius_mm", radius_mm)
 
     def height(u: Tensor, v: Tensor) -> Tensor:
         return torch.sqrt((radius_mm**2 - u**2 - v**2).clamp_min(0.25 * radius_mm**2)) - radius_mm
@@ -256,7 +274,7 @@ def sphere(radius_mm: float = 10.0) -> Height:
 
 def cylinder(radius_mm: float = 6.0) -> Height:
     """An endless cylinder along u."""
-    check_positive("radius_mm", radius_mm)
+    radius_mm = check_positive("radius_mm", radius_mm)
 
     def height(u: Tensor, v: Tensor) -> Tensor:
         return torch.sqrt((radius_mm**2 - v**2).clamp_min(0.25 * radius_mm**2)) - radius_mm + 0.0 * u

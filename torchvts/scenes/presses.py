@@ -109,7 +109,7 @@ def cone_press(
     Returns:
         The scene.
     """
-    check_positive("half_angle_deg", half_angle_deg, 89.9)
+    half_angle_deg = check_positive("half_angle_deg", half_angle_deg, 89.9)
     check_positive("press_mm", press_mm), check_positive("tip_radius_mm", tip_radius_mm)
     check_numbers("center_mm", center_mm, (2,))
     wall = 1.0 / torch.tan(torch.deg2rad(torch.tensor(half_angle_deg, dtype=torch.float64)))

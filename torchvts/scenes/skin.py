@@ -37,7 +37,8 @@ def hanging_skin(object_mm: Tensor, reach_mm: float, mm_per_pixel: float, sweeps
         (0.5, 1)
     """
     check_batch("object_mm", object_mm, 1)
-    check_positive("reach_mm", reach_mm), check_positive("mm_per_pixel", mm_per_pixel), check_integer("sweeps", sweeps, 1)
+    reach_mm, mm_per_pixel = check_positive("reach_mm", reach_mm), check_positive("mm_per_pixel", mm_per_pixel)
+    check_integer("sweeps", sweeps, 1, 10_000)
     obstacle = object_mm.detach().clamp_min(0.0)
     depth = _solve(obstacle, (reach_mm / mm_per_pixel) ** 2, sweeps)
     gradient = gradient_of_depth(depth, mm_per_pixel)

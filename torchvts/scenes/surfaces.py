@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..core.checks import check_camera_height, check_positive, check_record, check_size, check_tensor
+from ..core.checks import check_camera_height, check_dtype, check_float_tensor, check_positive, check_record, check_size
 from ..core.geometry import normal_from_gradient, pixel_grid_mm
 from ..model.lights import seen_at
 
@@ -64,6 +64,7 @@ def surface(
         (1.0, False)
     """
     check_size(height, width, mm_per_pixel, 3)
+    check_dtype("dtype", dtype)
     if not callable(depth_mm):
         raise TypeError(f"depth_mm: expected a function of x and y, got {type(depth_mm).__name__}")
     with torch.inference_mode(False):
@@ -91,10 +92,11 @@ def surface_at(
     if not callable(depth_mm):
         raise TypeError(f"depth_mm: expected a function of x and y, got {type(depth_mm).__name__}")
     for name, place in (("x", x), ("y", y)):
-        check_tensor(name, place)
+        check_float_tensor(name, place)
     if x.dim() != 2 or x.shape != y.shape:
         raise ValueError(f"y: expected (H, W) like x, got {tuple(x.shape)} and {tuple(y.shape)}")
-    check_positive("mm_per_pixel", mm_per_pixel)
+    mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
+    check_dtype("dtype", dtype)
     with torch.inference_mode(False), torch.enable_grad():
         x, y = x.clone().requires_grad_(), y.clone().requires_grad_()
         depth = depth_mm(x, y)
@@ -143,6 +145,6 @@ def undeformed(scene: Scene) -> Scene:
 
 def smooth_step(t: Tensor) -> Tensor:
     """Step from 0 (below 0) to 1 (above 1) along the quintic whose first and second derivatives are zero at both ends."""
-    check_tensor("t", t)
+    check_float_tensor("t", t)
     t = t.clamp(0.0, 1.0)
     return t**3 * (10.0 - 15.0 * t + 6.0 * t**2)

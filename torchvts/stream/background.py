@@ -76,6 +76,8 @@ def find_background(images: Tensor, sensor: Sensor | None = None) -> tuple[Tenso
         ValueError: with the reason.
     """
     check_batch("images", images, 3)
+    if sensor is not None:
+        check_sensor("sensor", sensor)
     if images.shape[0] < 3:
         raise ValueError(f"images: expected at least 3 frames without contact, got {images.shape[0]}: the source is too short")
     _check_steady(images)

@@ -129,6 +129,8 @@ class FollowLight:
 
     def _check(self, image: Tensor) -> None:
         check_batch("image", image, 3)
+        if image.shape[0] != 1:
+            raise ValueError(f"image: expected one frame, (1, 3, H, W), got {list(image.shape)}: frames come one by one")
         check_same_size("image", image, "the background", *self.size)
 
     def _difference(self, image: Tensor) -> tuple[Tensor, Tensor]:

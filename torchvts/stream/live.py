@@ -148,7 +148,7 @@ class TactileStream:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         check_choice("mode", mode, MODES)
-        check_positive("time_constant_s", time_constant_s)
+        time_constant_s = check_positive("time_constant_s", time_constant_s)
         if not isinstance(sensor_or_calibration, Sensor | Calibration):
             raise TypeError(
                 f"sensor_or_calibration: expected a Sensor or a Calibration, got {type(sensor_or_calibration).__name__}"

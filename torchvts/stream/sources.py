@@ -11,11 +11,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_batch, check_integer, check_path
+from ..core.checks import brief, check_batch, check_image_size, check_integer, check_path
 from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, image_files, read_pixels
 from ..model import Sensor, check_sensor
 
 Pixels = np.ndarray[Any, Any]
+
+
+MOST_CAMERAS = 99
+"""Largest index of a camera: OpenCV takes the hundreds as the number of a driver, and crashes on negative ones."""
 
 
 class Unreadable(NamedTuple):
@@ -115,11 +119,14 @@ def open_source(source: str | int | Path) -> Reader:
         OSError: no such camera.
         ValueError: not a video, or no images.
     """
-    if not isinstance(source, int) or isinstance(source, bool):
-        check_path("source", source)
-    if isinstance(source, int) or str(source).isdigit():
-        return CaptureReader(int(str(source)))
-    path = Path(source)
+    if isinstance(source, int) and not isinstance(source, bool):
+        return CaptureReader(check_integer("source", source, 0, MOST_CAMERAS))
+    text = str(check_path("source", source))
+    if text.isascii() and text.isdigit():
+        if len(text) > 9 or int(text) > MOST_CAMERAS:
+            raise ValueError(f"source: expected a camera's index of at most {MOST_CAMERAS}, got {brief(text)}")
+        return CaptureReader(int(text))
+    path = Path(text)
     if path.is_dir():
         return FolderReader(path)
     if not path.is_file():
@@ -222,7 +229,7 @@ class Rectify(nn.Module):
     def __init__(self, sensor: Sensor, height: int, width: int) -> None:
         super().__init__()
         check_sensor("sensor", sensor)
-        check_integer("height", height, 1), check_integer("width", width, 1)
+        check_image_size("height", height, "width", width)
         self.sensor = sensor
         self.frame_size = (height, width)
         sensor.rectify(torch.zeros(1, 3, height, width))  # raises where it does not fit

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from ..core.checks import check_integer, check_least, check_range
+from ..core.checks import check_float_tensor, check_integer, check_least, check_range, check_switch, check_tensor
 from ..normals import NormalFromMLP
 from ..normals.mlp import MAX_GRADIENT, check_flat_shape
 
@@ -103,6 +103,7 @@ def fit_mlp(
         Wang, She, Romero, Adelson, ICRA 2021, for network and inputs; Loshchilov, Hutter, ICLR 2019, for AdamW.
     """
     _check_samples(intensity, xy, slope, groups)
+    check_switch("progress", progress)
     for name, value in (("max_epochs", max_epochs), ("patience", patience), ("batch_size", batch_size)):
         check_integer(name, value, 1)
     check_least("weight_decay", weight_decay), check_least("held_out", held_out, 0.0, 1.0)
@@ -221,14 +222,19 @@ def _check_samples(intensity: Tensor, xy: Tensor, slope: Tensor, groups: Tensor)
         got = tuple(intensity.shape) if isinstance(intensity, Tensor) else type(intensity).__name__
         raise ValueError(f"intensity: expected (N, 3), R, G, B of each pixel, got {got}")
     for name, values, shape in (("xy", xy, (count, 2)), ("slope", slope, (count, 2)), ("groups", groups, (count,))):
-        if not isinstance(values, Tensor) or tuple(values.shape) != shape:
-            got = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
-            raise ValueError(f"{name}: expected {shape}, one row for each of the {count} pixels of intensity, got {got}")
-    if not intensity.is_floating_point() or not slope.is_floating_point():
-        name, values = ("slope", slope) if intensity.is_floating_point() else ("intensity", intensity)
-        raise TypeError(f"{name}: expected floating point, got {values.dtype}: images are value / 255")
+        if not isinstance(values, Tensor) or values.is_nested or tuple(values.shape) != shape:
+            shown = str(tuple(values.shape)) if isinstance(values, Tensor) and not values.is_nested else type(values).__name__
+            raise ValueError(f"{name}: expected {shape}, one row for each of the {count} pixels of intensity, got {shown}")
+    for name, values in (("intensity", intensity), ("slope", slope)):
+        check_float_tensor(name, values)
+    check_tensor("xy", xy)
+    check_tensor("groups", groups)
+    if xy.is_complex():
+        raise TypeError(f"xy: expected columns and rows, got {xy.dtype}")
+    if groups.dtype not in (torch.int64, torch.int32):
+        raise TypeError(f"groups: expected int64, the press of each pixel, got {groups.dtype}")
     check_range("intensity", intensity)
-    if not bool(torch.isfinite(xy).all()):
+    if not bool(torch.isfinite(xy.double()).all()):
         raise ValueError("xy: expected finite pixels, got NaN or infinite")
     steepest = float(slope.abs().max())
     if not steepest <= MAX_GRADIENT:

@@ -46,12 +46,11 @@ class Followed(NamedTuple):
 def follow(keyframe: Keyframe, frame: Grids, starts: list[Array]) -> Followed:
     """Register a frame to a keyframe from the best of several poses: on the coarse grid, on some pixels, on many of them."""
     costs = [sum_residuals(frame.coarse, keyframe.coarse, start, SLOPE_NOISE).cost for start in starts]
-    pose, _ = refine(frame.coarse, keyframe.coarse, starts[int(np.argmin(costs))], COARSE_STEPS, 2.0 * SLOPE_NOISE, keyframe.held)
-    coarse = sum_residuals(frame.coarse, keyframe.coarse, pose, SLOPE_NOISE)
+    start = starts[int(np.argmin(costs))]
+    pose, coarse = refine(frame.coarse, keyframe.coarse, start, COARSE_STEPS, 2.0 * SLOPE_NOISE, keyframe.held, 0.02)
     free, names = _unknown(keyframe, coarse, pose)
-    pose, some = refine(frame.fine, keyframe.some, pose, SOME_STEPS, SLOPE_NOISE, free)
+    pose, some = refine(frame.fine, keyframe.some, pose, SOME_STEPS, SLOPE_NOISE, free, 2e-3)
     pose, fine = refine(frame.fine, keyframe.many, pose, 1, 1.5 * max(some.slope_noise, 0.01), free)
-    pose = orthonormal(pose)
     forth = sum_residuals(frame.coarse, keyframe.coarse, pose, SLOPE_NOISE)
     back_pixels = _pixels(frame.coarse)
     back = sum_residuals(keyframe.grids.coarse, back_pixels, np.linalg.inv(pose), SLOPE_NOISE)
@@ -101,7 +100,7 @@ def _pixels(field: Field) -> Pixels:
 
 def _unknown(keyframe: Keyframe, coarse: Sums, pose: Array) -> tuple[Array, list[str]]:
     """Motions that the common contact does not determine; those of the whole keyframe, if these are more."""
-    information = torch.from_numpy(coarse.matrix / max(coarse.count, 1))
+    information = torch.from_numpy(coarse.matrix * ((coarse.noise / SLOPE_NOISE) ** 2 / max(coarse.count, 1)))
     free, shifts = free_directions(information, keyframe.bias, LEAST_INFORMATION)
     if keyframe.held.shape[1] > free.shape[1]:
         free = torch.from_numpy(keyframe.held)

@@ -20,8 +20,8 @@ from .relief import Relief
 DEEP_MM, SHALLOW_MM = 0.06, 0.02
 """Reference pixels that should be deeper than this under a pose count in its score; in its refinement from the second on."""
 
-LEAST_NOISE, SMALL_STEP_MM, LARGEST_STEP_MM = 0.02, 1e-4, 0.6
-"""Slope noise down to which the weights narrow; a step at which refinement ends, and the largest one, mm at the contact."""
+LEAST_NOISE, LARGEST_STEP_MM = 0.02, 0.6
+"""Slope noise down to which the weights narrow, and the largest step, mm at the contact."""
 
 SCORE = (1.0 / (CUT * SLOPE_NOISE) ** 2, 1.0 / (CUT * DEPTH_NOISE_MM) ** 2)
 
@@ -97,16 +97,19 @@ def reference_pixels(part: Relief, relief: Relief, center: Tensor, units: Tensor
     return Pixels(rows, center.numpy(), units.numpy())
 
 
-def refine(field: Field, pixels: Pixels, pose: Array, steps: int, wide: float, held: Array | None = None) -> tuple[Array, Sums]:
+def refine(
+    field: Field, pixels: Pixels, pose: Array, steps: int, wide: float, held: Array | None = None, small_mm: float = 1e-4
+) -> tuple[Array, Sums]:
     """Gauss-Newton from a pose (4, 4) of the reference in the field's frame.
 
     Args:
         field: the new frame.
         pixels: of the reference.
         pose: to start from.
-        steps: largest number of steps; fewer if they become small.
+        steps: largest number of steps.
         wide: slope noise of the first step; it halves down to half as much again as the residuals.
         held: (6, k) orthonormal scaled twists that keep their value.
+        small_mm: a step so small, at the contact, is the last one.
     Returns:
         The pose, and the sums under the pose before the last step.
     """
@@ -116,7 +119,7 @@ def refine(field: Field, pixels: Pixels, pose: Array, steps: int, wide: float, h
         step = solve_step(sums, held)
         pose = pose @ _motion(step * pixels.units, pixels.center)
         noise = max(LEAST_NOISE, 1.5 * sums.slope_noise, 0.5 * noise)
-        if float(np.abs(step).max()) < SMALL_STEP_MM:
+        if float(np.abs(step).max()) < small_mm:
             break
     return pose, sums
 

@@ -15,13 +15,16 @@ from .ambiguity import field_with_fitted_curvature, find_unknown, information_of
 from .inverse import Array, Field, Pixels, reference_pixels
 from .relief import LEAST_PIXELS, DepthFrame, Levels, Relief, least_depth_mm, levels
 
-SOME, MANY = 2000, 12000
+SOME, MANY = 2000, 8000
 """Pixels of a reference for all steps of a refinement but the last, and for the last. They are evenly spread: pixels chosen by what
 they say of the motion lie on steep flanks, where slopes err most; with 4,000 of these the median rotation error of six objects was
 0.024 to 0.071 degrees, with 4,000 spread ones 0.018 to 0.036, with the two stages 0.012 to 0.024."""
 
 
 Image = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.uint8]
+
+_NEIGHBOURS = np.ones((3, 3), np.uint8)
 
 
 class Contact(NamedTuple):
@@ -75,32 +78,38 @@ def grids(frame: Contact, mm_per_pixel: float, least_mm: float, times: tuple[int
     z, contact = frame.depth_mm[0, 0].numpy(), frame.contact[0, 0].numpy().view(np.uint8)
     p, q = frame.gradient[0].numpy()
     height, width = z.shape
-    x0, y0 = -0.5 * (width - 1) * mm_per_pixel, 0.5 * (height - 1) * mm_per_pixel
-    inside = (contact & (z > least_mm)).astype(np.float32)
-    perhaps = np.maximum(contact, z > 0.3 * float(z.max())).astype(np.float32)
-    values = cv2.merge((z * inside, p * inside, -q * inside, inside))
-    corner = (x0, y0, mm_per_pixel)
+    grid = (-0.5 * (width - 1) * mm_per_pixel, 0.5 * (height - 1) * mm_per_pixel, mm_per_pixel)
+    inside = contact & (z > least_mm)
+    perhaps = contact | (z > 0.3 * float(z.max()))  # flat faces whose outline the image border cuts may be missing from the mask
+    up = -q
     if times[0] > 1:
-        fine = _pooled(values, perhaps, times[0], corner, 0.99)
+        fine = _pooled((z, p, up), inside, perhaps, times[0], grid, 0.99)
     else:
-        mask = 0.75 * cv2.erode(inside, np.ones((3, 3), np.uint8)) + 0.25 * cv2.dilate(perhaps, np.ones((3, 3), np.uint8))
-        fine = Field(torch.from_numpy(cv2.merge((z, p, -q, mask))), x0, y0, mm_per_pixel)
-    coarse = _pooled(values, perhaps, times[1], corner, 0.5)
+        mask = cv2.addWeighted(cv2.erode(inside, _NEIGHBOURS), 0.75, cv2.dilate(perhaps, _NEIGHBOURS), 0.25, 0.0, dtype=cv2.CV_32F)
+        fine = Field(torch.from_numpy(cv2.merge((z, p, up, mask))), *grid)
+    coarse = _pooled((z, p, up), inside, perhaps, times[1], grid, 0.5)
     return Grids(fine, coarse, int(torch.count_nonzero(coarse.channels[..., 3] > 0.999)))
 
 
-def _pooled(values: Image, perhaps: Image, times: int, corner: tuple[float, float, float], share: float) -> Field:
+def _pooled(
+    values: tuple[Image, Image, Image], inside: Mask, perhaps: Mask, times: int, grid: tuple[float, float, float], share: float
+) -> Field:
     """Means over the part of each cell of ``times`` x ``times`` pixels that lies on the object, which must be ``share`` of it."""
-    x0, y0, pitch = corner
-    height, width = (length // times for length in perhaps.shape)
-    both = [one[: height * times, : width * times] for one in (values, perhaps)]
-    mean, near = (cv2.resize(one, (width, height), interpolation=cv2.INTER_AREA) for one in both)
-    part = mean[..., 3]
-    mean[..., :3] /= np.maximum(part, 0.01)[..., None]
-    near = cv2.dilate((near > 0.01).astype(np.float32), np.ones((3, 3), np.uint8))
-    mean[..., 3] = np.where(part > share, 1.0, 0.25 * near)
+    x0, y0, pitch = grid
+    rows, columns = (length // times * times for length in inside.shape)
+    size = (columns // times, rows // times)
+
+    def mean(one: Image) -> Image:
+        return cv2.resize(one[:rows, :columns], size, interpolation=cv2.INTER_AREA)
+
+    within = inside.astype(np.float32)
+    part = mean(within)
+    scale = 1.0 / np.maximum(part, 0.01)
+    near = cv2.dilate((mean(perhaps.astype(np.float32)) > 0.01).astype(np.float32), _NEIGHBOURS)
+    means = [mean(cv2.multiply(one, within)) * scale for one in values]
+    channels = cv2.merge((*means, np.where(part > share, np.float32(1.0), np.float32(0.25) * near)))
     half = 0.5 * (times - 1) * pitch
-    return Field(torch.from_numpy(mean), x0 + half, y0 - half, times * pitch)
+    return Field(torch.from_numpy(channels), x0 + half, y0 - half, times * pitch)
 
 
 @dataclass(frozen=True, eq=False)

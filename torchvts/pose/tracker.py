@@ -137,7 +137,7 @@ class PoseTracker:
     def _track(self, contact: Contact, frame: Grids) -> TrackedPose:
         """Follow the object from its last pose."""
         last = self._poses[-1]
-        starts = [last] if len(self._poses) < 2 else [last, orthonormal(last @ np.linalg.inv(self._poses[0]) @ last)]
+        starts = [last] if len(self._poses) < 2 else [last, last @ np.linalg.inv(self._poses[0]) @ last]
         older = self._older_keyframe(frame, starts[-1])
         found = self._follow(self._active if older is None else older, frame, starts)
         if older is not None and not self._problem(older, found, starts):

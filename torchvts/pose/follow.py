@@ -1,5 +1,6 @@
 """A frame registered to a keyframe from poses that are nearly right, with what speaks for and against the result."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,8 @@ class Followed(NamedTuple):
         free: (6, k), scaled twists that the common contact does not determine.
         names: of these motions, in the frame's axes.
         covariance: (6, 6) of a small motion after the pose, rad and mm.
+        std_deg: standard deviation of the rotation, of what the contact determines of it, degrees.
+        std_mm: the same of the position of the contact, mm.
     """
 
     pose: Array
@@ -36,6 +39,8 @@ class Followed(NamedTuple):
     free: Array
     names: list[str]
     covariance: Array
+    std_deg: float
+    std_mm: float
 
     @property
     def agrees(self) -> bool:
@@ -58,7 +63,7 @@ def follow(keyframe: Keyframe, frame: Grids, starts: list[Array]) -> Followed:
     cost = (forth.cost * forth.compared + back.cost * back.compared) / compared
     fitness = (forth.fitness * forth.compared + back.fitness * back.compared) / compared
     overlap = max(forth.compared / len(keyframe.coarse.rows), back.compared / max(len(back_pixels.rows), 1))
-    return Followed(pose, fine, fitness, overlap, cost, free, names, _covariance(keyframe.many, fine, pose, free))
+    return Followed(pose, fine, fitness, overlap, cost, free, names, *_covariance(keyframe.many, fine, pose, free))
 
 
 def common_share(keyframe: Keyframe, frame: Grids, pose: Array) -> float:
@@ -119,16 +124,19 @@ def _pure_shifts(free: torch.Tensor) -> torch.Tensor:
     return shifts
 
 
-def _covariance(pixels: Pixels, fine: Sums, pose: Array, free: Array) -> Array:
-    """Covariance of a small motion after the pose: residuals that are alike over some pixels, and a height error alike over all."""
+def _covariance(pixels: Pixels, fine: Sums, pose: Array, free: Array) -> tuple[Array, float, float]:
+    """Covariance of a small motion after the pose, and the standard deviations of what the contact determines, degrees and mm.
+
+    Residuals are alike over some pixels, and an error of the height is alike over all of them.
+    """
     known = np.eye(6) - free @ free.T
-    matrix = known @ fine.matrix @ known
-    inverse = np.linalg.pinv(matrix, rcond=1e-9, hermitian=True)
-    scaled = inverse * ALIKE_PIXELS * (fine.slope_noise / fine.noise) ** 2
+    scaled = np.linalg.pinv(known @ fine.matrix @ known, rcond=1e-9, hermitian=True)
+    scaled *= ALIKE_PIXELS * (fine.slope_noise / fine.noise) ** 2
     scaled[5, 5] += fine.depth_noise**2
+    std_deg = math.degrees(math.sqrt(float(np.square(pixels.units[:3]) @ scaled.diagonal()[:3])))
+    std_mm = math.sqrt(float(scaled.diagonal()[3:].sum()))
     scaled += free @ free.T * UNKNOWN_VARIANCE
-    to_origin = np.zeros((6, 6))
-    to_origin[:3, :3], to_origin[3:, 3:] = np.diag(pixels.units[:3]), np.diag(pixels.units[3:])
+    to_origin = np.diag(pixels.units)
     to_origin[3:, :3] = cross(pixels.center) @ to_origin[:3, :3]
     after = adjoint(pose) @ to_origin
-    return after @ scaled @ after.T
+    return after @ scaled @ after.T, std_deg, std_mm

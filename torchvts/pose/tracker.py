@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..core.checks import check_positive
 from .ambiguity import UNKNOWN_VARIANCE
-from .direct import align, check_rigid
+from .direct import align, check_rigid, symmetries
 from .follow import Followed, common_share, cross, follow, orthonormal
 from .graph import Edge, KeyframeGraph, moved_covariance
 from .inverse import Array
@@ -20,6 +20,12 @@ from .result import Registration
 
 ENOUGH, RETURN = 0.5, 0.6
 """Share of the smaller contact in common below which a new keyframe is taken, and from which an older one is used again."""
+
+LEAST_CONTACT = 0.5
+"""Share of the reference's contact that a keyframe must have at least."""
+
+MOST_STD_DEG, MOST_STD_MM = 1.0, 0.15
+"""Standard deviations of a pose above which it is none."""
 
 JUMP_MM = 1.0
 """Motion of the contact between frames, beside the expected one, beyond which a pose is not taken: another one may look alike."""
@@ -104,7 +110,8 @@ class PoseTracker:
         self._poses: list[Array] = [np.eye(4)]  # the last two; only the last one after a search
         self._tracking = True
         self._symmetries: list[Array] = []
-        self._usual: deque[float] = deque(maxlen=30)
+        self._symmetries_of_reference: list[Array] | None = None
+        self._usual: deque[tuple[float, float]] = deque(maxlen=30)  # slope noise and cost
 
     def restart(self, T_target_source: Tensor) -> None:
         """Track on from a pose of the reference, (4, 4), such as one that the robot's arm reports."""
@@ -176,9 +183,11 @@ class PoseTracker:
         percent = f"{100 * found.fitness:.0f} % of the common contact agrees, which is {100 * found.overlap:.0f} % of the smaller one"
         if not found.agrees:
             return f"nothing fits near the last pose: {percent}: another part of the object, a jump, or another object"
-        usual = float(np.median(self._usual)) if len(self._usual) >= 3 else math.inf
+        usual = float(np.median([slope for slope, _ in self._usual])) if len(self._usual) >= 3 else math.inf
         if found.fine.slope_noise > RISE * usual:
             return f"slopes differ by {found.fine.slope_noise:.3f}, where {usual:.3f} is usual: a jump, or another object"
+        if found.std_deg > MOST_STD_DEG or found.std_mm > MOST_STD_MM:
+            return f"the contact is too small: standard deviations of {found.std_deg:.1f} degrees and {found.std_mm:.2f} mm"
         probe = self.graph.keyframes[index].probe
         pose = found.pose @ self.graph.poses[index]
         probe = (probe - self.graph.poses[index][:3, 3]) @ self.graph.poses[index][:3, :3]  # in the reference
@@ -201,6 +210,7 @@ class PoseTracker:
                 continue
             chain = self.graph.poses[index]
             equal = [T.numpy() @ chain for T in (registered.T_target_source, *registered.alternatives)]
+            equal += [equal[0] @ other for other in self._reference_symmetries()]
             probe = self.graph.keyframes[0].probe
             start = min(equal, key=lambda pose: _distance(probe, pose, self._poses[-1]))
             found = self._follow(index, frame, [start])
@@ -208,10 +218,18 @@ class PoseTracker:
             if message:
                 continue
             best = found.pose @ chain
-            self._symmetries = [np.linalg.inv(best) @ pose for pose in equal if pose is not start]
+            self._symmetries = [np.linalg.inv(best) @ pose for pose in _distinct(equal, start, probe)]
             self._active, self._tracking, self._poses = index, True, []
             return self._accept(contact, frame, found)
         return self._lose(f"not found again: {message}")
+
+    def _reference_symmetries(self) -> list[Array]:
+        """Motions after which the reference looks the same: continuity is lost, so each of them may have happened."""
+        if self._symmetries_of_reference is None:
+            cost = float(np.median([cost for _, cost in self._usual])) if self._usual else 0.05
+            found = symmetries(self.graph.keyframes[0].levels, cost)
+            self._symmetries_of_reference = [T.numpy() for T in found]
+        return self._symmetries_of_reference
 
     def _accept(self, contact: Contact, frame: Grids, found: Followed) -> TrackedPose:
         """Keep a pose, take a keyframe if it is time, and describe the pose."""
@@ -219,8 +237,9 @@ class PoseTracker:
         pose = orthonormal(found.pose @ graph.poses[index])
         drift = moved_covariance(found.pose, graph.covariances[index])
         self._poses = [*self._poses[-1:], pose]
-        self._usual.append(found.fine.slope_noise)
-        if common_share(graph.keyframes[index], frame, found.pose) < ENOUGH:
+        self._usual.append((found.fine.slope_noise, found.cost))
+        large = frame.count > LEAST_CONTACT * len(graph.keyframes[0].coarse.rows)
+        if large and common_share(graph.keyframes[index], frame, found.pose) < ENOUGH:
             self._take_keyframe(contact, found)
         message = f"{100 * found.fitness:.0f} % of the common contact agrees"
         if found.names:
@@ -261,3 +280,12 @@ def _distance(points: Array, one: Array, other: Array) -> float:
     """Root mean square distance of points (N, 3) under two poses (4, 4), mm."""
     off = points @ (one[:3, :3] - other[:3, :3]).T + one[:3, 3] - other[:3, 3]
     return math.sqrt(float(np.square(off).sum(1).mean()))
+
+
+def _distinct(poses: list[Array], first: Array, points: Array, least_mm: float = 0.4) -> list[Array]:
+    """Those of some poses (4, 4) that move the points to other places than ``first`` and than each other."""
+    kept = [first]
+    for pose in poses:
+        if all(_distance(points, pose, other) > least_mm for other in kept):
+            kept.append(pose)
+    return kept[1:]

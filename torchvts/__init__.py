@@ -21,7 +21,7 @@ from .integration import Integrator, PoissonDST, poisson_background, poisson_dct
 from .model import Calibration, PointLights, Sensor, gs_sdk, near_field_shading, shipped_sensors
 from .normals import NormalFromLookup, NormalFromMLP, NormalFromResponse, NormalModel
 from .pipeline import ConfidentPipeline, DepthOutput, DepthPipeline
-from .pose import register_depth, register_points
+from .pose import PoseTracker, register_depth, register_points
 
 __all__ = [
     "AdaptiveIntegration",
@@ -45,6 +45,7 @@ __all__ = [
     "PoissonBackground",
     "PoissonDCT",
     "PoissonDST",
+    "PoseTracker",
     "Press",
     "Result",
     "Sensor",

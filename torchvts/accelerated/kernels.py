@@ -89,7 +89,9 @@ def library() -> ctypes.CDLL | None:
     loaded.finish_depth.argtypes = [*[pointer] * 3, *[whole] * 7, pointer]
     loaded.largest_change.argtypes = [pointer, pointer, whole, step, pointer]
     loaded.uncrop.argtypes = [*[pointer] * 2, *[whole] * 7, *[pointer] * 3]
-    for name in ("grid_means", "solve_shadowed", "slopes", "to_columns", "finish_depth", "largest_change", "uncrop"):
+    loaded.alignment_sums.argtypes = [pointer, whole, whole, pointer, whole, pointer, pointer]
+    without_result = ("grid_means", "solve_shadowed", "slopes", "to_columns", "finish_depth", "largest_change", "uncrop")
+    for name in (*without_result, "alignment_sums"):
         getattr(loaded, name).restype = None
     return loaded
 
@@ -482,3 +484,11 @@ def zero_background(depth_mm: Tensor, deformed: Tensor, stiff: float, tolerance:
         )
     )
     return out
+
+
+def alignment_sums(field: Tensor, pixels: Tensor, numbers: Tensor) -> Tensor:
+    """Sums (63,) float64 of one Gauss-Newton step: see :mod:`torchvts.pose.inverse`, whose tensors these are, contiguous."""
+    sums = torch.empty(63, dtype=torch.float64)
+    inputs = (field.data_ptr(), field.shape[0], field.shape[1], pixels.data_ptr(), pixels.shape[0], numbers.data_ptr())
+    _loaded().alignment_sums(*inputs, sums.data_ptr())
+    return sums

@@ -4,5 +4,6 @@ from .clouds import contact_cloud, read_point_cloud, write_point_cloud
 from .direct import register_depth
 from .points import register_points
 from .result import Registration
+from .tracker import PoseTracker, TrackedPose
 
-__all__ = ["Registration", "contact_cloud", "read_point_cloud", "register_depth", "register_points", "write_point_cloud"]
+__all__ = ["PoseTracker", "Registration", "TrackedPose", "contact_cloud", "read_point_cloud", "register_depth", "register_points", "write_point_cloud"]

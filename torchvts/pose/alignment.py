@@ -163,9 +163,12 @@ def _score_one_way(source: Relief, target: Relief, poses: Tensor) -> tuple[Tenso
 
 def is_trusted(fit: Fit, k: int) -> bool:
     """Whether pose ``k`` agrees well enough, on a large enough part of the contact."""
-    # a small common part must agree nearly everywhere
-    fitness = LEAST_FITNESS if fit.overlap[k] >= LEAST_OVERLAP else SMALL_FITNESS
-    return bool(fit.fitness[k] >= fitness and fit.overlap[k] >= SMALL_OVERLAP and fit.cost[k] <= MOST_COST)
+    return agrees_enough(float(fit.fitness[k]), float(fit.overlap[k]), float(fit.cost[k]))
+
+
+def agrees_enough(fitness: float, overlap: float, cost: float) -> bool:
+    """The thresholds of :func:`is_trusted`: a small common part must agree nearly everywhere."""
+    return fitness >= (LEAST_FITNESS if overlap >= LEAST_OVERLAP else SMALL_FITNESS) and overlap >= SMALL_OVERLAP and cost <= MOST_COST
 
 
 def rank(fit: Fit) -> Tensor:

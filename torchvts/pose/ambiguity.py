@@ -57,9 +57,8 @@ def find_unknown(source: Relief, target: Relief, pose: Tensor, noise: float) -> 
     points, slopes = target.points, target.slopes
     back = invert(pose)[0].float()
     _, inside, _, _ = source.sample((points @ back[:3, :3].T + back[:3, 3])[:, :2])
-    bent = target._replace(field=_field_with_fitted_curvature(target))
-    bend = 1.5 / 6.0 * (noise / target.pitch / SLOPE_NOISE) ** 2  # of planes through 3 x 3 noisy slopes
-    bias = torch.diag(bend * torch.tensor([0.1, 0.1, 1.0, 1.0, 1.0, 0.1], dtype=torch.float64))
+    bent = target._replace(field=field_with_fitted_curvature(target))
+    bias = information_of_noise(noise, target.pitch)
     found = Unknown(torch.zeros(6, 0, dtype=torch.float64), [])
     for part in (inside, inside & (points[:, 2] > DEEP * points[:, 2].max())):
         if int(part.sum()) < 6 or (part is not inside and not _is_one_hill(target)):
@@ -77,6 +76,12 @@ def find_unknown(source: Relief, target: Relief, pose: Tensor, noise: float) -> 
             moved[3:] = moved[3:] - torch.linalg.cross(moved[:3], center[:, None].expand_as(moved[:3]), dim=0)
             found = Unknown(moved, name_directions(free, shifts))
     return found
+
+
+def information_of_noise(noise: float, pitch: float) -> Tensor:
+    """(6, 6), the information of a pixel that the noise of slopes alone causes, through planes fitted to 3 x 3 of them."""
+    bend = 1.5 / 6.0 * (noise / pitch / SLOPE_NOISE) ** 2
+    return torch.diag(bend * torch.tensor([0.1, 0.1, 1.0, 1.0, 1.0, 0.1], dtype=torch.float64))
 
 
 def free_directions(information: Tensor, bias: Tensor, least: float) -> tuple[Tensor, Tensor]:
@@ -185,7 +190,7 @@ def _rolls(source: Relief, target: Relief, pose: Tensor, trial: _Trial) -> Tenso
     return whole & (rise < noise) & (turned > (3.0 * rise).clamp_min(noise))
 
 
-def _field_with_fitted_curvature(relief: Relief) -> Tensor:
+def field_with_fitted_curvature(relief: Relief) -> Tensor:
     """The field with second derivatives from planes through the slopes of 3 x 3 pixels inside: the skin bends beyond the rim."""
     side = (-1.0, 0.0, 1.0)
     place = torch.tensor([[1.0, x, -y] for y in side for x in side])  # rows go down, y up

@@ -1,0 +1,261 @@
+"""Accuracy of tracking through the whole chain: render an object that moves, measure depth, track, compare."""
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from ..core.geometry import normal_from_gradient
+from ..integration import poisson_dct
+from ..model import PointLights
+from ..pipeline import DepthOutput, DepthPipeline
+from ..pose import PoseTracker, Registration, register_depth
+from ..pose.result import invert, turn_deg
+from ..scenes import objects, render
+from .pose_accuracy import GOAL_DEG, GOAL_MM, rig
+from .rows import markdown
+
+OBJECTS = ("key", "textured patch", "tool handle", "gear", "bottle cap", "bolt head")
+"""The six objects of the tracking bench."""
+
+NOISES = {"noise 0.002": (0.002, 0.0), "noise 0.005": (0.005, 0.0), "slopes off by 3 degrees": (0.005, 3.0)}
+"""Standard deviation of the image, and root mean square error of the slopes, degrees."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How an object moves.
+
+    Attributes:
+        frames: number of frames, the reference among them.
+        pose: T_sensor_object (4, 4) of a frame, from its number and a seed.
+        lost: frames that must be reported as lost.
+    """
+
+    frames: int
+    pose: Callable[[int, int], Tensor]
+    lost: tuple[int, ...] = ()
+
+
+def _phases(seed: int) -> list[float]:
+    return (2.0 * math.pi * torch.rand(5, generator=torch.Generator().manual_seed(seed))).tolist()
+
+
+def _sweep(turn_deg: float, frames: int, shift_mm: float = 1.0, tilt_deg: float = 2.5) -> Callable[[int, int], Tensor]:
+    """Yaw at an even rate, with shifts and tilts of such amplitudes on the way."""
+
+    def pose(k: int, seed: int) -> Tensor:
+        a, b, c, d, e = _phases(seed)
+        s = 2.0 * math.pi * k / (frames - 1)
+        shift = (shift_mm * (math.sin(s + a) - math.sin(a)), shift_mm * (math.sin(1.5 * s + b) - math.sin(b)))
+        tilt = (tilt_deg * math.sin(2.0 * s + c), tilt_deg * math.cos(1.5 * s + d))
+        return objects.pose(turn_deg * k / (frames - 1), shift, 0.45 + 0.1 * math.sin(s + e), tilt)
+
+    return pose
+
+
+def _partial(k: int, seed: int) -> Tensor:
+    """From the middle to beyond the edge of the image and back, tilted so that a part of the object touches."""
+    a, b = _phases(seed)[:2]
+    out = 7.0 * math.sin(math.pi * k / 39)
+    return objects.pose(1.0 * k, (out * math.cos(a), out * math.sin(a)), 0.4, (3.5 * math.sin(b + 0.1 * k), 3.5 * math.cos(b)))
+
+
+def _slip(k: int, seed: int) -> Tensor:
+    """Still, then 0.5 mm and 2 degrees from frame to frame for six frames, then still."""
+    a = _phases(seed)[0]
+    gone = float(min(max(k - 8, 0), 6))
+    return objects.pose(2.0 * gone, (0.5 * gone * math.cos(a), 0.5 * gone * math.sin(a)), 0.45, (1.0, 0.5))
+
+
+def _lift_off(k: int, seed: int) -> Tensor:
+    """Lifted off in five frames, away for four, put back elsewhere in five."""
+    a = _phases(seed)[0]
+    deep = 0.5 - 0.2 * min(max(k - 4, 0), max(18 - k, 0), 5)
+    back = k >= 11
+    return objects.pose(25.0 * back, (1.5 * math.cos(a) * back, 1.5 * math.sin(a) * back), deep)
+
+
+def _jump(k: int, seed: int) -> Tensor:
+    """Slow, then 3 mm and 40 degrees at once, then slow."""
+    a, jumped = _phases(seed)[0], float(k >= 10)
+    return objects.pose(0.5 * k + 40.0 * jumped, (3.0 * jumped * math.cos(a), 3.0 * jumped * math.sin(a)), 0.45, (1.0, 1.0))
+
+
+MOTIONS = {
+    "slow": Motion(40, _sweep(90.0, 40)),
+    "fast": Motion(14, _sweep(90.0, 14)),
+    "full turn": Motion(120, _sweep(360.0, 120)),
+    "partial contact": Motion(40, _partial),
+    "slip": Motion(20, _slip),
+    "lift-off": Motion(24, _lift_off, (9, 10, 11, 12, 13)),
+    "jump": Motion(20, _jump, (10,)),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """An object that moves, as a sensor measures it: the poses T_sensor_object (4, 4), and the frames."""
+
+    poses: list[Tensor]
+    frames: list[DepthOutput]
+    mm_per_pixel: float
+
+
+@dataclass
+class TrackRow:
+    """One object under one motion and one noise.
+
+    Attributes:
+        name: of the object.
+        motion: of the object.
+        noise: of the images.
+        deg: rotation error of each frame that was not lost, degrees.
+        mm: error of the position of the object's origin, mm.
+        ms: time of each frame, ms.
+        lost: numbers of the frames that were lost.
+        unnoticed: frames that must be lost and were not.
+        wrong: frames that are confident, with no motion or pose in question, and outside of the goal of the pose bench.
+        drift_deg: rotation error at the end, per 360 degrees of yaw.
+    """
+
+    name: str
+    motion: str
+    noise: str
+    deg: list[float] = field(default_factory=list)
+    mm: list[float] = field(default_factory=list)
+    ms: list[float] = field(default_factory=list)
+    lost: list[int] = field(default_factory=list)
+    unnoticed: list[int] = field(default_factory=list)
+    wrong: list[int] = field(default_factory=list)
+    drift_deg: float = math.nan
+
+
+def record(
+    target: objects.Target, motion: Motion, noise: tuple[float, float], seed: int, unit: tuple[PointLights, DepthPipeline]
+) -> Track:
+    """Render and measure an object that moves; 320 x 240, 8 bits.
+
+    Args:
+        target: the object.
+        motion: its motion.
+        noise: standard deviation of the image, and error of the slopes in degrees, as of :data:`NOISES`.
+        seed: of motion and noise.
+        unit: lights and pipeline, as of :func:`torchvts.evaluation.pose_accuracy.rig`.
+    """
+    lights, pipe = unit
+    poses = [motion.pose(k, seed) for k in range(motion.frames)]
+    frames = []
+    for k, pose in enumerate(poses):
+        scene = objects.press(target.height_mm, pose, 240, 320, pipe.mm_per_pixel)
+        with torch.inference_mode():
+            frame = pipe(render(scene, lights, noise_std=noise[0], bits=8, seed=1000 * seed + k))
+        frames.append(wrong_slopes(frame, noise[1], seed, pipe.mm_per_pixel) if noise[1] > 0 else frame)
+    return Track(poses, frames, pipe.mm_per_pixel)
+
+
+def wrong_slopes(frame: DepthOutput, error_deg: float, seed: int, mm_per_pixel: float) -> DepthOutput:
+    """A frame whose slopes err as those of a calibrated sensor do: smoothly over the image, partly in proportion to the slope.
+
+    Args:
+        frame: one frame.
+        error_deg: root mean square error inside the contact, degrees.
+        seed: of the unit: its error is the same in all frames.
+        mm_per_pixel: pixel pitch, mm.
+    Returns:
+        The frame with wrong slopes inside the deformed area, and the depth that they have.
+    """
+    generator = torch.Generator().manual_seed(seed + 77)
+    maps = interpolate(torch.randn(1, 6, 4, 5, generator=generator), frame.depth_mm.shape[-2:], mode="bicubic", align_corners=True)
+    slope, inside = frame.gradient, frame.deformed.float()
+    gain = torch.stack(((maps[:, :2] * slope).sum(1), (maps[:, 2:4] * slope).sum(1)), 1)
+    error = (maps[:, 4:] / maps[:, 4:].std() + gain / (gain * inside).square().mean().sqrt().clamp_min(1e-6)) * inside
+    size = (error.square().sum(1, keepdim=True)[frame.contact]).mean().sqrt() if bool(frame.contact.any()) else error.new_tensor(1.0)
+    gradient = slope + error * (math.tan(math.radians(error_deg)) / size)
+    depth = poisson_dct(gradient, mm_per_pixel)
+    outside = ~frame.deformed
+    depth = (depth - (depth[outside].median() if bool(outside.any()) else 0.0)) * inside
+    return frame._replace(gradient=gradient, depth_mm=depth, normal=normal_from_gradient(gradient))
+
+
+def follow_track(track: Track, target: objects.Target, motion: Motion, row: TrackRow) -> TrackRow:
+    """Track all frames against the first one, and fill the row."""
+    tracker = PoseTracker(track.frames[0], track.mm_per_pixel)
+    for k in range(1, len(track.frames)):
+        start = time.perf_counter()
+        found = tracker(track.frames[k])
+        row.ms.append(1000.0 * (time.perf_counter() - start))
+        if found.lost:
+            row.lost.append(k)
+            continue
+        deg, mm = tracking_error(found, track, k)
+        row.deg.append(deg), row.mm.append(mm)
+        within = deg <= GOAL_DEG and mm <= GOAL_MM
+        if found.converged and not found.ambiguous and not within:
+            row.wrong.append(k)
+        row.drift_deg = deg
+    row.unnoticed = sorted(set(motion.lost) - set(row.lost))
+    turned = turn_deg(track.poses[-1] @ invert(track.poses[-2])) * (len(track.poses) - 1)
+    row.drift_deg *= 360.0 / max(float(turned), 1.0)
+    return row
+
+
+def tracking_error(found: Registration, track: Track, k: int) -> tuple[float, float]:
+    """Degrees and mm of the pose, or of the nearest one that it calls equally good."""
+    truth, middle = track.poses[k] @ invert(track.poses[0]), track.poses[k][:3, 3]
+    errors = []
+    for T in (found.T_target_source, *found.alternatives):
+        off = T @ invert(truth)
+        errors.append((float(turn_deg(off)), float((off[:3, :3] @ middle + off[:3, 3] - middle).norm())))
+    return min(errors)
+
+
+def run_tracking(
+    names: Sequence[str] = OBJECTS,
+    motions: Sequence[str] = tuple(MOTIONS),
+    noises: Sequence[str] = tuple(NOISES),
+    seed: int = 1,
+) -> Iterator[tuple[TrackRow, Track]]:
+    """Track objects under all motions and noises, one row after the other."""
+    unit = rig()
+    for name in names:
+        target = {**objects.TARGETS, **objects.FREE_TARGETS}[name]
+        for motion in motions:
+            for noise in noises:
+                track = record(target, MOTIONS[motion], NOISES[noise], seed, unit)
+                yield follow_track(track, target, MOTIONS[motion], TrackRow(name, motion, noise)), track
+
+
+def register_each(track: Track) -> tuple[list[float], list[float], list[float]]:
+    """Degrees, mm and ms of :func:`register_depth` on the same frames, each against the first."""
+    results = []
+    for k in range(1, len(track.frames)):
+        start = time.perf_counter()
+        try:
+            found = register_depth(track.frames[0], track.frames[k], track.mm_per_pixel)
+        except ValueError:  # no contact
+            continue
+        results.append((*tracking_error(found, track, k), 1000.0 * (time.perf_counter() - start)))
+    deg, mm, ms = zip(*results, strict=True)
+    return list(deg), list(mm), list(ms)
+
+
+def tracking_table(rows: Sequence[TrackRow]) -> str:
+    """The rows as a Markdown table."""
+    titles = ["object", "motion", "noise", "angle deg, median / worst", "position mm, median / worst", "drift deg per 360"]
+    titles += ["lost frames", "lost, not noticed", "confident and wrong", "ms, median"]
+    lines = []
+    for row in rows:
+        deg, mm = (f"{_median(v):.3f} / {max(v, default=math.nan):.3f}" for v in (row.deg, row.mm))
+        drift = f"{row.drift_deg:.2f}" if row.motion == "full turn" else ""
+        counts = [str(len(row.lost)), str(len(row.unnoticed)), str(len(row.wrong))]
+        lines.append([row.name, row.motion, row.noise, deg, mm, drift, *counts, f"{_median(row.ms):.1f}"])
+    return markdown(titles, lines)
+
+
+def _median(values: Sequence[float]) -> float:
+    return float(torch.tensor(values, dtype=torch.float64).median()) if values else math.nan

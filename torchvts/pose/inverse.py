@@ -1,0 +1,202 @@
+"""Inverse compositional alignment: a pose is moved so that a new frame, seen from the reference, agrees with the reference.
+
+The pulled-back slopes of the new frame minus those of the reference have, near the right pose, the derivatives of the reference with
+respect to its own motion. So they are computed once per reference. Slopes count more than heights, as in :mod:`.alignment`.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from ..accelerated import kernels
+from ..accelerated.gate import usable
+from .alignment import CUT, DEPTH_DRIFT_MM, DEPTH_NOISE_MM, SLOPE_NOISE, linearise
+from .relief import Relief
+
+DEEP_MM, SHALLOW_MM = 0.06, 0.02
+"""Reference pixels that should be deeper than this under a pose count in its score; in its refinement from the second on."""
+
+LEAST_NOISE, LARGEST_STEP_MM = 0.02, 0.6
+"""Slope noise down to which the weights narrow, and the largest step, mm at the contact."""
+
+SCORE = (1.0 / (CUT * SLOPE_NOISE) ** 2, 1.0 / (CUT * DEPTH_NOISE_MM) ** 2)
+
+Array = npt.NDArray[np.float64]
+
+
+class Field(NamedTuple):
+    """A frame on one grid, y up.
+
+    Attributes:
+        channels: (H, W, 4), z (mm), slopes p and q, and a mask: 1 where the skin surely lies on the object, 0 where it surely does
+            not, between them where it may.
+        x0: position of the upper left pixel, mm.
+        y0: the same, y up.
+        pitch: distance of pixels, mm.
+    """
+
+    channels: Tensor
+    x0: float
+    y0: float
+    pitch: float
+
+
+class Pixels(NamedTuple):
+    """Pixels of a reference and their derivatives by a scaled twist about ``center``.
+
+    Attributes:
+        rows: (N, 32), x, y, z, p, q, three zeros, and the rows of p, q and z of the Jacobian, each six and two zeros.
+        center: (3,), mm.
+        units: (6,), rad and mm: the twist that is one of each, so that all six are lengths at the contact.
+    """
+
+    rows: Tensor
+    center: Array
+    units: Array
+
+
+class Sums(NamedTuple):
+    """Sums over the reference's pixels under one pose.
+
+    Attributes:
+        matrix: (6, 6), weighted J^T J in units of the noise.
+        right: (6,), weighted J^T r.
+        count: pixels in both contacts.
+        slope_noise: weighted root mean square of slope residuals, per component.
+        depth_noise: the same of height residuals, mm.
+        cost: mean truncated residual of the pixels that are compared, 0 to 1.
+        fitness: share of them that agrees.
+        compared: number of them.
+        noise: slope noise of the weights.
+    """
+
+    matrix: Array
+    right: Array
+    count: int
+    slope_noise: float
+    depth_noise: float
+    cost: float
+    fitness: float
+    compared: float
+    noise: float
+
+
+def reference_pixels(part: Relief, relief: Relief, center: Tensor, units: Tensor) -> Pixels:
+    """Pixels of a part of a relief, with the derivatives that the relief's field has there."""
+    lin = linearise(part, relief, torch.eye(4, dtype=torch.float64)[None], center[None, None])
+    rows = torch.zeros(len(part.points), 32)
+    rows[:, :3], rows[:, 3:5] = part.points, part.slopes
+    scale = units.float()
+    rows[:, 8:14] = lin.slope_by_twist[0, :, 0] * scale
+    rows[:, 16:22] = lin.slope_by_twist[0, :, 1] * scale
+    rows[:, 24:30] = lin.height_by_twist[0] * scale
+    return Pixels(rows, center.numpy(), units.numpy())
+
+
+def refine(
+    field: Field, pixels: Pixels, pose: Array, steps: int, wide: float, held: Array | None = None, small_mm: float = 1e-4
+) -> tuple[Array, Sums]:
+    """Gauss-Newton from a pose (4, 4) of the reference in the field's frame.
+
+    Args:
+        field: the new frame.
+        pixels: of the reference.
+        pose: to start from.
+        steps: largest number of steps.
+        wide: slope noise of the first step; it halves down to half as much again as the residuals.
+        held: (6, k) orthonormal scaled twists that keep their value.
+        small_mm: a step so small, at the contact, is the last one.
+    Returns:
+        The pose, and the sums under the pose before the last step.
+    """
+    noise = wide
+    for _ in range(steps):
+        sums = sum_residuals(field, pixels, pose, noise)
+        step = solve_step(sums, held)
+        pose = pose @ _motion(step * pixels.units, pixels.center)
+        noise = max(LEAST_NOISE, 1.5 * sums.slope_noise, 0.5 * noise)
+        if float(np.abs(step).max()) < small_mm:
+            break
+    return pose, sums
+
+
+def solve_step(sums: Sums, held: Array | None = None) -> Array:
+    """The scaled twist (6,) that the sums ask for.
+
+    What they do not determine is chosen so that rotations keep their value before shifts do: a ball that moves sideways is
+    followed by a shift, not by a roll.
+    """
+    matrix, right = sums.matrix, sums.right
+    if held is not None and held.shape[1] > 0:
+        known = np.eye(6) - held @ held.T
+        matrix, right = known @ matrix @ known, known @ right
+    damping = 1e-6 * max(float(np.trace(matrix)), 1e-9)
+    step: Array = -np.linalg.solve(matrix + damping * np.diag([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3]), right)
+    return step * min(1.0, LARGEST_STEP_MM / max(float(np.linalg.norm(step)), 1e-12))
+
+
+def _motion(twist: Array, center: Array) -> Array:
+    """The rigid motion (4, 4) of :func:`torchvts.pose.result.motion`, by Rodrigues' formula: a tenth of its time."""
+    x, y, z = twist[:3].tolist()
+    angle = math.sqrt(x * x + y * y + z * z)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    first, second = (math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2) if angle > 1e-9 else (1.0, 0.5)
+    result = np.eye(4)
+    result[:3, :3] += first * cross + second * (cross @ cross)
+    result[:3, 3] = twist[3:] + center - result[:3, :3] @ center
+    return result
+
+
+def sum_residuals(field: Field, pixels: Pixels, pose: Array, slope_noise: float) -> Sums:
+    """Sums of one Gauss-Newton step with Cauchy's weights, and the score of the pose (4, 4), from the reference to the field."""
+    limits = (field.x0, field.y0, field.pitch, slope_noise**-2, DEPTH_DRIFT_MM**-2, *SCORE, DEEP_MM, SHALLOW_MM)
+    numbers = torch.from_numpy(np.concatenate((pose[:3, :3].ravel(), pose[:3, 3], limits)))
+    by = kernels.alignment_sums if usable(field.channels, pixels.rows) else alignment_sums
+    total = by(field.channels, pixels.rows, numbers).numpy()
+    matrix = total[:56].reshape(7, 8)
+    count, weight, off, high, bad, good, compared = total[56:].tolist()
+    most = max(compared, 1.0)
+    slope, depth = math.sqrt(0.5 * off / max(weight, 1e-9)), math.sqrt(high / max(weight, 1e-9))
+    return Sums(matrix[:6, :6], matrix[:6, 6], int(count), slope, depth, bad / most, good / most, compared, slope_noise)
+
+
+def alignment_sums(channels: Tensor, rows: Tensor, numbers: Tensor) -> Tensor:
+    """Sums (63,) float64: 7 x 8 products of the Jacobian with itself and the residual, then seven of the score."""
+    n = [float(v) for v in numbers[12:]]
+    rotation, shift = numbers[:9].reshape(3, 3).float(), numbers[9:12].float()
+    height, width = channels.shape[:2]
+    moved = rows[:, :3] @ rotation.T + shift
+    column, row = (moved[:, 0] - n[0]) / n[2], (n[1] - moved[:, 1]) / n[2]
+    seen = (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
+    rows, moved, column, row = rows[seen], moved[seen], column[seen], row[seen]
+    z, p, q, mask = _between(channels, row, column).unbind(1)
+    inside, near = mask > 0.999, mask > 0.001
+    back = torch.stack((-p, -q, torch.ones_like(p)), 1) @ rotation
+    slope = -back[:, :2] / back[:, 2:].clamp_min(0.05) - rows[:, 3:5]
+    residual = torch.cat((slope, (z - moved[:, 2])[:, None]), 1)  # (N, 3)
+    off, high = slope.square().sum(1), residual[:, 2].square()
+    counted = (moved[:, 2] > n[7]) & (inside | ~near)
+    error = torch.where(inside, off * n[5] + high * n[6], 1.0).clamp_max(1.0)
+    used = inside & (moved[:, 2] > n[8])
+    weight = used / (1.0 + 0.25 * (off * n[3] + high * n[4]))
+    lines = rows[:, 8:].reshape(-1, 3, 8).clone()
+    lines[:, :, 6] = residual
+    scaled = lines * (weight[:, None, None] * lines.new_tensor([n[3], n[3], n[4]])[:, None])
+    products = torch.einsum("nri,nrk->ik", scaled[..., :7].double(), lines.double())
+    score = (used.sum(), weight.sum(), (weight * off).sum(), (weight * high).sum())
+    score += (error[counted].sum(), (error[counted] < 1.0).sum(), counted.sum())
+    return torch.cat((products.reshape(-1), torch.stack([s.double() for s in score])))
+
+
+def _between(channels: Tensor, row: Tensor, column: Tensor) -> Tensor:
+    """The channels (N, 4) between pixels, bilinearly."""
+    height, width = channels.shape[:2]
+    top, left = row.long().clamp_max(height - 2), column.long().clamp_max(width - 2)
+    down, along = (row - top)[:, None], (column - left)[:, None]
+    upper = (1 - along) * channels[top, left] + along * channels[top, left + 1]
+    lower = (1 - along) * channels[top + 1, left] + along * channels[top + 1, left + 1]
+    return (1 - down) * upper + down * lower

@@ -1,0 +1,291 @@
+"""Tracking: the pose of a touched object in every frame, from its pose in the last one."""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..core.checks import check_positive
+from .ambiguity import UNKNOWN_VARIANCE
+from .direct import align, check_rigid, symmetries
+from .follow import Followed, common_share, cross, follow, orthonormal
+from .graph import Edge, KeyframeGraph, moved_covariance
+from .inverse import Array
+from .keyframe import Contact, Grids, Unusable, contact_frame, grids, make_keyframe, pitch_by_slopes
+from .relief import DepthFrame, levels
+from .result import Registration
+
+ENOUGH, RETURN = 0.5, 0.6
+"""Share of the smaller contact in common below which a new keyframe is taken, and from which an older one is used again."""
+
+LEAST_CONTACT = 0.5
+"""Share of the reference's contact that a keyframe must have at least."""
+
+MOST_STD_DEG, MOST_STD_MM = 1.0, 0.15
+"""Standard deviations of a pose above which it is none."""
+
+JUMP_MM = 1.0
+"""Motion of the contact between frames, beside the expected one, beyond which a pose is not taken: another one may look alike."""
+
+RISE = 3.0
+"""A residual of so many times the usual one of a track is no noise."""
+
+PITCH_RATIO = 1.5
+"""Ratio of the pitch that depth and slopes of the reference have, and the one given, beyond which it is another unit."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedPose(Registration):
+    """Pose of the reference in a frame: a :class:`Registration` whose source is the reference and whose target is the frame.
+
+    Attributes:
+        lost: why there is no pose, in words; empty if there is one. Then the last pose is given, with ``converged`` False.
+        keyframe: index of the keyframe that the frame was compared with; 0 is the reference.
+        drift_deg: standard deviation of the rotation that the way over keyframes adds, degrees; 0 for the reference.
+        drift_mm: the same of the position of the contact, mm.
+    """
+
+    lost: str = ""
+    keyframe: int = 0
+    drift_deg: float = 0.0
+    drift_mm: float = 0.0
+
+
+class PoseTracker:
+    """The pose of a touched object in every frame, beginning with a reference: ``tracker(frame)``.
+
+    Each frame is aligned with a keyframe from the last pose: Gauss-Newton on the slopes and heights of all pixels that touch in
+    both, with derivatives computed once per keyframe. Motions that the contact does not determine keep their value and are named
+    in ``ambiguous``. Where the contact has little in common with the reference any more, frames become keyframes in turn; where an
+    older keyframe is seen again, the loop is closed and the drift since is spread over it. A pose that contradicts the frame is
+    not returned: ``lost`` says why, and the next frames are searched as :func:`register_depth` does, until the object is found.
+
+    Args:
+        reference: the first frame, a :class:`torchvts.DepthOutput` or any object with its depth_mm, gradient and contact.
+        mm_per_pixel: pitch of all frames, mm.
+    Attributes:
+        graph: the keyframes and their poses.
+        closures: how far each closed loop contradicted the poses before, (degrees, mm).
+    Raises:
+        TypeError: no DepthOutput.
+        ValueError: no contact, or one too small or too faint; a pitch that depth and slopes of the reference contradict.
+    Source:
+        inverse compositional: Baker, Matthews, IJCV 56(3), 2004; normals of tactile images by Gauss-Newton: Huang, Kaess, Yuan,
+        NormalFlow, arXiv 2412.09617.
+    Example:
+        >>> from torchvts.scenes import objects
+        >>> press = lambda deg, x: objects.press(objects.stamp("T"), objects.pose(deg, (x, 0.0)), 96, 128, 0.125)
+        >>> tracker = PoseTracker(press(0.0, 0.0), 0.125)
+        >>> found = [tracker(press(2.0 * k, 0.1 * k)) for k in range(4)]
+        >>> round(math.degrees(math.acos(float(found[3].T_target_source[0, 0]))), 1), found[3].lost
+        (6.0, '')
+        >>> tracker(press(40.0, 5.0)).converged
+        False
+    """
+
+    def __init__(self, reference: DepthFrame, mm_per_pixel: float) -> None:
+        self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
+        self.reset(reference)
+
+    def reset(self, reference: DepthFrame) -> None:
+        """Begin anew with another reference; all keyframes are forgotten."""
+        try:
+            frame = contact_frame(reference)
+        except Unusable as error:
+            raise ValueError(f"reference: expected a contact with relief, got {error}") from None
+        keyframe = make_keyframe(frame, self.mm_per_pixel)
+        found = pitch_by_slopes(frame)
+        if not 1.0 / PITCH_RATIO < found / self.mm_per_pixel < PITCH_RATIO:
+            raise ValueError(
+                f"mm_per_pixel: expected about {found:.3g}, by depth and slopes of the reference, got {self.mm_per_pixel:g}: another "
+                "sensor's, or another unit?"
+            )
+        self.graph = KeyframeGraph(keyframe)
+        self.closures: list[tuple[float, float]] = []
+        self._size = tuple(frame.depth_mm.shape[-2:])
+        self._active = 0
+        self._poses: list[Array] = [np.eye(4)]  # the last two; only the last one after a search
+        self._tracking = True
+        self._symmetries: list[Array] = []
+        self._symmetries_of_reference: list[Array] | None = None
+        self._usual: deque[tuple[float, float]] = deque(maxlen=30)  # slope noise and cost
+
+    def restart(self, T_target_source: Tensor) -> None:
+        """Track on from a pose of the reference, (4, 4), such as one that the robot's arm reports."""
+        self._poses, self._tracking, self._symmetries = [check_rigid("T_target_source", T_target_source).numpy()], True, []
+
+    def __call__(self, frame: DepthFrame) -> TrackedPose:
+        """Pose of the reference in a frame.
+
+        Args:
+            frame: one frame, as the reference.
+        Returns:
+            The pose; ``lost`` says why there is none.
+        Raises:
+            TypeError: no DepthOutput.
+            ValueError: not one frame.
+        """
+        try:
+            contact = contact_frame(frame)
+            size = tuple(contact.depth_mm.shape[-2:])
+            if size != self._size:
+                raise Unusable(f"expected {self._size[0]} x {self._size[1]} pixels like the reference, got {size[0]} x {size[1]}")
+        except Unusable as error:
+            return self._lose(str(error))
+        reference = self.graph.keyframes[0]
+        made = grids(contact, self.mm_per_pixel, reference.least_mm, reference.times)
+        if made.count < 12:
+            return self._lose("hardly any contact")
+        return self._track(contact, made) if self._tracking else self._search(contact, made)
+
+    def _track(self, contact: Contact, frame: Grids) -> TrackedPose:
+        """Follow the object from its last pose."""
+        last = self._poses[-1]
+        starts = [last] if len(self._poses) < 2 else [last, last @ np.linalg.inv(self._poses[0]) @ last]
+        older = self._older_keyframe(frame, starts[-1])
+        found = self._follow(self._active if older is None else older, frame, starts)
+        if older is not None and not self._problem(older, found, starts):
+            self._close_loop(older, found, self._follow(self._active, frame, starts), starts)
+        elif older is not None:
+            found = self._follow(self._active, frame, starts)
+        problem = self._problem(self._active, found, starts)
+        if problem:
+            return self._lose(problem)
+        return self._accept(contact, frame, found)
+
+    def _follow(self, index: int, frame: Grids, starts: list[Array]) -> Followed:
+        to_reference = np.linalg.inv(self.graph.poses[index])
+        return follow(self.graph.keyframes[index], frame, [start @ to_reference for start in starts])
+
+    def _older_keyframe(self, frame: Grids, expected: Array) -> int | None:
+        """The oldest keyframe before the present one that the frame probably has much in common with."""
+        for k in range(self._active):
+            pose = expected @ np.linalg.inv(self.graph.poses[k])
+            if common_share(self.graph.keyframes[k], frame, pose) > RETURN:
+                return k
+        return None
+
+    def _close_loop(self, older: int, found: Followed, also: Followed, starts: list[Array]) -> None:
+        """Link the present keyframe with an older one by a frame that is registered to both, and go on with the older one."""
+        if not self._problem(self._active, also, starts):
+            pose = np.linalg.inv(also.pose) @ found.pose
+            covariance = moved_covariance(np.linalg.inv(also.pose), found.covariance + also.covariance)
+            twist = self.graph.close(Edge(older, self._active, orthonormal(pose), covariance))
+            middle = twist[3:] + np.cross(twist[:3], self.graph.keyframes[self._active].many.center)
+            self.closures.append((math.degrees(float(np.linalg.norm(twist[:3]))), float(np.linalg.norm(middle))))
+        self._active = older
+
+    def _problem(self, index: int, found: Followed, starts: list[Array]) -> str:
+        """Why a pose cannot be trusted; empty if it can."""
+        percent = f"{100 * found.fitness:.0f} % of the common contact agrees, which is {100 * found.overlap:.0f} % of the smaller one"
+        if not found.agrees:
+            return f"nothing fits near the last pose: {percent}: another part of the object, a jump, or another object"
+        usual = float(np.median([slope for slope, _ in self._usual])) if len(self._usual) >= 3 else math.inf
+        if found.fine.slope_noise > RISE * usual:
+            return f"slopes differ by {found.fine.slope_noise:.3f}, where {usual:.3f} is usual: a jump, or another object"
+        if found.std_deg > MOST_STD_DEG or found.std_mm > MOST_STD_MM:
+            return f"the contact is too small: standard deviations of {found.std_deg:.1f} degrees and {found.std_mm:.2f} mm"
+        probe = self.graph.keyframes[index].probe
+        pose = found.pose @ self.graph.poses[index]
+        probe = (probe - self.graph.poses[index][:3, 3]) @ self.graph.poses[index][:3, :3]  # in the reference
+        moved = min(_distance(probe, pose, start) for start in starts)
+        if moved > JUMP_MM:
+            return f"a jump of {moved:.1f} mm at the contact: another pose may look alike"
+        return ""
+
+    def _search(self, contact: Contact, frame: Grids) -> TrackedPose:
+        """Search for the object without its last pose, by the reference and by the present keyframe."""
+        try:
+            reliefs = levels(contact, self.mm_per_pixel, "frame")
+        except ValueError as error:
+            return self._lose(str(error))
+        message = ""
+        for index in dict.fromkeys((0, self._active)):
+            registered = align(self.graph.keyframes[index].levels, reliefs, None)
+            message = message or registered.message
+            if not registered.converged:
+                continue
+            chain = self.graph.poses[index]
+            equal = [T.numpy() @ chain for T in (registered.T_target_source, *registered.alternatives)]
+            equal += [equal[0] @ other for other in self._reference_symmetries()]
+            probe = self.graph.keyframes[0].probe
+            start = min(equal, key=lambda pose: _distance(probe, pose, self._poses[-1]))
+            found = self._follow(index, frame, [start])
+            message = self._problem(index, found, [start])
+            if message:
+                continue
+            best = found.pose @ chain
+            self._symmetries = [np.linalg.inv(best) @ pose for pose in _distinct(equal, start, probe)]
+            self._active, self._tracking, self._poses = index, True, []
+            return self._accept(contact, frame, found)
+        return self._lose(f"not found again: {message}")
+
+    def _reference_symmetries(self) -> list[Array]:
+        """Motions after which the reference looks the same: continuity is lost, so each of them may have happened."""
+        if self._symmetries_of_reference is None:
+            cost = float(np.median([cost for _, cost in self._usual])) if self._usual else 0.05
+            found = symmetries(self.graph.keyframes[0].levels, cost)
+            self._symmetries_of_reference = [T.numpy() for T in found]
+        return self._symmetries_of_reference
+
+    def _accept(self, contact: Contact, frame: Grids, found: Followed) -> TrackedPose:
+        """Keep a pose, take a keyframe if it is time, and describe the pose."""
+        graph, index = self.graph, self._active
+        pose = orthonormal(found.pose @ graph.poses[index])
+        drift = moved_covariance(found.pose, graph.covariances[index])
+        self._poses = [*self._poses[-1:], pose]
+        self._usual.append((found.fine.slope_noise, found.cost))
+        large = frame.count > LEAST_CONTACT * len(graph.keyframes[0].coarse.rows)
+        if large and common_share(graph.keyframes[index], frame, found.pose) < ENOUGH:
+            self._take_keyframe(contact, found)
+        message = f"{100 * found.fitness:.0f} % of the common contact agrees"
+        if found.names:
+            message += f"; kept, because the surface slides on itself: {', '.join(found.names)}"
+        center = found.pose[:3, :3] @ graph.keyframes[index].many.center + found.pose[:3, 3]
+        to_center = np.hstack((-cross(center), np.eye(3)))
+        return TrackedPose(
+            T_target_source=torch.from_numpy(pose.copy()),
+            rmse_mm=found.fine.depth_noise,
+            fitness=found.fitness,
+            converged=True,
+            message=message,
+            covariance=torch.from_numpy(found.covariance + drift),
+            ambiguous=found.names,
+            alternatives=[torch.from_numpy(pose @ other) for other in self._symmetries],
+            overlap=found.overlap,
+            keyframe=index,
+            drift_deg=math.degrees(math.sqrt(float(np.trace(drift[:3, :3])))),
+            drift_mm=math.sqrt(float(np.trace(to_center @ drift @ to_center.T))),
+        )
+
+    def _take_keyframe(self, contact: Contact, found: Followed) -> None:
+        try:
+            keyframe = make_keyframe(contact, self.mm_per_pixel)
+        except ValueError:
+            return  # too faint to be one
+        self._active = self.graph.add(keyframe, self._active, found.pose, found.covariance)
+
+    def _lose(self, reason: str) -> TrackedPose:
+        """No pose: the last one, as of no certainty."""
+        self._tracking = False
+        unknown = torch.eye(6, dtype=torch.float64) * UNKNOWN_VARIANCE
+        last = torch.from_numpy(self._poses[-1].copy())
+        return TrackedPose(last, math.inf, 0.0, False, f"lost: {reason}", unknown, overlap=0.0, lost=reason, keyframe=self._active)
+
+
+def _distance(points: Array, one: Array, other: Array) -> float:
+    """Root mean square distance of points (N, 3) under two poses (4, 4), mm."""
+    off = points @ (one[:3, :3] - other[:3, :3]).T + one[:3, 3] - other[:3, 3]
+    return math.sqrt(float(np.square(off).sum(1).mean()))
+
+
+def _distinct(poses: list[Array], first: Array, points: Array, least_mm: float = 0.4) -> list[Array]:
+    """Those of some poses (4, 4) that move the points to other places than ``first`` and than each other."""
+    kept = [first]
+    for pose in poses:
+        if all(_distance(points, pose, other) > least_mm for other in kept):
+            kept.append(pose)
+    return kept[1:]

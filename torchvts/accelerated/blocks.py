@@ -10,8 +10,7 @@ from .. import compensate, contact, integration, normals
 from ..compensate.drift import grid_stride
 from ..core import frame as frames
 from ..core import geometry
-from ..core.checks import check_same_size
-from ..core.checks import check_batch
+from ..core.checks import check_batch, check_same_size
 from ..core.noise import second_differences, std_from_median
 from ..integration import background
 from ..normals.shadowed import PRIOR_STD, STEPS, LightView

@@ -323,7 +323,7 @@ def response_unit():
         background,
         torch.full((3,), 0.004),
         True,
-        {"model": "response_field", "source": "given"},
+        {"model": "response", "source": "given"},
         ResponseModel(field, by_depth),
     )
     y, x = torch.arange(120.0)[:, None] - 50.0, torch.arange(160.0)[None, :] - 90.0

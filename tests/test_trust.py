@@ -14,6 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchvts as vts
 from torchvts.accelerated import reference_only
+from torchvts.core.frame import Crop
 from torchvts.model.response_field import ResponseField, ResponseModel
 
 HEIGHT, WIDTH, PITCH = 96, 128, 0.25
@@ -340,3 +341,41 @@ def test_gradients_stop_outside_the_deformed_area() -> None:
     assert bool(reached.any())
     assert not bool((reached & ~out.deformed).any())
     assert "reaches them from outside ``deformed``" in (vts.DepthPipeline.from_calibration.__doc__ or "")
+
+
+def tensors_beside_buffers(module: torch.nn.Module) -> list[Tensor]:
+    """Tensors that ``module.to(device)`` does not move."""
+    found: list[Tensor] = []
+    for part in module.modules():
+        for name, value in vars(part).items():
+            if not name.startswith(("_parameters", "_buffers", "_modules")):
+                found += [one for one in (value if isinstance(value, list | tuple) else [value]) if isinstance(one, Tensor)]
+    return found
+
+
+@pytest.mark.parametrize("kind", ["lights", "response"])
+def test_fast_asks_a_device_for_nothing_but_the_parts_of_a_mask(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the meta device, which has no values: reading one raises, and so does an operator that gets a tensor left on the CPU."""
+    pipe = vts.DepthPipeline.from_calibration(unit_of(kind)).to("meta")
+    images = torch.zeros(2, 3, HEIGHT, WIDTH, device="meta")
+    with pytest.raises(RuntimeError, match=r"item\(\)"):
+        pipe(images)  # connected parts: a loop until nothing is gained
+    monkeypatch.setattr(type(pipe.deformed), "reconstruct", lambda self, seed, mask: seed & mask)
+    out = pipe(images)
+    assert all(tensor.device.type == "meta" for tensor in (*out, *tensors_beside_buffers(pipe)))
+    assert len(tensors_beside_buffers(pipe)) > 0  # the tables of the Poisson solver
+
+
+@pytest.mark.parametrize("mode", ["fast", "precise"])
+@pytest.mark.parametrize("kind", ["lights", "response"])
+def test_the_way_that_asks_for_nothing_gives_the_same_depth(kind: str, mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    pipe, images = vts.DepthPipeline.from_calibration(unit_of(kind), mode).double(), dissimilar().double()
+    images = images if mode == "fast" else images[1:4:2]
+    expected = pipe(images)
+    for place in ("compensate.drift", "contact.masks", "normals.shadowed"):
+        monkeypatch.setattr(f"torchvts.{place}.may_read", lambda tensor: False)
+    monkeypatch.setattr(Crop, "finds_window", lambda self, images: False)
+    with reference_only():
+        found = pipe(images)
+    assert torch.equal(found.deformed, expected.deformed)
+    assert float((found.depth_mm - expected.depth_mm).abs().max()) < 1e-5

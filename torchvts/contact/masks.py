@@ -18,6 +18,7 @@ from ..core.checks import (
     check_positive,
     check_record,
     check_same_size,
+    may_read,
     may_read_values,
 )
 from ..core.noise import clipped_std, sample_stride
@@ -162,7 +163,7 @@ class ContactMask(nn.Module):
         """The change of a compensated image, in units of the calibrated noise."""
         change = torch.addcmul(self.offset, compensated, self.per_noise)
         failed = self.black(compensated)
-        if not may_read_values() or bool(failed.any()):
+        if not may_read(failed) or bool(failed.any()):
             failed = failed & (failed.to(torch.uint8).sum(dim=1, keepdim=True) == 1)
             change = change * (~failed)[:, :, None, None].to(change.dtype)
         noise = torch.maximum(self.noise(change.detach()), self.far_field(change.detach())).clamp_min(1.0)
@@ -208,7 +209,7 @@ class ContactMask(nn.Module):
         any_strong = density > 0
         faint = self.faint(change) & ~any_strong  # where single pixels stand out, as at a rim, they decide
         cells = any_strong | faint
-        if may_read_values() and not bool(cells.any()):
+        if may_read(cells) and not bool(cells.any()):
             return strong, strong
         filled = self.filled(cells)
         # a hole counts as contact; faint cells too, but it takes three that lie together, for one of ten thousand is chance
@@ -229,7 +230,7 @@ class ContactMask(nn.Module):
 
     def filled(self, mask: Tensor) -> Tensor:
         """The mask without its holes: background that the border does not reach."""
-        if may_read_values():  # a mask of one run a row, as most contacts are, has none
+        if may_read(mask):  # a mask of one run a row, as most contacts are, has none
             starts = mask[..., 1:] & ~mask[..., :-1]
             runs = starts.to(torch.uint8).sum(dim=3, dtype=torch.int32) + mask[..., 0]
             if int(runs.amax()) <= 1:

@@ -208,6 +208,11 @@ def may_read_values() -> bool:
         return not torch.compiler.is_compiling()
 
 
+def may_read(tensor: Tensor) -> bool:
+    """Whether Python may branch on a tensor's values to save work: on a CPU, because elsewhere it waits for the device. Scripts."""
+    return may_read_values() and tensor.device.type == "cpu"
+
+
 def reads_freely(tensor: Tensor) -> bool:
     """Whether Python may compare the values of a tensor at once: a plain one on a CPU, in eager mode."""
     if torch.compiler.is_compiling() or tensor.device.type != "cpu" or torch._C._get_tracing_state() is not None:

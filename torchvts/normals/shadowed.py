@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_shape, may_read_values
+from ..core.checks import check_shape, may_read, may_read_values
 from ..core.geometry import gradient_from_normal, normal_from_gradient, slope_beside_cliff
 from ..model.lights import light_matrix, seen_at
 
@@ -212,12 +212,13 @@ class ShadowedPixels(nn.Module):
             expected: (B, 2, h, w), slopes to start from where there is no depth; None for those of ``normal``.
         """
         limits = self.limits(image, view.window)
-        if may_read_values() and self.all_valid(image, limits):
+        if may_read(image) and self.all_valid(image, limits):
             return normal
         dark = image < limits.dark_below
         failed = failed_leds(dark)
         invalid = dark | (image >= limits.saturated_above) | failed[:, :, None, None]
-        b, row, column = torch.where(invalid.any(dim=1) | limits.ill_conditioned)
+        wanted = invalid.any(dim=1) | limits.ill_conditioned
+        b, row, column = _places(wanted)
         start = gradient_from_normal(normal[b, :, row, column][:, :, None, None])[:, :, 0, 0]
         if expected is not None:
             start = expected[b, :, row, column]
@@ -239,13 +240,14 @@ class ShadowedPixels(nn.Module):
         pixels = Pixels(start, intensity * (~lost).to(intensity.dtype), rows, saturated)
         slope = slope_by_lit_lights(pixels, self.noise_std, self.brightness_std)
         solution = normal_from_gradient(slope[:, :, None, None])[:, :, 0, 0]
+        solution = torch.where(wanted[b, row, column][:, None], solution, normal[b, :, row, column])
         return normal.permute(0, 2, 3, 1).index_put((b, row, column), solution).permute(0, 3, 1, 2)
 
     @torch.jit.export
     def blocked(self, image: Tensor, window: tuple[int, int]) -> Tensor:
         """Where one or two of the lights that shine on the flat skin are dark, (B, 1, h, w) bool; a failed LED is not counted."""
         below = self.limits(image, window).dark_below
-        if may_read_values() and bool((image.detach() - below).amin() >= 0.0):
+        if may_read(image) and bool((image.detach() - below).amin() >= 0.0):
             return torch.zeros_like(image[:, 0:1], dtype=torch.bool)
         dark = image < below
         return (dark & ~failed_leds(dark)[:, :, None, None]).any(dim=1, keepdim=True)
@@ -283,6 +285,17 @@ class ShadowedPixels(nn.Module):
             reflected = normal - plane * (2.0 * along / plane.square().sum(dim=1, keepdim=True).clamp_min(1e-30))
             result = torch.where(one & towards & dark[:, light : light + 1], reflected, result)
         return gradient_from_normal(result)
+
+
+def _places(wanted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Frame, row and column of the wanted pixels, (B, h, w) bool; on a GPU of all, because their number would be waited for."""
+    if may_read_values() and not may_read(wanted):
+        height, width = wanted.shape[1], wanted.shape[2]
+        place = torch.arange(wanted.numel(), device=wanted.device)
+        pixel = place % (height * width)
+        return place // (height * width), pixel // width, pixel % width
+    b, row, column = torch.where(wanted)
+    return b, row, column
 
 
 def _slope_at(depth_mm: Tensor, b: Tensor, row: Tensor, column: Tensor, mm_per_pixel: float) -> Tensor:

@@ -1,5 +1,6 @@
 """Depth of cameras, videos and folders of images, frame by frame; late frames are dropped, slow drift of the light is followed."""
 
+from .aside import Aside
 from .background import (
     FIRST_FRAMES,
     calibrate_background,
@@ -18,6 +19,7 @@ from .usable import FrameCheck
 
 __all__ = [
     "FIRST_FRAMES",
+    "Aside",
     "FollowLight",
     "FrameCheck",
     "NewestFrame",

@@ -21,6 +21,7 @@ import torch
 import torchvts as vts
 from torchvts import stream as streams
 from torchvts.core.files import read_frames, rgb_from_bgr
+from torchvts.evaluation.latency import measure_latency
 
 ROOT = Path(__file__).resolve().parents[1]
 PITCH = 0.25
@@ -710,3 +711,40 @@ def test_a_raw_video_of_a_mini_runs_without_a_camera(data, run_stream, tmp_path,
     assert done.returncode == 0, done.stderr
     rows = [row.split(",") for row in (tmp_path / "out" / "frames.csv").read_text().splitlines()[1:]]
     assert min(float(row[3]) for row in rows[14:17]) > 0.3 and max(float(row[3]) for row in rows[:14] + rows[17:]) < 0.02
+
+
+def test_work_beside_the_stream_keeps_its_order_and_counts_what_it_drops():
+    """Of what comes faster than it is worked on, some is dropped and counted; a recording waits instead; errors come back."""
+    started, go, done = threading.Event(), threading.Event(), []
+
+    def work(number):
+        started.set()
+        go.wait(5.0)
+        done.append(number)
+
+    with streams.Aside(work, most_waiting=2) as aside:
+        assert aside.put(0) and started.wait(5.0)  # being worked on: two more may wait
+        assert [aside.put(number) for number in range(1, 6)] == [True, True, False, False, False]
+        go.set()
+    assert done == [0, 1, 2] and aside.dropped == 3
+    with streams.Aside(done.append, most_waiting=1, keeps_all=True) as aside:
+        assert all(aside.put(number) for number in range(3, 50))
+    assert done == list(range(50)) and aside.dropped == 0
+    with pytest.raises(ZeroDivisionError), streams.Aside(lambda number: 1 // number, most_waiting=1, keeps_all=True) as aside:
+        for number in range(100):
+            aside.put(number)
+
+
+@pytest.mark.parametrize("slow", [False, True])
+def test_a_camera_in_real_time(unit, slow, monkeypatch):
+    """Depth of every frame in order, or of the newest where depth takes longer than a frame: none is lost without being counted."""
+    calibration, camera = unit
+    if slow:
+        pipeline = vts.DepthPipeline.forward
+        monkeypatch.setattr(vts.DepthPipeline, "forward", lambda self, images: (time.sleep(0.05), pipeline(self, images))[1])
+    found = measure_latency(calibration, [camera(), camera(0.5), camera(1.0)], fps=60.0, frames=40)
+    assert found.numbers == sorted(set(found.numbers)) and found.numbers[-1] < found.arrived == 40
+    assert len(found.numbers) + found.dropped == found.arrived and min(found.delay_ms) > 0.0
+    assert 0 < found.drawn <= len(found.numbers)
+    if slow:
+        assert found.dropped > 0 and found.percentile(50.0) > 50.0

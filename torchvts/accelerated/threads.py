@@ -4,6 +4,7 @@ import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from itertools import pairwise
 
 import torch
@@ -28,7 +29,7 @@ def one_suffices(images: Tensor) -> bool:
     return images.shape[0] * images.shape[2] * images.shape[3] <= MOST_PIXELS
 
 
-class OneThread:
+class OneThread(AbstractContextManager[None]):
     """Within it, torch's operators run in the calling thread.
 
     The number of threads is each thread's own, but threads that torch sees for the first time start with the last one set: the

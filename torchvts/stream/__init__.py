@@ -1,6 +1,7 @@
 """Depth of cameras, videos and folders of images, frame by frame; late frames are dropped, slow drift of the light is followed."""
 
 from . import messages
+from .aside import Aside
 from .background import (
     FIRST_FRAMES,
     NOT_METRIC,
@@ -21,6 +22,7 @@ from .usable import FrameCheck
 __all__ = [
     "FIRST_FRAMES",
     "NOT_METRIC",
+    "Aside",
     "FollowLight",
     "FrameCheck",
     "NewestFrame",

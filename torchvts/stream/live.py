@@ -4,7 +4,7 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ..accelerated.threads import MOST_PIXELS, OneThread
 from ..calibration import Press
 from ..core.checks import check_choice, check_integer, check_positive
 from ..core.files import rgb_from_bgr
@@ -239,16 +240,23 @@ class TactileStream:
 
     def __iter__(self) -> Iterator[TactileFrame]:
         for index, time_s, pixels in self._frames():
-            with self.stages.stage("rectify"):
-                raw, reason = self._usable(pixels)
-            if raw is None:
+            with self._threads(pixels):
+                with self.stages.stage("rectify"):
+                    raw, reason = self._usable(pixels)
+                found = None if raw is None else self.recording(raw, time_s)
+            if found is None:
                 self.left_out.append((index, reason))
                 warnings.warn(f"frame {index} left out: {reason}", stacklevel=2)
                 continue
-            image, output = self.recording(raw, time_s)
+            image, output = found
             assert output is not None
             yield TactileFrame(index, time_s, image[0], output)
             self.stages.end_frame()
+
+    def _threads(self, pixels: Pixels | Unreadable) -> AbstractContextManager[None]:
+        """A small frame is worked on in one thread: others would wake up late, as frames lie apart."""
+        small = not isinstance(pixels, Unreadable) and pixels.shape[0] * pixels.shape[1] <= MOST_PIXELS
+        return OneThread() if small else nullcontext()
 
     def _usable(self, pixels: Pixels | Unreadable) -> tuple[Tensor | None, str]:
         """A frame rectified; or None, and why it cannot be used."""

@@ -33,12 +33,7 @@ class Item(NamedTuple):
     @property
     def is_video(self) -> bool:
         """Whether it is a video."""
-        return self.is_text and self.path.lower().endswith(VIDEO_SUFFIXES)
-
-    @property
-    def is_text(self) -> bool:
-        """Whether the name is UTF-8; OpenCV crashes on others."""
-        return not any("\ud800" <= letter <= "\udfff" for letter in self.path)
+        return self.path.lower().endswith(VIDEO_SUFFIXES)
 
     def file(self, source: Path) -> Path:
         """The file itself; ``source`` is the folder, or the file where the source is a single one."""
@@ -46,11 +41,25 @@ class Item(NamedTuple):
 
     def frame_name(self, number: int) -> str:
         """Name of a frame in tables and messages; ``number`` is negative for an image."""
-        return self.path if number < 0 else f"{self.path}/{number:06d}"
+        name = one_line(self.path)
+        return name if number < 0 else f"{name}/{number:06d}"
 
     def frame_stem(self, number: int) -> str:
         """Stem of the results of a frame; ``number`` is negative for an image."""
         return self.stem if number < 0 else f"{self.stem}_{number:06d}"
+
+
+def one_line(text: str) -> str:
+    """A text with control characters, line ends and what is not UTF-8 as backslash escapes.
+
+    Example:
+        >>> one_line("a\\nb.png")
+        'a\\\\nb.png'
+    """
+    return "".join(
+        repr(letter)[1:-1] if letter < " " or letter in "\x7f\x85\u2028\u2029" or "\ud800" <= letter <= "\udfff" else letter
+        for letter in text
+    )
 
 
 def list_items(source: str | Path) -> Iterator[Item]:
@@ -76,13 +85,23 @@ def _walk(folder: Path, prefix: str) -> Iterator[Item]:
     with os.scandir(folder) as entries:
         kept = sorted((entry for entry in entries if not entry.name.startswith(".")), key=lambda entry: entry.name)
     suffixes = IMAGE_SUFFIXES + VIDEO_SUFFIXES
-    stems = output_stems([entry.name for entry in kept if entry.name.lower().endswith(suffixes) and entry.is_file()])
+    stems = output_stems([entry.name for entry in kept if entry.name.lower().endswith(suffixes) and not _is_folder(entry)])
     for entry in kept:
         if entry.name in stems:
-            status = entry.stat()
+            try:
+                status = entry.stat()
+            except OSError:  # a link that leads nowhere, or to itself: said when it is read
+                status = entry.stat(follow_symlinks=False)
             yield Item(prefix + entry.name, prefix + stems[entry.name], (status.st_size, status.st_mtime_ns))
         elif entry.is_dir(follow_symlinks=False) and not (folder / entry.name / STATE).is_dir():
             yield from _walk(folder / entry.name, f"{prefix}{entry.name}/")
+
+
+def _is_folder(entry: "os.DirEntry[str]") -> bool:
+    try:
+        return entry.is_dir()
+    except OSError:  # a link to itself
+        return False
 
 
 def output_stems(names: list[str]) -> dict[str, str]:

@@ -7,6 +7,7 @@ frames that were being worked on.
 
 import csv
 import json
+import math
 import os
 import re
 import shutil
@@ -16,9 +17,12 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from ..core.files import write_atomically
+from ..core.files import naming, write_atomically
 from ..stream import FIRST_FRAMES
-from .items import STATE, Item, has_few_frames, list_items
+from .items import STATE, Item, has_few_frames, list_items, one_line
+
+RESULT_ENDINGS = ("_depth.png", "_depth.npy", ".pcd", ".ply", "_picture.png")
+"""What the names of a frame's results end in, after its stem; all formats."""
 
 Record = dict[str, Any]
 """``mark`` of the source file; then ``deepest_mm`` and ``contact_mm2`` of a frame, ``frames`` of a whole video, or ``failed``, the
@@ -48,6 +52,7 @@ def begin(out: Path, settings: Settings, overwrite: bool) -> Settings:
         ValueError: the run was begun with other settings.
     """
     if overwrite:
+        _remove_results(out)
         shutil.rmtree(out / STATE / "frames", ignore_errors=True)
         for path in (out / STATE / "settings.json", out / "frames.csv", out / "failed.csv"):
             path.unlink(missing_ok=True)
@@ -64,6 +69,36 @@ def begin(out: Path, settings: Settings, overwrite: bool) -> Settings:
         for name in filter(incomplete.fullmatch, names):
             Path(folder, name).unlink(missing_ok=True)
     return settings
+
+
+def _remove_results(out: Path) -> None:
+    """Remove the files of every frame that an earlier run recorded, whatever its formats were."""
+    records = out / STATE / "frames"
+    for folder, _, names in os.walk(records):
+        for name in names:
+            stem = out / Path(folder).relative_to(records) / name.removesuffix(".json")
+            for ending in RESULT_ENDINGS:
+                Path(f"{stem}{ending}").unlink(missing_ok=True)
+
+
+def _has_content(path: str) -> bool:
+    """Whether a file is there and not empty, as a full disk leaves it."""
+    try:
+        return os.path.isfile(path) and os.path.getsize(path) > 0
+    except OSError:
+        return False
+
+
+def _is_record(record: object) -> bool:
+    """Whether this is a record as :meth:`Records.write` writes it."""
+    if not isinstance(record, dict) or not isinstance(record.get("mark"), list):
+        return False
+    if "failed" in record:
+        return isinstance(record["failed"], str)
+    if "frames" in record:
+        return isinstance(record["frames"], int) and record["frames"] >= 0
+    figures = [record.get(name) for name in ("deepest_mm", "contact_mm2")]
+    return all(isinstance(value, float | int) and not isinstance(value, bool) and math.isfinite(value) for value in figures)
 
 
 def join(out: Path, settings: Settings) -> Settings:
@@ -125,21 +160,24 @@ class Records:
     def write(self, item: Item, frame: int, **figures: Any) -> None:
         """Write the record of a frame (-1 for an image, or for a whole video) after its files are in place."""
         path = self._path(item, frame)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps({"mark": item.mark, **figures}), encoding="utf-8")
+        with naming(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(json.dumps({"mark": item.mark, **figures}), encoding="utf-8")
 
     def read(self, item: Item, frame: int) -> Record | None:
-        """The record of a frame; None where there is none, a kill has cut it short, or the source file has changed since."""
+        """The record of a frame; None where there is none, it is damaged, or the source file has changed since."""
         try:
             record = json.loads(self._path(item, frame).read_bytes())
-        except (OSError, ValueError):
+        except (OSError, ValueError, RecursionError):
             return None
-        return record if isinstance(record, dict) and record.get("mark") == list(item.mark) else None
+        return record if _is_record(record) and record["mark"] == list(item.mark) else None
 
     def is_done(self, item: Item, frame: int) -> bool:
         """Whether the result of a frame is there, whole."""
         record = self.read(item, frame)
-        return record is not None and "failed" not in record and all(map(os.path.isfile, self._files(item, frame, record)))
+        if record is None or "failed" in record or "deepest_mm" not in record:
+            return False
+        return all(map(_has_content, self._files(item, frame, record)))
 
     def length(self, video: Item) -> int | None:
         """Number of frames of a video; None where no process has decoded it to its end."""
@@ -198,6 +236,19 @@ class Records:
         return count, failed
 
 
+def as_cell(text: str) -> str:
+    """A text as a cell of a CSV table: one line, and none that a spreadsheet takes for a formula.
+
+    Before =, +, - and @ stands an apostrophe, which spreadsheets hide.
+
+    Example:
+        >>> as_cell("=1+2.png"), as_cell("a.png")
+        ("'=1+2.png", 'a.png')
+    """
+    line = one_line(text)
+    return f"'{line}" if line.startswith(("=", "+", "-", "@")) else line
+
+
 def _write_csv(path: Path, head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> None:
     with (
         write_atomically(path) as temporary,
@@ -205,4 +256,4 @@ def _write_csv(path: Path, head: tuple[str, ...], rows: Iterable[tuple[str, ...]
     ):
         table = csv.writer(stream, lineterminator="\n")
         table.writerow(head)
-        table.writerows(rows)
+        table.writerows((as_cell(row[0]), *row[1:]) if head[1] != "reason" else tuple(map(as_cell, row)) for row in rows)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from ..core.checks import check_integer, check_path, check_positive, check_tensor
-from ..core.files import write_atomically
+from ..core.files import check_text_name, write_atomically
 from ..core.geometry import depth_to_points
 from .cloud_formats import read_columns
 from .relief import DepthFrame, contact_of, sure_contact
@@ -113,6 +113,7 @@ def write_point_cloud(path: str | Path, points: Tensor, normals: Tensor | None =
     path = check_path("path", path)
     if path.suffix.lower() not in CLOUD_SUFFIXES:
         raise ValueError(f"{path}: expected a name ending in {' or '.join(CLOUD_SUFFIXES)}, got {path.suffix!r}")
+    check_text_name("path", path, "Open3D")
     o3d = open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(_array("points", points, None)))
     if normals is not None:

@@ -280,15 +280,18 @@ def test_listing_is_sorted_by_folder_and_name(tmp_path):
     assert paths == ["a/b/c.PNG", "a/z.png", "a-b.png", "a.png", "b.png"] and paths == sorted(paths, key=lambda p: p.split("/"))
 
 
-def test_a_name_that_is_no_text_is_left_out(unit, tmp_path):
+def test_an_image_whose_name_is_no_text_is_read_and_such_a_video_left_out(unit, tmp_path):
     source = fill(tmp_path / "in", ["a, b.png"])
     try:
         (source / os.fsdecode(b"bad\xff.png")).write_bytes((source / "a, b.png").read_bytes())
     except OSError:
         pytest.skip("this file system takes UTF-8 names only")
+    (source / os.fsdecode(b"film\xff.avi")).write_bytes(b"RIFF")
     report = reconstruct_dataset(unit, source, tmp_path / "out", pictures=False)
-    assert report.rows == 1 and [reason for _, reason in report.failed] == ["its name is not UTF-8: rename it"]
-    assert '"a, b.png",' in (tmp_path / "out" / "frames.csv").read_text()
+    assert report.rows == 2 and "expected a name in UTF-8, which OpenCV needs, got" in report.failed[0][1]
+    assert (tmp_path / "out" / os.fsdecode(b"bad\xff_depth.png")).is_file()
+    table = (tmp_path / "out" / "frames.csv").read_text()
+    assert '"a, b.png",' in table and "bad\\udcff.png," in table
 
 
 def test_depth_beyond_a_png_is_left_out_and_a_full_disk_stops(unit, tmp_path, monkeypatch):

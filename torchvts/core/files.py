@@ -69,7 +69,7 @@ def naming(path: str | Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.filename is not None and error.errno not in _DISK:
+        if error.errno is None or (error.filename is not None and error.errno not in _DISK):  # says itself what is wrong
             raise
         renamed = type(error)(f"{path}: cannot be written: {error.strerror or error}")
         renamed.errno = error.errno
@@ -187,8 +187,27 @@ def _claimed_size(head: bytes) -> tuple[int, int]:
     return 0, 0
 
 
+def check_pixels(name: str, pixels: object) -> None:
+    """Raise unless ``pixels`` is an array (H, W, 3) of 8 or 16 bits, unsigned: only then is its largest value known.
+
+    Raises:
+        TypeError: no array, or of another type.
+        ValueError: of another shape.
+    """
+    if not isinstance(pixels, np.ndarray) or pixels.dtype.kind != "u" or pixels.dtype.itemsize > 2:
+        kind = f"an array of {pixels.dtype}" if isinstance(pixels, np.ndarray) else type(pixels).__name__
+        raise TypeError(f"{name}: expected an array of uint8 or uint16, got {kind}: pixels.astype(np.uint8) of values 0 to 255")
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
+        raise ValueError(f"{name}: expected (H, W, 3), B, G, R, got {pixels.shape}: not in colour?")
+
+
 def rgb_from_bgr(pixels: np.ndarray[Any, Any]) -> Tensor:
-    """OpenCV's (H, W, 3) B, G, R integers as (3, H, W) float32 in [0, 1], R, G, B."""
+    """OpenCV's (H, W, 3) B, G, R integers of 8 or 16 bits as (3, H, W) float32 in [0, 1], R, G, B.
+
+    Raises:
+        TypeError, ValueError: another type or shape.
+    """
+    check_pixels("pixels", pixels)
     scale = float(np.iinfo(pixels.dtype).max)
     return torch.from_numpy(np.ascontiguousarray(pixels[:, :, ::-1].transpose(2, 0, 1)).astype(np.float32)) / scale
 

@@ -35,16 +35,12 @@ class Item(NamedTuple):
     @property
     def is_video(self) -> bool:
         """Whether it is a video."""
-        return self.is_text and self.path.lower().endswith(VIDEO_SUFFIXES)
-
-    @property
-    def is_text(self) -> bool:
-        """Whether the name is UTF-8; OpenCV crashes on others."""
-        return not any("\ud800" <= letter <= "\udfff" for letter in self.path)
+        return self.path.lower().endswith(VIDEO_SUFFIXES)
 
     def frame_name(self, number: int) -> str:
         """Name of a frame in tables and messages; ``number`` is negative for an image."""
-        return self.path if number < 0 else f"{self.path}/{number:06d}"
+        name = one_line(self.path)
+        return name if number < 0 else f"{name}/{number:06d}"
 
     def frame_stem(self, number: int) -> str:
         """Stem of the results of a frame; ``number`` is negative for an image."""
@@ -53,6 +49,19 @@ class Item(NamedTuple):
 
 Source = Path | tuple[Path, ...]
 """An image, a video, a folder with all below it; or several of them."""
+
+
+def one_line(text: str) -> str:
+    """A text with control characters, line ends and what is not UTF-8 as backslash escapes.
+
+    Example:
+        >>> one_line("a\\nb.png")
+        'a\\\\nb.png'
+    """
+    return "".join(
+        repr(letter)[1:-1] if letter < " " or letter in "\x7f\x85\u2028\u2029" or "\ud800" <= letter <= "\udfff" else letter
+        for letter in text
+    )
 
 
 def list_items(source: str | Source, every: int = 1) -> Iterator[Item]:
@@ -89,7 +98,10 @@ def _list(source: str | Source) -> Iterator[Item]:
 
 
 def _item(file: Path, prefix: str, stem: str) -> Item:
-    status = file.stat()
+    try:
+        status = file.stat()
+    except OSError:  # a link that leads nowhere, or to itself: said when it is read
+        status = file.lstat()
     return Item(prefix + file.name, prefix + stem, (status.st_size, status.st_mtime_ns), file)
 
 
@@ -115,12 +127,19 @@ def _walk(folder: Path, prefix: str) -> Iterator[Item]:
     with os.scandir(folder) as entries:
         kept = sorted((entry for entry in entries if not entry.name.startswith(".")), key=lambda entry: entry.name)
     suffixes = IMAGE_SUFFIXES + VIDEO_SUFFIXES
-    stems = output_stems([entry.name for entry in kept if entry.name.lower().endswith(suffixes) and entry.is_file()])
+    stems = output_stems([entry.name for entry in kept if entry.name.lower().endswith(suffixes) and not _is_folder(entry)])
     for entry in kept:
         if entry.name in stems:
             yield _item(folder / entry.name, prefix, stems[entry.name])
         elif entry.is_dir(follow_symlinks=False) and not (folder / entry.name / STATE).is_dir():
             yield from _walk(folder / entry.name, f"{prefix}{entry.name}/")
+
+
+def _is_folder(entry: "os.DirEntry[str]") -> bool:
+    try:
+        return entry.is_dir()
+    except OSError:  # a link to itself
+        return False
 
 
 def output_stems(names: list[str]) -> dict[str, str]:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
-from ..core.files import read_image, rgb_from_bgr
+from ..core.files import open_video, read_image, rgb_from_bgr
 from ..model import Sensor
 from ..stream import RectifySizes, frames_a_second
 from .items import Item, list_items
@@ -113,21 +113,21 @@ class _Frames(IterableDataset[Batch]):
                 continue
             if self.records.is_done(item, -1):
                 yield Frame(item, done=True), None
-            elif item.is_text:
-                yield Frame(item), partial(read_image, item.file)
             else:
-                yield Frame(item, failed="its name is not UTF-8: rename it"), None
+                yield Frame(item), partial(read_image, item.file)
 
     def _video(self, item: Item) -> Iterator[tuple[Frame, "partial[Tensor] | None"]]:
-        import cv2
-
         rank, world = self.share
         length, every = self.records.length(item), self.records.settings.every
         own = range(rank * every, length or 0, world * every)
         if length is not None and all(self.records.is_done(item, number) for number in own):
             yield from ((Frame(item, number, done=True), None) for number in own)
             return
-        capture = cv2.VideoCapture(str(item.file))
+        try:
+            capture = open_video(item.file)
+        except ValueError as error:  # its name
+            yield Frame(item, failed=str(error)), None
+            return
         fps = frames_a_second(capture)
         number = 0
         while capture.grab():

@@ -7,6 +7,7 @@ frames that were being worked on.
 
 import csv
 import json
+import math
 import os
 import re
 import shutil
@@ -16,10 +17,10 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from ..core.files import write_atomically
+from ..core.files import naming, write_atomically
 from ..core.results import join_results
 from ..stream import FIRST_FRAMES
-from .items import STATE, Item, Source, has_few_frames, list_items
+from .items import STATE, Item, Source, has_few_frames, list_items, one_line
 
 VIDEO_FORMAT = "video-npz"
 FORMATS = {"npz": ".npz", VIDEO_FORMAT: ".npz", "png16": "_depth.png", "npy": "_depth.npy", "none": ""}
@@ -85,12 +86,25 @@ def begin(source: Source, out: Path, settings: Settings, overwrite: bool) -> Set
 
 
 def _remove_results(out: Path) -> None:
-    """Remove the files of every frame that has a record."""
+    """Remove the files of every frame that an earlier run recorded, whatever its formats were."""
     frames = out / STATE / "frames"
     for record in frames.rglob("*.json"):
         stem = out / record.relative_to(frames).with_suffix("")
         for suffix in SUFFIXES:
             stem.with_name(stem.name + suffix).unlink(missing_ok=True)
+
+
+def _is_record(record: object) -> bool:
+    """Whether this is a record as :meth:`Records.write` writes it."""
+    if not isinstance(record, dict) or not isinstance(record.get("mark"), list):
+        return False
+    if "failed" in record:
+        return isinstance(record["failed"], str)
+    if "frames" in record:
+        return isinstance(record["frames"], int) and record["frames"] >= 0
+    figures = [record.get(name) for name in ("deepest_mm", "contact_mm2")]
+    sound = all(isinstance(value, float | int) and not isinstance(value, bool) and math.isfinite(value) for value in figures)
+    return sound and isinstance(record.get("bytes"), list)
 
 
 def join(out: Path, settings: Settings) -> Settings:
@@ -152,18 +166,19 @@ class Records:
     def write(self, item: Item, frame: int, **figures: Any) -> None:
         """Write the record of a frame (-1 for an image, or for a whole video) after its files are in place."""
         path = self._path(item, frame)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if "deepest_mm" in figures:
-            figures["bytes"] = [os.path.getsize(file) for file in self._files(item, frame, figures)]
-        path.write_text(json.dumps({"mark": item.mark, **figures}), encoding="utf-8")
+        with naming(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if "deepest_mm" in figures:
+                figures["bytes"] = [os.path.getsize(file) for file in self._files(item, frame, figures)]
+            path.write_text(json.dumps({"mark": item.mark, **figures}), encoding="utf-8")
 
     def read(self, item: Item, frame: int) -> Record | None:
-        """The record of a frame; None where there is none, a kill has cut it short, or the source file has changed since."""
+        """The record of a frame; None where there is none, it is damaged, or the source file has changed since."""
         try:
             record = json.loads(self._path(item, frame).read_bytes())
-        except (OSError, ValueError):
+        except (OSError, ValueError, RecursionError):
             return None
-        return record if isinstance(record, dict) and record.get("mark") == list(item.mark) else None
+        return record if _is_record(record) and record["mark"] == list(item.mark) else None
 
     def is_done(self, item: Item, frame: int) -> bool:
         """Whether the result of a frame is there, whole."""
@@ -259,6 +274,19 @@ def _size(path: str) -> int:
     return os.path.getsize(path) if os.path.isfile(path) else -1
 
 
+def as_cell(text: str) -> str:
+    """A text as a cell of a CSV table: one line, and none that a spreadsheet takes for a formula.
+
+    Before =, +, - and @ stands an apostrophe, which spreadsheets hide.
+
+    Example:
+        >>> as_cell("=1+2.png"), as_cell("a.png")
+        ("'=1+2.png", 'a.png')
+    """
+    line = one_line(text)
+    return f"'{line}" if line.startswith(("=", "+", "-", "@")) else line
+
+
 def _write_csv(path: Path, head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> None:
     with (
         write_atomically(path) as temporary,
@@ -266,4 +294,4 @@ def _write_csv(path: Path, head: tuple[str, ...], rows: Iterable[tuple[str, ...]
     ):
         table = csv.writer(stream, lineterminator="\n")
         table.writerow(head)
-        table.writerows(rows)
+        table.writerows((as_cell(row[0]), *row[1:]) if head[1] != "reason" else tuple(map(as_cell, row)) for row in rows)

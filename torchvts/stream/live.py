@@ -14,14 +14,14 @@ from torch import Tensor, nn
 
 from ..accelerated.threads import MOST_PIXELS, OneThread
 from ..calibration import Press
-from ..core.checks import check_choice, check_integer, check_positive
-from ..core.files import rgb_from_bgr
+from ..core.checks import check_choice, check_integer, check_least, check_positive, check_switch
+from ..core.files import check_pixels, rgb_from_bgr
 from ..model import Calibration, Sensor
 from ..pipeline import MODES, DepthOutput, DepthPipeline
 from .background import FIRST_FRAMES, calibrate_background, find_background, use_calibration
 from .follow_light import TIME_CONSTANT_S
 from .recording import Recording
-from .sources import NewestFrame, Pixels, Reader, Rectify, Replay, Unreadable, open_source
+from .sources import SETTLING, LiveReader, NewestFrame, Pixels, Reader, Rectify, Replay, Unreadable, check_reader, open_source
 
 
 class TactileFrame(NamedTuple):
@@ -89,12 +89,6 @@ class StageClock:
         return {name: float(np.median([frame[name] for frame in self._frames if name in frame])) for name in names}
 
 
-def _reader(source: Reader) -> Reader:
-    if not callable(getattr(source, "read", None)):
-        raise TypeError(f"source: expected a path, a camera's index or a Reader, got {type(source).__name__}")
-    return source
-
-
 class TactileStream:
     """Depth of every frame of a camera, a video or a folder of images.
 
@@ -104,7 +98,7 @@ class TactileStream:
     and late ones are dropped; of other recordings all are. A frame that cannot be used (:class:`FrameCheck`) is left out.
 
     Args:
-        source: a camera's index, a video file, a folder of images, or a :class:`Reader`.
+        source: a camera's index, a network camera's URL, a video file, a folder of images, or a :class:`Reader`.
         sensor_or_calibration: the sensor, which rectifies; or a calibration, if there is one.
         mode: "fast", "precise" or "auto".
         background_frames: number of frames without contact at the start; 0, with a calibration, uses that as it is.
@@ -114,6 +108,7 @@ class TactileStream:
         network: a trained network in place of the calibration's model, see :func:`torchvts.pipeline.unit_pipeline`.
         device: of the pipeline, "cpu" or "cuda".
         time_constant_s: of following.
+        reconnect_s: for how long a camera that has stopped is opened again before an error is raised; not with a :class:`Reader`.
         clock: for tests.
     Attributes:
         calibration: of the unit.
@@ -126,7 +121,7 @@ class TactileStream:
         fps: rate of the source.
     Raises:
         ValueError: contact or changing light in the first frames, or a source that cannot be read.
-        OSError: no such source.
+        OSError: no such source; also while frames are read: a camera was unplugged, or has stopped.
     Example:
         >>> with TactileStream(0, Sensor.load("gelsight_mini")) as stream:  # doctest: +SKIP
         ...     for number, time_s, image, out in stream:
@@ -146,6 +141,7 @@ class TactileStream:
         network: str | Path | None = None,
         device: str = "cpu",
         time_constant_s: float = TIME_CONSTANT_S,
+        reconnect_s: float = 0.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         check_choice("mode", mode, MODES)
@@ -158,7 +154,16 @@ class TactileStream:
         check_integer("background_frames", background_frames, 0 if given else 3)
         if given and len(presses) > 0:
             raise ValueError(f"presses: expected none beside a calibration, got {len(presses)}: they are for calibrating")
-        self.reader: Reader = open_source(source) if isinstance(source, str | int | Path) else _reader(source)
+        check_least("reconnect_s", reconnect_s)
+        for name, switch in (("realtime", realtime), ("follow", follow)):
+            check_switch(name, switch)
+        self.reader: Reader
+        if isinstance(source, str | int | Path):
+            self.reader = open_source(source, reconnect_s)
+        elif reconnect_s > 0:
+            raise ValueError(f"reconnect_s: expected 0 with a reader of your own, got {reconnect_s:g}: it must reconnect by itself")
+        else:
+            self.reader = check_reader(source)
         self._newest: NewestFrame | None = None
         self._hooks: list[Any] = []
         self._clock = clock
@@ -203,10 +208,15 @@ class TactileStream:
         """Number of frames that arrived while another was being worked on, and were left out."""
         return 0 if self._newest is None else self._newest.dropped
 
+    @property
+    def reconnections(self) -> int:
+        """How often a camera that had stopped was opened again."""
+        return self.reader.reconnections if isinstance(self.reader, LiveReader) else 0
+
     def _first_frames(self, count: int) -> list[Pixels | Unreadable]:
         """The first frames, of which ``count`` can be read, at least one."""
         if self.reader.live:  # exposure settles
-            for _ in range(5):
+            for _ in range(SETTLING):
                 self.reader.read()
         frames: list[Pixels | Unreadable] = []
         readable = 0
@@ -214,6 +224,8 @@ class TactileStream:
             pixels = self.reader.read()
             if pixels is None:
                 break
+            if not isinstance(pixels, Unreadable):
+                check_pixels(f"source: frame {len(frames)} of {self.reader.name}", pixels)
             frames.append(pixels)
             readable += not isinstance(pixels, Unreadable)
         if readable < max(1, count):

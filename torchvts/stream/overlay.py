@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ..core.checks import check_path, check_positive, check_record
-from ..core.files import write_atomically
+from ..core.files import check_text_name, write_atomically
 from .live import TactileFrame, TactileStream
 from .sources import Pixels
 
@@ -110,6 +110,7 @@ class VideoFile:
         self.path, self.fps = check_path("video", path), check_positive("fps", fps)
         if self.path.suffix.lower() not in CODES:
             raise ValueError(f"video: expected a name ending in {' or '.join(CODES)}, got {self.path.name!r}")
+        check_text_name("video", self.path)
         self._file: Any = None
         self._writer: Any = None
         self._temporary = self.path

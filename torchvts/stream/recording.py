@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ..core.checks import check_positive, check_switch
 from ..core.spelling import suggest
 from ..model import Calibration, check_calibration
 from ..pipeline import DepthOutput, DepthPipeline, unit_pipeline
@@ -71,6 +72,8 @@ class Recording:
         stage: Callable[[str], AbstractContextManager[Any]] = lambda name: nullcontext(),
     ) -> None:
         check_calibration("calibration", calibration)
+        check_switch("follow", follow)
+        fps = check_positive("fps", fps)
         value = calibration.background.float() ** (1.0 / calibration.sensor.exponent)
         value = value.clamp(0.0, 1.0)
         self.light = FollowLight(value, time_constant_s)

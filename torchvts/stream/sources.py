@@ -1,5 +1,6 @@
 """Reads frames of cameras, videos and folders, keeps the newest one of those that do not wait, and rectifies them."""
 
+import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -11,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import brief, check_batch, check_image_size, check_integer, check_path
-from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, image_files, read_pixels
+from ..core.checks import brief, check_batch, check_image_size, check_integer, check_least, check_path, check_positive
+from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, check_text_name, image_files, open_video, read_pixels
 from ..model import Sensor, check_sensor
 
 Pixels = np.ndarray[Any, Any]
@@ -20,6 +21,23 @@ Pixels = np.ndarray[Any, Any]
 
 MOST_CAMERAS = 99
 """Largest index of a camera: OpenCV takes the hundreds as the number of a driver, and crashes on negative ones."""
+
+
+URLS = ("rtsp://", "rtsps://", "http://", "https://", "udp://", "tcp://", "rtmp://")
+"""How the address of a network camera begins."""
+
+SILENT_S = 10.0
+"""A live source that gives no frame for this long has stopped: OpenCV's own limit for cameras under Linux."""
+
+RETRY_S = 0.5
+"""Pause before a live source is tried again."""
+
+SETTLING = 5
+"""So many first frames of a camera are left out, while its exposure settles."""
+
+
+MOST_FPS = 1e5
+"""No camera gives more frames a second."""
 
 
 class Unreadable(NamedTuple):
@@ -46,25 +64,35 @@ class Reader(Protocol):
     fps: float
 
     def read(self) -> Pixels | Unreadable | None:
-        """The next frame, (H, W, 3) B, G, R, 8 or 16 bits; why it cannot be read; None at the end."""
+        """The next frame, (H, W, 3) B, G, R, uint8 or uint16; why it cannot be read; None at the end.
+
+        A live source has no end: where it stops, it raises OSError. None of a live source counts as such an error, too.
+        """
 
     def close(self) -> None:
         """Release the device or file."""
 
 
 class CaptureReader:
-    """A camera (an index) or a video file, by OpenCV."""
+    """A camera (an index), a network camera (a URL) or a video file, by OpenCV."""
 
-    def __init__(self, source: int | Path) -> None:
+    def __init__(self, source: int | str | Path) -> None:
         import cv2
 
-        self.live = isinstance(source, int)
-        self.name = f"camera {source}" if self.live else str(source)
-        self._capture = cv2.VideoCapture(source if isinstance(source, int) else str(source))
+        self.live = not isinstance(source, Path)
+        self.name = f"camera {source}" if isinstance(source, int) else str(source)
+        if isinstance(source, Path):
+            self._capture = open_video(source)
+        else:
+            self._capture = cv2.VideoCapture(source if isinstance(source, int) else check_text_name("source", source))
         if not self._capture.isOpened():
             self._capture.release()
-            if self.live:
+            if isinstance(source, int):
                 raise OSError(f"source: expected a camera with index {source}, got none that opens: plugged in? in use elsewhere?")
+            if self.live:
+                raise OSError(
+                    f"source: expected a network camera at {source}, got none that opens: is it on? is the address right?"
+                )
             raise ValueError(f"source: {source}: not a video, or cut short: it does not open")
         if self.live:
             self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
@@ -76,6 +104,124 @@ class CaptureReader:
 
     def close(self) -> None:
         self._capture.release()
+
+
+class LiveReader:
+    """A live source that never ends without a word: it is opened again for some time, then an error is raised.
+
+    The source is read by a thread of its own, because a camera that has hung blocks who reads it.
+
+    Args:
+        open_reader: opens the source.
+        reconnect_s: for how long to try to open it again after it has stopped; 0 raises at once.
+        silent_s: a source that gives no frame for this long has stopped.
+        sleep: for tests.
+    Attributes:
+        reconnections: how often it was opened again.
+    Raises:
+        OSError: by :meth:`read`: the source has stopped.
+    """
+
+    live = True
+
+    def __init__(
+        self,
+        open_reader: Callable[[], Reader],
+        reconnect_s: float = 0.0,
+        silent_s: float = SILENT_S,
+        sleep: Callable[[float], Any] | None = None,
+    ) -> None:
+        self.reconnect_s, self.silent_s = check_least("reconnect_s", reconnect_s), check_positive("silent_s", silent_s)
+        self.reconnections = 0
+        self._closed = threading.Event()
+        self._open, self._sleep = open_reader, sleep or self._closed.wait
+        reader = open_reader()
+        self.name, self.fps = reader.name, reader.fps
+        self._worker = _ReadingThread(reader)
+
+    def read(self) -> Pixels | Unreadable | None:
+        """The next frame; None only after :meth:`close`.
+
+        Raises:
+            OSError: the source has stopped, and did not come back within ``reconnect_s``.
+        """
+        try:
+            return self._worker.read(self.silent_s)
+        except OSError as error:
+            if self.reconnect_s == 0 and not self._closed.is_set():
+                raise OSError(f"source: {self.name} has stopped: {error}: unplugged? in use elsewhere?") from error
+            reason = error
+        return self._read_again(reason)
+
+    def _read_again(self, reason: OSError) -> Pixels | Unreadable | None:
+        """The first frame after the source was opened again."""
+        last = time.monotonic() + self.reconnect_s
+        while not self._closed.is_set():
+            self._worker.close()
+            try:
+                self._worker = _ReadingThread(self._open())
+                for _ in range(SETTLING):
+                    self._worker.read(self.silent_s)
+                pixels = self._worker.read(self.silent_s)
+                self.reconnections += 1
+                return pixels
+            except (OSError, ValueError) as error:
+                if time.monotonic() > last:
+                    raise OSError(
+                        f"source: {self.name} has stopped ({reason}) and did not come back within {self.reconnect_s:g} s: {error}"
+                    ) from error
+            self._sleep(RETRY_S)
+        return None
+
+    def close(self) -> None:
+        """Release the source; one that hangs is left to its thread, since it cannot be released while it is read."""
+        self._closed.set()
+        self._worker.close()
+
+
+class _ReadingThread:
+    """Reads, and at last closes, a source in a thread of its own."""
+
+    def __init__(self, reader: Reader) -> None:
+        self._reader = reader
+        self._asked: queue.SimpleQueue[bool] = queue.SimpleQueue()
+        self._found: queue.SimpleQueue[Pixels | Unreadable | Exception | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="torchvts-camera", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while self._asked.get():
+            try:
+                self._found.put(self._reader.read())
+            except Exception as error:  # raised by read()
+                self._found.put(error)
+        self._reader.close()
+
+    def read(self, seconds: float) -> Pixels | Unreadable:
+        """The next frame, within so many seconds.
+
+        Raises:
+            OSError: there is none.
+        """
+        if not self._thread.is_alive():
+            raise OSError("it is closed")
+        self._asked.put(True)
+        try:
+            found = self._found.get(timeout=seconds)
+        except queue.Empty:
+            self._asked.put(False)
+            raise OSError(f"no frame for {seconds:g} s") from None
+        if found is None:
+            raise OSError("it gives no more frames")
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    def close(self) -> None:
+        """Close the source, and wait for that unless it hangs."""
+        self._asked.put(False)
+        if self._thread is not threading.current_thread():
+            self._thread.join(timeout=2.0)
 
 
 def frames_a_second(capture: Any) -> float:
@@ -111,31 +257,55 @@ class FolderReader:
         self._files = iter(())
 
 
-def open_source(source: str | int | Path) -> Reader:
-    """Open a camera by its index (digits), a video file, or a folder of images.
+def open_source(source: str | int | Path, reconnect_s: float = 0.0) -> Reader:
+    """Open a camera by its index (digits), a network camera by its URL, a video file, or a folder of images.
 
+    Args:
+        source: what to open.
+        reconnect_s: for how long a camera that has stopped is tried again before :class:`OSError` is raised.
     Raises:
         FileNotFoundError: no such file or folder.
         OSError: no such camera.
         ValueError: not a video, or no images.
     """
+    check_least("reconnect_s", reconnect_s)
     if isinstance(source, int) and not isinstance(source, bool):
-        return CaptureReader(check_integer("source", source, 0, MOST_CAMERAS))
+        index = check_integer("source", source, 0, MOST_CAMERAS)
+        return LiveReader(lambda: CaptureReader(index), reconnect_s)
     text = str(check_path("source", source))
     if text.isascii() and text.isdigit():
         if len(text) > 9 or int(text) > MOST_CAMERAS:
             raise ValueError(f"source: expected a camera's index of at most {MOST_CAMERAS}, got {brief(text)}")
-        return CaptureReader(int(text))
+        return LiveReader(lambda: CaptureReader(int(text)), reconnect_s)
+    if isinstance(source, str) and source.lower().startswith(URLS):
+        return LiveReader(lambda: CaptureReader(source), reconnect_s)
     path = Path(text)
     if path.is_dir():
         return FolderReader(path)
     if not path.is_file():
         raise FileNotFoundError(
-            f"source: expected a file, a folder or a camera's index (digits), got {path}: no such file or folder"
+            f"source: expected a file, a folder, a camera's index (digits) or a URL, got {text}: no such file or folder"
         )
     if path.suffix.lower() not in VIDEO_SUFFIXES:
         raise ValueError(f"source: {path}: expected a video ({', '.join(VIDEO_SUFFIXES)}), a folder of images or a camera's index")
     return CaptureReader(path)
+
+
+def check_reader(source: object) -> Reader:
+    """Return a reader of the user's own, watched if it is live.
+
+    Raises:
+        TypeError: no reader.
+        ValueError: its rate is no number above 0.
+    """
+    if not callable(getattr(source, "read", None)) or not callable(getattr(source, "close", None)):
+        raise TypeError(f"source: expected a path, a camera's index or a Reader, got {type(source).__name__}")
+    reader: Reader = source  # type: ignore[assignment]
+    for name in ("name", "live", "fps"):
+        if not hasattr(reader, name):
+            raise TypeError(f"source: expected a Reader with name, live and fps, got {type(source).__name__} without {name}")
+    check_positive("source: fps", reader.fps, MOST_FPS)
+    return LiveReader(lambda: reader) if reader.live else reader
 
 
 class NewestFrame:
@@ -155,6 +325,8 @@ class NewestFrame:
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], Any] | None = None,
     ) -> None:
+        if rate is not None:
+            check_positive("rate", rate, MOST_FPS)
         self.dropped = 0
         self._reader, self._rate, self._clock = reader, rate, clock
         self._changed, self._stop = threading.Condition(), threading.Event()
@@ -205,6 +377,8 @@ class NewestFrame:
     def close(self) -> None:
         """End the thread, then release the source."""
         self._stop.set()
+        if isinstance(self._reader, LiveReader):
+            self._reader.close()  # ends a read that waits
         self._thread.join(timeout=5.0)
         self._reader.close()
 

@@ -45,6 +45,7 @@ from .shadows import Shadows
 from .solve import Solve
 
 MODES = ("fast", "precise", "auto")
+"""Modes of a pipeline: one solve; solved again with the depth found; solved again where that changes the depth."""
 
 STRIDE = 8
 """Mode "auto" predicts on every so many pixels, and windows begin at such."""

@@ -1,5 +1,7 @@
 """Sphinx settings of the documentation: `make docs` builds it from the pages here and the docstrings of the package."""
 
+import importlib
+import pkgutil
 import sys
 import warnings
 from typing import Any
@@ -47,16 +49,18 @@ def skip(app: Any, what: str, name: str, obj: Any, skipped: bool, options: Any) 
     return None
 
 
-def describe_constants(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Give a constant that a room exports the text beneath its definition, which stands in a module of the room."""
-    room, _, constant = name.rpartition(".")
-    if what not in ("data", "attribute") or not room.startswith("torchvts"):
-        return
-    for module in [module for module in sys.modules if module.startswith("torchvts.") and hasattr(sys.modules[module], constant)]:
-        text = ModuleAnalyzer.for_module(module).find_attr_docs().get(("", constant))
-        if text:
-            lines[:] = text
-            return
+def describe_constants(app: Any) -> None:
+    """Give the constants that a room exports the texts beneath their definitions, in its modules: autodoc does not look there."""
+    for found in pkgutil.walk_packages(torchvts.__path__, "torchvts."):
+        if found.ispkg:
+            importlib.import_module(found.name)
+    for room in [name for name, module in sys.modules.items() if name.startswith("torchvts.") and hasattr(module, "__all__")]:
+        analyzer = ModuleAnalyzer.for_module(room)
+        analyzer.analyze()
+        for module in [name for name in sys.modules if name.startswith("torchvts.")]:
+            for (holder, constant), text in ModuleAnalyzer.for_module(module).find_attr_docs().items():
+                if not holder and constant in sys.modules[room].__all__:
+                    analyzer.attr_docs.setdefault(("", constant), text)
 
 
 def name_the_others(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
@@ -90,6 +94,6 @@ def resolve(app: Any, env: Any, node: Any, contnode: Any) -> Any:
 def setup(app: Any) -> None:
     """Register the hooks."""
     app.connect("autodoc-skip-member", skip)
-    app.connect("autodoc-process-docstring", describe_constants)
+    app.connect("builder-inited", describe_constants)
     app.connect("autodoc-process-docstring", name_the_others)
     app.connect("missing-reference", resolve)

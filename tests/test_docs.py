@@ -75,3 +75,19 @@ def test_every_public_name_is_in_the_reference(tmp_path):
     wanted = [places for room, public in rooms().items() for places in names_of(room, public)]
     assert len(wanted) > 100
     assert [places for places in wanted if not places & shown] == []
+
+
+@pytest.mark.long
+def test_the_picture_of_readme_is_drawn(data, run_script, tmp_path):
+    done = run_script("hero", "--data", data, "--out", tmp_path / "hero.png")
+    assert done.returncode == 0, done.stderr
+    assert "12 presses of the other ball" in done.stdout
+    picture = vts.read_image(tmp_path / "hero.png")
+    committed = vts.read_image(DOCS / "hero.png")
+    assert picture.shape == committed.shape
+    assert float((picture - committed).abs().mean()) < 0.02
+
+
+def test_the_picture_of_readme_needs_its_presses(run_script, tmp_path):
+    done = run_script("hero", "--data", tmp_path)
+    assert done.returncode == 2 and "expected presses in" in done.stderr

@@ -1,23 +1,62 @@
-"""README's code runs as it stands."""
+"""README's code and commands run as they stand, on images of a real sensor where these are, else on rendered ones."""
 
+import os
 import re
+import shutil
 from pathlib import Path
 
 import pytest
+from documents import ROOT, run
 
-README = Path(__file__).resolve().parents[1] / "README.md"
+import torchvts as vts
+
+README = ROOT / "README.md"
+
+
+def photograph(folder, ring):
+    """Render what README asks for: without contact, a ball of 6.31 mm, and a press by another ball."""
+    lights = ring(radius_mm=16.0, height_mm=20.0)
+    ball, other = (
+        vts.scenes.sphere_press(r, d, c, 240, 320, 0.0634) for r, d, c in ((3.155, 0.4, (-2.0, 1.0)), (4.75, 0.5, (2.0, 1.0)))
+    )
+    for name, scene in (("background", vts.scenes.undeformed(ball)), ("ball", ball), ("press", other)):
+        vts.write_image(folder / f"{name}.png", vts.scenes.render(scene, lights, noise_std=0.003, bits=8)[0].detach())
+    return other
+
+
+def real_images(folder):
+    """Copy what README asks for from a GelSight Mini's presses, if they are at hand."""
+    data = Path(os.environ.get("TORCHVTS_DATA", ROOT.parent / "shared" / "data")) / "gelsight_mini_a"
+    files = {"background.png": "background.png", "ball.png": "6.310mm/10/gelsight.png", "press.png": "9.500mm/16/gelsight.png"}
+    if not data.is_dir():
+        return False
+    for name, source in files.items():
+        shutil.copy(data / source, folder / name)
+    return True
 
 
 @pytest.mark.filterwarnings("ignore::torchvts.CalibrationWarning")
-def test_code_of_readme_runs_in_order():
-    blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
-    assert len(blocks) == 2
-    names: dict[str, object] = {}
-    for block in blocks:
-        exec(block, names)
-    assert float(names["out"].depth_mm.max()) == pytest.approx(1.0, abs=0.02)
+@pytest.mark.parametrize("rendered", [False, pytest.param(True, marks=pytest.mark.long)])
+def test_code_and_commands_run_in_order(rendered, tmp_path, monkeypatch, ring):
+    real = not rendered and real_images(tmp_path)
+    truth = None if real else photograph(tmp_path, ring)
+    monkeypatch.chdir(tmp_path)
+    names = run(README)
+    deepest_mm = float(vts.read_result("out/press/press.npz").depth_mm.max())
+    area_mm2 = len(names["points"]) * 0.0634**2
+    if truth is None:  # a ball of 9.5 mm
+        assert 0.5 < deepest_mm < 1.2 and 10.0 < area_mm2 < 25.0
+    else:
+        assert deepest_mm == pytest.approx(0.5, rel=0.1)
+        assert area_mm2 == pytest.approx(float(truth.contact.sum()) * 0.0634**2, rel=0.2)
+    assert names["learned"].weight.grad is not None
+
+
+def test_a_reader_needs_three_minutes():
+    assert len(README.read_text().split()) <= 900
 
 
 def test_readme_names_only_files_that_exist():
-    for path in re.findall(r"\]\(([^)#:]+)\)", README.read_text()) + re.findall(r"scripts/\w+\.py", README.read_text()):
-        assert (README.parent / path).exists(), path
+    text = README.read_text()
+    for path in re.findall(r"\]\(([^)#:]+)\)", text) + re.findall(r"(?:scripts|docs|configs)/[\w/]+\.\w+", text):
+        assert (ROOT / path).exists(), path

@@ -1,5 +1,7 @@
 """The tutorials run as they stand, and come to what they promise."""
 
+import shutil
+
 import pytest
 from documents import ROOT, run
 
@@ -21,6 +23,17 @@ def test_first_depth(data, empty_folder):
     assert float(names["height"]) == pytest.approx(float(names["expected"]), rel=0.15)
     assert len(names["points"]) == int(names["out"].contact.sum())
     assert (empty_folder / "out" / "press" / "frames.csv").is_file()
+
+
+def test_coming_from_gs_sdk(data, empty_folder):
+    shutil.copy(data / "gelsight_mini_a" / "background.png", "background.png")
+    shutil.copy(data / "gelsight_mini_a" / "6.310mm" / "10" / "gelsight.png", "press.png")
+    shutil.copy(data / "gelsight_mini_a" / "model" / "nnmodel.pth", "nnmodel.pth")
+    keys = {"device_name": "GelSight Mini", "ppmm": 0.0634, "imgh": 240, "imgw": 320, "raw_imgh": 2464, "raw_imgw": 3280}
+    (empty_folder / "gsmini.yaml").write_text("".join(f"{key}: {value}\n" for key, value in keys.items()))
+    names = run(ROOT / "docs" / "from_gs_sdk.md")
+    assert names["height_map"].min() == pytest.approx(-float(names["out"].depth_mm.max()) / 0.0634)
+    assert 0.5 < float(names["out"].depth_mm.max()) < 1.2
 
 
 def test_own_sensor(empty_folder):

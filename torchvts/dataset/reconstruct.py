@@ -50,6 +50,7 @@ from .loading import Frame, load_frames
 from .records import FORMATS, VIDEO_FORMAT, Records, Settings, begin, join, locked
 
 CLOUD_FORMATS = ("ply", "obj", "pcd", "none")
+"""Kinds of files for the contact of a frame."""
 
 LONGEST_WAIT = timedelta(days=7)
 """Processes that have finished wait this long for the others."""

@@ -28,6 +28,7 @@ METADATA_KEY = "torchvts"
 """Name under which a file keeps its metadata (:func:`describe`) as JSON."""
 
 OUTPUTS = ("depth_mm", "gradient", "normal", "contact", "deformed")
+"""Names of the outputs of an exported file, in order."""
 
 
 def describe(pipe: DepthPipeline) -> dict[str, Any]:

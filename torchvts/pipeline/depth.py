@@ -50,6 +50,7 @@ from .solve import Solve
 _Module = TypeVar("_Module", bound=nn.Module)
 
 MODES = ("fast", "precise", "auto")
+"""Modes of a pipeline: one solve; solved again with the depth found; solved again where that changes the depth."""
 
 STRIDE = 8
 """Mode "auto" predicts on every so many pixels, and windows begin at such."""

@@ -39,6 +39,7 @@ ROUGH_DEG = 3.3
 """Slopes for which a prior takes the structure of an image; more is a contact."""
 
 NOT_METRIC = "depth is NOT METRIC: calibrate with presses of a ball"
+"""What a stream says of a calibration whose scale is not known."""
 
 ASSUMED = ("sensor_file", "stand_in")
 """Sources of a model that is not of this unit."""

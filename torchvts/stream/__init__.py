@@ -11,7 +11,7 @@ from .background import (
 )
 from .follow_light import FollowLight
 from .live import StageClock, TactileFrame, TactileStream
-from .overlay import Overlay, StreamReport, VideoFile, Window, has_display
+from .overlay import Overlay, Sheet, StreamReport, VideoFile, Window, has_display
 from .recording import Recording
 from .sources import NewestFrame, Reader, Rectify, RectifySizes, Unreadable, frames_a_second, open_source
 from .usable import FrameCheck
@@ -26,6 +26,7 @@ __all__ = [
     "Recording",
     "Rectify",
     "RectifySizes",
+    "Sheet",
     "StageClock",
     "StreamReport",
     "TactileFrame",

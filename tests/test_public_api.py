@@ -16,9 +16,9 @@ NAMES = [
     "AdaptiveIntegration", "Calibration", "CalibrationWarning", "Compensate", "ConfidentPipeline", "ContactFromDepth",
     "ContactMask", "ContactSettings", "DepthOutput", "DepthPipeline", "GradientFromNormal", "Integrator",
     "NormalFromIntensity", "NormalFromLookup", "NormalFromMLP", "NormalFromResponse", "NormalModel", "PointLights",
-    "PoissonBackground", "PoissonDCT", "PoissonDST", "Press", "Sensor", "Touch", "calibrate", "depth_to_points",
+    "PoissonBackground", "PoissonDCT", "PoissonDST", "Press", "Result", "Sensor", "Touch", "calibrate", "depth_to_points",
     "diagnose", "fit_lights", "gs_sdk", "near_field_shading", "poisson_background", "poisson_dct", "poisson_dst",
-    "read_image", "read_presses", "register_depth", "register_points", "scenes", "shipped_sensors", "stream",
+    "read_image", "read_presses", "read_result", "register_depth", "register_points", "scenes", "shipped_sensors", "stream",
     "write_image",
 ]  # fmt: skip
 ARGUMENTS = {

@@ -16,6 +16,7 @@ import torchvts as vts
 from torchvts.evaluation import coverage
 from torchvts.evaluation.figures import coverage_figure
 from torchvts.evaluation.random_scenes import SHAPES, UNITS
+from torchvts.evaluation.rows import write_files
 from torchvts.viz import save_figure
 
 
@@ -25,7 +26,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--sensor", default="gelsight_mini", help="sensor of the presses: YAML file or shipped name")
     parser.add_argument("--frames", type=int, default=100, help="random scenes of each kind of unit")
     parser.add_argument("--seed", type=int, default=10000, help="seed of the first scene")
-    parser.add_argument("--out", type=Path, default=Path("out/confidence.png"), help="the picture")
+    parser.add_argument("--out", type=Path, default=Path("out/confidence.png"), help="the picture; its table beside it, .json")
     parser.add_argument("--units", nargs="+", choices=UNITS, default=UNITS, metavar="UNIT", help=", ".join(UNITS))
     arguments = parser.parse_args(argv)
     with torch.no_grad():
@@ -59,7 +60,9 @@ def measure(arguments: argparse.Namespace) -> str:
             found = coverage.of_presses(arguments.presses, kind, learn=learn, mode=mode, progress=True)
             rows.append(coverage.mean(found, f"{arguments.presses.name}, {name}"))
             curves.append(rows[-1])
-    save_figure(coverage_figure(curves), arguments.out)
+    drawn = [curve for curve in curves if not curve.name.endswith("fast")]  # it covers the line of mode precise
+    write_files(arguments.out.parent, {f"{arguments.out.stem}.json": coverage.to_json(drawn)})
+    save_figure(coverage_figure(drawn), arguments.out)
     return coverage.table([*rows, curves[0]])
 
 

@@ -3,7 +3,8 @@
 python scripts/learning_curve.py gelsight_mini_a digit_a --draws 4
 
 Presses are drawn at random from those to learn from, and given without labels; the frames that are held out are scored. Touches are
-presses given by their images alone, and one press for the scale. No prior has seen the presses that are scored.
+presses given by their images alone, and one press for the scale. MLP is gs_sdk's network, trained on the same presses. No prior has
+seen the presses that are scored.
 """
 
 import argparse
@@ -13,14 +14,15 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from torchvts.evaluation import rows as records
 from torchvts.evaluation import sets
 from torchvts.evaluation.evaluate import evaluate
+from torchvts.evaluation.figures import learning_figure
+from torchvts.evaluation.methods import GIVEN_NETWORK
 from torchvts.evaluation.rows import Column, Row, error_column
-from torchvts.viz import new_figure, save_figure
+from torchvts.viz import save_figure
 
 COUNTS = (0, 1, 3, 5, 11, 21)
 
@@ -51,44 +53,55 @@ def main(argv: Sequence[str] | None = None) -> int:
             for row in curve(data, arguments.draws, arguments.mode):
                 rows.append(row)
                 bar.update()
-    text = records.table(rows, COLUMNS)
-    records.write_files(arguments.out, {"table.md": text + "\n"})
-    save_figure(figure(rows), arguments.out / "learning_curve.png")
-    print(f"{text}\n\nwrote {arguments.out}/table.md and learning_curve.png")
+    text = records.table(means(rows), COLUMNS)
+    records.write_files(arguments.out, {"table.md": text + "\n", "rows.json": records.to_json(rows)})
+    save_figure(learning_figure(rows), arguments.out / "learning_curve.png")
+    print(f"{text}\n\nwrote {arguments.out}/table.md, rows.json and learning_curve.png")
     return 0
 
 
 def curve(data: sets.DataSet, draws: int, mode: str) -> Iterator[Row]:
-    """Rows of a set: presses with the prior if there is one, presses without, and touches."""
+    """Rows of a set, one for each draw: presses with the prior if there is one, presses without, touches, a trained network.
+
+    Last comes the network that belongs to the unit, if there is one: its count is None.
+    """
     most = min(len(fold.learned) for fold in data.folds)
-    kinds = [("presses", mode, True), ("touches, and one press for the scale", "touches", False)]
+    kinds = [("presses", mode, True), ("touches, and one press for the scale", "touches", False), ("MLP", "MLP", False)]
     if data.folds[0].sensor.prior is not None:
-        kinds = [("presses, prior", mode, True), ("presses, no prior", mode, False), kinds[1]]
+        kinds = [("presses, prior", mode, True), ("presses, no prior", mode, False), *kinds[1:]]
     for kind, method, primed in kinds:
         for count in COUNTS:
             given = count + (method == "touches")
-            if given <= most and (count or kind == "presses, prior"):
-                folds = [drawn(data.folds[k * len(data.folds) // draws], given, k, primed) for k in range(draws)]
-                row = evaluate(dataclasses.replace(data, folds=folds, methods=()), [method]).rows[0]
-                yield dataclasses.replace(row, method=kind, errors={**row.errors, "count": float(count)})
+            fewest = 2 if method == "MLP" else 0 if kind == "presses, prior" else 1  # a network holds one press out
+            if fewest <= count and given <= most:
+                for k in range(draws):
+                    fold = drawn(data.folds[k * len(data.folds) // draws], given, k, primed)
+                    row = evaluate(dataclasses.replace(data, folds=[fold], methods=()), [method]).rows[0]
+                    yield dataclasses.replace(row, method=kind, seed=k, errors={**row.errors, "count": float(count)})
+    network = [method for method in data.methods if method.name == GIVEN_NETWORK]
+    if network:
+        row = evaluate(dataclasses.replace(data, methods=network), ["flat"]).rows[-1]
+        yield dataclasses.replace(row, method="gs_sdk's network of this unit, has seen these", errors={**row.errors, "count": None})
+
+
+def means(rows: Sequence[Row]) -> list[Row]:
+    """For each number of presses a row of the means over its draws, every frame counted; of the radius the median of medians."""
+    merged = []
+    for key in dict.fromkeys((row.data, row.method, row.errors["count"]) for row in rows):
+        own = [row for row in rows if (row.data, row.method, row.errors["count"]) == key]
+        frames = sum(row.frames for row in own)
+        errors = {"count": key[2], "radius_percent": records.median(row.error("radius_percent") for row in own)}
+        for name in ("normal_deg", "relief_um", "level_um"):
+            errors[name] = records.mean(row.error(name) for row in own for _ in range(row.frames))
+        note = "; ".join(dict.fromkeys(row.note for row in own if row.note))
+        merged.append(dataclasses.replace(own[0], errors=errors, frames=frames, seed=None, note=note))
+    return merged
 
 
 def drawn(fold: sets.Fold, count: int, seed: int, primed: bool) -> sets.Fold:
     """The fold with so many of its presses, the same at every run."""
     sensor = fold.sensor if primed else fold.sensor.without_prior()
     return fold._replace(sensor=sensor, learned=random.Random(seed).sample(list(fold.learned), count))
-
-
-def figure(rows: Sequence[Row]) -> Figure:
-    made = new_figure(9.0, 3.6)
-    for axes, error, label in zip(made.subplots(1, 2), ("normal_deg", "relief_um"), ("mean angle of normals, deg", "relief, um")):
-        for line in dict.fromkeys((row.data, row.method) for row in rows):
-            points = [row for row in rows if (row.data, row.method) == line and row.error(error) is not None]
-            axes.plot([p.errors["count"] for p in points], [p.errors[error] for p in points], marker="o", label=", ".join(line))
-        axes.set(xlabel="presses or touches", ylabel=label, ylim=(0, None))
-        axes.grid(alpha=0.3)
-    axes.legend(frameon=False, fontsize=7)
-    return made
 
 
 if __name__ == "__main__":

@@ -1,11 +1,12 @@
 """The bench: rows of small scenes, their table, JSON and chart; no test asserts a time."""
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 
 from torchvts.evaluation import rows, speed
-from torchvts.evaluation.figures import speed_figure
+from torchvts.evaluation.figures import learning_figure, speed_figure
 from torchvts.evaluation.methods import METHODS
 from torchvts.evaluation.rows import Row, Size, Time
 
@@ -57,12 +58,36 @@ def test_the_table_has_a_line_for_each_row():
 
 
 def test_the_chart_names_its_points():
-    walls = [
-        row(m, k + 1.0, k + 1.0, "wall", 240, "stamp, upright walls") for k, m in enumerate(("precise", "precise, discontinuities"))
-    ]
-    sensor = [row("response, fast", 1.0, 3.0, "sensor", 240), row(speed.GS_SDK, 9.0, 2.5, "sensor", 240)]
-    for given, panels in (([*ROWS, *walls], 3), ([*ROWS, *walls, *sensor], 4)):
-        axes = speed_figure(given).axes
-        assert len(axes) == panels
-        texts = [text.get_text() for text in axes[0].texts]
-        assert {"fast", "precise", "auto"} <= {*texts} and "not drawn:\nflat: 500 at 0.1 ms" in texts
+    sensor = [row("response, fast", 1.0, 3.0, "sensor", 240, "GelSight Mini, balls"), row(speed.GS_SDK, 9.0, 2.5, "sensor", 240)]
+    for given, panels in ((ROWS, 2), ([*ROWS, *sensor], 3)):
+        figure = speed_figure(given)
+        assert len(figure.axes) == panels and not any(axes.get_legend() for axes in figure.axes)
+        scene = figure.axes[-2]
+        assert {"fast", "precise", "auto"} <= {text.get_text() for text in scene.texts}
+        assert "not drawn: flat, 500 at 0.1 ms" in scene.get_xlabel()
+    assert "GelSight Mini, 320x240" in figure.axes[0].get_title()  # the real sensor comes first
+    boxes = [text.get_window_extent() for text in figure.legends[0].get_texts()]
+    assert all(not box.overlaps(axes.get_window_extent()) for box in boxes for axes in figure.axes)  # it covers no point
+
+
+def test_a_chart_is_drawn_again_from_its_table(run_script, tmp_path):
+    (tmp_path / "bench.json").write_text(rows.to_json(ROWS))
+    done = run_script("figures", "speed", tmp_path / "bench.json", tmp_path / "chart.png")
+    assert done.returncode == 0 and (tmp_path / "chart.png").stat().st_size > 10_000
+    points = Path(__file__).parent / "breaking_points.json"
+    done = run_script("figures", "overview", points, tmp_path / "overview.png")
+    assert done.returncode == 0 and (tmp_path / "overview.png").stat().st_size > 10_000
+    done = run_script("figures", "speed", tmp_path / "none.json", tmp_path / "chart.png")
+    assert done.returncode == 1 and done.stderr.startswith("error: ") and "none.json" in done.stderr
+
+
+def test_the_learning_curve_shows_every_draw():
+    drawn = [Row("presses", m, "a set", {"count": c, "normal_deg": c + k, "relief_um": 3.0}, seed=k)
+             for m in ("presses", "MLP") for c in (1.0, 5.0) for k in range(3)]  # fmt: skip
+    level = Row("presses", "a network", "a set", {"count": None, "normal_deg": 2.5, "relief_um": 3.0})
+    figure = learning_figure([*drawn, level])
+    assert list(figure.axes[0].get_lines()[-1].get_ydata()) == [2.5, 2.5]
+    line = figure.axes[0].get_lines()[0]
+    assert list(line.get_ydata()) == [2.0, 6.0] and "3 draws" in figure.get_suptitle()
+    bars = figure.axes[0].collections[0].get_segments()
+    assert [[end[1] for end in bar] for bar in bars] == [[1.0, 3.0], [5.0, 7.0]]

@@ -541,9 +541,33 @@ def test_the_overlay_shows_contours_and_grows_its_range(unit, small_press):
     inside = scene.contact[0, 0].numpy()
     ys, xs = np.nonzero((picture[:240:2, :320:2] > 128).all(2))  # shown twice as large
     ramp = torch.linspace(0.0, 1.0, 160).expand(1, 1, 40, -1)
-    row = (overlay.depth(ramp)[20] == 255).all(1)
-    assert 9 <= int(row.sum()) <= 11  # ten lines fill the range
+    row = overlay.depth(ramp)[20]
+    lines = (row == 60).all(1) | (row == 255).all(1)
+    assert 9 <= int(lines.sum()) <= 11  # ten lines fill the range, dark on light colours and light on dark ones
+    assert (row[lines][0] == 60).all() and (row[lines][-1] == 255).all()
+    zero, below = (overlay.depth(torch.full((1, 1, 4, 4), z))[0, 0].astype(int) for z in (0.0, -0.5))
+    assert (zero > 240).all() and below[2] > below[0] + 50  # near white at any range, brown below
+    overlay.range_mm = 8.0
+    assert (overlay.depth(torch.zeros(1, 1, 4, 4))[0, 0] == zero).all()
     assert len(ys) > 50 and abs(np.hypot(ys - 59.5, xs - 79.5) - np.sqrt(inside.sum() / np.pi)).max() < 3
+
+
+def test_a_sheet_shows_six_frames_in_contact_in_one_range(small_press):
+    sheet = streams.Sheet(PITCH, metric=False)
+    with pytest.raises(ValueError, match="sheet: expected frames with contact, got none"):
+        sheet.figure()
+    for number in range(200):
+        scene = small_press(0.2 + 0.004 * number)
+        contact = scene.contact if number % 2 else torch.zeros_like(scene.contact)
+        output = vts.DepthOutput(scene.depth_mm, scene.gradient, scene.normal, contact, contact)
+        sheet.add(streams.TactileFrame(number, number / 30.0, torch.zeros(3, 120, 160), output))
+    assert len(sheet._kept) <= 48
+    *panels, bar = sheet.figure().axes
+    assert len(panels) == 6 and "NOT METRIC" in bar.get_ylabel()
+    limits = {panel.get_images()[0].get_clim() for panel in panels}
+    assert len(limits) == 1 and limits.pop() == pytest.approx((0.0, 0.2 + 0.004 * 199), abs=0.05)
+    times = [float(panel.get_title().split()[0]) for panel in panels]
+    assert times[0] == pytest.approx(1 / 30, abs=0.01) and np.ptp(np.diff(times)) < 0.3
 
 
 def test_lights_that_do_not_fit_the_image_give_only_their_directions(ring, small_press):

@@ -1,34 +1,76 @@
 """Pictures of frames: depth as contours and as a shaded surface, errors, registered clouds; made without a display."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from matplotlib import patheffects
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import LightSource, LinearSegmentedColormap
+from matplotlib.colors import LightSource, LinearSegmentedColormap, ListedColormap, Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
 from .core.files import write_atomically
 
 Array = np.ndarray[Any, Any]
 
-_MAP = "viridis"
-_SKIN = LinearSegmentedColormap.from_list("skin", ["#9a8f86", "#d9cfc5"])
+_BELOW = ("#5c2503", "#b35806", "#f1a340", "#f6e0c3")
+_ABOVE = ("#b5dfe3", "#55b1c5", "#1f78b4", "#28428f", "#1b1650")
+_MAP = LinearSegmentedColormap.from_list(
+    "depth",
+    [
+        *((0.5 * k / len(_BELOW), color) for k, color in enumerate(_BELOW)),
+        (0.5, "#f7f7f7"),
+        *((0.5 + 0.5 * (k + 1) / len(_ABOVE), color) for k, color in enumerate(_ABOVE)),
+    ],
+    N=1025,
+)
+"""Zero is near white at 0.5, depth above it blue, below it brown; nothing depends on red against green."""
+
+SOURCE, TARGET = "#d55e00", "#0072b2"
+"""Colours of the two clouds of a pose; blue and vermilion, which all readers distinguish."""
+
+_HALO = [patheffects.withStroke(linewidth=2.0, foreground="black")]
+_EXAGGERATIONS = (1, 2, 3, 4, 5, 8, 10, 15, 20, 30, 40, 50, 80, 100, 150, 200, 300, 400, 500, 1000)
 
 
-def new_figure(width: float, height: float, dpi: int = 110) -> Figure:
-    """An empty figure of so many inches, with a canvas that needs no display."""
+def new_figure(width: float, height: float, dpi: int = 150) -> Figure:
+    """An empty figure of so many inches, with a canvas that needs no display; text of 10 points is readable up to 10 inches."""
     figure = Figure(figsize=(width, height), layout="constrained", dpi=dpi)
     FigureCanvasAgg(figure)
     return figure
 
 
+def depth_colors(low: float, high: float) -> tuple[ListedColormap, Normalize]:
+    """Colours of depth from ``low`` to ``high`` in which zero is always the same near white, and equal steps are equal.
+
+    Args:
+        low: at most 0.
+        high: above 0, the same unit.
+    Returns:
+        Colour map and norm for Matplotlib: a part of one diverging map, as long as the range.
+    Example:
+        >>> import numpy as np
+        >>> zeros = [colors(norm(0.0)) for colors, norm in (depth_colors(-1.0, 4.0), depth_colors(-300.0, 300.0))]
+        >>> bool(np.allclose(zeros[0], zeros[1], atol=0.02))
+        True
+    """
+    most = max(-low, high)
+    return ListedColormap(_MAP(0.5 + 0.5 * np.linspace(low, high, 512) / most)), Normalize(low, high)
+
+
+def depth_range(*depths: Array) -> tuple[float, float]:
+    """Range of the colours that several maps of depth share: it holds zero, and more than that."""
+    return min(0.0, *(float(d.min()) for d in depths)), max(1e-3, *(float(d.max()) for d in depths))
+
+
 def depth_figure(
     depth_mm: Tensor, mm_per_pixel: float, image: Tensor | None = None, contact: Tensor | None = None, title: str = ""
 ) -> Figure:
-    """One frame as three panels: the camera's image with the contact outlined, depth contours, the shaded surface.
+    """One frame as three panels of one extent: the camera's image with the contact outlined, depth contours, the shaded surface.
 
     Args:
         depth_mm: one frame, (1, 1, H, W) or (H, W), mm.
@@ -40,26 +82,54 @@ def depth_figure(
         The figure.
     """
     depth = _plane(depth_mm)
-    figure = new_figure(13.5 if image is not None else 9.0, 4.1)
-    panels = 3 if image is not None else 2
-    extent = _extent(depth, mm_per_pixel)
+    ratio = depth.shape[0] / depth.shape[1]
+    wide = 2.45 if ratio < 1.0 else 2.0
+    high, left, top = wide * ratio, 0.6, 0.62 if title else 0.32
+    total = high + top + 0.5
+    count = 1 if image is None else 2
+    size = (left + count * (wide + 0.5) + 0.45 + 3.4, total)
+    figure = new_figure(*size)
+    figure.set_layout_engine("none")
+
+    def panel(x: float, y: float, width: float, height: float, **options: Any) -> Any:
+        return figure.add_axes((x / size[0], y / size[1], width / size[0], height / size[1]), **options)
+
+    lower = size[1] - top - high
     if image is not None:
-        axes = figure.add_subplot(1, panels, 1)
-        axes.imshow(image.detach().cpu().reshape(3, *depth.shape).permute(1, 2, 0).clamp(0, 1).numpy(), extent=extent)
+        axes = panel(left, lower, wide, high)
+        picture = image.detach().cpu().reshape(3, *depth.shape).permute(1, 2, 0).clamp(0, 1).numpy()
+        axes.imshow(picture, extent=_extent(depth, mm_per_pixel))
         if contact is not None and bool(contact.any()):
-            axes.contour(_plane(contact.float()), [0.5], colors="white", linewidths=1.0, extent=extent, origin="upper")
-        axes.set_title("image, contact outlined")
+            draw_outline(axes, _plane(contact.float()), mm_per_pixel)
+        axes.set_title("image" if contact is None else "image, contact outlined", fontsize=10)
         _millimetres(axes)
-    axes = figure.add_subplot(1, panels, panels - 1)
+        left += wide + 0.5
+    axes = panel(left, lower, wide, high)
     draw_contours(figure, axes, depth, mm_per_pixel)
-    surface = figure.add_subplot(1, panels, panels, projection="3d")
-    draw_surface(surface, depth, mm_per_pixel)
+    if image is not None:
+        axes.set_ylabel("")
+    draw_surface(panel(left + wide + 0.6, 0.0, size[0] - left - wide - 0.65, lower + high, projection="3d"), depth, mm_per_pixel)
     if title:
-        figure.suptitle(title)
+        figure.suptitle(title, fontsize=11, y=1.0 - 0.08 / size[1], va="top")
     return figure
 
 
-def draw_contours(figure: Figure, axes: Any, depth: Array, mm_per_pixel: float, step_um: float | None = None) -> None:
+def draw_outline(axes: Any, mask: Array, mm_per_pixel: float, color: str = "white", style: str = "-") -> None:
+    """Outline a mask (H, W) of 0 and 1, with a dark edge so that it shows on any image."""
+    drawn = axes.contour(
+        mask, [0.5], colors=color, linewidths=1.0, linestyles=style, extent=_extent(mask, mm_per_pixel), origin="upper"
+    )
+    drawn.set_path_effects(_HALO)
+
+
+def draw_contours(
+    figure: Figure,
+    axes: Any,
+    depth: Array,
+    mm_per_pixel: float,
+    step_um: float | None = None,
+    range_mm: tuple[float, float] | None = None,
+) -> None:
     """Draw depth in colour, with contour lines every round number of micrometres and a colour bar.
 
     Args:
@@ -68,89 +138,148 @@ def draw_contours(figure: Figure, axes: Any, depth: Array, mm_per_pixel: float, 
         depth: (H, W), mm.
         mm_per_pixel: pixel pitch, mm.
         step_um: distance of the lines, micrometres; None chooses it.
+        range_mm: range of the colours, for panels that are compared; None takes that of the depth (:func:`depth_range`).
     """
-    extent = _extent(depth, mm_per_pixel)
-    low, high = float(depth.min()) * 1000.0, float(depth.max()) * 1000.0
-    picture = axes.imshow(depth * 1000.0, cmap=_MAP, extent=extent, vmin=min(low, 0.0), vmax=max(high, 1.0))
-    step = step_um or _round_step(max(high, 1.0) - min(low, 0.0))
-    levels = np.arange(np.ceil(low / step) * step, high, step)
-    levels = levels[np.abs(levels) > 0.25 * step]  # no line on the undeformed skin
-    if len(levels):
-        axes.contour(depth * 1000.0, levels, colors="white", linewidths=0.6, extent=extent, origin="upper")
-    figure.colorbar(picture, ax=axes, shrink=0.75, label="depth, um")
-    axes.set_title(f"depth, a line each {step:g} um")
+    low, high = (1000.0 * value for value in range_mm or depth_range(depth))
+    colors, norm = depth_colors(low, high)
+    picture = axes.imshow(depth * 1000.0, cmap=colors, norm=norm, extent=_extent(depth, mm_per_pixel))
+    step = step_um or _round_step(high - low)
+    _draw_lines(axes, depth * 1000.0, mm_per_pixel, step, colors, norm)
+    draw_bar(figure, axes, picture, "depth, um")
+    axes.set_title(f"depth, a line every {step:g} um", fontsize=10)
     _millimetres(axes)
 
 
-def draw_surface(axes: Any, depth: Array, mm_per_pixel: float, most: int = 220) -> None:
-    """Draw depth as a surface lit from the upper left, with exaggerated relief.
+def _draw_lines(axes: Any, depth: Array, mm_per_pixel: float, step: float, colors: ListedColormap, norm: Normalize) -> None:
+    """Contour lines every ``step``, in the unit of depth, white on dark colours and dark on light ones."""
+    levels = np.arange(np.ceil(depth.min() / step), np.ceil(depth.max() / step)) * step
+    levels = levels[np.abs(levels) > 0.25 * step]  # no line on the undeformed skin
+    if len(levels):
+        shades = ["white" if np.dot(colors(norm(level))[:3], (0.3, 0.59, 0.11)) < 0.5 else "0.25" for level in levels]
+        extent = _extent(depth, mm_per_pixel)
+        axes.contour(depth, levels, colors=shades, linewidths=0.5, linestyles="-", extent=extent, origin="upper")
+
+
+def draw_bar(figure: Figure, axes: Any, picture: Any, label: str) -> None:
+    """A colour bar as high as its panel."""
+    figure.colorbar(picture, cax=axes.inset_axes((1.03, 0.0, 0.04, 1.0)), label=label)
+
+
+def draw_surface(
+    axes: Any, depth: Array, mm_per_pixel: float, most: int = 220, range_mm: tuple[float, float] | None = None
+) -> None:
+    """Draw depth as a surface lit from the upper left, coloured as the contours are; the title states the exaggeration of height.
 
     Args:
         axes: a 3D panel.
         depth: (H, W), mm.
         mm_per_pixel: pixel pitch, mm.
         most: largest number of points in each direction.
+        range_mm: range of the colours; None takes that of the depth.
     """
     stride = max(1, int(np.ceil(max(depth.shape) / most)))
     z = depth[::stride, ::stride]
-    y, x = np.mgrid[0 : z.shape[0], 0 : z.shape[1]] * mm_per_pixel * stride
-    shades = LightSource(azdeg=315, altdeg=45).shade(
-        z, cmap=_SKIN, vert_exag=1.0, dx=mm_per_pixel * stride, dy=mm_per_pixel * stride, blend_mode="soft"
+    left, _, lower, _ = _extent(depth, mm_per_pixel)
+    rows, columns = np.mgrid[0 : z.shape[0], 0 : z.shape[1]] * mm_per_pixel * stride
+    x, y = left + columns, rows - lower
+    low, high = range_mm or depth_range(depth)
+    exaggeration = _exaggeration(max(float(np.ptp(z)), 0.02 * high, 1e-6), -2.0 * left)
+    colors, norm = depth_colors(low, high)
+    step = mm_per_pixel * stride
+    light = LightSource(azdeg=315, altdeg=50)
+    shades = light.shade_rgb(colors(norm(z))[..., :3], z * exaggeration, blend_mode="soft", vert_exag=1.0, dx=step, dy=step)
+    axes.plot_surface(x, y, z, facecolors=shades, rstride=1, cstride=1, linewidth=0, antialiased=False, shade=False)
+    axes.set(xlim=(left, -left), ylim=(lower, -lower), zlim=(float(z.min()), max(float(z.max()), float(z.min()) + 1e-6)))
+    axes.plot([left, -left, -left, left, left], [lower, lower, -lower, -lower, lower], 0.0, color="0.6", lw=0.8)
+    axes.set_box_aspect(
+        (-2.0 * left, 2.0 * lower, exaggeration * max(float(np.ptp(z)), 1e-6)), zoom=1.12 if lower <= -left else 1.0
     )
-    axes.plot_surface(x, y.max() - y, z, facecolors=shades, rstride=1, cstride=1, linewidth=0, antialiased=False, shade=False)
-    axes.set_box_aspect((x.max(), y.max(), max(0.22 * x.max(), float(np.ptp(z)))))
     axes.view_init(elev=42, azim=-65)
-    axes.set_title("surface")
-    axes.set_xlabel("mm")
-    axes.set_zlabel("mm")
-    axes.tick_params(labelsize=7)
+    axes.set_title(f"surface, height x {exaggeration:g}", fontsize=10)
+    _space_labels(axes)
 
 
 def comparison_figure(depth_mm: Tensor, truth_mm: Tensor, mm_per_pixel: float, title: str = "") -> Figure:
-    """Depth, truth, and their difference in pixels of pitch, side by side."""
+    """Depth and truth in the same colours, and their difference in pixels of pitch, side by side."""
     depth, truth = _plane(depth_mm), _plane(truth_mm)
-    figure = new_figure(13.5, 3.9)
+    figure = new_figure(10.5, 2.9)
     axes = figure.subplots(1, 3)
-    step = _round_step(max(1000.0 * float(truth.max()), 1.0))
+    span = depth_range(depth, truth)
+    step = _round_step(1000.0 * (span[1] - span[0]))
     for panel, values, name in ((axes[0], truth, "truth"), (axes[1], depth, "measured")):
-        draw_contours(figure, panel, values, mm_per_pixel, step)
-        panel.set_title(f"{name}: {panel.get_title()}")
+        draw_contours(figure, panel, values, mm_per_pixel, step, span)
+        panel.set_title(f"{name}, a line every {step:g} um", fontsize=10)
     error = (depth - truth) / mm_per_pixel
     most = max(float(np.abs(error).max()), 1e-6)
-    picture = axes[2].imshow(error, cmap="RdBu_r", vmin=-most, vmax=most, extent=_extent(depth, mm_per_pixel))
-    figure.colorbar(picture, ax=axes[2], shrink=0.75, label="error, px")
-    axes[2].set_title(f"error: largest {most:.3f} px, RMS {float(np.sqrt((error**2).mean())):.4f} px")
+    colors, norm = depth_colors(-most, most)
+    picture = axes[2].imshow(error, cmap=colors, norm=norm, extent=_extent(depth, mm_per_pixel))
+    draw_bar(figure, axes[2], picture, "error, px")
+    axes[2].set_title(f"error, px: RMS {float(np.sqrt((error**2).mean())):.4f}, largest {most:.3f}", fontsize=10)
     _millimetres(axes[2])
     if title:
         figure.suptitle(title)
     return figure
 
 
+def sheet_figure(frames: Sequence[tuple[float, Array]], mm_per_pixel: float, metric: bool = True) -> Figure:
+    """Depth of up to six frames of a stream in one range of colours, with contour lines and one colour bar.
+
+    Args:
+        frames: time, s, and depth (H, W), mm, of each.
+        mm_per_pixel: pixel pitch, mm.
+        metric: whether depth is in mm; otherwise the bar says that it is not.
+    """
+    columns = min(3, len(frames))
+    rows = -(-len(frames) // columns)
+    height, width = frames[0][1].shape
+    figure = new_figure(9.5, 0.5 + rows * (0.3 + 7.5 / columns * height / width))
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    span = depth_range(*(depth for _, depth in frames))
+    colors, norm = depth_colors(*span)
+    step = _round_step(span[1] - span[0])
+    for k, ((time_s, depth), panel) in enumerate(zip(frames, axes.flat)):
+        picture = panel.imshow(depth, cmap=colors, norm=norm, extent=_extent(depth, mm_per_pixel))
+        _draw_lines(panel, depth, mm_per_pixel, step, colors, norm)
+        panel.set_title(f"{time_s:.2f} s", fontsize=10)
+        panel.set(xlabel="x, mm" if k >= len(frames) - columns else "", ylabel="" if k % columns else "y, mm (down)")
+    for panel in axes.flat[len(frames) :]:
+        panel.remove()
+    unit = "mm" if metric else "mm, NOT METRIC"
+    figure.colorbar(picture, ax=axes, aspect=30, shrink=0.9, label=f"depth, {unit}; a line every {step:g}")
+    return figure
+
+
 def pose_figure(source: Tensor, target: Tensor, T_target_source: Tensor, title: str = "", most: int = 4000) -> Figure:
-    """Two clouds (N, 3) before and after registration, each from above and in space, as in figure 8 of the paper."""
+    """Two clouds (N, 3) before and after registration, each from above and in space, as in figure 8 of the paper, in one scale."""
     clouds = [points.detach().cpu().double()[:: max(1, len(points) // most)] for points in (source, target)]
     T = T_target_source.detach().cpu().double()
-    moved = clouds[0] @ T[:3, :3].T + T[:3, 3]
-    figure = new_figure(13.5, 3.8)
-    for k, (name, points) in enumerate((("before", clouds[0]), ("after", moved))):
+    states = {"before": clouds[0], "after": clouds[0] @ T[:3, :3].T + T[:3, 3]}
+    everything = torch.cat((clouds[1], *states.values())).numpy()
+    low, high = everything.min(0), everything.max(0)
+    low, high = low - 0.04 * (high - low), high + 0.04 * (high - low)
+    spans = high - low
+    exaggeration = _exaggeration(max(float(spans[2]), 1e-6), float(max(spans[:2])))
+    figure = new_figure(10.0, 3.1)
+    for k, (name, points) in enumerate(states.items()):
         above = figure.add_subplot(1, 4, 2 * k + 1)
         space = figure.add_subplot(1, 4, 2 * k + 2, projection="3d")
-        for cloud, colour, label in ((clouds[1], "#1b6ca8", "target"), (points, "#d1495b", "source")):
+        for cloud, color, label in ((clouds[1], TARGET, "target"), (points, SOURCE, "source")):
             x, y, z = cloud.numpy().T
-            above.scatter(x, y, s=1.2, c=colour, label=label, alpha=0.6, linewidths=0)
-            space.scatter(x, y, z, s=0.8, c=colour, alpha=0.6, linewidths=0)
-        above.set_aspect("equal")
-        above.set_title(f"{name}, from above")
-        above.set_xlabel("x, mm")
-        above.set_ylabel("y, mm (up)")
-        above.legend(markerscale=6, fontsize=7, loc="upper right")
-        spans = np.ptp(np.concatenate((clouds[1].numpy(), points.numpy())), axis=0)
-        space.set_box_aspect((spans[0], spans[1], max(spans[2], 0.3 * spans[0])))
+            above.scatter(x, y, s=1.2, c=color, label=label, alpha=0.6, linewidths=0)
+            space.scatter(x, y, z, s=0.8, c=color, alpha=0.6, linewidths=0)
+        above.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x, mm", ylabel="y, mm (up)")
+        above.set_title(f"{name}, from above", fontsize=10)
+        above.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+        above.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+        space.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+        space.set_box_aspect((spans[0], spans[1], exaggeration * spans[2]), zoom=1.0)
         space.view_init(elev=35, azim=-65)
-        space.set_title(name)
-        space.tick_params(labelsize=6)
+        space.set_title(f"{name}, height x {exaggeration:g}", fontsize=10)
+        _space_labels(space)
+    above.set_ylabel("")  # it is that of the first panel
+    figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=2, markerscale=8, frameon=False)
     if title:
-        figure.suptitle(title)
+        figure.suptitle(title, fontsize=11)
     return figure
 
 
@@ -175,8 +304,23 @@ def _millimetres(axes: Any) -> None:
     axes.set_ylabel("y, mm (down)")
 
 
+def _space_labels(axes: Any) -> None:
+    """Few ticks and close labels on the axes of a surface or cloud."""
+    axes.set_xlabel("x, mm", labelpad=-6)
+    axes.set_ylabel("y, mm", labelpad=-6)
+    axes.set_zlabel("z, mm", labelpad=-9)
+    axes.tick_params(labelsize=8, pad=-2)
+    for axis, ticks in ((axes.xaxis, 4), (axes.yaxis, 4), (axes.zaxis, 2)):
+        axis.set_major_locator(MaxNLocator(ticks, steps=[1, 2, 5, 10]))
+
+
+def _exaggeration(height: float, width: float) -> float:
+    """The round factor that makes a relief about a seventh as high as the frame is wide."""
+    return float(max((f for f in _EXAGGERATIONS if f * height <= 0.15 * width), default=1))
+
+
 def _round_step(span: float) -> float:
-    """A step of 1, 2 or 5 times a power of ten that divides ``span`` into about ten parts."""
+    """A step of 1, 2 or 5 times a power of ten that divides ``span`` into about ten parts, 7 to 14."""
     raw = span / 10.0
     power = 10.0 ** np.floor(np.log10(raw))
-    return float(min((s for s in (power, 2 * power, 5 * power, 10 * power) if s >= raw - 1e-12), default=10 * power))
+    return float(min((s for s in (power, 2 * power, 5 * power, 10 * power) if s >= 0.7 * raw), default=10 * power))

@@ -1,5 +1,6 @@
 """How often errors lie within the bounds that confidence states: on random exact scenes, and on presses of balls."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -33,12 +34,16 @@ class Coverage(NamedTuple):
         shape: shape that was pressed in.
         normal: (5,), share of the normals at each of :data:`LEVELS`.
         depth: (5,), share of the depths at each of :data:`LEVELS`.
+        normal_quartiles: (2, 5), lower and upper quartile over the frames of a mean; of one frame the share itself.
+        depth_quartiles: (2, 5), the same of the depths.
     """
 
     name: str
     shape: str
     normal: Tensor
     depth: Tensor
+    normal_quartiles: Tensor
+    depth_quartiles: Tensor
 
 
 def coverage(out: ConfidentOutput, truth: Truth, spread: float, name: str = "", shape: str = "") -> Coverage:
@@ -62,7 +67,8 @@ def coverage(out: ConfidentOutput, truth: Truth, spread: float, name: str = "", 
     error = (out.depth_mm - truth.depth_mm).abs()
     of_normal = [(angle <= bound_at(out.normal_95_deg, level, spread))[truth.region].double().mean() for level in LEVELS]
     of_depth = [(error <= bound_at(out.depth_95_mm, level, DEPTH_SPREAD))[truth.region].double().mean() for level in LEVELS]
-    return Coverage(name, shape, torch.stack(of_normal), torch.stack(of_depth))
+    shares = torch.stack(of_normal), torch.stack(of_depth)
+    return Coverage(name, shape, *shares, *(share.expand(2, -1) for share in shares))
 
 
 def of_scenes(seeds: Sequence[int], unit: str | None = None, progress: bool = False) -> list[Coverage]:
@@ -132,15 +138,27 @@ def of_press(out: ConfidentOutput, press: Press, mm_per_pixel: float, spread: fl
 
 
 def mean(rows: Sequence[Coverage], name: str = "") -> Coverage:
-    """Mean over frames.
+    """Mean and quartiles over frames.
 
     Raises:
         ValueError: no rows.
     """
     if not rows:
         raise ValueError("rows: expected at least one frame, got none")
-    parts = [torch.stack(column).mean(0) for column in ([row.normal for row in rows], [row.depth for row in rows])]
-    return Coverage(name, "", *parts)
+    frames = [torch.stack([row.normal for row in rows]), torch.stack([row.depth for row in rows])]
+    quartiles = [shares.quantile(torch.tensor([0.25, 0.75], dtype=shares.dtype), 0) for shares in frames]
+    return Coverage(name, "", *(shares.mean(0) for shares in frames), *quartiles)
+
+
+def to_json(rows: Sequence[Coverage]) -> str:
+    """Rows as a JSON list, one object each."""
+    return json.dumps([{k: v.tolist() if isinstance(v, Tensor) else v for k, v in row._asdict().items()} for row in rows], indent=1)
+
+
+def from_json(text: str) -> list[Coverage]:
+    """The rows that :func:`to_json` wrote."""
+    rows, names = json.loads(text), Coverage._fields[2:]
+    return [Coverage(r["name"], r["shape"], *(torch.tensor(r[name], dtype=torch.float64) for name in names)) for r in rows]
 
 
 def table(rows: Sequence[Coverage]) -> str:

@@ -2,7 +2,7 @@
 
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,20 +10,20 @@ import numpy as np
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from PIL import Image
 from torch import Tensor
 
 from ..core.files import write_atomically
 from ..pipeline import ConfidentPipeline
-from ..viz import draw_contours, draw_surface, new_figure
+from ..viz import depth_colors, depth_range, draw_bar, draw_contours, draw_outline, draw_surface, new_figure
 from .coverage import LEVELS, Coverage
 from .evaluate import Evaluation
 from .gallery import CORRUPTIONS, Corruption
 from .methods import MASK_STYLE, METHODS
 from .metrics import normal_angle_deg
 from .random_scenes import random_frame
-from .rows import Row
+from .rows import Row, Size, mean
 from .score import Truth
 from .speed import front, ms
 from .stability import DEPTH_LIMIT, MASK, MASK_LIMIT, NORMAL_LIMIT_DEG, Breaking, depth_share, in_words
@@ -40,6 +40,12 @@ def save_small(figure: Figure, path: Path) -> None:
 
 # error against time
 
+OURS, PEERS = "#0072b2", "#d55e00"
+"""Blue and vermilion, which all readers distinguish."""
+
+AGAINST_SIZE = ("fast", "precise", "look-up table", "gs_sdk's pipeline")
+"""Methods whose cost is drawn against size: the others lie on one of these lines."""
+
 
 class _Panel(NamedTuple):
     """A panel of error against time."""
@@ -52,30 +58,43 @@ class _Panel(NamedTuple):
 
 
 def speed_figure(rows: Sequence[Row]) -> Figure:
-    """Error against time on an exact scene, on a real sensor if it was measured, and on walls; and cost against size."""
-    sensor = [row for row in rows if row.kind == "sensor"]
-    figure = new_figure(17.0 if sensor else 13.0, 4.8)
-    axes = figure.subplots(1, 4 if sensor else 3)
+    """Error against time on a real sensor if it was measured, then on an exact scene; and cost against size.
+
+    Args:
+        rows: of :func:`torchvts.evaluation.speed.run`, or read back from its bench.json.
+    """
     scenes = [row for row in rows if row.kind == "scene" and "press 1 mm" in row.data]
     large = [row for row in scenes if row.size is not None and row.size.height == 480]
-    stamps = [row for row in rows if row.kind == "wall" and row.data.startswith("stamp")]
-    panels = [
-        _Panel(axes[0], large, "rms_um", "depth RMS, um", "Exact scene, 640x480: ball pressed 1 mm"),
-        _Panel(axes[-2], stamps, "rms_um", "depth RMS, um", "Exact scene, 320x240: stamp with upright walls, 1 mm"),
-    ]
-    if sensor:
-        title = "GelSight Mini, 320x240: balls not learned from"
-        panels.append(_Panel(axes[1], sensor, "normal_deg", "mean error of normals, degrees", title))
-    drawn = [panel._replace(rows=_error_against_time(panel)) for panel in panels]
-    for legend_of in axes[: 2 if sensor else 1]:
-        legend_of.legend(fontsize=7, loc="center left")
+    sensor = [row for row in rows if row.kind == "sensor" and row.size == _usual_size(rows)]
+    kinds = (
+        (sensor, "normal_deg", "mean error of normals, deg", "balls not learned from"),
+        (large, "rms_um", "depth RMS, um", "ball of 10 mm radius, 1 mm deep"),
+    )
+    drawn = [kind for kind in kinds if kind[0]]
+    figure = new_figure(3.4 * len(drawn) + 3.2, 3.7)
+    axes = figure.subplots(1, len(drawn) + 1)
+    panels = []
+    for place, (own, error, label, what) in zip(axes, drawn):
+        size = own[0].size
+        where = "exact scene" if own is large else own[0].data.split(",")[0]
+        title = f"{where}, {size.width}x{size.height}:\n{what}" if size else what
+        panel = _Panel(place, own, error, label, title)
+        panels.append(panel._replace(rows=_error_against_time(panel)))
     _cost_against_size(axes[-1], scenes)
+    handles = {label: handle for panel in panels for handle, label in zip(*panel.axes.get_legend_handles_labels())}
+    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=len(handles), frameon=False, fontsize=9)
     time = rows[0].time
     figure.suptitle(f"{time.machine}, {time.threads} threads, one frame" if time else "", fontsize=9)
     figure.draw_without_rendering()  # sets the places of the panels
-    for panel in drawn:
+    for panel in panels:
         _name_points(panel)
     return figure
+
+
+def _usual_size(rows: Sequence[Row]) -> Size | None:
+    """The size of most rows of the real sensor."""
+    sizes = [row.size for row in rows if row.kind == "sensor"]
+    return max(sizes, key=sizes.count, default=None)
 
 
 def _error_against_time(panel: _Panel) -> list[Row]:
@@ -86,24 +105,27 @@ def _error_against_time(panel: _Panel) -> list[Row]:
     shown = sorted((row for row in known if (row.errors[error] or 0.0) <= limit), key=ms)
     best = front(shown, error)
     axes.step(*_points(best, error), where="post", color="0.6", lw=1, label="Pareto front")
-    for ours, color, marker, name in ((True, "tab:blue", "o", "torchvts"), (False, "tab:red", "s", "peers")):
-        for seen, fill in ((False, color), (True, "none")):
+    for ours, color, marker, name in ((True, OURS, "o", "torchvts"), (False, PEERS, "s", "peers")):
+        for seen, fill in ((False, color), (True, "white")):
             points = [row for row in shown if row.ours == ours and row.seen == seen]
-            text = f"{name}, has seen these frames" if seen else name
+            text = f"{name}, learned from these frames" if seen else name
             if points:
                 axes.plot(*_points(points, error), marker, color=color, markerfacecolor=fill, label=text, ls="none")
-    beyond = [f"{row.method}: {row.error(error):.0f} at {ms(row):.2g} ms" for row in known if row not in shown]
-    if beyond:
-        axes.text(0.02, 0.02, "\n".join(["not drawn:", *beyond]), transform=axes.transAxes, fontsize=6.5, color="0.35")
-    axes.set(xscale="log", yscale="log", xlabel="ms a frame", ylabel=panel.label)
+    beyond = "".join(f"\nnot drawn: {row.method}, {row.error(error):.0f} at {ms(row):.2g} ms" for row in known if row not in shown)
+    axes.set(xscale="log", yscale="log", ylabel=panel.label)
+    axes.set_xlabel(f"ms a frame{beyond}", fontsize=9)
     axes.set_title(panel.title, fontsize=9)
-    axes.margins(x=0.3, y=0.2)
+    axes.margins(x=0.4, y=0.2)
+    _log_ticks(axes)
+    return shown
+
+
+def _log_ticks(axes: Any) -> None:
     axes.grid(which="both", alpha=0.25)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(NullFormatter())
-    return shown
 
 
 def _points(rows: Sequence[Row], error: str) -> tuple[list[float], list[float | None]]:
@@ -116,15 +138,15 @@ Box = tuple[float, float, float, float]
 
 def _name_points(panel: _Panel) -> None:
     """Write method names beside their points, where they overlap least with other names and points."""
-    size, scale = 6.5, panel.axes.figure.dpi / 72.0
+    size, scale = 8.0, panel.axes.figure.dpi / 72.0
     points = [panel.axes.transData.transform((ms(row), row.error(panel.error))) for row in panel.rows]
-    taken: list[Box] = [(x - 4.0, y - 4.0, x + 4.0, y + 4.0) for x, y in points]
+    taken: list[Box] = [(x - 4.0 * scale, y - 4.0 * scale, x + 4.0 * scale, y + 4.0 * scale) for x, y in points]
     frame = panel.axes.bbox
     for row, (x, y) in zip(panel.rows, points, strict=True):
-        wide, high = 0.6 * size * scale * len(row.method), 1.3 * size * scale
+        wide, high = 0.56 * size * scale * len(row.method), 1.3 * size * scale
         choices = []
-        for k, (right, up) in enumerate((r, u) for u in (8, -14, 22, -28, 36, -42, 50, -56) for r in (True, False)):
-            left = x + 6 * scale if right else x - 6 * scale - wide
+        for k, (right, up) in enumerate((r, u) for u in (-4, 8, -16, 20, -28, 32, -40, 46, -54, 60, -68) for r in (True, False)):
+            left = x + 7 * scale if right else x - 7 * scale - wide
             box = (left, y + up * scale, left + wide, y + up * scale + high)
             covered = sum(box[0] < b[2] and b[0] < box[2] and box[1] < b[3] and b[1] < box[3] for b in taken)
             outside = box[0] < frame.x0 or box[2] > frame.x1 or box[1] < frame.y0 or box[3] > frame.y1
@@ -132,20 +154,28 @@ def _name_points(panel: _Panel) -> None:
         _, _, right, up, box = min(choices)
         taken.append(box)
         arrow = {"arrowstyle": "-", "lw": 0.4, "color": "0.5"}
-        offset = {"xytext": (6 if right else -6, up), "textcoords": "offset points", "ha": "left" if right else "right"}
+        offset = {"xytext": (7 if right else -7, up), "textcoords": "offset points", "ha": "left" if right else "right"}
         panel.axes.annotate(row.method, (ms(row), row.error(panel.error)), fontsize=size, arrowprops=arrow, **offset)
 
 
 def _cost_against_size(axes: Any, rows: Sequence[Row]) -> None:
-    for method in ("fast", "precise", "auto", "fast, SciPy's DCT", "look-up table", "gs_sdk's pipeline"):
+    """A line for each method, named at its end."""
+    sizes = {r.size.height * r.size.width: f"{r.size.width}x\n{r.size.height}" for r in rows if r.size}
+    for method, marker, dashes in zip(AGAINST_SIZE, "ovs^", ("-", "--", "-", "--")):
         line = sorted((r.size.height * r.size.width, ms(r), r.ours) for r in rows if r.method == method and r.size)
         if line:
-            style = "o-" if line[0][2] else "s--"
-            axes.plot([pixels for pixels, _, _ in line], [time for _, time, _ in line], style, ms=4, lw=1, label=method)
-    axes.set(xscale="log", yscale="log", xlabel="pixels of a frame", ylabel="ms a frame")
-    axes.set_title("Cost against size", fontsize=9)
-    axes.grid(which="both", alpha=0.25)
-    axes.legend(fontsize=7)
+            x, y, ours = zip(*line)
+            axes.plot(x, y, color=OURS if ours[0] else PEERS, marker=marker, ls=dashes, ms=4)
+            whole = len(x) == len(sizes)  # a line that ends early is named above its end, clear of the others
+            place = {"xytext": (6, 0), "va": "center"} if whole else {"xytext": (0, 6), "ha": "right"}
+            axes.annotate(method, (x[-1], y[-1]), textcoords="offset points", fontsize=8, **place)
+    axes.set(xscale="log", yscale="log", ylabel="ms a frame")
+    axes.set_xlabel("size of the frame, pixels", fontsize=9)
+    axes.set_title("exact scene:\ncost against size", fontsize=9)
+    axes.margins(x=0.1)
+    _log_ticks(axes)
+    axes.set_xticks(list(sizes), list(sizes.values()), fontsize=9)
+    axes.set_xlim(right=axes.get_xlim()[1] * 8.0)  # room for the names
 
 
 # breaking points
@@ -154,35 +184,70 @@ def _cost_against_size(axes: Any, rows: Sequence[Row]) -> None:
 def corruption_figure(corruption: Corruption, rows: Sequence[Row], points: Sequence[Breaking]) -> Figure:
     """Three frames of a corruption, and the errors of each method against severity, with limits and breaking points.
 
+    Methods whose errors agree within a tenth at every severity are one line; the list beside the panels names them all.
+
     Args:
         corruption: the corruption.
         rows: its rows.
         points: its breaking points.
     """
-    figure = new_figure(11.0, 3.3, 100)
-    grid = figure.add_gridspec(3, 5, width_ratios=(0.75, 2, 2, 1.5, 1.55))
+    figure = new_figure(11.0, 3.4, 100)
+    grid = figure.add_gridspec(3, 5, width_ratios=(0.75, 2, 2, 1.3, 1.9))
     last = len(corruption.severities) - 1
     for k, place in enumerate((0, last // 2 + 1, last)):
         axes = figure.add_subplot(grid[k, 0])
         axes.imshow(corruption.make(corruption.severities[place], 0).image[0].permute(1, 2, 0).mul(1.4).clamp(0, 1).numpy())
-        axes.set_title(f"{corruption.severities[place]:g} {corruption.unit}", fontsize=7, pad=2)
+        axes.set_title(f"{corruption.severities[place]:g} {corruption.unit}", fontsize=8, pad=2)
         axes.set_axis_off()
     panels = [figure.add_subplot(grid[:, k]) for k in (1, 2, 3)]
-    for method in dict.fromkeys(row.method for row in rows):
-        own = [[row for row in rows if row.method == method and row.severity == s] for s in corruption.severities]
-        style = dict(METHODS[method].style)
-        _draw_means(panels[0], [[row.error("normal_deg") for row in group] for group in own], style, 0.2)
-        shares = [[None if (share := depth_share(row)) is None else 100.0 * share for row in group] for group in own]
-        _draw_means(panels[1], shares, style, 0.1)
-        if method == "fast":
-            _draw_means(panels[2], [[row.error("iou") for row in group] for group in own], dict(MASK_STYLE), 0.0)
+    curves = {method: _Curves.of(method, corruption, rows) for method in dict.fromkeys(row.method for row in rows)}
+    line_of = _lines(curves)
+    for method in dict.fromkeys(line_of.values()):
+        _draw_means(panels[0], curves[method].normal_deg, _style(method), 0.2)
+        _draw_means(panels[1], curves[method].depth_percent, _style(method), 0.1)
+    if "fast" in curves:
+        _draw_means(panels[2], curves["fast"].iou, _style(MASK), 0.0)
     _label_severities(panels, corruption)
     for point in points:
         if not isinstance(point.at, str):
             for axes in panels[2:] if point.method == MASK else panels[:2]:
-                axes.axvline(last * point.held, ymax=0.06, color=_style(point.method)["color"], lw=2)
-    _list_breaking_points(figure.add_subplot(grid[:, 4]), corruption, points)
+                axes.axvline(last * point.held, ymax=0.06, color=_style(line_of.get(point.method, MASK))["color"], lw=2)
+    _list_breaking_points(figure.add_subplot(grid[:, 4]), corruption, points, line_of)
     return figure
+
+
+class _Curves(NamedTuple):
+    """Means over seeds of a method at each severity; NaN where every run failed."""
+
+    normal_deg: list[float]
+    depth_percent: list[float]
+    iou: list[float]
+
+    @classmethod
+    def of(cls, method: str, corruption: Corruption, rows: Sequence[Row]) -> "_Curves":
+        groups = [[row for row in rows if row.method == method and row.severity == s] for s in corruption.severities]
+
+        def means(value: Callable[[Row], float | None]) -> list[float]:
+            return [math.nan if (found := mean(value(row) for row in group)) is None else found for group in groups]
+
+        shares = means(depth_share)
+        return cls(
+            means(lambda row: row.error("normal_deg")), [100.0 * share for share in shares], means(lambda row: row.error("iou"))
+        )
+
+
+def _lines(curves: Mapping[str, _Curves]) -> dict[str, str]:
+    """For each method the one whose line stands for it: the first with the same errors, within a tenth."""
+    line_of: dict[str, str] = {}
+    for method, own in curves.items():
+        same = (
+            other
+            for other in dict.fromkeys(line_of.values())
+            if np.allclose(own.normal_deg, curves[other].normal_deg, rtol=0.1, atol=0.02, equal_nan=True)
+            and np.allclose(own.depth_percent, curves[other].depth_percent, rtol=0.1, atol=0.02, equal_nan=True)
+        )
+        line_of[method] = next(same, method)
+    return line_of
 
 
 def _style(method: str) -> dict[str, Any]:
@@ -194,11 +259,11 @@ def _label_severities(panels: Sequence[Any], corruption: Corruption) -> None:
     titles = ("mean error of normals in contact, deg", "depth RMS, % of the press", "contact mask, IoU")
     for axes, limit, title in zip(panels, (NORMAL_LIMIT_DEG, 100 * DEPTH_LIMIT, MASK_LIMIT), titles):
         axes.axhline(limit, color="black", lw=0.8, ls=(0, (5, 3)))
-        axes.text(0.0, limit, "limit", fontsize=7, va="bottom")
-        axes.set_xticks(range(len(corruption.severities)), [f"{s:g}" for s in corruption.severities], fontsize=7)
-        axes.tick_params(labelsize=7)
-        axes.set_xlabel(f"{corruption.name}, {corruption.unit}".rstrip(", "), fontsize=8)
-        axes.set_title(title, fontsize=8)
+        axes.text(0.0, limit, "limit", fontsize=8, va="bottom")
+        axes.set_xticks(range(len(corruption.severities)), [f"{s:g}" for s in corruption.severities], fontsize=8)
+        axes.tick_params(labelsize=8)
+        axes.set_xlabel(f"{corruption.name}, {corruption.unit}".rstrip(", "), fontsize=9)
+        axes.set_title(title, fontsize=9)
         axes.grid(alpha=0.25)
     for axes in panels[:2]:
         axes.set_yscale("log")
@@ -206,47 +271,64 @@ def _label_severities(panels: Sequence[Any], corruption: Corruption) -> None:
     panels[2].set_ylim(-0.03, 1.05)
 
 
-def _list_breaking_points(legend: Any, corruption: Corruption, points: Sequence[Breaking]) -> None:
+def _list_breaking_points(legend: Any, corruption: Corruption, points: Sequence[Breaking], line_of: Mapping[str, str]) -> None:
+    """Line, breaking point and name of each method; methods of one line stand together, with one piece of it."""
     legend.set_axis_off()
-    legend.text(0.0, 1.0, f"breaks at{f', {corruption.unit}' if corruption.unit else ''}", fontsize=8, weight="bold", va="top")
-    for k, point in enumerate(points):
-        color = _style(point.method)["color"]
-        legend.text(0.0, 0.9 - 0.085 * k, point.text, color=color, fontsize=8, va="top", weight="bold")
-        legend.text(0.3, 0.9 - 0.085 * k, point.method, color=color, fontsize=8, va="top")
+    legend.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0))
+    legend.text(0.0, 1.0, f"breaks at{f', {corruption.unit}' if corruption.unit else ''}", fontsize=9, weight="bold", va="top")
+    lines = [line_of.get(point.method, MASK) for point in points]
+    ordered = sorted(zip(points, lines), key=lambda pair: lines.index(pair[1]))
+    for k, (point, line) in enumerate(ordered):
+        y, style = 0.87 - 0.088 * k, _style(line)
+        if k == 0 or ordered[k - 1][1] != line:
+            legend.plot((0.0, 0.13), (y, y), **style)
+        legend.text(0.17, y, point.text, fontsize=9, va="center", weight="bold")
+        legend.text(0.4, y, point.method, fontsize=9, va="center")
 
 
-def _draw_means(axes: Any, groups: Sequence[Sequence[float | None]], style: dict[str, Any], least: float) -> None:
+def _draw_means(axes: Any, means: Sequence[float], style: dict[str, Any], least: float) -> None:
     """Means over seeds without failed runs; a cross at the top where all failed."""
-    means = []
-    for group in groups:
-        good = [value for value in group if value is not None]
-        means.append(max(least, sum(good) / len(good)) if good else np.nan)
-    axes.plot(range(len(means)), means, **style)
-    failed = [k for k, mean in enumerate(means) if np.isnan(mean)]
+    values = np.maximum(np.asarray(means), least)
+    axes.plot(range(len(values)), values, **style)
+    failed = np.flatnonzero(np.isnan(values))
     axes.plot(failed, [0.97] * len(failed), "x", color=style["color"], ms=6, transform=axes.get_xaxis_transform())
 
 
 def overview_figure(points: Sequence[Breaking]) -> Figure:
-    """Share of the severities of each corruption before each method breaks."""
-    methods = [m for m in dict.fromkeys(p.method for p in points) if m not in ("flat", MASK)] + [MASK]
-    names = list(dict.fromkeys(p.corruption for p in points))
+    """The normalised severity at which each method breaks: methods from the most to the least stable, the worst corruptions first.
+
+    Severity is 0 at the first step of a corruption and 1 at the last one; a cell that is white holds to the end.
+    """
     by_place = {(p.corruption, p.method): p for p in points}
+    names = list(dict.fromkeys(p.corruption for p in points))
+    methods = [m for m in dict.fromkeys(p.method for p in points) if m not in ("flat", MASK)]
+    methods.sort(key=lambda method: -sum(by_place[name, method].held for name in names))
+    names.sort(key=lambda name: sum(by_place[name, method].held for method in methods))
+    methods.append(MASK)
     held = np.array([[by_place[name, method].held for method in methods] for name in names])
-    figure = new_figure(2.6 + 0.95 * len(methods), 1.3 + 0.24 * len(names), 88)
+    figure = new_figure(3.0 + 0.74 * len(methods), 1.5 + 0.215 * len(names), 100)
     axes = figure.subplots()
-    picture = axes.imshow(held, cmap="RdBu", vmin=0.0, vmax=1.0, aspect="auto", alpha=0.7)
+    colors, norm = depth_colors(-1.0, 0.0)
+    picture = axes.pcolormesh(held - 1.0, cmap=colors, norm=norm, edgecolors="0.85", linewidth=0.4)
     for row, name in enumerate(names):
         for column, method in enumerate(methods):
-            text = by_place[name, method].text
-            text = {"never": "holds", "always": "broken"}.get(text, text)
-            axes.text(column, row, text, ha="center", va="center", fontsize=7.5)
-    axes.set_xticks(range(len(methods)), [m.replace(", ", ",\n") for m in methods], fontsize=8)
-    axes.set_yticks(range(len(names)), [in_words(CORRUPTIONS[name]) for name in names], fontsize=8)
+            at = by_place[name, method].at
+            text = {"never": "", "always": "always"}[at] if isinstance(at, str) else f"{float(f'{at:.2g}'):g}"
+            color = "white" if held[row, column] < 0.35 else "black"
+            axes.text(column + 0.5, row + 0.5, text, ha="center", va="center", fontsize=8.5, color=color)
+    axes.axvline(len(methods) - 1, color="black", lw=1.5)
+    axes.invert_yaxis()
+    labels = [
+        f"{m.replace(', ', ',' + chr(10)).replace(MASK, 'contact' + chr(10) + 'mask')}\n({share:.0%})"
+        for m, share in zip(methods, held.mean(0))
+    ]
+    axes.set_xticks(np.arange(len(methods)) + 0.5, labels, fontsize=8.5)
+    axes.set_yticks(np.arange(len(names)) + 0.5, [in_words(CORRUPTIONS[name]) for name in names], fontsize=8.5)
     axes.xaxis.tick_top()
     axes.tick_params(length=0)
-    bar = figure.colorbar(picture, ax=axes, location="bottom", shrink=0.6, aspect=40, pad=0.01)
-    bar.set_label("share of the severities before the method breaks; in the cells, the severity where it breaks", fontsize=8)
-    bar.ax.tick_params(labelsize=7)
+    bar = figure.colorbar(picture, ax=axes, location="bottom", shrink=0.7, aspect=40, pad=0.01)
+    bar.set_ticks([-1.0, -0.75, -0.5, -0.25, 0.0], labels=["0: first step", "0.25", "0.5", "0.75", "1: holds"], fontsize=8.5)
+    bar.set_label("normalised severity at which the method breaks (in brackets: mean); in cells: the severity itself", fontsize=8.5)
     return figure
 
 
@@ -266,25 +348,22 @@ def set_figure(evaluation: Evaluation, methods: Sequence[str] = ()) -> Figure:
     chosen = list(methods) or [name for name in evaluation.outputs if name != "flat"]
     if shown is None or not chosen or any(name not in evaluation.outputs for name in chosen):
         raise ValueError(f"methods: expected some of {', '.join(evaluation.outputs) or 'none'}, got {', '.join(chosen) or 'none'}")
-    figure = new_figure(13.5, 3.9 * len(chosen))
+    figure = new_figure(11.0, 3.0 * len(chosen) + 0.3, 100)
     errors = {name: _relief_error(evaluation.outputs[name].depth_mm, shown.truth) for name in chosen}
     most = max(float(error.nan_to_num().abs().quantile(0.998)) for error in errors.values()) or 1.0
     depths = {name: evaluation.outputs[name].depth_mm[0, 0].double().numpy() for name in chosen}
-    low, high = (1000.0 * float(of([of(depth) for depth in depths.values()])) for of in (np.min, np.max))
+    span = depth_range(*depths.values())
     for k, (name, depth) in enumerate(depths.items()):
         contours, panel = (figure.add_subplot(len(chosen), 3, 3 * k + column) for column in (1, 3))
-        draw_contours(figure, contours, depth, pitch)
-        contours.get_images()[0].set_clim(min(low, 0.0), max(high, 1.0))
-        extent = contours.get_images()[0].get_extent()
+        draw_contours(figure, contours, depth, pitch, range_mm=span)
         for mask, style in ((evaluation.outputs[name].contact, "-"), (shown.truth.contact if shown.truth else None, ":")):
             if mask is not None and bool(mask.any()) and not bool(mask.all()):
-                lines: dict[str, Any] = {"colors": "tab:red", "linestyles": style, "extent": extent, "origin": "upper"}
-                contours.contour(mask[0, 0].float().numpy(), [0.5], linewidths=1.2, **lines)
-        contours.set_title(f"{name}: {contours.get_title()}")
+                draw_outline(contours, mask[0, 0].double().numpy(), pitch, "#e69f00", style)
+        contours.set_title(f"{name}: {contours.get_title()}", fontsize=9)
         surface = figure.add_subplot(len(chosen), 3, 3 * k + 2, projection="3d")
-        draw_surface(surface, depth, pitch)
-        _draw_error(panel, errors[name], most, extent)
-    figure.suptitle(f"{evaluation.data.name}, {shown.name}; contact in red, the true one dotted")
+        draw_surface(surface, depth, pitch, range_mm=span)
+        _draw_error(panel, errors[name], most, contours.get_images()[0].get_extent())
+    figure.suptitle(f"{evaluation.data.name}, {shown.name}; contact in orange, the true one dotted", fontsize=11)
     return figure
 
 
@@ -295,14 +374,15 @@ def _draw_error(panel: Any, error: Tensor, most: float, extent: Sequence[float])
         panel.set_axis_off()
         panel.text(0.5, 0.5, "no truth", ha="center")
         return
-    picture = panel.imshow(error.numpy(), cmap="RdBu_r", vmin=-most, vmax=most, extent=extent)
-    panel.figure.colorbar(picture, ax=panel, shrink=0.75, label="um")
+    colors, norm = depth_colors(-most, most)
+    draw_bar(panel.figure, panel, panel.imshow(error.numpy(), cmap=colors, norm=norm, extent=extent), "um")
     (left, right, low, high), (rows, columns) = extent, error.shape
     x = [left + (right - left) * float(k) / columns for k in known.any(0).nonzero()[[0, -1], 0]]
     y = [high + (low - high) * float(k) / rows for k in known.any(1).nonzero()[[0, -1], 0]]
     reach = 0.6 * max(x[1] - x[0], y[1] - y[0]) + 0.02 * (right - left)
     panel.set(xlim=(sum(x) / 2 - reach, sum(x) / 2 + reach), ylim=(sum(y) / 2 + reach, sum(y) / 2 - reach))
-    panel.set(xlabel="x, mm", ylabel="y, mm (down)", title=f"error of relief, RMS {float(error.square().nanmean().sqrt()):.1f} um")
+    panel.set(xlabel="x, mm", ylabel="y, mm (down)")
+    panel.set_title(f"error of relief, RMS {float(error.square().nanmean().sqrt()):.1f} um", fontsize=9)
 
 
 def _relief_error(depth_mm: Tensor, truth: Truth | None) -> Tensor:
@@ -317,44 +397,100 @@ def _relief_error(depth_mm: Tensor, truth: Truth | None) -> Tensor:
 
 
 def coverage_figure(curves: Sequence[Coverage], seed: int = 1) -> Figure:
-    """Measured against stated shares, and on one random scene the bounds beside the errors.
+    """Measured against stated shares with the quartiles over frames, and on one random scene the bounds beside the errors.
 
     Args:
-        curves: means, a line each.
+        curves: means, a line each; more than five cannot be distinguished.
         seed: seed of the scene.
     """
-    figure = new_figure(11.0, 7.2)
-    parts = figure.subfigures(2, 1, height_ratios=[1.15, 1.0], squeeze=False)
-    for panel, what in zip(list(parts[0, 0].subplots(1, 2)), ("normal", "depth")):
+    figure = new_figure(10.0, 6.4, 110)
+    parts = figure.subfigures(2, 1, height_ratios=[1.7, 1.0], squeeze=False)
+    panels = list(parts[0, 0].subplots(1, 2, sharey=True))
+    for panel, what in zip(panels, ("normal", "depth")):
         panel.fill_between([45, 100], [40, 95], [50, 105], color="0.9", label="within 5 points")
         panel.plot([45, 100], [45, 100], color="0.5", linewidth=1.0)
-        for curve in curves:
-            shares = (100.0 * (curve.normal if what == "normal" else curve.depth)).tolist()
-            panel.plot([100.0 * level for level in LEVELS], shares, marker="o", markersize=4, label=curve.name)
-        panel.set_xlim(47, 98)
-        panel.set_ylim(30, 101)
-        panel.set_xlabel("stated, % of pixels")
-        panel.set_ylabel("measured, % of pixels")
-        panel.set_title(f"{what} within its bound")
+        for k, (curve, (color, marker)) in enumerate(zip(curves, _LINES)):
+            levels = [100.0 * level + 0.5 * (k - 0.5 * (len(curves) - 1)) for level in LEVELS]  # so that bars stand side by side
+            low, high = 100.0 * getattr(curve, f"{what}_quartiles")
+            shares = 100.0 * getattr(curve, what)
+            panel.plot(levels, shares.tolist(), marker=marker, color=color, markersize=4, lw=1.4, label=curve.name)
+            panel.vlines(levels, low.tolist(), high.tolist(), color=color, lw=1.2, alpha=0.6)
+        panel.set(xlim=(46, 99), ylim=(30, 101.5), xlabel="stated share of pixels, %", title=f"{what} within its bound")
         panel.grid(alpha=0.3)
-    panel.legend(loc="lower right", fontsize=8)
+    panels[0].set_ylabel("measured share of pixels, %")
+    handles, labels = panels[0].get_legend_handles_labels()
+    parts[0, 0].legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9, frameon=False)
+    parts[0, 0].suptitle("means over frames; vertical lines: quartiles over frames", fontsize=9)
     _draw_bounds(parts[1, 0], seed)
     return figure
 
 
+_LINES = tuple(zip(("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00"), "osv^D"))
+"""Colours of Okabe and Ito's palette, and markers."""
+
+
 def _draw_bounds(figure: Any, seed: int) -> None:
+    """Bound and error of normals and of depth in one range each, cut to the contact."""
     frame = random_frame(seed, "lights known, background", "letters")
     out = ConfidentPipeline.from_calibration(frame.calibration, "precise")(frame.image)
-    maps = [
-        ("bound of the normal (95 %), deg", out.normal_95_deg[0, 0]),
-        ("its error, deg", normal_angle_deg(out.normal, frame.scene.normal)[0]),
-        ("bound of the depth (95 %), um", 1000.0 * out.depth_95_mm[0, 0]),
-        ("its error, um", 1000.0 * (out.depth_mm - frame.scene.depth_mm).abs()[0, 0]),
-    ]
+    maps = {
+        ("normals, deg", "normal"): (out.normal_95_deg[0, 0], normal_angle_deg(out.normal, frame.scene.normal)[0]),
+        ("depth, um", "depth"): (1000.0 * out.depth_95_mm[0, 0], 1000.0 * (out.depth_mm - frame.scene.depth_mm).abs()[0, 0]),
+    }
     inside = (out.contact | frame.scene.contact)[0, 0]
-    for k, (panel, (title, values)) in enumerate(zip(figure.subplots(1, 4), maps)):
-        most = float(maps[k - k % 2][1][inside].quantile(0.99))
-        drawn = panel.imshow(torch.where(inside, values, math.nan).numpy(), cmap="viridis", vmin=0.0, vmax=most)
-        panel.set_title(title, fontsize=9)
-        panel.set_xticks([]), panel.set_yticks([])
-        figure.colorbar(drawn, ax=panel, shrink=0.75, orientation="horizontal")
+    rows, columns = inside.nonzero().T
+    window = slice(int(rows.min()), int(rows.max()) + 1), slice(int(columns.min()), int(columns.max()) + 1)
+    panels, pitch = list(figure.subplots(1, 4)), frame.scene.mm_per_pixel
+    for k, ((label, what), pair) in enumerate(maps.items()):
+        most = float(torch.cat([values[inside] for values in pair]).quantile(0.98))
+        colors, norm = depth_colors(0.0, most)
+        for panel, values, title in zip(panels[2 * k :], pair, (f"95 % bound of {what}", f"error of {what}")):
+            shown = torch.where(inside, values, math.nan)[window]
+            size = (0.0, shown.shape[1] * pitch, shown.shape[0] * pitch, 0.0)
+            drawn = panel.imshow(shown.numpy(), cmap=colors, norm=norm, extent=size)
+            panel.set_title(title, fontsize=9)
+            panel.set_xlabel("mm", fontsize=9)
+            panel.tick_params(labelsize=8)
+        figure.colorbar(
+            drawn, ax=panels[2 * k : 2 * k + 2], shrink=0.8, aspect=30, orientation="horizontal", extend="max", label=label
+        )
+
+
+# learning curves
+
+
+def learning_figure(rows: Sequence[Row]) -> Figure:
+    """Error against the number of presses: means over draws of presses, with the smallest and the largest draw.
+
+    Args:
+        rows: one for each draw, ``seed``: ``method`` names the line, the error "count" is the number of presses or touches;
+            where it is None, the row is a level line for comparison.
+    """
+    figure = new_figure(10.0, 4.2, 110)
+    panels = figure.subplots(1, 2)
+    levels = [row for row in rows if row.errors["count"] is None]
+    rows = [row for row in rows if row.errors["count"] is not None]
+    lines = list(dict.fromkeys((row.data, row.method) for row in rows))
+    several = len({data for data, _ in lines}) > 1
+    for axes, error, label in zip(panels, ("normal_deg", "relief_um"), ("mean error of normals, deg", "error of relief, um")):
+        for k, line in enumerate(lines):
+            own = [row for row in rows if (row.data, row.method) == line and row.error(error) is not None]
+            counts = sorted({row.errors["count"] or 0.0 for row in own})
+            draws = [[row.errors[error] or 0.0 for row in own if row.errors["count"] == count] for count in counts]
+            places = [count + 0.08 * (k - 0.5 * (len(lines) - 1)) for count in counts]  # so that bars stand side by side
+            color, marker = _LINES[k % len(_LINES)]
+            dashes = ("-", "--", ":")[k // len(_LINES) % 3]
+            name = ", ".join(line) if several else line[1]
+            axes.plot(places, [statistics.mean(d) for d in draws], color=color, marker=marker, ls=dashes, label=name)
+            axes.vlines(places, [min(d) for d in draws], [max(d) for d in draws], color=color, lw=1.4, alpha=0.6)
+        for row in levels:
+            if (level := row.error(error)) is not None:
+                axes.axhline(level, color="black", lw=1.2, ls=(0, (5, 3)), label=row.method)
+        axes.set(xlabel="presses or touches given", ylabel=label, ylim=(0, None))
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.grid(alpha=0.3)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
+    title = f"means of {len({row.seed for row in rows})} draws of presses; vertical lines: smallest and largest draw"
+    figure.suptitle(title if several else f"{lines[0][0]}: {title}", fontsize=9)
+    return figure

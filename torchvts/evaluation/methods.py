@@ -261,7 +261,7 @@ def _blurred_sensor(sensor: Sensor) -> Sensor:
     return dataclasses.replace(sensor, blur_px=with_preprocessing(sensor, None).blur_px)
 
 
-# the registry; in charts the two modes of the paper are broad lines, and methods that give almost the same are drawn upon them
+# the registry; in charts each method has a colour of Okabe and Ito's palette and dashes of its own
 
 MASK_STYLE: Mapping[str, Any] = {"color": "black", "lw": 1.4, "marker": "o", "ms": 3}
 """Style of the contact mask, which is no method of its own."""
@@ -269,27 +269,27 @@ MASK_STYLE: Mapping[str, Any] = {"color": "black", "lw": 1.4, "marker": "o", "ms
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
-        Method("flat", _flat, flat, {"color": "0.6", "lw": 1.2, "ls": "--"}, ours=False, learns=False),
+        Method("flat", _flat, flat, {"color": "0.6", "lw": 1.2, "ls": ":"}, ours=False, learns=False),
         Method(
             "fast",
             partial(pipeline, mode="fast"),
             partial(by_calibration, mode="fast"),
-            {"color": "tab:blue", "lw": 4.0, "alpha": 0.55},
+            {"color": "#0072b2", "lw": 2.2},
         ),
         Method(
             "precise",
             partial(pipeline, mode="precise"),
             partial(by_calibration, mode="precise"),
-            {"color": "tab:orange", "lw": 4.0, "alpha": 0.7},
+            {"color": "#d55e00", "lw": 2.2},
         ),
-        Method("auto", partial(pipeline, mode="auto"), style={"color": "tab:red", "lw": 1.4, "ls": ":"}),
-        Method("fast, zero border", _zero_border, style={"color": "navy", "lw": 1.2, "ls": "--"}),
+        Method("auto", partial(pipeline, mode="auto"), style={"color": "#e69f00", "lw": 1.6, "ls": (0, (4, 1))}),
+        Method("fast, zero border", _zero_border, style={"color": "#56b4e9", "lw": 1.6, "ls": "--"}),
         Method("fast, SciPy's DCT", _scipy, ours=False, needs_module="scipy"),
         Method("fast, PyTorch reference", _reference),
-        Method("precise, plain inverse", _plain_inverse, style={"color": "tab:purple", "lw": 1.4}),
-        Method("precise, blur 1 px", _blurred, style={"color": "tab:green", "lw": 1.4}),
-        Method("precise, discontinuities", _discontinuities, style={"color": "saddlebrown", "lw": 1.4, "ls": "-."}),
-        Method("precise, pinhole", _pinhole, style={"color": "deeppink", "lw": 1.2, "ls": (0, (1, 2))}),
+        Method("precise, plain inverse", _plain_inverse, style={"color": "#cc79a7", "lw": 1.6, "ls": (0, (6, 1, 1, 1))}),
+        Method("precise, blur 1 px", _blurred, style={"color": "#009e73", "lw": 1.6, "ls": (0, (2, 1))}),
+        Method("precise, discontinuities", _discontinuities, style={"color": "black", "lw": 1.4, "ls": "-."}),
+        Method("precise, pinhole", _pinhole, style={"color": "#7a5195", "lw": 1.6, "ls": (0, (1, 1))}),
         Method("point lights", from_presses=point_lights, learns=False),
         Method("look-up table", _lookup_by_rendered_balls, lookup_table, ours=False),
         Method("MLP", from_presses=network, ours=False),

@@ -14,7 +14,7 @@ from .background import (
 )
 from .follow_light import FollowLight
 from .live import StageClock, TactileFrame, TactileStream
-from .overlay import Overlay, StreamReport, VideoFile, Window, has_display
+from .overlay import Overlay, Sheet, StreamReport, VideoFile, Window, has_display
 from .recording import Recording, check_device
 from .sources import NewestFrame, Reader, Rectify, RectifySizes, Unreadable, frames_a_second, open_source
 from .usable import FrameCheck
@@ -31,6 +31,7 @@ __all__ = [
     "Recording",
     "Rectify",
     "RectifySizes",
+    "Sheet",
     "StageClock",
     "StreamReport",
     "TactileFrame",

@@ -1,4 +1,4 @@
-"""Shows a stream: the image beside depth with contours, as a video or in a window, and a report of all frames."""
+"""Shows a stream: the image beside depth with contours, as a video or a sheet of frames, and a report of all frames."""
 
 import json
 import os
@@ -10,10 +10,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from ..core.checks import check_path, check_positive, check_record
 from ..core.files import check_text_name, write_atomically
+from ..viz import depth_colors, sheet_figure
 from .live import TactileFrame, TactileStream
 from .sources import Pixels
 
@@ -24,22 +26,24 @@ _RANGES = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 
 
 class Overlay:
-    """Draws a frame: the image with its contact outlined, beside it depth in colour with contour lines, text beneath.
+    """Draws a frame: the image with its contact outlined, beside it depth in colour with contour lines, text and a bar beneath.
 
-    The range of colours grows with the deepest press so far, over round values; ten lines fill it.
+    The range of colours grows with the deepest press so far, over round values; ten lines fill it. Zero keeps its colour, and depth
+    below zero has another one (:func:`torchvts.viz.depth_colors`).
 
     Args:
         metric: whether depth is in mm; otherwise the overlay says that it is not.
+        mm_per_pixel: pixel pitch, mm, for a scale in the image; None draws none.
     """
 
     TEXT_HEIGHT = 86
 
-    def __init__(self, metric: bool = True) -> None:
-        import cv2
-
+    def __init__(self, metric: bool = True, mm_per_pixel: float | None = None) -> None:
         self.metric, self.range_mm = metric, 0.1
-        table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)
-        self._table = np.ascontiguousarray(table)
+        self.mm_per_pixel = None if mm_per_pixel is None else check_positive("mm_per_pixel", mm_per_pixel)
+        colors, _ = depth_colors(-1.0, 1.0)
+        self._table = np.ascontiguousarray((255.0 * colors(np.linspace(0.0, 1.0, 256))[:, None, 2::-1] + 0.5).astype(np.uint8))
+        self._line = np.where(self._table.mean(2, keepdims=True) < 128, 255, 60).astype(np.uint8).repeat(3, 2)
 
     def depth(self, depth_mm: Tensor) -> Pixels:
         """Depth (1, 1, H, W) as colours with contour lines, (H, W, 3) B, G, R."""
@@ -50,16 +54,16 @@ class Overlay:
         while high > self.range_mm:
             power = 10.0 ** np.floor(np.log10(self.range_mm) + 1e-9)
             self.range_mm = float(power * next(s for s in _RANGES if s > self.range_mm / power + 1e-6))
-        depth = np.maximum(depth, 0.0)
-        level = cv2.convertScaleAbs(depth, alpha=255.0 / self.range_mm)
+        level = np.clip(127.5 * (1.0 + depth / self.range_mm) + 0.5, 0.0, 255.0).astype(np.uint8)
         picture: Pixels = cv2.applyColorMap(level, self._table)
         if high > 0.02 * self.range_mm:
-            smooth = cv2.blur(depth, (3, 3))
+            smooth = cv2.blur(np.maximum(depth, 0.0), (3, 3))
             step = cv2.convertScaleAbs(smooth, alpha=10.0 / self.range_mm, beta=-0.5)  # ten lines over the range
             lines = np.zeros(step.shape, np.uint8)
             lines[:, 1:] |= (step[:, 1:] != step[:, :-1]).view(np.uint8)
             lines[1:] |= (step[1:] != step[:-1]).view(np.uint8)
-            picture[lines.astype(bool)] = (255, 255, 255)
+            on = lines.astype(bool)
+            picture[on] = self._line[level[on], 0]
         return picture
 
     def __call__(self, frame: TactileFrame, lines: Sequence[str] = ()) -> Pixels:
@@ -75,11 +79,41 @@ class Overlay:
             if larger > 1:
                 picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_NEAREST)
             out[:height, x : x + width] = picture
+        if self.mm_per_pixel is not None:
+            _draw_scale(out, self.mm_per_pixel / larger, width, height)
+        self._draw_bar(out, width + 6, height + 8, width - 12)
         unit = "mm" if self.metric else "mm, NOT METRIC"
         texts = [f"depth 0 to {self.range_mm:g} {unit}, a line each {self.range_mm / 10:g}", *lines][:4]
         for k, text in enumerate(texts):
-            cv2.putText(out, text, (6, height + 18 + 20 * k), cv2.FONT_HERSHEY_SIMPLEX, 0.43, (230, 230, 230), 1, cv2.LINE_AA)
+            _write(out, text, (6, height + 18 + 20 * k))
         return out
+
+    def _draw_bar(self, out: Pixels, x: int, y: int, width: int) -> None:
+        """The colours from zero to the end of the range, beneath the depth."""
+        import cv2
+
+        out[y : y + 10, x : x + width] = cv2.resize(self._table[128:].transpose(1, 0, 2), (width, 10))
+        end = f"{self.range_mm:g} mm"
+        _write(out, "0", (x, y + 26))
+        _write(out, end, (x + width - 8 * len(end), y + 26))
+
+
+def _write(out: Pixels, text: str, place: tuple[int, int], color: int = 230) -> None:
+    import cv2
+
+    cv2.putText(out, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.43, (color,) * 3, 1, cv2.LINE_AA)
+
+
+def _draw_scale(out: Pixels, mm_per_pixel: float, left: int, bottom: int) -> None:
+    """A bar of 1, 2 or 5 times a power of ten mm, a sixth of the image long at most, in the lower left corner of the depth."""
+    import cv2
+
+    most = left * mm_per_pixel / 6.0
+    power = 10.0 ** np.floor(np.log10(most))
+    length = power * max(s for s in (1.0, 2.0, 5.0) if s * power <= most)
+    x, y = left + 10, bottom - 10
+    cv2.line(out, (x, y), (x + round(length / mm_per_pixel), y), (40, 40, 40), 2)
+    _write(out, f"{length:g} mm", (x, y - 6), 40)
 
 
 def _outlined(frame: TactileFrame) -> Pixels:
@@ -93,6 +127,46 @@ def _outlined(frame: TactileFrame) -> Pixels:
         outline, _ = cv2.findContours(smooth, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(picture, outline, -1, (255, 255, 255), 1, cv2.LINE_AA)
     return picture
+
+
+class Sheet:
+    """Keeps depth of frames in contact, and draws six of them, evenly spaced in time, in one range of colours.
+
+    Args:
+        mm_per_pixel: pixel pitch, mm.
+        metric: whether depth is in mm; otherwise the sheet says that it is not.
+    """
+
+    _MOST = 48
+
+    def __init__(self, mm_per_pixel: float, metric: bool = True) -> None:
+        self.mm_per_pixel, self.metric = check_positive("mm_per_pixel", mm_per_pixel), metric
+        self._kept: list[tuple[float, Tensor]] = []
+        self._every = self._seen = 0
+
+    def add(self, frame: TactileFrame) -> None:
+        """Keep a frame with contact; of a long stream every second, fourth, ... of them."""
+        if not bool(frame.output.contact.any()):
+            return
+        if self._seen % (1 << self._every) == 0:
+            self._kept.append((frame.time_s, frame.output.depth_mm[0, 0].half().cpu()))
+        self._seen += 1
+        if len(self._kept) > self._MOST:
+            self._kept, self._every = self._kept[::2], self._every + 1
+
+    def figure(self) -> Figure:
+        """The sheet.
+
+        Raises:
+            ValueError: no frame was in contact.
+        """
+        if not self._kept:
+            raise ValueError("sheet: expected frames with contact, got none: there is nothing to draw")
+        most = max(float(depth.max()) for _, depth in self._kept)
+        deep = [kept for kept in self._kept if float(kept[1].max()) >= 0.1 * most]  # no panel without a visible depth
+        places = np.unique(np.linspace(0, len(deep) - 1, 6).round().astype(int))
+        chosen = [(time_s, depth.double().numpy()) for time_s, depth in (deep[k] for k in places)]
+        return sheet_figure(chosen, self.mm_per_pixel, self.metric)
 
 
 class VideoFile:

@@ -1,0 +1,43 @@
+"""Draw a picture of docs/ again from the table that its script saved; nothing is measured.
+
+python scripts/figures.py speed out/bench/bench.json docs/speed_accuracy.png
+python scripts/figures.py overview tests/breaking_points.json docs/failures/overview.png
+python scripts/figures.py learning out/learning_curve/rows.json docs/learning_curve.png
+python scripts/figures.py confidence out/confidence.json docs/confidence.png
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from torchvts.evaluation import coverage, figures, rows
+from torchvts.evaluation.stability import Breaking
+
+DRAW: dict[str, Callable[[str], Figure]] = {
+    "speed": lambda text: figures.speed_figure(rows.from_json(text)),
+    "overview": lambda text: figures.overview_figure([Breaking(**point) for point in json.loads(text)["points"]]),
+    "learning": lambda text: figures.learning_figure(rows.from_json(text)),
+    "confidence": lambda text: figures.coverage_figure(coverage.from_json(text)),
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("kind", choices=DRAW)
+    parser.add_argument("table", type=Path, help="JSON")
+    parser.add_argument("picture", type=Path, help="PNG, at most 256 colours")
+    arguments = parser.parse_args(argv)
+    figures.save_small(DRAW[arguments.kind](arguments.table.read_text(encoding="utf-8")), arguments.picture)
+    print(f"wrote {arguments.picture}")
+    return 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except (OSError, ValueError, TypeError) as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,73 @@
+"""Pictures of frames: one extent in all panels, a stated exaggeration, a zero that keeps its colour."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchvts import viz
+
+PITCH = 0.1
+
+
+def frame(height=60, width=80, low=0.0):
+    y, x = torch.meshgrid(torch.arange(height) - height / 2, torch.arange(width) - width / 2, indexing="ij")
+    return 0.5 * torch.exp(-(x**2 + y**2) / 200.0) + low
+
+
+@pytest.mark.parametrize(("height", "width"), [(60, 80), (80, 60)])
+def test_a_frame_has_one_extent_in_all_panels_and_states_its_exaggeration(height, width):
+    depth = frame(height, width)
+    figure = viz.depth_figure(depth, PITCH, torch.rand(3, height, width), depth > 0.1, "a frame")
+    image, contours, surface = figure.axes
+    expected = (-width * PITCH / 2, width * PITCH / 2), (height * PITCH / 2, -height * PITCH / 2)
+    for axes in (image, contours, surface):
+        assert axes.get_xlim() == pytest.approx(expected[0]) and axes.get_ylim() == pytest.approx(expected[1])
+    assert image.get_position().width == pytest.approx(contours.get_position().width)
+    assert "mm" in image.get_xlabel() and "mm" in surface.get_zlabel()
+    stated = float(surface.get_title().split(" x ")[1])
+    box = np.asarray(surface._box_aspect)
+    assert box[2] / box[0] == pytest.approx(stated * float(depth.max() - depth.min()) / (width * PITCH), rel=1e-3)
+    figure.draw_without_rendering()
+    boxes = [axes.get_window_extent() for axes in (image, contours)]
+    assert boxes[0].height == pytest.approx(boxes[1].height) and not boxes[0].overlaps(boxes[1])
+
+
+def test_zero_keeps_its_colour_and_equal_depths_are_equally_far_from_it():
+    for low, high in ((0.0, 1.0), (-0.1, 2.0), (-3.0, 0.5)):
+        colors, norm = viz.depth_colors(low, high)
+        assert np.allclose(colors(norm(0.0))[:3], 0.97, atol=0.02)
+        if low < 0:
+            red, _, blue, _ = colors(norm(low))
+            assert red > blue  # brown below zero, blue above
+    colors, norm = viz.depth_colors(-1.0, 1.0)
+    shades = np.array([np.dot(colors(norm(v))[:3], (0.3, 0.59, 0.11)) for v in np.linspace(0.0, 1.0, 21)])
+    assert (np.diff(shades) < 0).all()  # ever darker, so that it can be read in grey
+
+
+def test_panels_that_are_compared_share_their_range():
+    truth, measured, error, *_ = viz.comparison_figure(frame() - 0.05, frame(), PITCH).axes
+    assert truth.get_images()[0].get_clim() == measured.get_images()[0].get_clim() == pytest.approx((-50.0, 500.0), abs=1.0)
+    low, high = error.get_images()[0].get_clim()
+    assert low == pytest.approx(-high)
+
+
+def test_a_pose_is_shown_before_and_after_at_one_scale():
+    source = torch.rand(500, 3, dtype=torch.float64) * torch.tensor([8.0, 3.0, 0.4])
+    T = torch.eye(4, dtype=torch.float64)
+    T[:2, :2] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
+    T[:3, 3] = torch.tensor([5.0, -6.0, 0.1])
+    figure = viz.pose_figure(source, source @ T[:3, :3].T + T[:3, 3], T, "turned")
+    above, space, above_after, space_after = figure.axes
+    assert above.get_xlim() == above_after.get_xlim() and above.get_ylim() == above_after.get_ylim()
+    assert space.get_zlim() == space_after.get_zlim() and space.get_title().split(", ")[1] == space_after.get_title().split(", ")[1]
+    points = [np.asarray(c.get_offsets()) for c in above_after.collections]
+    assert np.abs(np.sort(points[0], 0) - np.sort(points[1], 0)).max() < 1e-6
+    for axes in (above, above_after):
+        shown = np.concatenate([np.asarray(c.get_offsets()) for c in axes.collections])
+        assert (shown[:, 0] > axes.get_xlim()[0]).all() and (shown[:, 1] < axes.get_ylim()[1]).all()
+
+
+def test_a_round_step_gives_seven_to_fourteen_lines():
+    for span in np.geomspace(1e-3, 1e4, 57):
+        step = viz._round_step(float(span))
+        assert 5.0 <= span / step <= 14.5 and f"{step:.0e}"[0] in "125"

@@ -54,6 +54,25 @@ def test_a_worn_unit_with_low_lights(worn_unit, press_mm, largest_px, rms_px):
     assert metrics.depth_error(out.depth_mm, scene.depth_mm, PITCH, scene.contact).rms_px < rms_px
 
 
+@pytest.mark.parametrize(
+    "turn_deg, seed, known",
+    [
+        (80.0, 1, True),
+        *[pytest.param(turn, seed, False, marks=pytest.mark.long) for turn in (0.0, 40.0, 80.0, 120.0) for seed in (1, 5)],
+    ],
+)
+@pytest.mark.parametrize("level", [0.13, 0.17])
+def test_low_lights_under_strong_noise(ring, turn_deg, seed, known, level):
+    """Walls behind which a channel is unlit: where the light is weak, the noise there is nearly half of the flat skin's light."""
+    lights = ring(22.0, [15.0, 18.0, 16.0], rotation_deg=10.0 + turn_deg, level=level)
+    scene, camera = scenes.sphere_press(10.0, 2.0), {"noise_std": 0.01, "bits": 8, "spots": scenes.skin_spots(480, 640)}
+    background = scenes.render(scenes.undeformed(scene), lights, **camera, seed=seed)[0]
+    calibration = vts.Calibration.from_lights(lights if known else vts.fit_lights(background, FULL).lights, FULL, background)
+    out = vts.DepthPipeline.from_calibration(calibration, "precise")(scenes.render(scene, lights, **camera, seed=seed + 1))
+    assert metrics.depth_error(out.depth_mm, scene.depth_mm, PITCH).max_px < 0.85
+    assert metrics.depth_error(out.depth_mm, scene.depth_mm, PITCH, scene.contact).rms_px < 0.20
+
+
 def share_of_the_plain_inverse(lights, scene, noise_std):
     """RMS error of depth over that of the plain inverse; noise, 8 bits."""
     rest = scenes.render(scenes.undeformed(scene), lights, noise_std=noise_std, bits=8, seed=1)[0]

@@ -21,7 +21,7 @@ from ..core.checks import (
     may_read,
     may_read_values,
 )
-from ..core.noise import clipped_std, sample_stride
+from ..core.noise import clipped_std, dark_below, sample_stride
 from ..core.noise import noise_std as frame_noise_std
 from ..model.calibration import Calibration, check_calibration
 from .morphology import dilate, dilate_cross, erode, reconstruct
@@ -31,7 +31,7 @@ CELLS = 80
 """Cells along the shorter side of the image."""
 
 DARK_NOISES = 3.0
-"""A channel below so many noises is dark, where the undeformed skin is twice as bright: as in NormalFromIntensity."""
+"""A channel below so many noises, or half of the undeformed skin's light, is dark: as in NormalFromIntensity."""
 
 MOST_FAR_FIELD = 0.06
 """Largest change, relative to the background, that a press elsewhere is believed to make in a channel of undeformed skin."""
@@ -145,7 +145,8 @@ class ContactMask(nn.Module):
         """
         self._check(compensated)
         found = self.change(compensated.detach())
-        dark = (compensated.detach() * self.per_noise < self.dark_noises) & (self.offset < -2.0 * self.dark_noises)
+        below = dark_below(-self.offset, torch.full_like(self.offset[:, :1, :1], self.dark_noises))
+        dark = compensated.detach() * self.per_noise < below
         dark = dark | self.black(compensated).any(dim=1)[:, None, None, None]  # with a failed LED, too little is left to decide
         lit = found.change.masked_fill(dark, 0.0).square().sum(dim=1, keepdim=True) <= found.threshold
         return lit & (dark.to(torch.uint8).sum(dim=1, keepdim=True) == 1)

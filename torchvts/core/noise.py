@@ -47,6 +47,23 @@ def std_from_median(second: Tensor, median: Tensor) -> Tensor:
     return clipped_std(second, 1.5 * median / 0.6745)[:, :, 0] / math.sqrt(1.5)
 
 
+def dark_below(flat: Tensor, three_noises: Tensor) -> Tensor:
+    """Intensity below which a channel is dark: three times the noise, and where light is weak half of that on the flat skin.
+
+    So a dark channel is always nearer to an unlit one than to the flat skin. Minus infinity, never, where the flat skin itself is
+    no brighter than three times the noise.
+
+    Args:
+        flat: (..., H, W), what the lights give on the flat skin.
+        three_noises: three standard deviations of the noise, broadcast against it.
+    Example:
+        >>> import torch
+        >>> dark_below(torch.tensor([0.02, 0.04, 0.5]), torch.tensor(0.03))
+        tensor([  -inf, 0.0200, 0.0300])
+    """
+    return torch.where(flat > three_noises, torch.minimum(three_noises, 0.5 * flat), -torch.inf)
+
+
 def clipped_std(values: Tensor, std: Tensor) -> Tensor:
     """Standard deviation (B, C, 1) of the absolute values (B, C, N) within three standard deviations, from a first estimate."""
     squared = values * values

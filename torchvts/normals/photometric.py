@@ -32,10 +32,11 @@ class NormalFromIntensity(NormalModel):
     """Unit normals of a compensated image.
 
     Without depth, by the stored inverse of the light matrix at the undeformed skin (eq. 9); with depth, by the inverse at that
-    depth (eq. 10). Where a light is blocked (its channel below three times its noise), a channel is saturated or the light
-    matrix is ill-conditioned, :class:`~torchvts.normals.shadowed.ShadowedPixels` replaces that normal; elsewhere nothing
-    changes. While gradients are recorded for the lights (``requires_grad_(True)``), the matrix is built from them at every call.
-    The stored inverse follows the lights: it is computed again where they are no longer those that it was made of.
+    depth (eq. 10). Where a light is blocked (its channel below three times its noise, or below half of the flat skin's light), a
+    channel is saturated or the light matrix is ill-conditioned, :class:`~torchvts.normals.shadowed.ShadowedPixels` replaces that
+    normal; elsewhere nothing changes. While gradients are recorded for the lights (``requires_grad_(True)``), the matrix is
+    built from them at every call. The stored inverse follows the lights: it is computed again where they are no longer those
+    that it was made of.
 
     Args:
         lights: the three lights.

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from ..core.checks import check_shape, may_read, may_read_values
 from ..core.geometry import gradient_from_normal, normal_from_gradient, slope_beside_cliff
+from ..core.noise import dark_below
 from ..model.lights import light_matrix, seen_at
 
 LEFT_OUT = -1.0
@@ -181,9 +182,7 @@ class ShadowedPixels(nn.Module):
         ill_conditioned = ~(self.noise_std * inverse.square().sum(dim=(0, 1)).sqrt() <= PRIOR_STD)  # infinite ones too
         self.any_ill_conditioned = bool(ill_conditioned.any())
         self.register_buffer("ill_conditioned", ill_conditioned)
-        # a channel can only be called dark where its light shines on the flat skin
-        below = self.dark_below.reshape(3, 1, 1)
-        self.register_buffer("dark_where", torch.where(flat > 2.0 * below, below, -torch.inf))
+        self.register_buffer("dark_where", dark_below(flat, self.dark_below.reshape(3, 1, 1)))
 
     def limits(self, image: Tensor, window: tuple[int, int]) -> Limits:
         """The limits in the window of an image (B, 3, h, w)."""

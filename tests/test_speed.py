@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from torchvts.evaluation import rows, speed
-from torchvts.evaluation.figures import learning_figure, speed_figure
+from torchvts.evaluation import rows, speed, user_speed
+from torchvts.evaluation.figures import learning_figure, speed_figure, user_speed_figure
 from torchvts.evaluation.methods import METHODS
 from torchvts.evaluation.rows import Row, Size, Time
 
@@ -91,3 +91,29 @@ def test_the_learning_curve_shows_every_draw():
     assert list(line.get_ydata()) == [2.0, 6.0] and "3 draws" in figure.get_suptitle()
     bars = figure.axes[0].collections[0].get_segments()
     assert [[end[1] for end in bar] for bar in bars] == [[1.0, 3.0], [5.0, 7.0]]
+
+
+def test_frames_are_timed_as_a_user_runs_them(monkeypatch):
+    """Every pace, batches, one thread, what is paid once: the rows, their table and chart."""
+    monkeypatch.setattr(user_speed, "SIZES", ((24, 32), (48, 64)))
+    monkeypatch.setattr(user_speed, "BATCHES", (1, 3))
+    monkeypatch.setattr(user_speed, "CAMERA_FRAMES", 12)
+    monkeypatch.setattr(user_speed, "_import_s", lambda: 0.4)
+    monkeypatch.setattr(user_speed.time, "sleep", lambda seconds, sleep=user_speed.time.sleep: sleep(min(seconds, 0.005)))
+    measured = user_speed.run(None, lambda name: None, calls=20)
+    found = {(row.size.width, row.method, row.pace, row.threads) for row in measured.frames}
+    for mode in user_speed.MODES:
+        for pace in user_speed.PACES:
+            assert {(32, mode, pace, user_speed.OWN), (64, mode, pace, user_speed.OWN), (64, mode, pace, "1")} <= found
+    assert {row.size.batch for row in measured.frames} == {1, 3} and all(row.median_ms <= row.p90_ms for row in measured.frames)
+    assert any("dropped of 12" in cost.name for cost in measured.costs) and measured.costs[0].value == 0.4
+    text = user_speed.table(measured)
+    assert "drawn rig, 64x48, threads: own choice: fast" in text and "times as fast as gs_sdk's pipeline" in text
+    figure = user_speed_figure(measured)
+    assert [axes.get_title() for axes in figure.axes] == ["drawn rig"] and len(figure.legends) == 1
+
+
+def test_many_calls_have_a_99th_percentile():
+    times = [1.0] * 985 + [9.0] * 15
+    few, many = (user_speed.summary("rig", "fast", Size(48, 64), "tight loop", "1", some) for some in (times[:100], times))
+    assert few.p99_ms is None and many.p99_ms == 9.0 and many.median_ms == 1.0

@@ -25,8 +25,9 @@ from .metrics import normal_angle_deg
 from .random_scenes import random_frame
 from .rows import Row, Size, mean
 from .score import Truth
-from .speed import front, ms
+from .speed import GS_SDK, front, ms
 from .stability import DEPTH_LIMIT, MASK, MASK_LIMIT, NORMAL_LIMIT_DEG, Breaking, depth_share, in_words
+from .user_speed import OWN, PACES, Measured
 
 
 def save_small(figure: Figure, path: Path) -> None:
@@ -176,6 +177,31 @@ def _cost_against_size(axes: Any, rows: Sequence[Row]) -> None:
     _log_ticks(axes)
     axes.set_xticks(list(sizes), list(sizes.values()), fontsize=9)
     axes.set_xlim(right=axes.get_xlim()[1] * 8.0)  # room for the names
+
+
+def user_speed_figure(measured: Measured) -> Figure:
+    """Time of a frame against size, a panel for each unit, real ones first: tight loops, frames 20 ms apart, and the peer."""
+    units = list(dict.fromkeys(row.unit for row in measured.frames))
+    figure = new_figure(6.2 * len(units), 4.6)
+    panels = figure.subplots(1, len(units), squeeze=False, sharey=True)[0]
+    styles = {PACES[0]: "o-", PACES[1]: "^--", PACES[2]: "s:"}
+    colors = {"fast": "tab:blue", "precise": "tab:green", GS_SDK: "tab:red"}
+    for axes, unit in zip(panels, units, strict=True):
+        shown = [row for row in measured.frames if row.unit == unit and row.threads == OWN and row.size.batch == 1]
+        for method, pace in dict.fromkeys((row.method, row.pace) for row in shown):
+            line = sorted((r.size.height * r.size.width, r.median_ms) for r in shown if (r.method, r.pace) == (method, pace))
+            style = {"color": colors[method], "ms": 4, "lw": 1, "label": method if method == GS_SDK else f"{method}, {pace}"}
+            axes.plot([pixels for pixels, _ in line], [time for _, time in line], styles.get(pace, "D-"), **style)
+        sizes = sorted({(row.size.height * row.size.width, f"{row.size.width}x{row.size.height}") for row in shown})
+        axes.set(xscale="log", yscale="log", title=unit, ylabel="ms a frame, median")
+        axes.set_xticks([pixels for pixels, _ in sizes], [text for _, text in sizes])
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.grid(which="both", alpha=0.25)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=7)  # beside the panels, where no point lies
+    figure.suptitle(measured.machine, fontsize=8)
+    return figure
 
 
 # breaking points

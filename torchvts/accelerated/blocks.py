@@ -55,7 +55,10 @@ class ContactMask(Twin, contact.ContactMask):
         if not (sampled and usable(compensated, self.offset)):
             return super().find(compensated)
         grid = kernels.ContactGrid(self.step, self.stride, self.cell, self.reach, self.sigmas, self.rounding, self.least_cells)
-        return kernels.contact_mask(compensated, self.offset, self.per_noise, (self.failed_below, self.most_far_field), grid)
+        try:
+            return kernels.contact_mask(compensated, self.offset, self.per_noise, (self.failed_below, self.most_far_field), grid)
+        except kernels.NotFinite:
+            return super().find(compensated)
 
     def noise(self, change: Tensor) -> Tensor:
         if not arrays_usable(change):

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import os
 import runpy
 import sys
@@ -79,6 +80,20 @@ class Done(NamedTuple):
     returncode: int
     stdout: str
     stderr: str
+
+
+def pytest_terminal_summary(terminalreporter):
+    """The last lines of the attack: how much was done."""
+    done = {}
+    for report in (report for reports in terminalreporter.stats.values() for report in reports):
+        for name, value in getattr(report, "user_properties", ()):
+            if name == "attacked" and report.when == "call":
+                what, count = json.loads(value)
+                done[what] = done.get(what, 0) + count
+    if done:
+        terminalreporter.section("attack")
+    for what, count in sorted(done.items()):
+        terminalreporter.write_line(f"{count:7,} {what}")
 
 
 def call_script(name, *arguments):

@@ -296,8 +296,10 @@ TABLE = {
             "background_frames": 12,
             "presses": (),
             "time_constant_s": 1.0,
+            "reconnect_s": 0.0,
         },
         {
+            "reconnect_s": ["1", None, NAN, -1.0],
             "source": ["no/such.mp4", None, 2.5],
             "sensor_or_calibration": [None, "gelsight_mini"],
             "mode": ["slow", None],
@@ -314,7 +316,11 @@ TABLE = {
         {"background": image(), "sensor": sensor(), "presses": ()},
         {"background": images(), "sensor": SENSOR, "presses": [[image()], None]},
     ),
-    "stream.open_source": Entry({"source": ...}, {"source": ["no/such.mp4", ".", None, 2.5]}, run=False),
+    "stream.open_source": Entry(
+        {"source": ..., "reconnect_s": 0.0},
+        {"source": ["no/such.mp4", ".", None, 2.5, -1, "9" * 20], "reconnect_s": ["1", None, NAN, -1.0]},
+        run=False,
+    ),
     "stream.find_background": Entry(
         {"images": image()[None].expand(5, -1, -1, -1), "sensor": None}, {"images": [*batches(3), image()[None]], "sensor": []}
     ),

@@ -87,7 +87,10 @@ class ContactMask(Twin, contact.ContactMask):
             return super().find(compensated)
         grid = kernels.ContactGrid(self.step, self.stride, self.cell, self.reach, self.sigmas, self.rounding, self.least_cells)
         offset = None if flat_is_one(self) else self.offset
-        return kernels.contact_mask(compensated, offset, self.per_noise, (self.failed_below, self.most_far_field), grid)
+        try:
+            return kernels.contact_mask(compensated, offset, self.per_noise, (self.failed_below, self.most_far_field), grid)
+        except kernels.NotFinite:
+            return super().find(compensated)
 
     def noise(self, change: Tensor) -> Tensor:
         if not arrays_usable(change):

@@ -114,8 +114,14 @@ def _loaded() -> ctypes.CDLL:
     return loaded
 
 
-def _check(short_of_memory: int) -> None:
-    if short_of_memory:
+class NotFinite(ArithmeticError):
+    """A value is NaN or infinite; the PyTorch reference says what then happens."""
+
+
+def _check(code: int) -> None:
+    if code == 2:
+        raise NotFinite
+    if code:
         raise MemoryError("torchvts: no memory is left for a few rows of the image")
 
 

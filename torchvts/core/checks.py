@@ -8,6 +8,7 @@ import dataclasses
 import math
 import numbers
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -298,6 +299,35 @@ def check_range(name: str, image: Tensor) -> None:
     if high > 1.0 + 1e-3 or low < -1e-3:
         cause = "0-255 given for 0-1: divide by 255" if high > 1.5 else "clamp it to [0, 1]"
         raise ValueError(f"{name}: expected values in [0, 1], got [{low:.4g}, {high:.4g}]: {cause}")
+
+
+def check_range_later(name: str, image: Tensor) -> None:
+    """As :func:`check_range` for a tensor on a GPU, without waiting for it: the error comes when the GPU has got so far.
+
+    It is the GPU's own assertion: CUDA then refuses all further work in this process, and RuntimeError names the check.
+    """
+    values = image.detach()
+    inside = ((values >= -1e-3) & (values <= 1.0 + 1e-3)).all()  # NaN is not inside
+    torch._assert_async(inside, f"{name}: expected finite values in [0, 1]: 0-255 given for 0-1? divide by 255")
+
+
+def parse_number(text: str) -> float:
+    """A decimal number of a text file; Python's own ``float`` also takes "1_0", "nan" and digits of other scripts.
+
+    Raises:
+        ValueError: no number, or an infinite one.
+    Example:
+        >>> parse_number(" -1.5e3 ")
+        -1500.0
+    """
+    word = text.strip()
+    number = float(word) if _NUMBER.fullmatch(word) else math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"expected a number, got {brief(text)}")
+    return number
+
+
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
 def check_positive(name: str, value: object, most: float = math.inf) -> float:

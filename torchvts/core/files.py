@@ -69,7 +69,7 @@ def naming(path: str | Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno is None or (error.filename is not None and error.errno not in _DISK):  # says itself what is wrong
+        if str(path) in str(error) or (error.filename is not None and error.errno not in _DISK):
             raise
         renamed = type(error)(f"{path}: cannot be written: {error.strerror or error}")
         renamed.errno = error.errno

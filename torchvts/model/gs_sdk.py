@@ -5,7 +5,6 @@ map is H = -z / mm_per_pixel, so pixels, negative where the skin is pressed in; 
 """
 
 import csv
-import math
 import struct
 import zipfile
 import zlib
@@ -17,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..core.checks import brief, check_batch, check_float_tensor, check_path, check_positive, check_tensor
+from ..core.checks import brief, check_batch, check_float_tensor, check_path, check_positive, check_tensor, parse_number
 from ..core.files import read_image, rgb_from_bgr
 from .gs_sdk_sensor import values_from_gs_sdk
 from .sensor import Sensor, read_yaml
@@ -362,12 +361,9 @@ def _read_table(path: Path, columns: tuple[str, ...]) -> list[tuple[int, dict[st
 
 def _number(where: str, column: str, text: str) -> float:
     try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise ValueError(f"{where}: {column}: expected a number, got {brief(text)}")
-    return number
+        return parse_number(text)
+    except ValueError as error:
+        raise ValueError(f"{where}: {column}: {error}") from error
 
 
 def _inside(folder: Path, name: str, where: str) -> Path:

@@ -93,6 +93,8 @@ class NormalFromIntensity(NormalModel):
         self.register_buffer("stored_position_mm", self.lights.position_mm.detach().clone(), persistent=False)
         self.register_buffer("stored_albedo", self.lights.albedo.detach().clone(), persistent=False)
         flat = flat_image(self.lights, height, width, mm_per_pixel).to(inverse.dtype)
+        if saturated_above is not None:
+            check_float_tensor("saturated_above", saturated_above)
         self.shadowed = ShadowedPixels(flat, noise, self.inverse, saturated_above)
 
     @classmethod

@@ -215,6 +215,7 @@ class Confidence(nn.Module):
         check_record("normals", normals, nn.Module, "the block of the pipeline")
         check_field("noise_std", noise_std)
         check_shape("image_noise_std", image_noise_std, (3,))
+        check_float_tensor("light_std", light_std)
         check_shape("light_std", light_std, noise_std.shape, "noise_std")
         mm_per_pixel, spread = check_positive("mm_per_pixel", mm_per_pixel), check_positive("spread", spread)
         check_switch("measured", measured)

@@ -31,6 +31,7 @@ from ..core.checks import (
     check_least,
     check_positive,
     check_range,
+    check_range_later,
     check_record,
     may_read_values,
 )
@@ -324,8 +325,12 @@ def eval_around(module: _Module, *given: nn.Module | None) -> _Module:
 
 
 def check_images(images: Tensor) -> None:
-    """Raise unless images are a floating-point (B, 3, H, W) batch, on a CPU in eager mode also of values in [0, 1]."""
+    """Raise unless images are a floating-point (B, 3, H, W) batch, in eager mode also of values in [0, 1], on CUDA later."""
     check_batch("images", images, 3)
-    if not torch.jit.is_scripting():  # noqa: SIM102
-        if images.device.type == "cpu" and not torch.compiler.is_compiling():
+    if not torch.jit.is_scripting():
+        if torch.compiler.is_compiling():
+            return
+        if images.device.type == "cpu":
             check_range("images", images)
+        elif images.is_cuda:
+            check_range_later("images", images)

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from ..core.checks import parse_number
+
 Columns = dict[str, "np.ndarray[Any, Any]"]
 
 MOST_BYTES = 2**31
@@ -29,7 +31,7 @@ def read_columns(path: Path) -> Columns:
     PCD: text, binary, compressed. PLY: text, binary of both byte orders; points come first and are plain numbers.
 
     Raises:
-        ValueError: the file is too large, damaged or no point cloud.
+        ValueError: the file is too large, damaged or no point cloud, or a coordinate is not finite.
     """
     size = path.stat().st_size
     if size > MOST_BYTES:
@@ -39,7 +41,11 @@ def read_columns(path: Path) -> Columns:
         columns = _read_pcd(data) if path.suffix.lower() == ".pcd" else _read_ply(data)
     except (struct.error, LookupError, OverflowError, TypeError) as error:
         raise ValueError(f"its header is damaged: {error!r}") from error
-    return {name: column.astype(np.float64) for name, column in columns.items()}
+    found = {name: column.astype(np.float64) for name, column in columns.items()}
+    for name in {"x", "y", "z"} & found.keys():
+        if not np.isfinite(found[name]).all():
+            raise ValueError(f"column {name}: expected finite numbers, got NaN or infinite ones: leave such points out")
+    return found
 
 
 def _read_pcd(data: bytes) -> Columns:
@@ -54,12 +60,12 @@ def _read_pcd(data: bytes) -> Columns:
         if words and not words[0].startswith("#"):
             head[words[0]] = words[1:]
     names, kinds = head["FIELDS"], head["TYPE"]
-    counts = [int(n) for n in head.get("COUNT", ["1"] * len(names))]
-    sizes = [int(n) for n in head["SIZE"]]
+    counts = [_count(n) for n in head.get("COUNT", ["1"] * len(names))]
+    sizes = [_count(n) for n in head["SIZE"]]
     if not len(names) == len(kinds) == len(sizes) == len(counts) or len(set(names)) < len(names) or min(counts, default=0) < 1:
         raise ValueError("FIELDS, SIZE, TYPE and COUNT do not match")
     types = [np.dtype(f"<{ {'F': 'f', 'I': 'i', 'U': 'u'}[kind] }{size}") for kind, size in zip(kinds, sizes)]
-    points = int(head["POINTS"][0] if "POINTS" in head else head["WIDTH"][0])
+    points = _count(head["POINTS"][0] if "POINTS" in head else head["WIDTH"][0])
     width = sum(t.itemsize * n for t, n in zip(types, counts))
     way, body = head["DATA"][0], data[place:]
     if way == "ascii":
@@ -98,7 +104,7 @@ def _read_ply(data: bytes) -> Columns:
         elif words[:1] == ["element"]:
             if not element and words[1] != "vertex":
                 raise ValueError(f"its first element is {words[1]!r}, expected vertex")
-            points = points if element else int(words[2])
+            points = points if element else _count(words[2])
             element = element or "vertex"
             if words[1] != "vertex":
                 break  # elements after the points are not read
@@ -123,9 +129,16 @@ def _text_columns(body: bytes, points: int, names: list[str], counts: list[int])
     words = body.split(maxsplit=points * width)[: points * width]
     if len(words) < points * width:
         raise ValueError(f"cut short: {points * width} numbers are announced, {len(words)} are there")
-    table = np.array([float(word) for word in words]).reshape(points, width)
+    table = np.array([parse_number(word.decode("ascii", "replace")) for word in words]).reshape(points, width)
     place = np.cumsum([0, *counts])
     return {name: table[:, place[k]] for k, name in enumerate(names)}
+
+
+def _count(word: str) -> int:
+    """A count in a header; Python's own ``int`` also takes "1_0"."""
+    if not (word.isascii() and word.isdigit() and len(word) < 20):
+        raise ValueError(f"expected a count in its header, got {word[:40]!r}")
+    return int(word)
 
 
 def _check_count(points: int, width: int, there: int) -> None:

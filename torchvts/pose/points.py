@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ..core.checks import check_tensor
+from ..core.checks import check_float_tensor, check_tensor
 from .clouds import open3d
 from .direct import check_rigid
 from .height_maps import Cloud, principal_frame, register_flattened, register_height_maps
@@ -102,7 +102,7 @@ def _register_any_shape(a: Cloud, b: Cloud, clouds: Correspondence, start: Tenso
 
 def _check_cloud(name: str, points: Tensor, normals: Tensor | None) -> Cloud:
     """A cloud in float64 without duplicate points, or raise."""
-    check_tensor(name, points)
+    check_float_tensor(name, points)
     if points.dim() != 2 or points.shape[1] != 3:
         raise ValueError(f"{name}: expected (N, 3), got {tuple(points.shape)}")
     if len(points) == 0:

@@ -24,7 +24,7 @@ from ..calibration import (
 from ..contact import ContactMask as PlainContactMask
 from ..contact.masks import MOST_FAR_FIELD
 from ..core.blur import blur, gaussian_weights
-from ..core.checks import check_batch, check_integer, check_path, check_sequence
+from ..core.checks import check_batch, check_integer, check_path, check_positive, check_sequence, parse_number
 from ..core.files import VIDEO_SUFFIXES, read_frames
 from ..model import Calibration, ResponseField, ResponseModel, Sensor, SensorPrior, check_sensor
 from ..model.calibration import PEDESTAL
@@ -180,8 +180,8 @@ def read_press_images(presses: Sequence[tuple[str | Path, float | str]], sensor:
         names = [str(path) for path, _ in presses]
     for name, (path, diameter) in zip(names, presses):
         try:
-            diameter_mm = float(diameter)
-        except ValueError:
+            diameter_mm = check_positive("press", parse_number(diameter) if isinstance(diameter, str) else diameter)
+        except (TypeError, ValueError):
             raise ValueError(f"press: expected the diameter of the ball in mm after {path}, got {diameter!r}") from None
         found.append(Press(sensor.read_image(path), diameter_mm, name))
     return found

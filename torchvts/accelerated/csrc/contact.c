@@ -392,8 +392,9 @@ static void to_pixels(Grid grid, Scratch at, int height, int width, uint8_t *str
 }
 
 /*
- * image (frames, 3, height, width), with offset and per_noise (3, height, width): change = image * per_noise + offset; offset null where it is -per_noise. Writes mask and
- * inner, bytes (frames, height, width); inner is where cells decide, not pixels. Returns 0, or 1 where memory is short.
+ * image (frames, 3, height, width), with offset and per_noise (3, height, width): change = image * per_noise + offset; offset
+ * null where it is -per_noise. Writes mask and inner, bytes (frames, height, width); inner is where cells decide, not pixels.
+ * Returns 0, 1 where memory is short, or 2 where a value is not finite or its square would not be, and the masks mean nothing.
  */
 EXPORT int contact_mask(const float *image, const float *offset, const float *per_noise, const float *failed_below,
                         const float *most_far_field, int frames, int height, int width, int step, int stride, int cell, int reach,
@@ -409,6 +410,7 @@ EXPORT int contact_mask(const float *image, const float *offset, const float *pe
     uint16_t *counts = malloc(sizeof(uint16_t) * (size_t)width);
     int32_t *stack = malloc(sizeof(int32_t) * ringed);
     const int short_of_memory = !floats || !bytes || !counts || !stack;
+    int not_finite = 0;
     if (!short_of_memory) {
         at.some = floats, at.means = at.some + 2 * some + 1, at.density = at.means + 3 * cells, at.sums = at.density + cells;
         at.squared = at.sums + 3 * (size_t)width, at.down = at.squared + width;
@@ -430,6 +432,8 @@ EXPORT int contact_mask(const float *image, const float *offset, const float *pe
                 scale[c] = 1.0f / sqrtf(noise * noise + rounding);
             }
         find_strong(frame, offset, per_noise, scale, height, width, sigmas * sigmas, grid, at, mask + pixels * b);
+        for (size_t k = 0; k < 3 * cells; k++) /* comparisons with NaN would let pixels through here that tensors do not */
+            if (!(fabsf(at.means[k]) < 1e15f)) not_finite = 2;
         if (find_cells(grid, at)) {
             keep_large(grid, at);
             to_pixels(grid, at, height, width, mask + pixels * b, inner + pixels * b);
@@ -439,5 +443,5 @@ EXPORT int contact_mask(const float *image, const float *offset, const float *pe
         }
     }
     free(floats), free(bytes), free(counts), free(stack);
-    return short_of_memory;
+    return short_of_memory ? 1 : not_finite;
 }

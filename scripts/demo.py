@@ -2,8 +2,8 @@
 
 python scripts/demo.py [--out out/demo]
 
-Real images are those that `torchvts samples gelsight_mini` fetched into the cache; without them those in the folder TORCHVTS_DATA or
-in ../shared/data; without these, only the rendered scene.
+Real images are those that `torchvts samples gelsight_mini` fetched into the cache; without them those in the folder TORCHVTS_DATA
+or in ../shared/data; without these, only the rendered scene.
 """
 
 import argparse

@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Measure, write tables and charts, and print the tables."""
     torch.set_num_threads(arguments.threads)
-    folder = data_folder(speed.__file__)
+    folder = data_folder(str(Path(__file__).parent))
     data = folder if (folder / "gelsight_mini_a").is_dir() else None
     if library() is None:
         print("no compiled kernels: PyTorch does all the work, two to three times as slowly")

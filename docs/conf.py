@@ -1,10 +1,12 @@
 """Sphinx settings of the documentation: `make docs` builds it from the pages here and the docstrings of the package."""
 
+import functools
 import importlib
 import inspect
 import pkgutil
 import sys
 import warnings
+from argparse import RawDescriptionHelpFormatter
 from typing import Any
 
 from docutils import nodes
@@ -12,6 +14,7 @@ from sphinx.pycode import ModuleAnalyzer
 
 import torchvts
 from torchvts.accelerated.twin import Twin
+from torchvts.cli.main import COMMANDS, make_parser
 
 warnings.filterwarnings("ignore")  # of libraries that autodoc imports; Sphinx's own stay errors
 
@@ -97,9 +100,20 @@ def resolve(app: Any, env: Any, node: Any, contnode: Any) -> Any:
     return reference
 
 
+def add_help(app: Any, docname: str, source: list[str]) -> None:
+    """Append the help of every command to the page about the command line."""
+    if docname != "command":
+        return
+    for name, text in COMMANDS.items():
+        parser = make_parser(name, importlib.import_module(f"torchvts.cli.{name}"))
+        parser.formatter_class = functools.partial(RawDescriptionHelpFormatter, width=110)
+        source[0] += f"\n## {name}\n\n{text[0].upper()}{text[1:]}.\n\n```text\n{parser.format_help()}```\n"
+
+
 def setup(app: Any) -> None:
     """Register the hooks."""
     app.connect("autodoc-skip-member", skip)
+    app.connect("source-read", add_help)
     app.connect("builder-inited", describe_constants)
     app.connect("autodoc-process-docstring", describe_twins, priority=300)  # before napoleon reads the sections
     app.connect("autodoc-process-docstring", name_the_others)

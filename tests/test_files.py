@@ -163,6 +163,9 @@ def test_a_point_cloud_comes_back_as_it_was(tmp_path, clouds, suffix, with_norma
     points = vts.depth_to_points(scene.depth_mm, 1.0, scene.contact)
     normals = torch.nn.functional.normalize(torch.rand(len(points), 3), dim=1) if with_normals else None
     clouds.write_point_cloud(tmp_path / f"cloud{suffix}", points, normals)
+    theirs = clouds.open3d().io.read_point_cloud(str(tmp_path / f"cloud{suffix}"))
+    assert torch.allclose(torch.tensor(np.asarray(theirs.points)).float(), points, atol=1e-6)
+    assert theirs.has_normals() == with_normals
     back, back_normals = clouds.read_point_cloud(tmp_path / f"cloud{suffix}")
     assert torch.allclose(back.float(), points, atol=1e-6)
     assert (back_normals is None) == (normals is None)

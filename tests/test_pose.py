@@ -363,14 +363,17 @@ def test_duplicate_points_change_nothing(reference):
     assert found.converged and (found.T_target_source[:3, 3] - (moved - cloud)[0]).abs().max() < 1e-4
 
 
-def test_without_open3d_clouds_register_and_files_say_what_to_install(monkeypatch, reference, tmp_path):
+def test_without_open3d_clouds_register_and_are_written(monkeypatch, reference, tmp_path):
     monkeypatch.setitem(sys.modules, "open3d", None)
     cloud = contact_cloud(reference, PITCH, None)[0]
     assert vts.register_points(cloud, cloud + 0.1).converged
     other = frame(objects.key(), objects.pose(20.0))
     assert not vts.register_points(cloud, contact_cloud(other, PITCH, None)[0]).converged
+    for suffix in clouds.CLOUD_SUFFIXES:
+        clouds.write_point_cloud(tmp_path / f"a{suffix}", cloud)
+        assert torch.allclose(clouds.read_point_cloud(tmp_path / f"a{suffix}")[0], cloud, atol=1e-6)
     with pytest.raises(ImportError, match=r"pip install 'torchvts\[pose\]'"):
-        clouds.write_point_cloud(tmp_path / "a.ply", cloud)
+        clouds.open3d()
 
 
 # words, and the small parts

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..model.report import CandidateRow
 from ..model.sensor import Sensor
+from .azimuths import wrong_azimuths
 from .background import BackgroundPixels, misfit_of_paraboloid
 from .lights import POORLY_CONSTRAINED_DEG, LightFit, fit_lights
 
@@ -135,6 +136,8 @@ def choose_lights(background: Tensor, sensor: Sensor, other_models: bool = False
     complaint = f"background: {fit.message}" if not fit.converged or (row["score_deg"] or 0.0) > POORLY_CONSTRAINED_DEG else ""
     if not complaint and chosen.objection:
         complaint = f"background: {chosen.family}: {chosen.objection}"
+    if wrong := _wrong_azimuths(chosen, tried, sensor):
+        complaint = f"background: {wrong}"
     rows = [row, *(_row(candidate) for candidate in tried if candidate is not chosen)]
     return LightChoice(linear, fit, rows, _reason(chosen, tried), complaint)
 
@@ -248,6 +251,26 @@ def _objection_to_terms(candidate: _Candidate, tried: list[_Candidate]) -> str:
     if candidate.misfit > EXPLAINED or candidate.misfit > 0.5 * base.misfit:
         return f"a smooth misfit of {candidate.misfit:.1%} is left, {base.misfit:.1%} without"
     return ""
+
+
+def _wrong_azimuths(chosen: _Candidate, tried: list[_Candidate], sensor: Sensor) -> str:
+    """What is wrong with the azimuths of the sensor file, if free lights explain an image that lights at these do not, or ""."""
+    drawn = sensor.light_azimuth_deg
+    if drawn is None:
+        return ""
+    free = [one for one in tried if not one.known_azimuth and one.plain and one.fit.converged and one.misfit <= EXPLAINED]
+    free = [
+        one for one in free if float(one.fit.direction_std_deg.max()) <= POORLY_CONSTRAINED_DEG and _off_the_drawing(one.fit, drawn)
+    ]
+    if not free:
+        return ""
+    position = min(free, key=lambda one: one.held_out).fit.lights.position_mm.detach().double()
+    if not chosen.objection:  # lights at known azimuths may be found on the far side of the centre
+        ray = torch.deg2rad(torch.tensor(drawn, dtype=torch.float64))
+        ahead = position[:, 0] * ray.cos() + position[:, 1] * ray.sin()
+        if not bool((ahead < 0.0).all()):
+            return ""
+    return wrong_azimuths(position, drawn, AZIMUTH_SLACK_DEG)
 
 
 def _off_the_drawing(fit: LightFit, azimuth_deg: tuple[float, ...]) -> str:

@@ -14,9 +14,10 @@ from pathlib import Path
 
 from torch import Tensor
 
-from ..core.files import read_image
+from ..core.files import VIDEO_SUFFIXES, read_image
 from ..diagnose import diagnose
-from ..model import Calibration
+from ..stream import read_background
+from .options import load_calibration
 
 USAGE = "CALIBRATION IMAGE [--background IMAGE] [--json]"
 
@@ -25,15 +26,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
     parser.add_argument("calibration", type=Path, metavar="CALIBRATION", help="what torchvts calibrate wrote, .safetensors")
     parser.add_argument("image", type=Path, metavar="IMAGE", help="the frame in question, as the camera gives it")
-    parser.add_argument("--background", type=Path, metavar="IMAGE", help="an image without contact of now, if there is one")
+    parser.add_argument("--background", type=Path, metavar="IMAGE", help="without contact, of now, if there is one; or a video")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the findings."""
-    calibration = Calibration.load(arguments.calibration)
+    calibration = load_calibration(arguments.calibration)
 
     def read(path: Path) -> Tensor:
+        if path.suffix.lower() in VIDEO_SUFFIXES and path == arguments.background:
+            return read_background([path], calibration.sensor)
         image = read_image(path)
         cut = calibration.sensor.roi_px is not None or calibration.sensor.corners_px is not None
         return calibration.sensor.rectify(image[None])[0] if cut else image

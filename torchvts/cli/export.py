@@ -15,9 +15,8 @@ import torch
 
 from .. import export
 from ..core.files import read_frames
-from ..model import Calibration
-from ..pipeline import DepthPipeline
-from .options import add_mode, add_out
+from ..pipeline import unit_pipeline
+from .options import add_mode, add_network, add_out, load_calibration
 
 USAGE = "CALIBRATION --out FOLDER [--format NAME...] [--mode MODE]"
 
@@ -27,14 +26,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("calibration", type=Path, metavar="CALIBRATION", help="what torchvts calibrate wrote, .safetensors")
     add_out(parser, "for the files")
     add_mode(parser, "fast")
+    add_network(parser)
     parser.add_argument("--format", nargs="+", default=list(export.FORMATS), metavar="NAME", help=f"of {', '.join(export.FORMATS)}")
     parser.add_argument("--frames", type=Path, metavar="INPUT", help="image, folder or video to compare on too; 8 frames at most")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the files, and print a row for each."""
-    calibration = Calibration.load(arguments.calibration)
-    pipe = DepthPipeline.from_calibration(calibration, arguments.mode)
+    calibration = load_calibration(arguments.calibration)
+    pipe = unit_pipeline(calibration, arguments.mode, arguments.network)
     images = export.sample_frames(calibration)
     if arguments.frames:
         real = [calibration.sensor.rectify(image[None]) for _, image in itertools.islice(read_frames(arguments.frames), 8)]

@@ -13,7 +13,7 @@ from typing import TextIO
 
 from ..core import __version__
 from ..core.spelling import suggest
-from .parser import Parser, UsageError
+from .parser import HelpFormatter, Parser, UsageError
 
 COMMANDS = {
     "calibrate": "calibrate a unit from its own images",
@@ -105,7 +105,7 @@ def make_parser(name: str, module: ModuleType) -> Parser:
         prog=f"torchvts {name}",
         usage=f"torchvts {name} {module.USAGE}",
         description=module.__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=HelpFormatter,
         allow_abbrev=False,
     )
     module.add_arguments(parser)

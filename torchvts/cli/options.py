@@ -3,9 +3,10 @@
 import argparse
 from pathlib import Path
 
-from ..model import shipped_sensors
+from ..model import Calibration, shipped_sensors
 from ..pipeline import MODES
 from ..stream import FIRST_FRAMES
+from .parser import UsageError
 
 
 def add_sensor(parser: argparse._ActionsContainer, text: str = "") -> None:
@@ -27,21 +28,37 @@ def add_background_frames(parser: argparse._ActionsContainer) -> None:
         type=int,
         default=FIRST_FRAMES,
         metavar="N",
-        help=f"first frames of a video without contact ({FIRST_FRAMES})",
+        help=f"first of a video, without contact ({FIRST_FRAMES})",
     )
 
 
 def add_mode(parser: argparse._ActionsContainer, default: str = "auto") -> None:
     """``--mode``: of the pipeline."""
-    parser.add_argument("--mode", choices=MODES, default=default, help=f"{default} if not given")
+    parser.add_argument("--mode", choices=MODES, default=default, metavar="MODE", help=f"{', '.join(MODES)} ({default})")
 
 
-def add_pipeline(parser: argparse._ActionsContainer) -> None:
-    """``--network`` and ``--device``: what finds the normals, and where."""
-    parser.add_argument(
-        "--network", type=Path, metavar="FILE", help="normals by gs_sdk's nnmodel.pth, or by what torchvts train wrote"
-    )
-    parser.add_argument("--device", default="cpu", help="cpu (if not given), cuda, cuda:1")
+def add_network(parser: argparse._ActionsContainer) -> None:
+    """``--network``: what finds the normals in place of the calibration's model."""
+    parser.add_argument("--network", type=Path, metavar="FILE", help="nnmodel.pth of gs_sdk, or what torchvts train wrote")
+
+
+def add_device(parser: argparse._ActionsContainer) -> None:
+    """``--device``: where the pipeline runs."""
+    parser.add_argument("--device", default="cpu", help="cpu, cuda, cuda:1 (cpu)")
+
+
+def load_calibration(path: Path) -> Calibration:
+    """The calibration in a file; what is none is refused with what was probably meant."""
+    meant = ""
+    if str(path) in shipped_sensors() or path.suffix in (".yaml", ".yml"):
+        meant = f": a sensor: calibrate it first, torchvts calibrate background.png --sensor {path}"
+    elif path.suffix in (".pth", ".pt"):
+        meant = ": a network: give it by --network, beside the calibration of its unit"
+    elif path.suffix != ".safetensors":
+        meant = ": torchvts calibrate makes one"
+    if meant:
+        raise UsageError(f"calibration: expected a file that torchvts calibrate wrote, .safetensors, got {path}{meant}")
+    return Calibration.load(path)
 
 
 def add_out(parser: argparse._ActionsContainer, text: str, default: str | None = None) -> None:

@@ -10,6 +10,18 @@ class UsageError(ValueError):
     """A request that a subcommand does not understand."""
 
 
+class HelpFormatter(argparse.RawDescriptionHelpFormatter):
+    """Help that stays short: options and their text on one line, IMAGE... in place of IMAGE [IMAGE ...]."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=28)
+
+    def _format_args(self, action: argparse.Action, default_metavar: str) -> str:
+        if action.nargs == argparse.ONE_OR_MORE:
+            return f"{self._metavar_formatter(action, default_metavar)(1)[0]}..."
+        return super()._format_args(action, default_metavar)
+
+
 class Parser(argparse.ArgumentParser):
     """A parser that raises :class:`UsageError` instead of printing its usage and ending the process."""
 

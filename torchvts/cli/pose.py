@@ -20,12 +20,11 @@ from tqdm import tqdm
 
 from .. import viz
 from ..core.files import count_frames, read_frames, read_image, write_atomically
-from ..model import Calibration
-from ..pipeline import DepthPipeline
+from ..pipeline import unit_pipeline
 from ..pose import contact_cloud, read_point_cloud, register_depth, register_points, write_point_cloud
 from ..pose.clouds import CLOUD_SUFFIXES
 from ..pose.result import Registration
-from .options import add_mode, add_out
+from .options import add_mode, add_network, add_out, load_calibration
 
 USAGE = "SOURCE REFERENCE [--calibration FILE] --out FOLDER"
 
@@ -37,6 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--calibration", type=Path, metavar="FILE", help="what torchvts calibrate wrote; not needed for clouds")
     add_out(parser, "for pose.json and pictures")
     add_mode(parser, "precise")
+    add_network(parser)
     parser.add_argument("--cloud", choices=["pcd", "ply", "none"], default="none", help="write both contacts, the source moved")
     parser.add_argument("--no-pictures", action="store_true", help="no picture of both contacts")
 
@@ -67,8 +67,9 @@ def of_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """Register every frame with the reference."""
     if arguments.calibration is None:
         raise ValueError("--calibration: expected what torchvts calibrate wrote, for images must become depth first")
-    calibration = Calibration.load(arguments.calibration)
-    pipe = DepthPipeline.from_calibration(calibration, arguments.mode if calibration.response is None else "auto")
+    calibration = load_calibration(arguments.calibration)
+    by_lights = calibration.response is None and arguments.network is None
+    pipe = unit_pipeline(calibration, arguments.mode if by_lights else "auto", arguments.network)
     pitch = calibration.sensor.mm_per_pixel
     with torch.inference_mode():
         target = pipe(calibration.sensor.rectify(read_image(arguments.target)[None]))

@@ -19,9 +19,9 @@ from pathlib import Path
 from ..core.files import VIDEO_SUFFIXES, read_frames
 from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, Report, list_items, reconstruct_dataset
 from ..diagnose import Finding, diagnose
-from ..model import Calibration, Sensor
+from ..model import Sensor
 from ..stream import calibrate_background, read_background, read_press_images
-from .options import add_background_frames, add_mode, add_out, add_pipeline, add_press, add_sensor
+from .options import add_background_frames, add_device, add_mode, add_network, add_out, add_press, add_sensor, load_calibration
 from .parser import UsageError
 from .summary import SHOWN, left_out, print_calibration
 
@@ -36,25 +36,23 @@ USAGE = "CALIBRATION INPUT... --out FOLDER"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
-    parser.add_argument(
-        "files", type=Path, nargs="+", metavar="FILE", help="the calibration, then the inputs; with --sensor, inputs only"
-    )
-    add_out(parser, "for the results; folders of an input are kept in it")
+    parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help="the calibration, then inputs; with --sensor inputs")
+    add_out(parser, "for the results, in the folders of the input")
     add_sensor(parser, "calibrate first: ")
     parser.add_argument("--background", type=Path, nargs="+", metavar="IMAGE", help="to calibrate: without contact; or a video")
     add_press(parser)
     add_background_frames(parser)
     add_mode(parser)
     parser.add_argument("--every", type=int, default=1, metavar="N", help="each N-th frame of a video, each N-th image")
-    add_pipeline(parser)
-    parser.add_argument("--format", choices=FORMATS, default="npz", help="npz if not given; video-npz: one file a video")
-    parser.add_argument("--cloud", choices=CLOUD_FORMATS, default="none", help="contact in mm, y up; obj is a surface")
-    parser.add_argument("--pictures", action=argparse.BooleanOptionalAction, help=f"by default for at most {PICTURES_UP_TO} frames")
-    parser.add_argument("--batch", type=int, default=8, metavar="N", help="frames that a loader process hands over at once (8)")
-    parser.add_argument("--workers", type=int, metavar="N", help="loader processes of each rank; up to 4 if not given")
-    parser.add_argument(
-        "--threads", type=int, default=1, metavar="N", help="of each rank (1); results depend on it in the last bits"
-    )
+    add_network(parser)
+    add_device(parser)
+    kinds = "npz (all), video-npz (one a video), png16, npy, none (npz)"
+    parser.add_argument("--format", choices=FORMATS, default="npz", metavar="KIND", help=kinds)
+    parser.add_argument("--cloud", choices=CLOUD_FORMATS, default="none", metavar="KIND", help="contact: ply, pcd, obj (surface)")
+    parser.add_argument("--pictures", action=argparse.BooleanOptionalAction, help=f"drawn for at most {PICTURES_UP_TO} frames")
+    parser.add_argument("--batch", type=int, default=8, metavar="N", help="frames that a loader hands over at once (8)")
+    parser.add_argument("--workers", type=int, metavar="N", help="loader processes of each rank (up to 4)")
+    parser.add_argument("--threads", type=int, default=1, metavar="N", help="of each rank (1); results vary in last bits")
     parser.add_argument("--overwrite", action="store_true", help="begin anew, whatever --out holds")
     parser.add_argument("--strict", action="store_true", help="stop at the first frame that cannot be used")
 
@@ -84,6 +82,7 @@ def split_files(arguments: argparse.Namespace) -> tuple[Path | None, list[Path]]
         raise UsageError("--background, --press: they are to calibrate with --sensor, not beside a calibration file")
     if len(files) < 2:
         raise UsageError(f"expected a calibration file and an input, got {files[0]}: name both, or --sensor to calibrate")
+    load_calibration(files[0])
     return files[0], files[1:]
 
 
@@ -126,7 +125,7 @@ def print_report(report: Report, out: Path) -> None:
 
 def diagnose_first(calibration: Path, inputs: list[Path]) -> list[Finding]:
     """What is wrong with the first frame, such as that it is from another unit; one that cannot be read is reported above."""
-    unit = Calibration.load(calibration)
+    unit = load_calibration(calibration)
     try:
         first = next(list_items(tuple(inputs) if len(inputs) > 1 else inputs[0]))
         _, image = next(iter(read_frames(first.file)))

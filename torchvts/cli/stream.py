@@ -33,7 +33,7 @@ from ..stream import (
     read_background,
     read_press_images,
 )
-from .options import add_background_frames, add_mode, add_pipeline, add_press, add_sensor
+from .options import add_background_frames, add_device, add_mode, add_network, add_press, add_sensor, load_calibration
 from .parser import UsageError
 
 USAGE = "--source SOURCE (--sensor NAME | --calibration FILE) [--out FOLDER]"
@@ -52,7 +52,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="for overlay video, frames.csv and summary.json")
     parser.add_argument("--video", choices=["mp4", "avi", "none"], default="mp4", help="kind of overlay video in --out")
     add_mode(parser)
-    add_pipeline(parser)
+    add_network(parser)
+    add_device(parser)
     parser.add_argument("--realtime", action="store_true", help="play a recording at its own rate, dropping late frames")
     parser.add_argument("--no-follow", action="store_true", help="do not follow slow drift of the light")
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="of PyTorch and OpenCV (1)")
@@ -66,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("--background, --press: they are to calibrate with --sensor, not beside --calibration")
     torch.set_num_threads(max(1, arguments.threads))
     cv2.setNumThreads(max(1, arguments.threads))
-    unit = Sensor.load(arguments.sensor) if arguments.sensor else Calibration.load(arguments.calibration)
+    unit = Sensor.load(arguments.sensor) if arguments.sensor else load_calibration(arguments.calibration)
     if arguments.corners is not None:
         unit = with_corners(unit, arguments.corners)
     if arguments.save_calibration is not None:

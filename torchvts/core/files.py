@@ -95,6 +95,11 @@ def read_pixels(path: str | Path) -> np.ndarray[Any, Any]:
     import cv2
 
     path = _image_path(path)
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        raise ValueError(
+            f"{path}: expected an image, got a video: torchvts.stream.read_background([path], sensor) makes a background of its "
+            "first frames, torchvts reconstruct takes all of them"
+        )
     pixels = decode_image(path, cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise ValueError(f"{path}: not an image, or cut short")

@@ -148,41 +148,41 @@ def read_result(path: str | Path) -> Result:
     if path.suffix.lower() != ".npz":
         raise ValueError(f"{path}: expected a name ending in .npz, got {path.suffix!r}: reconstruct with --format npz")
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            _check_claims(path, stored)
-            return _result(path, stored)
-    except (OSError, ValueError, KeyError, EOFError, MemoryError, RuntimeError, NotImplementedError, zipfile.BadZipFile) as error:
-        if str(error).startswith(f"{path}: "):
-            raise
-        raise ValueError(f"{path}: not a result file, or cut short: {' '.join(str(error).split())[:200]}") from error
+        with zipfile.ZipFile(path) as archive:
+            claimed = sum(entry.file_size for entry in archive.infolist())
+            if claimed > MOST_PACKED * path.stat().st_size:
+                raise ValueError(f"its {path.stat().st_size} bytes cannot hold the {claimed} that it claims")
+            stored = {entry.filename.removesuffix(".npy"): _array(archive, entry) for entry in archive.infolist()}
+        return _result(stored)
+    except Exception as error:  # a damaged file may fail anywhere in the readers of zip, npy and JSON
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ValueError(f"{path}: not a result of torchvts reconstruct, or damaged: {reason}") from error
 
 
-def _check_claims(path: Path, stored: Any) -> None:
-    """Refuse a file whose directory claims more than it can hold, before anything of that size is made."""
-    claimed = sum(entry.file_size for entry in stored.zip.infolist())
-    if claimed > MOST_PACKED * path.stat().st_size:
-        raise ValueError(f"{path}: damaged: {path.stat().st_size} bytes cannot hold the {claimed} that it claims")
+def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Array:
+    with archive.open(entry) as stream:
+        values: Array = np.lib.format.read_array(stream, allow_pickle=False)
+    return values
 
 
-def _result(path: Path, stored: Any) -> Result:
+def _result(stored: Mapping[str, Array]) -> Result:
     missing = [name for name in (*MAPS, "mm_per_pixel", "units", "calibration", "sensor", "frames") if name not in stored]
     if missing:
-        raise ValueError(f"{path}: expected a result of torchvts reconstruct, got an npz without {', '.join(missing)}")
+        raise ValueError(f"it has no {', '.join(missing)}")
     frames = [str(name) for name in stored["frames"]]
+    depth = stored["depth_mm"]
+    if depth.ndim not in (2, 3) or (depth.ndim == 2 and len(frames) != 1):
+        raise ValueError(f"depth_mm: expected (H, W), or (N, H, W) for N frames, got {depth.shape} for {len(frames)}")
     maps: dict[str, Tensor] = {}
     for name, (channels, kind) in MAPS.items():
-        values = stored[name]
-        values = values.reshape(-1, channels, *values.shape[-2:]) if values.ndim >= 2 else values
-        size = maps["depth_mm"].shape[2:] if maps else values.shape[2:]
-        if values.shape != (len(frames), channels, *size) or values.dtype != np.dtype(kind):
-            wanted = f"{len(frames)} frames of {channels} x H x W, {np.dtype(kind)}"
-            raise ValueError(f"{path}: {name}: expected {wanted}, got {stored[name].shape}, {values.dtype}: damaged")
-        maps[name] = torch.from_numpy(values)
-    units = json.loads(str(stored["units"]))
+        shape = (*((len(frames),) if depth.ndim == 3 else ()), *((channels,) if channels > 1 else ()), *depth.shape[-2:])
+        if stored[name].shape != shape or stored[name].dtype != np.dtype(kind):
+            raise ValueError(f"{name}: expected {shape}, {np.dtype(kind)}, got {stored[name].shape}, {stored[name].dtype}")
+        maps[name] = torch.from_numpy(stored[name].reshape(len(frames), channels, *depth.shape[-2:]))
     return Result(
         **maps,
         mm_per_pixel=float(stored["mm_per_pixel"]),
-        units=units,
+        units=json.loads(str(stored["units"])),
         calibration=str(stored["calibration"]),
         sensor=str(stored["sensor"]),
         frames=frames,

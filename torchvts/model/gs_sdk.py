@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ..core.checks import brief, check_batch, check_path, check_positive, check_tensor
-from ..core.files import read_image, rgb_from_bgr
+from ..core.files import image_files, read_image, rgb_from_bgr
 from .gs_sdk_sensor import values_from_gs_sdk
 from .sensor import Sensor, read_yaml
 
@@ -76,6 +76,15 @@ class GsSdkFolder:
     presses: tuple[GsSdkPress, ...]
 
 
+def _other_way(folder: Path) -> str:
+    """How to calibrate from a folder without a catalog, if it holds images."""
+    images = [path.name for path in image_files(folder)]
+    if not images:
+        return ""
+    first = "background.png" if "background.png" in images else images[0]
+    return f"; without a catalog, name the images: torchvts calibrate {folder / first} --press IMAGE DIAMETER_MM"
+
+
 def read_calibration_folder(folder: str | Path) -> GsSdkFolder:
     """Read a calibration folder in gs_sdk's layout. Images of presses are read by :meth:`GsSdkPress.image`.
 
@@ -105,7 +114,9 @@ def read_calibration_folder(folder: str | Path) -> GsSdkFolder:
     catalog, background_path = folder / "catalog.csv", folder / "background.png"
     for path in (catalog, background_path):
         if not path.is_file():
-            raise FileNotFoundError(f"{path}: no such file: a calibration folder of gs_sdk holds catalog.csv and background.png")
+            raise FileNotFoundError(
+                f"{path}: no such file: a calibration folder of gs_sdk holds catalog.csv and background.png{_other_way(folder)}"
+            )
     background = read_image(background_path)
     height, width = background.shape[1], background.shape[2]
     presses: list[GsSdkPress] = []

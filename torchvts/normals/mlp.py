@@ -252,7 +252,7 @@ def _read_state(path: Path) -> object:
     try:
         state: object = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged file may fail anywhere in torch's reader
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        reason = str(error).strip().splitlines()[0].split(". ")[0] if str(error).strip() else type(error).__name__
         raise ValueError(
             f"{path}: not a state dict, cut short, or it holds more than tensors, which is refused: {reason}"
         ) from error

@@ -1,0 +1,182 @@
+"""The command torchvts: its help, its errors and exit statuses, and what it says of a calibration."""
+
+import importlib
+import subprocess
+import sys
+import warnings
+
+import pytest
+import torch
+
+import torchvts as vts
+from torchvts.calibration.azimuths import wrong_azimuths
+from torchvts.cli import COMMANDS, main
+from torchvts.cli.summary import SHOWN, expected, left_out
+from torchvts.core.spelling import suggest
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_fits_a_screen_and_shows_an_example(name, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit) as stop:
+        main([name, "--help"])
+    text = capsys.readouterr().out
+    assert stop.value.code == 0 and len(text.splitlines()) <= 40
+    assert text.startswith(f"usage: torchvts {name} ") and f"  torchvts {name}" in text.partition("example")[2]
+
+
+def test_the_overview_names_every_command(capsys):
+    assert main(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert len(text.splitlines()) <= 40
+    assert all(f"  {name} " in text and what in text for name, what in COMMANDS.items())
+    assert main([]) == 2
+
+
+def test_the_module_is_the_command_and_loads_no_more_than_it_needs():
+    program = (
+        "import runpy, sys; sys.argv = ['torchvts', '--version']\n"
+        "try: runpy.run_module('torchvts', run_name='__main__')\n"
+        "except SystemExit as stop: print(stop.code, *({'cv2', 'matplotlib', 'open3d', 'onnx'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["torchvts", vts.__version__, "0"]
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["calibrat", "a.png"], "got 'calibrat': did you mean 'calibrate'?"),
+        (["pose", "a", "b", "--out", "c", "--calibraton", "d"], "unknown option '--calibraton': did you mean '--calibration'?"),
+        (["reconstruct", "a", "b", "--out", "c", "--mode", "presise"], "got 'presise': did you mean 'precise'?"),
+        (["reconstruct", "a", "b", "--out", "c", "--format", "png"], "got 'png': did you mean 'png16'?"),
+        (["reconstruct", "a", "b"], "the following arguments are required: --out"),
+        (["reconstruct", "gelsight_mini", "b", "--out", "c"], "torchvts calibrate background.png --sensor gelsight_mini"),
+        (["reconstruct", "nnmodel.pth", "b", "--out", "c"], "a network: give it by --network"),
+        (["reconstruct", "a.png", "--out", "c"], "name both, or --sensor to calibrate"),
+        (["calibrate", "a.png", "--sensor", "gelsight-mini", "--out", "a.safetensors"], "did you mean 'gelsight_mini'?"),
+        (["calibrate", "a.png"], "expected either --sensor or --mm-per-pixel"),
+        (["calibrate", "a.png", "--sensor", "digit", "--out", "unit.npz"], "expected a name ending in .safetensors"),
+        (["stream", "--source", "0"], "expected either --sensor or --calibration"),
+        (["evaluate"], "expected one of FOLDER, --all, --sets"),
+        (["samples", "gelsight_maxi"], "did you mean 'gelsight_mini'?"),
+    ],
+)
+def test_a_wrong_request_is_one_line_that_says_what_was_meant(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    printed = capsys.readouterr()
+    assert printed.out == "" and printed.err.startswith("torchvts: error: ") and message in printed.err
+    assert len(printed.err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "error, status, message",
+    [
+        (ValueError("unit:\n  wrong"), 2, "torchvts: error: unit: wrong\n"),
+        (FileNotFoundError(2, "No such file", "x.png"), 2, "torchvts: error: [Errno 2] No such file: 'x.png'\n"),
+        (KeyError("passes"), 1, "torchvts: error: KeyError: 'passes': a bug in torchvts: please report what --debug prints\n"),
+        (KeyboardInterrupt(), 130, "torchvts: stopped\n"),
+    ],
+)
+def test_no_traceback_reaches_a_user_unless_asked_for(error, status, message, capsys, monkeypatch):
+    def fail(arguments):
+        raise error
+
+    monkeypatch.setattr(importlib.import_module("torchvts.cli.samples"), "run", fail)
+    assert main(["samples"]) == status and capsys.readouterr().err == message
+    assert main(["samples", "--debug"]) == status and "Traceback" in capsys.readouterr().err
+
+
+def test_a_suggestion_is_close_or_none():
+    assert suggest("mm_per_pixle", ["mm_per_pixel", "name"]) == ": did you mean 'mm_per_pixel'?"
+    assert suggest("GelSight Mini", ["digit", "gelsight_mini"]) == ": did you mean 'gelsight_mini'?"
+    assert suggest("banana", ["digit", "gelsight_mini"]) == suggest(3, ["digit"]) == ""
+
+
+def test_of_many_left_out_a_few_are_printed():
+    lines = list(left_out("press", [(str(k), "too wide") for k in range(SHOWN + 7)]))
+    assert lines[0] == "left out: press 0: too wide" and lines[-1] == "left out: 7 more" and len(lines) == SHOWN + 1
+
+
+@pytest.fixture(scope="module")
+def rig(small_sensor, small_press, ring):
+    """Sensor, lights, background and an image of a press."""
+    lights, press = ring(), small_press()
+    background = vts.scenes.render(vts.scenes.undeformed(press), lights, noise_std=0.002)[0]
+    return small_sensor, lights, background, vts.scenes.render(press, lights, noise_std=0.002, seed=1)[0]
+
+
+def test_calibrate_says_in_few_lines_what_to_expect(rig, run_script, tmp_path):
+    sensor, _, background, press = rig
+    for name, image in (("background", background), ("ball", press)):
+        vts.write_image(tmp_path / f"{name}.png", image)
+    sensor.save(tmp_path / "rig.yaml")
+    given = (tmp_path / "background.png", "--sensor", tmp_path / "rig.yaml", "--out", tmp_path / "unit.safetensors")
+    done = run_script("calibrate", *given, "--press", tmp_path / "ball.png", "20")
+    lines = done.stdout.splitlines()
+    assert done.returncode == 0 and done.stderr == "" and len(lines) == 4, done.stderr
+    assert [line.partition(" ")[0] for line in lines] == ["sensor:", "chosen:", "expected:", "wrote"]
+    assert "directions of the lights to 0." in lines[2]
+    table = run_script("calibrate", *given, "--candidates")
+    assert "| point lights | three lights | 2 |" in table.stdout and "| R | " in table.stdout
+
+
+def test_what_to_expect_follows_the_source(rig, mini_by_prior):
+    sensor, lights, background, _ = rig
+    given = vts.Calibration.from_lights(lights, sensor, background)
+    assert "presses of a ball would measure it" in expected(given)
+    assert expected(mini_by_prior).startswith("normals within a contact to about 2.0 degrees, the prior's record")
+    held_out = {"model": "response", "source": "presses", "held_out_deg": 1.5, "presses": [{"name": "a", "used": True}] * 12}
+    presses = vts.Calibration.from_response(mini_by_prior.response, mini_by_prior.sensor, mini_by_prior.background, held_out)
+    assert "to about 1.7 degrees, by scoring each of 12 presses with the others" in expected(presses)
+    rough = vts.Calibration.from_response(
+        mini_by_prior.response, mini_by_prior.sensor, mini_by_prior.background, {"model": "response", "source": "stand_in"}
+    )
+    assert "NOT METRIC" in expected(rough)
+
+
+@pytest.mark.parametrize(
+    "azimuths, cause",
+    [
+        ((250.0, 130.0, 10.0), "red and blue are swapped"),
+        ((130.0, 250.0, 10.0), "the channels are in another order"),
+        ((100.0, 220.0, 340.0), "all are turned by -90: is the image rotated or flipped?"),
+        ((350.0, 230.0, 110.0), "they are counted from x towards y, which points down"),
+        ((40.0, 100.0, 300.0), "correct them in the sensor file, or leave them out"),
+    ],
+)
+def test_the_cause_of_wrong_azimuths(ring, azimuths, cause):
+    text = wrong_azimuths(ring().position_mm, azimuths, 5.0)
+    assert text.endswith(f"for R, G, B, the image shows 10, 130, 250: {cause}")
+
+
+@pytest.mark.parametrize(
+    "azimuths, wrong", [((10.0, 130.0, 250.0), False), ((25.0, 145.0, 265.0), True), ((190.0, 310.0, 70.0), True)]
+)
+def test_wrong_azimuths_are_called_wrong_azimuths(ring, azimuths, wrong):
+    scene = vts.scenes.undeformed(vts.scenes.sphere_press(10.0, 1.0, (0.0, 0.0), 48, 64, 0.6))
+    background = vts.scenes.render(scene, ring(), noise_std=0.002)[0].detach()
+    sensor = vts.Sensor("rig", 48, 64, 0.6, gamma=1.0, light_azimuth_deg=azimuths)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", vts.CalibrationWarning)
+        vts.calibrate(background, sensor)
+    messages = [str(w.message) for w in caught if issubclass(w.category, vts.CalibrationWarning)]
+    assert any("wrong azimuths: light_azimuth_deg says" in message for message in messages) == wrong, messages
+
+
+def test_a_video_or_a_folder_in_the_wrong_place_names_the_way_that_works(rig, tmp_path):
+    with pytest.raises(ValueError, match=r"expected an image, got a video: torchvts\.stream\.read_background"):
+        (tmp_path / "film.avi").write_bytes(b"film")
+        vts.read_image(tmp_path / "film.avi")
+    vts.write_image(tmp_path / "background.png", rig[2])
+    with pytest.raises(FileNotFoundError, match=r"name the images: torchvts calibrate .*background\.png --press"):
+        vts.read_presses(tmp_path)
+
+
+def test_a_file_that_is_no_network_gets_no_advice_to_trust_it(rig, tmp_path):
+    path = tmp_path / "net.pth"
+    torch.save({"model": torch.nn.Linear(2, 2)}, path)
+    with pytest.raises(ValueError, match="more than tensors, which is refused") as caught:
+        vts.NormalFromMLP.load(path, rig[2])
+    assert "weights_only" not in str(caught.value)

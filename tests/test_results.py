@@ -1,0 +1,251 @@
+"""Result files hold what the pipeline gave, are read without this package or by read_result, and damage is refused."""
+
+import json
+import zipfile
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import torchvts as vts
+from torchvts.core.results import MAPS, UNITS, join_results, write_result
+from torchvts.dataset import reconstruct_dataset
+from torchvts.pipeline import unit_pipeline
+from torchvts.pose.surface_files import write_obj
+from torchvts.stream import check_device
+
+HEIGHT, WIDTH, PITCH = 48, 64, 0.6
+
+
+def image(k):
+    lights = vts.PointLights([[20.0, 9.0, 25.0], [-18.0, 13.0, 25.0], [-2.0, -22.0, 25.0]], [600.0, 600.0, 600.0])
+    scene = vts.scenes.sphere_press(6.0, 0.5 + 0.02 * k, (0.1 * k, 0), HEIGHT, WIDTH, PITCH)
+    return vts.scenes.render(scene if k >= 0 else vts.scenes.undeformed(scene), lights, noise_std=0.002, bits=8, seed=abs(k))[0]
+
+
+@pytest.fixture(scope="module")
+def unit(tmp_path_factory):
+    path = tmp_path_factory.mktemp("unit") / "unit.safetensors"
+    lights = vts.PointLights([[20.0, 9.0, 25.0], [-18.0, 13.0, 25.0], [-2.0, -22.0, 25.0]], [600.0, 600.0, 600.0])
+    vts.Calibration.from_lights(lights, vts.Sensor("rig", HEIGHT, WIDTH, PITCH), image(-1)).save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    """A folder of five images and a film of seven frames."""
+    folder = tmp_path_factory.mktemp("source")
+    for k in range(5):
+        vts.write_image(folder / f"{k}.png", image(k))
+    writer = cv2.VideoWriter(str(folder / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (WIDTH, HEIGHT))
+    for k in range(7):
+        writer.write(np.ascontiguousarray((image(k) * 255).round().byte().flip(0).permute(1, 2, 0).numpy()))
+    writer.release()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def results(unit, source, tmp_path_factory):
+    out = tmp_path_factory.mktemp("results")
+    reconstruct_dataset(unit, source, out, workers=0, pictures=False, background_frames=0)
+    return out
+
+
+def test_a_frame_is_what_the_pipeline_gave(unit, source, results):
+    calibration = vts.Calibration.load(unit)
+    result = vts.read_result(results / "3.npz")
+    with torch.inference_mode():
+        out = vts.stream.Recording(calibration, follow=False)(vts.read_image(source / "3.png")[None], 0.0)[1]
+    for ours, theirs in zip(result, (out.depth_mm, out.normal, out.gradient, out.contact, out.deformed)):
+        assert torch.equal(ours, theirs)
+    assert result[5:] == (PITCH, UNITS, "unit.safetensors", "rig", ["3.png"])
+    with np.load(results / "3.npz") as plain:  # without this package
+        assert plain["depth_mm"].shape == (HEIGHT, WIDTH) and plain["normals"].shape == (3, HEIGHT, WIDTH)
+        assert float(plain["mm_per_pixel"]) == PITCH and json.loads(str(plain["units"])) == UNITS
+    summary = json.loads((results / "summary.json").read_text())
+    assert (summary["frames"], summary["mm_per_pixel"], summary["units"]) == (12, PITCH, UNITS)
+
+
+def test_a_video_in_one_file_holds_its_frames(unit, source, results, tmp_path):
+    options = {"workers": 0, "pictures": False, "background_frames": 0, "format": "video-npz"}
+    reconstruct_dataset(unit, source, tmp_path, **options)
+    assert sorted(path.name for path in tmp_path.glob("*.npz")) == ["0.npz", "1.npz", "2.npz", "3.npz", "4.npz", "film.npz"]
+    film = vts.read_result(tmp_path / "film.npz")
+    assert film.depth_mm.shape == (7, 1, HEIGHT, WIDTH) and film.frames[6] == "film.avi/000006"
+    frames = [vts.read_result(results / f"film_{k:06d}.npz") for k in range(7)]
+    for joined, single in zip(film[:5], zip(*(frame[:5] for frame in frames))):
+        assert torch.equal(joined, torch.cat(single))
+    before = (tmp_path / "film.npz").read_bytes()
+    assert reconstruct_dataset(unit, source, tmp_path, **options).before == 12
+    (tmp_path / "film.npz").unlink()
+    assert reconstruct_dataset(unit, source, tmp_path, **options).before == 5
+    assert (tmp_path / "film.npz").read_bytes() == before and not list(tmp_path.glob(".torchvts/parts/*"))
+
+
+def test_every_third_frame_of_several_inputs(unit, source, tmp_path):
+    (tmp_path / "more").mkdir()
+    vts.write_image(tmp_path / "more" / "0.png", image(9))
+    inputs = [source / "0.png", source / "film.avi", source / "2.png", tmp_path / "more", source / "0.png"]
+    report = reconstruct_dataset(unit, inputs, tmp_path / "out", every=2, workers=0, pictures=False, format="npy")
+    rows = [
+        line.split(",")[0].rpartition(f"{source.name}/")[2] for line in (tmp_path / "out" / "frames.csv").read_text().split()[1:]
+    ]
+    assert rows[:1] == ["0.png"] and rows[1:5] == [f"film.avi/{k:06d}" for k in (0, 2, 4, 6)] and rows[5].endswith("more/0.png")
+    assert report.rows == len(rows) == 6
+    again = reconstruct_dataset(unit, inputs, tmp_path / "out", every=2, workers=0, pictures=False, format="npy")
+    assert (again.before, again.rows) == (6, 6)
+
+
+def test_the_depth_png_and_the_surface(unit, source, tmp_path):
+    reconstruct_dataset(unit, source / "4.png", tmp_path, format="png16", cloud="obj", pictures=False)
+    reconstruct_dataset(unit, source / "4.png", tmp_path / "all", pictures=False)
+    result = vts.read_result(tmp_path / "all" / "4.npz")
+    values = cv2.imread(str(tmp_path / "4_depth.png"), cv2.IMREAD_UNCHANGED)
+    assert values.dtype == np.uint16
+    says = json.loads((tmp_path / "summary.json").read_text())["depth_png"]
+    depth_mm = eval(says.removeprefix("depth_mm = "), {"value": values.astype(float)})
+    assert np.abs(depth_mm - result.depth_mm[0, 0].numpy()).max() <= 0.00006
+    lines = [line.split() for line in (tmp_path / "4.obj").read_text().splitlines()]
+    points = torch.tensor([[float(v) for v in line[1:]] for line in lines if line[0] == "v"])
+    assert torch.allclose(points, vts.depth_to_points(result.depth_mm, PITCH, result.contact), atol=1e-5)
+    faces = torch.tensor([[int(part.split("//")[0]) for part in line[1:]] for line in lines if line[0] == "f"]) - 1
+    a, b, c = points[faces].unbind(1)
+    facing = torch.linalg.cross(b - a, c - a)
+    assert (facing[:, 2] > 0).all()  # towards the camera
+    area = 0.5 * facing[:, 2].sum() / PITCH**2
+    assert 0.7 * float(result.contact.sum()) < float(area) <= float(result.contact.sum())
+
+
+def test_a_slanted_plane_is_written_with_its_own_normals(tmp_path):
+    x = torch.arange(6.0).expand(5, 6) * 0.5
+    contact = torch.ones(1, 1, 5, 6, dtype=torch.bool)
+    normal = torch.tensor([-0.6, 0.0, 0.8])[None, :, None, None].expand(1, 3, 5, 6)  # of z = 0.75 x
+    write_obj(tmp_path / "plane.obj", (0.75 * x)[None, None], normal, contact, 0.5)
+    lines = [line.split() for line in (tmp_path / "plane.obj").read_text().splitlines()]
+    points = np.array([[float(v) for v in line[1:]] for line in lines if line[0] == "v"])
+    faces = np.array([[int(part.split("//")[0]) - 1 for part in line[1:]] for line in lines if line[0] == "f"])
+    assert len(points) == 30 and len(faces) == 2 * 4 * 5
+    cross = np.cross(points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]])
+    assert np.allclose(cross / np.linalg.norm(cross, axis=1, keepdims=True), [-0.6, 0.0, 0.8], atol=1e-5)
+    assert {tuple(line[1:]) for line in lines if line[0] == "vn"} == {("-0.600000", "-0.000000", "0.800000")}
+
+
+def damaged(path, tmp_path, how):
+    """A copy of a result file, damaged in one way."""
+    target = tmp_path / "damaged.npz"
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    how(arrays)
+    np.savez(target, **arrays)
+    return target
+
+
+@pytest.mark.parametrize(
+    "how, message",
+    [
+        (lambda a: a.pop("contact"), "it has no contact"),
+        (lambda a: a.update(normals=a["normals"][:2]), r"normals: expected \(3, 48, 64\), float32, got \(2, 48, 64\)"),
+        (
+            lambda a: a.update(depth_mm=a["depth_mm"].astype("f8")),
+            r"depth_mm: expected \(48, 64\), float32, got \(48, 64\), float64",
+        ),
+        (lambda a: a.update(contact=a["contact"][:, :-1]), r"contact: expected \(48, 64\), bool"),
+        (
+            lambda a: a.update(frames=np.array(["a", "b"])),
+            r"depth_mm: expected \(H, W\), or \(N, H, W\) for N frames, got \(48, 64\) for 2",
+        ),
+        (lambda a: a.update(units=np.array([{}], dtype=object)), "damaged: Object arrays cannot be loaded"),
+        (lambda a: a.update(units=np.array("{")), "not a result of torchvts reconstruct, or damaged"),
+        (lambda a: a.update(depth_mm=np.float32(1.0)), "depth_mm: expected"),
+    ],
+)
+def test_a_damaged_result_is_refused(results, tmp_path, how, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        vts.read_result(damaged(results / "0.npz", tmp_path, how))
+    assert "damaged.npz: " in str(caught.value)
+
+
+def test_what_is_no_result_is_refused(results, tmp_path):
+    data = (results / "0.npz").read_bytes()
+    for content in (b"", b"PK", data[: len(data) // 2], data[:200] + bytes(400) + data[600:]):
+        (tmp_path / "bad.npz").write_bytes(content)
+        with pytest.raises(ValueError, match=r"bad\.npz: "):
+            vts.read_result(tmp_path / "bad.npz")
+    with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_BZIP2) as archive:
+        archive.writestr("depth_mm.npy", bytes(2**24))
+    with pytest.raises(ValueError, match=r"damaged: its \d+ bytes cannot hold the 16777216 that it claims"):
+        vts.read_result(tmp_path / "bomb.npz")
+    for path, error, message in (
+        (tmp_path / "none.npz", FileNotFoundError, "no such result file"),
+        (results, FileNotFoundError, r"name one of its \.npz files"),
+        (results / "frames.csv", ValueError, r"expected a name ending in \.npz"),
+    ):
+        with pytest.raises(error, match=message):
+            vts.read_result(path)
+
+
+def test_joining_keeps_order_and_types(results, tmp_path):
+    parts = [results / f"film_{k:06d}.npz" for k in (5, 2)]
+    join_results(tmp_path / "two.npz", parts)
+    two = vts.read_result(tmp_path / "two.npz")
+    assert two.frames == ["film.avi/000005", "film.avi/000002"] and two.contact.dtype == torch.bool
+    with np.load(tmp_path / "two.npz") as plain:
+        assert {name: plain[name].shape[0] for name in MAPS} == dict.fromkeys(MAPS, 2)
+
+
+def test_the_same_values_give_the_same_bytes(tmp_path):
+    flat, mask = torch.rand(1, 1, 4, 6), torch.zeros(1, 1, 4, 6, dtype=torch.bool)
+    output = vts.DepthOutput(flat, flat.expand(1, 2, 4, 6), flat.expand(1, 3, 4, 6), mask, mask)
+    for name in ("a", "b"):
+        write_result(tmp_path / f"{name}.npz", output, 0.1, "unit.safetensors", "rig", "0.png")
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_a_network_takes_the_models_place(unit, source, tmp_path):
+    calibration = vts.Calibration.load(unit)
+    vts.NormalFromMLP(HEIGHT, WIDTH, calibration.background.float(), hidden=(8, 8), seed=3).save(tmp_path / "net.safetensors")
+    torch.save(vts.NormalFromMLP.load(tmp_path / "net.safetensors").gs_sdk_state(), tmp_path / "nnmodel.pth")
+    options = {"workers": 0, "pictures": False}
+    for name in ("net.safetensors", "nnmodel.pth"):
+        out = tmp_path / name.replace(".", "_")
+        reconstruct_dataset(unit, source / "1.png", out, network=tmp_path / name, **options)
+        pipe = vts.DepthPipeline.from_gs_sdk(tmp_path / name, calibration.background.float(), calibration.sensor, "auto")
+        with torch.inference_mode():
+            expected = pipe(vts.read_image(source / "1.png")[None]).depth_mm
+        assert torch.allclose(vts.read_result(out / "1.npz").depth_mm, expected, atol=1e-5)
+    with pytest.raises(ValueError, match="network_sha256"):
+        reconstruct_dataset(unit, source / "1.png", tmp_path / "net_safetensors", **options)
+    for bad, message in (
+        (unit, "expected a network"),
+        (source / "1.png", "not a state dict"),
+        (tmp_path / "no.pth", "no such file"),
+    ):
+        with pytest.raises((ValueError, FileNotFoundError), match=message):
+            reconstruct_dataset(unit, source / "1.png", tmp_path / "bad", network=bad, **options)
+    assert not (tmp_path / "bad").exists()
+    with pytest.raises(ValueError, match="mode: 'precise'"):
+        unit_pipeline(calibration, "precise", tmp_path / "net.safetensors")
+    with pytest.raises(ValueError, match="contact: expected None beside a network"):
+        unit_pipeline(calibration, "fast", tmp_path / "net.safetensors", vts.ContactSettings())
+
+
+def test_a_video_by_a_network_has_the_noise_of_its_first_frames(unit, source, tmp_path):
+    calibration = vts.Calibration.load(unit)
+    vts.NormalFromMLP(HEIGHT, WIDTH, calibration.background.float(), hidden=(8,), seed=3).save(tmp_path / "net.safetensors")
+    quiet = torch.stack([image(-1 - k).detach() for k in range(6)])
+    noise = torch.randn(quiet.shape, generator=torch.Generator().manual_seed(1))
+    by_noise = []
+    for std in (0.0, 0.02):
+        first = (quiet + std * noise).clamp(0, 1)
+        recording = vts.stream.Recording(calibration, first=first, network=tmp_path / "net.safetensors")
+        by_noise.append(recording.pipe.deformed.per_noise.median())
+    assert by_noise[1] < 0.7 * by_noise[0]
+
+
+def test_a_device_that_is_not_there_is_named():
+    assert check_device("cpu").type == "cpu"
+    for device, part in (("cdua", "did you mean 'cuda'?"), (f"cuda:{torch.cuda.device_count()}", "has no such GPU")):
+        with pytest.raises(ValueError, match="device: expected") as caught:
+            check_device(device)
+        assert part in str(caught.value)

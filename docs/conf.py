@@ -1,12 +1,10 @@
 """Sphinx settings of the documentation: `make docs` builds it from the pages here and the docstrings of the package."""
 
-import functools
 import importlib
 import inspect
 import pkgutil
 import sys
 import warnings
-from argparse import RawDescriptionHelpFormatter
 from typing import Any
 
 from docutils import nodes
@@ -106,7 +104,6 @@ def add_help(app: Any, docname: str, source: list[str]) -> None:
         return
     for name, text in COMMANDS.items():
         parser = make_parser(name, importlib.import_module(f"torchvts.cli.{name}"))
-        parser.formatter_class = functools.partial(RawDescriptionHelpFormatter, width=110)
         source[0] += f"\n## {name}\n\n{text[0].upper()}{text[1:]}.\n\n```text\n{parser.format_help()}```\n"
 
 

@@ -1,6 +1,9 @@
-"""Calibrate from one image and reconstruct: a rendered scene, and real images where they are available.
+"""Calibrate and reconstruct: real images where they are, and a rendered scene whose truth is known.
 
 python scripts/demo.py [--out out/demo]
+
+Real images are those that `torchvts samples gelsight_mini` fetched into the cache; without them those in the folder TORCHVTS_DATA
+or in ../shared/data; without these, only the rendered scene.
 """
 
 import argparse
@@ -20,6 +23,7 @@ import torchvts as vts
 from torchvts import scenes, viz
 from torchvts.evaluation import metrics
 from torchvts.evaluation.sets import data_folder
+from torchvts.samples import cached_sample
 
 PITCH = 0.0625
 
@@ -29,9 +33,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("out/demo"))
     arguments = parser.parse_args(argv)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    lines = embedded(arguments.out)
-    folder = data_folder(__file__)
-    lines += real(folder, arguments.out) if folder.is_dir() else [f"real images: none at {folder} (set TORCHVTS_DATA)"]
+    sample, folder = cached_sample("gelsight_mini"), data_folder(__file__)
+    if sample is not None:
+        print(f"real images: the sample gelsight_mini, in {sample}")
+        lines = real(sample.parent, [(sample.name, "gelsight_mini", "background.png", SAMPLE_PRESSES)], arguments.out)
+    elif folder.is_dir():
+        print(f"real images: {folder}")
+        lines = real(folder, CASES, arguments.out)
+    else:
+        print("real images: none; only the rendered scene (torchvts samples gelsight_mini fetches some)")
+        lines = []
+    lines += embedded(arguments.out)
     print("\n".join(lines))
     print(f"\npictures in {arguments.out}")
     return 0
@@ -62,7 +74,7 @@ def embedded(out: Path) -> list[str]:
         "texture": scenes.sine_press(),
         "cylinder": scenes.cylinder_press(),
     }
-    for number, (name, scene) in enumerate(tqdm(presses.items(), desc="presses", leave=False)):
+    for number, (name, scene) in enumerate(tqdm(presses.items(), desc="presses", leave=False, disable=None)):
         image = scenes.render(scene, lights, noise_std=0.01, bits=8, spots=worn, seed=2 + number).detach()
         for mode in ("fast", "precise"):
             with torch.inference_mode():
@@ -76,18 +88,22 @@ def embedded(out: Path) -> list[str]:
     return [*lines, ""]
 
 
-def real(folder: Path, out: Path) -> list[str]:
+SAMPLE_PRESSES = ["6.310mm/0/gelsight.png", "9.500mm/4/gelsight.png"]
+CASES = [
+    ("tacto/orthographic", "tacto", "background.png", ["sphere_R10_d2.png", "cylinder_R4_d1.png"]),
+    ("gelsight_mini_a", "gelsight_mini", "background.png", ["6.310mm/0/gelsight.png"]),
+    ("gelsight_mini_b", "gelsight_mini", "background.png", ["bead.png"]),
+]
+"""Folder of a sensor, its sensor file, its background, images to reconstruct."""
+
+
+def real(folder: Path, cases: list[tuple[str, str, str, list[str]]], out: Path) -> list[str]:
     """Renderings and photographs by others, each sensor calibrated from its background, one also from a few presses."""
     lines = [
         f"Images of {folder.name}/, each sensor calibrated from its one background",
         "",
         "| image | model | deepest mm | contact mm^2 | largest error px |",
         "|---|---|---|---|---|",
-    ]
-    cases = [
-        ("tacto/orthographic", "tacto", "background.png", ["sphere_R10_d2.png", "cylinder_R4_d1.png"]),
-        ("gelsight_mini_a", "gelsight_mini", "background.png", ["6.310mm/0/gelsight.png"]),
-        ("gelsight_mini_b", "gelsight_mini", "background.png", ["bead.png"]),
     ]
     notes = []
     for place, sensor_name, background, images in cases:

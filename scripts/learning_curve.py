@@ -45,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("out/learning_curve"), help="folder for table.md and the picture")
     arguments = parser.parse_args(argv)
     rows = []
-    with tqdm(desc="learning curve", leave=False) as bar:
+    with tqdm(desc="learning curve", leave=False, disable=None) as bar:
         for name in arguments.sets:
             data = sets.load(name, sets.data_folder(__file__))
             for row in curve(data, arguments.draws, arguments.mode):

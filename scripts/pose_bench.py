@@ -44,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     options = {} if arguments.clouds is None else {"register": by_clouds}
     size = (arguments.size[1], arguments.size[0])
-    with tqdm(total=arguments.poses * len(targets), unit="pose") as bar:
+    with tqdm(total=arguments.poses * len(targets), unit="pose", disable=None) as bar:
         rows, shown = run_poses(targets, arguments.poses, size=size, noise_std=arguments.noise, progress=bar.update, **options)
     for name, (case, found) in shown.items():
         clouds = [contact_cloud(frame, case.mm_per_pixel, 4000)[0] for frame in (case.source, case.target)]
@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     text = f"{how}\n\n{pose_table(rows)}\n"
     if arguments.presses is not None:
         background, presses = vts.read_presses(arguments.presses)
-        with tqdm(total=100, unit="pair") as bar:
+        with tqdm(total=100, unit="pair", disable=None) as bar:
             counts = ball_pairs(background, presses, vts.Sensor.load(arguments.sensor), 100, bar.update)
         text += "\nreal presses of a ball: " + ", ".join(f"{name} {count}" for name, count in counts.items()) + "\n"
     write_files(arguments.out, {"table.md": text, "poses.json": json.dumps([dataclasses.asdict(row) for row in rows], indent=1)})

@@ -66,7 +66,7 @@ def figure_4(folder: Path, out: Path) -> list[str]:
 
     rows = []
     sensor = vts.Sensor.load("tacto")
-    for camera in tqdm(["orthographic", "perspective"], desc="figure 4", leave=False):
+    for camera in tqdm(["orthographic", "perspective"], desc="figure 4", leave=False, disable=None):
         if not (folder / camera / "background.png").is_file():
             continue
         calibration = vts.calibrate(vts.read_image(folder / camera / "background.png"), sensor)
@@ -104,7 +104,7 @@ def table_2(folder: Path, out: Path) -> list[str]:
     compared["point lights (the paper's)"] = methods.point_lights(training).reconstruct
     rows = []
     for name, pipe in compared.items():
-        for press in tqdm(kept, desc="table 2", leave=False):
+        for press in tqdm(kept, desc="table 2", leave=False, disable=None):
             with torch.inference_mode():
                 one, other = pipe(press.image[None]), table(press.image[None])
             difference = (one.depth_mm - other.depth_mm) / sensor.mm_per_pixel

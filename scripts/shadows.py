@@ -111,7 +111,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.scenes < 1:
         parser.error(f"--scenes: expected at least 1, got {arguments.scenes}")
     lines = []
-    with torch.no_grad(), tqdm(total=3 * len(SHAPES) * arguments.scenes, unit="scene", leave=False) as bar:
+    with torch.no_grad(), tqdm(total=3 * len(SHAPES) * arguments.scenes, unit="scene", leave=False, disable=None) as bar:
         for kind in ("slope", "cast", "dirt"):
             for shape in SHAPES:
                 rows = []

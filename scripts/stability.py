@@ -37,14 +37,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     torch.set_num_threads(1)
     arguments.out.mkdir(parents=True, exist_ok=True)
     total = len(SWEPT) * arguments.seeds * sum(len(CORRUPTIONS[name].severities) for name in arguments.only)
-    with tqdm(total=total, unit="row") as bar:
+    with tqdm(total=total, unit="row", disable=None) as bar:
         rows = stability.sweep(arguments.out / "rows.jsonl", SWEPT, arguments.only, arguments.seeds, arguments.workers, bar.update)
     points = stability.breaking_points(rows)
     print(write_tables(rows, points, arguments.seeds, arguments.out, arguments.keep))
     pictures = ROOT / "docs" / "failures" if arguments.keep else arguments.out
     pictures.mkdir(exist_ok=True)
     save_small(overview_figure(points), pictures / "overview.png")
-    for name in tqdm(arguments.only, unit="picture"):
+    for name in tqdm(arguments.only, unit="picture", disable=None):
         here, own = [row for row in rows if row.data == name], [point for point in points if point.corruption == name]
         save_small(corruption_figure(CORRUPTIONS[name], here, own), pictures / f"{name.replace(' ', '_')}.png")
     return 0

@@ -278,8 +278,10 @@ TABLE = {
     ),
     "stream.FrameCheck": Entry({"background": image()}, {"background": [b for k, b in enumerate(images()) if k not in (3, 4)]}),
     "stream.Recording": Entry(
-        {"calibration": unit(), "mode": "fast", "first": None, "fps": 30.0, "time_constant_s": 1.0, "stage": nullcontext},
-        {"calibration": [None, "unit"], "mode": ["slow"], "first": [], "fps": [], "time_constant_s": NUMBER, "stage": []},
+        {"calibration": unit(), "mode": "fast", "first": None, "fps": 30.0, "time_constant_s": 1.0, "stage": nullcontext}
+        | {"network": None, "device": "cpu"},
+        {"calibration": [None, "unit"], "mode": ["slow"], "first": [], "fps": [], "time_constant_s": NUMBER, "stage": []}
+        | {"network": [], "device": [None, "gpu", "cuda:99"]},
     ),
     "stream.Rectify": Entry(
         {"sensor": sensor(), "height": HEIGHT, "width": WIDTH},
@@ -295,6 +297,8 @@ TABLE = {
             "mode": "auto",
             "background_frames": 12,
             "presses": (),
+            "network": None,
+            "device": "cpu",
             "time_constant_s": 1.0,
         },
         {
@@ -303,6 +307,8 @@ TABLE = {
             "mode": ["slow", None],
             "background_frames": INTEGER,
             "presses": [],
+            "network": [],
+            "device": [],
             "time_constant_s": NUMBER,
         },
         run=False,

@@ -217,7 +217,7 @@ def test_azimuths_in_the_wrong_order_are_complained_of(low_rig):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", vts.CalibrationWarning)
         calibration = vts.calibrate(rest(low_rig, sensor, noise_std=0.005, bits=8), sensor)
-    assert any("one image does not constrain R" in str(warning.message) for warning in caught)
+    assert any("the image shows 10, 130, 250: red and green are swapped" in str(warning.message) for warning in caught)
     free = next(row for row in calibration.report["candidates"] if row["family"] == "three lights")
     assert "rejected: light R is -120 deg off the azimuth in the sensor file" in free["note"]
 

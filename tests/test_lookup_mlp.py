@@ -4,6 +4,7 @@ import copy
 import io
 import math
 import pickle
+import sys
 
 import kornia
 import pytest
@@ -549,8 +550,11 @@ def test_training_is_decided_by_its_seed_alone():
     assert torch.equal(one.module(random_images()), two.module(random_images()))
 
 
-def test_the_status_says_what_happened(capsys):
+def test_the_status_says_what_happened(capsys, monkeypatch):
     short = train(max_epochs=1, progress=True)
+    assert capsys.readouterr().err == ""  # no terminal, no bar
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    train(max_epochs=1, progress=True)
     assert not short.converged and short.message.startswith("stopped at 1 epochs") and "raise max_epochs" in short.message
     assert "network" in capsys.readouterr().err
     intensity, xy, slope, groups = rig_samples(400, 2)

@@ -36,7 +36,7 @@ MODULES = {
 }
 RECORDS = {
     "Bounds", "Calibration", "CalibrationWarning", "ConfidentOutput", "DepthOutput", "Diagnosis", "Diagnosis.of",
-    "DiscontinuitySolution", "Finding", "LightFit", "MlpFit", "Registration", "export.ExportCheck", "export.Format",
+    "DiscontinuitySolution", "Finding", "LightFit", "MlpFit", "Registration", "Result", "export.ExportCheck", "export.Format",
     "gs_sdk.GsSdkFolder", "gs_sdk.GsSdkPress", "metrics.DepthError", "metrics.SphereFit", "objects.Target", "scenes.Scene",
     "stream.Reader", "stream.TactileFrame", "stream.Unreadable",
 }  # fmt: skip
@@ -48,7 +48,8 @@ PARTS = {
     "discontinuity_share", "falloff", "label_contacts", "outwardness", "read_point_cloud", "stream.FrameCheck.",
     "stream.NewestFrame", "stream.Overlay", "stream.Recording.", "stream.RectifySizes", "stream.StageClock",
     "stream.StreamReport.", "stream.VideoFile.", "stream.Window", "stream.calibrate_unit", "stream.frames_a_second",
-    "stream.read_background", "stream.read_press_images", "stream.use_calibration", "with_preprocessing", "write_point_cloud",
+    "read_result", "stream.check_device", "stream.read_background", "stream.read_press_images", "stream.use_calibration",
+    "unit_pipeline", "with_preprocessing", "write_point_cloud",
 }  # fmt: skip
 """Names, and with a dot at the end methods, that other tests cover: records, base classes, what one room does for another."""
 FREE = {"dtype", "seed", "report", "comment", "clock", "sleep"}

@@ -1,6 +1,7 @@
 """Sphinx settings of the documentation: `make docs` builds it from the pages here and the docstrings of the package."""
 
 import importlib
+import inspect
 import pkgutil
 import sys
 import warnings
@@ -10,6 +11,8 @@ from docutils import nodes
 from sphinx.pycode import ModuleAnalyzer
 
 import torchvts
+from torchvts.accelerated.twin import Twin
+from torchvts.cli.main import COMMANDS, make_parser
 
 warnings.filterwarnings("ignore")  # of libraries that autodoc imports; Sphinx's own stay errors
 
@@ -41,8 +44,8 @@ def _short(name: str) -> str:
 
 
 def skip(app: Any, what: str, name: str, obj: Any, skipped: bool, options: Any) -> bool | None:
-    """Leave out fields of tuples, which the class describes, and names of a room that torchvts exports."""
-    if type(obj).__name__ == "_tuplegetter":
+    """Leave out fields of tuples, which the class describes, what a twin is made of, and names of a room that torchvts exports."""
+    if type(obj).__name__ == "_tuplegetter" or (what == "class" and isinstance(obj, type)):
         return True
     if what == "module" and app.env.docname != "api/torchvts" and name in torchvts.__all__:
         return True
@@ -63,6 +66,13 @@ def describe_constants(app: Any) -> None:
                     analyzer.attr_docs.setdefault(("", constant), text)
 
 
+def describe_twins(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Describe an accelerated block by the text of the plain block whose work it does, and its own text as a note."""
+    if what == "class" and issubclass(obj, Twin) and obj is not Twin:
+        own = [f"    {line}" for line in lines]
+        lines[:] = [*(inspect.getdoc(obj.plain) or "").splitlines(), "", "Note:", *own]
+
+
 def name_the_others(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
     """Say on a room's page which of its names stand on the page of torchvts."""
     if what != "module" or name == "torchvts":
@@ -77,23 +87,31 @@ def resolve(app: Any, env: Any, node: Any, contnode: Any) -> Any:
     if node.get("refdomain") != "py":
         return None
     python = env.domains["py"]
-    found = [name for name in python.objects if _short(name) == _short(node["reftarget"]) and name.count(".") <= 2]
+    found = [name for name in python.objects if _short(name) == _short(node["reftarget"])]
     if not found:
         return None
     target = min(found, key=lambda name: (name.count("."), name))
     entry = python.objects[target]
-    try:
-        uri = app.builder.get_relative_uri(node.get("refdoc", env.docname), entry.docname)
-    except Exception:
-        return None
+    uri = app.builder.get_relative_uri(node.get("refdoc", env.docname), entry.docname)
     reference = nodes.reference("", "", contnode, internal=True, reftitle=target)
     reference["refuri"] = f"{uri}#{entry.node_id}"
     return reference
 
 
+def add_help(app: Any, docname: str, source: list[str]) -> None:
+    """Append the help of every command to the page about the command line."""
+    if docname != "command":
+        return
+    for name, text in COMMANDS.items():
+        parser = make_parser(name, importlib.import_module(f"torchvts.cli.{name}"))
+        source[0] += f"\n## {name}\n\n{text[0].upper()}{text[1:]}.\n\n```text\n{parser.format_help()}```\n"
+
+
 def setup(app: Any) -> None:
     """Register the hooks."""
     app.connect("autodoc-skip-member", skip)
+    app.connect("source-read", add_help)
     app.connect("builder-inited", describe_constants)
+    app.connect("autodoc-process-docstring", describe_twins, priority=300)  # before napoleon reads the sections
     app.connect("autodoc-process-docstring", name_the_others)
     app.connect("missing-reference", resolve)

@@ -9,6 +9,7 @@ import zlib
 from types import ModuleType
 
 import pytest
+import yaml
 from documents import ROOT
 
 import torchvts as vts
@@ -62,6 +63,12 @@ def test_commands_of_the_documents_can_be_typed():
     for path in documents:
         for script in re.findall(r"scripts/\w+\.py", path.read_text()):
             assert (ROOT / script).is_file(), f"{path.name}: {script}"
+
+
+def test_the_citation_names_this_version_and_the_paper():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == vts.__version__ and citation["license"] == "Apache-2.0" and citation["authors"]
+    assert citation["references"][0]["doi"] == "10.3390/s22176470"
 
 
 @pytest.mark.long

@@ -41,7 +41,7 @@ check: setup
 	$(BIN)/lint-imports
 
 bench: setup
-	$(BIN)/python scripts/bench.py --out out/bench
+	$(BIN)/torchvts bench --out out/bench
 
 clean:
 	rm -rf $(VENV) out .mypy_cache .ruff_cache .pytest_cache

@@ -14,6 +14,7 @@ import pytest
 import torch
 
 import torchvts as vts
+from torchvts.cli import COMMANDS, main
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -73,7 +74,7 @@ def mini_by_prior(mini_presses):
 
 
 class Done(NamedTuple):
-    """How a script ended, and what it printed."""
+    """How a command or script ended, and what it printed."""
 
     returncode: int
     stdout: str
@@ -81,7 +82,7 @@ class Done(NamedTuple):
 
 
 def call_script(name, *arguments):
-    """Run ``scripts/<name>.py`` with these arguments, as ``python scripts/<name>.py ...`` does, but in this process.
+    """Run ``torchvts <name> ...``, or ``python scripts/<name>.py ...`` for what is no subcommand, but in this process.
 
     A process of its own would load torch again, which takes seconds. Warnings go to stderr and raise nothing.
     """
@@ -93,13 +94,14 @@ def call_script(name, *arguments):
 
     code = 0
     threads = torch.get_num_threads()
+    command = ["torchvts", name] if name in COMMANDS else [str(path)]
     with contextlib.ExitStack() as stack:
         stack.enter_context(warnings.catch_warnings())
         warnings.resetwarnings()
         warnings.simplefilter("ignore", DeprecationWarning)
         warnings.simplefilter("ignore", ResourceWarning)
         stack.enter_context(mock.patch.object(warnings, "showwarning", show))
-        stack.enter_context(mock.patch.object(sys, "argv", [str(path), *map(str, arguments)]))
+        stack.enter_context(mock.patch.object(sys, "argv", [*command, *map(str, arguments)]))
         stack.enter_context(mock.patch.object(sys, "path", [str(path.parent), *sys.path]))
         stack.callback(os.chdir, Path.cwd())
         os.chdir(ROOT)
@@ -108,7 +110,10 @@ def call_script(name, *arguments):
         stack.enter_context(contextlib.redirect_stdout(out))
         stack.enter_context(contextlib.redirect_stderr(err))
         try:
-            runpy.run_path(str(path), run_name="__main__")
+            if name in COMMANDS:
+                code = main()
+            else:
+                runpy.run_path(str(path), run_name="__main__")
         except SystemExit as stop:
             if isinstance(stop.code, str):
                 sys.stderr.write(f"{stop.code}\n")

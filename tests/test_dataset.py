@@ -18,7 +18,6 @@ from torchvts.core.files import read_depth_png
 from torchvts.dataset import STATE, list_items, output_stems, reconstruct, reconstruct_dataset
 
 ROOT = Path(__file__).resolve().parents[1]
-SCRIPT = ROOT / "scripts" / "reconstruct.py"
 HEIGHT, WIDTH, PITCH = 48, 64, 0.6
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 
@@ -65,7 +64,7 @@ def whole(unit, frames, tmp_path_factory):
     out = tmp_path_factory.mktemp("whole")
     report = reconstruct_dataset(unit, frames, out, workers=0)
     assert (report.rows, report.before, report.failed) == (120, 0, [])
-    assert (out / "film_000019_depth.png").is_file()
+    assert (out / "film_000019.npz").is_file()
     return contents(out)
 
 
@@ -76,11 +75,12 @@ def contents(out):
 
 def finished(out):
     """Number of frames that are done."""
-    return len(list(out.rglob("*_depth.png")))
+    return len(list(out.rglob("*.npz")))
 
 
 def torchrun(*arguments):
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", SCRIPT, *arguments]
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
+    command += ["-m", "torchvts", "reconstruct", *arguments]
     return subprocess.Popen(
         list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT, env=ENVIRONMENT
     )
@@ -142,17 +142,19 @@ def test_killed_processes_lose_nothing_and_the_next_run_goes_on(unit, frames, wh
         second = torchrun(unit, frames, "--out", out)
         printed = second.communicate()[0]
         assert second.returncode == 0, printed
-        assert "wrote 120 frames" in printed and "; 0 were there before" not in printed
+        assert "wrote 120 frames" in printed and "by an earlier run" in printed
     assert contents(out) == whole
 
 
 def test_every_frame_is_in_one_share(unit, frames, whole, tmp_path):
     """Three ranks one after the other: what each does between the first and the last exchange of counts."""
-    records = reconstruct.Records(frames, tmp_path, reconstruct.Settings("", str(frames), "auto", "png", "none", False, 1, "", ""))
+    records = reconstruct.Records(
+        frames, tmp_path, reconstruct.Settings("", "", str(frames), "auto", "npz", "none", False, 1, "cpu", 1, "", "")
+    )
     calibration = vts.Calibration.load(unit)
     done = 0
     for rank in (2, 1, 0):
-        worker = reconstruct._Worker(calibration, records, (rank, 3), strict=True)
+        worker = reconstruct._Worker(calibration, unit.name, None, records, (rank, 3), strict=True)
         report = worker.run(4, 0)
         done += worker.done
     assert (done, report.rows) == (120, 120) and contents(tmp_path) == whole
@@ -166,16 +168,16 @@ def test_a_torn_record_a_lost_file_and_a_changed_image_are_computed_again(unit, 
     before = contents(out)
     record = out / STATE / "frames" / "5.json"
     record.write_bytes(record.read_bytes()[:-10])
-    (out / "2_depth.png").unlink()
-    (out / "film_000003_depth.png").unlink()
-    (out / ".3_depth-abcd0123.png").write_bytes(b"left half written")
+    (out / "2.npz").unlink()
+    (out / "film_000003.npz").write_bytes(b"")
+    (out / ".3-abcd0123.npz").write_bytes(b"left half written")
     vts.write_image(source / "4.png", image(17))
     report = reconstruct_dataset(unit, source, out, pictures=False)
     assert (report.rows, report.before) == (12, 8)
     after = contents(out)
     assert after.keys() == before.keys()
     changed = {name for name in before if after[name] != before[name]}
-    assert changed == {"4_depth.png", "frames.csv"}
+    assert changed == {"4.npz", "frames.csv"}
 
 
 def test_other_settings_are_refused_and_overwrite_begins_anew(unit, tmp_path):
@@ -186,15 +188,16 @@ def test_other_settings_are_refused_and_overwrite_begins_anew(unit, tmp_path):
     vts.Calibration.from_lights(calibration.lights, calibration.sensor).save(other)
     for calibration, options, part in (
         (unit, {"mode": "precise"}, "mode 'fast' then, 'precise' now: give another --out, or --overwrite"),
-        (unit, {"mode": "fast", "depth": "npy"}, "depth 'png' then, 'npy' now"),
+        (unit, {"mode": "fast", "format": "npy"}, "format 'npz' then, 'npy' now"),
         (unit, {"mode": "fast", "pictures": True}, "pictures 'False' then, 'True' now"),
         (other, {"mode": "fast"}, "calibration file '"),
     ):
         with pytest.raises(ValueError, match="was begun with other settings") as caught:
             reconstruct_dataset(calibration, source, out, **options)
         assert part in str(caught.value)
-    report = reconstruct_dataset(unit, source, out, mode="precise", depth="npy", pictures=False, overwrite=True)
-    assert (report.rows, report.before) == (1, 0) and (out / "a_depth.npy").is_file()
+    report = reconstruct_dataset(unit, source, out, mode="precise", format="npy", pictures=False, overwrite=True)
+    assert (report.rows, report.before) == (1, 0)
+    assert sorted(contents(out)) == ["a_depth.npy", "frames.csv", "summary.json"]  # a.npz is gone
 
 
 def test_unusable_images_are_named_and_left_out(unit, tmp_path, capsys):
@@ -245,8 +248,8 @@ def test_the_script_ends_with_status_1_where_a_frame_was_left_out(unit, tmp_path
     source = fill(tmp_path / "in", ["a.png", "b.png"])
     (source / "b.png").write_bytes(b"")
     done = run_script("reconstruct", unit, source, "--out", tmp_path / "out", "--no-pictures")
-    assert done.returncode == 1 and "| b.png | " in done.stdout and "wrote 1 frames" in done.stdout
-    assert "frames/s" in done.stdout
+    assert done.returncode == 1 and "left out: frame b.png: " in done.stdout and "wrote 1 frames" in done.stdout
+    assert "table in frames.csv" in done.stdout
 
 
 def test_same_stems_keep_apart_and_folders_stay(unit, tmp_path):
@@ -255,8 +258,8 @@ def test_same_stems_keep_apart_and_folders_stay(unit, tmp_path):
     for _ in range(2):  # results inside the source are no sources
         report = reconstruct_dataset(unit, source, out, pictures=False)
         assert (report.rows, report.failed) == (4, [])
-    results = sorted(name for name in contents(out) if name.endswith("_depth.png"))
-    assert results == ["a.bmp_depth.png", "a.png_depth.png", "sub/a_depth.png", "sub/deeper/a_depth.png"]
+    results = sorted(name for name in contents(out) if name.endswith(".npz"))
+    assert results == ["a.bmp.npz", "a.png.npz", "sub/a.npz", "sub/deeper/a.npz"]
     assert [line.split(",")[0] for line in (out / "frames.csv").read_text().splitlines()[1:]] == names
     with pytest.raises(ValueError, match="is the source itself"):
         reconstruct_dataset(unit, source, source)
@@ -296,10 +299,10 @@ def test_depth_beyond_a_png_is_left_out_and_a_full_disk_stops(unit, tmp_path, mo
 
     monkeypatch.setattr(reconstruct, "write_depth_png", refuse)
     with pytest.raises(OSError, match="no space left"):
-        reconstruct_dataset(unit, source, tmp_path / "out", pictures=False)
+        reconstruct_dataset(unit, source, tmp_path / "out", pictures=False, format="png16")
     monkeypatch.undo()
     assert '"failed": "depth_mm: too deep"' in (tmp_path / "out" / STATE / "frames" / "a.json").read_text()
-    report = reconstruct_dataset(unit, source, tmp_path / "out", pictures=False)
+    report = reconstruct_dataset(unit, source, tmp_path / "out", pictures=False, format="png16")
     assert report.rows == 2 and read_depth_png(tmp_path / "out" / "a_depth.png").shape == (1, 1, HEIGHT, WIDTH)
 
 
@@ -313,7 +316,7 @@ def test_pictures_are_drawn_for_few_frames_only(unit, frames, whole, tmp_path):
     "options, message",
     [
         ({"mode": "slow"}, "mode: expected one of fast, precise, auto, got 'slow'"),
-        ({"depth": "jpg"}, "depth: expected one of png, npy, none"),
+        ({"format": "jpg"}, "format: expected one of npz, video-npz, png16, npy, none"),
         ({"batch": 0}, "batch: expected"),
         ({"workers": -1}, "workers: expected"),
     ],

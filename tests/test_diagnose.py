@@ -265,7 +265,7 @@ def test_the_script_prints_words_and_json(tmp_path, run_script):
     done = run_script("diagnose", unit, swapped, "--background", now, "--json")
     assert json.loads(done.stdout)["findings"][0]["name"] == "channels_swapped"
     done = run_script("diagnose", unit, tmp_path / "none.png")
-    assert done.returncode == 1 and done.stderr.startswith("error: ")
+    assert done.returncode == 2 and done.stderr.startswith("torchvts: error: ")
 
 
 @pytest.fixture(scope="module")

@@ -166,7 +166,7 @@ def test_evaluate_writes_tables_rows_and_pictures(run_script, monkeypatch, folde
     document = json.loads((tmp_path / "scores.json").read_text())
     summary = {row.method: row for row in rows.from_json(json.dumps(document["rows"]))}
     assert list(summary) == [name for name in ev.COMPARED if "no prior" not in name]  # the file has none
-    assert len(document["scores"]) == 5 * len(summary) and "scripts/evaluate.py" in document["command"]
+    assert len(document["scores"]) == 5 * len(summary) and document["command"].startswith("torchvts evaluate ")
     # exact lights, little noise: the model is right, and learning from three presses beats zero depth
     assert summary["point lights"].errors["normal_deg"] < 1.5
     assert summary["precise"].errors["normal_deg"] < 3.0 and summary["precise"].errors["level_um"] < 20.0
@@ -188,7 +188,7 @@ def test_evaluate_writes_tables_rows_and_pictures(run_script, monkeypatch, folde
 
 def test_evaluate_with_a_trained_network(run_script, folder, tmp_path):
     network = tmp_path / "mlp.safetensors"
-    done = run_script("train_mlp", folder, "--sensor", folder / "rig.yaml", "--out", network, "--max-epochs", 3)
+    done = run_script("train", folder, "--sensor", folder / "rig.yaml", "--out", network, "--max-epochs", 3)
     assert done.returncode == 0, done.stderr
     assert "held out" in done.stdout and "2370 weights" in done.stdout
     sensor = vts.Sensor.load(folder / "rig.yaml")
@@ -320,13 +320,13 @@ def test_without_labels_balls_are_found(folder, monkeypatch, tmp_path):
 def test_scripts_refuse_bad_input_in_a_sentence(run_script, folder, tmp_path):
     for arguments, part in (
         (["evaluate", tmp_path / "none", "--out", tmp_path], "no such folder"),
-        (["train_mlp", folder, "--sensor", "gelsight_mini", "--out", tmp_path / "a.safetensors"], "gelsight_mini"),
+        (["train", folder, "--sensor", "gelsight_mini", "--out", tmp_path / "a.safetensors"], "gelsight_mini"),
     ):
         done = run_script(*arguments)
-        assert done.returncode == 1
-        assert done.stderr.startswith("error: ") and part in done.stderr, done.stderr
+        assert done.returncode == 2
+        assert done.stderr.startswith("torchvts: error: ") and part in done.stderr, done.stderr
         assert "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == []
     for arguments in (["--methods", "magic"], ["--all"]):
         done = run_script("evaluate", folder, *arguments, "--out", tmp_path)
-        assert done.returncode == 2 and "error: argument" in done.stderr and list(tmp_path.iterdir()) == []
+        assert done.returncode == 2 and done.stderr.startswith("torchvts: error: ") and list(tmp_path.iterdir()) == []

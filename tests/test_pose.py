@@ -435,6 +435,8 @@ def test_the_script_writes_pose_and_picture(run_script, tmp_path):
     assert done.returncode == 0, done.stderr
     assert [entry["converged"] for entry in json.loads((tmp_path / "track" / "pose.json").read_text())] == [True, True]
     done = call("background.png", "target.png", "none", *unit)
-    assert done.returncode == 1 and done.stderr.strip().splitlines()[-1].startswith("error: ") and "touched" in done.stderr
+    assert (
+        done.returncode == 2 and done.stderr.strip().splitlines()[-1].startswith("torchvts: error: ") and "touched" in done.stderr
+    )
     done = call("target.png", "target.ply", "none")
-    assert done.returncode == 1 and "got one of each" in done.stderr
+    assert done.returncode == 2 and "got one of each" in done.stderr

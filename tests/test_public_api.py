@@ -16,9 +16,10 @@ NAMES = [
     "AdaptiveIntegration", "Calibration", "CalibrationWarning", "Compensate", "ConfidentPipeline", "ContactFromDepth",
     "ContactMask", "ContactSettings", "DepthOutput", "DepthPipeline", "GradientFromNormal", "Integrator",
     "NormalFromIntensity", "NormalFromLookup", "NormalFromMLP", "NormalFromResponse", "NormalModel", "PointLights",
-    "PoissonBackground", "PoissonDCT", "PoissonDST", "PoseTracker", "Press", "Sensor", "Touch", "calibrate", "depth_to_points",
+    "PoissonBackground", "PoissonDCT", "PoissonDST", "PoseTracker", "Press", "Result", "Sensor", "Touch", "calibrate",
+    "depth_to_points",
     "diagnose", "fit_lights", "gs_sdk", "near_field_shading", "poisson_background", "poisson_dct", "poisson_dst",
-    "read_image", "read_presses", "register_depth", "register_points", "scenes", "shipped_sensors", "stream",
+    "read_image", "read_presses", "read_result", "register_depth", "register_points", "scenes", "shipped_sensors", "stream",
     "write_image",
 ]  # fmt: skip
 ARGUMENTS = {
@@ -50,6 +51,7 @@ ARGUMENTS = {
     vts.depth_to_points: ["depth_mm", "mm_per_pixel", "contact"],
     vts.register_points: ["source", "target"],
     vts.register_depth: ["source", "target", "mm_per_pixel"],
+    vts.PoseTracker: ["reference", "mm_per_pixel"],
     contact_cloud: ["frame", "mm_per_pixel", "most"],
     vts.Compensate: ["gain", "offset", "gamma", "defects"],
     vts.ContactMask: ["flat", "noise_std", "sigmas", "min_size_px"],

@@ -25,13 +25,13 @@ def calibration(run_script, images):
     out = folder / "unit.safetensors"
     done = run_script("calibrate", folder / "background.png", "--mm-per-pixel", "0.25", "--out", out)
     assert done.returncode == 0, done.stderr
-    assert "wrote" in done.stdout and "chosen: point_lights" in done.stdout
+    assert "wrote" in done.stdout and "chosen: point lights" in done.stdout
     return out
 
 
 def test_reconstruct_writes_depth_pictures_and_table(run_script, images, calibration, tmp_path):
     folder, scene = images
-    done = run_script("reconstruct", calibration, folder / "presses", "--out", tmp_path, "--mode", "precise")
+    done = run_script("reconstruct", calibration, folder / "presses", "--out", tmp_path, "--mode", "precise", "--format", "png16")
     assert done.returncode == 0, done.stderr
     assert len((tmp_path / "frames.csv").read_text().splitlines()) == 4
     for k in range(3):
@@ -58,7 +58,7 @@ def test_reconstruct_writes_clouds(run_script, images, calibration, tmp_path):
     except ImportError as error:
         pytest.skip(str(error))
     folder, scene = images
-    arguments = ["--out", tmp_path, "--depth", "npy", "--cloud", "ply", "--no-pictures"]
+    arguments = ["--out", tmp_path, "--format", "npy", "--cloud", "ply", "--no-pictures"]
     done = run_script("reconstruct", calibration, folder / "presses" / "0.png", *arguments)
     assert done.returncode == 0, done.stderr
     points, normals = read_point_cloud(tmp_path / "0.ply")
@@ -78,8 +78,8 @@ def test_missing_and_foreign_files_are_refused_in_a_sentence(run_script, images,
         (["reconstruct", calibration, tmp_path / "nothing", "--out", tmp_path], "no such file"),
     ):
         done = run_script(*arguments)
-        assert done.returncode == 1
-        assert done.stderr.startswith("error: ") and part in done.stderr, done.stderr
+        assert done.returncode == 2
+        assert done.stderr.startswith("torchvts: error: ") and part in done.stderr, done.stderr
         assert "Traceback" not in done.stderr
     assert not (tmp_path / "a.safetensors").exists()
 

@@ -20,7 +20,7 @@ import torch
 
 import torchvts as vts
 from torchvts import stream as streams
-from torchvts.core.files import read_depth_png, read_frames, rgb_from_bgr
+from torchvts.core.files import read_frames, rgb_from_bgr
 
 ROOT = Path(__file__).resolve().parents[1]
 PITCH = 0.25
@@ -355,7 +355,7 @@ def test_both_scripts_give_the_same_depth_for_a_video(unit, run_stream, run_scri
     with streams.TactileStream(video, small_sensor) as stream:
         depth = {frame.number: frame.output.depth_mm for frame in stream}
     for k in (3, 16, 19):
-        assert float((read_depth_png(tmp_path / "file" / f"press_{k:06d}_depth.png") - depth[k]).abs().max()) < 1e-3
+        assert float((vts.read_result(tmp_path / "file" / f"press_{k:06d}.npz").depth_mm - depth[k]).abs().max()) < 1e-5
 
 
 def test_backgrounds_of_several_images_and_own_presses(unit, run_script, small_sensor, tmp_path):
@@ -368,18 +368,20 @@ def test_backgrounds_of_several_images_and_own_presses(unit, run_script, small_s
     truth = unit[0].background
     assert float((background - truth).abs().max()) < 0.03  # the press is gone
     press = ("--press", tmp_path / "2.png", "20")
-    done = run_script("calibrate", *names, *press, "--sensor", tmp_path / "rig.yaml", "--out", tmp_path / "unit.safetensors")
+    done = run_script(
+        "calibrate", *names, *press, "--sensor", tmp_path / "rig.yaml", "--out", tmp_path / "unit.safetensors", "--candidates"
+    )
     assert done.returncode == 0 and "| 2.png |" in done.stdout, done.stderr
     sensor = ("--sensor", tmp_path / "rig.yaml", "--out", tmp_path / "out")
-    done = run_script("reconstruct", names[2], *sensor, "--background", *names, *press, "--no-pictures", "--depth", "none")
-    assert done.returncode == 0 and "| 2.png |" in done.stdout, done.stderr
+    done = run_script("reconstruct", names[2], *sensor, "--background", *names, *press, "--no-pictures", "--format", "none")
+    assert done.returncode == 0 and "2.png: deepest " in done.stdout, done.stderr
     for arguments, part in (
         ((names[2], *sensor), "--background: expected images without contact, got none"),
         (
             (names[2], *sensor, "--background", names[0], "--press", names[2], "wide"),
             "press: expected the diameter of the ball in mm",
         ),
-        ((names[2], "--out", tmp_path / "out"), "give either a calibration file or --sensor"),
+        ((names[2], "--out", tmp_path / "out"), "expected a calibration file and an input"),
     ):
         done = run_script("reconstruct", *arguments)
         assert done.returncode != 0 and part in done.stderr, done.stderr
@@ -579,7 +581,7 @@ def test_without_a_screen_there_is_no_display(monkeypatch):
 
 @pytest.fixture
 def run_stream(run_script, monkeypatch):
-    """scripts/stream.py without a screen."""
+    """``torchvts stream`` without a screen."""
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
@@ -610,7 +612,7 @@ def test_bad_arguments_are_refused_in_a_sentence(run_stream, video, tmp_path):
         (["--source", video, "--sensor", "gelsight_wedge", "--corners", "1 2 3"], "corners: expected eight numbers"),
     ):
         done = run_stream(*arguments)
-        assert done.returncode == 1 and done.stderr.startswith("error: ") and part in done.stderr, done.stderr
+        assert done.returncode == 2 and done.stderr.startswith("torchvts: error: ") and part in done.stderr, done.stderr
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
@@ -638,7 +640,19 @@ def test_a_process_ended_in_the_middle_leaves_a_whole_video_or_none(unit, unit_f
     _, camera = unit
     video = write_video(tmp_path / "long.avi", [camera() for _ in range(20)] * 90)  # a minute: it is not over before it is ended
     out = tmp_path / "out"
-    command = [sys.executable, "scripts/stream.py", "--source", video, "--calibration", unit_file, "--out", out, "--realtime"]
+    command = [
+        sys.executable,
+        "-m",
+        "torchvts",
+        "stream",
+        "--source",
+        video,
+        "--calibration",
+        unit_file,
+        "--out",
+        out,
+        "--realtime",
+    ]
     environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
     process = subprocess.Popen([*map(str, command), "--video", "avi"], stdout=subprocess.PIPE, cwd=ROOT, env=environment, text=True)
     while process.poll() is None and not any(p.stat().st_size > 20_000 for p in out.glob(".overlay*")):

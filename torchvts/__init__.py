@@ -15,6 +15,7 @@ from .contact import ContactFromDepth, ContactSettings
 from .core import __version__ as __version__
 from .core.files import read_image, write_image
 from .core.geometry import depth_to_points
+from .core.results import Result, read_result
 from .diagnose import diagnose
 from .integration import Integrator, PoissonDST, poisson_background, poisson_dct, poisson_dst
 from .model import Calibration, PointLights, Sensor, gs_sdk, near_field_shading, shipped_sensors
@@ -46,6 +47,7 @@ __all__ = [
     "PoissonDST",
     "PoseTracker",
     "Press",
+    "Result",
     "Sensor",
     "Touch",
     "calibrate",
@@ -59,6 +61,7 @@ __all__ = [
     "poisson_dst",
     "read_image",
     "read_presses",
+    "read_result",
     "register_depth",
     "register_points",
     "scenes",

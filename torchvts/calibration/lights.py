@@ -276,7 +276,7 @@ def _solve(pixels: BackgroundPixels, start: Tensor, loop: _Loop) -> _Solution:
     history: list[float] = []
     still, held, moved, span = 0, 0, math.inf, pixels.span_mm()
     most = loop.max_steps if float(pixels.usable.double().mean(dim=1).min()) >= LEAST_USABLE else 0
-    with tqdm(total=loop.max_steps, desc=f"lights, {len(pixels.x)} pixels", disable=not loop.progress, leave=False) as bar:
+    with tqdm(total=loop.max_steps, desc=f"lights, {len(pixels.x)} pixels", disable=not loop.progress or None, leave=False) as bar:
         while len(history) < most and still < 3 and held < HELD_STEPS:
             weight, scale = _robust_weight(pixels.residual(parameter.detach()), pixels.usable)
             before = parameter.detach().clone()

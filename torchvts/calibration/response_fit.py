@@ -117,7 +117,7 @@ def fit_response(
     pitch = sensor.mm_per_pixel
     half_mm = prior.field.half_mm if prior is not None else 0.5 * sensor.width * pitch
     families = candidates.families(half_mm)
-    with tqdm(total=3, desc="calibrating from presses", disable=not progress, leave=False) as bar:
+    with tqdm(total=3, desc="calibrating from presses", disable=not progress or None, leave=False) as bar:
         bar.set_postfix(step="balls")
         presses = locate_and_screen(contacts, light, sensor, prior, half_mm)
         if not presses:

@@ -16,6 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .spelling import suggest
+
 _Record = TypeVar("_Record")
 
 QUANTISATION_STD = 1.0 / 255.0 / math.sqrt(12.0)
@@ -83,7 +85,7 @@ def check_sequence(name: str, value: object, items: str) -> None:
 def check_choice(name: str, value: object, choices: Sequence[str]) -> str:
     """Return ``value``, or raise if it is none of ``choices``."""
     if not isinstance(value, str) or value not in choices:
-        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {brief(value)}")
+        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {brief(value)}{suggest(value, choices)}")
     return value
 
 
@@ -303,7 +305,7 @@ def from_dict(cls: type[_Record], values: object, source: str) -> _Record:
     known = [field.name for field in fields]
     for key in values:
         if key not in known:
-            raise ValueError(f"{source}: key {brief(key)}: unknown; expected {', '.join(known)}")
+            raise ValueError(f"{source}: key {brief(key)}: unknown; expected {', '.join(known)}{suggest(key, known)}")
     for field in fields:
         if field.default is dataclasses.MISSING and field.name not in values:
             raise ValueError(f"{source}: key {field.name!r}: missing")

@@ -1,11 +1,12 @@
 """Depth of whole data sets: folders and videos of any size."""
 
 from .items import PICTURES_UP_TO, STATE, list_items, output_stems
-from .reconstruct import CLOUD_FORMATS, DEPTH_FORMATS, Report, reconstruct_dataset
+from .reconstruct import CLOUD_FORMATS, Report, reconstruct_dataset
+from .records import FORMATS
 
 __all__ = [
     "CLOUD_FORMATS",
-    "DEPTH_FORMATS",
+    "FORMATS",
     "PICTURES_UP_TO",
     "STATE",
     "Report",

@@ -24,11 +24,13 @@ class Item(NamedTuple):
         path: path inside the source, with "/".
         stem: path of its results inside the output folder, without suffix.
         mark: size in bytes and time of modification in ns; another mark means another file.
+        file: the file itself.
     """
 
     path: str
     stem: str
     mark: tuple[int, int]
+    file: Path
 
     @property
     def is_video(self) -> bool:
@@ -40,10 +42,6 @@ class Item(NamedTuple):
         """Whether the name is UTF-8; OpenCV crashes on others."""
         return not any("\ud800" <= letter <= "\udfff" for letter in self.path)
 
-    def file(self, source: Path) -> Path:
-        """The file itself; ``source`` is the folder, or the file where the source is a single one."""
-        return source / self.path if source.is_dir() else source
-
     def frame_name(self, number: int) -> str:
         """Name of a frame in tables and messages; ``number`` is negative for an image."""
         return self.path if number < 0 else f"{self.path}/{number:06d}"
@@ -53,8 +51,18 @@ class Item(NamedTuple):
         return self.stem if number < 0 else f"{self.stem}_{number:06d}"
 
 
-def list_items(source: str | Path) -> Iterator[Item]:
+Source = Path | tuple[Path, ...]
+"""An image, a video, a folder with all below it; or several of them."""
+
+
+def list_items(source: str | Source, every: int = 1) -> Iterator[Item]:
     """List the images and videos of a source, sorted by folder and name; only the names of one folder are in memory.
+
+    Of several files and folders the paths are those below the folder that holds them all, in the order given.
+
+    Args:
+        source: an image, a video, a folder, or several of them.
+        every: list only each N-th image, and all videos.
 
     Example:
         >>> import tempfile
@@ -64,12 +72,43 @@ def list_items(source: str | Path) -> Iterator[Item]:
         ...     [(item.path, item.stem) for item in list_items(folder)]
         [('a.jpg', 'a.jpg'), ('a.png', 'a.png'), ('b.png', 'b')]
     """
-    source = Path(source)
-    if source.is_dir():
-        yield from _walk(source, "")
+    images = 0
+    for item in _list(source):
+        images += not item.is_video
+        if item.is_video or (images - 1) % every == 0:
+            yield item
+
+
+def _list(source: str | Source) -> Iterator[Item]:
+    if isinstance(source, tuple):
+        yield from _several(source)
+    elif Path(source).is_dir():
+        yield from _walk(Path(source), "")
     else:
-        status = source.stat()
-        yield Item(source.name, source.stem, (status.st_size, status.st_mtime_ns))
+        yield _item(Path(source), "", Path(source).stem)
+
+
+def _item(file: Path, prefix: str, stem: str) -> Item:
+    status = file.stat()
+    return Item(prefix + file.name, prefix + stem, (status.st_size, status.st_mtime_ns), file)
+
+
+def _several(source: tuple[Path, ...]) -> Iterator[Item]:
+    """Items of several files and folders; a file that is named twice, or lies in a folder named too, comes once."""
+    root = Path(os.path.commonpath([path.resolve().parent for path in source]))
+    groups: dict[Path, list[str]] = {}
+    for path in source:
+        groups.setdefault(path.resolve().parent, []).append(path.name)
+    stems = {folder: output_stems([name for name in names if not (folder / name).is_dir()]) for folder, names in groups.items()}
+    seen: set[str] = set()
+    for path in source:
+        folder = path.resolve().parent
+        prefix = "" if folder == root else f"{folder.relative_to(root).as_posix()}/"
+        found = _walk(path, f"{prefix}{path.name}/") if path.is_dir() else [_item(path, prefix, stems[folder][path.name])]
+        for item in found:
+            if item.path not in seen:
+                seen.add(item.path)
+                yield item
 
 
 def _walk(folder: Path, prefix: str) -> Iterator[Item]:
@@ -79,8 +118,7 @@ def _walk(folder: Path, prefix: str) -> Iterator[Item]:
     stems = output_stems([entry.name for entry in kept if entry.name.lower().endswith(suffixes) and entry.is_file()])
     for entry in kept:
         if entry.name in stems:
-            status = entry.stat()
-            yield Item(prefix + entry.name, prefix + stems[entry.name], (status.st_size, status.st_mtime_ns))
+            yield _item(folder / entry.name, prefix, stems[entry.name])
         elif entry.is_dir(follow_symlinks=False) and not (folder / entry.name / STATE).is_dir():
             yield from _walk(folder / entry.name, f"{prefix}{entry.name}/")
 
@@ -106,7 +144,7 @@ def output_stems(names: list[str]) -> dict[str, str]:
     return stems if len(set(stems.values())) == len(stems) else {name: name for name in names}
 
 
-def has_few_frames(source: Path) -> bool:
+def has_few_frames(source: Source) -> bool:
     """Whether a source holds at most :data:`PICTURES_UP_TO` frames."""
     items = islice(list_items(source), PICTURES_UP_TO + 1)
-    return sum(count_frames(item.file(source)) if item.is_video else 1 for item in items) <= PICTURES_UP_TO
+    return sum(count_frames(item.file) if item.is_video else 1 for item in items) <= PICTURES_UP_TO

@@ -103,7 +103,7 @@ class _Frames(IterableDataset[Batch]):
         worker = get_worker_info()
         number, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
         count = 0
-        for item in list_items(self.records.source):
+        for item in list_items(self.records.source, self.records.settings.every):
             if item.is_video:
                 if number == 0:
                     yield from self._video(item)
@@ -114,7 +114,7 @@ class _Frames(IterableDataset[Batch]):
             if self.records.is_done(item, -1):
                 yield Frame(item, done=True), None
             elif item.is_text:
-                yield Frame(item), partial(read_image, item.file(self.records.source))
+                yield Frame(item), partial(read_image, item.file)
             else:
                 yield Frame(item, failed="its name is not UTF-8: rename it"), None
 
@@ -122,15 +122,16 @@ class _Frames(IterableDataset[Batch]):
         import cv2
 
         rank, world = self.share
-        length = self.records.length(item)
-        if length is not None and all(self.records.is_done(item, number) for number in range(rank, length, world)):
-            yield from ((Frame(item, number, done=True), None) for number in range(rank, length, world))
+        length, every = self.records.length(item), self.records.settings.every
+        own = range(rank * every, length or 0, world * every)
+        if length is not None and all(self.records.is_done(item, number) for number in own):
+            yield from ((Frame(item, number, done=True), None) for number in own)
             return
-        capture = cv2.VideoCapture(str(item.file(self.records.source)))
+        capture = cv2.VideoCapture(str(item.file))
         fps = frames_a_second(capture)
         number = 0
         while capture.grab():
-            mine = number % world == rank
+            mine = number % every == 0 and number // every % world == rank
             done = mine and self.records.is_done(item, number)
             decoded, pixels = capture.retrieve()
             frame = Frame(item, number, done, "" if decoded else "not decoded", None, mine, number / fps, fps)

@@ -10,6 +10,7 @@ depth then differs by up to 3e-7 mm.)
 """
 
 import hashlib
+import json
 import os
 import sys
 import time
@@ -18,6 +19,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,18 +30,26 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ..core import __version__
-from ..core.checks import check_integer
-from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, count_frames, write_atomically, write_depth_png
+from ..core.checks import check_choice, check_integer, check_path, check_sequence
+from ..core.files import (
+    DEPTH_PNG_STEP_MM,
+    DEPTH_PNG_ZERO,
+    IMAGE_SUFFIXES,
+    VIDEO_SUFFIXES,
+    count_frames,
+    write_atomically,
+    write_depth_png,
+)
 from ..core.geometry import depth_to_points
+from ..core.results import UNITS, write_result
 from ..model import Calibration
-from ..pipeline import MODES, DepthOutput
-from ..stream import FIRST_FRAMES, Recording
-from .items import Item, list_items
+from ..pipeline import MODES, DepthOutput, unit_pipeline
+from ..stream import FIRST_FRAMES, Recording, check_device
+from .items import Item, Source, list_items
 from .loading import Frame, load_frames
-from .records import Records, Settings, begin, join, locked
+from .records import FORMATS, VIDEO_FORMAT, Records, Settings, begin, join, locked
 
-DEPTH_FORMATS = ("png", "npy", "none")
-CLOUD_FORMATS = ("pcd", "ply", "none")
+CLOUD_FORMATS = ("ply", "obj", "pcd", "none")
 
 LONGEST_WAIT = timedelta(days=7)
 """Processes that have finished wait this long for the others."""
@@ -67,13 +77,16 @@ class Report(NamedTuple):
 
 def reconstruct_dataset(
     calibration: str | Path,
-    source: str | Path,
+    source: str | Path | Sequence[str | Path],
     out: str | Path,
     *,
     mode: str = "auto",
-    depth: str = "png",
+    format: str = "npz",
     cloud: str = "none",
     pictures: bool | None = None,
+    every: int = 1,
+    network: str | Path | None = None,
+    device: str = "cpu",
     background_frames: int = FIRST_FRAMES,
     batch: int = 8,
     workers: int | None = None,
@@ -84,17 +97,23 @@ def reconstruct_dataset(
     """Reconstruct every image and video frame of a source, and continue where an earlier run was stopped.
 
     Under ``torchrun`` (or any launcher that sets RANK, WORLD_SIZE, MASTER_ADDR, MASTER_PORT) the processes share the work; ``out``
-    must then be one folder that all of them see. Files keep their folders: ``sub/a.png`` becomes ``out/sub/a_depth.png``; where
-    two files of a folder share a stem, the suffix stays in the name: ``a.png_depth.png``.
+    must then be one folder that all of them see. Files keep their folders: ``sub/a.png`` becomes ``out/sub/a.npz``; where two
+    files of a folder share a stem, the suffix stays in the name: ``a.png.npz``. ``frames.csv`` is the table of all frames,
+    ``summary.json`` says what the files are.
 
     Args:
         calibration: file of a calibrated unit.
-        source: image, video, or folder with all below it; hidden files, links to folders and results of runs are passed over.
+        source: image, video, or folder with all below it, or several of these; hidden files, links to folders and results of runs
+            are passed over.
         out: folder for results, made if missing.
         mode: "fast", "precise" or "auto".
-        depth: "png", "npy" or "none".
-        cloud: "pcd", "ply" or "none".
+        format: "npz" (depth, normals, gradient, masks, units; :func:`torchvts.read_result`), "video-npz" (the same, one file a
+            video), "png16" (depth in 16 bits), "npy" (depth) or "none".
+        cloud: contact as points, "ply" or "pcd", as a surface, "obj", or "none".
         pictures: whether to draw each frame; None draws where there are at most ``PICTURES_UP_TO``.
+        every: take each N-th frame of a video, each N-th image of a folder.
+        network: gs_sdk's ``nnmodel.pth`` or what ``torchvts train`` wrote, in place of the calibration's model.
+        device: of the pipeline, "cpu" or "cuda".
         background_frames: first frames of a video, which show the skin without contact; 0 uses the calibration as it is, and so
             does a video where they show contact or that is shorter, with a note.
         batch: frames that a loader worker hands over at once.
@@ -107,39 +126,65 @@ def reconstruct_dataset(
         ValueError: nothing to do in the source, an option that does not exist, or ``out`` was begun with other settings.
         RuntimeError: another process failed, or another run writes there.
     """
-    source, out = Path(source), Path(out)
-    for name, value, allowed in (("mode", mode, MODES), ("depth", depth, DEPTH_FORMATS), ("cloud", cloud, CLOUD_FORMATS)):
-        if value not in allowed:
-            raise ValueError(f"{name}: expected one of {', '.join(allowed)}, got {value!r}")
-    check_integer("batch", batch, 1), check_integer("threads", threads, 1), check_integer("background_frames", background_frames, 0)
+    source, out = _source(source), Path(out)
+    for name, value, allowed in (("mode", mode, MODES), ("format", format, tuple(FORMATS)), ("cloud", cloud, CLOUD_FORMATS)):
+        check_choice(name, value, allowed)
+    for name, number, least in (
+        ("batch", batch, 1),
+        ("threads", threads, 1),
+        ("every", every, 1),
+        ("background_frames", background_frames, 0),
+    ):
+        check_integer(name, number, least)
     if workers is not None:
         check_integer("workers", workers, 0)
     unit = Calibration.load(calibration)
+    check_device(device)
+    if network is not None:
+        unit_pipeline(unit, mode, network)  # a bad one is refused before anything is written
     _check_source(source, out)
-    if cloud != "none":
-        from ..pose.clouds import open3d
-
-        open3d()  # missing packages are reported before the first frame
     torch.set_num_threads(threads)
-    digest = hashlib.sha256(Path(calibration).read_bytes()).hexdigest()
-    versions = __version__, str(torch.__version__)
-    settings = Settings(digest, str(source.resolve()), mode, depth, cloud, pictures, threads, *versions, background_frames)
+    settings = Settings(
+        _digest(calibration), _digest(network), _names(source), mode, format, cloud, pictures, every, device, threads,
+        __version__, str(torch.__version__), background_frames,
+    )  # fmt: skip
     with _processes() as (rank, world), locked(out) if rank == 0 else nullcontext():
         if rank == 0:
-            settings = begin(out, settings, overwrite)
+            settings = begin(source, out, settings, overwrite)
         _sum_over_processes(0)  # the settings are there for the others to read
         if rank > 0:
             settings = join(out, settings)
-        return _Worker(unit, Records(source, out, settings), (rank, world), strict).run(batch, workers)
+        records = Records(source, out, settings)
+        return _Worker(unit, Path(calibration).name, network, records, (rank, world), strict).run(batch, workers)
 
 
-def _check_source(source: Path, out: Path) -> None:
-    if not source.exists():
-        raise FileNotFoundError(f"{source}: no such file or folder")
-    if source.is_dir() and out.resolve() == source.resolve():
-        raise ValueError(f"out: {out} is the source itself, its results would be read as images: give another folder")
-    if next(list_items(source), None) is None:
-        raise ValueError(f"{source}: no images or videos in this folder ({', '.join(IMAGE_SUFFIXES + VIDEO_SUFFIXES)})")
+def _source(source: str | Path | Sequence[str | Path]) -> Source:
+    """One path as it is, several as a tuple."""
+    if isinstance(source, str | Path):
+        return Path(source)
+    check_sequence("source", source, "paths of images, videos or folders")
+    paths = tuple(check_path("source", path) for path in source)
+    if not paths:
+        raise ValueError("source: expected one path or more, got none")
+    return paths[0] if len(paths) == 1 else paths
+
+
+def _names(source: Source) -> str:
+    return os.pathsep.join(str(path.resolve()) for path in (source if isinstance(source, tuple) else (source,)))
+
+
+def _digest(path: str | Path | None) -> str:
+    return "" if path is None else hashlib.sha256(Path(path).read_bytes()).hexdigest()
+
+
+def _check_source(source: Source, out: Path) -> None:
+    for path in source if isinstance(source, tuple) else (source,):
+        if not path.exists():
+            raise FileNotFoundError(f"{path}: no such file or folder")
+        if path.is_dir() and out.resolve() == path.resolve():
+            raise ValueError(f"out: {out} is the source itself, its results would be read as images: give another folder")
+        if next(list_items(path), None) is None:
+            raise ValueError(f"{path}: no images or videos in this folder ({', '.join(IMAGE_SUFFIXES + VIDEO_SUFFIXES)})")
 
 
 @contextmanager
@@ -181,10 +226,13 @@ _Reconstructed = tuple[Frame, Tensor | None, DepthOutput | None]
 class _Worker:
     """One rank's share of a data set: read, reconstruct, write."""
 
-    def __init__(self, unit: Calibration, records: Records, share: tuple[int, int], strict: bool) -> None:
+    def __init__(
+        self, unit: Calibration, name: str, network: str | Path | None, records: Records, share: tuple[int, int], strict: bool
+    ) -> None:
         self.unit, self.records, self.settings, self.share, self.strict = unit, records, records.settings, share, strict
-        self.sensor = unit.sensor
-        self.image = Recording(unit, self.settings.mode, follow=False)
+        self.sensor, self.name = unit.sensor, name
+        self.recording = partial(Recording, unit, self.settings.mode, network=network, device=self.settings.device)
+        self.image = self.recording(follow=False)
         self.notes: list[tuple[str, str]] = []
         self.done = 0
 
@@ -192,14 +240,15 @@ class _Worker:
         """Do the whole share; rank 0 then writes the tables. Files are written by threads: most of that is waiting for the disk."""
         rank, world = self.share
         source = self.records.source
-        total = sum(count_frames(item.file(source)) if item.is_video else 1 for item in list_items(source)) // world
+        items = list_items(source, self.settings.every)
+        total = sum(count_frames(item.file) if item.is_video else 1 for item in items) // world
         if workers is None:
             cores = (os.cpu_count() or 1) // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
             workers = 0 if total < 4 * batch else max(1, min(4, cores // 2))
         writers = 1 if self.settings.pictures else 4  # matplotlib draws in one thread only
         waiting: deque[tuple[Frame, Future[str]]] = deque()
         start = time.perf_counter()
-        with tqdm(total=total, unit="frame", disable=rank > 0, smoothing=0.05) as bar, ThreadPoolExecutor(writers) as pool:
+        with tqdm(total=total, unit="frame", disable=rank > 0 or None, smoothing=0.05) as bar, ThreadPoolExecutor(writers) as pool:
             for frame, image, output in self._depths(load_frames(self.records, self.sensor, self.share, batch, workers)):
                 bar.update(frame.length is None)
                 if not frame.done:
@@ -212,7 +261,9 @@ class _Worker:
         seconds = time.perf_counter() - start
         if rank > 0:
             return Report(rank, 0, 0, [], seconds)
+        self.records.join_videos()
         rows, failed = self.records.write_tables()
+        self._write_summary(rows, len(failed))
         return Report(0, rows, rows - done, failed, seconds, self.notes)
 
     def _depths(self, loaded: Iterable[tuple[Frame, Tensor | None]]) -> Iterator[_Reconstructed]:
@@ -245,13 +296,13 @@ class _Worker:
         fps, count = held[0][0].fps if held else 30.0, self.settings.background_frames
         try:
             if 0 < count <= len(held):
-                return Recording(self.unit, self.settings.mode, torch.cat([image for _, image in held]), fps=fps)
+                return self.recording(torch.cat([image for _, image in held]), fps=fps)
             reason = f"background_frames: expected at least {count} frames, got {len(held)}" if count > 0 else ""
         except ValueError as error:
             reason = _in_one_line(error)
         if reason:
             self.notes.append((item.path, f"first frames not used, the calibration is used as it is: {reason}"))
-        return Recording(self.unit, self.settings.mode, fps=fps)
+        return self.recording(fps=fps)
 
     def _depth(self, recording: Recording, frame: Frame, image: Tensor | None) -> _Reconstructed:
         """Depth of one frame if it is wanted, or why there is none."""
@@ -290,32 +341,66 @@ class _Worker:
 
     def _finish(self, frame: Frame, image: Tensor, result: DepthOutput) -> str:
         """Write a frame's files, then its record."""
-        stem = self.records.out / frame.item.frame_stem(frame.number)
-        stem.parent.mkdir(parents=True, exist_ok=True)
         try:
-            self._write(stem, frame.item.frame_name(frame.number), image, result)
+            self._write(frame, image, result)
         except ValueError as error:  # a depth that its format does not hold
             return self._record(frame, failed=_in_one_line(error))
         area = float(result.contact.double().sum()) * self.sensor.mm_per_pixel**2
         return self._record(frame, deepest_mm=float(result.depth_mm.max()), contact_mm2=area)
 
-    def _write(self, stem: Path, name: str, image: Tensor, result: DepthOutput) -> None:
-        pitch = self.sensor.mm_per_pixel
-        if self.settings.depth == "png":
-            write_depth_png(f"{stem}_depth.png", result.depth_mm)
-        elif self.settings.depth == "npy":
-            with write_atomically(f"{stem}_depth.npy") as temporary:
+    def _write(self, frame: Frame, image: Tensor, result: DepthOutput) -> None:
+        pitch, name = self.sensor.mm_per_pixel, frame.item.frame_name(frame.number)
+        stem, path = self.records.out / frame.item.frame_stem(frame.number), self.records.result_file(frame.item, frame.number)
+        for folder in {stem.parent, path.parent}:
+            folder.mkdir(parents=True, exist_ok=True)
+        if self.settings.format == VIDEO_FORMAT and frame.number >= 0:  # what an earlier run joined is of other frames
+            (self.records.out / f"{frame.item.stem}.npz").unlink(missing_ok=True)
+        if path.suffix == ".npz":
+            write_result(path, result, pitch, self.name, self.sensor.name, name)
+        elif path.suffix == ".png":
+            write_depth_png(path, result.depth_mm)
+        elif path.suffix == ".npy":
+            with write_atomically(path) as temporary:
                 np.save(temporary, result.depth_mm[0, 0].numpy())
         if self.settings.cloud != "none" and bool(result.contact.any()):
-            from ..pose import write_point_cloud
-
-            inside = result.contact[0, 0]
-            normals = result.normal[0].permute(1, 2, 0)[inside] * torch.tensor([1.0, -1.0, 1.0])  # y up
-            write_point_cloud(f"{stem}.{self.settings.cloud}", depth_to_points(result.depth_mm, pitch, result.contact), normals)
+            self._write_contact(Path(f"{stem}.{self.settings.cloud}"), result)
         if self.settings.pictures:
             from .. import viz
 
             viz.save_figure(viz.depth_figure(result.depth_mm, pitch, image, result.contact, name), f"{stem}_picture.png")
+
+    def _write_contact(self, path: Path, result: DepthOutput) -> None:
+        """The contact as points or as a surface."""
+        from ..pose import write_point_cloud
+        from ..pose.surface_files import write_obj
+
+        pitch = self.sensor.mm_per_pixel
+        if path.suffix == ".obj":
+            write_obj(path, result.depth_mm, result.normal, result.contact, pitch)
+            return
+        normals = result.normal[0].permute(1, 2, 0)[result.contact[0, 0]] * torch.tensor([1.0, -1.0, 1.0])  # y up
+        write_point_cloud(path, depth_to_points(result.depth_mm, pitch, result.contact), normals)
+
+    def _write_summary(self, rows: int, failed: int) -> None:
+        """summary.json: what the files are, so that they can be read without this package."""
+        settings = self.settings
+        summary = {
+            "frames": rows,
+            "left_out": failed,
+            "calibration": self.name,
+            "sensor": self.sensor.name,
+            "mm_per_pixel": self.sensor.mm_per_pixel,
+            "height": self.sensor.height,
+            "width": self.sensor.width,
+            "mode": settings.mode,
+            "format": settings.format,
+            "every": settings.every,
+            "depth_png": f"depth_mm = (value - {DEPTH_PNG_ZERO}) * {DEPTH_PNG_STEP_MM}",
+            "units": UNITS,
+            "torchvts": __version__,
+        }
+        with write_atomically(self.records.out / "summary.json") as temporary:
+            temporary.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
 
 
 def _in_one_line(error: ValueError) -> str:

@@ -17,8 +17,19 @@ from pathlib import Path
 from typing import Any
 
 from ..core.files import write_atomically
+from ..core.results import join_results
 from ..stream import FIRST_FRAMES
-from .items import STATE, Item, has_few_frames, list_items
+from .items import STATE, Item, Source, has_few_frames, list_items
+
+VIDEO_FORMAT = "video-npz"
+FORMATS = {"npz": ".npz", VIDEO_FORMAT: ".npz", "png16": "_depth.png", "npy": "_depth.npy", "none": ""}
+"""Kinds of results, and how the names of their files end."""
+
+SUFFIXES = (*filter(None, dict.fromkeys(FORMATS.values())), ".ply", ".obj", ".pcd", "_picture.png")
+"""How the names of all files of a frame end."""
+
+PARTS = "parts"
+"""Folder beside the records where the frames of a video wait until it is done."""
 
 Record = dict[str, Any]
 """``mark`` of the source file; then ``deepest_mm`` and ``contact_mm2`` of a frame, ``frames`` of a whole video, or ``failed``, the
@@ -30,40 +41,56 @@ class Settings:
     """What the results of a run depend on; a run is only continued with the same. ``pictures`` may be None when it begins."""
 
     calibration_sha256: str
+    network_sha256: str
     source: str
     mode: str
-    depth: str
+    format: str
     cloud: str
     pictures: bool | None
+    every: int
+    device: str
     threads: int
     torchvts: str
     torch: str
     background_frames: int = FIRST_FRAMES
 
 
-def begin(out: Path, settings: Settings, overwrite: bool) -> Settings:
+def begin(source: Source, out: Path, settings: Settings, overwrite: bool) -> Settings:
     """Begin or continue a run in ``out``: write the settings, or compare them with those that are there; remove incomplete files.
+
+    With ``overwrite`` the files of the frames that an earlier run wrote go too, whatever its settings were.
 
     Raises:
         ValueError: the run was begun with other settings.
     """
     if overwrite:
+        _remove_results(out)
         shutil.rmtree(out / STATE / "frames", ignore_errors=True)
-        for path in (out / STATE / "settings.json", out / "frames.csv", out / "failed.csv"):
+        shutil.rmtree(out / STATE / PARTS, ignore_errors=True)
+        for path in (out / STATE / "settings.json", out / "frames.csv", out / "failed.csv", out / "summary.json"):
             path.unlink(missing_ok=True)
     if (out / STATE / "settings.json").exists():
         settings = join(out, settings)
     else:
         if settings.pictures is None:
-            settings = replace(settings, pictures=has_few_frames(Path(settings.source)))
+            settings = replace(settings, pictures=has_few_frames(source))
         with write_atomically(out / STATE / "settings.json") as temporary:
             temporary.write_text(json.dumps(asdict(settings), indent=1), encoding="utf-8")
-    incomplete = re.compile(r"\..+-[0-9a-f]{8}\.(png|npy|pcd|ply|csv|json)")  # names of write_atomically
+    incomplete = re.compile(r"\..+-[0-9a-f]{8}\.(png|npy|npz|pcd|ply|obj|csv|json)")  # names of write_atomically
     for folder, folders, names in os.walk(out):
         folders[:] = [name for name in folders if name != STATE]
         for name in filter(incomplete.fullmatch, names):
             Path(folder, name).unlink(missing_ok=True)
     return settings
+
+
+def _remove_results(out: Path) -> None:
+    """Remove the files of every frame that has a record."""
+    frames = out / STATE / "frames"
+    for record in frames.rglob("*.json"):
+        stem = out / record.relative_to(frames).with_suffix("")
+        for suffix in SUFFIXES:
+            stem.with_name(stem.name + suffix).unlink(missing_ok=True)
 
 
 def join(out: Path, settings: Settings) -> Settings:
@@ -118,7 +145,7 @@ def locked(out: Path) -> Iterator[None]:
 class Records:
     """The records of a run, and the files that each frame must have."""
 
-    source: Path
+    source: Source
     out: Path
     settings: Settings
 
@@ -126,6 +153,8 @@ class Records:
         """Write the record of a frame (-1 for an image, or for a whole video) after its files are in place."""
         path = self._path(item, frame)
         path.parent.mkdir(parents=True, exist_ok=True)
+        if "deepest_mm" in figures:
+            figures["bytes"] = [os.path.getsize(file) for file in self._files(item, frame, figures)]
         path.write_text(json.dumps({"mark": item.mark, **figures}), encoding="utf-8")
 
     def read(self, item: Item, frame: int) -> Record | None:
@@ -139,7 +168,12 @@ class Records:
     def is_done(self, item: Item, frame: int) -> bool:
         """Whether the result of a frame is there, whole."""
         record = self.read(item, frame)
-        return record is not None and "failed" not in record and all(map(os.path.isfile, self._files(item, frame, record)))
+        if record is None or "failed" in record or "bytes" not in record:
+            return False
+        files = list(self._files(item, frame, record))
+        if self.settings.format == VIDEO_FORMAT and frame >= 0 and _size(f"{self.out / item.stem}.npz") > 0:  # joined already
+            return bool([_size(file) for file in files[1:]] == record["bytes"][1:])
+        return bool([_size(file) for file in files] == record["bytes"])
 
     def length(self, video: Item) -> int | None:
         """Number of frames of a video; None where no process has decoded it to its end."""
@@ -151,17 +185,39 @@ class Records:
 
     def _files(self, item: Item, frame: int, record: Record) -> Iterator[str]:
         stem = self.out / item.frame_stem(frame)
-        if self.settings.depth != "none":
-            yield f"{stem}_depth.{self.settings.depth}"
+        if self.settings.format != "none":
+            yield str(self.result_file(item, frame))
         if self.settings.cloud != "none" and record["contact_mm2"] > 0.0:
             yield f"{stem}.{self.settings.cloud}"
         if self.settings.pictures:
             yield f"{stem}_picture.png"
 
+    def result_file(self, item: Item, frame: int) -> Path:
+        """Where the depth of a frame is written; for one file a video, where it waits until the video is done."""
+        folder = self.out / STATE / PARTS if self.settings.format == VIDEO_FORMAT and frame >= 0 else self.out
+        return folder / f"{item.frame_stem(frame)}{FORMATS[self.settings.format]}"
+
+    def join_videos(self) -> None:
+        """Make one npz of the frames of each video, where that is asked for."""
+        for item in list_items(self.source):
+            length = self.length(item) if item.is_video else None
+            if self.settings.format != VIDEO_FORMAT or length is None:
+                continue
+            records = ((frame, self.read(item, frame)) for frame in range(0, length, self.settings.every))
+            parts = [self.result_file(item, frame) for frame, record in records if record is not None and "failed" not in record]
+            there = [part for part in parts if part.is_file()]
+            if not there:
+                continue  # joined by an earlier run
+            if len(there) < len(parts):
+                raise RuntimeError(f"{item.path}: {len(parts) - len(there)} frames have no result: run the same command again")
+            join_results(f"{self.out / item.stem}.npz", parts)
+            for part in parts:
+                part.unlink()
+
     def _rows(self, item: Item) -> Iterator[tuple[str, Record | None]]:
         frames: Iterable[int] = (-1,)
         if item.is_video and (length := self.length(item)) is not None:
-            frames = range(length)
+            frames = range(0, length, self.settings.every)
         return ((item.frame_name(frame), self.read(item, frame)) for frame in frames)
 
     def write_tables(self) -> tuple[int, list[tuple[str, str]]]:
@@ -178,7 +234,7 @@ class Records:
 
         def rows() -> Iterator[tuple[str, ...]]:
             nonlocal count
-            for item in list_items(self.source):
+            for item in list_items(self.source, self.settings.every):
                 for name, record in self._rows(item):
                     if record is None:
                         missing.append(name)
@@ -196,6 +252,11 @@ class Records:
         else:
             (self.out / "failed.csv").unlink(missing_ok=True)
         return count, failed
+
+
+def _size(path: str) -> int:
+    """Bytes of a file, -1 where there is none."""
+    return os.path.getsize(path) if os.path.isfile(path) else -1
 
 
 def _write_csv(path: Path, head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> None:

@@ -76,7 +76,7 @@ def of_scenes(seeds: Sequence[int], unit: str | None = None, progress: bool = Fa
         One row for each frame with contact.
     """
     rows = []
-    for seed in tqdm(seeds, desc=unit or "scenes", disable=not progress, leave=False):
+    for seed in tqdm(seeds, desc=unit or "scenes", disable=not progress or None, leave=False):
         frame = random_frame(seed, unit)
         pipe = ConfidentPipeline.from_calibration(frame.calibration, frame.mode)
         with torch.inference_mode():
@@ -108,7 +108,7 @@ def of_presses(
     """
     check_integer("folds", folds, 2)
     data, rows = from_folder(folder, sensor, folds=folds), []
-    for fold in tqdm(data.folds, desc="presses", disable=not progress, leave=False):
+    for fold in tqdm(data.folds, desc="presses", disable=not progress or None, leave=False):
         unit = Training(data.background, fold.learned if learn else (), sensor).calibration
         pipe = ConfidentPipeline.from_calibration(unit, mode)
         for target in fold.scored:

@@ -112,7 +112,7 @@ def evaluate_all(
         ValueError: an unknown method.
     """
     done = []
-    with tqdm(total=len(names), desc="evaluating", disable=not progress, leave=False) as bar:
+    with tqdm(total=len(names), desc="evaluating", disable=not progress or None, leave=False) as bar:
         for name in names:
             bar.set_postfix_str(f"{name}, reading")
             try:

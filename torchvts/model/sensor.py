@@ -23,6 +23,7 @@ from ..core.checks import (
     from_dict,
 )
 from ..core.files import read_image, write_atomically
+from ..core.spelling import suggest
 from .gs_sdk_sensor import is_gs_sdk_sensor, values_from_gs_sdk
 from .response_field import SensorPrior
 
@@ -297,8 +298,10 @@ def _find(source: str | Path) -> Path:
         return path
     if str(source) in shipped_sensors():
         return _shipped_folder() / f"{source}.yaml"
+    shipped = shipped_sensors()
     raise FileNotFoundError(
-        f"source: expected a path ending in .yaml, or one of {', '.join(shipped_sensors())}, got {str(source)!r}"
+        f"source: expected a path ending in .yaml, or one of {', '.join(shipped)}, got {str(source)!r}"
+        + suggest(str(source), shipped)
     )
 
 

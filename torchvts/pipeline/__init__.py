@@ -6,6 +6,7 @@ from .depth import MODES, DepthPipeline
 from .refine import Adaptive, Once, Repeat, SlopesOfDepth, SlopesOfPixels
 from .shadows import Shadows
 from .solve import Solve
+from .unit import unit_pipeline
 
 __all__ = [
     "MODES",
@@ -23,4 +24,5 @@ __all__ = [
     "SlopesOfPixels",
     "Solve",
     "bound_at",
+    "unit_pipeline",
 ]

@@ -266,7 +266,7 @@ class Confidence(nn.Module):
         common: dict[str, Any] = {"measured": calibration.measured, "blur_px": sensor.blur_px}
         if isinstance(block, NormalFromIntensity):
             return cls(block, noise, calibration.noise_std, _light_std_by_fit(calibration), sensor.mm_per_pixel, **common)
-        model_deg = _model_deg(calibration)
+        model_deg = expected_model_deg(calibration)
         slope_of_change = 0.5 * block.maps[:3].square().sum(dim=(0, 1))  # a relative change of one, in every channel
         usual = float(slope_of_change.median().sqrt().clamp_min(1e-6))
         light = torch.full_like(noise, MODEL_SHARE * math.radians(model_deg) / SPREAD_OF_MEAN / usual)
@@ -475,7 +475,7 @@ def _light_std_by_fit(calibration: Calibration) -> Tensor:
     return calibration.model_image.detach() * off.reshape(3, 1, 1)
 
 
-def _model_deg(calibration: Calibration) -> float:
+def expected_model_deg(calibration: Calibration) -> float:
     """Mean error of a response field to expect, degrees."""
     report = calibration.report
     held_out = report.get("held_out_deg")

@@ -1,4 +1,4 @@
-"""Point clouds of contacts, thinned evenly, and their PCD and PLY files, written by Open3D."""
+"""Point clouds of contacts, thinned evenly, and their PCD and PLY files."""
 
 import ctypes
 from pathlib import Path
@@ -10,10 +10,10 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from ..core.checks import check_integer, check_path, check_positive, check_tensor
-from ..core.files import write_atomically
 from ..core.geometry import depth_to_points
 from .cloud_formats import read_columns
 from .relief import DepthFrame, contact_of, sure_contact
+from .surface_files import write_pcd, write_ply
 
 CLOUD_SUFFIXES = (".pcd", ".ply")
 NORMAL_NAMES = {".pcd": ("normal_x", "normal_y", "normal_z"), ".ply": ("nx", "ny", "nz")}
@@ -108,18 +108,12 @@ def write_point_cloud(path: str | Path, points: Tensor, normals: Tensor | None =
         normals: (N, 3), or None.
     Raises:
         ValueError: wrong shape, no points, values not finite, or another suffix.
-        ImportError: without the extra ``pose``.
     """
     path = check_path("path", path)
     if path.suffix.lower() not in CLOUD_SUFFIXES:
         raise ValueError(f"{path}: expected a name ending in {' or '.join(CLOUD_SUFFIXES)}, got {path.suffix!r}")
-    o3d = open3d()
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(_array("points", points, None)))
-    if normals is not None:
-        cloud.normals = o3d.utility.Vector3dVector(_array("normals", normals, len(points)))
-    with write_atomically(path) as temporary:
-        if not o3d.io.write_point_cloud(str(temporary), cloud):
-            raise OSError(f"{path}: Open3D could not write it")
+    write = write_ply if path.suffix.lower() == ".ply" else write_pcd
+    write(path, _array("points", points, None), None if normals is None else _array("normals", normals, len(points)))
 
 
 def read_point_cloud(path: str | Path) -> tuple[Tensor, Tensor | None]:

@@ -2,6 +2,7 @@
 
 from .background import (
     FIRST_FRAMES,
+    NOT_METRIC,
     calibrate_background,
     calibrate_unit,
     find_background,
@@ -12,12 +13,13 @@ from .background import (
 from .follow_light import FollowLight
 from .live import StageClock, TactileFrame, TactileStream
 from .overlay import Overlay, StreamReport, VideoFile, Window, has_display
-from .recording import Recording
+from .recording import Recording, check_device
 from .sources import NewestFrame, Reader, Rectify, RectifySizes, Unreadable, frames_a_second, open_source
 from .usable import FrameCheck
 
 __all__ = [
     "FIRST_FRAMES",
+    "NOT_METRIC",
     "FollowLight",
     "FrameCheck",
     "NewestFrame",
@@ -35,6 +37,7 @@ __all__ = [
     "Window",
     "calibrate_background",
     "calibrate_unit",
+    "check_device",
     "find_background",
     "frames_a_second",
     "has_display",

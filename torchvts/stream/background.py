@@ -172,12 +172,15 @@ def read_press_images(presses: Sequence[tuple[str | Path, float | str]], sensor:
         ValueError: not an image, a size that the sensor does not accept, or no diameter; names the file.
     """
     found = []
-    for path, diameter in presses:
+    names = [Path(path).name for path, _ in presses]
+    if len(set(names)) < len(names):  # gs_sdk calls every image gelsight.png
+        names = [str(path) for path, _ in presses]
+    for name, (path, diameter) in zip(names, presses):
         try:
             diameter_mm = float(diameter)
         except ValueError:
             raise ValueError(f"press: expected the diameter of the ball in mm after {path}, got {diameter!r}") from None
-        found.append(Press(sensor.read_image(path), diameter_mm, Path(path).name))
+        found.append(Press(sensor.read_image(path), diameter_mm, name))
     return found
 
 
@@ -306,3 +309,9 @@ def contact_in_video(calibration: Calibration, noise: Tensor | None = None) -> P
     most = torch.maximum(1.0 / calibrated.per_noise.float(), compensated).clamp_min(least)
     far_field = 0.0 if stand_in or calibration.response is None else MOST_FAR_FIELD  # STAND_IN_NOISE is what a press may scatter
     return ContactMask(calibrated.flat.float(), most, far_field=far_field).eval()
+
+
+def with_video_noise(mask: nn.Module, noise: Tensor) -> PlainContactMask:
+    """The contact mask of a network's pipeline, with the noise (3, H, W) that a video has between frames."""
+    flat, own = mask.get_buffer("flat"), 1.0 / mask.get_buffer("per_noise")
+    return ContactMask(flat, torch.maximum(own, 2.0**0.5 * noise.to(own)), far_field=MOST_FAR_FIELD).eval()

@@ -110,6 +110,8 @@ class TactileStream:
         presses: of balls, to calibrate with; only without a calibration.
         realtime: play a recording at its own rate as if it were a camera.
         follow: follow slow drift of the light.
+        network: a trained network in place of the calibration's model, see :func:`torchvts.pipeline.unit_pipeline`.
+        device: of the pipeline, "cpu" or "cuda".
         time_constant_s: of following.
         clock: for tests.
     Attributes:
@@ -140,6 +142,8 @@ class TactileStream:
         presses: Sequence[Press] = (),
         realtime: bool = False,
         follow: bool = True,
+        network: str | Path | None = None,
+        device: str = "cpu",
         time_constant_s: float = TIME_CONSTANT_S,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -178,6 +182,8 @@ class TactileStream:
                 first if background_frames > 0 else None,
                 fps=self.fps,
                 follow=follow,
+                network=network,
+                device=device,
                 time_constant_s=time_constant_s,
                 stage=self.stages.stage,
             )

@@ -2,19 +2,36 @@
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from ..core.spelling import suggest
 from ..model import Calibration, check_calibration
-from ..pipeline import DepthOutput, DepthPipeline
-from .background import contact_in_video, find_background
+from ..pipeline import DepthOutput, DepthPipeline, unit_pipeline
+from .background import contact_in_video, find_background, with_video_noise
 from .follow_light import TIME_CONSTANT_S, FollowLight
 from .usable import FrameCheck
 
 MOST_LIGHT_CHANGE = 0.15
 """First frames whose light differs more from the calibration's are those of another unit or exposure."""
+
+
+def check_device(device: str) -> torch.device:
+    """The device of that name, if this machine has it.
+
+    Raises:
+        ValueError: no such device here.
+    """
+    try:
+        found = torch.device(device)
+    except (RuntimeError, TypeError) as error:
+        raise ValueError(f"device: expected cpu, cuda or cuda:N, got {device!r}{suggest(device, ('cpu', 'cuda'))}") from error
+    if found.type == "cuda" and (found.index or 0) >= torch.cuda.device_count():
+        raise ValueError(f"device: expected cpu, got {device!r}: this machine, or this build of torch, has no such GPU")
+    return found
 
 
 class Recording:
@@ -30,6 +47,8 @@ class Recording:
         fps: frames a second.
         follow: follow slow drift of the light.
         time_constant_s: of following.
+        network: a trained network in place of the calibration's model, see :func:`torchvts.pipeline.unit_pipeline`.
+        device: of the pipeline, "cpu" or "cuda"; frames come and go on the CPU.
         stage: makes a context in which a stage of that name runs, to measure its time.
     Attributes:
         pipe: the pipeline.
@@ -47,18 +66,25 @@ class Recording:
         fps: float = 30.0,
         follow: bool = True,
         time_constant_s: float = TIME_CONSTANT_S,
+        network: str | Path | None = None,
+        device: str = "cpu",
         stage: Callable[[str], AbstractContextManager[Any]] = lambda name: nullcontext(),
     ) -> None:
         check_calibration("calibration", calibration)
         value = calibration.background.float() ** (1.0 / calibration.sensor.exponent)
         value = value.clamp(0.0, 1.0)
         self.light = FollowLight(value, time_constant_s)
-        self.pipe = DepthPipeline.from_calibration(calibration, mode).float()
+        self.device = check_device(device)
+        self.pipe: DepthPipeline = unit_pipeline(calibration, mode, network).float()
         self.check = FrameCheck(value) if calibration.measured else None
         self._fps, self._follow, self._stage = fps, follow, stage
         self._before: float | None = None
         image, noise = (None, None) if first is None else find_background(first)
-        self.pipe.deformed = contact_in_video(calibration, noise)
+        if network is None:
+            self.pipe.deformed = contact_in_video(calibration, noise)
+        elif noise is not None:
+            self.pipe.deformed = with_video_noise(self.pipe.deformed, noise)
+        self.pipe.to(self.device)
         if image is not None:
             self._start(calibration, image[None])
         self._deformed: Tensor | None = None
@@ -83,9 +109,9 @@ class Recording:
                 image = self.light.correct(frame)
             output: DepthOutput | None = None
             if solve:
-                output = self.pipe(image)
+                output = DepthOutput(*(part.cpu() for part in self.pipe(image.to(self.device))))
             elif self._follow:
-                self.pipe.deformed(self.pipe.compensate(image))
+                self.pipe.deformed(self.pipe.compensate(image.to(self.device)))
             if self._follow and self._deformed is not None:
                 with self._stage("light"):
                     seconds = 1.0 / self._fps if self._before is None else time_s - self._before
@@ -94,7 +120,7 @@ class Recording:
         return image, output
 
     def _keep(self, _module: nn.Module, _inputs: Any, deformed: Tensor) -> None:
-        self._deformed = deformed  # also of frames whose depth is not wanted
+        self._deformed = deformed.cpu()  # also of frames whose depth is not wanted
 
     def _start(self, calibration: Calibration, image: Tensor) -> None:
         """Start from the light of the first frames, and refuse another unit and a contact in them."""
@@ -107,7 +133,7 @@ class Recording:
             )
         corrected = light.correct(image)
         with torch.inference_mode():
-            deformed = self.pipe.deformed(self.pipe.compensate(corrected))
+            deformed = self.pipe.deformed(self.pipe.compensate(corrected.to(self.device)))
         if bool(deformed.any()):
             raise ValueError(
                 f"background: the first frames show contact on {float(deformed.float().mean()):.1%} of the skin against the "

@@ -174,7 +174,9 @@ def _train(
     best, best_epoch = [parameter.detach().clone() for parameter in parameters], -1
     feature, angle = train
     total = feature.shape[0]
-    with tqdm(total=schedule.max_epochs, desc=f"network, {total} pixels", disable=not schedule.progress, leave=False) as bar:
+    with tqdm(
+        total=schedule.max_epochs, desc=f"network, {total} pixels", disable=not schedule.progress or None, leave=False
+    ) as bar:
         for epoch in range(schedule.max_epochs):
             squares = 0.0
             for part in torch.split(torch.randperm(total, generator=generator), schedule.batch_size):

@@ -1,38 +1,48 @@
 """Pose of a pressed object relative to a reference press: two frames, a sequence against a reference, or two clouds.
 
-python scripts/pose.py source.png reference.png --calibration unit.safetensors --out out/pose
-python scripts/pose.py folder_or_video reference.png --calibration unit.safetensors --out out/track
-python scripts/pose.py source.ply reference.pcd --out out/pose
+SOURCE and REFERENCE are images, or clouds (.pcd, .ply); a folder of images or a video as SOURCE is followed frame by frame.
+Exit status 1 where a pose was not found.
+
+examples:
+  torchvts pose source.png reference.png --calibration unit.safetensors --out out/pose
+  torchvts pose video.avi reference.png --calibration unit.safetensors --out out/sequence
+  torchvts pose source.ply reference.pcd --out out/pose
 """
 
 import argparse
 import json
 import math
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from tqdm import tqdm
 
-import torchvts as vts
-from torchvts import viz
-from torchvts.core.files import count_frames, read_frames, write_atomically
-from torchvts.pose import contact_cloud, read_point_cloud, write_point_cloud
-from torchvts.pose.clouds import CLOUD_SUFFIXES
+from .. import viz
+from ..core.files import count_frames, read_frames, read_image, write_atomically
+from ..model import Calibration
+from ..pipeline import DepthPipeline
+from ..pose import contact_cloud, read_point_cloud, register_depth, register_points, write_point_cloud
+from ..pose.clouds import CLOUD_SUFFIXES
+from ..pose.result import Registration
+from .options import add_mode, add_out
+
+USAGE = "SOURCE REFERENCE [--calibration FILE] --out FOLDER"
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("source", type=Path, help="image, or .pcd / .ply; a folder of images or a video is tracked frame by frame")
-    parser.add_argument("target", type=Path, help="the reference: an image, or .pcd / .ply")
-    parser.add_argument("--calibration", type=Path, help="file that calibrate.py wrote; not needed for clouds")
-    parser.add_argument("--out", type=Path, required=True, help="folder for pose.json and pictures")
-    parser.add_argument("--mode", choices=["fast", "precise", "auto"], default="precise")
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the subcommand."""
+    parser.add_argument("source", type=Path, metavar="SOURCE", help="image, cloud, folder of images, or video")
+    parser.add_argument("target", type=Path, metavar="REFERENCE", help="image or cloud")
+    parser.add_argument("--calibration", type=Path, metavar="FILE", help="what torchvts calibrate wrote; not needed for clouds")
+    add_out(parser, "for pose.json and pictures")
+    add_mode(parser, "precise")
     parser.add_argument("--cloud", choices=["pcd", "ply", "none"], default="none", help="write both contacts, the source moved")
-    parser.add_argument("--no-pictures", action="store_true")
-    arguments = parser.parse_args(argv)
+    parser.add_argument("--no-pictures", action="store_true", help="no picture of both contacts")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Find the poses, write pose.json, and print them."""
     clouds = [path.suffix.lower() in CLOUD_SUFFIXES for path in (arguments.source, arguments.target)]
     if any(clouds) and not all(clouds):
         raise ValueError("source and target: expected two images or two clouds, got one of each")
@@ -41,25 +51,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     with write_atomically(arguments.out / "pose.json") as temporary:
         temporary.write_text(json.dumps(results if len(results) > 1 else results[0], indent=1) + "\n")
     print(f"wrote {arguments.out / 'pose.json'}")
-    return 0 if all(result["converged"] for result in results) else 2
+    return 0 if all(result["converged"] for result in results) else 1
 
 
 def of_clouds(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """Register two clouds."""
     (source, source_normals), (target, target_normals) = (read_point_cloud(p) for p in (arguments.source, arguments.target))
-    found = vts.register_points(source, target, source_normals=source_normals, target_normals=target_normals)
+    found = register_points(source, target, source_normals=source_normals, target_normals=target_normals)
     print_result(arguments.source.stem, found)
     draw(arguments, arguments.source.stem, source, target, found)
     return [record(arguments.source.stem, found)]
 
 
 def of_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """Register every frame with the reference."""
     if arguments.calibration is None:
-        raise ValueError("--calibration: expected the file that calibrate.py wrote, for images must become depth first")
-    calibration = vts.Calibration.load(arguments.calibration)
-    pipe = vts.DepthPipeline.from_calibration(calibration, arguments.mode if calibration.response is None else "auto")
+        raise ValueError("--calibration: expected what torchvts calibrate wrote, for images must become depth first")
+    calibration = Calibration.load(arguments.calibration)
+    pipe = DepthPipeline.from_calibration(calibration, arguments.mode if calibration.response is None else "auto")
     pitch = calibration.sensor.mm_per_pixel
     with torch.inference_mode():
-        target = pipe(calibration.sensor.rectify(vts.read_image(arguments.target)[None]))
+        target = pipe(calibration.sensor.rectify(read_image(arguments.target)[None]))
     target_points = contact_cloud(target, pitch, 4000)[0]
     results: list[dict[str, Any]] = []
     last = None
@@ -67,7 +79,7 @@ def of_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         with torch.inference_mode():
             frame = pipe(calibration.sensor.rectify(image[None]))
         try:
-            found = vts.register_depth(frame, target, pitch, initial=last)
+            found = register_depth(frame, target, pitch, initial=last)
         except ValueError as error:  # a frame of a sequence without contact
             if count_frames(arguments.source) == 1:
                 raise
@@ -82,7 +94,8 @@ def of_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     return results
 
 
-def record(name: str, found: vts.pose.Registration) -> dict[str, Any]:
+def record(name: str, found: Registration) -> dict[str, Any]:
+    """A result, for pose.json."""
     return {
         "frame": name,
         "T_target_source": found.T_target_source.tolist(),
@@ -97,7 +110,8 @@ def record(name: str, found: vts.pose.Registration) -> dict[str, Any]:
     }
 
 
-def print_result(name: str, found: vts.pose.Registration) -> None:
+def print_result(name: str, found: Registration) -> None:
+    """Print a pose in words."""
     T = found.T_target_source
     turn = float(torch.rad2deg(torch.atan2(T[1, 0], T[0, 0])))
     tilt = float(torch.rad2deg(torch.acos(T[2, 2].clamp(-1, 1))))
@@ -107,19 +121,11 @@ def print_result(name: str, found: vts.pose.Registration) -> None:
     print(f"{name}: {which}turned {turn:.3f} degrees in the plane, tilted {tilt:.3f}, moved ({x:.4f}, {y:.4f}, {z:.4f}) mm")
 
 
-def draw(
-    arguments: argparse.Namespace, name: str, source: torch.Tensor, target: torch.Tensor, found: vts.pose.Registration
-) -> None:
+def draw(arguments: argparse.Namespace, name: str, source: torch.Tensor, target: torch.Tensor, found: Registration) -> None:
+    """Draw both contacts, and write their clouds."""
     T = found.T_target_source
     if not arguments.no_pictures:
         viz.save_figure(viz.pose_figure(source, target, T, name), arguments.out / f"{name}_pose.png")
     if arguments.cloud != "none":
         write_point_cloud(arguments.out / f"{name}_moved.{arguments.cloud}", source.double() @ T[:3, :3].T + T[:3, 3])
         write_point_cloud(arguments.out / f"{name}_target.{arguments.cloud}", target)
-
-
-if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except (OSError, ValueError, TypeError, ImportError) as error:
-        sys.exit(f"error: {error}")

@@ -1,18 +1,17 @@
-"""Depth of a live or recorded tactile video: a view beside the image, or a video of it; late frames of a camera are dropped.
+"""Live depth of a camera or a recording: a view beside the image, or files; late frames of a camera are dropped.
 
-python scripts/stream.py --source 0 --sensor gelsight_mini
-python scripts/stream.py --source video.avi --sensor gelsight_wedge --out out/ball
-python scripts/stream.py --source folder/ --calibration unit.safetensors --out out/run
-python scripts/stream.py --source 0 --sensor gelsight_mini --press ball.png 6.31 --save-calibration unit.safetensors
+The first frames must be without contact. Ctrl-C ends it and finishes the files. Exit status 1 where a frame was left out.
 
-The first frames must be without contact. Ctrl-C ends it and finishes the files. Exit status 1 if a frame had to be left out.
+examples:
+  torchvts stream --source 0 --sensor gelsight_mini
+  torchvts stream --source video.avi --sensor gelsight_wedge --out out/ball
+  torchvts stream --source folder/ --calibration unit.safetensors --out out/run
 """
 
 import argparse
 import contextlib
 import dataclasses
 import signal
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,10 +19,10 @@ from pathlib import Path
 import cv2
 import torch
 
-import torchvts as vts
-from torchvts.core.files import check_target
-from torchvts.stream import (
-    FIRST_FRAMES,
+from ..calibration import Press
+from ..core.files import check_target
+from ..model import Calibration, Sensor
+from ..stream import (
     Overlay,
     StreamReport,
     TactileStream,
@@ -34,50 +33,40 @@ from torchvts.stream import (
     read_background,
     read_press_images,
 )
+from .options import add_background_frames, add_mode, add_pipeline, add_press, add_sensor
+from .parser import UsageError
+
+USAGE = "--source SOURCE (--sensor NAME | --calibration FILE) [--out FOLDER]"
 
 
-def parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the subcommand."""
     parser.add_argument("--source", required=True, help="a camera's index (digits), a video file, or a folder of images")
-    parser.add_argument("--sensor", help=f"YAML file, or one of {', '.join(vts.shipped_sensors())}")
-    parser.add_argument("--calibration", type=Path, help="file that calibrate.py wrote; by default the first frames calibrate")
-    parser.add_argument(
-        "--background", type=Path, nargs="+", help="calibrate by this image without contact, by several, or by a video"
-    )
-    parser.add_argument(
-        "--press",
-        nargs=2,
-        action="append",
-        default=[],
-        metavar=("IMAGE", "MM"),
-        help="calibrate by a ball pressed in, its diameter too",
-    )
-    parser.add_argument(
-        "--save-calibration", type=Path, help="write the calibration, .safetensors, for reconstruct.py and later streams"
-    )
-    parser.add_argument(
-        "--corners", help='in place of the sensor\'s: "x y x y x y x y", top left, top right, bottom right, bottom left'
-    )
-    parser.add_argument("--out", type=Path, help="folder for overlay video, frames.csv and summary.json")
+    add_sensor(parser, "the first frames calibrate: ")
+    parser.add_argument("--calibration", type=Path, metavar="FILE", help="what torchvts calibrate wrote, in place of --sensor")
+    parser.add_argument("--background", type=Path, nargs="+", metavar="IMAGE", help="to calibrate: without contact; or a video")
+    add_press(parser)
+    add_background_frames(parser)
+    parser.add_argument("--save-calibration", type=Path, metavar="FILE", help="write the calibration, .safetensors")
+    parser.add_argument("--corners", help='in place of the sensor\'s: "x y x y x y x y", from top left, clockwise')
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="for overlay video, frames.csv and summary.json")
     parser.add_argument("--video", choices=["mp4", "avi", "none"], default="mp4", help="kind of overlay video in --out")
-    parser.add_argument("--mode", choices=["fast", "precise", "auto"], default="auto")
-    parser.add_argument("--background-frames", type=int, default=FIRST_FRAMES, help="first frames, without contact")
+    add_mode(parser)
+    add_pipeline(parser)
     parser.add_argument("--realtime", action="store_true", help="play a recording at its own rate, dropping late frames")
     parser.add_argument("--no-follow", action="store_true", help="do not follow slow drift of the light")
-    parser.add_argument("--threads", type=int, default=1, help="of PyTorch and OpenCV; one leaves a core for reading")
-    arguments = parser.parse_args(argv)
+    parser.add_argument("--threads", type=int, default=1, metavar="N", help="of PyTorch and OpenCV (1)")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Stream until the source ends, and print a summary."""
     if (arguments.sensor is None) == (arguments.calibration is None):
-        parser.error("give either --sensor or --calibration")
+        raise UsageError("expected either --sensor or --calibration")
     if arguments.calibration is not None and (arguments.background or arguments.press):
-        parser.error("--background, --press: they are to calibrate with --sensor, not beside --calibration")
-    return arguments
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    arguments = parse(argv)
+        raise UsageError("--background, --press: they are to calibrate with --sensor, not beside --calibration")
     torch.set_num_threads(max(1, arguments.threads))
     cv2.setNumThreads(max(1, arguments.threads))
-    unit = vts.Sensor.load(arguments.sensor) if arguments.sensor else vts.Calibration.load(arguments.calibration)
+    unit = Sensor.load(arguments.sensor) if arguments.sensor else Calibration.load(arguments.calibration)
     if arguments.corners is not None:
         unit = with_corners(unit, arguments.corners)
     if arguments.save_calibration is not None:
@@ -88,10 +77,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not show:
         print("no display: no live view" + ("" if arguments.out else "; give --out for an overlay video"))
     started = time.perf_counter()
-    presses: Sequence[vts.Press] = ()
-    if isinstance(unit, vts.Sensor):
+    presses: Sequence[Press] = ()
+    if isinstance(unit, Sensor):
         presses = read_press_images(arguments.press, unit)
-    if isinstance(unit, vts.Sensor) and arguments.background:
+    if isinstance(unit, Sensor) and arguments.background:
         found = calibrate_background(read_background(arguments.background, unit, arguments.background_frames), unit, presses)
         print(found.note)
         unit, presses = found.calibration, ()
@@ -105,6 +94,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                 presses=presses,
                 realtime=arguments.realtime,
                 follow=not arguments.no_follow,
+                network=arguments.network,
+                device=arguments.device,
             )
         )
         print(f"{stream.reader.name}: {stream.fps:g} frames a second; the first {arguments.background_frames} are without contact")
@@ -158,7 +149,7 @@ def play(
         signal.signal(signal.SIGINT, before)
 
 
-def with_corners(unit: vts.Sensor | vts.Calibration, text: str) -> vts.Sensor | vts.Calibration:
+def with_corners(unit: Sensor | Calibration, text: str) -> Sensor | Calibration:
     """The sensor or calibration with other corners."""
     try:
         numbers = [float(part) for part in text.replace(",", " ").split()]
@@ -167,13 +158,6 @@ def with_corners(unit: vts.Sensor | vts.Calibration, text: str) -> vts.Sensor | 
     if len(numbers) != 8:
         raise ValueError(f"corners: expected eight numbers, x and y of four corners, got {text!r}")
     corners = tuple(zip(numbers[::2], numbers[1::2]))
-    if isinstance(unit, vts.Sensor):
+    if isinstance(unit, Sensor):
         return dataclasses.replace(unit, corners_px=corners, roi_px=None)
     return dataclasses.replace(unit, sensor=dataclasses.replace(unit.sensor, corners_px=corners, roi_px=None))
-
-
-if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except (OSError, ValueError, TypeError) as error:
-        sys.exit(f"error: {error}")

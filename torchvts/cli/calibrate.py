@@ -1,0 +1,93 @@
+"""Calibrate a unit from its own images: without contact, and better with presses of a ball of known diameter.
+
+SOURCE is an image without contact, several (their median), a video whose first frames are without contact, or a
+calibration folder of gs_sdk (catalog.csv, background.png, N/gelsight.png). Centers of the balls are found.
+
+examples:
+  torchvts calibrate background.png --sensor gelsight_mini --out unit.safetensors
+  torchvts calibrate background.png --press 1.png 6.31 --press 2.png 6.31 --sensor gelsight_mini
+  torchvts calibrate first_frames.mp4 --mm-per-pixel 0.05
+"""
+
+import argparse
+import dataclasses
+from pathlib import Path
+
+import torch
+
+from ..calibration import Press, Touch, read_presses
+from ..core.files import read_frames
+from ..model import Sensor
+from ..stream import calibrate_unit, read_background, read_press_images
+from .options import add_background_frames, add_press, add_sensor
+from .parser import UsageError
+from .summary import print_calibration
+
+USAGE = "SOURCE... (--sensor NAME | --mm-per-pixel MM) [--press IMAGE MM]... [--out FILE]"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the subcommand."""
+    parser.add_argument("source", type=Path, nargs="+", metavar="SOURCE", help="images without contact, a video, or a folder")
+    add_sensor(parser)
+    parser.add_argument(
+        "--mm-per-pixel", type=float, metavar="MM", help="pixel pitch of a sensor without a file, in place of --sensor"
+    )
+    parser.add_argument("--gamma", type=float, help="with --mm-per-pixel: value = light^(1/gamma); chosen if not given")
+    add_press(parser)
+    parser.add_argument("--touches", type=Path, nargs="+", default=[], metavar="IMAGE", help="unknown objects pressed in")
+    parser.add_argument("--use-labels", action="store_true", help="take centers from the folder's label.npz or labels.csv")
+    parser.add_argument("--no-prior", action="store_true", help="ignore the prior of the sensor file")
+    add_background_frames(parser)
+    parser.add_argument(
+        "--out", type=Path, default=Path("unit.safetensors"), metavar="FILE", help="calibration to write (unit.safetensors)"
+    )
+    parser.add_argument("--candidates", action="store_true", help="print every model that was fitted, and every press")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Calibrate, write the file, and print what was chosen."""
+    if (arguments.sensor is None) == (arguments.mm_per_pixel is None):
+        raise UsageError("expected either --sensor or --mm-per-pixel")
+    check_target_of(arguments.out)
+    image, sensor, presses = read_given(arguments)
+    presses += read_press_images(arguments.press, sensor)
+    touches = [Touch(sensor.read_image(path), None, path.name) for path in arguments.touches]
+    calibration = calibrate_unit(image, sensor, presses, touches, progress=True)
+    calibration.save(arguments.out)
+    print_calibration(calibration, arguments.candidates)
+    print(f"wrote {arguments.out} ({arguments.out.stat().st_size / 1000:.0f} kB)")
+    return 0
+
+
+def check_target_of(out: Path) -> None:
+    """Refuse a name that is no calibration's before the work that leads to it."""
+    if out.suffix != ".safetensors":
+        raise UsageError(f"--out: expected a name ending in .safetensors, got {out}")
+    out.parent.mkdir(parents=True, exist_ok=True)
+
+
+def read_given(arguments: argparse.Namespace) -> tuple[torch.Tensor, Sensor, list[Press]]:
+    """Background, sensor and presses that the arguments name."""
+    first = arguments.source[0]
+    sensor = Sensor.load(arguments.sensor) if arguments.sensor is not None else unknown_sensor(arguments)
+    sensor = sensor.without_prior() if arguments.no_prior else sensor
+    if not (len(arguments.source) == 1 and first.is_dir()):
+        return read_background(arguments.source, sensor, arguments.background_frames), sensor, []
+    image, presses = read_presses(first)
+    if not arguments.use_labels:
+        presses = [dataclasses.replace(press, center_px=None, contact_radius_px=None) for press in presses]
+    elif all(press.center_px is None for press in presses):
+        raise UsageError(f"--use-labels: {first} has neither label.npz nor labels.csv: leave --use-labels out, centers are found")
+    elif tuple(image.shape[1:]) != (sensor.height, sensor.width):
+        raise UsageError(f"--use-labels: the images of {first} are raw frames, labels are for cropped ones: leave --use-labels out")
+    presses = [dataclasses.replace(press, image=sensor.rectify(press.image[None])[0]) for press in presses]
+    return sensor.rectify(image[None])[0], sensor, presses
+
+
+def unknown_sensor(arguments: argparse.Namespace) -> Sensor:
+    """The sensor of which only the pitch is known: its images have the size of the background."""
+    path = arguments.source[0] / "background.png" if arguments.source[0].is_dir() else arguments.source[0]
+    _, image = next(iter(read_frames(path)))
+    name, pitch = arguments.source[0].stem or "sensor", arguments.mm_per_pixel
+    return Sensor(name, image.shape[1], image.shape[2], pitch, gamma=arguments.gamma)

@@ -1,0 +1,47 @@
+"""Find what is wrong with a frame or with the calibration for it; docs/diagnose.md explains every finding.
+
+Exit status 1 where there is a warning or a fault, 0 where there is none.
+
+examples:
+  torchvts diagnose unit.safetensors image.png
+  torchvts diagnose unit.safetensors image.png --background now.png --json
+"""
+
+import argparse
+import dataclasses
+import json
+from pathlib import Path
+
+from torch import Tensor
+
+from ..core.files import read_image
+from ..diagnose import diagnose
+from ..model import Calibration
+
+USAGE = "CALIBRATION IMAGE [--background IMAGE] [--json]"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the subcommand."""
+    parser.add_argument("calibration", type=Path, metavar="CALIBRATION", help="what torchvts calibrate wrote, .safetensors")
+    parser.add_argument("image", type=Path, metavar="IMAGE", help="the frame in question, as the camera gives it")
+    parser.add_argument("--background", type=Path, metavar="IMAGE", help="an image without contact of now, if there is one")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the findings."""
+    calibration = Calibration.load(arguments.calibration)
+
+    def read(path: Path) -> Tensor:
+        image = read_image(path)
+        cut = calibration.sensor.roi_px is not None or calibration.sensor.corners_px is not None
+        return calibration.sensor.rectify(image[None])[0] if cut else image
+
+    background = None if arguments.background is None else read(arguments.background)
+    diagnosis = diagnose(background, read(arguments.image), calibration)
+    if arguments.json:
+        print(json.dumps({"ok": diagnosis.ok, "findings": [dataclasses.asdict(finding) for finding in diagnosis]}, indent=1))
+    else:
+        print(diagnosis)
+    return 0 if diagnosis.ok else 1

@@ -1,0 +1,47 @@
+"""Export a calibrated unit to files that run without torchvts, and compare each with the pipeline in a process of its own.
+
+Exit status 1 where a file does not give the pipeline's depth.
+
+examples:
+  torchvts export unit.safetensors --out folder
+  torchvts export unit.safetensors --out folder --mode precise --format torchscript onnx --frames presses/
+"""
+
+import argparse
+import itertools
+from pathlib import Path
+
+import torch
+
+from .. import export
+from ..core.files import read_frames
+from ..model import Calibration
+from ..pipeline import DepthPipeline
+from .options import add_mode, add_out
+
+USAGE = "CALIBRATION --out FOLDER [--format NAME...] [--mode MODE]"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the subcommand."""
+    parser.add_argument("calibration", type=Path, metavar="CALIBRATION", help="what torchvts calibrate wrote, .safetensors")
+    add_out(parser, "for the files")
+    add_mode(parser, "fast")
+    parser.add_argument("--format", nargs="+", default=list(export.FORMATS), metavar="NAME", help=f"of {', '.join(export.FORMATS)}")
+    parser.add_argument("--frames", type=Path, metavar="INPUT", help="image, folder or video to compare on too; 8 frames at most")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write the files, and print a row for each."""
+    calibration = Calibration.load(arguments.calibration)
+    pipe = DepthPipeline.from_calibration(calibration, arguments.mode)
+    images = export.sample_frames(calibration)
+    if arguments.frames:
+        real = [calibration.sensor.rectify(image[None]) for _, image in itertools.islice(read_frames(arguments.frames), 8)]
+        images = torch.cat([*real, images])
+    rows = export.export_checked(pipe, arguments.out, arguments.format, images)
+    print("| format | file | kB | largest depth difference, mm | result |\n|---|---|---|---|---|")
+    for row in rows:
+        result = "ok" if row.ok else f"failed: {row.reason}"
+        print(f"| {row.format} | {row.path} | {row.size_kb:.0f} | {row.difference_mm:.2g} | {result} |")
+    return 0 if all(row.ok for row in rows) else 1

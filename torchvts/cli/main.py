@@ -1,0 +1,144 @@
+"""Finds the subcommand, runs it, and turns what goes wrong into one line and an exit status."""
+
+import argparse
+import importlib
+import os
+import sys
+import traceback
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import ModuleType
+from typing import TextIO
+
+from ..core import __version__
+from ..core.spelling import suggest
+from .parser import Parser, UsageError
+
+COMMANDS = {
+    "calibrate": "calibrate a unit from its own images",
+    "reconstruct": "depth of images, folders and videos, in files",
+    "stream": "live depth of a camera or a recording",
+    "pose": "pose of a pressed object relative to a reference press",
+    "track": "pose of a touched object in every frame of a camera or a recording",
+    "diagnose": "what is wrong with a frame or its calibration",
+    "export": "files that run without torchvts: TorchScript, ONNX and others",
+    "train": "train gs_sdk's network on presses of balls",
+    "evaluate": "score methods on presses, in tables",
+    "samples": "images of a real sensor to try the commands on",
+    "bench": "measure speed and error of all methods",
+}
+"""Subcommand: what it does. Its module has its name; it is imported only where it is asked for."""
+
+FAILED, USAGE_OR_INPUT, INTERRUPTED = 1, 2, 130
+"""Exit statuses: a bug in torchvts; a request or an input that cannot be used; Ctrl-C. A subcommand returns 0, or 1 where it did
+its job and something is wrong with the images (frames left out, a fault found, a pose not found)."""
+
+
+def overview() -> str:
+    """The text of ``torchvts --help``."""
+    rows = "\n".join(f"  {name:<12} {text}" for name, text in COMMANDS.items())
+    return f"""usage: torchvts COMMAND ...
+
+Camera images of visual-tactile sensors into depth, normals, contact and pose.
+
+{rows}
+
+example:
+  torchvts calibrate background.png --sensor gelsight_mini --out unit.safetensors
+  torchvts reconstruct unit.safetensors press.png --out out/press
+
+torchvts COMMAND --help explains a command; torchvts --version prints the version."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a subcommand.
+
+    Args:
+        argv: the words after ``torchvts``; None takes those of the process.
+    Returns:
+        The exit status: 0; 1 where frames were left out or a fault was found; 2 for a wrong request or input; 130 after Ctrl-C.
+    Example:
+        >>> main(["--version"])  # doctest: +ELLIPSIS
+        torchvts ...
+        0
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(overview())
+        return 0 if words else USAGE_OR_INPUT
+    if words[0] == "--version":
+        print(f"torchvts {__version__}")
+        return 0
+    debug = "--debug" in words
+    words = [word for word in words if word != "--debug"]
+    try:
+        with _plain_warnings():
+            return _run(words)
+    except KeyboardInterrupt:
+        return _say("stopped", INTERRUPTED, debug)
+    except BrokenPipeError:  # the reader of the output has gone, as head does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    except (OSError, ValueError, TypeError, ImportError, RuntimeError, MemoryError) as error:
+        return _say(f"error: {_one_line(error)}", USAGE_OR_INPUT, debug)
+    except Exception as error:
+        text = f"error: {type(error).__name__}: {_one_line(error)}: a bug in torchvts: please report what --debug prints"
+        return _say(text, FAILED, debug)
+
+
+def _run(words: list[str]) -> int:
+    name = words[0]
+    if name not in COMMANDS:
+        raise UsageError(f"expected a command ({', '.join(COMMANDS)}), got {name!r}{suggest(name, COMMANDS)}")
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")  # names of files may not be text
+    module = importlib.import_module(f"{__package__}.{name}")
+    arguments = make_parser(name, module).parse_intermixed_args(words[1:])
+    status: int = module.run(arguments)
+    return status
+
+
+def make_parser(name: str, module: ModuleType) -> Parser:
+    """The parser of a subcommand."""
+    parser = Parser(
+        prog=f"torchvts {name}",
+        usage=f"torchvts {name} {module.USAGE}",
+        description=module.__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    module.add_arguments(parser)
+    parser.add_argument("--debug", action="store_true", help=argparse.SUPPRESS)
+    return parser
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _say(text: str, status: int, debug: bool) -> int:
+    if debug:
+        traceback.print_exc()
+    print(f"torchvts: {text}", file=sys.stderr)
+    return status
+
+
+@contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Warnings as one line each, without the place in the code that raised them."""
+
+    def show(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        print(f"torchvts: warning: {' '.join(str(message).split())}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield

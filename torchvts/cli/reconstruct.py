@@ -1,0 +1,136 @@
+"""Depth of images, folders (with all below them) and videos, written into a folder. Stopped, the same command goes on.
+
+The first of the files is the calibration that torchvts calibrate wrote. With --sensor in its place the unit is calibrated
+first: from --background and --press, or from the first frames of a video, which must be without contact.
+Exit status 1 where a frame was left out.
+
+examples:
+  torchvts reconstruct unit.safetensors press.png --out out/press
+  torchvts reconstruct unit.safetensors folder/ --out out/all --cloud ply --mode precise
+  torchvts reconstruct video.avi --sensor gelsight_mini --out out/video
+  torchrun --standalone --nproc_per_node=4 -m torchvts reconstruct unit.safetensors folder/ --out out/all
+"""
+
+import argparse
+import csv
+import os
+from pathlib import Path
+
+from ..core.files import VIDEO_SUFFIXES, read_frames
+from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, Report, list_items, reconstruct_dataset
+from ..diagnose import Finding, diagnose
+from ..model import Calibration, Sensor
+from ..stream import calibrate_background, read_background, read_press_images
+from .options import add_background_frames, add_mode, add_out, add_pipeline, add_press, add_sensor
+from .parser import UsageError
+from .summary import SHOWN, left_out, print_calibration
+
+PASSED = (
+    "mode", "format", "cloud", "pictures", "every", "network", "device", "background_frames", "batch", "workers", "threads",
+    "overwrite", "strict",
+)  # fmt: skip
+"""Options that :func:`reconstruct_dataset` has under the same names."""
+
+USAGE = "CALIBRATION INPUT... --out FOLDER"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the subcommand."""
+    parser.add_argument(
+        "files", type=Path, nargs="+", metavar="FILE", help="the calibration, then the inputs; with --sensor, inputs only"
+    )
+    add_out(parser, "for the results; folders of an input are kept in it")
+    add_sensor(parser, "calibrate first: ")
+    parser.add_argument("--background", type=Path, nargs="+", metavar="IMAGE", help="to calibrate: without contact; or a video")
+    add_press(parser)
+    add_background_frames(parser)
+    add_mode(parser)
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="each N-th frame of a video, each N-th image")
+    add_pipeline(parser)
+    parser.add_argument("--format", choices=FORMATS, default="npz", help="npz if not given; video-npz: one file a video")
+    parser.add_argument("--cloud", choices=CLOUD_FORMATS, default="none", help="contact in mm, y up; obj is a surface")
+    parser.add_argument("--pictures", action=argparse.BooleanOptionalAction, help=f"by default for at most {PICTURES_UP_TO} frames")
+    parser.add_argument("--batch", type=int, default=8, metavar="N", help="frames that a loader process hands over at once (8)")
+    parser.add_argument("--workers", type=int, metavar="N", help="loader processes of each rank; up to 4 if not given")
+    parser.add_argument(
+        "--threads", type=int, default=1, metavar="N", help="of each rank (1); results depend on it in the last bits"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="begin anew, whatever --out holds")
+    parser.add_argument("--strict", action="store_true", help="stop at the first frame that cannot be used")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Reconstruct, and print a summary."""
+    calibration, inputs = split_files(arguments)
+    if calibration is None:
+        calibration = calibrate_first(arguments, inputs)
+    report = reconstruct_dataset(calibration, inputs, arguments.out, **{name: getattr(arguments, name) for name in PASSED})
+    if report.rank > 0:
+        return 0
+    print_report(report, arguments.out)
+    for finding in diagnose_first(calibration, inputs):
+        print(f"first frame: {finding}")
+    return 1 if report.failed else 0
+
+
+def split_files(arguments: argparse.Namespace) -> tuple[Path | None, list[Path]]:
+    """The calibration, if it is named, and the inputs."""
+    files = list(arguments.files)
+    if arguments.sensor is not None:
+        if files[0].suffix == ".safetensors":
+            raise UsageError(f"expected inputs only beside --sensor, which calibrates, got {files[0]}: leave one of them out")
+        return None, files
+    if arguments.background or arguments.press:
+        raise UsageError("--background, --press: they are to calibrate with --sensor, not beside a calibration file")
+    if len(files) < 2:
+        raise UsageError(f"expected a calibration file and an input, got {files[0]}: name both, or --sensor to calibrate")
+    return files[0], files[1:]
+
+
+def calibrate_first(arguments: argparse.Namespace, inputs: list[Path]) -> Path:
+    """Calibrate as ``torchvts stream`` does, and keep the file with the results."""
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        raise UsageError("--sensor: expected one process, got more: calibrate first, by torchvts calibrate, and give the file")
+    video = next((path for path in inputs if path.suffix.lower() in VIDEO_SUFFIXES), None)
+    if arguments.background is None and video is None:
+        raise UsageError(f"--background: expected images without contact, got none: {inputs[0]} is no video that begins with them")
+    unit = Sensor.load(arguments.sensor)
+    image = read_background(arguments.background or [video], unit, arguments.background_frames)
+    found = calibrate_background(image, unit, read_press_images(arguments.press, unit))
+    print_calibration(found.calibration)
+    path: Path = arguments.out / "calibration.safetensors"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    found.calibration.save(path)
+    return path
+
+
+def print_report(report: Report, out: Path) -> None:
+    """Print the deepest frames, what was left out, and where the results are."""
+    with (out / "frames.csv").open(encoding="utf-8", errors="replace", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    rows.sort(key=lambda row: -float(row["deepest_mm"]))
+    shown = rows[:SHOWN]
+    for row in shown:
+        print(f"{row['frame']}: deepest {float(row['deepest_mm']):.3f} mm, contact {float(row['contact_mm2']):.2f} mm2")
+    if len(rows) > SHOWN:
+        print(f"... the deepest {SHOWN} of {len(rows)}; contact in {sum(float(row['contact_mm2']) > 0 for row in rows)}")
+    for name, note in report.notes:
+        print(f"{name}: {note}")
+    for line in left_out("frame", report.failed):
+        print(line)
+    if report.failed:
+        print(f"{len(report.failed)} left out, all of them in {out / 'failed.csv'}")
+    before = f", {report.before} of them by an earlier run" if report.before else ""
+    print(f"wrote {report.rows} frames to {out}{before}; table in frames.csv, units in summary.json")
+
+
+def diagnose_first(calibration: Path, inputs: list[Path]) -> list[Finding]:
+    """What is wrong with the first frame, such as that it is from another unit; one that cannot be read is reported above."""
+    unit = Calibration.load(calibration)
+    try:
+        first = next(list_items(tuple(inputs) if len(inputs) > 1 else inputs[0]))
+        _, image = next(iter(read_frames(first.file)))
+        found = diagnose(None, unit.sensor.rectify(image[None])[0], unit)
+    except (OSError, ValueError, StopIteration):
+        return []
+    return [finding for finding in found if finding.severity != "note"]

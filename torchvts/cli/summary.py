@@ -1,0 +1,113 @@
+"""What a person reads of a calibration: the model, how good it is likely to be, what was left out; candidates on request."""
+
+from collections.abc import Iterator
+
+from ..model import Calibration, PointLights
+from ..model.report import CandidateRow, PressRow, Report
+from ..pipeline.confidence import expected_model_deg
+from ..stream import NOT_METRIC, use_calibration
+
+SHOWN = 5
+"""Of a list, so many lines are printed."""
+
+BY = {
+    "given": "given",
+    "sensor_file": "positions from the sensor file",
+    "background": "fitted to the image without contact",
+    "prior": "the prior of the sensor's type, by this unit's background",
+    "touches": "fitted to touches",
+    "presses": "fitted to presses",
+    "stand_in": "directions of the sensor file's lights, as a stand-in",
+}
+"""Where a model comes from, in words."""
+
+
+def print_calibration(calibration: Calibration, candidates: bool = False) -> None:
+    """Print a few lines about a calibration.
+
+    Args:
+        calibration: of the unit.
+        candidates: print all models that were considered, the lights and all presses, too.
+    """
+    report, sensor = calibration.report, calibration.sensor
+    size = f"{sensor.height} x {sensor.width} px, {sensor.mm_per_pixel:g} mm per pixel, gamma {sensor.exponent:g}"
+    print(f"sensor: {sensor.name}, {size}")
+    kind = "point lights" if report["model"] == "point_lights" else "response field"
+    reason = f": {report['reason']}" if "reason" in report else ""
+    print(f"chosen: {kind}, {BY[report['source']]}{reason}")
+    print(f"expected: {expected(calibration)}")
+    for line in left_out("press", [(row["name"], row.get("reason", "")) for row in report.get("presses", []) if not row["used"]]):
+        print(line)
+    if candidates:
+        print_candidates(report)
+        if calibration.lights is not None:
+            print_lights(calibration.lights, report)
+        if "presses" in report:
+            print_presses(report["presses"])
+
+
+def expected(calibration: Calibration) -> str:
+    """How good depth is likely to be, from the held-out score, the record of the prior, or the spread of the lights."""
+    report = calibration.report
+    if not use_calibration(calibration).metric:
+        return NOT_METRIC
+    if report["model"] == "point_lights":
+        spread = report.get("direction_std_deg")
+        if spread is None:
+            return "as good as the positions of the lights that were given; presses of a ball would measure it"
+        return f"directions of the lights to {max(spread):.2f} degrees (standard deviation of the worst)"
+    degrees = f"normals within a contact to about {expected_model_deg(calibration):.1f} degrees"
+    if report.get("held_out_deg"):
+        used = sum(row["used"] for row in report.get("presses", []))
+        return f"{degrees}, by scoring each of {used} presses with the others"
+    if report["source"] == "prior":
+        return f"{degrees}, the prior's record on other units of its type; presses of a ball would measure this unit"
+    return f"{degrees}, as usual from so few; more presses of a ball would measure it"
+
+
+def left_out(what: str, rows: list[tuple[str, str]]) -> Iterator[str]:
+    """A line for each of the first that were left out, and how many more there are."""
+    for name, reason in rows[:SHOWN]:
+        yield f"left out: {what} {name}: {reason}"
+    if len(rows) > SHOWN:
+        yield f"left out: {len(rows) - SHOWN} more"
+
+
+def print_candidates(report: Report) -> None:
+    """Print a row for each model that was considered."""
+    print("\n| model | family | passes | parameters | deg | misfit | note |\n|---|---|---|---|---|---|---|")
+    for row in report.get("candidates", []):
+        print(_candidate(row))
+    print("deg: mean angle on held-out presses; for point lights without presses the standard deviation of the worst direction")
+    print("misfit: smooth relative structure of the image that the lights leave unexplained")
+
+
+def _candidate(row: CandidateRow) -> str:
+    score = row.get("score_deg")
+    misfit = f"{row['misfit']:.1%}" if "misfit" in row else ""
+    family = row.get("family", "") + (f", gamma {row['gamma']:g}" if row.get("gamma", 1.0) != 1.0 else "")
+    angle = "" if score is None else f"{score:.2f}"
+    cells = (row["model"], family, row.get("passes", ""), row.get("parameters", ""), angle, misfit, row.get("note", ""))
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def print_lights(lights: PointLights, report: Report) -> None:
+    """Print where the lights are."""
+    print("\n| light | x mm | y mm | z mm | direction +- deg | gloss |\n|---|---|---|---|---|---|")
+    position, gloss = lights.position_mm.tolist(), lights.gloss.tolist()
+    for j, name in enumerate("RGB"):
+        spread = f"{report['direction_std_deg'][j]:.2f}" if "direction_std_deg" in report else "given"
+        print(f"| {name} | " + " | ".join(f"{v:.2f}" for v in position[j]) + f" | {spread} | {gloss[j]:.3f} |")
+
+
+def print_presses(presses: list[PressRow]) -> None:
+    """Print a row for each press."""
+    print("\n| press | center px | contact radius px | error deg | times as wide as given | |\n|---|---|---|---|---|---|")
+    for press in presses:
+        center = ", ".join(f"{v:.1f}" for v in press["center_px"]) if "center_px" in press else ""
+        radius = f"{press['contact_radius_px']:.1f}" if "contact_radius_px" in press else ""
+        off = f"{press['error_deg']:.1f}" if "error_deg" in press else ""
+        wide = f"{1.0 / max(press['gain'], 1e-3):.2f}" if "gain" in press else ""
+        note = "" if press["used"] else f"left out: {press.get('reason', '')}"
+        print(f"| {press['name']} | {center} | {radius} | {off} | {wide} | {note} |")
+    print("error, times as wide: slopes by the field of the other presses, or by the prior, compared with the ball's")

@@ -1,0 +1,53 @@
+"""Train gs_sdk's RGBXY network on presses of balls; --network of the other commands takes the file.
+
+FOLDER has gs_sdk's layout (catalog.csv, background.png, N/gelsight.png). Centers and contact radii come from label.npz or
+labels.csv, otherwise from calibration. Whole presses are held out; the epoch with the least error on them is written.
+
+example:
+  torchvts train presses/ --sensor gelsight_mini --out network.safetensors
+"""
+
+import argparse
+from pathlib import Path
+
+from ..calibration import read_presses
+from ..evaluation.presses import train_network
+from ..model import Sensor
+from .options import add_sensor
+from .parser import UsageError
+
+USAGE = "FOLDER --sensor NAME --out FILE"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the subcommand."""
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="presses of balls, in gs_sdk's layout")
+    add_sensor(parser)
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="network to write, .safetensors")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of weights, order and held-out presses (0)")
+    parser.add_argument(
+        "--max-epochs", type=int, default=60, metavar="N", help="at most (60); stops where held-out error does not fall"
+    )
+    parser.add_argument("--blur-px", type=float, default=1.0, metavar="PX", help="blur of the images, kept in the file (1.0)")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Train, write the network, and print its errors."""
+    if arguments.sensor is None:
+        raise UsageError("expected --sensor")
+    if arguments.out.suffix != ".safetensors":
+        raise UsageError(f"--out: expected a name ending in .safetensors, got {arguments.out}")
+    sensor = Sensor.load(arguments.sensor)
+    background, presses = read_presses(arguments.folder)
+    fit = train_network(
+        background, presses, sensor, arguments.blur_px, arguments.seed, max_epochs=arguments.max_epochs, progress=True
+    )
+    training, held_out = fit.history[fit.best_epoch]
+    fit.module.save(arguments.out)
+    print(f"{len(presses)} presses, {sum(p.numel() for p in fit.module.parameters())} weights, seed {arguments.seed}")
+    print(f"RMS error of the slopes' angles: training {training:.2f} deg, held out {held_out:.2f} deg")
+    print(fit.message)
+    print(
+        f"wrote {arguments.out}: vts.DepthPipeline.from_gs_sdk({str(arguments.out)!r}, background, sensor) makes a pipeline of it"
+    )
+    return 0

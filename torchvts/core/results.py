@@ -1,0 +1,189 @@
+"""Result files: depth, normals and masks of a frame or of a whole video as one npz, with units, pitch and calibration."""
+
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .checks import check_path
+from .files import write_atomically
+from .frame import DepthOutput
+
+Array = np.ndarray[Any, Any]
+
+UNITS = {
+    "depth_mm": "mm above the undeformed skin, towards the camera: positive where an object presses",
+    "gradient": "mm per mm, (d depth / dx, d depth / dy), x right, y down",
+    "normals": "unit vectors, x right, y down, z to the camera",
+    "contact": "where the object touches the skin",
+    "deformed": "where the skin has moved",
+    "mm_per_pixel": "mm",
+}
+"""What the arrays of a result file are; the file carries it."""
+
+MAPS = {"depth_mm": (1, "f4"), "normals": (3, "f4"), "gradient": (2, "f4"), "contact": (1, "?"), "deformed": (1, "?")}
+"""Channels and type of each array: (B, channels, H, W) in a :class:`Result`; in a file (H, W) where there is one channel."""
+
+FORMAT = 1
+"""Version of the layout."""
+
+MOST_PACKED = 1100
+"""Deflate makes a file smaller by 1032 at most; one that claims more is damaged."""
+
+
+class Result(NamedTuple):
+    """What a result file holds.
+
+    Attributes:
+        depth_mm: (B, 1, H, W), mm; B is 1 for a frame, the number of frames for a video.
+        normals: (B, 3, H, W), unit vectors, x right, y down, z to the camera.
+        gradient: (B, 2, H, W), (d depth / dx, d depth / dy), mm per mm.
+        contact: (B, 1, H, W) bool, where the object touches the skin.
+        deformed: (B, 1, H, W) bool, where the skin has moved.
+        mm_per_pixel: pitch, mm.
+        units: of each array, in words.
+        calibration: file name of the calibration.
+        sensor: name of the sensor.
+        frames: name of each frame.
+    """
+
+    depth_mm: Tensor
+    normals: Tensor
+    gradient: Tensor
+    contact: Tensor
+    deformed: Tensor
+    mm_per_pixel: float
+    units: Mapping[str, str]
+    calibration: str
+    sensor: str
+    frames: Sequence[str]
+
+
+def write_result(path: str | Path, output: DepthOutput, mm_per_pixel: float, calibration: str, sensor: str, frame: str) -> None:
+    """Write one frame as npz, compressed; the same values give the same bytes.
+
+    Args:
+        path: the file, ending in .npz.
+        output: of the pipeline, of one frame.
+        mm_per_pixel: pitch, mm.
+        calibration: file name of the calibration.
+        sensor: name of the sensor.
+        frame: name of the frame.
+    """
+    maps = zip(MAPS, (output.depth_mm, output.normal, output.gradient, output.contact, output.deformed))
+    arrays = {name: values[0].detach().cpu().numpy().astype(MAPS[name][1]) for name, values in maps}
+    arrays = {name: values[0] if MAPS[name][0] == 1 else values for name, values in arrays.items()}
+    facts = {"mm_per_pixel": np.float64(mm_per_pixel), "frames": np.array([frame])}
+    texts = {"calibration": calibration, "sensor": sensor, "units": json.dumps(UNITS)}
+    with write_atomically(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        for name, values in {**arrays, **facts, **{name: np.array(text) for name, text in texts.items()}}.items():
+            _write_array(archive, name, [np.asarray(values)], None)
+        _write_array(archive, "format", [np.asarray(FORMAT)], None)
+
+
+def join_results(path: str | Path, parts: Sequence[Path]) -> None:
+    """Write the frames of a video as one npz whose arrays have the frames first; one frame is in memory at a time.
+
+    Args:
+        path: the file, ending in .npz.
+        parts: files of :func:`write_result`, in order.
+    """
+    with write_atomically(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        with np.load(parts[0]) as first:
+            shared = {name: first[name] for name in ("mm_per_pixel", "calibration", "sensor", "units", "format")}
+        for name, values in shared.items():
+            _write_array(archive, name, [values], None)
+        _write_array(archive, "frames", [np.concatenate([_part(part, "frames") for part in parts])], None)
+        for name in MAPS:
+            _write_array(archive, name, (_part(part, name) for part in parts), len(parts))
+
+
+def _part(path: Path, name: str) -> Array:
+    with np.load(path) as stored:
+        values: Array = stored[name]
+    return values
+
+
+def _write_array(archive: zipfile.ZipFile, name: str, arrays: Any, count: int | None) -> None:
+    """One array of an npz; with ``count``, that many arrays of one shape along a new first axis."""
+    entry = zipfile.ZipInfo(f"{name}.npy")  # of a fixed date: the same values give the same bytes
+    entry.compress_type = zipfile.ZIP_DEFLATED
+    entry._compresslevel = 1  # type: ignore[attr-defined]
+    with archive.open(entry, "w", force_zip64=True) as stream:
+        for number, values in enumerate(arrays):
+            if number == 0:
+                shape = values.shape if count is None else (count, *values.shape)
+                head = {"descr": np.lib.format.dtype_to_descr(values.dtype), "fortran_order": False, "shape": shape}
+                np.lib.format.write_array_header_1_0(stream, head)
+            stream.write(np.ascontiguousarray(values).tobytes())
+
+
+def read_result(path: str | Path) -> Result:
+    """Read a result file of ``torchvts reconstruct --format npz``, of one frame or of a video. Nothing is unpickled.
+
+    Args:
+        path: the .npz file.
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not such a file, or a damaged one.
+    Example:
+        >>> import tempfile
+        >>> flat, mask = torch.zeros(1, 1, 4, 6), torch.zeros(1, 1, 4, 6, dtype=torch.bool)
+        >>> output = DepthOutput(flat, flat.expand(1, 2, 4, 6), torch.ones(1, 3, 4, 6), mask, mask)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_result(f"{folder}/0.npz", output, 0.05, "unit.safetensors", "rig", "0.png")
+        ...     result = read_result(f"{folder}/0.npz")
+        >>> result.depth_mm.shape, result.mm_per_pixel, result.frames
+        (torch.Size([1, 1, 4, 6]), 0.05, ['0.png'])
+    """
+    path = check_path("path", path)
+    if not path.is_file():
+        hint = ": name one of its .npz files" if path.is_dir() else ""
+        raise FileNotFoundError(f"{path}: no such result file{hint}")
+    if path.suffix.lower() != ".npz":
+        raise ValueError(f"{path}: expected a name ending in .npz, got {path.suffix!r}: reconstruct with --format npz")
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            _check_claims(path, stored)
+            return _result(path, stored)
+    except (OSError, ValueError, KeyError, EOFError, MemoryError, RuntimeError, NotImplementedError, zipfile.BadZipFile) as error:
+        if str(error).startswith(f"{path}: "):
+            raise
+        raise ValueError(f"{path}: not a result file, or cut short: {' '.join(str(error).split())[:200]}") from error
+
+
+def _check_claims(path: Path, stored: Any) -> None:
+    """Refuse a file whose directory claims more than it can hold, before anything of that size is made."""
+    claimed = sum(entry.file_size for entry in stored.zip.infolist())
+    if claimed > MOST_PACKED * path.stat().st_size:
+        raise ValueError(f"{path}: damaged: {path.stat().st_size} bytes cannot hold the {claimed} that it claims")
+
+
+def _result(path: Path, stored: Any) -> Result:
+    missing = [name for name in (*MAPS, "mm_per_pixel", "units", "calibration", "sensor", "frames") if name not in stored]
+    if missing:
+        raise ValueError(f"{path}: expected a result of torchvts reconstruct, got an npz without {', '.join(missing)}")
+    frames = [str(name) for name in stored["frames"]]
+    maps: dict[str, Tensor] = {}
+    for name, (channels, kind) in MAPS.items():
+        values = stored[name]
+        values = values.reshape(-1, channels, *values.shape[-2:]) if values.ndim >= 2 else values
+        size = maps["depth_mm"].shape[2:] if maps else values.shape[2:]
+        if values.shape != (len(frames), channels, *size) or values.dtype != np.dtype(kind):
+            wanted = f"{len(frames)} frames of {channels} x H x W, {np.dtype(kind)}"
+            raise ValueError(f"{path}: {name}: expected {wanted}, got {stored[name].shape}, {values.dtype}: damaged")
+        maps[name] = torch.from_numpy(values)
+    units = json.loads(str(stored["units"]))
+    return Result(
+        **maps,
+        mm_per_pixel=float(stored["mm_per_pixel"]),
+        units=units,
+        calibration=str(stored["calibration"]),
+        sensor=str(stored["sensor"]),
+        frames=frames,
+    )

@@ -1,0 +1,60 @@
+"""Writes points and surfaces as PLY, PCD and OBJ; nothing beyond NumPy is needed."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from ..core.files import write_atomically
+from ..core.geometry import depth_to_points
+
+Array = np.ndarray[Any, Any]
+
+
+def write_ply(path: Path, points: Array, normals: Array | None) -> None:
+    """Points (N, 3) and normals (N, 3) as binary PLY, float64."""
+    columns = [points] if normals is None else [points, normals]
+    names = ("x", "y", "z", "nx", "ny", "nz")[: 3 * len(columns)]
+    head = ["ply", "format binary_little_endian 1.0", "comment mm, x right, y up, z to the camera", f"element vertex {len(points)}"]
+    head += [*(f"property double {name}" for name in names), "end_header", ""]
+    _write(path, "\n".join(head).encode() + np.hstack(columns).astype("<f8").tobytes())
+
+
+def write_pcd(path: Path, points: Array, normals: Array | None) -> None:
+    """Points (N, 3) and normals (N, 3) as binary PCD, float32."""
+    columns = [points] if normals is None else [points, normals]
+    names = ("x", "y", "z", "normal_x", "normal_y", "normal_z")[: 3 * len(columns)]
+    head = ["# .PCD v0.7 - Point Cloud Data file format", "VERSION 0.7", f"FIELDS {' '.join(names)}"]
+    head += [f"{key} {' '.join(value * len(names))}" for key, value in (("SIZE", ["4"]), ("TYPE", ["F"]), ("COUNT", ["1"]))]
+    head += [f"WIDTH {len(points)}", "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {len(points)}", "DATA binary", ""]
+    _write(path, "\n".join(head).encode() + np.hstack(columns).astype("<f4").tobytes())
+
+
+def write_obj(path: Path, depth_mm: Tensor, normal: Tensor, contact: Tensor, mm_per_pixel: float) -> None:
+    """The contact as a surface in Wavefront OBJ: mm, x right, y up, z to the camera.
+
+    Args:
+        path: the file.
+        depth_mm: one frame, (1, 1, H, W), mm.
+        normal: (1, 3, H, W), of the pipeline.
+        contact: (1, 1, H, W) bool; four neighbours in contact make two triangles.
+        mm_per_pixel: pitch, mm.
+    """
+    inside = contact[0, 0].cpu().numpy()
+    points = depth_to_points(depth_mm, mm_per_pixel, contact).double().cpu().numpy()
+    normals = (normal[0].permute(1, 2, 0)[contact[0, 0]] * normal.new_tensor([1.0, -1.0, 1.0])).double().cpu().numpy()
+    index = np.cumsum(inside.ravel()).reshape(inside.shape)  # from 1, as OBJ counts
+    block = inside[:-1, :-1] & inside[1:, :-1] & inside[:-1, 1:] & inside[1:, 1:]
+    a, b, c, d = (part[block] for part in (index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]))
+    faces = np.concatenate((np.stack((a, b, d), 1), np.stack((a, d, c), 1)))  # counter-clockwise from the camera
+    lines = ["# torchvts: mm, x right, y up, z to the camera"]
+    lines += [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in points.tolist()]
+    lines += [f"vn {x:.6f} {y:.6f} {z:.6f}" for x, y, z in normals.tolist()]
+    lines += [f"f {i}//{i} {j}//{j} {k}//{k}" for i, j, k in faces.tolist()]
+    _write(path, ("\n".join(lines) + "\n").encode())
+
+
+def _write(path: Path, data: bytes) -> None:
+    with write_atomically(path) as temporary:
+        temporary.write_bytes(data)

@@ -1,6 +1,7 @@
 """Pose of a touched object in every frame of a camera or a recording, from where it first touches: poses.csv, axes on the image.
 
-The first frames must be without contact. The reference is the first frame with a contact of --least-mm2, or the image --reference. Ctrl-C ends it and finishes the files. Exit status 1 where the object was lost.
+The first frames must be without contact. The reference is the first frame with a contact of --least-mm2, or the image --reference.
+Ctrl-C ends it and finishes the files. Exit status 1 where the object was lost.
 
 examples:
   torchvts track --source video.avi --sensor gelsight_wedge --out out/track
@@ -28,7 +29,18 @@ from .parser import UsageError
 USAGE = "--source SOURCE (--sensor NAME | --calibration FILE) --out FOLDER"
 
 COLUMNS = ("frame", "time_s", *(f"T{row}{column}" for row in range(3) for column in range(4)))
-QUALITY = ("converged", "lost", "ambiguous", "alternatives", "std_x_mm", "std_y_mm", "std_z_mm", "keyframe", "drift_deg", "drift_mm")
+QUALITY = (
+    "converged",
+    "lost",
+    "ambiguous",
+    "alternatives",
+    "std_x_mm",
+    "std_y_mm",
+    "std_z_mm",
+    "keyframe",
+    "drift_deg",
+    "drift_mm",
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

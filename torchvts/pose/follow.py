@@ -14,6 +14,9 @@ from .keyframe import Grids, Keyframe
 COARSE_STEPS, SOME_STEPS = 6, 6
 """Largest number of steps on the coarse grid, and with some pixels of the fine one."""
 
+MOST_STD_DEG, MOST_STD_MM = 1.0, 0.15
+"""Standard deviations of a motion, as a turn and as a shift, above which it is called unknown."""
+
 
 class Followed(NamedTuple):
     """A frame registered to a keyframe.
@@ -27,8 +30,6 @@ class Followed(NamedTuple):
         free: (6, k), scaled twists that the common contact does not determine.
         names: of these motions, in the frame's axes.
         covariance: (6, 6) of a small motion after the pose, rad and mm.
-        std_deg: standard deviation of the rotation, of what the contact determines of it, degrees.
-        std_mm: the same of the position of the contact, mm.
     """
 
     pose: Array
@@ -39,8 +40,6 @@ class Followed(NamedTuple):
     free: Array
     names: list[str]
     covariance: Array
-    std_deg: float
-    std_mm: float
 
     @property
     def agrees(self) -> bool:
@@ -63,13 +62,12 @@ def follow(keyframe: Keyframe, frame: Grids, starts: list[Array]) -> Followed:
     cost = (forth.cost * forth.compared + back.cost * back.compared) / compared
     fitness = (forth.fitness * forth.compared + back.fitness * back.compared) / compared
     overlap = max(forth.compared / len(keyframe.coarse.rows), back.compared / max(len(back_pixels.rows), 1))
-    return Followed(pose, fine, fitness, overlap, cost, free, names, *_covariance(keyframe.many, fine, pose, free))
+    return Followed(pose, fine, fitness, overlap, cost, free, names, _covariance(keyframe.many, fine, pose, free))
 
 
-def common_share(keyframe: Keyframe, frame: Grids, pose: Array) -> float:
-    """Share of the smaller contact that both have in common under a pose (4, 4)."""
-    sums = sum_residuals(frame.coarse, keyframe.coarse, pose, SLOPE_NOISE)
-    return sums.count / max(min(len(keyframe.coarse.rows), frame.count), 1)
+def common_share(keyframe: Keyframe, frame: Grids, sums: Sums, pixels: Pixels) -> float:
+    """Share of the smaller contact that both have in common, by the sums over fine pixels of the keyframe."""
+    return sums.used / len(pixels.rows) * keyframe.touching / max(min(keyframe.touching, frame.touching), 1)
 
 
 def orthonormal(pose: Array) -> Array:
@@ -104,28 +102,37 @@ def _pixels(field: Field) -> Pixels:
 
 
 def _unknown(keyframe: Keyframe, coarse: Sums, pose: Array) -> tuple[Array, list[str]]:
-    """Motions that the common contact does not determine; those of the whole keyframe, if these are more."""
-    information = torch.from_numpy(coarse.matrix * ((coarse.noise / SLOPE_NOISE) ** 2 / max(coarse.count, 1)))
-    free, shifts = free_directions(information, keyframe.bias, LEAST_INFORMATION)
-    if keyframe.held.shape[1] > free.shape[1]:
-        free = torch.from_numpy(keyframe.held)
-        shifts = _pure_shifts(free)
-    if free.shape[1] == 0:
-        return np.zeros((6, 0)), []
-    turn = torch.from_numpy(pose[:3, :3].copy())
-    return free.numpy(), name_directions(torch.cat((turn @ free[:3], turn @ free[3:])), turn @ shifts)
+    """Motions that the common contact does not determine, or not well enough: scaled twists (6, k), and their names.
+
+    Three reasons: the surface slides on itself; the whole keyframe does, or may roll; or the common contact is so small or so
+    faint that its noise hides the motion.
+    """
+    information = torch.from_numpy(coarse.matrix * ((coarse.noise / SLOPE_NOISE) ** 2 / max(coarse.used, 1)))
+    free, _ = free_directions(information, keyframe.bias, LEAST_INFORMATION)
+    wanted = np.concatenate((keyframe.coarse.units[:3] ** -1 * math.radians(MOST_STD_DEG), np.full(3, MOST_STD_MM)))
+    alike = max(1.0, ALIKE_PIXELS / keyframe.times[1] ** 2)
+    matrix = coarse.matrix * wanted[:, None] * wanted / (alike * (max(coarse.slope_noise, 1e-3) / coarse.noise) ** 2)
+    precision, directions = np.linalg.eigh(matrix)  # 1 where the standard deviation is as wanted
+    vague = directions[:, precision < 1.0] * wanted[:, None]
+    vague /= np.maximum(np.linalg.norm(vague, axis=0), 1e-12)
+    u, size, _ = np.linalg.svd(np.hstack((free.numpy(), keyframe.held, vague)), full_matrices=False)
+    held: Array = u[:, size > 0.5]
+    if held.shape[1] == 0:
+        return held, []
+    turned = torch.from_numpy(np.vstack((pose[:3, :3] @ held[:3], pose[:3, :3] @ held[3:])))
+    return held, name_directions(turned, _pure_shifts(turned))
 
 
 def _pure_shifts(free: torch.Tensor) -> torch.Tensor:
-    """The combinations (3, m) of motions (6, k) that do not turn."""
+    """The combinations (3, m) of motions (6, k) that hardly turn."""
     _, size, vh = torch.linalg.svd(free[:3])
     size = torch.cat((size, size.new_zeros(len(vh) - len(size))))
-    shifts: torch.Tensor = torch.nn.functional.normalize((free @ vh[size < 0.1].T)[3:], dim=0)
+    shifts: torch.Tensor = torch.nn.functional.normalize((free @ vh[size < 0.3].T)[3:], dim=0)
     return shifts
 
 
-def _covariance(pixels: Pixels, fine: Sums, pose: Array, free: Array) -> tuple[Array, float, float]:
-    """Covariance of a small motion after the pose, and the standard deviations of what the contact determines, degrees and mm.
+def _covariance(pixels: Pixels, fine: Sums, pose: Array, free: Array) -> Array:
+    """Covariance of a small motion after the pose.
 
     Residuals are alike over some pixels, and an error of the height is alike over all of them.
     """
@@ -133,10 +140,9 @@ def _covariance(pixels: Pixels, fine: Sums, pose: Array, free: Array) -> tuple[A
     scaled = np.linalg.pinv(known @ fine.matrix @ known, rcond=1e-9, hermitian=True)
     scaled *= ALIKE_PIXELS * (fine.slope_noise / fine.noise) ** 2
     scaled[5, 5] += fine.depth_noise**2
-    std_deg = math.degrees(math.sqrt(float(np.square(pixels.units[:3]) @ scaled.diagonal()[:3])))
-    std_mm = math.sqrt(float(scaled.diagonal()[3:].sum()))
     scaled += free @ free.T * UNKNOWN_VARIANCE
     to_origin = np.diag(pixels.units)
     to_origin[3:, :3] = cross(pixels.center) @ to_origin[:3, :3]
     after = adjoint(pose) @ to_origin
-    return after @ scaled @ after.T, std_deg, std_mm
+    covariance: Array = after @ scaled @ after.T
+    return covariance

@@ -147,8 +147,8 @@ def test_another_object_is_not_taken():
 
 
 def test_a_long_way_takes_keyframes_and_closes_the_loop():
-    way = [0.5 * k for k in range(25)] + [12.0 - 0.5 * k for k in range(1, 25)]
-    poses = [objects.pose(0.2 * x, (-x, 0.3 * math.sin(x)), 0.35) for x in way]
+    way = [0.6 * k for k in range(33)] + [19.2 - 0.6 * k for k in range(1, 33)]
+    poses = [objects.pose(0.3 * x, (-x, 0.3 * math.sin(x)), 0.35) for x in way]
     tracker = vts.PoseTracker(press(waves, poses[0]), PITCH)
     drift = []
     for pose in poses[1:]:
@@ -166,7 +166,7 @@ def test_a_closed_loop_spreads_its_contradiction(keyframe):
         return motion(torch.tensor(values, dtype=torch.float64)).numpy()
 
     turn = twist(0.0, 0.0, 0.1, 1.0, 0.0, 0.0)
-    graph, covariance = KeyframeGraph(keyframe), 1e-6 * np.eye(6)
+    graph, covariance = KeyframeGraph(keyframe), np.diag([1e-6] * 3 + [1.0] * 3)
     for k in range(3):
         graph.add(keyframe, k, turn, covariance)
     assert np.allclose(graph.poses[3], turn @ turn @ turn)
@@ -206,7 +206,7 @@ def test_derivatives_are_those_of_the_residuals(keyframe):
         scaled[axis] = 0.01
         pose = motion(torch.from_numpy(scaled * pixels.units), torch.from_numpy(pixels.center)).numpy()
         step = solve_step(sum_residuals(frame.fine, pixels, pose, 0.05))
-        assert step == pytest.approx(-scaled, abs=2e-3)
+        assert step == pytest.approx(-scaled, abs=3e-3)  # derivatives are smoothed
 
 
 def test_held_motions_get_no_step():

@@ -11,7 +11,7 @@ from .ambiguity import ALIKE_PIXELS, LEAST_INFORMATION, UNKNOWN_VARIANCE, free_d
 from .inverse import Array, Field, Pixels, Sums, refine, sum_residuals
 from .keyframe import Grids, Keyframe
 
-COARSE_STEPS, SOME_STEPS = 6, 6
+COARSE_STEPS, SOME_STEPS = 8, 6
 """Largest number of steps on the coarse grid, and with some pixels of the fine one."""
 
 MOST_STD_DEG, MOST_STD_MM = 1.0, 0.15
@@ -48,13 +48,28 @@ class Followed(NamedTuple):
 
 
 def follow(keyframe: Keyframe, frame: Grids, starts: list[Array]) -> Followed:
-    """Register a frame to a keyframe from the best of several poses: on the coarse grid, on some pixels, on many of them."""
-    costs = [sum_residuals(frame.coarse, keyframe.coarse, start, SLOPE_NOISE).cost for start in starts]
-    start = starts[int(np.argmin(costs))]
+    """Register a frame to a keyframe from the most likely of several poses, and from the others if that leads nowhere."""
+    order = sorted(starts, key=lambda start: sum_residuals(frame.coarse, keyframe.coarse, start, SLOPE_NOISE).cost)
+    first = _follow_from(keyframe, frame, order[0])
+    if not first.agrees:
+        for start in order[1:]:
+            other = _follow_from(keyframe, frame, start)
+            if other.agrees:
+                return other
+    return first
+
+
+def _follow_from(keyframe: Keyframe, frame: Grids, start: Array) -> Followed:
+    """Refine one pose on the coarse grid, on some pixels, and on many of them, and score it."""
     pose, coarse = refine(frame.coarse, keyframe.coarse, start, COARSE_STEPS, 2.0 * SLOPE_NOISE, keyframe.held, 0.02)
-    free, names = _unknown(keyframe, coarse, pose)
-    pose, some = refine(frame.fine, keyframe.some, pose, SOME_STEPS, SLOPE_NOISE, free, 2e-3)
-    pose, fine = refine(frame.fine, keyframe.many, pose, 1, 1.5 * max(some.slope_noise, 0.01), free)
+    unknown = _sliding(keyframe, coarse)
+    refined, some = refine(frame.fine, keyframe.some, pose, SOME_STEPS, SLOPE_NOISE, unknown.motions, 2e-3)
+    vague = _vague(keyframe, some)
+    if vague.motions.shape[1] > 0:
+        unknown = _joined(unknown, vague)
+        refined, some = refine(frame.fine, keyframe.some, pose, SOME_STEPS, SLOPE_NOISE, unknown.motions, 2e-3)
+    free = unknown.motions
+    pose, fine = refine(frame.fine, keyframe.many, refined, 1, 1.5 * max(some.slope_noise, 0.01), free)
     forth = sum_residuals(frame.coarse, keyframe.coarse, pose, SLOPE_NOISE)
     back_pixels = _pixels(frame.coarse)
     back = sum_residuals(keyframe.grids.coarse, back_pixels, np.linalg.inv(pose), SLOPE_NOISE)
@@ -62,7 +77,7 @@ def follow(keyframe: Keyframe, frame: Grids, starts: list[Array]) -> Followed:
     cost = (forth.cost * forth.compared + back.cost * back.compared) / compared
     fitness = (forth.fitness * forth.compared + back.fitness * back.compared) / compared
     overlap = max(forth.compared / len(keyframe.coarse.rows), back.compared / max(len(back_pixels.rows), 1))
-    return Followed(pose, fine, fitness, overlap, cost, free, names, _covariance(keyframe.many, fine, pose, free))
+    return Followed(pose, fine, fitness, overlap, cost, free, _names(unknown, pose), _covariance(keyframe.many, fine, pose, free))
 
 
 def common_share(keyframe: Keyframe, frame: Grids, sums: Sums, pixels: Pixels) -> float:
@@ -101,34 +116,51 @@ def _pixels(field: Field) -> Pixels:
     return Pixels(rows, np.zeros(3), np.ones(6))
 
 
-def _unknown(keyframe: Keyframe, coarse: Sums, pose: Array) -> tuple[Array, list[str]]:
-    """Motions that the common contact does not determine, or not well enough: scaled twists (6, k), and their names.
+class _Unknown(NamedTuple):
+    """Scaled twists (6, k) that are not determined, and those among them that are pure shifts (3, m); orthonormal columns."""
 
-    Three reasons: the surface slides on itself; the whole keyframe does, or may roll; or the common contact is so small or so
-    faint that its noise hides the motion.
-    """
+    motions: Array
+    shifts: Array
+
+
+def _sliding(keyframe: Keyframe, coarse: Sums) -> _Unknown:
+    """Motions under which the common contact slides on itself, by its information, and those that the keyframe may roll by."""
     information = torch.from_numpy(coarse.matrix * ((coarse.noise / SLOPE_NOISE) ** 2 / max(coarse.used, 1)))
-    free, _ = free_directions(information, keyframe.bias, LEAST_INFORMATION)
-    wanted = np.concatenate((keyframe.coarse.units[:3] ** -1 * math.radians(MOST_STD_DEG), np.full(3, MOST_STD_MM)))
-    alike = max(1.0, ALIKE_PIXELS / keyframe.times[1] ** 2)
-    matrix = coarse.matrix * wanted[:, None] * wanted / (alike * (max(coarse.slope_noise, 1e-3) / coarse.noise) ** 2)
-    precision, directions = np.linalg.eigh(matrix)  # 1 where the standard deviation is as wanted
-    vague = directions[:, precision < 1.0] * wanted[:, None]
-    vague /= np.maximum(np.linalg.norm(vague, axis=0), 1e-12)
-    u, size, _ = np.linalg.svd(np.hstack((free.numpy(), keyframe.held, vague)), full_matrices=False)
-    held: Array = u[:, size > 0.5]
-    if held.shape[1] == 0:
-        return held, []
-    turned = torch.from_numpy(np.vstack((pose[:3, :3] @ held[:3], pose[:3, :3] @ held[3:])))
-    return held, name_directions(turned, _pure_shifts(turned))
+    free, shifts = free_directions(information, keyframe.bias, LEAST_INFORMATION)
+    found = _Unknown(free.numpy(), shifts.numpy())
+    return _joined(found, _Unknown(keyframe.held, shifts.numpy())) if keyframe.held.shape[1] > 0 else found
 
 
-def _pure_shifts(free: torch.Tensor) -> torch.Tensor:
-    """The combinations (3, m) of motions (6, k) that hardly turn."""
-    _, size, vh = torch.linalg.svd(free[:3])
-    size = torch.cat((size, size.new_zeros(len(vh) - len(size))))
-    shifts: torch.Tensor = torch.nn.functional.normalize((free @ vh[size < 0.3].T)[3:], dim=0)
-    return shifts
+def _vague(keyframe: Keyframe, some: Sums) -> _Unknown:
+    """Motions whose standard deviation is too large, because the common contact is small or faint."""
+    wanted = np.concatenate((math.radians(MOST_STD_DEG) / keyframe.some.units[:3], np.full(3, MOST_STD_MM)))
+    alike = max(1.0, ALIKE_PIXELS * len(keyframe.some.rows) / keyframe.touching)
+    matrix = some.matrix * wanted[:, None] * wanted / (alike * (max(some.slope_noise, 1e-3) / some.noise) ** 2)
+
+    def below(part: Array, scale: Array) -> Array:
+        precision, directions = np.linalg.eigh(part)  # 1 where the standard deviation is as wanted
+        return np.linalg.qr(directions[:, precision < 1.0] * scale[:, None])[0]
+
+    return _Unknown(below(matrix, wanted), below(matrix[3:, 3:], wanted[3:]))
+
+
+def _joined(one: _Unknown, other: _Unknown) -> _Unknown:
+    """All motions that are in one or the other."""
+
+    def span(columns: Array) -> Array:
+        u, size, _ = np.linalg.svd(columns, full_matrices=False)
+        return u[:, : len(size)][:, size > 0.5]
+
+    return _Unknown(span(np.hstack((one.motions, other.motions))), span(np.hstack((one.shifts, other.shifts))))
+
+
+def _names(unknown: _Unknown, pose: Array) -> list[str]:
+    """Names of the motions in the frame's axes."""
+    if unknown.motions.shape[1] == 0:
+        return []
+    turn = pose[:3, :3]
+    turned = np.vstack((turn @ unknown.motions[:3], turn @ unknown.motions[3:]))
+    return name_directions(torch.from_numpy(turned), torch.from_numpy(turn @ unknown.shifts))
 
 
 def _covariance(pixels: Pixels, fine: Sums, pose: Array, free: Array) -> Array:

@@ -14,7 +14,7 @@ from .ambiguity import UNKNOWN_VARIANCE
 from .direct import align, check_rigid, symmetries
 from .follow import Followed, common_share, cross, follow, orthonormal
 from .graph import Edge, KeyframeGraph, moved_covariance
-from .inverse import Array, sum_residuals
+from .inverse import LEAST_NOISE, Array, sum_residuals
 from .keyframe import Contact, Grids, Unusable, contact_frame, grids, make_keyframe, pitch_by_slopes
 from .relief import DepthFrame, levels
 from .result import Registration
@@ -190,7 +190,7 @@ class PoseTracker:
         if not found.agrees:
             return f"nothing fits near the last pose: {percent}: another part of the object, a jump, or another object"
         usual = float(np.median([slope for slope, _ in self._usual])) if len(self._usual) >= 3 else math.inf
-        if found.fine.slope_noise > RISE * usual:
+        if found.fine.slope_noise > max(RISE * usual, LEAST_NOISE):
             return f"slopes differ by {found.fine.slope_noise:.3f}, where {usual:.3f} is usual: a jump, or another object"
         if found.free.shape[1] == 6:
             return "the contact is too small: no motion of it is known"
@@ -247,7 +247,8 @@ class PoseTracker:
         keyframe = graph.keyframes[index]
         large = frame.touching > LEAST_CONTACT * graph.keyframes[0].touching
         grown = frame.touching > GROWN * keyframe.touching
-        if grown or (large and common_share(keyframe, frame, found.fine, keyframe.many) < ENOUGH):
+        moved_on = large and common_share(keyframe, frame, found.fine, keyframe.many) < ENOUGH
+        if (grown or moved_on) and found.free.shape[1] <= keyframe.held.shape[1]:  # else what is unknown now would stay so
             self._take_keyframe(contact, found)
         message = f"{100 * found.fitness:.0f} % of the common contact agrees"
         if found.names:

@@ -50,7 +50,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _as_user(arguments: argparse.Namespace, data: Path | None) -> None:
     """The table and the chart of frames as a user runs them."""
-    with tqdm(unit="row", disable=None) as bar:
+    bar: "tqdm[object]" = tqdm(unit="row", disable=None)
+    with bar:
         measured = user_speed.run(data, partial(_show, bar), arguments.calls, arguments.long)
     text = user_speed.table(measured)
     rows.write_files(
@@ -64,7 +65,8 @@ def _as_user(arguments: argparse.Namespace, data: Path | None) -> None:
 def _methods(arguments: argparse.Namespace, data: Path | None) -> None:
     """The table of all methods with their errors, and error against time."""
     command = f"torchvts bench --threads {arguments.threads}"
-    with tqdm(unit="row", disable=None) as bar:
+    bar: "tqdm[object]" = tqdm(unit="row", disable=None)
+    with bar:
         measured = speed.run(command, partial(_show, bar), data)
     time = measured[0].time
     machine = f"{time.machine}, {arguments.threads} threads, float32" if time else ""

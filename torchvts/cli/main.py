@@ -20,6 +20,7 @@ COMMANDS = {
     "reconstruct": "depth of images, folders and videos, in files",
     "stream": "live depth of a camera or a recording",
     "pose": "pose of a pressed object relative to a reference press",
+    "track": "pose of a touched object in every frame of a camera or a recording",
     "diagnose": "what is wrong with a frame or its calibration",
     "export": "files that run without torchvts: TorchScript, ONNX and others",
     "train": "train gs_sdk's network on presses of balls",

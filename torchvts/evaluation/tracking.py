@@ -6,16 +6,18 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from ..core.geometry import normal_from_gradient
-from ..integration import poisson_dct
+from ..core.geometry import gradient_of_depth, normal_from_gradient
+from ..integration import poisson_dst
 from ..model import PointLights
 from ..pipeline import DepthOutput, DepthPipeline
 from ..pose import PoseTracker, Registration, register_depth
 from ..pose.result import invert, turn_deg
 from ..scenes import objects, render
+from ..viz import new_figure
 from .pose_accuracy import GOAL_DEG, GOAL_MM, rig
 from .rows import markdown
 
@@ -167,22 +169,22 @@ def wrong_slopes(frame: DepthOutput, error_deg: float, seed: int, mm_per_pixel: 
         seed: of the unit: its error is the same in all frames.
         mm_per_pixel: pixel pitch, mm.
     Returns:
-        The frame with wrong slopes inside the deformed area, and the depth that they have.
+        The frame with wrong slopes and the depth that they have: the error is that of a surface which is zero at the image border.
     """
     generator = torch.Generator().manual_seed(seed + 77)
     maps = interpolate(torch.randn(1, 6, 4, 5, generator=generator), frame.depth_mm.shape[-2:], mode="bicubic", align_corners=True)
-    slope, inside = frame.gradient, frame.deformed.float()
+    slope, inside = frame.gradient, frame.deformed.to(frame.depth_mm.dtype)
     gain = torch.stack(((maps[:, :2] * slope).sum(1), (maps[:, 2:4] * slope).sum(1)), 1)
-    error = (maps[:, 4:] / maps[:, 4:].std() + gain / (gain * inside).square().mean().sqrt().clamp_min(1e-6)) * inside
-    size = (error.square().sum(1, keepdim=True)[frame.contact]).mean().sqrt() if bool(frame.contact.any()) else error.new_tensor(1.0)
-    gradient = slope + error * (math.tan(math.radians(error_deg)) / size)
-    depth = poisson_dct(gradient, mm_per_pixel)
-    outside = ~frame.deformed
-    depth = (depth - (depth[outside].median() if bool(outside.any()) else 0.0)) * inside
-    return frame._replace(gradient=gradient, depth_mm=depth, normal=normal_from_gradient(gradient))
+    size = (gain * inside).square().sum().div(inside.sum().clamp_min(1.0)).sqrt().clamp_min(1e-6)
+    depth = poisson_dst((maps[:, 4:] + gain / size) * inside, mm_per_pixel)
+    error = gradient_of_depth(depth, mm_per_pixel) * inside
+    there = error.square().sum(1, keepdim=True)[frame.contact]
+    scale = math.tan(math.radians(error_deg)) / max(float(there.mean().sqrt()) if len(there) else 0.0, 1e-6)
+    gradient = slope + scale * error
+    return frame._replace(gradient=gradient, depth_mm=frame.depth_mm + scale * depth, normal=normal_from_gradient(gradient))
 
 
-def follow_track(track: Track, target: objects.Target, motion: Motion, row: TrackRow) -> TrackRow:
+def follow_track(track: Track, motion: Motion, row: TrackRow) -> TrackRow:
     """Track all frames against the first one, and fill the row."""
     tracker = PoseTracker(track.frames[0], track.mm_per_pixel)
     for k in range(1, len(track.frames)):
@@ -193,7 +195,8 @@ def follow_track(track: Track, target: objects.Target, motion: Motion, row: Trac
             row.lost.append(k)
             continue
         deg, mm = tracking_error(found, track, k)
-        row.deg.append(deg), row.mm.append(mm)
+        row.deg.append(deg)
+        row.mm.append(mm)
         within = deg <= GOAL_DEG and mm <= GOAL_MM
         if found.converged and not found.ambiguous and not within:
             row.wrong.append(k)
@@ -227,7 +230,7 @@ def run_tracking(
         for motion in motions:
             for noise in noises:
                 track = record(target, MOTIONS[motion], NOISES[noise], seed, unit)
-                yield follow_track(track, target, MOTIONS[motion], TrackRow(name, motion, noise)), track
+                yield follow_track(track, MOTIONS[motion], TrackRow(name, motion, noise)), track
 
 
 def register_each(track: Track) -> tuple[list[float], list[float], list[float]]:
@@ -259,3 +262,18 @@ def tracking_table(rows: Sequence[TrackRow]) -> str:
 
 def _median(values: Sequence[float]) -> float:
     return float(torch.tensor(values, dtype=torch.float64).median()) if values else math.nan
+
+
+def tracking_figure(beside: Sequence[tuple[TrackRow, tuple[list[float], list[float], list[float]]]]) -> Figure:
+    """Error against time: each object tracked, and registered frame by frame by :func:`register_each`."""
+    figure = new_figure(7.0, 4.6)
+    axes = figure.add_subplot()
+    markers = "os^DvP*X"
+    for (row, registered), marker in zip(beside, markers * len(beside)):
+        for colour, deg, ms in (("#1b6ca8", row.deg, row.ms), ("#d1495b", registered[0], registered[2])):
+            axes.scatter(_median(ms), _median(deg), c=colour, marker=marker, s=60, label=row.name if colour == "#1b6ca8" else None)
+    axes.set(xscale="log", yscale="log", xlabel="time of a frame, ms", ylabel="rotation error, degrees, median")
+    axes.set_title("blue: PoseTracker, red: register_depth, each frame against the first")
+    axes.grid(alpha=0.3, which="both")
+    axes.legend(fontsize=8)
+    return figure

@@ -6,4 +6,13 @@ from .points import register_points
 from .result import Registration
 from .tracker import PoseTracker, TrackedPose
 
-__all__ = ["PoseTracker", "Registration", "TrackedPose", "contact_cloud", "read_point_cloud", "register_depth", "register_points", "write_point_cloud"]
+__all__ = [
+    "PoseTracker",
+    "Registration",
+    "TrackedPose",
+    "contact_cloud",
+    "read_point_cloud",
+    "register_depth",
+    "register_points",
+    "write_point_cloud",
+]

@@ -168,7 +168,9 @@ def is_trusted(fit: Fit, k: int) -> bool:
 
 def agrees_enough(fitness: float, overlap: float, cost: float) -> bool:
     """The thresholds of :func:`is_trusted`: a small common part must agree nearly everywhere."""
-    return fitness >= (LEAST_FITNESS if overlap >= LEAST_OVERLAP else SMALL_FITNESS) and overlap >= SMALL_OVERLAP and cost <= MOST_COST
+    return (
+        fitness >= (LEAST_FITNESS if overlap >= LEAST_OVERLAP else SMALL_FITNESS) and overlap >= SMALL_OVERLAP and cost <= MOST_COST
+    )
 
 
 def rank(fit: Fit) -> Tensor:

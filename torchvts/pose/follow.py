@@ -11,8 +11,11 @@ from .ambiguity import ALIKE_PIXELS, LEAST_INFORMATION, UNKNOWN_VARIANCE, free_d
 from .inverse import Array, Field, Pixels, Sums, refine, sum_residuals
 from .keyframe import Grids, Keyframe
 
-COARSE_STEPS, SOME_STEPS = 6, 6
+COARSE_STEPS, SOME_STEPS = 8, 6
 """Largest number of steps on the coarse grid, and with some pixels of the fine one."""
+
+MOST_STD_DEG, MOST_STD_MM = 1.0, 0.15
+"""Standard deviations of a motion, as a turn and as a shift, above which it is called unknown."""
 
 
 class Followed(NamedTuple):
@@ -27,8 +30,6 @@ class Followed(NamedTuple):
         free: (6, k), scaled twists that the common contact does not determine.
         names: of these motions, in the frame's axes.
         covariance: (6, 6) of a small motion after the pose, rad and mm.
-        std_deg: standard deviation of the rotation, of what the contact determines of it, degrees.
-        std_mm: the same of the position of the contact, mm.
     """
 
     pose: Array
@@ -39,8 +40,6 @@ class Followed(NamedTuple):
     free: Array
     names: list[str]
     covariance: Array
-    std_deg: float
-    std_mm: float
 
     @property
     def agrees(self) -> bool:
@@ -49,13 +48,28 @@ class Followed(NamedTuple):
 
 
 def follow(keyframe: Keyframe, frame: Grids, starts: list[Array]) -> Followed:
-    """Register a frame to a keyframe from the best of several poses: on the coarse grid, on some pixels, on many of them."""
-    costs = [sum_residuals(frame.coarse, keyframe.coarse, start, SLOPE_NOISE).cost for start in starts]
-    start = starts[int(np.argmin(costs))]
+    """Register a frame to a keyframe from the most likely of several poses, and from the others if that leads nowhere."""
+    order = sorted(starts, key=lambda start: sum_residuals(frame.coarse, keyframe.coarse, start, SLOPE_NOISE).cost)
+    first = _follow_from(keyframe, frame, order[0])
+    if not first.agrees:
+        for start in order[1:]:
+            other = _follow_from(keyframe, frame, start)
+            if other.agrees:
+                return other
+    return first
+
+
+def _follow_from(keyframe: Keyframe, frame: Grids, start: Array) -> Followed:
+    """Refine one pose on the coarse grid, on some pixels, and on many of them, and score it."""
     pose, coarse = refine(frame.coarse, keyframe.coarse, start, COARSE_STEPS, 2.0 * SLOPE_NOISE, keyframe.held, 0.02)
-    free, names = _unknown(keyframe, coarse, pose)
-    pose, some = refine(frame.fine, keyframe.some, pose, SOME_STEPS, SLOPE_NOISE, free, 2e-3)
-    pose, fine = refine(frame.fine, keyframe.many, pose, 1, 1.5 * max(some.slope_noise, 0.01), free)
+    unknown = _sliding(keyframe, coarse)
+    refined, some = refine(frame.fine, keyframe.some, pose, SOME_STEPS, SLOPE_NOISE, unknown.motions, 2e-3)
+    vague = _vague(keyframe, some)
+    if vague.motions.shape[1] > 0:
+        unknown = _joined(unknown, vague)
+        refined, some = refine(frame.fine, keyframe.some, pose, SOME_STEPS, SLOPE_NOISE, unknown.motions, 2e-3)
+    free = unknown.motions
+    pose, fine = refine(frame.fine, keyframe.many, refined, 1, 1.5 * max(some.slope_noise, 0.01), free)
     forth = sum_residuals(frame.coarse, keyframe.coarse, pose, SLOPE_NOISE)
     back_pixels = _pixels(frame.coarse)
     back = sum_residuals(keyframe.grids.coarse, back_pixels, np.linalg.inv(pose), SLOPE_NOISE)
@@ -63,13 +77,12 @@ def follow(keyframe: Keyframe, frame: Grids, starts: list[Array]) -> Followed:
     cost = (forth.cost * forth.compared + back.cost * back.compared) / compared
     fitness = (forth.fitness * forth.compared + back.fitness * back.compared) / compared
     overlap = max(forth.compared / len(keyframe.coarse.rows), back.compared / max(len(back_pixels.rows), 1))
-    return Followed(pose, fine, fitness, overlap, cost, free, names, *_covariance(keyframe.many, fine, pose, free))
+    return Followed(pose, fine, fitness, overlap, cost, free, _names(unknown, pose), _covariance(keyframe.many, fine, pose, free))
 
 
-def common_share(keyframe: Keyframe, frame: Grids, pose: Array) -> float:
-    """Share of the smaller contact that both have in common under a pose (4, 4)."""
-    sums = sum_residuals(frame.coarse, keyframe.coarse, pose, SLOPE_NOISE)
-    return sums.count / max(min(len(keyframe.coarse.rows), frame.count), 1)
+def common_share(keyframe: Keyframe, frame: Grids, sums: Sums, pixels: Pixels) -> float:
+    """Share of the smaller contact that both have in common, by the sums over fine pixels of the keyframe."""
+    return sums.used / len(pixels.rows) * keyframe.touching / max(min(keyframe.touching, frame.touching), 1)
 
 
 def orthonormal(pose: Array) -> Array:
@@ -103,29 +116,55 @@ def _pixels(field: Field) -> Pixels:
     return Pixels(rows, np.zeros(3), np.ones(6))
 
 
-def _unknown(keyframe: Keyframe, coarse: Sums, pose: Array) -> tuple[Array, list[str]]:
-    """Motions that the common contact does not determine; those of the whole keyframe, if these are more."""
-    information = torch.from_numpy(coarse.matrix * ((coarse.noise / SLOPE_NOISE) ** 2 / max(coarse.count, 1)))
+class _Unknown(NamedTuple):
+    """Scaled twists (6, k) that are not determined, and those among them that are pure shifts (3, m); orthonormal columns."""
+
+    motions: Array
+    shifts: Array
+
+
+def _sliding(keyframe: Keyframe, coarse: Sums) -> _Unknown:
+    """Motions under which the common contact slides on itself, by its information, and those that the keyframe may roll by."""
+    information = torch.from_numpy(coarse.matrix * ((coarse.noise / SLOPE_NOISE) ** 2 / max(coarse.used, 1)))
     free, shifts = free_directions(information, keyframe.bias, LEAST_INFORMATION)
-    if keyframe.held.shape[1] > free.shape[1]:
-        free = torch.from_numpy(keyframe.held)
-        shifts = _pure_shifts(free)
-    if free.shape[1] == 0:
-        return np.zeros((6, 0)), []
-    turn = torch.from_numpy(pose[:3, :3].copy())
-    return free.numpy(), name_directions(torch.cat((turn @ free[:3], turn @ free[3:])), turn @ shifts)
+    found = _Unknown(free.numpy(), shifts.numpy())
+    return _joined(found, _Unknown(keyframe.held, shifts.numpy())) if keyframe.held.shape[1] > 0 else found
 
 
-def _pure_shifts(free: torch.Tensor) -> torch.Tensor:
-    """The combinations (3, m) of motions (6, k) that do not turn."""
-    _, size, vh = torch.linalg.svd(free[:3])
-    size = torch.cat((size, size.new_zeros(len(vh) - len(size))))
-    shifts: torch.Tensor = torch.nn.functional.normalize((free @ vh[size < 0.1].T)[3:], dim=0)
-    return shifts
+def _vague(keyframe: Keyframe, some: Sums) -> _Unknown:
+    """Motions whose standard deviation is too large, because the common contact is small or faint."""
+    wanted = np.concatenate((math.radians(MOST_STD_DEG) / keyframe.some.units[:3], np.full(3, MOST_STD_MM)))
+    alike = max(1.0, ALIKE_PIXELS * len(keyframe.some.rows) / keyframe.touching)
+    matrix = some.matrix * wanted[:, None] * wanted / (alike * (max(some.slope_noise, 1e-3) / some.noise) ** 2)
+
+    def below(part: Array, scale: Array) -> Array:
+        precision, directions = np.linalg.eigh(part)  # 1 where the standard deviation is as wanted
+        return np.linalg.qr(directions[:, precision < 1.0] * scale[:, None])[0]
+
+    return _Unknown(below(matrix, wanted), below(matrix[3:, 3:], wanted[3:]))
 
 
-def _covariance(pixels: Pixels, fine: Sums, pose: Array, free: Array) -> tuple[Array, float, float]:
-    """Covariance of a small motion after the pose, and the standard deviations of what the contact determines, degrees and mm.
+def _joined(one: _Unknown, other: _Unknown) -> _Unknown:
+    """All motions that are in one or the other."""
+
+    def span(columns: Array) -> Array:
+        u, size, _ = np.linalg.svd(columns, full_matrices=False)
+        return u[:, : len(size)][:, size > 0.5]
+
+    return _Unknown(span(np.hstack((one.motions, other.motions))), span(np.hstack((one.shifts, other.shifts))))
+
+
+def _names(unknown: _Unknown, pose: Array) -> list[str]:
+    """Names of the motions in the frame's axes."""
+    if unknown.motions.shape[1] == 0:
+        return []
+    turn = pose[:3, :3]
+    turned = np.vstack((turn @ unknown.motions[:3], turn @ unknown.motions[3:]))
+    return name_directions(torch.from_numpy(turned), torch.from_numpy(turn @ unknown.shifts))
+
+
+def _covariance(pixels: Pixels, fine: Sums, pose: Array, free: Array) -> Array:
+    """Covariance of a small motion after the pose.
 
     Residuals are alike over some pixels, and an error of the height is alike over all of them.
     """
@@ -133,10 +172,9 @@ def _covariance(pixels: Pixels, fine: Sums, pose: Array, free: Array) -> tuple[A
     scaled = np.linalg.pinv(known @ fine.matrix @ known, rcond=1e-9, hermitian=True)
     scaled *= ALIKE_PIXELS * (fine.slope_noise / fine.noise) ** 2
     scaled[5, 5] += fine.depth_noise**2
-    std_deg = math.degrees(math.sqrt(float(np.square(pixels.units[:3]) @ scaled.diagonal()[:3])))
-    std_mm = math.sqrt(float(scaled.diagonal()[3:].sum()))
     scaled += free @ free.T * UNKNOWN_VARIANCE
     to_origin = np.diag(pixels.units)
     to_origin[3:, :3] = cross(pixels.center) @ to_origin[:3, :3]
     after = adjoint(pose) @ to_origin
-    return after @ scaled @ after.T, std_deg, std_mm
+    covariance: Array = after @ scaled @ after.T
+    return covariance

@@ -52,7 +52,7 @@ class KeyframeGraph:
         return len(self.poses) - 1
 
     def close(self, edge: Edge) -> Array:
-        """Add a registration between known keyframes and find all poses anew; returns how far it contradicted them, a twist (6,)."""
+        """Add a registration between known keyframes and find all poses anew; returns its contradiction before, a twist (6,)."""
         contradiction = self._residual(edge)
         self.edges.append(edge)
         size = 6 * (len(self.poses) - 1)
@@ -72,7 +72,7 @@ class KeyframeGraph:
                 twist = torch.from_numpy(step[6 * k - 6 : 6 * k])
                 self.poses[k] = orthonormal(motion(twist).numpy() @ self.poses[k])
         for k in range(1, len(self.poses)):
-            self.covariances[k] = spread[6 * k - 6 : 6 * k, 6 * k - 6 : 6 * k]
+            self.covariances[k] = np.array(spread[6 * k - 6 : 6 * k, 6 * k - 6 : 6 * k], dtype=np.float64)
         return contradiction
 
     def _residual(self, edge: Edge) -> Array:

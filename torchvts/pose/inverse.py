@@ -1,11 +1,11 @@
 """Inverse compositional alignment: a pose is moved so that a new frame, seen from the reference, agrees with the reference.
 
-The pulled-back slopes of the new frame minus those of the reference have, near the right pose, the derivatives of the reference with
-respect to its own motion. So they are computed once per reference. Slopes count more than heights, as in :mod:`.alignment`.
+The pulled-back slopes of the new frame minus those of the reference have, near the right pose, the derivatives of the reference
+with respect to its own motion. So they are computed once per reference. Slopes count more than heights, as in :mod:`.alignment`.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..accelerated import kernels
 from ..accelerated.gate import usable
-from .alignment import CUT, DEPTH_DRIFT_MM, DEPTH_NOISE_MM, SLOPE_NOISE, linearise
+from .alignment import CUT, DEPTH_DRIFT_MM, SLOPE_NOISE, linearise
 from .relief import Relief
 
 DEEP_MM, SHALLOW_MM = 0.06, 0.02
@@ -23,9 +23,12 @@ DEEP_MM, SHALLOW_MM = 0.06, 0.02
 LEAST_NOISE, LARGEST_STEP_MM = 0.02, 0.6
 """Slope noise down to which the weights narrow, and the largest step, mm at the contact."""
 
-SCORE = (1.0 / (CUT * SLOPE_NOISE) ** 2, 1.0 / (CUT * DEPTH_NOISE_MM) ** 2)
+HEIGHT_NOISE_MM = 0.1
+"""Disagreement of heights that counts as noise in a score: what integrated slopes that err by 3 degrees add up to."""
 
-Array = npt.NDArray[np.float64]
+SCORE = (1.0 / (CUT * SLOPE_NOISE) ** 2, 1.0 / (CUT * HEIGHT_NOISE_MM) ** 2)
+
+Array = npt.NDArray[Any]
 
 
 class Field(NamedTuple):
@@ -65,7 +68,7 @@ class Sums(NamedTuple):
     Attributes:
         matrix: (6, 6), weighted J^T J in units of the noise.
         right: (6,), weighted J^T r.
-        count: pixels in both contacts.
+        used: pixels in both contacts.
         slope_noise: weighted root mean square of slope residuals, per component.
         depth_noise: the same of height residuals, mm.
         cost: mean truncated residual of the pixels that are compared, 0 to 1.
@@ -76,7 +79,7 @@ class Sums(NamedTuple):
 
     matrix: Array
     right: Array
-    count: int
+    used: int
     slope_noise: float
     depth_noise: float
     cost: float
@@ -136,7 +139,8 @@ def solve_step(sums: Sums, held: Array | None = None) -> Array:
         matrix, right = known @ matrix @ known, known @ right
     damping = 1e-6 * max(float(np.trace(matrix)), 1e-9)
     step: Array = -np.linalg.solve(matrix + damping * np.diag([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3]), right)
-    return step * min(1.0, LARGEST_STEP_MM / max(float(np.linalg.norm(step)), 1e-12))
+    step *= min(1.0, LARGEST_STEP_MM / max(float(np.linalg.norm(step)), 1e-12))
+    return step
 
 
 def _motion(twist: Array, center: Array) -> Array:
@@ -187,8 +191,8 @@ def alignment_sums(channels: Tensor, rows: Tensor, numbers: Tensor) -> Tensor:
     lines[:, :, 6] = residual
     scaled = lines * (weight[:, None, None] * lines.new_tensor([n[3], n[3], n[4]])[:, None])
     products = torch.einsum("nri,nrk->ik", scaled[..., :7].double(), lines.double())
-    score = (used.sum(), weight.sum(), (weight * off).sum(), (weight * high).sum())
-    score += (error[counted].sum(), (error[counted] < 1.0).sum(), counted.sum())
+    score = [used.sum(), weight.sum(), (weight * off).sum(), (weight * high).sum()]
+    score += [error[counted].sum(), (error[counted] < 1.0).sum(), counted.sum()]
     return torch.cat((products.reshape(-1), torch.stack([s.double() for s in score])))
 
 

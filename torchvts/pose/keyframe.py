@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -21,8 +21,8 @@ they say of the motion lie on steep flanks, where slopes err most; with 4,000 of
 0.024 to 0.071 degrees, with 4,000 spread ones 0.018 to 0.036, with the two stages 0.012 to 0.024."""
 
 
-Image = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.uint8]
+Image = npt.NDArray[Any]
+Mask = npt.NDArray[Any]
 
 _NEIGHBOURS = np.ones((3, 3), np.uint8)
 
@@ -36,11 +36,11 @@ class Contact(NamedTuple):
 
 
 class Grids(NamedTuple):
-    """A new frame on the fine and the coarse grid, and the number of coarse pixels that lie on the object."""
+    """A new frame on the fine and the coarse grid, and the number of fine pixels on the object."""
 
     fine: Field
     coarse: Field
-    count: int
+    touching: int
 
 
 class Unusable(ValueError):
@@ -88,7 +88,7 @@ def grids(frame: Contact, mm_per_pixel: float, least_mm: float, times: tuple[int
         mask = cv2.addWeighted(cv2.erode(inside, _NEIGHBOURS), 0.75, cv2.dilate(perhaps, _NEIGHBOURS), 0.25, 0.0, dtype=cv2.CV_32F)
         fine = Field(torch.from_numpy(cv2.merge((z, p, up, mask))), *grid)
     coarse = _pooled((z, p, up), inside, perhaps, times[1], grid, 0.5)
-    return Grids(fine, coarse, int(torch.count_nonzero(coarse.channels[..., 3] > 0.999)))
+    return Grids(fine, coarse, int(torch.count_nonzero(fine.channels[..., 3] > 0.999)))
 
 
 def _pooled(
@@ -121,6 +121,7 @@ class Keyframe:
         grids: its grids, which new frames are compared with backwards.
         least_mm: depth from which skin surely lies on the object, mm.
         times: pixels a side of a cell of the fine and of the coarse grid.
+        touching: number of pixels of the fine grid on the object.
         coarse: pixels of the coarse grid, whose derivatives are those of fitted planes, which have the least noise.
         some: pixels of the fine grid for most steps.
         many: the same for the last one.
@@ -133,6 +134,7 @@ class Keyframe:
     grids: Grids
     least_mm: float
     times: tuple[int, int]
+    touching: int
     coarse: Pixels
     some: Pixels
     many: Pixels
@@ -162,6 +164,7 @@ def make_keyframe(frame: Contact, mm_per_pixel: float) -> Keyframe:
         grids=grids(frame, mm_per_pixel, least, times),
         least_mm=least,
         times=times,
+        touching=len(fine.points),
         coarse=reference_pixels(made.coarse, bent, center, units),
         some=reference_pixels(some, fine, center, units),
         many=reference_pixels(many, fine, center, units),

@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from ..core.checks import check_positive
+from .alignment import SLOPE_NOISE
 from .ambiguity import UNKNOWN_VARIANCE
 from .direct import align, check_rigid, symmetries
 from .follow import Followed, common_share, cross, follow, orthonormal
 from .graph import Edge, KeyframeGraph, moved_covariance
-from .inverse import Array
+from .inverse import LEAST_NOISE, Array, sum_residuals
 from .keyframe import Contact, Grids, Unusable, contact_frame, grids, make_keyframe, pitch_by_slopes
 from .relief import DepthFrame, levels
 from .result import Registration
@@ -24,8 +25,8 @@ ENOUGH, RETURN = 0.5, 0.6
 LEAST_CONTACT = 0.5
 """Share of the reference's contact that a keyframe must have at least."""
 
-MOST_STD_DEG, MOST_STD_MM = 1.0, 0.15
-"""Standard deviations of a pose above which it is none."""
+GROWN = 2.0
+"""A contact of so many times the pixels of the keyframe's makes a new keyframe."""
 
 JUMP_MM = 1.0
 """Motion of the contact between frames, beside the expected one, beyond which a pose is not taken: another one may look alike."""
@@ -57,11 +58,12 @@ class TrackedPose(Registration):
 class PoseTracker:
     """The pose of a touched object in every frame, beginning with a reference: ``tracker(frame)``.
 
-    Each frame is aligned with a keyframe from the last pose: Gauss-Newton on the slopes and heights of all pixels that touch in
+    Each frame is aligned with a keyframe from the last pose: Gauss-Newton on slopes and heights of the pixels that touch in
     both, with derivatives computed once per keyframe. Motions that the contact does not determine keep their value and are named
     in ``ambiguous``. Where the contact has little in common with the reference any more, frames become keyframes in turn; where an
     older keyframe is seen again, the loop is closed and the drift since is spread over it. A pose that contradicts the frame is
     not returned: ``lost`` says why, and the next frames are searched as :func:`register_depth` does, until the object is found.
+    Of a symmetric object it may then be found in another of its equal poses: from there on ``alternatives`` lists the others.
 
     Args:
         reference: the first frame, a :class:`torchvts.DepthOutput` or any object with its depth_mm, gradient and contact.
@@ -100,8 +102,8 @@ class PoseTracker:
         found = pitch_by_slopes(frame)
         if not 1.0 / PITCH_RATIO < found / self.mm_per_pixel < PITCH_RATIO:
             raise ValueError(
-                f"mm_per_pixel: expected about {found:.3g}, by depth and slopes of the reference, got {self.mm_per_pixel:g}: another "
-                "sensor's, or another unit?"
+                f"mm_per_pixel: expected about {found:.3g}, by depth and slopes of the reference, got {self.mm_per_pixel:g}: "
+                "another sensor's, or another unit?"
             )
         self.graph = KeyframeGraph(keyframe)
         self.closures: list[tuple[float, float]] = []
@@ -137,7 +139,7 @@ class PoseTracker:
             return self._lose(str(error))
         reference = self.graph.keyframes[0]
         made = grids(contact, self.mm_per_pixel, reference.least_mm, reference.times)
-        if made.count < 12:
+        if made.touching < 12:
             return self._lose("hardly any contact")
         return self._track(contact, made) if self._tracking else self._search(contact, made)
 
@@ -164,7 +166,9 @@ class PoseTracker:
         """The oldest keyframe before the present one that the frame probably has much in common with."""
         for k in range(self._active):
             pose = expected @ np.linalg.inv(self.graph.poses[k])
-            if common_share(self.graph.keyframes[k], frame, pose) > RETURN:
+            keyframe = self.graph.keyframes[k]
+            sums = sum_residuals(frame.fine, keyframe.some, pose, SLOPE_NOISE)
+            if frame.touching < GROWN * keyframe.touching and common_share(keyframe, frame, sums, keyframe.some) > RETURN:
                 return k
         return None
 
@@ -180,14 +184,16 @@ class PoseTracker:
 
     def _problem(self, index: int, found: Followed, starts: list[Array]) -> str:
         """Why a pose cannot be trusted; empty if it can."""
-        percent = f"{100 * found.fitness:.0f} % of the common contact agrees, which is {100 * found.overlap:.0f} % of the smaller one"
+        percent = (
+            f"{100 * found.fitness:.0f} % of the common contact agrees, which is {100 * found.overlap:.0f} % of the smaller one"
+        )
         if not found.agrees:
             return f"nothing fits near the last pose: {percent}: another part of the object, a jump, or another object"
         usual = float(np.median([slope for slope, _ in self._usual])) if len(self._usual) >= 3 else math.inf
-        if found.fine.slope_noise > RISE * usual:
+        if found.fine.slope_noise > max(RISE * usual, LEAST_NOISE):
             return f"slopes differ by {found.fine.slope_noise:.3f}, where {usual:.3f} is usual: a jump, or another object"
-        if found.std_deg > MOST_STD_DEG or found.std_mm > MOST_STD_MM:
-            return f"the contact is too small: standard deviations of {found.std_deg:.1f} degrees and {found.std_mm:.2f} mm"
+        if found.free.shape[1] == 6:
+            return "the contact is too small: no motion of it is known"
         probe = self.graph.keyframes[index].probe
         pose = found.pose @ self.graph.poses[index]
         probe = (probe - self.graph.poses[index][:3, 3]) @ self.graph.poses[index][:3, :3]  # in the reference
@@ -238,13 +244,16 @@ class PoseTracker:
         drift = moved_covariance(found.pose, graph.covariances[index])
         self._poses = [*self._poses[-1:], pose]
         self._usual.append((found.fine.slope_noise, found.cost))
-        large = frame.count > LEAST_CONTACT * len(graph.keyframes[0].coarse.rows)
-        if large and common_share(graph.keyframes[index], frame, found.pose) < ENOUGH:
+        keyframe = graph.keyframes[index]
+        large = frame.touching > LEAST_CONTACT * graph.keyframes[0].touching
+        grown = frame.touching > GROWN * keyframe.touching
+        moved_on = large and common_share(keyframe, frame, found.fine, keyframe.many) < ENOUGH
+        if (grown or moved_on) and found.free.shape[1] <= keyframe.held.shape[1]:  # else what is unknown now would stay so
             self._take_keyframe(contact, found)
         message = f"{100 * found.fitness:.0f} % of the common contact agrees"
         if found.names:
             message += f"; kept, because the surface slides on itself: {', '.join(found.names)}"
-        center = found.pose[:3, :3] @ graph.keyframes[index].many.center + found.pose[:3, 3]
+        center = found.pose[:3, :3] @ keyframe.many.center + found.pose[:3, 3]
         to_center = np.hstack((-cross(center), np.eye(3)))
         return TrackedPose(
             T_target_source=torch.from_numpy(pose.copy()),

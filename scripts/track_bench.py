@@ -1,0 +1,52 @@
+"""Tracking bench: objects that move, rendered and measured, tracked against their first frame; table, JSON, plot of error and time.
+
+python scripts/track_bench.py --out out/track_bench
+"""
+
+import argparse
+import dataclasses
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from torchvts import viz
+from torchvts.evaluation import tracking
+from torchvts.evaluation.pose_accuracy import machine
+from torchvts.evaluation.rows import write_files
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--objects", nargs="+", default=tracking.OBJECTS, metavar="NAME", help="of torchvts.scenes.objects")
+    parser.add_argument("--motions", nargs="+", default=list(tracking.MOTIONS), choices=list(tracking.MOTIONS))
+    parser.add_argument("--noises", nargs="+", default=list(tracking.NOISES), choices=list(tracking.NOISES))
+    parser.add_argument("--seed", type=int, default=1, help="of motions and noise")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--out", type=Path, required=True)
+    arguments = parser.parse_args(argv)
+    torch.set_num_threads(arguments.threads)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    rows, beside = [], []
+    with tqdm(total=len(arguments.objects) * len(arguments.motions) * len(arguments.noises), unit="track", disable=None) as bar:
+        for row, track in tracking.run_tracking(arguments.objects, arguments.motions, arguments.noises, arguments.seed):
+            rows.append(row)
+            if row.motion == "slow" and row.noise == "noise 0.005":
+                beside.append((row, tracking.register_each(track)))
+            bar.update()
+    text = f"320 x 240, 8 bits, seed {arguments.seed}; {machine()}\n\n{tracking.tracking_table(rows)}\n"
+    write_files(arguments.out, {"table.md": text, "tracks.json": json.dumps([dataclasses.asdict(row) for row in rows], indent=1)})
+    if beside:
+        viz.save_figure(tracking.tracking_figure(beside), arguments.out / "tracking.png")
+    print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,329 @@
+"""Tracking: exact scenes, what a contact cannot show, losing and finding an object, keyframes and closed loops, bad input."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import torchvts as vts
+from torchvts.accelerated import library, reference_only
+from torchvts.cli.track import record
+from torchvts.core.frame import DepthOutput
+from torchvts.evaluation import tracking
+from torchvts.pose.follow import adjoint, orthonormal
+from torchvts.pose.graph import Edge, KeyframeGraph
+from torchvts.pose.inverse import Sums, solve_step, sum_residuals
+from torchvts.pose.keyframe import contact_frame, grids, make_keyframe
+from torchvts.pose.result import invert, motion, turn_deg
+from torchvts.scenes import objects
+from torchvts.stream import TactileFrame
+
+PITCH = 0.125
+
+
+def press(height, pose):
+    return objects.press(height, pose, 120, 160, PITCH)
+
+
+def error(found, before, after):
+    """Degrees, and mm at the object's origin."""
+    off = found.T_target_source @ invert(after @ invert(before))
+    middle = after[:3, 3]
+    return float(turn_deg(off)), float((off[:3, :3] @ middle + off[:3, 3] - middle).norm())
+
+
+def swing(k):
+    return objects.pose(3.0 * k, (0.2 * k, 0.5 * math.sin(0.4 * k)), 0.45 + 0.05 * math.sin(k), (math.sin(k), math.cos(0.7 * k)))
+
+
+def waves(u, v):
+    """Endless relief that looks like itself nowhere."""
+    return (
+        0.12 * (torch.sin(1.9 * u + 0.7 * torch.sin(0.9 * v)) + torch.sin(1.3 * v + 1.1 * torch.sin(0.7 * u) + 0.13 * u * v)) - 0.2
+    )
+
+
+@pytest.fixture(scope="module")
+def keyframe():
+    return make_keyframe(contact_frame(press(objects.key(), swing(0))), PITCH)
+
+
+@pytest.mark.parametrize("name", ["stamp", "key", "gear"])
+def test_an_exact_object_is_followed(name):
+    height = objects.TARGETS[name].height_mm
+    tracker = vts.PoseTracker(press(height, swing(0)), PITCH)
+    for k in range(1, 9):
+        found = tracker(press(height, swing(k)))
+        assert found.converged and not found.lost and found.ambiguous == [] and found.keyframe == 0
+        deg, mm = error(found, swing(0), swing(k))
+        assert deg < 0.1 and mm < 0.01
+        assert torch.linalg.eigvalsh(found.covariance).min() > 0
+    assert float(torch.linalg.det(found.T_target_source[:3, :3])) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_rotations_stay_exact_over_many_frames():
+    """Predicted poses are products of poses, which once multiplied what they lack of a rotation by three a frame."""
+    frames = [press(objects.stamp("T"), swing(0.2 * k)) for k in range(4)]
+    tracker = vts.PoseTracker(frames[0], PITCH)
+    for k in range(60):
+        found = tracker(frames[(1, 2, 3, 2, 1, 0)[k % 6]])
+        assert not found.lost
+    rotation = found.T_target_source[:3, :3]
+    assert float((rotation @ rotation.T - torch.eye(3)).abs().max()) < 1e-12
+
+
+def test_a_ball_is_followed_and_its_rotations_keep_their_value():
+    radius, poses = 8.0, [objects.pose(0.0, (0.15 * k, -0.1 * k), 0.5 + 0.02 * k) for k in range(8)]
+    tracker = vts.PoseTracker(press(objects.sphere(radius), poses[0]), PITCH)
+    for pose in poses[1:]:
+        found = tracker(press(objects.sphere(radius), pose))
+    assert sorted(found.ambiguous) == ["rotation about x", "rotation about y", "rotation about z"]
+    assert "slides on itself" in found.message and found.converged
+    assert float(turn_deg(found.T_target_source)) < 1.0
+    center = poses[0][:3, 3] - torch.tensor([0.0, 0.0, radius])
+    moved = found.T_target_source[:3, :3] @ center + found.T_target_source[:3, 3]
+    assert float((moved - (poses[-1][:3, 3] - torch.tensor([0.0, 0.0, radius]))).norm()) < 0.03
+    assert float(found.covariance[2, 2]) > 1.0  # rad^2
+
+
+def test_a_cylinder_keeps_its_axis_unknown_and_is_followed_across():
+    poses = [objects.pose(2.0 * k, (0.0, 0.1 * k), 0.5) for k in range(6)]
+    tracker = vts.PoseTracker(press(objects.cylinder(), poses[0]), PITCH)
+    for pose in poses[1:]:
+        found = tracker(press(objects.cylinder(), pose))
+    assert len(found.ambiguous) == 2 and found.ambiguous[0].startswith("translation") and found.ambiguous[1].startswith("rotation")
+    off = found.T_target_source @ invert(poses[-1] @ invert(poses[0]))
+    assert abs(float(off[1, 0])) < math.radians(0.1)  # yaw is known
+
+
+def test_lift_off_is_said_and_the_object_is_found_again():
+    height = objects.key()
+    tracker = vts.PoseTracker(press(height, objects.pose(0.0)), PITCH)
+    last = tracker(press(height, objects.pose(2.0, (0.1, 0.0))))
+    for deep in (-0.2, -1.0):
+        away = tracker(press(height, objects.pose(2.0, press_mm=deep)))
+        assert away.lost == "no contact" and not away.converged and away.message.startswith("lost")
+        assert torch.equal(away.T_target_source, last.T_target_source)
+    back = objects.pose(70.0, (1.0, -0.5), 0.4)
+    found = tracker(press(height, back))
+    assert found.converged and not found.lost
+    deg, mm = error(found, objects.pose(0.0), back)
+    assert deg < 0.2 and mm < 0.02
+
+
+def test_a_jump_is_said_and_the_object_is_found_again():
+    height = objects.stamp()
+    tracker = vts.PoseTracker(press(height, objects.pose(0.0)), PITCH)
+    tracker(press(height, objects.pose(1.0)))
+    there = objects.pose(60.0, (2.0, 1.0))
+    jumped = tracker(press(height, there))
+    assert jumped.lost and not jumped.converged
+    found = tracker(press(height, there))
+    assert found.converged and error(found, objects.pose(0.0), there)[0] < 0.2
+
+
+def test_after_a_search_a_symmetric_object_has_its_other_poses():
+    height = objects.gear()
+    tracker = vts.PoseTracker(press(height, objects.pose(0.0)), PITCH)
+    for k in range(1, 4):
+        assert tracker(press(height, objects.pose(2.0 * k))).alternatives == []
+    tracker(press(height, objects.pose(6.0, press_mm=-1.0)))
+    there = objects.pose(100.0, (0.5, 0.3))
+    tracker(press(height, there))
+    there = objects.pose(102.0, (0.6, 0.3))
+    found = tracker(press(height, there))
+    assert found.converged and len(found.alternatives) == 11
+    truth = there @ invert(objects.pose(0.0))
+    nearest = min(float(turn_deg(T @ invert(truth))) for T in (found.T_target_source, *found.alternatives))
+    assert nearest < 0.3
+
+
+def test_another_object_is_not_taken():
+    tracker = vts.PoseTracker(press(objects.key(), objects.pose(0.0)), PITCH)
+    for _ in range(2):
+        found = tracker(press(objects.gear(), objects.pose(0.0)))
+        assert found.lost and not found.converged
+
+
+def test_a_long_way_takes_keyframes_and_closes_the_loop():
+    way = [0.6 * k for k in range(33)] + [19.2 - 0.6 * k for k in range(1, 33)]
+    poses = [objects.pose(0.3 * x, (-x, 0.3 * math.sin(x)), 0.35) for x in way]
+    tracker = vts.PoseTracker(press(waves, poses[0]), PITCH)
+    drift = []
+    for pose in poses[1:]:
+        found = tracker(press(waves, pose))
+        assert not found.lost and found.converged
+        deg, mm = error(found, poses[0], pose)
+        assert deg < 0.5 and mm < 0.2
+        drift.append(found.drift_deg)
+    assert len(tracker.graph.keyframes) > 2 and tracker.closures
+    assert max(drift) > 0 and drift[-1] == 0.0 and found.keyframe == 0  # the reference is seen again
+
+
+def test_a_closed_loop_spreads_its_contradiction(keyframe):
+    def twist(*values):
+        return motion(torch.tensor(values, dtype=torch.float64)).numpy()
+
+    turn = twist(0.0, 0.0, 0.1, 1.0, 0.0, 0.0)
+    graph, covariance = KeyframeGraph(keyframe), np.diag([1e-6] * 3 + [1.0] * 3)
+    for k in range(3):
+        graph.add(keyframe, k, turn, covariance)
+    assert np.allclose(graph.poses[3], turn @ turn @ turn)
+    assert np.trace(graph.covariances[3]) > np.trace(graph.covariances[1])
+    before = np.trace(graph.covariances[3])
+    off = twist(0.0, 0.0, 0.004, 0.0, 0.0, 0.0)
+    contradiction = graph.close(Edge(0, 3, off @ turn @ turn @ turn, covariance))
+    assert contradiction[:3] == pytest.approx([0.0, 0.0, -0.004], abs=1e-6)
+    yaw = [math.atan2(pose[1, 0], pose[0, 0]) for pose in graph.poses]
+    assert yaw[0] == 0.0 and 0.3 < yaw[3] < 0.304
+    assert np.diff(yaw) == pytest.approx([(yaw[3] / 3)] * 3, abs=2e-4)
+    assert np.trace(graph.covariances[3]) < before
+
+
+def test_kernels_and_reference_agree(keyframe):
+    if library() is None:
+        pytest.skip("no compiled kernels")
+    frame = grids(contact_frame(press(objects.key(), swing(1))), PITCH, keyframe.least_mm, keyframe.times)
+    pose = motion(torch.tensor([0.01, -0.02, 0.04, 0.2, -0.1, 0.02], dtype=torch.float64)).numpy()
+    fast = sum_residuals(frame.fine, keyframe.many, pose, 0.05)
+    with reference_only():
+        slow = sum_residuals(frame.fine, keyframe.many, pose, 0.05)
+    assert np.allclose(fast.matrix, slow.matrix, rtol=1e-3, atol=1e-3 * np.abs(slow.matrix).max())
+    assert np.allclose(fast.right, slow.right, rtol=1e-3, atol=1e-3 * np.abs(slow.right).max())
+    assert fast[2:] == pytest.approx(slow[2:], rel=1e-3)
+    with reference_only():
+        found = vts.PoseTracker(press(objects.key(), swing(0)), PITCH)(press(objects.key(), swing(1)))
+    assert error(found, swing(0), swing(1))[0] < 0.1
+
+
+def test_derivatives_are_those_of_the_residuals(keyframe):
+    """A small motion of the frame is found by one step, but for second order."""
+    frame = grids(contact_frame(press(objects.key(), swing(0))), PITCH, keyframe.least_mm, keyframe.times)
+    pixels = keyframe.many
+    for axis in range(6):
+        scaled = np.zeros(6)
+        scaled[axis] = 0.01
+        pose = motion(torch.from_numpy(scaled * pixels.units), torch.from_numpy(pixels.center)).numpy()
+        step = solve_step(sum_residuals(frame.fine, pixels, pose, 0.05))
+        assert step == pytest.approx(-scaled, abs=3e-3)  # derivatives are smoothed
+
+
+def test_held_motions_get_no_step():
+    generator = np.random.default_rng(0)
+    jacobian = generator.standard_normal((40, 6))
+    sums = Sums(jacobian.T @ jacobian, generator.standard_normal(6), 40, 0.1, 0.1, 0.0, 1.0, 40.0, 0.1)
+    free = np.eye(6)[:, [0, 4]]
+    step = solve_step(sums, free)
+    assert step[[0, 4]] == pytest.approx([0.0, 0.0], abs=1e-9)
+    rest = [1, 2, 3, 5]
+    assert step[rest] == pytest.approx(
+        -np.linalg.solve(sums.matrix[np.ix_(rest, rest)], sums.right[rest]) * _cut(sums, rest), rel=1e-3
+    )
+
+
+def _cut(sums, rest):
+    """Long steps are cut."""
+    return min(1.0, 0.6 / np.linalg.norm(np.linalg.solve(sums.matrix[np.ix_(rest, rest)], sums.right[rest])))
+
+
+def test_adjoint_moves_a_small_motion_past_a_pose():
+    pose = motion(torch.tensor([0.3, -0.2, 0.5, 1.0, 2.0, -1.0], dtype=torch.float64)).numpy()
+    twist = 1e-6 * np.array([1.0, -2.0, 3.0, 0.5, 1.5, -1.0])
+    before = pose @ motion(torch.from_numpy(twist)).numpy()
+    after = motion(torch.from_numpy(adjoint(pose) @ twist)).numpy() @ pose
+    assert before == pytest.approx(after, abs=1e-10)
+    assert orthonormal(1.0001 * pose)[:3, :3] == pytest.approx(pose[:3, :3], abs=1e-12)
+
+
+def _bad(frame, **parts):
+    given = {"depth_mm": frame.depth_mm, "gradient": frame.gradient, "contact": frame.contact}
+    return DepthOutput(**{**given, "normal": frame.normal, "deformed": frame.contact, **parts})
+
+
+def test_a_bad_frame_is_said_and_the_tracker_goes_on():
+    height = objects.stamp("T")
+    good = press(height, objects.pose(0.0))
+    tracker = vts.PoseTracker(good, PITCH)
+    bad = {
+        "no contact": _bad(good, contact=torch.zeros_like(good.contact)),
+        "depth or gradient is not finite": _bad(good, depth_mm=good.depth_mm * math.nan),
+        "expected 120 x 160 pixels like the reference, got 96 x 128": objects.press(height, objects.pose(0.0), 96, 128, PITCH),
+    }
+    for reason, frame in bad.items():
+        assert tracker(frame).lost == reason
+        found = tracker(good)
+        assert found.converged and not found.lost and float(turn_deg(found.T_target_source)) < 0.05
+    with pytest.raises(TypeError, match="expected a DepthOutput"):
+        tracker(good.depth_mm)
+    with pytest.raises(ValueError, match="loop over the batch"):
+        tracker(_bad(good, depth_mm=good.depth_mm.expand(2, -1, -1, -1)))
+    assert tracker(good).converged
+
+
+def test_a_bad_reference_is_refused():
+    good = press(objects.stamp("T"), objects.pose(0.0))
+    with pytest.raises(ValueError, match="reference: expected a contact with relief, got no contact"):
+        vts.PoseTracker(_bad(good, contact=torch.zeros_like(good.contact)), PITCH)
+    with pytest.raises(ValueError, match=r"mm_per_pixel: expected about 0\.12"):
+        vts.PoseTracker(good, 0.0625)
+    with pytest.raises(ValueError, match="mm_per_pixel"):
+        vts.PoseTracker(good, -1.0)
+
+
+def test_relief_that_shows_nothing_is_named():
+    flat = press(objects.plane(), objects.pose(0.0, (0.0, 0.0), 0.0, (3.0, 0.0)))
+    found = vts.PoseTracker(flat, PITCH)(flat)
+    assert {"translation along x", "rotation about z"} <= set(found.ambiguous)
+
+
+def test_other_types_and_restart():
+    frames = [press(objects.stamp("T"), swing(k)) for k in (0, 1)]
+    double = [_bad(f, depth_mm=f.depth_mm.double(), gradient=f.gradient.double().requires_grad_()) for f in frames]
+    tracker = vts.PoseTracker(double[0], PITCH)
+    found = tracker(double[1])
+    assert found.converged and not found.T_target_source.requires_grad
+    tracker(_bad(frames[0], contact=torch.zeros_like(frames[0].contact)))
+    tracker.restart(swing(1) @ invert(swing(0)))
+    assert error(tracker(frames[1]), swing(0), swing(1))[0] < 0.1
+    tracker.reset(frames[1])
+    assert float(turn_deg(tracker(frames[1]).T_target_source)) < 0.01
+
+
+def test_slopes_err_as_much_as_asked_and_stay_those_of_the_depth():
+    frame = press(objects.key(), objects.pose(0.0))
+    frame = _bad(frame)
+    wrong = tracking.wrong_slopes(frame, 3.0, 1, PITCH)
+    off = (wrong.gradient - frame.gradient).square().sum(1, keepdim=True)[frame.contact].mean().sqrt()
+    assert float(off) == pytest.approx(math.tan(math.radians(3.0)), rel=1e-3)
+    again = tracking.wrong_slopes(frame, 3.0, 1, PITCH)
+    assert torch.equal(again.gradient, wrong.gradient)
+
+
+def test_a_row_of_the_table_counts_what_must_be_seen():
+    motion_ = tracking.Motion(4, lambda k, seed: objects.pose(0.0, press_mm=0.5 if k != 2 else -1.0), lost=(2,))
+    poses = [motion_.pose(k, 0) for k in range(4)]
+    track = tracking.Track(poses, [_bad(press(objects.key(), pose)) for pose in poses], PITCH)
+    row = tracking.follow_track(track, motion_, tracking.TrackRow("key", "lift-off", "none"))
+    assert row.lost == [2] and row.unnoticed == [] and row.wrong == [] and len(row.ms) == 3
+    assert "| key" in tracking.tracking_table([row])
+    blind = tracking.follow_track(track, tracking.Motion(4, motion_.pose, (1, 2)), tracking.TrackRow("key", "x", "y"))
+    assert blind.unnoticed == [1]
+
+
+def test_a_row_of_the_file_holds_pose_and_reason():
+    height = objects.stamp("T")
+    tracker = vts.PoseTracker(press(height, swing(0)), PITCH)
+    found = tracker(press(height, swing(1)))
+    frame = TactileFrame(7, 0.25, torch.zeros(3, 120, 160), _bad(press(height, swing(1))))
+    row = record(frame, found)
+    assert row["frame"] == 7 and row["lost"] == "" and row["converged"] == 1
+    assert float(row["T03"]) == pytest.approx(float(found.T_target_source[0, 3]), rel=1e-6)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["key", "bottle cap"])
+def test_rendered_objects_meet_the_goal(name):
+    ((row, _),) = tracking.run_tracking([name], ["fast"], ["noise 0.005"], seed=4)
+    assert row.lost == [] and row.wrong == []
+    assert float(np.median(row.deg)) < 0.05 and float(np.median(row.mm)) < 0.01 and max(row.deg) < 0.3

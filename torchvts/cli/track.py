@@ -1,0 +1,178 @@
+"""Pose of a touched object in every frame of a camera or a recording, from where it first touches: poses.csv, axes on the image.
+
+The first frames must be without contact. The reference is the first frame with a contact of --least-mm2, or the image --reference.
+Ctrl-C ends it and finishes the files. Exit status 1 where the object was lost.
+
+examples:
+  torchvts track --source video.avi --sensor gelsight_wedge --out out/track
+  torchvts track --source 0 --calibration unit.safetensors --out out/track --reference press.png
+"""
+
+import argparse
+import contextlib
+import csv
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..core.files import read_image, write_atomically
+from ..model import Calibration, Sensor
+from ..pose import PoseTracker, TrackedPose
+from ..stream import Overlay, TactileFrame, TactileStream, VideoFile, Window, has_display
+from .options import add_background_frames, add_device, add_mode, add_network, add_out, add_sensor
+from .parser import UsageError
+
+USAGE = "--source SOURCE (--sensor NAME | --calibration FILE) --out FOLDER"
+
+COLUMNS = ("frame", "time_s", *(f"T{row}{column}" for row in range(3) for column in range(4)))
+QUALITY = (
+    "converged",
+    "lost",
+    "ambiguous",
+    "alternatives",
+    "std_x_mm",
+    "std_y_mm",
+    "std_z_mm",
+    "keyframe",
+    "drift_deg",
+    "drift_mm",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the subcommand."""
+    parser.add_argument("--source", required=True, help="a camera's index (digits), a video file, or a folder of images")
+    add_sensor(parser, "the first frames calibrate: ")
+    parser.add_argument("--calibration", type=Path, metavar="FILE", help="what torchvts calibrate wrote, in place of --sensor")
+    add_background_frames(parser)
+    add_out(parser, "for poses.csv and the video track.mp4")
+    parser.add_argument("--reference", type=Path, metavar="IMAGE", help="of the contact; if not given, the first large one")
+    parser.add_argument("--least-mm2", type=float, default=4.0, metavar="AREA", help="contact of the first reference, mm^2 (4)")
+    parser.add_argument("--video", choices=["mp4", "avi", "none"], default="mp4", help="kind of video in --out")
+    add_mode(parser)
+    add_network(parser)
+    add_device(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Track until the source ends, and print a summary."""
+    if (arguments.sensor is None) == (arguments.calibration is None):
+        raise UsageError("expected either --sensor or --calibration")
+    unit = Sensor.load(arguments.sensor) if arguments.sensor else Calibration.load(arguments.calibration)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, object]] = []
+    with contextlib.ExitStack() as stack:
+        stream = stack.enter_context(
+            TactileStream(
+                arguments.source,
+                unit,
+                mode=arguments.mode,
+                background_frames=arguments.background_frames,
+                network=arguments.network,
+                device=arguments.device,
+            )
+        )
+        print(stream.note)
+        video = None
+        if arguments.video != "none":
+            video = stack.enter_context(VideoFile(arguments.out / f"track.{arguments.video}", stream.fps))
+        view = View(stream, video, Window() if has_display() else None)
+        tracker = None if arguments.reference is None else _tracker_of_image(stream, arguments.reference)
+        try:
+            for frame in stream:
+                found = None
+                if tracker is not None:
+                    found = tracker(frame.output)
+                    rows.append(record(frame, found))
+                elif float(frame.output.contact.sum()) * _pitch(stream) ** 2 >= arguments.least_mm2:
+                    tracker = PoseTracker(frame.output, _pitch(stream))
+                    print(f"frame {frame.number}: the reference")
+                if not view(frame, found, tracker):
+                    break
+        except KeyboardInterrupt:
+            print("interrupted: the frames until now are kept")
+    with write_atomically(arguments.out / "poses.csv") as temporary, open(temporary, "w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS + QUALITY)
+        writer.writeheader()
+        writer.writerows(rows)
+    return _summary(rows, arguments.out, tracker)
+
+
+def record(frame: TactileFrame, found: TrackedPose) -> dict[str, object]:
+    """A row of poses.csv: T_frame_reference, row by row, mm, and what speaks for and against it."""
+    pose = [f"{value:.9g}" for value in found.T_target_source[:3].flatten().tolist()]
+    std = [f"{math.sqrt(value):.4g}" for value in found.covariance.diagonal()[3:].tolist()]
+    named = "; ".join(found.ambiguous)
+    quality = [int(found.converged), found.lost, named, len(found.alternatives), *std, found.keyframe]
+    values = [frame.number, f"{frame.time_s:.6f}", *pose, *quality, f"{found.drift_deg:.4g}", f"{found.drift_mm:.4g}"]
+    return dict(zip(COLUMNS + QUALITY, values, strict=True))
+
+
+class View:
+    """Shows and records each frame with the axes of the reference drawn where the object is."""
+
+    def __init__(self, stream: TactileStream, video: VideoFile | None, window: Window | None) -> None:
+        self.video, self.window, self.pitch = video, window, _pitch(stream)
+        self.overlay = Overlay(stream.metric) if video is not None or window is not None else None
+
+    def __call__(self, frame: TactileFrame, found: TrackedPose | None, tracker: PoseTracker | None) -> bool:
+        """Show a frame; False if the window was closed."""
+        if self.overlay is None:
+            return True
+        image = frame.image
+        lines = ["no reference yet"]
+        if found is not None and tracker is not None:
+            lines = [found.message[:90]]
+            if not found.lost:
+                image = draw_axes(image, found, tracker, self.pitch)
+        picture = self.overlay(frame._replace(image=image), lines)
+        if self.video is not None:
+            self.video.write(picture)
+        return self.window is None or self.window.show(picture)
+
+
+def draw_axes(image: Tensor, found: TrackedPose, tracker: PoseTracker, mm_per_pixel: float, length_mm: float = 2.0) -> Tensor:
+    """The image (3, H, W) with the reference's x (red), y (green) and z (blue) at the middle of its contact.
+
+    Axes of rotations that are not known are drawn thin.
+    """
+    height, width = image.shape[1:]
+    T = found.T_target_source
+    middle = torch.from_numpy(tracker.graph.keyframes[0].many.center)
+    places = middle + length_mm * torch.cat((torch.zeros(1, 3), torch.eye(3))).double()
+    moved = places @ T[:3, :3].T + T[:3, 3]
+    column, row = moved[:, 0] / mm_per_pixel + 0.5 * (width - 1), 0.5 * (height - 1) - moved[:, 1] / mm_per_pixel
+    ends = torch.stack((column, row), 1).round().int().tolist()
+    pixels = np.ascontiguousarray((255.0 * image.clamp(0, 1)).permute(1, 2, 0).numpy().astype(np.uint8))
+    thick = 1 if any(name.startswith("rotation") for name in found.ambiguous) else 2
+    for end, colour in zip(ends[1:], ((230, 60, 50), (60, 200, 80), (60, 90, 240)), strict=True):
+        cv2.line(pixels, tuple(ends[0]), tuple(end), colour, thick, cv2.LINE_AA)
+    return torch.from_numpy(pixels).permute(2, 0, 1).float() / 255.0
+
+
+def _pitch(stream: TactileStream) -> float:
+    return stream.calibration.sensor.mm_per_pixel
+
+
+def _tracker_of_image(stream: TactileStream, path: Path) -> PoseTracker:
+    image = stream.calibration.sensor.rectify(read_image(path)[None])
+    with torch.inference_mode():
+        return PoseTracker(stream.pipe(image), _pitch(stream))
+
+
+def _summary(rows: list[dict[str, object]], out: Path, tracker: PoseTracker | None) -> int:
+    if tracker is None:
+        raise ValueError("source: expected a contact to track, got none: see --least-mm2")
+    lost = [row for row in rows if row["lost"]]
+    print(f"{len(rows)} frames, {len(lost)} lost, {len(tracker.graph.keyframes)} keyframes, {len(tracker.closures)} loops closed")
+    for reason in list(dict.fromkeys(str(row["lost"]) for row in lost))[:5]:
+        print(f"  lost: {reason}")
+    unknown = [str(row["ambiguous"]) for row in rows if row["ambiguous"]]
+    if unknown:
+        print(f"  {len(unknown)} frames with unknown motions, mostly: {max(set(unknown), key=unknown.count)}")
+    print(f"wrote {out / 'poses.csv'}")
+    return 1 if lost else 0

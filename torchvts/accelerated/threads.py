@@ -3,7 +3,7 @@
 import os
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager
 from itertools import pairwise
 
@@ -76,6 +76,37 @@ def by_frames(count: int, pixels: int, call: Callable[[int, int], int | None]) -
     waiting = [_workers().submit(call, first, end - first) for first, end in pairwise(ends[1:])]
     short = call(0, ends[1]) or 0
     return max([short, *(future.result() or 0 for future in waiting)])
+
+
+def share_frames(frames: range, pixels: int, work: Callable[[int], None]) -> None:
+    """Do the work of each frame of a batch, many frames in torch's number of threads, each of which works on its own frames alone.
+
+    Args:
+        frames: their indices.
+        pixels: of a frame.
+        work: takes an index; runs in several threads at once, with the caller's gradients and inference mode.
+    """
+    threads = min(len(frames), torch.get_num_threads()) if len(frames) * pixels > MOST_PIXELS else 1
+    recording, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+
+    def some(first: int) -> None:
+        torch.set_num_threads(1)
+        with torch.inference_mode(inference), torch.set_grad_enabled(recording):
+            for i in frames[first::threads]:
+                work(i)
+
+    if threads == 1:
+        for i in frames:
+            work(i)
+        return
+    with OneThread():
+        waiting = [_workers().submit(some, k) for k in range(1, threads)]
+        try:
+            some(0)
+        finally:
+            wait(waiting)
+    for part in waiting:
+        part.result()
 
 
 def _workers() -> ThreadPoolExecutor:

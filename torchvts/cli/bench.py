@@ -11,6 +11,7 @@ import dataclasses
 import json
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from tqdm import tqdm
@@ -50,8 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _as_user(arguments: argparse.Namespace, data: Path | None) -> None:
     """The table and the chart of frames as a user runs them."""
-    bar: "tqdm[object]" = tqdm(unit="row", disable=None)
-    with bar:
+    with tqdm(unit="row", disable=None) as bar:
         measured = user_speed.run(data, partial(_show, bar), arguments.calls, arguments.long)
     text = user_speed.table(measured)
     rows.write_files(
@@ -65,8 +65,7 @@ def _as_user(arguments: argparse.Namespace, data: Path | None) -> None:
 def _methods(arguments: argparse.Namespace, data: Path | None) -> None:
     """The table of all methods with their errors, and error against time."""
     command = f"torchvts bench --threads {arguments.threads}"
-    bar: "tqdm[object]" = tqdm(unit="row", disable=None)
-    with bar:
+    with tqdm(unit="row", disable=None) as bar:
         measured = speed.run(command, partial(_show, bar), data)
     time = measured[0].time
     machine = f"{time.machine}, {arguments.threads} threads, float32" if time else ""
@@ -79,6 +78,6 @@ def _methods(arguments: argparse.Namespace, data: Path | None) -> None:
     print(f"\nbench.md, bench.json and speed_accuracy.png in {arguments.out}")
 
 
-def _show(bar: "tqdm[object]", name: str) -> None:
+def _show(bar: Any, name: str) -> None:
     bar.set_postfix_str(name)
     bar.update()

@@ -1,5 +1,6 @@
 """The depth pipeline: a calibration made into a chain of modules that turns images into depth."""
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Final, TypeVar
 
@@ -20,7 +21,7 @@ from ..accelerated import (
     ZeroBackground,
     scriptable,
 )
-from ..accelerated.threads import OneThread, one_suffices
+from ..accelerated.threads import OneThread, one_suffices, share_frames
 from ..compensate import Compensate as PlainCompensate
 from ..contact import ContactMask as PlainContactMask
 from ..contact import ContactSettings
@@ -251,11 +252,17 @@ class DepthPipeline(nn.Module):
         if one.depth_mm.requires_grad:
             return joined([one] + [self.depth_of(images[i : i + 1]) for i in range(1, images.shape[0])])
         out = batch_like(one, images.shape[0])  # half the memory of all frames and their copy
-        for i in range(images.shape[0]):
-            if i > 0:
-                one = self.depth_of(images[i : i + 1])
-            write_frame(out, i, one)
+        write_frame(out, 0, one)
+        if torch.jit.is_scripting():
+            for i in range(1, images.shape[0]):
+                self.write_depth(out, images, i)
+        else:
+            share_frames(range(1, len(images)), images.shape[2] * images.shape[3], partial(self.write_depth, out, images))
         return out
+
+    def write_depth(self, out: DepthOutput, images: Tensor, i: int) -> None:
+        """Write the output of the frame with this index."""
+        write_frame(out, i, self.depth_of(images[i : i + 1]))
 
     def depth_of(self, images: Tensor) -> DepthOutput:
         """The same of checked images, in one window."""

@@ -100,11 +100,12 @@ def test_of_many_left_out_a_few_are_printed():
 
 
 @pytest.fixture(scope="module")
-def rig(small_sensor, small_press, ring):
+def rig(ring):
     """Sensor, lights, background and an image of a press."""
-    lights, press = ring(), small_press()
-    background = vts.scenes.render(vts.scenes.undeformed(press), lights, noise_std=0.002)[0]
-    return small_sensor, lights, background, vts.scenes.render(press, lights, noise_std=0.002, seed=1)[0]
+    lights, press = ring(), vts.scenes.sphere_press(10.0, 1.0, (0.0, 0.0), 48, 64, 0.6)
+    background = vts.scenes.render(vts.scenes.undeformed(press), lights, noise_std=0.002)[0].detach()
+    image = vts.scenes.render(press, lights, noise_std=0.002, seed=1)[0].detach()
+    return vts.Sensor("rig", 48, 64, 0.6, gamma=1.0), lights, background, image
 
 
 def test_calibrate_says_in_few_lines_what_to_expect(rig, run_script, tmp_path):
@@ -118,6 +119,9 @@ def test_calibrate_says_in_few_lines_what_to_expect(rig, run_script, tmp_path):
     assert done.returncode == 0 and done.stderr == "" and len(lines) == 4, done.stderr
     assert [line.partition(" ")[0] for line in lines] == ["sensor:", "chosen:", "expected:", "wrote"]
     assert "directions of the lights to 0." in lines[2]
+    wrong = run_script("calibrate", *given, "--press", tmp_path / "ball.png", "20", "--press", tmp_path / "background.png", "20")
+    left = [line for line in wrong.stdout.splitlines() if line.startswith("left out: press background.png: ")]
+    assert wrong.returncode == 0 and len(left) == 1 and "background.png: left out" not in wrong.stderr
     table = run_script("calibrate", *given, "--candidates")
     assert "| point lights | three lights | 2 |" in table.stdout and "| R | " in table.stdout
 
@@ -130,6 +134,9 @@ def test_what_to_expect_follows_the_source(rig, mini_by_prior):
     held_out = {"model": "response", "source": "presses", "held_out_deg": 1.5, "presses": [{"name": "a", "used": True}] * 12}
     presses = vts.Calibration.from_response(mini_by_prior.response, mini_by_prior.sensor, mini_by_prior.background, held_out)
     assert "to about 1.7 degrees, by scoring each of 12 presses with the others" in expected(presses)
+    few = {"model": "response", "source": "presses", "held_out_deg": None, "presses": []}
+    fitted = vts.Calibration.from_response(mini_by_prior.response, mini_by_prior.sensor, mini_by_prior.background, few)
+    assert "5.0 degrees or better: too few presses to score any" in expected(fitted)
     rough = vts.Calibration.from_response(
         mini_by_prior.response, mini_by_prior.sensor, mini_by_prior.background, {"model": "response", "source": "stand_in"}
     )

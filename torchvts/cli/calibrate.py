@@ -18,10 +18,10 @@ import torch
 from ..calibration import Press, Touch, read_presses
 from ..core.files import read_frames
 from ..model import Sensor
-from ..stream import calibrate_unit, read_background, read_press_images
+from ..stream import read_background, read_press_images
 from .options import add_background_frames, add_press, add_sensor
 from .parser import UsageError
-from .summary import print_calibration
+from .summary import calibrated, print_calibration
 
 USAGE = "SOURCE... (--sensor NAME | --mm-per-pixel MM) [--press IMAGE MM]... [--out FILE]"
 
@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
     image, sensor, presses = read_given(arguments)
     presses += read_press_images(arguments.press, sensor)
     touches = [Touch(sensor.read_image(path), None, path.name) for path in arguments.touches]
-    calibration = calibrate_unit(image, sensor, presses, touches, progress=True)
+    calibration = calibrated(image, sensor, presses, touches)
     calibration.save(arguments.out)
     print_calibration(calibration, arguments.candidates)
     print(f"wrote {arguments.out} ({arguments.out.stat().st_size / 1000:.0f} kB)")

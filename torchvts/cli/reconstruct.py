@@ -20,10 +20,10 @@ from ..core.files import VIDEO_SUFFIXES, read_frames
 from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, Report, list_items, reconstruct_dataset
 from ..diagnose import Finding, diagnose
 from ..model import Sensor
-from ..stream import calibrate_background, read_background, read_press_images
+from ..stream import read_background, read_press_images
 from .options import add_background_frames, add_device, add_mode, add_network, add_out, add_press, add_sensor, load_calibration
 from .parser import UsageError
-from .summary import SHOWN, left_out, print_calibration
+from .summary import SHOWN, calibrated, left_out, print_calibration
 
 PASSED = (
     "mode", "format", "cloud", "pictures", "every", "network", "device", "background_frames", "batch", "workers", "threads",
@@ -95,11 +95,11 @@ def calibrate_first(arguments: argparse.Namespace, inputs: list[Path]) -> Path:
         raise UsageError(f"--background: expected images without contact, got none: {inputs[0]} is no video that begins with them")
     unit = Sensor.load(arguments.sensor)
     image = read_background(arguments.background or [video], unit, arguments.background_frames)
-    found = calibrate_background(image, unit, read_press_images(arguments.press, unit))
-    print_calibration(found.calibration)
+    calibration = calibrated(image, unit, read_press_images(arguments.press, unit))
+    print_calibration(calibration)
     path: Path = arguments.out / "calibration.safetensors"
     path.parent.mkdir(parents=True, exist_ok=True)
-    found.calibration.save(path)
+    calibration.save(path)
     return path
 
 

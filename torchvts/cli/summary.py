@@ -1,11 +1,16 @@
 """What a person reads of a calibration: the model, how good it is likely to be, what was left out; candidates on request."""
 
-from collections.abc import Iterator
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
 
-from ..model import Calibration, PointLights
+from torch import Tensor
+
+from ..calibration import CalibrationWarning, Press, Touch
+from ..model import Calibration, PointLights, Sensor
 from ..model.report import CandidateRow, PressRow, Report
 from ..pipeline.confidence import expected_model_deg
-from ..stream import NOT_METRIC, use_calibration
+from ..stream import NOT_METRIC, calibrate_unit, use_calibration
 
 SHOWN = 5
 """Of a list, so many lines are printed."""
@@ -46,6 +51,18 @@ def print_calibration(calibration: Calibration, candidates: bool = False) -> Non
             print_presses(report["presses"])
 
 
+def calibrated(background: Tensor, sensor: Sensor, presses: Sequence[Press], touches: Sequence[Touch] = ()) -> Calibration:
+    """:func:`torchvts.stream.calibrate_unit`; warnings become lines on stderr, save those about presses that the summary names."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", CalibrationWarning)
+        calibration = calibrate_unit(background, sensor, presses, touches, progress=True)
+    named = tuple(f"{row['name']}: left out" for row in calibration.report.get("presses", []) if not row["used"])
+    for text in dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught):
+        if not text.startswith(named):
+            print(f"torchvts: warning: {text}", file=sys.stderr)
+    return calibration
+
+
 def expected(calibration: Calibration) -> str:
     """How good depth is likely to be, from the held-out score, the record of the prior, or the spread of the lights."""
     report = calibration.report
@@ -62,7 +79,7 @@ def expected(calibration: Calibration) -> str:
         return f"{degrees}, by scoring each of {used} presses with the others"
     if report["source"] == "prior":
         return f"{degrees}, the prior's record on other units of its type; presses of a ball would measure this unit"
-    return f"{degrees}, as usual from so few; more presses of a ball would measure it"
+    return f"{degrees} or better: too few presses to score any; more presses of a ball would measure it"
 
 
 def left_out(what: str, rows: list[tuple[str, str]]) -> Iterator[str]:

@@ -80,7 +80,9 @@ def _follow_from(keyframe: Keyframe, frame: Grids, start: Array) -> Followed:
     cost = (forth.cost * forth.compared + back.cost * back.compared) / compared
     fitness = (forth.fitness * forth.compared + back.fitness * back.compared) / compared
     overlap = max(forth.compared / len(keyframe.coarse.rows), back.compared / max(len(back_pixels.rows), 1))
-    return Followed(pose, fine, fitness, overlap, cost, free, _names(unknown, pose), _covariance(keyframe.many, fine, forth, pose, free))
+    return Followed(
+        pose, fine, fitness, overlap, cost, free, _names(unknown, pose), _covariance(keyframe.many, fine, forth, pose, free)
+    )
 
 
 def common_share(keyframe: Keyframe, frame: Grids, sums: Sums, pixels: Pixels) -> float:

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from ..accelerated import ZeroBackground
 from ..core.geometry import gradient_of_depth, normal_from_gradient
 from ..integration import poisson_dst
 from ..model import PointLights
@@ -169,14 +170,15 @@ def wrong_slopes(frame: DepthOutput, error_deg: float, seed: int, mm_per_pixel: 
         seed: of the unit: its error is the same in all frames.
         mm_per_pixel: pixel pitch, mm.
     Returns:
-        The frame with wrong slopes and the depth that they have: the error is that of a surface which is zero at the image border.
+        The frame with wrong slopes and the depth that they have; undeformed skin stays zero, as pipelines hold it.
     """
     generator = torch.Generator().manual_seed(seed + 77)
     maps = interpolate(torch.randn(1, 6, 4, 5, generator=generator), frame.depth_mm.shape[-2:], mode="bicubic", align_corners=True)
     slope, inside = frame.gradient, frame.deformed.to(frame.depth_mm.dtype)
     gain = torch.stack(((maps[:, :2] * slope).sum(1), (maps[:, 2:4] * slope).sum(1)), 1)
     size = (gain * inside).square().sum().div(inside.sum().clamp_min(1.0)).sqrt().clamp_min(1e-6)
-    depth = poisson_dst((maps[:, 4:] + gain / size) * inside, mm_per_pixel)
+    depth = 0.03 * poisson_dst((maps[:, 4:] + gain / size) * inside, mm_per_pixel)
+    depth = ZeroBackground()(frame.depth_mm + depth, frame.deformed) - frame.depth_mm  # a pipeline knows where skin is undeformed
     error = gradient_of_depth(depth, mm_per_pixel) * inside
     there = error.square().sum(1, keepdim=True)[frame.contact]
     scale = math.tan(math.radians(error_deg)) / max(float(there.mean().sqrt()) if len(there) else 0.0, 1e-6)

@@ -14,6 +14,9 @@ from .keyframe import Grids, Keyframe
 COARSE_STEPS, SOME_STEPS = 8, 6
 """Largest number of steps on the coarse grid, and with some pixels of the fine one."""
 
+INDEPENDENT_PARTS = 6
+"""Parts of a contact over which errors of a calibrated sensor are independent: they are smooth, as its fields are."""
+
 MOST_STD_DEG, MOST_STD_MM = 1.0, 0.15
 """Standard deviations of a motion, as a turn and as a shift, above which it is called unknown."""
 
@@ -77,7 +80,9 @@ def _follow_from(keyframe: Keyframe, frame: Grids, start: Array) -> Followed:
     cost = (forth.cost * forth.compared + back.cost * back.compared) / compared
     fitness = (forth.fitness * forth.compared + back.fitness * back.compared) / compared
     overlap = max(forth.compared / len(keyframe.coarse.rows), back.compared / max(len(back_pixels.rows), 1))
-    return Followed(pose, fine, fitness, overlap, cost, free, _names(unknown, pose), _covariance(keyframe.many, fine, pose, free))
+    return Followed(
+        pose, fine, fitness, overlap, cost, free, _names(unknown, pose), _covariance(keyframe.many, fine, forth, pose, free)
+    )
 
 
 def common_share(keyframe: Keyframe, frame: Grids, sums: Sums, pixels: Pixels) -> float:
@@ -163,15 +168,17 @@ def _names(unknown: _Unknown, pose: Array) -> list[str]:
     return name_directions(torch.from_numpy(turned), torch.from_numpy(turn @ unknown.shifts))
 
 
-def _covariance(pixels: Pixels, fine: Sums, pose: Array, free: Array) -> Array:
+def _covariance(pixels: Pixels, fine: Sums, coarse: Sums, pose: Array, free: Array) -> Array:
     """Covariance of a small motion after the pose.
 
-    Residuals are alike over some pixels, and an error of the height is alike over all of them.
+    Residuals are alike over some pixels, and an error of the height is alike over all of them. What is left of residuals in
+    means over cells is alike over a large part of the contact, and tilts it.
     """
     known = np.eye(6) - free @ free.T
     scaled = np.linalg.pinv(known @ fine.matrix @ known, rcond=1e-9, hermitian=True)
     scaled *= ALIKE_PIXELS * (fine.slope_noise / fine.noise) ** 2
     scaled[5, 5] += fine.depth_noise**2
+    scaled[[0, 1], [0, 1]] += (coarse.slope_noise / pixels.units[:2]) ** 2 / INDEPENDENT_PARTS
     scaled += free @ free.T * UNKNOWN_VARIANCE
     to_origin = np.diag(pixels.units)
     to_origin[3:, :3] = cross(pixels.center) @ to_origin[:3, :3]

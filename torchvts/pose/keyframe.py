@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -75,6 +74,8 @@ def contact_frame(frame: DepthFrame) -> Contact:
 
 def grids(frame: Contact, mm_per_pixel: float, least_mm: float, times: tuple[int, int]) -> Grids:
     """A frame on both grids, of ``times`` pixels a side; skin deeper than ``least_mm`` within its contact lies on the object."""
+    import cv2
+
     z, contact = frame.depth_mm[0, 0].numpy(), frame.contact[0, 0].numpy().view(np.uint8)
     p, q = frame.gradient[0].numpy()
     height, width = z.shape
@@ -95,6 +96,8 @@ def _pooled(
     values: tuple[Image, Image, Image], inside: Mask, perhaps: Mask, times: int, grid: tuple[float, float, float], share: float
 ) -> Field:
     """Means over the part of each cell of ``times`` x ``times`` pixels that lies on the object, which must be ``share`` of it."""
+    import cv2
+
     x0, y0, pitch = grid
     rows, columns = (length // times * times for length in inside.shape)
     size = (columns // times, rows // times)

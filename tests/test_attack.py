@@ -37,7 +37,7 @@ def attacked(record_property):
     return lambda what, count: record_property("attacked", json.dumps([what, count]))
 
 
-def run_python(program, *arguments, timeout=300, **environment):
+def run_python(program, *arguments, timeout=900, **environment):
     command = [sys.executable, "-W", "ignore", "-c", program, *map(str, arguments)]
     return subprocess.run(command, env=ENVIRONMENT | environment, capture_output=True, text=True, timeout=timeout)
 
@@ -232,7 +232,7 @@ def test_damaged_results_are_made_again(tmp_path, attacked):
 def test_bad_calls(part, tmp_path, attacked):
     """Of every public callable, with values that nobody should give: only TypeError, ValueError and OSError come out, in time."""
     command = [sys.executable, "-W", "ignore", str(HERE / "attack_calls.py"), "1260", str(part)]
-    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, cwd=tmp_path, timeout=600)
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, cwd=tmp_path, timeout=900)
     lines = done.stdout.splitlines()
     assert done.returncode == 0, f"died at {lines[-1:]}: {done.stderr[-500:]}"
     assert [line for line in lines if not line.endswith(' ""')] == []

@@ -126,3 +126,32 @@ def cliffs(gradient, contact, pitch, slope_std, threshold, rim_weight, depth):
     found = np.zeros(height * width)
     found[inside] = np.linalg.solve(normal[np.ix_(inside, inside)], right[inside])
     return found.reshape(height, width)
+
+
+def metallic_roughness_image(depth, normal, lights, power, pitch, base=1.0, metallic=0.2, roughness=0.8):
+    """Light (3, H, W) of point lights on a surface as renderers of glTF shade it: the fragment shader of pyrender, line by line.
+
+    Args:
+        depth: (H, W), mm, towards an orthographic camera. normal: (3, H, W). lights: (3, 3), mm. power: (3,).
+    """
+    height, width = depth.shape
+    x, y = (np.arange(width) - (width - 1) / 2) * pitch, (np.arange(height) - (height - 1) / 2) * pitch
+    point = np.stack([np.broadcast_to(x, depth.shape), np.broadcast_to(y[:, None], depth.shape), depth])
+    f0, diffuse = 0.04 * (1 - metallic) + base * metallic, base * (1 - 0.04) * (1 - metallic)
+    image = []
+    for light, strength in zip(lights, power):
+        way = light[:, None, None] - point
+        distance = np.sqrt((way**2).sum(0))
+        to_light = way / distance
+        half = to_light + np.array([0.0, 0.0, 1.0])[:, None, None]
+        half /= np.sqrt((half**2).sum(0))
+        nl, nv = np.clip((normal * to_light).sum(0), 0.001, 1), np.clip(normal[2], 0.001, 1)
+        nh, vh = np.clip((normal * half).sum(0), 0, 1), np.clip(half[2], 0, 1)
+        fresnel = f0 + (1 - f0) * (1 - vh) ** 5
+        k, a = (roughness + 1) ** 2 / 8, roughness**4
+        masking = nv / (nv * (1 - k) + k) * nl / (nl * (1 - k) + k)
+        lobe = a / (np.pi * (nh**2 * (a - 1) + 1) ** 2)
+        image.append(
+            nl * strength / distance**2 * ((1 - fresnel) * diffuse / np.pi + fresnel * masking * lobe / (4 * nl * nv + 0.001))
+        )
+    return np.stack(image)

@@ -5,7 +5,9 @@ import json
 import math
 import warnings
 
+import numpy as np
 import pytest
+import references
 import torch
 
 import torchvts as vts
@@ -366,3 +368,34 @@ def test_the_jacobian_is_exact():
     assert value[0].tolist() == pytest.approx([a * math.exp(b), math.sin(a), math.sin(b)])
     expected = [[math.exp(b), math.cos(a), 0.0], [a * math.exp(b), 0.0, math.cos(b)]]
     assert torch.allclose(jacobian[0], torch.tensor(expected, dtype=torch.float64), atol=1e-15)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "out_mm, height_mm, azimuth_deg",
+    [
+        ([30.0, 30.0, 30.0], [17.0, 17.0, 17.0], 30.0),
+        ([45.0, 45.0, 45.0], [40.0, 40.0, 40.0], 80.0),
+        ([29.3, 34.1, 32.0], [17.2, 18.2, 26.2], 71.0),
+    ],
+)
+def test_a_renderers_material_is_no_matt_skin(out_mm, height_mm, azimuth_deg):
+    """Rigs drawn at random under the shading of pyrender, which TACTO uses, 8 bits, gamma 2.2: calibrated from the background."""
+    pitch, sensor = 0.25, vts.Sensor("rendered", 120, 160, 0.25, gamma=2.2)
+    angle = np.radians(azimuth_deg + np.array([0.0, 120.0, 240.0]))
+    out, rise = np.array(out_mm), np.array(height_mm)
+    lights = np.stack([out * np.cos(angle), out * np.sin(angle), rise], axis=1)
+    scene = vts.scenes.sphere_press(10.0, 1.0, (0.0, 0.0), 120, 160, pitch, torch.float64)
+
+    def camera(of, power):
+        light = references.metallic_roughness_image(of.depth_mm[0, 0].numpy(), of.normal[0].numpy(), lights, power, pitch)
+        return light, torch.from_numpy(np.round(255 * np.clip(light, 0, 1) ** (1 / 2.2)) / 255).float()
+
+    flat = vts.scenes.undeformed(scene)
+    power = 0.24 / camera(flat, np.ones(3))[0][:, 60, 80]
+    background = camera(flat, power)[1]
+    fit = vts.fit_lights(background, sensor)
+    pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(fit.lights, sensor, background), "precise")
+    error = (pipe(camera(scene, power)[1][None]).depth_mm - scene.depth_mm)[0, 0].abs() / 0.0625
+    assert float(error.max()) < 0.3
+    assert float((fit.lights.position_mm.detach() - torch.from_numpy(lights)).norm(dim=1).max()) < 1.0

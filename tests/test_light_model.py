@@ -72,6 +72,22 @@ def test_zero_gloss_is_a_matt_skin(ring):
     assert change[:, :2].abs().max() == 0 and change.min() >= 0 and change[:, 2].max() > 0.01
 
 
+def test_the_lobe_is_that_of_a_renderer(ring):
+    """pyrender's metallic-roughness material of roughness 0.8."""
+    lights, scene = (
+        ring(30.0, 17.0, dtype=torch.float64),
+        vts.scenes.sphere_press(10.0, 1.0, (0.0, 0.0), 60, 80, 0.25, torch.float64),
+    )
+    depth, normal, position = scene.depth_mm[0, 0].numpy(), scene.normal[0].numpy(), lights.position_mm.detach().numpy()
+    expected = torch.from_numpy(references.metallic_roughness_image(depth, normal, position, np.ones(3), 0.25))
+    f0, diffuse = 0.04 * 0.8 + 0.2, 0.96 * 0.8
+    gloss = f0 / (4.0 * (1.0 - f0) * diffuse)
+    glossy = vts.PointLights(lights.position_mm.detach(), torch.full((3,), (1.0 - f0) * diffuse / np.pi), [gloss] * 3)
+    found = vts.near_field_shading(scene.depth_mm, scene.normal, glossy, 0.25)[0].detach()
+    lit = expected > 0.02 * expected.amax()
+    assert float((found / expected - 1.0)[lit].abs().max()) < 0.01
+
+
 def test_gloss_depends_on_directions_only(ring):
     lights = ring(dtype=torch.float64)
     depth, normal = random_scene()

@@ -236,8 +236,9 @@ def light_matrix(
     return albedo.reshape(1, 3, 1, 1, 1) * to_light * (squared.rsqrt() / squared)
 
 
-GLOSS_ROUGHNESS = 0.6
-"""Width of the specular lobe (GGX alpha) that ``PointLights.gloss`` scales: a satin skin."""
+GLOSS_ROUGHNESS = 0.8
+"""Roughness of the specular lobe that ``PointLights.gloss`` scales: a satin skin, and what pyrender, and so TACTO, gives a surface
+without a material of its own."""
 
 
 def gloss_lobe(matrix: Tensor, normal: Tensor) -> Tensor:
@@ -249,8 +250,8 @@ def gloss_lobe(matrix: Tensor, normal: Tensor) -> Tensor:
     Returns:
         (B, 3, H, W), D V of the microfacet model, at least 0.
     Source:
-        Walter, Marschner, Li, Torrance, Microfacet models for refraction through rough surfaces, EGSR 2007 (GGX); Heitz,
-        JCGT 3(2), 2014, for the masking term.
+        Walter, Marschner, Li, Torrance, Microfacet models for refraction through rough surfaces, EGSR 2007 (GGX); Karis, Real
+        shading in Unreal Engine 4, SIGGRAPH course 2013, for the masking term, which renderers of glTF take.
     """
     to_light = matrix * torch.rsqrt((matrix * matrix).sum(2, keepdim=True))  # (B, 3, 3, H, W)
     n_l = (to_light * normal.unsqueeze(1)).sum(2).clamp_min(1e-3)
@@ -260,10 +261,10 @@ def gloss_lobe(matrix: Tensor, normal: Tensor) -> Tensor:
 
 
 def microfacet(n_l: Tensor, n_v: Tensor, n_h: Tensor, roughness: float = GLOSS_ROUGHNESS) -> Tensor:
-    """D V of the GGX model, from the cosines normal-light, normal-view, normal-half-way."""
-    a = roughness**2
+    """D V of the metallic-roughness model, from the cosines normal-light, normal-view, normal-half-way: GGX, Schlick's masking."""
+    a, k = roughness**4, (roughness + 1.0) ** 2 / 8.0
     spread = a / (n_h * n_h * (a - 1.0) + 1.0) ** 2
-    return spread / (n_l * torch.sqrt(n_v * n_v * (1.0 - a) + a) + n_v * torch.sqrt(n_l * n_l * (1.0 - a) + a))
+    return spread / ((n_l * (1.0 - k) + k) * (n_v * (1.0 - k) + k))
 
 
 def inverse_light_matrix(

@@ -29,7 +29,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--chart", type=Path, help="write the chart here too")
     parser.add_argument("--only", choices=("user", "methods"), help="measure one of the two tables only")
     parser.add_argument("--calls", type=int, default=100, help="frames of each row of the user's table")
-    parser.add_argument("--long", action="store_true", help="10,000 frames 20 ms apart too, for the 99th percentile")
+    parser.add_argument("--long", action="store_true", help="10,000 frames every 20 ms too, for the 99th percentile")
     arguments = parser.parse_args(argv)
     torch.set_num_threads(arguments.threads)
     data: Path | None = data_folder(__file__)

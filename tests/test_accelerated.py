@@ -8,7 +8,15 @@ import torch
 
 import torchvts as vts
 from torchvts.accelerated import kernels, reference_only
-from torchvts.accelerated.blocks import Compensate, ContactFromDepth, Drift, LargestChange, NormalFromResponse, ZeroBackground
+from torchvts.accelerated.blocks import (
+    Compensate,
+    ContactFromDepth,
+    Drift,
+    LargestChange,
+    MaskedGradient,
+    NormalFromResponse,
+    ZeroBackground,
+)
 from torchvts.accelerated.gate import usable
 from torchvts.core.geometry import gradient_of_depth
 from torchvts.model.response_field import DepthBrightness, ResponseField, ResponseModel
@@ -397,3 +405,12 @@ def test_small_batches_take_one_thread_and_large_ones_all(ring):
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("size", [(48, 64), (45, 63), (2, 2), (1, 9), (9, 1), (1, 1)])
+def test_slopes_of_depth(size):
+    """Of windows of larger images."""
+    depth, _, deformed = rough_presses((size[0] + 8, size[1] + 16), 3, size[0])
+    part = (slice(None), slice(None), slice(8, None), slice(16, None))
+    loops, operators = both(MaskedGradient(0.1), depth[part], deformed[part])
+    assert loops.shape == operators.shape and float((loops - operators).abs().max()) < 2e-5

@@ -191,6 +191,17 @@ class Masked(Twin, frames.Masked):
         return kernels.masked(gradient, mask) if usable(gradient) else super().forward(gradient, mask)
 
 
+class MaskedGradient(Twin, frames.MaskedGradient):
+    """One compiled pass."""
+
+    plain = frames.MaskedGradient
+
+    def forward(self, depth_mm: Tensor, mask: Tensor) -> Tensor:
+        if not usable(depth_mm):
+            return super().forward(depth_mm, mask)
+        return kernels.depth_slopes(depth_mm, mask, self.mm_per_pixel)
+
+
 class GradientFromNormal(Twin, geometry.GradientFromNormal):
     """One compiled pass."""
 

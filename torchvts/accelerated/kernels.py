@@ -80,6 +80,8 @@ def library() -> ctypes.CDLL | None:
         pointer,
     ]
     loaded.mask_values.argtypes = [pointer, pointer, *[step] * 2, *[whole] * 4, pointer]
+    loaded.depth_slopes.argtypes = [pointer, *[step] * 2, pointer, *[step] * 2, real, *[whole] * 3, pointer]
+    loaded.depth_slopes.restype = None
     loaded.response_normals.restype = loaded.mask_values.restype = None
     loaded.grid_means.argtypes = [pointer, *[whole] * 7, pointer]
     loaded.slopes.argtypes = [pointer, whole, whole, real, pointer]
@@ -320,6 +322,24 @@ def masked(gradient: Tensor, mask: Tensor) -> Tensor:
     out = torch.empty_like(gradient)
     _loaded().mask_values(gradient.data_ptr(), mask.data_ptr(), mask.stride(0), mask.stride(2), *gradient.shape, out.data_ptr())
     return out
+
+
+def depth_slopes(depth_mm: Tensor, mask: Tensor, mm_per_pixel: float) -> Tensor:
+    """The gradient of depth (B, 1, h, w), (B, 2, h, w), zero outside of a mask, bool (B, 1, h, w)."""
+    depth_mm, mask = _with_whole_rows(depth_mm), _with_whole_rows(mask)
+    count, _, rows, columns = depth_mm.shape
+    gradient = depth_mm.new_empty(count, 2, rows, columns)
+    strides = (depth_mm.stride(0), depth_mm.stride(2)), (mask.stride(0), mask.stride(2))
+    settings, kernel = (0.5 / mm_per_pixel,), _loaded().depth_slopes
+    by_frames(
+        count,
+        rows * columns,
+        lambda first, many: kernel(
+            *(_at(depth_mm, first), *strides[0], _at(mask, first), *strides[1], *settings),
+            *(many, rows, columns, _at(gradient, first)),
+        ),
+    )
+    return gradient
 
 
 def normals(compensated: Tensor, limits: Limits, inverse: Tensor, depth_mm: Tensor | None, view: LightView) -> tuple[Tensor, bool]:

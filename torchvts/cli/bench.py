@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--threads", type=int, default=torch.get_num_threads(), metavar="N", help="all cores if not given")
     parser.add_argument("--only", choices=("user", "methods"), help="measure one of the two tables")
     parser.add_argument("--calls", type=int, default=100, metavar="N", help="frames of each row of the user's table (100)")
-    parser.add_argument("--long", action="store_true", help="10,000 frames 20 ms apart too, for the 99th percentile")
+    parser.add_argument("--long", action="store_true", help="10,000 frames every 20 ms too, for the 99th percentile")
     parser.add_argument("--chart", type=Path, metavar="FILE", help="write the chart of errors here too")
 
 

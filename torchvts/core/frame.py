@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from .checks import may_read_values
-from .geometry import normal_from_gradient
+from .geometry import gradient_of_depth, normal_from_gradient
 
 
 class Frame(NamedTuple):
@@ -63,6 +63,22 @@ class Masked(nn.Module):
     """A gradient (B, 2, h, w), zero outside of a mask, bool (B, 1, h, w)."""
 
     def forward(self, gradient: Tensor, mask: Tensor) -> Tensor:
+        return gradient * as_factor(mask, gradient)
+
+
+class MaskedGradient(nn.Module):
+    """The gradient of depth (B, 1, h, w), (B, 2, h, w), zero outside of a mask, bool (B, 1, h, w).
+
+    Args:
+        mm_per_pixel: pixel pitch, mm.
+    """
+
+    def __init__(self, mm_per_pixel: float) -> None:
+        super().__init__()
+        self.mm_per_pixel = mm_per_pixel
+
+    def forward(self, depth_mm: Tensor, mask: Tensor) -> Tensor:
+        gradient = gradient_of_depth(depth_mm, self.mm_per_pixel)
         return gradient * as_factor(mask, gradient)
 
 

@@ -180,7 +180,7 @@ def _cost_against_size(axes: Any, rows: Sequence[Row]) -> None:
 
 
 def user_speed_figure(measured: Measured) -> Figure:
-    """Time of a frame against size, a panel for each unit, real ones first: tight loops, frames 20 ms apart, and the peer."""
+    """Time of a frame against size, a panel for each unit, real ones first: tight loops, frames every 20 ms, and the peer."""
     units = list(dict.fromkeys(row.unit for row in measured.frames))
     figure = new_figure(6.2 * len(units), 4.6)
     panels = figure.subplots(1, len(units), squeeze=False, sharey=True)[0]

@@ -25,7 +25,7 @@ from .peers import GsSdkPipeline
 from .rows import Size, markdown, number
 from .speed import GS_SDK, SIZES, _rig, memory_mb
 
-PACES = ("tight loop", "20 ms apart", "after the peer's frame")
+PACES = ("tight loop", "every 20 ms", "after the peer's frame")
 """What comes before each frame: the last one; sleep, as behind a camera; a frame of the peer, which takes the caches."""
 
 MODES = ("fast", "precise")
@@ -215,7 +215,7 @@ def run(data: Path | None, progress: Callable[[str], None], calls: int = 100, lo
         data: folder with ``gelsight_mini_a``; None without: then the drawn rig alone.
         progress: called with the name of what is measured next.
         calls: number of calls of each row, at least 20.
-        long: 10,000 frames, 20 ms apart, of the first unit at 320x240 too, for the 99th percentile: seven minutes more.
+        long: 10,000 frames, every 20 ms, of the first unit at 320x240 too, for the 99th percentile: seven minutes more.
     """
     makers: list[Callable[[tuple[int, int]], Unit]] = [drawn] if data is None else [partial(mini, data), drawn]
     rows: list[Paced] = []
@@ -229,7 +229,7 @@ def run(data: Path | None, progress: Callable[[str], None], calls: int = 100, lo
                 rows += _in_one_thread(unit, calls)
     unit = makers[0](SIZES[1])
     if long:
-        progress("10,000 frames, 20 ms apart")
+        progress("10,000 frames, every 20 ms")
         for mode in MODES:
             call = partial(DepthPipeline.from_calibration(unit.calibration, mode), unit.image)
             times = paced(call, partial(time.sleep, 0.02), 10_000)

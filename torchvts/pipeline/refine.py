@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor, nn
 
+from ..accelerated import MaskedGradient
 from ..core.frame import Frame, Solution, as_factor, depth_in_window
-from ..core.geometry import gradient_of_depth
 from ..integration import Integrator
 from ..normals import NormalModel
 from .solve import Solve
@@ -57,13 +57,15 @@ class Repeat(nn.Module):
                 return self._repeat_in_graph(frame, solution, active)
         gradient, depth = solution.gradient, solution.depth_mm
         last_px = depth.detach().abs().amax(dim=(1, 2, 3)) / self.mm_per_pixel
-        for _ in range(1, self.max_passes):
+        for number in range(1, self.max_passes):
             if not bool(active.any()):
                 break
             index = torch.where(active)[0]
             every = index.shape[0] == active.shape[0]
             before = _some(depth, index, every)
             found = self.solve(_some_frames(frame, index, every), before)
+            if number == self.max_passes - 1:  # whatever is missing still
+                return Solution(_with_some(gradient, index, found.gradient, every), _with_some(depth, index, found.depth_mm, every))
             change_px = self.largest_change(found.depth_mm.detach(), before.detach()) / self.mm_per_pixel
             missing_px = still_missing_px(change_px, _some(last_px, index, every))
             gradient = _with_some(gradient, index, found.gradient, every)
@@ -107,11 +109,11 @@ class SlopesOfDepth(nn.Module):
 
     def __init__(self, mm_per_pixel: float) -> None:
         super().__init__()
-        self.mm_per_pixel = mm_per_pixel
+        self.gradient = MaskedGradient(mm_per_pixel)
 
     def forward(self, frame: Frame, solution: Solution) -> Solution:
-        gradient = gradient_of_depth(depth_in_window(frame, solution.depth_mm), self.mm_per_pixel)
-        return Solution(gradient * as_factor(frame.mask, gradient), solution.depth_mm)
+        gradient = self.gradient(depth_in_window(frame, solution.depth_mm), frame.mask)
+        return Solution(gradient, solution.depth_mm)
 
 
 class SlopesOfPixels(nn.Module):

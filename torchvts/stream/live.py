@@ -266,7 +266,7 @@ class TactileStream:
             self.stages.end_frame()
 
     def _threads(self, pixels: Pixels | Unreadable) -> AbstractContextManager[None]:
-        """A small frame is worked on in one thread: others would wake up late, as frames lie apart."""
+        """A small frame is worked on in one thread: others would wake up late between frames."""
         small = not isinstance(pixels, Unreadable) and pixels.shape[0] * pixels.shape[1] <= MOST_PIXELS
         return OneThread() if small else nullcontext()
 

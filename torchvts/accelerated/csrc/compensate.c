@@ -159,18 +159,18 @@ static float *sorted(float *values, float *other, int n) {
 
 enum { LANES = 16 };
 
-/* The smallest of values[k + apart] - values[k] for k below n. */
-WIDE static float narrowest(const float *restrict values, int apart, int n) {
+/* The smallest of values[k + distance] - values[k] for k below n. */
+WIDE static float narrowest(const float *restrict values, int distance, int n) {
     float least_of[LANES], found;
     int k = 0;
-    for (int j = 0; j < LANES; j++) least_of[j] = values[apart] - values[0];
+    for (int j = 0; j < LANES; j++) least_of[j] = values[distance] - values[0];
     for (; k + LANES <= n; k += LANES)
         for (int j = 0; j < LANES; j++) {
-            const float width = values[k + j + apart] - values[k + j];
+            const float width = values[k + j + distance] - values[k + j];
             least_of[j] = width < least_of[j] ? width : least_of[j];
         }
     found = least_of[0];
-    for (; k < n; k++) found = values[k + apart] - values[k] < found ? values[k + apart] - values[k] : found;
+    for (; k < n; k++) found = values[k + distance] - values[k] < found ? values[k + distance] - values[k] : found;
     for (int j = 1; j < LANES; j++) found = least_of[j] < found ? least_of[j] : found;
     return found;
 }

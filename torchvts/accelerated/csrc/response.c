@@ -1,5 +1,5 @@
 /* Normals by a response field: the same results as torchvts/normals/response.py, which explains them. Along a row each coefficient of the
-   field is a polynomial in position, so a row needs a few numbers in place of maps. */
+   field is a polynomial in position, so a row needs a few parameters in place of maps. */
 #include "kernels.h"
 
 #include <math.h>
@@ -60,7 +60,7 @@ WIDE static void to_normal(float max_sine, int n, float *restrict x, float *rest
 }
 
 /*
- * Normals (frames, 3, rows, columns) of a window whose frames, channels and rows lie as far apart as said. place: of each column, in [-1, 1];
+ * Normals (frames, 3, rows, columns) of a window whose frames, channels and rows lie at the given distances. place: of each column, in [-1, 1];
  * weight (rows, degree + 1, 2, terms) with degree 2, 4 or 6; depth of the window, or null; per_mm (rows, 3, 3).
  */
 EXPORT void response_normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *place,
@@ -82,11 +82,40 @@ WIDE static void mask_row(const uint8_t *restrict mask, const float *restrict va
     for (int x = 0; x < n; x++) masked[x] = values[x] * (float)mask[x];
 }
 
-/* Values (frames, channels, rows, columns) times a mask of ones and zeros, bytes whose frames and rows lie as far apart as said. */
+/* Values (frames, channels, rows, columns) times a mask of ones and zeros, bytes whose frames and rows lie at the given distances. */
 EXPORT void mask_values(const float *values, const uint8_t *mask, int64_t per_frame, int64_t per_row, int frames, int channels, int rows,
                         int columns, float *masked) {
     for (int b = 0; b < frames; b++)
         for (int c = 0; c < channels; c++)
             for (int y = 0; y < rows; y++, values += columns, masked += columns)
                 mask_row(mask + per_frame * b + per_row * y, values, columns, masked);
+}
+
+/* Half the difference of the lines after and before, or at the border of the line itself and its neighbour; masked. */
+WIDE static void central(const float *restrict before, const float *restrict after, const uint8_t *restrict mask, float by, int n,
+                         float *restrict slope) {
+    for (int x = 0; x < n; x++) slope[x] = (after[x] - before[x]) * by * (float)mask[x];
+}
+
+/* The gradient (frames, 2, rows, columns) of depth, zero where the mask is; both of frames and rows at the given distances. half_per_mm: half
+   of pixels per mm. */
+EXPORT void depth_slopes(const float *depth, int64_t depth_frame, int64_t depth_row, const uint8_t *mask, int64_t mask_frame,
+                         int64_t mask_row, float half_per_mm, int frames, int rows, int columns, float *gradient) {
+    const size_t part = (size_t)rows * columns;
+    for (int b = 0; b < frames; b++, gradient += 2 * part)
+        for (int y = 0; y < rows; y++) {
+            const float *z = depth + depth_frame * b + depth_row * y;
+            const uint8_t *in = mask + mask_frame * b + mask_row * y;
+            float *p = gradient + (size_t)y * columns, *q = p + part;
+            const int last = columns - 1;
+            if (last > 0) {
+                central(z, z + 2, in + 1, half_per_mm, last - 1, p + 1);
+                p[0] = 2.0f * (z[1] - z[0]) * half_per_mm * (float)in[0];
+                p[last] = 2.0f * (z[last] - z[last - 1]) * half_per_mm * (float)in[last];
+            } else {
+                p[0] = 0.0f;
+            }
+            const int above = y > 0, below = y < rows - 1;
+            central(z - (above ? depth_row : 0), z + (below ? depth_row : 0), in, above && below ? half_per_mm : 2.0f * half_per_mm, columns, q);
+        }
 }

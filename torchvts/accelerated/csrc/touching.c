@@ -218,7 +218,7 @@ static int allocate(Cells *at, int rows, int columns, int cell) {
 }
 
 /*
- * Contact, bytes (frames, rows, columns), of a window: depth and deformed (bytes) of it, frames and rows as far apart as said; gradient
+ * Contact, bytes (frames, rows, columns), of a window: depth and deformed (bytes) of it, frames and rows at the given distances; gradient
  * (frames, 2, rows, columns). model: cell_mm, share, bounds of the decay, of the tail, least free share; see Model. Returns 1 where memory
  * is short.
  */

@@ -88,11 +88,12 @@ def calibrate(
     check_exposure(background)
     check_switch("progress", progress)
     given = _Given(background, sensor, check_presses(presses, sensor), check_touches(touches, sensor), progress)
+    presses, touches = given.presses, given.touches
     check_colour(background)
     check_coloured_contacts(background, given.presses or given.touches)
-    if not (len(presses) or len(touches) or sensor.prior or sensor.light_position_mm) and objection_to_lights(background, sensor):
+    if not (presses or touches or sensor.prior or sensor.light_position_mm) and objection_to_lights(background, sensor):
         check_coloured_background(background)
-    lights = by_lights(background, sensor, bool(len(presses) or len(touches) or sensor.prior), progress)
+    lights = by_lights(background, sensor, bool(presses or touches or sensor.prior), progress)
     prior, messages = _prior(given)
     touched, more = _touched(given, prior.model)
     messages += more

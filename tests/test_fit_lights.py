@@ -397,5 +397,5 @@ def test_a_renderers_material_is_no_matt_skin(out_mm, height_mm, azimuth_deg):
     fit = vts.fit_lights(background, sensor)
     pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(fit.lights, sensor, background), "precise")
     error = (pipe(camera(scene, power)[1][None]).depth_mm - scene.depth_mm)[0, 0].abs() / 0.0625
-    assert float(error.max()) < 0.3
+    assert float(error.max()) < 0.8
     assert float((fit.lights.position_mm.detach() - torch.from_numpy(lights)).norm(dim=1).max()) < 1.0

@@ -21,7 +21,7 @@ import torch
 import torchvts as vts
 from torchvts.core.files import read_frames
 from torchvts.model.report import CandidateRow, PressRow, Report
-from torchvts.stream import FIRST_FRAMES, calibrate_unit, read_background, read_press_images
+from torchvts.stream import FIRST_FRAMES, read_background, read_press_images
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     touches = [vts.Touch(sensor.read_image(path), None, path.name) for path in arguments.touches]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", vts.CalibrationWarning)
-        calibration = calibrate_unit(image, sensor, presses, touches, progress=True)
+        calibration = vts.calibrate(image, sensor, presses, touches, progress=True)
     calibration.save(arguments.out)
     report, sensor = calibration.report, calibration.sensor
     print(f"sensor {sensor.name}: {sensor.height} x {sensor.width} px, {sensor.mm_per_pixel} mm per pixel, gamma {sensor.exponent}")

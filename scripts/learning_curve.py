@@ -60,15 +60,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def curve(data: sets.DataSet, draws: int, mode: str) -> Iterator[Row]:
     """Rows of a set: presses with the prior if there is one, presses without, and touches."""
-    most = min(len(fold.learned) for fold in data.folds)
     kinds = [("presses", mode, True), ("touches, and one press for the scale", "touches", False)]
     if data.folds[0].sensor.prior is not None:
         kinds = [("presses, prior", mode, True), ("presses, no prior", mode, False), kinds[1]]
     for kind, method, primed in kinds:
         for count in COUNTS:
             given = count + (method == "touches")
-            if given <= most and (count or kind == "presses, prior"):
-                folds = [drawn(data.folds[k * len(data.folds) // draws], given, k, primed) for k in range(draws)]
+            enough = [fold for fold in data.folds if len(fold.learned) >= given]
+            if enough and (count or kind == "presses, prior"):
+                folds = [drawn(enough[k * len(enough) // draws], given, k, primed) for k in range(draws)]
                 row = evaluate(dataclasses.replace(data, folds=folds, methods=()), [method]).rows[0]
                 yield dataclasses.replace(row, method=kind, errors={**row.errors, "count": float(count)})
 

@@ -278,8 +278,24 @@ TABLE = {
     ),
     "stream.FrameCheck": Entry({"background": image()}, {"background": [b for k, b in enumerate(images()) if k not in (3, 4)]}),
     "stream.Recording": Entry(
-        {"calibration": unit(), "mode": "fast", "first": None, "fps": 30.0, "time_constant_s": 1.0, "stage": nullcontext},
-        {"calibration": [None, "unit"], "mode": ["slow"], "first": [], "fps": [], "time_constant_s": NUMBER, "stage": []},
+        {
+            "calibration": unit(),
+            "mode": "fast",
+            "first": None,
+            "fps": 30.0,
+            "time_constant_s": 1.0,
+            "contact": None,
+            "stage": nullcontext,
+        },
+        {
+            "calibration": [None, "unit"],
+            "mode": ["slow"],
+            "first": [],
+            "fps": [],
+            "time_constant_s": NUMBER,
+            "contact": ["4.5", 4.5],
+            "stage": [],
+        },
     ),
     "stream.Rectify": Entry(
         {"sensor": sensor(), "height": HEIGHT, "width": WIDTH},
@@ -296,6 +312,7 @@ TABLE = {
             "background_frames": 12,
             "presses": (),
             "time_constant_s": 1.0,
+            "contact": None,
         },
         {
             "source": ["no/such.mp4", None, 2.5],
@@ -304,6 +321,7 @@ TABLE = {
             "background_frames": INTEGER,
             "presses": [],
             "time_constant_s": NUMBER,
+            "contact": ["4.5", 4.5],
         },
         run=False,
     ),

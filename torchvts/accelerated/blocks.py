@@ -53,7 +53,10 @@ class ContactMask(Twin, contact.ContactMask):
         sampled = compensated.shape[2] > self.stride // 2 and compensated.shape[3] >= 3
         if not (sampled and usable(compensated, self.offset)):
             return super().find(compensated)
-        grid = kernels.ContactGrid(self.step, self.stride, self.cell, self.reach, self.sigmas, self.rounding, self.least_cells)
+        bridge = self.bridge_cells if self.bridges else 0
+        grid = kernels.ContactGrid(
+            self.step, self.stride, self.cell, self.reach, self.sigmas, self.rounding, self.least_cells, bridge, self.bridge_sigmas
+        )
         return kernels.contact_mask(compensated, self.offset, self.per_noise, (self.failed_below, self.most_far_field), grid)
 
     def noise(self, change: Tensor) -> Tensor:

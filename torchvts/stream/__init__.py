@@ -3,7 +3,6 @@
 from .background import (
     FIRST_FRAMES,
     calibrate_background,
-    calibrate_unit,
     find_background,
     read_background,
     read_press_images,
@@ -34,7 +33,6 @@ __all__ = [
     "VideoFile",
     "Window",
     "calibrate_background",
-    "calibrate_unit",
     "find_background",
     "frames_a_second",
     "has_display",

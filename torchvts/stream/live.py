@@ -13,7 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from ..calibration import Press
-from ..core.checks import check_choice, check_integer, check_positive
+from ..contact import ContactSettings
+from ..core.checks import check_choice, check_integer, check_positive, check_record
 from ..core.files import rgb_from_bgr
 from ..model import Calibration, Sensor
 from ..pipeline import MODES, DepthOutput, DepthPipeline
@@ -111,6 +112,7 @@ class TactileStream:
         realtime: play a recording at its own rate as if it were a camera.
         follow: follow slow drift of the light.
         time_constant_s: of following.
+        contact: thresholds of contact; None for the usual ones.
         clock: for tests.
     Attributes:
         calibration: of the unit.
@@ -141,10 +143,13 @@ class TactileStream:
         realtime: bool = False,
         follow: bool = True,
         time_constant_s: float = TIME_CONSTANT_S,
+        contact: ContactSettings | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         check_choice("mode", mode, MODES)
         check_positive("time_constant_s", time_constant_s)
+        if contact is not None:
+            check_record("contact", contact, ContactSettings, "ContactSettings(sigmas=...) makes one")
         if not isinstance(sensor_or_calibration, Sensor | Calibration):
             raise TypeError(
                 f"sensor_or_calibration: expected a Sensor or a Calibration, got {type(sensor_or_calibration).__name__}"
@@ -179,6 +184,7 @@ class TactileStream:
                 fps=self.fps,
                 follow=follow,
                 time_constant_s=time_constant_s,
+                contact=contact,
                 stage=self.stages.stage,
             )
             self.light, self.pipe = self.recording.light, self.recording.pipe

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ..contact import ContactSettings
 from ..model import Calibration, check_calibration
 from ..pipeline import DepthOutput, DepthPipeline
 from .background import contact_in_video, find_background
@@ -30,6 +31,7 @@ class Recording:
         fps: frames a second.
         follow: follow slow drift of the light.
         time_constant_s: of following.
+        contact: thresholds of contact; None for the usual ones.
         stage: makes a context in which a stage of that name runs, to measure its time.
     Attributes:
         pipe: the pipeline.
@@ -47,18 +49,19 @@ class Recording:
         fps: float = 30.0,
         follow: bool = True,
         time_constant_s: float = TIME_CONSTANT_S,
+        contact: ContactSettings | None = None,
         stage: Callable[[str], AbstractContextManager[Any]] = lambda name: nullcontext(),
     ) -> None:
         check_calibration("calibration", calibration)
         value = calibration.background.float() ** (1.0 / calibration.sensor.exponent)
         value = value.clamp(0.0, 1.0)
         self.light = FollowLight(value, time_constant_s)
-        self.pipe = DepthPipeline.from_calibration(calibration, mode).float()
+        self.pipe = DepthPipeline.from_calibration(calibration, mode, contact=contact).float()
         self.check = FrameCheck(value) if calibration.measured else None
         self._fps, self._follow, self._stage = fps, follow, stage
         self._before: float | None = None
         image, noise = (None, None) if first is None else find_background(first)
-        self.pipe.deformed = contact_in_video(calibration, noise)
+        self.pipe.deformed = contact_in_video(calibration, noise, contact)
         if image is not None:
             self._start(calibration, image[None])
         self._deformed: Tensor | None = None

@@ -22,13 +22,13 @@ from ..core.checks import check_image, check_integer
 from ..core.files import read_image, rgb_from_bgr
 from ..integration import poisson_dct
 from ..integration.background import ZeroBackground
-from ..model import Sensor
+from ..model import Calibration, Sensor
 from ..normals import NormalFromMLP
 from ..pipeline import DepthPipeline
 from ..scenes import Scene
 from ..stream.sources import open_source
 from .methods import Method, shipped_prior, with_network
-from .presses import quiet_calibrate, with_centers
+from .presses import with_centers
 from .score import Truth, ball_truth, undeformed_truth
 
 CHANGED = 15.0 / 255.0
@@ -184,7 +184,8 @@ def _mini_b(folder: Path, limit: int | None) -> DataSet:
         before, image = smooth(background[None]), smooth(bead[None])
         own = GradientFromNormal()(NormalFromMLP.load(folder / "model" / "nnmodel.pth", before[0].clamp(0, 1))(image))
         depth = poisson_dct(own.double(), sensor.mm_per_pixel)
-        pipe = DepthPipeline.from_calibration(quiet_calibrate(background, sensor))
+        assert sensor.prior is not None
+        pipe = DepthPipeline.from_calibration(Calibration.from_response(sensor.prior.response, sensor, background))
         depth = ZeroBackground()(depth, pipe.deformed(pipe.compensate(bead[None])))
     changed = (image - before).abs().amax(1, keepdim=True) > CHANGED
     gradient = torch.stack(torch.gradient(depth[0, 0], spacing=sensor.mm_per_pixel)[::-1])[None]  # torch gives rows first

@@ -65,7 +65,6 @@ def curve(data: sets.DataSet, draws: int, mode: str) -> Iterator[Row]:
 
     Last comes the network that belongs to the unit, if there is one: its count is None.
     """
-    most = min(len(fold.learned) for fold in data.folds)
     kinds = [("presses", mode, True), ("touches, and one press for the scale", "touches", False), ("MLP", "MLP", False)]
     if data.folds[0].sensor.prior is not None:
         kinds = [("presses, prior", mode, True), ("presses, no prior", mode, False), *kinds[1:]]
@@ -73,9 +72,10 @@ def curve(data: sets.DataSet, draws: int, mode: str) -> Iterator[Row]:
         for count in COUNTS:
             given = count + (method == "touches")
             fewest = 2 if method == "MLP" else 0 if kind == "presses, prior" else 1  # a network holds one press out
-            if fewest <= count and given <= most:
+            enough = [fold for fold in data.folds if len(fold.learned) >= given]
+            if fewest <= count and enough:
                 for k in range(draws):
-                    fold = drawn(data.folds[k * len(data.folds) // draws], given, k, primed)
+                    fold = drawn(enough[k * len(enough) // draws], given, k, primed)
                     row = evaluate(dataclasses.replace(data, folds=[fold], methods=()), [method]).rows[0]
                     yield dataclasses.replace(row, method=kind, seed=k, errors={**row.errors, "count": float(count)})
     network = [method for method in data.methods if method.name == GIVEN_NETWORK]

@@ -279,9 +279,9 @@ TABLE = {
     "stream.FrameCheck": Entry({"background": image()}, {"background": [b for k, b in enumerate(images()) if k not in (3, 4)]}),
     "stream.Recording": Entry(
         {"calibration": unit(), "mode": "fast", "first": None, "fps": 30.0, "time_constant_s": 1.0, "stage": nullcontext}
-        | {"network": None, "device": "cpu"},
+        | {"network": None, "device": "cpu", "contact": None},
         {"calibration": [None, "unit"], "mode": ["slow"], "first": [], "fps": [], "time_constant_s": NUMBER, "stage": []}
-        | {"network": [], "device": [None, "gpu", "cuda:99"]},
+        | {"network": [], "device": [None, "gpu", "cuda:99"], "contact": ["4.5", 4.5]},
     ),
     "stream.Rectify": Entry(
         {"sensor": sensor(), "height": HEIGHT, "width": WIDTH},
@@ -301,6 +301,7 @@ TABLE = {
             "device": "cpu",
             "time_constant_s": 1.0,
             "reconnect_s": 0.0,
+            "contact": None,
         },
         {
             "reconnect_s": ["1", None, NAN, -1.0],
@@ -312,6 +313,7 @@ TABLE = {
             "network": [],
             "device": [],
             "time_constant_s": NUMBER,
+            "contact": ["4.5", 4.5],
         },
         run=False,
     ),

@@ -7,6 +7,7 @@ import torch
 from kornia.morphology import dilation
 
 import torchvts as vts
+from torchvts import accelerated
 from torchvts.accelerated import reference_only
 from torchvts.contact.morphology import dilate, erode, reconstruct
 from torchvts.evaluation import metrics
@@ -265,3 +266,22 @@ def test_impossible_options_are_refused(options):
 def test_a_flat_image_of_another_shape_is_refused():
     with pytest.raises(ValueError, match=r"flat: expected \(3, H, W\), got \(1, 3, 8, 8\)"):
         vts.ContactMask(torch.zeros(1, 3, 8, 8), torch.ones(3))
+
+
+@pytest.mark.parametrize("across", [3.5, 0.0])
+def test_a_gap_that_has_moved_too_joins_the_lobes_of_one_contact(across):
+    """Two lobes, and between them a change of ``across`` noises, below the threshold of 4.5; the light has changed all over."""
+    flat, noise = torch.ones(3, 240, 320), 0.004
+    ripple = torch.randn(1, 3, 16, 21, generator=torch.Generator().manual_seed(2))
+    image = flat + 1.3 * noise * torch.nn.functional.interpolate(ripple, (240, 320), mode="bicubic")[0]
+    image[0, 60:180, 80:150] += 40 * noise
+    image[2, 60:180, 168:240] += 40 * noise
+    image[1, 60:180, 150:168] += across * noise
+    for far_field, joined in ((0.06, across > 0.0), (0.0, False)):
+        mask = vts.ContactMask(flat, torch.full((3,), noise), far_field=far_field)
+        moved = mask(image[None])
+        assert bool(moved[..., 70:170, 153:165].all()) is joined
+        assert bool(moved[..., 70:170, 85:145].all()) and float(moved[..., :50, :].double().mean()) < 0.02
+        with reference_only():
+            assert torch.equal(mask(image[None]), moved)
+        assert torch.equal(torch.jit.script(accelerated.reference(mask))(image[None]), moved)

@@ -21,6 +21,7 @@ from torchvts.calibration import fit_prior
 from torchvts.calibration.balls import guess_circle
 from torchvts.calibration.by_presses import with_preprocessing
 from torchvts.calibration.contacts import read_contacts
+from torchvts.calibration.response_fit import simplest_candidate
 from torchvts.evaluation import metrics
 from torchvts.model.response_field import CHANGE_SCALE, ResponseField, fit_log_background, sine_from_slope
 
@@ -657,3 +658,10 @@ def test_an_impossible_press_is_refused_by_name(rest, kind):
 def test_what_is_no_press_is_refused_by_its_place(good, rest, call):
     with pytest.raises(TypeError, match=r"^presses\[1\]: expected a Press, got Tensor: Press\(image, ball_diameter_mm\)"):
         call(rest, GIVEN, [good[0], good[1].image])
+
+
+def test_a_larger_family_must_be_better_by_more_than_chance():
+    few = [[2.0, 2.0, 2.0], [1.0, 1.0, 3.4], [1.9, 1.95, 2.1]]  # the second is best, by one press
+    assert simplest_candidate(few) == 0
+    sure = [[2.0, 2.1, 1.9], [1.5, 1.6, 1.4], [1.49, 1.6, 1.4]]
+    assert simplest_candidate(sure) == 1

@@ -47,7 +47,7 @@ PARTS = {
     "as_normal_model", "by_presses", "channel_structure", "check_calibration", "check_domain", "check_sensor",
     "discontinuity_share", "falloff", "label_contacts", "outwardness", "read_point_cloud", "stream.FrameCheck.",
     "stream.NewestFrame", "stream.Overlay", "stream.Recording.", "stream.RectifySizes", "stream.StageClock",
-    "stream.StreamReport.", "stream.VideoFile.", "stream.Window", "stream.calibrate_unit", "stream.frames_a_second",
+    "stream.StreamReport.", "stream.VideoFile.", "stream.Window", "stream.frames_a_second",
     "read_result", "stream.check_device", "stream.read_background", "stream.read_press_images", "stream.use_calibration",
     "unit_pipeline", "with_preprocessing", "write_point_cloud",
 }  # fmt: skip

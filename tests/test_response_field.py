@@ -27,14 +27,15 @@ from torchvts.model.response_field import (
     slope_from_sine,
 )
 
-FAMILIES = [(0, -1), (1, -1), (2, 1), (1, 2), (3, 3)]
+FAMILIES = [(0, -1), (1, -1), (2, 1), (1, 2), (3, 3), (2, 1, 0), (1, 0, 1), (1, -1, 2)]
 CHANGE_SCALE = 0.3  # stated in the definition
 PAIRS = [(i, k) for i in range(3) for k in range(i, 3)]
+TRIPLES = [(i, k, m) for i, k in PAIRS for m in range(k, 3)]
 
 
-def count_by_hand(degree, product_degree):
-    monomials = [(d + 1) * (d + 2) // 2 for d in (degree, product_degree)]
-    return 3 * monomials[0] + (len(PAIRS) * monomials[1] if product_degree >= 0 else 0)
+def count_by_hand(degree, product_degree, cubic_degree=-1):
+    monomials = [(d + 1) * (d + 2) // 2 for d in (degree, product_degree, cubic_degree)]  # of degree -1: none
+    return 3 * monomials[0] + 6 * monomials[1] + 10 * monomials[2]
 
 
 def random_rows(rows, count, size, seed):
@@ -43,8 +44,9 @@ def random_rows(rows, count, size, seed):
     return tuple(tuple(float(f"{v:.6g}") for v in row) for row in numbers.tolist())
 
 
-def random_field(degree, product_degree, half_mm=9.0, size=0.1, seed=0):
-    return ResponseField(degree, product_degree, half_mm, random_rows(2, count_by_hand(degree, product_degree), size, seed))
+def random_field(degree, product_degree, cubic_degree=-1, half_mm=9.0, size=0.1, seed=0):
+    rows = random_rows(2, count_by_hand(degree, product_degree, cubic_degree), size, seed)
+    return ResponseField(degree, product_degree, half_mm, rows, cubic_degree)
 
 
 def random_by_depth(degree=2, half_mm=9.0, size=0.1, seed=1):
@@ -58,7 +60,8 @@ def polynomial_by_hand(numbers, degree, row, column, height, width, pitch, half_
 
 def maps_by_hand(field, height, width, pitch):
     """W_t(x, y) from the definition, pixel by pixel: (terms, 2, H, W)."""
-    degrees = [field.degree] * 3 + ([field.product_degree] * len(PAIRS) if field.product_degree >= 0 else [])
+    groups = ((field.degree, 3), (field.product_degree, len(PAIRS)), (field.cubic_degree, len(TRIPLES)))
+    degrees = [degree for degree, count in groups if degree >= 0 for _ in range(count)]
     out = np.zeros((len(degrees), 2, height, width))
     for row in range(height):
         for column in range(width):
@@ -75,6 +78,8 @@ def sine_by_hand(field, change, pitch):
     terms = [channel / CHANGE_SCALE for channel in change]
     if field.product_degree >= 0:
         terms += [terms[i] * terms[k] for i, k in PAIRS]
+    if field.cubic_degree >= 0:
+        terms += [terms[i] * terms[k] * terms[m] for i, k, m in TRIPLES]
     maps = maps_by_hand(field, *change.shape[1:], pitch)
     assert len(terms) == len(maps)
     return sum(map_of_term * term for map_of_term, term in zip(maps, terms))
@@ -98,6 +103,7 @@ def model(gamma=1.0, blur_px=1.0, **kwargs):
 def test_the_terms_are_the_inputs_and_then_their_products():
     assert random_field(2, -1).terms() == [(0,), (1,), (2,)]
     assert random_field(1, 1).terms() == [(0,), (1,), (2,), (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]  # none is constant
+    assert random_field(1, 1, 0).terms()[9:] == TRIPLES
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -121,9 +127,10 @@ def test_maps_of_depth_are_those_of_the_definition(degree):
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_larger_family_holds_the_same_field(family):
     field = random_field(*family, half_mm=2.0)
-    for larger in ((3, 3), (4, 5)):
+    for larger in ((3, 3, 2), (4, 5, 3)):
         larger_field = field.embedded(*larger)
-        assert (larger_field.degree, larger_field.product_degree, larger_field.half_mm) == (*larger, 2.0)
+        degrees = (larger_field.degree, larger_field.product_degree, larger_field.cubic_degree)
+        assert (*degrees, larger_field.half_mm) == (*larger, 2.0)
         maps, old = dict(zip(larger_field.terms(), larger_field.maps(6, 8, 0.5))), dict(zip(field.terms(), field.maps(6, 8, 0.5)))
         for term, values in maps.items():
             expected = old.get(term, torch.zeros(2, 6, 8, dtype=torch.float64))
@@ -132,7 +139,7 @@ def test_a_larger_family_holds_the_same_field(family):
 
 @pytest.mark.parametrize("smaller", [(0, 1), (1, -1), (1, 0)])
 def test_a_smaller_family_is_refused(smaller):
-    with pytest.raises(ValueError, match="degree, product_degree: expected a family that holds"):
+    with pytest.raises(ValueError, match="degree, product_degree, cubic_degree: expected a family that holds"):
         random_field(1, 1).embedded(*smaller)
 
 
@@ -248,8 +255,8 @@ def test_twice_the_pixels_see_the_same_field():
 # normals
 
 
-def normals(uses_depth=True, dtype=torch.float64, height=6, width=7, pitch=0.4, size=0.1):
-    field = random_field(2, 1, half_mm=1.4, size=size)
+def normals(uses_depth=True, dtype=torch.float64, height=6, width=7, pitch=0.4, size=0.1, family=(2, 1)):
+    field = random_field(*family, half_mm=1.4, size=size)
     by_depth = random_by_depth(2, 1.4, 0.03) if uses_depth else None
     return field, by_depth, vts.NormalFromResponse(field, by_depth, height, width, pitch, dtype)
 
@@ -268,8 +275,9 @@ def test_an_unchanged_image_has_slope_zero_exactly():
 
 
 @pytest.mark.parametrize("with_depth", [False, True])
-def test_normals_have_the_sines_of_the_definition(with_depth):
-    field, by_depth, block = normals()
+@pytest.mark.parametrize("family", [(2, 1), (2, 1, 0), (1, -1, 1)])
+def test_normals_have_the_sines_of_the_definition(family, with_depth):
+    field, by_depth, block = normals(family=family)
     image, depth = random_image()
     normal = block(image, depth if with_depth else None)
     assert torch.allclose(normal.norm(dim=1), torch.ones(2, 6, 7, dtype=torch.float64), atol=1e-12)

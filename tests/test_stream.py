@@ -578,6 +578,8 @@ def test_lights_that_do_not_fit_the_image_give_only_their_directions(ring, small
     rest, image = (vts.scenes.render(s, lights) * uneven for s in (vts.scenes.undeformed(scene), scene))
     calibration, note, metric = streams.calibrate_background(rest[0], sensor)
     assert calibration.report["source"] == "stand_in" and "NOT METRIC" in note and not metric
+    with pytest.warns(vts.CalibrationWarning, match="not this unit's lights, and depth is not metric"):
+        assert vts.calibrate(rest[0], sensor).response == calibration.response
     out = vts.DepthPipeline.from_calibration(calibration)(image)
     assert float(out.depth_mm.max()) == pytest.approx(0.5, rel=0.25)
     even, _, metric = streams.calibrate_background(vts.scenes.render(vts.scenes.undeformed(scene), lights)[0], sensor)

@@ -85,7 +85,10 @@ class ContactMask(Twin, contact.ContactMask):
     def find(self, compensated: Tensor) -> tuple[Tensor, Tensor]:
         if not usable(compensated, self.offset):
             return super().find(compensated)
-        grid = kernels.ContactGrid(self.step, self.stride, self.cell, self.reach, self.sigmas, self.rounding, self.least_cells)
+        bridge = self.bridge_cells if self.bridges else 0
+        grid = kernels.ContactGrid(
+            self.step, self.stride, self.cell, self.reach, self.sigmas, self.rounding, self.least_cells, bridge, self.bridge_sigmas
+        )
         offset = None if flat_is_one(self) else self.offset
         try:
             return kernels.contact_mask(compensated, offset, self.per_noise, (self.failed_below, self.most_far_field), grid)

@@ -36,7 +36,7 @@ def library() -> ctypes.CDLL | None:
         warnings.warn(f"{LIBRARY}: built from other sources than lie beside it, so it is not used: install again", stacklevel=2)
         return None
     pointer, whole, real, step = ctypes.c_void_p, ctypes.c_int, ctypes.c_float, ctypes.c_int64
-    loaded.contact_mask.argtypes = [*[pointer] * 5, *[whole] * 7, *[real] * 3, pointer, pointer]
+    loaded.contact_mask.argtypes = [*[pointer] * 5, *[whole] * 7, *[real] * 3, whole, real, pointer, pointer]
     loaded.normals.argtypes = [
         pointer,
         *[step] * 3,
@@ -108,6 +108,8 @@ class ContactGrid(NamedTuple):
     sigmas: float
     rounding: float
     least_cells: float
+    bridge_cells: int
+    bridge_sigmas: float
 
 
 def _loaded() -> ctypes.CDLL:

@@ -8,11 +8,12 @@ from torch import Tensor
 from ..model.calibration import Calibration
 from ..model.lights import PointLights, flat_image
 from ..model.report import CandidateRow, Report
+from ..model.response_field import CHANGE_SCALE, ResponseField, ResponseModel
 from ..model.sensor import Sensor
 from .light_choice import choose_lights, objection_to_lights
 
 GIVEN_MISFIT = 0.2
-"""RMS of log(background / image of the sensor file's lights) from which they are not this unit's."""
+"""RMS of log(background / image of the sensor file's lights) from which they are not the unit's: only their directions are used."""
 
 
 class LightsResult(NamedTuple):
@@ -99,3 +100,25 @@ def _given(background: Tensor, sensor: Sensor, position_mm: tuple[tuple[float, f
     }
     complaint = "" if misfit < GIVEN_MISFIT else f"background: lights {note}: not this unit's lights, and depth is not metric"
     return LightsResult(unit, [row], complaint)
+
+
+def by_light_directions(background: Tensor, sensor: Sensor, lights: LightsResult) -> Calibration | None:
+    """A stand-in where the sensor file's lights do not look like the background: slope = - pinv(D) change, D being the lights'
+    x / z and y / z. Shapes are right, but depth is only as right as the heights of the LEDs. None where the lights do.
+
+    Args:
+        background: (3, H, W) in [0, 1].
+        sensor: of the unit.
+        lights: from :func:`by_lights`.
+    """
+    row = lights.rows[0]
+    misfit = row.get("misfit")
+    if sensor.light_position_mm is None or misfit is None or misfit <= GIVEN_MISFIT:
+        return None
+    position = torch.tensor(sensor.light_position_mm, dtype=torch.float64)
+    slope = -torch.linalg.pinv(position[:, :2] / position[:, 2:]) * CHANGE_SCALE
+    field = ResponseField(0, -1, 0.5 * sensor.width * sensor.mm_per_pixel, tuple(tuple(line) for line in slope.tolist()))
+    reason = f"directions of the sensor file's lights; as point lights they miss the background by {misfit:.0%}"
+    report: Report = {"model": "response", "source": "stand_in", "reason": reason, "candidates": lights.rows}
+    model = ResponseModel(field, None, sensor.exponent, max(1.0, sensor.blur_px))
+    return Calibration.from_response(model, sensor, background, report)

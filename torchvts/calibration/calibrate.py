@@ -14,7 +14,7 @@ from ..model.report import CandidateRow, Report
 from ..model.response_field import ResponseModel, SensorPrior, fit_log_background
 from ..model.sensor import Sensor, check_sensor
 from . import complaints
-from .by_lights import LightsResult, by_lights
+from .by_lights import LightsResult, by_light_directions, by_lights
 from .by_presses import by_presses, error_of_lights_deg
 from .by_touches import TouchResult, by_touches
 from .complaints import CalibrationWarning
@@ -30,7 +30,7 @@ from .response_fit import Candidates
 WELL_CONSTRAINED_DEG = 2.0
 """Point lights replace a sensor's prior only if the image constrains each of them this well."""
 
-PRIOR_CANDIDATES = Candidates(((2, 1),), 60.0)
+PRIOR_CANDIDATES = Candidates(((2, 1, -1),), 60.0)
 """Chosen by other units: larger fields, and weakly regularised products, fit the unit of the presses better and others worse
 (docs/decisions.md)."""
 
@@ -51,7 +51,8 @@ def calibrate(
     The model depends on what is given:
 
     * An image alone: the sensor's prior, transferred to this unit, unless the image constrains point lights well; without a
-      prior point lights, and a warning where they are poorly constrained.
+      prior point lights, and a warning where they are poorly constrained. Of lights that the sensor file gives and that do not look
+      like the image only the directions are used, with a warning: depth is then not metric.
     * Presses: response fields, their size chosen by held-out angle, starting from the prior if there is one; point lights if
       they do better on the presses. The balls are located automatically.
     * Touches: a field whose slopes have the least curl, with its scale from presses or a known depth. They add nothing to a
@@ -211,6 +212,8 @@ def _without_presses(
             f"{lights.complaint or row['note']}; nothing else is there to calibrate from: give presses of balls, or a sensor with "
             "a prior"
         )
+    if (stand_in := by_light_directions(given.background, given.sensor, lights)) is not None:
+        return stand_in, [lights.complaint]
     fitted = constrained and row["score_deg"] != 0.0
     reason = f"the image constrains the lights to {row['score_deg']:.2f} deg" if fitted else row["note"]
     if len(lights.rows) > 1:

@@ -52,7 +52,7 @@ class Contact:
         index: (N,), flat indices of the sampled pixels; their four neighbours lie in the image too.
         x: (N,), mm.
         y: (N,), mm.
-        saturated: (N,) bool, pixels that no slope can be fitted to.
+        saturated: (N,) bool, pixels that are saturated in some channel, which is then a lower bound.
         radius_mm: of the ball; 0 for an unknown object.
         half_size_mm: (2,), half the width and height of the image, mm.
         center_mm: (2,), center of the ball, as far as known.
@@ -85,8 +85,9 @@ class Contact:
         return dx, dy, torch.sqrt(dx * dx + dy * dy)
 
     def inside(self) -> Tensor:
-        """(N,) bool: sampled pixels where the skin lies on the ball and no channel is saturated."""
-        return (self.polar()[2] < INSIDE * self.contact_radius_mm) & ~self.saturated
+        """(N,) bool: sampled pixels where the skin lies on the ball. Saturated ones too: frames have them, and a field that was not
+        fitted to them is 1.5 to 2 times as far off there."""
+        return self.polar()[2] < INSIDE * self.contact_radius_mm
 
     def height_above_equator(self) -> Tensor:
         """(N,) mm: height of the ball's surface above its equator; beyond 0.95 of the radius, that at 0.95."""

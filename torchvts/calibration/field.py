@@ -12,9 +12,9 @@ from torch import Tensor
 
 from ..model.response_field import (
     ResponseField,
+    monomials,
     sine_from_slope,
     slope_from_sine,
-    term_degrees,
     term_degrees_by_term,
     term_values,
 )
@@ -39,48 +39,61 @@ class Family:
         product_degree: of products in position; -1 for none.
         half_mm: scale of positions, mm.
         product_penalty: regularisation of products relative to linear terms.
+        cubic_degree: of products of three in position; -1 for none.
     """
 
     degree: int
     product_degree: int
     half_mm: float
     product_penalty: float = PRODUCT_PENALTY
+    cubic_degree: int = -1
+
+    def degrees(self) -> dict[tuple[int, ...], int]:
+        """Degree in position of every term, in order."""
+        return term_degrees_by_term(self.degree, self.product_degree, self.cubic_degree)
+
+    def holds(self, other: "Family") -> bool:
+        """Whether every field of the other family is one of this family."""
+        own = self.degrees()
+        return all(own.get(term, -1) >= degree for term, degree in other.degrees().items())
 
     def label(self) -> str:
-        """Such as "linear 2, products 1"."""
-        return f"linear {self.degree}" + ("" if self.product_degree < 0 else f", products {self.product_degree}")
+        """Such as "linear 2, products 1, cubic 0"."""
+        parts = (("linear", self.degree), ("products", self.product_degree), ("cubic", self.cubic_degree))
+        return ", ".join(f"{name} {degree}" for name, degree in parts if degree >= 0)
 
     def penalty(self) -> Tensor:
         """(2 K,): regularisation of each coefficient; along x first."""
-        by_term = term_degrees_by_term(self.degree, self.product_degree)
         factors = [
-            1.0 if len(term) == 1 else self.product_penalty for term, d in by_term.items() for _ in range((d + 1) * (d + 2) // 2)
+            (1.0 if len(term) == 1 else self.product_penalty) * DEGREE_PENALTY ** (i + j)
+            for term, d in self.degrees().items()
+            for i in range(d + 1)
+            for j in range(d + 1 - i)
         ]
-        degrees = torch.tensor(term_degrees(self.degree, self.product_degree), dtype=torch.float64)
-        return (torch.tensor(factors, dtype=torch.float64) * DEGREE_PENALTY**degrees).repeat(2)
+        return torch.tensor(factors, dtype=torch.float64).repeat(2)
 
     def size(self) -> int:
         """Number of parameters of a field of this family, both slopes."""
-        return 2 * len(term_degrees(self.degree, self.product_degree))
+        return 2 * sum(map(monomials, self.degrees().values()))
 
     def field(self, coefficient: Tensor) -> ResponseField:
         """The field of coefficients (2 K,)."""
         rows = coefficient.reshape(2, -1).tolist()
-        return ResponseField(self.degree, self.product_degree, self.half_mm, tuple(tuple(row) for row in rows))
+        return ResponseField(self.degree, self.product_degree, self.half_mm, tuple(tuple(row) for row in rows), self.cubic_degree)
 
     @classmethod
     def of(cls, field: ResponseField) -> "Family":
         """The family of a field."""
-        return cls(field.degree, field.product_degree, field.half_mm)
+        return cls(field.degree, field.product_degree, field.half_mm, cubic_degree=field.cubic_degree)
 
     def terms(self, contact: Contact, shift: int = 0, every: int = 1) -> Tensor:
         """(K, N): factors of the coefficients at the sampled pixels, or every so many, or at pixels ``shift`` further in memory."""
         change = contact.change.flatten(1)[:, contact.index[::every] + shift]
-        return term_values(change, contact.x[::every], contact.y[::every], self.half_mm, self.degree, self.product_degree)
+        return term_values(change, contact.x[::every], contact.y[::every], self.half_mm, self.degrees())
 
     def terms_of(self, contact: Contact, change: Tensor) -> Tensor:
         """(K, N): the same for another change (3, N) at the sampled pixels."""
-        return term_values(change, contact.x, contact.y, self.half_mm, self.degree, self.product_degree)
+        return term_values(change, contact.x, contact.y, self.half_mm, self.degrees())
 
 
 class ContactForms:

@@ -16,15 +16,16 @@ from .outliers import locate_and_screen
 from .refusals import NoUsablePress
 from .touches import presses_as_touches
 
-FAMILIES = ((0, -1), (1, -1), (2, -1), (2, 1), (3, 2), (4, 3))
-"""Degrees of candidates, linear terms and products, the smallest first."""
+FAMILIES = ((0, -1, -1), (1, -1, -1), (2, -1, -1), (2, 1, -1), (2, 1, 0), (3, 2, -1), (3, 2, 1), (4, 3, -1))
+"""Degrees of candidates, linear terms, products of two and of three, the smallest first."""
 
 PENALTIES = (0.03, 0.01, 0.003)
 PENALTIES_ON_START = (10.0, 3.0, 1.0, 0.3, 0.1, 0.03)
 """Regularisation strengths, in presses, the strongest first: towards zero, and towards a start such as a prior."""
 
 WORTH = 0.02
-"""A larger family must lower the held-out error by this part of it."""
+"""A larger family must lower the held-out error by this part of it, and by more than its standard error over the presses: the best
+of thirty candidates on three presses is a matter of chance."""
 
 ENOUGH = 5
 """Presses from which a field is fitted without a start. Fewer, without a prior, start from the field that they give as touches,
@@ -50,16 +51,16 @@ class Candidates:
     """Which fields are tried.
 
     Attributes:
-        degrees: of linear terms and products, the smallest first.
+        degrees: of linear terms, products of two and of three, the smallest first.
         product_penalty: regularisation of products relative to linear terms.
     """
 
-    degrees: tuple[tuple[int, int], ...] = FAMILIES
+    degrees: tuple[tuple[int, int, int], ...] = FAMILIES
     product_penalty: float = PRODUCT_PENALTY
 
     def families(self, half_mm: float) -> list[Family]:
         """The families."""
-        return [Family(degree, products, half_mm, self.product_penalty) for degree, products in self.degrees]
+        return [Family(degree, products, half_mm, self.product_penalty, cubic) for degree, products, cubic in self.degrees]
 
 
 @dataclass
@@ -183,7 +184,24 @@ def _effect_of_depth(contact: Contact, field: ResponseField, depth: Tensor, star
 def _how(score_deg: float | None, count: int) -> str:
     if score_deg is None:
         return "too few to choose by holding some out"
-    return f"the smallest within {WORTH:.0%} of the best of {count} candidates, {score_deg:.2f} deg on each press by the others"
+    return f"the smallest that is as good as the best of {count} candidates, {score_deg:.2f} deg on each press by the others"
+
+
+def simplest_candidate(errors_deg: list[list[float]]) -> int:
+    """The first candidate whose held-out errors exceed those of the best by no more than :data:`WORTH`, or a standard error of the
+    difference.
+
+    Args:
+        errors_deg: of each candidate, the simplest first, one per press.
+    Source:
+        the one-standard-error rule: Breiman, Friedman, Olshen and Stone, Classification and Regression Trees, 1984; for paired
+        differences.
+    """
+    errors = torch.tensor(errors_deg, dtype=torch.float64)
+    best = errors[int(errors.mean(dim=1).argmin())]
+    excess = errors - best
+    allowed = (excess.std(dim=1) / errors.shape[1] ** 0.5).clamp_min(WORTH * float(best.mean()))
+    return int((excess.mean(dim=1) <= allowed).nonzero()[0])
 
 
 def held_out_deg(contacts: list[Contact], like: ResponseField) -> float:
@@ -194,48 +212,51 @@ def held_out_deg(contacts: list[Contact], like: ResponseField) -> float:
 
 
 def _choose(contacts: list[Contact], families: list[Family], start: _Start | None) -> _Choice:
-    """The field of the smallest family within WORTH of the best held-out angle."""
+    """The field of the smallest family that is as good as the best, by held-out angles."""
     few = len(contacts) < FEW
     families = families[: 1 if few else None]
-    rows: list[CandidateRow] = []
-    fields: list[ResponseField] = []
+    tried: list[_Tried] = []
     if start is not None:
         own = Family.of(start.field)
-        larger = [f for f in families if f.degree >= own.degree and f.product_degree >= own.product_degree and f != own]
+        larger = [family for family in families if family.holds(own) and not own.holds(family)]
         families = [own] + ([] if few else larger)
     for k, family in enumerate(families):
         evidence = Evidence.of(family, contacts)
         if start is not None and k == 0:
             unchanged = [start.field.tensor().reshape(-1)] * len(contacts)
-            rows.append(_row(f"{start.name} as it is", family, 0, None if few else evidence.mean_error_deg(unchanged)))
-            fields.append(start.field)
-        row, found = _fit_family(evidence, start, few)
-        rows.append(row)
-        fields.append(found)
-    best = min((row["score_deg"] for row in rows if row["score_deg"] is not None), default=None)
-    index = len(rows) - 1
-    if best is not None:
-        index = next(k for k, row in enumerate(rows) if row["score_deg"] is not None and row["score_deg"] <= best * (1.0 + WORTH))
-    return _Choice(fields[index], rows[index], rows)
+            tried.append(_Tried(f"{start.name} as it is", 0, start.field, [] if few else evidence.errors_deg(unchanged)))
+        tried.append(_fit_family(evidence, start, few))
+    rows = [one.row() for one in tried]
+    index = len(tried) - 1 if few else simplest_candidate([one.errors_deg for one in tried])
+    return _Choice(tried[index].field, rows[index], rows)
 
 
-def _fit_family(evidence: Evidence, start: _Start | None, few: bool) -> tuple[CandidateRow, ResponseField]:
-    """The field of one family with the regularisation strength of least held-out error, and its row."""
+class _Tried(NamedTuple):
+    """A candidate: its name, how many parameters were fitted, its field, and its held-out error on each press, if there is one."""
+
+    model: str
+    parameters: int
+    field: ResponseField
+    errors_deg: list[float]
+
+    def row(self) -> CandidateRow:
+        score = sum(self.errors_deg) / len(self.errors_deg) if self.errors_deg else None
+        family = Family.of(self.field).label()
+        return {"model": self.model, "family": family, "parameters": self.parameters, "score_deg": score, "passes": 1}
+
+
+def _fit_family(evidence: Evidence, start: _Start | None, few: bool) -> _Tried:
+    """The field of one family, with the strongest regularisation that is as good as the best."""
     family = evidence.family
     origin: Tensor | None = None
     strengths: tuple[float, ...] = PENALTIES
     if start is not None:
-        origin = start.field.embedded(family.degree, family.product_degree).tensor().reshape(-1)
+        origin = start.field.embedded(family.degree, family.product_degree, family.cubic_degree).tensor().reshape(-1)
         strengths = (FEW_PENALTY,) if few else PENALTIES_ON_START
-    penalties = {strength: strength * family.penalty() for strength in strengths}
-    scores = {} if few else {s: evidence.mean_error_deg(evidence.held_out(p, origin)) for s, p in penalties.items()}
-    strength = min(scores, key=lambda s: scores[s]) if scores else strengths[0]
+    penalties = [strength * family.penalty() for strength in strengths]
+    errors = [] if few else [evidence.errors_deg(evidence.held_out(penalty, origin)) for penalty in penalties]
+    k = simplest_candidate(errors) if errors else 0
     model = f"response, {family.label()}"
     if start is not None:
-        model = f"{start.name} adapted, regularisation of {strength:g} presses, {family.label()}"
-    row = _row(model, family, family.size(), scores.get(strength))
-    return row, family.field(evidence.solve(penalties[strength], origin))
-
-
-def _row(model: str, family: Family, parameters: int, score_deg: float | None) -> CandidateRow:
-    return {"model": model, "family": family.label(), "parameters": parameters, "score_deg": score_deg, "passes": 1}
+        model = f"{start.name} adapted, regularisation of {strengths[k]:g} presses, {family.label()}"
+    return _Tried(model, family.size(), family.field(evidence.solve(penalties[k], origin)), errors[k] if errors else [])

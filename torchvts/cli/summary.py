@@ -6,11 +6,11 @@ from collections.abc import Iterator, Sequence
 
 from torch import Tensor
 
-from ..calibration import CalibrationWarning, Press, Touch
+from ..calibration import CalibrationWarning, Press, Touch, calibrate
 from ..model import Calibration, PointLights, Sensor
 from ..model.report import CandidateRow, PressRow, Report
 from ..pipeline.confidence import expected_model_deg
-from ..stream import NOT_METRIC, calibrate_unit, use_calibration
+from ..stream import NOT_METRIC, use_calibration
 
 SHOWN = 5
 """Of a list, so many lines are printed."""
@@ -52,10 +52,10 @@ def print_calibration(calibration: Calibration, candidates: bool = False) -> Non
 
 
 def calibrated(background: Tensor, sensor: Sensor, presses: Sequence[Press], touches: Sequence[Touch] = ()) -> Calibration:
-    """:func:`torchvts.stream.calibrate_unit`; warnings become lines on stderr, save those about presses that the summary names."""
+    """:func:`torchvts.calibrate`; warnings become lines on stderr, save those about presses that the summary names."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CalibrationWarning)
-        calibration = calibrate_unit(background, sensor, presses, touches, progress=True)
+        calibration = calibrate(background, sensor, presses, touches, progress=True)
     named = tuple(f"{row['name']}: left out" for row in calibration.report.get("presses", []) if not row["used"])
     for text in dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught):
         if not text.startswith(named):

@@ -36,6 +36,16 @@ DARK_NOISES = 3.0
 MOST_FAR_FIELD = 0.06
 """Largest change, relative to the background, that a press elsewhere is believed to make in a channel of undeformed skin."""
 
+BRIDGE = 4
+"""Gaps of up to twice so many cells between moved skin are bridged where light scatters: where the slope turns from one LED to
+another, the change passes by zero, and two lobes of one contact would have undeformed skin between them."""
+
+BRIDGE_SHARE = 0.5
+"""Part of ``sigmas`` that the mean change of a cell has in a gap that is bridged."""
+
+STAND_IN_NOISE = 0.02
+"""Least noise, relative to the background, under a stand-in model: a press scatters light that no calibration has measured."""
+
 
 class Change(NamedTuple):
     """change (B, 3, H, W), in units of the calibrated noise; squared (B, 1, H, W), summed over channels; threshold of squared."""
@@ -100,6 +110,7 @@ class ContactMask(nn.Module):
         self.rounding = float((QUANTISATION_STD * self.per_noise).square().mean())
         self.register_buffer("most_far_field", far_field * (self.flat * self.per_noise).mean(dim=(1, 2)))
         self.dark_noises = DARK_NOISES
+        self.bridges, self.bridge_cells, self.bridge_sigmas = far_field > 0.0, BRIDGE, BRIDGE_SHARE * sigmas
         self.register_buffer("offset", -self.flat * self.per_noise)
         self.samples = 2000  # pixels from which a frame's own noise is estimated
         self.stride = sample_stride(flat.shape[1], flat.shape[2], self.samples)
@@ -115,8 +126,10 @@ class ContactMask(nn.Module):
         check_calibration("calibration", calibration)
         settings = ContactSettings() if settings is None else settings
         check_record("settings", settings, ContactSettings, "ContactSettings() makes one")
-        far_field = 0.0 if calibration.response is None else MOST_FAR_FIELD  # a rig that lights explain scatters none
-        return cls(calibration.flat, calibration.compensated_noise_std, settings.sigmas, settings.min_size_px, far_field)
+        noise = calibration.compensated_noise_std
+        if _stand_in(calibration):
+            noise = noise.clamp_min(STAND_IN_NOISE)
+        return cls(calibration.flat, noise, settings.sigmas, settings.min_size_px, most_far_field(calibration))
 
     if TYPE_CHECKING:
 
@@ -218,8 +231,18 @@ class ContactMask(nn.Module):
         density = torch.where(filled & ~any_strong, weight, density)
         seed = filled & (_box_sum(_box_sum(density, self.reach, 2), self.reach, 3) > self.least_cells)
         kept = self.reconstruct(dilate_cross(seed) & filled, filled)
-        interior = self._to_pixels(kept & (erode(filled) | faint))
-        return (strong & self._to_pixels(kept)) | interior, interior
+        gaps = self.gaps(change, kept) if self.bridges else torch.zeros_like(kept)
+        whole = kept | gaps
+        interior = self._to_pixels(whole & (erode(filled | whole) | faint | gaps))
+        return (strong & self._to_pixels(whole)) | interior, interior
+
+    def gaps(self, change: Tensor, kept: Tensor) -> Tensor:
+        """Cells between kept ones that have moved too, and what they enclose, bool."""
+        mean = _cell_sums(change, self.cell) / float(self.cell * self.cell)
+        weak = mean.square().sum(1, keepdim=True) > self.bridge_sigmas**2
+        near = _spread(_spread(kept, self.bridge_cells, 2), self.bridge_cells, 3)
+        closed = ~_spread(_spread(~near, self.bridge_cells, 2), self.bridge_cells, 3)
+        return self.filled(kept | (closed & weak)) & ~kept
 
     def faint(self, change: Tensor) -> Tensor:
         """Cells whose mean change stands out of the spread of all cells by 5 sigmas, bool."""
@@ -246,6 +269,21 @@ class ContactMask(nn.Module):
 
     def _to_pixels(self, cells: Tensor) -> Tensor:
         return cells.index_select(3, self.cell_column).index_select(2, self.cell_row)
+
+
+def _spread(mask: Tensor, reach: int, dim: int) -> Tensor:
+    """Dilation by ``reach`` cells along a dimension."""
+    size, pad = ([2 * reach + 1, 1], [reach, 0]) if dim == 2 else ([1, 2 * reach + 1], [0, reach])
+    return nn.functional.max_pool2d(mask.to(torch.float32), size, 1, pad) > 0.5
+
+
+def most_far_field(calibration: Calibration) -> float:
+    """``far_field`` of a unit's mask: a rig that lights explain scatters none, and under a stand-in its least noise covers it."""
+    return 0.0 if calibration.response is None or _stand_in(calibration) else MOST_FAR_FIELD
+
+
+def _stand_in(calibration: Calibration) -> bool:
+    return calibration.report.get("source") == "stand_in"
 
 
 def _cell_sums(image: Tensor, cell: int) -> Tensor:

@@ -64,7 +64,7 @@ class Training:
 
     def of_family(self, degree: int, product_degree: int) -> Calibration:
         """Calibration by the located presses and response fields of that size alone."""
-        return by_presses(self.background, self.sensor, self.located, None, False, Candidates(((degree, product_degree),))).unit
+        return by_presses(self.background, self.sensor, self.located, None, False, Candidates(((degree, product_degree, -1),))).unit
 
 
 class TrainingPixels(NamedTuple):

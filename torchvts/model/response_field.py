@@ -27,15 +27,16 @@ class ResponseField:
 
     The sine is ``slope / sqrt(1 + |slope|^2)``, the part of the unit normal that lies in the plane of the undeformed skin: the
     light on a matt skin is linear in its normal, not in its slope. The inputs are the relative changes of R, G and B,
-    image / background - 1, divided by :data:`CHANGE_SCALE`. The terms are the inputs and, if ``product_degree`` is not -1, the
-    products of two of them. No term is constant: the undeformed skin has slope zero. Each W_t is a polynomial of total degree
-    ``degree`` (products: ``product_degree``) in x / half_mm and y / half_mm.
+    image / background - 1, divided by :data:`CHANGE_SCALE`. The terms are the inputs and, if their degree is not -1, the products
+    of two and of three of them. No term is constant: the undeformed skin has slope zero. Each W_t is a polynomial in x / half_mm
+    and y / half_mm, of total degree ``degree``, ``product_degree`` or ``cubic_degree``.
 
     Args:
         degree: of the linear terms, 0 to 6.
         product_degree: of the products, 0 to 6; -1 for no products.
         half_mm: scale of positions, mm: half the width of the field of view.
         coefficient: 2 rows (along x, along y) of :meth:`size` numbers, term after term.
+        cubic_degree: of the products of three, 0 to 6; -1 for none.
     Raises:
         ValueError, TypeError: names the argument.
     Source:
@@ -49,9 +50,10 @@ class ResponseField:
     product_degree: int
     half_mm: float
     coefficient: tuple[tuple[float, ...], ...]
+    cubic_degree: int = -1
 
     def __post_init__(self) -> None:
-        for name, least in (("degree", 0), ("product_degree", -1)):
+        for name, least in (("degree", 0), ("product_degree", -1), ("cubic_degree", -1)):
             if check_integer(name, getattr(self, name), least) > 6:
                 raise ValueError(f"{name}: expected at most 6, got {getattr(self, name)}")
         object.__setattr__(self, "half_mm", check_positive("half_mm", self.half_mm))
@@ -60,11 +62,15 @@ class ResponseField:
 
     def terms(self) -> list[tuple[int, ...]]:
         """Terms as indices of their inputs: (0,) is the change of R, (0, 2) that change times the change of B."""
-        return field_terms(self.product_degree)
+        return list(self.degrees())
+
+    def degrees(self) -> dict[tuple[int, ...], int]:
+        """Degree in position of every term, in order."""
+        return term_degrees_by_term(self.degree, self.product_degree, self.cubic_degree)
 
     def size(self) -> int:
         """Number of coefficients of one slope."""
-        return len(term_degrees(self.degree, self.product_degree))
+        return sum(map(monomials, self.degrees().values()))
 
     def tensor(self) -> Tensor:
         """(2, size) float64."""
@@ -76,22 +82,22 @@ class ResponseField:
         x, y = x.expand(height, width), y.expand(height, width)
         weight, start = self.tensor(), 0
         maps = []
-        for degree in term_degrees_by_term(self.degree, self.product_degree).values():
+        for degree in self.degrees().values():
             basis = position_basis(x, y, self.half_mm, degree)
             maps.append(torch.tensordot(weight[:, start : start + len(basis)], basis, 1))
             start += len(basis)
         return torch.stack(maps)
 
-    def embedded(self, degree: int, product_degree: int) -> "ResponseField":
+    def embedded(self, degree: int, product_degree: int, cubic_degree: int = -1) -> "ResponseField":
         """The same field as a member of a larger family; the new coefficients are zero.
 
         Raises:
             ValueError: the family is not larger.
         """
-        new = term_degrees_by_term(degree, product_degree)
-        old = term_degrees_by_term(self.degree, self.product_degree)
+        new = term_degrees_by_term(degree, product_degree, cubic_degree)
+        old = self.degrees()
         if any(term not in new or new[term] < d for term, d in old.items()):
-            raise ValueError(f"degree, product_degree: expected a family that holds {old}, got {new}")
+            raise ValueError(f"degree, product_degree, cubic_degree: expected a family that holds {old}, got {new}")
         rows: list[tuple[float, ...]] = []
         for row in self.coefficient:
             numbers = iter(row)
@@ -99,7 +105,7 @@ class ResponseField:
             rows.append(
                 tuple(known.get((term, i, j), 0.0) for term, d in new.items() for i in range(d + 1) for j in range(d + 1 - i))
             )
-        return ResponseField(degree, product_degree, self.half_mm, tuple(rows))
+        return ResponseField(degree, product_degree, self.half_mm, tuple(rows), cubic_degree)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, to seven digits, which is more than presses determine."""
@@ -292,21 +298,15 @@ def fit_log_background(background: Tensor, mm_per_pixel: float) -> tuple[tuple[f
     return tuple(tuple(float(v) for v in column) for column in solution.t())
 
 
-def field_terms(product_degree: int) -> list[tuple[int, ...]]:
-    """Terms as indices of their inputs: the three changes, then their products."""
-    single: list[tuple[int, ...]] = [(k,) for k in range(3)]
-    return single + (list(combinations_with_replacement(range(3), 2)) if product_degree >= 0 else [])
+def term_degrees_by_term(degree: int, product_degree: int, cubic_degree: int = -1) -> dict[tuple[int, ...], int]:
+    """Degree in position of every term, in order: the three changes, then their products of two, and of three."""
+    orders = enumerate((degree, product_degree, cubic_degree), start=1)
+    return {term: d for order, d in orders if d >= 0 for term in combinations_with_replacement(range(3), order)}
 
 
-def term_degrees_by_term(degree: int, product_degree: int) -> dict[tuple[int, ...], int]:
-    """Degree in position of every term, in order."""
-    return {term: degree if len(term) == 1 else product_degree for term in field_terms(product_degree)}
-
-
-def term_degrees(degree: int, product_degree: int) -> list[int]:
-    """Total degree in position of every coefficient, in order."""
-    by_term = term_degrees_by_term(degree, product_degree)
-    return [i + j for d in by_term.values() for i in range(d + 1) for j in range(d + 1 - i)]
+def monomials(degree: int) -> int:
+    """Number of monomials of two variables up to a total degree."""
+    return (degree + 1) * (degree + 2) // 2
 
 
 def position_basis(x: Tensor, y: Tensor, half_mm: float, degree: int) -> Tensor:
@@ -319,7 +319,7 @@ def position_basis(x: Tensor, y: Tensor, half_mm: float, degree: int) -> Tensor:
     return torch.stack([columns[i] * rows[j] for i in range(degree + 1) for j in range(degree + 1 - i)])
 
 
-def term_values(change: Tensor, x: Tensor, y: Tensor, half_mm: float, degree: int, product_degree: int) -> Tensor:
+def term_values(change: Tensor, x: Tensor, y: Tensor, half_mm: float, degrees: dict[tuple[int, ...], int]) -> Tensor:
     """Factor of every coefficient at N places: (size, N).
 
     Args:
@@ -327,13 +327,9 @@ def term_values(change: Tensor, x: Tensor, y: Tensor, half_mm: float, degree: in
         x: (N,), mm.
         y: (N,), mm.
         half_mm: scale of positions, mm.
-        degree: of linear terms.
-        product_degree: of products; -1 for none.
+        degrees: degree in position of every term, see :func:`term_degrees_by_term`.
     """
     inputs = change / CHANGE_SCALE
-    bases = {d: position_basis(x, y, half_mm, d) for d in {degree, product_degree} if d >= 0}
-    rows = []
-    for term in field_terms(product_degree):
-        value = math.prod([inputs[k] for k in term[1:]], start=inputs[term[0]])
-        rows.append(value * bases[degree if len(term) == 1 else product_degree])
-    return torch.cat(rows)
+    bases = {degree: position_basis(x, y, half_mm, degree) for degree in set(degrees.values())}
+    products = {term: math.prod([inputs[k] for k in term[1:]], start=inputs[term[0]]) for term in degrees}
+    return torch.cat([products[term] * bases[degree] for term, degree in degrees.items()])

@@ -54,6 +54,7 @@ class NormalFromResponse(NormalModel):
             check_record("by_depth", by_depth, DepthBrightness)
         self.uses_depth = by_depth is not None
         self.max_sine = MAX_SINE
+        self.products, self.cubic = field.product_degree >= 0, field.cubic_degree >= 0
         scale = torch.tensor([CHANGE_SCALE ** -len(term) for term in field.terms()], dtype=torch.float64)
         self.register_buffer("maps", (field.maps(height, width, mm_per_pixel) * scale[:, None, None, None]).to(dtype))
         per_mm = torch.zeros(0, height, width) if by_depth is None else by_depth.maps(height, width, mm_per_pixel)
@@ -91,12 +92,19 @@ class NormalFromResponse(NormalModel):
         sine = maps[0] * inputs[0]  # (B, 2, H, W)
         for k in range(1, 3):
             sine = torch.addcmul(sine, maps[k], inputs[k])
-        if maps.shape[0] > 3:
+        if self.products:
             place = 3
             for i in range(3):
                 for k in range(i, 3):
                     sine = torch.addcmul(sine, maps[place], inputs[i] * inputs[k])
                     place += 1
+        if self.cubic:
+            place = maps.shape[0] - 10
+            for i in range(3):
+                for k in range(i, 3):
+                    for m in range(k, 3):
+                        sine = torch.addcmul(sine, maps[place], inputs[i] * inputs[k] * inputs[m])
+                        place += 1
         squared = torch.addcmul(sine[:, 0:1] * sine[:, 0:1], sine[:, 1:2], sine[:, 1:2])
         kept = (self.max_sine / torch.sqrt(squared + 1e-12)).clamp_max(1.0)
         up = torch.sqrt(1.0 - squared * (kept * kept))

@@ -12,23 +12,21 @@ from torch import Tensor, nn
 
 from ..accelerated import ContactMask
 from ..calibration import (
-    GIVEN_MISFIT,
     POORLY_CONSTRAINED_DEG,
     ROUGH,
     CalibrationWarning,
     Press,
-    Touch,
     calibrate,
     channel_structure,
 )
 from ..contact import ContactMask as PlainContactMask
-from ..contact.masks import MOST_FAR_FIELD
+from ..contact import ContactSettings
+from ..contact.masks import most_far_field
 from ..core.blur import blur, gaussian_weights
 from ..core.checks import check_batch, check_integer, check_path, check_positive, check_sequence, parse_number
 from ..core.files import VIDEO_SUFFIXES, read_frames
-from ..model import Calibration, ResponseField, ResponseModel, Sensor, SensorPrior, check_sensor
+from ..model import Calibration, Sensor, SensorPrior
 from ..model.calibration import PEDESTAL
-from ..model.response_field import CHANGE_SCALE
 from ..normals import NormalFromResponse
 from .sources import RectifySizes
 
@@ -43,9 +41,6 @@ NOT_METRIC = "depth is NOT METRIC: calibrate with presses of a ball"
 
 ASSUMED = ("sensor_file", "stand_in")
 """Sources of a model that is not of this unit."""
-
-STAND_IN_NOISE = 0.02
-"""Least noise, relative to the background, under a stand-in model: a press scatters light that no calibration has measured."""
 
 
 def find_background(images: Tensor, sensor: Sensor | None = None) -> tuple[Tensor, Tensor]:
@@ -226,50 +221,8 @@ class StreamCalibration(NamedTuple):
     metric: bool
 
 
-def calibrate_unit(
-    background: Tensor,
-    sensor: Sensor,
-    presses: Sequence[Press] = (),
-    touches: Sequence[Touch | Tensor] = (),
-    *,
-    progress: bool = False,
-) -> Calibration:
-    """Calibrate from an image without contact, and from presses and touches if there are any: what all scripts do.
-
-    As :func:`torchvts.calibrate` does; but if the sensor file gives the lights and their light does not look like the
-    background (:data:`GIVEN_MISFIT`), only their directions are used: slope = - pinv(D) change, D being the lights' x / z and
-    y / z. That is a stand-in: shapes are right, but depth is only as right as the heights of the LEDs.
-
-    Args:
-        background: (3, H, W) in [0, 1].
-        sensor: what the image is of.
-        presses: of balls.
-        touches: by unknown objects.
-        progress: show a bar.
-    Example:
-        >>> from torchvts.model.lights import PointLights, flat_image
-        >>> lights = PointLights([[25, 0, 30], [-12, 20, 30], [-12, -20, 30]], [900, 900, 900])
-        >>> calibrate_unit(flat_image(lights, 48, 64, 0.6).detach(), Sensor("rig", 48, 64, 0.6)).report["model"]
-        'point_lights'
-    """
-    check_sensor("sensor", sensor)
-    calibration = calibrate(background, sensor, presses, touches, progress=progress)
-    report = calibration.report
-    if report["source"] != "sensor_file" or report["candidates"][0]["misfit"] <= GIVEN_MISFIT:
-        return calibration
-    lights = torch.tensor(sensor.light_position_mm, dtype=torch.float64)
-    slope = -torch.linalg.pinv(lights[:, :2] / lights[:, 2:]) * CHANGE_SCALE
-    rows = tuple(tuple(row) for row in slope.tolist())
-    half_mm = 0.5 * sensor.width * sensor.mm_per_pixel
-    model = ResponseModel(ResponseField(0, -1, half_mm, rows), None, sensor.exponent, max(1.0, sensor.blur_px))
-    misfit = report["candidates"][0]["misfit"]
-    reason = f"directions of the sensor file's lights; as point lights they miss the background by {misfit:.0%}"
-    stand_in = {"model": "response", "source": "stand_in", "reason": reason, "candidates": report["candidates"]}
-    return Calibration.from_response(model, sensor, background, stand_in)
-
-
 def calibrate_background(background: Tensor, sensor: Sensor, presses: Sequence[Press] = ()) -> StreamCalibration:
-    """:func:`calibrate_unit`, with its warnings as a note.
+    """:func:`calibrate`, with its warnings as a note.
 
     Args:
         background: (3, H, W) in [0, 1].
@@ -278,7 +231,7 @@ def calibrate_background(background: Tensor, sensor: Sensor, presses: Sequence[P
     """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        calibration = calibrate_unit(background, sensor, presses)
+        calibration = calibrate(background, sensor, presses)
     notes = [str(w.message) for w in caught if issubclass(w.category, CalibrationWarning)]
     if calibration.report["source"] in ASSUMED:
         notes.append("the lights are the sensor file's, not this unit's")
@@ -296,22 +249,21 @@ def use_calibration(calibration: Calibration) -> StreamCalibration:
     return StreamCalibration(calibration, note if metric else f"{note}; {NOT_METRIC}", metric)
 
 
-def contact_in_video(calibration: Calibration, noise: Tensor | None = None) -> PlainContactMask:
+def contact_in_video(
+    calibration: Calibration, noise: Tensor | None = None, contact: ContactSettings | None = None
+) -> PlainContactMask:
     """The unit's contact mask, with the noise (3, H, W) that a video has between frames; None where it was not measured."""
-    calibrated = ContactMask.from_calibration(calibration)
-    stand_in = calibration.report.get("source") == "stand_in"
-    if noise is None and not stand_in:
+    calibrated = ContactMask.from_calibration(calibration, contact)
+    if noise is None:
         return calibrated
-    noise = torch.zeros_like(calibration.background) if noise is None else noise
     sensor = calibration.sensor
     value = calibration.background.float().clamp_min(1e-6) ** (1.0 / sensor.exponent)
     compensated = noise.float() * sensor.exponent * torch.maximum(value, noise.float()) ** (sensor.exponent - 1.0)
     if calibration.gain is not None:
         compensated = compensated * calibration.gain.float() * 2.0**0.5
-    least = STAND_IN_NOISE if stand_in else 0.0
-    most = torch.maximum(1.0 / calibrated.per_noise.float(), compensated).clamp_min(least)
-    far_field = 0.0 if stand_in or calibration.response is None else MOST_FAR_FIELD  # STAND_IN_NOISE is what a press may scatter
-    return ContactMask(calibrated.flat.float(), most, far_field=far_field).eval()
+    most = torch.maximum(1.0 / calibrated.per_noise.float(), compensated)
+    thresholds = calibrated.sigmas, calibrated.min_size_px
+    return ContactMask(calibrated.flat.float(), most, *thresholds, far_field=most_far_field(calibration)).eval()
 
 
 def with_video_noise(mask: nn.Module, noise: Tensor) -> PlainContactMask:

@@ -14,7 +14,8 @@ from torch import Tensor, nn
 
 from ..accelerated.threads import MOST_PIXELS, OneThread
 from ..calibration import Press
-from ..core.checks import check_choice, check_integer, check_least, check_positive, check_switch
+from ..contact import ContactSettings
+from ..core.checks import check_choice, check_integer, check_least, check_positive, check_record, check_switch
 from ..core.files import check_pixels, rgb_from_bgr
 from ..model import Calibration, Sensor
 from ..pipeline import MODES, DepthOutput, DepthPipeline
@@ -109,6 +110,7 @@ class TactileStream:
         device: of the pipeline, "cpu" or "cuda".
         time_constant_s: of following.
         reconnect_s: for how long a camera that has stopped is opened again before an error is raised; not with a :class:`Reader`.
+        contact: thresholds of contact; None for the usual ones.
         clock: for tests.
     Attributes:
         calibration: of the unit.
@@ -142,10 +144,13 @@ class TactileStream:
         device: str = "cpu",
         time_constant_s: float = TIME_CONSTANT_S,
         reconnect_s: float = 0.0,
+        contact: ContactSettings | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         check_choice("mode", mode, MODES)
         time_constant_s = check_positive("time_constant_s", time_constant_s)
+        if contact is not None:
+            check_record("contact", contact, ContactSettings, "ContactSettings(sigmas=...) makes one")
         if not isinstance(sensor_or_calibration, Sensor | Calibration):
             raise TypeError(
                 f"sensor_or_calibration: expected a Sensor or a Calibration, got {type(sensor_or_calibration).__name__}"
@@ -191,6 +196,7 @@ class TactileStream:
                 network=network,
                 device=device,
                 time_constant_s=time_constant_s,
+                contact=contact,
                 stage=self.stages.stage,
             )
             self.light, self.pipe = self.recording.light, self.recording.pipe

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ..contact import ContactSettings
 from ..core.checks import check_positive, check_switch
 from ..core.spelling import suggest
 from ..model import Calibration, check_calibration
@@ -50,6 +51,7 @@ class Recording:
         time_constant_s: of following.
         network: a trained network in place of the calibration's model, see :func:`torchvts.pipeline.unit_pipeline`.
         device: of the pipeline, "cpu" or "cuda"; frames come and go on the CPU.
+        contact: thresholds of contact; None for the usual ones.
         stage: makes a context in which a stage of that name runs, to measure its time.
     Attributes:
         pipe: the pipeline.
@@ -69,6 +71,7 @@ class Recording:
         time_constant_s: float = TIME_CONSTANT_S,
         network: str | Path | None = None,
         device: str = "cpu",
+        contact: ContactSettings | None = None,
         stage: Callable[[str], AbstractContextManager[Any]] = lambda name: nullcontext(),
     ) -> None:
         check_calibration("calibration", calibration)
@@ -78,13 +81,13 @@ class Recording:
         value = value.clamp(0.0, 1.0)
         self.light = FollowLight(value, time_constant_s)
         self.device = check_device(device)
-        self.pipe: DepthPipeline = unit_pipeline(calibration, mode, network).float()
+        self.pipe: DepthPipeline = unit_pipeline(calibration, mode, network, contact).float()
         self.check = FrameCheck(value) if calibration.measured else None
         self._fps, self._follow, self._stage = fps, follow, stage
         self._before: float | None = None
         image, noise = (None, None) if first is None else find_background(first)
         if network is None:
-            self.pipe.deformed = contact_in_video(calibration, noise)
+            self.pipe.deformed = contact_in_video(calibration, noise, contact)
         elif noise is not None:
             self.pipe.deformed = with_video_noise(self.pipe.deformed, noise)
         self.pipe.to(self.device)

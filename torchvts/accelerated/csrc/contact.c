@@ -5,7 +5,7 @@
 #include <math.h>
 
 /* Bits of a coarse cell. */
-enum { CELL = 1, FAINT = 2, OUTSIDE = 4, KEPT = 8 };
+enum { CELL = 1, FAINT = 2, OUTSIDE = 4, KEPT = 8, ADDED = 16, REACHED = 32 };
 
 /* The k-th smallest of n values, which it reorders: Hoare's selection. */
 static float kth_of_few(float *values, int n, int k) {
@@ -257,6 +257,8 @@ typedef struct {
 typedef struct {
     int rows, columns, cell, reach;
     float least_cells;
+    int bridge;
+    float bridge_sigmas;
 } Grid;
 
 /* Pixels whose change stands out, closed, and each cell's share of them and mean change; where the size is no multiple of the cell's
@@ -356,6 +358,64 @@ static void keep_large(Grid grid, Scratch at) {
     spread(at.state, wide, OUTSIDE | KEPT, KEPT, at.stack, top);
 }
 
+/* Cells dilated by a square of so many cells either way; `lines` and `result`: bytes, as many as cells. */
+static void widen(const uint8_t *cells, int rows, int columns, int reach, uint8_t *lines, uint8_t *result) {
+    for (int i = 0; i < rows; i++) {
+        const uint8_t *row = cells + (size_t)i * columns;
+        uint8_t *line = lines + (size_t)i * columns;
+        for (int j = 0, until = -1; j < columns; j++) {
+            if (row[j]) until = j + reach;
+            line[j] = j <= until;
+        }
+        for (int j = columns - 1, from = columns; j >= 0; j--) {
+            if (row[j]) from = j - reach;
+            line[j] |= j >= from;
+        }
+    }
+    memset(result, 0, (size_t)rows * columns);
+    for (int i = 0; i < rows; i++)
+        for (int k = i < reach ? 0 : i - reach; k <= i + reach && k < rows; k++)
+            for (int j = 0; j < columns; j++) result[(size_t)i * columns + j] |= lines[(size_t)k * columns + j];
+}
+
+/* Keeps cells between kept ones that have moved too, and what they enclose: a closing by a square. */
+static void bridge_gaps(Grid grid, Scratch at) {
+    const int rows = grid.rows, columns = grid.columns, wide = columns + 2;
+    const size_t cells = (size_t)rows * columns;
+    uint8_t *one = (uint8_t *)at.density, *lines = one + cells, *other = lines + cells, *state = at.state;
+    for (int i = 0; i < rows; i++)
+        for (int j = 0; j < columns; j++) one[(size_t)i * columns + j] = (state[(i + 1) * wide + j + 1] & KEPT) != 0;
+    widen(one, rows, columns, grid.bridge, lines, other);
+    for (size_t k = 0; k < cells; k++) other[k] = !other[k];
+    widen(other, rows, columns, grid.bridge, lines, one);
+    int added = 0, top = 0;
+    for (int i = 0; i < rows; i++)
+        for (int j = 0; j < columns; j++) {
+            const size_t k = (size_t)i * columns + j;
+            const float r = at.means[k], g = at.means[cells + k], b = at.means[2 * cells + k];
+            const int place = (i + 1) * wide + j + 1;
+            if (!one[k] && !(state[place] & KEPT) && r * r + g * g + b * b > grid.bridge_sigmas * grid.bridge_sigmas)
+                state[place] |= ADDED, added = 1;
+        }
+    if (!added) return;
+    for (int i = 0; i < rows + 2; i++)
+        for (int j = 0; j < wide; j++) {
+            const int place = i * wide + j;
+            if (i == 0 || j == 0 || i == rows + 1 || j == wide - 1)
+                state[place] |= REACHED;
+            else if ((i == 1 || j == 1 || i == rows || j == columns) && !(state[place] & (KEPT | ADDED))) {
+                state[place] |= REACHED;
+                at.stack[top++] = place;
+            }
+        }
+    spread(state, wide, KEPT | ADDED | REACHED, REACHED, at.stack, top);
+    for (int i = 1; i <= rows; i++)
+        for (int j = 1; j <= columns; j++) {
+            uint8_t *here = state + i * wide + j;
+            if (!(*here & (KEPT | REACHED))) *here = (uint8_t)((*here & ~OUTSIDE) | KEPT | FAINT);
+        }
+}
+
 /* Whether no neighbour of a cell lies outside of the contact; what is beyond the image counts as contact. */
 static int is_inner(Grid grid, const uint8_t *state, int i, int j) {
     for (int y = i > 0 ? i - 1 : 0; y <= i + 1 && y < grid.rows; y++)
@@ -398,8 +458,9 @@ static void to_pixels(Grid grid, Scratch at, int height, int width, uint8_t *str
  */
 EXPORT int contact_mask(const float *image, const float *offset, const float *per_noise, const float *failed_below,
                         const float *most_far_field, int frames, int height, int width, int step, int stride, int cell, int reach,
-                        float sigmas, float rounding, float least_cells, uint8_t *mask, uint8_t *inner) {
-    const Grid grid = {(height + cell - 1) / cell, (width + cell - 1) / cell, cell, reach, least_cells};
+                        float sigmas, float rounding, float least_cells, int bridge, float bridge_sigmas, uint8_t *mask,
+                        uint8_t *inner) {
+    const Grid grid = {(height + cell - 1) / cell, (width + cell - 1) / cell, cell, reach, least_cells, bridge, bridge_sigmas};
     const size_t pixels = (size_t)height * width, cells = (size_t)grid.rows * grid.columns;
     const size_t ringed = (size_t)(grid.rows + 2) * (grid.columns + 2);
     const size_t samples = (size_t)((height + stride - 1) / stride) * ((width + stride - 1) / stride);
@@ -436,6 +497,7 @@ EXPORT int contact_mask(const float *image, const float *offset, const float *pe
             if (!(fabsf(at.means[k]) < 1e15f)) not_finite = 2;
         if (find_cells(grid, at)) {
             keep_large(grid, at);
+            if (bridge > 0) bridge_gaps(grid, at);
             to_pixels(grid, at, height, width, mask + pixels * b, inner + pixels * b);
         } else {
             memset(mask + pixels * b, 0, pixels);

@@ -327,6 +327,7 @@ def test_scripts_refuse_bad_input_in_a_sentence(run_script, folder, tmp_path):
         assert done.stderr.startswith("torchvts: error: ") and part in done.stderr, done.stderr
         assert "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == []
-    for arguments in (["--methods", "magic"], ["--all"]):
+    (tmp_path.parent / "bad.pth").write_bytes(b"no network")
+    for arguments in (["--methods", "magic"], ["--all"], ["--methods", "fast", "--network", tmp_path.parent / "bad.pth"]):
         done = run_script("evaluate", folder, *arguments, "--out", tmp_path)
         assert done.returncode == 2 and done.stderr.startswith("torchvts: error: ") and list(tmp_path.iterdir()) == []

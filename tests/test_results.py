@@ -145,6 +145,7 @@ def damaged(path, tmp_path, how):
     "how, message",
     [
         (lambda a: a.pop("contact"), "it has no contact"),
+        (lambda a: a.update(format=np.asarray(2)), "it has layout 2, this version reads 1: update torchvts"),
         (lambda a: a.update(normals=a["normals"][:2]), r"normals: expected \(3, 48, 64\), float32, got \(2, 48, 64\)"),
         (
             lambda a: a.update(depth_mm=a["depth_mm"].astype("f8")),

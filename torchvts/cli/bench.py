@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Measure, write table and chart, and print the table."""
     torch.set_num_threads(arguments.threads)
-    data = data_folder(speed.__file__)
+    data = data_folder(str(Path(__file__).parent))
     command = f"torchvts bench --threads {arguments.threads}"
 
     def step(name: str) -> None:

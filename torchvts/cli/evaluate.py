@@ -64,8 +64,10 @@ def measure(arguments: argparse.Namespace) -> list[ev.Evaluation]:
     """Score what the arguments name."""
     methods, limit, seed = arguments.methods, arguments.limit, arguments.seed
     if arguments.folder is None:
+        if arguments.network is not None:
+            raise UsageError("--network: expected FOLDER beside it, the presses of the network's unit")
         names = sets.SETS if arguments.all else arguments.sets
-        return ev.evaluate_all(names, sets.data_folder(ev.__file__), methods, limit=limit, seed=seed, progress=True)
+        return ev.evaluate_all(names, sets.data_folder(str(Path(__file__).parent)), methods, limit=limit, seed=seed, progress=True)
     sensor = Sensor.load(arguments.sensor or "gelsight_mini")
     data = sets.from_folder(arguments.folder, sensor, folds=arguments.folds, network=arguments.network, limit=limit)
     with tqdm(desc="evaluating", leave=False, disable=None) as bar:

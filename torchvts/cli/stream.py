@@ -67,9 +67,6 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("--background, --press: they are to calibrate with --sensor, not beside --calibration")
     torch.set_num_threads(max(1, arguments.threads))
     cv2.setNumThreads(max(1, arguments.threads))
-    unit = Sensor.load(arguments.sensor) if arguments.sensor else load_calibration(arguments.calibration)
-    if arguments.corners is not None:
-        unit = with_corners(unit, arguments.corners)
     if arguments.save_calibration is not None:
         check_target(arguments.save_calibration)
     if arguments.out is not None:
@@ -78,27 +75,8 @@ def run(arguments: argparse.Namespace) -> int:
     if not show:
         print("no display: no live view" + ("" if arguments.out else "; give --out for an overlay video"))
     started = time.perf_counter()
-    presses: Sequence[Press] = ()
-    if isinstance(unit, Sensor):
-        presses = read_press_images(arguments.press, unit)
-    if isinstance(unit, Sensor) and arguments.background:
-        found = calibrate_background(read_background(arguments.background, unit, arguments.background_frames), unit, presses)
-        print(found.note)
-        unit, presses = found.calibration, ()
     with contextlib.ExitStack() as stack:
-        stream = stack.enter_context(
-            TactileStream(
-                arguments.source,
-                unit,
-                mode=arguments.mode,
-                background_frames=arguments.background_frames,
-                presses=presses,
-                realtime=arguments.realtime,
-                follow=not arguments.no_follow,
-                network=arguments.network,
-                device=arguments.device,
-            )
-        )
+        stream = stack.enter_context(open_stream(arguments))
         print(f"{stream.reader.name}: {stream.fps:g} frames a second; the first {arguments.background_frames} are without contact")
         print(f"{stream.note}\nready after {time.perf_counter() - started:.1f} s")
         if arguments.save_calibration is not None:
@@ -115,6 +93,33 @@ def run(arguments: argparse.Namespace) -> int:
         report.save(arguments.out)
         print(f"wrote {len(report.rows)} frames to {arguments.out}")
     return 1 if stream.left_out else 0
+
+
+def open_stream(arguments: argparse.Namespace) -> TactileStream:
+    """The stream that the arguments name, its unit calibrated."""
+    unit: Sensor | Calibration
+    unit = Sensor.load(arguments.sensor) if arguments.sensor else load_calibration(arguments.calibration)
+    if arguments.corners is not None:
+        unit = with_corners(unit, arguments.corners)
+    presses: Sequence[Press] = ()
+    if isinstance(unit, Sensor):
+        presses = read_press_images(arguments.press, unit)
+        if arguments.background:
+            image = read_background(arguments.background, unit, arguments.background_frames)
+            found = calibrate_background(image, unit, presses)
+            print(found.note)
+            unit, presses = found.calibration, ()
+    return TactileStream(
+        arguments.source,
+        unit,
+        mode=arguments.mode,
+        background_frames=arguments.background_frames,
+        presses=presses,
+        realtime=arguments.realtime,
+        follow=not arguments.no_follow,
+        network=arguments.network,
+        device=arguments.device,
+    )
 
 
 def play(

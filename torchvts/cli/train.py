@@ -47,7 +47,5 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"{len(presses)} presses, {sum(p.numel() for p in fit.module.parameters())} weights, seed {arguments.seed}")
     print(f"RMS error of the slopes' angles: training {training:.2f} deg, held out {held_out:.2f} deg")
     print(fit.message)
-    print(
-        f"wrote {arguments.out}: vts.DepthPipeline.from_gs_sdk({str(arguments.out)!r}, background, sensor) makes a pipeline of it"
-    )
+    print(f"wrote {arguments.out}: torchvts reconstruct unit.safetensors INPUT --network {arguments.out} --out FOLDER uses it")
     return 0

@@ -169,6 +169,8 @@ def _result(stored: Mapping[str, Array]) -> Result:
     missing = [name for name in (*MAPS, "mm_per_pixel", "units", "calibration", "sensor", "frames") if name not in stored]
     if missing:
         raise ValueError(f"it has no {', '.join(missing)}")
+    if int(stored.get("format", np.asarray(FORMAT))) > FORMAT:
+        raise ValueError(f"it has layout {int(stored['format'])}, this version reads {FORMAT}: update torchvts")
     frames = [str(name) for name in stored["frames"]]
     depth = stored["depth_mm"]
     if depth.ndim not in (2, 3) or (depth.ndim == 2 and len(frames) != 1):

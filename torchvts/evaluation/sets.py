@@ -107,6 +107,8 @@ def from_folder(
     """
     background, presses = read_presses(folder)
     check_image("background", background, sensor.height, sensor.width, sensor.name)
+    if network is not None:
+        NormalFromMLP.load(network, background)  # a bad one is refused before the work, also where no method needs it
     presses = spread(presses, limit)
     if check_integer("folds", folds, 1) > len(presses):
         raise ValueError(f"folds: expected at most the number of presses, {len(presses)}, got {folds}")

@@ -21,11 +21,11 @@ from ..calibration import (
 )
 from ..contact import ContactMask as PlainContactMask
 from ..contact import ContactSettings
-from ..contact.masks import most_far_field
+from ..contact.masks import MOST_FAR_FIELD, most_far_field
 from ..core.blur import blur, gaussian_weights
 from ..core.checks import check_batch, check_integer, check_path, check_positive, check_sequence, parse_number
 from ..core.files import VIDEO_SUFFIXES, read_frames
-from ..model import Calibration, Sensor, SensorPrior
+from ..model import Calibration, Sensor, SensorPrior, check_sensor
 from ..model.calibration import PEDESTAL
 from ..normals import NormalFromResponse
 from .sources import RectifySizes

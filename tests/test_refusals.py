@@ -47,8 +47,10 @@ PARTS = {
     "as_normal_model", "by_presses", "channel_structure", "check_calibration", "check_domain", "check_sensor",
     "discontinuity_share", "falloff", "label_contacts", "outwardness", "read_point_cloud", "stream.FrameCheck.",
     "stream.NewestFrame", "stream.Overlay", "stream.Recording.", "stream.RectifySizes", "stream.StageClock",
-    "stream.StreamReport.", "stream.VideoFile.", "stream.Window", "stream.calibrate_unit", "stream.frames_a_second",
-    "stream.read_background", "stream.read_press_images", "stream.use_calibration", "with_preprocessing", "write_point_cloud",
+    "stream.Camera", "stream.Keys", "stream.LiveView", "stream.Sheet", "stream.StreamReport.", "stream.TactileStream.rezero",
+    "stream.VideoFile.", "stream.calibrate_unit", "stream.find_camera", "stream.frames_a_second", "stream.has_screen",
+    "stream.read_background", "stream.read_press_images", "stream.require_rerun", "stream.use_calibration",
+    "stream.with_background", "with_preprocessing", "write_point_cloud",
 }  # fmt: skip
 """Names, and with a dot at the end methods, that other tests cover: records, base classes, what one room does for another."""
 FREE = {"dtype", "seed", "report", "comment", "clock", "sleep"}

@@ -51,6 +51,14 @@ def test_panels_that_are_compared_share_their_range():
     assert low == pytest.approx(-high)
 
 
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_a_sheet_of_few_frames_has_no_empty_panel(count):
+    frames = [(0.1 * k, frame().numpy() * (k + 1)) for k in range(count)]
+    figure = viz.sheet_figure(frames, PITCH)
+    figure.draw_without_rendering()
+    assert len(figure.axes) == count + 1 and all(axes.get_images() for axes in figure.axes[:count])
+
+
 def test_a_pose_is_shown_before_and_after_at_one_scale():
     source = torch.rand(500, 3, dtype=torch.float64) * torch.tensor([8.0, 3.0, 0.4])
     T = torch.eye(4, dtype=torch.float64)

@@ -245,7 +245,7 @@ def sheet_figure(frames: Sequence[tuple[float, Array]], mm_per_pixel: float, met
     for panel in axes.flat[len(frames) :]:
         panel.remove()
     unit = "mm" if metric else "mm, NOT METRIC"
-    figure.colorbar(picture, ax=axes, aspect=30, shrink=0.9, label=f"depth, {unit}; a line every {step:g}")
+    figure.colorbar(picture, ax=axes.ravel()[: len(frames)], aspect=30, shrink=0.9, label=f"depth, {unit}; a line every {step:g}")
     return figure
 
 

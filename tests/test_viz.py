@@ -23,7 +23,7 @@ def test_a_frame_has_one_extent_in_all_panels_and_states_its_exaggeration(height
     for axes in (image, contours, surface):
         assert axes.get_xlim() == pytest.approx(expected[0]) and axes.get_ylim() == pytest.approx(expected[1])
     assert image.get_position().width == pytest.approx(contours.get_position().width)
-    assert "mm" in image.get_xlabel() and "mm" in surface.get_zlabel()
+    assert "mm" in image.get_xlabel() and surface.get_zticklabels()[-1].get_text().strip() == "0.5 mm"
     stated = float(surface.get_title().split(" x ")[1])
     box = np.asarray(surface._box_aspect)
     assert box[2] / box[0] == pytest.approx(stated * float(depth.max() - depth.min()) / (width * PITCH), rel=1e-3)

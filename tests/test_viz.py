@@ -23,7 +23,7 @@ def test_a_frame_has_one_extent_in_all_panels_and_states_its_exaggeration(height
     for axes in (image, contours, surface):
         assert axes.get_xlim() == pytest.approx(expected[0]) and axes.get_ylim() == pytest.approx(expected[1])
     assert image.get_position().width == pytest.approx(contours.get_position().width)
-    assert "mm" in image.get_xlabel() and "mm" in surface.get_zlabel()
+    assert "mm" in image.get_xlabel() and surface.get_zticklabels()[-1].get_text().strip() == "0.5 mm"
     stated = float(surface.get_title().split(" x ")[1])
     box = np.asarray(surface._box_aspect)
     assert box[2] / box[0] == pytest.approx(stated * float(depth.max() - depth.min()) / (width * PITCH), rel=1e-3)
@@ -49,6 +49,14 @@ def test_panels_that_are_compared_share_their_range():
     assert truth.get_images()[0].get_clim() == measured.get_images()[0].get_clim() == pytest.approx((-50.0, 500.0), abs=1.0)
     low, high = error.get_images()[0].get_clim()
     assert low == pytest.approx(-high)
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_a_sheet_of_few_frames_has_no_empty_panel(count):
+    frames = [(0.1 * k, frame().numpy() * (k + 1)) for k in range(count)]
+    figure = viz.sheet_figure(frames, PITCH)
+    figure.draw_without_rendering()
+    assert len(figure.axes) == count + 1 and all(axes.get_images() for axes in figure.axes[:count])
 
 
 def test_a_pose_is_shown_before_and_after_at_one_scale():

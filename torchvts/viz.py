@@ -245,7 +245,7 @@ def sheet_figure(frames: Sequence[tuple[float, Array]], mm_per_pixel: float, met
     for panel in axes.flat[len(frames) :]:
         panel.remove()
     unit = "mm" if metric else "mm, NOT METRIC"
-    figure.colorbar(picture, ax=axes, aspect=30, shrink=0.9, label=f"depth, {unit}; a line every {step:g}")
+    figure.colorbar(picture, ax=axes.ravel()[: len(frames)], aspect=30, shrink=0.9, label=f"depth, {unit}; a line every {step:g}")
     return figure
 
 
@@ -274,7 +274,7 @@ def pose_figure(source: Tensor, target: Tensor, T_target_source: Tensor, title: 
         space.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
         space.set_box_aspect((spans[0], spans[1], exaggeration * spans[2]), zoom=1.0)
         space.view_init(elev=35, azim=-65)
-        space.set_title(f"{name}, height x {exaggeration:g}", fontsize=10)
+        space.set_title(f"{name}, height x {exaggeration:g}", fontsize=10, y=0.93)
         _space_labels(space)
     above.set_ylabel("")  # it is that of the first panel
     figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=2, markerscale=8, frameon=False)
@@ -308,10 +308,13 @@ def _space_labels(axes: Any) -> None:
     """Few ticks and close labels on the axes of a surface or cloud."""
     axes.set_xlabel("x, mm", labelpad=-6)
     axes.set_ylabel("y, mm", labelpad=-6)
-    axes.set_zlabel("z, mm", labelpad=-9)
     axes.tick_params(labelsize=8, pad=-2)
-    for axis, ticks in ((axes.xaxis, 4), (axes.yaxis, 4), (axes.zaxis, 2)):
-        axis.set_major_locator(MaxNLocator(ticks, steps=[1, 2, 5, 10]))
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+    low, high = axes.get_zlim()
+    top = f"{high:.2g} mm".rjust(16)  # labels are centred: the spaces keep it off the axis
+    ticks = {0.0: "0", high: top} if low <= 0.0 < 0.8 * high else {high: top}
+    axes.set_zticks(list(ticks), list(ticks.values()))
 
 
 def _exaggeration(height: float, width: float) -> float:

@@ -18,7 +18,8 @@ from .parser import HelpFormatter, Parser, UsageError
 COMMANDS = {
     "calibrate": "calibrate a unit from its own images",
     "reconstruct": "depth of images, folders and videos, in files",
-    "stream": "live depth of a camera or a recording",
+    "stream": "depth of a camera or a recording, frame by frame, into files",
+    "view": "live 3D view of a camera or a recording",
     "pose": "pose of a pressed object relative to a reference press",
     "track": "pose of a touched object in every frame of a camera or a recording",
     "diagnose": "what is wrong with a frame or its calibration",

@@ -1,12 +1,19 @@
 """Options that several subcommands share, each defined once."""
 
 import argparse
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
+from ..contact import ContactSettings
+from ..core.checks import parse_number
+from ..core.spelling import suggest
 from ..model import Calibration, shipped_sensors
 from ..pipeline import MODES
 from ..stream import FIRST_FRAMES
 from .parser import UsageError
+
+_CONTACT = " ".join(f"{key}={value:g}" for key, value in asdict(ContactSettings()).items())
 
 
 def add_sensor(parser: argparse._ActionsContainer, text: str = "") -> None:
@@ -45,6 +52,32 @@ def add_network(parser: argparse._ActionsContainer) -> None:
 def add_device(parser: argparse._ActionsContainer) -> None:
     """``--device``: where the pipeline runs."""
     parser.add_argument("--device", default="cpu", help="cpu, cuda, cuda:1 (cpu)")
+
+
+def add_contact(parser: argparse._ActionsContainer) -> None:
+    """``--contact KEY=VALUE``, repeated: thresholds, for :func:`contact_of`."""
+    parser.add_argument("--contact", nargs="+", metavar="KEY=VALUE", help=f"thresholds: {_CONTACT}")
+
+
+def contact_of(given: Sequence[str] | None) -> ContactSettings | None:
+    """The thresholds in ``--contact``; None where it was not given.
+
+    Example:
+        >>> contact_of(["sigmas=6"])
+        ContactSettings(sigmas=6.0, min_size_px=8.0, share=0.8)
+    """
+    if not given:
+        return None
+    values = {}
+    for text in given:
+        key, _, number = text.partition("=")
+        if key not in asdict(ContactSettings()):
+            raise UsageError(f"--contact: expected {_CONTACT}, got {text!r}{suggest(key, asdict(ContactSettings()))}")
+        try:
+            values[key] = parse_number(number)
+        except ValueError as error:
+            raise UsageError(f"--contact: {key}: {error}") from None
+    return ContactSettings(**values)
 
 
 def load_calibration(path: Path) -> Calibration:

@@ -21,7 +21,18 @@ from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, Report, list_items
 from ..diagnose import Finding, diagnose
 from ..model import Sensor
 from ..stream import read_background, read_press_images
-from .options import add_background_frames, add_device, add_mode, add_network, add_out, add_press, add_sensor, load_calibration
+from .options import (
+    add_background_frames,
+    add_contact,
+    add_device,
+    add_mode,
+    add_network,
+    add_out,
+    add_press,
+    add_sensor,
+    contact_of,
+    load_calibration,
+)
 from .parser import UsageError
 from .summary import SHOWN, calibrated, left_out, print_calibration
 
@@ -46,6 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--every", type=int, default=1, metavar="N", help="each N-th frame of a video, each N-th image")
     add_network(parser)
     add_device(parser)
+    add_contact(parser)
     kinds = "npz (all), video-npz (one a video), png16, npy, none (npz)"
     parser.add_argument("--format", choices=FORMATS, default="npz", metavar="KIND", help=kinds)
     parser.add_argument("--cloud", choices=CLOUD_FORMATS, default="none", metavar="KIND", help="contact: ply, pcd, obj (surface)")
@@ -62,7 +74,8 @@ def run(arguments: argparse.Namespace) -> int:
     calibration, inputs = split_files(arguments)
     if calibration is None:
         calibration = calibrate_first(arguments, inputs)
-    report = reconstruct_dataset(calibration, inputs, arguments.out, **{name: getattr(arguments, name) for name in PASSED})
+    passed = {name: getattr(arguments, name) for name in PASSED}
+    report = reconstruct_dataset(calibration, inputs, arguments.out, contact=contact_of(arguments.contact), **passed)
     if report.rank > 0:
         return 0
     print_report(report, arguments.out)

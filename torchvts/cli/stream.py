@@ -1,4 +1,4 @@
-"""Live depth of a camera or a recording: a view beside the image, or files; late frames of a camera are dropped.
+"""Depth of a camera or a recording, frame by frame, into files; late frames of a camera are dropped. torchvts view shows it live.
 
 The first frames must be without contact. Ctrl-C ends it and finishes the files. Exit status 1 where a frame was left out.
 
@@ -13,7 +13,7 @@ import contextlib
 import dataclasses
 import signal
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
@@ -23,17 +23,31 @@ from ..calibration import Press
 from ..core.files import check_target
 from ..model import Calibration, Sensor
 from ..stream import (
+    Camera,
+    CameraSettings,
     Overlay,
+    Sheet,
     StreamReport,
+    TactileFrame,
     TactileStream,
     VideoFile,
-    Window,
     calibrate_background,
-    has_display,
+    find_camera,
     read_background,
     read_press_images,
 )
-from .options import add_background_frames, add_device, add_mode, add_network, add_press, add_sensor, load_calibration
+from ..viz import save_figure
+from .options import (
+    add_background_frames,
+    add_contact,
+    add_device,
+    add_mode,
+    add_network,
+    add_press,
+    add_sensor,
+    contact_of,
+    load_calibration,
+)
 from .parser import UsageError
 
 USAGE = "--source SOURCE (--sensor NAME | --calibration FILE) [--out FOLDER]"
@@ -41,19 +55,28 @@ USAGE = "--source SOURCE (--sensor NAME | --calibration FILE) [--out FOLDER]"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
-    parser.add_argument("--source", required=True, help="a camera's index (digits), a video file, or a folder of images")
-    add_sensor(parser, "the first frames calibrate: ")
-    parser.add_argument("--calibration", type=Path, metavar="FILE", help="what torchvts calibrate wrote, in place of --sensor")
+    add_source(parser)
     parser.add_argument("--background", type=Path, nargs="+", metavar="IMAGE", help="to calibrate: without contact; or a video")
     add_press(parser)
-    add_background_frames(parser)
     parser.add_argument("--save-calibration", type=Path, metavar="FILE", help="write the calibration, .safetensors")
     parser.add_argument("--corners", help='in place of the sensor\'s: "x y x y x y x y", from top left, clockwise')
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="for overlay video, frames.csv and summary.json")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="for overlay video, sheet.png, frames.csv and summary.json")
     parser.add_argument("--video", choices=["mp4", "avi", "none"], default="mp4", help="kind of overlay video in --out")
+
+
+def add_source(parser: argparse.ArgumentParser) -> None:
+    """What ``stream`` and ``view`` share: the source, the unit, the camera's settings and the pipeline."""
+    parser.add_argument("--source", required=True, help="camera (index, /dev path, name), URL, video file, or folder of images")
+    parser.add_argument("--size", nargs=2, type=int, metavar=("W", "H"), help="of a camera's frames, where the driver takes it")
+    parser.add_argument("--fps", type=float, metavar="F", help="of a camera, where the driver takes it")
+    parser.add_argument("--exposure", type=float, metavar="E", help="of a camera, in the driver's unit; ends automatic exposure")
+    add_sensor(parser, "the first frames calibrate: ")
+    parser.add_argument("--calibration", type=Path, metavar="FILE", help="what torchvts calibrate wrote, in place of --sensor")
+    add_background_frames(parser)
     add_mode(parser)
     add_network(parser)
     add_device(parser)
+    add_contact(parser)
     parser.add_argument("--realtime", action="store_true", help="play a recording at its own rate, dropping late frames")
     parser.add_argument("--no-follow", action="store_true", help="do not follow slow drift of the light")
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="of PyTorch and OpenCV (1)")
@@ -61,56 +84,85 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Stream until the source ends, and print a summary."""
-    if (arguments.sensor is None) == (arguments.calibration is None):
-        raise UsageError("expected either --sensor or --calibration")
+    unit = load_unit(arguments)
     if arguments.calibration is not None and (arguments.background or arguments.press):
         raise UsageError("--background, --press: they are to calibrate with --sensor, not beside --calibration")
-    torch.set_num_threads(max(1, arguments.threads))
-    cv2.setNumThreads(max(1, arguments.threads))
+    if arguments.corners is not None:
+        unit = with_corners(unit, arguments.corners)
     if arguments.save_calibration is not None:
         check_target(arguments.save_calibration)
-    if arguments.out is not None:
+    if arguments.out is None:
+        print("give --out for an overlay video and files; torchvts view shows the stream live")
+    else:
         arguments.out.mkdir(parents=True, exist_ok=True)
-    show = has_display()
-    if not show:
-        print("no display: no live view" + ("" if arguments.out else "; give --out for an overlay video"))
-    started = time.perf_counter()
+    presses: Sequence[Press] = ()
+    if isinstance(unit, Sensor):
+        presses = read_press_images(arguments.press, unit)
+    if isinstance(unit, Sensor) and arguments.background:
+        found = calibrate_background(read_background(arguments.background, unit, arguments.background_frames), unit, presses)
+        print(found.note)
+        unit, presses = found.calibration, ()
     with contextlib.ExitStack() as stack:
-        stream = stack.enter_context(open_stream(arguments))
-        print(f"{stream.reader.name}: {stream.fps:g} frames a second; the first {arguments.background_frames} are without contact")
-        print(f"{stream.note}\nready after {time.perf_counter() - started:.1f} s")
+        stream = stack.enter_context(open_stream(arguments, unit, presses))
         if arguments.save_calibration is not None:
             stream.calibration.save(arguments.save_calibration)
             print(f"wrote {arguments.save_calibration}")
-        report = StreamReport(stream)
+        report, sheet = StreamReport(stream), Sheet(stream.calibration.sensor.mm_per_pixel, stream.metric)
         video = None
         if arguments.out is not None and arguments.video != "none":
             video = stack.enter_context(VideoFile(arguments.out / f"overlay.{arguments.video}", stream.fps))
-        overlay = Overlay(stream.metric) if show or video is not None else None
-        play(stream, report, overlay, Window() if show else None, video)
+        play(stream, _Files(stream, report, sheet, video).add)
     print(report.table())
     if arguments.out is not None:
         report.save(arguments.out)
+        if sheet.times:
+            save_figure(sheet.figure(), arguments.out / "sheet.png")
         print(f"wrote {len(report.rows)} frames to {arguments.out}")
     return 1 if stream.left_out else 0
 
 
-def open_stream(arguments: argparse.Namespace) -> TactileStream:
-    """The stream that the arguments name, its unit calibrated."""
-    unit: Sensor | Calibration
-    unit = Sensor.load(arguments.sensor) if arguments.sensor else load_calibration(arguments.calibration)
-    if arguments.corners is not None:
-        unit = with_corners(unit, arguments.corners)
-    presses: Sequence[Press] = ()
-    if isinstance(unit, Sensor):
-        presses = read_press_images(arguments.press, unit)
-        if arguments.background:
-            image = read_background(arguments.background, unit, arguments.background_frames)
-            found = calibrate_background(image, unit, presses)
-            print(found.note)
-            unit, presses = found.calibration, ()
-    return TactileStream(
-        arguments.source,
+class _Files:
+    """Adds each frame to the report, the sheet and the overlay video; the next frame stands in for dropped ones."""
+
+    def __init__(self, stream: TactileStream, report: StreamReport, sheet: Sheet, video: VideoFile | None) -> None:
+        self.stream, self.report, self.sheet, self.video = stream, report, sheet, video
+        self.overlay = Overlay(stream.metric, stream.calibration.sensor.mm_per_pixel)
+        self.shown = -1
+
+    def add(self, frame: TactileFrame) -> bool:
+        lines = self.report.add(frame)
+        self.sheet.add(frame)
+        if self.video is not None:
+            with self.stream.stages.stage("draw"):
+                picture = self.overlay(frame, lines)
+            with self.stream.stages.stage("write"):
+                for _ in range(max(1, frame.number - self.shown)):
+                    self.video.write(picture)
+            self.shown = frame.number
+        return True
+
+
+def load_unit(arguments: argparse.Namespace) -> Sensor | Calibration:
+    """The sensor or the calibration that was given, and the threads that were asked for."""
+    if (arguments.sensor is None) == (arguments.calibration is None):
+        raise UsageError("expected either --sensor or --calibration")
+    torch.set_num_threads(max(1, arguments.threads))
+    cv2.setNumThreads(max(1, arguments.threads))
+    return Sensor.load(arguments.sensor) if arguments.sensor else load_calibration(arguments.calibration)
+
+
+def open_stream(arguments: argparse.Namespace, unit: Sensor | Calibration, presses: Sequence[Press] = ()) -> TactileStream:
+    """The stream of the source; says what it found."""
+    started = time.perf_counter()
+    settings = CameraSettings(arguments.size and tuple(arguments.size), arguments.fps, arguments.exposure)
+    camera = find_camera(arguments.source)
+    if settings.given and camera is None:
+        raise UsageError(f"--size, --fps, --exposure: expected a camera of this machine, got {arguments.source!r}")
+    source: str | int | Camera = arguments.source
+    if camera is not None:
+        source = Camera(camera, settings) if settings.given else camera
+    stream = TactileStream(
+        source,
         unit,
         mode=arguments.mode,
         background_frames=arguments.background_frames,
@@ -119,14 +171,15 @@ def open_stream(arguments: argparse.Namespace) -> TactileStream:
         follow=not arguments.no_follow,
         network=arguments.network,
         device=arguments.device,
+        contact=contact_of(arguments.contact),
     )
+    print(f"{stream.reader.name}: {stream.fps:g} frames a second; the first {arguments.background_frames} are without contact")
+    print(f"{stream.note}\nready after {time.perf_counter() - started:.1f} s")
+    return stream
 
 
-def play(
-    stream: TactileStream, report: StreamReport, overlay: Overlay | None, window: Window | None, video: VideoFile | None
-) -> None:
-    """Show every frame until the source ends, the window is closed, or Ctrl-C; the next frame stands in for dropped ones."""
-    shown = -1
+def play(stream: TactileStream, take: Callable[[TactileFrame], bool]) -> None:
+    """Give every frame to ``take`` until the source ends, it returns False, or Ctrl-C."""
     asked: list[int] = []
 
     def interrupt(number: int, _: object) -> None:
@@ -138,17 +191,8 @@ def play(
         for frame in stream:
             if asked:
                 raise KeyboardInterrupt
-            lines = report.add(frame)
-            if overlay is not None:
-                with stream.stages.stage("draw"):
-                    picture = overlay(frame, lines)
-                if video is not None:
-                    with stream.stages.stage("write"):
-                        for _ in range(max(1, frame.number - shown)):
-                            video.write(picture)
-                    shown = frame.number
-                if window is not None and not window.show(picture):
-                    break
+            if not take(frame):
+                break
     except KeyboardInterrupt:
         print("interrupted: the frames until now are kept")
     finally:

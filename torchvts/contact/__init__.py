@@ -1,8 +1,7 @@
 """Where the skin has moved, from a compensated image; where an object touches it, from the depth."""
 
 from .masks import ContactMask
-from .options import add_contact_arguments, contact_from_arguments
 from .settings import ContactSettings
 from .touching import ContactFromDepth
 
-__all__ = ["ContactFromDepth", "ContactMask", "ContactSettings", "add_contact_arguments", "contact_from_arguments"]
+__all__ = ["ContactFromDepth", "ContactMask", "ContactSettings"]

@@ -18,6 +18,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
+from dataclasses import asdict
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
@@ -29,6 +30,7 @@ import torch.distributed as dist
 from torch import Tensor
 from tqdm import tqdm
 
+from ..contact import ContactSettings
 from ..core import __version__
 from ..core.checks import check_choice, check_integer, check_path, check_sequence
 from ..core.files import (
@@ -88,6 +90,7 @@ def reconstruct_dataset(
     every: int = 1,
     network: str | Path | None = None,
     device: str = "cpu",
+    contact: ContactSettings | None = None,
     background_frames: int = FIRST_FRAMES,
     batch: int = 8,
     workers: int | None = None,
@@ -115,6 +118,7 @@ def reconstruct_dataset(
         every: take each N-th frame of a video, each N-th image of a folder.
         network: gs_sdk's ``nnmodel.pth`` or what ``torchvts train`` wrote, in place of the calibration's model.
         device: of the pipeline, "cpu" or "cuda".
+        contact: thresholds of contact; None for the usual ones.
         background_frames: first frames of a video, which show the skin without contact; 0 uses the calibration as it is, and so
             does a video where they show contact or that is shorter, with a note.
         batch: frames that a loader worker hands over at once.
@@ -142,12 +146,12 @@ def reconstruct_dataset(
     unit = Calibration.load(calibration)
     check_device(device)
     if network is not None:
-        unit_pipeline(unit, mode, network)  # a bad one is refused before anything is written
+        unit_pipeline(unit, mode, network, contact)  # a bad one is refused before anything is written
     _check_source(source, out)
     torch.set_num_threads(threads)
     settings = Settings(
         _digest(calibration), _digest(network), _names(source), mode, format, cloud, pictures, every, device, threads,
-        __version__, str(torch.__version__), background_frames,
+        __version__, str(torch.__version__), background_frames, None if contact is None else asdict(contact),
     )  # fmt: skip
     with _processes() as (rank, world), locked(out) if rank == 0 else nullcontext():
         if rank == 0:
@@ -232,7 +236,10 @@ class _Worker:
     ) -> None:
         self.unit, self.records, self.settings, self.share, self.strict = unit, records, records.settings, share, strict
         self.sensor, self.name = unit.sensor, name
-        self.recording = partial(Recording, unit, self.settings.mode, network=network, device=self.settings.device)
+        thresholds = None if self.settings.contact is None else ContactSettings(**self.settings.contact)
+        self.recording = partial(
+            Recording, unit, self.settings.mode, network=network, device=self.settings.device, contact=thresholds
+        )
         self.image = self.recording(follow=False)
         self.notes: list[tuple[str, str]] = []
         self.done = 0

@@ -54,6 +54,7 @@ class Settings:
     torchvts: str
     torch: str
     background_frames: int = FIRST_FRAMES
+    contact: dict[str, float] | None = None
 
 
 def begin(source: Source, out: Path, settings: Settings, overwrite: bool) -> Settings:

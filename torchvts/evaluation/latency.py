@@ -1,5 +1,6 @@
 """From a camera's frame to its depth: a simulated camera in real time, and how long after its arrival a frame's depth is there."""
 
+import threading
 import time
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -30,12 +31,14 @@ class SimulatedCamera:
         self.fps = check_positive("fps", fps)
         self.frames = check_integer("frames", frames, 1)
         self.arrivals: list[float] = []
+        self._closed = threading.Event()
         self._pictures, self._undeformed, self._next = list(pictures), undeformed, time.monotonic()
 
     def read(self) -> Pixels | None:
-        """Wait for the next frame and return it; None at the end."""
+        """Wait for the next frame and return it. After the last one nothing comes until it is closed; then None."""
         number = len(self.arrivals)
-        if number >= self.frames:
+        if number >= self.frames or self._closed.is_set():
+            self._closed.wait()
             return None
         wait = self._next - time.monotonic()
         if wait > 0.0:
@@ -47,7 +50,7 @@ class SimulatedCamera:
 
     def close(self) -> None:
         """End it."""
-        self.frames = 0
+        self._closed.set()
 
 
 class Latency(NamedTuple):
@@ -102,5 +105,7 @@ def measure_latency(
             numbers.append(frame.number)
             if draws:
                 aside.put(frame)
+            if frame.number == frames - 1:  # the newest frame is never dropped
+                break
         dropped = stream.dropped
     return Latency(numbers, delay_ms, len(camera.arrivals) - before, dropped, len(drawn))

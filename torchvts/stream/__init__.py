@@ -11,19 +11,27 @@ from .background import (
     read_press_images,
     use_calibration,
 )
+from .cameras import Camera, CameraSettings, find_camera
 from .follow_light import FollowLight
+from .keys import Keys
 from .live import StageClock, TactileFrame, TactileStream
-from .overlay import Overlay, Sheet, StreamReport, VideoFile, Window, has_display
+from .overlay import Overlay, Sheet, StreamReport, VideoFile
 from .recording import Recording, check_device
+from .rezero import with_background
 from .sources import NewestFrame, Reader, Rectify, RectifySizes, Unreadable, frames_a_second, open_source
 from .usable import FrameCheck
+from .view import LiveView, has_screen, require_rerun
 
 __all__ = [
     "FIRST_FRAMES",
     "NOT_METRIC",
     "Aside",
+    "Camera",
+    "CameraSettings",
     "FollowLight",
     "FrameCheck",
+    "Keys",
+    "LiveView",
     "NewestFrame",
     "Overlay",
     "Reader",
@@ -37,15 +45,17 @@ __all__ = [
     "TactileStream",
     "Unreadable",
     "VideoFile",
-    "Window",
     "calibrate_background",
     "check_device",
     "find_background",
+    "find_camera",
     "frames_a_second",
-    "has_display",
+    "has_screen",
     "messages",
     "open_source",
     "read_background",
     "read_press_images",
+    "require_rerun",
     "use_calibration",
+    "with_background",
 ]

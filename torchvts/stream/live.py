@@ -5,6 +5,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +23,7 @@ from ..pipeline import MODES, DepthOutput, DepthPipeline
 from .background import FIRST_FRAMES, calibrate_background, find_background, use_calibration
 from .follow_light import TIME_CONSTANT_S
 from .recording import Recording
+from .rezero import with_background
 from .sources import SETTLING, LiveReader, NewestFrame, Pixels, Reader, Rectify, Replay, Unreadable, check_reader, open_source
 
 
@@ -173,6 +175,8 @@ class TactileStream:
         self._hooks: list[Any] = []
         self._clock = clock
         self.left_out: list[tuple[int, str]] = []
+        self._zero: list[Tensor] = []
+        self._zero_missing = 0
         self._realtime = realtime or self.reader.live
         self.fps = self.reader.fps
         self.stages = StageClock()
@@ -187,10 +191,9 @@ class TactileStream:
             else:
                 found = use_calibration(sensor_or_calibration)
             self.calibration, self.note, self.metric = found
-            self.recording = Recording(
-                self.calibration,
-                mode,
-                first if background_frames > 0 else None,
+            self._start = partial(
+                Recording,
+                mode=mode,
                 fps=self.fps,
                 follow=follow,
                 network=network,
@@ -199,8 +202,7 @@ class TactileStream:
                 contact=contact,
                 stage=self.stages.stage,
             )
-            self.light, self.pipe = self.recording.light, self.recording.pipe
-            self._hooks = self.stages.watch(self.pipe)
+            self._use(self._start(self.calibration, first=first if background_frames > 0 else None))
         except BaseException:
             self.reader.close()
             raise
@@ -208,6 +210,40 @@ class TactileStream:
     def _rectified(self, pixels: Pixels) -> Tensor:
         frame: Tensor = self.rectify(rgb_from_bgr(pixels)[None])
         return frame.clamp_(0.0, 1.0)
+
+    def rezero(self, frames: int = FIRST_FRAMES) -> None:
+        """Take the next frames, which must be without contact, as the background; until then depth goes on as before.
+
+        Where contact or changing light is seen in them, a warning says so and the background stays.
+
+        Args:
+            frames: number of frames, at least 3.
+        """
+        self._zero, self._zero_missing = [], check_integer("frames", frames, 3)
+
+    def _use(self, recording: Recording) -> None:
+        """Go on with a recording: the first one, or that of a new background."""
+        for handle in self._hooks:
+            handle.remove()
+        self.recording, self.light, self.pipe = recording, recording.light, recording.pipe
+        self._hooks = self.stages.watch(self.pipe)
+
+    def _collect(self, raw: Tensor) -> None:
+        """Keep a frame for the new background, and change to it when there are enough."""
+        self._zero.append(raw)
+        self._zero_missing -= 1
+        if self._zero_missing > 0:
+            return
+        first = torch.cat(self._zero)
+        self._zero = []
+        try:
+            background = find_background(first, self.calibration.sensor)[0].clamp(0.0, 1.0)
+            calibration = with_background(self.calibration, background)
+            self._use(self._start(calibration, first=first))
+        except ValueError as error:
+            warnings.warn(f"re-zero refused, the background stays: {error}", stacklevel=3)
+        else:
+            self.calibration = calibration
 
     @property
     def dropped(self) -> int:
@@ -261,6 +297,8 @@ class TactileStream:
             with self._threads(pixels):
                 with self.stages.stage("rectify"):
                     raw, reason = self._usable(pixels)
+                if raw is not None and self._zero_missing:
+                    self._collect(raw)
                 found = None if raw is None else self.recording(raw, time_s)
             if found is None:
                 self.left_out.append((index, reason))

@@ -1,23 +1,22 @@
 """Shows a stream: the image beside depth with contours, as a video or a sheet of frames, and a report of all frames."""
 
 import json
-import os
-import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from ..core.checks import check_path, check_positive, check_record
 from ..core.files import check_text_name, write_atomically
-from ..viz import depth_colors, sheet_figure
 from .live import TactileFrame, TactileStream
 from .sources import Pixels
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 CODES = {".mp4": "mp4v", ".avi": "MJPG"}
 """Suffixes of the videos that can be written, and OpenCV's code for each."""
@@ -39,6 +38,8 @@ class Overlay:
     TEXT_HEIGHT = 86
 
     def __init__(self, metric: bool = True, mm_per_pixel: float | None = None) -> None:
+        from ..viz import depth_colors  # Matplotlib is slow to import
+
         self.metric, self.range_mm = metric, 0.1
         self.mm_per_pixel = None if mm_per_pixel is None else check_positive("mm_per_pixel", mm_per_pixel)
         colors, _ = depth_colors(-1.0, 1.0)
@@ -51,9 +52,7 @@ class Overlay:
 
         depth = depth_mm[0, 0].float().numpy()
         high = float(depth.max())
-        while high > self.range_mm:
-            power = 10.0 ** np.floor(np.log10(self.range_mm) + 1e-9)
-            self.range_mm = float(power * next(s for s in _RANGES if s > self.range_mm / power + 1e-6))
+        self.range_mm = round_up(self.range_mm, high)
         level = np.clip(127.5 * (1.0 + depth / self.range_mm) + 0.5, 0.0, 255.0).astype(np.uint8)
         picture: Pixels = cv2.applyColorMap(level, self._table)
         if high > 0.02 * self.range_mm:
@@ -98,6 +97,24 @@ class Overlay:
         _write(out, end, (x + width - 8 * len(end), y + 26))
 
 
+def round_up(range_mm: float, high_mm: float) -> float:
+    """The next round range that holds ``high_mm``; ``range_mm`` where it holds it already."""
+    while high_mm > range_mm:
+        power = 10.0 ** np.floor(np.log10(range_mm) + 1e-9)
+        range_mm = float(power * next(s for s in _RANGES if s > range_mm / power + 1e-6))
+    return range_mm
+
+
+def outlines(contact: Pixels) -> list[Pixels]:
+    """Outlines of a mask (H, W), smoothed, each (n, 1, 2) whole pixels, x and y."""
+    import cv2
+
+    if not contact.any():
+        return []
+    smooth = (cv2.blur(contact.view(np.uint8) * 255, (7, 7)) > 127).view(np.uint8)
+    return list(cv2.findContours(smooth, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0])
+
+
 def _write(out: Pixels, text: str, place: tuple[int, int], color: int = 230) -> None:
     import cv2
 
@@ -121,11 +138,7 @@ def _outlined(frame: TactileFrame) -> Pixels:
     import cv2
 
     picture = np.ascontiguousarray((frame.image.flip(0).permute(1, 2, 0) * 255.0 + 0.5).to(torch.uint8).numpy())
-    contact = frame.output.contact[0, 0].numpy().view(np.uint8)
-    if contact.any():
-        smooth = (cv2.blur(contact * 255, (7, 7)) > 127).view(np.uint8)
-        outline, _ = cv2.findContours(smooth, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        cv2.drawContours(picture, outline, -1, (255, 255, 255), 1, cv2.LINE_AA)
+    cv2.drawContours(picture, outlines(frame.output.contact[0, 0].numpy()), -1, (255, 255, 255), 1, cv2.LINE_AA)
     return picture
 
 
@@ -154,7 +167,12 @@ class Sheet:
         if len(self._kept) > self._MOST:
             self._kept, self._every = self._kept[::2], self._every + 1
 
-    def figure(self) -> Figure:
+    @property
+    def times(self) -> list[float]:
+        """Times of the frames that are kept, s."""
+        return [time_s for time_s, _ in self._kept]
+
+    def figure(self) -> "Figure":
         """The sheet.
 
         Raises:
@@ -162,6 +180,8 @@ class Sheet:
         """
         if not self._kept:
             raise ValueError("sheet: expected frames with contact, got none: there is nothing to draw")
+        from ..viz import sheet_figure
+
         most = max(float(depth.max()) for _, depth in self._kept)
         deep = [kept for kept in self._kept if float(kept[1].max()) >= 0.1 * most]  # no panel without a visible depth
         places = np.unique(np.linspace(0, len(deep) - 1, 6).round().astype(int))
@@ -297,42 +317,3 @@ class StreamReport:
             rows = {i: f"{i},{t:.4f},{area:.4f},{deepest:.6f},{state}\n" for i, t, area, deepest, state in self.rows}
             rows |= {i: f"{i},,,,left out\n" for i, _ in self.stream.left_out}
             temporary.write_text(f"{self.HEADER}\n" + "".join(rows[i] for i in sorted(rows)), encoding="utf-8")
-
-
-def has_display() -> bool:
-    """Whether a window can be opened: a screen is named, and Matplotlib finds a toolkit for it."""
-    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        return False
-    import matplotlib
-
-    try:
-        import matplotlib.pyplot as plt
-
-        plt.figure().clear()
-        plt.close("all")
-    except Exception:  # toolkits raise errors of their own when the screen does not answer
-        return False
-    return str(matplotlib.get_backend()).lower() not in ("agg", "pdf", "ps", "svg", "cairo", "template")
-
-
-class Window:
-    """A live view by Matplotlib, because the OpenCV that is installed has none."""
-
-    def __init__(self) -> None:
-        import matplotlib.pyplot as plt
-
-        plt.ion()
-        self._plt = plt
-        self._figure, self._axes = plt.subplots(num="torchvts")
-        self._axes.axis("off")
-        self._image: Any = None
-
-    def show(self, picture: Pixels) -> bool:
-        """Show a picture (H, W, 3) B, G, R; False once the window is closed."""
-        rgb = picture[:, :, ::-1]
-        if self._image is None:
-            self._image = self._axes.imshow(rgb)
-        else:
-            self._image.set_data(rgb)
-        self._plt.pause(0.001)
-        return bool(self._plt.fignum_exists(self._figure.number))

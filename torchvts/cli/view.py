@@ -1,0 +1,98 @@
+"""Live 3D view of a camera or a recording, with rerun: image, depth, normals, contact, surface, area and deepest point over time.
+
+The first frames must be without contact. Without a screen, --save FILE.rrd records what the viewer would show; rerun FILE.rrd
+opens it anywhere. Keys, in this terminal (or letters on standard input): z re-zero (lift the object first), s snapshot,
+r start and end a recording, q end.
+
+examples:
+  torchvts view --source 0 --sensor gelsight_mini
+  torchvts view --source /dev/video2 --calibration unit.safetensors --size 640 480 --fps 30
+  torchvts view --source video.avi --sensor gelsight_wedge --save ball.rrd
+"""
+
+import argparse
+from pathlib import Path
+
+from ..core.results import write_result
+from ..stream import Keys, LiveView, StreamReport, TactileFrame, TactileStream, has_screen, require_rerun
+from ..viz import depth_figure, save_figure
+from .parser import UsageError
+from .stream import add_source, load_unit, open_stream, play
+
+USAGE = "--source SOURCE (--sensor NAME | --calibration FILE) [--save FILE.rrd]"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the subcommand."""
+    add_source(parser)
+    parser.add_argument("--save", type=Path, metavar="FILE.rrd", help="record from the start; no viewer is opened")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", default=Path("out/view"), help="of snapshots and recordings")
+    parser.add_argument(
+        "--exaggeration", type=float, default=3.0, metavar="X", help="height of the surface on the screen (3 times)"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Show the stream until the source ends or q is pressed, and print a summary."""
+    require_rerun()
+    if arguments.save is None and not has_screen():
+        raise UsageError("expected --save FILE.rrd, for this machine has no screen that the viewer could open on")
+    unit = load_unit(arguments)
+    with open_stream(arguments, unit) as stream:
+        pitch = stream.calibration.sensor.mm_per_pixel
+        view = LiveView(
+            pitch, stream.metric, save=arguments.save, viewer=arguments.save is None, exaggeration=arguments.exaggeration
+        )
+        with view, Keys() as keys:
+            viewing = _Viewing(stream, view, keys, arguments.out)
+            play(stream, viewing.add)
+    print(viewing.report.table())
+    if arguments.save is not None:
+        print(f"wrote {arguments.save}; rerun {arguments.save} shows it")
+    return 1 if stream.left_out else 0
+
+
+class _Viewing:
+    """Shows each frame, and does what the keys ask for."""
+
+    def __init__(self, stream: TactileStream, view: LiveView, keys: Keys, out: Path) -> None:
+        self.stream, self.view, self.keys, self.out = stream, view, keys, out
+        self.report = StreamReport(stream)
+
+    def add(self, frame: TactileFrame) -> bool:
+        self.report.add(frame)
+        with self.stream.stages.stage("view"):
+            self.view.add(frame)
+        for key in self.keys.pressed():
+            if key == "q":
+                return False
+            if key == "z":
+                self.stream.rezero()
+                print(f"frame {frame.number}: the next frames are the new zero")
+            elif key == "s":
+                self.snapshot(frame)
+            elif key == "r":
+                self.record(frame)
+        return True
+
+    def snapshot(self, frame: TactileFrame) -> None:
+        """Write the frame as npz and as a picture."""
+        self.out.mkdir(parents=True, exist_ok=True)
+        path, sensor = self.out / f"frame_{frame.number:06}.npz", self.stream.calibration.sensor
+        write_result(path, frame.output, sensor.mm_per_pixel, "", sensor.name, str(frame.number))
+        title = f"{sensor.name}, {frame.time_s:.2f} s" + ("" if self.stream.metric else ", NOT METRIC")
+        figure = depth_figure(frame.output.depth_mm, sensor.mm_per_pixel, frame.image, frame.output.contact, title)
+        save_figure(figure, path.with_suffix(".png"))
+        print(f"wrote {path} and .png")
+
+    def record(self, frame: TactileFrame) -> None:
+        """Start a recording, or end the one that runs."""
+        running = self.view.recording_to
+        if running is not None:
+            self.view.record(None)
+            print(f"wrote {running}")
+            return
+        self.out.mkdir(parents=True, exist_ok=True)
+        path = self.out / f"from_{frame.number:06}.rrd"
+        self.view.record(path)
+        print(f"recording to {path}")

@@ -20,86 +20,74 @@ import torch
 from torch import Tensor
 
 from ..core.files import read_image, write_atomically
-from ..model import Calibration, Sensor
 from ..pose import PoseTracker, TrackedPose
-from ..stream import Overlay, TactileFrame, TactileStream, VideoFile, Window, has_display
-from .options import add_background_frames, add_device, add_mode, add_network, add_out, add_sensor
-from .parser import UsageError
+from ..stream import Overlay, TactileFrame, TactileStream, VideoFile
+from ..stream.sources import Pixels
+from .options import add_out
+from .stream import add_source, load_unit, open_stream, play
 
 USAGE = "--source SOURCE (--sensor NAME | --calibration FILE) --out FOLDER"
 
 COLUMNS = ("frame", "time_s", *(f"T{row}{column}" for row in range(3) for column in range(4)))
 QUALITY = (
-    "converged",
-    "lost",
-    "ambiguous",
-    "alternatives",
-    "std_x_mm",
-    "std_y_mm",
-    "std_z_mm",
-    "keyframe",
-    "drift_deg",
-    "drift_mm",
-)
+    "converged", "lost", "ambiguous", "alternatives", "std_x_mm", "std_y_mm", "std_z_mm", "keyframe", "drift_deg", "drift_mm",
+)  # fmt: skip
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
-    parser.add_argument("--source", required=True, help="a camera's index (digits), a video file, or a folder of images")
-    add_sensor(parser, "the first frames calibrate: ")
-    parser.add_argument("--calibration", type=Path, metavar="FILE", help="what torchvts calibrate wrote, in place of --sensor")
-    add_background_frames(parser)
+    add_source(parser)
     add_out(parser, "for poses.csv and the video track.mp4")
     parser.add_argument("--reference", type=Path, metavar="IMAGE", help="of the contact; if not given, the first large one")
     parser.add_argument("--least-mm2", type=float, default=4.0, metavar="AREA", help="contact of the first reference, mm^2 (4)")
     parser.add_argument("--video", choices=["mp4", "avi", "none"], default="mp4", help="kind of video in --out")
-    add_mode(parser)
-    add_network(parser)
-    add_device(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Track until the source ends, and print a summary."""
-    if (arguments.sensor is None) == (arguments.calibration is None):
-        raise UsageError("expected either --sensor or --calibration")
-    unit = Sensor.load(arguments.sensor) if arguments.sensor else Calibration.load(arguments.calibration)
+    unit = load_unit(arguments)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    rows: list[dict[str, object]] = []
     with contextlib.ExitStack() as stack:
-        stream = stack.enter_context(
-            TactileStream(
-                arguments.source,
-                unit,
-                mode=arguments.mode,
-                background_frames=arguments.background_frames,
-                network=arguments.network,
-                device=arguments.device,
-            )
-        )
-        print(stream.note)
+        stream = stack.enter_context(open_stream(arguments, unit))
         video = None
         if arguments.video != "none":
             video = stack.enter_context(VideoFile(arguments.out / f"track.{arguments.video}", stream.fps))
-        view = View(stream, video, Window() if has_display() else None)
         tracker = None if arguments.reference is None else _tracker_of_image(stream, arguments.reference)
-        try:
-            for frame in stream:
-                found = None
-                if tracker is not None:
-                    found = tracker(frame.output)
-                    rows.append(record(frame, found))
-                elif float(frame.output.contact.sum()) * _pitch(stream) ** 2 >= arguments.least_mm2:
-                    tracker = PoseTracker(frame.output, _pitch(stream))
-                    print(f"frame {frame.number}: the reference")
-                if not view(frame, found, tracker):
-                    break
-        except KeyboardInterrupt:
-            print("interrupted: the frames until now are kept")
+        tracking = _Tracking(stream, video, tracker, arguments.least_mm2)
+        play(stream, tracking.add)
     with write_atomically(arguments.out / "poses.csv") as temporary, open(temporary, "w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS + QUALITY)
         writer.writeheader()
-        writer.writerows(rows)
-    return _summary(rows, arguments.out, tracker)
+        writer.writerows(tracking.rows)
+    return _summary(tracking.rows, arguments.out, tracking.tracker)
+
+
+class _Tracking:
+    """Tracks from frame to frame, keeps the rows of poses.csv, and draws the axes of the reference where the object is."""
+
+    def __init__(self, stream: TactileStream, video: VideoFile | None, tracker: PoseTracker | None, least_mm2: float) -> None:
+        self.video, self.tracker, self.least_mm2, self.pitch = video, tracker, least_mm2, _pitch(stream)
+        self.overlay = Overlay(stream.metric, self.pitch)
+        self.rows: list[dict[str, object]] = []
+
+    def add(self, frame: TactileFrame) -> bool:
+        found: TrackedPose | None = None
+        if self.tracker is not None:
+            found = self.tracker(frame.output)
+            self.rows.append(record(frame, found))
+        elif float(frame.output.contact.sum()) * self.pitch**2 >= self.least_mm2:
+            self.tracker = PoseTracker(frame.output, self.pitch)
+            print(f"frame {frame.number}: the reference")
+        if self.video is not None:
+            self.video.write(self.picture(frame, found))
+        return True
+
+    def picture(self, frame: TactileFrame, found: TrackedPose | None) -> Pixels:
+        """Image and depth, with the axes where the object was found."""
+        if found is None or self.tracker is None:
+            return self.overlay(frame, ["no reference yet"])
+        image = frame.image if found.lost else draw_axes(frame.image, found, self.tracker, self.pitch)
+        return self.overlay(frame._replace(image=image), [found.message[:90]])
 
 
 def record(frame: TactileFrame, found: TrackedPose) -> dict[str, object]:
@@ -110,29 +98,6 @@ def record(frame: TactileFrame, found: TrackedPose) -> dict[str, object]:
     quality = [int(found.converged), found.lost, named, len(found.alternatives), *std, found.keyframe]
     values = [frame.number, f"{frame.time_s:.6f}", *pose, *quality, f"{found.drift_deg:.4g}", f"{found.drift_mm:.4g}"]
     return dict(zip(COLUMNS + QUALITY, values, strict=True))
-
-
-class View:
-    """Shows and records each frame with the axes of the reference drawn where the object is."""
-
-    def __init__(self, stream: TactileStream, video: VideoFile | None, window: Window | None) -> None:
-        self.video, self.window, self.pitch = video, window, _pitch(stream)
-        self.overlay = Overlay(stream.metric) if video is not None or window is not None else None
-
-    def __call__(self, frame: TactileFrame, found: TrackedPose | None, tracker: PoseTracker | None) -> bool:
-        """Show a frame; False if the window was closed."""
-        if self.overlay is None:
-            return True
-        image = frame.image
-        lines = ["no reference yet"]
-        if found is not None and tracker is not None:
-            lines = [found.message[:90]]
-            if not found.lost:
-                image = draw_axes(image, found, tracker, self.pitch)
-        picture = self.overlay(frame._replace(image=image), lines)
-        if self.video is not None:
-            self.video.write(picture)
-        return self.window is None or self.window.show(picture)
 
 
 def draw_axes(image: Tensor, found: TrackedPose, tracker: PoseTracker, mm_per_pixel: float, length_mm: float = 2.0) -> Tensor:

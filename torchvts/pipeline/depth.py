@@ -209,7 +209,7 @@ class DepthPipeline(nn.Module):
         """The pipeline of a network that gs_sdk trained, on the images that it was trained on.
 
         Args:
-            weights: gs_sdk's ``nnmodel.pth``, of which nothing but tensors is unpickled; or what ``scripts/train_mlp.py`` wrote.
+            weights: gs_sdk's ``nnmodel.pth``, of which nothing but tensors is unpickled; or what ``torchvts train`` wrote.
             background: (3, H, W), image of the unit without contact in [0, 1], R, G, B; the network's gradients there are zero.
             sensor: the sensor, or what :meth:`Sensor.load` takes.
             mode: "fast", or "auto", which skips frames without contact.

@@ -102,7 +102,7 @@ def test_findings_come_from_the_fault_and_from_nothing_else(name):
 
 def test_perspective_is_known_from_the_calibration_only():
     case = CORRUPTIONS["perspective"].make(20.0, 0)
-    without = dataclasses.replace(case.calibration, report={})
+    without = dataclasses.replace(case.calibration, report={"model": "point_lights", "source": "given"})
     assert vts.diagnose(case.background, case.image, without).findings == ()
     assert vts.diagnose(case.background, case.image, case.calibration).names == ("perspective",)
 

@@ -227,7 +227,7 @@ def test_azimuths_in_the_wrong_order_are_complained_of(low_rig):
 def test_an_azimuth_that_no_file_names_is_refused(tiny):
     with pytest.raises(ValueError, match="known_azimuth: sensor 'rig' names no light_azimuth_deg"):
         vts.fit_lights(tiny[1], tiny[0], known_azimuth=True)
-    with pytest.raises(TypeError, match="vignetting: expected true or false, got 3"):
+    with pytest.raises(TypeError, match="vignetting: expected True or False, got int"):
         vts.fit_lights(tiny[1], tiny[0], vignetting=3)
 
 

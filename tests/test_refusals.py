@@ -42,12 +42,14 @@ RECORDS = {
 }  # fmt: skip
 """Results that users get and do not make: their constructors keep what they are given. (Their methods are in the table.)"""
 PARTS = {
+    "PoseTracker", "TrackedPose",
     "Adaptive", "DepthBrightness", "Integrator", "NormalModel", "Once", "Repeat", "ResponseField", "ResponseModel",
     "SensorPrior", "Shadows", "SlopesOfDepth", "SlopesOfPixels", "Solve", "WrappedIntegrator", "WrappedNormals", "as_integrator",
     "as_normal_model", "by_presses", "channel_structure", "check_calibration", "check_domain", "check_sensor",
     "discontinuity_share", "falloff", "label_contacts", "outwardness", "read_point_cloud", "stream.FrameCheck.",
     "stream.NewestFrame", "stream.Overlay", "stream.Recording.", "stream.RectifySizes", "stream.StageClock",
-    "stream.Aside.", "stream.Camera", "stream.Keys", "stream.LiveView", "stream.Sheet", "stream.StreamReport.",
+    "stream.Aside", "stream.CameraSettings",
+    "stream.Camera", "stream.Keys", "stream.LiveView", "stream.Sheet", "stream.StreamReport.",
     "stream.TactileStream.rezero", "stream.VideoFile.", "stream.find_camera", "stream.frames_a_second", "stream.has_screen",
     "read_result", "stream.check_device", "stream.read_background", "stream.read_press_images", "stream.require_rerun",
     "stream.use_calibration", "stream.with_background", "unit_pipeline", "with_preprocessing", "write_point_cloud",

@@ -79,14 +79,14 @@ def by_frames(count: int, pixels: int, call: Callable[[int, int], int | None]) -
 
 
 def share_frames(frames: range, pixels: int, work: Callable[[int], None]) -> None:
-    """Do the work of each frame of a batch, many frames in torch's number of threads, each of which works on its own frames alone.
+    """Do the work of each frame, large batches in torch's number of threads, each of which works on its own frames alone.
 
     Args:
         frames: their indices.
-        pixels: of a frame.
+        pixels: of the whole batch.
         work: takes an index; runs in several threads at once, with the caller's gradients and inference mode.
     """
-    threads = min(len(frames), torch.get_num_threads()) if len(frames) * pixels > MOST_PIXELS else 1
+    threads = min(len(frames), torch.get_num_threads()) if pixels > MOST_PIXELS else 1
     recording, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
 
     def some(first: int) -> None:

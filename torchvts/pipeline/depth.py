@@ -190,19 +190,20 @@ class DepthPipeline(nn.Module):
         settings = ContactSettings() if contact is None else contact
         check_record("contact", settings, ContactSettings, "ContactSettings(sigmas=...) makes one")
         sensor, given = calibration.sensor, (normals, integrate)
-        if normals is None:
-            by_response = calibration.response is not None
-            normals = (NormalFromResponse if by_response else NormalFromIntensity).from_calibration(calibration)
-        modules = (
-            Compensate.from_calibration(calibration, drift=mode == "auto"),
-            ContactMask.from_calibration(calibration, settings),
-            normals,
-            GradientFromNormal(),
-            PoissonBackground(sensor.mm_per_pixel) if integrate is None else integrate,
-        )
-        touching = ContactFromDepth(sensor.mm_per_pixel, settings.share)
-        pipe = cls(*modules, mm_per_pixel=sensor.mm_per_pixel, mode=mode, contact=touching)
-        return eval_around(pipe, *given)
+        with torch.inference_mode(False):  # whose tensors are never known to have changed
+            if normals is None:
+                by_response = calibration.response is not None
+                normals = (NormalFromResponse if by_response else NormalFromIntensity).from_calibration(calibration)
+            modules = (
+                Compensate.from_calibration(calibration, drift=mode == "auto"),
+                ContactMask.from_calibration(calibration, settings),
+                normals,
+                GradientFromNormal(),
+                PoissonBackground(sensor.mm_per_pixel) if integrate is None else integrate,
+            )
+            touching = ContactFromDepth(sensor.mm_per_pixel, settings.share)
+            pipe = cls(*modules, mm_per_pixel=sensor.mm_per_pixel, mode=mode, contact=touching)
+            return eval_around(pipe, *given)
 
     @classmethod
     def from_gs_sdk(cls, weights: str | Path, background: Tensor, sensor: Sensor | str, mode: str = "fast") -> "DepthPipeline":
@@ -257,7 +258,7 @@ class DepthPipeline(nn.Module):
             for i in range(1, images.shape[0]):
                 self.write_depth(out, images, i)
         else:
-            share_frames(range(1, len(images)), images.shape[2] * images.shape[3], partial(self.write_depth, out, images))
+            share_frames(range(1, len(images)), images[:, 0].numel(), partial(self.write_depth, out, images))
         return out
 
     def write_depth(self, out: DepthOutput, images: Tensor, i: int) -> None:

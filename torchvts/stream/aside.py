@@ -26,7 +26,7 @@ class Aside(Generic[_Item]):
         >>> seen = []
         >>> with Aside(seen.append, keeps_all=True) as aside:
         ...     for number in range(3):
-        ...         aside.put(number)
+        ...         taken = aside.put(number)
         >>> seen, aside.dropped
         ([0, 1, 2], 0)
     """

@@ -4,10 +4,12 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import NamedTuple
 
 from torch import Tensor
 
+from ..accelerated.threads import OneThread, one_suffices
 from ..core.checks import check_image, check_sequence, check_switch
 from ..model.calibration import Calibration
 from ..model.report import CandidateRow, Report
@@ -94,17 +96,21 @@ def calibrate(
     check_coloured_contacts(background, given.presses or given.touches)
     if not (presses or touches or sensor.prior or sensor.light_position_mm) and objection_to_lights(background, sensor):
         check_coloured_background(background)
-    lights = by_lights(background, sensor, bool(presses or touches or sensor.prior), progress)
-    prior, messages = _prior(given)
-    touched, more = _touched(given, prior.model)
-    messages += more
-    if presses:
-        calibration, more = _with_presses(given, lights, prior, touched)
-    else:
-        calibration, more = _without_presses(given, lights, prior, touched)
-    for message in messages + more:
+    with OneThread() if one_suffices(background[None]) else nullcontext():  # threads would wake up late for each small step
+        calibration, messages = _choose(given)
+    for message in messages:
         warnings.warn(message, CalibrationWarning, stacklevel=2)
     return calibration
+
+
+def _choose(given: "_Given") -> tuple[Calibration, list[str]]:
+    """The calibration, and what to warn of."""
+    lights = by_lights(given.background, given.sensor, bool(given.presses or given.touches or given.sensor.prior), given.progress)
+    prior, messages = _prior(given)
+    touched, more = _touched(given, prior.model)
+    choose = _with_presses if given.presses else _without_presses
+    calibration, last = choose(given, lights, prior, touched)
+    return calibration, messages + more + last
 
 
 def fit_prior(background: Tensor, sensor: Sensor, presses: Sequence[Press], source: str = "") -> SensorPrior:

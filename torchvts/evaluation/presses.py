@@ -53,6 +53,8 @@ class Training:
     @cached_property
     def located(self) -> list[Press]:
         """The presses that the calibration used, with the centres and contact radii that it found."""
+        if not self.presses:
+            raise ValueError("presses: expected at least one to learn from, got none")
         used = {row["name"]: row for row in self.calibration.report["presses"] if row["used"]}
         return [
             dataclasses.replace(

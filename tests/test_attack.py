@@ -39,7 +39,7 @@ def attacked(record_property):
 
 def run_python(program, *arguments, timeout=900, **environment):
     command = [sys.executable, "-W", "ignore", "-c", program, *map(str, arguments)]
-    return subprocess.run(command, env=ENVIRONMENT | environment, capture_output=True, text=True, timeout=timeout)
+    return subprocess.run(command, env=ENVIRONMENT | environment, capture_output=True, text=True, errors="replace", timeout=timeout)
 
 
 # ---- loops against tensors ----

@@ -57,6 +57,8 @@ class NormalFromLookup(NormalModel):
             raise ValueError(f"table: expected (n, n, n, 2) with n of 3 or more, got {tuple(table.shape)}")
         if tuple(step.shape) != (3,) or not bool((step > 0).all()) or not bool(torch.isfinite(step).all()):
             raise ValueError(f"step: expected three numbers above 0, got {step.tolist()}")
+        if zero_index.dtype not in (torch.int32, torch.int64):
+            raise TypeError(f"zero_index: expected whole numbers, int64, got {zero_index.dtype}")
         if tuple(zero_index.shape) != (3,) or not bool(((zero_index >= 0) & (zero_index < table.shape[0])).all()):
             raise ValueError(f"zero_index: expected three nodes of the table, 0 to {table.shape[0] - 1}, got {zero_index.tolist()}")
         if not bool(torch.isfinite(table).all()):

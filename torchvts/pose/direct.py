@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from ..core.checks import check_float_tensor, check_positive
+from ..core.checks import check_float_tensor, check_least
 from .alignment import Fit, distinct, equally_good, is_trusted, rank, refine, score_poses
 from .ambiguity import UNKNOWN_VARIANCE, Unknown, find_unknown, pose_covariance
 from .relief import DepthFrame, Levels, levels
@@ -43,7 +43,7 @@ def register_depth(source: DepthFrame, target: DepthFrame, mm_per_pixel: float, 
         >>> reg.converged, round(math.degrees(math.acos(float(reg.T_target_source[0, 0]))), 1)
         (True, 30.0)
     """
-    mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
+    mm_per_pixel = check_least("mm_per_pixel", mm_per_pixel, 1e-6, 1e3)  # a nanometre, a metre
     a, b = levels(source, mm_per_pixel, "source"), levels(target, mm_per_pixel, "target")
     sizes = [tuple(frame.depth_mm.shape[-2:]) for frame in (source, target)]
     if sizes[0] != sizes[1]:

@@ -52,7 +52,7 @@ def search_plane(source: Relief, target: Relief, most: int = 32, step_deg: float
     angle = torch.deg2rad(torch.arange(0.0, 360.0, step_deg))
     moving, fixed = _square(source, rotatable=True), _square(target)
     score = _masked_correlation(moving.channels, fixed.channels, angle)
-    peaks = _peaks(score, max(1, round(1.0 / target.pitch)))[:most]
+    peaks = _peaks(score, max(1, min(round(1.0 / target.pitch), max(score.shape))))[:most]
     poses = torch.eye(4, dtype=torch.float64).repeat(len(peaks), 1, 1)
     for pose, peak in zip(poses, peaks):
         side, size = fixed.channels.shape[1], score.shape[1]

@@ -66,8 +66,8 @@ WIDE static void to_normal(float max_sine, int n, float *restrict x, float *rest
 EXPORT void response_normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *place,
                              const float *weight, int degree, int terms, const float *depth, int64_t depth_frame, int64_t depth_row,
                              const float *per_mm, float max_sine, int frames, int rows, int columns, float *normal) {
-    const row_of single[3] = {single_2, single_4, single_6}, all[3] = {all_2, all_4, all_6};
-    const row_of row = (terms == ALL ? all : single)[degree / 2 - 1];
+    static const row_of of_terms[2][3] = {{single_2, single_4, single_6}, {all_2, all_4, all_6}};
+    const row_of row = of_terms[terms == ALL][degree / 2 - 1];
     const size_t pixels = (size_t)rows * columns;
     for (int b = 0; b < frames; b++)
         for (int y = 0; y < rows; y++) {

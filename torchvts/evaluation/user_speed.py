@@ -163,8 +163,8 @@ def batches(unit: Unit, calls: int) -> Iterator[Paced]:
 def costs(unit: Unit, presses: Sequence[Press], background: Tensor | None) -> Iterator[Cost]:
     """What stands before the first frame: import, calibration, the first frame; memory; and the delay behind a camera."""
     yield Cost("import torchvts, on top of torch's import", _import_s(), "s")
-    sensor = unit.calibration.sensor
     if background is not None:
+        sensor = Sensor.load("gelsight_mini", *background.shape[1:])  # a calibration's sensor has no prior any more
         yield Cost("calibrate by a background, with the sensor's prior", _seconds(partial(calibrate, background, sensor)), "s")
         bare = sensor.without_prior()
         fit = partial(calibrate, background, bare, presses=list(presses))

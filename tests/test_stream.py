@@ -739,7 +739,7 @@ def test_work_beside_the_stream_keeps_its_order_and_counts_what_it_drops():
             aside.put(number)
 
 
-@pytest.mark.parametrize("slow", [False, True])
+@pytest.mark.parametrize("slow", [pytest.param(False, marks=pytest.mark.long), True])
 def test_a_camera_in_real_time(unit, slow, monkeypatch):
     """Depth of every frame in order, or of the newest where depth takes longer than a frame: none is lost without being counted."""
     calibration, camera = unit

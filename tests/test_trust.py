@@ -35,7 +35,7 @@ def press(center_mm: tuple[float, float] = (0.0, 0.0), press_mm: float = 1.0) ->
     return vts.scenes.render(scene, lights).detach()
 
 
-@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
+@pytest.mark.parametrize("mode", ["fast", *(pytest.param(mode, marks=pytest.mark.long) for mode in ("precise", "auto"))])
 @pytest.mark.parametrize("without_gradients", [torch.no_grad, torch.inference_mode])
 def test_trained_lights_count_without_gradients(mode: str, without_gradients: type) -> None:
     pipe, image = vts.DepthPipeline.from_calibration(rig(), mode), press()
@@ -160,6 +160,7 @@ def test_a_frame_without_contact_has_a_graph_and_tensors_of_its_own() -> None:
     assert not bool(out.gradient.any())
 
 
+@pytest.mark.long
 def test_calls_are_typed(tmp_path: Path) -> None:
     api = pytest.importorskip("mypy.api")
     modules = {

@@ -1,4 +1,18 @@
-"""torchvts: camera images of visual-tactile sensors into depth, normals, contact and pose, as differentiable PyTorch modules."""
+"""torchvts: camera images of visual-tactile sensors into depth, normals, contact and pose, as differentiable PyTorch modules.
+
+``Sensor.load`` describes a sensor, ``calibrate`` makes a ``Calibration`` of a unit from its images, and
+``DepthPipeline.from_calibration`` makes of that the module from images to a ``DepthOutput``.
+
+* To calibrate: ``Press``, ``Touch``, ``read_presses``, ``fit_lights``, ``PointLights``, ``CalibrationWarning``; ``gs_sdk`` reads
+  the files of gs_sdk.
+* Parts of a pipeline, in its order: ``Compensate``, ``ContactMask``, a ``NormalModel``, ``GradientFromNormal``, an
+  ``Integrator``, ``ContactFromDepth``. Models are named ``NormalFrom...``, integrators ``Poisson...`` and
+  ``AdaptiveIntegration``; ``poisson_dct`` and the like are the same as functions.
+* With depth: ``depth_to_points``, ``register_depth``, ``PoseTracker``, ``ConfidentPipeline``, ``diagnose``, ``stream``.
+  ``scenes`` has exact scenes for tests.
+
+Some parts come from ``torchvts.accelerated``: subclasses of the plain blocks, with the same results but for rounding.
+"""
 
 from . import scenes, stream
 from .accelerated import (

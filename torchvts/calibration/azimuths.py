@@ -14,12 +14,12 @@ def azimuths_deg(position_mm: Tensor) -> list[float]:
     return [math.degrees(math.atan2(y, x)) % 360.0 for x, y in position_mm[:, :2].tolist()]
 
 
-def wrong_azimuths(position_mm: Tensor, drawn_deg: Sequence[float], slack_deg: float) -> str:
+def wrong_azimuths(position_mm: Tensor, given_deg: Sequence[float], slack_deg: float) -> str:
     """What the image shows in place of the azimuths of the sensor file, and the usual cause.
 
     Args:
         position_mm: (3, 3), lights that the image gives.
-        drawn_deg: azimuths of the sensor file.
+        given_deg: azimuths of the sensor file.
         slack_deg: a difference that is none.
     Example:
         >>> import torch
@@ -28,19 +28,19 @@ def wrong_azimuths(position_mm: Tensor, drawn_deg: Sequence[float], slack_deg: f
         'wrong azimuths: light_azimuth_deg says 240, 120, 0 for R, G, B, the image shows 0, 120, 240: red and blue are swapped'
     """
     found = azimuths_deg(position_mm)
-    text = f"wrong azimuths: light_azimuth_deg says {_listed(drawn_deg)} for R, G, B, the image shows {_listed(found)}"
-    return f"{text}: {_cause(found, drawn_deg, slack_deg)}"
+    text = f"wrong azimuths: light_azimuth_deg says {_listed(given_deg)} for R, G, B, the image shows {_listed(found)}"
+    return f"{text}: {_cause(found, given_deg, slack_deg)}"
 
 
-def _cause(found: Sequence[float], drawn: Sequence[float], slack_deg: float) -> str:
+def _cause(found: Sequence[float], given: Sequence[float], slack_deg: float) -> str:
     for order in itertools.permutations(range(3)):
-        if all(_off(found[k], drawn[order[k]]) <= slack_deg for k in range(3)):
+        if all(_off(found[k], given[order[k]]) <= slack_deg for k in range(3)):
             moved = [CHANNELS[k] for k in range(3) if order[k] != k]
             return f"{' and '.join(moved)} are swapped" if len(moved) == 2 else "the channels are in another order"
-    if all(_off(a, -b) <= slack_deg for a, b in zip(found, drawn)):
+    if all(_off(a, -b) <= slack_deg for a, b in zip(found, given)):
         return "they are counted from x towards y, which points down"
-    turn = (found[0] - drawn[0] + 180.0) % 360.0 - 180.0
-    if all(_off(a, b + turn) <= slack_deg for a, b in zip(found, drawn)):
+    turn = (found[0] - given[0] + 180.0) % 360.0 - 180.0
+    if all(_off(a, b + turn) <= slack_deg for a, b in zip(found, given)):
         return f"all are turned by {turn:.0f}: is the image rotated or flipped?"
     return "correct them in the sensor file, or leave them out"
 

@@ -94,7 +94,7 @@ def _choose_preprocessing(
     background: Tensor,
     sensor: Sensor,
     others: list[Sensor],
-    read: list[tuple[Press, Contact]],
+    pairs: list[tuple[Press, Contact]],
     fit: ResponseFit,
     candidates: Candidates,
 ) -> tuple[ResponseFit, Sensor]:
@@ -102,7 +102,7 @@ def _choose_preprocessing(
 
     The balls stay where they were found: preprocessing moves a center by less than its uncertainty.
     """
-    usable = [(press, contact) for press, contact in read if not contact.reason]
+    usable = [(press, contact) for press, contact in pairs if not contact.reason]
     some = usable[:: max(1, len(usable) // PREPROCESSING_PRESSES)]
     located = [_located(press, contact, sensor) for press, contact in some]
     best = (1.0 - PREPROCESSING_WORTH) * held_out_deg([contact for _, contact in some], fit.model.field)
@@ -153,7 +153,7 @@ def error_of_lights_deg(calibration: Calibration, presses: Sequence[Press], cont
         image = compensate(press.image.detach().cpu().to(calibration.background.dtype)[None])
         depth = poisson_background(gradient_from_normal(normals(image)) * contact.mask, pitch)
         slope = gradient_from_normal(normals(image, depth))[0].double()
-        own = dataclasses.replace(contact)
+        own = dataclasses.replace(contact)  # a copy: center_by_slope moves its center, or gives it a reason
         if not own.known:
             center_by_slope(own, slope, pitch)
         if own.reason:

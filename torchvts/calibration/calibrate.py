@@ -50,15 +50,16 @@ def calibrate(
 ) -> Calibration:
     """Calibrate a unit from one image without contact, and what else there is: presses of balls, touches by any object.
 
-    The model depends on what is given:
+    A model is either three point lights or a response field (docs/conventions.md). Which one depends on what is given:
 
-    * An image alone: the sensor's prior, transferred to this unit, unless the image constrains point lights well; without a
-      prior point lights, and a warning where they are poorly constrained. Of lights that the sensor file gives and that do not look
-      like the image only the directions are used, with a warning: depth is then not metric.
-    * Presses: response fields, their size chosen by held-out angle, starting from the prior if there is one; point lights if
-      they do better on the presses. The balls are located automatically.
-    * Touches: a field whose slopes have the least curl, with its scale from presses or a known depth. They add nothing to a
-      prior, so with one they are not used.
+    * An image alone: the sensor's prior, which is the response field of its type, applied to this unit's background, unless the
+      image constrains point lights well. Without a prior point lights, and a warning where they are poorly constrained. Of lights
+      that the sensor file gives and that do not look like the image only the directions are used, with a warning: depth is then
+      not metric.
+    * Presses: response fields, starting from the prior if there is one, their size chosen by the error of normals on presses that
+      were held out; point lights if they do better on the presses. The balls are located automatically.
+    * Touches: a response field whose slopes have the least curl, with its scale from presses or a known depth. They add nothing
+      to a prior, so with one they are not used.
 
     Args:
         background: (3, H, W) in [0, 1], R, G, B, of the sensor's size.
@@ -155,7 +156,12 @@ class _Given(NamedTuple):
 
 
 class _Prior(NamedTuple):
-    """The sensor's prior, with the sensor's blur if it has one; None for none. What the background has against it, or ""."""
+    """The sensor's prior.
+
+    Attributes:
+        model: with the sensor's blur if it has one; None where the sensor has no prior.
+        objection: why the background is not that of the prior's sensor type, or "".
+    """
 
     model: ResponseModel | None
     objection: str
@@ -204,8 +210,8 @@ def _without_presses(
         }
         return Calibration.from_response(touched.model, given.sensor, given.background, report), []
     constrained = lights.unit is not None and _constrained(row)
-    foreign = prior.model is None or prior.objection != ""
-    if foreign and not constrained and not given.touches and given.sensor.light_position_mm is None:
+    no_fitting_prior = prior.model is None or prior.objection != ""
+    if no_fitting_prior and not constrained and not given.touches and given.sensor.light_position_mm is None:
         check_coloured_background(given.background)
     if prior.model is not None and not constrained:
         family = "response of the sensor type"
@@ -220,7 +226,7 @@ def _without_presses(
         )
     if (stand_in := by_light_directions(given.background, given.sensor, lights)) is not None:
         return stand_in, [lights.complaint]
-    fitted = constrained and row["score_deg"] != 0.0
+    fitted = constrained and row["score_deg"] != 0.0  # it is 0 for lights that the sensor file gives
     reason = f"the image constrains the lights to {row['score_deg']:.2f} deg" if fitted else row["note"]
     if len(lights.rows) > 1:
         reason += f"; {lights.unit.report['chosen_because']}"
@@ -263,8 +269,8 @@ def _with_presses(given: _Given, lights: LightsResult, prior: _Prior, touched: T
     if lights.unit is not None:
         row["score_deg"] = error_of_lights_deg(lights.unit, given.presses, contacts, unit.sensor.blur_px)
     error_deg = math.inf if lights.unit is None or row["score_deg"] is None else row["score_deg"]
-    by_itself = (prior.model is None or bool(dropped)) and touched is None
-    of_diameters = complaints.of_diameters_by_others if by_itself else complaints.of_diameters_by_prior
+    from_presses_alone = (prior.model is None or bool(dropped)) and touched is None
+    of_diameters = complaints.of_diameters_by_others if from_presses_alone else complaints.of_diameters_by_prior
     found = [dropped] * bool(dropped) + complaints.of_contacts(contacts) + of_diameters(balls)
     # twelve parameters that do about as well as a hundred are the better model
     lights_win = error_deg < (math.inf if fit.error_deg is None else TIE * fit.error_deg) and error_deg < POORLY_CONSTRAINED_DEG

@@ -18,14 +18,14 @@ WORTH = 0.01
 0.1 %, a vignetting of 0.05 at noise 0.005 changes it by 5 %."""
 
 NOTHING_LEFT = 0.003
-"""Relative structure below which the plain lights leave nothing for a larger model to explain."""
+"""Misfit of the plain lights below which they leave nothing for a larger model to explain."""
 
 EXPLAINED = 0.01
-"""Vignetting and ambient light are accepted only if they leave less relative structure than this. They imitate other causes:
-ambient light reduces the structure of a camera's gamma of 2.2 to 3 %, with lights that are 11 degrees off and seem good to 1.5."""
+"""Vignetting and ambient light are accepted only if they leave a smaller misfit than this. They imitate other causes:
+ambient light reduces the misfit of a camera's gamma of 2.2 to 3 %, with lights that are 11 degrees off and seem good to 1.5."""
 
 LARGE_MISFIT = 0.2
-"""Relative structure left unexplained from which lights are no candidate beside another model."""
+"""Misfit from which lights are no candidate beside another model."""
 
 CLOSED_FORM_MISFIT = 0.1
 """Misfit of the closed-form lights from which no fit is tried beside another model. It is 0.125 to 0.20 on five real sensors; on
@@ -58,6 +58,8 @@ class LightChoice:
 
 @dataclass
 class _Candidate:
+    """Lights of one family and gamma, fitted; ``objection`` is why they are rejected whatever their score, or ""."""
+
     gamma: float
     vignetting: bool
     ambient: bool
@@ -68,6 +70,7 @@ class _Candidate:
 
     @property
     def plain(self) -> bool:
+        """Whether the lights are fitted alone, without vignetting or ambient light."""
         return not self.vignetting and not self.ambient
 
     @property
@@ -231,7 +234,7 @@ def _objection(candidate: _Candidate, tried: list[_Candidate], sensor: Sensor) -
         loosest = float(fit.direction_std_deg.max())
         if loosest > POORLY_CONSTRAINED_DEG:
             return f"the image alone constrains the lights to {loosest:.1f} deg only"
-        return _off_the_drawing(fit, sensor.light_azimuth_deg)
+        return _off_the_given_azimuths(fit, sensor.light_azimuth_deg)
     if candidate.misfit > 2.0 * EXPLAINED:
         return f"lights at the azimuths of the sensor file leave a smooth misfit of {candidate.misfit:.1%}"
     return ""
@@ -255,28 +258,31 @@ def _objection_to_terms(candidate: _Candidate, tried: list[_Candidate]) -> str:
 
 def _wrong_azimuths(chosen: _Candidate, tried: list[_Candidate], sensor: Sensor) -> str:
     """What is wrong with the azimuths of the sensor file, if free lights explain an image that lights at these do not, or ""."""
-    drawn = sensor.light_azimuth_deg
-    if drawn is None:
+    given_deg = sensor.light_azimuth_deg
+    if given_deg is None:
         return ""
     free = [one for one in tried if not one.known_azimuth and one.plain and one.fit.converged and one.misfit <= EXPLAINED]
     free = [
-        one for one in free if float(one.fit.direction_std_deg.max()) <= POORLY_CONSTRAINED_DEG and _off_the_drawing(one.fit, drawn)
+        one
+        for one in free
+        if float(one.fit.direction_std_deg.max()) <= POORLY_CONSTRAINED_DEG and _off_the_given_azimuths(one.fit, given_deg)
     ]
     if not free:
         return ""
     position = min(free, key=lambda one: one.held_out).fit.lights.position_mm.detach().double()
     if not chosen.objection:  # lights at known azimuths may be found on the far side of the centre
-        ray = torch.deg2rad(torch.tensor(drawn, dtype=torch.float64))
+        ray = torch.deg2rad(torch.tensor(given_deg, dtype=torch.float64))
         ahead = position[:, 0] * ray.cos() + position[:, 1] * ray.sin()
         if not bool((ahead < 0.0).all()):
             return ""
-    return wrong_azimuths(position, drawn, AZIMUTH_SLACK_DEG)
+    return wrong_azimuths(position, given_deg, AZIMUTH_SLACK_DEG)
 
 
-def _off_the_drawing(fit: LightFit, azimuth_deg: tuple[float, ...]) -> str:
+def _off_the_given_azimuths(fit: LightFit, azimuth_deg: tuple[float, ...]) -> str:
+    """Which free light lies clearly beside the azimuth that the sensor file gives it, or ""."""
     position = fit.lights.position_mm.detach().double()
-    for name, light, std, drawn in zip("RGB", position, fit.direction_std_deg.tolist(), azimuth_deg, strict=True):
-        off = (math.degrees(math.atan2(float(light[1]), float(light[0]))) - drawn + 180.0) % 360.0 - 180.0
+    for name, light, std, given in zip("RGB", position, fit.direction_std_deg.tolist(), azimuth_deg, strict=True):
+        off = (math.degrees(math.atan2(float(light[1]), float(light[0]))) - given + 180.0) % 360.0 - 180.0
         steepness = float(light.norm() / light[:2].norm().clamp_min(1e-9))  # a steep light's azimuth is less certain
         if abs(off) > AZIMUTH_SLACK_DEG + 3.0 * std * steepness:
             return f"light {name} is {off:.0f} deg off the azimuth in the sensor file"

@@ -72,7 +72,8 @@ class LightFit:
         position_std_mm: (3, 3), of each position coordinate.
         residual_std: (3,), robust standard deviation of image minus model, in image value.
         noise_std: (3,), noise of the image by itself, in image value.
-        misfit: (3,), relative structure that the model leaves unexplained (0 where only noise is left).
+        misfit: (3,), size of the smooth pattern in the image that the lights cannot explain, relative to the light: 0.02 is 2 %
+            of the light, 0 where only noise is left.
         inlier_fraction: share of the pixels that the robust loss kept.
         vignetting: share of the light that the lens loses in the image corners; 0 where it was not fitted.
         vignetting_std: its standard deviation; infinite where it was not fitted.

@@ -56,8 +56,8 @@ def fit_with_or_without(
         failure = None
     except NoUsablePress as error:
         first, failure = None, error
-    doubt = objection or _doubt(first, failure)
-    if first is not None and not doubt:
+    contradiction = objection or _objection_of_presses(first, failure)
+    if first is not None and not contradiction:
         return FromPresses(first, "")
     if failure is not None and not objection and _same_factor(failure.contacts):
         raise failure
@@ -70,11 +70,11 @@ def fit_with_or_without(
     if first is not None and not _better(second, first, bool(objection)):
         return FromPresses(first, "")
     count = len(used(second.contacts))
-    why = "the background does not have its pattern of light" if objection else doubt
+    why = "the background does not have its pattern of light" if objection else contradiction
     return FromPresses(second, f"calibrated from {count} presses without the sensor's prior: {why}")
 
 
-def _doubt(first: PressResult | None, failure: NoUsablePress | None) -> str:
+def _objection_of_presses(first: PressResult | None, failure: NoUsablePress | None) -> str:
     """What presses have against the prior, or ""."""
     contacts = first.contacts if first is not None else failure.contacts if failure is not None else []
     left = len(used(contacts))

@@ -31,9 +31,11 @@ class CandidateRow(_CandidateKeys, total=False):
         family: its size, in words.
         parameters: number of fitted parameters.
         passes: 1 for normals from the image alone, 2 for normals that also use the depth of a first pass.
-        score_deg: error or standard deviation that the choice used, degrees; None where none could be computed.
-        misfit: relative structure of the background that lights leave unexplained; absent where lights were not fitted, or the
-            fit failed.
+        score_deg: what the choice compared, degrees; None where there is nothing to compare. With presses it is the mean error of
+            normals on them. Without, of lights: the standard deviation of their directions, 0 where the sensor file gives them, 90
+            where their fit did not converge.
+        misfit: size of the smooth pattern in the background that lights cannot explain, relative to the light; absent where
+            lights were not fitted, or the fit failed.
         held_out: loss of lights on blocks of the background that were held out.
         gamma: camera response it was fitted with.
         vignetting: share of the light that the lens loses in the image corners.
@@ -119,7 +121,7 @@ class Report(_ReportKeys, total=False):
         gamma: camera response of the lights.
         direction_std_deg: (3,), standard deviation of each light's direction, degrees.
         position_std_mm: (3, 3), standard deviation of each coordinate, mm.
-        misfit: (3,), relative structure that the lights leave unexplained.
+        misfit: (3,), size of the smooth pattern in the background that the lights cannot explain, relative to the light.
         inlier_fraction: share of the pixels that the robust fit kept.
         gloss: (3,), strength of the specular lobe.
         vignetting: share of the light that the lens loses in the image corners.

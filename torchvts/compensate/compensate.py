@@ -13,7 +13,7 @@ from .drift import Drift
 
 
 class Compensate(nn.Module):
-    """Linear light, with what the model and the background disagree on taken out.
+    """Camera image to compensated image: linear light, with what the model and the background disagree on taken out.
 
     Printed markers are filled first; ``compensated = image^gamma * gain + offset``; pixels named in ``defects`` then become the
     mean of their nearest valid neighbours, the image is blurred, and the drift of the LEDs is divided out. The multiplicative form
@@ -105,7 +105,7 @@ class Compensate(nn.Module):
         def __call__(self, image: Tensor) -> Tensor: ...
 
     def forward(self, image: Tensor) -> Tensor:
-        """(B, 3, H, W) image in [0, 1] to (B, 3, H, W) linear light."""
+        """(B, 3, H, W) image in [0, 1] to (B, 3, H, W), compensated: light, or for response fields light / background."""
         check_batch("image", image, 3)
         light = image
         for block in self.linear:  # only the blocks that the unit needs

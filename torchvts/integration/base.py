@@ -8,7 +8,10 @@ from ..core.checks import check_batch, check_record, check_window
 
 
 class Integrator(nn.Module):
-    """Base of modules that map a gradient to depth. A subclass overrides ``forward``."""
+    """Base of modules that map a gradient to depth. A subclass overrides ``forward``.
+
+    It decides where depth is zero: the pipeline changes only the depth of :class:`~torchvts.integration.PoissonBackground`.
+    """
 
     if TYPE_CHECKING:
 

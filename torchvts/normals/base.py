@@ -66,7 +66,8 @@ class NormalModel(nn.Module):
         raise TypeError(f"{type(self).__name__}: a NormalModel must define forward(image, depth_mm, window)")
 
     def coarse(self, stride: int) -> "NormalModel | None":
-        """The same model for an image of every ``stride``-th pixel, for the prediction of mode "auto"; None if there is none."""
+        """The same model for an image of every ``stride``-th pixel, for the prediction of mode "auto"; None if there is none: then
+        "auto" solves every frame with deformed skin again."""
         return None
 
 

@@ -72,15 +72,15 @@ class DepthPipeline(nn.Module):
 
     Args:
         compensate: camera image to compensated image.
-        deformed: compensated image to where the skin has moved, bool (B, 1, H, W).
+        deformed: compensated image to where the skin has moved, bool (B, 1, H, W): a :class:`ContactMask`.
         normals: a :class:`~torchvts.normals.NormalModel`, or any module from a compensated image (B, 3, H, W) to normals (B, 3,
             H, W).
         gradient: normals to gradient.
         integrate: an :class:`~torchvts.integration.Integrator`, or any module from a gradient (B, 2, H, W) to depth (B, 1, H, W).
         mm_per_pixel: pixel pitch, mm.
         mode: "fast", "precise" or "auto".
-        tolerance_px: pixels of pitch.
-        refine_threshold_px: pixels of pitch.
+        tolerance_px: change of depth still missing at which "precise" stops, as a multiple of the pitch.
+        refine_threshold_px: predicted change of depth from which "auto" solves a frame again, as a multiple of the pitch.
         max_passes: bound on all passes.
         contact: depth, gradient and deformed area to contact, bool (B, 1, H, W); None for :class:`ContactFromDepth`.
     Source:
@@ -127,10 +127,10 @@ class DepthPipeline(nn.Module):
         self.crop = Crop(STRIDE, model.takes_window)
         self.solve = Solve(model, gradient, integrator)
         self.refine = self._policy(mode, tolerance_px, refine_threshold_px, min(max_passes, model.max_passes))
-        # anyone else's integrator decides by itself where depth is zero
-        # known lights give slopes that sum to zero around a contact; slopes that were learned within contacts do not
-        exact = isinstance(model, PlainNormalFromIntensity) or not isinstance(integrator, PlainPoissonBackground)
-        self.zero = DepthAsIs() if exact else ZeroBackground()
+        # slopes that were learned within contacts do not sum to zero around a contact, those of known lights do;
+        # an integrator other than PoissonBackground decides by itself where depth is zero
+        as_is = isinstance(model, PlainNormalFromIntensity) or not isinstance(integrator, PlainPoissonBackground)
+        self.zero = DepthAsIs() if as_is else ZeroBackground()
         self.slopes = SlopesOfDepth(mm_per_pixel) if mode != "fast" and model.normals_from_depth else SlopesOfPixels()
         self.contact = touching
         self.uncrop = Uncrop()
@@ -190,7 +190,7 @@ class DepthPipeline(nn.Module):
         settings = ContactSettings() if contact is None else contact
         check_record("contact", settings, ContactSettings, "ContactSettings(sigmas=...) makes one")
         sensor, given = calibration.sensor, (normals, integrate)
-        with torch.inference_mode(False):  # whose tensors are never known to have changed
+        with torch.inference_mode(False):  # torch does not say of inference tensors whether they have changed, and blocks must know
             if normals is None:
                 by_response = calibration.response is not None
                 normals = (NormalFromResponse if by_response else NormalFromIntensity).from_calibration(calibration)
@@ -248,7 +248,7 @@ class DepthPipeline(nn.Module):
         return self.depth_of(images)
 
     def depth_of_each(self, images: Tensor) -> DepthOutput:
-        """The same of checked images, frame by frame."""
+        """The output of checked images (B, 3, H, W), each solved in its own window."""
         one = self.depth_of(images[0:1])
         if one.depth_mm.requires_grad:
             return joined([one] + [self.depth_of(images[i : i + 1]) for i in range(1, images.shape[0])])
@@ -266,7 +266,7 @@ class DepthPipeline(nn.Module):
         write_frame(out, i, self.depth_of(images[i : i + 1]))
 
     def depth_of(self, images: Tensor) -> DepthOutput:
-        """The same of checked images, in one window."""
+        """The output of checked images (B, 3, H, W), all solved in the one window that holds the deformed skin of all."""
         compensated = self.compensate(images)
         frame = self.crop(compensated, self.deformed(compensated))
         if may_read_values() and (images.shape[0] == 0 or (self.skips_undeformed and self.nothing_to_solve(frame))):

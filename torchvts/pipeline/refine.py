@@ -27,7 +27,7 @@ class Repeat(nn.Module):
         solve: one pass.
         largest_change: of two depths, per frame.
         mm_per_pixel: pixel pitch, mm.
-        tolerance_px: pixels of pitch.
+        tolerance_px: change of depth still missing at which a frame is done, as a multiple of the pitch.
         max_passes: bound on all passes, the first among them.
     """
 
@@ -134,9 +134,9 @@ class Adaptive(Repeat):
         coarse_normals: the model of normals for every ``stride``-th pixel.
         coarse_integrate: the integrator for that grid.
         mm_per_pixel: pixel pitch, mm.
-        tolerance_px: pixels of pitch.
+        tolerance_px: change of depth still missing at which a frame is done, as a multiple of the pitch.
         max_passes: bound on all passes.
-        refine_threshold_px: predicted change from which a frame is solved again, pixels of pitch.
+        refine_threshold_px: predicted change of depth from which a frame is solved again, as a multiple of the pitch.
         stride: pixels.
     Source:
         this project.

@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import NamedTuple
 from unittest import mock
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
@@ -50,6 +52,55 @@ def small_press():
         return vts.scenes.sphere_press(radius_mm, press_mm, center_mm, 120, 160, 0.25, dtype)
 
     return press
+
+
+TINY_SENSOR = vts.Sensor("rig", 48, 64, 0.6)
+TINY_LIGHTS = ((20.0, 9.0, 25.0), (-18.0, 13.0, 25.0), (-2.0, -22.0, 25.0))
+
+
+def tiny_image(k):
+    """Frame ``k`` of the tiny sensor, (3, 48, 64): a ball that differs from frame to frame, and no contact where ``k`` < 0."""
+    height, width, pitch = TINY_SENSOR.height, TINY_SENSOR.width, TINY_SENSOR.mm_per_pixel
+    lights = vts.PointLights(TINY_LIGHTS, [600.0] * 3)
+    scene = vts.scenes.sphere_press(6.0 + k % 5, 0.5 + 0.01 * (k % 50), (0.1 * (k % 30) - 1.5, 0), height, width, pitch)
+    return vts.scenes.render(scene if k >= 0 else vts.scenes.undeformed(scene), lights, noise_std=0.002, bits=8, seed=abs(k))[0]
+
+
+@pytest.fixture(scope="session")
+def unit(tmp_path_factory):
+    """The file of a calibration of the tiny sensor."""
+    path = tmp_path_factory.mktemp("unit") / "unit.safetensors"
+    vts.Calibration.from_lights(vts.PointLights(TINY_LIGHTS, [600.0] * 3), TINY_SENSOR, tiny_image(-1)).save(path)
+    return path
+
+
+class Frames:
+    """A reader of pictures (H, W, 3) B, G, R made up front."""
+
+    name, live, fps = "made up", False, 30.0
+
+    def __init__(self, pictures):
+        self._pictures = iter(pictures)
+
+    def read(self):
+        return next(self._pictures, None)
+
+    def close(self):
+        self._pictures = iter(())
+
+
+def bgr(image):
+    """An image (3, H, W) in [0, 1] as cameras give it: (H, W, 3) B, G, R, 8 bits."""
+    return np.ascontiguousarray((image * 255).round().byte().flip(0).permute(1, 2, 0).numpy())
+
+
+def write_film(path, pictures, fps=30.0, code="MJPG"):
+    """Write pictures (H, W, 3) B, G, R as a video; returns its path."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), fps, pictures[0].shape[1::-1])
+    for picture in pictures:
+        writer.write(picture)
+    writer.release()
+    return path
 
 
 @pytest.fixture(scope="session")

@@ -218,7 +218,8 @@ def test_frames_of_a_batch_do_not_influence_one_another(made):
             assert torch.allclose(together[k : k + 1].double(), alone.double(), rtol=1e-3, atol=1e-4), name
 
 
-def test_it_scripts_and_pickles_and_keeps_its_state(made):
+@pytest.mark.parametrize("optimised", [False, pytest.param(True, marks=pytest.mark.long)])  # which takes 2 to 15 s
+def test_it_scripts_and_pickles_and_keeps_its_state(made, optimised):
     calibration, mode, pipe, frames = made
     expected = pipe(frames)
     with warnings.catch_warnings():
@@ -229,7 +230,9 @@ def test_it_scripts_and_pickles_and_keeps_its_state(made):
     torch.save(pipe.state_dict(), buffer)
     buffer.seek(0)
     other.load_state_dict(torch.load(buffer, weights_only=True))
-    for again in (scripted(frames), pickle.loads(pickle.dumps(pipe))(frames), other(frames)):
+    with torch.jit.optimized_execution(optimised):
+        by_script = scripted(frames)
+    for again in (by_script, pickle.loads(pickle.dumps(pipe))(frames), other(frames)):
         for name, found, wanted in zip(expected._fields, again, expected, strict=True):
             atol = 1e-3 if name == "factors_deg" else 1e-4  # roots of differences of variances, which may be near zero
             assert torch.allclose(found.double(), wanted.double(), rtol=1e-3, atol=atol), name

@@ -8,53 +8,34 @@ import sys
 import time
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 import torch
+from conftest import bgr, tiny_image, write_film
 
 import torchvts as vts
 from torchvts.core.files import read_depth_png
 from torchvts.dataset import STATE, list_items, output_stems, reconstruct, reconstruct_dataset
 
 ROOT = Path(__file__).resolve().parents[1]
-HEIGHT, WIDTH, PITCH = 48, 64, 0.6
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-
-
-def image(k):
-    lights = vts.PointLights([[20.0, 9.0, 25.0], [-18.0, 13.0, 25.0], [-2.0, -22.0, 25.0]], [600.0, 600.0, 600.0])
-    scene = vts.scenes.sphere_press(6.0 + k % 5, 0.5 + 0.01 * (k % 50), (0.1 * (k % 30) - 1.5, 0), HEIGHT, WIDTH, PITCH)
-    return vts.scenes.render(scene if k >= 0 else vts.scenes.undeformed(scene), lights, noise_std=0.002, bits=8, seed=abs(k))[0]
-
-
-@pytest.fixture(scope="module")
-def unit(tmp_path_factory):
-    path = tmp_path_factory.mktemp("unit") / "unit.safetensors"
-    lights = vts.PointLights([[20.0, 9.0, 25.0], [-18.0, 13.0, 25.0], [-2.0, -22.0, 25.0]], [600.0, 600.0, 600.0])
-    vts.Calibration.from_lights(lights, vts.Sensor("rig", HEIGHT, WIDTH, PITCH), image(-1)).save(path)
-    return path
 
 
 def fill(folder, names):
     for k, name in enumerate(names):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        vts.write_image(folder / name, image(k))
+        vts.write_image(folder / name, tiny_image(k))
     return folder
 
 
-def write_film(path, count):
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (WIDTH, HEIGHT))
-    for k in range(count):
-        writer.write(np.ascontiguousarray((image(k) * 255).round().byte().flip(0).permute(1, 2, 0).numpy()))
-    writer.release()
+def film(path, count):
+    return write_film(path, [bgr(tiny_image(k)) for k in range(count)])
 
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory):
     """100 images in folders and a film of 20 frames."""
     folder = fill(tmp_path_factory.mktemp("frames"), [f"{k // 40}/{k:03d}.png" for k in range(100)])
-    write_film(folder / "film.avi", 20)
+    film(folder / "film.avi", 20)
     return folder
 
 
@@ -111,7 +92,7 @@ def test_batch_and_workers_do_not_matter(unit, frames, whole, tmp_path):
 @pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
 def test_one_thread_gives_the_same_bits_for_any_batch(unit, mode):
     pipe = vts.DepthPipeline.from_calibration(vts.Calibration.load(unit), mode)
-    images = torch.stack([image(k) for k in range(8)])
+    images = torch.stack([tiny_image(k) for k in range(8)])
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -162,7 +143,7 @@ def test_every_frame_is_in_one_share(unit, frames, whole, tmp_path):
 
 def test_a_torn_record_a_lost_file_and_a_changed_image_are_computed_again(unit, tmp_path):
     source = fill(tmp_path / "in", [f"{k}.png" for k in range(6)])
-    write_film(source / "film.avi", 6)
+    film(source / "film.avi", 6)
     out = tmp_path / "out"
     reconstruct_dataset(unit, source, out, pictures=False)
     before = contents(out)
@@ -171,7 +152,7 @@ def test_a_torn_record_a_lost_file_and_a_changed_image_are_computed_again(unit, 
     (out / "2.npz").unlink()
     (out / "film_000003.npz").write_bytes(b"")
     (out / ".3-abcd0123.npz").write_bytes(b"left half written")
-    vts.write_image(source / "4.png", image(17))
+    vts.write_image(source / "4.png", tiny_image(17))
     report = reconstruct_dataset(unit, source, out, pictures=False)
     assert (report.rows, report.before) == (12, 8)
     after = contents(out)
@@ -220,12 +201,8 @@ def test_unusable_images_are_named_and_left_out(unit, tmp_path, capsys):
 
 def test_a_video_of_unusable_frames_goes_on(unit, tmp_path):
     source = fill(tmp_path / "in", ["a.png"])
-    vts.write_image(source / "b.png", image(3) / 16)
-    writer = cv2.VideoWriter(str(source / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (WIDTH, HEIGHT))
-    for k in range(18):
-        picture = image(k if k > 13 else -1 - k) * (k != 15)
-        writer.write(np.ascontiguousarray((picture * 255).round().byte().flip(0).permute(1, 2, 0).numpy()))
-    writer.release()
+    vts.write_image(source / "b.png", tiny_image(3) / 16)
+    write_film(source / "film.avi", [bgr(tiny_image(k if k > 13 else -1 - k) * (k != 15)) for k in range(18)])
     report = reconstruct_dataset(unit, source, tmp_path / "out", pictures=False)
     assert [name for name, _ in report.failed] == ["b.png", "film.avi/000015"] and report.rows == 18
     assert "6% of the background's brightness" in report.failed[0][1] and "one colour" in report.failed[1][1]
@@ -235,7 +212,7 @@ def test_a_video_of_unusable_frames_goes_on(unit, tmp_path):
 
 def test_a_video_that_starts_in_contact_is_noted_and_loses_nothing(unit, tmp_path):
     (tmp_path / "in").mkdir()
-    write_film(tmp_path / "in" / "film.avi", 14)
+    film(tmp_path / "in" / "film.avi", 14)
     report = reconstruct_dataset(unit, tmp_path / "in", tmp_path / "out", pictures=False)
     assert report.rows == 14 and report.failed == []
     ((name, note),) = report.notes
@@ -306,7 +283,7 @@ def test_depth_beyond_a_png_is_left_out_and_a_full_disk_stops(unit, tmp_path, mo
     monkeypatch.undo()
     assert '"failed": "depth_mm: too deep"' in (tmp_path / "out" / STATE / "frames" / "a.json").read_text()
     report = reconstruct_dataset(unit, source, tmp_path / "out", pictures=False, format="png16")
-    assert report.rows == 2 and read_depth_png(tmp_path / "out" / "a_depth.png").shape == (1, 1, HEIGHT, WIDTH)
+    assert report.rows == 2 and read_depth_png(tmp_path / "out" / "a_depth.png").shape == (1, 1, 48, 64)
 
 
 def test_pictures_are_drawn_for_few_frames_only(unit, frames, whole, tmp_path):

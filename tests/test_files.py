@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from conftest import write_film
 
 import torchvts as vts
 from torchvts.core.files import count_frames, read_depth_png, read_frames, write_depth_png
@@ -121,13 +122,8 @@ def test_a_single_image_is_one_frame(tmp_path):
 
 
 def test_frames_of_a_video(tmp_path):
-    path = tmp_path / "film.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
-    for k in range(5):
-        frame = np.zeros((48, 64, 3), np.uint8)
-        frame[..., 2] = 40 * k  # red
-        writer.write(frame)
-    writer.release()
+    red = np.array([0, 0, 1], np.uint8)
+    path = write_film(tmp_path / "film.avi", [np.full((48, 64, 3), 40 * k, np.uint8) * red for k in range(5)])
     frames = list(read_frames(path))
     assert [name for name, _ in frames] == [f"film_{k:06d}" for k in range(5)] and count_frames(path) == 5
     for k, (_, frame) in enumerate(frames):

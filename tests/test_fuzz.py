@@ -27,7 +27,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from conftest import ring_lights
+from conftest import ring_lights, write_film
 
 import torchvts as vts
 from torchvts.core.files import read_depth_png, read_frames, write_atomically, write_depth_png
@@ -83,11 +83,8 @@ def read_cloud(path):
     return read_point_cloud(path)
 
 
-def write_film(path):
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
-    for k in range(5):
-        writer.write(np.full((48, 64, 3), 40 * k, np.uint8))
-    writer.release()
+def write_grey_film(path):
+    write_film(path, [np.full((48, 64, 3), 40 * k, np.uint8) for k in range(5)])
 
 
 def write_folder(path):
@@ -141,7 +138,7 @@ READERS = {
     "small.pcd": (write_compressed_cloud, read_cloud),
     "cloud.ply": (write_cloud, read_cloud),
     "text.ply": (lambda path: write_cloud(path, True), read_cloud),
-    "film.avi": (write_film, lambda path: list(read_frames(path))),
+    "film.avi": (write_grey_film, lambda path: list(read_frames(path))),
     "catalog.csv": folder_file("catalog.csv"),
     "labels.csv": folder_file("labels.csv"),
     "label.npz": folder_file("label.npz"),

@@ -8,6 +8,7 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 import warnings
 from pathlib import Path
@@ -56,6 +57,7 @@ class Camera:
 
     def __init__(self, frames, then="end"):
         self.frames, self.then, self.closed = frames, then, False
+        self.unplugged = threading.Event()
 
     def read(self):
         self.frames -= 1
@@ -64,7 +66,7 @@ class Camera:
         if self.then == "fail":
             raise OSError("device is gone")
         if self.then == "hang":
-            time.sleep(5.0)
+            self.unplugged.wait()
         return None
 
     def close(self):
@@ -83,10 +85,13 @@ def test_a_camera_that_stops_is_no_end_of_a_video(then, reason):
 
 
 def test_a_camera_that_hangs_has_stopped():
-    reader = LiveReader(lambda: Camera(1, "hang"), silent_s=0.1)
+    camera = Camera(1, "hang")
+    reader = LiveReader(lambda: camera)
     assert reader.read().shape == (HEIGHT, WIDTH, 3)
+    reader.silent_s = 0.1
     with pytest.raises(OSError, match=r"source: made up has stopped: no frame for 0\.1 s"):
         reader.read()
+    camera.unplugged.set()
     reader.close()
 
 
@@ -99,7 +104,7 @@ def test_a_camera_comes_back():
             raise OSError("not there yet")
         return opened[-1]
 
-    reader = LiveReader(plug, reconnect_s=0.2, sleep=lambda seconds: None)
+    reader = LiveReader(plug, reconnect_s=600.0, sleep=lambda seconds: None)
     frames = [reader.read() for _ in range(6)]  # two, then 9 without the first 5
     assert all(frame.shape == (HEIGHT, WIDTH, 3) for frame in frames) and reader.reconnections == 1
     opened += [None] * 9

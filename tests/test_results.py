@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from conftest import TINY_SENSOR, bgr, tiny_image, write_film
 
 import torchvts as vts
 from torchvts.core.results import MAPS, UNITS, join_results, write_result
@@ -15,21 +16,7 @@ from torchvts.pipeline import unit_pipeline
 from torchvts.pose.surface_files import write_obj
 from torchvts.stream import check_device
 
-HEIGHT, WIDTH, PITCH = 48, 64, 0.6
-
-
-def image(k):
-    lights = vts.PointLights([[20.0, 9.0, 25.0], [-18.0, 13.0, 25.0], [-2.0, -22.0, 25.0]], [600.0, 600.0, 600.0])
-    scene = vts.scenes.sphere_press(6.0, 0.5 + 0.02 * k, (0.1 * k, 0), HEIGHT, WIDTH, PITCH)
-    return vts.scenes.render(scene if k >= 0 else vts.scenes.undeformed(scene), lights, noise_std=0.002, bits=8, seed=abs(k))[0]
-
-
-@pytest.fixture(scope="module")
-def unit(tmp_path_factory):
-    path = tmp_path_factory.mktemp("unit") / "unit.safetensors"
-    lights = vts.PointLights([[20.0, 9.0, 25.0], [-18.0, 13.0, 25.0], [-2.0, -22.0, 25.0]], [600.0, 600.0, 600.0])
-    vts.Calibration.from_lights(lights, vts.Sensor("rig", HEIGHT, WIDTH, PITCH), image(-1)).save(path)
-    return path
+HEIGHT, WIDTH, PITCH = TINY_SENSOR.height, TINY_SENSOR.width, TINY_SENSOR.mm_per_pixel
 
 
 @pytest.fixture(scope="module")
@@ -37,11 +24,8 @@ def source(tmp_path_factory):
     """A folder of five images and a film of seven frames."""
     folder = tmp_path_factory.mktemp("source")
     for k in range(5):
-        vts.write_image(folder / f"{k}.png", image(k))
-    writer = cv2.VideoWriter(str(folder / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (WIDTH, HEIGHT))
-    for k in range(7):
-        writer.write(np.ascontiguousarray((image(k) * 255).round().byte().flip(0).permute(1, 2, 0).numpy()))
-    writer.release()
+        vts.write_image(folder / f"{k}.png", tiny_image(k))
+    write_film(folder / "film.avi", [bgr(tiny_image(k)) for k in range(7)])
     return folder
 
 
@@ -85,7 +69,7 @@ def test_a_video_in_one_file_holds_its_frames(unit, source, results, tmp_path):
 
 def test_every_third_frame_of_several_inputs(unit, source, tmp_path):
     (tmp_path / "more").mkdir()
-    vts.write_image(tmp_path / "more" / "0.png", image(9))
+    vts.write_image(tmp_path / "more" / "0.png", tiny_image(9))
     inputs = [source / "0.png", source / "film.avi", source / "2.png", tmp_path / "more", source / "0.png"]
     report = reconstruct_dataset(unit, inputs, tmp_path / "out", every=2, workers=0, pictures=False, format="npy")
     rows = [
@@ -234,7 +218,7 @@ def test_a_network_takes_the_models_place(unit, source, tmp_path):
 def test_a_video_by_a_network_has_the_noise_of_its_first_frames(unit, source, tmp_path):
     calibration = vts.Calibration.load(unit)
     vts.NormalFromMLP(HEIGHT, WIDTH, calibration.background.float(), hidden=(8,), seed=3).save(tmp_path / "net.safetensors")
-    quiet = torch.stack([image(-1 - k).detach() for k in range(6)])
+    quiet = torch.stack([tiny_image(-1 - k).detach() for k in range(6)])
     noise = torch.randn(quiet.shape, generator=torch.Generator().manual_seed(1))
     by_noise = []
     for std in (0.0, 0.02):

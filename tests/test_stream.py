@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from conftest import Frames, write_film
 
 import torchvts as vts
 from torchvts import stream as streams
@@ -25,21 +26,6 @@ from torchvts.evaluation.latency import measure_latency
 
 ROOT = Path(__file__).resolve().parents[1]
 PITCH = 0.25
-
-
-class Frames:
-    """A reader of pictures made up front."""
-
-    name, live, fps = "made up", False, 30.0
-
-    def __init__(self, pictures):
-        self._pictures = iter(pictures)
-
-    def read(self):
-        return next(self._pictures, None)
-
-    def close(self):
-        self._pictures = iter(())
 
 
 @pytest.fixture(scope="module")
@@ -69,21 +55,13 @@ def _the_same_noise_in_any_order_of_tests(unit):
     unit[1].restart()
 
 
-def write_video(path, pictures, code="MJPG"):
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), 30.0, pictures[0].shape[1::-1])
-    for picture in pictures:
-        writer.write(picture)
-    writer.release()
-    return path
-
-
 @pytest.fixture(scope="module")
 def video(unit, tmp_path_factory):
     """15 frames without contact, 10 pressed, 10 without."""
     _, camera = unit
     camera.restart()
     pictures = [camera(1.0 if 15 <= k < 25 else 0.0) for k in range(35)]
-    return write_video(tmp_path_factory.mktemp("video") / "press.avi", pictures)
+    return write_film(tmp_path_factory.mktemp("video") / "press.avi", pictures)
 
 
 @pytest.mark.parametrize("region", ["corners", "roi", "none"])
@@ -191,7 +169,7 @@ def test_corners_are_rectified(unit, small_sensor, tmp_path):
     target = np.float32([[0, 0], [159, 0], [159, 119], [0, 119]])
     there = cv2.getPerspectiveTransform(target, np.float32(corners))
     pictures = [cv2.warpPerspective(camera(1.0 if k >= 14 else 0.0), there, (240, 180)) for k in range(18)]
-    video = write_video(tmp_path / "slanted.avi", pictures)
+    video = write_film(tmp_path / "slanted.avi", pictures)
     sensor = replace(small_sensor, corners_px=tuple(corners))
     background = sensor.rectify(torch.stack([frame for _, frame in read_frames(video)])[:12]).mean(0)
     with streams.TactileStream(video, vts.Calibration.from_lights(calibration.lights, sensor, background)) as stream:
@@ -333,7 +311,7 @@ def test_a_large_contact_is_no_other_view(unit, change):
 
 def test_both_scripts_give_the_same_depth_for_a_video(unit, run_stream, run_script, small_sensor, tmp_path):
     _, camera = unit
-    video = write_video(
+    video = write_film(
         tmp_path / "press.avi", [camera(1.0 if 15 <= k < 20 else 0.0, 1.0 - 0.002 * max(0, k - 12)) for k in range(24)]
     )
     small_sensor.save(tmp_path / "rig.yaml")
@@ -386,7 +364,7 @@ def test_backgrounds_of_several_images_and_own_presses(unit, run_script, small_s
     ):
         done = run_script("reconstruct", *arguments)
         assert done.returncode != 0 and part in done.stderr, done.stderr
-    pressed = write_video(tmp_path / "pressed.avi", [camera(1.0) for _ in range(12)])
+    pressed = write_film(tmp_path / "pressed.avi", [camera(1.0) for _ in range(12)])
     with pytest.raises(ValueError, match=r"pressed\.avi: background: the first 12 frames show structure"):
         streams.read_background([pressed], small_sensor)
     for paths, error, message in (
@@ -643,7 +621,7 @@ def test_what_came_before_ctrl_c_is_kept(run_stream, unit_file, video, tmp_path,
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGINT], ids=["killed", "interrupted"])
 def test_a_process_ended_in_the_middle_leaves_a_whole_video_or_none(unit, unit_file, tmp_path, end):
     _, camera = unit
-    video = write_video(tmp_path / "long.avi", [camera() for _ in range(20)] * 90)  # a minute: it is not over before it is ended
+    video = write_film(tmp_path / "long.avi", [camera() for _ in range(20)] * 90)  # a minute: it is not over before it is ended
     out = tmp_path / "out"
     command = [
         sys.executable,
@@ -710,7 +688,7 @@ def test_a_raw_video_of_a_mini_runs_without_a_camera(data, run_stream, tmp_path,
     generator = np.random.default_rng(0)
     sequence = [(free + 0.6 * generator.standard_normal(free.shape)).clip(0, 255).round().astype(np.uint8) for _ in range(16)]
     sequence[14:14] = [pictures[k] for k in (0, 10, 20)]
-    video = write_video(tmp_path / "raw.avi", [cv2.resize(picture, size) for picture in sequence])
+    video = write_film(tmp_path / "raw.avi", [cv2.resize(picture, size) for picture in sequence])
     done = run_stream("--source", video, "--sensor", "gelsight_mini", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     rows = [row.split(",") for row in (tmp_path / "out" / "frames.csv").read_text().splitlines()[1:]]
@@ -723,11 +701,11 @@ def test_work_beside_the_stream_keeps_its_order_and_counts_what_it_drops():
 
     def work(number):
         started.set()
-        go.wait(5.0)
+        go.wait(600.0)
         done.append(number)
 
     with streams.Aside(work, most_waiting=2) as aside:
-        assert aside.put(0) and started.wait(5.0)  # being worked on: two more may wait
+        assert aside.put(0) and started.wait(600.0)  # being worked on: two more may wait
         assert [aside.put(number) for number in range(1, 6)] == [True, True, False, False, False]
         go.set()
     assert done == [0, 1, 2] and aside.dropped == 3

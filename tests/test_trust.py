@@ -35,7 +35,7 @@ def press(center_mm: tuple[float, float] = (0.0, 0.0), press_mm: float = 1.0) ->
     return vts.scenes.render(scene, lights).detach()
 
 
-@pytest.mark.parametrize("mode", ["fast", *(pytest.param(mode, marks=pytest.mark.long) for mode in ("precise", "auto"))])
+@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
 @pytest.mark.parametrize("without_gradients", [torch.no_grad, torch.inference_mode])
 def test_trained_lights_count_without_gradients(mode: str, without_gradients: type) -> None:
     pipe, image = vts.DepthPipeline.from_calibration(rig(), mode), press()
@@ -50,7 +50,8 @@ def test_trained_lights_count_without_gradients(mode: str, without_gradients: ty
     assert float((recorded - before).abs().max()) > 1e-3  # the step moved the lights
     assert float((found - recorded).abs().max()) < 1e-5
     assert float((pipe.requires_grad_(False)(image).depth_mm - recorded).abs().max()) < 1e-5
-    assert float((torch.jit.script(pipe)(image).depth_mm - recorded).abs().max()) < 1e-5
+    with torch.jit.optimized_execution(mode == "fast"):  # of the others it takes 10 s
+        assert float((torch.jit.script(pipe)(image).depth_mm - recorded).abs().max()) < 1e-5
 
 
 @pytest.mark.long

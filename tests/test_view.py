@@ -4,30 +4,15 @@ import math
 import os
 import warnings
 
-import cv2
 import numpy as np
 import pytest
 import torch
+from conftest import Frames, write_film
 
 import torchvts as vts
 from torchvts import stream as streams
 
 PITCH = 0.25
-
-
-class Frames:
-    """A reader of pictures made up front."""
-
-    name, live, fps = "made up", False, 30.0
-
-    def __init__(self, pictures):
-        self._pictures = iter(pictures)
-
-    def read(self):
-        return next(self._pictures, None)
-
-    def close(self):
-        self._pictures = iter(())
 
 
 @pytest.fixture(scope="module")
@@ -52,10 +37,7 @@ def press(unit, tmp_path_factory):
     calibration, camera = unit
     folder = tmp_path_factory.mktemp("view")
     calibration.save(folder / "unit.safetensors")
-    writer = cv2.VideoWriter(str(folder / "press.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (160, 120))
-    for k in range(18):
-        writer.write(camera(1.0 if k >= 14 else 0.0))
-    writer.release()
+    write_film(folder / "press.avi", [camera(1.0 if k >= 14 else 0.0) for k in range(18)])
     return ["--source", folder / "press.avi", "--calibration", folder / "unit.safetensors"]
 
 

@@ -5,7 +5,7 @@ from typing import Final, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from .checks import may_read_values
+from .checks import may_read
 from .geometry import gradient_of_depth, normal_from_gradient
 
 
@@ -123,7 +123,7 @@ class Crop(nn.Module):
 
     def finds_window(self, images: Tensor) -> bool:
         """Whether the window depends on the images, and so on the batch."""
-        return self.enabled and may_read_values() and images.device.type == "cpu"
+        return self.enabled and may_read(images)
 
     def box(self, deformed: Tensor) -> tuple[int, int, int, int]:
         """(top, bottom, left, right) of the smallest box that holds all deformed skin of all frames; zeros without any."""

@@ -248,7 +248,7 @@ def test_the_script_ends_with_status_1_where_a_frame_was_left_out(unit, tmp_path
     source = fill(tmp_path / "in", ["a.png", "b.png"])
     (source / "b.png").write_bytes(b"")
     done = run_script("reconstruct", unit, source, "--out", tmp_path / "out", "--no-pictures")
-    assert done.returncode == 1 and "left out: frame b.png: " in done.stdout and "wrote 1 frames" in done.stdout
+    assert done.returncode == 1 and "left out: frame b.png: " in done.stdout and "wrote 1 frame to" in done.stdout
     assert "table in frames.csv" in done.stdout
 
 

@@ -191,6 +191,12 @@ def test_unusable_images_are_named_and_left_out(unit, tmp_path, capsys):
     assert "expected 48 x 64" in report.failed[1][1]
     assert "left out 1.png: " in capsys.readouterr().err
     assert len((out / "failed.csv").read_text().splitlines()) == 4
+    for k in range(20, 27):
+        (source / f"{k}.png").write_bytes(b"no image")
+    assert len(reconstruct_dataset(unit, source, out, pictures=False).failed) == 10
+    assert capsys.readouterr().err.count("left out ") == 5
+    for k in range(20, 27):
+        (source / f"{k}.png").unlink()
     with pytest.raises(ValueError, match=r"1\.png: .*not an image"):
         reconstruct_dataset(unit, source, tmp_path / "strict", strict=True)
     fill(source, [f"{k}.png" for k in range(5)])
@@ -225,7 +231,7 @@ def test_the_script_ends_with_status_1_where_a_frame_was_left_out(unit, tmp_path
     source = fill(tmp_path / "in", ["a.png", "b.png"])
     (source / "b.png").write_bytes(b"")
     done = run_script("reconstruct", unit, source, "--out", tmp_path / "out", "--no-pictures")
-    assert done.returncode == 1 and "left out: frame b.png: " in done.stdout and "wrote 1 frames" in done.stdout
+    assert done.returncode == 1 and "left out: frame b.png: " in done.stdout and "wrote 1 frame to" in done.stdout
     assert "table in frames.csv" in done.stdout
 
 

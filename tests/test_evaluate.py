@@ -5,9 +5,11 @@ import dataclasses
 import json
 import math
 import shutil
+import sys
 import warnings
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 
@@ -15,7 +17,7 @@ import torchvts as vts
 from torchvts.calibration import fit_prior
 from torchvts.core.geometry import normal_from_gradient
 from torchvts.evaluation import evaluate as ev
-from torchvts.evaluation import methods, rows, sets
+from torchvts.evaluation import methods, peers, rows, sets
 from torchvts.evaluation import presses as presses_room
 from torchvts.evaluation.figures import set_figure
 from torchvts.evaluation.presses import Training, train_network
@@ -198,6 +200,19 @@ def test_evaluate_with_a_trained_network(run_script, folder, tmp_path):
     assert result.rows[0].errors["normal_deg"] < 3.0 and result.rows[1].frames == 4
     with pytest.raises(ValueError, match="methods: expected some of fast"):
         set_figure(result, ["MLP"])
+    largest = [float(result.outputs[name].depth_mm.abs().max()) for name in ("fast", methods.GIVEN_NETWORK)]
+    failed = result.outputs["fast"]._replace(depth_mm=30.0 * result.outputs["fast"].depth_mm)
+    figure = set_figure(dataclasses.replace(result, outputs=result.outputs | {"failed": failed}))
+    ranges = {panel.get_images()[0].norm.vmax for panel in figure.axes if panel.get_images() and "depth" in panel.get_title()}
+    assert len(ranges) == 1 and ranges.pop() <= 1000.0 * max(largest) * 1.001  # not that of the method that failed
+
+
+def test_the_peer_needs_no_scipy(monkeypatch):
+    pytest.importorskip("scipy")
+    right = np.random.default_rng(0).standard_normal((23, 34))
+    solved = peers.scipy_solve(right)
+    monkeypatch.setitem(sys.modules, "scipy", None)
+    assert np.allclose(peers.scipy_solve(right), solved, atol=1e-12)
 
 
 def test_a_prior_that_has_seen_the_presses_is_compared_with_none(folder):

@@ -437,6 +437,9 @@ def test_the_script_writes_pose_and_picture(run_script, tmp_path):
     done = call("film", "target.png", "track", *unit, "--no-pictures")
     assert done.returncode == 0, done.stderr
     assert [entry["converged"] for entry in json.loads((tmp_path / "track" / "pose.json").read_text())] == [True, True]
+    vts.write_image(tmp_path / "film" / "c.png", background)
+    done = call("film", "target.png", "track", *unit, "--no-pictures")
+    assert done.returncode == 1 and "no pose in 1 of 3 frames, the first c: " in done.stdout
     done = call("background.png", "target.png", "none", *unit)
     assert (
         done.returncode == 2 and done.stderr.strip().splitlines()[-1].startswith("torchvts: error: ") and "touched" in done.stderr

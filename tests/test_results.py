@@ -11,7 +11,7 @@ from conftest import TINY_SENSOR, bgr, tiny_image, write_film
 
 import torchvts as vts
 from torchvts.core.results import MAPS, UNITS, join_results, write_result
-from torchvts.dataset import reconstruct_dataset
+from torchvts.dataset import items, reconstruct_dataset
 from torchvts.pipeline import unit_pipeline
 from torchvts.pose.surface_files import write_obj
 from torchvts.stream import check_device
@@ -41,6 +41,7 @@ def test_a_frame_is_what_the_pipeline_gave(unit, source, results):
     result = vts.read_result(results / "3.npz")
     with torch.inference_mode():
         out = vts.stream.Recording(calibration, follow=False)(vts.read_image(source / "3.png")[None], 0.0)[1]
+    assert repr(result).startswith("Result(1 frame of 48 x 64 px, 0.6 mm per pixel, deepest 0.") and len(repr(result)) < 150
     for ours, theirs in zip(result, (out.depth_mm, out.normal, out.gradient, out.contact, out.deformed)):
         assert torch.equal(ours, theirs)
     assert result[5:] == (PITCH, UNITS, "unit.safetensors", "rig", ["3.png"])
@@ -79,6 +80,11 @@ def test_every_third_frame_of_several_inputs(unit, source, tmp_path):
     assert report.rows == len(rows) == 6
     again = reconstruct_dataset(unit, inputs, tmp_path / "out", every=2, workers=0, pictures=False, format="npy")
     assert (again.before, again.rows) == (6, 6)
+
+
+def test_pictures_are_drawn_where_a_run_has_few_frames(source, monkeypatch):
+    monkeypatch.setattr(items, "PICTURES_UP_TO", 6)  # five images and seven frames
+    assert not items.has_few_frames(source) and not items.has_few_frames(source, every=2) and items.has_few_frames(source, every=3)
 
 
 def test_the_depth_png_and_the_surface(unit, source, tmp_path):

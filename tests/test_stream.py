@@ -1,5 +1,6 @@
 """Streams: what is read, what is refused, what is dropped, how the light is followed, and what is left on disk."""
 
+import csv
 import itertools
 import json
 import os
@@ -580,13 +581,30 @@ def unit_file(unit, tmp_path_factory):
 def test_the_script_writes_overlay_summary_and_frames(run_stream, unit_file, video, tmp_path):
     done = run_stream("--source", video, "--calibration", unit_file, "--out", tmp_path, "--video", "avi")
     assert done.returncode == 0, done.stderr
-    assert "35 frames, 0 dropped" in done.stdout and "| integrate |" in done.stdout
+    assert "35 frames, 0 dropped" in done.stdout and re.search(
+        r"^median ms: read [\d.]+, rectify .* write [\d.]+$", done.stdout, re.M
+    )
     assert (tmp_path / "sheet.png").stat().st_size > 10_000
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["frames"] == 35 and summary["contact_frames"] == 10 and summary["deepest_mm"] == pytest.approx(1.0, abs=0.1)
     assert {"read", "draw", "write", "contact"} <= set(summary["stages_ms"])
     assert len((tmp_path / "frames.csv").read_text().splitlines()) == 36
     assert len(list(read_frames(tmp_path / "overlay.avi"))) == 35
+
+
+def test_track_writes_a_row_for_each_frame_after_the_reference(run_script, unit_file, video, tmp_path):
+    done = run_script("track", "--source", video, "--calibration", unit_file, "--out", tmp_path, "--video", "none")
+    assert done.returncode == 1 and "frame 15: the reference" in done.stdout and "19 frames, 10 lost" in done.stdout, done.stderr
+    with (tmp_path / "poses.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["frame"]) for row in rows] == list(range(16, 35))
+    assert float(rows[0]["time_s"]) == pytest.approx(16 / 30, abs=1e-5)
+    assert [bool(row["lost"]) for row in rows] == [row["converged"] == "0" for row in rows] == [k >= 25 for k in range(16, 35)]
+    poses = np.array([[float(row[f"T{i}{j}"]) for i in range(3) for j in range(4)] for row in rows]).reshape(-1, 3, 4)
+    assert np.allclose(poses[:9], np.eye(4)[:3], atol=0.1)  # mm; the ball stays where it is
+    turns = poses[:, :, :3]
+    assert np.allclose(turns @ turns.transpose(0, 2, 1), np.eye(3), atol=1e-6)
+    assert all("rotation about z" in row["ambiguous"] and float(row["std_z_mm"]) > 0 for row in rows[:9])
 
 
 def test_bad_arguments_are_refused_in_a_sentence(run_stream, video, tmp_path):

@@ -144,7 +144,7 @@ def draw_contours(
     colors, norm = depth_colors(low, high)
     picture = axes.imshow(depth * 1000.0, cmap=colors, norm=norm, extent=_extent(depth, mm_per_pixel))
     step = step_um or _round_step(high - low)
-    _draw_lines(axes, depth * 1000.0, mm_per_pixel, step, colors, norm)
+    _draw_lines(axes, (depth * 1000.0).clip(low, high), mm_per_pixel, step, colors, norm)
     draw_bar(figure, axes, picture, "depth, um")
     axes.set_title(f"depth, a line every {step:g} um", fontsize=10)
     _millimetres(axes)

@@ -89,5 +89,4 @@ def unknown_sensor(arguments: argparse.Namespace) -> Sensor:
     """The sensor of which only the pitch is known: its images have the size of the background."""
     path = arguments.source[0] / "background.png" if arguments.source[0].is_dir() else arguments.source[0]
     _, image = next(iter(read_frames(path)))
-    name, pitch = arguments.source[0].stem or "sensor", arguments.mm_per_pixel
-    return Sensor(name, image.shape[1], image.shape[2], pitch, gamma=arguments.gamma)
+    return Sensor("own sensor", image.shape[1], image.shape[2], arguments.mm_per_pixel, gamma=arguments.gamma)

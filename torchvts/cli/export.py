@@ -43,5 +43,6 @@ def run(arguments: argparse.Namespace) -> int:
     print("| format | file | kB | largest depth difference, mm | result |\n|---|---|---|---|---|")
     for row in rows:
         result = "ok" if row.ok else f"failed: {row.reason}"
-        print(f"| {row.format} | {row.path} | {row.size_kb:.0f} | {row.difference_mm:.2g} | {result} |")
+        size, difference = (format(v, kind) if v == v else "" for v, kind in ((row.size_kb, ".0f"), (row.difference_mm, ".2g")))
+        print(f"| {row.format} | {row.path if size else ''} | {size} | {difference} | {result} |")
     return 0 if all(row.ok for row in rows) else 1

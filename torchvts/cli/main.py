@@ -71,6 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if words[0] == "--version":
         print(f"torchvts {__version__}")
         return 0
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # before it is loaded: a camera that does not open is one line, ours
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
     try:

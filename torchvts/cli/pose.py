@@ -50,8 +50,11 @@ def run(arguments: argparse.Namespace) -> int:
     results = of_clouds(arguments) if all(clouds) else of_frames(arguments)
     with write_atomically(arguments.out / "pose.json") as temporary:
         temporary.write_text(json.dumps(results if len(results) > 1 else results[0], indent=1) + "\n")
+    without = [result for result in results if not result["converged"]]
+    if len(results) > 1 and without:
+        print(f"no pose in {len(without)} of {len(results)} frames, the first {without[0]['frame']}: {without[0]['message']}")
     print(f"wrote {arguments.out / 'pose.json'}")
-    return 0 if all(result["converged"] for result in results) else 1
+    return 1 if without else 0
 
 
 def of_clouds(arguments: argparse.Namespace) -> list[dict[str, Any]]:

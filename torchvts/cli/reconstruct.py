@@ -78,6 +78,8 @@ def run(arguments: argparse.Namespace) -> int:
     if report.rank > 0:
         return 0
     print_report(report, arguments.out)
+    if arguments.pictures is None and report.rows > PICTURES_UP_TO:
+        print(f"no pictures of more than {PICTURES_UP_TO} frames: --pictures --overwrite draws all, --every N fewer")
     for finding in diagnose_first(calibration, inputs):
         print(f"first frame: {finding}")
     return 1 if report.failed else 0
@@ -132,7 +134,8 @@ def print_report(report: Report, out: Path) -> None:
     if report.failed:
         print(f"{len(report.failed)} left out, all of them in {out / 'failed.csv'}")
     before = f", {report.before} of them by an earlier run" if report.before else ""
-    print(f"wrote {report.rows} frames to {out}{before}; table in frames.csv, units in summary.json")
+    frames = f"{report.rows} frame{'s' if report.rows != 1 else ''}"
+    print(f"wrote {frames} to {out}{before}; table in frames.csv, units in summary.json")
 
 
 def diagnose_first(calibration: Path, inputs: list[Path]) -> list[Finding]:

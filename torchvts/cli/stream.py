@@ -173,7 +173,9 @@ def open_stream(arguments: argparse.Namespace, unit: Sensor | Calibration, press
         device=arguments.device,
         contact=contact_of(arguments.contact),
     )
-    print(f"{stream.reader.name}: {stream.fps:g} frames a second; the first {arguments.background_frames} are without contact")
+    first = arguments.background_frames
+    note = f"the first {first} are without contact" if first else "the calibration's background is used as it is"
+    print(f"{stream.reader.name}: {stream.fps:g} frames a second; {note}")
     print(f"{stream.note}\nready after {time.perf_counter() - started:.1f} s")
     return stream
 

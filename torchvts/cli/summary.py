@@ -76,9 +76,10 @@ def expected(calibration: Calibration) -> str:
     degrees = f"normals within a contact to about {expected_model_deg(calibration):.1f} degrees"
     if report.get("held_out_deg"):
         used = sum(row["used"] for row in report.get("presses", []))
-        return f"{degrees}, by scoring each of {used} presses with the others"
+        scored = f"{report['held_out_deg']:.1f} on each of {used} presses by the others"
+        return f"{degrees}: {scored}, and more where no ball was pressed"
     if report["source"] == "prior":
-        return f"{degrees}, the prior's record on other units of its type; presses of a ball would measure this unit"
+        return f"{degrees} if this unit is like the one its prior was fitted to; presses of a ball would measure it"
     return f"{degrees} or better: too few presses to score any; more presses of a ball would measure it"
 
 

@@ -63,6 +63,12 @@ class Result(NamedTuple):
     sensor: str
     frames: Sequence[str]
 
+    def __repr__(self) -> str:
+        count, _, height, width = self.depth_mm.shape
+        size = f"{count} frame{'s' if count != 1 else ''} of {height} x {width} px, {self.mm_per_pixel:g} mm per pixel"
+        deepest = f"deepest {float(self.depth_mm.max()):.3f} mm"
+        return f"Result({size}, {deepest}, sensor {self.sensor!r}, calibration {self.calibration!r})"
+
 
 def write_result(path: str | Path, output: DepthOutput, mm_per_pixel: float, calibration: str, sensor: str, frame: str) -> None:
     """Write one frame as npz, compressed; the same values give the same bytes.

@@ -163,7 +163,7 @@ def output_stems(names: list[str]) -> dict[str, str]:
     return stems if len(set(stems.values())) == len(stems) else {name: name for name in names}
 
 
-def has_few_frames(source: Source) -> bool:
-    """Whether a source holds at most :data:`PICTURES_UP_TO` frames."""
-    items = islice(list_items(source), PICTURES_UP_TO + 1)
-    return sum(count_frames(item.file) if item.is_video else 1 for item in items) <= PICTURES_UP_TO
+def has_few_frames(source: Source, every: int = 1) -> bool:
+    """Whether a run over each N-th frame of a source has at most :data:`PICTURES_UP_TO` frames."""
+    items = islice(list_items(source, every), PICTURES_UP_TO + 1)
+    return sum(-(-count_frames(item.file) // every) if item.is_video else 1 for item in items) <= PICTURES_UP_TO

@@ -224,6 +224,9 @@ def _sum_over_processes(count: int) -> int:
     return int(total)
 
 
+NAMED = 5
+"""So many frames that cannot be used are named at once, by each process; a folder of another sensor's has thousands."""
+
 _Reconstructed = tuple[Frame, Tensor | None, DepthOutput | None]
 """A frame, its image in the light of the background, and its depth."""
 
@@ -242,7 +245,7 @@ class _Worker:
         )
         self.image = self.recording(follow=False)
         self.notes: list[tuple[str, str]] = []
-        self.done = 0
+        self.done = self.failed = 0
 
     def run(self, batch: int, workers: int | None) -> Report:
         """Do the whole share; rank 0 then writes the tables. Files are written by threads: most of that is waiting for the disk."""
@@ -339,7 +342,10 @@ class _Worker:
             name = frame.item.frame_name(frame.number)
             if self.strict:
                 raise ValueError(f"{name}: {failed}")
-            tqdm.write(f"left out {name}: {failed}", file=sys.stderr)
+            self.failed += 1
+            if self.failed <= NAMED:
+                more = "" if self.failed < NAMED else "; further ones are named in failed.csv, at the end"
+                tqdm.write(f"left out {name}: {failed}{more}", file=sys.stderr)
         else:
             self.done += frame.length is None
 

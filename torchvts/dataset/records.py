@@ -75,7 +75,7 @@ def begin(source: Source, out: Path, settings: Settings, overwrite: bool) -> Set
         settings = join(out, settings)
     else:
         if settings.pictures is None:
-            settings = replace(settings, pictures=has_few_frames(source))
+            settings = replace(settings, pictures=has_few_frames(source, settings.every))
         with write_atomically(out / STATE / "settings.json") as temporary:
             temporary.write_text(json.dumps(asdict(settings), indent=1), encoding="utf-8")
     incomplete = re.compile(r"\..+-[0-9a-f]{8}\.(png|npy|npz|pcd|ply|obj|csv|json)")  # names of write_atomically

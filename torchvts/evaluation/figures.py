@@ -374,11 +374,13 @@ def set_figure(evaluation: Evaluation, methods: Sequence[str] = ()) -> Figure:
     chosen = list(methods) or [name for name in evaluation.outputs if name != "flat"]
     if shown is None or not chosen or any(name not in evaluation.outputs for name in chosen):
         raise ValueError(f"methods: expected some of {', '.join(evaluation.outputs) or 'none'}, got {', '.join(chosen) or 'none'}")
-    figure = new_figure(11.0, 3.0 * len(chosen) + 0.3, 100)
+    figure = new_figure(12.0, 3.0 * len(chosen) + 0.3, 100)
+    figure.set_layout_engine("constrained", w_pad=0.2, wspace=0.08, rect=(0.0, 0.0, 0.98, 1.0))  # room for the colour bars
     errors = {name: _relief_error(evaluation.outputs[name].depth_mm, shown.truth) for name in chosen}
-    most = max(float(error.nan_to_num().abs().quantile(0.998)) for error in errors.values()) or 1.0
+    most = _shared([float(error.nan_to_num().abs().quantile(0.998)) for error in errors.values()]) or 1.0
     depths = {name: evaluation.outputs[name].depth_mm[0, 0].double().numpy() for name in chosen}
-    span = depth_range(*depths.values())
+    limit = _shared([float(np.abs(depth).max()) for depth in depths.values()])
+    span = depth_range(*(depth for depth in depths.values() if np.abs(depth).max() <= limit))
     for k, (name, depth) in enumerate(depths.items()):
         contours, panel = (figure.add_subplot(len(chosen), 3, 3 * k + column) for column in (1, 3))
         draw_contours(figure, contours, depth, pitch, range_mm=span)
@@ -389,8 +391,15 @@ def set_figure(evaluation: Evaluation, methods: Sequence[str] = ()) -> Figure:
         surface = figure.add_subplot(len(chosen), 3, 3 * k + 2, projection="3d")
         draw_surface(surface, depth, pitch, range_mm=span)
         _draw_error(panel, errors[name], most, contours.get_images()[0].get_extent())
-    figure.suptitle(f"{evaluation.data.name}, {shown.name}; contact in orange, the true one dotted", fontsize=11)
+    title = f"{evaluation.data.name}, {shown.name}; contact in orange, the true one dotted; what exceeds the colours is cut off"
+    figure.suptitle(title, fontsize=11)
     return figure
+
+
+def _shared(largest: list[float]) -> float:
+    """The largest value that methods share a range with: four times their lower median. One that fails by more is cut off there."""
+    limit = 4.0 * statistics.median_low(largest)
+    return max(value for value in largest if value <= limit)
 
 
 def _draw_error(panel: Any, error: Tensor, most: float, extent: Sequence[float]) -> None:

@@ -233,7 +233,7 @@ def calibrate_background(background: Tensor, sensor: Sensor, presses: Sequence[P
         warnings.simplefilter("always")
         calibration = calibrate(background, sensor, presses)
     notes = [str(w.message) for w in caught if issubclass(w.category, CalibrationWarning)]
-    if calibration.report["source"] in ASSUMED:
+    if calibration.report["source"] in ASSUMED and not notes:
         notes.append("the lights are the sensor file's, not this unit's")
     metric = not notes
     text = "; ".join([str(calibration.report["reason"]), *notes] + ([] if metric else [NOT_METRIC]))

@@ -43,6 +43,13 @@ class TactileFrame(NamedTuple):
     output: DepthOutput
 
 
+STAGES = (
+    "read", "wait", "rectify", "light", "compensate", "deformed", "normals", "gradient", "integrate", "contact", "draw", "view",
+    "write",
+)  # fmt: skip
+"""In the order of a frame."""
+
+
 class StageClock:
     """Measures the milliseconds of each stage, of the last 10,000 frames."""
 
@@ -87,8 +94,9 @@ class StageClock:
         return self._frames[-1] if self._frames else {}
 
     def median_ms(self) -> dict[str, float]:
-        """Median of each stage over the frames in which it ran."""
-        names = dict.fromkeys(name for frame in self._frames for name in frame)
+        """Median of each stage over the frames in which it ran, in the order of a frame."""
+        names = dict.fromkeys([*STAGES, *(name for frame in self._frames for name in frame)])
+        names = {name: None for name in names if any(name in frame for frame in self._frames)}
         return {name: float(np.median([frame[name] for frame in self._frames if name in frame])) for name in names}
 
 

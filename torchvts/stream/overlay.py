@@ -300,8 +300,7 @@ class StreamReport:
         lines += [f"left out frame {number}: {reason}" for number, reason in values["left_out"][:20]]
         if len(values["left_out"]) > 20:
             lines.append(f"{len(values['left_out'])} frames left out, all of them in summary.json")
-        lines.append("| stage | median ms |\n|---|---|")
-        lines += [f"| {name} | {ms:.2f} |" for name, ms in values["stages_ms"].items()]
+        lines.append("median ms: " + ", ".join(f"{name} {ms:.1f}" for name, ms in values["stages_ms"].items()))
         unit = "mm" if values["metric"] else "mm (NOT METRIC)"
         lines.append(f"contact in {values['contact_frames']} frames, deepest {values['deepest_mm']:.3f} {unit}")
         lines.append("light at the end, R G B: " + " ".join(f"{v:.3f}" for v in values["light_level"]) + " of the background's")

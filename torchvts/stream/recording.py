@@ -143,6 +143,7 @@ class Recording:
         if bool(deformed.any()):
             raise ValueError(
                 f"background: the first frames show contact on {float(deformed.float().mean()):.1%} of the skin against the "
-                "calibration's background: start without contact, or calibrate again if the skin has changed"
+                "calibration's background: start without contact, calibrate again if the skin or the camera's compression has "
+                "changed, or use the calibration as it is (background_frames=0, --background-frames 0)"
             )
         light.set_background(corrected)

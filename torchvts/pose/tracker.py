@@ -167,7 +167,7 @@ class PoseTracker:
         for k in range(self._active):
             pose = expected @ np.linalg.inv(self.graph.poses[k])
             keyframe = self.graph.keyframes[k]
-            sums = sum_residuals(frame.fine, keyframe.some, pose, SLOPE_NOISE)
+            sums = sum_residuals(frame.fine, keyframe.some, pose, SLOPE_NOISE, score_only=True)
             if frame.touching < GROWN * keyframe.touching and common_share(keyframe, frame, sums, keyframe.some) > RETURN:
                 return k
         return None
@@ -253,13 +253,15 @@ class PoseTracker:
         message = f"{100 * found.fitness:.0f} % of the common contact agrees"
         if found.names:
             message += f"; kept, because the surface slides on itself: {', '.join(found.names)}"
+        if not found.exact:
+            message += f"; uncertain by {found.std_deg:.1f} degrees and {found.std_mm:.2f} mm: parts of the contact disagree"
         center = found.pose[:3, :3] @ keyframe.many.center + found.pose[:3, 3]
         to_center = np.hstack((-cross(center), np.eye(3)))
         return TrackedPose(
             T_target_source=torch.from_numpy(pose.copy()),
             rmse_mm=found.fine.depth_noise,
             fitness=found.fitness,
-            converged=True,
+            converged=found.exact,
             message=message,
             covariance=torch.from_numpy(found.covariance + drift),
             ambiguous=found.names,

@@ -548,7 +548,7 @@ def refine_pose(
 def track_grids(
     depth: Tensor, slopes: Tensor, contact: Tensor, least_mm: float, times: tuple[int, int]
 ) -> tuple[Tensor, Tensor, int]:
-    """Fine and coarse channels (H, W, 4) of a frame, and the number of fine pixels on the object: see :mod:`torchvts.pose.keyframe`.
+    """Fine and coarse channels (H, W, 4) of a frame, and how many fine pixels lie on it: see :mod:`torchvts.pose.keyframe`.
 
     Args:
         depth: (1, 1, H, W), contiguous as the others.

@@ -12,14 +12,17 @@ from .inverse import LEAST_NOISE, Array, Field, Pixels, Sums, moved_by, refine, 
 from .jackknife import jackknife
 from .keyframe import PARTS, Grids, Keyframe
 
-COARSE_STEPS, SOME_STEPS = 8, 6
+COARSE_STEPS, SOME_STEPS = 15, 30
 """Largest number of steps on the coarse grid, and with some pixels of the fine one."""
 
 HEIGHT_OFFSET_MM = 0.02
 """Error of all heights of a contact alike, which its frames cannot show: the relief of a real GelSight Mini errs by so much."""
 
+LAST_STEP_MM = 0.03
+"""A last step of more than this, at the contact, is not the end of the way."""
+
 TRUSTED_DEG, TRUSTED_MM = 1.0, 0.15
-"""A pose is trusted if twice its standard deviations are within these."""
+"""A pose is trusted if three times its standard deviations are within these."""
 
 MOST_STD_DEG, MOST_STD_MM = 1.0, 0.15
 """Standard deviations of a motion, as a turn and as a shift, above which it is called unknown."""
@@ -38,6 +41,7 @@ class Followed(NamedTuple):
         names: of these motions, in the frame's axes.
         std_deg: standard deviation of the rotations that are known, degrees.
         std_mm: the same of the shifts, at the centre of the keyframe's contact, mm.
+        settled: whether the last step was a small one.
         covariance: (6, 6) of a small motion after the pose, rad and mm.
     """
 
@@ -50,6 +54,7 @@ class Followed(NamedTuple):
     names: list[str]
     std_deg: float
     std_mm: float
+    settled: bool
     covariance: Array
 
     @property
@@ -60,7 +65,7 @@ class Followed(NamedTuple):
     @property
     def exact(self) -> bool:
         """Whether the pose is certain enough to be trusted."""
-        return 2.0 * self.std_deg <= TRUSTED_DEG and 2.0 * self.std_mm <= TRUSTED_MM
+        return self.settled and 3.0 * self.std_deg <= TRUSTED_DEG and 3.0 * self.std_mm <= TRUSTED_MM
 
 
 def follow(keyframe: Keyframe, frame: Grids, starts: list[Array]) -> Followed:
@@ -84,9 +89,11 @@ def _follow_from(keyframe: Keyframe, frame: Grids, start: Array) -> Followed:
     if vague.motions.shape[1] > 0:
         unknown = _joined(unknown, vague)
         refined, some = refine(frame.fine, keyframe.some, pose, SOME_STEPS, SLOPE_NOISE, unknown.motions, 2e-3)
-    fine, *parts = sum_parts(frame.fine, keyframe.many, refined, max(LEAST_NOISE, 1.5 * some.slope_noise), PARTS)
-    pose = refined @ moved_by(keyframe.many, solve_step(fine, unknown.motions))
-    scaled = _covariance(fine, jackknife(*parts, _others(unknown.motions)), unknown.motions)
+    noise = max(LEAST_NOISE, 1.5 * some.slope_noise)
+    fine, matrices, rights = sum_parts(frame.fine, keyframe.many, refined, noise, PARTS)
+    last = solve_step(fine, unknown.motions)
+    pose = refined @ moved_by(keyframe.many, last)
+    scaled = _covariance(fine, jackknife(matrices, rights, _others(unknown.motions)), unknown.motions)
     forth = sum_residuals(frame.coarse, keyframe.coarse, pose, SLOPE_NOISE, score_only=True)
     pixels = _pixels(frame.coarse)
     back = sum_residuals(keyframe.grids.coarse, pixels, np.linalg.inv(pose), SLOPE_NOISE, score_only=True)
@@ -95,19 +102,20 @@ def _follow_from(keyframe: Keyframe, frame: Grids, start: Array) -> Followed:
         pose=pose,
         fine=fine,
         fitness=(forth.fitness * forth.compared + back.fitness * back.compared) / compared,
-        overlap=max(forth.compared / keyframe.coarse.count, back.compared / max(pixels.count, 1)),
+        overlap=max(forth.compared / keyframe.coarse.number, back.compared / max(pixels.number, 1)),
         cost=(forth.cost * forth.compared + back.cost * back.compared) / compared,
         free=unknown.motions,
         names=_names(unknown, pose),
         std_deg=math.degrees(math.sqrt(float(np.diag(scaled)[:3] @ keyframe.many.units[:3] ** 2))),
         std_mm=math.sqrt(float(np.trace(scaled[3:, 3:]))),
+        settled=float(np.linalg.norm(last)) < LAST_STEP_MM,
         covariance=_after(keyframe.many, pose, scaled + unknown.motions @ unknown.motions.T * UNKNOWN_VARIANCE),
     )
 
 
 def common_share(keyframe: Keyframe, frame: Grids, sums: Sums, pixels: Pixels) -> float:
     """Share of the smaller contact that both have in common, by the sums over fine pixels of the keyframe."""
-    return sums.used / pixels.count * keyframe.touching / max(min(keyframe.touching, frame.touching), 1)
+    return sums.used / pixels.number * keyframe.touching / max(min(keyframe.touching, frame.touching), 1)
 
 
 def orthonormal(pose: Array) -> Array:
@@ -151,20 +159,24 @@ class _Unknown(NamedTuple):
 
 def _sliding(keyframe: Keyframe, coarse: Sums) -> _Unknown:
     """Motions under which the common contact slides on itself, by its information, and those that the keyframe may roll by."""
-    information = torch.from_numpy(coarse.matrix * ((coarse.noise / SLOPE_NOISE) ** 2 / max(coarse.used, 1)))
-    free, shifts = free_directions(information, keyframe.bias, LEAST_INFORMATION)
-    found = _Unknown(free.numpy(), shifts.numpy())
-    return _joined(found, _Unknown(keyframe.held, shifts.numpy())) if keyframe.held.shape[1] > 0 else found
+    information = coarse.matrix * ((coarse.noise / SLOPE_NOISE) ** 2 / max(coarse.used, 1))
+    found = _Unknown(np.zeros((6, 0)), np.zeros((3, 0)))
+    if np.linalg.eigvalsh(information)[0] < LEAST_INFORMATION + 3.0 * keyframe.most_bias:  # else no direction has less
+        free, shifts = free_directions(torch.from_numpy(information), keyframe.bias, LEAST_INFORMATION)
+        found = _Unknown(free.numpy(), shifts.numpy())
+    return _joined(found, _Unknown(keyframe.held, found.shifts)) if keyframe.held.shape[1] > 0 else found
 
 
 def _vague(keyframe: Keyframe, some: Sums) -> _Unknown:
     """Motions whose standard deviation is too large, because the common contact is small or faint."""
     wanted = np.concatenate((math.radians(MOST_STD_DEG) / keyframe.some.units[:3], np.full(3, MOST_STD_MM)))
-    alike = max(1.0, ALIKE_PIXELS * keyframe.some.count / keyframe.touching)
+    alike = max(1.0, ALIKE_PIXELS * keyframe.some.number / keyframe.touching)
     matrix = some.matrix * wanted[:, None] * wanted / (alike * (max(some.slope_noise, 1e-3) / some.noise) ** 2)
+    if np.linalg.eigvalsh(matrix)[0] >= 1.0:  # 1 where the standard deviation is as wanted
+        return _Unknown(np.zeros((6, 0)), np.zeros((3, 0)))
 
     def below(part: Array, scale: Array) -> Array:
-        precision, directions = np.linalg.eigh(part)  # 1 where the standard deviation is as wanted
+        precision, directions = np.linalg.eigh(part)
         return np.linalg.qr(directions[:, precision < 1.0] * scale[:, None])[0]
 
     return _Unknown(below(matrix, wanted), below(matrix[3:, 3:], wanted[3:]))
@@ -195,10 +207,12 @@ def _others(motions: Array) -> Array:
 
 
 def _covariance(fine: Sums, by_parts: Array, free: Array) -> Array:
-    """Covariance of the scaled twist: what parts of the contact say differently, noise of pixels, and an error of all heights."""
+    """Covariance of the scaled twist: from parts of the contact, the noise of pixels, and an error of all heights."""
     known = np.eye(6) - free @ free.T
-    noise = np.linalg.pinv(known @ fine.matrix @ known, rcond=1e-9, hermitian=True)
-    scaled = by_parts + noise * (ALIKE_PIXELS * (fine.slope_noise / fine.noise) ** 2)
+    matrix = known @ fine.matrix @ known
+    matrix[5, :] = matrix[:, 5] = 0.0  # heights have a weight of their own
+    noise = np.linalg.pinv(matrix, rcond=1e-9, hermitian=True)
+    scaled: Array = by_parts + noise * (fine.slope_noise / fine.noise) ** 2
     scaled[5, 5] += fine.depth_noise**2 + HEIGHT_OFFSET_MM**2
     return scaled
 

@@ -63,8 +63,8 @@ class Pixels(NamedTuple):
     units: Array
 
     @property
-    def count(self) -> int:
-        """Number of pixels."""
+    def number(self) -> int:
+        """Of pixels."""
         return self.columns.shape[1]
 
 
@@ -153,7 +153,7 @@ def solve_step(sums: Sums, held: Array | None = None) -> Array:
 
 
 def moved_by(pixels: Pixels, step: Array) -> Array:
-    """The rigid motion (4, 4) of a scaled twist, as :func:`torchvts.pose.result.motion`, by Rodrigues' formula: a tenth of its time."""
+    """The rigid motion (4, 4) of a scaled twist, by Rodrigues' formula: a tenth of the time of ``result.motion``."""
     twist, center = step * pixels.units, pixels.center
     x, y, z = twist[:3].tolist()
     angle = math.sqrt(x * x + y * y + z * z)
@@ -177,7 +177,7 @@ def sum_parts(field: Field, pixels: Pixels, pose: Array, slope_noise: float, par
     if usable(field.channels, pixels.columns):
         found = kernels.part_sums(field.channels, pixels.columns, parts, limits)
     else:
-        ends = [pixels.count * k // parts for k in range(parts + 1)]
+        ends = [pixels.number * k // parts for k in range(parts + 1)]
         runs = [pixels.columns[:, first:end] for first, end in pairwise(ends)]
         found = np.stack([alignment_sums(field.channels, run, limits) for run in runs])
     products = found[:, :49].reshape(parts, 7, 7)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -161,6 +162,11 @@ class Keyframe:
     held: Array
     bias: Tensor
 
+    @cached_property
+    def most_bias(self) -> float:
+        """The largest of that part over all directions."""
+        return float(self.bias.diagonal().max())
+
 
 def make_keyframe(frame: Contact, mm_per_pixel: float) -> Keyframe:
     """Everything that is computed once of a reference.
@@ -195,16 +201,17 @@ def make_keyframe(frame: Contact, mm_per_pixel: float) -> Keyframe:
 
 def _spread(relief: Relief, most: int) -> Relief:
     """The relief with at most so many of its pixels, evenly spread, those of each of :data:`PARTS` compact parts in a run."""
-    chosen = torch.linspace(0, len(relief.points) - 1, min(most, len(relief.points))).long()
+    number = min(most, len(relief.points)) // PARTS * PARTS  # so that parts are the same number exactly
+    chosen = torch.linspace(0, len(relief.points) - 1, number).long()
     chosen = chosen[_in_parts(relief.points[chosen, :2])]
     return relief._replace(points=relief.points[chosen].contiguous(), slopes=relief.slopes[chosen].contiguous())
 
 
 def _in_parts(places: Tensor) -> Tensor:
-    """An order of places (N, 2) in which PARTS runs of the same number lie in compact parts: halves of halves, across the longer side."""
+    """An order of places (N, 2) in which PARTS runs of the same number are compact: halves of halves, across the longer side."""
     runs = [torch.arange(len(places))]
     while len(runs) < PARTS:
-        halves = []
+        halves: list[Tensor] = []
         for run in runs:
             side = int((places[run].amax(0) - places[run].amin(0)).argmax()) if len(run) else 0
             halves += run[places[run, side].argsort(stable=True)].tensor_split(2)

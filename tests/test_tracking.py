@@ -1,5 +1,6 @@
 """Tracking: exact scenes, what a contact cannot show, losing and finding an object, keyframes and closed loops, bad input."""
 
+import itertools
 import math
 
 import numpy as np
@@ -13,8 +14,9 @@ from torchvts.core.frame import DepthOutput
 from torchvts.evaluation import tracking
 from torchvts.pose.follow import adjoint, orthonormal
 from torchvts.pose.graph import Edge, KeyframeGraph
-from torchvts.pose.inverse import Sums, solve_step, sum_residuals
-from torchvts.pose.keyframe import contact_frame, grids, make_keyframe
+from torchvts.pose.inverse import Sums, refine, solve_step, sum_parts, sum_residuals
+from torchvts.pose.jackknife import ALIKE_PARTS, jackknife
+from torchvts.pose.keyframe import PARTS, contact_frame, grids, make_keyframe
 from torchvts.pose.result import invert, motion, turn_deg
 from torchvts.scenes import objects
 from torchvts.stream import TactileFrame
@@ -181,20 +183,79 @@ def test_a_closed_loop_spreads_its_contradiction(keyframe):
     assert np.trace(graph.covariances[3]) < before
 
 
-def test_kernels_and_reference_agree(keyframe):
+def test_sums_and_steps_of_kernels_and_reference_agree(keyframe):
     if library() is None:
         pytest.skip("no compiled kernels")
     frame = grids(contact_frame(press(objects.key(), swing(1))), PITCH, keyframe.least_mm, keyframe.times)
     pose = motion(torch.tensor([0.01, -0.02, 0.04, 0.2, -0.1, 0.02], dtype=torch.float64)).numpy()
-    fast = sum_residuals(frame.fine, keyframe.many, pose, 0.05)
+    for pixels in (keyframe.many, keyframe.many._replace(columns=keyframe.many.columns[:, 5:1002])):  # a block that is not full
+        held = np.eye(6)[:, [1]]
+
+        def results(pixels=pixels, held=held):
+            whole, matrices, rights = sum_parts(frame.fine, pixels, pose, 0.05, PARTS)
+            score = sum_residuals(frame.fine, pixels, pose, 0.05, score_only=True)
+            return whole, matrices, rights, score, *refine(frame.fine, pixels, pose, 4, 0.06, held)
+
+        fast = results()
+        with reference_only():
+            slow = results()
+        for one, other in ((fast[0], slow[0]), (fast[5], slow[5])):
+            assert np.allclose(one.matrix, other.matrix, rtol=1e-3, atol=1e-4 * np.abs(other.matrix).max())
+            assert np.allclose(one.right, other.right, rtol=1e-3, atol=1e-3 * np.abs(other.right).max())
+            assert one[2:] == pytest.approx(other[2:], rel=1e-3)
+        assert np.allclose(fast[1], slow[1], rtol=1e-3, atol=1e-4 * np.abs(slow[1]).max())
+        assert np.allclose(fast[2], slow[2], rtol=1e-3, atol=1e-3 * np.abs(slow[2]).max())
+        assert fast[3][2:] == pytest.approx(fast[0][2:], rel=1e-6) and not fast[3].matrix.any()
+        assert fast[4] == pytest.approx(slow[4], abs=1e-5)
+    assert np.allclose(fast[1].sum(0), fast[0].matrix)
+
+
+@pytest.mark.parametrize("times", [(1, 3), (2, 5)])
+def test_grids_of_kernels_and_opencv_agree(times):
+    if library() is None:
+        pytest.skip("no compiled kernels")
+    frame = press(objects.gear(), objects.pose(5.0, (9.0, 6.0), 0.5, (3.0, 1.0)))  # cut by the border of the image
+    frame = contact_frame(_bad(frame, contact=frame.contact & (torch.rand(frame.contact.shape) < 0.95)))
+    fast = grids(frame, PITCH, 0.03, times)
     with reference_only():
-        slow = sum_residuals(frame.fine, keyframe.many, pose, 0.05)
-    assert np.allclose(fast.matrix, slow.matrix, rtol=1e-3, atol=1e-3 * np.abs(slow.matrix).max())
-    assert np.allclose(fast.right, slow.right, rtol=1e-3, atol=1e-3 * np.abs(slow.right).max())
-    assert fast[2:] == pytest.approx(slow[2:], rel=1e-3)
+        slow = grids(frame, PITCH, 0.03, times)
+    assert fast.touching == slow.touching > 0
+    for one, other in ((fast.fine, slow.fine), (fast.coarse, slow.coarse)):
+        assert torch.equal(one.channels[..., 3], other.channels[..., 3])
+        assert torch.allclose(one.channels, other.channels, atol=1e-6)
+        assert one[1:] == pytest.approx(other[1:], abs=1e-9)
+
+
+def test_without_kernels_the_pose_is_the_same():
     with reference_only():
         found = vts.PoseTracker(press(objects.key(), swing(0)), PITCH)(press(objects.key(), swing(1)))
     assert error(found, swing(0), swing(1))[0] < 0.1
+
+
+def test_pixels_lie_in_compact_parts_of_the_same_number(keyframe):
+    places = keyframe.many.columns[:2].T
+    ends = [keyframe.many.number * k // PARTS for k in range(PARTS + 1)]
+    sides = torch.stack([places[a:b].amax(0) - places[a:b].amin(0) for a, b in itertools.pairwise(ends)])
+    whole = places.amax(0) - places.amin(0)
+    assert float(sides.prod(1).sum()) < 1.2 * float(whole.prod())  # they hardly overlap
+    assert float(sides.amax(1).max()) < 0.75 * float(whole.amax())
+
+
+@pytest.mark.parametrize("alike", [0.0, 1.0])
+def test_the_jackknife_expects_errors_that_parts_have_in_common(alike):
+    """Independent errors, and errors that all pixels of a part share: the variance is that of repeated draws."""
+    generator = np.random.default_rng(3)
+    jacobian = generator.standard_normal((PARTS, 50, 6))
+    matrices, steps, told = np.swapaxes(jacobian, 1, 2) @ jacobian, [], []
+    for _ in range(400):
+        common = generator.standard_normal((PARTS, 1)) * alike
+        rights = np.einsum("kni,kn->ki", jacobian + 0.5, generator.standard_normal((PARTS, 50)) + common)
+        steps.append(-np.linalg.solve(matrices.sum(0), rights.sum(0)))
+        told.append(jackknife(matrices, rights, np.eye(6)) / ALIKE_PARTS)
+    ratio = np.trace(np.mean(told, 0)) / np.square(steps).sum(1).mean()
+    assert 0.9 < ratio < 1.6
+    held = jackknife(matrices, rights, np.eye(6)[:, 2:])
+    assert not held[:2].any() and np.linalg.eigvalsh(held)[2:].min() > 0
 
 
 def test_derivatives_are_those_of_the_residuals(keyframe):
@@ -322,8 +383,24 @@ def test_a_row_of_the_file_holds_pose_and_reason():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["key", "bottle cap"])
-def test_rendered_objects_meet_the_goal(name):
-    ((row, _),) = tracking.run_tracking([name], ["fast"], ["noise 0.005"], seed=4)
+@pytest.mark.parametrize(
+    ("name", "motion_", "most_mm"),
+    [("bottle cap", "slow", 0.01), ("bolt head", "slow", 0.01), ("key", "fast", 0.02), ("bolt head", "fast", 0.02)],
+)
+def test_rendered_objects_meet_the_goal(name, motion_, most_mm):
+    """Asked is the slow motion: 90 degrees in 40 frames, medians of 0.05 degrees and 0.01 mm. The fast one, in 14 frames, has
+    half as strict a position: of a key it follows the depth, whose offset changes by 0.02 mm with the yaw."""
+    ((row, _),) = tracking.run_tracking([name], [motion_], ["noise 0.005"], seed=4)
     assert row.lost == [] and row.wrong == []
-    assert float(np.median(row.deg)) < 0.05 and float(np.median(row.mm)) < 0.02 and max(row.deg) < 0.3
+    assert float(np.median(row.deg)) < 0.05 and float(np.median(row.mm)) < most_mm and max(row.deg) < 0.3
+
+
+@pytest.mark.long
+def test_slopes_that_err_over_wide_areas_are_no_reason_for_confidence():
+    ((row, track),) = tracking.run_tracking(["tool handle"], ["fast"], ["slopes off by 3 degrees"], seed=4)
+    assert max(row.deg) > 1.0 and row.lost == [] and row.wrong == []
+    tracker = vts.PoseTracker(track.frames[0], track.mm_per_pixel)
+    found = tracker(track.frames[5])
+    assert not found.converged and "parts of the contact disagree" in found.message
+    std = np.rad2deg(np.sqrt(np.trace(found.covariance[:3, :3].numpy())))
+    assert tracking.tracking_error(found, track, 5)[0] < 4.0 * std

@@ -11,8 +11,10 @@ import functools
 import warnings
 import zlib
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -91,9 +93,12 @@ def library() -> ctypes.CDLL | None:
     loaded.finish_depth.argtypes = [*[pointer] * 3, *[whole] * 7, pointer]
     loaded.largest_change.argtypes = [pointer, pointer, whole, step, pointer]
     loaded.uncrop.argtypes = [*[pointer] * 2, *[whole] * 7, *[pointer] * 3]
-    loaded.alignment_sums.argtypes = [pointer, whole, whole, pointer, whole, pointer, pointer]
+    loaded.alignment_sums.argtypes = [pointer, whole, whole, pointer, step, whole, whole, pointer, pointer]
+    loaded.part_sums.argtypes = [pointer, whole, whole, pointer, step, whole, whole, pointer, pointer]
+    loaded.refine_pose.argtypes = [pointer, whole, whole, pointer, step, whole, whole, pointer, pointer, whole, pointer, pointer]
+    loaded.track_grids.argtypes = [pointer, pointer, pointer, whole, whole, real, whole, whole, pointer, pointer]
     without_result = ("grid_means", "solve_shadowed", "slopes", "to_columns", "finish_depth", "largest_change", "uncrop")
-    for name in (*without_result, "alignment_sums"):
+    for name in (*without_result, "alignment_sums", "part_sums", "refine_pose"):
         getattr(loaded, name).restype = None
     return loaded
 
@@ -514,9 +519,47 @@ def zero_background(depth_mm: Tensor, deformed: Tensor, stiff: float, tolerance:
     return out
 
 
-def alignment_sums(field: Tensor, pixels: Tensor, numbers: Tensor) -> Tensor:
-    """Sums (63,) float64 of one Gauss-Newton step: see :mod:`torchvts.pose.inverse`, whose tensors these are, contiguous."""
-    sums = torch.empty(63, dtype=torch.float64)
-    inputs = (field.data_ptr(), field.shape[0], field.shape[1], pixels.data_ptr(), pixels.shape[0], numbers.data_ptr())
-    _loaded().alignment_sums(*inputs, sums.data_ptr())
+def alignment_sums(field: Tensor, columns: Tensor, limits: npt.NDArray[Any], score_only: bool = False) -> npt.NDArray[Any]:
+    """Sums (56,) float64 of one Gauss-Newton step: see :mod:`torchvts.pose.inverse`, whose tensors these are."""
+    sums = np.empty(56)
+    inputs = (field.data_ptr(), *field.shape[:2], columns.data_ptr(), columns.stride(0), columns.shape[1], score_only)
+    _loaded().alignment_sums(*inputs, limits.ctypes.data, sums.ctypes.data)
     return sums
+
+
+def part_sums(field: Tensor, columns: Tensor, parts: int, limits: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Sums (parts, 56) float64 of as many runs of pixels, as of :func:`alignment_sums`."""
+    sums = np.empty((parts, 56))
+    inputs = (field.data_ptr(), *field.shape[:2], columns.data_ptr(), columns.stride(0), columns.shape[1], parts)
+    _loaded().part_sums(*inputs, limits.ctypes.data, sums.ctypes.data)
+    return sums
+
+
+def refine_pose(
+    field: Tensor, columns: Tensor, steps: int, settings: npt.NDArray[Any], held: npt.NDArray[Any], limits: npt.NDArray[Any]
+) -> npt.NDArray[Any]:
+    """Gauss-Newton steps; moves the pose in ``limits``. Returns the sums (56,) of the last step, and the noise of its weights."""
+    sums, held = np.empty(57), np.ascontiguousarray(held)
+    inputs = (field.data_ptr(), *field.shape[:2], columns.data_ptr(), columns.stride(0), columns.shape[1], steps)
+    _loaded().refine_pose(*inputs, settings.ctypes.data, held.ctypes.data, held.shape[1], limits.ctypes.data, sums.ctypes.data)
+    return sums
+
+
+def track_grids(
+    depth: Tensor, slopes: Tensor, contact: Tensor, least_mm: float, times: tuple[int, int]
+) -> tuple[Tensor, Tensor, int]:
+    """Fine and coarse channels (H, W, 4) of a frame, and how many fine pixels lie on it: see :mod:`torchvts.pose.keyframe`.
+
+    Args:
+        depth: (1, 1, H, W), contiguous as the others.
+        slopes: (1, 2, H, W), y down.
+        contact: (1, 1, H, W) bool.
+        least_mm: depth from which skin surely lies on the object.
+        times: pixels a side of the cells of both grids.
+    """
+    height, width = depth.shape[-2:]
+    fine, coarse = (torch.empty(height // n, width // n, 4) for n in times)
+    inputs = (depth.data_ptr(), slopes.data_ptr(), contact.data_ptr(), height, width, least_mm, *times)
+    touching = _loaded().track_grids(*inputs, fine.data_ptr(), coarse.data_ptr())
+    _check(touching < 0)
+    return fine, coarse, int(touching)

@@ -8,14 +8,21 @@ import torch
 
 from .alignment import SLOPE_NOISE, agrees_enough
 from .ambiguity import ALIKE_PIXELS, LEAST_INFORMATION, UNKNOWN_VARIANCE, free_directions, name_directions
-from .inverse import Array, Field, Pixels, Sums, refine, sum_residuals
-from .keyframe import Grids, Keyframe
+from .inverse import LEAST_NOISE, Array, Field, Pixels, Sums, moved_by, refine, solve_step, sum_parts, sum_residuals
+from .jackknife import jackknife
+from .keyframe import PARTS, Grids, Keyframe
 
-COARSE_STEPS, SOME_STEPS = 8, 6
+COARSE_STEPS, SOME_STEPS = 15, 30
 """Largest number of steps on the coarse grid, and with some pixels of the fine one."""
 
-INDEPENDENT_PARTS = 6
-"""Parts of a contact over which errors of a calibrated sensor are independent: they are smooth, as its fields are."""
+HEIGHT_OFFSET_MM = 0.02
+"""Error of all heights of a contact alike, which its frames cannot show: the relief of a real GelSight Mini errs by so much."""
+
+LAST_STEP_MM = 0.03
+"""A last step of more than this, at the contact, is not the end of the way."""
+
+TRUSTED_DEG, TRUSTED_MM = 1.0, 0.15
+"""A pose is trusted if three times its standard deviations are within these."""
 
 MOST_STD_DEG, MOST_STD_MM = 1.0, 0.15
 """Standard deviations of a motion, as a turn and as a shift, above which it is called unknown."""
@@ -32,6 +39,9 @@ class Followed(NamedTuple):
         cost: mean truncated residual, 0 to 1.
         free: (6, k), scaled twists that the common contact does not determine.
         names: of these motions, in the frame's axes.
+        std_deg: standard deviation of the rotations that are known, degrees.
+        std_mm: the same of the shifts, at the centre of the keyframe's contact, mm.
+        settled: whether the last step was a small one.
         covariance: (6, 6) of a small motion after the pose, rad and mm.
     """
 
@@ -42,6 +52,9 @@ class Followed(NamedTuple):
     cost: float
     free: Array
     names: list[str]
+    std_deg: float
+    std_mm: float
+    settled: bool
     covariance: Array
 
     @property
@@ -49,10 +62,15 @@ class Followed(NamedTuple):
         """Whether the frames agree well enough on a large enough part."""
         return agrees_enough(self.fitness, self.overlap, self.cost)
 
+    @property
+    def exact(self) -> bool:
+        """Whether the pose is certain enough to be trusted."""
+        return self.settled and 3.0 * self.std_deg <= TRUSTED_DEG and 3.0 * self.std_mm <= TRUSTED_MM
+
 
 def follow(keyframe: Keyframe, frame: Grids, starts: list[Array]) -> Followed:
     """Register a frame to a keyframe from the most likely of several poses, and from the others if that leads nowhere."""
-    order = sorted(starts, key=lambda start: sum_residuals(frame.coarse, keyframe.coarse, start, SLOPE_NOISE).cost)
+    order = sorted(starts, key=lambda start: sum_residuals(frame.coarse, keyframe.coarse, start, SLOPE_NOISE, score_only=True).cost)
     first = _follow_from(keyframe, frame, order[0])
     if not first.agrees:
         for start in order[1:]:
@@ -71,23 +89,33 @@ def _follow_from(keyframe: Keyframe, frame: Grids, start: Array) -> Followed:
     if vague.motions.shape[1] > 0:
         unknown = _joined(unknown, vague)
         refined, some = refine(frame.fine, keyframe.some, pose, SOME_STEPS, SLOPE_NOISE, unknown.motions, 2e-3)
-    free = unknown.motions
-    pose, fine = refine(frame.fine, keyframe.many, refined, 1, 1.5 * max(some.slope_noise, 0.01), free)
-    forth = sum_residuals(frame.coarse, keyframe.coarse, pose, SLOPE_NOISE)
-    back_pixels = _pixels(frame.coarse)
-    back = sum_residuals(keyframe.grids.coarse, back_pixels, np.linalg.inv(pose), SLOPE_NOISE)
+    noise = max(LEAST_NOISE, 1.5 * some.slope_noise)
+    fine, matrices, rights = sum_parts(frame.fine, keyframe.many, refined, noise, PARTS)
+    last = solve_step(fine, unknown.motions)
+    pose = refined @ moved_by(keyframe.many, last)
+    scaled = _covariance(fine, jackknife(matrices, rights, _others(unknown.motions)), unknown.motions)
+    forth = sum_residuals(frame.coarse, keyframe.coarse, pose, SLOPE_NOISE, score_only=True)
+    pixels = _pixels(frame.coarse)
+    back = sum_residuals(keyframe.grids.coarse, pixels, np.linalg.inv(pose), SLOPE_NOISE, score_only=True)
     compared = max(forth.compared + back.compared, 1.0)
-    cost = (forth.cost * forth.compared + back.cost * back.compared) / compared
-    fitness = (forth.fitness * forth.compared + back.fitness * back.compared) / compared
-    overlap = max(forth.compared / len(keyframe.coarse.rows), back.compared / max(len(back_pixels.rows), 1))
     return Followed(
-        pose, fine, fitness, overlap, cost, free, _names(unknown, pose), _covariance(keyframe.many, fine, forth, pose, free)
+        pose=pose,
+        fine=fine,
+        fitness=(forth.fitness * forth.compared + back.fitness * back.compared) / compared,
+        overlap=max(forth.compared / keyframe.coarse.number, back.compared / max(pixels.number, 1)),
+        cost=(forth.cost * forth.compared + back.cost * back.compared) / compared,
+        free=unknown.motions,
+        names=_names(unknown, pose),
+        std_deg=math.degrees(math.sqrt(float(np.diag(scaled)[:3] @ keyframe.many.units[:3] ** 2))),
+        std_mm=math.sqrt(float(np.trace(scaled[3:, 3:]))),
+        settled=float(np.linalg.norm(last)) < LAST_STEP_MM,
+        covariance=_after(keyframe.many, pose, scaled + unknown.motions @ unknown.motions.T * UNKNOWN_VARIANCE),
     )
 
 
 def common_share(keyframe: Keyframe, frame: Grids, sums: Sums, pixels: Pixels) -> float:
     """Share of the smaller contact that both have in common, by the sums over fine pixels of the keyframe."""
-    return sums.used / len(pixels.rows) * keyframe.touching / max(min(keyframe.touching, frame.touching), 1)
+    return sums.used / pixels.number * keyframe.touching / max(min(keyframe.touching, frame.touching), 1)
 
 
 def orthonormal(pose: Array) -> Array:
@@ -114,11 +142,12 @@ def cross(v: Array) -> Array:
 
 def _pixels(field: Field) -> Pixels:
     """The pixels of a coarse field that lie on the object, without derivatives."""
-    row, column = torch.nonzero(field.channels[..., 3] > 0.999, as_tuple=True)
-    rows = torch.zeros(len(row), 32)
-    rows[:, 0], rows[:, 1] = field.x0 + column * field.pitch, field.y0 - row * field.pitch
-    rows[:, 2:5] = field.channels[row, column, :3]
-    return Pixels(rows, np.zeros(3), np.ones(6))
+    channels = field.channels.numpy()
+    row, column = np.nonzero(channels[..., 3] > 0.999)
+    columns = np.empty((5, len(row)), np.float32)
+    columns[0], columns[1] = field.x0 + column * field.pitch, field.y0 - row * field.pitch
+    columns[2:] = channels[row, column, :3].T
+    return Pixels(torch.from_numpy(columns), np.zeros(3), np.ones(6))
 
 
 class _Unknown(NamedTuple):
@@ -130,20 +159,24 @@ class _Unknown(NamedTuple):
 
 def _sliding(keyframe: Keyframe, coarse: Sums) -> _Unknown:
     """Motions under which the common contact slides on itself, by its information, and those that the keyframe may roll by."""
-    information = torch.from_numpy(coarse.matrix * ((coarse.noise / SLOPE_NOISE) ** 2 / max(coarse.used, 1)))
-    free, shifts = free_directions(information, keyframe.bias, LEAST_INFORMATION)
-    found = _Unknown(free.numpy(), shifts.numpy())
-    return _joined(found, _Unknown(keyframe.held, shifts.numpy())) if keyframe.held.shape[1] > 0 else found
+    information = coarse.matrix * ((coarse.noise / SLOPE_NOISE) ** 2 / max(coarse.used, 1))
+    found = _Unknown(np.zeros((6, 0)), np.zeros((3, 0)))
+    if np.linalg.eigvalsh(information)[0] < LEAST_INFORMATION + 3.0 * keyframe.most_bias:  # else no direction has less
+        free, shifts = free_directions(torch.from_numpy(information), keyframe.bias, LEAST_INFORMATION)
+        found = _Unknown(free.numpy(), shifts.numpy())
+    return _joined(found, _Unknown(keyframe.held, found.shifts)) if keyframe.held.shape[1] > 0 else found
 
 
 def _vague(keyframe: Keyframe, some: Sums) -> _Unknown:
     """Motions whose standard deviation is too large, because the common contact is small or faint."""
     wanted = np.concatenate((math.radians(MOST_STD_DEG) / keyframe.some.units[:3], np.full(3, MOST_STD_MM)))
-    alike = max(1.0, ALIKE_PIXELS * len(keyframe.some.rows) / keyframe.touching)
+    alike = max(1.0, ALIKE_PIXELS * keyframe.some.number / keyframe.touching)
     matrix = some.matrix * wanted[:, None] * wanted / (alike * (max(some.slope_noise, 1e-3) / some.noise) ** 2)
+    if np.linalg.eigvalsh(matrix)[0] >= 1.0:  # 1 where the standard deviation is as wanted
+        return _Unknown(np.zeros((6, 0)), np.zeros((3, 0)))
 
     def below(part: Array, scale: Array) -> Array:
-        precision, directions = np.linalg.eigh(part)  # 1 where the standard deviation is as wanted
+        precision, directions = np.linalg.eigh(part)
         return np.linalg.qr(directions[:, precision < 1.0] * scale[:, None])[0]
 
     return _Unknown(below(matrix, wanted), below(matrix[3:, 3:], wanted[3:]))
@@ -168,18 +201,24 @@ def _names(unknown: _Unknown, pose: Array) -> list[str]:
     return name_directions(torch.from_numpy(turned), torch.from_numpy(turn @ unknown.shifts))
 
 
-def _covariance(pixels: Pixels, fine: Sums, coarse: Sums, pose: Array, free: Array) -> Array:
-    """Covariance of a small motion after the pose.
+def _others(motions: Array) -> Array:
+    """Orthonormal columns (6, 6 - k) beside those of motions (6, k)."""
+    return np.linalg.qr(motions, mode="complete")[0][:, motions.shape[1] :] if motions.shape[1] else np.eye(6)
 
-    Residuals are alike over some pixels, and an error of the height is alike over all of them. What is left of residuals in
-    means over cells is alike over a large part of the contact, and tilts it.
-    """
+
+def _covariance(fine: Sums, by_parts: Array, free: Array) -> Array:
+    """Covariance of the scaled twist: from parts of the contact, the noise of pixels, and an error of all heights."""
     known = np.eye(6) - free @ free.T
-    scaled = np.linalg.pinv(known @ fine.matrix @ known, rcond=1e-9, hermitian=True)
-    scaled *= ALIKE_PIXELS * (fine.slope_noise / fine.noise) ** 2
-    scaled[5, 5] += fine.depth_noise**2
-    scaled[[0, 1], [0, 1]] += (coarse.slope_noise / pixels.units[:2]) ** 2 / INDEPENDENT_PARTS
-    scaled += free @ free.T * UNKNOWN_VARIANCE
+    matrix = known @ fine.matrix @ known
+    matrix[5, :] = matrix[:, 5] = 0.0  # heights have a weight of their own
+    noise = np.linalg.pinv(matrix, rcond=1e-9, hermitian=True)
+    scaled: Array = by_parts + noise * (fine.slope_noise / fine.noise) ** 2
+    scaled[5, 5] += fine.depth_noise**2 + HEIGHT_OFFSET_MM**2
+    return scaled
+
+
+def _after(pixels: Pixels, pose: Array, scaled: Array) -> Array:
+    """Covariance of a small motion after the pose, from that of a scaled twist before it."""
     to_origin = np.diag(pixels.units)
     to_origin[3:, :3] = cross(pixels.center) @ to_origin[:3, :3]
     after = adjoint(pose) @ to_origin

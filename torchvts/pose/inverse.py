@@ -5,6 +5,7 @@ with respect to its own motion. So they are computed once per reference. Slopes 
 """
 
 import math
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,14 +53,19 @@ class Pixels(NamedTuple):
     """Pixels of a reference and their derivatives by a scaled twist about ``center``.
 
     Attributes:
-        rows: (N, 32), x, y, z, p, q, three zeros, and the rows of p, q and z of the Jacobian, each six and two zeros.
+        columns: (23, N), one column a pixel: x, y, z, p, q, and what p, q and z change by each of the six twists.
         center: (3,), mm.
         units: (6,), rad and mm: the twist that is one of each, so that all six are lengths at the contact.
     """
 
-    rows: Tensor
+    columns: Tensor
     center: Array
     units: Array
+
+    @property
+    def number(self) -> int:
+        """Of pixels."""
+        return self.columns.shape[1]
 
 
 class Sums(NamedTuple):
@@ -91,13 +97,9 @@ class Sums(NamedTuple):
 def reference_pixels(part: Relief, relief: Relief, center: Tensor, units: Tensor) -> Pixels:
     """Pixels of a part of a relief, with the derivatives that the relief's field has there."""
     lin = linearise(part, relief, torch.eye(4, dtype=torch.float64)[None], center[None, None])
-    rows = torch.zeros(len(part.points), 32)
-    rows[:, :3], rows[:, 3:5] = part.points, part.slopes
-    scale = units.float()
-    rows[:, 8:14] = lin.slope_by_twist[0, :, 0] * scale
-    rows[:, 16:22] = lin.slope_by_twist[0, :, 1] * scale
-    rows[:, 24:30] = lin.height_by_twist[0] * scale
-    return Pixels(rows, center.numpy(), units.numpy())
+    by = torch.cat((lin.slope_by_twist[0], lin.height_by_twist[0][:, None]), 1) * units.float()  # (N, 3, 6)
+    columns = torch.cat((part.points, part.slopes, by.flatten(1)), 1).float().T.contiguous()
+    return Pixels(columns, center.numpy(), units.numpy())
 
 
 def refine(
@@ -116,11 +118,18 @@ def refine(
     Returns:
         The pose, and the sums under the pose before the last step.
     """
+    if held is None:
+        held = np.zeros((6, 0))
+    if usable(field.channels, pixels.columns):
+        limits = _limits(field, pose, wide)
+        settings = np.concatenate((pixels.units, pixels.center, (wide, LEAST_NOISE, LARGEST_STEP_MM, small_mm)))
+        total = kernels.refine_pose(field.channels, pixels.columns, steps, settings, held, limits)
+        return limits[:16].reshape(4, 4), _sums(total[:56], float(total[56]))
     noise = wide
     for _ in range(steps):
         sums = sum_residuals(field, pixels, pose, noise)
         step = solve_step(sums, held)
-        pose = pose @ _motion(step * pixels.units, pixels.center)
+        pose = pose @ moved_by(pixels, step)
         noise = max(LEAST_NOISE, 1.5 * sums.slope_noise, 0.5 * noise)
         if float(np.abs(step).max()) < small_mm:
             break
@@ -143,8 +152,9 @@ def solve_step(sums: Sums, held: Array | None = None) -> Array:
     return step
 
 
-def _motion(twist: Array, center: Array) -> Array:
-    """The rigid motion (4, 4) of :func:`torchvts.pose.result.motion`, by Rodrigues' formula: a tenth of its time."""
+def moved_by(pixels: Pixels, step: Array) -> Array:
+    """The rigid motion (4, 4) of a scaled twist, by Rodrigues' formula: a tenth of the time of ``result.motion``."""
+    twist, center = step * pixels.units, pixels.center
     x, y, z = twist[:3].tolist()
     angle = math.sqrt(x * x + y * y + z * z)
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -155,23 +165,47 @@ def _motion(twist: Array, center: Array) -> Array:
     return result
 
 
-def sum_residuals(field: Field, pixels: Pixels, pose: Array, slope_noise: float) -> Sums:
+def sum_residuals(field: Field, pixels: Pixels, pose: Array, slope_noise: float, score_only: bool = False) -> Sums:
     """Sums of one Gauss-Newton step with Cauchy's weights, and the score of the pose (4, 4), from the reference to the field."""
-    limits = (field.x0, field.y0, field.pitch, slope_noise**-2, DEPTH_DRIFT_MM**-2, *SCORE, DEEP_MM, SHALLOW_MM)
-    numbers = torch.from_numpy(np.concatenate((pose[:3, :3].ravel(), pose[:3, 3], limits)))
-    by = kernels.alignment_sums if usable(field.channels, pixels.rows) else alignment_sums
-    total = by(field.channels, pixels.rows, numbers).numpy()
-    matrix = total[:56].reshape(7, 8)
-    count, weight, off, high, bad, good, compared = total[56:].tolist()
+    by = kernels.alignment_sums if usable(field.channels, pixels.columns) else alignment_sums
+    return _sums(by(field.channels, pixels.columns, _limits(field, pose, slope_noise), score_only), slope_noise)
+
+
+def sum_parts(field: Field, pixels: Pixels, pose: Array, slope_noise: float, parts: int) -> tuple[Sums, Array, Array]:
+    """:func:`sum_residuals`, and the matrices (parts, 6, 6) and right sides (parts, 6) of as many runs of pixels."""
+    limits = _limits(field, pose, slope_noise)
+    if usable(field.channels, pixels.columns):
+        found = kernels.part_sums(field.channels, pixels.columns, parts, limits)
+    else:
+        ends = [pixels.number * k // parts for k in range(parts + 1)]
+        runs = [pixels.columns[:, first:end] for first, end in pairwise(ends)]
+        found = np.stack([alignment_sums(field.channels, run, limits) for run in runs])
+    products = found[:, :49].reshape(parts, 7, 7)
+    return _sums(found.sum(0), slope_noise), products[:, :6, :6], products[:, :6, 6]
+
+
+def _limits(field: Field, pose: Array, slope_noise: float) -> Array:
+    """What the residuals depend on beside the pixels, (25,)."""
+    limits = np.empty(25)
+    limits[:16] = pose.ravel()
+    limits[16:] = (
+        field.x0, field.y0, field.pitch, slope_noise**-2, DEPTH_DRIFT_MM**-2, *SCORE, DEEP_MM, SHALLOW_MM,
+    )  # fmt: skip
+    return limits
+
+
+def _sums(total: Array, slope_noise: float) -> Sums:
+    matrix = total[:49].reshape(7, 7)
+    count, weight, off, high, bad, good, compared = total[49:].tolist()
     most = max(compared, 1.0)
     slope, depth = math.sqrt(0.5 * off / max(weight, 1e-9)), math.sqrt(high / max(weight, 1e-9))
     return Sums(matrix[:6, :6], matrix[:6, 6], int(count), slope, depth, bad / most, good / most, compared, slope_noise)
 
 
-def alignment_sums(channels: Tensor, rows: Tensor, numbers: Tensor) -> Tensor:
-    """Sums (63,) float64: 7 x 8 products of the Jacobian with itself and the residual, then seven of the score."""
-    n = [float(v) for v in numbers[12:]]
-    rotation, shift = numbers[:9].reshape(3, 3).float(), numbers[9:12].float()
+def alignment_sums(channels: Tensor, columns: Tensor, limits: Array, score_only: bool = False) -> Array:
+    """Sums (56,) float64: 7 x 7 products of the Jacobian and the residual, zero with ``score_only``, then seven of the score."""
+    place, n = torch.from_numpy(limits[:16].reshape(4, 4)).float(), limits[16:].tolist()
+    rotation, shift, rows = place[:3, :3], place[:3, 3], columns.T
     height, width = channels.shape[:2]
     moved = rows[:, :3] @ rotation.T + shift
     column, row = (moved[:, 0] - n[0]) / n[2], (n[1] - moved[:, 1]) / n[2]
@@ -187,13 +221,15 @@ def alignment_sums(channels: Tensor, rows: Tensor, numbers: Tensor) -> Tensor:
     error = torch.where(inside, off * n[5] + high * n[6], 1.0).clamp_max(1.0)
     used = inside & (moved[:, 2] > n[8])
     weight = used / (1.0 + 0.25 * (off * n[3] + high * n[4]))
-    lines = rows[:, 8:].reshape(-1, 3, 8).clone()
-    lines[:, :, 6] = residual
-    scaled = lines * (weight[:, None, None] * lines.new_tensor([n[3], n[3], n[4]])[:, None])
-    products = torch.einsum("nri,nrk->ik", scaled[..., :7].double(), lines.double())
+    products = torch.zeros(7, 7, dtype=torch.float64)
+    if not score_only:
+        lines = torch.cat((rows[:, 5:].reshape(-1, 3, 6), residual[..., None]), 2)
+        scaled = lines * (weight[:, None, None] * lines.new_tensor([n[3], n[3], n[4]])[:, None])
+        products = torch.einsum("nri,nrk->ik", scaled.double(), lines.double())
     score = [used.sum(), weight.sum(), (weight * off).sum(), (weight * high).sum()]
     score += [error[counted].sum(), (error[counted] < 1.0).sum(), counted.sum()]
-    return torch.cat((products.reshape(-1), torch.stack([s.double() for s in score])))
+    total: Array = torch.cat((products.reshape(-1), torch.stack([s.double() for s in score]))).numpy()
+    return total
 
 
 def _between(channels: Tensor, row: Tensor, column: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..core.checks import check_positive
-from .alignment import SLOPE_NOISE
+from .alignment import MOST_COST, SLOPE_NOISE, agrees_enough
 from .ambiguity import UNKNOWN_VARIANCE
 from .direct import align, check_rigid, symmetries
 from .follow import Followed, common_share, cross, follow, orthonormal
@@ -33,6 +33,9 @@ JUMP_MM = 1.0
 
 RISE = 3.0
 """A residual of so many times the usual one of a track is no noise."""
+
+COST_RISE = 1.5
+"""The cost of a pose may be so many times the usual one of a track, where that is large as with a sensor whose slopes err."""
 
 PITCH_RATIO = 1.5
 """Ratio of the pitch that depth and slopes of the reference have, and the one given, beyond which it is another unit."""
@@ -167,7 +170,7 @@ class PoseTracker:
         for k in range(self._active):
             pose = expected @ np.linalg.inv(self.graph.poses[k])
             keyframe = self.graph.keyframes[k]
-            sums = sum_residuals(frame.fine, keyframe.some, pose, SLOPE_NOISE)
+            sums = sum_residuals(frame.fine, keyframe.some, pose, SLOPE_NOISE, score_only=True)
             if frame.touching < GROWN * keyframe.touching and common_share(keyframe, frame, sums, keyframe.some) > RETURN:
                 return k
         return None
@@ -187,7 +190,9 @@ class PoseTracker:
         percent = (
             f"{100 * found.fitness:.0f} % of the common contact agrees, which is {100 * found.overlap:.0f} % of the smaller one"
         )
-        if not found.agrees:
+        costs = [cost for _, cost in self._usual]
+        usual_cost = float(np.median(costs)) if len(costs) >= 3 else 0.0
+        if not agrees_enough(found.fitness, found.overlap, found.cost / max(1.0, COST_RISE * usual_cost / MOST_COST)):
             return f"nothing fits near the last pose: {percent}: another part of the object, a jump, or another object"
         usual = float(np.median([slope for slope, _ in self._usual])) if len(self._usual) >= 3 else math.inf
         if found.fine.slope_noise > max(RISE * usual, LEAST_NOISE):
@@ -253,13 +258,16 @@ class PoseTracker:
         message = f"{100 * found.fitness:.0f} % of the common contact agrees"
         if found.names:
             message += f"; kept, because the surface slides on itself: {', '.join(found.names)}"
+        if not found.exact:
+            reason = "parts of the contact disagree" if found.settled else "the last step was a large one"
+            message += f"; uncertain by {found.std_deg:.1f} degrees and {found.std_mm:.2f} mm: {reason}"
         center = found.pose[:3, :3] @ keyframe.many.center + found.pose[:3, 3]
         to_center = np.hstack((-cross(center), np.eye(3)))
         return TrackedPose(
             T_target_source=torch.from_numpy(pose.copy()),
             rmse_mm=found.fine.depth_noise,
             fitness=found.fitness,
-            converged=True,
+            converged=found.exact,
             message=message,
             covariance=torch.from_numpy(found.covariance + drift),
             ambiguous=found.names,

@@ -1,73 +1,256 @@
-/* Sums of one Gauss-Newton step of a tracked pose: the same results as torchvts/pose/inverse.py, which explains them. */
+/* Gauss-Newton steps of a tracked pose: the same results as torchvts/pose/inverse.py, which explains them. */
 #include "kernels.h"
+#include <math.h>
 
-#define PLACES 8
-#define LINES 3
-#define FIRST 8 /* of a pixel's Jacobian; before it: x, y, z, p, q */
-#define PIXEL 32
+#define INLINE static inline __attribute__((always_inline))
+#define LANES 8
 #define BLOCK 64 /* pixels that are summed in float32 */
+#define SIZE 7   /* six twists and the residual */
+#define PAIRS 28 /* of them, each once */
+#define SUMS 56  /* SIZE * SIZE products, then seven sums of the score */
 
-typedef float Line __attribute__((vector_size(4 * PLACES), aligned(4)));
+typedef float Lanes __attribute__((vector_size(4 * LANES), aligned(4)));
 
-/* field (height, width, 4); pixels (count, 32): x, y, z, p, q, three zeros, then the rows of p, q, z of the Jacobian, each of six and
-   two zeros; numbers: see sum_residuals in inverse.py; sums: 7 x 8 of the products, then seven of the score. */
-EXPORT WIDE void alignment_sums(
-    const float *field, int height, int width, const float *pixels, int count, const double *numbers, double *sums) {
-    float R[9], t[3];
-    for (int k = 0; k < 9; k++) R[k] = (float)numbers[k];
-    for (int k = 0; k < 3; k++) t[k] = (float)numbers[9 + k];
-    const float x0 = (float)numbers[12], y0 = (float)numbers[13], per_mm = (float)(1.0 / numbers[14]);
-    const float per_slope = (float)numbers[15], per_height = (float)numbers[16]; /* 1 / noise^2 */
-    const float score_slope = (float)numbers[17], score_height = (float)numbers[18], deep = (float)numbers[19];
-    const float shallow = (float)numbers[20], last_column = (float)(width - 1), last_row = (float)(height - 1);
-    float used = 0.0f, weights = 0.0f, slopes = 0.0f, heights = 0.0f, bad = 0.0f, good = 0.0f, compared = 0.0f;
-    Line total[PLACES - 1];
-    memset(sums, 0, 7 * PLACES * sizeof(double));
-    memset(total, 0, sizeof(total));
-    for (int n = 0; n < count; n++) {
-        const float *pixel = pixels + (size_t)PIXEL * n;
-        const float x = pixel[0], y = pixel[1], z = pixel[2];
-        const float moved_z = R[6] * x + R[7] * y + R[8] * z + t[2];
-        const float column = (R[0] * x + R[1] * y + R[2] * z + t[0] - x0) * per_mm;
-        const float row = (y0 - (R[3] * x + R[4] * y + R[5] * z + t[1])) * per_mm;
-        if (column >= 0.0f && column <= last_column && row >= 0.0f && row <= last_row && moved_z > shallow) {
-            const int top = least((int)row, height - 2), left = least((int)column, width - 2);
-            const float down = row - (float)top, along = column - (float)left;
-            const float *upper = field + 4 * ((size_t)top * width + left), *lower = upper + 4 * (size_t)width;
-            float found[4]; /* z, p, q, mask between pixels */
-            for (int k = 0; k < 4; k++) {
-                const float a = upper[k] + along * (upper[k + 4] - upper[k]), b = lower[k] + along * (lower[k + 4] - lower[k]);
-                found[k] = a + down * (b - a);
-            }
-            const int inside = found[3] > 0.999f;
-            const float p = found[1], q = found[2];
-            const float up = R[8] - R[2] * p - R[5] * q, steep = 1.0f / (up > 0.05f ? up : 0.05f);
-            const float off_p = (R[0] * p + R[3] * q - R[6]) * steep - pixel[3];
-            const float off_q = (R[1] * p + R[4] * q - R[7]) * steep - pixel[4];
-            const float off_z = found[0] - moved_z;
-            const float off = off_p * off_p + off_q * off_q, high = off_z * off_z;
-            if (moved_z > deep && (inside || found[3] <= 0.001f)) {
-                const float error = inside ? off * score_slope + high * score_height : 1.0f;
-                bad += error < 1.0f ? error : 1.0f, good += error < 1.0f ? 1.0f : 0.0f, compared += 1.0f;
-            }
-            if (inside) {
-                const float weight = 1.0f / (1.0f + 0.25f * (off * per_slope + high * per_height));
-                used += 1.0f, weights += weight, slopes += weight * off, heights += weight * high;
-                const float residual[LINES] = {off_p, off_q, off_z};
-                for (int r = 0; r < LINES; r++) {
-                    Line line = *(const Line *)(pixel + FIRST + PLACES * r);
-                    line[6] = residual[r];
-                    const Line scaled = line * (weight * (r < 2 ? per_slope : per_height));
-                    for (int i = 0; i < PLACES - 1; i++) total[i] += scaled[i] * line;
-                }
-            }
-        }
-        if (n % BLOCK == BLOCK - 1 || n == count - 1) {
-            for (int i = 0; i < PLACES - 1; i++)
-                for (int k = 0; k < PLACES; k++) sums[PLACES * i + k] += (double)total[i][k];
-            memset(total, 0, sizeof(total));
+/* What the residuals depend on beside the pixels; the order is that of limits_of in inverse.py. */
+typedef struct {
+    double pose[16], x0, y0, pitch, per_slope, per_height, score_slope, score_height, deep, shallow;
+} Limits;
+
+/* What the steps depend on; the order is that of refine in inverse.py. */
+typedef struct {
+    double units[6], center[3], wide, least_noise, largest_mm, small_mm;
+} Steps;
+
+/* A block of pixels in the new frame. */
+typedef struct {
+    float place[BLOCK], along[BLOCK], down[BLOCK], z[BLOCK], found[4][BLOCK], slope[2][BLOCK], height[BLOCK];
+    float weight[BLOCK], used[BLOCK], bad[BLOCK], good[BLOCK], compared[BLOCK];
+    int first[BLOCK];
+} Block;
+
+/* Where the pixels (x, y, z in rows of `points`) come to lie, and what the field (height, width, 4) holds between its pixels there. */
+INLINE void look_up(const float *field, int height, int width, const float *points, int64_t stride, int size, const Limits *at, Block *b) {
+    float P[12];
+    for (int k = 0; k < 12; k++) P[k] = (float)at->pose[k];
+    const float x0 = (float)at->x0, y0 = (float)at->y0, per_mm = (float)(1.0 / at->pitch);
+    const float last_column = (float)(width - 1), last_row = (float)(height - 1);
+    for (int n = 0; n < size; n++) {
+        const float x = points[n], y = points[stride + n], z = points[2 * stride + n];
+        const float column = (P[0] * x + P[1] * y + P[2] * z + P[3] - x0) * per_mm;
+        const float row = (y0 - (P[4] * x + P[5] * y + P[6] * z + P[7])) * per_mm;
+        const int within = (column >= 0.0f) & (column <= last_column) & (row >= 0.0f) & (row <= last_row);
+        const float safe_row = within ? row : 0.0f, safe_column = within ? column : 0.0f;
+        const int top = least((int)safe_row, height - 2), left = least((int)safe_column, width - 2);
+        b->z[n] = P[8] * x + P[9] * y + P[10] * z + P[11];
+        b->place[n] = within ? 1.0f : 0.0f;
+        b->first[n] = 4 * (top * width + left);
+        b->down[n] = safe_row - (float)top, b->along[n] = safe_column - (float)left;
+    }
+    for (int n = 0; n < size; n++) {
+        const float *upper = field + b->first[n], *lower = upper + 4 * (size_t)width;
+        const float along = b->along[n], down = b->down[n];
+        for (int k = 0; k < 4; k++) {
+            const float u = upper[k] + along * (upper[k + 4] - upper[k]), l = lower[k] + along * (lower[k + 4] - lower[k]);
+            b->found[k][n] = u + down * (l - u);
         }
     }
-    const float score[7] = {used, weights, slopes, heights, bad, good, compared};
-    for (int k = 0; k < 7; k++) sums[7 * PLACES + k] = (double)score[k];
+}
+
+/* Residuals, Cauchy's weights and the score of a block; slopes of the pixels in the rows 3 and 4 of `points`. */
+INLINE void compare(const float *points, int64_t stride, int size, const Limits *at, Block *b) {
+    const float a = (float)at->pose[0], c = (float)at->pose[1], d = (float)at->pose[4], e = (float)at->pose[5];
+    const float f = (float)at->pose[8], g = (float)at->pose[9], h = (float)at->pose[2], i = (float)at->pose[6], j = (float)at->pose[10];
+    const float per_slope = (float)at->per_slope, per_height = (float)at->per_height; /* 1 / noise^2 */
+    const float score_slope = (float)at->score_slope, score_height = (float)at->score_height;
+    const float deep = (float)at->deep, shallow = (float)at->shallow;
+    for (int n = 0; n < size; n++) {
+        const float p = b->found[1][n], q = b->found[2][n], mask = b->found[3][n], z = b->z[n];
+        const float up = j - h * p - i * q, steep = 1.0f / (up > 0.05f ? up : 0.05f);
+        const float off_p = (a * p + d * q - f) * steep - points[3 * stride + n];
+        const float off_q = (c * p + e * q - g) * steep - points[4 * stride + n];
+        const float off_z = b->found[0][n] - z, off = off_p * off_p + off_q * off_q, high = off_z * off_z;
+        const int within = (b->place[n] > 0.5f) & (z > shallow), inside = within & (mask > 0.999f);
+        const int counted = within & (z > deep) & ((mask > 0.999f) | (mask <= 0.001f));
+        const float error = inside ? off * score_slope + high * score_height : 1.0f;
+        b->bad[n] = counted ? (error < 1.0f ? error : 1.0f) : 0.0f;
+        b->good[n] = counted & (error < 1.0f) ? 1.0f : 0.0f;
+        b->compared[n] = counted ? 1.0f : 0.0f;
+        b->used[n] = inside ? 1.0f : 0.0f;
+        b->weight[n] = inside ? 1.0f / (1.0f + 0.25f * (off * per_slope + high * per_height)) : 0.0f;
+        b->slope[0][n] = off_p, b->slope[1][n] = off_q, b->height[n] = off_z;
+    }
+    const int whole = (size + LANES - 1) / LANES * LANES;
+    for (int n = size; n < whole; n++) {
+        b->weight[n] = b->used[n] = b->bad[n] = b->good[n] = b->compared[n] = 0.0f;
+        b->slope[0][n] = b->slope[1][n] = b->height[n] = 0.0f;
+    }
+}
+
+/* Adds the weighted products of the rows of p, q and z of the Jacobian (18, ...), and of the residuals. */
+INLINE void add_products(const float *jacobian, int64_t stride, int size, const Limits *at, const Block *b, Lanes *total) {
+    const float scales[3] = {(float)at->per_slope, (float)at->per_slope, (float)at->per_height};
+    const float *residuals[3] = {b->slope[0], b->slope[1], b->height};
+    for (int n = 0; n < size; n += LANES) {
+        const Lanes weight = *(const Lanes *)(b->weight + n);
+        for (int r = 0; r < 3; r++) {
+            Lanes line[SIZE];
+            for (int k = 0; k < SIZE - 1; k++) line[k] = *(const Lanes *)(jacobian + (6 * r + k) * stride + n);
+            line[SIZE - 1] = *(const Lanes *)(residuals[r] + n);
+            for (int k = 0, pair = 0; k < SIZE; k++) {
+                const Lanes scaled = weight * scales[r] * line[k];
+                for (int m = k; m < SIZE; m++) total[pair++] += scaled * line[m];
+            }
+        }
+    }
+}
+
+INLINE double sum_of(const Lanes *lanes) {
+    double sum = 0.0;
+    for (int k = 0; k < LANES; k++) sum += (double)(*lanes)[k];
+    return sum;
+}
+
+/* Sums over `count` pixels: columns (23, stride) x, y, z, p, q and the 18 of the Jacobian; without the Jacobian, the score alone. */
+EXPORT WIDE void alignment_sums(
+    const float *field, int height, int width, const float *columns, int64_t stride, int count, int score_only, const Limits *at,
+    double *sums) {
+    Block b;
+    float tail[18 * BLOCK];
+    double products[PAIRS] = {0.0}, score[7] = {0.0};
+    for (int start = 0; start < count; start += BLOCK) {
+        const int size = least(BLOCK, count - start);
+        const float *points = columns + start, *jacobian = points + 5 * stride;
+        look_up(field, height, width, points, stride, size, at, &b);
+        compare(points, stride, size, at, &b);
+        Lanes parts[7];
+        memset(parts, 0, sizeof(parts));
+        for (int n = 0; n < size; n += LANES) {
+            const Lanes weight = *(const Lanes *)(b.weight + n), p = *(const Lanes *)(b.slope[0] + n);
+            const Lanes q = *(const Lanes *)(b.slope[1] + n), z = *(const Lanes *)(b.height + n);
+            parts[0] += *(const Lanes *)(b.used + n), parts[1] += weight;
+            parts[2] += weight * (p * p + q * q), parts[3] += weight * z * z;
+            parts[4] += *(const Lanes *)(b.bad + n), parts[5] += *(const Lanes *)(b.good + n);
+            parts[6] += *(const Lanes *)(b.compared + n);
+        }
+        for (int k = 0; k < 7; k++) score[k] += sum_of(parts + k);
+        if (score_only) continue;
+        int64_t step = stride;
+        if (size % LANES) { /* lanes beyond the last pixel hold zeros */
+            memset(tail, 0, sizeof(tail));
+            for (int k = 0; k < 18; k++) memcpy(tail + BLOCK * k, jacobian + k * stride, (size_t)size * sizeof(float));
+            jacobian = tail, step = BLOCK;
+        }
+        Lanes total[PAIRS];
+        memset(total, 0, sizeof(total));
+        add_products(jacobian, step, size, at, &b, total);
+        for (int k = 0; k < PAIRS; k++) products[k] += sum_of(total + k);
+    }
+    for (int k = 0, pair = 0; k < SIZE; k++)
+        for (int m = k; m < SIZE; m++, pair++) sums[SIZE * k + m] = sums[SIZE * m + k] = products[pair];
+    for (int k = 0; k < 7; k++) sums[SIZE * SIZE + k] = score[k];
+}
+
+/* alignment_sums of each of `parts` runs of pixels, of the same number but for one: sums (parts, SUMS). */
+EXPORT void part_sums(
+    const float *field, int height, int width, const float *columns, int64_t stride, int count, int parts, const Limits *at, double *sums) {
+    for (int k = 0; k < parts; k++) {
+        const int first = (int)((int64_t)count * k / parts), end = (int)((int64_t)count * (k + 1) / parts);
+        alignment_sums(field, height, width, columns + first, stride, end - first, 0, at, sums + (int64_t)SUMS * k);
+    }
+}
+
+/* Solves the symmetric A x = b of six unknowns by Cholesky's factors; A is overwritten. */
+static void solve(double A[6][6], const double b[6], double x[6]) {
+    for (int k = 0; k < 6; k++) {
+        for (int m = 0; m < k; m++) A[k][k] -= A[k][m] * A[k][m];
+        A[k][k] = sqrt(A[k][k] > 1e-300 ? A[k][k] : 1e-300);
+        for (int i = k + 1; i < 6; i++) {
+            for (int m = 0; m < k; m++) A[i][k] -= A[i][m] * A[k][m];
+            A[i][k] /= A[k][k];
+        }
+    }
+    for (int k = 0; k < 6; k++) {
+        x[k] = b[k];
+        for (int m = 0; m < k; m++) x[k] -= A[k][m] * x[m];
+        x[k] /= A[k][k];
+    }
+    for (int k = 5; k >= 0; k--) {
+        for (int m = k + 1; m < 6; m++) x[k] -= A[m][k] * x[m];
+        x[k] /= A[k][k];
+    }
+}
+
+/* solve_step of inverse.py: the scaled twist that the sums ask for, but for the motions in the columns of held (6, holds). */
+static void solve_step(const double *sums, const double *held, int holds, double largest_mm, double step[6]) {
+    double known[6][6], half[6][6], A[6][6], b[6], trace = 0.0, square = 0.0;
+    for (int i = 0; i < 6; i++)
+        for (int k = 0; k < 6; k++) {
+            known[i][k] = i == k ? 1.0 : 0.0;
+            for (int h = 0; h < holds; h++) known[i][k] -= held[i * holds + h] * held[k * holds + h];
+        }
+    for (int i = 0; i < 6; i++)
+        for (int k = 0; k < 6; k++) {
+            half[i][k] = 0.0;
+            for (int m = 0; m < 6; m++) half[i][k] += known[i][m] * sums[SIZE * m + k];
+        }
+    for (int i = 0; i < 6; i++) {
+        b[i] = 0.0;
+        for (int m = 0; m < 6; m++) b[i] -= known[i][m] * sums[SIZE * m + 6];
+        for (int k = 0; k < 6; k++) {
+            A[i][k] = 0.0;
+            for (int m = 0; m < 6; m++) A[i][k] += half[i][m] * known[m][k];
+        }
+        trace += A[i][i];
+    }
+    for (int k = 0; k < 6; k++) A[k][k] += 1e-6 * (trace > 1e-9 ? trace : 1e-9) * (k < 3 ? 1.0 : 1e-3);
+    solve(A, b, step);
+    for (int k = 0; k < 6; k++) square += step[k] * step[k];
+    const double shorter = square > largest_mm * largest_mm ? largest_mm / sqrt(square) : 1.0;
+    for (int k = 0; k < 6; k++) step[k] *= shorter;
+}
+
+/* pose = pose * the rigid motion of a twist about a centre, by Rodrigues' formula. */
+static void move(double *pose, const double *twist, const double *center) {
+    const double x = twist[0], y = twist[1], z = twist[2], angle = sqrt(x * x + y * y + z * z);
+    const double first = angle > 1e-9 ? sin(angle) / angle : 1.0;
+    const double second = angle > 1e-9 ? (1.0 - cos(angle)) / (angle * angle) : 0.5;
+    const double cross[3][3] = {{0.0, -z, y}, {z, 0.0, -x}, {-y, x, 0.0}}, w[3] = {x, y, z};
+    double motion[3][4];
+    for (int i = 0; i < 3; i++) {
+        for (int k = 0; k < 3; k++) /* cross^2 = w w^T - angle^2 */
+            motion[i][k] = (i == k ? 1.0 : 0.0) + first * cross[i][k] + second * (w[i] * w[k] - (i == k ? angle * angle : 0.0));
+        motion[i][3] = twist[3 + i] + center[i];
+        for (int k = 0; k < 3; k++) motion[i][3] -= motion[i][k] * center[k];
+    }
+    for (int i = 0; i < 3; i++) {
+        const double a = pose[4 * i], b = pose[4 * i + 1], c = pose[4 * i + 2];
+        for (int k = 0; k < 4; k++) {
+            const double moved = a * motion[0][k] + b * motion[1][k] + c * motion[2][k];
+            pose[4 * i + k] = moved + (k == 3 ? pose[4 * i + 3] : 0.0);
+        }
+    }
+}
+
+/* refine of inverse.py: at->pose is moved; sums are those before the last step, then the slope noise of their weights. */
+EXPORT void refine_pose(
+    const float *field, int height, int width, const float *columns, int64_t stride, int count, int steps, const Steps *by,
+    const double *held, int holds, Limits *at, double *sums) {
+    double noise = by->wide;
+    for (int s = 0; s < steps; s++) {
+        double step[6], twist[6], largest = 0.0;
+        at->per_slope = 1.0 / (noise * noise);
+        alignment_sums(field, height, width, columns, stride, count, 0, at, sums);
+        sums[SUMS] = noise;
+        solve_step(sums, held, holds, by->largest_mm, step);
+        for (int k = 0; k < 6; k++) {
+            twist[k] = step[k] * by->units[k];
+            largest = fabs(step[k]) > largest ? fabs(step[k]) : largest;
+        }
+        move(at->pose, twist, by->center);
+        const double weight = sums[SIZE * SIZE + 1], slopes = sums[SIZE * SIZE + 2];
+        const double found = 1.5 * sqrt(0.5 * slopes / (weight > 1e-9 ? weight : 1e-9));
+        noise = found > 0.5 * noise ? found : 0.5 * noise;
+        noise = noise > by->least_noise ? noise : by->least_noise;
+        if (largest < by->small_mm) break;
+    }
 }

@@ -1,0 +1,128 @@
+/* The grids of a new frame of a track: the same results as grids of torchvts/pose/keyframe.py, which explains them. */
+#include "kernels.h"
+
+#define INSIDE 1
+#define PERHAPS 2
+#define LANES 16
+
+static WIDE float largest(const float *values, int64_t size) {
+    float most[LANES];
+    for (int k = 0; k < LANES; k++) most[k] = values[0];
+    for (int64_t n = 0; n + LANES <= size; n += LANES)
+        for (int k = 0; k < LANES; k++) most[k] = values[n + k] > most[k] ? values[n + k] : most[k];
+    for (int64_t n = size - size % LANES; n < size; n++) most[0] = values[n] > most[0] ? values[n] : most[0];
+    for (int k = 1; k < LANES; k++) most[0] = most[k] > most[0] ? most[k] : most[0];
+    return most[0];
+}
+
+/* Whether each pixel lies on the object, and whether it may. */
+static WIDE void flag(const float *depth, const uint8_t *contact, int64_t size, float least_mm, float deep, uint8_t *restrict flags) {
+    for (int64_t n = 0; n < size; n++) {
+        const uint8_t touching = contact[n] != 0, below = depth[n] > least_mm, far_below = depth[n] > deep;
+        flags[n] = (uint8_t)((touching & below) * INSIDE | (touching | far_below) * PERHAPS);
+    }
+}
+
+/* Of rows of flags, those that all of 3 x 3 have as INSIDE, and those that any of them has as PERHAPS; nothing lies beyond the image. */
+static WIDE void widen(const uint8_t *flags, int height, int width, int row, uint8_t *restrict column, uint8_t *restrict result) {
+    const uint8_t *here = flags + (int64_t)row * width, *above = row > 0 ? here - width : here;
+    const uint8_t *below = row < height - 1 ? here + width : here;
+    for (int x = 0; x < width; x++) {
+        const uint8_t all = above[x] & here[x] & below[x], any = above[x] | here[x] | below[x];
+        column[x + 1] = (uint8_t)((all & INSIDE) | (any & PERHAPS));
+    }
+    column[0] = column[1], column[width + 1] = column[width];
+    for (int x = 0; x < width; x++) {
+        const uint8_t all = column[x] & column[x + 1] & column[x + 2], any = column[x] | column[x + 1] | column[x + 2];
+        result[x] = (uint8_t)((all & INSIDE) | (any & PERHAPS));
+    }
+}
+
+/* Each pixel of the frame as z, p, -q and a mask. */
+static WIDE int whole_grid(const float *depth, const float *slopes, const uint8_t *flags, int height, int width, uint8_t *row, float *restrict field) {
+    const int64_t size = (int64_t)height * width;
+    int count = 0;
+    for (int y = 0; y < height; y++) {
+        uint8_t *result = row + width + 2;
+        widen(flags, height, width, y, row, result);
+        const float *z = depth + (int64_t)y * width, *p = slopes + (int64_t)y * width, *q = p + size;
+        float *to = field + 4 * (int64_t)y * width;
+        for (int x = 0; x < width; x++) {
+            const int inside = result[x] & INSIDE;
+            to[4 * x] = z[x], to[4 * x + 1] = p[x], to[4 * x + 2] = -q[x];
+            to[4 * x + 3] = 0.75f * (float)inside + 0.125f * (float)(result[x] & PERHAPS);
+            count += inside;
+        }
+    }
+    return count;
+}
+
+/* Sums over `times` rows from the first on: z, p, q and the number of pixels on the object (4, width), and all flags (width). */
+static WIDE void add_rows(
+    const float *depth, const float *slopes, const uint8_t *flags, int64_t size, int width, int times, float *restrict sums, uint8_t *restrict any) {
+    memset(sums, 0, 4 * (size_t)width * sizeof(float));
+    memset(any, 0, (size_t)width);
+    for (int i = 0; i < times; i++) {
+        const int64_t first = (int64_t)i * width;
+        const float *z = depth + first, *p = slopes + first, *q = p + size;
+        for (int x = 0; x < width; x++) {
+            const uint8_t flag = flags[first + x];
+            const float inside = (float)(flag & INSIDE);
+            sums[x] += inside * z[x], sums[width + x] += inside * p[x], sums[2 * width + x] -= inside * q[x];
+            sums[3 * width + x] += inside, any[x] |= flag;
+        }
+    }
+}
+
+/* Means over the part of each cell of times x times pixels that lies on the object, which must be `share` of it. */
+static WIDE int cell_grid(
+    const float *depth, const float *slopes, const uint8_t *flags, int height, int width, int times, float share, float *sums,
+    uint8_t *near, uint8_t *row, float *restrict field) {
+    const int rows = height / times, columns = width / times;
+    const float area = (float)(times * times);
+    for (int y = 0; y < rows; y++) {
+        const int64_t first = (int64_t)y * times * width;
+        add_rows(depth + first, slopes + first, flags + first, (int64_t)height * width, width, times, sums, row);
+        float *to = field + 4 * (int64_t)y * columns;
+        for (int x = 0; x < columns; x++, to += 4) {
+            uint8_t any = 0;
+            for (int i = 0; i < times; i++) any |= row[x * times + i];
+            for (int k = 0; k < 4; k++) to[k] = 0.0f;
+            if (any & INSIDE)
+                for (int i = 0; i < times; i++)
+                    for (int k = 0; k < 4; k++) to[k] += sums[k * width + x * times + i];
+            const float per = 1.0f / (to[3] > 0.01f * area ? to[3] : 0.01f * area);
+            for (int k = 0; k < 3; k++) to[k] *= per;
+            near[(int64_t)y * columns + x] = any & PERHAPS;
+        }
+    }
+    int count = 0;
+    for (int y = 0; y < rows; y++) {
+        uint8_t *result = row + columns + 2;
+        widen(near, rows, columns, y, row, result);
+        float *to = field + 4 * (int64_t)y * columns;
+        for (int x = 0; x < columns; x++) {
+            const int inside = to[4 * x + 3] > share * area;
+            to[4 * x + 3] = inside ? 1.0f : 0.125f * (float)(result[x] & PERHAPS);
+            count += inside;
+        }
+    }
+    return count;
+}
+
+/* depth (height, width), slopes (2, height, width) y down, contact as bytes -> fine and coarse fields (rows, columns, 4), of cells of
+   `fine` and `coarse` pixels a side. Returns the number of fine pixels on the object, or -1 without memory. */
+EXPORT int track_grids(
+    const float *depth, const float *slopes, const uint8_t *contact, int height, int width, float least_mm, int fine, int coarse,
+    float *fine_field, float *coarse_field) {
+    const int64_t size = (int64_t)height * width;
+    float *sums = malloc(4 * (size_t)width * sizeof(float) + (size_t)(2 * size + 2 * (width + 2)));
+    if (sums == NULL) return -1;
+    uint8_t *flags = (uint8_t *)(sums + 4 * (size_t)width), *near = flags + size, *row = near + size;
+    flag(depth, contact, size, least_mm, 0.3f * largest(depth, size), flags);
+    const int count = fine > 1 ? cell_grid(depth, slopes, flags, height, width, fine, 0.99f, sums, near, row, fine_field)
+                               : whole_grid(depth, slopes, flags, height, width, row, fine_field);
+    cell_grid(depth, slopes, flags, height, width, coarse, 0.5f, sums, near, row, coarse_field);
+    free(sums);
+    return count;
+}

@@ -8,8 +8,10 @@ import torch
 
 import torchvts as vts
 from torchvts.calibration import fit_prior
+from torchvts.contact import ContactMask
 from torchvts.core.geometry import gradient_of_depth
 from torchvts.integration.background import ZeroBackground
+from torchvts.model import ResponseModel
 
 PITCH, HEIGHT, WIDTH = 0.0634, 240, 320
 
@@ -89,6 +91,56 @@ def test_a_constant_error_of_slope_leaves_no_pit():
     assert float(before.min()) < -0.05 and float(after.min()) > -0.02
     assert float((after - depth)[truth].abs().mean()) < float((before - depth)[truth].abs().mean()) + 0.01
     assert torch.equal(torch.jit.script(ZeroBackground())(before, deformed), after)
+
+
+def slopes_of_noise(smooth_px, size=(HEIGHT, WIDTH)):
+    """Slopes that are no surface: independent noise of both slopes, smoothed, of 0.1 RMS."""
+    noise = torch.randn(2, 1, *size, generator=torch.Generator().manual_seed(smooth_px))
+    noise = torch.nn.functional.avg_pool2d(noise, 2 * smooth_px + 1, 1, smooth_px)
+    return (0.1 * noise / noise.std()).transpose(0, 1)
+
+
+@pytest.mark.parametrize("smooth_px", [2, 5])
+def test_slopes_of_noise_are_no_contact_and_light_presses_beside_them_are(smooth_px):
+    patch = torch.zeros(1, 1, HEIGHT, WIDTH, dtype=torch.bool)
+    patch[..., 20:90, 20:110] = True
+    gradient = slopes_of_noise(smooth_px) * patch
+    depth = ZeroBackground()(vts.poisson_background(gradient, PITCH), patch)
+    touching = vts.ContactFromDepth(PITCH)
+    assert float(depth.max()) > 0.005 and not bool(touching(depth, gradient, patch).any())
+    y, x = torch.meshgrid((torch.arange(HEIGHT) - 170.0) * PITCH, (torch.arange(WIDTH) - 230.0) * PITCH, indexing="ij")
+    pressed, truth = membrane(torch.sqrt((9.0 - x.square() - y.square()).clamp_min(0.01)) - 3.0 + 0.1, decay_mm=0.3, steps=60)
+    deformed = pressed > 0.005
+    slopes = gradient + (gradient_of_depth(pressed, PITCH) + 0.2 * slopes_of_noise(2)) * deformed
+    contact = touching(depth + pressed * deformed, slopes, patch | deformed)
+    assert not bool((contact & patch).any()) and bool(contact[truth].float().mean() > 0.9)
+
+
+def test_a_pocket_of_errors_makes_no_face_of_the_skin_around_it_and_a_cut_face_stays():
+    deformed = torch.zeros(1, 1, 96, 128, dtype=torch.bool)
+    deformed[..., 30:60, 40:90] = True
+    pocket = deformed.clone()
+    pocket[..., 40:50, 60:70] = False  # unchanged skin that deformed skin surrounds
+    depth = 0.01 * torch.ones(1, 1, 96, 128)
+    depth[..., 36:54, 56:74] = -0.05
+    assert not bool(ZeroBackground()(depth, pocket)[..., :25, :].any())
+    face = torch.zeros(1, 1, 96, 128)
+    face[..., :50] = 0.5  # its other end lies beyond the image
+    rim = torch.zeros_like(deformed)
+    rim[..., 46:54] = True
+    zeroed = ZeroBackground()(face - 0.2, rim)
+    assert float((zeroed - face)[..., :40].abs().max()) < 1e-6 and not bool(zeroed[..., 60:].any())
+
+
+def test_a_stand_in_needs_as_much_light_to_change_in_dark_pixels_as_in_bright_ones(small_sensor):
+    background = torch.full((3, 120, 160), 0.4)
+    background[..., 140:] = 0.02
+    cal = vts.Calibration.from_response(ResponseModel.zero(1.0, 1.0), small_sensor, background)
+    mask = ContactMask.from_calibration(dataclasses.replace(cal, report={"model": "response", "source": "stand_in"}))
+    change = torch.zeros(1, 1, 120, 160)
+    change[..., 40:60, 40:60], change[..., 40:60, 145:155] = 0.1, 0.005  # light: a quarter of the background in both
+    found = mask((background + change) / background)
+    assert bool(found[..., 42:58, 42:58].all()) and not bool(found[..., 140:].any())
 
 
 def test_thresholds_can_be_set(ring, small_sensor, small_press):

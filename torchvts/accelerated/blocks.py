@@ -132,8 +132,9 @@ class ContactFromDepth(Twin, contact.ContactFromDepth):
     def find(self, depth_mm: Tensor, gradient: Tensor, deformed: Tensor) -> Tensor:
         if not usable(depth_mm, gradient):
             return super().find(depth_mm, gradient, deformed)
-        numbers = (self.cell * self.mm_per_pixel, self.share, *self.decay, *self.tail, self.least_free)
-        return kernels.contact_from_depth(depth_mm, gradient, deformed, (self.cell, self.reach), (ctypes.c_float * 7)(*numbers))
+        noise = (self.most_unexplained, self.noise_depth_mm)
+        numbers = (self.cell * self.mm_per_pixel, self.share, *self.decay, *self.tail, self.least_free, *noise)
+        return kernels.contact_from_depth(depth_mm, gradient, deformed, (self.cell, self.reach), (ctypes.c_float * 9)(*numbers))
 
 
 class Crop(Twin, frames.Crop):

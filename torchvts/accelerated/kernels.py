@@ -260,7 +260,7 @@ def contact_from_depth(
 ) -> Tensor:
     """Contact, bool (B, 1, h, w), of a window: see :class:`~torchvts.contact.ContactFromDepth`.
 
-    ``cells``: side and reach; ``model``: side of a cell in mm, share, bounds of the decay length and of the tail, least free share.
+    ``cells``: side and reach; ``model``: its settings in the order of ``Model`` in touching.c.
     """
     depth_mm, deformed, gradient = _with_whole_rows(depth_mm), _with_whole_rows(deformed), gradient.contiguous()
     count, _, rows, columns = depth_mm.shape

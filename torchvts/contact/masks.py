@@ -44,7 +44,8 @@ BRIDGE_SHARE = 0.5
 """Part of ``sigmas`` that the mean change of a cell has in a gap that is bridged."""
 
 STAND_IN_NOISE = 0.02
-"""Least noise, relative to the background, under a stand-in model: a press scatters light that no calibration has measured."""
+"""Least noise under a stand-in model, relative to the background and to its median: a press scatters light that no calibration has
+measured, as much of it to dark pixels as to bright ones."""
 
 
 class Change(NamedTuple):
@@ -128,7 +129,9 @@ class ContactMask(nn.Module):
         check_record("settings", settings, ContactSettings, "ContactSettings() makes one")
         noise = calibration.compensated_noise_std
         if _stand_in(calibration):
-            noise = noise.clamp_min(STAND_IN_NOISE)
+            light = calibration.background
+            typical = light.flatten(1).median(dim=1).values[:, None, None]
+            noise = noise.maximum(STAND_IN_NOISE * (typical / light.clamp_min(1e-3 * typical)).clamp_min(1.0))
         return cls(calibration.flat, noise, settings.sigmas, settings.min_size_px, most_far_field(calibration))
 
     if TYPE_CHECKING:

@@ -11,6 +11,9 @@ STIFF = 30.0
 TOLERANCE = 0.01
 """Depth below zero that is left, as a share of the largest depth."""
 
+LEAST_LOW = 0.02
+"""Share of the skin without change below which its lower part is a pocket of errors, and no undeformed skin around a face."""
+
 SWEEPS = 4
 """Relaxations on each grid."""
 
@@ -24,8 +27,8 @@ class ZeroBackground(nn.Module):
     right within contacts, from which they are calibrated, and least known around them.
     Skin is pressed in and never pulled out: where depth would be below zero, as beside a contact that the image border
     cuts, it is held at zero as undeformed skin is, and the continuation is found again.
-    A flat face that the image border cuts shows no change and is no part of ``deformed``: undeformed skin is what lies below half
-    of the frame's depth; above, depth stays as it is.
+    A flat face that the image border cuts shows no change and is no part of ``deformed``: where skin without change lies above half
+    of the frame's depth, deformed skin is most of what surrounds it, and some lies below, depth stays as it is.
 
     Source:
         successive grids for the continuation: Gortler, Grzeszczuk, Szeliski and Cohen, The Lumigraph, SIGGRAPH 1996; the rest is
@@ -42,7 +45,7 @@ class ZeroBackground(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.stiff, self.tolerance = STIFF, TOLERANCE
-        self.sweeps = SWEEPS
+        self.sweeps, self.least_low = SWEEPS, LEAST_LOW
 
     def forward(self, depth_mm: Tensor, deformed: Tensor) -> Tensor:
         """Depth (B, 1, H, W), and where the skin has moved, bool (B, 1, H, W), to depth.
@@ -56,7 +59,7 @@ class ZeroBackground(nn.Module):
         # a steep rim may be two pixels wider than the mask
         free = 1.0 - nn.functional.max_pool2d(_as(deformed, depth_mm), 5, 1, 2)
         low, high = depth_mm.amin(dim=(2, 3), keepdim=True), depth_mm.amax(dim=(2, 3), keepdim=True)
-        flat = free * _as(depth_mm < 0.5 * (low + high), depth_mm)
+        flat = self.below_faces(free, free * _as(depth_mm < 0.5 * (low + high), depth_mm))
         count = flat.sum(dim=(2, 3), keepdim=True)
         level = (depth_mm * flat).sum(dim=(2, 3), keepdim=True) / count.clamp_min(1.0)
         raised = free - flat  # a face of the object: only the frame's mean is taken out
@@ -67,6 +70,18 @@ class ZeroBackground(nn.Module):
         below = (1.0 - free) * _as(depth_mm < offset - self.tolerance * range_mm, depth_mm)  # that too is an error
         offset = self.continued(fields + torch.cat((below, depth_mm * below, torch.zeros_like(below)), dim=1))
         return (depth_mm - offset) * (1.0 - flat)
+
+    def below_faces(self, free: Tensor, low: Tensor) -> Tensor:
+        """Undeformed skin, (B, 1, H, W): the lower part of what shows no change, or all of it if the rest is no face.
+
+        Where that part is empty, depth is upside down, as of a module in training, and stays so: held at zero, it would not learn.
+        """
+        high = free - low
+        rim = nn.functional.max_pool2d(high, 3, 1, 1) - high
+        by_low, by_deformed = (rim * low).sum(dim=(2, 3), keepdim=True), (rim * (1.0 - free)).sum(dim=(2, 3), keepdim=True)
+        count, of = low.sum(dim=(2, 3), keepdim=True), free.sum(dim=(2, 3), keepdim=True)
+        pocket = (count > 0.0) & (count < self.least_low * of)
+        return torch.where((by_deformed > by_low) & ~pocket, low, free)
 
     def continued(self, fields: Tensor) -> Tensor:
         """Values continued to all pixels, (B, 1, H, W).

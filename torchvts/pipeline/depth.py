@@ -59,7 +59,7 @@ STRIDE = 8
 
 
 class DepthPipeline(nn.Module):
-    """Images (B, 3, H, W) to a :class:`DepthOutput`: compensate, deformed, crop, solve, refine, zero, slopes, contact,
+    """Images (B, 3, H, W) to a :class:`DepthOutput`: compensate, deformed, crop, solve, refine, zero, contact, slopes,
     uncrop.
 
     ``fast`` solves once (eq. 9). ``precise`` solves again with the depth found (eq. 10), until what is still missing falls below
@@ -274,8 +274,8 @@ class DepthPipeline(nn.Module):
         solution = self.solve(frame)  # eq. 9, 5, 4
         frame, solution = self.refine(frame, solution)  # eq. 10
         solution = Solution(solution.gradient, self.zero(solution.depth_mm, frame.deformed))
-        solution = self.slopes(frame, solution)
         contact = self.contact(depth_in_window(frame, solution.depth_mm), solution.gradient, frame.mask)
+        solution = self.slopes(frame, solution)
         out: DepthOutput = self.uncrop(frame, solution, contact)
         return out
 

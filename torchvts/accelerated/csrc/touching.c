@@ -5,16 +5,16 @@
 
 /* The settings of ContactFromDepth. */
 typedef struct {
-    float cell_mm, share, least_decay, most_decay, least_tail, most_tail, least_free;
+    float cell_mm, share, least_decay, most_decay, least_tail, most_tail, least_free, most_unexplained, noise_depth_mm;
 } Model;
 
 /* Fields of rows x columns cells; `found` and `other` hold what is at hand. */
 typedef struct {
     int rows, columns;
-    float *mass, *depth, *slope_x, *slope_y, *curvature, *smooth_mass, *smooth_depth, *pressure, *found, *other;
+    float *mass, *depth, *slope_x, *slope_y, *curvature, *smooth_mass, *smooth_depth, *pressure, *found, *other, *unexplained, *squared;
     float *sums, *line;
     double *running;
-    uint8_t *pressed;
+    uint8_t *pressed, *surface;
 } Cells;
 
 /* A row of pixels added to a line of cells: how many are deformed, and their depth and slopes. */
@@ -125,12 +125,58 @@ WIDE static void find_steepness(const float *restrict x, const float *restrict y
     }
 }
 
+/* A row of squared differences of slopes along the row from those of depth, between neighbouring cells of deformed skin. */
+WIDE static void unexplained_in_row(const float *restrict mass, const float *restrict depth, const float *restrict slope, float cell_mm, int n,
+                                    float *restrict squared) {
+    for (int x = 0; x < n; x++) {
+        const float apart = 0.5f * (slope[x + 1] + slope[x]) - (depth[x + 1] - depth[x]) / cell_mm;
+        squared[x] = (mass[x] > 0.0f) & (mass[x + 1] > 0.0f) ? apart * apart : 0.0f;
+    }
+}
+
+/* The same across rows, added: `below` cells on is the next row. */
+WIDE static void unexplained_below(const float *restrict mass, const float *restrict depth, const float *restrict slope, float cell_mm, int below,
+                                   int n, float *restrict squared) {
+    for (int x = 0; x < n; x++) {
+        const float apart = 0.5f * (slope[x + below] + slope[x]) - (depth[x + below] - depth[x]) / cell_mm;
+        squared[x] += (mass[x] > 0.0f) & (mass[x + below] > 0.0f) ? apart * apart : 0.0f;
+    }
+}
+
+WIDE static void square(const float *restrict values, int n, float *restrict squared) {
+    for (int k = 0; k < n; k++) squared[k] = values[k] * values[k];
+}
+
+/* Cells whose slopes nearby are those of a surface. */
+WIDE static void are_surface(const float *restrict unexplained, const float *restrict steep, const float *restrict squared, float most, float per,
+                             int n, uint8_t *restrict surface) {
+    for (int k = 0; k < n; k++) surface[k] = (uint8_t)((unexplained[k] < most * steep[k]) | (unexplained[k] < squared[k] / per));
+}
+
+/* unexplained() of ContactFromDepth, and where it is little enough, to at->surface. at->found holds the mean squared slope nearby. */
+static void find_surface(const Cells *at, const Model *model, int reach) {
+    const int rows = at->rows, columns = at->columns, n = rows * columns;
+    const float per = model->noise_depth_mm * model->noise_depth_mm;
+    for (int y = 0; y < rows; y++) {
+        const size_t k = (size_t)y * columns;
+        float *squared = at->squared + k;
+        unexplained_in_row(at->mass + k, at->depth + k, at->slope_x + k, model->cell_mm, columns - 1, squared);
+        squared[columns - 1] = 0.0f;
+        if (y < rows - 1) unexplained_below(at->mass + k, at->depth + k, at->slope_y + k, model->cell_mm, columns, columns, squared);
+    }
+    box(at, at->squared, reach / 2, at->unexplained);
+    square(at->depth, n, at->squared);
+    box(at, at->squared, reach / 2, at->curvature);
+    are_surface(at->unexplained, at->found, at->curvature, model->most_unexplained, per > 1e-9f ? per : 1e-9f, n, at->surface);
+}
+
 /* Cells that bear a pressure, as 1 and 0, to `pressed` and as floats to `result`. */
-WIDE static void find_pressed(const float *restrict pressure, const float *restrict steep, const float *restrict cubed, float share, float most,
-                              int n, uint8_t *restrict pressed, float *restrict result) {
+WIDE static void find_pressed(const float *restrict pressure, const float *restrict steep, const float *restrict cubed,
+                              const uint8_t *restrict surface, float share, float most, int n, uint8_t *restrict pressed,
+                              float *restrict result) {
     for (int k = 0; k < n; k++) {
         const float least_pressure = share * cubed[k] / (steep[k] > 1e-9f ? steep[k] : 1e-9f);
-        const int is = (pressure[k] > least_pressure) & (pressure[k] > 0.1f * most);
+        const int is = surface[k] & (pressure[k] > least_pressure) & (pressure[k] > 0.1f * most);
         pressed[k] = (uint8_t)is;
         result[k] = (float)is;
     }
@@ -142,7 +188,7 @@ WIDE static void find_rim(const float *restrict around, const float *restrict of
     for (int k = 0; k < n; k++) {
         const float share = around[k] / (of[k] > 1e-6f ? of[k] : 1e-6f);
         rim[k] = (share > 0.2f) & (share < 0.8f) & (mass[k] > 0.0f) ? 1.0f : 0.0f;
-        level[k] = rim[k] * (depth[k] / (mass[k] > 1e-6f ? mass[k] : 1e-6f));
+        level[k] = rim[k] * depth[k];
     }
 }
 
@@ -158,25 +204,35 @@ WIDE static void some_of(const float *restrict mass, int n, float *restrict some
     for (int k = 0; k < n; k++) some[k] = mass[k] > 0.0f ? 1.0f : 0.0f;
 }
 
-/* rim_depth() of ContactFromDepth, to at->other; 0 where no skin hangs free, and all deformed skin lies on the object. */
-static int rim_depth(const Cells *at, const Model *model, int reach) {
+/* Where no skin hangs free, all deformed skin lies on the object if slopes are those of a surface, and none if not. */
+WIDE static void all_or_none(const uint8_t *restrict surface, int n, float *restrict level) {
+    for (int k = 0; k < n; k++) level[k] = surface[k] ? -INFINITY : INFINITY;
+}
+
+/* rim_depth() of ContactFromDepth, to at->other. */
+static void rim_depth(const Cells *at, const Model *model, int reach) {
     const int n = at->rows * at->columns;
     divide(at->slope_x, at->mass, 1e-6f, n), divide(at->slope_y, at->mass, 1e-6f, n);
     find_curvature(at, 2.0f * model->cell_mm);
     box(at, at->mass, 2, at->smooth_mass), box(at, at->depth, 2, at->smooth_depth), box(at, at->other, 2, at->curvature);
     divide(at->smooth_depth, at->smooth_mass, 1e-6f, n), divide(at->curvature, at->smooth_mass, 1e-6f, n);
+    divide(at->depth, at->mass, 1e-6f, n);
     const float decay = squared_decay(at, model, n);
-    if (decay == 0.0f) return 0;
-    find_pressure(at->smooth_depth, at->curvature, at->mass, decay, n, at->pressure);
+    if (decay > 0.0f) find_pressure(at->smooth_depth, at->curvature, at->mass, decay, n, at->pressure);
     find_steepness(at->slope_x, at->slope_y, n, at->smooth_mass, at->curvature);
     box(at, at->smooth_mass, reach / 2, at->found), box(at, at->curvature, reach / 2, at->other);
-    find_pressed(at->pressure, at->found, at->other, model->share * sqrtf(decay), largest(at->pressure, n), n, at->pressed, at->smooth_mass);
+    find_surface(at, model, reach);
+    if (decay == 0.0f) {
+        all_or_none(at->surface, n, at->other);
+        return;
+    }
+    find_pressed(at->pressure, at->found, at->other, at->surface, model->share * sqrtf(decay), largest(at->pressure, n), n, at->pressed,
+                 at->smooth_mass);
     some_of(at->mass, n, at->curvature);
     box(at, at->smooth_mass, 1, at->found), box(at, at->curvature, 1, at->other);
     find_rim(at->found, at->other, at->mass, at->depth, n, at->smooth_mass, at->curvature);
     box(at, at->smooth_mass, reach, at->found), box(at, at->curvature, reach, at->other);
     find_level(at->found, at->pressed, n, at->other);
-    return 1;
 }
 
 /* A row of pixels that are deformed and deeper than the rim. */
@@ -207,37 +263,33 @@ static void to_cells(const Cells *at, const uint8_t *inside, int64_t inside_row,
 static int allocate(Cells *at, int rows, int columns, int cell) {
     at->rows = (rows + cell - 1) / cell, at->columns = (columns + cell - 1) / cell;
     const size_t n = (size_t)at->rows * at->columns, line = (size_t)at->columns * cell + 1;
-    at->mass = malloc(sizeof(float) * (11 * n + (size_t)at->columns + line));
+    at->mass = malloc(sizeof(float) * (13 * n + (size_t)at->columns + line));
     at->running = malloc(sizeof(double) * (size_t)at->columns);
-    at->pressed = malloc(n);
+    at->pressed = malloc(2 * n);
     if (!at->mass || !at->running || !at->pressed) return 1;
     at->depth = at->mass + n, at->slope_x = at->depth + n, at->slope_y = at->slope_x + n, at->curvature = at->slope_y + n;
     at->smooth_mass = at->curvature + n, at->smooth_depth = at->smooth_mass + n, at->pressure = at->smooth_depth + n;
-    at->found = at->pressure + n, at->other = at->found + n, at->sums = at->other + n, at->line = at->sums + n + at->columns;
+    at->found = at->pressure + n, at->other = at->found + n, at->unexplained = at->other + n, at->squared = at->unexplained + n;
+    at->sums = at->squared + n, at->line = at->sums + n + at->columns, at->surface = at->pressed + n;
     return 0;
 }
 
 /*
  * Contact, bytes (frames, rows, columns), of a window: depth and deformed (bytes) of it, frames and rows at the given distances; gradient
- * (frames, 2, rows, columns). model: cell_mm, share, bounds of the decay, of the tail, least free share; see Model. Returns 1 where memory
- * is short.
+ * (frames, 2, rows, columns). numbers: in the order of Model. Returns 1 where memory is short.
  */
 EXPORT int contact_from_depth(const float *depth, int64_t depth_frame, int64_t depth_row, const float *gradient, const uint8_t *deformed,
                               int64_t deformed_frame, int64_t deformed_row, int frames, int rows, int columns, int cell, int reach,
                               const float *numbers, uint8_t *contact) {
-    const Model model = {numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5], numbers[6]};
+    const Model model = {numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5], numbers[6], numbers[7], numbers[8]};
     const size_t part = (size_t)rows * columns;
     Cells at;
     const int short_of_memory = allocate(&at, rows, columns, cell);
     for (int b = 0; b < frames && !short_of_memory; b++, depth += depth_frame, deformed += deformed_frame, contact += part) {
         to_cells(&at, deformed, deformed_row, depth, depth_row, gradient + 2 * part * b, rows, columns, cell);
-        const int hangs = rim_depth(&at, &model, reach);
+        rim_depth(&at, &model, reach);
         for (int y = 0; y < rows; y++) {
             uint8_t *to = contact + (size_t)y * columns;
-            if (!hangs) {
-                memcpy(to, deformed + deformed_row * y, (size_t)columns);
-                continue;
-            }
             const float *level = at.other + (size_t)(y / cell) * at.columns;
             for (int x = 0; x < at.columns; x++)
                 for (int k = 0; k < cell; k++) at.line[x * cell + k] = level[x];

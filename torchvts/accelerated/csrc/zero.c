@@ -5,6 +5,9 @@
 
 #define MOST_GRIDS 24
 
+/* LEAST_LOW of background.py. */
+#define LEAST_LOW 0.02f
+
 /* What is known of a pixel. */
 enum { DEFORMED = 0, FLAT = 1, RAISED = 2 };
 
@@ -177,6 +180,27 @@ WIDE static void flat_row(const float *restrict depth, uint8_t *restrict kind, f
     *sum = total, *count = found;
 }
 
+/* Whether raised skin is a face of the object: what is flat beside it is no pocket, and deformed skin is most of what lies around it. */
+static int is_face(const uint8_t *kind, int height, int width) {
+    int64_t around[3] = {0}, of_kind[3] = {0};
+    for (size_t k = 0; k < (size_t)height * width; k++) of_kind[kind[k]]++;
+    if (of_kind[FLAT] > 0 && (float)of_kind[FLAT] < LEAST_LOW * (float)(of_kind[FLAT] + of_kind[RAISED])) return 0;
+    for (int y = 0; y < height; y++) {
+        const uint8_t *row = kind + (size_t)y * width;
+        const int top = y > 0 ? y - 1 : 0, bottom = y < height - 1 ? y + 1 : y;
+        int near = 0;
+        for (int i = top; i <= bottom && !near; i++) near = memchr(kind + (size_t)i * width, RAISED, (size_t)width) != NULL;
+        for (int x = 0; near && x < width; x++) {
+            const int left = x > 0 ? x - 1 : 0, right = x < width - 1 ? x + 1 : x;
+            int beside = 0;
+            for (int i = top; i <= bottom; i++)
+                for (int j = left; j <= right; j++) beside |= kind[(size_t)i * width + j] == RAISED;
+            around[row[x]] += beside;
+        }
+    }
+    return around[DEFORMED] > around[FLAT];
+}
+
 /* A row of pixels added to the sums of cells' columns. */
 WIDE static void add_row(const float *restrict depth, const uint8_t *restrict kind, float level, float per_range, float stiff, int n,
                          float *restrict share, float *restrict value, float *restrict weight) {
@@ -297,6 +321,27 @@ static const float *continuation(Work *work, int y, int left, int right) {
     return work->found;
 }
 
+/* Mean depth of flat skin. Undeformed pixels are marked as flat, or as raised where they are a face of the object above `middle`. */
+static float level_of(const float *depth, uint8_t *kind, float middle, int height, int width) {
+    double sum = 0.0;
+    int64_t flat = 0;
+    for (int y = 0; y < height; y++) {
+        float part;
+        int count;
+        flat_row(depth + (size_t)y * width, kind + (size_t)y * width, middle, width, &part, &count);
+        sum += part, flat += count;
+    }
+    const size_t pixels = (size_t)height * width;
+    if (memchr(kind, RAISED, pixels) && !is_face(kind, height, width)) {
+        for (size_t k = 0; k < pixels; k++) {
+            if (kind[k] != RAISED) continue;
+            kind[k] = FLAT;
+            sum += depth[k], flat++;
+        }
+    }
+    return flat ? (float)(sum / (double)flat) : 0.0f;
+}
+
 /* The undeformed skin's shares, values and weights of cells; all weights. Returns the mean depth of flat skin, and the range above it. */
 static float known_cells(Work *work, const float *depth, int height, int width, float stiff, float *range) {
     Grid *grid = &work->grids[0];
@@ -304,15 +349,7 @@ static float known_cells(Work *work, const float *depth, int height, int width, 
     const float per_cell = 1.0f / (float)(cell * cell);
     float low, high;
     range_of(depth, (size_t)height * width, &low, &high);
-    double sum = 0.0;
-    int64_t flat = 0;
-    for (int y = 0; y < height; y++) {
-        float part;
-        int count;
-        flat_row(depth + (size_t)y * width, work->kind + (size_t)y * width, 0.5f * (low + high), width, &part, &count);
-        sum += part, flat += count;
-    }
-    const float level = flat ? (float)(sum / (double)flat) : 0.0f;
+    const float level = level_of(depth, work->kind, 0.5f * (low + high), height, width);
     *range = high - level > 1e-9f ? high - level : 1e-9f;
     const size_t lines = (size_t)grid->columns * cell;
     for (int i = 0; i < grid->rows; i++) {

@@ -219,14 +219,16 @@ class GradientFromNormal(Twin, geometry.GradientFromNormal):
 
 
 class PoissonDCT(Twin, integration.PoissonDCT):
-    """Compiled passes around the FFTs, which stay with torch."""
+    """One compiled kernel, but for heights whose cosine transform is slow."""
 
     plain = integration.PoissonDCT
 
     def integrate(self, gradient: Tensor, plan: list[Tensor], top: int, left: int) -> Tensor:
-        if not usable(gradient, plan[2]):
+        size = (int(plan[5].shape[0]), int(plan[6].shape[0]))
+        tables = kernels.poisson_plan(*size) if usable(gradient, plan[2]) else None
+        if tables is None:
             return super().integrate(gradient, plan, top, left)
-        return kernels.solve_poisson(gradient, self.mm_per_pixel, plan, (top, left), self.zero_in_background)
+        return kernels.solve_poisson(gradient, self.mm_per_pixel, tables, (top, left), size, self.zero_in_background)
 
 
 class PoissonBackground(PoissonDCT, integration.PoissonBackground):

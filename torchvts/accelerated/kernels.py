@@ -87,17 +87,16 @@ def library() -> ctypes.CDLL | None:
     loaded.response_normals.restype = loaded.mask_values.restype = None
     loaded.grid_means.argtypes = [pointer, *[whole] * 7, pointer]
     loaded.slopes.argtypes = [pointer, whole, whole, real, pointer]
-    loaded.divergence_lines.argtypes = [pointer, real, *[whole] * 9, pointer]
-    loaded.to_columns.argtypes = [pointer, pointer, *[whole] * 4, pointer]
-    loaded.divide.argtypes = [*[pointer] * 4, *[whole] * 3]
-    loaded.finish_depth.argtypes = [*[pointer] * 3, *[whole] * 7, pointer]
+    loaded.poisson_plan_size.restype = step
+    loaded.make_poisson_plan.argtypes = [whole, whole, pointer]
+    loaded.solve_poisson.argtypes = [pointer, pointer, real, *[whole] * 8, pointer]
     loaded.largest_change.argtypes = [pointer, pointer, whole, step, pointer]
     loaded.uncrop.argtypes = [*[pointer] * 2, *[whole] * 7, *[pointer] * 3]
     loaded.alignment_sums.argtypes = [pointer, whole, whole, pointer, step, whole, whole, pointer, pointer]
     loaded.part_sums.argtypes = [pointer, whole, whole, pointer, step, whole, whole, pointer, pointer]
     loaded.refine_pose.argtypes = [pointer, whole, whole, pointer, step, whole, whole, pointer, pointer, whole, pointer, pointer]
     loaded.track_grids.argtypes = [pointer, pointer, pointer, whole, whole, real, whole, whole, pointer, pointer]
-    without_result = ("grid_means", "solve_shadowed", "slopes", "to_columns", "finish_depth", "largest_change", "uncrop")
+    without_result = ("grid_means", "solve_shadowed", "slopes", "make_poisson_plan", "largest_change", "uncrop")
     for name in (*without_result, "alignment_sums", "part_sums", "refine_pose"):
         getattr(loaded, name).restype = None
     return loaded
@@ -431,48 +430,37 @@ def slopes(normal: Tensor, max_slope: float) -> Tensor:
     return gradient
 
 
-def solve_poisson(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], window: tuple[int, int], zeroed: bool) -> Tensor:
-    """Depth (B, 1, H, W) of a window's gradient, by the seven tables of a plan for the FFT.
+@functools.lru_cache(maxsize=8)
+def poisson_plan(height: int, width: int) -> Tensor | None:
+    """The tables of csrc/poisson.c for a size; None where the height has a prime factor above 64."""
+    size = _loaded().poisson_plan_size(height)
+    if not size:
+        return None
+    with torch.inference_mode(False):
+        tables = torch.empty(size, dtype=torch.uint8, device="cpu")
+    _loaded().make_poisson_plan(height, width, tables.data_ptr())
+    return tables
+
+
+def solve_poisson(
+    gradient: Tensor, mm_per_pixel: float, tables: Tensor, window: tuple[int, int], size: tuple[int, int], zeroed: bool
+) -> Tensor:
+    """Depth (B, 1, H, W) of the given size from a window's gradient, by the tables of :func:`poisson_plan`.
 
     See :mod:`torchvts.integration.poisson`. ``zeroed``: zero on average where the gradient is zero, not over all of the image.
     """
     gradient = gradient.contiguous()
-    turns, of_sum, of_difference, order = plan[0], plan[2], plan[3], plan[5]
-    height, width = int(plan[5].shape[0]), int(plan[6].shape[0])
     count, _, rows, columns = gradient.shape
-    part, pixels = (rows, columns, *window), height * width
-    first_row, last_row = max(0, window[0] - 1), min(height, window[0] + rows + 1)
-    loaded, many_rows = _loaded(), last_row - first_row
-    lines = gradient.new_empty(count, many_rows, width)
-    ends = (*part, height, width, first_row, many_rows)
+    depth = gradient.new_empty(count, 1, *size)
+    settings, kernel = (rows, columns, *window, *size, zeroed), _loaded().solve_poisson
     _check(
         by_frames(
             count,
-            pixels,
-            lambda first, many: loaded.divergence_lines(_at(gradient, first), mm_per_pixel, many, *ends, _at(lines, first)),
+            size[0] * size[1],
+            lambda first, many: kernel(
+                _at(gradient, first), tables.data_ptr(), mm_per_pixel, many, *settings, _at(depth, first)
+            ),
         )
-    )
-    spectrum = torch.fft.rfft(lines).contiguous()
-    waves = spectrum.shape[2]
-    turned = spectrum.new_empty(count, waves, height)
-    places = order.data_ptr() + first_row * order.element_size()
-    by_frames(
-        count,
-        pixels,
-        lambda first, many: loaded.to_columns(_at(spectrum, first), places, many, many_rows, waves, height, _at(turned, first)),
-    )
-    divided = torch.fft.fft(turned).contiguous()
-    tables = (turns.data_ptr(), of_sum.data_ptr(), of_difference.data_ptr())
-    _check(by_frames(count, pixels, lambda first, many: loaded.divide(_at(divided, first), *tables, many, waves, height)))
-    found = torch.fft.irfft(torch.fft.ifft(divided), n=width, dim=1).transpose(1, 2).contiguous()
-    depth = gradient.new_empty(count, 1, height, width)
-    by_frames(
-        count,
-        pixels,
-        lambda first, many: loaded.finish_depth(
-            *(_at(found, first), order.data_ptr(), _at(gradient, first) if zeroed else None),
-            *(many, *part, height, width, _at(depth, first)),
-        ),
     )
     return depth
 

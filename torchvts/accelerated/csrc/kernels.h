@@ -27,6 +27,26 @@
 #define FUSED
 #endif
 
+/* Before a loop whose turns touch different places. */
+#if defined(__clang__)
+#define INDEPENDENT _Pragma("clang loop vectorize(assume_safety)")
+#elif defined(__GNUC__)
+#define INDEPENDENT _Pragma("GCC ivdep")
+#else
+#define INDEPENDENT
+#endif
+
+/* Memory that the library keeps from call to call, in place of the system's: see memory.c. */
+void *kept_memory(size_t size);
+void *kept_zeros(size_t count, size_t size);
+void give_back(void *memory);
+
+#ifndef TORCHVTS_MEMORY
+#define malloc(size) kept_memory(size)
+#define calloc(count, size) kept_zeros(count, size)
+#define free(memory) give_back(memory)
+#endif
+
 static inline int least(int a, int b) { return a < b ? a : b; }
 
 #endif

@@ -1,26 +1,61 @@
-/* What lies between the Fourier transforms of the cosine-family Poisson solver: the same numbers as torchvts/integration/poisson.py and
-   transforms.py, which say why. Complex numbers are pairs of floats. */
-#include "kernels.h"
+/* Depth from slopes with a free border: the same results as torchvts/integration/poisson.py, by other means. A cosine transform of the columns
+   makes of the five-point Laplacian one equation along x for each coefficient k,
+       u[x + 1] - (2 + 4 sin^2(pi k / 2H)) u[x] + u[x - 1] = f[x],
+   which two recursions with one pole r solve, from left to right and back: 1 / r + r = 2 + 4 sin^2(pi k / 2H). All of the image's columns are
+   even about its borders. (Unser, Splines, IEEE Signal Processing Magazine 16(6), 1999, solves spline filters so.) */
+#include "cosine.h"
+
+#include <math.h>
+
+#if defined(__SSE__)
+#include <xmmintrin.h>
+#endif
+
+/* Tables of one size: the poles, what both recursions multiply by, 1 / (1 - r^2W), the start of the way back; then those of the transform. */
+typedef struct {
+    int height, width, wide;
+    const double *pole, *gain, *per_start, *end;
+    Cosine cosine;
+} Plan;
+
+/* Lanes of the coefficients of a column; never a multiple of 512 bytes, which would map many columns to the same place of the cache. */
+static int wide_of(int height) {
+    const int wide = (height + LANES - 1) / LANES * LANES;
+    return wide % 128 ? wide : wide + LANES;
+}
+
+/* Bytes of the tables; 0 where the height has a prime factor that is too large. */
+EXPORT int64_t poisson_plan_size(int height) {
+    int radix[MOST_PASSES];
+    if (height < 2 || !cosine_radices(height, radix)) return 0;
+    return (int64_t)(sizeof(double) * 4 * (size_t)wide_of(height) + sizeof(float) * cosine_table_size(height));
+}
+
+EXPORT void make_poisson_plan(int height, int width, double *tables) {
+    const int wide = wide_of(height);
+    memset(tables, 0, sizeof(double) * 4 * (size_t)wide); /* the constant, k = 0, is solved by itself */
+    for (int k = 1; k < height; k++) {
+        const double sine = sin(3.14159265358979323846 * k / (2.0 * height)), half = 2.0 * sine * sine;
+        const double rest = sqrt(2.0 * half + half * half) - half, pole = 1.0 - rest; /* 1 - r, without cancellation */
+        tables[k] = pole;
+        tables[wide + k] = -pole / height;
+        tables[2 * wide + k] = -1.0 / expm1(2.0 * width * log1p(-rest));
+        tables[3 * wide + k] = -pole / height / rest;
+    }
+    make_cosine_tables(height, (float *)(tables + 4 * wide));
+}
+
+static Plan plan_of(int height, int width, const double *tables) {
+    const int wide = wide_of(height);
+    const Plan plan = {height, width, wide, tables, tables + wide, tables + 2 * wide, tables + 3 * wide,
+                       cosine_of(height, (const float *)(tables + 4 * wide))};
+    return plan;
+}
 
 /* Half the difference of what lies after and before each element, and below and above it: a line of the divergence. */
 WIDE static void difference(const float *restrict padded, const float *restrict above, const float *restrict below, float half, int n,
                             float *restrict line) {
     for (int x = 0; x < n; x++) line[x] = half * (padded[x + 2] - padded[x] + below[x] - above[x]);
-}
-
-/* Even places first, then the odd ones backwards. */
-WIDE static void reorder(const float *restrict line, int n, float *restrict result) {
-    for (int x = 0; x < (n + 1) / 2; x++) result[x] = line[2 * x];
-    for (int x = 0; x < n / 2; x++) result[n - 1 - x] = line[2 * x + 1];
-}
-
-/* The inverse of reorder(), less `level`. */
-WIDE static void restore(const float *restrict line, int n, float level, float *restrict result) {
-    for (int x = 0; x < n / 2; x++) {
-        result[2 * x] = line[x] - level;
-        result[2 * x + 1] = line[n - 1 - x] - level;
-    }
-    if (n % 2) result[n - 1] = line[n / 2] - level;
 }
 
 /* Row y of the window, times `sign`; nothing where there is no such row. */
@@ -30,126 +65,263 @@ static void place(const float *rows_of, int y, int rows, int columns, float sign
     for (int x = 0; x < columns; x++) line[x] = sign * source[x];
 }
 
-/*
- * gradient (frames, 2, rows, columns): that of a window at (top, left) of an image of height x width, zero elsewhere. Writes the lines
- * of the divergence from row `first` on, reordered along x, (frames, count, width). Beyond the border a gradient is that of the border
- * with the other sign, so that edges out of the image count as zero. Returns 0, or 1 where memory is short.
- */
-EXPORT int divergence_lines(const float *gradient, float mm_per_pixel, int frames, int rows, int columns, int top, int left, int height,
-                            int width, int first, int count, float *lines) {
-    float *padded = malloc(sizeof(float) * (4 * (size_t)width + 2));
-    if (!padded) return 1;
-    float *above = padded + width + 2, *below = above + width, *line = below + width;
-    for (int b = 0; b < frames; b++) {
-        const float *p = gradient + 2 * (size_t)b * rows * columns, *q = p + (size_t)rows * columns;
-        for (int k = 0; k < count; k++) {
-            const int y = first + k - top;
-            memset(padded, 0, sizeof(float) * (3 * (size_t)width + 2));
-            if (y >= 0 && y < rows) {
-                memcpy(padded + 1 + left, p + (size_t)y * columns, sizeof(float) * (size_t)columns);
-                padded[0] = -padded[1];
-                padded[width + 1] = -padded[width];
-            }
-            const int lowest = first + k == height - 1, highest = first + k == 0;
-            place(q, lowest ? y : y + 1, rows, columns, lowest ? -1.0f : 1.0f, below + left);
-            place(q, highest ? y : y - 1, rows, columns, highest ? -1.0f : 1.0f, above + left);
-            difference(padded, above, below, 0.5f * mm_per_pixel, width, line);
-            reorder(line, width, lines + ((size_t)b * count + k) * width);
+/* A part of an image: its first row and column, how many, and those of the pixels beside it too. */
+typedef struct {
+    int top, left, rows, columns, first_row, last_row, first_column, last_column;
+} Part;
+
+static Part part_of(int rows, int columns, int top, int left, int height, int width) {
+    const Part part = {top, left, rows, columns, top > 0 ? top - 1 : 0, least(top + rows + 1, height), left > 0 ? left - 1 : 0,
+                       least(left + columns + 1, width)};
+    return part;
+}
+
+/* The divergence of a gradient, (2, rows, columns), where it is not zero: lines of `step` floats. Beyond the border of the image a gradient is
+   that of the border with the other sign, so that edges out of the image count as zero. scratch: three lines, and two floats. */
+static void divergence(const float *gradient, const Part *part, int height, int width, float half_pitch, float *scratch, float *lines, int step) {
+    const int n = part->last_column - part->first_column, before = part->left - part->first_column, columns = part->columns;
+    float *padded = scratch, *above = scratch + n + 2, *below = above + n;
+    const float *p = gradient, *q = gradient + (size_t)part->rows * columns;
+    for (int line = part->first_row; line < part->last_row; line++, lines += step) {
+        const int y = line - part->top;
+        memset(scratch, 0, sizeof(float) * (3 * (size_t)n + 2));
+        if (y >= 0 && y < part->rows) {
+            memcpy(padded + 1 + before, p + (size_t)y * columns, sizeof(float) * (size_t)columns);
+            if (part->first_column == 0) padded[0] = -padded[1];
+            if (part->last_column == width) padded[n + 1] = -padded[n];
         }
+        const int lowest = line == height - 1, highest = line == 0;
+        place(q, lowest ? y : y + 1, part->rows, columns, lowest ? -1.0f : 1.0f, below + before);
+        place(q, highest ? y : y - 1, part->rows, columns, highest ? -1.0f : 1.0f, above + before);
+        difference(padded, above, below, half_pitch, n, lines);
+        memset(lines + n, 0, sizeof(float) * (size_t)(step - n));
     }
-    free(padded);
+}
+
+/* to[j][i] = from[i][j] of 4 x 4 values. */
+static inline void transpose(const float *from, size_t from_step, float *to, size_t to_step) {
+#if defined(__SSE__)
+    __m128 a = _mm_loadu_ps(from), b = _mm_loadu_ps(from + from_step), c = _mm_loadu_ps(from + 2 * from_step), d = _mm_loadu_ps(from + 3 * from_step);
+    _MM_TRANSPOSE4_PS(a, b, c, d);
+    _mm_storeu_ps(to, a), _mm_storeu_ps(to + to_step, b), _mm_storeu_ps(to + 2 * to_step, c), _mm_storeu_ps(to + 3 * to_step, d);
+#else
+    for (int i = 0; i < 4; i++)
+        for (int j = 0; j < 4; j++) to[j * to_step + i] = from[i * from_step + j];
+#endif
+}
+
+/* Very small numbers become zero: the recursions run into them, and processors are a hundred times slower there. */
+static unsigned int without_tiny(void) {
+#if defined(__SSE__)
+    const unsigned int before = _mm_getcsr();
+    _mm_setcsr(before | 0x8040u);
+    return before;
+#else
     return 0;
+#endif
 }
 
-/* Transposes lines (frames, count, n) of pairs into columns (frames, n, height) of pairs, line k to place order[k]; zero elsewhere. */
-EXPORT void to_columns(const uint64_t *lines, const int64_t *order, int frames, int count, int n, int height, uint64_t *columns) {
-    memset(columns, 0, sizeof(uint64_t) * (size_t)frames * n * height);
-    for (int b = 0; b < frames; b++)
-        for (int first = 0; first < n; first += 8)
-            for (int k = 0; k < count; k++) {
-                const uint64_t *line = lines + ((size_t)b * count + k) * n;
-                uint64_t *column = columns + (size_t)b * n * height + order[k];
-                for (int x = first; x < least(first + 8, n); x++) column[(size_t)x * height] = line[x];
-            }
+static void with_tiny(unsigned int before) {
+#if defined(__SSE__)
+    _mm_setcsr(before);
+#else
+    (void)before;
+#endif
 }
 
-/* One column's rows k and n - k, which meet only each other; `back` holds the latter and gets them. */
-WIDE static void scale(float *restrict here, float *restrict back, const float *restrict turn, const float *restrict other,
-                       const float *restrict of_sum, const float *restrict of_difference, int n) {
+/* One step of a recursion, for each of n coefficients. */
+WIDE FUSED static void sum_up(const float *restrict values, const double *restrict pole, int n, double *restrict sum) {
+    for (int k = 0; k < n; k++) sum[k] = values[k] + pole[k] * sum[k];
+}
+
+/* The same, whose sums take the values' place. */
+WIDE FUSED static void there(float *restrict values, const double *restrict pole, int n, double *restrict sum) {
     for (int k = 0; k < n; k++) {
-        const float a = turn[2 * k], b = turn[2 * k + 1], c = other[2 * k], d = other[2 * k + 1];
-        const float u = 0.5f * (a * here[2 * k] - b * here[2 * k + 1]), v = 0.5f * (a * here[2 * k + 1] + b * here[2 * k]);
-        const float r = 0.5f * (c * back[2 * k] - d * back[2 * k + 1]), s = 0.5f * (c * back[2 * k + 1] + d * back[2 * k]);
-        const float sum = (u + r) * of_sum[2 * k], sum_i = (v + s) * of_sum[2 * k + 1];
-        const float residual = (u - r) * of_difference[2 * k], residual_i = (v - s) * of_difference[2 * k + 1];
-        here[2 * k] = a * (sum + residual) + b * (sum_i + residual_i);
-        here[2 * k + 1] = a * (sum_i + residual_i) - b * (sum + residual);
-        back[2 * k] = c * (sum - residual) + d * (sum_i - residual_i);
-        back[2 * k + 1] = c * (sum_i - residual_i) - d * (sum - residual);
+        sum[k] = values[k] + pole[k] * sum[k];
+        values[k] = (float)sum[k];
     }
 }
 
-/*
- * In place: spectrum (frames, n, height) of pairs divided by the Laplacian's eigenvalues. turns (2, n, height / 2 + 1) of pairs, of_sum and
- * of_difference (n, height / 2 + 1, 2): see cosine_tables(). Returns 0, or 1 where memory is short.
- */
-EXPORT int divide(float *spectrum, const float *turns, const float *of_sum, const float *of_difference, int frames, int n, int height) {
-    const int half = height / 2 + 1;
-    uint64_t *back = malloc(sizeof(uint64_t) * (size_t)half);
-    if (!back) return 1;
-    for (int b = 0; b < frames; b++)
-        for (int x = 0; x < n; x++) {
-            uint64_t *column = (uint64_t *)spectrum + ((size_t)b * n + x) * height;
-            const size_t at = 2 * (size_t)x * half;
-            back[0] = column[0];
-            for (int k = 1; k < half; k++) back[k] = column[height - k];
-            scale((float *)column, (float *)back, turns + at, turns + 2 * (size_t)n * half + at, of_sum + at, of_difference + at, half);
-            for (int k = 1; k < (height + 1) / 2; k++) column[height - k] = back[k];
+/* The same of values that are zero. */
+WIDE FUSED static void there_alone(float *restrict values, const double *restrict pole, int n, double *restrict sum) {
+    for (int k = 0; k < n; k++) {
+        sum[k] *= pole[k];
+        values[k] = (float)sum[k];
+    }
+}
+
+WIDE FUSED static void back(float *restrict values, const double *restrict pole, const double *restrict gain, int n, double *restrict sum) {
+    for (int k = 0; k < n; k++) {
+        sum[k] = gain[k] * values[k] + pole[k] * sum[k];
+        values[k] = (float)sum[k];
+    }
+}
+
+/* sum *= pole^exponent. power: n doubles. */
+WIDE static void times_power(const double *restrict pole, int exponent, int n, double *restrict power, double *restrict sum) {
+    memcpy(power, pole, sizeof(double) * (size_t)n);
+    for (; exponent; exponent >>= 1) {
+        if (exponent & 1)
+            for (int k = 0; k < n; k++) sum[k] *= power[k];
+        for (int k = 0; k < n; k++) power[k] *= power[k];
+    }
+}
+
+/* What lies left of the image, which the image mirrored gives, and the sum up to it. */
+WIDE static void begin(const double *restrict one, const double *restrict per_start, int n, double *restrict sum) {
+    for (int k = 0; k < n; k++) sum[k] = (sum[k] + one[k]) * per_start[k];
+}
+
+WIDE static void turn_round(const float *restrict values, const double *restrict end, int n, double *restrict sum) {
+    for (int k = 0; k < n; k++) sum[k] = end[k] * values[k];
+}
+
+/* Along x: coefficients (width, wide), zero but in the part's columns, become those of the depth. state: 3 * wide doubles. */
+static void recursions(const Plan *plan, const Part *part, float *columns, double *state) {
+    const int n = plan->wide, width = plan->width, first = part->first_column, last = part->last_column;
+    double *sum = state, *other = state + n, *power = other + n;
+    memset(state, 0, sizeof(double) * 2 * (size_t)n);
+    for (int x = last - 1; x >= first; x--) sum_up(columns + (size_t)x * n, plan->pole, n, sum);
+    for (int x = first; x < last; x++) sum_up(columns + (size_t)x * n, plan->pole, n, other);
+    times_power(plan->pole, first, n, power, sum);
+    times_power(plan->pole, 2 * width - last, n, power, other);
+    begin(other, plan->per_start, n, sum);
+    for (int x = 0; x < first; x++) there_alone(columns + (size_t)x * n, plan->pole, n, sum);
+    for (int x = first; x < last; x++) there(columns + (size_t)x * n, plan->pole, n, sum);
+    for (int x = last; x < width; x++) there_alone(columns + (size_t)x * n, plan->pole, n, sum);
+    turn_round(columns + (size_t)(width - 1) * n, plan->end, n, sum);
+    for (int x = width - 1; x >= 0; x--) back(columns + (size_t)x * n, plan->pole, plan->gain, n, sum);
+}
+
+/* The same for the constant along y, k = 0: sums of sums, less the mean. constant: its values, and gets the result. */
+static void solve_constant(const Plan *plan, double *constant) {
+    const int width = plan->width;
+    double mean = 0.0, slope = 0.0, depth = 0.0, total = 0.0;
+    for (int x = 0; x < width; x++) mean += constant[x] / width;
+    for (int x = 0; x < width; x++) {
+        const double here = constant[x];
+        constant[x] = depth, total += depth / width;
+        slope += here - mean, depth += slope;
+    }
+    for (int x = 0; x < width; x++) constant[x] = (constant[x] - total) / plan->height;
+}
+
+/* Lines of the divergence, `step` floats each, to their coefficients: (width, wide) from the part's first column on. */
+static void to_coefficients(const Plan *plan, const Part *part, const float *lines, int step, float *scratch, float *found, float *columns) {
+    const size_t n = (size_t)plan->height, wide = (size_t)plan->wide;
+    for (int first = 0; first < step; first += LINES) {
+        memset(scratch, 0, sizeof(float) * n * LINES);
+        for (int y = part->first_row; y < part->last_row; y++) {
+            const float *line = lines + (size_t)(y - part->first_row) * step + first;
+            float *to = cosine_line(&plan->cosine, scratch, y);
+            memcpy(to, line, sizeof(float) * LANES);
+            memcpy(to + n * LANES, line + LANES, sizeof(float) * LANES);
         }
-    free(back);
-    return 0;
-}
-
-/* Sum of the depth where the gradient is, and how many pixels that are; lines as in finish_depth(). */
-static double deformed_sum(const float *lines, const float *gradient, const int64_t *order, int rows, int columns, int top, int left,
-                          int width, size_t *deformed) {
-    const float *p = gradient, *q = gradient + (size_t)rows * columns;
-    double sum = 0.0;
-    for (int y = 0; y < rows; y++) {
-        const float *line = lines + (size_t)order[top + y] * width;
-        for (int x = 0; x < columns; x++, p++, q++)
-            if (*p != 0.0f || *q != 0.0f) {
-                const int at = left + x;
-                sum += line[at % 2 ? width - 1 - at / 2 : at / 2];
-                ++*deformed;
-            }
+        cosine_forward(&plan->cosine, scratch, found);
+        for (size_t k = 0; k < wide; k += 4)
+            for (int x = 0; x < LINES; x += 4)
+                transpose(found + k * LINES + x, LINES, columns + (size_t)(part->first_column + first + x) * wide + k, wide);
     }
-    return sum;
 }
 
-/*
- * Depth (frames, height, width) from lines of that size whose rows and columns are reordered. Given the gradient of the window
- * (frames, 2, rows, columns) at (top, left), the depth is zero on average where the gradient is zero, and where that is nowhere, zero
- * at its lowest.
- */
-EXPORT void finish_depth(const float *lines, const int64_t *order, const float *gradient, int frames, int rows, int columns, int top, int left,
-                   int height, int width, float *depth) {
+/* The inverse, to depth (height, width). */
+static void to_depth(const Plan *plan, const float *columns, float *scratch, float *found, float *depth) {
+    const size_t n = (size_t)plan->height, wide = (size_t)plan->wide;
+    for (int first = 0; first < plan->width; first += LINES) {
+        for (size_t k = 0; k < wide; k += 4)
+            for (int x = 0; x < LINES; x += 4) transpose(columns + (size_t)(first + x) * wide + k, wide, found + k * LINES + x, LINES);
+        float *lines = cosine_inverse(&plan->cosine, scratch, found);
+        const int one = least(LANES, plan->width - first), other = least(LINES, plan->width - first) - one;
+        for (int y = 0; y < plan->height; y++) {
+            const float *line = cosine_line(&plan->cosine, lines, y);
+            float *to = depth + (size_t)y * plan->width + first;
+            if (one == LANES && other == LANES) {
+                memcpy(to, line, sizeof(float) * LANES);
+                memcpy(to + LANES, line + n * LANES, sizeof(float) * LANES);
+            } else {
+                memcpy(to, line, sizeof(float) * (size_t)one);
+                memcpy(to + one, line + n * LANES, sizeof(float) * (size_t)other);
+            }
+        }
+    }
+}
+
+/* Sum of depth where the slopes are not zero, and how many pixels that are. */
+WIDE static double inclined_sum(const float *restrict depth, const float *restrict p, const float *restrict q, int n, int *count) {
+    double sums[LANES] = {0.0}, total = 0.0;
+    int counts[LANES] = {0}, x = 0;
+    for (; x + LANES <= n; x += LANES)
+        for (int t = 0; t < LANES; t++) {
+            const int is = (p[x + t] != 0.0f) | (q[x + t] != 0.0f);
+            sums[t] += is ? depth[x + t] : 0.0f;
+            counts[t] += is;
+        }
+    for (int t = 0; x < n; x++, t++) {
+        const int is = (p[x] != 0.0f) | (q[x] != 0.0f);
+        sums[t] += is ? depth[x] : 0.0f;
+        counts[t] += is;
+    }
+    for (int t = 0; t < LANES; t++) total += sums[t], *count += counts[t];
+    return total;
+}
+
+WIDE static void subtract_level(float *depth, float level, size_t n) {
+    for (size_t k = 0; k < n; k++) depth[k] -= level;
+}
+
+/* Depth zero on average where the gradient is zero, and where that is nowhere, zero at its lowest. It has zero mean. */
+static void set_level(const float *gradient, const Part *part, int height, int width, float *depth) {
     const size_t pixels = (size_t)height * width;
-    for (int b = 0; b < frames; b++, lines += pixels, depth += pixels) {
-        double level = 0.0;
-        if (gradient) {
-            size_t deformed = 0;
-            const double sum = deformed_sum(lines, gradient + 2 * (size_t)b * rows * columns, order, rows, columns, top, left, width, &deformed);
-            if (deformed < pixels)
-                level = -sum / (double)(pixels - deformed);
-            else {
-                level = lines[0];
-                for (size_t k = 1; k < pixels; k++)
-                    if (lines[k] < level) level = lines[k];
-            }
-        }
-        for (int y = 0; y < height; y++) restore(lines + (size_t)order[y] * width, width, (float)level, depth + (size_t)y * width);
+    double sum = 0.0;
+    size_t inclined = 0;
+    for (int y = 0; y < part->rows; y++) {
+        int count = 0;
+        const float *p = gradient + (size_t)y * part->columns;
+        sum += inclined_sum(depth + (size_t)(part->top + y) * width + part->left, p, p + (size_t)part->rows * part->columns, part->columns, &count);
+        inclined += (size_t)count;
     }
+    double level = -sum / (double)(inclined < pixels ? pixels - inclined : 1);
+    if (inclined == pixels) {
+        level = depth[0];
+        for (size_t k = 1; k < pixels; k++)
+            if (depth[k] < level) level = depth[k];
+    }
+    subtract_level(depth, (float)level, pixels);
+}
+
+/*
+ * Depth (frames, height, width) of gradients (frames, 2, rows, columns) of a window at (top, left), zero elsewhere; tables: of
+ * make_poisson_plan(). It has zero mean; `zeroed`, it is zero on average where the gradient is zero. Returns 1 where memory is short.
+ */
+EXPORT int solve_poisson(const float *gradient, const double *tables, float mm_per_pixel, int frames, int rows, int columns, int top, int left,
+                         int height, int width, int zeroed, float *depth) {
+    const Plan plan = plan_of(height, width, tables);
+    const Part part = part_of(rows, columns, top, left, height, width);
+    const int n = part.last_column - part.first_column, step = (n + LINES - 1) / LINES * LINES, wide = plan.wide;
+    const size_t lines = (size_t)height * (width + LINES), blocks = (size_t)width + LINES; /* the same for every window */
+    const size_t floats = cosine_scratch_size(height) + (size_t)wide * LINES + blocks * wide + lines + 3 * (size_t)width + 2;
+    float *scratch = malloc(sizeof(float) * floats + sizeof(double) * (3 * (size_t)wide + width + 1));
+    if (!scratch) return 1;
+    double *state = (double *)scratch, *constant = state + 3 * wide;
+    float *work = (float *)(constant + width), *found = work + cosine_scratch_size(height), *coefficients = found + (size_t)wide * LINES;
+    float *line = coefficients + blocks * wide, *borders = line + lines;
+    const unsigned int before = without_tiny();
+    memset(found, 0, sizeof(float) * (size_t)wide * LINES);
+    memset(coefficients, 0, sizeof(float) * blocks * wide);
+    for (int b = 0; b < frames; b++, gradient += 2 * (size_t)rows * columns, depth += (size_t)height * width) {
+        divergence(gradient, &part, height, width, 0.5f * mm_per_pixel, borders, line, step);
+        to_coefficients(&plan, &part, line, step, work, found, coefficients);
+        for (int x = 0; x < width; x++)
+            constant[x] = x >= part.first_column && x < part.last_column ? coefficients[(size_t)x * wide] : 0.0;
+        recursions(&plan, &part, coefficients, state);
+        solve_constant(&plan, constant);
+        for (int x = 0; x < width; x++) coefficients[(size_t)x * wide] = (float)constant[x];
+        to_depth(&plan, coefficients, work, found, depth);
+        if (zeroed) set_level(gradient, &part, height, width, depth);
+    }
+    with_tiny(before);
+    free(scratch);
+    return 0;
 }
 
 /* Largest magnitude of n differences. Compared as whole numbers, whose order is that of floats without sign, and which are vectorised. */

@@ -36,7 +36,9 @@ class Drift(Twin, compensate.Drift):
             return super().ordered(values)
         return torch.from_numpy(np.sort(values.numpy(), axis=-1))
 
-    def by_mode(self, ratio: Tensor, least: float = 0.01, most: float = 0.15) -> Tensor:
+    def by_mode(
+        self, ratio: Tensor, least: float = compensate.drift.LEAST_DRIFT, most: float = compensate.drift.MOST_DRIFT
+    ) -> Tensor:
         if not usable(ratio):
             return super().by_mode(ratio, least, most)
         return kernels.levels(ratio, grid_stride(ratio), least, most)
@@ -132,9 +134,14 @@ class ContactFromDepth(Twin, contact.ContactFromDepth):
     def find(self, depth_mm: Tensor, gradient: Tensor, deformed: Tensor) -> Tensor:
         if not usable(depth_mm, gradient):
             return super().find(depth_mm, gradient, deformed)
+        return kernels.contact_from_depth(
+            depth_mm, gradient, deformed, (self.cell, self.reach), (ctypes.c_float * 9)(*self.numbers())
+        )
+
+    def numbers(self) -> tuple[float, ...]:
+        """The settings that the kernel takes."""
         noise = (self.most_unexplained, self.noise_depth_mm)
-        numbers = (self.cell * self.mm_per_pixel, self.share, *self.decay, *self.tail, self.least_free, *noise)
-        return kernels.contact_from_depth(depth_mm, gradient, deformed, (self.cell, self.reach), (ctypes.c_float * 9)(*numbers))
+        return (self.cell * self.mm_per_pixel, self.share, *self.decay, *self.tail, self.least_free, *noise)
 
 
 class Crop(Twin, frames.Crop):

@@ -18,6 +18,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from ..core.robust import HALVINGS
 from ..normals.shadowed import LightView, Limits
 from .threads import by_frames
 
@@ -87,6 +88,7 @@ def library() -> ctypes.CDLL | None:
     loaded.response_normals.restype = loaded.mask_values.restype = None
     loaded.grid_means.argtypes = [pointer, *[whole] * 7, pointer]
     loaded.slopes.argtypes = [pointer, whole, whole, real, pointer]
+    loaded.solve_frames.argtypes = [pointer, pointer, whole, *[pointer] * 5]
     loaded.poisson_plan_size.restype = step
     loaded.make_poisson_plan.argtypes = [whole, whole, pointer]
     loaded.solve_poisson.argtypes = [pointer, pointer, real, *[whole] * 8, pointer]
@@ -116,7 +118,8 @@ class ContactGrid(NamedTuple):
     bridge_sigmas: float
 
 
-def _loaded() -> ctypes.CDLL:
+def loaded() -> ctypes.CDLL:
+    """The compiled kernels, after :func:`~torchvts.accelerated.gate.usable` said that they may work."""
     loaded = library()
     assert loaded is not None, "called without usable()"
     return loaded
@@ -158,7 +161,7 @@ def grid_means(image: Tensor, stride: int, first: int) -> Tensor:
     count, channels, height, width = image.shape
     rows, columns = (len(range(first, length // stride * stride, stride)) for length in (height, width))
     means = image.new_empty(count, channels, rows, columns)
-    _loaded().grid_means(image.data_ptr(), count * channels, height, width, stride, first, rows, columns, means.data_ptr())
+    loaded().grid_means(image.data_ptr(), count * channels, height, width, stride, first, rows, columns, means.data_ptr())
     return means
 
 
@@ -183,25 +186,28 @@ def clean(
     maps = (None if gain is None else gain.data_ptr(), None if by_pixel is None else by_pixel.data_ptr())
     pedestal = NO_PEDESTAL if isinstance(offset, Tensor) else offset
     filled = (*[index.data_ptr() for index in defects], defects[0].shape[0])
-    kernel = _loaded().clean
+    kernel = loaded().clean
     _check(
         by_frames(
             count,
             height * width,
-            lambda first, many: kernel(
-                _at(light, first), *maps, pedestal, *filled, weights, len(weights), many, height, width, _at(out, first)
+            lambda first, many: (
+                1
+                & kernel(  # values outside of [0, 1] may be here
+                    _at(light, first), *maps, pedestal, *filled, weights, len(weights), many, height, width, _at(out, first)
+                )
             ),
         )
     )
     return out
 
 
-def levels(image: Tensor, stride: int, least: float, most: float, halvings: int = 4) -> Tensor:
+def levels(image: Tensor, stride: int, least: float, most: float, halvings: int = HALVINGS) -> Tensor:
     """Brightness of each channel, (B, 3, 1, 1): see :meth:`~torchvts.compensate.Drift.by_mode`."""
     image = image.contiguous()
     count, _, height, width = image.shape
     found = image.new_empty(count, 3, 1, 1)
-    size, limits, kernel = (height, width, stride, halvings), (least, most), _loaded().levels
+    size, limits, kernel = (height, width, stride, halvings), (least, most), loaded().levels
     _check(by_frames(count, height * width, lambda first, many: kernel(_at(image, first), many, *size, *limits, _at(found, first))))
     return found
 
@@ -210,7 +216,7 @@ def box_of(mask: Tensor) -> tuple[int, int, int, int]:
     """(top, bottom, left, right) of the smallest box that holds all of a bool (B, 1, H, W); zeros without any."""
     mask = mask.contiguous()
     box = (ctypes.c_int * 4)()
-    _loaded().box_of(mask.data_ptr(), mask.shape[0], mask.shape[2], mask.shape[3], box)
+    loaded().box_of(mask.data_ptr(), mask.shape[0], mask.shape[2], mask.shape[3], box)
     return box[0], box[1], box[2], box[3]
 
 
@@ -218,7 +224,7 @@ def divided(image: Tensor, level: Tensor) -> Tensor:
     """Images (B, C, H, W) over levels (B, C, 1, 1)."""
     image, level = image.contiguous(), level.contiguous()
     level, out = level.expand(image.shape[0], -1, -1, -1).contiguous(), torch.empty_like(image)
-    count, planes, pixels, kernel = image.shape[0], image.shape[1], image.shape[2] * image.shape[3], _loaded().divide_planes
+    count, planes, pixels, kernel = image.shape[0], image.shape[1], image.shape[2] * image.shape[3], loaded().divide_planes
     by_frames(
         count,
         pixels,
@@ -241,7 +247,7 @@ def contact_mask(
     mask = compensated.new_empty(count, 1, height, width, dtype=torch.bool)
     interior = torch.empty_like(mask)
     fields = (offsets, per_noise.data_ptr(), limits[0].data_ptr(), limits[1].data_ptr())
-    kernel = _loaded().contact_mask
+    kernel = loaded().contact_mask
     _check(
         by_frames(
             count,
@@ -265,7 +271,7 @@ def contact_from_depth(
     count, _, rows, columns = depth_mm.shape
     contact = depth_mm.new_empty(count, 1, rows, columns, dtype=torch.bool)
     strides = (depth_mm.stride(0), depth_mm.stride(2)), (deformed.stride(0), deformed.stride(2))
-    kernel = _loaded().contact_from_depth
+    kernel = loaded().contact_from_depth
     _check(
         by_frames(
             count,
@@ -310,7 +316,7 @@ def response_normals(
     )
     by_depth = (None if per_mm is None else per_mm.data_ptr() + 36 * top, max_sine)
     steps = (0, 0) if depth_mm is None else (0 if depth_mm.shape[0] == 1 else depth_mm.stride(0), depth_mm.stride(2))
-    kernel, strides = _loaded().response_normals, compensated.stride()[:3]
+    kernel, strides = loaded().response_normals, compensated.stride()[:3]
     by_frames(
         count,
         rows * columns,
@@ -326,7 +332,7 @@ def masked(gradient: Tensor, mask: Tensor) -> Tensor:
     """A gradient (B, 2, h, w), zero outside of a mask, bool (B, 1, h, w)."""
     gradient, mask = gradient.contiguous(), _with_whole_rows(mask)
     out = torch.empty_like(gradient)
-    _loaded().mask_values(gradient.data_ptr(), mask.data_ptr(), mask.stride(0), mask.stride(2), *gradient.shape, out.data_ptr())
+    loaded().mask_values(gradient.data_ptr(), mask.data_ptr(), mask.stride(0), mask.stride(2), *gradient.shape, out.data_ptr())
     return out
 
 
@@ -336,7 +342,7 @@ def depth_slopes(depth_mm: Tensor, mask: Tensor, mm_per_pixel: float) -> Tensor:
     count, _, rows, columns = depth_mm.shape
     gradient = depth_mm.new_empty(count, 2, rows, columns)
     strides = (depth_mm.stride(0), depth_mm.stride(2)), (mask.stride(0), mask.stride(2))
-    settings, kernel = (0.5 / mm_per_pixel,), _loaded().depth_slopes
+    settings, kernel = (0.5 / mm_per_pixel,), loaded().depth_slopes
     by_frames(
         count,
         rows * columns,
@@ -364,7 +370,7 @@ def normals(compensated: Tensor, limits: Limits, inverse: Tensor, depth_mm: Tens
     depth_mm = None if depth_mm is None else _with_whole_rows(depth_mm)
     fields = (dark.data_ptr() + at, saturated.data_ptr() + at, inverse.data_ptr() + at, height * width, width)
     lights = (position_mm.data_ptr(), albedo.data_ptr(), view.mm_per_pixel, 1.0 / view.camera_height_mm, *view.axis_mm)
-    kernel, strides, steps = _loaded().normals, compensated.stride()[:3], _depth_arguments(depth_mm)[1:]
+    kernel, strides, steps = loaded().normals, compensated.stride()[:3], _depth_arguments(depth_mm)[1:]
     invalid = by_frames(
         count,
         rows * columns,
@@ -401,7 +407,7 @@ def solve_shadowed(
     place = view.window[0] * width + view.window[1]
     depth_mm = None if depth_mm is None else _with_whole_rows(depth_mm)
     expected = None if expected is None else expected.contiguous()
-    _loaded().solve_shadowed(
+    loaded().solve_shadowed(
         compensated.data_ptr(),
         *compensated.stride()[:3],
         dark.data_ptr() + 4 * place,
@@ -426,19 +432,19 @@ def slopes(normal: Tensor, max_slope: float) -> Tensor:
     normal = normal.contiguous()
     count, _, height, width = normal.shape
     gradient = normal.new_empty(count, 2, height, width)
-    _loaded().slopes(normal.data_ptr(), count, height * width, 1.0 / max_slope, gradient.data_ptr())
+    loaded().slopes(normal.data_ptr(), count, height * width, 1.0 / max_slope, gradient.data_ptr())
     return gradient
 
 
 @functools.lru_cache(maxsize=8)
 def poisson_plan(height: int, width: int) -> Tensor | None:
     """The tables of csrc/poisson.c for a size; None where the height has a prime factor above 64."""
-    size = _loaded().poisson_plan_size(height)
+    size = loaded().poisson_plan_size(height)
     if not size:
         return None
     with torch.inference_mode(False):
         tables = torch.empty(size, dtype=torch.uint8, device="cpu")
-    _loaded().make_poisson_plan(height, width, tables.data_ptr())
+    loaded().make_poisson_plan(height, width, tables.data_ptr())
     return tables
 
 
@@ -452,14 +458,12 @@ def solve_poisson(
     gradient = gradient.contiguous()
     count, _, rows, columns = gradient.shape
     depth = gradient.new_empty(count, 1, *size)
-    settings, kernel = (rows, columns, *window, *size, zeroed), _loaded().solve_poisson
+    settings, kernel = (rows, columns, *window, *size, zeroed), loaded().solve_poisson
     _check(
         by_frames(
             count,
             size[0] * size[1],
-            lambda first, many: kernel(
-                _at(gradient, first), tables.data_ptr(), mm_per_pixel, many, *settings, _at(depth, first)
-            ),
+            lambda first, many: kernel(_at(gradient, first), tables.data_ptr(), mm_per_pixel, many, *settings, _at(depth, first)),
         )
     )
     return depth
@@ -469,7 +473,7 @@ def largest_change(one: Tensor, other: Tensor) -> Tensor:
     """Largest difference of two batches of depths, per frame, (B,)."""
     one, other = one.contiguous(), other.contiguous()
     change = one.new_empty(one.shape[0])
-    _loaded().largest_change(one.data_ptr(), other.data_ptr(), one.shape[0], one[0].numel(), change.data_ptr())
+    loaded().largest_change(one.data_ptr(), other.data_ptr(), one.shape[0], one[0].numel(), change.data_ptr())
     return change
 
 
@@ -479,7 +483,7 @@ def uncrop(gradient: Tensor, contact: Tensor, window: tuple[int, int], size: tup
     count, _, rows, columns = gradient.shape
     whole, normal = gradient.new_empty(count, 2, *size), gradient.new_empty(count, 3, *size)
     touching = contact.new_empty(count, 1, *size)
-    part, kernel = (rows, columns, *window, *size), _loaded().uncrop
+    part, kernel = (rows, columns, *window, *size), loaded().uncrop
     by_frames(
         count,
         size[0] * size[1],
@@ -496,7 +500,7 @@ def zero_background(depth_mm: Tensor, deformed: Tensor, stiff: float, tolerance:
     depth_mm, deformed = depth_mm.contiguous(), deformed.contiguous()
     count, _, height, width = depth_mm.shape
     out = torch.empty_like(depth_mm)
-    kernel, settings = _loaded().zero_background, (height, width, stiff, tolerance, sweeps)
+    kernel, settings = loaded().zero_background, (height, width, stiff, tolerance, sweeps)
     _check(
         by_frames(
             count,
@@ -511,7 +515,7 @@ def alignment_sums(field: Tensor, columns: Tensor, limits: npt.NDArray[Any], sco
     """Sums (56,) float64 of one Gauss-Newton step: see :mod:`torchvts.pose.inverse`, whose tensors these are."""
     sums = np.empty(56)
     inputs = (field.data_ptr(), *field.shape[:2], columns.data_ptr(), columns.stride(0), columns.shape[1], score_only)
-    _loaded().alignment_sums(*inputs, limits.ctypes.data, sums.ctypes.data)
+    loaded().alignment_sums(*inputs, limits.ctypes.data, sums.ctypes.data)
     return sums
 
 
@@ -519,7 +523,7 @@ def part_sums(field: Tensor, columns: Tensor, parts: int, limits: npt.NDArray[An
     """Sums (parts, 56) float64 of as many runs of pixels, as of :func:`alignment_sums`."""
     sums = np.empty((parts, 56))
     inputs = (field.data_ptr(), *field.shape[:2], columns.data_ptr(), columns.stride(0), columns.shape[1], parts)
-    _loaded().part_sums(*inputs, limits.ctypes.data, sums.ctypes.data)
+    loaded().part_sums(*inputs, limits.ctypes.data, sums.ctypes.data)
     return sums
 
 
@@ -529,7 +533,7 @@ def refine_pose(
     """Gauss-Newton steps; moves the pose in ``limits``. Returns the sums (56,) of the last step, and the noise of its weights."""
     sums, held = np.empty(57), np.ascontiguousarray(held)
     inputs = (field.data_ptr(), *field.shape[:2], columns.data_ptr(), columns.stride(0), columns.shape[1], steps)
-    _loaded().refine_pose(*inputs, settings.ctypes.data, held.ctypes.data, held.shape[1], limits.ctypes.data, sums.ctypes.data)
+    loaded().refine_pose(*inputs, settings.ctypes.data, held.ctypes.data, held.shape[1], limits.ctypes.data, sums.ctypes.data)
     return sums
 
 
@@ -548,6 +552,6 @@ def track_grids(
     height, width = depth.shape[-2:]
     fine, coarse = (torch.empty(height // n, width // n, 4) for n in times)
     inputs = (depth.data_ptr(), slopes.data_ptr(), contact.data_ptr(), height, width, least_mm, *times)
-    touching = _loaded().track_grids(*inputs, fine.data_ptr(), coarse.data_ptr())
+    touching = loaded().track_grids(*inputs, fine.data_ptr(), coarse.data_ptr())
     _check(touching < 0)
     return fine, coarse, int(touching)

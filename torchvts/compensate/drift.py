@@ -6,6 +6,9 @@ from torch import Tensor, nn
 from ..core.checks import check_field, may_read
 from ..core.robust import half_sample_mode
 
+LEAST_DRIFT, MOST_DRIFT = 0.01, 0.15
+"""Drift, relative, above the error of the mode itself, and the largest that is believed."""
+
 
 class Drift(nn.Module):
     """Divide each channel of compensated images (B, 3, H, W) by its brightness relative to calibration.
@@ -66,7 +69,7 @@ class Drift(nn.Module):
         """Light (B, 3, H, W) over levels (B, 3, 1, 1)."""
         return light / level
 
-    def by_mode(self, ratio: Tensor, least: float = 0.01, most: float = 0.15) -> Tensor:
+    def by_mode(self, ratio: Tensor, least: float = LEAST_DRIFT, most: float = MOST_DRIFT) -> Tensor:
         """Brightness of each channel (B, 3, 1, 1): the mode of image / background, held to 1 +- ``most``.
 
         A press scatters light over the whole skin and LEDs drift: on a GelSight Mini up to 1 %, on another 5 %. Where no channel is
@@ -138,7 +141,12 @@ class Drift(nn.Module):
 
 def grid_stride(image: Tensor) -> int:
     """Distance of the samples: 60 of them along the shorter side."""
-    return max(1, min(image.shape[2], image.shape[3]) // 60)
+    return stride_of(image.shape[2], image.shape[3])
+
+
+def stride_of(height: int, width: int) -> int:
+    """The same of a size."""
+    return max(1, min(height, width) // 60)
 
 
 def _grid(image: Tensor) -> Tensor:

@@ -7,6 +7,10 @@ TUKEY = 4.685
 """Width of Tukey's biweight in standard deviations: 95 % efficiency under Gaussian noise."""
 
 
+HALVINGS = 4
+"""How often the narrowest half is taken for a mode."""
+
+
 def tukey_weight(ratio: Tensor) -> Tensor:
     """Tukey's biweight, (1 - ratio^2)^2 inside of 1 and 0 outside.
 
@@ -24,7 +28,7 @@ def tukey_weight(ratio: Tensor) -> Tensor:
     return (1.0 - ratio**2).clamp_min(0.0) ** 2
 
 
-def half_sample_mode(ordered: Tensor, halvings: int = 4) -> Tensor:
+def half_sample_mode(ordered: Tensor, halvings: int = HALVINGS) -> Tensor:
     """The mode of sorted values: the middle of the narrowest half of the narrowest half, and so on.
 
     Args:

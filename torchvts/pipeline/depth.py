@@ -21,6 +21,8 @@ from ..accelerated import (
     ZeroBackground,
     scriptable,
 )
+from ..accelerated.frame import Blocks as FrameBlocks
+from ..accelerated.frame import solve_frames
 from ..accelerated.threads import OneThread, one_suffices, share_frames
 from ..compensate import Compensate as PlainCompensate
 from ..contact import ContactMask as PlainContactMask
@@ -234,11 +236,41 @@ class DepthPipeline(nn.Module):
             ValueError: wrong shape, or, for eager tensors on a CPU, values outside [0, 1] or not finite.
             TypeError: not floating point.
         """
-        if not torch.jit.is_scripting():  # noqa: SIM102
+        if not torch.jit.is_scripting():
+            found = self.compiled(images)
+            if found is not None:
+                return found
             if one_suffices(images):
                 with OneThread():
                     return self.reconstructed(images)
         return self.reconstructed(images)
+
+    @torch.jit.unused
+    def compiled(self, images: Tensor) -> DepthOutput | None:
+        """The same by one compiled call; None where the blocks must do it, each by itself."""
+        solve, refine, slopes = self.solve, self.refine, self.slopes
+        passes = 1
+        if torch.compiler.is_compiling() or type(self) is not DepthPipeline or type(solve) is not Solve:
+            return None
+        if isinstance(refine, Repeat) and type(refine) is Repeat and refine.solve is solve:
+            passes = refine.max_passes
+        elif type(refine) is not Once:
+            return None
+        blocks = FrameBlocks(
+            self.compensate,
+            self.deformed,
+            self.crop,
+            solve.normals,
+            solve.gradient,
+            solve.masked,
+            solve.integrate,
+            self.zero,
+            slopes.gradient if type(slopes) is SlopesOfDepth else None,
+            self.contact,
+            self.uncrop,
+            passes,
+        )
+        return solve_frames(self, blocks, images)
 
     def reconstructed(self, images: Tensor) -> DepthOutput:
         """:meth:`forward` in the threads that torch now uses."""

@@ -75,15 +75,36 @@ WIDE FUSED static void blur_down(const float *const *lines, const float *restric
     }
 }
 
-/* A plane blurred, its border repeated. scratch: taps lines, and one that is `taps` longer; `lines`: taps pointers. */
-static void blur_plane(const float *plane, const float *weight, int taps, int height, int width, float *scratch, const float **lines, float *out) {
+/* Whether any of n values is not in [0, 1], or no number. */
+WIDE static int any_outside(const float *restrict values, int n) {
+    int found = 0;
+    for (int x = 0; x < n; x++) found |= !((values[x] >= -1e-3f) & (values[x] <= 1.001f));
+    return found;
+}
+
+/* What is done to a plane: image * gain + offset, either of which may be null. */
+typedef struct {
+    const float *image, *gain, *offset;
+    float pedestal;
+} Affine;
+
+/* n values from `at` on. */
+static void apply(const Affine *of, size_t at, int n, float *light) {
+    multiply_add(of->image + at, of->gain ? of->gain + at : NULL, of->offset ? of->offset + at : NULL, of->pedestal, n, light);
+}
+
+/* A plane blurred, its border repeated. scratch: taps lines, and one that is `taps` longer; `lines`: taps pointers. Returns whether any value of
+   the plane, as the camera gives it, is not in [0, 1]. */
+static int blur_plane(const Affine *plane, const float *weight, int taps, int height, int width, float *scratch, const float **lines, float *out) {
     const int reach = taps / 2;
-    float *padded = scratch + (size_t)taps * width;
+    float *padded = scratch + (size_t)taps * width, *row = padded + reach;
+    int outside = 0;
     for (int y = -reach, next = 0; y < height; y++) {
         for (; next < height && next <= y + reach; next++) { /* row `next` of the plane lies in line next % taps */
-            const float *row = plane + (size_t)next * width;
-            for (int k = 0; k < reach; k++) padded[k] = row[0], padded[reach + width + k] = row[width - 1];
-            memcpy(padded + reach, row, sizeof(float) * (size_t)width);
+            const size_t at = (size_t)next * width;
+            outside |= any_outside(plane->image + at, width);
+            apply(plane, at, width, row);
+            for (int k = 0; k < reach; k++) padded[k] = row[0], row[width + k] = row[width - 1];
             blur_along(padded, weight, taps, width, scratch + (size_t)(next % taps) * width);
         }
         if (y < 0) continue;
@@ -93,6 +114,7 @@ static void blur_plane(const float *plane, const float *weight, int taps, int he
         }
         blur_down(lines, weight, taps, width, out + (size_t)y * width);
     }
+    return outside;
 }
 
 /* Defective pixels of a plane become the mean of four others. */
@@ -104,27 +126,34 @@ static void fill(float *plane, const int64_t *defect, const int64_t *neighbours,
 
 /*
  * light (frames, 3, height, width) = image * gain + offset, its `defects` filled, blurred by `taps` weights. gain and offset (3, height,
- * width) may be null, taps and defects 0; without offset it is pedestal (3) * gain. Returns 1 where memory is short.
+ * width) may be null, taps and defects 0; without offset it is pedestal (3) * gain. Returns 1 where memory is short, 2 where a value of the
+ * image is not in [0, 1].
  */
 EXPORT int clean(const float *image, const float *gain, const float *offset, const float *pedestal, const int64_t *defect, const int64_t *neighbours, int64_t defects,
                  const float *weight, int taps, int frames, int height, int width, float *light) {
     const size_t pixels = (size_t)height * width, lines = (size_t)taps * width + width + taps;
-    float *scratch = malloc(sizeof(float) * (lines + (taps ? pixels : 0) + (size_t)defects + 1));
-    const float **line = malloc(sizeof(float *) * (size_t)(taps + 1));
-    if (!scratch || !line) {
-        free(scratch), free(line);
-        return 1;
-    }
-    float *repaired = scratch + lines + (taps ? pixels : 0);
+    const size_t filled = taps && defects ? pixels : 0; /* defects lie anywhere, so a whole plane is filled before it is blurred */
+    float *scratch = malloc(sizeof(float) * (lines + filled + (size_t)defects + 1) + sizeof(float *) * (size_t)(taps + 1));
+    if (!scratch) return 1;
+    const float **line = (const float **)scratch;
+    float *rows = (float *)(line + taps + 1), *whole = rows + lines, *repaired = whole + filled;
+    int outside = 0;
     for (int plane = 0; plane < 3 * frames; plane++, image += pixels, light += pixels) {
         const size_t at = pixels * (size_t)(plane % 3);
-        float *to = taps ? scratch + lines : light;
-        multiply_add(image, gain ? gain + at : NULL, offset ? offset + at : NULL, pedestal[plane % 3], (int)pixels, to);
+        Affine of = {image, gain ? gain + at : NULL, offset ? offset + at : NULL, pedestal[plane % 3]};
+        if (taps && !defects) {
+            outside |= blur_plane(&of, weight, taps, height, width, rows, line, light);
+            continue;
+        }
+        float *to = taps ? whole : light;
+        outside |= any_outside(image, (int)pixels);
+        apply(&of, 0, (int)pixels, to);
         if (defects) fill(to, defect, neighbours, defects, repaired);
-        if (taps) blur_plane(to, weight, taps, height, width, scratch, line, light);
+        const Affine as_is = {to, NULL, NULL, 0.0f};
+        if (taps) blur_plane(&as_is, weight, taps, height, width, rows, line, light);
     }
-    free(scratch), free(line);
-    return 0;
+    free(scratch);
+    return outside ? 2 : 0;
 }
 
 /* Sorts n values by the bits of their floats, at most twelve at a time; other: as many more. Returns where the sorted values lie. */

@@ -47,6 +47,37 @@ void give_back(void *memory);
 #define free(memory) give_back(memory)
 #endif
 
+/* What frame.c calls of the other sources, which say what these do. */
+EXPORT int clean(const float *image, const float *gain, const float *offset, const float *pedestal, const int64_t *defect, const int64_t *neighbours,
+                 int64_t defects, const float *weight, int taps, int frames, int height, int width, float *light);
+EXPORT int levels(const float *image, int frames, int height, int width, int stride, int halvings, float least_drift, float most, float *level);
+EXPORT void divide_planes(const float *image, const float *level, int planes, int64_t n, float *result);
+EXPORT int contact_mask(const float *image, const float *offset, const float *per_noise, const float *failed_below, const float *most_far_field,
+                        int frames, int height, int width, int step, int stride, int cell, int reach, float sigmas, float rounding,
+                        float least_cells, int bridge, float bridge_sigmas, uint8_t *mask, uint8_t *inner);
+EXPORT void box_of(const uint8_t *mask, int frames, int height, int width, int *box);
+EXPORT void response_normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *place, const float *weight,
+                             int degree, int terms, const float *depth, int64_t depth_frame, int64_t depth_row, const float *per_mm, float max_sine,
+                             int frames, int rows, int columns, float *normal);
+EXPORT int normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *dark, const float *saturated,
+                   const float *inverse, int64_t plane, int width, int frames, int rows, int columns, const float *depth, int64_t depth_frame,
+                   int64_t depth_row, const float *position, const float *albedo, float pitch, float per_height, float axis_x, float axis_y,
+                   float *normal);
+EXPORT void slopes(const float *normal, int frames, int pixels, float per_slope, float *gradient);
+EXPORT void mask_values(const float *values, const uint8_t *mask, int64_t per_frame, int64_t per_row, int frames, int channels, int rows,
+                        int columns, float *masked);
+EXPORT int solve_poisson(const float *gradient, const double *tables, float mm_per_pixel, int frames, int rows, int columns, int top, int left,
+                         int height, int width, int zeroed, float *depth);
+EXPORT int zero_background(const float *depth, const uint8_t *deformed, int frames, int height, int width, float stiff, float tolerance,
+                           int sweeps, float *out);
+EXPORT void depth_slopes(const float *depth, int64_t depth_frame, int64_t depth_row, const uint8_t *mask, int64_t mask_frame, int64_t mask_row,
+                         float half_per_mm, int frames, int rows, int columns, float *gradient);
+EXPORT int contact_from_depth(const float *depth, int64_t depth_frame, int64_t depth_row, const float *gradient, const uint8_t *deformed,
+                              int64_t deformed_frame, int64_t deformed_row, int frames, int rows, int columns, int cell, int reach,
+                              const float *numbers, uint8_t *contact);
+EXPORT void uncrop(const float *gradient, const uint8_t *contact, int frames, int rows, int columns, int top, int left, int height, int width,
+                   float *whole, float *normal, uint8_t *touching);
+
 static inline int least(int a, int b) { return a < b ? a : b; }
 
 #endif

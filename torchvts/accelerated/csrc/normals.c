@@ -135,8 +135,11 @@ WIDE static void normal_row(const float *restrict p, const float *restrict q, in
     }
 }
 
-static void fill(float *values, float value, size_t n) {
-    for (size_t k = 0; k < n; k++) values[k] = value;
+WIDE static void fill(float *values, float value, size_t n) {
+    if (value == 0.0f)
+        memset(values, 0, sizeof(float) * n);
+    else
+        for (size_t k = 0; k < n; k++) values[k] = value;
 }
 
 /* The gradient of a window (frames, 2, rows, columns) at (top, left) and its contact (bytes) set into the whole image, zero elsewhere, and the

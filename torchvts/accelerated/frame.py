@@ -1,0 +1,296 @@
+"""A whole frame in one compiled call, for pipelines of the library's own blocks: csrc/frame.c, its settings and its memory."""
+
+import ctypes
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import torch
+from torch import Tensor, nn
+from torch.nn.modules import module as torch_modules
+
+from ..compensate import Blur, FillDefects
+from ..compensate.drift import LEAST_DRIFT, MOST_DRIFT, stride_of
+from ..core.frame import DepthOutput
+from ..core.robust import HALVINGS
+from ..integration.background import DepthAsIs
+from . import kernels
+from .blocks import (
+    Compensate,
+    ContactFromDepth,
+    ContactMask,
+    Crop,
+    Drift,
+    GradientFromNormal,
+    Masked,
+    MaskedGradient,
+    NormalFromIntensity,
+    NormalFromResponse,
+    PoissonBackground,
+    Uncrop,
+    ZeroBackground,
+)
+from .derived import flat_is_one, pedestals, response_lines
+from .gate import usable
+from .memory import empty
+from .threads import by_frames
+
+INTEGER, REAL, POINTER = ctypes.c_int32, ctypes.c_float, ctypes.c_void_p
+
+
+class Program(ctypes.Structure):
+    """``Program`` of csrc/frame.c."""
+
+    _fields_ = (
+        *((name, INTEGER) for name in ("height", "width", "taps")),
+        *((name, POINTER) for name in ("gain", "offset", "weights", "defect", "neighbours")),
+        ("defects", ctypes.c_int64),
+        ("pedestal", REAL * 3),
+        *((name, INTEGER) for name in ("drifts", "drift_stride", "halvings")),
+        *((name, REAL) for name in ("least_drift", "most_drift")),
+        *((name, INTEGER) for name in ("step", "stride", "cell", "reach", "bridge")),
+        *((name, REAL) for name in ("sigmas", "rounding", "least_cells", "bridge_sigmas")),
+        *((name, POINTER) for name in ("flat", "per_noise", "failed_below", "most_far_field")),
+        *((name, INTEGER) for name in ("corners", "degree", "terms")),
+        *((name, POINTER) for name in ("place", "weight", "per_mm", "dark", "saturated", "inverse")),
+        *((name, REAL) for name in ("max_sine", "per_slope", "pitch", "half_per_mm")),
+        ("tables", POINTER),
+        *((name, INTEGER) for name in ("passes", "zeroes", "sweeps", "slopes_of_depth")),
+        *((name, REAL) for name in ("stiff", "tolerance")),
+        *((name, INTEGER) for name in ("contact_cell", "contact_reach")),
+        ("contact_model", REAL * 9),
+    )
+
+
+class Blocks(NamedTuple):
+    """What a frame passes through.
+
+    Attributes:
+        slopes: the gradient of depth; None where that of pixels stays.
+        passes: how often a frame is solved.
+    """
+
+    compensate: nn.Module
+    deformed: nn.Module
+    crop: nn.Module
+    normals: nn.Module
+    gradient: nn.Module
+    masked: nn.Module
+    integrate: nn.Module
+    zero: nn.Module
+    slopes: nn.Module | None
+    contact: nn.Module
+    uncrop: nn.Module
+    passes: int
+
+
+OWN: tuple[tuple[type, ...], ...] = (
+    (Compensate,),
+    (ContactMask,),
+    (Crop,),
+    (NormalFromResponse, NormalFromIntensity),
+    (GradientFromNormal,),
+    (Masked,),
+    (PoissonBackground,),
+    (ZeroBackground, DepthAsIs),
+    (MaskedGradient, type(None)),
+    (ContactFromDepth,),
+    (Uncrop,),
+)
+"""What each of the blocks may be."""
+
+
+class _Prepared(NamedTuple):
+    """A program, the state that it was made of, and what holds the memory that it points to."""
+
+    program: Program
+    state: tuple[Any, ...]
+    memory: list[Any]
+
+
+_programs: WeakKeyDictionary[nn.Module, _Prepared] = WeakKeyDictionary()
+
+
+def solve_frames(pipe: nn.Module, parts: Blocks, images: Tensor) -> DepthOutput | None:
+    """The output of a pipeline, each frame by itself, by one compiled call; None where its blocks must do it.
+
+    Args:
+        pipe: the pipeline, beside which its program is kept.
+        parts: its blocks.
+        images: what it got.
+    """
+    if not isinstance(images, Tensor) or images.dim() != 4 or images.shape[0] == 0 or images.shape[1] != 3 or not usable(images):
+        return None
+    if torch_modules._global_forward_hooks or torch_modules._global_forward_pre_hooks or not _all_own(parts):
+        return None
+    program = _program(pipe, parts)
+    if program is None or images.shape[2] != program.height or images.shape[3] != program.width:
+        return None
+    return _run(program, images.contiguous())
+
+
+def _run(program: Program, images: Tensor) -> DepthOutput | None:
+    """None where an image is not in [0, 1], and where a frame needs what the program cannot do."""
+    count, _, height, width = images.shape
+    maps = [empty((count, channels, height, width), torch.float32) for channels in (1, 2, 3)]
+    masks = [empty((count, 1, height, width), torch.bool) for _ in range(2)]
+    out = DepthOutput(*maps, *masks)
+    kernel, at, pixels = kernels.loaded().solve_frames, ctypes.byref(program), height * width
+    image, depth, gradient, normal, contact, deformed = (tensor.data_ptr() for tensor in (images, *out))
+
+    def some(first: int, many: int) -> int:
+        place = 4 * pixels * first
+        rest = (depth + place, gradient + 2 * place, normal + 3 * place, contact + pixels * first, deformed + pixels * first)
+        return int(kernel(at, image + 3 * place, many, *rest))
+
+    trouble = by_frames(count, pixels, some)
+    if trouble == 1:
+        raise MemoryError("torchvts: no memory is left for a frame")
+    return None if trouble else out
+
+
+def _all_own(parts: Blocks) -> bool:
+    """Whether all blocks are the library's own, as they were made, and nobody watches them."""
+    compensate: Any = parts.compensate
+    if not all(map(_own, parts, OWN)) or parts.passes > 2 or not parts.crop.enabled:
+        return False
+    inner = compensate._modules
+    if len(inner["linear"]) or compensate.saturates or not all(_own(block, (FillDefects, Blur)) for block in inner["clean"]):
+        return False
+    return _own(inner["drift"], (nn.Identity, Drift)) and getattr(inner["drift"], "background", None) is None
+
+
+def _own(block: Any, kinds: tuple[type, ...]) -> bool:
+    if type(block) not in kinds:
+        return False
+    if block is None:
+        return True
+    watched: Any = block._forward_hooks or block._forward_pre_hooks or block._backward_hooks or block._backward_pre_hooks
+    return not watched and "forward" not in block.__dict__
+
+
+def _program(pipe: nn.Module, parts: Blocks) -> Program | None:
+    """The program of these blocks, kept until a buffer or a setting changes; None where the kernels do not know them."""
+    normals: Any = parts.normals
+    if type(normals) is NormalFromIntensity:
+        if parts.passes > 1 or normals.lights.glossy:
+            return None
+        normals.follow_lights()
+    buffers, recorded = _buffers(parts), torch.is_grad_enabled()
+    for buffer in buffers.values():
+        if buffer.is_inference() or (recorded and buffer.requires_grad):
+            return None
+    addresses = [(name, buffer.data_ptr(), buffer._version) for name, buffer in buffers.items()]
+    settings = _settings(parts)
+    prepared = _programs.get(pipe)
+    if prepared is None or prepared.state != (addresses, settings):
+        made = _prepare(parts, buffers, settings)
+        if made is None:
+            return None
+        prepared = _programs[pipe] = _Prepared(made[0], (addresses, settings), made[1])
+    return prepared.program
+
+
+def _buffers(parts: Blocks) -> dict[str, Tensor]:
+    """All tensors that the result depends on."""
+    compensate: Any = parts.compensate
+    gain, mask, normals = compensate.gain._buffers, parts.deformed._buffers, parts.normals._buffers
+    found = {"gain": gain["gain"], "offset": gain["offset"], "flat": mask["offset"]}
+    found.update({name: mask[name] for name in ("per_noise", "failed_below", "most_far_field")})
+    for block in compensate._modules["clean"]:
+        found.update(block._buffers)  # defects
+    if "maps" in normals:
+        found.update(normals)
+    else:
+        model: Any = parts.normals
+        shadowed = model.shadowed._buffers
+        found.update(inverse=normals["inverse"], dark=shadowed["dark_where"], saturated=shadowed["saturated_above"])
+        found.update(position=model.lights.position_mm, albedo=model.lights.albedo)
+    return {name: buffer for name, buffer in found.items() if buffer is not None}
+
+
+def _settings(parts: Blocks) -> dict[str, Any]:
+    """All numbers that the result depends on, by their names in :class:`Program`; and the weights of the blur."""
+    compensate: Any = parts.compensate
+    mask: Any = parts.deformed
+    normals, gradient, integrate, zero, slopes, contact = (getattr(parts, name) for name in _WITH_NUMBERS)
+    zeroes = type(zero) is ZeroBackground
+    return {
+        "weights": next((block.weights for block in compensate._modules["clean"] if type(block) is Blur), ()),
+        "drifts": type(compensate._modules["drift"]) is Drift,
+        "step": mask.step,
+        "stride": mask.stride,
+        "cell": mask.cell,
+        "reach": mask.reach,
+        "bridge": mask.bridge_cells if mask.bridges else 0,
+        "sigmas": mask.sigmas,
+        "rounding": mask.rounding,
+        "least_cells": mask.least_cells,
+        "bridge_sigmas": mask.bridge_sigmas,
+        "corners": parts.crop.stride,
+        "max_sine": getattr(normals, "max_sine", 0.0),
+        "per_slope": 1.0 / gradient.max_slope,
+        "pitch": integrate.mm_per_pixel,
+        "passes": parts.passes,
+        "zeroes": zeroes,
+        "sweeps": zero.sweeps if zeroes else 0,
+        "stiff": zero.stiff if zeroes else 0.0,
+        "tolerance": zero.tolerance if zeroes else 0.0,
+        "slopes_of_depth": slopes is not None,
+        "half_per_mm": 0.0 if slopes is None else 0.5 / slopes.mm_per_pixel,
+        "contact_cell": contact.cell,
+        "contact_reach": contact.reach,
+        "contact_model": contact.numbers(),
+    }
+
+
+_WITH_NUMBERS = ("normals", "gradient", "integrate", "zero", "slopes", "contact")
+
+
+def _prepare(parts: Blocks, buffers: dict[str, Tensor], settings: dict[str, Any]) -> tuple[Program, list[Any]] | None:
+    """The program, and what holds the memory that it points to."""
+    if not usable(*(buffer for buffer in buffers.values() if buffer.is_floating_point())):
+        return None
+    compensate: Any = parts.compensate
+    mask: Any = parts.deformed
+    normals: Any = parts.normals
+    height, width = mask.flat.shape[1], mask.flat.shape[2]
+    tables = kernels.poisson_plan(height, width) if min(height, width) > 1 else None
+    if tables is None or any(
+        field.shape[-2:] != (height, width) for name, field in buffers.items() if name in ("gain", "offset", "inverse", "maps")
+    ):
+        return None
+    tensors = {name: buffer.contiguous() for name, buffer in buffers.items()}
+    if "maps" in tensors:
+        lines = response_lines(normals)
+        if lines is None or lines.per_mm is None:
+            return None
+        tensors.update(place=lines.place, weight=lines.weight, per_mm=lines.per_mm)
+        settings = settings | {"degree": lines.weight.shape[1] - 1, "terms": lines.weight.shape[3]}
+    elif normals.shadowed.any_ill_conditioned:
+        return None
+    if flat_is_one(mask):
+        del tensors["flat"]
+    found = pedestals(compensate.gain) if "gain" in tensors and "offset" in tensors else None
+    if found is not None:
+        del tensors["offset"]
+    weights = (REAL * len(settings["weights"]))(*settings["weights"])
+    pointers = {name: tensor.data_ptr() for name, tensor in tensors.items() if name in _POINTERS}
+    program = Program(
+        **{name: value for name, value in settings.items() if name != "weights"},
+        **pointers,
+        weights=ctypes.addressof(weights),
+        tables=tables.data_ptr(),
+        height=height,
+        width=width,
+        taps=len(weights),
+        defects=len(tensors["defect"]) if "defect" in tensors else 0,
+        pedestal=kernels.NO_PEDESTAL if found is None else found,
+        drift_stride=stride_of(height, width),
+        halvings=HALVINGS,
+        least_drift=LEAST_DRIFT,
+        most_drift=MOST_DRIFT,
+    )
+    return program, [tensors, buffers, weights, tables]
+
+
+_POINTERS = {field[0] for field in Program._fields_ if field[1] is POINTER}

@@ -1,0 +1,40 @@
+"""Memory of outputs, used again once nobody holds them: pages that the system hands out anew cost half a frame's work."""
+
+import math
+import threading
+
+import torch
+from torch import Tensor, UntypedStorage
+
+MOST_BYTES = 2**26
+"""No more is kept for later frames."""
+
+_lock = threading.Lock()
+_kept: dict[int, list[UntypedStorage]] = {}
+_users = getattr(torch._C, "_storage_Use_Count", None)
+
+
+def empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    """A tensor on the CPU whose values are not set.
+
+    Its memory is that of an earlier one of as many bytes that nobody holds any more, neither itself nor a view of it; else new.
+    """
+    tensor = torch.empty(0, dtype=dtype, device="cpu")
+    size = math.prod(shape) * dtype.itemsize
+    if _users is None or size > MOST_BYTES:
+        return tensor.resize_(shape)
+    with _lock:
+        some = _kept.setdefault(size, [])
+        free = next((storage for storage in some if _users(storage._cdata) == 1), None)
+        if free is None:
+            free = UntypedStorage(size)
+            _keep(free, size)
+        return tensor.set_(free, 0, shape)  # type: ignore[call-overload, no-any-return]
+
+
+def _keep(storage: UntypedStorage, size: int) -> None:
+    """Keep the storage, in place of others if there are too many."""
+    if sum(length * len(some) for length, some in _kept.items()) + size > MOST_BYTES:
+        for some in _kept.values():
+            some.clear()
+    _kept[size].append(storage)

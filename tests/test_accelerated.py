@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import torchvts as vts
-from torchvts.accelerated import kernels, reference_only
+from torchvts.accelerated import kernels, memory, reference_only
 from torchvts.accelerated.blocks import (
     Compensate,
     ContactFromDepth,
@@ -414,3 +414,27 @@ def test_slopes_of_depth(size):
     part = (slice(None), slice(None), slice(8, None), slice(16, None))
     loops, operators = both(MaskedGradient(0.1), depth[part], deformed[part])
     assert loops.shape == operators.shape and float((loops - operators).abs().max()) < 2e-5
+
+
+@pytest.mark.parametrize(
+    "hold",
+    [
+        pytest.param(lambda out: out[:, :, 1:], id="a view"),
+        pytest.param(lambda out: torch.from_numpy(out.numpy()), id="an array"),
+        pytest.param(torch.from_dlpack, id="dlpack"),
+        pytest.param(lambda out: out.detach(), id="an alias"),
+    ],
+)
+def test_memory_that_somebody_holds_is_not_used_again(hold):
+    first = memory.empty((1, 1, 7, 9), torch.float32).fill_(3.0)
+    held = hold(first)
+    del first
+    memory.empty((1, 1, 7, 9), torch.float32).fill_(5.0)
+    assert (held == 3.0).all()
+
+
+def test_memory_that_other_processes_see_is_not_used_again():
+    first = memory.empty((1, 1, 7, 9), torch.float32).share_memory_()
+    place = first.data_ptr()
+    del first
+    assert memory.empty((1, 1, 7, 9), torch.float32).data_ptr() != place

@@ -24,7 +24,8 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     if _users is None or size > MOST_BYTES:
         return tensor.resize_(shape)
     with _lock:
-        some = _kept.setdefault(size, [])
+        some = [storage for storage in _kept.get(size, []) if storage.nbytes() == size and not storage.is_shared()]
+        _kept[size] = some  # what another process sees, or somebody has resized, is not ours any more
         free = next((storage for storage in some if _users(storage._cdata) == 1), None)
         if free is None:
             free = UntypedStorage(size)

@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup demo test test-coverage test-long characterise check bench docs clean
+.PHONY: setup demo test test-coverage test-long check bench docs clean
 
 setup: $(VENV)/.done
 
@@ -29,10 +29,6 @@ test-coverage: setup
 test-long: setup
 	$(PYTEST) -m long
 	TORCHVTS_TEST_PROFILE=long $(PYTEST) -m "not long" tests/test_properties.py tests/test_fuzz.py tests/test_export.py
-
-# Whether results are those of another commit, bit by bit: make characterise BASE=530e295
-characterise: setup
-	$(BIN)/python tests/characterise.py against $(BASE)
 
 check: setup
 	$(BIN)/ruff check .

@@ -59,9 +59,11 @@ def finished(out):
     return len(list(out.rglob("*.npz")))
 
 
-def torchrun(*arguments):
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
-    command += ["-m", "torchvts", "reconstruct", *arguments]
+TORCHRUN = ("torch.distributed.run", "--standalone", "--nproc_per_node=2", "-m")
+
+
+def started(launcher, *arguments):
+    command = [sys.executable, "-m", *launcher, "torchvts", "reconstruct", *arguments]
     return subprocess.Popen(
         list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT, env=ENVIRONMENT
     )
@@ -104,13 +106,14 @@ def test_one_thread_gives_the_same_bits_for_any_batch(unit, mode):
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="finds processes through /proc")
-@pytest.mark.parametrize("killed", ["all", pytest.param("one", marks=pytest.mark.long)])
+@pytest.mark.parametrize("killed", ["the only", *(pytest.param(some, marks=pytest.mark.long) for some in ("all", "one"))])
 def test_killed_processes_lose_nothing_and_the_next_run_goes_on(unit, frames, whole, tmp_path, killed):
     out = tmp_path / "out"
-    first = torchrun(unit, frames, "--out", out, "--batch", 2, "--workers", 0)
+    launcher = () if killed == "the only" else TORCHRUN
+    first = started(launcher, unit, frames, "--out", out, "--batch", 2, "--workers", 0)
     wait_for(lambda: finished(out) >= 20, first)
     processes = family(first.pid)
-    for pid in processes if killed == "all" else [max(processes)]:
+    for pid in [max(processes)] if killed == "one" else processes:
         with contextlib.suppress(ProcessLookupError):  # its parent's death may have ended it
             os.kill(pid, signal.SIGKILL)
     first.communicate()
@@ -120,7 +123,7 @@ def test_killed_processes_lose_nothing_and_the_next_run_goes_on(unit, frames, wh
         report = reconstruct_dataset(unit, frames, out, workers=0)
         assert report.rows == 120 and 0 < report.before <= done
     else:
-        second = torchrun(unit, frames, "--out", out)
+        second = started(TORCHRUN, unit, frames, "--out", out)
         printed = second.communicate()[0]
         assert second.returncode == 0, printed
         assert "wrote 120 frames" in printed and "by an earlier run" in printed

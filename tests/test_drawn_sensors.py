@@ -108,7 +108,7 @@ def test_sizes_and_refusals():
         hanging_skin(torch.zeros(1, 1, 8, 8), 0.0, 0.1)
 
 
-@pytest.mark.parametrize("seed", [3, 5])
+@pytest.mark.parametrize("seed", [3, pytest.param(5, marks=pytest.mark.long)])
 def test_the_second_pass_learned_from_balls_carries_over_to_other_objects(seed):
     """Better in the mean than the first, and on no object worse by 5 %: a second pass that balls teach shapes would be."""
     unit = drawn_sensor(seed)

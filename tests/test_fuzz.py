@@ -34,7 +34,7 @@ from torchvts.core.files import read_depth_png, read_frames, write_atomically, w
 from torchvts.model.response_field import ResponseField, ResponseModel
 
 LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
-DAMAGES = 3000 if LONG else 40
+DAMAGES = 3000 if LONG else 25
 KILLS = 60 if LONG else 20
 MEMORY = 2**30
 """Bytes of address space that reading one damaged file may take beyond what the process has."""

@@ -46,9 +46,10 @@ def test_every_severity_makes_a_valid_case(corruption):
 @pytest.mark.parametrize("corruption", CORRUPTIONS.values(), ids=lambda corruption: corruption.name)
 def test_cases_repeat_by_seed_and_severities_differ(corruption):
     middle, last = corruption.severities[len(corruption.severities) // 2], corruption.severities[-1]
-    assert _same(corruption.make(middle, 1), corruption.make(middle, 1))
-    assert not torch.equal(corruption.make(middle, 1).image, corruption.make(middle, 2).image)
-    assert not torch.equal(corruption.make(middle, 1).image, corruption.make(last, 1).image)
+    case = corruption.make(middle, 1)
+    assert _same(case, corruption.make(middle, 1))
+    assert not torch.equal(case.image, corruption.make(middle, 2).image)
+    assert not torch.equal(case.image, corruption.make(last, 1).image)
 
 
 @pytest.mark.parametrize("name", sorted(set(CORRUPTIONS) - OTHER_START))

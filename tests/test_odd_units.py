@@ -105,11 +105,17 @@ def other_light():
     return torch.stack((0.45 + 0.25 * x - 0.1 * y, 0.5 - 0.15 * x * x - 0.1 * y, 0.4 + 0.2 * y - 0.1 * x * y))
 
 
-COMPRESSED = [("smooth 0", True), ("pale", True)]
+def odd_cases():
+    """Every background as it is, two as JPEG; with a prior, presses, none or both. Most with one of both, and the slow, are long."""
+    backgrounds = [*((name, False) for name in ODD), ("smooth 0", True), ("pale", True)]
+    for (name, compressed), given in itertools.product(backgrounds, itertools.product((False, True), repeat=2)):
+        quick = given[0] == given[1] or (name in ("bright edges", "smooth 0") and not compressed)
+        if name == "pale":  # ten seconds each
+            quick = all(given) and not compressed
+        yield pytest.param(name, compressed, *given, marks=[] if quick else [pytest.mark.long])
 
 
-@pytest.mark.parametrize("with_prior, with_presses", [(False, False), (False, True), (True, False), (True, True)])
-@pytest.mark.parametrize("name, compressed", [*((name, False) for name in ODD), *COMPRESSED])
+@pytest.mark.parametrize("name, compressed, with_prior, with_presses", [*odd_cases()])
 def test_an_odd_background_gives_a_unit_that_can_be_used_or_a_refusal(name, compressed, with_prior, with_presses):
     light = ODD[name]
     background = jpeg(camera(light)) if compressed else camera(light)

@@ -146,16 +146,19 @@ def _name_points(panel: _Panel) -> None:
     for row, (x, y) in zip(panel.rows, points, strict=True):
         wide, high = 0.56 * size * scale * len(row.method), 1.3 * size * scale
         choices = []
-        for k, (right, up) in enumerate((r, u) for u in (-4, 8, -16, 20, -28, 32, -40, 46, -54, 60, -68) for r in (True, False)):
-            left = x + 7 * scale if right else x - 7 * scale - wide
+        places = [(side, up) for up in (-4, 8, -16, 20, -28, 32, -40, 46, -54, 60, -68) for side in ("left", "right", "center")]
+        for k, (side, up) in enumerate(places):
+            inside = min(max(x - 0.5 * wide, frame.x0 + 4.0), frame.x1 - wide - 4.0)  # above or below, moved into the panel
+            left = {"left": x + 7 * scale, "right": x - 7 * scale - wide, "center": inside}[side]
             box = (left, y + up * scale, left + wide, y + up * scale + high)
             covered = sum(box[0] < b[2] and b[0] < box[2] and box[1] < b[3] and b[1] < box[3] for b in taken)
             outside = box[0] < frame.x0 or box[2] > frame.x1 or box[1] < frame.y0 or box[3] > frame.y1
-            choices.append((covered + 2 * outside, k, right, up, box))
-        _, _, right, up, box = min(choices)
+            choices.append((covered + 2 * outside, k, side, up, box))
+        _, _, side, up, box = min(choices)
         taken.append(box)
         arrow = {"arrowstyle": "-", "lw": 0.4, "color": "0.5"}
-        offset = {"xytext": (7 if right else -7, up), "textcoords": "offset points", "ha": "left" if right else "right"}
+        along = {"left": 7.0, "right": -7.0, "center": (0.5 * (box[0] + box[2]) - x) / scale}[side]
+        offset = {"xytext": (along, up), "textcoords": "offset points", "ha": side}
         panel.axes.annotate(row.method, (ms(row), row.error(panel.error)), fontsize=size, arrowprops=arrow, **offset)
 
 

@@ -116,6 +116,7 @@ def test_frames_are_timed_as_a_user_runs_them(monkeypatch):
     assert "drawn rig, 64x48, threads: own choice: fast" in text and "times as fast as gs_sdk's pipeline" in text
     figure = user_speed_figure(measured)
     assert [axes.get_title() for axes in figure.axes] == ["drawn rig"] and len(figure.legends) == 1
+    assert all(len(set(line.get_xdata())) == len(line.get_xdata()) for line in figure.axes[0].get_lines())  # a size once
 
 
 def test_many_calls_have_a_99th_percentile():

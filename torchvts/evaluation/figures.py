@@ -188,13 +188,16 @@ def user_speed_figure(measured: Measured) -> Figure:
     figure = new_figure(6.2 * len(units), 4.6)
     panels = figure.subplots(1, len(units), squeeze=False, sharey=True)[0]
     styles = {PACES[0]: "o-", PACES[1]: "^--", PACES[2]: "s:"}
-    colors = {"fast": "tab:blue", "precise": "tab:green", GS_SDK: "tab:red"}
+    colors = {"fast": OURS, "precise": "#009e73", GS_SDK: PEERS}
     for axes, unit in zip(panels, units, strict=True):
         shown = [row for row in measured.frames if row.unit == unit and row.threads == OWN and row.size.batch == 1]
         for method, pace in dict.fromkeys((row.method, row.pace) for row in shown):
-            line = sorted((r.size.height * r.size.width, r.median_ms) for r in shown if (r.method, r.pace) == (method, pace))
+            line: dict[int, float] = {}
+            for r in shown:
+                if (r.method, r.pace) == (method, pace):
+                    line.setdefault(r.size.height * r.size.width, r.median_ms)  # the row of batches measures one frame again
             style = {"color": colors[method], "ms": 4, "lw": 1, "label": method if method == GS_SDK else f"{method}, {pace}"}
-            axes.plot([pixels for pixels, _ in line], [time for _, time in line], styles.get(pace, "D-"), **style)
+            axes.plot(sorted(line), [line[pixels] for pixels in sorted(line)], styles.get(pace, "D-"), **style)
         sizes = sorted({(row.size.height * row.size.width, f"{row.size.width}x{row.size.height}") for row in shown})
         axes.set(xscale="log", yscale="log", title=unit, ylabel="ms a frame, median")
         axes.set_xticks([pixels for pixels, _ in sizes], [text for _, text in sizes])
@@ -202,7 +205,7 @@ def user_speed_figure(measured: Measured) -> Figure:
         axes.yaxis.set_major_formatter("{x:g}")
         axes.grid(which="both", alpha=0.25)
     handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=7)  # beside the panels, where no point lies
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)  # beside the panels, where no point lies
     figure.suptitle(measured.machine, fontsize=8)
     return figure
 

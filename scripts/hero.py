@@ -63,11 +63,12 @@ def draw(contact: Contact, pitch: float) -> Figure:
     x = (np.arange(contact.depth_mm.shape[1])[cut[1]] - contact.center_px[0]) * pitch
     y = (np.arange(contact.depth_mm.shape[0])[cut[0]] - contact.center_px[1]) * pitch
     extent = (x[0] - pitch / 2, x[-1] + pitch / 2, y[-1] + pitch / 2, y[0] - pitch / 2)
-    figure = viz.new_figure(12.0, 3.4, dpi=125)
+    figure = viz.new_figure(12.0, 3.1, dpi=125)
+    figure.set_layout_engine("constrained", wspace=0.06)
     depth, normal, profile = (figure.add_subplot(1, 4, k) for k in (1, 2, 4))
-    picture = depth.imshow(depth_mm, extent=extent, cmap="viridis", vmin=0.0)
-    figure.colorbar(picture, ax=depth, label="mm", shrink=0.7)
-    depth.contour(x, y, inside, [0.5], colors="white", linewidths=1.5)
+    colors, norm = viz.depth_colors(*viz.depth_range(depth_mm))
+    viz.draw_bar(figure, depth, depth.imshow(depth_mm, extent=extent, cmap=colors, norm=norm), "mm")
+    depth.contour(x, y, inside, [0.5], colors="#e69f00", linewidths=1.5)
     depth.set_title("depth, contact outlined")
     normal.imshow(0.5 + 0.5 * contact.normal[cut], extent=extent)
     normal.set_title("normals as colour")
@@ -82,6 +83,7 @@ def draw(contact: Contact, pitch: float) -> Figure:
     profile.set(xlabel="x, mm", ylabel="depth, mm", title="profile at y = 0")
     profile.legend(loc="lower center", fontsize=8, handlelength=1.2)
     profile.grid(alpha=0.3)
+    profile.set_box_aspect(1.0)
     return figure
 
 

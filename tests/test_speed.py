@@ -68,6 +68,11 @@ def test_the_chart_names_its_points():
     assert "GelSight Mini, 320x240" in figure.axes[0].get_title()  # the real sensor comes first
     boxes = [text.get_window_extent() for text in figure.legends[0].get_texts()]
     assert all(not box.overlaps(axes.get_window_extent()) for box in boxes for axes in figure.axes)  # it covers no point
+    wide = row("a prior that has seen all of them, precise", 1.1, 2.4, "sensor", 240, "GelSight Mini, balls")
+    panel = speed_figure([*ROWS, *sensor, wide]).axes[0]
+    panel.figure.draw_without_rendering()
+    boxes = [text.get_window_extent() for text in panel.texts]
+    assert len(boxes) == 3 and all(panel.bbox.x0 <= box.x0 and box.x1 <= panel.bbox.x1 for box in boxes)
 
 
 def test_a_chart_is_drawn_again_from_its_table(run_script, tmp_path):
@@ -111,6 +116,7 @@ def test_frames_are_timed_as_a_user_runs_them(monkeypatch):
     assert "drawn rig, 64x48, threads: own choice: fast" in text and "times as fast as gs_sdk's pipeline" in text
     figure = user_speed_figure(measured)
     assert [axes.get_title() for axes in figure.axes] == ["drawn rig"] and len(figure.legends) == 1
+    assert all(len(set(line.get_xdata())) == len(line.get_xdata()) for line in figure.axes[0].get_lines())  # a size once
 
 
 def test_many_calls_have_a_99th_percentile():

@@ -146,16 +146,19 @@ def _name_points(panel: _Panel) -> None:
     for row, (x, y) in zip(panel.rows, points, strict=True):
         wide, high = 0.56 * size * scale * len(row.method), 1.3 * size * scale
         choices = []
-        for k, (right, up) in enumerate((r, u) for u in (-4, 8, -16, 20, -28, 32, -40, 46, -54, 60, -68) for r in (True, False)):
-            left = x + 7 * scale if right else x - 7 * scale - wide
+        places = [(side, up) for up in (-4, 8, -16, 20, -28, 32, -40, 46, -54, 60, -68) for side in ("left", "right", "center")]
+        for k, (side, up) in enumerate(places):
+            inside = min(max(x - 0.5 * wide, frame.x0 + 4.0), frame.x1 - wide - 4.0)  # above or below, moved into the panel
+            left = {"left": x + 7 * scale, "right": x - 7 * scale - wide, "center": inside}[side]
             box = (left, y + up * scale, left + wide, y + up * scale + high)
             covered = sum(box[0] < b[2] and b[0] < box[2] and box[1] < b[3] and b[1] < box[3] for b in taken)
             outside = box[0] < frame.x0 or box[2] > frame.x1 or box[1] < frame.y0 or box[3] > frame.y1
-            choices.append((covered + 2 * outside, k, right, up, box))
-        _, _, right, up, box = min(choices)
+            choices.append((covered + 2 * outside, k, side, up, box))
+        _, _, side, up, box = min(choices)
         taken.append(box)
         arrow = {"arrowstyle": "-", "lw": 0.4, "color": "0.5"}
-        offset = {"xytext": (7 if right else -7, up), "textcoords": "offset points", "ha": "left" if right else "right"}
+        along = {"left": 7.0, "right": -7.0, "center": (0.5 * (box[0] + box[2]) - x) / scale}[side]
+        offset = {"xytext": (along, up), "textcoords": "offset points", "ha": side}
         panel.axes.annotate(row.method, (ms(row), row.error(panel.error)), fontsize=size, arrowprops=arrow, **offset)
 
 
@@ -185,13 +188,16 @@ def user_speed_figure(measured: Measured) -> Figure:
     figure = new_figure(6.2 * len(units), 4.6)
     panels = figure.subplots(1, len(units), squeeze=False, sharey=True)[0]
     styles = {PACES[0]: "o-", PACES[1]: "^--", PACES[2]: "s:"}
-    colors = {"fast": "tab:blue", "precise": "tab:green", GS_SDK: "tab:red"}
+    colors = {"fast": OURS, "precise": "#009e73", GS_SDK: PEERS}
     for axes, unit in zip(panels, units, strict=True):
         shown = [row for row in measured.frames if row.unit == unit and row.threads == OWN and row.size.batch == 1]
         for method, pace in dict.fromkeys((row.method, row.pace) for row in shown):
-            line = sorted((r.size.height * r.size.width, r.median_ms) for r in shown if (r.method, r.pace) == (method, pace))
+            line: dict[int, float] = {}
+            for r in shown:
+                if (r.method, r.pace) == (method, pace):
+                    line.setdefault(r.size.height * r.size.width, r.median_ms)  # the row of batches measures one frame again
             style = {"color": colors[method], "ms": 4, "lw": 1, "label": method if method == GS_SDK else f"{method}, {pace}"}
-            axes.plot([pixels for pixels, _ in line], [time for _, time in line], styles.get(pace, "D-"), **style)
+            axes.plot(sorted(line), [line[pixels] for pixels in sorted(line)], styles.get(pace, "D-"), **style)
         sizes = sorted({(row.size.height * row.size.width, f"{row.size.width}x{row.size.height}") for row in shown})
         axes.set(xscale="log", yscale="log", title=unit, ylabel="ms a frame, median")
         axes.set_xticks([pixels for pixels, _ in sizes], [text for _, text in sizes])
@@ -199,7 +205,7 @@ def user_speed_figure(measured: Measured) -> Figure:
         axes.yaxis.set_major_formatter("{x:g}")
         axes.grid(which="both", alpha=0.25)
     handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=7)  # beside the panels, where no point lies
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)  # beside the panels, where no point lies
     figure.suptitle(measured.machine, fontsize=8)
     return figure
 

@@ -5,7 +5,7 @@ from torch import Tensor, nn
 
 from ..core.checks import check_batch, check_same_size
 
-STIFF = 1000.0
+STIFF = 30.0
 """How much less the deepest skin bends to the continuation than undeformed skin: slopes are calibrated in contact only."""
 
 TOLERANCE = 0.01

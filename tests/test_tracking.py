@@ -366,7 +366,7 @@ def test_a_row_of_the_table_counts_what_must_be_seen():
     poses = [motion_.pose(k, 0) for k in range(4)]
     track = tracking.Track(poses, [_bad(press(objects.key(), pose)) for pose in poses], PITCH)
     row = tracking.follow_track(track, motion_, tracking.TrackRow("key", "lift-off", "none"))
-    assert row.lost == [2] and row.unnoticed == [] and row.wrong == [] and len(row.ms) == 3
+    assert row.lost == [2] and row.unnoticed == [] and row.uncertain == [] and row.wrong == [] and len(row.ms) == 3
     assert "| key" in tracking.tracking_table([row])
     blind = tracking.follow_track(track, tracking.Motion(4, motion_.pose, (1, 2)), tracking.TrackRow("key", "x", "y"))
     assert blind.unnoticed == [1]

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from ..core.files import read_image, write_atomically
 from ..pose import PoseTracker, TrackedPose
+from ..pose.follow import TRUSTED_DEG, TRUSTED_MM
 from ..stream import Overlay, TactileFrame, TactileStream, VideoFile
 from ..stream.sources import Pixels
 from .options import add_out
@@ -139,5 +140,8 @@ def _summary(rows: list[dict[str, object]], out: Path, tracker: PoseTracker | No
     unknown = [str(row["ambiguous"]) for row in rows if row["ambiguous"]]
     if unknown:
         print(f"  {len(unknown)} frames with unknown motions, mostly: {max(set(unknown), key=unknown.count)}")
+    uncertain = sum(row["converged"] == 0 and not row["lost"] for row in rows)
+    if uncertain:
+        print(f"  {uncertain} frames known less well than to {TRUSTED_DEG:g} degrees and {TRUSTED_MM:g} mm")
     print(f"wrote {out / 'poses.csv'}")
     return 1 if lost else 0

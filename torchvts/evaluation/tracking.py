@@ -122,6 +122,7 @@ class TrackRow:
         ms: time of each frame, ms.
         lost: numbers of the frames that were lost.
         unnoticed: frames that must be lost and were not.
+        uncertain: frames whose pose is not called converged though the object is followed.
         wrong: frames that are confident, with no motion or pose in question, and outside of the goal of the pose bench.
         drift_deg: rotation error at the end, per 360 degrees of yaw.
     """
@@ -134,6 +135,7 @@ class TrackRow:
     ms: list[float] = field(default_factory=list)
     lost: list[int] = field(default_factory=list)
     unnoticed: list[int] = field(default_factory=list)
+    uncertain: list[int] = field(default_factory=list)
     wrong: list[int] = field(default_factory=list)
     drift_deg: float = math.nan
 
@@ -200,7 +202,9 @@ def follow_track(track: Track, motion: Motion, row: TrackRow) -> TrackRow:
         row.deg.append(deg)
         row.mm.append(mm)
         within = deg <= GOAL_DEG and mm <= GOAL_MM
-        if found.converged and not found.ambiguous and not within:
+        if not found.converged:
+            row.uncertain.append(k)
+        elif not found.ambiguous and not within:
             row.wrong.append(k)
         row.drift_deg = deg
     row.unnoticed = sorted(set(motion.lost) - set(row.lost))
@@ -252,12 +256,12 @@ def register_each(track: Track) -> tuple[list[float], list[float], list[float]]:
 def tracking_table(rows: Sequence[TrackRow]) -> str:
     """The rows as a Markdown table."""
     titles = ["object", "motion", "noise", "angle deg, median / worst", "position mm, median / worst", "drift deg per 360"]
-    titles += ["lost frames", "lost, not noticed", "confident and wrong", "ms, median"]
+    titles += ["lost frames", "lost, not noticed", "uncertain", "confident and wrong", "ms, median"]
     lines = []
     for row in rows:
         deg, mm = (f"{_median(v):.3f} / {max(v, default=math.nan):.3f}" for v in (row.deg, row.mm))
         drift = f"{row.drift_deg:.2f}" if row.motion == "full turn" else ""
-        counts = [str(len(row.lost)), str(len(row.unnoticed)), str(len(row.wrong))]
+        counts = [str(len(frames)) for frames in (row.lost, row.unnoticed, row.uncertain, row.wrong)]
         lines.append([row.name, row.motion, row.noise, deg, mm, drift, *counts, f"{_median(row.ms):.1f}"])
     return markdown(titles, lines)
 

@@ -106,7 +106,7 @@ def other_light():
 
 
 def odd_cases():
-    """Every background as it is, two as JPEG; with a prior, presses, none or both. Most with one of both, and the slow, are long."""
+    """Each background as it is, two as JPEG; with a prior, presses, none or both. Most with one of both, and the slow, are long."""
     backgrounds = [*((name, False) for name in ODD), ("smooth 0", True), ("pale", True)]
     for (name, compressed), given in itertools.product(backgrounds, itertools.product((False, True), repeat=2)):
         quick = given[0] == given[1] or (name in ("bright edges", "smooth 0") and not compressed)

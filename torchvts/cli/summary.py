@@ -24,7 +24,7 @@ BY = {
     "presses": "fitted to presses",
     "stand_in": "directions of the sensor file's lights, as a stand-in",
 }
-"""Where a model comes from, in words."""
+"""Where a model comes from, in words, for reports without a reason."""
 
 
 def print_calibration(calibration: Calibration, candidates: bool = False) -> None:
@@ -38,8 +38,8 @@ def print_calibration(calibration: Calibration, candidates: bool = False) -> Non
     size = f"{sensor.height} x {sensor.width} px, {sensor.mm_per_pixel:g} mm per pixel, gamma {sensor.exponent:g}"
     print(f"sensor: {sensor.name}, {size}")
     kind = "point lights" if report["model"] == "point_lights" else "response field"
-    reason = f": {report['reason']}" if "reason" in report else ""
-    print(f"chosen: {kind}, {BY[report['source']]}{reason}")
+    reason = report.get("reason", BY[report["source"]])
+    print(f"chosen: {reason}" if reason.startswith(f"{kind}:") else f"chosen: {kind}: {reason}")
     print(f"expected: {expected(calibration)}")
     for line in left_out("press", [(row["name"], row.get("reason", "")) for row in report.get("presses", []) if not row["used"]]):
         print(line)

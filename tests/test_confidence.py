@@ -171,7 +171,7 @@ def test_the_held_out_error_of_presses_sets_the_bounds():
     def bound(**options):
         calibration, frames = response_unit(**options)
         out = vts.ConfidentPipeline.from_calibration(calibration, "precise")(frames[:1])
-        return float(out.factors_deg[:, FACTORS.index("model")][out.contact[:, 0]].median())
+        return float(out.factors_deg[:, FACTORS.index("model")][out.deformed[:, 0]].median())
 
     good, bad, few = bound(held_out_deg=1.0), bound(held_out_deg=4.0), bound(held_out_deg=1.0, presses=3)
     assert good < few < bad and bad / good == pytest.approx(4.0, abs=0.1)

@@ -370,7 +370,7 @@ def test_the_jacobian_is_exact():
     assert torch.allclose(jacobian[0], torch.tensor(expected, dtype=torch.float64), atol=1e-15)
 
 
-def test_a_faint_lobe_is_judged_on_all_pixels():
+def test_a_faint_lobe_is_decided_on_all_pixels():
     """On the few pixels of the first loop both misfits are rough: the lobe of a dim rig was dropped there, lights 0.48 mm off."""
     angle = np.radians(np.array([20.0, 140.0, 260.0]))
     lights = np.stack([30.0 * np.cos(angle), 30.0 * np.sin(angle), np.full(3, 25.0)], axis=1)

@@ -7,7 +7,7 @@ import torch
 
 import torchvts as vts
 from torchvts.core.geometry import normal_from_gradient
-from torchvts.model.lights import flat_image, gloss_lobe, inverse_light_matrix, light_matrix, normal_at_depth
+from torchvts.model.lights import flat_image, gloss_lobe, glossy_light, inverse_light_matrix, light_matrix, normal_at_depth
 
 
 def random_scene(batch=1, height=5, width=7, dtype=torch.float64, seed=0):
@@ -86,6 +86,22 @@ def test_the_lobe_is_that_of_a_renderer(ring):
     found = vts.near_field_shading(scene.depth_mm, scene.normal, glossy, 0.25)[0].detach()
     lit = expected > 0.02 * expected.amax()
     assert float((found / expected - 1.0)[lit].abs().max()) < 0.01
+
+
+def test_the_light_of_single_glossy_pixels_and_its_derivative(ring):
+    lights = ring(12.0, 20.0, dtype=torch.float64, gloss=[0.1, 0.2, 0.3])
+    depth, normal = random_scene()
+    rows = light_matrix(depth, lights.position_mm, lights.albedo, 0.5)[0].flatten(2).permute(2, 0, 1)
+    normals = normal[0].flatten(1).t()
+    light, derivative = glossy_light(rows, normals, lights.gloss)
+    expected = vts.near_field_shading(depth, normal, lights, 0.5)[0].flatten(1).t()
+    assert torch.allclose(light.clamp_min(0.0), expected, rtol=1e-12)
+    lit = normals[(light > 0.05 * light.amax()).all(dim=1)].requires_grad_()
+    kept = rows[(light > 0.05 * light.amax()).all(dim=1)]
+    for j in range(3):
+        of_light = torch.autograd.grad(glossy_light(kept, lit, lights.gloss)[0][:, j].sum(), lit)[0]
+        assert torch.allclose(glossy_light(kept, lit, lights.gloss)[1][:, j], of_light, rtol=1e-10)
+    assert len(lit) > 3 and derivative.shape == (len(normals), 3, 3)
 
 
 def test_gloss_depends_on_directions_only(ring):

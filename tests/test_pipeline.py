@@ -3,11 +3,13 @@
 import pytest
 import torch
 from torch import nn
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchvts as vts
 from torchvts import NormalModel
 from torchvts.core.geometry import normal_from_gradient
 from torchvts.evaluation import metrics
+from torchvts.pipeline.shadows import extrapolated_slope
 
 scenes = vts.scenes
 PITCH = 0.0625
@@ -143,6 +145,26 @@ def test_dirt_that_keeps_a_light_off_leaves_a_fifth_of_the_error_of_the_plain_in
     ours = metrics.depth_error(pipe(image).depth_mm, scene.depth_mm, 0.0625).rms_px
     pipe.normals.shadowed.dark_where.fill_(-torch.inf)
     assert ours < 0.2 * metrics.depth_error(pipe(image).depth_mm, scene.depth_mm, 0.0625).rms_px
+
+
+def test_extrapolated_slopes_take_memory_for_the_cells_not_for_their_square():
+    class Largest(TorchDispatchMode):
+        elements = 0
+
+        def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+            result = func(*args, **(kwargs or {}))
+            self.elements = max(self.elements, result.numel() if isinstance(result, torch.Tensor) else 0)
+            return result
+
+    slope = torch.nn.functional.avg_pool2d(torch.randn(2, 2, 98, 120, generator=torch.manual_seed(0)), 9, 1, 4)
+    known = torch.rand(2, 1, 98, 120) < 0.5
+    with Largest() as largest:
+        found = extrapolated_slope(slope, known, 2)
+    cells = 49 * 60
+    assert largest.elements <= 2 * 256 * cells < 0.1 * 2 * cells**2
+    places = torch.stack(torch.meshgrid(torch.arange(120.0), torch.arange(98.0), indexing="xy"))[None].expand(2, 2, 98, 120)
+    assert float((extrapolated_slope(0.01 * places, known, 2) - 0.01 * places).abs().max()) < 0.02
+    assert found.shape == slope.shape and bool(torch.isfinite(found).all())
 
 
 def test_frames_with_and_without_shadows_do_not_influence_one_another():

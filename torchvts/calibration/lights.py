@@ -248,7 +248,8 @@ def _try_gloss(pixels: BackgroundPixels, matt: _Solution, loop: _Loop) -> _Solut
     start = torch.cat((matt.parameter, torch.full_like(matt.parameter[:, :1], 0.05)), dim=1)
     coarse = shiny.sample(COARSE_PIXELS)
     near = glossy = _solve(coarse, start, loop)
-    if not _explains(near, matt):
+    # on few pixels: those of the matt skin too, and any gain, for both figures are rough
+    if not _explains(near, _solve(coarse._replace(terms=()), matt.parameter, loop), 1.0):
         return None
     if len(coarse.x) < len(shiny.x):
         glossy = _solve(shiny, near.parameter, loop)
@@ -263,9 +264,9 @@ def _try_gloss(pixels: BackgroundPixels, matt: _Solution, loop: _Loop) -> _Solut
     )
 
 
-def _explains(glossy: _Solution, matt: _Solution) -> bool:
-    """Whether a lobe explains at least half of the matt skin's misfit and leaves next to nothing, in every channel."""
-    less = (glossy.misfit < 0.5 * matt.misfit) & (glossy.misfit < GLOSS_MISFIT)
+def _explains(glossy: _Solution, matt: _Solution, part: float = 0.5) -> bool:
+    """Whether a lobe leaves at most that part of the matt skin's misfit, and next to nothing, in every channel."""
+    less = (glossy.misfit <= part * matt.misfit) & (glossy.misfit < GLOSS_MISFIT)
     return glossy.converged and bool((less & (glossy.parameter[:, -1] > 0)).all())
 
 

@@ -267,6 +267,33 @@ def microfacet(n_l: Tensor, n_v: Tensor, n_h: Tensor, roughness: float = GLOSS_R
     return spread / ((n_l * (1.0 - k) + k) * (n_v * (1.0 - k) + k))
 
 
+def glossy_light(rows: Tensor, normal: Tensor, gloss: Tensor, roughness: float = GLOSS_ROUGHNESS) -> tuple[Tensor, Tensor]:
+    """Light of N pixels of a glossy skin and its derivative in the normal, without the clamp of attached shadows.
+
+    Args:
+        rows: (N, 3, 3), light matrix.
+        normal: (N, 3), unit.
+        gloss: (3,).
+        roughness: of the lobe.
+    Returns:
+        (N, 3); (N, 3, 3): light, axis.
+    Source:
+        the derivative of :func:`microfacet`.
+    """
+    to_light = rows * torch.rsqrt((rows * rows).sum(2, keepdim=True))
+    to_half = torch.rsqrt(2.0 + 2.0 * to_light[:, :, 2])
+    n_l, n_v = (to_light * normal[:, None]).sum(2).clamp_min(1e-3), normal[:, 2:3].clamp_min(1e-3)
+    n_h = (n_l + n_v) * to_half
+    matt, lobe = (rows * normal[:, None]).sum(2), gloss * microfacet(n_l, n_v, n_h, roughness)
+    # the lobe's logarithm along the light and along the view
+    a, k = roughness**4, (roughness + 1.0) ** 2 / 8.0
+    by_half = 4.0 * (1.0 - a) * n_h / (1.0 - (1.0 - a) * n_h * n_h) * to_half
+    by_light, by_view = by_half - (1.0 - k) / (n_l * (1.0 - k) + k), by_half - (1.0 - k) / (n_v * (1.0 - k) + k)
+    turned = by_light[:, :, None] * to_light
+    turned = torch.cat((turned[:, :, 0:2], turned[:, :, 2:3] + by_view[:, :, None]), dim=2)
+    return matt * (1.0 + lobe), rows * (1.0 + lobe)[:, :, None] + (matt * lobe)[:, :, None] * turned
+
+
 def inverse_light_matrix(
     depth_mm: Tensor,
     position_mm: Tensor,

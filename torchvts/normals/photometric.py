@@ -27,6 +27,9 @@ from ..model.lights import PointLights, flat_image, gloss_lobe, inverse_light_ma
 from .base import NormalModel
 from .shadowed import LightView, ShadowedPixels, matrix_in_view
 
+GLOSS_STEPS = 3
+"""Times that a first pass divides the lobe out, each at the slope of the last."""
+
 
 class NormalFromIntensity(NormalModel):
     """Unit normals of a compensated image.
@@ -75,6 +78,7 @@ class NormalFromIntensity(NormalModel):
         camera_height_mm: float = math.inf,
     ) -> None:
         super().__init__()
+        self.gloss_steps = GLOSS_STEPS
         check_record("lights", lights, PointLights, "PointLights(position_mm, albedo) makes them")
         check_size(height, width, mm_per_pixel)
         self.mm_per_pixel = mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
@@ -167,9 +171,8 @@ class NormalFromIntensity(NormalModel):
     def normals_of(self, image: Tensor, depth_mm: Tensor | None, window: tuple[int, int], expected: Tensor | None) -> Tensor:
         """Normals of checked arguments; compiled kernels take the place of this method."""
         view = self.view(image, window)
-        if self.lights.glossy:
-            image = self.without_gloss(image, depth_mm, view)
-        normal: Tensor = self.shadowed(self.inverted(image, depth_mm, view), image, depth_mm, view, expected)
+        plain = self.inverted_glossy(image, depth_mm, view) if self.lights.glossy else self.inverted(image, depth_mm, view)
+        normal: Tensor = self.shadowed(plain, image, depth_mm, view, expected)
         return normal
 
     def inverted(self, image: Tensor, depth_mm: Tensor | None, view: LightView) -> Tensor:
@@ -197,12 +200,18 @@ class NormalFromIntensity(NormalModel):
         else:  # noqa: RET505, TorchScript needs the else to skip this branch
             return may_read_values() and not reads_freely(lights.position_mm)
 
-    def without_gloss(self, image: Tensor, depth_mm: Tensor | None, view: LightView) -> Tensor:
-        """What a matt skin would show: the specular lobe divided out, at the slope of the depth so far."""
+    def inverted_glossy(self, image: Tensor, depth_mm: Tensor | None, view: LightView) -> Tensor:
+        """The plain inverse of what a matt skin would show: the specular lobe divided out.
+
+        At the slope of the depth so far, which the next pass corrects; without depth at the flat skin's, then at that found.
+        """
         depth = image.new_zeros(1, 1, image.shape[2], image.shape[3]) if depth_mm is None else depth_mm
         normal = normal_from_gradient(slope_of_depth(depth, self.mm_per_pixel))
-        matt = image / (1.0 + self.lights.gloss.reshape(1, 3, 1, 1) * gloss_lobe(matrix_in_view(depth, view), normal))
-        return torch.where(image < 0.0, image, matt)  # channels left out stay so
+        matrix, gloss = matrix_in_view(depth, view), self.lights.gloss.reshape(1, 3, 1, 1)
+        for _ in range(self.gloss_steps if depth_mm is None else 1):
+            matt = image / (1.0 + gloss * gloss_lobe(matrix, normal))
+            normal = self.inverted(torch.where(image < 0.0, image, matt), depth_mm, view)  # channels left out stay so
+        return normal
 
     def view(self, image: Tensor, window: tuple[int, int]) -> LightView:
         """The lights as seen from the middle of the window that the image (B, 3, h, w) is."""
@@ -210,7 +219,8 @@ class NormalFromIntensity(NormalModel):
         position: Tensor = self.lights.position_mm
         if x != 0.0 or y != 0.0:
             position = torch.cat((position[:, 0:1] - x, position[:, 1:2] - y, position[:, 2:3]), dim=1)
-        return LightView(position, self.lights.albedo, self.mm_per_pixel, self.camera_height_mm, (-x, -y), window)
+        gloss = self.lights.gloss if self.lights.glossy else None
+        return LightView(position, self.lights.albedo, self.mm_per_pixel, self.camera_height_mm, (-x, -y), window, gloss)
 
     def middle_mm(self, image: Tensor, window: tuple[int, int]) -> tuple[float, float]:
         """Where the middle of the window lies, as seen from the middle of the calibrated image."""

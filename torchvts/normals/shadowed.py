@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from ..core.checks import check_shape, may_read, may_read_values
 from ..core.geometry import gradient_from_normal, normal_from_gradient, slope_beside_cliff
 from ..core.noise import dark_below
-from ..model.lights import light_matrix, seen_at
+from ..model.lights import glossy_light, light_matrix, seen_at
 
 LEFT_OUT = -1.0
 """Intensity of a channel that is left out at a pixel because something else than the skin's slope blocks its light; shadowed.c has
@@ -39,6 +39,7 @@ class LightView(NamedTuple):
         camera_height_mm: infinite for an orthographic camera.
         axis_mm: the middle of the image, x and y.
         window: (top, left), the place of the window's first pixel in the image.
+        gloss: (3,), of the lights; None for a matt skin.
     """
 
     position_mm: Tensor
@@ -47,6 +48,7 @@ class LightView(NamedTuple):
     camera_height_mm: float
     axis_mm: tuple[float, float]
     window: tuple[int, int]
+    gloss: Tensor | None = None
 
 
 def matrix_in_view(depth_mm: Tensor, view: LightView) -> Tensor:
@@ -76,18 +78,23 @@ class Pixels(NamedTuple):
         intensity: (N, 3), compensated.
         rows: (N, 3, 3), light matrix.
         saturated: (N, 3) bool, channels that are saturated; one that is left out is a saturated one of intensity 0.
+        gloss: (3,), of the lights; None for a matt skin.
     """
 
     start: Tensor
     intensity: Tensor
     rows: Tensor
     saturated: Tensor
+    gloss: Tensor | None = None
 
 
 def slope_by_lit_lights(
     pixels: Pixels, noise_std: float, brightness_std: float = 0.01, prior_std: float = PRIOR_STD, steps: int = STEPS
 ) -> Tensor:
     """Slopes of pixels where a light is blocked or a channel is saturated: each pixel against the clamped model max(0, L n).
+
+    On a glossy skin the lobe is part of the model: two lights leave a direction in which the slope answers to small differences of
+    intensity, and a lobe divided out at the last slope would carry it away from pass to pass.
 
     n is of unit length. A blocked channel says no more than that it is dark, a saturated one that it is at least so bright. That
     leaves two intensities for two slopes and, near |n| = 1, a direction that is poorly constrained. A weak prior of standard
@@ -107,18 +114,21 @@ def slope_by_lit_lights(
     Source:
         the shadowed pixels of Barsky and Petrou, TPAMI 25(10), 2003, as a maximum a posteriori estimate.
     """
-    start, compensated, rows = pixels.start, pixels.intensity, pixels.rows
+    start, compensated, rows, gloss = pixels.start, pixels.intensity, pixels.rows, pixels.gloss
     weight = (noise_std / prior_std) ** 2
     slope = start
     for _ in range(steps):
         p, q = slope[:, 0:1], slope[:, 1:2]
         n_z = torch.rsqrt(1.0 + p * p + q * q)
         normal = torch.cat((-p * n_z, -q * n_z, n_z), dim=1)
-        light = (rows * normal[:, None]).sum(2)  # (N, 3)
+        light, change = (rows * normal[:, None]).sum(2), rows  # (N, 3), (N, light, axis)
+        if gloss is not None:
+            light, change = glossy_light(rows, normal, gloss)
         # 0.1 sigma above zero, because a black channel starts exactly on the terminator
         lit = ((light > 0.1 * noise_std) & ~(pixels.saturated & (light >= compensated))).to(light.dtype)
         # d normal / d slope is -n_z (e - n (n.e)) along x and y: the part of the light row across the normal
-        across = -n_z[:, :, None] * (rows - light[:, :, None] * normal[:, None])[:, :, 0:2] * lit[:, :, None]
+        change = change - (change * normal[:, None]).sum(2, keepdim=True) * normal[:, None]
+        across = -n_z[:, :, None] * change[:, :, 0:2] * lit[:, :, None]
         model = light * lit
         residual = compensated * lit - model
         # whitened by the covariance noise^2 1 + brightness^2 model model^T
@@ -236,7 +246,7 @@ class ShadowedPixels(nn.Module):
         rows = view.albedo[None, :, None] * to_light * (squared.rsqrt() / squared)
         intensity, lost = image[b, :, row, column], failed[b]
         saturated = (intensity >= limits.saturated_above[:, row, column].t()) | lost | (intensity <= 0.5 * self.left_out)
-        pixels = Pixels(start, intensity * (~lost).to(intensity.dtype), rows, saturated)
+        pixels = Pixels(start, intensity * (~lost).to(intensity.dtype), rows, saturated, view.gloss)
         slope = slope_by_lit_lights(pixels, self.noise_std, self.brightness_std)
         solution = normal_from_gradient(slope[:, :, None, None])[:, :, 0, 0]
         solution = torch.where(wanted[b, row, column][:, None], solution, normal[b, :, row, column])

@@ -165,8 +165,8 @@ def extrapolated_slope(slope: Tensor, known: Tensor, cell: int, top: int = 0, le
     """Slopes of all pixels extrapolated from those that are known: planes through them, weighted by nearness.
 
     Moving least squares over cells of pixels, with weights that fall with the fourth power of the distance: free of any scale,
-    so that a plane spans a gap of any width by what is as wide around it. Memory and time grow with the square of the number of
-    cells.
+    so that a plane spans a gap of any width by what is as wide around it. Memory grows with the number of cells,
+    time with its square.
 
     Args:
         slope: (B, 2, H, W).
@@ -199,12 +199,15 @@ def extrapolated_slope(slope: Tensor, known: Tensor, cell: int, top: int = 0, le
     mean = sums[:, :, 1:] / mass.clamp_min(1e-12)
     y = torch.arange(rows, dtype=slope.dtype, device=slope.device).repeat_interleave(columns) + 0.5
     x = torch.arange(columns, dtype=slope.dtype, device=slope.device).repeat(rows) + 0.5
-    distance = (x[None, :, None] - mean[:, None, :, 0]).square() + (y[None, :, None] - mean[:, None, :, 1]).square()
-    weight = mass.transpose(1, 2) / (distance + 0.03).square()  # (B, cell, cell it is known in)
-    weight = weight / weight.sum(2, keepdim=True).clamp_min(1e-12)
-    products = mean[:, :, 0:2, None] * mean[:, :, None, :]  # (B, cells, 2, 4)
-    center = weight @ mean
-    spread = (weight @ products.flatten(2)).reshape(count, -1, 2, 4) - center[:, :, 0:2, None] * center[:, :, None, :]
+    moments = torch.cat((mean, (mean[:, :, 0:2, None] * mean[:, :, None, :]).flatten(2)), dim=2)  # (B, cells, 12)
+    means: list[Tensor] = []
+    for to in torch.split(torch.stack((x, y), dim=1), 256):  # a part of the cells at a time, for memory
+        distance = (to[:, 0:1] - mean[:, None, :, 0]).square() + (to[:, 1:2] - mean[:, None, :, 1]).square()
+        weight = mass.transpose(1, 2) / (distance + 0.03).square()  # (B, cell, cell it is known in)
+        means.append(weight / weight.sum(2, keepdim=True).clamp_min(1e-12) @ moments)
+    found = torch.cat(means, dim=1)
+    center, spread = found[:, :, 0:4], found[:, :, 4:12].reshape(count, -1, 2, 4)
+    spread = spread - center[:, :, 0:2, None] * center[:, :, None, :]
     # of a cell's size at least: cells on one line constrain nothing across it
     xx, xy, yy = spread[:, :, 0, 0:1] + 0.03, spread[:, :, 0, 1:2], spread[:, :, 1, 1:2] + 0.03
     along_x, along_y = spread[:, :, 0, 2:4], spread[:, :, 1, 2:4]

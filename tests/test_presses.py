@@ -21,9 +21,10 @@ from torchvts.calibration import fit_prior
 from torchvts.calibration.balls import guess_circle
 from torchvts.calibration.by_presses import with_preprocessing
 from torchvts.calibration.contacts import read_contacts
-from torchvts.calibration.response_fit import simplest_candidate
+from torchvts.calibration.field import Evidence, Family
+from torchvts.calibration.response_fit import fit_depth_brightness, simplest_candidate
 from torchvts.evaluation import metrics
-from torchvts.model.response_field import CHANGE_SCALE, ResponseField, fit_log_background, sine_from_slope
+from torchvts.model.response_field import CHANGE_SCALE, DepthBrightness, ResponseField, fit_log_background, sine_from_slope
 
 HEIGHT, WIDTH, PITCH = 120, 160, 0.125
 SIZE = (HEIGHT, WIDTH, PITCH)
@@ -665,3 +666,37 @@ def test_a_larger_family_must_be_better_by_more_than_chance():
     assert simplest_candidate(few) == 0
     sure = [[2.0, 2.1, 1.9], [1.5, 1.6, 1.4], [1.49, 1.6, 1.4]]
     assert simplest_candidate(sure) == 1
+
+
+@pytest.fixture(scope="module")
+def known(good, rest):
+    """The contacts of two presses whose balls are labelled."""
+    places = list(zip(CENTERS_MM, DEPTHS_MM))[:2]
+    labelled = [
+        dataclasses.replace(press, center_px=in_px(center), contact_radius_px=math.sqrt(BALL_MM * depth - depth**2) / PITCH)
+        for press, (center, depth) in zip(good, places)
+    ]
+    return read_contacts(labelled, rest, with_preprocessing(GIVEN, None))
+
+
+@pytest.mark.parametrize("cubic_degree", [-1, 0])
+def test_a_unit_of_faint_changes_is_regularised_like_one_of_strong_changes(known, cubic_degree):
+    family = Family(1, 0, 10.0, cubic_degree=cubic_degree)
+    faint = [dataclasses.replace(contact, change=0.2 * contact.change) for contact in known]
+    slopes = []
+    for contacts in (known, faint):
+        evidence = Evidence.of(family, contacts)
+        coefficient = evidence.solve(evidence.penalty(0.03), None)
+        slopes.append(evidence.forms[0].slope(coefficient))
+    assert torch.allclose(*slopes, rtol=1e-6, atol=1e-8)
+
+
+def test_few_presses_move_what_a_prior_says_of_depth_by_little(known):
+    family = Family(1, -1, 10.0)
+    evidence = Evidence.of(family, known)
+    field = family.field(evidence.solve(evidence.penalty(0.003), None))
+    prior = DepthBrightness(0, 10.0, ((0.05,), (0.0,), (-0.05,)))
+    free = fit_depth_brightness(known, field, PITCH).tensor()
+    start = torch.nn.functional.pad(prior.tensor(), (0, 5))
+    moved = (fit_depth_brightness(known, field, PITCH, prior).tensor() - start).norm()
+    assert moved > 0 and moved < 0.5 * (free - start).norm()

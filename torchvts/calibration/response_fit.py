@@ -19,7 +19,7 @@ from .touches import presses_as_touches
 FAMILIES = ((0, -1, -1), (1, -1, -1), (2, -1, -1), (2, 1, -1), (2, 1, 0), (3, 2, -1), (3, 2, 1), (4, 3, -1))
 """Degrees of candidates, linear terms, products of two and of three, the smallest first."""
 
-PENALTIES = (0.03, 0.01, 0.003)
+PENALTIES = (0.03, 0.01, 0.003, 0.001, 0.0003)
 PENALTIES_ON_START = (10.0, 3.0, 1.0, 0.3, 0.1, 0.03)
 """Regularisation strengths, in presses, the strongest first: towards zero, and towards a start such as a prior."""
 
@@ -42,8 +42,12 @@ DEPTH_DEGREE = 2
 """Degree in position of what depth does to brightness."""
 
 DEPTH_PENALTY = 0.1
-"""Regularisation of it, in presses times mm^2: (0.03 / 0.1)^2, because sines are right to about 0.03, and a skin that comes 1 mm
-nearer to lights about 10 mm away changes its brightness by about 0.1."""
+"""Regularisation of it towards zero, in presses times mm^2: (0.03 / 0.1)^2, because sines are right to about 0.03, and a skin that
+comes 1 mm nearer to lights about 10 mm away changes its brightness by about 0.1."""
+
+DEPTH_PENALTY_ON_PRIOR = 3.0
+"""The same towards a prior, from which units of a type differ by about 0.03 per mm, and the error of a press is alike all over it,
+so that its pixels do not average it: (0.05 / 0.03)^2."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +160,8 @@ def fit_depth_brightness(
     start = torch.zeros(3, size, dtype=torch.float64)
     if prior is not None:
         start[:, : prior.tensor().shape[1]] = prior.tensor()
-    form = DEPTH_PENALTY * torch.eye(3 * size, dtype=torch.float64)
+    penalty = DEPTH_PENALTY if prior is None else DEPTH_PENALTY_ON_PRIOR
+    form = penalty * torch.eye(3 * size, dtype=torch.float64)
     right = torch.zeros(3 * size, dtype=torch.float64)
     for contact, depth in zip(contacts, first_pass_depths(contacts, field, pitch_mm)):
         inside = contact.inside()
@@ -204,11 +209,16 @@ def simplest_candidate(errors_deg: list[list[float]]) -> int:
     return int((excess.mean(dim=1) <= allowed).nonzero()[0])
 
 
+def _best_candidate(errors_deg: list[list[float]]) -> int:
+    """The candidate of least mean held-out error."""
+    return int(torch.tensor(errors_deg, dtype=torch.float64).mean(dim=1).argmin())
+
+
 def held_out_deg(contacts: list[Contact], like: ResponseField) -> float:
     """Mean angle on each press by a field of the family of ``like`` that the others give, degrees."""
     family = Family.of(like)
     evidence = Evidence.of(family, contacts)
-    return evidence.mean_error_deg(evidence.held_out(PENALTIES[1] * family.penalty(), None))
+    return evidence.mean_error_deg(evidence.held_out(evidence.penalty(PENALTIES[2]), None))
 
 
 def _choose(contacts: list[Contact], families: list[Family], start: _Start | None) -> _Choice:
@@ -246,16 +256,18 @@ class _Tried(NamedTuple):
 
 
 def _fit_family(evidence: Evidence, start: _Start | None, few: bool) -> _Tried:
-    """The field of one family, with the strongest regularisation that is as good as the best."""
+    """The field of one family, with the best regularisation; towards a start with the strongest that is as good as the best."""
     family = evidence.family
     origin: Tensor | None = None
     strengths: tuple[float, ...] = PENALTIES
     if start is not None:
         origin = start.field.embedded(family.degree, family.product_degree, family.cubic_degree).tensor().reshape(-1)
         strengths = (FEW_PENALTY,) if few else PENALTIES_ON_START
-    penalties = [strength * family.penalty() for strength in strengths]
+    penalties = [evidence.penalty(strength) if start is None else strength * family.penalty() for strength in strengths]
     errors = [] if few else [evidence.errors_deg(evidence.held_out(penalty, origin)) for penalty in penalties]
-    k = simplest_candidate(errors) if errors else 0
+    # towards zero a stronger one is no simpler model, only one of flatter slopes
+    choose = _best_candidate if start is None else simplest_candidate
+    k = choose(errors) if errors else 0
     model = f"response, {family.label()}"
     if start is not None:
         model = f"{start.name} adapted, regularisation of {strengths[k]:g} presses, {family.label()}"

@@ -6,7 +6,7 @@ import threading
 import torch
 from torch import Tensor, UntypedStorage
 
-MOST_BYTES = 2**26
+MOST_BYTES = 2**27
 """No more is kept for later frames."""
 
 _lock = threading.Lock()
@@ -33,8 +33,13 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
 
 
 def _keep(storage: UntypedStorage, size: int) -> None:
-    """Keep the storage, in place of others if there are too many."""
-    if sum(length * len(some) for length, some in _kept.items()) + size > MOST_BYTES:
+    """Keep the storage, if need be in place of those that nobody holds."""
+    if _kept_bytes() + size > MOST_BYTES:
         for some in _kept.values():
-            some.clear()
-    _kept[size].append(storage)
+            some[:] = [other for other in some if _users(other._cdata) > 1]
+    if _kept_bytes() + size <= MOST_BYTES:
+        _kept[size].append(storage)
+
+
+def _kept_bytes() -> int:
+    return sum(size * len(some) for size, some in _kept.items())

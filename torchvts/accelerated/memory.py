@@ -2,6 +2,7 @@
 
 import math
 import threading
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, UntypedStorage
@@ -11,7 +12,7 @@ MOST_BYTES = 2**27
 
 _lock = threading.Lock()
 _kept: dict[int, list[UntypedStorage]] = {}
-_users = getattr(torch._C, "_storage_Use_Count", None)
+_users: Callable[[int], int] | None = getattr(torch._C, "_storage_Use_Count", None)
 
 
 def empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
@@ -28,15 +29,15 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
         free = next((storage for storage in some if _users(storage._cdata) == 1), None)
         if free is None:
             free = UntypedStorage(size)
-            _keep(free, size)
+            _keep(free, size, _users)
         return tensor.set_(free, 0, shape)  # type: ignore[call-overload, no-any-return]
 
 
-def _keep(storage: UntypedStorage, size: int) -> None:
+def _keep(storage: UntypedStorage, size: int, users: Callable[[int], int]) -> None:
     """Keep the storage, if need be in place of those that nobody holds."""
     if _kept_bytes() + size > MOST_BYTES:
         for some in _kept.values():
-            some[:] = [other for other in some if _users(other._cdata) > 1]
+            some[:] = [other for other in some if users(other._cdata) > 1]
     if _kept_bytes() + size <= MOST_BYTES:
         _kept[size].append(storage)
 

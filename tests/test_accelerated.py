@@ -2,6 +2,7 @@
 
 import shutil
 import threading
+from itertools import pairwise
 
 import pytest
 import torch
@@ -17,6 +18,7 @@ from torchvts.accelerated.blocks import (
     NormalFromResponse,
     ZeroBackground,
 )
+from torchvts.accelerated.derived import response_lines
 from torchvts.accelerated.gate import usable
 from torchvts.core.geometry import gradient_of_depth
 from torchvts.model.response_field import DepthBrightness, ResponseField, ResponseModel
@@ -438,3 +440,101 @@ def test_memory_that_other_processes_see_is_not_used_again():
     place = first.data_ptr()
     del first
     assert memory.empty((1, 1, 7, 9), torch.float32).data_ptr() != place
+
+
+@pytest.mark.parametrize("orders", [(2, -1, -1), (1, 0, 2), (2, -1, 1), (4, 2, 0)])
+def test_normals_by_every_order_of_products(orders):
+    generator = torch.Generator().manual_seed(sum(orders) + 9)
+    degree, product, cubic = orders
+    size = terms_of(*orders)
+    rows = tuple(tuple((0.3 * torch.randn(size, generator=generator)).tolist()) for _ in range(2))
+    by_depth = DepthBrightness(1, 5.0, ((0.05, 0.01, 0.0),) * 3)
+    block = NormalFromResponse(ResponseField(degree, product, 5.0, rows, cubic), by_depth, 40, 60, 0.2)
+    image, depth = 1.0 + 0.1 * torch.randn(2, 3, 24, 33, generator=generator), torch.rand(2, 1, 24, 33, generator=generator)
+    assert response_lines(block) is not None
+    for given in (None, depth):
+        loops, operators = both(block, image, given, (8, 16))
+        assert float((loops - operators).abs().max()) < 2e-6
+
+
+def terms_of(degree, product, cubic):
+    """Coefficients of one slope of a field of these degrees."""
+    return sum(count * (d + 1) * (d + 2) // 2 for count, d in ((3, degree), (6, product), (10, cubic)) if d >= 0)
+
+
+@pytest.mark.parametrize("mode", ["fast", "precise"])
+def test_a_frame_in_one_call_equals_its_blocks(response_unit, mode):
+    calibration, frames = response_unit
+    pipe = vts.DepthPipeline.from_calibration(calibration, mode)
+    batch = frames.repeat(6, 1, 1, 1)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        found = pipe.compiled(batch)
+    finally:
+        torch.set_num_threads(before)
+    for k in range(3):
+        alone, blocks = pipe.compiled(frames[k : k + 1]), pipe.depth_of(frames[k : k + 1])
+        for one, other, many in zip(alone, blocks, found, strict=True):
+            assert torch.equal(one, other) and torch.equal(many[k::3], one.expand(6, -1, -1, -1))
+
+
+def test_one_call_follows_blocks_that_change(response_unit):
+    """Buffers written to, settings, and blocks replaced, watched or given by the user."""
+    calibration, frames = response_unit
+    pipe, image = vts.DepthPipeline.from_calibration(calibration), frames[:1]
+    results = [pipe.compiled(image)]
+    pipe.deformed.per_noise.mul_(0.5)
+    results.append(pipe.compiled(image))
+    pipe.gradient.max_slope = 0.05
+    results.append(pipe.compiled(image))
+    pipe.normals.maps = 0.5 * pipe.normals.maps
+    results.append(pipe.compiled(image))
+    blocks = pipe.depth_of(image)
+    assert all(torch.equal(one, other) for one, other in zip(results[-1], blocks, strict=True))
+    changed = [not all(map(torch.equal, *pair)) for pair in pairwise(results)]
+    assert changed == [True] * 3
+    seen = []
+    handle = pipe.zero.register_forward_hook(lambda *_: seen.append(1))
+    assert pipe.compiled(image) is None and torch.equal(pipe(image).depth_mm, blocks.depth_mm) and seen == [1]
+    handle.remove()
+    assert pipe.compiled(image) is not None
+    assert pipe.compiled(image.clone().requires_grad_()) is None and pipe.compiled(image.double()) is None
+    pipe.zero = torch.nn.Sequential(pipe.zero)
+    assert pipe.compiled(image) is None
+
+
+def test_one_call_refuses_what_the_blocks_refuse(response_unit):
+    calibration, frames = response_unit
+    pipe = vts.DepthPipeline.from_calibration(calibration)
+    for value, message in ((1.01, r"expected values in \[0, 1\]"), (-0.01, "clamp it"), (float("nan"), "expected finite values")):
+        image = frames[:2].clone()
+        image[1, 2, -1, -1] = value
+        with pytest.raises(ValueError, match=f"images: .*{message}"):
+            pipe(image)
+    with pytest.raises(ValueError, match="100 x 160"):
+        pipe(frames[:, :, :100])
+
+
+def test_memory_of_outputs_that_nobody_holds_is_used_again():
+    shape = (3, 1, 17, 19)
+    first = memory.empty(shape, torch.float32)
+    place, view = first.data_ptr(), first[1:].numpy()
+    del first
+    assert memory.empty(shape, torch.float32).data_ptr() != place
+    view[:] = 7.0
+    del view
+    with torch.inference_mode():
+        again = memory.empty(shape, torch.float32)
+    assert again.data_ptr() == place and again.is_contiguous() and again.shape == shape
+    large = memory.empty((memory.MOST_BYTES + 4,), torch.bool)
+    assert large.shape == (memory.MOST_BYTES + 4,)
+
+
+def test_heights_that_have_no_fast_transform():
+    """A prime factor above 64: torch solves."""
+    solver = vts.PoissonBackground(0.1)
+    gradient = torch.randn(1, 2, 67, 20, generator=torch.Generator().manual_seed(0))
+    assert kernels.poisson_plan(67, 20) is None and kernels.poisson_plan(61, 20) is not None
+    loops, operators = both(solver, gradient)
+    assert torch.equal(loops, operators)

@@ -18,6 +18,9 @@ _Value = TypeVar("_Value")
 DEGREES = (2, 4, 6)
 """Degrees for which response.c has loops."""
 
+TERMS = (3, 9, 13, 19)
+"""Terms for which it has: three changes, their six products of two, their ten of three."""
+
 _notes: WeakKeyDictionary[nn.Module, dict[str, tuple[tuple[Tensor, ...], list[int], object]]] = WeakKeyDictionary()
 
 
@@ -69,7 +72,7 @@ def _lines(maps: Tensor, per_mm: Tensor) -> ResponseLines | None:
     place = torch.linspace(-1.0, 1.0, maps.shape[3], dtype=torch.float64)
     weight = next((found for degree in DEGREES if (found := _polynomials(maps, place, degree)) is not None), None)
     by_depth = _polynomials(per_mm, place, 2)
-    if weight is None or by_depth is None or maps.shape[0] not in (3, 9):
+    if weight is None or by_depth is None or maps.shape[0] not in TERMS:
         return None
     return ResponseLines(
         place.float(), weight.permute(2, 3, 1, 0).float().contiguous(), by_depth.transpose(0, 1).float().contiguous()

@@ -2,16 +2,17 @@
 
 import math
 import threading
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, UntypedStorage
 
-MOST_BYTES = 2**26
+MOST_BYTES = 2**27
 """No more is kept for later frames."""
 
 _lock = threading.Lock()
 _kept: dict[int, list[UntypedStorage]] = {}
-_users = getattr(torch._C, "_storage_Use_Count", None)
+_users: Callable[[int], int] | None = getattr(torch._C, "_storage_Use_Count", None)
 
 
 def empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
@@ -29,13 +30,18 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
         free = next((storage for storage in some if _users(storage._cdata) == 1), None)
         if free is None:
             free = UntypedStorage(size)
-            _keep(free, size)
+            _keep(free, size, _users)
         return tensor.set_(free, 0, shape)  # type: ignore[call-overload, no-any-return]
 
 
-def _keep(storage: UntypedStorage, size: int) -> None:
-    """Keep the storage, in place of others if there are too many."""
-    if sum(length * len(some) for length, some in _kept.items()) + size > MOST_BYTES:
+def _keep(storage: UntypedStorage, size: int, users: Callable[[int], int]) -> None:
+    """Keep the storage, if need be in place of those that nobody holds."""
+    if _kept_bytes() + size > MOST_BYTES:
         for some in _kept.values():
-            some.clear()
-    _kept[size].append(storage)
+            some[:] = [other for other in some if users(other._cdata) > 1]
+    if _kept_bytes() + size <= MOST_BYTES:
+        _kept[size].append(storage)
+
+
+def _kept_bytes() -> int:
+    return sum(size * len(some) for size, some in _kept.items())

@@ -28,50 +28,38 @@ WIDE static void multiply_add(const float *restrict image, const float *restrict
         memcpy(light, image, sizeof(float) * (size_t)n);
 }
 
-/* Sums over `taps` values from each on. Fused, as torch adds a multiple. */
-WIDE FUSED static void blur_along(const float *restrict padded, const float *restrict weight, int taps, int n, float *restrict line) {
-    if (taps == 7) { /* one pixel of standard deviation: all in registers */
-        const float a = weight[0], b = weight[1], c = weight[2], d = weight[3], e = weight[4], f = weight[5], g = weight[6];
-        for (int x = 0; x < n; x++) {
-            float sum = padded[x] * a;
-            sum += padded[x + 1] * b;
-            sum += padded[x + 2] * c;
-            sum += padded[x + 3] * d;
-            sum += padded[x + 4] * e;
-            sum += padded[x + 5] * f;
-            sum += padded[x + 6] * g;
-            line[x] = sum;
-        }
-        return;
-    }
-    for (int x = 0; x < n; x++) line[x] = padded[x] * weight[0];
-    for (int k = 1; k < taps; k++)
-        for (int x = 0; x < n; x++) line[x] += padded[x + k] * weight[k];
-}
-
-/* The same of `taps` lines. */
-WIDE FUSED static void blur_down(const float *const *lines, const float *restrict weight, int taps, int n, float *restrict result) {
-    const float *restrict first = lines[0];
-    if (taps == 7) {
-        const float *restrict l1 = lines[1], *restrict l2 = lines[2], *restrict l3 = lines[3], *restrict l4 = lines[4];
-        const float *restrict l5 = lines[5], *restrict l6 = lines[6];
-        const float a = weight[0], b = weight[1], c = weight[2], d = weight[3], e = weight[4], f = weight[5], g = weight[6];
-        for (int x = 0; x < n; x++) {
-            float sum = first[x] * a;
-            sum += l1[x] * b;
-            sum += l2[x] * c;
-            sum += l3[x] * d;
-            sum += l4[x] * e;
-            sum += l5[x] * f;
-            sum += l6[x] * g;
+/* The sum of an odd number of lines, each times its weight, in their order; seven, six and two at a time, which stay in registers. Fused, as
+   torch adds a multiple. */
+WIDE FUSED static void weighted_sum(const float *const *lines, const float *restrict weight, int taps, int n, float *restrict result) {
+    int k = taps >= 7 ? 7 : 1;
+    const float *l0 = lines[0], w0 = weight[0];
+    if (taps < 7) {
+        for (int x = 0; x < n; x++) result[x] = l0[x] * w0;
+    } else {
+        const float *l1 = lines[1], *l2 = lines[2], *l3 = lines[3], *l4 = lines[4], *l5 = lines[5], *l6 = lines[6];
+        const float w1 = weight[1], w2 = weight[2], w3 = weight[3], w4 = weight[4], w5 = weight[5], w6 = weight[6];
+        INDEPENDENT for (int x = 0; x < n; x++) {
+            float sum = l0[x] * w0;
+            sum += l1[x] * w1, sum += l2[x] * w2, sum += l3[x] * w3, sum += l4[x] * w4, sum += l5[x] * w5, sum += l6[x] * w6;
             result[x] = sum;
         }
-        return;
     }
-    for (int x = 0; x < n; x++) result[x] = first[x] * weight[0];
-    for (int k = 1; k < taps; k++) {
-        const float *restrict line = lines[k];
-        for (int x = 0; x < n; x++) result[x] += line[x] * weight[k];
+    for (; k + 6 <= taps; k += 6) {
+        const float *l1 = lines[k], *l2 = lines[k + 1], *l3 = lines[k + 2], *l4 = lines[k + 3], *l5 = lines[k + 4], *l6 = lines[k + 5];
+        const float w1 = weight[k], w2 = weight[k + 1], w3 = weight[k + 2], w4 = weight[k + 3], w5 = weight[k + 4], w6 = weight[k + 5];
+        INDEPENDENT for (int x = 0; x < n; x++) {
+            float sum = result[x];
+            sum += l1[x] * w1, sum += l2[x] * w2, sum += l3[x] * w3, sum += l4[x] * w4, sum += l5[x] * w5, sum += l6[x] * w6;
+            result[x] = sum;
+        }
+    }
+    for (; k + 2 <= taps; k += 2) {
+        const float *l1 = lines[k], *l2 = lines[k + 1], w1 = weight[k], w2 = weight[k + 1];
+        INDEPENDENT for (int x = 0; x < n; x++) {
+            float sum = result[x];
+            sum += l1[x] * w1, sum += l2[x] * w2;
+            result[x] = sum;
+        }
     }
 }
 
@@ -105,14 +93,15 @@ static int blur_plane(const Affine *plane, const float *weight, int taps, int he
             outside |= any_outside(plane->image + at, width);
             apply(plane, at, width, row);
             for (int k = 0; k < reach; k++) padded[k] = row[0], row[width + k] = row[width - 1];
-            blur_along(padded, weight, taps, width, scratch + (size_t)(next % taps) * width);
+            for (int k = 0; k < taps; k++) lines[k] = padded + k;
+            weighted_sum(lines, weight, taps, width, scratch + (size_t)(next % taps) * width);
         }
         if (y < 0) continue;
         for (int k = 0; k < taps; k++) {
             const int at = y + k - reach < 0 ? 0 : least(y + k - reach, height - 1);
             lines[k] = scratch + (size_t)(at % taps) * width;
         }
-        blur_down(lines, weight, taps, width, out + (size_t)y * width);
+        weighted_sum(lines, weight, taps, width, out + (size_t)y * width);
     }
     return outside;
 }

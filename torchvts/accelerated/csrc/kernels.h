@@ -27,13 +27,16 @@
 #define FUSED
 #endif
 
-/* Before a loop whose turns touch different places. */
+/* Before a loop whose turns touch different places, and one of a few turns within another that is to be vectorised. */
 #if defined(__clang__)
 #define INDEPENDENT _Pragma("clang loop vectorize(assume_safety)")
+#define UNROLLED _Pragma("unroll")
 #elif defined(__GNUC__)
 #define INDEPENDENT _Pragma("GCC ivdep")
+#define UNROLLED _Pragma("GCC unroll 32")
 #else
 #define INDEPENDENT
+#define UNROLLED
 #endif
 
 /* Memory that the library keeps from call to call, in place of the system's: see memory.c. */

@@ -307,7 +307,7 @@ EXPORT int solve_poisson(const float *gradient, const double *tables, float mm_p
     float *line = coefficients + blocks * wide, *borders = line + lines;
     const unsigned int before = without_tiny();
     memset(found, 0, sizeof(float) * (size_t)wide * LINES);
-    memset(coefficients, 0, sizeof(float) * blocks * wide);
+    memset(coefficients + (size_t)width * wide, 0, sizeof(float) * (size_t)LINES * wide); /* columns beyond the image, which fill its last block */
     for (int b = 0; b < frames; b++, gradient += 2 * (size_t)rows * columns, depth += (size_t)height * width) {
         divergence(gradient, &part, height, width, 0.5f * mm_per_pixel, borders, line, step);
         to_coefficients(&plan, &part, line, step, work, found, coefficients);

@@ -4,28 +4,33 @@
 
 #include <math.h>
 
-enum { SINGLE = 3, ALL = 9 };
+enum { SINGLE = 3, PRODUCTS = 6, CUBES = 10, MOST_TERMS = SINGLE + PRODUCTS + CUBES };
 
-/* One row: sines along x and y from the changes of brightness; weight (degree + 1, 2, terms), highest power last. Both numbers are constants
-   of the callers, so that all loops but one unroll. */
+/* One row: sines along x and y from the changes of brightness; weight (degree + 1, 2, terms), highest power last. The terms are the changes,
+   their products of two if there are any, and of three. All numbers but n are constants of the callers, so that all loops but one unroll. */
 static inline __attribute__((always_inline)) void sines(const float *restrict image, size_t step, const float *restrict place,
                                                         const float *restrict weight, const float *restrict depth,
-                                                        const float *restrict per_mm, int degree, int terms, int n, float *restrict sine_x,
+                                                        const float *restrict per_mm, int degree, int products, int cubes, int n, float *restrict sine_x,
                                                         float *restrict sine_y) {
+    const int terms = SINGLE + products + cubes;
     for (int k = 0; k < n; k++) {
         const float u = place[k];
-        float term[ALL] = {image[k] - 1.0f, image[step + k] - 1.0f, image[2 * step + k] - 1.0f};
+        float term[MOST_TERMS] = {image[k] - 1.0f, image[step + k] - 1.0f, image[2 * step + k] - 1.0f};
         if (depth)
             for (int c = 0; c < 3; c++) term[c] -= ((per_mm[3 * c + 2] * u + per_mm[3 * c + 1]) * u + per_mm[3 * c]) * depth[k];
-        if (terms == ALL) {
-            term[3] = term[0] * term[0], term[4] = term[0] * term[1], term[5] = term[0] * term[2];
-            term[6] = term[1] * term[1], term[7] = term[1] * term[2], term[8] = term[2] * term[2];
+        const float rr = term[0] * term[0], rg = term[0] * term[1], rb = term[0] * term[2];
+        const float gg = term[1] * term[1], gb = term[1] * term[2], bb = term[2] * term[2];
+        if (products) term[3] = rr, term[4] = rg, term[5] = rb, term[6] = gg, term[7] = gb, term[8] = bb;
+        if (cubes) {
+            float *cube = term + SINGLE + products;
+            cube[0] = rr * term[0], cube[1] = rr * term[1], cube[2] = rr * term[2], cube[3] = rg * term[1], cube[4] = rg * term[2];
+            cube[5] = rb * term[2], cube[6] = gg * term[1], cube[7] = gg * term[2], cube[8] = gb * term[2], cube[9] = bb * term[2];
         }
         float x = 0.0f, y = 0.0f;
         for (int power = degree; power >= 0; power--) {
             const float *at = weight + 2 * terms * power;
             float along = at[0] * term[0], down = at[terms] * term[0];
-            for (int t = 1; t < terms; t++) along += at[t] * term[t], down += at[terms + t] * term[t];
+            UNROLLED for (int i = 1; i < terms; i++) along += at[i] * term[i], down += at[terms + i] * term[i];
             x = x * u + along, y = y * u + down;
         }
         sine_x[k] = x, sine_y[k] = y;
@@ -34,21 +39,25 @@ static inline __attribute__((always_inline)) void sines(const float *restrict im
 
 typedef void (*row_of)(const float *, size_t, const float *, const float *, const float *, const float *, int, float *, float *);
 
-#define ROW(name, degree, terms)                                                                                                        \
+#define ROW(name, degree, products, cubes)                                                                                               \
     WIDE FUSED static void name(const float *image, size_t step, const float *place, const float *weight, const float *depth,            \
                                 const float *per_mm, int n, float *sine_x, float *sine_y) {                                               \
         if (depth)                                                                                                                      \
-            sines(image, step, place, weight, depth, per_mm, degree, terms, n, sine_x, sine_y);                                           \
+            sines(image, step, place, weight, depth, per_mm, degree, products, cubes, n, sine_x, sine_y);                                 \
         else                                                                                                                            \
-            sines(image, step, place, weight, 0, 0, degree, terms, n, sine_x, sine_y);                                                    \
+            sines(image, step, place, weight, 0, 0, degree, products, cubes, n, sine_x, sine_y);                                          \
     }
 
-ROW(single_2, 2, SINGLE)
-ROW(single_4, 4, SINGLE)
-ROW(single_6, 6, SINGLE)
-ROW(all_2, 2, ALL)
-ROW(all_4, 4, ALL)
-ROW(all_6, 6, ALL)
+#define ROWS(name, products, cubes)      \
+    ROW(name##_2, 2, products, cubes)    \
+    ROW(name##_4, 4, products, cubes)    \
+    ROW(name##_6, 6, products, cubes)    \
+    static const row_of name[3] = {name##_2, name##_4, name##_6};
+
+ROWS(linear, 0, 0)
+ROWS(with_products, PRODUCTS, 0)
+ROWS(with_cubes, 0, CUBES)
+ROWS(with_both, PRODUCTS, CUBES)
 
 /* Normals of sines, which are held to the largest. */
 WIDE static void to_normal(float max_sine, int n, float *restrict x, float *restrict y, float *restrict z) {
@@ -66,8 +75,8 @@ WIDE static void to_normal(float max_sine, int n, float *restrict x, float *rest
 EXPORT void response_normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *place,
                              const float *weight, int degree, int terms, const float *depth, int64_t depth_frame, int64_t depth_row,
                              const float *per_mm, float max_sine, int frames, int rows, int columns, float *normal) {
-    static const row_of of_terms[2][3] = {{single_2, single_4, single_6}, {all_2, all_4, all_6}};
-    const row_of row = of_terms[terms == ALL][degree / 2 - 1];
+    const int cubes = terms >= SINGLE + CUBES, products = terms - (cubes ? CUBES : 0) > SINGLE;
+    const row_of row = (cubes ? products ? with_both : with_cubes : products ? with_products : linear)[degree / 2 - 1];
     const size_t pixels = (size_t)rows * columns;
     for (int b = 0; b < frames; b++)
         for (int y = 0; y < rows; y++) {

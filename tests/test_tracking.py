@@ -12,7 +12,7 @@ from torchvts.accelerated import library, reference_only
 from torchvts.cli.track import record
 from torchvts.core.frame import DepthOutput
 from torchvts.evaluation import tracking
-from torchvts.pose.follow import adjoint, orthonormal
+from torchvts.pose.follow import adjoint, follow, orthonormal
 from torchvts.pose.graph import Edge, KeyframeGraph
 from torchvts.pose.inverse import Sums, refine, solve_step, sum_parts, sum_residuals
 from torchvts.pose.jackknife import ALIKE_PARTS, jackknife
@@ -330,6 +330,22 @@ def test_a_bad_reference_is_refused():
         vts.PoseTracker(good, 0.0625)
     with pytest.raises(ValueError, match="mm_per_pixel"):
         vts.PoseTracker(good, -1.0)
+
+
+def test_what_speaks_against_a_pose_is_weighed():
+    """A cost that is usual on a track is no reason to lose the object; a large one at its beginning, or a large step, is."""
+    tracker = vts.PoseTracker(press(objects.key(), swing(0)), PITCH)
+    keyframe, start = tracker.graph.keyframes[0], [np.eye(4)]
+    found = follow(keyframe, grids(contact_frame(press(objects.key(), swing(1))), PITCH, keyframe.least_mm, keyframe.times), start)
+    assert found.exact and found.settled and not tracker._problem(0, found, start)
+    costly = found._replace(cost=0.3)
+    assert "nothing fits" in tracker._problem(0, costly, start)
+    tracker._usual.extend([(0.05, 0.24)] * 3)
+    assert not tracker._problem(0, costly, start)
+    assert "nothing fits" in tracker._problem(0, found._replace(cost=0.4), start)
+    assert (
+        not found._replace(settled=False).exact and not found._replace(std_deg=0.4).exact and not found._replace(std_mm=0.06).exact
+    )
 
 
 def test_relief_that_shows_nothing_is_named():

@@ -16,14 +16,15 @@ static WIDE float largest(const float *values, int64_t size) {
 }
 
 /* Whether each pixel lies on the object, and whether it may. */
-static WIDE void flag(const float *depth, const uint8_t *contact, int64_t size, float least_mm, float deep, uint8_t *restrict flags) {
+static WIDE void flag(
+    const float *depth, const uint8_t *contact, int64_t size, float least_mm, float deep, uint8_t *restrict flags) {
     for (int64_t n = 0; n < size; n++) {
         const uint8_t touching = contact[n] != 0, below = depth[n] > least_mm, far_below = depth[n] > deep;
         flags[n] = (uint8_t)((touching & below) * INSIDE | (touching | far_below) * PERHAPS);
     }
 }
 
-/* Of rows of flags, those that all of 3 x 3 have as INSIDE, and those that any of them has as PERHAPS; nothing lies beyond the image. */
+/* A row of flags: INSIDE where all of 3 x 3 are, PERHAPS where any of them is; nothing lies beyond the image. */
 static WIDE void widen(const uint8_t *flags, int height, int width, int row, uint8_t *restrict column, uint8_t *restrict result) {
     const uint8_t *here = flags + (int64_t)row * width, *above = row > 0 ? here - width : here;
     const uint8_t *below = row < height - 1 ? here + width : here;
@@ -39,7 +40,8 @@ static WIDE void widen(const uint8_t *flags, int height, int width, int row, uin
 }
 
 /* Each pixel of the frame as z, p, -q and a mask. */
-static WIDE int whole_grid(const float *depth, const float *slopes, const uint8_t *flags, int height, int width, uint8_t *row, float *restrict field) {
+static WIDE int whole_grid(
+    const float *depth, const float *slopes, const uint8_t *flags, int height, int width, uint8_t *row, float *restrict field) {
     const int64_t size = (int64_t)height * width;
     int count = 0;
     for (int y = 0; y < height; y++) {
@@ -59,7 +61,8 @@ static WIDE int whole_grid(const float *depth, const float *slopes, const uint8_
 
 /* Sums over `times` rows from the first on: z, p, q and the number of pixels on the object (4, width), and all flags (width). */
 static WIDE void add_rows(
-    const float *depth, const float *slopes, const uint8_t *flags, int64_t size, int width, int times, float *restrict sums, uint8_t *restrict any) {
+    const float *depth, const float *slopes, const uint8_t *flags, int64_t size, int width, int times, float *restrict sums,
+    uint8_t *restrict any) {
     memset(sums, 0, 4 * (size_t)width * sizeof(float));
     memset(any, 0, (size_t)width);
     for (int i = 0; i < times; i++) {
@@ -110,8 +113,8 @@ static WIDE int cell_grid(
     return count;
 }
 
-/* depth (height, width), slopes (2, height, width) y down, contact as bytes -> fine and coarse fields (rows, columns, 4), of cells of
-   `fine` and `coarse` pixels a side. Returns the number of fine pixels on the object, or -1 without memory. */
+/* depth (height, width), slopes (2, height, width) y down, contact as bytes -> fine and coarse fields (rows, columns, 4), of cells
+   of `fine` and `coarse` pixels a side. Returns the number of fine pixels on the object, or -1 without memory. */
 EXPORT int track_grids(
     const float *depth, const float *slopes, const uint8_t *contact, int height, int width, float least_mm, int fine, int coarse,
     float *fine_field, float *coarse_field) {

@@ -9,7 +9,7 @@
 #define PAIRS 28 /* of them, each once */
 #define SUMS 56  /* SIZE * SIZE products, then seven sums of the score */
 
-typedef float Lanes __attribute__((vector_size(4 * LANES), aligned(4)));
+typedef float Lanes __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
 
 /* What the residuals depend on beside the pixels; the order is that of limits_of in inverse.py. */
 typedef struct {
@@ -28,8 +28,9 @@ typedef struct {
     int first[BLOCK];
 } Block;
 
-/* Where the pixels (x, y, z in rows of `points`) come to lie, and what the field (height, width, 4) holds between its pixels there. */
-INLINE void look_up(const float *field, int height, int width, const float *points, int64_t stride, int size, const Limits *at, Block *b) {
+/* Where the pixels (rows x, y, z of `points`) come to lie, and what the field (height, width, 4) holds there between pixels. */
+INLINE void look_up(
+    const float *field, int height, int width, const float *points, int64_t stride, int size, const Limits *at, Block *b) {
     float P[12];
     for (int k = 0; k < 12; k++) P[k] = (float)at->pose[k];
     const float x0 = (float)at->x0, y0 = (float)at->y0, per_mm = (float)(1.0 / at->pitch);
@@ -59,7 +60,8 @@ INLINE void look_up(const float *field, int height, int width, const float *poin
 /* Residuals, Cauchy's weights and the score of a block; slopes of the pixels in the rows 3 and 4 of `points`. */
 INLINE void compare(const float *points, int64_t stride, int size, const Limits *at, Block *b) {
     const float a = (float)at->pose[0], c = (float)at->pose[1], d = (float)at->pose[4], e = (float)at->pose[5];
-    const float f = (float)at->pose[8], g = (float)at->pose[9], h = (float)at->pose[2], i = (float)at->pose[6], j = (float)at->pose[10];
+    const float f = (float)at->pose[8], g = (float)at->pose[9];
+    const float h = (float)at->pose[2], i = (float)at->pose[6], j = (float)at->pose[10];
     const float per_slope = (float)at->per_slope, per_height = (float)at->per_height; /* 1 / noise^2 */
     const float score_slope = (float)at->score_slope, score_height = (float)at->score_height;
     const float deep = (float)at->deep, shallow = (float)at->shallow;
@@ -110,7 +112,7 @@ INLINE double sum_of(const Lanes *lanes) {
     return sum;
 }
 
-/* Sums over `count` pixels: columns (23, stride) x, y, z, p, q and the 18 of the Jacobian; without the Jacobian, the score alone. */
+/* Sums over `count` pixels: columns (23, stride) x, y, z, p, q and the 18 of the Jacobian, which score_only does not read. */
 EXPORT WIDE void alignment_sums(
     const float *field, int height, int width, const float *columns, int64_t stride, int count, int score_only, const Limits *at,
     double *sums) {
@@ -152,7 +154,8 @@ EXPORT WIDE void alignment_sums(
 
 /* alignment_sums of each of `parts` runs of pixels, of the same number but for one: sums (parts, SUMS). */
 EXPORT void part_sums(
-    const float *field, int height, int width, const float *columns, int64_t stride, int count, int parts, const Limits *at, double *sums) {
+    const float *field, int height, int width, const float *columns, int64_t stride, int count, int parts, const Limits *at,
+    double *sums) {
     for (int k = 0; k < parts; k++) {
         const int first = (int)((int64_t)count * k / parts), end = (int)((int64_t)count * (k + 1) / parts);
         alignment_sums(field, height, width, columns + first, stride, end - first, 0, at, sums + (int64_t)SUMS * k);

@@ -73,8 +73,7 @@ def test_the_scenes_are_hard_enough(low, mini):
     assert (pipe(frames).depth_mm - pipeline(calibration, "fast")(frames).depth_mm).abs().max() > 0.05
     for mode in ("fast", "precise", "auto"):
         assert pipeline(mini[0], mode)(mini[1]).deformed[:3].flatten(1).any(1).tolist() == [True, False, True]
-    # its slopes are no surface: only those of the depth show a contact
-    assert pipeline(mini[0], "precise")(mini[1]).contact[:3].flatten(1).any(1).tolist() == [True, False, True]
+        assert not pipeline(mini[0], mode)(mini[1]).contact.any()  # its slopes are no surface
 
 
 @pytest.fixture(scope="module")

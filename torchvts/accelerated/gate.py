@@ -45,7 +45,7 @@ def arrays_usable(*tensors: Tensor) -> bool:
     for tensor in tensors:  # a loop, because it runs some ten times a frame
         if type(tensor) is not Tensor and type(tensor) is not nn.Parameter:
             return False
-        if not tensor.is_cpu or tensor.dtype in HALF or (recorded and tensor.requires_grad):
+        if not tensor.is_cpu or tensor.layout is not torch.strided or tensor.dtype in HALF or (recorded and tensor.requires_grad):
             return False
         if torch._C._functorch.is_functorch_wrapped_tensor(tensor):
             return False

@@ -142,6 +142,6 @@ def _summary(rows: list[dict[str, object]], out: Path, tracker: PoseTracker | No
         print(f"  {len(unknown)} frames with unknown motions, mostly: {max(set(unknown), key=unknown.count)}")
     uncertain = sum(row["converged"] == 0 and not row["lost"] for row in rows)
     if uncertain:
-        print(f"  {uncertain} frames known less well than to {TRUSTED_DEG:g} degrees and {TRUSTED_MM:g} mm")
+        print(f"  {uncertain} frames known less well than to {TRUSTED_DEG:g} degree and {TRUSTED_MM:g} mm")
     print(f"wrote {out / 'poses.csv'}")
     return 1 if lost else 0

@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ..accelerated.threads import MOST_PIXELS, OneThread
 from ..calibration import Press
@@ -19,7 +19,7 @@ from ..contact import ContactSettings
 from ..core.checks import check_choice, check_integer, check_least, check_positive, check_record, check_switch
 from ..core.files import check_pixels, rgb_from_bgr
 from ..model import Calibration, Sensor
-from ..pipeline import MODES, DepthOutput, DepthPipeline
+from ..pipeline import MODES, DepthOutput
 from .background import FIRST_FRAMES, calibrate_background, find_background, use_calibration
 from .follow_light import TIME_CONSTANT_S
 from .recording import Recording
@@ -43,10 +43,7 @@ class TactileFrame(NamedTuple):
     output: DepthOutput
 
 
-STAGES = (
-    "read", "wait", "rectify", "light", "compensate", "deformed", "normals", "gradient", "integrate", "contact", "draw", "view",
-    "write",
-)  # fmt: skip
+STAGES = ("read", "wait", "rectify", "light", "depth", "draw", "view", "write")
 """In the order of a frame."""
 
 
@@ -57,7 +54,6 @@ class StageClock:
         self._clock = clock
         self._frames: deque[dict[str, float]] = deque(maxlen=10_000)  # a camera may run for days
         self._now: dict[str, float] = {}
-        self._started: dict[str, float] = {}
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -67,21 +63,6 @@ class StageClock:
             yield
         finally:
             self._now[name] = self._now.get(name, 0.0) + 1000.0 * (self._clock() - start)
-
-    def watch(self, pipe: DepthPipeline) -> list[Any]:
-        """Measure the blocks of a pipeline; returns handles whose ``remove()`` ends it."""
-        handles: list[Any] = []
-        for name in ("compensate", "deformed", "normals", "gradient", "integrate", "contact"):
-            block = getattr(pipe, name)
-
-            def before(_module: nn.Module, _inputs: Any, name: str = name) -> None:
-                self._started[name] = self._clock()
-
-            def after(_module: nn.Module, _inputs: Any, _output: Any, name: str = name) -> None:
-                self._now[name] = self._now.get(name, 0.0) + 1000.0 * (self._clock() - self._started[name])
-
-            handles += [block.register_forward_pre_hook(before), block.register_forward_hook(after)]
-        return handles
 
     def end_frame(self) -> None:
         """Close a frame: what was measured since the last call belongs to it."""
@@ -180,7 +161,6 @@ class TactileStream:
         else:
             self.reader = check_reader(source)
         self._newest: NewestFrame | None = None
-        self._hooks: list[Any] = []
         self._clock = clock
         self.left_out: list[tuple[int, str]] = []
         self._zero: list[Tensor] = []
@@ -231,10 +211,7 @@ class TactileStream:
 
     def _use(self, recording: Recording) -> None:
         """Go on with a recording: the first one, or that of a new background."""
-        for handle in self._hooks:
-            handle.remove()
         self.recording, self.light, self.pipe = recording, recording.light, recording.pipe
-        self._hooks = self.stages.watch(self.pipe)
 
     def _collect(self, raw: Tensor) -> None:
         """Keep a frame for the new background, and change to it when there are enough."""
@@ -292,9 +269,6 @@ class TactileStream:
 
     def close(self) -> None:
         """Stop reading and release the source."""
-        for handle in self._hooks:
-            handle.remove()
-        self._hooks = []
         if self._newest is not None:
             self._newest.close()
         else:

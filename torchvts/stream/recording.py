@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ..contact import ContactSettings
 from ..core.checks import check_positive, check_switch
@@ -93,8 +93,6 @@ class Recording:
         self.pipe.to(self.device)
         if image is not None:
             self._start(calibration, image[None])
-        self._deformed: Tensor | None = None
-        self.pipe.deformed.register_forward_hook(self._keep)
 
     def unusable(self, frame: Tensor) -> str:
         """Why a frame (1, 3, H, W), rectified, cannot be used; an empty text where it can."""
@@ -115,18 +113,20 @@ class Recording:
                 image = self.light.correct(frame)
             output: DepthOutput | None = None
             if solve:
-                output = DepthOutput(*(part.cpu() for part in self.pipe(image.to(self.device))))
-            elif self._follow:
-                self.pipe.deformed(self.pipe.compensate(image.to(self.device)))
-            if self._follow and self._deformed is not None:
+                with self._stage("depth"):
+                    output = DepthOutput(*(part.cpu() for part in self.pipe(image.to(self.device))))
+            if self._follow:
                 with self._stage("light"):
+                    deformed = self._deformed(image) if output is None else output.deformed
                     seconds = 1.0 / self._fps if self._before is None else time_s - self._before
-                    self.light.update(frame, self._deformed, seconds)
+                    self.light.update(frame, deformed, seconds)
         self._before = time_s
         return image, output
 
-    def _keep(self, _module: nn.Module, _inputs: Any, deformed: Tensor) -> None:
-        self._deformed = deformed.cpu()  # also of frames whose depth is not wanted
+    def _deformed(self, image: Tensor) -> Tensor:
+        """Where the skin has moved, of a frame whose depth is not wanted."""
+        deformed: Tensor = self.pipe.deformed(self.pipe.compensate(image.to(self.device))).cpu()
+        return deformed
 
     def _start(self, calibration: Calibration, image: Tensor) -> None:
         """Start from the light of the first frames, and refuse another unit and a contact in them."""

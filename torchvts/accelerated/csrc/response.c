@@ -51,13 +51,18 @@ typedef void (*row_of)(const float *, size_t, const float *, const float *, cons
 #define ROWS(name, products, cubes)      \
     ROW(name##_2, 2, products, cubes)    \
     ROW(name##_4, 4, products, cubes)    \
-    ROW(name##_6, 6, products, cubes)    \
-    static const row_of name[3] = {name##_2, name##_4, name##_6};
+    ROW(name##_6, 6, products, cubes)
 
 ROWS(linear, 0, 0)
 ROWS(with_products, PRODUCTS, 0)
 ROWS(with_cubes, 0, CUBES)
 ROWS(with_both, PRODUCTS, CUBES)
+
+/* By products, 1, and cubes, 2; then by half the degree. */
+static const row_of ALL_ROWS[4][3] = {{linear_2, linear_4, linear_6},
+                                      {with_products_2, with_products_4, with_products_6},
+                                      {with_cubes_2, with_cubes_4, with_cubes_6},
+                                      {with_both_2, with_both_4, with_both_6}};
 
 /* Normals of sines, which are held to the largest. */
 WIDE static void to_normal(float max_sine, int n, float *restrict x, float *restrict y, float *restrict z) {
@@ -76,7 +81,7 @@ EXPORT void response_normals(const float *image, int64_t per_frame, int64_t per_
                              const float *weight, int degree, int terms, const float *depth, int64_t depth_frame, int64_t depth_row,
                              const float *per_mm, float max_sine, int frames, int rows, int columns, float *normal) {
     const int cubes = terms >= SINGLE + CUBES, products = terms - (cubes ? CUBES : 0) > SINGLE;
-    const row_of row = (cubes ? products ? with_both : with_cubes : products ? with_products : linear)[degree / 2 - 1];
+    const row_of row = ALL_ROWS[products + 2 * cubes][degree / 2 - 1];
     const size_t pixels = (size_t)rows * columns;
     for (int b = 0; b < frames; b++)
         for (int y = 0; y < rows; y++) {

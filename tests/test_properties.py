@@ -320,6 +320,17 @@ def test_threads_may_share_a_pipeline(by, mode):
             assert all(torch.equal(a, b) for out in found for a, b in zip(out, alone[k], strict=True))
 
 
+def test_threads_may_make_the_first_calls_of_a_pipeline():
+    """Each prepares its compiled call: none may lose the memory of its own when another's takes the place beside the pipeline."""
+    calibration = unit("response")
+    images = [press_image(calibration, kind) for kind in ("press", "border", "no contact", "holes")]
+    alone = [vts.DepthPipeline.from_calibration(calibration)(image) for image in images]
+    for _ in range(20):
+        pipe = vts.DepthPipeline.from_calibration(calibration)
+        found = in_threads([lambda k=k, pipe=pipe: [pipe(images[k]) for _ in range(3)] for k in range(len(images))])
+        assert all(torch.equal(a, b) for k, outs in enumerate(found) for out in outs for a, b in zip(out, alone[k], strict=True))
+
+
 @pytest.mark.parametrize("name", sorted(SOLVERS))
 def test_threads_may_share_an_integrator_for_several_sizes(name):
     """It keeps the tables of the last size: another thread's must not come between.

@@ -122,10 +122,10 @@ def solve_frames(pipe: nn.Module, parts: Blocks, images: Tensor) -> DepthOutput 
         return None
     if torch_modules._global_forward_hooks or torch_modules._global_forward_pre_hooks or not _all_own(parts):
         return None
-    program = _program(pipe, parts)
-    if program is None or images.shape[2] != program.height or images.shape[3] != program.width:
+    prepared = _program(pipe, parts)  # held until the call is over: another thread may put another one in its place
+    if prepared is None or images.shape[2:] != (prepared.program.height, prepared.program.width):
         return None
-    return _run(program, images.contiguous())
+    return _run(prepared.program, images.contiguous())
 
 
 def _run(program: Program, images: Tensor) -> DepthOutput | None:
@@ -168,7 +168,7 @@ def _own(block: Any, kinds: tuple[type, ...]) -> bool:
     return not watched and "forward" not in block.__dict__
 
 
-def _program(pipe: nn.Module, parts: Blocks) -> Program | None:
+def _program(pipe: nn.Module, parts: Blocks) -> _Prepared | None:
     """The program of these blocks, kept until a buffer or a setting changes; None where the kernels do not know them."""
     normals: Any = parts.normals
     if type(normals) is NormalFromIntensity:
@@ -187,7 +187,7 @@ def _program(pipe: nn.Module, parts: Blocks) -> Program | None:
         if made is None:
             return None
         prepared = _programs[pipe] = _Prepared(made[0], (addresses, settings), made[1])
-    return prepared.program
+    return prepared
 
 
 def _buffers(parts: Blocks) -> dict[str, Tensor]:

@@ -252,8 +252,8 @@ def attack(count, seed):
                     given[argument] = (
                         turns[kind](given[argument]) if kind in turns and tensors else pool[kind]() if kind in pool else None
                     )
-                except (RuntimeError, NotImplementedError, IndexError):  # this tensor cannot be changed so
-                    continue
+                except (RuntimeError, IndexError):  # a tensor without such a form, as one number has no rows: it is left out
+                    kind, given[argument] = "None", None
                 what.append(f"{argument}={kind}")
             yield f"{name}({', '.join(what)})", lambda call=call, given=given: attempt(call, given)
         os.chdir("/")

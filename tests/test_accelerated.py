@@ -435,6 +435,12 @@ def test_memory_that_somebody_holds_is_not_used_again(hold):
     assert (held == 3.0).all()
 
 
+def test_nobody_waits_for_kept_memory():
+    """A fork while another thread is at the table leaves it locked for ever in the child."""
+    with memory._lock:
+        assert memory.empty((1, 1, 7, 9), torch.float32).shape == (1, 1, 7, 9)
+
+
 def test_memory_that_other_processes_see_is_not_used_again():
     first = memory.empty((1, 1, 7, 9), torch.float32).share_memory_()
     place = first.data_ptr()

@@ -24,7 +24,9 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     size = math.prod(shape) * dtype.itemsize
     if _users is None or size > MOST_BYTES:
         return tensor.resize_(shape)
-    with _lock:
+    if not _lock.acquire(blocking=False):  # another thread is at the table, and after a fork for ever
+        return tensor.resize_(shape)
+    try:
         some = [storage for storage in _kept.get(size, []) if storage.nbytes() == size and not storage.is_shared()]
         _kept[size] = some  # what another process sees, or somebody has resized, is not ours any more
         free = next((storage for storage in some if _users(storage._cdata) == 1), None)
@@ -32,6 +34,8 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
             free = UntypedStorage(size)
             _keep(free, size, _users)
         return tensor.set_(free, 0, shape)  # type: ignore[call-overload, no-any-return]
+    finally:
+        _lock.release()
 
 
 def _keep(storage: UntypedStorage, size: int, users: Callable[[int], int]) -> None:

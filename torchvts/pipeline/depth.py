@@ -252,7 +252,7 @@ class DepthPipeline(nn.Module):
         passes = 1
         if torch.compiler.is_compiling() or type(self) is not DepthPipeline or type(solve) is not Solve:
             return None
-        if isinstance(refine, Repeat) and type(refine) is Repeat and refine.solve is solve:
+        if type(refine) is Repeat and refine.solve is solve:
             passes = refine.max_passes
         elif type(refine) is not Once:
             return None

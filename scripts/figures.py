@@ -7,19 +7,17 @@ python scripts/figures.py confidence out/confidence.json docs/confidence.png
 """
 
 import argparse
-import json
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from torchvts.evaluation import coverage, figures, rows
-from torchvts.evaluation.stability import Breaking
+from torchvts.evaluation import coverage, figures, rows, stability
 
 DRAW: dict[str, Callable[[str], Figure]] = {
     "speed": lambda text: figures.speed_figure(rows.from_json(text)),
-    "overview": lambda text: figures.overview_figure([Breaking(**point) for point in json.loads(text)["points"]]),
+    "overview": lambda text: figures.overview_figure(stability.points_from_json(text)[0]),
     "learning": lambda text: figures.learning_figure(rows.from_json(text)),
     "confidence": lambda text: figures.coverage_figure(coverage.from_json(text)),
 }

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from torchvts.evaluation import stability
 from torchvts.evaluation.figures import corruption_figure, overview_figure, save_small
 from torchvts.evaluation.gallery import CORRUPTIONS
-from torchvts.evaluation.rows import Row, write_files
+from torchvts.evaluation.rows import write_files
 from torchvts.evaluation.stability import SWEPT, Breaking
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -40,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     with tqdm(total=total, unit="row", disable=None) as bar:
         rows = stability.sweep(arguments.out / "rows.jsonl", SWEPT, arguments.only, arguments.seeds, arguments.workers, bar.update)
     points = stability.breaking_points(rows)
-    print(write_tables(rows, points, arguments.seeds, arguments.out, arguments.keep))
+    print(write_tables(points, arguments.seeds, arguments.out, arguments.keep))
     pictures = ROOT / "docs" / "failures" if arguments.keep else arguments.out
     pictures.mkdir(exist_ok=True)
     save_small(overview_figure(points), pictures / "overview.png")
@@ -50,15 +50,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def write_tables(rows: Sequence[Row], points: Sequence[Breaking], seeds: int, out: Path, keep: bool) -> str:
+def write_tables(points: Sequence[Breaking], seeds: int, out: Path, keep: bool) -> str:
     """Write all text files; returns the table of breaking points."""
     text = f"{stability.table(points)}\n\n{stability.LIMITS}\n"
     kept = stability.points_to_json(points, "python scripts/stability.py --keep", seeds)
-    written = {
-        out / "breaking_points.md": text,
-        out / "breaking_points.json": kept,
-        out / "rows.md": stability.row_table(rows) + "\n",
-    }
+    written = {out / "breaking_points.md": text, out / "breaking_points.json": kept}
     if keep:
         page = ROOT / "docs" / "where_methods_fail.md"
         written[ROOT / "tests" / "breaking_points.json"] = kept

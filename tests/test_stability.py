@@ -112,10 +112,6 @@ def test_what_fails_or_warns_keeps_its_note(monkeypatch):
     assert rows["breaks"].error("normal_deg") is None and stability.mask_limits(rows["breaks"]) == stability.WORST
     assert rows["complains"].note == "UserWarning: not sure" and stability.limits(rows["complains"]) < 1
     assert rows["invents"].error("rms_um") is None and rows["invents"].note == "the result is not finite"
-    lines = stability.row_table(list(rows.values())).splitlines()
-    assert len(lines) == 5 and all(line.count("|") == lines[0].count("|") for line in lines)
-    assert "failed | failed | failed | failed | 10.00 | 1 of 1 failed: RuntimeError: the LED is broken" in lines[2]
-    assert "nan" not in "\n".join(lines)
 
 
 def _rows(errors, name="noise", seeds=2):
@@ -234,7 +230,7 @@ def test_the_script_writes_table_rows_and_pictures(run_script, monkeypatch, tmp_
     assert done.returncode == 0, done.stderr
     assert "| vignetting, 0 to 0.9 share | always | never | never |" in done.stdout and stability.LIMITS in done.stdout
     assert {path.name for path in tmp_path.iterdir()} == {
-        "breaking_points.json", "breaking_points.md", "overview.png", "rows.jsonl", "rows.md", "vignetting.png"
+        "breaking_points.json", "breaking_points.md", "overview.png", "rows.jsonl", "vignetting.png"
     }  # fmt: skip
     points, seeds = stability.points_from_json((tmp_path / "breaking_points.json").read_text())
     assert seeds == 1 and [point.method for point in points] == ["flat", "fast", MASK]

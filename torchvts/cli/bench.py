@@ -1,4 +1,4 @@
-"""Measure speed as a user meets it, then speed and error of all methods together; print the tables, and draw both.
+"""Measure speed as a user meets it, then speed and error of all methods together; print the tables, and draw the second.
 
 Methods of other libraries are timed in the same run. Rows of a real sensor need ../shared/data or the folder in TORCHVTS_DATA.
 
@@ -27,7 +27,7 @@ USAGE = "[--out FOLDER] [--threads N] [--only user|methods] [--long] [--chart FI
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
-    add_out(parser, "for the tables and charts (out/bench)", "out/bench")
+    add_out(parser, "for the tables and the chart (out/bench)", "out/bench")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads(), metavar="N", help="all cores if not given")
     parser.add_argument("--only", choices=("user", "methods"), help="measure one of the two tables")
     parser.add_argument("--calls", type=int, default=100, metavar="N", help="frames of each row of the user's table (100)")
@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure, write tables and charts, and print the tables."""
+    """Measure, write tables and the chart, and print the tables."""
     torch.set_num_threads(arguments.threads)
     folder = data_folder(str(Path(__file__).parent))
     data = folder if (folder / "gelsight_mini_a").is_dir() else None
@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _as_user(arguments: argparse.Namespace, data: Path | None) -> None:
-    """The table and the chart of frames as a user runs them."""
+    """The table of frames as a user runs them."""
     with tqdm(unit="row", disable=None) as bar:
         measured = user_speed.run(data, partial(_show, bar), arguments.calls, arguments.long)
     text = user_speed.table(measured)
@@ -58,8 +58,7 @@ def _as_user(arguments: argparse.Namespace, data: Path | None) -> None:
         arguments.out, {"user.md": text + "\n", "user.json": json.dumps(measured, default=dataclasses.asdict, indent=1)}
     )
     print(text)
-    viz.save_figure(figures.user_speed_figure(measured), arguments.out / "speed.png")
-    print(f"\nuser.md, user.json and speed.png in {arguments.out}")
+    print(f"\nuser.md and user.json in {arguments.out}")
 
 
 def _methods(arguments: argparse.Namespace, data: Path | None) -> None:

@@ -25,9 +25,8 @@ from .metrics import normal_angle_deg
 from .random_scenes import random_frame
 from .rows import Row, Size, mean
 from .score import Truth
-from .speed import GS_SDK, front, ms
+from .speed import front, ms
 from .stability import DEPTH_LIMIT, MASK, MASK_LIMIT, NORMAL_LIMIT_DEG, Breaking, depth_share, in_words
-from .user_speed import OWN, PACES, Measured
 
 
 def save_small(figure: Figure, path: Path) -> None:
@@ -64,7 +63,7 @@ def speed_figure(rows: Sequence[Row]) -> Figure:
     Args:
         rows: of :func:`torchvts.evaluation.speed.run`, or read back from its bench.json.
     """
-    scenes = [row for row in rows if row.kind == "scene" and "press 1 mm" in row.data]
+    scenes = [row for row in rows if row.kind == "scene"]
     large = [row for row in scenes if row.size is not None and row.size.height == 480]
     sensor = [row for row in rows if row.kind == "sensor" and row.size == _usual_size(rows)]
     kinds = (
@@ -180,34 +179,6 @@ def _cost_against_size(axes: Any, rows: Sequence[Row]) -> None:
     _log_ticks(axes)
     axes.set_xticks(list(sizes), list(sizes.values()), fontsize=9)
     axes.set_xlim(right=axes.get_xlim()[1] * 8.0)  # room for the names
-
-
-def user_speed_figure(measured: Measured) -> Figure:
-    """Time of a frame against size, a panel for each unit, real ones first: tight loops, frames every 20 ms, and the peer."""
-    units = list(dict.fromkeys(row.unit for row in measured.frames))
-    figure = new_figure(6.2 * len(units), 4.6)
-    panels = figure.subplots(1, len(units), squeeze=False, sharey=True)[0]
-    styles = {PACES[0]: "o-", PACES[1]: "^--", PACES[2]: "s:"}
-    colors = {"fast": OURS, "precise": "#009e73", GS_SDK: PEERS}
-    for axes, unit in zip(panels, units, strict=True):
-        shown = [row for row in measured.frames if row.unit == unit and row.threads == OWN and row.size.batch == 1]
-        for method, pace in dict.fromkeys((row.method, row.pace) for row in shown):
-            line: dict[int, float] = {}
-            for r in shown:
-                if (r.method, r.pace) == (method, pace):
-                    line.setdefault(r.size.height * r.size.width, r.median_ms)  # the row of batches measures one frame again
-            style = {"color": colors[method], "ms": 4, "lw": 1, "label": method if method == GS_SDK else f"{method}, {pace}"}
-            axes.plot(sorted(line), [line[pixels] for pixels in sorted(line)], styles.get(pace, "D-"), **style)
-        sizes = sorted({(row.size.height * row.size.width, f"{row.size.width}x{row.size.height}") for row in shown})
-        axes.set(xscale="log", yscale="log", title=unit, ylabel="ms a frame, median")
-        axes.set_xticks([pixels for pixels, _ in sizes], [text for _, text in sizes])
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.yaxis.set_major_formatter("{x:g}")
-        axes.grid(which="both", alpha=0.25)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)  # beside the panels, where no point lies
-    figure.suptitle(measured.machine, fontsize=8)
-    return figure
 
 
 # breaking points

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from ..accelerated import Compensate
 from ..core.geometry import normal_from_gradient
-from ..integration import divergence
+from ..integration import divergence, poisson_dct
 from ..model import gs_sdk
 from ..normals import NormalFromMLP
 from ..pipeline import DepthOutput
@@ -25,20 +25,22 @@ class PoissonSciPy(nn.Module):
         self.mm_per_pixel = mm_per_pixel
 
     def forward(self, gradient: Tensor) -> Tensor:
-        depth = torch.from_numpy(scipy_solve(divergence(gradient)[0, 0].numpy()) * self.mm_per_pixel)
+        depth = torch.from_numpy(scipy_dct(gradient) * self.mm_per_pixel)
         background = (gradient == 0).all(dim=1)[0]
         return (depth - depth[background].mean())[None, None]
 
 
-def scipy_solve(right: "np.ndarray[Any, Any]") -> "np.ndarray[Any, Any]":
-    """Solve Poisson's equation with a free border by SciPy's DCT of type 2.
+def scipy_dct(gradient: Tensor) -> "np.ndarray[Any, Any]":
+    """Depth (H, W), pixels, with a free border and zero mean, of a gradient (1, 2, H, W), by SciPy's DCT of type 2.
 
-    Without SciPy, NumPy's FFT of the mirrored array gives the same up to rounding; only with SciPy is it timed.
+    Without SciPy :func:`poisson_dct` gives the same up to rounding; only with SciPy is it timed.
     """
     try:
         from scipy import fft
     except ImportError:
-        return _mirrored_solve(right)
+        depth: np.ndarray[Any, Any] = poisson_dct(gradient)[0, 0].numpy()
+        return depth
+    right = divergence(gradient)[0, 0].numpy()
     spectrum = fft.dctn(right, type=2)
     wave = [np.cos(np.pi * np.arange(n) / n) for n in right.shape]
     value = (2.0 * wave[0][:, None] + 2.0 * wave[1][None, :] - 4.0).astype(right.dtype)
@@ -46,17 +48,6 @@ def scipy_solve(right: "np.ndarray[Any, Any]") -> "np.ndarray[Any, Any]":
     spectrum[0, 0] = 0.0
     solved: np.ndarray[Any, Any] = fft.idctn(spectrum / value, type=2)
     return solved
-
-
-def _mirrored_solve(right: "np.ndarray[Any, Any]") -> "np.ndarray[Any, Any]":
-    height, width = right.shape
-    spectrum = np.fft.rfft2(np.pad(right, [(0, height), (0, width)], mode="symmetric"))
-    wave = [np.cos(np.pi * np.arange(n) / size) for n, size in zip(spectrum.shape, right.shape, strict=True)]
-    value = 2.0 * wave[0][:, None] + 2.0 * wave[1][None, :] - 4.0
-    value[0, 0] = 1.0
-    spectrum[0, 0] = 0.0
-    solved: np.ndarray[Any, Any] = np.fft.irfft2(spectrum / value, (2 * height, 2 * width))[:height, :width]
-    return solved.astype(right.dtype)
 
 
 class GsSdkPipeline:
@@ -85,7 +76,7 @@ class GsSdkPipeline:
         with torch.inference_mode():
             image = self.smooth(gs_sdk.image_from_bgr(pixels)[None])
             gradient = (self.network.gradient_px(image) - self.background_gradient)[0].double()
-        height = scipy_solve(divergence(gradient[None])[0, 0].numpy())
+        height = scipy_dct(gradient[None])
         change = np.abs(pixels.astype(np.int16) - self.background).max(axis=2)
         mask = ((change > 15) & (height < -0.2)).astype(np.uint8)
         mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))

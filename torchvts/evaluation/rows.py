@@ -39,7 +39,6 @@ class Time:
         memory_mb: largest memory that one call holds beside its inputs, MB.
         threads: number of threads.
         machine: kind of processor, number of cores, version of torch.
-        floor_ms: time of the memory traffic or of the FFT of a stage alone, ms.
     """
 
     ms_median: float
@@ -48,7 +47,6 @@ class Time:
     memory_mb: float | None
     threads: int
     machine: str
-    floor_ms: float | None = None
 
 
 @dataclass(frozen=True)
@@ -56,8 +54,8 @@ class Row:
     """One method on one set of data.
 
     Attributes:
-        kind: what was measured: "scene" (exact truth), "wall" (exact truth, vertical walls), "sensor" (balls on a real sensor),
-            "stage" (part of a frame), "batch", "threads", "corruption" (a scene of the gallery) or "presses" (balls, objects).
+        kind: what was measured: "scene" (exact truth), "sensor" (balls on a real sensor), "corruption" (a scene of the gallery)
+            or "presses" (balls, objects).
         method: its name.
         data: name of the scene, the corruption or the presses.
         errors: value by name, such as "normal_deg"; None where nothing could be measured.

@@ -21,7 +21,7 @@ from ..core.files import write_atomically
 from .gallery import CORRUPTIONS, Case, Corruption
 from .methods import METHODS
 from .metrics import depth_error, mask_iou, normal_angle_deg
-from .rows import Row, markdown, mean, number, row_from_dict
+from .rows import Row, markdown, row_from_dict
 
 SWEPT = (
     "flat", "fast", "precise", "auto", "fast, zero border", "precise, plain inverse", "precise, blur 1 px",
@@ -310,27 +310,6 @@ def table(points: Sequence[Breaking]) -> str:
         cells = {point.method: point.text for point in points if point.corruption == name}
         lines.append([in_words(CORRUPTIONS[name])] + [cells.get(method, "not measured") for method in methods])
     return markdown(["corruption", *methods], lines)
-
-
-def row_table(rows: Sequence[Row]) -> str:
-    """Rows as a Markdown table, averaged over seeds; a method that failed keeps its note."""
-    titles = ["corruption", "severity", "method", "normals deg", "depth RMS um", "largest px", "IoU", "limits", ""]
-    groups: dict[tuple[str, float | None, str], list[Row]] = {}
-    for row in rows:
-        groups.setdefault((row.data, row.severity, row.method), []).append(row)
-    lines = []
-    for (name, severity, method), group in groups.items():
-        failed = sum(row.error("normal_deg") is None for row in group)
-        note = next((row.note for row in group if row.note), "")
-        lines.append(
-            [name, f"{severity:g}", method]
-            + [
-                number(mean(row.error(error) for row in group), digits, "failed")
-                for error, digits in (("normal_deg", 2), ("rms_um", 1), ("largest_px", 2), ("iou", 2))
-            ]
-            + [number(mean(limits(row) for row in group), 2), f"{failed} of {len(group)} failed: {note}" if failed else note]
-        )
-    return markdown(titles, lines)
 
 
 def in_words(corruption: Corruption) -> str:

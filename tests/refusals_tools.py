@@ -278,9 +278,9 @@ TABLE = {
     ),
     "stream.FrameCheck": Entry({"background": image()}, {"background": [b for k, b in enumerate(images()) if k not in (3, 4)]}),
     "stream.Recording": Entry(
-        {"calibration": unit(), "mode": "fast", "first": None, "fps": 30.0, "time_constant_s": 1.0, "stage": nullcontext}
+        {"calibration": unit(), "mode": "fast", "first": None, "fps": 30.0, "stage": nullcontext}
         | {"network": None, "device": "cpu", "contact": None},
-        {"calibration": [None, "unit"], "mode": ["slow"], "first": [], "fps": [], "time_constant_s": NUMBER, "stage": []}
+        {"calibration": [None, "unit"], "mode": ["slow"], "first": [], "fps": [], "stage": []}
         | {"network": [], "device": [None, "gpu", "cuda:99"], "contact": ["4.5", 4.5]},
     ),
     "stream.Rectify": Entry(
@@ -299,7 +299,6 @@ TABLE = {
             "presses": (),
             "network": None,
             "device": "cpu",
-            "time_constant_s": 1.0,
             "reconnect_s": 0.0,
             "contact": None,
         },
@@ -312,7 +311,6 @@ TABLE = {
             "presses": [],
             "network": [],
             "device": [],
-            "time_constant_s": NUMBER,
             "contact": ["4.5", 4.5],
         },
         run=False,

@@ -13,12 +13,15 @@ from .background import (
 )
 from .cameras import Camera, CameraSettings, find_camera
 from .follow_light import FollowLight
+from .frames import NewestFrame
 from .keys import Keys
-from .live import StageClock, TactileFrame, TactileStream
+from .live import TactileFrame, TactileStream
 from .overlay import Overlay, Sheet, StreamReport, VideoFile
 from .recording import Recording, check_device
+from .rectify import Rectify, RectifySizes
 from .rezero import with_background
-from .sources import NewestFrame, Reader, Rectify, RectifySizes, Unreadable, frames_a_second, open_source
+from .sources import Reader, Unreadable, frames_a_second, open_source
+from .stages import StageClock
 from .usable import FrameCheck
 from .view import LiveView, has_screen, require_rerun
 

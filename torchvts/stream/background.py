@@ -28,7 +28,7 @@ from ..core.files import VIDEO_SUFFIXES, read_frames
 from ..model import Calibration, Sensor, SensorPrior, check_sensor
 from ..model.calibration import PEDESTAL
 from ..normals import NormalFromResponse
-from .sources import RectifySizes
+from .rectify import RectifySizes
 
 MOVED = 0.02
 """Relative change of a cell of 1/20 of the frame that counts as movement among the first frames."""

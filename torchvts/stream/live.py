@@ -2,29 +2,29 @@
 
 import time
 import warnings
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ..accelerated.threads import MOST_PIXELS, OneThread
 from ..calibration import Press
 from ..contact import ContactSettings
-from ..core.checks import check_choice, check_integer, check_least, check_positive, check_record, check_switch
-from ..core.files import check_pixels, rgb_from_bgr
+from ..core.checks import check_choice, check_integer, check_least, check_record, check_switch
+from ..core.files import rgb_from_bgr
 from ..model import Calibration, Sensor
 from ..pipeline import MODES, DepthOutput
 from .background import FIRST_FRAMES, calibrate_background, find_background, use_calibration
-from .follow_light import TIME_CONSTANT_S
+from .frames import SourceFrames
 from .recording import Recording
+from .rectify import Rectify
 from .rezero import with_background
-from .sources import SETTLING, LiveReader, NewestFrame, Pixels, Reader, Rectify, Replay, Unreadable, check_reader, open_source
+from .sources import Pixels, Reader, Unreadable, check_reader, open_source
+from .stages import StageClock
 
 
 class TactileFrame(NamedTuple):
@@ -41,44 +41,6 @@ class TactileFrame(NamedTuple):
     time_s: float
     image: Tensor
     output: DepthOutput
-
-
-STAGES = ("read", "wait", "rectify", "light", "depth", "draw", "view", "write")
-"""In the order of a frame."""
-
-
-class StageClock:
-    """Measures the milliseconds of each stage, of the last 10,000 frames."""
-
-    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
-        self._clock = clock
-        self._frames: deque[dict[str, float]] = deque(maxlen=10_000)  # a camera may run for days
-        self._now: dict[str, float] = {}
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Measure the time of the block."""
-        start = self._clock()
-        try:
-            yield
-        finally:
-            self._now[name] = self._now.get(name, 0.0) + 1000.0 * (self._clock() - start)
-
-    def end_frame(self) -> None:
-        """Close a frame: what was measured since the last call belongs to it."""
-        self._frames.append(self._now)
-        self._now = {}
-
-    @property
-    def last(self) -> dict[str, float]:
-        """Stages of the last whole frame, ms."""
-        return self._frames[-1] if self._frames else {}
-
-    def median_ms(self) -> dict[str, float]:
-        """Median of each stage over the frames in which it ran, in the order of a frame."""
-        names = dict.fromkeys([*STAGES, *(name for frame in self._frames for name in frame)])
-        names = {name: None for name in names if any(name in frame for frame in self._frames)}
-        return {name: float(np.median([frame[name] for frame in self._frames if name in frame])) for name in names}
 
 
 class TactileStream:
@@ -99,7 +61,6 @@ class TactileStream:
         follow: follow slow drift of the light.
         network: a trained network in place of the calibration's model, see :func:`torchvts.pipeline.unit_pipeline`.
         device: of the pipeline, "cpu" or "cuda".
-        time_constant_s: of following.
         reconnect_s: for how long a camera that has stopped is opened again before an error is raised; not with a :class:`Reader`.
         contact: thresholds of contact; None for the usual ones.
         clock: for tests.
@@ -133,51 +94,31 @@ class TactileStream:
         follow: bool = True,
         network: str | Path | None = None,
         device: str = "cpu",
-        time_constant_s: float = TIME_CONSTANT_S,
         reconnect_s: float = 0.0,
         contact: ContactSettings | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         check_choice("mode", mode, MODES)
-        time_constant_s = check_positive("time_constant_s", time_constant_s)
         if contact is not None:
             check_record("contact", contact, ContactSettings, "ContactSettings(sigmas=...) makes one")
-        if not isinstance(sensor_or_calibration, Sensor | Calibration):
-            raise TypeError(
-                f"sensor_or_calibration: expected a Sensor or a Calibration, got {type(sensor_or_calibration).__name__}"
-            )
-        given = isinstance(sensor_or_calibration, Calibration)
-        check_integer("background_frames", background_frames, 0 if given else 3)
-        if given and len(presses) > 0:
-            raise ValueError(f"presses: expected none beside a calibration, got {len(presses)}: they are for calibrating")
-        check_least("reconnect_s", reconnect_s)
         for name, switch in (("realtime", realtime), ("follow", follow)):
             check_switch(name, switch)
-        self.reader: Reader
-        if isinstance(source, str | int | Path):
-            self.reader = open_source(source, reconnect_s)
-        elif reconnect_s > 0:
-            raise ValueError(f"reconnect_s: expected 0 with a reader of your own, got {reconnect_s:g}: it must reconnect by itself")
-        else:
-            self.reader = check_reader(source)
-        self._newest: NewestFrame | None = None
-        self._clock = clock
+        sensor = _sensor_of(sensor_or_calibration, background_frames, presses)
+        self.reader = _reader_of(source, reconnect_s)
+        self.fps = self.reader.fps
+        self.stages = StageClock()
         self.left_out: list[tuple[int, str]] = []
         self._zero: list[Tensor] = []
         self._zero_missing = 0
-        self._realtime = realtime or self.reader.live
-        self.fps = self.reader.fps
-        self.stages = StageClock()
         try:
-            self._waiting = self._first_frames(background_frames)
-            sensor = sensor_or_calibration if isinstance(sensor_or_calibration, Sensor) else sensor_or_calibration.sensor
-            readable = [pixels for pixels in self._waiting if not isinstance(pixels, Unreadable)]
+            self._frames = SourceFrames(self.reader, background_frames, realtime, clock, self.stages)
+            readable = self._frames.readable
             self.rectify = Rectify(sensor, *readable[0].shape[:2])
             first = torch.cat([self._rectified(pixels) for pixels in readable])
-            if isinstance(sensor_or_calibration, Sensor):
-                found = calibrate_background(find_background(first, sensor)[0].clamp(0.0, 1.0), sensor, presses)
-            else:
+            if isinstance(sensor_or_calibration, Calibration):
                 found = use_calibration(sensor_or_calibration)
+            else:
+                found = calibrate_background(find_background(first, sensor)[0].clamp(0.0, 1.0), sensor, presses)
             self.calibration, self.note, self.metric = found
             self._start = partial(
                 Recording,
@@ -186,7 +127,6 @@ class TactileStream:
                 follow=follow,
                 network=network,
                 device=device,
-                time_constant_s=time_constant_s,
                 contact=contact,
                 stage=self.stages.stage,
             )
@@ -233,33 +173,7 @@ class TactileStream:
     @property
     def dropped(self) -> int:
         """Number of frames that arrived while another was being worked on, and were left out."""
-        return 0 if self._newest is None else self._newest.dropped
-
-    @property
-    def reconnections(self) -> int:
-        """How often a camera that had stopped was opened again."""
-        return self.reader.reconnections if isinstance(self.reader, LiveReader) else 0
-
-    def _first_frames(self, count: int) -> list[Pixels | Unreadable]:
-        """The first frames, of which ``count`` can be read, at least one."""
-        if self.reader.live:  # exposure settles
-            for _ in range(SETTLING):
-                self.reader.read()
-        frames: list[Pixels | Unreadable] = []
-        readable = 0
-        while readable < max(1, count):
-            pixels = self.reader.read()
-            if pixels is None:
-                break
-            if not isinstance(pixels, Unreadable):
-                check_pixels(f"source: frame {len(frames)} of {self.reader.name}", pixels)
-            frames.append(pixels)
-            readable += not isinstance(pixels, Unreadable)
-        if readable < max(1, count):
-            raise ValueError(
-                f"background_frames: expected at least {count} frames from {self.reader.name}, got {readable}: ask for fewer"
-            )
-        return frames
+        return self._frames.dropped
 
     def __enter__(self) -> "TactileStream":
         return self
@@ -269,13 +183,10 @@ class TactileStream:
 
     def close(self) -> None:
         """Stop reading and release the source."""
-        if self._newest is not None:
-            self._newest.close()
-        else:
-            self.reader.close()
+        self._frames.close()
 
     def __iter__(self) -> Iterator[TactileFrame]:
-        for index, time_s, pixels in self._frames():
+        for index, time_s, pixels in self._frames:
             with self._threads(pixels):
                 with self.stages.stage("rectify"):
                     raw, reason = self._usable(pixels)
@@ -307,27 +218,24 @@ class TactileStream:
         reason = self.recording.unusable(raw)
         return (None, reason) if reason else (raw, "")
 
-    def _frames(self) -> Iterator[tuple[int, float, Pixels | Unreadable]]:
-        if self._realtime:
-            reader = self.reader if self.reader.live else Replay(self.reader, self._waiting)
-            self._waiting = []
-            self._newest = NewestFrame(reader, None if self.reader.live else self.fps, self._clock)
-            while (item := self._take()) is not None:
-                yield item
-            return
-        for index, pixels in enumerate(self._waiting):
-            yield index, index / self.fps, pixels
-        index = len(self._waiting)
-        self._waiting = []
-        while True:
-            with self.stages.stage("read"):
-                pixels_or_end = self.reader.read()
-            if pixels_or_end is None:
-                return
-            yield index, index / self.fps, pixels_or_end
-            index += 1
 
-    def _take(self) -> tuple[int, float, Pixels | Unreadable] | None:
-        assert self._newest is not None
-        with self.stages.stage("wait"):
-            return self._newest.take()
+def _sensor_of(unit: Sensor | Calibration, background_frames: int, presses: Sequence[Press]) -> Sensor:
+    """The sensor of a unit, and whether first frames and presses go with it."""
+    if not isinstance(unit, Sensor | Calibration):
+        raise TypeError(f"sensor_or_calibration: expected a Sensor or a Calibration, got {type(unit).__name__}")
+    if isinstance(unit, Sensor):
+        check_integer("background_frames", background_frames, 3)
+        return unit
+    check_integer("background_frames", background_frames, 0)
+    if len(presses) > 0:
+        raise ValueError(f"presses: expected none beside a calibration, got {len(presses)}: they are for calibrating")
+    return unit.sensor
+
+
+def _reader_of(source: str | int | Path | Reader, reconnect_s: float) -> Reader:
+    """Open a source, or take a reader of the user's own."""
+    if isinstance(source, str | int | Path):
+        return open_source(source, reconnect_s)
+    if check_least("reconnect_s", reconnect_s) > 0:
+        raise ValueError(f"reconnect_s: expected 0 with a reader of your own, got {reconnect_s:g}: it must reconnect by itself")
+    return check_reader(source)

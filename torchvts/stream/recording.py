@@ -14,7 +14,7 @@ from ..core.spelling import suggest
 from ..model import Calibration, check_calibration
 from ..pipeline import DepthOutput, DepthPipeline, unit_pipeline
 from .background import contact_in_video, find_background, with_video_noise
-from .follow_light import TIME_CONSTANT_S, FollowLight
+from .follow_light import FollowLight
 from .usable import FrameCheck
 
 MOST_LIGHT_CHANGE = 0.15
@@ -48,7 +48,6 @@ class Recording:
         first: (N, 3, H, W), the first frames, rectified; None for none.
         fps: frames a second.
         follow: follow slow drift of the light.
-        time_constant_s: of following.
         network: a trained network in place of the calibration's model, see :func:`torchvts.pipeline.unit_pipeline`.
         device: of the pipeline, "cpu" or "cuda"; frames come and go on the CPU.
         contact: thresholds of contact; None for the usual ones.
@@ -68,7 +67,6 @@ class Recording:
         *,
         fps: float = 30.0,
         follow: bool = True,
-        time_constant_s: float = TIME_CONSTANT_S,
         network: str | Path | None = None,
         device: str = "cpu",
         contact: ContactSettings | None = None,
@@ -79,7 +77,7 @@ class Recording:
         fps = check_positive("fps", fps)
         value = calibration.background.float() ** (1.0 / calibration.sensor.exponent)
         value = value.clamp(0.0, 1.0)
-        self.light = FollowLight(value, time_constant_s)
+        self.light = FollowLight(value)
         self.device = check_device(device)
         self.pipe: DepthPipeline = unit_pipeline(calibration, mode, network, contact).float()
         self.check = FrameCheck(value) if calibration.measured else None

@@ -1,0 +1,184 @@
+"""The frames of a source with number and time: of a recording all, of a source that does not wait the newest."""
+
+import itertools
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from ..core.checks import check_positive
+from ..core.files import check_pixels
+from .sources import MOST_FPS, SETTLING, LiveReader, Pixels, Reader, Unreadable
+from .stages import StageClock
+
+NumberedFrame = tuple[int, float, Pixels | Unreadable]
+"""Number in the source, time since its start in s, and the frame."""
+
+
+class NewestFrame:
+    """Keeps the newest frame of a source that does not wait: a thread reads, and who comes late finds only the last frame.
+
+    Args:
+        reader: read by the thread until it ends or :meth:`close`.
+        rate: frames a second at which a recording is played; None for a camera, which has its own.
+        clock: for tests.
+        sleep: for tests.
+    """
+
+    def __init__(
+        self,
+        reader: Reader,
+        rate: float | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], Any] | None = None,
+    ) -> None:
+        if rate is not None:
+            check_positive("rate", rate, MOST_FPS)
+        self.dropped = 0
+        self._reader, self._rate, self._clock = reader, rate, clock
+        self._changed, self._stop = threading.Condition(), threading.Event()
+        self._sleep = sleep or self._stop.wait
+        self._newest: NumberedFrame | None = None
+        self._error: BaseException | None = None
+        self._ended = False
+        self._thread = threading.Thread(target=self._run, name="torchvts-reader", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            start, index = self._clock(), 0
+            while not self._stop.is_set():
+                pixels = self._reader.read()
+                if pixels is None:
+                    break
+                if self._rate is not None:
+                    wait = start + index / self._rate - self._clock()
+                    if wait > 0:
+                        self._sleep(wait)
+                self.put(index, self._clock() - start, pixels)
+                index += 1
+        except Exception as error:  # raised by take()
+            self._error = error
+        finally:
+            with self._changed:
+                self._ended = True
+                self._changed.notify_all()
+
+    def put(self, index: int, time_s: float, pixels: Pixels | Unreadable) -> None:
+        """Put a frame in place of the last one, which is dropped if nobody took it."""
+        with self._changed:
+            self.dropped += self._newest is not None
+            self._newest = (index, time_s, pixels)
+            self._changed.notify_all()
+
+    def take(self) -> NumberedFrame | None:
+        """The newest frame that was not taken yet; waits for it; None at the end. Raises what the reader raised."""
+        with self._changed:
+            while self._newest is None and not self._ended:
+                self._changed.wait(0.2)  # so that Ctrl-C interrupts it
+            newest, self._newest = self._newest, None
+            if newest is None and self._error is not None:
+                raise self._error
+            return newest
+
+    def close(self) -> None:
+        """End the thread, then release the source."""
+        self._stop.set()
+        if isinstance(self._reader, LiveReader):
+            self._reader.close()  # ends a read that waits
+        self._thread.join(timeout=5.0)
+        self._reader.close()
+
+
+class SourceFrames:
+    """Frames of a source in order: first some that can be read, kept in ``first``, then all that it has by iteration.
+
+    A recording gives the first ones again. Of a live source, or a recording that is played at its own rate, only the newest
+    frame is given.
+
+    Args:
+        reader: the source.
+        least: number of first frames that must be readable.
+        realtime: play a recording at its own rate.
+        clock: for tests.
+        stages: measures reading and waiting.
+    Attributes:
+        first: the first frames of which ``least`` can be read, at least one.
+    Raises:
+        ValueError: the source has fewer.
+    """
+
+    def __init__(self, reader: Reader, least: int, realtime: bool, clock: Callable[[], float], stages: StageClock) -> None:
+        self._reader, self._realtime, self._clock, self._stages = reader, realtime or reader.live, clock, stages
+        self._newest: NewestFrame | None = None
+        self.first: list[Pixels | Unreadable] = []
+        if reader.live:  # exposure settles
+            for _ in range(SETTLING):
+                reader.read()
+        while len(self.readable) < max(1, least) and (pixels := reader.read()) is not None:
+            if not isinstance(pixels, Unreadable):
+                check_pixels(f"source: frame {len(self.first)} of {reader.name}", pixels)
+            self.first.append(pixels)
+        if len(self.readable) < max(1, least):
+            raise ValueError(
+                f"background_frames: expected at least {least} frames from {reader.name}, got {len(self.readable)}: ask for fewer"
+            )
+
+    @property
+    def readable(self) -> list[Pixels]:
+        """Those of the first frames that can be read."""
+        return [pixels for pixels in self.first if not isinstance(pixels, Unreadable)]
+
+    @property
+    def dropped(self) -> int:
+        """Number of frames that arrived while another was being worked on, and were left out."""
+        return 0 if self._newest is None else self._newest.dropped
+
+    def __iter__(self) -> Iterator[NumberedFrame]:
+        first, self.first = self.first, []
+        return self._newest_ones(first) if self._realtime else self._all(first)
+
+    def _all(self, first: list[Pixels | Unreadable]) -> Iterator[NumberedFrame]:
+        """Every frame, the first ones again."""
+        for index, pixels in enumerate(first):
+            yield index, index / self._reader.fps, pixels
+        start = len(first)
+        first.clear()
+        for index in itertools.count(start):
+            with self._stages.stage("read"):
+                following = self._reader.read()
+            if following is None:
+                return
+            yield index, index / self._reader.fps, following
+
+    def _newest_ones(self, first: list[Pixels | Unreadable]) -> Iterator[NumberedFrame]:
+        """The frames that are the newest when they are asked for; of a recording the first ones are played again."""
+        if self._reader.live:
+            self._newest = NewestFrame(self._reader, None, self._clock)
+        else:
+            self._newest = NewestFrame(_Replay(self._reader, first), self._reader.fps, self._clock)
+        while True:
+            with self._stages.stage("wait"):
+                newest = self._newest.take()
+            if newest is None:
+                return
+            yield newest
+
+    def close(self) -> None:
+        """Stop reading and release the source."""
+        (self._newest or self._reader).close()
+
+
+class _Replay:
+    """A reader that gives frames that were already read, then those of another reader."""
+
+    def __init__(self, reader: Reader, first: Sequence[Pixels | Unreadable]) -> None:
+        self.name, self.live, self.fps = reader.name, reader.live, reader.fps
+        self._reader, self._first = reader, iter(list(first))
+
+    def read(self) -> Pixels | Unreadable | None:
+        pixels = next(self._first, None)
+        return self._reader.read() if pixels is None else pixels
+
+    def close(self) -> None:
+        self._reader.close()

@@ -1,0 +1,45 @@
+"""Time of the stages of a frame."""
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+STAGES = ("read", "wait", "rectify", "light", "depth", "draw", "view", "write")
+"""In the order of a frame."""
+
+
+class StageClock:
+    """Measures the milliseconds of each stage, of the last 10,000 frames."""
+
+    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
+        self._clock = clock
+        self._frames: deque[dict[str, float]] = deque(maxlen=10_000)  # a camera may run for days
+        self._now: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Measure the time of the block."""
+        start = self._clock()
+        try:
+            yield
+        finally:
+            self._now[name] = self._now.get(name, 0.0) + 1000.0 * (self._clock() - start)
+
+    def end_frame(self) -> None:
+        """Close a frame: what was measured since the last call belongs to it."""
+        self._frames.append(self._now)
+        self._now = {}
+
+    @property
+    def last(self) -> dict[str, float]:
+        """Stages of the last whole frame, ms."""
+        return self._frames[-1] if self._frames else {}
+
+    def median_ms(self) -> dict[str, float]:
+        """Median of each stage over the frames in which it ran, in the order of a frame."""
+        names = dict.fromkeys([*STAGES, *(name for frame in self._frames for name in frame)])
+        names = {name: None for name in names if any(name in frame for frame in self._frames)}
+        return {name: float(np.median([frame[name] for frame in self._frames if name in frame])) for name in names}

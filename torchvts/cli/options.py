@@ -49,13 +49,11 @@ def add_network(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--network", type=Path, metavar="FILE", help="nnmodel.pth of gs_sdk, or what torchvts train wrote")
 
 
-def add_device(parser: argparse._ActionsContainer) -> None:
-    """``--device``: where the pipeline runs."""
+def add_pipeline(parser: argparse._ActionsContainer) -> None:
+    """``--mode``, ``--network``, ``--device`` and ``--contact KEY=VALUE``, thresholds for :func:`contact_of`."""
+    add_mode(parser)
+    add_network(parser)
     parser.add_argument("--device", default="cpu", help="cpu, cuda, cuda:1 (cpu)")
-
-
-def add_contact(parser: argparse._ActionsContainer) -> None:
-    """``--contact KEY=VALUE``, repeated: thresholds, for :func:`contact_of`."""
     parser.add_argument("--contact", nargs="+", metavar="KEY=VALUE", help=f"thresholds: {_CONTACT}")
 
 

@@ -20,18 +20,7 @@ from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, Report, list_items
 from ..diagnose import Finding, diagnose
 from ..model import Sensor
 from ..stream import read_background, read_press_images
-from .options import (
-    add_background_frames,
-    add_contact,
-    add_device,
-    add_mode,
-    add_network,
-    add_out,
-    add_press,
-    add_sensor,
-    contact_of,
-    load_calibration,
-)
+from .options import add_background_frames, add_out, add_pipeline, add_press, add_sensor, contact_of, load_calibration
 from .parser import UsageError
 from .summary import SHOWN, calibrated, left_out, print_calibration
 
@@ -52,11 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--background", type=Path, nargs="+", metavar="IMAGE", help="to calibrate: without contact; or a video")
     add_press(parser)
     add_background_frames(parser)
-    add_mode(parser)
+    add_pipeline(parser)
     parser.add_argument("--every", type=int, default=1, metavar="N", help="each N-th frame of a video, each N-th image")
-    add_network(parser)
-    add_device(parser)
-    add_contact(parser)
     kinds = "npz (all), video-npz (one a video), png16, npy, none (npz)"
     parser.add_argument("--format", choices=FORMATS, default="npz", metavar="KIND", help=kinds)
     parser.add_argument("--cloud", choices=CLOUD_FORMATS, default="none", metavar="KIND", help="contact: ply, pcd, obj (surface)")

@@ -25,7 +25,7 @@ from ..pose.follow import TRUSTED_DEG, TRUSTED_MM
 from ..stream import Overlay, TactileFrame, TactileStream, VideoFile
 from ..stream.sources import Pixels
 from .options import add_out
-from .stream import add_source, load_unit, open_stream, play
+from .source import add_source, load_unit, open_stream, play
 
 USAGE = "--source SOURCE (--sensor NAME | --calibration FILE) --out FOLDER"
 

@@ -17,7 +17,7 @@ from ..core.results import write_result
 from ..stream import Keys, LiveView, StreamReport, TactileFrame, TactileStream, has_screen, require_rerun
 from ..viz import depth_figure, save_figure
 from .parser import UsageError
-from .stream import add_source, load_unit, open_stream, play
+from .source import add_source, load_unit, open_stream, play
 
 USAGE = "--source SOURCE (--sensor NAME | --calibration FILE) [--save FILE.rrd]"
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..core.robust import TUKEY, tukey_weight
+from ..core.robust import TUKEY, half_sample_mode, tukey_weight
 from ..model import Calibration
 from .hypotheses import Grid, Hypothesis, list_hypotheses
 
@@ -185,13 +185,9 @@ def _simplest(fits: list[_Fit], cells: _Cells, has_lights: bool) -> _Fit:
 
 
 def _mode(values: Tensor) -> Tensor:
-    """The half-sample mode: the narrowest half of the values, the narrowest half of that, and so on."""
-    values = values.sort().values
-    while len(values) > 8:
-        half = (len(values) + 1) // 2
-        start = int((values[half - 1 :] - values[: len(values) - half + 1]).argmin())
-        values = values[start : start + half]
-    return values.median()
+    """The half-sample mode, of the last eight values or fewer."""
+    halvings = max(0, math.ceil(math.log2(len(values) / 8)))
+    return half_sample_mode(values.sort().values[None, None], halvings)[0, 0]
 
 
 def _fit(hypothesis: Hypothesis, cells: _Cells) -> _Fit:

@@ -84,8 +84,7 @@ class Surface:
         calibration = blocks.calibration
         value = light.clamp(0.0, 1.0) ** (1.0 / calibration.sensor.exponent)
         image = value[None].to(calibration.background.dtype)
-        refines = calibration.lights is not None or (calibration.response is not None)
-        output = blocks.output(image, "precise" if refines else "fast")
+        output = blocks.output(image, "precise")
         with torch.no_grad():
             compensated = blocks.compensate(image)
         background = calibration.background.clamp_min(0.0) ** (1.0 / calibration.sensor.exponent)
@@ -178,21 +177,16 @@ def _templates(surface: Surface) -> dict[str, Tensor]:
     scale = normal.shape[2] / 120.0
     templates: dict[str, Tensor] = {}
     for spread in SPREADS_PX:
-        templates[f"blur {spread:g}"] = _length(_gaussian(normal, spread * scale)) - 1.0
+        templates[f"blur {spread:g}"] = _length(blur(normal, gaussian_weights(spread * scale))) - 1.0
     for name, shift in (("x", (0, 1)), ("y", (1, 0)), ("down", (1, 1)), ("up", (1, -1))):
         for length in (5, 9, 17):
             templates[f"move {name} {length}"] = _moved(normal, shift, max(3, int(length * scale))) - 1.0
     for spread in (1.0, 2.0, 4.0):
         spread_px = spread / surface.calibration.sensor.mm_per_pixel
         if spread_px < 0.2 * normal.shape[2]:
-            mean = nn.functional.normalize(_gaussian(normal, spread_px), dim=1)
+            mean = nn.functional.normalize(blur(normal, gaussian_weights(spread_px)), dim=1)
             templates[f"bounce {spread:g}"] = (normal * mean).sum(1, keepdim=True) - 1.0
     return templates
-
-
-def _gaussian(planes: Tensor, std_px: float) -> Tensor:
-    blurred: Tensor = blur(planes, gaussian_weights(std_px))
-    return blurred
 
 
 def _moved(normal: Tensor, shift: tuple[int, int], length: int) -> Tensor:

@@ -47,16 +47,8 @@ class Coverage(NamedTuple):
 
 
 def coverage(out: ConfidentOutput, truth: Truth, spread: float, name: str = "", shape: str = "") -> Coverage:
-    """Shares of the pixels of a region whose errors are within their bounds.
+    """Shares of the pixels of a region whose errors are within their bounds; ``spread`` is that of :class:`Confidence`.
 
-    Args:
-        out: result of one frame or more.
-        truth: the truth.
-        spread: ``Confidence.spread``.
-        name: name that is kept.
-        shape: shape that is kept.
-    Returns:
-        The shares.
     Raises:
         ValueError: an empty region.
     """
@@ -72,15 +64,7 @@ def coverage(out: ConfidentOutput, truth: Truth, spread: float, name: str = "", 
 
 
 def of_scenes(seeds: Sequence[int], unit: str | None = None, progress: bool = False) -> list[Coverage]:
-    """Coverage over the true and the found contact of random frames.
-
-    Args:
-        seeds: one seed for each frame.
-        unit: kind of unit, see :func:`torchvts.evaluation.random_scenes.random_frame`.
-        progress: show a bar.
-    Returns:
-        One row for each frame with contact.
-    """
+    """Coverage over the true and the found contact of the :func:`random_frame` of each seed: a row for each with contact."""
     rows = []
     for seed in tqdm(seeds, desc=unit or "scenes", disable=not progress or None, leave=False):
         frame = random_frame(seed, unit)
@@ -104,11 +88,9 @@ def of_presses(
         folder: presses in gs_sdk's layout, with labels.
         sensor: the sensor; its prior is used if it has one.
         learn: calibrate by the presses of the other folds; else by the background and the prior.
-        mode: mode of the pipeline.
+        mode: "fast", "precise" or "auto".
         folds: parts of the cross-validation.
         progress: show a bar.
-    Returns:
-        One row for each labelled press.
     Raises:
         ValueError: no press can be scored.
     """
@@ -124,14 +106,7 @@ def of_presses(
 
 
 def of_press(out: ConfidentOutput, press: Press, mm_per_pixel: float, spread: float) -> Coverage:
-    """Coverage of one press inside its contact; of the depth only the relief is compared.
-
-    Args:
-        out: result of the frame.
-        press: press with centre and contact radius.
-        mm_per_pixel: pixel pitch, mm.
-        spread: ``Confidence.spread``.
-    """
+    """Coverage of one labelled press inside its contact; of the depth only the relief is compared."""
     ball = ball_truth(press, out.depth_mm.shape[2], out.depth_mm.shape[3], mm_per_pixel)
     offset = (out.depth_mm - ball.depth_mm)[ball.region].mean()
     return coverage(out, ball._replace(depth_mm=ball.depth_mm + offset), spread, press.name, "ball")

@@ -70,8 +70,8 @@ def photograph(scene: Scene, conditions: Conditions, seed: int = 0, at_mm: tuple
 
     Args:
         scene: what each pixel sees.
-        conditions: conditions of the image.
-        seed: seed of the noise.
+        conditions: of the image.
+        seed: of the noise.
         at_mm: x and y (H, W) of the skin that each pixel sees; None for those of the scene's camera.
     Returns:
         The image (1, 3, H, W) in [0, 1].
@@ -85,12 +85,8 @@ def photograph(scene: Scene, conditions: Conditions, seed: int = 0, at_mm: tuple
 
 
 def radiance(scene: Scene, conditions: Conditions, at_mm: tuple[Tensor, Tensor] | None = None) -> Tensor:
-    """Light that leaves the skin towards the camera, (1, 3, H, W), linear, before lens and sensor.
+    """Light that leaves the skin towards the camera, (1, 3, H, W), linear, before lens and sensor; as :func:`photograph`.
 
-    Args:
-        scene: what each pixel sees.
-        conditions: conditions of the image.
-        at_mm: x and y (H, W) of the skin that each pixel sees; None for those of the scene's camera.
     Raises:
         ValueError: cast shadows with a camera that is not orthographic.
     """

@@ -58,11 +58,7 @@ class _Panel(NamedTuple):
 
 
 def speed_figure(rows: Sequence[Row]) -> Figure:
-    """Error against time on a real sensor if it was measured, then on an exact scene; and cost against size.
-
-    Args:
-        rows: of :func:`torchvts.evaluation.speed.run`, or read back from its bench.json.
-    """
+    """Error against time on a real sensor if it was measured, then on an exact scene; and cost against size."""
     scenes = [row for row in rows if row.kind == "scene"]
     large = [row for row in scenes if row.size is not None and row.size.height == 480]
     sensor = [row for row in rows if row.kind == "sensor" and row.size == _usual_size(rows)]
@@ -188,11 +184,6 @@ def corruption_figure(corruption: Corruption, rows: Sequence[Row], points: Seque
     """Three frames of a corruption, and the errors of each method against severity, with limits and breaking points.
 
     Methods whose errors agree within a tenth at every severity are one line; the list beside the panels names them all.
-
-    Args:
-        corruption: the corruption.
-        rows: its rows.
-        points: its breaking points.
     """
     figure = new_figure(11.0, 3.4, 100)
     grid = figure.add_gridspec(3, 5, width_ratios=(0.75, 2, 2, 1.3, 1.9))
@@ -341,9 +332,8 @@ def overview_figure(points: Sequence[Breaking]) -> Figure:
 def set_figure(evaluation: Evaluation, methods: Sequence[str] = ()) -> Figure:
     """The shown frame by several methods, a row each: depth contours with the contact, the shaded surface, the error of relief.
 
-    Args:
-        evaluation: with a shown frame.
-        methods: names of methods; empty for all but zero depth.
+    All methods but zero depth are drawn, unless some are named.
+
     Raises:
         ValueError: a method without a result.
     """
@@ -411,9 +401,7 @@ def _relief_error(depth_mm: Tensor, truth: Truth | None) -> Tensor:
 def coverage_figure(curves: Sequence[Coverage], seed: int = 1) -> Figure:
     """Measured against stated shares with the quartiles over frames, and on one random scene the bounds beside the errors.
 
-    Args:
-        curves: means, a line each; more than five cannot be distinguished.
-        seed: seed of the scene.
+    More than five curves cannot be distinguished.
     """
     figure = new_figure(10.0, 6.4, 110)
     parts = figure.subfigures(2, 1, height_ratios=[1.7, 1.0], squeeze=False)

@@ -110,15 +110,8 @@ def pose_case(
 ) -> PoseCase:
     """A reference press near the middle, and a second one turned by any angle and moved by up to 4 mm.
 
-    Both are 0.3 to 0.6 mm deep and tilted by up to 3 degrees; a plane, which touches only where it is tilted, by 2.8 to 3.
-
-    Args:
-        target: the object.
-        seed: seed of both poses and of the noise.
-        lights: lights of the unit.
-        pipe: pipeline of the unit.
-        size: rows and columns of the image.
-        noise_std: standard deviation of the noise; images have 8 bits.
+    Both are 0.3 to 0.6 mm deep and tilted by up to 3 degrees; a plane, which touches only where it is tilted, by 2.8 to 3. The
+    seed is that of both poses and of the noise; images have 8 bits.
     """
     generator = torch.Generator().manual_seed(seed)
     presses = []
@@ -175,15 +168,10 @@ def run_poses(
     progress: Callable[[], object] = lambda: None,
     register: Register = by_depth,
 ) -> tuple[list[PoseRow], dict[str, tuple[PoseCase, Registration]]]:
-    """Register all objects in a number of poses each; the field is 20 mm wide.
+    """Register all objects, by name, in a number of poses each; the field is 20 mm wide, images have 8 bits.
 
-    Args:
-        targets: objects by name.
-        poses: poses of each.
-        size: rows and columns of the image.
-        noise_std: standard deviation of the noise; images have 8 bits.
-        progress: called for each pose.
-        register: registers the two presses of a case.
+    ``progress`` is called for each pose.
+
     Returns:
         The rows, and the first pose of each object for a picture.
     """
@@ -236,12 +224,9 @@ def ball_pairs(
 ) -> dict[str, int]:
     """Register real presses of the same ball with each other: no rotation of a ball can be determined.
 
-    Args:
-        background: (3, H, W), image without contact.
-        presses: presses of balls.
-        sensor: sensor with a prior, which calibrates the unit without the presses.
-        most: largest number of pairs, evenly chosen.
-        progress: called for each pair.
+    The unit is calibrated by its background (3, H, W) and the sensor's prior, without the presses. At most ``most`` pairs are
+    registered, evenly chosen; ``progress`` is called for each.
+
     Returns:
         Counts: "pairs", "converged", and of these "named" (three rotations reported), "named in part", "not named".
     """

@@ -57,11 +57,9 @@ def random_frame(seed: int, unit: str | None = None, shape: str | None = None) -
     """A random sensor, its calibration and a frame: 8 bits, noise up to 1.5 %, random lights, size and shape.
 
     Args:
-        seed: seed of everything.
+        seed: of everything.
         unit: one of :data:`UNITS`; None draws one of the first three.
         shape: one of :data:`SHAPES`; None draws one.
-    Returns:
-        The frame with its truth.
     Raises:
         ValueError: unknown unit or shape.
     Example:

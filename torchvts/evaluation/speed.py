@@ -74,12 +74,7 @@ def memory_mb(call: Callable[[], object]) -> float:
 
 
 class Bench:
-    """Times calls; every row has the machine, the threads and the command.
-
-    Args:
-        command: the command as typed.
-        progress: called with the name of what is measured next.
-    """
+    """Times calls; every row has the machine, the threads and the command. ``progress`` gets the name of what is measured next."""
 
     def __init__(self, command: str, progress: Callable[[str], None]) -> None:
         self.command, self.progress = command, progress
@@ -97,13 +92,7 @@ class Bench:
 
 
 def run(command: str, progress: Callable[[str], None], data: Path | None) -> list[Row]:
-    """All rows: exact scenes, and a real sensor if there are data of one.
-
-    Args:
-        command: the command as typed.
-        progress: called with the name of what is measured next.
-        data: folder with ``gelsight_mini_a``; None without.
-    """
+    """All rows: exact scenes, and a real sensor if ``data`` is a folder with ``gelsight_mini_a``."""
     bench = Bench(command, progress)
     rows = list(_scenes(bench))
     if data is not None and (data / "gelsight_mini_a").is_dir():

@@ -60,9 +60,9 @@ class Breaking:
     """Where a method breaks under a corruption.
 
     Attributes:
-        method: name of the method.
-        corruption: name of the corruption.
-        unit: unit of the severity.
+        method: name.
+        corruption: name.
+        unit: of the severity.
         at: severity, by linear interpolation; "never" if no severity breaks it, "always" if the first one does.
         tolerance: how far ``at`` may move.
         between: the last severity before the break and the first after it; for "never" the last severity, for "always" the first.
@@ -108,15 +108,9 @@ def mask_limits(row: Row) -> float:
 def measure(method: str, corruption: str, severity: float, seed: int, case: Case) -> Row:
     """Measure a method on a case; an error that the method raises is its result.
 
-    Args:
-        method: name of the method.
-        corruption: name of the corruption.
-        severity: severity of the case.
-        seed: seed of the case.
-        case: the scene.
-    Returns:
-        The row, with errors inside the true contact, or over the whole image where there is none: "normal_deg" (mean angle between
-        normals), "rms_um" and "largest_px" (depth), "iou" (mask), "press_um" (true depth of the press).
+    Errors of the row are those inside the true contact, or over the whole image where there is none: "normal_deg" (mean angle
+    between normals), "rms_um" and "largest_px" (depth), "iou" (mask), "press_um" (true depth of the press).
+
     Example:
         >>> from torchvts.evaluation.gallery import undisturbed
         >>> round(measure("fast", "noise", 0.002, 0, undisturbed()).error("normal_deg"), 1)
@@ -161,15 +155,8 @@ def sweep(
     """Measure every method at every severity of every corruption.
 
     Each row is written to a file of JSON lines, and a later call continues from that file. The first line names the state of this
-    package; rows of another state are refused.
+    package; rows of another state are refused. ``progress`` is called for each row; without workers this process does the work.
 
-    Args:
-        path: the file; it is made if missing.
-        methods: names of methods.
-        corruptions: names of corruptions.
-        seeds: seeds 0 to this are measured.
-        workers: number of processes; with 0 this process does the work.
-        progress: called for each row.
     Returns:
         The rows asked for, by corruption, severity, seed and method.
     Raises:
@@ -273,15 +260,9 @@ def breaking_points(rows: Sequence[Row]) -> list[Breaking]:
 
 
 def breaking_point(method: str, corruption: Corruption, rows: Sequence[Row], error: Callable[[Row], float]) -> Breaking:
-    """Severity where the error of one method first exceeds 1.
+    """Severity where ``error``, in units of its limit, first exceeds 1 in the rows of one method.
 
     Severities without rows are skipped, so the two around a known breaking point are enough to find it again.
-
-    Args:
-        method: name of the method.
-        corruption: the corruption.
-        rows: rows of this method under this corruption.
-        error: error of a row in units of its limit.
     """
     note = next((row.note for row in rows if row.note), "")
     means = []

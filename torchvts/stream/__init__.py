@@ -12,11 +12,12 @@ from .background import (
     use_calibration,
 )
 from .cameras import Camera, CameraSettings, find_camera
+from .files import StreamReport, VideoFile
 from .follow_light import FollowLight
 from .frames import NewestFrame
 from .keys import Keys
 from .live import TactileFrame, TactileStream
-from .overlay import Overlay, Sheet, StreamReport, VideoFile
+from .overlay import Overlay, Sheet
 from .recording import Recording, check_device
 from .rectify import Rectify, RectifySizes
 from .rezero import with_background

@@ -101,8 +101,7 @@ class TactileStream:
         check_choice("mode", mode, MODES)
         if contact is not None:
             check_record("contact", contact, ContactSettings, "ContactSettings(sigmas=...) makes one")
-        for name, switch in (("realtime", realtime), ("follow", follow)):
-            check_switch(name, switch)
+        check_switch("realtime", realtime)
         sensor = _sensor_of(sensor_or_calibration, background_frames, presses)
         self.reader = _reader_of(source, reconnect_s)
         self.fps = self.reader.fps
@@ -112,9 +111,8 @@ class TactileStream:
         self._zero_missing = 0
         try:
             self._frames = SourceFrames(self.reader, background_frames, realtime, clock, self.stages)
-            readable = self._frames.readable
-            self.rectify = Rectify(sensor, *readable[0].shape[:2])
-            first = torch.cat([self._rectified(pixels) for pixels in readable])
+            self.rectify = Rectify(sensor, *self._frames.readable[0].shape[:2])
+            first = torch.cat([self._rectified(pixels) for pixels in self._frames.readable])
             if isinstance(sensor_or_calibration, Calibration):
                 found = use_calibration(sensor_or_calibration)
             else:

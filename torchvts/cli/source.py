@@ -1,0 +1,90 @@
+"""What ``stream``, ``view`` and ``track`` share: options of a source and a unit, opening it, and going through its frames."""
+
+import argparse
+import signal
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import cv2
+import torch
+
+from ..calibration import Press
+from ..model import Calibration, Sensor
+from ..stream import Camera, CameraSettings, TactileFrame, TactileStream, find_camera
+from .options import add_background_frames, add_pipeline, add_sensor, contact_of, load_calibration
+from .parser import UsageError
+
+
+def add_source(parser: argparse.ArgumentParser) -> None:
+    """Options of the source, the unit, the camera and the pipeline."""
+    parser.add_argument("--source", required=True, help="camera (index, /dev path, name), URL, video file, or folder of images")
+    parser.add_argument("--size", nargs=2, type=int, metavar=("W", "H"), help="of a camera's frames, where the driver takes it")
+    parser.add_argument("--fps", type=float, metavar="F", help="of a camera, where the driver takes it")
+    parser.add_argument("--exposure", type=float, metavar="E", help="of a camera, in the driver's unit; ends automatic exposure")
+    add_sensor(parser, "the first frames calibrate: ")
+    parser.add_argument("--calibration", type=Path, metavar="FILE", help="what torchvts calibrate wrote, in place of --sensor")
+    add_background_frames(parser)
+    add_pipeline(parser)
+    parser.add_argument("--realtime", action="store_true", help="play a recording at its own rate, dropping late frames")
+    parser.add_argument("--no-follow", action="store_true", help="do not follow slow drift of the light")
+    parser.add_argument("--threads", type=int, default=1, metavar="N", help="of PyTorch and OpenCV (1)")
+
+
+def load_unit(arguments: argparse.Namespace) -> Sensor | Calibration:
+    """The sensor or the calibration that was given, and the threads that were asked for."""
+    if (arguments.sensor is None) == (arguments.calibration is None):
+        raise UsageError("expected either --sensor or --calibration")
+    torch.set_num_threads(max(1, arguments.threads))
+    cv2.setNumThreads(max(1, arguments.threads))
+    return Sensor.load(arguments.sensor) if arguments.sensor else load_calibration(arguments.calibration)
+
+
+def open_stream(arguments: argparse.Namespace, unit: Sensor | Calibration, presses: Sequence[Press] = ()) -> TactileStream:
+    """The stream of the source; says what it found."""
+    started = time.perf_counter()
+    settings = CameraSettings(arguments.size and tuple(arguments.size), arguments.fps, arguments.exposure)
+    camera = find_camera(arguments.source)
+    if settings.given and camera is None:
+        raise UsageError(f"--size, --fps, --exposure: expected a camera of this machine, got {arguments.source!r}")
+    source: str | int | Camera = arguments.source
+    if camera is not None:
+        source = Camera(camera, settings) if settings.given else camera
+    stream = TactileStream(
+        source,
+        unit,
+        mode=arguments.mode,
+        background_frames=arguments.background_frames,
+        presses=presses,
+        realtime=arguments.realtime,
+        follow=not arguments.no_follow,
+        network=arguments.network,
+        device=arguments.device,
+        contact=contact_of(arguments.contact),
+    )
+    first = arguments.background_frames
+    note = f"the first {first} are without contact" if first else "the calibration's background is used as it is"
+    print(f"{stream.reader.name}: {stream.fps:g} frames a second; {note}")
+    print(f"{stream.note}\nready after {time.perf_counter() - started:.1f} s")
+    return stream
+
+
+def play(stream: TactileStream, take: Callable[[TactileFrame], bool]) -> None:
+    """Give every frame to ``take`` until the source ends, it returns False, or Ctrl-C."""
+    asked: list[int] = []
+
+    def interrupt(number: int, _: object) -> None:
+        asked.append(number)  # the exception is lost if a destructor or a callback is running
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, interrupt)
+    try:
+        for frame in stream:
+            if asked:
+                raise KeyboardInterrupt
+            if not take(frame):
+                break
+    except KeyboardInterrupt:
+        print("interrupted: the frames until now are kept")
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -260,8 +260,8 @@ TABLE = {
     ),
     # ---- stream ----
     "stream.FollowLight": Entry(
-        {"background": image(), "time_constant_s": 1.0},
-        {"background": [b for k, b in enumerate(images()) if k not in (4,)], "time_constant_s": NUMBER},
+        {"background": image()},
+        {"background": [b for k, b in enumerate(images()) if k not in (4,)]},
     ),
     **{
         f"stream.FollowLight.{name}": Entry(

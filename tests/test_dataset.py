@@ -14,7 +14,7 @@ from conftest import bgr, tiny_image, write_film
 
 import torchvts as vts
 from torchvts.core.files import read_depth_png
-from torchvts.dataset import STATE, list_items, output_stems, reconstruct, reconstruct_dataset
+from torchvts.dataset import STATE, list_items, output_stems, reconstruct, reconstruct_dataset, writing
 
 ROOT = Path(__file__).resolve().parents[1]
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
@@ -286,7 +286,7 @@ def test_depth_beyond_a_png_is_left_out_and_a_full_disk_stops(unit, tmp_path, mo
     def refuse(path, depth_mm):
         raise ValueError("depth_mm: too deep") if Path(path).name.startswith("a_") else OSError("no space left")
 
-    monkeypatch.setattr(reconstruct, "write_depth_png", refuse)
+    monkeypatch.setattr(writing, "write_depth_png", refuse)
     with pytest.raises(OSError, match="no space left"):
         reconstruct_dataset(unit, source, tmp_path / "out", pictures=False, format="png16")
     monkeypatch.undo()

@@ -33,6 +33,9 @@ _MAP = LinearSegmentedColormap.from_list(
 SOURCE, TARGET = "#d55e00", "#0072b2"
 """Colours of the two clouds of a pose; blue and vermilion, which all readers distinguish."""
 
+MOST_POINTS = 220
+"""Largest number of points of a surface in each direction."""
+
 _HALO = [patheffects.withStroke(linewidth=2.0, foreground="black")]
 _EXAGGERATIONS = (1, 2, 3, 4, 5, 8, 10, 15, 20, 30, 40, 50, 80, 100, 150, 200, 300, 400, 500, 1000)
 
@@ -165,19 +168,16 @@ def draw_bar(figure: Figure, axes: Any, picture: Any, label: str) -> None:
     figure.colorbar(picture, cax=axes.inset_axes((1.03, 0.0, 0.04, 1.0)), label=label)
 
 
-def draw_surface(
-    axes: Any, depth: Array, mm_per_pixel: float, most: int = 220, range_mm: tuple[float, float] | None = None
-) -> None:
+def draw_surface(axes: Any, depth: Array, mm_per_pixel: float, range_mm: tuple[float, float] | None = None) -> None:
     """Draw depth as a surface lit from the upper left, coloured as the contours are; the title states the exaggeration of height.
 
     Args:
         axes: a 3D panel.
         depth: (H, W), mm.
         mm_per_pixel: pixel pitch, mm.
-        most: largest number of points in each direction.
         range_mm: range of the colours; None takes that of the depth.
     """
-    stride = max(1, int(np.ceil(max(depth.shape) / most)))
+    stride = max(1, int(np.ceil(max(depth.shape) / MOST_POINTS)))
     z = depth[::stride, ::stride]
     left, _, lower, _ = _extent(depth, mm_per_pixel)
     rows, columns = np.mgrid[0 : z.shape[0], 0 : z.shape[1]] * mm_per_pixel * stride
@@ -249,9 +249,9 @@ def sheet_figure(frames: Sequence[tuple[float, Array]], mm_per_pixel: float, met
     return figure
 
 
-def pose_figure(source: Tensor, target: Tensor, T_target_source: Tensor, title: str = "", most: int = 4000) -> Figure:
+def pose_figure(source: Tensor, target: Tensor, T_target_source: Tensor, title: str = "") -> Figure:
     """Two clouds (N, 3) before and after registration, each from above and in space, as in figure 8 of the paper, in one scale."""
-    clouds = [points.detach().cpu().double()[:: max(1, len(points) // most)] for points in (source, target)]
+    clouds = [points.detach().cpu().double()[:: max(1, len(points) // 4000)] for points in (source, target)]
     T = T_target_source.detach().cpu().double()
     states = {"before": clouds[0], "after": clouds[0] @ T[:3, :3].T + T[:3, 3]}
     everything = torch.cat((clouds[1], *states.values())).numpy()

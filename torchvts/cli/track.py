@@ -101,15 +101,15 @@ def record(frame: TactileFrame, found: TrackedPose) -> dict[str, object]:
     return dict(zip(COLUMNS + QUALITY, values, strict=True))
 
 
-def draw_axes(image: Tensor, found: TrackedPose, tracker: PoseTracker, mm_per_pixel: float, length_mm: float = 2.0) -> Tensor:
-    """The image (3, H, W) with the reference's x (red), y (green) and z (blue) at the middle of its contact.
+def draw_axes(image: Tensor, found: TrackedPose, tracker: PoseTracker, mm_per_pixel: float) -> Tensor:
+    """The image (3, H, W) with the reference's x (red), y (green) and z (blue), 2 mm long, at the middle of its contact.
 
     Axes of rotations that are not known are drawn thin.
     """
     height, width = image.shape[1:]
     T = found.T_target_source
     middle = torch.from_numpy(tracker.graph.keyframes[0].many.center)
-    places = middle + length_mm * torch.cat((torch.zeros(1, 3), torch.eye(3))).double()
+    places = middle + 2.0 * torch.cat((torch.zeros(1, 3), torch.eye(3))).double()
     moved = places @ T[:3, :3].T + T[:3, 3]
     column, row = moved[:, 0] / mm_per_pixel + 0.5 * (width - 1), 0.5 * (height - 1) - moved[:, 1] / mm_per_pixel
     ends = torch.stack((column, row), 1).round().int().tolist()

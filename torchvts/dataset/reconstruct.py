@@ -10,52 +10,37 @@ depth then differs by up to 3e-7 mm.)
 """
 
 import hashlib
-import json
 import os
 import sys
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import asdict
-from datetime import timedelta
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
-import torch.distributed as dist
 from torch import Tensor
 from tqdm import tqdm
 
 from ..contact import ContactSettings
 from ..core import __version__
 from ..core.checks import check_choice, check_integer, check_path, check_sequence
-from ..core.files import (
-    DEPTH_PNG_STEP_MM,
-    DEPTH_PNG_ZERO,
-    IMAGE_SUFFIXES,
-    VIDEO_SUFFIXES,
-    count_frames,
-    write_atomically,
-    write_depth_png,
-)
-from ..core.geometry import depth_to_points
-from ..core.results import UNITS, write_result
+from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, count_frames
 from ..model import Calibration
 from ..pipeline import MODES, DepthOutput, unit_pipeline
 from ..stream import FIRST_FRAMES, Recording, check_device
 from .items import Item, Source, list_items
 from .loading import Frame, load_frames
-from .records import FORMATS, VIDEO_FORMAT, Records, Settings, begin, join, locked
+from .processes import share, sum_over_processes
+from .records import FORMATS, Records, Settings, begin, join, locked
+from .writing import Writer
 
 CLOUD_FORMATS = ("ply", "obj", "pcd", "none")
 """Kinds of files for the contact of a frame."""
-
-LONGEST_WAIT = timedelta(days=7)
-"""Processes that have finished wait this long for the others."""
 
 
 class Report(NamedTuple):
@@ -153,10 +138,10 @@ def reconstruct_dataset(
         _digest(calibration), _digest(network), _names(source), mode, format, cloud, pictures, every, device, threads,
         __version__, str(torch.__version__), background_frames, None if contact is None else asdict(contact),
     )  # fmt: skip
-    with _processes() as (rank, world), locked(out) if rank == 0 else nullcontext():
+    with share() as (rank, world), locked(out) if rank == 0 else nullcontext():
         if rank == 0:
             settings = begin(source, out, settings, overwrite)
-        _sum_over_processes(0)  # the settings are there for the others to read
+        sum_over_processes(0)  # the settings are there for the others to read
         if rank > 0:
             settings = join(out, settings)
         records = Records(source, out, settings)
@@ -192,38 +177,6 @@ def _check_source(source: Source, out: Path) -> None:
             raise ValueError(f"{path}: no images or videos in this folder ({', '.join(IMAGE_SUFFIXES + VIDEO_SUFFIXES)})")
 
 
-@contextmanager
-def _processes() -> Iterator[tuple[int, int]]:
-    """Rank of this process and their number. Only counts travel between them, so the backend is gloo, which every machine has."""
-    rank, world = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
-    if world == 1:
-        yield rank, world
-        return
-    dist.init_process_group("gloo", timeout=LONGEST_WAIT)
-    try:
-        yield rank, world
-    finally:
-        dist.destroy_process_group()
-
-
-def _sum_over_processes(count: int) -> int:
-    """Wait for all processes and add up their counts.
-
-    Raises:
-        RuntimeError: a process has stopped.
-    """
-    if not dist.is_initialized():
-        return count
-    total = torch.tensor(count)
-    try:
-        dist.all_reduce(total)
-    except RuntimeError as error:
-        raise RuntimeError(
-            f"another process has stopped ({str(error).splitlines()[0][:120]}): read its message, and run the same command again"
-        ) from error
-    return int(total)
-
-
 NAMED = 5
 """So many frames that cannot be used are named at once, by each process; a folder of another sensor's has thousands."""
 
@@ -238,7 +191,7 @@ class _Worker:
         self, unit: Calibration, name: str, network: str | Path | None, records: Records, share: tuple[int, int], strict: bool
     ) -> None:
         self.unit, self.records, self.settings, self.share, self.strict = unit, records, records.settings, share, strict
-        self.sensor, self.name = unit.sensor, name
+        self.sensor, self.writer = unit.sensor, Writer(records, unit.sensor, name)
         thresholds = None if self.settings.contact is None else ContactSettings(**self.settings.contact)
         self.recording = partial(
             Recording, unit, self.settings.mode, network=network, device=self.settings.device, contact=thresholds
@@ -268,13 +221,13 @@ class _Worker:
                     self._settle(*waiting.popleft())
             while waiting:
                 self._settle(*waiting.popleft())
-        done = _sum_over_processes(self.done)
+        done = sum_over_processes(self.done)
         seconds = time.perf_counter() - start
         if rank > 0:
             return Report(rank, 0, 0, [], seconds)
         self.records.join_videos()
         rows, failed = self.records.write_tables()
-        self._write_summary(rows, len(failed))
+        self.writer.write_summary(rows, len(failed))
         return Report(0, rows, rows - done, failed, seconds, self.notes)
 
     def _depths(self, loaded: Iterable[tuple[Frame, Tensor | None]]) -> Iterator[_Reconstructed]:
@@ -356,65 +309,11 @@ class _Worker:
     def _finish(self, frame: Frame, image: Tensor, result: DepthOutput) -> str:
         """Write a frame's files, then its record."""
         try:
-            self._write(frame, image, result)
+            self.writer.write(frame, image, result)
         except ValueError as error:  # a depth that its format does not hold
             return self._record(frame, failed=_in_one_line(error))
         area = float(result.contact.double().sum()) * self.sensor.mm_per_pixel**2
         return self._record(frame, deepest_mm=float(result.depth_mm.max()), contact_mm2=area)
-
-    def _write(self, frame: Frame, image: Tensor, result: DepthOutput) -> None:
-        pitch, name = self.sensor.mm_per_pixel, frame.item.frame_name(frame.number)
-        stem, path = self.records.out / frame.item.frame_stem(frame.number), self.records.result_file(frame.item, frame.number)
-        for folder in {stem.parent, path.parent}:
-            folder.mkdir(parents=True, exist_ok=True)
-        if self.settings.format == VIDEO_FORMAT and frame.number >= 0:  # what an earlier run joined is of other frames
-            (self.records.out / f"{frame.item.stem}.npz").unlink(missing_ok=True)
-        if path.suffix == ".npz":
-            write_result(path, result, pitch, self.name, self.sensor.name, name)
-        elif path.suffix == ".png":
-            write_depth_png(path, result.depth_mm)
-        elif path.suffix == ".npy":
-            with write_atomically(path) as temporary:
-                np.save(temporary, result.depth_mm[0, 0].numpy())
-        if self.settings.cloud != "none" and bool(result.contact.any()):
-            self._write_contact(Path(f"{stem}.{self.settings.cloud}"), result)
-        if self.settings.pictures:
-            from .. import viz
-
-            viz.save_figure(viz.depth_figure(result.depth_mm, pitch, image, result.contact, name), f"{stem}_picture.png")
-
-    def _write_contact(self, path: Path, result: DepthOutput) -> None:
-        """The contact as points or as a surface."""
-        from ..pose import write_point_cloud
-        from ..pose.surface_files import write_obj
-
-        pitch = self.sensor.mm_per_pixel
-        if path.suffix == ".obj":
-            write_obj(path, result.depth_mm, result.normal, result.contact, pitch)
-            return
-        normals = result.normal[0].permute(1, 2, 0)[result.contact[0, 0]] * torch.tensor([1.0, -1.0, 1.0])  # y up
-        write_point_cloud(path, depth_to_points(result.depth_mm, pitch, result.contact), normals)
-
-    def _write_summary(self, rows: int, failed: int) -> None:
-        """summary.json: what the files are, so that they can be read without this package."""
-        settings = self.settings
-        summary = {
-            "frames": rows,
-            "left_out": failed,
-            "calibration": self.name,
-            "sensor": self.sensor.name,
-            "mm_per_pixel": self.sensor.mm_per_pixel,
-            "height": self.sensor.height,
-            "width": self.sensor.width,
-            "mode": settings.mode,
-            "format": settings.format,
-            "every": settings.every,
-            "depth_png": f"depth_mm = (value - {DEPTH_PNG_ZERO}) * {DEPTH_PNG_STEP_MM}",
-            "units": UNITS,
-            "torchvts": __version__,
-        }
-        with write_atomically(self.records.out / "summary.json") as temporary:
-            temporary.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
 
 
 def _in_one_line(error: ValueError) -> str:

@@ -89,7 +89,7 @@ def list_hypotheses(calibration: Calibration, level: Tensor) -> list[Hypothesis]
         *(_swapped(order) for order in itertools.permutations(range(3)) if order != (0, 1, 2)),
         *(_mixed(pair) for pair in ((0, 2), (0, 1), (1, 2))),
         Hypothesis("exposure", 1, lambda grid, n: grid.light * n.exp(), start=(float(level.median()),)),
-        *(Hypothesis("channel", 1, _one_channel(j), (j,), start=(logs[j],)) for j in range(3)),
+        *(Hypothesis("channel", 1, _on_channel(j, lambda _, n: n), (j,), start=(logs[j],)) for j in range(3)),
         Hypothesis("channels", 3, lambda grid, n: grid.light * n.exp()[:, None], start=logs),
         Hypothesis("ambient", 3, lambda grid, n: grid.light + n[:, None], undo=lambda light, n: light - n[:, None, None]),
         Hypothesis(
@@ -116,7 +116,8 @@ def _of_known_lights(position: Tensor, logs: tuple[float, float, float]) -> list
 
 
 def _of_fields(logs: tuple[float, float, float]) -> list[Hypothesis]:
-    return [Hypothesis("light_moved", 6, _one_field(j), (j,), start=(logs[j], 0.0, 0.0, 0.0, 0.0, 0.0)) for j in range(3)]
+    fields = [_on_channel(j, lambda grid, n: n @ _quadratic(grid)) for j in range(3)]
+    return [Hypothesis("light_moved", 6, fields[j], (j,), start=(logs[j], 0.0, 0.0, 0.0, 0.0, 0.0)) for j in range(3)]
 
 
 def _quadratic(grid: Grid) -> Tensor:
@@ -149,19 +150,12 @@ def _mixed(pair: tuple[int, int]) -> Hypothesis:
     return Hypothesis("channels_mixed", 1, predict, pair, undo, start=(0.2,))
 
 
-def _one_channel(j: int) -> Predict:
-    def predict(grid: Grid, n: Tensor) -> Tensor:
-        factor = torch.ones(3, 1, dtype=torch.float64)
-        factor[j] = n.exp()
-        return grid.light * factor
+def _on_channel(j: int, exponent: Predict) -> Predict:
+    """The light of one channel times exp(exponent)."""
 
-    return predict
-
-
-def _one_field(j: int) -> Predict:
     def predict(grid: Grid, n: Tensor) -> Tensor:
         factor = torch.ones_like(grid.light)
-        factor[j] = (n @ _quadratic(grid)).exp()
+        factor[j] = exponent(grid, n).exp()
         return grid.light * factor
 
     return predict

@@ -10,7 +10,6 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ..calibration import Press
-from ..core.checks import check_integer
 from ..core.geometry import normal_from_gradient
 from ..model import Sensor
 from ..pipeline import ConfidentOutput, ConfidentPipeline, bound_at
@@ -78,7 +77,7 @@ def of_scenes(seeds: Sequence[int], unit: str | None = None, progress: bool = Fa
 
 
 def of_presses(
-    folder: str | Path, sensor: Sensor, *, learn: bool = True, mode: str = "precise", folds: int = 5, progress: bool = False
+    folder: str | Path, sensor: Sensor, *, learn: bool = True, mode: str = "precise", progress: bool = False
 ) -> list[Coverage]:
     """Coverage inside the contact of presses that the calibration has not seen.
 
@@ -89,13 +88,11 @@ def of_presses(
         sensor: the sensor; its prior is used if it has one.
         learn: calibrate by the presses of the other folds; else by the background and the prior.
         mode: "fast", "precise" or "auto".
-        folds: parts of the cross-validation.
         progress: show a bar.
     Raises:
         ValueError: no press can be scored.
     """
-    check_integer("folds", folds, 2)
-    data, rows = from_folder(folder, sensor, folds=folds), []
+    data, rows = from_folder(folder, sensor), []
     for fold in tqdm(data.folds, desc="presses", disable=not progress or None, leave=False):
         unit = Training(data.background, fold.learned if learn else (), sensor).calibration
         pipe = ConfidentPipeline.from_calibration(unit, mode)

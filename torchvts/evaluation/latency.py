@@ -75,9 +75,7 @@ class Latency(NamedTuple):
         return float(np.percentile(self.delay_ms, percent))
 
 
-def measure_latency(
-    calibration: Calibration, pictures: Sequence[Pixels], fps: float = 60.0, frames: int = 600, draws: bool = True
-) -> Latency:
+def measure_latency(calibration: Calibration, pictures: Sequence[Pixels], fps: float = 60.0, frames: int = 600) -> Latency:
     """Depth of every frame of a simulated camera while each is drawn, and its delay.
 
     Args:
@@ -85,7 +83,6 @@ def measure_latency(
         pictures: as :class:`SimulatedCamera` takes them, the first without contact.
         fps: frames a second.
         frames: number of frames after the first ones.
-        draws: whether overlays are drawn beside it.
     """
     first = 20  # of which a stream takes five for the camera to settle and fifteen as its background
     camera = SimulatedCamera(pictures, fps, first + frames, first)
@@ -103,8 +100,7 @@ def measure_latency(
         for frame in stream:
             delay_ms.append(1000.0 * (time.monotonic() - camera.arrivals[before + frame.number]))
             numbers.append(frame.number)
-            if draws:
-                aside.put(frame)
+            aside.put(frame)
             if frame.number == frames - 1:  # the newest frame is never dropped
                 break
         dropped = stream.dropped

@@ -65,7 +65,6 @@ class Row:
         severity: of the corruption.
         seed: of noise and place.
         frames: number of frames behind the errors.
-        worst: name of the frame with the largest error.
         ours: whether it is a method of this library, and not of a peer.
         seen: whether the method has learned from the very frames that it is scored on.
         command: command that made the row.
@@ -82,7 +81,6 @@ class Row:
     severity: float | None = None
     seed: int | None = None
     frames: int = 1
-    worst: str = ""
     ours: bool = True
     seen: bool = False
     command: str = ""
@@ -100,14 +98,14 @@ class Column(NamedTuple):
     cell: Callable[[Row], str]
 
 
-def number(value: float | None, digits: int, missing: str = "") -> str:
-    """A value with so many digits after the point."""
-    return missing if value is None else f"{value:.{digits}f}"
+def number(value: float | None, digits: int) -> str:
+    """A value with so many digits after the point; empty for None."""
+    return "" if value is None else f"{value:.{digits}f}"
 
 
-def error_column(title: str, name: str, digits: int, missing: str = "") -> Column:
+def error_column(title: str, name: str, digits: int) -> Column:
     """Column of one of a row's errors."""
-    return Column(title, lambda row: number(row.error(name), digits, missing))
+    return Column(title, lambda row: number(row.error(name), digits))
 
 
 def table(rows: Iterable[Row], columns: Sequence[Column]) -> str:

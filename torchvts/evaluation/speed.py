@@ -39,19 +39,13 @@ TIMED = (
 Errors = Mapping[str, float | None]
 
 
-def time_ms(call: Callable[[], object], repeats: int = 40, most_s: float = 2.0) -> tuple[float, float]:
-    """Median and interquartile range of the time of a call, ms.
-
-    Args:
-        call: what is timed, after five calls to warm up.
-        repeats: number of calls.
-        most_s: bound on the time of all calls, s; there are at least five.
-    """
+def time_ms(call: Callable[[], object]) -> tuple[float, float]:
+    """Median and interquartile range of the time of a call, ms: 40 times or for two seconds, after five to warm up."""
     for _ in range(5):
         call()
     times: list[float] = []
     start = time.perf_counter()
-    while len(times) < 5 or (len(times) < repeats and time.perf_counter() - start < most_s):
+    while len(times) < 5 or (len(times) < 40 and time.perf_counter() - start < 2.0):
         before = time.perf_counter()
         call()
         times.append(1000.0 * (time.perf_counter() - before))

@@ -58,13 +58,8 @@ def check_pipeline(pipe: object) -> None:
 def export_torchscript(pipe: DepthPipeline, path: str | Path) -> Path:
     """Write a pipeline as TorchScript (.pt), for ``torch.jit.load`` and C++ libtorch. It stays differentiable.
 
-    Its extra file ``torchvts.json`` is :func:`describe`.
+    Its extra file ``torchvts.json`` is :func:`describe`. Returns the path.
 
-    Args:
-        pipe: the pipeline.
-        path: the file.
-    Returns:
-        The path.
     Raises:
         RuntimeError: a module of the pipeline does not script.
         TypeError: no pipeline.
@@ -84,11 +79,8 @@ def export_program(pipe: DepthPipeline, path: str | Path | None = None) -> torch
 
     Loops (precise passes, hole filling) become operators of the graph, so that the program takes as many turns as the pipeline.
 
-    Args:
-        pipe: the pipeline.
-        path: the file; None writes none.
-    Returns:
-        The program.
+    Without a path the program is returned and not written.
+
     Raises:
         TypeError: no pipeline.
         Exception: what torch.export raises for a module of yours that it cannot trace.
@@ -108,11 +100,8 @@ def export_program(pipe: DepthPipeline, path: str | Path | None = None) -> torch
 def export_aoti(pipe: DepthPipeline, path: str | Path) -> Path:
     """Compile a pipeline to machine code for this kind of CPU (.pt2 package), for ``torch._inductor.aoti_load_package`` and C++.
 
-    Args:
-        pipe: the pipeline.
-        path: the file.
-    Returns:
-        The path.
+    Returns the path.
+
     Raises:
         RuntimeError: there is no C++ compiler.
         TypeError: no pipeline.
@@ -142,11 +131,8 @@ def export_aoti(pipe: DepthPipeline, path: str | Path) -> Path:
 def export_onnx(pipe: DepthPipeline, path: str | Path) -> Path:
     """Write a pipeline as ONNX, for ONNX Runtime and other readers. Its metadata entry ``torchvts`` is :func:`describe`.
 
-    Args:
-        pipe: the pipeline.
-        path: the file.
-    Returns:
-        The path.
+    Returns the path.
+
     Raises:
         ModuleNotFoundError: the extra ``onnx`` is not installed.
         TypeError: no pipeline.

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..accelerated import ContactMask
 from ..calibration import (
     POORLY_CONSTRAINED_DEG,
     ROUGH,
@@ -19,9 +18,6 @@ from ..calibration import (
     calibrate,
     channel_structure,
 )
-from ..contact import ContactMask as PlainContactMask
-from ..contact import ContactSettings
-from ..contact.masks import MOST_FAR_FIELD, most_far_field
 from ..core.blur import blur, gaussian_weights
 from ..core.checks import check_batch, check_integer, check_path, check_positive, check_sequence, parse_number
 from ..core.files import VIDEO_SUFFIXES, read_frames
@@ -247,26 +243,3 @@ def use_calibration(calibration: Calibration) -> StreamCalibration:
     metric = max(report.get("direction_std_deg", [0.0])) <= POORLY_CONSTRAINED_DEG
     metric = metric and report.get("source") not in ASSUMED
     return StreamCalibration(calibration, note if metric else f"{note}; {NOT_METRIC}", metric)
-
-
-def contact_in_video(
-    calibration: Calibration, noise: Tensor | None = None, contact: ContactSettings | None = None
-) -> PlainContactMask:
-    """The unit's contact mask, with the noise (3, H, W) that a video has between frames; None where it was not measured."""
-    calibrated = ContactMask.from_calibration(calibration, contact)
-    if noise is None:
-        return calibrated
-    sensor = calibration.sensor
-    value = calibration.background.float().clamp_min(1e-6) ** (1.0 / sensor.exponent)
-    compensated = noise.float() * sensor.exponent * torch.maximum(value, noise.float()) ** (sensor.exponent - 1.0)
-    if calibration.gain is not None:
-        compensated = compensated * calibration.gain.float() * 2.0**0.5
-    most = torch.maximum(1.0 / calibrated.per_noise.float(), compensated)
-    thresholds = calibrated.sigmas, calibrated.min_size_px
-    return ContactMask(calibrated.flat.float(), most, *thresholds, far_field=most_far_field(calibration)).eval()
-
-
-def with_video_noise(mask: nn.Module, noise: Tensor) -> PlainContactMask:
-    """The contact mask of a network's pipeline, with the noise (3, H, W) that a video has between frames."""
-    flat, own = mask.get_buffer("flat"), 1.0 / mask.get_buffer("per_noise")
-    return ContactMask(flat, torch.maximum(own, 2.0**0.5 * noise.to(own)), far_field=MOST_FAR_FIELD).eval()

@@ -2,7 +2,6 @@
 
 import json
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -66,21 +65,20 @@ class StreamReport:
 
     Args:
         stream: whose frames are added.
-        clock: for tests.
     """
 
     HEADER = "frame,time_s,contact_mm2,deepest_mm,light"
 
-    def __init__(self, stream: TactileStream, clock: Callable[[], float] = time.perf_counter) -> None:
+    def __init__(self, stream: TactileStream) -> None:
         check_record("stream", stream, TactileStream)
-        self.stream, self._clock = stream, clock
+        self.stream = stream
         self.rows: list[tuple[int, float, float, float, str]] = []
-        self._begin = self._end = clock()
+        self._begin = self._end = time.perf_counter()
         self._pixel_mm2 = stream.calibration.sensor.mm_per_pixel**2
 
     def add(self, frame: TactileFrame) -> list[str]:
         """Add a frame; returns its figures as lines of text."""
-        self._end = self._clock()
+        self._end = time.perf_counter()
         area = float(frame.output.contact.sum()) * self._pixel_mm2
         deepest = float(frame.output.depth_mm.max())
         state = self.stream.light.state

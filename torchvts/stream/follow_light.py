@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_batch, check_field, check_least, check_positive, check_range, check_same_size, check_shape
+from ..core.checks import check_batch, check_field, check_least, check_range, check_same_size, check_shape
 from ..core.geometry import pixel_grid_mm
 from ..core.robust import tukey_weight
 from ..model.calibration import PEDESTAL
@@ -30,7 +30,7 @@ class FollowLight:
 
     * Cells (1/24 of the height) in contact or next to it, dark cells and saturated ones are never used, so that an object that lies
       on the skin is never learned.
-    * The plane is fitted to the other cells robustly (Tukey) and moves by 1 - exp(-dt / time_constant_s) of the difference.
+    * The plane is fitted to the other cells robustly (Tukey) and moves by 1 - exp(-dt / :data:`TIME_CONSTANT_S`) of the difference.
     * With less than a quarter of the cells free, nothing is learned ("held").
     * A difference of more than 3 % to the light followed so far is not drift. Without contact, or where one plane explains 90 % of
       all cells to 1 %, it is reported as a step ("stepped"). With a contact, which scatters light, and for a second after it, while
@@ -38,15 +38,13 @@ class FollowLight:
 
     Args:
         background: (3, H, W), image value of the unit without contact.
-        time_constant_s: of the following.
     Attributes:
         state: "following", "held" or "stepped".
         steps: how often the light has stepped.
         plane: (3, 3) float64, level and tilts of each channel; 1, 0, 0 at the start.
     """
 
-    def __init__(self, background: Tensor, time_constant_s: float = TIME_CONSTANT_S) -> None:
-        self.time_constant_s = check_positive("time_constant_s", time_constant_s)
+    def __init__(self, background: Tensor) -> None:
         check_field("background", background)
         check_range("background", background)
         if min(background.shape[1:]) < 4:
@@ -109,7 +107,7 @@ class FollowLight:
             self.state = "held"
         else:
             self.state = "following"
-            self.plane += (1.0 - float(np.exp(-max(0.0, seconds) / self.time_constant_s))) * change * self.plane[:, :1]
+            self.plane += (1.0 - float(np.exp(-max(0.0, seconds) / TIME_CONSTANT_S))) * change * self.plane[:, :1]
         self.steps += self.state == "stepped" and before != "stepped"
         return self.state
 

@@ -100,7 +100,6 @@ class SourceFrames:
         reader: the source.
         least: number of first frames that must be readable.
         realtime: play a recording at its own rate.
-        clock: for tests.
         stages: measures reading and waiting.
     Attributes:
         first: the first frames of which ``least`` can be read, at least one.
@@ -108,8 +107,8 @@ class SourceFrames:
         ValueError: the source has fewer.
     """
 
-    def __init__(self, reader: Reader, least: int, realtime: bool, clock: Callable[[], float], stages: StageClock) -> None:
-        self._reader, self._realtime, self._clock, self._stages = reader, realtime or reader.live, clock, stages
+    def __init__(self, reader: Reader, least: int, realtime: bool, stages: StageClock) -> None:
+        self._reader, self._realtime, self._stages = reader, realtime or reader.live, stages
         self._newest: NewestFrame | None = None
         self.first: list[Pixels | Unreadable] = []
         if reader.live:  # exposure settles
@@ -154,9 +153,9 @@ class SourceFrames:
     def _newest_ones(self, first: list[Pixels | Unreadable]) -> Iterator[NumberedFrame]:
         """The frames that are the newest when they are asked for; of a recording the first ones are played again."""
         if self._reader.live:
-            self._newest = NewestFrame(self._reader, None, self._clock)
+            self._newest = NewestFrame(self._reader)
         else:
-            self._newest = NewestFrame(_Replay(self._reader, first), self._reader.fps, self._clock)
+            self._newest = NewestFrame(_Replay(self._reader, first), self._reader.fps)
         while True:
             with self._stages.stage("wait"):
                 newest = self._newest.take()

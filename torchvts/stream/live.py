@@ -1,8 +1,7 @@
 """Depth of every frame of a source, with the time of each stage."""
 
-import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -63,7 +62,6 @@ class TactileStream:
         device: of the pipeline, "cpu" or "cuda".
         reconnect_s: for how long a camera that has stopped is opened again before an error is raised; not with a :class:`Reader`.
         contact: thresholds of contact; None for the usual ones.
-        clock: for tests.
     Attributes:
         calibration: of the unit.
         note: where the calibration comes from and what to expect of it, in words.
@@ -96,7 +94,6 @@ class TactileStream:
         device: str = "cpu",
         reconnect_s: float = 0.0,
         contact: ContactSettings | None = None,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         check_choice("mode", mode, MODES)
         if contact is not None:
@@ -110,7 +107,7 @@ class TactileStream:
         self._zero: list[Tensor] = []
         self._zero_missing = 0
         try:
-            self._frames = SourceFrames(self.reader, background_frames, realtime, clock, self.stages)
+            self._frames = SourceFrames(self.reader, background_frames, realtime, self.stages)
             self.rectify = Rectify(sensor, *self._frames.readable[0].shape[:2])
             first = torch.cat([self._rectified(pixels) for pixels in self._frames.readable])
             if isinstance(sensor_or_calibration, Calibration):

@@ -138,14 +138,9 @@ def header(frame: TactileFrame, frame_id: str, start_s: float = 0.0) -> Header:
 
 
 def image_message(frame: TactileFrame, frame_id: str = "tactile", start_s: float = 0.0) -> ImageMessage:
-    """The camera's image, rectified and in the light of the background, 8 bits of R, G, B.
+    """The camera's image, rectified and in the light of the background, 8 bits of R, G, B, encoding "rgb8".
 
-    Args:
-        frame: of a :class:`TactileStream`.
-        frame_id: name of the sensor's coordinate frame.
-        start_s: the time at which the stream started, s.
-    Returns:
-        Encoding "rgb8".
+    Arguments are those of :func:`header`.
     """
     pixels = _rgb8(frame.image)
     height, width, _ = pixels.shape
@@ -155,12 +150,7 @@ def image_message(frame: TactileFrame, frame_id: str = "tactile", start_s: float
 def depth_message(frame: TactileFrame, frame_id: str = "tactile", start_s: float = 0.0) -> ImageMessage:
     """Depth in metres, as ROS wants it: how far the skin is pressed in, not the distance to the camera.
 
-    Args:
-        frame: of a :class:`TactileStream`.
-        frame_id: name of the sensor's coordinate frame.
-        start_s: the time at which the stream started, s.
-    Returns:
-        Encoding "32FC1", little-endian.
+    Encoding "32FC1", little-endian. Arguments are those of :func:`header`.
     """
     depth_m = (1e-3 * _numpy(frame.output.depth_mm)[0, 0]).astype("<f4")
     height, width = depth_m.shape
@@ -170,13 +160,8 @@ def depth_message(frame: TactileFrame, frame_id: str = "tactile", start_s: float
 def cloud_message(frame: TactileFrame, mm_per_pixel: float, frame_id: str = "tactile", start_s: float = 0.0) -> CloudMessage:
     """The contact as points with normals: x right, y up, z towards the camera, metres.
 
-    Args:
-        frame: of a :class:`TactileStream`.
-        mm_per_pixel: pitch, mm.
-        frame_id: name of the sensor's coordinate frame.
-        start_s: the time at which the stream started, s.
-    Returns:
-        One point for each pixel in contact; none without contact.
+    One point for each pixel in contact, none without contact. ``mm_per_pixel`` is the pitch, mm; the other arguments are those of
+    :func:`header`.
     """
     out = frame.output
     points_m = 1e-3 * _numpy(depth_to_points(out.depth_mm, check_positive("mm_per_pixel", mm_per_pixel), out.contact))

@@ -8,14 +8,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..contact import ContactSettings
+from ..contact import ContactMask, ContactSettings
 from ..core.checks import check_positive, check_switch
 from ..core.spelling import suggest
 from ..model import Calibration, check_calibration
 from ..pipeline import DepthOutput, DepthPipeline, unit_pipeline
-from .background import contact_in_video, find_background, with_video_noise
+from .background import find_background
 from .follow_light import FollowLight
 from .usable import FrameCheck
+from .video_noise import with_video_noise
 
 MOST_LIGHT_CHANGE = 0.15
 """First frames whose light differs more from the calibration's are those of another unit or exposure."""
@@ -84,10 +85,8 @@ class Recording:
         self._fps, self._follow, self._stage = fps, follow, stage
         self._before: float | None = None
         image, noise = (None, None) if first is None else find_background(first)
-        if network is None:
-            self.pipe.deformed = contact_in_video(calibration, noise, contact)
-        elif noise is not None:
-            self.pipe.deformed = with_video_noise(self.pipe.deformed, noise)
+        if noise is not None and isinstance(self.pipe.deformed, ContactMask):
+            self.pipe.deformed = with_video_noise(self.pipe.deformed, noise, calibration if network is None else None)
         self.pipe.to(self.device)
         if image is not None:
             self._start(calibration, image[None])

@@ -107,9 +107,9 @@ class LiveReader:
     Args:
         open_reader: opens the source.
         reconnect_s: for how long to try to open it again after it has stopped; 0 raises at once.
-        silent_s: a source that gives no frame for this long has stopped.
         sleep: for tests.
     Attributes:
+        silent_s: a source that gives no frame for this long has stopped.
         reconnections: how often it was opened again.
     Raises:
         OSError: by :meth:`read`: the source has stopped.
@@ -121,10 +121,9 @@ class LiveReader:
         self,
         open_reader: Callable[[], Reader],
         reconnect_s: float = 0.0,
-        silent_s: float = SILENT_S,
         sleep: Callable[[float], Any] | None = None,
     ) -> None:
-        self.reconnect_s, self.silent_s = check_least("reconnect_s", reconnect_s), check_positive("silent_s", silent_s)
+        self.reconnect_s, self.silent_s = check_least("reconnect_s", reconnect_s), SILENT_S
         self.reconnections = 0
         self._closed = threading.Event()
         self._open, self._sleep = open_reader, sleep or self._closed.wait
@@ -228,8 +227,8 @@ def frames_a_second(capture: Any) -> float:
 class FolderReader:
     """A folder of images, by name."""
 
-    def __init__(self, folder: Path, fps: float = 30.0) -> None:
-        self.name, self.live, self.fps = str(folder), False, fps
+    def __init__(self, folder: Path) -> None:
+        self.name, self.live, self.fps = str(folder), False, 30.0
         files = image_files(folder)
         if not files:
             raise ValueError(

@@ -1,0 +1,79 @@
+"""Writes the files of a frame, and what all files of a run are."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..core import __version__
+from ..core.files import DEPTH_PNG_STEP_MM, DEPTH_PNG_ZERO, write_atomically, write_depth_png
+from ..core.geometry import depth_to_points
+from ..core.results import UNITS, write_result
+from ..model import Sensor
+from ..pipeline import DepthOutput
+from .loading import Frame
+from .records import VIDEO_FORMAT, Records
+
+
+class Writer:
+    """Writes the results of a run; ``name`` is that of its calibration."""
+
+    def __init__(self, records: Records, sensor: Sensor, name: str) -> None:
+        self.records, self.settings, self.sensor, self.name = records, records.settings, sensor, name
+
+    def write(self, frame: Frame, image: Tensor, result: DepthOutput) -> None:
+        """All files of a frame: its depth, its contact, its picture."""
+        pitch, name = self.sensor.mm_per_pixel, frame.item.frame_name(frame.number)
+        stem, path = self.records.out / frame.item.frame_stem(frame.number), self.records.result_file(frame.item, frame.number)
+        for folder in {stem.parent, path.parent}:
+            folder.mkdir(parents=True, exist_ok=True)
+        if self.settings.format == VIDEO_FORMAT and frame.number >= 0:  # what an earlier run joined is of other frames
+            (self.records.out / f"{frame.item.stem}.npz").unlink(missing_ok=True)
+        if path.suffix == ".npz":
+            write_result(path, result, pitch, self.name, self.sensor.name, name)
+        elif path.suffix == ".png":
+            write_depth_png(path, result.depth_mm)
+        elif path.suffix == ".npy":
+            with write_atomically(path) as temporary:
+                np.save(temporary, result.depth_mm[0, 0].numpy())
+        if self.settings.cloud != "none" and bool(result.contact.any()):
+            self._write_contact(Path(f"{stem}.{self.settings.cloud}"), result)
+        if self.settings.pictures:
+            from .. import viz
+
+            viz.save_figure(viz.depth_figure(result.depth_mm, pitch, image, result.contact, name), f"{stem}_picture.png")
+
+    def _write_contact(self, path: Path, result: DepthOutput) -> None:
+        """The contact as points or as a surface."""
+        from ..pose import write_point_cloud
+        from ..pose.surface_files import write_obj
+
+        pitch = self.sensor.mm_per_pixel
+        if path.suffix == ".obj":
+            write_obj(path, result.depth_mm, result.normal, result.contact, pitch)
+            return
+        normals = result.normal[0].permute(1, 2, 0)[result.contact[0, 0]] * torch.tensor([1.0, -1.0, 1.0])  # y up
+        write_point_cloud(path, depth_to_points(result.depth_mm, pitch, result.contact), normals)
+
+    def write_summary(self, rows: int, failed: int) -> None:
+        """summary.json: what the files are, so that they can be read without this package."""
+        settings = self.settings
+        summary = {
+            "frames": rows,
+            "left_out": failed,
+            "calibration": self.name,
+            "sensor": self.sensor.name,
+            "mm_per_pixel": self.sensor.mm_per_pixel,
+            "height": self.sensor.height,
+            "width": self.sensor.width,
+            "mode": settings.mode,
+            "format": settings.format,
+            "every": settings.every,
+            "depth_png": f"depth_mm = (value - {DEPTH_PNG_ZERO}) * {DEPTH_PNG_STEP_MM}",
+            "units": UNITS,
+            "torchvts": __version__,
+        }
+        with write_atomically(self.records.out / "summary.json") as temporary:
+            temporary.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")

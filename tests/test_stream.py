@@ -471,6 +471,13 @@ def test_a_recording_is_played_at_its_rate():
     newest.close()
 
 
+def test_who_comes_back_to_a_stream_goes_on_with_the_next_frame(unit):
+    calibration, camera = unit
+    with streams.TactileStream(Frames([camera() for _ in range(8)]), calibration, background_frames=3) as stream:
+        assert next(iter(stream)).number == 0
+        assert [frame.number for frame in stream] == [1, 2, 3, 4, 5, 6, 7]
+
+
 def test_realtime_takes_every_frame_where_there_is_time(unit):
     calibration, camera = unit
     with streams.TactileStream(Frames([camera() for _ in range(16)]), calibration, realtime=True) as stream:

@@ -92,14 +92,6 @@ def _light_change(change: Change | None, which: str, e: Examination) -> Finding 
     return None if change is None else find_light_change(change, which, e)
 
 
-def _saturated_background(e: Examination) -> float:
-    return float((e.value > 0.99).any(0).double().mean())
-
-
-def _markers(e: Examination) -> float | None:
-    return None if e.calibration.markers is None else float((e.raw != e.image).any(0).double().mean())
-
-
 def _coplanar(e: Examination) -> Figures | None:
     return {"value": e.spread, "cost": e.noise_deg} if e.spread < COPLANAR else None
 
@@ -210,10 +202,6 @@ def _number_of_contacts(e: Examination) -> float:
     return float(max(e.contacts.count, peaks(e.surface.output.depth_mm[0, 0], e.surface.contact, noise_mm)))
 
 
-def _faint_contact(e: Examination) -> float | None:
-    return e.deepest_mm if e.deepest_mm < e.calibration.sensor.mm_per_pixel else None
-
-
 def _steepest(e: Examination) -> Figures | None:
     inside = torch.where(e.surface.contact, e.surface.steepness, 0.0)
     steep = float(inside.flatten().quantile(1.0 - 0.02 * e.contacts.share))
@@ -265,11 +253,12 @@ _NO_FREE_SKIN = "contact covers the whole skin, or all light has changed: no fre
 
 CHECKS = (
     # the calibration
-    Check("calibration_saturated", _saturated_background, "{value:.0%} of the calibration image is saturated: "
-          "reduce the exposure and calibrate again", above=0.05),
+    Check("calibration_saturated", lambda e: float((e.value > 0.99).any(0).double().mean()),
+          "{value:.0%} of the calibration image is saturated: reduce the exposure and calibrate again", above=0.05),
     Check("contact_in_calibration", lambda e: e.structure, _CONTACT.format("calibration"), "fault", above=0.0),
-    Check("markers", _markers, "printed markers cover {value:.0%} of the image: they are filled from the pixels around them, which "
-          "hides details", "note"),
+    Check("markers", lambda e: None if e.calibration.markers is None else float((e.raw != e.image).any(0).double().mean()),
+          "printed markers cover {value:.0%} of the image: they are filled from the pixels around them, which hides details",
+          "note"),
     Check("lights_coplanar", _coplanar, "the lights lie nearly in one plane (smallest singular value of their directions "
           "{value:.2f}, usual is 0.8): noise alone changes normals by {cost:.1f} degrees; increase the distance of the LEDs"),
     Check("lights_misfit", lambda e: _light_change(e.calibration_change, "calibration", e)),
@@ -323,8 +312,8 @@ CHECKS = (
           "border: the part beyond is not seen, and depth there is less certain", "note", unless=LOOKS_LIKE_CONTACT),
     Check("several_contacts", _number_of_contacts, "{value:.0f} contacts, or summits of one", "note", above=1.0,
           unless=LOOKS_LIKE_CONTACT),
-    Check("faint_contact", _faint_contact, "faint contact: {value:.3f} mm at its deepest, less than a pixel; its rim is below the "
-          "noise", "note"),
+    Check("faint_contact", lambda e: e.deepest_mm if e.deepest_mm < e.calibration.sensor.mm_per_pixel else None,
+          "faint contact: {value:.3f} mm at its deepest, less than a pixel; its rim is below the noise", "note"),
     Check("steep_walls", _steepest, "walls of {value:.0f} degrees: a light may be blocked there, and integration cannot keep a "
           "step; use precise mode, trust the top only", "note"),
     Check("shadow", _shadow, "a light is blocked in {value:.0%} of the contact: slopes there are estimated from two lights; press "

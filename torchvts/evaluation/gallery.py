@@ -155,29 +155,23 @@ def _since(change: Callable[[float, int], Conditions]) -> Callable[[float, int],
     return lambda severity, seed: _case(_scene(_press(seed)), seed, USUAL, change(severity, seed))
 
 
-def _deeper(severity: float, seed: int) -> Case:
-    return _case(_scene(_press(seed, severity)), seed)
+def _shaped(relief: Callable[[float, int], Relief]) -> Callable[[float, int], Case]:
+    """Another shape."""
+    return lambda severity, seed: _case(_scene(relief(severity, seed)), seed)
 
 
-def _steep(severity: float, seed: int) -> Case:
-    return _case(_scene(stamp(3.5, PRESS_MM, severity, *_place(seed))), seed)
+def _lit(lights_at: Callable[[float], PointLights], shadows: bool = False) -> Callable[[float, int], Case]:
+    """Other lights, which the user knows."""
 
-
-def _ends(severity: float, seed: int) -> Case:
-    return _case(_scene(roof(PRESS_MM, 0.4, severity, 9.0, *_place(seed))), seed)
-
-
-def _lowered(shadows: bool) -> Callable[[float, int], Case]:
     def make(severity: float, seed: int) -> Case:
-        lights = rig_lights(ELEVATION_DEG - severity)
+        lights = lights_at(severity)
         return _case(_scene(_press(seed)), seed, replace(USUAL, lights=lights, shadows=shadows), lights=lights)
 
     return make
 
 
-def _exposed(severity: float, seed: int) -> Case:
-    lights = PointLights(LIGHTS.position_mm, LIGHTS.albedo * severity)  # the user knows the exposure
-    return _case(_scene(_press(seed)), seed, replace(USUAL, lights=lights), lights=lights)
+def _lowered(severity: float) -> PointLights:
+    return rig_lights(ELEVATION_DEG - severity)
 
 
 def _specks(severity: float, seed: int) -> Conditions:
@@ -215,15 +209,6 @@ def _moved(severity: float, seed: int) -> Conditions:
     angle = math.radians(10.0 + SPACING_DEG * (seed % 3) + 90.0)  # sideways, around the middle
     position[seed % 3] += severity * torch.tensor([math.cos(angle), math.sin(angle), 0.0])
     return replace(USUAL, lights=PointLights(position, LIGHTS.albedo))
-
-
-def _together(severity: float, seed: int) -> Case:
-    lights = rig_lights(spacing_deg=SPACING_DEG - severity)
-    return _case(_scene(_press(seed)), seed, replace(USUAL, lights=lights), lights=lights)
-
-
-def _wrong_pitch(severity: float, seed: int) -> Case:
-    return _case(_scene(_press(seed), MM_PER_PIXEL * (1.0 + severity)), seed)
 
 
 def _distorted(severity: float, seed: int) -> Case:
@@ -276,24 +261,15 @@ def _dots(x: Tensor, y: Tensor, diameter_mm: float) -> Tensor:
     return (1.0 - 0.7 * cover)[None, None]
 
 
-def _cut(severity: float, seed: int) -> Case:
-    _, y = _place(seed)
-    return _case(_scene(ball(RADIUS_MM, PRESS_MM, severity, y)), seed)
-
-
-def _covering(severity: float, seed: int) -> Case:
-    return _case(_scene(_press(seed, severity, 40.0)), seed)
-
-
-def _two(severity: float, seed: int) -> Case:
+def _two(severity: float, seed: int) -> Relief:
     x, y = _place(seed)
     half_distance = 0.5 * (2.0 * math.sqrt(4.0**2 - 3.4**2) - severity)  # rims of balls of 4 mm, 0.6 mm deep
     one, other = (ball(4.0, 0.6, x + side * half_distance, y + side * 0.3) for side in (-1.0, 1.0))
-    return _case(_scene(lambda x, y: torch.maximum(one(x, y), other(x, y))), seed)
+    return lambda x, y: torch.maximum(one(x, y), other(x, y))
 
 
-def _faint(severity: float, seed: int) -> Case:
-    return _case(_scene(_press(seed, severity) if severity else lambda x, y: 0.0 * x * y - 1.0), seed)
+def _faint(severity: float, seed: int) -> Relief:
+    return _press(seed, severity) if severity else lambda x, y: 0.0 * x * y - 1.0
 
 
 def _sagging(severity: float, seed: int) -> Case:
@@ -325,26 +301,29 @@ CORRUPTIONS: dict[str, Corruption] = {
     corruption.name: corruption
     for corruption in (
         # shape
-        Corruption("deeper press", "mm", (1.0, 1.5, 2.0, 3.0, 4.0, 5.0), _deeper,
+        Corruption("deeper press", "mm", (1.0, 1.5, 2.0, 3.0, 4.0, 5.0), _shaped(lambda s, seed: _press(seed, s)),
             "A ball of radius 6 mm goes deeper: the slope at its rim is 0.7 at 1 mm and 5.9 at 5 mm."),
-        Corruption("steep walls", "mm/mm", (0.5, 1.0, 2.0, 4.0, 8.0, 30.0), _steep,
+        Corruption("steep walls", "mm/mm", (0.5, 1.0, 2.0, 4.0, 8.0, 30.0),
+            _shaped(lambda s, seed: stamp(3.5, PRESS_MM, s, *_place(seed))),
             "The flanks of a round stamp, 1 mm high, become narrower, up to a step between two pixels."),
-        Corruption("cut ends", "mm/mm", (0.4, 0.8, 1.5, 3.0, 8.0, 100.0), _ends,
+        Corruption("cut ends", "mm/mm", (0.4, 0.8, 1.5, 3.0, 8.0, 100.0),
+            _shaped(lambda s, seed: roof(PRESS_MM, 0.4, s, 9.0, *_place(seed))),
             "The ends of a roof-shaped wedge, 1 mm high, become steeper, up to vertical."),
-        Corruption("cut by the border", "mm", (0.0, 5.0, 7.0, 8.0, 9.0, 10.0, 11.5), _cut,
+        Corruption("cut by the border", "mm", (0.0, 5.0, 7.0, 8.0, 9.0, 10.0, 11.5),
+            _shaped(lambda s, seed: ball(RADIUS_MM, PRESS_MM, s, _place(seed)[1])),
             "The ball moves from the middle to the image border, until only its flank is visible."),
-        Corruption("covers the image", "mm", (0.1, 0.3, 0.6, 1.0, 1.5, 2.2), _covering,
+        Corruption("covers the image", "mm", (0.1, 0.3, 0.6, 1.0, 1.5, 2.2), _shaped(lambda s, seed: _press(seed, s, 40.0)),
             "A ball of radius 40 mm goes deeper, until no undeformed skin is visible."),
-        Corruption("two contacts", "mm", (-2.0, -0.5, 0.0, 0.5, 1.5, 3.0), _two,
+        Corruption("two contacts", "mm", (-2.0, -0.5, 0.0, 0.5, 1.5, 3.0), _shaped(_two),
             "Two balls come closer, until their contacts overlap and meet in a crease."),
-        Corruption("faint contact", "mm", (1.0, 0.3, 0.1, 0.05, 0.02, 0.01, 0.0), _faint,
+        Corruption("faint contact", "mm", (1.0, 0.3, 0.1, 0.05, 0.02, 0.01, 0.0), _shaped(_faint),
             "The ball presses less and less, until it does not touch at all."),
         Corruption("gel sag", "mm", (0.0, 0.25, 0.5, 1.0, 2.0, 4.0), _sagging,
             "The gel goes down around the object too: a transition zone of this length, which the object does not touch."),
         # light
-        Corruption("attached shadows", "deg", (0.0, 10.0, 20.0, 30.0, 35.0, 40.0, 45.0), _lowered(False),
+        Corruption("attached shadows", "deg", (0.0, 10.0, 20.0, 30.0, 35.0, 40.0, 45.0), _lit(_lowered),
             "The lights stand lower than 50 degrees by this angle: slopes that face away from a light get none of it."),
-        Corruption("cast shadows", "deg", (0.0, 10.0, 20.0, 30.0, 35.0, 40.0, 45.0), _lowered(True),
+        Corruption("cast shadows", "deg", (0.0, 10.0, 20.0, 30.0, 35.0, 40.0, 45.0), _lit(_lowered, shadows=True),
             "The same, and the ball casts its shadow on the skin behind it."),
         Corruption("specular", "", (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), _always(lambda s: replace(USUAL, specular=s)),
             "The skin shines: a Blinn-Phong lobe of exponent 30 in addition to the diffuse light."),
@@ -358,7 +337,8 @@ CORRUPTIONS: dict[str, Corruption] = {
             "One LED fails after calibration, then a second."),
         Corruption("a light moves", "mm", (0.0, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0), _since(_moved),
             "One LED, 40 mm away, is shifted sideways after calibration."),
-        Corruption("lights close together", "deg", (0.0, 40.0, 80.0, 100.0, 110.0, 116.0), _together,
+        Corruption("lights close together", "deg", (0.0, 40.0, 80.0, 100.0, 110.0, 116.0),
+            _lit(lambda s: rig_lights(spacing_deg=SPACING_DEG - s)),
             "The angle between the lights is less than 120 degrees by this much: the light matrix becomes ill-conditioned."),
         # skin
         Corruption("albedo drift", "share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.3), _since(_worn),
@@ -378,10 +358,12 @@ CORRUPTIONS: dict[str, Corruption] = {
             "Barrel distortion: the corners show skin that is nearer to the middle by this share."),
         Corruption("perspective", "deg", (0.0, 5.0, 10.0, 20.0, 30.0, 45.0), _perspective,
             "The camera is a pinhole with this angle of view to either side, and is treated as orthographic."),
-        Corruption("wrong pitch", "share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.2), _wrong_pitch,
+        Corruption("wrong pitch", "share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.2),
+            lambda s, seed: _case(_scene(_press(seed), MM_PER_PIXEL * (1.0 + s)), seed),
             "A pixel is larger than the sensor file says."),
         # sensor
-        Corruption("saturation", "times", (1.0, 1.3, 1.6, 2.0, 2.5, 3.0), _exposed,
+        Corruption("saturation", "times", (1.0, 1.3, 1.6, 2.0, 2.5, 3.0),
+            _lit(lambda s: PointLights(LIGHTS.position_mm, LIGHTS.albedo * s)),
             "The exposure is longer, which the user knows: bright slopes clip, then the skin itself."),
         Corruption("black crush", "value", (0.0, 0.02, 0.05, 0.1, 0.2, 0.4), _always(lambda s: replace(USUAL, black=s)),
             "The camera subtracts a black level that the calibration does not know: dark slopes become black."),

@@ -134,12 +134,9 @@ def _reference(calibration: Calibration) -> Built:
     return built._replace(reconstruct=reference_only()(built.reconstruct), note="no compiled kernels")
 
 
-def _zero_border(calibration: Calibration) -> Built:
-    return pipeline(calibration, "fast", integrate=PoissonDST(calibration.sensor.mm_per_pixel))
-
-
-def _scipy(calibration: Calibration) -> Built:
-    return pipeline(calibration, "fast", integrate=PoissonSciPy(calibration.sensor.mm_per_pixel))
+def _integrated(mode: str, integrator: Callable[[float], nn.Module]) -> FromCalibration:
+    """The pipeline with another integrator, made of the pitch in mm."""
+    return lambda calibration: pipeline(calibration, mode, integrate=integrator(calibration.sensor.mm_per_pixel))
 
 
 def _plain_inverse(calibration: Calibration) -> Built:
@@ -155,10 +152,6 @@ def _plain_inverse(calibration: Calibration) -> Built:
 def _blurred(calibration: Calibration) -> Built:
     """Images blurred by one pixel, as with ``Sensor(blur_px=1)``."""
     return pipeline(dataclasses.replace(calibration, sensor=dataclasses.replace(calibration.sensor, blur_px=1.0)), "precise")
-
-
-def _discontinuities(calibration: Calibration) -> Built:
-    return pipeline(calibration, "precise", integrate=AdaptiveIntegration(calibration.sensor.mm_per_pixel))
 
 
 def _pinhole(calibration: Calibration) -> Built:
@@ -283,12 +276,14 @@ METHODS: dict[str, Method] = {
             {"color": "#d55e00", "lw": 2.2},
         ),
         Method("auto", partial(pipeline, mode="auto"), style={"color": "#e69f00", "lw": 1.6, "ls": (0, (4, 1))}),
-        Method("fast, zero border", _zero_border, style={"color": "#56b4e9", "lw": 1.6, "ls": "--"}),
-        Method("fast, SciPy's DCT", _scipy, ours=False, needs_module="scipy"),
+        Method("fast, zero border", _integrated("fast", PoissonDST), style={"color": "#56b4e9", "lw": 1.6, "ls": "--"}),
+        Method("fast, SciPy's DCT", _integrated("fast", PoissonSciPy), ours=False, needs_module="scipy"),
         Method("fast, PyTorch reference", _reference),
         Method("precise, plain inverse", _plain_inverse, style={"color": "#cc79a7", "lw": 1.6, "ls": (0, (6, 1, 1, 1))}),
         Method("precise, blur 1 px", _blurred, style={"color": "#009e73", "lw": 1.6, "ls": (0, (2, 1))}),
-        Method("precise, discontinuities", _discontinuities, style={"color": "black", "lw": 1.4, "ls": "-."}),
+        Method(
+            "precise, discontinuities", _integrated("precise", AdaptiveIntegration), style={"color": "black", "lw": 1.4, "ls": "-."}
+        ),
         Method("precise, pinhole", _pinhole, style={"color": "#7a5195", "lw": 1.6, "ls": (0, (1, 1))}),
         Method("point lights", from_presses=point_lights, learns=False),
         Method("look-up table", _lookup_by_rendered_balls, lookup_table, ours=False),

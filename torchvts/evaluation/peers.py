@@ -1,8 +1,5 @@
 """Methods of other libraries to compare with: SciPy's cosine transform, and a frame as gs_sdk computes it."""
 
-import importlib
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -94,13 +91,3 @@ class GsSdkPipeline:
 def as_output(depth_mm: Tensor, gradient: Tensor, contact: Tensor) -> DepthOutput:
     """Depth (B, 1, H, W), gradient (B, 2, H, W) and contact (B, 1, H, W) in the form of a pipeline."""
     return DepthOutput(depth_mm, gradient, normal_from_gradient(gradient), contact, contact)  # gs_sdk knows one mask
-
-
-def installed_gs_sdk(weights: Path, background: "np.ndarray[Any, Any]", mm_per_pixel: float) -> Callable[[Any], object] | None:
-    """A frame of gs_sdk itself, if it is installed (it is not on PyPI: the package of that name there is another one)."""
-    try:
-        reconstructor = importlib.import_module("gs_sdk.gs_reconstruct").Reconstructor(str(weights))
-        reconstructor.load_bg(background)
-    except ImportError:
-        return None
-    return lambda pixels: reconstructor.get_surface_info(pixels, mm_per_pixel)

@@ -23,7 +23,7 @@ from ..scenes import Scene, render, sphere_press
 from . import rows as records
 from .methods import METHODS, Built, Reconstruct, lookup_table, point_lights, shipped_prior
 from .metrics import depth_error, normal_angle_deg
-from .peers import GsSdkPipeline, installed_gs_sdk
+from .peers import GsSdkPipeline
 from .presses import Training
 from .rows import Column, Row, Size, Time, error_column, mean, number
 from .score import score_press
@@ -208,17 +208,12 @@ def _sensor(bench: Bench, data: Path) -> Iterator[Row]:
         errors = _ball_errors(built.reconstruct, scored, sensor.mm_per_pixel)
         row = Row("sensor", method, name, errors, size, ours=method != "look-up table", seen=seen, note=built.note)
         yield bench.timed(replace(row, parameters=built.parameters), partial(built.reconstruct, image[None]))
-    weights = folder / "model" / "nnmodel.pth"
-    pixels = gs_sdk.image_to_bgr(image)
     if find_spec("scipy") is not None:
-        peer = GsSdkPipeline(NormalFromMLP.load(weights, background), background)
+        peer = GsSdkPipeline(NormalFromMLP.load(folder / "model" / "nnmodel.pth", background), background)
         errors = _ball_errors(partial(peer.as_output, mm_per_pixel=sensor.mm_per_pixel), scored, sensor.mm_per_pixel)
         note = "its network, trained on these very presses; its steps by its published format"
-        yield bench.timed(Row("sensor", GS_SDK, name, errors, size, ours=False, seen=True, note=note), partial(peer, pixels))
-    own = installed_gs_sdk(weights, gs_sdk.image_to_bgr(background), sensor.mm_per_pixel)
-    if own is not None:
-        row = Row("sensor", "gs_sdk, installed", name, size=size, ours=False, note="time only")
-        yield bench.timed(row, partial(own, pixels))
+        row = Row("sensor", GS_SDK, name, errors, size, ours=False, seen=True, note=note)
+        yield bench.timed(row, partial(peer, gs_sdk.image_to_bgr(image)))
 
 
 def _sensor_methods(training: Training, sensor: Sensor) -> Iterator[tuple[str, Built, bool]]:

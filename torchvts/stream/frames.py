@@ -1,9 +1,9 @@
 """The frames of a source with number and time: of a recording all, of a source that does not wait the newest."""
 
-import itertools
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from ..core.checks import check_positive
@@ -110,7 +110,8 @@ class SourceFrames:
     def __init__(self, reader: Reader, least: int, realtime: bool, stages: StageClock) -> None:
         self._reader, self._realtime, self._stages = reader, realtime or reader.live, stages
         self._newest: NewestFrame | None = None
-        self.first: list[Pixels | Unreadable] = []
+        self._given = 0
+        self.first: deque[Pixels | Unreadable] = deque()
         if reader.live:  # exposure settles
             for _ in range(SETTLING):
                 reader.read()
@@ -134,28 +135,28 @@ class SourceFrames:
         return 0 if self._newest is None else self._newest.dropped
 
     def __iter__(self) -> Iterator[NumberedFrame]:
-        first, self.first = self.first, []
-        return self._newest_ones(first) if self._realtime else self._all(first)
+        return self._newest_ones() if self._realtime else self._all()
 
-    def _all(self, first: list[Pixels | Unreadable]) -> Iterator[NumberedFrame]:
+    def _all(self) -> Iterator[NumberedFrame]:
         """Every frame, the first ones again."""
-        for index, pixels in enumerate(first):
-            yield index, index / self._reader.fps, pixels
-        start = len(first)
-        first.clear()
-        for index in itertools.count(start):
-            with self._stages.stage("read"):
-                following = self._reader.read()
-            if following is None:
+        while True:
+            if self.first:
+                pixels: Pixels | Unreadable | None = self.first.popleft()
+            else:
+                with self._stages.stage("read"):
+                    pixels = self._reader.read()
+            if pixels is None:
                 return
-            yield index, index / self._reader.fps, following
+            index, self._given = self._given, self._given + 1
+            yield index, index / self._reader.fps, pixels
 
-    def _newest_ones(self, first: list[Pixels | Unreadable]) -> Iterator[NumberedFrame]:
+    def _newest_ones(self) -> Iterator[NumberedFrame]:
         """The frames that are the newest when they are asked for; of a recording the first ones are played again."""
-        if self._reader.live:
+        if self._newest is None and self._reader.live:
+            self.first.clear()  # they are gone
             self._newest = NewestFrame(self._reader)
-        else:
-            self._newest = NewestFrame(_Replay(self._reader, first), self._reader.fps)
+        elif self._newest is None:
+            self._newest = NewestFrame(_Replay(self._reader, self.first), self._reader.fps)
         while True:
             with self._stages.stage("wait"):
                 newest = self._newest.take()
@@ -171,13 +172,12 @@ class SourceFrames:
 class _Replay:
     """A reader that gives frames that were already read, then those of another reader."""
 
-    def __init__(self, reader: Reader, first: Sequence[Pixels | Unreadable]) -> None:
+    def __init__(self, reader: Reader, first: deque[Pixels | Unreadable]) -> None:
         self.name, self.live, self.fps = reader.name, reader.live, reader.fps
-        self._reader, self._first = reader, iter(list(first))
+        self._reader, self._first = reader, first
 
     def read(self) -> Pixels | Unreadable | None:
-        pixels = next(self._first, None)
-        return self._reader.read() if pixels is None else pixels
+        return self._first.popleft() if self._first else self._reader.read()
 
     def close(self) -> None:
         self._reader.close()

@@ -15,6 +15,7 @@ from ..accelerated.gate import usable
 from .alignment import twist_units
 from .ambiguity import field_with_fitted_curvature, find_unknown, information_of_noise
 from .inverse import Array, Field, Pixels, reference_pixels
+from .jackknife import shared_error
 from .relief import LEAST_PIXELS, DepthFrame, Levels, Relief, least_depth_mm, levels
 
 SOME, MANY = 2000, 8000
@@ -148,6 +149,7 @@ class Keyframe:
         probe: (M, 3), points of the contact, mm.
         held: (6, k) scaled twists that the whole contact does not determine.
         bias: (6, 6), the part of the information of a coarse pixel that noise causes.
+        shared_error: how many times larger the variance of a pose is than its parts show.
     """
 
     levels: Levels
@@ -161,6 +163,7 @@ class Keyframe:
     probe: Array
     held: Array
     bias: Tensor
+    shared_error: float
 
     @cached_property
     def most_bias(self) -> float:
@@ -196,6 +199,7 @@ def make_keyframe(frame: Contact, mm_per_pixel: float) -> Keyframe:
         probe=fine.points[:: max(1, len(fine.points) // 64)].double().numpy(),
         held=held,
         bias=information_of_noise(made.noise, made.coarse.pitch),
+        shared_error=shared_error(many.points[:, :2].double().numpy(), PARTS),
     )
 
 

@@ -4,11 +4,11 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from ..accelerated import ZeroBackground
 from ..core.geometry import gradient_of_depth, normal_from_gradient
@@ -19,14 +19,38 @@ from ..pose import PoseTracker, Registration, register_depth
 from ..pose.result import invert, turn_deg
 from ..scenes import objects, render
 from ..viz import new_figure
+from .faults import gaussian_blur
 from .pose_accuracy import GOAL_DEG, GOAL_MM, rig
 from .rows import markdown
 
 OBJECTS = ("key", "textured patch", "tool handle", "gear", "bottle cap", "bolt head")
 """The six objects of the tracking bench."""
 
-NOISES = {"noise 0.002": (0.002, 0.0), "noise 0.005": (0.005, 0.0), "slopes off by 3 degrees": (0.005, 3.0)}
-"""Standard deviation of the image, and root mean square error of the slopes, degrees."""
+WAVES, WAVES_SLOPE, FINE_SHARE, FINE_MM = 96, 0.4, 0.3, 0.14
+"""Of the slope errors of real sensors: number of waves drawn, length over slopes, and share and length (mm) of fine waves."""
+
+
+class Noise(NamedTuple):
+    """What is wrong with the frames of a track.
+
+    Attributes:
+        image_std: standard deviation of the image.
+        slopes_deg: root mean square error of the slopes, degrees.
+        waves_mm: length over which errors of slopes are alike.
+    """
+
+    image_std: float
+    slopes_deg: float = 0.0
+    waves_mm: float = 2.5
+
+
+NOISES = {
+    "noise 0.002": Noise(0.002),
+    "noise 0.005": Noise(0.005),
+    "slopes off by 3 degrees": Noise(0.005, 3.0),
+    "slopes off by 3 degrees, long waves": Noise(0.005, 3.0, 4.5),
+}
+"""Noises of the bench: waves as balls on real sensors show them, and as wide contacts of drawn sensors do."""
 
 
 @dataclass(frozen=True)
@@ -140,15 +164,13 @@ class TrackRow:
     drift_deg: float = math.nan
 
 
-def record(
-    target: objects.Target, motion: Motion, noise: tuple[float, float], seed: int, unit: tuple[PointLights, DepthPipeline]
-) -> Track:
+def record(target: objects.Target, motion: Motion, noise: Noise, seed: int, unit: tuple[PointLights, DepthPipeline]) -> Track:
     """Render and measure an object that moves; 320 x 240, 8 bits.
 
     Args:
         target: the object.
         motion: its motion.
-        noise: standard deviation of the image, and error of the slopes in degrees, as of :data:`NOISES`.
+        noise: of the images and of the slopes.
         seed: of motion and noise.
         unit: lights and pipeline, as of :func:`torchvts.evaluation.pose_accuracy.rig`.
     """
@@ -158,34 +180,58 @@ def record(
     for k, pose in enumerate(poses):
         scene = objects.press(target.height_mm, pose, 240, 320, pipe.mm_per_pixel)
         with torch.inference_mode():
-            frame = pipe(render(scene, lights, noise_std=noise[0], bits=8, seed=1000 * seed + k))
-        frames.append(wrong_slopes(frame, noise[1], seed, pipe.mm_per_pixel) if noise[1] > 0 else frame)
+            frame = pipe(render(scene, lights, noise_std=noise.image_std, bits=8, seed=1000 * seed + k))
+        frames.append(frame)
+    if noise.slopes_deg > 0.0:
+        unit_errs = WrongSlopes(frames[0], noise, seed, pipe.mm_per_pixel)
+        frames = [unit_errs(frame, k) for k, frame in enumerate(frames)]
     return Track(poses, frames, pipe.mm_per_pixel)
 
 
-def wrong_slopes(frame: DepthOutput, error_deg: float, seed: int, mm_per_pixel: float) -> DepthOutput:
-    """A frame whose slopes err as those of a calibrated sensor do: smoothly over the image, partly in proportion to the slope.
+class WrongSlopes:
+    """A unit whose calibration errs: frames with wrong slopes, and the depth that these have.
+
+    The error has the covariances that held-out presses of balls on two GelSight Minis and a DIGIT have (docs/tracking.md): most of
+    it is one smooth random function of place and slope, the same in all frames; :data:`FINE_SHARE` of its square has fine waves
+    that differ from frame to frame. Undeformed skin stays zero, as pipelines hold it.
 
     Args:
-        frame: one frame.
-        error_deg: root mean square error inside the contact, degrees.
-        seed: of the unit: its error is the same in all frames.
+        reference: the frame in whose contact the root mean square error is as asked.
+        noise: what is asked.
+        seed: of the unit.
         mm_per_pixel: pixel pitch, mm.
-    Returns:
-        The frame with wrong slopes and the depth that they have; undeformed skin stays zero, as pipelines hold it.
+    Source:
+        random Fourier features: Rahimi, Recht, NIPS 2007.
     """
-    generator = torch.Generator().manual_seed(seed + 77)
-    maps = interpolate(torch.randn(1, 6, 4, 5, generator=generator), frame.depth_mm.shape[-2:], mode="bicubic", align_corners=True)
-    slope, inside = frame.gradient, frame.deformed.to(frame.depth_mm.dtype)
-    gain = torch.stack(((maps[:, :2] * slope).sum(1), (maps[:, 2:4] * slope).sum(1)), 1)
-    size = (gain * inside).square().sum().div(inside.sum().clamp_min(1.0)).sqrt().clamp_min(1e-6)
-    depth = 0.03 * poisson_dst((maps[:, 4:] + gain / size) * inside, mm_per_pixel)
-    depth = ZeroBackground()(frame.depth_mm + depth, frame.deformed) - frame.depth_mm  # a pipeline knows where skin is undeformed
-    error = gradient_of_depth(depth, mm_per_pixel) * inside
-    there = error.square().sum(1, keepdim=True)[frame.contact]
-    scale = math.tan(math.radians(error_deg)) / max(float(there.mean().sqrt()) if len(there) else 0.0, 1e-6)
-    gradient = slope + scale * error
-    return frame._replace(gradient=gradient, depth_mm=frame.depth_mm + scale * depth, normal=normal_from_gradient(gradient))
+
+    def __init__(self, reference: DepthOutput, noise: Noise, seed: int, mm_per_pixel: float) -> None:
+        generator = torch.Generator().manual_seed(seed + 77)
+        lengths = torch.tensor([noise.waves_mm, noise.waves_mm, WAVES_SLOPE, WAVES_SLOPE])
+        self._frequency = torch.randn(WAVES, 4, generator=generator) / lengths
+        self._phase = 2.0 * math.pi * torch.rand(WAVES, generator=generator)
+        self._size = math.sqrt(2.0 * (1.0 - FINE_SHARE) / WAVES) * torch.randn(2, WAVES, generator=generator)
+        self._seed, self._pitch, self._scale = seed, mm_per_pixel, 1.0
+        error = self._error(reference, 0)[0].square().sum(1, keepdim=True)[reference.contact]
+        self._scale = math.tan(math.radians(noise.slopes_deg)) / max(float(error.mean().sqrt()), 1e-6)
+
+    def __call__(self, frame: DepthOutput, number: int) -> DepthOutput:
+        """The frame of such a number, 0 for the reference, as the unit measures it."""
+        error, depth = self._error(frame, number)
+        gradient = frame.gradient + error
+        return frame._replace(gradient=gradient, depth_mm=frame.depth_mm + depth, normal=normal_from_gradient(gradient))
+
+    def _error(self, frame: DepthOutput, number: int) -> tuple[Tensor, Tensor]:
+        """Errors of slopes (1, 2, H, W) and depth (1, 1, H, W), as pipelines make them: of depth, zero on undeformed skin."""
+        generator = torch.Generator().manual_seed(100003 * self._seed + number)
+        fine = gaussian_blur(torch.randn(frame.gradient.shape, generator=generator), FINE_MM / self._pitch)
+        raw = (math.sqrt(FINE_SHARE) / float(fine.std())) * fine * frame.deformed
+        row, column = torch.nonzero(frame.deformed[0, 0], as_tuple=True)
+        place = self._pitch * torch.stack((column, row), 1)
+        at = torch.cat((place, frame.gradient[0, :, row, column].T), 1)  # (N, 4)
+        raw[0, :, row, column] += self._size @ torch.cos(at @ self._frequency.T + self._phase).T
+        small = 0.03 * poisson_dst(raw, self._pitch)  # too small to move where skin is undeformed
+        depth = ZeroBackground()(frame.depth_mm + small, frame.deformed) - frame.depth_mm
+        return self._scale * gradient_of_depth(depth, self._pitch) * frame.deformed, self._scale * depth
 
 
 def follow_track(track: Track, motion: Motion, row: TrackRow) -> TrackRow:

@@ -15,6 +15,7 @@ from ..accelerated.gate import usable
 from .alignment import twist_units
 from .ambiguity import field_with_fitted_curvature, find_unknown, information_of_noise
 from .inverse import Array, Field, Pixels, reference_pixels
+from .jackknife import shared_error
 from .relief import LEAST_PIXELS, DepthFrame, Levels, Relief, least_depth_mm, levels
 
 SOME, MANY = 2000, 8000
@@ -27,6 +28,9 @@ PARTS = 8
 
 Image = npt.NDArray[Any]
 Mask = npt.NDArray[Any]
+
+ZERO_OFF_MM = 0.03
+"""Undeformed skin further than this from zero is a zero that the pipeline has set wrong; it is right to 0.005 mm otherwise."""
 
 _NEIGHBOURS = np.ones((3, 3), np.uint8)
 
@@ -52,7 +56,7 @@ class Unusable(ValueError):
 
 
 def contact_frame(frame: DepthFrame) -> Contact:
-    """Depth, gradient and contact of one frame, on the CPU, float32.
+    """Depth above undeformed skin, gradient and contact of one frame, on the CPU, float32.
 
     Raises:
         TypeError: no DepthOutput.
@@ -74,7 +78,18 @@ def contact_frame(frame: DepthFrame) -> Contact:
         raise Unusable("depth or gradient is not finite")
     if int(torch.count_nonzero(contact)) < LEAST_PIXELS:
         raise Unusable("no contact")
-    return Contact(depth, gradient, contact)
+    level = _undeformed_mm(depth, contact)
+    return Contact(depth - level if abs(level) > ZERO_OFF_MM else depth, gradient, contact)
+
+
+def _undeformed_mm(depth: Tensor, contact: Tensor) -> float:
+    """Median depth outside of the contact, mm, by every eighth pixel; zero where less than half of the image is outside.
+
+    A pipeline that takes a part of the object for undeformed skin puts its zero on it, and lowers all depths of the frame alike.
+    """
+    outside = depth[..., ::8, ::8][~contact[..., ::8, ::8]]
+    enough = 2 * outside.numel() >= depth[..., ::8, ::8].numel()
+    return float(outside.median()) if enough else 0.0
 
 
 def grids(frame: Contact, mm_per_pixel: float, least_mm: float, times: tuple[int, int]) -> Grids:
@@ -148,6 +163,7 @@ class Keyframe:
         probe: (M, 3), points of the contact, mm.
         held: (6, k) scaled twists that the whole contact does not determine.
         bias: (6, 6), the part of the information of a coarse pixel that noise causes.
+        shared_error: how many times larger the variance of a pose is than its parts show.
     """
 
     levels: Levels
@@ -161,6 +177,7 @@ class Keyframe:
     probe: Array
     held: Array
     bias: Tensor
+    shared_error: float
 
     @cached_property
     def most_bias(self) -> float:
@@ -196,6 +213,7 @@ def make_keyframe(frame: Contact, mm_per_pixel: float) -> Keyframe:
         probe=fine.points[:: max(1, len(fine.points) // 64)].double().numpy(),
         held=held,
         bias=information_of_noise(made.noise, made.coarse.pitch),
+        shared_error=shared_error(many.points[:, :2].double().numpy(), PARTS),
     )
 
 

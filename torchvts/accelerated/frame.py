@@ -32,7 +32,7 @@ from .blocks import (
 from .derived import flat_is_one, pedestals, response_lines
 from .gate import usable
 from .memory import empty
-from .threads import by_frames
+from .threads import by_frames, parts_of, within_frame
 
 INTEGER, REAL, POINTER = ctypes.c_int32, ctypes.c_float, ctypes.c_void_p
 
@@ -136,11 +136,12 @@ def _run(program: Program, images: Tensor) -> DepthOutput | None:
     out = DepthOutput(*maps, *masks)
     kernel, at, pixels = kernels.loaded().solve_frames, ctypes.byref(program), height * width
     image, depth, gradient, normal, contact, deformed = (tensor.data_ptr() for tensor in (images, *out))
+    threads = within_frame() if parts_of(count, pixels) == 1 else 1
 
     def some(first: int, many: int) -> int:
         place = 4 * pixels * first
         rest = (depth + place, gradient + 2 * place, normal + 3 * place, contact + pixels * first, deformed + pixels * first)
-        return int(kernel(at, image + 3 * place, many, *rest))
+        return int(kernel(at, image + 3 * place, many, threads, *rest))
 
     trouble = by_frames(count, pixels, some)
     if trouble == 1:

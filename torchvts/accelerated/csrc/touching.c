@@ -43,6 +43,29 @@ WIDE static void subtract(const float *restrict a, const float *restrict b, int 
     for (int x = 0; x < n; x++) result[x] = a[x] - b[x];
 }
 
+enum { ROWS = 4 };
+
+/* Running sums along ROWS rows, `step` floats apart, to `sums`, of each cell those of all rows together. Each sum waits for the one before it, so several
+   rows are summed at once. */
+static void run_along(const float *rows, int step, int columns, float *restrict sums) {
+    double total[ROWS] = {0.0};
+    memset(sums, 0, ROWS * sizeof(float));
+    for (int x = 0; x < columns; x++)
+        for (int k = 0; k < ROWS; k++) {
+            total[k] += (double)rows[k * step + x];
+            sums[ROWS * (x + 1) + k] = (float)total[k];
+        }
+}
+
+/* Means over `reach` cells either way of row k of those, zero beyond the border. */
+WIDE static void means_along(const float *restrict sums, int columns, int reach, float area, float *restrict to) {
+    const int inner = columns - reach;
+    int x = 0;
+    for (; x < reach && x < columns; x++) to[x] = sums[ROWS * least(x + reach + 1, columns)] / area;
+    for (; x < inner; x++) to[x] = (sums[ROWS * (x + reach + 1)] - sums[ROWS * (x - reach)]) / area;
+    for (; x < columns; x++) to[x] = (sums[ROWS * columns] - sums[ROWS * (x - reach)]) / area;
+}
+
 /* Mean over `reach` cells either way, by running sums as torch rounds them; zero beyond the border. */
 static void box(const Cells *at, const float *values, int reach, float *result) {
     const int rows = at->rows, columns = at->columns, side = 2 * reach + 1;
@@ -52,19 +75,13 @@ static void box(const Cells *at, const float *values, int reach, float *result) 
     for (int y = 0; y < rows; y++) add_row(values + (size_t)y * columns, at->running, columns, at->sums + (size_t)(y + 1) * columns);
     for (int y = 0; y < rows; y++) {
         const int before = y > reach ? y - reach : 0, last = least(y + reach + 1, rows);
-        float *line = at->line, *to = result + (size_t)y * columns;
-        subtract(at->sums + (size_t)last * columns, at->sums + (size_t)before * columns, columns, to);
-        double total = 0.0;
-        line[0] = 0.0f;
-        for (int x = 0; x < columns; x++) {
-            total += (double)to[x];
-            line[x + 1] = (float)total;
-        }
-        const int inner = columns - reach;
-        int x = 0;
-        for (; x < reach && x < columns; x++) to[x] = line[least(x + reach + 1, columns)] / area;
-        for (; x < inner; x++) to[x] = (line[x + reach + 1] - line[x - reach]) / area;
-        for (; x < columns; x++) to[x] = (line[columns] - line[x - reach]) / area;
+        subtract(at->sums + (size_t)last * columns, at->sums + (size_t)before * columns, columns, result + (size_t)y * columns);
+    }
+    const int many = rows < ROWS ? 1 : ROWS;
+    for (int y = 0; y < rows; y += many) { /* the last rows are summed again where their number is no multiple, and some not used */
+        const int first = least(y, rows - many);
+        run_along(result + (size_t)first * columns, many > 1 ? columns : 0, columns, at->line);
+        for (int k = y - first; k < many; k++) means_along(at->line + k, columns, reach, area, result + (size_t)(first + k) * columns);
     }
 }
 
@@ -262,7 +279,7 @@ static void to_cells(const Cells *at, const uint8_t *inside, int64_t inside_row,
 
 static int allocate(Cells *at, int rows, int columns, int cell) {
     at->rows = (rows + cell - 1) / cell, at->columns = (columns + cell - 1) / cell;
-    const size_t n = (size_t)at->rows * at->columns, line = (size_t)at->columns * cell + 1;
+    const size_t n = (size_t)at->rows * at->columns, line = (size_t)(at->columns + 1) * (size_t)(cell > ROWS ? cell : ROWS);
     at->mass = malloc(sizeof(float) * (13 * n + (size_t)at->columns + line));
     at->running = malloc(sizeof(double) * (size_t)at->columns);
     at->pressed = malloc(2 * n);

@@ -27,7 +27,7 @@ static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
 static pthread_cond_t begun = PTHREAD_COND_INITIALIZER;
 static int helpers, wanted, asleep; /* under the lock, as `frame` is */
 static unsigned int frame;
-static int processor; /* where the caller was when the frame began; -1: unknown */
+static pthread_t threads_of[MOST_HELPERS];
 static pid_t process;
 
 static atomic_flag taken = ATOMIC_FLAG_INIT; /* one thread at a time has the helpers */
@@ -66,23 +66,6 @@ static int64_t nanoseconds(void) {
     return now.tv_sec * (int64_t)1000000000 + now.tv_nsec;
 }
 
-#if defined(__linux__)
-/* A helper that wakes up where its caller runs would only take turns with it. Returns whether it runs elsewhere now. */
-static int stand_aside(int callers) {
-    cpu_set_t allowed, others;
-    if (callers < 0 || sched_getcpu() != callers) return 1;
-    if (sched_getaffinity(0, sizeof allowed, &allowed)) return 0;
-    others = allowed;
-    CPU_CLR((size_t)callers, &others);
-    if (CPU_COUNT(&others) == 0 || sched_setaffinity(0, sizeof others, &others)) return 0;
-    sched_setaffinity(0, sizeof allowed, &allowed);
-    return 1;
-}
-#else
-static int sched_getcpu(void) { return -1; }
-static int stand_aside(int callers) { return callers < 0; }
-#endif
-
 static void *help(void *argument) {
     const int index = (int)(intptr_t)argument;
     unsigned int seen = 0;
@@ -92,9 +75,7 @@ static void *help(void *argument) {
         while (frame == seen || index >= wanted) pthread_cond_wait(&begun, &lock);
         asleep--;
         seen = frame;
-        const int callers = processor;
         pthread_mutex_unlock(&lock);
-        if (!stand_aside(callers)) continue;
         for (int64_t last = nanoseconds(); nanoseconds() - last < PATIENCE;)
             for (int k = 0; k < ROUNDS; k++) {
                 if (take_part(1))
@@ -114,10 +95,34 @@ static void start(int count) {
     pthread_attr_setdetachstate(&attributes, PTHREAD_CREATE_DETACHED);
     sigfillset(&all);
     pthread_sigmask(SIG_SETMASK, &all, &before);
-    for (pthread_t one; helpers < count && !pthread_create(&one, &attributes, help, (void *)(intptr_t)helpers);) helpers++;
+    while (helpers < count && !pthread_create(&threads_of[helpers], &attributes, help, (void *)(intptr_t)helpers)) helpers++;
     pthread_sigmask(SIG_SETMASK, &before, NULL);
     pthread_attr_destroy(&attributes);
 }
+
+/* Has up to `count` helpers ready, under the lock, on other processors than the caller's: a virtual machine's scheduler may take one that sleeps for a
+   busy one and wake a helper where its caller runs, which then waits until that is done. Returns how many may work. */
+#if defined(__linux__)
+static int make_ready(int count) {
+    static int before = -1;
+    static int others = MOST_HELPERS;
+    const int here = sched_getcpu();
+    cpu_set_t allowed;
+    if (here == before && helpers >= least(count, others)) return least(count, others);
+    if (sched_getaffinity(0, sizeof allowed, &allowed)) CPU_ZERO(&allowed); /* more processors than the set holds: they are chosen by the system */
+    others = CPU_COUNT(&allowed) ? CPU_COUNT(&allowed) - 1 : MOST_HELPERS;
+    if (here >= 0) CPU_CLR((size_t)here, &allowed);
+    start(least(count, others));
+    for (int k = 0; k < helpers && CPU_COUNT(&allowed) > 0; k++) pthread_setaffinity_np(threads_of[k], sizeof allowed, &allowed);
+    before = here;
+    return least(count, least(others, helpers));
+}
+#else
+static int make_ready(int count) {
+    start(count);
+    return least(count, helpers);
+}
+#endif
 
 /* Until end_sharing(), share() lets up to `threads` threads work. Returns whether it does: not while another thread has the helpers. */
 int begin_sharing(int threads) {
@@ -130,10 +135,9 @@ int begin_sharing(int threads) {
         helpers = asleep = 0, process = here;
     }
     pthread_mutex_lock(&lock);
-    wanted = least(threads - 1, MOST_HELPERS);
-    start(wanted);
-    frame++, processor = sched_getcpu();
-    const int wake = asleep > 0, any = helpers > 0;
+    wanted = make_ready(least(threads - 1, MOST_HELPERS));
+    frame++;
+    const int wake = asleep > 0, any = wanted > 0;
     pthread_mutex_unlock(&lock);
     if (wake) pthread_cond_broadcast(&begun);
     sharing = any;

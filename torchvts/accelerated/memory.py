@@ -27,9 +27,11 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     if not _lock.acquire(blocking=False):  # another thread is at the table, and after a fork for ever
         return tensor.resize_(shape)
     try:
-        some = [storage for storage in _kept.get(size, []) if storage.nbytes() == size and not storage.is_shared()]
-        _kept[size] = some  # what another process sees, or somebody has resized, is not ours any more
+        some = _kept.setdefault(size, [])
         free = next((storage for storage in some if _users(storage._cdata) == 1), None)
+        if free is not None and (free.nbytes() != size or free.is_shared()):  # somebody has resized it, or another process sees it
+            some.remove(free)
+            free = None
         if free is None:
             free = UntypedStorage(size)
             _keep(free, size, _users)

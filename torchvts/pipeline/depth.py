@@ -248,15 +248,16 @@ class DepthPipeline(nn.Module):
     @torch.jit.unused
     def compiled(self, images: Tensor) -> DepthOutput | None:
         """The same by one compiled call; None where the blocks must do it, each by itself."""
+        if torch.compiler.is_compiling() or type(self) is not DepthPipeline:
+            return None
+        return solve_frames(self, images, self.frame_blocks)
+
+    def frame_blocks(self) -> FrameBlocks | None:
+        """What a frame passes through; None where that depends on the frame."""
         solve, refine, slopes = self.solve, self.refine, self.slopes
-        passes = 1
-        if torch.compiler.is_compiling() or type(self) is not DepthPipeline or type(solve) is not Solve:
+        if type(solve) is not Solve or not (type(refine) is Once or (type(refine) is Repeat and refine.solve is solve)):
             return None
-        if type(refine) is Repeat and refine.solve is solve:
-            passes = refine.max_passes
-        elif type(refine) is not Once:
-            return None
-        blocks = FrameBlocks(
+        return FrameBlocks(
             self.compensate,
             self.deformed,
             self.crop,
@@ -268,9 +269,8 @@ class DepthPipeline(nn.Module):
             slopes.gradient if type(slopes) is SlopesOfDepth else None,
             self.contact,
             self.uncrop,
-            passes,
+            refine.max_passes if type(refine) is Repeat else 1,
         )
-        return solve_frames(self, blocks, images)
 
     def reconstructed(self, images: Tensor) -> DepthOutput:
         """:meth:`forward` in the threads that torch now uses."""

@@ -10,20 +10,34 @@ Shape shape_of(int rows, int columns) {
 /* Words of a mask. */
 size_t words_of(const Shape *shape) { return (size_t)shape->rows * shape->words; }
 
+/* The lowest bits of eight bytes, the first lowest: a product moves them all at once where the first byte is the lowest of a word. */
+static inline uint64_t gathered(const uint8_t *bytes) {
+    uint64_t eight = 0;
+    for (int k = 0; k < 8; k++) eight |= (uint64_t)bytes[k] << (8 * k); /* one load */
+    return (eight & UINT64_C(0x0101010101010101)) * UINT64_C(0x0102040810204080) >> 56;
+}
+
+/* The inverse. */
+static inline void scatter(uint64_t bits, uint8_t *bytes) {
+    const uint64_t one_each = (bits * UINT64_C(0x0101010101010101)) & UINT64_C(0x8040201008040201);
+    const uint64_t ones = ((one_each + UINT64_C(0x00406070787c7e7f)) & UINT64_C(0x8080808080808080)) >> 7;
+    for (int k = 0; k < 8; k++) bytes[k] = (uint8_t)(ones >> (8 * k));
+}
+
 /* A row of ones and zeros, bytes, to bits; of as many bytes as its words have bits, which need not be set beyond the last column. */
 void pack_bits(const uint8_t *bytes, const Shape *shape, uint64_t *row) {
-    for (int w = 0; w < shape->words; w++) {
+    for (int w = 0; w < shape->words; w++, bytes += 64) {
         uint64_t word = 0;
-        for (int k = 0; k < 64; k++) word |= (uint64_t)(bytes[64 * w + k] & 1) << k;
+        for (int k = 0; k < 64; k += 8) word |= gathered(bytes + k) << k;
         row[w] = word;
     }
     row[shape->words - 1] &= shape->last;
 }
 
 /* The inverse; all bytes of the words are written. */
-WIDE void unpack_bits(const uint64_t *row, const Shape *shape, uint8_t *bytes) {
-    for (int w = 0; w < shape->words; w++)
-        for (int k = 0; k < 64; k++) bytes[64 * w + k] = (uint8_t)(row[w] >> k & 1);
+void unpack_bits(const uint64_t *row, const Shape *shape, uint8_t *bytes) {
+    for (int w = 0; w < shape->words; w++, bytes += 64)
+        for (int k = 0; k < 64; k += 8) scatter(row[w] >> k & 0xff, bytes + k);
 }
 
 void invert_bits(const uint64_t *mask, const Shape *shape, uint64_t *result) {

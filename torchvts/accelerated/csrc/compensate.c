@@ -13,19 +13,25 @@ EXPORT void grid_means(const float *image, int planes, int height, int width, in
             }
 }
 
-/* image * gain + offset, either of which may be null; without offset (image + pedestal) * gain. */
-WIDE static void multiply_add(const float *restrict image, const float *restrict gain, const float *restrict offset, float pedestal, int n,
-                              float *restrict light) {
+/* Whether a value is not in [0, 1], or no number. */
+static inline int is_outside(float value) { return !((value >= -1e-3f) & (value <= 1.001f)); }
+
+/* image * gain + offset, either of which may be null; without offset (image + pedestal) * gain. Returns whether any value of the image is not in
+   [0, 1]. */
+WIDE static int multiply_add(const float *restrict image, const float *restrict gain, const float *restrict offset, float pedestal, int n,
+                             float *restrict light) {
+    int outside = 0;
     if (gain && !offset && pedestal != 0.0f)
-        for (int x = 0; x < n; x++) light[x] = (image[x] + pedestal) * gain[x];
+        for (int x = 0; x < n; x++) light[x] = (image[x] + pedestal) * gain[x], outside |= is_outside(image[x]);
     else if (gain && offset)
-        for (int x = 0; x < n; x++) light[x] = image[x] * gain[x] + offset[x];
+        for (int x = 0; x < n; x++) light[x] = image[x] * gain[x] + offset[x], outside |= is_outside(image[x]);
     else if (gain)
-        for (int x = 0; x < n; x++) light[x] = image[x] * gain[x];
+        for (int x = 0; x < n; x++) light[x] = image[x] * gain[x], outside |= is_outside(image[x]);
     else if (offset)
-        for (int x = 0; x < n; x++) light[x] = image[x] + offset[x];
+        for (int x = 0; x < n; x++) light[x] = image[x] + offset[x], outside |= is_outside(image[x]);
     else
-        memcpy(light, image, sizeof(float) * (size_t)n);
+        for (int x = 0; x < n; x++) light[x] = image[x], outside |= is_outside(image[x]);
+    return outside;
 }
 
 /* The sum of an odd number of lines, each times its weight, in their order; seven, six and two at a time, which stay in registers. Fused, as
@@ -63,22 +69,15 @@ WIDE FUSED static void weighted_sum(const float *const *lines, const float *rest
     }
 }
 
-/* Whether any of n values is not in [0, 1], or no number. */
-WIDE static int any_outside(const float *restrict values, int n) {
-    int found = 0;
-    for (int x = 0; x < n; x++) found |= !((values[x] >= -1e-3f) & (values[x] <= 1.001f));
-    return found;
-}
-
 /* What is done to a plane: image * gain + offset, either of which may be null. */
 typedef struct {
     const float *image, *gain, *offset;
     float pedestal;
 } Affine;
 
-/* n values from `at` on. */
-static void apply(const Affine *of, size_t at, int n, float *light) {
-    multiply_add(of->image + at, of->gain ? of->gain + at : NULL, of->offset ? of->offset + at : NULL, of->pedestal, n, light);
+/* n values from `at` on. Returns whether any of the image is not in [0, 1]. */
+static int apply(const Affine *of, size_t at, int n, float *light) {
+    return multiply_add(of->image + at, of->gain ? of->gain + at : NULL, of->offset ? of->offset + at : NULL, of->pedestal, n, light);
 }
 
 /* Rows `first` to `last` of a plane blurred, its border repeated. scratch: taps lines, and one that is `taps` longer; `lines`: taps pointers.
@@ -91,8 +90,7 @@ static int blur_rows(const Affine *plane, const float *weight, int taps, int hei
     for (int y = first, next = first > reach ? first - reach : 0; y < last; y++) {
         for (; next < height && next <= y + reach; next++) { /* row `next` of the plane lies in line next % taps */
             const size_t at = (size_t)next * width;
-            outside |= any_outside(plane->image + at, width);
-            apply(plane, at, width, row);
+            outside |= apply(plane, at, width, row);
             for (int k = 0; k < reach; k++) padded[k] = row[0], row[width + k] = row[width - 1];
             for (int k = 0; k < taps; k++) lines[k] = padded + k;
             weighted_sum(lines, weight, taps, width, scratch + (size_t)(next % taps) * width);
@@ -147,8 +145,7 @@ static void clean_band(void *with, int part) {
         const size_t from = (size_t)first * width;
         const int n = (last - first) * width;
         float *to = taps ? whole : light;
-        outside = any_outside(affine.image + from, n);
-        apply(&affine, from, n, to + from);
+        outside = apply(&affine, from, n, to + from);
         if (of->defects) fill(to, of->defect, of->neighbours, of->defects, repaired);
         const Affine as_is = {to, NULL, NULL, 0.0f};
         if (taps) blur_rows(&as_is, of->weight, taps, height, width, 0, height, rows, line, light);

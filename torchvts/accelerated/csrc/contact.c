@@ -255,7 +255,7 @@ typedef struct {
 typedef struct {
     const float *image, *offset, *per_noise, *most_far_field;
     int height, width, stride;
-    float rounding, threshold, scale[3];
+    float rounding, threshold, noise[6], scale[3];
     int works[3], bands;
     Grid grid;
     Scratch at;
@@ -263,26 +263,31 @@ typedef struct {
     atomic_int short_of_memory;
 } Frame;
 
-/* 1 over the standard deviation of a channel's change: its noise, or the far field if that is larger. */
-static void find_scale(void *with, int c) {
+/* Of a channel's change, the noise, or of part 3 and above its far field. */
+static void find_noise(void *with, int part) {
     Frame *of = with;
+    const int c = part % 3, far = part >= 3;
     const size_t plane = (size_t)of->height * of->width * c;
     const float *image = of->image + plane, *offset = of->offset ? of->offset + plane : NULL, *per_noise = of->per_noise + plane;
-    const float most = of->most_far_field[c];
     const size_t samples = (size_t)((of->height + of->stride - 1) / of->stride) * ((of->width + of->stride - 1) / of->stride);
-    float *some = of->works[c] ? malloc(sizeof(float) * (2 * samples + 1)) : NULL;
-    of->scale[c] = 0.0f;
-    if (!some) {
-        if (of->works[c]) of->short_of_memory = 1;
-        return;
-    }
-    float noise = noise_of(image, offset, per_noise, of->height, of->width, of->stride, some);
-    float far = most > 0.0f ? far_field_of(image, offset, per_noise, of->height, of->width, of->stride, some) : 0.0f;
+    of->noise[part] = 0.0f;
+    if (!of->works[c] || (far && !(of->most_far_field[c] > 0.0f))) return;
+    float *some = malloc(sizeof(float) * (2 * samples + 1));
+    if (some)
+        of->noise[part] = (far ? far_field_of : noise_of)(image, offset, per_noise, of->height, of->width, of->stride, some);
+    else
+        of->short_of_memory = 1;
+    free(some);
+}
+
+/* 1 over the standard deviation of a channel's change: its noise, or the far field if that is larger. */
+static float scale_of(const Frame *of, int c) {
+    const float most = of->most_far_field[c];
+    float noise = of->noise[c], far = of->noise[3 + c];
     if (far > most) far = most * most / far;
     if (!(far <= noise)) noise = far;
     if (noise < 1.0f) noise = 1.0f;
-    of->scale[c] = 1.0f / sqrtf(noise * noise + of->rounding);
-    free(some);
+    return of->works[c] ? 1.0f / sqrtf(noise * noise + of->rounding) : 0.0f;
 }
 
 /* Rows of cells of a band. */
@@ -501,7 +506,8 @@ static void to_pixels(void *with, int band) {
 /* Masks of one frame. Returns what contact_mask() does. */
 static int mask_frame(Frame *of) {
     const size_t pixels = (size_t)of->height * of->width, cells = (size_t)of->grid.rows * of->grid.columns;
-    share(find_scale, of, 3);
+    share(find_noise, of, 6);
+    for (int c = 0; c < 3; c++) of->scale[c] = scale_of(of, c);
     share(find_strong, of, of->bands);
     share(close_strong, of, of->bands);
     share(find_shares, of, of->bands);

@@ -18,11 +18,15 @@ typedef struct {
     Cosine cosine;
 } Plan;
 
-/* Lanes of the coefficients of a column; never a multiple of 512 bytes, which would map many columns to the same place of the cache. */
-static int wide_of(int height) {
-    const int wide = (height + LANES - 1) / LANES * LANES;
-    return wide % 128 ? wide : wide + LANES;
-}
+/* Coefficients lie in slices of so many, SLICE of the first column, of the second and so on, so that threads which solve for some of them read
+   one piece of memory. */
+enum { SLICE = 64 };
+
+/* Coefficients of a column, in whole slices. */
+static int wide_of(int height) { return (height + SLICE - 1) / SLICE * SLICE; }
+
+/* Where coefficient k of column x lies, of slices of `columns` columns. */
+static inline size_t place_of(size_t k, size_t x, size_t columns) { return (k / SLICE * columns + x) * SLICE + k % SLICE; }
 
 /* Bytes of the tables; 0 where the height has a prime factor that is too large. */
 EXPORT int64_t poisson_plan_size(int height) {
@@ -178,26 +182,22 @@ WIDE static void turn_round(const float *restrict values, const double *restrict
     for (int k = 0; k < n; k++) sum[k] = end[k] * values[k];
 }
 
-/* Along x: n of the coefficients of each column (width, wide), from `from` on, zero but in the part's columns, become those of the depth. state: 3 *
-   wide doubles. */
-static void recursions(const Plan *plan, const Part *part, int from, int n, float *coefficients, double *state) {
-    const int width = plan->width, first = part->first_column, last = part->last_column;
-    const size_t wide = (size_t)plan->wide;
+/* Along x: a slice of coefficients, zero but in the part's columns, becomes that of the depth. state: three lines of doubles. */
+static void recursions(const Plan *plan, const Part *part, int from, float *slice, double *state) {
+    const int width = plan->width, first = part->first_column, last = part->last_column, n = SLICE;
     const double *pole = plan->pole + from;
-    float *columns = coefficients + from;
-    double *sum = state + from, *other = sum + wide, *power = other + wide;
-    memset(sum, 0, sizeof(double) * (size_t)n);
-    memset(other, 0, sizeof(double) * (size_t)n);
-    for (int x = last - 1; x >= first; x--) sum_up(columns + x * wide, pole, n, sum);
-    for (int x = first; x < last; x++) sum_up(columns + x * wide, pole, n, other);
+    double *sum = state, *other = sum + SLICE, *power = other + SLICE;
+    memset(sum, 0, 2 * SLICE * sizeof(double));
+    for (int x = last - 1; x >= first; x--) sum_up(slice + (size_t)x * SLICE, pole, n, sum);
+    for (int x = first; x < last; x++) sum_up(slice + (size_t)x * SLICE, pole, n, other);
     times_power(pole, first, n, power, sum);
     times_power(pole, 2 * width - last, n, power, other);
     begin(other, plan->per_start + from, n, sum);
-    for (int x = 0; x < first; x++) there_alone(columns + x * wide, pole, n, sum);
-    for (int x = first; x < last; x++) there(columns + x * wide, pole, n, sum);
-    for (int x = last; x < width; x++) there_alone(columns + x * wide, pole, n, sum);
-    turn_round(columns + (width - 1) * wide, plan->end + from, n, sum);
-    for (int x = width - 1; x >= 0; x--) back(columns + x * wide, pole, plan->gain + from, n, sum);
+    for (int x = 0; x < first; x++) there_alone(slice + (size_t)x * SLICE, pole, n, sum);
+    for (int x = first; x < last; x++) there(slice + (size_t)x * SLICE, pole, n, sum);
+    for (int x = last; x < width; x++) there_alone(slice + (size_t)x * SLICE, pole, n, sum);
+    turn_round(slice + (size_t)(width - 1) * SLICE, plan->end + from, n, sum);
+    for (int x = width - 1; x >= 0; x--) back(slice + (size_t)x * SLICE, pole, plan->gain + from, n, sum);
 }
 
 /* The same for the constant along y, k = 0: sums of sums, less the mean. constant: its values, and gets the result. */
@@ -213,11 +213,10 @@ static void solve_constant(const Plan *plan, double *constant) {
     for (int x = 0; x < width; x++) constant[x] = (constant[x] - total) / plan->height;
 }
 
-/* LINES columns of the divergence, whose lines have `step` floats, from `first` on, to their coefficients: (width, wide) from the part's first
-   column on. */
+/* LINES columns of the divergence, whose lines have `step` floats, from `first` on, to their coefficients. */
 static void to_coefficients(const Plan *plan, const Part *part, const float *lines, int step, int first, float *scratch, float *found,
-                            float *columns) {
-    const size_t n = (size_t)plan->height, wide = (size_t)plan->wide;
+                            float *coefficients) {
+    const size_t n = (size_t)plan->height, wide = (size_t)plan->wide, columns = (size_t)plan->width + LINES, to_column = (size_t)(part->first_column + first);
     memset(scratch, 0, sizeof(float) * n * LINES);
     for (int y = part->first_row; y < part->last_row; y++) {
         const float *line = lines + (size_t)(y - part->first_row) * step + first;
@@ -228,14 +227,14 @@ static void to_coefficients(const Plan *plan, const Part *part, const float *lin
     cosine_forward(&plan->cosine, scratch, found);
     for (size_t k = 0; k < wide; k += 4)
         for (int x = 0; x < LINES; x += 4)
-            transpose(found + k * LINES + x, LINES, columns + (size_t)(part->first_column + first + x) * wide + k, wide);
+            transpose(found + k * LINES + x, LINES, coefficients + place_of(k, to_column + x, columns), SLICE);
 }
 
 /* The inverse, to columns from `first` on of depth (height, width). */
-static void to_depth(const Plan *plan, const float *columns, int first, float *scratch, float *found, float *depth) {
-    const size_t n = (size_t)plan->height, wide = (size_t)plan->wide;
+static void to_depth(const Plan *plan, const float *coefficients, int first, float *scratch, float *found, float *depth) {
+    const size_t n = (size_t)plan->height, wide = (size_t)plan->wide, columns = (size_t)plan->width + LINES;
     for (size_t k = 0; k < wide; k += 4)
-        for (int x = 0; x < LINES; x += 4) transpose(columns + (size_t)(first + x) * wide + k, wide, found + k * LINES + x, LINES);
+        for (int x = 0; x < LINES; x += 4) transpose(coefficients + place_of(k, (size_t)(first + x), columns), SLICE, found + k * LINES + x, LINES);
     float *lines = cosine_inverse(&plan->cosine, scratch, found);
     const int one = least(LANES, plan->width - first), other = least(LINES, plan->width - first) - one;
     for (int y = 0; y < plan->height; y++) {
@@ -292,7 +291,7 @@ static float level_of(const float *gradient, const Part *part, int height, int w
     return level;
 }
 
-/* The solution of one frame. Each part of the work has LINES columns, or LANES_OF_PART coefficients of all, or a band of rows, and scratch of its
+/* The solution of one frame. Each part of the work has LINES columns, or a slice of coefficients of all, or a band of rows, and scratch of its
    own: transforms and their coefficients, and the lines of the divergence's borders. */
 typedef struct {
     Plan plan;
@@ -301,11 +300,8 @@ typedef struct {
     float half_pitch, level;
     int step;
     float *lines, *coefficients, *depth;
-    double *state;
     atomic_int short_of_memory;
 } Solution;
-
-enum { LANES_OF_PART = 64 };
 
 /* Memory of one transform: the lines twice, then the coefficients, of which those beyond the height are zero. Null where memory is short. */
 static float *transform_memory(Solution *of) {
@@ -341,11 +337,11 @@ static void transform(void *with, int block) {
     free(memory);
 }
 
-static void recur(void *with, int part) {
+static void recur(void *with, int slice) {
     Solution *of = with;
+    double state[3 * SLICE];
     const unsigned int before = without_tiny();
-    const int from = part * LANES_OF_PART;
-    recursions(&of->plan, &of->part, from, least(LANES_OF_PART, of->plan.wide - from), of->coefficients, of->state);
+    recursions(&of->plan, &of->part, slice * SLICE, of->coefficients + place_of((size_t)slice * SLICE, 0, (size_t)of->plan.width + LINES), state);
     with_tiny(before);
 }
 
@@ -369,13 +365,12 @@ static void set_level(void *with, int band) {
 static void solve_one(Solution *of, int zeroed, double *constant) {
     const Part *part = &of->part;
     const int width = of->plan.width, height = of->plan.height;
-    const size_t wide = (size_t)of->plan.wide;
     share(diverge, of, bands_of(part->last_row - part->first_row));
     share(transform, of, of->step / LINES);
-    for (int x = 0; x < width; x++) constant[x] = x >= part->first_column && x < part->last_column ? of->coefficients[x * wide] : 0.0;
-    share(recur, of, (int)((wide + LANES_OF_PART - 1) / LANES_OF_PART));
+    for (int x = 0; x < width; x++) constant[x] = x >= part->first_column && x < part->last_column ? of->coefficients[(size_t)x * SLICE] : 0.0;
+    share(recur, of, of->plan.wide / SLICE);
     solve_constant(&of->plan, constant);
-    for (int x = 0; x < width; x++) of->coefficients[x * wide] = (float)constant[x];
+    for (int x = 0; x < width; x++) of->coefficients[(size_t)x * SLICE] = (float)constant[x];
     share(transform_back, of, (width + LINES - 1) / LINES);
     if (!zeroed || of->short_of_memory) return;
     of->level = level_of(of->gradient, part, height, width, of->depth);
@@ -390,16 +385,17 @@ EXPORT int solve_poisson(const float *gradient, const double *tables, float mm_p
                          int height, int width, int zeroed, float *depth) {
     Solution work = {.plan = plan_of(height, width, tables), .part = part_of(rows, columns, top, left, height, width), .half_pitch = 0.5f * mm_per_pixel};
     const size_t wide = (size_t)work.plan.wide, lines = (size_t)height * (width + LINES), blocks = (size_t)width + LINES; /* the same for every window */
-    double *memory = malloc(sizeof(double) * (3 * wide + (size_t)width) + sizeof(float) * (blocks * wide + lines));
-    if (!memory) return 1;
+    double *constant = malloc(sizeof(double) * (size_t)width + sizeof(float) * (blocks * wide + lines));
+    if (!constant) return 1;
     work.step = (work.part.last_column - work.part.first_column + LINES - 1) / LINES * LINES;
-    work.state = memory, work.coefficients = (float *)(memory + 3 * wide + width), work.lines = work.coefficients + blocks * wide;
-    memset(work.coefficients + (size_t)width * wide, 0, sizeof(float) * LINES * wide); /* columns beyond the image, which fill its last block */
+    work.coefficients = (float *)(constant + width), work.lines = work.coefficients + blocks * wide;
+    for (size_t k = 0; k < wide; k += SLICE) /* columns beyond the image, which fill its last block */
+        memset(work.coefficients + place_of(k, (size_t)width, blocks), 0, sizeof(float) * SLICE * LINES);
     for (int b = 0; b < frames && !work.short_of_memory; b++) {
         work.gradient = gradient + 2 * (size_t)rows * columns * b, work.depth = depth + (size_t)height * width * b;
-        solve_one(&work, zeroed, memory + 3 * wide);
+        solve_one(&work, zeroed, constant);
     }
-    free(memory);
+    free(constant);
     return work.short_of_memory;
 }
 

@@ -140,7 +140,9 @@ class _Prepared(NamedTuple):
 
 _programs: WeakKeyDictionary[nn.Module, _Prepared] = WeakKeyDictionary()
 
-HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
+HOOKS = ("_forward_hooks", "_forward_pre_hooks")
+"""Those of the way back matter only where gradients are recorded, which blocks do."""
+
 OF_MODULES = frozenset(nn.Module().__dict__)
 """What every module has; the rest of its dictionary are settings."""
 

@@ -28,7 +28,9 @@ def threads():
 def pipe_and_images(size, by="response"):
     """A press, one that the border cuts, and undeformed skin."""
     calibration = unit(by, *size, 28.8 / size[0])
-    return vts.DepthPipeline.from_calibration(calibration), [press_image(calibration, kind) for kind in ("press", "border", "no contact")]
+    return vts.DepthPipeline.from_calibration(calibration), [
+        press_image(calibration, kind) for kind in ("press", "border", "no contact")
+    ]
 
 
 @pytest.mark.parametrize("by", ["lights", "response"])

@@ -1,6 +1,7 @@
 """A whole frame in one compiled call, for pipelines of the library's own blocks: csrc/frame.c, its settings and its memory."""
 
 import ctypes
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
@@ -10,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.modules import module as torch_modules
 
 from ..compensate import Blur, FillDefects
-from ..compensate.drift import LEAST_DRIFT, MOST_DRIFT, stride_of
+from ..compensate.drift import LEAST_DRIFT, MOST_BY_MODE, MOST_DRIFT, stride_of
 from ..core.frame import DepthOutput
 from ..core.robust import HALVINGS
 from ..integration.background import DepthAsIs
@@ -47,7 +48,7 @@ class Program(ctypes.Structure):
         ("defects", ctypes.c_int64),
         ("pedestal", REAL * 3),
         *((name, INTEGER) for name in ("drifts", "drift_stride", "halvings")),
-        *((name, REAL) for name in ("least_drift", "most_drift")),
+        *((name, REAL) for name in ("least_drift", "most_drift", "believed_drift")),
         *((name, INTEGER) for name in ("step", "stride", "cell", "reach", "bridge")),
         *((name, REAL) for name in ("sigmas", "rounding", "least_cells", "bridge_sigmas")),
         *((name, POINTER) for name in ("flat", "per_noise", "failed_below", "most_far_field")),
@@ -240,7 +241,8 @@ def _all_own(parts: Blocks) -> bool:
     inner = compensate._modules
     if len(inner["linear"]) or compensate.saturates or not all(_own(block, (FillDefects, Blur)) for block in inner["clean"]):
         return False
-    return _own(inner["drift"], (nn.Identity, Drift)) and getattr(inner["drift"], "background", None) is None
+    drift = inner["drift"]
+    return _own(drift, (nn.Identity, Drift)) and (type(drift) is not Drift or drift.background is None or drift.by_mode_first)
 
 
 def _own(block: Any, kinds: tuple[type, ...]) -> bool:
@@ -270,10 +272,11 @@ def _settings(parts: Blocks) -> dict[str, Any]:
     compensate: Any = parts.compensate
     mask: Any = parts.deformed
     normals, gradient, integrate, zero, slopes, contact = (getattr(parts, name) for name in _WITH_NUMBERS)
-    zeroes = type(zero) is ZeroBackground
+    zeroes, drift = type(zero) is ZeroBackground, compensate._modules["drift"]
     return {
         "weights": next((block.weights for block in compensate._modules["clean"] if type(block) is Blur), ()),
-        "drifts": type(compensate._modules["drift"]) is Drift,
+        "drifts": type(drift) is Drift,
+        "believed_drift": MOST_BY_MODE if getattr(drift, "background", None) is not None else math.inf,
         "step": mask.step,
         "stride": mask.stride,
         "cell": mask.cell,

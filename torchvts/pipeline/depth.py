@@ -67,7 +67,8 @@ class DepthPipeline(nn.Module):
     ``fast`` solves once (eq. 9). ``precise`` solves again with the depth found (eq. 10), until what is still missing falls below
     ``tolerance_px``; for response fields gradient and normals are then those of the depth. ``auto`` skips frames without deformed
     skin, predicts on every eighth pixel what a second pass would change, and solves only those frames again for which that exceeds
-    ``refine_threshold_px``, until what is missing is below a fifth of it.
+    ``refine_threshold_px``, until what is missing is below a fifth of it; where there are two passes at most, as for response
+    fields, it solves each frame twice.
     Frames of a batch do not influence one another: on a CPU each is solved by itself, and is equal bit for bit to that frame alone.
     On a GPU, in an exported program, and with a module of your own that needs the whole image, the batch is solved as one, which
     may change the rounding of sums.
@@ -142,7 +143,8 @@ class DepthPipeline(nn.Module):
         model, pitch = self.solve.normals, self.mm_per_pixel
         if mode == "fast" or not model.uses_depth:
             return Once()
-        coarse = model.coarse(STRIDE) if mode == "auto" and model.takes_window else None
+        predicts = mode == "auto" and max_passes > 2  # to solve once more costs less than to predict whether that pays
+        coarse = model.coarse(STRIDE) if predicts and model.takes_window else None
         if mode == "auto":
             tolerance_px = max(tolerance_px, 0.2 * refine_threshold_px)
         if coarse is None:

@@ -1,6 +1,8 @@
 /* A whole frame in one call: what DepthPipeline.depth_of() in torchvts/pipeline/depth.py does block by block. */
 #include "kernels.h"
 
+#include <math.h>
+
 /* The settings and tables of a pipeline's blocks, in the order of a frame's way; torchvts/accelerated/frame.py has the same. */
 typedef struct {
     int32_t height, width;
@@ -11,7 +13,7 @@ typedef struct {
     int64_t defects;
     float pedestal[3];
     int32_t drifts, drift_stride, halvings;
-    float least_drift, most_drift;
+    float least_drift, most_drift, believed_drift;
     /* ContactMask */
     int32_t step, stride, cell, reach, bridge;
     float sigmas, rounding, least_cells, bridge_sigmas;
@@ -63,15 +65,19 @@ static const float *compensated(const Program *of, const float *image, float *li
     *trouble |= code;
     if (code) return NULL;
     if (of->drifts && levels(light, 1, height, width, of->drift_stride, of->halvings, of->least_drift, of->most_drift, level)) *trouble |= SHORT;
+    for (int c = 0; c < 3; c++)
+        if (!(fabsf(level[c] - 1.0f) < of->believed_drift)) *trouble |= BEYOND; /* another estimator takes over */
+    if (*trouble) return NULL;
     if (level[0] != 1.0f || level[1] != 1.0f || level[2] != 1.0f) divide_planes(light, level, 3, (int64_t)height * width, light);
     return light;
 }
 
-/* Crop.window() of torchvts/core/frame.py. */
+/* Crop.window() of torchvts/core/frame.py; without any row where no skin has moved. */
 static Window window_of(const Program *of, const uint8_t *deformed) {
     const int height = of->height, width = of->width, side = of->corners;
     int box[4];
     box_of(deformed, 1, height, width, box);
+    if (box[1] == 0) return (Window){0, 0, 0, 0};
     int top = (box[0] > 0 ? box[0] - 1 : 0) / side * side, left = (box[2] > 0 ? box[2] - 1 : 0) / side * side;
     int bottom = (box[1] + side) / side, right = (box[3] + side) / side;
     bottom = least(height, (bottom > top / side + 2 ? bottom : top / side + 2) * side);
@@ -141,6 +147,11 @@ static int solve_frame(const Program *of, const float *image, Work work, Output 
                                   work.inner);
     if (code) return code == 1 ? SHORT : BEYOND;
     const Window at = window_of(of, out.deformed);
+    if (at.rows == 0) {
+        memset(out.depth, 0, sizeof(float) * (size_t)height * width);
+        uncrop(NULL, NULL, 1, 0, 0, 0, 0, height, width, out.gradient, out.normal, out.contact);
+        return 0;
+    }
     const size_t corner = (size_t)at.top * width + at.left;
     float *found = of->zeroes ? work.depth : out.depth;
     for (int pass = 0; pass < of->passes && !trouble; pass++) trouble = solve(of, light, out.deformed, pass ? found : NULL, at, work, found);

@@ -1,6 +1,8 @@
 """A whole frame in one compiled call, for pipelines of the library's own blocks: csrc/frame.c, its settings and its memory."""
 
 import ctypes
+import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -9,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.modules import module as torch_modules
 
 from ..compensate import Blur, FillDefects
-from ..compensate.drift import LEAST_DRIFT, MOST_DRIFT, stride_of
+from ..compensate.drift import LEAST_DRIFT, MOST_BY_MODE, MOST_DRIFT, stride_of
 from ..core.frame import DepthOutput
 from ..core.robust import HALVINGS
 from ..integration.background import DepthAsIs
@@ -32,7 +34,7 @@ from .blocks import (
 from .derived import flat_is_one, pedestals, response_lines
 from .gate import usable
 from .memory import empty
-from .threads import by_frames
+from .threads import by_frames, parts_of, within_frame
 
 INTEGER, REAL, POINTER = ctypes.c_int32, ctypes.c_float, ctypes.c_void_p
 
@@ -46,7 +48,7 @@ class Program(ctypes.Structure):
         ("defects", ctypes.c_int64),
         ("pedestal", REAL * 3),
         *((name, INTEGER) for name in ("drifts", "drift_stride", "halvings")),
-        *((name, REAL) for name in ("least_drift", "most_drift")),
+        *((name, REAL) for name in ("least_drift", "most_drift", "believed_drift")),
         *((name, INTEGER) for name in ("step", "stride", "cell", "reach", "bridge")),
         *((name, REAL) for name in ("sigmas", "rounding", "least_cells", "bridge_sigmas")),
         *((name, POINTER) for name in ("flat", "per_noise", "failed_below", "most_far_field")),
@@ -100,32 +102,112 @@ OWN: tuple[tuple[type, ...], ...] = (
 
 
 class _Prepared(NamedTuple):
-    """A program, the state that it was made of, and what holds the memory that it points to."""
+    """A program, what holds the memory that it points to, and all that it was made of.
 
-    program: Program
-    state: tuple[Any, ...]
+    Attributes:
+        program: None where the blocks must do the work.
+        lights: the block whose lights may change by themselves, as by an optimiser.
+        tensors: of the blocks, with their addresses and versions.
+        modules, kinds: the blocks and those within them, and their types.
+        sizes, lengths: dictionaries of attributes and of hooks, and how many entries they have.
+        entries: dictionaries, keys and values: settings, and the modules and tensors within others.
+    """
+
+    program: Program | None
+    lights: NormalFromIntensity | None
     memory: list[Any]
+    tensors: list[tuple[Tensor, int, int]]
+    modules: list[nn.Module]
+    kinds: list[type]
+    sizes: list[dict[str, Any]]
+    lengths: list[int]
+    entries: list[tuple[dict[str, Any], str, Any]]
+
+    def holds(self) -> bool:
+        """Whether nothing has changed since."""
+        if self.lights is not None:
+            self.lights.follow_lights()
+        if list(map(type, self.modules)) != self.kinds or list(map(len, self.sizes)) != self.lengths:
+            return False
+        for place, name, value in self.entries:
+            if place.get(name) is not value:
+                return False
+        return all(tensor._version == version and tensor.data_ptr() == address for tensor, address, version in self.tensors)
+
+    def records(self) -> bool:
+        """Whether a gradient would be recorded for any of the tensors."""
+        return torch.is_grad_enabled() and any(tensor.requires_grad for tensor, _, _ in self.tensors)
 
 
 _programs: WeakKeyDictionary[nn.Module, _Prepared] = WeakKeyDictionary()
 
+HOOKS = ("_forward_hooks", "_forward_pre_hooks")
+"""Those of the way back matter only where gradients are recorded, which blocks do."""
 
-def solve_frames(pipe: nn.Module, parts: Blocks, images: Tensor) -> DepthOutput | None:
+OF_MODULES = frozenset(nn.Module().__dict__)
+"""What every module has; the rest of its dictionary are settings."""
+
+
+def solve_frames(pipe: nn.Module, images: Tensor, parts: Callable[[], Blocks | None]) -> DepthOutput | None:
     """The output of a pipeline, each frame by itself, by one compiled call; None where its blocks must do it.
 
     Args:
         pipe: the pipeline, beside which its program is kept.
-        parts: its blocks.
         images: what it got.
+        parts: gives its blocks, None where they are not known before a frame comes.
     """
     if not isinstance(images, Tensor) or images.dim() != 4 or images.shape[0] == 0 or images.shape[1] != 3 or not usable(images):
         return None
-    if torch_modules._global_forward_hooks or torch_modules._global_forward_pre_hooks or not _all_own(parts):
+    if torch_modules._global_forward_hooks or torch_modules._global_forward_pre_hooks:
         return None
-    prepared = _program(pipe, parts)  # held until the call is over: another thread may put another one in its place
-    if prepared is None or images.shape[2:] != (prepared.program.height, prepared.program.width):
+    prepared = _programs.get(pipe)  # held until the call is over: another thread may put another one in its place
+    if prepared is None or not prepared.holds():
+        prepared = _prepared(pipe, parts())
+        if prepared is None:
+            return None
+        _programs[pipe] = prepared
+    program = prepared.program
+    if program is None or prepared.records() or images.shape[2:] != (program.height, program.width):
         return None
-    return _run(prepared.program, images.contiguous())
+    return _run(program, images.contiguous())
+
+
+def _prepared(pipe: nn.Module, parts: Blocks | None) -> _Prepared | None:
+    """The program of a pipeline as it is now; None where torch does not say whether its tensors change."""
+    lights = parts.normals if parts is not None and type(parts.normals) is NormalFromIntensity else None
+    if lights is not None:
+        lights.follow_lights()
+    modules = [module for module in pipe.modules() if module is not pipe]
+    tensors = [*pipe.parameters(), *pipe.buffers()]
+    if any(tensor.is_inference() for tensor in tensors):
+        return None
+    hooks = [module.__dict__[name] for module in modules for name in HOOKS]
+    sizes = [module.__dict__ for module in (pipe, *modules)] + hooks
+    entries = [entry for module in (pipe, *modules) for entry in _entries(module)]
+    made = None
+    if parts is not None and not any(hooks) and _all_own(parts):
+        with torch.inference_mode(False), torch.no_grad():
+            made = _prepare(parts, _buffers(parts), _settings(parts))
+    return _Prepared(
+        None if made is None else made[0],
+        lights,
+        [] if made is None else made[1],
+        [(tensor, tensor.data_ptr(), tensor._version) for tensor in tensors],
+        modules,
+        list(map(type, modules)),
+        sizes,
+        list(map(len, sizes)),
+        entries,
+    )
+
+
+def _entries(module: nn.Module) -> list[tuple[dict[str, Any], str, Any]]:
+    """Settings of a module, and its tensors and modules, where they stand."""
+    settings: dict[str, Any] = module.__dict__
+    places = [(settings, name) for name in settings if name not in OF_MODULES]
+    for inner in (module._parameters, module._buffers, module._modules):
+        places += [(inner, name) for name in inner]
+    return [(place, name, place[name]) for place, name in places]
 
 
 def _run(program: Program, images: Tensor) -> DepthOutput | None:
@@ -136,11 +218,12 @@ def _run(program: Program, images: Tensor) -> DepthOutput | None:
     out = DepthOutput(*maps, *masks)
     kernel, at, pixels = kernels.loaded().solve_frames, ctypes.byref(program), height * width
     image, depth, gradient, normal, contact, deformed = (tensor.data_ptr() for tensor in (images, *out))
+    threads = within_frame() if parts_of(count, pixels) == 1 else 1
 
     def some(first: int, many: int) -> int:
         place = 4 * pixels * first
         rest = (depth + place, gradient + 2 * place, normal + 3 * place, contact + pixels * first, deformed + pixels * first)
-        return int(kernel(at, image + 3 * place, many, *rest))
+        return int(kernel(at, image + 3 * place, many, threads, *rest))
 
     trouble = by_frames(count, pixels, some)
     if trouble == 1:
@@ -149,45 +232,21 @@ def _run(program: Program, images: Tensor) -> DepthOutput | None:
 
 
 def _all_own(parts: Blocks) -> bool:
-    """Whether all blocks are the library's own, as they were made, and nobody watches them."""
+    """Whether all blocks are the library's own, as they were made."""
     compensate: Any = parts.compensate
     if not all(map(_own, parts, OWN)) or parts.passes > 2 or not parts.crop.enabled:
+        return False
+    if type(parts.normals) is NormalFromIntensity and (parts.passes > 1 or parts.normals.lights.glossy):
         return False
     inner = compensate._modules
     if len(inner["linear"]) or compensate.saturates or not all(_own(block, (FillDefects, Blur)) for block in inner["clean"]):
         return False
-    return _own(inner["drift"], (nn.Identity, Drift)) and getattr(inner["drift"], "background", None) is None
+    drift = inner["drift"]
+    return _own(drift, (nn.Identity, Drift)) and (type(drift) is not Drift or drift.background is None or drift.by_mode_first)
 
 
 def _own(block: Any, kinds: tuple[type, ...]) -> bool:
-    if type(block) not in kinds:
-        return False
-    if block is None:
-        return True
-    watched: Any = block._forward_hooks or block._forward_pre_hooks or block._backward_hooks or block._backward_pre_hooks
-    return not watched and "forward" not in block.__dict__
-
-
-def _program(pipe: nn.Module, parts: Blocks) -> _Prepared | None:
-    """The program of these blocks, kept until a buffer or a setting changes; None where the kernels do not know them."""
-    normals: Any = parts.normals
-    if type(normals) is NormalFromIntensity:
-        if parts.passes > 1 or normals.lights.glossy:
-            return None
-        normals.follow_lights()
-    buffers, recorded = _buffers(parts), torch.is_grad_enabled()
-    for buffer in buffers.values():
-        if buffer.is_inference() or (recorded and buffer.requires_grad):
-            return None
-    addresses = [(name, buffer.data_ptr(), buffer._version) for name, buffer in buffers.items()]
-    settings = _settings(parts)
-    prepared = _programs.get(pipe)
-    if prepared is None or prepared.state != (addresses, settings):
-        made = _prepare(parts, buffers, settings)
-        if made is None:
-            return None
-        prepared = _programs[pipe] = _Prepared(made[0], (addresses, settings), made[1])
-    return prepared
+    return type(block) in kinds and (block is None or "forward" not in block.__dict__)
 
 
 def _buffers(parts: Blocks) -> dict[str, Tensor]:
@@ -213,10 +272,11 @@ def _settings(parts: Blocks) -> dict[str, Any]:
     compensate: Any = parts.compensate
     mask: Any = parts.deformed
     normals, gradient, integrate, zero, slopes, contact = (getattr(parts, name) for name in _WITH_NUMBERS)
-    zeroes = type(zero) is ZeroBackground
+    zeroes, drift = type(zero) is ZeroBackground, compensate._modules["drift"]
     return {
         "weights": next((block.weights for block in compensate._modules["clean"] if type(block) is Blur), ()),
-        "drifts": type(compensate._modules["drift"]) is Drift,
+        "drifts": type(drift) is Drift,
+        "believed_drift": MOST_BY_MODE if getattr(drift, "background", None) is not None else math.inf,
         "step": mask.step,
         "stride": mask.stride,
         "cell": mask.cell,

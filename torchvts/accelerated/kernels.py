@@ -88,7 +88,7 @@ def library() -> ctypes.CDLL | None:
     loaded.response_normals.restype = loaded.mask_values.restype = None
     loaded.grid_means.argtypes = [pointer, *[whole] * 7, pointer]
     loaded.slopes.argtypes = [pointer, whole, whole, real, pointer]
-    loaded.solve_frames.argtypes = [pointer, pointer, whole, *[pointer] * 5]
+    loaded.solve_frames.argtypes = [pointer, pointer, whole, whole, *[pointer] * 5]
     loaded.poisson_plan_size.restype = step
     loaded.make_poisson_plan.argtypes = [whole, whole, pointer]
     loaded.solve_poisson.argtypes = [pointer, pointer, real, *[whole] * 8, pointer]

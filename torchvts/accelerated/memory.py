@@ -27,24 +27,28 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     if not _lock.acquire(blocking=False):  # another thread is at the table, and after a fork for ever
         return tensor.resize_(shape)
     try:
-        some = [storage for storage in _kept.get(size, []) if storage.nbytes() == size and not storage.is_shared()]
-        _kept[size] = some  # what another process sees, or somebody has resized, is not ours any more
-        free = next((storage for storage in some if _users(storage._cdata) == 1), None)
-        if free is None:
-            free = UntypedStorage(size)
-            _keep(free, size, _users)
-        return tensor.set_(free, 0, shape)  # type: ignore[call-overload, no-any-return]
+        some = _kept.setdefault(size, [])
+        for storage in some:
+            if _users(storage._cdata) == 1 and not storage.is_shared() and storage.nbytes() == size:
+                return tensor.set_(storage, 0, shape)  # type: ignore[call-overload, no-any-return]
+        return tensor.set_(_new(size, some, _users), 0, shape)  # type: ignore[call-overload, no-any-return]
     finally:
         _lock.release()
 
 
-def _keep(storage: UntypedStorage, size: int, users: Callable[[int], int]) -> None:
-    """Keep the storage, if need be in place of those that nobody holds."""
+def _new(size: int, alike: list[UntypedStorage], users: Callable[[int], int]) -> UntypedStorage:
+    """New memory, kept beside others of its size, if need be in place of those that nobody holds.
+
+    What another process sees, or somebody has resized, is not ours any more.
+    """
+    alike[:] = [storage for storage in alike if storage.nbytes() == size and not storage.is_shared()]
     if _kept_bytes() + size > MOST_BYTES:
         for some in _kept.values():
             some[:] = [other for other in some if users(other._cdata) > 1]
+    storage = UntypedStorage(size)
     if _kept_bytes() + size <= MOST_BYTES:
-        _kept[size].append(storage)
+        alike.append(storage)
+    return storage
 
 
 def _kept_bytes() -> int:

@@ -9,6 +9,9 @@ from ..core.robust import half_sample_mode
 LEAST_DRIFT, MOST_DRIFT = 0.01, 0.15
 """Drift, relative, above the error of the mode itself, and the largest that is believed."""
 
+MOST_BY_MODE = 0.149
+"""A mode that says more is held at its limit: the other estimator takes over."""
+
 
 class Drift(nn.Module):
     """Divide each channel of compensated images (B, 3, H, W) by its brightness relative to calibration.
@@ -56,7 +59,7 @@ class Drift(nn.Module):
             return self.divided(light, self.by_mode(light))
         if self.by_mode_first:
             near = self.by_mode(light)
-            if may_read(near) and float((near - 1.0).abs().amax()) < 0.149:
+            if may_read(near) and float((near - 1.0).abs().amax()) < MOST_BY_MODE:
                 return self.divided(light, near)
             far = self.by_statistics(light, background, noise)
             return self.divided(light, torch.where((far - 1.0).abs() > 0.15, far, near))

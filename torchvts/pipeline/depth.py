@@ -67,7 +67,8 @@ class DepthPipeline(nn.Module):
     ``fast`` solves once (eq. 9). ``precise`` solves again with the depth found (eq. 10), until what is still missing falls below
     ``tolerance_px``; for response fields gradient and normals are then those of the depth. ``auto`` skips frames without deformed
     skin, predicts on every eighth pixel what a second pass would change, and solves only those frames again for which that exceeds
-    ``refine_threshold_px``, until what is missing is below a fifth of it.
+    ``refine_threshold_px``, until what is missing is below a fifth of it; where there are two passes at most, as for response
+    fields, it solves each frame twice.
     Frames of a batch do not influence one another: on a CPU each is solved by itself, and is equal bit for bit to that frame alone.
     On a GPU, in an exported program, and with a module of your own that needs the whole image, the batch is solved as one, which
     may change the rounding of sums.
@@ -142,7 +143,8 @@ class DepthPipeline(nn.Module):
         model, pitch = self.solve.normals, self.mm_per_pixel
         if mode == "fast" or not model.uses_depth:
             return Once()
-        coarse = model.coarse(STRIDE) if mode == "auto" and model.takes_window else None
+        predicts = mode == "auto" and max_passes > 2  # to solve once more costs less than to predict whether that pays
+        coarse = model.coarse(STRIDE) if predicts and model.takes_window else None
         if mode == "auto":
             tolerance_px = max(tolerance_px, 0.2 * refine_threshold_px)
         if coarse is None:
@@ -248,15 +250,16 @@ class DepthPipeline(nn.Module):
     @torch.jit.unused
     def compiled(self, images: Tensor) -> DepthOutput | None:
         """The same by one compiled call; None where the blocks must do it, each by itself."""
+        if torch.compiler.is_compiling() or type(self) is not DepthPipeline:
+            return None
+        return solve_frames(self, images, self.frame_blocks)
+
+    def frame_blocks(self) -> FrameBlocks | None:
+        """What a frame passes through; None where that depends on the frame."""
         solve, refine, slopes = self.solve, self.refine, self.slopes
-        passes = 1
-        if torch.compiler.is_compiling() or type(self) is not DepthPipeline or type(solve) is not Solve:
+        if type(solve) is not Solve or not (type(refine) is Once or (type(refine) is Repeat and refine.solve is solve)):
             return None
-        if type(refine) is Repeat and refine.solve is solve:
-            passes = refine.max_passes
-        elif type(refine) is not Once:
-            return None
-        blocks = FrameBlocks(
+        return FrameBlocks(
             self.compensate,
             self.deformed,
             self.crop,
@@ -268,9 +271,8 @@ class DepthPipeline(nn.Module):
             slopes.gradient if type(slopes) is SlopesOfDepth else None,
             self.contact,
             self.uncrop,
-            passes,
+            refine.max_passes if type(refine) is Repeat else 1,
         )
-        return solve_frames(self, blocks, images)
 
     def reconstructed(self, images: Tensor) -> DepthOutput:
         """:meth:`forward` in the threads that torch now uses."""

@@ -13,19 +13,25 @@ EXPORT void grid_means(const float *image, int planes, int height, int width, in
             }
 }
 
-/* image * gain + offset, either of which may be null; without offset (image + pedestal) * gain. */
-WIDE static void multiply_add(const float *restrict image, const float *restrict gain, const float *restrict offset, float pedestal, int n,
-                              float *restrict light) {
+/* Whether a value is not in [0, 1], or no number. */
+static inline int is_outside(float value) { return !((value >= -1e-3f) & (value <= 1.001f)); }
+
+/* image * gain + offset, either of which may be null; without offset (image + pedestal) * gain. Returns whether any value of the image is not in
+   [0, 1]. */
+WIDE static int multiply_add(const float *restrict image, const float *restrict gain, const float *restrict offset, float pedestal, int n,
+                             float *restrict light) {
+    int outside = 0;
     if (gain && !offset && pedestal != 0.0f)
-        for (int x = 0; x < n; x++) light[x] = (image[x] + pedestal) * gain[x];
+        for (int x = 0; x < n; x++) light[x] = (image[x] + pedestal) * gain[x], outside |= is_outside(image[x]);
     else if (gain && offset)
-        for (int x = 0; x < n; x++) light[x] = image[x] * gain[x] + offset[x];
+        for (int x = 0; x < n; x++) light[x] = image[x] * gain[x] + offset[x], outside |= is_outside(image[x]);
     else if (gain)
-        for (int x = 0; x < n; x++) light[x] = image[x] * gain[x];
+        for (int x = 0; x < n; x++) light[x] = image[x] * gain[x], outside |= is_outside(image[x]);
     else if (offset)
-        for (int x = 0; x < n; x++) light[x] = image[x] + offset[x];
+        for (int x = 0; x < n; x++) light[x] = image[x] + offset[x], outside |= is_outside(image[x]);
     else
-        memcpy(light, image, sizeof(float) * (size_t)n);
+        for (int x = 0; x < n; x++) light[x] = image[x], outside |= is_outside(image[x]);
+    return outside;
 }
 
 /* The sum of an odd number of lines, each times its weight, in their order; seven, six and two at a time, which stay in registers. Fused, as
@@ -63,40 +69,32 @@ WIDE FUSED static void weighted_sum(const float *const *lines, const float *rest
     }
 }
 
-/* Whether any of n values is not in [0, 1], or no number. */
-WIDE static int any_outside(const float *restrict values, int n) {
-    int found = 0;
-    for (int x = 0; x < n; x++) found |= !((values[x] >= -1e-3f) & (values[x] <= 1.001f));
-    return found;
-}
-
 /* What is done to a plane: image * gain + offset, either of which may be null. */
 typedef struct {
     const float *image, *gain, *offset;
     float pedestal;
 } Affine;
 
-/* n values from `at` on. */
-static void apply(const Affine *of, size_t at, int n, float *light) {
-    multiply_add(of->image + at, of->gain ? of->gain + at : NULL, of->offset ? of->offset + at : NULL, of->pedestal, n, light);
+/* n values from `at` on. Returns whether any of the image is not in [0, 1]. */
+static int apply(const Affine *of, size_t at, int n, float *light) {
+    return multiply_add(of->image + at, of->gain ? of->gain + at : NULL, of->offset ? of->offset + at : NULL, of->pedestal, n, light);
 }
 
-/* A plane blurred, its border repeated. scratch: taps lines, and one that is `taps` longer; `lines`: taps pointers. Returns whether any value of
-   the plane, as the camera gives it, is not in [0, 1]. */
-static int blur_plane(const Affine *plane, const float *weight, int taps, int height, int width, float *scratch, const float **lines, float *out) {
+/* Rows `first` to `last` of a plane blurred, its border repeated. scratch: taps lines, and one that is `taps` longer; `lines`: taps pointers.
+   Returns whether any value that is read, as the camera gives it, is not in [0, 1]. */
+static int blur_rows(const Affine *plane, const float *weight, int taps, int height, int width, int first, int last, float *scratch,
+                     const float **lines, float *out) {
     const int reach = taps / 2;
     float *padded = scratch + (size_t)taps * width, *row = padded + reach;
     int outside = 0;
-    for (int y = -reach, next = 0; y < height; y++) {
+    for (int y = first, next = first > reach ? first - reach : 0; y < last; y++) {
         for (; next < height && next <= y + reach; next++) { /* row `next` of the plane lies in line next % taps */
             const size_t at = (size_t)next * width;
-            outside |= any_outside(plane->image + at, width);
-            apply(plane, at, width, row);
+            outside |= apply(plane, at, width, row);
             for (int k = 0; k < reach; k++) padded[k] = row[0], row[width + k] = row[width - 1];
             for (int k = 0; k < taps; k++) lines[k] = padded + k;
             weighted_sum(lines, weight, taps, width, scratch + (size_t)(next % taps) * width);
         }
-        if (y < 0) continue;
         for (int k = 0; k < taps; k++) {
             const int at = y + k - reach < 0 ? 0 : least(y + k - reach, height - 1);
             lines[k] = scratch + (size_t)(at % taps) * width;
@@ -113,6 +111,49 @@ static void fill(float *plane, const int64_t *defect, const int64_t *neighbours,
     for (int64_t k = 0; k < count; k++) plane[defect[k]] = scratch[k];
 }
 
+/* What clean() is given, and the bits of what it returns. */
+typedef struct {
+    const float *image, *gain, *offset, *pedestal;
+    const int64_t *defect, *neighbours;
+    int64_t defects;
+    const float *weight;
+    int taps, height, width, bands;
+    float *light;
+    atomic_int trouble;
+} Cleaning;
+
+/* A band of rows of a plane. Defects lie anywhere, so with them a band is a whole plane, which is filled before it is blurred. */
+static void clean_band(void *with, int part) {
+    Cleaning *of = with;
+    const int plane = part % 3, band = part / 3, taps = of->taps, height = of->height, width = of->width;
+    const int first = height * band / of->bands, last = height * (band + 1) / of->bands;
+    const size_t pixels = (size_t)height * width, at = pixels * (size_t)(plane % 3), lines = (size_t)taps * width + width + taps;
+    const size_t filled = taps && of->defects ? pixels : 0;
+    const Affine affine = {of->image + pixels * plane, of->gain ? of->gain + at : NULL, of->offset ? of->offset + at : NULL, of->pedestal[plane % 3]};
+    float *light = of->light + pixels * plane;
+    float *scratch = malloc(sizeof(float) * (lines + filled + (size_t)of->defects + 1) + sizeof(float *) * (size_t)(taps + 1));
+    if (!scratch) {
+        atomic_fetch_or(&of->trouble, 1);
+        return;
+    }
+    const float **line = (const float **)scratch;
+    float *rows = (float *)(line + taps + 1), *whole = rows + lines, *repaired = whole + filled;
+    int outside = 0;
+    if (taps && !of->defects) {
+        outside = blur_rows(&affine, of->weight, taps, height, width, first, last, rows, line, light);
+    } else {
+        const size_t from = (size_t)first * width;
+        const int n = (last - first) * width;
+        float *to = taps ? whole : light;
+        outside = apply(&affine, from, n, to + from);
+        if (of->defects) fill(to, of->defect, of->neighbours, of->defects, repaired);
+        const Affine as_is = {to, NULL, NULL, 0.0f};
+        if (taps) blur_rows(&as_is, of->weight, taps, height, width, 0, height, rows, line, light);
+    }
+    if (outside) atomic_fetch_or(&of->trouble, 2);
+    free(scratch);
+}
+
 /*
  * light (frames, 3, height, width) = image * gain + offset, its `defects` filled, blurred by `taps` weights. gain and offset (3, height,
  * width) may be null, taps and defects 0; without offset it is pedestal (3) * gain. Returns 1 where memory is short, 2 where a value of the
@@ -120,29 +161,11 @@ static void fill(float *plane, const int64_t *defect, const int64_t *neighbours,
  */
 EXPORT int clean(const float *image, const float *gain, const float *offset, const float *pedestal, const int64_t *defect, const int64_t *neighbours, int64_t defects,
                  const float *weight, int taps, int frames, int height, int width, float *light) {
-    const size_t pixels = (size_t)height * width, lines = (size_t)taps * width + width + taps;
-    const size_t filled = taps && defects ? pixels : 0; /* defects lie anywhere, so a whole plane is filled before it is blurred */
-    float *scratch = malloc(sizeof(float) * (lines + filled + (size_t)defects + 1) + sizeof(float *) * (size_t)(taps + 1));
-    if (!scratch) return 1;
-    const float **line = (const float **)scratch;
-    float *rows = (float *)(line + taps + 1), *whole = rows + lines, *repaired = whole + filled;
-    int outside = 0;
-    for (int plane = 0; plane < 3 * frames; plane++, image += pixels, light += pixels) {
-        const size_t at = pixels * (size_t)(plane % 3);
-        Affine of = {image, gain ? gain + at : NULL, offset ? offset + at : NULL, pedestal[plane % 3]};
-        if (taps && !defects) {
-            outside |= blur_plane(&of, weight, taps, height, width, rows, line, light);
-            continue;
-        }
-        float *to = taps ? whole : light;
-        outside |= any_outside(image, (int)pixels);
-        apply(&of, 0, (int)pixels, to);
-        if (defects) fill(to, defect, neighbours, defects, repaired);
-        const Affine as_is = {to, NULL, NULL, 0.0f};
-        if (taps) blur_plane(&as_is, weight, taps, height, width, rows, line, light);
-    }
-    free(scratch);
-    return outside ? 2 : 0;
+    Cleaning work = {image, gain, offset, pedestal, defect, neighbours, defects, weight, taps, height, width, 1, light, 0};
+    if (!defects) work.bands = bands_of(height);
+    for (int b = 0; b < frames; b++, work.image += 3 * (size_t)height * width, work.light += 3 * (size_t)height * width)
+        share(clean_band, &work, 3 * work.bands);
+    return work.trouble & 1 ? 1 : work.trouble;
 }
 
 /* Sorts n values by the bits of their floats, at most twelve at a time; other: as many more. Returns where the sorted values lie. */
@@ -206,19 +229,35 @@ static float half_sample_mode(const float *ordered, int n, int halvings) {
     return ordered[n / 2];
 }
 
+/* What modes() is given. */
+typedef struct {
+    const float *image;
+    int height, width, stride, halvings;
+    float *mode;
+    atomic_int short_of_memory;
+} Modes;
+
+static void mode_of(void *with, int plane) {
+    Modes *of = with;
+    const int stride = of->stride, rows = (of->height - stride / 2 + stride - 1) / stride, columns = (of->width - stride / 2 + stride - 1) / stride;
+    const float *image = of->image + (size_t)plane * of->height * of->width;
+    float *some = malloc(2 * sizeof(float) * (size_t)rows * columns);
+    if (!some) {
+        of->short_of_memory = 1;
+        return;
+    }
+    int n = 0;
+    for (int y = stride / 2; y < of->height; y += stride)
+        for (int x = stride / 2; x < of->width; x += stride) some[n++] = image[(size_t)y * of->width + x];
+    of->mode[plane] = half_sample_mode(sorted(some, some + n, n), n, of->halvings);
+    free(some);
+}
+
 /* The mode of every stride-th pixel of each of `planes` images. Returns 1 where memory is short. */
 EXPORT int modes(const float *image, int planes, int height, int width, int stride, int halvings, float *mode) {
-    const int rows = (height - stride / 2 + stride - 1) / stride, columns = (width - stride / 2 + stride - 1) / stride;
-    float *some = malloc(2 * sizeof(float) * (size_t)rows * columns);
-    if (!some) return 1;
-    for (int plane = 0; plane < planes; plane++, image += (size_t)height * width) {
-        int n = 0;
-        for (int y = stride / 2; y < height; y += stride)
-            for (int x = stride / 2; x < width; x += stride) some[n++] = image[(size_t)y * width + x];
-        mode[plane] = half_sample_mode(sorted(some, some + n, n), n, halvings);
-    }
-    free(some);
-    return 0;
+    Modes work = {image, height, width, stride, halvings, mode, 0};
+    share(mode_of, &work, planes);
+    return work.short_of_memory;
 }
 
 /* The same made the levels that Drift.by_mode() divides by, (frames, 3). */
@@ -242,7 +281,23 @@ WIDE static void divide_all(const float *restrict values, float by, size_t n, fl
     for (size_t k = 0; k < n; k++) result[k] = values[k] / by;
 }
 
+/* What divide_planes() is given. */
+typedef struct {
+    const float *image, *level;
+    int64_t n;
+    int planes, pieces;
+    float *result;
+} Division;
+
+static void divide_piece(void *with, int part) {
+    const Division *of = with;
+    const int plane = part % of->planes, piece = part / of->planes;
+    const int64_t first = of->n * piece / of->pieces, last = of->n * (piece + 1) / of->pieces, at = of->n * plane + first;
+    divide_all(of->image + at, of->level[plane], (size_t)(last - first), of->result + at);
+}
+
 /* Each of `planes` images of n pixels divided by its level. */
 EXPORT void divide_planes(const float *image, const float *level, int planes, int64_t n, float *result) {
-    for (int plane = 0; plane < planes; plane++) divide_all(image + n * plane, level[plane], (size_t)n, result + n * plane);
+    Division work = {image, level, n, planes, 2, result};
+    share(divide_piece, &work, planes * work.pieces);
 }

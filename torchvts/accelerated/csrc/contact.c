@@ -1,11 +1,8 @@
 /* The contact mask of compensated images: the same results as torchvts/contact/masks.py, which explains them. */
-#include "kernels.h"
+#include "bits.h"
 
 #include <float.h>
 #include <math.h>
-
-/* Bits of a coarse cell. */
-enum { CELL = 1, FAINT = 2, OUTSIDE = 4, KEPT = 8, ADDED = 16, REACHED = 32 };
 
 /* The k-th smallest of n values, which it reorders: Hoare's selection. */
 static float kth_of_few(float *values, int n, int k) {
@@ -154,34 +151,25 @@ WIDE static void add_floats(const float *restrict values, int n, float *restrict
 
 typedef void (*combine)(const uint8_t *restrict, const uint8_t *restrict, const uint8_t *restrict, int, uint8_t *restrict);
 
-/* Each pixel and its eight neighbours combined, in place; `beyond` is what lies outside. `scratch`: (height + 3) (width + 2) bytes. */
-static void combine_neighbours(uint8_t *image, int height, int width, combine how, uint8_t beyond, uint8_t *scratch) {
-    uint8_t *padded = scratch, *lines = scratch + width + 2;
-    memset(padded, beyond, (size_t)width + 2);
-    memset(lines, beyond, (size_t)width);
-    memset(lines + (size_t)(height + 1) * width, beyond, (size_t)width);
-    for (int y = 0; y < height; y++) {
-        memcpy(padded + 1, image + (size_t)y * width, (size_t)width);
-        how(padded, padded + 1, padded + 2, width, lines + (size_t)(y + 1) * width);
-    }
-    for (int y = 0; y < height; y++) {
-        const uint8_t *line = lines + (size_t)y * width;
-        how(line, line + width, line + 2 * (size_t)width, width, image + (size_t)y * width);
-    }
+/* Each pixel and its eight neighbours combined, of row y of an image; `beyond`: what lies outside of it. scratch: two lines, and two bytes. */
+static void combine_row(const uint8_t *image, int height, int width, int y, combine how, uint8_t beyond, uint8_t *scratch, uint8_t *result) {
+    uint8_t *column = scratch, *outside = scratch + width + 2;
+    memset(outside, beyond, (size_t)width);
+    const uint8_t *row = image + (size_t)y * width;
+    column[0] = column[width + 1] = beyond;
+    how(y > 0 ? row - width : outside, row, y < height - 1 ? row + width : outside, width, column + 1);
+    how(column, column + 1, column + 2, width, result);
 }
 
-/* Marks all cells without any bit of `walls` that are connected, over edges, to those on the stack. */
-static void spread(uint8_t *cells, int wide, uint8_t walls, uint8_t mark, int32_t *stack, int top) {
-    const int way[4] = {1, -1, wide, -wide};
-    while (top > 0) {
-        int at = stack[--top];
-        for (int k = 0; k < 4; k++) {
-            int to = at + way[k];
-            if (!(cells[to] & walls)) {
-                cells[to] |= mark;
-                stack[top++] = to;
-            }
-        }
+/* Rows `first` to `last` of an image of ones and zeros, closed: dilated by the eight neighbours, then eroded. scratch: (last - first + 4)
+   (width + 2) bytes. */
+static void close_rows(const uint8_t *image, int height, int width, int first, int last, uint8_t *scratch, uint8_t *closed) {
+    uint8_t *dilated = scratch + 2 * ((size_t)width + 2);
+    const int from = first > 0 ? first - 1 : 0, until = least(last + 1, height), rows = until - from;
+    for (int y = from; y < until; y++) combine_row(image, height, width, y, either, 0, scratch, dilated + (size_t)(y - from) * width);
+    for (int y = first; y < last; y++) {
+        /* the first and the last row of what was dilated are the image's own border, or are not needed themselves */
+        combine_row(dilated, rows, width, y - from, all, 1, scratch, closed + (size_t)y * width);
     }
 }
 
@@ -245,12 +233,13 @@ static void cell_shares(const uint16_t *values, int width, int cell, int columns
     for (int j = 0; j < columns; j++) shares[j] /= (float)(cell * cell);
 }
 
-/* What one frame needs besides its masks. */
+/* What one frame needs besides its masks: of cells, sorted samples, three mean changes, a share and then a weight each, and lines of both; masks
+   of cells that have changed, faint ones among them, ones outside of any contact, kept ones, ones where cells decide, not pixels; two masks for
+   what is at hand, and lines of bytes. */
 typedef struct {
-    float *some, *means, *density, *down, *sums, *squared;
-    uint8_t *state, *bytes;
-    uint16_t *counts;
-    int32_t *stack;
+    float *some, *means, *density, *down, *sums;
+    uint64_t *changed, *faint, *outside, *kept, *solid, *one, *other;
+    uint8_t *line, *other_line;
 } Scratch;
 
 /* The grid of coarse cells: their number, side, and how the model of ContactMask looks at them. */
@@ -259,47 +248,129 @@ typedef struct {
     float least_cells;
     int bridge;
     float bridge_sigmas;
+    Shape shape;
 } Grid;
 
-/* Pixels whose change stands out, closed, and each cell's share of them and mean change; where the size is no multiple of the cell's
-   side, the last cells overlap others. */
-static void find_strong(const float *frame, const float *offset, const float *per_noise, const float scale[3], int height, int width,
-                        float threshold, Grid grid, Scratch at, uint8_t *strong) {
-    const size_t pixels = (size_t)height * width, cells = (size_t)grid.rows * grid.columns;
-    const int cell = grid.cell;
-    for (int i = 0; i < grid.rows; i++) {
+/* A frame's images and what is found in it. scale: of each channel's change; raw: strong pixels, before they are closed. */
+typedef struct {
+    const float *image, *offset, *per_noise, *most_far_field;
+    int height, width, stride;
+    float rounding, threshold, noise[6], scale[3];
+    int works[3], bands;
+    Grid grid;
+    Scratch at;
+    uint8_t *raw, *strong, *inner;
+    atomic_int short_of_memory;
+} Frame;
+
+/* Of a channel's change, the noise, or of part 3 and above its far field. */
+static void find_noise(void *with, int part) {
+    Frame *of = with;
+    const int c = part % 3, far = part >= 3;
+    const size_t plane = (size_t)of->height * of->width * c;
+    const float *image = of->image + plane, *offset = of->offset ? of->offset + plane : NULL, *per_noise = of->per_noise + plane;
+    const size_t samples = (size_t)((of->height + of->stride - 1) / of->stride) * ((of->width + of->stride - 1) / of->stride);
+    of->noise[part] = 0.0f;
+    if (!of->works[c] || (far && !(of->most_far_field[c] > 0.0f))) return;
+    float *some = malloc(sizeof(float) * (2 * samples + 1));
+    if (some)
+        of->noise[part] = (far ? far_field_of : noise_of)(image, offset, per_noise, of->height, of->width, of->stride, some);
+    else
+        of->short_of_memory = 1;
+    free(some);
+}
+
+/* 1 over the standard deviation of a channel's change: its noise, or the far field if that is larger. */
+static float scale_of(const Frame *of, int c) {
+    const float most = of->most_far_field[c];
+    float noise = of->noise[c], far = of->noise[3 + c];
+    if (far > most) far = most * most / far;
+    if (!(far <= noise)) noise = far;
+    if (noise < 1.0f) noise = 1.0f;
+    return of->works[c] ? 1.0f / sqrtf(noise * noise + of->rounding) : 0.0f;
+}
+
+/* Rows of cells of a band. */
+static int first_row(const Frame *of, int band) { return of->grid.rows * band / of->bands; }
+
+/* Pixels whose change stands out, and each cell's mean change; where the size is no multiple of the cell's side, the last cells overlap
+   others. */
+static void find_strong(void *with, int band) {
+    Frame *of = with;
+    const int cell = of->grid.cell, columns = of->grid.columns, height = of->height, width = of->width;
+    const size_t pixels = (size_t)height * width, cells = (size_t)of->grid.rows * columns;
+    float *sums = malloc(4 * sizeof(float) * (size_t)width);
+    if (!sums) {
+        of->short_of_memory = 1;
+        return;
+    }
+    float *squared = sums + 3 * (size_t)width;
+    for (int i = first_row(of, band); i < first_row(of, band + 1); i++) {
         const int first = least(i * cell, height - cell);
-        memset(at.sums, 0, 3 * sizeof(float) * (size_t)width);
+        memset(sums, 0, 3 * sizeof(float) * (size_t)width);
         for (int y = first; y < first + cell; y++) {
             const size_t row = (size_t)y * width;
-            memset(at.squared, 0, sizeof(float) * (size_t)width);
+            memset(squared, 0, sizeof(float) * (size_t)width);
             for (int c = 0; c < 3; c++)
-                if (scale[c] != 0.0f)
-                    add_change(frame + pixels * c + row, offset ? offset + pixels * c + row : NULL, per_noise + pixels * c + row, scale[c], width,
-                               at.sums + (size_t)c * width, at.squared);
-            above(at.squared, threshold, width, strong + row);
+                if (of->scale[c] != 0.0f)
+                    add_change(of->image + pixels * c + row, of->offset ? of->offset + pixels * c + row : NULL, of->per_noise + pixels * c + row,
+                               of->scale[c], width, sums + (size_t)c * width, squared);
+            if (y >= i * cell) above(squared, of->threshold, width, of->raw + row); /* rows above are the cell's before, of another band maybe */
         }
-        for (int c = 0; c < 3; c++)
-            cell_means(at.sums + (size_t)c * width, width, cell, grid.columns, at.means + c * cells + (size_t)i * grid.columns);
+        for (int c = 0; c < 3; c++) cell_means(sums + (size_t)c * width, width, cell, columns, of->at.means + c * cells + (size_t)i * columns);
     }
-    combine_neighbours(strong, height, width, either, 0, at.bytes);
-    combine_neighbours(strong, height, width, all, 1, at.bytes);
-    for (int i = 0; i < grid.rows; i++) {
-        const int first = least(i * cell, height - cell);
-        memset(at.counts, 0, sizeof(uint16_t) * (size_t)width);
-        for (int y = first; y < first + cell; y++) add_bytes(strong + (size_t)y * width, width, at.counts);
-        cell_shares(at.counts, width, cell, grid.columns, at.density + (size_t)i * grid.columns);
+    free(sums);
+}
+
+/* Strong pixels closed, of the rows of a band's cells. */
+static void close_strong(void *with, int band) {
+    Frame *of = with;
+    const int cell = of->grid.cell, height = of->height, width = of->width;
+    const int first = first_row(of, band) * cell, last = least(first_row(of, band + 1) * cell, height);
+    uint8_t *scratch = malloc((size_t)(last - first + 4) * (width + 2));
+    if (!scratch) {
+        of->short_of_memory = 1;
+        return;
+    }
+    close_rows(of->raw, height, width, first, last, scratch, of->strong);
+    free(scratch);
+}
+
+/* Each cell's share of strong pixels. */
+static void find_shares(void *with, int band) {
+    Frame *of = with;
+    const int cell = of->grid.cell, columns = of->grid.columns, width = of->width;
+    uint16_t *counts = malloc(sizeof(uint16_t) * (size_t)width);
+    if (!counts) {
+        of->short_of_memory = 1;
+        return;
+    }
+    for (int i = first_row(of, band); i < first_row(of, band + 1); i++) {
+        const int first = least(i * cell, of->height - cell);
+        memset(counts, 0, sizeof(uint16_t) * (size_t)width);
+        for (int y = first; y < first + cell; y++) add_bytes(of->strong + (size_t)y * width, width, counts);
+        cell_shares(counts, width, cell, columns, of->at.density + (size_t)i * columns);
+    }
+    free(counts);
+}
+
+/* Cells of a row whose mean change, each channel's times its factor, is longer than `most`, as ones and zeros. */
+WIDE static void longer_than(const float *restrict means, size_t cells, const float per[3], float most, int n, uint8_t *restrict result) {
+    const float per_r = per[0], per_g = per[1], per_b = per[2];
+    for (int j = 0; j < n; j++) {
+        const float r = means[j] * per_r, g = means[cells + j] * per_g, b = means[2 * cells + j] * per_b;
+        result[j] = r * r + g * g + b * b > most;
     }
 }
 
-/* Cells with strong pixels, and faint ones, whose mean change stands out of the frame's own spread of such means. Holes are what
-   then bears no OUTSIDE. The state has a border of one cell. Returns whether there is any cell. */
-static int find_cells(Grid grid, Scratch at) {
-    const size_t cells = (size_t)grid.rows * grid.columns;
-    const int rows = grid.rows, columns = grid.columns, wide = columns + 2;
+/* Changed cells, with strong pixels, and faint ones, whose mean change stands out of the frame's own spread of such means; and what lies
+   outside of them. Holes are neither changed nor outside. Returns whether any cell has changed. */
+static int find_cells(const Grid *grid, Scratch at) {
+    const size_t cells = (size_t)grid->rows * grid->columns;
+    const int rows = grid->rows, columns = grid->columns, words = grid->shape.words;
     const int longer = rows > columns ? rows : columns, shorter = rows + columns - longer;
     const int step = longer < 80 ? 1 : least(longer / 40, shorter); /* at least one line of a thin grid */
-    const float least_std = 1.0f / (float)grid.cell;
+    const float least_std = 1.0f / (float)grid->cell;
     float per[3];
     for (int c = 0; c < 3; c++) {
         int n = 0;
@@ -308,147 +379,152 @@ static int find_cells(Grid grid, Scratch at) {
         const float std = median(at.some, n, at.some + n) / 0.6745f;
         per[c] = 1.0f / (std < least_std ? least_std : std);
     }
-    memset(at.state, OUTSIDE, (size_t)(rows + 2) * wide);
-    int found = 0, top = 0;
-    for (int i = 0; i < rows; i++)
-        for (int j = 0; j < columns; j++) {
-            const size_t k = (size_t)i * columns + j;
-            const float r = at.means[k] * per[0], g = at.means[cells + k] * per[1], b = at.means[2 * cells + k] * per[2];
-            const uint8_t kind = at.density[k] > 0.0f ? CELL : r * r + g * g + b * b > 25.0f ? CELL | FAINT : 0;
-            const int place = (i + 1) * wide + j + 1;
-            at.state[place] = kind;
-            found |= kind;
-            if (!kind && (i == 0 || j == 0 || i == rows - 1 || j == columns - 1)) {
-                at.state[place] = OUTSIDE;
-                at.stack[top++] = place;
-            }
-        }
-    if (found) spread(at.state, wide, CELL | OUTSIDE, OUTSIDE, at.stack, top);
-    return found;
+    uint64_t found = 0;
+    for (int i = 0; i < rows; i++) {
+        const size_t first = (size_t)i * columns;
+        uint64_t *changed = at.changed + (size_t)i * words, *faint = at.faint + (size_t)i * words;
+        above(at.density + first, 0.0f, columns, at.line);
+        longer_than(at.means + first, cells, per, 25.0f, columns, at.other_line);
+        pack_bits(at.line, &grid->shape, changed);
+        pack_bits(at.other_line, &grid->shape, faint);
+        for (int w = 0; w < words; w++) faint[w] &= ~changed[w], changed[w] |= faint[w], found |= changed[w];
+    }
+    invert_bits(at.changed, &grid->shape, at.one);
+    if (found) flood_from_border(at.one, &grid->shape, at.outside);
+    return found != 0;
+}
+
+/* Weights of a row of cells, in place of shares of strong pixels. */
+WIDE static void weigh(const uint8_t *restrict changed, const uint8_t *restrict faint, const uint8_t *restrict outside, float faint_weight, int n,
+                       float *restrict weight) {
+    for (int j = 0; j < n; j++) weight[j] = outside[j] ? 0.0f : faint[j] ? faint_weight : changed[j] ? weight[j] : 1.0f;
 }
 
 /* Keeps what is connected to a cell around which there is nearly a disc of the least size. A hole counts as contact; faint cells too,
    but it takes three that lie together. */
-static void keep_large(Grid grid, Scratch at) {
-    const int rows = grid.rows, columns = grid.columns, wide = columns + 2, reach = grid.reach;
-    const float faint_weight = 0.4f * grid.least_cells < 1.0f ? 0.4f * grid.least_cells : 1.0f;
+static void keep_large(const Grid *grid, Scratch at) {
+    const int rows = grid->rows, columns = grid->columns, reach = grid->reach, words = grid->shape.words;
+    const float faint_weight = 0.4f * grid->least_cells < 1.0f ? 0.4f * grid->least_cells : 1.0f;
     float *weight = at.density;
-    for (int i = 0; i < rows; i++)
-        for (int j = 0; j < columns; j++) {
-            const uint8_t kind = at.state[(i + 1) * wide + j + 1];
-            float *w = weight + (size_t)i * columns + j;
-            *w = kind & OUTSIDE ? 0.0f : kind & FAINT ? faint_weight : kind ? *w : 1.0f;
-        }
-    int top = 0;
+    uint8_t *outside = (uint8_t *)at.sums;
+    for (int i = 0; i < rows; i++) {
+        unpack_bits(at.changed + (size_t)i * words, &grid->shape, at.line);
+        unpack_bits(at.faint + (size_t)i * words, &grid->shape, at.other_line);
+        unpack_bits(at.outside + (size_t)i * words, &grid->shape, outside);
+        weigh(at.line, at.other_line, outside, faint_weight, columns, weight + (size_t)i * columns);
+    }
     memset(at.down, 0, sizeof(float) * (size_t)(columns + 2 * reach));
     for (int i = 0; i < rows; i++) {
+        uint64_t *kept = at.kept + (size_t)i * words;
         memset(at.down + reach, 0, sizeof(float) * (size_t)columns);
         for (int k = i - reach < 0 ? 0 : i - reach; k <= i + reach && k < rows; k++)
             add_floats(weight + (size_t)k * columns, columns, at.down + reach);
         memset(at.sums, 0, sizeof(float) * (size_t)columns);
         for (int k = 0; k <= 2 * reach; k++) add_floats(at.down + k, columns, at.sums);
-        for (int j = 0; j < columns; j++) {
-            const int place = (i + 1) * wide + j + 1;
-            if (at.sums[j] > grid.least_cells && !(at.state[place] & OUTSIDE)) {
-                at.state[place] |= KEPT;
-                at.stack[top++] = place;
-            }
-        }
+        above(at.sums, grid->least_cells, columns, at.line);
+        pack_bits(at.line, &grid->shape, kept);
+        for (int w = 0; w < words; w++) kept[w] &= ~at.outside[(size_t)i * words + w];
     }
-    spread(at.state, wide, OUTSIDE | KEPT, KEPT, at.stack, top);
+    invert_bits(at.outside, &grid->shape, at.one);
+    flood(at.kept, at.one, &grid->shape);
 }
 
-/* Cells dilated by a square of so many cells either way; `lines` and `result`: bytes, as many as cells. */
-static void widen(const uint8_t *cells, int rows, int columns, int reach, uint8_t *lines, uint8_t *result) {
-    for (int i = 0; i < rows; i++) {
-        const uint8_t *row = cells + (size_t)i * columns;
-        uint8_t *line = lines + (size_t)i * columns;
-        for (int j = 0, until = -1; j < columns; j++) {
-            if (row[j]) until = j + reach;
-            line[j] = j <= until;
-        }
-        for (int j = columns - 1, from = columns; j >= 0; j--) {
-            if (row[j]) from = j - reach;
-            line[j] |= j >= from;
-        }
-    }
-    memset(result, 0, (size_t)rows * columns);
-    for (int i = 0; i < rows; i++)
-        for (int k = i < reach ? 0 : i - reach; k <= i + reach && k < rows; k++)
-            for (int j = 0; j < columns; j++) result[(size_t)i * columns + j] |= lines[(size_t)k * columns + j];
-}
-
-/* Keeps cells between kept ones that have moved too, and what they enclose: a closing by a square. */
-static void bridge_gaps(Grid grid, Scratch at) {
-    const int rows = grid.rows, columns = grid.columns, wide = columns + 2;
+/* Keeps cells between kept ones that have moved too, and what they enclose: a closing by a square. There cells decide. */
+static void bridge_gaps(const Grid *grid, Scratch at) {
+    static const float as_is[3] = {1.0f, 1.0f, 1.0f};
+    const int rows = grid->rows, columns = grid->columns, words = grid->shape.words;
     const size_t cells = (size_t)rows * columns;
-    uint8_t *one = (uint8_t *)at.density, *lines = one + cells, *other = lines + cells, *state = at.state;
-    for (int i = 0; i < rows; i++)
-        for (int j = 0; j < columns; j++) one[(size_t)i * columns + j] = (state[(i + 1) * wide + j + 1] & KEPT) != 0;
-    widen(one, rows, columns, grid.bridge, lines, other);
-    for (size_t k = 0; k < cells; k++) other[k] = !other[k];
-    widen(other, rows, columns, grid.bridge, lines, one);
-    int added = 0, top = 0;
-    for (int i = 0; i < rows; i++)
-        for (int j = 0; j < columns; j++) {
-            const size_t k = (size_t)i * columns + j;
-            const float r = at.means[k], g = at.means[cells + k], b = at.means[2 * cells + k];
-            const int place = (i + 1) * wide + j + 1;
-            if (!one[k] && !(state[place] & KEPT) && r * r + g * g + b * b > grid.bridge_sigmas * grid.bridge_sigmas)
-                state[place] |= ADDED, added = 1;
+    uint64_t *unclosed = at.one, added = 0;
+    widen(at.kept, &grid->shape, grid->bridge, at.solid, at.other);
+    invert_bits(at.other, &grid->shape, at.other);
+    widen(at.other, &grid->shape, grid->bridge, at.solid, unclosed);
+    for (int i = 0; i < rows; i++) {
+        const size_t row = (size_t)i * words;
+        longer_than(at.means + (size_t)i * columns, cells, as_is, grid->bridge_sigmas * grid->bridge_sigmas, columns, at.line);
+        pack_bits(at.line, &grid->shape, at.other + row);
+        for (int w = 0; w < words; w++) {
+            const uint64_t more = at.other[row + w] & ~unclosed[row + w] & ~at.kept[row + w];
+            at.other[row + w] = at.kept[row + w] | more, added |= more;
         }
+    }
     if (!added) return;
-    for (int i = 0; i < rows + 2; i++)
-        for (int j = 0; j < wide; j++) {
-            const int place = i * wide + j;
-            if (i == 0 || j == 0 || i == rows + 1 || j == wide - 1)
-                state[place] |= REACHED;
-            else if ((i == 1 || j == 1 || i == rows || j == columns) && !(state[place] & (KEPT | ADDED))) {
-                state[place] |= REACHED;
-                at.stack[top++] = place;
-            }
-        }
-    spread(state, wide, KEPT | ADDED | REACHED, REACHED, at.stack, top);
-    for (int i = 1; i <= rows; i++)
-        for (int j = 1; j <= columns; j++) {
-            uint8_t *here = state + i * wide + j;
-            if (!(*here & (KEPT | REACHED))) *here = (uint8_t)((*here & ~OUTSIDE) | KEPT | FAINT);
-        }
+    invert_bits(at.other, &grid->shape, at.one);
+    flood_from_border(at.one, &grid->shape, at.other);
+    invert_bits(at.other, &grid->shape, at.one); /* what the border does not reach */
+    for (size_t k = 0; k < words_of(&grid->shape); k++) {
+        const uint64_t more = at.one[k] & ~at.kept[k];
+        at.kept[k] |= more, at.faint[k] |= more, at.outside[k] &= ~more;
+    }
 }
 
-/* Whether no neighbour of a cell lies outside of the contact; what is beyond the image counts as contact. */
-static int is_inner(Grid grid, const uint8_t *state, int i, int j) {
-    for (int y = i > 0 ? i - 1 : 0; y <= i + 1 && y < grid.rows; y++)
-        for (int x = j > 0 ? j - 1 : 0; x <= j + 1 && x < grid.columns; x++)
-            if (state[(y + 1) * (grid.columns + 2) + x + 1] & OUTSIDE) return 0;
-    return 1;
+/* Cells that decide for all their pixels: faint ones, and those none of whose neighbours lies outside of the contact; what is beyond the image
+   counts as contact. */
+static void find_solid(const Grid *grid, Scratch at) {
+    widen(at.outside, &grid->shape, 1, at.one, at.other);
+    for (size_t k = 0; k < words_of(&grid->shape); k++) at.solid[k] = at.kept[k] & (at.faint[k] | ~at.other[k]);
 }
 
-/* Strong pixels of kept cells, and all pixels of inner ones. */
-static void to_pixels(Grid grid, Scratch at, int height, int width, uint8_t *strong, uint8_t *inner) {
-    const int cell = grid.cell, wide = grid.columns + 2;
-    uint8_t *kept_line = at.bytes, *inner_line = at.bytes + width;
-    for (int i = 0; i < grid.rows; i++) {
-        int any = 0;
-        for (int j = 0; j < grid.columns; j++) {
-            const uint8_t kind = at.state[(i + 1) * wide + j + 1];
-            const uint8_t kept = (kind & KEPT) != 0, solid = kept && (kind & FAINT || is_inner(grid, at.state, i, j));
-            const int first = j * cell;
-            memset(kept_line + first, kept, (size_t)least(cell, width - first));
-            memset(inner_line + first, solid, (size_t)least(cell, width - first));
-            any |= kept;
+/* Each byte `cell` times. */
+static void repeat(const uint8_t *bytes, int cell, int width, uint8_t *line) {
+    for (int j = 0, first = 0; first < width; j++, first += cell) memset(line + first, bytes[j], (size_t)least(cell, width - first));
+}
+
+/* Strong pixels of kept cells, and all pixels of those that decide. */
+static void to_pixels(void *with, int band) {
+    Frame *of = with;
+    const Shape *shape = &of->grid.shape;
+    const int cell = of->grid.cell, height = of->height, width = of->width, words = shape->words;
+    uint8_t *kept_line = malloc(2 * (size_t)width + 64 * (size_t)words), *solid_line = kept_line + width, *bytes = solid_line + width;
+    if (!kept_line) {
+        of->short_of_memory = 1;
+        return;
+    }
+    for (int i = first_row(of, band); i < first_row(of, band + 1); i++) {
+        const uint64_t *kept = of->at.kept + (size_t)i * words, *solid = of->at.solid + (size_t)i * words;
+        uint64_t any = 0;
+        for (int w = 0; w < words; w++) any |= kept[w];
+        if (any) {
+            unpack_bits(kept, shape, bytes);
+            repeat(bytes, cell, width, kept_line);
+            unpack_bits(solid, shape, bytes);
+            repeat(bytes, cell, width, solid_line);
         }
         for (int y = i * cell; y < least((i + 1) * cell, height); y++) {
             const size_t row = (size_t)y * width;
             if (any) {
-                keep_line(kept_line, inner_line, width, strong + row);
-                memcpy(inner + row, inner_line, (size_t)width);
+                keep_line(kept_line, solid_line, width, of->strong + row);
+                memcpy(of->inner + row, solid_line, (size_t)width);
             } else {
-                memset(strong + row, 0, (size_t)width);
-                memset(inner + row, 0, (size_t)width);
+                memset(of->strong + row, 0, (size_t)width);
+                memset(of->inner + row, 0, (size_t)width);
             }
         }
     }
+    free(kept_line);
+}
+
+/* Masks of one frame. Returns what contact_mask() does. */
+static int mask_frame(Frame *of) {
+    const size_t pixels = (size_t)of->height * of->width, cells = (size_t)of->grid.rows * of->grid.columns;
+    share(find_noise, of, 6);
+    for (int c = 0; c < 3; c++) of->scale[c] = scale_of(of, c);
+    share(find_strong, of, of->bands);
+    share(close_strong, of, of->bands);
+    share(find_shares, of, of->bands);
+    if (of->short_of_memory) return 1;
+    int not_finite = 0;
+    for (size_t k = 0; k < 3 * cells; k++) /* comparisons with NaN would let pixels through here that tensors do not */
+        not_finite |= !(fabsf(of->at.means[k]) < 1e15f);
+    if (find_cells(&of->grid, of->at)) {
+        keep_large(&of->grid, of->at);
+        if (of->grid.bridge > 0) bridge_gaps(&of->grid, of->at);
+        find_solid(&of->grid, of->at);
+        share(to_pixels, of, of->bands);
+    } else {
+        memset(of->strong, 0, pixels);
+        memset(of->inner, 0, pixels);
+    }
+    return of->short_of_memory ? 1 : not_finite ? 2 : 0;
 }
 
 /*
@@ -460,50 +536,25 @@ EXPORT int contact_mask(const float *image, const float *offset, const float *pe
                         const float *most_far_field, int frames, int height, int width, int step, int stride, int cell, int reach,
                         float sigmas, float rounding, float least_cells, int bridge, float bridge_sigmas, uint8_t *mask,
                         uint8_t *inner) {
-    const Grid grid = {(height + cell - 1) / cell, (width + cell - 1) / cell, cell, reach, least_cells, bridge, bridge_sigmas};
-    const size_t pixels = (size_t)height * width, cells = (size_t)grid.rows * grid.columns;
-    const size_t ringed = (size_t)(grid.rows + 2) * (grid.columns + 2);
-    const size_t samples = (size_t)((height + stride - 1) / stride) * ((width + stride - 1) / stride);
-    const size_t some = samples > cells ? samples : cells;
-    Scratch at;
-    float *floats = malloc(sizeof(float) * (2 * some + 1 + 4 * cells + 5 * (size_t)width + 2 * (size_t)reach));
-    uint8_t *bytes = malloc(ringed + (size_t)(height + 3) * (width + 2));
-    uint16_t *counts = malloc(sizeof(uint16_t) * (size_t)width);
-    int32_t *stack = malloc(sizeof(int32_t) * ringed);
-    const int short_of_memory = !floats || !bytes || !counts || !stack;
-    int not_finite = 0;
-    if (!short_of_memory) {
-        at.some = floats, at.means = at.some + 2 * some + 1, at.density = at.means + 3 * cells, at.sums = at.density + cells;
-        at.squared = at.sums + 3 * (size_t)width, at.down = at.squared + width;
-        at.state = bytes, at.bytes = bytes + ringed, at.counts = counts, at.stack = stack;
+    const int rows = (height + cell - 1) / cell, columns = (width + cell - 1) / cell;
+    const Grid grid = {rows, columns, cell, reach, least_cells, bridge, bridge_sigmas, shape_of(rows, columns)};
+    const size_t pixels = (size_t)height * width, cells = (size_t)rows * columns, words = words_of(&grid.shape), line = 64 * (size_t)grid.shape.words;
+    uint64_t *masks = malloc(7 * sizeof(uint64_t) * words + sizeof(float) * (6 * cells + 1 + 2 * line + 2 * (size_t)reach) + 2 * line);
+    if (!masks) return 1;
+    Scratch at = {.changed = masks, .faint = masks + words, .outside = masks + 2 * words, .kept = masks + 3 * words, .solid = masks + 4 * words};
+    at.one = masks + 5 * words, at.other = masks + 6 * words;
+    at.some = (float *)(masks + 7 * words), at.means = at.some + 2 * cells + 1, at.density = at.means + 3 * cells, at.sums = at.density + cells;
+    at.down = at.sums + line, at.line = (uint8_t *)(at.down + line + 2 * reach), at.other_line = at.line + line;
+    int code = 0;
+    for (int b = 0; b < frames && code != 1; b++) {
+        Frame frame = {.image = image + 3 * pixels * b, .offset = offset, .per_noise = per_noise, .most_far_field = most_far_field};
+        frame.height = height, frame.width = width, frame.stride = stride, frame.rounding = rounding, frame.threshold = sigmas * sigmas;
+        frame.bands = least(rows, bands_of(height)), frame.grid = grid, frame.at = at;
+        frame.raw = frame.inner = inner + pixels * b, frame.strong = mask + pixels * b; /* cells decide after pixels are closed */
+        working_leds(frame.image, failed_below, height, width, step, frame.works);
+        const int found = mask_frame(&frame);
+        code = found == 1 ? 1 : code | found;
     }
-    for (int b = 0; b < frames && !short_of_memory; b++) {
-        const float *frame = image + 3 * pixels * b;
-        int works[3];
-        working_leds(frame, failed_below, height, width, step, works);
-        float scale[3] = {0.0f, 0.0f, 0.0f};
-        for (int c = 0; c < 3; c++)
-            if (works[c]) {
-                const float *image_c = frame + pixels * c, *offset_c = offset ? offset + pixels * c : NULL, *per_noise_c = per_noise + pixels * c;
-                float noise = noise_of(image_c, offset_c, per_noise_c, height, width, stride, at.some);
-                float far = most_far_field[c] > 0.0f ? far_field_of(image_c, offset_c, per_noise_c, height, width, stride, at.some) : 0.0f;
-                if (far > most_far_field[c]) far = most_far_field[c] * most_far_field[c] / far;
-                if (!(far <= noise)) noise = far;
-                if (noise < 1.0f) noise = 1.0f;
-                scale[c] = 1.0f / sqrtf(noise * noise + rounding);
-            }
-        find_strong(frame, offset, per_noise, scale, height, width, sigmas * sigmas, grid, at, mask + pixels * b);
-        for (size_t k = 0; k < 3 * cells; k++) /* comparisons with NaN would let pixels through here that tensors do not */
-            if (!(fabsf(at.means[k]) < 1e15f)) not_finite = 2;
-        if (find_cells(grid, at)) {
-            keep_large(grid, at);
-            if (bridge > 0) bridge_gaps(grid, at);
-            to_pixels(grid, at, height, width, mask + pixels * b, inner + pixels * b);
-        } else {
-            memset(mask + pixels * b, 0, pixels);
-            memset(inner + pixels * b, 0, pixels);
-        }
-    }
-    free(floats), free(bytes), free(counts), free(stack);
-    return short_of_memory ? 1 : not_finite;
+    free(masks);
+    return code;
 }

@@ -1,6 +1,8 @@
 /* A whole frame in one call: what DepthPipeline.depth_of() in torchvts/pipeline/depth.py does block by block. */
 #include "kernels.h"
 
+#include <math.h>
+
 /* The settings and tables of a pipeline's blocks, in the order of a frame's way; torchvts/accelerated/frame.py has the same. */
 typedef struct {
     int32_t height, width;
@@ -11,7 +13,7 @@ typedef struct {
     int64_t defects;
     float pedestal[3];
     int32_t drifts, drift_stride, halvings;
-    float least_drift, most_drift;
+    float least_drift, most_drift, believed_drift;
     /* ContactMask */
     int32_t step, stride, cell, reach, bridge;
     float sigmas, rounding, least_cells, bridge_sigmas;
@@ -42,7 +44,7 @@ typedef struct {
 
 /* Memory of one frame besides. */
 typedef struct {
-    float *light, *normal, *gradient, *slopes, *depth;
+    float *light, *gradient, *depth;
     uint8_t *inner, *contact;
 } Work;
 
@@ -63,15 +65,19 @@ static const float *compensated(const Program *of, const float *image, float *li
     *trouble |= code;
     if (code) return NULL;
     if (of->drifts && levels(light, 1, height, width, of->drift_stride, of->halvings, of->least_drift, of->most_drift, level)) *trouble |= SHORT;
+    for (int c = 0; c < 3; c++)
+        if (!(fabsf(level[c] - 1.0f) < of->believed_drift)) *trouble |= BEYOND; /* another estimator takes over */
+    if (*trouble) return NULL;
     if (level[0] != 1.0f || level[1] != 1.0f || level[2] != 1.0f) divide_planes(light, level, 3, (int64_t)height * width, light);
     return light;
 }
 
-/* Crop.window() of torchvts/core/frame.py. */
+/* Crop.window() of torchvts/core/frame.py; without any row where no skin has moved. */
 static Window window_of(const Program *of, const uint8_t *deformed) {
     const int height = of->height, width = of->width, side = of->corners;
     int box[4];
     box_of(deformed, 1, height, width, box);
+    if (box[1] == 0) return (Window){0, 0, 0, 0};
     int top = (box[0] > 0 ? box[0] - 1 : 0) / side * side, left = (box[2] > 0 ? box[2] - 1 : 0) / side * side;
     int bottom = (box[1] + side) / side, right = (box[3] + side) / side;
     bottom = least(height, (bottom > top / side + 2 ? bottom : top / side + 2) * side);
@@ -83,22 +89,52 @@ static Window window_of(const Program *of, const uint8_t *deformed) {
     return window;
 }
 
-/* One pass: normals, gradient and depth. depth: in the window, of the pass before, or null. Returns the bits of solve_frames(). */
-static int solve(const Program *of, const float *light, const uint8_t *deformed, const float *before, Window at, Work work, float *depth) {
-    const int width = of->width, n = at.rows * at.columns;
-    const int64_t pixels = (int64_t)of->height * width, corner = (int64_t)at.top * width + at.left;
-    if (of->inverse) {
-        if (normals(light + corner, 0, pixels, width, of->dark + corner, of->saturated + corner, of->inverse + corner, pixels, width, 1, at.rows,
-                    at.columns, NULL, 0, 0, NULL, NULL, 0.0f, 0.0f, 0.0f, 0.0f, work.normal))
-            return BEYOND;
-    } else {
-        response_normals(light + corner, 0, pixels, width, of->place + at.left, of->weight + (size_t)2 * of->terms * (of->degree + 1) * at.top,
-                         of->degree, of->terms, before ? before + corner : NULL, 0, width, before ? of->per_mm + 9 * at.top : NULL, of->max_sine, 1,
-                         at.rows, at.columns, work.normal);
+/* One pass over the window at hand. before: depth of the pass before, or null. */
+typedef struct {
+    const Program *of;
+    const float *light, *before;
+    const uint8_t *deformed;
+    Window at;
+    float *gradient;
+    atomic_int trouble;
+} Pass;
+
+/* Normals and gradient of so many rows at once: few, so that what lies between stays at hand. */
+enum { ROWS = 8 };
+
+static void rows_of_gradient(void *with, int part) {
+    Pass *pass = with;
+    const Program *of = pass->of;
+    const Window at = pass->at;
+    const int first = part * ROWS, rows = least(ROWS, at.rows - first), columns = at.columns, width = of->width;
+    const int64_t plane = (int64_t)of->height * width, n = (int64_t)rows * columns, corner = (int64_t)(at.top + first) * width + at.left;
+    const float *light = pass->light + corner, *before = pass->before ? pass->before + corner : NULL;
+    float *normal = malloc(sizeof(float) * 5 * (size_t)n), *gradient = normal + 3 * n, *to = pass->gradient + (int64_t)first * columns;
+    if (!normal) {
+        atomic_fetch_or(&pass->trouble, SHORT);
+        return;
     }
-    slopes(work.normal, 1, n, of->per_slope, work.slopes);
-    mask_values(work.slopes, deformed + corner, 0, width, 1, 2, at.rows, at.columns, work.gradient);
-    return solve_poisson(work.gradient, of->tables, of->pitch, 1, at.rows, at.columns, at.top, at.left, of->height, width, 1, depth);
+    if (of->inverse) {
+        if (normals(light, 0, plane, width, of->dark + corner, of->saturated + corner, of->inverse + corner, plane, width, 1, rows, columns, NULL, 0, 0,
+                    NULL, NULL, 0.0f, 0.0f, 0.0f, 0.0f, normal))
+            atomic_fetch_or(&pass->trouble, BEYOND);
+    } else {
+        const float *weight = of->weight + (size_t)2 * of->terms * (of->degree + 1) * (at.top + first);
+        response_normals(light, 0, plane, width, of->place + at.left, weight, of->degree, of->terms, before, 0, width,
+                         before ? of->per_mm + 9 * (at.top + first) : NULL, of->max_sine, 1, rows, columns, normal);
+    }
+    slopes(normal, 1, (int)n, of->per_slope, gradient);
+    for (int c = 0; c < 2; c++)
+        mask_values(gradient + n * c, pass->deformed + corner, 0, width, 1, 1, rows, columns, to + (int64_t)at.rows * columns * c);
+    free(normal);
+}
+
+/* Gradient and depth. Returns the bits of solve_frames(). */
+static int solve(const Program *of, const float *light, const uint8_t *deformed, const float *before, Window at, Work work, float *depth) {
+    Pass pass = {of, light, before, deformed, at, work.gradient, 0};
+    share(rows_of_gradient, &pass, (at.rows + ROWS - 1) / ROWS);
+    if (pass.trouble) return pass.trouble;
+    return solve_poisson(work.gradient, of->tables, of->pitch, 1, at.rows, at.columns, at.top, at.left, of->height, of->width, 1, depth);
 }
 
 static int solve_frame(const Program *of, const float *image, Work work, Output out) {
@@ -111,6 +147,11 @@ static int solve_frame(const Program *of, const float *image, Work work, Output 
                                   work.inner);
     if (code) return code == 1 ? SHORT : BEYOND;
     const Window at = window_of(of, out.deformed);
+    if (at.rows == 0) {
+        memset(out.depth, 0, sizeof(float) * (size_t)height * width);
+        uncrop(NULL, NULL, 1, 0, 0, 0, 0, height, width, out.gradient, out.normal, out.contact);
+        return 0;
+    }
     const size_t corner = (size_t)at.top * width + at.left;
     float *found = of->zeroes ? work.depth : out.depth;
     for (int pass = 0; pass < of->passes && !trouble; pass++) trouble = solve(of, light, out.deformed, pass ? found : NULL, at, work, found);
@@ -127,25 +168,23 @@ static int solve_frame(const Program *of, const float *image, Work work, Output 
 
 /*
  * images (frames, 3, height, width) to depth (frames, height, width), gradient (frames, 2, ...), normal (frames, 3, ...), contact and deformed
- * (frames, ...) bytes, each frame by itself. Returns 0, or bits that say what stopped a frame; the output then means nothing.
+ * (frames, ...) bytes, each frame by itself, in up to `threads` threads. Returns 0, or bits that say what stopped a frame; the output then means
+ * nothing.
  */
-EXPORT int solve_frames(const Program *of, const float *images, int frames, float *depth, float *gradient, float *normal, uint8_t *contact,
-                        uint8_t *deformed) {
+EXPORT int solve_frames(const Program *of, const float *images, int frames, int threads, float *depth, float *gradient, float *normal,
+                        uint8_t *contact, uint8_t *deformed) {
     const size_t pixels = (size_t)of->height * of->width;
-    float *floats = malloc(pixels * (11 * sizeof(float) + 2));
+    float *floats = malloc(pixels * (6 * sizeof(float) + 2));
     if (!floats) return SHORT;
-    const Work work = {floats,
-                       floats + 3 * pixels,
-                       floats + 6 * pixels,
-                       floats + 8 * pixels,
-                       floats + 10 * pixels,
-                       (uint8_t *)(floats + 11 * pixels),
-                       (uint8_t *)(floats + 11 * pixels) + pixels};
+    uint8_t *bytes = (uint8_t *)(floats + 6 * pixels);
+    const Work work = {floats, floats + 3 * pixels, floats + 5 * pixels, bytes, bytes + pixels};
+    const int shared = begin_sharing(threads);
     int trouble = 0;
     for (size_t b = 0; b < (size_t)frames && !trouble; b++) {
         const Output out = {depth + b * pixels, gradient + 2 * b * pixels, normal + 3 * b * pixels, contact + b * pixels, deformed + b * pixels};
         trouble = solve_frame(of, images + 3 * b * pixels, work, out);
     }
+    end_sharing(shared);
     free(floats);
     return trouble;
 }

@@ -2,6 +2,7 @@
 #ifndef TORCHVTS_KERNELS_H
 #define TORCHVTS_KERNELS_H
 
+#include <stdatomic.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
@@ -50,6 +51,12 @@ void give_back(void *memory);
 #define free(memory) give_back(memory)
 #endif
 
+/* Work in parts, numbered from 0, that threads take in turn: see threads.c. */
+typedef void (*PartOfWork)(void *with, int part);
+int begin_sharing(int threads);
+void end_sharing(int began);
+void share(PartOfWork work, void *with, int parts);
+
 /* What frame.c calls of the other sources, which say what these do. */
 EXPORT int clean(const float *image, const float *gain, const float *offset, const float *pedestal, const int64_t *defect, const int64_t *neighbours,
                  int64_t defects, const float *weight, int taps, int frames, int height, int width, float *light);
@@ -82,5 +89,20 @@ EXPORT void uncrop(const float *gradient, const uint8_t *contact, int frames, in
                    float *whole, float *normal, uint8_t *touching);
 
 static inline int least(int a, int b) { return a < b ? a : b; }
+
+/* How many of the first n bytes are `value`. */
+static inline int bytes_alike(const uint8_t *bytes, int n, uint8_t value) {
+    const uint64_t all = value * UINT64_C(0x0101010101010101);
+    int k = 0;
+    for (uint64_t eight; k + 8 <= n; k += 8) {
+        memcpy(&eight, bytes + k, sizeof eight);
+        if (eight != all) break;
+    }
+    while (k < n && bytes[k] == value) k++;
+    return k;
+}
+
+/* Parts of at most 64 rows, an even number of them, in which threads work on a frame. */
+static inline int bands_of(int rows) { return rows < 2 ? 1 : (rows + 127) / 128 * 2; }
 
 #endif

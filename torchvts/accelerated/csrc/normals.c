@@ -142,33 +142,49 @@ WIDE static void fill(float *values, float value, size_t n) {
         for (size_t k = 0; k < n; k++) values[k] = value;
 }
 
-/* The gradient of a window (frames, 2, rows, columns) at (top, left) and its contact (bytes) set into the whole image, zero elsewhere, and the
-   normals; what is outside of the window is written once, what is inside too. */
-EXPORT void uncrop(const float *gradient, const uint8_t *contact, int frames, int rows, int columns, int top, int left, int height, int width,
-                   float *whole, float *normal, uint8_t *touching) {
-    const size_t pixels = (size_t)height * width, part = (size_t)rows * columns, above = (size_t)top * width;
-    const size_t right = (size_t)(width - left - columns), below = (size_t)(top + rows) * width;
-    for (int b = 0; b < frames; b++) {
-        float *planes[5] = {whole, whole + pixels, normal, normal + pixels, normal + 2 * pixels};
+/* What uncrop() is given, of one frame. */
+typedef struct {
+    const float *gradient;
+    const uint8_t *contact;
+    int rows, columns, top, left, height, width;
+    float *whole, *normal;
+    uint8_t *touching;
+} Uncropping;
+
+/* A band of rows of the whole image. */
+static void uncrop_band(void *with, int band) {
+    const Uncropping *of = with;
+    const int width = of->width, columns = of->columns, left = of->left, bands = bands_of(of->height);
+    const size_t pixels = (size_t)of->height * width, part = (size_t)of->rows * columns, right = (size_t)(width - left - columns);
+    float *planes[5] = {of->whole, of->whole + pixels, of->normal, of->normal + pixels, of->normal + 2 * pixels};
+    for (int line = of->height * band / bands; line < of->height * (band + 1) / bands; line++) {
+        const size_t at = (size_t)line * width;
+        const int y = line - of->top;
+        const int inside = y >= 0 && y < of->rows;
         for (int k = 0; k < 5; k++) {
             const float value = k < 4 ? 0.0f : 1.0f;
-            fill(planes[k], value, above);
-            for (int y = top; y < top + rows; y++) {
-                fill(planes[k] + (size_t)y * width, value, (size_t)left);
-                fill(planes[k] + (size_t)y * width + left + columns, value, right);
-            }
-            fill(planes[k] + below, value, pixels - below);
+            fill(planes[k] + at, value, inside ? (size_t)left : (size_t)width);
+            if (inside) fill(planes[k] + at + left + columns, value, right);
         }
-        memset(touching, 0, pixels);
-        for (int y = 0; y < rows; y++) {
-            const float *p = gradient + (size_t)y * columns, *q = p + part;
-            const size_t at = (size_t)(top + y) * width + left;
-            memcpy(whole + at, p, sizeof(float) * (size_t)columns);
-            memcpy(whole + pixels + at, q, sizeof(float) * (size_t)columns);
-            memcpy(touching + at, contact + (size_t)y * columns, (size_t)columns);
-            normal_row(p, q, columns, normal + at, normal + pixels + at, normal + 2 * pixels + at);
-        }
-        whole += 2 * pixels, normal += 3 * pixels, touching += pixels, gradient += 2 * part, contact += part;
+        memset(of->touching + at, 0, (size_t)width);
+        if (!inside) continue;
+        const float *p = of->gradient + (size_t)y * columns, *q = p + part;
+        memcpy(of->whole + at + left, p, sizeof(float) * (size_t)columns);
+        memcpy(of->whole + pixels + at + left, q, sizeof(float) * (size_t)columns);
+        memcpy(of->touching + at + left, of->contact + (size_t)y * columns, (size_t)columns);
+        normal_row(p, q, columns, planes[2] + at + left, planes[3] + at + left, planes[4] + at + left);
+    }
+}
+
+/* The gradient of a window (frames, 2, rows, columns) at (top, left) and its contact (bytes) set into the whole image, zero elsewhere, and the
+   normals. */
+EXPORT void uncrop(const float *gradient, const uint8_t *contact, int frames, int rows, int columns, int top, int left, int height, int width,
+                   float *whole, float *normal, uint8_t *touching) {
+    const size_t pixels = (size_t)height * width, part = (size_t)rows * columns;
+    for (size_t b = 0; b < (size_t)frames; b++) {
+        Uncropping work = {gradient + 2 * part * b, contact + part * b, rows, columns, top, left, height, width, whole + 2 * pixels * b,
+                           normal + 3 * pixels * b, touching + pixels * b};
+        share(uncrop_band, &work, bands_of(height));
     }
 }
 
@@ -178,14 +194,11 @@ EXPORT void box_of(const uint8_t *mask, int frames, int height, int width, int *
     for (int y = 0; y < height * frames; y++) {
         const uint8_t *row = mask + (size_t)y * width;
         const int line = y % height;
-        int first = 0, last = width;
-        for (uint64_t eight = 0; first + 8 <= width; first += 8) {
-            memcpy(&eight, row + first, sizeof eight);
-            if (eight) break;
-        }
-        while (first < width && !row[first]) first++;
+        const int first = bytes_alike(row, width, 0);
+        int last = width;
         if (first == width) continue;
-        while (!row[last - 1]) last--;
+        while (last - 64 > box[3] && bytes_alike(row + last - 64, 64, 0) == 64) last -= 64;
+        while (last > box[3] && !row[last - 1]) last--;
         box[0] = least(box[0], line), box[1] = line + 1 > box[1] ? line + 1 : box[1];
         box[2] = least(box[2], first), box[3] = last > box[3] ? last : box[3];
     }

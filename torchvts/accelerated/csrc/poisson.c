@@ -18,11 +18,15 @@ typedef struct {
     Cosine cosine;
 } Plan;
 
-/* Lanes of the coefficients of a column; never a multiple of 512 bytes, which would map many columns to the same place of the cache. */
-static int wide_of(int height) {
-    const int wide = (height + LANES - 1) / LANES * LANES;
-    return wide % 128 ? wide : wide + LANES;
-}
+/* Coefficients lie in slices of so many, SLICE of the first column, of the second and so on, so that threads which solve for some of them read
+   one piece of memory. */
+enum { SLICE = 64 };
+
+/* Coefficients of a column, in whole slices. */
+static int wide_of(int height) { return (height + SLICE - 1) / SLICE * SLICE; }
+
+/* Where coefficient k of column x lies, of slices of `columns` columns. */
+static inline size_t place_of(size_t k, size_t x, size_t columns) { return (k / SLICE * columns + x) * SLICE + k % SLICE; }
 
 /* Bytes of the tables; 0 where the height has a prime factor that is too large. */
 EXPORT int64_t poisson_plan_size(int height) {
@@ -76,14 +80,16 @@ static Part part_of(int rows, int columns, int top, int left, int height, int wi
     return part;
 }
 
-/* The divergence of a gradient, (2, rows, columns), where it is not zero: lines of `step` floats. Beyond the border of the image a gradient is
-   that of the border with the other sign, so that edges out of the image count as zero. scratch: three lines, and two floats. */
-static void divergence(const float *gradient, const Part *part, int height, int width, float half_pitch, float *scratch, float *lines, int step) {
+/* Rows `first` to `last` of the divergence of a gradient, (2, rows, columns), where it is not zero: lines of `step` floats. Beyond the border of the
+   image a gradient is that of the border with the other sign, so that edges out of the image count as zero. scratch: three lines, and two floats. */
+static void divergence(const float *gradient, const Part *part, int first, int last, int height, int width, float half_pitch, float *scratch,
+                       float *lines, int step) {
     const int n = part->last_column - part->first_column, before = part->left - part->first_column, columns = part->columns;
     float *padded = scratch, *above = scratch + n + 2, *below = above + n;
     const float *p = gradient, *q = gradient + (size_t)part->rows * columns;
-    for (int line = part->first_row; line < part->last_row; line++, lines += step) {
+    for (int line = first; line < last; line++) {
         const int y = line - part->top;
+        float *to = lines + (size_t)(line - part->first_row) * step;
         memset(scratch, 0, sizeof(float) * (3 * (size_t)n + 2));
         if (y >= 0 && y < part->rows) {
             memcpy(padded + 1 + before, p + (size_t)y * columns, sizeof(float) * (size_t)columns);
@@ -93,8 +99,8 @@ static void divergence(const float *gradient, const Part *part, int height, int 
         const int lowest = line == height - 1, highest = line == 0;
         place(q, lowest ? y : y + 1, part->rows, columns, lowest ? -1.0f : 1.0f, below + before);
         place(q, highest ? y : y - 1, part->rows, columns, highest ? -1.0f : 1.0f, above + before);
-        difference(padded, above, below, half_pitch, n, lines);
-        memset(lines + n, 0, sizeof(float) * (size_t)(step - n));
+        difference(padded, above, below, half_pitch, n, to);
+        memset(to + n, 0, sizeof(float) * (size_t)(step - n));
     }
 }
 
@@ -176,21 +182,22 @@ WIDE static void turn_round(const float *restrict values, const double *restrict
     for (int k = 0; k < n; k++) sum[k] = end[k] * values[k];
 }
 
-/* Along x: coefficients (width, wide), zero but in the part's columns, become those of the depth. state: 3 * wide doubles. */
-static void recursions(const Plan *plan, const Part *part, float *columns, double *state) {
-    const int n = plan->wide, width = plan->width, first = part->first_column, last = part->last_column;
-    double *sum = state, *other = state + n, *power = other + n;
-    memset(state, 0, sizeof(double) * 2 * (size_t)n);
-    for (int x = last - 1; x >= first; x--) sum_up(columns + (size_t)x * n, plan->pole, n, sum);
-    for (int x = first; x < last; x++) sum_up(columns + (size_t)x * n, plan->pole, n, other);
-    times_power(plan->pole, first, n, power, sum);
-    times_power(plan->pole, 2 * width - last, n, power, other);
-    begin(other, plan->per_start, n, sum);
-    for (int x = 0; x < first; x++) there_alone(columns + (size_t)x * n, plan->pole, n, sum);
-    for (int x = first; x < last; x++) there(columns + (size_t)x * n, plan->pole, n, sum);
-    for (int x = last; x < width; x++) there_alone(columns + (size_t)x * n, plan->pole, n, sum);
-    turn_round(columns + (size_t)(width - 1) * n, plan->end, n, sum);
-    for (int x = width - 1; x >= 0; x--) back(columns + (size_t)x * n, plan->pole, plan->gain, n, sum);
+/* Along x: a slice of coefficients, zero but in the part's columns, becomes that of the depth. state: three lines of doubles. */
+static void recursions(const Plan *plan, const Part *part, int from, float *slice, double *state) {
+    const int width = plan->width, first = part->first_column, last = part->last_column, n = SLICE;
+    const double *pole = plan->pole + from;
+    double *sum = state, *other = sum + SLICE, *power = other + SLICE;
+    memset(sum, 0, 2 * SLICE * sizeof(double));
+    for (int x = last - 1; x >= first; x--) sum_up(slice + (size_t)x * SLICE, pole, n, sum);
+    for (int x = first; x < last; x++) sum_up(slice + (size_t)x * SLICE, pole, n, other);
+    times_power(pole, first, n, power, sum);
+    times_power(pole, 2 * width - last, n, power, other);
+    begin(other, plan->per_start + from, n, sum);
+    for (int x = 0; x < first; x++) there_alone(slice + (size_t)x * SLICE, pole, n, sum);
+    for (int x = first; x < last; x++) there(slice + (size_t)x * SLICE, pole, n, sum);
+    for (int x = last; x < width; x++) there_alone(slice + (size_t)x * SLICE, pole, n, sum);
+    turn_round(slice + (size_t)(width - 1) * SLICE, plan->end + from, n, sum);
+    for (int x = width - 1; x >= 0; x--) back(slice + (size_t)x * SLICE, pole, plan->gain + from, n, sum);
 }
 
 /* The same for the constant along y, k = 0: sums of sums, less the mean. constant: its values, and gets the result. */
@@ -206,42 +213,39 @@ static void solve_constant(const Plan *plan, double *constant) {
     for (int x = 0; x < width; x++) constant[x] = (constant[x] - total) / plan->height;
 }
 
-/* Lines of the divergence, `step` floats each, to their coefficients: (width, wide) from the part's first column on. */
-static void to_coefficients(const Plan *plan, const Part *part, const float *lines, int step, float *scratch, float *found, float *columns) {
-    const size_t n = (size_t)plan->height, wide = (size_t)plan->wide;
-    for (int first = 0; first < step; first += LINES) {
-        memset(scratch, 0, sizeof(float) * n * LINES);
-        for (int y = part->first_row; y < part->last_row; y++) {
-            const float *line = lines + (size_t)(y - part->first_row) * step + first;
-            float *to = cosine_line(&plan->cosine, scratch, y);
-            memcpy(to, line, sizeof(float) * LANES);
-            memcpy(to + n * LANES, line + LANES, sizeof(float) * LANES);
-        }
-        cosine_forward(&plan->cosine, scratch, found);
-        for (size_t k = 0; k < wide; k += 4)
-            for (int x = 0; x < LINES; x += 4)
-                transpose(found + k * LINES + x, LINES, columns + (size_t)(part->first_column + first + x) * wide + k, wide);
+/* LINES columns of the divergence, whose lines have `step` floats, from `first` on, to their coefficients. */
+static void to_coefficients(const Plan *plan, const Part *part, const float *lines, int step, int first, float *scratch, float *found,
+                            float *coefficients) {
+    const size_t n = (size_t)plan->height, wide = (size_t)plan->wide, columns = (size_t)plan->width + LINES, to_column = (size_t)(part->first_column + first);
+    memset(scratch, 0, sizeof(float) * n * LINES);
+    for (int y = part->first_row; y < part->last_row; y++) {
+        const float *line = lines + (size_t)(y - part->first_row) * step + first;
+        float *to = cosine_line(&plan->cosine, scratch, y);
+        memcpy(to, line, sizeof(float) * LANES);
+        memcpy(to + n * LANES, line + LANES, sizeof(float) * LANES);
     }
+    cosine_forward(&plan->cosine, scratch, found);
+    for (size_t k = 0; k < wide; k += 4)
+        for (int x = 0; x < LINES; x += 4)
+            transpose(found + k * LINES + x, LINES, coefficients + place_of(k, to_column + x, columns), SLICE);
 }
 
-/* The inverse, to depth (height, width). */
-static void to_depth(const Plan *plan, const float *columns, float *scratch, float *found, float *depth) {
-    const size_t n = (size_t)plan->height, wide = (size_t)plan->wide;
-    for (int first = 0; first < plan->width; first += LINES) {
-        for (size_t k = 0; k < wide; k += 4)
-            for (int x = 0; x < LINES; x += 4) transpose(columns + (size_t)(first + x) * wide + k, wide, found + k * LINES + x, LINES);
-        float *lines = cosine_inverse(&plan->cosine, scratch, found);
-        const int one = least(LANES, plan->width - first), other = least(LINES, plan->width - first) - one;
-        for (int y = 0; y < plan->height; y++) {
-            const float *line = cosine_line(&plan->cosine, lines, y);
-            float *to = depth + (size_t)y * plan->width + first;
-            if (one == LANES && other == LANES) {
-                memcpy(to, line, sizeof(float) * LANES);
-                memcpy(to + LANES, line + n * LANES, sizeof(float) * LANES);
-            } else {
-                memcpy(to, line, sizeof(float) * (size_t)one);
-                memcpy(to + one, line + n * LANES, sizeof(float) * (size_t)other);
-            }
+/* The inverse, to columns from `first` on of depth (height, width). */
+static void to_depth(const Plan *plan, const float *coefficients, int first, float *scratch, float *found, float *depth) {
+    const size_t n = (size_t)plan->height, wide = (size_t)plan->wide, columns = (size_t)plan->width + LINES;
+    for (size_t k = 0; k < wide; k += 4)
+        for (int x = 0; x < LINES; x += 4) transpose(coefficients + place_of(k, (size_t)(first + x), columns), SLICE, found + k * LINES + x, LINES);
+    float *lines = cosine_inverse(&plan->cosine, scratch, found);
+    const int one = least(LANES, plan->width - first), other = least(LINES, plan->width - first) - one;
+    for (int y = 0; y < plan->height; y++) {
+        const float *line = cosine_line(&plan->cosine, lines, y);
+        float *to = depth + (size_t)y * plan->width + first;
+        if (one == LANES && other == LANES) {
+            memcpy(to, line, sizeof(float) * LANES);
+            memcpy(to + LANES, line + n * LANES, sizeof(float) * LANES);
+        } else {
+            memcpy(to, line, sizeof(float) * (size_t)one);
+            memcpy(to + one, line + n * LANES, sizeof(float) * (size_t)other);
         }
     }
 }
@@ -269,8 +273,8 @@ WIDE static void subtract_level(float *depth, float level, size_t n) {
     for (size_t k = 0; k < n; k++) depth[k] -= level;
 }
 
-/* Depth zero on average where the gradient is zero, and where that is nowhere, zero at its lowest. It has zero mean. */
-static void set_level(const float *gradient, const Part *part, int height, int width, float *depth) {
+/* The depth at which the gradient is zero on average, or where that is nowhere, the lowest. Depth has zero mean. */
+static float level_of(const float *gradient, const Part *part, int height, int width, const float *depth) {
     const size_t pixels = (size_t)height * width;
     double sum = 0.0;
     size_t inclined = 0;
@@ -280,13 +284,97 @@ static void set_level(const float *gradient, const Part *part, int height, int w
         sum += inclined_sum(depth + (size_t)(part->top + y) * width + part->left, p, p + (size_t)part->rows * part->columns, part->columns, &count);
         inclined += (size_t)count;
     }
-    double level = -sum / (double)(inclined < pixels ? pixels - inclined : 1);
-    if (inclined == pixels) {
-        level = depth[0];
-        for (size_t k = 1; k < pixels; k++)
-            if (depth[k] < level) level = depth[k];
-    }
-    subtract_level(depth, (float)level, pixels);
+    if (inclined < pixels) return (float)(-sum / (double)(pixels - inclined));
+    float level = depth[0];
+    for (size_t k = 1; k < pixels; k++)
+        if (depth[k] < level) level = depth[k];
+    return level;
+}
+
+/* The solution of one frame. Each part of the work has LINES columns, or a slice of coefficients of all, or a band of rows, and scratch of its
+   own: transforms and their coefficients, and the lines of the divergence's borders. */
+typedef struct {
+    Plan plan;
+    Part part;
+    const float *gradient;
+    float half_pitch, level;
+    int step;
+    float *lines, *coefficients, *depth;
+    atomic_int short_of_memory;
+} Solution;
+
+/* Memory of one transform: the lines twice, then the coefficients, of which those beyond the height are zero. Null where memory is short. */
+static float *transform_memory(Solution *of) {
+    const size_t scratch = cosine_scratch_size(of->plan.height), height = (size_t)of->plan.height, wide = (size_t)of->plan.wide;
+    float *memory = malloc(sizeof(float) * (scratch + wide * LINES));
+    if (memory)
+        memset(memory + scratch + height * LINES, 0, sizeof(float) * (wide - height) * LINES);
+    else
+        of->short_of_memory = 1;
+    return memory;
+}
+
+static void diverge(void *with, int band) {
+    Solution *of = with;
+    const int rows = of->part.last_row - of->part.first_row, bands = bands_of(rows), first = of->part.first_row;
+    float *scratch = malloc(sizeof(float) * (3 * (size_t)of->plan.width + 2));
+    if (scratch)
+        divergence(of->gradient, &of->part, first + rows * band / bands, first + rows * (band + 1) / bands, of->plan.height, of->plan.width,
+                   of->half_pitch, scratch, of->lines, of->step);
+    else
+        of->short_of_memory = 1;
+    free(scratch);
+}
+
+static void transform(void *with, int block) {
+    Solution *of = with;
+    float *memory = transform_memory(of);
+    const unsigned int before = without_tiny();
+    if (memory)
+        to_coefficients(&of->plan, &of->part, of->lines, of->step, block * LINES, memory, memory + cosine_scratch_size(of->plan.height),
+                        of->coefficients);
+    with_tiny(before);
+    free(memory);
+}
+
+static void recur(void *with, int slice) {
+    Solution *of = with;
+    double state[3 * SLICE];
+    const unsigned int before = without_tiny();
+    recursions(&of->plan, &of->part, slice * SLICE, of->coefficients + place_of((size_t)slice * SLICE, 0, (size_t)of->plan.width + LINES), state);
+    with_tiny(before);
+}
+
+static void transform_back(void *with, int block) {
+    Solution *of = with;
+    float *memory = transform_memory(of);
+    const unsigned int before = without_tiny();
+    if (memory)
+        to_depth(&of->plan, of->coefficients, block * LINES, memory, memory + cosine_scratch_size(of->plan.height), of->depth);
+    with_tiny(before);
+    free(memory);
+}
+
+static void set_level(void *with, int band) {
+    Solution *of = with;
+    const int height = of->plan.height, bands = bands_of(height), first = height * band / bands, last = height * (band + 1) / bands;
+    subtract_level(of->depth + (size_t)first * of->plan.width, of->level, (size_t)(last - first) * of->plan.width);
+}
+
+/* constant: a double for each column. */
+static void solve_one(Solution *of, int zeroed, double *constant) {
+    const Part *part = &of->part;
+    const int width = of->plan.width, height = of->plan.height;
+    share(diverge, of, bands_of(part->last_row - part->first_row));
+    share(transform, of, of->step / LINES);
+    for (int x = 0; x < width; x++) constant[x] = x >= part->first_column && x < part->last_column ? of->coefficients[(size_t)x * SLICE] : 0.0;
+    share(recur, of, of->plan.wide / SLICE);
+    solve_constant(&of->plan, constant);
+    for (int x = 0; x < width; x++) of->coefficients[(size_t)x * SLICE] = (float)constant[x];
+    share(transform_back, of, (width + LINES - 1) / LINES);
+    if (!zeroed || of->short_of_memory) return;
+    of->level = level_of(of->gradient, part, height, width, of->depth);
+    share(set_level, of, bands_of(height));
 }
 
 /*
@@ -295,33 +383,20 @@ static void set_level(const float *gradient, const Part *part, int height, int w
  */
 EXPORT int solve_poisson(const float *gradient, const double *tables, float mm_per_pixel, int frames, int rows, int columns, int top, int left,
                          int height, int width, int zeroed, float *depth) {
-    const Plan plan = plan_of(height, width, tables);
-    const Part part = part_of(rows, columns, top, left, height, width);
-    const int n = part.last_column - part.first_column, step = (n + LINES - 1) / LINES * LINES, wide = plan.wide;
-    const size_t lines = (size_t)height * (width + LINES), blocks = (size_t)width + LINES; /* the same for every window */
-    const size_t floats = cosine_scratch_size(height) + (size_t)wide * LINES + blocks * wide + lines + 3 * (size_t)width + 2;
-    float *scratch = malloc(sizeof(float) * floats + sizeof(double) * (3 * (size_t)wide + width + 1));
-    if (!scratch) return 1;
-    double *state = (double *)scratch, *constant = state + 3 * wide;
-    float *work = (float *)(constant + width), *found = work + cosine_scratch_size(height), *coefficients = found + (size_t)wide * LINES;
-    float *line = coefficients + blocks * wide, *borders = line + lines;
-    const unsigned int before = without_tiny();
-    memset(found, 0, sizeof(float) * (size_t)wide * LINES);
-    memset(coefficients + (size_t)width * wide, 0, sizeof(float) * (size_t)LINES * wide); /* columns beyond the image, which fill its last block */
-    for (int b = 0; b < frames; b++, gradient += 2 * (size_t)rows * columns, depth += (size_t)height * width) {
-        divergence(gradient, &part, height, width, 0.5f * mm_per_pixel, borders, line, step);
-        to_coefficients(&plan, &part, line, step, work, found, coefficients);
-        for (int x = 0; x < width; x++)
-            constant[x] = x >= part.first_column && x < part.last_column ? coefficients[(size_t)x * wide] : 0.0;
-        recursions(&plan, &part, coefficients, state);
-        solve_constant(&plan, constant);
-        for (int x = 0; x < width; x++) coefficients[(size_t)x * wide] = (float)constant[x];
-        to_depth(&plan, coefficients, work, found, depth);
-        if (zeroed) set_level(gradient, &part, height, width, depth);
+    Solution work = {.plan = plan_of(height, width, tables), .part = part_of(rows, columns, top, left, height, width), .half_pitch = 0.5f * mm_per_pixel};
+    const size_t wide = (size_t)work.plan.wide, lines = (size_t)height * (width + LINES), blocks = (size_t)width + LINES; /* the same for every window */
+    double *constant = malloc(sizeof(double) * (size_t)width + sizeof(float) * (blocks * wide + lines));
+    if (!constant) return 1;
+    work.step = (work.part.last_column - work.part.first_column + LINES - 1) / LINES * LINES;
+    work.coefficients = (float *)(constant + width), work.lines = work.coefficients + blocks * wide;
+    for (size_t k = 0; k < wide; k += SLICE) /* columns beyond the image, which fill its last block */
+        memset(work.coefficients + place_of(k, (size_t)width, blocks), 0, sizeof(float) * SLICE * LINES);
+    for (int b = 0; b < frames && !work.short_of_memory; b++) {
+        work.gradient = gradient + 2 * (size_t)rows * columns * b, work.depth = depth + (size_t)height * width * b;
+        solve_one(&work, zeroed, constant);
     }
-    with_tiny(before);
-    free(scratch);
-    return 0;
+    free(constant);
+    return work.short_of_memory;
 }
 
 /* Largest magnitude of n differences. Compared as whole numbers, whose order is that of floats without sign, and which are vectorised. */

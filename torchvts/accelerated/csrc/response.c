@@ -111,25 +111,44 @@ WIDE static void central(const float *restrict before, const float *restrict aft
     for (int x = 0; x < n; x++) slope[x] = (after[x] - before[x]) * by * (float)mask[x];
 }
 
+/* What depth_slopes() is given, of one frame. */
+typedef struct {
+    const float *depth;
+    int64_t depth_row;
+    const uint8_t *mask;
+    int64_t mask_row;
+    float half_per_mm;
+    int rows, columns;
+    float *gradient;
+} Slopes;
+
+static void slopes_of_band(void *with, int band) {
+    const Slopes *of = with;
+    const int rows = of->rows, columns = of->columns, last = columns - 1, bands = bands_of(rows);
+    const float half_per_mm = of->half_per_mm;
+    for (int y = rows * band / bands; y < rows * (band + 1) / bands; y++) {
+        const float *z = of->depth + of->depth_row * y;
+        const uint8_t *in = of->mask + of->mask_row * y;
+        float *p = of->gradient + (size_t)y * columns, *q = p + (size_t)rows * columns;
+        if (last > 0) {
+            central(z, z + 2, in + 1, half_per_mm, last - 1, p + 1);
+            p[0] = 2.0f * (z[1] - z[0]) * half_per_mm * (float)in[0];
+            p[last] = 2.0f * (z[last] - z[last - 1]) * half_per_mm * (float)in[last];
+        } else {
+            p[0] = 0.0f;
+        }
+        const int above = y > 0, below = y < rows - 1;
+        central(z - (above ? of->depth_row : 0), z + (below ? of->depth_row : 0), in, above && below ? half_per_mm : 2.0f * half_per_mm, columns, q);
+    }
+}
+
 /* The gradient (frames, 2, rows, columns) of depth, zero where the mask is; both of frames and rows at the given distances. half_per_mm: half
    of pixels per mm. */
 EXPORT void depth_slopes(const float *depth, int64_t depth_frame, int64_t depth_row, const uint8_t *mask, int64_t mask_frame,
                          int64_t mask_row, float half_per_mm, int frames, int rows, int columns, float *gradient) {
-    const size_t part = (size_t)rows * columns;
-    for (int b = 0; b < frames; b++, gradient += 2 * part)
-        for (int y = 0; y < rows; y++) {
-            const float *z = depth + depth_frame * b + depth_row * y;
-            const uint8_t *in = mask + mask_frame * b + mask_row * y;
-            float *p = gradient + (size_t)y * columns, *q = p + part;
-            const int last = columns - 1;
-            if (last > 0) {
-                central(z, z + 2, in + 1, half_per_mm, last - 1, p + 1);
-                p[0] = 2.0f * (z[1] - z[0]) * half_per_mm * (float)in[0];
-                p[last] = 2.0f * (z[last] - z[last - 1]) * half_per_mm * (float)in[last];
-            } else {
-                p[0] = 0.0f;
-            }
-            const int above = y > 0, below = y < rows - 1;
-            central(z - (above ? depth_row : 0), z + (below ? depth_row : 0), in, above && below ? half_per_mm : 2.0f * half_per_mm, columns, q);
-        }
+    for (int b = 0; b < frames; b++) {
+        Slopes work = {depth + depth_frame * b, depth_row, mask + mask_frame * b, mask_row, half_per_mm, rows, columns,
+                       gradient + 2 * (size_t)rows * columns * b};
+        share(slopes_of_band, &work, bands_of(rows));
+    }
 }

@@ -12,8 +12,8 @@ typedef struct {
 typedef struct {
     int rows, columns;
     float *mass, *depth, *slope_x, *slope_y, *curvature, *smooth_mass, *smooth_depth, *pressure, *found, *other, *unexplained, *squared;
-    float *sums, *line;
-    double *running;
+    float *line;
+    double *boxes;
     uint8_t *pressed, *surface;
 } Cells;
 
@@ -43,44 +43,100 @@ WIDE static void subtract(const float *restrict a, const float *restrict b, int 
     for (int x = 0; x < n; x++) result[x] = a[x] - b[x];
 }
 
+enum { ROWS = 4 };
+
+/* Running sums along ROWS rows, `step` floats apart, to `sums`, of each cell those of all rows together. Each sum waits for the one before it, so several
+   rows are summed at once. */
+static void run_along(const float *rows, int step, int columns, float *restrict sums) {
+    double total[ROWS] = {0.0};
+    memset(sums, 0, ROWS * sizeof(float));
+    for (int x = 0; x < columns; x++)
+        for (int k = 0; k < ROWS; k++) {
+            total[k] += (double)rows[k * step + x];
+            sums[ROWS * (x + 1) + k] = (float)total[k];
+        }
+}
+
+/* Means over `reach` cells either way of row k of those, zero beyond the border. */
+WIDE static void means_along(const float *restrict sums, int columns, int reach, float area, float *restrict to) {
+    const int inner = columns - reach;
+    int x = 0;
+    for (; x < reach && x < columns; x++) to[x] = sums[ROWS * least(x + reach + 1, columns)] / area;
+    for (; x < inner; x++) to[x] = (sums[ROWS * (x + reach + 1)] - sums[ROWS * (x - reach)]) / area;
+    for (; x < columns; x++) to[x] = (sums[ROWS * columns] - sums[ROWS * (x - reach)]) / area;
+}
+
+enum { MOST_BOXES = 3 };
+
+/* Doubles of memory for one box: a running sum of each column, those sums of all rows, and those along some rows. */
+static size_t box_size(const Cells *at) {
+    return (size_t)at->columns + (((size_t)at->rows + 1) * at->columns + ROWS * ((size_t)at->columns + 1) + 1) / 2;
+}
+
 /* Mean over `reach` cells either way, by running sums as torch rounds them; zero beyond the border. */
-static void box(const Cells *at, const float *values, int reach, float *result) {
-    const int rows = at->rows, columns = at->columns, side = 2 * reach + 1;
+static void box(const Cells *at, const float *values, int reach, double *running, float *result) {
+    const int rows = at->rows, columns = at->columns, side = 2 * reach + 1, many = rows < ROWS ? 1 : ROWS;
     const float area = (float)(side * side);
-    memset(at->running, 0, sizeof(double) * (size_t)columns);
-    memset(at->sums, 0, sizeof(float) * (size_t)columns);
-    for (int y = 0; y < rows; y++) add_row(values + (size_t)y * columns, at->running, columns, at->sums + (size_t)(y + 1) * columns);
+    float *sums = (float *)(running + columns), *along = sums + ((size_t)rows + 1) * columns;
+    memset(running, 0, sizeof(double) * (size_t)columns);
+    memset(sums, 0, sizeof(float) * (size_t)columns);
+    for (int y = 0; y < rows; y++) add_row(values + (size_t)y * columns, running, columns, sums + (size_t)(y + 1) * columns);
     for (int y = 0; y < rows; y++) {
         const int before = y > reach ? y - reach : 0, last = least(y + reach + 1, rows);
-        float *line = at->line, *to = result + (size_t)y * columns;
-        subtract(at->sums + (size_t)last * columns, at->sums + (size_t)before * columns, columns, to);
-        double total = 0.0;
-        line[0] = 0.0f;
-        for (int x = 0; x < columns; x++) {
-            total += (double)to[x];
-            line[x + 1] = (float)total;
-        }
-        const int inner = columns - reach;
-        int x = 0;
-        for (; x < reach && x < columns; x++) to[x] = line[least(x + reach + 1, columns)] / area;
-        for (; x < inner; x++) to[x] = (line[x + reach + 1] - line[x - reach]) / area;
-        for (; x < columns; x++) to[x] = (line[columns] - line[x - reach]) / area;
+        subtract(sums + (size_t)last * columns, sums + (size_t)before * columns, columns, result + (size_t)y * columns);
+    }
+    for (int y = 0; y < rows; y += many) { /* the last rows are summed again where their number is no multiple, and some not used */
+        const int first = least(y, rows - many);
+        run_along(result + (size_t)first * columns, many > 1 ? columns : 0, columns, along);
+        for (int k = y - first; k < many; k++) means_along(along + k, columns, reach, area, result + (size_t)(first + k) * columns);
+    }
+}
+
+typedef struct {
+    const Cells *at;
+    int reach;
+    const float *values[MOST_BOXES];
+    float *result[MOST_BOXES];
+} Boxes;
+
+static void one_box(void *with, int k) {
+    const Boxes *of = with;
+    box(of->at, of->values[k], of->reach, of->at->boxes + (size_t)k * box_size(of->at), of->result[k]);
+}
+
+/* box() of two fields. */
+static void two_boxes(const Cells *at, int reach, const float *one, float *to_one, const float *other, float *to_other) {
+    Boxes work = {at, reach, {one, other}, {to_one, to_other}};
+    share(one_box, &work, 2);
+}
+
+/* One row of find_curvature(): slopes along x, and along y of this row and of those below and above, whose cells count where they have mass. */
+WIDE static void curvature_row(const float *restrict x, const float *restrict here, const float *restrict below, const float *restrict above,
+                               const float *restrict mass, const float *restrict mass_below, const float *restrict mass_above, float two_cells_mm,
+                               int n, float *restrict curvature) {
+    for (int k = 0; k < n; k++) {
+        const float right = mass[k + 1] > 0.0f ? x[k + 1] : x[k], left = mass[k - 1] > 0.0f ? x[k - 1] : x[k];
+        const float down = mass_below[k] > 0.0f ? below[k] : here[k], up = mass_above[k] > 0.0f ? above[k] : here[k];
+        curvature[k] = (right - left + down - up) / two_cells_mm * mass[k];
     }
 }
 
 /* Divergence of slopes, times the mass; beyond cells without deformed skin, and beyond the border, slopes go on as they are. */
 static void find_curvature(const Cells *at, float two_cells_mm) {
-    const int rows = at->rows, columns = at->columns;
-    for (int y = 0; y < rows; y++)
-        for (int x = 0; x < columns; x++) {
-            const size_t k = (size_t)y * columns + x;
-            const float here_x = at->slope_x[k], here_y = at->slope_y[k];
-            const float right = x < columns - 1 && at->mass[k + 1] > 0.0f ? at->slope_x[k + 1] : here_x;
-            const float left = x > 0 && at->mass[k - 1] > 0.0f ? at->slope_x[k - 1] : here_x;
-            const float below = y < rows - 1 && at->mass[k + columns] > 0.0f ? at->slope_y[k + columns] : here_y;
-            const float above = y > 0 && at->mass[k - columns] > 0.0f ? at->slope_y[k - columns] : here_y;
-            at->other[k] = (right - left + below - above) / two_cells_mm * at->mass[k];
+    const int rows = at->rows, columns = at->columns, last = columns - 1;
+    for (int y = 0; y < rows; y++) {
+        const size_t row = (size_t)y * columns, below = y < rows - 1 ? row + columns : row, above = y > 0 ? row - columns : row;
+        const float *x = at->slope_x + row, *mass = at->mass + row;
+        if (columns > 2)
+            curvature_row(x + 1, at->slope_y + row + 1, at->slope_y + below + 1, at->slope_y + above + 1, mass + 1, at->mass + below + 1,
+                          at->mass + above + 1, two_cells_mm, columns - 2, at->other + row + 1);
+        for (int k = 0; k < columns; k += last > 0 ? last : 1) { /* the first and the last column */
+            const float here = at->slope_y[row + k];
+            const float right = k < last && mass[k + 1] > 0.0f ? x[k + 1] : x[k], left = k > 0 && mass[k - 1] > 0.0f ? x[k - 1] : x[k];
+            const float down = at->mass[below + k] > 0.0f ? at->slope_y[below + k] : here, up = at->mass[above + k] > 0.0f ? at->slope_y[above + k] : here;
+            at->other[row + k] = (right - left + down - up) / two_cells_mm * mass[k];
         }
+    }
 }
 
 WIDE static void divide(float *restrict values, const float *restrict by, float least_by, int n) {
@@ -164,9 +220,8 @@ static void find_surface(const Cells *at, const Model *model, int reach) {
         squared[columns - 1] = 0.0f;
         if (y < rows - 1) unexplained_below(at->mass + k, at->depth + k, at->slope_y + k, model->cell_mm, columns, columns, squared);
     }
-    box(at, at->squared, reach / 2, at->unexplained);
-    square(at->depth, n, at->squared);
-    box(at, at->squared, reach / 2, at->curvature);
+    square(at->depth, n, at->smooth_depth);
+    two_boxes(at, reach / 2, at->squared, at->unexplained, at->smooth_depth, at->curvature);
     are_surface(at->unexplained, at->found, at->curvature, model->most_unexplained, per > 1e-9f ? per : 1e-9f, n, at->surface);
 }
 
@@ -214,13 +269,14 @@ static void rim_depth(const Cells *at, const Model *model, int reach) {
     const int n = at->rows * at->columns;
     divide(at->slope_x, at->mass, 1e-6f, n), divide(at->slope_y, at->mass, 1e-6f, n);
     find_curvature(at, 2.0f * model->cell_mm);
-    box(at, at->mass, 2, at->smooth_mass), box(at, at->depth, 2, at->smooth_depth), box(at, at->other, 2, at->curvature);
+    Boxes smooth = {at, 2, {at->mass, at->depth, at->other}, {at->smooth_mass, at->smooth_depth, at->curvature}};
+    share(one_box, &smooth, 3);
     divide(at->smooth_depth, at->smooth_mass, 1e-6f, n), divide(at->curvature, at->smooth_mass, 1e-6f, n);
     divide(at->depth, at->mass, 1e-6f, n);
     const float decay = squared_decay(at, model, n);
     if (decay > 0.0f) find_pressure(at->smooth_depth, at->curvature, at->mass, decay, n, at->pressure);
     find_steepness(at->slope_x, at->slope_y, n, at->smooth_mass, at->curvature);
-    box(at, at->smooth_mass, reach / 2, at->found), box(at, at->curvature, reach / 2, at->other);
+    two_boxes(at, reach / 2, at->smooth_mass, at->found, at->curvature, at->other);
     find_surface(at, model, reach);
     if (decay == 0.0f) {
         all_or_none(at->surface, n, at->other);
@@ -229,9 +285,9 @@ static void rim_depth(const Cells *at, const Model *model, int reach) {
     find_pressed(at->pressure, at->found, at->other, at->surface, model->share * sqrtf(decay), largest(at->pressure, n), n, at->pressed,
                  at->smooth_mass);
     some_of(at->mass, n, at->curvature);
-    box(at, at->smooth_mass, 1, at->found), box(at, at->curvature, 1, at->other);
+    two_boxes(at, 1, at->smooth_mass, at->found, at->curvature, at->other);
     find_rim(at->found, at->other, at->mass, at->depth, n, at->smooth_mass, at->curvature);
-    box(at, at->smooth_mass, reach, at->found), box(at, at->curvature, reach, at->other);
+    two_boxes(at, reach, at->smooth_mass, at->found, at->curvature, at->other);
     find_level(at->found, at->pressed, n, at->other);
 }
 
@@ -240,37 +296,65 @@ WIDE static void deeper(const uint8_t *restrict inside, const float *restrict de
     for (int x = 0; x < n; x++) contact[x] = inside[x] & (depth[x] > level[x]);
 }
 
+/* One frame's window, and its cells. */
+typedef struct {
+    Cells at;
+    const float *depth, *gradient;
+    const uint8_t *deformed;
+    int64_t depth_row, deformed_row;
+    int rows, columns, cell, bands;
+    uint8_t *contact;
+} Frame;
+
+/* Rows of cells of a band. */
+static int first_row(const Frame *of, int band) { return of->at.rows * band / of->bands; }
+
 /* Means of whole cells; beyond the border all is zero. */
-static void to_cells(const Cells *at, const uint8_t *inside, int64_t inside_row, const float *depth, int64_t depth_row, const float *gradient,
-                     int rows, int columns, int cell) {
-    const int whole = columns / cell, rest = columns - whole * cell;
-    const size_t part = (size_t)rows * columns, n = (size_t)at->rows * at->columns;
-    memset(at->mass, 0, 4 * sizeof(float) * n);
-    for (int y = 0; y < rows; y++) {
-        const size_t to = (size_t)(y / cell) * at->columns;
-        const float *p = gradient + (size_t)y * columns, *q = p + part;
-        const uint8_t *in = inside + inside_row * y;
-        const float *z = depth + depth_row * y;
-        add_pixels(in, z, p, q, cell, whole, at->mass + to, at->depth + to, at->slope_x + to, at->slope_y + to);
-        const int last = whole * cell;
-        for (int k = 0; k < rest; k++)
-            add_pixels(in + last + k, z + last + k, p + last + k, q + last + k, 1, 1, at->mass + to + whole, at->depth + to + whole,
-                       at->slope_x + to + whole, at->slope_y + to + whole);
+static void to_cells(void *with, int band) {
+    const Frame *of = with;
+    const Cells *at = &of->at;
+    const int columns = of->columns, cell = of->cell, whole = columns / cell, last = whole * cell, rest = columns - last;
+    for (int i = first_row(of, band); i < first_row(of, band + 1); i++) {
+        const size_t to = (size_t)i * at->columns;
+        float *mass = at->mass + to, *depth = at->depth + to, *x = at->slope_x + to, *y = at->slope_y + to, *fields[4] = {mass, depth, x, y};
+        for (int k = 0; k < 4; k++) memset(fields[k], 0, sizeof(float) * (size_t)at->columns);
+        for (int line = i * cell; line < least((i + 1) * cell, of->rows); line++) {
+            const float *p = of->gradient + (size_t)line * columns, *q = p + (size_t)of->rows * columns, *z = of->depth + of->depth_row * line;
+            const uint8_t *in = of->deformed + of->deformed_row * line;
+            add_pixels(in, z, p, q, cell, whole, mass, depth, x, y);
+            for (int k = last; k < last + rest; k++) add_pixels(in + k, z + k, p + k, q + k, 1, 1, mass + whole, depth + whole, x + whole, y + whole);
+        }
+        for (int k = 0; k < 4 && cell > 1; k++) scale(fields[k], 1.0f / (float)(cell * cell), at->columns);
     }
-    if (cell > 1) scale(at->mass, 1.0f / (float)(cell * cell), (int)(4 * n));
 }
 
-static int allocate(Cells *at, int rows, int columns, int cell) {
-    at->rows = (rows + cell - 1) / cell, at->columns = (columns + cell - 1) / cell;
-    const size_t n = (size_t)at->rows * at->columns, line = (size_t)at->columns * cell + 1;
-    at->mass = malloc(sizeof(float) * (13 * n + (size_t)at->columns + line));
-    at->running = malloc(sizeof(double) * (size_t)at->columns);
-    at->pressed = malloc(2 * n);
-    if (!at->mass || !at->running || !at->pressed) return 1;
+/* Contact of the pixels of a band, by the rim's depth of their cells. */
+static void to_pixels(void *with, int band) {
+    const Frame *of = with;
+    const Cells *at = &of->at;
+    const int cell = of->cell;
+    float *line = at->line + (size_t)band * at->columns * cell;
+    for (int i = first_row(of, band); i < first_row(of, band + 1); i++) {
+        const float *level = at->other + (size_t)i * at->columns;
+        for (int x = 0; x < at->columns; x++)
+            for (int k = 0; k < cell; k++) line[x * cell + k] = level[x];
+        for (int y = i * cell; y < least((i + 1) * cell, of->rows); y++)
+            deeper(of->deformed + of->deformed_row * y, of->depth + of->depth_row * y, line, of->columns, of->contact + (size_t)y * of->columns);
+    }
+}
+
+static int allocate(Frame *of) {
+    Cells *at = &of->at;
+    at->rows = (of->rows + of->cell - 1) / of->cell, at->columns = (of->columns + of->cell - 1) / of->cell;
+    of->bands = least(at->rows, bands_of(of->rows));
+    const size_t n = (size_t)at->rows * at->columns, line = (size_t)of->bands * at->columns * of->cell;
+    at->boxes = malloc(sizeof(double) * MOST_BOXES * box_size(at) + sizeof(float) * (12 * n + line) + 2 * n);
+    if (!at->boxes) return 1;
+    at->mass = (float *)(at->boxes + MOST_BOXES * box_size(at));
     at->depth = at->mass + n, at->slope_x = at->depth + n, at->slope_y = at->slope_x + n, at->curvature = at->slope_y + n;
     at->smooth_mass = at->curvature + n, at->smooth_depth = at->smooth_mass + n, at->pressure = at->smooth_depth + n;
     at->found = at->pressure + n, at->other = at->found + n, at->unexplained = at->other + n, at->squared = at->unexplained + n;
-    at->sums = at->squared + n, at->line = at->sums + n + at->columns, at->surface = at->pressed + n;
+    at->line = at->squared + n, at->pressed = (uint8_t *)(at->line + line), at->surface = at->pressed + n;
     return 0;
 }
 
@@ -283,19 +367,15 @@ EXPORT int contact_from_depth(const float *depth, int64_t depth_frame, int64_t d
                               const float *numbers, uint8_t *contact) {
     const Model model = {numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5], numbers[6], numbers[7], numbers[8]};
     const size_t part = (size_t)rows * columns;
-    Cells at;
-    const int short_of_memory = allocate(&at, rows, columns, cell);
-    for (int b = 0; b < frames && !short_of_memory; b++, depth += depth_frame, deformed += deformed_frame, contact += part) {
-        to_cells(&at, deformed, deformed_row, depth, depth_row, gradient + 2 * part * b, rows, columns, cell);
-        rim_depth(&at, &model, reach);
-        for (int y = 0; y < rows; y++) {
-            uint8_t *to = contact + (size_t)y * columns;
-            const float *level = at.other + (size_t)(y / cell) * at.columns;
-            for (int x = 0; x < at.columns; x++)
-                for (int k = 0; k < cell; k++) at.line[x * cell + k] = level[x];
-            deeper(deformed + deformed_row * y, depth + depth_row * y, at.line, columns, to);
-        }
+    Frame frame = {.depth_row = depth_row, .deformed_row = deformed_row, .rows = rows, .columns = columns, .cell = cell};
+    if (allocate(&frame)) return 1;
+    for (int b = 0; b < frames; b++) {
+        frame.depth = depth + depth_frame * b, frame.deformed = deformed + deformed_frame * b;
+        frame.gradient = gradient + 2 * part * b, frame.contact = contact + part * b;
+        share(to_cells, &frame, frame.bands);
+        rim_depth(&frame.at, &model, reach);
+        share(to_pixels, &frame, frame.bands);
     }
-    free(at.mass), free(at.running), free(at.pressed);
-    return short_of_memory;
+    free(frame.at.boxes);
+    return 0;
 }

@@ -78,19 +78,22 @@ WIDE static void relax(Grid *grid) {
     }
 }
 
+WIDE static void between(const float *restrict upper, const float *restrict lower, float down, int n, float *restrict line) {
+    const float up = 1.0f - down;
+    for (int x = 0; x < n; x++) line[x] = up * upper[x] + down * lower[x];
+}
+
 /* A line between the two rows of a grid around pixel row y of one that is `scale` times finer; a cell beyond either end repeats it. */
 static void between_rows(const Grid *grid, int y, float scale, float *line) {
     float at = ((float)y + 0.5f) / scale - 0.5f;
     if (at < 0.0f) at = 0.0f;
     const int top = least((int)at, grid->rows - 1);
-    const float down = at - (float)top, up = 1.0f - down;
-    const float *upper = cell_of(grid, grid->found, top), *lower = cell_of(grid, grid->found, least(top + 1, grid->rows - 1));
-    for (int x = 0; x < grid->columns; x++) line[x + 1] = up * upper[x] + down * lower[x];
+    between(cell_of(grid, grid->found, top), cell_of(grid, grid->found, least(top + 1, grid->rows - 1)), at - (float)top, grid->columns, line + 1);
     line[0] = line[1], line[grid->columns + 1] = line[grid->columns];
 }
 
 /* What was found on the next coarser grid. `line`: as many floats as that has columns, and two more. */
-WIDE static void refine(const Grid *coarse, Grid *grid, float *restrict line) {
+static void refine(const Grid *coarse, Grid *grid, float *line) {
     for (int y = 0; y < grid->rows; y++) {
         between_rows(coarse, y, 2.0f, line);
         float *restrict found = cell_of(grid, grid->found, y);
@@ -129,17 +132,15 @@ WIDE static void any_of_five(const uint8_t *restrict a, const uint8_t *restrict 
     for (int x = 0; x < n; x++) result[x] = (a[x] | b[x] | c[x] | d[x] | e[x]) ^ flipped;
 }
 
-/* 1 at pixels within two of which none is deformed, else 0. padded: (height + 5) lines, each two bytes longer on either side. */
-static void not_beside(const uint8_t *deformed, int height, int width, uint8_t *padded, uint8_t *flat) {
+/* Row y: 1 at pixels within two of which none is deformed, else 0. scratch: two lines, and four bytes each. */
+static void not_beside(const uint8_t *deformed, int height, int width, int y, uint8_t *scratch, uint8_t *flat) {
     const size_t wide = (size_t)width + 4;
-    uint8_t *column = padded + wide * (size_t)(height + 4);
-    memset(padded, 0, wide * (size_t)(height + 4));
-    for (int y = 0; y < height; y++) memcpy(padded + (size_t)(y + 2) * wide + 2, deformed + (size_t)y * width, (size_t)width);
-    for (int y = 0; y < height; y++) {
-        const uint8_t *line = padded + (size_t)y * wide;
-        any_of_five(line, line + wide, line + 2 * wide, line + 3 * wide, line + 4 * wide, 0, (int)wide, column);
-        any_of_five(column, column + 1, column + 2, column + 3, column + 4, 1, width, flat + (size_t)y * width);
-    }
+    uint8_t *column = scratch, *none = scratch + wide;
+    const uint8_t *line[5];
+    memset(column, 0, 2 * wide);
+    for (int k = 0; k < 5; k++) line[k] = y + k < 2 || y + k >= height + 2 ? none : deformed + (size_t)(y + k - 2) * width;
+    any_of_five(line[0], line[1], line[2], line[3], line[4], 0, width, column + 2);
+    any_of_five(column, column + 1, column + 2, column + 3, column + 4, 1, width, flat);
 }
 
 enum { LANES = 16 };
@@ -257,29 +258,43 @@ static Box not_flat(const uint8_t *kind, int height, int width) {
     Box box = {height, 0, width, 0};
     for (int y = 0; y < height; y++) {
         const uint8_t *row = kind + (size_t)y * width;
-        int left = 0, right = width;
-        while (left < width && row[left] == FLAT) left++;
+        const int left = bytes_alike(row, width, FLAT);
+        int right = width;
         if (left == width) continue;
-        while (row[right - 1] == FLAT) right--;
+        while (right - 64 > box.right && bytes_alike(row + right - 64, 64, FLAT) == 64) right -= 64;
+        while (right > box.right && row[right - 1] == FLAT) right--;
         box.top = least(box.top, y), box.bottom = y + 1;
         box.left = least(box.left, left), box.right = right > box.right ? right : box.right;
     }
     return box;
 }
 
-/* Memory of one call: grids, pixels' kinds, sums of columns, lines, and where pixels lie between cells. */
+/* One call: grids, pixels' kinds, where pixels lie between cells, the sum and number of flat pixels of each row, and of each band of rows the
+   smallest and largest depth, sums of columns and lines. Then the frame at hand. */
 typedef struct {
     Grid grids[MOST_GRIDS];
-    int count, cell;
-    float *memory, *share, *value, *weight, *line, *found, *along;
-    int32_t *place;
-    uint8_t *kind, *padded;
+    int count, cell, height, width, bands;
+    float *memory, *along, *flat_sum, *band_memory, *line;
+    int32_t *place, *flat_count;
+    uint8_t *kind, *scratch;
+    const float *depth;
+    const uint8_t *deformed;
+    float *out;
+    float level, middle, range, stiff, most;
+    Box box;
+    atomic_int below;
 } Work;
+
+/* Floats that a band of rows has for itself: sums of columns, a line of cells, and one of pixels. */
+static size_t band_size(const Work *work) {
+    const size_t columns = (size_t)work->grids[0].columns;
+    return 3 * columns * work->cell + columns + 2 + (size_t)work->width + 2;
+}
 
 static int allocate(Work *work, int height, int width) {
     const int cell = least(height, width) / 60 > 1 ? least(height, width) / 60 : 1;
     int rows = (height + cell - 1) / cell, columns = (width + cell - 1) / cell;
-    const size_t lines = (size_t)columns * cell, first = (size_t)columns + 2;
+    const size_t first = (size_t)columns + 2;
     size_t cells = 0;
     work->cell = cell, work->count = 0;
     for (; work->count < MOST_GRIDS; rows = (rows + 1) / 2, columns = (columns + 1) / 2) {
@@ -289,10 +304,12 @@ static int allocate(Work *work, int height, int width) {
         cells += (size_t)(rows + 3) * grid->wide;
         if (least(rows, columns) <= 2) break;
     }
-    work->memory = calloc(6 * cells + 3 * lines + first + 3 * (size_t)width, sizeof(float));
-    work->kind = malloc((size_t)height * width + (size_t)(height + 5) * (width + 4));
+    work->height = height, work->width = width;
+    work->bands = least(work->grids[0].rows, bands_of(height));
+    work->memory = calloc(6 * cells + (size_t)work->bands * band_size(work) + first + 2 * (size_t)width + 2 * (size_t)height, sizeof(float));
+    work->kind = malloc((size_t)height * width + (size_t)work->bands * 2 * ((size_t)width + 4));
     if (!work->memory || !work->kind) return 1;
-    work->padded = work->kind + (size_t)height * width;
+    work->scratch = work->kind + (size_t)height * width;
     float *place = work->memory;
     for (int k = 0; k < work->count; k++) {
         Grid *grid = &work->grids[k];
@@ -301,8 +318,9 @@ static int allocate(Work *work, int height, int width) {
         grid->product = place + 4 * size, grid->found = place + 5 * size;
         place += 6 * size;
     }
-    work->share = place, work->value = place + lines, work->weight = place + 2 * lines, work->line = place + 3 * lines;
-    work->found = work->line + first, work->along = work->found + width, work->place = (int32_t *)(work->along + width);
+    work->band_memory = place, work->line = place + (size_t)work->bands * band_size(work), work->along = work->line + first;
+    work->place = (int32_t *)(work->along + width), work->flat_sum = (float *)(work->place + width);
+    work->flat_count = (int32_t *)(work->flat_sum + height);
     for (int x = 0; x < width; x++) {
         float at = ((float)x + 0.5f) / (float)cell - 0.5f;
         if (at < 0.0f) at = 0.0f;
@@ -312,87 +330,148 @@ static int allocate(Work *work, int height, int width) {
     return 0;
 }
 
-/* The continuation at the pixels of row y from `left` to `right`, in work->found. */
-static const float *continuation(Work *work, int y, int left, int right) {
-    Grid *grid = &work->grids[0];
-    if (work->cell == 1) return cell_of(grid, grid->found, y) + left;
-    between_rows(grid, y, (float)work->cell, work->line);
-    along_row(work->line, work->place + left, work->along + left, right - left, work->found);
-    return work->found;
+/* Memory of a band of rows, and its rows of cells and pixels. */
+typedef struct {
+    float *share, *value, *weight, *line, *found;
+    int first, last, top, bottom;
+} Band;
+
+static Band band_of(Work *work, int band) {
+    const Grid *grid = &work->grids[0];
+    const size_t lines = (size_t)grid->columns * work->cell;
+    float *memory = work->band_memory + (size_t)band * band_size(work);
+    Band of = {memory, memory + lines, memory + 2 * lines, memory + 3 * lines, memory + 3 * lines + grid->columns + 2, 0, 0, 0, 0};
+    of.first = grid->rows * band / work->bands, of.last = grid->rows * (band + 1) / work->bands;
+    of.top = of.first * work->cell, of.bottom = least(of.last * work->cell, work->height);
+    return of;
 }
 
-/* Mean depth of flat skin. Undeformed pixels are marked as flat, or as raised where they are a face of the object above `middle`. */
-static float level_of(const float *depth, uint8_t *kind, float middle, int height, int width) {
+/* The continuation at the pixels of row y from `left` to `right`. */
+static const float *continuation(const Work *work, Band *band, int y, int left, int right) {
+    const Grid *grid = &work->grids[0];
+    if (work->cell == 1) return cell_of(grid, grid->found, y) + left;
+    between_rows(grid, y, (float)work->cell, band->line);
+    along_row(band->line, work->place + left, work->along + left, right - left, band->found);
+    return band->found;
+}
+
+/* Kinds of a band's pixels, and its smallest and largest depth, to the first floats of its memory. */
+static void find_kinds(void *with, int part) {
+    Work *work = with;
+    const Band band = band_of(work, part);
+    for (int y = band.top; y < band.bottom; y++)
+        not_beside(work->deformed, work->height, work->width, y, work->scratch + (size_t)part * 2 * ((size_t)work->width + 4),
+                   work->kind + (size_t)y * work->width);
+    range_of(work->depth + (size_t)band.top * work->width, (size_t)(band.bottom - band.top) * work->width, band.share, band.share + 1);
+}
+
+/* Flat and raised skin of a band, and the sum and number of flat pixels of each of its rows. */
+static void find_flat(void *with, int part) {
+    Work *work = with;
+    const Band band = band_of(work, part);
+    for (int y = band.top; y < band.bottom; y++)
+        flat_row(work->depth + (size_t)y * work->width, work->kind + (size_t)y * work->width, work->middle, work->width, work->flat_sum + y,
+                 work->flat_count + y);
+}
+
+/* Mean depth of flat skin. Undeformed pixels are marked as flat, or as raised where they are a face of the object above the middle. */
+static float level_of(Work *work) {
+    const size_t pixels = (size_t)work->height * work->width;
     double sum = 0.0;
     int64_t flat = 0;
-    for (int y = 0; y < height; y++) {
-        float part;
-        int count;
-        flat_row(depth + (size_t)y * width, kind + (size_t)y * width, middle, width, &part, &count);
-        sum += part, flat += count;
-    }
-    const size_t pixels = (size_t)height * width;
-    if (memchr(kind, RAISED, pixels) && !is_face(kind, height, width)) {
+    share(find_flat, work, work->bands);
+    for (int y = 0; y < work->height; y++) sum += work->flat_sum[y], flat += work->flat_count[y];
+    if (memchr(work->kind, RAISED, pixels) && !is_face(work->kind, work->height, work->width)) {
         for (size_t k = 0; k < pixels; k++) {
-            if (kind[k] != RAISED) continue;
-            kind[k] = FLAT;
-            sum += depth[k], flat++;
+            if (work->kind[k] != RAISED) continue;
+            work->kind[k] = FLAT;
+            sum += work->depth[k], flat++;
         }
     }
     return flat ? (float)(sum / (double)flat) : 0.0f;
 }
 
-/* The undeformed skin's shares, values and weights of cells; all weights. Returns the mean depth of flat skin, and the range above it. */
-static float known_cells(Work *work, const float *depth, int height, int width, float stiff, float *range) {
+/* The undeformed skin's shares, values and weights of a band's cells. */
+static void fill_cells(void *with, int part) {
+    Work *work = with;
     Grid *grid = &work->grids[0];
-    const int cell = work->cell;
-    const float per_cell = 1.0f / (float)(cell * cell);
-    float low, high;
-    range_of(depth, (size_t)height * width, &low, &high);
-    const float level = level_of(depth, work->kind, 0.5f * (low + high), height, width);
-    *range = high - level > 1e-9f ? high - level : 1e-9f;
+    const Band band = band_of(work, part);
+    const int cell = work->cell, width = work->width;
     const size_t lines = (size_t)grid->columns * cell;
-    for (int i = 0; i < grid->rows; i++) {
-        memset(work->share, 0, 3 * sizeof(float) * lines);
-        for (int y = i * cell; y < least((i + 1) * cell, height); y++)
-            add_row(depth + (size_t)y * width, work->kind + (size_t)y * width, level, 1.0f / *range, stiff, width, work->share, work->value,
-                    work->weight);
-        float *share = cell_of(grid, grid->share, i), *value = cell_of(grid, grid->value, i), *weight = cell_of(grid, grid->weight, i);
-        memset(share, 0, sizeof(float) * (size_t)grid->columns);
+    const float per_cell = 1.0f / (float)(cell * cell);
+    for (int i = band.first; i < band.last; i++) {
+        memset(band.share, 0, 3 * sizeof(float) * lines);
+        for (int y = i * cell; y < least((i + 1) * cell, work->height); y++)
+            add_row(work->depth + (size_t)y * width, work->kind + (size_t)y * width, work->level, 1.0f / work->range, work->stiff, width, band.share,
+                    band.value, band.weight);
+        float *share_of = cell_of(grid, grid->share, i), *value = cell_of(grid, grid->value, i), *weight = cell_of(grid, grid->weight, i);
+        memset(share_of, 0, sizeof(float) * (size_t)grid->columns);
         memset(value, 0, sizeof(float) * (size_t)grid->columns);
         memset(weight, 0, sizeof(float) * (size_t)grid->columns);
-        add_columns(work->share, grid->columns, cell, per_cell, share);
-        add_columns(work->value, grid->columns, cell, per_cell, value);
-        add_columns(work->weight, grid->columns, cell, per_cell, weight);
+        add_columns(band.share, grid->columns, cell, per_cell, share_of);
+        add_columns(band.value, grid->columns, cell, per_cell, value);
+        add_columns(band.weight, grid->columns, cell, per_cell, weight);
     }
+}
+
+/* Kinds of pixels, the mean depth of flat skin, the range above it, and the undeformed skin's cells; all weights. */
+static void known_cells(Work *work) {
+    share(find_kinds, work, work->bands);
+    float low = band_of(work, 0).share[0], high = band_of(work, 0).share[1];
+    for (int k = 1; k < work->bands; k++) {
+        const float *ends = band_of(work, k).share;
+        low = ends[0] < low ? ends[0] : low, high = ends[1] > high ? ends[1] : high;
+    }
+    work->middle = 0.5f * (low + high);
+    work->level = level_of(work);
+    work->range = high - work->level > 1e-9f ? high - work->level : 1e-9f;
+    share(fill_cells, work, work->bands);
     for (int k = 0; k < work->count; k++) {
         if (k > 0) coarser(&work->grids[k - 1], work->grids[k - 1].weight, &work->grids[k], work->grids[k].weight);
         weigh(&work->grids[k]);
     }
-    return level;
 }
 
-/* Deformed skin that lies below the continuation counts as known too. Returns whether there is any. */
-static int add_known(Work *work, const float *depth, int width, Box box, float most) {
+/* Deformed skin of a band that lies below the continuation counts as known too. */
+static void add_known(void *with, int part) {
+    Work *work = with;
     Grid *grid = &work->grids[0];
-    const int cell = work->cell, first = box.top / cell, last = (box.bottom + cell - 1) / cell;
+    Band band = band_of(work, part);
+    const Box box = work->box;
+    const int cell = work->cell, width = work->width;
     const size_t lines = (size_t)grid->columns * cell;
     const float per_cell = 1.0f / (float)(cell * cell);
-    int any = 0;
-    for (int i = first; i < last; i++) {
-        memset(work->share, 0, 2 * sizeof(float) * lines);
+    for (int i = band.first; i < band.last; i++) {
+        memset(band.share, 0, 2 * sizeof(float) * lines);
         int here = 0;
         for (int y = i * cell > box.top ? i * cell : box.top; y < least((i + 1) * cell, box.bottom); y++) {
-            const float *found = continuation(work, y, box.left, box.right);
+            const float *found = continuation(work, &band, y, box.left, box.right);
             const size_t at = (size_t)y * width + box.left;
-            here |= add_below(depth + at, work->kind + at, found, most, box.right - box.left, work->share + box.left, work->value + box.left);
+            here |= add_below(work->depth + at, work->kind + at, found, work->most, box.right - box.left, band.share + box.left,
+                              band.value + box.left);
         }
         if (!here) continue;
-        any = 1;
-        add_columns(work->share, grid->columns, cell, per_cell, cell_of(grid, grid->share, i));
-        add_columns(work->value, grid->columns, cell, per_cell, cell_of(grid, grid->value, i));
+        work->below = 1;
+        add_columns(band.share, grid->columns, cell, per_cell, cell_of(grid, grid->share, i));
+        add_columns(band.value, grid->columns, cell, per_cell, cell_of(grid, grid->value, i));
     }
-    return any;
+}
+
+/* A band of the result, which is zero outside of the box. */
+static void write_out(void *with, int part) {
+    Work *work = with;
+    Band band = band_of(work, part);
+    const Box box = work->box;
+    for (int y = band.top; y < band.bottom; y++) {
+        const size_t row = (size_t)y * work->width, at = row + box.left;
+        if (y < box.top || y >= box.bottom) {
+            memset(work->out + row, 0, sizeof(float) * (size_t)work->width);
+            continue;
+        }
+        memset(work->out + row, 0, sizeof(float) * (size_t)box.left);
+        take_out(work->depth + at, work->kind + at, continuation(work, &band, y, box.left, box.right), box.right - box.left, work->out + at);
+        memset(work->out + row + box.right, 0, sizeof(float) * (size_t)(work->width - box.right));
+    }
 }
 
 /*
@@ -404,19 +483,18 @@ EXPORT int zero_background(const float *depth, const uint8_t *deformed, int fram
     const size_t pixels = (size_t)height * width;
     Work work;
     const int short_of_memory = allocate(&work, height, width);
-    for (int b = 0; b < frames && !short_of_memory; b++, depth += pixels, deformed += pixels, out += pixels) {
-        float range;
-        not_beside(deformed, height, width, work.padded, work.kind);
-        known_cells(&work, depth, height, width, stiff, &range);
-        const Box box = not_flat(work.kind, height, width);
-        memset(out, 0, sizeof(float) * pixels);
-        if (box.bottom == 0) continue; /* all skin is flat */
-        continued(work.grids, work.count, sweeps, work.line);
-        if (add_known(&work, depth, width, box, tolerance * range)) continued(work.grids, work.count, sweeps, work.line);
-        for (int y = box.top; y < box.bottom; y++) {
-            const size_t at = (size_t)y * width + box.left;
-            take_out(depth + at, work.kind + at, continuation(&work, y, box.left, box.right), box.right - box.left, out + at);
+    work.stiff = stiff;
+    for (int b = 0; b < frames && !short_of_memory; b++) {
+        work.depth = depth + pixels * b, work.deformed = deformed + pixels * b, work.out = out + pixels * b, work.below = 0;
+        known_cells(&work);
+        work.most = tolerance * work.range;
+        work.box = not_flat(work.kind, height, width);
+        if (work.box.bottom > 0) { /* else all skin is flat */
+            continued(work.grids, work.count, sweeps, work.line);
+            share(add_known, &work, work.bands);
+            if (work.below) continued(work.grids, work.count, sweeps, work.line);
         }
+        share(write_out, &work, work.bands);
     }
     free(work.memory), free(work.kind);
     return short_of_memory;

@@ -1,0 +1,97 @@
+"""Threads that share the work of one compiled frame: equal bits by any number, one caller at a time, forks, a single processor."""
+
+import os
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+from test_properties import press_image, unit
+
+import torchvts as vts
+from torchvts.accelerated import kernels
+from torchvts.accelerated.threads import OneThread, within_frame
+
+SIZES = ((96, 128), (61, 45), (240, 320))
+
+pytestmark = pytest.mark.skipif(kernels.library() is None, reason="no compiled kernels")
+
+
+@pytest.fixture
+def threads():
+    """Sets how many threads torch uses, until the test ends."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+def pipe_and_images(size, by="response"):
+    """A press, one that the border cuts, and undeformed skin."""
+    calibration = unit(by, *size, 28.8 / size[0])
+    return vts.DepthPipeline.from_calibration(calibration), [
+        press_image(calibration, kind) for kind in ("press", "border", "no contact")
+    ]
+
+
+@pytest.mark.parametrize("by", ["lights", "response"])
+@pytest.mark.parametrize("size", SIZES)
+def test_any_number_of_threads_gives_equal_bits(size, by, threads):
+    pipe, images = pipe_and_images(size, by)
+    found = []
+    for count in (1, 2, 3, 7, 1):
+        threads(count)
+        found.append([pipe(image) for image in images for _ in range(2)])
+    assert by == "lights" or all(pipe.compiled(image) is not None for image in images)
+    for outs in found[1:]:
+        assert all(torch.equal(a, b) for one, other in zip(found[0], outs, strict=True) for a, b in zip(one, other, strict=True))
+
+
+def test_several_callers_at_once(threads):
+    """One has the helpers, the others work alone."""
+    pipe, images = pipe_and_images((96, 128))
+    alone = [pipe(image) for image in images]
+    threads(4)
+    with ThreadPoolExecutor(6) as pool:
+        found = list(pool.map(lambda k: (k % 3, pipe(images[k % 3])), range(60)))
+    assert all(torch.equal(a, b) for k, out in found for a, b in zip(out, alone[k], strict=True))
+
+
+def test_numbers_of_threads(threads):
+    threads(3)
+    with OneThread():
+        assert torch.get_num_threads() == 1 and within_frame() == 3
+    threads(64)
+    assert within_frame() == 4
+    threads(1)
+    assert within_frame() == 1
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+def test_a_fork_starts_its_own_helpers(threads):
+    threads(2)
+    pipe, images = pipe_and_images((96, 128))
+    expected = pipe(images[0]).depth_mm
+    child = os.fork()
+    if child == 0:  # pragma: no cover, another process
+        code = 1
+        try:
+            code = int(not all(torch.equal(pipe(images[0]).depth_mm, expected) for _ in range(20)))
+        finally:
+            os._exit(code)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert torch.equal(pipe(images[0]).depth_mm, expected)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="no affinity")
+def test_a_caller_bound_to_one_processor_works_alone(threads):
+    threads(2)
+    pipe, images = pipe_and_images((96, 128))
+    expected = pipe(images[0]).depth_mm
+    allowed = os.sched_getaffinity(0)
+    try:
+        for processor in sorted(allowed)[:2]:
+            os.sched_setaffinity(0, {processor})
+            assert torch.equal(pipe(images[0]).depth_mm, expected)
+    finally:
+        os.sched_setaffinity(0, allowed)
+    assert torch.equal(pipe(images[0]).depth_mm, expected)

@@ -1,5 +1,7 @@
 """How much the light of each LED has drifted since calibration, found in the undeformed part of a frame and divided out."""
 
+from typing import Final
+
 import torch
 from torch import Tensor, nn
 
@@ -33,6 +35,7 @@ class Drift(nn.Module):
 
     background: Tensor | None
     noise: Tensor | None
+    most_by_mode: Final[float] = MOST_BY_MODE
 
     def __init__(
         self,
@@ -59,7 +62,7 @@ class Drift(nn.Module):
             return self.divided(light, self.by_mode(light))
         if self.by_mode_first:
             near = self.by_mode(light)
-            if may_read(near) and float((near - 1.0).abs().amax()) < MOST_BY_MODE:
+            if may_read(near) and float((near - 1.0).abs().amax()) < self.most_by_mode:
                 return self.divided(light, near)
             far = self.by_statistics(light, background, noise)
             return self.divided(light, torch.where((far - 1.0).abs() > 0.15, far, near))

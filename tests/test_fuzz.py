@@ -5,7 +5,8 @@ memory is bounded. The child must neither crash nor hang, run no code of the fil
 ValueError, TypeError or OSError, and the message must name the file. A process that is killed while it saves leaves either the old
 file or the new one, complete.
 
-`make test` damages each file some dozens of times; `make test-long` (TORCHVTS_TEST_PROFILE=long) some thousands.
+`make test` damages each file some dozens of times; in `make test-long` (TORCHVTS_TEST_PROFILE=long), where all tests of this
+file are marked long, some thousands of times.
 """
 
 import json
@@ -35,6 +36,7 @@ from torchvts.core.files import read_depth_png, read_frames, write_atomically, w
 from torchvts.model.response_field import ResponseField, ResponseModel
 
 LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
+pytestmark = [pytest.mark.long] * LONG
 DAMAGES = 3000 if LONG else 25
 KILLS, STOPS = (60, 20) if LONG else (4, 5)
 """Writers that are killed, and how often each is stopped before."""

@@ -177,6 +177,8 @@ def test_onnx_without_torchvts(low, mini, tmp_path, kind):
     calibration, frames = mini if kind.startswith("response") else low
     pipe = pipeline(calibration, kind.split()[1])
     at_most_two_passes(pipe)
+    if kind == "lights precise":
+        pipe.refine.rounds = 1  # the same operators, 6,200 of 7,500; writing ONNX takes longer than their number
     path = export.export_onnx(pipe, tmp_path / "pipe.onnx")
     assert export.compare(path, pipe, frames, "onnx") <= 1e-3
 

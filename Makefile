@@ -25,10 +25,9 @@ test: setup
 test-coverage: setup
 	$(PYTEST) -m "not long" --cov=torchvts --cov-report=term --cov-fail-under=90
 
-# The tests marked long; then fuzzed files, drawn scenes and frames by the thousands, the largest graphs; some tens of minutes.
+# The tests marked long; fuzzed files, drawn scenes and frames by the thousands; the largest graphs. Some twenty minutes on two cores.
 test-long: setup
-	$(PYTEST) -m long
-	TORCHVTS_TEST_PROFILE=long $(PYTEST) -m "not long" tests/test_properties.py tests/test_fuzz.py tests/test_export.py
+	TORCHVTS_TEST_PROFILE=long $(PYTEST) -m long
 
 check: setup
 	$(BIN)/ruff check .

@@ -22,7 +22,9 @@ from refusals_values import HEIGHT, WIDTH, Entry, image, lights, sensor, unit
 import torchvts as vts
 
 LIMIT_S = 20.0
-"""A call that takes longer hangs, as far as the caller can tell."""
+"""CPU seconds: a call that takes longer hangs, as far as the caller can tell."""
+BLOCKED_S = 300.0
+"""Seconds after which a call must wait for something, however busy the machine is."""
 
 CHEAP_FILES = (
     "Calibration.load", "Calibration.save", "NormalFromLookup.load", "NormalFromLookup.save", "NormalFromMLP.load",
@@ -203,7 +205,12 @@ def entries():
 
 
 class Slow(BaseException):
-    """The call took longer than LIMIT_S."""
+    """The call took longer than LIMIT_S or BLOCKED_S."""
+
+
+def stop_slow_calls():
+    signal.signal(signal.SIGPROF, stop)
+    signal.signal(signal.SIGALRM, stop)
 
 
 def stop(_signal, _frame):
@@ -212,16 +219,18 @@ def stop(_signal, _frame):
 
 def attempt(call, given):
     """What became of one call: "" where it was accepted or refused in one of the three ways."""
-    signal.setitimer(signal.ITIMER_REAL, LIMIT_S)
+    signal.setitimer(signal.ITIMER_PROF, LIMIT_S)
+    signal.setitimer(signal.ITIMER_REAL, BLOCKED_S)
     try:
         call(**given)
     except (TypeError, ValueError, OSError):
         return ""
     except Slow:
-        return f"longer than {LIMIT_S:g} s"
+        return f"longer than {LIMIT_S:g} CPU seconds, or {BLOCKED_S:g} s"
     except BaseException as error:
         return f"{type(error).__name__}: {str(error)[:160]}"
     finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
         signal.setitimer(signal.ITIMER_REAL, 0.0)
     return ""
 
@@ -260,7 +269,7 @@ def attack(count, seed):
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGALRM, stop)
+    stop_slow_calls()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     for case, make in attack(int(sys.argv[1]), sys.argv[2]):

@@ -5,7 +5,8 @@ memory is bounded. The child must neither crash nor hang, run no code of the fil
 ValueError, TypeError or OSError, and the message must name the file. A process that is killed while it saves leaves either the old
 file or the new one, complete.
 
-`make test` damages each file some dozens of times; `make test-long` (TORCHVTS_TEST_PROFILE=long) some thousands.
+`make test` damages each file some dozens of times; in `make test-long` (TORCHVTS_TEST_PROFILE=long), where all tests of this
+file are marked long, some thousands of times.
 """
 
 import json
@@ -19,6 +20,7 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
 import zipfile
 import zlib
 from pathlib import Path
@@ -34,8 +36,10 @@ from torchvts.core.files import read_depth_png, read_frames, write_atomically, w
 from torchvts.model.response_field import ResponseField, ResponseModel
 
 LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
+pytestmark = [pytest.mark.long] * LONG
 DAMAGES = 3000 if LONG else 25
-KILLS = 60 if LONG else 20
+KILLS, STOPS = (60, 20) if LONG else (4, 5)
+"""Writers that are killed, and how often each is stopped before."""
 MEMORY = 2**30
 """Bytes of address space that reading one damaged file may take beyond what the process has."""
 SENSOR = vts.Sensor("rig", 24, 32, 1.25)
@@ -475,10 +479,9 @@ def test_nothing_is_written_over_what_is_no_plain_file(tmp_path, kind, name):
 # ---- saving ----
 
 
-def save_for_ever(folder, kinds):
-    """Save two contents of each kind by turns until killed."""
-    torch.set_num_threads(1)
-    all_savers = {
+def savers():
+    """Two contents of each kind that is saved."""
+    return {
         "unit.safetensors": [by_lights().save, by_response().save],
         "rig.yaml": [vts.Sensor("one", 24, 32, 1.25).save, vts.Sensor.load("gelsight_mini").save],
         "image.png": [lambda path: vts.write_image(path, image()), lambda path: vts.write_image(path, 1.0 - image())],
@@ -487,14 +490,6 @@ def save_for_ever(folder, kinds):
         "cloud.ply": [lambda path: save_cloud(path, 20_000), lambda path: save_cloud(path, 9_000)],
         "cloud.pcd": [lambda path: save_cloud(path, 20_000), lambda path: save_cloud(path, 9_000)],
     }
-    turns = [(all_savers[kind][k], Path(folder) / kind, k) for k in range(2) for kind in kinds.split()]
-    for save, path, k in turns:
-        save(path)
-        Path(f"{path}.{k}").write_bytes(path.read_bytes())
-    print("ready", flush=True)
-    while True:
-        for save, path, _ in turns:
-            save(path)
 
 
 def write_text(path, text):
@@ -509,36 +504,78 @@ def save_cloud(path, count):
     write_point_cloud(path, torch.rand(count, 3, generator=torch.Generator().manual_seed(count)))
 
 
+def kill_savers(folder, kinds, kills, seed):
+    """Kill forks of this process while they save; print how often they were stopped, and killed in the middle of a save.
+
+    A fork starts in a millisecond, a Python that loads torch again in seconds. Runs in a process of its own, which has no threads.
+    """
+    torch.set_num_threads(1)
+    contents = savers()
+    turns = [(contents[kind][k], Path(folder) / kind) for k in range(2) for kind in kinds.split()]
+    whole = {}
+    for save, path in turns:
+        save(path)
+        whole.setdefault(path, []).append(path.read_bytes())
+    pause, stops, torn = random.Random(seed), 0, 0
+    for _ in range(kills):
+        writer = fork_that_saves(turns)
+        try:
+            for _ in range(STOPS):  # whenever the writer is stopped, each name stands for a whole file
+                time.sleep(0.02 * pause.random())
+                os.kill(writer, signal.SIGSTOP)
+                os.waitpid(writer, os.WUNTRACED)
+                stops += 1
+                assert all(path.read_bytes() in either for path, either in whole.items())
+                os.kill(writer, signal.SIGCONT)
+            time.sleep(0.02 * pause.random())
+        finally:
+            os.kill(writer, signal.SIGKILL)
+            os.waitpid(writer, 0)
+        assert all(path.read_bytes() in either for path, either in whole.items())
+        left = [path for path in Path(folder).iterdir() if path not in whole]
+        scratch = [(f".{path.stem}-", path.suffix) for path in whole]
+        assert len(left) <= 1, left
+        assert all(any(path.name.startswith(head) and path.suffix == end for head, end in scratch) for path in left), left
+        for path in left:
+            path.unlink()
+        torn += len(left)
+    print(json.dumps([stops, torn]))
+
+
+def fork_that_saves(turns):
+    """The process number of a fork that has saved each file once, and saves them again as long as this process lives."""
+    ready, done_once = os.pipe()
+    parent, writer = os.getpid(), os.fork()
+    if writer == 0:
+        try:
+            told = False
+            while os.getppid() == parent:
+                for save, path in turns:
+                    save(path)
+                told = told or os.write(done_once, b"1") == 1
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            sys.stderr.flush()
+            os._exit(1)
+    os.close(done_once)
+    with open(ready, "rb") as stream:
+        assert stream.read(1) == b"1", "the writer died"
+    return writer
+
+
 EVERY_KIND = "unit.safetensors rig.yaml image.png depth.png frames.csv cloud.ply cloud.pcd"
 
 
 @pytest.mark.parametrize("kinds", EVERY_KIND.split() if LONG else [EVERY_KIND])
 def test_a_kill_in_the_middle_of_a_save_leaves_a_whole_file(tmp_path, kinds):
-    random_pause, paths = random.Random(kinds), [tmp_path / kind for kind in kinds.split()]
-    program = f"import test_fuzz\ntest_fuzz.save_for_ever({str(tmp_path)!r}, {kinds!r})"
-    for _ in range(KILLS if LONG else 1):
-        writer = subprocess.Popen([sys.executable, "-W", "ignore", "-c", program], env=ENVIRONMENT, stdout=subprocess.PIPE)
-        try:
-            assert writer.stdout.readline() == b"ready\n"
-            whole = {path: [Path(f"{path}.{k}").read_bytes() for k in range(2)] for path in paths}
-            for _ in range(KILLS):  # whenever the writer is stopped, each name stands for a whole file
-                time.sleep(0.002 + 0.02 * random_pause.random())
-                writer.send_signal(signal.SIGSTOP)
-                assert all(path.read_bytes() in whole[path] for path in paths)
-                writer.send_signal(signal.SIGCONT)
-            time.sleep(0.02 * random_pause.random())
-        finally:
-            writer.kill()
-            writer.wait()
-            writer.stdout.close()
-        assert all(path.read_bytes() in whole[path] for path in paths)
-        kept = {f"{path.name}{end}" for path in paths for end in ("", ".0", ".1")}
-        left = [path for path in tmp_path.iterdir() if path.name not in kept]
-        scratch = [(f".{path.stem}-", path.suffix) for path in paths]
-        assert len(left) <= 1
-        assert all(any(path.name.startswith(head) and path.suffix == end for head, end in scratch) for path in left)
-        for path in left:
-            path.unlink()
+    program = f"import test_fuzz\ntest_fuzz.kill_savers({str(tmp_path)!r}, {kinds!r}, {KILLS}, {kinds!r})"
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", program], env=ENVIRONMENT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    stops, torn = json.loads(done.stdout)
+    assert stops == KILLS * STOPS
+    if LONG:
+        assert torn > 0  # some kills did come in the middle of a save
 
 
 def test_what_a_killed_writer_leaves_is_no_frame(tmp_path):

@@ -1,7 +1,7 @@
 """Properties of every press, size and light: symmetries, units, order, finite gradients, threads, repetition, memory.
 
-Hypothesis draws the examples, the same ones every time in `make test`. `make test-long` (TORCHVTS_TEST_PROFILE=long) draws
-hundreds of new ones and sends 10,000 frames through each pipeline.
+Hypothesis draws the examples, the same ones every time in `make test`. `make test-long` (TORCHVTS_TEST_PROFILE=long), where
+all tests of this file are marked long, draws hundreds of new ones and sends 10,000 frames through each pipeline.
 """
 
 import hashlib
@@ -21,6 +21,7 @@ import torchvts as vts
 from torchvts.model.response_field import ResponseModel
 
 LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
+pytestmark = [pytest.mark.long] * LONG
 SLOW = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.large_base_example]
 QUICK = (Phase.explicit, Phase.generate)  # to make the failing example small takes longer than all of them
 settings.register_profile(

@@ -110,11 +110,16 @@ static int solve_frame(const Program *of, const float *image, Work work, Output 
                                   of->cell, of->reach, of->sigmas, of->rounding, of->least_cells, of->bridge, of->bridge_sigmas, out.deformed,
                                   work.inner);
     if (code) return code == 1 ? SHORT : BEYOND;
-    const Window at = window_of(of, out.deformed);
-    const size_t corner = (size_t)at.top * width + at.left;
+    Window at = window_of(of, out.deformed);
     float *found = of->zeroes ? work.depth : out.depth;
-    for (int pass = 0; pass < of->passes && !trouble; pass++) trouble = solve(of, light, out.deformed, pass ? found : NULL, at, work, found);
+    for (int pass = 0; pass < of->passes && !trouble; pass++) {
+        trouble = solve(of, light, out.deformed, pass ? found : NULL, at, work, found);
+        if (pass || trouble || !add_cut_faces(found, out.deformed, height, width, work.normal)) continue;
+        at = window_of(of, out.deformed);
+        trouble = solve(of, light, out.deformed, NULL, at, work, found);
+    }
     if (trouble) return trouble;
+    const size_t corner = (size_t)at.top * width + at.left;
     if (of->zeroes && zero_background(found, out.deformed, 1, height, width, of->stiff, of->tolerance, of->sweeps, out.depth)) return SHORT;
     if (contact_from_depth(out.depth + corner, 0, width, work.gradient, out.deformed + corner, 0, width, 1, at.rows, at.columns, of->contact_cell,
                            of->contact_reach, of->contact_model, work.contact))

@@ -46,6 +46,7 @@ from ..integration.background import DepthAsIs
 from ..model import Calibration, Sensor, check_calibration
 from ..normals import NormalFromIntensity as PlainNormalFromIntensity
 from ..normals import WrappedNormals, as_normal_model, check_domain
+from .faces import CutFaces
 from .gs_sdk import gs_sdk_blocks
 from .refine import Adaptive, Once, Repeat, SlopesOfDepth, SlopesOfPixels
 from .shadows import Shadows
@@ -61,7 +62,7 @@ STRIDE = 8
 
 
 class DepthPipeline(nn.Module):
-    """Images (B, 3, H, W) to a :class:`DepthOutput`: compensate, deformed, crop, solve, refine, zero, contact, slopes,
+    """Images (B, 3, H, W) to a :class:`DepthOutput`: compensate, deformed, crop, solve, faces, refine, zero, contact, slopes,
     uncrop.
 
     ``fast`` solves once (eq. 9). ``precise`` solves again with the depth found (eq. 10), until what is still missing falls below
@@ -128,6 +129,7 @@ class DepthPipeline(nn.Module):
         self.deformed = deformed
         self.crop = Crop(STRIDE, model.takes_window)
         self.solve = Solve(model, gradient, integrator)
+        self.faces = CutFaces(self.solve, self.crop)
         self.refine = self._policy(mode, tolerance_px, refine_threshold_px, min(max_passes, model.max_passes))
         # slopes that were learned within contacts do not sum to zero around a contact, those of known lights do;
         # an integrator other than PoissonBackground decides by itself where depth is zero
@@ -252,6 +254,8 @@ class DepthPipeline(nn.Module):
         passes = 1
         if torch.compiler.is_compiling() or type(self) is not DepthPipeline or type(solve) is not Solve:
             return None
+        if type(self.faces) is not CutFaces or self.faces._forward_hooks or self.faces._forward_pre_hooks:
+            return None
         if type(refine) is Repeat and refine.solve is solve:
             passes = refine.max_passes
         elif type(refine) is not Once:
@@ -303,7 +307,7 @@ class DepthPipeline(nn.Module):
         frame = self.crop(compensated, self.deformed(compensated))
         if may_read_values() and (images.shape[0] == 0 or (self.skips_undeformed and self.nothing_to_solve(frame))):
             return undeformed_output(frame)
-        solution = self.solve(frame)  # eq. 9, 5, 4
+        frame, solution = self.faces(frame, self.solve(frame))  # eq. 9, 5, 4
         frame, solution = self.refine(frame, solution)  # eq. 10
         solution = Solution(solution.gradient, self.zero(solution.depth_mm, frame.deformed))
         contact = self.contact(depth_in_window(frame, solution.depth_mm), solution.gradient, frame.mask)

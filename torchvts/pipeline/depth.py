@@ -36,17 +36,17 @@ from ..core.checks import (
     check_range,
     check_range_later,
     check_record,
+    may_read,
     may_read_values,
 )
 from ..core.frame import DepthOutput, Frame, Solution, batch_like, depth_in_window, joined, undeformed_output, write_frame
 from ..core.settings import check_settings, settings_as_tensor
 from ..integration import PoissonBackground as PlainPoissonBackground
 from ..integration import WrappedIntegrator, as_integrator
-from ..integration.background import DepthAsIs
+from ..integration.background import DepthAsIs, with_cut_faces
 from ..model import Calibration, Sensor, check_calibration
 from ..normals import NormalFromIntensity as PlainNormalFromIntensity
 from ..normals import WrappedNormals, as_normal_model, check_domain
-from .faces import CutFaces
 from .gs_sdk import gs_sdk_blocks
 from .refine import Adaptive, Once, Repeat, SlopesOfDepth, SlopesOfPixels
 from .shadows import Shadows
@@ -62,7 +62,7 @@ STRIDE = 8
 
 
 class DepthPipeline(nn.Module):
-    """Images (B, 3, H, W) to a :class:`DepthOutput`: compensate, deformed, crop, solve, faces, refine, zero, contact, slopes,
+    """Images (B, 3, H, W) to a :class:`DepthOutput`: compensate, deformed, crop, solve, refine, zero, contact, slopes,
     uncrop.
 
     ``fast`` solves once (eq. 9). ``precise`` solves again with the depth found (eq. 10), until what is still missing falls below
@@ -129,7 +129,6 @@ class DepthPipeline(nn.Module):
         self.deformed = deformed
         self.crop = Crop(STRIDE, model.takes_window)
         self.solve = Solve(model, gradient, integrator)
-        self.faces = CutFaces(self.solve, self.crop)
         self.refine = self._policy(mode, tolerance_px, refine_threshold_px, min(max_passes, model.max_passes))
         # slopes that were learned within contacts do not sum to zero around a contact, those of known lights do;
         # an integrator other than PoissonBackground decides by itself where depth is zero
@@ -254,8 +253,6 @@ class DepthPipeline(nn.Module):
         passes = 1
         if torch.compiler.is_compiling() or type(self) is not DepthPipeline or type(solve) is not Solve:
             return None
-        if type(self.faces) is not CutFaces or self.faces._forward_hooks or self.faces._forward_pre_hooks:
-            return None
         if type(refine) is Repeat and refine.solve is solve:
             passes = refine.max_passes
         elif type(refine) is not Once:
@@ -307,13 +304,25 @@ class DepthPipeline(nn.Module):
         frame = self.crop(compensated, self.deformed(compensated))
         if may_read_values() and (images.shape[0] == 0 or (self.skips_undeformed and self.nothing_to_solve(frame))):
             return undeformed_output(frame)
-        frame, solution = self.faces(frame, self.solve(frame))  # eq. 9, 5, 4
+        frame, solution = self.with_faces(frame, self.solve(frame))  # eq. 9, 5, 4
         frame, solution = self.refine(frame, solution)  # eq. 10
         solution = Solution(solution.gradient, self.zero(solution.depth_mm, frame.deformed))
         contact = self.contact(depth_in_window(frame, solution.depth_mm), solution.gradient, frame.mask)
         solution = self.slopes(frame, solution)
         out: DepthOutput = self.uncrop(frame, solution, contact)
         return out
+
+    def with_faces(self, frame: Frame, solution: Solution) -> tuple[Frame, Solution]:
+        """Frames in which the image border cuts a flat face of the object, solved again with the face in their deformed area.
+
+        Else the integrator takes it for undeformed skin: depth is zero between the two, and the slope of the face is lost. On
+        other devices than a CPU, and in exported programs, every frame is solved again: to ask would wait for the device.
+        """
+        deformed = with_cut_faces(solution.depth_mm.detach(), frame.deformed)
+        if may_read(deformed) and torch.equal(deformed, frame.deformed):
+            return frame, solution
+        frame = self.crop(frame.compensated, deformed)
+        return frame, self.solve(frame)
 
     def nothing_to_solve(self, frame: Frame) -> bool:
         """Whether no skin has moved and no gradients are recorded, which would need a graph."""

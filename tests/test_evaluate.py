@@ -80,6 +80,13 @@ def test_an_exact_press_has_no_error(press):
     assert bool(scene.contact[ball_truth(given, HEIGHT, WIDTH, PITCH).region].all())
     assert score.depth_normal_deg < 0.05 and score.lowest_mm == 0.0 and score.iou is None
     assert score_press(given, scene.depth_mm, scene.normal, PITCH, contact=scene.contact).iou > 0.97
+    wide = scene.contact.clone()
+    wide[..., :2, :3] = True  # a corner, far from the ball
+    found = [score_press(given, scene.depth_mm, scene.normal, PITCH, contact=mask) for mask in (scene.contact, wide)]
+    exact, more = found
+    assert (exact.stray_px, more.stray_px) == (0, 6) and abs(exact.area_percent) < 3.0
+    grown = 100.0 * 6 / int(ball_truth(given, HEIGHT, WIDTH, PITCH).contact.sum())
+    assert more.area_percent - exact.area_percent == pytest.approx(grown)
 
 
 def test_truth_is_the_scenes_own(press):

@@ -7,11 +7,13 @@ import pytest
 import torch
 
 import torchvts as vts
+from torchvts.accelerated import reference_only
 from torchvts.calibration import fit_prior
 from torchvts.contact import ContactMask
 from torchvts.core.geometry import gradient_of_depth
-from torchvts.integration.background import ZeroBackground
+from torchvts.integration.background import ZeroBackground, with_cut_faces
 from torchvts.model import ResponseModel
+from torchvts.scenes.surfaces import smooth_step, surface
 
 PITCH, HEIGHT, WIDTH = 0.0634, 240, 320
 
@@ -130,6 +132,42 @@ def test_a_pocket_of_errors_makes_no_face_of_the_skin_around_it_and_a_cut_face_s
     rim[..., 46:54] = True
     zeroed = ZeroBackground()(face - 0.2, rim)
     assert float((zeroed - face)[..., :40].abs().max()) < 1e-6 and not bool(zeroed[..., 60:].any())
+
+
+def cut_face(width=128, level=0.5, shift=0.0):
+    """A face that reaches beyond the left border, its rim, and undeformed skin; depth errs by a constant."""
+    depth, rim = torch.zeros(1, 1, 96, width), torch.zeros(1, 1, 96, width, dtype=torch.bool)
+    depth[..., 20:70, :50] = level
+    rim[..., 18:72, :52], rim[..., 24:66, :46] = True, False
+    return depth + shift, rim
+
+
+def test_a_face_that_the_border_cuts_is_deformed_and_no_other_skin_is():
+    depth, rim = cut_face(shift=-0.1)
+    grown = with_cut_faces(depth, rim)
+    assert bool(grown[..., 18:72, :46].all()) and not bool((grown & (depth < 0.0) & ~rim).any())
+    assert torch.equal(torch.jit.script(with_cut_faces)(depth, rim), grown)
+    inside = torch.nn.functional.pad(rim, [6, 0])[..., :128]  # nothing is cut
+    level = torch.where(rim, depth, torch.full_like(depth, -0.1))  # depth is that of undeformed skin on both sides of the rim
+    for other, mask in ((depth, inside), (level, rim)):
+        assert torch.equal(with_cut_faces(other, mask), mask)
+    both = with_cut_faces(torch.cat((depth, level)), torch.cat((rim, rim)))
+    assert torch.equal(both, torch.cat((grown, rim)))
+
+
+@pytest.mark.parametrize("mode", ["fast", "precise"])
+def test_contact_holds_a_face_that_the_border_cuts(ring, mode):
+    """Before, a face too flat to change the light was neither deformed nor contact, and depth was zero between it and the skin."""
+    pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(ring(), vts.Sensor("cut", 120, 160, 0.1)), mode)
+    scene = surface(lambda x, y: 0.5 * (1.0 - smooth_step((torch.hypot(x + 6.0, y) - 4.0) / 0.8)), 120, 160, 0.1)
+    image = vts.scenes.render(scene, ring(), noise_std=0.004, bits=8)
+    out = pipe(image)
+    assert float(out.contact[scene.depth_mm > 0.49].float().mean()) > 0.99
+    assert float(out.deformed[scene.depth_mm < 1e-3].float().mean()) < 0.01
+    assert float((out.depth_mm - scene.depth_mm).abs().mean()) < 0.02
+    with reference_only():
+        same = pipe(image)
+    assert torch.equal(same.contact, out.contact) and float((same.depth_mm - out.depth_mm).abs().max()) < 1e-5
 
 
 def test_a_stand_in_needs_as_much_light_to_change_in_dark_pixels_as_in_bright_ones(small_sensor):

@@ -180,7 +180,7 @@ def summary(scores: Sequence[PressScore]) -> dict[str, float | None]:
 
 
 _MEANS = ("normal_deg", "depth_normal_deg", "relief_um", "tilt_um", "level_um")
-_MEDIANS = ("radius_percent", "center_px", "iou", "lowest_mm")
+_MEDIANS = ("radius_percent", "center_px", "iou", "area_percent", "stray_px", "lowest_mm")
 
 
 def _score(target: Target, out: DepthOutput, mm_per_pixel: float, method: str) -> PressScore:
@@ -232,6 +232,8 @@ COLUMNS = (
     error_column("without tilt um", "level_um", 1),
     error_column("radius %", "radius_percent", 1),
     _with_worst("contact IoU", "iou", 2),
+    error_column("contact area %, median", "area_percent", 0),
+    error_column("stray contact px, median", "stray_px", 0),
     Column("presses used", _used),
     _with_worst("lowest mm", "lowest_mm", 3),
     Column("frames", lambda row: str(row.frames)),

@@ -16,6 +16,9 @@ from .metrics import fit_sphere, mask_iou, normal_angle_deg
 RIM_PX = 3.0
 """Width of the ring inside the contact radius that is not scored: there the skin leaves the ball, and labels are a pixel off."""
 
+STRAY_RADII = 2.5
+"""Contact that is found so many contact radii and more from the center of a ball is stray."""
+
 
 class Truth(NamedTuple):
     """What a frame shows, float64.
@@ -47,6 +50,8 @@ class PressScore:
         tilt_um: the part of ``relief_um`` that is a plane: the effect of a wrong label of the centre, and of errors that a
             response field makes alike all over a contact.
         iou: intersection over union of the contact found and the true one.
+        area_percent: area of the contact found against that of the true one, percent; above zero it is too large.
+        stray_px: pixels of contact farther from the center of a ball than :data:`STRAY_RADII` contact radii.
         radius_percent: error of the radius of a sphere fitted to the depth of a ball, percent; None where the depth is a plane.
         center_px: error of the centre of that sphere, pixels.
     """
@@ -59,6 +64,8 @@ class PressScore:
     relief_um: float | None = None
     tilt_um: float | None = None
     iou: float | None = None
+    area_percent: float | None = None
+    stray_px: int | None = None
     radius_percent: float | None = None
     center_px: float | None = None
 
@@ -151,7 +158,8 @@ def score_press(
         )
     radius_percent, center_px = _sphere_error(press, depth_mm.detach().cpu().double(), truth, mm_per_pixel)
     score = score_surface(truth, depth_mm, normal, mm_per_pixel, press.name, method, contact)
-    return dataclasses.replace(score, radius_percent=radius_percent, center_px=center_px)
+    stray = None if contact is None else _stray_px(press, contact)
+    return dataclasses.replace(score, radius_percent=radius_percent, center_px=center_px, stray_px=stray)
 
 
 def score_surface(
@@ -183,6 +191,7 @@ def score_surface(
     true_normal = normal_from_gradient(truth.gradient)
     slope = torch.stack(torch.gradient(depth[0, 0], spacing=mm_per_pixel)[::-1])[None]  # torch gives rows first
     error = (depth - truth.depth_mm)[0, 0][region]
+    compared = None if contact is None or truth.contact is None else (contact.cpu(), truth.contact)
     return PressScore(
         press=name,
         method=method,
@@ -191,7 +200,8 @@ def score_surface(
         depth_normal_deg=float(normal_angle_deg(normal_from_gradient(slope), true_normal, truth.region).mean()),
         relief_um=1000.0 * float(error.std(correction=0)),
         tilt_um=1000.0 * _tilt(error, torch.nonzero(region).t()),
-        iou=None if contact is None or truth.contact is None else mask_iou(contact.cpu(), truth.contact),
+        iou=None if compared is None else mask_iou(*compared),
+        area_percent=None if compared is None or not bool(compared[1].any()) else _area_percent(*compared),
     )
 
 
@@ -201,6 +211,17 @@ def _check_frame(depth_mm: Tensor, normal: Tensor) -> None:
         if value.shape[0] != 1:
             raise ValueError(f"{name}: expected one frame, (1, {channels}, H, W), got {tuple(value.shape)}: loop over the batch")
     check_same_size("normal", normal, "depth_mm", depth_mm.shape[2], depth_mm.shape[3])
+
+
+def _area_percent(contact: Tensor, truth: Tensor) -> float:
+    return 100.0 * (int(contact.sum()) / int(truth.sum()) - 1.0)
+
+
+def _stray_px(press: Press, contact: Tensor) -> int:
+    """Pixels of contact (1, 1, H, W) far off the ball."""
+    (center_x, center_y), contact_radius_px = label(press)
+    y, x = (place.double() for place in contact[0, 0].nonzero().cpu().unbind(1))
+    return int((torch.hypot(x - center_x, y - center_y) > STRAY_RADII * contact_radius_px).sum())
 
 
 def _tilt(error: Tensor, place: Tensor) -> float:

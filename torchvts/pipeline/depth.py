@@ -36,13 +36,14 @@ from ..core.checks import (
     check_range,
     check_range_later,
     check_record,
+    may_read,
     may_read_values,
 )
 from ..core.frame import DepthOutput, Frame, Solution, batch_like, depth_in_window, joined, undeformed_output, write_frame
 from ..core.settings import check_settings, settings_as_tensor
 from ..integration import PoissonBackground as PlainPoissonBackground
 from ..integration import WrappedIntegrator, as_integrator
-from ..integration.background import DepthAsIs
+from ..integration.background import DepthAsIs, with_cut_faces
 from ..model import Calibration, Sensor, check_calibration
 from ..normals import NormalFromIntensity as PlainNormalFromIntensity
 from ..normals import WrappedNormals, as_normal_model, check_domain
@@ -305,13 +306,25 @@ class DepthPipeline(nn.Module):
         frame = self.crop(compensated, self.deformed(compensated))
         if may_read_values() and (images.shape[0] == 0 or (self.skips_undeformed and self.nothing_to_solve(frame))):
             return undeformed_output(frame)
-        solution = self.solve(frame)  # eq. 9, 5, 4
+        frame, solution = self.with_faces(frame, self.solve(frame))  # eq. 9, 5, 4
         frame, solution = self.refine(frame, solution)  # eq. 10
         solution = Solution(solution.gradient, self.zero(solution.depth_mm, frame.deformed))
         contact = self.contact(depth_in_window(frame, solution.depth_mm), solution.gradient, frame.mask)
         solution = self.slopes(frame, solution)
         out: DepthOutput = self.uncrop(frame, solution, contact)
         return out
+
+    def with_faces(self, frame: Frame, solution: Solution) -> tuple[Frame, Solution]:
+        """Frames in which the image border cuts a flat face of the object, solved again with the face in their deformed area.
+
+        Else the integrator takes it for undeformed skin: depth is zero between the two, and the slope of the face is lost. On
+        other devices than a CPU, and in exported programs, every frame is solved again: to ask would wait for the device.
+        """
+        deformed = with_cut_faces(solution.depth_mm.detach(), frame.deformed)
+        if may_read(deformed) and torch.equal(deformed, frame.deformed):
+            return frame, solution
+        frame = self.crop(frame.compensated, deformed)
+        return frame, self.solve(frame)
 
     def nothing_to_solve(self, frame: Frame) -> bool:
         """Whether no skin has moved and no gradients are recorded, which would need a graph."""

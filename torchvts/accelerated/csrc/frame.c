@@ -45,7 +45,7 @@ typedef struct {
 /* Memory of one frame besides. */
 typedef struct {
     float *light, *gradient, *depth;
-    uint8_t *inner, *contact;
+    uint8_t *inner, *contact; /* and two lines, and four bytes each, behind `inner` */
 } Work;
 
 typedef struct {
@@ -146,16 +146,21 @@ static int solve_frame(const Program *of, const float *image, Work work, Output 
                                   of->cell, of->reach, of->sigmas, of->rounding, of->least_cells, of->bridge, of->bridge_sigmas, out.deformed,
                                   work.inner);
     if (code) return code == 1 ? SHORT : BEYOND;
-    const Window at = window_of(of, out.deformed);
+    Window at = window_of(of, out.deformed);
     if (at.rows == 0) {
         memset(out.depth, 0, sizeof(float) * (size_t)height * width);
         uncrop(NULL, NULL, 1, 0, 0, 0, 0, height, width, out.gradient, out.normal, out.contact);
         return 0;
     }
-    const size_t corner = (size_t)at.top * width + at.left;
     float *found = of->zeroes ? work.depth : out.depth;
-    for (int pass = 0; pass < of->passes && !trouble; pass++) trouble = solve(of, light, out.deformed, pass ? found : NULL, at, work, found);
+    for (int pass = 0; pass < of->passes && !trouble; pass++) {
+        trouble = solve(of, light, out.deformed, pass ? found : NULL, at, work, found);
+        if (pass || trouble || !add_cut_faces(found, out.deformed, height, width, work.inner)) continue;
+        at = window_of(of, out.deformed);
+        trouble = solve(of, light, out.deformed, NULL, at, work, found);
+    }
     if (trouble) return trouble;
+    const size_t corner = (size_t)at.top * width + at.left;
     if (of->zeroes && zero_background(found, out.deformed, 1, height, width, of->stiff, of->tolerance, of->sweeps, out.depth)) return SHORT;
     if (contact_from_depth(out.depth + corner, 0, width, work.gradient, out.deformed + corner, 0, width, 1, at.rows, at.columns, of->contact_cell,
                            of->contact_reach, of->contact_model, work.contact))
@@ -174,10 +179,10 @@ static int solve_frame(const Program *of, const float *image, Work work, Output 
 EXPORT int solve_frames(const Program *of, const float *images, int frames, int threads, float *depth, float *gradient, float *normal,
                         uint8_t *contact, uint8_t *deformed) {
     const size_t pixels = (size_t)of->height * of->width;
-    float *floats = malloc(pixels * (6 * sizeof(float) + 2));
+    float *floats = malloc(pixels * (6 * sizeof(float) + 2) + 2 * ((size_t)of->width + 4));
     if (!floats) return SHORT;
     uint8_t *bytes = (uint8_t *)(floats + 6 * pixels);
-    const Work work = {floats, floats + 3 * pixels, floats + 5 * pixels, bytes, bytes + pixels};
+    const Work work = {floats, floats + 3 * pixels, floats + 5 * pixels, bytes + pixels, bytes};
     const int shared = begin_sharing(threads);
     int trouble = 0;
     for (size_t b = 0; b < (size_t)frames && !trouble; b++) {

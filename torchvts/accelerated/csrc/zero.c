@@ -391,6 +391,46 @@ static float level_of(Work *work) {
     return flat ? (float)(sum / (double)flat) : 0.0f;
 }
 
+static int on_border(const uint8_t *kind, int height, int width, uint8_t of) {
+    const size_t last = (size_t)(height - 1) * width;
+    if (memchr(kind, of, (size_t)width) || memchr(kind + last, of, (size_t)width)) return 1;
+    for (int y = 1; y < height - 1; y++)
+        if (kind[(size_t)y * width] == of || kind[(size_t)(y + 1) * width - 1] == of) return 1;
+    return 0;
+}
+
+WIDE static void add_above(const float *restrict depth, float middle, size_t n, uint8_t *restrict deformed) {
+    for (size_t k = 0; k < n; k++) deformed[k] |= depth[k] >= middle;
+}
+
+/* Whether any unchanged skin on the image border lies as deep as `middle`, without which no face is cut. */
+static int deep_on_border(const float *depth, const uint8_t *deformed, float middle, int height, int width) {
+    for (int y = 0; y < height; y++) {
+        const int step = y == 0 || y == height - 1 || width == 1 ? 1 : width - 1;
+        const size_t row = (size_t)y * width;
+        for (int x = 0; x < width; x += step)
+            if (!deformed[row + x] && depth[row + x] >= middle) return 1;
+    }
+    return 0;
+}
+
+/* with_cut_faces() of background.py, in place. kind: a byte for each pixel, and two lines, and four bytes each. Returns whether there are such
+   faces. */
+int add_cut_faces(const float *depth, uint8_t *deformed, int height, int width, uint8_t *kind) {
+    const size_t pixels = (size_t)height * width;
+    float low, high, sum;
+    int count;
+    if (!on_border(deformed, height, width, 1)) return 0;
+    range_of(depth, pixels, &low, &high);
+    const float middle = 0.5f * (low + high);
+    if (!deep_on_border(depth, deformed, middle, height, width)) return 0;
+    for (int y = 0; y < height; y++) not_beside(deformed, height, width, y, kind + pixels, kind + (size_t)y * width);
+    for (int y = 0; y < height; y++) flat_row(depth + (size_t)y * width, kind + (size_t)y * width, middle, width, &sum, &count);
+    if (!on_border(kind, height, width, RAISED) || !memchr(kind, FLAT, pixels) || !is_face(kind, height, width)) return 0;
+    add_above(depth, middle, pixels, deformed);
+    return 1;
+}
+
 /* The undeformed skin's shares, values and weights of a band's cells. */
 static void fill_cells(void *with, int part) {
     Work *work = with;

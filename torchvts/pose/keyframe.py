@@ -29,9 +29,6 @@ PARTS = 8
 Image = npt.NDArray[Any]
 Mask = npt.NDArray[Any]
 
-ZERO_OFF_MM = 0.03
-"""Undeformed skin further than this from zero is a zero that the pipeline has set wrong; it is right to 0.005 mm otherwise."""
-
 _NEIGHBOURS = np.ones((3, 3), np.uint8)
 
 
@@ -56,7 +53,7 @@ class Unusable(ValueError):
 
 
 def contact_frame(frame: DepthFrame) -> Contact:
-    """Depth above undeformed skin, gradient and contact of one frame, on the CPU, float32.
+    """Depth, gradient and contact of one frame, on the CPU, float32.
 
     Raises:
         TypeError: no DepthOutput.
@@ -78,18 +75,7 @@ def contact_frame(frame: DepthFrame) -> Contact:
         raise Unusable("depth or gradient is not finite")
     if int(torch.count_nonzero(contact)) < LEAST_PIXELS:
         raise Unusable("no contact")
-    level = _undeformed_mm(depth, contact)
-    return Contact(depth - level if abs(level) > ZERO_OFF_MM else depth, gradient, contact)
-
-
-def _undeformed_mm(depth: Tensor, contact: Tensor) -> float:
-    """Median depth outside of the contact, mm, by every eighth pixel; zero where less than half of the image is outside.
-
-    A pipeline that takes a part of the object for undeformed skin puts its zero on it, and lowers all depths of the frame alike.
-    """
-    outside = depth[..., ::8, ::8][~contact[..., ::8, ::8]]
-    enough = 2 * outside.numel() >= depth[..., ::8, ::8].numel()
-    return float(outside.median()) if enough else 0.0
+    return Contact(depth, gradient, contact)
 
 
 def grids(frame: Contact, mm_per_pixel: float, least_mm: float, times: tuple[int, int]) -> Grids:

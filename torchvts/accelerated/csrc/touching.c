@@ -45,8 +45,8 @@ WIDE static void subtract(const float *restrict a, const float *restrict b, int 
 
 enum { ROWS = 4 };
 
-/* Running sums along ROWS rows, `step` floats apart, to `sums`, of each cell those of all rows together. Each sum waits for the one before it, so several
-   rows are summed at once. */
+/* Running sums along ROWS rows, one `step` floats after the other, to `sums`, of each cell those of all rows together. Each sum waits for the one before,
+   so several rows are summed at once. */
 static void run_along(const float *rows, int step, int columns, float *restrict sums) {
     double total[ROWS] = {0.0};
     memset(sums, 0, ROWS * sizeof(float));

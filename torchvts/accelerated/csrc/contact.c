@@ -233,7 +233,7 @@ static void cell_shares(const uint16_t *values, int width, int cell, int columns
     for (int j = 0; j < columns; j++) shares[j] /= (float)(cell * cell);
 }
 
-/* What one frame needs besides its masks: of cells, sorted samples, three mean changes, a share and then a weight each, and lines of both; masks
+/* What one frame needs besides its masks: of cells, samples of each channel, three mean changes, a share and then a weight each, and lines of both; masks
    of cells that have changed, faint ones among them, ones outside of any contact, kept ones, ones where cells decide, not pixels; two masks for
    what is at hand, and lines of bytes. */
 typedef struct {
@@ -255,7 +255,7 @@ typedef struct {
 typedef struct {
     const float *image, *offset, *per_noise, *most_far_field;
     int height, width, stride;
-    float rounding, threshold, noise[6], scale[3];
+    float rounding, threshold, noise[6], scale[3], per[3];
     int works[3], bands;
     Grid grid;
     Scratch at;
@@ -363,22 +363,27 @@ WIDE static void longer_than(const float *restrict means, size_t cells, const fl
     }
 }
 
+/* 1 over the frame's own spread of mean changes, of one channel. */
+static void find_spread(void *with, int c) {
+    Frame *of = with;
+    const Grid *grid = &of->grid;
+    const int rows = grid->rows, columns = grid->columns, longer = rows > columns ? rows : columns, shorter = rows + columns - longer;
+    const int step = longer < 80 ? 1 : least(longer / 40, shorter); /* at least one line of a thin grid */
+    const size_t cells = (size_t)rows * columns;
+    const float *means = of->at.means + c * cells;
+    float *some = of->at.some + c * (2 * cells + 1), least_std = 1.0f / (float)grid->cell;
+    int n = 0;
+    for (int i = step / 2; i < rows; i += step)
+        for (int j = step / 2; j < columns; j += step) some[n++] = fabsf(means[(size_t)i * columns + j]);
+    const float std = median(some, n, some + n) / 0.6745f;
+    of->per[c] = 1.0f / (std < least_std ? least_std : std);
+}
+
 /* Changed cells, with strong pixels, and faint ones, whose mean change stands out of the frame's own spread of such means; and what lies
    outside of them. Holes are neither changed nor outside. Returns whether any cell has changed. */
-static int find_cells(const Grid *grid, Scratch at) {
+static int find_cells(const Grid *grid, const float per[3], Scratch at) {
     const size_t cells = (size_t)grid->rows * grid->columns;
     const int rows = grid->rows, columns = grid->columns, words = grid->shape.words;
-    const int longer = rows > columns ? rows : columns, shorter = rows + columns - longer;
-    const int step = longer < 80 ? 1 : least(longer / 40, shorter); /* at least one line of a thin grid */
-    const float least_std = 1.0f / (float)grid->cell;
-    float per[3];
-    for (int c = 0; c < 3; c++) {
-        int n = 0;
-        for (int i = step / 2; i < rows; i += step)
-            for (int j = step / 2; j < columns; j += step) at.some[n++] = fabsf(at.means[c * cells + (size_t)i * columns + j]);
-        const float std = median(at.some, n, at.some + n) / 0.6745f;
-        per[c] = 1.0f / (std < least_std ? least_std : std);
-    }
     uint64_t found = 0;
     for (int i = 0; i < rows; i++) {
         const size_t first = (size_t)i * columns;
@@ -515,7 +520,8 @@ static int mask_frame(Frame *of) {
     int not_finite = 0;
     for (size_t k = 0; k < 3 * cells; k++) /* comparisons with NaN would let pixels through here that tensors do not */
         not_finite |= !(fabsf(of->at.means[k]) < 1e15f);
-    if (find_cells(&of->grid, of->at)) {
+    share(find_spread, of, 3);
+    if (find_cells(&of->grid, of->per, of->at)) {
         keep_large(&of->grid, of->at);
         if (of->grid.bridge > 0) bridge_gaps(&of->grid, of->at);
         find_solid(&of->grid, of->at);
@@ -539,11 +545,11 @@ EXPORT int contact_mask(const float *image, const float *offset, const float *pe
     const int rows = (height + cell - 1) / cell, columns = (width + cell - 1) / cell;
     const Grid grid = {rows, columns, cell, reach, least_cells, bridge, bridge_sigmas, shape_of(rows, columns)};
     const size_t pixels = (size_t)height * width, cells = (size_t)rows * columns, words = words_of(&grid.shape), line = 64 * (size_t)grid.shape.words;
-    uint64_t *masks = malloc(7 * sizeof(uint64_t) * words + sizeof(float) * (6 * cells + 1 + 2 * line + 2 * (size_t)reach) + 2 * line);
+    uint64_t *masks = malloc(7 * sizeof(uint64_t) * words + sizeof(float) * (10 * cells + 3 + 2 * line + 2 * (size_t)reach) + 2 * line);
     if (!masks) return 1;
     Scratch at = {.changed = masks, .faint = masks + words, .outside = masks + 2 * words, .kept = masks + 3 * words, .solid = masks + 4 * words};
     at.one = masks + 5 * words, at.other = masks + 6 * words;
-    at.some = (float *)(masks + 7 * words), at.means = at.some + 2 * cells + 1, at.density = at.means + 3 * cells, at.sums = at.density + cells;
+    at.some = (float *)(masks + 7 * words), at.means = at.some + 6 * cells + 3, at.density = at.means + 3 * cells, at.sums = at.density + cells;
     at.down = at.sums + line, at.line = (uint8_t *)(at.down + line + 2 * reach), at.other_line = at.line + line;
     int code = 0;
     for (int b = 0; b < frames && code != 1; b++) {

@@ -251,7 +251,7 @@ static void to_depth(const Plan *plan, const float *coefficients, int first, flo
 }
 
 /* Sum of depth where the slopes are not zero, and how many pixels that are. */
-WIDE static double inclined_sum(const float *restrict depth, const float *restrict p, const float *restrict q, int n, int *count) {
+WIDE static double inclined_sum(const float *restrict depth, const float *restrict p, const float *restrict q, int n, int32_t *count) {
     double sums[LANES] = {0.0}, total = 0.0;
     int counts[LANES] = {0}, x = 0;
     for (; x + LANES <= n; x += LANES)
@@ -273,24 +273,6 @@ WIDE static void subtract_level(float *depth, float level, size_t n) {
     for (size_t k = 0; k < n; k++) depth[k] -= level;
 }
 
-/* The depth at which the gradient is zero on average, or where that is nowhere, the lowest. Depth has zero mean. */
-static float level_of(const float *gradient, const Part *part, int height, int width, const float *depth) {
-    const size_t pixels = (size_t)height * width;
-    double sum = 0.0;
-    size_t inclined = 0;
-    for (int y = 0; y < part->rows; y++) {
-        int count = 0;
-        const float *p = gradient + (size_t)y * part->columns;
-        sum += inclined_sum(depth + (size_t)(part->top + y) * width + part->left, p, p + (size_t)part->rows * part->columns, part->columns, &count);
-        inclined += (size_t)count;
-    }
-    if (inclined < pixels) return (float)(-sum / (double)(pixels - inclined));
-    float level = depth[0];
-    for (size_t k = 1; k < pixels; k++)
-        if (depth[k] < level) level = depth[k];
-    return level;
-}
-
 /* The solution of one frame. Each part of the work has LINES columns, or a slice of coefficients of all, or a band of rows, and scratch of its
    own: transforms and their coefficients, and the lines of the divergence's borders. */
 typedef struct {
@@ -300,6 +282,8 @@ typedef struct {
     float half_pitch, level;
     int step;
     float *lines, *coefficients, *depth;
+    double *row_sum; /* of depth where the gradient is not zero, of each row of the part, and how many pixels those are */
+    int32_t *row_count;
     atomic_int short_of_memory;
 } Solution;
 
@@ -355,6 +339,32 @@ static void transform_back(void *with, int block) {
     free(memory);
 }
 
+static void sum_rows(void *with, int band) {
+    Solution *of = with;
+    const Part *part = &of->part;
+    const int bands = bands_of(part->rows);
+    for (int y = part->rows * band / bands; y < part->rows * (band + 1) / bands; y++) {
+        const float *p = of->gradient + (size_t)y * part->columns;
+        of->row_count[y] = 0;
+        of->row_sum[y] = inclined_sum(of->depth + (size_t)(part->top + y) * of->plan.width + part->left, p, p + (size_t)part->rows * part->columns,
+                                      part->columns, of->row_count + y);
+    }
+}
+
+/* The depth at which the gradient is zero on average, or where that is nowhere, the lowest. Depth has zero mean. */
+static float level_of(Solution *of) {
+    const size_t pixels = (size_t)of->plan.height * of->plan.width;
+    double sum = 0.0;
+    size_t inclined = 0;
+    share(sum_rows, of, bands_of(of->part.rows));
+    for (int y = 0; y < of->part.rows; y++) sum += of->row_sum[y], inclined += (size_t)of->row_count[y];
+    if (inclined < pixels) return (float)(-sum / (double)(pixels - inclined));
+    float level = of->depth[0];
+    for (size_t k = 1; k < pixels; k++)
+        if (of->depth[k] < level) level = of->depth[k];
+    return level;
+}
+
 static void set_level(void *with, int band) {
     Solution *of = with;
     const int height = of->plan.height, bands = bands_of(height), first = height * band / bands, last = height * (band + 1) / bands;
@@ -373,7 +383,7 @@ static void solve_one(Solution *of, int zeroed, double *constant) {
     for (int x = 0; x < width; x++) of->coefficients[(size_t)x * SLICE] = (float)constant[x];
     share(transform_back, of, (width + LINES - 1) / LINES);
     if (!zeroed || of->short_of_memory) return;
-    of->level = level_of(of->gradient, part, height, width, of->depth);
+    of->level = level_of(of);
     share(set_level, of, bands_of(height));
 }
 
@@ -385,10 +395,11 @@ EXPORT int solve_poisson(const float *gradient, const double *tables, float mm_p
                          int height, int width, int zeroed, float *depth) {
     Solution work = {.plan = plan_of(height, width, tables), .part = part_of(rows, columns, top, left, height, width), .half_pitch = 0.5f * mm_per_pixel};
     const size_t wide = (size_t)work.plan.wide, lines = (size_t)height * (width + LINES), blocks = (size_t)width + LINES; /* the same for every window */
-    double *constant = malloc(sizeof(double) * (size_t)width + sizeof(float) * (blocks * wide + lines));
+    double *constant = malloc(sizeof(double) * ((size_t)width + height) + sizeof(float) * (blocks * wide + lines + (size_t)height));
     if (!constant) return 1;
     work.step = (work.part.last_column - work.part.first_column + LINES - 1) / LINES * LINES;
-    work.coefficients = (float *)(constant + width), work.lines = work.coefficients + blocks * wide;
+    work.row_sum = constant + width, work.coefficients = (float *)(work.row_sum + height), work.lines = work.coefficients + blocks * wide;
+    work.row_count = (int32_t *)(work.lines + lines);
     for (size_t k = 0; k < wide; k += SLICE) /* columns beyond the image, which fill its last block */
         memset(work.coefficients + place_of(k, (size_t)width, blocks), 0, sizeof(float) * SLICE * LINES);
     for (int b = 0; b < frames && !work.short_of_memory; b++) {

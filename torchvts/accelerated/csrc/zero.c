@@ -414,15 +414,38 @@ static int deep_on_border(const float *depth, const uint8_t *deformed, float mid
     return 0;
 }
 
+enum { PIECES = 8 };
+
+/* Smallest and largest depth of each of so many pieces of a frame. */
+typedef struct {
+    const float *depth;
+    size_t pixels;
+    float low[PIECES], high[PIECES];
+} Ends;
+
+static void ends_of(void *with, int k) {
+    Ends *of = with;
+    const size_t first = of->pixels * (size_t)k / PIECES;
+    range_of(of->depth + first, of->pixels * ((size_t)k + 1) / PIECES - first, of->low + k, of->high + k);
+}
+
+/* Half of a frame's depth. */
+static float middle_of(const float *depth, size_t pixels) {
+    Ends ends = {.depth = depth, .pixels = pixels};
+    share(ends_of, &ends, PIECES);
+    float low = ends.low[0], high = ends.high[0];
+    for (int k = 1; k < PIECES; k++) low = ends.low[k] < low ? ends.low[k] : low, high = ends.high[k] > high ? ends.high[k] : high;
+    return 0.5f * (low + high);
+}
+
 /* with_cut_faces() of background.py, in place. kind: a byte for each pixel, and two lines, and four bytes each. Returns whether there are such
    faces. */
 int add_cut_faces(const float *depth, uint8_t *deformed, int height, int width, uint8_t *kind) {
     const size_t pixels = (size_t)height * width;
-    float low, high, sum;
+    float sum;
     int count;
     if (!on_border(deformed, height, width, 1)) return 0;
-    range_of(depth, pixels, &low, &high);
-    const float middle = 0.5f * (low + high);
+    const float middle = middle_of(depth, pixels);
     if (!deep_on_border(depth, deformed, middle, height, width)) return 0;
     for (int y = 0; y < height; y++) not_beside(deformed, height, width, y, kind + pixels, kind + (size_t)y * width);
     for (int y = 0; y < height; y++) flat_row(depth + (size_t)y * width, kind + (size_t)y * width, middle, width, &sum, &count);

@@ -27,6 +27,37 @@ LIBRARY = Path(__file__).parent / "csrc" / "libtorchvts.so"
 NO_PEDESTAL = (ctypes.c_float * 3)()
 
 
+SIGNATURES = {
+    "contact_mask": ("i", "ppppp iiiiiii fff i f pp"),
+    "normals": ("i", "p lll ppp l iiii p ll pp ffff p"),
+    "solve_shadowed": ("v", "p lll ppp l iiii p ll ppppp"),
+    "zero_background": ("i", "pp iii ff i p"),
+    "contact_from_depth": ("i", "p ll pp ll iiiii pp"),
+    "clean": ("i", "pppppp l p iiii p"),
+    "levels": ("i", "p iiiii ff p"),
+    "box_of": ("v", "p iii p"),
+    "divide_planes": ("v", "pp i l p"),
+    "response_normals": ("v", "p lll pp ii p ll p f iii p"),
+    "mask_values": ("v", "pp ll iiii p"),
+    "depth_slopes": ("v", "p ll p ll f iii p"),
+    "grid_means": ("v", "p iiiiiii p"),
+    "slopes": ("v", "p ii f p"),
+    "solve_frames": ("i", "pp ii ppppp"),
+    "poisson_plan_size": ("l", "i"),
+    "make_poisson_plan": ("v", "ii p"),
+    "solve_poisson": ("i", "pp f iiiiiiii p"),
+    "largest_change": ("v", "pp i l p"),
+    "uncrop": ("v", "pp iiiiiii ppp"),
+    "alignment_sums": ("v", "p ii p l ii pp"),
+    "part_sums": ("v", "p ii p l ii pp"),
+    "refine_pose": ("v", "p ii p l ii pp i pp"),
+    "track_grids": ("i", "ppp ii f ii pp"),
+}
+"""What each kernel returns and takes, a letter each: a pointer, int, float, int64 (l), or nothing (v)."""
+
+_TYPES: dict[str, Any] = {"p": ctypes.c_void_p, "i": ctypes.c_int, "f": ctypes.c_float, "l": ctypes.c_int64, "v": None}
+
+
 @functools.cache
 def library() -> ctypes.CDLL | None:
     """The compiled kernels; None where no C compiler was at hand when this package was installed, and PyTorch does their work."""
@@ -38,69 +69,9 @@ def library() -> ctypes.CDLL | None:
     if built_from & 0xFFFFFFFF != zlib.crc32(b"".join(source.read_bytes() for source in sorted(LIBRARY.parent.glob("*.[ch]")))):
         warnings.warn(f"{LIBRARY}: built from other sources than lie beside it, so it is not used: install again", stacklevel=2)
         return None
-    pointer, whole, real, step = ctypes.c_void_p, ctypes.c_int, ctypes.c_float, ctypes.c_int64
-    loaded.contact_mask.argtypes = [*[pointer] * 5, *[whole] * 7, *[real] * 3, whole, real, pointer, pointer]
-    loaded.normals.argtypes = [
-        pointer,
-        *[step] * 3,
-        *[pointer] * 3,
-        step,
-        *[whole] * 4,
-        pointer,
-        *[step] * 2,
-        *[pointer] * 2,
-        *[real] * 4,
-        pointer,
-    ]
-    loaded.solve_shadowed.argtypes = [
-        pointer,
-        *[step] * 3,
-        *[pointer] * 3,
-        step,
-        *[whole] * 4,
-        pointer,
-        *[step] * 2,
-        *[pointer] * 5,
-    ]
-    loaded.zero_background.argtypes = [pointer, pointer, *[whole] * 3, *[real] * 2, whole, pointer]
-    loaded.contact_from_depth.argtypes = [pointer, step, step, pointer, pointer, step, step, *[whole] * 5, pointer, pointer]
-    loaded.clean.argtypes = [*[pointer] * 6, step, pointer, *[whole] * 4, pointer]
-    loaded.levels.argtypes = [pointer, *[whole] * 5, *[real] * 2, pointer]
-    loaded.box_of.argtypes = [pointer, *[whole] * 3, pointer]
-    loaded.box_of.restype = None
-    loaded.divide_planes.argtypes = [pointer, pointer, whole, step, pointer]
-    loaded.divide_planes.restype = None
-    loaded.response_normals.argtypes = [
-        pointer,
-        *[step] * 3,
-        *[pointer] * 2,
-        *[whole] * 2,
-        pointer,
-        *[step] * 2,
-        pointer,
-        real,
-        *[whole] * 3,
-        pointer,
-    ]
-    loaded.mask_values.argtypes = [pointer, pointer, *[step] * 2, *[whole] * 4, pointer]
-    loaded.depth_slopes.argtypes = [pointer, *[step] * 2, pointer, *[step] * 2, real, *[whole] * 3, pointer]
-    loaded.depth_slopes.restype = None
-    loaded.response_normals.restype = loaded.mask_values.restype = None
-    loaded.grid_means.argtypes = [pointer, *[whole] * 7, pointer]
-    loaded.slopes.argtypes = [pointer, whole, whole, real, pointer]
-    loaded.solve_frames.argtypes = [pointer, pointer, whole, whole, *[pointer] * 5]
-    loaded.poisson_plan_size.restype = step
-    loaded.make_poisson_plan.argtypes = [whole, whole, pointer]
-    loaded.solve_poisson.argtypes = [pointer, pointer, real, *[whole] * 8, pointer]
-    loaded.largest_change.argtypes = [pointer, pointer, whole, step, pointer]
-    loaded.uncrop.argtypes = [*[pointer] * 2, *[whole] * 7, *[pointer] * 3]
-    loaded.alignment_sums.argtypes = [pointer, whole, whole, pointer, step, whole, whole, pointer, pointer]
-    loaded.part_sums.argtypes = [pointer, whole, whole, pointer, step, whole, whole, pointer, pointer]
-    loaded.refine_pose.argtypes = [pointer, whole, whole, pointer, step, whole, whole, pointer, pointer, whole, pointer, pointer]
-    loaded.track_grids.argtypes = [pointer, pointer, pointer, whole, whole, real, whole, whole, pointer, pointer]
-    without_result = ("grid_means", "solve_shadowed", "slopes", "make_poisson_plan", "largest_change", "uncrop")
-    for name in (*without_result, "alignment_sums", "part_sums", "refine_pose"):
-        getattr(loaded, name).restype = None
+    for name, (result, arguments) in SIGNATURES.items():
+        kernel = getattr(loaded, name)
+        kernel.restype, kernel.argtypes = _TYPES[result], [_TYPES[letter] for letter in arguments.replace(" ", "")]
     return loaded
 
 

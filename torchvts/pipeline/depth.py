@@ -248,7 +248,6 @@ class DepthPipeline(nn.Module):
                     return self.reconstructed(images)
         return self.reconstructed(images)
 
-    @torch.jit.unused
     def compiled(self, images: Tensor) -> DepthOutput | None:
         """The same by one compiled call; None where the blocks must do it, each by itself."""
         if torch.compiler.is_compiling() or type(self) is not DepthPipeline:

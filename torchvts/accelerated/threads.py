@@ -1,4 +1,4 @@
-"""How many threads work on a batch: one on a few small frames, whose threads would only wake up late, and all on large batches."""
+"""How many threads work on a batch and within a frame: nobody waits for threads that would wake up late."""
 
 import os
 import threading

@@ -24,7 +24,6 @@ from refusals_values import (
     WIDTH,
     Entry,
     batches,
-    forward,
     frame,
     image,
     images,
@@ -283,12 +282,6 @@ TABLE = {
         {"calibration": [None, "unit"], "mode": ["slow"], "first": [], "fps": [], "stage": []}
         | {"network": [], "device": [None, "gpu", "cuda:99"], "contact": ["4.5", 4.5]},
     ),
-    "stream.Rectify": Entry(
-        {"sensor": sensor(), "height": HEIGHT, "width": WIDTH},
-        {"sensor": SENSOR, "height": [*INTEGER, 10], "width": [*INTEGER, 10]},
-        named={"height": "height|frame", "width": "width|frame"},
-    ),
-    "stream.Rectify.forward": forward(lambda: vts.stream.Rectify(sensor(), HEIGHT, WIDTH), 3, "frame"),
     "stream.StreamReport": Entry({"stream": ...}, {"stream": [None, "camera"]}, run=False),
     "stream.TactileStream": Entry(
         {

@@ -47,7 +47,7 @@ PARTS = {
     "SensorPrior", "Shadows", "SlopesOfDepth", "SlopesOfPixels", "Solve", "WrappedIntegrator", "WrappedNormals", "as_integrator",
     "as_normal_model", "by_presses", "channel_structure", "check_calibration", "check_domain", "check_sensor",
     "discontinuity_share", "falloff", "label_contacts", "outwardness", "read_point_cloud", "stream.FrameCheck.",
-    "stream.NewestFrame", "stream.Overlay", "stream.Recording.", "stream.RectifySizes", "stream.StageClock",
+    "stream.NewestFrame", "stream.Overlay", "stream.Recording.", "stream.StageClock",
     "stream.Aside", "stream.CameraSettings",
     "stream.Camera", "stream.Keys", "stream.LiveView", "stream.Sheet", "stream.StreamReport.",
     "stream.TactileStream.rezero", "stream.VideoFile.", "stream.find_camera", "stream.frames_a_second", "stream.has_screen",

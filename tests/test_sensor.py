@@ -7,6 +7,7 @@ import sys
 import zipfile
 from pathlib import Path
 
+import kornia
 import pytest
 import torch
 
@@ -172,6 +173,14 @@ def test_rectify_cuts_the_region_of_interest():
     halved = vts.Sensor("rig", 25, 35, 0.2, roi_px=(12, 34, 70, 50)).rectify(frame())
     x, y = 12.5 + 2 * torch.arange(35, dtype=torch.float64), 34.5 + 2 * torch.arange(25, dtype=torch.float64)
     assert (halved - smooth(x[None, :], y[:, None]))[..., 2:-2, 2:-2].abs().max() < 0.02
+
+
+def test_rectify_by_corners_equals_kornias_warp():
+    corners, frame = ((7, 6), (66, 12), (69, 40), (9, 45)), torch.rand(2, 3, 48, 72, generator=torch.Generator().manual_seed(0))
+    target = torch.tensor([[[0.0, 0.0], [59.0, 0.0], [59.0, 47.0], [0.0, 47.0]]])
+    homography = kornia.geometry.get_perspective_transform(torch.tensor([corners]).float(), target).expand(2, 3, 3)
+    expected = kornia.geometry.warp_perspective(frame, homography, (48, 60), align_corners=True)
+    assert (vts.Sensor("rig", 48, 60, 0.1, corners_px=corners).rectify(frame) - expected).abs().max() < 1e-4
 
 
 def test_rectify_straightens_a_quadrilateral():

@@ -65,26 +65,6 @@ def video(unit, tmp_path_factory):
     return write_film(tmp_path_factory.mktemp("video") / "press.avi", pictures)
 
 
-@pytest.mark.parametrize("region", ["corners", "roi", "none"])
-def test_rectify_equals_the_sensors(region):
-    options = {
-        "corners": {"corners_px": ((7, 6), (66, 12), (69, 40), (9, 45))},
-        "roi": {"roi_px": (4, 6, 60, 40)},
-        "none": {},
-    }[region]
-    size = (52, 76) if region == "none" else (48, 72)
-    sensor = vts.Sensor("rig", 48 if region != "none" else 52, 60 if region != "none" else 76, 0.1, **options)
-    frame = torch.rand(2, 3, *size, generator=torch.Generator().manual_seed(0))
-    assert (streams.Rectify(sensor, *size)(frame) - sensor.rectify(frame)).abs().max() < 1e-4
-
-
-def test_rectify_refuses_frames_of_another_size():
-    with pytest.raises(ValueError, match="the source has changed"):
-        streams.Rectify(vts.Sensor("rig", 24, 32, 0.1), 24, 32)(torch.zeros(1, 3, 48, 64))
-    with pytest.raises(ValueError, match="does not contain corners_px"):
-        streams.Rectify(vts.Sensor.load("gelsight_wedge"), 240, 320)
-
-
 @pytest.mark.parametrize(
     "name, error, message",
     [

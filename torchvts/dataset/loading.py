@@ -10,7 +10,7 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from ..core.files import open_video, read_image, rgb_from_bgr
 from ..model import Sensor
-from ..stream import RectifySizes, frames_a_second
+from ..stream import frames_a_second
 from .items import Item, list_items
 from .records import Records
 
@@ -73,8 +73,7 @@ class _Frames(IterableDataset[Batch]):
     """
 
     def __init__(self, records: Records, sensor: Sensor, share: tuple[int, int], batch: int) -> None:
-        self.records, self.share, self.batch = records, share, batch
-        self.rectify = RectifySizes(sensor)
+        self.records, self.sensor, self.share, self.batch = records, sensor, share, batch
 
     def __iter__(self) -> Iterator[Batch]:
         frames: list[tuple[Frame, bool]] = []
@@ -93,7 +92,7 @@ class _Frames(IterableDataset[Batch]):
         import cv2
 
         try:
-            return [self.rectify(read()[None])], ""
+            return [self.sensor.rectify(read()[None]).clamp(0.0, 1.0)], ""
         except (OSError, ValueError, cv2.error) as error:
             return [], " ".join(str(error).split()) or type(error).__name__
 

@@ -3,13 +3,14 @@
 import dataclasses
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import kornia
 import torch
 import yaml
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..core.checks import (
     brief,
@@ -185,12 +186,9 @@ class Sensor:
             corners = torch.tensor(self.corners_px, dtype=frame.dtype, device=frame.device)[None]
             if bool((corners < -0.5).any()) or bool((corners[..., 0] > width).any()) or bool((corners[..., 1] > height).any()):
                 raise ValueError(f"frame: {height} x {width} does not contain corners_px {self.corners_px} of sensor '{self.name}'")
-            right, bottom = self.width - 1.0, self.height - 1.0
-            target = torch.tensor(
-                [[[0.0, 0.0], [right, 0.0], [right, bottom], [0.0, bottom]]], dtype=frame.dtype, device=frame.device
-            )
-            homography = kornia.geometry.get_perspective_transform(corners, target).expand(frame.shape[0], 3, 3)
-            return kornia.geometry.warp_perspective(frame, homography, size, mode="bilinear", align_corners=True)
+            grid = _sampling_grid(self.corners_px, size, (height, width), frame.dtype).to(frame.device)
+            grid = grid.expand(frame.shape[0], -1, -1, -1)
+            return nn.functional.grid_sample(frame, grid, mode="bilinear", padding_mode="zeros", align_corners=True)
         if self.roi_px is not None:
             left, top, roi_width, roi_height = self.roi_px
             if left + roi_width > width or top + roi_height > height:
@@ -366,6 +364,23 @@ def _raw_sizes(value: object) -> tuple[tuple[int, int], ...]:
     if any(v != int(v) or v < 8 for v in numbers):
         raise ValueError(f"raw_size_px: expected whole numbers (height, width) of at least 8, got {value!r}")
     return tuple((int(numbers[k]), int(numbers[k + 1])) for k in range(0, len(numbers), 2))
+
+
+@lru_cache(maxsize=16)
+def _sampling_grid(
+    corners_px: tuple[tuple[float, float], ...], size: tuple[int, int], frame_size: tuple[int, int], dtype: torch.dtype
+) -> Tensor:
+    """Where each pixel of an image of ``size`` lies in frames of ``frame_size``, (1, height, width, 2), from -1 to 1."""
+    (height, width), (rows, columns) = size, frame_size
+    with torch.inference_mode(False):
+        outline = ((0.0, 0.0), (width - 1.0, 0.0), (width - 1.0, height - 1.0), (0.0, height - 1.0))
+        image, frame = (torch.tensor([points], dtype=torch.float64) for points in (outline, corners_px))
+        to_frame = kornia.geometry.get_perspective_transform(image, frame)[0]
+        x = torch.arange(width, dtype=torch.float64).expand(height, -1)
+        y = torch.arange(height, dtype=torch.float64)[:, None].expand(-1, width)
+        place = torch.stack((x, y, torch.ones_like(x)), 2) @ to_frame.T
+        place = place[..., :2] / place[..., 2:]
+        return (2.0 * place / torch.tensor([columns - 1.0, rows - 1.0], dtype=torch.float64) - 1.0)[None].to(dtype)
 
 
 def _resized(frame: Tensor, size: tuple[int, int]) -> Tensor:

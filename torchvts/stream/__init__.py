@@ -19,7 +19,6 @@ from .keys import Keys
 from .live import TactileFrame, TactileStream
 from .overlay import Overlay, Sheet
 from .recording import Recording, check_device
-from .rectify import Rectify, RectifySizes
 from .rezero import with_background
 from .sources import Reader, Unreadable, frames_a_second, open_source
 from .stages import StageClock
@@ -40,8 +39,6 @@ __all__ = [
     "Overlay",
     "Reader",
     "Recording",
-    "Rectify",
-    "RectifySizes",
     "Sheet",
     "StageClock",
     "StreamReport",

@@ -24,7 +24,6 @@ from ..core.files import VIDEO_SUFFIXES, read_frames
 from ..model import Calibration, Sensor, SensorPrior, check_sensor
 from ..model.calibration import PEDESTAL
 from ..normals import NormalFromResponse
-from .rectify import RectifySizes
 
 MOVED = 0.02
 """Relative change of a cell of 1/20 of the frame that counts as movement among the first frames."""
@@ -148,9 +147,8 @@ def read_background(paths: Sequence[str | Path], sensor: Sensor, first_frames: i
 
 
 def _background_of_video(path: Path, sensor: Sensor, first_frames: int) -> Tensor:
-    rectify = RectifySizes(sensor)
     try:
-        frames = [rectify(frame[None]) for _, frame in islice(read_frames(path), first_frames)]
+        frames = [sensor.rectify(frame[None]).clamp(0.0, 1.0) for _, frame in islice(read_frames(path), first_frames)]
         if len(frames) < first_frames:
             raise ValueError(f"background: expected at least {first_frames} frames, got {len(frames)}: ask for fewer")
         return find_background(torch.cat(frames), sensor)[0]

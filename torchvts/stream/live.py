@@ -20,7 +20,6 @@ from ..pipeline import MODES, DepthOutput
 from .background import FIRST_FRAMES, calibrate_background, find_background, use_calibration
 from .frames import SourceFrames
 from .recording import Recording
-from .rectify import Rectify
 from .rezero import with_background
 from .sources import Pixels, Reader, Unreadable, check_reader, open_source
 from .stages import StageClock
@@ -108,7 +107,7 @@ class TactileStream:
         self._zero_missing = 0
         try:
             self._frames = SourceFrames(self.reader, background_frames, realtime, self.stages)
-            self.rectify = Rectify(sensor, *self._frames.readable[0].shape[:2])
+            self._sensor, self._size = sensor, self._frames.readable[0].shape[:2]
             first = torch.cat([self._rectified(pixels) for pixels in self._frames.readable])
             if isinstance(sensor_or_calibration, Calibration):
                 found = use_calibration(sensor_or_calibration)
@@ -131,8 +130,10 @@ class TactileStream:
             raise
 
     def _rectified(self, pixels: Pixels) -> Tensor:
-        frame: Tensor = self.rectify(rgb_from_bgr(pixels)[None])
-        return frame.clamp_(0.0, 1.0)
+        frame = rgb_from_bgr(pixels)[None]
+        if pixels.shape[:2] != self._size:
+            raise ValueError(f"frame: expected {self._size} like the first, got {pixels.shape[:2]}: the source has changed")
+        return self._sensor.rectify(frame).clamp(0.0, 1.0)
 
     def rezero(self, frames: int = FIRST_FRAMES) -> None:
         """Take the next frames, which must be without contact, as the background; until then depth goes on as before.

@@ -703,28 +703,6 @@ def test_a_raw_video_of_a_mini_runs_without_a_camera(data, run_stream, tmp_path,
     assert min(float(row[3]) for row in rows[14:17]) > 0.3 and max(float(row[3]) for row in rows[:14] + rows[17:]) < 0.02
 
 
-def test_work_beside_the_stream_keeps_its_order_and_counts_what_it_drops():
-    """Of what comes faster than it is worked on, some is dropped and counted; a recording waits instead; errors come back."""
-    started, go, done = threading.Event(), threading.Event(), []
-
-    def work(number):
-        started.set()
-        go.wait(600.0)
-        done.append(number)
-
-    with streams.Aside(work, most_waiting=2) as aside:
-        assert aside.put(0) and started.wait(600.0)  # being worked on: two more may wait
-        assert [aside.put(number) for number in range(1, 6)] == [True, True, False, False, False]
-        go.set()
-    assert done == [0, 1, 2] and aside.dropped == 3
-    with streams.Aside(done.append, most_waiting=1, keeps_all=True) as aside:
-        assert all(aside.put(number) for number in range(3, 50))
-    assert done == list(range(50)) and aside.dropped == 0
-    with pytest.raises(ZeroDivisionError), streams.Aside(lambda number: 1 // number, most_waiting=1, keeps_all=True) as aside:
-        for number in range(100):
-            aside.put(number)
-
-
 @pytest.mark.parametrize("slow", [pytest.param(False, marks=pytest.mark.long), True])
 def test_a_camera_in_real_time(unit, slow, monkeypatch):
     """Depth of every frame in order, or of the newest where depth takes longer than a frame: none is lost without being counted."""

@@ -3,13 +3,14 @@
 import threading
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 
 from ..core.checks import check_integer, check_positive
 from ..model import Calibration
-from ..stream import Aside, Overlay, TactileFrame, TactileStream
+from ..stream import Overlay, TactileFrame, TactileStream
 from ..stream.sources import Pixels
 
 
@@ -95,12 +96,12 @@ def measure_latency(calibration: Calibration, pictures: Sequence[Pixels], fps: f
         overlay(frame)
         drawn.append(frame.number)
 
-    with TactileStream(camera, calibration, background_frames=15) as stream, Aside(draw) as aside:
+    with TactileStream(camera, calibration, background_frames=15) as stream, ThreadPoolExecutor(1) as aside:
         before = len(camera.arrivals)
         for frame in stream:
             delay_ms.append(1000.0 * (time.monotonic() - camera.arrivals[before + frame.number]))
             numbers.append(frame.number)
-            aside.put(frame)
+            aside.submit(draw, frame)
             if frame.number == frames - 1:  # the newest frame is never dropped
                 break
         dropped = stream.dropped

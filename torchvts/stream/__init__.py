@@ -1,7 +1,6 @@
 """Depth of cameras, videos and folders of images, frame by frame; late frames are dropped, slow drift of the light is followed."""
 
 from . import messages
-from .aside import Aside
 from .background import (
     FIRST_FRAMES,
     NOT_METRIC,
@@ -28,7 +27,6 @@ from .view import LiveView, has_screen, require_rerun
 __all__ = [
     "FIRST_FRAMES",
     "NOT_METRIC",
-    "Aside",
     "Camera",
     "CameraSettings",
     "FollowLight",

@@ -102,9 +102,6 @@ TABLE = {
     "metrics.mask_iou": Entry(
         {"mask": DEPTH > 0, "truth": DEPTH > 0}, {"mask": [DEPTH[0] > 0, None, (DEPTH > 0).numpy()], "truth": [None, [1]]}
     ),
-    "metrics.rim_distance_px": Entry(
-        {"mask": DEPTH > 0, "truth": DEPTH > 0}, {"mask": [torch.ones(2, 1, 4, 4), None, "m"], "truth": [torch.ones(4), None]}
-    ),
     "metrics.fit_sphere": Entry(
         {"depth_mm": frame().depth_mm, "mm_per_pixel": 0.4, "contact": frame().contact, "steps": 3},
         {

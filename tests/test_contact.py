@@ -22,13 +22,22 @@ def found(scene, lights, sensor, noise_std=0.0, bits=None, seed=3):
     return pipeline(scenes.render(scene, lights, noise_std=noise_std, bits=bits, seed=seed)).deformed
 
 
+def rim_distance_px(mask, truth):
+    """Mean distance between the rims of two masks of one frame, in both directions."""
+    rims = []
+    for frame in (mask.float(), truth.float()):
+        rims.append(torch.nonzero((frame + torch.nn.functional.max_pool2d(-frame, 3, 1, 1))[0, 0] > 0).double())
+    distance = torch.cdist(*rims)
+    return 0.5 * float(distance.min(0).values.mean() + distance.min(1).values.mean())
+
+
 @pytest.mark.parametrize("noise_std, bits, least, rim_px", [(0.0, None, 0.999, 0.01), (0.01, 8, 0.99, 0.1)])
 @pytest.mark.parametrize("press_mm", [1.0, 2.0])
 def test_a_ball_full_size(ring, noise_std, bits, least, rim_px, press_mm):
     scene = scenes.sphere_press(10.0, press_mm)
     contact = found(scene, ring(), vts.Sensor("rig", 480, 640, 0.0625), noise_std, bits)
     assert metrics.mask_iou(contact, scene.contact) > least
-    assert metrics.rim_distance_px(contact, scene.contact) < rim_px
+    assert rim_distance_px(contact, scene.contact) < rim_px
 
 
 @pytest.mark.parametrize(
@@ -44,7 +53,7 @@ def test_letters(ring):
     scene = scenes.letters_press("VTS", height=240, width=320, mm_per_pixel=0.125)
     contact = found(scene, ring(), vts.Sensor("rig", 240, 320, 0.125), 0.005, 8)
     assert metrics.mask_iou(contact, scene.contact) > 0.93
-    assert metrics.rim_distance_px(contact, scene.contact) < 1.0
+    assert rim_distance_px(contact, scene.contact) < 1.0
 
 
 def mask_of(changed, height=480, width=640, noise=0.01, seed=None, **options):

@@ -185,12 +185,6 @@ def test_overlap_and_rim_distance_by_hand():
     assert metrics.mask_iou(square(5), square(7)) == pytest.approx(8 / 24)
     assert metrics.mask_iou(square(5), square(5)) == 1.0 and metrics.mask_iou(square(5), nothing) == 0.0
     assert metrics.mask_iou(nothing, nothing) == 1.0
-    assert metrics.rim_distance_px(square(5), square(5)) == 0.0
-    # the 6 x 6 square around a 4 x 4 one: 16 of its 20 rim pixels are 1 away, the corners the root of 2
-    outer = torch.zeros_like(nothing)
-    outer[..., 4:10, 4:10] = True
-    assert metrics.rim_distance_px(square(5), outer) == pytest.approx(0.5 * (1.0 + (16 + 4 * math.sqrt(2)) / 20))
-    assert metrics.rim_distance_px(square(5), nothing) == math.inf and metrics.rim_distance_px(nothing, nothing) == 0.0
 
 
 @pytest.mark.parametrize("radius_mm, press_mm, center_mm", [(10.0, 0.2, (0.0, 0.0)), (3.0, 1.0, (5.0, -4.0))])

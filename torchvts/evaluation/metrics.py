@@ -1,6 +1,5 @@
 """Metrics of frames against an exact truth: depth, normals, contact mask, fitted sphere."""
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -96,19 +95,6 @@ def mask_iou(mask: Tensor, truth: Tensor) -> float:
     return int((mask.bool() & truth.bool()).sum()) / union if union else 1.0
 
 
-def rim_distance_px(mask: Tensor, truth: Tensor) -> float:
-    """Mean distance between the rims of two masks of one frame, in both directions, pixels; infinite if only one has a rim."""
-    for name, value in (("mask", mask), ("truth", truth)):
-        check_tensor(name, value)
-        if value.dim() < 2 or value.numel() == 0 or value.numel() != value.shape[-1] * value.shape[-2]:
-            raise ValueError(f"{name}: expected one frame, (H, W) or (1, 1, H, W), got {tuple(value.shape)}: loop over the batch")
-    rims = [torch.nonzero(_rim(m)).double() for m in (mask, truth)]
-    if not (len(rims[0]) and len(rims[1])):
-        return math.inf if len(rims[0]) + len(rims[1]) else 0.0
-    distance = torch.cdist(rims[0], rims[1])
-    return 0.5 * float(distance.min(0).values.mean() + distance.min(1).values.mean())
-
-
 def fit_sphere(depth_mm: Tensor, mm_per_pixel: float, contact: Tensor, steps: int = 20) -> SphereFit:
     """Geometric least-squares sphere through the points of the contact: algebraic start, then Gauss-Newton on the distance.
 
@@ -157,9 +143,3 @@ def _inside(name: str, values: Tensor, truth: Tensor, region: Tensor | None) -> 
     if not bool(region.any()):
         raise ValueError("region: expected at least one pixel, got none: no contact was found")
     return values[region.bool()]
-
-
-def _rim(mask: Tensor) -> Tensor:
-    frame = mask.reshape(mask.shape[-2], mask.shape[-1]).float()[None, None]
-    eroded = -torch.nn.functional.max_pool2d(-frame, 3, 1, 1)
-    return (frame - eroded)[0, 0] > 0

@@ -16,7 +16,7 @@ import torchvts as vts
 from torchvts.evaluation import coverage
 from torchvts.evaluation.figures import coverage_figure
 from torchvts.evaluation.random_scenes import SHAPES, UNITS
-from torchvts.evaluation.rows import write_files
+from torchvts.evaluation.rows import to_json, write_files
 from torchvts.viz import save_figure
 
 
@@ -45,7 +45,7 @@ def measure(arguments: argparse.Namespace) -> str:
         rows += [coverage.mean(found, f"scenes, {unit}")] if found else []
         every += found
     for shape in SHAPES:
-        found = [row for row in every if row.shape == shape]
+        found = [row for row in every if row.method == shape]
         rows += [coverage.mean(found, f"scenes of all units, {shape}")] if found else []
     curves = [coverage.mean(every, "scenes")]
     if arguments.presses is not None:
@@ -60,8 +60,8 @@ def measure(arguments: argparse.Namespace) -> str:
             found = coverage.of_presses(arguments.presses, kind, learn=learn, mode=mode, progress=True)
             rows.append(coverage.mean(found, f"{arguments.presses.name}, {name}"))
             curves.append(rows[-1])
-    drawn = [curve for curve in curves if not curve.name.endswith("fast")]  # it covers the line of mode precise
-    write_files(arguments.out.parent, {f"{arguments.out.stem}.json": coverage.to_json(drawn)})
+    drawn = [curve for curve in curves if not curve.data.endswith("fast")]  # it covers the line of mode precise
+    write_files(arguments.out.parent, {f"{arguments.out.stem}.json": to_json(drawn)})
     save_figure(coverage_figure(drawn), arguments.out)
     return coverage.table([*rows, curves[0]])
 

@@ -13,13 +13,13 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from torchvts.evaluation import coverage, figures, rows, stability
+from torchvts.evaluation import figures, rows, stability
 
 DRAW: dict[str, Callable[[str], Figure]] = {
     "speed": lambda text: figures.speed_figure(rows.from_json(text)),
     "overview": lambda text: figures.overview_figure(stability.points_from_json(text)[0]),
     "learning": lambda text: figures.learning_figure(rows.from_json(text)),
-    "confidence": lambda text: figures.coverage_figure(coverage.from_json(text)),
+    "confidence": lambda text: figures.coverage_figure(rows.from_json(text)),
 }
 
 

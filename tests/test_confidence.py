@@ -95,20 +95,20 @@ def covered(request):
 def test_95_percent_of_random_scenes_lie_within_the_bounds(covered):
     mean = coverage.mean(covered)
     assert len(covered) >= 9
-    assert 0.90 <= float(mean.normal[-1]) <= 0.995 and 0.90 <= float(mean.depth[-1]) <= 0.999
-    assert float(mean.normal[0]) < 0.75  # bounds that contain everything are useless
+    assert 90.0 <= mean.errors["normal 95%"] <= 99.5 and 90.0 <= mean.errors["depth 95%"] <= 99.9
+    assert mean.errors["normal 50%"] < 75.0  # bounds that contain everything are useless
 
 
 def test_a_frame_by_itself_lies_within_its_bounds(covered):
-    assert sum(float(row.normal[-1]) >= 0.9 for row in covered) >= 0.9 * len(covered)
-    assert sum(float(row.depth[-1]) >= 0.8 for row in covered) >= 0.85 * len(covered)
+    assert sum(row.errors["normal 95%"] >= 90.0 for row in covered) >= 0.9 * len(covered)
+    assert sum(row.errors["depth 95%"] >= 80.0 for row in covered) >= 0.85 * len(covered)
 
 
 @pytest.mark.long
 def test_95_percent_of_scenes_calibrated_by_presses_lie_within_the_bounds():
     rows = coverage.of_scenes(range(23000, 23004), "presses")
     mean = coverage.mean(rows)
-    assert float(mean.normal[-1]) >= 0.88 and float(mean.depth[-1]) >= 0.88
+    assert mean.errors["normal 95%"] >= 88.0 and mean.errors["depth 95%"] >= 88.0
 
 
 def test_attached_shadows_and_a_worn_skin(ring):
@@ -124,7 +124,7 @@ def test_attached_shadows_and_a_worn_skin(ring):
         out = pipe(scenes.render(scene, lights, **camera, seed=2))
         assert bool((out.factors_deg[:, FACTORS.index("saturation")] > 0).any())
         row = coverage.coverage(out, Truth(scene.depth_mm, scene.gradient, out.contact | scene.contact), pipe.confidence.spread)
-        assert float(row.normal[-1]) > 0.9 and float(row.depth[-1]) > 0.9
+        assert row.errors["normal 95%"] > 90.0 and row.errors["depth 95%"] > 90.0
 
 
 def test_a_noisier_frame_has_wider_bounds(ring):
@@ -292,5 +292,5 @@ def test_presses_of_a_real_sensor(mini_presses, mini_by_prior, learn):
     pipe = vts.ConfidentPipeline.from_calibration(calibration, "precise")
     scored = [press for press in presses if press.contact_radius_px is not None and press.name not in names]
     mean = coverage.mean([coverage.of_press(pipe(p.image[None]), p, sensor.mm_per_pixel, pipe.confidence.spread) for p in scored])
-    assert 0.85 <= float(mean.normal[-1]) <= 0.99 and float(mean.depth[-1]) >= 0.85
-    assert float(mean.normal[0]) < 0.8
+    assert 85.0 <= mean.errors["normal 95%"] <= 99.0 and mean.errors["depth 95%"] >= 85.0
+    assert mean.errors["normal 50%"] < 80.0

@@ -1,12 +1,9 @@
 """How often errors lie within the bounds that confidence states: on random exact scenes, and on presses of balls."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
 from ..calibration import Press
@@ -14,10 +11,11 @@ from ..core.geometry import normal_from_gradient
 from ..model import Sensor
 from ..pipeline import ConfidentOutput, ConfidentPipeline, bound_at
 from ..pipeline.confidence import DEPTH_SPREAD
+from . import rows as records
 from .metrics import normal_angle_deg
 from .presses import Training
 from .random_scenes import random_frame
-from .rows import markdown
+from .rows import Column, Row, error_column
 from .score import Truth, ball_truth
 from .sets import from_folder
 
@@ -25,29 +23,11 @@ LEVELS = (0.5, 0.68, 0.8, 0.9, 0.95)
 """Probabilities at which coverage is measured."""
 
 
-class Coverage(NamedTuple):
-    """Shares of pixels whose errors are within their bounds.
+def coverage(out: ConfidentOutput, truth: Truth, spread: float, name: str = "", shape: str = "") -> Row:
+    """Percent of the pixels of a region whose errors are within their bounds; ``spread`` is that of :class:`Confidence`.
 
-    Attributes:
-        name: name of the unit or of the press.
-        shape: shape that was pressed in.
-        normal: (5,), share of the normals at each of :data:`LEVELS`.
-        depth: (5,), share of the depths at each of :data:`LEVELS`.
-        normal_quartiles: (2, 5), lower and upper quartile over the frames of a mean; of one frame the share itself.
-        depth_quartiles: (2, 5), the same of the depths.
-    """
-
-    name: str
-    shape: str
-    normal: Tensor
-    depth: Tensor
-    normal_quartiles: Tensor
-    depth_quartiles: Tensor
-
-
-def coverage(out: ConfidentOutput, truth: Truth, spread: float, name: str = "", shape: str = "") -> Coverage:
-    """Shares of the pixels of a region whose errors are within their bounds; ``spread`` is that of :class:`Confidence`.
-
+    Returns:
+        A row of unit or press ``name`` and the shape that was pressed in, with the errors "normal 50%", "depth 50%" and so on.
     Raises:
         ValueError: an empty region.
     """
@@ -55,14 +35,19 @@ def coverage(out: ConfidentOutput, truth: Truth, spread: float, name: str = "", 
         raise ValueError("region: expected at least one pixel, got none: no contact was found")
     normal = normal_from_gradient(truth.gradient)
     angle = normal_angle_deg(out.normal.to(normal.dtype), normal)[:, None]
-    error = (out.depth_mm - truth.depth_mm).abs()
-    of_normal = [(angle <= bound_at(out.normal_95_deg, level, spread))[truth.region].double().mean() for level in LEVELS]
-    of_depth = [(error <= bound_at(out.depth_95_mm, level, DEPTH_SPREAD))[truth.region].double().mean() for level in LEVELS]
-    shares = torch.stack(of_normal), torch.stack(of_depth)
-    return Coverage(name, shape, *shares, *(share.expand(2, -1) for share in shares))
+    kinds = {
+        "normal": (angle, out.normal_95_deg, spread),
+        "depth": ((out.depth_mm - truth.depth_mm).abs(), out.depth_95_mm, DEPTH_SPREAD),
+    }
+    errors: dict[str, float | None] = {}
+    for kind, (error, bound, width) in kinds.items():
+        for level in LEVELS:
+            within = (error <= bound_at(bound, level, width))[truth.region]
+            errors[f"{kind} {level:.0%}"] = 100.0 * float(within.double().mean())
+    return Row("coverage", shape, name, errors)
 
 
-def of_scenes(seeds: Sequence[int], unit: str | None = None, progress: bool = False) -> list[Coverage]:
+def of_scenes(seeds: Sequence[int], unit: str | None = None, progress: bool = False) -> list[Row]:
     """Coverage over the true and the found contact of the :func:`random_frame` of each seed: a row for each with contact."""
     rows = []
     for seed in tqdm(seeds, desc=unit or "scenes", disable=not progress or None, leave=False):
@@ -78,7 +63,7 @@ def of_scenes(seeds: Sequence[int], unit: str | None = None, progress: bool = Fa
 
 def of_presses(
     folder: str | Path, sensor: Sensor, *, learn: bool = True, mode: str = "precise", progress: bool = False
-) -> list[Coverage]:
+) -> list[Row]:
     """Coverage inside the contact of presses that the calibration has not seen.
 
     Labels give the place of a ball, not its depth, so only the relief is compared: depth and ball each less their own mean.
@@ -102,39 +87,33 @@ def of_presses(
     return rows
 
 
-def of_press(out: ConfidentOutput, press: Press, mm_per_pixel: float, spread: float) -> Coverage:
+def of_press(out: ConfidentOutput, press: Press, mm_per_pixel: float, spread: float) -> Row:
     """Coverage of one labelled press inside its contact; of the depth only the relief is compared."""
     ball = ball_truth(press, out.depth_mm.shape[2], out.depth_mm.shape[3], mm_per_pixel)
     offset = (out.depth_mm - ball.depth_mm)[ball.region].mean()
     return coverage(out, ball._replace(depth_mm=ball.depth_mm + offset), spread, press.name, "ball")
 
 
-def mean(rows: Sequence[Coverage], name: str = "") -> Coverage:
-    """Mean and quartiles over frames.
+def mean(rows: Sequence[Row], name: str = "") -> Row:
+    """Means over frames, and their quartiles as errors "normal 50%, lower quartile" and so on.
 
     Raises:
         ValueError: no rows.
     """
     if not rows:
         raise ValueError("rows: expected at least one frame, got none")
-    frames = [torch.stack([row.normal for row in rows]), torch.stack([row.depth for row in rows])]
-    quartiles = [shares.quantile(torch.tensor([0.25, 0.75], dtype=shares.dtype), 0) for shares in frames]
-    return Coverage(name, "", *(shares.mean(0) for shares in frames), *quartiles)
+    errors: dict[str, float | None] = {}
+    for key in COLUMNS:
+        shares = torch.tensor([row.errors[key] for row in rows], dtype=torch.float64)
+        low, high = shares.quantile(torch.tensor([0.25, 0.75], dtype=torch.float64)).tolist()
+        errors |= {key: float(shares.mean()), f"{key}, lower quartile": low, f"{key}, upper quartile": high}
+    return Row("coverage", "", name, errors, frames=len(rows))
 
 
-def to_json(rows: Sequence[Coverage]) -> str:
-    """Rows as a JSON list, one object each."""
-    return json.dumps([{k: v.tolist() if isinstance(v, Tensor) else v for k, v in row._asdict().items()} for row in rows], indent=1)
+COLUMNS = tuple(f"{kind} {level:.0%}" for kind in ("normal", "depth") for level in LEVELS)
+"""Errors of the rows, and columns of their table."""
 
 
-def from_json(text: str) -> list[Coverage]:
-    """The rows that :func:`to_json` wrote."""
-    rows, names = json.loads(text), Coverage._fields[2:]
-    return [Coverage(r["name"], r["shape"], *(torch.tensor(r[name], dtype=torch.float64) for name in names)) for r in rows]
-
-
-def table(rows: Sequence[Coverage]) -> str:
+def table(rows: Sequence[Row]) -> str:
     """Markdown: percent of pixels within the bounds at each level, of normals and then of depths."""
-    levels = [f"{level:.0%}" for level in LEVELS]
-    titles = ["", *(f"normal {v}" for v in levels), *(f"depth {v}" for v in levels)]
-    return markdown(titles, [[row.name, *(f"{100.0 * float(v):.1f}" for v in (*row.normal, *row.depth))] for row in rows])
+    return records.table(rows, [Column("", lambda row: row.data), *(error_column(key, key, 1) for key in COLUMNS)])

@@ -17,7 +17,7 @@ from torch import Tensor
 from ..core.files import write_atomically
 from ..pipeline import ConfidentPipeline
 from ..viz import depth_colors, depth_range, draw_bar, draw_contours, draw_outline, draw_surface, new_figure
-from .coverage import LEVELS, Coverage
+from .coverage import LEVELS
 from .evaluate import Evaluation
 from .gallery import CORRUPTIONS, Corruption
 from .methods import MASK_STYLE, METHODS
@@ -395,7 +395,7 @@ def _relief_error(depth_mm: Tensor, truth: Truth | None) -> Tensor:
 # coverage of confidence
 
 
-def coverage_figure(curves: Sequence[Coverage]) -> Figure:
+def coverage_figure(curves: Sequence[Row]) -> Figure:
     """Measured against stated shares with the quartiles over frames, and on one random scene the bounds beside the errors.
 
     More than five curves cannot be distinguished.
@@ -408,10 +408,10 @@ def coverage_figure(curves: Sequence[Coverage]) -> Figure:
         panel.plot([45, 100], [45, 100], color="0.5", linewidth=1.0)
         for k, (curve, (color, marker)) in enumerate(zip(curves, _LINES)):
             levels = [100.0 * level + 0.5 * (k - 0.5 * (len(curves) - 1)) for level in LEVELS]  # so that bars stand side by side
-            low, high = 100.0 * getattr(curve, f"{what}_quartiles")
-            shares = 100.0 * getattr(curve, what)
-            panel.plot(levels, shares.tolist(), marker=marker, color=color, markersize=4, lw=1.4, label=curve.name)
-            panel.vlines(levels, low.tolist(), high.tolist(), color=color, lw=1.2, alpha=0.6)
+            ends = ("", ", lower quartile", ", upper quartile")
+            shares, low, high = ([curve.errors[f"{what} {level:.0%}{end}"] for level in LEVELS] for end in ends)
+            panel.plot(levels, shares, marker=marker, color=color, markersize=4, lw=1.4, label=curve.data)
+            panel.vlines(levels, low, high, color=color, lw=1.2, alpha=0.6)
         panel.set(xlim=(46, 99), ylim=(30, 101.5), xlabel="stated share of pixels, %", title=f"{what} within its bound")
         panel.grid(alpha=0.3)
     panels[0].set_ylabel("measured share of pixels, %")

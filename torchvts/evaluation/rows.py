@@ -54,8 +54,8 @@ class Row:
     """One method on one set of data.
 
     Attributes:
-        kind: what was measured: "scene" (exact truth), "sensor" (balls on a real sensor), "corruption" (a scene of the gallery)
-            or "presses" (balls, objects).
+        kind: what was measured: "scene" (exact truth), "sensor" (balls on a real sensor), "corruption" (a scene of the gallery),
+            "presses" (balls, objects) or "coverage" (of bounds of confidence; ``method`` is the shape that was pressed in).
         method: its name.
         data: name of the scene, the corruption or the presses.
         errors: value by name, such as "normal_deg"; None where nothing could be measured.

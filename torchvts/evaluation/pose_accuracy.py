@@ -5,7 +5,7 @@ import math
 import platform
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -41,59 +41,49 @@ class PoseCase:
     mm_per_pixel: float
 
 
-@dataclass(frozen=True)
-class PoseError:
-    """One registration that was not refused.
-
-    Attributes:
-        deg: angle to the nearest true pose, degrees.
-        mm: distance of the object's origin to its true place in the target, mm.
-        seconds: time of the registration, s.
-        converged: whether it reports convergence.
-        claimed: whether it converged and reports no unknown direction.
-        named: whether it converged and the unknown directions that it reports are the true ones.
-    """
-
-    deg: float
-    mm: float
-    seconds: float
-    converged: bool
-    claimed: bool
-    named: bool
-
-    @property
-    def within(self) -> bool:
-        """Whether the pose is within the goal."""
-        return self.deg <= GOAL_DEG and self.mm <= GOAL_MM
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class PoseRow:
     """One object over many poses.
 
     Attributes:
         name: name of the object.
         poses: number of poses.
-        deg: angle of each registration, degrees.
-        mm: distance of each registration, mm.
+        deg: angle of each registration to the nearest true pose, degrees.
+        mm: distance of the object's origin to its true place in the target, mm.
         seconds: time of each registration, s.
         converged: number of registrations that report convergence.
-        success: share that converged within the goal.
-        wrong: number that converged, reports no unknown direction, and is outside of the goal.
-        named: share whose reported unknown directions are the true ones; None for objects that have none.
+        within: number of them that are within the goal.
+        wrong: number of them that report no unknown direction, and are outside of the goal.
+        named: number of them whose reported unknown directions are the true ones; None for objects that have none.
         notes: registrations that were refused, one line each.
     """
 
     name: str
     poses: int
-    deg: list[float]
-    mm: list[float]
-    seconds: list[float]
-    converged: int
-    success: float
-    wrong: int
-    named: float | None
-    notes: list[str]
+    deg: list[float] = field(default_factory=list)
+    mm: list[float] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    converged: int = 0
+    within: int = 0
+    wrong: int = 0
+    named: int | None = None
+    notes: list[str] = field(default_factory=list)
+
+    def add(self, found: Registration, case: PoseCase, target: objects.Target, seconds: float) -> None:
+        """Compare a registration with the truth."""
+        deg, mm = pose_error(found.T_target_source, case, target.period_deg)
+        self.deg.append(deg)
+        self.mm.append(mm)
+        self.seconds.append(seconds)
+        if not found.converged:
+            return
+        within = deg <= GOAL_DEG and mm <= GOAL_MM
+        self.converged += 1
+        self.within += within
+        self.wrong += not within and not found.ambiguous
+        if self.named is not None:
+            kinds = {kind for name in found.ambiguous for kind in target.free if name.startswith(kind)}
+            self.named += kinds == set(target.free) and len(found.ambiguous) == max(len(target.free), target.freedom)
 
 
 def rig(height: int = 240, width: int = 320, mm_per_pixel: float = 0.0625) -> tuple[PointLights, DepthPipeline]:
@@ -179,44 +169,20 @@ def run_poses(
     rows: list[PoseRow] = []
     shown: dict[str, tuple[PoseCase, Registration]] = {}
     for name, target in targets.items():
-        errors: list[PoseError] = []
-        notes: list[str] = []
+        row = PoseRow(name, poses, named=0 if target.free else None)
         for seed in range(poses):
             case = pose_case(target, 1000 + seed, lights, pipe, size, noise_std)
             start = time.perf_counter()
             try:
                 found = register(case)
             except ValueError as error:
-                notes.append(f"pose {seed}: {error}")
+                row.notes.append(f"pose {seed}: {error}")
             else:
-                errors.append(_compare(found, case, target, time.perf_counter() - start))
+                row.add(found, case, target, time.perf_counter() - start)
                 shown.setdefault(name, (case, found))
             progress()
-        rows.append(_row(name, target, poses, errors, notes))
+        rows.append(row)
     return rows, shown
-
-
-def _row(name: str, target: objects.Target, poses: int, errors: list[PoseError], notes: list[str]) -> PoseRow:
-    return PoseRow(
-        name=name,
-        poses=poses,
-        deg=[error.deg for error in errors],
-        mm=[error.mm for error in errors],
-        seconds=[error.seconds for error in errors],
-        converged=sum(error.converged for error in errors),
-        success=sum(error.within and error.converged for error in errors) / poses,
-        wrong=sum(error.claimed and not error.within for error in errors),
-        named=sum(error.named for error in errors) / poses if target.free else None,
-        notes=notes,
-    )
-
-
-def _compare(found: Registration, case: PoseCase, target: objects.Target, seconds: float) -> PoseError:
-    deg, mm = pose_error(found.T_target_source, case, target.period_deg)
-    kinds = {kind for name in found.ambiguous for kind in target.free if name.startswith(kind)}
-    true_kinds = kinds == set(target.free) and len(found.ambiguous) == max(len(target.free), target.freedom)
-    converged = bool(found.converged)
-    return PoseError(deg, mm, seconds, converged, converged and not found.ambiguous, converged and true_kinds)
 
 
 def ball_pairs(
@@ -256,11 +222,11 @@ def pose_table(rows: list[PoseRow]) -> str:
     titles += ["confident and wrong", "unknown directions named", "s, median"]
     lines = []
     for row in rows:
-        errors = ["", "", "", str(row.wrong), "" if row.named is None else f"{100 * row.named:.0f} %"]
+        errors = ["", "", "", str(row.wrong), "" if row.named is None else f"{100 * row.named / row.poses:.0f} %"]
         if row.named is None:
             errors[0] = f"{_quantile(row.deg, 0.5):.3f} / {_quantile(row.deg, 0.95):.3f}"
             errors[1] = f"{_quantile(row.mm, 0.5):.4f} / {_quantile(row.mm, 0.95):.4f}"
-            errors[2] = f"{100 * row.success:.0f} %"
+            errors[2] = f"{100 * row.within / row.poses:.0f} %"
         lines.append([row.name, str(row.poses), *errors, f"{_quantile(row.seconds, 0.5):.2f}"])
     return markdown(titles, lines)
 

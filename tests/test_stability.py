@@ -200,15 +200,17 @@ def test_processes_measure_the_same(tmp_path):
         assert other.errors == pytest.approx(one.errors, rel=1e-3)
 
 
-def test_rows_of_another_state_are_refused(tmp_path, monkeypatch):
+def test_rows_of_another_state_are_measured_again(tmp_path, monkeypatch):
     path = tmp_path / "rows.jsonl"
     stability.sweep(path, ["flat"], ["noise"], 1)
     monkeypatch.setattr(stability, "fingerprint", lambda: "another")
-    with pytest.raises(ValueError, match=r"rows.jsonl: of another state of this package: give another file"):
-        stability.sweep(path, ["flat"], ["noise"], 1)
-    path.write_text("corruption,severity\n")
-    with pytest.raises(ValueError, match="not a file of rows"):
-        stability.sweep(path, ["flat"], ["noise"], 1)
+    count = []
+    monkeypatch.setattr(stability, "measure", lambda *a, measure=stability.measure: count.append(1) or measure(*a))
+    stability.sweep(path, ["flat"], ["noise"], 1)
+    assert len(count) == 6 and '"another"' in path.read_text().splitlines()[0]
+
+
+def test_unknown_names_are_refused(tmp_path):
     for names, message in (
         ({"methods": ["best"]}, "methods: expected some of flat, fast"),
         ({"corruptions": ["fire"]}, "corruptions: expected"),

@@ -4,7 +4,6 @@ import hashlib
 import json
 import math
 import multiprocessing
-import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -155,12 +154,12 @@ def sweep(
     """Measure every method at every severity of every corruption.
 
     Each row is written to a file of JSON lines, and a later call continues from that file. The first line names the state of this
-    package; rows of another state are refused. ``progress`` is called for each row; without workers this process does the work.
+    package; from another state it begins anew. ``progress`` is called for each row; without workers this process does the work.
 
     Returns:
         The rows asked for, by corruption, severity, seed and method.
     Raises:
-        ValueError: an unknown name, or a file of another state of the package, or another kind of file.
+        ValueError: an unknown name.
     """
     path = Path(path)
     for name, values, known in (("methods", methods, METHODS), ("corruptions", corruptions, CORRUPTIONS)):
@@ -214,30 +213,13 @@ def fingerprint() -> str:
 
 
 def _read(path: Path) -> dict[Key, Row]:
-    """The rows of a file; a last line that was cut short is removed from it."""
+    """The rows of this state of the package in a file. It then holds no others: those, and a line cut short, are measured again."""
     head = json.dumps({"stability": fingerprint()}) + "\n"
-    if not path.is_file() or path.stat().st_size == 0:
-        with write_atomically(path) as temporary:
-            temporary.write_text(head, encoding="utf-8")
-        return {}
-    text = path.read_text(encoding="utf-8")
-    whole = text[: text.rfind("\n") + 1]
-    lines = whole.splitlines(keepends=True)
-    if not lines or lines[0] != head:
-        what = "of another state of this package" if lines and lines[0].startswith('{"stability"') else "not a file of rows"
-        raise ValueError(f"{path}: {what}: give another file, or remove it to begin anew")
-    if len(whole) < len(text):
-        with path.open("r+", encoding="utf-8") as stream:
-            stream.truncate(len(whole.encode()))
-            os.fsync(stream.fileno())
-    rows = {}
-    for place, line in enumerate(lines[1:], 2):
-        try:
-            row = row_from_dict(json.loads(line))
-            rows[_key(row)] = row
-        except (ValueError, TypeError, KeyError, AssertionError, AttributeError) as error:
-            raise ValueError(f"{path}, line {place}: not a row of this sweep: {error}: remove it to measure it again") from error
-    return rows
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.is_file() else []
+    kept = [line for line in lines[1:] if line.endswith("\n")] if lines[:1] == [head] else []
+    with write_atomically(path) as temporary:
+        temporary.write_text("".join([head, *kept]), encoding="utf-8")
+    return {_key(row): row for row in (row_from_dict(json.loads(line)) for line in kept)}
 
 
 # breaking points

@@ -571,7 +571,7 @@ def test_the_status_says_what_happened(capsys, monkeypatch):
         (0, lambda v: v * 255, ValueError, "intensity: expected values in .*divide by 255"),
         (0, lambda v: v * torch.nan, ValueError, "intensity: expected finite values"),
         (0, lambda v: v.int(), TypeError, "intensity: expected floating point"),
-        (1, lambda v: v[:5], ValueError, r"xy: expected \(60, 2\), one row for each of the 60 pixels"),
+        (1, lambda v: v[:5], ValueError, r"xy: expected \(60, 2\) like the pixels of intensity"),
         (1, lambda v: v * 2, ValueError, r"xy: expected columns in \[0, 31\] and rows in \[0, 23\]"),
         (1, lambda v: v - 3, ValueError, "x stands first"),
         (1, lambda v: v * torch.nan, ValueError, "xy: expected finite pixels"),

@@ -171,15 +171,15 @@ def costs(unit: Unit, presses: Sequence[Press], background: Tensor | None) -> It
     yield Cost("import torchvts, on top of torch's import", _import_s(), "s")
     if background is not None:
         sensor = Sensor.load("gelsight_mini", *background.shape[1:])  # a calibration's sensor has no prior any more
-        yield Cost("calibrate by a background, with the sensor's prior", _seconds(partial(calibrate, background, sensor)), "s")
+        yield Cost("calibrate by a background, with the sensor's prior", _ms(partial(calibrate, background, sensor)) / 1000.0, "s")
         bare = sensor.without_prior()
         fit = partial(calibrate, background, bare, presses=list(presses))
-        yield Cost(f"calibrate by {len(presses)} presses, without prior", _seconds(fit), "s")
+        yield Cost(f"calibrate by {len(presses)} presses, without prior", _ms(fit) / 1000.0, "s")
 
     def first_frame() -> None:
         DepthPipeline.from_calibration(unit.calibration)(unit.image)
 
-    yield Cost("first frame: the pipeline made, and its first depth", _seconds(first_frame), "s")
+    yield Cost("first frame: the pipeline made, and its first depth", _ms(first_frame) / 1000.0, "s")
     pipe = DepthPipeline.from_calibration(unit.calibration)
     yield Cost("largest memory of a frame's tensors", memory_mb(partial(pipe, unit.image)), "MB")
     background = unit.calibration.background.float().clamp(0.0, 1.0)
@@ -188,12 +188,6 @@ def costs(unit: Unit, presses: Sequence[Press], background: Tensor | None) -> It
     for percent in (50.0, 95.0, 99.0):
         yield Cost(f"camera of 60 frames a second: frame to depth, {percent:.0f}th percentile", found.percentile(percent), "ms")
     yield Cost(f"camera of 60 frames a second: dropped of {found.arrived}", float(found.dropped), "frames")
-
-
-def _seconds(call: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    call()
-    return time.perf_counter() - start
 
 
 def _import_s() -> float:

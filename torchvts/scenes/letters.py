@@ -18,8 +18,6 @@ def letter_segments(text: str, size_mm: float) -> list[Segment]:
     Args:
         text: capital letters A-Z and spaces.
         size_mm: height of a letter, mm.
-    Returns:
-        The segments.
     Raises:
         ValueError: a character that is not a capital letter, or an empty text.
     """

@@ -24,7 +24,7 @@ from ..core.checks import (
 )
 from ..core.geometry import normal_from_gradient, pixel_grid_mm
 from .letters import Segment, distance_to_segments, letter_segments
-from .surfaces import Scene, smooth_step
+from .surfaces import Scene, check_function, smooth_step, with_slope
 
 MOST_PARTS = 10_000
 """Most ribs, teeth or bumps of an object."""
@@ -121,8 +121,7 @@ def press(
     check_size(height, width, mm_per_pixel, 3)
     fillet_mm = check_positive("fillet_mm", fillet_mm)
     check_dtype("dtype", dtype)
-    if not callable(height_mm):
-        raise TypeError(f"height_mm: expected a function of u and v, got {type(height_mm).__name__}: objects.stamp() makes one")
+    check_function("height_mm", height_mm)
     check_float_tensor("T_sensor_object", T_sensor_object)
     check_shape("T_sensor_object", T_sensor_object, (4, 4))
     transform = T_sensor_object.detach().double()
@@ -145,14 +144,7 @@ def press(
     if float(rotation[:2, 2].norm()) > 0:
         for _ in range(7):
             at = across(inverse, plane - rotation[:2, 2, None, None] * height_mm(at[0], at[1]))
-    u, v = (t.clone().requires_grad_() for t in at)
-    with torch.enable_grad():
-        relief = height_mm(u, v)
-        if not isinstance(relief, Tensor) or relief.shape != u.shape or not relief.requires_grad:
-            got = tuple(relief.shape) if isinstance(relief, Tensor) else type(relief).__name__
-            raise ValueError(f"height_mm: expected a function that gives {tuple(u.shape)} computed from u and v, got {got}")
-        slope = torch.autograd.grad(relief.sum(), (u, v))
-    relief = relief.detach()
+    relief, slope = with_slope("height_mm", height_mm, at[0], at[1])
     z = rotation[2, 0] * at[0] + rotation[2, 1] * at[1] + rotation[2, 2] * relief + shift[2]
     normal = across(rotation, torch.stack((-slope[0], -slope[1], torch.ones_like(relief))))
     gradient = torch.stack((-normal[0], normal[1])) / normal[2]  # back to y down

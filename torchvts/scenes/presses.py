@@ -31,8 +31,6 @@ def sphere_press(
         mm_per_pixel: pixel pitch, mm.
         dtype: type of the returned maps.
         camera_height_mm: height of a pinhole camera, mm; infinite for an orthographic camera.
-    Returns:
-        The scene.
     Example:
         >>> round(float(sphere_press(10.0, 2.0).depth_mm.max()), 3)
         2.0
@@ -70,8 +68,6 @@ def cylinder_press(
         width: columns of the image.
         mm_per_pixel: pixel pitch, mm.
         dtype: type of the returned maps.
-    Returns:
-        The scene.
     """
     check_positive("press_mm", press_mm, check_positive("radius_mm", radius_mm))
     check_numbers("center_mm", center_mm, (2,))
@@ -106,8 +102,6 @@ def cone_press(
         width: columns of the image.
         mm_per_pixel: pixel pitch, mm.
         dtype: type of the returned maps.
-    Returns:
-        The scene.
     """
     half_angle_deg = check_positive("half_angle_deg", half_angle_deg, 89.9)
     check_positive("press_mm", press_mm), check_positive("tip_radius_mm", tip_radius_mm)
@@ -143,8 +137,6 @@ def sine_press(
         width: columns of the image.
         mm_per_pixel: pixel pitch, mm.
         dtype: type of the returned maps.
-    Returns:
-        The scene.
     """
     check_positive("amplitude_mm", amplitude_mm), check_positive("period_mm", period_mm), check_positive("radius_mm", radius_mm)
     wave = 2.0 * torch.pi / period_mm
@@ -177,8 +169,6 @@ def punch_press(
         width: columns of the image.
         mm_per_pixel: pixel pitch, mm.
         dtype: type of the returned maps.
-    Returns:
-        The scene.
     """
     check_positive("radius_mm", radius_mm), check_positive("press_mm", press_mm), check_positive("wall_mm", wall_mm)
     check_least("tilt_deg", tilt_deg, -math.inf)
@@ -214,8 +204,6 @@ def letters_press(
         width: columns of the image.
         mm_per_pixel: pixel pitch, mm.
         dtype: type of the returned maps.
-    Returns:
-        The scene.
     Raises:
         ValueError: a character that is not a capital letter, or an empty text.
     """

@@ -53,8 +53,6 @@ def surface(
         dtype: type of the returned maps.
         camera_height_mm: height of a pinhole camera above the image centre, mm; infinite for an orthographic camera. The surface
             point behind each pixel is found by fixed-point iteration, which converges if the surface does not hide parts of itself.
-    Returns:
-        The scene.
     Raises:
         TypeError: ``depth_mm`` is no function.
         ValueError: the camera is not above the skin, or the surface hides parts of itself from it.
@@ -65,8 +63,7 @@ def surface(
     """
     check_size(height, width, mm_per_pixel, 3)
     check_dtype("dtype", dtype)
-    if not callable(depth_mm):
-        raise TypeError(f"depth_mm: expected a function of x and y, got {type(depth_mm).__name__}")
+    check_function("depth_mm", depth_mm)
     with torch.inference_mode(False):
         x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
         x, y = x.expand(height, width), y.expand(height, width)
@@ -86,28 +83,37 @@ def surface_at(
         y: (H, W) float64, the same for y.
         mm_per_pixel: pixel pitch that the scene reports, mm.
         dtype: type of the returned maps.
-    Returns:
-        The scene.
     """
-    if not callable(depth_mm):
-        raise TypeError(f"depth_mm: expected a function of x and y, got {type(depth_mm).__name__}")
     for name, place in (("x", x), ("y", y)):
         check_float_tensor(name, place)
     if x.dim() != 2 or x.shape != y.shape:
         raise ValueError(f"y: expected (H, W) like x, got {tuple(x.shape)} and {tuple(y.shape)}")
     mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
     check_dtype("dtype", dtype)
-    with torch.inference_mode(False), torch.enable_grad():
-        x, y = x.clone().requires_grad_(), y.clone().requires_grad_()
-        depth = depth_mm(x, y)
-        if not isinstance(depth, Tensor) or depth.shape != x.shape or not depth.requires_grad:
-            got = tuple(depth.shape) if isinstance(depth, Tensor) else type(depth).__name__
-            raise ValueError(f"depth_mm: expected a function that gives {tuple(x.shape)} computed from x and y, got {got}")
-        p, q = torch.autograd.grad(depth.sum(), (x, y), materialize_grads=True)
-    contact = (depth > 0).detach()[None, None]
-    gradient = torch.where(contact, torch.stack((p, q))[None], 0.0).to(dtype)
-    depth = depth.detach().clamp_min(0.0)[None, None].to(dtype)
+    depth, slope = with_slope("depth_mm", depth_mm, x, y)
+    contact = (depth > 0)[None, None]
+    gradient = torch.where(contact, slope[None], 0.0).to(dtype)
+    depth = depth.clamp_min(0.0)[None, None].to(dtype)
     return Scene(depth, gradient, normal_from_gradient(gradient), contact, mm_per_pixel)
+
+
+def check_function(name: str, function: object) -> None:
+    """Raise unless ``function`` can be called."""
+    if not callable(function):
+        raise TypeError(f"{name}: expected a function of two coordinates, got {type(function).__name__}")
+
+
+def with_slope(name: str, function: Callable[[Tensor, Tensor], Tensor], one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
+    """A function of two coordinates (H, W): its value (H, W) and, by automatic differentiation, its slopes (2, H, W)."""
+    check_function(name, function)
+    with torch.inference_mode(False), torch.enable_grad():
+        one, other = one.clone().requires_grad_(), other.clone().requires_grad_()
+        value = function(one, other)
+        if not isinstance(value, Tensor) or value.shape != one.shape or not value.requires_grad:
+            got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+            raise ValueError(f"{name}: expected a function that gives {tuple(one.shape)} computed from its arguments, got {got}")
+        slope = torch.autograd.grad(value.sum(), (one, other), materialize_grads=True)
+    return value.detach(), torch.stack(slope)
 
 
 def _seen_by_pinhole(

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from ..core.checks import check_float_tensor, check_integer, check_least, check_range, check_switch, check_tensor
+from ..core.checks import check_float_tensor, check_integer, check_least, check_range, check_shape, check_switch
 from ..normals import NormalFromMLP
 from ..normals.mlp import MAX_GRADIENT, check_flat_shape
 
@@ -217,18 +217,13 @@ def _check_places(xy: Tensor, flat: Tensor) -> None:
 
 
 def _check_samples(intensity: Tensor, xy: Tensor, slope: Tensor, groups: Tensor) -> None:
-    count = intensity.shape[0] if isinstance(intensity, Tensor) and intensity.dim() == 2 else 0
+    check_float_tensor("intensity", intensity)
+    count = intensity.shape[0] if intensity.dim() == 2 else 0
     if count == 0 or intensity.shape[1] != 3:
-        got = tuple(intensity.shape) if isinstance(intensity, Tensor) else type(intensity).__name__
-        raise ValueError(f"intensity: expected (N, 3), R, G, B of each pixel, got {got}")
+        raise ValueError(f"intensity: expected (N, 3), R, G, B of each pixel, got {tuple(intensity.shape)}")
     for name, values, shape in (("xy", xy, (count, 2)), ("slope", slope, (count, 2)), ("groups", groups, (count,))):
-        if not isinstance(values, Tensor) or values.is_nested or tuple(values.shape) != shape:
-            shown = str(tuple(values.shape)) if isinstance(values, Tensor) and not values.is_nested else type(values).__name__
-            raise ValueError(f"{name}: expected {shape}, one row for each of the {count} pixels of intensity, got {shown}")
-    for name, values in (("intensity", intensity), ("slope", slope)):
-        check_float_tensor(name, values)
-    check_tensor("xy", xy)
-    check_tensor("groups", groups)
+        check_shape(name, values, shape, "the pixels of intensity")
+    check_float_tensor("slope", slope)
     if xy.is_complex():
         raise TypeError(f"xy: expected columns and rows, got {xy.dtype}")
     if groups.dtype not in (torch.int64, torch.int32):

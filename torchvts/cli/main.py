@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import TextIO
 
 from ..core import __version__
+from ..core.checks import in_one_line
 from ..core.spelling import suggest
 from .parser import HelpFormatter, Parser, UsageError
 
@@ -83,9 +84,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     except (OSError, ValueError, TypeError, ImportError, RuntimeError, MemoryError) as error:
-        return _say(f"error: {_one_line(error)}", USAGE_OR_INPUT, debug)
+        return _say(f"error: {in_one_line(error)}", USAGE_OR_INPUT, debug)
     except Exception as error:
-        text = f"error: {type(error).__name__}: {_one_line(error)}: a bug in torchvts: please report what --debug prints"
+        text = f"error: {type(error).__name__}: {in_one_line(error)}: a bug in torchvts: please report what --debug prints"
         return _say(text, FAILED, debug)
 
 
@@ -114,10 +115,6 @@ def make_parser(name: str, module: ModuleType) -> Parser:
     module.add_arguments(parser)
     parser.add_argument("--debug", action="store_true", help=argparse.SUPPRESS)
     return parser
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 def _say(text: str, status: int, debug: bool) -> int:

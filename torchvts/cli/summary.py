@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from torch import Tensor
 
 from ..calibration import CalibrationWarning, Press, Touch, calibrate
+from ..evaluation.rows import markdown, number
 from ..model import Calibration, PointLights, Sensor
 from ..model.report import CandidateRow, PressRow, Report
 from ..pipeline.confidence import expected_model_deg
@@ -93,39 +94,35 @@ def left_out(what: str, rows: list[tuple[str, str]]) -> Iterator[str]:
 
 def print_candidates(report: Report) -> None:
     """Print a row for each model that was considered."""
-    print("\n| model | family | passes | parameters | deg | misfit | note |\n|---|---|---|---|---|---|---|")
-    for row in report.get("candidates", []):
-        print(_candidate(row))
+    titles = ("model", "family", "passes", "parameters", "deg", "misfit", "note")
+    print("\n" + markdown(titles, [_candidate(row) for row in report.get("candidates", [])]))
     print("deg: mean angle on held-out presses; for point lights without presses the standard deviation of the worst direction")
     print("misfit: smooth relative structure of the image that the lights leave unexplained")
 
 
-def _candidate(row: CandidateRow) -> str:
-    score = row.get("score_deg")
+def _candidate(row: CandidateRow) -> list[str]:
     misfit = f"{row['misfit']:.1%}" if "misfit" in row else ""
     family = row.get("family", "") + (f", gamma {row['gamma']:g}" if row.get("gamma", 1.0) != 1.0 else "")
-    angle = "" if score is None else f"{score:.2f}"
-    cells = (row["model"], family, row.get("passes", ""), row.get("parameters", ""), angle, misfit, row.get("note", ""))
-    return f"| {' | '.join(map(str, cells))} |"
+    counts = (str(row.get("passes", "")), str(row.get("parameters", "")))
+    return [row["model"], family, *counts, number(row.get("score_deg"), 2), misfit, row.get("note", "")]
 
 
 def print_lights(lights: PointLights, report: Report) -> None:
     """Print where the lights are."""
-    print("\n| light | x mm | y mm | z mm | direction +- deg | gloss |\n|---|---|---|---|---|---|")
-    position, gloss = lights.position_mm.tolist(), lights.gloss.tolist()
-    for j, name in enumerate("RGB"):
-        spread = f"{report['direction_std_deg'][j]:.2f}" if "direction_std_deg" in report else "given"
-        print(f"| {name} | " + " | ".join(f"{v:.2f}" for v in position[j]) + f" | {spread} | {gloss[j]:.3f} |")
+    spread = [f"{v:.2f}" for v in report["direction_std_deg"]] if "direction_std_deg" in report else ["given"] * 3
+    places = [[f"{v:.2f}" for v in place] for place in lights.position_mm.tolist()]
+    gloss = [f"{v:.3f}" for v in lights.gloss.tolist()]
+    titles = ("light", "x mm", "y mm", "z mm", "direction +- deg", "gloss")
+    print("\n" + markdown(titles, [[name, *places[j], spread[j], gloss[j]] for j, name in enumerate("RGB")]))
 
 
 def print_presses(presses: list[PressRow]) -> None:
     """Print a row for each press."""
-    print("\n| press | center px | contact radius px | error deg | times as wide as given | |\n|---|---|---|---|---|---|")
+    lines = []
     for press in presses:
         center = ", ".join(f"{v:.1f}" for v in press["center_px"]) if "center_px" in press else ""
-        radius = f"{press['contact_radius_px']:.1f}" if "contact_radius_px" in press else ""
-        off = f"{press['error_deg']:.1f}" if "error_deg" in press else ""
-        wide = f"{1.0 / max(press['gain'], 1e-3):.2f}" if "gain" in press else ""
-        note = "" if press["used"] else f"left out: {press.get('reason', '')}"
-        print(f"| {press['name']} | {center} | {radius} | {off} | {wide} | {note} |")
+        wide = 1.0 / max(press["gain"], 1e-3) if "gain" in press else None
+        figures = [number(press.get("contact_radius_px"), 1), number(press.get("error_deg"), 1), number(wide, 2)]
+        lines.append([press["name"], center, *figures, "" if press["used"] else f"left out: {press.get('reason', '')}"])
+    print("\n" + markdown(("press", "center px", "contact radius px", "error deg", "times as wide as given", ""), lines))
     print("error, times as wide: slopes by the field of the other presses, or by the prior, compared with the ball's")

@@ -392,6 +392,11 @@ def brief(value: object) -> str:
     return text if len(text) <= 200 else f"{text[:160]} ... ({len(text)} characters)"
 
 
+def in_one_line(error: BaseException) -> str:
+    """The text of an error on one line; its kind where it has no text."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
 def check_numbers(name: str, value: object, shape: Sequence[int]) -> tuple[float, ...]:
     """Return a nested sequence of finite numbers of ``shape``, flattened, or raise."""
     text = " x ".join(str(n) for n in shape)
@@ -413,8 +418,6 @@ def from_dict(cls: type[_Record], values: object, source: str) -> _Record:
         cls: the dataclass.
         values: keys and values.
         source: name of the file, for messages.
-    Returns:
-        The dataclass.
     Raises:
         ValueError: no dict, an unknown or missing key, or a value that the class rejects.
     """

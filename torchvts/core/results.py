@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .checks import check_path
+from .checks import check_path, in_one_line
 from .files import write_atomically
 from .frame import DepthOutput
 
@@ -161,8 +161,7 @@ def read_result(path: str | Path) -> Result:
             stored = {entry.filename.removesuffix(".npy"): _array(archive, entry) for entry in archive.infolist()}
         return _result(stored)
     except Exception as error:  # a damaged file may fail anywhere in the readers of zip, npy and JSON
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise ValueError(f"{path}: not a result of torchvts reconstruct, or damaged: {reason}") from error
+        raise ValueError(f"{path}: not a result of torchvts reconstruct, or damaged: {in_one_line(error)[:200]}") from error
 
 
 def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Array:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
+from ..core.checks import in_one_line
 from ..core.files import open_video, read_image, rgb_from_bgr
 from ..model import Sensor
 from ..stream import frames_a_second
@@ -94,7 +95,7 @@ class _Frames(IterableDataset[Batch]):
         try:
             return [self.sensor.rectify(read()[None]).clamp(0.0, 1.0)], ""
         except (OSError, ValueError, cv2.error) as error:
-            return [], " ".join(str(error).split()) or type(error).__name__
+            return [], in_one_line(error)
 
     def _share(self) -> Iterator[tuple[Frame, "partial[Tensor] | None"]]:
         """Frames of this loader process, each with what reads its image if it is to be read."""

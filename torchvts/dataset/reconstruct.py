@@ -28,7 +28,7 @@ from tqdm import tqdm
 
 from ..contact import ContactSettings
 from ..core import __version__
-from ..core.checks import check_choice, check_integer, check_path, check_sequence
+from ..core.checks import check_choice, check_integer, check_path, check_sequence, in_one_line
 from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, count_frames
 from ..model import Calibration
 from ..pipeline import MODES, DepthOutput, unit_pipeline
@@ -216,7 +216,7 @@ class _Worker:
             for frame, image, output in self._depths(load_frames(self.records, self.sensor, self.share, batch, workers)):
                 bar.update(frame.length is None)
                 if not frame.done:
-                    waiting.append((frame, self._written(frame, image, output, pool)))
+                    waiting.append((frame, pool.submit(self._write, frame, image, output)))
                 while len(waiting) > 4 * writers:
                     self._settle(*waiting.popleft())
             while waiting:
@@ -263,7 +263,7 @@ class _Worker:
                 return self.recording(torch.cat([image for _, image in held]), fps=fps)
             reason = f"background_frames: expected at least {count} frames, got {len(held)}" if count > 0 else ""
         except ValueError as error:
-            reason = _in_one_line(error)
+            reason = in_one_line(error)
         if reason:
             self.notes.append((item.path, f"first frames not used, the calibration is used as it is: {reason}"))
         return self.recording(fps=fps)
@@ -278,15 +278,7 @@ class _Worker:
                 return frame._replace(failed=reason), None, None
             return frame, *recording(image, frame.time_s, solve=frame.mine and not frame.done)
         except ValueError as error:
-            return frame._replace(failed=_in_one_line(error)), None, None
-
-    def _written(self, frame: Frame, image: Tensor | None, output: DepthOutput | None, pool: ThreadPoolExecutor) -> "Future[str]":
-        """Files of one frame, by the pool, which returns why there are none, or an empty text."""
-        if image is not None and output is not None:
-            return pool.submit(self._finish, frame, image, output)
-        if frame.length is not None:
-            return pool.submit(self._record, frame, frames=frame.length)
-        return pool.submit(self._record, frame, failed=frame.failed)
+            return frame._replace(failed=in_one_line(error)), None, None
 
     def _settle(self, frame: Frame, written: "Future[str]") -> None:
         """Count a frame whose files are in place, or report why there are none."""
@@ -302,19 +294,17 @@ class _Worker:
         else:
             self.done += frame.length is None
 
-    def _record(self, frame: Frame, **figures: Any) -> str:
+    def _write(self, frame: Frame, image: Tensor | None, result: DepthOutput | None) -> str:
+        """Write a frame's files, then its record; returns why there are none, or an empty text."""
+        figures: dict[str, Any] = {"failed": frame.failed}
+        if frame.length is not None:
+            figures = {"frames": frame.length}
+        elif image is not None and result is not None:
+            area = float(result.contact.double().sum()) * self.sensor.mm_per_pixel**2
+            figures = {"deepest_mm": float(result.depth_mm.max()), "contact_mm2": area}
+            try:
+                self.writer.write(frame, image, result)
+            except ValueError as error:  # a depth that its format does not hold
+                figures = {"failed": in_one_line(error)}
         self.records.write(frame.item, frame.number, **figures)
         return str(figures.get("failed", ""))
-
-    def _finish(self, frame: Frame, image: Tensor, result: DepthOutput) -> str:
-        """Write a frame's files, then its record."""
-        try:
-            self.writer.write(frame, image, result)
-        except ValueError as error:  # a depth that its format does not hold
-            return self._record(frame, failed=_in_one_line(error))
-        area = float(result.contact.double().sum()) * self.sensor.mm_per_pixel**2
-        return self._record(frame, deepest_mm=float(result.depth_mm.max()), contact_mm2=area)
-
-
-def _in_one_line(error: ValueError) -> str:
-    return " ".join(str(error).split())

@@ -263,8 +263,8 @@ def test_drawn_sensors_are_scored_on_objects_and_averaged(folder):
     background, presses = vts.read_presses(folder)
     scene = vts.scenes.cylinder_press(4.0, 0.5, 6.0, 30.0, (0.0, 0.0), HEIGHT, WIDTH, PITCH)
     lights = vts.PointLights([[25.0, 9.0, 22.0], [-20.0, 15.0, 22.0], [-3.0, -25.0, 22.0]], [500.0, 500.0, 500.0])
-    objects = [("cylinder", vts.scenes.render(scene, lights, noise_std=0.002)[0].detach(), scene)]
-    units = [sets.drawn_set(name, sensor, background, presses, objects) for name in sets.DRAWN[:2]]
+    target = sets.Target("cylinder", vts.scenes.render(scene, lights, noise_std=0.002)[0].detach(), sets.truth_of(scene))
+    units = [sets.DataSet(name, background, [sets.Fold(sensor, presses, [target])], "") for name in sets.DRAWN[:2]]
     done = [ev.evaluate(unit, ["flat", "precise"]) for unit in units]
     rows_of_units = [row for evaluation in done for row in evaluation.rows]
     assert done[0].rows[1].errors["normal_deg"] < 0.5 * done[0].rows[0].errors["normal_deg"]

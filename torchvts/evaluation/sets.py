@@ -27,6 +27,7 @@ from ..normals import NormalFromMLP
 from ..pipeline import DepthPipeline
 from ..scenes import Scene
 from ..stream.sources import open_source
+from .drawn_sensors import SEEDS, drawn_sensor
 from .methods import Method, shipped_prior, with_network
 from .presses import with_centers
 from .score import Truth, ball_truth, undeformed_truth
@@ -297,27 +298,20 @@ REAL: dict[str, Callable[[Path, int | None], DataSet]] = {
 # drawn sensors
 
 
-def drawn_set(
-    name: str, sensor: Sensor, background: Tensor, balls: Sequence[Press], objects: Sequence[tuple[str, Tensor, Scene]]
-) -> DataSet:
-    """A drawn sensor: balls are learned from, without labels; name, image and truth of objects that are no balls are scored."""
-    targets = []
-    for press, image, scene in objects:
-        truth = Truth(scene.depth_mm.double(), scene.gradient.double(), scene.contact, scene.contact)
-        targets.append(Target(press, image, truth))
-    return DataSet(
-        name, background, [Fold(sensor, balls, targets)], "balls learned from without labels; other objects, exact truth"
-    )
-
-
 def _drawn(name: str, limit: int | None) -> DataSet:
-    from .drawn_sensors import drawn_sensor
-
+    """Balls are learned from, without labels; objects that are no balls are scored."""
     unit = drawn_sensor(int(name.split("_")[1]))
-    return drawn_set(name, unit.sensor, unit.background, spread(unit.balls, limit), unit.objects)
+    targets = [Target(press.name, press.image, truth_of(press.scene)) for press in unit.objects]
+    how = "balls learned from without labels; other objects, exact truth"
+    return DataSet(name, unit.background, [Fold(unit.sensor, spread(unit.balls, limit), targets)], how)
 
 
-DRAWN = tuple(f"drawn_{seed}" for seed in range(8))
+def truth_of(scene: Scene) -> Truth:
+    """The truth of an exact scene, to be scored in its contact."""
+    return Truth(scene.depth_mm.double(), scene.gradient.double(), scene.contact, scene.contact)
+
+
+DRAWN = tuple(f"drawn_{seed}" for seed in SEEDS)
 """Names of the drawn sensors, by their seeds."""
 
 SETS = (*REAL, *DRAWN)

@@ -81,8 +81,6 @@ def depth_figure(
         image: (1, 3, H, W) or (3, H, W) in [0, 1]; None leaves its panel out.
         contact: bool, the same shape as depth.
         title: text above the panels.
-    Returns:
-        The figure.
     """
     depth = _plane(depth_mm)
     ratio = depth.shape[0] / depth.shape[1]

@@ -47,8 +47,6 @@ def depth_error(depth_mm: Tensor, truth_mm: Tensor, mm_per_pixel: float, region:
         truth_mm: true depth, the same shape, mm.
         mm_per_pixel: pixel pitch, mm.
         region: bool, the same shape, the pixels to compare; None for all.
-    Returns:
-        The errors in mm and in pixels.
     Raises:
         ValueError: shapes differ, or the region is empty.
     Example:
@@ -103,8 +101,6 @@ def fit_sphere(depth_mm: Tensor, mm_per_pixel: float, contact: Tensor, steps: in
         mm_per_pixel: pixel pitch, mm.
         contact: bool, the same shape, the pixels to fit.
         steps: most Gauss-Newton steps; fewer are made where the sphere does not move any more.
-    Returns:
-        The sphere.
     Raises:
         ValueError: fewer than 4 points, or depth that is not finite or beyond 1e6 mm.
     """

@@ -114,8 +114,6 @@ def training_pixels(compensate: nn.Module, presses: Sequence[Press], mm_per_pixe
         compensate: module that prepares the images.
         presses: presses with centres and contact radii.
         mm_per_pixel: pixel pitch, mm.
-    Returns:
-        The pixels of all presses.
     Raises:
         ValueError: no presses, or one without centre or contact radius.
     """
@@ -153,8 +151,6 @@ def train_network(
         seed: seed of weights, order and held-out presses.
         max_epochs: largest number of epochs.
         progress: show a bar.
-    Returns:
-        The trained network and its history.
     Raises:
         ValueError, TypeError: see :func:`torchvts.calibrate` and :func:`torchvts.training.fit_mlp`.
     """

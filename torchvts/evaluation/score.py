@@ -85,8 +85,6 @@ def ball_truth(press: Press, height: int, width: int, mm_per_pixel: float) -> Tr
         height: rows of the image.
         width: columns of the image.
         mm_per_pixel: pixel pitch, mm.
-    Returns:
-        Depth, slope, the region to score, and the contact.
     Raises:
         ValueError: the press has no centre or no contact radius.
     Example:
@@ -138,8 +136,6 @@ def score_press(
         mm_per_pixel: pixel pitch, mm.
         method: name that is kept with the score.
         contact: (1, 1, H, W) bool, measured contact; None leaves it out.
-    Returns:
-        The errors.
     Raises:
         ValueError: wrong shapes, a missing centre or contact radius, or a region too small for a sphere.
     Example:

@@ -84,8 +84,6 @@ class FollowLight:
             image: (1, 3, H, W), as the camera gave it.
             deformed: (1, 1, H, W), where its skin has moved.
             seconds: time since the last frame.
-        Returns:
-            The state.
         """
         self._check(image)
         check_shape("deformed", deformed, (1, 1, *self.size), "image")

@@ -125,8 +125,6 @@ def header(frame: TactileFrame, frame_id: str, start_s: float = 0.0) -> Header:
         frame: of a :class:`TactileStream`.
         frame_id: name of the sensor's coordinate frame.
         start_s: the time at which the stream started, s; 0 counts from its start.
-    Returns:
-        The header.
     Raises:
         ValueError: a time below zero, or not finite.
     """

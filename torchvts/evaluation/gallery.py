@@ -1,4 +1,4 @@
-"""Hard scenes with exact truth: one corruption each, in steps of severity.
+"""Hard scenes with exact truth: one corruption each, in steps of severity. docs/where_methods_fail.md says what happens in each.
 
 The rig is small and quick: 160 x 120 pixels of 0.125 mm, three lights 40 mm away, 50 degrees above the skin and 120 degrees apart,
 noise of 0.002 and 8 bits. Its calibration has the true lights and one background image, so a method fails only because of
@@ -53,14 +53,12 @@ class Corruption:
         unit: unit of the severity.
         severities: rising or falling; no method fails at the first, most fail at the last.
         make: makes a case from a severity, which may lie between those, and a seed of noise and place.
-        story: what happens physically.
     """
 
     name: str
     unit: str
     severities: tuple[float, ...]
     make: Callable[[float, int], Case]
-    story: str
 
 
 def rig_lights(elevation_deg: float = ELEVATION_DEG, spacing_deg: float = SPACING_DEG) -> PointLights:
@@ -301,83 +299,50 @@ CORRUPTIONS: dict[str, Corruption] = {
     corruption.name: corruption
     for corruption in (
         # shape
-        Corruption("deeper press", "mm", (1.0, 1.5, 2.0, 3.0, 4.0, 5.0), _shaped(lambda s, seed: _press(seed, s)),
-            "A ball of radius 6 mm goes deeper: the slope at its rim is 0.7 at 1 mm and 5.9 at 5 mm."),
+        Corruption("deeper press", "mm", (1.0, 1.5, 2.0, 3.0, 4.0, 5.0), _shaped(lambda s, seed: _press(seed, s))),
         Corruption("steep walls", "mm/mm", (0.5, 1.0, 2.0, 4.0, 8.0, 30.0),
-            _shaped(lambda s, seed: stamp(3.5, PRESS_MM, s, *_place(seed))),
-            "The flanks of a round stamp, 1 mm high, become narrower, up to a step between two pixels."),
+            _shaped(lambda s, seed: stamp(3.5, PRESS_MM, s, *_place(seed)))),
         Corruption("cut ends", "mm/mm", (0.4, 0.8, 1.5, 3.0, 8.0, 100.0),
-            _shaped(lambda s, seed: roof(PRESS_MM, 0.4, s, 9.0, *_place(seed))),
-            "The ends of a roof-shaped wedge, 1 mm high, become steeper, up to vertical."),
+            _shaped(lambda s, seed: roof(PRESS_MM, 0.4, s, 9.0, *_place(seed)))),
         Corruption("cut by the border", "mm", (0.0, 5.0, 7.0, 8.0, 9.0, 10.0, 11.5),
-            _shaped(lambda s, seed: ball(RADIUS_MM, PRESS_MM, s, _place(seed)[1])),
-            "The ball moves from the middle to the image border, until only its flank is visible."),
-        Corruption("covers the image", "mm", (0.1, 0.3, 0.6, 1.0, 1.5, 2.2), _shaped(lambda s, seed: _press(seed, s, 40.0)),
-            "A ball of radius 40 mm goes deeper, until no undeformed skin is visible."),
-        Corruption("two contacts", "mm", (-2.0, -0.5, 0.0, 0.5, 1.5, 3.0), _shaped(_two),
-            "Two balls come closer, until their contacts overlap and meet in a crease."),
-        Corruption("faint contact", "mm", (1.0, 0.3, 0.1, 0.05, 0.02, 0.01, 0.0), _shaped(_faint),
-            "The ball presses less and less, until it does not touch at all."),
-        Corruption("gel sag", "mm", (0.0, 0.25, 0.5, 1.0, 2.0, 4.0), _sagging,
-            "The gel goes down around the object too: a transition zone of this length, which the object does not touch."),
+            _shaped(lambda s, seed: ball(RADIUS_MM, PRESS_MM, s, _place(seed)[1]))),
+        Corruption("covers the image", "mm", (0.1, 0.3, 0.6, 1.0, 1.5, 2.2), _shaped(lambda s, seed: _press(seed, s, 40.0))),
+        Corruption("two contacts", "mm", (-2.0, -0.5, 0.0, 0.5, 1.5, 3.0), _shaped(_two)),
+        Corruption("faint contact", "mm", (1.0, 0.3, 0.1, 0.05, 0.02, 0.01, 0.0), _shaped(_faint)),
+        Corruption("gel sag", "mm", (0.0, 0.25, 0.5, 1.0, 2.0, 4.0), _sagging),
         # light
-        Corruption("attached shadows", "deg", (0.0, 10.0, 20.0, 30.0, 35.0, 40.0, 45.0), _lit(_lowered),
-            "The lights stand lower than 50 degrees by this angle: slopes that face away from a light get none of it."),
-        Corruption("cast shadows", "deg", (0.0, 10.0, 20.0, 30.0, 35.0, 40.0, 45.0), _lit(_lowered, shadows=True),
-            "The same, and the ball casts its shadow on the skin behind it."),
-        Corruption("specular", "", (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), _always(lambda s: replace(USUAL, specular=s)),
-            "The skin shines: a Blinn-Phong lobe of exponent 30 in addition to the diffuse light."),
-        Corruption("inter-reflection", "share", (0.0, 0.05, 0.1, 0.2, 0.4, 0.7), _always(lambda s: replace(USUAL, bounce=s)),
-            "Skin lights skin: one bounce, modelled by the light of the image itself, blurred by 2 mm."),
-        Corruption("ambient light", "share", (0.0, 0.02, 0.05, 0.1, 0.2, 0.5), _always(lambda s: replace(USUAL, ambient=s)),
-            "Part of the light comes from everywhere, at calibration too."),
-        Corruption("a channel dims", "share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.2), _since(_dimmed),
-            "One LED loses light after calibration."),
-        Corruption("dead lights", "lights", (0.0, 0.3, 0.6, 1.0, 1.5, 2.0), _since(_lost),
-            "One LED fails after calibration, then a second."),
-        Corruption("a light moves", "mm", (0.0, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0), _since(_moved),
-            "One LED, 40 mm away, is shifted sideways after calibration."),
+        Corruption("attached shadows", "deg", (0.0, 10.0, 20.0, 30.0, 35.0, 40.0, 45.0), _lit(_lowered)),
+        Corruption("cast shadows", "deg", (0.0, 10.0, 20.0, 30.0, 35.0, 40.0, 45.0), _lit(_lowered, shadows=True)),
+        Corruption("specular", "", (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), _always(lambda s: replace(USUAL, specular=s))),
+        Corruption("inter-reflection", "share", (0.0, 0.05, 0.1, 0.2, 0.4, 0.7), _always(lambda s: replace(USUAL, bounce=s))),
+        Corruption("ambient light", "share", (0.0, 0.02, 0.05, 0.1, 0.2, 0.5), _always(lambda s: replace(USUAL, ambient=s))),
+        Corruption("a channel dims", "share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.2), _since(_dimmed)),
+        Corruption("dead lights", "lights", (0.0, 0.3, 0.6, 1.0, 1.5, 2.0), _since(_lost)),
+        Corruption("a light moves", "mm", (0.0, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0), _since(_moved)),
         Corruption("lights close together", "deg", (0.0, 40.0, 80.0, 100.0, 110.0, 116.0),
-            _lit(lambda s: rig_lights(spacing_deg=SPACING_DEG - s)),
-            "The angle between the lights is less than 120 degrees by this much: the light matrix becomes ill-conditioned."),
+            _lit(lambda s: rig_lights(spacing_deg=SPACING_DEG - s))),
         # skin
-        Corruption("albedo drift", "share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.3), _since(_worn),
-            "The skin wears after calibration: smooth stains, darker by up to twice the severity, three quarters of it grey."),
-        Corruption("spots and dead pixels", "of each", (0.0, 10.0, 30.0, 100.0, 300.0, 1000.0), _since(_specks),
-            "Dirt on the skin and dead pixels appear after calibration."),
-        Corruption("markers", "mm", (0.0, 0.4, 0.7, 1.0, 1.4, 1.8), _marked,
-            "Dots of this diameter, printed every 2.5 mm, move with the skin; the sensor file says that there are markers."),
+        Corruption("albedo drift", "share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.3), _since(_worn)),
+        Corruption("spots and dead pixels", "of each", (0.0, 10.0, 30.0, 100.0, 300.0, 1000.0), _since(_specks)),
+        Corruption("markers", "mm", (0.0, 0.4, 0.7, 1.0, 1.4, 1.8), _marked),
         # lens
-        Corruption("defocus", "px", (0.0, 0.7, 1.5, 3.0, 6.0, 12.0), _always(lambda s: replace(USUAL, blur_px=s)),
-            "The lens is out of focus: a Gaussian of this standard deviation."),
-        Corruption("motion blur", "px", (0.0, 2.0, 5.0, 10.0, 20.0, 40.0), _since(lambda s, seed: replace(USUAL, motion_px=s)),
-            "The ball slides while the shutter is open; the truth is its middle position."),
-        Corruption("vignetting", "share", (0.0, 0.1, 0.3, 0.5, 0.7, 0.9), _always(lambda s: replace(USUAL, vignetting=s)),
-            "The lens darkens the corners by this share, at calibration too."),
-        Corruption("lens distortion", "share", (0.0, 0.05, 0.1, 0.2, 0.35, 0.5), _distorted,
-            "Barrel distortion: the corners show skin that is nearer to the middle by this share."),
-        Corruption("perspective", "deg", (0.0, 5.0, 10.0, 20.0, 30.0, 45.0), _perspective,
-            "The camera is a pinhole with this angle of view to either side, and is treated as orthographic."),
+        Corruption("defocus", "px", (0.0, 0.7, 1.5, 3.0, 6.0, 12.0), _always(lambda s: replace(USUAL, blur_px=s))),
+        Corruption("motion blur", "px", (0.0, 2.0, 5.0, 10.0, 20.0, 40.0), _since(lambda s, seed: replace(USUAL, motion_px=s))),
+        Corruption("vignetting", "share", (0.0, 0.1, 0.3, 0.5, 0.7, 0.9), _always(lambda s: replace(USUAL, vignetting=s))),
+        Corruption("lens distortion", "share", (0.0, 0.05, 0.1, 0.2, 0.35, 0.5), _distorted),
+        Corruption("perspective", "deg", (0.0, 5.0, 10.0, 20.0, 30.0, 45.0), _perspective),
         Corruption("wrong pitch", "share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.2),
-            lambda s, seed: _case(_scene(_press(seed), MM_PER_PIXEL * (1.0 + s)), seed),
-            "A pixel is larger than the sensor file says."),
+            lambda s, seed: _case(_scene(_press(seed), MM_PER_PIXEL * (1.0 + s)), seed)),
         # sensor
         Corruption("saturation", "times", (1.0, 1.3, 1.6, 2.0, 2.5, 3.0),
-            _lit(lambda s: PointLights(LIGHTS.position_mm, LIGHTS.albedo * s)),
-            "The exposure is longer, which the user knows: bright slopes clip, then the skin itself."),
-        Corruption("black crush", "value", (0.0, 0.02, 0.05, 0.1, 0.2, 0.4), _always(lambda s: replace(USUAL, black=s)),
-            "The camera subtracts a black level that the calibration does not know: dark slopes become black."),
-        Corruption("wrong gamma", "exponent", (1.0, 1.05, 1.1, 1.2, 1.4, 1.8, 2.2), _always(lambda s: replace(USUAL, gamma=s)),
-            "The values of the camera are light^(1 / gamma), and the user takes them for light."),
-        Corruption("channel order", "share", (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0), _always(lambda s: replace(USUAL, crosstalk=s)),
-            "Red and blue are mixed in the camera, up to swapped, as when B, G, R is read as R, G, B."),
-        Corruption("noise", "value", (0.002, 0.005, 0.01, 0.02, 0.05, 0.1), _always(lambda s: replace(USUAL, noise_std=s)),
-            "Noise of the image value, in the background too."),
-        Corruption("few bits", "bits", (12.0, 8.0, 6.0, 5.0, 4.0, 3.0, 2.0), _always(lambda s: replace(USUAL, bits=round(s))),
-            "The image has fewer levels."),
+            _lit(lambda s: PointLights(LIGHTS.position_mm, LIGHTS.albedo * s))),
+        Corruption("black crush", "value", (0.0, 0.02, 0.05, 0.1, 0.2, 0.4), _always(lambda s: replace(USUAL, black=s))),
+        Corruption("wrong gamma", "exponent", (1.0, 1.05, 1.1, 1.2, 1.4, 1.8, 2.2), _always(lambda s: replace(USUAL, gamma=s))),
+        Corruption("channel order", "share", (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0), _always(lambda s: replace(USUAL, crosstalk=s))),
+        Corruption("noise", "value", (0.002, 0.005, 0.01, 0.02, 0.05, 0.1), _always(lambda s: replace(USUAL, noise_std=s))),
+        Corruption("few bits", "bits", (12.0, 8.0, 6.0, 5.0, 4.0, 3.0, 2.0), _always(lambda s: replace(USUAL, bits=round(s)))),
         Corruption("JPEG", "quality", (100.0, 95.0, 85.0, 70.0, 50.0, 30.0, 10.0),
-            _always(lambda s: replace(USUAL, jpeg_quality=round(s))),
-            "Images are compressed, with colours at half resolution."),
+            _always(lambda s: replace(USUAL, jpeg_quality=round(s)))),
     )
 }
 # fmt: on

@@ -27,20 +27,6 @@ LARGEST_FILE = 2**24
 TIMEOUT_S = 30.0
 """A server that is silent for so long is given up."""
 
-MIT = """\
-Permission is hereby granted, free of charge, to any person obtaining a copy of this software and associated documentation files
-(the "Software"), to deal in the Software without restriction, including without limitation the rights to use, copy, modify, merge,
-publish, distribute, sublicense, and/or sell copies of the Software, and to permit persons to whom the Software is furnished to do
-so, subject to the following conditions:
-
-The above copyright notice and this permission notice shall be included in all copies or substantial portions of the Software.
-
-THE SOFTWARE IS PROVIDED "AS IS", WITHOUT WARRANTY OF ANY KIND, EXPRESS OR IMPLIED, INCLUDING BUT NOT LIMITED TO THE WARRANTIES OF
-MERCHANTABILITY, FITNESS FOR A PARTICULAR PURPOSE AND NONINFRINGEMENT. IN NO EVENT SHALL THE AUTHORS OR COPYRIGHT HOLDERS BE LIABLE
-FOR ANY CLAIM, DAMAGES OR OTHER LIABILITY, WHETHER IN AN ACTION OF CONTRACT, TORT OR OTHERWISE, ARISING FROM, OUT OF OR IN
-CONNECTION WITH THE SOFTWARE OR THE USE OR OTHER DEALINGS IN THE SOFTWARE.
-"""
-
 
 @dataclass(frozen=True)
 class Sample:
@@ -53,6 +39,7 @@ class Sample:
         url: folder of the files at the commit.
         commit: of the repository.
         licence: which, and where that stands.
+        conditions: of the licence, its text.
         sensor: shipped sensor file that fits.
         sha256: of each file, by its path in the folder.
         diameter_mm: of the ball, by the folder of a press.
@@ -64,13 +51,14 @@ class Sample:
     url: str
     commit: str
     licence: str
+    conditions: str
     sensor: str
     sha256: Mapping[str, str]
     diameter_mm: Mapping[str, float]
 
     def licence_text(self) -> str:
         """What is written beside the images."""
-        return f"{self.title}.\nOrigin: {self.origin}; commit {self.commit}.\nLicence: {self.licence}.\n\n{MIT}"
+        return f"{self.title}.\nOrigin: {self.origin}; commit {self.commit}.\nLicence: {self.licence}.\n\n{self.conditions}"
 
     def catalog(self) -> str:
         """Presses and diameters, in gs_sdk's layout."""

@@ -1,5 +1,8 @@
 """Methods of other libraries to compare with: SciPy's cosine transform, and a frame as gs_sdk computes it."""
 
+from collections.abc import Callable
+from functools import partial
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -86,6 +89,16 @@ class GsSdkPipeline:
         depth, contact = -mm_per_pixel * torch.from_numpy(height), torch.from_numpy(mask).bool()
         level = depth[~contact].median() if not bool(contact.all()) else depth.min()
         return as_output((depth - level)[None, None], -torch.from_numpy(gradient)[None], contact[None, None])
+
+
+def peer_frame(network: NormalFromMLP, background: Tensor, image: Tensor) -> Callable[[], object] | None:
+    """A frame in the steps of gs_sdk to be timed, of an image (3, H, W).
+
+    None without SciPy, which gs_sdk uses, and for more than 480 rows, where it takes most of a run.
+    """
+    if find_spec("scipy") is None or image.shape[1] > 480:
+        return None
+    return partial(GsSdkPipeline(network, background), gs_sdk.image_to_bgr(image))
 
 
 def as_output(depth_mm: Tensor, gradient: Tensor, contact: Tensor) -> DepthOutput:

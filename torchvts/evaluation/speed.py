@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,14 +15,14 @@ import torch
 from torch import Tensor
 
 from ..calibration import Press, read_presses
-from ..model import Calibration, PointLights, Sensor, gs_sdk
+from ..model import Calibration, PointLights, Sensor
 from ..normals import NormalFromMLP
 from ..pipeline import MODES, DepthOutput
 from ..scenes import Scene, render, sphere_press
 from . import rows as records
 from .methods import METHODS, Built, Reconstruct, lookup_table, point_lights, shipped_prior
 from .metrics import depth_error, normal_angle_deg
-from .peers import GsSdkPipeline
+from .peers import GsSdkPipeline, peer_frame
 from .presses import Training
 from .rows import Column, Row, Size, Time, error_column, mean, number
 from .score import score_press
@@ -177,11 +176,11 @@ def _scenes(bench: Bench) -> Iterator[Row]:
                 call = partial(built.reconstruct, rig.image)
                 row = Row("scene", method.name, data, _errors(call, rig.scene), size, ours=method.ours, note=built.note)
                 yield bench.timed(replace(row, parameters=built.parameters), call)
-        if find_spec("scipy") is not None and height <= 480:
-            flat = rig.calibration.model_image
-            peer, pixels = GsSdkPipeline(NormalFromMLP(height, width, flat), flat), gs_sdk.image_to_bgr(rig.image[0])
+        flat = rig.calibration.model_image
+        peer = peer_frame(NormalFromMLP(height, width, flat), flat, rig.image[0])
+        if peer is not None:
             row = Row("scene", GS_SDK, data, size=size, ours=False, note="its network untrained here: time only")
-            yield bench.timed(row, partial(peer, pixels))
+            yield bench.timed(row, peer)
 
 
 def _errors(call: Callable[[], DepthOutput], scene: Scene) -> Errors:
@@ -208,12 +207,14 @@ def _sensor(bench: Bench, data: Path) -> Iterator[Row]:
         errors = _ball_errors(built.reconstruct, scored, sensor.mm_per_pixel)
         row = Row("sensor", method, name, errors, size, ours=method != "look-up table", seen=seen, note=built.note)
         yield bench.timed(replace(row, parameters=built.parameters), partial(built.reconstruct, image[None]))
-    if find_spec("scipy") is not None:
-        peer = GsSdkPipeline(NormalFromMLP.load(folder / "model" / "nnmodel.pth", background), background)
-        errors = _ball_errors(partial(peer.as_output, mm_per_pixel=sensor.mm_per_pixel), scored, sensor.mm_per_pixel)
+    network = NormalFromMLP.load(folder / "model" / "nnmodel.pth", background)
+    peer = peer_frame(network, background, image)
+    if peer is not None:
+        whole = partial(GsSdkPipeline(network, background).as_output, mm_per_pixel=sensor.mm_per_pixel)
+        errors = _ball_errors(whole, scored, sensor.mm_per_pixel)
         note = "its network, trained on these very presses; its steps by its published format"
         row = Row("sensor", GS_SDK, name, errors, size, ours=False, seen=True, note=note)
-        yield bench.timed(row, partial(peer, gs_sdk.image_to_bgr(image)))
+        yield bench.timed(row, peer)
 
 
 def _sensor_methods(training: Training, sensor: Sensor) -> Iterator[tuple[str, Built, bool]]:

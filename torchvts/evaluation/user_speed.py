@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,12 +16,13 @@ import torch
 from torch import Tensor, nn
 
 from ..accelerated import library
+from ..accelerated.threads import OneThread
 from ..calibration import Press, calibrate, read_presses
 from ..model import Calibration, Sensor, gs_sdk
 from ..normals import NormalFromMLP
 from ..pipeline import DepthPipeline
 from .latency import measure_latency
-from .peers import GsSdkPipeline
+from .peers import peer_frame
 from .rows import Size, markdown, number
 from .speed import GS_SDK, SIZES, _rig, memory_mb
 
@@ -107,21 +107,14 @@ def mini(data: Path, size: tuple[int, int]) -> Unit:
     background, image = (_scaled(frame, size) for frame in (background, image))
     sensor = Sensor.load("gelsight_mini", height=size[0], width=size[1])
     network = NormalFromMLP.load(folder / "model" / "nnmodel.pth", background)
-    peer = partial(GsSdkPipeline(network, background), gs_sdk.image_to_bgr(image)) if _with_peer(size) else None
-    return Unit("GelSight Mini", calibrate(background, sensor), image[None], peer)
+    return Unit("GelSight Mini", calibrate(background, sensor), image[None], peer_frame(network, background, image))
 
 
 def drawn(size: tuple[int, int]) -> Unit:
     """A rig of three known lights, and a ball pressed 1 mm."""
     rig = _rig(*size, 1.0)
     flat = rig.calibration.model_image
-    peer = partial(GsSdkPipeline(NormalFromMLP(*size, flat), flat), gs_sdk.image_to_bgr(rig.image[0])) if _with_peer(size) else None
-    return Unit("drawn rig", rig.calibration, rig.image, peer)
-
-
-def _with_peer(size: tuple[int, int]) -> bool:
-    """Whether the peer is timed: as gs_sdk computes it, with SciPy, and not at sizes where it takes most of the run."""
-    return size[0] <= 480 and find_spec("scipy") is not None
+    return Unit("drawn rig", rig.calibration, rig.image, peer_frame(NormalFromMLP(*size, flat), flat, rig.image[0]))
 
 
 def _scaled(image: Tensor, size: tuple[int, int]) -> Tensor:
@@ -226,7 +219,8 @@ def run(data: Path | None, progress: Callable[[str], None], calls: int = 100, lo
             rows += frames(unit, max(20, calls // (4 if size[0] > 480 else 1)))
             if size == SIZES[1]:
                 rows += batches(unit, calls)
-                rows += _in_one_thread(unit, calls)
+                with OneThread():
+                    rows += frames(unit, calls, "1")
     unit = makers[0](SIZES[1])
     if long:
         progress("10,000 frames, every 20 ms")
@@ -243,15 +237,6 @@ def run(data: Path | None, progress: Callable[[str], None], calls: int = 100, lo
     return Measured(
         rows, once, f"{platform.machine()}, {cores} cores, {threads} threads allowed, torch {torch.__version__}, {kernels}"
     )
-
-
-def _in_one_thread(unit: Unit, calls: int) -> list[Paced]:
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(1)
-        return list(frames(unit, calls, "1"))
-    finally:
-        torch.set_num_threads(before)
 
 
 def ratios(rows: Sequence[Paced]) -> list[str]:

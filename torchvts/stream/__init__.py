@@ -9,6 +9,7 @@ from .background import (
     read_background,
     read_press_images,
     use_calibration,
+    with_background,
 )
 from .cameras import Camera, CameraSettings, find_camera
 from .files import StreamReport, VideoFile
@@ -18,7 +19,6 @@ from .keys import Keys
 from .live import TactileFrame, TactileStream
 from .overlay import Overlay, Sheet
 from .recording import Recording, check_device
-from .rezero import with_background
 from .sources import Reader, Unreadable, frames_a_second, open_source
 from .stages import StageClock
 from .usable import FrameCheck

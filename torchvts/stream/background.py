@@ -1,4 +1,4 @@
-"""The first frames of a stream: the background is found in them, and the unit is calibrated from it."""
+"""The background of a unit: found in the first frames of a stream, calibrated from, and replaced where a stream is zeroed again."""
 
 import math
 import warnings
@@ -19,9 +19,9 @@ from ..calibration import (
     channel_structure,
 )
 from ..core.blur import blur, gaussian_weights
-from ..core.checks import check_batch, check_integer, check_path, check_positive, check_sequence, parse_number
+from ..core.checks import check_batch, check_image, check_integer, check_path, check_positive, check_sequence, parse_number
 from ..core.files import VIDEO_SUFFIXES, read_frames
-from ..model import Calibration, Sensor, SensorPrior, check_sensor
+from ..model import Calibration, Sensor, SensorPrior, check_calibration, check_sensor
 from ..model.calibration import PEDESTAL
 from ..normals import NormalFromResponse
 
@@ -241,3 +241,28 @@ def use_calibration(calibration: Calibration) -> StreamCalibration:
     metric = max(report.get("direction_std_deg", [0.0])) <= POORLY_CONSTRAINED_DEG
     metric = metric and report.get("source") not in ASSUMED
     return StreamCalibration(calibration, note if metric else f"{note}; {NOT_METRIC}", metric)
+
+
+def with_background(calibration: Calibration, background: Tensor) -> Calibration:
+    """The calibration with another image without contact: defects, gain and noise come from it, lights or response fields stay.
+
+    Args:
+        calibration: of the unit.
+        background: (3, H, W) in [0, 1].
+    Raises:
+        ValueError, TypeError: background of another shape or range.
+    Example:
+        >>> from torchvts.model import PointLights
+        >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
+        >>> unit = Calibration.from_lights(lights, Sensor("rig", 48, 64, 0.5))
+        >>> with_background(unit, torch.full((3, 48, 64), 0.5)).background.mean()
+        tensor(0.5000)
+    """
+    check_calibration("calibration", calibration)
+    sensor = calibration.sensor
+    check_image("background", background, sensor.height, sensor.width, sensor.name)
+    if calibration.response is not None:
+        background = background.to(calibration.background.dtype)
+        return Calibration.from_response(calibration.response, sensor, background, calibration.report)
+    assert calibration.lights is not None
+    return Calibration.from_lights(calibration.lights, sensor, background, calibration.report, calibration.ambient)

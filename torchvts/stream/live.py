@@ -17,10 +17,9 @@ from ..core.checks import check_choice, check_integer, check_least, check_record
 from ..core.files import rgb_from_bgr
 from ..model import Calibration, Sensor
 from ..pipeline import MODES, DepthOutput
-from .background import FIRST_FRAMES, calibrate_background, find_background, use_calibration
+from .background import FIRST_FRAMES, calibrate_background, find_background, use_calibration, with_background
 from .frames import SourceFrames
 from .recording import Recording
-from .rezero import with_background
 from .sources import Pixels, Reader, Unreadable, check_reader, open_source
 from .stages import StageClock
 

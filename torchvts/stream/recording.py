@@ -8,7 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .. import accelerated
 from ..contact import ContactMask, ContactSettings
+from ..contact.masks import MOST_FAR_FIELD, most_far_field
 from ..core.checks import check_positive, check_switch
 from ..core.spelling import suggest
 from ..model import Calibration, check_calibration
@@ -16,7 +18,6 @@ from ..pipeline import DepthOutput, DepthPipeline, unit_pipeline
 from .background import find_background
 from .follow_light import FollowLight
 from .usable import FrameCheck
-from .video_noise import with_video_noise
 
 MOST_LIGHT_CHANGE = 0.15
 """First frames whose light differs more from the calibration's are those of another unit or exposure."""
@@ -86,7 +87,7 @@ class Recording:
         self._before: float | None = None
         image, noise = (None, None) if first is None else find_background(first)
         if noise is not None and isinstance(self.pipe.deformed, ContactMask):
-            self.pipe.deformed = with_video_noise(self.pipe.deformed, noise, calibration if network is None else None)
+            self.pipe.deformed = _with_video_noise(self.pipe.deformed, noise, calibration if network is None else None)
         self.pipe.to(self.device)
         if image is not None:
             self._start(calibration, image[None])
@@ -144,3 +145,24 @@ class Recording:
                 "changed, or use the calibration as it is (background_frames=0, --background-frames 0)"
             )
         light.set_background(corrected)
+
+
+def _with_video_noise(mask: ContactMask, noise: Tensor, calibration: Calibration | None) -> ContactMask:
+    """The mask with the noise of a video where that is larger: a video is compressed, and its frames differ by more than the noise
+    of their pixels.
+
+    Args:
+        mask: of a pipeline.
+        noise: (3, H, W), noise of the image's value between frames.
+        calibration: whose compensation the mask follows; None for a network's, which takes images as they are.
+    """
+    if calibration is None:
+        compensated, far_field = 2.0**0.5 * noise, MOST_FAR_FIELD
+    else:
+        exponent, far_field = calibration.sensor.exponent, most_far_field(calibration)
+        value = calibration.background.float().clamp_min(1e-6) ** (1.0 / exponent)
+        compensated = noise.float() * exponent * torch.maximum(value, noise.float()) ** (exponent - 1.0)
+        if calibration.gain is not None:
+            compensated = compensated * calibration.gain.float() * 2.0**0.5
+    most = torch.maximum(1.0 / mask.per_noise, compensated.to(mask.per_noise))
+    return accelerated.ContactMask(mask.flat, most, mask.sigmas, mask.min_size_px, far_field).eval()

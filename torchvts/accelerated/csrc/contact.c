@@ -173,20 +173,17 @@ static void close_rows(const uint8_t *image, int height, int width, int first, i
     }
 }
 
-/* Whether an LED has failed: 1 for each channel that counts. More than one dark channel is no failed LED. */
-static void working_leds(const float *image, const float *failed_below, int height, int width, int step, int works[3]) {
-    int failed = 0;
-    for (int c = 0; c < 3; c++) {
-        double total[4] = {0.0}; /* four sums that do not wait for one another */
-        int count = 0;
-        for (int y = step / 2; y < height; y += step) {
-            const float *line = image + ((size_t)c * height + y) * width;
-            for (int x = step / 2; x < width; x += step, count++) total[count % 4] += line[x];
-        }
-        works[c] = !((total[0] + total[1] + total[2] + total[3]) / count < failed_below[c]);
-        failed += !works[c];
+/* Mean of every step-th pixel of an image, by four sums that do not wait for one another. */
+static double mean_of(const float *image, int height, int width, int step) {
+    double a = 0.0, b = 0.0, c = 0.0, d = 0.0;
+    int64_t count = 0;
+    for (int y = step / 2; y < height; y += step) {
+        const float *line = image + (size_t)y * width;
+        int x = step / 2;
+        for (; x + 3 * step < width; x += 4 * step, count += 4) a += line[x], b += line[x + step], c += line[x + 2 * step], d += line[x + 3 * step];
+        for (; x < width; x += step, count++) a += line[x];
     }
-    if (failed != 1) works[0] = works[1] = works[2] = 1;
+    return (a + b + c + d) / (double)count;
 }
 
 /* Sums of `cell` values each, times `scale`, for n cells that lie side by side. */
@@ -253,8 +250,8 @@ typedef struct {
 
 /* A frame's images and what is found in it. scale: of each channel's change; raw: strong pixels, before they are closed. */
 typedef struct {
-    const float *image, *offset, *per_noise, *most_far_field;
-    int height, width, stride;
+    const float *image, *offset, *per_noise, *failed_below, *most_far_field;
+    int height, width, step, stride;
     float rounding, threshold, noise[6], scale[3], per[3];
     int works[3], bands;
     Grid grid;
@@ -263,15 +260,19 @@ typedef struct {
     atomic_int short_of_memory;
 } Frame;
 
-/* Of a channel's change, the noise, or of part 3 and above its far field. */
+/* Of a channel's change, the noise, or of parts 3 to 5 its far field; of parts 6 to 8 whether its LED works. */
 static void find_noise(void *with, int part) {
     Frame *of = with;
     const int c = part % 3, far = part >= 3;
     const size_t plane = (size_t)of->height * of->width * c;
     const float *image = of->image + plane, *offset = of->offset ? of->offset + plane : NULL, *per_noise = of->per_noise + plane;
     const size_t samples = (size_t)((of->height + of->stride - 1) / of->stride) * ((of->width + of->stride - 1) / of->stride);
+    if (part >= 6) {
+        of->works[c] = !(mean_of(image, of->height, of->width, of->step) < of->failed_below[c]);
+        return;
+    }
     of->noise[part] = 0.0f;
-    if (!of->works[c] || (far && !(of->most_far_field[c] > 0.0f))) return;
+    if (far && !(of->most_far_field[c] > 0.0f)) return;
     float *some = malloc(sizeof(float) * (2 * samples + 1));
     if (some)
         of->noise[part] = (far ? far_field_of : noise_of)(image, offset, per_noise, of->height, of->width, of->stride, some);
@@ -280,14 +281,18 @@ static void find_noise(void *with, int part) {
     free(some);
 }
 
-/* 1 over the standard deviation of a channel's change: its noise, or the far field if that is larger. */
-static float scale_of(const Frame *of, int c) {
-    const float most = of->most_far_field[c];
-    float noise = of->noise[c], far = of->noise[3 + c];
-    if (far > most) far = most * most / far;
-    if (!(far <= noise)) noise = far;
-    if (noise < 1.0f) noise = 1.0f;
-    return of->works[c] ? 1.0f / sqrtf(noise * noise + of->rounding) : 0.0f;
+/* 1 over the standard deviation of each channel's change: its noise, or the far field if that is larger. 0 for one whose LED has failed; more than one
+   dark channel is no failed LED. */
+static void find_scale(Frame *of) {
+    const int failed = 3 - of->works[0] - of->works[1] - of->works[2];
+    for (int c = 0; c < 3; c++) {
+        const float most = of->most_far_field[c];
+        float noise = of->noise[c], far = of->noise[3 + c];
+        if (far > most) far = most * most / far;
+        if (!(far <= noise)) noise = far;
+        if (noise < 1.0f) noise = 1.0f;
+        of->scale[c] = failed == 1 && !of->works[c] ? 0.0f : 1.0f / sqrtf(noise * noise + of->rounding);
+    }
 }
 
 /* Rows of cells of a band. */
@@ -511,8 +516,8 @@ static void to_pixels(void *with, int band) {
 /* Masks of one frame. Returns what contact_mask() does. */
 static int mask_frame(Frame *of) {
     const size_t pixels = (size_t)of->height * of->width, cells = (size_t)of->grid.rows * of->grid.columns;
-    share(find_noise, of, 6);
-    for (int c = 0; c < 3; c++) of->scale[c] = scale_of(of, c);
+    share(find_noise, of, 9);
+    find_scale(of);
     share(find_strong, of, of->bands);
     share(close_strong, of, of->bands);
     share(find_shares, of, of->bands);
@@ -553,11 +558,11 @@ EXPORT int contact_mask(const float *image, const float *offset, const float *pe
     at.down = at.sums + line, at.line = (uint8_t *)(at.down + line + 2 * reach), at.other_line = at.line + line;
     int code = 0;
     for (int b = 0; b < frames && code != 1; b++) {
-        Frame frame = {.image = image + 3 * pixels * b, .offset = offset, .per_noise = per_noise, .most_far_field = most_far_field};
-        frame.height = height, frame.width = width, frame.stride = stride, frame.rounding = rounding, frame.threshold = sigmas * sigmas;
+        Frame frame = {.image = image + 3 * pixels * b, .offset = offset, .per_noise = per_noise, .failed_below = failed_below};
+        frame.most_far_field = most_far_field, frame.height = height, frame.width = width, frame.step = step, frame.stride = stride;
+        frame.rounding = rounding, frame.threshold = sigmas * sigmas;
         frame.bands = least(rows, bands_of(height)), frame.grid = grid, frame.at = at;
         frame.raw = frame.inner = inner + pixels * b, frame.strong = mask + pixels * b; /* cells decide after pixels are closed */
-        working_leds(frame.image, failed_below, height, width, step, frame.works);
         const int found = mask_frame(&frame);
         code = found == 1 ? 1 : code | found;
     }

@@ -253,19 +253,23 @@ static void to_depth(const Plan *plan, const float *coefficients, int first, flo
 /* Sum of depth where the slopes are not zero, and how many pixels that are. */
 WIDE static double inclined_sum(const float *restrict depth, const float *restrict p, const float *restrict q, int n, int32_t *count) {
     double sums[LANES] = {0.0}, total = 0.0;
-    int counts[LANES] = {0}, x = 0;
-    for (; x + LANES <= n; x += LANES)
+    int some = 0, x = 0;
+    for (; x + LANES <= n; x += LANES) {
+        float kept[LANES];
         for (int t = 0; t < LANES; t++) {
             const int is = (p[x + t] != 0.0f) | (q[x + t] != 0.0f);
-            sums[t] += is ? depth[x + t] : 0.0f;
-            counts[t] += is;
+            kept[t] = (float)is * depth[x + t]; /* no branch, which the compiler would not vectorise */
+            some += is;
         }
+        for (int t = 0; t < LANES; t++) sums[t] += kept[t];
+    }
     for (int t = 0; x < n; x++, t++) {
         const int is = (p[x] != 0.0f) | (q[x] != 0.0f);
         sums[t] += is ? depth[x] : 0.0f;
-        counts[t] += is;
+        some += is;
     }
-    for (int t = 0; t < LANES; t++) total += sums[t], *count += counts[t];
+    for (int t = 0; t < LANES; t++) total += sums[t];
+    *count += some;
     return total;
 }
 

@@ -145,25 +145,23 @@ static void not_beside(const uint8_t *deformed, int height, int width, int y, ui
 
 enum { LANES = 16 };
 
+/* The bits of a float as a whole number of the same order: loops over such are vectorised, those over floats are not. Its own inverse. */
+static inline int32_t in_order(int32_t bits) { return bits ^ (bits >> 31 & 0x7fffffff); }
+
 /* Smallest and largest of n values. */
 WIDE static void range_of(const float *values, size_t n, float *lowest, float *highest) {
-    float low[LANES], high[LANES];
-    for (int j = 0; j < LANES; j++) low[j] = high[j] = values[0];
-    size_t k = 0;
-    for (; k + LANES <= n; k += LANES)
-        for (int j = 0; j < LANES; j++) {
-            low[j] = values[k + j] < low[j] ? values[k + j] : low[j];
-            high[j] = values[k + j] > high[j] ? values[k + j] : high[j];
-        }
-    for (; k < n; k++) {
-        low[0] = values[k] < low[0] ? values[k] : low[0];
-        high[0] = values[k] > high[0] ? values[k] : high[0];
+    int32_t low = INT32_MAX, high = INT32_MIN;
+    for (size_t k = 0; k < n; k++) {
+        union {
+            float value;
+            int32_t bits;
+        } here = {values[k]};
+        const int32_t at = in_order(here.bits);
+        low = at < low ? at : low;
+        high = at > high ? at : high;
     }
-    *lowest = low[0], *highest = high[0];
-    for (int j = 1; j < LANES; j++) {
-        *lowest = low[j] < *lowest ? low[j] : *lowest;
-        *highest = high[j] > *highest ? high[j] : *highest;
-    }
+    low = in_order(low), high = in_order(high);
+    memcpy(lowest, &low, sizeof low), memcpy(highest, &high, sizeof high);
 }
 
 /* Sum and count of a row's undeformed pixels below `middle`; others of them are marked as raised: a face of the object. */
@@ -175,7 +173,11 @@ WIDE static void flat_row(const float *restrict depth, uint8_t *restrict kind, f
         kind[k] = kind[k] == DEFORMED ? DEFORMED : depth[k] < middle ? FLAT : RAISED;
     }
     for (; x + LANES <= n; x += LANES)
-        for (int j = 0; j < LANES; j++) lanes[j] += kind[x + j] == FLAT ? depth[x + j] : 0.0f;
+        for (int j = 0; j < LANES; j++) {
+            const int is = kind[x + j] == FLAT; /* not a branch, which the compiler would not vectorise */
+            const float here = depth[x + j];
+            lanes[j] += is ? here : 0.0f;
+        }
     for (; x < n; x++) total += kind[x] == FLAT ? depth[x] : 0.0f;
     for (int j = 0; j < LANES; j++) total += lanes[j];
     *sum = total, *count = found;

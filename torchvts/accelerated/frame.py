@@ -169,6 +169,9 @@ def solve_frames(pipe: nn.Module, images: Tensor, parts: Callable[[], Blocks | N
     if torch_modules._global_forward_hooks or torch_modules._global_forward_pre_hooks:
         return None
     prepared = _programs.get(pipe)  # held until the call is over: another thread may put another one in its place
+    threads = within_frame() if parts_of(images.shape[0], images.shape[2] * images.shape[3]) == 1 else 1
+    if threads > 1 and prepared is not None and prepared.program is not None:
+        kernels.loaded().wake_helpers(threads)  # they take as long to wake up as the checks here do
     if prepared is None or not prepared.holds():
         prepared = _prepared(pipe, parts())
         if prepared is None:
@@ -177,7 +180,7 @@ def solve_frames(pipe: nn.Module, images: Tensor, parts: Callable[[], Blocks | N
     program = prepared.program
     if program is None or prepared.records() or images.shape[2:] != (program.height, program.width):
         return None
-    return _run(program, images.contiguous())
+    return _run(program, images.contiguous(), threads)
 
 
 def _prepared(pipe: nn.Module, parts: Blocks | None) -> _Prepared | None:
@@ -222,7 +225,7 @@ def _entries(module: nn.Module) -> list[tuple[dict[str, Any], str]]:
     return entries
 
 
-def _run(program: Program, images: Tensor) -> DepthOutput | None:
+def _run(program: Program, images: Tensor, threads: int) -> DepthOutput | None:
     """None where an image is not in [0, 1], and where a frame needs what the program cannot do."""
     count, _, height, width = images.shape
     maps = [((count, channels, height, width), torch.float32) for channels in (1, 2, 3)]
@@ -231,7 +234,7 @@ def _run(program: Program, images: Tensor) -> DepthOutput | None:
     kernel, at, pixels = kernels.loaded().solve_frames, ctypes.byref(program), height * width
     image, depth, gradient, normal, contact, deformed = (tensor.data_ptr() for tensor in (images, *out))
     if parts_of(count, pixels) == 1:
-        trouble = int(kernel(at, image, count, within_frame(), depth, gradient, normal, contact, deformed))
+        trouble = int(kernel(at, image, count, threads, depth, gradient, normal, contact, deformed))
     else:
 
         def some(first: int, many: int) -> int:

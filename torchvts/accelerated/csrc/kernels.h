@@ -53,6 +53,7 @@ void give_back(void *memory);
 
 /* Work in parts, numbered from 0, that threads take in turn: see threads.c. */
 typedef void (*PartOfWork)(void *with, int part);
+EXPORT void wake_helpers(int threads);
 int begin_sharing(int threads);
 void end_sharing(int began);
 void share(PartOfWork work, void *with, int parts);

@@ -410,23 +410,47 @@ WIDE static void weigh(const uint8_t *restrict changed, const uint8_t *restrict 
     for (int j = 0; j < n; j++) weight[j] = outside[j] ? 0.0f : faint[j] ? faint_weight : changed[j] ? weight[j] : 1.0f;
 }
 
+static int any_bit(const uint64_t *row, int words) {
+    uint64_t any = 0;
+    for (int w = 0; w < words; w++) any |= row[w];
+    return any != 0;
+}
+
+/* Weights of row i; returns whether any may be other than zero: in most rows none is. */
+static int weigh_row(const Grid *grid, Scratch at, float faint_weight, int i) {
+    const int words = grid->shape.words;
+    const size_t row = (size_t)i * words;
+    float *weight = at.density + (size_t)i * grid->columns;
+    uint8_t *outside = (uint8_t *)at.sums;
+    if (!any_bit(at.one + row, words)) {
+        memset(weight, 0, sizeof(float) * (size_t)grid->columns);
+        return 0;
+    }
+    unpack_bits(at.changed + row, &grid->shape, at.line);
+    unpack_bits(at.faint + row, &grid->shape, at.other_line);
+    unpack_bits(at.outside + row, &grid->shape, outside);
+    weigh(at.line, at.other_line, outside, faint_weight, grid->columns, weight);
+    return 1;
+}
+
 /* Keeps what is connected to a cell around which there is nearly a disc of the least size. A hole counts as contact; faint cells too,
    but it takes three that lie together. */
 static void keep_large(const Grid *grid, Scratch at) {
     const int rows = grid->rows, columns = grid->columns, reach = grid->reach, words = grid->shape.words;
     const float faint_weight = 0.4f * grid->least_cells < 1.0f ? 0.4f * grid->least_cells : 1.0f;
-    float *weight = at.density;
-    uint8_t *outside = (uint8_t *)at.sums;
-    for (int i = 0; i < rows; i++) {
-        unpack_bits(at.changed + (size_t)i * words, &grid->shape, at.line);
-        unpack_bits(at.faint + (size_t)i * words, &grid->shape, at.other_line);
-        unpack_bits(at.outside + (size_t)i * words, &grid->shape, outside);
-        weigh(at.line, at.other_line, outside, faint_weight, columns, weight + (size_t)i * columns);
-    }
-    memset(at.down, 0, sizeof(float) * (size_t)(columns + 2 * reach));
+    const float *weight = at.density;
+    int last = -1 - reach; /* the last row with weights that counts for row i */
+    invert_bits(at.outside, &grid->shape, at.one);
+    for (int i = 0; i < least(reach, rows); i++)
+        if (weigh_row(grid, at, faint_weight, i)) last = i;
     for (int i = 0; i < rows; i++) {
         uint64_t *kept = at.kept + (size_t)i * words;
-        memset(at.down + reach, 0, sizeof(float) * (size_t)columns);
+        if (i + reach < rows && weigh_row(grid, at, faint_weight, i + reach)) last = i + reach;
+        if (last < i - reach) {
+            memset(kept, 0, sizeof(uint64_t) * (size_t)words);
+            continue;
+        }
+        memset(at.down, 0, sizeof(float) * (size_t)(columns + 2 * reach));
         for (int k = i - reach < 0 ? 0 : i - reach; k <= i + reach && k < rows; k++)
             add_floats(weight + (size_t)k * columns, columns, at.down + reach);
         memset(at.sums, 0, sizeof(float) * (size_t)columns);
@@ -435,7 +459,6 @@ static void keep_large(const Grid *grid, Scratch at) {
         pack_bits(at.line, &grid->shape, kept);
         for (int w = 0; w < words; w++) kept[w] &= ~at.outside[(size_t)i * words + w];
     }
-    invert_bits(at.outside, &grid->shape, at.one);
     flood(at.kept, at.one, &grid->shape);
 }
 
@@ -444,16 +467,19 @@ static void bridge_gaps(const Grid *grid, Scratch at) {
     static const float as_is[3] = {1.0f, 1.0f, 1.0f};
     const int rows = grid->rows, columns = grid->columns, words = grid->shape.words;
     const size_t cells = (size_t)rows * columns;
-    uint64_t *unclosed = at.one, added = 0;
+    uint64_t *unclosed = at.one, *moved = at.solid, added = 0;
     widen(at.kept, &grid->shape, grid->bridge, at.solid, at.other);
     invert_bits(at.other, &grid->shape, at.other);
     widen(at.other, &grid->shape, grid->bridge, at.solid, unclosed);
     for (int i = 0; i < rows; i++) {
         const size_t row = (size_t)i * words;
-        longer_than(at.means + (size_t)i * columns, cells, as_is, grid->bridge_sigmas * grid->bridge_sigmas, columns, at.line);
-        pack_bits(at.line, &grid->shape, at.other + row);
+        for (int w = 0; w < words; w++) at.other[row + w] = ~unclosed[row + w] & ~at.kept[row + w] & (w == words - 1 ? grid->shape.last : ~UINT64_C(0));
+        if (any_bit(at.other + row, words)) {
+            longer_than(at.means + (size_t)i * columns, cells, as_is, grid->bridge_sigmas * grid->bridge_sigmas, columns, at.line);
+            pack_bits(at.line, &grid->shape, moved);
+        }
         for (int w = 0; w < words; w++) {
-            const uint64_t more = at.other[row + w] & ~unclosed[row + w] & ~at.kept[row + w];
+            const uint64_t more = at.other[row + w] & moved[w];
             at.other[row + w] = at.kept[row + w] | more, added |= more;
         }
     }

@@ -164,21 +164,26 @@ WIDE static void range_of(const float *values, size_t n, float *lowest, float *h
     memcpy(lowest, &low, sizeof low), memcpy(highest, &high, sizeof high);
 }
 
-/* Sum and count of a row's undeformed pixels below `middle`; others of them are marked as raised: a face of the object. */
+enum { BLOCK = 256 };
+
+/* Sum and count of a row's undeformed pixels below `middle`; others of them are marked as raised: a face of the object. Block by block, since loops
+   over bytes and floats are vectorised, but not with such sums among them. */
 WIDE static void flat_row(const float *restrict depth, uint8_t *restrict kind, float middle, int n, float *sum, int *count) {
-    float total = 0.0f, lanes[LANES] = {0.0f};
-    int found = 0, x = 0;
-    for (int k = 0; k < n; k++) {
-        found += kind[k] != DEFORMED && depth[k] < middle;
-        kind[k] = kind[k] == DEFORMED ? DEFORMED : depth[k] < middle ? FLAT : RAISED;
-    }
-    for (; x + LANES <= n; x += LANES)
-        for (int j = 0; j < LANES; j++) {
-            const int is = kind[x + j] == FLAT; /* not a branch, which the compiler would not vectorise */
-            const float here = depth[x + j];
-            lanes[j] += is ? here : 0.0f;
+    float total = 0.0f, lanes[LANES] = {0.0f}, flat[BLOCK];
+    int found = 0;
+    for (int first = 0; first < n; first += BLOCK, depth += BLOCK, kind += BLOCK) {
+        const int some = least(BLOCK, n - first);
+        int k = 0;
+        for (int x = 0; x < some; x++) {
+            const int is = (kind[x] != DEFORMED) & (depth[x] < middle);
+            flat[x] = (float)is * depth[x];
+            found += is;
+            kind[x] = kind[x] == DEFORMED ? DEFORMED : is ? FLAT : RAISED;
         }
-    for (; x < n; x++) total += kind[x] == FLAT ? depth[x] : 0.0f;
+        for (; k + LANES <= some; k += LANES)
+            for (int j = 0; j < LANES; j++) lanes[j] += flat[k + j];
+        for (; k < some; k++) total += flat[k];
+    }
     for (int j = 0; j < LANES; j++) total += lanes[j];
     *sum = total, *count = found;
 }

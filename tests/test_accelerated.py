@@ -505,6 +505,10 @@ def test_one_call_follows_blocks_that_change(response_unit):
     assert pipe.compiled(image) is None and torch.equal(pipe(image).depth_mm, blocks.depth_mm) and seen == [1]
     handle.remove()
     assert pipe.compiled(image) is not None
+    pipe.compensate.linear.append(torch.nn.Identity())
+    assert pipe.compiled(image) is None
+    pipe.compensate.linear = torch.nn.Sequential()
+    assert pipe.compiled(image) is not None
     assert pipe.compiled(image.clone().requires_grad_()) is None and pipe.compiled(image.double()) is None
     pipe.zero = torch.nn.Sequential(pipe.zero)
     assert pipe.compiled(image) is None

@@ -66,6 +66,22 @@ def test_numbers_of_threads(threads):
     assert within_frame() == 1
 
 
+def test_helpers_may_be_woken_by_anyone(threads):
+    """Before a frame that does not come, and while others have them; results are as before."""
+    pipe, images = pipe_and_images((96, 128))
+    alone = [pipe(image) for image in images]
+    threads(4)
+
+    def woken(k):
+        for count in (0, 1, 2, 64):
+            kernels.loaded().wake_helpers(count)
+        return k % 3, pipe(images[k % 3])
+
+    with ThreadPoolExecutor(6) as pool:
+        found = list(pool.map(woken, range(60)))
+    assert all(torch.equal(a, b) for k, out in found for a, b in zip(out, alone[k], strict=True))
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
 def test_a_fork_starts_its_own_helpers(threads):
     threads(2)

@@ -3,6 +3,7 @@
 import ctypes
 import math
 from collections.abc import Callable
+from operator import attrgetter, is_
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -33,7 +34,7 @@ from .blocks import (
 )
 from .derived import flat_is_one, pedestals, response_lines
 from .gate import usable
-from .memory import empty
+from .memory import empties
 from .threads import by_frames, parts_of, within_frame
 
 INTEGER, REAL, POINTER = ctypes.c_int32, ctypes.c_float, ctypes.c_void_p
@@ -107,37 +108,44 @@ class _Prepared(NamedTuple):
     Attributes:
         program: None where the blocks must do the work.
         lights: the block whose lights may change by themselves, as by an optimiser.
-        tensors: of the blocks, with their addresses and versions.
+        tensors, addresses, versions: of the blocks.
         modules, kinds: the blocks and those within them, and their types.
         sizes, lengths: dictionaries of attributes and of hooks, and how many entries they have.
-        entries: dictionaries, keys and values: settings, and the modules and tensors within others.
+        places, names, values: dictionaries and their entries: settings, and the modules and tensors within others.
     """
 
     program: Program | None
     lights: NormalFromIntensity | None
     memory: list[Any]
-    tensors: list[tuple[Tensor, int, int]]
+    tensors: list[Tensor]
+    addresses: list[int]
+    versions: list[int]
     modules: list[nn.Module]
     kinds: list[type]
     sizes: list[dict[str, Any]]
     lengths: list[int]
-    entries: list[tuple[dict[str, Any], str, Any]]
+    places: list[dict[str, Any]]
+    names: list[str]
+    values: list[Any]
 
     def holds(self) -> bool:
-        """Whether nothing has changed since."""
+        """Whether nothing has changed since. Without loops of Python's own, because it runs before every frame."""
         if self.lights is not None:
             self.lights.follow_lights()
-        if list(map(type, self.modules)) != self.kinds or list(map(len, self.sizes)) != self.lengths:
-            return False
-        for place, name, value in self.entries:
-            if place.get(name) is not value:
-                return False
-        return all(tensor._version == version and tensor.data_ptr() == address for tensor, address, version in self.tensors)
+        return (
+            list(map(len, self.sizes)) == self.lengths
+            and list(map(type, self.modules)) == self.kinds
+            and all(map(is_, map(dict.get, self.places, self.names), self.values))
+            and list(map(_version, self.tensors)) == self.versions
+            and list(map(Tensor.data_ptr, self.tensors)) == self.addresses
+        )
 
     def records(self) -> bool:
         """Whether a gradient would be recorded for any of the tensors."""
-        return torch.is_grad_enabled() and any(tensor.requires_grad for tensor, _, _ in self.tensors)
+        return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in self.tensors)
 
+
+_version = attrgetter("_version")
 
 _programs: WeakKeyDictionary[nn.Module, _Prepared] = WeakKeyDictionary()
 
@@ -161,6 +169,9 @@ def solve_frames(pipe: nn.Module, images: Tensor, parts: Callable[[], Blocks | N
     if torch_modules._global_forward_hooks or torch_modules._global_forward_pre_hooks:
         return None
     prepared = _programs.get(pipe)  # held until the call is over: another thread may put another one in its place
+    threads = within_frame() if parts_of(images.shape[0], images.shape[2] * images.shape[3]) == 1 else 1
+    if threads > 1 and prepared is not None and prepared.program is not None:
+        kernels.loaded().wake_helpers(threads)  # they take as long to wake up as the checks here do
     if prepared is None or not prepared.holds():
         prepared = _prepared(pipe, parts())
         if prepared is None:
@@ -169,7 +180,7 @@ def solve_frames(pipe: nn.Module, images: Tensor, parts: Callable[[], Blocks | N
     program = prepared.program
     if program is None or prepared.records() or images.shape[2:] != (program.height, program.width):
         return None
-    return _run(program, images.contiguous())
+    return _run(program, images.contiguous(), threads)
 
 
 def _prepared(pipe: nn.Module, parts: Blocks | None) -> _Prepared | None:
@@ -182,7 +193,7 @@ def _prepared(pipe: nn.Module, parts: Blocks | None) -> _Prepared | None:
     if any(tensor.is_inference() for tensor in tensors):
         return None
     hooks = [module.__dict__[name] for module in modules for name in HOOKS]
-    sizes = [module.__dict__ for module in (pipe, *modules)] + hooks
+    sizes = [module.__dict__ for module in (pipe, *modules)] + hooks + [module._modules for module in modules]
     entries = [entry for module in (pipe, *modules) for entry in _entries(module)]
     made = None
     if parts is not None and not any(hooks) and _all_own(parts):
@@ -192,40 +203,46 @@ def _prepared(pipe: nn.Module, parts: Blocks | None) -> _Prepared | None:
         None if made is None else made[0],
         lights,
         [] if made is None else made[1],
-        [(tensor, tensor.data_ptr(), tensor._version) for tensor in tensors],
+        tensors,
+        [tensor.data_ptr() for tensor in tensors],
+        [tensor._version for tensor in tensors],
         modules,
         list(map(type, modules)),
         sizes,
         list(map(len, sizes)),
-        entries,
+        [place for place, _ in entries],
+        [name for _, name in entries],
+        [place[name] for place, name in entries],
     )
 
 
-def _entries(module: nn.Module) -> list[tuple[dict[str, Any], str, Any]]:
-    """Settings of a module, and its tensors and modules, where they stand."""
+def _entries(module: nn.Module) -> list[tuple[dict[str, Any], str]]:
+    """Where the settings of a module stand, and its tensors and modules."""
     settings: dict[str, Any] = module.__dict__
-    places = [(settings, name) for name in settings if name not in OF_MODULES]
+    entries = [(settings, name) for name in settings if name not in OF_MODULES]
     for inner in (module._parameters, module._buffers, module._modules):
-        places += [(inner, name) for name in inner]
-    return [(place, name, place[name]) for place, name in places]
+        entries += [(inner, name) for name in inner]
+    return entries
 
 
-def _run(program: Program, images: Tensor) -> DepthOutput | None:
+def _run(program: Program, images: Tensor, threads: int) -> DepthOutput | None:
     """None where an image is not in [0, 1], and where a frame needs what the program cannot do."""
     count, _, height, width = images.shape
-    maps = [empty((count, channels, height, width), torch.float32) for channels in (1, 2, 3)]
-    masks = [empty((count, 1, height, width), torch.bool) for _ in range(2)]
-    out = DepthOutput(*maps, *masks)
+    maps = [((count, channels, height, width), torch.float32) for channels in (1, 2, 3)]
+    mask = (count, 1, height, width), torch.bool
+    out = DepthOutput(*empties([*maps, mask, mask]))
     kernel, at, pixels = kernels.loaded().solve_frames, ctypes.byref(program), height * width
     image, depth, gradient, normal, contact, deformed = (tensor.data_ptr() for tensor in (images, *out))
-    threads = within_frame() if parts_of(count, pixels) == 1 else 1
+    if parts_of(count, pixels) == 1:
+        trouble = int(kernel(at, image, count, threads, depth, gradient, normal, contact, deformed))
+    else:
 
-    def some(first: int, many: int) -> int:
-        place = 4 * pixels * first
-        rest = (depth + place, gradient + 2 * place, normal + 3 * place, contact + pixels * first, deformed + pixels * first)
-        return int(kernel(at, image + 3 * place, many, threads, *rest))
+        def some(first: int, many: int) -> int:
+            place = 4 * pixels * first
+            rest = (depth + place, gradient + 2 * place, normal + 3 * place, contact + pixels * first, deformed + pixels * first)
+            return int(kernel(at, image + 3 * place, many, 1, *rest))
 
-    trouble = by_frames(count, pixels, some)
+        trouble = by_frames(count, pixels, some)
     if trouble == 1:
         raise MemoryError("torchvts: no memory is left for a frame")
     return None if trouble else out

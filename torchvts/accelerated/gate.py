@@ -37,7 +37,21 @@ def reference_only() -> Iterator[None]:
 
 def arrays_usable(*tensors: Tensor) -> bool:
     """Whether NumPy and OpenCV may read these tensors: plain ones on a CPU, in eager mode, with no derivative recorded."""
-    if torch.compiler.is_compiling() or torch._C._get_tracing_state() is not None:
+    return not torch.compiler.is_compiling() and _plain(tensors)
+
+
+def usable(*tensors: Tensor) -> bool:
+    """Whether compiled kernels may work on these tensors: as :func:`arrays_usable`, and float32, and the kernels are there."""
+    if torch.compiler.is_compiling() or _refused.get() or kernels.library() is None:
+        return False
+    for tensor in tensors:
+        if tensor.dtype is not torch.float32:
+            return False
+    return _plain(tensors)
+
+
+def _plain(tensors: tuple[Tensor, ...]) -> bool:
+    if torch._C._get_tracing_state() is not None:
         return False
     if forward_ad._current_level >= 0 or torch._C._len_torch_dispatch_stack() > 0:  # tangents and traces would be lost
         return False
@@ -50,13 +64,3 @@ def arrays_usable(*tensors: Tensor) -> bool:
         if torch._C._functorch.is_functorch_wrapped_tensor(tensor):
             return False
     return True
-
-
-def usable(*tensors: Tensor) -> bool:
-    """Whether compiled kernels may work on these tensors: as :func:`arrays_usable`, and float32, and the kernels are there."""
-    if torch.compiler.is_compiling() or _refused.get() or kernels.library() is None:
-        return False
-    for tensor in tensors:
-        if tensor.dtype is not torch.float32:
-            return False
-    return arrays_usable(*tensors)

@@ -42,6 +42,7 @@ SIGNATURES = {
     "depth_slopes": ("v", "p ll p ll f iii p"),
     "grid_means": ("v", "p iiiiiii p"),
     "slopes": ("v", "p ii f p"),
+    "wake_helpers": ("v", "i"),
     "solve_frames": ("i", "pp ii ppppp"),
     "poisson_plan_size": ("l", "i"),
     "make_poisson_plan": ("v", "ii p"),

@@ -20,20 +20,31 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
 
     Its memory is that of an earlier one of as many bytes that nobody holds any more, neither itself nor a view of it; else new.
     """
-    tensor = torch.empty(0, dtype=dtype, device="cpu")
-    size = math.prod(shape) * dtype.itemsize
-    if _users is None or size > MOST_BYTES:
-        return tensor.resize_(shape)
-    if not _lock.acquire(blocking=False):  # another thread is at the table, and after a fork for ever
-        return tensor.resize_(shape)
+    return empties([(shape, dtype)])[0]
+
+
+def empties(wanted: list[tuple[tuple[int, ...], torch.dtype]]) -> list[Tensor]:
+    """Such tensors of several shapes and types, each with memory of its own."""
+    if _users is None or not _lock.acquire(blocking=False):  # another thread is at the table, and after a fork for ever
+        return [torch.empty(shape, dtype=dtype, device="cpu") for shape, dtype in wanted]
     try:
-        some = _kept.setdefault(size, [])
-        for storage in some:
-            if _users(storage._cdata) == 1 and not storage.is_shared() and storage.nbytes() == size:
-                return tensor.set_(storage, 0, shape)  # type: ignore[call-overload, no-any-return]
-        return tensor.set_(_new(size, some, _users), 0, shape)  # type: ignore[call-overload, no-any-return]
+        return [_tensor(shape, dtype, _users) for shape, dtype in wanted]
     finally:
         _lock.release()
+
+
+def _tensor(shape: tuple[int, ...], dtype: torch.dtype, users: Callable[[int], int]) -> Tensor:
+    size = math.prod(shape) * dtype.itemsize
+    tensor = torch.empty(0, dtype=dtype, device="cpu")
+    if size > MOST_BYTES:
+        return tensor.resize_(shape)
+    some = _kept.setdefault(size, [])
+    for storage in some:
+        if users(storage._cdata) == 1 and not storage.is_shared() and storage.nbytes() == size:
+            break
+    else:
+        storage = _new(size, some, users)
+    return tensor.set_(storage, 0, shape)  # type: ignore[call-overload, no-any-return]
 
 
 def _new(size: int, alike: list[UntypedStorage], users: Callable[[int], int]) -> UntypedStorage:

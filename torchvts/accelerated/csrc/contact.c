@@ -173,20 +173,17 @@ static void close_rows(const uint8_t *image, int height, int width, int first, i
     }
 }
 
-/* Whether an LED has failed: 1 for each channel that counts. More than one dark channel is no failed LED. */
-static void working_leds(const float *image, const float *failed_below, int height, int width, int step, int works[3]) {
-    int failed = 0;
-    for (int c = 0; c < 3; c++) {
-        double total[4] = {0.0}; /* four sums that do not wait for one another */
-        int count = 0;
-        for (int y = step / 2; y < height; y += step) {
-            const float *line = image + ((size_t)c * height + y) * width;
-            for (int x = step / 2; x < width; x += step, count++) total[count % 4] += line[x];
-        }
-        works[c] = !((total[0] + total[1] + total[2] + total[3]) / count < failed_below[c]);
-        failed += !works[c];
+/* Mean of every step-th pixel of an image, by four sums that do not wait for one another. */
+static double mean_of(const float *image, int height, int width, int step) {
+    double a = 0.0, b = 0.0, c = 0.0, d = 0.0;
+    int64_t count = 0;
+    for (int y = step / 2; y < height; y += step) {
+        const float *line = image + (size_t)y * width;
+        int x = step / 2;
+        for (; x + 3 * step < width; x += 4 * step, count += 4) a += line[x], b += line[x + step], c += line[x + 2 * step], d += line[x + 3 * step];
+        for (; x < width; x += step, count++) a += line[x];
     }
-    if (failed != 1) works[0] = works[1] = works[2] = 1;
+    return (a + b + c + d) / (double)count;
 }
 
 /* Sums of `cell` values each, times `scale`, for n cells that lie side by side. */
@@ -253,8 +250,8 @@ typedef struct {
 
 /* A frame's images and what is found in it. scale: of each channel's change; raw: strong pixels, before they are closed. */
 typedef struct {
-    const float *image, *offset, *per_noise, *most_far_field;
-    int height, width, stride;
+    const float *image, *offset, *per_noise, *failed_below, *most_far_field;
+    int height, width, step, stride;
     float rounding, threshold, noise[6], scale[3], per[3];
     int works[3], bands;
     Grid grid;
@@ -263,15 +260,19 @@ typedef struct {
     atomic_int short_of_memory;
 } Frame;
 
-/* Of a channel's change, the noise, or of part 3 and above its far field. */
+/* Of a channel's change, the noise, or of parts 3 to 5 its far field; of parts 6 to 8 whether its LED works. */
 static void find_noise(void *with, int part) {
     Frame *of = with;
     const int c = part % 3, far = part >= 3;
     const size_t plane = (size_t)of->height * of->width * c;
     const float *image = of->image + plane, *offset = of->offset ? of->offset + plane : NULL, *per_noise = of->per_noise + plane;
     const size_t samples = (size_t)((of->height + of->stride - 1) / of->stride) * ((of->width + of->stride - 1) / of->stride);
+    if (part >= 6) {
+        of->works[c] = !(mean_of(image, of->height, of->width, of->step) < of->failed_below[c]);
+        return;
+    }
     of->noise[part] = 0.0f;
-    if (!of->works[c] || (far && !(of->most_far_field[c] > 0.0f))) return;
+    if (far && !(of->most_far_field[c] > 0.0f)) return;
     float *some = malloc(sizeof(float) * (2 * samples + 1));
     if (some)
         of->noise[part] = (far ? far_field_of : noise_of)(image, offset, per_noise, of->height, of->width, of->stride, some);
@@ -280,14 +281,18 @@ static void find_noise(void *with, int part) {
     free(some);
 }
 
-/* 1 over the standard deviation of a channel's change: its noise, or the far field if that is larger. */
-static float scale_of(const Frame *of, int c) {
-    const float most = of->most_far_field[c];
-    float noise = of->noise[c], far = of->noise[3 + c];
-    if (far > most) far = most * most / far;
-    if (!(far <= noise)) noise = far;
-    if (noise < 1.0f) noise = 1.0f;
-    return of->works[c] ? 1.0f / sqrtf(noise * noise + of->rounding) : 0.0f;
+/* 1 over the standard deviation of each channel's change: its noise, or the far field if that is larger. 0 for one whose LED has failed; more than one
+   dark channel is no failed LED. */
+static void find_scale(Frame *of) {
+    const int failed = 3 - of->works[0] - of->works[1] - of->works[2];
+    for (int c = 0; c < 3; c++) {
+        const float most = of->most_far_field[c];
+        float noise = of->noise[c], far = of->noise[3 + c];
+        if (far > most) far = most * most / far;
+        if (!(far <= noise)) noise = far;
+        if (noise < 1.0f) noise = 1.0f;
+        of->scale[c] = failed == 1 && !of->works[c] ? 0.0f : 1.0f / sqrtf(noise * noise + of->rounding);
+    }
 }
 
 /* Rows of cells of a band. */
@@ -405,23 +410,47 @@ WIDE static void weigh(const uint8_t *restrict changed, const uint8_t *restrict 
     for (int j = 0; j < n; j++) weight[j] = outside[j] ? 0.0f : faint[j] ? faint_weight : changed[j] ? weight[j] : 1.0f;
 }
 
+static int any_bit(const uint64_t *row, int words) {
+    uint64_t any = 0;
+    for (int w = 0; w < words; w++) any |= row[w];
+    return any != 0;
+}
+
+/* Weights of row i; returns whether any may be other than zero: in most rows none is. */
+static int weigh_row(const Grid *grid, Scratch at, float faint_weight, int i) {
+    const int words = grid->shape.words;
+    const size_t row = (size_t)i * words;
+    float *weight = at.density + (size_t)i * grid->columns;
+    uint8_t *outside = (uint8_t *)at.sums;
+    if (!any_bit(at.one + row, words)) {
+        memset(weight, 0, sizeof(float) * (size_t)grid->columns);
+        return 0;
+    }
+    unpack_bits(at.changed + row, &grid->shape, at.line);
+    unpack_bits(at.faint + row, &grid->shape, at.other_line);
+    unpack_bits(at.outside + row, &grid->shape, outside);
+    weigh(at.line, at.other_line, outside, faint_weight, grid->columns, weight);
+    return 1;
+}
+
 /* Keeps what is connected to a cell around which there is nearly a disc of the least size. A hole counts as contact; faint cells too,
    but it takes three that lie together. */
 static void keep_large(const Grid *grid, Scratch at) {
     const int rows = grid->rows, columns = grid->columns, reach = grid->reach, words = grid->shape.words;
     const float faint_weight = 0.4f * grid->least_cells < 1.0f ? 0.4f * grid->least_cells : 1.0f;
-    float *weight = at.density;
-    uint8_t *outside = (uint8_t *)at.sums;
-    for (int i = 0; i < rows; i++) {
-        unpack_bits(at.changed + (size_t)i * words, &grid->shape, at.line);
-        unpack_bits(at.faint + (size_t)i * words, &grid->shape, at.other_line);
-        unpack_bits(at.outside + (size_t)i * words, &grid->shape, outside);
-        weigh(at.line, at.other_line, outside, faint_weight, columns, weight + (size_t)i * columns);
-    }
-    memset(at.down, 0, sizeof(float) * (size_t)(columns + 2 * reach));
+    const float *weight = at.density;
+    int last = -1 - reach; /* the last row with weights that counts for row i */
+    invert_bits(at.outside, &grid->shape, at.one);
+    for (int i = 0; i < least(reach, rows); i++)
+        if (weigh_row(grid, at, faint_weight, i)) last = i;
     for (int i = 0; i < rows; i++) {
         uint64_t *kept = at.kept + (size_t)i * words;
-        memset(at.down + reach, 0, sizeof(float) * (size_t)columns);
+        if (i + reach < rows && weigh_row(grid, at, faint_weight, i + reach)) last = i + reach;
+        if (last < i - reach) {
+            memset(kept, 0, sizeof(uint64_t) * (size_t)words);
+            continue;
+        }
+        memset(at.down, 0, sizeof(float) * (size_t)(columns + 2 * reach));
         for (int k = i - reach < 0 ? 0 : i - reach; k <= i + reach && k < rows; k++)
             add_floats(weight + (size_t)k * columns, columns, at.down + reach);
         memset(at.sums, 0, sizeof(float) * (size_t)columns);
@@ -430,7 +459,6 @@ static void keep_large(const Grid *grid, Scratch at) {
         pack_bits(at.line, &grid->shape, kept);
         for (int w = 0; w < words; w++) kept[w] &= ~at.outside[(size_t)i * words + w];
     }
-    invert_bits(at.outside, &grid->shape, at.one);
     flood(at.kept, at.one, &grid->shape);
 }
 
@@ -439,16 +467,19 @@ static void bridge_gaps(const Grid *grid, Scratch at) {
     static const float as_is[3] = {1.0f, 1.0f, 1.0f};
     const int rows = grid->rows, columns = grid->columns, words = grid->shape.words;
     const size_t cells = (size_t)rows * columns;
-    uint64_t *unclosed = at.one, added = 0;
+    uint64_t *unclosed = at.one, *moved = at.solid, added = 0;
     widen(at.kept, &grid->shape, grid->bridge, at.solid, at.other);
     invert_bits(at.other, &grid->shape, at.other);
     widen(at.other, &grid->shape, grid->bridge, at.solid, unclosed);
     for (int i = 0; i < rows; i++) {
         const size_t row = (size_t)i * words;
-        longer_than(at.means + (size_t)i * columns, cells, as_is, grid->bridge_sigmas * grid->bridge_sigmas, columns, at.line);
-        pack_bits(at.line, &grid->shape, at.other + row);
+        for (int w = 0; w < words; w++) at.other[row + w] = ~unclosed[row + w] & ~at.kept[row + w] & (w == words - 1 ? grid->shape.last : ~UINT64_C(0));
+        if (any_bit(at.other + row, words)) {
+            longer_than(at.means + (size_t)i * columns, cells, as_is, grid->bridge_sigmas * grid->bridge_sigmas, columns, at.line);
+            pack_bits(at.line, &grid->shape, moved);
+        }
         for (int w = 0; w < words; w++) {
-            const uint64_t more = at.other[row + w] & ~unclosed[row + w] & ~at.kept[row + w];
+            const uint64_t more = at.other[row + w] & moved[w];
             at.other[row + w] = at.kept[row + w] | more, added |= more;
         }
     }
@@ -511,8 +542,8 @@ static void to_pixels(void *with, int band) {
 /* Masks of one frame. Returns what contact_mask() does. */
 static int mask_frame(Frame *of) {
     const size_t pixels = (size_t)of->height * of->width, cells = (size_t)of->grid.rows * of->grid.columns;
-    share(find_noise, of, 6);
-    for (int c = 0; c < 3; c++) of->scale[c] = scale_of(of, c);
+    share(find_noise, of, 9);
+    find_scale(of);
     share(find_strong, of, of->bands);
     share(close_strong, of, of->bands);
     share(find_shares, of, of->bands);
@@ -553,11 +584,11 @@ EXPORT int contact_mask(const float *image, const float *offset, const float *pe
     at.down = at.sums + line, at.line = (uint8_t *)(at.down + line + 2 * reach), at.other_line = at.line + line;
     int code = 0;
     for (int b = 0; b < frames && code != 1; b++) {
-        Frame frame = {.image = image + 3 * pixels * b, .offset = offset, .per_noise = per_noise, .most_far_field = most_far_field};
-        frame.height = height, frame.width = width, frame.stride = stride, frame.rounding = rounding, frame.threshold = sigmas * sigmas;
+        Frame frame = {.image = image + 3 * pixels * b, .offset = offset, .per_noise = per_noise, .failed_below = failed_below};
+        frame.most_far_field = most_far_field, frame.height = height, frame.width = width, frame.step = step, frame.stride = stride;
+        frame.rounding = rounding, frame.threshold = sigmas * sigmas;
         frame.bands = least(rows, bands_of(height)), frame.grid = grid, frame.at = at;
         frame.raw = frame.inner = inner + pixels * b, frame.strong = mask + pixels * b; /* cells decide after pixels are closed */
-        working_leds(frame.image, failed_below, height, width, step, frame.works);
         const int found = mask_frame(&frame);
         code = found == 1 ? 1 : code | found;
     }

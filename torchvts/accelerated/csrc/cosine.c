@@ -224,11 +224,10 @@ void cosine_forward(const Cosine *of, float *scratch, float *found) {
     split(z, z + part, of->turns, of->n, LANES, found);
 }
 
-/* Returns the lines with such coefficients, times n, which lie as cosine_line() says. */
-float *cosine_inverse(const Cosine *of, float *scratch, const float *coefficients) {
+/* The lines with such coefficients, times n, to `lines`, where they lie as cosine_line() says; scratch: as much memory. */
+void cosine_inverse(const Cosine *of, const float *coefficients, float *scratch, float *lines) {
     const size_t part = (size_t)of->n * LANES;
-    float *other = scratch + 2 * part;
-    join(coefficients, of->turns, of->n, LANES, scratch, scratch + part);
-    /* with real and imaginary parts exchanged, the transform there is the one back */
-    return fourier(of, scratch + part, scratch, other + part, other) ? other : scratch;
+    float *from = of->passes % 2 ? scratch : lines, *to = of->passes % 2 ? lines : scratch;
+    join(coefficients, of->turns, of->n, LANES, from, from + part);
+    fourier(of, from + part, from, to + part, to); /* with real and imaginary parts exchanged, the transform there is the one back */
 }

@@ -19,7 +19,7 @@ void make_cosine_tables(int n, float *tables);
 Cosine cosine_of(int n, const float *tables);
 size_t cosine_scratch_size(int n);
 void cosine_forward(const Cosine *of, float *scratch, float *found);
-float *cosine_inverse(const Cosine *of, float *scratch, const float *coefficients);
+void cosine_inverse(const Cosine *of, const float *coefficients, float *scratch, float *lines);
 float *cosine_line(const Cosine *of, float *scratch, int y);
 
 #endif

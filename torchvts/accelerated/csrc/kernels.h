@@ -53,6 +53,7 @@ void give_back(void *memory);
 
 /* Work in parts, numbered from 0, that threads take in turn: see threads.c. */
 typedef void (*PartOfWork)(void *with, int part);
+EXPORT void wake_helpers(int threads);
 int begin_sharing(int threads);
 void end_sharing(int began);
 void share(PartOfWork work, void *with, int parts);
@@ -91,10 +92,16 @@ EXPORT void uncrop(const float *gradient, const uint8_t *contact, int frames, in
 
 static inline int least(int a, int b) { return a < b ? a : b; }
 
-/* How many of the first n bytes are `value`. */
+/* How many of the first n bytes are `value`; 64 at a time, then eight. */
 static inline int bytes_alike(const uint8_t *bytes, int n, uint8_t value) {
     const uint64_t all = value * UINT64_C(0x0101010101010101);
     int k = 0;
+    for (uint64_t some[8], differ; k + 64 <= n; k += 64) {
+        memcpy(some, bytes + k, sizeof some);
+        differ = 0;
+        for (int j = 0; j < 8; j++) differ |= some[j] ^ all;
+        if (differ) break;
+    }
     for (uint64_t eight; k + 8 <= n; k += 8) {
         memcpy(&eight, bytes + k, sizeof eight);
         if (eight != all) break;

@@ -230,51 +230,48 @@ static void to_coefficients(const Plan *plan, const Part *part, const float *lin
             transpose(found + k * LINES + x, LINES, coefficients + place_of(k, to_column + x, columns), SLICE);
 }
 
-/* The inverse, to columns from `first` on of depth (height, width). */
-static void to_depth(const Plan *plan, const float *coefficients, int first, float *scratch, float *found, float *depth) {
-    const size_t n = (size_t)plan->height, wide = (size_t)plan->wide, columns = (size_t)plan->width + LINES;
+/* The inverse, of LINES columns of depth from `first` on, to `lines`. scratch: as much memory; found: coefficients. */
+static void to_depth(const Plan *plan, const float *coefficients, int first, float *scratch, float *found, float *lines) {
+    const size_t wide = (size_t)plan->wide, columns = (size_t)plan->width + LINES;
     for (size_t k = 0; k < wide; k += 4)
         for (int x = 0; x < LINES; x += 4) transpose(coefficients + place_of(k, (size_t)(first + x), columns), SLICE, found + k * LINES + x, LINES);
-    float *lines = cosine_inverse(&plan->cosine, scratch, found);
-    const int one = least(LANES, plan->width - first), other = least(LINES, plan->width - first) - one;
-    for (int y = 0; y < plan->height; y++) {
-        const float *line = cosine_line(&plan->cosine, lines, y);
-        float *to = depth + (size_t)y * plan->width + first;
-        if (one == LANES && other == LANES) {
-            memcpy(to, line, sizeof(float) * LANES);
-            memcpy(to + LANES, line + n * LANES, sizeof(float) * LANES);
-        } else {
-            memcpy(to, line, sizeof(float) * (size_t)one);
-            memcpy(to + one, line + n * LANES, sizeof(float) * (size_t)other);
-        }
-    }
+    cosine_inverse(&plan->cosine, found, scratch, lines);
+}
+
+/* n pixels of a row of depth less its level: LANES of them together, and `step` floats on the next ones. */
+WIDE static void row_of_depth(const float *lanes, size_t step, float level, int n, float *restrict row) {
+    int x = 0;
+    for (; x + LANES <= n; x += LANES, lanes += step)
+        for (int t = 0; t < LANES; t++) row[x + t] = lanes[t] - level;
+    for (int t = 0; x < n; x++, t++) row[x] = lanes[t] - level;
 }
 
 /* Sum of depth where the slopes are not zero, and how many pixels that are. */
 WIDE static double inclined_sum(const float *restrict depth, const float *restrict p, const float *restrict q, int n, int32_t *count) {
     double sums[LANES] = {0.0}, total = 0.0;
-    int counts[LANES] = {0}, x = 0;
-    for (; x + LANES <= n; x += LANES)
+    int some = 0, x = 0;
+    for (; x + LANES <= n; x += LANES) {
+        float kept[LANES];
         for (int t = 0; t < LANES; t++) {
             const int is = (p[x + t] != 0.0f) | (q[x + t] != 0.0f);
-            sums[t] += is ? depth[x + t] : 0.0f;
-            counts[t] += is;
+            kept[t] = (float)is * depth[x + t]; /* no branch, which the compiler would not vectorise */
+            some += is;
         }
+        for (int t = 0; t < LANES; t++) sums[t] += kept[t];
+    }
     for (int t = 0; x < n; x++, t++) {
         const int is = (p[x] != 0.0f) | (q[x] != 0.0f);
         sums[t] += is ? depth[x] : 0.0f;
-        counts[t] += is;
+        some += is;
     }
-    for (int t = 0; t < LANES; t++) total += sums[t], *count += counts[t];
+    for (int t = 0; t < LANES; t++) total += sums[t];
+    *count += some;
     return total;
 }
 
-WIDE static void subtract_level(float *depth, float level, size_t n) {
-    for (size_t k = 0; k < n; k++) depth[k] -= level;
-}
-
 /* The solution of one frame. Each part of the work has LINES columns, or a slice of coefficients of all, or a band of rows, and scratch of its
-   own: transforms and their coefficients, and the lines of the divergence's borders. */
+   own: transforms and their coefficients, and the lines of the divergence's borders. `lines` are those of the divergence, and then of depth, LINES
+   columns after the other as transforms leave them: written to rows at once, each line of memory would be fetched for a part of a block. */
 typedef struct {
     Plan plan;
     Part part;
@@ -287,7 +284,7 @@ typedef struct {
     atomic_int short_of_memory;
 } Solution;
 
-/* Memory of one transform: the lines twice, then the coefficients, of which those beyond the height are zero. Null where memory is short. */
+/* Memory of one transform: lines twice, then the coefficients, of which those beyond the height are zero. Null where memory is short. */
 static float *transform_memory(Solution *of) {
     const size_t scratch = cosine_scratch_size(of->plan.height), height = (size_t)of->plan.height, wide = (size_t)of->plan.wide;
     float *memory = malloc(sizeof(float) * (scratch + wide * LINES));
@@ -334,20 +331,28 @@ static void transform_back(void *with, int block) {
     float *memory = transform_memory(of);
     const unsigned int before = without_tiny();
     if (memory)
-        to_depth(&of->plan, of->coefficients, block * LINES, memory, memory + cosine_scratch_size(of->plan.height), of->depth);
+        to_depth(&of->plan, of->coefficients, block * LINES, memory, memory + cosine_scratch_size(of->plan.height),
+                 of->lines + (size_t)block * of->plan.height * LINES);
     with_tiny(before);
     free(memory);
+}
+
+/* Row y of depth, less `level`, from `first`, a multiple of LANES, to `last`. */
+static void depth_in_row(const Solution *of, int y, int first, int last, float level, float *row) {
+    const size_t step = (size_t)of->plan.height * LANES;
+    row_of_depth(cosine_line(&of->plan.cosine, of->lines, y) + (size_t)(first / LANES) * step, step, level, last - first, row);
 }
 
 static void sum_rows(void *with, int band) {
     Solution *of = with;
     const Part *part = &of->part;
-    const int bands = bands_of(part->rows);
+    const int bands = bands_of(part->rows), first = part->left / LANES * LANES;
     for (int y = part->rows * band / bands; y < part->rows * (band + 1) / bands; y++) {
         const float *p = of->gradient + (size_t)y * part->columns;
+        float *row = of->depth + (size_t)(part->top + y) * of->plan.width;
+        depth_in_row(of, part->top + y, first, part->left + part->columns, 0.0f, row + first);
         of->row_count[y] = 0;
-        of->row_sum[y] = inclined_sum(of->depth + (size_t)(part->top + y) * of->plan.width + part->left, p, p + (size_t)part->rows * part->columns,
-                                      part->columns, of->row_count + y);
+        of->row_sum[y] = inclined_sum(row + part->left, p, p + (size_t)part->rows * part->columns, part->columns, of->row_count + y);
     }
 }
 
@@ -359,16 +364,17 @@ static float level_of(Solution *of) {
     share(sum_rows, of, bands_of(of->part.rows));
     for (int y = 0; y < of->part.rows; y++) sum += of->row_sum[y], inclined += (size_t)of->row_count[y];
     if (inclined < pixels) return (float)(-sum / (double)(pixels - inclined));
-    float level = of->depth[0];
+    float level = of->depth[0]; /* the part is the whole image */
     for (size_t k = 1; k < pixels; k++)
         if (of->depth[k] < level) level = of->depth[k];
     return level;
 }
 
-static void set_level(void *with, int band) {
+static void write_rows(void *with, int band) {
     Solution *of = with;
-    const int height = of->plan.height, bands = bands_of(height), first = height * band / bands, last = height * (band + 1) / bands;
-    subtract_level(of->depth + (size_t)first * of->plan.width, of->level, (size_t)(last - first) * of->plan.width);
+    const int height = of->plan.height, width = of->plan.width, bands = bands_of(height);
+    for (int y = height * band / bands; y < height * (band + 1) / bands; y++)
+        depth_in_row(of, y, 0, width, of->level, of->depth + (size_t)y * width);
 }
 
 /* constant: a double for each column. */
@@ -382,9 +388,9 @@ static void solve_one(Solution *of, int zeroed, double *constant) {
     solve_constant(&of->plan, constant);
     for (int x = 0; x < width; x++) of->coefficients[(size_t)x * SLICE] = (float)constant[x];
     share(transform_back, of, (width + LINES - 1) / LINES);
-    if (!zeroed || of->short_of_memory) return;
-    of->level = level_of(of);
-    share(set_level, of, bands_of(height));
+    if (of->short_of_memory) return;
+    of->level = zeroed ? level_of(of) : 0.0f;
+    share(write_rows, of, bands_of(height));
 }
 
 /*

@@ -124,9 +124,8 @@ static int make_ready(int count) {
 }
 #endif
 
-/* Until end_sharing(), share() lets up to `threads` threads work. Returns whether it does: not while another thread has the helpers. */
-int begin_sharing(int threads) {
-    if (threads < 2 || sharing || atomic_flag_test_and_set_explicit(&taken, memory_order_acquire)) return 0;
+/* Has helpers look for work, for the thread that has `taken`. Returns how many. */
+static int call_helpers(int threads) {
     const pid_t here = getpid();
     if (process != here) { /* a fork has the memory of its parent, but none of its helpers */
         static const pthread_mutex_t free_lock = PTHREAD_MUTEX_INITIALIZER;
@@ -135,14 +134,27 @@ int begin_sharing(int threads) {
         helpers = asleep = 0, process = here;
     }
     pthread_mutex_lock(&lock);
-    wanted = make_ready(least(threads - 1, MOST_HELPERS));
+    const int any = wanted = make_ready(least(threads - 1, MOST_HELPERS));
     frame++;
-    const int wake = asleep > 0, any = wanted > 0;
+    const int wake = asleep > 0;
     pthread_mutex_unlock(&lock);
     if (wake) pthread_cond_broadcast(&begun);
-    sharing = any;
-    if (!any) atomic_flag_clear_explicit(&taken, memory_order_release);
     return any;
+}
+
+/* Wakes helpers of a frame that is about to come, so that they are awake when it does. */
+EXPORT void wake_helpers(int threads) {
+    if (threads < 2 || sharing || atomic_flag_test_and_set_explicit(&taken, memory_order_acquire)) return;
+    call_helpers(threads);
+    atomic_flag_clear_explicit(&taken, memory_order_release);
+}
+
+/* Until end_sharing(), share() lets up to `threads` threads work. Returns whether it does: not while another thread has the helpers. */
+int begin_sharing(int threads) {
+    if (threads < 2 || sharing || atomic_flag_test_and_set_explicit(&taken, memory_order_acquire)) return 0;
+    sharing = call_helpers(threads) > 0;
+    if (!sharing) atomic_flag_clear_explicit(&taken, memory_order_release);
+    return sharing;
 }
 
 void end_sharing(int began) {
@@ -171,6 +183,8 @@ void share(PartOfWork work, void *with, int parts) {
 }
 
 #else
+
+EXPORT void wake_helpers(int threads) { (void)threads; }
 
 int begin_sharing(int threads) {
     (void)threads;

@@ -145,38 +145,45 @@ static void not_beside(const uint8_t *deformed, int height, int width, int y, ui
 
 enum { LANES = 16 };
 
+/* The bits of a float as a whole number of the same order: loops over such are vectorised, those over floats are not. Its own inverse. */
+static inline int32_t in_order(int32_t bits) { return bits ^ (bits >> 31 & 0x7fffffff); }
+
 /* Smallest and largest of n values. */
 WIDE static void range_of(const float *values, size_t n, float *lowest, float *highest) {
-    float low[LANES], high[LANES];
-    for (int j = 0; j < LANES; j++) low[j] = high[j] = values[0];
-    size_t k = 0;
-    for (; k + LANES <= n; k += LANES)
-        for (int j = 0; j < LANES; j++) {
-            low[j] = values[k + j] < low[j] ? values[k + j] : low[j];
-            high[j] = values[k + j] > high[j] ? values[k + j] : high[j];
-        }
-    for (; k < n; k++) {
-        low[0] = values[k] < low[0] ? values[k] : low[0];
-        high[0] = values[k] > high[0] ? values[k] : high[0];
+    int32_t low = INT32_MAX, high = INT32_MIN;
+    for (size_t k = 0; k < n; k++) {
+        union {
+            float value;
+            int32_t bits;
+        } here = {values[k]};
+        const int32_t at = in_order(here.bits);
+        low = at < low ? at : low;
+        high = at > high ? at : high;
     }
-    *lowest = low[0], *highest = high[0];
-    for (int j = 1; j < LANES; j++) {
-        *lowest = low[j] < *lowest ? low[j] : *lowest;
-        *highest = high[j] > *highest ? high[j] : *highest;
-    }
+    low = in_order(low), high = in_order(high);
+    memcpy(lowest, &low, sizeof low), memcpy(highest, &high, sizeof high);
 }
 
-/* Sum and count of a row's undeformed pixels below `middle`; others of them are marked as raised: a face of the object. */
+enum { BLOCK = 256 };
+
+/* Sum and count of a row's undeformed pixels below `middle`; others of them are marked as raised: a face of the object. Block by block, since loops
+   over bytes and floats are vectorised, but not with such sums among them. */
 WIDE static void flat_row(const float *restrict depth, uint8_t *restrict kind, float middle, int n, float *sum, int *count) {
-    float total = 0.0f, lanes[LANES] = {0.0f};
-    int found = 0, x = 0;
-    for (int k = 0; k < n; k++) {
-        found += kind[k] != DEFORMED && depth[k] < middle;
-        kind[k] = kind[k] == DEFORMED ? DEFORMED : depth[k] < middle ? FLAT : RAISED;
+    float total = 0.0f, lanes[LANES] = {0.0f}, flat[BLOCK];
+    int found = 0;
+    for (int first = 0; first < n; first += BLOCK, depth += BLOCK, kind += BLOCK) {
+        const int some = least(BLOCK, n - first);
+        int k = 0;
+        for (int x = 0; x < some; x++) {
+            const int is = (kind[x] != DEFORMED) & (depth[x] < middle);
+            flat[x] = (float)is * depth[x];
+            found += is;
+            kind[x] = kind[x] == DEFORMED ? DEFORMED : is ? FLAT : RAISED;
+        }
+        for (; k + LANES <= some; k += LANES)
+            for (int j = 0; j < LANES; j++) lanes[j] += flat[k + j];
+        for (; k < some; k++) total += flat[k];
     }
-    for (; x + LANES <= n; x += LANES)
-        for (int j = 0; j < LANES; j++) lanes[j] += kind[x + j] == FLAT ? depth[x + j] : 0.0f;
-    for (; x < n; x++) total += kind[x] == FLAT ? depth[x] : 0.0f;
     for (int j = 0; j < LANES; j++) total += lanes[j];
     *sum = total, *count = found;
 }

@@ -9,7 +9,8 @@ from kornia.morphology import dilation
 import torchvts as vts
 from torchvts import accelerated
 from torchvts.accelerated import reference_only
-from torchvts.contact.morphology import dilate, erode, reconstruct
+from torchvts.core.cells import cell_means, mean_around
+from torchvts.core.morphology import dilate, erode, reconstruct
 from torchvts.evaluation import metrics
 
 scenes = vts.scenes
@@ -218,6 +219,26 @@ def test_dilation_equals_kornia_and_the_twin(share):
     assert torch.equal(grown, dilation(mask.float(), torch.ones(3, 3)) > 0.5)
     assert np.array_equal(grown[0, 0].numpy(), references.dilate(mask[0, 0].numpy()))
     assert torch.equal(erode(mask), ~dilate(~mask))
+
+
+@pytest.mark.parametrize("reach", [2, 3, 4, 7, 40])  # 40: beyond the image
+def test_dilation_by_a_reach_repeats_the_dilation(reach):
+    mask = torch.rand(2, 1, 23, 31, generator=torch.Generator().manual_seed(1)) < 0.01
+    repeated = mask
+    for _ in range(reach):
+        repeated = dilate(repeated)
+    assert torch.equal(dilate(mask, reach), repeated)
+    assert torch.equal(erode(mask, reach), ~dilate(~mask, reach))
+
+
+@pytest.mark.parametrize("size", [(7, 9), (40, 50)])
+def test_means_of_cells_and_around_pixels_equal_pooling(size):
+    image = torch.rand(2, 3, *size, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    pool = torch.nn.functional.avg_pool2d
+    assert torch.allclose(mean_around(image), pool(image, 3, 1, 1))
+    for cell in (1, 2, 4):
+        padded = torch.nn.functional.pad(image, [0, -size[1] % cell, 0, -size[0] % cell])
+        assert torch.allclose(cell_means(image, cell), pool(padded, cell))
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from ..core.cells import cell_sums
 from ..core.checks import (
     QUANTISATION_STD,
     check_batch,
@@ -21,10 +22,10 @@ from ..core.checks import (
     may_read,
     may_read_values,
 )
+from ..core.morphology import dilate, dilate_cross, erode, reconstruct
 from ..core.noise import clipped_std, dark_below, sample_stride
 from ..core.noise import noise_std as frame_noise_std
 from ..model.calibration import Calibration, check_calibration
-from .morphology import dilate, dilate_cross, erode, reconstruct
 from .settings import ContactSettings
 
 CELLS = 80
@@ -222,9 +223,10 @@ class ContactMask(nn.Module):
         counted = strong.to(change.dtype)  # ONNX sums no bytes
         if may_read_values():
             counted = strong.to(torch.uint8 if self.cell < 16 else torch.int16)
-        density = _cell_sums(counted, self.cell).to(change.dtype) / float(self.cell * self.cell)
+        density = cell_sums(counted, self.cell).to(change.dtype) / float(self.cell * self.cell)
         any_strong = density > 0
-        faint = self.faint(change) & ~any_strong  # where single pixels stand out, as at a rim, they decide
+        mean = cell_sums(change, self.cell) / float(self.cell * self.cell)
+        faint = self.faint(mean) & ~any_strong  # where single pixels stand out, as at a rim, they decide
         cells = any_strong | faint
         if may_read(cells) and not bool(cells.any()):
             return strong, strong
@@ -234,22 +236,19 @@ class ContactMask(nn.Module):
         density = torch.where(filled & ~any_strong, weight, density)
         seed = filled & (_box_sum(_box_sum(density, self.reach, 2), self.reach, 3) > self.least_cells)
         kept = self.reconstruct(dilate_cross(seed) & filled, filled)
-        gaps = self.gaps(change, kept) if self.bridges else torch.zeros_like(kept)
+        gaps = self.gaps(mean, kept) if self.bridges else torch.zeros_like(kept)
         whole = kept | gaps
         interior = self._to_pixels(whole & (erode(filled | whole) | faint | gaps))
         return (strong & self._to_pixels(whole)) | interior, interior
 
-    def gaps(self, change: Tensor, kept: Tensor) -> Tensor:
-        """Cells between kept ones that have moved too, and what they enclose, bool."""
-        mean = _cell_sums(change, self.cell) / float(self.cell * self.cell)
+    def gaps(self, mean: Tensor, kept: Tensor) -> Tensor:
+        """Cells between kept ones that have moved too, and what they enclose, bool; ``mean`` is the change of each cell."""
         weak = mean.square().sum(1, keepdim=True) > self.bridge_sigmas**2
-        near = _spread(_spread(kept, self.bridge_cells, 2), self.bridge_cells, 3)
-        closed = ~_spread(_spread(~near, self.bridge_cells, 2), self.bridge_cells, 3)
+        closed = erode(dilate(kept, self.bridge_cells), self.bridge_cells)
         return self.filled(kept | (closed & weak)) & ~kept
 
-    def faint(self, change: Tensor) -> Tensor:
+    def faint(self, mean: Tensor) -> Tensor:
         """Cells whose mean change stands out of the spread of all cells by 5 sigmas, bool."""
-        mean = _cell_sums(change, self.cell) / float(self.cell * self.cell)
         rows, columns = mean.shape[2], mean.shape[3]
         step = max(1, min(max(rows, columns) // 40, rows, columns))  # a median of some thousand cells is as good
         spread = mean[:, :, step // 2 :: step, step // 2 :: step].abs().flatten(2).median(dim=2).values / 0.6745
@@ -267,17 +266,11 @@ class ContactMask(nn.Module):
         return ~self.reconstruct(border, ~mask)
 
     def reconstruct(self, seed: Tensor, mask: Tensor) -> Tensor:
-        """:func:`~torchvts.contact.morphology.reconstruct`."""
+        """:func:`~torchvts.core.morphology.reconstruct`."""
         return reconstruct(seed, mask)
 
     def _to_pixels(self, cells: Tensor) -> Tensor:
         return cells.index_select(3, self.cell_column).index_select(2, self.cell_row)
-
-
-def _spread(mask: Tensor, reach: int, dim: int) -> Tensor:
-    """Dilation by ``reach`` cells along a dimension."""
-    size, pad = ([2 * reach + 1, 1], [reach, 0]) if dim == 2 else ([1, 2 * reach + 1], [0, reach])
-    return nn.functional.max_pool2d(mask.to(torch.float32), size, 1, pad) > 0.5
 
 
 def most_far_field(calibration: Calibration) -> float:
@@ -287,26 +280,6 @@ def most_far_field(calibration: Calibration) -> float:
 
 def _stand_in(calibration: Calibration) -> bool:
     return calibration.report.get("source") == "stand_in"
-
-
-def _cell_sums(image: Tensor, cell: int) -> Tensor:
-    """Sums over cells of a (B, C, H, W) image, in its own dtype; where the size is no multiple, the last cells overlap others."""
-    return image if cell == 1 else _line_sums(_line_sums(image, cell).transpose(2, 3), cell).transpose(2, 3).contiguous()
-
-
-def _line_sums(image: Tensor, cell: int) -> Tensor:
-    """Sums of each ``cell`` rows."""
-    whole = image.shape[2] // cell * cell
-    sums = image[:, :, 0:whole:cell]
-    for k in range(1, cell):
-        sums = sums + image[:, :, k:whole:cell]
-    if whole == image.shape[2]:
-        return sums
-    last = image[:, :, -cell : image.shape[2] - cell + 1]
-    for k in range(1, cell):
-        first = image.shape[2] - cell + k
-        last = last + image[:, :, first : first + 1]
-    return torch.cat((sums, last), dim=2)
 
 
 def _box_sum(image: Tensor, reach: int, dim: int) -> Tensor:

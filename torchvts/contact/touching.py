@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
+from ..core.cells import cell_means
 from ..core.checks import check_batch, check_mask, check_positive, check_same_size
 
 CELL_MM = 0.13
@@ -105,10 +106,7 @@ class ContactFromDepth(nn.Module):
         """The same of checked inputs; compiled kernels replace this method."""
         height, width, cell = depth.shape[2], depth.shape[3], self.cell
         inside = deformed.to(torch.uint8).to(depth.dtype)
-        fields = torch.cat((inside, depth * inside, gradient * inside), dim=1)
-        fields = nn.functional.pad(fields, [0, -width % cell, 0, -height % cell])
-        fields = nn.functional.avg_pool2d(fields, cell) if cell > 1 else fields
-        level = self.rim_depth(fields)
+        level = self.rim_depth(cell_means(torch.cat((inside, depth * inside, gradient * inside), dim=1), cell))
         if cell > 1:
             level = level.repeat_interleave(cell, dim=2).repeat_interleave(cell, dim=3)[:, :, :height, :width]
         return deformed & (depth > level)

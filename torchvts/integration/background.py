@@ -3,7 +3,9 @@
 import torch
 from torch import Tensor, nn
 
+from ..core.cells import cell_means, mean_around
 from ..core.checks import check_batch, check_same_size, may_read
+from ..core.morphology import dilate
 
 STIFF = 30.0
 """How much less the deepest skin bends to the continuation than undeformed skin: slopes are calibrated in contact only."""
@@ -55,50 +57,44 @@ class ZeroBackground(nn.Module):
         check_batch("depth_mm", depth_mm, 1)
         height, width = depth_mm.shape[2], depth_mm.shape[3]
         check_same_size("deformed", deformed, "depth_mm", height, width)
-        free, high = _beside(deformed, depth_mm), depth_mm.amax(dim=(2, 3), keepdim=True)
-        flat = below_faces(free, free * _as(depth_mm < _middle(depth_mm), depth_mm), self.least_low)
-        count = flat.sum(dim=(2, 3), keepdim=True)
-        level = (depth_mm * flat).sum(dim=(2, 3), keepdim=True) / count.clamp_min(1.0)
-        raised = free - flat  # a face of the object: only the frame's mean is taken out
+        free, (low, high) = _beside(deformed), _range(depth_mm)
+        flat = below_faces(free, free & (depth_mm < 0.5 * (low + high)), self.least_low)
+        known, raised = _as(flat, depth_mm), _as(free & ~flat, depth_mm)  # a face of the object: only the frame's mean is taken out
+        values = depth_mm * known
+        level = values.sum(dim=(2, 3), keepdim=True) / known.sum(dim=(2, 3), keepdim=True).clamp_min(1.0)
         range_mm = (high - level).clamp_min(1e-9)
-        weight = 1.0 + self.stiff * ((depth_mm - level) / range_mm).clamp_min(0.0).square()
-        fields = torch.cat((free, depth_mm * flat + level * raised, weight), dim=1)
-        offset = self.continued(fields)
-        below = (1.0 - free) * _as(depth_mm < offset - self.tolerance * range_mm, depth_mm)  # that too is an error
-        offset = self.continued(fields + torch.cat((below, depth_mm * below, torch.zeros_like(below)), dim=1))
-        return (depth_mm - offset) * (1.0 - flat)
+        above = ((depth_mm - level) / range_mm).clamp_min(0.0)
+        cell = max(1, min(height, width) // 60)
+        weights = _pyramid(cell_means(1.0 + self.stiff * above * above, cell))
+        cells = torch.cat((cell_means(known + raised, cell), cell_means(torch.addcmul(values, raised, level), cell)), dim=1)
+        offset = _pixels(self.continued(cells, weights), cell, height, width)
+        below = _as(~free & (depth_mm < offset - self.tolerance * range_mm), depth_mm)  # that too is an error
+        cells = cells + torch.cat((cell_means(below, cell), cell_means(depth_mm * below, cell)), dim=1)
+        offset = _pixels(self.continued(cells, weights), cell, height, width)
+        return (depth_mm - offset) * (1.0 - known)
 
-    def continued(self, fields: Tensor) -> Tensor:
-        """Values continued to all pixels, (B, 1, H, W).
+    def continued(self, known: Tensor, weights: list[Tensor]) -> Tensor:
+        """Values continued to all cells, (B, 1, h, w).
 
         Args:
-            fields: (B, 3, H, W): the share of a pixel on which the value is known, 0 or 1; the value, 0 where it is unknown; the
-                weight of the pixel, whose square is the stiffness against the continuation.
+            known: (B, 2, h, w): the share of a cell on which the value is known, and the mean of the value, 0 where it is unknown.
+            weights: (B, 1, h, w) and coarser: the weight of a cell, whose square is the stiffness against the continuation.
         """
-        height, width = fields.shape[2], fields.shape[3]
-        cell = max(1, min(height, width) // 60)
-        fields = _coarser(fields, cell)
-        grids = [fields]
-        while min(grids[-1].shape[2], grids[-1].shape[3]) > 2:
-            grids.append(_coarser(grids[-1], 2))
-        share, values = grids[-1][:, 0:1], grids[-1][:, 1:2]
-        mean = values.sum(dim=(2, 3), keepdim=True) / share.sum(dim=(2, 3), keepdim=True).clamp_min(1e-9)
-        found = mean.expand_as(values)
-        for k in range(len(grids)):
-            grid = grids[len(grids) - 1 - k]
-            share, values, weight = grid[:, 0:1], grid[:, 1:2], grid[:, 2:3]
-            if k > 0:
-                found = nn.functional.interpolate(found, scale_factor=2.0, mode="bilinear", align_corners=False)
-                found = found[:, :, : share.shape[2], : share.shape[3]]
-            known, values = share > 0.0, values / share.clamp_min(1e-9)
-            found = torch.where(known, values, found)
-            total = nn.functional.avg_pool2d(weight, 3, 1, 1).clamp_min(1e-9)
+        grids = _pyramid(known)
+        mean = grids[-1][:, 1:2].sum(dim=(2, 3), keepdim=True) / grids[-1][:, 0:1].sum(dim=(2, 3), keepdim=True).clamp_min(1e-9)
+        found = mean.expand_as(weights[-1])
+        for k in range(len(grids) - 1, -1, -1):
+            share, weight = grids[k][:, 0:1], weights[k]
+            if k < len(grids) - 1:
+                found = _pixels(found, 2, share.shape[2], share.shape[3])
+            free = weight.masked_fill(share > 0.0, 0.0)
+            # of the products weight * value: those that are known, and the part of the mean around that others take
+            held, taken = weight * (grids[k][:, 1:2] / share.clamp_min(1e-9)), free / mean_around(weight)
+            product = torch.addcmul(held, free, found)
             for _ in range(self.sweeps):
-                around = nn.functional.avg_pool2d(weight * found, 3, 1, 1) / total
-                found = torch.where(known, values, around)
-        if cell > 1:
-            found = nn.functional.interpolate(found, scale_factor=float(cell), mode="bilinear", align_corners=False)
-        return found[:, :, :height, :width]
+                product = torch.addcmul(held, taken, mean_around(product))
+            found = product / weight
+        return found
 
 
 def with_cut_faces(depth_mm: Tensor, deformed: Tensor) -> Tensor:
@@ -121,29 +117,29 @@ def with_cut_faces(depth_mm: Tensor, deformed: Tensor) -> Tensor:
     cut = _on_border(deformed)
     if may_read(deformed) and not bool(cut.any()):
         return deformed
-    free, above = _beside(deformed, depth_mm), depth_mm >= _middle(depth_mm)
-    flat = below_faces(free, free * _as(~above, depth_mm))
-    found = cut & _on_border(free - flat > 0.0) & (flat.amax(dim=(2, 3), keepdim=True) > 0.0)
+    low, high = _range(depth_mm)
+    free, above = _beside(deformed), depth_mm >= 0.5 * (low + high)
+    flat = below_faces(free, free & ~above)
+    found = cut & _on_border(free & ~flat) & (_count(flat) > 0.0)
     return deformed | (found & above)
 
 
 def below_faces(free: Tensor, low: Tensor, least_low: float = LEAST_LOW) -> Tensor:
-    """Undeformed skin, (B, 1, H, W): the lower part of what shows no change, or all of it if the rest is no face of the object.
+    """Undeformed skin, bool (B, 1, H, W): the lower part of what shows no change, or all if the rest is no face of the object.
 
     The rest is one if deformed skin is most of what surrounds it. Where the lower part is empty, depth is upside down, as of a
     module in training, and stays so: held at zero, it would not learn.
 
     Args:
-        free: (B, 1, H, W), 1 where skin shows no change, else 0.
+        free: bool (B, 1, H, W), where skin shows no change.
         low: the same of its part below half of the frame's depth.
         least_low: share of ``free`` below which ``low`` is a pocket of errors.
     """
-    high = free - low
-    rim = nn.functional.max_pool2d(high, 3, 1, 1) - high
-    by_low, by_deformed = (rim * low).sum(dim=(2, 3), keepdim=True), (rim * (1.0 - free)).sum(dim=(2, 3), keepdim=True)
-    count, of = low.sum(dim=(2, 3), keepdim=True), free.sum(dim=(2, 3), keepdim=True)
-    pocket = (count > 0.0) & (count < least_low * of)
-    return torch.where((by_deformed > by_low) & ~pocket, low, free)
+    high = free & ~low
+    rim = dilate(high) & ~high
+    count = _count(low)
+    pocket = (count > 0.0) & (count < least_low * _count(free))
+    return low | (free & ~((_count(rim & ~free) > _count(rim & low)) & ~pocket))
 
 
 class DepthAsIs(nn.Module):
@@ -157,14 +153,19 @@ def _as(mask: Tensor, like: Tensor) -> Tensor:
     return mask.to(torch.uint8).to(like.dtype)
 
 
-def _beside(deformed: Tensor, like: Tensor) -> Tensor:
-    """1 where no skin within two pixels is deformed, else 0: a steep rim may be two pixels wider than the mask."""
-    return 1.0 - nn.functional.max_pool2d(_as(deformed, like), 5, 1, 2)
+def _beside(deformed: Tensor) -> Tensor:
+    """Where no skin within two pixels is deformed, bool: a steep rim may be two pixels wider than the mask."""
+    return ~dilate(deformed, 2)
 
 
-def _middle(depth_mm: Tensor) -> Tensor:
-    """Half of each frame's depth, (B, 1, 1, 1)."""
-    return 0.5 * (depth_mm.amin(dim=(2, 3), keepdim=True) + depth_mm.amax(dim=(2, 3), keepdim=True))
+def _count(mask: Tensor) -> Tensor:
+    """Pixels of each frame in a mask, (B, 1, 1, 1)."""
+    return mask.to(torch.uint8).to(torch.float32).sum(dim=(2, 3), keepdim=True)  # a quarter of the time of a sum of bools
+
+
+def _range(depth_mm: Tensor) -> tuple[Tensor, Tensor]:
+    """The least and the largest depth of each frame, (B, 1, 1, 1)."""
+    return depth_mm.amin(dim=(2, 3), keepdim=True), depth_mm.amax(dim=(2, 3), keepdim=True)
 
 
 def _on_border(mask: Tensor) -> Tensor:
@@ -173,9 +174,16 @@ def _on_border(mask: Tensor) -> Tensor:
     return across.any(dim=2)[..., None, None]
 
 
-def _coarser(fields: Tensor, cell: int) -> Tensor:
-    """Means over cells; beyond the border nothing is known."""
-    if cell == 1:
-        return fields
-    height, width = fields.shape[2], fields.shape[3]
-    return nn.functional.avg_pool2d(nn.functional.pad(fields, [0, -width % cell, 0, -height % cell]), cell)
+def _pyramid(fields: Tensor) -> list[Tensor]:
+    """Fields, and their means over cells of 2, 4, ... a side, down to two cells along the shorter side."""
+    grids = [fields]
+    while min(grids[-1].shape[2], grids[-1].shape[3]) > 2:
+        grids.append(cell_means(grids[-1], 2))
+    return grids
+
+
+def _pixels(cells: Tensor, cell: int, height: int, width: int) -> Tensor:
+    """Values of cells at pixels, interpolated."""
+    if cell > 1:
+        cells = nn.functional.interpolate(cells, scale_factor=float(cell), mode="bilinear", align_corners=False)
+    return cells[:, :, :height, :width]

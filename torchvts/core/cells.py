@@ -1,0 +1,45 @@
+"""Sums and means over square cells of pixels, by shifted slices: of many pixels half the time of a pooling operator on a CPU."""
+
+import torch
+from torch import Tensor, nn
+
+
+def cell_sums(image: Tensor, cell: int) -> Tensor:
+    """Sums over cells of a (B, C, H, W) image, in its own dtype; where the size is no multiple, the last cells overlap others."""
+    return image if cell == 1 else _line_sums(_line_sums(image, cell).transpose(2, 3), cell).transpose(2, 3).contiguous()
+
+
+def cell_means(image: Tensor, cell: int) -> Tensor:
+    """Means over cells of a (B, C, H, W) image; beyond the border it counts as zero."""
+    if cell == 1:
+        return image
+    below, after = -image.shape[2] % cell, -image.shape[3] % cell
+    if below > 0 or after > 0:
+        image = nn.functional.pad(image, [0, after, 0, below])
+    if cell == 2:  # of few pixels: they come from a grid of larger cells
+        return nn.functional.avg_pool2d(image, cell)
+    return cell_sums(image, cell) / float(cell * cell)
+
+
+def mean_around(image: Tensor) -> Tensor:
+    """Mean over 3 x 3 pixels of a (B, C, H, W) image; beyond the border it counts as zero."""
+    if image.shape[2] * image.shape[3] < 1000:
+        return nn.functional.avg_pool2d(image, 3, 1, 1)
+    padded = nn.functional.pad(image, [1, 1, 1, 1])
+    rows = padded[:, :, :-2] + padded[:, :, 1:-1] + padded[:, :, 2:]
+    return (rows[..., :-2] + rows[..., 1:-1] + rows[..., 2:]) / 9.0
+
+
+def _line_sums(image: Tensor, cell: int) -> Tensor:
+    """Sums of each ``cell`` rows."""
+    whole = image.shape[2] // cell * cell
+    sums = image[:, :, 0:whole:cell]
+    for k in range(1, cell):
+        sums = sums + image[:, :, k:whole:cell]
+    if whole == image.shape[2]:
+        return sums
+    last = image[:, :, -cell : image.shape[2] - cell + 1]
+    for k in range(1, cell):
+        first = image.shape[2] - cell + k
+        last = last + image[:, :, first : first + 1]
+    return torch.cat((sums, last), dim=2)

@@ -11,14 +11,14 @@ import torchvts as vts
 from torchvts.accelerated import library, reference_only
 from torchvts.cli.track import record
 from torchvts.core.frame import DepthOutput
-from torchvts.evaluation import tracking
+from torchvts.evaluation import pose_accuracy, tracking
 from torchvts.pose.follow import adjoint, follow, orthonormal
 from torchvts.pose.graph import Edge, KeyframeGraph
 from torchvts.pose.inverse import Sums, refine, solve_step, sum_parts, sum_residuals
 from torchvts.pose.jackknife import ALIKE_MM, jackknife, shared_error
 from torchvts.pose.keyframe import PARTS, contact_frame, grids, make_keyframe
 from torchvts.pose.result import invert, motion, turn_deg
-from torchvts.scenes import objects
+from torchvts.scenes import objects, render
 from torchvts.stream import TactileFrame
 
 PITCH = 0.125
@@ -419,14 +419,25 @@ def test_a_row_of_the_file_holds_pose_and_reason():
     assert float(row["T03"]) == pytest.approx(float(found.T_target_source[0, 3]), rel=1e-6)
 
 
+@pytest.mark.parametrize("turn", [0.0, 35.0])
+def test_a_rig_that_knows_its_noise_measures_the_depth_of_steep_flanks(turn):
+    """Noise in a shadow looks like light: flanks steeper than the lights came out too shallow, and a key by 0.02 mm too low."""
+    scene = objects.press(objects.key(), objects.pose(turn, press_mm=0.45), 180, 240, 1.0 / 12.0)
+    low = []
+    for told in (0.0, 0.005):
+        lights, pipe = pose_accuracy.rig(180, 240, 1.0 / 12.0, told)
+        out = pipe(render(scene, lights, noise_std=0.005, bits=8, seed=1))
+        low.append(float((scene.depth_mm - out.depth_mm)[out.contact & scene.contact].mean()))
+    assert low[0] > 0.012 and abs(low[1]) < 0.005
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "motion_", "most_mm"),
-    [("bottle cap", "slow", 0.01), ("bolt head", "slow", 0.01), ("key", "fast", 0.02), ("bolt head", "fast", 0.02)],
+    [("bottle cap", "slow", 0.005), ("key", "slow", 0.005), ("key", "fast", 0.01), ("bolt head", "fast", 0.01)],
 )
 def test_rendered_objects_meet_the_goal(name, motion_, most_mm):
-    """Asked is the slow motion: 90 degrees in 40 frames, medians of 0.05 degrees and 0.01 mm. The fast one, in 14 frames, has
-    half as strict a position: of a key it follows the depth, whose offset changes by 0.02 mm with the yaw."""
+    """Asked is the slow motion: 90 degrees in 40 frames, medians of 0.05 degrees and 0.01 mm. The fast one has 14 frames."""
     ((row, _),) = tracking.run_tracking([name], [motion_], ["noise 0.005"], seed=4)
     assert row.lost == [] and row.wrong == []
     assert float(np.median(row.deg)) < 0.05 and float(np.median(row.mm)) < most_mm and max(row.deg) < 0.3
@@ -435,7 +446,7 @@ def test_rendered_objects_meet_the_goal(name, motion_, most_mm):
 @pytest.mark.long
 def test_slopes_that_err_over_wide_areas_are_no_reason_for_confidence():
     ((row, track),) = tracking.run_tracking(["tool handle"], ["fast"], ["slopes off by 3 degrees"], seed=4)
-    assert max(row.deg) > 1.0 and row.lost == [] and row.wrong == []
+    assert max(row.deg) > 0.7 and row.lost == [] and row.wrong == []
     tracker = vts.PoseTracker(track.frames[0], track.mm_per_pixel)
     for frame in track.frames[1:6]:
         found = tracker(frame)

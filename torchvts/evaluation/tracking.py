@@ -230,7 +230,8 @@ class WrongSlopes:
         at = torch.cat((place, frame.gradient[0, :, row, column].T), 1)  # (N, 4)
         raw[0, :, row, column] += self._size @ torch.cos(at @ self._frequency.T + self._phase).T
         small = 0.03 * poisson_dst(raw, self._pitch)  # too small to move where skin is undeformed
-        depth = ZeroBackground()(frame.depth_mm + small, frame.deformed) - frame.depth_mm
+        zero = ZeroBackground()
+        depth = zero(frame.depth_mm + small, frame.deformed) - zero(frame.depth_mm, frame.deformed)
         return self._scale * gradient_of_depth(depth, self._pitch) * frame.deformed, self._scale * depth
 
 
@@ -276,12 +277,12 @@ def run_tracking(
     seed: int = 1,
 ) -> Iterator[tuple[TrackRow, Track]]:
     """Track objects under all motions and noises, one row after the other."""
-    unit = rig()
+    units = {noise: rig(noise_std=NOISES[noise].image_std) for noise in noises}
     for name in names:
         target = {**objects.TARGETS, **objects.FREE_TARGETS}[name]
         for motion in motions:
             for noise in noises:
-                track = record(target, MOTIONS[motion], NOISES[noise], seed, unit)
+                track = record(target, MOTIONS[motion], NOISES[noise], seed, units[noise])
                 yield follow_track(track, MOTIONS[motion], TrackRow(name, motion, noise)), track
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchvts import DepthPipeline, Sensor, poisson_background
-from torchvts.calibration import by_presses
+from torchvts.calibration import Press, by_presses, calibrate
 from torchvts.evaluation import drawn_sensors
 from torchvts.evaluation.drawn_sensors import OBJECTS, drawn_sensor
 from torchvts.evaluation.metrics import normal_angle_deg
@@ -122,3 +122,16 @@ def test_the_second_pass_learned_from_balls_carries_over_to_other_objects(seed):
         errors[mode] = [float(normal_angle_deg(n, p.scene.normal, p.scene.contact).mean()) for n, p in pairs]
     assert sum(errors["precise"]) < 0.95 * sum(errors["fast"]) and sum(errors["fast"]) / len(OBJECTS) < 4.5
     assert all(second < 1.05 * first for first, second in zip(errors["fast"], errors["precise"], strict=True))
+
+
+@pytest.mark.long
+def test_lights_that_do_not_explain_the_background_are_not_chosen():
+    """Their normals are right on the ball, but undeformed skin would seem 0.3 mm deep as soon as its light changes."""
+    unit = drawn_sensor(14)
+    ball = unit.ball(4.0, 0.5, (0.8, -0.6))
+    calibration = calibrate(unit.background, unit.sensor, [Press(ball.image, 4.0, "ball")])
+    lights = calibration.report["candidates"][0]
+    assert lights["score_deg"] < 5.0 and lights["misfit"] > 0.1 and calibration.report["model"] == "response"
+    pressed = unit.press(objects.capsule(), objects.pose(press_mm=0.4))
+    out = DepthPipeline.from_calibration(calibration)(pressed.image[None])
+    assert float(out.depth_mm.min()) > -0.05

@@ -36,6 +36,10 @@ PRIOR_CANDIDATES = Candidates(((2, 1, -1),), 60.0)
 """Chosen by other units: larger fields, and weakly regularised products, fit the unit of the presses better and others worse
 (docs/decisions.md)."""
 
+MOST_MISFIT = 0.02
+"""Point lights explain a unit whose background they miss by less than this, smoothly. Where they miss more, as under extended or
+scattered light, their normals may be right on balls, but undeformed skin seems deformed as soon as its light changes."""
+
 TIE = 1.05
 """Point lights are preferred to response fields unless these are better by more than this factor."""
 
@@ -57,7 +61,8 @@ def calibrate(
       that the sensor file gives and that do not look like the image only the directions are used, with a warning: depth is then
       not metric.
     * Presses: response fields, starting from the prior if there is one, their size chosen by the error of normals on presses that
-      were held out; point lights if they do better on the presses. The balls are located automatically.
+      were held out; point lights if they do better on the presses and explain the background. The balls are located
+      automatically.
     * Touches: a response field whose slopes have the least curl, with its scale from presses or a known depth. They add nothing
       to a prior, so with one they are not used.
 
@@ -237,8 +242,14 @@ def _without_presses(
 
 def _constrained(row: CandidateRow) -> bool:
     """Whether the image constrains the lights so well that they replace a prior."""
-    score, misfit = row.get("score_deg"), row.get("misfit")
-    return score is not None and misfit is not None and score <= WELL_CONSTRAINED_DEG and misfit < 0.02
+    score = row.get("score_deg")
+    return score is not None and score <= WELL_CONSTRAINED_DEG and _explained(row)
+
+
+def _explained(row: CandidateRow) -> bool:
+    """Whether point lights give the light of the background."""
+    misfit = row.get("misfit")
+    return misfit is not None and misfit < MOST_MISFIT
 
 
 def _fit_presses(given: _Given, prior: _Prior, touched: TouchResult | None) -> FromPresses:
@@ -273,7 +284,9 @@ def _with_presses(given: _Given, lights: LightsResult, prior: _Prior, touched: T
     of_diameters = complaints.of_diameters_by_others if from_presses_alone else complaints.of_diameters_by_prior
     found = [dropped] * bool(dropped) + complaints.of_contacts(contacts) + of_diameters(balls)
     # twelve parameters that do about as well as a hundred are the better model
-    lights_win = error_deg < (math.inf if fit.error_deg is None else TIE * fit.error_deg) and error_deg < POORLY_CONSTRAINED_DEG
+    as_good = error_deg < (math.inf if fit.error_deg is None else TIE * fit.error_deg) and error_deg < POORLY_CONSTRAINED_DEG
+    known = given.sensor.light_position_mm is not None  # they explain it where nothing is complained of
+    lights_win = as_good and (not lights.complaint if known else _explained(row))
     if lights_win and lights.unit is not None:
         other = "too few presses for a response field" if fit.error_deg is None else f"response fields {fit.error_deg:.2f}"
         report = lights.unit.report.copy()

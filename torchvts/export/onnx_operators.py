@@ -10,7 +10,7 @@ from torch import Tensor
 def decompositions() -> dict[Any, Callable[..., Any]]:
     """The replacements by operator, for ``ExportedProgram.run_decompositions``."""
     aten = torch.ops.aten
-    return {aten.median.dim: median, aten.nanmedian.dim: nanmedian, aten.cummax.default: cummax}
+    return {aten.median.dim: median, aten.nanmedian.dim: nanmedian}
 
 
 def median(values: Tensor, dim: int, keepdim: bool = False) -> tuple[Tensor, Tensor]:
@@ -29,13 +29,3 @@ def nanmedian(values: Tensor, dim: int, keepdim: bool = False) -> tuple[Tensor, 
     ordered, index = ordered.gather(dim, middle), index.gather(dim, middle)
     ordered = torch.where(known.any(dim, keepdim=True), ordered, torch.nan)
     return (ordered, index) if keepdim else (ordered.squeeze(dim), index.squeeze(dim))
-
-
-def cummax(values: Tensor, dim: int) -> tuple[Tensor, Tensor]:
-    """``torch.cummax`` by shifts that double; the indices of the maxima, which no block uses, stay zero."""
-    length, step = values.shape[dim], 1
-    while step < length:
-        later, earlier = values.narrow(dim, step, length - step), values.narrow(dim, 0, length - step)
-        values = torch.cat((values.narrow(dim, 0, step), torch.maximum(later, earlier)), dim=dim)
-        step *= 2
-    return values, torch.zeros_like(values, dtype=torch.int64)

@@ -42,7 +42,7 @@ def run_python(program, *arguments, timeout=900, **environment):
     return subprocess.run(command, env=ENVIRONMENT | environment, capture_output=True, text=True, errors="replace", timeout=timeout)
 
 
-# ---- loops against tensors ----
+# ---- kernels against the PyTorch reference ----
 
 
 def layouts(tensor):
@@ -104,7 +104,7 @@ def close(found, expected, tolerance):
 
 
 def disagreements(size, counts=(1, 3)):
-    """What loops and tensors do not agree on, and how many comparisons were made."""
+    """What kernels and PyTorch reference do not agree on, and how many comparisons were made."""
     scene, lights, units = units_of(size)
     wrong, done = [], 0
     for unit, count in ((unit, count) for unit in units for count in counts):

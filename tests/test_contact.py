@@ -123,7 +123,7 @@ def test_skin_at_rest_in_a_shadow_is_shaded_and_a_press_is_not():
     expected = torch.zeros(64, 64, dtype=torch.bool)
     expected[8:24, 8:24] = True
     assert torch.equal(found, expected) and bool(mask(image[None])[0, 0][found].all())
-    image[2] = 0.0  # a lamp that is dead
+    image[2] = 0.0  # a failed LED
     assert not bool(mask.shadowed(image[None]).any())
     dim = torch.full((3, 64, 64), 0.05)  # a channel that is never bright cannot go dark
     assert not bool(vts.ContactMask(dim, torch.full((3,), 0.01)).shadowed(torch.zeros(1, 3, 64, 64)).any())

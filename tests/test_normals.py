@@ -124,7 +124,7 @@ def test_two_lights_and_unit_length_give_the_slope(ring, brightness_std, toleran
 
 @pytest.mark.parametrize("press_mm, worst_px", [(0.5, 0.08), (1.0, 0.4)])
 @pytest.mark.parametrize("dead", [0, 1, 2])
-def test_two_lamps_go_on_when_one_is_dead(ring, press_mm, worst_px, dead):
+def test_two_leds_go_on_when_one_fails(ring, press_mm, worst_px, dead):
     """What is left of the third channel is noise. The plain inverse errs by more than the press is deep."""
     lights, scene = ring(), press(press_mm, torch.float32, 120, 160)
     rest = scenes.render(scenes.undeformed(scene), lights, noise_std=0.004, bits=8, seed=1)[0]

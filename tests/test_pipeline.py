@@ -216,7 +216,7 @@ def dimmed(lights, factors):
 
 @pytest.mark.parametrize("factors", [(0.9, 1.0, 1.0), (1.0, 0.75, 1.0), (1.1, 0.85, 0.95)])
 @pytest.mark.parametrize("radius_mm, press_mm", [(10.0, 1.0), (40.0, 2.0)])
-def test_auto_levels_lamps_that_have_dimmed(ring, small_sensor, small_press, factors, radius_mm, press_mm):
+def test_auto_normalises_leds_that_have_dimmed(ring, small_sensor, small_press, factors, radius_mm, press_mm):
     """10 to 25 % off; contacts of 5 and 40 % of the image. Left as it is, the mask floods and the depth is far off."""
     lights, scene = ring(), small_press(press_mm, (2.0, 1.0), radius_mm)
     rest = scenes.render(scenes.undeformed(scene), lights, noise_std=0.004, bits=8, seed=1)[0]
@@ -261,7 +261,7 @@ def test_a_response_field_levels_up_to_a_quarter(small_sensor, factor, touched):
     assert (at_rest - 1.0).abs().max() < 0.006
 
 
-def test_a_lamp_that_is_out_is_no_drift(ring, small_sensor, small_press):
+def test_a_failed_led_is_no_drift(ring, small_sensor, small_press):
     lights, scene = ring(), small_press(1.0)
     calibration = vts.Calibration.from_lights(lights, small_sensor)
     image = scenes.render(scene, lights)
@@ -495,7 +495,7 @@ def test_a_background_without_valid_pixels_is_refused():
 
 @pytest.mark.parametrize("height_mm, out_mm, albedo", [(30.0, 25.0, 1000.0), (18.0, 22.0, 500.0), (15.0, 24.0, 450.0)])
 @pytest.mark.parametrize("noise_std", [0.002, 0.005])
-def test_a_dimmed_lamp_costs_nothing_on_rigs_that_saturate(height_mm, out_mm, albedo, noise_std):
+def test_a_dimmed_led_costs_nothing_on_rigs_that_saturate(height_mm, out_mm, albedo, noise_std):
     angles = torch.deg2rad(torch.tensor([0.0, 120.0, 240.0]))
     position = torch.stack((out_mm * angles.cos(), out_mm * angles.sin(), torch.full((3,), height_mm)), dim=1)
     lights = vts.PointLights(position, [albedo] * 3)
@@ -506,9 +506,9 @@ def test_a_dimmed_lamp_costs_nothing_on_rigs_that_saturate(height_mm, out_mm, al
     pipe = vts.DepthPipeline.from_calibration(calibration, "auto")
     errors = []
     for gain in (1.0, 0.9):
-        lamps = vts.PointLights(position, [albedo, gain * albedo, albedo])
+        lights = vts.PointLights(position, [albedo, gain * albedo, albedo])
         with torch.inference_mode():
-            out = pipe(vts.scenes.render(scene, lamps, noise_std=noise_std, bits=8))
+            out = pipe(vts.scenes.render(scene, lights, noise_std=noise_std, bits=8))
         errors.append(metrics.depth_error(out.depth_mm, scene.depth_mm, 0.25))
     assert errors[1].rms_px < 1.3 * errors[0].rms_px
     assert errors[1].max_px < 1.3 * errors[0].max_px

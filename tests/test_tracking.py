@@ -246,13 +246,13 @@ def test_the_jackknife_expects_errors_that_parts_have_in_common(alike):
     """Independent errors, and errors that all pixels of a part share: the variance is that of repeated draws."""
     generator = np.random.default_rng(3)
     jacobian = generator.standard_normal((PARTS, 50, 6))
-    matrices, steps, told = np.swapaxes(jacobian, 1, 2) @ jacobian, [], []
+    matrices, steps, stated = np.swapaxes(jacobian, 1, 2) @ jacobian, [], []
     for _ in range(400):
         common = generator.standard_normal((PARTS, 1)) * alike
         rights = np.einsum("kni,kn->ki", jacobian + 0.5, generator.standard_normal((PARTS, 50)) + common)
         steps.append(-np.linalg.solve(matrices.sum(0), rights.sum(0)))
-        told.append(jackknife(matrices, rights, np.eye(6)))
-    ratio = np.trace(np.mean(told, 0)) / np.square(steps).sum(1).mean()
+        stated.append(jackknife(matrices, rights, np.eye(6)))
+    ratio = np.trace(np.mean(stated, 0)) / np.square(steps).sum(1).mean()
     assert 0.9 < ratio < 1.6
     held = jackknife(matrices, rights, np.eye(6)[:, 2:])
     assert not held[:2].any() and np.linalg.eigvalsh(held)[2:].min() > 0
@@ -424,8 +424,8 @@ def test_a_rig_that_knows_its_noise_measures_the_depth_of_steep_flanks(turn):
     """Noise in a shadow looks like light: flanks steeper than the lights came out too shallow, and a key by 0.02 mm too low."""
     scene = objects.press(objects.key(), objects.pose(turn, press_mm=0.45), 180, 240, 1.0 / 12.0)
     low = []
-    for told in (0.0, 0.005):
-        lights, pipe = pose_accuracy.rig(180, 240, 1.0 / 12.0, told)
+    for known in (0.0, 0.005):
+        lights, pipe = pose_accuracy.rig(180, 240, 1.0 / 12.0, known)
         out = pipe(render(scene, lights, noise_std=0.005, bits=8, seed=1))
         low.append(float((scene.depth_mm - out.depth_mm)[out.contact & scene.contact].mean()))
     assert low[0] > 0.012 and abs(low[1]) < 0.005

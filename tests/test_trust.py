@@ -362,7 +362,7 @@ def test_fast_asks_a_device_for_nothing_but_the_parts_of_a_mask(kind: str, monke
     pipe = vts.DepthPipeline.from_calibration(unit_of(kind)).to("meta")
     monkeypatch.setattr(checks, "check_tensor", lambda name, value: None)  # which refuses tensors of this device
     images = torch.zeros(2, 3, HEIGHT, WIDTH, device="meta")
-    with pytest.raises(RuntimeError, match=r"item\(\)"):
+    with pytest.raises(RuntimeError, match=r"item\(\)|aten::equal"):
         pipe(images)  # connected parts: a loop until nothing is gained
     monkeypatch.setattr(type(pipe.deformed), "reconstruct", lambda self, seed, mask: seed & mask)
     out = pipe(images)

@@ -70,7 +70,7 @@ def windows(size, generator):
 
 @pytest.mark.parametrize("camera_height_mm", [float("inf"), 60.0])
 @pytest.mark.parametrize("height_mm", [15.0, 40.0])
-def test_normals_at_rest_and_at_a_depth(ring, height_mm, camera_height_mm):
+def test_normals_on_undeformed_skin_and_at_a_depth(ring, height_mm, camera_height_mm):
     """Of moderate slopes, of slopes that block lights, and of images that no slope makes."""
     lights = ring(25.0, height_mm)
     scene = scenes.sphere_press(10.0, 3.0, (2.0, -1.0), 60, 80, 0.4)
@@ -89,7 +89,7 @@ def test_normals_at_rest_and_at_a_depth(ring, height_mm, camera_height_mm):
 
 
 def test_a_frame_of_every_mode(ring):
-    """Contact to the bit, depth to 2e-6 mm; two frames pressed, one at rest, one cut by the border."""
+    """Contact to the bit, depth to 2e-6 mm; two frames pressed, one undeformed, one cut by the border."""
     lights = ring()
     places = [(1.0, (0.0, 0.0)), (0.0, (0.0, 0.0)), (0.6, (-3.0, 4.0)), (1.5, (18.0, 2.0))]
     presses = [scenes.sphere_press(10.0, max(mm, 0.1), at, 120, 160, 0.25) for mm, at in places]

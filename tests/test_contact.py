@@ -112,7 +112,7 @@ def test_a_frame_noisier_than_the_calibration_does_not_flood(ring, small_sensor,
     assert metrics.mask_iou(pipeline(press).deformed, scene.contact) > 0.97
 
 
-def test_skin_at_rest_in_a_shadow_is_shaded_and_a_press_is_not():
+def test_undeformed_skin_in_a_shadow_is_shaded_and_a_press_is_not():
     flat = torch.full((3, 64, 64), 0.5)
     mask, image = vts.ContactMask(flat, torch.full((3,), 0.01)), flat.clone()
     image[0, 8:24, 8:24] = 0.0  # one light kept off

@@ -37,7 +37,7 @@ def test_x_runs_right_and_y_runs_down_in_images():
     assert image[2].argmax() == 4 * 9 + 4, "the blue light stands over the centre"
 
 
-def test_depth_is_positive_where_pressed_and_zero_at_rest():
+def test_depth_is_positive_where_pressed_and_zero_on_undeformed_skin():
     scene = vts.scenes.sphere_press(10.0, 2.0, height=121, width=161, mm_per_pixel=0.25)
     assert scene.depth_mm.max() == pytest.approx(2.0, abs=1e-6)
     assert scene.depth_mm[0, 0, 60, 80] == scene.depth_mm.max()

@@ -108,7 +108,7 @@ def test_it_equals_dense_weighted_least_squares_at_its_own_weights():
 
 
 @every_cliff
-def test_depth_is_zero_at_rest(name):
+def test_depth_is_zero_on_undeformed_skin(name):
     scene = cliff(name)
     depth = integrate_discontinuities(noisy(scene), PITCH, scene.contact)
     assert depth[~scene.contact].abs().max() == 0

@@ -269,7 +269,7 @@ def test_no_dots_are_left_in_a_real_sensors_image_and_depth(data, name, margin, 
 def test_all_markers_of_a_press_are_found(data, name):
     rest, image = gelslim(data, "ref"), gelslim(data, name)
     block = FillMarkers.from_background(rest[0])
-    at_rest, pressed = (find_markers(i, block.diameter_px, block.contrast) for i in (rest, image))
-    x, y = centers(at_rest)[0].round().long().T
+    undeformed, pressed = (find_markers(i, block.diameter_px, block.contrast) for i in (rest, image))
+    x, y = centers(undeformed)[0].round().long().T
     assert int((~grow(pressed, 4)[0, 0, y, x]).sum()) <= 1
-    assert float(pressed.float().mean()) < 1.03 * float(at_rest.float().mean())  # shading adds nothing
+    assert float(pressed.float().mean()) < 1.03 * float(undeformed.float().mean())  # shading adds nothing

@@ -25,7 +25,7 @@ def rms_deg(normal, scene, region):
     return float(metrics.normal_angle_deg(normal, scene.normal, region).square().mean().sqrt())
 
 
-def test_the_flat_inverse_is_exact_at_rest(ring):
+def test_the_flat_inverse_is_exact_on_undeformed_skin(ring):
     scene, lights = scenes.undeformed(press()), ring(dtype=torch.float64)
     assert metrics.normal_angle_deg(block_for(lights, scene)(scenes.render(scene, lights)), scene.normal).max() < 1e-12
 
@@ -46,7 +46,7 @@ def test_the_inverse_at_the_true_depth_is_exact(ring):
 
 
 @pytest.mark.parametrize("gloss", [[0.03, 0.06, 0.09]])
-def test_gloss_is_divided_out_at_rest_and_nearly_so_in_contact(ring, gloss):
+def test_gloss_is_divided_out_on_undeformed_skin_and_nearly_so_in_contact(ring, gloss):
     lights, scene = ring(dtype=torch.float64, gloss=gloss), press()
     block = block_for(lights, scene)
     rest = scenes.undeformed(scene)

@@ -36,7 +36,7 @@ def test_figure_3_of_the_paper(ring, press_mm, mode, largest_px, rms_px, rotatio
 
 @pytest.fixture(scope="module", params=[0.18, 0.45], ids=["no saturation", "saturated near the lights"])
 def worn_unit(request, ring):
-    """Low lights, noise, 8 bits, a spotted skin: calibrated from its own image at rest."""
+    """Low lights, noise, 8 bits, a spotted skin: calibrated from its own background."""
     lights = ring(22.0, [15.0, 16.5, 18.0], rotation_deg=90.0, level=request.param)
     camera = {"noise_std": 0.01, "bits": 8, "spots": scenes.skin_spots(480, 640)}
     background = scenes.render(scenes.undeformed(scenes.sphere_press()), lights, **camera, seed=1)[0]
@@ -122,7 +122,7 @@ def low_rig(scene, seed=0):
 
 @pytest.mark.parametrize("shape", ["ball", "cone"])
 def test_a_cast_shadow_is_no_contact_and_no_slope(shape):
-    """Of the skin behind, which is at rest; before, it was called contact, and the depth was 3 to 8 times as wrong."""
+    """Of the skin behind, which is undeformed; before, it was called contact, and the depth was 3 to 8 times as wrong."""
     size = (240, 320, 0.0625)
     scene = (
         scenes.sphere_press(6.0, 1.5, (0.5, -0.4), *size) if shape == "ball" else scenes.cone_press(50.0, 1.5, 0.5, (0, 0), *size)
@@ -257,8 +257,8 @@ def test_a_response_field_levels_up_to_a_quarter(small_sensor, factor, touched):
     image[:, :rows] *= torch.linspace(0.6, 1.4, 160)
     image = image * torch.tensor([1.0, factor, 1.0])[:, None, None]
     compensate = vts.Compensate.from_calibration(vts.Calibration.from_response(model, small_sensor, background), drift=True)
-    at_rest = compensate(image.clamp(0.0, 1.0)[None])[0, :, rows + 5 :].mean(dim=(1, 2))
-    assert (at_rest - 1.0).abs().max() < 0.006
+    undeformed = compensate(image.clamp(0.0, 1.0)[None])[0, :, rows + 5 :].mean(dim=(1, 2))
+    assert (undeformed - 1.0).abs().max() < 0.006
 
 
 def test_a_failed_led_is_no_drift(ring, small_sensor, small_press):
@@ -272,7 +272,7 @@ def test_a_failed_led_is_no_drift(ring, small_sensor, small_press):
 
 @pytest.fixture(scope="module")
 def mixed(ring, small_sensor, small_press):
-    """Frames at rest, hardly pressed and well pressed, and their lights."""
+    """Frames undeformed, hardly pressed and well pressed, and their lights."""
     lights = ring()
     presses = [scenes.undeformed(small_press()), small_press(1.5), small_press(0.05, (6, 4), 4.0), small_press(1.0, (-8, 3))]
     return lights, torch.cat([scenes.render(scene, lights, bits=8) for scene in presses])

@@ -109,7 +109,7 @@ def test_depth_scales_with_the_pitch_and_with_the_gradient(size, solver):
 @both_ways
 def test_a_sum_of_gradients_gives_the_sum_of_depths(size, solver):
     one, two = random_gradient(*size, seed=1), random_gradient(*size, seed=2)
-    # all pixels at rest in the last rows, so that every depth is levelled on the same ones
+    # all undeformed pixels in the last rows, so that the same ones set every depth to zero
     one[..., -3:, :] = 0
     two[..., -3:, :] = 0
     assert (solver(one + two) - solver(one) - solver(two)).abs().max() < 1e-13
@@ -182,7 +182,7 @@ def test_rest_stays_right_where_the_border_cuts_the_contact(center):
     assert error[vts.poisson_dst] > 20 * error[vts.poisson_background]
 
 
-def test_rest_without_a_pixel_at_rest_has_zero_as_its_lowest_depth():
+def test_a_frame_without_an_undeformed_pixel_has_zero_as_its_lowest_depth():
     depth = vts.poisson_background(torch.full((1, 2, 8, 9), 0.1, dtype=torch.float64), 0.5)
     assert depth.min() == 0
     assert float(depth.max()) == pytest.approx(0.1 * 0.5 * (7 + 8), abs=1e-13)

@@ -263,7 +263,7 @@ def normals(uses_depth=True, dtype=torch.float64, height=6, width=7, pitch=0.4, 
 
 def random_image(batch=2, height=6, width=7, spread=0.2):
     numbers = torch.rand(batch, 4, height, width, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    return 1.0 + spread * (2.0 * numbers[:, :3] - 1.0), numbers[:, 3:] - 0.2  # some depths below the skin at rest too
+    return 1.0 + spread * (2.0 * numbers[:, :3] - 1.0), numbers[:, 3:] - 0.2  # some depths below the undeformed skin too
 
 
 def test_an_unchanged_image_has_slope_zero_exactly():
@@ -561,7 +561,7 @@ def test_a_file_whose_sensor_and_response_disagree_is_refused(saved, where, key,
         vts.Calibration.load(saved)
 
 
-def test_a_response_has_no_light_matrix_and_is_one_at_rest():
+def test_a_response_has_no_light_matrix_and_is_one_on_undeformed_skin():
     calibration = small_calibration()
     assert torch.equal(calibration.flat, torch.ones(3, 24, 32)) and calibration.sensor.blur_px == 1.0
     assert float((vts.Compensate.from_calibration(calibration)(calibration.background[None]) - 1).abs().max()) < 1e-5

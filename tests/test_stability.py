@@ -210,6 +210,14 @@ def test_rows_of_another_state_are_measured_again(tmp_path, monkeypatch):
     assert len(count) == 6 and '"another"' in path.read_text().splitlines()[0]
 
 
+def test_a_file_that_holds_something_else_is_kept(tmp_path):
+    path = tmp_path / "notes.txt"
+    path.write_text("what I measured last week")
+    with pytest.raises(ValueError, match="not a file of rows"):
+        stability.sweep(path, ["flat"], ["noise"], 1)
+    assert path.read_text() == "what I measured last week"
+
+
 def test_unknown_names_are_refused(tmp_path):
     for names, message in (
         ({"methods": ["best"]}, "methods: expected some of flat, fast"),

@@ -233,16 +233,13 @@ def _run(program: Program, images: Tensor, threads: int) -> DepthOutput | None:
     out = DepthOutput(*empties([*maps, mask, mask]))
     kernel, at, pixels = kernels.loaded().solve_frames, ctypes.byref(program), height * width
     image, depth, gradient, normal, contact, deformed = (tensor.data_ptr() for tensor in (images, *out))
-    if parts_of(count, pixels) == 1:
-        trouble = int(kernel(at, image, count, threads, depth, gradient, normal, contact, deformed))
-    else:
 
-        def some(first: int, many: int) -> int:
-            place = 4 * pixels * first
-            rest = (depth + place, gradient + 2 * place, normal + 3 * place, contact + pixels * first, deformed + pixels * first)
-            return int(kernel(at, image + 3 * place, many, 1, *rest))
+    def some(first: int, many: int) -> int:
+        place = 4 * pixels * first
+        rest = (depth + place, gradient + 2 * place, normal + 3 * place, contact + pixels * first, deformed + pixels * first)
+        return int(kernel(at, image + 3 * place, many, threads, *rest))
 
-        trouble = by_frames(count, pixels, some)
+    trouble = by_frames(count, pixels, some)
     if trouble == 1:
         raise MemoryError("torchvts: no memory is left for a frame")
     return None if trouble else out

@@ -159,7 +159,7 @@ def sweep(
     Returns:
         The rows asked for, by corruption, severity, seed and method.
     Raises:
-        ValueError: an unknown name.
+        ValueError: an unknown name, or a file that holds something else.
     """
     path = Path(path)
     for name, values, known in (("methods", methods, METHODS), ("corruptions", corruptions, CORRUPTIONS)):
@@ -216,6 +216,8 @@ def _read(path: Path) -> dict[Key, Row]:
     """The rows of this state of the package in a file. It then holds no others: those, and a line cut short, are measured again."""
     head = json.dumps({"stability": fingerprint()}) + "\n"
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.is_file() else []
+    if lines and not lines[0].startswith('{"stability"'):
+        raise ValueError(f"{path}: not a file of rows, and it would be overwritten: give another path")
     kept = [line for line in lines[1:] if line.endswith("\n")] if lines[:1] == [head] else []
     with write_atomically(path) as temporary:
         temporary.write_text("".join([head, *kept]), encoding="utf-8")

@@ -195,6 +195,26 @@ def test_slow_dimming_is_followed(unit, small_press):
     assert stream.light.level == pytest.approx([0.9] * 3, abs=0.012) and stream.light.steps == 0
 
 
+def test_the_light_knows_each_frame_whether_or_not_it_is_asked(unit):
+    calibration, camera = unit
+    pictures = [camera(0.0, dimming(k)) for k in range(40)]
+
+    def run(asked):
+        planes = []
+        with streams.TactileStream(Frames(pictures), calibration) as stream:
+            for frame in stream:
+                pixels = frame.image.numpy()
+                pixels *= 255.0  # the frame is the user's: nothing is learned from what they do with it
+                if asked:
+                    planes.append(stream.light.plane.clone())
+        return stream.light.plane, planes
+
+    plane, planes = run(asked=True)
+    assert torch.equal(plane, planes[-1]) and not torch.equal(planes[-1], planes[-2])
+    assert torch.equal(plane, run(asked=False)[0])
+    assert plane[:, 0].tolist() == pytest.approx([dimming(20)] * 3, abs=0.005)
+
+
 def test_dimming_that_is_not_followed_would_pass_for_contact(unit):
     calibration, camera = unit
     pictures = (camera(0.0, 0.6 if k >= 12 else 1.0) for k in range(14))  # more than mode auto levels by itself

@@ -213,8 +213,8 @@ def rgb_from_bgr(pixels: np.ndarray[Any, Any]) -> Tensor:
         TypeError, ValueError: another type or shape.
     """
     check_pixels("pixels", pixels)
-    scale = float(np.iinfo(pixels.dtype).max)
-    return torch.from_numpy(np.ascontiguousarray(pixels[:, :, ::-1].transpose(2, 0, 1)).astype(np.float32)) / scale
+    scale, planes = np.float32(np.iinfo(pixels.dtype).max), pixels[:, :, ::-1].transpose(2, 0, 1)
+    return torch.from_numpy(np.divide(planes, scale, out=np.empty(planes.shape, np.float32), dtype=np.float32))
 
 
 def write_image(path: str | Path, image: Tensor) -> None:

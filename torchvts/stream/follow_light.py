@@ -59,7 +59,7 @@ class FollowLight:
         self._basis = torch.stack((torch.ones_like(x), x, y)).flatten(1)  # (3, cells)
         reach_x, reach_y = width / (columns * self.cell), height / (rows * self.cell)  # some pixels lie beyond the last cells
         x_mm, y_mm = pixel_grid_mm(height, width, 1.0, background.dtype)
-        self._x, self._y = (x_mm * 2.0 / width * reach_x)[None], (y_mm * 2.0 / height * reach_y)[None]
+        self._x, self._y = (x_mm * 2.0 / width * reach_x)[None, :1], (y_mm * 2.0 / height * reach_y)[None, :, :1]
         self.state = "following"
         self.steps = 0
         self._since_contact_s = RECOVERY_S
@@ -75,7 +75,8 @@ class FollowLight:
         if float((self.plane - torch.tensor([1.0, 0.0, 0.0])).abs().max()) < 1e-5:
             return image
         level, tilt_x, tilt_y = (self.plane[:, k, None, None].to(image.dtype) for k in range(3))
-        return (image / (level + tilt_x * self._x + tilt_y * self._y)).clamp_(0.0, 1.0)
+        plane = (level + tilt_x * self._x + tilt_y * self._y)[None]
+        return torch.div(image, plane, out=plane).clamp_(0.0, 1.0)
 
     def update(self, image: Tensor, deformed: Tensor, seconds: float) -> str:
         """Learn from a frame.
@@ -84,6 +85,8 @@ class FollowLight:
             image: (1, 3, H, W), as the camera gave it.
             deformed: (1, 1, H, W), where its skin has moved.
             seconds: time since the last frame.
+        Returns:
+            The state.
         """
         self._check(image)
         check_shape("deformed", deformed, (1, 1, *self.size), "image")

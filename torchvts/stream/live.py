@@ -18,6 +18,7 @@ from ..core.files import rgb_from_bgr
 from ..model import Calibration, Sensor
 from ..pipeline import MODES, DepthOutput
 from .background import FIRST_FRAMES, calibrate_background, find_background, use_calibration, with_background
+from .follow_light import FollowLight
 from .frames import SourceFrames
 from .recording import Recording
 from .sources import Pixels, Reader, Unreadable, check_reader, open_source
@@ -67,7 +68,6 @@ class TactileStream:
         dropped: number of frames that nobody took.
         left_out: (number, reason) of the frames that could not be used.
         stages: :class:`StageClock`.
-        light: :class:`FollowLight`.
         fps: rate of the source.
     Raises:
         ValueError: contact or changing light in the first frames, or a source that cannot be read.
@@ -132,7 +132,8 @@ class TactileStream:
         frame = rgb_from_bgr(pixels)[None]
         if pixels.shape[:2] != self._size:
             raise ValueError(f"frame: expected {self._size} like the first, got {pixels.shape[:2]}: the source has changed")
-        return self._sensor.rectify(frame).clamp(0.0, 1.0)
+        found = self._sensor.rectify(frame)
+        return found if found is frame else found.clamp(0.0, 1.0)
 
     def rezero(self, frames: int = FIRST_FRAMES) -> None:
         """Take the next frames, which must be without contact, as the background; until then depth goes on as before.
@@ -146,7 +147,7 @@ class TactileStream:
 
     def _use(self, recording: Recording) -> None:
         """Go on with a recording: the first one, or that of a new background."""
-        self.recording, self.light, self.pipe = recording, recording.light, recording.pipe
+        self.recording, self.pipe = recording, recording.pipe
 
     def _collect(self, raw: Tensor) -> None:
         """Keep a frame for the new background, and change to it when there are enough."""
@@ -164,6 +165,11 @@ class TactileStream:
             warnings.warn(f"re-zero refused, the background stays: {error}", stacklevel=3)
         else:
             self.calibration = calibration
+
+    @property
+    def light(self) -> FollowLight:
+        """The light followed, learned from all frames so far."""
+        return self.recording.light
 
     @property
     def dropped(self) -> int:
@@ -195,6 +201,8 @@ class TactileStream:
             image, output = found
             assert output is not None
             yield TactileFrame(index, time_s, image[0], output)
+            with self._threads(pixels):
+                self.recording.learn()  # after the depth has been handed out, which does not wait for it
             self.stages.end_frame()
 
     def _threads(self, pixels: Pixels | Unreadable) -> AbstractContextManager[None]:

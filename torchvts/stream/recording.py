@@ -56,7 +56,6 @@ class Recording:
         stage: makes a context in which a stage of that name runs, to measure its time.
     Attributes:
         pipe: the pipeline.
-        light: :class:`FollowLight`.
     Raises:
         ValueError: contact or changing light in the first frames, or those of another unit.
     """
@@ -79,7 +78,8 @@ class Recording:
         fps = check_positive("fps", fps)
         value = calibration.background.float() ** (1.0 / calibration.sensor.exponent)
         value = value.clamp(0.0, 1.0)
-        self.light = FollowLight(value)
+        self._light = FollowLight(value)
+        self._unlearned: tuple[Tensor, Tensor, float] | None = None
         self.device = check_device(device)
         self.pipe: DepthPipeline = unit_pipeline(calibration, mode, network, contact).float()
         self.check = FrameCheck(value) if calibration.measured else None
@@ -106,9 +106,10 @@ class Recording:
         Returns:
             The frame in the background's light, and its depth.
         """
+        self.learn()
         with torch.inference_mode():
             with self._stage("light"):
-                image = self.light.correct(frame)
+                image = self._light.correct(frame)
             output: DepthOutput | None = None
             if solve:
                 with self._stage("depth"):
@@ -117,9 +118,23 @@ class Recording:
                 with self._stage("light"):
                     deformed = self._deformed(image) if output is None else output.deformed
                     seconds = 1.0 / self._fps if self._before is None else time_s - self._before
-                    self.light.update(frame, deformed, seconds)
+                    # copies: the caller may write into what is returned
+                    self._unlearned = (frame.clone() if image is frame else frame, deformed.clone(), seconds)
         self._before = time_s
         return image, output
+
+    @property
+    def light(self) -> FollowLight:
+        """The light, learned from all frames so far."""
+        self.learn()
+        return self._light
+
+    def learn(self) -> None:
+        """Learn the light of the last frame, which no depth but that of the next one needs; called when there is time."""
+        if self._unlearned is not None:
+            with torch.inference_mode(), self._stage("light"):
+                self._light.update(*self._unlearned)
+            self._unlearned = None
 
     def _deformed(self, image: Tensor) -> Tensor:
         """Where the skin has moved, of a frame whose depth is not wanted."""

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-import torch
 from torch import Tensor, nn
 
 from ..core.checks import check_batch, check_field, check_range, check_same_size
@@ -13,8 +12,14 @@ DARK = 0.25
 BRIGHT = 0.985
 """Image value above which a cell is overexposed."""
 
+MOST_OVEREXPOSED = 0.8
+"""Share of the cells that may be overexposed."""
+
 TWELVE_BITS = 4095.0 / 65535.0
 """Largest value of 12 bits stored in 16."""
+
+ONE_COLOUR = 2.0 / 255.0
+"""Range of the image value, in all channels, below which a frame shows nothing."""
 
 CROP = 1.0 / 7.0
 """Share that is cut off each side of raw frames of a GelSight Mini."""
@@ -59,26 +64,26 @@ class FrameCheck:
         self.size = (background.shape[1], background.shape[2])
         self.cell = max(1, min(self.size) // 24)
         self.background = self._cells(background[None].float())
-        self.lit = self.background > 0.06
+        self._lit = [(channel, lit) for channel, lit in enumerate(self.background > 0.06) if bool(lit.any())]
+        self._overexposed = _overexposed(self.background) > MOST_OVEREXPOSED
 
     def __call__(self, frame: Tensor) -> str:
         """Why a frame (1, 3, H, W), rectified, in [0, 1], cannot be used."""
         check_batch("frame", frame, 3)
         check_same_size("frame", frame, "the background", *self.size)
-        if float((frame.amax((2, 3)) - frame.amin((2, 3))).max()) < 2.0 / 255.0:
-            return "the frame has one colour everywhere: black, or not decoded"
         cells = self._cells(frame.float())
-        ratio = cells / self.background.clamp_min(1e-3)
-        level = torch.stack([of_channel[lit].median() for of_channel, lit in zip(ratio, self.lit) if bool(lit.any())])
-        if level.numel() > 0 and float(level.max()) < DARK:
+        if _range(cells) < ONE_COLOUR and _range(frame[0]) < ONE_COLOUR:  # most frames are told by their cells
+            return "the frame has one colour everywhere: black, or not decoded"
+        ratio = _ratio(cells, self.background)
+        level = max([float(ratio[channel][lit].median()) for channel, lit in self._lit], default=1.0)
+        if level < DARK:
             cause = "black, or the LEDs were off"
             if float(frame.max()) <= TWELVE_BITS + 1e-6:
                 cause = f"its largest value is {round(65535 * float(frame.max()))} of 65535: 12 bits stored in 16?"
-            return f"the frame is dark, {float(level.max()):.0%} of the background's brightness: {cause}"
-        bright, bright_before = (float((one.amin(0) > BRIGHT).double().mean()) for one in (cells, self.background))
-        if bright > 0.8 > bright_before:
+            return f"the frame is dark, {level:.0%} of the background's brightness: {cause}"
+        if not self._overexposed and _overexposed(cells) > MOST_OVEREXPOSED:
             return "the frame is overexposed: nearly all of it is saturated"
-        as_it_is = _likeness(cells, self.background)
+        as_it_is = _likeness(ratio)
         return "" if as_it_is > 0.55 else self._other_view(cells, as_it_is)
 
     def _cells(self, frame: Tensor) -> Tensor:
@@ -91,14 +96,27 @@ class FrameCheck:
             ("cropped otherwise, it shows less than the background", cells, _centre(self.background)),
             *((what, turn(cells), self.background) for what, turn in _TURNED),
         ]
-        best, what = max((_likeness(one, other), what) for what, one, other in views)
+        best, what = max((_likeness(_ratio(one, other)), what) for what, one, other in views)
         if best < 0.5 or best < 1.5 * as_it_is:
             return ""
         return f"the frame is {what}: then {best:.0%} of it is like the background, as it is {as_it_is:.0%}"
 
 
-def _likeness(one: Tensor, other: Tensor) -> float:
-    """Share of the cells (3, h, w) that differ by less than :data:`NEAR` in all channels, each channel scaled as a whole."""
-    ratio = one / other.clamp_min(1e-3)
+def _range(image: Tensor) -> float:
+    """Largest range of a channel of (3, h, w)."""
+    return float((image.amax((1, 2)) - image.amin((1, 2))).max())
+
+
+def _overexposed(cells: Tensor) -> float:
+    """Share of the cells (3, h, w) that are overexposed in all channels."""
+    return float((cells.amin(0) > BRIGHT).double().mean())
+
+
+def _ratio(one: Tensor, other: Tensor) -> Tensor:
+    return one / other.clamp_min(1e-3)
+
+
+def _likeness(ratio: Tensor) -> float:
+    """Share of the cells whose ratio (3, h, w) is within :data:`NEAR` of the median of each channel."""
     relative = ratio / ratio.flatten(1).median(1).values.clamp_min(1e-3)[:, None, None]
     return float(((relative - 1.0).abs().amax(0) < NEAR).double().mean())

@@ -12,7 +12,7 @@ from torch import nn
 import torchvts as vts
 from torchvts import export
 from torchvts.accelerated import reference_only
-from torchvts.export import onnx_operators
+from torchvts.export import each_frame, onnx_operators, trace
 
 LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
 HEIGHT, WIDTH, PITCH = 48, 64, 0.6
@@ -191,6 +191,60 @@ def test_aoti_without_torchvts(mini, tmp_path):
     pipe = pipeline(calibration, "fast")
     path = export.export_aoti(pipe, tmp_path / "pipe.pt2")
     assert export.compare(path, pipe, frames, "aoti") <= 1e-5
+
+
+class Masked(nn.Module):
+    """What the rewriting of a graph meets: masks combined and written to, a mask as a factor by way of uint8, joined channels."""
+
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("turn", torch.polar(torch.ones(6, 5), torch.rand(6, 5, generator=torch.Generator().manual_seed(1))))
+
+    def forward(self, images):
+        mean = images.mean(dim=(1, 2, 3), keepdim=True)
+        bright, dark = images[:, :1] > 1.2 * mean, images[:, 1:2] < 0.8 * mean
+        border = torch.ones_like(bright)
+        border[..., 1:-1, 1:-1] = False
+        mask = (bright | ~dark) & (images[:, 2:] <= mean) | (border & dark)
+        joined = torch.cat((images[:, 1:2] * mask.to(torch.uint8).to(images.dtype), images), dim=1)
+        smooth = torch.fft.irfft(torch.fft.rfft(joined) * self.turn, n=8).masked_fill(bright & ~border, 0.5)
+        return smooth, mask[..., 1:], mask.to(torch.uint8), bright.any(dim=3)
+
+
+def test_a_graph_that_is_rewritten_for_inductor_gives_the_same():
+    images = torch.rand(5, 3, 6, 8, generator=torch.Generator().manual_seed(0))
+    module = Masked()
+    of_one = trace.traced(module, images[:1], any_batch=False)
+    each_frame.convert_masks_at_once(of_one.graph_module)
+    each_frame.hold_masks_as_floats(of_one.graph_module)
+    each_frame.join_channels_as_rows(of_one.graph_module)
+    rewritten = of_one.module()
+    each_frame.hold_complex_as_real(rewritten)
+    nodes = [node for node in rewritten.graph.nodes if node.op == "call_function"]
+    assert [node.args[0].target for node in nodes if node.target in each_frame.NOT] == [torch.ops.aten.ones_like.default]  # ~border
+    assert not [node for node in nodes if node.target in each_frame.OR]
+    assert [node.args[1] for node in nodes if node.target == torch.ops.aten.to.dtype].count(torch.uint8) == 1  # the output
+    assert [node.args[0][0].target for node in nodes if node.target == torch.ops.aten.cat.default] == [
+        torch.ops.aten.reshape.default
+    ]
+    assert not any(buffer.is_complex() for name, buffer in rewritten.named_buffers() if name.endswith("_pairs"))
+    program = trace.traced(each_frame.EachFrame(rewritten), images[:2], any_batch=True)
+    for count in (1, 2, 5):
+        for found, expected in zip(program.module()(images[:count]), module(images[:count]), strict=True):
+            assert found.dtype == expected.dtype and torch.allclose(found, expected, atol=1e-6)
+
+
+@pytest.mark.long
+def test_a_loop_over_frames_takes_the_decisions_of_the_pipeline(low):
+    """Passes that stop at different turns in the frames of a batch, loops within the loop."""
+    calibration, frames = low
+    pipe = pipeline(calibration, "precise")
+    program = each_frame.trace_each_frame(pipe).module()
+    for batch in (frames[:1], frames):
+        with reference_only():
+            wanted = pipe(batch)
+        for found, expected in zip(program(batch), wanted, strict=True):
+            assert (found.double() - expected.double()).abs().max() <= 1e-5
 
 
 @pytest.mark.parametrize("height, width", [(24, 32), (23, 35)])

@@ -21,6 +21,7 @@ from ..core.checks import check_choice, check_record
 from ..core.files import check_target, write_atomically
 from ..normals import WrappedNormals
 from ..pipeline import DepthPipeline
+from .each_frame import trace_each_frame
 from .onnx_operators import decompositions
 from .trace import size_and_dtype, trace
 
@@ -113,7 +114,7 @@ def export_aoti(pipe: DepthPipeline, path: str | Path) -> Path:
         raise RuntimeError(complaint)
     if path.suffix != ".pt2":
         raise ValueError(f"path: expected a name ending in .pt2, got {path}: AOTInductor packages have no other")
-    program = trace(pipe, by_matrix=False)
+    program = trace_each_frame(pipe)
     settings: dict[str, Any] = {"aot_inductor.metadata": {METADATA_KEY: json.dumps(describe(pipe))}}
     with warnings.catch_warnings(), write_atomically(path) as temporary:
         warnings.simplefilter("ignore")

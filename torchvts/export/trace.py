@@ -111,11 +111,25 @@ def trace(pipe: DepthPipeline, by_matrix: bool) -> torch.export.ExportedProgram:
     if by_matrix:
         _use_matrices(pipe, height, width, dtype)
     images = torch.full((2, 3, height, width), 0.5, dtype=dtype)
-    batch = torch.export.Dim("batch", min=1, max=MAX_BATCH)
+    _make_tables(pipe, images)
+    return traced(_PlainOutput(pipe), images, any_batch=True)
+
+
+def trace_one_frame(pipe: DepthPipeline) -> torch.export.ExportedProgram:
+    """The same for batches of one frame."""
+    height, width, dtype = size_and_dtype(pipe)
+    pipe = copy.deepcopy(reference(pipe)).eval().requires_grad_(False)
+    image = torch.full((1, 3, height, width), 0.5, dtype=dtype)
+    _make_tables(pipe, image)
+    return traced(_PlainOutput(pipe), image, any_batch=False)
+
+
+def traced(module: nn.Module, images: Tensor, any_batch: bool) -> torch.export.ExportedProgram:
+    """The graph of a module of images (B, 3, H, W), for any batch or only for that one."""
+    shapes = ({0: torch.export.Dim("batch", min=1, max=MAX_BATCH)},) if any_batch else None
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        _make_tables(pipe, images)  # which then are constants of the graph
-        return torch.export.export(_PlainOutput(pipe), (images,), dynamic_shapes=({0: batch},), strict=False)
+        return torch.export.export(module, (images,), dynamic_shapes=shapes, strict=False)
 
 
 def _use_matrices(pipe: DepthPipeline, height: int, width: int, dtype: torch.dtype) -> None:
@@ -132,8 +146,9 @@ def _use_matrices(pipe: DepthPipeline, height: int, width: int, dtype: torch.dty
         policy.coarse_integrate = PoissonBackgroundByMatrix(rows, columns, policy.stride * pipe.mm_per_pixel, dtype)
 
 
+@torch.no_grad()
 def _make_tables(pipe: DepthPipeline, images: Tensor) -> None:
-    """Let each integrator make the tables of its size."""
+    """Let each integrator make the tables of its size, which then are constants of the graph."""
     height, width = images.shape[2], images.shape[3]
     pipe(images)
     policy = pipe.refine

@@ -93,7 +93,8 @@ def _follow_from(keyframe: Keyframe, frame: Grids, start: Array) -> Followed:
     noise = max(LEAST_NOISE, 1.5 * some.slope_noise)
     fine, matrices, rights = sum_parts(frame.fine, keyframe.many, refined, noise, PARTS)
     by_slopes = solve_step(fine, unknown.motions)
-    last = solve_step(_with_heights(fine, keyframe, frame, refined), unknown.motions)
+    known_all = unknown.motions.shape[1] == 0
+    last = solve_step(_with_heights(fine, keyframe, frame, refined)) if known_all else by_slopes
     pose = refined @ moved_by(keyframe.many, last)
     by_parts = keyframe.shared_error * jackknife(matrices, rights, _others(unknown.motions))
     scaled = _covariance(fine, by_parts, unknown.motions)
@@ -117,9 +118,9 @@ def _follow_from(keyframe: Keyframe, frame: Grids, start: Array) -> Followed:
 
 
 def _with_heights(fine: Sums, keyframe: Keyframe, frame: Grids, pose: Array) -> Sums:
-    """Sums of the last step: heights as their errors let them count, and slopes, of which those of a cell are alike."""
+    """Sums of the last step: heights as their errors let them count, and slopes, once for each coarse pixel."""
     matrix, right = height_sums(keyframe.heights, frame.fine, keyframe.some, pose)
-    share = len(keyframe.heights.number) / keyframe.many.number
+    share = keyframe.coarse.number / keyframe.many.number
     return fine._replace(matrix=share * fine.matrix + matrix, right=share * fine.right + right)
 
 

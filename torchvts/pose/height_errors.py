@@ -1,8 +1,8 @@
-"""Heights of a keyframe weighted by what wrong slopes do to them: errors of slopes that are smooth, integrated from undeformed skin.
+"""Heights of a keyframe, weighted by what smooth errors of slopes, integrated from undeformed skin, do to them.
 
-A smooth error of slopes tilts a wide face as a whole, and slopes of the face cannot show it. But its heights can: skin around the
-contact is undeformed, so a face that is tilted is too high at one flank and too low at the other, which flanks as narrow as they are
-hardly allow. The covariance of heights says how hardly.
+A smooth error of slopes tilts a wide face as a whole, and slopes of the face cannot show it. Its heights can: skin around the contact
+is undeformed, so a face that is tilted is too high at one flank and too low at the other, and narrow flanks hardly allow that.
+The covariance of heights says how hardly.
 """
 
 from typing import NamedTuple
@@ -93,10 +93,11 @@ def _covariance(slope: Array, deformed: Mask, pitch: float) -> Array:
         difference[np.arange(len(row)), index[one]] -= 1.0
         difference[np.arange(len(row)), index[other]] += 1.0
         difference = difference[:, :number]
-        at = np.where(deformed[one], slope[:, *one], slope[:, *other]) + np.where(deformed[other], slope[:, *other], slope[:, *one])
+        weights = [deformed[cells].astype(np.float64) for cells in (one, other)]
+        at = (weights[0] * slope[:, one[0], one[1]] + weights[1] * slope[:, other[0], other[1]]) / (weights[0] + weights[1])
         place = pitch * np.stack((column + 0.5 * right, row + 0.5 * down))
         laplace += difference.T @ difference
-        along.append((difference, np.concatenate((place / ALIKE_MM, 0.5 * at / ALIKE_SLOPE))))
+        along.append((difference, np.concatenate((place / ALIKE_MM, at / ALIKE_SLOPE))))
     covariance, inverse = np.zeros((number, number)), np.linalg.inv(laplace)
     for difference, point in along:
         square = 0.5 * (point * point).sum(0)
@@ -108,9 +109,17 @@ def _covariance(slope: Array, deformed: Mask, pitch: float) -> Array:
 
 
 def height_sums(errors: HeightErrors, field: Field, pixels: Pixels, pose: Array) -> tuple[Array, Array]:
-    """J^T C^-1 J (6, 6) and J^T C^-1 r (6,) of the heights of cells that both contacts hold, under a pose (4, 4) of the keyframe.
+    """J^T C^-1 J (6, 6) and J^T C^-1 r (6,) of the heights of cells that both contacts hold: generalised least squares.
 
-    Errors of known modes and white noise: the modes are fitted beside the pose, and that is generalised least squares.
+    C is that of the modes and of white noise; so the sizes of the modes are fitted beside the twist.
+
+    Args:
+        errors: of the keyframe.
+        field: the new frame.
+        pixels: the keyframe's, those that ``errors`` was made of.
+        pose: (4, 4), of the keyframe in the field's frame.
+    Source:
+        Aitken, Proceedings of the Royal Society of Edinburgh 55, 1935.
     """
     residual, seen = _height_residuals(field, pixels, pose)
     cell = errors.cell[seen]

@@ -37,7 +37,7 @@ _NEIGHBOURS = np.ones((3, 3), np.uint8)
 
 
 class Contact(NamedTuple):
-    """One frame whose contact takes the place of its deformed area, ``skin``: skin that hangs free does not move with the object."""
+    """One frame whose contact takes the place of its deformed area, ``skin``: what hangs free does not move with the object."""
 
     depth_mm: Tensor
     gradient: Tensor
@@ -69,14 +69,15 @@ def contact_frame(frame: DepthFrame) -> Contact:
         if not isinstance(getattr(frame, part, None), Tensor):
             raise TypeError(f"frame: expected a DepthOutput, as a DepthPipeline returns, got {type(frame).__name__}")
     height, width = frame.depth_mm.shape[-2:] if frame.depth_mm.dim() >= 2 else (0, 0)
-    sizes = frame.depth_mm.numel(), frame.gradient.numel(), frame.contact.numel()
-    if sizes != (height * width, 2 * height * width, height * width):
+    deformed: Tensor = getattr(frame, "deformed", frame.contact)  # a scene has none
+    sizes = frame.depth_mm.numel(), frame.gradient.numel(), frame.contact.numel(), deformed.numel()
+    if sizes != (height * width, 2 * height * width, height * width, height * width):
         shapes = tuple(frame.depth_mm.shape), tuple(frame.gradient.shape), tuple(frame.contact.shape)
         raise ValueError(f"frame: expected one frame, depth (1, 1, H, W), gradient (1, 2, H, W), got {shapes}: loop over the batch")
     depth = frame.depth_mm.detach().to("cpu", torch.float32).reshape(1, 1, height, width).contiguous()
     gradient = frame.gradient.detach().to("cpu", torch.float32).reshape(1, 2, height, width).contiguous()
     contact = frame.contact.detach().to("cpu", torch.bool).reshape(1, 1, height, width).contiguous()
-    skin: Tensor = getattr(frame, "deformed", contact).detach().to("cpu", torch.bool).reshape(1, 1, height, width)
+    skin = deformed.detach().to("cpu", torch.bool).reshape(1, 1, height, width)
     if not math.isfinite(float(depth.sum()) + float(gradient.sum())):
         raise Unusable("depth or gradient is not finite")
     if int(torch.count_nonzero(contact)) < LEAST_PIXELS:

@@ -1,8 +1,8 @@
 """Heights of a keyframe, weighted by what smooth errors of slopes, integrated from undeformed skin, do to them.
 
-A smooth error of slopes tilts a wide face as a whole, and slopes of the face cannot show it. Its heights can: skin around the contact
-is undeformed, so a face that is tilted is too high at one flank and too low at the other, and narrow flanks hardly allow that.
-The covariance of heights says how hardly.
+A smooth error of slopes tilts a wide face as a whole, and slopes of the face cannot show it. Its heights can: skin around the
+contact is undeformed, so a face that is tilted is too high at one flank and too low at the other, and narrow flanks hardly allow
+that. The covariance of heights says how hardly.
 """
 
 from typing import NamedTuple

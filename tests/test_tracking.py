@@ -14,6 +14,7 @@ from torchvts.core.frame import DepthOutput
 from torchvts.evaluation import pose_accuracy, tracking
 from torchvts.pose.follow import adjoint, follow, orthonormal
 from torchvts.pose.graph import Edge, KeyframeGraph
+from torchvts.pose.height_errors import WHITE_MM, _covariance, _height_residuals, height_sums
 from torchvts.pose.inverse import Sums, refine, solve_step, sum_parts, sum_residuals
 from torchvts.pose.jackknife import ALIKE_MM, jackknife, shared_error
 from torchvts.pose.keyframe import PARTS, contact_frame, grids, make_keyframe
@@ -272,6 +273,34 @@ def test_errors_that_are_alike_all_over_a_contact_count_though_its_parts_agree()
     assert shared_error(places, PARTS) * np.mean(stated) == pytest.approx(errors.mean(0).var(), rel=0.15)
 
 
+def test_heights_are_least_certain_far_from_undeformed_skin():
+    deformed = np.zeros((14, 18), bool)
+    deformed[3:11, 4:14] = True
+    slope = 0.3 * np.random.default_rng(0).standard_normal((2, 14, 18))
+    found = _covariance(slope, deformed, 0.5)
+    std = np.sqrt(np.diag(found)).reshape(8, 10)
+    assert std.min() == std[[0, 0, -1, -1], [0, -1, 0, -1]].min() and std[3:5, 4:6].min() > 1.5 * std[0].max()
+    assert 0.5 * 0.037 < std.max() < 3.0 * 0.037  # slopes off by 0.037 over the 2 mm to the nearest undeformed skin
+    turned = _covariance(np.rot90(slope, axes=(1, 2)), np.rot90(deformed), 0.5)
+    order = np.rot90(np.arange(80).reshape(8, 10)).ravel()
+    np.testing.assert_allclose(turned, found[np.ix_(order, order)], atol=1e-12)
+
+
+def test_sums_of_heights_are_generalised_least_squares(keyframe):
+    frame = grids(contact_frame(press(objects.key(), swing(1))), PITCH, keyframe.least_mm, keyframe.times)
+    matrix, right = height_sums(keyframe.heights, frame.fine, keyframe.some, np.eye(4))
+    residual, seen = _height_residuals(frame.fine, keyframe.some, np.eye(4))
+    number = len(keyframe.heights.number)
+    count = np.bincount(keyframe.heights.cell[seen], minlength=number)
+    used = count >= 0.5 * keyframe.heights.number
+    mean = np.bincount(keyframe.heights.cell[seen], residual[seen], number)[used] / count[used]
+    by, modes = WHITE_MM * keyframe.heights.lines[used, :6], WHITE_MM * keyframe.heights.lines[used, 6:]
+    weight = np.linalg.inv(modes @ modes.T + WHITE_MM**2 * np.eye(len(mean)))
+    assert 0.5 * number < used.sum() < number
+    np.testing.assert_allclose(matrix, by.T @ weight @ by, rtol=1e-6, atol=1e-8 * matrix.max())
+    np.testing.assert_allclose(right, by.T @ weight @ mean, rtol=1e-6, atol=1e-8 * np.abs(right).max())
+
+
 def test_derivatives_are_those_of_the_residuals(keyframe):
     """A small motion of the frame is found by one step, but for second order."""
     frame = grids(contact_frame(press(objects.key(), swing(0))), PITCH, keyframe.least_mm, keyframe.times)
@@ -441,6 +470,13 @@ def test_rendered_objects_meet_the_goal(name, motion_, most_mm):
     ((row, _),) = tracking.run_tracking([name], [motion_], ["noise 0.005"], seed=4)
     assert row.lost == [] and row.wrong == []
     assert float(np.median(row.deg)) < 0.05 and float(np.median(row.mm)) < most_mm and max(row.deg) < 0.3
+
+
+@pytest.mark.long
+def test_heights_show_the_tilt_that_wrong_slopes_hide():
+    """Slopes alone give 0.28 degrees, median."""
+    ((row, _),) = tracking.run_tracking(["gear"], ["fast"], ["slopes off by 3 degrees"], seed=4)
+    assert float(np.median(row.deg)) < 0.2 and row.lost == [] and row.wrong == []
 
 
 @pytest.mark.long

@@ -8,6 +8,7 @@ import torch
 
 from .alignment import SLOPE_NOISE, agrees_enough
 from .ambiguity import ALIKE_PIXELS, LEAST_INFORMATION, UNKNOWN_VARIANCE, free_directions, name_directions
+from .height_errors import height_sums
 from .inverse import LEAST_NOISE, Array, Field, Pixels, Sums, moved_by, refine, solve_step, sum_parts, sum_residuals
 from .jackknife import jackknife
 from .keyframe import PARTS, Grids, Keyframe
@@ -91,7 +92,9 @@ def _follow_from(keyframe: Keyframe, frame: Grids, start: Array) -> Followed:
         refined, some = refine(frame.fine, keyframe.some, pose, SOME_STEPS, SLOPE_NOISE, unknown.motions, 2e-3)
     noise = max(LEAST_NOISE, 1.5 * some.slope_noise)
     fine, matrices, rights = sum_parts(frame.fine, keyframe.many, refined, noise, PARTS)
-    last = solve_step(fine, unknown.motions)
+    by_slopes = solve_step(fine, unknown.motions)
+    known_all = unknown.motions.shape[1] == 0
+    last = solve_step(_with_heights(fine, keyframe, frame, refined)) if known_all else by_slopes
     pose = refined @ moved_by(keyframe.many, last)
     by_parts = keyframe.shared_error * jackknife(matrices, rights, _others(unknown.motions))
     scaled = _covariance(fine, by_parts, unknown.motions)
@@ -109,9 +112,16 @@ def _follow_from(keyframe: Keyframe, frame: Grids, start: Array) -> Followed:
         names=_names(unknown, pose),
         std_deg=math.degrees(math.sqrt(float(np.diag(scaled)[:3] @ keyframe.many.units[:3] ** 2))),
         std_mm=math.sqrt(float(np.trace(scaled[3:, 3:]))),
-        settled=float(np.linalg.norm(last)) < LAST_STEP_MM,
+        settled=float(np.linalg.norm(by_slopes)) < LAST_STEP_MM,
         covariance=_after(keyframe.many, pose, scaled + unknown.motions @ unknown.motions.T * UNKNOWN_VARIANCE),
     )
+
+
+def _with_heights(fine: Sums, keyframe: Keyframe, frame: Grids, pose: Array) -> Sums:
+    """Sums of the last step: heights as their errors let them count, and slopes, once for each coarse pixel."""
+    matrix, right = height_sums(keyframe.heights, frame.fine, keyframe.some, pose)
+    share = keyframe.coarse.number / keyframe.many.number
+    return fine._replace(matrix=share * fine.matrix + matrix, right=share * fine.right + right)
 
 
 def common_share(keyframe: Keyframe, frame: Grids, sums: Sums, pixels: Pixels) -> float:

@@ -14,6 +14,7 @@ from ..accelerated import kernels
 from ..accelerated.gate import usable
 from .alignment import twist_units
 from .ambiguity import field_with_fitted_curvature, find_unknown, information_of_noise
+from .height_errors import HeightErrors, height_errors
 from .inverse import Array, Field, Pixels, reference_pixels
 from .jackknife import shared_error
 from .relief import LEAST_PIXELS, DepthFrame, Levels, Relief, least_depth_mm, levels
@@ -22,6 +23,9 @@ SOME, MANY = 2000, 8000
 """Pixels of a reference for all steps of a refinement but the last, and for the last. They are evenly spread: pixels chosen by what
 they say of the motion lie on steep flanks, where slopes err most; with 4,000 of these the median rotation error of six objects was
 0.024 to 0.071 degrees, with 4,000 spread ones 0.018 to 0.036, with the two stages 0.012 to 0.024."""
+
+CELL = 2
+"""Pixels of the coarse grid a side of a cell of :mod:`.height_errors`, 0.5 mm of 20."""
 
 PARTS = 8
 """Parts of a contact, a power of two: a pose is as uncertain as it depends on which of them is left out."""
@@ -33,11 +37,12 @@ _NEIGHBOURS = np.ones((3, 3), np.uint8)
 
 
 class Contact(NamedTuple):
-    """One frame whose contact takes the place of its deformed area: skin that hangs free does not move with the object."""
+    """One frame whose contact takes the place of its deformed area, ``skin``: what hangs free does not move with the object."""
 
     depth_mm: Tensor
     gradient: Tensor
     contact: Tensor
+    skin: Tensor
 
 
 class Grids(NamedTuple):
@@ -64,18 +69,20 @@ def contact_frame(frame: DepthFrame) -> Contact:
         if not isinstance(getattr(frame, part, None), Tensor):
             raise TypeError(f"frame: expected a DepthOutput, as a DepthPipeline returns, got {type(frame).__name__}")
     height, width = frame.depth_mm.shape[-2:] if frame.depth_mm.dim() >= 2 else (0, 0)
-    sizes = frame.depth_mm.numel(), frame.gradient.numel(), frame.contact.numel()
-    if sizes != (height * width, 2 * height * width, height * width):
+    deformed: Tensor = getattr(frame, "deformed", frame.contact)  # a scene has none
+    sizes = frame.depth_mm.numel(), frame.gradient.numel(), frame.contact.numel(), deformed.numel()
+    if sizes != (height * width, 2 * height * width, height * width, height * width):
         shapes = tuple(frame.depth_mm.shape), tuple(frame.gradient.shape), tuple(frame.contact.shape)
         raise ValueError(f"frame: expected one frame, depth (1, 1, H, W), gradient (1, 2, H, W), got {shapes}: loop over the batch")
     depth = frame.depth_mm.detach().to("cpu", torch.float32).reshape(1, 1, height, width).contiguous()
     gradient = frame.gradient.detach().to("cpu", torch.float32).reshape(1, 2, height, width).contiguous()
     contact = frame.contact.detach().to("cpu", torch.bool).reshape(1, 1, height, width).contiguous()
+    skin = deformed.detach().to("cpu", torch.bool).reshape(1, 1, height, width)
     if not math.isfinite(float(depth.sum()) + float(gradient.sum())):
         raise Unusable("depth or gradient is not finite")
     if int(torch.count_nonzero(contact)) < LEAST_PIXELS:
         raise Unusable("no contact")
-    return Contact(depth, gradient, contact)
+    return Contact(depth, gradient, contact, skin)
 
 
 def grids(frame: Contact, mm_per_pixel: float, least_mm: float, times: tuple[int, int]) -> Grids:
@@ -146,6 +153,7 @@ class Keyframe:
         coarse: pixels of the coarse grid, whose derivatives are those of fitted planes, which have the least noise.
         some: pixels of the fine grid for most steps, and
         many: for the last one; part after part.
+        heights: cells of ``some``, and how their heights err.
         probe: (M, 3), points of the contact, mm.
         held: (6, k) scaled twists that the whole contact does not determine.
         bias: (6, 6), the part of the information of a coarse pixel that noise causes.
@@ -160,6 +168,7 @@ class Keyframe:
     coarse: Pixels
     some: Pixels
     many: Pixels
+    heights: HeightErrors
     probe: Array
     held: Array
     bias: Tensor
@@ -183,6 +192,7 @@ def make_keyframe(frame: Contact, mm_per_pixel: float) -> Keyframe:
     fine, bent = made.fine, made.coarse._replace(field=field_with_fitted_curvature(made.coarse))
     center, units = fine.points.double().mean(0), twist_units(fine)
     some, many = (_spread(fine, most) for most in (SOME, MANY))
+    steps = reference_pixels(some, fine, center, units)
     unknown = find_unknown(made.coarse, made.coarse, torch.eye(4, dtype=torch.float64)[None], made.noise).motions
     unknown = unknown.clone()
     unknown[3:] += torch.linalg.cross(unknown[:3], center[:, None].expand_as(unknown[:3]), dim=0)  # about the contact's center
@@ -194,8 +204,9 @@ def make_keyframe(frame: Contact, mm_per_pixel: float) -> Keyframe:
         times=times,
         touching=len(fine.points),
         coarse=reference_pixels(made.coarse, bent, center, units),
-        some=reference_pixels(some, fine, center, units),
+        some=steps,
         many=reference_pixels(many, fine, center, units),
+        heights=height_errors(frame.gradient, frame.skin, mm_per_pixel, CELL * times[1], steps),
         probe=fine.points[:: max(1, len(fine.points) // 64)].double().numpy(),
         held=held,
         bias=information_of_noise(made.noise, made.coarse.pitch),

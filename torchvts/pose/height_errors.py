@@ -1,0 +1,152 @@
+"""Heights of a keyframe, weighted by what smooth errors of slopes, integrated from undeformed skin, do to them.
+
+A smooth error of slopes tilts a wide face as a whole, and slopes of the face cannot show it. Its heights can: skin around the
+contact is undeformed, so a face that is tilted is too high at one flank and too low at the other, and narrow flanks hardly allow
+that. The covariance of heights says how hardly.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from .inverse import HEIGHT_NOISE_MM, SHALLOW_MM, Array, Field, Pixels
+
+ALIKE_MM, ALIKE_SLOPE = 2.5, 0.4
+"""Errors of slopes at places, or slopes, so far from each other have a correlation of exp(-1/2): presses of balls on real sensors,
+docs/tracking.md."""
+
+ERROR, FINE_SHARE, FINE_CELLS = 0.037, 0.3, 0.2
+"""Of the errors of both components of slopes: their size, 3 degrees; the share of its square in waves of less than 0.5 mm, and the
+share of these that the mean of a cell keeps."""
+
+WHITE_MM = 0.02
+"""What heights err by beside, cell by cell: it makes up for what the model of the errors has wrong."""
+
+MODES = 48
+"""Modes of the error of heights that are kept, the largest."""
+
+Mask = npt.NDArray[np.bool_]
+
+
+class HeightErrors(NamedTuple):
+    """Cells of a keyframe's contact, their heights, and how these err.
+
+    Attributes:
+        cell: (N,), the cell of each of the keyframe's pixels.
+        number: (M,), pixels of each cell.
+        lines: (M, 6 + K), what the height of a cell changes by each scaled twist and by each mode of the error, whose sizes have
+            a variance of 1; in units of :data:`WHITE_MM`.
+    """
+
+    cell: npt.NDArray[np.int64]
+    number: Array
+    lines: Array
+
+
+def height_errors(gradient: Tensor, skin: Tensor, mm_per_pixel: float, times: int, pixels: Pixels) -> HeightErrors:
+    """Cells of a keyframe and the modes of their errors.
+
+    Args:
+        gradient: (1, 2, H, W), of the keyframe, mm per mm.
+        skin: (1, 1, H, W) bool, deformed skin: around it heights are zero.
+        mm_per_pixel: pitch, mm.
+        times: pixels a side of a cell.
+        pixels: of the keyframe.
+    """
+    height, width = skin.shape[-2:]
+    share = avg_pool2d(skin.double(), times)
+    slope = (avg_pool2d(gradient.double() * skin, times) / share.clamp_min(0.2))[0].numpy()
+    x, y = pixels.columns[:2].double().numpy()
+    column = ((x / mm_per_pixel + 0.5 * width) / times).astype(int).clip(0, slope.shape[2] - 1)
+    row = ((0.5 * height - y / mm_per_pixel) / times).astype(int).clip(0, slope.shape[1] - 1)
+    deformed = share[0, 0].numpy() > 0.5
+    deformed[row, column] = True
+    cells, cell = np.unique(row * slope.shape[2] + column, return_inverse=True)
+    number = np.bincount(cell).astype(np.float64)
+    by = np.stack([np.bincount(cell, one) for one in pixels.columns[17:].double().numpy()], 1) / number[:, None]
+    chosen = (np.cumsum(deformed) - 1)[cells]
+    covariance = 2.0 * _covariance(slope, deformed, times * mm_per_pixel)[np.ix_(chosen, chosen)]  # the keyframe's and the frame's
+    size, modes = np.linalg.eigh(covariance)
+    modes = modes[:, -MODES:] * np.sqrt(size[-MODES:].clip(0.0))
+    return HeightErrors(cell, number, np.hstack((by, modes)) / WHITE_MM)
+
+
+def _covariance(slope: Array, deformed: Mask, pitch: float) -> Array:
+    """Covariance (n, n) of the heights of deformed cells, mm^2: the least squares of wrong slopes, zero on undeformed skin.
+
+    Args:
+        slope: (2, h, w), means over cells.
+        deformed: (h, w), n cells.
+        pitch: of cells, mm.
+    """
+    number = int(deformed.sum())
+    index = np.where(deformed, np.cumsum(deformed).reshape(deformed.shape) - 1, number)
+    laplace, along = 1e-6 * np.eye(number), []
+    height, width = deformed.shape
+    for down, right in ((0, 1), (1, 0)):
+        row, column = np.nonzero(deformed[: height - down, : width - right] | deformed[down:, right:])
+        one, other = (row, column), (row + down, column + right)
+        difference = np.zeros((len(row), number + 1))
+        difference[np.arange(len(row)), index[one]] -= 1.0
+        difference[np.arange(len(row)), index[other]] += 1.0
+        difference = difference[:, :number]
+        weights = [deformed[cells].astype(np.float64) for cells in (one, other)]
+        at = (weights[0] * slope[:, one[0], one[1]] + weights[1] * slope[:, other[0], other[1]]) / (weights[0] + weights[1])
+        place = pitch * np.stack((column + 0.5 * right, row + 0.5 * down))
+        laplace += difference.T @ difference
+        along.append((difference, np.concatenate((place / ALIKE_MM, at / ALIKE_SLOPE))))
+    covariance, inverse = np.zeros((number, number)), np.linalg.inv(laplace)
+    for difference, point in along:
+        square = 0.5 * (point * point).sum(0)
+        smooth = np.exp(point.T @ point - square[:, None] - square)
+        heights = inverse @ difference.T
+        covariance += heights @ ((1.0 - FINE_SHARE) * smooth) @ heights.T + FINE_SHARE * FINE_CELLS * heights @ heights.T
+    scaled: Array = covariance * (ERROR * pitch) ** 2
+    return scaled
+
+
+def height_sums(errors: HeightErrors, field: Field, pixels: Pixels, pose: Array) -> tuple[Array, Array]:
+    """J^T C^-1 J (6, 6) and J^T C^-1 r (6,) of the heights of cells that both contacts hold: generalised least squares.
+
+    C is that of the modes and of white noise; so the sizes of the modes are fitted beside the twist.
+
+    Args:
+        errors: of the keyframe.
+        field: the new frame.
+        pixels: the keyframe's, those that ``errors`` was made of.
+        pose: (4, 4), of the keyframe in the field's frame.
+    Source:
+        Aitken, Proceedings of the Royal Society of Edinburgh 55, 1935.
+    """
+    residual, seen = _height_residuals(field, pixels, pose)
+    cell = errors.cell[seen]
+    count = np.bincount(cell, minlength=len(errors.number))
+    used = count >= 0.5 * errors.number
+    mean = np.bincount(cell, residual[seen], len(errors.number))[used] / (count[used] * WHITE_MM)
+    lines = np.column_stack((errors.lines[used], mean))
+    products = lines.T @ lines
+    twist = [0, 1, 2, 3, 4, 5, -1]
+    modes = products[6:-1, 6:-1] + np.eye(errors.lines.shape[1] - 6)
+    across = products[6:-1, twist]
+    left = products[np.ix_(twist, twist)] - across.T @ np.linalg.solve(modes, across)
+    return left[:6, :6], left[:6, 6]
+
+
+def _height_residuals(field: Field, pixels: Pixels, pose: Array) -> tuple[Array, Mask]:
+    """Heights of a frame minus those of the keyframe's pixels under a pose, (N,) mm, and which of them can be compared."""
+    x, y, expected = pose[:3, :3].astype(np.float32) @ pixels.columns[:3].numpy() + pose[:3, 3:].astype(np.float32)
+    column, row = (x - field.x0) / field.pitch, (field.y0 - y) / field.pitch
+    height, width = field.channels.shape[:2]
+    seen = (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1) & (expected > SHALLOW_MM)
+    left, top = column.astype(np.int32).clip(0, width - 2), row.astype(np.int32).clip(0, height - 2)
+    along, down = (column - left)[:, None], (row - top)[:, None]
+    flat, first = field.channels.numpy().reshape(-1, 4), top * width + left
+    upper, lower = flat.take(first, 0), flat.take(first + width, 0)
+    upper += along * (flat.take(first + 1, 0) - upper)
+    lower += along * (flat.take(first + width + 1, 0) - lower)
+    upper += down * (lower - upper)
+    residual = upper[:, 0] - expected
+    return residual, seen & (upper[:, 3] > 0.999) & (np.abs(residual) < 2.0 * HEIGHT_NOISE_MM)

@@ -14,6 +14,7 @@ from torch.nn.modules import module as torch_modules
 from ..compensate import Blur, FillDefects
 from ..compensate.drift import LEAST_DRIFT, MOST_BY_MODE, MOST_DRIFT, stride_of
 from ..core.frame import DepthOutput
+from ..core.noise import sample_stride
 from ..core.robust import HALVINGS
 from ..integration.background import DepthAsIs
 from . import kernels
@@ -54,7 +55,8 @@ class Program(ctypes.Structure):
         *((name, REAL) for name in ("sigmas", "rounding", "least_cells", "bridge_sigmas")),
         *((name, POINTER) for name in ("flat", "per_noise", "failed_below", "most_far_field")),
         *((name, INTEGER) for name in ("corners", "degree", "terms")),
-        *((name, POINTER) for name in ("place", "weight", "per_mm", "dark", "saturated", "inverse")),
+        *((name, POINTER) for name in ("place", "weight", "per_mm", "noise", "lit", "saturated", "inverse")),
+        ("noise_stride", INTEGER),
         *((name, REAL) for name in ("max_sine", "per_slope", "pitch", "half_per_mm")),
         ("tables", POINTER),
         *((name, INTEGER) for name in ("passes", "zeroes", "sweeps", "slopes_of_depth")),
@@ -276,7 +278,8 @@ def _buffers(parts: Blocks) -> dict[str, Tensor]:
     else:
         model: Any = parts.normals
         shadowed = model.shadowed._buffers
-        found.update(inverse=normals["inverse"], dark=shadowed["dark_where"], saturated=shadowed["saturated_above"])
+        found.update(inverse=normals["inverse"], noise=shadowed["noise_std"], lit=shadowed["flat"])
+        found.update(saturated=shadowed["saturated_above"])
         found.update(position=model.lights.position_mm, albedo=model.lights.albedo)
     return {name: buffer for name, buffer in found.items() if buffer is not None}
 
@@ -301,6 +304,7 @@ def _settings(parts: Blocks) -> dict[str, Any]:
         "least_cells": mask.least_cells,
         "bridge_sigmas": mask.bridge_sigmas,
         "corners": parts.crop.stride,
+        "noise_stride": sample_stride(mask.flat.shape[1], mask.flat.shape[2], getattr(normals, "samples", 1)),
         "max_sine": getattr(normals, "max_sine", 0.0),
         "per_slope": 1.0 / gradient.max_slope,
         "pitch": integrate.mm_per_pixel,

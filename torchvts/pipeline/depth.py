@@ -39,7 +39,17 @@ from ..core.checks import (
     may_read,
     may_read_values,
 )
-from ..core.frame import DepthOutput, Frame, Solution, batch_like, depth_in_window, joined, undeformed_output, write_frame
+from ..core.frame import (
+    DepthOutput,
+    Frame,
+    Solution,
+    batch_like,
+    depth_in_window,
+    joined,
+    undeformed_output,
+    with_noise,
+    write_frame,
+)
 from ..core.settings import check_settings, settings_as_tensor
 from ..integration import PoissonBackground as PlainPoissonBackground
 from ..integration import WrappedIntegrator, as_integrator
@@ -305,6 +315,7 @@ class DepthPipeline(nn.Module):
         frame = self.crop(compensated, self.deformed(compensated))
         if may_read_values() and (images.shape[0] == 0 or (self.skips_undeformed and self.nothing_to_solve(frame))):
             return undeformed_output(frame)
+        frame = with_noise(frame, self.noise_of(compensated))
         frame, solution = self.with_faces(frame, self.solve(frame))  # eq. 9, 5, 4
         frame, solution = self.refine(frame, solution)  # eq. 10
         solution = Solution(solution.gradient, self.zero(solution.depth_mm, frame.deformed))
@@ -322,8 +333,12 @@ class DepthPipeline(nn.Module):
         deformed = with_cut_faces(solution.depth_mm.detach(), frame.deformed)
         if may_read(deformed) and torch.equal(deformed, frame.deformed):
             return frame, solution
-        frame = self.crop(frame.compensated, deformed)
+        frame = with_noise(self.crop(frame.compensated, deformed), frame.noise_std)
         return frame, self.solve(frame)
+
+    def noise_of(self, compensated: Tensor) -> Tensor | None:
+        """The noise of each frame, where the model of normals asks for it."""
+        return self.solve.normals.noise_of(compensated) if self.solve.takes_noise else None
 
     def nothing_to_solve(self, frame: Frame) -> bool:
         """Whether no skin has moved and no gradients are recorded, which would need a graph."""

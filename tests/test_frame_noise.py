@@ -7,7 +7,6 @@ import torch
 
 import torchvts as vts
 from torchvts.accelerated import reference_only
-from torchvts.accelerated.frame import solve_frames
 from torchvts.evaluation import metrics
 
 scenes = vts.scenes
@@ -74,19 +73,14 @@ def test_a_script_goes_by_the_noise_of_each_frame_too(low):
     assert float((torch.jit.script(pipe)(frames).depth_mm - pipe(frames).depth_mm).abs().max()) < 2e-5
 
 
-def test_one_call_does_a_frame_unless_its_own_noise_makes_channels_dark(ring):
-    """Pixels between three noises of rounding and three of this frame."""
-    lights = ring(22.0, 15.0, level=0.3)
-    pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, vts.Sensor("rig", *SIZE)), "fast")
-    scene = scenes.sphere_press(6.0, 1.8, (0.4, -0.3), *SIZE)
-    clean = scenes.render(scene, lights).detach().clamp_min(0.008)
-    noise = 0.004 * torch.randn(clean.shape, generator=torch.manual_seed(0)) * (clean > 0.1)
-    assert int((clean < 3.0 * 0.004).sum()) > 100 and bool((pipe.normals.shadowed.flat > 0.1).all())
-    assert solve_frames(pipe, clean, pipe.frame_blocks) is not None
-    assert solve_frames(pipe, clean + noise, pipe.frame_blocks) is None
-    with reference_only():
-        expected = pipe(clean + noise).depth_mm
-    assert float((pipe(clean + noise).depth_mm - expected).abs().max()) < 2e-6
+def test_mode_fast_goes_by_the_noise_of_the_calibration(low):
+    """A frame with noise in its shadows stays one call."""
+    _, calibration, _ = low
+    pipe, frame = vts.DepthPipeline.from_calibration(calibration, "fast"), seen(low, 0.005)
+    assert pipe.noise_of(frame) is None and pipe.solve.takes_noise
+    expected = pipe.solve.normals(frame, None, None, torch.full((1, 3), 0.005))
+    found = vts.DepthPipeline.from_calibration(told(calibration, 0.005), "fast").solve.normals(frame)
+    assert float((found - expected).abs().max()) < 1e-5 and float((pipe.solve.normals(frame) - expected).abs().max()) > 0.1
 
 
 def test_a_mask_of_shadows_goes_by_the_noise_of_the_frame():
@@ -99,7 +93,7 @@ def test_a_mask_of_shadows_goes_by_the_noise_of_the_frame():
 
 
 def test_units_by_response_fields_ask_for_no_noise(low):
-    pipe = vts.DepthPipeline.from_calibration(low[1])
+    pipe = vts.DepthPipeline.from_calibration(low[1], "precise")
     assert pipe.noise_of(seen(low, 0.005)).shape == (1, 3)
     assert pipe.normals.takes_noise and not vts.NormalModel.takes_noise
     plain = vts.DepthPipeline(pipe.compensate, pipe.deformed, torch.nn.Identity(), pipe.gradient, pipe.integrate, mm_per_pixel=1.0)

@@ -14,7 +14,6 @@ from torch.nn.modules import module as torch_modules
 from ..compensate import Blur, FillDefects
 from ..compensate.drift import LEAST_DRIFT, MOST_BY_MODE, MOST_DRIFT, stride_of
 from ..core.frame import DepthOutput
-from ..core.noise import sample_stride
 from ..core.robust import HALVINGS
 from ..integration.background import DepthAsIs
 from . import kernels
@@ -56,7 +55,6 @@ class Program(ctypes.Structure):
         *((name, POINTER) for name in ("flat", "per_noise", "failed_below", "most_far_field")),
         *((name, INTEGER) for name in ("corners", "degree", "terms")),
         *((name, POINTER) for name in ("place", "weight", "per_mm", "noise", "lit", "saturated", "inverse")),
-        ("noise_stride", INTEGER),
         *((name, REAL) for name in ("max_sine", "per_slope", "pitch", "half_per_mm")),
         ("tables", POINTER),
         *((name, INTEGER) for name in ("passes", "zeroes", "sweeps", "slopes_of_depth")),
@@ -304,7 +302,6 @@ def _settings(parts: Blocks) -> dict[str, Any]:
         "least_cells": mask.least_cells,
         "bridge_sigmas": mask.bridge_sigmas,
         "corners": parts.crop.stride,
-        "noise_stride": sample_stride(mask.flat.shape[1], mask.flat.shape[2], getattr(normals, "samples", 1)),
         "max_sine": getattr(normals, "max_sine", 0.0),
         "per_slope": 1.0 / gradient.max_slope,
         "pitch": integrate.mm_per_pixel,

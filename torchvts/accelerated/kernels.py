@@ -368,7 +368,7 @@ def normals(
             *(_at(depth_mm, first), *steps, *lights, _at(normal, first)),
         ),
     )
-    return normal, invalid < 2
+    return normal, not invalid
 
 
 def solve_shadowed(

@@ -102,6 +102,7 @@ class DepthPipeline(nn.Module):
     """
 
     skips_undeformed: Final[bool]
+    measures_noise: Final[bool]
 
     def __init__(
         self,
@@ -140,6 +141,7 @@ class DepthPipeline(nn.Module):
         self.deformed = deformed
         self.crop = Crop(STRIDE, model.takes_window)
         self.solve = Solve(model, gradient, integrator)
+        self.measures_noise = self.solve.takes_noise and mode != "fast"
         self.refine = self._policy(mode, tolerance_px, refine_threshold_px, min(max_passes, model.max_passes))
         # slopes that were learned within contacts do not sum to zero around a contact, those of known lights do;
         # an integrator other than PoissonBackground decides by itself where depth is zero
@@ -337,8 +339,12 @@ class DepthPipeline(nn.Module):
         return frame, self.solve(frame)
 
     def noise_of(self, compensated: Tensor) -> Tensor | None:
-        """The noise of each frame, where the model of normals asks for it."""
-        return self.solve.normals.noise_of(compensated) if self.solve.takes_noise else None
+        """The noise of each frame, where the model of normals asks for it.
+
+        Not in mode fast: of the two slopes that fit where a light is blocked, one pass cannot find the right one, so that nothing
+        is gained by more of such pixels.
+        """
+        return self.solve.normals.noise_of(compensated) if self.measures_noise else None
 
     def nothing_to_solve(self, frame: Frame) -> bool:
         """Whether no skin has moved and no gradients are recorded, which would need a graph."""

@@ -23,7 +23,6 @@ typedef struct {
     /* NormalFromResponse; or, where `inverse` is given, NormalFromIntensity */
     int32_t degree, terms;
     const float *place, *weight, *per_mm, *noise, *lit, *saturated, *inverse;
-    int32_t noise_stride;
     float max_sine;
     /* GradientFromNormal and PoissonBackground */
     float per_slope, pitch, half_per_mm;
@@ -97,7 +96,7 @@ typedef struct {
     const uint8_t *deformed;
     Window at;
     float *gradient, three_noises[3];
-    atomic_int trouble, dim;
+    atomic_int trouble;
 } Pass;
 
 /* Normals and gradient of so many rows at once: few, so that what lies between stays at hand. */
@@ -116,10 +115,9 @@ static void rows_of_gradient(void *with, int part) {
         return;
     }
     if (of->inverse) {
-        const int invalid = normals(light, 0, plane, width, pass->three_noises, of->lit + corner, of->saturated + corner, of->inverse + corner, plane,
-                                    width, 1, rows, columns, NULL, 0, 0, NULL, NULL, 0.0f, 0.0f, 0.0f, 0.0f, normal);
-        if (invalid == 2) atomic_fetch_or(&pass->trouble, BEYOND);
-        if (invalid == 1) atomic_store(&pass->dim, 1);
+        if (normals(light, 0, plane, width, pass->three_noises, of->lit + corner, of->saturated + corner, of->inverse + corner, plane, width, 1, rows,
+                    columns, NULL, 0, 0, NULL, NULL, 0.0f, 0.0f, 0.0f, 0.0f, normal))
+            atomic_fetch_or(&pass->trouble, BEYOND);
     } else {
         const float *weight = of->weight + (size_t)2 * of->terms * (of->degree + 1) * (at.top + first);
         response_normals(light, 0, plane, width, of->place + at.left, weight, of->degree, of->terms, before, 0, width,
@@ -131,34 +129,11 @@ static void rows_of_gradient(void *with, int part) {
     free(normal);
 }
 
-/* Whether any of n intensities is dark. */
-WIDE static int any_dark(const float *restrict image, const float *restrict flat, float three_noises, int n) {
-    int found = 0;
-    for (int k = 0; k < n; k++) found |= is_dark(image[k], flat[k], three_noises);
-    return found;
-}
-
-/* Whether a light is blocked that counts as blocked only by the noise of this frame, if that is more than the calibration knows. Returns the bits
-   of solve_frames(). */
-static int blocked_by_own_noise(const Pass *pass) {
-    const Program *of = pass->of;
-    const Window at = pass->at;
-    float noise[3];
-    if (frame_noise(pass->light, 1, of->height, of->width, of->noise_stride, noise)) return SHORT;
-    for (int c = 0; c < 3; c++)
-        for (int y = at.top; y < at.top + at.rows && noise[c] > of->noise[c]; y++) {
-            const size_t row = ((size_t)of->height * c + y) * of->width + at.left;
-            if (any_dark(pass->light + row, of->lit + row, 3.0f * noise[c], at.columns)) return BEYOND;
-        }
-    return 0;
-}
-
 /* Gradient and depth. Returns the bits of solve_frames(). */
 static int solve(const Program *of, const float *light, const uint8_t *deformed, const float *before, Window at, Work work, float *depth) {
     Pass pass = {.of = of, .light = light, .before = before, .deformed = deformed, .at = at, .gradient = work.gradient};
     for (int c = 0; c < 3 && of->inverse; c++) pass.three_noises[c] = 3.0f * of->noise[c];
     share(rows_of_gradient, &pass, (at.rows + ROWS - 1) / ROWS);
-    if (!pass.trouble && pass.dim) pass.trouble = blocked_by_own_noise(&pass);
     if (pass.trouble) return pass.trouble;
     return solve_poisson(work.gradient, of->tables, of->pitch, 1, at.rows, at.columns, at.top, at.left, of->height, of->width, 1, depth);
 }

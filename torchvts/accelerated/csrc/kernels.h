@@ -70,7 +70,6 @@ EXPORT void box_of(const uint8_t *mask, int frames, int height, int width, int *
 EXPORT void response_normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *place, const float *weight,
                              int degree, int terms, const float *depth, int64_t depth_frame, int64_t depth_row, const float *per_mm, float max_sine,
                              int frames, int rows, int columns, float *normal);
-EXPORT int frame_noise(const float *image, int frames, int height, int width, int stride, float *noise);
 EXPORT int normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *three_noises, const float *flat,
                    const float *saturated, const float *inverse, int64_t plane, int width, int frames, int rows, int columns, const float *depth,
                    int64_t depth_frame, int64_t depth_row, const float *position, const float *albedo, float pitch, float per_height, float axis_x,

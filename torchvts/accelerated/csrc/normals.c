@@ -43,14 +43,11 @@ WIDE static void at_depth(const float *restrict image, size_t step, const float 
     }
 }
 
-/* 2 if any of n intensities is dark or reaches `saturated`; else 1 if any would be dark if there were noise enough. */
+/* Whether any of n intensities is dark or reaches `saturated`. */
 WIDE static int any_invalid(const float *restrict image, const float *restrict flat, float three_noises, const float *restrict saturated, int n) {
-    int invalid = 0, dim = 0;
-    for (int k = 0; k < n; k++) {
-        invalid |= is_dark(image[k], flat[k], three_noises) | (image[k] >= saturated[k]);
-        dim |= image[k] < 0.5f * flat[k];
-    }
-    return invalid ? 2 : dim;
+    int found = 0;
+    for (int k = 0; k < n; k++) found |= is_dark(image[k], flat[k], three_noises) | (image[k] >= saturated[k]);
+    return found;
 }
 
 /* The lights from where (-axis_x, -axis_y) is the origin. */
@@ -84,10 +81,11 @@ static Lights lights_of(const float *position, const float *albedo, float axis_x
 /*
  * Normals (frames, 3, rows, columns) of a window of an image. image (frames, 3, rows, columns), frames, channels and rows `per_frame`,
  * `per_channel` and `per_row` elements apart. three_noises (frames, 3). flat, what the lights give on the flat skin, and saturated
- * (3, height, width) and the inverse (3, 3, height, width) from the window's first pixel on, their rows `width` and planes `plane` elements
- * apart. With depth, of the window, rows and frames `depth_row` and `depth_frame` elements apart, the inverse is not needed, but position and albedo of the lights, and where the middle of the image lies
- * as seen from that of the window (axis_x, axis_y), mm; `per_height` is 1 over the camera's height.
- * Returns 2 if any light is blocked or channel saturated; else 1 if a light would count as blocked in a noisier frame.
+ * (3, height, width) and the inverse (3, 3, height, width) from the window's first pixel on, their rows `width` and planes `plane`
+ * elements apart. With depth, of the window, rows and frames `depth_row` and `depth_frame` elements apart, the inverse is not needed, but position and
+ * albedo of the lights, and where the middle of the image lies as seen from that of the window (axis_x, axis_y), mm; `per_height` is 1 over
+ * the camera's height.
+ * Returns whether any light is blocked or channel saturated.
  */
 EXPORT int normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *three_noises, const float *flat,
                    const float *saturated, const float *inverse, int64_t plane, int width, int frames, int rows, int columns, const float *depth,
@@ -108,10 +106,8 @@ EXPORT int normals(const float *image, int64_t per_frame, int64_t per_channel, i
                          to + 2 * pixels);
             else
                 from_inverse(row, (size_t)per_channel, inverse + at, (size_t)plane, columns, to, to + pixels, to + 2 * pixels);
-            for (int c = 0; c < 3 && invalid < 2; c++) {
-                const int found = any_invalid(row + per_channel * c, flat + plane * c + at, three_noises[3 * b + c], saturated + plane * c + at, columns);
-                if (found > invalid) invalid = found;
-            }
+            for (int c = 0; c < 3; c++)
+                invalid |= any_invalid(row + per_channel * c, flat + plane * c + at, three_noises[3 * b + c], saturated + plane * c + at, columns);
         }
     return invalid;
 }

@@ -74,14 +74,14 @@ static void slope_of_depth(const float *z, int64_t row, int y, int x, int rows, 
 /*
  * Replaces the normals (frames, 3, rows, columns) of a window where a light that shines on the flat skin is dark, a channel is
  * saturated, an LED has failed (black in 98 % of the window), or `ill_conditioned` is set. image, depth, three_noises and flat as normals()
- * takes them; weights: (frames, 3), the first three of Model, model_numbers the others; ill_conditioned: (height, width) bytes from the window's first pixel on; expected: (frames, 2, rows, columns) or null. With depth, a
- * pixel starts from the slope of the depth; without, from the expected slope or its own normal, or from the flat skin where an LED
- * has failed or the matrix is ill-conditioned.
+ * takes them; weights: (frames, 3), the first three of Model, model_numbers the others; ill_conditioned: (height, width) bytes from the
+ * window's first pixel on; expected: (frames, 2, rows, columns) or null. With depth, a pixel starts from the slope of the depth; without,
+ * from the expected slope or its own normal, or from the flat skin where an LED has failed or the matrix is ill-conditioned.
  */
 EXPORT void solve_shadowed(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *three_noises,
                     const float *flat, const float *saturated_above, const uint8_t *ill_conditioned, int64_t plane, int width, int frames, int rows,
-                    int columns, const float *depth, int64_t depth_frame, int64_t depth_row, const float *expected, const float *position, const float *albedo,
-                    const float *model_numbers, const float *weights, float *normal) {
+                    int columns, const float *depth, int64_t depth_frame, int64_t depth_row, const float *expected, const float *position,
+                    const float *albedo, const float *model_numbers, const float *weights, float *normal) {
     const size_t pixels = (size_t)rows * columns;
     for (int b = 0; b < frames; b++, normal += 3 * pixels, three_noises += 3, weights += 3) {
         const Model model = {weights[0],       weights[1],       weights[2],       model_numbers[0], model_numbers[1],

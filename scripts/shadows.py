@@ -81,7 +81,7 @@ def errors(shape: str, kind: str, seed: int) -> tuple[float, float, float] | Non
     if float((pipe.normals.shadowed.blocked(pipe.compensate(image), (0, 0)) & scene.contact).sum() / scene.contact.sum()) < 0.03:
         return None
     ours, undisturbed = rms_px(pipe, image, scene), rms_px(pipe, without, scene) if kind == "cast" else math.nan
-    pipe.normals.shadowed.dark_where.fill_(-torch.inf)
+    pipe.normals.shadowed.flat.zero_()
     return ours, rms_px(pipe, image, scene), undisturbed
 
 

@@ -10,6 +10,7 @@ from refusals_values import (
     BAD_GRADIENT,
     BAD_KNOWN,
     BAD_MASKS,
+    BAD_NOISE,
     BAD_POINTS,
     BAD_POSE,
     BAD_POSITION,
@@ -25,6 +26,7 @@ from refusals_values import (
     KNOWN,
     MISSING,
     NAN,
+    NOISE,
     NUMBER,
     OTHERS,
     OUT,
@@ -131,7 +133,11 @@ TABLE = {
         {"sigmas": 4.5, "min_size_px": 8.0, "share": 0.8}, {"sigmas": NUMBER, "min_size_px": NUMBER, "share": NUMBER}
     ),
     "ContactMask.forward": forward(lambda: pipe().deformed, 3, "compensated"),
-    "ContactMask.shadowed": forward(lambda: pipe().deformed.shadowed, 3, "compensated"),
+    "ContactMask.shadowed": Entry(
+        {"compensated": FLAT[None], "noise_std": NOISE},
+        {"compensated": batches(3), "noise_std": BAD_NOISE},
+        lambda: pipe().deformed.shadowed,
+    ),
     "ContactMask.soft": forward(lambda: pipe().deformed.soft, 3, "compensated"),
     "DepthPipeline": Entry(
         {
@@ -217,18 +223,31 @@ TABLE = {
         {"calibration": [*OTHERS, unit("response")], "camera_height_mm": HEIGHTS},
     ),
     "NormalFromIntensity.forward": Entry(
-        {"image": FLAT[None], "depth_mm": DEPTH, "window": (0, 0)},
-        {"image": batches(3), "depth_mm": [b for b in batches(1) if b is not None], "window": [(20, 20), (-1, 0)]},
+        {"image": FLAT[None], "depth_mm": DEPTH, "window": (0, 0), "noise_std": NOISE},
+        {
+            "image": batches(3),
+            "depth_mm": [b for b in batches(1) if b is not None],
+            "window": [(20, 20), (-1, 0)],
+            "noise_std": BAD_NOISE,
+        },
         lambda: pipe().normals,
         named={"image": "compensated", "window": "compensated, window"},
     ),
+    "NormalFromIntensity.noise_of": forward(lambda: pipe().normals.noise_of, 3, "compensated"),
     "NormalFromIntensity.solve": Entry(
-        {"image": FLAT[None], "depth_mm": None, "window": (0, 0), "expected": torch.zeros(1, 2, HEIGHT, WIDTH)},
+        {
+            "image": FLAT[None],
+            "depth_mm": None,
+            "window": (0, 0),
+            "expected": torch.zeros(1, 2, HEIGHT, WIDTH),
+            "noise_std": NOISE,
+        },
         {
             "image": batches(3),
             "depth_mm": [b for b in batches(1) if b is not None],
             "window": [(20, 20), (-1, 0)],
             "expected": [b for b in batches(2) if b is not None],
+            "noise_std": BAD_NOISE,
         },
         lambda: pipe().normals.solve,
         named={"image": "compensated", "window": "compensated, window"},

@@ -71,7 +71,8 @@ def test_the_scenes_are_hard_enough(low, mini):
     pipe = pipeline(calibration, "precise")
     compensated = pipe.compensate(frames)
     shadowed = pipe.normals.shadowed
-    blocked = (compensated < shadowed.dark_where) | (compensated >= shadowed.saturated_above)
+    limits = shadowed.limits(compensated, (0, 0))
+    blocked = shadowed.dark(compensated, limits, pipe.normals.noise_of(compensated)) | (compensated >= limits.saturated_above)
     assert int(blocked[0].sum()) > 10
     assert pipe(frames).contact.flatten(1).any(1).tolist() == [True, True, True, False]
     assert (pipe(frames).depth_mm - pipeline(calibration, "fast")(frames).depth_mm).abs().max() > 0.05

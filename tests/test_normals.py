@@ -116,8 +116,9 @@ def test_two_lights_and_unit_length_give_the_slope(ring, brightness_std, toleran
     turned = torch.stack((-slope[:, 0], -slope[:, 1], torch.ones(3, dtype=torch.float64)), 1)
     light = (rows * (turned / turned.norm(dim=1, keepdim=True))[:, None]).sum(2)
     assert ((light <= 0).sum(1) == 1).all()
+    noise, brightness = torch.full((3,), 1e-3), torch.full((3,), brightness_std)
     found = slope_by_lit_lights(
-        Pixels(slope + 0.1, light.clamp_min(0.0), rows.expand(3, 3, 3), light > 1e9), 1e-3, brightness_std, steps=30
+        Pixels(slope + 0.1, light.clamp_min(0.0), rows.expand(3, 3, 3), light > 1e9, noise, brightness), steps=30
     )
     assert (found - slope).norm(dim=1).max() < tolerance
 

@@ -449,15 +449,12 @@ def test_a_row_of_the_file_holds_pose_and_reason():
 
 
 @pytest.mark.parametrize("turn", [0.0, 35.0])
-def test_a_rig_that_knows_its_noise_measures_the_depth_of_steep_flanks(turn):
+def test_a_rig_of_known_lights_alone_measures_the_depth_of_steep_flanks(turn):
     """Noise in a shadow looks like light: flanks steeper than the lights came out too shallow, and a key by 0.02 mm too low."""
     scene = objects.press(objects.key(), objects.pose(turn, press_mm=0.45), 180, 240, 1.0 / 12.0)
-    low = []
-    for known in (0.0, 0.005):
-        lights, pipe = pose_accuracy.rig(180, 240, 1.0 / 12.0, known)
-        out = pipe(render(scene, lights, noise_std=0.005, bits=8, seed=1))
-        low.append(float((scene.depth_mm - out.depth_mm)[out.contact & scene.contact].mean()))
-    assert low[0] > 0.012 and abs(low[1]) < 0.005
+    lights, pipe = pose_accuracy.rig(180, 240, 1.0 / 12.0)
+    out = pipe(render(scene, lights, noise_std=0.005, bits=8, seed=1))
+    assert abs(float((scene.depth_mm - out.depth_mm)[out.contact & scene.contact].mean())) < 0.005
 
 
 @pytest.mark.long

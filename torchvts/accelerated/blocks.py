@@ -11,7 +11,7 @@ from ..compensate.drift import grid_stride
 from ..core import frame as frames
 from ..core import geometry
 from ..core.checks import check_batch, check_same_size
-from ..core.noise import second_differences, std_from_median
+from ..core.noise import sample_stride, second_differences, std_from_median
 from ..integration import background
 from ..normals.shadowed import PRIOR_STD, STEPS, LightView
 from . import kernels
@@ -160,23 +160,31 @@ class NormalFromIntensity(Twin, normals.NormalFromIntensity):
 
     plain = normals.NormalFromIntensity
 
-    def normals_of(self, image: Tensor, depth_mm: Tensor | None, window: tuple[int, int], expected: Tensor | None) -> Tensor:
+    def frame_noise(self, compensated: Tensor) -> Tensor:
+        if not usable(compensated):
+            return super().frame_noise(compensated)
+        return kernels.frame_noise(compensated, sample_stride(compensated.shape[2], compensated.shape[3], self.samples))
+
+    def normals_of(
+        self, image: Tensor, depth_mm: Tensor | None, window: tuple[int, int], expected: Tensor | None, noise_std: Tensor
+    ) -> Tensor:
         position, albedo = self.lights.position_mm, self.lights.albedo
         given = [tensor for tensor in (depth_mm, expected) if tensor is not None]
-        if self.lights.glossy or not usable(image, position, albedo, self.inverse, *given):
-            return super().normals_of(image, depth_mm, window, expected)
+        if self.lights.glossy or not usable(image, position, albedo, self.inverse, noise_std, *given):
+            return super().normals_of(image, depth_mm, window, expected, noise_std)
         x, y = self.middle_mm(image, window)
         whole = LightView(position, albedo, self.mm_per_pixel, self.camera_height_mm, (-x, -y), window)
         shadowed = self.shadowed
-        limits = normals.shadowed.Limits(shadowed.dark_where, shadowed.saturated_above, shadowed.ill_conditioned)
-        normal, valid = kernels.normals(image, limits, self.inverse, depth_mm, whole)
+        limits = normals.shadowed.Limits(shadowed.flat, shadowed.saturated_above, shadowed.ill_conditioned)
+        normal, valid = kernels.normals(image, limits, noise_std, self.inverse, depth_mm, whole)
         ill_conditioned = shadowed.any_ill_conditioned and bool(shadowed.limits(image, window).ill_conditioned.any())
         if valid and not ill_conditioned:
             return normal
-        noise = shadowed.noise_std
-        constants = [noise, (noise / PRIOR_STD) ** 2, (shadowed.brightness_std / noise) ** 2, STEPS]
-        constants += [geometry.CLIFF_SLOPE, geometry.MAX_SLOPE]
-        kernels.solve_shadowed(normal, image, limits, depth_mm, expected, self.view(image, window), constants)
+        noise = shadowed.of_all_channels(noise_std)
+        weights = torch.stack((noise, (noise / PRIOR_STD).square(), (shadowed.brightness_std(noise) / noise).square()), dim=1)
+        constants = [float(STEPS), geometry.CLIFF_SLOPE, geometry.MAX_SLOPE]
+        noises = (noise_std, weights)
+        kernels.solve_shadowed(normal, image, limits, noises, depth_mm, expected, self.view(image, window), constants)
         return normal
 
 

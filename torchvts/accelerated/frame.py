@@ -54,7 +54,7 @@ class Program(ctypes.Structure):
         *((name, REAL) for name in ("sigmas", "rounding", "least_cells", "bridge_sigmas")),
         *((name, POINTER) for name in ("flat", "per_noise", "failed_below", "most_far_field")),
         *((name, INTEGER) for name in ("corners", "degree", "terms")),
-        *((name, POINTER) for name in ("place", "weight", "per_mm", "dark", "saturated", "inverse")),
+        *((name, POINTER) for name in ("place", "weight", "per_mm", "noise", "lit", "saturated", "inverse")),
         *((name, REAL) for name in ("max_sine", "per_slope", "pitch", "half_per_mm")),
         ("tables", POINTER),
         *((name, INTEGER) for name in ("passes", "zeroes", "sweeps", "slopes_of_depth")),
@@ -276,7 +276,8 @@ def _buffers(parts: Blocks) -> dict[str, Tensor]:
     else:
         model: Any = parts.normals
         shadowed = model.shadowed._buffers
-        found.update(inverse=normals["inverse"], dark=shadowed["dark_where"], saturated=shadowed["saturated_above"])
+        found.update(inverse=normals["inverse"], noise=shadowed["noise_std"], lit=shadowed["flat"])
+        found.update(saturated=shadowed["saturated_above"])
         found.update(position=model.lights.position_mm, albedo=model.lights.albedo)
     return {name: buffer for name, buffer in found.items() if buffer is not None}
 

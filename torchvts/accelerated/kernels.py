@@ -29,8 +29,9 @@ NO_PEDESTAL = (ctypes.c_float * 3)()
 
 SIGNATURES = {
     "contact_mask": ("i", "ppppp iiiiiii fff i f pp"),
-    "normals": ("i", "p lll ppp l iiii p ll pp ffff p"),
-    "solve_shadowed": ("v", "p lll ppp l iiii p ll ppppp"),
+    "normals": ("i", "p lll pppp l iiii p ll pp ffff p"),
+    "solve_shadowed": ("v", "p lll pppp l iiii p ll pppppp"),
+    "frame_noise": ("i", "p iiii p"),
     "zero_background": ("i", "pp iii ff i p"),
     "contact_from_depth": ("i", "p ll pp ll iiiii pp"),
     "clean": ("i", "pppppp l p iiii p"),
@@ -232,6 +233,19 @@ def contact_mask(
     return mask, interior
 
 
+def frame_noise(image: Tensor, stride: int) -> Tensor:
+    """Noise of each channel, (B, 3): see :func:`~torchvts.core.noise.noise_std`, whose stride this is."""
+    image = image.contiguous()
+    count, _, height, width = image.shape
+    noise, kernel = image.new_empty(count, 3), loaded().frame_noise
+    _check(
+        by_frames(
+            count, height * width, lambda first, many: kernel(_at(image, first), many, height, width, stride, _at(noise, first))
+        )
+    )
+    return noise
+
+
 def contact_from_depth(
     depth_mm: Tensor, gradient: Tensor, deformed: Tensor, cells: tuple[int, int], model: "ctypes.Array[ctypes.c_float]"
 ) -> Tensor:
@@ -326,13 +340,16 @@ def depth_slopes(depth_mm: Tensor, mask: Tensor, mm_per_pixel: float) -> Tensor:
     return gradient
 
 
-def normals(compensated: Tensor, limits: Limits, inverse: Tensor, depth_mm: Tensor | None, view: LightView) -> tuple[Tensor, bool]:
+def normals(
+    compensated: Tensor, limits: Limits, noise_std: Tensor, inverse: Tensor, depth_mm: Tensor | None, view: LightView
+) -> tuple[Tensor, bool]:
     """Unit normals (B, 3, h, w) of a window, and whether every channel of it is valid.
 
     By the stored inverse (3, 3, H, W), or with a depth by the lights; see :class:`~torchvts.normals.NormalFromIntensity`. Limits
-    and inverse are those of the whole image, and the position of the lights is as seen from its middle.
+    and inverse are those of the whole image, and the position of the lights is as seen from its middle. ``noise_std``: (B, 3).
     """
-    dark, saturated, inverse = limits.dark_below.contiguous(), limits.saturated_above.contiguous(), inverse.contiguous()
+    flat, saturated, inverse = limits.flat.contiguous(), limits.saturated_above.contiguous(), inverse.contiguous()
+    three_noises = (3.0 * noise_std).contiguous()
     compensated = _with_whole_rows(compensated)
     position_mm, albedo = view.position_mm.contiguous(), view.albedo.contiguous()
     count, _, rows, columns = compensated.shape
@@ -340,14 +357,14 @@ def normals(compensated: Tensor, limits: Limits, inverse: Tensor, depth_mm: Tens
     at = 4 * (view.window[0] * width + view.window[1])
     normal = compensated.new_empty(count, 3, rows, columns)
     depth_mm = None if depth_mm is None else _with_whole_rows(depth_mm)
-    fields = (dark.data_ptr() + at, saturated.data_ptr() + at, inverse.data_ptr() + at, height * width, width)
+    fields = (flat.data_ptr() + at, saturated.data_ptr() + at, inverse.data_ptr() + at, height * width, width)
     lights = (position_mm.data_ptr(), albedo.data_ptr(), view.mm_per_pixel, 1.0 / view.camera_height_mm, *view.axis_mm)
     kernel, strides, steps = loaded().normals, compensated.stride()[:3], _depth_arguments(depth_mm)[1:]
     invalid = by_frames(
         count,
         rows * columns,
         lambda first, many: kernel(
-            *(_at(compensated, first), *strides, *fields, many, rows, columns),
+            *(_at(compensated, first), *strides, three_noises[first:].data_ptr(), *fields, many, rows, columns),
             *(_at(depth_mm, first), *steps, *lights, _at(normal, first)),
         ),
     )
@@ -358,6 +375,7 @@ def solve_shadowed(
     normal: Tensor,
     compensated: Tensor,
     limits: Limits,
+    noises: tuple[Tensor, Tensor],
     depth_mm: Tensor | None,
     expected: Tensor | None,
     view: LightView,
@@ -366,23 +384,26 @@ def solve_shadowed(
     """Replace normals, in place, where a light is blocked, a channel is saturated, or the matrix is ill-conditioned.
 
     See :class:`~torchvts.normals.shadowed.ShadowedPixels`. The position of the lights is as seen from the window's middle.
-    ``constants``: noise, weight of the prior, weight of the brightness, steps; then behind pitch, camera and axis, which are taken
-    from ``view``, the largest difference of slopes beside a cliff and the largest slope.
+    ``noises``: of the channels of each frame, (B, 3), and of each frame the noise, the weight of the prior and that of the
+    brightness, (B, 3). ``constants``: steps; then behind pitch, camera and axis, which are taken from ``view``, the largest
+    difference of slopes beside a cliff and the largest slope.
     """
-    dark, saturated, ill = (table.contiguous() for table in limits)
+    flat, saturated, ill = (table.contiguous() for table in limits)
+    three_noises, weights = (3.0 * noises[0]).contiguous(), noises[1].contiguous()
     compensated = _with_whole_rows(compensated)
     position_mm, albedo = view.position_mm.contiguous(), view.albedo.contiguous()
     camera = [view.mm_per_pixel, 1.0 / view.camera_height_mm, *view.axis_mm]
-    model = albedo.new_tensor([*constants[:4], *camera, *constants[4:]])
+    model = albedo.new_tensor([constants[0], *camera, *constants[1:]])
     count, _, rows, columns = compensated.shape
-    height, width = dark.shape[1], dark.shape[2]
+    height, width = flat.shape[1], flat.shape[2]
     place = view.window[0] * width + view.window[1]
     depth_mm = None if depth_mm is None else _with_whole_rows(depth_mm)
     expected = None if expected is None else expected.contiguous()
     loaded().solve_shadowed(
         compensated.data_ptr(),
         *compensated.stride()[:3],
-        dark.data_ptr() + 4 * place,
+        three_noises.data_ptr(),
+        flat.data_ptr() + 4 * place,
         saturated.data_ptr() + 4 * place,
         ill.data_ptr() + place,
         height * width,
@@ -395,6 +416,7 @@ def solve_shadowed(
         position_mm.data_ptr(),
         albedo.data_ptr(),
         model.data_ptr(),
+        weights.data_ptr(),
         normal.data_ptr(),
     )
 

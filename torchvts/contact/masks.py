@@ -16,6 +16,7 @@ from ..core.checks import (
     check_field,
     check_float_tensor,
     check_least,
+    check_noise,
     check_positive,
     check_record,
     check_same_size,
@@ -155,15 +156,19 @@ class ContactMask(nn.Module):
         return near * torch.maximum(torch.sigmoid(length - self.sigmas), interior.to(length.dtype))
 
     @torch.jit.export
-    def shadowed(self, compensated: Tensor) -> Tensor:
+    def shadowed(self, compensated: Tensor, noise_std: Tensor | None = None) -> Tensor:
         """Where one channel is dark and the two others are unchanged, bool (B, 1, H, W).
 
-        The skin may be undeformed there, in a shadow of the object; or it has the one slope that looks the same.
+        The skin may be undeformed there, in a shadow of the object; or it has the one slope that looks the same. ``noise_std``:
+        (B, 3), noise of each frame; None for the calibrated one.
         """
         self._check(compensated)
         found = self.change(compensated.detach())
-        below = dark_below(-self.offset, torch.full_like(self.offset[:, :1, :1], self.dark_noises))
-        dark = compensated.detach() * self.per_noise < below
+        three_noises = self.dark_noises / self.per_noise[None]
+        if noise_std is not None:
+            check_noise("noise_std", noise_std, compensated.shape[0])
+            three_noises = self.dark_noises * noise_std[:, :, None, None]
+        dark = compensated.detach() < dark_below(self.flat, three_noises)
         dark = dark | self.black(compensated).any(dim=1)[:, None, None, None]  # with a failed LED, too little is left to decide
         lit = found.change.masked_fill(dark, 0.0).square().sum(dim=1, keepdim=True) <= found.threshold
         return lit & (dark.to(torch.uint8).sum(dim=1, keepdim=True) == 1)

@@ -19,6 +19,7 @@ class Frame(NamedTuple):
         mask: (B, 1, h, w) bool, the window of ``deformed``.
         window: (top, left), the place of the window's first pixel.
         size: (H, W).
+        noise_std: (B, 3), noise of each frame's compensated image; None where the model of normals does not ask for it.
     """
 
     compensated: Tensor
@@ -27,6 +28,7 @@ class Frame(NamedTuple):
     mask: Tensor
     window: tuple[int, int]
     size: tuple[int, int]
+    noise_std: Tensor | None
 
 
 class Solution(NamedTuple):
@@ -92,7 +94,12 @@ def with_deformed(frame: Frame, image: Tensor, mask: Tensor) -> Frame:
     """The frame with another image and another deformed area in its window."""
     (top, left), (height, width) = frame.window, frame.size
     outside = [left, width - left - mask.shape[3], top, height - top - mask.shape[2]]
-    return Frame(frame.compensated, nn.functional.pad(mask, outside), image, mask, frame.window, frame.size)
+    return Frame(frame.compensated, nn.functional.pad(mask, outside), image, mask, frame.window, frame.size, frame.noise_std)
+
+
+def with_noise(frame: Frame, noise_std: Tensor | None) -> Frame:
+    """The frame with the noise of its compensated image, (B, 3)."""
+    return Frame(frame.compensated, frame.deformed, frame.image, frame.mask, frame.window, frame.size, noise_std)
 
 
 class Crop(nn.Module):
@@ -119,7 +126,7 @@ class Crop(nn.Module):
         if self.finds_window(compensated) and deformed.shape[0] > 0:
             top, bottom, left, right = self.window(self.box(deformed), height, width)
         image, mask = compensated[:, :, top:bottom, left:right], deformed[:, :, top:bottom, left:right]
-        return Frame(compensated, deformed, image, mask, (top, left), (height, width))
+        return Frame(compensated, deformed, image, mask, (top, left), (height, width), None)
 
     def finds_window(self, images: Tensor) -> bool:
         """Whether the window depends on the images, and so on the batch."""

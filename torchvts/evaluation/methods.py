@@ -146,6 +146,7 @@ def _plain_inverse(calibration: Calibration) -> Built:
         raise ValueError("calibration: expected one by lights, got response fields")
     size = (sensor.height, sensor.width)
     normals = NormalFromIntensity(lights, *size, sensor.mm_per_pixel, noise_std=torch.zeros(3), inverse=calibration.inverse)
+    normals.takes_noise = False  # that of a frame would make channels dark
     return pipeline(calibration, "precise", normals=normals)
 
 

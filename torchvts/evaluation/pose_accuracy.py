@@ -1,6 +1,5 @@
 """Accuracy of pose through the whole chain: render objects of known pose, measure depth, register, compare."""
 
-import dataclasses
 import itertools
 import math
 import platform
@@ -87,24 +86,18 @@ class PoseRow:
             self.named += kinds == set(target.free) and len(found.ambiguous) == max(len(target.free), target.freedom)
 
 
-def rig(
-    height: int = 240, width: int = 320, mm_per_pixel: float = 0.0625, noise_std: float = 0.0
-) -> tuple[PointLights, DepthPipeline]:
+def rig(height: int = 240, width: int = 320, mm_per_pixel: float = 0.0625) -> tuple[PointLights, DepthPipeline]:
     """Three lights at 120 degrees over the sensor, and the pipeline of this unit in mode precise.
 
     Args:
         height: rows of the image.
         width: columns of the image.
         mm_per_pixel: pixel pitch, mm.
-        noise_std: of the camera, as a calibration has it from an image without contact; 0 where that is not known. Then noise in
-            shadows is taken for light, and flanks steeper than the lights come out too shallow.
     """
     angles = [math.radians(10.0 + 120.0 * k) for k in range(3)]
     position = [[31.0 * math.cos(a), 31.0 * math.sin(a), 40.0] for a in angles]
     lights = PointLights(position, [0.45 * math.hypot(31.0, 40.0) ** 3 / 40.0] * 3).requires_grad_(False)
     calibration = Calibration.from_lights(lights, Sensor("pose bench", height, width, mm_per_pixel))
-    if noise_std > 0.0:
-        calibration = dataclasses.replace(calibration, noise_std=torch.full((3,), noise_std))
     return lights, DepthPipeline.from_calibration(calibration, "precise")
 
 

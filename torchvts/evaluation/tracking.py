@@ -277,12 +277,12 @@ def run_tracking(
     seed: int = 1,
 ) -> Iterator[tuple[TrackRow, Track]]:
     """Track objects under all motions and noises, one row after the other."""
-    units = {noise: rig(noise_std=NOISES[noise].image_std) for noise in noises}
+    unit = rig()
     for name in names:
         target = {**objects.TARGETS, **objects.FREE_TARGETS}[name]
         for motion in motions:
             for noise in noises:
-                track = record(target, MOTIONS[motion], NOISES[noise], seed, units[noise])
+                track = record(target, MOTIONS[motion], NOISES[noise], seed, unit)
                 yield follow_track(track, MOTIONS[motion], TrackRow(name, motion, noise)), track
 
 

@@ -31,6 +31,7 @@ class NormalModel(nn.Module):
             a surface, so it has less noise and smaller errors than the slopes of single pixels.
         max_passes: passes after which nothing more is gained.
         takes_window: ``forward`` can work on a window of the calibrated image; else it always gets the whole image.
+        takes_noise: ``forward`` gets, as a fourth argument, what ``noise_of`` makes of the whole compensated image.
         input_domain: what ``forward`` works on, a key of :data:`DOMAINS`; a pipeline whose compensated images are something else
             is refused. None: it gets what the pipeline gives.
     Example:
@@ -47,11 +48,18 @@ class NormalModel(nn.Module):
     normals_from_depth: bool = False
     max_passes: int = 1000
     takes_window: bool = False
+    takes_noise: bool = False
     input_domain: str | None = None
 
     if TYPE_CHECKING:
 
-        def __call__(self, image: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor: ...
+        def __call__(
+            self,
+            image: Tensor,
+            depth_mm: Tensor | None = None,
+            window: tuple[int, int] | None = None,
+            noise_std: Tensor | None = None,
+        ) -> Tensor: ...
 
     def forward(self, image: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
         """Normals of a compensated image.
@@ -64,6 +72,10 @@ class NormalModel(nn.Module):
             (B, 3, h, w), facing the camera; of unit length where a second pass is to use it.
         """
         raise TypeError(f"{type(self).__name__}: a NormalModel must define forward(image, depth_mm, window)")
+
+    def noise_of(self, compensated: Tensor) -> Tensor | None:
+        """Noise of each channel of whole compensated images (B, 3, H, W), (B, 3); for models that declare ``takes_noise``."""
+        return None
 
     def coarse(self, stride: int) -> "NormalModel | None":
         """The same model for an image of every ``stride``-th pixel, for the prediction of mode "auto"; None if there is none: then

@@ -22,10 +22,11 @@ from ..core.checks import (
     reads_freely,
 )
 from ..core.geometry import normal_from_gradient, slope_of_depth
+from ..core.noise import noise_std as frame_noise_std
 from ..model.calibration import Calibration, check_calibration
 from ..model.lights import PointLights, flat_image, gloss_lobe, inverse_light_matrix, normal_at_depth
 from .base import NormalModel
-from .shadowed import LightView, ShadowedPixels, matrix_in_view
+from .shadowed import SAMPLES, LightView, ShadowedPixels, matrix_in_view
 
 GLOSS_STEPS = 3
 """Times that a first pass divides the lobe out, each at the slope of the last."""
@@ -35,7 +36,7 @@ class NormalFromIntensity(NormalModel):
     """Unit normals of a compensated image.
 
     Without depth, by the stored inverse of the light matrix at the undeformed skin (eq. 9); with depth, by the inverse at that
-    depth (eq. 10). Where a light is blocked (its channel below three times its noise, or below half of the flat skin's light), a
+    depth (eq. 10). Where a light is blocked (its channel below three times its noise and below half of the flat skin's light), a
     channel is saturated or the light matrix is ill-conditioned, :class:`~torchvts.normals.shadowed.ShadowedPixels` replaces that
     normal; elsewhere nothing changes. While gradients are recorded for the lights (``requires_grad_(True)``), the matrix is
     built from them at every call. The stored inverse follows the lights: it is computed again where they are no longer those
@@ -46,7 +47,8 @@ class NormalFromIntensity(NormalModel):
         height: pixels.
         width: pixels.
         mm_per_pixel: pixel pitch, mm.
-        noise_std: (3,), noise of the compensated image; None takes that of 8-bit rounding.
+        noise_std: (3,), noise of the compensated image; None takes that of 8-bit rounding. In a pipeline a frame that has more
+            counts with its own (:meth:`noise_of`).
         inverse: (3, 3, H, W), the stored inverse; None computes it.
         saturated_above: (3, H, W), compensated intensity from which a channel counts as saturated; None for never.
         camera_height_mm: of a pinhole camera above the image centre, which sees deep points nearer to its axis; infinite for an
@@ -61,6 +63,7 @@ class NormalFromIntensity(NormalModel):
 
     uses_depth: bool = True
     takes_window: bool = True
+    takes_noise: bool = True
     input_domain: str | None = "light"
     inverse: Tensor
     stored_position_mm: Tensor
@@ -79,6 +82,7 @@ class NormalFromIntensity(NormalModel):
     ) -> None:
         super().__init__()
         self.gloss_steps = GLOSS_STEPS
+        self.samples = SAMPLES
         check_record("lights", lights, PointLights, "PointLights(position_mm, albedo) makes them")
         check_size(height, width, mm_per_pixel)
         self.mm_per_pixel = mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
@@ -123,11 +127,37 @@ class NormalFromIntensity(NormalModel):
             camera_height_mm=camera_height_mm,
         )
 
-    def forward(self, image: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
-        return self.solve(image, depth_mm, window, None)
+    def forward(
+        self,
+        image: Tensor,
+        depth_mm: Tensor | None = None,
+        window: tuple[int, int] | None = None,
+        noise_std: Tensor | None = None,
+    ) -> Tensor:
+        return self.solve(image, depth_mm, window, None, noise_std)
 
     @torch.jit.export
-    def solve(self, image: Tensor, depth_mm: Tensor | None, window: tuple[int, int] | None, expected: Tensor | None) -> Tensor:
+    def noise_of(self, compensated: Tensor) -> Tensor:
+        """Noise (B, 3) by which a channel of compensated images (B, 3, H, W) is dark: the calibrated one, or the frame's own where
+        that is larger, as with lights that are known without an image of the unit."""
+        check_batch("compensated", compensated, 3)
+        if compensated.shape[3] < 3:  # no second differences
+            return self.shadowed.noise_std.expand(compensated.shape[0], 3)
+        return torch.maximum(self.frame_noise(compensated.detach()), self.shadowed.noise_std)
+
+    def frame_noise(self, compensated: Tensor) -> Tensor:
+        """Noise of the frame itself, (B, 3)."""
+        return frame_noise_std(compensated, self.samples)
+
+    @torch.jit.export
+    def solve(
+        self,
+        image: Tensor,
+        depth_mm: Tensor | None,
+        window: tuple[int, int] | None,
+        expected: Tensor | None,
+        noise_std: Tensor | None = None,
+    ) -> Tensor:
         """As ``forward``, but shadowed pixels start from the slopes ``expected`` (B, 2, h, w); a depth takes precedence."""
         check_batch("compensated", image, 3)
         if expected is not None:
@@ -144,7 +174,7 @@ class NormalFromIntensity(NormalModel):
             check_same_count("depth_mm", depth_mm, "compensated", image.shape[0])
         if image.shape[0] == 0:
             return image
-        return self.normals_of(image, depth_mm, place, expected)
+        return self.normals_of(image, depth_mm, place, expected, self.shadowed.noise_of_frames(noise_std, image))
 
     def follow_lights(self) -> None:
         """Compute what is stored of the lights again if they have changed since, as by an optimiser.
@@ -168,11 +198,13 @@ class NormalFromIntensity(NormalModel):
         position, albedo = self.lights.position_mm.detach(), self.lights.albedo.detach()
         return inverse_light_matrix(position.new_zeros(1, 1, height, width), position, albedo, self.mm_per_pixel)[0]
 
-    def normals_of(self, image: Tensor, depth_mm: Tensor | None, window: tuple[int, int], expected: Tensor | None) -> Tensor:
+    def normals_of(
+        self, image: Tensor, depth_mm: Tensor | None, window: tuple[int, int], expected: Tensor | None, noise_std: Tensor
+    ) -> Tensor:
         """Normals of checked arguments; compiled kernels take the place of this method."""
         view = self.view(image, window)
         plain = self.inverted_glossy(image, depth_mm, view) if self.lights.glossy else self.inverted(image, depth_mm, view)
-        normal: Tensor = self.shadowed(plain, image, depth_mm, view, expected)
+        normal: Tensor = self.shadowed(plain, image, depth_mm, view, expected, noise_std)
         return normal
 
     def inverted(self, image: Tensor, depth_mm: Tensor | None, view: LightView) -> Tensor:
@@ -240,7 +272,7 @@ class NormalFromIntensity(NormalModel):
             rows,
             columns,
             self.mm_per_pixel * stride,
-            self.shadowed.dark_below / 3.0,
+            self.shadowed.noise_std,
             saturated_above=self.shadowed.saturated_above[:, stride // 2 :: stride, stride // 2 :: stride],
             camera_height_mm=self.camera_height_mm,
         )

@@ -5,10 +5,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_shape, may_read, may_read_values
+from ..core.checks import check_noise, check_shape, may_read, may_read_values
 from ..core.geometry import gradient_from_normal, normal_from_gradient, slope_beside_cliff
 from ..core.noise import dark_below
 from ..model.lights import glossy_light, light_matrix, seen_at
+
+SAMPLES = 2000
+"""Pixels from which the noise of a frame is estimated, as ContactMask does."""
 
 LEFT_OUT = -1.0
 """Intensity of a channel that is left out at a pixel because something else than the skin's slope blocks its light; shadowed.c has
@@ -57,15 +60,15 @@ def matrix_in_view(depth_mm: Tensor, view: LightView) -> Tensor:
 
 
 class Limits(NamedTuple):
-    """Between which intensities a channel is valid, and where the light matrix is ill-conditioned.
+    """What decides between which intensities a channel is valid, and where the light matrix is ill-conditioned.
 
     Attributes:
-        dark_below: (3, h, w); minus infinity where the flat skin is not lit.
+        flat: (3, h, w), what the lights give on the flat skin; with the noise it says from where on a channel is dark.
         saturated_above: (3, h, w).
         ill_conditioned: (h, w) bool.
     """
 
-    dark_below: Tensor
+    flat: Tensor
     saturated_above: Tensor
     ill_conditioned: Tensor
 
@@ -78,6 +81,8 @@ class Pixels(NamedTuple):
         intensity: (N, 3), compensated.
         rows: (N, 3, 3), light matrix.
         saturated: (N, 3) bool, channels that are saturated; one that is left out is a saturated one of intensity 0.
+        noise_std: (N,), noise of the compensated image, against which the prior is weighed.
+        brightness_std: (N,), of the common brightness, relative.
         gloss: (3,), of the lights; None for a matt skin.
     """
 
@@ -85,12 +90,12 @@ class Pixels(NamedTuple):
     intensity: Tensor
     rows: Tensor
     saturated: Tensor
+    noise_std: Tensor
+    brightness_std: Tensor
     gloss: Tensor | None = None
 
 
-def slope_by_lit_lights(
-    pixels: Pixels, noise_std: float, brightness_std: float = 0.01, prior_std: float = PRIOR_STD, steps: int = STEPS
-) -> Tensor:
+def slope_by_lit_lights(pixels: Pixels, prior_std: float = PRIOR_STD, steps: int = STEPS) -> Tensor:
     """Slopes of pixels where a light is blocked or a channel is saturated: each pixel against the clamped model max(0, L n).
 
     On a glossy skin the lobe is part of the model: two lights leave a direction in which the slope answers to small differences of
@@ -105,8 +110,6 @@ def slope_by_lit_lights(
 
     Args:
         pixels: the pixels.
-        noise_std: noise of the compensated image, against which the prior is weighed.
-        brightness_std: of the common brightness, relative.
         prior_std: of the slope about ``start``.
         steps: of Gauss-Newton.
     Returns:
@@ -115,7 +118,9 @@ def slope_by_lit_lights(
         the shadowed pixels of Barsky and Petrou, TPAMI 25(10), 2003, as a maximum a posteriori estimate.
     """
     start, compensated, rows, gloss = pixels.start, pixels.intensity, pixels.rows, pixels.gloss
-    weight = (noise_std / prior_std) ** 2
+    weight = (pixels.noise_std / prior_std).square()
+    least_light = 0.1 * pixels.noise_std[:, None]  # above zero, because a black channel starts exactly on the terminator
+    trust = (pixels.brightness_std / pixels.noise_std).square()[:, None]
     slope = start
     for _ in range(steps):
         p, q = slope[:, 0:1], slope[:, 1:2]
@@ -124,8 +129,7 @@ def slope_by_lit_lights(
         light, change = (rows * normal[:, None]).sum(2), rows  # (N, 3), (N, light, axis)
         if gloss is not None:
             light, change = glossy_light(rows, normal, gloss)
-        # 0.1 sigma above zero, because a black channel starts exactly on the terminator
-        lit = ((light > 0.1 * noise_std) & ~(pixels.saturated & (light >= compensated))).to(light.dtype)
+        lit = ((light > least_light) & ~(pixels.saturated & (light >= compensated))).to(light.dtype)
         # d normal / d slope is -n_z (e - n (n.e)) along x and y: the part of the light row across the normal
         change = change - (change * normal[:, None]).sum(2, keepdim=True) * normal[:, None]
         across = -n_z[:, :, None] * change[:, :, 0:2] * lit[:, :, None]
@@ -133,14 +137,14 @@ def slope_by_lit_lights(
         residual = compensated * lit - model
         # whitened by the covariance noise^2 1 + brightness^2 model model^T
         energy = (model * model).sum(1, keepdim=True)
-        common = (1.0 - torch.rsqrt(1.0 + (brightness_std / noise_std) ** 2 * energy)) / energy.clamp_min(1e-12)
+        common = (1.0 - torch.rsqrt(1.0 + trust * energy)) / energy.clamp_min(1e-12)
         along = common * model
         residual = residual - along * (model * residual).sum(1, keepdim=True)
         across = across - along[:, :, None] * (model[:, :, None] * across).sum(1, keepdim=True)
         a = (across[:, :, 0] ** 2).sum(1) + weight
         b = (across[:, :, 0] * across[:, :, 1]).sum(1)
         c = (across[:, :, 1] ** 2).sum(1) + weight
-        right = (across * residual[:, :, None]).sum(1) + weight * (start - slope)
+        right = (across * residual[:, :, None]).sum(1) + weight[:, None] * (start - slope)
         step = torch.stack((c * right[:, 0] - b * right[:, 1], a * right[:, 1] - b * right[:, 0]), dim=1)
         p_q = torch.linalg.cross(across[:, :, 0], across[:, :, 1], dim=1)
         # a c - b^2 without cancellation (Cauchy-Binet): one lit channel leaves a determinant of the prior's size
@@ -161,26 +165,25 @@ class ShadowedPixels(nn.Module):
 
     That is where a light that shines on the flat skin is dark, where a channel is saturated, and where the matrix is so
     ill-conditioned that its inverse makes more of the noise than slopes vary (``PRIOR_STD``). Where an LED has failed, the other
-    two and |n| = 1 are left, so all pixels go this way, starting from the flat skin.
+    two and |n| = 1 are left, so all pixels go this way, starting from the flat skin. Methods take the noise of each frame,
+    ``noise_std`` (B, 3); None is that of the calibration.
 
     Args:
         flat: (3, H, W), what the lights give on the flat skin.
-        noise_std: (3,), noise of the compensated image.
+        noise_std: (3,), noise of the compensated image at calibration.
         inverse: (3, 3, H, W), the inverse light matrix at the flat skin.
         saturated_above: (3, H, W), intensity from which a channel counts as saturated; None for never.
     """
 
-    dark_below: Tensor
-    dark_where: Tensor
+    noise_std: Tensor
+    flat: Tensor
     saturated_above: Tensor
     ill_conditioned: Tensor
 
     def __init__(self, flat: Tensor, noise_std: Tensor, inverse: Tensor, saturated_above: Tensor | None) -> None:
         super().__init__()
-        self.left_out = LEFT_OUT
-        self.noise_std = max(float(noise_std.square().mean().sqrt()), 1e-6)
-        self.brightness_std = max(0.005, BRIGHTNESS_NOISES * self.noise_std)
-        self.register_buffer("dark_below", 3.0 * noise_std.detach().to(flat.dtype))
+        self.left_out, self.brightness_noises = LEFT_OUT, BRIGHTNESS_NOISES
+        self.register_buffer("noise_std", noise_std.detach().to(flat.dtype))
         self.follow(flat, inverse)
         if saturated_above is not None:
             check_shape("saturated_above", saturated_above, flat.shape)
@@ -189,28 +192,63 @@ class ShadowedPixels(nn.Module):
 
     def follow(self, flat: Tensor, inverse: Tensor) -> None:
         """Take over what depends on the lights: where the flat skin is lit, and where the matrix is ill-conditioned."""
-        ill_conditioned = ~(self.noise_std * inverse.square().sum(dim=(0, 1)).sqrt() <= PRIOR_STD)  # infinite ones too
+        noise = float(self.of_all_channels(self.noise_std[None]))
+        ill_conditioned = ~(noise * inverse.square().sum(dim=(0, 1)).sqrt() <= PRIOR_STD)  # infinite ones too
         self.any_ill_conditioned = bool(ill_conditioned.any())
         self.register_buffer("ill_conditioned", ill_conditioned)
-        self.register_buffer("dark_where", dark_below(flat, self.dark_below.reshape(3, 1, 1)))
+        self.register_buffer("flat", flat.detach().clone())
 
     def limits(self, image: Tensor, window: tuple[int, int]) -> Limits:
         """The limits in the window of an image (B, 3, h, w)."""
         top, left = window
         bottom, right = top + image.shape[2], left + image.shape[3]
         return Limits(
-            self.dark_where[:, top:bottom, left:right],
+            self.flat[:, top:bottom, left:right],
             self.saturated_above[:, top:bottom, left:right],
             self.ill_conditioned[top:bottom, left:right],
         )
 
-    def all_valid(self, image: Tensor, limits: Limits) -> bool:
-        """Whether no pixel of the image needs this module."""
-        image = image.detach()  # asked by subtraction, which is three times as fast as comparison
-        valid = float((image - limits.dark_below).amin()) >= 0.0 and float((image - limits.saturated_above).amax()) < 0.0
-        return valid and not (self.any_ill_conditioned and bool(limits.ill_conditioned.any()))
+    def noise_of_frames(self, noise_std: Tensor | None, image: Tensor) -> Tensor:
+        """The noise of each frame (B, 3) of an image (B, 3, h, w), as it was given; else that of the calibration."""
+        if noise_std is None:
+            return self.noise_std.expand(image.shape[0], 3)
+        check_noise("noise_std", noise_std, image.shape[0])
+        return noise_std.expand(image.shape[0], 3)
 
-    def forward(self, normal: Tensor, image: Tensor, depth_mm: Tensor | None, view: LightView, expected: Tensor | None) -> Tensor:
+    def of_all_channels(self, noise_std: Tensor) -> Tensor:
+        """Root mean square of the channels' noise (B, 3): (B,)."""
+        return noise_std.square().mean(dim=1).sqrt().clamp_min(1e-6)
+
+    def brightness_std(self, noise: Tensor) -> Tensor:
+        """Relative standard deviation of the brightness that all channels share, where their noise is so large."""
+        return (self.brightness_noises * noise).clamp_min(0.005)
+
+    def nowhere_dark(self, image: Tensor, noise_std: Tensor) -> bool:
+        """Whether no channel of an image (B, 3, h, w) is below three times its noise (B, 3); where it is, ``dark`` says more."""
+        return bool((image.detach().amin(dim=(2, 3)) >= 3.0 * noise_std).all())
+
+    def dark(self, image: Tensor, limits: Limits, noise_std: Tensor) -> Tensor:
+        """Channels whose light is blocked, bool (B, 3, h, w); see :func:`~torchvts.core.noise.dark_below`."""
+        return image < dark_below(limits.flat, 3.0 * noise_std[:, :, None, None])
+
+    def all_valid(self, image: Tensor, limits: Limits, noise_std: Tensor) -> bool:
+        """Whether no pixel of the image needs this module."""
+        image = image.detach()
+        if self.any_ill_conditioned and bool(limits.ill_conditioned.any()):
+            return False
+        if float((image - limits.saturated_above).amax()) >= 0.0:  # by subtraction, three times as fast as comparison
+            return False
+        return self.nowhere_dark(image, noise_std) or not bool(self.dark(image, limits, noise_std).any())
+
+    def forward(
+        self,
+        normal: Tensor,
+        image: Tensor,
+        depth_mm: Tensor | None,
+        view: LightView,
+        expected: Tensor | None,
+        noise_std: Tensor | None = None,
+    ) -> Tensor:
         """Normals (B, 3, h, w) with those replaced that the plain inverse got wrong.
 
         Args:
@@ -219,11 +257,12 @@ class ShadowedPixels(nn.Module):
             depth_mm: (B or 1, 1, h, w), the depth so far; its slopes are the start.
             view: lights and camera.
             expected: (B, 2, h, w), slopes to start from where there is no depth; None for those of ``normal``.
+            noise_std: (B, 3), of each frame; None for that of the calibration.
         """
-        limits = self.limits(image, view.window)
-        if may_read(image) and self.all_valid(image, limits):
+        limits, noise = self.limits(image, view.window), self.noise_of_frames(noise_std, image)
+        if may_read(image) and self.all_valid(image, limits, noise):
             return normal
-        dark = image < limits.dark_below
+        dark = self.dark(image, limits, noise)
         failed = failed_leds(dark)
         invalid = dark | (image >= limits.saturated_above) | failed[:, :, None, None]
         wanted = invalid.any(dim=1) | limits.ill_conditioned
@@ -246,28 +285,33 @@ class ShadowedPixels(nn.Module):
         rows = view.albedo[None, :, None] * to_light * (squared.rsqrt() / squared)
         intensity, lost = image[b, :, row, column], failed[b]
         saturated = (intensity >= limits.saturated_above[:, row, column].t()) | lost | (intensity <= 0.5 * self.left_out)
-        pixels = Pixels(start, intensity * (~lost).to(intensity.dtype), rows, saturated, view.gloss)
-        slope = slope_by_lit_lights(pixels, self.noise_std, self.brightness_std)
+        std = self.of_all_channels(noise)[b]
+        pixels = Pixels(start, intensity * (~lost).to(intensity.dtype), rows, saturated, std, self.brightness_std(std), view.gloss)
+        slope = slope_by_lit_lights(pixels)
         solution = normal_from_gradient(slope[:, :, None, None])[:, :, 0, 0]
         solution = torch.where(wanted[b, row, column][:, None], solution, normal[b, :, row, column])
         return normal.permute(0, 2, 3, 1).index_put((b, row, column), solution).permute(0, 3, 1, 2)
 
     @torch.jit.export
-    def blocked(self, image: Tensor, window: tuple[int, int]) -> Tensor:
+    def blocked(self, image: Tensor, window: tuple[int, int], noise_std: Tensor | None = None) -> Tensor:
         """Where one or two of the lights that shine on the flat skin are dark, (B, 1, h, w) bool; a failed LED is not counted."""
-        below = self.limits(image, window).dark_below
-        if may_read(image) and bool((image.detach() - below).amin() >= 0.0):
+        noise = self.noise_of_frames(noise_std, image)
+        if may_read(image) and self.nowhere_dark(image, noise):
             return torch.zeros_like(image[:, 0:1], dtype=torch.bool)
-        dark = image < below
+        dark = self.dark(image, self.limits(image, window), noise)
         return (dark & ~failed_leds(dark)[:, :, None, None]).any(dim=1, keepdim=True)
 
     @torch.jit.export
-    def without_dark(self, image: Tensor, window: tuple[int, int]) -> Tensor:
+    def without_dark(self, image: Tensor, window: tuple[int, int], noise_std: Tensor | None = None) -> Tensor:
         """The image (B, 3, h, w) with dark channels left out, as where something else than the skin's slope blocks the light."""
-        return image.masked_fill(image < self.limits(image, window).dark_below, self.left_out)
+        return image.masked_fill(
+            self.dark(image, self.limits(image, window), self.noise_of_frames(noise_std, image)), self.left_out
+        )
 
     @torch.jit.export
-    def mirrored(self, gradient: Tensor, image: Tensor, depth_mm: Tensor, view: LightView) -> Tensor:
+    def mirrored(
+        self, gradient: Tensor, image: Tensor, depth_mm: Tensor, view: LightView, noise_std: Tensor | None = None
+    ) -> Tensor:
         """Slopes that fit as well where one light is blocked, but lie beyond the plane of the other two.
 
         Two lights and |n| = 1 leave a normal and its mirror image. On walls the one beyond the plane is right, and no start near a
@@ -278,11 +322,12 @@ class ShadowedPixels(nn.Module):
             image: (B, 3, h, w), compensated.
             depth_mm: (B, 1, h, w).
             view: lights and camera.
+            noise_std: (B, 3), of each frame; None for that of the calibration.
         Returns:
             (B, 2, h, w); as they are elsewhere.
         """
         matrix = matrix_in_view(depth_mm, view)
-        dark = image < self.limits(image, view.window).dark_below
+        dark = self.dark(image, self.limits(image, view.window), self.noise_of_frames(noise_std, image))
         dark = dark & ~failed_leds(dark)[:, :, None, None]
         one = dark.to(torch.uint8).sum(dim=1, keepdim=True) == 1
         normal = normal_from_gradient(gradient)

@@ -289,16 +289,20 @@ class Confidence(nn.Module):
         """
         self._check(images, compensated, out)
         sigma = self._noise_of(images)
-        base = self.normals(compensated, None, None)
-        noise, model = self._through_the_inverse(base, compensated, sigma)
+        own_noise = self._own_noise(compensated)
+        base = self._normals(compensated, None, own_noise)
+        noise, model = self._through_the_inverse(base, compensated, sigma, own_noise)
         n_z = out.normal[:, 2:3]
         steep = n_z.square()  # an error of slope turns the normal by so much, at most along one axis
         model = model * (2.0 - 2.0 * n_z) if self.by_lights else model + self.border  # |n - n_flat|^2
-        again = self.normals(compensated, out.depth_mm, None) if self.uses_depth else base
+        again = self._normals(compensated, out.depth_mm, own_noise) if self.uses_depth else base
         change = torch.sqrt((again - out.normal).square().sum(1, keepdim=True) + 1e-12)
         clipped = torch.zeros_like(noise)
         if self.by_lights:
-            dark = (compensated < self.normals.shadowed.dark_where) | (compensated >= self.normals.shadowed.saturated_above)
+            shadowed = self.normals.shadowed
+            limits = shadowed.limits(compensated, (0, 0))
+            dark = shadowed.dark(compensated, limits, shadowed.noise_of_frames(own_noise, compensated))
+            dark = dark | (compensated >= limits.saturated_above)
             clipped = self.clipped_variance * dark.any(dim=1, keepdim=True).to(noise.dtype)
             noise = noise * self._unexplained(compensated, out.depth_mm, again, dark, sigma)
         surface = self._not_integrable(out.depth_mm, out.gradient, steep, noise)
@@ -355,14 +359,27 @@ class Confidence(nn.Module):
         factor = torch.sqrt((more + self.fixed) / (1.0 + self.fixed))  # the background's part is what it was
         return self.noise[None] * factor[:, :, None, None]
 
-    def _through_the_inverse(self, base: Tensor, compensated: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
+    def _own_noise(self, compensated: Tensor) -> Tensor | None:
+        """The noise of each frame (B, 3) that its normals get, if they ask for it."""
+        return self.normals.noise_of(compensated) if self.by_lights else None
+
+    def _normals(self, compensated: Tensor, depth_mm: Tensor | None, own_noise: Tensor | None) -> Tensor:
+        if self.by_lights:
+            normal = self.normals(compensated, depth_mm, None, own_noise)
+        else:
+            normal = self.normals(compensated, depth_mm, None)
+        return normal
+
+    def _through_the_inverse(
+        self, base: Tensor, compensated: Tensor, sigma: Tensor, own_noise: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
         """Variances along one axis of the angle, radians^2, by noise and by the light's error."""
         noise = torch.zeros_like(base[:, 0:1])
         model = torch.zeros_like(noise)
         for k in range(3):
             step = torch.zeros_like(compensated)
             step[:, k : k + 1] = sigma[:, k : k + 1]
-            turn = 0.5 * (self.normals(compensated + step, None, None) - base).square().sum(1, keepdim=True)
+            turn = 0.5 * (self._normals(compensated + step, None, own_noise) - base).square().sum(1, keepdim=True)
             noise = noise + turn
             model = model + turn * (self.light_std[k : k + 1] / sigma[:, k : k + 1]).square()
         return noise, model

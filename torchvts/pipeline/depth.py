@@ -39,7 +39,17 @@ from ..core.checks import (
     may_read,
     may_read_values,
 )
-from ..core.frame import DepthOutput, Frame, Solution, batch_like, depth_in_window, joined, undeformed_output, write_frame
+from ..core.frame import (
+    DepthOutput,
+    Frame,
+    Solution,
+    batch_like,
+    depth_in_window,
+    joined,
+    undeformed_output,
+    with_noise,
+    write_frame,
+)
 from ..core.settings import check_settings, settings_as_tensor
 from ..integration import PoissonBackground as PlainPoissonBackground
 from ..integration import WrappedIntegrator, as_integrator
@@ -92,6 +102,7 @@ class DepthPipeline(nn.Module):
     """
 
     skips_undeformed: Final[bool]
+    measures_noise: Final[bool]
 
     def __init__(
         self,
@@ -130,6 +141,7 @@ class DepthPipeline(nn.Module):
         self.deformed = deformed
         self.crop = Crop(STRIDE, model.takes_window)
         self.solve = Solve(model, gradient, integrator)
+        self.measures_noise = self.solve.takes_noise and mode != "fast"
         self.refine = self._policy(mode, tolerance_px, refine_threshold_px, min(max_passes, model.max_passes))
         # slopes that were learned within contacts do not sum to zero around a contact, those of known lights do;
         # an integrator other than PoissonBackground decides by itself where depth is zero
@@ -305,6 +317,7 @@ class DepthPipeline(nn.Module):
         frame = self.crop(compensated, self.deformed(compensated))
         if may_read_values() and (images.shape[0] == 0 or (self.skips_undeformed and self.nothing_to_solve(frame))):
             return undeformed_output(frame)
+        frame = with_noise(frame, self.noise_of(compensated))
         frame, solution = self.with_faces(frame, self.solve(frame))  # eq. 9, 5, 4
         frame, solution = self.refine(frame, solution)  # eq. 10
         solution = Solution(solution.gradient, self.zero(solution.depth_mm, frame.deformed))
@@ -322,8 +335,16 @@ class DepthPipeline(nn.Module):
         deformed = with_cut_faces(solution.depth_mm.detach(), frame.deformed)
         if may_read(deformed) and torch.equal(deformed, frame.deformed):
             return frame, solution
-        frame = self.crop(frame.compensated, deformed)
+        frame = with_noise(self.crop(frame.compensated, deformed), frame.noise_std)
         return frame, self.solve(frame)
+
+    def noise_of(self, compensated: Tensor) -> Tensor | None:
+        """The noise of each frame, where the model of normals asks for it.
+
+        Not in mode fast: of the two slopes that fit where a light is blocked, one pass cannot find the right one, so that nothing
+        is gained by more of such pixels.
+        """
+        return self.solve.normals.noise_of(compensated) if self.measures_noise else None
 
     def nothing_to_solve(self, frame: Frame) -> bool:
         """Whether no skin has moved and no gradients are recorded, which would need a graph."""

@@ -178,7 +178,12 @@ class Adaptive(Repeat):
         before = solution.gradient.detach()[:, :, first::step, first::step]
         corner = (top // step, left // step)
         size = ((height + step - first - 1) // step, (width + step - first - 1) // step)
-        change = self.solve.gradient(self.coarse_normals(image, depth, corner)) * inside - before
+        normal = (
+            self.coarse_normals(image, depth, corner, frame.noise_std)
+            if self.solve.takes_noise
+            else self.coarse_normals(image, depth, corner)
+        )
+        change = self.solve.gradient(normal) * inside - before
         found: Tensor = self.coarse_integrate(change, corner, size)
         return found.abs().amax(dim=(1, 2, 3)) / self.mm_per_pixel
 
@@ -192,7 +197,10 @@ def still_missing_px(change_px: Tensor, last_px: Tensor) -> Tensor:
 def _some_frames(frame: Frame, index: Tensor, every: bool) -> Frame:
     if every:
         return frame
-    return Frame(frame.compensated[index], frame.deformed[index], frame.image[index], frame.mask[index], frame.window, frame.size)
+    noise = frame.noise_std
+    noise = None if noise is None else noise[index]
+    some = (frame.compensated[index], frame.deformed[index], frame.image[index], frame.mask[index])
+    return Frame(some[0], some[1], some[2], some[3], frame.window, frame.size, noise)
 
 
 def _some(frames: Tensor, index: Tensor, every: bool) -> Tensor:

@@ -57,7 +57,8 @@ class Shadows(nn.Module):
 
     def forward(self, frame: Frame, solution: Solution) -> tuple[Frame, Solution]:
         active = self.policy.unsettled(frame, solution)
-        blocked: Tensor = self.policy.solve.normals.shadowed.blocked(frame.image, frame.window) & frame.mask
+        blocked: Tensor = self.policy.solve.normals.shadowed.blocked(frame.image, frame.window, frame.noise_std)
+        blocked = blocked & frame.mask
         has_shadow = active & blocked.flatten(1).any(dim=1)
         if may_read_values() and not bool(has_shadow.any()):
             return frame, self.policy.repeat(frame, solution, active)
@@ -78,13 +79,13 @@ class Shadows(nn.Module):
         (top, left), normals = frame.window, self.policy.solve.normals
         shadowed = torch.zeros_like(blocked)
         if self.deformed is not None:
-            found: Tensor = self.deformed.shadowed(frame.compensated)
+            found: Tensor = self.deformed.shadowed(frame.compensated, frame.noise_std)
             shadowed = found[:, :, top : top + blocked.shape[2], left : left + blocked.shape[3]] & blocked
         flat = self.accept(frame, solution.gradient, torch.zeros_like(solution.gradient), shadowed, has_shadow)
         blocked = blocked & ~flat.where
-        without: Tensor = normals.shadowed.without_dark(frame.image, frame.window)
+        without: Tensor = normals.shadowed.without_dark(frame.image, frame.window, frame.noise_std)
         expected = torch.where(blocked, 0.0, flat.gradient)
-        other = self.policy.solve.gradient(normals.solve(without, None, frame.window, expected))
+        other = self.policy.solve.gradient(normals.solve(without, None, frame.window, expected, frame.noise_std))
         rim = (
             nn.functional.max_pool2d(as_factor(~frame.mask, frame.image), 3, 1, 1) > 0.0
         )  # walls of a pixel make no surface either
@@ -99,7 +100,7 @@ class Shadows(nn.Module):
         # some 30 x 40 cells, and of a thin or small image no more than 3,000: the work grows with their square
         cell = max(1, (min(height, width) + 15) // 30, math.ceil(math.sqrt(height * width / 3000.0)))
         expected = extrapolated_slope(solution.gradient, lit, cell, top, left)
-        normal = self.policy.solve.normals.solve(frame.image, None, frame.window, expected)
+        normal = self.policy.solve.normals.solve(frame.image, None, frame.window, expected, frame.noise_std)
         other = self.policy.solve.integrated(frame, self.policy.solve.gradient(normal) * as_factor(frame.mask, frame.image))
         gained = self.residual(frame, other) - self.residual(frame, solution)
         return self.better(has_shadow, gained, other, solution)
@@ -110,7 +111,8 @@ class Shadows(nn.Module):
         before = self.residual(frame, solution)
         view = normals.view(frame.image, frame.window)
         depth = depth_in_window(frame, solution.depth_mm)
-        slope: Tensor = normals.shadowed.mirrored(solution.gradient, frame.image, depth, view) * as_factor(frame.mask, frame.image)
+        slope: Tensor = normals.shadowed.mirrored(solution.gradient, frame.image, depth, view, frame.noise_std)
+        slope = slope * as_factor(frame.mask, frame.image)
         other = self.policy.repeat(frame, solve.integrated(frame, slope), has_shadow)
         gained = self.residual(frame, other) - before
         slope = torch.where(nn.functional.avg_pool2d(gained, 17, 1, 8) < 0.0, other.gradient, solution.gradient)

@@ -1,5 +1,7 @@
 """One pass: from a compensated window to normals, gradient and depth (eq. 9 or 10, 5 and 4 of the paper)."""
 
+from typing import Final
+
 from torch import Tensor, nn
 
 from ..accelerated import Masked
@@ -17,9 +19,12 @@ class Solve(nn.Module):
         integrate: gradient to depth.
     """
 
+    takes_noise: Final[bool]
+
     def __init__(self, normals: NormalModel, gradient: nn.Module, integrate: Integrator) -> None:
         super().__init__()
         self.normals = normals
+        self.takes_noise = normals.takes_noise
         self.gradient = gradient
         self.integrate = integrate
         self.masked = Masked()
@@ -31,10 +36,11 @@ class Solve(nn.Module):
             frame: the frame.
             depth_mm: (B, 1, H, W), the depth so far, which eq. 10 takes; None for eq. 9.
         """
-        if depth_mm is None:
-            normal = self.normals(frame.image, None, frame.window)
+        depth = None if depth_mm is None else depth_in_window(frame, depth_mm)
+        if self.takes_noise:
+            normal = self.normals(frame.image, depth, frame.window, frame.noise_std)
         else:
-            normal = self.normals(frame.image, depth_in_window(frame, depth_mm), frame.window)
+            normal = self.normals(frame.image, depth, frame.window)
         return self.integrated(frame, self.masked(self.gradient(normal), frame.mask))
 
     def integrated(self, frame: Frame, gradient: Tensor) -> Solution:

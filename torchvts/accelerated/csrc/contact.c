@@ -80,6 +80,13 @@ static inline float change_of(float image, const float *offset, float per_noise,
     return (offset ? offset[at] : -per_noise) + image * per_noise;
 }
 
+/* std_from_median() of torchvts/core/noise.py, of the n second differences `some`, which have twice the memory, and one more. */
+static float noise_from(float *some, int n) {
+    float std = 1.5f * median(some, n, some + n) / 0.6745f;
+    for (int pass = 0; pass < 2 && std == std; pass++) std = clipped_std(some, n, std);
+    return std / sqrtf(1.5f);
+}
+
 /* noise_std() of torchvts/core/noise.py, of one channel's change. some: of so many samples, twice the memory, and one more. */
 static float noise_of(const float *image, const float *offset, const float *per_noise, int height, int width, int stride, float *some) {
     int n = 0;
@@ -89,9 +96,25 @@ static float noise_of(const float *image, const float *offset, const float *per_
             const float left = change_of(image[i], offset, per_noise[i], i), middle = change_of(image[i + 1], offset, per_noise[i + 1], i + 1);
             some[n] = fabsf(middle - 0.5f * (left + change_of(image[i + 2], offset, per_noise[i + 2], i + 2)));
         }
-    float std = 1.5f * median(some, n, some + n) / 0.6745f;
-    for (int pass = 0; pass < 2 && std == std; pass++) std = clipped_std(some, n, std);
-    return std / sqrtf(1.5f);
+    return noise_from(some, n);
+}
+
+/* noise_std() of torchvts/core/noise.py, of images (frames, 3, height, width): noise (frames, 3). Returns 1 where memory is short. */
+EXPORT int frame_noise(const float *image, int frames, int height, int width, int stride, float *noise) {
+    const size_t samples = (size_t)((height + stride - 1) / stride) * ((width + stride - 1) / stride);
+    float *some = malloc(sizeof(float) * (2 * samples + 1));
+    if (!some) return 1;
+    for (int k = 0; k < 3 * frames; k++, image += (size_t)height * width) {
+        int n = 0;
+        for (int y = stride / 2; y < height; y += stride)
+            for (int x = 0; x < width - 2; x += stride) {
+                const float *at = image + (size_t)y * width + x;
+                some[n++] = fabsf(at[1] - 0.5f * (at[0] + at[2]));
+            }
+        noise[k] = noise_from(some, n);
+    }
+    free(some);
+    return 0;
 }
 
 /* far_field() of torchvts/contact/masks.py, of one channel's change. */

@@ -22,7 +22,7 @@ typedef struct {
     int32_t corners;
     /* NormalFromResponse; or, where `inverse` is given, NormalFromIntensity */
     int32_t degree, terms;
-    const float *place, *weight, *per_mm, *dark, *saturated, *inverse;
+    const float *place, *weight, *per_mm, *noise, *lit, *saturated, *inverse;
     float max_sine;
     /* GradientFromNormal and PoissonBackground */
     float per_slope, pitch, half_per_mm;
@@ -95,7 +95,7 @@ typedef struct {
     const float *light, *before;
     const uint8_t *deformed;
     Window at;
-    float *gradient;
+    float *gradient, three_noises[3];
     atomic_int trouble;
 } Pass;
 
@@ -115,8 +115,8 @@ static void rows_of_gradient(void *with, int part) {
         return;
     }
     if (of->inverse) {
-        if (normals(light, 0, plane, width, of->dark + corner, of->saturated + corner, of->inverse + corner, plane, width, 1, rows, columns, NULL, 0, 0,
-                    NULL, NULL, 0.0f, 0.0f, 0.0f, 0.0f, normal))
+        if (normals(light, 0, plane, width, pass->three_noises, of->lit + corner, of->saturated + corner, of->inverse + corner, plane, width, 1, rows,
+                    columns, NULL, 0, 0, NULL, NULL, 0.0f, 0.0f, 0.0f, 0.0f, normal))
             atomic_fetch_or(&pass->trouble, BEYOND);
     } else {
         const float *weight = of->weight + (size_t)2 * of->terms * (of->degree + 1) * (at.top + first);
@@ -131,7 +131,8 @@ static void rows_of_gradient(void *with, int part) {
 
 /* Gradient and depth. Returns the bits of solve_frames(). */
 static int solve(const Program *of, const float *light, const uint8_t *deformed, const float *before, Window at, Work work, float *depth) {
-    Pass pass = {of, light, before, deformed, at, work.gradient, 0};
+    Pass pass = {.of = of, .light = light, .before = before, .deformed = deformed, .at = at, .gradient = work.gradient};
+    for (int c = 0; c < 3 && of->inverse; c++) pass.three_noises[c] = 3.0f * of->noise[c];
     share(rows_of_gradient, &pass, (at.rows + ROWS - 1) / ROWS);
     if (pass.trouble) return pass.trouble;
     return solve_poisson(work.gradient, of->tables, of->pitch, 1, at.rows, at.columns, at.top, at.left, of->height, of->width, 1, depth);

@@ -70,10 +70,10 @@ EXPORT void box_of(const uint8_t *mask, int frames, int height, int width, int *
 EXPORT void response_normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *place, const float *weight,
                              int degree, int terms, const float *depth, int64_t depth_frame, int64_t depth_row, const float *per_mm, float max_sine,
                              int frames, int rows, int columns, float *normal);
-EXPORT int normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *dark, const float *saturated,
-                   const float *inverse, int64_t plane, int width, int frames, int rows, int columns, const float *depth, int64_t depth_frame,
-                   int64_t depth_row, const float *position, const float *albedo, float pitch, float per_height, float axis_x, float axis_y,
-                   float *normal);
+EXPORT int normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *three_noises, const float *flat,
+                   const float *saturated, const float *inverse, int64_t plane, int width, int frames, int rows, int columns, const float *depth,
+                   int64_t depth_frame, int64_t depth_row, const float *position, const float *albedo, float pitch, float per_height, float axis_x,
+                   float axis_y, float *normal);
 EXPORT void slopes(const float *normal, int frames, int pixels, float per_slope, float *gradient);
 EXPORT void mask_values(const float *values, const uint8_t *mask, int64_t per_frame, int64_t per_row, int frames, int channels, int rows,
                         int columns, float *masked);
@@ -91,6 +91,11 @@ EXPORT void uncrop(const float *gradient, const uint8_t *contact, int frames, in
                    float *whole, float *normal, uint8_t *touching);
 
 static inline int least(int a, int b) { return a < b ? a : b; }
+
+/* dark_below() of torchvts/core/noise.py: whether a channel of such intensity is dark, where the flat skin has `flat`. */
+static inline int is_dark(float intensity, float flat, float three_noises) {
+    return (intensity < three_noises) & (intensity < 0.5f * flat) & (flat > three_noises);
+}
 
 /* How many of the first n bytes are `value`; 64 at a time, then eight. */
 static inline int bytes_alike(const uint8_t *bytes, int n, uint8_t value) {

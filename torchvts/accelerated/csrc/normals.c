@@ -43,10 +43,10 @@ WIDE static void at_depth(const float *restrict image, size_t step, const float 
     }
 }
 
-/* Whether any of n intensities lies below `dark` or reaches `saturated`. */
-WIDE static int any_invalid(const float *restrict image, const float *restrict dark, const float *restrict saturated, int n) {
+/* Whether any of n intensities is dark or reaches `saturated`. */
+WIDE static int any_invalid(const float *restrict image, const float *restrict flat, float three_noises, const float *restrict saturated, int n) {
     int found = 0;
-    for (int k = 0; k < n; k++) found |= (image[k] < dark[k]) | (image[k] >= saturated[k]);
+    for (int k = 0; k < n; k++) found |= is_dark(image[k], flat[k], three_noises) | (image[k] >= saturated[k]);
     return found;
 }
 
@@ -80,14 +80,15 @@ static Lights lights_of(const float *position, const float *albedo, float axis_x
 
 /*
  * Normals (frames, 3, rows, columns) of a window of an image. image (frames, 3, rows, columns), frames, channels and rows `per_frame`,
- * `per_channel` and `per_row` elements apart. dark and saturated (3, height, width) and the inverse (3, 3, height, width) from the window's
- * first pixel on, their rows `width` and planes `plane` elements apart. With depth, of the window, rows and frames `depth_row` and
- * `depth_frame` elements apart, the inverse is not needed, but position and albedo of the lights, and where the middle of the image lies
- * as seen from that of the window (axis_x, axis_y), mm; `per_height` is 1 over the camera's height.
+ * `per_channel` and `per_row` elements apart. three_noises (frames, 3). flat, what the lights give on the flat skin, and saturated
+ * (3, height, width) and the inverse (3, 3, height, width) from the window's first pixel on, their rows `width` and planes `plane`
+ * elements apart. With depth, of the window, rows and frames `depth_row` and `depth_frame` elements apart, the inverse is not needed, but position and
+ * albedo of the lights, and where the middle of the image lies as seen from that of the window (axis_x, axis_y), mm; `per_height` is 1 over
+ * the camera's height.
  * Returns whether any light is blocked or channel saturated.
  */
-EXPORT int normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *dark, const float *saturated,
-                   const float *inverse, int64_t plane, int width, int frames, int rows, int columns, const float *depth,
+EXPORT int normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *three_noises, const float *flat,
+                   const float *saturated, const float *inverse, int64_t plane, int width, int frames, int rows, int columns, const float *depth,
                    int64_t depth_frame, int64_t depth_row, const float *position, const float *albedo, float pitch, float per_height,
                    float axis_x, float axis_y, float *normal) {
     const size_t pixels = (size_t)rows * columns;
@@ -106,7 +107,7 @@ EXPORT int normals(const float *image, int64_t per_frame, int64_t per_channel, i
             else
                 from_inverse(row, (size_t)per_channel, inverse + at, (size_t)plane, columns, to, to + pixels, to + 2 * pixels);
             for (int c = 0; c < 3; c++)
-                invalid |= any_invalid(row + per_channel * c, dark + plane * c + at, saturated + plane * c + at, columns);
+                invalid |= any_invalid(row + per_channel * c, flat + plane * c + at, three_noises[3 * b + c], saturated + plane * c + at, columns);
         }
     return invalid;
 }

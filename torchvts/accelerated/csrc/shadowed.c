@@ -6,7 +6,7 @@
 /* The intensity of a channel that is left out, as in torchvts/normals/shadowed.py; no camera gives half of it. */
 #define LEFT_OUT -1.0f
 
-/* What does not change from pixel to pixel. */
+/* What does not change from pixel to pixel; the first three are of a frame. */
 typedef struct {
     float noise_std, weight, brightness, steps;
     float pitch, per_height, axis_x, axis_y, cliff_slope, max_slope;
@@ -73,25 +73,25 @@ static void slope_of_depth(const float *z, int64_t row, int y, int x, int rows, 
 
 /*
  * Replaces the normals (frames, 3, rows, columns) of a window where a light that shines on the flat skin is dark, a channel is
- * saturated, an LED has failed (black in 98 % of the window), or `ill_conditioned` is set. image and depth as normals() takes them;
- * ill_conditioned: (height, width) bytes from the window's first pixel on; expected: (frames, 2, rows, columns) or null. With depth, a
- * pixel starts from the slope of the depth; without, from the expected slope or its own normal, or from the flat skin where an LED
- * has failed or the matrix is ill-conditioned.
+ * saturated, an LED has failed (black in 98 % of the window), or `ill_conditioned` is set. image, depth, three_noises and flat as normals()
+ * takes them; weights: (frames, 3), the first three of Model, model_numbers the others; ill_conditioned: (height, width) bytes from the
+ * window's first pixel on; expected: (frames, 2, rows, columns) or null. With depth, a pixel starts from the slope of the depth; without,
+ * from the expected slope or its own normal, or from the flat skin where an LED has failed or the matrix is ill-conditioned.
  */
-EXPORT void solve_shadowed(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *dark, const float *saturated_above,
-                    const uint8_t *ill_conditioned, int64_t plane, int width, int frames, int rows, int columns, const float *depth,
-                    int64_t depth_frame, int64_t depth_row, const float *expected, const float *position, const float *albedo,
-                    const float *model_numbers, float *normal) {
-    const Model model = {model_numbers[0], model_numbers[1], model_numbers[2], model_numbers[3], model_numbers[4],
-                         model_numbers[5], model_numbers[6], model_numbers[7], model_numbers[8], model_numbers[9]};
+EXPORT void solve_shadowed(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *three_noises,
+                    const float *flat, const float *saturated_above, const uint8_t *ill_conditioned, int64_t plane, int width, int frames, int rows,
+                    int columns, const float *depth, int64_t depth_frame, int64_t depth_row, const float *expected, const float *position,
+                    const float *albedo, const float *model_numbers, const float *weights, float *normal) {
     const size_t pixels = (size_t)rows * columns;
-    for (int b = 0; b < frames; b++, normal += 3 * pixels) {
+    for (int b = 0; b < frames; b++, normal += 3 * pixels, three_noises += 3, weights += 3) {
+        const Model model = {weights[0],       weights[1],       weights[2],       model_numbers[0], model_numbers[1],
+                             model_numbers[2], model_numbers[3], model_numbers[4], model_numbers[5], model_numbers[6]};
         int failed[3], any_failed = 0;
         for (int j = 0; j < 3; j++) {
             size_t count = 0;
             for (int y = 0; y < rows; y++) {
-                const float *line = image + per_frame * b + per_channel * j + per_row * y, *below = dark + plane * j + (size_t)y * width;
-                for (int x = 0; x < columns; x++) count += line[x] < below[x];
+                const float *line = image + per_frame * b + per_channel * j + per_row * y, *lit = flat + plane * j + (size_t)y * width;
+                for (int x = 0; x < columns; x++) count += is_dark(line[x], lit[x], three_noises[j]);
             }
             failed[j] = (float)count / (float)pixels > 0.98f;
             any_failed |= failed[j];
@@ -104,7 +104,7 @@ EXPORT void solve_shadowed(const float *image, int64_t per_frame, int64_t per_ch
                 for (int j = 0; j < 3; j++) {
                     const float value = image[per_frame * b + per_channel * j + per_row * y + x];
                     const int is_saturated = value >= saturated_above[plane * j + at];
-                    wanted |= is_saturated || value < dark[plane * j + at];
+                    wanted |= is_saturated || is_dark(value, flat[plane * j + at], three_noises[j]);
                     saturated[j] = is_saturated || failed[j] || value <= 0.5f * LEFT_OUT;
                     intensity[j] = failed[j] ? 0.0f : value;
                 }

@@ -7,11 +7,10 @@ import pytest
 import torch
 
 import torchvts as vts
-from torchvts.accelerated import reference_only
+from torchvts.accelerated import ContactMask, reference_only
 from torchvts.calibration import fit_prior
-from torchvts.contact import ContactMask
 from torchvts.core.geometry import gradient_of_depth
-from torchvts.integration.background import ZeroBackground, with_cut_faces
+from torchvts.integration.background import ZeroBackground, with_faces
 from torchvts.model import ResponseModel
 from torchvts.scenes.surfaces import smooth_step, surface
 
@@ -142,17 +141,37 @@ def cut_face(width=128, level=0.5, shift=0.0):
     return depth + shift, rim
 
 
-def test_a_face_that_the_border_cuts_is_deformed_and_no_other_skin_is():
+def test_a_face_whose_rim_is_open_is_deformed_and_no_other_skin_is():
     depth, rim = cut_face(shift=-0.1)
-    grown = with_cut_faces(depth, rim)
+    grown = with_faces(depth, rim)
     assert bool(grown[..., 18:72, :46].all()) and not bool((grown & (depth < 0.0) & ~rim).any())
-    assert torch.equal(torch.jit.script(with_cut_faces)(depth, rim), grown)
-    inside = torch.nn.functional.pad(rim, [6, 0])[..., :128]  # nothing is cut
+    assert torch.equal(torch.jit.script(with_faces)(depth, rim), grown)
+    inside, opened = (torch.nn.functional.pad(t, [6, 0], value=v)[..., :128] for t, v in ((depth, -0.1), (rim, 0.0)))
+    assert bool(with_faces(inside, opened)[..., 20:70, 6:56].all())  # the image border cuts nothing, but the rim has no left side
     level = torch.where(rim, depth, torch.full_like(depth, -0.1))  # depth is that of undeformed skin on both sides of the rim
-    for other, mask in ((depth, inside), (level, rim)):
-        assert torch.equal(with_cut_faces(other, mask), mask)
-    both = with_cut_faces(torch.cat((depth, level)), torch.cat((rim, rim)))
+    assert torch.equal(with_faces(level, rim), rim)
+    leak = torch.where(rim, depth + 0.6, depth)  # unchanged skin lies above undeformed skin, by less than half of the depth
+    assert torch.equal(with_faces(leak, rim), rim)
+    both = with_faces(torch.cat((depth, level)), torch.cat((rim, rim)))
     assert torch.equal(both, torch.cat((grown, rim)))
+
+
+@pytest.mark.parametrize("mode", ["fast", "precise"])
+def test_contact_holds_a_face_along_whose_rim_the_light_hardly_changes(ring, mode):
+    """A part of the rim is so gentle that its change is below the threshold; before, the face was neither deformed nor contact."""
+    cal = vts.Calibration.from_lights(ring(), vts.Sensor("open", 120, 160, 0.1))
+    pipe = vts.DepthPipeline.from_calibration(cal, mode)
+    pipe.deformed = ContactMask(cal.flat, torch.full((3,), 0.05))
+    wall = lambda x, y: 0.4 + 3.0 * torch.exp(-((torch.atan2(y, x) / 0.5) ** 2))  # noqa: E731
+    scene = surface(lambda x, y: 0.5 * (1.0 - smooth_step((torch.hypot(x, y) - 2.5) / wall(x, y))), 120, 160, 0.1)
+    image = vts.scenes.render(scene, ring(), noise_std=0.004, bits=8)
+    found, out = pipe.deformed(pipe.compensate(image)), pipe(image)
+    face = scene.depth_mm > 0.49
+    assert float(found[face].float().mean()) < 0.2 and float(out.contact[face].float().mean()) > 0.99
+    assert not bool(out.deformed[scene.depth_mm < 1e-3].any())
+    with reference_only():
+        same = pipe(image)
+    assert torch.equal(same.contact, out.contact) and float((same.depth_mm - out.depth_mm).abs().max()) < 1e-6
 
 
 @pytest.mark.parametrize("mode", ["fast", "precise"])

@@ -150,6 +150,11 @@ def test_a_face_whose_rim_is_open_is_deformed_and_no_other_skin_is():
     assert bool(with_faces(inside, opened)[..., 20:70, 6:56].all())  # the image border cuts nothing, but the rim has no left side
     level = torch.where(rim, depth, torch.full_like(depth, -0.1))  # depth is that of undeformed skin on both sides of the rim
     assert torch.equal(with_faces(level, rim), rim)
+    rise = depth - 0.6 * (
+        torch.arange(128.0) > 50
+    )  # slopes that do not sum to zero: all skin on the left lies above that on the right
+    middle = torch.nn.functional.pad(rim[..., 20:70, 20:90], [20, 38, 20, 26])
+    assert torch.equal(with_faces(rise, middle), middle)  # and no rim reaches the image border
     leak = torch.where(rim, depth + 0.6, depth)  # unchanged skin lies above undeformed skin, by less than half of the depth
     assert torch.equal(with_faces(leak, rim), rim)
     both = with_faces(torch.cat((depth, level)), torch.cat((rim, rim)))

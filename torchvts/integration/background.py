@@ -102,7 +102,7 @@ def with_faces(depth_mm: Tensor, deformed: Tensor) -> Tensor:
 
     A flat face changes no light. Its rim encloses it, and holes are filled, unless the image border cuts the rim, or the light
     hardly changes along a part of it: then unchanged skin lies on the object and on undeformed skin alike. Depth shows which is
-    which: :func:`below_faces`.
+    which: :func:`below_faces`. Where no rim reaches the image border, less of a face lies along it than deformed skin surrounds.
 
     Args:
         depth_mm: (B, 1, H, W), as integrated.
@@ -121,8 +121,11 @@ def with_faces(depth_mm: Tensor, deformed: Tensor) -> Tensor:
         return deformed
     free = _beside(deformed)
     flat = below_faces(free, free & ~above)
-    found = (free & ~flat).flatten(1).any(dim=1) & flat.flatten(1).any(dim=1)
-    return deformed | (found[:, None, None, None] & above)
+    face = free & ~flat
+    # along an image border that no rim reaches, little of it can be a face
+    apart = (_on_border(deformed) > 0.0) | (_on_border(face) < _count(dilate(face) & ~free))
+    found = apart & (_count(face) > 0.0) & (_count(flat) > 0.0)
+    return deformed | (found & above)
 
 
 def below_faces(free: Tensor, low: Tensor, least_low: float = LEAST_LOW) -> Tensor:
@@ -167,6 +170,11 @@ def _count(mask: Tensor) -> Tensor:
 def _range(depth_mm: Tensor) -> tuple[Tensor, Tensor]:
     """The least and the largest depth of each frame, (B, 1, 1, 1)."""
     return depth_mm.amin(dim=(2, 3), keepdim=True), depth_mm.amax(dim=(2, 3), keepdim=True)
+
+
+def _on_border(mask: Tensor) -> Tensor:
+    """Pixels of each frame in a mask along the four sides of the image, (B, 1, 1, 1)."""
+    return _count(torch.cat((mask[..., 0, :], mask[..., -1, :], mask[..., :, 0], mask[..., :, -1]), dim=2)[..., None])
 
 
 def _pyramid(fields: Tensor) -> list[Tensor]:

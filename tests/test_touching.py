@@ -12,6 +12,7 @@ from torchvts.calibration import fit_prior
 from torchvts.core.geometry import gradient_of_depth
 from torchvts.integration.background import ZeroBackground, with_faces
 from torchvts.model import ResponseModel
+from torchvts.scenes import hanging_skin
 from torchvts.scenes.surfaces import smooth_step, surface
 
 PITCH, HEIGHT, WIDTH = 0.0634, 240, 320
@@ -58,6 +59,22 @@ def test_contact_of_skin_that_hangs_free(name, least):
     depth, truth = membrane(objects()[name])
     contact, deformed = found(depth)
     assert iou(contact, truth) > least > iou(deformed, truth) + 0.15
+
+
+@pytest.mark.parametrize("pitch, height, width", [(0.128, 60, 80), (0.064, 120, 160), (0.032, 240, 320)])
+def test_skin_that_hangs_over_a_groove_is_no_contact(pitch, height, width):
+    """Two bars 1 mm apart: the skin between them is deeper than the rim around them, and was contact."""
+    y, x = ((torch.arange(n) - (n - 1) / 2) * pitch for n in (height, width))
+    bars = ((x.abs() - 1.2).abs() < 0.7) & (y.abs()[:, None] < 2.4)
+    scene = hanging_skin(torch.where(bars, 0.5, -1.0)[None, None], 0.6, pitch)
+    deformed = scene.depth_mm > 0.02
+    inputs = (scene.depth_mm, scene.gradient * deformed, deformed)
+    contact = vts.ContactFromDepth(pitch)(*inputs)
+    middle = (x.abs() < 0.3) & (y.abs()[:, None] < 1.5)
+    assert not bool(contact[0, 0][middle].any()) and iou(contact, scene.contact) > 0.7  # before: 0.63
+    assert float(scene.depth_mm[0, 0][middle].min()) > 0.2
+    with reference_only():
+        assert torch.equal(vts.ContactFromDepth(pitch)(*inputs), contact)
 
 
 def test_contact_does_not_depend_on_units_of_length():
@@ -220,7 +237,11 @@ def test_thresholds_can_be_set(ring, small_sensor, small_press):
 
 @pytest.mark.long
 def test_labelled_contacts_of_a_real_sensor(data):
-    """The prior is that of the other ball; before, contact was what deformed is: 0.27 in the median."""
+    """The prior is that of the other ball; before, contact was what deformed is: 0.27 in the median.
+
+    The labels' radii are 7 to 10 % too large and the contact found is 10 % smaller in area (docs/decisions.md, "The rule for the
+    contact radius"): to ask for more than 0.87 would ask for their bias.
+    """
     background, presses = vts.read_presses(data / "gelsight_mini_a")
     sensor, score, low = vts.Sensor.load("gelsight_mini"), [], []
     y, x = torch.meshgrid(torch.arange(240.0), torch.arange(320.0), indexing="ij")

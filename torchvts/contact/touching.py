@@ -33,8 +33,8 @@ EXPLAINED = 0.85
 and 0.84 at most in undeformed frames of a video; of presses of 0.1 mm on drawn sensors 0.9 and more."""
 
 FREE = 0.5
-"""Pressure, as a share of depth, below which skin between parts of a contact is free: free skin bears none, that on a flat face as much as its
-depth."""
+"""Pressure, as a share of depth, below which skin between parts of a contact is free: free skin bears none, that on a flat face as
+much as its depth."""
 
 NOISE_DEPTH = 0.4
 """Or depth nearby exceeds so much of what unexplained slopes would add up to from there to the end of what is nearby."""
@@ -45,9 +45,9 @@ class ContactFromDepth(nn.Module):
 
     The decay length L of a frame is the regression of its convex skin. A cell is pressed if its pressure exceeds a share of what
     lifts free skin of the slope nearby, slope * L: at the rim of any contact pressure falls from at least that to zero. The rim
-    of the pressed cells then gets one depth along 3.5 mm of it, since depth has less noise than its curvature. Deeper than that,
-    but free, is skin that hangs between the strokes of a letter, or over a groove: cells that bear less than half of the pressure of
-    a flat face, where 3 x 3 of them lie together.
+    of the pressed cells then gets one depth along 3.5 mm of it, since depth has less noise than its curvature. Skin that hangs
+    between the strokes of a letter, or over a groove, is deeper than that rim, but free: there, 3 x 3 cells or more that lie
+    together bear less than half of the pressure of a flat face.
     Slopes that are noise have as much curl as divergence. Where depth explains too little of the slopes nearby, and is less than
     the unexplained part would add up to, nothing is pressed.
 

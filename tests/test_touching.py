@@ -7,12 +7,12 @@ import pytest
 import torch
 
 import torchvts as vts
-from torchvts.accelerated import reference_only
+from torchvts.accelerated import ContactMask, reference_only
 from torchvts.calibration import fit_prior
-from torchvts.contact import ContactMask
 from torchvts.core.geometry import gradient_of_depth
-from torchvts.integration.background import ZeroBackground, with_cut_faces
+from torchvts.integration.background import ZeroBackground, with_faces
 from torchvts.model import ResponseModel
+from torchvts.scenes import hanging_skin
 from torchvts.scenes.surfaces import smooth_step, surface
 
 PITCH, HEIGHT, WIDTH = 0.0634, 240, 320
@@ -59,6 +59,22 @@ def test_contact_of_skin_that_hangs_free(name, least):
     depth, truth = membrane(objects()[name])
     contact, deformed = found(depth)
     assert iou(contact, truth) > least > iou(deformed, truth) + 0.15
+
+
+@pytest.mark.parametrize("pitch, height, width", [(0.128, 60, 80), (0.064, 120, 160), (0.032, 240, 320)])
+def test_skin_that_hangs_over_a_groove_is_no_contact(pitch, height, width):
+    """Two bars 1 mm apart: the skin between them is deeper than the rim around them, and was contact."""
+    y, x = ((torch.arange(n) - (n - 1) / 2) * pitch for n in (height, width))
+    bars = ((x.abs() - 1.2).abs() < 0.7) & (y.abs()[:, None] < 2.4)
+    scene = hanging_skin(torch.where(bars, 0.5, -1.0)[None, None], 0.6, pitch)
+    deformed = scene.depth_mm > 0.02
+    inputs = (scene.depth_mm, scene.gradient * deformed, deformed)
+    contact = vts.ContactFromDepth(pitch)(*inputs)
+    middle = (x.abs() < 0.3) & (y.abs()[:, None] < 1.5)
+    assert not bool(contact[0, 0][middle].any()) and iou(contact, scene.contact) > 0.7  # before: 0.63
+    assert float(scene.depth_mm[0, 0][middle].min()) > 0.2
+    with reference_only():
+        assert torch.equal(vts.ContactFromDepth(pitch)(*inputs), contact)
 
 
 def test_contact_does_not_depend_on_units_of_length():
@@ -142,17 +158,42 @@ def cut_face(width=128, level=0.5, shift=0.0):
     return depth + shift, rim
 
 
-def test_a_face_that_the_border_cuts_is_deformed_and_no_other_skin_is():
+def test_a_face_whose_rim_is_open_is_deformed_and_no_other_skin_is():
     depth, rim = cut_face(shift=-0.1)
-    grown = with_cut_faces(depth, rim)
+    grown = with_faces(depth, rim)
     assert bool(grown[..., 18:72, :46].all()) and not bool((grown & (depth < 0.0) & ~rim).any())
-    assert torch.equal(torch.jit.script(with_cut_faces)(depth, rim), grown)
-    inside = torch.nn.functional.pad(rim, [6, 0])[..., :128]  # nothing is cut
+    assert torch.equal(torch.jit.script(with_faces)(depth, rim), grown)
+    inside, opened = (torch.nn.functional.pad(t, [6, 0], value=v)[..., :128] for t, v in ((depth, -0.1), (rim, 0.0)))
+    assert bool(with_faces(inside, opened)[..., 20:70, 6:56].all())  # the image border cuts nothing, but the rim has no left side
     level = torch.where(rim, depth, torch.full_like(depth, -0.1))  # depth is that of undeformed skin on both sides of the rim
-    for other, mask in ((depth, inside), (level, rim)):
-        assert torch.equal(with_cut_faces(other, mask), mask)
-    both = with_cut_faces(torch.cat((depth, level)), torch.cat((rim, rim)))
+    assert torch.equal(with_faces(level, rim), rim)
+    rise = depth - 0.6 * (
+        torch.arange(128.0) > 50
+    )  # slopes that do not sum to zero: all skin on the left lies above that on the right
+    middle = torch.nn.functional.pad(rim[..., 20:70, 20:90], [20, 38, 20, 26])
+    assert torch.equal(with_faces(rise, middle), middle)  # and no rim reaches the image border
+    leak = torch.where(rim, depth + 0.6, depth)  # unchanged skin lies above undeformed skin, by less than half of the depth
+    assert torch.equal(with_faces(leak, rim), rim)
+    both = with_faces(torch.cat((depth, level)), torch.cat((rim, rim)))
     assert torch.equal(both, torch.cat((grown, rim)))
+
+
+@pytest.mark.parametrize("mode", ["fast", "precise"])
+def test_contact_holds_a_face_along_whose_rim_the_light_hardly_changes(ring, mode):
+    """A part of the rim is so gentle that its change is below the threshold; before, the face was neither deformed nor contact."""
+    cal = vts.Calibration.from_lights(ring(), vts.Sensor("open", 120, 160, 0.1))
+    pipe = vts.DepthPipeline.from_calibration(cal, mode)
+    pipe.deformed = ContactMask(cal.flat, torch.full((3,), 0.05))
+    wall = lambda x, y: 0.4 + 3.0 * torch.exp(-((torch.atan2(y, x) / 0.5) ** 2))  # noqa: E731
+    scene = surface(lambda x, y: 0.5 * (1.0 - smooth_step((torch.hypot(x, y) - 2.5) / wall(x, y))), 120, 160, 0.1)
+    image = vts.scenes.render(scene, ring(), noise_std=0.004, bits=8)
+    found, out = pipe.deformed(pipe.compensate(image)), pipe(image)
+    face = scene.depth_mm > 0.49
+    assert float(found[face].float().mean()) < 0.2 and float(out.contact[face].float().mean()) > 0.99
+    assert not bool(out.deformed[scene.depth_mm < 1e-3].any())
+    with reference_only():
+        same = pipe(image)
+    assert torch.equal(same.contact, out.contact) and float((same.depth_mm - out.depth_mm).abs().max()) < 1e-6
 
 
 @pytest.mark.parametrize("mode", ["fast", "precise"])
@@ -196,7 +237,11 @@ def test_thresholds_can_be_set(ring, small_sensor, small_press):
 
 @pytest.mark.long
 def test_labelled_contacts_of_a_real_sensor(data):
-    """The prior is that of the other ball; before, contact was what deformed is: 0.27 in the median."""
+    """The prior is that of the other ball; before, contact was what deformed is: 0.27 in the median.
+
+    The labels' radii are 7 to 10 % too large and the contact found is 10 % smaller in area (docs/decisions.md, "The rule for the
+    contact radius"): to ask for more than 0.87 would ask for their bias.
+    """
     background, presses = vts.read_presses(data / "gelsight_mini_a")
     sensor, score, low = vts.Sensor.load("gelsight_mini"), [], []
     y, x = torch.meshgrid(torch.arange(240.0), torch.arange(320.0), indexing="ij")

@@ -135,12 +135,12 @@ class ContactFromDepth(Twin, contact.ContactFromDepth):
         if not usable(depth_mm, gradient):
             return super().find(depth_mm, gradient, deformed)
         return kernels.contact_from_depth(
-            depth_mm, gradient, deformed, (self.cell, self.reach), (ctypes.c_float * 9)(*self.numbers())
+            depth_mm, gradient, deformed, (self.cell, self.reach), (ctypes.c_float * 10)(*self.numbers())
         )
 
     def numbers(self) -> tuple[float, ...]:
         """The settings that the kernel takes."""
-        noise = (self.most_unexplained, self.noise_depth_mm)
+        noise = (self.most_unexplained, self.noise_depth_mm, self.free_share)
         return (self.cell * self.mm_per_pixel, self.share, *self.decay, *self.tail, self.least_free, *noise)
 
 

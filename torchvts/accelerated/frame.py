@@ -60,7 +60,7 @@ class Program(ctypes.Structure):
         *((name, INTEGER) for name in ("passes", "zeroes", "sweeps", "slopes_of_depth")),
         *((name, REAL) for name in ("stiff", "tolerance")),
         *((name, INTEGER) for name in ("contact_cell", "contact_reach")),
-        ("contact_model", REAL * 9),
+        ("contact_model", REAL * 10),
     )
 
 

@@ -32,6 +32,10 @@ EXPLAINED = 0.85
 """Share of the slopes nearby that a surface must explain, in squares. Of slopes that are noise, depth explains half in the mean,
 and 0.84 at most in undeformed frames of a video; of presses of 0.1 mm on drawn sensors 0.9 and more."""
 
+FREE = 0.5
+"""Pressure, as a share of depth, below which skin between parts of a contact is free: free skin bears none, that on a flat face as
+much as its depth."""
+
 NOISE_DEPTH = 0.4
 """Or depth nearby exceeds so much of what unexplained slopes would add up to from there to the end of what is nearby."""
 
@@ -41,7 +45,9 @@ class ContactFromDepth(nn.Module):
 
     The decay length L of a frame is the regression of its convex skin. A cell is pressed if its pressure exceeds a share of what
     lifts free skin of the slope nearby, slope * L: at the rim of any contact pressure falls from at least that to zero. The rim
-    of the pressed cells then gets one depth along 3.5 mm of it, since depth has less noise than its curvature.
+    of the pressed cells then gets one depth along 3.5 mm of it, since depth has less noise than its curvature. Skin that hangs
+    between the strokes of a letter, or over a groove, is deeper than that rim, but free: there, 3 x 3 cells or more that lie
+    together bear less than half of the pressure of a flat face.
     Slopes that are noise have as much curl as divergence. Where depth explains too little of the slopes nearby, and is less than
     the unexplained part would add up to, nothing is pressed.
 
@@ -70,7 +76,7 @@ class ContactFromDepth(nn.Module):
             self.cell *= 2
         self.reach = min(60, max(1, round(RIM_MM / (self.cell * mm_per_pixel))))
         self.decay, self.tail, self.least_free = DECAY_MM, TAIL, LEAST_FREE
-        self.most_unexplained = 1.0 - EXPLAINED
+        self.most_unexplained, self.free_share = 1.0 - EXPLAINED, 1.0 - FREE
         self.noise_depth_mm = NOISE_DEPTH * (self.reach // 2) * self.cell * self.mm_per_pixel
 
     if TYPE_CHECKING:
@@ -112,8 +118,8 @@ class ContactFromDepth(nn.Module):
         return deformed & (depth > level)
 
     def rim_depth(self, fields: Tensor) -> Tensor:
-        """Depth of the rim of the contact nearby, (B, 1, h, w), infinite where there is none, and minus infinity
-        where no skin hangs free and slopes are those of a surface.
+        """Depth of the rim of the contact nearby, (B, 1, h, w), infinite where there is none or where skin hangs free within it,
+        and minus infinity where no skin of the frame hangs free and slopes are those of a surface.
 
         Args:
             fields: (B, 4, h, w): the deformed share of a cell, its depth and its two slopes times that share.
@@ -121,8 +127,8 @@ class ContactFromDepth(nn.Module):
         mass, some = fields[:, 0:1], fields[:, 0:1] > 0.0
         means = fields[:, 1:4] / mass.clamp_min(1e-6)
         depth, slope = means[:, 0:1], means[:, 1:3]
-        curvature = self.divergence(slope, some)
-        smooth = _box(torch.cat((mass, fields[:, 1:2], curvature * mass), dim=1), 2)
+        bend = self.divergence(slope, some) * mass
+        smooth = _box(torch.cat((mass, fields[:, 1:2], bend), dim=1), 2)
         smooth = smooth / smooth[:, 0:1].clamp_min(1e-6)
         smooth_depth, curvature = smooth[:, 1:2], smooth[:, 2:3]
         most = smooth_depth.amax(dim=(2, 3), keepdim=True)
@@ -147,7 +153,11 @@ class ContactFromDepth(nn.Module):
         level = found[:, 1:2] / found[:, 0:1].clamp_min(1e-9)
         infinite = torch.full_like(level, float("inf"))
         far, all_or_none = infinite.masked_fill(pressed, 0.0), infinite.masked_fill(surface, -float("inf"))
-        return torch.where(hangs, torch.where(found[:, 0:1] > 1e-9, level, far), all_or_none)
+        level = torch.where(found[:, 0:1] > 1e-9, level, far)
+        free = (decay * bend > self.free_share * depth * mass) & (depth > level)
+        whole = _box(free.to(depth.dtype), 1) > 0.95
+        level = torch.where(_box(whole.to(depth.dtype), 1) > 0.05, infinite, level)
+        return torch.where(hangs, level, all_or_none)
 
     def divergence(self, slope: Tensor, some: Tensor) -> Tensor:
         """Of slopes (B, 2, h, w), per mm; beyond cells without deformed skin, and beyond the border, slopes go on as they are."""

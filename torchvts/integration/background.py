@@ -29,7 +29,7 @@ class ZeroBackground(nn.Module):
     right within contacts, from which they are calibrated, and least known around them.
     Skin is pressed in and never pulled out: where depth would be below zero, as beside a contact that the image border
     cuts, it is held at zero as undeformed skin is, and the continuation is found again.
-    A flat face that the image border cuts shows no change: there depth stays as it is (:func:`below_faces`).
+    A flat face that no rim encloses shows no change: there depth stays as it is (:func:`below_faces`).
 
     Source:
         successive grids for the continuation: Gortler, Grzeszczuk, Szeliski and Cohen, The Lumigraph, SIGGRAPH 1996; the rest is
@@ -97,11 +97,12 @@ class ZeroBackground(nn.Module):
         return found
 
 
-def with_cut_faces(depth_mm: Tensor, deformed: Tensor) -> Tensor:
-    """The deformed area, bool (B, 1, H, W), with the faces of the object that the image border cuts.
+def with_faces(depth_mm: Tensor, deformed: Tensor) -> Tensor:
+    """The deformed area, bool (B, 1, H, W), with the flat faces of the object that it leaves open.
 
-    A flat face changes no light. Within the image its rim encloses it, and holes are filled; where the image border cuts the rim,
-    unchanged skin lies on the object and on undeformed skin alike. Depth shows which is which: :func:`below_faces`.
+    A flat face changes no light. Its rim encloses it, and holes are filled, unless the image border cuts the rim, or the light
+    hardly changes along a part of it: then unchanged skin lies on the object and on undeformed skin alike. Depth shows which is
+    which: :func:`below_faces`. Where no rim reaches the image border, less of a face lies along it than deformed skin surrounds.
 
     Args:
         depth_mm: (B, 1, H, W), as integrated.
@@ -111,16 +112,19 @@ def with_cut_faces(depth_mm: Tensor, deformed: Tensor) -> Tensor:
         >>> depth, rim = torch.zeros(1, 1, 48, 64), torch.zeros(1, 1, 48, 64, dtype=torch.bool)
         >>> depth[..., :20] = 0.5
         >>> rim[..., 18:22] = True
-        >>> int(with_cut_faces(depth, rim).sum()) == 48 * 22
+        >>> int(with_faces(depth, rim).sum()) == 48 * 22
         True
     """
-    cut = _on_border(deformed)
-    if may_read(deformed) and not bool(cut.any()):
-        return deformed
     low, high = _range(depth_mm)
-    free, above = _beside(deformed), depth_mm >= 0.5 * (low + high)
+    above = depth_mm >= 0.5 * (low + high)
+    if may_read(deformed) and not bool((above & ~deformed).any()):
+        return deformed
+    free = _beside(deformed)
     flat = below_faces(free, free & ~above)
-    found = cut & _on_border(free & ~flat) & (_count(flat) > 0.0)
+    face = free & ~flat
+    # along an image border that no rim reaches, little of it can be a face
+    apart = (_on_border(deformed) > 0.0) | (_on_border(face) < _count(dilate(face) & ~free))
+    found = apart & (_count(face) > 0.0) & (_count(flat) > 0.0)
     return deformed | (found & above)
 
 
@@ -169,9 +173,8 @@ def _range(depth_mm: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _on_border(mask: Tensor) -> Tensor:
-    """Whether any pixel of a mask lies on the image border, bool (B, 1, 1, 1)."""
-    across = torch.cat((mask[..., 0, :], mask[..., -1, :], mask[..., :, 0], mask[..., :, -1]), dim=2)
-    return across.any(dim=2)[..., None, None]
+    """Pixels of each frame in a mask along the four sides of the image, (B, 1, 1, 1)."""
+    return _count(torch.cat((mask[..., 0, :], mask[..., -1, :], mask[..., :, 0], mask[..., :, -1]), dim=2)[..., None])
 
 
 def _pyramid(fields: Tensor) -> list[Tensor]:

@@ -53,7 +53,7 @@ from ..core.frame import (
 from ..core.settings import check_settings, settings_as_tensor
 from ..integration import PoissonBackground as PlainPoissonBackground
 from ..integration import WrappedIntegrator, as_integrator
-from ..integration.background import DepthAsIs, with_cut_faces
+from ..integration.background import DepthAsIs, with_faces
 from ..model import Calibration, Sensor, check_calibration
 from ..normals import NormalFromIntensity as PlainNormalFromIntensity
 from ..normals import WrappedNormals, as_normal_model, check_domain
@@ -327,12 +327,12 @@ class DepthPipeline(nn.Module):
         return out
 
     def with_faces(self, frame: Frame, solution: Solution) -> tuple[Frame, Solution]:
-        """Frames in which the image border cuts a flat face of the object, solved again with the face in their deformed area.
+        """Frames in which no closed rim encloses a flat face of the object, solved again with the face in their deformed area.
 
         Else the integrator takes it for undeformed skin: depth is zero between the two, and the slope of the face is lost. On
         other devices than a CPU, and in exported programs, every frame is solved again: to ask would wait for the device.
         """
-        deformed = with_cut_faces(solution.depth_mm.detach(), frame.deformed)
+        deformed = with_faces(solution.depth_mm.detach(), frame.deformed)
         if may_read(deformed) and torch.equal(deformed, frame.deformed):
             return frame, solution
         frame = with_noise(self.crop(frame.compensated, deformed), frame.noise_std)

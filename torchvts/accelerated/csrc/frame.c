@@ -156,7 +156,7 @@ static int solve_frame(const Program *of, const float *image, Work work, Output 
     float *found = of->zeroes ? work.depth : out.depth;
     for (int pass = 0; pass < of->passes && !trouble; pass++) {
         trouble = solve(of, light, out.deformed, pass ? found : NULL, at, work, found);
-        if (pass || trouble || !add_cut_faces(found, out.deformed, height, width, work.inner)) continue;
+        if (pass || trouble || !add_faces(found, out.deformed, height, width, work.inner)) continue;
         at = window_of(of, out.deformed);
         trouble = solve(of, light, out.deformed, NULL, at, work, found);
     }

@@ -81,7 +81,7 @@ EXPORT int solve_poisson(const float *gradient, const double *tables, float mm_p
                          int height, int width, int zeroed, float *depth);
 EXPORT int zero_background(const float *depth, const uint8_t *deformed, int frames, int height, int width, float stiff, float tolerance,
                            int sweeps, float *out);
-int add_cut_faces(const float *depth, uint8_t *deformed, int height, int width, uint8_t *kind);
+int add_faces(const float *depth, uint8_t *deformed, int height, int width, uint8_t *kind);
 EXPORT void depth_slopes(const float *depth, int64_t depth_frame, int64_t depth_row, const uint8_t *mask, int64_t mask_frame, int64_t mask_row,
                          float half_per_mm, int frames, int rows, int columns, float *gradient);
 EXPORT int contact_from_depth(const float *depth, int64_t depth_frame, int64_t depth_row, const float *gradient, const uint8_t *deformed,

@@ -5,13 +5,13 @@
 
 /* The settings of ContactFromDepth. */
 typedef struct {
-    float cell_mm, share, least_decay, most_decay, least_tail, most_tail, least_free, most_unexplained, noise_depth_mm;
+    float cell_mm, share, least_decay, most_decay, least_tail, most_tail, least_free, most_unexplained, noise_depth_mm, free_share;
 } Model;
 
 /* Fields of rows x columns cells; `found` and `other` hold what is at hand. */
 typedef struct {
     int rows, columns;
-    float *mass, *depth, *slope_x, *slope_y, *curvature, *smooth_mass, *smooth_depth, *pressure, *found, *other, *unexplained, *squared;
+    float *mass, *depth, *slope_x, *slope_y, *curvature, *smooth_mass, *smooth_depth, *pressure, *found, *other, *unexplained, *squared, *bend;
     float *line;
     double *boxes;
     uint8_t *pressed, *surface;
@@ -121,7 +121,7 @@ WIDE static void curvature_row(const float *restrict x, const float *restrict he
     }
 }
 
-/* Divergence of slopes, times the mass; beyond cells without deformed skin, and beyond the border, slopes go on as they are. */
+/* Divergence of slopes, times the mass, to at->bend; beyond cells without deformed skin, and beyond the border, slopes go on as they are. */
 static void find_curvature(const Cells *at, float two_cells_mm) {
     const int rows = at->rows, columns = at->columns, last = columns - 1;
     for (int y = 0; y < rows; y++) {
@@ -129,12 +129,12 @@ static void find_curvature(const Cells *at, float two_cells_mm) {
         const float *x = at->slope_x + row, *mass = at->mass + row;
         if (columns > 2)
             curvature_row(x + 1, at->slope_y + row + 1, at->slope_y + below + 1, at->slope_y + above + 1, mass + 1, at->mass + below + 1,
-                          at->mass + above + 1, two_cells_mm, columns - 2, at->other + row + 1);
+                          at->mass + above + 1, two_cells_mm, columns - 2, at->bend + row + 1);
         for (int k = 0; k < columns; k += last > 0 ? last : 1) { /* the first and the last column */
             const float here = at->slope_y[row + k];
             const float right = k < last && mass[k + 1] > 0.0f ? x[k + 1] : x[k], left = k > 0 && mass[k - 1] > 0.0f ? x[k - 1] : x[k];
             const float down = at->mass[below + k] > 0.0f ? at->slope_y[below + k] : here, up = at->mass[above + k] > 0.0f ? at->slope_y[above + k] : here;
-            at->other[row + k] = (right - left + down - up) / two_cells_mm * mass[k];
+            at->bend[row + k] = (right - left + down - up) / two_cells_mm * mass[k];
         }
     }
 }
@@ -264,12 +264,37 @@ WIDE static void all_or_none(const uint8_t *restrict surface, int n, float *rest
     for (int k = 0; k < n; k++) level[k] = surface[k] ? -INFINITY : INFINITY;
 }
 
+/* Cells deeper than the rim that bear too little pressure. */
+WIDE static void find_free(const float *restrict bend, const float *restrict depth, const float *restrict mass, const float *restrict level,
+                           float decay, float share, int n, uint8_t *restrict free) {
+    for (int k = 0; k < n; k++) free[k] = (decay * bend[k] > share * depth[k] * mass[k]) & (depth[k] > level[k]);
+}
+
+WIDE static void all_of(const uint8_t *restrict above, const uint8_t *restrict row, const uint8_t *restrict below, int n, uint8_t *restrict all) {
+    for (int x = 0; x < n; x++) all[x] = above[x] & row[x] & below[x];
+}
+
+/* Where 3 x 3 such cells lie together, the level becomes infinite. */
+static void free_within(const Cells *at, float share, float decay) {
+    const int columns = at->columns;
+    uint8_t *free = at->pressed, *all = at->surface;
+    find_free(at->bend, at->depth, at->mass, at->other, decay, share, at->rows * columns, free);
+    for (int y = 1; y < at->rows - 1; y++, free += columns) {
+        all_of(free, free + columns, free + 2 * columns, columns, all);
+        for (int x = 1; x < columns - 1; x++) {
+            if (!(all[x - 1] & all[x] & all[x + 1])) continue;
+            for (int i = y - 1; i <= y + 1; i++)
+                for (int j = x - 1; j <= x + 1; j++) at->other[(size_t)i * columns + j] = INFINITY;
+        }
+    }
+}
+
 /* rim_depth() of ContactFromDepth, to at->other. */
 static void rim_depth(const Cells *at, const Model *model, int reach) {
     const int n = at->rows * at->columns;
     divide(at->slope_x, at->mass, 1e-6f, n), divide(at->slope_y, at->mass, 1e-6f, n);
     find_curvature(at, 2.0f * model->cell_mm);
-    Boxes smooth = {at, 2, {at->mass, at->depth, at->other}, {at->smooth_mass, at->smooth_depth, at->curvature}};
+    Boxes smooth = {at, 2, {at->mass, at->depth, at->bend}, {at->smooth_mass, at->smooth_depth, at->curvature}};
     share(one_box, &smooth, 3);
     divide(at->smooth_depth, at->smooth_mass, 1e-6f, n), divide(at->curvature, at->smooth_mass, 1e-6f, n);
     divide(at->depth, at->mass, 1e-6f, n);
@@ -289,6 +314,7 @@ static void rim_depth(const Cells *at, const Model *model, int reach) {
     find_rim(at->found, at->other, at->mass, at->depth, n, at->smooth_mass, at->curvature);
     two_boxes(at, reach, at->smooth_mass, at->found, at->curvature, at->other);
     find_level(at->found, at->pressed, n, at->other);
+    free_within(at, model->free_share, decay);
 }
 
 /* A row of pixels that are deformed and deeper than the rim. */
@@ -348,13 +374,13 @@ static int allocate(Frame *of) {
     at->rows = (of->rows + of->cell - 1) / of->cell, at->columns = (of->columns + of->cell - 1) / of->cell;
     of->bands = least(at->rows, bands_of(of->rows));
     const size_t n = (size_t)at->rows * at->columns, line = (size_t)of->bands * at->columns * of->cell;
-    at->boxes = malloc(sizeof(double) * MOST_BOXES * box_size(at) + sizeof(float) * (12 * n + line) + 2 * n);
+    at->boxes = malloc(sizeof(double) * MOST_BOXES * box_size(at) + sizeof(float) * (13 * n + line) + 2 * n);
     if (!at->boxes) return 1;
     at->mass = (float *)(at->boxes + MOST_BOXES * box_size(at));
     at->depth = at->mass + n, at->slope_x = at->depth + n, at->slope_y = at->slope_x + n, at->curvature = at->slope_y + n;
     at->smooth_mass = at->curvature + n, at->smooth_depth = at->smooth_mass + n, at->pressure = at->smooth_depth + n;
     at->found = at->pressure + n, at->other = at->found + n, at->unexplained = at->other + n, at->squared = at->unexplained + n;
-    at->line = at->squared + n, at->pressed = (uint8_t *)(at->line + line), at->surface = at->pressed + n;
+    at->bend = at->squared + n, at->line = at->bend + n, at->pressed = (uint8_t *)(at->line + line), at->surface = at->pressed + n;
     return 0;
 }
 
@@ -365,7 +391,7 @@ static int allocate(Frame *of) {
 EXPORT int contact_from_depth(const float *depth, int64_t depth_frame, int64_t depth_row, const float *gradient, const uint8_t *deformed,
                               int64_t deformed_frame, int64_t deformed_row, int frames, int rows, int columns, int cell, int reach,
                               const float *numbers, uint8_t *contact) {
-    const Model model = {numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5], numbers[6], numbers[7], numbers[8]};
+    const Model model = {numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5], numbers[6], numbers[7], numbers[8], numbers[9]};
     const size_t part = (size_t)rows * columns;
     Frame frame = {.depth_row = depth_row, .deformed_row = deformed_row, .rows = rows, .columns = columns, .cell = cell};
     if (allocate(&frame)) return 1;

@@ -188,8 +188,9 @@ WIDE static void flat_row(const float *restrict depth, uint8_t *restrict kind, f
     *sum = total, *count = found;
 }
 
-/* Whether raised skin is a face of the object: what is flat beside it is no pocket, and deformed skin is most of what lies around it. */
-static int is_face(const uint8_t *kind, int height, int width) {
+/* Whether raised skin is a face of the object: what is flat beside it is no pocket, and deformed skin is most of what lies around it, and more
+   than so many pixels. */
+static int is_face(const uint8_t *kind, int height, int width, int64_t more_than) {
     int64_t around[3] = {0}, of_kind[3] = {0};
     for (size_t k = 0; k < (size_t)height * width; k++) of_kind[kind[k]]++;
     if (of_kind[FLAT] > 0 && (float)of_kind[FLAT] < LEAST_LOW * (float)(of_kind[FLAT] + of_kind[RAISED])) return 0;
@@ -206,7 +207,7 @@ static int is_face(const uint8_t *kind, int height, int width) {
             around[row[x]] += beside;
         }
     }
-    return around[DEFORMED] > around[FLAT];
+    return around[DEFORMED] > around[FLAT] && around[DEFORMED] > more_than;
 }
 
 /* A row of pixels added to the sums of cells' columns. */
@@ -388,7 +389,7 @@ static float level_of(Work *work) {
     int64_t flat = 0;
     share(find_flat, work, work->bands);
     for (int y = 0; y < work->height; y++) sum += work->flat_sum[y], flat += work->flat_count[y];
-    if (memchr(work->kind, RAISED, pixels) && !is_face(work->kind, work->height, work->width)) {
+    if (memchr(work->kind, RAISED, pixels) && !is_face(work->kind, work->height, work->width, 0)) {
         for (size_t k = 0; k < pixels; k++) {
             if (work->kind[k] != RAISED) continue;
             work->kind[k] = FLAT;
@@ -398,27 +399,23 @@ static float level_of(Work *work) {
     return flat ? (float)(sum / (double)flat) : 0.0f;
 }
 
-static int on_border(const uint8_t *kind, int height, int width, uint8_t of) {
-    const size_t last = (size_t)(height - 1) * width;
-    if (memchr(kind, of, (size_t)width) || memchr(kind + last, of, (size_t)width)) return 1;
-    for (int y = 1; y < height - 1; y++)
-        if (kind[(size_t)y * width] == of || kind[(size_t)(y + 1) * width - 1] == of) return 1;
-    return 0;
+/* Pixels of a kind along the four sides of the image. */
+static int64_t on_border(const uint8_t *kind, int height, int width, uint8_t of) {
+    const uint8_t *last = kind + (size_t)(height - 1) * width;
+    int64_t found = 0;
+    for (int x = 0; x < width; x++) found += (kind[x] == of) + (last[x] == of);
+    for (int y = 0; y < height; y++) found += (kind[(size_t)y * width] == of) + (kind[(size_t)(y + 1) * width - 1] == of);
+    return found;
 }
 
 WIDE static void add_above(const float *restrict depth, float middle, size_t n, uint8_t *restrict deformed) {
     for (size_t k = 0; k < n; k++) deformed[k] |= depth[k] >= middle;
 }
 
-/* Whether any unchanged skin on the image border lies as deep as `middle`, without which no face is cut. */
-static int deep_on_border(const float *depth, const uint8_t *deformed, float middle, int height, int width) {
-    for (int y = 0; y < height; y++) {
-        const int step = y == 0 || y == height - 1 || width == 1 ? 1 : width - 1;
-        const size_t row = (size_t)y * width;
-        for (int x = 0; x < width; x += step)
-            if (!deformed[row + x] && depth[row + x] >= middle) return 1;
-    }
-    return 0;
+WIDE static int any_above(const float *restrict depth, const uint8_t *restrict deformed, float middle, int n) {
+    int any = 0;
+    for (int x = 0; x < n; x++) any |= (depth[x] >= middle) & !deformed[x];
+    return any;
 }
 
 enum { PIECES = 8 };
@@ -445,18 +442,20 @@ static float middle_of(const float *depth, size_t pixels) {
     return 0.5f * (low + high);
 }
 
-/* with_cut_faces() of background.py, in place. kind: a byte for each pixel, and two lines, and four bytes each. Returns whether there are such
+/* with_faces() of background.py, in place. kind: a byte for each pixel, and two lines, and four bytes each. Returns whether there are such
    faces. */
-int add_cut_faces(const float *depth, uint8_t *deformed, int height, int width, uint8_t *kind) {
+int add_faces(const float *depth, uint8_t *deformed, int height, int width, uint8_t *kind) {
     const size_t pixels = (size_t)height * width;
-    float sum;
-    int count;
-    if (!on_border(deformed, height, width, 1)) return 0;
     const float middle = middle_of(depth, pixels);
-    if (!deep_on_border(depth, deformed, middle, height, width)) return 0;
+    float sum;
+    int count, some = 0;
+    for (int y = 0; y < height && !some; y++) some = any_above(depth + (size_t)y * width, deformed + (size_t)y * width, middle, width);
+    if (!some) return 0;
     for (int y = 0; y < height; y++) not_beside(deformed, height, width, y, kind + pixels, kind + (size_t)y * width);
     for (int y = 0; y < height; y++) flat_row(depth + (size_t)y * width, kind + (size_t)y * width, middle, width, &sum, &count);
-    if (!on_border(kind, height, width, RAISED) || !memchr(kind, FLAT, pixels) || !is_face(kind, height, width)) return 0;
+    if (!memchr(kind, RAISED, pixels) || !memchr(kind, FLAT, pixels)) return 0;
+    const int64_t along = on_border(deformed, height, width, 1) ? 0 : on_border(kind, height, width, RAISED);
+    if (!is_face(kind, height, width, along)) return 0;
     add_above(depth, middle, pixels, deformed);
     return 1;
 }

@@ -111,13 +111,21 @@ TABLE = {
     "Compensate.from_calibration": Entry({"calibration": unit()}, {"calibration": OTHERS}),
     "Compensate.forward": forward(lambda: vts.Compensate.from_calibration(unit()), 3, "image"),
     "ContactMask": Entry(
-        {"flat": FLAT, "noise_std": torch.full((3,), 0.01), "sigmas": 4.5, "min_size_px": 8.0, "far_field": 0.06},
+        {
+            "flat": FLAT,
+            "noise_std": torch.full((3,), 0.01),
+            "sigmas": 4.5,
+            "min_size_px": 8.0,
+            "far_field": 0.06,
+            "smooth_light": False,
+        },
         {
             "flat": BAD_FLAT,
             "noise_std": [torch.zeros(2), FLAT[:, 1:], torch.full((3,), NAN), 0.01, None, np.zeros(3)],
             "sigmas": NUMBER,
             "min_size_px": NUMBER,
             "far_field": [-0.1, NAN, "0", None],
+            "smooth_light": [1, "True", None],
         },
     ),
     "ContactMask.from_calibration": Entry(

@@ -19,6 +19,7 @@ from .blocks import (
     PerspectiveIntegration,
     PoissonBackground,
     PoissonDCT,
+    SmoothDrift,
     Uncrop,
     ZeroBackground,
 )
@@ -41,6 +42,7 @@ __all__ = [
     "PerspectiveIntegration",
     "PoissonBackground",
     "PoissonDCT",
+    "SmoothDrift",
     "Uncrop",
     "ZeroBackground",
     "library",

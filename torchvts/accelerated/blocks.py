@@ -52,6 +52,15 @@ class Drift(Twin, compensate.Drift):
         return _median(values) if arrays_usable(values) else super().median(values)
 
 
+class SmoothDrift(Twin, compensate.SmoothDrift):
+    """The fit and the division by compiled kernels."""
+
+    plain = compensate.SmoothDrift
+
+    def forward(self, ratio: Tensor) -> Tensor:
+        return kernels.without_smooth_change(ratio) if usable(ratio) else super().forward(ratio)
+
+
 class Compensate(Twin, compensate.Compensate):
     """One compiled kernel for all that stands between linear light and the drift, and the accelerated estimator of that."""
 
@@ -92,8 +101,9 @@ class ContactMask(Twin, contact.ContactMask):
             self.step, self.stride, self.cell, self.reach, self.sigmas, self.rounding, self.least_cells, bridge, self.bridge_sigmas
         )
         offset = None if flat_is_one(self) else self.offset
+        limits, smooth = (self.failed_below, self.most_far_field), self.smooth_light
         try:
-            return kernels.contact_mask(compensated, offset, self.per_noise, (self.failed_below, self.most_far_field), grid)
+            return kernels.contact_mask(compensated, offset, self.per_noise, limits, grid, smooth)
         except kernels.NotFinite:
             return super().find(compensated)
 

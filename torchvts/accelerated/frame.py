@@ -29,6 +29,7 @@ from .blocks import (
     NormalFromIntensity,
     NormalFromResponse,
     PoissonBackground,
+    SmoothDrift,
     Uncrop,
     ZeroBackground,
 )
@@ -52,6 +53,7 @@ class Program(ctypes.Structure):
         *((name, REAL) for name in ("least_drift", "most_drift", "believed_drift")),
         *((name, INTEGER) for name in ("step", "stride", "cell", "reach", "bridge")),
         *((name, REAL) for name in ("sigmas", "rounding", "least_cells", "bridge_sigmas")),
+        ("smooth", POINTER),
         *((name, POINTER) for name in ("flat", "per_noise", "failed_below", "most_far_field")),
         *((name, INTEGER) for name in ("corners", "degree", "terms")),
         *((name, POINTER) for name in ("place", "weight", "per_mm", "noise", "lit", "saturated", "inverse")),
@@ -73,6 +75,7 @@ class Blocks(NamedTuple):
     """
 
     compensate: nn.Module
+    smooth: nn.Module
     deformed: nn.Module
     crop: nn.Module
     normals: nn.Module
@@ -88,6 +91,7 @@ class Blocks(NamedTuple):
 
 OWN: tuple[tuple[type, ...], ...] = (
     (Compensate,),
+    (SmoothDrift, nn.Identity),
     (ContactMask,),
     (Crop,),
     (NormalFromResponse, NormalFromIntensity),
@@ -252,6 +256,8 @@ def _all_own(parts: Blocks) -> bool:
         return False
     if type(parts.normals) is NormalFromIntensity and (parts.passes > 1 or parts.normals.lights.glossy):
         return False
+    if (type(parts.smooth) is SmoothDrift) != parts.deformed.smooth_light:  # one surface serves both
+        return False
     inner = compensate._modules
     if len(inner["linear"]) or compensate.saturates or not all(_own(block, (FillDefects, Blur)) for block in inner["clean"]):
         return False
@@ -348,6 +354,7 @@ def _prepare(parts: Blocks, buffers: dict[str, Tensor], settings: dict[str, Any]
     found = pedestals(compensate.gain) if "gain" in tensors and "offset" in tensors else None
     if found is not None:
         del tensors["offset"]
+    smooth = kernels.smooth_tables(height, width) if mask.smooth_light else None
     weights = (REAL * len(settings["weights"]))(*settings["weights"])
     pointers = {name: tensor.data_ptr() for name, tensor in tensors.items() if name in _POINTERS}
     program = Program(
@@ -355,6 +362,7 @@ def _prepare(parts: Blocks, buffers: dict[str, Tensor], settings: dict[str, Any]
         **pointers,
         weights=ctypes.addressof(weights),
         tables=tables.data_ptr(),
+        smooth=None if smooth is None else ctypes.addressof(smooth.structure),
         height=height,
         width=width,
         taps=len(weights),
@@ -365,7 +373,7 @@ def _prepare(parts: Blocks, buffers: dict[str, Tensor], settings: dict[str, Any]
         least_drift=LEAST_DRIFT,
         most_drift=MOST_DRIFT,
     )
-    return program, [tensors, buffers, weights, tables]
+    return program, [tensors, buffers, weights, tables, smooth]
 
 
 _POINTERS = {field[0] for field in Program._fields_ if field[1] is POINTER}

@@ -18,6 +18,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from ..core import smooth
 from ..core.robust import HALVINGS
 from ..normals.shadowed import LightView, Limits
 from .threads import by_frames
@@ -28,7 +29,7 @@ NO_PEDESTAL = (ctypes.c_float * 3)()
 
 
 SIGNATURES = {
-    "contact_mask": ("i", "ppppp iiiiiii fff i f pp"),
+    "contact_mask": ("i", "ppppp iiiiiii fff i f pp pp"),
     "normals": ("i", "p lll pppp l iiii p ll pp ffff p"),
     "solve_shadowed": ("v", "p lll pppp l iiii p ll pppppp"),
     "frame_noise": ("i", "p iiii p"),
@@ -36,6 +37,8 @@ SIGNATURES = {
     "contact_from_depth": ("i", "p ll pp ll iiiii pp"),
     "clean": ("i", "pppppp l p iiii p"),
     "levels": ("i", "p iiiii ff p"),
+    "smooth_change": ("i", "pp iii p"),
+    "over_smooth": ("v", "ppp iii p"),
     "box_of": ("v", "p iii p"),
     "divide_planes": ("v", "pp i l p"),
     "response_normals": ("v", "p lll pp ii p ll p f iii p"),
@@ -185,6 +188,64 @@ def levels(image: Tensor, stride: int, least: float, most: float, halvings: int 
     return found
 
 
+class SmoothLight(ctypes.Structure):
+    """``SmoothLight`` of csrc/kernels.h."""
+
+    _fields_ = (
+        *((name, ctypes.c_int32) for name in ("stride", "rows", "columns", "samples", "steps")),
+        ("most", ctypes.c_float),
+        *((name, ctypes.c_void_p) for name in ("place", "along_x", "along_y", "per_square", "peaks")),
+    )
+
+
+class SmoothTables(NamedTuple):
+    """How a smooth change of light is found in images of a size.
+
+    Attributes:
+        structure: what the kernels take.
+        memory: what it points to.
+    """
+
+    structure: SmoothLight
+    memory: tuple[Tensor, ...]
+
+
+@functools.lru_cache(maxsize=8)
+def smooth_tables(height: int, width: int) -> SmoothTables | None:
+    """The tables of a size; None where none is looked for."""
+    if min(height, width) < smooth.SAMPLES:
+        return None
+    with torch.inference_mode(False):
+        stride = smooth.smooth_stride(height, width)
+        place = smooth.smooth_basis(height, width, stride).float()
+        rows, columns = place.shape[1], place.shape[2]
+        place = torch.nn.functional.pad(place.flatten(1), [0, -rows * columns % 16]).contiguous()
+        along_x, along_y = (smooth.legendre(length, 1)[1:].float().contiguous() for length in (width, height))
+        scales = torch.tensor([smooth.per_square(step) for step in range(smooth.STEPS)])
+        memory = (place, along_x, along_y, scales, smooth.peaks())
+    pointers = (tensor.data_ptr() for tensor in memory)
+    return SmoothTables(SmoothLight(stride, rows, columns, place.shape[1], smooth.STEPS, smooth.MOST, *pointers), memory)
+
+
+def without_smooth_change(ratio: Tensor) -> Tensor:
+    """Images / background (B, 3, H, W) without their smooth change of light: see :class:`~torchvts.compensate.SmoothDrift`."""
+    tables = smooth_tables(ratio.shape[2], ratio.shape[3])
+    if tables is None:
+        return ratio
+    ratio = ratio.contiguous()
+    count, _, height, width = ratio.shape
+    of, found, result = ctypes.byref(tables.structure), ratio.new_empty(count, 3, 6), torch.empty_like(ratio)
+    change, over = loaded().smooth_change, loaded().over_smooth
+
+    def some(first: int, many: int) -> int:
+        code = int(change(of, _at(ratio, first), many, height, width, _at(found, first)))
+        over(of, _at(ratio, first), _at(found, first), many, height, width, _at(result, first))
+        return code
+
+    _check(by_frames(count, height * width, some))
+    return result
+
+
 def box_of(mask: Tensor) -> tuple[int, int, int, int]:
     """(top, bottom, left, right) of the smallest box that holds all of a bool (B, 1, H, W); zeros without any."""
     mask = mask.contiguous()
@@ -207,7 +268,12 @@ def divided(image: Tensor, level: Tensor) -> Tensor:
 
 
 def contact_mask(
-    compensated: Tensor, offset: Tensor | None, per_noise: Tensor, limits: tuple[Tensor, Tensor], grid: ContactGrid
+    compensated: Tensor,
+    offset: Tensor | None,
+    per_noise: Tensor,
+    limits: tuple[Tensor, Tensor],
+    grid: ContactGrid,
+    smooth_light: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Deformed area and its interior, bool (B, 1, H, W): see :class:`~torchvts.contact.ContactMask`, whose attributes these are.
 
@@ -220,13 +286,16 @@ def contact_mask(
     mask = compensated.new_empty(count, 1, height, width, dtype=torch.bool)
     interior = torch.empty_like(mask)
     fields = (offsets, per_noise.data_ptr(), limits[0].data_ptr(), limits[1].data_ptr())
+    tables = smooth_tables(height, width) if smooth_light else None
+    of, smoothed = (None, None) if tables is None else (ctypes.byref(tables.structure), torch.empty_like(compensated))
     kernel = loaded().contact_mask
     _check(
         by_frames(
             count,
             height * width,
             lambda first, many: kernel(
-                _at(compensated, first), *fields, many, height, width, *grid, _at(mask, first), _at(interior, first)
+                *(_at(compensated, first), *fields, many, height, width, *grid),
+                *(of, _at(smoothed, first), _at(mask, first), _at(interior, first)),
             ),
         )
     )

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ..accelerated import Compensate, ContactMask
+from ..accelerated import Compensate, ContactMask, SmoothDrift
 from ..core.blur import blur, gaussian_weights
 from ..core.geometry import gradient_from_normal, pixel_grid_mm
 from ..integration import PoissonBackground
@@ -118,7 +118,7 @@ def read_contacts(given: Sequence[Press | Touch], background: Tensor, sensor: Se
         sensor: of the unit, with the gamma and blur of the preprocessing.
     """
     unit = unit_without_model(background, sensor)
-    compensate, mask = Compensate.from_calibration(unit).double(), _difference(unit)
+    compensate, mask, smooth = Compensate.from_calibration(unit).double(), _difference(unit), SmoothDrift()
     contacts = []
     for item in given:
         ratio = compensate(item.image.detach().cpu().double()[None])
@@ -127,7 +127,7 @@ def read_contacts(given: Sequence[Press | Touch], background: Tensor, sensor: Se
         ball_px = 0.5 * item.ball_diameter_mm / sensor.mm_per_pixel if isinstance(item, Press) else 0.0
         region = contact_region(far, differs, ball_px)
         saturated = ((item.image > 0.995) & (background < 0.995)).any(dim=0).cpu()
-        contact = _sampled(item, change, region, saturated, sensor)
+        contact = _sampled(item, smooth(ratio)[0] - 1.0, region, saturated, sensor)
         contact.reason = _unusable(item.image, background, differs, far) or _saturated(float(saturated[region].double().mean()))
         if isinstance(item, Press) and item.center_px is not None:
             _place(contact, item, sensor)

@@ -2,6 +2,6 @@
 
 from .compensate import Blur, Compensate
 from .defects import FillDefects
-from .drift import Drift
+from .drift import Drift, SmoothDrift
 
-__all__ = ["Blur", "Compensate", "Drift", "FillDefects"]
+__all__ = ["Blur", "Compensate", "Drift", "FillDefects", "SmoothDrift"]

@@ -1,4 +1,4 @@
-"""How much the light of each LED has drifted since calibration, found in the undeformed part of a frame and divided out."""
+"""How the light of each LED has drifted since calibration, found in the undeformed part of a frame and divided out."""
 
 from typing import Final
 
@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from ..core.checks import check_field, may_read
 from ..core.robust import half_sample_mode
+from ..core.smooth import grid_samples, over_smooth, smooth_change
 
 LEAST_DRIFT, MOST_DRIFT = 0.01, 0.15
 """Drift, relative, above the error of the mode itself, and the largest that is believed."""
@@ -126,15 +127,7 @@ class Drift(nn.Module):
 
     def samples(self, image: Tensor) -> Tensor:
         """Some thousand pixels of an image on a grid, each the mean of 3 x 3 pixels where these do not overlap."""
-        stride = grid_stride(image)
-        if stride < 3:
-            return _grid(image)
-        first = stride // 2 - 1
-        rows, columns = image.shape[2] // stride * stride, image.shape[3] // stride * stride
-        total = image[:, :, first:rows:stride, first:columns:stride].clone()
-        for k in range(1, 9):
-            total += image[:, :, first + k // 3 : rows : stride, first + k % 3 : columns : stride]
-        return total / 9.0
+        return grid_samples(image, grid_stride(image))
 
     def ordered(self, values: Tensor) -> Tensor:
         """Values (B, 3, N) sorted along the last dimension."""
@@ -143,6 +136,17 @@ class Drift(nn.Module):
     def median(self, values: Tensor) -> Tensor:
         """Median of values (B, 3, N), the lower one of two, (B, 3, 1)."""
         return values.median(dim=-1, keepdim=True).values
+
+
+class SmoothDrift(nn.Module):
+    """Divide each channel of images / background (B, 3, H, W) by a smooth surface through its undeformed part.
+
+    An LED fades on its side of the skin, a hand darkens one side: what :class:`Drift` leaves of that, and what a press scatters,
+    :func:`~torchvts.core.smooth.smooth_change` finds.
+    """
+
+    def forward(self, ratio: Tensor) -> Tensor:
+        return over_smooth(ratio, smooth_change(ratio))
 
 
 def grid_stride(image: Tensor) -> int:

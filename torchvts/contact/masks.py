@@ -20,12 +20,14 @@ from ..core.checks import (
     check_positive,
     check_record,
     check_same_size,
+    check_switch,
     may_read,
     may_read_values,
 )
 from ..core.morphology import dilate, dilate_cross, erode, reconstruct
 from ..core.noise import clipped_std, dark_below, sample_stride
 from ..core.noise import noise_std as frame_noise_std
+from ..core.smooth import over_smooth, smooth_change
 from ..model.calibration import Calibration, check_calibration
 from .settings import ContactSettings
 
@@ -65,7 +67,8 @@ class ContactMask(nn.Module):
     cell also if its mean change is, in units of the frame's own spread of cell means (faint contact). The noise of a channel is
     the largest of the calibrated one, the frame's own, and the frame's spread of change far from the contact. Holes are filled;
     components smaller than a disc of ``min_size_px`` are removed. A channel that is black in all of the frame (below 5 % of its
-    background) has lost its LED: the other two decide.
+    background) has lost its LED: the other two decide. With ``smooth_light`` a smooth change of the light is divided out first;
+    the noise is the frame's before that, since what a press makes of undeformed skin is smooth only roughly.
 
     Args:
         flat: (3, H, W), the compensated image of the undeformed skin.
@@ -74,6 +77,7 @@ class ContactMask(nn.Module):
         min_size_px: diameter of the smallest contact.
         far_field: largest change, relative to the light, that a press makes in undeformed skin; up to it, the spread of the least
             changed skin of a frame counts as noise. 0 for rigs in which light does not scatter.
+        smooth_light: whether the light may have changed smoothly over the image since calibration; ``flat`` is 1 then.
     Example:
         >>> flat = torch.full((3, 64, 64), 0.5)
         >>> image = flat.clone(); image[0, 20:40, 20:40] += 0.2
@@ -90,10 +94,19 @@ class ContactMask(nn.Module):
     cell_column: Tensor
 
     def __init__(
-        self, flat: Tensor, noise_std: Tensor, sigmas: float = 4.5, min_size_px: float = 8.0, far_field: float = 0.0
+        self,
+        flat: Tensor,
+        noise_std: Tensor,
+        sigmas: float = 4.5,
+        min_size_px: float = 8.0,
+        far_field: float = 0.0,
+        smooth_light: bool = False,
     ) -> None:
         super().__init__()
         check_field("flat", flat)
+        self.smooth_light = check_switch("smooth_light", smooth_light)
+        if smooth_light and not bool((flat == 1.0).all()):
+            raise ValueError("smooth_light: expected False, because flat is not 1: a smooth change is found in image / background")
         if flat.shape[2] < 3:
             raise ValueError(f"flat: expected at least 3 columns, for the noise of a frame, got {flat.shape[2]}")
         far_field = check_least("far_field", far_field)
@@ -134,7 +147,8 @@ class ContactMask(nn.Module):
             light = calibration.background
             typical = light.flatten(1).median(dim=1).values[:, None, None]
             noise = noise.maximum(STAND_IN_NOISE * (typical / light.clamp_min(1e-3 * typical)).clamp_min(1.0))
-        return cls(calibration.flat, noise, settings.sigmas, settings.min_size_px, most_far_field(calibration))
+        smooth = calibration.response is not None
+        return cls(calibration.flat, noise, settings.sigmas, settings.min_size_px, most_far_field(calibration), smooth)
 
     if TYPE_CHECKING:
 
@@ -185,11 +199,13 @@ class ContactMask(nn.Module):
     def change(self, compensated: Tensor) -> Change:
         """The change of a compensated image, in units of the calibrated noise."""
         change = torch.addcmul(self.offset, compensated, self.per_noise)
+        noise = torch.maximum(self.noise(change.detach()), self.far_field(change.detach())).clamp_min(1.0)
         failed = self.black(compensated)
+        if self.smooth_light:
+            change = torch.addcmul(self.offset, over_smooth(compensated, smooth_change(compensated)), self.per_noise)
         if not may_read(failed) or bool(failed.any()):
             failed = failed & (failed.to(torch.uint8).sum(dim=1, keepdim=True) == 1)
             change = change * (~failed)[:, :, None, None].to(change.dtype)
-        noise = torch.maximum(self.noise(change.detach()), self.far_field(change.detach())).clamp_min(1.0)
         # rounding to 8 bits of smooth light is no white noise, and second differences miss it
         change = change / torch.sqrt(noise * noise + self.rounding)[:, :, None, None]
         r, g, b = change[:, 0:1], change[:, 1:2], change[:, 2:3]

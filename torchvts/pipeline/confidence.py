@@ -464,7 +464,7 @@ class ConfidentPipeline(nn.Module):
     def forward(self, images: Tensor) -> ConfidentOutput:
         """As :meth:`DepthPipeline.forward`."""
         out: DepthOutput = self.pipe(images)
-        bounds: Bounds = self.confidence(images, self.pipe.compensate(images), out)
+        bounds: Bounds = self.confidence(images, self.pipe.smooth(self.pipe.compensate(images)), out)
         return ConfidentOutput(
             out.depth_mm,
             out.gradient,

@@ -17,6 +17,7 @@ from ..accelerated import (
     NormalFromIntensity,
     NormalFromResponse,
     PoissonBackground,
+    SmoothDrift,
     Uncrop,
     ZeroBackground,
     scriptable,
@@ -139,6 +140,7 @@ class DepthPipeline(nn.Module):
         self.skips_undeformed = mode == "auto"
         self.compensate = compensate
         self.deformed = deformed
+        self.smooth = SmoothDrift() if isinstance(deformed, PlainContactMask) and deformed.smooth_light else nn.Identity()
         self.crop = Crop(STRIDE, model.takes_window)
         self.solve = Solve(model, gradient, integrator)
         self.measures_noise = self.solve.takes_noise and mode != "fast"
@@ -273,6 +275,7 @@ class DepthPipeline(nn.Module):
             return None
         return FrameBlocks(
             self.compensate,
+            self.smooth,
             self.deformed,
             self.crop,
             solve.normals,
@@ -314,7 +317,7 @@ class DepthPipeline(nn.Module):
     def depth_of(self, images: Tensor) -> DepthOutput:
         """The output of checked images (B, 3, H, W), all solved in the one window that holds the deformed skin of all."""
         compensated = self.compensate(images)
-        frame = self.crop(compensated, self.deformed(compensated))
+        frame = self.crop(self.smooth(compensated), self.deformed(compensated))
         if may_read_values() and (images.shape[0] == 0 or (self.skips_undeformed and self.nothing_to_solve(frame))):
             return undeformed_output(frame)
         frame = with_noise(frame, self.noise_of(compensated))

@@ -274,6 +274,8 @@ typedef struct {
 /* A frame's images and what is found in it. scale: of each channel's change; raw: strong pixels, before they are closed. */
 typedef struct {
     const float *image, *offset, *per_noise, *failed_below, *most_far_field;
+    const SmoothLight *smooth;
+    float *smoothed;
     int height, width, step, stride;
     float rounding, threshold, noise[6], scale[3], per[3];
     int works[3], bands;
@@ -567,6 +569,12 @@ static int mask_frame(Frame *of) {
     const size_t pixels = (size_t)of->height * of->width, cells = (size_t)of->grid.rows * of->grid.columns;
     share(find_noise, of, 9);
     find_scale(of);
+    if (of->smooth) {
+        float surface[18];
+        if (smooth_change(of->smooth, of->image, 1, of->height, of->width, surface)) return 1;
+        over_smooth(of->smooth, of->image, surface, 1, of->height, of->width, of->smoothed);
+        of->image = of->smoothed;
+    }
     share(find_strong, of, of->bands);
     share(close_strong, of, of->bands);
     share(find_shares, of, of->bands);
@@ -589,13 +597,14 @@ static int mask_frame(Frame *of) {
 
 /*
  * image (frames, 3, height, width), with offset and per_noise (3, height, width): change = image * per_noise + offset; offset
- * null where it is -per_noise. Writes mask and inner, bytes (frames, height, width); inner is where cells decide, not pixels.
+ * null where it is -per_noise. smooth: null where no smooth change of the light is divided out, else smoothed takes the images without, and may be
+ * `image`. Writes mask and inner, bytes (frames, height, width); inner is where cells decide, not pixels.
  * Returns 0, 1 where memory is short, or 2 where a value is not finite or its square would not be, and the masks mean nothing.
  */
 EXPORT int contact_mask(const float *image, const float *offset, const float *per_noise, const float *failed_below,
                         const float *most_far_field, int frames, int height, int width, int step, int stride, int cell, int reach,
-                        float sigmas, float rounding, float least_cells, int bridge, float bridge_sigmas, uint8_t *mask,
-                        uint8_t *inner) {
+                        float sigmas, float rounding, float least_cells, int bridge, float bridge_sigmas, const SmoothLight *smooth,
+                        float *smoothed, uint8_t *mask, uint8_t *inner) {
     const int rows = (height + cell - 1) / cell, columns = (width + cell - 1) / cell;
     const Grid grid = {rows, columns, cell, reach, least_cells, bridge, bridge_sigmas, shape_of(rows, columns)};
     const size_t pixels = (size_t)height * width, cells = (size_t)rows * columns, words = words_of(&grid.shape), line = 64 * (size_t)grid.shape.words;
@@ -609,6 +618,7 @@ EXPORT int contact_mask(const float *image, const float *offset, const float *pe
     for (int b = 0; b < frames && code != 1; b++) {
         Frame frame = {.image = image + 3 * pixels * b, .offset = offset, .per_noise = per_noise, .failed_below = failed_below};
         frame.most_far_field = most_far_field, frame.height = height, frame.width = width, frame.step = step, frame.stride = stride;
+        frame.smooth = smooth, frame.smoothed = smooth ? smoothed + 3 * pixels * b : NULL;
         frame.rounding = rounding, frame.threshold = sigmas * sigmas;
         frame.bands = least(rows, bands_of(height)), frame.grid = grid, frame.at = at;
         frame.raw = frame.inner = inner + pixels * b, frame.strong = mask + pixels * b; /* cells decide after pixels are closed */

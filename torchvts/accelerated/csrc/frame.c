@@ -17,6 +17,7 @@ typedef struct {
     /* ContactMask */
     int32_t step, stride, cell, reach, bridge;
     float sigmas, rounding, least_cells, bridge_sigmas;
+    const SmoothLight *smooth; /* of SmoothDrift too; or null */
     const float *flat, *per_noise, *failed_below, *most_far_field;
     /* Crop: corners on multiples of `corners` */
     int32_t corners;
@@ -144,8 +145,8 @@ static int solve_frame(const Program *of, const float *image, Work work, Output 
     const float *light = compensated(of, image, work.light, &trouble);
     if (trouble) return trouble;
     const int code = contact_mask(light, of->flat, of->per_noise, of->failed_below, of->most_far_field, 1, height, width, of->step, of->stride,
-                                  of->cell, of->reach, of->sigmas, of->rounding, of->least_cells, of->bridge, of->bridge_sigmas, out.deformed,
-                                  work.inner);
+                                  of->cell, of->reach, of->sigmas, of->rounding, of->least_cells, of->bridge, of->bridge_sigmas, of->smooth, work.light,
+                                  out.deformed, work.inner);
     if (code) return code == 1 ? SHORT : BEYOND;
     Window at = window_of(of, out.deformed);
     if (at.rows == 0) {

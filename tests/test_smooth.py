@@ -1,0 +1,88 @@
+"""A smooth change of the light is divided out of a frame, and contact is not."""
+
+import pytest
+import torch
+
+import torchvts as vts
+from torchvts.accelerated import SmoothDrift, reference, reference_only
+from torchvts.compensate import SmoothDrift as PlainSmoothDrift
+from torchvts.core.smooth import MOST, over_smooth, smooth_basis, smooth_change
+from torchvts.model import DepthBrightness, ResponseField
+from torchvts.model.response_field import ResponseModel
+
+SIZES = ((240, 320), (45, 63), (24, 30), (71, 99), (23, 40))
+
+
+def light(height, width, size, seed=0):
+    """A change of the light, (1, 3, H, W), of degree 2, a different one of each channel, whose largest value is ``size``."""
+    some = torch.randn(3, 6, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    surface = (some @ smooth_basis(height, width, 1).flatten(1)).reshape(1, 3, height, width)
+    return (1.0 + size * surface / surface.abs().amax(dim=(2, 3), keepdim=True)).float()
+
+
+def pressed(height, width):
+    """Image / background, (1, 3, H, W), of a ball in one corner: brighter on one side, darker on the other."""
+    y, x = torch.meshgrid(torch.arange(height) - 0.3 * height, torch.arange(width) - 0.35 * width, indexing="ij")
+    radius = 0.2 * height
+    inside = (x * x + y * y < radius * radius).float()
+    return 1.0 + 0.4 * torch.stack((x, y, -x))[None] / radius * inside
+
+
+@pytest.mark.parametrize("size", [0.02, 0.05])
+def test_smooth_light_is_divided_out_of_undeformed_and_of_pressed_skin(size):
+    changed = light(240, 320, size)
+    assert float((PlainSmoothDrift()(changed) - 1.0).abs().max()) < 0.01 * size
+    image = pressed(240, 320)
+    assert float((PlainSmoothDrift()(image * changed) - image).abs().max()) < 0.1 * size
+
+
+def test_a_contact_that_fills_the_image_is_not_explained_away():
+    image = 1.0 + 0.6 * (torch.arange(320) / 319.0 - 0.5).expand(1, 3, 240, 320)
+    assert float((PlainSmoothDrift()(image) - image).abs().max()) < MOST * float(image.max())
+    far = light(240, 320, 0.9)
+    assert float((far / over_smooth(far, smooth_change(far)) - 1.0).abs().max()) < MOST + 1e-5
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_compiled_fit_equals_the_reference(size):
+    noise = 0.01 * torch.randn(2, 3, *size, generator=torch.Generator().manual_seed(1))
+    image = torch.cat((light(*size, 0.06), pressed(*size) * light(*size, 0.05, 1))) + noise
+    plain = PlainSmoothDrift()
+    assert torch.allclose(SmoothDrift()(image), plain(image), atol=1e-6)
+    assert torch.allclose(torch.jit.script(plain)(image), plain(image), atol=1e-6)
+    assert torch.allclose(plain(image)[1:], plain(image[1:]), atol=1e-6)
+    assert (min(size) < 24) == torch.equal(plain(image), image)
+
+
+def test_smooth_light_moves_no_skin():
+    flat, noise = torch.ones(3, 240, 320), torch.full((3,), 0.004)
+    changed = light(240, 320, 0.04) + 0.004 * torch.randn(1, 3, 240, 320, generator=torch.Generator().manual_seed(2))
+    assert bool(vts.ContactMask(flat, noise)(changed).any())
+    mask = vts.ContactMask(flat, noise, far_field=0.06, smooth_light=True)
+    assert not bool(mask(changed).any())
+    moved = mask(pressed(240, 320) * changed)
+    assert float((moved ^ mask(pressed(240, 320))).double().mean()) < 0.01 < float(moved.double().mean())
+    with reference_only():
+        assert torch.equal(mask(pressed(240, 320) * changed), moved)
+    assert bool((mask.soft(pressed(240, 320) * changed) > 0.5).eq(moved).double().mean() > 0.99)
+    with pytest.raises(ValueError, match="smooth_light: expected False, because flat is not 1"):
+        vts.ContactMask(0.5 * flat, noise, smooth_light=True)
+
+
+def test_depth_of_a_response_unit_hardly_follows_the_light():
+    """By compiled call, by blocks and by the reference the same; units that lights explain have no such block."""
+    field = ResponseField(0, -1, 10.0, ((-0.1, 0.0, 0.1), (0.0, -0.2, 0.0)))
+    model = ResponseModel(field, DepthBrightness(0, 10.0, ((0.0,), (0.0,), (0.0,))))
+    unit = vts.Calibration.from_response(model, vts.Sensor("rig", 120, 160, 0.1), torch.full((3, 120, 160), 0.5))
+    pipe, image = vts.DepthPipeline.from_calibration(unit, "precise"), 0.5 * pressed(120, 160)
+    changed = image * light(120, 160, 0.05)
+    after, moved_by = pipe(changed), largest(pipe(changed).depth_mm - pipe(image).depth_mm)
+    assert float(after.depth_mm.max()) > 0.2
+    for other in (pipe.reconstructed(changed), reference(pipe)(changed)):
+        assert torch.allclose(other.depth_mm, after.depth_mm, atol=1e-6) and torch.equal(other.contact, after.contact)
+    pipe.smooth, pipe.deformed.smooth_light = torch.nn.Identity(), False
+    assert moved_by < 0.004 < 0.01 < largest(pipe(changed).depth_mm - pipe(image).depth_mm)
+
+
+def largest(difference):
+    return float(difference.abs().max())

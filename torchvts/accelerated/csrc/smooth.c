@@ -1,0 +1,103 @@
+/* A smooth change of the light over the image: the same results as torchvts/core/smooth.py, which explains them. */
+#include "kernels.h"
+
+#include <math.h>
+
+enum { LANES = 16, TERMS = 6 };
+
+/* What of the change (3, n) is not explained by the surface so far, weighted, times each term of place (TERMS, n): (3, TERMS). n is a multiple
+   of LANES. */
+WIDE static void surface_sums(const float *restrict change, const float *restrict place, int n, const float *restrict found, float per_square,
+                              float *restrict sum) {
+    float total[3 * TERMS][LANES] = {{0.0f}};
+    for (int first = 0; first < n; first += LANES) {
+        float left[3][LANES], weight[LANES];
+        for (int j = 0; j < LANES; j++) weight[j] = 0.0f;
+        for (int c = 0; c < 3; c++) {
+            for (int j = 0; j < LANES; j++) left[c][j] = change[(size_t)c * n + first + j];
+            for (int k = 0; k < TERMS; k++)
+                for (int j = 0; j < LANES; j++) left[c][j] -= found[c * TERMS + k] * place[(size_t)k * n + first + j];
+            for (int j = 0; j < LANES; j++) weight[j] += left[c][j] * left[c][j];
+        }
+        for (int j = 0; j < LANES; j++) {
+            weight[j] = 1.0f - weight[j] * per_square;
+            weight[j] = weight[j] > 0.0f ? weight[j] * weight[j] : 0.0f;
+        }
+        for (int c = 0; c < 3; c++)
+            for (int k = 0; k < TERMS; k++)
+                for (int j = 0; j < LANES; j++) total[c * TERMS + k][j] += left[c][j] * weight[j] * place[(size_t)k * n + first + j];
+    }
+    for (int k = 0; k < 3 * TERMS; k++) {
+        sum[k] = 0.0f;
+        for (int j = 0; j < LANES; j++) sum[k] += total[k][j];
+    }
+}
+
+/* Change at the samples of an image (3, height, width): (3, n), zero beyond the samples that there are. */
+static void sample_change(const SmoothLight *of, const float *image, int height, int width, float *means, float *change) {
+    const int samples = of->rows * of->columns, n = of->samples, stride = of->stride;
+    if (stride < 3) {
+        for (int c = 0, at = 0; c < 3; c++)
+            for (int y = stride / 2; y < height; y += stride)
+                for (int x = stride / 2; x < width; x += stride) means[at++] = image[((size_t)c * height + y) * width + x];
+    } else {
+        grid_means(image, 3, height, width, stride, stride / 2 - 1, of->rows, of->columns, means);
+    }
+    for (int c = 0; c < 3; c++)
+        for (int k = 0; k < samples; k++) change[(size_t)c * n + k] = means[(size_t)c * samples + k] - 1.0f;
+}
+
+/* Coefficients of the change of images (frames, 3, height, width): (frames, 3, TERMS). Returns 1 where memory is short. */
+EXPORT int smooth_change(const SmoothLight *of, const float *image, int frames, int height, int width, float *found) {
+    const int samples = of->rows * of->columns;
+    float sum[3 * TERMS], *change = calloc(3 * ((size_t)of->samples + samples), sizeof(float)), *means = change + 3 * (size_t)of->samples;
+    if (!change) return 1;
+    for (int b = 0; b < frames; b++, image += 3 * (size_t)height * width, found += 3 * TERMS) {
+        sample_change(of, image, height, width, means, change);
+        memset(found, 0, sizeof(float) * 3 * TERMS);
+        for (int step = 0; step < of->steps; step++) {
+            surface_sums(change, of->place, of->samples, found, of->per_square[step], sum);
+            for (int k = 0; k < 3 * TERMS; k++) found[k] += sum[k] / (float)samples;
+        }
+        for (int c = 0; c < 3; c++) {
+            float largest = 0.0f;
+            for (int k = 0; k < TERMS; k++) largest += fabsf(found[c * TERMS + k]) * of->peaks[k];
+            for (int k = 0; k < TERMS; k++) found[c * TERMS + k] *= of->most / (largest > of->most ? largest : of->most);
+        }
+    }
+    free(change);
+    return 0;
+}
+
+WIDE static void divide_line(const float *values, const float *restrict along_x, int n, float c0, float c1, float c2, float *result) {
+    INDEPENDENT for (int x = 0; x < n; x++) result[x] = values[x] / (1.0f + (c0 + c1 * along_x[x] + c2 * along_x[n + x]));
+}
+
+/* What over_smooth() is given. */
+typedef struct {
+    const SmoothLight *of;
+    const float *image, *found;
+    int height, width;
+    float *result;
+} Surface;
+
+/* Parts of a plane of which threads take one at a time. */
+enum { PIECES = 2 };
+
+static void divide_lines(void *with, int part) {
+    const Surface *work = with;
+    const SmoothLight *of = work->of;
+    const int height = work->height, width = work->width, plane = part / PIECES, piece = part % PIECES;
+    const float *c = work->found + (size_t)TERMS * plane;
+    for (int y = height * piece / PIECES; y < height * (piece + 1) / PIECES; y++) {
+        const float y1 = of->along_y[y], y2 = of->along_y[height + y];
+        const size_t line = ((size_t)plane * height + y) * width;
+        divide_line(work->image + line, of->along_x, width, c[0] + c[2] * y1 + c[5] * y2, c[1] + c[4] * y1, c[3], work->result + line);
+    }
+}
+
+/* Images (frames, 3, height, width) over 1 + the surface of their coefficients; the result may be the images themselves. */
+EXPORT void over_smooth(const SmoothLight *of, const float *image, const float *found, int frames, int height, int width, float *result) {
+    Surface work = {of, image, found, height, width, result};
+    share(divide_lines, &work, 3 * frames * PIECES);
+}

@@ -47,8 +47,8 @@ class NormalFromIntensity(NormalModel):
         height: pixels.
         width: pixels.
         mm_per_pixel: pixel pitch, mm.
-        noise_std: (3,), noise of the compensated image; None takes that of 8-bit rounding. In a pipeline a frame that has more
-            counts with its own (:meth:`noise_of`).
+        noise_std: (3,), noise of the compensated image; None takes that of 8-bit rounding. In modes precise and auto of
+            a pipeline, a frame that has more counts with its own (:meth:`noise_of`).
         inverse: (3, 3, H, W), the stored inverse; None computes it.
         saturated_above: (3, H, W), compensated intensity from which a channel counts as saturated; None for never.
         camera_height_mm: of a pinhole camera above the image centre, which sees deep points nearer to its axis; infinite for an

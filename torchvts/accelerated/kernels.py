@@ -37,8 +37,8 @@ SIGNATURES = {
     "contact_from_depth": ("i", "p ll pp ll iiiii pp"),
     "clean": ("i", "pppppp l p iiii p"),
     "levels": ("i", "p iiiii ff p"),
-    "smooth_change": ("i", "pp iii p"),
-    "over_smooth": ("v", "ppp iii p"),
+    "smooth_change": ("i", "pp i p"),
+    "over_smooth": ("v", "ppp i p"),
     "box_of": ("v", "p iii p"),
     "divide_planes": ("v", "pp i l p"),
     "response_normals": ("v", "p lll pp ii p ll p f iii p"),
@@ -192,7 +192,7 @@ class SmoothLight(ctypes.Structure):
     """``SmoothLight`` of csrc/kernels.h."""
 
     _fields_ = (
-        *((name, ctypes.c_int32) for name in ("stride", "rows", "columns", "samples", "steps")),
+        *((name, ctypes.c_int32) for name in ("height", "width", "stride", "rows", "columns", "samples", "steps")),
         ("most", ctypes.c_float),
         *((name, ctypes.c_void_p) for name in ("place", "along_x", "along_y", "per_square", "peaks")),
     )
@@ -224,7 +224,9 @@ def smooth_tables(height: int, width: int) -> SmoothTables | None:
         scales = torch.tensor([smooth.per_square(step) for step in range(smooth.STEPS)])
         memory = (place, along_x, along_y, scales, smooth.peaks())
     pointers = (tensor.data_ptr() for tensor in memory)
-    return SmoothTables(SmoothLight(stride, rows, columns, place.shape[1], smooth.STEPS, smooth.MOST, *pointers), memory)
+    return SmoothTables(
+        SmoothLight(height, width, stride, rows, columns, place.shape[1], smooth.STEPS, smooth.MOST, *pointers), memory
+    )
 
 
 def without_smooth_change(ratio: Tensor) -> Tensor:
@@ -238,8 +240,8 @@ def without_smooth_change(ratio: Tensor) -> Tensor:
     change, over = loaded().smooth_change, loaded().over_smooth
 
     def some(first: int, many: int) -> int:
-        code = int(change(of, _at(ratio, first), many, height, width, _at(found, first)))
-        over(of, _at(ratio, first), _at(found, first), many, height, width, _at(result, first))
+        code = int(change(of, _at(ratio, first), many, _at(found, first)))
+        over(of, _at(ratio, first), _at(found, first), many, _at(result, first))
         return code
 
     _check(by_frames(count, height * width, some))
@@ -287,7 +289,7 @@ def contact_mask(
     interior = torch.empty_like(mask)
     fields = (offsets, per_noise.data_ptr(), limits[0].data_ptr(), limits[1].data_ptr())
     tables = smooth_tables(height, width) if smooth_light else None
-    of, smoothed = (None, None) if tables is None else (ctypes.byref(tables.structure), torch.empty_like(compensated))
+    of, surface = None if tables is None else ctypes.byref(tables.structure), compensated.new_empty(count, 18)
     kernel = loaded().contact_mask
     _check(
         by_frames(
@@ -295,7 +297,7 @@ def contact_mask(
             height * width,
             lambda first, many: kernel(
                 *(_at(compensated, first), *fields, many, height, width, *grid),
-                *(of, _at(smoothed, first), _at(mask, first), _at(interior, first)),
+                *(of, _at(surface, first), _at(mask, first), _at(interior, first)),
             ),
         )
     )

@@ -46,9 +46,10 @@ def smooth_change(ratio: Tensor, samples: int = SAMPLES, steps: int = STEPS, mos
 
 
 def over_smooth(ratio: Tensor, coefficients: Tensor) -> Tensor:
-    """Images (B, 3, H, W) over 1 + the surface of coefficients (B, 3, 6)."""
+    """Images (B, 3, H, W) over 1 + the surface of coefficients (B, 3, 6), to second order: at 5 % off by 0.01 %."""
     place = smooth_basis(ratio.shape[2], ratio.shape[3], 1).to(ratio)
-    return ratio / (1.0 + (coefficients @ place.flatten(1)).reshape(ratio.shape))
+    surface = (coefficients @ place.flatten(1)).reshape(ratio.shape)
+    return ratio * (1.0 - surface + surface.square())
 
 
 def grid_samples(image: Tensor, stride: int) -> Tensor:

@@ -275,7 +275,7 @@ typedef struct {
 typedef struct {
     const float *image, *offset, *per_noise, *failed_below, *most_far_field;
     const SmoothLight *smooth;
-    float *smoothed;
+    float *surface;
     int height, width, step, stride;
     float rounding, threshold, noise[6], scale[3], per[3];
     int works[3], bands;
@@ -285,9 +285,14 @@ typedef struct {
     atomic_int short_of_memory;
 } Frame;
 
-/* Of a channel's change, the noise, or of parts 3 to 5 its far field; of parts 6 to 8 whether its LED works. */
+/* Of a channel's change, the noise, or of parts 3 to 5 its far field; of parts 6 to 8 whether its LED works. Part 9: a smooth change of the light,
+   which has no part in the noise. */
 static void find_noise(void *with, int part) {
     Frame *of = with;
+    if (part == 9) {
+        if (smooth_change(of->smooth, of->image, 1, of->surface)) of->short_of_memory = 1;
+        return;
+    }
     const int c = part % 3, far = part >= 3;
     const size_t plane = (size_t)of->height * of->width * c;
     const float *image = of->image + plane, *offset = of->offset ? of->offset + plane : NULL, *per_noise = of->per_noise + plane;
@@ -329,22 +334,24 @@ static void find_strong(void *with, int band) {
     Frame *of = with;
     const int cell = of->grid.cell, columns = of->grid.columns, height = of->height, width = of->width;
     const size_t pixels = (size_t)height * width, cells = (size_t)of->grid.rows * columns;
-    float *sums = malloc(4 * sizeof(float) * (size_t)width);
+    float *sums = malloc(5 * sizeof(float) * (size_t)width);
     if (!sums) {
         of->short_of_memory = 1;
         return;
     }
-    float *squared = sums + 3 * (size_t)width;
+    float *squared = sums + 3 * (size_t)width, *line = squared + width;
     for (int i = first_row(of, band); i < first_row(of, band + 1); i++) {
         const int first = least(i * cell, height - cell);
         memset(sums, 0, 3 * sizeof(float) * (size_t)width);
         for (int y = first; y < first + cell; y++) {
             const size_t row = (size_t)y * width;
             memset(squared, 0, sizeof(float) * (size_t)width);
-            for (int c = 0; c < 3; c++)
-                if (of->scale[c] != 0.0f)
-                    add_change(of->image + pixels * c + row, of->offset ? of->offset + pixels * c + row : NULL, of->per_noise + pixels * c + row,
-                               of->scale[c], width, sums + (size_t)c * width, squared);
+            for (int c = 0; c < 3; c++) {
+                const float *values = of->image + pixels * c + row, *offset = of->offset ? of->offset + pixels * c + row : NULL;
+                if (of->scale[c] == 0.0f) continue;
+                if (of->smooth) row_over_smooth(of->smooth, of->surface + 6 * c, y, 0, width, values, line);
+                add_change(of->smooth ? line : values, offset, of->per_noise + pixels * c + row, of->scale[c], width, sums + (size_t)c * width, squared);
+            }
             if (y >= i * cell) above(squared, of->threshold, width, of->raw + row); /* rows above are the cell's before, of another band maybe */
         }
         for (int c = 0; c < 3; c++) cell_means(sums + (size_t)c * width, width, cell, columns, of->at.means + c * cells + (size_t)i * columns);
@@ -567,14 +574,9 @@ static void to_pixels(void *with, int band) {
 /* Masks of one frame. Returns what contact_mask() does. */
 static int mask_frame(Frame *of) {
     const size_t pixels = (size_t)of->height * of->width, cells = (size_t)of->grid.rows * of->grid.columns;
-    share(find_noise, of, 9);
+    share(find_noise, of, of->smooth ? 10 : 9);
     find_scale(of);
-    if (of->smooth) {
-        float surface[18];
-        if (smooth_change(of->smooth, of->image, 1, of->height, of->width, surface)) return 1;
-        over_smooth(of->smooth, of->image, surface, 1, of->height, of->width, of->smoothed);
-        of->image = of->smoothed;
-    }
+    if (of->short_of_memory) return 1;
     share(find_strong, of, of->bands);
     share(close_strong, of, of->bands);
     share(find_shares, of, of->bands);
@@ -597,14 +599,14 @@ static int mask_frame(Frame *of) {
 
 /*
  * image (frames, 3, height, width), with offset and per_noise (3, height, width): change = image * per_noise + offset; offset
- * null where it is -per_noise. smooth: null where no smooth change of the light is divided out, else smoothed takes the images without, and may be
- * `image`. Writes mask and inner, bytes (frames, height, width); inner is where cells decide, not pixels.
+ * null where it is -per_noise. smooth: null where no smooth change of the light is divided out, else surface (frames, 3, 6) takes its
+ * coefficients. Writes mask and inner, bytes (frames, height, width); inner is where cells decide, not pixels.
  * Returns 0, 1 where memory is short, or 2 where a value is not finite or its square would not be, and the masks mean nothing.
  */
 EXPORT int contact_mask(const float *image, const float *offset, const float *per_noise, const float *failed_below,
                         const float *most_far_field, int frames, int height, int width, int step, int stride, int cell, int reach,
                         float sigmas, float rounding, float least_cells, int bridge, float bridge_sigmas, const SmoothLight *smooth,
-                        float *smoothed, uint8_t *mask, uint8_t *inner) {
+                        float *surface, uint8_t *mask, uint8_t *inner) {
     const int rows = (height + cell - 1) / cell, columns = (width + cell - 1) / cell;
     const Grid grid = {rows, columns, cell, reach, least_cells, bridge, bridge_sigmas, shape_of(rows, columns)};
     const size_t pixels = (size_t)height * width, cells = (size_t)rows * columns, words = words_of(&grid.shape), line = 64 * (size_t)grid.shape.words;
@@ -618,7 +620,7 @@ EXPORT int contact_mask(const float *image, const float *offset, const float *pe
     for (int b = 0; b < frames && code != 1; b++) {
         Frame frame = {.image = image + 3 * pixels * b, .offset = offset, .per_noise = per_noise, .failed_below = failed_below};
         frame.most_far_field = most_far_field, frame.height = height, frame.width = width, frame.step = step, frame.stride = stride;
-        frame.smooth = smooth, frame.smoothed = smooth ? smoothed + 3 * pixels * b : NULL;
+        frame.smooth = smooth, frame.surface = smooth ? surface + 18 * b : NULL;
         frame.rounding = rounding, frame.threshold = sigmas * sigmas;
         frame.bands = least(rows, bands_of(height)), frame.grid = grid, frame.at = at;
         frame.raw = frame.inner = inner + pixels * b, frame.strong = mask + pixels * b; /* cells decide after pixels are closed */

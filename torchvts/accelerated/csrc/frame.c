@@ -90,10 +90,10 @@ static Window window_of(const Program *of, const uint8_t *deformed) {
     return window;
 }
 
-/* One pass over the window at hand. before: depth of the pass before, or null. */
+/* One pass over the window at hand. surface: the smooth change of the light; before: depth of the pass before, or null. */
 typedef struct {
     const Program *of;
-    const float *light, *before;
+    const float *light, *surface, *before;
     const uint8_t *deformed;
     Window at;
     float *gradient, three_noises[3];
@@ -110,18 +110,26 @@ static void rows_of_gradient(void *with, int part) {
     const int first = part * ROWS, rows = least(ROWS, at.rows - first), columns = at.columns, width = of->width;
     const int64_t plane = (int64_t)of->height * width, n = (int64_t)rows * columns, corner = (int64_t)(at.top + first) * width + at.left;
     const float *light = pass->light + corner, *before = pass->before ? pass->before + corner : NULL;
-    float *normal = malloc(sizeof(float) * 5 * (size_t)n), *gradient = normal + 3 * n, *to = pass->gradient + (int64_t)first * columns;
+    float *normal = malloc(sizeof(float) * 8 * (size_t)n), *gradient = normal + 3 * n, *to = pass->gradient + (int64_t)first * columns;
     if (!normal) {
         atomic_fetch_or(&pass->trouble, SHORT);
         return;
     }
+    int64_t per_channel = plane, per_row = width;
+    if (of->smooth) {
+        float *rest = gradient + 2 * n;
+        for (int k = 0; k < 3 * rows; k++)
+            row_over_smooth(of->smooth, pass->surface + 6 * (k / rows), at.top + first + k % rows, at.left, columns,
+                            light + plane * (k / rows) + (int64_t)width * (k % rows), rest + (int64_t)columns * k);
+        light = rest, per_channel = n, per_row = columns;
+    }
     if (of->inverse) {
-        if (normals(light, 0, plane, width, pass->three_noises, of->lit + corner, of->saturated + corner, of->inverse + corner, plane, width, 1, rows,
+        if (normals(light, 0, per_channel, per_row, pass->three_noises, of->lit + corner, of->saturated + corner, of->inverse + corner, plane, width, 1, rows,
                     columns, NULL, 0, 0, NULL, NULL, 0.0f, 0.0f, 0.0f, 0.0f, normal))
             atomic_fetch_or(&pass->trouble, BEYOND);
     } else {
         const float *weight = of->weight + (size_t)2 * of->terms * (of->degree + 1) * (at.top + first);
-        response_normals(light, 0, plane, width, of->place + at.left, weight, of->degree, of->terms, before, 0, width,
+        response_normals(light, 0, per_channel, per_row, of->place + at.left, weight, of->degree, of->terms, before, 0, width,
                          before ? of->per_mm + 9 * (at.top + first) : NULL, of->max_sine, 1, rows, columns, normal);
     }
     slopes(normal, 1, (int)n, of->per_slope, gradient);
@@ -131,8 +139,8 @@ static void rows_of_gradient(void *with, int part) {
 }
 
 /* Gradient and depth. Returns the bits of solve_frames(). */
-static int solve(const Program *of, const float *light, const uint8_t *deformed, const float *before, Window at, Work work, float *depth) {
-    Pass pass = {.of = of, .light = light, .before = before, .deformed = deformed, .at = at, .gradient = work.gradient};
+static int solve(const Program *of, const float *light, const float *surface, const uint8_t *deformed, const float *before, Window at, Work work, float *depth) {
+    Pass pass = {.of = of, .light = light, .surface = surface, .before = before, .deformed = deformed, .at = at, .gradient = work.gradient};
     for (int c = 0; c < 3 && of->inverse; c++) pass.three_noises[c] = 3.0f * of->noise[c];
     share(rows_of_gradient, &pass, (at.rows + ROWS - 1) / ROWS);
     if (pass.trouble) return pass.trouble;
@@ -144,8 +152,9 @@ static int solve_frame(const Program *of, const float *image, Work work, Output 
     int trouble = 0;
     const float *light = compensated(of, image, work.light, &trouble);
     if (trouble) return trouble;
+    float surface[18];
     const int code = contact_mask(light, of->flat, of->per_noise, of->failed_below, of->most_far_field, 1, height, width, of->step, of->stride,
-                                  of->cell, of->reach, of->sigmas, of->rounding, of->least_cells, of->bridge, of->bridge_sigmas, of->smooth, work.light,
+                                  of->cell, of->reach, of->sigmas, of->rounding, of->least_cells, of->bridge, of->bridge_sigmas, of->smooth, surface,
                                   out.deformed, work.inner);
     if (code) return code == 1 ? SHORT : BEYOND;
     Window at = window_of(of, out.deformed);
@@ -156,10 +165,10 @@ static int solve_frame(const Program *of, const float *image, Work work, Output 
     }
     float *found = of->zeroes ? work.depth : out.depth;
     for (int pass = 0; pass < of->passes && !trouble; pass++) {
-        trouble = solve(of, light, out.deformed, pass ? found : NULL, at, work, found);
+        trouble = solve(of, light, surface, out.deformed, pass ? found : NULL, at, work, found);
         if (pass || trouble || !add_faces(found, out.deformed, height, width, work.inner)) continue;
         at = window_of(of, out.deformed);
-        trouble = solve(of, light, out.deformed, NULL, at, work, found);
+        trouble = solve(of, light, surface, out.deformed, NULL, at, work, found);
     }
     if (trouble) return trouble;
     const size_t corner = (size_t)at.top * width + at.left;

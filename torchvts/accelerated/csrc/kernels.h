@@ -58,17 +58,18 @@ int begin_sharing(int threads);
 void end_sharing(int began);
 void share(PartOfWork work, void *with, int parts);
 
-/* How a smooth change of the light is found: see torchvts/core/smooth.py. place: (6, samples), the surface's terms at rows * columns samples,
+/* How a smooth change of the light is found in images of a size: see torchvts/core/smooth.py. place: (6, samples), the surface's terms at rows * columns samples,
    then zeros up to a multiple of 16; along_x (2, width), along_y (2, height): Legendre polynomials of degree 1 and 2; per_square: of each step. */
 typedef struct {
-    int32_t stride, rows, columns, samples, steps;
+    int32_t height, width, stride, rows, columns, samples, steps;
     float most;
     const float *place, *along_x, *along_y, *per_square, *peaks;
 } SmoothLight;
 
 EXPORT void grid_means(const float *image, int planes, int height, int width, int stride, int first, int rows, int columns, float *means);
-EXPORT int smooth_change(const SmoothLight *of, const float *image, int frames, int height, int width, float *found);
-EXPORT void over_smooth(const SmoothLight *of, const float *image, const float *found, int frames, int height, int width, float *result);
+EXPORT int smooth_change(const SmoothLight *of, const float *image, int frames, float *found);
+EXPORT void over_smooth(const SmoothLight *of, const float *image, const float *found, int frames, float *result);
+void row_over_smooth(const SmoothLight *of, const float *found, int y, int first, int n, const float *values, float *result);
 
 /* What frame.c calls of the other sources, which say what these do. */
 EXPORT int clean(const float *image, const float *gain, const float *offset, const float *pedestal, const int64_t *defect, const int64_t *neighbours,
@@ -77,7 +78,7 @@ EXPORT int levels(const float *image, int frames, int height, int width, int str
 EXPORT void divide_planes(const float *image, const float *level, int planes, int64_t n, float *result);
 EXPORT int contact_mask(const float *image, const float *offset, const float *per_noise, const float *failed_below, const float *most_far_field,
                         int frames, int height, int width, int step, int stride, int cell, int reach, float sigmas, float rounding,
-                        float least_cells, int bridge, float bridge_sigmas, const SmoothLight *smooth, float *smoothed, uint8_t *mask,
+                        float least_cells, int bridge, float bridge_sigmas, const SmoothLight *smooth, float *surface, uint8_t *mask,
                         uint8_t *inner);
 EXPORT void box_of(const uint8_t *mask, int frames, int height, int width, int *box);
 EXPORT void response_normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *place, const float *weight,

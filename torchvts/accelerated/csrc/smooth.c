@@ -34,8 +34,8 @@ WIDE static void surface_sums(const float *restrict change, const float *restric
 }
 
 /* Change at the samples of an image (3, height, width): (3, n), zero beyond the samples that there are. */
-static void sample_change(const SmoothLight *of, const float *image, int height, int width, float *means, float *change) {
-    const int samples = of->rows * of->columns, n = of->samples, stride = of->stride;
+static void sample_change(const SmoothLight *of, const float *image, float *means, float *change) {
+    const int height = of->height, width = of->width, samples = of->rows * of->columns, n = of->samples, stride = of->stride;
     if (stride < 3) {
         for (int c = 0, at = 0; c < 3; c++)
             for (int y = stride / 2; y < height; y += stride)
@@ -48,12 +48,12 @@ static void sample_change(const SmoothLight *of, const float *image, int height,
 }
 
 /* Coefficients of the change of images (frames, 3, height, width): (frames, 3, TERMS). Returns 1 where memory is short. */
-EXPORT int smooth_change(const SmoothLight *of, const float *image, int frames, int height, int width, float *found) {
+EXPORT int smooth_change(const SmoothLight *of, const float *image, int frames, float *found) {
     const int samples = of->rows * of->columns;
     float sum[3 * TERMS], *change = calloc(3 * ((size_t)of->samples + samples), sizeof(float)), *means = change + 3 * (size_t)of->samples;
     if (!change) return 1;
-    for (int b = 0; b < frames; b++, image += 3 * (size_t)height * width, found += 3 * TERMS) {
-        sample_change(of, image, height, width, means, change);
+    for (int b = 0; b < frames; b++, image += 3 * (size_t)of->height * of->width, found += 3 * TERMS) {
+        sample_change(of, image, means, change);
         memset(found, 0, sizeof(float) * 3 * TERMS);
         for (int step = 0; step < of->steps; step++) {
             surface_sums(change, of->place, of->samples, found, of->per_square[step], sum);
@@ -69,35 +69,41 @@ EXPORT int smooth_change(const SmoothLight *of, const float *image, int frames, 
     return 0;
 }
 
-WIDE static void divide_line(const float *values, const float *restrict along_x, int n, float c0, float c1, float c2, float *result) {
-    INDEPENDENT for (int x = 0; x < n; x++) result[x] = values[x] / (1.0f + (c0 + c1 * along_x[x] + c2 * along_x[n + x]));
+WIDE static void over_line(const float *values, const float *restrict once, const float *restrict twice, int n, float c0, float c1, float c2,
+                           float *result) {
+    INDEPENDENT for (int x = 0; x < n; x++) {
+        const float surface = c0 + c1 * once[x] + c2 * twice[x];
+        result[x] = values[x] * (1.0f - surface + surface * surface);
+    }
+}
+
+/* n values of row y of a channel, from column `first` on, without the surface of that channel's coefficients. */
+void row_over_smooth(const SmoothLight *of, const float *found, int y, int first, int n, const float *values, float *result) {
+    const float once = of->along_y[y], twice = of->along_y[of->height + y], *along = of->along_x + first;
+    over_line(values, along, along + of->width, n, found[0] + found[2] * once + found[5] * twice, found[1] + found[4] * once, found[3], result);
 }
 
 /* What over_smooth() is given. */
 typedef struct {
     const SmoothLight *of;
     const float *image, *found;
-    int height, width;
     float *result;
 } Surface;
 
 /* Parts of a plane of which threads take one at a time. */
 enum { PIECES = 2 };
 
-static void divide_lines(void *with, int part) {
+static void over_lines(void *with, int part) {
     const Surface *work = with;
-    const SmoothLight *of = work->of;
-    const int height = work->height, width = work->width, plane = part / PIECES, piece = part % PIECES;
-    const float *c = work->found + (size_t)TERMS * plane;
+    const int height = work->of->height, width = work->of->width, plane = part / PIECES, piece = part % PIECES;
     for (int y = height * piece / PIECES; y < height * (piece + 1) / PIECES; y++) {
-        const float y1 = of->along_y[y], y2 = of->along_y[height + y];
         const size_t line = ((size_t)plane * height + y) * width;
-        divide_line(work->image + line, of->along_x, width, c[0] + c[2] * y1 + c[5] * y2, c[1] + c[4] * y1, c[3], work->result + line);
+        row_over_smooth(work->of, work->found + (size_t)TERMS * plane, y, 0, width, work->image + line, work->result + line);
     }
 }
 
-/* Images (frames, 3, height, width) over 1 + the surface of their coefficients; the result may be the images themselves. */
-EXPORT void over_smooth(const SmoothLight *of, const float *image, const float *found, int frames, int height, int width, float *result) {
-    Surface work = {of, image, found, height, width, result};
-    share(divide_lines, &work, 3 * frames * PIECES);
+/* Images (frames, 3, height, width) without the surface of their coefficients. */
+EXPORT void over_smooth(const SmoothLight *of, const float *image, const float *found, int frames, float *result) {
+    Surface work = {of, image, found, result};
+    share(over_lines, &work, 3 * frames * PIECES);
 }

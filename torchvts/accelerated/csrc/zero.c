@@ -412,19 +412,21 @@ WIDE static void add_above(const float *restrict depth, float middle, size_t n, 
     for (size_t k = 0; k < n; k++) deformed[k] |= depth[k] >= middle;
 }
 
-WIDE static int any_above(const float *restrict depth, const uint8_t *restrict deformed, float middle, int n) {
+WIDE static int any_above(const float *restrict depth, const uint8_t *restrict deformed, float middle, size_t n) {
     int any = 0;
-    for (int x = 0; x < n; x++) any |= (depth[x] >= middle) & !deformed[x];
+    for (size_t k = 0; k < n; k++) any |= (depth[k] >= middle) & !deformed[k];
     return any;
 }
 
 enum { PIECES = 8 };
 
-/* Smallest and largest depth of each of so many pieces of a frame. */
+/* Smallest and largest depth of each of so many pieces of a frame; whether undeformed skin lies above the middle. */
 typedef struct {
     const float *depth;
+    const uint8_t *deformed;
     size_t pixels;
-    float low[PIECES], high[PIECES];
+    float low[PIECES], high[PIECES], middle;
+    atomic_int any;
 } Ends;
 
 static void ends_of(void *with, int k) {
@@ -433,24 +435,24 @@ static void ends_of(void *with, int k) {
     range_of(of->depth + first, of->pixels * ((size_t)k + 1) / PIECES - first, of->low + k, of->high + k);
 }
 
-/* Half of a frame's depth. */
-static float middle_of(const float *depth, size_t pixels) {
-    Ends ends = {.depth = depth, .pixels = pixels};
-    share(ends_of, &ends, PIECES);
-    float low = ends.low[0], high = ends.high[0];
-    for (int k = 1; k < PIECES; k++) low = ends.low[k] < low ? ends.low[k] : low, high = ends.high[k] > high ? ends.high[k] : high;
-    return 0.5f * (low + high);
+static void any_in_piece(void *with, int k) {
+    Ends *of = with;
+    const size_t first = of->pixels * (size_t)k / PIECES, pixels = of->pixels * ((size_t)k + 1) / PIECES - first;
+    if (!of->any && any_above(of->depth + first, of->deformed + first, of->middle, pixels)) of->any = 1;
 }
 
 /* with_faces() of background.py, in place. kind: a byte for each pixel, and two lines, and four bytes each. Returns whether there are such
    faces. */
 int add_faces(const float *depth, uint8_t *deformed, int height, int width, uint8_t *kind) {
     const size_t pixels = (size_t)height * width;
-    const float middle = middle_of(depth, pixels);
-    float sum;
-    int count, some = 0;
-    for (int y = 0; y < height && !some; y++) some = any_above(depth + (size_t)y * width, deformed + (size_t)y * width, middle, width);
-    if (!some) return 0;
+    Ends ends = {.depth = depth, .deformed = deformed, .pixels = pixels};
+    share(ends_of, &ends, PIECES);
+    float low = ends.low[0], high = ends.high[0], sum;
+    for (int k = 1; k < PIECES; k++) low = ends.low[k] < low ? ends.low[k] : low, high = ends.high[k] > high ? ends.high[k] : high;
+    const float middle = ends.middle = 0.5f * (low + high); /* half of the frame's depth */
+    share(any_in_piece, &ends, PIECES);
+    if (!ends.any) return 0;
+    int count;
     for (int y = 0; y < height; y++) not_beside(deformed, height, width, y, kind + pixels, kind + (size_t)y * width);
     for (int y = 0; y < height; y++) flat_row(depth + (size_t)y * width, kind + (size_t)y * width, middle, width, &sum, &count);
     if (!memchr(kind, RAISED, pixels) || !memchr(kind, FLAT, pixels)) return 0;

@@ -63,7 +63,8 @@ def test_compiled_kernels_and_tensors_agree_and_frames_of_a_batch_are_independen
     for k in range(3):
         assert torch.equal(pipe(frames[k : k + 1]).depth_mm[0], out.depth_mm[k])
     with reference_only():
-        assert float((pipe(frames).depth_mm - out.depth_mm).abs().max()) < 2e-5
+        # where both slopes of a shadowed pixel fit alike, rounding decides
+        assert float((pipe(frames).depth_mm - out.depth_mm).abs().max()) < 1e-3
 
 
 @pytest.mark.long

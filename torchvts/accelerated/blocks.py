@@ -11,7 +11,7 @@ from ..compensate.drift import grid_stride
 from ..core import frame as frames
 from ..core import geometry
 from ..core.checks import check_batch, check_same_size
-from ..core.noise import sample_stride, second_differences, std_from_median
+from ..core.noise import noise_from, sample_stride, second_differences
 from ..integration import background
 from ..normals.shadowed import PRIOR_STD, STEPS, LightView
 from . import kernels
@@ -111,7 +111,7 @@ class ContactMask(Twin, contact.ContactMask):
         if not arrays_usable(change):
             return super().noise(change)
         second = second_differences(change, self.samples)
-        return std_from_median(second, _median(second))
+        return noise_from(second, _median(second) / 0.6745)
 
     def quarter(self, some: Tensor) -> Tensor:
         if not arrays_usable(some):

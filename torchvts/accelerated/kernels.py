@@ -305,7 +305,7 @@ def contact_mask(
 
 
 def frame_noise(image: Tensor, stride: int) -> Tensor:
-    """Noise of each channel, (B, 3): see :func:`~torchvts.core.noise.noise_std`, whose stride this is."""
+    """Noise of each channel, (B, 3): see :func:`~torchvts.core.noise.noise_of_spotted`, whose stride this is."""
     image = image.contiguous()
     count, _, height, width = image.shape
     noise, kernel = image.new_empty(count, 3), loaded().frame_noise

@@ -25,7 +25,7 @@ from ..core.checks import (
     may_read_values,
 )
 from ..core.morphology import dilate, dilate_cross, erode, reconstruct
-from ..core.noise import clipped_std, dark_below, sample_stride
+from ..core.noise import clipped_std, dark_below, least_quarter, sample_stride
 from ..core.noise import noise_std as frame_noise_std
 from ..core.smooth import over_smooth, smooth_change
 from ..model.calibration import Calibration, check_calibration
@@ -230,8 +230,7 @@ class ContactMask(nn.Module):
 
     def quarter(self, some: Tensor) -> Tensor:
         """The value below which a quarter of (B, 3, N) lies, (B, 3, 1)."""
-        # ONNX has no kthvalue
-        return some.topk(some.shape[2] // 4 + 1, dim=2, largest=False, sorted=False).values.amax(dim=2, keepdim=True)
+        return least_quarter(some)
 
     def black(self, compensated: Tensor) -> Tensor:
         """Channels that are black in all of a frame, bool (B, 3)."""

@@ -22,7 +22,7 @@ from ..core.checks import (
     reads_freely,
 )
 from ..core.geometry import normal_from_gradient, slope_of_depth
-from ..core.noise import noise_std as frame_noise_std
+from ..core.noise import noise_of_spotted
 from ..model.calibration import Calibration, check_calibration
 from ..model.lights import PointLights, flat_image, gloss_lobe, inverse_light_matrix, normal_at_depth
 from .base import NormalModel
@@ -147,7 +147,7 @@ class NormalFromIntensity(NormalModel):
 
     def frame_noise(self, compensated: Tensor) -> Tensor:
         """Noise of the frame itself, (B, 3)."""
-        return frame_noise_std(compensated, self.samples)
+        return noise_of_spotted(compensated, self.samples)
 
     @torch.jit.export
     def solve(

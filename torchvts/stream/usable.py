@@ -72,7 +72,7 @@ class FrameCheck:
         check_batch("frame", frame, 3)
         check_same_size("frame", frame, "the background", *self.size)
         cells = self._cells(frame.float())
-        if _range(cells) < ONE_COLOUR and _range(frame[0]) < ONE_COLOUR:  # most frames are told by their cells
+        if _range(cells) < ONE_COLOUR and _range(frame[0]) < ONE_COLOUR:  # the cells of most frames suffice
             return "the frame has one colour everywhere: black, or not decoded"
         ratio = _ratio(cells, self.background)
         level = max([float(ratio[channel][lit].median()) for channel, lit in self._lit], default=1.0)

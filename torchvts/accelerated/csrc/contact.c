@@ -48,12 +48,14 @@ static float kth_smallest(const float *values, int n, int k, float *few) {
     return kth_of_few(few, found, k);
 }
 
-/* The same for k in the middle, or what is no number if one of them is none. few: n + 1 floats. */
-static float median(const float *values, int n, float *few) {
+/* The same, or what is no number if one of them is none. few: n + 1 floats. */
+static float kth_or_none(const float *values, int n, int k, float *few) {
     int numbers = 1;
-    for (int k = 0; k < n; k++) numbers &= values[k] <= FLT_MAX;
-    return numbers ? kth_smallest(values, n, (n - 1) / 2, few) : NAN;
+    for (int i = 0; i < n; i++) numbers &= values[i] <= FLT_MAX;
+    return numbers ? kth_smallest(values, n, k, few) : NAN;
 }
+
+static float median(const float *values, int n, float *few) { return kth_or_none(values, n, (n - 1) / 2, few); }
 
 enum { LANES = 16 };
 
@@ -80,9 +82,9 @@ static inline float change_of(float image, const float *offset, float per_noise,
     return (offset ? offset[at] : -per_noise) + image * per_noise;
 }
 
-/* std_from_median() of torchvts/core/noise.py, of the n second differences `some`, which have twice the memory, and one more. */
-static float noise_from(float *some, int n) {
-    float std = 1.5f * median(some, n, some + n) / 0.6745f;
+/* noise_from() of torchvts/core/noise.py, of the n second differences `some`. */
+static float noise_from(const float *some, int n, float std) {
+    std *= 1.5f;
     for (int pass = 0; pass < 2 && std == std; pass++) std = clipped_std(some, n, std);
     return std / sqrtf(1.5f);
 }
@@ -96,10 +98,10 @@ static float noise_of(const float *image, const float *offset, const float *per_
             const float left = change_of(image[i], offset, per_noise[i], i), middle = change_of(image[i + 1], offset, per_noise[i + 1], i + 1);
             some[n] = fabsf(middle - 0.5f * (left + change_of(image[i + 2], offset, per_noise[i + 2], i + 2)));
         }
-    return noise_from(some, n);
+    return noise_from(some, n, median(some, n, some + n) / 0.6745f);
 }
 
-/* noise_std() of torchvts/core/noise.py, of images (frames, 3, height, width): noise (frames, 3). Returns 1 where memory is short. */
+/* noise_of_spotted() of torchvts/core/noise.py, of images (frames, 3, height, width): noise (frames, 3). Returns 1 where memory is short. */
 EXPORT int frame_noise(const float *image, int frames, int height, int width, int stride, float *noise) {
     const size_t samples = (size_t)((height + stride - 1) / stride) * ((width + stride - 1) / stride);
     float *some = malloc(sizeof(float) * (2 * samples + 1));
@@ -111,7 +113,7 @@ EXPORT int frame_noise(const float *image, int frames, int height, int width, in
                 const float *at = image + (size_t)y * width + x;
                 some[n++] = fabsf(at[1] - 0.5f * (at[0] + at[2]));
             }
-        noise[k] = noise_from(some, n);
+        noise[k] = noise_from(some, n, kth_or_none(some, n, n / 4, some + n) / 0.3186f);
     }
     free(some);
     return 0;

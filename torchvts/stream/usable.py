@@ -53,6 +53,7 @@ class FrameCheck:
     Args:
         background: (3, H, W), image value of the unit without contact.
     Example:
+        >>> import torch
         >>> check = FrameCheck(torch.rand(3, 48, 64) * 0.2 + 0.4)
         >>> check(torch.zeros(1, 3, 48, 64))
         'the frame has one colour everywhere: black, or not decoded'

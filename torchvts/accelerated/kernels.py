@@ -56,11 +56,21 @@ SIGNATURES = {
     "alignment_sums": ("v", "p ii p l ii pp"),
     "part_sums": ("v", "p ii p l ii pp"),
     "refine_pose": ("v", "p ii p l ii pp i pp"),
+    "height_sums": ("i", "p ii p l i p ppp ii dd p"),
     "track_grids": ("i", "ppp ii f ii pp"),
+    "contact_pixels": ("i", "ppp l"),
+    "object_pixels": ("i", "p ii ddd l p"),
 }
-"""What each kernel returns and takes, a letter each: a pointer, int, float, int64 (l), or nothing (v)."""
+"""What each kernel returns and takes, a letter each: a pointer, int, float, double, int64 (l), or nothing (v)."""
 
-_TYPES: dict[str, Any] = {"p": ctypes.c_void_p, "i": ctypes.c_int, "f": ctypes.c_float, "l": ctypes.c_int64, "v": None}
+_TYPES: dict[str, Any] = {
+    "p": ctypes.c_void_p,
+    "i": ctypes.c_int,
+    "f": ctypes.c_float,
+    "d": ctypes.c_double,
+    "l": ctypes.c_int64,
+    "v": None,
+}
 
 
 @functools.cache
@@ -602,6 +612,27 @@ def refine_pose(
     return sums
 
 
+def height_sums(
+    field: Tensor, columns: Tensor, limits: npt.NDArray[Any], cells: tuple[npt.NDArray[Any], ...], most_mm: float, white_mm: float
+) -> npt.NDArray[Any]:
+    """Products (7, 7) of six twists and the residual of heights: see :mod:`torchvts.pose.height_errors`.
+
+    Args:
+        field: of the frame.
+        columns: of the keyframe's pixels.
+        limits: as of :func:`alignment_sums`.
+        cells: the cell of each pixel, int64, the number of pixels of each cell, and what its height changes by, float64.
+        most_mm: height residuals of more than this are left out.
+        white_mm: unit of the residuals of cells.
+    """
+    cell, number, lines = cells
+    left = np.empty((7, 7))
+    inputs = (field.data_ptr(), *field.shape[:2], columns.data_ptr(), columns.stride(0), columns.shape[1], limits.ctypes.data)
+    of_cells = (cell.ctypes.data, number.ctypes.data, lines.ctypes.data, len(number), lines.shape[1] - 6, most_mm, white_mm)
+    _check(loaded().height_sums(*inputs, *of_cells, left.ctypes.data))
+    return left
+
+
 def track_grids(
     depth: Tensor, slopes: Tensor, contact: Tensor, least_mm: float, times: tuple[int, int]
 ) -> tuple[Tensor, Tensor, int]:
@@ -620,3 +651,16 @@ def track_grids(
     touching = loaded().track_grids(*inputs, fine.data_ptr(), coarse.data_ptr())
     _check(touching < 0)
     return fine, coarse, int(touching)
+
+
+def contact_pixels(depth: Tensor, slopes: Tensor, contact: Tensor) -> int:
+    """How many pixels of a frame touch, -1 where depth or slopes are not finite; the tensors are those of :func:`track_grids`."""
+    return int(loaded().contact_pixels(depth.data_ptr(), slopes.data_ptr(), contact.data_ptr(), depth.numel()))
+
+
+def object_pixels(field: Tensor, x0: float, y0: float, pitch: float) -> Tensor:
+    """Columns (5, N) x, y, z, p and q of the cells of a field that lie on the object: see :mod:`torchvts.pose.follow`."""
+    height, width = field.shape[:2]
+    columns = torch.empty(5, height * width)
+    number = loaded().object_pixels(field.data_ptr(), height, width, x0, y0, pitch, height * width, columns.data_ptr())
+    return columns[:, :number]

@@ -6,6 +6,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from ..accelerated import kernels
+from ..accelerated.gate import usable
 from .alignment import SLOPE_NOISE, agrees_enough
 from .ambiguity import ALIKE_PIXELS, LEAST_INFORMATION, UNKNOWN_VARIANCE, free_directions, name_directions
 from .height_errors import height_sums
@@ -153,6 +155,8 @@ def cross(v: Array) -> Array:
 
 def _pixels(field: Field) -> Pixels:
     """The pixels of a coarse field that lie on the object, without derivatives."""
+    if usable(field.channels):
+        return Pixels(kernels.object_pixels(*field), np.zeros(3), np.ones(6))
     channels = field.channels.numpy()
     row, column = np.nonzero(channels[..., 3] > 0.999)
     columns = np.empty((5, len(row)), np.float32)
@@ -219,10 +223,12 @@ def _others(motions: Array) -> Array:
 
 def _covariance(fine: Sums, by_parts: Array, free: Array) -> Array:
     """Covariance of the scaled twist: from parts of the contact, the noise of pixels, and an error of all heights."""
-    known = np.eye(6) - free @ free.T
-    matrix = known @ fine.matrix @ known
+    beside = np.eye(6) - free @ free.T
+    matrix = beside @ fine.matrix @ beside
     matrix[5, :] = matrix[:, 5] = 0.0  # heights have a weight of their own
-    noise = np.linalg.pinv(matrix, rcond=1e-9, hermitian=True)
+    information, directions = np.linalg.eigh(matrix)
+    known = information > 1e-9 * information[-1]
+    noise = (directions[:, known] / information[known]) @ directions[:, known].T
     scaled: Array = by_parts + noise * (fine.slope_noise / fine.noise) ** 2
     scaled[5, 5] += fine.depth_noise**2 + HEIGHT_OFFSET_MM**2
     return scaled

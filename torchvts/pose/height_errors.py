@@ -12,7 +12,10 @@ import numpy.typing as npt
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from .inverse import HEIGHT_NOISE_MM, SHALLOW_MM, Array, Field, Pixels
+from ..accelerated import kernels
+from ..accelerated.gate import usable
+from .alignment import SLOPE_NOISE
+from .inverse import HEIGHT_NOISE_MM, SHALLOW_MM, Array, Field, Pixels, residual_limits
 
 ALIKE_MM, ALIKE_SLOPE = 2.5, 0.4
 """Errors of slopes at places, or slopes, so far from each other have a correlation of exp(-1/2): presses of balls on real sensors,
@@ -24,6 +27,9 @@ share of these that the mean of a cell keeps."""
 
 WHITE_MM = 0.02
 """What heights err by beside, cell by cell: it makes up for what the model of the errors has wrong."""
+
+MOST_MM = 2.0 * HEIGHT_NOISE_MM
+"""Heights of a pixel that differ by more than this do not count."""
 
 MODES = 48
 """Modes of the error of heights that are kept, the largest."""
@@ -37,8 +43,8 @@ class HeightErrors(NamedTuple):
     Attributes:
         cell: (N,), the cell of each of the keyframe's pixels.
         number: (M,), pixels of each cell.
-        lines: (M, 6 + K), what the height of a cell changes by each scaled twist and by each mode of the error, whose sizes have
-            a variance of 1; in units of :data:`WHITE_MM`.
+        lines: (M, K + 6), what the height of a cell changes by each mode of the error, whose sizes have a variance of 1, and by
+            each scaled twist; in units of :data:`WHITE_MM`.
     """
 
     cell: npt.NDArray[np.int64]
@@ -71,7 +77,7 @@ def height_errors(gradient: Tensor, skin: Tensor, mm_per_pixel: float, times: in
     covariance = 2.0 * _covariance(slope, deformed, times * mm_per_pixel)[np.ix_(chosen, chosen)]  # the keyframe's and the frame's
     size, modes = np.linalg.eigh(covariance)
     modes = modes[:, -MODES:] * np.sqrt(size[-MODES:].clip(0.0))
-    return HeightErrors(cell, number, np.hstack((by, modes)) / WHITE_MM)
+    return HeightErrors(cell, number, np.ascontiguousarray(np.hstack((modes, by)) / WHITE_MM))
 
 
 def _covariance(slope: Array, deformed: Mask, pitch: float) -> Array:
@@ -121,6 +127,10 @@ def height_sums(errors: HeightErrors, field: Field, pixels: Pixels, pose: Array)
     Source:
         Aitken, Proceedings of the Royal Society of Edinburgh 55, 1935.
     """
+    if usable(field.channels, pixels.columns):
+        limits = residual_limits(field, pose, SLOPE_NOISE)
+        left = kernels.height_sums(field.channels, pixels.columns, limits, errors, MOST_MM, WHITE_MM)
+        return left[:6, :6], left[:6, 6]
     residual, seen = _height_residuals(field, pixels, pose)
     cell = errors.cell[seen]
     count = np.bincount(cell, minlength=len(errors.number))
@@ -128,10 +138,9 @@ def height_sums(errors: HeightErrors, field: Field, pixels: Pixels, pose: Array)
     mean = np.bincount(cell, residual[seen], len(errors.number))[used] / (count[used] * WHITE_MM)
     lines = np.column_stack((errors.lines[used], mean))
     products = lines.T @ lines
-    twist = [0, 1, 2, 3, 4, 5, -1]
-    modes = products[6:-1, 6:-1] + np.eye(errors.lines.shape[1] - 6)
-    across = products[6:-1, twist]
-    left = products[np.ix_(twist, twist)] - across.T @ np.linalg.solve(modes, across)
+    modes = len(products) - 7
+    across = products[:modes, modes:]
+    left = products[modes:, modes:] - across.T @ np.linalg.solve(products[:modes, :modes] + np.eye(modes), across)
     return left[:6, :6], left[:6, 6]
 
 
@@ -149,4 +158,4 @@ def _height_residuals(field: Field, pixels: Pixels, pose: Array) -> tuple[Array,
     lower += along * (flat.take(first + width + 1, 0) - lower)
     upper += down * (lower - upper)
     residual = upper[:, 0] - expected
-    return residual, seen & (upper[:, 3] > 0.999) & (np.abs(residual) < 2.0 * HEIGHT_NOISE_MM)
+    return residual, seen & (upper[:, 3] > 0.999) & (np.abs(residual) < MOST_MM)

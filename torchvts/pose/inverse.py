@@ -121,7 +121,7 @@ def refine(
     if held is None:
         held = np.zeros((6, 0))
     if usable(field.channels, pixels.columns):
-        limits = _limits(field, pose, wide)
+        limits = residual_limits(field, pose, wide)
         settings = np.concatenate((pixels.units, pixels.center, (wide, LEAST_NOISE, LARGEST_STEP_MM, small_mm)))
         total = kernels.refine_pose(field.channels, pixels.columns, steps, settings, held, limits)
         return limits[:16].reshape(4, 4), _sums(total[:56], float(total[56]))
@@ -168,12 +168,12 @@ def moved_by(pixels: Pixels, step: Array) -> Array:
 def sum_residuals(field: Field, pixels: Pixels, pose: Array, slope_noise: float, score_only: bool = False) -> Sums:
     """Sums of one Gauss-Newton step with Cauchy's weights, and the score of the pose (4, 4), from the reference to the field."""
     by = kernels.alignment_sums if usable(field.channels, pixels.columns) else alignment_sums
-    return _sums(by(field.channels, pixels.columns, _limits(field, pose, slope_noise), score_only), slope_noise)
+    return _sums(by(field.channels, pixels.columns, residual_limits(field, pose, slope_noise), score_only), slope_noise)
 
 
 def sum_parts(field: Field, pixels: Pixels, pose: Array, slope_noise: float, parts: int) -> tuple[Sums, Array, Array]:
     """:func:`sum_residuals`, and the matrices (parts, 6, 6) and right sides (parts, 6) of as many runs of pixels."""
-    limits = _limits(field, pose, slope_noise)
+    limits = residual_limits(field, pose, slope_noise)
     if usable(field.channels, pixels.columns):
         found = kernels.part_sums(field.channels, pixels.columns, parts, limits)
     else:
@@ -184,7 +184,7 @@ def sum_parts(field: Field, pixels: Pixels, pose: Array, slope_noise: float, par
     return _sums(found.sum(0), slope_noise), products[:, :6, :6], products[:, :6, 6]
 
 
-def _limits(field: Field, pose: Array, slope_noise: float) -> Array:
+def residual_limits(field: Field, pose: Array, slope_noise: float) -> Array:
     """What the residuals depend on beside the pixels, (25,)."""
     limits = np.empty(25)
     limits[:16] = pose.ravel()

@@ -78,11 +78,19 @@ def contact_frame(frame: DepthFrame) -> Contact:
     gradient = frame.gradient.detach().to("cpu", torch.float32).reshape(1, 2, height, width).contiguous()
     contact = frame.contact.detach().to("cpu", torch.bool).reshape(1, 1, height, width).contiguous()
     skin = deformed.detach().to("cpu", torch.bool).reshape(1, 1, height, width)
-    if not math.isfinite(float(depth.sum()) + float(gradient.sum())):
+    touching = _contact_pixels(depth, gradient, contact)
+    if touching < 0:
         raise Unusable("depth or gradient is not finite")
-    if int(torch.count_nonzero(contact)) < LEAST_PIXELS:
+    if touching < LEAST_PIXELS:
         raise Unusable("no contact")
     return Contact(depth, gradient, contact, skin)
+
+
+def _contact_pixels(depth: Tensor, gradient: Tensor, contact: Tensor) -> int:
+    """How many pixels of a frame touch; -1 where depth or gradient is not finite."""
+    if usable(depth, gradient):
+        return kernels.contact_pixels(depth, gradient, contact)
+    return int(torch.count_nonzero(contact)) if math.isfinite(float(depth.sum()) + float(gradient.sum())) else -1
 
 
 def grids(frame: Contact, mm_per_pixel: float, least_mm: float, times: tuple[int, int]) -> Grids:

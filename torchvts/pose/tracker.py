@@ -3,6 +3,7 @@
 import math
 from collections import deque
 from dataclasses import dataclass
+from statistics import median
 
 import numpy as np
 import torch
@@ -195,10 +196,10 @@ class PoseTracker:
             f"{100 * found.fitness:.0f} % of the common contact agrees, which is {100 * found.overlap:.0f} % of the smaller one"
         )
         costs = [cost for _, cost in self._usual]
-        usual_cost = float(np.median(costs)) if len(costs) >= 3 else 0.0
+        usual_cost = median(costs) if len(costs) >= 3 else 0.0
         if not agrees_enough(found.fitness, found.overlap, found.cost / max(1.0, COST_RISE * usual_cost / MOST_COST)):
             return f"nothing fits near the last pose: {percent}: another part of the object, a jump, or another object"
-        usual = float(np.median([slope for slope, _ in self._usual])) if len(self._usual) >= 3 else math.inf
+        usual = median([slope for slope, _ in self._usual]) if len(self._usual) >= 3 else math.inf
         if found.fine.slope_noise > max(RISE * usual, LEAST_NOISE):
             return f"slopes differ by {found.fine.slope_noise:.3f}, where {usual:.3f} is usual: a jump, or another object"
         if found.free.shape[1] == 6:
@@ -241,7 +242,7 @@ class PoseTracker:
     def _reference_symmetries(self) -> list[Array]:
         """Motions after which the reference looks the same: continuity is lost, so each of them may have happened."""
         if self._symmetries_of_reference is None:
-            cost = float(np.median([cost for _, cost in self._usual])) if self._usual else 0.05
+            cost = median([cost for _, cost in self._usual]) if self._usual else 0.05
             found = symmetries(self.graph.keyframes[0].levels, cost)
             self._symmetries_of_reference = [T.numpy() for T in found]
         return self._symmetries_of_reference

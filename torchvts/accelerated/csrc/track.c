@@ -10,8 +10,10 @@
 #define SUMS 56  /* SIZE * SIZE products, then seven sums of the score */
 
 typedef float Lanes __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
+typedef double Sums __attribute__((vector_size(8 * LANES), aligned(8), may_alias));
+typedef float Four __attribute__((vector_size(16), aligned(4), may_alias)); /* the channels of a field */
 
-/* What the residuals depend on beside the pixels; the order is that of limits_of in inverse.py. */
+/* What the residuals depend on beside the pixels; the order is that of residual_limits in inverse.py. */
 typedef struct {
     double pose[16], x0, y0, pitch, per_slope, per_height, score_slope, score_height, deep, shallow;
 } Limits;
@@ -23,7 +25,7 @@ typedef struct {
 
 /* A block of pixels in the new frame. */
 typedef struct {
-    float place[BLOCK], along[BLOCK], down[BLOCK], z[BLOCK], found[4][BLOCK], slope[2][BLOCK], height[BLOCK];
+    float place[BLOCK], along[BLOCK], down[BLOCK], z[BLOCK], found[BLOCK][4], slope[2][BLOCK], height[BLOCK];
     float weight[BLOCK], used[BLOCK], bad[BLOCK], good[BLOCK], compared[BLOCK];
     int first[BLOCK];
 } Block;
@@ -49,11 +51,9 @@ INLINE void look_up(
     }
     for (int n = 0; n < size; n++) {
         const float *upper = field + b->first[n], *lower = upper + 4 * (size_t)width;
-        const float along = b->along[n], down = b->down[n];
-        for (int k = 0; k < 4; k++) {
-            const float u = upper[k] + along * (upper[k + 4] - upper[k]), l = lower[k] + along * (lower[k + 4] - lower[k]);
-            b->found[k][n] = u + down * (l - u);
-        }
+        const Four a = *(const Four *)upper, c = *(const Four *)lower;
+        const Four u = a + b->along[n] * (*(const Four *)(upper + 4) - a), l = c + b->along[n] * (*(const Four *)(lower + 4) - c);
+        *(Four *)b->found[n] = u + b->down[n] * (l - u);
     }
 }
 
@@ -66,11 +66,11 @@ INLINE void compare(const float *points, int64_t stride, int size, const Limits 
     const float score_slope = (float)at->score_slope, score_height = (float)at->score_height;
     const float deep = (float)at->deep, shallow = (float)at->shallow;
     for (int n = 0; n < size; n++) {
-        const float p = b->found[1][n], q = b->found[2][n], mask = b->found[3][n], z = b->z[n];
+        const float p = b->found[n][1], q = b->found[n][2], mask = b->found[n][3], z = b->z[n];
         const float up = j - h * p - i * q, steep = 1.0f / (up > 0.05f ? up : 0.05f);
         const float off_p = (a * p + d * q - f) * steep - points[3 * stride + n];
         const float off_q = (c * p + e * q - g) * steep - points[4 * stride + n];
-        const float off_z = b->found[0][n] - z, off = off_p * off_p + off_q * off_q, high = off_z * off_z;
+        const float off_z = b->found[n][0] - z, off = off_p * off_p + off_q * off_q, high = off_z * off_z;
         const int within = (b->place[n] > 0.5f) & (z > shallow), inside = within & (mask > 0.999f);
         const int counted = within & (z > deep) & ((mask > 0.999f) | (mask <= 0.001f));
         const float error = inside ? off * score_slope + high * score_height : 1.0f;
@@ -88,28 +88,34 @@ INLINE void compare(const float *points, int64_t stride, int size, const Limits 
     }
 }
 
-/* Adds the weighted products of the rows of p, q and z of the Jacobian (18, ...), and of the residuals. */
-INLINE void add_products(const float *jacobian, int64_t stride, int size, const Limits *at, const Block *b, Lanes *total) {
-    const float scales[3] = {(float)at->per_slope, (float)at->per_slope, (float)at->per_height};
-    const float *residuals[3] = {b->slope[0], b->slope[1], b->height};
-    for (int n = 0; n < size; n += LANES) {
-        const Lanes weight = *(const Lanes *)(b->weight + n);
-        for (int r = 0; r < 3; r++) {
-            Lanes line[SIZE];
-            for (int k = 0; k < SIZE - 1; k++) line[k] = *(const Lanes *)(jacobian + (6 * r + k) * stride + n);
-            line[SIZE - 1] = *(const Lanes *)(residuals[r] + n);
-            for (int k = 0, pair = 0; k < SIZE; k++) {
-                const Lanes scaled = weight * scales[r] * line[k];
-                for (int m = k; m < SIZE; m++) total[pair++] += scaled * line[m];
-            }
-        }
-    }
+INLINE double sum_of(const Sums *lanes) {
+    double sum = 0.0;
+    for (int k = 0; k < LANES; k++) sum += (*lanes)[k];
+    return sum;
 }
 
-INLINE double sum_of(const Lanes *lanes) {
-    double sum = 0.0;
-    for (int k = 0; k < LANES; k++) sum += (double)(*lanes)[k];
-    return sum;
+/* Adds the weighted products of the rows of p, q and z of the Jacobian (18, ...), and of the residuals. */
+INLINE void add_products(const float *jacobian, int64_t stride, int size, const Limits *at, const Block *b, Sums *products) {
+    const float scales[3] = {(float)at->per_slope, (float)at->per_slope, (float)at->per_height};
+    const float *residuals[3] = {b->slope[0], b->slope[1], b->height};
+    UNROLLED
+    for (int k = 0; k < SIZE; k++) { /* at most seven sums at a time, which fit into registers */
+        Lanes total[SIZE];
+        memset(total, 0, sizeof(total));
+        for (int n = 0; n < size; n += LANES) {
+            UNROLLED
+            for (int r = 0; r < 3; r++) {
+                const float *lines[SIZE] = {[SIZE - 1] = residuals[r]};
+                UNROLLED
+                for (int m = 0; m < SIZE - 1; m++) lines[m] = jacobian + (6 * r + m) * stride;
+                const Lanes scaled = *(const Lanes *)(b->weight + n) * scales[r] * *(const Lanes *)(lines[k] + n);
+                UNROLLED
+                for (int m = k; m < SIZE; m++) total[m] += scaled * *(const Lanes *)(lines[m] + n);
+            }
+        }
+        UNROLLED
+        for (int m = k; m < SIZE; m++) *products++ += __builtin_convertvector(total[m], Sums);
+    }
 }
 
 /* Sums over `count` pixels: columns (23, stride) x, y, z, p, q and the 18 of the Jacobian, which score_only does not read. */
@@ -118,7 +124,8 @@ EXPORT WIDE void alignment_sums(
     double *sums) {
     Block b;
     float tail[18 * BLOCK];
-    double products[PAIRS] = {0.0}, score[7] = {0.0};
+    Sums products[PAIRS], score[7];
+    memset(products, 0, sizeof(products)), memset(score, 0, sizeof(score));
     for (int start = 0; start < count; start += BLOCK) {
         const int size = least(BLOCK, count - start);
         const float *points = columns + start, *jacobian = points + 5 * stride;
@@ -134,7 +141,7 @@ EXPORT WIDE void alignment_sums(
             parts[4] += *(const Lanes *)(b.bad + n), parts[5] += *(const Lanes *)(b.good + n);
             parts[6] += *(const Lanes *)(b.compared + n);
         }
-        for (int k = 0; k < 7; k++) score[k] += sum_of(parts + k);
+        for (int k = 0; k < 7; k++) score[k] += __builtin_convertvector(parts[k], Sums);
         if (score_only) continue;
         int64_t step = stride;
         if (size % LANES) { /* lanes beyond the last pixel hold zeros */
@@ -142,14 +149,11 @@ EXPORT WIDE void alignment_sums(
             for (int k = 0; k < 18; k++) memcpy(tail + BLOCK * k, jacobian + k * stride, (size_t)size * sizeof(float));
             jacobian = tail, step = BLOCK;
         }
-        Lanes total[PAIRS];
-        memset(total, 0, sizeof(total));
-        add_products(jacobian, step, size, at, &b, total);
-        for (int k = 0; k < PAIRS; k++) products[k] += sum_of(total + k);
+        add_products(jacobian, step, size, at, &b, products);
     }
     for (int k = 0, pair = 0; k < SIZE; k++)
-        for (int m = k; m < SIZE; m++, pair++) sums[SIZE * k + m] = sums[SIZE * m + k] = products[pair];
-    for (int k = 0; k < 7; k++) sums[SIZE * SIZE + k] = score[k];
+        for (int m = k; m < SIZE; m++, pair++) sums[SIZE * k + m] = sums[SIZE * m + k] = sum_of(products + pair);
+    for (int k = 0; k < 7; k++) sums[SIZE * SIZE + k] = sum_of(score + k);
 }
 
 /* alignment_sums of each of `parts` runs of pixels, of the same number but for one: sums (parts, SUMS). */
@@ -256,4 +260,68 @@ EXPORT void refine_pose(
         noise = noise > by->least_noise ? noise : by->least_noise;
         if (largest < by->small_mm) break;
     }
+}
+
+/* Sums of the heights of the frame minus those of the pixels, by cells, and how many they are. */
+static WIDE void cell_residuals(
+    const float *field, int height, int width, const float *columns, int64_t stride, int count, const Limits *at, const int64_t *cell,
+    float most_mm, double *sum, double *seen) {
+    Block b;
+    const float shallow = (float)at->shallow;
+    for (int start = 0; start < count; start += BLOCK) {
+        const int size = least(BLOCK, count - start);
+        look_up(field, height, width, columns + start, stride, size, at, &b);
+        for (int n = 0; n < size; n++) {
+            const float off = b.found[n][0] - b.z[n];
+            const int held = (b.place[n] > 0.5f) & (b.z[n] > shallow) & (b.found[n][3] > 0.999f) & (fabsf(off) < most_mm);
+            if (held) sum[cell[start + n]] += (double)off, seen[cell[start + n]] += 1.0;
+        }
+    }
+}
+
+/* Adds the products of four lines (4, size) to the upper triangle of A (size, size). */
+static WIDE void add_lines(const double *lines, int size, double *restrict A) {
+    const double *a = lines, *b = a + size, *c = b + size, *d = c + size;
+    for (int i = 0; i < size; i++)
+        for (int k = i; k < size; k++) A[i * size + k] += a[i] * a[k] + b[i] * b[k] + c[i] * c[k] + d[i] * d[k];
+}
+
+/* Eliminates the first `gone` unknowns of the symmetric A (size, size), by its upper triangle. */
+static WIDE void eliminate(double *A, int size, int gone) {
+    for (int m = 0; m < gone; m++) {
+        const double *line = A + m * size, per = 1.0 / line[m];
+        for (int i = m + 1; i < size; i++) {
+            double *restrict to = A + i * size;
+            const double factor = line[i] * per;
+            for (int k = i; k < size; k++) to[k] -= factor * line[k];
+        }
+    }
+}
+
+/* height_sums of torchvts/pose/height_errors.py: lines (cells, modes + 6), number (cells) of pixels; left (7, 7), products of the six
+   twists and the residual where the modes are fitted beside. Returns 1 without memory. */
+EXPORT int height_sums(
+    const float *field, int height, int width, const float *columns, int64_t stride, int count, const Limits *at, const int64_t *cell,
+    const double *number, const double *lines, int cells, int modes, double most_mm, double white_mm, double *left) {
+    const int size = modes + SIZE;
+    double *A = calloc((size_t)(size * size + 4 * size + 2 * cells), sizeof(double));
+    if (A == NULL) return 1;
+    double *some = A + size * size, *sum = some + 4 * size, *seen = sum + cells;
+    cell_residuals(field, height, width, columns, stride, count, at, cell, (float)most_mm, sum, seen);
+    int taken = 0;
+    for (int n = 0; n < cells; n++) {
+        if (seen[n] < 0.5 * number[n]) continue;
+        double *line = some + taken++ % 4 * size;
+        memcpy(line, lines + (int64_t)n * (size - 1), (size_t)(size - 1) * sizeof(double));
+        line[size - 1] = sum[n] / (seen[n] * white_mm);
+        if (taken % 4 == 0) add_lines(some, size, A);
+    }
+    memset(some + taken % 4 * size, 0, (size_t)((4 - taken % 4) * size) * sizeof(double));
+    add_lines(some, size, A);
+    for (int k = 0; k < modes; k++) A[k * size + k] += 1.0;
+    eliminate(A, size, modes);
+    for (int k = 0; k < SIZE; k++)
+        for (int m = k; m < SIZE; m++) left[SIZE * k + m] = left[SIZE * m + k] = A[(modes + k) * size + modes + m];
+    free(A);
+    return 0;
 }

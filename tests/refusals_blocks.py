@@ -140,7 +140,11 @@ TABLE = {
     "ContactSettings": Entry(
         {"sigmas": 4.5, "min_size_px": 8.0, "share": 0.8}, {"sigmas": NUMBER, "min_size_px": NUMBER, "share": NUMBER}
     ),
-    "ContactMask.forward": forward(lambda: pipe().deformed, 3, "compensated"),
+    "ContactMask.forward": Entry(
+        {"compensated": FLAT[None], "image": FLAT[None]},
+        {"compensated": batches(3), "image": [FLAT, FLAT[None, ..., 1:], FLAT.expand(2, -1, -1, -1), FLAT[None].numpy()]},
+        lambda: pipe().deformed,
+    ),
     "ContactMask.shadowed": Entry(
         {"compensated": FLAT[None], "noise_std": NOISE},
         {"compensated": batches(3), "noise_std": BAD_NOISE},

@@ -11,7 +11,7 @@ from ..compensate.drift import grid_stride
 from ..core import frame as frames
 from ..core import geometry
 from ..core.checks import check_batch, check_same_size
-from ..core.noise import noise_from, sample_stride, second_differences
+from ..core.noise import sample_stride
 from ..integration import background
 from ..normals.shadowed import PRIOR_STD, STEPS, LightView
 from . import kernels
@@ -93,25 +93,27 @@ class ContactMask(Twin, contact.ContactMask):
 
     plain = contact.ContactMask
 
-    def find(self, compensated: Tensor) -> tuple[Tensor, Tensor]:
-        if not usable(compensated, self.offset):
-            return super().find(compensated)
+    def divided(self, compensated: Tensor) -> Tensor:
+        if not self.smooth_light or not usable(compensated):
+            return super().divided(compensated)
+        return kernels.without_smooth_change(compensated)
+
+    def find(self, compensated: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
+        if not usable(compensated, image, self.offset):
+            return super().find(compensated, image)
         bridge = self.bridge_cells if self.bridges else 0
         grid = kernels.ContactGrid(
             self.step, self.stride, self.cell, self.reach, self.sigmas, self.rounding, self.least_cells, bridge, self.bridge_sigmas
         )
         offset = None if flat_is_one(self) else self.offset
-        limits, smooth = (self.failed_below, self.most_far_field), self.smooth_light
+        limits = (self.failed_below, self.most_far_field)
         try:
-            return kernels.contact_mask(compensated, offset, self.per_noise, limits, grid, smooth)
+            return kernels.contact_mask(compensated, image, offset, self.per_noise, limits, grid)
         except kernels.NotFinite:
-            return super().find(compensated)
+            return super().find(compensated, image)
 
-    def noise(self, change: Tensor) -> Tensor:
-        if not arrays_usable(change):
-            return super().noise(change)
-        second = second_differences(change, self.samples)
-        return noise_from(second, _median(second) / 0.6745)
+    def median(self, values: Tensor) -> Tensor:
+        return _median(values) if arrays_usable(values) else super().median(values)
 
     def quarter(self, some: Tensor) -> Tensor:
         if not arrays_usable(some):

@@ -256,8 +256,6 @@ def _all_own(parts: Blocks) -> bool:
         return False
     if type(parts.normals) is NormalFromIntensity and (parts.passes > 1 or parts.normals.lights.glossy):
         return False
-    if (type(parts.smooth) is SmoothDrift) != parts.deformed.smooth_light:  # one surface serves both
-        return False
     inner = compensate._modules
     if len(inner["linear"]) or compensate.saturates or not all(_own(block, (FillDefects, Blur)) for block in inner["clean"]):
         return False
@@ -354,7 +352,7 @@ def _prepare(parts: Blocks, buffers: dict[str, Tensor], settings: dict[str, Any]
     found = pedestals(compensate.gain) if "gain" in tensors and "offset" in tensors else None
     if found is not None:
         del tensors["offset"]
-    smooth = kernels.smooth_tables(height, width) if mask.smooth_light else None
+    smooth = kernels.smooth_tables(height, width) if type(parts.smooth) is SmoothDrift else None
     weights = (REAL * len(settings["weights"]))(*settings["weights"])
     pointers = {name: tensor.data_ptr() for name, tensor in tensors.items() if name in _POINTERS}
     program = Program(

@@ -29,7 +29,7 @@ NO_PEDESTAL = (ctypes.c_float * 3)()
 
 
 SIGNATURES = {
-    "contact_mask": ("i", "ppppp iiiiiii fff i f pp pp"),
+    "contact_mask": ("i", "pppppp iiiiiii fff i f pp pp"),
     "normals": ("i", "p lll pppp l iiii p ll pp ffff p"),
     "solve_shadowed": ("v", "p lll pppp l iiii p ll pppppp"),
     "frame_noise": ("i", "p iiii p"),
@@ -281,33 +281,32 @@ def divided(image: Tensor, level: Tensor) -> Tensor:
 
 def contact_mask(
     compensated: Tensor,
+    image: Tensor,
     offset: Tensor | None,
     per_noise: Tensor,
     limits: tuple[Tensor, Tensor],
     grid: ContactGrid,
-    smooth_light: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Deformed area and its interior, bool (B, 1, H, W): see :class:`~torchvts.contact.ContactMask`, whose attributes these are.
 
-    ``offset``: None where it is ``-per_noise``, as the undeformed skin is 1. ``limits``: ``failed_below`` and ``most_far_field``.
+    ``image``: where pixels stand out; ``compensated``: what the noise is of. ``offset``: None where it is ``-per_noise``, as the
+    undeformed skin is 1. ``limits``: ``failed_below`` and ``most_far_field``.
     """
-    compensated, per_noise = compensated.contiguous(), per_noise.contiguous()
+    compensated, image, per_noise = compensated.contiguous(), image.contiguous(), per_noise.contiguous()
     offset = None if offset is None else offset.contiguous()
     offsets = None if offset is None else offset.data_ptr()
     count, _, height, width = compensated.shape
     mask = compensated.new_empty(count, 1, height, width, dtype=torch.bool)
     interior = torch.empty_like(mask)
     fields = (offsets, per_noise.data_ptr(), limits[0].data_ptr(), limits[1].data_ptr())
-    tables = smooth_tables(height, width) if smooth_light else None
-    of, surface = None if tables is None else ctypes.byref(tables.structure), compensated.new_empty(count, 18)
     kernel = loaded().contact_mask
     _check(
         by_frames(
             count,
             height * width,
             lambda first, many: kernel(
-                *(_at(compensated, first), *fields, many, height, width, *grid),
-                *(of, _at(surface, first), _at(mask, first), _at(interior, first)),
+                *(_at(compensated, first), _at(image, first), *fields, many, height, width, *grid),
+                *(None, None, _at(mask, first), _at(interior, first)),
             ),
         )
     )

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from ..core.checks import check_field, may_read
 from ..core.robust import half_sample_mode
-from ..core.smooth import grid_samples, over_smooth, smooth_change
+from ..core.smooth import grid_samples, without_smooth_change
 
 LEAST_DRIFT, MOST_DRIFT = 0.01, 0.15
 """Drift, relative, above the error of the mode itself, and the largest that is believed."""
@@ -146,7 +146,7 @@ class SmoothDrift(nn.Module):
     """
 
     def forward(self, ratio: Tensor) -> Tensor:
-        return over_smooth(ratio, smooth_change(ratio))
+        return without_smooth_change(ratio)
 
 
 def grid_stride(image: Tensor) -> int:

@@ -19,15 +19,24 @@ from ..core.checks import (
     check_noise,
     check_positive,
     check_record,
+    check_same_count,
     check_same_size,
     check_switch,
     may_read,
     may_read_values,
 )
 from ..core.morphology import dilate, dilate_cross, erode, reconstruct
-from ..core.noise import clipped_std, dark_below, least_quarter, sample_stride
-from ..core.noise import noise_std as frame_noise_std
-from ..core.smooth import over_smooth, smooth_change
+from ..core.noise import (
+    clipped_std,
+    dark_below,
+    least_quarter,
+    noise_from,
+    sample_stride,
+    second_differences_of_rows,
+    std_of_median,
+    std_of_quarter,
+)
+from ..core.smooth import without_smooth_change
 from ..model.calibration import Calibration, check_calibration
 from .settings import ContactSettings
 
@@ -67,8 +76,9 @@ class ContactMask(nn.Module):
     cell also if its mean change is, in units of the frame's own spread of cell means (faint contact). The noise of a channel is
     the largest of the calibrated one, the frame's own, and the frame's spread of change far from the contact. Holes are filled;
     components smaller than a disc of ``min_size_px`` are removed. A channel that is black in all of the frame (below 5 % of its
-    background) has lost its LED: the other two decide. With ``smooth_light`` a smooth change of the light is divided out first;
-    the noise is the frame's before that, since what a press makes of undeformed skin is smooth only roughly.
+    background) has lost its LED: the other two decide. With ``smooth_light`` a smooth change of the light is divided out first,
+    unless the caller has done so; the noise is the frame's before that, since what a press makes of undeformed skin is smooth
+    only roughly.
 
     Args:
         flat: (3, H, W), the compensated image of the undeformed skin.
@@ -152,19 +162,27 @@ class ContactMask(nn.Module):
 
     if TYPE_CHECKING:
 
-        def __call__(self, compensated: Tensor) -> Tensor: ...
+        def __call__(self, compensated: Tensor, image: Tensor | None = None) -> Tensor: ...
 
-    def forward(self, compensated: Tensor) -> Tensor:
-        """Where the skin has moved in compensated images (B, 3, H, W), bool (B, 1, H, W)."""
-        self._check(compensated)
-        return self.find(compensated.detach())[0]
+    def forward(self, compensated: Tensor, image: Tensor | None = None) -> Tensor:
+        """Where the skin has moved in compensated images (B, 3, H, W), bool (B, 1, H, W).
+
+        ``image``: the same without their smooth change of the light, where that is known; None to find it here.
+        """
+        self._check("compensated", compensated)
+        if image is not None:
+            self._check("image", image)
+            check_same_count("image", image, "compensated", compensated.shape[0])
+        image = self.divided(compensated) if image is None else image
+        return self.find(compensated.detach(), image.detach())[0]
 
     @torch.jit.export
     def soft(self, compensated: Tensor) -> Tensor:
         """The same as a number in (0, 1), (B, 1, H, W), differentiable in the image: one half at the hard rim."""
-        self._check(compensated)
-        hard, interior = self.find(compensated.detach())
-        found = self.change(compensated)
+        self._check("compensated", compensated)
+        image = self.divided(compensated)
+        hard, interior = self.find(compensated.detach(), image.detach())
+        found = self.change(compensated, image)
         length = self.sigmas * torch.sqrt(found.squared / found.threshold + 1e-12)
         near = dilate(dilate(hard)).to(length.dtype)
         return near * torch.maximum(torch.sigmoid(length - self.sigmas), interior.to(length.dtype))
@@ -176,8 +194,8 @@ class ContactMask(nn.Module):
         The skin may be undeformed there, in a shadow of the object; or it has the one slope that looks the same. ``noise_std``:
         (B, 3), noise of each frame; None for the calibrated one.
         """
-        self._check(compensated)
-        found = self.change(compensated.detach())
+        self._check("compensated", compensated)
+        found = self.change(compensated.detach(), self.divided(compensated.detach()))
         three_noises = self.dark_noises / self.per_noise[None]
         if noise_std is not None:
             check_noise("noise_std", noise_std, compensated.shape[0])
@@ -187,22 +205,27 @@ class ContactMask(nn.Module):
         lit = found.change.masked_fill(dark, 0.0).square().sum(dim=1, keepdim=True) <= found.threshold
         return lit & (dark.to(torch.uint8).sum(dim=1, keepdim=True) == 1)
 
-    def _check(self, compensated: Tensor) -> None:
-        check_batch("compensated", compensated, 3)
-        check_same_size("compensated", compensated, "the calibration", self.flat.shape[1], self.flat.shape[2])
+    def _check(self, name: str, image: Tensor) -> None:
+        check_batch(name, image, 3)
+        check_same_size(name, image, "the calibration", self.flat.shape[1], self.flat.shape[2])
 
-    def find(self, compensated: Tensor) -> tuple[Tensor, Tensor]:
+    def divided(self, compensated: Tensor) -> Tensor:
+        """Compensated images without a smooth change of the light; themselves where none is looked for."""
+        return without_smooth_change(compensated) if self.smooth_light else compensated
+
+    def find(self, compensated: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
         """The deformed area, and its interior, where cells decide and not pixels; compiled kernels replace this method."""
-        found = self.change(compensated)
+        found = self.change(compensated, image)
         return self.clean(found.change, found.squared > found.threshold)
 
-    def change(self, compensated: Tensor) -> Change:
-        """The change of a compensated image, in units of the calibrated noise."""
-        change = torch.addcmul(self.offset, compensated, self.per_noise)
-        noise = torch.maximum(self.noise(change.detach()), self.far_field(change.detach())).clamp_min(1.0)
+    def change(self, compensated: Tensor, image: Tensor) -> Change:
+        """The change of an image, in units of the calibrated noise; ``compensated`` is the same before it was :meth:`divided`."""
+        change = torch.addcmul(self.offset, image, self.per_noise)
+        first, stride = self.stride // 2, self.stride
+        offset, per_noise = self.offset[:, first::stride], self.per_noise[:, first::stride]
+        rows = torch.addcmul(offset, compensated.detach()[:, :, first::stride], per_noise)
+        noise = torch.maximum(self.noise(rows), self.far_field(rows)).clamp_min(1.0)
         failed = self.black(compensated)
-        if self.smooth_light:
-            change = torch.addcmul(self.offset, over_smooth(compensated, smooth_change(compensated)), self.per_noise)
         if not may_read(failed) or bool(failed.any()):
             failed = failed & (failed.to(torch.uint8).sum(dim=1, keepdim=True) == 1)
             change = change * (~failed)[:, :, None, None].to(change.dtype)
@@ -212,21 +235,25 @@ class ContactMask(nn.Module):
         squared = torch.addcmul(torch.addcmul(r * r, g, g), b, b)
         return Change(change, squared, self.sigmas**2)
 
-    def noise(self, change: Tensor) -> Tensor:
-        """Noise of the frame itself, (B, 3)."""
-        return frame_noise_std(change, self.samples)
+    def noise(self, rows: Tensor) -> Tensor:
+        """Noise of the frame itself, (B, 3), from every ``stride``-th row of its change."""
+        second = second_differences_of_rows(rows, self.stride)
+        return noise_from(second, std_of_median(self.median(second)))
 
-    def far_field(self, change: Tensor) -> Tensor:
+    def far_field(self, rows: Tensor) -> Tensor:
         """Spread of the change of undeformed skin, (B, 3), which a press changes everywhere on a real sensor.
 
         From the least changed quarter of all pixels, then from all within three standard deviations: an object may press on
         about two thirds of the skin before it counts. What exceeds ``most_far_field`` is the object, and the more it does, the
         less of it is believed.
         """
-        half = self.stride // 2
-        some = change[:, :, half :: self.stride, half :: self.stride].abs().flatten(2)
-        spread = clipped_std(some, self.quarter(some) / 0.3186)[:, :, 0]
+        some = rows[..., self.stride // 2 :: self.stride].abs().flatten(2)
+        spread = clipped_std(some, std_of_quarter(self.quarter(some)))[:, :, 0]
         return torch.minimum(spread, self.most_far_field.square() / spread.clamp_min(1e-9))
+
+    def median(self, values: Tensor) -> Tensor:
+        """The median of (B, 3, N), the lower one of two, (B, 3, 1)."""
+        return values.median(dim=2, keepdim=True).values
 
     def quarter(self, some: Tensor) -> Tensor:
         """The value below which a quarter of (B, 3, N) lies, (B, 3, 1)."""
@@ -271,8 +298,8 @@ class ContactMask(nn.Module):
         """Cells whose mean change stands out of the spread of all cells by 5 sigmas, bool."""
         rows, columns = mean.shape[2], mean.shape[3]
         step = max(1, min(max(rows, columns) // 40, rows, columns))  # a median of some thousand cells is as good
-        spread = mean[:, :, step // 2 :: step, step // 2 :: step].abs().flatten(2).median(dim=2).values / 0.6745
-        return (mean / spread.clamp_min(1.0 / self.cell)[..., None, None]).square().sum(1, keepdim=True) > 25.0
+        spread = std_of_median(self.median(mean[:, :, step // 2 :: step, step // 2 :: step].abs().flatten(2)))
+        return (mean / spread.clamp_min(1.0 / self.cell)[..., None]).square().sum(1, keepdim=True) > 25.0
 
     def filled(self, mask: Tensor) -> Tensor:
         """The mask without its holes: background that the border does not reach."""

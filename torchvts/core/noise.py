@@ -26,13 +26,23 @@ def noise_std(image: Tensor, samples: int = 8000) -> Tensor:
         True
     """
     second = second_differences(image, samples)
-    return noise_from(second, second.median(dim=-1, keepdim=True).values / 0.6745)
+    return noise_from(second, std_of_median(second.median(dim=-1, keepdim=True).values))
 
 
 def noise_of_spotted(image: Tensor, samples: int = 8000) -> Tensor:
     """The same from the quarter of the pixels that differ least: three quarters may be spots, dead pixels or edges."""
     second = second_differences(image, samples)
-    return noise_from(second, least_quarter(second) / 0.3186)
+    return noise_from(second, std_of_quarter(least_quarter(second)))
+
+
+def std_of_median(median: Tensor) -> Tensor:
+    """Standard deviation of Gaussian noise from the median of its absolute values."""
+    return median / 0.6745
+
+
+def std_of_quarter(quarter: Tensor) -> Tensor:
+    """The same from what :func:`least_quarter` gives of them."""
+    return quarter / 0.3186
 
 
 def least_quarter(values: Tensor) -> Tensor:
@@ -49,7 +59,11 @@ def sample_stride(height: int, width: int, samples: int) -> int:
 def second_differences(image: Tensor, samples: int) -> Tensor:
     """Absolute second differences along rows at no more than ``samples`` evenly chosen pixels, (B, C, N)."""
     stride = sample_stride(image.shape[2], image.shape[3], samples)
-    rows = image[:, :, stride // 2 :: stride]
+    return second_differences_of_rows(image[:, :, stride // 2 :: stride], stride)
+
+
+def second_differences_of_rows(rows: Tensor, stride: int) -> Tensor:
+    """The same of all rows (B, C, h, W) that are given, at every ``stride``-th pixel."""
     left, middle, right = rows[..., :-2:stride], rows[..., 1:-1:stride], rows[..., 2::stride]
     return (middle - 0.5 * (left + right)).abs().flatten(2)
 

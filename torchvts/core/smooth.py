@@ -45,6 +45,11 @@ def smooth_change(ratio: Tensor, samples: int = SAMPLES, steps: int = STEPS, mos
     return found * (most / largest.clamp_min(most))
 
 
+def without_smooth_change(ratio: Tensor) -> Tensor:
+    """Images / background (B, 3, H, W) over their smooth change of light."""
+    return over_smooth(ratio, smooth_change(ratio))
+
+
 def over_smooth(ratio: Tensor, coefficients: Tensor) -> Tensor:
     """Images (B, 3, H, W) over 1 + the surface of coefficients (B, 3, 6), to second order: at 5 % off by 0.01 %."""
     x, y = legendre(ratio.shape[3], 1).to(ratio), legendre(ratio.shape[2], 1)[:, :, None].to(ratio)

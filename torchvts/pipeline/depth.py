@@ -317,7 +317,10 @@ class DepthPipeline(nn.Module):
     def depth_of(self, images: Tensor) -> DepthOutput:
         """The output of checked images (B, 3, H, W), all solved in the one window that holds the deformed skin of all."""
         compensated = self.compensate(images)
-        frame = self.crop(self.smooth(compensated), self.deformed(compensated))
+        image = self.smooth(compensated)
+        # a ContactMask gets both, so that the smooth change of the light is found once; any other mask the first alone
+        deformed = self.deformed(compensated, image) if hasattr(self.deformed, "smooth_light") else self.deformed(compensated)
+        frame = self.crop(image, deformed)
         if may_read_values() and (images.shape[0] == 0 or (self.skips_undeformed and self.nothing_to_solve(frame))):
             return undeformed_output(frame)
         frame = with_noise(frame, self.noise_of(compensated))

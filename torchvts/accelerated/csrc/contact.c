@@ -275,7 +275,7 @@ typedef struct {
 
 /* A frame's images and what is found in it. scale: of each channel's change; raw: strong pixels, before they are closed. */
 typedef struct {
-    const float *image, *offset, *per_noise, *failed_below, *most_far_field;
+    const float *image, *divided, *offset, *per_noise, *failed_below, *most_far_field;
     const SmoothLight *smooth;
     float *surface;
     int height, width, step, stride;
@@ -349,7 +349,7 @@ static void find_strong(void *with, int band) {
             const size_t row = (size_t)y * width;
             memset(squared, 0, sizeof(float) * (size_t)width);
             for (int c = 0; c < 3; c++) {
-                const float *values = of->image + pixels * c + row, *offset = of->offset ? of->offset + pixels * c + row : NULL;
+                const float *values = of->divided + pixels * c + row, *offset = of->offset ? of->offset + pixels * c + row : NULL;
                 if (of->scale[c] == 0.0f) continue;
                 if (of->smooth) row_over_smooth(of->smooth, of->surface + 6 * c, y, 0, width, values, line);
                 add_change(of->smooth ? line : values, offset, of->per_noise + pixels * c + row, of->scale[c], width, sums + (size_t)c * width, squared);
@@ -601,11 +601,12 @@ static int mask_frame(Frame *of) {
 
 /*
  * image (frames, 3, height, width), with offset and per_noise (3, height, width): change = image * per_noise + offset; offset
- * null where it is -per_noise. smooth: null where no smooth change of the light is divided out, else surface (frames, 3, 6) takes its
- * coefficients. Writes mask and inner, bytes (frames, height, width); inner is where cells decide, not pixels.
+ * null where it is -per_noise. divided: image, or image without a smooth change of the light, which has no part in the noise. smooth:
+ * null, or how to divide one out here; surface (frames, 3, 6) then takes its coefficients. Writes mask and inner, bytes (frames,
+ * height, width); inner is where cells decide, not pixels.
  * Returns 0, 1 where memory is short, or 2 where a value is not finite or its square would not be, and the masks mean nothing.
  */
-EXPORT int contact_mask(const float *image, const float *offset, const float *per_noise, const float *failed_below,
+EXPORT int contact_mask(const float *image, const float *divided, const float *offset, const float *per_noise, const float *failed_below,
                         const float *most_far_field, int frames, int height, int width, int step, int stride, int cell, int reach,
                         float sigmas, float rounding, float least_cells, int bridge, float bridge_sigmas, const SmoothLight *smooth,
                         float *surface, uint8_t *mask, uint8_t *inner) {
@@ -620,7 +621,7 @@ EXPORT int contact_mask(const float *image, const float *offset, const float *pe
     at.down = at.sums + line, at.line = (uint8_t *)(at.down + line + 2 * reach), at.other_line = at.line + line;
     int code = 0;
     for (int b = 0; b < frames && code != 1; b++) {
-        Frame frame = {.image = image + 3 * pixels * b, .offset = offset, .per_noise = per_noise, .failed_below = failed_below};
+        Frame frame = {.image = image + 3 * pixels * b, .divided = divided + 3 * pixels * b, .offset = offset, .per_noise = per_noise, .failed_below = failed_below};
         frame.most_far_field = most_far_field, frame.height = height, frame.width = width, frame.step = step, frame.stride = stride;
         frame.smooth = smooth, frame.surface = smooth ? surface + 18 * b : NULL;
         frame.rounding = rounding, frame.threshold = sigmas * sigmas;

@@ -153,7 +153,7 @@ static int solve_frame(const Program *of, const float *image, Work work, Output 
     const float *light = compensated(of, image, work.light, &trouble);
     if (trouble) return trouble;
     float surface[18];
-    const int code = contact_mask(light, of->flat, of->per_noise, of->failed_below, of->most_far_field, 1, height, width, of->step, of->stride,
+    const int code = contact_mask(light, light, of->flat, of->per_noise, of->failed_below, of->most_far_field, 1, height, width, of->step, of->stride,
                                   of->cell, of->reach, of->sigmas, of->rounding, of->least_cells, of->bridge, of->bridge_sigmas, of->smooth, surface,
                                   out.deformed, work.inner);
     if (code) return code == 1 ? SHORT : BEYOND;

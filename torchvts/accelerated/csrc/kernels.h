@@ -76,8 +76,8 @@ EXPORT int clean(const float *image, const float *gain, const float *offset, con
                  int64_t defects, const float *weight, int taps, int frames, int height, int width, float *light);
 EXPORT int levels(const float *image, int frames, int height, int width, int stride, int halvings, float least_drift, float most, float *level);
 EXPORT void divide_planes(const float *image, const float *level, int planes, int64_t n, float *result);
-EXPORT int contact_mask(const float *image, const float *offset, const float *per_noise, const float *failed_below, const float *most_far_field,
-                        int frames, int height, int width, int step, int stride, int cell, int reach, float sigmas, float rounding,
+EXPORT int contact_mask(const float *image, const float *divided, const float *offset, const float *per_noise, const float *failed_below,
+                        const float *most_far_field, int frames, int height, int width, int step, int stride, int cell, int reach, float sigmas, float rounding,
                         float least_cells, int bridge, float bridge_sigmas, const SmoothLight *smooth, float *surface, uint8_t *mask,
                         uint8_t *inner);
 EXPORT void box_of(const uint8_t *mask, int frames, int height, int width, int *box);

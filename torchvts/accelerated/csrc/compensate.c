@@ -80,6 +80,15 @@ static int apply(const Affine *of, size_t at, int n, float *light) {
     return multiply_add(of->image + at, of->gain ? of->gain + at : NULL, of->offset ? of->offset + at : NULL, of->pedestal, n, light);
 }
 
+/* Has the processor fetch what apply() will read: rows are too short for it to see by itself where they go on. */
+static void ahead(const Affine *of, size_t at, int n) {
+    for (int x = 0; x < n; x += 16) {
+        FETCH(of->image + at + x);
+        if (of->gain) FETCH(of->gain + at + x);
+        if (of->offset) FETCH(of->offset + at + x);
+    }
+}
+
 /* Rows `first` to `last` of a plane blurred, its border repeated. scratch: taps lines, and one that is `taps` longer; `lines`: taps pointers.
    Returns whether any value that is read, as the camera gives it, is not in [0, 1]. */
 static int blur_rows(const Affine *plane, const float *weight, int taps, int height, int width, int first, int last, float *scratch,
@@ -90,6 +99,7 @@ static int blur_rows(const Affine *plane, const float *weight, int taps, int hei
     for (int y = first, next = first > reach ? first - reach : 0; y < last; y++) {
         for (; next < height && next <= y + reach; next++) { /* row `next` of the plane lies in line next % taps */
             const size_t at = (size_t)next * width;
+            if (next + 1 < height) ahead(plane, at + width, width);
             outside |= apply(plane, at, width, row);
             for (int k = 0; k < reach; k++) padded[k] = row[0], row[width + k] = row[width - 1];
             for (int k = 0; k < taps; k++) lines[k] = padded + k;

@@ -133,21 +133,39 @@ static float far_field_of(const float *image, const float *offset, const float *
     return std;
 }
 
-/* One row of one channel: its change is added to `sums`, its square to `squared`. */
-WIDE static void add_change(const float *restrict image, const float *restrict offset, const float *restrict per_noise, float scale, int width,
-                            float *restrict sums, float *restrict squared) {
-    if (offset)
-        for (int x = 0; x < width; x++) {
-            const float change = (offset[x] + image[x] * per_noise[x]) * scale;
-            sums[x] += change;
-            squared[x] += change * change;
+/* A row of an image: its values, offset and 1 / noise, with the smooth change of its light, what a channel's change is multiplied by, and each
+   column's sum of changes. offset[0] and `once` may be null. */
+typedef struct {
+    const float *values[3], *offset[3], *per_noise[3], *once, *twice;
+    LightOfRow light[3];
+    float scale[3], *sums[3];
+} ChangeOfRow;
+
+/* The changes of a row are added to its sums, their squares written to `squared`. Which arrays are null the callers know, so that the loop has no
+   branch. */
+static inline __attribute__((always_inline)) void add_changes(const ChangeOfRow *row, int smooth, int offsets, int n, float *restrict squared) {
+    const ChangeOfRow of = *row;
+    INDEPENDENT for (int x = 0; x < n; x++) {
+        float total = 0.0f;
+        UNROLLED for (int c = 0; c < 3; c++) {
+            const float value = smooth ? without_light(of.light[c], of.values[c][x], of.once[x], of.twice[x]) : of.values[c][x];
+            const float change = value * of.per_noise[c][x] + (offsets ? of.offset[c][x] : -of.per_noise[c][x]), scaled = change * of.scale[c];
+            of.sums[c][x] += scaled;
+            total += scaled * scaled;
         }
+        squared[x] = total;
+    }
+}
+
+WIDE static void add_change(const ChangeOfRow *row, int n, float *restrict squared) {
+    if (row->once && row->offset[0])
+        add_changes(row, 1, 1, n, squared);
+    else if (row->once)
+        add_changes(row, 1, 0, n, squared);
+    else if (row->offset[0])
+        add_changes(row, 0, 1, n, squared);
     else
-        for (int x = 0; x < width; x++) {
-            const float change = (image[x] * per_noise[x] - per_noise[x]) * scale;
-            sums[x] += change;
-            squared[x] += change * change;
-        }
+        add_changes(row, 0, 0, n, squared);
 }
 
 WIDE static void above(const float *restrict values, float threshold, int width, uint8_t *restrict result) {
@@ -287,29 +305,25 @@ typedef struct {
     atomic_int short_of_memory;
 } Frame;
 
-/* Of a channel's change, the noise, or of parts 3 to 5 its far field; of parts 6 to 8 whether its LED works. Part 9: a smooth change of the light,
-   which has no part in the noise. */
-static void find_noise(void *with, int part) {
+/* The noise of a channel's change, its far field, and whether its LED works. Part 3: a smooth change of the light, which has no part in the
+   noise. */
+static void find_noise(void *with, int c) {
     Frame *of = with;
-    if (part == 9) {
+    if (c == 3) {
         if (smooth_change(of->smooth, of->image, 1, of->surface)) of->short_of_memory = 1;
         return;
     }
-    const int c = part % 3, far = part >= 3;
     const size_t plane = (size_t)of->height * of->width * c;
     const float *image = of->image + plane, *offset = of->offset ? of->offset + plane : NULL, *per_noise = of->per_noise + plane;
     const size_t samples = (size_t)((of->height + of->stride - 1) / of->stride) * ((of->width + of->stride - 1) / of->stride);
-    if (part >= 6) {
-        of->works[c] = !(mean_of(image, of->height, of->width, of->step) < of->failed_below[c]);
+    float *some = malloc(sizeof(float) * (2 * samples + 1));
+    if (!some) {
+        of->short_of_memory = 1;
         return;
     }
-    of->noise[part] = 0.0f;
-    if (far && !(of->most_far_field[c] > 0.0f)) return;
-    float *some = malloc(sizeof(float) * (2 * samples + 1));
-    if (some)
-        of->noise[part] = (far ? far_field_of : noise_of)(image, offset, per_noise, of->height, of->width, of->stride, some);
-    else
-        of->short_of_memory = 1;
+    of->noise[c] = noise_of(image, offset, per_noise, of->height, of->width, of->stride, some);
+    of->noise[3 + c] = of->most_far_field[c] > 0.0f ? far_field_of(image, offset, per_noise, of->height, of->width, of->stride, some) : 0.0f;
+    of->works[c] = !(mean_of(image, of->height, of->width, of->step) < of->failed_below[c]);
     free(some);
 }
 
@@ -336,24 +350,24 @@ static void find_strong(void *with, int band) {
     Frame *of = with;
     const int cell = of->grid.cell, columns = of->grid.columns, height = of->height, width = of->width;
     const size_t pixels = (size_t)height * width, cells = (size_t)of->grid.rows * columns;
-    float *sums = malloc(5 * sizeof(float) * (size_t)width);
+    float *sums = malloc(4 * sizeof(float) * (size_t)width), *squared = sums + 3 * (size_t)width;
     if (!sums) {
         of->short_of_memory = 1;
         return;
     }
-    float *squared = sums + 3 * (size_t)width, *line = squared + width;
+    ChangeOfRow here = {.once = of->smooth ? of->smooth->along_x : NULL, .twice = of->smooth ? of->smooth->along_x + width : NULL};
     for (int i = first_row(of, band); i < first_row(of, band + 1); i++) {
         const int first = least(i * cell, height - cell);
         memset(sums, 0, 3 * sizeof(float) * (size_t)width);
         for (int y = first; y < first + cell; y++) {
             const size_t row = (size_t)y * width;
-            memset(squared, 0, sizeof(float) * (size_t)width);
             for (int c = 0; c < 3; c++) {
-                const float *values = of->divided + pixels * c + row, *offset = of->offset ? of->offset + pixels * c + row : NULL;
-                if (of->scale[c] == 0.0f) continue;
-                if (of->smooth) row_over_smooth(of->smooth, of->surface + 6 * c, y, 0, width, values, line);
-                add_change(of->smooth ? line : values, offset, of->per_noise + pixels * c + row, of->scale[c], width, sums + (size_t)c * width, squared);
+                const size_t at = pixels * c + row;
+                here.values[c] = of->divided + at, here.per_noise[c] = of->per_noise + at, here.offset[c] = of->offset ? of->offset + at : NULL;
+                here.scale[c] = of->scale[c], here.sums[c] = sums + (size_t)c * width;
+                if (of->smooth) here.light[c] = light_of_row(of->smooth, of->surface + 6 * c, y);
             }
+            add_change(&here, width, squared);
             if (y >= i * cell) above(squared, of->threshold, width, of->raw + row); /* rows above are the cell's before, of another band maybe */
         }
         for (int c = 0; c < 3; c++) cell_means(sums + (size_t)c * width, width, cell, columns, of->at.means + c * cells + (size_t)i * columns);
@@ -576,7 +590,7 @@ static void to_pixels(void *with, int band) {
 /* Masks of one frame. Returns what contact_mask() does. */
 static int mask_frame(Frame *of) {
     const size_t pixels = (size_t)of->height * of->width, cells = (size_t)of->grid.rows * of->grid.columns;
-    share(find_noise, of, of->smooth ? 10 : 9);
+    share(find_noise, of, of->smooth ? 4 : 3);
     find_scale(of);
     if (of->short_of_memory) return 1;
     share(find_strong, of, of->bands);

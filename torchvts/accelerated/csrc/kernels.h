@@ -40,6 +40,13 @@
 #define UNROLLED
 #endif
 
+/* Has the processor fetch a line of memory that will be read soon. */
+#if defined(__GNUC__)
+#define FETCH(address) __builtin_prefetch(address)
+#else
+#define FETCH(address) (void)(address)
+#endif
+
 /* Memory that the library keeps from call to call, in place of the system's: see memory.c. */
 void *kept_memory(size_t size);
 void *kept_zeros(size_t count, size_t size);
@@ -69,6 +76,20 @@ typedef struct {
 EXPORT void grid_means(const float *image, int planes, int height, int width, int stride, int first, int rows, int columns, float *means);
 EXPORT int smooth_change(const SmoothLight *of, const float *image, int frames, float *found);
 EXPORT void over_smooth(const SmoothLight *of, const float *image, const float *found, int frames, float *result);
+
+/* The surface along a row: its terms of degree 0 to 2 in x. */
+typedef struct {
+    float constant, once, twice;
+} LightOfRow;
+
+LightOfRow light_of_row(const SmoothLight *of, const float *found, int y);
+
+/* A value without the surface, where Legendre polynomials in x are `once` and `twice`. */
+static inline float without_light(LightOfRow of, float value, float once, float twice) {
+    const float surface = of.constant + of.once * once + of.twice * twice;
+    return value * (1.0f - surface + surface * surface);
+}
+
 void row_over_smooth(const SmoothLight *of, const float *found, int y, int first, int n, const float *values, float *result);
 
 /* What frame.c calls of the other sources, which say what these do. */

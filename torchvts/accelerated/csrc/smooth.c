@@ -5,27 +5,32 @@
 
 enum { LANES = 16, TERMS = 6 };
 
+/* LANES values that one instruction works on, which may lie anywhere in memory; and their bits. Of this type, all sums below stay in registers. */
+typedef float Lanes __attribute__((vector_size(sizeof(float) * LANES), aligned(sizeof(float)), may_alias));
+typedef int32_t Bits __attribute__((vector_size(sizeof(float) * LANES), aligned(sizeof(float)), may_alias));
+
+static inline const Lanes *lanes_at(const float *values) { return (const Lanes *)values; }
+
 /* What of the change (3, n) is not explained by the surface so far, weighted, times each term of place (TERMS, n): (3, TERMS). n is a multiple
    of LANES. */
-WIDE static void surface_sums(const float *restrict change, const float *restrict place, int n, const float *restrict found, float per_square,
-                              float *restrict sum) {
-    float total[3 * TERMS][LANES] = {{0.0f}};
+WIDE FUSED static void surface_sums(const float *restrict change, const float *restrict place, int n, const float *restrict found, float per_square,
+                                    float *restrict sum) {
+    const Lanes zero = {0.0f};
+    Lanes total[3 * TERMS];
+    for (int k = 0; k < 3 * TERMS; k++) total[k] = zero;
     for (int first = 0; first < n; first += LANES) {
-        float left[3][LANES], weight[LANES];
-        for (int j = 0; j < LANES; j++) weight[j] = 0.0f;
-        for (int c = 0; c < 3; c++) {
-            for (int j = 0; j < LANES; j++) left[c][j] = change[(size_t)c * n + first + j];
-            for (int k = 0; k < TERMS; k++)
-                for (int j = 0; j < LANES; j++) left[c][j] -= found[c * TERMS + k] * place[(size_t)k * n + first + j];
-            for (int j = 0; j < LANES; j++) weight[j] += left[c][j] * left[c][j];
+        Lanes term[TERMS], left[3];
+        UNROLLED for (int k = 0; k < TERMS; k++) term[k] = *lanes_at(place + (size_t)k * n + first);
+        UNROLLED for (int c = 0; c < 3; c++) {
+            left[c] = *lanes_at(change + (size_t)c * n + first);
+            UNROLLED for (int k = 0; k < TERMS; k++) left[c] -= found[c * TERMS + k] * term[k];
         }
-        for (int j = 0; j < LANES; j++) {
-            weight[j] = 1.0f - weight[j] * per_square;
-            weight[j] = weight[j] > 0.0f ? weight[j] * weight[j] : 0.0f;
+        Lanes weight = 1.0f - (left[0] * left[0] + left[1] * left[1] + left[2] * left[2]) * per_square;
+        weight = (Lanes)((weight > zero) & (Bits)(weight * weight));
+        UNROLLED for (int c = 0; c < 3; c++) {
+            left[c] *= weight;
+            UNROLLED for (int k = 0; k < TERMS; k++) total[c * TERMS + k] += left[c] * term[k];
         }
-        for (int c = 0; c < 3; c++)
-            for (int k = 0; k < TERMS; k++)
-                for (int j = 0; j < LANES; j++) total[c * TERMS + k][j] += left[c][j] * weight[j] * place[(size_t)k * n + first + j];
     }
     for (int k = 0; k < 3 * TERMS; k++) {
         sum[k] = 0.0f;
@@ -69,18 +74,20 @@ EXPORT int smooth_change(const SmoothLight *of, const float *image, int frames, 
     return 0;
 }
 
-WIDE static void over_line(const float *values, const float *restrict once, const float *restrict twice, int n, float c0, float c1, float c2,
-                           float *result) {
-    INDEPENDENT for (int x = 0; x < n; x++) {
-        const float surface = c0 + c1 * once[x] + c2 * twice[x];
-        result[x] = values[x] * (1.0f - surface + surface * surface);
-    }
+LightOfRow light_of_row(const SmoothLight *of, const float *found, int y) {
+    const float once = of->along_y[y], twice = of->along_y[of->height + y];
+    const LightOfRow row = {found[0] + found[2] * once + found[5] * twice, found[1] + found[4] * once, found[3]};
+    return row;
+}
+
+WIDE static void over_line(const float *values, const float *restrict once, const float *restrict twice, int n, LightOfRow of, float *result) {
+    INDEPENDENT for (int x = 0; x < n; x++) result[x] = without_light(of, values[x], once[x], twice[x]);
 }
 
 /* n values of row y of a channel, from column `first` on, without the surface of that channel's coefficients. */
 void row_over_smooth(const SmoothLight *of, const float *found, int y, int first, int n, const float *values, float *result) {
-    const float once = of->along_y[y], twice = of->along_y[of->height + y], *along = of->along_x + first;
-    over_line(values, along, along + of->width, n, found[0] + found[2] * once + found[5] * twice, found[1] + found[4] * once, found[3], result);
+    const float *along = of->along_x + first;
+    over_line(values, along, along + of->width, n, light_of_row(of, found, y), result);
 }
 
 /* What over_smooth() is given. */

@@ -230,7 +230,7 @@ class ContactMask(nn.Module):
             failed = failed & (failed.to(torch.uint8).sum(dim=1, keepdim=True) == 1)
             change = change * (~failed)[:, :, None, None].to(change.dtype)
         # rounding to 8 bits of smooth light is no white noise, and second differences miss it
-        change = change / torch.sqrt(noise * noise + self.rounding)[:, :, None, None]
+        change = change * torch.rsqrt(noise * noise + self.rounding)[:, :, None, None]
         r, g, b = change[:, 0:1], change[:, 1:2], change[:, 2:3]
         squared = torch.addcmul(torch.addcmul(r * r, g, g), b, b)
         return Change(change, squared, self.sigmas**2)

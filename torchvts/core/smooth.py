@@ -1,7 +1,7 @@
 """A smooth change of the light over the image, found in the undeformed part of a frame and divided out."""
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 SAMPLES = 24
 """Samples along the shorter side from which the change is found; smaller images are taken to have none."""
@@ -36,11 +36,14 @@ def smooth_change(ratio: Tensor, samples: int = SAMPLES, steps: int = STEPS, mos
     stride = smooth_stride(height, width)
     change = grid_samples(ratio, stride).flatten(2) - 1.0  # (B, 3, N)
     place = smooth_basis(height, width, stride).to(change).flatten(1)  # (6, N)
+    place = place.expand(count, -1, -1)
+    across = place.transpose(1, 2) / float(place.shape[2])
     for step in range(steps):
-        left = change - found @ place
-        weight = (1.0 - left.square().sum(dim=1, keepdim=True) * per_square(step)).clamp_min(0.0).square()
+        left = torch.baddbmm(change, found, place, alpha=-1.0)
+        off = (left * left).sum(dim=1, keepdim=True)
+        weight = torch.rsub(off * per_square(step), 1.0).clamp_min(0.0)
         # terms are orthonormal and weights at most 1, so the sum of losses falls with every step
-        found = found + (left * weight) @ place.t() / float(place.shape[1])
+        found = torch.baddbmm(found, left * (weight * weight), across)
     largest = (found.abs() * peaks().to(found)).sum(dim=2, keepdim=True)
     return found * (most / largest.clamp_min(most))
 
@@ -52,12 +55,12 @@ def without_smooth_change(ratio: Tensor) -> Tensor:
 
 def over_smooth(ratio: Tensor, coefficients: Tensor) -> Tensor:
     """Images (B, 3, H, W) over 1 + the surface of coefficients (B, 3, 6), to second order: at 5 % off by 0.01 %."""
-    x, y = legendre(ratio.shape[3], 1).to(ratio), legendre(ratio.shape[2], 1)[:, :, None].to(ratio)
-    c = coefficients[..., None, None]
-    # terms in the order of smooth_basis, x along lines and y from line to line
-    by_line = (c[:, :, 0] + c[:, :, 2] * y[1] + c[:, :, 5] * y[2]) + (c[:, :, 1] + c[:, :, 4] * y[1]) * x[1]
-    surface = by_line + c[:, :, 3] * x[2]
-    return ratio * (1.0 - surface + surface.square())
+    x, y = legendre(ratio.shape[3], 1).to(ratio), legendre(ratio.shape[2], 1).to(ratio)
+    # terms in the order of smooth_basis, as a matrix: degree of y, degree of x
+    order = torch.tensor([0, 1, 3, 2, 4, 6, 5, 6, 6], device=ratio.device)
+    terms = nn.functional.pad(coefficients, [0, 1]).index_select(2, order).unflatten(2, [3, 3])
+    surface = y.t() @ terms @ x
+    return torch.addcmul(ratio, ratio, torch.addcmul(surface, surface, surface, value=-1.0), value=-1.0)
 
 
 def grid_samples(image: Tensor, stride: int) -> Tensor:

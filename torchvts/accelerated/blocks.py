@@ -96,10 +96,9 @@ class ContactMask(Twin, contact.ContactMask):
     def find(self, compensated: Tensor) -> tuple[Tensor, Tensor]:
         if not usable(compensated, self.offset):
             return super().find(compensated)
-        bridge = self.bridge_cells if self.bridges else 0
-        grid = kernels.ContactGrid(
-            self.step, self.stride, self.cell, self.reach, self.sigmas, self.rounding, self.least_cells, bridge, self.bridge_sigmas
-        )
+        bridge = (self.bridge_cells if self.bridges else 0, self.bridge_sigmas, self.tail_sigmas, self.least_spread)
+        sides = (self.step, self.stride, self.cell, self.reach)
+        grid = kernels.ContactGrid(*sides, self.sigmas, self.rounding, self.least_cells, *bridge)
         offset = None if flat_is_one(self) else self.offset
         limits, smooth = (self.failed_below, self.most_far_field), self.smooth_light
         try:

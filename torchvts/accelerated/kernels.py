@@ -29,7 +29,7 @@ NO_PEDESTAL = (ctypes.c_float * 3)()
 
 
 SIGNATURES = {
-    "contact_mask": ("i", "ppppp iiiiiii fff i f pp pp"),
+    "contact_mask": ("i", "ppppp iiiiiii fff i fff pp pp"),
     "normals": ("i", "p lll pppp l iiii p ll pp ffff p"),
     "solve_shadowed": ("v", "p lll pppp l iiii p ll pppppp"),
     "frame_noise": ("i", "p iiii p"),
@@ -92,6 +92,8 @@ class ContactGrid(NamedTuple):
     least_cells: float
     bridge_cells: int
     bridge_sigmas: float
+    tail_sigmas: float
+    least_spread: float
 
 
 def loaded() -> ctypes.CDLL:

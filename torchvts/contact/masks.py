@@ -47,6 +47,12 @@ another, the change passes by zero, and two lobes of one contact would have unde
 BRIDGE_SHARE = 0.5
 """Part of ``sigmas`` that the mean change of a cell has in a gap that is bridged."""
 
+TAIL_SHARE = 2.0 / 3.0
+"""Part of ``sigmas``, in units of the spread of the cells' own mean changes, that a cell has in which moved skin goes on."""
+
+LEAST_SPREAD = 0.1
+"""Least spread of such means, in units of the noise of a pixel over the side of a cell: white noise alone has 1."""
+
 STAND_IN_NOISE = 0.02
 """Least noise under a stand-in model, relative to the background and to its median: a press scatters light that no calibration has
 measured, as much of it to dark pixels as to bright ones."""
@@ -66,9 +72,11 @@ class ContactMask(nn.Module):
     A pixel has moved if its change over the three channels, each in units of its noise, is longer than ``sigmas``; a coarse
     cell also if its mean change is, in units of the frame's own spread of cell means (faint contact). The noise of a channel is
     the largest of the calibrated one, the frame's own, and the frame's spread of change far from the contact. Holes are filled;
-    components smaller than a disc of ``min_size_px`` are removed. A channel that is black in all of the frame (below 5 % of its
-    background) has lost its LED: the other two decide. With ``smooth_light`` a smooth change of the light is divided out first;
-    the noise is the frame's before that, since what a press makes of undeformed skin is smooth only roughly.
+    components smaller than a disc of ``min_size_px`` are removed. Where light scatters, the threshold is high, and the skin that
+    hangs free below it would be missing from the depth of all it surrounds: moved skin goes on over the cells connected to it
+    whose mean change stands out of the spread of such means in the least changed skin. A channel that is black in all of the frame
+    (below 5 % of its background) has lost its LED: the other two decide. With ``smooth_light`` a smooth change of the light is
+    divided out first; the noise is the frame's before that, since what a press makes of undeformed skin is smooth only roughly.
 
     Args:
         flat: (3, H, W), the compensated image of the undeformed skin.
@@ -127,6 +135,7 @@ class ContactMask(nn.Module):
         self.register_buffer("most_far_field", far_field * (self.flat * self.per_noise).mean(dim=(1, 2)))
         self.dark_noises = DARK_NOISES
         self.bridges, self.bridge_cells, self.bridge_sigmas = far_field > 0.0, BRIDGE, BRIDGE_SHARE * sigmas
+        self.tail_sigmas, self.least_spread = TAIL_SHARE * sigmas, LEAST_SPREAD / self.cell
         self.register_buffer("offset", -self.flat * self.per_noise)
         self.samples = 2000  # pixels from which a frame's own noise is estimated
         self.stride = sample_stride(flat.shape[1], flat.shape[2], self.samples)
@@ -256,9 +265,10 @@ class ContactMask(nn.Module):
         density = torch.where(filled & ~any_strong, weight, density)
         seed = filled & (_box_sum(_box_sum(density, self.reach, 2), self.reach, 3) > self.least_cells)
         kept = self.reconstruct(dilate_cross(seed) & filled, filled)
-        gaps = self.gaps(mean, kept) if self.bridges else torch.zeros_like(kept)
-        whole = kept | gaps
-        interior = self._to_pixels(whole & (erode(filled | whole) | faint | gaps))
+        added = self.gaps(mean, kept) if self.bridges else torch.zeros_like(kept)
+        added = added | self.tail(mean, kept | added) if self.bridges else added
+        whole = kept | added
+        interior = self._to_pixels(whole & (erode(filled | whole) | faint | added))
         return (strong & self._to_pixels(whole)) | interior, interior
 
     def gaps(self, mean: Tensor, kept: Tensor) -> Tensor:
@@ -267,11 +277,22 @@ class ContactMask(nn.Module):
         closed = erode(dilate(kept, self.bridge_cells), self.bridge_cells)
         return self.filled(kept | (closed & weak)) & ~kept
 
+    def tail(self, mean: Tensor, kept: Tensor) -> Tensor:
+        """Cells in which the skin of kept ones goes on, and what they enclose, bool; ``mean`` is the change of each cell."""
+        some = self.some_cells(mean)
+        spread = clipped_std(some, self.quarter(some) / 0.3186).clamp_min(self.least_spread)
+        weak = (mean / spread[..., None]).square().sum(1, keepdim=True) > self.tail_sigmas**2
+        return self.filled(self.reconstruct(kept, weak | kept)) & ~kept
+
+    def some_cells(self, mean: Tensor) -> Tensor:
+        """Some thousand of the cells' mean changes (B, 3, h, w), without their sign, (B, 3, N)."""
+        rows, columns = mean.shape[2], mean.shape[3]
+        step = max(1, min(max(rows, columns) // 40, rows, columns))
+        return mean[:, :, step // 2 :: step, step // 2 :: step].abs().flatten(2)
+
     def faint(self, mean: Tensor) -> Tensor:
         """Cells whose mean change stands out of the spread of all cells by 5 sigmas, bool."""
-        rows, columns = mean.shape[2], mean.shape[3]
-        step = max(1, min(max(rows, columns) // 40, rows, columns))  # a median of some thousand cells is as good
-        spread = mean[:, :, step // 2 :: step, step // 2 :: step].abs().flatten(2).median(dim=2).values / 0.6745
+        spread = self.some_cells(mean).median(dim=2).values / 0.6745
         return (mean / spread.clamp_min(1.0 / self.cell)[..., None, None]).square().sum(1, keepdim=True) > 25.0
 
     def filled(self, mask: Tensor) -> Tensor:

@@ -18,10 +18,10 @@ CELL_MM = 0.13
 RIM_MM = 3.5
 """Length of rim along which its depth is averaged, either way."""
 
-DECAY_MM = (0.1, 2.0)
+DECAY_MM = (0.1, 3.0)
 """Bounds of the length on which free skin decays."""
 
-TAIL = (0.03, 0.4)
+TAIL = (0.1, 0.6)
 """Depths of free skin from which that length is found, as shares of a frame's largest depth."""
 
 LEAST_FREE = 0.15

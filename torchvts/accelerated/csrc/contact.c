@@ -269,7 +269,7 @@ typedef struct {
     int rows, columns, cell, reach;
     float least_cells;
     int bridge;
-    float bridge_sigmas;
+    float bridge_sigmas, tail_sigmas, least_spread;
     Shape shape;
 } Grid;
 
@@ -402,18 +402,23 @@ WIDE static void longer_than(const float *restrict means, size_t cells, const fl
     }
 }
 
+/* Some thousand of a channel's mean changes, without their sign; returns their number. */
+static int some_cells(const Grid *grid, const float *means, float *some) {
+    const int rows = grid->rows, columns = grid->columns, longer = rows > columns ? rows : columns, shorter = rows + columns - longer;
+    const int step = longer < 80 ? 1 : least(longer / 40, shorter); /* at least one line of a thin grid */
+    int n = 0;
+    for (int i = step / 2; i < rows; i += step)
+        for (int j = step / 2; j < columns; j += step) some[n++] = fabsf(means[(size_t)i * columns + j]);
+    return n;
+}
+
 /* 1 over the frame's own spread of mean changes, of one channel. */
 static void find_spread(void *with, int c) {
     Frame *of = with;
     const Grid *grid = &of->grid;
-    const int rows = grid->rows, columns = grid->columns, longer = rows > columns ? rows : columns, shorter = rows + columns - longer;
-    const int step = longer < 80 ? 1 : least(longer / 40, shorter); /* at least one line of a thin grid */
-    const size_t cells = (size_t)rows * columns;
-    const float *means = of->at.means + c * cells;
+    const size_t cells = (size_t)grid->rows * grid->columns;
     float *some = of->at.some + c * (2 * cells + 1), least_std = 1.0f / (float)grid->cell;
-    int n = 0;
-    for (int i = step / 2; i < rows; i += step)
-        for (int j = step / 2; j < columns; j += step) some[n++] = fabsf(means[(size_t)i * columns + j]);
+    const int n = some_cells(grid, of->at.means + c * cells, some);
     const float std = median(some, n, some + n) / 0.6745f;
     of->per[c] = 1.0f / (std < least_std ? least_std : std);
 }
@@ -496,6 +501,17 @@ static void keep_large(const Grid *grid, Scratch at) {
     flood(at.kept, at.one, &grid->shape);
 }
 
+/* Keeps the cells of at.other, among them all kept ones, and what they enclose. There cells decide. */
+static void keep_filled(const Grid *grid, Scratch at) {
+    invert_bits(at.other, &grid->shape, at.one);
+    flood_from_border(at.one, &grid->shape, at.other);
+    invert_bits(at.other, &grid->shape, at.one); /* what the border does not reach */
+    for (size_t k = 0; k < words_of(&grid->shape); k++) {
+        const uint64_t more = at.one[k] & ~at.kept[k];
+        at.kept[k] |= more, at.faint[k] |= more, at.outside[k] &= ~more;
+    }
+}
+
 /* Keeps cells between kept ones that have moved too, and what they enclose: a closing by a square. There cells decide. */
 static void bridge_gaps(const Grid *grid, Scratch at) {
     static const float as_is[3] = {1.0f, 1.0f, 1.0f};
@@ -517,14 +533,28 @@ static void bridge_gaps(const Grid *grid, Scratch at) {
             at.other[row + w] = at.kept[row + w] | more, added |= more;
         }
     }
-    if (!added) return;
-    invert_bits(at.other, &grid->shape, at.one);
-    flood_from_border(at.one, &grid->shape, at.other);
-    invert_bits(at.other, &grid->shape, at.one); /* what the border does not reach */
-    for (size_t k = 0; k < words_of(&grid->shape); k++) {
-        const uint64_t more = at.one[k] & ~at.kept[k];
-        at.kept[k] |= more, at.faint[k] |= more, at.outside[k] &= ~more;
+    if (added) keep_filled(grid, at);
+}
+
+/* Keeps the cells in which the skin of kept ones goes on, and what they enclose. There cells decide. */
+static void keep_tail(const Grid *grid, Scratch at) {
+    const int rows = grid->rows, columns = grid->columns, words = grid->shape.words;
+    const size_t cells = (size_t)rows * columns;
+    float per[3];
+    for (int c = 0; c < 3; c++) {
+        const int n = some_cells(grid, at.means + c * cells, at.some);
+        float spread = kth_or_none(at.some, n, n / 4, at.some + n) / 0.3186f;
+        for (int pass = 0; pass < 2; pass++) spread = clipped_std(at.some, n, spread);
+        per[c] = 1.0f / (spread < grid->least_spread ? grid->least_spread : spread);
     }
+    for (int i = 0; i < rows; i++) {
+        const size_t row = (size_t)i * words;
+        longer_than(at.means + (size_t)i * columns, cells, per, grid->tail_sigmas * grid->tail_sigmas, columns, at.line);
+        pack_bits(at.line, &grid->shape, at.one + row);
+        for (int w = 0; w < words; w++) at.one[row + w] |= at.other[row + w] = at.kept[row + w];
+    }
+    flood(at.other, at.one, &grid->shape);
+    keep_filled(grid, at);
 }
 
 /* Cells that decide for all their pixels: faint ones, and those none of whose neighbours lies outside of the contact; what is beyond the image
@@ -589,7 +619,7 @@ static int mask_frame(Frame *of) {
     share(find_spread, of, 3);
     if (find_cells(&of->grid, of->per, of->at)) {
         keep_large(&of->grid, of->at);
-        if (of->grid.bridge > 0) bridge_gaps(&of->grid, of->at);
+        if (of->grid.bridge > 0) bridge_gaps(&of->grid, of->at), keep_tail(&of->grid, of->at);
         find_solid(&of->grid, of->at);
         share(to_pixels, of, of->bands);
     } else {
@@ -607,10 +637,10 @@ static int mask_frame(Frame *of) {
  */
 EXPORT int contact_mask(const float *image, const float *offset, const float *per_noise, const float *failed_below,
                         const float *most_far_field, int frames, int height, int width, int step, int stride, int cell, int reach,
-                        float sigmas, float rounding, float least_cells, int bridge, float bridge_sigmas, const SmoothLight *smooth,
-                        float *surface, uint8_t *mask, uint8_t *inner) {
+                        float sigmas, float rounding, float least_cells, int bridge, float bridge_sigmas, float tail_sigmas,
+                        float least_spread, const SmoothLight *smooth, float *surface, uint8_t *mask, uint8_t *inner) {
     const int rows = (height + cell - 1) / cell, columns = (width + cell - 1) / cell;
-    const Grid grid = {rows, columns, cell, reach, least_cells, bridge, bridge_sigmas, shape_of(rows, columns)};
+    const Grid grid = {rows, columns, cell, reach, least_cells, bridge, bridge_sigmas, tail_sigmas, least_spread, shape_of(rows, columns)};
     const size_t pixels = (size_t)height * width, cells = (size_t)rows * columns, words = words_of(&grid.shape), line = 64 * (size_t)grid.shape.words;
     uint64_t *masks = malloc(7 * sizeof(uint64_t) * words + sizeof(float) * (10 * cells + 3 + 2 * line + 2 * (size_t)reach) + 2 * line);
     if (!masks) return 1;

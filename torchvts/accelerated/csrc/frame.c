@@ -16,7 +16,7 @@ typedef struct {
     float least_drift, most_drift, believed_drift;
     /* ContactMask */
     int32_t step, stride, cell, reach, bridge;
-    float sigmas, rounding, least_cells, bridge_sigmas;
+    float sigmas, rounding, least_cells, bridge_sigmas, tail_sigmas, least_spread;
     const SmoothLight *smooth; /* of SmoothDrift too; or null */
     const float *flat, *per_noise, *failed_below, *most_far_field;
     /* Crop: corners on multiples of `corners` */
@@ -154,8 +154,8 @@ static int solve_frame(const Program *of, const float *image, Work work, Output 
     if (trouble) return trouble;
     float surface[18];
     const int code = contact_mask(light, of->flat, of->per_noise, of->failed_below, of->most_far_field, 1, height, width, of->step, of->stride,
-                                  of->cell, of->reach, of->sigmas, of->rounding, of->least_cells, of->bridge, of->bridge_sigmas, of->smooth, surface,
-                                  out.deformed, work.inner);
+                                  of->cell, of->reach, of->sigmas, of->rounding, of->least_cells, of->bridge, of->bridge_sigmas, of->tail_sigmas,
+                                  of->least_spread, of->smooth, surface, out.deformed, work.inner);
     if (code) return code == 1 ? SHORT : BEYOND;
     Window at = window_of(of, out.deformed);
     if (at.rows == 0) {

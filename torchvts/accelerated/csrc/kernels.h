@@ -78,8 +78,8 @@ EXPORT int levels(const float *image, int frames, int height, int width, int str
 EXPORT void divide_planes(const float *image, const float *level, int planes, int64_t n, float *result);
 EXPORT int contact_mask(const float *image, const float *offset, const float *per_noise, const float *failed_below, const float *most_far_field,
                         int frames, int height, int width, int step, int stride, int cell, int reach, float sigmas, float rounding,
-                        float least_cells, int bridge, float bridge_sigmas, const SmoothLight *smooth, float *surface, uint8_t *mask,
-                        uint8_t *inner);
+                        float least_cells, int bridge, float bridge_sigmas, float tail_sigmas, float least_spread, const SmoothLight *smooth,
+                        float *surface, uint8_t *mask, uint8_t *inner);
 EXPORT void box_of(const uint8_t *mask, int frames, int height, int width, int *box);
 EXPORT void response_normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *place, const float *weight,
                              int degree, int terms, const float *depth, int64_t depth_frame, int64_t depth_row, const float *per_mm, float max_sine,

@@ -110,16 +110,19 @@ def test_sizes_and_refusals():
 
 @pytest.mark.parametrize("seed", [3, pytest.param(5, marks=pytest.mark.long)])
 def test_the_second_pass_learned_from_balls_carries_over_to_other_objects(seed):
-    """Better in the mean than the first, and on no object worse by 5 %: a second pass that balls teach shapes would be."""
+    """Better in the mean than the first, and on no object worse by 5 %: a second pass that balls teach shapes would be.
+    Depth counts from the undeformed skin, so skin that hangs free around the object must not be left out."""
     unit = drawn_sensor(seed)
     calibrated = by_presses(unit.background, unit.sensor, unit.balls, None, False).unit
     errors = {}
     for mode in ("fast", "precise"):
         pipe = DepthPipeline.from_calibration(calibrated, mode)
         with torch.inference_mode():
-            normals = [pipe(pressed.image[None]).normal for pressed in unit.objects]
-        pairs = zip(normals, unit.objects, strict=True)
-        errors[mode] = [float(normal_angle_deg(n, p.scene.normal, p.scene.contact).mean()) for n, p in pairs]
+            found = [pipe(pressed.image[None]) for pressed in unit.objects]
+        pairs = list(zip(found, unit.objects, strict=True))
+        errors[mode] = [float(normal_angle_deg(out.normal, p.scene.normal, p.scene.contact).mean()) for out, p in pairs]
+        missing = [float((p.scene.depth_mm - out.depth_mm)[p.scene.contact].mean()) for out, p in pairs]
+        assert 0.0 < sum(missing) / len(missing) < 0.055  # mm; before, 0.075
     assert sum(errors["precise"]) < 0.95 * sum(errors["fast"]) and sum(errors["fast"]) / len(OBJECTS) < 4.5
     assert all(second < 1.05 * first for first, second in zip(errors["fast"], errors["precise"], strict=True))
 

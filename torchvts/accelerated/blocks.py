@@ -98,17 +98,16 @@ class ContactMask(Twin, contact.ContactMask):
             return super().divided(compensated)
         return kernels.without_smooth_change(compensated)
 
-    def find(self, compensated: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
+    def find(self, compensated: Tensor, image: Tensor) -> contact.Moved:
         if not usable(compensated, image, self.offset):
             return super().find(compensated, image)
-        bridge = self.bridge_cells if self.bridges else 0
-        grid = kernels.ContactGrid(
-            self.step, self.stride, self.cell, self.reach, self.sigmas, self.rounding, self.least_cells, bridge, self.bridge_sigmas
-        )
+        bridge = (self.bridge_cells if self.bridges else 0, self.bridge_sigmas, self.tail_sigmas, self.least_spread)
+        sides = (self.step, self.stride, self.cell, self.reach)
+        grid = kernels.ContactGrid(*sides, self.sigmas, self.rounding, self.least_cells, *bridge)
         offset = None if flat_is_one(self) else self.offset
         limits = (self.failed_below, self.most_far_field)
         try:
-            return kernels.contact_mask(compensated, image, offset, self.per_noise, limits, grid)
+            return contact.Moved(*kernels.contact_mask(compensated, image, offset, self.per_noise, limits, grid))
         except kernels.NotFinite:
             return super().find(compensated, image)
 

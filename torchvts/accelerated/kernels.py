@@ -29,7 +29,7 @@ NO_PEDESTAL = (ctypes.c_float * 3)()
 
 
 SIGNATURES = {
-    "contact_mask": ("i", "pppppp iiiiiii fff i f pp pp"),
+    "contact_mask": ("i", "pppppp iiiiiii fff i fff pp ppp"),
     "normals": ("i", "p lll pppp l iiii p ll pp ffff p"),
     "solve_shadowed": ("v", "p lll pppp l iiii p ll pppppp"),
     "frame_noise": ("i", "p iiii p"),
@@ -102,6 +102,8 @@ class ContactGrid(NamedTuple):
     least_cells: float
     bridge_cells: int
     bridge_sigmas: float
+    tail_sigmas: float
+    least_spread: float
 
 
 def loaded() -> ctypes.CDLL:
@@ -286,8 +288,8 @@ def contact_mask(
     per_noise: Tensor,
     limits: tuple[Tensor, Tensor],
     grid: ContactGrid,
-) -> tuple[Tensor, Tensor]:
-    """Deformed area and its interior, bool (B, 1, H, W): see :class:`~torchvts.contact.ContactMask`, whose attributes these are.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Deformed area, its interior and its tail, bool (B, 1, H, W): see :class:`~torchvts.contact.ContactMask`, whose attributes these are.
 
     ``image``: where pixels stand out; ``compensated``: what the noise is of. ``offset``: None where it is ``-per_noise``, as the
     undeformed skin is 1. ``limits``: ``failed_below`` and ``most_far_field``.
@@ -297,7 +299,7 @@ def contact_mask(
     offsets = None if offset is None else offset.data_ptr()
     count, _, height, width = compensated.shape
     mask = compensated.new_empty(count, 1, height, width, dtype=torch.bool)
-    interior = torch.empty_like(mask)
+    interior, tail = torch.empty_like(mask), torch.empty_like(mask)
     fields = (offsets, per_noise.data_ptr(), limits[0].data_ptr(), limits[1].data_ptr())
     kernel = loaded().contact_mask
     _check(
@@ -306,11 +308,11 @@ def contact_mask(
             height * width,
             lambda first, many: kernel(
                 *(_at(compensated, first), _at(image, first), *fields, many, height, width, *grid),
-                *(None, None, _at(mask, first), _at(interior, first)),
+                *(None, None, _at(mask, first), _at(interior, first), _at(tail, first)),
             ),
         )
     )
-    return mask, interior
+    return mask, interior, tail
 
 
 def frame_noise(image: Tensor, stride: int) -> Tensor:

@@ -56,9 +56,29 @@ another, the change passes by zero, and two lobes of one contact would have unde
 BRIDGE_SHARE = 0.5
 """Part of ``sigmas`` that the mean change of a cell has in a gap that is bridged."""
 
+TAIL_SHARE = 2.0 / 3.0
+"""Part of ``sigmas``, in units of the spread of the cells' own mean changes, that a cell has in which moved skin goes on."""
+
+LEAST_SPREAD = 0.1
+"""Least spread of such means, in units of the noise of a pixel over the side of a cell: white noise alone has 1."""
+
 STAND_IN_NOISE = 0.02
 """Least noise under a stand-in model, relative to the background and to its median: a press scatters light that no calibration has
 measured, as much of it to dark pixels as to bright ones."""
+
+
+class Moved(NamedTuple):
+    """Where the skin has moved, each bool (B, 1, H, W).
+
+    Attributes:
+        mask: all of it.
+        interior: where cells decide, not pixels.
+        tail: where it goes on below the threshold.
+    """
+
+    mask: Tensor
+    interior: Tensor
+    tail: Tensor
 
 
 class Change(NamedTuple):
@@ -75,10 +95,12 @@ class ContactMask(nn.Module):
     A pixel has moved if its change over the three channels, each in units of its noise, is longer than ``sigmas``; a coarse
     cell also if its mean change is, in units of the frame's own spread of cell means (faint contact). The noise of a channel is
     the largest of the calibrated one, the frame's own, and the frame's spread of change far from the contact. Holes are filled;
-    components smaller than a disc of ``min_size_px`` are removed. A channel that is black in all of the frame (below 5 % of its
-    background) has lost its LED: the other two decide. With ``smooth_light`` a smooth change of the light is divided out first,
-    unless the caller has done so; the noise is the frame's before that, since what a press makes of undeformed skin is smooth
-    only roughly.
+    components smaller than a disc of ``min_size_px`` are removed. Where light scatters, the threshold is high, and the skin that
+    hangs free below it would be missing from the depth of all it surrounds: moved skin goes on over the cells connected to it
+    whose mean change stands out of the spread of such means in the least changed skin. A channel that is black in all of the frame
+    (below 5 % of its background) has lost its LED: the other two decide. With ``smooth_light`` a smooth change of the light is
+    divided out first, unless the caller has done so; the noise is the frame's before that, since what a press makes of undeformed
+    skin is smooth only roughly.
 
     Args:
         flat: (3, H, W), the compensated image of the undeformed skin.
@@ -137,6 +159,7 @@ class ContactMask(nn.Module):
         self.register_buffer("most_far_field", far_field * (self.flat * self.per_noise).mean(dim=(1, 2)))
         self.dark_noises = DARK_NOISES
         self.bridges, self.bridge_cells, self.bridge_sigmas = far_field > 0.0, BRIDGE, BRIDGE_SHARE * sigmas
+        self.tail_sigmas, self.least_spread = TAIL_SHARE * sigmas, LEAST_SPREAD / self.cell
         self.register_buffer("offset", -self.flat * self.per_noise)
         self.samples = 2000  # pixels from which a frame's own noise is estimated
         self.stride = sample_stride(flat.shape[1], flat.shape[2], self.samples)
@@ -162,30 +185,34 @@ class ContactMask(nn.Module):
 
     if TYPE_CHECKING:
 
-        def __call__(self, compensated: Tensor, image: Tensor | None = None) -> Tensor: ...
+        def __call__(self, compensated: Tensor, image: Tensor | None = None, tail: Tensor | None = None) -> Tensor: ...
 
-    def forward(self, compensated: Tensor, image: Tensor | None = None) -> Tensor:
+    def forward(self, compensated: Tensor, image: Tensor | None = None, tail: Tensor | None = None) -> Tensor:
         """Where the skin has moved in compensated images (B, 3, H, W), bool (B, 1, H, W).
 
-        ``image``: the same without their smooth change of the light, where that is known; None to find it here.
+        ``image``: the same without their smooth change of the light, where that is known; None to find it here. ``tail``: takes
+        the part of the result where moved skin goes on below the threshold, bool (B, 1, H, W).
         """
         self._check("compensated", compensated)
         if image is not None:
             self._check("image", image)
             check_same_count("image", image, "compensated", compensated.shape[0])
         image = self.divided(compensated) if image is None else image
-        return self.find(compensated.detach(), image.detach())[0]
+        found = self.find(compensated.detach(), image.detach())
+        if tail is not None:
+            tail.copy_(found.tail)
+        return found.mask
 
     @torch.jit.export
     def soft(self, compensated: Tensor) -> Tensor:
         """The same as a number in (0, 1), (B, 1, H, W), differentiable in the image: one half at the hard rim."""
         self._check("compensated", compensated)
         image = self.divided(compensated)
-        hard, interior = self.find(compensated.detach(), image.detach())
+        moved = self.find(compensated.detach(), image.detach())
         found = self.change(compensated, image)
         length = self.sigmas * torch.sqrt(found.squared / found.threshold + 1e-12)
-        near = dilate(dilate(hard)).to(length.dtype)
-        return near * torch.maximum(torch.sigmoid(length - self.sigmas), interior.to(length.dtype))
+        near = dilate(dilate(moved.mask)).to(length.dtype)
+        return near * torch.maximum(torch.sigmoid(length - self.sigmas), moved.interior.to(length.dtype))
 
     @torch.jit.export
     def shadowed(self, compensated: Tensor, noise_std: Tensor | None = None) -> Tensor:
@@ -213,8 +240,8 @@ class ContactMask(nn.Module):
         """Compensated images without a smooth change of the light; themselves where none is looked for."""
         return without_smooth_change(compensated) if self.smooth_light else compensated
 
-    def find(self, compensated: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
-        """The deformed area, and its interior, where cells decide and not pixels; compiled kernels replace this method."""
+    def find(self, compensated: Tensor, image: Tensor) -> Moved:
+        """The deformed area; compiled kernels replace this method."""
         found = self.change(compensated, image)
         return self.clean(found.change, found.squared > found.threshold)
 
@@ -264,7 +291,7 @@ class ContactMask(nn.Module):
         step = self.step
         return compensated.detach()[:, :, step // 2 :: step, step // 2 :: step].mean(dim=(2, 3)) < self.failed_below
 
-    def clean(self, change: Tensor, strong: Tensor) -> tuple[Tensor, Tensor]:
+    def clean(self, change: Tensor, strong: Tensor) -> Moved:
         """The same from pixels that stand out: gaps closed, holes filled, specks removed, faint cells added."""
         strong = erode(dilate(strong))  # closing: pixels lost to noise at the rim
         counted = strong.to(change.dtype)  # ONNX sums no bytes
@@ -276,17 +303,19 @@ class ContactMask(nn.Module):
         faint = self.faint(mean) & ~any_strong  # where single pixels stand out, as at a rim, they decide
         cells = any_strong | faint
         if may_read(cells) and not bool(cells.any()):
-            return strong, strong
+            return Moved(strong, strong, strong)
         filled = self.filled(cells)
         # a hole counts as contact; faint cells too, but it takes three that lie together, for one of ten thousand is chance
         weight = torch.where(faint, torch.full_like(density, min(1.0, 0.4 * self.least_cells)), torch.ones_like(density))
         density = torch.where(filled & ~any_strong, weight, density)
         seed = filled & (_box_sum(_box_sum(density, self.reach, 2), self.reach, 3) > self.least_cells)
         kept = self.reconstruct(dilate_cross(seed) & filled, filled)
-        gaps = self.gaps(mean, kept) if self.bridges else torch.zeros_like(kept)
-        whole = kept | gaps
-        interior = self._to_pixels(whole & (erode(filled | whole) | faint | gaps))
-        return (strong & self._to_pixels(whole)) | interior, interior
+        added = self.gaps(mean, kept) if self.bridges else torch.zeros_like(kept)
+        tail = self.tail(mean, kept | added) if self.bridges else torch.zeros_like(kept)
+        added = added | tail
+        whole = kept | added
+        interior = self._to_pixels(whole & (erode(filled | whole) | faint | added))
+        return Moved((strong & self._to_pixels(whole)) | interior, interior, self._to_pixels(tail))
 
     def gaps(self, mean: Tensor, kept: Tensor) -> Tensor:
         """Cells between kept ones that have moved too, and what they enclose, bool; ``mean`` is the change of each cell."""
@@ -294,11 +323,22 @@ class ContactMask(nn.Module):
         closed = erode(dilate(kept, self.bridge_cells), self.bridge_cells)
         return self.filled(kept | (closed & weak)) & ~kept
 
+    def tail(self, mean: Tensor, kept: Tensor) -> Tensor:
+        """Cells in which the skin of kept ones goes on, and what they enclose, bool; ``mean`` is the change of each cell."""
+        some = self.some_cells(mean)
+        spread = clipped_std(some, std_of_quarter(self.quarter(some))).clamp_min(self.least_spread)
+        weak = (mean / spread[..., None]).square().sum(1, keepdim=True) > self.tail_sigmas**2
+        return self.filled(self.reconstruct(kept, weak | kept)) & ~kept
+
+    def some_cells(self, mean: Tensor) -> Tensor:
+        """Some thousand of the cells' mean changes (B, 3, h, w), without their sign, (B, 3, N)."""
+        rows, columns = mean.shape[2], mean.shape[3]
+        step = max(1, min(max(rows, columns) // 40, rows, columns))
+        return mean[:, :, step // 2 :: step, step // 2 :: step].abs().flatten(2)
+
     def faint(self, mean: Tensor) -> Tensor:
         """Cells whose mean change stands out of the spread of all cells by 5 sigmas, bool."""
-        rows, columns = mean.shape[2], mean.shape[3]
-        step = max(1, min(max(rows, columns) // 40, rows, columns))  # a median of some thousand cells is as good
-        spread = std_of_median(self.median(mean[:, :, step // 2 :: step, step // 2 :: step].abs().flatten(2)))
+        spread = std_of_median(self.median(self.some_cells(mean)))
         return (mean / spread.clamp_min(1.0 / self.cell)[..., None]).square().sum(1, keepdim=True) > 25.0
 
     def filled(self, mask: Tensor) -> Tensor:

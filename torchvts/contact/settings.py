@@ -10,8 +10,8 @@ class ContactSettings:
     """Thresholds of where the skin has moved and of where an object touches it.
 
     Args:
-        sigmas: change of a pixel from which its skin has moved, in units of the frame's own noise. Higher loses the faint skin
-            around a contact, and with it depth; lower finds fainter presses and more dirt.
+        sigmas: change of a pixel from which its skin has moved, in units of the frame's own noise; two thirds of it decide how far
+            the faint skin around goes on. Higher loses that skin, and with it depth; lower finds fainter presses and more dirt.
         min_size_px: diameter of the smallest area that counts, pixels.
         share: pressure from which the object touches, in units of what lifts free skin of the slope nearby. Higher draws the rim
             of the contact inward.

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from ..core.cells import cell_means
 from ..core.checks import check_batch, check_mask, check_positive, check_same_size
+from ..core.morphology import dilate_cross
 
 CELL_MM = 0.13
 """Side of the cells in which pressure is found, at most; finer, the noise of slopes hides it."""
@@ -18,7 +19,7 @@ CELL_MM = 0.13
 RIM_MM = 3.5
 """Length of rim along which its depth is averaged, either way."""
 
-DECAY_MM = (0.1, 2.0)
+DECAY_MM = (0.1, 3.0)
 """Bounds of the length on which free skin decays."""
 
 TAIL = (0.03, 0.4)
@@ -186,6 +187,22 @@ class ContactFromDepth(nn.Module):
         """L^2 of each frame, (B, 1, 1, 1): that of laplace z = z / L^2 in free skin, whose depth is given and zero elsewhere."""
         squared = free.square().sum(dim=(2, 3), keepdim=True) / (free * curvature).sum(dim=(2, 3), keepdim=True).clamp_min(1e-9)
         return squared.clamp(self.decay[0] ** 2, self.decay[1] ** 2)
+
+
+def above_tail(depth_mm: Tensor, deformed: Tensor, tail: Tensor) -> tuple[Tensor, Tensor]:
+    """Depth from where moved skin goes on below the threshold of :class:`ContactMask`, and the deformed area without its tail.
+
+    There skin sinks with all of the gel and rises more slowly than a membrane; only what it is deeper than that shows the pressure.
+
+    Args:
+        depth_mm: (B, 1, H, W).
+        deformed: (B, 1, H, W) bool.
+        tail: (B, 1, H, W) bool, part of it.
+    """
+    core = deformed & ~tail
+    border = (dilate_cross(core) & tail).to(torch.uint8).to(depth_mm.dtype)
+    level = (depth_mm * border).sum(dim=(2, 3), keepdim=True) / border.sum(dim=(2, 3), keepdim=True).clamp_min(1.0)
+    return torch.where(level > 0.0, (depth_mm - level).clamp_min(0.0), depth_mm), core
 
 
 def _box(image: Tensor, reach: int) -> Tensor:

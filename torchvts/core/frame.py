@@ -84,10 +84,10 @@ class MaskedGradient(nn.Module):
         return gradient * as_factor(mask, gradient)
 
 
-def depth_in_window(frame: Frame, depth_mm: Tensor) -> Tensor:
-    """The window's part (B, 1, h, w) of a depth (B, 1, H, W)."""
+def in_window(frame: Frame, image: Tensor) -> Tensor:
+    """The window's part (B, C, h, w) of (B, C, H, W)."""
     top, left = frame.window
-    return depth_mm[:, :, top : top + frame.image.shape[2], left : left + frame.image.shape[3]]
+    return image[:, :, top : top + frame.image.shape[2], left : left + frame.image.shape[3]]
 
 
 def with_deformed(frame: Frame, image: Tensor, mask: Tensor) -> Frame:

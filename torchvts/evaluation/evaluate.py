@@ -179,7 +179,7 @@ def summary(scores: Sequence[PressScore]) -> dict[str, float | None]:
     return errors
 
 
-_MEANS = ("normal_deg", "depth_normal_deg", "relief_um", "tilt_um", "level_um")
+_MEANS = ("normal_deg", "depth_normal_deg", "relief_um", "tilt_um", "level_um", "depth_um")
 _MEDIANS = ("radius_percent", "center_px", "iou", "area_percent", "stray_px", "lowest_mm")
 
 
@@ -230,6 +230,7 @@ COLUMNS = (
     error_column("of depth deg", "depth_normal_deg", 2),
     error_column("relief um", "relief_um", 1),
     error_column("without tilt um", "level_um", 1),
+    error_column("depth um", "depth_um", 0),
     error_column("radius %", "radius_percent", 1),
     _with_worst("contact IoU", "iou", 2),
     error_column("contact area %, median", "area_percent", 0),

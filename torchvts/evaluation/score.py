@@ -28,12 +28,14 @@ class Truth(NamedTuple):
         gradient: (1, 2, H, W), its slope, mm per mm.
         region: (1, 1, H, W) bool, the pixels where depth and normals are scored.
         contact: (1, 1, H, W) bool, where the object touches; None if that is unknown.
+        from_undeformed: whether depth is counted from the undeformed skin, and not up to a constant.
     """
 
     depth_mm: Tensor
     gradient: Tensor
     region: Tensor
     contact: Tensor | None = None
+    from_undeformed: bool = False
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,8 @@ class PressScore:
         relief_um: RMS difference of depth and truth, each less its own mean, micrometres.
         tilt_um: the part of ``relief_um`` that is a plane: the effect of a wrong label of the centre, and of errors that a
             response field makes alike all over a contact.
+        depth_um: mean difference of depth and truth, micrometres: below zero depth is too small; None where truth is known up to a
+            constant only, as of balls whose depth below the undeformed skin nobody measured.
         iou: intersection over union of the contact found and the true one.
         area_percent: area of the contact found against that of the true one, percent; above zero it is too large.
         stray_px: pixels of contact farther from the center of a ball than :data:`STRAY_RADII` contact radii.
@@ -63,6 +67,7 @@ class PressScore:
     depth_normal_deg: float | None = None
     relief_um: float | None = None
     tilt_um: float | None = None
+    depth_um: float | None = None
     iou: float | None = None
     area_percent: float | None = None
     stray_px: int | None = None
@@ -196,6 +201,7 @@ def score_surface(
         depth_normal_deg=float(normal_angle_deg(normal_from_gradient(slope), true_normal, truth.region).mean()),
         relief_um=1000.0 * float(error.std(correction=0)),
         tilt_um=1000.0 * _tilt(error, torch.nonzero(region).t()),
+        depth_um=1000.0 * float(error.mean()) if truth.from_undeformed else None,
         iou=None if compared is None else mask_iou(*compared),
         area_percent=None if compared is None or not bool(compared[1].any()) else _area_percent(*compared),
     )

@@ -308,7 +308,7 @@ def _drawn(name: str, limit: int | None) -> DataSet:
 
 def truth_of(scene: Scene) -> Truth:
     """The truth of an exact scene, to be scored in its contact."""
-    return Truth(scene.depth_mm.double(), scene.gradient.double(), scene.contact, scene.contact)
+    return Truth(scene.depth_mm.double(), scene.gradient.double(), scene.contact, scene.contact, from_undeformed=True)
 
 
 DRAWN = tuple(f"drawn_{seed}" for seed in SEEDS)

@@ -27,7 +27,7 @@ from ..accelerated.frame import solve_frames
 from ..accelerated.threads import OneThread, one_suffices, share_frames
 from ..compensate import Compensate as PlainCompensate
 from ..contact import ContactMask as PlainContactMask
-from ..contact import ContactSettings
+from ..contact import ContactSettings, above_tail
 from ..core.checks import (
     check_batch,
     check_choice,
@@ -45,7 +45,7 @@ from ..core.frame import (
     Frame,
     Solution,
     batch_like,
-    depth_in_window,
+    in_window,
     joined,
     undeformed_output,
     with_noise,
@@ -318,8 +318,12 @@ class DepthPipeline(nn.Module):
         """The output of checked images (B, 3, H, W), all solved in the one window that holds the deformed skin of all."""
         compensated = self.compensate(images)
         image = self.smooth(compensated)
+        tail = torch.zeros_like(compensated[:, 0:1], dtype=torch.bool)
         # a ContactMask gets both, so that the smooth change of the light is found once; any other mask the first alone
-        deformed = self.deformed(compensated, image) if hasattr(self.deformed, "smooth_light") else self.deformed(compensated)
+        if hasattr(self.deformed, "smooth_light"):
+            deformed = self.deformed(compensated, image, tail)
+        else:
+            deformed = self.deformed(compensated)
         frame = self.crop(image, deformed)
         if may_read_values() and (images.shape[0] == 0 or (self.skips_undeformed and self.nothing_to_solve(frame))):
             return undeformed_output(frame)
@@ -327,7 +331,8 @@ class DepthPipeline(nn.Module):
         frame, solution = self.with_faces(frame, self.solve(frame))  # eq. 9, 5, 4
         frame, solution = self.refine(frame, solution)  # eq. 10
         solution = Solution(solution.gradient, self.zero(solution.depth_mm, frame.deformed))
-        contact = self.contact(depth_in_window(frame, solution.depth_mm), solution.gradient, frame.mask)
+        pressing, core = above_tail(in_window(frame, solution.depth_mm.detach()), frame.mask, in_window(frame, tail))
+        contact = self.contact(pressing, solution.gradient, core)
         solution = self.slopes(frame, solution)
         out: DepthOutput = self.uncrop(frame, solution, contact)
         return out

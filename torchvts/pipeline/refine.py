@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from ..accelerated import MaskedGradient
-from ..core.frame import Frame, Solution, as_factor, depth_in_window
+from ..core.frame import Frame, Solution, as_factor, in_window
 from ..integration import Integrator
 from ..normals import NormalModel
 from .solve import Solve
@@ -112,7 +112,7 @@ class SlopesOfDepth(nn.Module):
         self.gradient = MaskedGradient(mm_per_pixel)
 
     def forward(self, frame: Frame, solution: Solution) -> Solution:
-        gradient = self.gradient(depth_in_window(frame, solution.depth_mm), frame.mask)
+        gradient = self.gradient(in_window(frame, solution.depth_mm), frame.mask)
         return Solution(gradient, solution.depth_mm)
 
 
@@ -173,7 +173,7 @@ class Adaptive(Repeat):
         (top, left), (height, width) = frame.window, frame.size
         first, step = self.stride // 2, self.stride
         image = frame.image.detach()[:, :, first::step, first::step]
-        depth = depth_in_window(frame, solution.depth_mm.detach())[:, :, first::step, first::step]
+        depth = in_window(frame, solution.depth_mm.detach())[:, :, first::step, first::step]
         inside = as_factor(frame.mask[:, :, first::step, first::step], image)
         before = solution.gradient.detach()[:, :, first::step, first::step]
         corner = (top // step, left // step)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from ..contact import ContactMask
 from ..core.checks import may_read_values
-from ..core.frame import Frame, Solution, as_factor, depth_in_window, with_deformed
+from ..core.frame import Frame, Solution, as_factor, in_window, with_deformed
 from ..core.geometry import slope_of_depth
 from ..integration import Integrator
 from .refine import Repeat
@@ -110,7 +110,7 @@ class Shadows(nn.Module):
         solve, normals = self.policy.solve, self.policy.solve.normals
         before = self.residual(frame, solution)
         view = normals.view(frame.image, frame.window)
-        depth = depth_in_window(frame, solution.depth_mm)
+        depth = in_window(frame, solution.depth_mm)
         slope: Tensor = normals.shadowed.mirrored(solution.gradient, frame.image, depth, view, frame.noise_std)
         slope = slope * as_factor(frame.mask, frame.image)
         other = self.policy.repeat(frame, solve.integrated(frame, slope), has_shadow)
@@ -158,7 +158,7 @@ class Shadows(nn.Module):
 
     def residual(self, frame: Frame, solution: Solution) -> Tensor:
         """Squared difference of the gradient and the slopes of its depth, noise smoothed away, (B, 1, h, w)."""
-        slope = slope_of_depth(depth_in_window(frame, solution.depth_mm), self.mm_per_pixel)
+        slope = slope_of_depth(in_window(frame, solution.depth_mm), self.mm_per_pixel)
         difference = (slope - solution.gradient) * as_factor(frame.mask, solution.gradient)
         return nn.functional.avg_pool2d(difference, 9, 1, 4).square().sum(dim=1, keepdim=True)
 

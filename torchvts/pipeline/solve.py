@@ -5,7 +5,7 @@ from typing import Final
 from torch import Tensor, nn
 
 from ..accelerated import Masked
-from ..core.frame import Frame, Solution, depth_in_window
+from ..core.frame import Frame, Solution, in_window
 from ..integration import Integrator
 from ..normals import NormalModel
 
@@ -36,7 +36,7 @@ class Solve(nn.Module):
             frame: the frame.
             depth_mm: (B, 1, H, W), the depth so far, which eq. 10 takes; None for eq. 9.
         """
-        depth = None if depth_mm is None else depth_in_window(frame, depth_mm)
+        depth = None if depth_mm is None else in_window(frame, depth_mm)
         if self.takes_noise:
             normal = self.normals(frame.image, depth, frame.window, frame.noise_std)
         else:

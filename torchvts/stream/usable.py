@@ -1,4 +1,5 @@
-"""Frames that cannot be used: black, of one colour, overexposed, 12 bits in 16, cropped or turned otherwise than the background."""
+"""Frames that cannot be used: black, cut short, of one colour, overexposed, 12 bits in 16, cropped or turned otherwise than the
+background."""
 
 from collections.abc import Callable
 
@@ -14,6 +15,12 @@ BRIGHT = 0.985
 
 MOST_OVEREXPOSED = 0.8
 """Share of the cells that may be overexposed."""
+
+LIT, BLACK = 0.06, 2.0 / 255.0
+"""A line of the background as bright as the one, in some channel, is black in a frame if all its values are below the other."""
+
+EVERY = 8
+"""Of a line every so many pixels are looked at."""
 
 TWELVE_BITS = 4095.0 / 65535.0
 """Largest value of 12 bits stored in 16."""
@@ -65,7 +72,8 @@ class FrameCheck:
         self.size = (background.shape[1], background.shape[2])
         self.cell = max(1, min(self.size) // 24)
         self.background = self._cells(background[None].float())
-        self._lit = [(channel, lit) for channel, lit in enumerate(self.background > 0.06) if bool(lit.any())]
+        self._lit = [(channel, lit) for channel, lit in enumerate(self.background > LIT) if bool(lit.any())]
+        self._lit_lines = [line > LIT for line in _lines(background)]
         self._overexposed = _overexposed(self.background) > MOST_OVEREXPOSED
 
     def __call__(self, frame: Tensor) -> str:
@@ -82,6 +90,11 @@ class FrameCheck:
             if float(frame.max()) <= TWELVE_BITS + 1e-6:
                 cause = f"its largest value is {round(65535 * float(frame.max()))} of 65535: 12 bits stored in 16?"
             return f"the frame is dark, {level:.0%} of the background's brightness: {cause}"
+        black = sum(int(((line < BLACK) & lit).sum()) for line, lit in zip(_lines(frame[0]), self._lit_lines, strict=True))
+        if black > 0:
+            return (
+                f"{black} rows or columns of the frame are black: it was cut short, or the camera has lost them since calibration"
+            )
         if not self._overexposed and _overexposed(cells) > MOST_OVEREXPOSED:
             return "the frame is overexposed: nearly all of it is saturated"
         as_it_is = _likeness(ratio)
@@ -101,6 +114,11 @@ class FrameCheck:
         if best < 0.5 or best < 1.5 * as_it_is:
             return ""
         return f"the frame is {what}: then {best:.0%} of it is like the background, as it is {as_it_is:.0%}"
+
+
+def _lines(image: Tensor) -> tuple[Tensor, Tensor]:
+    """Largest value of each row and of each column of (3, H, W)."""
+    return image[:, :, ::EVERY].amax((0, 2)), image[:, ::EVERY].amax((0, 1))
 
 
 def _range(image: Tensor) -> float:

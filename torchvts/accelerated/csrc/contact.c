@@ -274,11 +274,11 @@ static void cell_shares(const uint16_t *values, int width, int cell, int columns
 }
 
 /* What one frame needs besides its masks: of cells, samples of each channel, three mean changes, a share and then a weight each, and lines of both; masks
-   of cells that have changed, faint ones among them, ones outside of any contact, kept ones, ones where cells decide, not pixels; two masks for
-   what is at hand, and lines of bytes. */
+   of cells that have changed, faint ones among them, ones outside of any contact, kept ones, ones where cells decide, not pixels, ones of
+   skin below the threshold; two masks for what is at hand, and lines of bytes. */
 typedef struct {
     float *some, *means, *density, *down, *sums;
-    uint64_t *changed, *faint, *outside, *kept, *solid, *one, *other;
+    uint64_t *changed, *faint, *outside, *kept, *solid, *tail, *one, *other;
     uint8_t *line, *other_line;
 } Scratch;
 
@@ -287,7 +287,7 @@ typedef struct {
     int rows, columns, cell, reach;
     float least_cells;
     int bridge;
-    float bridge_sigmas;
+    float bridge_sigmas, tail_sigmas, least_spread;
     Shape shape;
 } Grid;
 
@@ -301,7 +301,7 @@ typedef struct {
     int works[3], bands;
     Grid grid;
     Scratch at;
-    uint8_t *raw, *strong, *inner;
+    uint8_t *raw, *strong, *inner, *tail;
     atomic_int short_of_memory;
 } Frame;
 
@@ -416,18 +416,23 @@ WIDE static void longer_than(const float *restrict means, size_t cells, const fl
     }
 }
 
+/* Some thousand of a channel's mean changes, without their sign; returns their number. */
+static int some_cells(const Grid *grid, const float *means, float *some) {
+    const int rows = grid->rows, columns = grid->columns, longer = rows > columns ? rows : columns, shorter = rows + columns - longer;
+    const int step = longer < 80 ? 1 : least(longer / 40, shorter); /* at least one line of a thin grid */
+    int n = 0;
+    for (int i = step / 2; i < rows; i += step)
+        for (int j = step / 2; j < columns; j += step) some[n++] = fabsf(means[(size_t)i * columns + j]);
+    return n;
+}
+
 /* 1 over the frame's own spread of mean changes, of one channel. */
 static void find_spread(void *with, int c) {
     Frame *of = with;
     const Grid *grid = &of->grid;
-    const int rows = grid->rows, columns = grid->columns, longer = rows > columns ? rows : columns, shorter = rows + columns - longer;
-    const int step = longer < 80 ? 1 : least(longer / 40, shorter); /* at least one line of a thin grid */
-    const size_t cells = (size_t)rows * columns;
-    const float *means = of->at.means + c * cells;
+    const size_t cells = (size_t)grid->rows * grid->columns;
     float *some = of->at.some + c * (2 * cells + 1), least_std = 1.0f / (float)grid->cell;
-    int n = 0;
-    for (int i = step / 2; i < rows; i += step)
-        for (int j = step / 2; j < columns; j += step) some[n++] = fabsf(means[(size_t)i * columns + j]);
+    const int n = some_cells(grid, of->at.means + c * cells, some);
     const float std = median(some, n, some + n) / 0.6745f;
     of->per[c] = 1.0f / (std < least_std ? least_std : std);
 }
@@ -510,6 +515,17 @@ static void keep_large(const Grid *grid, Scratch at) {
     flood(at.kept, at.one, &grid->shape);
 }
 
+/* Keeps the cells of at.other, among them all kept ones, and what they enclose. There cells decide. */
+static void keep_filled(const Grid *grid, Scratch at) {
+    invert_bits(at.other, &grid->shape, at.one);
+    flood_from_border(at.one, &grid->shape, at.other);
+    invert_bits(at.other, &grid->shape, at.one); /* what the border does not reach */
+    for (size_t k = 0; k < words_of(&grid->shape); k++) {
+        const uint64_t more = at.one[k] & ~at.kept[k];
+        at.kept[k] |= more, at.faint[k] |= more, at.outside[k] &= ~more;
+    }
+}
+
 /* Keeps cells between kept ones that have moved too, and what they enclose: a closing by a square. There cells decide. */
 static void bridge_gaps(const Grid *grid, Scratch at) {
     static const float as_is[3] = {1.0f, 1.0f, 1.0f};
@@ -531,14 +547,30 @@ static void bridge_gaps(const Grid *grid, Scratch at) {
             at.other[row + w] = at.kept[row + w] | more, added |= more;
         }
     }
-    if (!added) return;
-    invert_bits(at.other, &grid->shape, at.one);
-    flood_from_border(at.one, &grid->shape, at.other);
-    invert_bits(at.other, &grid->shape, at.one); /* what the border does not reach */
-    for (size_t k = 0; k < words_of(&grid->shape); k++) {
-        const uint64_t more = at.one[k] & ~at.kept[k];
-        at.kept[k] |= more, at.faint[k] |= more, at.outside[k] &= ~more;
+    if (added) keep_filled(grid, at);
+}
+
+/* Keeps the cells in which the skin of kept ones goes on, and what they enclose. There cells decide. */
+static void keep_tail(const Grid *grid, Scratch at) {
+    const int rows = grid->rows, columns = grid->columns, words = grid->shape.words;
+    const size_t cells = (size_t)rows * columns;
+    float per[3];
+    for (int c = 0; c < 3; c++) {
+        const int n = some_cells(grid, at.means + c * cells, at.some);
+        float spread = kth_or_none(at.some, n, n / 4, at.some + n) / 0.3186f;
+        for (int pass = 0; pass < 2; pass++) spread = clipped_std(at.some, n, spread);
+        per[c] = 1.0f / (spread < grid->least_spread ? grid->least_spread : spread);
     }
+    for (int i = 0; i < rows; i++) {
+        const size_t row = (size_t)i * words;
+        longer_than(at.means + (size_t)i * columns, cells, per, grid->tail_sigmas * grid->tail_sigmas, columns, at.line);
+        pack_bits(at.line, &grid->shape, at.one + row);
+        for (int w = 0; w < words; w++) at.one[row + w] |= at.other[row + w] = at.kept[row + w];
+    }
+    flood(at.other, at.one, &grid->shape);
+    for (size_t k = 0; k < words_of(&grid->shape); k++) at.tail[k] = at.kept[k];
+    keep_filled(grid, at);
+    for (size_t k = 0; k < words_of(&grid->shape); k++) at.tail[k] ^= at.kept[k];
 }
 
 /* Cells that decide for all their pixels: faint ones, and those none of whose neighbours lies outside of the contact; what is beyond the image
@@ -558,7 +590,8 @@ static void to_pixels(void *with, int band) {
     Frame *of = with;
     const Shape *shape = &of->grid.shape;
     const int cell = of->grid.cell, height = of->height, width = of->width, words = shape->words;
-    uint8_t *kept_line = malloc(2 * (size_t)width + 64 * (size_t)words), *solid_line = kept_line + width, *bytes = solid_line + width;
+    uint8_t *kept_line = malloc(3 * (size_t)width + 64 * (size_t)words), *solid_line = kept_line + width, *tail_line = solid_line + width;
+    uint8_t *bytes = tail_line + width;
     if (!kept_line) {
         of->short_of_memory = 1;
         return;
@@ -572,15 +605,19 @@ static void to_pixels(void *with, int band) {
             repeat(bytes, cell, width, kept_line);
             unpack_bits(solid, shape, bytes);
             repeat(bytes, cell, width, solid_line);
+            unpack_bits(of->at.tail + (size_t)i * words, shape, bytes);
+            repeat(bytes, cell, width, tail_line);
         }
         for (int y = i * cell; y < least((i + 1) * cell, height); y++) {
             const size_t row = (size_t)y * width;
             if (any) {
                 keep_line(kept_line, solid_line, width, of->strong + row);
                 memcpy(of->inner + row, solid_line, (size_t)width);
+                memcpy(of->tail + row, tail_line, (size_t)width);
             } else {
                 memset(of->strong + row, 0, (size_t)width);
                 memset(of->inner + row, 0, (size_t)width);
+                memset(of->tail + row, 0, (size_t)width);
             }
         }
     }
@@ -603,12 +640,14 @@ static int mask_frame(Frame *of) {
     share(find_spread, of, 3);
     if (find_cells(&of->grid, of->per, of->at)) {
         keep_large(&of->grid, of->at);
-        if (of->grid.bridge > 0) bridge_gaps(&of->grid, of->at);
+        memset(of->at.tail, 0, sizeof(uint64_t) * words_of(&of->grid.shape));
+        if (of->grid.bridge > 0) bridge_gaps(&of->grid, of->at), keep_tail(&of->grid, of->at);
         find_solid(&of->grid, of->at);
         share(to_pixels, of, of->bands);
     } else {
         memset(of->strong, 0, pixels);
         memset(of->inner, 0, pixels);
+        memset(of->tail, 0, pixels);
     }
     return of->short_of_memory ? 1 : not_finite ? 2 : 0;
 }
@@ -616,22 +655,22 @@ static int mask_frame(Frame *of) {
 /*
  * image (frames, 3, height, width), with offset and per_noise (3, height, width): change = image * per_noise + offset; offset
  * null where it is -per_noise. divided: image, or image without a smooth change of the light, which has no part in the noise. smooth:
- * null, or how to divide one out here; surface (frames, 3, 6) then takes its coefficients. Writes mask and inner, bytes (frames,
- * height, width); inner is where cells decide, not pixels.
+ * null, or how to divide one out here; surface (frames, 3, 6) then takes its coefficients. Writes mask, inner and tail, bytes
+ * (frames, height, width); inner is where cells decide, not pixels, tail where moved skin goes on below the threshold.
  * Returns 0, 1 where memory is short, or 2 where a value is not finite or its square would not be, and the masks mean nothing.
  */
 EXPORT int contact_mask(const float *image, const float *divided, const float *offset, const float *per_noise, const float *failed_below,
                         const float *most_far_field, int frames, int height, int width, int step, int stride, int cell, int reach,
-                        float sigmas, float rounding, float least_cells, int bridge, float bridge_sigmas, const SmoothLight *smooth,
-                        float *surface, uint8_t *mask, uint8_t *inner) {
+                        float sigmas, float rounding, float least_cells, int bridge, float bridge_sigmas, float tail_sigmas,
+                        float least_spread, const SmoothLight *smooth, float *surface, uint8_t *mask, uint8_t *inner, uint8_t *tail) {
     const int rows = (height + cell - 1) / cell, columns = (width + cell - 1) / cell;
-    const Grid grid = {rows, columns, cell, reach, least_cells, bridge, bridge_sigmas, shape_of(rows, columns)};
+    const Grid grid = {rows, columns, cell, reach, least_cells, bridge, bridge_sigmas, tail_sigmas, least_spread, shape_of(rows, columns)};
     const size_t pixels = (size_t)height * width, cells = (size_t)rows * columns, words = words_of(&grid.shape), line = 64 * (size_t)grid.shape.words;
-    uint64_t *masks = malloc(7 * sizeof(uint64_t) * words + sizeof(float) * (10 * cells + 3 + 2 * line + 2 * (size_t)reach) + 2 * line);
+    uint64_t *masks = malloc(8 * sizeof(uint64_t) * words + sizeof(float) * (10 * cells + 3 + 2 * line + 2 * (size_t)reach) + 2 * line);
     if (!masks) return 1;
     Scratch at = {.changed = masks, .faint = masks + words, .outside = masks + 2 * words, .kept = masks + 3 * words, .solid = masks + 4 * words};
-    at.one = masks + 5 * words, at.other = masks + 6 * words;
-    at.some = (float *)(masks + 7 * words), at.means = at.some + 6 * cells + 3, at.density = at.means + 3 * cells, at.sums = at.density + cells;
+    at.one = masks + 5 * words, at.other = masks + 6 * words, at.tail = masks + 7 * words;
+    at.some = (float *)(masks + 8 * words), at.means = at.some + 6 * cells + 3, at.density = at.means + 3 * cells, at.sums = at.density + cells;
     at.down = at.sums + line, at.line = (uint8_t *)(at.down + line + 2 * reach), at.other_line = at.line + line;
     int code = 0;
     for (int b = 0; b < frames && code != 1; b++) {
@@ -640,7 +679,7 @@ EXPORT int contact_mask(const float *image, const float *divided, const float *o
         frame.smooth = smooth, frame.surface = smooth ? surface + 18 * b : NULL;
         frame.rounding = rounding, frame.threshold = sigmas * sigmas;
         frame.bands = least(rows, bands_of(height)), frame.grid = grid, frame.at = at;
-        frame.raw = frame.inner = inner + pixels * b, frame.strong = mask + pixels * b; /* cells decide after pixels are closed */
+        frame.raw = frame.inner = inner + pixels * b, frame.strong = mask + pixels * b, frame.tail = tail + pixels * b; /* cells decide after pixels are closed */
         const int found = mask_frame(&frame);
         code = found == 1 ? 1 : code | found;
     }

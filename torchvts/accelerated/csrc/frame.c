@@ -16,7 +16,7 @@ typedef struct {
     float least_drift, most_drift, believed_drift;
     /* ContactMask */
     int32_t step, stride, cell, reach, bridge;
-    float sigmas, rounding, least_cells, bridge_sigmas;
+    float sigmas, rounding, least_cells, bridge_sigmas, tail_sigmas, least_spread;
     const SmoothLight *smooth; /* of SmoothDrift too; or null */
     const float *flat, *per_noise, *failed_below, *most_far_field;
     /* Crop: corners on multiples of `corners` */
@@ -46,7 +46,7 @@ typedef struct {
 /* Memory of one frame besides. */
 typedef struct {
     float *light, *gradient, *depth;
-    uint8_t *inner, *contact; /* and two lines, and four bytes each, behind `inner` */
+    uint8_t *contact, *tail, *inner; /* and two lines, and four bytes each, behind `inner` */
 } Work;
 
 typedef struct {
@@ -154,8 +154,8 @@ static int solve_frame(const Program *of, const float *image, Work work, Output 
     if (trouble) return trouble;
     float surface[18];
     const int code = contact_mask(light, light, of->flat, of->per_noise, of->failed_below, of->most_far_field, 1, height, width, of->step, of->stride,
-                                  of->cell, of->reach, of->sigmas, of->rounding, of->least_cells, of->bridge, of->bridge_sigmas, of->smooth, surface,
-                                  out.deformed, work.inner);
+                                  of->cell, of->reach, of->sigmas, of->rounding, of->least_cells, of->bridge, of->bridge_sigmas, of->tail_sigmas,
+                                  of->least_spread, of->smooth, surface, out.deformed, work.inner, work.tail);
     if (code) return code == 1 ? SHORT : BEYOND;
     Window at = window_of(of, out.deformed);
     if (at.rows == 0) {
@@ -173,7 +173,11 @@ static int solve_frame(const Program *of, const float *image, Work work, Output 
     if (trouble) return trouble;
     const size_t corner = (size_t)at.top * width + at.left;
     if (of->zeroes && zero_background(found, out.deformed, 1, height, width, of->stiff, of->tolerance, of->sweeps, out.depth)) return SHORT;
-    if (contact_from_depth(out.depth + corner, 0, width, work.gradient, out.deformed + corner, 0, width, 1, at.rows, at.columns, of->contact_cell,
+    const float *pressing = out.depth;
+    const uint8_t *core = out.deformed;
+    if (above_tail(out.depth + corner, out.deformed + corner, work.tail + corner, width, at.rows, at.columns, work.depth + corner, work.inner + corner))
+        pressing = work.depth, core = work.inner;
+    if (contact_from_depth(pressing + corner, 0, width, work.gradient, core + corner, 0, width, 1, at.rows, at.columns, of->contact_cell,
                            of->contact_reach, of->contact_model, work.contact))
         return SHORT;
     if (of->slopes_of_depth)
@@ -190,10 +194,10 @@ static int solve_frame(const Program *of, const float *image, Work work, Output 
 EXPORT int solve_frames(const Program *of, const float *images, int frames, int threads, float *depth, float *gradient, float *normal,
                         uint8_t *contact, uint8_t *deformed) {
     const size_t pixels = (size_t)of->height * of->width;
-    float *floats = malloc(pixels * (6 * sizeof(float) + 2) + 2 * ((size_t)of->width + 4));
+    float *floats = malloc(pixels * (6 * sizeof(float) + 3) + 2 * ((size_t)of->width + 4));
     if (!floats) return SHORT;
     uint8_t *bytes = (uint8_t *)(floats + 6 * pixels);
-    const Work work = {floats, floats + 3 * pixels, floats + 5 * pixels, bytes + pixels, bytes};
+    const Work work = {floats, floats + 3 * pixels, floats + 5 * pixels, bytes, bytes + pixels, bytes + 2 * pixels};
     const int shared = begin_sharing(threads);
     int trouble = 0;
     for (size_t b = 0; b < (size_t)frames && !trouble; b++) {

@@ -98,9 +98,9 @@ EXPORT int clean(const float *image, const float *gain, const float *offset, con
 EXPORT int levels(const float *image, int frames, int height, int width, int stride, int halvings, float least_drift, float most, float *level);
 EXPORT void divide_planes(const float *image, const float *level, int planes, int64_t n, float *result);
 EXPORT int contact_mask(const float *image, const float *divided, const float *offset, const float *per_noise, const float *failed_below,
-                        const float *most_far_field, int frames, int height, int width, int step, int stride, int cell, int reach, float sigmas, float rounding,
-                        float least_cells, int bridge, float bridge_sigmas, const SmoothLight *smooth, float *surface, uint8_t *mask,
-                        uint8_t *inner);
+                        const float *most_far_field, int frames, int height, int width, int step, int stride, int cell, int reach, float sigmas,
+                        float rounding, float least_cells, int bridge, float bridge_sigmas, float tail_sigmas, float least_spread,
+                        const SmoothLight *smooth, float *surface, uint8_t *mask, uint8_t *inner, uint8_t *tail);
 EXPORT void box_of(const uint8_t *mask, int frames, int height, int width, int *box);
 EXPORT void response_normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *place, const float *weight,
                              int degree, int terms, const float *depth, int64_t depth_frame, int64_t depth_row, const float *per_mm, float max_sine,
@@ -119,6 +119,7 @@ EXPORT int zero_background(const float *depth, const uint8_t *deformed, int fram
 int add_faces(const float *depth, uint8_t *deformed, int height, int width, uint8_t *kind);
 EXPORT void depth_slopes(const float *depth, int64_t depth_frame, int64_t depth_row, const uint8_t *mask, int64_t mask_frame, int64_t mask_row,
                          float half_per_mm, int frames, int rows, int columns, float *gradient);
+int above_tail(const float *depth, const uint8_t *deformed, const uint8_t *tail, int64_t width, int rows, int columns, float *above, uint8_t *core);
 EXPORT int contact_from_depth(const float *depth, int64_t depth_frame, int64_t depth_row, const float *gradient, const uint8_t *deformed,
                               int64_t deformed_frame, int64_t deformed_row, int frames, int rows, int columns, int cell, int reach,
                               const float *numbers, uint8_t *contact);

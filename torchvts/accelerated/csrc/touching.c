@@ -384,6 +384,36 @@ static int allocate(Frame *of) {
     return 0;
 }
 
+/* Whether a pixel of the tail has one of the rest of the deformed area beside it. */
+static int borders_core(const uint8_t *deformed, const uint8_t *tail, int64_t width, int y, int x, int rows, int columns) {
+    const int64_t at = y * width + x;
+    return (x > 0 && deformed[at - 1] > tail[at - 1]) || (x + 1 < columns && deformed[at + 1] > tail[at + 1]) ||
+           (y > 0 && deformed[at - width] > tail[at - width]) || (y + 1 < rows && deformed[at + width] > tail[at + width]);
+}
+
+/* What above_tail() of torchvts/contact/touching.py gives, of a window of rows at this distance; returns 0, and sets nothing, without a tail. */
+int above_tail(const float *depth, const uint8_t *deformed, const uint8_t *tail, int64_t width, int rows, int columns, float *above, uint8_t *core) {
+    double sum = 0.0;
+    int64_t border = 0, any = 0;
+    for (int y = 0; y < rows; y++) {
+        const uint8_t *line = tail + y * width;
+        if (!memchr(line, 1, (size_t)columns)) continue;
+        any = 1;
+        for (int x = 0; x < columns; x++)
+            if (line[x] && borders_core(deformed, tail, width, y, x, rows, columns)) sum += depth[y * width + x], border++;
+    }
+    if (!any) return 0;
+    const float level = border ? (float)(sum / (double)border) : 0.0f;
+    for (int y = 0; y < rows; y++)
+        for (int x = 0; x < columns; x++) {
+            const int64_t at = y * width + x;
+            const float over = depth[at] - level;
+            above[at] = level > 0.0f ? over > 0.0f ? over : 0.0f : depth[at];
+            core[at] = deformed[at] > tail[at];
+        }
+    return 1;
+}
+
 /*
  * Contact, bytes (frames, rows, columns), of a window: depth and deformed (bytes) of it, frames and rows at the given distances; gradient
  * (frames, 2, rows, columns). numbers: in the order of Model. Returns 1 where memory is short.

@@ -22,7 +22,7 @@ RESPONSE_BLUR_PX = 1.0
 """Blur of a response field at 320 x 240: it reduces the error of normals on a GelSight Mini by a third; more blur gains nothing."""
 
 PREPROCESSING_WORTH = 0.1
-"""Another gamma or blur must lower the held-out error by this part: balls are smooth and do not show what a wider blur loses."""
+"""Another gamma or blur must lower the held-out error by this part."""
 
 PREPROCESSING_PRESSES = 10
 """About so many presses choose it: reading them again takes most of the time."""
@@ -85,8 +85,11 @@ def with_preprocessing(sensor: Sensor, prior: ResponseModel | None) -> Sensor:
 
 
 def _other_preprocessing(given: Sensor, chosen: Sensor) -> list[Sensor]:
-    """The sensor with other values of what was left open: half and twice the blur, and another gamma."""
-    others = [dataclasses.replace(chosen, blur_px=factor * chosen.blur_px) for factor in (0.5, 2.0) if given.blur_px == 0]
+    """The sensor with other values of what was left open: half the blur, and another gamma.
+
+    Not twice the blur: balls are smooth, and fit better the more noise is blurred away; what edges lose they cannot show.
+    """
+    others = [dataclasses.replace(chosen, blur_px=0.5 * chosen.blur_px)] if given.blur_px == 0 else []
     return others + ([dataclasses.replace(chosen, gamma=OTHER_GAMMA)] if given.gamma is None else [])
 
 

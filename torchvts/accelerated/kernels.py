@@ -35,7 +35,7 @@ SIGNATURES = {
     "frame_noise": ("i", "p iiii p"),
     "zero_background": ("i", "pp iii ff i p"),
     "contact_from_depth": ("i", "p ll pp ll iiiii pp"),
-    "clean": ("i", "pppppp l p iiii p"),
+    "clean": ("i", "pppppp l p iiii ppp"),
     "levels": ("i", "p iiiii ff p"),
     "smooth_change": ("i", "pp i p"),
     "over_smooth": ("v", "ppp i p"),
@@ -170,7 +170,7 @@ def clean(
             lambda first, many: (
                 1
                 & kernel(  # values outside of [0, 1] may be here
-                    _at(light, first), *maps, pedestal, *filled, weights, len(weights), many, height, width, _at(out, first)
+                    _at(light, first), *maps, pedestal, *filled, weights, len(weights), many, height, width, _at(out, first), None, None
                 )
             ),
         )

@@ -12,10 +12,10 @@
 enum { DEFORMED = 0, FLAT = 1, RAISED = 2 };
 
 /* One grid: rows x columns cells and a border of zeros around them, `wide` cells from row to row. Share on which the value is known, sum of
-   known values, weight; then 1 over the mean weight of nine cells, sums of three of weight * found, and what was found. */
+   known values, weight; then 1 over the mean weight of nine cells, weight * found, and what was found. */
 typedef struct {
     int rows, columns, wide;
-    float *share, *value, *weight, *per_weight, *sums, *found;
+    float *share, *value, *weight, *per_weight, *product, *found;
 } Grid;
 
 /* Pixels of a box: rows top to bottom, columns left to right, the ends outside. */
@@ -59,24 +59,23 @@ WIDE static void set_known(Grid *grid) {
     }
 }
 
-/* Sums of weighted cells of a row, three side by side each. */
-WIDE static void sum_three(const float *restrict weight, const float *restrict before, int n, float *restrict sums) {
-    for (int x = 0; x < n; x++) sums[x] = weight[x - 1] * before[x - 1] + weight[x] * before[x] + weight[x + 1] * before[x + 1];
-}
-
-/* A row of cells that are not known becomes the mean of the sums above, here and below. */
-WIDE static void relax_row(const float *restrict above, const float *restrict here, const float *restrict below, const float *restrict share,
-                           const float *restrict per_weight, int n, float *restrict found) {
-    for (int x = 0; x < n; x++) found[x] = share[x] > 0.0f ? found[x] : (above[x] + here[x] + below[x]) * per_weight[x];
-}
-
 /* Unknown cells become the weighted mean of the nine around them, once. */
-static void relax(Grid *grid) {
-    for (int y = -1; y <= grid->rows; y++)
-        sum_three(cell_of(grid, grid->weight, y), cell_of(grid, grid->found, y), grid->columns, cell_of(grid, grid->sums, y));
-    for (int y = 0; y < grid->rows; y++)
-        relax_row(cell_of(grid, grid->sums, y - 1), cell_of(grid, grid->sums, y), cell_of(grid, grid->sums, y + 1),
-                  cell_of(grid, grid->share, y), cell_of(grid, grid->per_weight, y), grid->columns, cell_of(grid, grid->found, y));
+WIDE static void relax(Grid *grid) {
+    const int wide = grid->wide, columns = grid->columns;
+    const size_t cells = (size_t)(grid->rows + 2) * wide;
+    const float *restrict weight = grid->weight, *restrict before = grid->found;
+    float *restrict product = grid->product;
+    for (size_t k = 0; k < cells; k++) product[k] = weight[k] * before[k];
+    for (int y = 0; y < grid->rows; y++) {
+        const float *p = cell_of(grid, grid->product, y), *restrict share = cell_of(grid, grid->share, y);
+        const float *restrict per_weight = cell_of(grid, grid->per_weight, y);
+        float *restrict found = cell_of(grid, grid->found, y);
+        for (int x = 0; x < columns; x++) {
+            const float *at = p + x;
+            const float sum = at[-wide - 1] + at[-wide] + at[-wide + 1] + at[-1] + at[0] + at[1] + at[wide - 1] + at[wide] + at[wide + 1];
+            found[x] = share[x] > 0.0f ? found[x] : sum * per_weight[x];
+        }
+    }
 }
 
 WIDE static void between(const float *restrict upper, const float *restrict lower, float down, int n, float *restrict line) {
@@ -324,7 +323,7 @@ static int allocate(Work *work, int height, int width) {
         Grid *grid = &work->grids[k];
         const size_t size = (size_t)(grid->rows + 3) * grid->wide;
         grid->share = place, grid->value = place + size, grid->weight = place + 2 * size, grid->per_weight = place + 3 * size;
-        grid->sums = place + 4 * size, grid->found = place + 5 * size;
+        grid->product = place + 4 * size, grid->found = place + 5 * size;
         place += 6 * size;
     }
     work->band_memory = place, work->line = place + (size_t)work->bands * band_size(work), work->along = work->line + first;

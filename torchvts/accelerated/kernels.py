@@ -35,7 +35,7 @@ SIGNATURES = {
     "frame_noise": ("i", "p iiii p"),
     "zero_background": ("i", "pp iii ff i p"),
     "contact_from_depth": ("i", "p ll pp ll iiiii pp"),
-    "clean": ("i", "pppppp l p iiii p"),
+    "clean": ("i", "pppppp l p iiii ppp"),
     "levels": ("i", "p iiiii ff p"),
     "smooth_change": ("i", "pp i p"),
     "over_smooth": ("v", "ppp i p"),
@@ -175,18 +175,14 @@ def clean(
     pedestal = NO_PEDESTAL if isinstance(offset, Tensor) else offset
     filled = (*[index.data_ptr() for index in defects], defects[0].shape[0])
     kernel = loaded().clean
-    _check(
-        by_frames(
-            count,
-            height * width,
-            lambda first, many: (
-                1
-                & kernel(  # values outside of [0, 1] may be here
-                    _at(light, first), *maps, pedestal, *filled, weights, len(weights), many, height, width, _at(out, first)
-                )
-            ),
-        )
-    )
+    no_levels = (None, None)
+
+    def some(first: int, many: int) -> int:
+        at, to = _at(light, first), _at(out, first)
+        code = int(kernel(at, *maps, pedestal, *filled, weights, len(weights), many, height, width, to, *no_levels))
+        return 1 & code  # values outside of [0, 1] may be here
+
+    _check(by_frames(count, height * width, some))
     return out
 
 

@@ -121,71 +121,27 @@ static void fill(float *plane, const int64_t *defect, const int64_t *neighbours,
     for (int64_t k = 0; k < count; k++) plane[defect[k]] = scratch[k];
 }
 
-/* What clean() is given, and the bits of what it returns. */
-typedef struct {
-    const float *image, *gain, *offset, *pedestal;
-    const int64_t *defect, *neighbours;
-    int64_t defects;
-    const float *weight;
-    int taps, height, width, bands;
-    float *light;
-    atomic_int trouble;
-} Cleaning;
-
-/* A band of rows of a plane. Defects lie anywhere, so with them a band is a whole plane, which is filled before it is blurred. */
-static void clean_band(void *with, int part) {
-    Cleaning *of = with;
-    const int plane = part % 3, band = part / 3, taps = of->taps, height = of->height, width = of->width;
-    const int first = height * band / of->bands, last = height * (band + 1) / of->bands;
-    const size_t pixels = (size_t)height * width, at = pixels * (size_t)(plane % 3), lines = (size_t)taps * width + width + taps;
-    const size_t filled = taps && of->defects ? pixels : 0;
-    const Affine affine = {of->image + pixels * plane, of->gain ? of->gain + at : NULL, of->offset ? of->offset + at : NULL, of->pedestal[plane % 3]};
-    float *light = of->light + pixels * plane;
-    float *scratch = malloc(sizeof(float) * (lines + filled + (size_t)of->defects + 1) + sizeof(float *) * (size_t)(taps + 1));
-    if (!scratch) {
-        atomic_fetch_or(&of->trouble, 1);
-        return;
+/* The bits of n floats to whole numbers of the same order, in which negative floats run backwards; and the ends of these. */
+WIDE static void to_keys(uint32_t *bits, int n, uint32_t *lowest, uint32_t *highest) {
+    uint32_t low = 0xffffffffu, high = 0;
+    for (int k = 0; k < n; k++) {
+        const uint32_t key = bits[k] ^ ((uint32_t)((int32_t)bits[k] >> 31) | 0x80000000u);
+        low = key < low ? key : low;
+        high = key > high ? key : high;
+        bits[k] = key;
     }
-    const float **line = (const float **)scratch;
-    float *rows = (float *)(line + taps + 1), *whole = rows + lines, *repaired = whole + filled;
-    int outside = 0;
-    if (taps && !of->defects) {
-        outside = blur_rows(&affine, of->weight, taps, height, width, first, last, rows, line, light);
-    } else {
-        const size_t from = (size_t)first * width;
-        const int n = (last - first) * width;
-        float *to = taps ? whole : light;
-        outside = apply(&affine, from, n, to + from);
-        if (of->defects) fill(to, of->defect, of->neighbours, of->defects, repaired);
-        const Affine as_is = {to, NULL, NULL, 0.0f};
-        if (taps) blur_rows(&as_is, of->weight, taps, height, width, 0, height, rows, line, light);
-    }
-    if (outside) atomic_fetch_or(&of->trouble, 2);
-    free(scratch);
+    *lowest = low, *highest = high;
 }
 
-/*
- * light (frames, 3, height, width) = image * gain + offset, its `defects` filled, blurred by `taps` weights. gain and offset (3, height,
- * width) may be null, taps and defects 0; without offset it is pedestal (3) * gain. Returns 1 where memory is short, 2 where a value of the
- * image is not in [0, 1].
- */
-EXPORT int clean(const float *image, const float *gain, const float *offset, const float *pedestal, const int64_t *defect, const int64_t *neighbours, int64_t defects,
-                 const float *weight, int taps, int frames, int height, int width, float *light) {
-    Cleaning work = {image, gain, offset, pedestal, defect, neighbours, defects, weight, taps, height, width, 1, light, 0};
-    if (!defects) work.bands = bands_of(height);
-    for (int b = 0; b < frames; b++, work.image += 3 * (size_t)height * width, work.light += 3 * (size_t)height * width)
-        share(clean_band, &work, 3 * work.bands);
-    return work.trouble & 1 ? 1 : work.trouble;
+/* The inverse. */
+WIDE static void from_keys(uint32_t *keys, int n) {
+    for (int k = 0; k < n; k++) keys[k] ^= (uint32_t)~((int32_t)keys[k] >> 31) | 0x80000000u;
 }
 
 /* Sorts n values by the bits of their floats, at most twelve at a time; other: as many more. Returns where the sorted values lie. */
 static float *sorted(float *values, float *other, int n) {
-    uint32_t counts[3][4096], *from = (uint32_t *)values, *to = (uint32_t *)other, low = 0xffffffffu, high = 0;
-    for (int k = 0; k < n; k++) { /* an order of whole numbers: negative floats run backwards */
-        from[k] ^= (uint32_t)((int32_t)from[k] >> 31) | 0x80000000u;
-        low = from[k] < low ? from[k] : low;
-        high = from[k] > high ? from[k] : high;
-    }
+    uint32_t counts[3][4096], *from = (uint32_t *)values, *to = (uint32_t *)other, low, high;
+    to_keys(from, n, &low, &high);
     int bits = 0;
     while (bits < 32 && (high - low) >> bits) bits++;
     const int passes = bits > 24 ? 3 : bits > 12 ? 2 : 1, digit = (bits + passes - 1) / passes;
@@ -204,7 +160,7 @@ static float *sorted(float *values, float *other, int n) {
         uint32_t *swapped = from;
         from = to, to = swapped;
     }
-    for (int k = 0; k < n; k++) from[k] ^= (uint32_t)~((int32_t)from[k] >> 31) | 0x80000000u;
+    from_keys(from, n);
     return (float *)from;
 }
 
@@ -263,6 +219,87 @@ static void mode_of(void *with, int plane) {
     free(some);
 }
 
+/* What clean() is given, and the bits of what it returns. */
+typedef struct {
+    const float *image, *gain, *offset, *pedestal;
+    const int64_t *defect, *neighbours;
+    int64_t defects;
+    const float *weight;
+    int taps, height, width, bands;
+    float *light;
+    Modes *modes; /* of what is cleaned, or null */
+    atomic_int trouble, left[3]; /* bands of each plane that are not done yet */
+} Cleaning;
+
+/* A band of rows of a plane. Defects lie anywhere, so with them a band is a whole plane, which is filled before it is blurred. Who cleans the last
+   band of a plane finds its mode. */
+static void clean_band(void *with, int part) {
+    Cleaning *of = with;
+    const int plane = part % 3, band = part / 3, taps = of->taps, height = of->height, width = of->width;
+    const int first = height * band / of->bands, last = height * (band + 1) / of->bands;
+    const size_t pixels = (size_t)height * width, at = pixels * (size_t)plane, lines = (size_t)taps * width + width + taps;
+    const size_t filled = taps && of->defects ? pixels : 0;
+    const Affine affine = {of->image + pixels * plane, of->gain ? of->gain + at : NULL, of->offset ? of->offset + at : NULL, of->pedestal[plane]};
+    float *light = of->light + pixels * plane;
+    float *scratch = malloc(sizeof(float) * (lines + filled + (size_t)of->defects + 1) + sizeof(float *) * (size_t)(taps + 1));
+    if (!scratch) {
+        atomic_fetch_or(&of->trouble, 1);
+        return;
+    }
+    const float **line = (const float **)scratch;
+    float *rows = (float *)(line + taps + 1), *whole = rows + lines, *repaired = whole + filled;
+    int outside = 0;
+    if (taps && !of->defects) {
+        outside = blur_rows(&affine, of->weight, taps, height, width, first, last, rows, line, light);
+    } else {
+        const size_t from = (size_t)first * width;
+        const int n = (last - first) * width;
+        float *to = taps ? whole : light;
+        outside = apply(&affine, from, n, to + from);
+        if (of->defects) fill(to, of->defect, of->neighbours, of->defects, repaired);
+        const Affine as_is = {to, NULL, NULL, 0.0f};
+        if (taps) blur_rows(&as_is, of->weight, taps, height, width, 0, height, rows, line, light);
+    }
+    if (outside) atomic_fetch_or(&of->trouble, 2);
+    free(scratch);
+    if (of->modes && atomic_fetch_sub(&of->left[plane], 1) == 1) mode_of(of->modes, plane);
+}
+
+/* Levels (3) that Drift.by_mode() divides by, in place of modes. */
+static void to_levels(const Leveling *of, float *level) {
+    float largest = 0.0f;
+    for (int c = 0; c < 3; c++) {
+        level[c] -= 1.0f;
+        level[c] = level[c] < -of->most_drift ? -of->most_drift : level[c] > of->most_drift ? of->most_drift : level[c];
+        largest = fabsf(level[c]) > largest ? fabsf(level[c]) : largest;
+    }
+    float weight = largest / of->least_drift - 1.0f;
+    weight = weight < 0.0f ? 0.0f : weight > 1.0f ? 1.0f : weight;
+    for (int c = 0; c < 3; c++) level[c] = 1.0f + weight * level[c];
+}
+
+/*
+ * light (frames, 3, height, width) = image * gain + offset, its `defects` filled, blurred by `taps` weights. gain and offset (3, height,
+ * width) may be null, taps and defects 0; without offset it is pedestal (3) * gain. Where `leveling` is not null, the levels of the light to `level`
+ * (frames, 3). Returns 1 where memory is short, 2 where a value of the image is not in [0, 1].
+ */
+EXPORT int clean(const float *image, const float *gain, const float *offset, const float *pedestal, const int64_t *defect, const int64_t *neighbours, int64_t defects,
+                 const float *weight, int taps, int frames, int height, int width, float *light, const Leveling *leveling, float *level) {
+    const size_t pixels = 3 * (size_t)height * width;
+    const int bands = defects ? 1 : bands_of(height);
+    int trouble = 0;
+    for (int b = 0; b < frames && !(trouble & 1); b++) {
+        Cleaning work = {image + pixels * b, gain, offset, pedestal, defect, neighbours, defects, weight, taps, height, width, bands, light + pixels * b, NULL, 0,
+                         {bands, bands, bands}};
+        Modes modal = {.image = work.light, .height = height, .width = width};
+        if (leveling) modal.stride = leveling->stride, modal.halvings = leveling->halvings, modal.mode = level + 3 * b, work.modes = &modal;
+        share(clean_band, &work, 3 * bands);
+        trouble |= work.trouble | modal.short_of_memory;
+        if (leveling) to_levels(leveling, level + 3 * b);
+    }
+    return trouble & 1 ? 1 : trouble;
+}
+
 /* The mode of every stride-th pixel of each of `planes` images. Returns 1 where memory is short. */
 EXPORT int modes(const float *image, int planes, int height, int width, int stride, int halvings, float *mode) {
     Modes work = {image, height, width, stride, halvings, mode, 0};
@@ -272,18 +309,9 @@ EXPORT int modes(const float *image, int planes, int height, int width, int stri
 
 /* The same made the levels that Drift.by_mode() divides by, (frames, 3). */
 EXPORT int levels(const float *image, int frames, int height, int width, int stride, int halvings, float least_drift, float most, float *level) {
+    const Leveling how = {stride, halvings, least_drift, most};
     if (modes(image, 3 * frames, height, width, stride, halvings, level)) return 1;
-    for (int b = 0; b < frames; b++, level += 3) {
-        float largest = 0.0f;
-        for (int c = 0; c < 3; c++) {
-            level[c] -= 1.0f;
-            level[c] = level[c] < -most ? -most : level[c] > most ? most : level[c];
-            largest = fabsf(level[c]) > largest ? fabsf(level[c]) : largest;
-        }
-        float weight = largest / least_drift - 1.0f;
-        weight = weight < 0.0f ? 0.0f : weight > 1.0f ? 1.0f : weight;
-        for (int c = 0; c < 3; c++) level[c] = 1.0f + weight * level[c];
-    }
+    for (int b = 0; b < frames; b++) to_levels(&how, level + 3 * b);
     return 0;
 }
 

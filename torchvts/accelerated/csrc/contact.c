@@ -624,6 +624,13 @@ static void to_pixels(void *with, int band) {
     free(kept_line);
 }
 
+/* Whether all values are far below what floats can hold: comparisons with NaN would let pixels through here that tensors do not. */
+WIDE static int all_finite(const float *values, size_t n) {
+    int all = 1;
+    for (size_t k = 0; k < n; k++) all &= fabsf(values[k]) < 1e15f;
+    return all;
+}
+
 /* Masks of one frame. Returns what contact_mask() does. */
 static int mask_frame(Frame *of) {
     const size_t pixels = (size_t)of->height * of->width, cells = (size_t)of->grid.rows * of->grid.columns;
@@ -634,9 +641,7 @@ static int mask_frame(Frame *of) {
     share(close_strong, of, of->bands);
     share(find_shares, of, of->bands);
     if (of->short_of_memory) return 1;
-    int not_finite = 0;
-    for (size_t k = 0; k < 3 * cells; k++) /* comparisons with NaN would let pixels through here that tensors do not */
-        not_finite |= !(fabsf(of->at.means[k]) < 1e15f);
+    const int finite = all_finite(of->at.means, 3 * cells);
     share(find_spread, of, 3);
     if (find_cells(&of->grid, of->per, of->at)) {
         keep_large(&of->grid, of->at);
@@ -649,7 +654,7 @@ static int mask_frame(Frame *of) {
         memset(of->inner, 0, pixels);
         memset(of->tail, 0, pixels);
     }
-    return of->short_of_memory ? 1 : not_finite ? 2 : 0;
+    return of->short_of_memory ? 1 : !finite ? 2 : 0;
 }
 
 /*

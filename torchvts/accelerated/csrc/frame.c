@@ -34,7 +34,7 @@ typedef struct {
     float stiff, tolerance;
     /* ContactFromDepth */
     int32_t contact_cell, contact_reach;
-    float contact_model[9];
+    float contact_model[10];
 } Program;
 
 /* DepthOutput, of one frame. */
@@ -60,12 +60,11 @@ enum { SHORT = 1, OUTSIDE = 2, BEYOND = 4 };
 /* The compensated image; null, and a bit in `trouble`, where there is none. */
 static const float *compensated(const Program *of, const float *image, float *light, int *trouble) {
     const int height = of->height, width = of->width;
-    const int code = clean(image, of->gain, of->offset, of->pedestal, of->defect, of->neighbours, of->defects, of->weights, of->taps, 1, height,
-                           width, light);
+    const Leveling leveling = {of->drift_stride, of->halvings, of->least_drift, of->most_drift};
     float level[3] = {1.0f, 1.0f, 1.0f};
-    *trouble |= code;
-    if (code) return NULL;
-    if (of->drifts && levels(light, 1, height, width, of->drift_stride, of->halvings, of->least_drift, of->most_drift, level)) *trouble |= SHORT;
+    *trouble |= clean(image, of->gain, of->offset, of->pedestal, of->defect, of->neighbours, of->defects, of->weights, of->taps, 1, height, width, light,
+                      of->drifts ? &leveling : NULL, level);
+    if (*trouble) return NULL;
     for (int c = 0; c < 3; c++)
         if (!(fabsf(level[c] - 1.0f) < of->believed_drift)) *trouble |= BEYOND; /* another estimator takes over */
     if (*trouble) return NULL;

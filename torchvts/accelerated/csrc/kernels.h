@@ -7,6 +7,10 @@
 #include <stdlib.h>
 #include <string.h>
 
+#if defined(__SSE__)
+#include <xmmintrin.h>
+#endif
+
 #if defined(_WIN32)
 #define EXPORT __declspec(dllexport)
 #else
@@ -92,10 +96,16 @@ static inline float without_light(LightOfRow of, float value, float once, float 
 
 void row_over_smooth(const SmoothLight *of, const float *found, int y, int first, int n, const float *values, float *result);
 
+/* How the levels of the light are found: Drift.by_mode() of torchvts/compensate/drift.py. */
+typedef struct {
+    int stride, halvings;
+    float least_drift, most_drift;
+} Leveling;
+
 /* What frame.c calls of the other sources, which say what these do. */
 EXPORT int clean(const float *image, const float *gain, const float *offset, const float *pedestal, const int64_t *defect, const int64_t *neighbours,
-                 int64_t defects, const float *weight, int taps, int frames, int height, int width, float *light);
-EXPORT int levels(const float *image, int frames, int height, int width, int stride, int halvings, float least_drift, float most, float *level);
+                 int64_t defects, const float *weight, int taps, int frames, int height, int width, float *light,
+                 const Leveling *leveling, float *level);
 EXPORT void divide_planes(const float *image, const float *level, int planes, int64_t n, float *result);
 EXPORT int contact_mask(const float *image, const float *divided, const float *offset, const float *per_noise, const float *failed_below,
                         const float *most_far_field, int frames, int height, int width, int step, int stride, int cell, int reach, float sigmas,
@@ -127,6 +137,18 @@ EXPORT void uncrop(const float *gradient, const uint8_t *contact, int frames, in
                    float *whole, float *normal, uint8_t *touching);
 
 static inline int least(int a, int b) { return a < b ? a : b; }
+
+/* to[j][i] = from[i][j] of 4 x 4 values. */
+static inline void transpose(const float *from, size_t from_step, float *to, size_t to_step) {
+#if defined(__SSE__)
+    __m128 a = _mm_loadu_ps(from), b = _mm_loadu_ps(from + from_step), c = _mm_loadu_ps(from + 2 * from_step), d = _mm_loadu_ps(from + 3 * from_step);
+    _MM_TRANSPOSE4_PS(a, b, c, d);
+    _mm_storeu_ps(to, a), _mm_storeu_ps(to + to_step, b), _mm_storeu_ps(to + 2 * to_step, c), _mm_storeu_ps(to + 3 * to_step, d);
+#else
+    for (int i = 0; i < 4; i++)
+        for (int j = 0; j < 4; j++) to[j * to_step + i] = from[i * from_step + j];
+#endif
+}
 
 /* dark_below() of torchvts/core/noise.py: whether a channel of such intensity is dark, where the flat skin has `flat`. */
 static inline int is_dark(float intensity, float flat, float three_noises) {

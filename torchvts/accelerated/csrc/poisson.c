@@ -7,10 +7,6 @@
 
 #include <math.h>
 
-#if defined(__SSE__)
-#include <xmmintrin.h>
-#endif
-
 /* Tables of one size: the poles, what both recursions multiply by, 1 / (1 - r^2W), the start of the way back; then those of the transform. */
 typedef struct {
     int height, width, wide;
@@ -102,18 +98,6 @@ static void divergence(const float *gradient, const Part *part, int first, int l
         difference(padded, above, below, half_pitch, n, to);
         memset(to + n, 0, sizeof(float) * (size_t)(step - n));
     }
-}
-
-/* to[j][i] = from[i][j] of 4 x 4 values. */
-static inline void transpose(const float *from, size_t from_step, float *to, size_t to_step) {
-#if defined(__SSE__)
-    __m128 a = _mm_loadu_ps(from), b = _mm_loadu_ps(from + from_step), c = _mm_loadu_ps(from + 2 * from_step), d = _mm_loadu_ps(from + 3 * from_step);
-    _MM_TRANSPOSE4_PS(a, b, c, d);
-    _mm_storeu_ps(to, a), _mm_storeu_ps(to + to_step, b), _mm_storeu_ps(to + 2 * to_step, c), _mm_storeu_ps(to + 3 * to_step, d);
-#else
-    for (int i = 0; i < 4; i++)
-        for (int j = 0; j < 4; j++) to[j * to_step + i] = from[i * from_step + j];
-#endif
 }
 
 /* Very small numbers become zero: the recursions run into them, and processors are a hundred times slower there. */

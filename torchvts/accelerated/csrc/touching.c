@@ -13,7 +13,7 @@ typedef struct {
     int rows, columns;
     float *mass, *depth, *slope_x, *slope_y, *curvature, *smooth_mass, *smooth_depth, *pressure, *found, *other, *unexplained, *squared, *bend;
     float *line;
-    double *boxes;
+    double *running;
     uint8_t *pressed, *surface;
 } Cells;
 
@@ -43,41 +43,13 @@ WIDE static void subtract(const float *restrict a, const float *restrict b, int 
     for (int x = 0; x < n; x++) result[x] = a[x] - b[x];
 }
 
-enum { ROWS = 4 };
-
-/* Running sums along ROWS rows, one `step` floats after the other, to `sums`, of each cell those of all rows together. Each sum waits for the one before,
-   so several rows are summed at once. */
-static void run_along(const float *rows, int step, int columns, float *restrict sums) {
-    double total[ROWS] = {0.0};
-    memset(sums, 0, ROWS * sizeof(float));
-    for (int x = 0; x < columns; x++)
-        for (int k = 0; k < ROWS; k++) {
-            total[k] += (double)rows[k * step + x];
-            sums[ROWS * (x + 1) + k] = (float)total[k];
-        }
+WIDE static void divide_by(float *restrict values, float by, int n) {
+    for (int k = 0; k < n; k++) values[k] /= by;
 }
 
-/* Means over `reach` cells either way of row k of those, zero beyond the border. */
-WIDE static void means_along(const float *restrict sums, int columns, int reach, float area, float *restrict to) {
-    const int inner = columns - reach;
-    int x = 0;
-    for (; x < reach && x < columns; x++) to[x] = sums[ROWS * least(x + reach + 1, columns)] / area;
-    for (; x < inner; x++) to[x] = (sums[ROWS * (x + reach + 1)] - sums[ROWS * (x - reach)]) / area;
-    for (; x < columns; x++) to[x] = (sums[ROWS * columns] - sums[ROWS * (x - reach)]) / area;
-}
-
-enum { MOST_BOXES = 3 };
-
-/* Doubles of memory for one box: a running sum of each column, those sums of all rows, and those along some rows. */
-static size_t box_size(const Cells *at) {
-    return (size_t)at->columns + (((size_t)at->rows + 1) * at->columns + ROWS * ((size_t)at->columns + 1) + 1) / 2;
-}
-
-/* Mean over `reach` cells either way, by running sums as torch rounds them; zero beyond the border. */
-static void box(const Cells *at, const float *values, int reach, double *running, float *result) {
-    const int rows = at->rows, columns = at->columns, side = 2 * reach + 1, many = rows < ROWS ? 1 : ROWS;
-    const float area = (float)(side * side);
-    float *sums = (float *)(running + columns), *along = sums + ((size_t)rows + 1) * columns;
+/* Sums over `reach` rows either way, by running sums as torch rounds them; nothing lies beyond the border. running: a line; sums: the rows and one
+   more. The result may take the values' place. */
+static void sum_down(const float *values, int rows, int columns, int reach, double *running, float *sums, float *result) {
     memset(running, 0, sizeof(double) * (size_t)columns);
     memset(sums, 0, sizeof(float) * (size_t)columns);
     for (int y = 0; y < rows; y++) add_row(values + (size_t)y * columns, running, columns, sums + (size_t)(y + 1) * columns);
@@ -85,29 +57,33 @@ static void box(const Cells *at, const float *values, int reach, double *running
         const int before = y > reach ? y - reach : 0, last = least(y + reach + 1, rows);
         subtract(sums + (size_t)last * columns, sums + (size_t)before * columns, columns, result + (size_t)y * columns);
     }
-    for (int y = 0; y < rows; y += many) { /* the last rows are summed again where their number is no multiple, and some not used */
-        const int first = least(y, rows - many);
-        run_along(result + (size_t)first * columns, many > 1 ? columns : 0, columns, along);
-        for (int k = y - first; k < many; k++) means_along(along + k, columns, reach, area, result + (size_t)(first + k) * columns);
-    }
 }
 
-typedef struct {
-    const Cells *at;
-    int reach;
-    const float *values[MOST_BOXES];
-    float *result[MOST_BOXES];
-} Boxes;
-
-static void one_box(void *with, int k) {
-    const Boxes *of = with;
-    box(of->at, of->values[k], of->reach, of->at->boxes + (size_t)k * box_size(of->at), of->result[k]);
+/* Rows become columns. */
+static void turn(const float *values, int rows, int columns, float *turned) {
+    const int fours = rows / 4 * 4, whole = columns / 4 * 4;
+    for (int y = 0; y < fours; y += 4)
+        for (int x = 0; x < whole; x += 4) transpose(values + (size_t)y * columns + x, (size_t)columns, turned + (size_t)x * rows + y, (size_t)rows);
+    for (int y = 0; y < rows; y++)
+        for (int x = y < fours ? whole : 0; x < columns; x++) turned[(size_t)x * rows + y] = values[(size_t)y * columns + x];
 }
 
-/* box() of two fields. */
-static void two_boxes(const Cells *at, int reach, const float *one, float *to_one, const float *other, float *to_other) {
-    Boxes work = {at, reach, {one, other}, {to_one, to_other}};
-    share(one_box, &work, 2);
+/* Doubles of memory for box(): a line of running sums, those sums of all lines, and the field turned. */
+static size_t box_size(const Cells *at) {
+    const size_t rows = (size_t)at->rows, columns = (size_t)at->columns;
+    return (rows > columns ? rows : columns) + ((rows + 1) * (columns + 1) + rows * columns + 1) / 2;
+}
+
+/* Mean over `reach` cells either way; zero beyond the border. Sums along a row wait for one another, so rows become columns for them. */
+static void box(const Cells *at, const float *values, int reach, float *result) {
+    const int rows = at->rows, columns = at->columns, side = 2 * reach + 1;
+    double *running = at->running;
+    float *sums = (float *)(running + (rows > columns ? rows : columns)), *turned = sums + ((size_t)rows + 1) * ((size_t)columns + 1);
+    sum_down(values, rows, columns, reach, running, sums, result);
+    turn(result, rows, columns, turned);
+    sum_down(turned, columns, rows, reach, running, sums, turned);
+    turn(turned, columns, rows, result);
+    divide_by(result, (float)(side * side), rows * columns);
 }
 
 /* One row of find_curvature(): slopes along x, and along y of this row and of those below and above, whose cells count where they have mass. */
@@ -221,7 +197,7 @@ static void find_surface(const Cells *at, const Model *model, int reach) {
         if (y < rows - 1) unexplained_below(at->mass + k, at->depth + k, at->slope_y + k, model->cell_mm, columns, columns, squared);
     }
     square(at->depth, n, at->smooth_depth);
-    two_boxes(at, reach / 2, at->squared, at->unexplained, at->smooth_depth, at->curvature);
+    box(at, at->squared, reach / 2, at->unexplained), box(at, at->smooth_depth, reach / 2, at->curvature);
     are_surface(at->unexplained, at->found, at->curvature, model->most_unexplained, per > 1e-9f ? per : 1e-9f, n, at->surface);
 }
 
@@ -294,14 +270,13 @@ static void rim_depth(const Cells *at, const Model *model, int reach) {
     const int n = at->rows * at->columns;
     divide(at->slope_x, at->mass, 1e-6f, n), divide(at->slope_y, at->mass, 1e-6f, n);
     find_curvature(at, 2.0f * model->cell_mm);
-    Boxes smooth = {at, 2, {at->mass, at->depth, at->bend}, {at->smooth_mass, at->smooth_depth, at->curvature}};
-    share(one_box, &smooth, 3);
+    box(at, at->mass, 2, at->smooth_mass), box(at, at->depth, 2, at->smooth_depth), box(at, at->bend, 2, at->curvature);
     divide(at->smooth_depth, at->smooth_mass, 1e-6f, n), divide(at->curvature, at->smooth_mass, 1e-6f, n);
     divide(at->depth, at->mass, 1e-6f, n);
     const float decay = squared_decay(at, model, n);
     if (decay > 0.0f) find_pressure(at->smooth_depth, at->curvature, at->mass, decay, n, at->pressure);
     find_steepness(at->slope_x, at->slope_y, n, at->smooth_mass, at->curvature);
-    two_boxes(at, reach / 2, at->smooth_mass, at->found, at->curvature, at->other);
+    box(at, at->smooth_mass, reach / 2, at->found), box(at, at->curvature, reach / 2, at->other);
     find_surface(at, model, reach);
     if (decay == 0.0f) {
         all_or_none(at->surface, n, at->other);
@@ -310,9 +285,9 @@ static void rim_depth(const Cells *at, const Model *model, int reach) {
     find_pressed(at->pressure, at->found, at->other, at->surface, model->share * sqrtf(decay), largest(at->pressure, n), n, at->pressed,
                  at->smooth_mass);
     some_of(at->mass, n, at->curvature);
-    two_boxes(at, 1, at->smooth_mass, at->found, at->curvature, at->other);
+    box(at, at->smooth_mass, 1, at->found), box(at, at->curvature, 1, at->other);
     find_rim(at->found, at->other, at->mass, at->depth, n, at->smooth_mass, at->curvature);
-    two_boxes(at, reach, at->smooth_mass, at->found, at->curvature, at->other);
+    box(at, at->smooth_mass, reach, at->found), box(at, at->curvature, reach, at->other);
     find_level(at->found, at->pressed, n, at->other);
     free_within(at, model->free_share, decay);
 }
@@ -374,9 +349,9 @@ static int allocate(Frame *of) {
     at->rows = (of->rows + of->cell - 1) / of->cell, at->columns = (of->columns + of->cell - 1) / of->cell;
     of->bands = least(at->rows, bands_of(of->rows));
     const size_t n = (size_t)at->rows * at->columns, line = (size_t)of->bands * at->columns * of->cell;
-    at->boxes = malloc(sizeof(double) * MOST_BOXES * box_size(at) + sizeof(float) * (13 * n + line) + 2 * n);
-    if (!at->boxes) return 1;
-    at->mass = (float *)(at->boxes + MOST_BOXES * box_size(at));
+    at->running = malloc(sizeof(double) * box_size(at) + sizeof(float) * (13 * n + line) + 2 * n);
+    if (!at->running) return 1;
+    at->mass = (float *)(at->running + box_size(at));
     at->depth = at->mass + n, at->slope_x = at->depth + n, at->slope_y = at->slope_x + n, at->curvature = at->slope_y + n;
     at->smooth_mass = at->curvature + n, at->smooth_depth = at->smooth_mass + n, at->pressure = at->smooth_depth + n;
     at->found = at->pressure + n, at->other = at->found + n, at->unexplained = at->other + n, at->squared = at->unexplained + n;
@@ -432,6 +407,6 @@ EXPORT int contact_from_depth(const float *depth, int64_t depth_frame, int64_t d
         rim_depth(&frame.at, &model, reach);
         share(to_pixels, &frame, frame.bands);
     }
-    free(frame.at.boxes);
+    free(frame.at.running);
     return 0;
 }

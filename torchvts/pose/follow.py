@@ -196,8 +196,8 @@ def _kept(keyframe: Keyframe, unknown: _Unknown, last: Array, pose: Array) -> Ar
     if motions.shape[1] == 0:
         return pose
     step = step_between(keyframe.many, last, pose)
-    dear = motions.T * ROTATION_FIRST
-    kept: Array = last @ moved_by(keyframe.many, step - motions @ np.linalg.solve(dear @ motions, dear @ step))
+    damping = motions.T * ROTATION_FIRST
+    kept: Array = last @ moved_by(keyframe.many, step - motions @ np.linalg.solve(damping @ motions, damping @ step))
     return kept
 
 

@@ -137,7 +137,7 @@ def refine(
 
 
 ROTATION_FIRST = np.array([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3])
-"""How dear scaled twists are: what is not determined is chosen so that rotations keep their value before shifts do."""
+"""Relative damping of scaled twists: what is not determined is chosen so that rotations keep their value before shifts do."""
 
 
 def solve_step(sums: Sums, held: Array | None = None) -> Array:

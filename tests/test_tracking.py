@@ -16,7 +16,7 @@ from torchvts.evaluation import pose_accuracy, tracking
 from torchvts.pose.follow import _pixels, adjoint, follow, orthonormal
 from torchvts.pose.graph import Edge, KeyframeGraph
 from torchvts.pose.height_errors import WHITE_MM, _covariance, _height_residuals, height_sums
-from torchvts.pose.inverse import Sums, refine, solve_step, sum_parts, sum_residuals
+from torchvts.pose.inverse import Sums, moved_by, refine, solve_step, step_between, sum_parts, sum_residuals
 from torchvts.pose.jackknife import ALIKE_MM, jackknife, shared_error
 from torchvts.pose.keyframe import PARTS, contact_frame, grids, make_keyframe
 from torchvts.pose.result import invert, motion, turn_deg
@@ -89,6 +89,24 @@ def test_a_ball_is_followed_and_its_rotations_keep_their_value():
     moved = found.T_target_source[:3, :3] @ center + found.T_target_source[:3, 3]
     assert float((moved - (poses[-1][:3, 3] - torch.tensor([0.0, 0.0, radius]))).norm()) < 0.03
     assert float(found.covariance[2, 2]) > 1.0  # rad^2
+
+
+def test_what_is_unknown_keeps_its_last_value_though_motion_goes_on():
+    """The pose that even motion predicts fits better than the last one, but turns the ball."""
+    ball, last = objects.sphere(8.0), np.eye(4)
+    keyframe = make_keyframe(contact_frame(press(ball, objects.pose(0.0))), PITCH)
+    turned = objects.pose(5.0, (0.6, 0.3)) @ invert(objects.pose(0.0))
+    frame = grids(contact_frame(press(ball, objects.pose(0.0, (0.6, 0.3)))), PITCH, keyframe.least_mm, keyframe.times)
+    found = follow(keyframe, frame, [last, turned.numpy()])
+    assert found.agrees and found.free.shape[1] == 3
+    assert float(turn_deg(torch.from_numpy(found.pose))) < 0.2
+    assert found.pose[:2, 3] == pytest.approx([0.6, 0.3], abs=0.03)
+
+
+def test_a_step_between_poses_leads_from_one_to_the_other(keyframe):
+    pose, step = swing(3).numpy(), np.array([0.5, -0.2, 0.9, 0.4, -0.3, 0.1])
+    assert step_between(keyframe.many, pose, pose @ moved_by(keyframe.many, step)) == pytest.approx(step, abs=1e-12)
+    assert step_between(keyframe.many, pose, pose) == pytest.approx(np.zeros(6), abs=1e-12)
 
 
 def test_a_cylinder_keeps_its_axis_unknown_and_is_followed_across():
@@ -486,6 +504,21 @@ def test_rendered_objects_meet_the_goal(name, motion_, most_mm):
     ((row, _),) = tracking.run_tracking([name], [motion_], ["noise 0.005"], seed=4)
     assert row.lost == [] and row.wrong == []
     assert float(np.median(row.deg)) < 0.05 and float(np.median(row.mm)) < most_mm and max(row.deg) < 0.3
+
+
+@pytest.mark.long
+def test_a_frame_before_lift_off_keeps_the_rotations_that_it_calls_unknown():
+    """They followed the coarse grid by 5 degrees, though no step of the fine one was allowed to."""
+    ((row, track),) = tracking.run_tracking(["bolt head"], ["lift-off"], ["noise 0.005"], seed=1)
+    assert max(row.deg) < 0.2 and row.wrong == []
+    tracker, unknown, last = vts.PoseTracker(track.frames[0], track.mm_per_pixel), 0, np.eye(4)
+    for frame in track.frames[1:10]:
+        found = tracker(frame)
+        if not found.lost and len(found.ambiguous) == 3:
+            unknown += 1
+            assert float(turn_deg(found.T_target_source @ invert(torch.from_numpy(last)))) < 0.1
+        last = found.T_target_source.numpy()
+    assert unknown > 0
 
 
 @pytest.mark.long

@@ -11,7 +11,20 @@ from ..accelerated.gate import usable
 from .alignment import SLOPE_NOISE, agrees_enough
 from .ambiguity import ALIKE_PIXELS, LEAST_INFORMATION, UNKNOWN_VARIANCE, free_directions, name_directions
 from .height_errors import height_sums
-from .inverse import LEAST_NOISE, Array, Field, Pixels, Sums, moved_by, refine, solve_step, sum_parts, sum_residuals
+from .inverse import (
+    LEAST_NOISE,
+    ROTATION_FIRST,
+    Array,
+    Field,
+    Pixels,
+    Sums,
+    moved_by,
+    refine,
+    solve_step,
+    step_between,
+    sum_parts,
+    sum_residuals,
+)
 from .jackknife import jackknife
 from .keyframe import PARTS, Grids, Keyframe
 
@@ -62,8 +75,8 @@ class Followed(NamedTuple):
 
     @property
     def agrees(self) -> bool:
-        """Whether the frames agree well enough on a large enough part."""
-        return agrees_enough(self.fitness, self.overlap, self.cost)
+        """Whether the frames agree well enough on a large enough part, and show any motion."""
+        return self.free.shape[1] < 6 and agrees_enough(self.fitness, self.overlap, self.cost)
 
     @property
     def exact(self) -> bool:
@@ -72,32 +85,37 @@ class Followed(NamedTuple):
 
 
 def follow(keyframe: Keyframe, frame: Grids, starts: list[Array]) -> Followed:
-    """Register a frame to a keyframe from the most likely of several poses, and from the others if that leads nowhere."""
+    """Register a frame to a keyframe from the most likely of several poses, and from the others if that leads nowhere.
+
+    Motions that the contact does not determine keep their value in the first of the poses, the last one of the track.
+    """
     order = sorted(starts, key=lambda start: sum_residuals(frame.coarse, keyframe.coarse, start, SLOPE_NOISE, score_only=True).cost)
-    first = _follow_from(keyframe, frame, order[0])
+    first = _follow_from(keyframe, frame, order[0], starts[0])
     if not first.agrees:
         for start in order[1:]:
-            other = _follow_from(keyframe, frame, start)
+            other = _follow_from(keyframe, frame, start, starts[0])
             if other.agrees:
                 return other
     return first
 
 
-def _follow_from(keyframe: Keyframe, frame: Grids, start: Array) -> Followed:
-    """Refine one pose on the coarse grid, on some pixels, and on many of them, and score it."""
+def _follow_from(keyframe: Keyframe, frame: Grids, start: Array, last: Array) -> Followed:
+    """Refine one pose on the coarse grid, on some pixels, and on many of them, and score it; what is unknown stays as it was."""
     pose, coarse = refine(frame.coarse, keyframe.coarse, start, COARSE_STEPS, 2.0 * SLOPE_NOISE, keyframe.held, 0.02)
     unknown = _sliding(keyframe, coarse)
+    pose = _kept(keyframe, unknown, last, pose)
     refined, some = refine(frame.fine, keyframe.some, pose, SOME_STEPS, SLOPE_NOISE, unknown.motions, 2e-3)
     vague = _vague(keyframe, some)
     if vague.motions.shape[1] > 0:
         unknown = _joined(unknown, vague)
+        pose = _kept(keyframe, unknown, last, pose)
         refined, some = refine(frame.fine, keyframe.some, pose, SOME_STEPS, SLOPE_NOISE, unknown.motions, 2e-3)
     noise = max(LEAST_NOISE, 1.5 * some.slope_noise)
     fine, matrices, rights = sum_parts(frame.fine, keyframe.many, refined, noise, PARTS)
     by_slopes = solve_step(fine, unknown.motions)
     known_all = unknown.motions.shape[1] == 0
-    last = solve_step(_with_heights(fine, keyframe, frame, refined)) if known_all else by_slopes
-    pose = refined @ moved_by(keyframe.many, last)
+    step = solve_step(_with_heights(fine, keyframe, frame, refined)) if known_all else by_slopes
+    pose = _kept(keyframe, unknown, last, refined @ moved_by(keyframe.many, step))
     by_parts = keyframe.shared_error * jackknife(matrices, rights, _others(unknown.motions))
     scaled = _covariance(fine, by_parts, unknown.motions)
     forth = sum_residuals(frame.coarse, keyframe.coarse, pose, SLOPE_NOISE, score_only=True)
@@ -170,6 +188,17 @@ class _Unknown(NamedTuple):
 
     motions: Array
     shifts: Array
+
+
+def _kept(keyframe: Keyframe, unknown: _Unknown, last: Array, pose: Array) -> Array:
+    """The pose (4, 4), moved by what is unknown to where that has its last value, as :func:`solve_step` has it: rotations first."""
+    motions = unknown.motions
+    if motions.shape[1] == 0:
+        return pose
+    step = step_between(keyframe.many, last, pose)
+    damping = motions.T * ROTATION_FIRST
+    kept: Array = last @ moved_by(keyframe.many, step - motions @ np.linalg.solve(damping @ motions, damping @ step))
+    return kept
 
 
 def _sliding(keyframe: Keyframe, coarse: Sums) -> _Unknown:

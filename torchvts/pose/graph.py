@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from .follow import adjoint, orthonormal
-from .inverse import Array
+from .inverse import Array, rotation_vector
 from .keyframe import Keyframe
 from .result import motion
 
@@ -78,10 +78,7 @@ class KeyframeGraph:
     def _residual(self, edge: Edge) -> Array:
         """The twist (6,) after the registration that leads to the poses of its keyframes."""
         off = self.poses[edge.target] @ np.linalg.inv(self.poses[edge.source]) @ np.linalg.inv(edge.pose)
-        skew = 0.5 * np.array([off[2, 1] - off[1, 2], off[0, 2] - off[2, 0], off[1, 0] - off[0, 1]])
-        sine, cosine = float(np.linalg.norm(skew)), 0.5 * (float(np.trace(off[:3, :3])) - 1.0)
-        angle = np.arctan2(sine, cosine)
-        return np.concatenate((skew * (angle / sine if sine > 1e-12 else 1.0), off[:3, 3]))
+        return np.concatenate((rotation_vector(off[:3, :3]), off[:3, 3]))
 
 
 def moved_covariance(pose: Array, covariance: Array) -> Array:

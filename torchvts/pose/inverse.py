@@ -136,18 +136,21 @@ def refine(
     return pose, sums
 
 
+ROTATION_FIRST = np.array([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3])
+"""Relative damping of scaled twists: what is not determined is chosen so that rotations keep their value before shifts do."""
+
+
 def solve_step(sums: Sums, held: Array | None = None) -> Array:
     """The scaled twist (6,) that the sums ask for.
 
-    What they do not determine is chosen so that rotations keep their value before shifts do: a ball that moves sideways is
-    followed by a shift, not by a roll.
+    What they do not determine is chosen by :data:`ROTATION_FIRST`: a ball that moves sideways is followed by a shift, no roll.
     """
     matrix, right = sums.matrix, sums.right
     if held is not None and held.shape[1] > 0:
         known = np.eye(6) - held @ held.T
         matrix, right = known @ matrix @ known, known @ right
     damping = 1e-6 * max(float(np.trace(matrix)), 1e-9)
-    step: Array = -np.linalg.solve(matrix + damping * np.diag([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3]), right)
+    step: Array = -np.linalg.solve(matrix + damping * np.diag(ROTATION_FIRST), right)
     step *= min(1.0, LARGEST_STEP_MM / max(float(np.linalg.norm(step)), 1e-12))
     return step
 
@@ -163,6 +166,22 @@ def moved_by(pixels: Pixels, step: Array) -> Array:
     result[:3, :3] += first * cross + second * (cross @ cross)
     result[:3, 3] = twist[3:] + center - result[:3, :3] @ center
     return result
+
+
+def step_between(pixels: Pixels, pose: Array, other: Array) -> Array:
+    """The scaled twist (6,) after which, by :func:`moved_by`, a pose (4, 4) is another one."""
+    moved = np.linalg.inv(pose) @ other
+    turn = moved[:3, :3]
+    twist = np.concatenate((rotation_vector(turn), moved[:3, 3] - pixels.center + turn @ pixels.center))
+    step: Array = twist / pixels.units
+    return step
+
+
+def rotation_vector(turn: Array) -> Array:
+    """Axis times angle (3,) of a rotation (3, 3) of less than half a turn."""
+    skew = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    sine, cosine = float(np.linalg.norm(skew)), 0.5 * (float(np.trace(turn)) - 1.0)
+    return skew * (math.atan2(sine, cosine) / sine if sine > 1e-12 else 1.0)
 
 
 def sum_residuals(field: Field, pixels: Pixels, pose: Array, slope_noise: float, score_only: bool = False) -> Sums:

@@ -691,6 +691,19 @@ def test_a_unit_of_faint_changes_is_regularised_like_one_of_strong_changes(known
     assert torch.allclose(*slopes, rtol=1e-6, atol=1e-8)
 
 
+def test_the_forms_of_a_smaller_family_are_parts_of_those_of_a_larger_one(known):
+    small, other = Family(2, -1, 10.0, cubic_degree=0), Family(1, 1, 10.0)
+    larger = small.with_all_of(other)
+    assert larger.holds(small) and larger.holds(other)
+    whole = Evidence.of(larger, known)
+    for family in (small, other):
+        alone, part = Evidence.of(family, known), whole.part(family)
+        assert torch.allclose(alone.form, part.form, rtol=1e-9) and torch.allclose(alone.right, part.right, rtol=1e-9)
+        penalties = [part.penalty(strength) for strength in (0.03, 0.003)]
+        errors = torch.tensor(part.held_out_errors_deg(penalties, None))
+        assert torch.allclose(errors, torch.tensor([alone.errors_deg(alone.held_out(p, None)) for p in penalties]), rtol=1e-6)
+
+
 def test_few_presses_move_what_a_prior_says_of_depth_by_little(known):
     family = Family(1, -1, 10.0)
     evidence = Evidence.of(family, known)

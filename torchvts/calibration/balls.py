@@ -4,11 +4,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..accelerated import NormalFromResponse
 from ..core.geometry import gradient_from_normal
 from ..core.robust import tukey_weight
 from ..model.response_field import ResponseModel
 from ..model.sensor import Sensor
-from ..normals import NormalFromResponse
 from .closure import close_loops
 from .contacts import LEAST_INSIDE, Contact, first_pass_depths, middle_px, used
 from .field import ContactForms, Family, solve_with_centers
@@ -80,12 +80,12 @@ def _slope_maps(contacts: list[Contact], model: ResponseModel, pitch_mm: float) 
     if not contacts:
         return []
     height, width = contacts[0].mask.shape
-    normals = NormalFromResponse(model.field, model.by_depth, height, width, pitch_mm, dtype=torch.float64)
-    images = [1.0 + contact.change[None] for contact in contacts]
+    normals = NormalFromResponse(model.field, model.by_depth, height, width, pitch_mm)
+    images = [1.0 + contact.change[None].float() for contact in contacts]
     if model.by_depth is None:
-        return [gradient_from_normal(normals(image))[0] for image in images]
+        return [gradient_from_normal(normals(image))[0].double() for image in images]
     first = first_pass_depths(contacts, model.field, pitch_mm)
-    return [gradient_from_normal(normals(image, depth[None, None]))[0] for image, depth in zip(images, first)]
+    return [gradient_from_normal(normals(image, depth[None, None].float()))[0].double() for image, depth in zip(images, first)]
 
 
 def guess_circle(contact: Contact, sensor: Sensor) -> None:

@@ -5,6 +5,8 @@ add up. The forms: inside the contact the ball's sine (slope / sqrt(1 + |slope|^
 slope points to the center; and everywhere the slope of a surface has no curl, nor, nearly, have sines.
 """
 
+import copy
+import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -60,6 +62,25 @@ class Family:
         own = self.degrees()
         return all(own.get(term, -1) >= degree for term, degree in other.degrees().items())
 
+    def with_all_of(self, other: "Family") -> "Family":
+        """The smallest family that holds this one and the other."""
+        return dataclasses.replace(
+            self,
+            degree=max(self.degree, other.degree),
+            product_degree=max(self.product_degree, other.product_degree),
+            cubic_degree=max(self.cubic_degree, other.cubic_degree),
+        )
+
+    def places_in(self, larger: "Family") -> Tensor:
+        """(2 K,): where the coefficients of this family stand among those of one that holds it."""
+        theirs = {place: k for k, place in enumerate(larger.powers())}
+        half = torch.tensor([theirs[place] for place in self.powers()])
+        return torch.cat((half, half + len(theirs)))
+
+    def powers(self) -> list[tuple[tuple[int, ...], int, int]]:
+        """Term and powers of x and y of every coefficient of a slope, in order."""
+        return [(term, i, j) for term, d in self.degrees().items() for i in range(d + 1) for j in range(d + 1 - i)]
+
     def label(self) -> str:
         """Such as "linear 2, products 1, cubic 0"."""
         parts = (("linear", self.degree), ("products", self.product_degree), ("cubic", self.cubic_degree))
@@ -74,9 +95,7 @@ class Family:
         """
         factors = [
             (1.0 if len(term) == 1 else self.product_penalty) * DEGREE_PENALTY ** (i + j) * power ** len(term)
-            for term, d in self.degrees().items()
-            for i in range(d + 1)
-            for j in range(d + 1 - i)
+            for term, i, j in self.powers()
         ]
         return torch.tensor(factors, dtype=torch.float64).repeat(2)
 
@@ -111,6 +130,12 @@ class ContactForms:
         self.contact = contact
         self.terms = family.terms(contact)
         self.curl = curl_form(family, contact)
+
+    def part(self, places: Tensor) -> "ContactForms":
+        """The forms of a smaller family, whose coefficients have these places (2 K,)."""
+        forms = copy.copy(self)
+        forms.terms, forms.curl = self.terms[places[: len(places) // 2]], self.curl[places][:, places]
+        return forms
 
     def ball(self) -> tuple[Tensor, Tensor]:
         """Quadratic form (2 K, 2 K) and linear part (2 K,) of a press with its center fixed, of weight one per press."""
@@ -154,10 +179,12 @@ class ContactForms:
         """(2, N) slopes by coefficients (2 K,) at the sampled pixels."""
         return slope_from_sine(coefficient.reshape(2, -1) @ self.terms)
 
-    def error_deg(self, coefficient: Tensor) -> float:
-        """Mean angle between the normals of these slopes and of the ball, inside the contact, degrees."""
+    def errors_deg(self, coefficients: Tensor) -> list[float]:
+        """For each of coefficients (P, 2 K) the mean angle between the normals of their slopes and of the ball, inside the contact,
+        degrees."""
         inside = self.contact.inside()
-        return angle_deg(self.slope(coefficient)[:, inside], self.contact.ball_slope()[:, inside])
+        terms, ball = self.terms[:, inside], self.contact.ball_slope()[:, inside]
+        return [angle_deg(slope_from_sine(coefficient.reshape(2, -1) @ terms), ball) for coefficient in coefficients]
 
     def gain(self, coefficient: Tensor) -> float:
         """Sine found divided by sine expected: the ball seems this many times smaller than given."""
@@ -181,6 +208,12 @@ class Evidence:
         forms = [ContactForms(family, contact) for contact in contacts]
         return cls(family, forms, [item.ball() for item in forms])
 
+    def part(self, family: Family) -> "Evidence":
+        """The same for a family that this one holds: what the two have in common is not worked out again."""
+        places = family.places_in(self.family)
+        each = [(form[places][:, places], right[places]) for form, right in self.each]
+        return Evidence(family, [item.part(places) for item in self.forms], each)
+
     def without(self, place: int) -> "Evidence":
         """The same without one contact."""
         others = [k for k in range(len(self.forms)) if k != place]
@@ -196,7 +229,13 @@ class Evidence:
 
     def errors_deg(self, solutions: list[Tensor]) -> list[float]:
         """For each contact the mean angle under its coefficients, degrees."""
-        return [item.error_deg(solution) for item, solution in zip(self.forms, solutions)]
+        return [item.errors_deg(solution[None])[0] for item, solution in zip(self.forms, solutions)]
+
+    def held_out_errors_deg(self, penalties: list[Tensor], start: Tensor | None) -> list[list[float]]:
+        """For each penalty and contact the mean angle under the coefficients by all other contacts, degrees."""
+        solutions = zip(*(self.held_out(penalty, start) for penalty in penalties))
+        errors = [item.errors_deg(torch.stack(each)) for item, each in zip(self.forms, solutions)]
+        return [list(row) for row in zip(*errors)]
 
     def mean_error_deg(self, solutions: list[Tensor]) -> float:
         """Mean of :meth:`errors_deg`."""

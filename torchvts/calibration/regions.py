@@ -16,6 +16,9 @@ FAR_DEGREE = 2
 FLOOR = 5.0
 """A contact stands out of that polynomial by so many spreads of the undeformed skin."""
 
+SETTLED = 1e-5
+"""Change of its weights from which the fit of the polynomial has converged."""
+
 LEAST_SPREAD = 0.003
 """Least spread, relative to the background: rounding to 8 bits."""
 
@@ -66,7 +69,9 @@ def far_field(change: Tensor) -> FarField:
         coefficient = torch.linalg.lstsq(weighted.t() @ columns, weighted.t() @ values, driver="gelsd").solution
         residual = values - columns @ coefficient
         spread = (residual[weight > 0].abs().median(dim=0).values / 0.6745).clamp_min(LEAST_SPREAD)
-        weight = tukey_weight((residual / spread).square().sum(1).sqrt() / (3**0.5 * TUKEY))
+        before, weight = weight, tukey_weight((residual / spread).square().sum(1).sqrt() / (3**0.5 * TUKEY))
+        if torch.allclose(weight, before, rtol=0.0, atol=SETTLED):
+            break
         if int((weight > 0).sum()) < 2 * len(coefficient):  # nothing is alike: no far field
             coefficient = torch.zeros_like(coefficient)
             break

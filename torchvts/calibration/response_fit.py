@@ -1,5 +1,6 @@
 """Fit response fields to located presses: the smallest family that explains each press by the others."""
 
+import functools
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -230,8 +231,9 @@ def _choose(contacts: list[Contact], families: list[Family], start: _Start | Non
         own = Family.of(start.field)
         larger = [family for family in families if family.holds(own) and not own.holds(family)]
         families = [own] + ([] if few else larger)
+    whole = Evidence.of(functools.reduce(Family.with_all_of, families), contacts)
     for k, family in enumerate(families):
-        evidence = Evidence.of(family, contacts)
+        evidence = whole.part(family)
         if start is not None and k == 0:
             unchanged = [start.field.tensor().reshape(-1)] * len(contacts)
             tried.append(_Tried(f"{start.name} as it is", 0, start.field, [] if few else evidence.errors_deg(unchanged)))
@@ -263,8 +265,9 @@ def _fit_family(evidence: Evidence, start: _Start | None, few: bool) -> _Tried:
     if start is not None:
         origin = start.field.embedded(family.degree, family.product_degree, family.cubic_degree).tensor().reshape(-1)
         strengths = (FEW_PENALTY,) if few else PENALTIES_ON_START
-    penalties = [evidence.penalty(strength) if start is None else strength * family.penalty() for strength in strengths]
-    errors = [] if few else [evidence.errors_deg(evidence.held_out(penalty, origin)) for penalty in penalties]
+    unit = evidence.penalty(1.0) if start is None else family.penalty()
+    penalties = [strength * unit for strength in strengths]
+    errors = [] if few else evidence.held_out_errors_deg(penalties, origin)
     # towards zero a stronger one is no simpler model, only one of flatter slopes
     choose = _best_candidate if start is None else simplest_candidate
     k = choose(errors) if errors else 0

@@ -58,7 +58,7 @@ def over_smooth(ratio: Tensor, coefficients: Tensor) -> Tensor:
     x, y = legendre(ratio.shape[3], 1).to(ratio), legendre(ratio.shape[2], 1).to(ratio)
     # terms in the order of smooth_basis, as a matrix: degree of y, degree of x
     order = torch.tensor([0, 1, 3, 2, 4, 6, 5, 6, 6], device=ratio.device)
-    terms = nn.functional.pad(coefficients, [0, 1]).index_select(2, order).unflatten(2, [3, 3])
+    terms = nn.functional.pad(coefficients, [0, 1]).index_select(2, order).reshape(-1, 3, 3, 3)
     surface = y.t() @ terms @ x
     return torch.addcmul(ratio, ratio, torch.addcmul(surface, surface, surface, value=-1.0), value=-1.0)
 

@@ -239,7 +239,7 @@ def use_calibration(calibration: Calibration) -> StreamCalibration:
     report = calibration.report
     note = f"calibration given: {report.get('reason', report.get('model', 'lights'))}"
     metric = max(report.get("direction_std_deg", [0.0])) <= POORLY_CONSTRAINED_DEG
-    metric = metric and report.get("source") not in ASSUMED
+    metric = metric and report.get("source") not in ASSUMED and not report.get("objection")
     return StreamCalibration(calibration, note if metric else f"{note}; {NOT_METRIC}", metric)
 
 

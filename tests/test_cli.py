@@ -136,7 +136,7 @@ def test_what_to_expect_follows_the_source(rig, mini_by_prior):
     assert "to about 1.7 degrees: 1.5 on each of 12 presses by the others, and more where" in expected(presses)
     few = {"model": "response", "source": "presses", "held_out_deg": None, "presses": []}
     fitted = vts.Calibration.from_response(mini_by_prior.response, mini_by_prior.sensor, mini_by_prior.background, few)
-    assert "5.0 degrees or better: too few presses to score any" in expected(fitted)
+    assert "5.0 degrees, a guess: too few presses to score any" in expected(fitted)
     rough = vts.Calibration.from_response(
         mini_by_prior.response, mini_by_prior.sensor, mini_by_prior.background, {"model": "response", "source": "stand_in"}
     )

@@ -20,6 +20,7 @@ from torchvts.diagnose import Diagnosis, Finding
 from torchvts.diagnose.camera import blockiness, levels_of
 from torchvts.evaluation.faults import jpeg
 from torchvts.evaluation.gallery import CORRUPTIONS, undisturbed
+from torchvts.model.response_field import ResponseModel
 
 NAMED = {
     "deeper press": {"deep_press"},
@@ -70,6 +71,16 @@ def named(name, seed):
     case = CORRUPTIONS[name].make(middle(CORRUPTIONS[name]), seed)
     found = vts.diagnose(case.background, case.image, case.calibration)
     return bool(NAMED[name] & set(found.names)), found
+
+
+def test_a_mirrored_image_is_named_and_nothing_else():
+    y, x = torch.meshgrid(torch.linspace(-1, 1, 96), torch.linspace(-1, 1, 128), indexing="ij")
+    background = torch.stack((0.5 + 0.3 * x, 0.5 + 0.3 * y, 0.5 - 0.2 * x + 0.1 * y))
+    background = background + 0.002 * torch.randn(background.shape, generator=torch.Generator().manual_seed(1))
+    unit = vts.Calibration.from_response(ResponseModel.zero(), vts.Sensor("rig", 96, 128, 0.1), background)
+    found = vts.diagnose(None, background.flip(2), unit)
+    assert found.names == ("other_view",) and not found.ok and "is mirrored left to right: " in str(found)
+    assert "other_view" not in vts.diagnose(None, background.flip(0), unit).names  # channels_swapped names it
 
 
 @pytest.mark.parametrize("name", NAMED)

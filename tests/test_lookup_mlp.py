@@ -474,7 +474,7 @@ def test_a_damaged_or_dangerous_file_is_refused(tmp_path):
     contents = (b"", b"text", whole[: len(whole) // 2], whole[:10], (tmp_path / "module.pth").read_bytes(), pickle.dumps(network))
     for content in contents:
         path.write_bytes(content)
-        with pytest.raises(ValueError, match=r"bad\.pth: not a state dict, cut short, or it holds more than tensors"):
+        with pytest.raises(ValueError, match=r"bad\.pth: expected a state dict of torch.save"):
             NormalFromMLP.load(path, flat_skin())
     torch.save([1, 2], path)
     with pytest.raises(ValueError, match=r"bad\.pth: expected a state dict of tensors .* got list"):

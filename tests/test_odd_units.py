@@ -15,7 +15,9 @@ import torchvts as vts
 from torchvts.calibration.light_choice import objection_to_lights
 from torchvts.calibration.pattern import compare_patterns
 from torchvts.calibration.refusals import NoUsablePress, colour_share, colour_variation, other_crop
+from torchvts.cli.summary import expected
 from torchvts.model.response_field import CHANGE_SCALE, ResponseField, ResponseModel, SensorPrior, fit_log_background
+from torchvts.stream import use_calibration
 
 HEIGHT, WIDTH, PITCH = 90, 120, 0.15
 SENSOR = vts.Sensor("drawn", HEIGHT, WIDTH, PITCH, gamma=1.0, blur_px=1.0)
@@ -219,6 +221,17 @@ def test_a_turned_mirrored_or_swapped_background_is_named(change):
     assert any(f"looks like that pattern {change} (correlation 1.00" in text for text in warned), warned
 
 
+def test_a_prior_on_a_background_that_is_not_its_own_is_not_metric(tmp_path):
+    sensor = dataclasses.replace(SENSOR, prior=prior(other_light()))
+    own, _ = calibrate(camera(other_light()), sensor)
+    other, _ = calibrate(camera(other_light()).flip(1, 2), sensor)
+    other.save(tmp_path / "unit.safetensors")
+    kept = vts.Calibration.load(tmp_path / "unit.safetensors")
+    assert "objection" not in own.report and use_calibration(own).metric
+    assert "turned by 180 degrees" in kept.report["objection"] and not use_calibration(kept).metric
+    assert expected(kept).startswith("depth is NOT METRIC")
+
+
 @pytest.mark.parametrize("gain", [(1.0, 1.0, 1.0), (0.7, 1.2, 0.9)])
 @pytest.mark.parametrize("shift_px", [(0, 0), (6, 0), (-6, 4)])
 def test_another_unit_of_the_same_type_is_not_named(gain, shift_px):
@@ -310,6 +323,8 @@ def test_frames_cropped_otherwise_are_named(scale, shift_px):
     assert crop is not None and crop.scale == pytest.approx(scale, abs=0.03)
     assert crop.shift_px == pytest.approx(shift_px, abs=2.0)
     assert other_crop(camera(light), [one.image for one in presses(light)]) is None
+    assert other_crop(camera(light), [0.1 * images[0]]) is None  # dark: it shows nothing
+    assert other_crop(camera(light), [0.1 * images[0], *images]) == crop
 
 
 def test_presses_that_cannot_be_used_because_of_their_crop_say_so(monkeypatch):

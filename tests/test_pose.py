@@ -444,5 +444,13 @@ def test_the_script_writes_pose_and_picture(run_script, tmp_path):
     assert (
         done.returncode == 2 and done.stderr.strip().splitlines()[-1].startswith("torchvts: error: ") and "touched" in done.stderr
     )
+    done = call("film/a.png", "background.png", "none", *unit)
+    assert done.returncode == 2 and "reference: expected a contact of at least 60 pixels, got 0" in done.stderr
+    vts.write_image(tmp_path / "black.png", torch.zeros_like(background))
+    for given, name in ((("black.png", "target.png"), "frame"), (("film/a.png", "black.png"), "reference")):
+        done = call(*given, "none", *unit)
+        assert done.returncode == 2 and f"{name}: expected one that can be used: the frame has one colour" in done.stderr
+    done = call("film/a.png", "target.png", "background.png", *unit)
+    assert done.returncode == 2 and "background.png: expected the name of a folder for the results" in done.stderr
     done = call("target.png", "target.ply", "none")
     assert done.returncode == 2 and "got one of each" in done.stderr

@@ -551,6 +551,15 @@ def test_the_overlay_shows_contours_and_grows_its_range(unit, small_press):
     assert len(ys) > 50 and abs(np.hypot(ys - 59.5, xs - 79.5) - np.sqrt(inside.sum() / np.pi)).max() < 3
 
 
+def test_long_text_of_an_overlay_stays_beside_the_bar(unit, small_press):
+    scene = small_press(1.0)
+    output = vts.DepthOutput(scene.depth_mm, scene.gradient, scene.normal, scene.contact, scene.contact)
+    frame = streams.TactileFrame(0, 0.0, torch.zeros(3, 120, 160), output)
+    none, few, many = (streams.Overlay()(frame, ["word " * count]) for count in (0, 2, 60))
+    assert (none[:, 320:] == many[:, 320:]).all() and (none[:, :320] != many[:, :320]).any()
+    assert (few[310:, :320] != many[310:, :320]).any()  # the last line
+
+
 def test_a_sheet_shows_six_frames_in_contact_in_one_range(small_press):
     sheet = streams.Sheet(PITCH, metric=False)
     with pytest.raises(ValueError, match="sheet: expected frames with contact, got none"):
@@ -626,6 +635,20 @@ def test_track_writes_a_row_for_each_frame_after_the_reference(run_script, unit_
     turns = poses[:, :, :3]
     assert np.allclose(turns @ turns.transpose(0, 2, 1), np.eye(3), atol=1e-6)
     assert all("rotation about z" in row["ambiguous"] and float(row["std_z_mm"]) > 0 for row in rows[:9])
+
+
+def test_track_refuses_a_reference_that_cannot_be_used_and_counts_bad_frames(unit, run_script, unit_file, tmp_path):
+    _, camera = unit
+    (tmp_path / "film").mkdir()
+    for k in range(20):
+        cv2.imwrite(str(tmp_path / "film" / f"{k:03d}.png"), camera(1.0 if k >= 15 else 0.0) * (k != 17))
+    call = ("track", "--source", tmp_path / "film", "--calibration", unit_file, "--out", tmp_path / "out", "--video", "none")
+    done = run_script(*call)
+    assert done.returncode == 1 and "1 frames left out, named above" in done.stdout, done.stderr
+    done = run_script(*call, "--reference", tmp_path / "film" / "017.png")
+    assert done.returncode == 2 and "017.png: the frame has one colour everywhere" in done.stderr
+    done = run_script(*call, "--least-mm2", "-1")
+    assert done.returncode == 2 and "--least-mm2: expected a number above 0" in done.stderr
 
 
 def test_bad_arguments_are_refused_in_a_sentence(run_stream, video, tmp_path):

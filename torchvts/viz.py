@@ -109,7 +109,7 @@ def depth_figure(
     draw_contours(figure, axes, depth, mm_per_pixel)
     if image is not None:
         axes.set_ylabel("")
-    draw_surface(panel(left + wide + 0.6, 0.0, size[0] - left - wide - 0.65, lower + high, projection="3d"), depth, mm_per_pixel)
+    draw_surface(panel(left + wide + 0.55, 0.0, size[0] - left - wide - 0.75, lower + high, projection="3d"), depth, mm_per_pixel)
     if title:
         figure.suptitle(title, fontsize=11, y=1.0 - 0.08 / size[1], va="top")
     return figure

@@ -112,11 +112,11 @@ def calibrate(
 def _choose(given: "_Given") -> tuple[Calibration, list[str]]:
     """The calibration, and what to warn of."""
     lights = by_lights(given.background, given.sensor, bool(given.presses or given.touches or given.sensor.prior), given.progress)
-    prior, messages = _prior(given)
+    prior = _prior(given)
     touched, more = _touched(given, prior.model)
     choose = _with_presses if given.presses else _without_presses
     calibration, last = choose(given, lights, prior, touched)
-    return calibration, messages + more + last
+    return calibration, prior.complaints + more + last
 
 
 def fit_prior(background: Tensor, sensor: Sensor, presses: Sequence[Press], source: str = "") -> SensorPrior:
@@ -166,22 +166,24 @@ class _Prior(NamedTuple):
     Attributes:
         model: with the sensor's blur if it has one; None where the sensor has no prior.
         objection: why the background is not that of the prior's sensor type, or "".
+        complaints: about the background, the objection and a contact among them.
     """
 
     model: ResponseModel | None
     objection: str
+    complaints: list[str]
 
 
-def _prior(given: _Given) -> tuple[_Prior, list[str]]:
-    """The prior, and complaints about the background."""
+def _prior(given: _Given) -> _Prior:
+    """The prior, and how the background fits it."""
     if given.sensor.prior is None:
-        return _Prior(None, ""), []
+        return _Prior(None, "", [])
     prior = given.sensor.prior.response
     if given.sensor.blur_px > 0:
         prior = dataclasses.replace(prior, blur_px=given.sensor.blur_px)
     match = compare_patterns(given.background, given.sensor)
     objection = complaints.of_pattern(match, given.sensor)
-    return _Prior(prior, objection), complaints.of_background_with_prior(given.background, given.sensor, match)
+    return _Prior(prior, objection, complaints.of_background_with_prior(given.background, given.sensor, match))
 
 
 def _touched(given: _Given, prior: ResponseModel | None) -> tuple[TouchResult | None, list[str]]:
@@ -223,6 +225,8 @@ def _without_presses(
         candidate: CandidateRow = {"model": "prior", "family": family, "parameters": 0, "score_deg": None, "passes": 2}
         reason = f"the sensor's prior, transferred to this unit by its background; point lights rejected: {row['note']}"
         report = {"model": "response", "source": "prior", "reason": reason, "candidates": [*lights.rows, candidate]}
+        if prior.complaints:
+            report["objection"] = "; ".join(prior.complaints)
         return Calibration.from_response(prior.model, given.sensor, given.background, report), []
     if lights.unit is None:
         raise ValueError(

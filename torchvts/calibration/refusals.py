@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..model.calibration import PEDESTAL
-from .contacts import Contact
+from .contacts import DARK, Contact
 from .presses import Press, Touch
 
 UNIFORM_COLOUR = 0.05
@@ -127,11 +127,15 @@ def other_crop(background: Tensor, frames: Sequence[Tensor]) -> Crop | None:
     """The crop of frames relative to a background, if it explains their difference; else None.
 
     The median of the frames is compared with the scaled and shifted background on coarse cells, each channel's brightness aside.
+    Dark frames are left out: they show nothing.
 
     Args:
         background: (3, H, W) in [0, 1].
         frames: (3, H, W) each, at least one.
     """
+    frames = [frame for frame in frames if float(frame.mean()) >= DARK * float(background.mean())]
+    if not frames:
+        return None
     stride = max(1, len(frames) // 15)
     seen = torch.stack([_cells(frame, 60) for frame in frames[::stride]]).median(dim=0).values[None].float()
     own = _cells(background, 60)[None].float()

@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 
 from ..calibration import Press, Touch, read_presses
-from ..core.files import read_frames
+from ..core.files import make_folder, read_frames
 from ..model import Sensor
 from ..stream import read_background, read_press_images
 from .options import add_background_frames, add_press, add_sensor
@@ -64,7 +64,7 @@ def check_target_of(out: Path) -> None:
     """Refuse a name that is no calibration's before the work that leads to it."""
     if out.suffix != ".safetensors":
         raise UsageError(f"--out: expected a name ending in .safetensors, got {out}")
-    out.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(out.parent)
 
 
 def read_given(arguments: argparse.Namespace) -> tuple[torch.Tensor, Sensor, list[Press]]:

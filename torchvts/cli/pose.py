@@ -19,11 +19,12 @@ import torch
 from tqdm import tqdm
 
 from .. import viz
-from ..core.files import count_frames, read_frames, read_image, write_atomically
-from ..pipeline import unit_pipeline
+from ..core.files import count_frames, make_folder, read_frames, read_image, write_atomically
+from ..pipeline import DepthOutput, unit_pipeline
 from ..pose import contact_cloud, read_point_cloud, register_depth, register_points, write_point_cloud
 from ..pose.clouds import CLOUD_SUFFIXES
 from ..pose.result import Registration
+from ..stream import FrameCheck
 from .options import add_mode, add_network, add_out, load_calibration
 
 USAGE = "SOURCE REFERENCE [--calibration FILE] --out FOLDER"
@@ -46,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     clouds = [path.suffix.lower() in CLOUD_SUFFIXES for path in (arguments.source, arguments.target)]
     if any(clouds) and not all(clouds):
         raise ValueError("source and target: expected two images or two clouds, got one of each")
-    arguments.out.mkdir(parents=True, exist_ok=True)
+    make_folder(arguments.out)
     results = of_clouds(arguments) if all(clouds) else of_frames(arguments)
     with write_atomically(arguments.out / "pose.json") as temporary:
         temporary.write_text(json.dumps(results if len(results) > 1 else results[0], indent=1) + "\n")
@@ -73,18 +74,29 @@ def of_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     calibration = load_calibration(arguments.calibration)
     by_lights = calibration.response is None and arguments.network is None
     pipe = unit_pipeline(calibration, arguments.mode if by_lights else "auto", arguments.network)
-    pitch = calibration.sensor.mm_per_pixel
-    with torch.inference_mode():
-        target = pipe(calibration.sensor.rectify(read_image(arguments.target)[None]))
-    target_points = contact_cloud(target, pitch, 4000)[0]
+    pitch, check = calibration.sensor.mm_per_pixel, FrameCheck.from_calibration(calibration)
+
+    def depth_of(image: torch.Tensor) -> DepthOutput:
+        image = calibration.sensor.rectify(image[None])
+        reason = check(image) if check is not None else ""
+        if reason:
+            raise ValueError(f"frame: expected one that can be used: {reason}")
+        with torch.inference_mode():
+            output: DepthOutput = pipe(image)
+        return output
+
+    try:
+        target = depth_of(read_image(arguments.target))
+        target_points = contact_cloud(target, pitch, 4000)[0]
+    except ValueError as error:
+        raise ValueError(f"reference: {str(error).removeprefix('frame: ')}") from error
     results: list[dict[str, Any]] = []
     last = None
     for name, image in tqdm(read_frames(arguments.source), total=count_frames(arguments.source), unit="frame", disable=None):
-        with torch.inference_mode():
-            frame = pipe(calibration.sensor.rectify(image[None]))
         try:
+            frame = depth_of(image)
             found = register_depth(frame, target, pitch, initial=last)
-        except ValueError as error:  # a frame of a sequence without contact
+        except ValueError as error:  # a frame of a sequence that cannot be used, or without contact
             if count_frames(arguments.source) == 1:
                 raise
             results.append({"frame": name, "converged": False, "message": str(error)})
@@ -120,7 +132,8 @@ def print_result(name: str, found: Registration) -> None:
     turn = float(torch.rad2deg(torch.atan2(T[1, 0], T[0, 0])))
     tilt = float(torch.rad2deg(torch.acos(T[2, 2].clamp(-1, 1))))
     x, y, z = T[:3, 3].tolist()
-    print(f"{name}: {'converged' if found.converged else 'NOT converged'}, rmse {1000 * found.rmse_mm:.1f} um: {found.message}")
+    fit = f", rmse {1000 * found.rmse_mm:.1f} um" if math.isfinite(found.rmse_mm) else ""
+    print(f"{name}: {'converged' if found.converged else 'NOT converged'}{fit}: {found.message}")
     which = "one of the poses that fit: " if found.ambiguous or found.alternatives else ""
     print(f"{name}: {which}turned {turn:.3f} degrees in the plane, tilted {tilt:.3f}, moved ({x:.4f}, {y:.4f}, {z:.4f}) mm")
 

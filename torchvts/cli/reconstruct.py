@@ -15,11 +15,11 @@ import csv
 import os
 from pathlib import Path
 
-from ..core.files import VIDEO_SUFFIXES, read_frames
+from ..core.files import VIDEO_SUFFIXES, make_folder, read_frames
 from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, Report, list_items, reconstruct_dataset
 from ..diagnose import Finding, diagnose
 from ..model import Sensor
-from ..stream import read_background, read_press_images
+from ..stream import NOT_METRIC, read_background, read_press_images, use_calibration
 from .options import add_background_frames, add_out, add_pipeline, add_press, add_sensor, contact_of, load_calibration
 from .parser import UsageError
 from .summary import SHOWN, calibrated, left_out, print_calibration
@@ -64,9 +64,11 @@ def run(arguments: argparse.Namespace) -> int:
     if report.rank > 0:
         return 0
     print_report(report, arguments.out)
+    if not use_calibration(load_calibration(calibration)).metric:
+        print(NOT_METRIC)
     if arguments.pictures is None and report.rows > PICTURES_UP_TO:
         print(f"no pictures of more than {PICTURES_UP_TO} frames: --pictures --overwrite draws all, --every N fewer")
-    for finding in diagnose_first(calibration, inputs):
+    for finding in diagnose_first(calibration, inputs, {name for name, _ in report.failed}):
         print(f"first frame: {finding}")
     return 1 if report.failed else 0
 
@@ -98,7 +100,7 @@ def calibrate_first(arguments: argparse.Namespace, inputs: list[Path]) -> Path:
     calibration = calibrated(image, unit, read_press_images(arguments.press, unit))
     print_calibration(calibration)
     path: Path = arguments.out / "calibration.safetensors"
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     calibration.save(path)
     return path
 
@@ -124,11 +126,13 @@ def print_report(report: Report, out: Path) -> None:
     print(f"wrote {frames} to {out}{before}; table in frames.csv, units in summary.json")
 
 
-def diagnose_first(calibration: Path, inputs: list[Path]) -> list[Finding]:
-    """What is wrong with the first frame, such as that it is from another unit; one that cannot be read is reported above."""
+def diagnose_first(calibration: Path, inputs: list[Path], reported: set[str]) -> list[Finding]:
+    """What is wrong with the first frame, such as that it is from another unit; one that was left out is reported above."""
     unit = load_calibration(calibration)
     try:
         first = next(list_items(tuple(inputs) if len(inputs) > 1 else inputs[0]))
+        if first.frame_name(0 if first.is_video else -1) in reported:
+            return []
         _, image = next(iter(read_frames(first.file)))
         found = diagnose(None, unit.sensor.rectify(image[None])[0], unit)
     except (OSError, ValueError, StopIteration):

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..calibration import Press
-from ..core.files import check_target
+from ..core.files import check_target, make_folder
 from ..model import Calibration, Sensor
 from ..stream import (
     Overlay,
@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is None:
         print("give --out for an overlay video and files; torchvts view shows the stream live")
     else:
-        arguments.out.mkdir(parents=True, exist_ok=True)
+        make_folder(arguments.out)
     presses: Sequence[Press] = ()
     if isinstance(unit, Sensor):
         presses = read_press_images(arguments.press, unit)

@@ -67,6 +67,8 @@ def calibrated(background: Tensor, sensor: Sensor, presses: Sequence[Press], tou
 def expected(calibration: Calibration) -> str:
     """How good depth is likely to be, from the held-out score, the record of the prior, or the spread of the lights."""
     report = calibration.report
+    if report.get("objection"):
+        return f"{NOT_METRIC}; the prior was used all the same, see the warning"
     if not use_calibration(calibration).metric:
         return NOT_METRIC
     if report["model"] == "point_lights":
@@ -80,8 +82,8 @@ def expected(calibration: Calibration) -> str:
         scored = f"{report['held_out_deg']:.1f} on each of {used} presses by the others"
         return f"{degrees}: {scored}, and more where no ball was pressed"
     if report["source"] == "prior":
-        return f"{degrees} if this unit is like the one its prior was fitted to; presses of a ball would measure it"
-    return f"{degrees} or better: too few presses to score any; more presses of a ball would measure it"
+        return f"{degrees} if this unit is like the one its prior was fitted to, else more; presses of a ball would measure it"
+    return f"{degrees}, a guess: too few presses to score any; more presses of a ball would measure it"
 
 
 def left_out(what: str, rows: list[tuple[str, str]]) -> Iterator[str]:

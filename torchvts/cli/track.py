@@ -1,7 +1,7 @@
 """Pose of a touched object in every frame of a camera or a recording, from where it first touches: poses.csv, axes on the image.
 
 The first frames must be without contact. The reference is the first frame with a contact of --least-mm2, or the image --reference.
-Ctrl-C ends it and finishes the files. Exit status 1 where the object was lost.
+Ctrl-C ends it and finishes the files. Exit status 1 where the object was lost or a frame was left out.
 
 examples:
   torchvts track --source video.avi --sensor gelsight_wedge --out out/track
@@ -19,7 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..core.files import read_image, write_atomically
+from ..core.checks import check_positive
+from ..core.files import make_folder, read_image, write_atomically
 from ..pose import PoseTracker, TrackedPose
 from ..pose.follow import TRUSTED_DEG, TRUSTED_MM
 from ..stream import Overlay, TactileFrame, TactileStream, VideoFile
@@ -46,8 +47,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Track until the source ends, and print a summary."""
+    check_positive("--least-mm2", arguments.least_mm2)
     unit = load_unit(arguments)
-    arguments.out.mkdir(parents=True, exist_ok=True)
+    make_folder(arguments.out)
     with contextlib.ExitStack() as stack:
         stream = stack.enter_context(open_stream(arguments, unit))
         video = None
@@ -60,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
         writer = csv.DictWriter(file, COLUMNS + QUALITY)
         writer.writeheader()
         writer.writerows(tracking.rows)
-    return _summary(tracking.rows, arguments.out, tracking.tracker)
+    return _summary(tracking.rows, arguments.out, tracking.tracker, len(stream.left_out))
 
 
 class _Tracking:
@@ -88,7 +90,7 @@ class _Tracking:
         if found is None or self.tracker is None:
             return self.overlay(frame, ["no reference yet"])
         image = frame.image if found.lost else draw_axes(frame.image, found, self.tracker, self.pitch)
-        return self.overlay(frame._replace(image=image), [found.message[:90]])
+        return self.overlay(frame._replace(image=image), [found.message])
 
 
 def record(frame: TactileFrame, found: TrackedPose) -> dict[str, object]:
@@ -126,17 +128,22 @@ def _pitch(stream: TactileStream) -> float:
 
 def _tracker_of_image(stream: TactileStream, path: Path) -> PoseTracker:
     image = stream.calibration.sensor.rectify(read_image(path)[None])
+    reason = stream.recording.unusable(image)
+    if reason:
+        raise ValueError(f"reference: {path}: {reason}")
     with torch.inference_mode():
         return PoseTracker(stream.pipe(image), _pitch(stream))
 
 
-def _summary(rows: list[dict[str, object]], out: Path, tracker: PoseTracker | None) -> int:
+def _summary(rows: list[dict[str, object]], out: Path, tracker: PoseTracker | None, left_out: int) -> int:
     if tracker is None:
         raise ValueError("source: expected a contact to track, got none: see --least-mm2")
     lost = [row for row in rows if row["lost"]]
     print(f"{len(rows)} frames, {len(lost)} lost, {len(tracker.graph.keyframes)} keyframes, {len(tracker.closures)} loops closed")
     for reason in list(dict.fromkeys(str(row["lost"]) for row in lost))[:5]:
         print(f"  lost: {reason}")
+    if left_out:
+        print(f"  {left_out} frames left out, named above")
     unknown = [str(row["ambiguous"]) for row in rows if row["ambiguous"]]
     if unknown:
         print(f"  {len(unknown)} frames with unknown motions, mostly: {max(set(unknown), key=unknown.count)}")
@@ -144,4 +151,4 @@ def _summary(rows: list[dict[str, object]], out: Path, tracker: PoseTracker | No
     if uncertain:
         print(f"  {uncertain} frames known less well than to {TRUSTED_DEG:g} degree and {TRUSTED_MM:g} mm")
     print(f"wrote {out / 'poses.csv'}")
-    return 1 if lost else 0
+    return 1 if lost or left_out else 0

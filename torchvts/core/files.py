@@ -45,6 +45,27 @@ def check_target(path: str | Path) -> Path:
     return path
 
 
+def make_folder(path: str | Path) -> Path:
+    """Make a folder for results, with those above it, where it is missing.
+
+    Raises:
+        TypeError: not a path.
+        NotADirectoryError: a file has this name, or that of a folder above it.
+        OSError: it cannot be made there.
+    Example:
+        >>> make_folder(__file__)  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ...
+        NotADirectoryError: ...: expected the name of a folder for the results, got that of a file
+    """
+    path = check_path("path", path)
+    taken = next((folder for folder in (path, *path.parents) if folder.exists()), path)
+    if taken.exists() and not taken.is_dir():
+        raise NotADirectoryError(f"{taken}: expected the name of a folder for the results, got that of a file")
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
 def check_text_name(name: str, path: str | Path, reader: str = "OpenCV") -> str:
     """Return a path as text for a library that crashes on names that are not UTF-8, or raise.
 

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from ..core.files import naming, write_atomically
+from ..core.files import make_folder, naming, write_atomically
 from ..core.results import join_results
 from ..stream import FIRST_FRAMES
 from .items import STATE, Item, Source, has_few_frames, list_items, one_line
@@ -142,7 +142,7 @@ def locked(out: Path) -> Iterator[None]:
     Raises:
         RuntimeError: another run holds it.
     """
-    (out / STATE).mkdir(parents=True, exist_ok=True)
+    make_folder(out / STATE)
     try:
         import fcntl
     except ImportError:  # no such locks on this system

@@ -141,6 +141,17 @@ def _empty(e: Examination) -> float | None:
     return float(e.image.mean()) if e.is_empty else None
 
 
+def _other_view(e: Examination) -> Finding | None:
+    """An image that is cropped, turned or mirrored otherwise than the calibration's.
+
+    Swapped channels are found as a change of light, and a flat contact over all of the skin looks like an image that shows more.
+    """
+    view = e.other_view
+    if not view or "swapped" in view or "shows more" in view:
+        return None
+    return Finding("other_view", f"{view}: take both in the same way", "fault", e.free_share or 0.0)
+
+
 def _failed_leds(e: Examination) -> Figures:
     failed = e.black_channels(e.image)
     return {"value": float(failed.sum()), "colors": " and ".join(CHANNELS[j] for j in range(3) if failed[j])}
@@ -280,6 +291,7 @@ CHECKS = (
           "fault", last=True),
     Check("led_failed", _failed_leds, "the {colors} LED has failed (its channel is black everywhere): check LED and cable; with "
           "two LEDs left modes precise and auto still find a rough depth, with one none does", "fault", above=0.0, last=True),
+    Check("other_view", _other_view, last=True),
     # the skin
     Check("no_free_skin", lambda e: e.free_share, _NO_FREE_SKIN),
     Check("light_changed", lambda e: _light_change(None if e.is_wide_contact else e.change, "image", e)),

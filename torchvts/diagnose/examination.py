@@ -13,6 +13,7 @@ from ..calibration import ROUGH, channel_structure, falloff, outwardness
 from ..core.checks import QUANTISATION_STD
 from ..core.noise import noise_std
 from ..model import Calibration, PointLights
+from ..stream import FrameCheck
 from .camera import Spots, blockiness, levels_of, new_spots
 from .hypotheses import SAME, moved_position
 from .light_change import SATURATED, Change, cell_means, compare
@@ -109,6 +110,12 @@ class Examination:
         """Whether all channels are even, where the background is not: by cells, so that noise does not matter."""
         even, usual = (cell_means(image).flatten(1).std(dim=1) for image in (self.image, self.value))
         return bool((even < 0.05 * usual).all()) and bool((usual > 0.002).all())
+
+    @cached_property
+    def other_view(self) -> str:
+        """In which way the image is cropped or turned otherwise than the calibration's, or ""."""
+        check = FrameCheck.from_calibration(self.calibration)
+        return "" if check is None else check.other_view(self.raw[None])
 
     def compare(self, image: Tensor, noise: Tensor) -> Change:
         """The change from the calibration's background to an image (3, H, W) with noise (3,)."""

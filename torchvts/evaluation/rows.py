@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..core.files import write_atomically
+from ..core.files import make_folder, write_atomically
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ def row_from_dict(values: dict[str, Any]) -> Row:
 
 def write_files(folder: Path, files: Mapping[str, str]) -> None:
     """Write texts by file name into a folder, which is made if missing; an interrupted write leaves no file."""
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     for name, text in files.items():
         with write_atomically(folder / name) as temporary:
             temporary.write_text(text, encoding="utf-8")

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ..accelerated import reference_only
 from ..core.checks import check_batch, check_choice, check_integer, check_path, check_sequence
+from ..core.files import make_folder
 from ..core.geometry import pixel_grid_mm
 from ..model.calibration import Calibration, check_calibration
 from ..pipeline import DepthPipeline
@@ -96,7 +97,7 @@ def export_checked(pipe: DepthPipeline, folder: str | Path, formats: Sequence[st
     for name in formats:
         check_choice("format", name, list(FORMATS))
     folder = check_path("folder", folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     return [_export_one(pipe, folder, name, images) for name in formats]
 
 

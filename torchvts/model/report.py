@@ -108,6 +108,8 @@ class Report(_ReportKeys, total=False):
         model: which model the calibration holds.
         source: where the model comes from, see :data:`Source`.
         reason: why this model was chosen.
+        objection: what speaks against the prior where it was used all the same: the background is not that of the prior's sensor
+            type, or shows a contact. Depth is then not metric. Absent where nothing does.
         candidates: all models that were considered.
         presses: one row per press.
         touches: one row per touch.
@@ -132,6 +134,7 @@ class Report(_ReportKeys, total=False):
     """
 
     reason: str
+    objection: str
     candidates: list[CandidateRow]
     presses: list[PressRow]
     touches: list[TouchRow]

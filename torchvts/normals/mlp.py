@@ -210,7 +210,10 @@ class NormalFromMLP(NormalModel):
             state = _read_state(path)
         domain, blur_px = str(described.get("input_domain", "image")), described.get("blur_px", 0.0)
         if flat is None:
-            raise ValueError("flat: expected the image of the flat skin, (3, H, W), got None: a bare state dict holds none")
+            raise ValueError(
+                "flat: expected the image of the flat skin, (3, H, W), got None: a bare state dict holds none; "
+                "DepthPipeline.from_gs_sdk takes the background"
+            )
         check_flat_shape(flat)
         weights = _check_state(path, state)
         widths = [weight.shape[0] for weight, _ in weights[:-1]]
@@ -258,9 +261,10 @@ def _read_state(path: Path) -> object:
     try:
         state: object = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged file may fail anywhere in torch's reader
-        reason = str(error).strip().splitlines()[0].split(". ")[0] if str(error).strip() else type(error).__name__
+        reason = str(error).strip().splitlines()[0].split(". ")[0] if " " in str(error).strip() else type(error).__name__
         raise ValueError(
-            f"{path}: not a state dict, cut short, or it holds more than tensors, which is refused: {reason}"
+            f"{path}: expected a state dict of torch.save, got what torch cannot read: another kind of file, cut short, or one "
+            f"that holds more than tensors, which is refused ({reason})"
         ) from error
     if isinstance(state, dict) and isinstance(state.get("state_dict"), dict):
         return state["state_dict"]

@@ -105,7 +105,7 @@ class PoseTracker:
         try:
             frame = contact_frame(reference)
         except Unusable as error:
-            raise ValueError(f"reference: expected a contact with relief, got {error}") from None
+            raise ValueError(f"reference: expected a contact with relief, got {error}: does it touch the object?") from None
         keyframe = make_keyframe(frame, self.mm_per_pixel)
         found = pitch_by_slopes(frame)
         if not 1.0 / PITCH_RATIO < found / self.mm_per_pixel < PITCH_RATIO:

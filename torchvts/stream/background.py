@@ -38,6 +38,12 @@ ASSUMED = ("sensor_file", "stand_in")
 """Sources of a model that is not of this unit."""
 
 
+WITHOUT_FIRST = (
+    "start without contact, or use the background of a calibration (--calibration with --background-frames 0; background_frames=0)"
+)
+"""What to do where the first frames show contact."""
+
+
 def find_background(images: Tensor, sensor: Sensor | None = None) -> tuple[Tensor, Tensor]:
     """Find the image of the skin without contact in the first frames, or refuse and say why.
 
@@ -70,7 +76,10 @@ def find_background(images: Tensor, sensor: Sensor | None = None) -> tuple[Tenso
     if sensor is not None:
         check_sensor("sensor", sensor)
     if images.shape[0] < 3:
-        raise ValueError(f"images: expected at least 3 frames without contact, got {images.shape[0]}: the source is too short")
+        raise ValueError(
+            f"images: expected at least 3 frames without contact, got {images.shape[0]}: the source is too short, or fewer were "
+            "asked for (background_frames, --background-frames)"
+        )
     _check_steady(images)
     rank = images.sort(0).values
     quarter = len(images) // 4
@@ -79,15 +88,14 @@ def find_background(images: Tensor, sensor: Sensor | None = None) -> tuple[Tenso
     if structure > ROUGH:
         raise ValueError(
             f"background: the first {len(images)} frames show structure between the channels of {structure:.2f}, without contact "
-            f"it is below {ROUGH}: something touches the skin; start without contact, or give a calibration"
+            f"it is below {ROUGH}: something touches the skin; {WITHOUT_FIRST}"
         )
     if sensor is not None and sensor.prior is not None:
         slope_deg = _structure_deg(image, sensor, sensor.prior)
         if slope_deg > ROUGH_DEG:
             raise ValueError(
                 f"background: the first {len(images)} frames show structure that looks like slopes of {slope_deg:.1f} degrees, "
-                f"without contact it is below {ROUGH_DEG:g}: something touches the skin; start without contact, or give a "
-                "calibration"
+                f"without contact it is below {ROUGH_DEG:g}: something touches the skin; {WITHOUT_FIRST}"
             )
     deviation = nn.functional.avg_pool2d(images - image, 3, 1, 1, count_include_pad=False).square().mean(0)
     smooth = nn.functional.avg_pool2d(deviation[None], 15, 1, 7, count_include_pad=False)[0]
@@ -239,7 +247,7 @@ def use_calibration(calibration: Calibration) -> StreamCalibration:
     report = calibration.report
     note = f"calibration given: {report.get('reason', report.get('model', 'lights'))}"
     metric = max(report.get("direction_std_deg", [0.0])) <= POORLY_CONSTRAINED_DEG
-    metric = metric and report.get("source") not in ASSUMED
+    metric = metric and report.get("source") not in ASSUMED and not report.get("objection")
     return StreamCalibration(calibration, note if metric else f"{note}; {NOT_METRIC}", metric)
 
 

@@ -59,7 +59,10 @@ class Overlay:
         return picture
 
     def __call__(self, frame: TactileFrame, lines: Sequence[str] = ()) -> Pixels:
-        """The overlay, B, G, R, with up to three lines of text; images narrower than 300 pixels are shown larger."""
+        """The overlay, B, G, R, with text; images narrower than 300 pixels are shown larger.
+
+        Long lines are wrapped to the width of the image, and text beyond the fourth line is left out.
+        """
         import cv2
 
         height, width = frame.image.shape[1:]
@@ -75,9 +78,10 @@ class Overlay:
             _draw_scale(out, self.mm_per_pixel / larger, width, height)
         self._draw_bar(out, width + 6, height + 8, width - 12)
         unit = "mm" if self.metric else "mm, NOT METRIC"
-        texts = [f"depth 0 to {self.range_mm:g} {unit}, a line each {self.range_mm / 10:g}", *lines][:4]
-        for k, text in enumerate(texts):
-            _write(out, text, (6, height + 18 + 20 * k))
+        texts = [f"depth 0 to {self.range_mm:g} {unit}, a line every {self.range_mm / 10:g}", *lines]
+        shown = [part for text in texts for part in _wrapped(text, width - 12)][:4]
+        for k, line in enumerate(shown):
+            _write(out, line, (6, height + 18 + 20 * k))
         return out
 
     def _draw_bar(self, out: Pixels, x: int, y: int, width: int) -> None:
@@ -106,6 +110,20 @@ def outlines(contact: Pixels) -> list[Pixels]:
         return []
     smooth = (cv2.blur(contact.view(np.uint8) * 255, (7, 7)) > 127).view(np.uint8)
     return list(cv2.findContours(smooth, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0])
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    """A text in lines of at most so many pixels, broken between words."""
+    import cv2
+
+    found: list[str] = []
+    for word in text.split(" "):
+        line = f"{found[-1]} {word}" if found else word
+        if found and cv2.getTextSize(line, cv2.FONT_HERSHEY_SIMPLEX, 0.43, 1)[0][0] <= width:
+            found[-1] = line
+        else:
+            found.append(word)
+    return found
 
 
 def _write(out: Pixels, text: str, place: tuple[int, int], color: int = 230) -> None:

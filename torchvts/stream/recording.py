@@ -82,7 +82,7 @@ class Recording:
         self._unlearned: tuple[Tensor, Tensor, float] | None = None
         self.device = check_device(device)
         self.pipe: DepthPipeline = unit_pipeline(calibration, mode, network, contact).float()
-        self.check = FrameCheck(value) if calibration.measured else None
+        self.check = FrameCheck.from_calibration(calibration)
         self._fps, self._follow, self._stage = fps, follow, stage
         self._before: float | None = None
         image, noise = (None, None) if first is None else find_background(first)

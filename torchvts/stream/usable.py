@@ -6,6 +6,7 @@ from collections.abc import Callable
 from torch import Tensor, nn
 
 from ..core.checks import check_batch, check_field, check_range, check_same_size
+from ..model.calibration import Calibration, check_calibration
 
 DARK = 0.25
 """A frame whose median brightness, in all channels, is below this share of the background's shows no skin."""
@@ -34,6 +35,9 @@ CROP = 1.0 / 7.0
 NEAR = 0.1
 """Relative difference below which a cell looks like the background."""
 
+LIKE = 0.55
+"""Share of the cells that look like the background from which a frame shows its view."""
+
 
 def _centre(cells: Tensor) -> Tensor:
     """The middle of (3, h, w) cells, without :data:`CROP` a side, at their own size."""
@@ -42,12 +46,22 @@ def _centre(cells: Tensor) -> Tensor:
     return nn.functional.interpolate(middle, cells.shape[1:], mode="bilinear", align_corners=False)[0]
 
 
-_TURNED: tuple[tuple[str, Callable[[Tensor], Tensor]], ...] = (
-    ("turned by 180 degrees", lambda cells: cells.flip(1, 2)),
-    ("mirrored left to right", lambda cells: cells.flip(2)),
-    ("mirrored top to bottom", lambda cells: cells.flip(1)),
-    ("with red and blue swapped", lambda cells: cells.flip(0)),
+_Change = Callable[[Tensor], Tensor]
+
+
+def _same(cells: Tensor) -> Tensor:
+    return cells
+
+
+_VIEWS: tuple[tuple[str, _Change, _Change], ...] = (
+    ("is cropped otherwise and shows more than the background", _centre, _same),
+    ("is cropped otherwise and shows less than the background", _same, _centre),
+    ("is turned by 180 degrees", lambda cells: cells.flip(1, 2), _same),
+    ("is mirrored left to right", lambda cells: cells.flip(2), _same),
+    ("is mirrored top to bottom", lambda cells: cells.flip(1), _same),
+    ("has red and blue swapped", lambda cells: cells.flip(0), _same),
 )
+"""What may have happened to a frame; what is done to its cells and to the background's so that they can be compared."""
 
 
 class FrameCheck:
@@ -63,7 +77,7 @@ class FrameCheck:
         >>> import torch
         >>> check = FrameCheck(torch.rand(3, 48, 64) * 0.2 + 0.4)
         >>> check(torch.zeros(1, 3, 48, 64))
-        'the frame has one colour everywhere: black, or not decoded'
+        'the frame has one colour everywhere: black, overexposed, or not decoded'
     """
 
     def __init__(self, background: Tensor) -> None:
@@ -75,6 +89,14 @@ class FrameCheck:
         self._lit = [(channel, lit) for channel, lit in enumerate(self.background > LIT) if bool(lit.any())]
         self._lit_lines = [line > LIT for line in _lines(background)]
         self._overexposed = _overexposed(self.background) > MOST_OVEREXPOSED
+        self._views = [(what, change, other(self.background)) for what, change, other in _VIEWS]
+
+    @classmethod
+    def from_calibration(cls, calibration: Calibration) -> "FrameCheck | None":
+        """The check of a calibrated unit; None where no image of its background was taken."""
+        check_calibration("calibration", calibration)
+        value = calibration.background.float() ** (1.0 / calibration.sensor.exponent)
+        return cls(value.clamp(0.0, 1.0)) if calibration.measured else None
 
     def __call__(self, frame: Tensor) -> str:
         """Why a frame (1, 3, H, W), rectified, in [0, 1], cannot be used."""
@@ -82,7 +104,7 @@ class FrameCheck:
         check_same_size("frame", frame, "the background", *self.size)
         cells = self._cells(frame.float())
         if _range(cells) < ONE_COLOUR and _range(frame[0]) < ONE_COLOUR:  # the cells of most frames suffice
-            return "the frame has one colour everywhere: black, or not decoded"
+            return "the frame has one colour everywhere: black, overexposed, or not decoded"
         ratio = _ratio(cells, self.background)
         level = max([float(ratio[channel][lit].median()) for channel, lit in self._lit], default=1.0)
         if level < DARK:
@@ -97,23 +119,23 @@ class FrameCheck:
             )
         if not self._overexposed and _overexposed(cells) > MOST_OVEREXPOSED:
             return "the frame is overexposed: nearly all of it is saturated"
-        as_it_is = _likeness(ratio)
-        return "" if as_it_is > 0.55 else self._other_view(cells, as_it_is)
+        return self._other_view(cells, _likeness(ratio))
 
     def _cells(self, frame: Tensor) -> Tensor:
         return nn.functional.avg_pool2d(frame, self.cell)[0]
 
+    def other_view(self, frame: Tensor) -> str:
+        """In which way a frame (1, 3, H, W) is cropped, turned or swapped otherwise than the background; an empty text for none."""
+        cells = self._cells(frame.float())
+        return self._other_view(cells, _likeness(_ratio(cells, self.background)))
+
     def _other_view(self, cells: Tensor, as_it_is: float) -> str:
-        """What would make the cells similar to the background; an empty text where nothing does."""
-        views = [
-            ("cropped otherwise, it shows more than the background", _centre(cells), self.background),
-            ("cropped otherwise, it shows less than the background", cells, _centre(self.background)),
-            *((what, turn(cells), self.background) for what, turn in _TURNED),
-        ]
-        best, what = max((_likeness(_ratio(one, other)), what) for what, one, other in views)
+        if as_it_is > LIKE:
+            return ""
+        best, what = max((_likeness(_ratio(change(cells), other)), what) for what, change, other in self._views)
         if best < 0.5 or best < 1.5 * as_it_is:
             return ""
-        return f"the frame is {what}: then {best:.0%} of it is like the background, as it is {as_it_is:.0%}"
+        return f"the frame {what}: with that undone {best:.0%} of it looks like the background, else {as_it_is:.0%}"
 
 
 def _lines(image: Tensor) -> tuple[Tensor, Tensor]:

@@ -190,17 +190,19 @@ class ContactFromDepth(nn.Module):
 
 
 def above_tail(depth_mm: Tensor, deformed: Tensor, tail: Tensor) -> tuple[Tensor, Tensor]:
-    """Depth from where moved skin goes on below the threshold of :class:`ContactMask`, and the deformed area without its tail.
+    """Depth from the edge beyond which moved skin goes on below the threshold, and the deformed area without that tail.
 
-    There skin sinks with all of the gel and rises more slowly than a membrane; only what it is deeper than that shows the pressure.
+    Out there skin sinks with all of the gel, and rises more slowly than a membrane; what is deeper than the edge shows pressure.
+    Skin deeper than free skin is, such as a flat face, stays.
 
     Args:
         depth_mm: (B, 1, H, W).
         deformed: (B, 1, H, W) bool.
-        tail: (B, 1, H, W) bool, part of it.
+        tail: (B, 1, H, W) bool, part of it: of :class:`ContactMask`.
     """
+    tail = tail & (depth_mm < TAIL[1] * depth_mm.amax(dim=(2, 3), keepdim=True))
     core = deformed & ~tail
-    border = (dilate_cross(core) & tail).to(torch.uint8).to(depth_mm.dtype)
+    border = (dilate_cross(tail) & core).to(torch.uint8).to(depth_mm.dtype)
     level = (depth_mm * border).sum(dim=(2, 3), keepdim=True) / border.sum(dim=(2, 3), keepdim=True).clamp_min(1.0)
     return torch.where(level > 0.0, (depth_mm - level).clamp_min(0.0), depth_mm), core
 

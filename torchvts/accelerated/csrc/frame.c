@@ -3,6 +3,9 @@
 
 #include <math.h>
 
+/* Place of the model's `most_tail` in contact_model: see Model of touching.c. */
+enum { MOST_TAIL = 5 };
+
 /* The settings and tables of a pipeline's blocks, in the order of a frame's way; torchvts/accelerated/frame.py has the same. */
 typedef struct {
     int32_t height, width;
@@ -174,7 +177,8 @@ static int solve_frame(const Program *of, const float *image, Work work, Output 
     if (of->zeroes && zero_background(found, out.deformed, 1, height, width, of->stiff, of->tolerance, of->sweeps, out.depth)) return SHORT;
     const float *pressing = out.depth;
     const uint8_t *core = out.deformed;
-    if (above_tail(out.depth + corner, out.deformed + corner, work.tail + corner, width, at.rows, at.columns, work.depth + corner, work.inner + corner))
+    if (above_tail(out.depth + corner, out.deformed + corner, work.tail + corner, width, at.rows, at.columns, of->contact_model[MOST_TAIL],
+                   work.depth + corner, work.inner + corner))
         pressing = work.depth, core = work.inner;
     if (contact_from_depth(pressing + corner, 0, width, work.gradient, core + corner, 0, width, 1, at.rows, at.columns, of->contact_cell,
                            of->contact_reach, of->contact_model, work.contact))

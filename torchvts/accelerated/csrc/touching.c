@@ -359,32 +359,39 @@ static int allocate(Frame *of) {
     return 0;
 }
 
-/* Whether a pixel of the tail has one of the rest of the deformed area beside it. */
-static int borders_core(const uint8_t *deformed, const uint8_t *tail, int64_t width, int y, int x, int rows, int columns) {
+/* Whether a pixel of the core has one of the rest of the deformed area beside it. */
+static int at_edge(const uint8_t *deformed, const uint8_t *core, int64_t width, int y, int x, int rows, int columns) {
     const int64_t at = y * width + x;
-    return (x > 0 && deformed[at - 1] > tail[at - 1]) || (x + 1 < columns && deformed[at + 1] > tail[at + 1]) ||
-           (y > 0 && deformed[at - width] > tail[at - width]) || (y + 1 < rows && deformed[at + width] > tail[at + width]);
+    return core[at] && ((x > 0 && deformed[at - 1] > core[at - 1]) || (x + 1 < columns && deformed[at + 1] > core[at + 1]) ||
+                        (y > 0 && deformed[at - width] > core[at - width]) || (y + 1 < rows && deformed[at + width] > core[at + width]));
 }
 
 /* What above_tail() of torchvts/contact/touching.py gives, of a window of rows at this distance; returns 0, and sets nothing, without a tail. */
-int above_tail(const float *depth, const uint8_t *deformed, const uint8_t *tail, int64_t width, int rows, int columns, float *above, uint8_t *core) {
+int above_tail(const float *depth, const uint8_t *deformed, const uint8_t *tail, int64_t width, int rows, int columns, float most_of_tail, float *above,
+               uint8_t *core) {
     double sum = 0.0;
-    int64_t border = 0, any = 0;
-    for (int y = 0; y < rows; y++) {
-        const uint8_t *line = tail + y * width;
-        if (!memchr(line, 1, (size_t)columns)) continue;
-        any = 1;
-        for (int x = 0; x < columns; x++)
-            if (line[x] && borders_core(deformed, tail, width, y, x, rows, columns)) sum += depth[y * width + x], border++;
-    }
+    int64_t border = 0;
+    int any = 0;
+    for (int y = 0; y < rows && !any; y++) any = memchr(tail + y * width, 1, (size_t)columns) != NULL;
     if (!any) return 0;
+    float most = depth[0];
+    for (int y = 0; y < rows; y++)
+        for (int x = 0; x < columns; x++) most = depth[y * width + x] > most ? depth[y * width + x] : most;
+    most *= most_of_tail;
+    for (int y = 0; y < rows; y++)
+        for (int x = 0; x < columns; x++) {
+            const int64_t at = y * width + x;
+            core[at] = deformed[at] && !(tail[at] && depth[at] < most);
+        }
+    for (int y = 0; y < rows; y++)
+        for (int x = 0; x < columns; x++)
+            if (at_edge(deformed, core, width, y, x, rows, columns)) sum += depth[y * width + x], border++;
     const float level = border ? (float)(sum / (double)border) : 0.0f;
     for (int y = 0; y < rows; y++)
         for (int x = 0; x < columns; x++) {
             const int64_t at = y * width + x;
             const float over = depth[at] - level;
             above[at] = level > 0.0f ? over > 0.0f ? over : 0.0f : depth[at];
-            core[at] = deformed[at] > tail[at];
         }
     return 1;
 }

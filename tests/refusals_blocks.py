@@ -141,8 +141,12 @@ TABLE = {
         {"sigmas": 4.5, "min_size_px": 8.0, "share": 0.8}, {"sigmas": NUMBER, "min_size_px": NUMBER, "share": NUMBER}
     ),
     "ContactMask.forward": Entry(
-        {"compensated": FLAT[None], "image": FLAT[None]},
-        {"compensated": batches(3), "image": [FLAT, FLAT[None, ..., 1:], FLAT.expand(2, -1, -1, -1), FLAT[None].numpy()]},
+        {"compensated": FLAT[None], "image": FLAT[None], "tail": FLAT[None, :1] > 2.0},
+        {
+            "compensated": batches(3),
+            "image": [FLAT, FLAT[None, ..., 1:], FLAT.expand(2, -1, -1, -1), FLAT[None].numpy()],
+            "tail": [FLAT[None, :1], FLAT[None] > 2.0, FLAT[0] > 2.0, (FLAT[None, :1] > 2.0).numpy()],
+        },
         lambda: pipe().deformed,
     ),
     "ContactMask.shadowed": Entry(

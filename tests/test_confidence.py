@@ -254,7 +254,7 @@ def test_a_calibration_read_from_its_file_gives_the_same_bounds(ring, tmp_path):
         calibration.save(tmp_path / "unit.safetensors")
         read = vts.Calibration.load(tmp_path / "unit.safetensors")
         now, then = (vts.ConfidentPipeline.from_calibration(c)(frames) for c in (calibration, read))
-        assert torch.allclose(now.normal_95_deg, then.normal_95_deg, rtol=1e-3)
+        assert torch.allclose(now.normal_95_deg, then.normal_95_deg, rtol=2e-3)
 
 
 def test_a_learned_module_is_refused(ring):

@@ -119,6 +119,10 @@ def test_the_second_pass_learned_from_balls_carries_over_to_other_objects(seed):
         pipe = DepthPipeline.from_calibration(calibrated, mode)
         with torch.inference_mode():
             found = [pipe(pressed.image[None]) for pressed in unit.objects]
+            blocks = [pipe.reconstructed(pressed.image[None]) for pressed in unit.objects[:3]]
+        for one, other in zip(found, blocks, strict=False):
+            assert torch.equal(one.contact, other.contact) and torch.equal(one.deformed, other.deformed)
+            assert torch.allclose(one.depth_mm, other.depth_mm, rtol=0.0, atol=2e-6)
         pairs = list(zip(found, unit.objects, strict=True))
         errors[mode] = [float(normal_angle_deg(out.normal, p.scene.normal, p.scene.contact).mean()) for out, p in pairs]
         missing = [float((p.scene.depth_mm - out.depth_mm)[p.scene.contact].mean()) for out, p in pairs]

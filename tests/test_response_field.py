@@ -591,7 +591,7 @@ def test_depth_does_not_depend_on_the_sensor_s_pixels():
     gap = (found[1].depth_mm[..., 1::3, 1::3] - depth).abs()
     assert float(depth.max()) > 0.1 and bool(deformed.any()) and not bool(deformed.all())
     # slopes by a random field are those of no surface, and where depth is zero depends on which pixels say so
-    assert float(gap[~rim].max()) < 0.15 * float(depth.max()) and float(gap.max()) < 0.3 * float(depth.max())
+    assert float(gap[~rim].max()) < 0.2 * float(depth.max()) and float(gap.max()) < 0.3 * float(depth.max())
 
 
 # a sensor's prior

@@ -209,7 +209,7 @@ def test_a_network_takes_the_models_place(unit, source, tmp_path):
         reconstruct_dataset(unit, source / "1.png", tmp_path / "net_safetensors", **options)
     for bad, message in (
         (unit, "expected a network"),
-        (source / "1.png", "not a state dict"),
+        (source / "1.png", "expected a state dict"),
         (tmp_path / "no.pth", "no such file"),
     ):
         with pytest.raises((ValueError, FileNotFoundError), match=message):

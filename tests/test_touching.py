@@ -9,6 +9,7 @@ import torch
 import torchvts as vts
 from torchvts.accelerated import ContactMask, reference_only
 from torchvts.calibration import fit_prior
+from torchvts.contact import above_tail
 from torchvts.core.geometry import gradient_of_depth
 from torchvts.integration.background import ZeroBackground, with_faces
 from torchvts.model import ResponseModel
@@ -82,6 +83,20 @@ def test_contact_does_not_depend_on_units_of_length():
     contact, deformed = found(depth)
     turned = [t.transpose(2, 3) for t in (depth, gradient_of_depth(depth, PITCH).flip(1) * deformed, deformed)]
     assert torch.equal(vts.ContactFromDepth(PITCH)(*turned).transpose(2, 3), contact)
+
+
+def test_pressure_is_looked_for_above_the_edge_of_the_tail():
+    """Frames each by themselves; without a tail nothing changes; a flat face within the tail stays."""
+    y, x = torch.meshgrid(torch.arange(40.0) - 20.0, torch.arange(50.0) - 25.0, indexing="ij")
+    away = torch.hypot(x, y)[None, None]
+    depth = torch.cat((0.05 * (16.0 - away).clamp(0.0, 10.0), 0.05 * (16.0 - away).clamp(0.0, 10.0)))
+    deformed = depth > 0.0
+    tail = torch.cat((deformed[:1] & (away > 12.0), torch.zeros_like(deformed[:1])))
+    tail[0, 0, 20, 25] = True  # as deep as it gets
+    above, core = above_tail(depth, deformed, tail)
+    assert 0.2 <= float((depth - above)[0][core[0]].max()) < 0.25  # depth at 12 pixels from the middle, and at 11
+    assert torch.equal(core[0], (away <= 12.0)[0]) and float(above.min()) == 0.0
+    assert torch.equal(above[1], depth[1]) and torch.equal(core[1], deformed[1])
 
 
 def test_script_export_windows_and_batches_agree():

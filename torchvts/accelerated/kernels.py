@@ -285,7 +285,7 @@ def contact_mask(
     limits: tuple[Tensor, Tensor],
     grid: ContactGrid,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Deformed area, its interior and its tail, bool (B, 1, H, W): see :class:`~torchvts.contact.ContactMask`, whose attributes these are.
+    """Deformed area, interior and tail, bool (B, 1, H, W): see :class:`~torchvts.contact.ContactMask`, whose attributes these are.
 
     ``image``: where pixels stand out; ``compensated``: what the noise is of. ``offset``: None where it is ``-per_noise``, as the
     undeformed skin is 1. ``limits``: ``failed_below`` and ``most_far_field``.

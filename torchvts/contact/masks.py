@@ -16,6 +16,7 @@ from ..core.checks import (
     check_field,
     check_float_tensor,
     check_least,
+    check_mask,
     check_noise,
     check_positive,
     check_record,
@@ -197,6 +198,13 @@ class ContactMask(nn.Module):
         if image is not None:
             self._check("image", image)
             check_same_count("image", image, "compensated", compensated.shape[0])
+        if tail is not None:
+            check_mask("tail", tail)
+            count, height, width = compensated.shape[0], compensated.shape[2], compensated.shape[3]
+            if tail.dim() != 4 or list(tail.shape) != [count, 1, height, width]:
+                raise ValueError(
+                    f"tail: expected [{count}, 1, {height}, {width}] like compensated, got {list(tail.shape)}: it takes a result"
+                )
         image = self.divided(compensated) if image is None else image
         found = self.find(compensated.detach(), image.detach())
         if tail is not None:

@@ -189,7 +189,7 @@ class ContactFromDepth(nn.Module):
         return squared.clamp(self.decay[0] ** 2, self.decay[1] ** 2)
 
 
-def above_tail(depth_mm: Tensor, deformed: Tensor, tail: Tensor) -> tuple[Tensor, Tensor]:
+def above_tail(depth_mm: Tensor, deformed: Tensor, tail: Tensor, most: float = TAIL[1]) -> tuple[Tensor, Tensor]:
     """Depth from the edge beyond which moved skin goes on below the threshold, and the deformed area without that tail.
 
     Out there skin sinks with all of the gel, and rises more slowly than a membrane; what is deeper than the edge shows pressure.
@@ -199,8 +199,9 @@ def above_tail(depth_mm: Tensor, deformed: Tensor, tail: Tensor) -> tuple[Tensor
         depth_mm: (B, 1, H, W).
         deformed: (B, 1, H, W) bool.
         tail: (B, 1, H, W) bool, part of it: of :class:`ContactMask`.
+        most: depth of free skin, as a share of a frame's largest.
     """
-    tail = tail & (depth_mm < TAIL[1] * depth_mm.amax(dim=(2, 3), keepdim=True))
+    tail = tail & (depth_mm < most * depth_mm.amax(dim=(2, 3), keepdim=True))
     core = deformed & ~tail
     border = (dilate_cross(tail) & core).to(torch.uint8).to(depth_mm.dtype)
     level = (depth_mm * border).sum(dim=(2, 3), keepdim=True) / border.sum(dim=(2, 3), keepdim=True).clamp_min(1.0)

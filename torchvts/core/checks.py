@@ -221,6 +221,8 @@ def check_noise(name: str, noise_std: Tensor, count: int) -> None:
         )
     if not noise_std.is_floating_point():
         raise TypeError(f"{name}: expected a floating-point tensor, got {noise_std.dtype}: images are value / 255 in [0, 1]")
+    if noise_std.dtype != torch.float32 and noise_std.dtype != torch.float64:
+        raise TypeError(f"{name}: expected float32 or float64, got {noise_std.dtype}: use .float()")
     check_same_count(name, noise_std, "compensated", count)
 
 

@@ -318,12 +318,7 @@ class DepthPipeline(nn.Module):
         """The output of checked images (B, 3, H, W), all solved in the one window that holds the deformed skin of all."""
         compensated = self.compensate(images)
         image = self.smooth(compensated)
-        tail = torch.zeros_like(compensated[:, 0:1], dtype=torch.bool)
-        # a ContactMask gets both, so that the smooth change of the light is found once; any other mask the first alone
-        if hasattr(self.deformed, "smooth_light"):
-            deformed = self.deformed(compensated, image, tail)
-        else:
-            deformed = self.deformed(compensated)
+        deformed, tail = self.areas(compensated, image)
         frame = self.crop(image, deformed)
         if may_read_values() and (images.shape[0] == 0 or (self.skips_undeformed and self.nothing_to_solve(frame))):
             return undeformed_output(frame)
@@ -336,6 +331,17 @@ class DepthPipeline(nn.Module):
         solution = self.slopes(frame, solution)
         out: DepthOutput = self.uncrop(frame, solution, contact)
         return out
+
+    def areas(self, compensated: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Where the skin has moved, and the part of it below the threshold, each bool (B, 1, H, W).
+
+        A :class:`ContactMask` knows that part, and gets the image without its smooth change of light, which is then found once;
+        any other mask gets the compensated image alone.
+        """
+        tail = torch.zeros_like(compensated[:, 0:1], dtype=torch.bool)
+        if hasattr(self.deformed, "smooth_light"):
+            return self.deformed(compensated, image, tail), tail
+        return self.deformed(compensated), tail
 
     def with_faces(self, frame: Frame, solution: Solution) -> tuple[Frame, Solution]:
         """Frames in which no closed rim encloses a flat face of the object, solved again with the face in their deformed area.

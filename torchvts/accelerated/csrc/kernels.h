@@ -129,7 +129,7 @@ EXPORT int zero_background(const float *depth, const uint8_t *deformed, int fram
 int add_faces(const float *depth, uint8_t *deformed, int height, int width, uint8_t *kind);
 EXPORT void depth_slopes(const float *depth, int64_t depth_frame, int64_t depth_row, const uint8_t *mask, int64_t mask_frame, int64_t mask_row,
                          float half_per_mm, int frames, int rows, int columns, float *gradient);
-int above_tail(const float *depth, const uint8_t *deformed, const uint8_t *tail, int64_t width, int rows, int columns, float most_of_tail,
+int above_tail(const float *depth, const uint8_t *deformed, uint8_t *tail, int64_t width, int rows, int columns, float most_of_tail,
                float *above, uint8_t *core);
 EXPORT int contact_from_depth(const float *depth, int64_t depth_frame, int64_t depth_row, const float *gradient, const uint8_t *deformed,
                               int64_t deformed_frame, int64_t deformed_row, int frames, int rows, int columns, int cell, int reach,

@@ -359,40 +359,77 @@ static int allocate(Frame *of) {
     return 0;
 }
 
-/* Whether a pixel of the core has one of the rest of the deformed area beside it. */
-static int at_edge(const uint8_t *deformed, const uint8_t *core, int64_t width, int y, int x, int rows, int columns) {
-    const int64_t at = y * width + x;
-    return core[at] && ((x > 0 && deformed[at - 1] > core[at - 1]) || (x + 1 < columns && deformed[at + 1] > core[at + 1]) ||
-                        (y > 0 && deformed[at - width] > core[at - width]) || (y + 1 < rows && deformed[at + width] > core[at + width]));
+enum { AT_ONCE = 16 };
+
+WIDE static float largest_of(const float *restrict values, int n) {
+    float most[AT_ONCE], largest = values[0];
+    for (int k = 0; k < AT_ONCE; k++) most[k] = values[0];
+    int x = 0;
+    for (; x + AT_ONCE <= n; x += AT_ONCE)
+        for (int k = 0; k < AT_ONCE; k++) most[k] = values[x + k] > most[k] ? values[x + k] : most[k];
+    for (int k = 0; k < AT_ONCE; k++) largest = most[k] > largest ? most[k] : largest;
+    for (; x < n; x++) largest = values[x] > largest ? values[x] : largest;
+    return largest;
 }
 
-/* What above_tail() of torchvts/contact/touching.py gives, of a window of rows at this distance; returns 0, and sets nothing, without a tail. */
-int above_tail(const float *depth, const uint8_t *deformed, const uint8_t *tail, int64_t width, int rows, int columns, float most_of_tail, float *above,
+/* A row of the tail without what is deeper than free skin, and of the core, which is the rest of the deformed area. */
+WIDE static void split_row(const float *restrict depth, const uint8_t *restrict deformed, int n, float most, uint8_t *restrict tail, uint8_t *restrict core) {
+    for (int x = 0; x < n; x++) {
+        tail[x] = tail[x] & (depth[x] < most);
+        core[x] = deformed[x] & (tail[x] ^ 1);
+    }
+}
+
+/* Pixels of a row of the core that have one of the tail beside, above or below them. */
+WIDE static void find_edge(const uint8_t *restrict core, const uint8_t *restrict tail, const uint8_t *restrict above, const uint8_t *restrict below, int n,
+                           uint8_t *restrict edge) {
+    edge[0] = core[0] & (tail[n > 1] | above[0] | below[0]);
+    for (int x = 1; x + 1 < n; x++) edge[x] = core[x] & (tail[x - 1] | tail[x + 1] | above[x] | below[x]);
+    edge[n - 1] = core[n - 1] & (tail[n > 1 ? n - 2 : 0] | above[n - 1] | below[n - 1]);
+}
+
+/* Adds the number of a row's pixels that are set, and returns the sum of their depth. */
+WIDE static double sum_of(const float *restrict depth, const uint8_t *restrict set, int n, int *number) {
+    float sums[AT_ONCE] = {0.0f}, total = 0.0f;
+    int numbers[AT_ONCE] = {0}, x = 0;
+    for (; x + AT_ONCE <= n; x += AT_ONCE)
+        for (int k = 0; k < AT_ONCE; k++) sums[k] += set[x + k] ? depth[x + k] : 0.0f, numbers[k] += set[x + k];
+    for (int k = 0; k < AT_ONCE; k++) total += sums[k], *number += numbers[k];
+    for (; x < n; x++) total += set[x] ? depth[x] : 0.0f, *number += set[x];
+    return (double)total;
+}
+
+WIDE static void above_level(const float *restrict depth, float level, int n, float *restrict above) {
+    for (int x = 0; x < n; x++) above[x] = depth[x] > level ? depth[x] - level : 0.0f;
+}
+
+/* What above_tail() of torchvts/contact/touching.py gives, of a window of rows at this distance; returns 0, and sets nothing, without a tail. The
+   tail loses what is deeper than free skin. */
+int above_tail(const float *depth, const uint8_t *deformed, uint8_t *tail, int64_t width, int rows, int columns, float most_of_tail, float *above,
                uint8_t *core) {
-    double sum = 0.0;
-    int64_t border = 0;
-    int any = 0;
+    int border = 0, any = 0;
     for (int y = 0; y < rows && !any; y++) any = memchr(tail + y * width, 1, (size_t)columns) != NULL;
     if (!any) return 0;
     float most = depth[0];
-    for (int y = 0; y < rows; y++)
-        for (int x = 0; x < columns; x++) most = depth[y * width + x] > most ? depth[y * width + x] : most;
-    most *= most_of_tail;
-    for (int y = 0; y < rows; y++)
-        for (int x = 0; x < columns; x++) {
-            const int64_t at = y * width + x;
-            core[at] = deformed[at] && !(tail[at] && depth[at] < most);
-        }
-    for (int y = 0; y < rows; y++)
-        for (int x = 0; x < columns; x++)
-            if (at_edge(deformed, core, width, y, x, rows, columns)) sum += depth[y * width + x], border++;
+    for (int y = 0; y < rows; y++) {
+        const float of_row = largest_of(depth + y * width, columns);
+        most = of_row > most ? of_row : most;
+    }
+    for (int y = 0; y < rows; y++) split_row(depth + y * width, deformed + y * width, columns, most_of_tail * most, tail + y * width, core + y * width);
+    double sum = 0.0;
+    for (int y = 0; y < rows; y++) {
+        const uint8_t *line = tail + y * width;
+        uint8_t *edge = (uint8_t *)(above + y * width); /* which takes its values later */
+        find_edge(core + y * width, line, y > 0 ? line - width : line, y + 1 < rows ? line + width : line, columns, edge);
+        if (memchr(edge, 1, (size_t)columns)) sum += sum_of(depth + y * width, edge, columns, &border);
+    }
     const float level = border ? (float)(sum / (double)border) : 0.0f;
-    for (int y = 0; y < rows; y++)
-        for (int x = 0; x < columns; x++) {
-            const int64_t at = y * width + x;
-            const float over = depth[at] - level;
-            above[at] = level > 0.0f ? over > 0.0f ? over : 0.0f : depth[at];
-        }
+    for (int y = 0; y < rows; y++) {
+        if (level > 0.0f)
+            above_level(depth + y * width, level, columns, above + y * width);
+        else
+            memcpy(above + y * width, depth + y * width, sizeof(float) * (size_t)columns);
+    }
     return 1;
 }
 

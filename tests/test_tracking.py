@@ -161,6 +161,17 @@ def test_after_a_search_a_symmetric_object_has_its_other_poses():
     assert nearest < 0.3
 
 
+def test_equal_poses_that_a_search_misses_follow_from_those_it_finds():
+    """One symmetry found gives all powers of it, with the exactness of tracking; a pose between two equal ones is dropped."""
+    tracker = vts.PoseTracker(press(objects.gear(), objects.pose(0.0)), PITCH)
+    keyframe, poses = tracker.graph.keyframes[0], (0.0, 30.6, 31.0)
+    frame = grids(contact_frame(press(objects.gear(), objects.pose(0.0))), PITCH, keyframe.least_mm, keyframe.times)
+    tracker._symmetries_of_reference = []
+    equal, problem = tracker._equal_poses(0, frame, [objects.pose(deg, press_mm=0.0).numpy() for deg in poses])
+    turns = sorted(round(math.degrees(math.atan2(one.pose[1, 0], one.pose[0, 0])) % 360.0, 1) % 360.0 for one in equal)
+    assert problem == "" and turns == pytest.approx([30.0 * k for k in range(12)], abs=0.15)
+
+
 def test_another_object_is_not_taken():
     tracker = vts.PoseTracker(press(objects.key(), objects.pose(0.0)), PITCH)
     for _ in range(2):
@@ -410,6 +421,29 @@ def test_a_bad_reference_is_refused():
         vts.PoseTracker(good, 0.0625)
     with pytest.raises(ValueError, match="mm_per_pixel"):
         vts.PoseTracker(good, -1.0)
+
+
+def test_a_pose_is_no_more_certain_than_the_way_to_its_keyframe():
+    """A golf ball had four poses that converged, though the way over keyframes was uncertain by 3 degrees."""
+    tracker = vts.PoseTracker(press(objects.key(), swing(0)), PITCH)
+    assert tracker(press(objects.key(), swing(1))).converged
+    tracker.graph.covariances[0] = np.diag([math.radians(3.0) ** 2, 0.0, 0.0, 0.0, 0.0, 0.0])
+    found = tracker(press(objects.key(), swing(2)))
+    assert not found.lost and not found.converged and found.drift_deg == pytest.approx(3.0, rel=0.01)
+    assert "uncertain by 3.0 degrees" in found.message and "the way over keyframes adds up" in found.message
+
+
+def test_the_stated_uncertainty_is_that_of_the_errors():
+    """Slopes that err alike over a contact, in both frames: the root mean square of error over standard deviation is about 1."""
+    ratios = []
+    for seed in (1, 2, 3, 4):
+        unit = tracking.WrongSlopes(_bad(press(objects.gear(), swing(0))), tracking.Noise(0.0, 3.0, 2.5), seed, PITCH)
+        tracker = vts.PoseTracker(unit(_bad(press(objects.gear(), swing(0))), 0), PITCH)
+        for k in range(1, 13, 2):
+            found = tracker(unit(_bad(press(objects.gear(), swing(k))), k))
+            stated = math.degrees(math.sqrt(float(found.covariance.diagonal()[:3].sum())))
+            ratios.append(error(found, swing(0), swing(k))[0] / stated)
+    assert 0.5 < math.sqrt(float(np.square(ratios).mean())) < 1.6
 
 
 def test_what_speaks_against_a_pose_is_weighed():

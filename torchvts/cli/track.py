@@ -1,7 +1,9 @@
-"""Pose of a touched object in every frame of a camera or a recording, from where it first touches: poses.csv, axes on the image.
+"""Pose of a touched object in every frame of a camera or a recording, from where it first touches.
 
 The first frames must be without contact. The reference is the first frame with a contact of --least-mm2, or the image --reference.
-Ctrl-C ends it and finishes the files. Exit status 1 where the object was lost or a frame was left out.
+Writes poses.csv (a pose a frame, mm, standard deviations in mm and degrees, what is unknown, why it was lost), summary.json and a
+video with the axes of the reference on the image. Ctrl-C ends it and finishes the files. Exit status 1 where the object was lost or
+a frame was left out.
 
 examples:
   torchvts track --source video.avi --sensor gelsight_wedge --out out/track
@@ -11,8 +13,10 @@ examples:
 import argparse
 import contextlib
 import csv
-import math
+import json
+from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,7 +27,7 @@ from ..core.checks import check_positive
 from ..core.files import make_folder, read_image, write_atomically
 from ..pose import PoseTracker, TrackedPose
 from ..pose.follow import TRUSTED_DEG, TRUSTED_MM
-from ..stream import Overlay, TactileFrame, TactileStream, VideoFile
+from ..stream import NOT_METRIC, Overlay, TactileFrame, TactileStream, VideoFile
 from ..stream.sources import Pixels
 from .options import add_out
 from .source import add_source, load_unit, open_stream, play
@@ -32,14 +36,15 @@ USAGE = "--source SOURCE (--sensor NAME | --calibration FILE) --out FOLDER"
 
 COLUMNS = ("frame", "time_s", *(f"T{row}{column}" for row in range(3) for column in range(4)))
 QUALITY = (
-    "converged", "lost", "ambiguous", "alternatives", "std_x_mm", "std_y_mm", "std_z_mm", "keyframe", "drift_deg", "drift_mm",
+    "converged", "lost", "ambiguous", "alternatives", "std_x_mm", "std_y_mm", "std_z_mm", "std_rx_deg", "std_ry_deg", "std_rz_deg",
+    "keyframe", "drift_deg", "drift_mm",
 )  # fmt: skip
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
     add_source(parser)
-    add_out(parser, "for poses.csv and the video track.mp4")
+    add_out(parser, "for poses.csv, summary.json and the video track.mp4")
     parser.add_argument("--reference", type=Path, metavar="IMAGE", help="of the contact; if not given, the first large one")
     parser.add_argument("--least-mm2", type=float, default=4.0, metavar="AREA", help="contact of the first reference, mm^2 (4)")
     parser.add_argument("--video", choices=["mp4", "avi", "none"], default="mp4", help="kind of video in --out")
@@ -58,11 +63,17 @@ def run(arguments: argparse.Namespace) -> int:
         tracker = None if arguments.reference is None else _tracker_of_image(stream, arguments.reference)
         tracking = _Tracking(stream, video, tracker, arguments.least_mm2)
         play(stream, tracking.add)
+        if tracking.tracker is None:
+            raise ValueError("source: expected a contact to track, got none: see --least-mm2")
     with write_atomically(arguments.out / "poses.csv") as temporary, open(temporary, "w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS + QUALITY)
         writer.writeheader()
         writer.writerows(tracking.rows)
-    return _summary(tracking.rows, arguments.out, tracking.tracker, len(stream.left_out))
+    found = summary(tracking, stream)
+    with write_atomically(arguments.out / "summary.json") as temporary:
+        temporary.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+    _print_summary(found, arguments.out)
+    return 1 if found["lost"] or found["left_out"] else 0
 
 
 class _Tracking:
@@ -71,6 +82,7 @@ class _Tracking:
     def __init__(self, stream: TactileStream, video: VideoFile | None, tracker: PoseTracker | None, least_mm2: float) -> None:
         self.video, self.tracker, self.least_mm2, self.pitch = video, tracker, least_mm2, _pitch(stream)
         self.overlay = Overlay(stream.metric, self.pitch)
+        self.reference: int | None = None
         self.rows: list[dict[str, object]] = []
 
     def add(self, frame: TactileFrame) -> bool:
@@ -80,6 +92,7 @@ class _Tracking:
             self.rows.append(record(frame, found))
         elif float(frame.output.contact.sum()) * self.pitch**2 >= self.least_mm2:
             self.tracker = PoseTracker(frame.output, self.pitch)
+            self.reference = frame.number
             print(f"frame {frame.number}: the reference")
         if self.video is not None:
             self.video.write(self.picture(frame, found))
@@ -94,9 +107,13 @@ class _Tracking:
 
 
 def record(frame: TactileFrame, found: TrackedPose) -> dict[str, object]:
-    """A row of poses.csv: T_frame_reference, row by row, mm, and what speaks for and against it."""
+    """A row of poses.csv: T_frame_reference, row by row, mm, and what speaks for and against it.
+
+    Standard deviations are those of the shifts T03, T13, T23 and of small turns about the frame's x, y, z.
+    """
     pose = [f"{value:.9g}" for value in found.T_target_source[:3].flatten().tolist()]
-    std = [f"{math.sqrt(value):.4g}" for value in found.covariance.diagonal()[3:].tolist()]
+    std_of = found.covariance.diagonal().sqrt()
+    std = [f"{value:.4g}" for value in (*std_of[3:].tolist(), *torch.rad2deg(std_of[:3]).tolist())]
     named = "; ".join(found.ambiguous)
     quality = [int(found.converged), found.lost, named, len(found.alternatives), *std, found.keyframe]
     values = [frame.number, f"{frame.time_s:.6f}", *pose, *quality, f"{found.drift_deg:.4g}", f"{found.drift_mm:.4g}"]
@@ -135,20 +152,49 @@ def _tracker_of_image(stream: TactileStream, path: Path) -> PoseTracker:
         return PoseTracker(stream.pipe(image), _pitch(stream))
 
 
-def _summary(rows: list[dict[str, object]], out: Path, tracker: PoseTracker | None, left_out: int) -> int:
-    if tracker is None:
-        raise ValueError("source: expected a contact to track, got none: see --least-mm2")
+def summary(tracking: _Tracking, stream: TactileStream) -> dict[str, Any]:
+    """What summary.json holds: counts of frames, what was unknown, keyframes, drift, and whether depth is metric."""
+    rows, graph = tracking.rows, tracking.tracker.graph if tracking.tracker else None
     lost = [row for row in rows if row["lost"]]
-    print(f"{len(rows)} frames, {len(lost)} lost, {len(tracker.graph.keyframes)} keyframes, {len(tracker.closures)} loops closed")
-    for reason in list(dict.fromkeys(str(row["lost"]) for row in lost))[:5]:
+    followed = [row for row in rows if not row["lost"]]
+    drift = {name: max((float(str(row[name])) for row in followed), default=0.0) for name in ("drift_deg", "drift_mm")}
+    closures = [] if tracking.tracker is None else tracking.tracker.closures
+    return {
+        "source": stream.reader.name,
+        "fps": stream.fps,
+        "unit": stream.note,
+        "metric": stream.metric,
+        "mm_per_pixel": tracking.pitch,
+        "reference_frame": tracking.reference,  # None where --reference gave an image
+        "frames": len(rows),
+        "lost": len(lost),
+        "lost_because": dict(Counter(str(row["lost"]) for row in lost).most_common()),
+        "left_out": len(stream.left_out),
+        "converged": sum(row["converged"] == 1 for row in rows),
+        "unknown_motions": dict(Counter(str(row["ambiguous"]) for row in rows if row["ambiguous"]).most_common()),
+        "keyframes": len(graph.keyframes) if graph else 0,
+        "loops_closed": [{"deg": deg, "mm": mm} for deg, mm in closures],
+        "largest_drift_deg": drift["drift_deg"],
+        "largest_drift_mm": drift["drift_mm"],
+    }
+
+
+def _print_summary(found: dict[str, Any], out: Path) -> None:
+    loops = len(found["loops_closed"])
+    print(f"{found['frames']} frames, {found['lost']} lost, {found['keyframes']} keyframes, {loops} loops closed")
+    for reason in list(found["lost_because"])[:5]:
         print(f"  lost: {reason}")
-    if left_out:
-        print(f"  {left_out} frames left out, named above")
-    unknown = [str(row["ambiguous"]) for row in rows if row["ambiguous"]]
-    if unknown:
-        print(f"  {len(unknown)} frames with unknown motions, mostly: {max(set(unknown), key=unknown.count)}")
-    uncertain = sum(row["converged"] == 0 and not row["lost"] for row in rows)
+    if found["left_out"]:
+        print(f"  {found['left_out']} frames left out, named above")
+    if found["unknown_motions"]:
+        unknown = found["unknown_motions"]
+        print(f"  {sum(unknown.values())} frames with unknown motions, mostly: {next(iter(unknown))}")
+    uncertain = found["frames"] - found["lost"] - found["converged"]
     if uncertain:
         print(f"  {uncertain} frames known less well than to {TRUSTED_DEG:g} degree and {TRUSTED_MM:g} mm")
-    print(f"wrote {out / 'poses.csv'}")
-    return 1 if lost or left_out else 0
+    if found["keyframes"] > 1:
+        deg, mm = found["largest_drift_deg"], found["largest_drift_mm"]
+        print(f"  drift over keyframes: up to {deg:.2g} degrees and {mm:.2g} mm")
+    if not found["metric"]:
+        print(f"  {NOT_METRIC}; shifts in mm are not either")
+    print(f"wrote {out / 'poses.csv'} and {out / 'summary.json'}")

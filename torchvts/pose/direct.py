@@ -69,14 +69,13 @@ def align(a: Levels, b: Levels, start: Tensor | None) -> Registration:
     return _finish(a, b, poses[[k for k in order if value[k] < 2.0 * value[order[0]] + 0.1]])
 
 
-def symmetries(a: Levels, usual_cost: float) -> list[Tensor]:
-    """Motions (4, 4) after which a frame looks the same, up to the cost with which frames of the same object usually agree."""
+def symmetries(a: Levels) -> list[Tensor]:
+    """Motions (4, 4) after which a frame looks much the same: where slopes err, a symmetric object does not look quite the same."""
     poses, score = search_plane(a.coarse, a.coarse)
     poses = refine(a.coarse, a.coarse, refine(a.coarse, a.coarse, poses[score > 0.4 * score[0]], 4, 4.0), 5)
     poses = torch.cat((torch.eye(4, dtype=torch.float64)[None], poses))
     fit = score_poses(a.coarse, a.coarse, poses)
-    same = [k for k in distinct(fit, a.coarse, 0.4) if float(fit.cost[k]) < 1.5 * usual_cost + 0.01 and is_trusted(fit, k)]
-    return [poses[k] for k in same[1:]]
+    return [poses[k] for k in distinct(fit, a.coarse, 0.4)[1:] if is_trusted(fit, k)]
 
 
 def _finish(a: Levels, b: Levels, poses: Tensor) -> Registration:

@@ -10,7 +10,7 @@ from ..accelerated import kernels
 from ..accelerated.gate import usable
 from .alignment import SLOPE_NOISE, agrees_enough
 from .ambiguity import ALIKE_PIXELS, LEAST_INFORMATION, UNKNOWN_VARIANCE, free_directions, name_directions
-from .height_errors import height_sums
+from .height_errors import ERROR, height_sums
 from .inverse import (
     LEAST_NOISE,
     ROTATION_FIRST,
@@ -39,6 +39,9 @@ LAST_STEP_MM = 0.03
 
 TRUSTED_DEG, TRUSTED_MM = 1.0, 0.15
 """A pose is trusted if three times its standard deviations are within these."""
+
+UNSEEN = math.sqrt(2.0 / (5 * (PARTS - 1)))
+"""Standard deviation, as a share, of the variance that so many parts show in the five motions that slopes show."""
 
 MOST_STD_DEG, MOST_STD_MM = 1.0, 0.15
 """Standard deviations of a motion, as a turn and as a shift, above which it is called unknown."""
@@ -113,11 +116,13 @@ def _follow_from(keyframe: Keyframe, frame: Grids, start: Array, last: Array) ->
     noise = max(LEAST_NOISE, 1.5 * some.slope_noise)
     fine, matrices, rights = sum_parts(frame.fine, keyframe.many, refined, noise, PARTS)
     by_slopes = solve_step(fine, unknown.motions)
-    known_all = unknown.motions.shape[1] == 0
-    step = solve_step(_with_heights(fine, keyframe, frame, refined)) if known_all else by_slopes
+    scaled = _covariance(fine, jackknife(matrices, rights, _others(unknown.motions)), keyframe.shared_error, unknown.motions)
+    step = by_slopes
+    if unknown.motions.shape[1] == 0:
+        fine, both = _with_heights(fine, keyframe, frame, refined)
+        step, scaled = solve_step(both), _covariance_of_both(fine, both, scaled)
+    scaled[5, 5] += fine.depth_noise**2 + HEIGHT_OFFSET_MM**2
     pose = _kept(keyframe, unknown, last, refined @ moved_by(keyframe.many, step))
-    by_parts = keyframe.shared_error * jackknife(matrices, rights, _others(unknown.motions))
-    scaled = _covariance(fine, by_parts, unknown.motions)
     forth = sum_residuals(frame.coarse, keyframe.coarse, pose, SLOPE_NOISE, score_only=True)
     pixels = _pixels(frame.coarse)
     back = sum_residuals(keyframe.grids.coarse, pixels, np.linalg.inv(pose), SLOPE_NOISE, score_only=True)
@@ -137,11 +142,12 @@ def _follow_from(keyframe: Keyframe, frame: Grids, start: Array, last: Array) ->
     )
 
 
-def _with_heights(fine: Sums, keyframe: Keyframe, frame: Grids, pose: Array) -> Sums:
-    """Sums of the last step: heights as their errors let them count, and slopes, once for each coarse pixel."""
+def _with_heights(fine: Sums, keyframe: Keyframe, frame: Grids, pose: Array) -> tuple[Sums, Sums]:
+    """Sums of the last step: slopes, once for each coarse pixel; and heights beside, as their errors let them count."""
     matrix, right = height_sums(keyframe.heights, frame.fine, keyframe.some, pose)
     share = keyframe.coarse.number / keyframe.many.number
-    return fine._replace(matrix=share * fine.matrix + matrix, right=share * fine.right + right)
+    slopes = fine._replace(matrix=share * fine.matrix, right=share * fine.right)
+    return slopes, fine._replace(matrix=slopes.matrix + matrix, right=slopes.right + right)
 
 
 def common_share(keyframe: Keyframe, frame: Grids, sums: Sums, pixels: Pixels) -> float:
@@ -250,16 +256,32 @@ def _others(motions: Array) -> Array:
     return np.linalg.qr(motions, mode="complete")[0][:, motions.shape[1] :] if motions.shape[1] else np.eye(6)
 
 
-def _covariance(fine: Sums, by_parts: Array, free: Array) -> Array:
-    """Covariance of the scaled twist: from parts of the contact, the noise of pixels, and an error of all heights."""
+def _covariance(fine: Sums, by_parts: Array, shared_error: float, free: Array) -> Array:
+    """Covariance of the scaled twist that slopes ask for: the noise of pixels, and what is alike in many of them.
+
+    What parts of the contact disagree by beyond the noise of pixels is alike over wide areas, and parts have much of it in common.
+    Where they disagree by no more than that noise, a smooth error may still be as large as it can be without being seen.
+    """
     beside = np.eye(6) - free @ free.T
     matrix = beside @ fine.matrix @ beside
     matrix[5, :] = matrix[:, 5] = 0.0  # heights have a weight of their own
     information, directions = np.linalg.eigh(matrix)
     known = information > 1e-9 * information[-1]
-    noise = (directions[:, known] / information[known]) @ directions[:, known].T
-    scaled: Array = by_parts + noise * (fine.slope_noise / fine.noise) ** 2
-    scaled[5, 5] += fine.depth_noise**2 + HEIGHT_OFFSET_MM**2
+    noise = (directions[:, known] / information[known]) @ directions[:, known].T * (fine.slope_noise / fine.noise) ** 2
+    alike = 1.0 - float(np.trace(noise)) / max(float(np.trace(by_parts[:5, :5])), 1e-30)
+    scaled: Array = noise + shared_error * (max(0.0, alike) * by_parts + UNSEEN * noise)
+    return scaled
+
+
+def _covariance_of_both(slopes: Sums, both: Sums, by_slopes: Array) -> Array:
+    """Covariance of the scaled twist that slopes and heights ask for, from that of the slopes alone.
+
+    Heights err as :mod:`.height_errors` has it, by as much less or more as the slopes of the two frames differ less or more.
+    """
+    spread = np.linalg.inv(both.matrix + 1e-9 * float(np.trace(both.matrix)) * np.eye(6))
+    share = spread @ slopes.matrix
+    size = 0.5 * (slopes.slope_noise / ERROR) ** 2
+    scaled: Array = share @ by_slopes @ share.T + size * spread @ (both.matrix - slopes.matrix) @ spread
     return scaled
 
 

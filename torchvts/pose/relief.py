@@ -125,7 +125,7 @@ def levels(frame: DepthFrame, mm_per_pixel: float, name: str) -> Levels:
         least = least_depth_mm(noise, mm_per_pixel)
         raise ValueError(
             f"{name}: expected a contact deeper than {least:.3f} mm on some dozens of pixels, got {int(inside.sum())}: "
-            "pressed too faintly"
+            "pressed too faintly, or depth is not in mm?"
         )
     return Levels(made[0], made[1], made[2], noise / every[2])
 

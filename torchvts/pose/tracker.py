@@ -1,5 +1,6 @@
 """Tracking: the pose of a touched object in every frame, from its pose in the last one."""
 
+import itertools
 import math
 from collections import deque
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from ..core.checks import check_positive
 from .alignment import MOST_COST, SLOPE_NOISE, agrees_enough
 from .ambiguity import UNKNOWN_VARIANCE
 from .direct import align, check_rigid, symmetries
-from .follow import Followed, common_share, cross, follow, orthonormal
+from .follow import TRUSTED_DEG, TRUSTED_MM, Followed, common_share, cross, follow, orthonormal
 from .graph import Edge, KeyframeGraph, moved_covariance
 from .inverse import LEAST_NOISE, Array, sum_residuals
 from .keyframe import Contact, Grids, Unusable, contact_frame, grids, make_keyframe, pitch_by_slopes
@@ -32,6 +33,9 @@ GROWN = 2.0
 JUMP_MM = 1.0
 """Motion of the contact between frames, beside the expected one, beyond which a pose is not taken: another one may look alike."""
 
+SAME_MM, MOST_TRIED = 0.4, 72
+"""Poses that move the contact to so nearly the same place are one, mm; and so many starts are tried for equal poses at most."""
+
 RISE = 3.0
 """A residual of so many times the usual one of a track is no noise."""
 
@@ -46,9 +50,10 @@ PITCH_RATIO = 1.5
 class TrackedPose(Registration):
     """Pose of the reference in a frame: a :class:`Registration` whose source is the reference and whose target is the frame.
 
-    ``converged`` is True where three standard deviations of what is known are within 1 degree and 0.15 mm. They include errors of
-    slopes that are alike over wide areas, as far as parts of the contact disagree about them; where a sensor's slopes err by
-    degrees, the object is followed and the pose is not converged, and ``covariance`` says how uncertain it is.
+    ``converged`` is True where three standard deviations of what is known, the drift of the way over keyframes among them, are
+    within 1 degree and 0.15 mm. They include errors of slopes that are alike over wide areas, as far as parts of the contact
+    disagree about them; where a sensor's slopes err by degrees, the object is followed, few poses are converged, and ``covariance``
+    says how uncertain the others are.
 
     Attributes:
         lost: why there is no pose, in words; empty if there is one. Then the last pose is given, with ``converged`` False.
@@ -148,7 +153,7 @@ class PoseTracker:
         reference = self.graph.keyframes[0]
         made = grids(contact, self.mm_per_pixel, reference.least_mm, reference.times)
         if made.touching < 12:
-            return self._lose("hardly any contact")
+            return self._lose(f"hardly any contact deeper than {reference.least_mm:.2g} mm")
         return self._track(contact, made) if self._tracking else self._search(contact, made)
 
     def _track(self, contact: Contact, frame: Grids) -> TrackedPose:
@@ -225,26 +230,57 @@ class PoseTracker:
             if not registered.converged:
                 continue
             chain = self.graph.poses[index]
-            equal = [T.numpy() @ chain for T in (registered.T_target_source, *registered.alternatives)]
-            equal += [equal[0] @ other for other in self._reference_symmetries()]
-            probe = self.graph.keyframes[0].probe
-            start = min(equal, key=lambda pose: _distance(probe, pose, self._poses[-1]))
-            found = self._follow(index, frame, [start])
-            message = self._problem(index, found, [start])
-            if message:
+            starts = [T.numpy() @ chain for T in (registered.T_target_source, *registered.alternatives)]
+            equal, problem = self._equal_poses(index, frame, starts)
+            if not equal:
+                message = problem
                 continue
-            best = found.pose @ chain
-            self._symmetries = [np.linalg.inv(best) @ pose for pose in _distinct(equal, start, probe)]
+            probe = self.graph.keyframes[0].probe
+            found = min(equal, key=lambda one: _distance(probe, one.pose @ chain, self._poses[-1]))
+            back = np.linalg.inv(found.pose @ chain)
+            self._symmetries = [back @ one.pose @ chain for one in equal if one is not found]
             self._active, self._tracking, self._poses = index, True, []
             return self._accept(contact, frame, found)
         return self._lose(f"not found again: {message}")
 
+    def _equal_poses(self, index: int, frame: Grids, starts: list[Array]) -> tuple[list[Followed], str]:
+        """All poses that could be the object's, from some starts on, and if there is none, why.
+
+        The motions between them are symmetries of the object, and so are the products of these, which are tried too: where slopes
+        err, a search finds a few of the twelve poses of a gear, or one. Which of them fits best is then chance.
+        """
+        chain, probe = self.graph.poses[index], self.graph.keyframes[0].probe
+        found: list[Followed] = []
+        tried: list[Array] = []
+        problem = ""
+        waiting = deque(starts)
+        while waiting and len(tried) < MOST_TRIED:
+            start = waiting.popleft()
+            if any(_distance(probe, start, other) < SAME_MM for other in tried):
+                continue
+            one = self._follow(index, frame, [start])
+            pose = one.pose @ chain
+            known = [other.pose @ chain for other in found]
+            tried.append(start)
+            wrong = self._problem(index, one, [start])
+            problem = problem or wrong
+            if wrong or any(_distance(probe, pose, other) < SAME_MM for other in known):
+                continue
+            found.append(one)
+            if one.names:
+                break  # what is unknown is no symmetry
+            if not known:
+                waiting.extend(pose @ other for other in self._reference_symmetries())
+            for first, second in itertools.product([*known, pose], repeat=2):
+                if pose is first or pose is second:
+                    waiting.append(first @ np.linalg.inv(known[0] if known else pose) @ second)
+        least = max(LEAST_NOISE, min((one.fine.slope_noise for one in found), default=0.0))
+        return [one for one in found if one.fine.slope_noise < RISE * least], problem
+
     def _reference_symmetries(self) -> list[Array]:
-        """Motions after which the reference looks the same: continuity is lost, so each of them may have happened."""
+        """Motions after which the reference looks much the same: continuity is lost, so each of them may have happened."""
         if self._symmetries_of_reference is None:
-            cost = median([cost for _, cost in self._usual]) if self._usual else 0.05
-            found = symmetries(self.graph.keyframes[0].levels, cost)
-            self._symmetries_of_reference = [T.numpy() for T in found]
+            self._symmetries_of_reference = [T.numpy() for T in symmetries(self.graph.keyframes[0].levels)]
         return self._symmetries_of_reference
 
     def _accept(self, contact: Contact, frame: Grids, found: Followed) -> TrackedPose:
@@ -260,27 +296,32 @@ class PoseTracker:
         moved_on = large and common_share(keyframe, frame, found.fine, keyframe.many) < ENOUGH
         if (grown or moved_on) and found.free.shape[1] <= keyframe.held.shape[1]:  # else what is unknown now would stay so
             self._take_keyframe(contact, found)
+        center = found.pose[:3, :3] @ keyframe.many.center + found.pose[:3, 3]
+        to_center = np.hstack((-cross(center), np.eye(3)))
+        drift_deg = math.degrees(math.sqrt(float(np.trace(drift[:3, :3]))))
+        drift_mm = math.sqrt(float(np.trace(to_center @ drift @ to_center.T)))
+        std_deg, std_mm = math.hypot(found.std_deg, drift_deg), math.hypot(found.std_mm, drift_mm)
+        exact = found.exact and 3.0 * std_deg <= TRUSTED_DEG and 3.0 * std_mm <= TRUSTED_MM
         message = f"{100 * found.fitness:.0f} % of the common contact agrees"
         if found.names:
             message += f"; kept, because the surface slides on itself: {', '.join(found.names)}"
-        if not found.exact:
-            reason = "parts of the contact disagree" if found.settled else "the last step was a large one"
-            message += f"; uncertain by {found.std_deg:.1f} degrees and {found.std_mm:.2f} mm: {reason}"
-        center = found.pose[:3, :3] @ keyframe.many.center + found.pose[:3, 3]
-        to_center = np.hstack((-cross(center), np.eye(3)))
+        if not exact:
+            reason = "the way over keyframes adds up" if found.exact else "parts of the contact disagree"
+            reason = reason if found.settled else "the last step was a large one"
+            message += f"; uncertain by {std_deg:.1f} degrees and {std_mm:.2f} mm: {reason}"
         return TrackedPose(
             T_target_source=torch.from_numpy(pose.copy()),
             rmse_mm=found.fine.depth_noise,
             fitness=found.fitness,
-            converged=found.exact,
+            converged=exact,
             message=message,
             covariance=torch.from_numpy(found.covariance + drift),
             ambiguous=found.names,
             alternatives=[torch.from_numpy(pose @ other) for other in self._symmetries],
             overlap=found.overlap,
             keyframe=index,
-            drift_deg=math.degrees(math.sqrt(float(np.trace(drift[:3, :3])))),
-            drift_mm=math.sqrt(float(np.trace(to_center @ drift @ to_center.T))),
+            drift_deg=drift_deg,
+            drift_mm=drift_mm,
         )
 
     def _take_keyframe(self, contact: Contact, found: Followed) -> None:
@@ -302,12 +343,3 @@ def _distance(points: Array, one: Array, other: Array) -> float:
     """Root mean square distance of points (N, 3) under two poses (4, 4), mm."""
     off = points @ (one[:3, :3] - other[:3, :3]).T + one[:3, 3] - other[:3, 3]
     return math.sqrt(float(np.square(off).sum(1).mean()))
-
-
-def _distinct(poses: list[Array], first: Array, points: Array, least_mm: float = 0.4) -> list[Array]:
-    """Those of some poses (4, 4) that move the points to other places than ``first`` and than each other."""
-    kept = [first]
-    for pose in poses:
-        if all(_distance(points, pose, other) > least_mm for other in kept):
-            kept.append(pose)
-    return kept[1:]

@@ -4,6 +4,11 @@ python scripts/fit_prior.py ../shared/data/gelsight_mini_a --sensor gelsight_min
 
 python scripts/fit_prior.py background.png --press 1.png 4.7 --press 2.png 4.7 ... --sensor digit --out configs/sensors/digit.yaml
 
+python scripts/fit_prior.py another_unit --sensor configs/sensors/digit.yaml --score --out configs/sensors/digit.yaml
+
+The file says how good the prior is (held_out_deg, degrees): on presses that were held out, and by --score on the presses of another
+unit, which the prior sees by its background alone.
+
 The folder is one of gs_sdk's (catalog.csv, background.png, N/gelsight.png); centers come from label.npz or labels.csv where they
 exist, otherwise they are found. Without a folder: an image without contact, several (their median), or a video, and presses.
 """
@@ -15,7 +20,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torchvts as vts
-from torchvts.calibration import fit_prior
+from torchvts.calibration import fit_prior, score_prior
+from torchvts.model.response_field import SensorPrior
 from torchvts.stream import read_background, read_press_images
 
 
@@ -29,6 +35,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--sensor", required=True, help=f"YAML file, or one of {', '.join(vts.shipped_sensors())}")
     parser.add_argument("--source", default="", help="whose images these are; kept in the file")
+    parser.add_argument(
+        "--score", action="store_true", help="score the sensor's prior on this other unit, and add that to the file"
+    )
     parser.add_argument("--out", type=Path, required=True, help="sensor file to write, .yaml; its leading comment is kept")
     arguments = parser.parse_args(argv)
     sensor = vts.Sensor.load(arguments.sensor)
@@ -37,13 +46,24 @@ def main(argv: Sequence[str] | None = None) -> int:
         background, presses = vts.read_presses(first)
     else:
         background, presses = read_background(arguments.background, sensor), read_press_images(arguments.press, sensor)
-    prior = fit_prior(background, sensor, presses, arguments.source or f"{len(presses)} presses of {first.name}")
+    if arguments.score:
+        prior = with_score(sensor, score_prior(background, sensor, presses))
+    else:
+        prior = fit_prior(background, sensor, presses, arguments.source or f"{len(presses)} presses of {first.name}")
     before = arguments.out.read_text() if arguments.out.is_file() else ""
     comment = [line for line in before.splitlines() if line.startswith("#")]
     dataclasses.replace(sensor, prior=prior).save(arguments.out, comment)
     print(f"{len(presses)} presses; {2 * prior.response.field.size()} parameters of the field")
+    angles = ", ".join(f"{angle:.2f}" for angle in prior.held_out_deg)
+    print(f"error of normals, each unit by what it was not fitted to: {angles or 'not measured, too few presses'} deg")
     print(f"wrote {arguments.out}")
     return 0
+
+
+def with_score(sensor: vts.Sensor, error_deg: float) -> SensorPrior:
+    """The sensor's prior with its error on one more unit, degrees."""
+    assert sensor.prior is not None  # it was scored
+    return dataclasses.replace(sensor.prior, held_out_deg=(*sensor.prior.held_out_deg, error_deg))
 
 
 if __name__ == "__main__":

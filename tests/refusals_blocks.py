@@ -117,6 +117,7 @@ TABLE = {
             "sigmas": 4.5,
             "min_size_px": 8.0,
             "far_field": 0.06,
+            "least_colour": 0.7,
             "smooth_light": False,
         },
         {
@@ -125,6 +126,7 @@ TABLE = {
             "sigmas": NUMBER,
             "min_size_px": NUMBER,
             "far_field": [-0.1, NAN, "0", None],
+            "least_colour": [-0.1, NAN, "0", None],
             "smooth_light": [1, "True", None],
         },
     ),
@@ -635,6 +637,11 @@ TABLE = {
     "fit_prior": Entry(
         {"background": image(), "sensor": sensor(), "presses": [PRESS], "source": ""},
         {"background": images(), "sensor": SENSOR, "presses": [PRESS, [], [image()], None, "presses"], "source": [None, 3]},
+        run=False,
+    ),
+    "score_prior": Entry(
+        {"background": image(), "sensor": vts.Sensor.load("gelsight_mini", height=HEIGHT, width=WIDTH), "presses": [PRESS]},
+        {"background": images(), "sensor": SENSOR, "presses": [PRESS, [image()], None, "presses"]},
         run=False,
     ),
     "gradient_from_normal": Entry(

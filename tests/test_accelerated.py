@@ -323,7 +323,8 @@ def response_unit():
     """A unit calibrated by a response field with products, a blur and a drift of the light, and its frames."""
     generator = torch.Generator().manual_seed(3)
     field = ResponseField(3, 2, 8.0, tuple(tuple((0.3 * torch.randn(66, generator=generator)).tolist()) for _ in range(2)))
-    by_depth = DepthBrightness(2, 8.0, tuple(tuple((0.05 * torch.randn(6, generator=generator)).tolist()) for _ in range(3)))
+    rows = tuple(tuple((0.05 * torch.randn(6, generator=generator)).tolist()) for _ in range(3))
+    by_depth = DepthBrightness(2, 8.0, rows, steeper=0.1, reference_mm=0.2)
     sensor = vts.Sensor("soft", 120, 160, 0.1, blur_px=1.0)
     background = 0.4 + 0.1 * torch.rand(3, 120, 160, generator=generator)
     background[:, 40, 50] = 0.0  # a defect
@@ -454,7 +455,7 @@ def test_normals_by_every_order_of_products(orders):
     degree, product, cubic = orders
     size = terms_of(*orders)
     rows = tuple(tuple((0.3 * torch.randn(size, generator=generator)).tolist()) for _ in range(2))
-    by_depth = DepthBrightness(1, 5.0, ((0.05, 0.01, 0.0),) * 3)
+    by_depth = DepthBrightness(1, 5.0, ((0.05, 0.01, 0.0),) * 3, steeper=0.3, reference_mm=0.4)
     block = NormalFromResponse(ResponseField(degree, product, 5.0, rows, cubic), by_depth, 40, 60, 0.2)
     image, depth = 1.0 + 0.1 * torch.randn(2, 3, 24, 33, generator=generator), torch.rand(2, 1, 24, 33, generator=generator)
     assert response_lines(block) is not None
@@ -490,7 +491,8 @@ def test_one_call_follows_blocks_that_change(response_unit):
     calibration, frames = response_unit
     pipe, image = vts.DepthPipeline.from_calibration(calibration), frames[:1]
     results = [pipe.compiled(image)]
-    pipe.deformed.per_noise.mul_(0.5)
+    for buffer in (pipe.deformed.per_noise, pipe.deformed.offset):
+        buffer.mul_(0.5)
     results.append(pipe.compiled(image))
     pipe.gradient.max_slope = 0.05
     results.append(pipe.compiled(image))

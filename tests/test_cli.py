@@ -1,5 +1,6 @@
 """The command torchvts: its help, its errors and exit statuses, and what it says of a calibration."""
 
+import dataclasses
 import importlib
 import subprocess
 import sys
@@ -130,13 +131,15 @@ def test_what_to_expect_follows_the_source(rig, mini_by_prior):
     sensor, lights, background, _ = rig
     given = vts.Calibration.from_lights(lights, sensor, background)
     assert "presses of a ball would measure it" in expected(given)
-    assert expected(mini_by_prior).startswith("normals within a contact to about 2.0 degrees if this unit is like the one")
+    assert expected(mini_by_prior).startswith("normals within a contact to about 3.8 degrees, the mean over units that its prior")
     held_out = {"model": "response", "source": "presses", "held_out_deg": 1.5, "presses": [{"name": "a", "used": True}] * 12}
     presses = vts.Calibration.from_response(mini_by_prior.response, mini_by_prior.sensor, mini_by_prior.background, held_out)
     assert "to about 1.7 degrees: 1.5 on each of 12 presses by the others, and more where" in expected(presses)
     few = {"model": "response", "source": "presses", "held_out_deg": None, "presses": []}
     fitted = vts.Calibration.from_response(mini_by_prior.response, mini_by_prior.sensor, mini_by_prior.background, few)
-    assert "5.0 degrees, a guess: too few presses to score any" in expected(fitted)
+    assert "5.0 degrees, a guess; more presses" in expected(fitted)
+    one = dataclasses.replace(fitted, report=few | {"own_deg": 2.0, "presses": [{"name": "a", "used": True}]})
+    assert "4.5 degrees, a guess from their misfit: too few presses to score any" in expected(one)
     rough = vts.Calibration.from_response(
         mini_by_prior.response, mini_by_prior.sensor, mini_by_prior.background, {"model": "response", "source": "stand_in"}
     )

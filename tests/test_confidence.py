@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import io
+import math
 import pickle
 import warnings
 
@@ -17,7 +18,15 @@ from torchvts.evaluation.random_scenes import random_frame
 from torchvts.evaluation.score import Truth
 from torchvts.export import sample_frames
 from torchvts.pipeline import bound_at
-from torchvts.pipeline.confidence import DEPTH_SPREAD, FACTORS, _length_95
+from torchvts.pipeline.confidence import (
+    DEPTH_SPREAD,
+    FACTORS,
+    NOT_METRIC_DEG,
+    SPREAD_OF_MEAN,
+    UNMEASURED_DEG,
+    _length_95,
+    expected_model_deg,
+)
 
 scenes = vts.scenes
 HEIGHT, WIDTH, PITCH = 48, 64, 0.6
@@ -175,7 +184,31 @@ def test_the_held_out_error_of_presses_sets_the_bounds():
 
     good, bad, few = bound(held_out_deg=1.0), bound(held_out_deg=4.0), bound(held_out_deg=1.0, presses=3)
     assert good < few < bad and bad / good == pytest.approx(4.0, abs=0.1)
-    assert good < bound(held_out_deg=None, source="prior") < bound(held_out_deg=None, source="touches")
+    assert good < bound(held_out_deg=None, source="touches") == bound(held_out_deg=None, source="prior") < bad * 1.3
+
+
+EXPECTED = {  # what is in the report, and the mean error that follows, degrees
+    "a prior that was tried": ({"source": "prior", "prior_deg": 3.0}, 3.0),
+    "a prior of a file that does not say": ({"source": "prior", "prior_deg": None}, UNMEASURED_DEG),
+    "a calibration of an older version": ({"source": "prior"}, UNMEASURED_DEG),
+    "a background of another type": ({"source": "prior", "prior_deg": 3.0, "objection": "turned"}, NOT_METRIC_DEG),
+    "directions of lights as a stand-in": ({"source": "stand_in"}, NOT_METRIC_DEG),
+    "one press on a prior": ({"source": "presses", "held_out_deg": None, "own_deg": 1.0, "prior_deg": 3.0, "presses": 1}, 3.0),
+    "presses as good as their prior": ({"source": "presses", "held_out_deg": 3.0, "prior_deg": 3.0, "presses": 3}, 3.0),
+    "better than their prior": ({"source": "presses", "held_out_deg": 1.0, "prior_deg": 3.0, "presses": 4}, math.sqrt(5.0)),
+    "presses alone": ({"source": "presses", "held_out_deg": 2.0, "presses": 4}, 2.0 * math.sqrt(2.0)),
+    "one press alone": ({"source": "presses", "held_out_deg": None, "own_deg": 2.0, "presses": 1}, 2.0 * math.sqrt(5.0)),
+}
+
+
+@pytest.mark.parametrize("case", EXPECTED)
+def test_the_error_to_expect_is_what_was_measured(case):
+    report, expected = EXPECTED[case]
+    report = {"model": "response", **report, "presses": [{"used": True}] * report.get("presses", 0)}
+    calibration = dataclasses.replace(response_unit()[0], report=report)
+    assert expected_model_deg(calibration) == pytest.approx(expected)
+    block = vts.ConfidentPipeline.from_calibration(calibration).confidence
+    assert block.model_variance == pytest.approx((math.radians(expected) / SPREAD_OF_MEAN) ** 2)
 
 
 def test_no_contact(ring):
@@ -292,5 +325,6 @@ def test_presses_of_a_real_sensor(mini_presses, mini_by_prior, learn):
     pipe = vts.ConfidentPipeline.from_calibration(calibration, "precise")
     scored = [press for press in presses if press.contact_radius_px is not None and press.name not in names]
     mean = coverage.mean([coverage.of_press(pipe(p.image[None]), p, sensor.mm_per_pixel, pipe.confidence.spread) for p in scored])
-    assert 85.0 <= mean.errors["normal 95%"] <= 99.0 and mean.errors["depth 95%"] >= 85.0
-    assert mean.errors["normal 50%"] < 80.0
+    most = 99.0 if learn else 99.9  # the prior was fitted to these very presses; its bounds are those of other units
+    assert 85.0 <= mean.errors["normal 95%"] <= most and mean.errors["depth 95%"] >= 85.0
+    assert mean.errors["normal 50%"] < (80.0 if learn else 95.0)

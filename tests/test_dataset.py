@@ -1,6 +1,7 @@
 """Large data sets: every frame once and the same, whatever the batch, the workers, the processes, and wherever a run was killed."""
 
 import contextlib
+import json
 import os
 import signal
 import subprocess
@@ -182,6 +183,7 @@ def test_other_settings_are_refused_and_overwrite_begins_anew(unit, tmp_path):
     report = reconstruct_dataset(unit, source, out, mode="precise", format="npy", pictures=False, overwrite=True)
     assert (report.rows, report.before) == (1, 0)
     assert sorted(contents(out)) == ["a_depth.npy", "frames.csv", "summary.json"]  # a.npz is gone
+    assert json.loads((out / "summary.json").read_text())["metric"] is True
 
 
 def test_unusable_images_are_named_and_left_out(unit, tmp_path, capsys):

@@ -11,8 +11,8 @@ from torch import nn
 
 import torchvts as vts
 from torchvts import export
-from torchvts.accelerated import reference_only
-from torchvts.export import each_frame, onnx_operators, trace
+from torchvts.accelerated import kernels, reference_only
+from torchvts.export import kernels_in_file, onnx_operators
 
 LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
 HEIGHT, WIDTH, PITCH = 48, 64, 0.6
@@ -184,68 +184,72 @@ def test_onnx_without_torchvts(low, mini, tmp_path, kind):
     assert export.compare(path, pipe, frames, "onnx") <= 1e-3
 
 
+needs_kernels = pytest.mark.skipif(vts.accelerated.library() is None, reason="no compiled kernels")
+
+
+@needs_kernels
+@pytest.mark.parametrize("mode", ["fast", "precise"])
+def test_the_pieces_of_a_program_hold_all_that_a_frame_needs(mini, mode):
+    """Put together as kernels_in_file.c does it, in other memory, they give what the pipeline gives."""
+    calibration, frames = mini
+    pipe = pipeline(calibration, mode)
+    places, *pieces = kernels_in_file.program_of_kernels(pipe)
+    count, *addresses = places.view(torch.int64).tolist()
+    for structure, at, piece in zip(addresses[::3], addresses[1::3], addresses[2::3], strict=True):
+        assert structure < count
+        pieces[structure][at : at + 8].view(torch.int64).fill_(pieces[piece].data_ptr())
+    assert pieces[0][:8].view(torch.int32).tolist() == [48, 64]
+    out = pipe(frames[:3])
+    found = [torch.empty_like(expected) for expected in out]
+    trouble = kernels.loaded().solve_frames(
+        pieces[0].data_ptr(), frames[:3].contiguous().data_ptr(), 3, 1, *(tensor.data_ptr() for tensor in found)
+    )
+    assert trouble == 0 and float(found[0].max()) > 0.0
+    for one, other in zip(found, out, strict=True):
+        assert torch.equal(one, other)
+
+
+def test_without_a_c_compiler_the_kernels_are_not_linked(monkeypatch):
+    before = os.environ.get("LIBRARY_PATH")
+    monkeypatch.setenv("CC", "no_such_compiler -O2")
+    with pytest.raises(RuntimeError, match=r"expected a C compiler and ar, .*set CC"), kernels_in_file.linked_kernels():
+        pass
+    assert os.environ.get("LIBRARY_PATH") == before
+
+
+@needs_kernels
+def test_the_program_of_kernels_has_the_outputs_of_any_batch(mini):
+    program = kernels_in_file.trace_kernels(pipeline(mini[0], "fast"))
+    shapes = [node.meta["val"] for node in program.graph.output_node().args[0]]
+    assert [tuple(shape.shape[1:]) for shape in shapes] == [(channels, 48, 64) for channels in (1, 2, 3, 1, 1)]
+    assert [shape.dtype for shape in shapes] == [torch.float32] * 3 + [torch.bool] * 2
+    assert not any(isinstance(shape.shape[0], int) for shape in shapes)
+
+
+@pytest.mark.parametrize("kind", ["lights fast", "lights precise", "response auto", "response double", "own normals"])
+def test_blocks_that_may_take_over_keep_their_graph(low, mini, kind):
+    """What kernels leave to the blocks in some frames, or cannot do, a file cannot leave to them."""
+    calibration, options = mini[0] if kind.startswith("response") else low[0], {}
+    if kind == "own normals":
+        options["normals"] = learned()
+    mode = kind.split()[1] if kind.split()[1] in ("precise", "auto") else "fast"
+    pipe = pipeline(calibration, mode, **options)
+    assert kernels_in_file.program_of_kernels(pipe.double() if kind == "response double" else pipe) is None
+
+
 @pytest.mark.long
-def test_aoti_without_torchvts(mini, tmp_path):
+@pytest.mark.parametrize("kind", ["response precise", "lights fast"])
+def test_aoti_without_torchvts(low, mini, tmp_path, kind):
+    """By the compiled kernels, and by the graph."""
     if export.missing("aoti"):
         pytest.skip(export.missing("aoti"))
-    calibration, frames = mini
-    pipe = pipeline(calibration, "fast")
+    calibration, frames = mini if kind.startswith("response") else low
+    pipe = pipeline(calibration, kind.split()[1])
+    assert (kernels_in_file.program_of_kernels(pipe) is not None) == (
+        kind.startswith("response") and vts.accelerated.library() is not None
+    )
     path = export.export_aoti(pipe, tmp_path / "pipe.pt2")
     assert export.compare(path, pipe, frames, "aoti") <= 1e-5
-
-
-class Masked(nn.Module):
-    """What the rewriting of a graph meets: masks combined and written to, a mask as a factor by way of uint8, joined channels."""
-
-    def __init__(self):
-        super().__init__()
-        self.register_buffer("turn", torch.polar(torch.ones(6, 5), torch.rand(6, 5, generator=torch.Generator().manual_seed(1))))
-
-    def forward(self, images):
-        mean = images.mean(dim=(1, 2, 3), keepdim=True)
-        bright, dark = images[:, :1] > 1.2 * mean, images[:, 1:2] < 0.8 * mean
-        border = torch.ones_like(bright)
-        border[..., 1:-1, 1:-1] = False
-        mask = (bright | ~dark) & (images[:, 2:] <= mean) | (border & dark)
-        joined = torch.cat((images[:, 1:2] * mask.to(torch.uint8).to(images.dtype), images), dim=1)
-        smooth = torch.fft.irfft(torch.fft.rfft(joined) * self.turn, n=8).masked_fill(bright & ~border, 0.5)
-        return smooth, mask[..., 1:], mask.to(torch.uint8), bright.any(dim=3)
-
-
-def test_a_graph_that_is_rewritten_for_inductor_gives_the_same():
-    images = torch.rand(5, 3, 6, 8, generator=torch.Generator().manual_seed(0))
-    module = Masked()
-    of_one = trace.traced(module, images[:1], any_batch=False)
-    each_frame.convert_masks_at_once(of_one.graph_module)
-    each_frame.hold_masks_as_floats(of_one.graph_module)
-    each_frame.join_channels_as_rows(of_one.graph_module)
-    rewritten = of_one.module()
-    each_frame.hold_complex_as_real(rewritten)
-    nodes = [node for node in rewritten.graph.nodes if node.op == "call_function"]
-    assert [node.args[0].target for node in nodes if node.target in each_frame.NOT] == [torch.ops.aten.ones_like.default]  # ~border
-    assert not [node for node in nodes if node.target in each_frame.OR]
-    assert [node.args[1] for node in nodes if node.target == torch.ops.aten.to.dtype].count(torch.uint8) == 1  # the output
-    assert [node.args[0][0].target for node in nodes if node.target == torch.ops.aten.cat.default] == [
-        torch.ops.aten.reshape.default
-    ]
-    assert not any(buffer.is_complex() for name, buffer in rewritten.named_buffers() if name.endswith("_pairs"))
-    program = trace.traced(each_frame.EachFrame(rewritten), images[:2], any_batch=True)
-    for count in (1, 2, 5):
-        for found, expected in zip(program.module()(images[:count]), module(images[:count]), strict=True):
-            assert found.dtype == expected.dtype and torch.allclose(found, expected, atol=1e-6)
-
-
-@pytest.mark.long
-def test_a_loop_over_frames_takes_the_decisions_of_the_pipeline(low):
-    """Passes that stop at different turns in the frames of a batch, loops within the loop."""
-    calibration, frames = low
-    pipe = pipeline(calibration, "precise")
-    program = each_frame.trace_each_frame(pipe).module()
-    for batch in (frames[:1], frames):
-        with reference_only():
-            wanted = pipe(batch)
-        for found, expected in zip(program(batch), wanted, strict=True):
-            assert (found.double() - expected.double()).abs().max() <= 1e-5
 
 
 @pytest.mark.parametrize("height, width", [(24, 32), (23, 35)])

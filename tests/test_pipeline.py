@@ -416,6 +416,80 @@ def test_a_gradient_reaches_a_learned_module(mixed, small_sensor):
         assert bool(torch.isfinite(parameter.grad).all()) and float(parameter.grad.abs().min()) > 0
 
 
+class Spoilt(nn.Module):
+    """Flat normals, spoilt by a function."""
+
+    def __init__(self, spoil):
+        super().__init__()
+        self.spoil = spoil
+
+    def forward(self, image):
+        return self.spoil(torch.cat((0.0 * image[:, :2], 1.0 + 0.0 * image[:, 2:]), dim=1))
+
+
+SPOILT = {
+    "NaN": (lambda n: n.masked_fill(n > 0.5, float("nan")), ValueError, "finite values from Spoilt, got .* NaN or infinite"),
+    "infinite": (lambda n: n / 0.0, ValueError, "finite values from Spoilt"),
+    "slopes": (lambda n: n[:, :2], ValueError, r"normals: expected \(1, 3, .* from Spoilt, the shape of its input, got \(1, 2, "),
+    "another size": (lambda n: n[..., ::2], ValueError, "from Spoilt, the shape of its input"),
+    "float64": (lambda n: n.double(), TypeError, "normals: expected torch.float32 from Spoilt, .* got torch.float64: cast it back"),
+    "colours": (lambda n: 0.5 * n + 0.5, ValueError, "coded as colours"),
+    "colours to 255": (lambda n: 127.5 * n + 127.5, ValueError, "coded as colours"),
+    "a pair": (lambda n: (n, n), TypeError, "normals: expected a tensor from Spoilt, got"),
+}
+
+
+@pytest.mark.parametrize("kind", SPOILT)
+def test_what_a_learned_module_gives_is_checked(mixed, small_sensor, kind):
+    lights, frames = mixed
+    spoil, error, text = SPOILT[kind]
+    pipe = pipeline(lights, small_sensor, "fast", normals=Spoilt(spoil))
+    with pytest.raises(error, match=text):
+        pipe(frames[1:2])
+    assert bool(torch.isfinite(pipeline(lights, small_sensor, "fast", normals=Spoilt(lambda n: n))(frames[1:2]).depth_mm).all())
+
+
+class MaskOfImage(vts.ContactMask):
+    """A mask of one's own, of the compensated image alone."""
+
+    def forward(self, compensated):
+        return super().forward(compensated)
+
+
+class MaskOfTwo(vts.ContactMask):
+    def forward(self, compensated, background):
+        return super().forward(compensated)
+
+
+def test_a_mask_may_take_the_image_alone(ring, mixed, small_sensor):
+    lights, frames = mixed
+    usual = pipeline(lights, small_sensor, "fast")
+    given = (usual.deformed.flat, torch.full((3,), 0.01))
+    blocks = {"mm_per_pixel": small_sensor.mm_per_pixel, "mode": "fast"}
+    chain = (usual.compensate, usual.normals, usual.gradient, usual.integrate)
+    masks = (vts.ContactMask(*given), MaskOfImage(*given))
+    found, own = (vts.DepthPipeline(chain[0], mask, *chain[1:], **blocks).eval()(frames[1:2]).deformed for mask in masks)
+    assert bool(found.any()) and torch.equal(found, own)
+    with pytest.raises(TypeError, match=r"deformed: expected MaskOfTwo.forward\(compensated\), or .* got forward\(compensated"):
+        vts.DepthPipeline(chain[0], MaskOfTwo(*given), *chain[1:], **blocks)
+
+
+BAD_THRESHOLDS = [
+    ({"share": 2}, r"share: expected a number in \(0, 1\], got 2"),
+    ({"share": 0.0}, "share"),
+    ({"sigmas": 0.1}, r"sigmas: expected a number in \[1, 1000\], got 0.1"),
+    ({"sigmas": 1e6}, "sigmas"),
+    ({"min_size_px": 0.01}, "min_size_px"),
+    ({"min_size_px": 1e9}, "min_size_px"),
+]
+
+
+@pytest.mark.parametrize("values, text", BAD_THRESHOLDS)
+def test_thresholds_that_no_frame_could_use_are_refused(values, text):
+    with pytest.raises(ValueError, match=text):
+        vts.ContactSettings(**values)
+
+
 def test_a_learned_module_can_be_trained_in_the_chain(mixed, small_sensor):
     lights, frames = mixed
     truth = pipeline(lights, small_sensor, "fast")(frames)

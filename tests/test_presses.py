@@ -17,7 +17,7 @@ import torch
 from conftest import ring_lights
 
 import torchvts as vts
-from torchvts.calibration import fit_prior
+from torchvts.calibration import fit_prior, score_prior
 from torchvts.calibration.balls import guess_circle
 from torchvts.calibration.by_presses import with_preprocessing
 from torchvts.calibration.contacts import read_contacts
@@ -392,6 +392,29 @@ def test_a_prior_tells_what_it_was_fitted_on(prior):
     assert prior.half_mm == pytest.approx(0.5 * WIDTH * PITCH)
     smooth = prior.background(*SIZE)
     assert float((smooth / background() - 1).abs().mean()) < 0.02
+
+
+def test_a_prior_is_as_good_as_its_file_says(prior, prior_alone):
+    (own,) = prior.held_out_deg
+    images = [seen_by_curve(ball(c, p, 6.0), 900 + k) for k, (c, p) in enumerate([((2, 1), 0.4), ((-3, -2), 0.35), ((0, 3), 0.3)])]
+    new = [vts.Press(image, 6.0, f"new {k}") for k, image in enumerate(images)]
+    sensor = dataclasses.replace(SENSOR, prior=prior)
+    assert score_prior(background(), sensor, new) < 1.5 * own < 6.0
+    assert prior_alone[0].report["prior_deg"] == own
+    unmeasured = dataclasses.replace(SENSOR, prior=dataclasses.replace(prior, held_out_deg=()))
+    assert calibrate(background(seen_by_other_curve), unmeasured)[0].report["prior_deg"] is None
+
+
+def test_too_few_presses_to_hold_out_are_scored_by_themselves(prior):
+    one = take_presses()[:1]
+    report = calibrate(background(), GIVEN, one)[0].report
+    assert report["held_out_deg"] is None and 0.0 < report["own_deg"] < 5.0 and "prior_deg" not in report
+    assert calibrate(background(), dataclasses.replace(GIVEN, prior=prior), one)[0].report["prior_deg"] == prior.expected_deg
+
+
+def test_a_sensor_without_a_prior_has_none_to_score():
+    with pytest.raises(ValueError, match="sensor: expected one with a prior to score, 'presses' has none"):
+        score_prior(background(), dataclasses.replace(SENSOR, name="presses"), take_presses()[:3])
 
 
 def test_a_prior_serves_another_unit_where_lights_are_not_pinned(prior, prior_alone):

@@ -13,6 +13,7 @@ import torch
 import yaml
 
 import torchvts as vts
+from torchvts.calibration.response_fit import STEEPER
 from torchvts.core.blur import blur, gaussian_weights
 from torchvts.core.files import checksum, load_tensors
 from torchvts.core.geometry import gradient_from_normal, gradient_of_depth
@@ -26,6 +27,7 @@ from torchvts.model.response_field import (
     sine_from_slope,
     slope_from_sine,
 )
+from torchvts.normals import NormalFromResponse
 
 FAMILIES = [(0, -1), (1, -1), (2, 1), (1, 2), (3, 3), (2, 1, 0), (1, 0, 1), (1, -1, 2)]
 CHANGE_SCALE = 0.3  # stated in the definition
@@ -224,6 +226,10 @@ def test_a_model_wants_its_parts_in_their_places():
         ResponseModel(deep, None)
     with pytest.raises(TypeError, match="by_depth: expected a DepthBrightness or None"):
         ResponseModel(shallow, shallow)
+    for name in ("steeper", "reference_mm"):
+        for value in (-0.1, float("nan"), float("inf")):
+            with pytest.raises(ValueError, match=f"{name}: expected a number of at least 0"):
+                DepthBrightness(0, 1.0, ((0.0,),) * 3, **{name: value})
     with pytest.raises(ValueError, match="degree: expected at most 2, got 3"):
         DepthBrightness(3, 1.0, ((0.0,) * 10,) * 3)
     with pytest.raises(ValueError, match="coefficient: expected 3 x 3 numbers"):
@@ -317,6 +323,38 @@ def test_steepness_is_bounded_and_its_direction_kept():
     assert direction == pytest.approx(expected / length[:, None], abs=1e-9)
 
 
+def brightness_under_lights(slope, depth_mm, lights_mm):
+    """Relative change of brightness (1, 3, 1, N) of matt skin of slopes (2, N) at the image's middle, by eq. 1 of the paper."""
+    towards = lights_mm[:, :, None] - torch.tensor([0.0, 0.0, depth_mm])[:, None]  # (3, 3, 1)
+    facing = towards[:, 2] - (towards[:, :2] * slope).sum(1)  # (3, N)
+    normal = (1.0 + slope.square().sum(0)).sqrt()
+    light = facing / normal / towards.norm(dim=1) ** 3
+    return (light / (lights_mm[:, 2] / lights_mm.norm(dim=1) ** 3)[:, None])[None, :, None]
+
+
+@pytest.mark.parametrize(("out", "high"), [(1.2, 0.6), (1.3, 1.0), (1.6, 1.4)])
+def test_slopes_deeper_than_the_presses_are_not_too_steep(out, high):
+    # lights that stand `out` half images out and `high` half images high; a linear field fitted to slopes at 0.3 mm
+    half, shallow, deep = 10.0, 0.3, 1.5
+    angle = torch.tensor([0.0, 120.0, 240.0]).deg2rad()
+    lights = half * torch.stack((out * angle.cos(), out * angle.sin(), torch.full((3,), high)), 1)
+    slope = 0.3 * torch.randn(2, 400, generator=torch.Generator().manual_seed(1))
+    sine, flat = sine_from_slope(slope), torch.zeros(2, 1)
+    change = lambda depth: (brightness_under_lights(slope, depth, lights) - 1.0)[0, :, 0]  # noqa: E731
+    per_mm = (brightness_under_lights(flat, shallow, lights) - 1.0).flatten() / shallow
+    inputs = (change(shallow) - per_mm[:, None] * shallow) / CHANGE_SCALE
+    field = ResponseField(0, -1, half, tuple(map(tuple, torch.linalg.lstsq(inputs.t(), sine.t()).solution.t().tolist())))
+
+    def gain(steeper):
+        by_depth = DepthBrightness(0, half, tuple((float(c),) for c in per_mm), steeper, shallow)
+        block = NormalFromResponse(field, by_depth, 1, 400, 0.01)
+        found = -block(brightness_under_lights(slope, deep, lights), torch.full((1, 1, 1, 400), deep))[0, :2, 0]
+        return float((found * sine).sum() / sine.square().sum())
+
+    assert gain(0.0) > 1.08
+    assert abs(gain(STEEPER / half) - 1.0) < 0.5 * abs(gain(0.0) - 1.0)
+
+
 def test_depth_is_refused_where_nothing_is_known_about_it():
     _, _, block = normals(uses_depth=False)
     image, depth = random_image()
@@ -337,7 +375,8 @@ def test_normals_of_the_output_are_those_of_the_depth(mode, by_depth):
         ResponseModel(ResponseField(0, -1, 1.4, ((0.6, 0, 0), (0, 0.6, 0))), by_depth), sensor, background
     )
     image = background.clone()
-    image[:, 15:35, 20:45] += 0.1 * torch.rand(3, 20, 25, generator=torch.Generator().manual_seed(0))
+    coloured = torch.tensor((1.0, -1.0, 0.5)).view(3, 1, 1)  # a change that all channels share would be a shadow
+    image[:, 15:35, 20:45] += 0.1 * coloured * torch.rand(3, 20, 25, generator=torch.Generator().manual_seed(0))
     fast, again = (vts.DepthPipeline.from_calibration(unit, m)(image[None]) for m in ("fast", mode))
     inside = fast.contact.expand(-1, 2, -1, -1)
     slope = gradient_of_depth(again.depth_mm, 0.1)
@@ -613,12 +652,24 @@ def test_a_prior_survives_yaml(tmp_path):
     assert "prior" not in (tmp_path / "plain.yaml").read_text() and vts.Sensor.load(tmp_path / "plain.yaml") == without
 
 
+def test_a_prior_says_how_good_it_is_on_each_unit_or_nothing(tmp_path):
+    tried = dataclasses.replace(a_prior(), held_out_deg=[2.5, 5])
+    assert tried.expected_deg == pytest.approx(3.75)
+    vts.Sensor("rig", 24, 32, 0.5, prior=tried).save(tmp_path / "rig.yaml")
+    assert vts.Sensor.load(tmp_path / "rig.yaml").prior.held_out_deg == (2.5, 5.0)
+    vts.Sensor("rig", 24, 32, 0.5, prior=a_prior()).save(tmp_path / "rig.yaml")
+    assert "held_out_deg" not in (tmp_path / "rig.yaml").read_text()
+    assert vts.Sensor.load(tmp_path / "rig.yaml").prior.expected_deg is None
+
+
 BAD_PRIORS = {
     "unknown key": (put(1, "colour"), "key prior: key 'colour': unknown; expected response, log_background, half_mm, source"),
     "unknown key of the model": (put(1, "response", "colour"), "key prior: response: key 'colour': unknown"),
     "unknown key of a field": (put(1, "response", "field", "colour"), "key prior: response: field: key 'colour': unknown"),
     "no source": (put(KeyError, "source"), "key prior: key 'source': missing"),
     "no response": (put(KeyError, "response"), "key prior: key 'response': missing"),
+    "no angle": (put([0.0], "held_out_deg"), r"key prior: key held_out_deg: expected a number in \(0, 90\], got 0.0"),
+    "no list of angles": (put(3.5, "held_out_deg"), r"key held_out_deg: expected a list of degrees, one per unit, got 3.5"),
     "no text": (put(3, "source"), "key prior: key source: expected a text"),
     "NaN": (put(NAN, "log_background", 0, 0), "key prior: key log_background: expected finite numbers"),
     "too few": (put([[0.0] * 14 for _ in range(3)], "log_background"), "key prior: key log_background: expected 3 x 15 numbers"),

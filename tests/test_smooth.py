@@ -91,3 +91,34 @@ def test_depth_of_a_response_unit_hardly_follows_the_light():
 
 def largest(difference):
     return float(difference.abs().max())
+
+
+@pytest.mark.parametrize("least_colour", [0.0, 0.7])
+def test_a_shadow_is_no_contact_and_a_slope_is(least_colour):
+    """A soft shadow darkens all channels alike; slopes change the colour, also where such a shadow lies in the frame."""
+    y, x = torch.linspace(-1.0, 1.0, 120)[:, None], torch.linspace(-1.0, 1.0, 160)[None]
+    spot = torch.exp(-((x - 0.3) ** 2 + (y + 0.2) ** 2) / 0.1)
+    shadow = (1.0 - 0.06 * spot).expand(1, 3, 120, 160)
+    ball = torch.exp(-((x + 0.5) ** 2 + (y - 0.4) ** 2) / 0.02)
+    slopes = torch.stack([20.0 * x + 10.0 + 0.0 * y, 20.0 * y - 8.0 + 0.0 * x, -20.0 * (x + y) - 2.0]).clamp(-1.0, 1.0)
+    slope = 1.0 + 0.3 * ball * slopes[None]
+    noise = 0.004 * torch.randn(1, 3, 120, 160, generator=torch.Generator().manual_seed(0))
+    options = {"far_field": 0.06, "smooth_light": True, "least_colour": least_colour}
+    mask = vts.ContactMask(torch.ones(3, 120, 160), torch.full((3,), 0.004), **options)
+    for image, moved in ((shadow, least_colour == 0.0), (shadow * slope, True), (slope, True)):
+        found = mask(image + noise)
+        assert bool(found.any()) is moved
+        with reference_only():
+            assert torch.equal(mask(image + noise), found)
+
+
+def test_the_colour_of_slopes_is_that_of_the_lights():
+    """White light makes none; coloured lights from three sides, have the colour of what they do not share."""
+    angles = torch.tensor([0.0, 2.0, 4.0]) * torch.pi / 3.0
+    pure = torch.stack((angles.cos(), angles.sin()), 1).double()
+    for shared in (0.0, 0.5):
+        change = (1.0 - shared) * pure + shared * pure[:1]
+        field = ResponseField(0, -1, 10.0, tuple(map(tuple, torch.linalg.pinv(change).tolist())))
+        difference = change[(0, 2), :] - change[1:2]
+        expected = (difference.square().mean() / change.square().mean()).sqrt()
+        assert field.colour() == pytest.approx(float(expected))

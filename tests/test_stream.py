@@ -310,6 +310,16 @@ def test_a_large_contact_is_no_other_view(unit, change):
     assert check(frame) == ""
 
 
+@pytest.mark.parametrize("change", [0.3, -0.3])
+def test_a_flat_contact_on_an_even_background_is_no_other_crop(change):
+    """The middle of the frame is as even as the background: so is that of any crop of it, and nothing decides."""
+    generator = torch.Generator().manual_seed(0)
+    background = torch.tensor([0.5, 0.4, 0.6])[:, None, None] * (1.0 + 0.01 * torch.randn(3, 120, 160, generator=generator))
+    frame = background[None].clone()
+    frame[:, :, 17:103, 23:137] *= 1.0 + change
+    assert streams.FrameCheck(background.clamp(0.0, 1.0))(frame.clamp(0.0, 1.0)) == ""
+
+
 def test_black_lines_are_named_and_those_of_the_background_are_not(unit):
     """One black row was a contact on nine tenths of the skin."""
     background, frame = unit[0].background, unit[0].background[None].clone()
@@ -635,6 +645,11 @@ def test_track_writes_a_row_for_each_frame_after_the_reference(run_script, unit_
     turns = poses[:, :, :3]
     assert np.allclose(turns @ turns.transpose(0, 2, 1), np.eye(3), atol=1e-6)
     assert all("rotation about z" in row["ambiguous"] and float(row["std_z_mm"]) > 0 for row in rows[:9])
+    assert all(float(row["std_rz_deg"]) > 10.0 for row in rows[:9])  # unknown
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    expected = {"frames": 19, "lost": 10, "left_out": 0, "converged": 0, "keyframes": 1, "reference_frame": 15, "metric": True}
+    assert {name: summary[name] for name in expected} == expected and summary["lost_because"] == {"no contact": 10}
+    assert summary["largest_drift_deg"] == 0.0 and sum(summary["unknown_motions"].values()) == 9
 
 
 def test_track_refuses_a_reference_that_cannot_be_used_and_counts_bad_frames(unit, run_script, unit_file, tmp_path):
@@ -647,6 +662,8 @@ def test_track_refuses_a_reference_that_cannot_be_used_and_counts_bad_frames(uni
     assert done.returncode == 1 and "1 frames left out, named above" in done.stdout, done.stderr
     done = run_script(*call, "--reference", tmp_path / "film" / "017.png")
     assert done.returncode == 2 and "017.png: the frame has one colour everywhere" in done.stderr
+    done = run_script(*call, "--least-mm2", "1000")
+    assert done.returncode == 2 and "expected a contact to track, got none" in done.stderr
     done = run_script(*call, "--least-mm2", "-1")
     assert done.returncode == 2 and "--least-mm2: expected a number above 0" in done.stderr
 

@@ -11,6 +11,7 @@ from torchvts.accelerated import ContactMask, reference_only
 from torchvts.calibration import fit_prior
 from torchvts.contact import above_tail
 from torchvts.core.geometry import gradient_of_depth
+from torchvts.evaluation.gallery import CORRUPTIONS
 from torchvts.integration.background import ZeroBackground, with_faces
 from torchvts.model import ResponseModel
 from torchvts.scenes import hanging_skin
@@ -71,8 +72,8 @@ def test_skin_that_hangs_over_a_groove_is_no_contact(pitch, height, width):
     deformed = scene.depth_mm > 0.02
     inputs = (scene.depth_mm, scene.gradient * deformed, deformed)
     contact = vts.ContactFromDepth(pitch)(*inputs)
-    middle = (x.abs() < 0.3) & (y.abs()[:, None] < 1.5)
-    assert not bool(contact[0, 0][middle].any()) and iou(contact, scene.contact) > 0.7  # before: 0.63
+    middle = (x.abs() < 0.25) & (y.abs()[:, None] < 1.5)
+    assert not bool(contact[0, 0][middle].any()) and iou(contact, scene.contact) > 0.76  # before: 0.63
     assert float(scene.depth_mm[0, 0][middle].min()) > 0.2
     with reference_only():
         assert torch.equal(vts.ContactFromDepth(pitch)(*inputs), contact)
@@ -226,6 +227,15 @@ def test_contact_holds_a_face_that_the_border_cuts(ring, mode):
     assert torch.equal(same.contact, out.contact) and float((same.depth_mm - out.depth_mm).abs().max()) < 1e-5
 
 
+@pytest.mark.parametrize("corruption,severity", [("albedo drift", 0.02), ("few bits", 6.0)])
+def test_skin_without_depth_is_no_contact_where_none_hangs_free(corruption, severity):
+    case = CORRUPTIONS[corruption].make(severity, 0)
+    out = vts.DepthPipeline.from_calibration(case.calibration, "fast")(case.image)
+    truth = case.truth.contact
+    assert int((out.deformed & ~truth).sum()) > int(truth.sum())  # stains and banding, far from the ball
+    assert float((out.contact & truth).sum() / (out.contact | truth).sum()) > 0.7
+
+
 def test_a_stand_in_needs_as_much_light_to_change_in_dark_pixels_as_in_bright_ones(small_sensor):
     background = torch.full((3, 120, 160), 0.4)
     background[..., 140:] = 0.02
@@ -240,9 +250,9 @@ def test_a_stand_in_needs_as_much_light_to_change_in_dark_pixels_as_in_bright_on
 def test_thresholds_can_be_set(ring, small_sensor, small_press):
     cal = vts.Calibration.from_lights(ring(), small_sensor)
     image = vts.scenes.render(small_press(1.0), ring())
-    usual, strict = (vts.DepthPipeline.from_calibration(cal, contact=s) for s in (None, vts.ContactSettings(9.0, 200.0, 2.0)))
+    usual, strict = (vts.DepthPipeline.from_calibration(cal, contact=s) for s in (None, vts.ContactSettings(9.0, 200.0, 1.0)))
     assert bool(usual(image).deformed.any()) and not bool(strict(image).deformed.any())
-    assert (strict.deformed.sigmas, strict.deformed.min_size_px, strict.contact.share) == (9.0, 200.0, 2.0)
+    assert (strict.deformed.sigmas, strict.deformed.min_size_px, strict.contact.share) == (9.0, 200.0, 1.0)
     depth, _ = membrane(objects()["ball"], steps=60)
     inputs = (depth, gradient_of_depth(depth, PITCH), depth > 0.02)
     assert int(vts.ContactFromDepth(PITCH, 2.0)(*inputs).sum()) < int(vts.ContactFromDepth(PITCH)(*inputs).sum())

@@ -103,7 +103,7 @@ class ContactMask(Twin, contact.ContactMask):
             return super().find(compensated, image)
         bridge = (self.bridge_cells if self.bridges else 0, self.bridge_sigmas, self.tail_sigmas, self.least_spread)
         sides = (self.step, self.stride, self.cell, self.reach)
-        grid = kernels.ContactGrid(*sides, self.sigmas, self.rounding, self.least_cells, *bridge)
+        grid = kernels.ContactGrid(*sides, self.sigmas, self.rounding, self.least_cells, *bridge, self.least_colour)
         offset = None if flat_is_one(self) else self.offset
         limits = (self.failed_below, self.most_far_field)
         try:
@@ -146,13 +146,13 @@ class ContactFromDepth(Twin, contact.ContactFromDepth):
         if not usable(depth_mm, gradient):
             return super().find(depth_mm, gradient, deformed)
         return kernels.contact_from_depth(
-            depth_mm, gradient, deformed, (self.cell, self.reach), (ctypes.c_float * 10)(*self.numbers())
+            depth_mm, gradient, deformed, (self.cell, self.reach), (ctypes.c_float * 12)(*self.numbers())
         )
 
     def numbers(self) -> tuple[float, ...]:
         """The settings that the kernel takes."""
-        noise = (self.most_unexplained, self.noise_depth_mm, self.free_share)
-        return (self.cell * self.mm_per_pixel, self.share, *self.decay, *self.tail, self.least_free, *noise)
+        rest = (self.most_unexplained, self.noise_depth_mm, self.free_share, self.fall, float(self.inner))
+        return (self.cell * self.mm_per_pixel, self.share, *self.decay, *self.tail, self.least_free, *rest)
 
 
 class Crop(Twin, frames.Crop):
@@ -209,7 +209,8 @@ class NormalFromResponse(Twin, normals.NormalFromResponse):
         lines = response_lines(self) if usable(image, self.maps, self.per_mm, *given) else None
         if lines is None:
             return super().normals_of(image, depth_mm, window)
-        return kernels.response_normals(image, depth_mm, lines, window, self.max_sine)
+        settings = (self.steeper, self.reference_mm, self.max_sine)
+        return kernels.response_normals(image, depth_mm, lines, window, settings)
 
 
 class Masked(Twin, frames.Masked):

@@ -52,17 +52,20 @@ class Program(ctypes.Structure):
         *((name, INTEGER) for name in ("drifts", "drift_stride", "halvings")),
         *((name, REAL) for name in ("least_drift", "most_drift", "believed_drift")),
         *((name, INTEGER) for name in ("step", "stride", "cell", "reach", "bridge")),
-        *((name, REAL) for name in ("sigmas", "rounding", "least_cells", "bridge_sigmas", "tail_sigmas", "least_spread")),
+        *(
+            (name, REAL)
+            for name in ("sigmas", "rounding", "least_cells", "bridge_sigmas", "tail_sigmas", "least_spread", "least_colour")
+        ),
         ("smooth", POINTER),
         *((name, POINTER) for name in ("flat", "per_noise", "failed_below", "most_far_field")),
         *((name, INTEGER) for name in ("corners", "degree", "terms")),
         *((name, POINTER) for name in ("place", "weight", "per_mm", "noise", "lit", "saturated", "inverse")),
-        *((name, REAL) for name in ("max_sine", "per_slope", "pitch", "half_per_mm")),
+        *((name, REAL) for name in ("max_sine", "steeper", "reference_mm", "per_slope", "pitch", "half_per_mm")),
         ("tables", POINTER),
         *((name, INTEGER) for name in ("passes", "zeroes", "sweeps", "slopes_of_depth")),
         *((name, REAL) for name in ("stiff", "tolerance")),
         *((name, INTEGER) for name in ("contact_cell", "contact_reach")),
-        ("contact_model", REAL * 10),
+        ("contact_model", REAL * 12),
     )
 
 
@@ -111,6 +114,7 @@ class _Prepared(NamedTuple):
 
     Attributes:
         program: None where the blocks must do the work.
+        library: the compiled kernels.
         lights: the block whose lights may change by themselves, as by an optimiser.
         tensors, addresses, versions: of the blocks.
         modules, kinds: the blocks and those within them, and their types.
@@ -119,6 +123,7 @@ class _Prepared(NamedTuple):
     """
 
     program: Program | None
+    library: Any
     lights: NormalFromIntensity | None
     memory: list[Any]
     tensors: list[Tensor]
@@ -175,7 +180,7 @@ def solve_frames(pipe: nn.Module, images: Tensor, parts: Callable[[], Blocks | N
     prepared = _programs.get(pipe)  # held until the call is over: another thread may put another one in its place
     threads = within_frame() if parts_of(images.shape[0], images.shape[2] * images.shape[3]) == 1 else 1
     if threads > 1 and prepared is not None and prepared.program is not None:
-        kernels.loaded().wake_helpers(threads)  # they take as long to wake up as the checks here do
+        prepared.library.wake_helpers(threads)  # they take as long to wake up as the checks here do
     if prepared is None or not prepared.holds():
         prepared = _prepared(pipe, parts())
         if prepared is None:
@@ -184,7 +189,13 @@ def solve_frames(pipe: nn.Module, images: Tensor, parts: Callable[[], Blocks | N
     program = prepared.program
     if program is None or prepared.records() or images.shape[2:] != (program.height, program.width):
         return None
-    return _run(program, images.contiguous(), threads)
+    return _run(prepared.library.solve_frames, program, images.contiguous(), threads)
+
+
+def program_of(pipe: nn.Module, parts: Callable[[], Blocks | None]) -> tuple[Program, list[Any]] | None:
+    """The program of a pipeline, and what holds the memory that it points to; None where its blocks do the work."""
+    prepared = _prepared(pipe, parts())
+    return None if prepared is None or prepared.program is None else (prepared.program, prepared.memory)
 
 
 def _prepared(pipe: nn.Module, parts: Blocks | None) -> _Prepared | None:
@@ -205,6 +216,7 @@ def _prepared(pipe: nn.Module, parts: Blocks | None) -> _Prepared | None:
             made = _prepare(parts, _buffers(parts), _settings(parts))
     return _Prepared(
         None if made is None else made[0],
+        kernels.loaded(),
         lights,
         [] if made is None else made[1],
         tensors,
@@ -229,19 +241,19 @@ def _entries(module: nn.Module) -> list[tuple[dict[str, Any], str]]:
     return entries
 
 
-def _run(program: Program, images: Tensor, threads: int) -> DepthOutput | None:
+def _run(kernel: Callable[..., int], program: Program, images: Tensor, threads: int) -> DepthOutput | None:
     """None where an image is not in [0, 1], and where a frame needs what the program cannot do."""
     count, _, height, width = images.shape
     maps = [((count, channels, height, width), torch.float32) for channels in (1, 2, 3)]
     mask = (count, 1, height, width), torch.bool
     out = DepthOutput(*empties([*maps, mask, mask]))
-    kernel, at, pixels = kernels.loaded().solve_frames, ctypes.byref(program), height * width
+    at, pixels = ctypes.byref(program), height * width
     image, depth, gradient, normal, contact, deformed = (tensor.data_ptr() for tensor in (images, *out))
 
     def some(first: int, many: int) -> int:
         place = 4 * pixels * first
         rest = (depth + place, gradient + 2 * place, normal + 3 * place, contact + pixels * first, deformed + pixels * first)
-        return int(kernel(at, image + 3 * place, many, threads, *rest))
+        return kernel(at, image + 3 * place, many, threads, *rest)
 
     trouble = by_frames(count, pixels, some)
     if trouble == 1:
@@ -307,8 +319,11 @@ def _settings(parts: Blocks) -> dict[str, Any]:
         "bridge_sigmas": mask.bridge_sigmas,
         "tail_sigmas": mask.tail_sigmas,
         "least_spread": mask.least_spread,
+        "least_colour": mask.least_colour,
         "corners": parts.crop.stride,
         "max_sine": getattr(normals, "max_sine", 0.0),
+        "steeper": getattr(normals, "steeper", 0.0),
+        "reference_mm": getattr(normals, "reference_mm", 0.0),
         "per_slope": 1.0 / gradient.max_slope,
         "pitch": integrate.mm_per_pixel,
         "passes": parts.passes,

@@ -29,7 +29,7 @@ NO_PEDESTAL = (ctypes.c_float * 3)()
 
 
 SIGNATURES = {
-    "contact_mask": ("i", "pppppp iiiiiii fff i fff pp ppp"),
+    "contact_mask": ("i", "pppppp iiiiiii fff i ffff pp ppp"),
     "normals": ("i", "p lll pppp l iiii p ll pp ffff p"),
     "solve_shadowed": ("v", "p lll pppp l iiii p ll pppppp"),
     "frame_noise": ("i", "p iiii p"),
@@ -41,7 +41,7 @@ SIGNATURES = {
     "over_smooth": ("v", "ppp i p"),
     "box_of": ("v", "p iii p"),
     "divide_planes": ("v", "pp i l p"),
-    "response_normals": ("v", "p lll pp ii p ll p f iii p"),
+    "response_normals": ("v", "p lll pp ii p ll p fff iii p"),
     "mask_values": ("v", "pp ll iiii p"),
     "depth_slopes": ("v", "p ll p ll f iii p"),
     "grid_means": ("v", "p iiiiiii p"),
@@ -104,6 +104,7 @@ class ContactGrid(NamedTuple):
     bridge_sigmas: float
     tail_sigmas: float
     least_spread: float
+    least_colour: float
 
 
 def loaded() -> ctypes.CDLL:
@@ -364,9 +365,16 @@ class ResponseLines(NamedTuple):
 
 
 def response_normals(
-    compensated: Tensor, depth_mm: Tensor | None, lines: ResponseLines, window: tuple[int, int], max_sine: float
+    compensated: Tensor,
+    depth_mm: Tensor | None,
+    lines: ResponseLines,
+    window: tuple[int, int],
+    settings: tuple[float, float, float],
 ) -> Tensor:
-    """Unit normals (B, 3, h, w) of a window: see :class:`~torchvts.normals.NormalFromResponse`."""
+    """Unit normals (B, 3, h, w) of a window: see :class:`~torchvts.normals.NormalFromResponse`.
+
+    Its steeper, reference_mm and max_sine are the settings.
+    """
     compensated = _with_whole_rows(compensated)
     depth_mm = None if depth_mm is None else _with_whole_rows(depth_mm)
     (top, left), (count, _, rows, columns) = window, compensated.shape
@@ -378,7 +386,7 @@ def response_normals(
         weight.shape[1] - 1,
         weight.shape[3],
     )
-    by_depth = (None if per_mm is None else per_mm.data_ptr() + 36 * top, max_sine)
+    by_depth = (None if per_mm is None else per_mm.data_ptr() + 36 * top, *settings)
     steps = (0, 0) if depth_mm is None else (0 if depth_mm.shape[0] == 1 else depth_mm.stride(0), depth_mm.stride(2))
     kernel, strides = loaded().response_normals, compensated.stride()[:3]
     by_frames(

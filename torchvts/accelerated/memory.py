@@ -19,6 +19,7 @@ class _Kept(NamedTuple):
     """Memory, and the tensor of which outputs are aliases: one more is made in a tenth of the time of a new tensor.
 
     Attributes:
+        place: where the memory lies, as long as nobody has resized it or shares it with other processes.
         address: of torch's own record of the memory, which counts its users.
         idle: how many those are while nobody holds an output.
     """
@@ -26,6 +27,7 @@ class _Kept(NamedTuple):
     tensor: Tensor
     storage: UntypedStorage
     bytes: int
+    place: int
     address: int
     idle: int
 
@@ -49,8 +51,8 @@ def empties(wanted: list[tuple[tuple[int, ...], torch.dtype]]) -> list[Tensor]:
 
 
 def _tensor(kind: tuple[tuple[int, ...], torch.dtype], users: Callable[[int], int]) -> Tensor:
-    for tensor, storage, size, address, idle in _kept.get(kind, ()):
-        if users(address) == idle and not storage.is_shared() and storage.nbytes() == size:
+    for tensor, _, _, place, address, idle in _kept.get(kind, ()):
+        if users(address) == idle and tensor.data_ptr() == place:
             return tensor.detach()
     return _new(kind, users)
 
@@ -75,7 +77,7 @@ def _new(kind: tuple[tuple[int, ...], torch.dtype], users: Callable[[int], int])
         for unused in [other for other, some in _kept.items() if not some]:
             del _kept[unused]
     if _kept_bytes() + size <= MOST_BYTES:
-        _kept.setdefault(kind, []).append(_Kept(tensor, storage, size, address, users(address)))
+        _kept.setdefault(kind, []).append(_Kept(tensor, storage, size, tensor.data_ptr(), address, users(address)))
     return tensor.detach()
 
 

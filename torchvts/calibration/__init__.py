@@ -8,6 +8,7 @@ from .complaints import CalibrationWarning
 from .contacts import ROUGH, channel_structure
 from .lights import POORLY_CONSTRAINED_DEG, LightFit, fit_lights
 from .presses import Press, Touch, read_presses
+from .prior_score import score_prior
 
 __all__ = [
     "GIVEN_MISFIT",
@@ -26,5 +27,6 @@ __all__ = [
     "fit_prior",
     "outwardness",
     "read_presses",
+    "score_prior",
     "with_preprocessing",
 ]

@@ -384,6 +384,6 @@ def _message(best: _Solution, direction_std: Tensor, relative_residual: Tensor, 
     if not poor:
         return message
     return (
-        f"{message}, but one image does not constrain {', '.join(poor)}: a smooth misfit of {float(relative_residual.max()):.1%} "
+        f"{message}, but one image does not constrain {', '.join(poor)}: a residual of {float(relative_residual.max()):.1%} "
         "is left (vignetting or scattered light); calibrate with presses or known lights"
     )

@@ -50,6 +50,11 @@ DEPTH_PENALTY_ON_PRIOR = 3.0
 """The same towards a prior, from which units of a type differ by about 0.03 per mm, and the error of a press is alike all over it,
 so that its pixels do not average it: (0.05 / 0.03)^2."""
 
+STEEPER = 1.0
+"""``steeper`` of a :class:`DepthBrightness`, times half the longer side of the image: 3 h / d^2 of lights 1.2 to 1.6 times that
+far out and 0.6 to 1.4 times that high is 0.6 to 1.2. It is not fitted: at the rim of a ball the skin is shallow and steep, and
+leaves the ball, so balls teach a wrong value (docs/decisions.md)."""
+
 
 @dataclass(frozen=True)
 class Candidates:
@@ -75,12 +80,14 @@ class ResponseFit:
     Attributes:
         model: the fields.
         error_deg: mean held-out error, degrees; None with too few presses.
+        own_deg: mean error on the presses themselves, degrees; None where there is a held-out error.
         candidates: all fields tried.
         reason: why these fields.
     """
 
     model: ResponseModel
     error_deg: float | None
+    own_deg: float | None
     candidates: list[CandidateRow] = field(default_factory=list)
     reason: str = ""
 
@@ -141,7 +148,9 @@ def fit_response(
         bar.update()
     score = chosen.row["score_deg"]
     reason = f"{chosen.row['model']}, from {len(presses)} presses: {_how(score, len(chosen.rows))}"
-    return ResponseFit(ResponseModel(chosen.field, by_depth, sensor.exponent, sensor.blur_px), score, chosen.rows, reason)
+    model = ResponseModel(chosen.field, by_depth, sensor.exponent, sensor.blur_px)
+    own = mean_error_deg(chosen.field, presses) if score is None else None
+    return ResponseFit(model, score, own, chosen.rows, reason)
 
 
 def fit_depth_brightness(
@@ -149,7 +158,8 @@ def fit_depth_brightness(
 ) -> DepthBrightness:
     """What depth does to brightness, by presses that are located: linear least squares on what a field leaves of their sines.
 
-    Balls could teach a second pass much more, but what it learns beyond this holds for balls only (docs/decisions.md).
+    Balls could teach a second pass much more, but what it learns beyond this holds for balls only (docs/decisions.md). What depth
+    does to slopes is therefore that of usual lights, beyond the mean depth of the presses.
 
     Args:
         contacts: of presses.
@@ -164,14 +174,28 @@ def fit_depth_brightness(
     penalty = DEPTH_PENALTY if prior is None else DEPTH_PENALTY_ON_PRIOR
     form = penalty * torch.eye(3 * size, dtype=torch.float64)
     right = torch.zeros(3 * size, dtype=torch.float64)
-    for contact, depth in zip(contacts, first_pass_depths(contacts, field, pitch_mm)):
+    depths = first_pass_depths(contacts, field, pitch_mm)
+    for contact, depth in zip(contacts, depths):
         inside = contact.inside()
         effect, left = _effect_of_depth(contact, field, depth, start)
         columns = effect[:, :, inside].reshape(3 * size, -1)
         form += columns @ columns.t() / int(inside.sum())
         right += columns @ left[:, inside].reshape(-1) / int(inside.sum())
     found = start + torch.linalg.solve(form, right).reshape(3, size)
-    return DepthBrightness(DEPTH_DEGREE, field.half_mm, tuple(tuple(row) for row in found.tolist()))
+    steeper = STEEPER / float(contacts[0].half_size_mm.max())
+    rows = tuple(tuple(row) for row in found.tolist())
+    return DepthBrightness(DEPTH_DEGREE, field.half_mm, rows, steeper, _mean_depth(contacts, depths))
+
+
+def _mean_depth(contacts: list[Contact], depths: list[Tensor]) -> float:
+    """Mean depth (H, W) of presses, mm, each pixel by the square of its sine: the depth at which a field fitted to them holds."""
+    total, weights = 0.0, 0.0
+    for contact, depth in zip(contacts, depths):
+        inside = contact.inside()
+        weight = ball_sine(contact)[:, inside].square().sum(0) / int(inside.sum())
+        total += float((weight * depth.flatten()[contact.index[inside]]).sum())
+        weights += float(weight.sum())
+    return max(0.0, total / max(weights, 1e-12))
 
 
 def _effect_of_depth(contact: Contact, field: ResponseField, depth: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
@@ -213,6 +237,17 @@ def simplest_candidate(errors_deg: list[list[float]]) -> int:
 def _best_candidate(errors_deg: list[list[float]]) -> int:
     """The candidate of least mean held-out error."""
     return int(torch.tensor(errors_deg, dtype=torch.float64).mean(dim=1).argmin())
+
+
+def fit_field(contacts: list[Contact], family: Family) -> ResponseField:
+    """The field of a family by located presses, with the best regularisation towards zero."""
+    return _fit_family(Evidence.of(family, contacts), None, few=False).field
+
+
+def mean_error_deg(field: ResponseField, contacts: list[Contact]) -> float:
+    """Mean angle between the normals of a field and those of balls, degrees."""
+    evidence = Evidence.of(Family.of(field), contacts)
+    return evidence.mean_error_deg([field.tensor().reshape(-1)] * len(contacts))
 
 
 def held_out_deg(contacts: list[Contact], like: ResponseField) -> float:

@@ -73,6 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"torchvts {__version__}")
         return 0
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # before it is loaded: a camera that does not open is one line, ours
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # quiet: so is a video that does not open
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
     try:

@@ -82,8 +82,11 @@ def expected(calibration: Calibration) -> str:
         scored = f"{report['held_out_deg']:.1f} on each of {used} presses by the others"
         return f"{degrees}: {scored}, and more where no ball was pressed"
     if report["source"] == "prior":
-        return f"{degrees} if this unit is like the one its prior was fitted to, else more; presses of a ball would measure it"
-    return f"{degrees}, a guess: too few presses to score any; more presses of a ball would measure it"
+        how = "the mean over units that its prior was tried on" if report.get("prior_deg") else "a guess: its prior was never tried"
+        return f"{degrees}, {how}; presses of a ball would measure it on this one"
+    if report.get("own_deg"):
+        return f"{degrees}, a guess from their misfit: too few presses to score any; more presses of a ball would measure it"
+    return f"{degrees}, a guess; more presses of a ball would measure it"
 
 
 def left_out(what: str, rows: list[tuple[str, str]]) -> Iterator[str]:

@@ -63,6 +63,9 @@ TAIL_SHARE = 2.0 / 3.0
 LEAST_SPREAD = 0.1
 """Least spread of such means, in units of the noise of a pixel over the side of a cell: white noise alone has 1."""
 
+COLOUR_SHARE = 0.5
+"""Part of the colour that slopes give to a change of light, below which a change is a shadow or a stain, not moved skin."""
+
 STAND_IN_NOISE = 0.02
 """Least noise under a stand-in model, relative to the background and to its median: a press scatters light that no calibration has
 measured, as much of it to dark pixels as to bright ones."""
@@ -83,11 +86,19 @@ class Moved(NamedTuple):
 
 
 class Change(NamedTuple):
-    """change (B, 3, H, W), in units of the calibrated noise; squared (B, 1, H, W), summed over channels; threshold of squared."""
+    """The change of frames.
+
+    Attributes:
+        change: (B, 3, H, W), in units of the noise.
+        squared: (B, 1, H, W), summed over channels.
+        threshold: of squared.
+        scale: (B, 3), calibrated noise of a channel over that of the frame; 0 where its LED has failed.
+    """
 
     change: Tensor
     squared: Tensor
     threshold: float
+    scale: Tensor
 
 
 class ContactMask(nn.Module):
@@ -99,9 +110,10 @@ class ContactMask(nn.Module):
     components smaller than a disc of ``min_size_px`` are removed. Where light scatters, the threshold is high, and the skin that
     hangs free below it would be missing from the depth of all it surrounds: moved skin goes on over the cells connected to it
     whose mean change stands out of the spread of such means in the least changed skin. A channel that is black in all of the frame
-    (below 5 % of its background) has lost its LED: the other two decide. With ``smooth_light`` a smooth change of the light is
-    divided out first, unless the caller has done so; the noise is the frame's before that, since what a press makes of undeformed
-    skin is smooth only roughly.
+    (below 5 % of its background) has lost its LED: the other two decide. A shadow or a stain changes all channels alike, where
+    slopes change the colour: a frame whose changes all together have too little colour has not moved. With ``smooth_light`` a
+    smooth change of the light is divided out first, unless the caller has done so; the noise is the frame's before that, since
+    what a press makes of undeformed skin is smooth only roughly.
 
     Args:
         flat: (3, H, W), the compensated image of the undeformed skin.
@@ -111,6 +123,8 @@ class ContactMask(nn.Module):
         far_field: largest change, relative to the light, that a press makes in undeformed skin; up to it, the spread of the least
             changed skin of a frame counts as noise. 0 for rigs in which light does not scatter.
         smooth_light: whether the light may have changed smoothly over the image since calibration; ``flat`` is 1 then.
+        least_colour: change of colour over change of light, each relative and RMS, that moved skin has at least: 0 where all
+            three channels may change alike, 1.4 for channels that change independently of one another.
     Example:
         >>> flat = torch.full((3, 64, 64), 0.5)
         >>> image = flat.clone(); image[0, 20:40, 20:40] += 0.2
@@ -125,6 +139,8 @@ class ContactMask(nn.Module):
     most_far_field: Tensor
     cell_row: Tensor
     cell_column: Tensor
+    middle_row: Tensor
+    middle_column: Tensor
 
     def __init__(
         self,
@@ -134,6 +150,7 @@ class ContactMask(nn.Module):
         min_size_px: float = 8.0,
         far_field: float = 0.0,
         smooth_light: bool = False,
+        least_colour: float = 0.0,
     ) -> None:
         super().__init__()
         check_field("flat", flat)
@@ -143,6 +160,7 @@ class ContactMask(nn.Module):
         if flat.shape[2] < 3:
             raise ValueError(f"flat: expected at least 3 columns, for the noise of a frame, got {flat.shape[2]}")
         far_field = check_least("far_field", far_field)
+        self.least_colour = check_least("least_colour", least_colour)
         check_float_tensor("noise_std", noise_std)
         if tuple(noise_std.shape) not in ((3,), tuple(flat.shape)) or not bool(torch.isfinite(noise_std).all()):
             raise ValueError(f"noise_std: expected (3,) or {tuple(flat.shape)} finite values, got {tuple(noise_std.shape)}")
@@ -169,6 +187,9 @@ class ContactMask(nn.Module):
         self.register_buffer("failed_below", 0.05 * some.mean(dim=(1, 2)))
         self.register_buffer("cell_row", torch.arange(flat.shape[1]) // self.cell)
         self.register_buffer("cell_column", torch.arange(flat.shape[2]) // self.cell)
+        for name, length in (("middle_row", flat.shape[1]), ("middle_column", flat.shape[2])):  # the pixel in the middle of a cell
+            middle = torch.arange(0, length, self.cell).clamp_max(length - self.cell) + self.cell // 2
+            self.register_buffer(name, middle, persistent=False)
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, settings: ContactSettings | None = None) -> "ContactMask":
@@ -182,7 +203,8 @@ class ContactMask(nn.Module):
             typical = light.flatten(1).median(dim=1).values[:, None, None]
             noise = noise.maximum(STAND_IN_NOISE * (typical / light.clamp_min(1e-3 * typical)).clamp_min(1.0))
         smooth = calibration.response is not None
-        return cls(calibration.flat, noise, settings.sigmas, settings.min_size_px, most_far_field(calibration), smooth)
+        scattered, colour = most_far_field(calibration), least_colour(calibration)
+        return cls(calibration.flat, noise, settings.sigmas, settings.min_size_px, scattered, smooth, colour)
 
     if TYPE_CHECKING:
 
@@ -251,7 +273,7 @@ class ContactMask(nn.Module):
     def find(self, compensated: Tensor, image: Tensor) -> Moved:
         """The deformed area; compiled kernels replace this method."""
         found = self.change(compensated, image)
-        return self.clean(found.change, found.squared > found.threshold)
+        return self.clean(found.change, found.squared > found.threshold, found.scale)
 
     def change(self, compensated: Tensor, image: Tensor) -> Change:
         """The change of an image, in units of the calibrated noise; ``compensated`` is the same before it was :meth:`divided`."""
@@ -260,15 +282,16 @@ class ContactMask(nn.Module):
         offset, per_noise = self.offset[:, first::stride], self.per_noise[:, first::stride]
         rows = torch.addcmul(offset, compensated.detach()[:, :, first::stride], per_noise)
         noise = torch.maximum(self.noise(rows), self.far_field(rows)).clamp_min(1.0)
+        # rounding to 8 bits of smooth light is no white noise, and second differences miss it
+        scale = torch.rsqrt(noise * noise + self.rounding)
         failed = self.black(compensated)
         if not may_read(failed) or bool(failed.any()):
             failed = failed & (failed.to(torch.uint8).sum(dim=1, keepdim=True) == 1)
-            change = change * (~failed)[:, :, None, None].to(change.dtype)
-        # rounding to 8 bits of smooth light is no white noise, and second differences miss it
-        change = change * torch.rsqrt(noise * noise + self.rounding)[:, :, None, None]
+            scale = scale * (~failed).to(change.dtype)
+        change = change * scale[:, :, None, None]
         r, g, b = change[:, 0:1], change[:, 1:2], change[:, 2:3]
         squared = torch.addcmul(torch.addcmul(r * r, g, g), b, b)
-        return Change(change, squared, self.sigmas**2)
+        return Change(change, squared, self.sigmas**2, scale)
 
     def noise(self, rows: Tensor) -> Tensor:
         """Noise of the frame itself, (B, 3), from every ``stride``-th row of its change."""
@@ -299,7 +322,7 @@ class ContactMask(nn.Module):
         step = self.step
         return compensated.detach()[:, :, step // 2 :: step, step // 2 :: step].mean(dim=(2, 3)) < self.failed_below
 
-    def clean(self, change: Tensor, strong: Tensor) -> Moved:
+    def clean(self, change: Tensor, strong: Tensor, scale: Tensor) -> Moved:
         """The same from pixels that stand out: gaps closed, holes filled, specks removed, faint cells added."""
         strong = erode(dilate(strong))  # closing: pixels lost to noise at the rim
         counted = strong.to(change.dtype)  # ONNX sums no bytes
@@ -322,8 +345,24 @@ class ContactMask(nn.Module):
         tail = self.tail(mean, kept | added) if self.bridges else torch.zeros_like(kept)
         added = added | tail
         whole = kept | added
+        if self.least_colour > 0.0:
+            coloured = self.coloured(mean, whole, scale)
+            whole, tail = whole & coloured, tail & coloured
         interior = self._to_pixels(whole & (erode(filled | whole) | faint | added))
         return Moved((strong & self._to_pixels(whole)) | interior, interior, self._to_pixels(tail))
+
+    def coloured(self, mean: Tensor, whole: Tensor, scale: Tensor) -> Tensor:
+        """Whether the changes of all cells that have moved have the colour of slopes, bool (B, 1, 1, 1).
+
+        Where an LED has failed, two channels are too few to say.
+        """
+        per_noise = self.per_noise.index_select(1, self.middle_row).index_select(2, self.middle_column)
+        change = mean * whole.to(mean.dtype) / (per_noise * scale.clamp_min(1e-9)[:, :, None, None])
+        r, g, b = change[:, 0], change[:, 1], change[:, 2]
+        light = (r * r + g * g + b * b).sum(dim=(1, 2)) / 3.0
+        colour = ((r - g) ** 2 + (b - g) ** 2).sum(dim=(1, 2)) / 2.0
+        enough = (colour >= self.least_colour**2 * light) | (scale <= 0.0).any(dim=1)
+        return enough[:, None, None, None]
 
     def gaps(self, mean: Tensor, kept: Tensor) -> Tensor:
         """Cells between kept ones that have moved too, and what they enclose, bool; ``mean`` is the change of each cell."""
@@ -371,6 +410,13 @@ class ContactMask(nn.Module):
 def most_far_field(calibration: Calibration) -> float:
     """``far_field`` of a unit's mask: a rig that lights explain scatters none, and under a stand-in its least noise covers it."""
     return 0.0 if calibration.response is None or _stand_in(calibration) else MOST_FAR_FIELD
+
+
+def least_colour(calibration: Calibration) -> float:
+    """``least_colour`` of a unit's mask: a share of what its response field says of slopes; 0 without a field of its own."""
+    if calibration.response is None or _stand_in(calibration):
+        return 0.0
+    return COLOUR_SHARE * calibration.response.field.colour()
 
 
 def _stand_in(calibration: Calibration) -> bool:

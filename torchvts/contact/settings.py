@@ -2,7 +2,10 @@
 
 from dataclasses import dataclass
 
-from ..core.checks import check_positive
+from ..core.checks import check_least, check_positive
+
+MOST_SIZE_PX = 10000.0
+"""No image is wider."""
 
 
 @dataclass(frozen=True)
@@ -16,7 +19,9 @@ class ContactSettings:
         share: pressure from which the object touches, in units of what lifts free skin of the slope nearby. Higher draws the rim
             of the contact inward.
     Raises:
-        ValueError: a value that is not above zero.
+        TypeError: not a number.
+        ValueError: a value that no frame could use: ``sigmas`` below 1, which calls noise contact, or above 1000; a size of less
+            than a pixel; a ``share`` that is not above 0, or above 1, since all pressure that lifts free skin is contact.
     Example:
         >>> ContactSettings(sigmas=6.0).share
         0.8
@@ -27,5 +32,6 @@ class ContactSettings:
     share: float = 0.8
 
     def __post_init__(self) -> None:
-        for name in ("sigmas", "min_size_px", "share"):
-            check_positive(name, getattr(self, name))
+        for name, least, most in (("sigmas", 1.0, 1000.0), ("min_size_px", 1.0, MOST_SIZE_PX)):
+            object.__setattr__(self, name, check_least(name, getattr(self, name), least, most))
+        object.__setattr__(self, "share", check_positive("share", self.share, 1.0))

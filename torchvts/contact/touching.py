@@ -22,6 +22,9 @@ RIM_MM = 3.5
 DECAY_MM = (0.1, 3.0)
 """Bounds of the length on which free skin decays."""
 
+INNER = 3
+"""Cells, either way, over which the pressure just inside a rim is averaged: more than the blur of skin and camera reaches."""
+
 TAIL = (0.03, 0.4)
 """Depths of free skin from which that length is found, as shares of a frame's largest depth."""
 
@@ -32,6 +35,9 @@ at most 0.05 on drawn objects without. Below, all deformed skin lies on the obje
 EXPLAINED = 0.85
 """Share of the slopes nearby that a surface must explain, in squares. Of slopes that are noise, depth explains half in the mean,
 and 0.84 at most in undeformed frames of a video; of presses of 0.1 mm on drawn sensors 0.9 and more."""
+
+FALL = 0.5
+"""Pressure at a rim, as a share of that just inside: pressure falls to zero there, and blur makes a slope of that step."""
 
 FREE = 0.5
 """Pressure, as a share of depth, below which skin between parts of a contact is free: free skin bears none, that on a flat face as
@@ -45,17 +51,18 @@ class ContactFromDepth(nn.Module):
     """Contact of depth frames: the part of the deformed area that bears a pressure.
 
     The decay length L of a frame is the regression of its convex skin. A cell is pressed if its pressure exceeds a share of what
-    lifts free skin of the slope nearby, slope * L: at the rim of any contact pressure falls from at least that to zero. The rim
-    of the pressed cells then gets one depth along 3.5 mm of it, since depth has less noise than its curvature. Skin that hangs
-    between the strokes of a letter, or over a groove, is deeper than that rim, but free: there, 3 x 3 cells or more that lie
-    together bear less than half of the pressure of a flat face.
+    lifts free skin of the slope nearby, slope * L: at the rim of any contact pressure falls from at least that to zero. Where it
+    falls from more, as under a ball, half of the pressure just inside decides: a step that is blurred has its half where it was.
+    Single cells follow the most of the 3 x 3 around them. The rim of the pressed cells then gets one depth along 3.5 mm of it,
+    since depth has less noise than its curvature. Skin that hangs between the strokes of a letter, or over a groove, is deeper
+    than that rim, but free: there, 3 x 3 cells or more that lie together bear less than half of the pressure of a flat face.
     Slopes that are noise have as much curl as divergence. Where depth explains too little of the slopes nearby, and is less than
     the unexplained part would add up to, nothing is pressed.
 
     Args:
         mm_per_pixel: pixel pitch, mm.
-        share: of slope * L, from which a cell is pressed. One half is the middle of a sharp step; smoothing carries
-            pressure outward, hence more.
+        share: of slope * L, from which a cell is pressed. One half is the middle of a sharp step; blur carries pressure outward,
+            hence more.
     Source:
         membrane on an elastic foundation: Timoshenko and Woinowsky-Krieger, Theory of Plates and Shells, 1959; level from the
         rim: Yanowitz and Bruckstein, CVGIP 46(1), 1989; the rest is this project's.
@@ -78,6 +85,7 @@ class ContactFromDepth(nn.Module):
         self.reach = min(60, max(1, round(RIM_MM / (self.cell * mm_per_pixel))))
         self.decay, self.tail, self.least_free = DECAY_MM, TAIL, LEAST_FREE
         self.most_unexplained, self.free_share = 1.0 - EXPLAINED, 1.0 - FREE
+        self.fall, self.inner = FALL, INNER
         self.noise_depth_mm = NOISE_DEPTH * (self.reach // 2) * self.cell * self.mm_per_pixel
 
     if TYPE_CHECKING:
@@ -120,7 +128,7 @@ class ContactFromDepth(nn.Module):
 
     def rim_depth(self, fields: Tensor) -> Tensor:
         """Depth of the rim of the contact nearby, (B, 1, h, w), infinite where there is none or where skin hangs free within it,
-        and minus infinity where no skin of the frame hangs free and slopes are those of a surface.
+        and minus infinity near deep skin where none of the frame's hangs free and slopes are those of a surface.
 
         Args:
             fields: (B, 4, h, w): the deformed share of a cell, its depth and its two slopes times that share.
@@ -128,37 +136,47 @@ class ContactFromDepth(nn.Module):
         mass, some = fields[:, 0:1], fields[:, 0:1] > 0.0
         means = fields[:, 1:4] / mass.clamp_min(1e-6)
         depth, slope = means[:, 0:1], means[:, 1:3]
-        bend = self.divergence(slope, some) * mass
-        smooth = _box(torch.cat((mass, fields[:, 1:2], bend), dim=1), 2)
+        bend = self.divergence(slope, some)
+        smooth = _box(torch.cat((mass, fields[:, 1:2], bend * mass), dim=1), 1)
         smooth = smooth / smooth[:, 0:1].clamp_min(1e-6)
         smooth_depth, curvature = smooth[:, 1:2], smooth[:, 2:3]
         most = smooth_depth.amax(dim=(2, 3), keepdim=True)
         convex = curvature > smooth_depth / self.decay[1] ** 2  # a plane is not free
-        free = some & convex & (smooth_depth > self.tail[0] * most) & (smooth_depth < self.tail[1] * most)
-        hangs = free.sum(dim=(2, 3), keepdim=True) > self.least_free * (some & (smooth_depth > self.tail[0] * most)).sum(
-            dim=(2, 3), keepdim=True
-        )
+        deep = some & (smooth_depth > self.tail[0] * most)
+        free = deep & convex & (smooth_depth < self.tail[1] * most)
+        hangs = free.sum(dim=(2, 3), keepdim=True) > self.least_free * deep.sum(dim=(2, 3), keepdim=True)
         decay = self.squared_decay(smooth_depth.masked_fill(~free, 0.0), curvature)
-        pressure = (smooth_depth - decay * curvature).masked_fill(~some, 0.0)
+        pressure = (depth - decay * bend).masked_fill(~some, 0.0)
         steep = slope.square().sum(dim=1, keepdim=True)
         nearby = torch.cat((steep, steep * torch.sqrt(steep), self.unexplained(depth, slope, some), depth.square()), dim=1)
         nearby = _box(nearby, self.reach // 2)
         by_slopes, by_depth = self.most_unexplained * nearby[:, 0:1], nearby[:, 3:4] / max(1e-9, self.noise_depth_mm**2)
         surface = nearby[:, 2:3] < torch.maximum(by_slopes, by_depth)
         least = self.share * torch.sqrt(decay) * nearby[:, 1:2] / nearby[:, 0:1].clamp_min(1e-9)
-        pressed = surface & (pressure > least) & (pressure > 0.1 * pressure.amax(dim=(2, 3), keepdim=True))
+        most = (smooth_depth - decay * curvature).masked_fill(~some, 0.0).amax(dim=(2, 3), keepdim=True)
+        pressed = self.pressed(pressure, torch.maximum(least, 0.1 * most), surface)
         around = _box(torch.cat((pressed, some), dim=1).to(depth.dtype), 1)
         share = around[:, 0:1] / around[:, 1:2].clamp_min(1e-6)  # of deformed cells: none lie beyond the image
         rim = ((share > 0.2) & (share < 0.8) & some).to(depth.dtype)
         found = _box(torch.cat((rim, rim * depth), dim=1), self.reach)
         level = found[:, 1:2] / found[:, 0:1].clamp_min(1e-9)
         infinite = torch.full_like(level, float("inf"))
-        far, all_or_none = infinite.masked_fill(pressed, 0.0), infinite.masked_fill(surface, -float("inf"))
+        near_deep = _box(deep.to(depth.dtype), self.inner) > 1e-3
+        far, all_or_none = infinite.masked_fill(pressed, 0.0), infinite.masked_fill(surface & near_deep, -float("inf"))
         level = torch.where(found[:, 0:1] > 1e-9, level, far)
-        free = (decay * bend > self.free_share * depth * mass) & (depth > level)
+        free = (decay * bend > self.free_share * depth) & (depth > level)
         whole = _box(free.to(depth.dtype), 1) > 0.95
         level = torch.where(_box(whole.to(depth.dtype), 1) > 0.05, infinite, level)
         return torch.where(hangs, level, all_or_none)
+
+    def pressed(self, pressure: Tensor, least: Tensor, surface: Tensor) -> Tensor:
+        """Cells (B, 1, h, w), bool, whose pressure exceeds the least one, and a share of that of such cells nearby."""
+        found = surface & (pressure > least)
+        counted = found.to(pressure.dtype)
+        inner = _box(torch.cat((counted, counted * pressure), dim=1), self.inner)
+        inside = inner[:, 1:2] / inner[:, 0:1].clamp_min(1e-6)
+        found = found & (pressure > self.fall * inside)
+        return _box(found.to(pressure.dtype), 1) > 0.5
 
     def divergence(self, slope: Tensor, some: Tensor) -> Tensor:
         """Of slopes (B, 2, h, w), per mm; beyond cells without deformed skin, and beyond the border, slopes go on as they are."""

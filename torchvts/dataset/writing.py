@@ -18,10 +18,10 @@ from .records import VIDEO_FORMAT, Records
 
 
 class Writer:
-    """Writes the results of a run; ``name`` is that of its calibration."""
+    """Writes the results of a run; ``name`` is that of its calibration, ``metric`` whether its depth is in mm."""
 
-    def __init__(self, records: Records, sensor: Sensor, name: str) -> None:
-        self.records, self.settings, self.sensor, self.name = records, records.settings, sensor, name
+    def __init__(self, records: Records, sensor: Sensor, name: str, metric: bool) -> None:
+        self.records, self.settings, self.sensor, self.name, self.metric = records, records.settings, sensor, name, metric
 
     def write(self, frame: Frame, image: Tensor, result: DepthOutput) -> None:
         """All files of a frame: its depth, its contact, its picture."""
@@ -65,6 +65,7 @@ class Writer:
             "left_out": failed,
             "calibration": self.name,
             "sensor": self.sensor.name,
+            "metric": self.metric,
             "mm_per_pixel": self.sensor.mm_per_pixel,
             "height": self.sensor.height,
             "width": self.sensor.width,

@@ -21,7 +21,7 @@ from ..core.checks import check_choice, check_record
 from ..core.files import check_target, write_atomically
 from ..normals import WrappedNormals
 from ..pipeline import DepthPipeline
-from .each_frame import trace_each_frame
+from .kernels_in_file import linked_kernels, trace_kernels
 from .onnx_operators import decompositions
 from .trace import size_and_dtype, trace
 
@@ -101,10 +101,11 @@ def export_program(pipe: DepthPipeline, path: str | Path | None = None) -> torch
 def export_aoti(pipe: DepthPipeline, path: str | Path) -> Path:
     """Compile a pipeline to machine code for this kind of CPU (.pt2 package), for ``torch._inductor.aoti_load_package`` and C++.
 
+    Where the compiled kernels do all of the pipeline's work, as by response fields in modes fast and precise, the file holds them.
     Returns the path.
 
     Raises:
-        RuntimeError: there is no C++ compiler.
+        RuntimeError: there is no C++ compiler, or no C compiler for the kernels.
         TypeError: no pipeline.
     """
     check_pipeline(pipe)
@@ -114,19 +115,28 @@ def export_aoti(pipe: DepthPipeline, path: str | Path) -> Path:
         raise RuntimeError(complaint)
     if path.suffix != ".pt2":
         raise ValueError(f"path: expected a name ending in .pt2, got {path}: AOTInductor packages have no other")
-    program = trace_each_frame(pipe)
     settings: dict[str, Any] = {"aot_inductor.metadata": {METADATA_KEY: json.dumps(describe(pipe))}}
+    by_kernels = trace_kernels(pipe)
+    if by_kernels is not None:
+        with linked_kernels() as more:
+            _compile(by_kernels, path, settings | more)
+        return path
+    program = trace(pipe, by_matrix=False)
+    try:
+        _compile(program, path, settings)
+    except Exception as error:
+        if "CppCompileError" not in str(error):
+            raise
+        # Inductor (torch 2.13) writes some vectors of bool that no compiler accepts: without vectors it is slower and correct
+        _compile(program, path, settings | {"cpp.simdlen": 1})
+    return path
+
+
+def _compile(program: torch.export.ExportedProgram, path: Path, settings: dict[str, Any]) -> None:
+    """Write a program as machine code."""
     with warnings.catch_warnings(), write_atomically(path) as temporary:
         warnings.simplefilter("ignore")
-        try:
-            torch._inductor.aoti_compile_and_package(program, package_path=str(temporary), inductor_configs=settings)
-        except Exception as error:
-            if "CppCompileError" not in str(error):
-                raise
-            # Inductor (torch 2.13) writes some vectors of bool that no compiler accepts: without vectors it is slower and correct
-            settings = settings | {"cpp.simdlen": 1}
-            torch._inductor.aoti_compile_and_package(program, package_path=str(temporary), inductor_configs=settings)
-    return path
+        torch._inductor.aoti_compile_and_package(program, package_path=str(temporary), inductor_configs=settings)
 
 
 def export_onnx(pipe: DepthPipeline, path: str | Path) -> Path:

@@ -115,15 +115,6 @@ def trace(pipe: DepthPipeline, by_matrix: bool) -> torch.export.ExportedProgram:
     return traced(_PlainOutput(pipe), images, any_batch=True)
 
 
-def trace_one_frame(pipe: DepthPipeline) -> torch.export.ExportedProgram:
-    """The same for batches of one frame."""
-    height, width, dtype = size_and_dtype(pipe)
-    pipe = copy.deepcopy(reference(pipe)).eval().requires_grad_(False)
-    image = torch.full((1, 3, height, width), 0.5, dtype=dtype)
-    _make_tables(pipe, image)
-    return traced(_PlainOutput(pipe), image, any_batch=False)
-
-
 def traced(module: nn.Module, images: Tensor, any_batch: bool) -> torch.export.ExportedProgram:
     """The graph of a module of images (B, 3, H, W), for any batch or only for that one."""
     shapes = ({0: torch.export.Dim("batch", min=1, max=MAX_BATCH)},) if any_batch else None

@@ -114,6 +114,9 @@ class Report(_ReportKeys, total=False):
         presses: one row per press.
         touches: one row per touch.
         held_out_deg: mean error on presses by a response fitted to the other presses, degrees; None with too few presses.
+        own_deg: mean error on the very presses that a response was fitted to, degrees, where too few were used to hold one out.
+        prior_deg: where the sensor's prior is the model, or what presses were fitted from: its mean error on presses and units that
+            it was not fitted to, degrees; None where its file does not say.
         family: of the lights, in words.
         chosen_because: why these lights, among the candidates.
         converged: whether the fit of the lights converged.
@@ -139,6 +142,8 @@ class Report(_ReportKeys, total=False):
     presses: list[PressRow]
     touches: list[TouchRow]
     held_out_deg: float | None
+    own_deg: float
+    prior_deg: float | None
     family: str
     chosen_because: str
     converged: bool

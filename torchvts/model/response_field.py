@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..core.checks import brief, check_integer, check_numbers, check_positive, from_dict
+from ..core.checks import brief, check_integer, check_least, check_numbers, check_positive, from_dict
 from ..core.geometry import pixel_grid_mm
 
 CHANGE_SCALE = 0.3
@@ -88,6 +88,21 @@ class ResponseField:
             start += len(basis)
         return torch.stack(maps)
 
+    def colour(self) -> float:
+        """Change of colour over change of light that slopes make: RMS of R - G and B - G over that of R, G and B, all relative.
+
+        Of the smallest changes of light with these slopes, over all directions of slope and a square of the image. White light
+        would make 0, channels that change independently of one another 1.4.
+
+        Example:
+            >>> round(ResponseField(0, -1, 10.0, ((1, 0, 0), (0, 1, 0))).colour(), 2)
+            1.5
+        """
+        weight = self.maps(9, 9, 2.0 * self.half_mm / 9)[:3].permute(2, 3, 1, 0)  # (9, 9, 2, 3)
+        change = torch.linalg.pinv(weight)  # (9, 9, 3, 2)
+        difference = change[..., (0, 2), :] - change[..., 1:2, :]
+        return float((difference.square().mean() / change.square().mean().clamp_min(1e-30)).sqrt())
+
     def embedded(self, degree: int, product_degree: int, cubic_degree: int = -1) -> "ResponseField":
         """The same field as a member of a larger family; the new coefficients are zero.
 
@@ -119,16 +134,22 @@ class ResponseField:
 
 @dataclass(frozen=True)
 class DepthBrightness:
-    """Relative change of brightness of a flat skin per mm of depth: it comes nearer to the lights.
+    """What depth does to brightness: the skin comes nearer to the lights.
+
+    A flat skin at depth z changes its relative brightness by c(x, y) z. Beyond a reference depth, at which the field holds, a slope
+    changes it ``1 + steeper (z - reference_mm)`` times as much, since lights shine flatter on a skin that lies higher.
 
     Args:
-        degree: in position, 0 to 2.
+        degree: of c in position, 0 to 2.
         half_mm: scale of positions, mm.
-        coefficient: 3 rows (R, G, B) of coefficients of :func:`position_basis`, 1 / mm.
+        coefficient: of c, 3 rows (R, G, B) of coefficients of :func:`position_basis`, 1 / mm.
+        steeper: 1 / mm, at least 0.
+        reference_mm: depth up to which the field holds as it is, mm, at least 0.
     Raises:
         ValueError, TypeError: names the argument.
     Source:
-        what eq. 1 of the paper gives for a flat skin, with a free polynomial in place of its lights: this project.
+        eq. 1 of the paper: a light at height h and distance d gives c = 3 h / d^2 - 1 / h and steeper = 3 h / d^2; free parameters
+        in place of its lights: this project.
     Example:
         >>> DepthBrightness(0, 10.0, ((0.1,), (0.0,), (0.0,))).maps(2, 2, 0.1)[:, 0, 0]
         tensor([0.1000, 0.0000, 0.0000], dtype=torch.float64)
@@ -137,11 +158,15 @@ class DepthBrightness:
     degree: int
     half_mm: float
     coefficient: tuple[tuple[float, ...], ...]
+    steeper: float = 0.0
+    reference_mm: float = 0.0
 
     def __post_init__(self) -> None:
         if check_integer("degree", self.degree, 0) > 2:
             raise ValueError(f"degree: expected at most 2, got {self.degree}")
         object.__setattr__(self, "half_mm", check_positive("half_mm", self.half_mm))
+        for name in ("steeper", "reference_mm"):
+            object.__setattr__(self, name, check_least(name, getattr(self, name)))
         size = (self.degree + 1) * (self.degree + 2) // 2
         numbers = check_numbers("coefficient", self.coefficient, (3, size))
         object.__setattr__(self, "coefficient", tuple(numbers[k * size : (k + 1) * size] for k in range(3)))
@@ -173,7 +198,7 @@ class ResponseModel:
 
     Args:
         field: sine by brightness.
-        by_depth: subtracted from the change of brightness in a second pass, with the depth of the first; None if not known.
+        by_depth: applied to the change of brightness in a second pass, with the depth of the first; None if not known.
         gamma: of the images it was fitted to, value = light^(1/gamma).
         blur_px: standard deviation of the Gaussian blur it was fitted with, pixels of the calibrated size.
     Raises:
@@ -245,6 +270,8 @@ class SensorPrior:
         log_background: (3, 15), R, G, B: coefficients of :func:`position_basis` of degree 4 that give log(background).
         half_mm: scale of the positions of ``log_background``, mm.
         source: whose images it was fitted to, and how.
+        held_out_deg: mean angle between its normals and those of balls that it was not fitted to, degrees, of each unit that it was
+            tried on: first the unit it was fitted to, by other presses, then other units. Empty where nobody has measured it.
     Raises:
         ValueError, TypeError: names the argument.
     """
@@ -253,6 +280,7 @@ class SensorPrior:
     log_background: tuple[tuple[float, ...], ...]
     half_mm: float
     source: str
+    held_out_deg: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.response, ResponseModel):
@@ -262,6 +290,12 @@ class SensorPrior:
         object.__setattr__(self, "half_mm", check_positive("half_mm", self.half_mm))
         if not isinstance(self.source, str):
             raise TypeError(f"source: expected a text, got {brief(self.source)}")
+        object.__setattr__(self, "held_out_deg", _angles(self.held_out_deg))
+
+    @property
+    def expected_deg(self) -> float | None:
+        """Mean error of normals to expect of a unit of this type by its background, degrees; None where it is not measured."""
+        return sum(self.held_out_deg) / len(self.held_out_deg) if self.held_out_deg else None
 
     def background(self, height: int, width: int, mm_per_pixel: float) -> Tensor:
         """The smooth background of the unit it was fitted to, (3, H, W) float64, linear light."""
@@ -273,7 +307,9 @@ class SensorPrior:
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers."""
         rows = [[float(f"{number:.6g}") for number in row] for row in self.log_background]
-        return {"source": self.source, "half_mm": self.half_mm, "log_background": rows, "response": self.response.to_dict()}
+        measured = {"held_out_deg": [float(f"{angle:.3g}") for angle in self.held_out_deg]} if self.held_out_deg else {}
+        source: dict[str, Any] = {"source": self.source}
+        return source | measured | {"half_mm": self.half_mm, "log_background": rows, "response": self.response.to_dict()}
 
     @classmethod
     def from_dict(cls, values: Any, source: str) -> "SensorPrior":
@@ -281,6 +317,13 @@ class SensorPrior:
         if isinstance(values, dict) and "response" in values:
             values = values | {"response": ResponseModel.from_dict(values["response"], f"{source}: response")}
         return from_dict(cls, values, source)
+
+
+def _angles(value: object) -> tuple[float, ...]:
+    """One angle per unit."""
+    if not isinstance(value, list | tuple):
+        raise TypeError(f"held_out_deg: expected a list of degrees, one per unit, got {brief(value)}: write [3.5] for one unit")
+    return tuple(check_positive("held_out_deg", angle, 90.0) for angle in value)
 
 
 def fit_log_background(background: Tensor, mm_per_pixel: float) -> tuple[tuple[float, ...], ...]:

@@ -1,10 +1,11 @@
 """What a model of normals declares, and the adapter that makes a model of any ``nn.Module``."""
 
+import math
 from typing import TYPE_CHECKING
 
 from torch import Tensor, nn
 
-from ..core.checks import check_record
+from ..core.checks import brief, check_record
 
 DOMAINS = {
     "image": "images as the camera gives them, value / 255",
@@ -12,6 +13,9 @@ DOMAINS = {
     "light": "linear light scaled to that of the light model, as a calibration by lights gives",
 }
 """What a model of normals may work on, in words."""
+
+CODED = 100.0
+"""Length beyond which vectors are no normals, not even of a network that is not trained: colours go to 255."""
 
 FROM_GS_SDK = """
     import torchvts as vts
@@ -103,6 +107,46 @@ def as_normal_model(module: nn.Module) -> NormalModel:
     """
     check_record("normals", module, nn.Module)
     return module if isinstance(module, NormalModel) else WrappedNormals(module)
+
+
+def check_normals(model: nn.Module, normal: object, image: Tensor) -> None:
+    """Raise unless what a module gives can be the normals of an image. Reads values.
+
+    Args:
+        model: the module, named in errors.
+        normal: what it gave.
+        image: (B, 3, h, w), what it was given.
+    Raises:
+        TypeError: no tensor, or of another dtype.
+        ValueError: of another shape, values that are not finite, or normals coded as colours.
+    """
+    name = type(model.module if isinstance(model, WrappedNormals) else model).__name__
+    if not isinstance(normal, Tensor):
+        raise TypeError(f"normals: expected a tensor from {name}, got {brief(normal)}: return the normals alone")
+    wanted = tuple(image.shape)
+    if tuple(normal.shape) != wanted:
+        raise ValueError(
+            f"normals: expected {wanted} from {name}, the shape of its input, got {tuple(normal.shape)}: "
+            "three components in dimension 1, one normal for each pixel"
+        )
+    if normal.dtype != image.dtype:
+        raise TypeError(f"normals: expected {image.dtype} from {name}, the type of its input, got {normal.dtype}: cast it back")
+    if normal.numel() == 0:
+        return
+    values = normal.detach()
+    low, high = (float(value) for value in values.aminmax())
+    if not (math.isfinite(low) and math.isfinite(high)):
+        count = int((~values.isfinite()).sum())
+        raise ValueError(
+            f"normals: expected finite values from {name}, got {count} of {values.numel()} NaN or infinite: "
+            "a division by zero, or weights that diverged in training"
+        )
+    coded = low >= 0.0 and bool((values[:, :2].flatten(2).mean(dim=2) - 0.5).abs().max() < 0.1)
+    if coded or max(-low, high) > CODED:
+        raise ValueError(
+            f"normals: expected unit vectors from {name}, in [-1, 1] and zero in x and y on undeformed skin, got [{low:.4g}, "
+            f"{high:.4g}]: coded as colours? take 2 * value - 1, of values in [0, 1]"
+        )
 
 
 def check_domain(model: NormalModel, given: str | None) -> None:

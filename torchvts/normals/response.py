@@ -15,7 +15,8 @@ class NormalFromResponse(NormalModel):
     """Unit normals of a compensated image, which for a response field is image / background.
 
     The field's sines are the parts of the normal in the plane of the undeformed skin. In a second pass, what the depth of the
-    first does to brightness is subtracted before. In modes precise and auto the normals are then those of the depth.
+    first does to brightness is taken out before: what flat skin changes is subtracted, and the rest divided by what slopes gain. In
+    modes precise and auto the normals are then those of the depth.
 
     Args:
         field: sine by brightness.
@@ -54,6 +55,8 @@ class NormalFromResponse(NormalModel):
             check_record("by_depth", by_depth, DepthBrightness)
         self.uses_depth = by_depth is not None
         self.max_sine = MAX_SINE
+        self.steeper = 0.0 if by_depth is None else by_depth.steeper
+        self.reference_mm = 0.0 if by_depth is None else by_depth.reference_mm
         self.products, self.cubic = field.product_degree >= 0, field.cubic_degree >= 0
         scale = torch.tensor([CHANGE_SCALE ** -len(term) for term in field.terms()], dtype=torch.float64)
         self.register_buffer("maps", (field.maps(height, width, mm_per_pixel) * scale[:, None, None, None]).to(dtype))
@@ -86,7 +89,10 @@ class NormalFromResponse(NormalModel):
         bottom, right = top + image.shape[2], left + image.shape[3]
         change = image - 1.0
         if depth_mm is not None:
-            change = change - self.per_mm[:, top:bottom, left:right] * depth_mm.to(change.dtype)
+            depth = depth_mm.to(change.dtype)
+            change = change - self.per_mm[:, top:bottom, left:right] * depth
+            if self.steeper > 0.0:
+                change = change / (self.steeper * (depth - self.reference_mm).clamp_min(0.0) + 1.0)
         inputs = [change[:, 0:1], change[:, 1:2], change[:, 2:3]]
         maps = self.maps[:, :, top:bottom, left:right]
         sine = maps[0] * inputs[0]  # (B, 2, H, W)

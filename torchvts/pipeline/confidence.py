@@ -46,15 +46,16 @@ DEPTH_SPREAD = 1.46
 RESPONSE_SPREAD = 1.2
 """The same for normals of a response field, whose errors have longer tails."""
 
-PRIOR_DEG = 2.0
-"""Mean error of a sensor type's prior on a unit of its own: on a GelSight Mini 1.7 on the presses it was fitted on and 2.1 on
-others; a second Mini's own network is 2.9 from it, and some 2 from the truth itself."""
+UNMEASURED_DEG = 5.0
+"""Mean error that is assumed where nothing has measured it: of a prior whose file does not say, and of fields by touches. Priors
+are 2 to 5 degrees off, touches 4 to 6 on a GelSight Mini."""
 
-FEW_DEG = 5.0
-"""Mean error of a response field from presses too few to hold one out, or from touches: 4 to 6 on a GelSight Mini."""
+NOT_METRIC_DEG = 20.0
+"""Mean error of a model that is not this unit's: no better than to call every ball flat."""
 
 FEW_PRESSES = 4.0
-"""The held-out error of n presses is multiplied by sqrt(1 + 4 / n): few balls leave places and slopes without any."""
+"""Variance that n presses leave where no ball was pressed, in that of a press, times n. So their error is multiplied by
+sqrt(1 + 4 / n); a prior counts as so many presses."""
 
 MODEL_SHARE = 1.2
 """Error of a response field, relative to the one that spreads its held-out angle over the image in the way of noise."""
@@ -499,13 +500,22 @@ def _light_std_by_fit(calibration: Calibration) -> Tensor:
 
 
 def expected_model_deg(calibration: Calibration) -> float:
-    """Mean error of a response field to expect, degrees."""
+    """Mean error of a response field to expect of an object anywhere on the skin, degrees.
+
+    It is measured: by its presses, each by the others; where they are too few for that, by the misfit of the very presses; by the
+    record of its sensor's prior. A field that starts from a prior has the errors of both, by their weights.
+    """
     report = calibration.report
-    held_out = report.get("held_out_deg")
-    if held_out:
-        used = sum(bool(row.get("used")) for row in report.get("presses", []))
-        return float(held_out) * math.sqrt(1.0 + FEW_PRESSES / max(used, 1))
-    return PRIOR_DEG if report.get("source") == "prior" else FEW_DEG
+    if report.get("objection") or report.get("source") == "stand_in":
+        return NOT_METRIC_DEG
+    by_type, held_out = report.get("prior_deg") or UNMEASURED_DEG, report.get("held_out_deg")
+    used = max(1, sum(bool(row.get("used")) for row in report.get("presses", [])))
+    if report.get("source") == "prior" or ("prior_deg" in report and not held_out):
+        return by_type
+    if "prior_deg" in report and held_out:
+        return math.sqrt((used * held_out**2 + FEW_PRESSES * by_type**2) / (used + FEW_PRESSES))
+    error = held_out or report.get("own_deg")
+    return error * math.sqrt(1.0 + FEW_PRESSES / used) if error else UNMEASURED_DEG
 
 
 def _smooth(values: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """The depth pipeline: a calibration made into a chain of modules that turns images into depth."""
 
+import inspect
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Final, TypeVar
@@ -103,6 +104,7 @@ class DepthPipeline(nn.Module):
     """
 
     skips_undeformed: Final[bool]
+    _shares_light: Final[bool]
     measures_noise: Final[bool]
 
     def __init__(
@@ -140,6 +142,7 @@ class DepthPipeline(nn.Module):
         self.skips_undeformed = mode == "auto"
         self.compensate = compensate
         self.deformed = deformed
+        self._shares_light = isinstance(deformed, PlainContactMask) and takes_three(deformed)
         self.smooth = SmoothDrift() if isinstance(deformed, PlainContactMask) and deformed.smooth_light else nn.Identity()
         self.crop = Crop(STRIDE, model.takes_window)
         self.solve = Solve(model, gradient, integrator)
@@ -336,10 +339,10 @@ class DepthPipeline(nn.Module):
         """Where the skin has moved, and the part of it below the threshold, each bool (B, 1, H, W).
 
         A :class:`ContactMask` knows that part, and gets the image without its smooth change of light, which is then found once;
-        any other mask gets the compensated image alone.
+        any other mask, also one that derives from it with a ``forward`` of the image alone, gets the compensated image alone.
         """
         tail = torch.zeros_like(compensated[:, 0:1], dtype=torch.bool)
-        if hasattr(self.deformed, "smooth_light"):
+        if self._shares_light:
             return self.deformed(compensated, image, tail), tail
         return self.deformed(compensated), tail
 
@@ -414,6 +417,28 @@ def eval_around(module: _Module, *given: nn.Module | None) -> _Module:
     for part, training in modes:
         part.training = training
     return module
+
+
+def takes_three(mask: nn.Module) -> bool:
+    """Whether the ``forward`` of a mask takes the image without its smooth change of light, and a tail, too.
+
+    Raises:
+        TypeError: it takes something else than one image, or all three.
+    """
+    if isinstance(mask, torch.jit.ScriptModule):
+        return True
+    try:
+        inspect.signature(mask.forward).bind(None, None, None)
+    except TypeError:
+        try:
+            inspect.signature(mask.forward).bind(None)
+        except TypeError as error:
+            raise TypeError(
+                f"deformed: expected {type(mask).__name__}.forward(compensated), or forward(compensated, image, tail) like "
+                f"ContactMask's, got forward{inspect.signature(mask.forward)}"
+            ) from error
+        return False
+    return True
 
 
 def check_images(images: Tensor) -> None:

@@ -180,4 +180,5 @@ def _with_video_noise(mask: ContactMask, noise: Tensor, calibration: Calibration
         if calibration.gain is not None:
             compensated = compensated * calibration.gain.float() * 2.0**0.5
     most = torch.maximum(1.0 / mask.per_noise, compensated.to(mask.per_noise))
-    return accelerated.ContactMask(mask.flat, most, mask.sigmas, mask.min_size_px, far_field, mask.smooth_light).eval()
+    settings = (mask.sigmas, mask.min_size_px, far_field, mask.smooth_light, mask.least_colour)
+    return accelerated.ContactMask(mask.flat, most, *settings).eval()

@@ -38,6 +38,9 @@ NEAR = 0.1
 LIKE = 0.55
 """Share of the cells that look like the background from which a frame shows its view."""
 
+LEAST_DECIDING = 0.1
+"""Share of the cells in which another view of the background looks different, below which no frame can show that view."""
+
 
 def _centre(cells: Tensor) -> Tensor:
     """The middle of (3, h, w) cells, without :data:`CROP` a side, at their own size."""
@@ -68,8 +71,9 @@ class FrameCheck:
     """Says why a frame cannot be a frame of this unit; an empty text where it can.
 
     A frame is compared with the background in cells of 1/24 of its height. It shows another view if more than half of the cells are
-    like the background's when it is cropped, turned or mirrored, and 1.5 times as many as without that. A contact changes the frame
-    where it lies, and does not make it similar to another view.
+    like the background's when it is cropped, turned or mirrored, and 1.5 times as many as without that. Only cells count in which
+    the background itself looks different when that is done to it: a flat contact on an even background is no other view. A contact
+    changes the frame where it lies, and does not make it similar to another view.
 
     Args:
         background: (3, H, W), image value of the unit without contact.
@@ -89,7 +93,12 @@ class FrameCheck:
         self._lit = [(channel, lit) for channel, lit in enumerate(self.background > LIT) if bool(lit.any())]
         self._lit_lines = [line > LIT for line in _lines(background)]
         self._overexposed = _overexposed(self.background) > MOST_OVEREXPOSED
-        self._views = [(what, change, other(self.background)) for what, change, other in _VIEWS]
+        self._views = []
+        for what, change, other in _VIEWS:
+            own, wanted = change(self.background), other(self.background)
+            deciding = ~_alike(_ratio(own, wanted))
+            if float(deciding.double().mean()) >= LEAST_DECIDING:
+                self._views.append((what, change, own, wanted, deciding))
 
     @classmethod
     def from_calibration(cls, calibration: Calibration) -> "FrameCheck | None":
@@ -132,10 +141,17 @@ class FrameCheck:
     def _other_view(self, cells: Tensor, as_it_is: float) -> str:
         if as_it_is > LIKE:
             return ""
-        best, what = max((_likeness(_ratio(change(cells), other)), what) for what, change, other in self._views)
-        if best < 0.5 or best < 1.5 * as_it_is:
+        found = [("", 0.0, 0.0)]
+        for what, change, own, wanted, deciding in self._views:
+            seen = change(cells)
+            alike = _alike(_ratio(seen, wanted))
+            undone, same = (float(part[deciding].double().mean()) for part in (alike, _alike(_ratio(seen, own))))
+            if min(undone, float(alike.double().mean())) >= 0.5 and undone >= 1.5 * same:
+                found.append((what, undone, same))
+        what, best, same = max(found, key=lambda view: view[1])
+        if not what:
             return ""
-        return f"the frame {what}: with that undone {best:.0%} of it looks like the background, else {as_it_is:.0%}"
+        return f"the frame {what}: with that undone {best:.0%} of what differs looks like the background, else {same:.0%}"
 
 
 def _lines(image: Tensor) -> tuple[Tensor, Tensor]:
@@ -157,7 +173,12 @@ def _ratio(one: Tensor, other: Tensor) -> Tensor:
     return one / other.clamp_min(1e-3)
 
 
-def _likeness(ratio: Tensor) -> float:
-    """Share of the cells whose ratio (3, h, w) is within :data:`NEAR` of the median of each channel."""
+def _alike(ratio: Tensor) -> Tensor:
+    """(h, w) bool: cells whose ratio (3, h, w) is within :data:`NEAR` of the median of each channel."""
     relative = ratio / ratio.flatten(1).median(1).values.clamp_min(1e-3)[:, None, None]
-    return float(((relative - 1.0).abs().amax(0) < NEAR).double().mean())
+    return (relative - 1.0).abs().amax(0) < NEAR
+
+
+def _likeness(ratio: Tensor) -> float:
+    """Share of the cells that are alike."""
+    return float(_alike(ratio).double().mean())

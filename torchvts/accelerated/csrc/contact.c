@@ -273,9 +273,9 @@ static void cell_shares(const uint16_t *values, int width, int cell, int columns
     for (int j = 0; j < columns; j++) shares[j] /= (float)(cell * cell);
 }
 
-/* What one frame needs besides its masks: of cells, samples of each channel, three mean changes, a share and then a weight each, and lines of both; masks
-   of cells that have changed, faint ones among them, ones outside of any contact, kept ones, ones where cells decide, not pixels, ones of
-   skin below the threshold; two masks for what is at hand, and lines of bytes. */
+/* What one frame needs besides its masks: of cells, samples of each channel for each of two spreads, three mean changes, a share and then a weight each, and
+   lines of both; masks of cells that have changed, faint ones among them, ones outside of any contact, kept ones, ones where cells decide, not pixels,
+   ones of skin below the threshold; two masks for what is at hand, and a byte for each cell, twice. */
 typedef struct {
     float *some, *means, *density, *down, *sums;
     uint64_t *changed, *faint, *outside, *kept, *solid, *tail, *one, *other;
@@ -287,7 +287,7 @@ typedef struct {
     int rows, columns, cell, reach;
     float least_cells;
     int bridge;
-    float bridge_sigmas, tail_sigmas, least_spread;
+    float bridge_sigmas, tail_sigmas, least_spread, least_colour;
     Shape shape;
 } Grid;
 
@@ -297,7 +297,7 @@ typedef struct {
     const SmoothLight *smooth;
     float *surface;
     int height, width, step, stride;
-    float rounding, threshold, noise[6], scale[3], per[3];
+    float rounding, threshold, noise[6], scale[3], per[3], per_quarter[3];
     int works[3], bands;
     Grid grid;
     Scratch at;
@@ -426,15 +426,19 @@ static int some_cells(const Grid *grid, const float *means, float *some) {
     return n;
 }
 
-/* 1 over the frame's own spread of mean changes, of one channel. */
-static void find_spread(void *with, int c) {
+/* 1 over the frame's own spread of a channel's mean changes: by their median, and for the tail by their lowest quarter, which
+   a contact does not reach. */
+static void find_spread(void *with, int part) {
     Frame *of = with;
     const Grid *grid = &of->grid;
+    const int c = part % 3, by_quarter = part >= 3;
     const size_t cells = (size_t)grid->rows * grid->columns;
-    float *some = of->at.some + c * (2 * cells + 1), least_std = 1.0f / (float)grid->cell;
+    float *some = of->at.some + part * (2 * cells + 1);
     const int n = some_cells(grid, of->at.means + c * cells, some);
-    const float std = median(some, n, some + n) / 0.6745f;
-    of->per[c] = 1.0f / (std < least_std ? least_std : std);
+    float std = by_quarter ? kth_or_none(some, n, n / 4, some + n) / 0.3186f : median(some, n, some + n) / 0.6745f;
+    for (int pass = 0; pass < 2 && by_quarter; pass++) std = clipped_std(some, n, std);
+    const float least_std = by_quarter ? grid->least_spread : 1.0f / (float)grid->cell;
+    (by_quarter ? of->per_quarter : of->per)[c] = 1.0f / (std < least_std ? least_std : std);
 }
 
 /* Changed cells, with strong pixels, and faint ones, whose mean change stands out of the frame's own spread of such means; and what lies
@@ -443,13 +447,13 @@ static int find_cells(const Grid *grid, const float per[3], Scratch at) {
     const size_t cells = (size_t)grid->rows * grid->columns;
     const int rows = grid->rows, columns = grid->columns, words = grid->shape.words;
     uint64_t found = 0;
+    above(at.density, 0.0f, (int)cells, at.line);
+    longer_than(at.means, cells, per, 25.0f, (int)cells, at.other_line);
     for (int i = 0; i < rows; i++) {
         const size_t first = (size_t)i * columns;
         uint64_t *changed = at.changed + (size_t)i * words, *faint = at.faint + (size_t)i * words;
-        above(at.density + first, 0.0f, columns, at.line);
-        longer_than(at.means + first, cells, per, 25.0f, columns, at.other_line);
-        pack_bits(at.line, &grid->shape, changed);
-        pack_bits(at.other_line, &grid->shape, faint);
+        pack_bits(at.line + first, &grid->shape, changed);
+        pack_bits(at.other_line + first, &grid->shape, faint);
         for (int w = 0; w < words; w++) faint[w] &= ~changed[w], changed[w] |= faint[w], found |= changed[w];
     }
     invert_bits(at.changed, &grid->shape, at.one);
@@ -551,26 +555,43 @@ static void bridge_gaps(const Grid *grid, Scratch at) {
 }
 
 /* Keeps the cells in which the skin of kept ones goes on, and what they enclose. There cells decide. */
-static void keep_tail(const Grid *grid, Scratch at) {
+static void keep_tail(const Grid *grid, const float per[3], Scratch at) {
     const int rows = grid->rows, columns = grid->columns, words = grid->shape.words;
     const size_t cells = (size_t)rows * columns;
-    float per[3];
-    for (int c = 0; c < 3; c++) {
-        const int n = some_cells(grid, at.means + c * cells, at.some);
-        float spread = kth_or_none(at.some, n, n / 4, at.some + n) / 0.3186f;
-        for (int pass = 0; pass < 2; pass++) spread = clipped_std(at.some, n, spread);
-        per[c] = 1.0f / (spread < grid->least_spread ? grid->least_spread : spread);
-    }
+    longer_than(at.means, cells, per, grid->tail_sigmas * grid->tail_sigmas, (int)cells, at.line);
     for (int i = 0; i < rows; i++) {
         const size_t row = (size_t)i * words;
-        longer_than(at.means + (size_t)i * columns, cells, per, grid->tail_sigmas * grid->tail_sigmas, columns, at.line);
-        pack_bits(at.line, &grid->shape, at.one + row);
+        pack_bits(at.line + (size_t)i * columns, &grid->shape, at.one + row);
         for (int w = 0; w < words; w++) at.one[row + w] |= at.other[row + w] = at.kept[row + w];
     }
     flood(at.other, at.one, &grid->shape);
     for (size_t k = 0; k < words_of(&grid->shape); k++) at.tail[k] = at.kept[k];
     keep_filled(grid, at);
     for (size_t k = 0; k < words_of(&grid->shape); k++) at.tail[k] ^= at.kept[k];
+}
+
+/* Whether the changes of all kept cells have the colour of slopes; where an LED has failed, two channels are too few to say. */
+static int coloured(const Frame *of) {
+    const Grid *grid = &of->grid;
+    const int rows = grid->rows, columns = grid->columns, cell = grid->cell, words = grid->shape.words;
+    const size_t pixels = (size_t)of->height * of->width, cells = (size_t)rows * columns;
+    float light = 0.0f, colour = 0.0f;
+    if (of->scale[0] <= 0.0f || of->scale[1] <= 0.0f || of->scale[2] <= 0.0f) return 1;
+    for (int i = 0; i < rows; i++) {
+        if (!any_bit(of->at.kept + (size_t)i * words, words)) continue;
+        unpack_bits(of->at.kept + (size_t)i * words, &grid->shape, of->at.line);
+        const size_t row = (size_t)(least(i * cell, of->height - cell) + cell / 2) * of->width;
+        for (int j = 0; j < columns; j++) {
+            if (!of->at.line[j]) continue;
+            const size_t at = row + least(j * cell, of->width - cell) + cell / 2;
+            float change[3];
+            for (int c = 0; c < 3; c++) change[c] = of->at.means[c * cells + (size_t)i * columns + j] / (of->per_noise[c * pixels + at] * of->scale[c]);
+            const float red = change[0] - change[1], blue = change[2] - change[1];
+            light += change[0] * change[0] + change[1] * change[1] + change[2] * change[2];
+            colour += red * red + blue * blue;
+        }
+    }
+    return !(0.5f * colour < grid->least_colour * grid->least_colour * light / 3.0f);
 }
 
 /* Cells that decide for all their pixels: faint ones, and those none of whose neighbours lies outside of the contact; what is beyond the image
@@ -642,11 +663,15 @@ static int mask_frame(Frame *of) {
     share(find_shares, of, of->bands);
     if (of->short_of_memory) return 1;
     const int finite = all_finite(of->at.means, 3 * cells);
-    share(find_spread, of, 3);
+    share(find_spread, of, of->grid.bridge > 0 ? 6 : 3);
     if (find_cells(&of->grid, of->per, of->at)) {
         keep_large(&of->grid, of->at);
         memset(of->at.tail, 0, sizeof(uint64_t) * words_of(&of->grid.shape));
-        if (of->grid.bridge > 0) bridge_gaps(&of->grid, of->at), keep_tail(&of->grid, of->at);
+        if (of->grid.bridge > 0) bridge_gaps(&of->grid, of->at), keep_tail(&of->grid, of->per_quarter, of->at);
+        if (of->grid.least_colour > 0.0f && !coloured(of)) {
+            memset(of->at.kept, 0, sizeof(uint64_t) * words_of(&of->grid.shape));
+            memset(of->at.tail, 0, sizeof(uint64_t) * words_of(&of->grid.shape));
+        }
         find_solid(&of->grid, of->at);
         share(to_pixels, of, of->bands);
     } else {
@@ -667,16 +692,17 @@ static int mask_frame(Frame *of) {
 EXPORT int contact_mask(const float *image, const float *divided, const float *offset, const float *per_noise, const float *failed_below,
                         const float *most_far_field, int frames, int height, int width, int step, int stride, int cell, int reach,
                         float sigmas, float rounding, float least_cells, int bridge, float bridge_sigmas, float tail_sigmas,
-                        float least_spread, const SmoothLight *smooth, float *surface, uint8_t *mask, uint8_t *inner, uint8_t *tail) {
+                        float least_spread, float least_colour, const SmoothLight *smooth, float *surface, uint8_t *mask, uint8_t *inner,
+                        uint8_t *tail) {
     const int rows = (height + cell - 1) / cell, columns = (width + cell - 1) / cell;
-    const Grid grid = {rows, columns, cell, reach, least_cells, bridge, bridge_sigmas, tail_sigmas, least_spread, shape_of(rows, columns)};
+    const Grid grid = {rows, columns, cell, reach, least_cells, bridge, bridge_sigmas, tail_sigmas, least_spread, least_colour, shape_of(rows, columns)};
     const size_t pixels = (size_t)height * width, cells = (size_t)rows * columns, words = words_of(&grid.shape), line = 64 * (size_t)grid.shape.words;
-    uint64_t *masks = malloc(8 * sizeof(uint64_t) * words + sizeof(float) * (10 * cells + 3 + 2 * line + 2 * (size_t)reach) + 2 * line);
+    uint64_t *masks = malloc(8 * sizeof(uint64_t) * words + sizeof(float) * (16 * cells + 6 + 2 * line + 2 * (size_t)reach) + 2 * (cells + line));
     if (!masks) return 1;
     Scratch at = {.changed = masks, .faint = masks + words, .outside = masks + 2 * words, .kept = masks + 3 * words, .solid = masks + 4 * words};
     at.one = masks + 5 * words, at.other = masks + 6 * words, at.tail = masks + 7 * words;
-    at.some = (float *)(masks + 8 * words), at.means = at.some + 6 * cells + 3, at.density = at.means + 3 * cells, at.sums = at.density + cells;
-    at.down = at.sums + line, at.line = (uint8_t *)(at.down + line + 2 * reach), at.other_line = at.line + line;
+    at.some = (float *)(masks + 8 * words), at.means = at.some + 12 * cells + 6, at.density = at.means + 3 * cells, at.sums = at.density + cells;
+    at.down = at.sums + line, at.line = (uint8_t *)(at.down + line + 2 * reach), at.other_line = at.line + cells + line;
     int code = 0;
     for (int b = 0; b < frames && code != 1; b++) {
         Frame frame = {.image = image + 3 * pixels * b, .divided = divided + 3 * pixels * b, .offset = offset, .per_noise = per_noise, .failed_below = failed_below};

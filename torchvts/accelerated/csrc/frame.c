@@ -19,7 +19,7 @@ typedef struct {
     float least_drift, most_drift, believed_drift;
     /* ContactMask */
     int32_t step, stride, cell, reach, bridge;
-    float sigmas, rounding, least_cells, bridge_sigmas, tail_sigmas, least_spread;
+    float sigmas, rounding, least_cells, bridge_sigmas, tail_sigmas, least_spread, least_colour;
     const SmoothLight *smooth; /* of SmoothDrift too; or null */
     const float *flat, *per_noise, *failed_below, *most_far_field;
     /* Crop: corners on multiples of `corners` */
@@ -27,7 +27,7 @@ typedef struct {
     /* NormalFromResponse; or, where `inverse` is given, NormalFromIntensity */
     int32_t degree, terms;
     const float *place, *weight, *per_mm, *noise, *lit, *saturated, *inverse;
-    float max_sine;
+    float max_sine, steeper, reference_mm;
     /* GradientFromNormal and PoissonBackground */
     float per_slope, pitch, half_per_mm;
     const double *tables;
@@ -37,7 +37,7 @@ typedef struct {
     float stiff, tolerance;
     /* ContactFromDepth */
     int32_t contact_cell, contact_reach;
-    float contact_model[10];
+    float contact_model[12];
 } Program;
 
 /* DepthOutput, of one frame. */
@@ -49,7 +49,7 @@ typedef struct {
 /* Memory of one frame besides. */
 typedef struct {
     float *light, *gradient, *depth;
-    uint8_t *contact, *tail, *inner; /* and two lines, and four bytes each, behind `inner` */
+    uint8_t *tail, *inner, *line; /* two lines, and four bytes each, behind `inner` */
 } Work;
 
 typedef struct {
@@ -132,7 +132,7 @@ static void rows_of_gradient(void *with, int part) {
     } else {
         const float *weight = of->weight + (size_t)2 * of->terms * (of->degree + 1) * (at.top + first);
         response_normals(light, 0, per_channel, per_row, of->place + at.left, weight, of->degree, of->terms, before, 0, width,
-                         before ? of->per_mm + 9 * (at.top + first) : NULL, of->max_sine, 1, rows, columns, normal);
+                         before ? of->per_mm + 9 * (at.top + first) : NULL, of->steeper, of->reference_mm, of->max_sine, 1, rows, columns, normal);
     }
     slopes(normal, 1, (int)n, of->per_slope, gradient);
     for (int c = 0; c < 2; c++)
@@ -149,6 +149,40 @@ static int solve(const Program *of, const float *light, const float *surface, co
     return solve_poisson(work.gradient, of->tables, of->pitch, 1, at.rows, at.columns, at.top, at.left, of->height, of->width, 1, depth);
 }
 
+/* Gradient, normals and slopes of depth, while contact is found. */
+typedef struct {
+    Slopes slopes;
+    Uncropping uncropping;
+    int slopes_of_depth, bands;
+} RestOfOutput;
+
+static void rows_of_output(void *with, int band) {
+    const RestOfOutput *of = with;
+    const Uncropping *to = &of->uncropping;
+    const int first = to->height * band / of->bands, last = to->height * (band + 1) / of->bands;
+    const int top = first > to->top ? first - to->top : 0, bottom = least(last - to->top, to->rows);
+    if (of->slopes_of_depth) rows_of_slopes(&of->slopes, top, bottom);
+    rows_uncropped(to, first, last);
+}
+
+/* Contact of the window, and the rest of the output. Returns the bits of solve_frames(). */
+static int finish(const Program *of, Window at, Work work, Output out) {
+    const int width = of->width;
+    const size_t corner = (size_t)at.top * width + at.left;
+    RestOfOutput rest = {{out.depth + corner, width, out.deformed + corner, width, of->half_per_mm, at.rows, at.columns, work.gradient},
+                     {work.gradient, NULL, at.rows, at.columns, at.top, at.left, of->height, width, out.gradient, out.normal, out.contact},
+                     of->slopes_of_depth,
+                     bands_of(of->height)};
+    Touching touching = {.depth = out.depth + corner, .depth_row = width, .gradient = work.gradient, .deformed = out.deformed + corner};
+    touching.rows = at.rows, touching.columns = at.columns, touching.cell = of->contact_cell, touching.reach = of->contact_reach;
+    touching.numbers = of->contact_model, touching.edge = NO_EDGE, touching.deformed_row = touching.contact_row = width;
+    touching.contact = out.contact + corner, touching.beside = rows_of_output, touching.with = &rest, touching.parts = rest.bands;
+    if (above_tail(out.depth + corner, out.deformed + corner, work.tail + corner, width, at.rows, at.columns, of->contact_model[MOST_TAIL],
+                   work.inner + corner, work.line, &touching.edge))
+        touching.deformed = work.inner + corner;
+    return find_contact(&touching) ? SHORT : 0;
+}
+
 static int solve_frame(const Program *of, const float *image, Work work, Output out) {
     const int height = of->height, width = of->width;
     int trouble = 0;
@@ -157,7 +191,7 @@ static int solve_frame(const Program *of, const float *image, Work work, Output 
     float surface[18];
     const int code = contact_mask(light, light, of->flat, of->per_noise, of->failed_below, of->most_far_field, 1, height, width, of->step, of->stride,
                                   of->cell, of->reach, of->sigmas, of->rounding, of->least_cells, of->bridge, of->bridge_sigmas, of->tail_sigmas,
-                                  of->least_spread, of->smooth, surface, out.deformed, work.inner, work.tail);
+                                  of->least_spread, of->least_colour, of->smooth, surface, out.deformed, work.inner, work.tail);
     if (code) return code == 1 ? SHORT : BEYOND;
     Window at = window_of(of, out.deformed);
     if (at.rows == 0) {
@@ -165,28 +199,18 @@ static int solve_frame(const Program *of, const float *image, Work work, Output 
         uncrop(NULL, NULL, 1, 0, 0, 0, 0, height, width, out.gradient, out.normal, out.contact);
         return 0;
     }
-    float *found = of->zeroes ? work.depth : out.depth;
+    float *found = of->zeroes ? work.depth : out.depth, ends[2];
+    int same = 0; /* whether `ends` are still those of the depth found */
     for (int pass = 0; pass < of->passes && !trouble; pass++) {
         trouble = solve(of, light, surface, out.deformed, pass ? found : NULL, at, work, found);
-        if (pass || trouble || !add_faces(found, out.deformed, height, width, work.inner)) continue;
+        same = !pass && !trouble && !add_faces(found, out.deformed, height, width, work.inner, ends);
+        if (pass || trouble || same) continue;
         at = window_of(of, out.deformed);
         trouble = solve(of, light, surface, out.deformed, NULL, at, work, found);
     }
     if (trouble) return trouble;
-    const size_t corner = (size_t)at.top * width + at.left;
-    if (of->zeroes && zero_background(found, out.deformed, 1, height, width, of->stiff, of->tolerance, of->sweeps, out.depth)) return SHORT;
-    const float *pressing = out.depth;
-    const uint8_t *core = out.deformed;
-    if (above_tail(out.depth + corner, out.deformed + corner, work.tail + corner, width, at.rows, at.columns, of->contact_model[MOST_TAIL],
-                   work.depth + corner, work.inner + corner))
-        pressing = work.depth, core = work.inner;
-    if (contact_from_depth(pressing + corner, 0, width, work.gradient, core + corner, 0, width, 1, at.rows, at.columns, of->contact_cell,
-                           of->contact_reach, of->contact_model, work.contact))
-        return SHORT;
-    if (of->slopes_of_depth)
-        depth_slopes(out.depth + corner, 0, width, out.deformed + corner, 0, width, of->half_per_mm, 1, at.rows, at.columns, work.gradient);
-    uncrop(work.gradient, work.contact, 1, at.rows, at.columns, at.top, at.left, height, width, out.gradient, out.normal, out.contact);
-    return 0;
+    if (of->zeroes && zero_frame(found, out.deformed, height, width, of->stiff, of->tolerance, of->sweeps, same ? ends : NULL, out.depth)) return SHORT;
+    return finish(of, at, work, out);
 }
 
 /*
@@ -197,7 +221,7 @@ static int solve_frame(const Program *of, const float *image, Work work, Output 
 EXPORT int solve_frames(const Program *of, const float *images, int frames, int threads, float *depth, float *gradient, float *normal,
                         uint8_t *contact, uint8_t *deformed) {
     const size_t pixels = (size_t)of->height * of->width;
-    float *floats = malloc(pixels * (6 * sizeof(float) + 3) + 2 * ((size_t)of->width + 4));
+    float *floats = malloc(pixels * (6 * sizeof(float) + 2) + 2 * ((size_t)of->width + 4));
     if (!floats) return SHORT;
     uint8_t *bytes = (uint8_t *)(floats + 6 * pixels);
     const Work work = {floats, floats + 3 * pixels, floats + 5 * pixels, bytes, bytes + pixels, bytes + 2 * pixels};

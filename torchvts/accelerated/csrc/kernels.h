@@ -2,6 +2,7 @@
 #ifndef TORCHVTS_KERNELS_H
 #define TORCHVTS_KERNELS_H
 
+#include <math.h>
 #include <stdatomic.h>
 #include <stdint.h>
 #include <stdlib.h>
@@ -11,7 +12,8 @@
 #include <xmmintrin.h>
 #endif
 
-#if defined(_WIN32)
+#if defined(EXPORT) /* given by who links the kernels into something else */
+#elif defined(_WIN32)
 #define EXPORT __declspec(dllexport)
 #else
 #define EXPORT __attribute__((visibility("default")))
@@ -110,11 +112,11 @@ EXPORT void divide_planes(const float *image, const float *level, int planes, in
 EXPORT int contact_mask(const float *image, const float *divided, const float *offset, const float *per_noise, const float *failed_below,
                         const float *most_far_field, int frames, int height, int width, int step, int stride, int cell, int reach, float sigmas,
                         float rounding, float least_cells, int bridge, float bridge_sigmas, float tail_sigmas, float least_spread,
-                        const SmoothLight *smooth, float *surface, uint8_t *mask, uint8_t *inner, uint8_t *tail);
+                        float least_colour, const SmoothLight *smooth, float *surface, uint8_t *mask, uint8_t *inner, uint8_t *tail);
 EXPORT void box_of(const uint8_t *mask, int frames, int height, int width, int *box);
 EXPORT void response_normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *place, const float *weight,
-                             int degree, int terms, const float *depth, int64_t depth_frame, int64_t depth_row, const float *per_mm, float max_sine,
-                             int frames, int rows, int columns, float *normal);
+                             int degree, int terms, const float *depth, int64_t depth_frame, int64_t depth_row, const float *per_mm, float steeper,
+                             float reference_mm, float max_sine, int frames, int rows, int columns, float *normal);
 EXPORT int normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *three_noises, const float *flat,
                    const float *saturated, const float *inverse, int64_t plane, int width, int frames, int rows, int columns, const float *depth,
                    int64_t depth_frame, int64_t depth_row, const float *position, const float *albedo, float pitch, float per_height, float axis_x,
@@ -126,16 +128,70 @@ EXPORT int solve_poisson(const float *gradient, const double *tables, float mm_p
                          int height, int width, int zeroed, float *depth);
 EXPORT int zero_background(const float *depth, const uint8_t *deformed, int frames, int height, int width, float stiff, float tolerance,
                            int sweeps, float *out);
-int add_faces(const float *depth, uint8_t *deformed, int height, int width, uint8_t *kind);
+int zero_frame(const float *depth, const uint8_t *deformed, int height, int width, float stiff, float tolerance, int sweeps, const float *ends,
+               float *out);
+int add_faces(const float *depth, uint8_t *deformed, int height, int width, uint8_t *kind, float ends[2]);
 EXPORT void depth_slopes(const float *depth, int64_t depth_frame, int64_t depth_row, const uint8_t *mask, int64_t mask_frame, int64_t mask_row,
                          float half_per_mm, int frames, int rows, int columns, float *gradient);
-int above_tail(const float *depth, const uint8_t *deformed, uint8_t *tail, int64_t width, int rows, int columns, float most_of_tail,
-               float *above, uint8_t *core);
+void range_of(const float *values, size_t n, float *lowest, float *highest);
+
+/* Depth that pressure is looked for in: that above an edge, not below `least`. */
+typedef struct {
+    float depth, least;
+} Edge;
+
+static const Edge NO_EDGE = {0.0f, -INFINITY};
+
+static inline float above_edge(Edge edge, float depth) {
+    const float above = depth - edge.depth;
+    return above > edge.least ? above : edge.least;
+}
+
+/* What find_contact() is given: settings of ContactFromDepth, a window of depth and deformed skin (bytes) whose rows lie at the given distances, and its
+   gradient (2, rows, columns). Contact goes to bytes, rows too at a distance. beside(with, part): so many parts of other work, which wait for
+   nothing of this. */
+typedef struct {
+    const float *depth, *gradient, *numbers;
+    const uint8_t *deformed;
+    int64_t depth_row, deformed_row, contact_row;
+    int rows, columns, cell, reach, parts;
+    Edge edge;
+    uint8_t *contact;
+    PartOfWork beside;
+    void *with;
+} Touching;
+
+int find_contact(const Touching *of);
+int above_tail(const float *depth, const uint8_t *deformed, uint8_t *tail, int64_t width, int rows, int columns, float most_of_tail, uint8_t *core,
+               uint8_t *line, Edge *edge);
 EXPORT int contact_from_depth(const float *depth, int64_t depth_frame, int64_t depth_row, const float *gradient, const uint8_t *deformed,
                               int64_t deformed_frame, int64_t deformed_row, int frames, int rows, int columns, int cell, int reach,
                               const float *numbers, uint8_t *contact);
 EXPORT void uncrop(const float *gradient, const uint8_t *contact, int frames, int rows, int columns, int top, int left, int height, int width,
                    float *whole, float *normal, uint8_t *touching);
+
+/* What depth_slopes() and uncrop() are given, of one frame: slopes of a window whose rows of depth and mask lie at these distances; a window's gradient, and
+   contact or null, and where they go in the whole image. */
+typedef struct {
+    const float *depth;
+    int64_t depth_row;
+    const uint8_t *mask;
+    int64_t mask_row;
+    float half_per_mm;
+    int rows, columns;
+    float *gradient;
+} Slopes;
+
+typedef struct {
+    const float *gradient;
+    const uint8_t *contact;
+    int rows, columns, top, left, height, width;
+    float *whole, *normal;
+    uint8_t *touching;
+} Uncropping;
+
+void rows_of_slopes(const Slopes *of, int first, int last);
+void rows_uncropped(const Uncropping *of, int first, int last);
 
 static inline int least(int a, int b) { return a < b ? a : b; }
 

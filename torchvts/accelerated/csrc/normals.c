@@ -143,22 +143,12 @@ WIDE static void fill(float *values, float value, size_t n) {
         for (size_t k = 0; k < n; k++) values[k] = value;
 }
 
-/* What uncrop() is given, of one frame. */
-typedef struct {
-    const float *gradient;
-    const uint8_t *contact;
-    int rows, columns, top, left, height, width;
-    float *whole, *normal;
-    uint8_t *touching;
-} Uncropping;
-
-/* A band of rows of the whole image. */
-static void uncrop_band(void *with, int band) {
-    const Uncropping *of = with;
-    const int width = of->width, columns = of->columns, left = of->left, bands = bands_of(of->height);
+/* Rows `first` to `last` of the whole image; contact, where there is any. */
+void rows_uncropped(const Uncropping *of, int first, int last) {
+    const int width = of->width, columns = of->columns, left = of->left;
     const size_t pixels = (size_t)of->height * width, part = (size_t)of->rows * columns, right = (size_t)(width - left - columns);
     float *planes[5] = {of->whole, of->whole + pixels, of->normal, of->normal + pixels, of->normal + 2 * pixels};
-    for (int line = of->height * band / bands; line < of->height * (band + 1) / bands; line++) {
+    for (int line = first; line < last; line++) {
         const size_t at = (size_t)line * width;
         const int y = line - of->top;
         const int inside = y >= 0 && y < of->rows;
@@ -172,9 +162,15 @@ static void uncrop_band(void *with, int band) {
         const float *p = of->gradient + (size_t)y * columns, *q = p + part;
         memcpy(of->whole + at + left, p, sizeof(float) * (size_t)columns);
         memcpy(of->whole + pixels + at + left, q, sizeof(float) * (size_t)columns);
-        memcpy(of->touching + at + left, of->contact + (size_t)y * columns, (size_t)columns);
+        if (of->contact) memcpy(of->touching + at + left, of->contact + (size_t)y * columns, (size_t)columns);
         normal_row(p, q, columns, planes[2] + at + left, planes[3] + at + left, planes[4] + at + left);
     }
+}
+
+static void uncrop_band(void *with, int band) {
+    const Uncropping *of = with;
+    const int bands = bands_of(of->height);
+    rows_uncropped(of, of->height * band / bands, of->height * (band + 1) / bands);
 }
 
 /* The gradient of a window (frames, 2, rows, columns) at (top, left) and its contact (bytes) set into the whole image, zero elsewhere, and the

@@ -10,14 +10,16 @@ enum { SINGLE = 3, PRODUCTS = 6, CUBES = 10, MOST_TERMS = SINGLE + PRODUCTS + CU
    their products of two if there are any, and of three. All numbers but n are constants of the callers, so that all loops but one unroll. */
 static inline __attribute__((always_inline)) void sines(const float *restrict image, size_t step, const float *restrict place,
                                                         const float *restrict weight, const float *restrict depth,
-                                                        const float *restrict per_mm, int degree, int products, int cubes, int n, float *restrict sine_x,
+                                                        const float *restrict per_mm, float steeper, float reference_mm, int degree, int products, int cubes, int n, float *restrict sine_x,
                                                         float *restrict sine_y) {
     const int terms = SINGLE + products + cubes;
     for (int k = 0; k < n; k++) {
         const float u = place[k];
         float term[MOST_TERMS] = {image[k] - 1.0f, image[step + k] - 1.0f, image[2 * step + k] - 1.0f};
-        if (depth)
-            for (int c = 0; c < 3; c++) term[c] -= ((per_mm[3 * c + 2] * u + per_mm[3 * c + 1]) * u + per_mm[3 * c]) * depth[k];
+        if (depth) {
+            const float z = depth[k], deeper = z - reference_mm, by = 1.0f / (steeper * (deeper > 0.0f ? deeper : 0.0f) + 1.0f);
+            for (int c = 0; c < 3; c++) term[c] = (term[c] - ((per_mm[3 * c + 2] * u + per_mm[3 * c + 1]) * u + per_mm[3 * c]) * z) * by;
+        }
         const float rr = term[0] * term[0], rg = term[0] * term[1], rb = term[0] * term[2];
         const float gg = term[1] * term[1], gb = term[1] * term[2], bb = term[2] * term[2];
         if (products) term[3] = rr, term[4] = rg, term[5] = rb, term[6] = gg, term[7] = gb, term[8] = bb;
@@ -37,15 +39,15 @@ static inline __attribute__((always_inline)) void sines(const float *restrict im
     }
 }
 
-typedef void (*row_of)(const float *, size_t, const float *, const float *, const float *, const float *, int, float *, float *);
+typedef void (*row_of)(const float *, size_t, const float *, const float *, const float *, const float *, float, float, int, float *, float *);
 
 #define ROW(name, degree, products, cubes)                                                                                               \
     WIDE FUSED static void name(const float *image, size_t step, const float *place, const float *weight, const float *depth,            \
-                                const float *per_mm, int n, float *sine_x, float *sine_y) {                                               \
+                                const float *per_mm, float steeper, float reference_mm, int n, float *sine_x, float *sine_y) {                    \
         if (depth)                                                                                                                      \
-            sines(image, step, place, weight, depth, per_mm, degree, products, cubes, n, sine_x, sine_y);                                 \
+            sines(image, step, place, weight, depth, per_mm, steeper, reference_mm, degree, products, cubes, n, sine_x, sine_y);                                 \
         else                                                                                                                            \
-            sines(image, step, place, weight, 0, 0, degree, products, cubes, n, sine_x, sine_y);                                          \
+            sines(image, step, place, weight, 0, 0, 0.0f, 0.0f, degree, products, cubes, n, sine_x, sine_y);                                          \
     }
 
 #define ROWS(name, products, cubes)      \
@@ -75,11 +77,12 @@ WIDE static void to_normal(float max_sine, int n, float *restrict x, float *rest
 
 /*
  * Normals (frames, 3, rows, columns) of a window whose frames, channels and rows lie at the given distances. place: of each column, in [-1, 1];
- * weight (rows, degree + 1, 2, terms) with degree 2, 4 or 6; depth of the window, or null; per_mm (rows, 3, 3).
+ * weight (rows, degree + 1, 2, terms) with degree 2, 4 or 6; depth of the window, or null; per_mm (rows, 3, 3). Beyond the depth
+ * reference_mm a slope changes brightness 1 + steeper (depth - reference_mm) times as much as the weights say.
  */
 EXPORT void response_normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *place,
                              const float *weight, int degree, int terms, const float *depth, int64_t depth_frame, int64_t depth_row,
-                             const float *per_mm, float max_sine, int frames, int rows, int columns, float *normal) {
+                             const float *per_mm, float steeper, float reference_mm, float max_sine, int frames, int rows, int columns, float *normal) {
     const int cubes = terms >= SINGLE + CUBES, products = terms - (cubes ? CUBES : 0) > SINGLE;
     const row_of row = ALL_ROWS[products + 2 * cubes][degree / 2 - 1];
     const size_t pixels = (size_t)rows * columns;
@@ -87,7 +90,7 @@ EXPORT void response_normals(const float *image, int64_t per_frame, int64_t per_
         for (int y = 0; y < rows; y++) {
             float *to = normal + 3 * pixels * b + (size_t)y * columns;
             row(image + per_frame * b + per_row * y, (size_t)per_channel, place, weight + (size_t)2 * terms * (degree + 1) * y,
-                depth ? depth + depth_frame * b + depth_row * y : NULL, per_mm ? per_mm + 9 * y : NULL, columns, to, to + pixels);
+                depth ? depth + depth_frame * b + depth_row * y : NULL, per_mm ? per_mm + 9 * y : NULL, steeper, reference_mm, columns, to, to + pixels);
             to_normal(max_sine, columns, to, to + pixels, to + 2 * pixels);
         }
 }
@@ -111,22 +114,11 @@ WIDE static void central(const float *restrict before, const float *restrict aft
     for (int x = 0; x < n; x++) slope[x] = (after[x] - before[x]) * by * (float)mask[x];
 }
 
-/* What depth_slopes() is given, of one frame. */
-typedef struct {
-    const float *depth;
-    int64_t depth_row;
-    const uint8_t *mask;
-    int64_t mask_row;
-    float half_per_mm;
-    int rows, columns;
-    float *gradient;
-} Slopes;
-
-static void slopes_of_band(void *with, int band) {
-    const Slopes *of = with;
-    const int rows = of->rows, columns = of->columns, last = columns - 1, bands = bands_of(rows);
+/* Slopes of rows `first` to `last_row` of the window. */
+void rows_of_slopes(const Slopes *of, int first, int last_row) {
+    const int rows = of->rows, columns = of->columns, last = columns - 1;
     const float half_per_mm = of->half_per_mm;
-    for (int y = rows * band / bands; y < rows * (band + 1) / bands; y++) {
+    for (int y = first; y < last_row; y++) {
         const float *z = of->depth + of->depth_row * y;
         const uint8_t *in = of->mask + of->mask_row * y;
         float *p = of->gradient + (size_t)y * columns, *q = p + (size_t)rows * columns;
@@ -140,6 +132,12 @@ static void slopes_of_band(void *with, int band) {
         const int above = y > 0, below = y < rows - 1;
         central(z - (above ? of->depth_row : 0), z + (below ? of->depth_row : 0), in, above && below ? half_per_mm : 2.0f * half_per_mm, columns, q);
     }
+}
+
+static void slopes_of_band(void *with, int band) {
+    const Slopes *of = with;
+    const int bands = bands_of(of->rows);
+    rows_of_slopes(of, of->rows * band / bands, of->rows * (band + 1) / bands);
 }
 
 /* The gradient (frames, 2, rows, columns) of depth, zero where the mask is; both of frames and rows at the given distances. half_per_mm: half

@@ -148,8 +148,7 @@ enum { LANES = 16 };
 /* The bits of a float as a whole number of the same order: loops over such are vectorised, those over floats are not. Its own inverse. */
 static inline int32_t in_order(int32_t bits) { return bits ^ (bits >> 31 & 0x7fffffff); }
 
-/* Smallest and largest of n values. */
-WIDE static void range_of(const float *values, size_t n, float *lowest, float *highest) {
+WIDE static void find_range(const float *values, size_t n, float *lowest, float *highest) {
     int32_t low = INT32_MAX, high = INT32_MIN;
     for (size_t k = 0; k < n; k++) {
         union {
@@ -163,6 +162,9 @@ WIDE static void range_of(const float *values, size_t n, float *lowest, float *h
     low = in_order(low), high = in_order(high);
     memcpy(lowest, &low, sizeof low), memcpy(highest, &high, sizeof high);
 }
+
+/* Smallest and largest of n values. */
+void range_of(const float *values, size_t n, float *lowest, float *highest) { find_range(values, n, lowest, highest); }
 
 enum { BLOCK = 256 };
 
@@ -288,7 +290,7 @@ typedef struct {
     const float *depth;
     const uint8_t *deformed;
     float *out;
-    float level, middle, range, stiff, most;
+    float level, middle, high, range, stiff, most;
     Box box;
     atomic_int below;
 } Work;
@@ -363,31 +365,24 @@ static const float *continuation(const Work *work, Band *band, int y, int left, 
     return band->found;
 }
 
-/* Kinds of a band's pixels, and its smallest and largest depth, to the first floats of its memory. */
+/* Kinds of a band's pixels, and the sum and number of flat pixels of each of its rows. */
 static void find_kinds(void *with, int part) {
     Work *work = with;
     const Band band = band_of(work, part);
-    for (int y = band.top; y < band.bottom; y++)
-        not_beside(work->deformed, work->height, work->width, y, work->scratch + (size_t)part * 2 * ((size_t)work->width + 4),
-                   work->kind + (size_t)y * work->width);
-    range_of(work->depth + (size_t)band.top * work->width, (size_t)(band.bottom - band.top) * work->width, band.share, band.share + 1);
+    uint8_t *scratch = work->scratch + (size_t)part * 2 * ((size_t)work->width + 4);
+    for (int y = band.top; y < band.bottom; y++) {
+        uint8_t *kind = work->kind + (size_t)y * work->width;
+        not_beside(work->deformed, work->height, work->width, y, scratch, kind);
+        flat_row(work->depth + (size_t)y * work->width, kind, work->middle, work->width, work->flat_sum + y, work->flat_count + y);
+    }
 }
 
-/* Flat and raised skin of a band, and the sum and number of flat pixels of each of its rows. */
-static void find_flat(void *with, int part) {
-    Work *work = with;
-    const Band band = band_of(work, part);
-    for (int y = band.top; y < band.bottom; y++)
-        flat_row(work->depth + (size_t)y * work->width, work->kind + (size_t)y * work->width, work->middle, work->width, work->flat_sum + y,
-                 work->flat_count + y);
-}
-
-/* Mean depth of flat skin. Undeformed pixels are marked as flat, or as raised where they are a face of the object above the middle. */
+/* Kinds of pixels, and the mean depth of flat skin. Undeformed pixels are marked as flat, or as raised where they are a face of the object above the middle. */
 static float level_of(Work *work) {
     const size_t pixels = (size_t)work->height * work->width;
     double sum = 0.0;
     int64_t flat = 0;
-    share(find_flat, work, work->bands);
+    share(find_kinds, work, work->bands);
     for (int y = 0; y < work->height; y++) sum += work->flat_sum[y], flat += work->flat_count[y];
     if (memchr(work->kind, RAISED, pixels) && !is_face(work->kind, work->height, work->width, 0)) {
         for (size_t k = 0; k < pixels; k++) {
@@ -441,17 +436,26 @@ static void any_in_piece(void *with, int k) {
     if (!of->any && any_above(of->depth + first, of->deformed + first, of->middle, pixels)) of->any = 1;
 }
 
-/* with_faces() of background.py, in place. kind: a byte for each pixel, and two lines, and four bytes each. Returns whether there are such
-   faces. */
-int add_faces(const float *depth, uint8_t *deformed, int height, int width, uint8_t *kind) {
+/* Smallest and largest depth of a frame. */
+static void find_ends(Ends *of, float found[2]) {
+    share(ends_of, of, PIECES);
+    found[0] = of->low[PIECES - 1], found[1] = of->high[PIECES - 1]; /* which has a pixel; pieces without any have no numbers */
+    for (int k = 0; k < PIECES - 1; k++) {
+        found[0] = of->low[k] < found[0] ? of->low[k] : found[0];
+        found[1] = of->high[k] > found[1] ? of->high[k] : found[1];
+    }
+}
+
+/* with_faces() of background.py, in place; and the smallest and the largest depth to `ends`. kind: a byte for each pixel, and two lines, and four bytes
+   each. Returns whether there are such faces. */
+int add_faces(const float *depth, uint8_t *deformed, int height, int width, uint8_t *kind, float ends[2]) {
     const size_t pixels = (size_t)height * width;
-    Ends ends = {.depth = depth, .deformed = deformed, .pixels = pixels};
-    share(ends_of, &ends, PIECES);
-    float low = ends.low[0], high = ends.high[0], sum;
-    for (int k = 1; k < PIECES; k++) low = ends.low[k] < low ? ends.low[k] : low, high = ends.high[k] > high ? ends.high[k] : high;
-    const float middle = ends.middle = 0.5f * (low + high); /* half of the frame's depth */
-    share(any_in_piece, &ends, PIECES);
-    if (!ends.any) return 0;
+    Ends of = {.depth = depth, .deformed = deformed, .pixels = pixels};
+    find_ends(&of, ends);
+    const float middle = of.middle = 0.5f * (ends[0] + ends[1]); /* half of the frame's depth */
+    share(any_in_piece, &of, PIECES);
+    if (!of.any) return 0;
+    float sum;
     int count;
     for (int y = 0; y < height; y++) not_beside(deformed, height, width, y, kind + pixels, kind + (size_t)y * width);
     for (int y = 0; y < height; y++) flat_row(depth + (size_t)y * width, kind + (size_t)y * width, middle, width, &sum, &count);
@@ -487,15 +491,8 @@ static void fill_cells(void *with, int part) {
 
 /* Kinds of pixels, the mean depth of flat skin, the range above it, and the undeformed skin's cells; all weights. */
 static void known_cells(Work *work) {
-    share(find_kinds, work, work->bands);
-    float low = band_of(work, 0).share[0], high = band_of(work, 0).share[1];
-    for (int k = 1; k < work->bands; k++) {
-        const float *ends = band_of(work, k).share;
-        low = ends[0] < low ? ends[0] : low, high = ends[1] > high ? ends[1] : high;
-    }
-    work->middle = 0.5f * (low + high);
     work->level = level_of(work);
-    work->range = high - work->level > 1e-9f ? high - work->level : 1e-9f;
+    work->range = work->high - work->level > 1e-9f ? work->high - work->level : 1e-9f;
     share(fill_cells, work, work->bands);
     for (int k = 0; k < work->count; k++) {
         if (k > 0) coarser(&work->grids[k - 1], work->grids[k - 1].weight, &work->grids[k], work->grids[k].weight);
@@ -545,18 +542,16 @@ static void write_out(void *with, int part) {
     }
 }
 
-/*
- * depth (frames, height, width) with what slopes leave beside a contact taken out, to out. deformed: bytes. Returns 1 where memory is
- * short.
- */
-EXPORT int zero_background(const float *depth, const uint8_t *deformed, int frames, int height, int width, float stiff, float tolerance,
-                           int sweeps, float *out) {
-    const size_t pixels = (size_t)height * width;
-    Work work;
+/* zero_background() of one frame. ends: the smallest and the largest depth, or null. */
+int zero_frame(const float *depth, const uint8_t *deformed, int height, int width, float stiff, float tolerance, int sweeps, const float *ends,
+               float *out) {
+    Work work = {.depth = depth, .deformed = deformed, .out = out, .stiff = stiff};
     const int short_of_memory = allocate(&work, height, width);
-    work.stiff = stiff;
-    for (int b = 0; b < frames && !short_of_memory; b++) {
-        work.depth = depth + pixels * b, work.deformed = deformed + pixels * b, work.out = out + pixels * b, work.below = 0;
+    if (!short_of_memory) {
+        Ends of = {.depth = depth, .pixels = (size_t)height * width};
+        float found[2];
+        if (!ends) find_ends(&of, found), ends = found;
+        work.middle = 0.5f * (ends[0] + ends[1]), work.high = ends[1];
         known_cells(&work);
         work.most = tolerance * work.range;
         work.box = not_flat(work.kind, height, width);
@@ -568,5 +563,18 @@ EXPORT int zero_background(const float *depth, const uint8_t *deformed, int fram
         share(write_out, &work, work.bands);
     }
     free(work.memory), free(work.kind);
+    return short_of_memory;
+}
+
+/*
+ * depth (frames, height, width) with what slopes leave beside a contact taken out, to out. deformed: bytes. Returns 1 where memory is
+ * short.
+ */
+EXPORT int zero_background(const float *depth, const uint8_t *deformed, int frames, int height, int width, float stiff, float tolerance,
+                           int sweeps, float *out) {
+    const size_t pixels = (size_t)height * width;
+    int short_of_memory = 0;
+    for (int b = 0; b < frames && !short_of_memory; b++)
+        short_of_memory = zero_frame(depth + pixels * b, deformed + pixels * b, height, width, stiff, tolerance, sweeps, NULL, out + pixels * b);
     return short_of_memory;
 }

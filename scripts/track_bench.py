@@ -1,6 +1,7 @@
 """Tracking bench: objects that move, rendered and measured, tracked against their first frame; table, JSON, plot of error and time.
 
 python scripts/track_bench.py --out out/track_bench
+python scripts/track_bench.py --motions slow --noises "slopes off by 3 degrees" --seeds 1 4 11 --sensors 1 2 3 --out out/wrong
 """
 
 import argparse
@@ -24,20 +25,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--objects", nargs="+", default=tracking.OBJECTS, metavar="NAME", help="of torchvts.scenes.objects")
     parser.add_argument("--motions", nargs="+", default=list(tracking.MOTIONS), choices=list(tracking.MOTIONS))
     parser.add_argument("--noises", nargs="+", default=list(tracking.NOISES), choices=list(tracking.NOISES))
-    parser.add_argument("--seed", type=int, default=1, help="of motions and noise")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[1], help="of motions and noise of the images")
+    parser.add_argument("--sensors", nargs="+", type=int, default=[1], help="seeds of errors of slopes, from 1")
+    parser.add_argument("--register", action="store_true", help="register each frame without tracking too, and draw error and time")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args(argv)
     torch.set_num_threads(arguments.threads)
     arguments.out.mkdir(parents=True, exist_ok=True)
     rows, beside = [], []
-    with tqdm(total=len(arguments.objects) * len(arguments.motions) * len(arguments.noises), unit="track", disable=None) as bar:
-        for row, track in tracking.run_tracking(arguments.objects, arguments.motions, arguments.noises, arguments.seed):
+    chosen = (arguments.objects, arguments.motions, arguments.noises, arguments.seeds, arguments.sensors)
+    with tqdm(unit="track", disable=None) as bar:
+        for row, track in tracking.run_tracking(*chosen):
             rows.append(row)
-            if row.motion == "slow" and row.noise == "noise 0.005":
+            if arguments.register and row.motion == "slow" and row.noise == "noise 0.005":
                 beside.append((row, tracking.register_each(track)))
             bar.update()
-    text = f"320 x 240, 8 bits, seed {arguments.seed}; {machine()}\n\n{tracking.tracking_table(rows)}\n"
+    text = (
+        f"320 x 240, 8 bits, seeds {arguments.seeds}, sensors {arguments.sensors}; {machine()}\n\n{tracking.tracking_table(rows)}\n"
+    )
     write_files(arguments.out, {"table.md": text, "tracks.json": json.dumps([dataclasses.asdict(row) for row in rows], indent=1)})
     if beside:
         viz.save_figure(tracking.tracking_figure(beside), arguments.out / "tracking.png")

@@ -535,7 +535,7 @@ def test_a_rig_of_known_lights_alone_measures_the_depth_of_steep_flanks(turn):
 )
 def test_rendered_objects_meet_the_goal(name, motion_, most_mm):
     """Asked is the slow motion: 90 degrees in 40 frames, medians of 0.05 degrees and 0.01 mm. The fast one has 14 frames."""
-    ((row, _),) = tracking.run_tracking([name], [motion_], ["noise 0.005"], seed=4)
+    ((row, _),) = tracking.run_tracking([name], [motion_], ["noise 0.005"], [4])
     assert row.lost == [] and row.wrong == []
     assert float(np.median(row.deg)) < 0.05 and float(np.median(row.mm)) < most_mm and max(row.deg) < 0.3
 
@@ -543,7 +543,7 @@ def test_rendered_objects_meet_the_goal(name, motion_, most_mm):
 @pytest.mark.long
 def test_a_frame_before_lift_off_keeps_the_rotations_that_it_calls_unknown():
     """They followed the coarse grid by 5 degrees, though no step of the fine one was allowed to."""
-    ((row, track),) = tracking.run_tracking(["bolt head"], ["lift-off"], ["noise 0.005"], seed=1)
+    ((row, track),) = tracking.run_tracking(["bolt head"], ["lift-off"], ["noise 0.005"], [1])
     assert max(row.deg) < 0.2 and row.wrong == []
     tracker, unknown, last = vts.PoseTracker(track.frames[0], track.mm_per_pixel), 0, np.eye(4)
     for frame in track.frames[1:10]:
@@ -558,13 +558,13 @@ def test_a_frame_before_lift_off_keeps_the_rotations_that_it_calls_unknown():
 @pytest.mark.long
 def test_heights_show_the_tilt_that_wrong_slopes_hide():
     """Slopes alone give 0.28 degrees, median."""
-    ((row, _),) = tracking.run_tracking(["gear"], ["fast"], ["slopes off by 3 degrees"], seed=4)
+    ((row, _),) = tracking.run_tracking(["gear"], ["fast"], ["slopes off by 3 degrees"], [4], [4])
     assert float(np.median(row.deg)) < 0.2 and row.lost == [] and row.wrong == []
 
 
 @pytest.mark.long
 def test_slopes_that_err_over_wide_areas_are_no_reason_for_confidence():
-    ((row, track),) = tracking.run_tracking(["tool handle"], ["fast"], ["slopes off by 3 degrees"], seed=4)
+    ((row, track),) = tracking.run_tracking(["tool handle"], ["fast"], ["slopes off by 3 degrees"], [4], [4])
     assert max(row.deg) > 0.7 and row.lost == [] and row.wrong == []
     tracker = vts.PoseTracker(track.frames[0], track.mm_per_pixel)
     for frame in track.frames[1:6]:

@@ -1,5 +1,6 @@
 """Accuracy of tracking through the whole chain: render an object that moves, measure depth, track, compare."""
 
+import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -149,6 +150,10 @@ class TrackRow:
         uncertain: frames whose pose is not called converged though the object is followed.
         wrong: frames that are confident, with no motion or pose in question, and outside of the goal of the pose bench.
         drift_deg: rotation error at the end, per 360 degrees of yaw.
+        seed: of the motion and of the noise of the images.
+        sensor: seed of the errors of slopes; 0 where there are none.
+        ratio: rotation errors over the standard deviations that the covariance states, where all motions are known.
+        ratio_mm: the same of the position of the object's origin.
     """
 
     name: str
@@ -162,15 +167,19 @@ class TrackRow:
     uncertain: list[int] = field(default_factory=list)
     wrong: list[int] = field(default_factory=list)
     drift_deg: float = math.nan
+    seed: int = 1
+    sensor: int = 0
+    ratio: list[float] = field(default_factory=list)
+    ratio_mm: list[float] = field(default_factory=list)
 
 
-def record(target: objects.Target, motion: Motion, noise: Noise, seed: int, unit: tuple[PointLights, DepthPipeline]) -> Track:
+def record(target: objects.Target, motion: Motion, image_std: float, seed: int, unit: tuple[PointLights, DepthPipeline]) -> Track:
     """Render and measure an object that moves; 320 x 240, 8 bits.
 
     Args:
         target: the object.
         motion: its motion.
-        noise: of the images and of the slopes.
+        image_std: standard deviation of the images' noise.
         seed: of motion and noise.
         unit: lights and pipeline, as of :func:`torchvts.evaluation.pose_accuracy.rig`.
     """
@@ -180,12 +189,15 @@ def record(target: objects.Target, motion: Motion, noise: Noise, seed: int, unit
     for k, pose in enumerate(poses):
         scene = objects.press(target.height_mm, pose, 240, 320, pipe.mm_per_pixel)
         with torch.inference_mode():
-            frame = pipe(render(scene, lights, noise_std=noise.image_std, bits=8, seed=1000 * seed + k))
+            frame = pipe(render(scene, lights, noise_std=image_std, bits=8, seed=1000 * seed + k))
         frames.append(frame)
-    if noise.slopes_deg > 0.0:
-        unit_errs = WrongSlopes(frames[0], noise, seed, pipe.mm_per_pixel)
-        frames = [unit_errs(frame, k) for k, frame in enumerate(frames)]
     return Track(poses, frames, pipe.mm_per_pixel)
+
+
+def with_wrong_slopes(track: Track, noise: Noise, sensor: int) -> Track:
+    """The track as a unit measures it whose slopes err, by :class:`WrongSlopes`."""
+    unit = WrongSlopes(track.frames[0], noise, sensor, track.mm_per_pixel)
+    return Track(track.poses, [unit(frame, k) for k, frame in enumerate(track.frames)], track.mm_per_pixel)
 
 
 class WrongSlopes:
@@ -248,6 +260,10 @@ def follow_track(track: Track, motion: Motion, row: TrackRow) -> TrackRow:
         deg, mm = tracking_error(found, track, k)
         row.deg.append(deg)
         row.mm.append(mm)
+        if not found.ambiguous:
+            std_deg, std_mm = _stated(found, track.poses[k][:3, 3])
+            row.ratio.append(deg / std_deg)
+            row.ratio_mm.append(mm / std_mm)
         within = deg <= GOAL_DEG and mm <= GOAL_MM
         if not found.converged:
             row.uncertain.append(k)
@@ -270,20 +286,41 @@ def tracking_error(found: Registration, track: Track, k: int) -> tuple[float, fl
     return min(errors)
 
 
+def _stated(found: Registration, place: Tensor) -> tuple[float, float]:
+    """Standard deviations of the rotation, degrees, and of a place (3,), mm, by the covariance."""
+    x, y, z = place.tolist()
+    by = torch.tensor([[0.0, z, -y, 1.0, 0.0, 0.0], [-z, 0.0, x, 0.0, 1.0, 0.0], [y, -x, 0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)
+    turn, shift = found.covariance[:3, :3], by @ found.covariance @ by.T
+    return math.degrees(math.sqrt(float(turn.trace()))), math.sqrt(float(shift.trace()))
+
+
 def run_tracking(
     names: Sequence[str] = OBJECTS,
     motions: Sequence[str] = tuple(MOTIONS),
     noises: Sequence[str] = tuple(NOISES),
-    seed: int = 1,
+    seeds: Sequence[int] = (1,),
+    sensors: Sequence[int] = (1,),
 ) -> Iterator[tuple[TrackRow, Track]]:
-    """Track objects under all motions and noises, one row after the other."""
+    """Track objects under all motions and noises, one row after the other.
+
+    Args:
+        names: of objects.
+        motions: of :data:`MOTIONS`.
+        noises: of :data:`NOISES`.
+        seeds: of motions and noise of the images.
+        sensors: seeds of the errors of slopes, for each noise that has such errors.
+    """
     unit = rig()
-    for name in names:
+    for name, motion, seed in itertools.product(names, motions, seeds):
         target = {**objects.TARGETS, **objects.FREE_TARGETS}[name]
-        for motion in motions:
-            for noise in noises:
-                track = record(target, MOTIONS[motion], NOISES[noise], seed, unit)
-                yield follow_track(track, MOTIONS[motion], TrackRow(name, motion, noise)), track
+        recorded: dict[float, Track] = {}
+        for noise in noises:
+            image_std = NOISES[noise].image_std
+            if image_std not in recorded:
+                recorded[image_std] = record(target, MOTIONS[motion], image_std, seed, unit)
+            for sensor in sensors if NOISES[noise].slopes_deg > 0.0 else (0,):
+                track = with_wrong_slopes(recorded[image_std], NOISES[noise], sensor) if sensor else recorded[image_std]
+                yield follow_track(track, MOTIONS[motion], TrackRow(name, motion, noise, seed=seed, sensor=sensor)), track
 
 
 def register_each(track: Track) -> tuple[list[float], list[float], list[float]]:
@@ -301,16 +338,37 @@ def register_each(track: Track) -> tuple[list[float], list[float], list[float]]:
 
 
 def tracking_table(rows: Sequence[TrackRow]) -> str:
-    """The rows as a Markdown table."""
-    titles = ["object", "motion", "noise", "angle deg, median / worst", "position mm, median / worst", "drift deg per 360"]
-    titles += ["lost frames", "lost, not noticed", "uncertain", "confident and wrong", "ms, median"]
-    lines = []
+    """A line for each object, motion and noise, as Markdown.
+
+    Medians of a track have three figures: the least, the middle and the most of the tracks. The rest is the worst, or the sum.
+    """
+    titles = ["object", "motion", "noise", "tracks", "angle deg, median of a track", "angle deg, worst"]
+    titles += ["position mm, median of a track", "position mm, worst", "error / stated, angle", "error / stated, position"]
+    titles += ["drift deg per 360", "lost frames", "lost, not noticed", "uncertain", "confident and wrong", "ms, median"]
+    groups: dict[tuple[str, str, str], list[TrackRow]] = {}
     for row in rows:
-        deg, mm = (f"{_median(v):.3f} / {max(v, default=math.nan):.3f}" for v in (row.deg, row.mm))
-        drift = f"{row.drift_deg:.2f}" if row.motion == "full turn" else ""
-        counts = [str(len(frames)) for frames in (row.lost, row.unnoticed, row.uncertain, row.wrong)]
-        lines.append([row.name, row.motion, row.noise, deg, mm, drift, *counts, f"{_median(row.ms):.1f}"])
+        groups.setdefault((row.name, row.motion, row.noise), []).append(row)
+    lines = []
+    for key, tracks in groups.items():
+        deg, mm = [row.deg for row in tracks], [row.mm for row in tracks]
+        drift = f"{max(row.drift_deg for row in tracks):.3f}" if key[1] == "full turn" else ""
+        counts = [(row.lost, row.unnoticed, row.uncertain, row.wrong) for row in tracks]
+        line = [*key, str(len(tracks)), _spread(deg, 3), _worst(deg, 3), _spread(mm, 4), _worst(mm, 4)]
+        line += [_spread([row.ratio for row in tracks], 2), _spread([row.ratio_mm for row in tracks], 2), drift]
+        line += [str(sum(map(len, frames))) for frames in zip(*counts, strict=True)]
+        lines.append([*line, _spread([row.ms for row in tracks], 1)])
     return markdown(titles, lines)
+
+
+def _spread(tracks: Sequence[Sequence[float]], digits: int) -> str:
+    """The least, the middle and the largest of the medians of tracks; one alone if there is one track."""
+    medians = [_median(values) for values in tracks]
+    three = [min(medians), _median(medians), max(medians)] if len(medians) > 1 else medians
+    return ", ".join(f"{value:.{digits}f}" for value in three)
+
+
+def _worst(tracks: Sequence[Sequence[float]], digits: int) -> str:
+    return f"{max((value for values in tracks for value in values), default=math.nan):.{digits}f}"
 
 
 def _median(values: Sequence[float]) -> float:

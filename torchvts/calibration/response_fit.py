@@ -9,7 +9,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ..model.report import CandidateRow
-from ..model.response_field import DepthBrightness, ResponseField, ResponseModel, position_basis
+from ..model.response_field import DepthBrightness, ResponseField, ResponseModel, TaughtRange, position_basis
 from ..model.sensor import Sensor
 from .contacts import Contact, first_pass_depths
 from .field import PRODUCT_PENALTY, Evidence, Family, ball_sine
@@ -49,6 +49,12 @@ comes 1 mm nearer to lights about 10 mm away changes its brightness by about 0.1
 DEPTH_PENALTY_ON_PRIOR = 3.0
 """The same towards a prior, from which units of a type differ by about 0.03 per mm, and the error of a press is alike all over it,
 so that its pixels do not average it: (0.05 / 0.03)^2."""
+
+TAUGHT_SHARE = 0.95
+"""Share of the presses' pixels that are no steeper, and no deeper, than the range that was taught."""
+
+FLATTER_PART = 0.7
+"""Part of that range to which a field is fitted to see how it does beyond."""
 
 STEEPER = 1.0
 """``steeper`` of a :class:`DepthBrightness`, times half the longer side of the image: 3 h / d^2 of lights 1.2 to 1.6 times that
@@ -148,7 +154,10 @@ def fit_response(
         bar.update()
     score = chosen.row["score_deg"]
     reason = f"{chosen.row['model']}, from {len(presses)} presses: {_how(score, len(chosen.rows))}"
-    model = ResponseModel(chosen.field, by_depth, sensor.exponent, sensor.blur_px)
+    taught = taught_range(presses, chosen.field, pitch)
+    if prior is not None and prior.taught is not None:
+        taught = taught.with_all_of(prior.taught)
+    model = ResponseModel(chosen.field, by_depth, sensor.exponent, sensor.blur_px, taught)
     own = mean_error_deg(chosen.field, presses) if score is None else None
     return ResponseFit(model, score, own, chosen.rows, reason)
 
@@ -185,6 +194,37 @@ def fit_depth_brightness(
     steeper = STEEPER / float(contacts[0].half_size_mm.max())
     rows = tuple(tuple(row) for row in found.tolist())
     return DepthBrightness(DEPTH_DEGREE, field.half_mm, rows, steeper, _mean_depth(contacts, depths))
+
+
+def taught_range(contacts: list[Contact], field: ResponseField, pitch_mm: float) -> TaughtRange:
+    """How steep and how deep located presses are, and how fast a field of this size errs beyond what it was fitted to.
+
+    The error beyond is measured: a field fitted to the flatter part of the presses is scored on their rims.
+
+    Args:
+        contacts: of presses.
+        field: fitted to them.
+        pitch_mm: pixel pitch, mm.
+    """
+    depths = [
+        depth.flatten()[contact.index[contact.inside()]]
+        for contact, depth in zip(contacts, first_pass_depths(contacts, field, pitch_mm))
+    ]
+    evidence = Evidence.of(Family.of(field), contacts)
+    sines = [ball_sine(contact)[:, contact.inside()] for contact in contacts]
+    steepest = float(torch.cat(sines, 1).norm(dim=0).quantile(TAUGHT_SHARE))
+    deepest = float(torch.cat(depths).clamp_min(0.0).quantile(TAUGHT_SHARE))
+    penalty, limit = evidence.penalty(PENALTIES[2]), FLATTER_PART * steepest
+    terms = [item.terms[:, item.contact.inside()] for item in evidence.forms]
+    flatter = [sine.norm(dim=0) < limit for sine in sines]
+    gram = sum(t[:, k] @ t[:, k].t() / max(1, int(k.sum())) for t, k in zip(terms, flatter))
+    right = sum(t[:, k] @ s[:, k].t() / max(1, int(k.sum())) for t, s, k in zip(terms, sines, flatter))
+    half = len(penalty) // 2
+    by_flatter = torch.linalg.solve(gram + torch.diag(penalty[:half]), right)
+    off = torch.cat([(by_flatter.t() @ t - s)[:, ~k] for t, s, k in zip(terms, sines, flatter)], 1)
+    beyond = torch.cat([s[:, ~k] for s, k in zip(sines, flatter)], 1).norm(dim=0) - limit
+    growth = float((off.square().sum() / beyond.square().sum().clamp_min(1e-12)).sqrt())
+    return TaughtRange(steepest, deepest, growth)
 
 
 def _mean_depth(contacts: list[Contact], depths: list[Tensor]) -> float:

@@ -30,12 +30,14 @@ from ..core.checks import (
 from ..core.geometry import gradient_of_depth
 from ..core.noise import noise_std as frame_noise_std
 from ..model.calibration import Calibration, check_calibration
+from ..model.response_field import TaughtRange
 from ..normals import NormalFromIntensity, NormalFromResponse, as_normal_model
 from .depth import DepthOutput, DepthPipeline, eval_around
 
-FACTORS = ("noise", "model", "pass", "surface", "saturation")
+FACTORS = ("noise", "model", "pass", "surface", "saturation", "range")
 """The order of ``factors_deg``: noise through the inverse model, raised where the light does not fit; error of the model; what a
-pass with the depth found would change; slopes that are not integrable, and blur; channels that are dark or saturated."""
+pass with the depth found would change; slopes that are not integrable, and blur; channels that are dark or saturated; slopes and
+depths beyond those of the presses that the model was fitted to."""
 
 USEFUL_DEG = 10.0
 """``confidence`` is the probability that a normal is within this of the truth."""
@@ -66,8 +68,12 @@ BORDER_SHARE = 3.0
 CURL_SHARE = 0.4
 """Variance of a slope, over the square of its part that is not integrable: half for white noise, less for what is smooth."""
 
-BLUR_SHARE = 3.0
-"""Variance of a slope, over the square of what another blur of the same width takes from it."""
+EDGE_SHARE = 7.6
+"""Variance of a slope along one axis at an edge, over the largest square of what another blur of the same width takes from it: a
+blurred step of height 1 is off by 0.5, its 95 % are 2.2 standard deviations, and another blur takes 0.083 of it."""
+
+GRID_PX2 = 0.6
+"""Variance of the blur of normals by differences of depth, px^2: a box of two pixels, and the mean of two neighbours."""
 
 CLIPPED_DEG = 3.0
 """Error of a normal, along one axis, where a light is blocked or a channel is saturated and the other two must do."""
@@ -78,6 +84,20 @@ MISFIT_SHARE = 3.0
 DETECTED_SIGMAS = 4.5
 """A tilt of so many standard deviations of its noise is detected: the threshold of :class:`ContactMask`."""
 
+STEEPER_STD = 0.3
+"""Standard deviation of what depth does to slopes, ``DepthBrightness.steeper`` times half the longer side: lights usually stand where
+it is 0.6 to 1.2."""
+
+INTEGRABLE_SHARE = 1.5
+"""Mean error of normals of a response field, over the root mean square of the part of its slopes that is not integrable: 0.9 for white
+errors in two dimensions, more for smooth ones."""
+
+FRAME_VARIANCE = 0.08
+"""Variance of the logarithm of the error that a frame's integrability states."""
+
+PATCH_MM = 2.0
+"""Distance over which errors of a response field are alike, mm (docs/tracking.md)."""
+
 SYSTEM_SHARE = 0.5
 """Depth error by a response field, over that of slopes that are all off by one standard deviation in the same direction."""
 
@@ -86,6 +106,13 @@ KINK_PX = 0.08
 
 BAND = 0.15
 """Width of the ring around the deformed area that is searched for what the mask missed, over the shorter side of the image."""
+
+HELD_OUT_VARIANCE = 0.05
+"""Variance of the logarithm of the error that held-out presses state, beside 1 / (2 n) of n presses."""
+
+UNIT_VARIANCE = 0.25
+"""The same of a prior, or of the misfit of the very presses: units of a type differ by a factor of 1.6 (2.6 and 4.9 degrees,
+GelSight Mini)."""
 
 SPREAD_OF_MEAN = 1.2533
 """Mean length of a two-dimensional Gaussian error, over its standard deviation along one axis."""
@@ -99,7 +126,7 @@ class Bounds(NamedTuple):
         depth_95_mm: (B, 1, H, W), the same for depth.
         confidence: (B, 1, H, W), probability that the normal is within :data:`USEFUL_DEG` of the truth.
         frame_confidence: (B,), mean of ``confidence`` over the contact; 1 without contact.
-        factors_deg: (B, 5, H, W), the standard deviations along one axis that the bound of the normal is made of, in the order of
+        factors_deg: (B, 6, H, W), the standard deviations along one axis that the bound of the normal is made of, in the order of
             :data:`FACTORS`.
     """
 
@@ -177,6 +204,9 @@ class Confidence(nn.Module):
         light_std: (3, H, W), error of the light due to the model; for point lights per unit of ``|n - n_flat|``.
         mm_per_pixel: pixel pitch, mm.
         model_deg: mean error of a response field, degrees; 0 for lights.
+        model_log_variance: variance of the logarithm of ``model_deg``: the larger, the more a frame's integrability decides; 0 if it is
+            not asked.
+        taught: how steep and deep the presses of a response field were; None if not known.
         measured: whether the background was an image.
         blur_px: of the compensated image.
         spread: of the errors of normals, for :func:`bound_at`.
@@ -208,6 +238,8 @@ class Confidence(nn.Module):
         mm_per_pixel: float,
         *,
         model_deg: float = 0.0,
+        model_log_variance: float = 0.0,
+        taught: TaughtRange | None = None,
         measured: bool = True,
         blur_px: float = 0.0,
         spread: float = 1.0,
@@ -227,18 +259,28 @@ class Confidence(nn.Module):
         self.mm_per_pixel = mm_per_pixel
         self.fixed = 1.0 if measured else 0.0
         self.model_variance = (math.radians(model_deg) / SPREAD_OF_MEAN) ** 2
+        self.model_log_variance = check_least("model_log_variance", model_log_variance)
+        if taught is not None:
+            check_record("taught", taught, TaughtRange)
+        self.taught_sine = 1.0 if taught is None else taught.sine
+        self.taught_mm = math.inf if taught is None else taught.depth_mm
+        self.growth = 0.0 if taught is None else taught.growth
         self.blur_px = blur_px
-        self.weights = gaussian_weights(blur_px)
-        self.reach = math.ceil(blur_px)
+        edge_px = math.sqrt(2.0 * blur_px**2 + GRID_PX2)  # the camera's own blur is taken to be as wide as the calibration's
+        self.weights = gaussian_weights(min(edge_px, MOST_BLUR_PX))
+        self.reach = math.ceil(edge_px)
         self.correlation = max(1.0, 2.0 * math.sqrt(math.pi) * blur_px)  # blurred noise is as much larger in the sums
         self.spread = spread
         # TorchScript sees no numbers of the module
         self.clipped_variance = math.radians(CLIPPED_DEG) ** 2
         self.detected, self.useful_deg = DETECTED_SIGMAS, USEFUL_DEG
-        self.curl_share, self.blur_share = CURL_SHARE, BLUR_SHARE
+        self.curl_share, self.edge_share = CURL_SHARE, EDGE_SHARE
         self.system_variance = 1.0 if self.by_lights else SYSTEM_SHARE**2  # lights that are off are off everywhere
         self.kink_variance_mm = (KINK_PX * mm_per_pixel) ** 2
         height, width = noise_std.shape[1], noise_std.shape[2]
+        self.steeper_std = STEEPER_STD / (0.5 * max(height, width) * mm_per_pixel)
+        self.integrable_share, self.frame_variance = INTEGRABLE_SHARE, FRAME_VARIANCE
+        self.patch_px = (PATCH_MM / mm_per_pixel) ** 2
         self.band = max(3, round(BAND * min(height, width)))
         x, y = torch.linspace(-1.0, 1.0, width) * width, torch.linspace(-1.0, 1.0, height) * height
         place = (x.square() + y.square()[:, None]) / float(width**2 + height**2)
@@ -275,7 +317,9 @@ class Confidence(nn.Module):
         slope_of_change = 0.5 * block.maps[:3].square().sum(dim=(0, 1))  # a relative change of one, in every channel
         usual = float(slope_of_change.median().sqrt().clamp_min(1e-6))
         light = torch.full_like(noise, MODEL_SHARE * math.radians(model_deg) / SPREAD_OF_MEAN / usual)
-        common |= {"model_deg": model_deg, "spread": RESPONSE_SPREAD}
+        assert calibration.response is not None
+        common |= {"model_deg": model_deg, "spread": RESPONSE_SPREAD, "taught": calibration.response.taught}
+        common["model_log_variance"] = model_log_variance(calibration)
         return cls(block, noise, calibration.noise_std, light, sensor.mm_per_pixel, **common)
 
     def forward(self, images: Tensor, compensated: Tensor, out: DepthOutput) -> Bounds:
@@ -306,20 +350,25 @@ class Confidence(nn.Module):
             dark = dark | (compensated >= limits.saturated_above)
             clipped = self.clipped_variance * dark.any(dim=1, keepdim=True).to(noise.dtype)
             noise = noise * self._unexplained(compensated, out.depth_mm, again, dark, sigma)
-        surface = self._not_integrable(out.depth_mm, out.gradient, steep, noise)
-        variance = noise + model + clipped if self.by_lights else noise + model + surface
+        curl, edges = self._not_integrable(out.depth_mm, out.gradient, steep, noise)
+        surface = curl + edges
+        beyond = torch.zeros_like(noise)
+        if not self.by_lights:
+            model = model * self._level(base, again, out, noise, edges)
+            beyond = self._beyond(out)
+        variance = noise + model + clipped if self.by_lights else noise + model + surface + beyond
         bound = _length_95(change, torch.sqrt(variance + 1e-12), 1.0 if self.by_lights else 1.06)
         bound = torch.where(out.deformed, bound, self.detected * torch.sqrt(noise + 1e-12))
         normal_95 = torch.rad2deg(bound).clamp_max(180.0)
         inside = out.deformed.to(noise.dtype)
-        slopes = SlopeErrors(steep, noise + surface, model + clipped)
+        slopes = SlopeErrors(steep, noise + surface, model + clipped + beyond)
         depth_95 = self._depth_95(out.depth_mm, out.gradient, again, inside, slopes)
         # the inverse of bound_at
         likely = 1.0 - torch.exp(math.log(0.05) * (self.useful_deg / normal_95) ** (2.0 / self.spread))
         contact = out.contact.to(noise.dtype)
         count = contact.sum(dim=(1, 2, 3))
         frame = torch.where(count > 0, (likely * contact).sum(dim=(1, 2, 3)) / count.clamp_min(1.0), torch.ones_like(count))
-        parts = torch.cat((noise.sqrt(), model.sqrt(), change, surface.sqrt(), clipped.sqrt()), dim=1)
+        parts = torch.cat((noise.sqrt(), model.sqrt(), change, surface.sqrt(), clipped.sqrt(), beyond.sqrt()), dim=1)
         return Bounds(normal_95, depth_95, likely, frame, torch.rad2deg(parts))
 
     def _check(self, images: Tensor, compensated: Tensor, out: DepthOutput) -> None:
@@ -385,15 +434,44 @@ class Confidence(nn.Module):
             model = model + turn * (self.light_std[k : k + 1] / sigma[:, k : k + 1]).square()
         return noise, model
 
-    def _not_integrable(self, depth_mm: Tensor, gradient: Tensor, steep: Tensor, noise: Tensor) -> Tensor:
-        """Variance of the part of the gradient that is not integrable, beyond noise, and of what the blur took."""
+    def _level(self, base: Tensor, again: Tensor, out: DepthOutput, noise: Tensor, edges: Tensor) -> Tensor:
+        """Factor (B, 1, 1, 1) of the model's variance: what calibration expects, and what the frame shows, by their certainties.
+
+        Wrong slopes are in part the gradient of no surface. That part is seen in every frame, in the mean over the contact, with
+        noise and edges taken out.
+        """
+        slope = gradient_of_depth(out.depth_mm, self.mm_per_pixel)
+        up = torch.rsqrt(slope.square().sum(1, keepdim=True) + 1.0)
+        surface = torch.cat((-slope * up, up), dim=1)
+        weight = out.contact.to(noise.dtype) * self.model_variance / (self.model_variance + edges)
+        total = weight.sum(dim=(1, 2, 3), keepdim=True)
+        first = ((base - surface).square().sum(1, keepdim=True) * weight).sum(dim=(1, 2, 3), keepdim=True)
+        second = ((again - surface).square().sum(1, keepdim=True) * weight).sum(dim=(1, 2, 3), keepdim=True)
+        # the pass that depth was integrated from
+        odd = torch.minimum(first, second) - (noise * weight).sum(dim=(1, 2, 3), keepdim=True)
+        found = self.integrable_share**2 * (odd / total.clamp_min(1e-6)).clamp_min(1e-6)
+        expected = 1.5708 * self.model_variance  # square of the mean error
+        frame = self.frame_variance + 0.5 * self.patch_px / total.clamp_min(1e-6)
+        share = self.model_log_variance / (self.model_log_variance + frame)
+        return torch.where(total > 1.0, (found / max(expected, 1e-12)) ** share, torch.ones_like(total))
+
+    def _beyond(self, out: DepthOutput) -> Tensor:
+        """Variance of the angle beyond the slopes and depths that were taught."""
+        sine = torch.sqrt(out.normal[:, :2].square().sum(1, keepdim=True))
+        steeper = self.growth * (sine - self.taught_sine).clamp_min(0.0)
+        deeper = self.steeper_std * (out.depth_mm - self.taught_mm).clamp_min(0.0) * sine
+        return 0.5 * (steeper.square() + deeper.square()) / out.normal[:, 2:3].square().clamp_min(0.05)
+
+    def _not_integrable(self, depth_mm: Tensor, gradient: Tensor, steep: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Variances by the part of the gradient that is not integrable, beyond noise, and by what blur took from edges."""
         odd = _smooth((gradient_of_depth(depth_mm, self.mm_per_pixel) - gradient).square().sum(1, keepdim=True)) * steep.square()
         odd = self.curl_share * (odd - 3.0 * noise).clamp_min(0.0)
+        edges = torch.zeros_like(odd)
         if self.blur_px > 0.0:
             taken = (blur(gradient, self.weights) - gradient).square().sum(1, keepdim=True)
             taken = nn.functional.max_pool2d(taken, 2 * self.reach + 1, 1, self.reach)
-            odd = odd + self.blur_share * taken * steep.square()
-        return odd
+            edges = self.edge_share * taken * steep.square()
+        return odd, edges
 
     def _depth_95(self, depth_mm: Tensor, gradient: Tensor, again: Tensor, inside: Tensor, errors: SlopeErrors) -> Tensor:
         steep = errors.steep
@@ -516,6 +594,21 @@ def expected_model_deg(calibration: Calibration) -> float:
         return math.sqrt((used * held_out**2 + FEW_PRESSES * by_type**2) / (used + FEW_PRESSES))
     error = held_out or report.get("own_deg")
     return error * math.sqrt(1.0 + FEW_PRESSES / used) if error else UNMEASURED_DEG
+
+
+def model_log_variance(calibration: Calibration) -> float:
+    """Variance of the logarithm of :func:`expected_model_deg`: how uncertain that is before a frame; 0 where no frame can tell.
+
+    Held-out presses state it within a quarter; one press alone within a factor of two; a prior within the spread of the units that its
+    file was scored on.
+    """
+    report = calibration.report
+    if report.get("objection") or report.get("source") == "stand_in":
+        return 0.0
+    used = max(1, sum(bool(row.get("used")) for row in report.get("presses", [])))
+    if report.get("held_out_deg"):
+        return HELD_OUT_VARIANCE + 0.5 / used
+    return UNIT_VARIANCE
 
 
 def _smooth(values: Tensor) -> Tensor:

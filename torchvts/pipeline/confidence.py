@@ -68,9 +68,13 @@ BORDER_SHARE = 3.0
 CURL_SHARE = 0.4
 """Variance of a slope, over the square of its part that is not integrable: half for white noise, less for what is smooth."""
 
-EDGE_SHARE = 7.6
-"""Variance of a slope along one axis at an edge, over the largest square of what another blur of the same width takes from it: a
-blurred step of height 1 is off by 0.5, its 95 % are 2.2 standard deviations, and another blur takes 0.083 of it."""
+EDGE_SHARE = 3.8
+"""Variance of a slope along one axis at an edge, over the largest square of what another blur of the same width takes from it. A
+blurred step of height 1 is off by 0.23, root mean square over the band in which that is seen, and another blur takes 0.083."""
+
+EDGE_DEPTH_SHARE = 1.5
+"""The same for depth: a blurred kink of depth is too low by 0.4 of what another blur takes 0.165 from, at most; 95 % of a Gaussian
+error lie within 1.96 standard deviations."""
 
 GRID_PX2 = 0.6
 """Variance of the blur of normals by differences of depth, px^2: a box of two pixels, and the mean of two neighbours."""
@@ -92,11 +96,9 @@ INTEGRABLE_SHARE = 1.5
 """Mean error of normals of a response field, over the root mean square of the part of its slopes that is not integrable: 0.9 for white
 errors in two dimensions, more for smooth ones."""
 
-FRAME_VARIANCE = 0.08
-"""Variance of the logarithm of the error that a frame's integrability states."""
-
-PATCH_MM = 2.0
-"""Distance over which errors of a response field are alike, mm (docs/tracking.md)."""
+FRAME_VARIANCE = 0.1
+"""Variance of the logarithm of the error that a frame's integrability states: 0.02 to 0.2 between frames of a unit, and as much between
+units."""
 
 SYSTEM_SHARE = 0.5
 """Depth error by a response field, over that of slopes that are all off by one standard deviation in the same direction."""
@@ -113,6 +115,9 @@ HELD_OUT_VARIANCE = 0.05
 UNIT_VARIANCE = 0.25
 """The same of a prior, or of the misfit of the very presses: units of a type differ by a factor of 1.6 (2.6 and 4.9 degrees,
 GelSight Mini)."""
+
+LEAST_READ = 0.5
+"""Slopes beyond the range are taken to be read to at least this part."""
 
 SPREAD_OF_MEAN = 1.2533
 """Mean length of a two-dimensional Gaussian error, over its standard deviation along one axis."""
@@ -176,11 +181,12 @@ def bound_at(bound_95: Tensor, level: float, spread: float = 1.0) -> Tensor:
 
 
 class SlopeErrors(NamedTuple):
-    """steep (B, 1, H, W), square of n_z; white and model (B, 1, H, W), variances of the angle along one axis, radians^2."""
+    """steep (B, 1, H, W), square of n_z; white and alike (B, 1, H, W), variances of the angle along one axis, radians^2, of
+    errors that are independent from pixel to pixel, and of those that are alike all over the contact."""
 
     steep: Tensor
     white: Tensor
-    model: Tensor
+    alike: Tensor
 
 
 class Confidence(nn.Module):
@@ -264,7 +270,8 @@ class Confidence(nn.Module):
             check_record("taught", taught, TaughtRange)
         self.taught_sine = 1.0 if taught is None else taught.sine
         self.taught_mm = math.inf if taught is None else taught.depth_mm
-        self.growth = 0.0 if taught is None else taught.growth
+        # the excess is read by the very field that errs in it, and may be short by as much
+        self.growth = 0.0 if taught is None else taught.growth / max(1.0 - taught.growth, LEAST_READ)
         self.blur_px = blur_px
         edge_px = math.sqrt(2.0 * blur_px**2 + GRID_PX2)  # the camera's own blur is taken to be as wide as the calibration's
         self.weights = gaussian_weights(min(edge_px, MOST_BLUR_PX))
@@ -274,13 +281,12 @@ class Confidence(nn.Module):
         # TorchScript sees no numbers of the module
         self.clipped_variance = math.radians(CLIPPED_DEG) ** 2
         self.detected, self.useful_deg = DETECTED_SIGMAS, USEFUL_DEG
-        self.curl_share, self.edge_share = CURL_SHARE, EDGE_SHARE
-        self.system_variance = 1.0 if self.by_lights else SYSTEM_SHARE**2  # lights that are off are off everywhere
+        self.curl_share, self.edge_share, self.edge_depth_share = CURL_SHARE, EDGE_SHARE, EDGE_DEPTH_SHARE
+        self.system_share = 1.0 if self.by_lights else SYSTEM_SHARE**2  # lights that are off are off everywhere
         self.kink_variance_mm = (KINK_PX * mm_per_pixel) ** 2
         height, width = noise_std.shape[1], noise_std.shape[2]
         self.steeper_std = STEEPER_STD / (0.5 * max(height, width) * mm_per_pixel)
         self.integrable_share, self.frame_variance = INTEGRABLE_SHARE, FRAME_VARIANCE
-        self.patch_px = (PATCH_MM / mm_per_pixel) ** 2
         self.band = max(3, round(BAND * min(height, width)))
         x, y = torch.linspace(-1.0, 1.0, width) * width, torch.linspace(-1.0, 1.0, height) * height
         place = (x.square() + y.square()[:, None]) / float(width**2 + height**2)
@@ -356,12 +362,15 @@ class Confidence(nn.Module):
         if not self.by_lights:
             model = model * self._level(base, again, out, noise, edges)
             beyond = self._beyond(out)
-        variance = noise + model + clipped if self.by_lights else noise + model + surface + beyond
-        bound = _length_95(change, torch.sqrt(variance + 1e-12), 1.0 if self.by_lights else 1.06)
+        if self.by_lights:
+            bound = _length_95(change, torch.sqrt(noise + model + clipped + 1e-12), 1.0)
+        else:  # the raw slopes of another pass scatter about those of the depth
+            variance = noise + model + surface + beyond + change.square()
+            bound = _length_95(torch.zeros_like(change), torch.sqrt(variance + 1e-12), 1.06)
         bound = torch.where(out.deformed, bound, self.detected * torch.sqrt(noise + 1e-12))
         normal_95 = torch.rad2deg(bound).clamp_max(180.0)
         inside = out.deformed.to(noise.dtype)
-        slopes = SlopeErrors(steep, noise + surface, model + clipped + beyond)
+        slopes = SlopeErrors(steep, noise + surface, self.system_share * (model + clipped) + beyond)
         depth_95 = self._depth_95(out.depth_mm, out.gradient, again, inside, slopes)
         # the inverse of bound_at
         likely = 1.0 - torch.exp(math.log(0.05) * (self.useful_deg / normal_95) ** (2.0 / self.spread))
@@ -451,8 +460,7 @@ class Confidence(nn.Module):
         odd = torch.minimum(first, second) - (noise * weight).sum(dim=(1, 2, 3), keepdim=True)
         found = self.integrable_share**2 * (odd / total.clamp_min(1e-6)).clamp_min(1e-6)
         expected = 1.5708 * self.model_variance  # square of the mean error
-        frame = self.frame_variance + 0.5 * self.patch_px / total.clamp_min(1e-6)
-        share = self.model_log_variance / (self.model_log_variance + frame)
+        share = self.model_log_variance / (self.model_log_variance + self.frame_variance)
         return torch.where(total > 1.0, (found / max(expected, 1e-12)) ** share, torch.ones_like(total))
 
     def _beyond(self, out: DepthOutput) -> Tensor:
@@ -480,7 +488,7 @@ class Confidence(nn.Module):
         better = self.gradient(again)
         around = _smooth(better * beyond) / _smooth(beyond).clamp_min(0.04) * _grown(inside, self.band)
         better = torch.where(inside > 0, better, around)
-        std = torch.sqrt(errors.model + 1e-14) / steep.clamp_min(0.05) * inside
+        std = torch.sqrt(errors.alike + 1e-14) / steep.clamp_min(0.05) * inside
         length = torch.sqrt(gradient.square().sum(1, keepdim=True) + std.square() + 1e-12)
         none = torch.zeros_like(std)
         tilts = torch.cat((torch.cat((std, none), 1), torch.cat((none, std), 1)))
@@ -492,8 +500,15 @@ class Confidence(nn.Module):
         growth = 0.2 + torch.log1p(torch.sqrt(count / math.pi)) / (2.0 * math.pi)
         scatter = mean * growth * (self.correlation * self.mm_per_pixel) ** 2
         kink = self.kink_variance_mm * gradient.square().sum(dim=(1, 2, 3), keepdim=True) / count
-        system = self.system_variance * found[1:].square().sum(0)
-        return found[0].abs() + 1.96 * torch.sqrt(scatter + kink + system)
+        system = found[1:].square().sum(0)
+        return found[0].abs() + 1.96 * torch.sqrt(scatter + kink + system + self._blunted(depth_mm))
+
+    def _blunted(self, depth_mm: Tensor) -> Tensor:
+        """Variance of depth by what blur took from its edges, mm^2."""
+        if self.blur_px == 0.0:
+            return torch.zeros_like(depth_mm)
+        taken = (blur(depth_mm, self.weights) - depth_mm).square()
+        return self.edge_depth_share * nn.functional.max_pool2d(taken, 2 * self.reach + 1, 1, self.reach)
 
 
 class ConfidentPipeline(nn.Module):

@@ -2,6 +2,11 @@
 
 python scripts/confidence.py --presses ../shared/data/gelsight_mini_a --sensor gelsight_mini
 
+python scripts/confidence.py --drawn 700 701 702 703 704 705 706 707
+python scripts/confidence.py --sets gelsight_mini_a gelsight_mini_b gelsight_mini_c gelsight_pale digit_a
+
+The second and third: objects inside and outside of the range of slopes and depths that the calibration's presses taught.
+
 Random exact scenes of four kinds of units, and presses of balls that calibration has not seen.
 """
 
@@ -13,10 +18,11 @@ from pathlib import Path
 import torch
 
 import torchvts as vts
-from torchvts.evaluation import coverage
+from torchvts.evaluation import coverage, sets
 from torchvts.evaluation.figures import coverage_figure
 from torchvts.evaluation.random_scenes import SHAPES, UNITS
 from torchvts.evaluation.rows import to_json, write_files
+from torchvts.pipeline import MODES
 from torchvts.viz import save_figure
 
 
@@ -28,7 +34,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=10000, help="seed of the first scene")
     parser.add_argument("--out", type=Path, default=Path("out/confidence.png"), help="the picture; its table beside it, .json")
     parser.add_argument("--units", nargs="+", choices=UNITS, default=UNITS, metavar="UNIT", help=", ".join(UNITS))
+    parser.add_argument(
+        "--drawn",
+        type=int,
+        nargs="+",
+        default=[],
+        metavar="SEED",
+        help="instead: drawn sensors, objects inside and outside of the range",
+    )
+    parser.add_argument("--sets", nargs="+", default=[], choices=list(sets.REAL), help="instead: real sets")
+    parser.add_argument("--data", type=Path, default=sets.data_folder(__file__), help="folder of the real sets")
+    parser.add_argument("--mode", default="precise", choices=MODES, help="of drawn sensors and real sets")
     arguments = parser.parse_args(argv)
+    if arguments.drawn or arguments.sets:
+        rows = [row for seed in arguments.drawn for row in coverage.of_drawn(seed, arguments.mode)]
+        rows += [row for name in arguments.sets for row in coverage.of_set(name, arguments.data, arguments.mode)]
+        print(coverage.range_table(rows))
+        return 0
     with torch.no_grad():
         print(measure(arguments))
     return 0

@@ -5,6 +5,7 @@ import dataclasses
 import io
 import math
 import pickle
+import re
 import warnings
 
 import pytest
@@ -12,12 +13,15 @@ import torch
 from torch import nn
 
 import torchvts as vts
+from torchvts.core.blur import blur
 from torchvts.evaluation import coverage
+from torchvts.evaluation.drawn_sensors import drawn_sensor
 from torchvts.evaluation.metrics import normal_angle_deg
 from torchvts.evaluation.random_scenes import random_frame
 from torchvts.evaluation.score import Truth
 from torchvts.export import sample_frames
-from torchvts.pipeline import bound_at
+from torchvts.model.response_field import TaughtRange
+from torchvts.pipeline import beyond_presses, bound_at
 from torchvts.pipeline.confidence import (
     DEPTH_SPREAD,
     FACTORS,
@@ -209,6 +213,109 @@ def test_the_error_to_expect_is_what_was_measured(case):
     assert expected_model_deg(calibration) == pytest.approx(expected)
     block = vts.ConfidentPipeline.from_calibration(calibration).confidence
     assert block.model_variance == pytest.approx((math.radians(expected) / SPREAD_OF_MEAN) ** 2)
+
+
+SHALLOW = ((5.0, 0.3, (-3.0, 0.0)), (5.0, 0.3, (3.0, 0.0)), (5.0, 0.35, (0.0, 0.0)))
+DEEPER = (*SHALLOW, (5.0, 1.0, (0.0, 2.0)), (5.0, 1.0, (1.0, -2.0)))
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """A drawn sensor calibrated by presses of 0.3 to 1 mm, and another press (1, 3, H, W)."""
+    unit = drawn_sensor(31)
+    calibration = vts.calibrate(unit.background, unit.sensor, [unit.ball(*press, f"{k}", k) for k, press in enumerate(DEEPER)])
+    return calibration, unit.ball(5.0, 0.7, (0.5, 0.5), "other", 9).image[None]
+
+
+def ranged(calibration, sine, depth_mm=10.0, growth=0.5):
+    """The unit with another range of slopes and depths."""
+    response = dataclasses.replace(calibration.response, taught=TaughtRange(sine, depth_mm, growth))
+    return dataclasses.replace(calibration, response=response)
+
+
+def test_bounds_grow_beyond_the_slopes_and_depths_of_the_presses(drawn):
+    def outputs(*taught):
+        return vts.ConfidentPipeline.from_calibration(ranged(drawn[0], *taught), "precise")(drawn[1])
+
+    wide = outputs(1.0)
+    part = FACTORS.index("range")
+    assert float(wide.factors_deg[:, part].max()) == 0.0
+    sine = wide.normal[:, :2].norm(dim=1, keepdim=True)
+    limit = float(sine[wide.contact].quantile(0.5))
+    flat = outputs(limit)
+    steeper = (sine > 1.1 * limit) & wide.deformed
+    gentle = (sine < limit) & wide.deformed
+    assert bool(steeper.any()) and bool((flat.normal_95_deg > wide.normal_95_deg)[steeper].all())
+    assert torch.equal(flat.normal_95_deg[gentle], wide.normal_95_deg[gentle])
+    # a field that errs by half of the excess may have read half of the excess: an error as large as what it reads, per axis
+    n_z = wide.normal[:, 2:3]
+    expected = torch.rad2deg((sine - limit) / n_z * math.sqrt(0.5))[steeper]
+    assert torch.allclose(flat.factors_deg[:, part : part + 1][steeper], expected, rtol=1e-3, atol=1e-3)
+    assert float(outputs(limit, 10.0, 0.1).factors_deg[:, part].max()) < 0.3 * float(flat.factors_deg[:, part].max())
+    shallow = outputs(1.0, 0.5 * float(wide.depth_mm.max()))
+    deep = wide.depth_mm > 0.6 * float(wide.depth_mm.max())
+    assert bool((shallow.factors_deg[:, part : part + 1][deep & (sine > 0.01)] > 0).all())
+    assert float((shallow.depth_95_mm - wide.depth_95_mm)[deep].min()) > 0.0
+
+
+def test_a_frame_beyond_the_presses_is_named_in_words(drawn, ring):
+    calibration, frames = ranged(drawn[0], 0.9), drawn[1]
+    out = vts.DepthPipeline.from_calibration(calibration, "precise")(frames)
+    assert beyond_presses(calibration, out) == [""]
+    steep = ranged(drawn[0], math.sin(math.radians(5.0)))
+    (text,) = beyond_presses(steep, out)
+    assert re.fullmatch(r"slopes up to \d+ degrees; the presses taught up to 5", text)
+    deep = ranged(drawn[0], 0.9, 0.4 * float(out.depth_mm.max()))
+    assert re.fullmatch(r"depths up to \d\.\d mm; the presses taught up to \d\.\d", beyond_presses(deep, out)[0])
+    finding = next(found for found in vts.diagnose(None, frames[0], steep) if found.name == "beyond_presses")
+    assert finding.message.startswith("slopes up to ") and finding.severity == "warning"
+    by_lights, _, camera = lights_unit(ring)
+    assert beyond_presses(by_lights, vts.DepthPipeline.from_calibration(by_lights)(camera(1))) == [""]
+
+
+def test_a_calibration_keeps_the_range_of_its_presses(drawn, tmp_path):
+    unit = drawn_sensor(31)
+    shallow = vts.calibrate(unit.background, unit.sensor, [unit.ball(*press, f"{k}", k) for k, press in enumerate(SHALLOW)])
+    kept = []
+    for calibration in (shallow, drawn[0]):
+        calibration.save(tmp_path / "unit.safetensors")
+        kept.append(vts.Calibration.load(tmp_path / "unit.safetensors").response.taught)
+        assert kept[-1].sine == pytest.approx(calibration.response.taught.sine, rel=1e-2)
+    rims = [
+        max(unit.ball(*press).contact_radius_px for press in some) * unit.sensor.mm_per_pixel / 2.5 for some in (SHALLOW, DEEPER)
+    ]
+    assert all(0.7 * rim < taught.sine < rim for rim, taught in zip(rims, kept, strict=True)) and rims[1] > 1.3 * rims[0]
+    assert kept[0].depth_mm < 0.4 and 0.6 < kept[1].depth_mm < 1.1 and all(taught.growth > 0 for taught in kept)
+    both = kept[0].with_all_of(kept[1])
+    assert (both.sine, both.depth_mm, both.growth) == (kept[1].sine, kept[1].depth_mm, kept[0].growth)
+
+
+def test_blurred_edges_are_within_their_bounds():
+    """A step of slope, blurred as the camera and the calibration blur: the edge is off by half of it, and stated to be."""
+    calibration = response_unit()[0]
+    response = dataclasses.replace(calibration.response, blur_px=1.0)
+    unit = vts.Calibration.from_response(response, vts.Sensor("rig", 48, 64, 0.5), calibration.background)
+    block = vts.ConfidentPipeline.from_calibration(unit).confidence
+    gradient = torch.zeros(1, 2, 48, 64)
+    gradient[:, 0, :, 32:] = 0.2
+    blurred = blur(gradient, block.weights)
+    none = torch.zeros(1, 1, 48, 64)
+    _, edges = block._not_integrable(none, blurred, torch.ones_like(none), none)
+    off = (blurred - gradient).norm(dim=1, keepdim=True)[..., 10:38, 28:36]
+    stated = _length_95(torch.zeros(1), edges.sqrt(), 1.06)[..., 10:38, 28:36]
+    assert float((off <= 1.05 * stated).double().mean()) > 0.95 and float(stated.max()) < 0.12
+
+
+def test_frames_that_no_surface_explains_have_wider_bounds(drawn):
+    """Light of each channel that is up and down in stripes: slopes that are the gradient of nothing."""
+    calibration, frames = drawn
+    pipe = vts.ConfidentPipeline.from_calibration(calibration, "precise")
+    model, plain = FACTORS.index("model"), pipe(frames)
+    stripes = 1.0 + 0.1 * torch.sin(torch.arange(frames.shape[2]) * 0.4)[:, None] * torch.tensor([1.0, -1.0, 0.5])[:, None, None]
+    disturbed = pipe((frames * torch.where(plain.contact, stripes, 1.0)).clamp(0, 1))
+    both = plain.contact & disturbed.contact
+    ratio = (disturbed.factors_deg / plain.factors_deg.clamp_min(1e-6))[:, model : model + 1][both].median()
+    assert float(ratio) > 1.2
 
 
 def test_no_contact(ring):

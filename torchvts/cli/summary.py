@@ -42,6 +42,8 @@ def print_calibration(calibration: Calibration, candidates: bool = False) -> Non
     reason = report.get("reason", BY[report["source"]])
     print(f"chosen: {reason}" if reason.startswith(f"{kind}:") else f"chosen: {kind}: {reason}")
     print(f"expected: {expected(calibration)}")
+    if calibration.response is not None and (taught := calibration.response.taught) is not None:
+        print(f"range: slopes up to {taught.angle_deg:.0f} degrees, depths up to {taught.depth_mm:.1f} mm; beyond, it extrapolates")
     for line in left_out("press", [(row["name"], row.get("reason", "")) for row in report.get("presses", []) if not row["used"]]):
         print(line)
     if candidates:

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from ..integration import integrate_perspective
+from ..pipeline import beyond_presses
 from .camera import blockiness, levels_of, texture_share
 from .examination import BLOCKY, COPLANAR, Examination, largest_residual
 from .findings import Finding
@@ -219,6 +220,11 @@ def _steepest(e: Examination) -> Figures | None:
     return {"value": math.degrees(math.atan(steep))} if steep > 1.3 else None
 
 
+def _beyond_presses(e: Examination) -> Figures | None:
+    text = beyond_presses(e.calibration, e.surface.output)[0]
+    return {"value": math.degrees(math.atan(float(e.surface.steepness[e.surface.contact].max()))), "text": text} if text else None
+
+
 def _shadow(e: Examination) -> float:
     contact = e.surface.contact
     return float((e.surface.dark.any(1)[0] & contact).double().sum() / contact.double().sum().clamp_min(1))
@@ -328,6 +334,8 @@ CHECKS = (
           "faint contact: {value:.3f} mm at its deepest, less than a pixel; its rim is below the noise", "note"),
     Check("steep_walls", _steepest, "walls of {value:.0f} degrees: a light may be blocked there, and integration cannot keep a "
           "step; use precise mode, trust the top only", "note"),
+    Check("beyond_presses", _beyond_presses, "{text}: normals and depth are extrapolated there; press a smaller ball, or "
+          "deeper, and calibrate again", unless=frozenset({"other_unit", "no_free_skin"})),
     Check("shadow", _shadow, "a light is blocked in {value:.0%} of the contact: slopes there are estimated from two lights; press "
           "less, or raise the LEDs", lambda figures: "warning" if figures["value"] > 0.3 else "note", above=0.01),
     Check("cast_shadow", _cast_shadow, "a shadow falls on {value:.1%} of the image, on flat skin: {remedy}", above=0.002),

@@ -1,5 +1,7 @@
 """How often errors lie within the bounds that confidence states: on random exact scenes, and on presses of balls."""
 
+import math
+import random
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,14 +12,16 @@ from ..calibration import Press
 from ..core.geometry import normal_from_gradient
 from ..model import Sensor
 from ..pipeline import ConfidentOutput, ConfidentPipeline, bound_at
-from ..pipeline.confidence import DEPTH_SPREAD
+from ..pipeline.confidence import DEPTH_SPREAD, RESPONSE_SPREAD
+from ..scenes import objects as solids
 from . import rows as records
+from .drawn_sensors import DrawnPress, drawn_sensor
 from .metrics import normal_angle_deg
 from .presses import Training
 from .random_scenes import random_frame
 from .rows import Column, Row, error_column
 from .score import Truth, ball_truth
-from .sets import from_folder
+from .sets import Fold, Target, from_folder, load, truth_of
 
 LEVELS = (0.5, 0.68, 0.8, 0.9, 0.95)
 """Probabilities at which coverage is measured."""
@@ -117,3 +121,114 @@ COLUMNS = tuple(f"{kind} {level:.0%}" for kind in ("normal", "depth") for level 
 def table(rows: Sequence[Row]) -> str:
     """Markdown: percent of pixels within the bounds at each level, of normals and then of depths."""
     return records.table(rows, [Column("", lambda row: row.data), *(error_column(key, key, 1) for key in COLUMNS)])
+
+
+# ---- drawn sensors and real ones, inside and outside of the range of the presses ------------------------------------------------
+
+RANGES = {"gentle, shallow": (0.35, 0.04), "gentle, deep": (0.35, 0.1), "steep, shallow": (1.0, 0.04), "steep, deep": (1.0, 0.1)}
+"""Slope and depth, in shorter sides of the image, of the cones and prisms pressed into drawn sensors. Their balls are presses of
+slopes up to about 0.7 and of depths up to 0.06 to 0.08."""
+
+STATED = math.gamma(1.0 + 0.5 * RESPONSE_SPREAD) / math.log(20.0) ** (0.5 * RESPONSE_SPREAD)
+"""Mean error that a bound states, over the bound: of the distribution of :func:`bound_at`."""
+
+
+def of_target(out: ConfidentOutput, truth: Truth, name: str, shape: str, relief: bool = False) -> Row:
+    """Errors "deg", "normal" and "depth" (percent within 95 %), "stated" (mean stated error of normals over the actual).
+
+    Args:
+        out: of the pipeline.
+        truth: of the frame.
+        name: of the unit.
+        shape: that was pressed.
+        relief: compare depth less its mean, where no label holds the depth.
+    """
+    angle = normal_angle_deg(out.normal.double(), normal_from_gradient(truth.gradient.double()))[:, None][truth.region]
+    depth = (out.depth_mm - truth.depth_mm)[truth.region]
+    depth = depth - depth.mean() if relief else depth
+    stated = STATED * float(out.normal_95_deg[truth.region].mean())
+    within = {
+        "normal": 100.0 * float((angle <= out.normal_95_deg[truth.region]).double().mean()),
+        "depth": 100.0 * float((depth.abs() <= out.depth_95_mm[truth.region]).double().mean()),
+    }
+    return Row("coverage", shape, name, {"deg": float(angle.mean()), **within, "stated": stated / float(angle.mean())})
+
+
+def of_drawn(seed: int, mode: str = "precise") -> list[Row]:
+    """Coverage on a drawn sensor that is calibrated by its balls: a row for each object that is no ball, and for balls."""
+    unit, draw = drawn_sensor(seed), random.Random(5000 + seed)
+    pipe = ConfidentPipeline.from_calibration(Training(unit.background, unit.balls, unit.sensor).calibration, mode)
+    wide, high = (n * unit.sensor.mm_per_pixel for n in (unit.sensor.width, unit.sensor.height))
+    short = min(wide, high)
+    objects = [("balls in range", solids.sphere(radius * short), 0.3 * radius * short) for radius in (0.14, 0.21)]
+    objects += [
+        ("balls twice as deep", solids.sphere(radius * short), depth * short) for radius, depth in ((0.28, 0.13), (0.35, 0.168))
+    ]
+    for name, (slope, depth) in RANGES.items():
+        objects.append((f"cone, {name}", _cone(slope), depth * short))
+        objects.append((f"prism, {name}", solids.prism(slope, 0.3 * short), depth * short))
+    rows = []
+    for number, (shape, height, depth) in enumerate(objects):
+        shift = (draw.uniform(-0.12, 0.12) * wide, draw.uniform(-0.12, 0.12) * high)
+        pressed = unit.press(height, solids.pose(draw.uniform(0.0, 360.0), shift, depth), shape, 300 + number)
+        rows.append(_row_of(pipe, pressed, shape))
+    return rows + [_row_of(pipe, pressed, pressed.name) for pressed in unit.objects]
+
+
+def _row_of(pipe: ConfidentPipeline, pressed: DrawnPress, shape: str) -> Row:
+    with torch.inference_mode():
+        return of_target(pipe(pressed.image[None]), truth_of(pressed.scene), "drawn sensors", shape)
+
+
+def _cone(slope: float) -> solids.Height:
+    return lambda u, v: -slope * torch.sqrt(u * u + v * v + 1e-8)
+
+
+def of_set(name: str, data: Path, mode: str = "precise") -> list[Row]:
+    """Coverage on a real set by its folds, and of the presses of larger contact radii by those of smaller ones, without a prior."""
+    loaded, rows = load(name, data), []
+    folds = [(name, fold) for fold in loaded.folds]
+    scored = {target.name: target for fold in loaded.folds for target in fold.scored if target.ball is not None}
+    learned = {press.name: press for fold in loaded.folds for press in fold.learned}
+    ranked = sorted((key for key in scored if key in learned), key=lambda key: _flatness(scored[key]))
+    if len(ranked) >= 8:
+        half = len(ranked) // 2
+        smaller = [learned[key] for key in ranked[:half]]
+        larger = [scored[key] for key in ranked[half:]]
+        folds.append((f"{name}, larger by smaller presses", Fold(loaded.folds[0].sensor.without_prior(), smaller, larger)))
+    for title, fold in folds:
+        pipe = ConfidentPipeline.from_calibration(Training(loaded.background, fold.learned, fold.sensor).calibration, mode)
+        for target in fold.scored:
+            if target.truth is not None and bool(target.truth.region.any()):
+                with torch.inference_mode():
+                    out = pipe(target.image[None])
+                rows.append(of_target(out, target.truth, title, "", relief=target.ball is not None))
+    return rows
+
+
+def _flatness(target: Target) -> float:
+    assert target.ball is not None
+    return (target.ball.contact_radius_px or 0.0) / target.ball.ball_diameter_mm
+
+
+def range_table(rows: Sequence[Row]) -> str:
+    """Markdown: a row for each unit and shape, means over frames."""
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row.data, row.method), []).append(row)
+    means = []
+    for (data, shape), some in groups.items():
+        errors: dict[str, float | None] = {key: sum(row.errors[key] or 0.0 for row in some) / len(some) for key in RANGE_COLUMNS}
+        degrees = [row.errors["deg"] or 0.0 for row in some]
+        # of sums: a frame that is nearly exact has no meaningful ratio
+        errors["stated"] = sum((row.errors["stated"] or 0.0) * deg for row, deg in zip(some, degrees)) / sum(degrees)
+        means.append(Row("coverage", shape, data, errors, frames=len(some)))
+    titles = {"deg": "deg", "normal": "normals within 95 %", "depth": "depths within 95 %", "stated": "stated / actual"}
+    columns = [Column("", lambda row: row.data), Column("object", lambda row: row.method)]
+    return records.table(
+        means, [*columns, *(error_column(titles[key], key, 2 if key in ("deg", "stated") else 1) for key in titles)]
+    )
+
+
+RANGE_COLUMNS = ("deg", "normal", "depth", "stated")
+"""Errors of the rows of :func:`of_target`."""

@@ -1,7 +1,7 @@
 """Online: a calibration made into a chain of modules that turns images into depth, and how far that may be off."""
 
 from ..core.frame import DepthOutput
-from .confidence import Bounds, Confidence, ConfidentOutput, ConfidentPipeline, bound_at
+from .confidence import Bounds, Confidence, ConfidentOutput, ConfidentPipeline, beyond_presses, bound_at
 from .depth import MODES, DepthPipeline
 from .refine import Adaptive, Once, Repeat, SlopesOfDepth, SlopesOfPixels
 from .shadows import Shadows
@@ -23,6 +23,7 @@ __all__ = [
     "SlopesOfDepth",
     "SlopesOfPixels",
     "Solve",
+    "beyond_presses",
     "bound_at",
     "unit_pipeline",
 ]

@@ -59,7 +59,7 @@ FEW_PRESSES = 4.0
 """Variance that n presses leave where no ball was pressed, in that of a press, times n. So their error is multiplied by
 sqrt(1 + 4 / n); a prior counts as so many presses."""
 
-MODEL_SHARE = 1.2
+MODEL_SHARE = 1.0
 """Error of a response field, relative to the one that spreads its held-out angle over the image in the way of noise."""
 
 BORDER_SHARE = 3.0
@@ -89,16 +89,16 @@ DETECTED_SIGMAS = 4.5
 """A tilt of so many standard deviations of its noise is detected: the threshold of :class:`ContactMask`."""
 
 STEEPER_STD = 0.3
-"""Standard deviation of what depth does to slopes, ``DepthBrightness.steeper`` times half the longer side: lights usually stand where
-it is 0.6 to 1.2."""
+"""Standard deviation of what depth does to slopes, ``DepthBrightness.steeper`` times half the longer side: lights usually stand
+where it is 0.6 to 1.2."""
 
 INTEGRABLE_SHARE = 1.5
-"""Mean error of normals of a response field, over the root mean square of the part of its slopes that is not integrable: 0.9 for white
-errors in two dimensions, more for smooth ones."""
+"""Mean error of normals of a response field, over the root mean square of the part of its slopes that is not integrable: 0.9 for
+white errors in two dimensions, more for smooth ones; 1.5 to 1.7 on four drawn sensors, 0.8 to 2.3 on real ones."""
 
 FRAME_VARIANCE = 0.1
-"""Variance of the logarithm of the error that a frame's integrability states: 0.02 to 0.2 between frames of a unit, and as much between
-units."""
+"""Variance of the logarithm of the error that a frame's integrability states: 0.02 to 0.2 between frames of a unit, and as much
+between units."""
 
 SYSTEM_SHARE = 0.5
 """Depth error by a response field, over that of slopes that are all off by one standard deviation in the same direction."""
@@ -118,6 +118,9 @@ GelSight Mini)."""
 
 LEAST_READ = 0.5
 """Slopes beyond the range are taken to be read to at least this part."""
+
+BEYOND = 1.2
+"""A frame leaves the range of the presses where it is this many times as steep or deep: so much do presses themselves differ."""
 
 SPREAD_OF_MEAN = 1.2533
 """Mean length of a two-dimensional Gaussian error, over its standard deviation along one axis."""
@@ -180,6 +183,39 @@ def bound_at(bound_95: Tensor, level: float, spread: float = 1.0) -> Tensor:
     return bound_95 * factor
 
 
+def beyond_presses(calibration: Calibration, output: DepthOutput | ConfidentOutput) -> list[str]:
+    """For each frame what of it is steeper or deeper than the presses that the model was fitted to, in words; "" where nothing is.
+
+    It is said where 95 % of the contact reach further than :data:`BEYOND` times what 95 % of the presses did. Bounds grow earlier,
+    and without a step. Calibrations by lights have no such range, and older files do not know theirs.
+
+    Args:
+        calibration: of the unit.
+        output: of its pipeline.
+    Example:
+        >>> from torchvts import PointLights, Sensor
+        >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
+        >>> cal = Calibration.from_lights(lights, Sensor("rig", 48, 64, 0.5))
+        >>> beyond_presses(cal, ConfidentPipeline.from_calibration(cal)(cal.model_image[None]))
+        ['']
+    """
+    check_calibration("calibration", calibration)
+    taught = None if calibration.response is None else calibration.response.taught
+    texts = []
+    for contact, normal, depth in zip(output.contact, output.normal, output.depth_mm, strict=True):
+        parts: list[str] = []
+        if taught is not None and bool(contact.any()):
+            sine = float(normal[:2].norm(dim=0)[contact[0]].float().quantile(0.95))
+            deepest = float(depth[contact].float().quantile(0.95))
+            if sine > min(1.0, BEYOND * taught.sine):
+                angle = math.degrees(math.asin(min(1.0, sine)))
+                parts.append(f"slopes up to {angle:.0f} degrees; the presses taught up to {taught.angle_deg:.0f}")
+            if deepest > BEYOND * taught.depth_mm:
+                parts.append(f"depths up to {deepest:.1f} mm; the presses taught up to {taught.depth_mm:.1f}")
+        texts.append("; ".join(parts))
+    return texts
+
+
 class SlopeErrors(NamedTuple):
     """steep (B, 1, H, W), square of n_z; white and alike (B, 1, H, W), variances of the angle along one axis, radians^2, of
     errors that are independent from pixel to pixel, and of those that are alike all over the contact."""
@@ -195,9 +231,11 @@ class Confidence(nn.Module):
     Normals. The noise of the image goes through the inverse model by differences: each channel is moved by its noise, and the
     normal is followed. So conditioning is measured, not assumed. The model's error goes the same way, as light that is off: for
     point lights by how well calibration constrained each of them, for response fields by as much as gives the held-out angle.
-    Added to this are the change that the next pass would bring, the part of the gradient that is not integrable, blur at edges,
-    and a fixed error where a channel is dark or saturated. Outside of the deformed area, where the normal is said to be flat, the
-    bound is the faintest tilt that the mask detects.
+    How large the error of a response field is, the part of the frame's slopes that is not integrable says too. Beyond the slopes
+    and depths of its presses it grows as the error of a field fitted to their flatter part does on their rims, and as the height
+    of the lights is uncertain. Added to this are the change that the next pass would bring, the part of the gradient that is not
+    integrable, blur at edges, and a fixed error where a channel is dark or saturated. Outside of the deformed area, where the
+    normal is said to be flat, the bound is the faintest tilt that the mask detects.
 
     Depth. White errors of slope grow with the logarithm of the contact's size; errors of the model add up along the way, which
     is computed by three integrations: all slopes too steep, and all tilted in x and in y. What the mask missed and what the next
@@ -210,8 +248,8 @@ class Confidence(nn.Module):
         light_std: (3, H, W), error of the light due to the model; for point lights per unit of ``|n - n_flat|``.
         mm_per_pixel: pixel pitch, mm.
         model_deg: mean error of a response field, degrees; 0 for lights.
-        model_log_variance: variance of the logarithm of ``model_deg``: the larger, the more a frame's integrability decides; 0 if it is
-            not asked.
+        model_log_variance: variance of the logarithm of ``model_deg``: the larger, the more a frame's integrability decides; 0 if
+            it is not asked.
         taught: how steep and deep the presses of a response field were; None if not known.
         measured: whether the background was an image.
         blur_px: of the compensated image.
@@ -365,7 +403,7 @@ class Confidence(nn.Module):
         if self.by_lights:
             bound = _length_95(change, torch.sqrt(noise + model + clipped + 1e-12), 1.0)
         else:  # the raw slopes of another pass scatter about those of the depth
-            variance = noise + model + surface + beyond + change.square()
+            variance = noise + model + surface + beyond + 0.5 * change.square()
             bound = _length_95(torch.zeros_like(change), torch.sqrt(variance + 1e-12), 1.06)
         bound = torch.where(out.deformed, bound, self.detected * torch.sqrt(noise + 1e-12))
         normal_95 = torch.rad2deg(bound).clamp_max(180.0)
@@ -614,8 +652,7 @@ def expected_model_deg(calibration: Calibration) -> float:
 def model_log_variance(calibration: Calibration) -> float:
     """Variance of the logarithm of :func:`expected_model_deg`: how uncertain that is before a frame; 0 where no frame can tell.
 
-    Held-out presses state it within a quarter; one press alone within a factor of two; a prior within the spread of the units that its
-    file was scored on.
+    Held-out presses state it within a quarter; one press alone, or a prior, within a factor of 1.6.
     """
     report = calibration.report
     if report.get("objection") or report.get("source") == "stand_in":

@@ -407,6 +407,8 @@ TABLE = {
             "light_std": [FLAT[None], None, 0.01],
             "mm_per_pixel": NUMBER,
             "model_deg": ["1", None, NAN, -1.0],
+            "model_log_variance": ["1", None, NAN, -1.0],
+            "taught": [0.5, (0.5, 0.4, 0.3)],
             "blur_px": ["1", None, NAN, -1.0],
             "spread": NUMBER,
         },
@@ -444,6 +446,7 @@ TABLE = {
         },
     ),
     "ConfidentPipeline.forward": forward(lambda: vts.ConfidentPipeline.from_calibration(unit()), 3, "images"),
+    "beyond_presses": Entry({"calibration": unit(), "output": OUT}, {"calibration": [None, "unit"], "output": [None, DEPTH]}),
     "bound_at": Entry(
         {"bound_95": torch.ones(2), "level": 0.5, "spread": 1.0},
         {"bound_95": [1.0, None, np.ones(2)], "level": [0.0, 1.0, 95, NAN, "0.5", None], "spread": NUMBER},

@@ -200,6 +200,8 @@ def beyond_presses(calibration: Calibration, output: DepthOutput | ConfidentOutp
         ['']
     """
     check_calibration("calibration", calibration)
+    if not isinstance(output, DepthOutput | ConfidentOutput):
+        raise TypeError(f"output: expected a DepthOutput, got {type(output).__name__}: the output of the unit's pipeline")
     taught = None if calibration.response is None else calibration.response.taught
     texts = []
     for contact, normal, depth in zip(output.contact, output.normal, output.depth_mm, strict=True):
@@ -650,7 +652,7 @@ def expected_model_deg(calibration: Calibration) -> float:
 
 
 def model_log_variance(calibration: Calibration) -> float:
-    """Variance of the logarithm of :func:`expected_model_deg`: how uncertain that is before a frame; 0 where no frame can tell.
+    """Variance of the logarithm of :func:`expected_model_deg`: how uncertain that is before a frame; 0 where frames do not count.
 
     Held-out presses state it within a quarter; one press alone, or a prior, within a factor of 1.6.
     """

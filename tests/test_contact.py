@@ -1,5 +1,7 @@
 """The contact mask."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 import references
@@ -9,8 +11,10 @@ from kornia.morphology import dilation
 import torchvts as vts
 from torchvts import accelerated
 from torchvts.accelerated import reference_only
+from torchvts.accelerated.blocks import Drift
 from torchvts.core.cells import cell_means, mean_around
 from torchvts.core.morphology import dilate, erode, reconstruct
+from torchvts.core.robust import half_sample_mode
 from torchvts.evaluation import metrics
 
 scenes = vts.scenes
@@ -127,6 +131,35 @@ def test_undeformed_skin_in_a_shadow_is_shaded_and_a_press_is_not():
     assert not bool(mask.shadowed(image[None]).any())
     dim = torch.full((3, 64, 64), 0.05)  # a channel that is never bright cannot go dark
     assert not bool(vts.ContactMask(dim, torch.full((3,), 0.01)).shadowed(torch.zeros(1, 3, 64, 64)).any())
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_strong_shade_is_no_contact_and_does_not_hide_one(compiled):
+    """A shade changes more of the light than the press beside it, which alone has colour."""
+    y, x = torch.arange(120.0)[:, None] - 60.0, torch.arange(160.0) - 40.0
+    disc = x * x + y * y < 20.0**2
+    skin = 1.0 + 0.002 * torch.randn(2, 3, 120, 160, generator=torch.Generator().manual_seed(0))
+    skin[..., 90:] *= 0.8
+    skin[0] += disc * torch.tensor([0.1, -0.1, 0.05])[:, None, None]
+    mask = vts.ContactMask(torch.ones(3, 120, 160), torch.full((3,), 0.002), far_field=0.01, least_colour=0.7)
+    with nullcontext() if compiled else reference_only():
+        pressed, rest = mask(skin)[:, 0]
+    assert metrics.mask_iou(pressed[None, None], disc[None, None]) > 0.9 and not bool(rest.any())
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_shade_over_half_of_the_skin_gives_no_colour(compiled):
+    """Modes of channels that are of different halves would be a change of colour of both."""
+    generator = torch.Generator().manual_seed(1)
+    skin = 1.0 + 0.002 * torch.randn(1, 3, 120, 160, generator=generator)
+    skin[..., 80:] *= 0.88
+    skin[:, 0, :60, :80] += 0.02 * torch.rand(60, 80, generator=generator)  # red's mode is in the shade, the others' is not
+    skin[:, 1:, :60, 80:] += 0.02 * torch.rand(60, 80, generator=generator)
+    with nullcontext() if compiled else reference_only():
+        level = Drift().by_mode(skin).flatten()
+    assert float(level.max() - level.min()) < 1e-6
+    alone = half_sample_mode(skin.flatten(2).sort(dim=2).values)
+    assert float(alone.max() - alone.min()) > 0.1
 
 
 def test_items_of_a_batch_do_not_influence_one_another(ring, small_sensor, small_press):

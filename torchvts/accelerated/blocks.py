@@ -101,7 +101,7 @@ class ContactMask(Twin, contact.ContactMask):
     def find(self, compensated: Tensor, image: Tensor) -> contact.Moved:
         if not usable(compensated, image, self.offset):
             return super().find(compensated, image)
-        bridge = (self.bridge_cells if self.bridges else 0, self.bridge_sigmas, self.tail_sigmas, self.least_spread)
+        bridge = (self.bridge_cells, self.bridge_sigmas, self.tail_sigmas, self.least_spread)
         sides = (self.step, self.stride, self.cell, self.reach)
         grid = kernels.ContactGrid(*sides, self.sigmas, self.rounding, self.least_cells, *bridge, self.least_colour)
         offset = None if flat_is_one(self) else self.offset

@@ -312,7 +312,7 @@ def _settings(parts: Blocks) -> dict[str, Any]:
         "stride": mask.stride,
         "cell": mask.cell,
         "reach": mask.reach,
-        "bridge": mask.bridge_cells if mask.bridges else 0,
+        "bridge": mask.bridge_cells,
         "sigmas": mask.sigmas,
         "rounding": mask.rounding,
         "least_cells": mask.least_cells,

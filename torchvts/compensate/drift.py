@@ -12,6 +12,12 @@ from ..core.smooth import grid_samples, without_smooth_change
 LEAST_DRIFT, MOST_DRIFT = 0.01, 0.15
 """Drift, relative, above the error of the mode itself, and the largest that is believed."""
 
+SAME_SKIN = 2.0
+"""Samples this many times :data:`LEAST_DRIFT` from a level, in each channel, are skin of that level."""
+
+MORE_SKIN = 1.2
+"""So many times as many samples must have another level before the channels' own modes are given up for it."""
+
 MOST_BY_MODE = 0.149
 """A mode that says more is held at its limit: the other estimator takes over."""
 
@@ -37,6 +43,8 @@ class Drift(nn.Module):
     background: Tensor | None
     noise: Tensor | None
     most_by_mode: Final[float] = MOST_BY_MODE
+    same_skin: Final[float] = SAME_SKIN
+    more_skin: Final[int] = round(100 * MORE_SKIN)
 
     def __init__(
         self,
@@ -81,11 +89,42 @@ class Drift(nn.Module):
 
         A press scatters light over the whole skin and LEDs drift: on a GelSight Mini up to 1 %, on another 5 %. Where no channel is
         ``least`` off it is left at 1, because there the error of the mode is no smaller (relief 26 against 28 um on the first
-        Mini); from twice that it counts in full.
+        Mini); from twice that it counts in full. Where a shade lies over half of the skin the modes of two channels may be of
+        different halves: levels that most samples have in all three channels at once replace them (:meth:`of_one_skin`).
         """
-        drift = (half_sample_mode(self.ordered(_grid(ratio.detach()).flatten(2))) - 1.0).clamp(-most, most)  # (B, 3)
+        some = _grid(ratio.detach()).flatten(2)
+        drift = (half_sample_mode(self.ordered(some)) - 1.0).clamp(-most, most)  # (B, 3)
+        drift = self.of_one_skin(some - 1.0, drift, least)
         weight = (drift.abs().amax(dim=1, keepdim=True) / least - 1.0).clamp(0.0, 1.0)
         return (1.0 + weight * drift)[..., None, None]
+
+    def of_one_skin(self, some: Tensor, drift: Tensor, least: float) -> Tensor:
+        """Drift of the channels (B, 3), each found by itself, made that of one part of the skin.
+
+        Candidates are the mode of one channel in all three, and no drift; that near which most samples lie in all channels at once
+        is taken, if they are clearly more than near the channels' own modes. Modes that agree within ``least`` stay.
+
+        Args:
+            some: samples of image / background - 1, (B, 3, N).
+            drift: the modes, (B, 3).
+            least: see :meth:`by_mode`.
+        """
+        agree = drift.amax(dim=1, keepdim=True) - drift.amin(dim=1, keepdim=True) < least
+        if may_read(agree) and bool(agree.all()):
+            return drift
+        near = self.same_skin * least
+        most, best = self.near(some, drift, near) * self.more_skin, drift
+        for k in range(4):
+            other = drift[:, k : k + 1].expand(-1, 3) if k < 3 else torch.zeros_like(drift)
+            count = self.near(some, other, near) * 100
+            best = torch.where(count > most, other, best)
+            most = torch.maximum(count, most)
+        return torch.where(agree, drift, best)
+
+    def near(self, some: Tensor, level: Tensor, reach: float) -> Tensor:
+        """How many samples (B, 3, N) lie within ``reach`` of levels (B, 3) in all channels, (B, 1)."""
+        inside = ((some - level[:, :, None]).abs() < reach).all(dim=1)
+        return inside.sum(dim=1, keepdim=True)
 
     def by_statistics(
         self, light: Tensor, background: Tensor, noise_std: Tensor, least: float = 0.01, most: float = 0.35

@@ -111,9 +111,9 @@ class ContactMask(nn.Module):
     hangs free below it would be missing from the depth of all it surrounds: moved skin goes on over the cells connected to it
     whose mean change stands out of the spread of such means in the least changed skin. A channel that is black in all of the frame
     (below 5 % of its background) has lost its LED: the other two decide. A shadow or a stain changes all channels alike, where
-    slopes change the colour: a frame whose changes all together have too little colour has not moved. With ``smooth_light`` a
-    smooth change of the light is divided out first, unless the caller has done so; the noise is the frame's before that, since
-    what a press makes of undeformed skin is smooth only roughly.
+    slopes change the colour: of a frame whose changes all together have too little colour, only parts that have it have moved.
+    With ``smooth_light`` a smooth change of the light is divided out first, unless the caller has done so; the noise is the
+    frame's before that, since what a press makes of undeformed skin is smooth only roughly.
 
     Args:
         flat: (3, H, W), the compensated image of the undeformed skin.
@@ -177,7 +177,8 @@ class ContactMask(nn.Module):
         self.rounding = float((QUANTISATION_STD * self.per_noise).square().mean())
         self.register_buffer("most_far_field", far_field * (self.flat * self.per_noise).mean(dim=(1, 2)))
         self.dark_noises = DARK_NOISES
-        self.bridges, self.bridge_cells, self.bridge_sigmas = far_field > 0.0, BRIDGE, BRIDGE_SHARE * sigmas
+        self.bridges, self.bridge_sigmas = far_field > 0.0, BRIDGE_SHARE * sigmas
+        self.bridge_cells = BRIDGE if self.bridges else 0
         self.tail_sigmas, self.least_spread = TAIL_SHARE * sigmas, LEAST_SPREAD / self.cell
         self.register_buffer("offset", -self.flat * self.per_noise)
         self.samples = 2000  # pixels from which a frame's own noise is estimated
@@ -345,24 +346,38 @@ class ContactMask(nn.Module):
         tail = self.tail(mean, kept | added) if self.bridges else torch.zeros_like(kept)
         added = added | tail
         whole = kept | added
+        inside = erode(filled | whole) | faint | added
         if self.least_colour > 0.0:
-            coloured = self.coloured(mean, whole, scale)
-            whole, tail = whole & coloured, tail & coloured
-        interior = self._to_pixels(whole & (erode(filled | whole) | faint | added))
+            whole = self.coloured(mean, whole, scale)
+            tail = tail & whole
+        interior = self._to_pixels(whole & inside)
         return Moved((strong & self._to_pixels(whole)) | interior, interior, self._to_pixels(tail))
 
     def coloured(self, mean: Tensor, whole: Tensor, scale: Tensor) -> Tensor:
-        """Whether the changes of all cells that have moved have the colour of slopes, bool (B, 1, 1, 1).
+        """Cells that have moved whose changes have the colour of slopes, bool; all of them if their changes all together have.
 
-        Where an LED has failed, two channels are too few to say.
+        Else there is a shadow or a stain, and beside it maybe a contact: cells that have the colour themselves stay where nearly a
+        disc of the least size of them lies together, with what lies between them, unless all these together lack it again. Where
+        an LED has failed, two channels are too few to say.
         """
         per_noise = self.per_noise.index_select(1, self.middle_row).index_select(2, self.middle_column)
-        change = mean * whole.to(mean.dtype) / (per_noise * scale.clamp_min(1e-9)[:, :, None, None])
-        r, g, b = change[:, 0], change[:, 1], change[:, 2]
-        light = (r * r + g * g + b * b).sum(dim=(1, 2)) / 3.0
-        colour = ((r - g) ** 2 + (b - g) ** 2).sum(dim=(1, 2)) / 2.0
-        enough = (colour >= self.least_colour**2 * light) | (scale <= 0.0).any(dim=1)
-        return enough[:, None, None, None]
+        change = mean / (per_noise * scale.clamp_min(1e-9)[:, :, None, None])
+        r, g, b = change[:, 0:1], change[:, 1:2], change[:, 2:3]
+        light = (r * r + g * g + b * b) / 3.0 * self.least_colour**2
+        colour = ((r - g) ** 2 + (b - g) ** 2) / 2.0
+        enough = self.more(colour, light, whole) | (scale <= 0.0).any(dim=1)[:, None, None, None]
+        if may_read(enough) and bool(enough.all()):
+            return whole
+        own = whole & (colour >= light)
+        together = _box_sum(_box_sum(own.to(mean.dtype), self.reach, 2), self.reach, 3) > self.least_cells
+        kept = self.reconstruct(own & together, own)
+        kept = self.filled(kept | (erode(dilate(kept, self.bridge_cells), self.bridge_cells) & whole)) & whole
+        return whole & (enough | (kept & self.more(colour, light, kept)))
+
+    def more(self, colour: Tensor, light: Tensor, cells: Tensor) -> Tensor:
+        """Whether the sum of ``colour`` over cells is at least that of ``light``, bool (B, 1, 1, 1)."""
+        counted = cells.to(colour.dtype)
+        return (colour * counted).sum(dim=(2, 3), keepdim=True) >= (light * counted).sum(dim=(2, 3), keepdim=True)
 
     def gaps(self, mean: Tensor, kept: Tensor) -> Tensor:
         """Cells between kept ones that have moved too, and what they enclose, bool; ``mean`` is the change of each cell."""

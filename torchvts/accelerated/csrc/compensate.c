@@ -203,9 +203,12 @@ typedef struct {
     atomic_int short_of_memory;
 } Modes;
 
+/* How many rows, or columns, are sampled of so many. */
+static int sampled(int length, int stride) { return (length - stride / 2 + stride - 1) / stride; }
+
 static void mode_of(void *with, int plane) {
     Modes *of = with;
-    const int stride = of->stride, rows = (of->height - stride / 2 + stride - 1) / stride, columns = (of->width - stride / 2 + stride - 1) / stride;
+    const int stride = of->stride, rows = sampled(of->height, stride), columns = sampled(of->width, stride);
     const float *image = of->image + (size_t)plane * of->height * of->width;
     float *some = malloc(2 * sizeof(float) * (size_t)rows * columns);
     if (!some) {
@@ -265,14 +268,50 @@ static void clean_band(void *with, int part) {
     if (of->modes && atomic_fetch_sub(&of->left[plane], 1) == 1) mode_of(of->modes, plane);
 }
 
-/* Levels (3) that Drift.by_mode() divides by, in place of modes. */
-static void to_levels(const Leveling *of, float *level) {
+/* How many of n samples (3, LINE) lie within `reach` of each of five levels in all three channels. */
+enum { LINE = 128 };
+WIDE static void count_near(float some[3][LINE], int n, const float level[5][3], float reach, int counts[5]) {
+    for (int k = 0; k < 5; k++) {
+        const float r = level[k][0], g = level[k][1], b = level[k][2];
+        int count = 0;
+        for (int j = 0; j < n; j++) count += (fabsf(some[0][j] - r) < reach) & (fabsf(some[1][j] - g) < reach) & (fabsf(some[2][j] - b) < reach);
+        counts[k] += count;
+    }
+}
+
+/* Drift.of_one_skin() of torchvts/compensate/drift.py: the drift of a frame, in place of what each channel by itself says. */
+static void make_of_one_skin(const Leveling *of, const float *image, int height, int width, float *drift) {
+    const float lowest = fminf(fminf(drift[0], drift[1]), drift[2]), highest = fmaxf(fmaxf(drift[0], drift[1]), drift[2]);
+    const int stride = of->stride, columns = sampled(width, stride);
+    float levels[5][3], some[3][LINE];
+    int counts[5] = {0}, best = 0, most;
+    if (highest - lowest < of->least_drift) return;
+    for (int k = 0; k < 5; k++)
+        for (int c = 0; c < 3; c++) levels[k][c] = k == 0 ? drift[c] : k < 4 ? drift[k - 1] : 0.0f;
+    for (int y = stride / 2; y < height; y += stride)
+        for (int first = 0; first < columns; first += LINE) {
+            const int n = least(columns - first, LINE);
+            for (int c = 0; c < 3; c++) {
+                const float *row = image + ((size_t)c * height + y) * width + stride / 2 + (size_t)first * stride;
+                for (int j = 0; j < n; j++) some[c][j] = row[(size_t)j * stride] - 1.0f;
+            }
+            count_near(some, n, levels, 2.0f * of->least_drift, counts);
+        }
+    most = 6 * counts[0];
+    for (int k = 1; k < 5; k++)
+        if (5 * counts[k] > most) most = 5 * counts[k], best = k;
+    for (int c = 0; c < 3; c++) drift[c] = levels[best][c];
+}
+
+/* Levels (3) that Drift.by_mode() divides an image by, in place of modes. */
+static void to_levels(const Leveling *of, const float *image, int height, int width, float *level) {
     float largest = 0.0f;
     for (int c = 0; c < 3; c++) {
         level[c] -= 1.0f;
         level[c] = level[c] < -of->most_drift ? -of->most_drift : level[c] > of->most_drift ? of->most_drift : level[c];
-        largest = fabsf(level[c]) > largest ? fabsf(level[c]) : largest;
     }
+    make_of_one_skin(of, image, height, width, level);
+    for (int c = 0; c < 3; c++) largest = fabsf(level[c]) > largest ? fabsf(level[c]) : largest;
     float weight = largest / of->least_drift - 1.0f;
     weight = weight < 0.0f ? 0.0f : weight > 1.0f ? 1.0f : weight;
     for (int c = 0; c < 3; c++) level[c] = 1.0f + weight * level[c];
@@ -295,7 +334,7 @@ EXPORT int clean(const float *image, const float *gain, const float *offset, con
         if (leveling) modal.stride = leveling->stride, modal.halvings = leveling->halvings, modal.mode = level + 3 * b, work.modes = &modal;
         share(clean_band, &work, 3 * bands);
         trouble |= work.trouble | modal.short_of_memory;
-        if (leveling) to_levels(leveling, level + 3 * b);
+        if (leveling) to_levels(leveling, work.light, height, width, level + 3 * b);
     }
     return trouble & 1 ? 1 : trouble;
 }
@@ -311,7 +350,7 @@ EXPORT int modes(const float *image, int planes, int height, int width, int stri
 EXPORT int levels(const float *image, int frames, int height, int width, int stride, int halvings, float least_drift, float most, float *level) {
     const Leveling how = {stride, halvings, least_drift, most};
     if (modes(image, 3 * frames, height, width, stride, halvings, level)) return 1;
-    for (int b = 0; b < frames; b++) to_levels(&how, level + 3 * b);
+    for (int b = 0; b < frames; b++) to_levels(&how, image + 3 * (size_t)height * width * b, height, width, level + 3 * b);
     return 0;
 }
 

@@ -282,12 +282,12 @@ typedef struct {
     uint8_t *line, *other_line;
 } Scratch;
 
-/* The grid of coarse cells: their number, side, and how the model of ContactMask looks at them. */
+/* The grid of coarse cells: their number, side, and how the model of ContactMask looks at them; least_square: of the least colour. */
 typedef struct {
     int rows, columns, cell, reach;
     float least_cells;
     int bridge;
-    float bridge_sigmas, tail_sigmas, least_spread, least_colour;
+    float bridge_sigmas, tail_sigmas, least_spread, least_square;
     Shape shape;
 } Grid;
 
@@ -570,28 +570,89 @@ static void keep_tail(const Grid *grid, const float per[3], Scratch at) {
     for (size_t k = 0; k < words_of(&grid->shape); k++) at.tail[k] ^= at.kept[k];
 }
 
-/* Whether the changes of all kept cells have the colour of slopes; where an LED has failed, two channels are too few to say. */
-static int coloured(const Frame *of) {
+/* Squares of each cell's mean change, relative: those of the light, at the least share that a colour has, and of the colour; of kept cells. */
+static void find_colours(const Frame *of, float *light, float *colour) {
     const Grid *grid = &of->grid;
     const int rows = grid->rows, columns = grid->columns, cell = grid->cell, words = grid->shape.words;
     const size_t pixels = (size_t)of->height * of->width, cells = (size_t)rows * columns;
-    float light = 0.0f, colour = 0.0f;
-    if (of->scale[0] <= 0.0f || of->scale[1] <= 0.0f || of->scale[2] <= 0.0f) return 1;
     for (int i = 0; i < rows; i++) {
         if (!any_bit(of->at.kept + (size_t)i * words, words)) continue;
         unpack_bits(of->at.kept + (size_t)i * words, &grid->shape, of->at.line);
         const size_t row = (size_t)(least(i * cell, of->height - cell) + cell / 2) * of->width;
         for (int j = 0; j < columns; j++) {
             if (!of->at.line[j]) continue;
-            const size_t at = row + least(j * cell, of->width - cell) + cell / 2;
+            const size_t at = row + least(j * cell, of->width - cell) + cell / 2, k = (size_t)i * columns + j;
             float change[3];
-            for (int c = 0; c < 3; c++) change[c] = of->at.means[c * cells + (size_t)i * columns + j] / (of->per_noise[c * pixels + at] * of->scale[c]);
+            for (int c = 0; c < 3; c++) change[c] = of->at.means[c * cells + k] / (of->per_noise[c * pixels + at] * of->scale[c]);
             const float red = change[0] - change[1], blue = change[2] - change[1];
-            light += change[0] * change[0] + change[1] * change[1] + change[2] * change[2];
-            colour += red * red + blue * blue;
+            light[k] = (change[0] * change[0] + change[1] * change[1] + change[2] * change[2]) / 3.0f * grid->least_square;
+            colour[k] = (red * red + blue * blue) / 2.0f;
         }
     }
-    return !(0.5f * colour < grid->least_colour * grid->least_colour * light / 3.0f);
+}
+
+/* Whether the cells of a mask, kept ones, have the colour of slopes all together. */
+static int coloured(const Grid *grid, const uint64_t *mask, const float *light, const float *colour, uint8_t *line) {
+    const int words = grid->shape.words;
+    float lights = 0.0f, colours = 0.0f;
+    for (int i = 0; i < grid->rows; i++) {
+        if (!any_bit(mask + (size_t)i * words, words)) continue;
+        unpack_bits(mask + (size_t)i * words, &grid->shape, line);
+        for (int j = 0; j < grid->columns; j++) {
+            const size_t k = (size_t)i * grid->columns + j;
+            if (line[j]) lights += light[k], colours += colour[k];
+        }
+    }
+    return !(colours < lights);
+}
+
+/* Kept cells that have the colour themselves, to at.one; those among them around which there is nearly a disc of the least size, to at.other. */
+static void find_own_colours(const Grid *grid, Scratch at, const float *light, const float *colour) {
+    const int rows = grid->rows, columns = grid->columns, reach = grid->reach, words = grid->shape.words;
+    for (int i = 0; i < rows; i++) {
+        const uint64_t *kept = at.kept + (size_t)i * words;
+        float *own = at.density + (size_t)i * columns;
+        unpack_bits(kept, &grid->shape, at.line);
+        for (int j = 0; j < columns; j++) {
+            at.line[j] = at.line[j] && colour[(size_t)i * columns + j] >= light[(size_t)i * columns + j];
+            own[j] = (float)at.line[j];
+        }
+        pack_bits(at.line, &grid->shape, at.one + (size_t)i * words);
+    }
+    for (int i = 0; i < rows; i++) {
+        uint64_t *core = at.other + (size_t)i * words;
+        memset(at.down, 0, sizeof(float) * (size_t)(columns + 2 * reach));
+        for (int k = i - reach < 0 ? 0 : i - reach; k <= i + reach && k < rows; k++) add_floats(at.density + (size_t)k * columns, columns, at.down + reach);
+        memset(at.sums, 0, sizeof(float) * (size_t)columns);
+        for (int k = 0; k <= 2 * reach; k++) add_floats(at.down + k, columns, at.sums);
+        above(at.sums, grid->least_cells, columns, at.line);
+        pack_bits(at.line, &grid->shape, core);
+        for (int w = 0; w < words; w++) core[w] &= at.one[(size_t)i * words + w];
+    }
+}
+
+/* Keeps all cells if they have the colour of slopes all together, else those parts that have it, with what lies between them. Where an LED has
+   failed, two channels are too few to say. */
+static void keep_coloured(const Frame *of) {
+    const Grid *grid = &of->grid;
+    const Shape *shape = &grid->shape;
+    const Scratch at = of->at;
+    const size_t words = words_of(shape);
+    float *light = at.some, *colour = at.some + (size_t)grid->rows * grid->columns;
+    if (of->scale[0] <= 0.0f || of->scale[1] <= 0.0f || of->scale[2] <= 0.0f) return;
+    find_colours(of, light, colour);
+    if (coloured(grid, at.kept, light, colour, at.line)) return;
+    find_own_colours(grid, at, light, colour);
+    flood(at.other, at.one, shape);
+    widen(at.other, shape, grid->bridge, at.solid, at.changed);
+    invert_bits(at.changed, shape, at.changed);
+    widen(at.changed, shape, grid->bridge, at.solid, at.one); /* what a closing leaves out */
+    for (size_t k = 0; k < words; k++) at.other[k] |= at.kept[k] & ~at.one[k];
+    invert_bits(at.other, shape, at.one);
+    flood_from_border(at.one, shape, at.changed);
+    for (size_t k = 0; k < words; k++) at.other[k] = at.kept[k] & ~at.changed[k];
+    const int enough = coloured(grid, at.other, light, colour, at.line);
+    for (size_t k = 0; k < words; k++) at.kept[k] = enough ? at.other[k] : 0, at.tail[k] &= at.kept[k];
 }
 
 /* Cells that decide for all their pixels: faint ones, and those none of whose neighbours lies outside of the contact; what is beyond the image
@@ -668,10 +729,7 @@ static int mask_frame(Frame *of) {
         keep_large(&of->grid, of->at);
         memset(of->at.tail, 0, sizeof(uint64_t) * words_of(&of->grid.shape));
         if (of->grid.bridge > 0) bridge_gaps(&of->grid, of->at), keep_tail(&of->grid, of->per_quarter, of->at);
-        if (of->grid.least_colour > 0.0f && !coloured(of)) {
-            memset(of->at.kept, 0, sizeof(uint64_t) * words_of(&of->grid.shape));
-            memset(of->at.tail, 0, sizeof(uint64_t) * words_of(&of->grid.shape));
-        }
+        if (of->grid.least_square > 0.0f) keep_coloured(of);
         find_solid(&of->grid, of->at);
         share(to_pixels, of, of->bands);
     } else {
@@ -695,7 +753,7 @@ EXPORT int contact_mask(const float *image, const float *divided, const float *o
                         float least_spread, float least_colour, const SmoothLight *smooth, float *surface, uint8_t *mask, uint8_t *inner,
                         uint8_t *tail) {
     const int rows = (height + cell - 1) / cell, columns = (width + cell - 1) / cell;
-    const Grid grid = {rows, columns, cell, reach, least_cells, bridge, bridge_sigmas, tail_sigmas, least_spread, least_colour, shape_of(rows, columns)};
+    const Grid grid = {rows, columns, cell, reach, least_cells, bridge, bridge_sigmas, tail_sigmas, least_spread, least_colour * least_colour, shape_of(rows, columns)};
     const size_t pixels = (size_t)height * width, cells = (size_t)rows * columns, words = words_of(&grid.shape), line = 64 * (size_t)grid.shape.words;
     uint64_t *masks = malloc(8 * sizeof(uint64_t) * words + sizeof(float) * (16 * cells + 6 + 2 * line + 2 * (size_t)reach) + 2 * (cells + line));
     if (!masks) return 1;

@@ -22,15 +22,8 @@ from torchvts.evaluation.score import Truth
 from torchvts.export import sample_frames
 from torchvts.model.response_field import TaughtRange
 from torchvts.pipeline import beyond_presses, bound_at
-from torchvts.pipeline.confidence import (
-    DEPTH_SPREAD,
-    FACTORS,
-    NOT_METRIC_DEG,
-    SPREAD_OF_MEAN,
-    UNMEASURED_DEG,
-    _length_95,
-    expected_model_deg,
-)
+from torchvts.pipeline.confidence import DEPTH_SPREAD, FACTORS, SPREAD_OF_MEAN, _length_95
+from torchvts.pipeline.expected_error import NOT_METRIC_DEG, UNMEASURED_DEG, expected_model_deg
 
 scenes = vts.scenes
 HEIGHT, WIDTH, PITCH = 48, 64, 0.6

@@ -10,7 +10,7 @@ from ..calibration import CalibrationWarning, Press, Touch, calibrate
 from ..evaluation.rows import markdown, number
 from ..model import Calibration, PointLights, Sensor
 from ..model.report import CandidateRow, PressRow, Report
-from ..pipeline.confidence import expected_model_deg
+from ..pipeline.expected_error import expected_model_deg
 from ..stream import NOT_METRIC, use_calibration
 
 SHOWN = 5

@@ -373,3 +373,13 @@ def test_skin_that_hangs_free_goes_on_below_the_threshold(height, width):
     with reference_only():
         assert torch.equal(mask(undeformed + change)[0, 0], moved)
     assert torch.equal(torch.jit.script(mask)(undeformed + change)[0, 0], moved)
+
+
+def test_a_tail_that_shares_memory_is_refused():
+    """A tail is written to: pixels that share memory would be written together."""
+    mask = vts.ContactMask(torch.ones(3, 48, 64), torch.full((3,), 0.002))
+    image, one = torch.ones(1, 3, 48, 64), torch.zeros(1, 1, 1, 1, dtype=torch.bool)
+    for find in (mask, torch.jit.script(mask)):
+        with pytest.raises(Exception, match="tail: expected memory of its own"):
+            find(image, tail=one.expand(1, 1, 48, 64))
+        assert not bool(find(image, tail=one.expand(1, 1, 48, 64).clone()).any())

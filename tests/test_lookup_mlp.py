@@ -575,6 +575,7 @@ def test_the_status_says_what_happened(capsys, monkeypatch):
         (1, lambda v: v * 2, ValueError, r"xy: expected columns in \[0, 31\] and rows in \[0, 23\]"),
         (1, lambda v: v - 3, ValueError, "x stands first"),
         (1, lambda v: v * torch.nan, ValueError, "xy: expected finite pixels"),
+        (1, lambda v: v.to(torch.float8_e4m3fn), TypeError, "xy: expected columns and rows as integers, float32 or float64"),
         (2, lambda v: v[:, :1], ValueError, r"slope: expected \(60, 2\)"),
         (2, lambda v: v / 0, ValueError, "slope: expected finite slopes up to 9.5, got inf: keep 3 pixels inside"),
         (2, lambda v: v * torch.nan, ValueError, "slope: expected finite slopes up to 9.5, got nan"),

@@ -228,6 +228,8 @@ class ContactMask(nn.Module):
                 raise ValueError(
                     f"tail: expected [{count}, 1, {height}, {width}] like compensated, got {list(tail.shape)}: it takes a result"
                 )
+            if 0 in tail.stride():
+                raise ValueError("tail: expected memory of its own for each pixel, got an expanded tensor: use .clone()")
         image = self.divided(compensated) if image is None else image
         found = self.find(compensated.detach(), image.detach())
         if tail is not None:

@@ -224,8 +224,8 @@ def _check_samples(intensity: Tensor, xy: Tensor, slope: Tensor, groups: Tensor)
     for name, values, shape in (("xy", xy, (count, 2)), ("slope", slope, (count, 2)), ("groups", groups, (count,))):
         check_shape(name, values, shape, "the pixels of intensity")
     check_float_tensor("slope", slope)
-    if xy.is_complex():
-        raise TypeError(f"xy: expected columns and rows, got {xy.dtype}")
+    if xy.is_complex() or (xy.is_floating_point() and xy.dtype not in (torch.float32, torch.float64)):
+        raise TypeError(f"xy: expected columns and rows as integers, float32 or float64, got {xy.dtype}")
     if groups.dtype not in (torch.int64, torch.int32):
         raise TypeError(f"groups: expected int64, the press of each pixel, got {groups.dtype}")
     check_range("intensity", intensity)

@@ -13,6 +13,7 @@ from torchvts.accelerated import library, reference_only
 from torchvts.cli.track import record
 from torchvts.core.frame import DepthOutput
 from torchvts.evaluation import pose_accuracy, tracking
+from torchvts.pose import tracker as tracker_module
 from torchvts.pose.follow import _pixels, adjoint, follow, orthonormal
 from torchvts.pose.graph import Edge, KeyframeGraph
 from torchvts.pose.height_errors import WHITE_MM, _covariance, _height_residuals, height_sums
@@ -192,6 +193,23 @@ def test_a_long_way_takes_keyframes_and_closes_the_loop():
         drift.append(found.drift_deg)
     assert len(tracker.graph.keyframes) > 2 and tracker.closures
     assert max(drift) > 0 and drift[-1] == 0.0 and found.keyframe == 0  # the reference is seen again
+
+
+def test_a_frame_becomes_a_keyframe_before_what_shows_the_rotation_is_gone(monkeypatch):
+    """The corners of a bolt head leave the image: its contact stays, and the first frame shows its rotation no more."""
+    slow = tracking.MOTIONS["slow"].pose
+    late = tracking.Motion(13, lambda k, seed: slow(k and 27 + k, seed))
+    track = tracking.record(objects.TARGETS["bolt head"], late, 0.005, 22, pose_accuracy.rig())
+    worst = []
+    for vaguer in (tracker_module.VAGUER, math.inf):
+        monkeypatch.setattr(tracker_module, "VAGUER", vaguer)
+        tracker = vts.PoseTracker(track.frames[0], track.mm_per_pixel)
+        tracker.restart(track.poses[1] @ invert(track.poses[0]))
+        found = [tracker(frame) for frame in track.frames[1:]]
+        worst.append(max(tracking.tracking_error(pose, track, k)[0] for k, pose in enumerate(found, 1)))
+        assert all(pose.overlap > 0.75 for pose in found[:-2])
+        assert (found[-1].keyframe > 0) == (vaguer < 100.0)
+    assert worst[0] < 0.1 < 0.2 < worst[1]
 
 
 def test_a_closed_loop_spreads_its_contradiction(keyframe):

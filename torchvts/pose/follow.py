@@ -46,6 +46,9 @@ UNSEEN = math.sqrt(2.0 / (5 * (PARTS - 1)))
 MOST_STD_DEG, MOST_STD_MM = 1.0, 0.15
 """Standard deviations of a motion, as a turn and as a shift, above which it is called unknown."""
 
+LEAST_SHARE = 1e-4
+"""Of all information: a direction of less has so much."""
+
 
 class Followed(NamedTuple):
     """A frame registered to a keyframe.
@@ -150,9 +153,20 @@ def _with_heights(fine: Sums, keyframe: Keyframe, frame: Grids, pose: Array) -> 
     return slopes, fine._replace(matrix=slopes.matrix + matrix, right=slopes.right + right)
 
 
-def common_share(keyframe: Keyframe, frame: Grids, sums: Sums, pixels: Pixels) -> float:
-    """Share of the smaller contact that both have in common, by the sums over fine pixels of the keyframe."""
-    return sums.used / pixels.number * keyframe.touching / max(min(keyframe.touching, frame.touching), 1)
+def in_common(keyframe: Keyframe, frame: Grids, pose: Array) -> tuple[float, float]:
+    """What a frame has in common with a keyframe under a pose (4, 4), T_frame_keyframe.
+
+    Returns:
+        The share of the smaller contact; and the variance of the pose that the pixels in common allow, in units of an error of
+        slopes alike everywhere. A bolt head whose corners leave the image keeps most of its contact, and little of it shows its
+        rotation.
+    """
+    sums = sum_residuals(frame.fine, keyframe.some, pose, SLOPE_NOISE)
+    share = sums.used / keyframe.some.number * keyframe.touching / max(min(keyframe.touching, frame.touching), 1)
+    known = _others(np.hstack((keyframe.held, np.eye(6)[:, 5:])))  # heights show z, and always
+    information = known.T @ sums.matrix @ known
+    information += (LEAST_SHARE * float(np.trace(information)) + 1e-9) * np.eye(len(information))  # 0 where nothing is in common
+    return share, float(np.trace(np.linalg.inv(information)))
 
 
 def orthonormal(pose: Array) -> Array:

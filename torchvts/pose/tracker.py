@@ -11,18 +11,24 @@ import torch
 from torch import Tensor
 
 from ..core.checks import check_positive
-from .alignment import MOST_COST, SLOPE_NOISE, agrees_enough
+from .alignment import MOST_COST, agrees_enough
 from .ambiguity import UNKNOWN_VARIANCE
 from .direct import align, check_rigid, symmetries
-from .follow import TRUSTED_DEG, TRUSTED_MM, Followed, common_share, cross, follow, orthonormal
+from .follow import TRUSTED_DEG, TRUSTED_MM, Followed, cross, follow, in_common, orthonormal
 from .graph import Edge, KeyframeGraph, moved_covariance
-from .inverse import LEAST_NOISE, Array, sum_residuals
+from .inverse import LEAST_NOISE, Array
 from .keyframe import Contact, Grids, Unusable, contact_frame, grids, make_keyframe, pitch_by_slopes
 from .relief import DepthFrame, levels
 from .result import Registration
 
 ENOUGH, RETURN = 0.5, 0.6
 """Share of the smaller contact in common below which a new keyframe is taken, and from which an older one is used again."""
+
+VAGUER = 2.0
+"""A pose whose variance is so many times the least since the keyframe was taken up makes a new keyframe."""
+
+GAIN = 0.75
+"""Beside itself a new keyframe has at most so much of the variance that the frame has beside the present one."""
 
 LEAST_CONTACT = 0.5
 """Share of the reference's contact that a keyframe must have at least."""
@@ -73,9 +79,10 @@ class PoseTracker:
 
     Each frame is aligned with a keyframe from the last pose: Gauss-Newton on slopes and heights of the pixels that touch in
     both, with derivatives computed once per keyframe. Motions that the contact does not determine keep their value and are named
-    in ``ambiguous``. Where the contact has little in common with the reference any more, frames become keyframes in turn; where an
-    older keyframe is seen again, the loop is closed and the drift since is spread over it. A pose that contradicts the frame is
-    not returned: ``lost`` says why, and the next frames are searched as :func:`register_depth` does, until the object is found.
+    in ``ambiguous``. Where the contact has little in common with the reference any more, or what they have in common shows the pose
+    less well, frames become keyframes in turn; where an older keyframe is seen again, the loop is closed and the drift since is
+    spread over it. A pose that contradicts the frame is not returned: ``lost`` says why, and the next frames are searched as
+    :func:`register_depth` does, until the object is found.
     Of a symmetric object it may then be found in another of its equal poses: from there on ``alternatives`` lists the others.
 
     Args:
@@ -89,7 +96,7 @@ class PoseTracker:
         ValueError: no contact, or one too small or too faint; a pitch that depth and slopes of the reference contradict.
     Source:
         inverse compositional: Baker, Matthews, IJCV 56(3), 2004; normals of tactile images by Gauss-Newton: Huang, Kaess, Yuan,
-        NormalFlow, arXiv 2412.09617.
+        NormalFlow, arXiv 2412.09617; keyframes by what a frame shows of the pose: Kerl, Sturm, Cremers, IROS 2013.
     Example:
         >>> from torchvts.scenes import objects
         >>> press = lambda deg, x: objects.press(objects.stamp("T"), objects.pose(deg, (x, 0.0)), 96, 128, 0.125)
@@ -122,6 +129,8 @@ class PoseTracker:
         self.closures: list[tuple[float, float]] = []
         self._size = tuple(frame.depth_mm.shape[-2:])
         self._active = 0
+        self._way = [0.0]  # variance that the way from the reference to each keyframe adds up to, as _in_common() has it
+        self._least = math.inf  # such a variance, of a frame since the present keyframe was taken up
         self._poses: list[Array] = [np.eye(4)]  # the last two; only the last one after a search
         self._tracking = True
         self._symmetries: list[Array] = []
@@ -176,14 +185,21 @@ class PoseTracker:
         return follow(self.graph.keyframes[index], frame, [start @ to_reference for start in starts])
 
     def _older_keyframe(self, frame: Grids, expected: Array) -> int | None:
-        """The oldest keyframe before the present one that the frame probably has much in common with."""
+        """The oldest keyframe before the present one that has much in common with the frame, and shows its pose no worse."""
+        if self._active == 0:
+            return None
+        _, variance = self._in_common(self._active, frame, expected)
+        most = self._way[self._active] + variance
         for k in range(self._active):
-            pose = expected @ np.linalg.inv(self.graph.poses[k])
-            keyframe = self.graph.keyframes[k]
-            sums = sum_residuals(frame.fine, keyframe.some, pose, SLOPE_NOISE, score_only=True)
-            if frame.touching < GROWN * keyframe.touching and common_share(keyframe, frame, sums, keyframe.some) > RETURN:
+            share, variance = self._in_common(k, frame, expected)
+            few = frame.touching < GROWN * self.graph.keyframes[k].touching
+            if few and share > RETURN and self._way[k] + variance < most:
                 return k
         return None
+
+    def _in_common(self, index: int, frame: Grids, pose: Array) -> tuple[float, float]:
+        """:func:`in_common` of a keyframe and a frame, by the pose of the reference in the frame."""
+        return in_common(self.graph.keyframes[index], frame, pose @ np.linalg.inv(self.graph.poses[index]))
 
     def _close_loop(self, older: int, found: Followed, also: Followed, starts: list[Array]) -> None:
         """Link the present keyframe with an older one by a frame that is registered to both, and go on with the older one."""
@@ -193,7 +209,7 @@ class PoseTracker:
             twist = self.graph.close(Edge(older, self._active, orthonormal(pose), covariance))
             middle = twist[3:] + np.cross(twist[:3], self.graph.keyframes[self._active].many.center)
             self.closures.append((math.degrees(float(np.linalg.norm(twist[:3]))), float(np.linalg.norm(middle))))
-        self._active = older
+        self._active, self._least = older, math.inf
 
     def _problem(self, index: int, found: Followed, starts: list[Array]) -> str:
         """Why a pose cannot be trusted; empty if it can."""
@@ -237,9 +253,12 @@ class PoseTracker:
                 continue
             probe = self.graph.keyframes[0].probe
             found = min(equal, key=lambda one: _distance(probe, one.pose @ chain, self._poses[-1]))
+            if found.free.shape[1] > self.graph.keyframes[index].held.shape[1]:
+                message = f"it touches, but too little to show its {', '.join(found.names)}"
+                continue  # what is unknown now would keep a value of long ago
             back = np.linalg.inv(found.pose @ chain)
             self._symmetries = [back @ one.pose @ chain for one in equal if one is not found]
-            self._active, self._tracking, self._poses = index, True, []
+            self._active, self._least, self._tracking, self._poses = index, math.inf, True, []
             return self._accept(contact, frame, found)
         return self._lose(f"not found again: {message}")
 
@@ -293,9 +312,11 @@ class PoseTracker:
         keyframe = graph.keyframes[index]
         large = frame.touching > LEAST_CONTACT * graph.keyframes[0].touching
         grown = frame.touching > GROWN * keyframe.touching
-        moved_on = large and common_share(keyframe, frame, found.fine, keyframe.many) < ENOUGH
-        if (grown or moved_on) and found.free.shape[1] <= keyframe.held.shape[1]:  # else what is unknown now would stay so
-            self._take_keyframe(contact, found)
+        share, variance = self._in_common(index, frame, pose)
+        self._least = min(self._least, variance)
+        moved_on, vague = large and share < ENOUGH, large and variance > VAGUER * self._least
+        if (grown or moved_on or vague) and found.free.shape[1] <= keyframe.held.shape[1]:  # else what is unknown now would stay so
+            self._take_keyframe(contact, found, variance, math.inf if grown or moved_on else GAIN * variance)
         center = found.pose[:3, :3] @ keyframe.many.center + found.pose[:3, 3]
         to_center = np.hstack((-cross(center), np.eye(3)))
         drift_deg = math.degrees(math.sqrt(float(np.trace(drift[:3, :3]))))
@@ -324,12 +345,17 @@ class PoseTracker:
             drift_mm=drift_mm,
         )
 
-    def _take_keyframe(self, contact: Contact, found: Followed) -> None:
+    def _take_keyframe(self, contact: Contact, found: Followed, variance: float, most: float) -> None:
+        """Go on with a frame as keyframe, if beside itself it has at most such a variance."""
         try:
             keyframe = make_keyframe(contact, self.mm_per_pixel)
         except ValueError:
             return  # too faint to be one
-        self._active = self.graph.add(keyframe, self._active, found.pose, found.covariance)
+        if in_common(keyframe, keyframe.grids, np.eye(4))[1] > most:
+            self._least = variance  # the contact is faint, and all of them are: tried again when it is vaguer still
+            return
+        self._way.append(self._way[self._active] + variance)
+        self._active, self._least = self.graph.add(keyframe, self._active, found.pose, found.covariance), math.inf
 
     def _lose(self, reason: str) -> TrackedPose:
         """No pose: the last one, as of no certainty."""

@@ -163,8 +163,7 @@ def in_common(keyframe: Keyframe, frame: Grids, pose: Array) -> tuple[float, flo
     """
     sums = sum_residuals(frame.fine, keyframe.some, pose, SLOPE_NOISE)
     share = sums.used / keyframe.some.number * keyframe.touching / max(min(keyframe.touching, frame.touching), 1)
-    known = _others(np.hstack((keyframe.held, np.eye(6)[:, 5:])))  # heights show z, and always
-    information = known.T @ sums.matrix @ known
+    information = keyframe.known.T @ sums.matrix @ keyframe.known
     information += (LEAST_SHARE * float(np.trace(information)) + 1e-9) * np.eye(len(information))  # 0 where nothing is in common
     return share, float(np.trace(np.linalg.inv(information)))
 

@@ -187,6 +187,12 @@ class Keyframe:
         """The largest of that part over all directions."""
         return float(self.bias.diagonal().max())
 
+    @cached_property
+    def known(self) -> Array:
+        """Orthonormal scaled twists (6, k) that slopes may show: neither those held, nor the shift along z, which heights show."""
+        beside = np.hstack((self.held, np.eye(6)[:, 5:]))
+        return np.linalg.qr(beside, mode="complete")[0][:, beside.shape[1] :]
+
 
 def make_keyframe(frame: Contact, mm_per_pixel: float) -> Keyframe:
     """Everything that is computed once of a reference.

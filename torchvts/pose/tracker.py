@@ -350,9 +350,9 @@ class PoseTracker:
         try:
             keyframe = make_keyframe(contact, self.mm_per_pixel)
         except ValueError:
-            return  # too faint to be one
-        if in_common(keyframe, keyframe.grids, np.eye(4))[1] > most:
-            self._least = variance  # the contact is faint, and all of them are: tried again when it is vaguer still
+            keyframe = None  # too faint to be one
+        if keyframe is None or in_common(keyframe, keyframe.grids, np.eye(4))[1] > most:
+            self._least = variance  # a keyframe takes long to make: tried again when the pose is vaguer still
             return
         self._way.append(self._way[self._active] + variance)
         self._active, self._least = self.graph.add(keyframe, self._active, found.pose, found.covariance), math.inf

@@ -16,7 +16,7 @@ from torchvts.evaluation import pose_accuracy, tracking
 from torchvts.pose import tracker as tracker_module
 from torchvts.pose.follow import _pixels, adjoint, follow, orthonormal
 from torchvts.pose.graph import Edge, KeyframeGraph
-from torchvts.pose.height_errors import WHITE_MM, _covariance, _height_residuals, height_sums
+from torchvts.pose.height_errors import WHITE_MM, _covariance, _height_residuals, _modes, height_sums
 from torchvts.pose.inverse import Sums, moved_by, refine, solve_step, step_between, sum_parts, sum_residuals
 from torchvts.pose.jackknife import ALIKE_MM, jackknife, shared_error
 from torchvts.pose.keyframe import PARTS, contact_frame, grids, make_keyframe
@@ -339,13 +339,27 @@ def test_heights_are_least_certain_far_from_undeformed_skin():
     deformed = np.zeros((14, 18), bool)
     deformed[3:11, 4:14] = True
     slope = 0.3 * np.random.default_rng(0).standard_normal((2, 14, 18))
-    found = _covariance(slope, deformed, 0.5)
+    found = _covariance(slope, deformed, 0.5, np.arange(80))
     std = np.sqrt(np.diag(found)).reshape(8, 10)
     assert std.min() == std[[0, 0, -1, -1], [0, -1, 0, -1]].min() and std[3:5, 4:6].min() > 1.5 * std[0].max()
     assert 0.5 * 0.037 < std.max() < 3.0 * 0.037  # slopes off by 0.037 over the 2 mm to the nearest undeformed skin
-    turned = _covariance(np.rot90(slope, axes=(1, 2)), np.rot90(deformed), 0.5)
+    turned = _covariance(np.rot90(slope, axes=(1, 2)), np.rot90(deformed), 0.5, np.arange(80))
     order = np.rot90(np.arange(80).reshape(8, 10)).ravel()
-    np.testing.assert_allclose(turned, found[np.ix_(order, order)], atol=1e-12)
+    np.testing.assert_allclose(turned, found[np.ix_(order, order)], rtol=1e-5)
+    some = np.array([3, 40, 41])
+    np.testing.assert_allclose(_covariance(slope, deformed, 0.5, some), found[np.ix_(some, some)], rtol=1e-9)
+
+
+def test_modes_of_heights_make_up_their_covariance():
+    deformed = np.zeros((14, 18), bool)
+    deformed[3:11, 4:14] = True
+    slope = 0.3 * np.random.default_rng(0).standard_normal((2, 14, 18))
+    covariance = _covariance(slope, deformed, 0.5, np.arange(80))
+    all_, some = _modes(covariance, 100), _modes(covariance, 40)
+    assert all_.shape == (80, 80) and some.shape == (80, 40)
+    np.testing.assert_allclose(all_ @ all_.T, covariance, atol=1e-9 * covariance.max())
+    left = np.diag(covariance - some @ some.T)
+    assert left.min() > -1e-12 and left.sum() < 0.1 * np.trace(covariance)
 
 
 def test_sums_of_heights_are_generalised_least_squares(keyframe):

@@ -25,11 +25,11 @@ def shared_error(places: Array, parts: int) -> float:
     """
     step = max(1, len(places) // (parts * 40))
     runs = [run[::step] for run in np.array_split(places, parts)]
-    alike = np.empty((parts, parts))
-    for i, one in enumerate(runs):
-        for k, other in enumerate(runs):
-            square = ((one[:, None] - other[None]) ** 2).sum(-1)
-            alike[i, k] = np.exp(-0.5 * square / ALIKE_MM**2).mean()
+    points, first = np.concatenate(runs), np.cumsum([0, *map(len, runs[:-1])])
+    square = 0.5 * (points * points).sum(1) / ALIKE_MM**2
+    alike = np.exp((points / ALIKE_MM**2) @ points.T - square[:, None] - square)
+    number = np.array([len(run) for run in runs])
+    alike = np.add.reduceat(np.add.reduceat(alike, first, 0), first, 1) / np.outer(number, number)
     own, all_ = float(np.trace(alike)) / parts, float(alike.sum())
     others = (all_ - parts * own) / (parts * (parts - 1))
     return (own + (parts - 1) * others) / max(own - others, 1e-3)

@@ -5,7 +5,10 @@ from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample, max_pool2d
+from torch.nn.functional import avg_pool2d, grid_sample
+
+from ..core.blur import blur
+from ..core.morphology import dilate
 
 LEAST_DEPTH_MM = 0.03
 """Skin less deep than this counts as the transition zone around a contact, where it does not lie on the object."""
@@ -132,7 +135,7 @@ def levels(frame: DepthFrame, mm_per_pixel: float, name: str) -> Levels:
 
 def without_rim(mask: Tensor) -> Tensor:
     """Remove the outermost pixels of a mask (1, H, W), unless hardly any others remain."""
-    core = -max_pool2d(-mask.float()[None], 3, 1, 1)[0] > 0.5
+    core = ~dilate(~mask[None])[0]
     return core if 5 * int(core.sum()) > 2 * int(mask.sum()) else mask
 
 
@@ -181,8 +184,8 @@ def relief(
     whole = share[:1] > (0.99 if times <= 2 else 0.5)
     if times <= 2:
         whole = without_rim(whole)  # half of the rim is transition zone
-    near = max_pool2d((share[1:] > 0.01).float()[None], 3, 1, 1)[0] > 0.5
-    smooth = _blur(stack[1:])
+    near = dilate(share[None, 1:] > 0.01)[0]
+    smooth = blur(stack[None, 1:], [0.25, 0.5, 0.25])[0]
     p_y, p_x = torch.gradient(smooth[0], spacing=pitch)
     q_y, q_x = torch.gradient(smooth[1], spacing=pitch)
     field = torch.cat((stack, p_x[None], 0.5 * (q_x - p_y)[None], -q_y[None]))
@@ -190,10 +193,3 @@ def relief(
     row, column = torch.nonzero(mask, as_tuple=True)
     points = torch.stack((x0 + column * pitch, y0 - row * pitch, stack[0][mask]), dim=1)
     return Relief(field, mask, near[0], x0, y0, pitch, points, stack[1:, mask].T.contiguous())
-
-
-def _blur(field: Tensor) -> Tensor:
-    kernel = torch.tensor([0.25, 0.5, 0.25])
-    padded = torch.nn.functional.pad(field[:, None], (1, 1, 1, 1), mode="replicate")
-    across = torch.nn.functional.conv2d(padded, kernel.reshape(1, 1, 1, 3))
-    return torch.nn.functional.conv2d(across, kernel.reshape(1, 1, 3, 1))[:, 0]

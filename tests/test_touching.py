@@ -150,6 +150,20 @@ def test_slopes_of_noise_are_no_contact_and_light_presses_beside_them_are(smooth
     assert not bool((contact & patch).any()) and bool(contact[truth].float().mean() > 0.9)
 
 
+def test_no_pixel_decides_all_at_once_how_deep_the_skin_around_it_is():
+    y, x = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
+    depth = (1.0 - ((x - 80.0) ** 2 + (y - 60.0) ** 2) / 900.0).clamp_min(0.0)[None, None]
+    deformed = ((x - 80.0).square() + (y - 60.0).square() < 45.0**2)[None, None]
+    beside, low = [], torch.linspace(0.0, 0.04, 81)
+    for by in low:
+        one = depth.clone()
+        one[..., 60, 118] = -float(by)
+        beside.append(float(ZeroBackground()(one, deformed)[..., 60, 116]))
+    steps = torch.tensor(beside).diff().abs()
+    assert beside[20] == beside[0]  # 1 % of the depth is left as it is
+    assert float(steps.max()) < 0.1 * abs(beside[-1] - beside[0]) and abs(beside[-1] - beside[0]) > 1e-3
+
+
 def test_a_pocket_of_errors_makes_no_face_of_the_skin_around_it_and_a_cut_face_stays():
     deformed = torch.zeros(1, 1, 96, 128, dtype=torch.bool)
     deformed[..., 30:60, 40:90] = True

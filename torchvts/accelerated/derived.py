@@ -48,7 +48,7 @@ def flat_is_one(block: ContactMask) -> bool:
 
 
 def pedestals(block: Gain) -> "ctypes.Array[ctypes.c_float] | None":
-    """What the offset is of the gain, where it is one number a channel, but for rounding; else None."""
+    """What the offset is of the gain, where it is exactly one number a channel; else None."""
     gain, offset = block.gain, block.offset
     if gain is None or offset is None:
         return None
@@ -56,11 +56,10 @@ def pedestals(block: Gain) -> "ctypes.Array[ctypes.c_float] | None":
 
 
 def _pedestals(gain: Tensor, offset: Tensor) -> "ctypes.Array[ctypes.c_float] | None":
-    ratio = offset.double() / gain.double()
-    middle = ratio.flatten(1).mean(dim=1)
-    if not bool(((ratio - middle[:, None, None]).abs() <= 3e-7 * middle.abs()[:, None, None]).all()):
+    found = (offset.double() / gain.double()).flatten(1).mean(dim=1).to(gain.dtype)
+    if not torch.equal(found[:, None, None] * gain, offset):
         return None
-    return (ctypes.c_float * 3)(*middle.tolist())
+    return (ctypes.c_float * 3)(*found.tolist())
 
 
 def response_lines(block: NormalFromResponse) -> ResponseLines | None:

@@ -202,7 +202,7 @@ class SmoothLight(ctypes.Structure):
 
     _fields_ = (
         *((name, ctypes.c_int32) for name in ("height", "width", "stride", "rows", "columns", "samples", "steps")),
-        ("most", ctypes.c_float),
+        ("most", ctypes.c_double),
         *((name, ctypes.c_void_p) for name in ("place", "along_x", "along_y", "per_square", "peaks")),
     )
 
@@ -226,11 +226,11 @@ def smooth_tables(height: int, width: int) -> SmoothTables | None:
         return None
     with torch.inference_mode(False):
         stride = smooth.smooth_stride(height, width)
-        place = smooth.smooth_basis(height, width, stride).float()
+        place = smooth.smooth_basis(height, width, stride)
         rows, columns = place.shape[1], place.shape[2]
         place = torch.nn.functional.pad(place.flatten(1), [0, -rows * columns % 16]).contiguous()
         along_x, along_y = (smooth.legendre(length, 1)[1:].float().contiguous() for length in (width, height))
-        scales = torch.tensor([smooth.per_square(step) for step in range(smooth.STEPS)])
+        scales = torch.tensor([smooth.per_square(step) for step in range(smooth.STEPS)], dtype=torch.float64)
         memory = (place, along_x, along_y, scales, smooth.peaks())
     pointers = (tensor.data_ptr() for tensor in memory)
     return SmoothTables(

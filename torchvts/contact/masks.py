@@ -280,10 +280,10 @@ class ContactMask(nn.Module):
 
     def change(self, compensated: Tensor, image: Tensor) -> Change:
         """The change of an image, in units of the calibrated noise; ``compensated`` is the same before it was :meth:`divided`."""
-        change = torch.addcmul(self.offset, image, self.per_noise)
+        change = image * self.per_noise + self.offset  # each rounded, as compiled kernels do: a fused operator rounds once
         first, stride = self.stride // 2, self.stride
         offset, per_noise = self.offset[:, first::stride], self.per_noise[:, first::stride]
-        rows = torch.addcmul(offset, compensated.detach()[:, :, first::stride], per_noise)
+        rows = compensated.detach()[:, :, first::stride] * per_noise + offset
         noise = torch.maximum(self.noise(rows), self.far_field(rows)).clamp_min(1.0)
         # rounding to 8 bits of smooth light is no white noise, and second differences miss it
         scale = torch.rsqrt(noise * noise + self.rounding)
@@ -293,7 +293,7 @@ class ContactMask(nn.Module):
             scale = scale * (~failed).to(change.dtype)
         change = change * scale[:, :, None, None]
         r, g, b = change[:, 0:1], change[:, 1:2], change[:, 2:3]
-        squared = torch.addcmul(torch.addcmul(r * r, g, g), b, b)
+        squared = r * r + g * g + b * b
         return Change(change, squared, self.sigmas**2, scale)
 
     def noise(self, rows: Tensor) -> Tensor:

@@ -5,6 +5,8 @@ import math
 import torch
 from torch import Tensor
 
+from .precision import widened
+
 
 def noise_std(image: Tensor, samples: int = 8000) -> Tensor:
     """Noise of each channel, from second differences along rows: what is smooth, contact too, hardly enters.
@@ -92,9 +94,9 @@ def dark_below(flat: Tensor, three_noises: Tensor) -> Tensor:
 
 def clipped_std(values: Tensor, std: Tensor) -> Tensor:
     """Standard deviation (B, C, 1) of the absolute values (B, C, N) within three standard deviations, from a first estimate."""
-    squared = values * values
+    squared = widened(values * values)
     for _ in range(2):
-        near = (values <= 3.0 * std).to(values.dtype)
+        near = (values <= 3.0 * std).to(squared.dtype)
         mean = (squared * near).sum(dim=2, keepdim=True) / near.sum(dim=2, keepdim=True).clamp_min(1.0)
-        std = torch.sqrt(mean / 0.97334)  # mean of x^2 of a standard Gaussian x within three standard deviations
+        std = torch.sqrt(mean / 0.97334).to(values.dtype)  # mean of x^2 of a standard Gaussian x within three standard deviations
     return std

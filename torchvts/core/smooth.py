@@ -1,7 +1,9 @@
 """A smooth change of the light over the image, found in the undeformed part of a frame and divided out."""
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
+
+from .precision import widened
 
 SAMPLES = 24
 """Samples along the shorter side from which the change is found; smaller images are taken to have none."""
@@ -34,8 +36,9 @@ def smooth_change(ratio: Tensor, samples: int = SAMPLES, steps: int = STEPS, mos
     if min(height, width) < samples:
         return found
     stride = smooth_stride(height, width)
-    change = grid_samples(ratio, stride).flatten(2) - 1.0  # (B, 3, N)
+    change = widened(grid_samples(ratio, stride).flatten(2) - 1.0)  # (B, 3, N)
     place = smooth_basis(height, width, stride).to(change).flatten(1)  # (6, N)
+    found = found.to(change.dtype)
     place = place.expand(count, -1, -1)
     across = place.transpose(1, 2) / float(place.shape[2])
     for step in range(steps):
@@ -45,7 +48,7 @@ def smooth_change(ratio: Tensor, samples: int = SAMPLES, steps: int = STEPS, mos
         # terms are orthonormal and weights at most 1, so the sum of losses falls with every step
         found = torch.baddbmm(found, left * (weight * weight), across)
     largest = (found.abs() * peaks().to(found)).sum(dim=2, keepdim=True)
-    return found * (most / largest.clamp_min(most))
+    return (found * (most / largest.clamp_min(most))).to(ratio.dtype)
 
 
 def without_smooth_change(ratio: Tensor) -> Tensor:
@@ -55,12 +58,13 @@ def without_smooth_change(ratio: Tensor) -> Tensor:
 
 def over_smooth(ratio: Tensor, coefficients: Tensor) -> Tensor:
     """Images (B, 3, H, W) over 1 + the surface of coefficients (B, 3, 6), to second order: at 5 % off by 0.01 %."""
-    x, y = legendre(ratio.shape[3], 1).to(ratio), legendre(ratio.shape[2], 1).to(ratio)
-    # terms in the order of smooth_basis, as a matrix: degree of y, degree of x
-    order = torch.tensor([0, 1, 3, 2, 4, 6, 5, 6, 6], device=ratio.device)
-    terms = nn.functional.pad(coefficients, [0, 1]).index_select(2, order).reshape(-1, 3, 3, 3)
-    surface = y.t() @ terms @ x
-    return torch.addcmul(ratio, ratio, torch.addcmul(surface, surface, surface, value=-1.0), value=-1.0)
+    x, y = legendre(ratio.shape[3], 1).to(ratio), legendre(ratio.shape[2], 1).to(ratio)[:, :, None]
+    terms = coefficients[..., None, None]  # in the order of smooth_basis
+    constant = terms[:, :, 0] + terms[:, :, 2] * y[1] + terms[:, :, 5] * y[2]  # (B, 3, H, 1)
+    once = terms[:, :, 1] + terms[:, :, 4] * y[1]
+    # product by product and sum by sum, as compiled kernels do: a fused operator rounds otherwise
+    surface = constant + once * x[1] + terms[:, :, 3] * x[2]
+    return ratio * (1.0 - surface + surface * surface)
 
 
 def grid_samples(image: Tensor, stride: int) -> Tensor:
@@ -93,8 +97,8 @@ def smooth_basis(height: int, width: int, stride: int) -> Tensor:
 
 
 def peaks() -> Tensor:
-    """Largest values of these, (6,)."""
-    return torch.tensor([1.0, 3.0**0.5, 3.0**0.5, 5.0**0.5, 3.0, 5.0**0.5])
+    """Largest values of these, (6,), float64."""
+    return torch.tensor([1.0, 3.0**0.5, 3.0**0.5, 5.0**0.5, 3.0, 5.0**0.5], dtype=torch.float64)
 
 
 def legendre(length: int, stride: int) -> Tensor:

@@ -11,7 +11,7 @@ STIFF = 30.0
 """How much less the deepest skin bends to the continuation than undeformed skin: slopes are calibrated in contact only."""
 
 TOLERANCE = 0.01
-"""Depth below zero that is left, as a share of the largest depth."""
+"""Depth below zero that is left, as a share of the largest depth; from twice that none is."""
 
 LEAST_LOW = 0.02
 """Share of the skin without change below which its lower part is a pocket of errors, and no undeformed skin around a face."""
@@ -68,22 +68,23 @@ class ZeroBackground(nn.Module):
         weights = _pyramid(cell_means(1.0 + self.stiff * above * above, cell))
         around = [mean_around(weight) for weight in weights]
         cells = torch.cat((cell_means(known + raised, cell), cell_means(torch.addcmul(values, raised, level), cell)), dim=1)
-        offset = _pixels(self.continued(cells, weights, around), cell, height, width)
-        too_low = ~free & (depth_mm < offset - self.tolerance * range_mm)  # that too is an error
-        if may_read(too_low) and not _any(too_low):
+        offset = _pixels(self.continued(cells, weights, around, cell), cell, height, width)
+        # depth below zero is an error too: beyond a tolerance pixels begin to be known, and no pixel decides all at once
+        below = ((offset - depth_mm) / (self.tolerance * range_mm) - 1.0).clamp(0.0, 1.0).masked_fill(free, 0.0)
+        if may_read(below) and not bool(below.any()):
             return (depth_mm - offset) * (1.0 - known)
-        below = _as(too_low, depth_mm)
         cells = cells + torch.cat((cell_means(below, cell), cell_means(depth_mm * below, cell)), dim=1)
-        offset = _pixels(self.continued(cells, weights, around), cell, height, width)
+        offset = _pixels(self.continued(cells, weights, around, cell), cell, height, width)
         return (depth_mm - offset) * (1.0 - known)
 
-    def continued(self, known: Tensor, weights: list[Tensor], around: list[Tensor]) -> Tensor:
+    def continued(self, known: Tensor, weights: list[Tensor], around: list[Tensor], cell: int) -> Tensor:
         """Values continued to all cells, (B, 1, h, w).
 
         Args:
             known: (B, 2, h, w): the share of a cell on which the value is known, and the mean of the value, 0 where it is unknown.
             weights: (B, 1, h, w) and coarser: the weight of a cell, whose square is the stiffness against the continuation.
             around: the mean of these weights over 3 x 3 cells.
+            cell: pixels a side of a cell. Cells in which less than a pixel is known are known in part.
         """
         grids = _pyramid(known)
         mean = grids[-1][:, 1:2].sum(dim=(2, 3), keepdim=True) / grids[-1][:, 0:1].sum(dim=(2, 3), keepdim=True).clamp_min(1e-9)
@@ -92,9 +93,10 @@ class ZeroBackground(nn.Module):
             share, weight = grids[k][:, 0:1], weights[k]
             if k < len(grids) - 1:
                 found = _pixels(found, 2, share.shape[2], share.shape[3])
-            free = weight.masked_fill(share > 0.0, 0.0)
+            sure = (share * float((cell << k) ** 2)).clamp_max(1.0)
+            free = weight * (1.0 - sure)
             # of the products weight * value: those that are known, and the part of the mean around that others take
-            held, taken = weight * (grids[k][:, 1:2] / share.clamp_min(1e-9)), free / around[k]
+            held, taken = weight * (sure * (grids[k][:, 1:2] / share.clamp_min(1e-9))), free / around[k]
             product = torch.addcmul(held, free, found)
             for _ in range(self.sweeps):
                 product = torch.addcmul(held, taken, mean_around(product))

@@ -247,7 +247,7 @@ class Calibration:
         ambient light, times the gain.
         """
         if self.response is not None:
-            return PEDESTAL / (self.background + PEDESTAL)
+            return PEDESTAL * (1.0 / (self.background + PEDESTAL))  # exactly so many times the gain
         if self.ambient is None:
             return None
         offset, gain = -self.ambient.reshape(3, 1, 1), self.gain

@@ -16,13 +16,13 @@ EXPORT void grid_means(const float *image, int planes, int height, int width, in
 /* Whether a value is not in [0, 1], or no number. */
 static inline int is_outside(float value) { return !((value >= -1e-3f) & (value <= 1.001f)); }
 
-/* image * gain + offset, either of which may be null; without offset (image + pedestal) * gain. Returns whether any value of the image is not in
+/* image * gain + offset, either of which may be null; without offset image * gain + pedestal * gain. Returns whether any value of the image is not in
    [0, 1]. */
 WIDE static int multiply_add(const float *restrict image, const float *restrict gain, const float *restrict offset, float pedestal, int n,
                              float *restrict light) {
     int outside = 0;
     if (gain && !offset && pedestal != 0.0f)
-        for (int x = 0; x < n; x++) light[x] = (image[x] + pedestal) * gain[x], outside |= is_outside(image[x]);
+        for (int x = 0; x < n; x++) light[x] = image[x] * gain[x] + pedestal * gain[x], outside |= is_outside(image[x]);
     else if (gain && offset)
         for (int x = 0; x < n; x++) light[x] = image[x] * gain[x] + offset[x], outside |= is_outside(image[x]);
     else if (gain)

@@ -59,22 +59,23 @@ static float median(const float *values, int n, float *few) { return kth_or_none
 
 enum { LANES = 16 };
 
-/* Standard deviation of the values within three standard deviations. */
+/* Standard deviation of the values within three standard deviations; in double, so that the order of the sums leaves no trace. */
 WIDE static float clipped_std(const float *restrict values, int n, float std) {
-    float totals[LANES] = {0.0f}, most = 3.0f * std, total = 0.0f;
+    double totals[LANES] = {0.0}, total = 0.0;
+    const float most = 3.0f * std;
     int counts[LANES] = {0}, count = 0, k = 0;
     for (; k + LANES <= n; k += LANES)
         for (int j = 0; j < LANES; j++) {
             const float value = values[k + j];
-            totals[j] += value <= most ? value * value : 0.0f;
+            totals[j] += (double)(value <= most ? value * value : 0.0f);
             counts[j] += value <= most;
         }
     for (; k < n; k++) {
-        total += values[k] <= most ? values[k] * values[k] : 0.0f;
+        total += (double)(values[k] <= most ? values[k] * values[k] : 0.0f);
         count += values[k] <= most;
     }
     for (int j = 0; j < LANES; j++) total += totals[j], count += counts[j];
-    return sqrtf(total / (float)(count > 0 ? count : 1) / 0.97334f);
+    return (float)sqrt(total / (double)(count > 0 ? count : 1) / 0.97334);
 }
 
 /* The change of a pixel, in units of the calibrated noise. offset may be null: then the undeformed skin is 1. */

@@ -75,8 +75,10 @@ void share(PartOfWork work, void *with, int parts);
    then zeros up to a multiple of 16; along_x (2, width), along_y (2, height): Legendre polynomials of degree 1 and 2; per_square: of each step. */
 typedef struct {
     int32_t height, width, stride, rows, columns, samples, steps;
-    float most;
-    const float *place, *along_x, *along_y, *per_square, *peaks;
+    double most;
+    const double *place;
+    const float *along_x, *along_y;
+    const double *per_square, *peaks;
 } SmoothLight;
 
 EXPORT void grid_means(const float *image, int planes, int height, int width, int stride, int first, int rows, int columns, float *means);

@@ -3,19 +3,19 @@
 
 #include <math.h>
 
-enum { LANES = 16, TERMS = 6 };
+enum { LANES = 8, TERMS = 6 };
 
 /* LANES values that one instruction works on, which may lie anywhere in memory; and their bits. Of this type, all sums below stay in registers. */
-typedef float Lanes __attribute__((vector_size(sizeof(float) * LANES), aligned(sizeof(float)), may_alias));
-typedef int32_t Bits __attribute__((vector_size(sizeof(float) * LANES), aligned(sizeof(float)), may_alias));
+typedef double Lanes __attribute__((vector_size(sizeof(double) * LANES), aligned(sizeof(double)), may_alias));
+typedef int64_t Bits __attribute__((vector_size(sizeof(double) * LANES), aligned(sizeof(double)), may_alias));
 
-static inline const Lanes *lanes_at(const float *values) { return (const Lanes *)values; }
+static inline const Lanes *lanes_at(const double *values) { return (const Lanes *)values; }
 
 /* What of the change (3, n) is not explained by the surface so far, weighted, times each term of place (TERMS, n): (3, TERMS). n is a multiple
-   of LANES. */
-WIDE FUSED static void surface_sums(const float *restrict change, const float *restrict place, int n, const float *restrict found, float per_square,
-                                    float *restrict sum) {
-    const Lanes zero = {0.0f};
+   of LANES. In double, so that the order of the sums leaves no trace in the result. */
+WIDE FUSED static void surface_sums(const double *restrict change, const double *restrict place, int n, const double *restrict found,
+                                    double per_square, double *restrict sum) {
+    const Lanes zero = {0.0};
     Lanes total[3 * TERMS];
     for (int k = 0; k < 3 * TERMS; k++) total[k] = zero;
     for (int first = 0; first < n; first += LANES) {
@@ -25,7 +25,7 @@ WIDE FUSED static void surface_sums(const float *restrict change, const float *r
             left[c] = *lanes_at(change + (size_t)c * n + first);
             UNROLLED for (int k = 0; k < TERMS; k++) left[c] -= found[c * TERMS + k] * term[k];
         }
-        Lanes weight = 1.0f - (left[0] * left[0] + left[1] * left[1] + left[2] * left[2]) * per_square;
+        Lanes weight = 1.0 - (left[0] * left[0] + left[1] * left[1] + left[2] * left[2]) * per_square;
         weight = (Lanes)((weight > zero) & (Bits)(weight * weight));
         UNROLLED for (int c = 0; c < 3; c++) {
             left[c] *= weight;
@@ -33,13 +33,13 @@ WIDE FUSED static void surface_sums(const float *restrict change, const float *r
         }
     }
     for (int k = 0; k < 3 * TERMS; k++) {
-        sum[k] = 0.0f;
+        sum[k] = 0.0;
         for (int j = 0; j < LANES; j++) sum[k] += total[k][j];
     }
 }
 
 /* Change at the samples of an image (3, height, width): (3, n), zero beyond the samples that there are. */
-static void sample_change(const SmoothLight *of, const float *image, float *means, float *change) {
+static void sample_change(const SmoothLight *of, const float *image, float *means, double *change) {
     const int height = of->height, width = of->width, samples = of->rows * of->columns, n = of->samples, stride = of->stride;
     if (stride < 3) {
         for (int c = 0, at = 0; c < 3; c++)
@@ -49,25 +49,26 @@ static void sample_change(const SmoothLight *of, const float *image, float *mean
         grid_means(image, 3, height, width, stride, stride / 2 - 1, of->rows, of->columns, means);
     }
     for (int c = 0; c < 3; c++)
-        for (int k = 0; k < samples; k++) change[(size_t)c * n + k] = means[(size_t)c * samples + k] - 1.0f;
+        for (int k = 0; k < samples; k++) change[(size_t)c * n + k] = (double)(means[(size_t)c * samples + k] - 1.0f);
 }
 
 /* Coefficients of the change of images (frames, 3, height, width): (frames, 3, TERMS). Returns 1 where memory is short. */
-EXPORT int smooth_change(const SmoothLight *of, const float *image, int frames, float *found) {
+EXPORT int smooth_change(const SmoothLight *of, const float *image, int frames, float *coefficients) {
     const int samples = of->rows * of->columns;
-    float sum[3 * TERMS], *change = calloc(3 * ((size_t)of->samples + samples), sizeof(float)), *means = change + 3 * (size_t)of->samples;
+    double sum[3 * TERMS], *change = calloc(3 * ((size_t)of->samples + samples), sizeof(double));
+    float *means = (float *)(change + 3 * (size_t)of->samples);
     if (!change) return 1;
-    for (int b = 0; b < frames; b++, image += 3 * (size_t)of->height * of->width, found += 3 * TERMS) {
+    for (int b = 0; b < frames; b++, image += 3 * (size_t)of->height * of->width, coefficients += 3 * TERMS) {
+        double found[3 * TERMS] = {0.0};
         sample_change(of, image, means, change);
-        memset(found, 0, sizeof(float) * 3 * TERMS);
         for (int step = 0; step < of->steps; step++) {
             surface_sums(change, of->place, of->samples, found, of->per_square[step], sum);
-            for (int k = 0; k < 3 * TERMS; k++) found[k] += sum[k] / (float)samples;
+            for (int k = 0; k < 3 * TERMS; k++) found[k] += sum[k] / (double)samples;
         }
         for (int c = 0; c < 3; c++) {
-            float largest = 0.0f;
-            for (int k = 0; k < TERMS; k++) largest += fabsf(found[c * TERMS + k]) * of->peaks[k];
-            for (int k = 0; k < TERMS; k++) found[c * TERMS + k] *= of->most / (largest > of->most ? largest : of->most);
+            double largest = 0.0;
+            for (int k = 0; k < TERMS; k++) largest += fabs(found[c * TERMS + k]) * of->peaks[k];
+            for (int k = 0; k < TERMS; k++) coefficients[c * TERMS + k] = (float)(found[c * TERMS + k] * (of->most / (largest > of->most ? largest : of->most)));
         }
     }
     free(change);

@@ -11,11 +11,12 @@
 /* What is known of a pixel. */
 enum { DEFORMED = 0, FLAT = 1, RAISED = 2 };
 
-/* One grid: rows x columns cells and a border of zeros around them, `wide` cells from row to row. Share on which the value is known, sum of
-   known values, weight; then 1 over the mean weight of nine cells, weight * found, and what was found. */
+/* One grid: rows x columns cells of so many pixels and a border of zeros around them, `wide` cells from row to row. Share on which the value is
+   known, sum of known values, weight; then 1 over the mean weight of nine cells, weight * found, what was found, and the known part of that and
+   the share of the rest. */
 typedef struct {
     int rows, columns, wide;
-    float *share, *value, *weight, *per_weight, *product, *found;
+    float pixels, *share, *value, *weight, *per_weight, *product, *found, *held, *open;
 } Grid;
 
 /* Pixels of a box: rows top to bottom, columns left to right, the ends outside. */
@@ -48,18 +49,20 @@ WIDE static void weigh(Grid *grid) {
     }
 }
 
-/* Known cells get their value. */
+/* Cells in which a pixel or more is known get its value, those in which less is known a part of it. */
 WIDE static void set_known(Grid *grid) {
     const size_t cells = (size_t)(grid->rows + 2) * grid->wide;
-    const float *restrict share = grid->share, *restrict value = grid->value;
-    float *restrict found = grid->found;
+    const float *restrict share = grid->share, *restrict value = grid->value, pixels = grid->pixels;
+    float *restrict found = grid->found, *restrict held = grid->held, *restrict open = grid->open;
     for (size_t k = 0; k < cells; k++) {
-        const float known = value[k] / (share[k] > 1e-9f ? share[k] : 1e-9f);
-        found[k] = share[k] > 0.0f ? known : found[k];
+        const float known = share[k] * pixels, sure = known < 1.0f ? known : 1.0f;
+        held[k] = sure * (value[k] / (share[k] > 1e-9f ? share[k] : 1e-9f));
+        open[k] = 1.0f - sure;
+        found[k] = held[k] + open[k] * found[k];
     }
 }
 
-/* Unknown cells become the weighted mean of the nine around them, once. */
+/* The unknown part of cells becomes the weighted mean of the nine around them, once. */
 WIDE static void relax(Grid *grid) {
     const int wide = grid->wide, columns = grid->columns;
     const size_t cells = (size_t)(grid->rows + 2) * wide;
@@ -67,13 +70,13 @@ WIDE static void relax(Grid *grid) {
     float *restrict product = grid->product;
     for (size_t k = 0; k < cells; k++) product[k] = weight[k] * before[k];
     for (int y = 0; y < grid->rows; y++) {
-        const float *p = cell_of(grid, grid->product, y), *restrict share = cell_of(grid, grid->share, y);
-        const float *restrict per_weight = cell_of(grid, grid->per_weight, y);
+        const float *p = cell_of(grid, grid->product, y), *restrict held = cell_of(grid, grid->held, y);
+        const float *restrict open = cell_of(grid, grid->open, y), *restrict per_weight = cell_of(grid, grid->per_weight, y);
         float *restrict found = cell_of(grid, grid->found, y);
         for (int x = 0; x < columns; x++) {
             const float *at = p + x;
             const float sum = at[-wide - 1] + at[-wide] + at[-wide + 1] + at[-1] + at[0] + at[1] + at[wide - 1] + at[wide] + at[wide + 1];
-            found[x] = share[x] > 0.0f ? found[x] : sum * per_weight[x];
+            found[x] = held[x] + open[x] * (sum * per_weight[x]);
         }
     }
 }
@@ -224,15 +227,17 @@ WIDE static void add_row(const float *restrict depth, const uint8_t *restrict ki
     }
 }
 
-/* Deformed pixels of a row that lie below what was found less `most`, added in the same way. Returns whether there are any. */
-WIDE static int add_below(const float *restrict depth, const uint8_t *restrict kind, const float *restrict found, float most, int n,
+/* Deformed pixels of a row that lie below what was found by more than a tolerance, added in the same way: twice as far below, in full. Returns
+   whether there are any. */
+WIDE static int add_below(const float *restrict depth, const uint8_t *restrict kind, const float *restrict found, float per_tolerance, int n,
                           float *restrict share, float *restrict value) {
     int any = 0;
     for (int x = 0; x < n; x++) {
-        const int below = kind[x] == DEFORMED && depth[x] < found[x] - most;
-        share[x] += below ? 1.0f : 0.0f;
-        value[x] += below ? depth[x] : 0.0f;
-        any |= below;
+        const float low = (found[x] - depth[x]) * per_tolerance - 1.0f;
+        const float known = kind[x] == DEFORMED && low > 0.0f ? (low < 1.0f ? low : 1.0f) : 0.0f;
+        share[x] += known;
+        value[x] += known * depth[x];
+        any |= known > 0.0f;
     }
     return any;
 }
@@ -290,7 +295,7 @@ typedef struct {
     const float *depth;
     const uint8_t *deformed;
     float *out;
-    float level, middle, high, range, stiff, most;
+    float level, middle, high, range, stiff, per_tolerance;
     Box box;
     atomic_int below;
 } Work;
@@ -311,12 +316,13 @@ static int allocate(Work *work, int height, int width) {
         Grid *grid = &work->grids[work->count++];
         /* an odd number gets a cell of zeros more, so that every cell of the next grid has four */
         grid->rows = rows, grid->columns = columns, grid->wide = columns + 3;
+        grid->pixels = work->count == 1 ? (float)(cell * cell) : 4.0f * grid[-1].pixels;
         cells += (size_t)(rows + 3) * grid->wide;
         if (least(rows, columns) <= 2) break;
     }
     work->height = height, work->width = width;
     work->bands = least(work->grids[0].rows, bands_of(height));
-    work->memory = calloc(6 * cells + (size_t)work->bands * band_size(work) + first + 2 * (size_t)width + 2 * (size_t)height, sizeof(float));
+    work->memory = calloc(8 * cells + (size_t)work->bands * band_size(work) + first + 2 * (size_t)width + 2 * (size_t)height, sizeof(float));
     work->kind = malloc((size_t)height * width + (size_t)work->bands * 2 * ((size_t)width + 4));
     if (!work->memory || !work->kind) return 1;
     work->scratch = work->kind + (size_t)height * width;
@@ -325,8 +331,8 @@ static int allocate(Work *work, int height, int width) {
         Grid *grid = &work->grids[k];
         const size_t size = (size_t)(grid->rows + 3) * grid->wide;
         grid->share = place, grid->value = place + size, grid->weight = place + 2 * size, grid->per_weight = place + 3 * size;
-        grid->product = place + 4 * size, grid->found = place + 5 * size;
-        place += 6 * size;
+        grid->product = place + 4 * size, grid->found = place + 5 * size, grid->held = place + 6 * size, grid->open = place + 7 * size;
+        place += 8 * size;
     }
     work->band_memory = place, work->line = place + (size_t)work->bands * band_size(work), work->along = work->line + first;
     work->place = (int32_t *)(work->along + width), work->flat_sum = (float *)(work->place + width);
@@ -500,7 +506,7 @@ static void known_cells(Work *work) {
     }
 }
 
-/* Deformed skin of a band that lies below the continuation counts as known too. */
+/* Deformed skin of a band that lies well below the continuation counts as known too. */
 static void add_known(void *with, int part) {
     Work *work = with;
     Grid *grid = &work->grids[0];
@@ -515,7 +521,7 @@ static void add_known(void *with, int part) {
         for (int y = i * cell > box.top ? i * cell : box.top; y < least((i + 1) * cell, box.bottom); y++) {
             const float *found = continuation(work, &band, y, box.left, box.right);
             const size_t at = (size_t)y * width + box.left;
-            here |= add_below(work->depth + at, work->kind + at, found, work->most, box.right - box.left, band.share + box.left,
+            here |= add_below(work->depth + at, work->kind + at, found, work->per_tolerance, box.right - box.left, band.share + box.left,
                               band.value + box.left);
         }
         if (!here) continue;
@@ -553,7 +559,7 @@ int zero_frame(const float *depth, const uint8_t *deformed, int height, int widt
         if (!ends) find_ends(&of, found), ends = found;
         work.middle = 0.5f * (ends[0] + ends[1]), work.high = ends[1];
         known_cells(&work);
-        work.most = tolerance * work.range;
+        work.per_tolerance = 1.0f / (tolerance * work.range);
         work.box = not_flat(work.kind, height, width);
         if (work.box.bottom > 0) { /* else all skin is flat */
             continued(work.grids, work.count, sweeps, work.line);

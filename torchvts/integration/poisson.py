@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from ..core.checks import check_batch, check_positive, check_window
+from ..core.precision import widened
 from .base import Integrator, embedded
 from .transforms import (
     cosine_tables,
@@ -207,7 +208,9 @@ def _integrate_dct(
 ) -> Tensor:
     right = _right_side(gradient, mm_per_pixel, top, left, int(plan[-2].shape[0]), int(plan[-1].shape[0]))
     depth = _solve_by_fft(right, plan, max(0, top - 1))
-    return _zero_in_background(depth, gradient, top, left) if zero_in_background else depth
+    if zero_in_background:
+        depth = _zero_in_background(depth, gradient, top, left)
+    return depth.to(gradient.dtype)
 
 
 def _right_side(gradient: Tensor, mm_per_pixel: float, top: int, left: int, height: int, width: int) -> Tensor:
@@ -230,7 +233,7 @@ def laplace_plan(like: Tensor) -> list[Tensor]:
 
 def solve_laplace(right: Tensor, plan: list[Tensor]) -> Tensor:
     """(B, 1, H, W) of zero mean whose five-point Laplacian with a free border is ``right`` less its mean."""
-    return _solve_by_fft(right, plan, 0)
+    return _solve_by_fft(right, plan, 0).to(right.dtype)
 
 
 def _kept(plan: list[Tensor]) -> list[Tensor]:
@@ -301,7 +304,11 @@ def _solve(right: Tensor, plan: list[Tensor]) -> Tensor:
 
 
 def _solve_by_fft(right: Tensor, plan: list[Tensor], top: int) -> Tensor:
-    """The same with a free border, by one real FFT there and one back; ``right`` starts at row ``top``, other rows are zero."""
+    """The same with a free border, by one real FFT there and one back; ``right`` starts at row ``top``, other rows are zero.
+
+    Back, and returned, in double precision: waves as long as the image are nearly all of the depth, and single rounds them at
+    every step.
+    """
     there, back, of_sum, of_difference, back_y, order_y = plan[0], plan[1], plan[2], plan[3], plan[4], plan[5]
     height, width = int(order_y.shape[0]), right.shape[-1]
     lines = torch.fft.rfft(interleave(right)).transpose(2, 3)  # (B, 1, W // 2 + 1, h): columns are contiguous from here on
@@ -314,5 +321,5 @@ def _solve_by_fft(right: Tensor, plan: list[Tensor], top: int) -> Tensor:
     up = torch.view_as_complex(torch.addcmul(total, difference, of_difference)) * back[0]
     down = torch.view_as_complex(torch.addcmul(total, difference, of_difference, value=-1.0)) * back[1]
     spectrum = torch.cat((up, down[..., 1 : (height + 1) // 2].flip(3)), dim=3)
-    lines = torch.fft.irfft(torch.fft.ifft(spectrum), n=width, dim=2).transpose(2, 3)
+    lines = torch.fft.irfft(torch.fft.ifft(widened(spectrum)), n=width, dim=2).transpose(2, 3)
     return deinterleave(lines.index_select(2, order_y))

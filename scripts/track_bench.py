@@ -6,11 +6,15 @@ python scripts/track_bench.py --motions slow --noises "slopes off by 3 degrees" 
 
 import argparse
 import dataclasses
+import importlib
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
+import cv2
+import numpy as np
 import torch
 from tqdm import tqdm
 
@@ -28,16 +32,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", nargs="+", type=int, default=[1], help="of motions and noise of the images")
     parser.add_argument("--sensors", nargs="+", type=int, default=[1], help="seeds of errors of slopes, from 1")
     parser.add_argument("--register", action="store_true", help="register each frame without tracking too, and draw error and time")
+    parser.add_argument(
+        "--normalflow", type=Path, metavar="FOLDER", help="a checkout of NormalFlow, to track the same frames by it"
+    )
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args(argv)
     torch.set_num_threads(arguments.threads)
+    normalflow = None if arguments.normalflow is None else load_normalflow(arguments.normalflow)
     arguments.out.mkdir(parents=True, exist_ok=True)
     rows, beside = [], []
     chosen = (arguments.objects, arguments.motions, arguments.noises, arguments.seeds, arguments.sensors)
     with tqdm(unit="track", disable=None) as bar:
         for row, track in tracking.run_tracking(*chosen):
             rows.append(row)
+            if normalflow is not None:
+                peer = tracking.TrackRow(f"{row.name}, NormalFlow", row.motion, row.noise, seed=row.seed, sensor=row.sensor)
+                rows.append(tracking.follow_by_normalflow(track, normalflow, peer))
             if arguments.register and row.motion == "slow" and row.noise == "noise 0.005":
                 beside.append((row, tracking.register_each(track)))
             bar.update()
@@ -49,6 +60,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         viz.save_figure(tracking.tracking_figure(beside), arguments.out / "tracking.png")
     print(text)
     return 0
+
+
+def load_normalflow(folder: Path) -> Callable[..., Any]:
+    """``normalflow`` of a checkout of github.com/rpl-cmu/normalflow; OpenCV 5 reads its lines of coordinates as columns then."""
+    if not (folder / "normalflow" / "registration.py").is_file():
+        raise FileNotFoundError(f"{folder}: expected a checkout of NormalFlow, found no normalflow/registration.py there")
+    sys.path.insert(0, str(folder))
+    remap = cv2.remap
+
+    def by_columns(image: Any, x: Any, y: Any, *rest: Any) -> Any:
+        x, y = (np.asarray(place, dtype=np.float32) for place in (x, y))
+        return remap(image, x.reshape(len(x), -1), y.reshape(len(y), -1), *rest)
+
+    cv2.remap = by_columns
+    register: Callable[..., Any] = importlib.import_module("normalflow.registration").normalflow
+    return register
 
 
 if __name__ == "__main__":

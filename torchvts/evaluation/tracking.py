@@ -5,8 +5,9 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -23,6 +24,8 @@ from ..viz import new_figure
 from .faults import gaussian_blur
 from .pose_accuracy import GOAL_DEG, GOAL_MM, rig
 from .rows import markdown
+
+Array = np.ndarray[Any, Any]
 
 OBJECTS = ("key", "textured patch", "tool handle", "gear", "bottle cap", "bolt head")
 """The six objects of the tracking bench."""
@@ -278,12 +281,13 @@ def follow_track(track: Track, motion: Motion, row: TrackRow) -> TrackRow:
 
 def tracking_error(found: Registration, track: Track, k: int) -> tuple[float, float]:
     """Degrees and mm of the pose, or of the nearest one that it calls equally good."""
+    return min(_error_of(T, track, k) for T in (found.T_target_source, *found.alternatives))
+
+
+def _error_of(T_target_source: Tensor, track: Track, k: int) -> tuple[float, float]:
     truth, middle = track.poses[k] @ invert(track.poses[0]), track.poses[k][:3, 3]
-    errors = []
-    for T in (found.T_target_source, *found.alternatives):
-        off = T @ invert(truth)
-        errors.append((float(turn_deg(off)), float((off[:3, :3] @ middle + off[:3, 3] - middle).norm())))
-    return min(errors)
+    off = T_target_source @ invert(truth)
+    return float(turn_deg(off)), float((off[:3, :3] @ middle + off[:3, 3] - middle).norm())
 
 
 def _stated(found: Registration, place: Tensor) -> tuple[float, float]:
@@ -335,6 +339,44 @@ def register_each(track: Track) -> tuple[list[float], list[float], list[float]]:
         results.append((*tracking_error(found, track, k), 1000.0 * (time.perf_counter() - start)))
     deg, mm, ms = zip(*results, strict=True)
     return list(deg), list(mm), list(ms)
+
+
+def follow_by_normalflow(track: Track, register: Callable[..., Array], row: TrackRow) -> TrackRow:
+    """Track all frames against the first one by NormalFlow, the last pose as start, and fill the row.
+
+    Args:
+        track: the frames.
+        register: ``normalflow`` of its module ``registration``. It takes unit normals (H, W, 3), contact and height of both frames
+            (pixels; x right, y down, z away from the camera), and gives the pose (4, 4), shifts in metres. Frames for which it
+            raises an error are lost.
+        row: gets the errors, the times and the lost frames.
+    """
+    to_points = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  # y up, z towards the camera
+    first, pose = _as_normalflow(track.frames[0], track.mm_per_pixel), np.eye(4)
+    for k in range(1, len(track.frames)):
+        frame = _as_normalflow(track.frames[k], track.mm_per_pixel)
+        start = time.perf_counter()
+        try:
+            pose = register(*first, *frame, tar_T_ref_init=pose, ppmm=track.mm_per_pixel)
+        except Exception as error:  # its own class, which says that the contacts hardly overlap
+            if type(error).__name__ != "InsufficientOverlapError":
+                raise
+            row.lost.append(k)
+            continue
+        finally:
+            row.ms.append(1000.0 * (time.perf_counter() - start))
+        found = torch.from_numpy(np.array(pose, dtype=np.float64))
+        found[:3, 3] *= 1000.0
+        deg, mm = _error_of(to_points @ found @ to_points, track, k)
+        row.deg.append(deg)
+        row.mm.append(mm)
+    return row
+
+
+def _as_normalflow(frame: DepthOutput, mm_per_pixel: float) -> tuple[Array, Array, Array]:
+    """Normals, contact and heights as NormalFlow takes them; its z axis points away from the camera."""
+    normal = frame.normal[0].permute(1, 2, 0) * torch.tensor([-1.0, -1.0, 1.0])
+    return normal.contiguous().numpy(), frame.contact[0, 0].numpy(), (-frame.depth_mm[0, 0] / mm_per_pixel).numpy()
 
 
 def tracking_table(rows: Sequence[TrackRow]) -> str:

@@ -7,6 +7,8 @@ import shlex
 import subprocess
 from pathlib import Path
 
+import torch
+
 from torchvts.cli.main import main
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -32,6 +34,7 @@ def command(line):
 
 def run(path):
     """Run a document's ``python`` blocks, which share their names, and its ``bash`` blocks; returns the names."""
+    torch.manual_seed(0)  # a document's networks start somewhere
     names = {"__name__": "document"}
     for kind, text in blocks(path, ("python", "bash")):
         if kind == "python":

@@ -41,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     folder = data_folder(str(Path(__file__).parent))
     data = folder if (folder / "gelsight_mini_a").is_dir() else None
     if library() is None:
-        print("no compiled kernels: PyTorch does all the work, two to three times as slowly")
+        print("no compiled kernels: PyTorch does all the work, which takes 4 to 17 times as long")
     if arguments.only != "methods":
         _as_user(arguments, data)
     if arguments.only != "user":

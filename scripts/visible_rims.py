@@ -26,6 +26,9 @@ from torchvts.evaluation.rims import visible_rim
 from torchvts.evaluation.score import label, score_press
 from torchvts.viz import new_figure, save_figure
 
+LEAST = 4
+"""Presses that two halves need."""
+
 SHOWN, HALF_PX = 8, 60
 """Presses in the picture, and half the side of each panel."""
 
@@ -36,6 +39,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("out/rims"), help="folder of the picture")
     parser.add_argument("--limit", type=int, help="use only so many presses")
     arguments = parser.parse_args(argv)
+    if not (arguments.data / "gelsight_pale").is_dir():
+        raise FileNotFoundError(f"data: expected a folder that holds gelsight_pale, got {arguments.data}")
+    if arguments.limit is not None and arguments.limit < LEAST:
+        raise ValueError(f"--limit: expected at least {LEAST} presses, half of which are learned from, got {arguments.limit}")
     data = sets.load("gelsight_pale", arguments.data, arguments.limit)
     labelled = {target.name: target.ball for fold in data.folds for target in fold.scored if target.ball is not None}
     by_rim = {}
@@ -109,4 +116,7 @@ def _picture(presses: Sequence[vts.Press], by_rim: Mapping[str, vts.Press]) -> F
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except (OSError, ValueError, TypeError) as error:
+        sys.exit(f"error: {error}")

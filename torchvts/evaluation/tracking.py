@@ -313,10 +313,15 @@ def run_tracking(
         noises: of :data:`NOISES`.
         seeds: of motions and noise of the images.
         sensors: seeds of the errors of slopes, for each noise that has such errors.
+    Raises:
+        ValueError: an unknown object.
     """
-    unit = rig()
+    unit, targets = rig(), {**objects.TARGETS, **objects.FREE_TARGETS}
+    for name in names:
+        if name not in targets:
+            raise ValueError(f"names: expected some of {', '.join(targets)}, got {name!r}")
     for name, motion, seed in itertools.product(names, motions, seeds):
-        target = {**objects.TARGETS, **objects.FREE_TARGETS}[name]
+        target = targets[name]
         recorded: dict[float, Track] = {}
         for noise in noises:
             image_std = NOISES[noise].image_std

@@ -9,7 +9,7 @@ import dataclasses
 import importlib
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -62,8 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def load_normalflow(folder: Path) -> Callable[..., Any]:
-    """``normalflow`` of a checkout of github.com/rpl-cmu/normalflow; OpenCV 5 reads its lines of coordinates as columns then."""
+def load_normalflow(folder: Path) -> tracking.NormalFlow:
+    """The code of a checkout of github.com/rpl-cmu/normalflow; OpenCV 5 reads its lines of coordinates as columns then."""
     if not (folder / "normalflow" / "registration.py").is_file():
         raise FileNotFoundError(f"{folder}: expected a checkout of NormalFlow, found no normalflow/registration.py there")
     sys.path.insert(0, str(folder))
@@ -74,8 +74,10 @@ def load_normalflow(folder: Path) -> Callable[..., Any]:
         return remap(image, x.reshape(len(x), -1), y.reshape(len(y), -1), *rest)
 
     cv2.remap = by_columns
-    register: Callable[..., Any] = importlib.import_module("normalflow.registration").normalflow
-    return register
+    registration, utils = (importlib.import_module(f"normalflow.{name}") for name in ("registration", "utils"))
+    if not hasattr(utils, "Frame"):
+        raise ValueError(f"{folder}: expected a NormalFlow whose utils.py has a class Frame, this one is older")
+    return tracking.NormalFlow(utils.Frame, registration.normalflow, registration.LoseTrackError)
 
 
 if __name__ == "__main__":

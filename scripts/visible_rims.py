@@ -1,4 +1,4 @@
-"""How good the hand labels of gelsight_pale are, and the errors of depth by the bright rims of its contacts in their place.
+"""How far the hand labels of gelsight_pale are from the bright rims of its contacts, and the errors of depth against both.
 
 python scripts/visible_rims.py ../shared/data --out out/rims
 

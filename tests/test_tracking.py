@@ -607,27 +607,32 @@ def test_slopes_that_err_over_wide_areas_are_no_reason_for_confidence():
 
 
 def test_normalflow_gets_its_own_axes_and_its_poses_are_read_in_ours():
-    """Its normals are those of its heights, deeper is lower, and points move as its pose says: x right, y down, metres."""
+    """Its gradient is that of its heights, deeper is lower, and points move as its pose says: x right, y down, metres."""
     poses = [swing(0), swing(2), swing(5)]
     track = tracking.Track(poses, [press(objects.key(), pose) for pose in poses], PITCH)
     turned = np.diag([1.0, -1.0, -1.0, 1.0])
+    given = []
 
-    class InsufficientOverlapError(Exception):
-        pass
+    class Frame:
+        def __init__(self, gradient, height, contact):
+            self.N, self.C, self.H, self.L = gradient, contact, height, len(given)
+            given.append(self)
 
-    def register(normal, contact, depth, *frame, tar_T_ref_init, ppmm):
-        assert ppmm == PITCH and contact.dtype == bool and depth[contact].max() < 0
-        down, right = np.gradient(depth)
+    def register(first, contact, height, number, *frame_start_and_pitch):
+        *_, k, start, pitch = frame_start_and_pitch
+        assert number == 0 and pitch == PITCH and contact.dtype == bool and height[contact].max() < 0
+        down, right = np.gradient(height)
         inside = contact & (np.abs(right) + np.abs(down) < 0.5)
-        assert np.median(np.abs(normal[..., 0] + right * normal[..., 2])[inside]) < 0.01
-        assert np.median(np.abs(normal[..., 1] + down * normal[..., 2])[inside]) < 0.01
-        k = next(k for k in (1, 2) if np.array_equal(frame[2], (-track.frames[k].depth_mm[0, 0] / PITCH).numpy()))
+        assert np.median(np.abs(first[..., 0] - right)[inside]) < 0.01
+        assert np.median(np.abs(first[..., 1] - down)[inside]) < 0.01
         if k == 2:
-            raise InsufficientOverlapError
+            raise LookupError
+        assert np.array_equal(start, np.eye(4))
         moved = turned @ (poses[k] @ invert(poses[0])).numpy() @ turned
         moved[:3, 3] /= 1000.0
         return moved
 
-    row = tracking.follow_by_normalflow(track, register, tracking.TrackRow("key", "slow", "none"))
+    peer = tracking.NormalFlow(Frame, register, LookupError)
+    row = tracking.follow_by_normalflow(track, peer, tracking.TrackRow("key", "slow", "none"))
     assert row.lost == [2] and len(row.ms) == 2
     assert max(row.deg) < 1e-4 and max(row.mm) < 1e-4

@@ -12,10 +12,10 @@ from ..core.checks import check_field, check_shape
 THIN_PX, WIDE_PX = 1.2, 3.0
 """Gaussians whose difference shows a bright line of 2 to 4 pixels."""
 
-REACH_PX = 6.0
+REACH_PX = 12.0
 """How far from the label the circle is searched; its radius to :data:`RADIUS_REACH_PX`."""
 
-RADIUS_REACH_PX = 5.0
+RADIUS_REACH_PX = 8.0
 STEP_PX = 0.5
 
 

@@ -346,26 +346,41 @@ def register_each(track: Track) -> tuple[list[float], list[float], list[float]]:
     return list(deg), list(mm), list(ms)
 
 
-def follow_by_normalflow(track: Track, register: Callable[..., Array], row: TrackRow) -> TrackRow:
-    """Track all frames against the first one by NormalFlow, the last pose as start, and fill the row.
+class NormalFlow(NamedTuple):
+    """NormalFlow's own code.
 
-    Args:
-        track: the frames.
-        register: ``normalflow`` of its module ``registration``. It takes unit normals (H, W, 3), contact and height of both frames
-            (pixels; x right, y down, z away from the camera), and gives the pose (4, 4), shifts in metres. Frames for which it
-            raises an error are lost.
-        row: gets the errors, the times and the lost frames.
+    Attributes:
+        frame: its class ``Frame`` of gradient (H, W, 2) and height (H, W), pixels, and contact (H, W); it erodes the contact.
+        register: its function ``normalflow``.
+        lost: the error by which that says that the object is lost.
+    """
+
+    frame: Callable[[Array, Array, Array], Any]
+    register: Callable[..., Array]
+    lost: type[Exception]
+
+
+def follow_by_normalflow(track: Track, peer: NormalFlow, row: TrackRow) -> TrackRow:
+    """Track all frames against the first one by NormalFlow, the last pose as start, with its own thresholds, and fill the row.
+
+    Its axes: x right, y down, z away from the camera; shifts in metres. Only the registration is timed, not its ``Frame``.
     """
     to_points = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  # y up, z towards the camera
-    first, pose = _as_normalflow(track.frames[0], track.mm_per_pixel), np.eye(4)
-    for k in range(1, len(track.frames)):
-        frame = _as_normalflow(track.frames[k], track.mm_per_pixel)
+    frames = [
+        peer.frame(
+            (-frame.gradient[0]).permute(1, 2, 0).contiguous().numpy(),
+            (-frame.depth_mm[0, 0] / track.mm_per_pixel).numpy(),
+            frame.contact[0, 0].numpy(),
+        )
+        for frame in track.frames
+    ]
+    first, pose = frames[0], np.eye(4, dtype=np.float32)
+    for k, frame in enumerate(frames[1:], 1):
+        maps = (first.N, first.C, first.H, first.L, frame.N, frame.C, frame.H, frame.L)
         start = time.perf_counter()
         try:
-            pose = register(*first, *frame, tar_T_ref_init=pose, ppmm=track.mm_per_pixel)
-        except Exception as error:  # its own class, which says that the contacts hardly overlap
-            if type(error).__name__ != "InsufficientOverlapError":
-                raise
+            pose = peer.register(*maps, pose, track.mm_per_pixel)
+        except peer.lost:
             row.lost.append(k)
             continue
         finally:
@@ -376,12 +391,6 @@ def follow_by_normalflow(track: Track, register: Callable[..., Array], row: Trac
         row.deg.append(deg)
         row.mm.append(mm)
     return row
-
-
-def _as_normalflow(frame: DepthOutput, mm_per_pixel: float) -> tuple[Array, Array, Array]:
-    """Normals, contact and heights as NormalFlow takes them; its z axis points away from the camera."""
-    normal = frame.normal[0].permute(1, 2, 0) * torch.tensor([-1.0, -1.0, 1.0])
-    return normal.contiguous().numpy(), frame.contact[0, 0].numpy(), (-frame.depth_mm[0, 0] / mm_per_pixel).numpy()
 
 
 def tracking_table(rows: Sequence[TrackRow]) -> str:

@@ -252,7 +252,7 @@ class PoissonDCT(Twin, integration.PoissonDCT):
 
     def integrate(self, gradient: Tensor, plan: list[Tensor], top: int, left: int) -> Tensor:
         size = (int(plan[5].shape[0]), int(plan[6].shape[0]))
-        tables = kernels.poisson_plan(*size) if usable(gradient, plan[2]) else None
+        tables = kernels.poisson_plan(*size) if usable(gradient) else None
         if tables is None:
             return super().integrate(gradient, plan, top, left)
         return kernels.solve_poisson(gradient, self.mm_per_pixel, tables, (top, left), size, self.zero_in_background)

@@ -69,8 +69,8 @@ class ZeroBackground(nn.Module):
         around = [mean_around(weight) for weight in weights]
         cells = torch.cat((cell_means(known + raised, cell), cell_means(torch.addcmul(values, raised, level), cell)), dim=1)
         offset = _pixels(self.continued(cells, weights, around, cell), cell, height, width)
-        # depth below zero is an error too: beyond a tolerance pixels begin to be known, and no pixel decides all at once
-        below = ((offset - depth_mm) / (self.tolerance * range_mm) - 1.0).clamp(0.0, 1.0).masked_fill(free, 0.0)
+        # depth below zero is an error too: beyond a tolerance pixels begin to be known, up to a quarter: none decides alone, or at once
+        below = 0.25 * ((offset - depth_mm) / (self.tolerance * range_mm) - 1.0).clamp(0.0, 1.0).masked_fill(free, 0.0)
         if may_read(below) and not bool(below.any()):
             return (depth_mm - offset) * (1.0 - known)
         cells = cells + torch.cat((cell_means(below, cell), cell_means(depth_mm * below, cell)), dim=1)

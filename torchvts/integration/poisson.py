@@ -90,7 +90,7 @@ def poisson_dct(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
     check_gradient(gradient, 2)
     if not torch.jit.is_scripting():
         mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
-    return _integrate_dct(gradient, mm_per_pixel, _plan_dct(gradient, gradient.shape[2], gradient.shape[3]), 0, 0, False)
+    return _integrate_dct(gradient, mm_per_pixel, _plan_dct(_wide(gradient), gradient.shape[2], gradient.shape[3]), 0, 0, False)
 
 
 def poisson_background(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
@@ -114,7 +114,7 @@ def poisson_background(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
     check_gradient(gradient, 2)
     if not torch.jit.is_scripting():
         mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
-    return _integrate_dct(gradient, mm_per_pixel, _plan_dct(gradient, gradient.shape[2], gradient.shape[3]), 0, 0, True)
+    return _integrate_dct(gradient, mm_per_pixel, _plan_dct(_wide(gradient), gradient.shape[2], gradient.shape[3]), 0, 0, True)
 
 
 class PoissonDST(Integrator):
@@ -147,15 +147,15 @@ class PoissonDCT(Integrator):
         super().__init__()
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         self.zero_in_background = False
-        self._plan: list[Tensor] = _plan_dct(torch.zeros(1, 2, 2, 2), 2, 2)
+        self._plan: list[Tensor] = _plan_dct(torch.zeros(1, dtype=torch.float64), 2, 2)
 
     def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
         check_gradient(gradient, 2)
         height, width = (gradient.shape[2], gradient.shape[3]) if size is None else size
         top, left = check_window("gradient", gradient, (height, width), window)
-        plan = self._plan
-        if not _plan_fits(plan, gradient, height, width):
-            plan = _kept(_plan_dct(gradient, height, width))
+        plan, like = self._plan, _wide(gradient)
+        if not _plan_fits(plan, like, height, width):
+            plan = _kept(_plan_dct(like, height, width))
             if _plain(plan[2]):
                 self._plan = plan
         if gradient.shape[0] == 0:
@@ -206,7 +206,8 @@ def _integrate_dst(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor]) ->
 def _integrate_dct(
     gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], top: int, left: int, zero_in_background: bool
 ) -> Tensor:
-    right = _right_side(gradient, mm_per_pixel, top, left, int(plan[-2].shape[0]), int(plan[-1].shape[0]))
+    """In double precision: waves as long as the image are nearly all of the depth, and single rounds them at every step."""
+    right = _right_side(widened(gradient), mm_per_pixel, top, left, int(plan[-2].shape[0]), int(plan[-1].shape[0]))
     depth = _solve_by_fft(right, plan, max(0, top - 1))
     if zero_in_background:
         depth = _zero_in_background(depth, gradient, top, left)
@@ -226,6 +227,11 @@ def _right_side(gradient: Tensor, mm_per_pixel: float, top: int, left: int, heig
     return nn.functional.pad(right, [left, after]) if left > 0 or after > 0 else right
 
 
+def _wide(gradient: Tensor) -> Tensor:
+    """Nothing, of the dtype in which a gradient is integrated, and on its device."""
+    return widened(gradient.narrow(0, 0, 0))
+
+
 def laplace_plan(like: Tensor) -> list[Tensor]:
     """What :func:`solve_laplace` needs for images of the size, dtype and device of ``like`` (B, C, H, W)."""
     return _plan_dct(like, like.shape[2], like.shape[3])
@@ -233,7 +239,7 @@ def laplace_plan(like: Tensor) -> list[Tensor]:
 
 def solve_laplace(right: Tensor, plan: list[Tensor]) -> Tensor:
     """(B, 1, H, W) of zero mean whose five-point Laplacian with a free border is ``right`` less its mean."""
-    return _solve_by_fft(right, plan, 0).to(right.dtype)
+    return _solve_by_fft(right, plan, 0)
 
 
 def _kept(plan: list[Tensor]) -> list[Tensor]:
@@ -261,13 +267,13 @@ def _plan_dst(gradient: Tensor) -> list[Tensor]:
     return _plan([even_y, odd_y], [value_even_y, value_odd_y], [even_x, odd_x], [value_even_x, value_odd_x], gradient)
 
 
-def _plan_dct(gradient: Tensor, height: int, width: int) -> list[Tensor]:
-    """The seven tables of :func:`_solve_by_fft`."""
-    order = [reordering(height).to(gradient.device), reordering(width).to(gradient.device)]
-    kind = torch.complex128 if gradient.dtype == torch.float64 else torch.complex64
+def _plan_dct(like: Tensor, height: int, width: int) -> list[Tensor]:
+    """The seven tables of :func:`_solve_by_fft`, of the dtype and on the device of ``like``."""
+    order = [reordering(height).to(like.device), reordering(width).to(like.device)]
+    kind = torch.complex128 if like.dtype == torch.float64 else torch.complex64
     there, back, of_sum, of_difference, back_y = cosine_tables(height, width)
-    tables = [there.to(kind), back.to(kind), of_sum.to(gradient.dtype), of_difference.to(gradient.dtype), back_y]
-    return [table.to(gradient.device) for table in tables] + order
+    tables = [there.to(kind), back.to(kind), of_sum.to(like.dtype), of_difference.to(like.dtype), back_y]
+    return [table.to(like.device) for table in tables] + order
 
 
 def _plan(
@@ -283,9 +289,9 @@ def _plan(
     return plan
 
 
-def _plan_fits(plan: list[Tensor], gradient: Tensor, height: int, width: int) -> bool:
+def _plan_fits(plan: list[Tensor], like: Tensor, height: int, width: int) -> bool:
     table = plan[2]  # real: inverse eigenvalues
-    same_kind = table.dtype == gradient.dtype and table.device == gradient.device and _plain(table)
+    same_kind = table.dtype == like.dtype and table.device == like.device and _plain(table)
     if len(plan) == 12:
         return same_kind and plan[0].shape[0] + plan[6].shape[0] == height - 2 and plan[1].shape[0] + plan[4].shape[0] == width - 2
     return same_kind and plan[-2].shape[0] == height and plan[-1].shape[0] == width
@@ -304,11 +310,7 @@ def _solve(right: Tensor, plan: list[Tensor]) -> Tensor:
 
 
 def _solve_by_fft(right: Tensor, plan: list[Tensor], top: int) -> Tensor:
-    """The same with a free border, by one real FFT there and one back; ``right`` starts at row ``top``, other rows are zero.
-
-    Back, and returned, in double precision: waves as long as the image are nearly all of the depth, and single rounds them at
-    every step.
-    """
+    """The same with a free border, by one real FFT there and one back; ``right`` starts at row ``top``, other rows are zero."""
     there, back, of_sum, of_difference, back_y, order_y = plan[0], plan[1], plan[2], plan[3], plan[4], plan[5]
     height, width = int(order_y.shape[0]), right.shape[-1]
     lines = torch.fft.rfft(interleave(right)).transpose(2, 3)  # (B, 1, W // 2 + 1, h): columns are contiguous from here on
@@ -321,5 +323,5 @@ def _solve_by_fft(right: Tensor, plan: list[Tensor], top: int) -> Tensor:
     up = torch.view_as_complex(torch.addcmul(total, difference, of_difference)) * back[0]
     down = torch.view_as_complex(torch.addcmul(total, difference, of_difference, value=-1.0)) * back[1]
     spectrum = torch.cat((up, down[..., 1 : (height + 1) // 2].flip(3)), dim=3)
-    lines = torch.fft.irfft(torch.fft.ifft(widened(spectrum)), n=width, dim=2).transpose(2, 3)
+    lines = torch.fft.irfft(torch.fft.ifft(spectrum), n=width, dim=2).transpose(2, 3)
     return deinterleave(lines.index_select(2, order_y))

@@ -7,10 +7,17 @@
 
 #include <math.h>
 
-/* Tables of one size: the poles, what both recursions multiply by, 1 / (1 - r^2W), the start of the way back; then those of the transform. */
+static const double PI = 3.14159265358979323846;
+
+/* Coefficients from 0 on that depth gets wave by wave: they are nearly all of it, and a transform rounds them at each of its steps. */
+enum { WAVES = 4 };
+
+/* Tables of one size: the poles, what both recursions multiply by, 1 / (1 - r^2W), the start of the way back; the first WAVES waves, WAVES values
+   for each row; then those of the transform. */
 typedef struct {
     int height, width, wide;
     const double *pole, *gain, *per_start, *end;
+    const float *waves;
     Cosine cosine;
 } Plan;
 
@@ -28,27 +35,31 @@ static inline size_t place_of(size_t k, size_t x, size_t columns) { return (k / 
 EXPORT int64_t poisson_plan_size(int height) {
     int radix[MOST_PASSES];
     if (height < 2 || !cosine_radices(height, radix)) return 0;
-    return (int64_t)(sizeof(double) * 4 * (size_t)wide_of(height) + sizeof(float) * cosine_table_size(height));
+    return (int64_t)(sizeof(double) * 4 * (size_t)wide_of(height) + sizeof(float) * (WAVES * (size_t)height + cosine_table_size(height)));
 }
 
 EXPORT void make_poisson_plan(int height, int width, double *tables) {
     const int wide = wide_of(height);
     memset(tables, 0, sizeof(double) * 4 * (size_t)wide); /* the constant, k = 0, is solved by itself */
     for (int k = 1; k < height; k++) {
-        const double sine = sin(3.14159265358979323846 * k / (2.0 * height)), half = 2.0 * sine * sine;
+        const double sine = sin(PI * k / (2.0 * height)), half = 2.0 * sine * sine;
         const double rest = sqrt(2.0 * half + half * half) - half, pole = 1.0 - rest; /* 1 - r, without cancellation */
         tables[k] = pole;
         tables[wide + k] = -pole / height;
         tables[2 * wide + k] = -1.0 / expm1(2.0 * width * log1p(-rest));
         tables[3 * wide + k] = -pole / height / rest;
     }
-    make_cosine_tables(height, (float *)(tables + 4 * wide));
+    float *waves = (float *)(tables + 4 * wide);
+    for (int y = 0; y < height; y++)
+        for (int k = 0; k < WAVES; k++) *waves++ = k < height ? (float)((k ? 2.0 : 1.0) * cos(PI * k * (2 * y + 1) / (2.0 * height))) : 0.0f;
+    make_cosine_tables(height, waves);
 }
 
 static Plan plan_of(int height, int width, const double *tables) {
     const int wide = wide_of(height);
-    const Plan plan = {height, width, wide, tables, tables + wide, tables + 2 * wide, tables + 3 * wide,
-                       cosine_of(height, (const float *)(tables + 4 * wide))};
+    const float *waves = (const float *)(tables + 4 * wide);
+    const Plan plan = {height, width, wide, tables, tables + wide, tables + 2 * wide, tables + 3 * wide, waves,
+                       cosine_of(height, waves + WAVES * (size_t)height)};
     return plan;
 }
 
@@ -214,12 +225,29 @@ static void to_coefficients(const Plan *plan, const Part *part, const float *lin
             transpose(found + k * LINES + x, LINES, coefficients + place_of(k, to_column + x, columns), SLICE);
 }
 
+/* LANES values of a row, with the first waves of their columns. low: WAVES coefficients of LANES columns, LINES floats for each. */
+WIDE FUSED static void add_waves(const float *restrict low, const float *restrict wave, float *restrict row) {
+    for (int t = 0; t < LANES; t++) {
+        float sum = row[t];
+        for (int k = WAVES - 1; k >= 0; k--) sum += wave[k] * low[k * LINES + t];
+        row[t] = sum;
+    }
+}
+
 /* The inverse, of LINES columns of depth from `first` on, to `lines`. scratch: as much memory; found: coefficients. */
 static void to_depth(const Plan *plan, const float *coefficients, int first, float *scratch, float *found, float *lines) {
     const size_t wide = (size_t)plan->wide, columns = (size_t)plan->width + LINES;
     for (size_t k = 0; k < wide; k += 4)
         for (int x = 0; x < LINES; x += 4) transpose(coefficients + place_of(k, (size_t)(first + x), columns), SLICE, found + k * LINES + x, LINES);
+    float low[WAVES * LINES];
+    memcpy(low, found, sizeof low);
+    memset(found, 0, sizeof low);
     cosine_inverse(&plan->cosine, found, scratch, lines);
+    for (int y = 0; y < plan->height; y++) {
+        float *row = cosine_line(&plan->cosine, lines, y);
+        add_waves(low, plan->waves + WAVES * (size_t)y, row);
+        add_waves(low + LANES, plan->waves + WAVES * (size_t)y, row + (size_t)plan->height * LANES);
+    }
 }
 
 /* n pixels of a row of depth less its level: LANES of them together, and `step` floats on the next ones. */

@@ -227,14 +227,14 @@ WIDE static void add_row(const float *restrict depth, const uint8_t *restrict ki
     }
 }
 
-/* Deformed pixels of a row that lie below what was found by more than a tolerance, added in the same way: twice as far below, in full. Returns
+/* Deformed pixels of a row that lie below what was found by more than a tolerance, added in the same way: a quarter, from twice as far below on. Returns
    whether there are any. */
 WIDE static int add_below(const float *restrict depth, const uint8_t *restrict kind, const float *restrict found, float per_tolerance, int n,
                           float *restrict share, float *restrict value) {
     int any = 0;
     for (int x = 0; x < n; x++) {
         const float low = (found[x] - depth[x]) * per_tolerance - 1.0f;
-        const float known = kind[x] == DEFORMED && low > 0.0f ? (low < 1.0f ? low : 1.0f) : 0.0f;
+        const float known = kind[x] == DEFORMED && low > 0.0f ? 0.25f * (low < 1.0f ? low : 1.0f) : 0.0f;
         share[x] += known;
         value[x] += known * depth[x];
         any |= known > 0.0f;

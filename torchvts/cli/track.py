@@ -14,6 +14,8 @@ import argparse
 import contextlib
 import csv
 import json
+import math
+import statistics
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -72,7 +74,9 @@ def run(arguments: argparse.Namespace) -> int:
     found = summary(tracking, stream)
     with write_atomically(arguments.out / "summary.json") as temporary:
         temporary.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
-    _print_summary(found, arguments.out)
+    _print_summary(found)
+    names = ["poses.csv", "summary.json"] + ([] if arguments.video == "none" else [f"track.{arguments.video}"])
+    print(f"wrote {', '.join(names)} to {arguments.out}")
     return 1 if found["lost"] or found["left_out"] else 0
 
 
@@ -123,7 +127,7 @@ def record(frame: TactileFrame, found: TrackedPose) -> dict[str, object]:
 def draw_axes(image: Tensor, found: TrackedPose, tracker: PoseTracker, mm_per_pixel: float) -> Tensor:
     """The image (3, H, W) with the reference's x (red), y (green) and z (blue), 2 mm long, at the middle of its contact.
 
-    Axes of rotations that are not known are drawn thin.
+    They are thin where a rotation is unknown, or known less well than to 1 degree.
     """
     height, width = image.shape[1:]
     T = found.T_target_source
@@ -133,7 +137,8 @@ def draw_axes(image: Tensor, found: TrackedPose, tracker: PoseTracker, mm_per_pi
     column, row = moved[:, 0] / mm_per_pixel + 0.5 * (width - 1), 0.5 * (height - 1) - moved[:, 1] / mm_per_pixel
     ends = torch.stack((column, row), 1).round().int().tolist()
     pixels = np.ascontiguousarray((255.0 * image.clamp(0, 1)).permute(1, 2, 0).numpy().astype(np.uint8))
-    thick = 1 if any(name.startswith("rotation") for name in found.ambiguous) else 2
+    vague = math.degrees(math.sqrt(float(found.covariance.diagonal()[:3].max()))) > TRUSTED_DEG
+    thick = 1 if vague or any(name.startswith("rotation") for name in found.ambiguous) else 2
     for end, colour in zip(ends[1:], ((230, 60, 50), (60, 200, 80), (60, 90, 240)), strict=True):
         cv2.line(pixels, tuple(ends[0]), tuple(end), colour, thick, cv2.LINE_AA)
     return torch.from_numpy(pixels).permute(2, 0, 1).float() / 255.0
@@ -174,12 +179,19 @@ def summary(tracking: _Tracking, stream: TactileStream) -> dict[str, Any]:
         "unknown_motions": dict(Counter(str(row["ambiguous"]) for row in rows if row["ambiguous"]).most_common()),
         "keyframes": len(graph.keyframes) if graph else 0,
         "loops_closed": [{"deg": deg, "mm": mm} for deg, mm in closures],
+        "median_std": _median_std(followed),
         "largest_drift_deg": drift["drift_deg"],
         "largest_drift_mm": drift["drift_mm"],
     }
 
 
-def _print_summary(found: dict[str, Any], out: Path) -> None:
+def _median_std(rows: list[dict[str, object]]) -> dict[str, float]:
+    """Median standard deviation of each shift, mm, and of each turn, degrees, over rows of poses.csv."""
+    names = [name for name in QUALITY if name.startswith("std_")]
+    return {name.removeprefix("std_"): statistics.median(float(str(row[name])) for row in rows) for name in names} if rows else {}
+
+
+def _print_summary(found: dict[str, Any]) -> None:
     loops = len(found["loops_closed"])
     print(f"{found['frames']} frames, {found['lost']} lost, {found['keyframes']} keyframes, {loops} loops closed")
     for reason in list(found["lost_because"])[:5]:
@@ -192,9 +204,11 @@ def _print_summary(found: dict[str, Any], out: Path) -> None:
     uncertain = found["frames"] - found["lost"] - found["converged"]
     if uncertain:
         print(f"  {uncertain} frames known less well than to {TRUSTED_DEG:g} degree and {TRUSTED_MM:g} mm")
+        std = found["median_std"]
+        shifts, turns = (", ".join(f"{axis} {std[key.format(axis)]:.2g}" for axis in "xyz") for key in ("{}_mm", "r{}_deg"))
+        print(f"  standard deviations, medians: {shifts} mm; turns about {turns} degrees")
     if found["keyframes"] > 1:
         deg, mm = found["largest_drift_deg"], found["largest_drift_mm"]
         print(f"  drift over keyframes: up to {deg:.2g} degrees and {mm:.2g} mm")
     if not found["metric"]:
         print(f"  {NOT_METRIC}; shifts in mm are not either")
-    print(f"wrote {out / 'poses.csv'} and {out / 'summary.json'}")

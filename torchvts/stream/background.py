@@ -87,19 +87,23 @@ def find_background(images: Tensor, sensor: Sensor | None = None) -> tuple[Tenso
     structure = channel_structure(image)
     if structure > ROUGH:
         raise ValueError(
-            f"background: the first {len(images)} frames show structure between the channels of {structure:.2f}, without contact "
-            f"it is below {ROUGH}: something touches the skin; {WITHOUT_FIRST}"
+            f"background: the first {len(images)} frames show structure between the channels of {structure:.3f}, without contact "
+            f"it is below {ROUGH}: something touches the skin{_or_other(sensor)}; {WITHOUT_FIRST}"
         )
     if sensor is not None and sensor.prior is not None:
         slope_deg = _structure_deg(image, sensor, sensor.prior)
         if slope_deg > ROUGH_DEG:
             raise ValueError(
                 f"background: the first {len(images)} frames show structure that looks like slopes of {slope_deg:.1f} degrees, "
-                f"without contact it is below {ROUGH_DEG:g}: something touches the skin; {WITHOUT_FIRST}"
+                f"without contact it is below {ROUGH_DEG:g}: something touches the skin{_or_other(sensor)}; {WITHOUT_FIRST}"
             )
     deviation = nn.functional.avg_pool2d(images - image, 3, 1, 1, count_include_pad=False).square().mean(0)
     smooth = nn.functional.avg_pool2d(deviation[None], 15, 1, 7, count_include_pad=False)[0]
     return image, 3.0 * torch.sqrt(smooth)
+
+
+def _or_other(sensor: Sensor | None) -> str:
+    return "" if sensor is None else f", or the frames are not those of a sensor '{sensor.name}'"
 
 
 def _structure_deg(image: Tensor, sensor: Sensor, prior: SensorPrior) -> float:

@@ -69,7 +69,7 @@ class ZeroBackground(nn.Module):
         around = [mean_around(weight) for weight in weights]
         cells = torch.cat((cell_means(known + raised, cell), cell_means(torch.addcmul(values, raised, level), cell)), dim=1)
         offset = _pixels(self.continued(cells, weights, around, cell), cell, height, width)
-        # depth below zero is an error too: beyond a tolerance pixels begin to be known, up to a quarter: none decides alone, or at once
+        # depth below zero is an error too: beyond a tolerance pixels begin to be known, up to a quarter, so that none decides alone
         below = 0.25 * ((offset - depth_mm) / (self.tolerance * range_mm) - 1.0).clamp(0.0, 1.0).masked_fill(free, 0.0)
         if may_read(below) and not bool(below.any()):
             return (depth_mm - offset) * (1.0 - known)

@@ -162,15 +162,39 @@ def test_after_a_search_a_symmetric_object_has_its_other_poses():
     assert nearest < 0.3
 
 
+def test_what_only_the_outline_says_tells_equal_poses_from_others():
+    """A bolt head put back: on its face 98 % agree at any angle; it had 7 to 15 poses, confident, and the one nearest to the last
+    was up to 30 degrees off."""
+    (lights, pipe), height = pose_accuracy.rig(), objects.bolt_head()
+    poses = [objects.pose(93.0, (0.2, 0.3), 0.25, (-1.6, -0.4)), objects.pose(0.0, press_mm=-1.5)]
+    poses += [objects.pose(12.0 + k, (0.7, -0.8 + 0.05 * k), 0.44, (0.7, -1.4)) for k in range(2)]
+    frames = []
+    for k, pose in enumerate(poses):
+        scene = objects.press(height, pose, 240, 320, pipe.mm_per_pixel)
+        with torch.inference_mode():
+            frames.append(pipe(render(scene, lights, noise_std=0.005, bits=8, seed=k)))
+    tracker = vts.PoseTracker(frames[0], pipe.mm_per_pixel)
+    assert tracker(frames[1]).lost
+    for frame, pose in zip(frames[2:], poses[2:], strict=True):
+        found = tracker(frame)
+        truth = [pose @ objects.pose(60.0 * k, press_mm=0.0) @ invert(poses[0]) for k in range(6)]
+        every = [found.T_target_source, *found.alternatives]
+        assert found.converged and len(every) == 6
+        assert max(min(float(turn_deg(T @ invert(other))) for other in truth) for T in every) < 0.5
+
+
 def test_equal_poses_that_a_search_misses_follow_from_those_it_finds():
     """One symmetry found gives all powers of it, with the exactness of tracking; a pose between two equal ones is dropped."""
     tracker = vts.PoseTracker(press(objects.gear(), objects.pose(0.0)), PITCH)
-    keyframe, poses = tracker.graph.keyframes[0], (0.0, 30.6, 31.0)
-    frame = grids(contact_frame(press(objects.gear(), objects.pose(0.0))), PITCH, keyframe.least_mm, keyframe.times)
+    keyframe, poses = (
+        tracker.graph.keyframes[0],
+        (7.0, 37.6, 38.0),
+    )  # not 0, where the frame is the reference, and fits better than any
+    frame = grids(contact_frame(press(objects.gear(), objects.pose(7.0, (0.3, 0.1)))), PITCH, keyframe.least_mm, keyframe.times)
     tracker._symmetries_of_reference = []
-    equal, problem = tracker._equal_poses(0, frame, [objects.pose(deg, press_mm=0.0).numpy() for deg in poses])
+    equal, problem = tracker._equal_poses(0, frame, [objects.pose(deg, (0.3, 0.1), 0.0).numpy() for deg in poses])
     turns = sorted(round(math.degrees(math.atan2(one.pose[1, 0], one.pose[0, 0])) % 360.0, 1) % 360.0 for one in equal)
-    assert problem == "" and turns == pytest.approx([30.0 * k for k in range(12)], abs=0.15)
+    assert problem == "" and turns == pytest.approx([7.0 + 30.0 * k for k in range(12)], abs=0.15)
 
 
 def test_another_object_is_not_taken():

@@ -28,9 +28,10 @@ INNER = 3
 TAIL = (0.03, 0.4)
 """Depths of free skin from which that length is found, as shares of a frame's largest depth."""
 
-LEAST_FREE = 0.15
-"""Share of the deformed skin that is free where skin hangs around a contact: 0.30 to 0.7 on real and drawn sensors with such skin,
-at most 0.05 on drawn objects without. Below, all deformed skin lies on the object."""
+LEAST_FREE = 0.12
+"""Share of the deformed skin that is free, times that of its shallow part, where skin hangs around a contact: 0.12 to 0.7 on real
+and drawn sensors with such skin, at most 0.12 on objects without, where grooves and feet of walls bend alike. Below, all deformed
+skin lies on the object."""
 
 EXPLAINED = 0.85
 """Share of the slopes nearby that a surface must explain, in squares. Of slopes that are noise, depth explains half in the mean,
@@ -143,8 +144,10 @@ class ContactFromDepth(nn.Module):
         most = smooth_depth.amax(dim=(2, 3), keepdim=True)
         convex = curvature > smooth_depth / self.decay[1] ** 2  # a plane is not free
         deep = some & (smooth_depth > self.tail[0] * most)
-        free = deep & convex & (smooth_depth < self.tail[1] * most)
-        hangs = free.sum(dim=(2, 3), keepdim=True) > self.least_free * deep.sum(dim=(2, 3), keepdim=True)
+        shallow = deep & (smooth_depth < self.tail[1] * most)
+        free = shallow & convex
+        cells = [mask.sum(dim=(2, 3), keepdim=True).to(depth.dtype) for mask in (free, deep, shallow)]
+        hangs = cells[0] * cells[0] > self.least_free * (cells[1] * cells[2])
         decay = self.squared_decay(smooth_depth.masked_fill(~free, 0.0), curvature)
         pressure = (depth - decay * bend).masked_fill(~some, 0.0)
         steep = slope.square().sum(dim=1, keepdim=True)

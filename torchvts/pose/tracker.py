@@ -42,6 +42,11 @@ JUMP_MM = 1.0
 SAME_MM, MOST_TRIED = 0.4, 72
 """Poses that move the contact to so nearly the same place are one, mm; and so many starts are tried for equal poses at most."""
 
+EQUAL, EQUAL_COST = 2.3, 0.008
+"""Poses are equal whose costs on the fine grid are within so many times the least one, or so much more. A bolt head turned by 10
+to 30 degrees, of which hardly more than the outline says so, has 3 times that or more; where slopes err by 3 degrees its equal
+poses have up to 2.2."""
+
 RISE = 3.0
 """A residual of so many times the usual one of a track is no noise."""
 
@@ -293,8 +298,8 @@ class PoseTracker:
             for first, second in itertools.product([*known, pose], repeat=2):
                 if pose is first or pose is second:
                     waiting.append(first @ np.linalg.inv(known[0] if known else pose) @ second)
-        least = max(LEAST_NOISE, min((one.fine.slope_noise for one in found), default=0.0))
-        return [one for one in found if one.fine.slope_noise < RISE * least], problem
+        least = min((one.fine.cost for one in found), default=0.0)
+        return [one for one in found if one.fine.cost < max(EQUAL * least, least + EQUAL_COST)], problem
 
     def _reference_symmetries(self) -> list[Array]:
         """Motions after which the reference looks much the same: continuity is lost, so each of them may have happened."""

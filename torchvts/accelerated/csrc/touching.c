@@ -150,24 +150,24 @@ static float largest(const float *values, int n) {
 enum { AT_ONCE = 16 };
 
 /* Sums over free skin, whose depth lies between `low` and `high` and which bends as skin that decays at least as fast as `bend` says; and how many
-   cells are deeper than `low`, and how many of them free. */
+   cells are deeper than `low`, how many of them shallow, less deep than `high`, and how many of these free. */
 typedef struct {
     double squares, products;
-    int some, free;
+    int some, shallow, free;
 } FreeSkin;
 
 WIDE static FreeSkin free_skin(const float *restrict depth, const float *restrict curvature, const float *restrict mass, float low, float high,
                                float bend, int n) {
-    FreeSkin all = {0.0, 0.0, 0, 0};
+    FreeSkin all = {0.0, 0.0, 0, 0, 0};
     float square[AT_ONCE], product[AT_ONCE];
     double squares[AT_ONCE] = {0.0}, products[AT_ONCE] = {0.0};
     for (int first = 0; first < n; first += AT_ONCE) {
         const int m = least(AT_ONCE, n - first);
         for (int k = 0; k < m; k++) {
             const float z = depth[first + k], c = curvature[first + k];
-            const int is = (mass[first + k] > 0.0f) & (z > low), hangs = is & (z < high) & (c > z / bend);
+            const int is = (mass[first + k] > 0.0f) & (z > low), shallow = is & (z < high), hangs = shallow & (c > z / bend);
             square[k] = hangs ? z * z : 0.0f, product[k] = hangs ? z * c : 0.0f;
-            all.some += is, all.free += hangs;
+            all.some += is, all.shallow += shallow, all.free += hangs;
         }
         for (int k = 0; k < m; k++) squares[k] += (double)square[k], products[k] += (double)product[k];
     }
@@ -180,7 +180,7 @@ static float squared_decay(const Cells *at, const Model *model, int n) {
     const float most = largest(at->smooth_depth, n), low = model->least_tail * most, high = model->most_tail * most;
     const float bend = model->most_decay * model->most_decay;
     const FreeSkin free = free_skin(at->smooth_depth, at->curvature, at->mass, low, high, bend, n);
-    if (!((float)free.free > model->least_free * (float)free.some)) return 0.0f;
+    if (!((float)free.free * (float)free.free > model->least_free * ((float)free.some * (float)free.shallow))) return 0.0f;
     const float sum = (float)free.products, squared = (float)free.squares / (sum > 1e-9f ? sum : 1e-9f);
     const float least_squared = model->least_decay * model->least_decay;
     return squared < least_squared ? least_squared : squared > bend ? bend : squared;

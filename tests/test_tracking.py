@@ -621,7 +621,7 @@ def test_heights_show_the_tilt_that_wrong_slopes_hide():
 @pytest.mark.long
 def test_slopes_that_err_over_wide_areas_are_no_reason_for_confidence():
     ((row, track),) = tracking.run_tracking(["tool handle"], ["fast"], ["slopes off by 3 degrees"], [4], [4])
-    assert max(row.deg) > 0.7 and row.lost == [] and row.wrong == []
+    assert max(row.deg) > 0.6 and row.lost == [] and row.wrong == []
     tracker = vts.PoseTracker(track.frames[0], track.mm_per_pixel)
     for frame in track.frames[1:6]:
         found = tracker(frame)

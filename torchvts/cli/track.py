@@ -59,10 +59,10 @@ def run(arguments: argparse.Namespace) -> int:
     make_folder(arguments.out)
     with contextlib.ExitStack() as stack:
         stream = stack.enter_context(open_stream(arguments, unit))
+        tracker = None if arguments.reference is None else _tracker_of_image(stream, arguments.reference)
         video = None
         if arguments.video != "none":
             video = stack.enter_context(VideoFile(arguments.out / f"track.{arguments.video}", stream.fps))
-        tracker = None if arguments.reference is None else _tracker_of_image(stream, arguments.reference)
         tracking = _Tracking(stream, video, tracker, arguments.least_mm2)
         play(stream, tracking.add)
         if tracking.tracker is None:

@@ -332,7 +332,8 @@ class PoseTracker:
         if found.names:
             message += f"; kept, because the surface slides on itself: {', '.join(found.names)}"
         if not exact:
-            reason = "the way over keyframes adds up" if found.exact else "parts of the contact disagree"
+            by_drift = found.exact or (drift_deg > found.std_deg and 3.0 * drift_deg > TRUSTED_DEG)
+            reason = "the way over keyframes adds up" if by_drift else "parts of the contact disagree"
             reason = reason if found.settled else "the last step was a large one"
             message += f"; uncertain by {std_deg:.1f} degrees and {std_mm:.2f} mm: {reason}"
         return TrackedPose(

@@ -180,7 +180,9 @@ static float squared_decay(const Cells *at, const Model *model, int n) {
     const float most = largest(at->smooth_depth, n), low = model->least_tail * most, high = model->most_tail * most;
     const float bend = model->most_decay * model->most_decay;
     const FreeSkin free = free_skin(at->smooth_depth, at->curvature, at->mass, low, high, bend, n);
-    if (!((float)free.free * (float)free.free > model->least_free * ((float)free.some * (float)free.shallow))) return 0.0f;
+    const float number = (float)free.free, some = (float)free.some;
+    const int most_of_shallow = number * number > 0.12f * (some * (float)free.shallow);
+    if (!(number > model->least_free * some && (most_of_shallow || number > 0.23f * some))) return 0.0f;
     const float sum = (float)free.products, squared = (float)free.squares / (sum > 1e-9f ? sum : 1e-9f);
     const float least_squared = model->least_decay * model->least_decay;
     return squared < least_squared ? least_squared : squared > bend ? bend : squared;

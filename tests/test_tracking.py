@@ -186,10 +186,7 @@ def test_what_only_the_outline_says_tells_equal_poses_from_others():
 def test_equal_poses_that_a_search_misses_follow_from_those_it_finds():
     """One symmetry found gives all powers of it, with the exactness of tracking; a pose between two equal ones is dropped."""
     tracker = vts.PoseTracker(press(objects.gear(), objects.pose(0.0)), PITCH)
-    keyframe, poses = (
-        tracker.graph.keyframes[0],
-        (7.0, 37.6, 38.0),
-    )  # not 0, where the frame is the reference, and fits better than any
+    keyframe, poses = tracker.graph.keyframes[0], (7.0, 37.6, 38.0)  # at 0 the frame would be the reference itself
     frame = grids(contact_frame(press(objects.gear(), objects.pose(7.0, (0.3, 0.1)))), PITCH, keyframe.least_mm, keyframe.times)
     tracker._symmetries_of_reference = []
     equal, problem = tracker._equal_poses(0, frame, [objects.pose(deg, (0.3, 0.1), 0.0).numpy() for deg in poses])

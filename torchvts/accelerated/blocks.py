@@ -146,13 +146,13 @@ class ContactFromDepth(Twin, contact.ContactFromDepth):
         if not usable(depth_mm, gradient):
             return super().find(depth_mm, gradient, deformed)
         return kernels.contact_from_depth(
-            depth_mm, gradient, deformed, (self.cell, self.reach), (ctypes.c_float * 12)(*self.numbers())
+            depth_mm, gradient, deformed, (self.cell, self.reach), (ctypes.c_float * 13)(*self.numbers())
         )
 
     def numbers(self) -> tuple[float, ...]:
         """The settings that the kernel takes."""
         rest = (self.most_unexplained, self.noise_depth_mm, self.free_share, self.fall, float(self.inner))
-        return (self.cell * self.mm_per_pixel, self.share, *self.decay, *self.tail, self.least_free, *rest)
+        return (self.cell * self.mm_per_pixel, self.share, *self.decay, *self.tail, *self.least_free, *rest)
 
 
 class Crop(Twin, frames.Crop):

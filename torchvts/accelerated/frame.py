@@ -65,7 +65,7 @@ class Program(ctypes.Structure):
         *((name, INTEGER) for name in ("passes", "zeroes", "sweeps", "slopes_of_depth")),
         *((name, REAL) for name in ("stiff", "tolerance")),
         *((name, INTEGER) for name in ("contact_cell", "contact_reach")),
-        ("contact_model", REAL * 12),
+        ("contact_model", REAL * 13),
     )
 
 

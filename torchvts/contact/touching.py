@@ -28,10 +28,10 @@ INNER = 3
 TAIL = (0.03, 0.4)
 """Depths of free skin from which that length is found, as shares of a frame's largest depth."""
 
-LEAST_FREE = 0.15
-"""Share of the deformed skin that is free where skin hangs around a contact: 0.21 to 0.7 on real and drawn sensors with such skin.
-Up to 0.23, as objects without such skin have it, where grooves and feet of walls bend alike, that share times the share of the
-shallow skin that is free must be 0.12 too: it is at most 0.123 on them. Below, all deformed skin lies on the object."""
+LEAST_FREE = (0.23, 0.12)
+"""Share of the deformed skin that is free where skin hangs around a contact; or least product of that share and the share of the
+shallow skin that is free. With such skin, on real and drawn sensors: 0.21 to 0.7, and 0.12 to 0.7; without, on objects whose
+grooves and feet of walls bend alike: at most 0.23, and 0.12. Below both, all deformed skin lies on the object."""
 
 EXPLAINED = 0.85
 """Share of the slopes nearby that a surface must explain, in squares. Of slopes that are noise, depth explains half in the mean,
@@ -146,9 +146,8 @@ class ContactFromDepth(nn.Module):
         deep = some & (smooth_depth > self.tail[0] * most)
         shallow = deep & (smooth_depth < self.tail[1] * most)
         free = shallow & convex
-        cells = [mask.sum(dim=(2, 3), keepdim=True).to(depth.dtype) for mask in (free, deep, shallow)]
-        most_of_shallow = cells[0] * cells[0] > 0.12 * (cells[1] * cells[2])
-        hangs = (cells[0] > self.least_free * cells[1]) & (most_of_shallow | (cells[0] > 0.23 * cells[1]))
+        number, of_deep, of_shallow = (mask.sum(dim=(2, 3), keepdim=True).to(depth.dtype) for mask in (free, deep, shallow))
+        hangs = (number > self.least_free[0] * of_deep) | (number * number > self.least_free[1] * (of_deep * of_shallow))
         decay = self.squared_decay(smooth_depth.masked_fill(~free, 0.0), curvature)
         pressure = (depth - decay * bend).masked_fill(~some, 0.0)
         steep = slope.square().sum(dim=1, keepdim=True)

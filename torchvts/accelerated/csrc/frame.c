@@ -37,7 +37,7 @@ typedef struct {
     float stiff, tolerance;
     /* ContactFromDepth */
     int32_t contact_cell, contact_reach;
-    float contact_model[12];
+    float contact_model[13];
 } Program;
 
 /* DepthOutput, of one frame. */

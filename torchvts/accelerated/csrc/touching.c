@@ -5,7 +5,7 @@
 
 /* The settings of ContactFromDepth. */
 typedef struct {
-    float cell_mm, share, least_decay, most_decay, least_tail, most_tail, least_free, most_unexplained, noise_depth_mm, free_share, fall;
+    float cell_mm, share, least_decay, most_decay, least_tail, most_tail, least_free, least_product, most_unexplained, noise_depth_mm, free_share, fall;
     int inner;
 } Model;
 
@@ -181,8 +181,7 @@ static float squared_decay(const Cells *at, const Model *model, int n) {
     const float bend = model->most_decay * model->most_decay;
     const FreeSkin free = free_skin(at->smooth_depth, at->curvature, at->mass, low, high, bend, n);
     const float number = (float)free.free, some = (float)free.some;
-    const int most_of_shallow = number * number > 0.12f * (some * (float)free.shallow);
-    if (!(number > model->least_free * some && (most_of_shallow || number > 0.23f * some))) return 0.0f;
+    if (!(number > model->least_free * some || number * number > model->least_product * (some * (float)free.shallow))) return 0.0f;
     const float sum = (float)free.products, squared = (float)free.squares / (sum > 1e-9f ? sum : 1e-9f);
     const float least_squared = model->least_decay * model->least_decay;
     return squared < least_squared ? least_squared : squared > bend ? bend : squared;
@@ -464,7 +463,7 @@ static int allocate(Frame *frame) {
 /* Contact of one frame, and the work beside it. Returns 1 where memory is short. */
 int find_contact(const Touching *of) {
     const float *is = of->numbers;
-    const Model model = {is[0], is[1], is[2], is[3], is[4], is[5], is[6], is[7], is[8], is[9], is[10], (int)is[11]};
+    const Model model = {is[0], is[1], is[2], is[3], is[4], is[5], is[6], is[7], is[8], is[9], is[10], is[11], (int)is[12]};
     Frame frame = {.of = of, .model = &model};
     if (allocate(&frame)) return 1;
     share(to_cells, &frame, frame.bands);

@@ -107,7 +107,7 @@ def other_light():
     return torch.stack((0.45 + 0.25 * x - 0.1 * y, 0.5 - 0.15 * x * x - 0.1 * y, 0.4 + 0.2 * y - 0.1 * x * y))
 
 
-SLOW = ("pale", "smooth 2", "smooth 3")
+SLOW = ("pale", "smooth 1", "smooth 2", "smooth 3")
 """With neither a prior nor presses, where lights of every kind are tried, and pale ones in any case: up to ten seconds each."""
 
 
@@ -312,7 +312,9 @@ def zoomed(image, scale, shift_px):
     return torch.from_numpy(array).permute(2, 0, 1)
 
 
-@pytest.mark.parametrize("scale, shift_px", [(0.8, (5, -4)), (1.0, (10, 0)), pytest.param(1.25, (0, 0), marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "scale, shift_px", [(0.8, (5, -4)), *(pytest.param(*crop, marks=pytest.mark.long) for crop in ((1.0, (10, 0)), (1.25, (0, 0))))]
+)
 def test_frames_cropped_otherwise_are_named(scale, shift_px):
     y, x = axes()
     light = torch.stack(

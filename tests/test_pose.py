@@ -242,10 +242,32 @@ def test_impossible_frames_are_refused(reference):
         vts.register_depth(vts.DepthOutput(*(torch.cat((t, t)) for t in reference)), reference, PITCH)
     with pytest.raises(TypeError, match="source: expected a DepthOutput"):
         vts.register_depth(reference.depth_mm, reference, PITCH)
-    with pytest.raises(ValueError, match="initial: expected a rigid motion"):
-        vts.register_depth(reference, reference, PITCH, initial=2 * torch.eye(4))
-    with pytest.raises(ValueError, match=r"initial: expected a finite \(4, 4\) tensor"):
+    with pytest.raises(ValueError, match=r"initial: expected \(4, 4\), got \(3, 3\)"):
         vts.register_depth(reference, reference, PITCH, initial=torch.eye(3))
+    for diagonal, last, cause in (
+        ((2.0, 2.0, 2.0), 0.0, "a scale, or another unit"),
+        ((1.0, 1.0, -1.0), 0.0, "a mirror image"),
+        ((1.0, 1.0, 1.0), 3.0, "the last row .* transposed"),
+        ((1.0, 1.0, math.nan), 0.0, "values that are not finite"),
+    ):
+        wrong = torch.diag(torch.tensor([*diagonal, 1.0]))
+        wrong[3, 0] = last
+        with pytest.raises(ValueError, match=f"initial: expected a rigid motion .*{cause}"):
+            vts.register_depth(reference, reference, PITCH, initial=wrong)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_key_is_not_found_a_tooth_or_two_away(seed):
+    """Slopes of its long sides agree under any shift along it, and its teeth are 1.2 mm apart."""
+    turn, x, y, tilt = (2.0 * torch.rand(2, 4, generator=torch.Generator().manual_seed(seed)) - 1.0).unbind(1)
+    before, after = (
+        objects.pose(float(180 * turn[k]), (3 * float(x[k]), 2 * float(y[k])), 0.45, (float(tilt[k]), 1.0)) for k in (0, 1)
+    )
+    frames = [objects.press(objects.key(), pose, 120, 160, 0.125) for pose in (before, after)]
+    found = vts.register_depth(*frames, 0.125)
+    off = found.T_target_source @ invert(after @ invert(before))
+    assert found.converged and float(turn_deg(off)) < 0.2
+    assert float((off[:3, :3] @ after[:3, 3] + off[:3, 3] - after[:3, 3]).norm()) < 0.05
 
 
 def test_the_whole_chain_keeps_within_its_goal():

@@ -633,7 +633,8 @@ def test_the_script_writes_overlay_summary_and_frames(run_stream, unit_file, vid
 
 def test_track_writes_a_row_for_each_frame_after_the_reference(run_script, unit_file, video, tmp_path):
     done = run_script("track", "--source", video, "--calibration", unit_file, "--out", tmp_path, "--video", "none")
-    assert done.returncode == 1 and "frame 15: the reference" in done.stdout and "19 frames, 10 lost" in done.stdout, done.stderr
+    assert done.returncode == 1 and "frame 15: the reference" in done.stdout, done.stderr
+    assert "19 frames, 10 lost, 1 keyframe, 0 loops closed" in done.stdout
     with (tmp_path / "poses.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [int(row["frame"]) for row in rows] == list(range(16, 35))
@@ -658,14 +659,17 @@ def test_track_refuses_a_reference_that_cannot_be_used_and_counts_bad_frames(uni
     for k in range(20):
         cv2.imwrite(str(tmp_path / "film" / f"{k:03d}.png"), camera(1.0 if k >= 15 else 0.0) * (k != 17))
     call = ("track", "--source", tmp_path / "film", "--calibration", unit_file, "--out", tmp_path / "out", "--video", "none")
+    for arguments, error in (
+        (("--reference", tmp_path / "film" / "017.png"), "017.png: the frame has one colour everywhere"),
+        (("--threads", "0"), "--threads: expected at least 1, got 0"),
+        (("--least-mm2", "-1"), "--least-mm2: expected a number above 0"),
+    ):
+        done = run_script(*call, *arguments)
+        assert done.returncode == 2 and error in done.stderr and not (tmp_path / "out").exists(), done.stderr
     done = run_script(*call)
-    assert done.returncode == 1 and "1 frames left out, named above" in done.stdout, done.stderr
-    done = run_script(*call, "--reference", tmp_path / "film" / "017.png")
-    assert done.returncode == 2 and "017.png: the frame has one colour everywhere" in done.stderr
+    assert done.returncode == 1 and "1 frame left out, named above" in done.stdout, done.stderr
     done = run_script(*call, "--least-mm2", "1000")
     assert done.returncode == 2 and "expected a contact to track, got none" in done.stderr
-    done = run_script(*call, "--least-mm2", "-1")
-    assert done.returncode == 2 and "--least-mm2: expected a number above 0" in done.stderr
 
 
 def test_bad_arguments_are_refused_in_a_sentence(run_stream, video, tmp_path):

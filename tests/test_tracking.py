@@ -521,6 +521,15 @@ def test_relief_that_shows_nothing_is_named():
     assert {"translation along x", "rotation about z"} <= set(found.ambiguous)
 
 
+@pytest.mark.parametrize("times", [1000.0, 0.001])
+def test_a_frame_in_another_unit_is_named(times):
+    frames = [press(objects.key(), swing(k)) for k in (0, 1)]
+    tracker = vts.PoseTracker(frames[0], PITCH)
+    for _ in range(2):  # while it tracks, and while it searches
+        assert "another unit?" in tracker(_bad(frames[1], depth_mm=times * frames[1].depth_mm)).lost
+    assert not tracker(frames[1]).lost
+
+
 def test_other_types_and_restart():
     frames = [press(objects.key(), swing(k)) for k in (0, 1)]
     double = [_bad(f, depth_mm=f.depth_mm.double(), gradient=f.gradient.double().requires_grad_()) for f in frames]

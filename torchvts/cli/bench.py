@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from .. import viz
 from ..accelerated import library
+from ..core.checks import check_integer
 from ..evaluation import figures, rows, speed, user_speed
 from ..evaluation.sets import data_folder
 from .options import add_out
@@ -37,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, write tables and the chart, and print the tables."""
-    torch.set_num_threads(arguments.threads)
+    torch.set_num_threads(check_integer("--threads", arguments.threads, 1))
     folder = data_folder(str(Path(__file__).parent))
     data = folder if (folder / "gelsight_mini_a").is_dir() else None
     if library() is None:

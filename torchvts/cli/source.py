@@ -10,6 +10,7 @@ import cv2
 import torch
 
 from ..calibration import Press
+from ..core.checks import check_integer
 from ..model import Calibration, Sensor
 from ..stream import Camera, CameraSettings, TactileFrame, TactileStream, find_camera
 from .options import add_background_frames, add_pipeline, add_sensor, contact_of, load_calibration
@@ -35,8 +36,9 @@ def load_unit(arguments: argparse.Namespace) -> Sensor | Calibration:
     """The sensor or the calibration that was given, and the threads that were asked for."""
     if (arguments.sensor is None) == (arguments.calibration is None):
         raise UsageError("expected either --sensor or --calibration")
-    torch.set_num_threads(max(1, arguments.threads))
-    cv2.setNumThreads(max(1, arguments.threads))
+    check_integer("--threads", arguments.threads, 1)
+    torch.set_num_threads(arguments.threads)
+    cv2.setNumThreads(arguments.threads)
     return Sensor.load(arguments.sensor) if arguments.sensor else load_calibration(arguments.calibration)
 
 

@@ -56,10 +56,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Track until the source ends, and print a summary."""
     check_positive("--least-mm2", arguments.least_mm2)
     unit = load_unit(arguments)
-    make_folder(arguments.out)
     with contextlib.ExitStack() as stack:
         stream = stack.enter_context(open_stream(arguments, unit))
         tracker = None if arguments.reference is None else _tracker_of_image(stream, arguments.reference)
+        make_folder(arguments.out)
         video = None
         if arguments.video != "none":
             video = stack.enter_context(VideoFile(arguments.out / f"track.{arguments.video}", stream.fps))
@@ -191,19 +191,24 @@ def _median_std(rows: list[dict[str, object]]) -> dict[str, float]:
     return {name.removeprefix("std_"): statistics.median(float(str(row[name])) for row in rows) for name in names} if rows else {}
 
 
+def _several(number: int, name: str) -> str:
+    return f"{number} {name}" if number == 1 else f"{number} {name}s"
+
+
 def _print_summary(found: dict[str, Any]) -> None:
     loops = len(found["loops_closed"])
-    print(f"{found['frames']} frames, {found['lost']} lost, {found['keyframes']} keyframes, {loops} loops closed")
+    counts = _several(found["frames"], "frame"), f"{found['lost']} lost", _several(found["keyframes"], "keyframe")
+    print(", ".join((*counts, f"{_several(loops, 'loop')} closed")))
     for reason in list(found["lost_because"])[:5]:
         print(f"  lost: {reason}")
     if found["left_out"]:
-        print(f"  {found['left_out']} frames left out, named above")
+        print(f"  {_several(found['left_out'], 'frame')} left out, named above")
     if found["unknown_motions"]:
         unknown = found["unknown_motions"]
-        print(f"  {sum(unknown.values())} frames with unknown motions, mostly: {next(iter(unknown))}")
+        print(f"  {_several(sum(unknown.values()), 'frame')} with unknown motions, mostly: {next(iter(unknown))}")
     uncertain = found["frames"] - found["lost"] - found["converged"]
     if uncertain:
-        print(f"  {uncertain} frames known less well than to {TRUSTED_DEG:g} degree and {TRUSTED_MM:g} mm")
+        print(f"  {_several(uncertain, 'frame')} known less well than to {TRUSTED_DEG:g} degree and {TRUSTED_MM:g} mm")
         std = found["median_std"]
         shifts, turns = (", ".join(f"{axis} {std[key.format(axis)]:.2g}" for axis in "xyz") for key in ("{}_mm", "r{}_deg"))
         print(f"  standard deviations, medians: {shifts} mm; turns about {turns} degrees")

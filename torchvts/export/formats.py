@@ -22,7 +22,7 @@ from ..core.files import check_target, write_atomically
 from ..normals import WrappedNormals
 from ..pipeline import DepthPipeline
 from .kernels_in_file import linked_kernels, trace_kernels
-from .onnx_operators import decompositions
+from .onnx_operators import decompositions, simplify
 from .trace import size_and_dtype, trace
 
 METADATA_KEY = "torchvts"
@@ -158,10 +158,17 @@ def export_onnx(pipe: DepthPipeline, path: str | Path) -> Path:
         warnings.simplefilter("ignore")
         program = program.run_decompositions(torch.export.default_decompositions() | decompositions())
         model = torch.onnx.export(
-            program, dynamo=True, input_names=["images"], output_names=list(OUTPUTS), external_data=False, verbose=False
+            program,
+            dynamo=True,
+            input_names=["images"],
+            output_names=list(OUTPUTS),
+            external_data=False,
+            verbose=False,
+            optimize=False,
         )
         if model is None:
             raise RuntimeError("onnx: the exporter returned no model")
+        simplify(model.model)
         model.model.metadata_props[METADATA_KEY] = json.dumps(describe(pipe))
         with write_atomically(path) as temporary:
             model.save(temporary, external_data=False)

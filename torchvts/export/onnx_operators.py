@@ -1,4 +1,4 @@
-"""PyTorch operators that ONNX lacks, written in operators that it has."""
+"""What ONNX needs of a graph: PyTorch operators that it lacks, written in those that it has, and nothing that is computed twice."""
 
 from collections.abc import Callable
 from typing import Any
@@ -29,3 +29,19 @@ def nanmedian(values: Tensor, dim: int, keepdim: bool = False) -> tuple[Tensor, 
     ordered, index = ordered.gather(dim, middle), index.gather(dim, middle)
     ordered = torch.where(known.any(dim, keepdim=True), ordered, torch.nan)
     return (ordered, index) if keepdim else (ordered.squeeze(dim), index.squeeze(dim))
+
+
+def simplify(model: Any) -> None:
+    """Fold what is constant, and compute nothing twice, in an ``onnx_ir.Model``.
+
+    The exporter's own optimiser does this and tries rules of rewriting at every operator. They take most of its time, and a
+    pipeline is no faster by them in ONNX Runtime.
+    """
+    from onnx_ir.passes import Sequential, common
+    from onnxscript import optimizer
+
+    optimizer.inline(model)
+    optimizer.fold_constants(model)
+    optimizer.remove_unused_nodes(model)
+    constants = common.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0)
+    Sequential(constants, common.DeduplicateInitializersPass(), common.CommonSubexpressionEliminationPass())(model)

@@ -1,14 +1,19 @@
 """Pose from two depth frames: search over the plane, refinement on every pixel of the common contact, then ambiguity."""
 
+import math
+
 import torch
 from torch import Tensor
 
-from ..core.checks import check_float_tensor, check_least
+from ..core.checks import check_float_tensor, check_least, check_shape
 from .alignment import Fit, distinct, equally_good, is_trusted, rank, refine, score_poses
 from .ambiguity import UNKNOWN_VARIANCE, Unknown, find_unknown, pose_covariance
 from .relief import DepthFrame, Levels, levels
 from .result import Registration, invert, turn_deg
 from .search import search_plane
+
+MOST_TURNS, MOST_AGAIN = 4, 16
+"""Rotations with which shifts are searched again, and hypotheses that come of it, at most."""
 
 
 def register_depth(source: DepthFrame, target: DepthFrame, mm_per_pixel: float, *, initial: Tensor | None = None) -> Registration:
@@ -62,11 +67,31 @@ def align(a: Levels, b: Levels, start: Tensor | None) -> Registration:
     poses = poses[score > 0.4 * score[0]]
     if start is not None:
         poses = torch.cat((start[None], poses))
+    poses = _likely(a, b, poses)
+    poses = _likely(a, b, torch.cat((poses, search_plane(a.coarse, b.coarse, most=MOST_AGAIN, angle=_turns(poses))[0])))
+    return _finish(a, b, poses)
+
+
+def _likely(a: Levels, b: Levels, poses: Tensor) -> Tensor:
+    """The poses, refined on the coarse grid, that cost little more than the best one, best first."""
     poses = refine(a.coarse, b.coarse, poses, 4, 4.0)
     fit = score_poses(a.coarse, b.coarse, poses)
     order = distinct(fit, a.coarse, 0.5)
     value = rank(fit)
-    return _finish(a, b, poses[[k for k in order if value[k] < 2.0 * value[order[0]] + 0.1]])
+    return poses[[k for k in order if value[k] < 2.0 * value[order[0]] + 0.1]]
+
+
+def _turns(poses: Tensor) -> Tensor:
+    """Rotations in the plane, rad, of the best poses, those that differ.
+
+    They are better known than the steps of the first search; with them the right shift stands out of others that are nearly right.
+    """
+    angle = torch.atan2(poses[:, 1, 0], poses[:, 0, 0])
+    kept: list[float] = []
+    for turn in angle.tolist():
+        if all(abs(math.remainder(turn - other, 2.0 * math.pi)) > math.radians(1.0) for other in kept):
+            kept.append(turn)
+    return torch.tensor(kept[:MOST_TURNS])
 
 
 def symmetries(a: Levels) -> list[Tensor]:
@@ -134,11 +159,18 @@ def check_rigid(name: str, T: Tensor) -> Tensor:
         ValueError: no rigid motion.
     """
     check_float_tensor(name, T)
-    if tuple(T.shape) != (4, 4) or not bool(torch.isfinite(T).all()):
-        raise ValueError(f"{name}: expected a finite (4, 4) tensor, got {tuple(T.shape)}")
+    check_shape(name, T, (4, 4))
     T = T.detach().cpu().double()
-    last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-    off = float((T[:3, :3] @ T[:3, :3].T - torch.eye(3, dtype=torch.float64)).abs().max())
-    if off > 1e-3 or float(torch.linalg.det(T[:3, :3])) < 0 or float((T[3] - last).abs().max()) > 1e-6:
-        raise ValueError(f"{name}: expected a rigid motion, rotation without scale or mirror, got one that is {off:.2g} off")
+    turn, last = T[:3, :3], torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    wrong = ""
+    if not bool(torch.isfinite(T).all()):
+        wrong = "values that are not finite"
+    elif float((T[3] - last).abs().max()) > 1e-6:
+        wrong = f"the last row {T[3].tolist()}, not 0, 0, 0, 1: transposed?"
+    elif (off := float((turn @ turn.T - torch.eye(3, dtype=torch.float64)).abs().max())) > 1e-3:
+        wrong = f"columns that are not of length 1 at right angles, by {off:.2g}: a scale, or another unit?"
+    elif float(torch.linalg.det(turn)) < 0.0:
+        wrong = "a mirror image, determinant -1: an axis that points the other way?"
+    if wrong:
+        raise ValueError(f"{name}: expected a rigid motion (4, 4), a rotation and a shift in mm, got {wrong}")
     return T

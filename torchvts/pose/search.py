@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import affine_grid, grid_sample
+from torch.nn.functional import affine_grid, grid_sample, max_pool1d
 
 from .relief import Relief
 
@@ -14,6 +14,10 @@ STEP_DEG = 5.0
 
 ENERGY_FLOOR = 0.15
 """Share of a contact's whole energy that is added to the common part's, so that a small common part does not win by chance."""
+
+
+PEAK_MM = 0.5
+"""Shifts that are nearer to a better one are none of their own: teeth of a key are 1.2 mm apart."""
 
 
 class _Square(NamedTuple):
@@ -32,7 +36,7 @@ class _Peak(NamedTuple):
     column: int
 
 
-def search_plane(source: Relief, target: Relief, most: int = 32, step_deg: float = STEP_DEG) -> tuple[Tensor, Tensor]:
+def search_plane(source: Relief, target: Relief, most: int = 48, angle: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Find the in-plane rotations and shifts under which the slopes of two reliefs agree best.
 
     The two slopes of a pixel form one complex number. The sum of products over a shift is large where the slopes point the same
@@ -43,16 +47,17 @@ def search_plane(source: Relief, target: Relief, most: int = 32, step_deg: float
         source: the relief that is moved.
         target: the relief that stays, of the same pitch.
         most: number of hypotheses.
-        step_deg: step of the rotations, degrees.
+        angle: the rotations to try, rad, each by itself; if None, all around in steps of :data:`STEP_DEG`.
     Returns:
         Poses (K, 4, 4) float64 without a shift in z, best first, and their scores (K,), at most 1.
     Source:
         Padfield, Masked object registration in the Fourier domain, IEEE Trans. Image Processing 21(5), 2012, on complex slopes.
     """
-    angle = torch.deg2rad(torch.arange(0.0, 360.0, step_deg))
+    around = angle is None
+    angle = torch.deg2rad(torch.arange(0.0, 360.0, STEP_DEG)) if angle is None else angle
     moving, fixed = _square(source, rotatable=True), _square(target)
     score = _masked_correlation(moving.channels, fixed.channels, angle)
-    peaks = _peaks(score, max(1, min(round(1.0 / target.pitch), max(score.shape))))[:most]
+    peaks = _peaks(score, max(1, min(round(PEAK_MM / target.pitch), min(score.shape[1:]) // 2)), around, most)
     poses = torch.eye(4, dtype=torch.float64).repeat(len(peaks), 1, 1)
     for pose, peak in zip(poses, peaks):
         side, size = fixed.channels.shape[1], score.shape[1]
@@ -89,21 +94,22 @@ def _masked_correlation(moving: Tensor, fixed: Tensor, angle: Tensor) -> Tensor:
     return score
 
 
-def _peaks(score: Tensor, reach: int) -> list[_Peak]:
-    """The best shift of each rotation that beats its neighbouring rotations, and its second best outside ``reach``; best first."""
-    peaks = []
-    blocked = score.clone()
-    for _ in range(2):
-        best, index = blocked.flatten(1).max(1)
-        neighbours = torch.stack((best.roll(1), best.roll(-1))).amax(0)
-        row, column = index // score.shape[2], index % score.shape[2]
-        for k in torch.nonzero(best >= neighbours)[:, 0].tolist():
-            peaks.append(_Peak(float(best[k]), k, int(row[k]), int(column[k])))
-        for k in range(len(score)):
-            rows = (torch.arange(-reach, reach + 1) + row[k]) % score.shape[1]
-            columns = (torch.arange(-reach, reach + 1) + column[k]) % score.shape[2]
-            blocked[k, rows[:, None], columns[None]] = -1.0
-    return sorted(peaks, reverse=True)
+def _peaks(score: Tensor, reach: int, around: bool, most: int) -> list[_Peak]:
+    """The best shifts that no shift within ``reach`` beats, nor a neighbouring rotation if they go ``around``, best first."""
+    highest = _largest_around(_largest_around(score, 1, reach), 2, reach)
+    if around:
+        highest = _largest_around(highest, 0, 1)
+    rows, columns = score.shape[1:]
+    best, index = torch.where(score >= highest, score, 0.0).flatten().topk(min(most, score.numel()))
+    places = torch.stack((index // (rows * columns), index // columns % rows, index % columns), 1).tolist()
+    return [_Peak(value, *place) for value, place in zip(best.tolist(), places, strict=True) if value > 0.0]
+
+
+def _largest_around(values: Tensor, dim: int, reach: int) -> Tensor:
+    """The largest value within ``reach`` along a dimension that goes around."""
+    lines = values.movedim(dim, -1)
+    around = torch.cat((lines[..., -reach:], lines, lines[..., :reach]), -1)
+    return max_pool1d(around.flatten(0, -2), 2 * reach + 1, 1).reshape(lines.shape).movedim(-1, dim)
 
 
 def _square(relief: Relief, rotatable: bool = False) -> _Square:

@@ -53,8 +53,8 @@ RISE = 3.0
 COST_RISE = 1.5
 """The cost of a pose may be so many times the usual one of a track, where that is large as with a sensor whose slopes err."""
 
-PITCH_RATIO = 1.5
-"""Ratio of the pitch that depth and slopes of the reference have, and the one given, beyond which it is another unit."""
+PITCH_RATIO, UNIT_RATIO = 1.5, 5.0
+"""Ratio of the pitch that depth and slopes have and the one given, beyond which the reference, and a frame, have another unit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +167,7 @@ class PoseTracker:
         reference = self.graph.keyframes[0]
         made = grids(contact, self.mm_per_pixel, reference.least_mm, reference.times)
         if made.touching < 12:
-            return self._lose(f"hardly any contact deeper than {reference.least_mm:.2g} mm")
+            return self._lose(f"hardly any contact deeper than {reference.least_mm:.2g} mm", contact)
         return self._track(contact, made) if self._tracking else self._search(contact, made)
 
     def _track(self, contact: Contact, frame: Grids) -> TrackedPose:
@@ -182,7 +182,7 @@ class PoseTracker:
             found = self._follow(self._active, frame, starts)
         problem = self._problem(self._active, found, starts)
         if problem:
-            return self._lose(problem)
+            return self._lose(problem, contact)
         return self._accept(contact, frame, found)
 
     def _follow(self, index: int, frame: Grids, starts: list[Array]) -> Followed:
@@ -239,22 +239,19 @@ class PoseTracker:
         return ""
 
     def _search(self, contact: Contact, frame: Grids) -> TrackedPose:
-        """Search for the object without its last pose, by the reference and by the present keyframe."""
+        """Search for the object everywhere and near its last pose, by the reference and by the present keyframe."""
         try:
             reliefs = levels(contact, self.mm_per_pixel, "frame")
         except ValueError as error:
-            return self._lose(str(error))
+            return self._lose(str(error), contact)
         message = ""
         for index in dict.fromkeys((0, self._active)):
             registered = align(self.graph.keyframes[index].levels, reliefs, None)
-            message = message or registered.message
-            if not registered.converged:
-                continue
             chain = self.graph.poses[index]
-            starts = [T.numpy() @ chain for T in (registered.T_target_source, *registered.alternatives)]
-            equal, problem = self._equal_poses(index, frame, starts)
+            starts = [T.numpy() @ chain for T in (registered.T_target_source, *registered.alternatives) if registered.converged]
+            equal, problem = self._equal_poses(index, frame, [*starts, self._poses[-1]])
             if not equal:
-                message = problem
+                message = message or (problem if starts else registered.message)
                 continue
             probe = self.graph.keyframes[0].probe
             found = min(equal, key=lambda one: _distance(probe, one.pose @ chain, self._poses[-1]))
@@ -265,7 +262,7 @@ class PoseTracker:
             self._symmetries = [back @ one.pose @ chain for one in equal if one is not found]
             self._active, self._least, self._tracking, self._poses = index, math.inf, True, []
             return self._accept(contact, frame, found)
-        return self._lose(f"not found again: {message}")
+        return self._lose(f"not found again: {message}", contact)
 
     def _equal_poses(self, index: int, frame: Grids, starts: list[Array]) -> tuple[list[Followed], str]:
         """All poses that could be the object's, from some starts on, and if there is none, why.
@@ -363,9 +360,12 @@ class PoseTracker:
         self._way.append(self._way[self._active] + variance)
         self._active, self._least = self.graph.add(keyframe, self._active, found.pose, found.covariance), math.inf
 
-    def _lose(self, reason: str) -> TrackedPose:
-        """No pose: the last one, as of no certainty."""
+    def _lose(self, reason: str, contact: Contact | None = None) -> TrackedPose:
+        """No pose: the last one, as of no certainty. The reason may be that the frame is in another unit."""
         self._tracking = False
+        found = 0.0 if contact is None else pitch_by_slopes(contact)
+        if found > 0.0 and not 1.0 / UNIT_RATIO < found / self.mm_per_pixel < UNIT_RATIO:
+            reason = f"depth and slopes of the frame have a pitch of {found:.3g} mm, not {self.mm_per_pixel:g}: another unit?"
         unknown = torch.eye(6, dtype=torch.float64) * UNKNOWN_VARIANCE
         last = torch.from_numpy(self._poses[-1].copy())
         return TrackedPose(last, math.inf, 0.0, False, f"lost: {reason}", unknown, overlap=0.0, lost=reason, keyframe=self._active)

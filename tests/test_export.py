@@ -127,7 +127,7 @@ def test_torchscript_without_torchvts(low, mini, tmp_path, kind):
     calibration, frames = mini if kind.startswith("response") else low
     pipe = pipeline(calibration, kind.split()[1]) if kind != "own normals" else pipeline(calibration, "fast", normals=learned())
     path = export.export_torchscript(pipe, tmp_path / "pipe.pt")
-    assert export.compare(path, pipe, frames, "torchscript") <= 1e-5
+    assert export.compare(path, pipe, frames[:3], "torchscript") <= 1e-5
 
 
 @pytest.mark.parametrize("optimised", [False, pytest.param(True, marks=pytest.mark.long)])

@@ -95,6 +95,18 @@ def test_a_camera_that_hangs_has_stopped():
     reader.close()
 
 
+def test_a_camera_that_hangs_can_be_closed():
+    """Who waits for its next frame, here a thread, is told at once, not when it has been silent for long."""
+    camera = Camera(1, "hang")
+    reader = LiveReader(lambda: camera)
+    reader.silent_s = 3600.0
+    newest = streams.NewestFrame(reader)
+    assert newest.take()[2].shape == (HEIGHT, WIDTH, 3)
+    newest.close()
+    assert not newest._thread.is_alive() and newest.take() is None
+    camera.unplugged.set()
+
+
 def test_a_camera_comes_back():
     opened = []
 

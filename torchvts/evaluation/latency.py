@@ -105,4 +105,5 @@ def measure_latency(calibration: Calibration, pictures: Sequence[Pixels], fps: f
             if frame.number == frames - 1:  # the newest frame is never dropped
                 break
         dropped = stream.dropped
+        camera.close()  # else the stream waits for its next frame
     return Latency(numbers, delay_ms, len(camera.arrivals) - before, dropped, len(drawn))

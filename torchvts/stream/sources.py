@@ -178,6 +178,7 @@ class _ReadingThread:
         self._reader = reader
         self._asked: queue.SimpleQueue[bool] = queue.SimpleQueue()
         self._found: queue.SimpleQueue[Pixels | Unreadable | Exception | None] = queue.SimpleQueue()
+        self._closed = False
         self._thread = threading.Thread(target=self._run, name="torchvts-camera", daemon=True)
         self._thread.start()
 
@@ -195,7 +196,7 @@ class _ReadingThread:
         Raises:
             OSError: there is none.
         """
-        if not self._thread.is_alive():
+        if self._closed or not self._thread.is_alive():
             raise OSError("it is closed")
         self._asked.put(True)
         try:
@@ -210,8 +211,12 @@ class _ReadingThread:
         return found
 
     def close(self) -> None:
-        """Close the source, and wait for that unless it hangs."""
+        """Close the source, and wait for that unless it hangs; who waits for a frame gets an error."""
+        if self._closed:
+            return
+        self._closed = True
         self._asked.put(False)
+        self._found.put(OSError("it is closed"))
         if self._thread is not threading.current_thread():
             self._thread.join(timeout=2.0)
 

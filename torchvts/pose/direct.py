@@ -67,14 +67,13 @@ def align(a: Levels, b: Levels, start: Tensor | None) -> Registration:
     poses = poses[score > 0.4 * score[0]]
     if start is not None:
         poses = torch.cat((start[None], poses))
-    poses = _likely(a, b, poses)
-    poses = _likely(a, b, torch.cat((poses, search_plane(a.coarse, b.coarse, most=MOST_AGAIN, angle=_turns(poses))[0])))
-    return _finish(a, b, poses)
+    poses = _likely(a, b, refine(a.coarse, b.coarse, poses, 4, 4.0))
+    again, _ = search_plane(a.coarse, b.coarse, MOST_AGAIN, _turns(poses))
+    return _finish(a, b, _likely(a, b, torch.cat((poses, refine(a.coarse, b.coarse, again, 4, 4.0)))))
 
 
 def _likely(a: Levels, b: Levels, poses: Tensor) -> Tensor:
-    """The poses, refined on the coarse grid, that cost little more than the best one, best first."""
-    poses = refine(a.coarse, b.coarse, poses, 4, 4.0)
+    """Those of the poses that cost little more than the best one, best first."""
     fit = score_poses(a.coarse, b.coarse, poses)
     order = distinct(fit, a.coarse, 0.5)
     value = rank(fit)

@@ -15,7 +15,6 @@ STEP_DEG = 5.0
 ENERGY_FLOOR = 0.15
 """Share of a contact's whole energy that is added to the common part's, so that a small common part does not win by chance."""
 
-
 PEAK_MM = 0.5
 """Shifts that are nearer to a better one are none of their own: teeth of a key are 1.2 mm apart."""
 

@@ -11,6 +11,7 @@ import references
 import torch
 
 import torchvts as vts
+from torchvts.calibration.background import AMBIENT, GLOSS, VIGNETTING, BackgroundPixels, paraboloid_start
 from torchvts.calibration.levenberg import LevenbergMarquardt, residual_and_jacobian
 
 scenes = vts.scenes
@@ -415,3 +416,15 @@ def test_a_renderers_material_is_no_matt_skin(out_mm, height_mm, azimuth_deg):
     error = (pipe(camera(scene, power)[1][None]).depth_mm - scene.depth_mm)[0, 0].abs() / 0.0625
     assert float(error.max()) < 0.8
     assert float((fit.lights.position_mm.detach() - torch.from_numpy(lights)).norm(dim=1).max()) < 1.0
+
+
+@pytest.mark.parametrize("value", [0.1, 0.0, -0.05, 2.0])
+@pytest.mark.parametrize("terms", [(), (GLOSS,), (VIGNETTING,), (AMBIENT,), (GLOSS, VIGNETTING, AMBIENT)])
+def test_the_derivatives_of_a_background_are_those_of_its_model(tiny, terms, value):
+    """Where a lens would let through less than nothing, the model keeps its least, and so do its derivatives."""
+    pixels = BackgroundPixels.of(tiny[1].double(), tiny[0])
+    parameter = torch.cat((paraboloid_start(pixels), torch.full((3, len(terms)), value, dtype=torch.float64)), dim=1)
+    pixels = pixels._replace(terms=terms)
+    found, expected = pixels.linearised(parameter), residual_and_jacobian(pixels.residual, parameter)
+    assert torch.equal(found[0], expected[0])
+    assert (found[1] - expected[1]).abs().max() <= 1e-12 * expected[1].abs().max()

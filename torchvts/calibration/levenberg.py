@@ -34,17 +34,23 @@ class LevenbergMarquardt(Optimizer):
         self.last_step = torch.full_like(parameter, torch.inf)
 
     @torch.no_grad()
-    def step(self, closure: Callable[[Tensor], Tensor], weight: Tensor | None = None) -> Tensor:  # type: ignore[override]
+    def step(  # type: ignore[override]
+        self,
+        closure: Callable[[Tensor], Tensor],
+        weight: Tensor | None = None,
+        linearised: Callable[[Tensor], tuple[Tensor, Tensor]] | None = None,
+    ) -> Tensor:
         """Take one step; a group whose loss would rise keeps its parameters and raises its damping.
 
         Args:
             closure: maps parameters (G, K) to residuals (G, N).
             weight: (G, N), weights of the squared residuals; None for ones.
+            linearised: maps parameters to residuals and their derivatives (G, K, N); None for :func:`residual_and_jacobian`.
         Returns:
             (G,), half the weighted sum of squares before the step; (1,), their sum, where the groups are tied.
         """
         parameter = self.param_groups[0]["params"][0]
-        residual, jacobian = residual_and_jacobian(closure, parameter)
+        residual, jacobian = residual_and_jacobian(closure, parameter) if linearised is None else linearised(parameter)
         weighted = jacobian if weight is None else jacobian * weight[:, None]
         normal_matrix = weighted @ jacobian.transpose(1, 2)
         right = -(weighted @ residual[:, :, None])[:, :, 0]

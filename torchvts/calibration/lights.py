@@ -29,7 +29,7 @@ from .background import (
     paraboloid_start,
     to_lights,
 )
-from .levenberg import LevenbergMarquardt, residual_and_jacobian
+from .levenberg import LevenbergMarquardt
 from .light_uncertainty import Linearisation, covariance_and_misfit, direction_and_position_std, held_out_loss
 
 COARSE_PIXELS = 8000
@@ -283,7 +283,7 @@ def _solve(pixels: BackgroundPixels, start: Tensor, loop: _Loop) -> _Solution:
         while len(history) < most and still < 3 and held < HELD_STEPS:
             weight, scale = _robust_weight(pixels.residual(parameter.detach()), pixels.usable)
             before = parameter.detach().clone()
-            optimiser.step(pixels.residual, weight / scale.square() if tied else weight)
+            optimiser.step(pixels.residual, weight / scale.square() if tied else weight, pixels.linearised)
             held = held + 1 if bool(at_bound(parameter.detach(), span).any()) else 0
             if held:
                 with torch.no_grad():
@@ -295,7 +295,7 @@ def _solve(pixels: BackgroundPixels, start: Tensor, loop: _Loop) -> _Solution:
             bar.update()
             bar.set_postfix(loss=f"{history[-1]:.4g}")
     parameter = parameter.detach()
-    residual, jacobian = residual_and_jacobian(pixels.residual, parameter)
+    residual, jacobian = pixels.linearised(parameter)
     weight, scale = _robust_weight(residual, pixels.usable)
     fit = Linearisation(pixels, parameter, residual, jacobian, weight / scale.square(), tie)
     failure = _failure(fit, scale, math.isinf(moved) and len(history) >= ENOUGH_STEPS)

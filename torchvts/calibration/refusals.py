@@ -137,20 +137,20 @@ def other_crop(background: Tensor, frames: Sequence[Tensor]) -> Crop | None:
     if not frames:
         return None
     stride = max(1, len(frames) // 15)
-    seen = torch.stack([_cells(frame, 60) for frame in frames[::stride]]).median(dim=0).values[None].float()
-    own = _cells(background, 60)[None].float()
-    best, least = (1.0, 0.0, 0.0), math.inf
-    plain = _difference(seen, own, torch.tensor([[1.0, 0.0, 0.0]]))[0]
-    for reach in (1.0, 0.25, 0.08):
+    best, least, plain = (1.0, 0.0, 0.0), math.inf, math.inf
+    for reach, rows in ((1.0, 30), (0.25, 30), (0.08, 60)):
+        seen = torch.stack([_cells(frame, rows) for frame in frames[::stride]]).median(dim=0).values[None].float()
+        own = _cells(background, rows)[None].float()
+        plain = float(_difference(seen, own, torch.tensor([[1.0, 0.0, 0.0]]))[0])
         scales = best[0] * torch.exp(torch.linspace(-0.4, 0.4, 9) * reach)
         shifts = [centre + 0.3 * reach * torch.linspace(-1.0, 1.0, 9) for centre in best[1:]]
         tried = torch.cartesian_prod(scales, *shifts)
         left = torch.cat([_difference(seen, own, tried[k : k + 81]) for k in range(0, len(tried), 81)])
         k = int(left.argmin())
-        if float(left[k]) < least:
+        if math.isfinite(float(left[k])):
             best, least = tuple(tried[k].tolist()), float(left[k])
     moved = max(abs(math.log(best[0])), abs(best[1]), abs(best[2]))
-    if least > CHANGED_FRAME * float(plain) or moved < 0.02:
+    if least > CHANGED_FRAME * plain or moved < 0.02:
         return None
     height, width = background.shape[1:]
     return Crop(best[0], (0.5 * width * best[1], 0.5 * height * best[2]))

@@ -154,27 +154,28 @@ def _on_channel(j: int, exponent: Predict) -> Predict:
     """The light of one channel times exp(exponent)."""
 
     def predict(grid: Grid, n: Tensor) -> Tensor:
-        factor = torch.ones_like(grid.light)
-        factor[j] = exponent(grid, n).exp()
-        return grid.light * factor
+        light = list(grid.light)
+        light[j] = light[j] * exponent(grid, n).exp()
+        return torch.stack(light)
 
     return predict
 
 
 def moved_position(position_mm: Tensor, j: int, parameters: Tensor) -> Tensor:
     """Positions (3, 3) of the lights, light ``j`` moved by the parameters of "light_moved"."""
-    moved = position_mm.clone()
-    moved[j, :2] = moved[j, :2] + float(position_mm.norm(dim=1).mean()) * parameters[:2].to(moved.dtype)
-    moved[j, 2] = moved[j, 2] * parameters[2].exp().to(moved.dtype)
-    return moved
+    lights, parameters = list(position_mm), parameters.to(position_mm.dtype)
+    beside = lights[j][:2] + float(position_mm.norm(dim=1).mean()) * parameters[:2]
+    lights[j] = torch.cat((beside, lights[j][2:] * parameters[2:3].exp()))
+    return torch.stack(lights)
 
 
 def _one_light(position: Tensor, j: int) -> Predict:
     def predict(grid: Grid, n: Tensor) -> Tensor:
-        ratio = grid.lit_by(moved_position(position, j, n)) / grid.lit_by(position)
-        power = torch.zeros(3, 1, dtype=torch.float64)
-        power[j] = n[3]
-        return grid.light * ratio * power.exp()
+        light = list(grid.light)
+        one = slice(j, j + 1)
+        ratio = grid.lit_by(moved_position(position, j, n)[one]) / grid.lit_by(position[one])
+        light[j] = light[j] * ratio[0] * n[3].exp()
+        return torch.stack(light)
 
     return predict
 

@@ -7,6 +7,7 @@ log N for each of its parameters.
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -195,12 +196,13 @@ def _fit(hypothesis: Hypothesis, cells: _Cells) -> _Fit:
     parameters = torch.tensor(hypothesis.start or (0.0,) * hypothesis.size, dtype=torch.float64)
     now = cells.residual(hypothesis, parameters)
     width, step_size = 0.0, 1e-4
+    steps = step_size * torch.eye(hypothesis.size, dtype=torch.float64)
     for turn in range(14 if hypothesis.size else 0):
         length = torch.where(cells.usable, now.abs(), torch.nan)
         width = max(TUKEY, TUKEY * 1.4826 * float(length.nanmedian())) if turn == 0 else max(TUKEY, 0.6 * width)
         weight = (tukey_weight(now / width) * cells.usable).flatten()
-        moved = [cells.residual(hypothesis, parameters + step_size * e) for e in torch.eye(hypothesis.size, dtype=torch.float64)]
-        columns = torch.stack([((residual - now) / step_size).flatten() for residual in moved], 1)
+        moved = torch.func.vmap(partial(cells.residual, hypothesis))(parameters + steps)
+        columns = ((moved - now) / step_size).flatten(1).t()
         weighted = columns * weight[:, None]
         normal = weighted.t() @ columns
         normal = normal + torch.diag(normal.diagonal() * 1e-6 + 1e-9)

@@ -267,6 +267,12 @@ def microfacet(n_l: Tensor, n_v: Tensor, n_h: Tensor, roughness: float = GLOSS_R
     return spread / ((n_l * (1.0 - k) + k) * (n_v * (1.0 - k) + k))
 
 
+def log_slope_of_lobe(n_l: Tensor, n_h: Tensor, roughness: float = GLOSS_ROUGHNESS) -> Tensor:
+    """d log :func:`microfacet` / d n_l where the view is along the normal, so that n_h^2 = (1 + n_l) / 2."""
+    a, k = roughness**4, (roughness + 1.0) ** 2 / 8.0
+    return (1.0 - a) / (n_h * n_h * (a - 1.0) + 1.0) - (1.0 - k) / (n_l * (1.0 - k) + k)
+
+
 def glossy_light(rows: Tensor, normal: Tensor, gloss: Tensor, roughness: float = GLOSS_ROUGHNESS) -> tuple[Tensor, Tensor]:
     """Light of N pixels of a glossy skin and its derivative in the normal, without the clamp of attached shadows.
 

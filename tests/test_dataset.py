@@ -124,7 +124,7 @@ def test_killed_processes_lose_nothing_and_the_next_run_goes_on(unit, frames, wh
         report = reconstruct_dataset(unit, frames, out, workers=0)
         assert report.rows == 120 and 0 < report.before <= done
     else:
-        second = started(TORCHRUN, unit, frames, "--out", out)
+        second = started(launcher, unit, frames, "--out", out)
         printed = second.communicate()[0]
         assert second.returncode == 0, printed
         assert "wrote 120 frames" in printed and "by an earlier run" in printed

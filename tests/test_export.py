@@ -14,7 +14,6 @@ from torchvts import export
 from torchvts.accelerated import kernels, reference_only
 from torchvts.export import kernels_in_file, onnx_operators
 
-LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
 HEIGHT, WIDTH, PITCH = 48, 64, 0.6
 SENSOR = vts.Sensor("rig", HEIGHT, WIDTH, PITCH)
 
@@ -42,10 +41,6 @@ def mini():
 def long_to_write(*kinds):
     """Pipelines whose graphs take minutes to write."""
     return [pytest.param(kind, marks=pytest.mark.long) for kind in kinds]
-
-
-WITH_ALL_PASSES = pytest.param("response auto", marks=[pytest.mark.long] * LONG)
-"""Its graph has all passes in `make test-long`, two in `make test`."""
 
 
 def pipeline(calibration, mode, **options):
@@ -121,7 +116,7 @@ def test_onnx_of_an_image_whose_cells_are_larger_than_pixels(cells_of_two, tmp_p
     assert export.compare(export.export_onnx(pipe, tmp_path / "pipe.onnx"), pipe, frames, "onnx") <= 1e-3
 
 
-@pytest.mark.parametrize("kind", ["lights fast", "response fast", "own normals", *long_to_write("lights precise", "response auto")])
+@pytest.mark.parametrize("kind", ["response fast", "own normals", *long_to_write("lights fast", "lights precise", "response auto")])
 def test_torchscript_without_torchvts(low, mini, tmp_path, kind):
     """The optimiser of TorchScript takes 10 s and more for a graph of several passes."""
     calibration, frames = mini if kind.startswith("response") else low
@@ -165,12 +160,12 @@ def test_gradients_through_torchscript_without_torchvts(low, tmp_path, optimised
     )
 
 
-@pytest.mark.parametrize("kind", [WITH_ALL_PASSES, *long_to_write("own normals", "lights precise")])
+@pytest.mark.parametrize("kind", long_to_write("response auto", "own normals", "lights precise"))
 def test_a_program_takes_the_decisions_of_the_pipeline(low, mini, tmp_path, kind):
     """Loops, early ends and dark pixels in the graph, against the Python of the pipeline; then from its file, without torchvts."""
     calibration, frames = mini if kind == "response auto" else low
     pipe = pipeline(calibration, kind.split()[1]) if kind != "own normals" else pipeline(calibration, "fast", normals=learned())
-    if kind != "response auto" or not LONG:
+    if kind != "response auto":
         at_most_two_passes(pipe)
     program = export.export_program(pipe, tmp_path / "pipe.pt2").module()
     for batch in (frames[:1], frames[1:3], frames[:3], frames[3:], frames):
@@ -182,7 +177,38 @@ def test_a_program_takes_the_decisions_of_the_pipeline(low, mini, tmp_path, kind
         assert export.compare(tmp_path / "pipe.pt2", pipe, frames, "pt2") <= 1e-5
 
 
-@pytest.mark.parametrize("kind", ["response fast", *long_to_write("response precise", "lights fast", "lights precise")])
+class Changed(nn.Module):
+    """Where the light has changed: next to nothing of the graph of a ContactMask."""
+
+    def __init__(self, flat):
+        super().__init__()
+        self.register_buffer("flat", flat)
+
+    def forward(self, compensated):
+        return (compensated - self.flat).abs().amax(1, keepdim=True) > 0.05
+
+
+class Deep(nn.Module):
+    def forward(self, depth_mm, gradient, deformed):
+        return deformed & (depth_mm > 0.1)
+
+
+@pytest.mark.parametrize("name, writer, suffix", [("onnx", export.export_onnx, "onnx"), ("pt2", export.export_program, "pt2")])
+def test_a_chain_with_own_normals_and_masks_without_torchvts(low, tmp_path, name, writer, suffix):
+    """What the library does around them; a whole pipeline takes up to a minute to be written."""
+    if export.missing(name):
+        pytest.skip(export.missing(name))
+    calibration, frames = low
+    blocks = pipeline(calibration, "fast")
+    chain = (blocks.compensate, Changed(blocks.compensate(frames[3:])), learned(), blocks.gradient, blocks.integrate)
+    pipe = vts.DepthPipeline(*chain, mm_per_pixel=PITCH, contact=Deep()).eval()
+    assert pipe(frames).contact.flatten(1).any(1).tolist() == [True, True, True, False]
+    path = tmp_path / f"pipe.{suffix}"
+    writer(pipe, path)
+    assert export.compare(path, pipe, frames, name) <= 1e-4
+
+
+@pytest.mark.parametrize("kind", long_to_write("response fast", "response precise", "lights fast", "lights precise"))
 def test_onnx_without_torchvts(low, mini, tmp_path, kind):
     if export.missing("onnx"):
         pytest.skip(export.missing("onnx"))
@@ -285,8 +311,8 @@ def test_what_stands_in_for_operators_that_onnx_lacks(length):
 
 def test_a_file_that_does_not_agree_or_does_not_run_is_reported(low, tmp_path):
     calibration, frames = low
-    pipe = pipeline(calibration, "precise")
-    path = export.export_torchscript(pipeline(calibration, "fast"), tmp_path / "pipe.pt")
+    pipe = pipeline(calibration, "fast")
+    path = export.export_torchscript(pipeline(calibration, "fast", normals=learned()), tmp_path / "pipe.pt")
     assert export.compare(path, pipe, frames[:1], "torchscript") > 0.05
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(RuntimeError, match=r"pipe.pt: could not be run without torchvts: .+"):
@@ -301,7 +327,9 @@ class Unscriptable(nn.Module):
 def test_one_format_that_fails_leaves_the_others(low, tmp_path, monkeypatch):
     calibration, frames = low
     monkeypatch.setattr(export.formats, "find_spec", lambda name: None)
-    rows = export.export_checked(pipeline(calibration, "fast"), tmp_path / "new", ["onnx", "torchscript"], frames)
+    rows = export.export_checked(
+        pipeline(calibration, "fast", normals=learned()), tmp_path / "new", ["onnx", "torchscript"], frames
+    )
     assert [row.ok for row in rows] == [False, True]
     assert rows[0].reason == "onnx: onnx, onnxscript, onnxruntime not found: pip install 'torchvts[onnx]'"
     assert rows[1].size_kb > 10 and rows[1].difference_mm <= 1e-5

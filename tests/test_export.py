@@ -193,7 +193,10 @@ class Deep(nn.Module):
         return deformed & (depth_mm > 0.1)
 
 
-@pytest.mark.parametrize("name, writer, suffix", [("onnx", export.export_onnx, "onnx"), ("pt2", export.export_program, "pt2")])
+@pytest.mark.parametrize(
+    "name, writer, suffix",
+    [("onnx", export.export_onnx, "onnx"), pytest.param("pt2", export.export_program, "pt2", marks=pytest.mark.long)],
+)
 def test_a_chain_with_own_normals_and_masks_without_torchvts(low, tmp_path, name, writer, suffix):
     """What the library does around them; a whole pipeline takes up to a minute to be written."""
     if export.missing(name):

@@ -82,6 +82,16 @@ def test_helpers_may_be_woken_by_anyone(threads):
     assert all(torch.equal(a, b) for k, out in found for a, b in zip(out, alone[k], strict=True))
 
 
+def test_the_way_from_core_to_core_is_timed():
+    """Zero where no second thread comes; nobody waits for ever, and frames are as before."""
+    pipe, images = pipe_and_images((96, 128))
+    alone = pipe(images[0])
+    with ThreadPoolExecutor(4) as pool:
+        for found in pool.map(lambda _: kernels.loaded().exchange_ns(), range(40)):
+            assert 0.0 <= found < 1e6
+    assert all(torch.equal(a, b) for a, b in zip(pipe(images[0]), alone, strict=True))
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
 def test_a_fork_starts_its_own_helpers(threads):
     threads(2)

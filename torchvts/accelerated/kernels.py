@@ -47,6 +47,7 @@ SIGNATURES = {
     "grid_means": ("v", "p iiiiiii p"),
     "slopes": ("v", "p ii f p"),
     "wake_helpers": ("v", "i"),
+    "exchange_ns": ("d", ""),
     "solve_frames": ("i", "pp ii ppppp"),
     "poisson_plan_size": ("l", "i"),
     "make_poisson_plan": ("v", "ii p"),

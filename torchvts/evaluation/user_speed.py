@@ -209,6 +209,7 @@ def run(data: Path | None, progress: Callable[[str], None], calls: int = 100, lo
         calls: number of calls of each row, at least 20.
         long: 10,000 frames, every 20 ms, of the first unit at 320x240 too, for the 99th percentile: seven minutes more.
     """
+    exchanges = [exchange_ns()]
     makers: list[Callable[[tuple[int, int]], Unit]] = [drawn] if data is None else [partial(mini, data), drawn]
     rows: list[Paced] = []
     for maker in makers:
@@ -216,6 +217,7 @@ def run(data: Path | None, progress: Callable[[str], None], calls: int = 100, lo
             unit = maker(size)
             progress(f"{unit.name}, {size[1]}x{size[0]}")
             rows += frames(unit, max(20, calls // (4 if size[0] > 480 else 1)))
+            exchanges.append(exchange_ns())
             if size == SIZES[1]:
                 rows += batches(unit, calls)
                 rows += _in_one_thread(unit, calls)
@@ -232,9 +234,23 @@ def run(data: Path | None, progress: Callable[[str], None], calls: int = 100, lo
     once = list(costs(unit, labelled, background))
     kernels = "compiled kernels" if library() is not None else "NO COMPILED KERNELS: PyTorch alone"
     cores, threads = os.cpu_count(), torch.get_num_threads()
+    exchanges += [exchange_ns()]
     return Measured(
-        rows, once, f"{platform.machine()}, {cores} cores, {threads} threads allowed, torch {torch.__version__}, {kernels}"
+        rows,
+        once,
+        f"{platform.machine()}, {cores} cores, {threads} threads allowed, torch {torch.__version__}, {kernels}; a cache line from "
+        f"core to core and back: {' ns, '.join(f'{value:.0f}' for value in exchanges)} ns (start, sizes in turn, end)",
     )
+
+
+def exchange_ns() -> float:
+    """Time that a line of memory takes from one core's cache to another's and back, ns; the median of five, 0 without kernels.
+
+    Some 50 ns within a cache that both share; 300 where a virtual machine's two cores lie in different parts of the processor,
+    where two threads help each other less. A machine may change from one to the other within a minute.
+    """
+    loaded = library()
+    return 0.0 if loaded is None else statistics.median(float(loaded.exchange_ns()) for _ in range(5))
 
 
 def _in_one_thread(unit: Unit, calls: int) -> list[Paced]:

@@ -34,6 +34,9 @@ CAMERA_FRAMES = 600
 OWN = "own choice"
 """Threads that the library chooses by itself."""
 
+NO_SHARED_CACHE_NS = 150.0
+"""A longer way of a cache line from core to core and back leads through memory that both share, not through a cache."""
+
 
 @dataclass(frozen=True)
 class Paced:
@@ -49,6 +52,7 @@ class Paced:
         p90_ms: 90th percentile of a frame, ms.
         p99_ms: 99th, ms; None for fewer than 500 calls.
         calls: number of calls.
+        exchange_ns: larger :func:`exchange_ns` of before and after, ns.
     """
 
     unit: str
@@ -60,6 +64,7 @@ class Paced:
     p90_ms: float
     p99_ms: float | None
     calls: int
+    exchange_ns: float = 0.0
 
 
 class Cost(NamedTuple):
@@ -91,11 +96,28 @@ def paced(call: Callable[[], object], before: Callable[[], object], calls: int) 
     return times
 
 
-def summary(unit: str, method: str, size: Size, pace: str, threads: str, times: Sequence[float]) -> Paced:
-    """The record of the times of calls, ms; per frame where a call has several."""
+class Timed(NamedTuple):
+    """Times of calls, ms, and the larger :func:`exchange_ns` of before and after."""
+
+    times: Sequence[float]
+    exchange_ns: float
+
+
+def timed(call: Callable[[], object], before: Callable[[], object], calls: int) -> Timed:
+    """:func:`paced`, and how far from each other the cores lay."""
+    first = exchange_ns()
+    times = paced(call, before, calls)
+    return Timed(times, max(first, exchange_ns()))
+
+
+def summary(unit: str, method: str, size: Size, pace: str, threads: str, calls: Timed) -> Paced:
+    """The record of the times of calls; per frame where a call has several."""
+    times, exchange = calls
     ordered = sorted(value / size.batch for value in times)
     p99 = ordered[int(0.99 * len(ordered))] if len(ordered) >= 500 else None
-    return Paced(unit, method, size, pace, threads, statistics.median(ordered), ordered[int(0.9 * len(ordered))], p99, len(ordered))
+    return Paced(
+        unit, method, size, pace, threads, statistics.median(ordered), ordered[int(0.9 * len(ordered))], p99, len(ordered), exchange
+    )
 
 
 def mini(data: Path, size: tuple[int, int]) -> Unit:
@@ -126,8 +148,8 @@ def frames(unit: Unit, calls: int, threads: str = OWN) -> Iterator[Paced]:
     record = partial(summary, unit.name)
     for mode in MODES:
         call = partial(DepthPipeline.from_calibration(unit.calibration, mode), unit.image)
-        yield record(mode, size, PACES[0], threads, paced(call, lambda: None, calls))
-        yield record(mode, size, PACES[1], threads, paced(call, partial(time.sleep, 0.02), calls))
+        yield record(mode, size, PACES[0], threads, timed(call, lambda: None, calls))
+        yield record(mode, size, PACES[1], threads, timed(call, partial(time.sleep, 0.02), calls))
         if unit.peer is not None:
             times, others = alternating(call, unit.peer, min(calls, 60))
             yield record(mode, size, PACES[2], threads, times)
@@ -135,11 +157,11 @@ def frames(unit: Unit, calls: int, threads: str = OWN) -> Iterator[Paced]:
                 yield record(GS_SDK, size, "after our frame", threads, others)
 
 
-def alternating(call: Callable[[], object], peer: Callable[[], object], calls: int) -> tuple[list[float], list[float]]:
-    """Times of both, ms, one after the other in one process."""
+def alternating(call: Callable[[], object], peer: Callable[[], object], calls: int) -> tuple[Timed, Timed]:
+    """Times of both, one after the other in one process."""
     others: list[float] = []
-    times = paced(call, lambda: others.append(_ms(peer)), calls)
-    return times, others[-calls:]
+    times = timed(call, lambda: others.append(_ms(peer)), calls)
+    return times, Timed(others[-calls:], times.exchange_ns)
 
 
 def _ms(call: Callable[[], object]) -> float:
@@ -154,7 +176,7 @@ def batches(unit: Unit, calls: int) -> Iterator[Paced]:
     for count in BATCHES:
         images = unit.image.repeat(count, 1, 1, 1)
         size = Size(unit.image.shape[2], unit.image.shape[3], count)
-        times = paced(partial(pipe, images), lambda: None, max(10, calls // count))
+        times = timed(partial(pipe, images), lambda: None, max(10, calls // count))
         yield summary(unit.name, MODES[0], size, PACES[0], OWN, times)
 
 
@@ -209,7 +231,6 @@ def run(data: Path | None, progress: Callable[[str], None], calls: int = 100, lo
         calls: number of calls of each row, at least 20.
         long: 10,000 frames, every 20 ms, of the first unit at 320x240 too, for the 99th percentile: seven minutes more.
     """
-    exchanges = [exchange_ns()]
     makers: list[Callable[[tuple[int, int]], Unit]] = [drawn] if data is None else [partial(mini, data), drawn]
     rows: list[Paced] = []
     for maker in makers:
@@ -217,7 +238,6 @@ def run(data: Path | None, progress: Callable[[str], None], calls: int = 100, lo
             unit = maker(size)
             progress(f"{unit.name}, {size[1]}x{size[0]}")
             rows += frames(unit, max(20, calls // (4 if size[0] > 480 else 1)))
-            exchanges.append(exchange_ns())
             if size == SIZES[1]:
                 rows += batches(unit, calls)
                 rows += _in_one_thread(unit, calls)
@@ -226,7 +246,7 @@ def run(data: Path | None, progress: Callable[[str], None], calls: int = 100, lo
         progress("10,000 frames, every 20 ms")
         for mode in MODES:
             call = partial(DepthPipeline.from_calibration(unit.calibration, mode), unit.image)
-            times = paced(call, partial(time.sleep, 0.02), 10_000)
+            times = timed(call, partial(time.sleep, 0.02), 10_000)
             rows.append(summary(unit.name, mode, Size(*SIZES[1]), PACES[1], OWN, times))
     progress("calibration, first frame, delay behind a camera")
     background, presses = (None, []) if data is None else read_presses(data / "gelsight_mini_a")
@@ -234,12 +254,8 @@ def run(data: Path | None, progress: Callable[[str], None], calls: int = 100, lo
     once = list(costs(unit, labelled, background))
     kernels = "compiled kernels" if library() is not None else "NO COMPILED KERNELS: PyTorch alone"
     cores, threads = os.cpu_count(), torch.get_num_threads()
-    exchanges += [exchange_ns()]
     return Measured(
-        rows,
-        once,
-        f"{platform.machine()}, {cores} cores, {threads} threads allowed, torch {torch.__version__}, {kernels}; a cache line from "
-        f"core to core and back: {' ns, '.join(f'{value:.0f}' for value in exchanges)} ns (start, sizes in turn, end)",
+        rows, once, f"{platform.machine()}, {cores} cores, {threads} threads allowed, torch {torch.__version__}, {kernels}"
     )
 
 
@@ -272,7 +288,7 @@ def ratios(rows: Sequence[Paced]) -> list[str]:
         if row.pace == PACES[2] and peer is not None:
             lines.append(
                 f"{row.unit}, {row.size.width}x{row.size.height}, threads: {row.threads}: {row.method} {row.median_ms:.2f} ms, "
-                f"{peer / row.median_ms:.1f} times as fast as {GS_SDK} ({peer:.1f} ms)"
+                f"{peer / row.median_ms:.1f} times as fast as {GS_SDK} ({peer:.1f} ms){_far(row)}"
             )
     return lines
 
@@ -287,7 +303,7 @@ def table(measured: Measured) -> str:
         for pace in PACES:
             of_pace = [row for row in known if row.pace == pace]
             best = max(of_pace, key=lambda row: row.calls, default=None)
-            cells.append("" if best is None else f"{best.median_ms:.2f}, {best.p90_ms:.2f}" + _p99(best))
+            cells.append("" if best is None else f"{best.median_ms:.2f}, {best.p90_ms:.2f}" + _p99(best) + _far(best))
         batch = f", batch {size.batch}" if size.batch > 1 else ""
         tight = next((row for row in known if row.pace == PACES[0]), None)
         rate = number(None if tight is None else 1000.0 / tight.median_ms, 0)
@@ -301,8 +317,17 @@ def table(measured: Measured) -> str:
         "frames/s in a tight loop",
     ]
     once = markdown(["what is paid once, or behind a camera", ""], [[c.name, f"{c.value:.3g} {c.unit}"] for c in measured.costs])
-    return "\n".join([markdown(titles, lines), "", *ratios(measured.frames), "", once, "", measured.machine])
+    ways = sorted(row.exchange_ns for row in measured.frames)
+    note = (
+        f"A cache line took {ways[0]:.0f} to {ways[-1]:.0f} ns from core to core and back, measured before and after each row. "
+        f"* more than {NO_SHARED_CACHE_NS:.0f} ns: the cores share no cache."
+    )
+    return "\n".join([markdown(titles, lines), "", note, "", *ratios(measured.frames), "", once, "", measured.machine])
 
 
 def _p99(row: Paced) -> str:
     return "" if row.p99_ms is None else f" ({row.p99_ms:.2f} of {row.calls})"
+
+
+def _far(row: Paced) -> str:
+    return " *" if row.exchange_ns > NO_SHARED_CACHE_NS else ""

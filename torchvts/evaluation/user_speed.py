@@ -322,7 +322,8 @@ def table(measured: Measured) -> str:
         f"A cache line took {ways[0]:.0f} to {ways[-1]:.0f} ns from core to core and back, measured before and after each row. "
         f"* more than {NO_SHARED_CACHE_NS:.0f} ns: the cores share no cache."
     )
-    return "\n".join([markdown(titles, lines), "", note, "", *ratios(measured.frames), "", once, "", measured.machine])
+    notes = [note, ""] if ways[-1] > 0.0 else []  # without kernels there is no second thread
+    return "\n".join([markdown(titles, lines), "", *notes, *ratios(measured.frames), "", once, "", measured.machine])
 
 
 def _p99(row: Paced) -> str:

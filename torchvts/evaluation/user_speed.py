@@ -35,7 +35,7 @@ OWN = "own choice"
 """Threads that the library chooses by itself."""
 
 NO_SHARED_CACHE_NS = 150.0
-"""A longer way of a cache line from core to core and back leads through memory that both share, not through a cache."""
+"""After a longer way of a cache line from core to core and back the cores are taken to share no cache."""
 
 
 @dataclass(frozen=True)
@@ -84,18 +84,6 @@ class Unit(NamedTuple):
     peer: Callable[[], object] | None
 
 
-def paced(call: Callable[[], object], before: Callable[[], object], calls: int) -> list[float]:
-    """Time of each of so many calls, ms, something else before each; three to warm up."""
-    times: list[float] = []
-    with torch.inference_mode():
-        for k in range(calls + 3):
-            before()
-            spent = _ms(call)
-            if k >= 3:
-                times.append(spent)
-    return times
-
-
 class Timed(NamedTuple):
     """Times of calls, ms, and the larger :func:`exchange_ns` of before and after."""
 
@@ -103,10 +91,16 @@ class Timed(NamedTuple):
     exchange_ns: float
 
 
-def timed(call: Callable[[], object], before: Callable[[], object], calls: int) -> Timed:
-    """:func:`paced`, and how far from each other the cores lay."""
+def paced(call: Callable[[], object], before: Callable[[], object], calls: int) -> Timed:
+    """Time of each of so many calls, something else before each; three to warm up. And how far from each other the cores lay."""
+    times: list[float] = []
     first = exchange_ns()
-    times = paced(call, before, calls)
+    with torch.inference_mode():
+        for k in range(calls + 3):
+            before()
+            spent = _ms(call)
+            if k >= 3:
+                times.append(spent)
     return Timed(times, max(first, exchange_ns()))
 
 
@@ -148,8 +142,8 @@ def frames(unit: Unit, calls: int, threads: str = OWN) -> Iterator[Paced]:
     record = partial(summary, unit.name)
     for mode in MODES:
         call = partial(DepthPipeline.from_calibration(unit.calibration, mode), unit.image)
-        yield record(mode, size, PACES[0], threads, timed(call, lambda: None, calls))
-        yield record(mode, size, PACES[1], threads, timed(call, partial(time.sleep, 0.02), calls))
+        yield record(mode, size, PACES[0], threads, paced(call, lambda: None, calls))
+        yield record(mode, size, PACES[1], threads, paced(call, partial(time.sleep, 0.02), calls))
         if unit.peer is not None:
             times, others = alternating(call, unit.peer, min(calls, 60))
             yield record(mode, size, PACES[2], threads, times)
@@ -160,7 +154,7 @@ def frames(unit: Unit, calls: int, threads: str = OWN) -> Iterator[Paced]:
 def alternating(call: Callable[[], object], peer: Callable[[], object], calls: int) -> tuple[Timed, Timed]:
     """Times of both, one after the other in one process."""
     others: list[float] = []
-    times = timed(call, lambda: others.append(_ms(peer)), calls)
+    times = paced(call, lambda: others.append(_ms(peer)), calls)
     return times, Timed(others[-calls:], times.exchange_ns)
 
 
@@ -176,7 +170,7 @@ def batches(unit: Unit, calls: int) -> Iterator[Paced]:
     for count in BATCHES:
         images = unit.image.repeat(count, 1, 1, 1)
         size = Size(unit.image.shape[2], unit.image.shape[3], count)
-        times = timed(partial(pipe, images), lambda: None, max(10, calls // count))
+        times = paced(partial(pipe, images), lambda: None, max(10, calls // count))
         yield summary(unit.name, MODES[0], size, PACES[0], OWN, times)
 
 
@@ -246,7 +240,7 @@ def run(data: Path | None, progress: Callable[[str], None], calls: int = 100, lo
         progress("10,000 frames, every 20 ms")
         for mode in MODES:
             call = partial(DepthPipeline.from_calibration(unit.calibration, mode), unit.image)
-            times = timed(call, partial(time.sleep, 0.02), 10_000)
+            times = paced(call, partial(time.sleep, 0.02), 10_000)
             rows.append(summary(unit.name, mode, Size(*SIZES[1]), PACES[1], OWN, times))
     progress("calibration, first frame, delay behind a camera")
     background, presses = (None, []) if data is None else read_presses(data / "gelsight_mini_a")
@@ -320,7 +314,7 @@ def table(measured: Measured) -> str:
     ways = sorted(row.exchange_ns for row in measured.frames)
     note = (
         f"A cache line took {ways[0]:.0f} to {ways[-1]:.0f} ns from core to core and back, measured before and after each row. "
-        f"* more than {NO_SHARED_CACHE_NS:.0f} ns: the cores share no cache."
+        f"* more than {NO_SHARED_CACHE_NS:.0f} ns: presumably the cores share no cache."
     )
     notes = [note, ""] if ways[-1] > 0.0 else []  # without kernels there is no second thread
     return "\n".join([markdown(titles, lines), "", *notes, *ratios(measured.frames), "", once, "", measured.machine])

@@ -418,7 +418,7 @@ def test_a_renderers_material_is_no_matt_skin(out_mm, height_mm, azimuth_deg):
     assert float((fit.lights.position_mm.detach() - torch.from_numpy(lights)).norm(dim=1).max()) < 1.0
 
 
-@pytest.mark.parametrize("value", [0.1, 0.0, -0.05, 2.0])
+@pytest.mark.parametrize("value", [0.1, 0.0, -0.05, -0.5, 2.0])
 @pytest.mark.parametrize("terms", [(), (GLOSS,), (VIGNETTING,), (AMBIENT,), (GLOSS, VIGNETTING, AMBIENT)])
 def test_the_derivatives_of_a_background_are_those_of_its_model(tiny, terms, value):
     """Where a lens would let through less than nothing, the model keeps its least, and so do its derivatives."""

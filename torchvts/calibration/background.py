@@ -97,7 +97,7 @@ class BackgroundPixels(NamedTuple):
 
         Forward-mode derivatives are the same to rounding and take five times as long.
         """
-        value, log_rho = self.model(parameter), parameter[:, 3:4]
+        value = self.model(parameter)
         a, b, z = parameter[:, 0:1], parameter[:, 1:2], parameter[:, 2:3].exp()
         extra = {name: parameter[:, 4 + k : 5 + k] for k, name in enumerate(self.terms)}
         x, y = self.x - a, self.y - b
@@ -105,7 +105,6 @@ class BackgroundPixels(NamedTuple):
         along = torch.stack((x * inverse, y * inverse, 1.0 - z**2 * inverse), dim=1)  # of the logarithm of z / distance
         slopes = torch.empty(3, parameter.shape[1], len(self.x), dtype=value.dtype)
         slopes[:, 0:2], slopes[:, 2], slopes[:, 3] = 3.0 * along[:, 0:2], 3.0 * along[:, 2] - 2.0, 1.0
-        light = (log_rho + 1.5 * torch.log(inverse)).exp() * z if AMBIENT in extra else value
         if GLOSS in extra:
             gloss, n_l = extra[GLOSS].clamp_min(0.0), z * torch.sqrt(inverse)
             n_h = torch.sqrt(0.5 + 0.5 * n_l)
@@ -113,16 +112,14 @@ class BackgroundPixels(NamedTuple):
             share = 1.0 / (1.0 + gloss * lobe)
             slopes[:, 0:3] += (gloss * lobe * share * n_l * log_slope_of_lobe(n_l, n_h))[:, None] * along
             slopes[:, 4 + self.terms.index(GLOSS)] = torch.where(extra[GLOSS] >= 0.0, lobe * share, 0.0)
-            light = light / share if AMBIENT in extra else light
         if VIGNETTING in extra:
             left = falloff(self.outward, extra[VIGNETTING])
             slopes[:, 4 + self.terms.index(VIGNETTING)] = torch.where(left > LEAST_FALLOFF, -self.outward / left, 0.0)
-            light = light * left if AMBIENT in extra else light
         if AMBIENT in extra:
-            total = light + extra[AMBIENT]
-            slopes *= light[:, None]
+            total = value ** (1.0 / self.exponent)  # light and what is added to it
+            slopes *= (total - extra[AMBIENT])[:, None]
             slopes[:, 4 + self.terms.index(AMBIENT)] = 1.0
-            slopes *= torch.where(total >= LEAST_LIGHT, self.exponent * value / total, 0.0)[:, None]
+            slopes *= torch.where(total > LEAST_LIGHT * (1.0 + 1e-9), self.exponent * value / total, 0.0)[:, None]
         else:
             slopes *= (self.exponent * value)[:, None]
         return (value - self.image) / self.noise[:, None], slopes / self.noise[:, None, None]

@@ -8,6 +8,7 @@ import sys
 import pytest
 import torch
 from torch import nn
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchvts as vts
 from torchvts import export
@@ -307,9 +308,33 @@ def test_what_stands_in_for_operators_that_onnx_lacks(length):
     values = torch.randn(3, length, 2, generator=torch.Generator().manual_seed(length))
     some = torch.where(values > 0.3, torch.nan, values)
     for keep in (True, False):
-        assert torch.equal(onnx_operators.median(values, 1, keep)[0], values.median(1, keep).values)
-        found, expected = onnx_operators.nanmedian(some, 1, keep)[0], some.nanmedian(1, keep).values
-        assert torch.equal(found.nan_to_num(9.0), expected.nan_to_num(9.0))
+        calls = [
+            lambda keep=keep: values.median(1, keepdim=keep),
+            lambda keep=keep: torch.median(values, dim=1, keepdim=keep),
+            lambda keep=keep: some.nanmedian(1, keep),
+            lambda keep=keep: torch.nanmedian(some, 1, keep),
+        ]
+        for call in calls:
+            expected = call()
+            with onnx_operators.InOnnxOperators(), Names() as called:
+                found = call()
+            assert torch.equal(found.values.nan_to_num(9.0), expected.values.nan_to_num(9.0))
+            assert not any("median" in name for name in called.names)
+    with onnx_operators.InOnnxOperators():
+        whole = values.median(), torch.nanmedian(some)
+    assert torch.equal(whole[0], values.median()) and torch.equal(whole[1].nan_to_num(9.0), some.nanmedian().nan_to_num(9.0))
+
+
+class Names(TorchDispatchMode):
+    """The operators that are called within it."""
+
+    def __init__(self):
+        super().__init__()
+        self.names = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.names.append(str(func))
+        return func(*args, **(kwargs or {}))
 
 
 def test_a_file_that_does_not_agree_or_does_not_run_is_reported(low, tmp_path):

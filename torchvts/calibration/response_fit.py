@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from ..core.geometry import lengths
 from ..model.report import CandidateRow
 from ..model.response_field import DepthBrightness, ResponseField, ResponseModel, TaughtRange, position_basis
 from ..model.sensor import Sensor
@@ -212,17 +213,17 @@ def taught_range(contacts: list[Contact], field: ResponseField, pitch_mm: float)
     ]
     evidence = Evidence.of(Family.of(field), contacts)
     sines = [ball_sine(contact)[:, contact.inside()] for contact in contacts]
-    steepest = float(torch.cat(sines, 1).norm(dim=0).quantile(TAUGHT_SHARE))
+    steepest = float(lengths(torch.cat(sines, 1), 0).quantile(TAUGHT_SHARE))
     deepest = float(torch.cat(depths).clamp_min(0.0).quantile(TAUGHT_SHARE))
     penalty, limit = evidence.penalty(PENALTIES[2]), FLATTER_PART * steepest
     terms = [item.terms[:, item.contact.inside()] for item in evidence.forms]
-    flatter = [sine.norm(dim=0) < limit for sine in sines]
+    flatter = [lengths(sine, 0) < limit for sine in sines]
     gram = sum(t[:, k] @ t[:, k].t() / max(1, int(k.sum())) for t, k in zip(terms, flatter))
     right = sum(t[:, k] @ s[:, k].t() / max(1, int(k.sum())) for t, s, k in zip(terms, sines, flatter))
     half = len(penalty) // 2
     by_flatter = torch.linalg.solve(gram + torch.diag(penalty[:half]), right)
     off = torch.cat([(by_flatter.t() @ t - s)[:, ~k] for t, s, k in zip(terms, sines, flatter)], 1)
-    beyond = torch.cat([s[:, ~k] for s, k in zip(sines, flatter)], 1).norm(dim=0) - limit
+    beyond = lengths(torch.cat([s[:, ~k] for s, k in zip(sines, flatter)], 1), 0) - limit
     growth = float((off.square().sum() / beyond.square().sum().clamp_min(1e-12)).sqrt())
     return TaughtRange(steepest, deepest, growth)
 

@@ -28,6 +28,25 @@ def pixel_grid_mm(
     return x[None, :], y[:, None]
 
 
+def lengths(vectors: Tensor, dim: int, keepdim: bool = False) -> Tensor:
+    """Lengths of vectors along a dimension, as ``vectors.norm(dim=dim)``.
+
+    On a CPU that takes thirty times as long (PyTorch 2.13) where the dimension is not the last, as in images.
+
+    Example:
+        >>> lengths(torch.tensor([[3.0, 0.0], [4.0, 0.0]]), dim=0)
+        tensor([5., 0.])
+    """
+    squared = vectors.square().sum(dim, keepdim)
+    some = squared > 0  # else the derivative at zero would be NaN
+    return torch.where(some, torch.where(some, squared, 1.0).sqrt(), squared)
+
+
+def angles_deg(one: Tensor, other: Tensor) -> Tensor:
+    """Angles in degrees (B, H, W) between vectors (B, 3, H, W)."""
+    return torch.rad2deg(torch.atan2(lengths(torch.linalg.cross(one, other, dim=1), 1), (one * other).sum(1)))
+
+
 def normal_from_gradient(gradient: Tensor) -> Tensor:
     """Unit normals that face the camera: (-dz/dx, -dz/dy, 1) / norm.
 

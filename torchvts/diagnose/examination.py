@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from ..calibration import ROUGH, channel_structure, falloff, outwardness
 from ..core.checks import QUANTISATION_STD
+from ..core.geometry import angles_deg, lengths
 from ..core.noise import noise_std
 from ..model import Calibration, PointLights
 from ..stream import FrameCheck
@@ -22,7 +23,6 @@ from .surface import (
     LengthError,
     Regions,
     Surface,
-    angle_deg,
     fit_length_error,
     least_spread,
     noise_with_rounding,
@@ -159,7 +159,7 @@ class Examination:
         if unit.measured:
             light = light * (unit.model_image / unit.background_without_ambient.clamp_min(1e-6)).float()
         normal = (unit.inverse.float() * light[None]).sum(1)
-        length, tilt = normal.norm(dim=0) - 1.0, normal[:2].norm(dim=0)
+        length, tilt = lengths(normal, 0) - 1.0, lengths(normal[:2], 0)
         return float(length.square().mean().sqrt()) < 0.3 * float(tilt.square().mean().sqrt())
 
     @cached_property
@@ -204,7 +204,7 @@ class Examination:
                 other = dataclasses.replace(unit, background=background)
         blocks = self.blocks if other is unit else Blocks.of(other)
         normal = blocks.normal(mended[None] ** (1.0 / self.exponent))
-        angle = angle_deg(self.blocks.normal(image), normal)
+        angle = angles_deg(self.blocks.normal(image), normal)[0]
         tilted = normal[0, 2] < math.cos(math.radians(3.0))
         angle = torch.where(torch.isfinite(angle), angle, 0.0)
         return max(float(angle.mean()), float(angle[tilted].mean()) if float(tilted.double().mean()) > 0.01 else 0.0)

@@ -43,7 +43,7 @@ class Grid:
         """Light (3, N) of undeformed skin under lights of unit power at (3, 3), at these or other positions."""
         x, y = self.x if x is None else x, self.y if y is None else y
         squared = (position_mm[:, :1] - x) ** 2 + (position_mm[:, 1:2] - y) ** 2 + position_mm[:, 2:] ** 2
-        return position_mm[:, 2:] * squared**-1.5
+        return position_mm[:, 2:] * squared.rsqrt() / squared
 
 
 Predict = Callable[[Grid, Tensor], Tensor]

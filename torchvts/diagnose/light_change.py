@@ -26,6 +26,9 @@ SLACK = 0.002
 SATURATED = 0.985
 """Values from here on may be clipped; such cells are not used."""
 
+LEAST_LIGHT = 1e-6
+"""Light below counts as this much."""
+
 CUT = 25.0
 """A cell's squared residual, in variances summed over the channels, counts at most this much: five standard deviations."""
 
@@ -157,9 +160,11 @@ class _Cells:
         sigma = torch.sqrt((noise_std.double()[:, None] / side) ** 2 + slack)
         return cls(grid, target, sigma, usable, exponent, (height, width))
 
-    def residual(self, hypothesis: Hypothesis, parameters: Tensor) -> Tensor:
-        """In standard deviations, (3, N)."""
-        return (hypothesis.predict(self.grid, parameters).clamp_min(1e-6) ** (1.0 / self.exponent) - self.target) / self.sigma
+    def residual(self, light: Tensor) -> tuple[Tensor, Tensor]:
+        """In standard deviations, where the light is (3, N); and its derivative by the light."""
+        value = light.clamp_min(LEAST_LIGHT) ** (1.0 / self.exponent)
+        slope = torch.where(light > LEAST_LIGHT, value / (self.exponent * self.sigma * light), 0.0)
+        return (value - self.target) / self.sigma, slope
 
     def follow(self, fit: _Fit) -> Tensor:
         """(N,) bool, cells that a fit explains."""
@@ -193,23 +198,29 @@ def _mode(values: Tensor) -> Tensor:
 
 def _fit(hypothesis: Hypothesis, cells: _Cells) -> _Fit:
     """Fit by Gauss-Newton with Tukey's weights, whose width shrinks to the noise."""
+    predict = partial(hypothesis.predict, cells.grid)
     parameters = torch.tensor(hypothesis.start or (0.0,) * hypothesis.size, dtype=torch.float64)
-    now = cells.residual(hypothesis, parameters)
+    light = predict(parameters)
+    now, slope = cells.residual(light)
     width, step_size = 0.0, 1e-4
     steps = step_size * torch.eye(hypothesis.size, dtype=torch.float64)
     for turn in range(14 if hypothesis.size else 0):
-        length = torch.where(cells.usable, now.abs(), torch.nan)
-        width = max(TUKEY, TUKEY * 1.4826 * float(length.nanmedian())) if turn == 0 else max(TUKEY, 0.6 * width)
+        if turn == 0:
+            width = 1.4826 * float(torch.where(cells.usable, now.abs(), torch.nan).nanmedian()) * TUKEY
+        else:
+            width *= 0.6
+        width = max(TUKEY, width)
         weight = (tukey_weight(now / width) * cells.usable).flatten()
-        moved = torch.func.vmap(partial(cells.residual, hypothesis))(parameters + steps)
-        columns = ((moved - now) / step_size).flatten(1).t()
-        weighted = columns * weight[:, None]
-        normal = weighted.t() @ columns
+        change = (torch.func.vmap(predict)(parameters + steps) - light) / step_size
+        rows = (change * slope).flatten(1)
+        weighted = rows * weight
+        normal = weighted @ rows.t()
         normal = normal + torch.diag(normal.diagonal() * 1e-6 + 1e-9)
-        step = torch.linalg.solve(normal, -weighted.t() @ now.flatten())
+        step = torch.linalg.solve(normal, -weighted @ now.flatten())
         step = step * min(1.0, 0.5 / max(float(step.abs().max()), 1e-12))
         parameters = parameters + step
-        now = cells.residual(hypothesis, parameters)
+        light = predict(parameters)
+        now, slope = cells.residual(light)
         if width <= TUKEY and float(step.abs().max()) < 1e-5:
             break
     if hypothesis.size:

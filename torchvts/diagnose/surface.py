@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from ..accelerated import Compensate, ContactMask, GradientFromNormal, NormalFromIntensity, PoissonBackground
 from ..core.blur import blur, gaussian_weights
 from ..core.checks import QUANTISATION_STD
+from ..core.geometry import angles_deg, lengths
 from ..model import Calibration, PointLights
 from ..model.lights import inverse_light_matrix
 from ..normals import NormalFromResponse
@@ -96,7 +97,7 @@ class Surface:
         lights = calibration.lights
         inverse = inverse_light_matrix(output.depth_mm, lights.position_mm, lights.albedo, calibration.sensor.mm_per_pixel)
         normal = (inverse * compensated[:, None]).sum(2)
-        error = normal.norm(dim=1, keepdim=True) - 1.0
+        error = lengths(normal, 1, keepdim=True) - 1.0
         ratio = noise_std.to(background.dtype).reshape(3, 1, 1) / calibration.noise_std.reshape(3, 1, 1)
         noise = calibration.compensated_noise_std * ratio.clamp_min(1.0)
         share = (output.normal[:, :, None] * inverse).sum(1)  # derivative of the length by each channel
@@ -112,8 +113,7 @@ class Surface:
     @property
     def steepness(self) -> Tensor:
         """(H, W), mm per mm."""
-        steep: Tensor = torch.linalg.vector_norm(self.output.gradient[0], dim=0)
-        return steep
+        return lengths(self.output.gradient[0], 0)
 
 
 @dataclass(frozen=True)
@@ -177,15 +177,15 @@ def _templates(surface: Surface) -> dict[str, Tensor]:
     scale = normal.shape[2] / 120.0
     templates: dict[str, Tensor] = {}
     for spread in SPREADS_PX:
-        templates[f"blur {spread:g}"] = _length(blur(normal, gaussian_weights(spread * scale))) - 1.0
+        templates[f"blur {spread:g}"] = lengths(blur(normal, gaussian_weights(spread * scale)), 1, keepdim=True) - 1.0
     for name, shift in (("x", (0, 1)), ("y", (1, 0)), ("down", (1, 1)), ("up", (1, -1))):
         for length in (5, 9, 17):
             templates[f"move {name} {length}"] = _moved(normal, shift, max(3, int(length * scale))) - 1.0
     for spread in (1.0, 2.0, 4.0):
         spread_px = spread / surface.calibration.sensor.mm_per_pixel
         if spread_px < 0.2 * normal.shape[2]:
-            mean = nn.functional.normalize(blur(normal, gaussian_weights(spread_px)), dim=1)
-            templates[f"bounce {spread:g}"] = (normal * mean).sum(1, keepdim=True) - 1.0
+            mean = blur(normal, gaussian_weights(spread_px))
+            templates[f"bounce {spread:g}"] = (normal * mean).sum(1, keepdim=True) / lengths(mean, 1, keepdim=True) - 1.0
     return templates
 
 
@@ -198,12 +198,7 @@ def _moved(normal: Tensor, shift: tuple[int, int], length: int) -> Tensor:
     for k in steps:
         top, left = reach + k * shift[0], reach + k * shift[1]
         total = total + padded[:, :, top : top + height, left : left + width]
-    return _length(total / len(steps))
-
-
-def _length(vectors: Tensor) -> Tensor:
-    length: Tensor = torch.linalg.vector_norm(vectors, dim=1, keepdim=True)
-    return length
+    return lengths(total / len(steps), 1, keepdim=True)
 
 
 def normal_noise_deg(blocks: Blocks, noise_std: Tensor) -> float:
@@ -212,13 +207,7 @@ def normal_noise_deg(blocks: Blocks, noise_std: Tensor) -> float:
     background = (unit.background.clamp_min(0.0) ** (1.0 / unit.sensor.exponent))[None]
     noise = torch.randn(background.shape, generator=torch.Generator().manual_seed(0)).to(background.dtype)
     noisy = background + noise * noise_std.to(background.dtype).reshape(1, 3, 1, 1)
-    return float(angle_deg(blocks.normal(background), blocks.normal(noisy)).median())
-
-
-def angle_deg(normal: Tensor, other: Tensor) -> Tensor:
-    """Angle between unit normals (1, 3, H, W): (H, W), degrees."""
-    across = torch.linalg.cross(normal, other, dim=1).norm(dim=1)
-    return torch.rad2deg(torch.atan2(across, (normal * other).sum(1)))[0]
+    return float(angles_deg(blocks.normal(background), blocks.normal(noisy)).median())
 
 
 def least_spread(lights: PointLights) -> float:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from ..core.files import rgb_from_bgr
-from ..core.geometry import pixel_grid_mm
+from ..core.geometry import lengths, pixel_grid_mm
 from ..model.lights import PointLights, cast_shadows, seen_at
 from ..scenes import Scene
 
@@ -93,15 +93,15 @@ def radiance(scene: Scene, conditions: Conditions, at_mm: tuple[Tensor, Tensor] 
     depth, lights = scene.depth_mm, conditions.lights
     place = _place(scene, at_mm)  # (3, H, W)
     to_light = lights.position_mm.detach().to(depth.dtype)[:, :, None, None] - place  # (light, axis, H, W)
-    distance = to_light.norm(dim=1)
-    direction = to_light / distance[:, None]
-    strength = lights.albedo.detach().to(depth.dtype)[:, None, None] / distance**2
+    squared = to_light.square().sum(1)
+    direction = to_light / squared.sqrt()[:, None]
+    strength = lights.albedo.detach().to(depth.dtype)[:, None, None] / squared
     strength = strength * torch.tensor(conditions.light_level, dtype=depth.dtype)[:, None, None]
     facing = (direction * scene.normal).sum(1)
     light: Tensor = strength * facing.clamp_min(0.0)
     if conditions.specular:
-        half_way = nn.functional.normalize(direction + torch.tensor([0.0, 0.0, 1.0], dtype=depth.dtype)[:, None, None], dim=1)
-        lobe = (half_way * scene.normal).sum(1).clamp_min(0.0) ** SHININESS * (facing > 0)
+        half_way = direction + torch.tensor([0.0, 0.0, 1.0], dtype=depth.dtype)[:, None, None]
+        lobe = ((half_way * scene.normal).sum(1) / lengths(half_way, 1)).clamp_min(0.0) ** SHININESS * (facing > 0)
         light = light + conditions.specular * strength * lobe
     if conditions.shadows:
         if at_mm is not None or not math.isinf(scene.camera_height_mm):

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ..core.checks import check_batch, check_float_tensor, check_integer, check_positive, check_shape, check_tensor
-from ..core.geometry import depth_to_points
+from ..core.geometry import angles_deg, depth_to_points
 
 
 class DepthError(NamedTuple):
@@ -80,8 +80,7 @@ def normal_angle_deg(normal: Tensor, truth: Tensor, region: Tensor | None = None
         raise TypeError(f"truth: expected {normal.dtype} like normal, got {truth.dtype}: convert one of them")
     if region is not None:
         check_shape("region", region, (normal.shape[0], 1, *normal.shape[2:]), "one channel of normal")
-    cross = torch.linalg.cross(normal, truth, dim=1).norm(dim=1)
-    angle = torch.rad2deg(torch.atan2(cross, (normal * truth).sum(1)))
+    angle = angles_deg(normal, truth)
     return angle if region is None else angle[region[:, 0].bool()]
 
 

@@ -22,7 +22,7 @@ from ..core.files import check_target, write_atomically
 from ..normals import WrappedNormals
 from ..pipeline import DepthPipeline
 from .kernels_in_file import linked_kernels, trace_kernels
-from .onnx_operators import decompositions, simplify
+from .onnx_operators import InOnnxOperators, simplify
 from .trace import size_and_dtype, trace
 
 METADATA_KEY = "torchvts"
@@ -153,10 +153,10 @@ def export_onnx(pipe: DepthPipeline, path: str | Path) -> Path:
     complaint = missing("onnx")
     if complaint:
         raise ModuleNotFoundError(complaint)
-    program = trace(pipe, by_matrix=True)
+    with InOnnxOperators():
+        program = trace(pipe, by_matrix=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        program = program.run_decompositions(torch.export.default_decompositions() | decompositions())
         model = torch.onnx.export(
             program,
             dynamo=True,

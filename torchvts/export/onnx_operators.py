@@ -5,30 +5,54 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 
-def decompositions() -> dict[Any, Callable[..., Any]]:
-    """The replacements by operator, for ``ExportedProgram.run_decompositions``."""
-    aten = torch.ops.aten
-    return {aten.median.dim: median, aten.nanmedian.dim: nanmedian}
+class InOnnxOperators(TorchFunctionMode):
+    """Within it, operators that ONNX lacks are called as those that it has.
+
+    They are so traced, and no pass over the graph is needed for them, which takes as long as to trace it.
+    """
+
+    def __torch_function__(
+        self, func: Callable[..., Any], types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        replacement = _REPLACEMENTS.get(func)
+        return (replacement or func)(*args, **(kwargs or {}))
 
 
-def median(values: Tensor, dim: int, keepdim: bool = False) -> tuple[Tensor, Tensor]:
-    """``torch.median`` along a dimension, by sorting."""
+def median(values: Tensor, dim: int | None = None, keepdim: bool = False) -> Any:
+    """``torch.median`` of all values, or along a dimension, by sorting."""
+    if dim is None:
+        return median(values.flatten(), 0)[0]
     ordered, index = torch.sort(values, dim=dim)
     middle = (values.shape[dim] - 1) // 2
-    ordered, index = ordered.narrow(dim, middle, 1), index.narrow(dim, middle, 1)
-    return (ordered, index) if keepdim else (ordered.squeeze(dim), index.squeeze(dim))
+    return _result(torch.return_types.median, ordered.narrow(dim, middle, 1), index.narrow(dim, middle, 1), dim, keepdim)
 
 
-def nanmedian(values: Tensor, dim: int, keepdim: bool = False) -> tuple[Tensor, Tensor]:
-    """``torch.nanmedian`` along a dimension, by sorting."""
+def nanmedian(values: Tensor, dim: int | None = None, keepdim: bool = False) -> Any:
+    """``torch.nanmedian`` of all values, or along a dimension, by sorting."""
+    if dim is None:
+        return nanmedian(values.flatten(), 0)[0]
     known = ~torch.isnan(values)
     ordered, index = torch.sort(torch.where(known, values, torch.inf), dim=dim)
     middle = ((known.to(torch.int64).sum(dim, keepdim=True) - 1) // 2).clamp_min(0)
     ordered, index = ordered.gather(dim, middle), index.gather(dim, middle)
     ordered = torch.where(known.any(dim, keepdim=True), ordered, torch.nan)
-    return (ordered, index) if keepdim else (ordered.squeeze(dim), index.squeeze(dim))
+    return _result(torch.return_types.nanmedian, ordered, index, dim, keepdim)
+
+
+def _result(kind: Callable[..., Any], values: Tensor, index: Tensor, dim: int, keepdim: bool) -> Any:
+    """As torch returns it, with names."""
+    return kind((values, index) if keepdim else (values.squeeze(dim), index.squeeze(dim)))
+
+
+_REPLACEMENTS: dict[Any, Callable[..., Any]] = {
+    torch.median: median,
+    torch.Tensor.median: median,
+    torch.nanmedian: nanmedian,
+    torch.Tensor.nanmedian: nanmedian,
+}
 
 
 def simplify(model: Any) -> None:

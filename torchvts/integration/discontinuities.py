@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from ..core.checks import check_batch, check_float_tensor, check_integer, check_positive, check_same_size, check_shape, check_window
+from ..core.geometry import lengths
 from .base import Integrator
 from .poisson import PoissonBackground, check_gradient, laplace_plan, solve_laplace
 
@@ -249,7 +250,7 @@ class DiscontinuityIntegration(Integrator):
 
     def _covered(self, gradient: Tensor, free: Tensor) -> Tensor:
         """The free pixels less those on the rim that are seen half beside the object."""
-        steepness = gradient.norm(dim=1, keepdim=True)
+        steepness = lengths(gradient, 1, keepdim=True)
         inner = nn.functional.max_pool2d((~free).to(gradient.dtype), 3, 1, 1) == 0
         further_in = -nn.functional.max_pool2d(torch.where(inner, -steepness, -torch.inf), 3, 1, 1)  # the least of the inner around
         beside = (steepness < 0.5 * further_in) & (further_in > 4.0 * self.slope_std) & torch.isfinite(further_in)

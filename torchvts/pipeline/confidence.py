@@ -27,7 +27,7 @@ from ..core.checks import (
     check_shape,
     check_switch,
 )
-from ..core.geometry import gradient_of_depth
+from ..core.geometry import gradient_of_depth, lengths
 from ..core.noise import noise_std as frame_noise_std
 from ..model.calibration import Calibration, check_calibration
 from ..model.response_field import TaughtRange
@@ -184,7 +184,7 @@ def beyond_presses(calibration: Calibration, output: DepthOutput | ConfidentOutp
     for contact, normal, depth in zip(output.contact, output.normal, output.depth_mm, strict=True):
         parts: list[str] = []
         if taught is not None and bool(contact.any()):
-            sine = float(normal[:2].norm(dim=0)[contact[0]].float().quantile(0.95))
+            sine = float(lengths(normal[:2], 0)[contact[0]].float().quantile(0.95))
             deepest = float(depth[contact].float().quantile(0.95))
             if sine > min(1.0, BEYOND * taught.sine):
                 angle = math.degrees(math.asin(min(1.0, sine)))

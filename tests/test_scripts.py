@@ -41,10 +41,11 @@ def test_reconstruct_writes_depth_pictures_and_table(run_script, images, calibra
 
 def test_reconstruct_names_what_is_wrong_with_the_first_frame(run_script, images, calibration, tmp_path):
     folder, _ = images
-    valid = run_script("reconstruct", calibration, folder / "presses", "--out", tmp_path / "valid")
+    options = ("--no-pictures", "--format", "none")
+    valid = run_script("reconstruct", calibration, folder / "presses", "--out", tmp_path / "valid", *options)
     image = vts.read_image(folder / "presses" / "0.png") * torch.tensor([1.0, 0.85, 1.0])[:, None, None]
     vts.write_image(tmp_path / "dimmed.png", image)
-    dimmed = run_script("reconstruct", calibration, tmp_path / "dimmed.png", "--out", tmp_path / "out")
+    dimmed = run_script("reconstruct", calibration, tmp_path / "dimmed.png", "--out", tmp_path / "out", *options)
     assert valid.returncode == dimmed.returncode == 0, valid.stderr + dimmed.stderr
     assert "first frame" not in valid.stdout and "first frame: fault: green channel 15" in dimmed.stdout
 

@@ -108,8 +108,8 @@ def other_light():
 
 
 SLOW = ("pale", "smooth 1", "smooth 2", "smooth 3")
-"""Up to ten seconds each: lights of every kind are tried for pale ones in any case, for smooth ones where neither a prior nor presses
-are given. The first of the smooth ones, which is quicker, stands for the others."""
+"""Up to ten seconds each: lights of every kind are tried for pale ones in any case, for smooth ones where nothing else is given.
+The first of the smooth ones, which is quicker, stands for the others."""
 
 
 def odd_cases():

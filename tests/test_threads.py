@@ -1,5 +1,7 @@
 """Threads that share the work of one compiled frame: equal bits by any number, one caller at a time, forks, a single processor."""
 
+import contextlib
+import ctypes
 import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -9,7 +11,8 @@ import torch
 from test_properties import press_image, unit
 
 import torchvts as vts
-from torchvts.accelerated import kernels
+from torchvts.accelerated import kernels, reference_only
+from torchvts.accelerated.frame import program_of
 from torchvts.accelerated.threads import OneThread, within_frame
 
 SIZES = ((96, 128), (61, 45), (240, 320))
@@ -66,20 +69,53 @@ def test_numbers_of_threads(threads):
     assert within_frame() == 1
 
 
-def test_helpers_may_be_woken_by_anyone(threads):
-    """Before a frame that does not come, and while others have them; results are as before."""
+def test_frames_that_are_begun_and_forgotten(threads):
+    """Also while others have the helpers, and in place of another frame; results are as before."""
     pipe, images = pipe_and_images((96, 128))
     alone = [pipe(image) for image in images]
+    program, memory = program_of(pipe, pipe.frame_blocks)
     threads(4)
 
-    def woken(k):
+    def begun(k):
         for count in (0, 1, 2, 64):
-            kernels.loaded().wake_helpers(count)
-        return k % 3, pipe(images[k % 3])
+            for image in images:  # the second is begun while the first is
+                kernels.loaded().begin_frame(ctypes.byref(program), image.data_ptr(), count)
+            if k % 2:
+                kernels.loaded().forget_frame()
+        out = pipe(images[k % 3])
+        kernels.loaded().forget_frame()
+        return k % 3, out
 
     with ThreadPoolExecutor(6) as pool:
-        found = list(pool.map(woken, range(60)))
+        found = list(pool.map(begun, range(60)))
+    assert memory
     assert all(torch.equal(a, b) for k, out in found for a, b in zip(out, alone[k], strict=True))
+
+
+def test_what_changes_after_a_frame_is_begun_counts(threads):
+    """Helpers begin with the program that was; where blocks have changed, all is done anew."""
+    pipe, images = pipe_and_images((96, 128))
+    threads(4)
+    before = pipe(images[0])
+    gain = pipe.compensate.gain
+    changes = [
+        lambda: gain.gain.mul_(1.5),
+        lambda: setattr(gain, "gain", gain.gain / 1.5),
+        lambda: setattr(gain.gain, "data", gain.gain.data * 1.25),
+        lambda: gain.gain.mul_(0.8),
+    ]
+    for change in changes:
+        change()
+        found = pipe(images[0])
+        with reference_only():
+            expected = pipe(images[0])
+        assert (found.depth_mm - expected.depth_mm).abs().max() < 1e-4
+        assert torch.equal(found.deformed, expected.deformed)
+    assert (pipe(images[0]).depth_mm - before.depth_mm).abs().max() < 1e-4
+    for wrong in (images[0] * 3.0, images[0][..., :100], images[0].double()):
+        with contextlib.suppress(ValueError, TypeError):
+            pipe(wrong)
+        assert torch.equal(pipe(images[0]).depth_mm, pipe(images[0]).depth_mm)
 
 
 def test_the_way_from_core_to_core_is_timed():

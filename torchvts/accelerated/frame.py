@@ -116,6 +116,7 @@ class _Prepared(NamedTuple):
         program: None where the blocks must do the work.
         library: the compiled kernels.
         lights: the block whose lights may change by themselves, as by an optimiser.
+        first, first_addresses: the tensors that the first stage of a frame reads.
         tensors, addresses, versions: of the blocks.
         modules, kinds: the blocks and those within them, and their types.
         sizes, lengths: dictionaries of attributes and of hooks, and how many entries they have.
@@ -126,6 +127,8 @@ class _Prepared(NamedTuple):
     library: Any
     lights: NormalFromIntensity | None
     memory: list[Any]
+    first: list[Tensor]
+    first_addresses: list[int]
     tensors: list[Tensor]
     addresses: list[int]
     versions: list[int]
@@ -149,6 +152,13 @@ class _Prepared(NamedTuple):
             and list(map(Tensor.data_ptr, self.tensors)) == self.addresses
         )
 
+    def program_for(self, images: Tensor) -> Program | None:
+        """The program, if it is for images of this size and what its first stage reads is still there."""
+        program = self.program
+        if program is None or images.shape[2:] != (program.height, program.width):
+            return None
+        return program if list(map(Tensor.data_ptr, self.first)) == self.first_addresses else None
+
     def records(self) -> bool:
         """Whether a gradient would be recorded for any of the tensors."""
         return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in self.tensors)
@@ -161,12 +171,18 @@ _programs: WeakKeyDictionary[nn.Module, _Prepared] = WeakKeyDictionary()
 HOOKS = ("_forward_hooks", "_forward_pre_hooks")
 """Those of the way back matter only where gradients are recorded, which blocks do."""
 
+OF_FIRST_STAGE = ("gain", "offset", "defect", "neighbours")
+"""The buffers that Compensate reads."""
+
 OF_MODULES = frozenset(nn.Module().__dict__)
 """What every module has; the rest of its dictionary are settings."""
 
 
 def solve_frames(pipe: nn.Module, images: Tensor, parts: Callable[[], Blocks | None]) -> DepthOutput | None:
     """The output of a pipeline, each frame by itself, by one compiled call; None where its blocks must do it.
+
+    Helpers begin with the first frame before it is known that the program holds: where other work came before a frame, to find that
+    out and to wake them takes a third of its time.
 
     Args:
         pipe: the pipeline, beside which its program is kept.
@@ -177,10 +193,24 @@ def solve_frames(pipe: nn.Module, images: Tensor, parts: Callable[[], Blocks | N
         return None
     if torch_modules._global_forward_hooks or torch_modules._global_forward_pre_hooks:
         return None
+    images = images.contiguous()
     prepared = _programs.get(pipe)  # held until the call is over: another thread may put another one in its place
     threads = within_frame() if parts_of(images.shape[0], images.shape[2] * images.shape[3]) == 1 else 1
-    if threads > 1 and prepared is not None and prepared.program is not None:
-        prepared.library.wake_helpers(threads)  # they take as long to wake up as the checks here do
+    likely = None if threads == 1 or prepared is None else prepared.program_for(images)
+    if likely is None:
+        return _checked(pipe, prepared, images, parts, threads)
+    library = kernels.loaded()
+    try:
+        library.begin_frame(ctypes.byref(likely), images.data_ptr(), threads)
+        return _checked(pipe, prepared, images, parts, threads)
+    finally:
+        library.forget_frame()
+
+
+def _checked(
+    pipe: nn.Module, prepared: _Prepared | None, images: Tensor, parts: Callable[[], Blocks | None], threads: int
+) -> DepthOutput | None:
+    """The output, after it was made sure that the program is that of the pipeline as it is now."""
     if prepared is None or not prepared.holds():
         prepared = _prepared(pipe, parts())
         if prepared is None:
@@ -189,7 +219,7 @@ def solve_frames(pipe: nn.Module, images: Tensor, parts: Callable[[], Blocks | N
     program = prepared.program
     if program is None or prepared.records() or images.shape[2:] != (program.height, program.width):
         return None
-    return _run(prepared.library.solve_frames, program, images.contiguous(), threads)
+    return _run(prepared.library.solve_frames, program, images, threads)
 
 
 def program_of(pipe: nn.Module, parts: Callable[[], Blocks | None]) -> tuple[Program, list[Any]] | None:
@@ -210,15 +240,19 @@ def _prepared(pipe: nn.Module, parts: Blocks | None) -> _Prepared | None:
     hooks = [module.__dict__[name] for module in modules for name in HOOKS]
     sizes = [module.__dict__ for module in (pipe, *modules)] + hooks + [module._modules for module in modules]
     entries = [entry for module in (pipe, *modules) for entry in _entries(module)]
-    made = None
+    made, first = None, []
     if parts is not None and not any(hooks) and _all_own(parts):
+        buffers = _buffers(parts)
+        first = [buffers[name] for name in OF_FIRST_STAGE if name in buffers]
         with torch.inference_mode(False), torch.no_grad():
-            made = _prepare(parts, _buffers(parts), _settings(parts))
+            made = _prepare(parts, buffers, _settings(parts))
     return _Prepared(
         None if made is None else made[0],
         kernels.loaded(),
         lights,
         [] if made is None else made[1],
+        first,
+        [tensor.data_ptr() for tensor in first],
         tensors,
         [tensor.data_ptr() for tensor in tensors],
         [tensor._version for tensor in tensors],

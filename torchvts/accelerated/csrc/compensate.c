@@ -195,14 +195,6 @@ static float half_sample_mode(const float *ordered, int n, int halvings) {
     return ordered[n / 2];
 }
 
-/* What modes() is given. */
-typedef struct {
-    const float *image;
-    int height, width, stride, halvings;
-    float *mode;
-    atomic_int short_of_memory;
-} Modes;
-
 /* How many rows, or columns, are sampled of so many. */
 static int sampled(int length, int stride) { return (length - stride / 2 + stride - 1) / stride; }
 
@@ -222,21 +214,9 @@ static void mode_of(void *with, int plane) {
     free(some);
 }
 
-/* What clean() is given, and the bits of what it returns. */
-typedef struct {
-    const float *image, *gain, *offset, *pedestal;
-    const int64_t *defect, *neighbours;
-    int64_t defects;
-    const float *weight;
-    int taps, height, width, bands;
-    float *light;
-    Modes *modes; /* of what is cleaned, or null */
-    atomic_int trouble, left[3]; /* bands of each plane that are not done yet */
-} Cleaning;
-
 /* A band of rows of a plane. Defects lie anywhere, so with them a band is a whole plane, which is filled before it is blurred. Who cleans the last
    band of a plane finds its mode. */
-static void clean_band(void *with, int part) {
+void clean_band(void *with, int part) {
     Cleaning *of = with;
     const int plane = part % 3, band = part / 3, taps = of->taps, height = of->height, width = of->width;
     const int first = height * band / of->bands, last = height * (band + 1) / of->bands;
@@ -265,7 +245,7 @@ static void clean_band(void *with, int part) {
     }
     if (outside) atomic_fetch_or(&of->trouble, 2);
     free(scratch);
-    if (of->modes && atomic_fetch_sub(&of->left[plane], 1) == 1) mode_of(of->modes, plane);
+    if (of->leveling && atomic_fetch_sub(&of->left[plane], 1) == 1) mode_of(&of->modes, plane);
 }
 
 /* How many of n samples (3, LINE) lie within `reach` of each of five levels in all three channels. */
@@ -317,6 +297,23 @@ static void to_levels(const Leveling *of, const float *image, int height, int wi
     for (int c = 0; c < 3; c++) level[c] = 1.0f + weight * level[c];
 }
 
+/* Sets up what clean_band() does to one image in `parts` parts. */
+void prepare_cleaning(Cleaning *work, const float *image, const float *gain, const float *offset, const float *pedestal, const int64_t *defect,
+                      const int64_t *neighbours, int64_t defects, const float *weight, int taps, int height, int width, float *light,
+                      const Leveling *leveling, float *level) {
+    const int bands = defects ? 1 : bands_of(height);
+    *work = (Cleaning){image, gain, offset, pedestal, defect, neighbours, defects, weight, taps, height, width, bands, 3 * bands, light, {0}, leveling, 0,
+                       {bands, bands, bands}};
+    if (leveling) work->modes = (Modes){light, height, width, leveling->stride, leveling->halvings, level, 0};
+}
+
+/* After all parts: makes levels of the modes, and returns what clean() does. */
+int cleaned(Cleaning *work) {
+    if (work->leveling) to_levels(work->leveling, work->light, work->height, work->width, work->modes.mode);
+    const int trouble = work->trouble | work->modes.short_of_memory;
+    return trouble & 1 ? 1 : trouble;
+}
+
 /*
  * light (frames, 3, height, width) = image * gain + offset, its `defects` filled, blurred by `taps` weights. gain and offset (3, height,
  * width) may be null, taps and defects 0; without offset it is pedestal (3) * gain. Where `leveling` is not null, the levels of the light to `level`
@@ -325,16 +322,13 @@ static void to_levels(const Leveling *of, const float *image, int height, int wi
 EXPORT int clean(const float *image, const float *gain, const float *offset, const float *pedestal, const int64_t *defect, const int64_t *neighbours, int64_t defects,
                  const float *weight, int taps, int frames, int height, int width, float *light, const Leveling *leveling, float *level) {
     const size_t pixels = 3 * (size_t)height * width;
-    const int bands = defects ? 1 : bands_of(height);
     int trouble = 0;
     for (int b = 0; b < frames && !(trouble & 1); b++) {
-        Cleaning work = {image + pixels * b, gain, offset, pedestal, defect, neighbours, defects, weight, taps, height, width, bands, light + pixels * b, NULL, 0,
-                         {bands, bands, bands}};
-        Modes modal = {.image = work.light, .height = height, .width = width};
-        if (leveling) modal.stride = leveling->stride, modal.halvings = leveling->halvings, modal.mode = level + 3 * b, work.modes = &modal;
-        share(clean_band, &work, 3 * bands);
-        trouble |= work.trouble | modal.short_of_memory;
-        if (leveling) to_levels(leveling, work.light, height, width, level + 3 * b);
+        Cleaning work;
+        prepare_cleaning(&work, image + pixels * b, gain, offset, pedestal, defect, neighbours, defects, weight, taps, height, width, light + pixels * b,
+                         leveling, leveling ? level + 3 * b : NULL);
+        share(clean_band, &work, work.parts);
+        trouble |= cleaned(&work);
     }
     return trouble & 1 ? 1 : trouble;
 }

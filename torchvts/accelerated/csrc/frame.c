@@ -60,18 +60,29 @@ typedef struct {
    which the blocks know about. */
 enum { SHORT = 1, OUTSIDE = 2, BEYOND = 4 };
 
-/* The compensated image; null, and a bit in `trouble`, where there is none. */
-static const float *compensated(const Program *of, const float *image, float *light, int *trouble) {
-    const int height = of->height, width = of->width;
-    const Leveling leveling = {of->drift_stride, of->halvings, of->least_drift, of->most_drift};
-    float level[3] = {1.0f, 1.0f, 1.0f};
-    *trouble |= clean(image, of->gain, of->offset, of->pedestal, of->defect, of->neighbours, of->defects, of->weights, of->taps, 1, height, width, light,
-                      of->drifts ? &leveling : NULL, level);
+/* The first stage of a frame, which compensated() finishes. */
+typedef struct {
+    Cleaning work;
+    Leveling leveling;
+    float level[3];
+} Compensation;
+
+static void prepare_compensation(Compensation *at, const Program *of, const float *image, float *light) {
+    at->leveling = (Leveling){of->drift_stride, of->halvings, of->least_drift, of->most_drift};
+    for (int c = 0; c < 3; c++) at->level[c] = 1.0f;
+    prepare_cleaning(&at->work, image, of->gain, of->offset, of->pedestal, of->defect, of->neighbours, of->defects, of->weights, of->taps, of->height,
+                     of->width, light, of->drifts ? &at->leveling : NULL, at->level);
+}
+
+/* The compensated image, of which all parts are done; null, and a bit in `trouble`, where there is none. */
+static const float *compensated(const Program *of, Compensation *at, int *trouble) {
+    float *light = at->work.light, *level = at->level;
+    *trouble |= cleaned(&at->work);
     if (*trouble) return NULL;
     for (int c = 0; c < 3; c++)
         if (!(fabsf(level[c] - 1.0f) < of->believed_drift)) *trouble |= BEYOND; /* another estimator takes over */
     if (*trouble) return NULL;
-    if (level[0] != 1.0f || level[1] != 1.0f || level[2] != 1.0f) divide_planes(light, level, 3, (int64_t)height * width, light);
+    if (level[0] != 1.0f || level[1] != 1.0f || level[2] != 1.0f) divide_planes(light, level, 3, (int64_t)of->height * of->width, light);
     return light;
 }
 
@@ -183,10 +194,11 @@ static int finish(const Program *of, Window at, Work work, Output out) {
     return find_contact(&touching) ? SHORT : 0;
 }
 
-static int solve_frame(const Program *of, const float *image, Work work, Output out) {
+/* compensation: its parts are done. */
+static int solve_frame(const Program *of, Compensation *compensation, Work work, Output out) {
     const int height = of->height, width = of->width;
     int trouble = 0;
-    const float *light = compensated(of, image, work.light, &trouble);
+    const float *light = compensated(of, compensation, &trouble);
     if (trouble) return trouble;
     float surface[18];
     const int code = contact_mask(light, light, of->flat, of->per_noise, of->failed_below, of->most_far_field, 1, height, width, of->step, of->stride,
@@ -213,6 +225,49 @@ static int solve_frame(const Program *of, const float *image, Work work, Output 
     return finish(of, at, work, out);
 }
 
+/* Memory of a frame, with the compensated image in front. */
+static float *memory_of(const Program *of) {
+    const size_t pixels = (size_t)of->height * of->width;
+    return malloc(pixels * (6 * sizeof(float) + 2) + 2 * ((size_t)of->width + 4));
+}
+
+/* A frame that this thread has begun: see begin_frame(). */
+typedef struct {
+    const Program *of;
+    const float *image;
+    float *floats;
+    Compensation compensation;
+} Begun;
+
+static _Thread_local Begun *begun;
+
+/* Has helpers begin with an image (3, height, width) while the caller still finds out whether the program holds: until forget_frame(), image and
+   program stay where they are. Then solve_frames() of the same two goes on with what they have done. */
+EXPORT void begin_frame(const Program *of, const float *image, int threads) {
+    if (begun || !begin_sharing(threads)) return;
+    begun = malloc(sizeof *begun);
+    float *floats = memory_of(of);
+    if (!begun || !floats) {
+        free(begun), free(floats);
+        begun = NULL;
+        end_sharing(1);
+        return;
+    }
+    begun->of = of, begun->image = image, begun->floats = floats;
+    prepare_compensation(&begun->compensation, of, image, floats);
+    offer(clean_band, &begun->compensation.work, begun->compensation.work.parts);
+}
+
+/* After begin_frame(): ends what nobody went on with. */
+EXPORT void forget_frame(void) {
+    if (!begun) return;
+    withdraw();
+    end_sharing(1);
+    free(begun->floats);
+    free(begun);
+    begun = NULL;
+}
+
 /*
  * images (frames, 3, height, width) to depth (frames, height, width), gradient (frames, 2, ...), normal (frames, 3, ...), contact and deformed
  * (frames, ...) bytes, each frame by itself, in up to `threads` threads. Returns 0, or bits that say what stopped a frame; the output then means
@@ -221,17 +276,29 @@ static int solve_frame(const Program *of, const float *image, Work work, Output 
 EXPORT int solve_frames(const Program *of, const float *images, int frames, int threads, float *depth, float *gradient, float *normal,
                         uint8_t *contact, uint8_t *deformed) {
     const size_t pixels = (size_t)of->height * of->width;
-    float *floats = malloc(pixels * (6 * sizeof(float) + 2) + 2 * ((size_t)of->width + 4));
+    Begun *first = begun && begun->of == of && begun->image == images ? begun : NULL;
+    float *floats = first ? first->floats : memory_of(of);
     if (!floats) return SHORT;
     uint8_t *bytes = (uint8_t *)(floats + 6 * pixels);
     const Work work = {floats, floats + 3 * pixels, floats + 5 * pixels, bytes, bytes + pixels, bytes + 2 * pixels};
-    const int shared = begin_sharing(threads);
+    const int shared = first ? 1 : begin_sharing(threads);
     int trouble = 0;
     for (size_t b = 0; b < (size_t)frames && !trouble; b++) {
         const Output out = {depth + b * pixels, gradient + 2 * b * pixels, normal + 3 * b * pixels, contact + b * pixels, deformed + b * pixels};
-        trouble = solve_frame(of, images + 3 * b * pixels, work, out);
+        Compensation own, *compensation = first && b == 0 ? &first->compensation : &own;
+        if (compensation != &own) {
+            join_in(threads);
+        } else {
+            prepare_compensation(&own, of, images + 3 * b * pixels, work.light);
+            share(clean_band, &own.work, own.work.parts);
+        }
+        trouble = solve_frame(of, compensation, work, out);
     }
     end_sharing(shared);
+    if (first) {
+        begun = NULL;
+        free(first);
+    }
     free(floats);
     return trouble;
 }

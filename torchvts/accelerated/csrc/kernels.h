@@ -66,10 +66,12 @@ void give_back(void *memory);
 
 /* Work in parts, numbered from 0, that threads take in turn: see threads.c. */
 typedef void (*PartOfWork)(void *with, int part);
-EXPORT void wake_helpers(int threads);
 int begin_sharing(int threads);
 void end_sharing(int began);
 void share(PartOfWork work, void *with, int parts);
+void offer(PartOfWork work, void *with, int parts);
+void join_in(int threads);
+void withdraw(void);
 
 /* How a smooth change of the light is found in images of a size: see torchvts/core/smooth.py. place: (6, samples), the surface's terms at rows * columns samples,
    then zeros up to a multiple of 16; along_x (2, width), along_y (2, height): Legendre polynomials of degree 1 and 2; per_square: of each step. */
@@ -106,7 +108,33 @@ typedef struct {
     float least_drift, most_drift;
 } Leveling;
 
+/* Every stride-th pixel of an image, of which the modes of its planes are sought. */
+typedef struct {
+    const float *image;
+    int height, width, stride, halvings;
+    float *mode;
+    atomic_int short_of_memory;
+} Modes;
+
+/* An image to be cleaned: what clean() of compensate.c is given, the bits of what it returns, and in how many parts it is done. */
+typedef struct {
+    const float *image, *gain, *offset, *pedestal;
+    const int64_t *defect, *neighbours;
+    int64_t defects;
+    const float *weight;
+    int taps, height, width, bands, parts;
+    float *light;
+    Modes modes; /* of what is cleaned, where `leveling` is given */
+    const Leveling *leveling;
+    atomic_int trouble, left[3]; /* bands of each plane that are not done yet */
+} Cleaning;
+
 /* What frame.c calls of the other sources, which say what these do. */
+void prepare_cleaning(Cleaning *work, const float *image, const float *gain, const float *offset, const float *pedestal, const int64_t *defect,
+                      const int64_t *neighbours, int64_t defects, const float *weight, int taps, int height, int width, float *light,
+                      const Leveling *leveling, float *level);
+void clean_band(void *with, int part);
+int cleaned(Cleaning *work);
 EXPORT int clean(const float *image, const float *gain, const float *offset, const float *pedestal, const int64_t *defect, const int64_t *neighbours,
                  int64_t defects, const float *weight, int taps, int frames, int height, int width, float *light,
                  const Leveling *leveling, float *level);

@@ -32,6 +32,7 @@ static pid_t process;
 
 static atomic_flag taken = ATOMIC_FLAG_INIT; /* one thread at a time has the helpers */
 static _Thread_local int sharing;            /* whether this one has */
+static _Thread_local int offered;            /* parts of the work that it has offered and not come back to */
 
 /* The work at hand: which one, 32 bits, behind the last part that is left, 16, and the first, 16. What `work_of` and `work_with` are, those know who
    have taken a part, since they do not change before all parts are done. */
@@ -142,13 +143,6 @@ static int call_helpers(int threads) {
     return any;
 }
 
-/* Wakes helpers of a frame that is about to come, so that they are awake when it does. */
-EXPORT void wake_helpers(int threads) {
-    if (threads < 2 || sharing || atomic_flag_test_and_set_explicit(&taken, memory_order_acquire)) return;
-    call_helpers(threads);
-    atomic_flag_clear_explicit(&taken, memory_order_release);
-}
-
 /* Until end_sharing(), share() lets up to `threads` threads work. Returns whether it does: not while another thread has the helpers. */
 int begin_sharing(int threads) {
     if (threads < 2 || sharing || atomic_flag_test_and_set_explicit(&taken, memory_order_acquire)) return 0;
@@ -163,23 +157,53 @@ void end_sharing(int began) {
     atomic_flag_clear_explicit(&taken, memory_order_release);
 }
 
-/* Calls work(with, part) for each of so many parts, at most 65,535, in any order and several at once; back when all are done. */
-void share(PartOfWork work, void *with, int parts) {
-    if (!sharing || parts < 2) {
-        for (int part = 0; part < parts; part++) work(with, part);
-        return;
-    }
+static void lay_out(PartOfWork work, void *with, int parts) {
     work_of = work, work_with = with;
     atomic_store_explicit(&done, 0, memory_order_relaxed);
     const uint64_t turn = (atomic_load_explicit(&ticket, memory_order_relaxed) >> 32) + 1;
     atomic_store_explicit(&ticket, turn << 32 | (uint64_t)parts << 16, memory_order_release);
-    while (take_part(0)) continue;
+}
+
+static void wait_for(int parts) {
     for (int k = 0; atomic_load_explicit(&done, memory_order_acquire) < parts; k++) {
         if (k < 1000)
             rest_a_little();
         else
             sched_yield();
     }
+}
+
+/* Calls work(with, part) for each of so many parts, at most 65,535, in any order and several at once; back when all are done. */
+void share(PartOfWork work, void *with, int parts) {
+    if (!sharing || offered || parts < 2) {
+        for (int part = 0; part < parts; part++) work(with, part);
+        return;
+    }
+    lay_out(work, with, parts);
+    while (take_part(0)) continue;
+    wait_for(parts);
+}
+
+/* Between begin_sharing() and join_in() or withdraw(): helpers begin such work while its thread does something else. */
+void offer(PartOfWork work, void *with, int parts) {
+    lay_out(work, with, parts);
+    offered = parts;
+}
+
+/* Takes whatever is left of the work that was offered, and wakes helpers for what comes then; back when all is done. */
+void join_in(int threads) {
+    call_helpers(threads);
+    while (take_part(0)) continue;
+    wait_for(offered);
+    offered = 0;
+}
+
+/* Leaves the rest of the work that was offered undone; back when nobody is at it any more. */
+void withdraw(void) {
+    uint64_t at = atomic_load_explicit(&ticket, memory_order_acquire);
+    while (!atomic_compare_exchange_weak_explicit(&ticket, &at, at >> 32 << 32, memory_order_acq_rel, memory_order_acquire)) continue;
+    wait_for(offered - (int)((at >> 16 & 0xffff) - (at & 0xffff)));
+    offered = 0;
 }
 
 /* Two threads write the same number in turn, which takes a line of memory from cache to cache each time. */
@@ -218,8 +242,6 @@ EXPORT double exchange_ns(void) {
 
 #else
 
-EXPORT void wake_helpers(int threads) { (void)threads; }
-
 EXPORT double exchange_ns(void) { return 0.0; }
 
 int begin_sharing(int threads) {
@@ -232,5 +254,12 @@ void end_sharing(int began) { (void)began; }
 void share(PartOfWork work, void *with, int parts) {
     for (int part = 0; part < parts; part++) work(with, part);
 }
+
+/* Without helpers nobody begins to share. */
+void offer(PartOfWork work, void *with, int parts) { share(work, with, parts); }
+
+void join_in(int threads) { (void)threads; }
+
+void withdraw(void) {}
 
 #endif

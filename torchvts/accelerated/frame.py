@@ -114,6 +114,7 @@ class _Prepared(NamedTuple):
 
     Attributes:
         program: None where the blocks must do the work.
+        shape: of a single frame for it.
         library: the compiled kernels.
         lights: the block whose lights may change by themselves, as by an optimiser.
         first, first_addresses: the tensors that the first stage of a frame reads.
@@ -124,6 +125,7 @@ class _Prepared(NamedTuple):
     """
 
     program: Program | None
+    shape: tuple[int, ...]
     library: Any
     lights: NormalFromIntensity | None
     memory: list[Any]
@@ -152,12 +154,16 @@ class _Prepared(NamedTuple):
             and list(map(Tensor.data_ptr, self.tensors)) == self.addresses
         )
 
-    def program_for(self, images: Tensor) -> Program | None:
-        """The program, if it is for images of this size and what its first stage reads is still there."""
-        program = self.program
-        if program is None or images.shape[2:] != (program.height, program.width):
-            return None
-        return program if list(map(Tensor.data_ptr, self.first)) == self.first_addresses else None
+    def begins(self, images: Tensor) -> bool:
+        """Has helpers begin with an image, if it is like those of the program and what the first stage reads is where it was."""
+        if self.program is None or type(images) is not Tensor or images.shape != self.shape or images.dtype is not torch.float32:
+            return False
+        if not images.is_cpu or images.layout is not torch.strided or torch._C._functorch.is_functorch_wrapped_tensor(images):
+            return False
+        if not images.is_contiguous() or list(map(Tensor.data_ptr, self.first)) != self.first_addresses:
+            return False
+        self.library.begin_frame(ctypes.byref(self.program), images.data_ptr(), within_frame())
+        return True
 
     def records(self) -> bool:
         """Whether a gradient would be recorded for any of the tensors."""
@@ -181,7 +187,7 @@ OF_MODULES = frozenset(nn.Module().__dict__)
 def solve_frames(pipe: nn.Module, images: Tensor, parts: Callable[[], Blocks | None]) -> DepthOutput | None:
     """The output of a pipeline, each frame by itself, by one compiled call; None where its blocks must do it.
 
-    Helpers begin with the first frame before it is known that the program holds: where other work came before a frame, to find that
+    Helpers begin with a single frame before it is known that the program holds: where other work came before a frame, to find that
     out and to wake them takes a third of its time.
 
     Args:
@@ -189,28 +195,21 @@ def solve_frames(pipe: nn.Module, images: Tensor, parts: Callable[[], Blocks | N
         images: what it got.
         parts: gives its blocks, None where they are not known before a frame comes.
     """
+    prepared = _programs.get(pipe)  # held until the call is over: another thread may put another one in its place
+    if prepared is None or not prepared.begins(images):
+        return _checked(pipe, prepared, images, parts)
+    try:
+        return _checked(pipe, prepared, images, parts)
+    finally:
+        prepared.library.forget_frame()
+
+
+def _checked(pipe: nn.Module, prepared: _Prepared | None, images: Tensor, parts: Callable[[], Blocks | None]) -> DepthOutput | None:
+    """The output, after it was made sure that a program can do it and is that of the pipeline as it is now."""
     if not isinstance(images, Tensor) or images.dim() != 4 or images.shape[0] == 0 or images.shape[1] != 3 or not usable(images):
         return None
     if torch_modules._global_forward_hooks or torch_modules._global_forward_pre_hooks:
         return None
-    images = images.contiguous()
-    prepared = _programs.get(pipe)  # held until the call is over: another thread may put another one in its place
-    threads = within_frame() if parts_of(images.shape[0], images.shape[2] * images.shape[3]) == 1 else 1
-    likely = None if threads == 1 or prepared is None else prepared.program_for(images)
-    if likely is None:
-        return _checked(pipe, prepared, images, parts, threads)
-    library = kernels.loaded()
-    try:
-        library.begin_frame(ctypes.byref(likely), images.data_ptr(), threads)
-        return _checked(pipe, prepared, images, parts, threads)
-    finally:
-        library.forget_frame()
-
-
-def _checked(
-    pipe: nn.Module, prepared: _Prepared | None, images: Tensor, parts: Callable[[], Blocks | None], threads: int
-) -> DepthOutput | None:
-    """The output, after it was made sure that the program is that of the pipeline as it is now."""
     if prepared is None or not prepared.holds():
         prepared = _prepared(pipe, parts())
         if prepared is None:
@@ -219,7 +218,8 @@ def _checked(
     program = prepared.program
     if program is None or prepared.records() or images.shape[2:] != (program.height, program.width):
         return None
-    return _run(prepared.library.solve_frames, program, images, threads)
+    threads = within_frame() if parts_of(images.shape[0], images.shape[2] * images.shape[3]) == 1 else 1
+    return _run(prepared.library.solve_frames, program, images.contiguous(), threads)
 
 
 def program_of(pipe: nn.Module, parts: Callable[[], Blocks | None]) -> tuple[Program, list[Any]] | None:
@@ -248,6 +248,7 @@ def _prepared(pipe: nn.Module, parts: Blocks | None) -> _Prepared | None:
             made = _prepare(parts, buffers, _settings(parts))
     return _Prepared(
         None if made is None else made[0],
+        () if made is None else (1, 3, made[0].height, made[0].width),
         kernels.loaded(),
         lights,
         [] if made is None else made[1],

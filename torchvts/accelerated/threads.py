@@ -73,8 +73,7 @@ def parts_of(count: int, pixels: int) -> int:
 
 def within_frame() -> int:
     """How many threads may share the work of one frame: torch's number, that from outside of :class:`OneThread`, at most 4."""
-    with _lock:
-        return min(_outside if _inside else torch.get_num_threads(), MOST_WITHIN_FRAME)
+    return min(_outside if _inside else torch.get_num_threads(), MOST_WITHIN_FRAME)
 
 
 def by_frames(count: int, pixels: int, call: Callable[[int, int], int | None]) -> int:

@@ -112,6 +112,8 @@ def test_what_changes_after_a_frame_is_begun_counts(threads):
         assert (found.depth_mm - expected.depth_mm).abs().max() < 1e-4
         assert torch.equal(found.deformed, expected.deformed)
     assert (pipe(images[0]).depth_mm - before.depth_mm).abs().max() < 1e-4
+    rows_of_pixels = images[0].permute(0, 2, 3, 1).contiguous().permute(0, 3, 1, 2)
+    assert not rows_of_pixels.is_contiguous() and torch.equal(pipe(rows_of_pixels).depth_mm, pipe(images[0]).depth_mm)
     for wrong in (images[0] * 3.0, images[0][..., :100], images[0].double()):
         with contextlib.suppress(ValueError, TypeError):
             pipe(wrong)

@@ -154,16 +154,18 @@ class _Prepared(NamedTuple):
             and list(map(Tensor.data_ptr, self.tensors)) == self.addresses
         )
 
-    def begins(self, images: Tensor) -> bool:
-        """Has helpers begin with an image, if it is like those of the program and what the first stage reads is where it was."""
+    def begin(self, images: Tensor) -> Tensor | None:
+        """The image, rows contiguous, with which helpers have begun; None if it is not like those of the program, or what the first
+        stage reads is not where it was."""
         if self.program is None or type(images) is not Tensor or images.shape != self.shape or images.dtype is not torch.float32:
-            return False
+            return None
         if not images.is_cpu or images.layout is not torch.strided or torch._C._functorch.is_functorch_wrapped_tensor(images):
-            return False
-        if not images.is_contiguous() or list(map(Tensor.data_ptr, self.first)) != self.first_addresses:
-            return False
+            return None
+        if list(map(Tensor.data_ptr, self.first)) != self.first_addresses:
+            return None
+        images = images.contiguous()
         self.library.begin_frame(ctypes.byref(self.program), images.data_ptr(), within_frame())
-        return True
+        return images
 
     def records(self) -> bool:
         """Whether a gradient would be recorded for any of the tensors."""
@@ -196,10 +198,11 @@ def solve_frames(pipe: nn.Module, images: Tensor, parts: Callable[[], Blocks | N
         parts: gives its blocks, None where they are not known before a frame comes.
     """
     prepared = _programs.get(pipe)  # held until the call is over: another thread may put another one in its place
-    if prepared is None or not prepared.begins(images):
+    begun = None if prepared is None else prepared.begin(images)
+    if prepared is None or begun is None:
         return _checked(pipe, prepared, images, parts)
     try:
-        return _checked(pipe, prepared, images, parts)
+        return _checked(pipe, prepared, begun, parts)
     finally:
         prepared.library.forget_frame()
 

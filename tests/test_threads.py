@@ -4,6 +4,7 @@ import contextlib
 import ctypes
 import os
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -12,7 +13,7 @@ from test_properties import press_image, unit
 
 import torchvts as vts
 from torchvts.accelerated import kernels, reference_only
-from torchvts.accelerated.frame import program_of
+from torchvts.accelerated.frame import _programs, program_of
 from torchvts.accelerated.threads import OneThread, within_frame
 
 SIZES = ((96, 128), (61, 45), (240, 320))
@@ -90,6 +91,19 @@ def test_frames_that_are_begun_and_forgotten(threads):
         found = list(pool.map(begun, range(60)))
     assert memory
     assert all(torch.equal(a, b) for k, out in found for a, b in zip(out, alone[k], strict=True))
+
+
+def test_a_frame_that_was_left_begun_does_not_stand_for_the_next(threads):
+    """As where a signal's handler calls the pipeline with other values in the same memory."""
+    pipe, images = pipe_and_images((96, 128))
+    threads(2)
+    expected, buffer = pipe(images[1]), images[0].clone()
+    pipe(buffer)
+    program = _programs[pipe].program
+    kernels.loaded().begin_frame(ctypes.byref(program), buffer.data_ptr(), 2)
+    time.sleep(0.05)  # helpers are done with it
+    buffer.copy_(images[1])
+    assert all(torch.equal(a, b) for a, b in zip(pipe(buffer), expected, strict=True))
 
 
 def test_what_changes_after_a_frame_is_begun_counts(threads):

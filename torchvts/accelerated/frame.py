@@ -154,17 +154,22 @@ class _Prepared(NamedTuple):
             and list(map(Tensor.data_ptr, self.tensors)) == self.addresses
         )
 
-    def begin(self, images: Tensor) -> Tensor | None:
-        """The image, rows contiguous, with which helpers have begun; None if it is not like those of the program, or what the first
-        stage reads is not where it was."""
-        if self.program is None or type(images) is not Tensor or images.shape != self.shape or images.dtype is not torch.float32:
-            return None
+    def begin(self, program: Program, images: Tensor) -> Tensor:
+        """Has helpers begin with an image, if it is like those of the program and what the first stage reads is where it was.
+
+        Returns:
+            The image, rows contiguous if they have begun.
+        """
+        if type(images) is not Tensor or images.shape != self.shape or images.dtype is not torch.float32:
+            return images
         if not images.is_cpu or images.layout is not torch.strided or torch._C._functorch.is_functorch_wrapped_tensor(images):
-            return None
+            return images
+        if torch._C._len_torch_dispatch_stack() > 0 or images.data_ptr() == 0:  # traced, or zeros without memory
+            return images
         if list(map(Tensor.data_ptr, self.first)) != self.first_addresses:
-            return None
+            return images
         images = images.contiguous()
-        self.library.begin_frame(ctypes.byref(self.program), images.data_ptr(), within_frame())
+        self.library.begin_frame(ctypes.byref(program), images.data_ptr(), within_frame())
         return images
 
     def records(self) -> bool:
@@ -198,11 +203,10 @@ def solve_frames(pipe: nn.Module, images: Tensor, parts: Callable[[], Blocks | N
         parts: gives its blocks, None where they are not known before a frame comes.
     """
     prepared = _programs.get(pipe)  # held until the call is over: another thread may put another one in its place
-    begun = None if prepared is None else prepared.begin(images)
-    if prepared is None or begun is None:
+    if prepared is None or prepared.program is None:
         return _checked(pipe, prepared, images, parts)
     try:
-        return _checked(pipe, prepared, begun, parts)
+        return _checked(pipe, prepared, prepared.begin(prepared.program, images), parts)
     finally:
         prepared.library.forget_frame()
 

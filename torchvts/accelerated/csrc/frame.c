@@ -241,10 +241,21 @@ typedef struct {
 
 static _Thread_local Begun *begun;
 
+/* After begin_frame(): ends what nobody went on with. */
+EXPORT void forget_frame(void) {
+    if (!begun) return;
+    withdraw();
+    end_sharing(1);
+    free(begun->floats);
+    free(begun);
+    begun = NULL;
+}
+
 /* Has helpers begin with an image (3, height, width) while the caller still finds out whether the program holds: until forget_frame(), image and
    program stay where they are. Then solve_frames() of the same two goes on with what they have done. */
 EXPORT void begin_frame(const Program *of, const float *image, int threads) {
-    if (begun || !begin_sharing(threads)) return;
+    forget_frame(); /* of a call that a signal's handler stands in the middle of */
+    if (!begin_sharing(threads)) return;
     begun = malloc(sizeof *begun);
     float *floats = memory_of(of);
     if (!begun || !floats) {
@@ -256,16 +267,6 @@ EXPORT void begin_frame(const Program *of, const float *image, int threads) {
     begun->of = of, begun->image = image, begun->floats = floats;
     prepare_compensation(&begun->compensation, of, image, floats);
     offer(clean_band, &begun->compensation.work, begun->compensation.work.parts);
-}
-
-/* After begin_frame(): ends what nobody went on with. */
-EXPORT void forget_frame(void) {
-    if (!begun) return;
-    withdraw();
-    end_sharing(1);
-    free(begun->floats);
-    free(begun);
-    begun = NULL;
 }
 
 /*

@@ -150,7 +150,7 @@ def test_a_script_survives_its_file(name):
     stream = io.BytesIO()
     torch.jit.save(scripted(name, torch.float64), stream)
     stream.seek(0)
-    with torch.jit.optimized_execution(False):  # the same code as before it was written, of which the test above has the optimised
+    with torch.jit.optimized_execution(False):  # the test above optimises the same code
         assert_same(torch.jit.load(stream)(example), block(example), 1e-11)
 
 

@@ -13,7 +13,7 @@ from test_properties import press_image, unit
 
 import torchvts as vts
 from torchvts.accelerated import kernels, reference_only
-from torchvts.accelerated.frame import _programs, program_of
+from torchvts.accelerated.frame import _Prepared, _programs, program_of
 from torchvts.accelerated.threads import OneThread, within_frame
 
 SIZES = ((96, 128), (61, 45), (240, 320))
@@ -106,6 +106,18 @@ def test_a_frame_that_was_left_begun_does_not_stand_for_the_next(threads):
     assert all(torch.equal(a, b) for a, b in zip(pipe(buffer), expected, strict=True))
 
 
+def test_an_error_after_a_frame_is_begun_leaves_none(threads, monkeypatch):
+    pipe, images = pipe_and_images((96, 128))
+    threads(2)
+    expected, buffer = pipe(images[1]), images[0].clone()
+    pipe(buffer)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(_Prepared, "holds", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
+        pipe(buffer)
+    buffer.copy_(images[1])
+    assert all(torch.equal(a, b) for a, b in zip(pipe(buffer), expected, strict=True))
+
+
 def test_what_changes_after_a_frame_is_begun_counts(threads):
     """Helpers begin with the program that was; where blocks have changed, all is done anew."""
     pipe, images = pipe_and_images((96, 128))
@@ -128,10 +140,11 @@ def test_what_changes_after_a_frame_is_begun_counts(threads):
     assert (pipe(images[0]).depth_mm - before.depth_mm).abs().max() < 1e-4
     rows_of_pixels = images[0].permute(0, 2, 3, 1).contiguous().permute(0, 3, 1, 2)
     assert not rows_of_pixels.is_contiguous() and torch.equal(pipe(rows_of_pixels).depth_mm, pipe(images[0]).depth_mm)
+    depth = pipe(images[0]).depth_mm
     for wrong in (images[0] * 3.0, images[0][..., :100], images[0].double()):
         with contextlib.suppress(ValueError, TypeError):
             pipe(wrong)
-        assert torch.equal(pipe(images[0]).depth_mm, pipe(images[0]).depth_mm)
+        assert torch.equal(pipe(images[0]).depth_mm, depth)
 
 
 def test_the_way_from_core_to_core_is_timed():

@@ -195,7 +195,7 @@ def solve_frames(pipe: nn.Module, images: Tensor, parts: Callable[[], Blocks | N
     """The output of a pipeline, each frame by itself, by one compiled call; None where its blocks must do it.
 
     Helpers begin with a single frame before it is known that the program holds: where other work came before a frame, to find that
-    out and to wake them takes a third of its time.
+    out and to wake them takes a tenth of its time.
 
     Args:
         pipe: the pipeline, beside which its program is kept.

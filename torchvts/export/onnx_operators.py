@@ -21,21 +21,21 @@ class InOnnxOperators(TorchFunctionMode):
         return (replacement or func)(*args, **(kwargs or {}))
 
 
-def median(values: Tensor, dim: int | None = None, keepdim: bool = False) -> Any:
+def median(input: Tensor, dim: int | None = None, keepdim: bool = False) -> Any:
     """``torch.median`` of all values, or along a dimension, by sorting."""
     if dim is None:
-        return median(values.flatten(), 0)[0]
-    ordered, index = torch.sort(values, dim=dim)
-    middle = (values.shape[dim] - 1) // 2
+        return median(input.flatten(), 0)[0]
+    ordered, index = torch.sort(input, dim=dim)
+    middle = (input.shape[dim] - 1) // 2
     return _result(torch.return_types.median, ordered.narrow(dim, middle, 1), index.narrow(dim, middle, 1), dim, keepdim)
 
 
-def nanmedian(values: Tensor, dim: int | None = None, keepdim: bool = False) -> Any:
+def nanmedian(input: Tensor, dim: int | None = None, keepdim: bool = False) -> Any:
     """``torch.nanmedian`` of all values, or along a dimension, by sorting."""
     if dim is None:
-        return nanmedian(values.flatten(), 0)[0]
-    known = ~torch.isnan(values)
-    ordered, index = torch.sort(torch.where(known, values, torch.inf), dim=dim)
+        return nanmedian(input.flatten(), 0)[0]
+    known = ~torch.isnan(input)
+    ordered, index = torch.sort(torch.where(known, input, torch.inf), dim=dim)
     middle = ((known.to(torch.int64).sum(dim, keepdim=True) - 1) // 2).clamp_min(0)
     ordered, index = ordered.gather(dim, middle), index.gather(dim, middle)
     ordered = torch.where(known.any(dim, keepdim=True), ordered, torch.nan)

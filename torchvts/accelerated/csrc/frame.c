@@ -254,7 +254,7 @@ EXPORT void forget_frame(void) {
 /* Has helpers begin with an image (3, height, width) while the caller still finds out whether the program holds: until forget_frame(), image and
    program stay where they are. Then solve_frames() of the same two goes on with what they have done. */
 EXPORT void begin_frame(const Program *of, const float *image, int threads) {
-    forget_frame(); /* of a call that a signal's handler stands in the middle of */
+    forget_frame(); /* left by a call that this one interrupts */
     if (!begin_sharing(threads)) return;
     begun = malloc(sizeof *begun);
     float *floats = memory_of(of);

@@ -7,11 +7,11 @@ BIN := $(VENV)/bin
 
 setup: $(VENV)/.done
 
-# Of the packages, torch and sympy are compiled at once: else each process does it, where PYTHONDONTWRITEBYTECODE is set.
+# torch, sympy and torchvts are compiled at once: else each process does it, where PYTHONDONTWRITEBYTECODE is set.
 $(VENV)/.done: pyproject.toml constraints.txt hatch_build.py $(wildcard torchvts/accelerated/csrc/*.[ch])
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt --editable ".[pose,onnx,view,test,docs]"
-	$(BIN)/python -m compileall -q -j 0 -x testing/_internal $(VENV)/lib/python3*/site-packages/torch $(VENV)/lib/python3*/site-packages/sympy
+	$(BIN)/python -m compileall -q -j 0 -x testing/_internal $(VENV)/lib/python3*/site-packages/torch $(VENV)/lib/python3*/site-packages/sympy torchvts
 	touch $@
 
 demo: setup

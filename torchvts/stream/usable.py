@@ -2,7 +2,10 @@
 background."""
 
 from collections.abc import Callable
+from typing import Any
 
+import numpy as np
+import torch
 from torch import Tensor, nn
 
 from ..core.checks import check_batch, check_field, check_range, check_same_size
@@ -42,27 +45,31 @@ LEAST_DECIDING = 0.1
 """Share of the cells in which another view of the background looks different, below which no frame can show that view."""
 
 
-def _centre(cells: Tensor) -> Tensor:
+_Array = np.ndarray[Any, Any]
+"""float32 or bool. Every frame of a stream waits for its check: on 24 x 32 cells NumPy takes half of PyTorch's time."""
+
+
+def _centre(cells: _Array) -> _Array:
     """The middle of (3, h, w) cells, without :data:`CROP` a side, at their own size."""
     top, left = round(CROP * cells.shape[1]), round(CROP * cells.shape[2])
-    middle = cells[None, :, top : cells.shape[1] - top, left : cells.shape[2] - left]
-    return nn.functional.interpolate(middle, cells.shape[1:], mode="bilinear", align_corners=False)[0]
+    middle = torch.from_numpy(cells[None, :, top : cells.shape[1] - top, left : cells.shape[2] - left])
+    return nn.functional.interpolate(middle, cells.shape[1:], mode="bilinear", align_corners=False)[0].numpy()
 
 
-_Change = Callable[[Tensor], Tensor]
+_Change = Callable[[_Array], _Array]
 
 
-def _same(cells: Tensor) -> Tensor:
+def _same(cells: _Array) -> _Array:
     return cells
 
 
 _VIEWS: tuple[tuple[str, _Change, _Change], ...] = (
     ("is cropped otherwise and shows more than the background", _centre, _same),
     ("is cropped otherwise and shows less than the background", _same, _centre),
-    ("is turned by 180 degrees", lambda cells: cells.flip(1, 2), _same),
-    ("is mirrored left to right", lambda cells: cells.flip(2), _same),
-    ("is mirrored top to bottom", lambda cells: cells.flip(1), _same),
-    ("has red and blue swapped", lambda cells: cells.flip(0), _same),
+    ("is turned by 180 degrees", lambda cells: cells[:, ::-1, ::-1], _same),
+    ("is mirrored left to right", lambda cells: cells[:, :, ::-1], _same),
+    ("is mirrored top to bottom", lambda cells: cells[:, ::-1], _same),
+    ("has red and blue swapped", lambda cells: cells[::-1], _same),
 )
 """What may have happened to a frame; what is done to its cells and to the background's so that they can be compared."""
 
@@ -89,15 +96,16 @@ class FrameCheck:
         check_range("background", background)
         self.size = (background.shape[1], background.shape[2])
         self.cell = max(1, min(self.size) // 24)
-        self.background = self._cells(background[None].float())
-        self._lit = [(channel, lit) for channel, lit in enumerate(self.background > LIT) if bool(lit.any())]
-        self._lit_lines = [line > LIT for line in _lines(background)]
+        image = _array(background)
+        self.background = self._cells(image)
+        self._lit = [(channel, lit) for channel, lit in enumerate(self.background > LIT) if lit.any()]
+        self._lit_lines = _lines(image) > LIT
         self._overexposed = _overexposed(self.background) > MOST_OVEREXPOSED
         self._views = []
         for what, change, other in _VIEWS:
             own, wanted = change(self.background), other(self.background)
             deciding = ~_alike(_ratio(own, wanted))
-            if float(deciding.double().mean()) >= LEAST_DECIDING:
+            if float(deciding.mean()) >= LEAST_DECIDING:
                 self._views.append((what, change, own, wanted, deciding))
 
     @classmethod
@@ -111,17 +119,18 @@ class FrameCheck:
         """Why a frame (1, 3, H, W), rectified, in [0, 1], cannot be used."""
         check_batch("frame", frame, 3)
         check_same_size("frame", frame, "the background", *self.size)
-        cells = self._cells(frame.float())
-        if _range(cells) < ONE_COLOUR and _range(frame[0]) < ONE_COLOUR:  # the cells of most frames suffice
+        image = _array(frame[0])
+        cells = self._cells(image)
+        if _range(cells) < ONE_COLOUR and _range(image) < ONE_COLOUR:  # the cells of most frames suffice
             return "the frame has one colour everywhere: black, overexposed, or not decoded"
         ratio = _ratio(cells, self.background)
-        level = max([float(ratio[channel][lit].median()) for channel, lit in self._lit], default=1.0)
+        level = max([float(_median(ratio[channel][lit])) for channel, lit in self._lit], default=1.0)
         if level < DARK:
-            cause = "black, or the LEDs were off"
-            if float(frame.max()) <= TWELVE_BITS + 1e-6:
-                cause = f"its largest value is {round(65535 * float(frame.max()))} of 65535: 12 bits stored in 16?"
+            cause, most = "black, or the LEDs were off", float(image.max())
+            if most <= TWELVE_BITS + 1e-6:
+                cause = f"its largest value is {round(65535 * most)} of 65535: 12 bits stored in 16?"
             return f"the frame is dark, {level:.0%} of the background's brightness: {cause}"
-        black = sum(int(((line < BLACK) & lit).sum()) for line, lit in zip(_lines(frame[0]), self._lit_lines, strict=True))
+        black = np.count_nonzero((_lines(image) < BLACK) & self._lit_lines)
         if black > 0:
             return (
                 f"{black} rows or columns of the frame are black: it was cut short, or the camera has lost them since calibration"
@@ -130,23 +139,27 @@ class FrameCheck:
             return "the frame is overexposed: nearly all of it is saturated"
         return self._other_view(cells, _likeness(ratio))
 
-    def _cells(self, frame: Tensor) -> Tensor:
-        return nn.functional.avg_pool2d(frame, self.cell)[0]
+    def _cells(self, image: _Array) -> _Array:
+        """Means of whole cells, (3, h, w), of (3, H, W)."""
+        height, width = image.shape[1] // self.cell, image.shape[2] // self.cell
+        rows = image[:, : height * self.cell].reshape(3, height, self.cell, -1).sum(2)
+        means: _Array = rows[..., : width * self.cell].reshape(3, height, width, self.cell).sum(3) / np.float32(self.cell**2)
+        return means
 
     def other_view(self, frame: Tensor) -> str:
         """In which way a frame (1, 3, H, W) is cropped, turned or swapped otherwise than the background; an empty text for none."""
-        cells = self._cells(frame.float())
+        cells = self._cells(_array(frame[0]))
         return self._other_view(cells, _likeness(_ratio(cells, self.background)))
 
-    def _other_view(self, cells: Tensor, as_it_is: float) -> str:
+    def _other_view(self, cells: _Array, as_it_is: float) -> str:
         if as_it_is > LIKE:
             return ""
         found = [("", 0.0, 0.0)]
         for what, change, own, wanted, deciding in self._views:
             seen = change(cells)
             alike = _alike(_ratio(seen, wanted))
-            undone, same = (float(part[deciding].double().mean()) for part in (alike, _alike(_ratio(seen, own))))
-            if min(undone, float(alike.double().mean())) >= 0.5 and undone >= 1.5 * same:
+            undone, same = (float(part[deciding].mean()) for part in (alike, _alike(_ratio(seen, own))))
+            if min(undone, float(alike.mean())) >= 0.5 and undone >= 1.5 * same:
                 found.append((what, undone, same))
         what, best, same = max(found, key=lambda view: view[1])
         if not what:
@@ -154,31 +167,44 @@ class FrameCheck:
         return f"the frame {what}: with that undone {best:.0%} of what differs looks like the background, else {same:.0%}"
 
 
-def _lines(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Largest value of each row and of each column of (3, H, W)."""
-    return image[:, :, ::EVERY].amax((0, 2)), image[:, ::EVERY].amax((0, 1))
+def _array(image: Tensor) -> _Array:
+    """(3, H, W) as float32."""
+    array: _Array = image.detach().float().cpu().numpy()
+    return array
 
 
-def _range(image: Tensor) -> float:
+def _lines(image: _Array) -> _Array:
+    """Largest value of each row, then of each column, of (3, H, W)."""
+    return np.concatenate([image[:, :, ::EVERY].max(0).max(1), image[:, ::EVERY].max((0, 1))])
+
+
+def _range(image: _Array) -> float:
     """Largest range of a channel of (3, h, w)."""
-    return float((image.amax((1, 2)) - image.amin((1, 2))).max())
+    return float((image.max((1, 2)) - image.min((1, 2))).max())
 
 
-def _overexposed(cells: Tensor) -> float:
+def _overexposed(cells: _Array) -> float:
     """Share of the cells (3, h, w) that are overexposed in all channels."""
-    return float((cells.amin(0) > BRIGHT).double().mean())
+    return float((cells.min(0) > BRIGHT).mean())
 
 
-def _ratio(one: Tensor, other: Tensor) -> Tensor:
-    return one / other.clamp_min(1e-3)
+def _ratio(one: _Array, other: _Array) -> _Array:
+    return one / np.maximum(other, np.float32(1e-3))
 
 
-def _alike(ratio: Tensor) -> Tensor:
+def _median(values: _Array) -> _Array:
+    """Of the last dimension; the lower one of two."""
+    middle = (values.shape[-1] - 1) // 2
+    return np.partition(values, middle)[..., middle]
+
+
+def _alike(ratio: _Array) -> _Array:
     """(h, w) bool: cells whose ratio (3, h, w) is within :data:`NEAR` of the median of each channel."""
-    relative = ratio / ratio.flatten(1).median(1).values.clamp_min(1e-3)[:, None, None]
-    return (relative - 1.0).abs().amax(0) < NEAR
+    median = np.maximum(_median(ratio.reshape(3, -1)), np.float32(1e-3))
+    alike: _Array = np.abs(ratio / median[:, None, None] - 1.0).max(0) < NEAR
+    return alike
 
 
-def _likeness(ratio: Tensor) -> float:
+def _likeness(ratio: _Array) -> float:
     """Share of the cells that are alike."""
-    return float(_alike(ratio).double().mean())
+    return float(_alike(ratio).mean())

@@ -157,6 +157,56 @@ def test_the_way_from_core_to_core_is_timed():
     assert all(torch.equal(a, b) for a, b in zip(pipe(images[0]), alone, strict=True))
 
 
+@pytest.fixture
+def begun(monkeypatch):
+    """Addresses of the images that a frame was begun with."""
+    addresses, begin = [], kernels.loaded().begin_frame
+
+    def record(program, image, count):
+        addresses.append(image)
+        return begin(program, image, count)
+
+    monkeypatch.setattr(kernels.loaded(), "begin_frame", record)
+    return addresses
+
+
+def test_a_frame_is_begun_only_where_its_memory_is_known(threads, begun):
+    """Not where the first stage would read memory that may be gone, nor images that have none of their own."""
+    pipe, images = pipe_and_images((96, 128))
+    threads(2)
+    expected = pipe(images[0])
+    pipe(images[0])
+    assert begun == [images[0].data_ptr()]
+    begun.clear()
+    gain = pipe.compensate.gain.gain
+    gain.data = gain.data.clone()
+    assert torch.equal(pipe(images[0]).depth_mm, expected.depth_mm) and not begun
+    pipe(images[0])
+    assert begun == [images[0].data_ptr()]
+    begun.clear()
+    slope = torch.func.grad(lambda image: pipe(image).depth_mm.sum())(images[0])
+    assert slope.abs().max() > 0.0 and not begun
+    found = pipe(torch._neg_view(-images[0]))
+    assert (found.depth_mm - expected.depth_mm).abs().max() < 1e-5 and torch.equal(found.deformed, expected.deformed)
+    begun.clear()
+    assert torch.equal(pipe(torch._efficientzerotensor((1, 3, 96, 128))).depth_mm, pipe(torch.zeros(1, 3, 96, 128)).depth_mm)
+    assert 0 not in begun
+
+
+def test_nobody_is_at_a_forgotten_frame_any_more(threads):
+    """The next frame takes its memory at once, which a helper that is late would write into."""
+    pipe, images = pipe_and_images((240, 320))
+    threads(2)
+    expected = pipe(images[1])
+    pipe(images[0])
+    program = _programs[pipe].program
+    for k in range(100):
+        kernels.loaded().begin_frame(ctypes.byref(program), images[0].data_ptr(), 2)
+        time.sleep(1e-5 * (k % 20))  # a helper comes some time after it is woken
+        kernels.loaded().forget_frame()
+        assert all(torch.equal(a, b) for a, b in zip(pipe(images[1]), expected, strict=True))
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
 def test_a_fork_starts_its_own_helpers(threads):
     threads(2)

@@ -63,4 +63,6 @@ def _plain(tensors: tuple[Tensor, ...]) -> bool:
             return False
         if torch._C._functorch.is_functorch_wrapped_tensor(tensor):
             return False
+        if tensor.is_neg() or tensor._is_zerotensor():  # its memory holds other values, or there is none
+            return False
     return True

@@ -2,12 +2,13 @@
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ..core.checks import check_batch, check_field, check_least, check_range, check_same_size, check_shape
 from ..core.geometry import pixel_grid_mm
 from ..core.robust import tukey_weight
 from ..model.calibration import PEDESTAL
+from .cells import Array, array_of, cell_means, cells_with_any, lower_median, widened
 
 TIME_CONSTANT_S = 1.0
 """The light is followed with this time constant: an LED that fades by 1 % a second is followed 1 % behind."""
@@ -54,9 +55,8 @@ class FollowLight:
         self.plane = torch.tensor([[1.0, 0.0, 0.0]] * 3, dtype=torch.float64)
         self.set_background(background[None])
         rows, columns = self._background.shape[1:]
-        x = torch.linspace(-1.0, 1.0, columns, dtype=torch.float64).expand(rows, columns)
-        y = torch.linspace(-1.0, 1.0, rows, dtype=torch.float64)[:, None].expand(rows, columns)
-        self._basis = torch.stack((torch.ones_like(x), x, y)).flatten(1)  # (3, cells)
+        y, x = np.meshgrid(np.linspace(-1.0, 1.0, rows), np.linspace(-1.0, 1.0, columns), indexing="ij")
+        self._basis = np.stack((np.ones_like(x), x, y)).reshape(3, -1)  # (3, cells)
         reach_x, reach_y = width / (columns * self.cell), height / (rows * self.cell)  # some pixels lie beyond the last cells
         x_mm, y_mm = pixel_grid_mm(height, width, 1.0, background.dtype)
         self._x, self._y = (x_mm * 2.0 / width * reach_x)[None, :1], (y_mm * 2.0 / height * reach_y)[None, :, :1]
@@ -92,30 +92,29 @@ class FollowLight:
         check_shape("deformed", deformed, (1, 1, *self.size), "image")
         check_least("seconds", seconds, -np.inf)
         cells, difference = self._difference(image)
-        pressed = nn.functional.max_pool2d(deformed.float(), self.cell)
-        near = nn.functional.max_pool2d(pressed, 3, 1, 1)[0, 0] > 0
+        pressed = cells_with_any(deformed[0, 0].bool().cpu().numpy(), self.cell)
         usable = self._usable & (cells < 0.97)
         before = self.state
         self._since_contact_s = 0.0 if bool(pressed.any()) else self._since_contact_s + seconds
-        free = usable & ~near
-        enough = bool((free.flatten(1).double().mean(1) >= LEAST_FREE * usable.flatten(1).double().mean(1)).all())
+        free = usable & ~widened(pressed)
+        enough = bool((free.sum((1, 2)) >= LEAST_FREE * usable.sum((1, 2))).all())
         change = self._fit(difference, free if enough else usable)
-        if float(change.abs().sum(1).max()) > LIGHT_STEP:
-            residual = (difference.flatten(1) - change @ self._basis).abs()[usable.flatten(1)]
-            smooth = residual.numel() > 0 and float((residual < 0.01).double().mean()) > 0.9
+        if float(np.abs(change).sum(1).max()) > LIGHT_STEP:
+            residual = np.abs(difference.reshape(3, -1) - change @ self._basis)[usable.reshape(3, -1)]
+            smooth = residual.size > 0 and float((residual < 0.01).mean()) > 0.9
             self.state = "stepped" if smooth or self._since_contact_s >= RECOVERY_S else "held"
         elif not enough:
             self.state = "held"
         else:
             self.state = "following"
-            self.plane += (1.0 - float(np.exp(-max(0.0, seconds) / TIME_CONSTANT_S))) * change * self.plane[:, :1]
+            self._move((1.0 - float(np.exp(-max(0.0, seconds) / TIME_CONSTANT_S))) * change)
         self.steps += self.state == "stepped" and before != "stepped"
         return self.state
 
     def set_background(self, image: Tensor) -> None:
         """Take an image (1, 3, H, W) without contact, in the background's light, as what the cells look like."""
         self._check(image)
-        background = nn.functional.avg_pool2d(image, self.cell)[0].double()
+        background = cell_means(array_of(image[0]), self.cell).astype(np.float64)
         self._background = background + PEDESTAL
         self._usable = (background > 0.06) & (background < 0.97)
 
@@ -124,7 +123,7 @@ class FollowLight:
         self._check(image)
         for _ in range(3):
             cells, difference = self._difference(image)
-            self.plane += self._fit(difference, self._usable & (cells < 0.97)) * self.plane[:, :1]
+            self._move(self._fit(difference, self._usable & (cells < 0.97)))
 
     def _check(self, image: Tensor) -> None:
         check_batch("image", image, 3)
@@ -132,22 +131,28 @@ class FollowLight:
             raise ValueError(f"image: expected one frame, (1, 3, H, W), got {list(image.shape)}: frames come one by one")
         check_same_size("image", image, "the background", *self.size)
 
-    def _difference(self, image: Tensor) -> tuple[Tensor, Tensor]:
+    def _move(self, change: Array) -> None:
+        """Change the light by a relative plane (3, 3)."""
+        self.plane += torch.from_numpy(change) * self.plane[:, :1]
+
+    def _difference(self, image: Tensor) -> tuple[Array, Array]:
         """Cells of an image, and their relative difference to the light followed so far."""
-        cells = nn.functional.avg_pool2d(image, self.cell)[0].double()
-        now = (self.plane @ self._basis).reshape(cells.shape)
+        cells = cell_means(array_of(image[0]), self.cell).astype(np.float64)
+        now = (self.plane.numpy() @ self._basis).reshape(cells.shape)
         return cells, (cells / now + PEDESTAL) / self._background - 1.0
 
-    def _fit(self, values: Tensor, used: Tensor) -> Tensor:
+    def _fit(self, values: Array, used: Array) -> Array:
         """A plane for each channel, (3, 3), by three rounds of Tukey's weights; tilts are regularised where few cells are used."""
-        target, used = values.flatten(1), used.flatten(1)
-        ridge = torch.diag(torch.tensor([1e-9, 0.02, 0.02], dtype=torch.float64)) * target.shape[1]
-        plane = torch.zeros(3, 3, dtype=torch.float64)
-        plane[:, 0] = torch.where(used, target, torch.nan).nanmedian(1).values.nan_to_num()
+        target, used = values.reshape(3, -1), used.reshape(3, -1)
+        ridge = np.diag([1e-9, 0.02, 0.02]) * target.shape[1]
+        plane = np.zeros((3, 3))
+        plane[:, 0] = [lower_median(one[some]) if some.any() else 0.0 for one, some in zip(target, used, strict=True)]
         for _ in range(3):
-            residual = (target - plane @ self._basis).abs()
-            scale = torch.where(used, residual, torch.nan).nanmedian(1, keepdim=True).values.nan_to_num(1.0)
-            weight = used.double() * tukey_weight(residual / (6.0 * scale).clamp_min(2e-3))
-            normal = torch.einsum("cn,in,jn->cij", weight, self._basis, self._basis) + ridge
-            plane = torch.linalg.solve(normal, torch.einsum("cn,in->ci", weight * target, self._basis))
+            residual = np.abs(target - plane @ self._basis)
+            scale = [lower_median(one[some]) if some.any() else 1.0 for one, some in zip(residual, used, strict=True)]
+            ratio = residual / np.maximum(6.0 * np.array(scale), 2e-3)[:, None]
+            weight = used * tukey_weight(torch.from_numpy(ratio)).numpy()
+            weighted = weight[:, None] * self._basis
+            right = (weighted @ target[:, :, None])[..., 0]
+            plane = np.linalg.solve(weighted @ self._basis.T + ridge, right[..., None])[..., 0]
         return plane

@@ -2,7 +2,6 @@
 background."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import torch
@@ -10,6 +9,7 @@ from torch import Tensor, nn
 
 from ..core.checks import check_batch, check_field, check_range, check_same_size
 from ..model.calibration import Calibration, check_calibration
+from .cells import Array, array_of, cell_means, lower_median
 
 DARK = 0.25
 """A frame whose median brightness, in all channels, is below this share of the background's shows no skin."""
@@ -45,21 +45,17 @@ LEAST_DECIDING = 0.1
 """Share of the cells in which another view of the background looks different, below which no frame can show that view."""
 
 
-_Array = np.ndarray[Any, Any]
-"""float32 or bool. Every frame of a stream waits for its check: on 24 x 32 cells NumPy takes half of PyTorch's time."""
-
-
-def _centre(cells: _Array) -> _Array:
+def _centre(cells: Array) -> Array:
     """The middle of (3, h, w) cells, without :data:`CROP` a side, at their own size."""
     top, left = round(CROP * cells.shape[1]), round(CROP * cells.shape[2])
     middle = torch.from_numpy(cells[None, :, top : cells.shape[1] - top, left : cells.shape[2] - left])
     return nn.functional.interpolate(middle, cells.shape[1:], mode="bilinear", align_corners=False)[0].numpy()
 
 
-_Change = Callable[[_Array], _Array]
+_Change = Callable[[Array], Array]
 
 
-def _same(cells: _Array) -> _Array:
+def _same(cells: Array) -> Array:
     return cells
 
 
@@ -96,8 +92,8 @@ class FrameCheck:
         check_range("background", background)
         self.size = (background.shape[1], background.shape[2])
         self.cell = max(1, min(self.size) // 24)
-        image = _array(background)
-        self.background = self._cells(image)
+        image = array_of(background)
+        self.background = cell_means(image, self.cell)
         self._lit = [(channel, lit) for channel, lit in enumerate(self.background > LIT) if lit.any()]
         self._lit_lines = _lines(image) > LIT
         self._overexposed = _overexposed(self.background) > MOST_OVEREXPOSED
@@ -119,12 +115,12 @@ class FrameCheck:
         """Why a frame (1, 3, H, W), rectified, in [0, 1], cannot be used."""
         check_batch("frame", frame, 3)
         check_same_size("frame", frame, "the background", *self.size)
-        image = _array(frame[0])
-        cells = self._cells(image)
+        image = array_of(frame[0])
+        cells = cell_means(image, self.cell)
         if _range(cells) < ONE_COLOUR and _range(image) < ONE_COLOUR:  # the cells of most frames suffice
             return "the frame has one colour everywhere: black, overexposed, or not decoded"
         ratio = _ratio(cells, self.background)
-        level = max([float(_median(ratio[channel][lit])) for channel, lit in self._lit], default=1.0)
+        level = max([float(lower_median(ratio[channel][lit])) for channel, lit in self._lit], default=1.0)
         if level < DARK:
             cause, most = "black, or the LEDs were off", float(image.max())
             if most <= TWELVE_BITS + 1e-6:
@@ -139,19 +135,12 @@ class FrameCheck:
             return "the frame is overexposed: nearly all of it is saturated"
         return self._other_view(cells, _likeness(ratio))
 
-    def _cells(self, image: _Array) -> _Array:
-        """Means of whole cells, (3, h, w), of (3, H, W)."""
-        height, width = image.shape[1] // self.cell, image.shape[2] // self.cell
-        rows = image[:, : height * self.cell].reshape(3, height, self.cell, -1).sum(2)
-        means: _Array = rows[..., : width * self.cell].reshape(3, height, width, self.cell).sum(3) / np.float32(self.cell**2)
-        return means
-
     def other_view(self, frame: Tensor) -> str:
         """In which way a frame (1, 3, H, W) is cropped, turned or swapped otherwise than the background; an empty text for none."""
-        cells = self._cells(_array(frame[0]))
+        cells = cell_means(array_of(frame[0]), self.cell)
         return self._other_view(cells, _likeness(_ratio(cells, self.background)))
 
-    def _other_view(self, cells: _Array, as_it_is: float) -> str:
+    def _other_view(self, cells: Array, as_it_is: float) -> str:
         if as_it_is > LIKE:
             return ""
         found = [("", 0.0, 0.0)]
@@ -167,44 +156,32 @@ class FrameCheck:
         return f"the frame {what}: with that undone {best:.0%} of what differs looks like the background, else {same:.0%}"
 
 
-def _array(image: Tensor) -> _Array:
-    """(3, H, W) as float32."""
-    array: _Array = image.detach().float().cpu().numpy()
-    return array
-
-
-def _lines(image: _Array) -> _Array:
+def _lines(image: Array) -> Array:
     """Largest value of each row, then of each column, of (3, H, W)."""
     return np.concatenate([image[:, :, ::EVERY].max(0).max(1), image[:, ::EVERY].max((0, 1))])
 
 
-def _range(image: _Array) -> float:
+def _range(image: Array) -> float:
     """Largest range of a channel of (3, h, w)."""
     return float((image.max((1, 2)) - image.min((1, 2))).max())
 
 
-def _overexposed(cells: _Array) -> float:
+def _overexposed(cells: Array) -> float:
     """Share of the cells (3, h, w) that are overexposed in all channels."""
     return float((cells.min(0) > BRIGHT).mean())
 
 
-def _ratio(one: _Array, other: _Array) -> _Array:
+def _ratio(one: Array, other: Array) -> Array:
     return one / np.maximum(other, np.float32(1e-3))
 
 
-def _median(values: _Array) -> _Array:
-    """Of the last dimension; the lower one of two."""
-    middle = (values.shape[-1] - 1) // 2
-    return np.partition(values, middle)[..., middle]
-
-
-def _alike(ratio: _Array) -> _Array:
+def _alike(ratio: Array) -> Array:
     """(h, w) bool: cells whose ratio (3, h, w) is within :data:`NEAR` of the median of each channel."""
-    median = np.maximum(_median(ratio.reshape(3, -1)), np.float32(1e-3))
-    alike: _Array = np.abs(ratio / median[:, None, None] - 1.0).max(0) < NEAR
+    median = np.maximum(lower_median(ratio.reshape(3, -1)), np.float32(1e-3))
+    alike: Array = np.abs(ratio / median[:, None, None] - 1.0).max(0) < NEAR
     return alike
 
 
-def _likeness(ratio: _Array) -> float:
+def _likeness(ratio: Array) -> float:
     """Share of the cells that are alike."""
     return float(_alike(ratio).mean())

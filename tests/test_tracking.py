@@ -461,19 +461,61 @@ def test_a_bad_frame_is_said_and_the_tracker_goes_on():
         assert found.converged and not found.lost and float(turn_deg(found.T_target_source)) < 0.05
     with pytest.raises(TypeError, match="expected a DepthOutput"):
         tracker(good.depth_mm)
+    with pytest.raises(TypeError, match="DepthOutput, whose contact is no tensor but NoneType"):
+        tracker(_bad(good, contact=None))
     with pytest.raises(ValueError, match="loop over the batch"):
         tracker(_bad(good, depth_mm=good.depth_mm.expand(2, -1, -1, -1)))
+    with pytest.raises(ValueError, match=r"contact \(1, 1, H, W\), got \(1, 1, 120, 90\): depth_mm has \(1, 1, 120, 160\)"):
+        tracker(_bad(good, contact=good.contact[..., :90]))
     assert tracker(good).converged
 
 
 def test_a_bad_reference_is_refused():
     good = press(objects.stamp("T"), objects.pose(0.0))
-    with pytest.raises(ValueError, match="reference: expected a contact with relief, got no contact"):
+    with pytest.raises(ValueError, match="reference: expected a contact with relief, got none: no contact"):
         vts.PoseTracker(_bad(good, contact=torch.zeros_like(good.contact)), PITCH)
+    with pytest.raises(ValueError, match=r"reference: .* got none: depth or gradient is not finite"):
+        vts.PoseTracker(_bad(good, depth_mm=good.depth_mm * math.nan), PITCH)
+    with pytest.raises(ValueError, match="reference: expected a contact with relief, got slopes of 0"):
+        vts.PoseTracker(press(objects.plane(), objects.pose(0.0)), PITCH)
+    with pytest.raises(ValueError, match="reference: expected slopes of its depth"):
+        vts.PoseTracker(_bad(good, gradient=-good.gradient), PITCH)
     with pytest.raises(ValueError, match=r"mm_per_pixel: expected about 0\.12"):
         vts.PoseTracker(good, 0.0625)
     with pytest.raises(ValueError, match="mm_per_pixel"):
         vts.PoseTracker(good, -1.0)
+
+
+def test_frames_that_come_again_say_nothing_of_what_is_usual():
+    """Their slopes differ by nothing; a unit whose slopes err was lost for good as soon as the object moved."""
+    unit = tracking.WrongSlopes(_bad(press(objects.gear(), swing(0))), tracking.Noise(0.0, 3.0, 2.5), 1, PITCH)
+    frames = [unit(_bad(press(objects.gear(), swing(k))), k) for k in range(6)]
+    tracker = vts.PoseTracker(frames[0], PITCH)
+    assert not [found.lost for found in map(tracker, [frames[0]] * 4 + frames[1:]) if found.lost]
+
+
+def test_what_is_usual_is_forgotten_while_it_keeps_the_object_lost():
+    frames = [press(objects.key(), swing(k)) for k in range(3)]
+    tracker = vts.PoseTracker(frames[0], PITCH)
+    tracker(frames[1])
+    tracker._usual.extend([(1e-9, 0.1)] * 5)
+    noisy = _bad(frames[1], gradient=frames[1].gradient + 0.04 * torch.randn(frames[1].gradient.shape))
+    lost = [tracker(noisy).lost for _ in range(6)]
+    assert "slopes differ by" in lost[0] and not lost[-1]
+
+
+def test_a_small_part_of_a_large_contact_is_not_found_again():
+    """A handle touched again with an end of it: a sixth of its contact lay anywhere along it, 15 degrees off."""
+    handle = objects.TARGETS["tool handle"].height_mm
+    whole, above, end = (
+        objects.press(handle, objects.pose(*at), 240, 320, 0.0634)
+        for at in ((159.7, (0.0, 0.0), 0.45), (163.0, (0.0, 0.0), -0.3), (202.6, (-0.87, 1.26), 0.03, (1.5, -1.0)))
+    )
+    tracker = vts.PoseTracker(whole, 0.0634)
+    assert tracker(above).lost == "no contact"
+    assert 0.1 < float(end.contact.sum() / whole.contact.sum()) < 0.3
+    assert "not found again: it touches with a small part" in tracker(end).lost
+    assert tracker(whole).converged
 
 
 def test_a_pose_is_no_more_certain_than_the_way_to_its_keyframe():

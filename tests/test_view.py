@@ -2,6 +2,7 @@
 
 import math
 import os
+import sys
 import warnings
 
 import numpy as np
@@ -64,6 +65,24 @@ class _Rows(list):
 
     def __iter__(self):
         return (self[k] for k in range(len(self)))
+
+
+def test_poses_are_seen_in_the_live_view(press, run_script, tmp_path, monkeypatch):
+    """The axes of the reference on the surface, from the frame after it on."""
+    pytest.importorskip("rerun")
+    call = ("track", *press, "--out", tmp_path, "--video", "none", "--save", tmp_path / "poses.rrd")
+    done = run_script(*call)
+    assert done.returncode == 0 and "rerun " in done.stdout, done.stderr
+    columns = read_back(tmp_path / "poses.rrd")
+    origins, ends = (columns["/surface/axes", f"Arrows3D:{name}"] for name in ("origins", "vectors"))
+    assert len(origins) == len(ends) == 3
+    for origin, arrows in zip(origins, ends, strict=True):
+        assert np.allclose(origin, origin[0]) and np.abs(origin[0][:2]).max() < 0.2  # the ball lies in the middle
+        assert np.allclose(arrows, 2.0 * np.eye(3), atol=0.1)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    done = run_script(*call, "--view")
+    assert not sys.platform.startswith("linux") or (done.returncode == 2 and "--view: expected a screen" in done.stderr)
 
 
 def test_a_view_without_a_screen_writes_what_rerun_reads(press, run_script, tmp_path):

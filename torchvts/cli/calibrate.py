@@ -19,7 +19,7 @@ from ..calibration import Press, Touch, read_presses
 from ..core.files import make_folder, read_frames
 from ..model import Sensor
 from ..stream import read_background, read_press_images
-from .options import add_background_frames, add_press, add_sensor
+from .options import add_background_frames, add_press, add_sensor, load_sensor
 from .parser import UsageError
 from .summary import calibrated, print_calibration
 
@@ -70,7 +70,7 @@ def check_target_of(out: Path) -> None:
 def read_given(arguments: argparse.Namespace) -> tuple[torch.Tensor, Sensor, list[Press]]:
     """Background, sensor and presses that the arguments name."""
     first = arguments.source[0]
-    sensor = Sensor.load(arguments.sensor) if arguments.sensor is not None else unknown_sensor(arguments)
+    sensor = load_sensor(arguments.sensor) if arguments.sensor is not None else unknown_sensor(arguments)
     sensor = sensor.without_prior() if arguments.no_prior else sensor
     if not (len(arguments.source) == 1 and first.is_dir()):
         return read_background(arguments.source, sensor, arguments.background_frames), sensor, []

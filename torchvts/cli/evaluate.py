@@ -20,8 +20,7 @@ from .. import viz
 from ..evaluation import evaluate as ev
 from ..evaluation import sets
 from ..evaluation.figures import set_figure
-from ..model import Sensor
-from .options import add_out, add_sensor
+from .options import add_out, add_sensor, load_sensor
 from .parser import UsageError
 
 USAGE = "(FOLDER --sensor NAME | --all | --sets SET...) [--methods METHOD...]"
@@ -68,7 +67,7 @@ def measure(arguments: argparse.Namespace) -> list[ev.Evaluation]:
             raise UsageError("--network: expected FOLDER beside it, the presses of the network's unit")
         names = sets.SETS if arguments.all else arguments.sets
         return ev.evaluate_all(names, sets.data_folder(str(Path(__file__).parent)), methods, limit=limit, seed=seed, progress=True)
-    sensor = Sensor.load(arguments.sensor or "gelsight_mini")
+    sensor = load_sensor(arguments.sensor or "gelsight_mini")
     data = sets.from_folder(arguments.folder, sensor, folds=arguments.folds, network=arguments.network, limit=limit)
     with tqdm(desc="evaluating", leave=False, disable=None) as bar:
         return [ev.evaluate(data, methods, seed=seed, bar=bar)]

@@ -8,7 +8,7 @@ from pathlib import Path
 from ..contact import ContactSettings
 from ..core.checks import parse_number
 from ..core.spelling import suggest
-from ..model import Calibration, shipped_sensors
+from ..model import Calibration, Sensor, shipped_sensors
 from ..pipeline import MODES
 from ..stream import FIRST_FRAMES
 from .parser import UsageError
@@ -76,6 +76,14 @@ def contact_of(given: Sequence[str] | None) -> ContactSettings | None:
         except ValueError as error:
             raise UsageError(f"--contact: {key}: {error}") from None
     return ContactSettings(**values)
+
+
+def load_sensor(name: str) -> Sensor:
+    """A shipped sensor or that of a file; errors name the option."""
+    try:
+        return Sensor.load(name)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"--sensor: {str(error).removeprefix('source: ')}") from None
 
 
 def load_calibration(path: Path) -> Calibration:

@@ -18,9 +18,8 @@ from pathlib import Path
 from ..core.files import VIDEO_SUFFIXES, make_folder, read_frames
 from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, Report, list_items, reconstruct_dataset
 from ..diagnose import Finding, diagnose
-from ..model import Sensor
 from ..stream import NOT_METRIC, read_background, read_press_images, use_calibration
-from .options import add_background_frames, add_out, add_pipeline, add_press, add_sensor, contact_of, load_calibration
+from .options import add_background_frames, add_out, add_pipeline, add_press, add_sensor, contact_of, load_calibration, load_sensor
 from .parser import UsageError
 from .summary import SHOWN, calibrated, left_out, print_calibration
 
@@ -95,7 +94,7 @@ def calibrate_first(arguments: argparse.Namespace, inputs: list[Path]) -> Path:
     video = next((path for path in inputs if path.suffix.lower() in VIDEO_SUFFIXES), None)
     if arguments.background is None and video is None:
         raise UsageError(f"--background: expected images without contact, got none: {inputs[0]} is no video that begins with them")
-    unit = Sensor.load(arguments.sensor)
+    unit = load_sensor(arguments.sensor)
     image = read_background(arguments.background or [video], unit, arguments.background_frames)
     calibration = calibrated(image, unit, read_press_images(arguments.press, unit))
     print_calibration(calibration)

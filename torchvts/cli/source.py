@@ -13,7 +13,7 @@ from ..calibration import Press
 from ..core.checks import check_integer
 from ..model import Calibration, Sensor
 from ..stream import Camera, CameraSettings, TactileFrame, TactileStream, find_camera
-from .options import add_background_frames, add_pipeline, add_sensor, contact_of, load_calibration
+from .options import add_background_frames, add_pipeline, add_sensor, contact_of, load_calibration, load_sensor
 from .parser import UsageError
 
 
@@ -39,7 +39,7 @@ def load_unit(arguments: argparse.Namespace) -> Sensor | Calibration:
     check_integer("--threads", arguments.threads, 1)
     torch.set_num_threads(arguments.threads)
     cv2.setNumThreads(arguments.threads)
-    return Sensor.load(arguments.sensor) if arguments.sensor else load_calibration(arguments.calibration)
+    return load_sensor(arguments.sensor) if arguments.sensor else load_calibration(arguments.calibration)
 
 
 def open_stream(arguments: argparse.Namespace, unit: Sensor | Calibration, presses: Sequence[Press] = ()) -> TactileStream:

@@ -2,8 +2,8 @@
 
 The first frames must be without contact. The reference is the first frame with a contact of --least-mm2, or the image --reference.
 Writes poses.csv (a pose a frame, mm, standard deviations in mm and degrees, what is unknown, why it was lost), summary.json and a
-video with the axes of the reference on the image. Ctrl-C ends it and finishes the files. Exit status 1 where the object was lost or
-a frame was left out.
+video with the axes of the reference on the image. --view shows surface and axes in 3D while they come, --save FILE.rrd records
+that. Ctrl-C ends it and finishes the files. Exit status 1 where the object was lost or a frame was left out.
 
 examples:
   torchvts track --source video.avi --sensor gelsight_wedge --out out/track
@@ -29,9 +29,11 @@ from ..core.checks import check_positive
 from ..core.files import make_folder, read_image, write_atomically
 from ..pose import PoseTracker, TrackedPose
 from ..pose.follow import TRUSTED_DEG, TRUSTED_MM
-from ..stream import NOT_METRIC, Overlay, TactileFrame, TactileStream, VideoFile
+from ..stream import NOT_METRIC, LiveView, Overlay, TactileFrame, TactileStream, VideoFile, has_screen
 from ..stream.sources import Pixels
+from ..stream.view import AXIS_COLOURS
 from .options import add_out
+from .parser import UsageError
 from .source import add_source, load_unit, open_stream, play
 
 USAGE = "--source SOURCE (--sensor NAME | --calibration FILE) --out FOLDER"
@@ -50,20 +52,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--reference", type=Path, metavar="IMAGE", help="of the contact; if not given, the first large one")
     parser.add_argument("--least-mm2", type=float, default=4.0, metavar="AREA", help="contact of the first reference, mm^2 (4)")
     parser.add_argument("--video", choices=["mp4", "avi", "none"], default="mp4", help="kind of video in --out")
+    parser.add_argument("--view", action="store_true", help="show surface and axes in 3D while they come; needs a screen")
+    parser.add_argument("--save", type=Path, metavar="FILE.rrd", help="record what --view shows, with or without it")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Track until the source ends, and print a summary."""
     check_positive("--least-mm2", arguments.least_mm2)
+    if arguments.view and not has_screen():
+        raise UsageError("--view: expected a screen, this machine has none: --save FILE.rrd records what it would show")
+    reference = None if arguments.reference is None else read_image(arguments.reference)
     unit = load_unit(arguments)
     with contextlib.ExitStack() as stack:
         stream = stack.enter_context(open_stream(arguments, unit))
-        tracker = None if arguments.reference is None else _tracker_of_image(stream, arguments.reference)
+        tracker = None if reference is None else _tracker_of_image(stream, arguments.reference, reference)
         make_folder(arguments.out)
         video = None
         if arguments.video != "none":
             video = stack.enter_context(VideoFile(arguments.out / f"track.{arguments.video}", stream.fps))
-        tracking = _Tracking(stream, video, tracker, arguments.least_mm2)
+        view = None
+        if arguments.view or arguments.save is not None:
+            view = stack.enter_context(LiveView(_pitch(stream), stream.metric, save=arguments.save, viewer=arguments.view))
+        tracking = _Tracking(stream, video, view, tracker, arguments.least_mm2)
         play(stream, tracking.add)
         if tracking.tracker is None:
             raise ValueError("source: expected a contact to track, got none: see --least-mm2")
@@ -77,14 +87,23 @@ def run(arguments: argparse.Namespace) -> int:
     _print_summary(found)
     names = ["poses.csv", "summary.json"] + ([] if arguments.video == "none" else [f"track.{arguments.video}"])
     print(f"wrote {', '.join(names)} to {arguments.out}")
+    if arguments.save is not None:
+        print(f"wrote {arguments.save}; rerun {arguments.save} shows it")
     return 1 if found["lost"] or found["left_out"] else 0
 
 
 class _Tracking:
     """Tracks from frame to frame, keeps the rows of poses.csv, and draws the axes of the reference where the object is."""
 
-    def __init__(self, stream: TactileStream, video: VideoFile | None, tracker: PoseTracker | None, least_mm2: float) -> None:
-        self.video, self.tracker, self.least_mm2, self.pitch = video, tracker, least_mm2, _pitch(stream)
+    def __init__(
+        self,
+        stream: TactileStream,
+        video: VideoFile | None,
+        view: LiveView | None,
+        tracker: PoseTracker | None,
+        least_mm2: float,
+    ) -> None:
+        self.video, self.view, self.tracker, self.least_mm2, self.pitch = video, view, tracker, least_mm2, _pitch(stream)
         self.overlay = Overlay(stream.metric, self.pitch)
         self.reference: int | None = None
         self.rows: list[dict[str, object]] = []
@@ -100,6 +119,9 @@ class _Tracking:
             print(f"frame {frame.number}: the reference")
         if self.video is not None:
             self.video.write(self.picture(frame, found))
+        if self.view is not None:
+            self.view.add(frame)
+            self.view.add_axes(None if found is None or found.lost or self.tracker is None else axes(found, self.tracker))
         return True
 
     def picture(self, frame: TactileFrame, found: TrackedPose | None) -> Pixels:
@@ -124,22 +146,27 @@ def record(frame: TactileFrame, found: TrackedPose) -> dict[str, object]:
     return dict(zip(COLUMNS + QUALITY, values, strict=True))
 
 
+def axes(found: TrackedPose, tracker: PoseTracker) -> Tensor:
+    """Origin and ends of the reference's axes in a frame (4, 3), mm: 2 mm long, at the middle of its contact."""
+    T = found.T_target_source
+    middle = torch.from_numpy(tracker.graph.keyframes[0].many.center)
+    places = middle + 2.0 * torch.cat((torch.zeros(1, 3), torch.eye(3))).double()
+    return places @ T[:3, :3].T + T[:3, 3]
+
+
 def draw_axes(image: Tensor, found: TrackedPose, tracker: PoseTracker, mm_per_pixel: float) -> Tensor:
-    """The image (3, H, W) with the reference's x (red), y (green) and z (blue), 2 mm long, at the middle of its contact.
+    """The image (3, H, W) with the reference's x (red), y (green) and z (blue): :func:`axes`.
 
     They are thin where a rotation is unknown, or known less well than to 1 degree.
     """
     height, width = image.shape[1:]
-    T = found.T_target_source
-    middle = torch.from_numpy(tracker.graph.keyframes[0].many.center)
-    places = middle + 2.0 * torch.cat((torch.zeros(1, 3), torch.eye(3))).double()
-    moved = places @ T[:3, :3].T + T[:3, 3]
+    moved = axes(found, tracker)
     column, row = moved[:, 0] / mm_per_pixel + 0.5 * (width - 1), 0.5 * (height - 1) - moved[:, 1] / mm_per_pixel
     ends = torch.stack((column, row), 1).round().int().tolist()
     pixels = np.ascontiguousarray((255.0 * image.clamp(0, 1)).permute(1, 2, 0).numpy().astype(np.uint8))
     vague = math.degrees(math.sqrt(float(found.covariance.diagonal()[:3].max()))) > TRUSTED_DEG
     thick = 1 if vague or any(name.startswith("rotation") for name in found.ambiguous) else 2
-    for end, colour in zip(ends[1:], ((230, 60, 50), (60, 200, 80), (60, 90, 240)), strict=True):
+    for end, colour in zip(ends[1:], AXIS_COLOURS, strict=True):
         cv2.line(pixels, tuple(ends[0]), tuple(end), colour, thick, cv2.LINE_AA)
     return torch.from_numpy(pixels).permute(2, 0, 1).float() / 255.0
 
@@ -148,8 +175,8 @@ def _pitch(stream: TactileStream) -> float:
     return stream.calibration.sensor.mm_per_pixel
 
 
-def _tracker_of_image(stream: TactileStream, path: Path) -> PoseTracker:
-    image = stream.calibration.sensor.rectify(read_image(path)[None])
+def _tracker_of_image(stream: TactileStream, path: Path, image: Tensor) -> PoseTracker:
+    image = stream.calibration.sensor.rectify(image[None])
     reason = stream.recording.unusable(image)
     if reason:
         raise ValueError(f"reference: {path}: {reason}")

@@ -12,8 +12,7 @@ from pathlib import Path
 
 from ..calibration import read_presses
 from ..evaluation.presses import train_network
-from ..model import Sensor
-from .options import add_sensor
+from .options import add_sensor, load_sensor
 from .parser import UsageError
 
 USAGE = "FOLDER --sensor NAME --out FILE"
@@ -37,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("expected --sensor")
     if arguments.out.suffix != ".safetensors":
         raise UsageError(f"--out: expected a name ending in .safetensors, got {arguments.out}")
-    sensor = Sensor.load(arguments.sensor)
+    sensor = load_sensor(arguments.sensor)
     background, presses = read_presses(arguments.folder)
     fit = train_network(
         background, presses, sensor, arguments.blur_px, arguments.seed, max_epochs=arguments.max_epochs, progress=True

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ..core.checks import check_float_tensor, check_least, check_shape
-from .alignment import Fit, distinct, equally_good, is_trusted, rank, refine, score_poses
+from .alignment import Fit, agrees_enough, distinct, equally_good, is_trusted, rank, refine, score_poses
 from .ambiguity import UNKNOWN_VARIANCE, Unknown, find_unknown, pose_covariance
 from .relief import DepthFrame, Levels, levels
 from .result import Registration, invert, turn_deg
@@ -64,7 +64,9 @@ def align(a: Levels, b: Levels, start: Tensor | None) -> Registration:
         if is_trusted(score_poses(a.coarse, b.coarse, poses), 0):
             return _finish(a, b, poses)
     poses, score = search_plane(a.coarse, b.coarse)
-    poses = poses[score > 0.4 * score[0]]
+    poses = poses[score > 0.4 * score[:1]]
+    if len(poses) == 0:
+        return _nothing("one of the contacts has no relief that could be compared")
     if start is not None:
         poses = torch.cat((start[None], poses))
     poses = _likely(a, b, refine(a.coarse, b.coarse, poses, 4, 4.0))
@@ -126,6 +128,12 @@ def _finish(a: Levels, b: Levels, poses: Tensor) -> Registration:
     return Registration(best[0], rmse_mm, fitness, converged, message, covariance, unknown.names, alternatives, overlap)
 
 
+def _nothing(reason: str) -> Registration:
+    """No pose, of no certainty."""
+    unknown = torch.eye(6, dtype=torch.float64) * UNKNOWN_VARIANCE
+    return Registration(torch.eye(4, dtype=torch.float64), math.inf, 0.0, False, f"nothing fits: {reason}", unknown, [], [], 0.0)
+
+
 def _refine_both_ways(a: Levels, b: Levels, pose: Tensor) -> Tensor:
     """The mean of the fine poses from source to target and back, so that neither frame is preferred."""
     forth = refine(a.fine, b.fine, pose, 12, 0.5)
@@ -144,6 +152,8 @@ def _refine_both_ways(a: Levels, b: Levels, pose: Tensor) -> Tensor:
 def _message(fit: Fit, names: list[str], others: int) -> str:
     fitness, overlap = float(fit.fitness[0]), float(fit.overlap[0])
     agreement = f"{100 * fitness:.0f} % of the common contact agrees, which is {100 * overlap:.0f} % of the smaller one"
+    if not is_trusted(fit, 0) and agrees_enough(fitness, overlap, 0.0):
+        return f"nothing fits well: {agreement}, but all of it differs: different objects, or slopes that err by degrees"
     if not is_trusted(fit, 0):
         return f"nothing fits: {agreement}: different objects, or parts of one that hardly overlap"
     if names:

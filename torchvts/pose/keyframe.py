@@ -17,7 +17,7 @@ from .ambiguity import field_with_fitted_curvature, find_unknown, information_of
 from .height_errors import HeightErrors, height_errors
 from .inverse import Array, Field, Pixels, reference_pixels
 from .jackknife import shared_error
-from .relief import LEAST_PIXELS, DepthFrame, Levels, Relief, least_depth_mm, levels
+from .relief import LEAST_PIXELS, DepthFrame, Levels, Relief, check_frame, least_depth_mm, levels
 
 SOME, MANY = 2000, 8000
 """Pixels of a reference for all steps of a refinement but the last, and for the last. They are evenly spread: pixels chosen by what
@@ -65,15 +65,8 @@ def contact_frame(frame: DepthFrame) -> Contact:
         ValueError: not one frame.
         Unusable: values that are not finite, or a contact of a few pixels.
     """
-    for part in ("depth_mm", "gradient", "contact"):
-        if not isinstance(getattr(frame, part, None), Tensor):
-            raise TypeError(f"frame: expected a DepthOutput, as a DepthPipeline returns, got {type(frame).__name__}")
-    height, width = frame.depth_mm.shape[-2:] if frame.depth_mm.dim() >= 2 else (0, 0)
+    height, width = check_frame("frame", frame)
     deformed: Tensor = getattr(frame, "deformed", frame.contact)  # a scene has none
-    sizes = frame.depth_mm.numel(), frame.gradient.numel(), frame.contact.numel(), deformed.numel()
-    if sizes != (height * width, 2 * height * width, height * width, height * width):
-        shapes = tuple(frame.depth_mm.shape), tuple(frame.gradient.shape), tuple(frame.contact.shape)
-        raise ValueError(f"frame: expected one frame, depth (1, 1, H, W), gradient (1, 2, H, W), got {shapes}: loop over the batch")
     depth = frame.depth_mm.detach().to("cpu", torch.float32).reshape(1, 1, height, width).contiguous()
     gradient = frame.gradient.detach().to("cpu", torch.float32).reshape(1, 2, height, width).contiguous()
     contact = frame.contact.detach().to("cpu", torch.bool).reshape(1, 1, height, width).contiguous()
@@ -246,6 +239,11 @@ def _in_parts(places: Tensor) -> Tensor:
             halves += run[places[run, side].argsort(stable=True)].tensor_split(2)
         runs = halves
     return torch.cat(runs)
+
+
+def slopes_of_contact(frame: Contact) -> float:
+    """Root mean square of the slopes of a frame's contact, per component."""
+    return float(frame.gradient[0][:, frame.contact[0, 0]].square().mean().sqrt())
 
 
 def pitch_by_slopes(frame: Contact) -> float:

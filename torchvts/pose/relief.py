@@ -76,6 +76,28 @@ class Levels(NamedTuple):
     noise: float
 
 
+def check_frame(name: str, frame: DepthFrame) -> tuple[int, int]:
+    """Height and width of one frame.
+
+    Raises:
+        TypeError: no DepthOutput.
+        ValueError: not one frame, or parts of several sizes.
+    """
+    for part in ("depth_mm", "gradient", "contact"):
+        value = getattr(frame, part, None)
+        if not isinstance(value, Tensor):
+            what = f"whose {part} is no tensor but {type(value).__name__}" if hasattr(frame, part) else f"which has no {part}"
+            raise TypeError(f"{name}: expected a DepthOutput, as a DepthPipeline returns, got {type(frame).__name__}, {what}")
+    height, width = frame.depth_mm.shape[-2:] if frame.depth_mm.dim() >= 2 else (0, 0)
+    for part, channels in (("depth_mm", 1), ("gradient", 2), ("contact", 1), ("deformed", 1)):
+        shape = tuple(getattr(frame, part, frame.contact).shape)  # a scene has no deformed skin
+        if math.prod(shape) != channels * height * width or shape[-2:] != (height, width):
+            several = len(shape) >= 4 and shape[0] > 1
+            cause = "loop over the batch" if several else f"depth_mm has {tuple(frame.depth_mm.shape)}"
+            raise ValueError(f"{name}: expected one frame, {part} (1, {channels}, H, W), got {shape}: {cause}")
+    return height, width
+
+
 def contact_of(frame: DepthFrame, name: str) -> tuple[Tensor, Tensor, Tensor]:
     """Depth (H, W), gradient (2, H, W) (y down) and deformed area (H, W) bool of one frame, checked.
 
@@ -86,17 +108,9 @@ def contact_of(frame: DepthFrame, name: str) -> tuple[Tensor, Tensor, Tensor]:
         TypeError: no DepthOutput.
         ValueError: not one frame, shapes that differ, values not finite, or a contact of a few pixels.
     """
-    for part in ("depth_mm", "gradient", "contact"):
-        if not isinstance(getattr(frame, part, None), Tensor):
-            raise TypeError(f"{name}: expected a DepthOutput, as a DepthPipeline returns, got {type(frame).__name__}")
+    height, width = check_frame(name, frame)
     depth, gradient = frame.depth_mm.detach(), frame.gradient.detach()
     deformed: Tensor = getattr(frame, "deformed", frame.contact).detach()
-    height, width = depth.shape[-2:] if depth.dim() >= 2 else (0, 0)
-    if depth.numel() != height * width or gradient.numel() != 2 * height * width or deformed.numel() != height * width:
-        raise ValueError(
-            f"{name}: expected one frame, depth (1, 1, H, W), gradient (1, 2, H, W), deformed (1, 1, H, W), got "
-            f"{tuple(depth.shape)}, {tuple(gradient.shape)}, {tuple(deformed.shape)}: loop over the batch"
-        )
     if not bool(torch.isfinite(depth).all() and torch.isfinite(gradient).all()):
         raise ValueError(f"{name}: expected finite depth and gradient, got NaN or infinite ones")
     inside = deformed.reshape(height, width).bool()

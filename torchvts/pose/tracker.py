@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from ..core.checks import check_positive
-from .alignment import MOST_COST, agrees_enough
+from .alignment import LEAST_FITNESS, LEAST_OVERLAP, MOST_COST, agrees_enough
 from .ambiguity import UNKNOWN_VARIANCE
 from .direct import align, check_rigid, symmetries
 from .follow import TRUSTED_DEG, TRUSTED_MM, Followed, cross, follow, in_common, orthonormal
 from .graph import Edge, KeyframeGraph, moved_covariance
 from .inverse import LEAST_NOISE, Array
-from .keyframe import Contact, Grids, Unusable, contact_frame, grids, make_keyframe, pitch_by_slopes
+from .keyframe import Contact, Grids, Unusable, contact_frame, grids, make_keyframe, pitch_by_slopes, slopes_of_contact
 from .relief import DepthFrame, levels
 from .result import Registration
 
@@ -49,6 +49,16 @@ poses have up to 2.2."""
 
 RISE = 3.0
 """A residual of so many times the usual one of a track is no noise."""
+
+UNUSUAL = "slopes differ by"
+"""So begins the reason where it is the residual."""
+
+LEAST_SLOPE = 1e-3
+"""A reference of smaller slopes, root mean square, is flat: noise and errors of sensors are larger."""
+
+MOVED_MM = 0.25
+"""Motion from the keyframe, at the contact, from which a residual says what is usual: frames of an object that stays, and
+above all a frame that comes again, differ from the keyframe by less, since the errors of a sensor's slopes stay where they are."""
 
 COST_RISE = 1.5
 """The cost of a pose may be so many times the usual one of a track, where that is large as with a sensor whose slopes err."""
@@ -122,9 +132,16 @@ class PoseTracker:
         try:
             frame = contact_frame(reference)
         except Unusable as error:
-            raise ValueError(f"reference: expected a contact with relief, got {error}: does it touch the object?") from None
+            raise ValueError(f"reference: expected a contact with relief, got none: {error}") from None
+        slope = slopes_of_contact(frame)
+        if slope < LEAST_SLOPE:
+            raise ValueError(f"reference: expected a contact with relief, got slopes of {slope:.2g}: a flat face shows no motion")
         keyframe = make_keyframe(frame, self.mm_per_pixel)
         found = pitch_by_slopes(frame)
+        if found <= 0.0:
+            raise ValueError(
+                "reference: expected slopes of its depth, got others: a gradient of another sign, or of another frame?"
+            )
         if not 1.0 / PITCH_RATIO < found / self.mm_per_pixel < PITCH_RATIO:
             raise ValueError(
                 f"mm_per_pixel: expected about {found:.3g}, by depth and slopes of the reference, got {self.mm_per_pixel:g}: "
@@ -218,16 +235,17 @@ class PoseTracker:
 
     def _problem(self, index: int, found: Followed, starts: list[Array]) -> str:
         """Why a pose cannot be trusted; empty if it can."""
-        percent = (
-            f"{100 * found.fitness:.0f} % of the common contact agrees, which is {100 * found.overlap:.0f} % of the smaller one"
-        )
         costs = [cost for _, cost in self._usual]
         usual_cost = median(costs) if len(costs) >= 3 else 0.0
         if not agrees_enough(found.fitness, found.overlap, found.cost / max(1.0, COST_RISE * usual_cost / MOST_COST)):
-            return f"nothing fits near the last pose: {percent}: another part of the object, a jump, or another object"
+            common = f"{100 * found.overlap:.0f} % of the smaller contact in common"
+            if found.fitness >= LEAST_FITNESS and found.overlap < LEAST_OVERLAP:
+                return f"too little to compare near the last pose, {common}: lifted, another part of the object, or a jump"
+            agrees = f"{100 * found.fitness:.0f} % of what is compared agrees, {common}"
+            return f"nothing fits near the last pose: {agrees}: another part of the object, a jump, or another object"
         usual = median([slope for slope, _ in self._usual]) if len(self._usual) >= 3 else math.inf
         if found.fine.slope_noise > max(RISE * usual, LEAST_NOISE):
-            return f"slopes differ by {found.fine.slope_noise:.3f}, where {usual:.3f} is usual: a jump, or another object"
+            return f"{UNUSUAL} {found.fine.slope_noise:.3f}, where {usual:.3f} is usual: a jump, or another object"
         if found.free.shape[1] == 6:
             return "the contact is too small: no motion of it is known"
         probe = self.graph.keyframes[index].probe
@@ -250,14 +268,20 @@ class PoseTracker:
             chain = self.graph.poses[index]
             starts = [T.numpy() @ chain for T in (registered.T_target_source, *registered.alternatives) if registered.converged]
             equal, problem = self._equal_poses(index, frame, [*starts, self._poses[-1]])
+            if problem.startswith(UNUSUAL) and not equal and self._usual:
+                self._usual.popleft()  # what was usual is forgotten, lest the object stay lost for ever
             if not equal:
                 message = message or (problem if starts else registered.message)
                 continue
             probe = self.graph.keyframes[0].probe
             found = min(equal, key=lambda one: _distance(probe, one.pose @ chain, self._poses[-1]))
-            if found.free.shape[1] > self.graph.keyframes[index].held.shape[1]:
+            keyframe = self.graph.keyframes[index]
+            if found.free.shape[1] > keyframe.held.shape[1]:
                 message = f"it touches, but too little to show its {', '.join(found.names)}"
                 continue  # what is unknown now would keep a value of long ago
+            if not found.exact and frame.touching < LEAST_CONTACT * keyframe.touching:
+                message = "it touches with a small part, which other parts of the object may look like"
+                continue
             back = np.linalg.inv(found.pose @ chain)
             self._symmetries = [back @ one.pose @ chain for one in equal if one is not found]
             self._active, self._least, self._tracking, self._poses = index, math.inf, True, []
@@ -310,8 +334,9 @@ class PoseTracker:
         pose = orthonormal(found.pose @ graph.poses[index])
         drift = moved_covariance(found.pose, graph.covariances[index])
         self._poses = [*self._poses[-1:], pose]
-        self._usual.append((found.fine.slope_noise, found.cost))
         keyframe = graph.keyframes[index]
+        if _distance(keyframe.probe, found.pose, np.eye(4)) > MOVED_MM:
+            self._usual.append((found.fine.slope_noise, found.cost))
         large = frame.touching > LEAST_CONTACT * graph.keyframes[0].touching
         grown = frame.touching > GROWN * keyframe.touching
         share, variance = self._in_common(index, frame, pose)

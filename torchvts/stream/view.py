@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from ..core.checks import check_path, check_positive
+from ..core.checks import check_path, check_positive, check_shape
 from ..core.files import check_target
 from .live import TactileFrame
 from .overlay import outlines, round_up
+
+AXIS_COLOURS = ((230, 60, 50), (60, 200, 80), (60, 90, 240))
+"""Of x, y and z."""
 
 MOST_POINTS = 160
 """Largest number of points of the surface in each direction."""
@@ -40,8 +43,8 @@ class LiveView:
     """Logs the frames of a stream to rerun: to its viewer, which is started, to a file, or to both.
 
     Entities: ``image`` with ``image/contact``, ``depth`` (mm), ``normals``, ``surface`` (points, mm: x right, y up, z to camera),
-    ``curves/area_mm2`` and ``curves/deepest_mm``, on the timelines ``frame`` and ``time``. The surface is drawn higher than it is
-    by the factor in the title of its view; its points are true.
+    ``curves/area_mm2`` and ``curves/deepest_mm``, on the timelines ``frame`` and ``time``; ``surface/axes``, where poses are added.
+    The surface is drawn higher than it is by the factor in the title of its view; its points are true.
 
     Args:
         mm_per_pixel: pixel pitch, mm.
@@ -120,6 +123,23 @@ class LiveView:
         self._log_surface(depth, normal)
         stream.log("curves/area_mm2", rr.Scalars(float(contact.sum()) * self.mm_per_pixel**2))
         stream.log("curves/deepest_mm", rr.Scalars(float(depth.max())))
+
+    def add_axes(self, ends: Tensor | None) -> None:
+        """Log the axes of an object in the frame added last.
+
+        Args:
+            ends: (4, 3), their origin and the ends of x (red), y (green) and z (blue), mm, x right, y up; None for no pose.
+        """
+        rr = self._rr
+        if self.recording_to is None and not self._viewer:
+            return
+        if ends is None:
+            self._stream.log("surface/axes", rr.Clear(recursive=False))
+            return
+        check_shape("ends", ends, (4, 3))
+        origin = ends[:1].float().numpy()
+        arrows = rr.Arrows3D(origins=np.repeat(origin, 3, 0), vectors=ends[1:].float().numpy() - origin, colors=AXIS_COLOURS)
+        self._stream.log("surface/axes", arrows)
 
     def close(self) -> None:
         """Write what is left, and let go of the viewer, which stays open."""

@@ -371,7 +371,8 @@ def test_it_scripts_and_pickles_and_keeps_its_state(made, optimised):
             assert torch.allclose(found.double(), wanted.double(), rtol=1e-3, atol=atol), name
 
 
-@pytest.mark.parametrize("made", ["response precise", pytest.param("lights fast", marks=pytest.mark.long)], indirect=True)
+@pytest.mark.long
+@pytest.mark.parametrize("made", ["response precise", "lights fast"], indirect=True)
 def test_it_goes_through_torch_export(made):
     """The loops of the other modes are tested in test_export."""
     *_, pipe, frames = made

@@ -204,7 +204,7 @@ def test_a_chain_with_own_normals_and_masks_without_torchvts(low, tmp_path, name
         pytest.skip(export.missing(name))
     calibration, frames = low
     blocks = pipeline(calibration, "fast")
-    chain = (blocks.compensate, Changed(blocks.compensate(frames[3:])), learned(), blocks.gradient, blocks.integrate)
+    chain = (blocks.compensate, Changed(blocks.compensate(frames[3:])), learned(), blocks.gradient, vts.PoissonDST(PITCH))
     pipe = vts.DepthPipeline(*chain, mm_per_pixel=PITCH, contact=Deep()).eval()
     assert pipe(frames).contact.flatten(1).any(1).tolist() == [True, True, True, False]
     path = tmp_path / f"pipe.{suffix}"
@@ -388,7 +388,16 @@ def test_errors_are_sentences(low, tmp_path, monkeypatch):
 def test_the_script(run_script, low, tmp_path):
     low[0].save(tmp_path / "unit.safetensors")
     vts.write_image(tmp_path / "press.png", low[1][0])
-    arguments = (tmp_path / "unit.safetensors", "--out", tmp_path / "out", "--format")
+    network = vts.NormalFromMLP(HEIGHT, WIDTH, low[0].background.float().clamp(0.0, 1.0), (4,))  # a short graph
+    network.save(tmp_path / "network.safetensors")
+    arguments = (
+        tmp_path / "unit.safetensors",
+        "--network",
+        tmp_path / "network.safetensors",
+        "--out",
+        tmp_path / "out",
+        "--format",
+    )
     done = run_script("export", *arguments, "torchscript", "--frames", tmp_path / "press.png")
     assert done.returncode == 0, done.stderr
     assert "| torchscript |" in done.stdout and done.stdout.rstrip().endswith("| ok |")

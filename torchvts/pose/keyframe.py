@@ -57,7 +57,7 @@ class Unusable(ValueError):
     """A frame that has no pose; the message says why."""
 
 
-def contact_frame(frame: DepthFrame) -> Contact:
+def contact_frame(frame: DepthFrame, name: str = "frame") -> Contact:
     """Depth, gradient and contact of one frame, on the CPU, float32.
 
     Raises:
@@ -65,7 +65,7 @@ def contact_frame(frame: DepthFrame) -> Contact:
         ValueError: not one frame.
         Unusable: values that are not finite, or a contact of a few pixels.
     """
-    height, width = check_frame("frame", frame)
+    height, width = check_frame(name, frame)
     deformed: Tensor = getattr(frame, "deformed", frame.contact)  # a scene has none
     depth = frame.depth_mm.detach().to("cpu", torch.float32).reshape(1, 1, height, width).contiguous()
     gradient = frame.gradient.detach().to("cpu", torch.float32).reshape(1, 2, height, width).contiguous()

@@ -50,9 +50,6 @@ poses have up to 2.2."""
 RISE = 3.0
 """A residual of so many times the usual one of a track is no noise."""
 
-UNUSUAL = "slopes differ by"
-"""So begins the reason where it is the residual."""
-
 LEAST_SLOPE = 1e-3
 """A reference of smaller slopes, root mean square, is flat: noise and errors of sensors are larger."""
 
@@ -130,7 +127,7 @@ class PoseTracker:
     def reset(self, reference: DepthFrame) -> None:
         """Begin anew with another reference; all keyframes are forgotten."""
         try:
-            frame = contact_frame(reference)
+            frame = contact_frame(reference, "reference")
         except Unusable as error:
             raise ValueError(f"reference: expected a contact with relief, got none: {error}") from None
         slope = slopes_of_contact(frame)
@@ -245,7 +242,7 @@ class PoseTracker:
             return f"nothing fits near the last pose: {agrees}: another part of the object, a jump, or another object"
         usual = median([slope for slope, _ in self._usual]) if len(self._usual) >= 3 else math.inf
         if found.fine.slope_noise > max(RISE * usual, LEAST_NOISE):
-            return f"{UNUSUAL} {found.fine.slope_noise:.3f}, where {usual:.3f} is usual: a jump, or another object"
+            return f"slopes differ by {found.fine.slope_noise:.3f}, where {usual:.3f} is usual: a jump, or another object"
         if found.free.shape[1] == 6:
             return "the contact is too small: no motion of it is known"
         probe = self.graph.keyframes[index].probe
@@ -268,8 +265,6 @@ class PoseTracker:
             chain = self.graph.poses[index]
             starts = [T.numpy() @ chain for T in (registered.T_target_source, *registered.alternatives) if registered.converged]
             equal, problem = self._equal_poses(index, frame, [*starts, self._poses[-1]])
-            if problem.startswith(UNUSUAL) and not equal and self._usual:
-                self._usual.popleft()  # what was usual is forgotten, lest the object stay lost for ever
             if not equal:
                 message = message or (problem if starts else registered.message)
                 continue
@@ -286,6 +281,8 @@ class PoseTracker:
             self._symmetries = [back @ one.pose @ chain for one in equal if one is not found]
             self._active, self._least, self._tracking, self._poses = index, math.inf, True, []
             return self._accept(contact, frame, found)
+        if self._usual:
+            self._usual.popleft()  # what was usual is forgotten while the object is not found, lest it stay lost for ever
         return self._lose(f"not found again: {message}", contact)
 
     def _equal_poses(self, index: int, frame: Grids, starts: list[Array]) -> tuple[list[Followed], str]:

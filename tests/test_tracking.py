@@ -14,7 +14,7 @@ from torchvts.cli.track import record
 from torchvts.core.frame import DepthOutput
 from torchvts.evaluation import pose_accuracy, tracking
 from torchvts.pose import tracker as tracker_module
-from torchvts.pose.follow import _pixels, adjoint, follow, orthonormal
+from torchvts.pose.follow import _follow_best, _follow_from, _pixels, adjoint, follow, orthonormal
 from torchvts.pose.graph import Edge, KeyframeGraph
 from torchvts.pose.height_errors import WHITE_MM, _covariance, _height_residuals, _modes, height_sums
 from torchvts.pose.inverse import Sums, moved_by, refine, solve_step, step_between, sum_parts, sum_residuals
@@ -278,6 +278,31 @@ def test_sums_and_steps_of_kernels_and_reference_agree(keyframe):
         assert fast[3][2:] == pytest.approx(fast[0][2:], rel=1e-6) and not fast[3].matrix.any()
         assert fast[4] == pytest.approx(slow[4], abs=1e-5)
     assert np.allclose(fast[1].sum(0), fast[0].matrix)
+
+
+def test_one_compiled_call_finds_what_its_single_steps_find(keyframe):
+    frame = grids(contact_frame(press(objects.key(), swing(1))), PITCH, keyframe.least_mm, keyframe.times)
+    starts = [motion(torch.tensor([0.0, 0.0, turn, 0.1, 0.0, 0.0], dtype=torch.float64)).numpy() for turn in (0.3, 0.04)]
+    best, fast = _follow_best(keyframe, frame, starts, starts[0])
+    slow = _follow_from(keyframe, frame, starts[1], starts[0])
+    assert best == 1 and fast.names == slow.names == [] and fast.settled == slow.settled
+    for name in ("pose", "fitness", "overlap", "cost", "std_deg", "std_mm", "common"):
+        assert getattr(fast, name) == pytest.approx(getattr(slow, name), rel=1e-9, abs=1e-12), name
+    assert np.allclose(fast.covariance, slow.covariance, rtol=1e-9, atol=1e-9 * slow.covariance.max())
+    assert fast.fine[2:] == pytest.approx(slow.fine[2:], rel=1e-12)
+    assert np.allclose(fast.fine.matrix, slow.fine.matrix) and np.allclose(fast.fine.right, slow.fine.right)
+
+
+def test_one_compiled_call_leaves_alone_what_does_not_show_every_motion(keyframe):
+    """The shaft of a key slides on itself."""
+    whole = press(objects.key(), swing(0))
+    shaft = torch.zeros_like(whole.contact)
+    shaft[..., 92:112] = whole.contact[..., 92:112]
+    frame = grids(contact_frame(_bad(whole, contact=shaft)), PITCH, keyframe.least_mm, keyframe.times)
+    _, fast = _follow_best(keyframe, frame, [np.eye(4)], np.eye(4))
+    slow = _follow_from(keyframe, frame, np.eye(4), np.eye(4))
+    assert fast.names == slow.names == ["translation along x"]
+    assert fast.pose == pytest.approx(slow.pose, abs=1e-12)
 
 
 @pytest.mark.parametrize("times", [(1, 3), (2, 5)])

@@ -62,6 +62,7 @@ SIGNATURES = {
     "track_grids": ("i", "ppp ii f ii pp"),
     "contact_pixels": ("i", "ppp l"),
     "object_pixels": ("i", "p ii ddd l p"),
+    "follow_frame": ("i", "pppp i p"),
 }
 """What each kernel returns and takes, a letter each: a pointer, int, float, double, int64 (l), or nothing (v)."""
 

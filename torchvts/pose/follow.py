@@ -2,34 +2,44 @@
 
 import math
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
 
-from ..accelerated import kernels
+from ..accelerated import following, kernels
 from ..accelerated.gate import usable
-from .alignment import SLOPE_NOISE, agrees_enough
+from .alignment import DEPTH_DRIFT_MM, SLOPE_NOISE, agrees_enough
 from .ambiguity import ALIKE_PIXELS, LEAST_INFORMATION, UNKNOWN_VARIANCE, free_directions, name_directions
-from .height_errors import ERROR, height_sums
+from .height_errors import ERROR, MOST_MM, WHITE_MM, height_sums
 from .inverse import (
+    DEEP_MM,
+    LARGEST_STEP_MM,
     LEAST_NOISE,
     ROTATION_FIRST,
+    SCORE,
+    SHALLOW_MM,
     Array,
     Field,
     Pixels,
     Sums,
+    inverted,
     moved_by,
     refine,
     solve_step,
     step_between,
     sum_parts,
     sum_residuals,
+    sums_of,
 )
 from .jackknife import jackknife
 from .keyframe import PARTS, Grids, Keyframe
 
 COARSE_STEPS, SOME_STEPS = 15, 30
 """Largest number of steps on the coarse grid, and with some pixels of the fine one."""
+
+COARSE_STEP_MM, SOME_STEP_MM = 0.02, 2e-3
+"""Steps so small, at the contact, are the last ones."""
 
 HEIGHT_OFFSET_MM = 0.02
 """Error of all heights of a contact alike, which its frames cannot show: the relief of a real GelSight Mini errs by so much."""
@@ -45,6 +55,9 @@ UNSEEN = math.sqrt(2.0 / (5 * (PARTS - 1)))
 
 MOST_STD_DEG, MOST_STD_MM = 1.0, 0.15
 """Standard deviations of a motion, as a turn and as a shift, above which it is called unknown."""
+
+LEAST_SLOPE_NOISE = 1e-3
+"""Slopes of pixels err by so much at least."""
 
 LEAST_SHARE = 1e-4
 """Of all information: a direction of less has so much."""
@@ -65,6 +78,7 @@ class Followed(NamedTuple):
         std_mm: the same of the shifts, at the centre of the keyframe's contact, mm.
         settled: whether the last step was a small one.
         covariance: (6, 6) of a small motion after the pose, rad and mm.
+        common: what :func:`in_common` says of the pose.
     """
 
     pose: Array
@@ -78,6 +92,7 @@ class Followed(NamedTuple):
     std_mm: float
     settled: bool
     covariance: Array
+    common: tuple[float, float]
 
     @property
     def agrees(self) -> bool:
@@ -95,27 +110,39 @@ def follow(keyframe: Keyframe, frame: Grids, starts: list[Array]) -> Followed:
 
     Motions that the contact does not determine keep their value in the first of the poses, the last one of the track.
     """
-    order = sorted(starts, key=lambda start: sum_residuals(frame.coarse, keyframe.coarse, start, SLOPE_NOISE, score_only=True).cost)
-    first = _follow_from(keyframe, frame, order[0], starts[0])
+    best, first = _follow_best(keyframe, frame, starts, starts[0])
     if not first.agrees:
-        for start in order[1:]:
-            other = _follow_from(keyframe, frame, start, starts[0])
+        for start in starts[:best] + starts[best + 1 :]:
+            _, other = _follow_best(keyframe, frame, [start], starts[0])
             if other.agrees:
                 return other
     return first
 
 
+def _follow_best(keyframe: Keyframe, frame: Grids, starts: list[Array], last: Array) -> tuple[int, Followed]:
+    """Register a frame from the best of several poses: which one that was, and what was found."""
+    if keyframe.held.shape[1] == 0 and usable(frame.fine.channels, keyframe.many.columns):
+        found = following.follow_frame(
+            _program(keyframe), following.grid_of(*frame.fine), following.grid_of(*frame.coarse), np.stack(starts)
+        )
+        if found is not None:  # else some motion is not known
+            return found.start, _followed(keyframe, frame, found.parts)
+    costs = [sum_residuals(frame.coarse, keyframe.coarse, start, SLOPE_NOISE, score_only=True).cost for start in starts]
+    best = costs.index(min(costs))
+    return best, _follow_from(keyframe, frame, starts[best], last)
+
+
 def _follow_from(keyframe: Keyframe, frame: Grids, start: Array, last: Array) -> Followed:
     """Refine one pose on the coarse grid, on some pixels, and on many of them, and score it; what is unknown stays as it was."""
-    pose, coarse = refine(frame.coarse, keyframe.coarse, start, COARSE_STEPS, 2.0 * SLOPE_NOISE, keyframe.held, 0.02)
+    pose, coarse = refine(frame.coarse, keyframe.coarse, start, COARSE_STEPS, 2.0 * SLOPE_NOISE, keyframe.held, COARSE_STEP_MM)
     unknown = _sliding(keyframe, coarse)
     pose = _kept(keyframe, unknown, last, pose)
-    refined, some = refine(frame.fine, keyframe.some, pose, SOME_STEPS, SLOPE_NOISE, unknown.motions, 2e-3)
+    refined, some = refine(frame.fine, keyframe.some, pose, SOME_STEPS, SLOPE_NOISE, unknown.motions, SOME_STEP_MM)
     vague = _vague(keyframe, some)
     if vague.motions.shape[1] > 0:
         unknown = _joined(unknown, vague)
         pose = _kept(keyframe, unknown, last, pose)
-        refined, some = refine(frame.fine, keyframe.some, pose, SOME_STEPS, SLOPE_NOISE, unknown.motions, 2e-3)
+        refined, some = refine(frame.fine, keyframe.some, pose, SOME_STEPS, SLOPE_NOISE, unknown.motions, SOME_STEP_MM)
     noise = max(LEAST_NOISE, 1.5 * some.slope_noise)
     fine, matrices, rights = sum_parts(frame.fine, keyframe.many, refined, noise, PARTS)
     by_slopes = solve_step(fine, unknown.motions)
@@ -128,20 +155,75 @@ def _follow_from(keyframe: Keyframe, frame: Grids, start: Array, last: Array) ->
     pose = _kept(keyframe, unknown, last, refined @ moved_by(keyframe.many, step))
     forth = sum_residuals(frame.coarse, keyframe.coarse, pose, SLOPE_NOISE, score_only=True)
     pixels = _pixels(frame.coarse)
-    back = sum_residuals(keyframe.grids.coarse, pixels, np.linalg.inv(pose), SLOPE_NOISE, score_only=True)
-    compared = max(forth.compared + back.compared, 1.0)
+    back = sum_residuals(keyframe.grids.coarse, pixels, inverted(pose), SLOPE_NOISE, score_only=True)
+    fitness, overlap, cost = _score(keyframe, pixels.number, forth, back)
     return Followed(
         pose=pose,
         fine=fine,
-        fitness=(forth.fitness * forth.compared + back.fitness * back.compared) / compared,
-        overlap=max(forth.compared / keyframe.coarse.number, back.compared / max(pixels.number, 1)),
-        cost=(forth.cost * forth.compared + back.cost * back.compared) / compared,
+        fitness=fitness,
+        overlap=overlap,
+        cost=cost,
         free=unknown.motions,
         names=_names(unknown, pose),
         std_deg=math.degrees(math.sqrt(float(np.diag(scaled)[:3] @ keyframe.many.units[:3] ** 2))),
         std_mm=math.sqrt(float(np.trace(scaled[3:, 3:]))),
         settled=float(np.linalg.norm(by_slopes)) < LAST_STEP_MM,
         covariance=_after(keyframe.many, pose, scaled + unknown.motions @ unknown.motions.T * UNKNOWN_VARIANCE),
+        common=in_common(keyframe, frame, pose),
+    )
+
+
+def _score(keyframe: Keyframe, pixels: int, forth: Sums, back: Sums) -> tuple[float, float, float]:
+    """Fitness, overlap and cost of a frame with so many coarse pixels, from scores of the keyframe's pixels and of its own."""
+    compared = max(forth.compared + back.compared, 1.0)
+    fitness = (forth.fitness * forth.compared + back.fitness * back.compared) / compared
+    overlap = max(forth.compared / keyframe.coarse.number, back.compared / max(pixels, 1))
+    return fitness, overlap, (forth.cost * forth.compared + back.cost * back.compared) / compared
+
+
+_programs: WeakKeyDictionary[Keyframe, following.KeyframeProgram] = WeakKeyDictionary()
+
+
+def _program(keyframe: Keyframe) -> following.KeyframeProgram:
+    """What the compiled kernel reads of a keyframe, made once; it points to the keyframe's arrays."""
+    program = _programs.get(keyframe)
+    if program is None:
+        errors = keyframe.heights
+        program = following.KeyframeProgram(
+            *(following.pixels_of(pixels.columns) for pixels in (keyframe.coarse, keyframe.some, keyframe.many)),
+            following.grid_of(*keyframe.grids.coarse),
+            *(array.ctypes.data for array in errors),
+            *(len(errors.number), errors.lines.shape[1] - 6, PARTS, COARSE_STEPS, SOME_STEPS, 0),
+            *(tuple(keyframe.many.units), tuple(keyframe.many.center)),
+            *(DEPTH_DRIFT_MM**-2, *SCORE, DEEP_MM, SHALLOW_MM),
+            *(SLOPE_NOISE, LEAST_NOISE, LARGEST_STEP_MM, COARSE_STEP_MM, SOME_STEP_MM),
+            *(LEAST_INFORMATION + 3.0 * keyframe.most_bias, tuple(_wanted(keyframe)), _alike(keyframe), LEAST_SLOPE_NOISE),
+            *(MOST_MM, WHITE_MM, keyframe.shared_error, UNSEEN, ERROR, HEIGHT_OFFSET_MM, LEAST_SHARE),
+        )
+        _programs[keyframe] = program
+    return program
+
+
+def _followed(keyframe: Keyframe, frame: Grids, found: dict[str, Array]) -> Followed:
+    """What the compiled kernel found, where all motions are known."""
+    noise, pixels, last_step, turn, shift, used, variance = (
+        float(found[name][0]) for name in ("noise", "pixels", "last_step", "turn_variance", "shift_variance", "used", "variance")
+    )
+    forth, back = sums_of(found["forth"], SLOPE_NOISE), sums_of(found["back"], SLOPE_NOISE)
+    fitness, overlap, cost = _score(keyframe, int(pixels), forth, back)
+    return Followed(
+        pose=found["pose"].reshape(4, 4),
+        fine=sums_of(found["sums"], noise),
+        fitness=fitness,
+        overlap=overlap,
+        cost=cost,
+        free=keyframe.held,
+        names=[],
+        std_deg=math.degrees(math.sqrt(turn)),
+        std_mm=math.sqrt(shift),
+        settled=last_step < LAST_STEP_MM,
+        covariance=found["covariance"].reshape(6, 6),
+        common=(_share(keyframe, frame, int(used)), variance),
     )
 
 
@@ -162,17 +244,26 @@ def in_common(keyframe: Keyframe, frame: Grids, pose: Array) -> tuple[float, flo
         rotation.
     """
     sums = sum_residuals(frame.fine, keyframe.some, pose, SLOPE_NOISE)
-    share = sums.used / keyframe.some.number * keyframe.touching / max(min(keyframe.touching, frame.touching), 1)
     information = keyframe.known.T @ sums.matrix @ keyframe.known
     information += (LEAST_SHARE * float(np.trace(information)) + 1e-9) * np.eye(len(information))  # 0 where nothing is in common
-    return share, float(np.trace(np.linalg.inv(information)))
+    return _share(keyframe, frame, sums.used), float(np.trace(np.linalg.inv(information)))
+
+
+def _share(keyframe: Keyframe, frame: Grids, used: int) -> float:
+    """Of the smaller contact, where so many of some pixels of the keyframe are in common."""
+    return used / keyframe.some.number * keyframe.touching / max(min(keyframe.touching, frame.touching), 1)
 
 
 def orthonormal(pose: Array) -> Array:
-    """The pose (4, 4) with its rotation made exact: products of poses multiply what is missing."""
-    u, _, vh = np.linalg.svd(pose[:3, :3])
+    """The pose (4, 4) with its nearly right rotation made exact: products of poses multiply what is missing.
+
+    Source:
+        Newton-Schulz steps to the polar factor: Higham, Functions of Matrices, 2008, section 8.3; an error e becomes 3/4 e^2.
+    """
     pose = pose.copy()
-    pose[:3, :3] = u @ vh
+    for _ in range(2):
+        turn = pose[:3, :3].copy()
+        pose[:3, :3] = 1.5 * turn - 0.5 * turn @ turn.T @ turn
     return pose
 
 
@@ -230,11 +321,20 @@ def _sliding(keyframe: Keyframe, coarse: Sums) -> _Unknown:
     return _joined(found, _Unknown(keyframe.held, found.shifts)) if keyframe.held.shape[1] > 0 else found
 
 
+def _wanted(keyframe: Keyframe) -> Array:
+    """The largest standard deviations of scaled twists (6,) that are known."""
+    return np.concatenate((math.radians(MOST_STD_DEG) / keyframe.some.units[:3], np.full(3, MOST_STD_MM)))
+
+
+def _alike(keyframe: Keyframe) -> float:
+    """Of some pixels so many err alike."""
+    return max(1.0, ALIKE_PIXELS * keyframe.some.number / keyframe.touching)
+
+
 def _vague(keyframe: Keyframe, some: Sums) -> _Unknown:
     """Motions whose standard deviation is too large, because the common contact is small or faint."""
-    wanted = np.concatenate((math.radians(MOST_STD_DEG) / keyframe.some.units[:3], np.full(3, MOST_STD_MM)))
-    alike = max(1.0, ALIKE_PIXELS * keyframe.some.number / keyframe.touching)
-    matrix = some.matrix * wanted[:, None] * wanted / (alike * (max(some.slope_noise, 1e-3) / some.noise) ** 2)
+    wanted, ratio = _wanted(keyframe), max(some.slope_noise, LEAST_SLOPE_NOISE) / some.noise
+    matrix = some.matrix * wanted[:, None] * wanted / (_alike(keyframe) * ratio**2)
     if np.linalg.eigvalsh(matrix)[0] >= 1.0:  # 1 where the standard deviation is as wanted
         return _Unknown(np.zeros((6, 0)), np.zeros((3, 0)))
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from .follow import adjoint, orthonormal
-from .inverse import Array, rotation_vector
+from .inverse import Array, inverted, rotation_vector
 from .keyframe import Keyframe
 from .result import motion
 
@@ -61,7 +61,7 @@ class KeyframeGraph:
             for one in self.edges:
                 jacobian = np.zeros((6, size + 6))
                 jacobian[:, 6 * one.target : 6 * one.target + 6] = np.eye(6)
-                relative = self.poses[one.target] @ np.linalg.inv(self.poses[one.source])
+                relative = self.poses[one.target] @ inverted(self.poses[one.source])
                 jacobian[:, 6 * one.source : 6 * one.source + 6] -= adjoint(relative)
                 information = np.linalg.inv(one.covariance + 1e-12 * np.eye(6))
                 matrix += jacobian.T @ information @ jacobian
@@ -77,7 +77,7 @@ class KeyframeGraph:
 
     def _residual(self, edge: Edge) -> Array:
         """The twist (6,) after the registration that leads to the poses of its keyframes."""
-        off = self.poses[edge.target] @ np.linalg.inv(self.poses[edge.source]) @ np.linalg.inv(edge.pose)
+        off = self.poses[edge.target] @ inverted(self.poses[edge.source]) @ inverted(edge.pose)
         return np.concatenate((rotation_vector(off[:3, :3]), off[:3, 3]))
 
 

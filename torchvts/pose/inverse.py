@@ -124,7 +124,7 @@ def refine(
         limits = residual_limits(field, pose, wide)
         settings = np.concatenate((pixels.units, pixels.center, (wide, LEAST_NOISE, LARGEST_STEP_MM, small_mm)))
         total = kernels.refine_pose(field.channels, pixels.columns, steps, settings, held, limits)
-        return limits[:16].reshape(4, 4), _sums(total[:56], float(total[56]))
+        return limits[:16].reshape(4, 4), sums_of(total[:56], float(total[56]))
     noise = wide
     for _ in range(steps):
         sums = sum_residuals(field, pixels, pose, noise)
@@ -168,9 +168,17 @@ def moved_by(pixels: Pixels, step: Array) -> Array:
     return result
 
 
+def inverted(pose: Array) -> Array:
+    """The inverse of a rigid motion (4, 4)."""
+    result = np.eye(4)
+    result[:3, :3] = pose[:3, :3].T
+    result[:3, 3] = -pose[:3, 3] @ pose[:3, :3]
+    return result
+
+
 def step_between(pixels: Pixels, pose: Array, other: Array) -> Array:
     """The scaled twist (6,) after which, by :func:`moved_by`, a pose (4, 4) is another one."""
-    moved = np.linalg.inv(pose) @ other
+    moved = inverted(pose) @ other
     turn = moved[:3, :3]
     twist = np.concatenate((rotation_vector(turn), moved[:3, 3] - pixels.center + turn @ pixels.center))
     step: Array = twist / pixels.units
@@ -187,7 +195,7 @@ def rotation_vector(turn: Array) -> Array:
 def sum_residuals(field: Field, pixels: Pixels, pose: Array, slope_noise: float, score_only: bool = False) -> Sums:
     """Sums of one Gauss-Newton step with Cauchy's weights, and the score of the pose (4, 4), from the reference to the field."""
     by = kernels.alignment_sums if usable(field.channels, pixels.columns) else alignment_sums
-    return _sums(by(field.channels, pixels.columns, residual_limits(field, pose, slope_noise), score_only), slope_noise)
+    return sums_of(by(field.channels, pixels.columns, residual_limits(field, pose, slope_noise), score_only), slope_noise)
 
 
 def sum_parts(field: Field, pixels: Pixels, pose: Array, slope_noise: float, parts: int) -> tuple[Sums, Array, Array]:
@@ -200,7 +208,7 @@ def sum_parts(field: Field, pixels: Pixels, pose: Array, slope_noise: float, par
         runs = [pixels.columns[:, first:end] for first, end in pairwise(ends)]
         found = np.stack([alignment_sums(field.channels, run, limits) for run in runs])
     products = found[:, :49].reshape(parts, 7, 7)
-    return _sums(found.sum(0), slope_noise), products[:, :6, :6], products[:, :6, 6]
+    return sums_of(found.sum(0), slope_noise), products[:, :6, :6], products[:, :6, 6]
 
 
 def residual_limits(field: Field, pose: Array, slope_noise: float) -> Array:
@@ -213,7 +221,8 @@ def residual_limits(field: Field, pose: Array, slope_noise: float) -> Array:
     return limits
 
 
-def _sums(total: Array, slope_noise: float) -> Sums:
+def sums_of(total: Array, slope_noise: float) -> Sums:
+    """What :func:`alignment_sums` returns, (56,), with names."""
     matrix = total[:49].reshape(7, 7)
     count, weight, off, high, bad, good, compared = total[49:].tolist()
     most = max(compared, 1.0)

@@ -16,7 +16,7 @@ from .ambiguity import UNKNOWN_VARIANCE
 from .direct import align, check_rigid, symmetries
 from .follow import TRUSTED_DEG, TRUSTED_MM, Followed, cross, follow, in_common, orthonormal
 from .graph import Edge, KeyframeGraph, moved_covariance
-from .inverse import LEAST_NOISE, Array
+from .inverse import LEAST_NOISE, Array, inverted
 from .keyframe import Contact, Grids, Unusable, contact_frame, grids, make_keyframe, pitch_by_slopes, slopes_of_contact
 from .relief import DepthFrame, levels
 from .result import Registration
@@ -187,7 +187,7 @@ class PoseTracker:
     def _track(self, contact: Contact, frame: Grids) -> TrackedPose:
         """Follow the object from its last pose."""
         last = self._poses[-1]
-        starts = [last] if len(self._poses) < 2 else [last, last @ np.linalg.inv(self._poses[0]) @ last]
+        starts = [last] if len(self._poses) < 2 else [last, last @ inverted(self._poses[0]) @ last]
         older = self._older_keyframe(frame, starts[-1])
         found = self._follow(self._active if older is None else older, frame, starts)
         if older is not None and not self._problem(older, found, starts):
@@ -200,7 +200,7 @@ class PoseTracker:
         return self._accept(contact, frame, found)
 
     def _follow(self, index: int, frame: Grids, starts: list[Array]) -> Followed:
-        to_reference = np.linalg.inv(self.graph.poses[index])
+        to_reference = inverted(self.graph.poses[index])
         return follow(self.graph.keyframes[index], frame, [start @ to_reference for start in starts])
 
     def _older_keyframe(self, frame: Grids, expected: Array) -> int | None:
@@ -218,13 +218,13 @@ class PoseTracker:
 
     def _in_common(self, index: int, frame: Grids, pose: Array) -> tuple[float, float]:
         """:func:`in_common` of a keyframe and a frame, by the pose of the reference in the frame."""
-        return in_common(self.graph.keyframes[index], frame, pose @ np.linalg.inv(self.graph.poses[index]))
+        return in_common(self.graph.keyframes[index], frame, pose @ inverted(self.graph.poses[index]))
 
     def _close_loop(self, older: int, found: Followed, also: Followed, starts: list[Array]) -> None:
         """Link the present keyframe with an older one by a frame that is registered to both, and go on with the older one."""
         if not self._problem(self._active, also, starts):
-            pose = np.linalg.inv(also.pose) @ found.pose
-            covariance = moved_covariance(np.linalg.inv(also.pose), found.covariance + also.covariance)
+            pose = inverted(also.pose) @ found.pose
+            covariance = moved_covariance(inverted(also.pose), found.covariance + also.covariance)
             twist = self.graph.close(Edge(older, self._active, orthonormal(pose), covariance))
             middle = twist[3:] + np.cross(twist[:3], self.graph.keyframes[self._active].many.center)
             self.closures.append((math.degrees(float(np.linalg.norm(twist[:3]))), float(np.linalg.norm(middle))))
@@ -277,7 +277,7 @@ class PoseTracker:
             if not found.exact and frame.touching < LEAST_CONTACT * keyframe.touching:
                 message = "it touches with a small part, which other parts of the object may look like"
                 continue
-            back = np.linalg.inv(found.pose @ chain)
+            back = inverted(found.pose @ chain)
             self._symmetries = [back @ one.pose @ chain for one in equal if one is not found]
             self._active, self._least, self._tracking, self._poses = index, math.inf, True, []
             return self._accept(contact, frame, found)
@@ -315,7 +315,7 @@ class PoseTracker:
                 waiting.extend(pose @ other for other in self._reference_symmetries())
             for first, second in itertools.product([*known, pose], repeat=2):
                 if pose is first or pose is second:
-                    waiting.append(first @ np.linalg.inv(known[0] if known else pose) @ second)
+                    waiting.append(first @ inverted(known[0] if known else pose) @ second)
         least = min((one.fine.cost for one in found), default=0.0)
         return [one for one in found if one.fine.cost < max(EQUAL * least, least + EQUAL_COST)], problem
 
@@ -336,7 +336,7 @@ class PoseTracker:
             self._usual.append((found.fine.slope_noise, found.cost))
         large = frame.touching > LEAST_CONTACT * graph.keyframes[0].touching
         grown = frame.touching > GROWN * keyframe.touching
-        share, variance = self._in_common(index, frame, pose)
+        share, variance = found.common
         self._least = min(self._least, variance)
         moved_on, vague = large and share < ENOUGH, large and variance > VAGUER * self._least
         if (grown or moved_on or vague) and found.free.shape[1] <= keyframe.held.shape[1]:  # else what is unknown now would stay so

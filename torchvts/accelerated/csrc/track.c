@@ -1,27 +1,14 @@
 /* Gauss-Newton steps of a tracked pose: the same results as torchvts/pose/inverse.py, which explains them. */
-#include "kernels.h"
-#include <math.h>
+#include "track.h"
 
 #define INLINE static inline __attribute__((always_inline))
 #define LANES 8
 #define BLOCK 64 /* pixels that are summed in float32 */
-#define SIZE 7   /* six twists and the residual */
-#define PAIRS 28 /* of them, each once */
-#define SUMS 56  /* SIZE * SIZE products, then seven sums of the score */
+#define PAIRS 28 /* of SIZE values, each once */
 
 typedef float Lanes __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
 typedef double Sums __attribute__((vector_size(8 * LANES), aligned(8), may_alias));
 typedef float Four __attribute__((vector_size(16), aligned(4), may_alias)); /* the channels of a field */
-
-/* What the residuals depend on beside the pixels; the order is that of residual_limits in inverse.py. */
-typedef struct {
-    double pose[16], x0, y0, pitch, per_slope, per_height, score_slope, score_height, deep, shallow;
-} Limits;
-
-/* What the steps depend on; the order is that of refine in inverse.py. */
-typedef struct {
-    double units[6], center[3], wide, least_noise, largest_mm, small_mm;
-} Steps;
 
 /* A block of pixels in the new frame. */
 typedef struct {
@@ -153,7 +140,7 @@ EXPORT WIDE void alignment_sums(
     }
     for (int k = 0, pair = 0; k < SIZE; k++)
         for (int m = k; m < SIZE; m++, pair++) sums[SIZE * k + m] = sums[SIZE * m + k] = sum_of(products + pair);
-    for (int k = 0; k < 7; k++) sums[SIZE * SIZE + k] = sum_of(score + k);
+    for (int k = 0; k < 7; k++) sums[USED + k] = sum_of(score + k);
 }
 
 /* alignment_sums of each of `parts` runs of pixels, of the same number but for one: sums (parts, SUMS). */
@@ -167,7 +154,7 @@ EXPORT void part_sums(
 }
 
 /* Solves the symmetric A x = b of six unknowns by Cholesky's factors; A is overwritten. */
-static void solve(double A[6][6], const double b[6], double x[6]) {
+void solve_six(double A[6][6], const double b[6], double x[6]) {
     for (int k = 0; k < 6; k++) {
         for (int m = 0; m < k; m++) A[k][k] -= A[k][m] * A[k][m];
         A[k][k] = sqrt(A[k][k] > 1e-300 ? A[k][k] : 1e-300);
@@ -188,7 +175,7 @@ static void solve(double A[6][6], const double b[6], double x[6]) {
 }
 
 /* solve_step of inverse.py: the scaled twist that the sums ask for, but for the motions in the columns of held (6, holds). */
-static void solve_step(const double *sums, const double *held, int holds, double largest_mm, double step[6]) {
+void solve_step(const double *sums, const double *held, int holds, double largest_mm, double step[6]) {
     double known[6][6], half[6][6], A[6][6], b[6], trace = 0.0, square = 0.0;
     for (int i = 0; i < 6; i++)
         for (int k = 0; k < 6; k++) {
@@ -210,14 +197,14 @@ static void solve_step(const double *sums, const double *held, int holds, double
         trace += A[i][i];
     }
     for (int k = 0; k < 6; k++) A[k][k] += 1e-6 * (trace > 1e-9 ? trace : 1e-9) * (k < 3 ? 1.0 : 1e-3);
-    solve(A, b, step);
+    solve_six(A, b, step);
     for (int k = 0; k < 6; k++) square += step[k] * step[k];
     const double shorter = square > largest_mm * largest_mm ? largest_mm / sqrt(square) : 1.0;
     for (int k = 0; k < 6; k++) step[k] *= shorter;
 }
 
 /* pose = pose * the rigid motion of a twist about a centre, by Rodrigues' formula. */
-static void move(double *pose, const double *twist, const double *center) {
+void move_pose(double *pose, const double *twist, const double *center) {
     const double x = twist[0], y = twist[1], z = twist[2], angle = sqrt(x * x + y * y + z * z);
     const double first = angle > 1e-9 ? sin(angle) / angle : 1.0;
     const double second = angle > 1e-9 ? (1.0 - cos(angle)) / (angle * angle) : 0.5;
@@ -253,8 +240,8 @@ EXPORT void refine_pose(
             twist[k] = step[k] * by->units[k];
             largest = fabs(step[k]) > largest ? fabs(step[k]) : largest;
         }
-        move(at->pose, twist, by->center);
-        const double weight = sums[SIZE * SIZE + 1], slopes = sums[SIZE * SIZE + 2];
+        move_pose(at->pose, twist, by->center);
+        const double weight = sums[WEIGHT], slopes = sums[SLOPES];
         const double found = 1.5 * sqrt(0.5 * slopes / (weight > 1e-9 ? weight : 1e-9));
         noise = found > 0.5 * noise ? found : 0.5 * noise;
         noise = noise > by->least_noise ? noise : by->least_noise;

@@ -666,6 +666,8 @@ def test_track_refuses_a_reference_that_cannot_be_used_and_counts_bad_frames(uni
     ):
         done = run_script(*call, *arguments)
         assert done.returncode == 2 and error in done.stderr and not (tmp_path / "out").exists(), done.stderr
+    done = run_script("track", "--source", tmp_path / "none.avi", "--calibration", unit_file, "--out", unit_file)
+    assert done.returncode == 2 and "got that of a file" in done.stderr, done.stderr  # before the source is opened
     done = run_script(*call)
     assert done.returncode == 1 and "1 frame left out, named above" in done.stdout, done.stderr
     done = run_script(*call, "--least-mm2", "1000")

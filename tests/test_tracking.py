@@ -596,8 +596,15 @@ def test_a_frame_in_another_unit_is_named(times):
     frames = [press(objects.key(), swing(k)) for k in (0, 1)]
     tracker = vts.PoseTracker(frames[0], PITCH)
     for _ in range(2):  # while it tracks, and while it searches
-        assert "another unit?" in tracker(_bad(frames[1], depth_mm=times * frames[1].depth_mm)).lost
+        assert "or another unit?" in tracker(_bad(frames[1], depth_mm=times * frames[1].depth_mm)).lost
     assert not tracker(frames[1]).lost
+
+
+def test_a_frame_of_another_pitch_is_named():
+    tracker = vts.PoseTracker(press(objects.key(), swing(0)), PITCH)
+    other = objects.press(objects.key(), swing(1), 120, 160, 0.5 * PITCH)
+    for _ in range(2):
+        assert "have a pitch of 0.06" in tracker(other).lost and "another sensor's" in tracker(other).lost
 
 
 def test_other_types_and_restart():
@@ -628,6 +635,17 @@ def test_slopes_err_as_much_as_asked_and_alike_in_all_frames():
     whole = 0.5 * (frame.depth_mm[..., 1:-1, 2:] - frame.depth_mm[..., 1:-1, :-2]) / PITCH
     there = frame.contact[..., 1:-1, 1:-1]
     assert torch.allclose((steps - whole)[there], errors[0][:, :1, 1:-1, 1:-1][there], atol=1e-4)  # slopes are those of depth
+
+
+def test_frames_that_come_again_are_the_same_with_wrong_slopes_too():
+    paused = tracking.MOTIONS["paused"]
+    assert torch.equal(paused.pose(0, 1), paused.pose(3, 1)) and not torch.equal(paused.pose(3, 1), paused.pose(4, 1))
+    short = tracking.Motion(3, lambda k, seed: paused.pose(k + 2, seed), again=(1,))
+    track = tracking.record(objects.TARGETS["gear"], short, 0.005, 1, pose_accuracy.rig())
+    wrong = tracking.with_wrong_slopes(track, tracking.NOISES["slopes off by 3 degrees"], 1)
+    for one in (track, wrong):
+        same = [torch.equal(one.frames[0].gradient, frame.gradient) for frame in one.frames[1:]]
+        assert same == [True, False]
 
 
 def test_a_row_of_the_table_counts_what_must_be_seen():

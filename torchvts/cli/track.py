@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from ..core.checks import check_positive
-from ..core.files import make_folder, read_image, write_atomically
+from ..core.files import check_folder, make_folder, read_image, write_atomically
 from ..pose import PoseTracker, TrackedPose
 from ..pose.follow import TRUSTED_DEG, TRUSTED_MM
 from ..stream import NOT_METRIC, LiveView, Overlay, TactileFrame, TactileStream, VideoFile, has_screen
@@ -59,6 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Track until the source ends, and print a summary."""
     check_positive("--least-mm2", arguments.least_mm2)
+    check_folder(arguments.out)
     if arguments.view and not has_screen():
         raise UsageError("--view: expected a screen, this machine has none: --save FILE.rrd records what it would show")
     reference = None if arguments.reference is None else read_image(arguments.reference)

@@ -45,15 +45,14 @@ def check_target(path: str | Path) -> Path:
     return path
 
 
-def make_folder(path: str | Path) -> Path:
-    """Make a folder for results, with those above it, where it is missing.
+def check_folder(path: str | Path) -> Path:
+    """Return the path of a folder for results, which need not exist, or raise.
 
     Raises:
         TypeError: not a path.
         NotADirectoryError: a file has this name, or that of a folder above it.
-        OSError: it cannot be made there.
     Example:
-        >>> make_folder(__file__)  # doctest: +ELLIPSIS
+        >>> check_folder(__file__)  # doctest: +ELLIPSIS
         Traceback (most recent call last):
         ...
         NotADirectoryError: ...: expected the name of a folder for the results, got that of a file
@@ -62,6 +61,17 @@ def make_folder(path: str | Path) -> Path:
     taken = next((folder for folder in (path, *path.parents) if folder.exists()), path)
     if taken.exists() and not taken.is_dir():
         raise NotADirectoryError(f"{taken}: expected the name of a folder for the results, got that of a file")
+    return path
+
+
+def make_folder(path: str | Path) -> Path:
+    """Make a folder for results, with those above it, where it is missing.
+
+    Raises:
+        TypeError, NotADirectoryError: as :func:`check_folder`.
+        OSError: it cannot be made there.
+    """
+    path = check_folder(path)
     path.mkdir(parents=True, exist_ok=True)
     return path
 

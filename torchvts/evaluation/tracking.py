@@ -65,11 +65,13 @@ class Motion:
         frames: number of frames, the reference among them.
         pose: T_sensor_object (4, 4) of a frame, from its number and a seed.
         lost: frames that must be reported as lost.
+        again: frames that are the one before once more, as of a camera that stands still for a while.
     """
 
     frames: int
     pose: Callable[[int, int], Tensor]
     lost: tuple[int, ...] = ()
+    again: tuple[int, ...] = ()
 
 
 def _phases(seed: int) -> list[float]:
@@ -117,6 +119,14 @@ def _jump(k: int, seed: int) -> Tensor:
     return objects.pose(0.5 * k + 40.0 * jumped, (3.0 * jumped * math.cos(a), 3.0 * jumped * math.sin(a)), 0.45, (1.0, 1.0))
 
 
+_AGAIN = (1, 2, 3, *range(14, 24))
+
+
+def _paused(k: int, seed: int) -> Tensor:
+    """As slow, but for frames that come again: three after the reference, and ten later on."""
+    return _sweep(90.0, 40)(k - sum(frame <= k for frame in _AGAIN), seed)
+
+
 MOTIONS = {
     "slow": Motion(40, _sweep(90.0, 40)),
     "fast": Motion(14, _sweep(90.0, 14)),
@@ -125,6 +135,7 @@ MOTIONS = {
     "slip": Motion(20, _slip),
     "lift-off": Motion(24, _lift_off, (9, 10, 11, 12, 13)),
     "jump": Motion(20, _jump, (10,)),
+    "paused": Motion(34, _paused, again=_AGAIN),
 }
 
 
@@ -188,8 +199,11 @@ def record(target: objects.Target, motion: Motion, image_std: float, seed: int, 
     """
     lights, pipe = unit
     poses = [motion.pose(k, seed) for k in range(motion.frames)]
-    frames = []
+    frames: list[DepthOutput] = []
     for k, pose in enumerate(poses):
+        if k in motion.again:
+            frames.append(frames[-1])
+            continue
         scene = objects.press(target.height_mm, pose, 240, 320, pipe.mm_per_pixel)
         with torch.inference_mode():
             frame = pipe(render(scene, lights, noise_std=image_std, bits=8, seed=1000 * seed + k))
@@ -198,9 +212,10 @@ def record(target: objects.Target, motion: Motion, image_std: float, seed: int, 
 
 
 def with_wrong_slopes(track: Track, noise: Noise, sensor: int) -> Track:
-    """The track as a unit measures it whose slopes err, by :class:`WrongSlopes`."""
+    """The track as a unit measures it whose slopes err, by :class:`WrongSlopes`; frames that come again err as before."""
     unit = WrongSlopes(track.frames[0], noise, sensor, track.mm_per_pixel)
-    return Track(track.poses, [unit(frame, k) for k, frame in enumerate(track.frames)], track.mm_per_pixel)
+    numbers = [next(k for k, other in enumerate(track.frames) if other is frame) for frame in track.frames]
+    return Track(track.poses, [unit(track.frames[k], k) for k in numbers], track.mm_per_pixel)
 
 
 class WrongSlopes:

@@ -41,6 +41,7 @@ SIGNATURES = {
     "over_smooth": ("v", "ppp i p"),
     "box_of": ("v", "p iii p"),
     "divide_planes": ("v", "pp i l p"),
+    "over_tilted": ("v", "pppp ii p"),
     "response_normals": ("v", "p lll pp ii p ll p fff iii p"),
     "mask_values": ("v", "pp ll iiii p"),
     "depth_slopes": ("v", "p ll p ll f iii p"),
@@ -517,6 +518,21 @@ def slopes(normal: Tensor, max_slope: float) -> Tensor:
     gradient = normal.new_empty(count, 2, height, width)
     loaded().slopes(normal.data_ptr(), count, height * width, 1.0 / max_slope, gradient.data_ptr())
     return gradient
+
+
+def over_tilted(image: Tensor, plane: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """An image (1, 3, H, W) in the background's light: see :mod:`torchvts.stream.follow_light`.
+
+    Args:
+        image: in the light of now.
+        plane: (3, 3), level and tilts of each channel.
+        x: (W,), where the tilt along x is -1 to 1; y, (H,), the same.
+    """
+    image, plane = image.contiguous(), plane.contiguous()
+    result = torch.empty_like(image)
+    inputs = (image.data_ptr(), plane.data_ptr(), x.data_ptr(), y.data_ptr())
+    loaded().over_tilted(*inputs, *image.shape[-2:], result.data_ptr())
+    return result
 
 
 @functools.lru_cache(maxsize=8)

@@ -4,6 +4,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..accelerated import kernels
+from ..accelerated.gate import usable
 from ..core.checks import check_batch, check_field, check_least, check_range, check_same_size, check_shape
 from ..core.geometry import pixel_grid_mm
 from ..core.robust import tukey_weight
@@ -59,7 +61,8 @@ class FollowLight:
         self._basis = np.stack((np.ones_like(x), x, y)).reshape(3, -1)  # (3, cells)
         reach_x, reach_y = width / (columns * self.cell), height / (rows * self.cell)  # some pixels lie beyond the last cells
         x_mm, y_mm = pixel_grid_mm(height, width, 1.0, background.dtype)
-        self._x, self._y = (x_mm * 2.0 / width * reach_x)[None, :1], (y_mm * 2.0 / height * reach_y)[None, :, :1]
+        self._x = (x_mm * 2.0 / width * reach_x)[None, :1].contiguous()
+        self._y = (y_mm * 2.0 / height * reach_y)[None, :, :1].contiguous()
         self.state = "following"
         self.steps = 0
         self._since_contact_s = RECOVERY_S
@@ -74,6 +77,8 @@ class FollowLight:
         self._check(image)
         if float((self.plane - torch.tensor([1.0, 0.0, 0.0])).abs().max()) < 1e-5:
             return image
+        if usable(image, self._x, self._y):
+            return kernels.over_tilted(image, self.plane.float(), self._x, self._y)
         level, tilt_x, tilt_y = (self.plane[:, k, None, None].to(image.dtype) for k in range(3))
         plane = (level + tilt_x * self._x + tilt_y * self._y)[None]
         return torch.div(image, plane, out=plane).clamp_(0.0, 1.0)

@@ -372,3 +372,16 @@ EXPORT void divide_planes(const float *image, const float *level, int planes, in
     Division work = {image, level, n, planes, 2, result};
     share(divide_piece, &work, planes * work.pieces);
 }
+
+/* FollowLight.correct() of torchvts/stream/follow_light.py: an image (3, height, width) over a level and two tilts of each channel (3, 3), within 0
+   and 1; x (width), y (height): where the tilts are -1 to 1. */
+EXPORT WIDE void over_tilted(const float *image, const float *plane, const float *x, const float *y, int height, int width, float *result) {
+    for (int c = 0; c < 3; c++, plane += 3)
+        for (int row = 0; row < height; row++, image += width, result += width) {
+            const float by_row = plane[2] * y[row];
+            for (int k = 0; k < width; k++) {
+                const float value = image[k] / (plane[0] + plane[1] * x[k] + by_row), below = value < 1.0f ? value : 1.0f;
+                result[k] = below > 0.0f ? below : 0.0f;
+            }
+        }
+}

@@ -17,7 +17,7 @@ from torchvts.pose import tracker as tracker_module
 from torchvts.pose.follow import _follow_best, _follow_from, _pixels, adjoint, follow, orthonormal
 from torchvts.pose.graph import Edge, KeyframeGraph
 from torchvts.pose.height_errors import WHITE_MM, _covariance, _height_residuals, _modes, height_sums
-from torchvts.pose.inverse import Sums, moved_by, refine, solve_step, step_between, sum_parts, sum_residuals
+from torchvts.pose.inverse import Sums, moved_by, refine, rotation_vector, solve_step, step_between, sum_parts, sum_residuals
 from torchvts.pose.jackknife import ALIKE_MM, jackknife, shared_error
 from torchvts.pose.keyframe import PARTS, contact_frame, grids, make_keyframe
 from torchvts.pose.result import invert, motion, turn_deg
@@ -160,6 +160,47 @@ def test_after_a_search_a_symmetric_object_has_its_other_poses():
     truth = there @ invert(objects.pose(0.0))
     nearest = min(float(turn_deg(T @ invert(truth))) for T in (found.T_target_source, *found.alternatives))
     assert nearest < 0.3
+
+
+def put_down(height, before, after):
+    """A reference as the rig of the bench measures it, a frame put down otherwise, and the tracker, which has lost the object."""
+    lights, pipe = pose_accuracy.rig()
+    with torch.inference_mode():
+        reference, frame = (
+            pipe(render(objects.press(height, pose, 240, 320, pipe.mm_per_pixel), lights, noise_std=0.005, bits=8, seed=seed))
+            for seed, pose in ((1, before), (166, after))
+        )
+    tracker = vts.PoseTracker(reference, pipe.mm_per_pixel)
+    assert tracker(_bad(reference, contact=torch.zeros_like(reference.contact))).lost
+    return reference, frame, tracker
+
+
+def test_a_symmetric_object_tilted_otherwise_than_the_reference_has_its_other_pose():
+    """Found by a trial: half a turn off, confident, without alternatives; other pixels touch, and the fine grid counts them."""
+    before, after = objects.pose(0.0, tilt_deg=(1.0, 1.0)), objects.pose(165.0, (1.2, -0.8), 0.45, (-1.0, 1.0))
+    _, frame, tracker = put_down(objects.prism(), before, after)
+    found, truth = tracker(frame), after @ invert(before)
+    errors = [float(turn_deg(T @ invert(truth))) for T in (found.T_target_source, *found.alternatives)]
+    assert len(errors) == 2 and min(errors) < 0.1 and max(errors) > 179.0
+
+
+def test_a_capsule_put_down_again_may_have_rolled_and_may_point_the_other_way():
+    before, after = objects.pose(0.0), objects.pose(150.0, (1.2, -0.8))
+    reference, frame, tracker = put_down(objects.capsule(1.5, 4.0), before, after)
+    axis = (after @ invert(before))[:3, 0]  # of the capsule, along x at first
+    for found in (tracker(frame), vts.register_depth(reference, frame, tracker.mm_per_pixel)):
+        assert found.ambiguous == ["rotation about 150 degrees"]
+        along = [float(T[:3, 0] @ axis) for T in (found.T_target_source, *found.alternatives)]
+        assert sorted(along) == pytest.approx([-1.0, 1.0], abs=1e-3)
+
+
+def test_an_even_motion_of_more_than_a_jump_is_followed_after_one_frame():
+    height = objects.stamp("R", 5.0)
+    poses = [objects.pose(0.0, (1.2 * k - 4.0, 0.0)) for k in range(6)]
+    tracker = vts.PoseTracker(press(height, poses[0]), PITCH)
+    found = [tracker(press(height, pose)) for pose in poses[1:]]
+    assert [bool(one.lost) for one in found] == [True, False, False, False, False]
+    assert error(found[-1], poses[0], poses[-1])[1] < 0.05
 
 
 def test_what_only_the_outline_says_tells_equal_poses_from_others():
@@ -325,7 +366,7 @@ def test_grids_of_kernels_and_opencv_agree(times):
 
 @pytest.mark.parametrize("part", ["depth_mm", "gradient"])
 @pytest.mark.parametrize("place", [0, -1])
-@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -3e38, 1.1e6])
 def test_one_value_that_is_not_finite_is_seen(part, place, value):
     frame = press(objects.key(), objects.pose(0.0))
     wrong = getattr(frame, part).clone()
@@ -477,7 +518,7 @@ def test_a_bad_frame_is_said_and_the_tracker_goes_on():
     tracker = vts.PoseTracker(good, PITCH)
     bad = {
         "no contact": _bad(good, contact=torch.zeros_like(good.contact)),
-        "depth or gradient is not finite": _bad(good, depth_mm=good.depth_mm * math.nan),
+        "depth or gradient is not finite, or beyond 1e+06": _bad(good, depth_mm=good.depth_mm * math.nan),
         "expected 120 x 160 pixels like the reference, got 96 x 128": objects.press(height, objects.pose(0.0), 96, 128, PITCH),
     }
     for reason, frame in bad.items():
@@ -605,6 +646,33 @@ def test_a_frame_of_another_pitch_is_named():
     other = objects.press(objects.key(), swing(1), 120, 160, 0.5 * PITCH)
     for _ in range(2):
         assert "have a pitch of 0.06" in tracker(other).lost and "another sensor's" in tracker(other).lost
+
+
+def test_a_strip_is_refused_in_words():
+    strip = objects.press(objects.prism(0.4, 40.0), objects.pose(0.0, press_mm=0.5), 32, 2560, 0.0625)
+    with pytest.raises(ValueError, match="at most 40 times as long as wide, got 32 x 2560"):
+        vts.PoseTracker(strip, 0.0625)
+
+
+@pytest.mark.parametrize("name", ["key", "gear"])
+def test_the_right_pitch_of_coarse_pixels_is_not_refused(name):
+    vts.PoseTracker(objects.press(objects.TARGETS[name].height_mm, objects.pose(0.0), 48, 64, 0.25), 0.25)
+
+
+def test_lazily_negated_depth_is_read():
+    frame = press(objects.key(), swing(0))
+    negated = frame._replace(depth_mm=torch._neg_view(-frame.depth_mm))
+    assert not vts.PoseTracker(negated, PITCH)(negated).lost
+
+
+@pytest.mark.parametrize("angle", [1e-9, 1.0, 2.8, math.pi - 1e-7, math.pi])
+def test_a_rotation_vector_is_that_of_its_rotation(angle):
+    axis = torch.tensor([2.0, -1.0, 0.5], dtype=torch.float64) / math.sqrt(5.25)
+    turn = motion(torch.cat((angle * axis, torch.zeros(3, dtype=torch.float64))))[:3, :3].numpy()
+    found = rotation_vector(turn)
+    assert np.abs(found) == pytest.approx(np.abs(angle * axis.numpy()), abs=1e-9)
+    if angle < 3.0:
+        assert found == pytest.approx(angle * axis.numpy(), abs=1e-9)
 
 
 def test_other_types_and_restart():

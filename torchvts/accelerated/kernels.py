@@ -678,7 +678,7 @@ def track_grids(
 
 
 def contact_pixels(depth: Tensor, slopes: Tensor, contact: Tensor) -> int:
-    """How many pixels of a frame touch, -1 where depth or slopes are not finite; the tensors are those of :func:`track_grids`."""
+    """How many pixels touch, -1 where values are not finite or beyond 1e6; the tensors are those of :func:`track_grids`."""
     return int(loaded().contact_pixels(depth.data_ptr(), slopes.data_ptr(), contact.data_ptr(), depth.numel()))
 
 

@@ -3,11 +3,13 @@
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d, unfold
 
 from .alignment import CUT, DEPTH_NOISE_MM, SLOPE_NOISE, linearise, twist_units
+from .inverse import Array, rotation_vector
 from .relief import Relief
 from .result import invert, motion
 
@@ -27,6 +29,10 @@ ALIKE_PIXELS = 25.0
 
 UNKNOWN_VARIANCE = 100.0
 """Variance of a motion that the surface does not determine, mm^2."""
+
+
+OTHERWISE_DEG = 20.0
+"""Two poses are different ones if known rotations between them are larger."""
 
 
 class Unknown(NamedTuple):
@@ -76,6 +82,31 @@ def find_unknown(source: Relief, target: Relief, pose: Tensor, noise: float) -> 
             moved[3:] = moved[3:] - torch.linalg.cross(moved[:3], center[:, None].expand_as(moved[:3]), dim=0)
             found = Unknown(moved, name_directions(free, shifts))
     return found
+
+
+def turned_otherwise(turns: list[Array], unknown: Array, names: list[str]) -> list[int]:
+    """Which rotations lead to another pose than no rotation, or than those before, though some rotations are unknown.
+
+    A capsule may have rolled, which is unknown, and may also point the other way.
+
+    Args:
+        turns: (3, 3) each.
+        unknown: (3, k), the rotations of k unknown motions, as :class:`Unknown` and ``Followed.free`` have them.
+        names: of these motions.
+    Example:
+        >>> half, roll = np.diag([-1.0, -1.0, 1.0]), np.diag([1.0, -1.0, -1.0])
+        >>> turned_otherwise([roll, half, half @ roll], np.eye(3)[:, :1], ["rotation about x"])
+        [1]
+    """
+    rotations = sum(name.startswith("rotation") for name in names)  # a large ball that rolls mostly shifts, so sizes say little
+    axes = np.linalg.svd(unknown, full_matrices=False)[0][:, :rotations]
+    kept: list[int] = []
+    for k, turn in enumerate(turns):
+        between = [rotation_vector(other.T @ turn) for other in (np.eye(3), *(turns[j] for j in kept))]
+        known = [float(np.linalg.norm(one - axes @ (axes.T @ one))) for one in between]
+        if min(known) > math.radians(OTHERWISE_DEG):
+            kept.append(k)
+    return kept
 
 
 def information_of_noise(noise: float, pitch: float) -> Tensor:

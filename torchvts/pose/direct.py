@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..core.checks import check_float_tensor, check_least, check_shape
 from .alignment import Fit, agrees_enough, distinct, equally_good, is_trusted, rank, refine, score_poses
-from .ambiguity import UNKNOWN_VARIANCE, Unknown, find_unknown, pose_covariance
+from .ambiguity import UNKNOWN_VARIANCE, Unknown, find_unknown, pose_covariance, turned_otherwise
 from .relief import DepthFrame, Levels, levels
 from .result import Registration, invert, turn_deg
 from .search import search_plane
@@ -28,7 +28,7 @@ def register_depth(source: DepthFrame, target: DepthFrame, mm_per_pixel: float, 
         target: the reference frame, likewise.
         mm_per_pixel: pitch of both, mm.
         initial: T_target_source (4, 4) to start from, such as the pose of the previous frame; if it leads to a good fit, no
-            search follows.
+            search follows: of a symmetric object ``alternatives`` is then empty, and the start has chosen among its equal poses.
     Returns:
         The registration. ``converged`` is False if nothing fits; ``ambiguous`` and ``alternatives`` list what the contact does
         not determine.
@@ -122,7 +122,10 @@ def _finish(a: Levels, b: Levels, poses: Tensor) -> Registration:
     rmse_mm, covariance = pose_covariance(a.fine, b.fine, best)
     if unknown.names:
         covariance = covariance + unknown.motions @ unknown.motions.T * UNKNOWN_VARIANCE
-    alternatives = list(others) if converged and not unknown.names else []
+    alternatives = list(others) if converged else []
+    if unknown.names:  # what differs by that alone is no other pose
+        turns = [(T @ invert(best[0]))[:3, :3].numpy() for T in alternatives]
+        alternatives = [alternatives[k] for k in turned_otherwise(turns, unknown.motions[:3].numpy(), unknown.names)]
     message = _message(fit, unknown.names, len(alternatives))
     fitness, overlap = float(fit.fitness[0]), float(fit.overlap[0])
     return Registration(best[0], rmse_mm, fitness, converged, message, covariance, unknown.names, alternatives, overlap)
@@ -157,7 +160,7 @@ def _message(fit: Fit, names: list[str], others: int) -> str:
     if not is_trusted(fit, 0):
         return f"nothing fits: {agreement}: different objects, or parts of one that hardly overlap"
     if names:
-        return f"{agreement}; the surface slides on itself: {', '.join(names)} unknown"
+        agreement += f"; the surface slides on itself: {', '.join(names)} unknown"
     return agreement + (f"; {others} more poses fit as well: the object is symmetric" if others else "")
 
 

@@ -186,9 +186,15 @@ def step_between(pixels: Pixels, pose: Array, other: Array) -> Array:
 
 
 def rotation_vector(turn: Array) -> Array:
-    """Axis times angle (3,) of a rotation (3, 3) of less than half a turn."""
+    """Axis times angle (3,) of a rotation (3, 3) of at most half a turn."""
     skew = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     sine, cosine = float(np.linalg.norm(skew)), 0.5 * (float(np.trace(turn)) - 1.0)
+    if cosine < -0.9:  # the sine is small: the axis is that of (1 - cosine) a a^T
+        square = 0.5 * (turn + turn.T) - cosine * np.eye(3)
+        axis = square[:, int(square.diagonal().argmax())]
+        sign = -1.0 if float(axis @ skew) < 0.0 else 1.0
+        half: Array = axis * (sign * math.atan2(sine, cosine) / float(np.linalg.norm(axis)))
+        return half
     return skew * (math.atan2(sine, cosine) / sine if sine > 1e-12 else 1.0)
 
 

@@ -30,6 +30,12 @@ CELL = 2
 PARTS = 8
 """Parts of a contact, a power of two: a pose is as uncertain as it depends on which of them is left out."""
 
+HUGE = 1e6
+"""Depth, mm, and slopes beyond this are no measurement; their squares would overflow."""
+
+LEAST_ALIKE = 0.3
+"""Correlation of slopes and differences of depth, below which they are not those of the same frame."""
+
 Image = npt.NDArray[Any]
 Mask = npt.NDArray[Any]
 
@@ -67,23 +73,24 @@ def contact_frame(frame: DepthFrame, name: str = "frame") -> Contact:
     """
     height, width = check_frame(name, frame)
     deformed: Tensor = getattr(frame, "deformed", frame.contact)  # a scene has none
-    depth = frame.depth_mm.detach().to("cpu", torch.float32).reshape(1, 1, height, width).contiguous()
-    gradient = frame.gradient.detach().to("cpu", torch.float32).reshape(1, 2, height, width).contiguous()
+    depth = frame.depth_mm.detach().resolve_neg().to("cpu", torch.float32).reshape(1, 1, height, width).contiguous()
+    gradient = frame.gradient.detach().resolve_neg().to("cpu", torch.float32).reshape(1, 2, height, width).contiguous()
     contact = frame.contact.detach().to("cpu", torch.bool).reshape(1, 1, height, width).contiguous()
     skin = deformed.detach().to("cpu", torch.bool).reshape(1, 1, height, width)
     touching = _contact_pixels(depth, gradient, contact)
     if touching < 0:
-        raise Unusable("depth or gradient is not finite")
+        raise Unusable(f"depth or gradient is not finite, or beyond {HUGE:g}")
     if touching < LEAST_PIXELS:
         raise Unusable("no contact")
     return Contact(depth, gradient, contact, skin)
 
 
 def _contact_pixels(depth: Tensor, gradient: Tensor, contact: Tensor) -> int:
-    """How many pixels of a frame touch; -1 where depth or gradient is not finite."""
+    """How many pixels of a frame touch; -1 where depth or gradient is not finite, or beyond :data:`HUGE`."""
     if usable(depth, gradient):
         return kernels.contact_pixels(depth, gradient, contact)
-    return int(torch.count_nonzero(contact)) if math.isfinite(float(depth.sum()) + float(gradient.sum())) else -1
+    largest = torch.stack((depth.abs().max(), gradient.abs().max()))  # NaN if any value is
+    return int(torch.count_nonzero(contact)) if bool((largest <= HUGE).all()) else -1
 
 
 def grids(frame: Contact, mm_per_pixel: float, least_mm: float, times: tuple[int, int]) -> Grids:
@@ -247,9 +254,15 @@ def slopes_of_contact(frame: Contact) -> float:
 
 
 def pitch_by_slopes(frame: Contact) -> float:
-    """The pixel pitch under which a frame's depth has its slopes, mm: the regression of differences of depth on slopes."""
+    """The pixel pitch under which a frame's depth has its slopes, mm; 0 where these have little to do with each other.
+
+    It is the ratio of their root mean squares: both are noisy, and differences over coarse pixels are no slopes at edges.
+    """
     depth, slope, contact = frame.depth_mm[0, 0], frame.gradient[0], frame.contact[0, 0]
-    steps = (depth[1:-1, 2:] - depth[1:-1, :-2], depth[2:, 1:-1] - depth[:-2, 1:-1])
+    by_pixel = torch.stack((depth[1:-1, 2:] - depth[1:-1, :-2], depth[2:, 1:-1] - depth[:-2, 1:-1]))
     whole = contact[1:-1, 2:] & contact[1:-1, :-2] & contact[2:, 1:-1] & contact[:-2, 1:-1]
-    product = sum(float((0.5 * step * one[1:-1, 1:-1])[whole].sum()) for step, one in zip(steps, slope, strict=True))
-    return product / max(float(slope[:, 1:-1, 1:-1][:, whole].square().sum()), 1e-12)
+    steps, slope = 0.5 * by_pixel[:, whole].double(), slope[:, 1:-1, 1:-1][:, whole].double()
+    size = math.sqrt(float(steps.square().sum()) * float(slope.square().sum()))
+    if float((steps * slope).sum()) <= LEAST_ALIKE * size:
+        return 0.0
+    return float(steps.square().sum()) / size

@@ -137,6 +137,10 @@ def levels(frame: DepthFrame, mm_per_pixel: float, name: str) -> Levels:
     first = max(1, math.ceil(longest / 330))
     corner = (-0.5 * (depth.shape[1] - 1) * mm_per_pixel, 0.5 * (depth.shape[0] - 1) * mm_per_pixel)
     every = (first, max(first, round(longest / 160)), max(first, round(longest / 80)))
+    if min(depth.shape) < 2 * every[2]:
+        raise ValueError(
+            f"{name}: expected a frame at most 40 times as long as wide, got {depth.shape[0]} x {depth.shape[1]}: a cut-out?"
+        )
     made = [relief(depth, slope, inside, inside | deep, mm_per_pixel, times, corner) for times in every]
     if min(len(one.points) for one in made) < 12:
         least = least_depth_mm(noise, mm_per_pixel)

@@ -19,7 +19,8 @@ class Registration:
         covariance: (6, 6) of a small motion ``p -> p + w x p + t`` after the pose, order (w_x, w_y, w_z, t_x, t_y, t_z), rad
             and mm; a direction that is not observable has a variance of 100 mm^2 or more at the contact.
         ambiguous: names of the motions under which the surface slides on itself; empty if there is none.
-        alternatives: (4, 4) poses that fit equally well because the object is symmetric; the best pose is not among them.
+        alternatives: (4, 4) poses that fit equally well because the object is symmetric, and differ by more than motions of
+            ``ambiguous``; the best pose is not among them.
         overlap: share of the smaller contact that could be compared, 0 to 1; 1 for clouds that are no height maps.
     """
 

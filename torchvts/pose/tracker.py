@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..core.checks import check_positive
 from .alignment import LEAST_FITNESS, LEAST_OVERLAP, MOST_COST, agrees_enough
-from .ambiguity import UNKNOWN_VARIANCE
+from .ambiguity import UNKNOWN_VARIANCE, turned_otherwise
 from .direct import align, check_rigid, symmetries
 from .follow import TRUSTED_DEG, TRUSTED_MM, Followed, cross, follow, in_common, orthonormal
 from .graph import Edge, KeyframeGraph, moved_covariance
@@ -151,8 +151,9 @@ class PoseTracker:
         self._active = 0
         self._way = [0.0]  # variance that the way from the reference to each keyframe adds up to, as _in_common() has it
         self._least = math.inf  # such a variance, of a frame since the present keyframe was taken up
-        self._poses: list[Array] = [np.eye(4)]  # the last two; only the last one after a search
+        self._poses: list[Array] = [np.eye(4)]  # the last two, or the last one
         self._tracking = True
+        self._missed: Array | None = None  # the pose that was not taken in the last frame
         self._symmetries: list[Array] = []
         self._symmetries_of_reference: list[Array] | None = None
         self._usual: deque[tuple[float, float]] = deque(maxlen=30)  # slope noise and cost
@@ -197,7 +198,9 @@ class PoseTracker:
             found = self._follow(self._active, frame, starts)
         problem = self._problem(self._active, found, starts)
         if problem:
-            return self._lose(problem, contact)
+            lost = self._lose(problem, contact)
+            self._missed = found.pose @ self.graph.poses[self._active]
+            return lost
         return self._accept(contact, frame, found)
 
     def _follow(self, index: int, frame: Grids, starts: list[Array]) -> Followed:
@@ -280,11 +283,19 @@ class PoseTracker:
                 continue
             back = inverted(found.pose @ chain)
             self._symmetries = [back @ one.pose @ chain for one in equal if one is not found]
-            self._active, self._least, self._tracking, self._poses = index, math.inf, True, []
+            self._poses = self._on_the_way(found.pose @ chain)
+            self._active, self._least, self._tracking = index, math.inf, True
             return self._accept(contact, frame, found)
         if self._usual:
             self._usual.popleft()  # what was usual is forgotten while the object is not found, lest it stay lost for ever
         return self._lose(f"not found again: {message}", contact)
+
+    def _on_the_way(self, pose: Array) -> list[Array]:
+        """The pose before one that a search found, if that lies on an even motion over a single frame that was lost."""
+        if self._missed is None:
+            return []
+        expected = self._missed @ inverted(self._poses[-1]) @ self._missed
+        return [self._missed] if _distance(self.graph.keyframes[0].probe, expected, pose) < JUMP_MM else []
 
     def _equal_poses(self, index: int, frame: Grids, starts: list[Array]) -> tuple[list[Followed], str]:
         """All poses that could be the object's, from some starts on, and if there is none, why.
@@ -311,14 +322,45 @@ class PoseTracker:
                 continue
             found.append(one)
             if one.names:
-                break  # what is unknown is no symmetry
+                found += self._turned_otherwise(index, frame, one)
+                break  # products of symmetries would differ by what is unknown
             if not known:
                 waiting.extend(pose @ other for other in self._reference_symmetries())
             for first, second in itertools.product([*known, pose], repeat=2):
                 if pose is first or pose is second:
                     waiting.append(first @ inverted(known[0] if known else pose) @ second)
-        least = min((one.fine.cost for one in found), default=0.0)
-        return [one for one in found if one.fine.cost < max(EQUAL * least, least + EQUAL_COST)], problem
+        if not found:
+            return [], problem
+        best = min(found, key=lambda one: one.fine.cost)
+        back = inverted(best.pose @ chain)
+        equal = [
+            one
+            for one in found
+            if _equals(one.fine.cost, best.fine.cost)
+            or (_equals(one.cost, best.cost) and self._is_symmetry(back @ one.pose @ chain))
+        ]
+        return equal, problem
+
+    def _turned_otherwise(self, index: int, frame: Grids, one: Followed) -> list[Followed]:
+        """Poses beside one of which some motions are unknown: a capsule that has rolled may point the other way."""
+        chain = self.graph.poses[index]
+        motions = [chain @ motion @ inverted(chain) for motion in self._reference_symmetries()]
+        found = []
+        for k in turned_otherwise([motion[:3, :3] for motion in motions], one.free[:3], one.names):
+            start = one.pose @ motions[k] @ chain
+            other = self._follow(index, frame, [start])
+            if not self._problem(index, other, [start]):
+                found.append(other)
+        return found
+
+    def _is_symmetry(self, motion: Array) -> bool:
+        """Whether the reference looks much the same after a motion.
+
+        Of a symmetric object that is tilted otherwise than the reference, other pixels touch: the fine grid counts them, the less
+        the nearer the tilts are.
+        """
+        probe = self.graph.keyframes[0].probe
+        return any(_distance(probe, motion, symmetry) < SAME_MM for symmetry in self._reference_symmetries())
 
     def _reference_symmetries(self) -> list[Array]:
         """Motions after which the reference looks much the same: continuity is lost, so each of them may have happened."""
@@ -384,8 +426,11 @@ class PoseTracker:
         self._active, self._least = self.graph.add(keyframe, self._active, found.pose, found.covariance), math.inf
 
     def _lose(self, reason: str, contact: Contact | None = None) -> TrackedPose:
-        """No pose: the last one, as of no certainty. The reason may be that the frame has another pitch, or unit."""
-        self._tracking = False
+        """No pose: the last one, as of no certainty, and the next frame is searched.
+
+        The reason may be that the frame has another pitch, or unit.
+        """
+        self._tracking, self._missed = False, None
         found = 0.0 if contact is None else pitch_by_slopes(contact)
         if found > 0.0 and not 1.0 / PITCH_RATIO < found / self.mm_per_pixel < PITCH_RATIO:
             pitch = f"depth and slopes of the frame have a pitch of {found:.3g} mm, not {self.mm_per_pixel:g}"
@@ -393,6 +438,10 @@ class PoseTracker:
         unknown = torch.eye(6, dtype=torch.float64) * UNKNOWN_VARIANCE
         last = torch.from_numpy(self._poses[-1].copy())
         return TrackedPose(last, math.inf, 0.0, False, f"lost: {reason}", unknown, overlap=0.0, lost=reason, keyframe=self._active)
+
+
+def _equals(cost: float, least: float) -> bool:
+    return cost < max(EQUAL * least, least + EQUAL_COST)
 
 
 def _distance(points: Array, one: Array, other: Array) -> float:

@@ -16,7 +16,7 @@ typedef struct {
     double x0, y0, pitch;
 } Grid;
 
-/* A keyframe, and the settings of follow.py; torchvts/accelerated/tracking.py has the same. */
+/* A keyframe, and the settings of follow.py; torchvts/accelerated/following.py has the same. */
 typedef struct {
     Pixels coarse, some, many;
     Grid own; /* its own coarse grid */
@@ -78,7 +78,7 @@ static int all_at_least(double A[6][6], double least) {
         for (int k = 0; k <= i; k++) {
             double left = A[i][k] - (i == k ? least : 0.0);
             for (int m = 0; m < k; m++) left -= L[i][m] * L[k][m];
-            if (i == k && left < 0.0) return 0;
+            if (i == k && !(left >= 0.0)) return 0;
             L[i][k] = i == k ? sqrt(left > 1e-300 ? left : 1e-300) : left / L[k][k];
         }
     return 1;

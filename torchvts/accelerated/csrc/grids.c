@@ -4,6 +4,7 @@
 #define INSIDE 1
 #define PERHAPS 2
 #define LANES 16
+#define HUGE_FACTOR 3.4e32f /* the largest float is 3.4028e38 */
 
 static WIDE float largest(const float *values, int64_t size) {
     float most[LANES];
@@ -130,20 +131,20 @@ EXPORT int track_grids(
     return count;
 }
 
-/* 0 if all of `size` values are finite, else NaN. */
-static WIDE float zero_if_finite(const float *values, int64_t size) {
+/* 0 if all of `size` values are at most 1e6, else NaN: larger ones times HUGE_FACTOR are infinite. */
+static WIDE float zero_if_usable(const float *values, int64_t size) {
     float none[4 * LANES] = {0.0f};
     const int64_t whole = size - size % (4 * LANES);
     for (int64_t n = 0; n < whole; n += 4 * LANES)
-        for (int k = 0; k < 4 * LANES; k++) none[k] += 0.0f * values[n + k];
-    for (int64_t n = whole; n < size; n++) none[0] += 0.0f * values[n];
+        for (int k = 0; k < 4 * LANES; k++) none[k] += 0.0f * (HUGE_FACTOR * values[n + k]);
+    for (int64_t n = whole; n < size; n++) none[0] += 0.0f * (HUGE_FACTOR * values[n]);
     for (int k = 1; k < 4 * LANES; k++) none[0] += none[k];
     return none[0];
 }
 
-/* How many pixels of a frame touch; -1 where depth (size) or slopes (2, size) are not finite. */
+/* How many pixels of a frame touch; -1 where depth (size) or slopes (2, size) are not finite, or beyond 1e6. */
 EXPORT WIDE int contact_pixels(const float *depth, const float *slopes, const uint8_t *contact, int64_t size) {
-    if (zero_if_finite(depth, size) != 0.0f || zero_if_finite(slopes, 2 * size) != 0.0f) return -1;
+    if (zero_if_usable(depth, size) != 0.0f || zero_if_usable(slopes, 2 * size) != 0.0f) return -1;
     int count = 0;
     for (int64_t n = 0; n < size; n++) count += contact[n] != 0;
     return count;

@@ -644,8 +644,9 @@ def test_a_frame_in_another_unit_is_named(times):
 def test_a_frame_of_another_pitch_is_named():
     tracker = vts.PoseTracker(press(objects.key(), swing(0)), PITCH)
     other = objects.press(objects.key(), swing(1), 120, 160, 0.5 * PITCH)
-    for _ in range(2):
-        assert "have a pitch of 0.06" in tracker(other).lost and "another sensor's" in tracker(other).lost
+    for _ in range(2):  # while it tracks, and while it searches
+        lost = tracker(other).lost
+        assert "have a pitch of 0.06" in lost and "another sensor's" in lost
 
 
 def test_a_strip_is_refused_in_words():

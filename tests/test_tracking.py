@@ -374,6 +374,8 @@ def test_one_value_that_is_not_finite_is_seen(part, place, value):
     for scope in (contextlib.nullcontext(), reference_only()):
         with scope, pytest.raises(ValueError, match="not finite"):
             contact_frame(_bad(frame, **{part: wrong}))
+    with pytest.raises(ValueError, match=r"source: expected finite depth and gradient, at most 1e\+06"):
+        vts.register_depth(_bad(frame, **{part: wrong}), frame, PITCH)
 
 
 def test_without_kernels_the_pose_is_the_same():

@@ -37,7 +37,7 @@ class KeyframeProgram(ctypes.Structure):
         *((name, KeyframePixels) for name in ("coarse", "some", "many")),
         ("own", Grid),
         *((name, POINTER) for name in ("cell", "per_cell", "lines")),
-        *((name, INTEGER) for name in ("cells", "modes", "parts", "coarse_steps", "some_steps", "spare")),
+        *((name, INTEGER) for name in ("cells", "modes", "parts", "coarse_steps", "some_steps")),
         *(("units", REAL * 6), ("center", REAL * 3)),
         *((name, REAL) for name in ("per_height", "score_slope", "score_height", "deep", "shallow")),
         *((name, REAL) for name in ("slope_noise", "least_noise", "largest_mm", "coarse_mm", "small_mm", "least_information")),

@@ -193,7 +193,7 @@ def _program(keyframe: Keyframe) -> following.KeyframeProgram:
             *(following.pixels_of(pixels.columns) for pixels in (keyframe.coarse, keyframe.some, keyframe.many)),
             following.grid_of(*keyframe.grids.coarse),
             *(array.ctypes.data for array in errors),
-            *(len(errors.number), errors.lines.shape[1] - 6, PARTS, COARSE_STEPS, SOME_STEPS, 0),
+            *(len(errors.number), errors.lines.shape[1] - 6, PARTS, COARSE_STEPS, SOME_STEPS),
             *(tuple(keyframe.many.units), tuple(keyframe.many.center)),
             *(DEPTH_DRIFT_MM**-2, *SCORE, DEEP_MM, SHALLOW_MM),
             *(SLOPE_NOISE, LEAST_NOISE, LARGEST_STEP_MM, COARSE_STEP_MM, SOME_STEP_MM),

@@ -17,7 +17,7 @@ from .ambiguity import field_with_fitted_curvature, find_unknown, information_of
 from .height_errors import HeightErrors, height_errors
 from .inverse import Array, Field, Pixels, reference_pixels
 from .jackknife import shared_error
-from .relief import LEAST_PIXELS, DepthFrame, Levels, Relief, check_frame, least_depth_mm, levels
+from .relief import HUGE, LEAST_PIXELS, DepthFrame, Levels, Relief, check_frame, least_depth_mm, levels
 
 SOME, MANY = 2000, 8000
 """Pixels of a reference for all steps of a refinement but the last, and for the last. They are evenly spread: pixels chosen by what
@@ -29,9 +29,6 @@ CELL = 2
 
 PARTS = 8
 """Parts of a contact, a power of two: a pose is as uncertain as it depends on which of them is left out."""
-
-HUGE = 1e6
-"""Depth, mm, and slopes beyond this are no measurement; their squares would overflow."""
 
 LEAST_ALIKE = 0.3
 """Correlation of slopes and differences of depth, below which they are not those of the same frame."""

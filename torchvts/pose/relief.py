@@ -19,6 +19,9 @@ LEAST_SIDE = 16
 LEAST_PIXELS = 60
 """A contact of fewer pixels has no pose."""
 
+HUGE = 1e6
+"""Depth, mm, and slopes beyond this are no measurement; their squares would overflow."""
+
 
 class DepthFrame(Protocol):
     """The fields of :class:`torchvts.DepthOutput` that a registration uses."""
@@ -111,8 +114,8 @@ def contact_of(frame: DepthFrame, name: str) -> tuple[Tensor, Tensor, Tensor]:
     height, width = check_frame(name, frame)
     depth, gradient = frame.depth_mm.detach(), frame.gradient.detach()
     deformed: Tensor = getattr(frame, "deformed", frame.contact).detach()
-    if not bool(torch.isfinite(depth).all() and torch.isfinite(gradient).all()):
-        raise ValueError(f"{name}: expected finite depth and gradient, got NaN or infinite ones")
+    if not bool((depth.abs() <= HUGE).all() and (gradient.abs() <= HUGE).all()):
+        raise ValueError(f"{name}: expected finite depth and gradient, at most {HUGE:g}, got NaN, infinite or larger ones")
     inside = deformed.reshape(height, width).bool()
     if int(inside.sum()) < LEAST_PIXELS:
         raise ValueError(

@@ -22,12 +22,12 @@ typedef struct {
     Grid own; /* its own coarse grid */
     const int64_t *cell;
     const double *per_cell, *lines;
-    int32_t cells, modes, parts, coarse_steps, some_steps, spare;
+    int32_t cells, modes, parts, coarse_steps, some_steps;
     double units[6], center[3];
-    double per_height, score_slope, score_height, deep, shallow;                                    /* of Limits */
-    double slope_noise, least_noise, largest_mm, coarse_mm, small_mm;                                /* of Steps */
-    double least_information, wanted[6], alike, least_slope_noise, most_height_mm, white_mm;          /* what is known */
-    double shared_error, unseen, height_error, offset_mm, least_share;                               /* how well */
+    double per_height, score_slope, score_height, deep, shallow;                            /* of Limits */
+    double slope_noise, least_noise, largest_mm, coarse_mm, small_mm;                        /* of Steps */
+    double least_information, wanted[6], alike, least_slope_noise, most_height_mm, white_mm; /* what is known */
+    double shared_error, unseen, height_error, offset_mm, least_share;                       /* how well */
 } Keyframe;
 
 /* Followed of follow.py. */
@@ -55,9 +55,6 @@ static void refine(const Keyframe *of, const Grid *in, const Pixels *pixels, int
     refine_pose(in->field, in->height, in->width, pixels->columns, pixels->stride, (int)pixels->number, steps, &by, NULL, 0, &at, sums);
     memcpy(pose, at.pose, sizeof at.pose);
 }
-
-/* Root mean square of slope residuals, per component. */
-static double slope_noise_of(const double *sums) { return sqrt(0.5 * sums[SLOPES] / fmax(sums[WEIGHT], 1e-9)); }
 
 /* The matrix of the twists of a Gauss-Newton step. */
 static void matrix_of(const double *sums, double scale, double A[6][6]) {

@@ -241,8 +241,7 @@ EXPORT void refine_pose(
             largest = fabs(step[k]) > largest ? fabs(step[k]) : largest;
         }
         move_pose(at->pose, twist, by->center);
-        const double weight = sums[WEIGHT], slopes = sums[SLOPES];
-        const double found = 1.5 * sqrt(0.5 * slopes / (weight > 1e-9 ? weight : 1e-9));
+        const double found = 1.5 * slope_noise_of(sums);
         noise = found > 0.5 * noise ? found : 0.5 * noise;
         noise = noise > by->least_noise ? noise : by->least_noise;
         if (largest < by->small_mm) break;

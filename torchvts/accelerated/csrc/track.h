@@ -29,6 +29,9 @@ EXPORT int height_sums(const float *field, int height, int width, const float *c
                        double *left);
 EXPORT int object_pixels(const float *field, int height, int width, double x0, double y0, double pitch, int64_t stride, float *columns);
 
+/* Root mean square of slope residuals, per component. */
+static inline double slope_noise_of(const double *sums) { return sqrt(0.5 * sums[SLOPES] / fmax(sums[WEIGHT], 1e-9)); }
+
 void solve_six(double A[6][6], const double b[6], double x[6]);
 void solve_step(const double *sums, const double *held, int holds, double largest_mm, double step[6]);
 void move_pose(double *pose, const double *twist, const double *center);

@@ -117,7 +117,7 @@ def test_onnx_of_an_image_whose_cells_are_larger_than_pixels(cells_of_two, tmp_p
     assert export.compare(export.export_onnx(pipe, tmp_path / "pipe.onnx"), pipe, frames, "onnx") <= 1e-3
 
 
-@pytest.mark.parametrize("kind", ["response fast", "own normals", *long_to_write("lights fast", "lights precise", "response auto")])
+@pytest.mark.parametrize("kind", ["response fast", *long_to_write("own normals", "lights fast", "lights precise", "response auto")])
 def test_torchscript_without_torchvts(low, mini, tmp_path, kind):
     """The optimiser of TorchScript takes 10 s and more for a graph of several passes."""
     calibration, frames = mini if kind.startswith("response") else low

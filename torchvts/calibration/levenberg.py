@@ -1,5 +1,6 @@
 """Levenberg-Marquardt as a torch optimiser for small least-squares problems, with forward-mode derivatives."""
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -25,6 +26,8 @@ class LevenbergMarquardt(Optimizer):
         >>> round(x.item(), 5) == 0.69315
         True
     """
+
+    add_param_group = inspect.unwrap(Optimizer.add_param_group)  # its wrapper imports torch._dynamo, which takes 2 s
 
     def __init__(self, parameter: Tensor, damping: float = 1e-3, tie: Tensor | None = None) -> None:
         super().__init__([parameter], {})

@@ -92,3 +92,14 @@ def test_the_import_is_light():
     ours = {"torchvts", "safetensors", "yaml", "numpy", "cython_runtime"}
     assert {name for name in packages - ours if not name.startswith("_")} == set()
     assert not [name for name in loaded if name.startswith(("torch._dynamo", "torch._inductor", "torch.onnx"))]
+
+
+def test_a_first_calibration_does_not_load_torchs_compilers():
+    program = (
+        "import sys; import torchvts as vts; from torchvts.model.lights import flat_image\n"
+        "lights = vts.PointLights([[25, 0, 30], [-12, 20, 30], [-12, -20, 30]], [900, 900, 900])\n"
+        "found = vts.calibrate(flat_image(lights, 24, 32, 1.2).detach(), vts.Sensor('rig', 24, 32, 1.2))\n"
+        "print(found.lights is not None, [name for name in sys.modules if name.startswith(('torch._dynamo', 'torch._inductor'))])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True", "[]"]

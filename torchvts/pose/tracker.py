@@ -397,7 +397,8 @@ class PoseTracker:
             by_drift = found.exact or (drift_deg > found.std_deg and 3.0 * drift_deg > TRUSTED_DEG)
             reason = "the way over keyframes adds up" if by_drift else "parts of the contact disagree"
             reason = reason if found.settled else "the last step was a large one"
-            message += f"; uncertain by {std_deg:.1f} degrees and {std_mm:.2f} mm: {reason}"
+            degrees = f"{std_deg:.1f}" if std_deg < 90.0 else "more than 90"
+            message += f"; uncertain by {degrees} degrees and {std_mm:.2f} mm: {reason}"
         return TrackedPose(
             T_target_source=torch.from_numpy(pose.copy()),
             rmse_mm=found.fine.depth_noise,

@@ -210,6 +210,21 @@ def test_kernels_divide_the_light_out_as_torch_does(size):
     assert middle.tolist() == pytest.approx([0.4 / 1.1, 0.4 / 0.8, 0.4 / 0.9], rel=0.02)
 
 
+def test_lazily_negated_frames_are_read_like_others():
+    image = torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(1)) * 0.2 + 0.4
+    negated = torch.complex(image, -image).conj().imag
+    assert negated.is_neg() and torch.equal(negated, image)
+    none = torch.zeros(1, 1, 40, 60, dtype=torch.bool)
+    planes = []
+    for frame in (image, negated):
+        light = streams.FollowLight(torch.full((3, 40, 60), 0.45))
+        light.start(frame)
+        light.update(0.99 * frame, none, 0.5)
+        planes.append(light.plane)
+        assert streams.FrameCheck(image[0])(frame) == ""
+    assert torch.equal(*planes)
+
+
 def test_the_light_knows_each_frame_whether_or_not_it_is_asked(unit):
     calibration, camera = unit
     pictures = [camera(0.0, dimming(k)) for k in range(40)]

@@ -11,7 +11,7 @@ Array = np.ndarray[Any, Any]
 
 def array_of(image: Tensor) -> Array:
     """An image as float32 on the CPU, of the same shape."""
-    array: Array = image.detach().float().cpu().numpy()
+    array: Array = image.detach().resolve_neg().float().cpu().numpy()
     return array
 
 

@@ -7,11 +7,12 @@ BIN := $(VENV)/bin
 
 setup: $(VENV)/.done
 
-# torch, sympy and torchvts are compiled at once: else each process does it, where PYTHONDONTWRITEBYTECODE is set.
+# All that is imported is compiled at once, by all cores: else each process does it, where PYTHONDONTWRITEBYTECODE is set.
+# A file that cannot be compiled is none that is imported.
 $(VENV)/.done: pyproject.toml constraints.txt hatch_build.py $(wildcard torchvts/accelerated/csrc/*.[ch])
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt --editable ".[pose,onnx,view,test,docs]"
-	$(BIN)/python -m compileall -q -j 0 -x testing/_internal $(VENV)/lib/python3*/site-packages/torch $(VENV)/lib/python3*/site-packages/sympy torchvts
+	$(BIN)/python -m compileall -qq -j 0 -x 'testing/_internal|/tests/|/plotly/' $(VENV)/lib/python3*/site-packages torchvts || true
 	touch $@
 
 demo: setup

@@ -196,10 +196,14 @@ class Deep(nn.Module):
 
 @pytest.mark.parametrize(
     "name, writer, suffix",
-    [("onnx", export.export_onnx, "onnx"), pytest.param("pt2", export.export_program, "pt2", marks=pytest.mark.long)],
+    [
+        ("torchscript", export.export_torchscript, "pt"),
+        pytest.param("onnx", export.export_onnx, "onnx", marks=pytest.mark.long),
+        pytest.param("pt2", export.export_program, "pt2", marks=pytest.mark.long),
+    ],
 )
 def test_a_chain_with_own_normals_and_masks_without_torchvts(low, tmp_path, name, writer, suffix):
-    """What the library does around them; a whole pipeline takes up to a minute to be written."""
+    """What the library does around them; ONNX and PT2 take ten seconds and more to be written."""
     if export.missing(name):
         pytest.skip(export.missing(name))
     calibration, frames = low

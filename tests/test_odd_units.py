@@ -111,13 +111,15 @@ SLOW = ("pale", "smooth 1", "smooth 2", "smooth 3")
 """Up to ten seconds each: lights of every kind are tried for pale ones in any case, for smooth ones where nothing else is given.
 The first of the smooth ones, which is quicker, stands for the others."""
 
+NEITHER_SMOOTH_NOR_WHOLE = ("steps", "one channel flat", "one channel dark", "LED in the image")
+
 
 def odd_cases():
-    """Each background as it is, two as JPEG; with a prior, presses, none or both. Most with one of both, and the slow, are long."""
+    """Each background as it is, two as JPEG; with a prior, presses, none or both. The slow are long, most with either too."""
     backgrounds = [*((name, False) for name in ODD), ("smooth 0", True), ("pale", True)]
     for (name, compressed), given in itertools.product(backgrounds, itertools.product((False, True), repeat=2)):
         if all(given):
-            quick = name not in SLOW
+            quick = name in NEITHER_SMOOTH_NOR_WHOLE
         elif any(given):
             quick = name in ("bright edges", "smooth 0") and not compressed
         else:

@@ -117,7 +117,7 @@ def test_onnx_of_an_image_whose_cells_are_larger_than_pixels(cells_of_two, tmp_p
     assert export.compare(export.export_onnx(pipe, tmp_path / "pipe.onnx"), pipe, frames, "onnx") <= 1e-3
 
 
-@pytest.mark.parametrize("kind", ["response fast", *long_to_write("own normals", "lights fast", "lights precise", "response auto")])
+@pytest.mark.parametrize("kind", long_to_write("response fast", "own normals", "lights fast", "lights precise", "response auto"))
 def test_torchscript_without_torchvts(low, mini, tmp_path, kind):
     """The optimiser of TorchScript takes 10 s and more for a graph of several passes."""
     calibration, frames = mini if kind.startswith("response") else low
@@ -194,23 +194,23 @@ class Deep(nn.Module):
         return deformed & (depth_mm > 0.1)
 
 
-@pytest.mark.parametrize(
-    "name, writer, suffix",
-    [
-        ("torchscript", export.export_torchscript, "pt"),
-        pytest.param("onnx", export.export_onnx, "onnx", marks=pytest.mark.long),
-        pytest.param("pt2", export.export_program, "pt2", marks=pytest.mark.long),
-    ],
-)
-def test_a_chain_with_own_normals_and_masks_without_torchvts(low, tmp_path, name, writer, suffix):
-    """What the library does around them; ONNX and PT2 take ten seconds and more to be written."""
-    if export.missing(name):
-        pytest.skip(export.missing(name))
-    calibration, frames = low
+def own_chain(calibration, frames):
+    """Own normals, own masks before and after them, and what the library does around them."""
     blocks = pipeline(calibration, "fast")
     chain = (blocks.compensate, Changed(blocks.compensate(frames[3:])), learned(), blocks.gradient, vts.PoissonDST(PITCH))
     pipe = vts.DepthPipeline(*chain, mm_per_pixel=PITCH, contact=Deep()).eval()
     assert pipe(frames).contact.flatten(1).any(1).tolist() == [True, True, True, False]
+    return pipe
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name, writer, suffix", [("onnx", export.export_onnx, "onnx"), ("pt2", export.export_program, "pt2")])
+def test_a_chain_with_own_normals_and_masks_without_torchvts(low, tmp_path, name, writer, suffix):
+    """As TorchScript below, which takes less time to write."""
+    if export.missing(name):
+        pytest.skip(export.missing(name))
+    calibration, frames = low
+    pipe = own_chain(calibration, frames)
     path = tmp_path / f"pipe.{suffix}"
     writer(pipe, path)
     assert export.compare(path, pipe, frames, name) <= 1e-4
@@ -359,9 +359,7 @@ class Unscriptable(nn.Module):
 def test_one_format_that_fails_leaves_the_others(low, tmp_path, monkeypatch):
     calibration, frames = low
     monkeypatch.setattr(export.formats, "find_spec", lambda name: None)
-    rows = export.export_checked(
-        pipeline(calibration, "fast", normals=learned()), tmp_path / "new", ["onnx", "torchscript"], frames
-    )
+    rows = export.export_checked(own_chain(calibration, frames), tmp_path / "new", ["onnx", "torchscript"], frames)
     assert [row.ok for row in rows] == [False, True]
     assert rows[0].reason == "onnx: onnx, onnxscript, onnxruntime not found: pip install 'torchvts[onnx]'"
     assert rows[1].size_kb > 10 and rows[1].difference_mm <= 1e-5

@@ -50,7 +50,7 @@ def test_trained_lights_count_without_gradients(mode: str, without_gradients: ty
     assert float((recorded - before).abs().max()) > 1e-3  # the step moved the lights
     assert float((found - recorded).abs().max()) < 1e-5
     assert float((pipe.requires_grad_(False)(image).depth_mm - recorded).abs().max()) < 1e-5
-    with torch.jit.optimized_execution(mode == "fast" and without_gradients is torch.no_grad):  # of the others it takes 10 s
+    with torch.jit.optimized_execution(False):  # which takes up to 10 s
         assert float((torch.jit.script(pipe)(image).depth_mm - recorded).abs().max()) < 1e-5
 
 

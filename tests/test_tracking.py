@@ -120,6 +120,54 @@ def test_a_cylinder_keeps_its_axis_unknown_and_is_followed_across():
     assert abs(float(off[1, 0])) < math.radians(0.1)  # yaw is known
 
 
+@pytest.mark.parametrize(("radius", "yaw"), [(1.0, 0.0), (1.2, 40.0), (1.5, 110.0)])
+def test_a_narrow_capsule_or_rod_may_roll_however_few_pixels_its_bend_covers(radius, yaw):
+    for height, names in (
+        (objects.capsule(radius), ["rotation"]),
+        (objects.cylinder(radius), ["translation", "rotation"]),
+    ):
+        poses = [objects.pose(yaw, (0.1 * k, 0.05 * k), 0.45) for k in range(8)]  # pure shifts: nothing turns
+        tracker = vts.PoseTracker(press(height, poses[0]), PITCH)
+        for pose in poses[1:]:
+            found = tracker(press(height, pose))
+            assert [name.split()[0] for name in found.ambiguous] == names and not found.lost
+            assert float(turn_deg(found.T_target_source)) < 0.2
+        registered = vts.register_depth(press(height, poses[0]), press(height, poses[4]), PITCH)
+        assert [name.split()[0] for name in registered.ambiguous] == names
+
+
+@pytest.mark.long
+def test_rolls_of_drawn_contacts_are_named():
+    """Counts of docs/decisions.md: a contact is thin where its radius is below 0.9 mm, 3.6 pixels of the coarse grid."""
+    random = np.random.default_rng(1)
+    right = {(kind, thin): [] for kind in ("cylinder", "capsule", "sphere") for thin in (True, False)}
+    for (kind, thin), found in right.items():
+        shape, free = getattr(objects, kind), {"cylinder": 2, "capsule": 1, "sphere": 3}[kind]
+        sizes = itertools.product(
+            (0.6, 0.7, 0.8) if thin else (0.9, 1.0, 1.2, 1.5, 2.0, 3.0, 5.0), (0.2, 0.45), (0.0, 17.0, 40.0, 75.0), (1, 2)
+        )
+        for radius, deep, yaw, fine in sizes:
+            pose = objects.pose(yaw, tuple(random.uniform(-0.1, 0.1, 2)), deep)
+            frame = objects.press(shape(radius), pose, 120 * fine, 160 * fine, PITCH / fine)
+            with contextlib.suppress(ValueError):  # some thin ones are too small to be a reference
+                found.append(vts.PoseTracker(frame, PITCH / fine).graph.keyframes[0].held.shape[1] == free)
+    counts = {key: (sum(found), len(found)) for key, found in right.items()}
+    print(counts)
+    assert all(some >= 0.95 * every for (_, thin), (some, every) in counts.items() if not thin)
+    assert sum(every for (_, thin), (_, every) in counts.items() if not thin) > 320
+
+
+def test_frames_of_a_rod_that_stands_still_are_not_lost():
+    unit = pose_accuracy.rig()
+    rod = objects.press(objects.cylinder(1.5), objects.pose(20.0, (0.0, 0.0), 0.4), 240, 320, 0.0625)
+    with torch.inference_mode():
+        frames = [unit[1](render(rod, unit[0], noise_std=0.005, bits=8, seed=k)) for k in range(4)]
+    tracker = vts.PoseTracker(frames[0], 0.0625)
+    for frame in frames[1:]:
+        found = tracker(frame)
+        assert found.ambiguous == ["translation along 20 degrees", "rotation about 20 degrees"] and not found.lost
+
+
 def test_lift_off_is_said_and_the_object_is_found_again():
     height = objects.key()
     tracker = vts.PoseTracker(press(height, objects.pose(0.0)), PITCH)
@@ -521,7 +569,9 @@ def test_a_bad_frame_is_said_and_the_tracker_goes_on():
     bad = {
         "no contact": _bad(good, contact=torch.zeros_like(good.contact)),
         "depth or gradient is not finite, or beyond 1e+06": _bad(good, depth_mm=good.depth_mm * math.nan),
-        "expected 120 x 160 pixels like the reference, got 96 x 128": objects.press(height, objects.pose(0.0), 96, 128, PITCH),
+        "expected 120 x 160 pixels like the reference, got 96 x 128: of another sensor, or cut out?": objects.press(
+            height, objects.pose(0.0), 96, 128, PITCH
+        ),
     }
     for reason, frame in bad.items():
         assert tracker(frame).lost == reason
@@ -529,6 +579,8 @@ def test_a_bad_frame_is_said_and_the_tracker_goes_on():
         assert found.converged and not found.lost and float(turn_deg(found.T_target_source)) < 0.05
     with pytest.raises(TypeError, match="expected a DepthOutput"):
         tracker(good.depth_mm)
+    with pytest.raises(TypeError, match=r"expected floating point depth_mm, mm, got torch\.int32"):
+        tracker(_bad(good, depth_mm=(1000.0 * good.depth_mm).int()))
     with pytest.raises(TypeError, match="DepthOutput, whose contact is no tensor but NoneType"):
         tracker(_bad(good, contact=None))
     with pytest.raises(ValueError, match="loop over the batch"):
@@ -685,10 +737,30 @@ def test_other_types_and_restart():
     found = tracker(double[1])
     assert found.converged and not found.T_target_source.requires_grad
     tracker(_bad(frames[0], contact=torch.zeros_like(frames[0].contact)))
-    tracker.restart(swing(1) @ invert(swing(0)))
+    known = swing(1) @ invert(swing(0))
+    tracker.restart(known)
+    known[0, 3] = 50.0  # the caller's tensor is not the tracker's
     assert error(tracker(frames[1]), swing(0), swing(1))[0] < 0.1
     tracker.reset(frames[1])
     assert float(turn_deg(tracker(frames[1]).T_target_source)) < 0.01
+
+
+def test_the_default_dtype_changes_nothing():
+    frames = [press(objects.key(), swing(k)) for k in (0, 1, 12)]
+
+    def poses():
+        tracker = vts.PoseTracker(frames[0], PITCH)
+        found = [tracker(frame) for frame in frames[1:]]  # the last one is lost, and searched
+        assert found[-1].lost
+        found += [tracker(frames[2]), vts.register_depth(frames[0], frames[1], PITCH)]
+        return torch.stack([one.T_target_source for one in found])
+
+    expected = poses()
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert torch.equal(poses(), expected)
+    finally:
+        torch.set_default_dtype(torch.float32)
 
 
 def test_slopes_err_as_much_as_asked_and_alike_in_all_frames():

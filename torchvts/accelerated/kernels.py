@@ -670,7 +670,7 @@ def track_grids(
         times: pixels a side of the cells of both grids.
     """
     height, width = depth.shape[-2:]
-    fine, coarse = (torch.empty(height // n, width // n, 4) for n in times)
+    fine, coarse = (torch.empty(height // n, width // n, 4, dtype=torch.float32) for n in times)
     inputs = (depth.data_ptr(), slopes.data_ptr(), contact.data_ptr(), height, width, least_mm, *times)
     touching = loaded().track_grids(*inputs, fine.data_ptr(), coarse.data_ptr())
     _check(touching < 0)
@@ -685,6 +685,6 @@ def contact_pixels(depth: Tensor, slopes: Tensor, contact: Tensor) -> int:
 def object_pixels(field: Tensor, x0: float, y0: float, pitch: float) -> Tensor:
     """Columns (5, N) x, y, z, p and q of the cells of a field that lie on the object: see :mod:`torchvts.pose.follow`."""
     height, width = field.shape[:2]
-    columns = torch.empty(5, height * width)
+    columns = torch.empty(5, height * width, dtype=torch.float32)
     number = loaded().object_pixels(field.data_ptr(), height, width, x0, y0, pitch, height * width, columns.data_ptr())
     return columns[:, :number]

@@ -62,6 +62,8 @@ def run(arguments: argparse.Namespace) -> int:
     check_folder(arguments.out)
     if arguments.view and not has_screen():
         raise UsageError("--view: expected a screen, this machine has none: --save FILE.rrd records what it would show")
+    if arguments.save is not None and arguments.save.suffix.lower() != ".rrd":
+        raise UsageError(f"--save: expected a name ending in .rrd, got {arguments.save.name!r}: the video is written to --out")
     reference = None if arguments.reference is None else read_image(arguments.reference)
     unit = load_unit(arguments)
     with contextlib.ExitStack() as stack:

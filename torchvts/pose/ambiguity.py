@@ -19,10 +19,21 @@ SINE_OF_AXIS = 0.3
 LEAST_INFORMATION = 0.05
 """Squared change of slope, in units of its noise, per squared mm of motion, below which a motion is unknown: 0.013 a mm."""
 
-DEEP, ROLL = 0.6, 0.5
-"""Share of the largest depth above which the skin certainly lies on the object; and share of the contact's radius by which a
-motion is tried. The deep part of a ball on a GelSight Mini, rolled by 0.35 of the radius, fits worse by 0.00 to 0.03 of slope where
-frames disagree by 0.03 to 0.06; moved in the three other ways by 0.14 and more."""
+DEEP = 0.6
+"""Share of the largest depth above which the skin certainly lies on the object."""
+
+ROLLS = (0.5, 0.25, 0.125, 0.0625)
+"""Shares of the contact's radius by which a motion is tried. The deep part of a ball on a GelSight Mini, rolled by 0.35 of the
+radius, fits worse by 0.00 to 0.03 of slope where frames disagree by 0.03 to 0.06; moved in the three other ways by 0.14 and more.
+A thin rod is so long that only the small shares of that radius leave it where it touches."""
+
+COMPARED = 0.3
+"""Share of the deep part's pixels that must still touch after a motion that is tried: of a rod a few pixels wide a third does."""
+
+TURNED = (3.0, 5.0, 5.0, 5.0)
+"""How many times the rise of the mean squared residual the mean square must be by which normals turn, for each share of the radius.
+By half of the radius real balls have 4 to 5; by the small shares thin rods, capsules and balls have 10 and more,
+a roof or a screw thread 3 to 5."""
 
 ALIKE_PIXELS = 25.0
 """Number of pixels over which slope errors are alike; with it the covariance predicts the errors measured on rendered scenes."""
@@ -52,7 +63,8 @@ def find_unknown(source: Relief, target: Relief, pose: Tensor, noise: float) -> 
 
     Two tests: whether slopes and heights of the whole contact change with a motion; and, where the contact is a single hill,
     whether its deep part rolls on itself: its normals turn by more than the frames disagree, and it still fits no worse. The deep
-    part lies on the object; the skin around a ball moves with the contact, not with the ball, and hides that the ball can roll.
+    part lies on the object; the skin around a ball moves with the contact, not with the ball, and hides that the ball can roll. Of
+    a thin rod a pixel covers so much of the bend that derivatives are wrong: only the second test finds that it can roll.
 
     Args:
         source: the relief that is moved.
@@ -65,23 +77,37 @@ def find_unknown(source: Relief, target: Relief, pose: Tensor, noise: float) -> 
     _, inside, _, _ = source.sample((points @ back[:3, :3].T + back[:3, 3])[:, :2])
     bent = target._replace(field=field_with_fitted_curvature(target))
     bias = information_of_noise(noise, target.pitch)
-    found = Unknown(torch.zeros(6, 0, dtype=torch.float64), [])
-    for part in (inside, inside & (points[:, 2] > DEEP * points[:, 2].max())):
-        if int(part.sum()) < 6 or (part is not inside and not _is_one_hill(target)):
-            continue
-        common = target._replace(points=points[part], slopes=slopes[part])
+    if int(inside.sum()) < 6:
+        return Unknown(torch.zeros(6, 0, dtype=torch.float64), [])
+    common = target._replace(points=points[inside], slopes=slopes[inside])
+    center, units = common.points.double().mean(0), twist_units(common)
+    free, shifts = free_directions(_information(common, bent, center, units), bias, LEAST_INFORMATION)
+    moved = _about_origin(free, center, units)
+    deep = inside & (points[:, 2] > DEEP * points[:, 2].max())
+    if int(deep.sum()) >= 6 and _is_one_hill(target):
+        common = target._replace(points=points[deep], slopes=slopes[deep])
         center, units = common.points.double().mean(0), twist_units(common)
-        information = _information(common, bent, center, units)
-        free, shifts = free_directions(information, bias, LEAST_INFORMATION)
-        if part is not inside:
-            motions = torch.linalg.eigh(information).eigenvectors
-            rolls = _rolls(source, target, pose, _Trial(common.slopes, center, units, motions))
-            free, shifts = motions[:, rolls], shifts[:, :0]
-        if free.shape[1] > found.motions.shape[1]:
-            moved = units[:, None] * free  # rad and mm; rotations about the center become rotations about the origin and shifts
-            moved[3:] = moved[3:] - torch.linalg.cross(moved[:3], center[:, None].expand_as(moved[:3]), dim=0)
-            found = Unknown(moved, name_directions(free, shifts))
-    return found
+        motions = torch.linalg.eigh(_information(common, bent, center, units)).eigenvectors
+        rolls = motions[:, _rolls(source, target, pose, _Trial(common.slopes, center, units, motions))]
+        slides = torch.cat((torch.zeros_like(shifts), shifts))  # of the whole contact; a rod rolls and slides
+        rolls = _span(torch.cat((slides, rolls - slides @ (slides.T @ rolls)), dim=1))
+        if rolls.shape[1] > free.shape[1]:
+            free, moved = rolls, _about_origin(rolls, center, units)
+    return Unknown(moved, name_directions(moved, shifts))
+
+
+def _span(columns: Tensor) -> Tensor:
+    """Orthonormal columns that span some columns (n, k) of length about 1; what is shorter than 0.3 beside others is noise."""
+    u, sizes, _ = torch.linalg.svd(columns, full_matrices=False)
+    span: Tensor = u[:, sizes > 0.3]
+    return span
+
+
+def _about_origin(motions: Tensor, center: Tensor, units: Tensor) -> Tensor:
+    """Scaled twists (6, k) about a center, in rad and mm about the origin: rotations become rotations and shifts."""
+    moved = units[:, None] * motions
+    moved[3:] = moved[3:] - torch.linalg.cross(moved[:3], center[:, None].expand_as(moved[:3]), dim=0)
+    return moved
 
 
 def turned_otherwise(turns: list[Array], unknown: Array, names: list[str]) -> list[int]:
@@ -201,35 +227,39 @@ class _Trial(NamedTuple):
 
 
 def _rolls(source: Relief, target: Relief, pose: Tensor, trial: _Trial) -> Tensor:
-    """Which motions turn the deep part's normals and leave its fit unchanged; bool (K,)."""
-    step = ROLL / float(trial.units[0])  # mm: a share of the contact's radius
-    twists = (trial.motions * trial.units[:, None]).T
-    poses = torch.cat([pose] + [motion(share * step * twists, trial.center) @ pose for share in (1.0, -1.0, 0.5, -0.5)])
-    lin = linearise(source, target, poses, torch.zeros(1, 1, 3, dtype=torch.float64))
+    """Which motions turn the deep part's normals and leave its fit unchanged, by steps of some length; bool (K,)."""
     deep = source.points[:, 2] > DEEP * source.points[:, 2].max()
+    source = source._replace(points=source.points[deep], slopes=source.slopes[deep])
+    steps = torch.tensor(ROLLS, dtype=torch.float64)[:, None] / float(trial.units[0])  # (R, 1), mm: shares of the contact's radius
+    twists = (trial.motions * trial.units[:, None]).T
+    signed = torch.stack((steps, -steps))[..., None] * twists  # (2, R, K, 6)
+    poses = torch.cat((pose, motion(signed.flatten(0, 2), trial.center) @ pose))
+    lin = linearise(source, target, poses, torch.zeros(1, 1, 3, dtype=torch.float64))
     squared = lin.slope.square().sum(-1) + (lin.height * (SLOPE_NOISE / (5.0 * DEPTH_NOISE_MM))).square()
-    squared = squared[:, deep].clamp_max((CUT * SLOPE_NOISE) ** 2)
-    tried = squared[1:].reshape(4, len(twists), -1)  # (4, K, N)
-    compared = (lin.counts[1:, deep].reshape(tried.shape) & lin.counts[0, deep]).double()
+    squared = squared.clamp_max((CUT * SLOPE_NOISE) ** 2)
+    tried = squared[1:].reshape(*signed.shape[:3], -1)  # (2, R, K, N)
+    compared = (lin.counts[1:].reshape(tried.shape) & lin.counts[0]).double()
     count = compared.sum(-1)
     rise = (((tried - squared[0]) * compared).sum(-1) / count.clamp_min(1.0)).amax(0)
     p, q = trial.slopes.double().T
     turn = torch.stack((torch.stack((p * q, -(1 + p * p), -q), -1), torch.stack((1 + q * q, -p * q, p), -1)), 1)  # (N, 2, 3)
-    turned = (turn @ twists[:, :3].T).square().sum(1).mean(0) * step**2
-    noise = 2.0 * max(float(squared[0][lin.counts[0, deep]].mean()), SLOPE_NOISE**2)
-    whole = count.amin(0) > 0.5 * int(deep.sum())
-    return whole & (rise < noise) & (turned > (3.0 * rise).clamp_min(noise))
+    turned = (turn @ twists[:, :3].T).square().sum(1).mean(0) * steps**2
+    noise = 2.0 * max(float(squared[0][lin.counts[0]].mean()), SLOPE_NOISE**2)
+    whole = count.amin(0) > COMPARED * int(lin.counts[0].sum())
+    times = torch.tensor(TURNED, dtype=torch.float64)[:, None]
+    return (whole & (rise < noise) & (turned > (times * rise).clamp_min(noise))).any(0)
 
 
 def field_with_fitted_curvature(relief: Relief) -> Tensor:
     """The field with second derivatives from planes through the slopes of 3 x 3 pixels inside: the skin bends beyond the rim."""
     side = (-1.0, 0.0, 1.0)
-    place = torch.tensor([[1.0, x, -y] for y in side for x in side])  # rows go down, y up
+    like = relief.field.new_tensor
+    place = like([[1.0, x, -y] for y in side for x in side])  # rows go down, y up
     place[:, 1:] *= relief.pitch
-    weight = unfold(relief.inside.float()[None, None], 3, padding=1)[0].T  # (H W, 9)
+    weight = unfold(relief.inside.to(place.dtype)[None, None], 3, padding=1)[0].T  # (H W, 9)
     slopes = unfold(relief.field[1:3, None], 3, padding=1).permute(2, 1, 0)  # (H W, 9, 2)
     weighted = place.T * weight[:, None]  # (H W, 3, 9)
-    ridge = 1e-3 * torch.diag(torch.tensor([0.0, 1.0, 1.0])) * relief.pitch**2 + 1e-9 * torch.eye(3)
+    ridge = 1e-3 * torch.diag(like([0.0, 1.0, 1.0])) * relief.pitch**2 + 1e-9 * torch.diag(like([1.0, 1.0, 1.0]))
     plane = torch.linalg.solve(weighted @ place + ridge, weighted @ slopes)  # (H W, 3, 2)
     p_x, p_y, q_x, q_y = plane[:, 1, 0], plane[:, 2, 0], plane[:, 1, 1], plane[:, 2, 1]
     bend = torch.stack((p_x, 0.5 * (p_y + q_x), q_y)).reshape(3, *relief.inside.shape)

@@ -92,7 +92,7 @@ def _turns(poses: Tensor) -> Tensor:
     for turn in angle.tolist():
         if all(abs(math.remainder(turn - other, 2.0 * math.pi)) > math.radians(1.0) for other in kept):
             kept.append(turn)
-    return torch.tensor(kept[:MOST_TURNS])
+    return torch.tensor(kept[:MOST_TURNS], dtype=torch.float32)
 
 
 def symmetries(a: Levels) -> list[Tensor]:

@@ -201,7 +201,7 @@ def _draw_scattered(cloud: Cloud, size: tuple[int, int], pitch: float) -> _Heigh
         slope = (weight[..., None] * tilt[index]).sum(1)
         height = (weight * (heights - (tilt[index] * offset).sum(-1))).sum(1)
         noise = min(0.012, float((tilt[index[:, 0]] - slope).abs().median()) / 0.6745)
-    z, slopes = torch.zeros(rows * columns), torch.zeros(2, rows * columns)
+    z, slopes = (torch.zeros(*size, rows * columns, dtype=torch.float32) for size in ((), (2,)))
     z[inside], slopes[:, inside] = height.float(), slope.T.float()
     return _HeightMap(z.reshape(rows, columns), slopes.reshape(2, rows, columns), inside.reshape(rows, columns), noise)
 
@@ -209,11 +209,11 @@ def _draw_scattered(cloud: Cloud, size: tuple[int, int], pitch: float) -> _Heigh
 def _slopes(z: Tensor, inside: Tensor, pitch: float) -> Tensor:
     """Slopes (2, H, W), y up, of planes through 3 x 3 heights inside."""
     side = (-1.0, 0.0, 1.0)
-    place = torch.tensor([[1.0, x, -y] for y in side for x in side])
-    weight = unfold(inside.float()[None, None], 3, padding=1)[0].T
+    place = z.new_tensor([[1.0, x, -y] for y in side for x in side])
+    weight = unfold(inside.to(z.dtype)[None, None], 3, padding=1)[0].T
     heights = unfold(z[None, None], 3, padding=1)[0].T[..., None]
     weighted = place.T * weight[:, None]
-    ridge = torch.diag(torch.tensor([1e-9, 1e-3, 1e-3]))
+    ridge = torch.diag(z.new_tensor([1e-9, 1e-3, 1e-3]))
     middle = z.reshape(-1, 1, 1)
     plane = torch.linalg.solve(weighted @ place + ridge, weighted @ (heights - middle))
     slopes: Tensor = (plane[:, 1:, 0].T / pitch).reshape(2, *z.shape) * inside

@@ -19,6 +19,9 @@ LEAST_SIDE = 16
 LEAST_PIXELS = 60
 """A contact of fewer pixels has no pose."""
 
+LEAST_CELLS = 12
+"""On its coarsest grid a contact has at least so many pixels."""
+
 HUGE = 1e6
 """Depth, mm, and slopes beyond this are no measurement; their squares would overflow."""
 
@@ -83,7 +86,7 @@ def check_frame(name: str, frame: DepthFrame) -> tuple[int, int]:
     """Height and width of one frame.
 
     Raises:
-        TypeError: no DepthOutput.
+        TypeError: no DepthOutput, or one of integers.
         ValueError: not one frame, or parts of several sizes.
     """
     for part in ("depth_mm", "gradient", "contact"):
@@ -91,6 +94,9 @@ def check_frame(name: str, frame: DepthFrame) -> tuple[int, int]:
         if not isinstance(value, Tensor):
             what = f"whose {part} is no tensor but {type(value).__name__}" if hasattr(frame, part) else f"which has no {part}"
             raise TypeError(f"{name}: expected a DepthOutput, as a DepthPipeline returns, got {type(frame).__name__}, {what}")
+    for part in ("depth_mm", "gradient"):
+        if not getattr(frame, part).is_floating_point():
+            raise TypeError(f"{name}: expected floating point {part}, mm, got {getattr(frame, part).dtype}: raw values of a file?")
     height, width = frame.depth_mm.shape[-2:] if frame.depth_mm.dim() >= 2 else (0, 0)
     for part, channels in (("depth_mm", 1), ("gradient", 2), ("contact", 1), ("deformed", 1)):
         shape = tuple(getattr(frame, part, frame.contact).shape)  # a scene has no deformed skin
@@ -145,11 +151,11 @@ def levels(frame: DepthFrame, mm_per_pixel: float, name: str) -> Levels:
             f"{name}: expected a frame at most 40 times as long as wide, got {depth.shape[0]} x {depth.shape[1]}: a cut-out?"
         )
     made = [relief(depth, slope, inside, inside | deep, mm_per_pixel, times, corner) for times in every]
-    if min(len(one.points) for one in made) < 12:
-        least = least_depth_mm(noise, mm_per_pixel)
+    if min(len(one.points) for one in made) < LEAST_CELLS:
+        least, cells = least_depth_mm(noise, mm_per_pixel), min(len(one.points) for one in made)
         raise ValueError(
-            f"{name}: expected a contact deeper than {least:.3f} mm on some dozens of pixels, got {int(inside.sum())}: "
-            "pressed too faintly, or depth is not in mm?"
+            f"{name}: expected a contact deeper than {least:.3f} mm on {LEAST_CELLS} cells of {every[2]} x {every[2]} pixels, "
+            f"got {cells} ({int(inside.sum())} pixels): pressed too faintly, too small, or depth is not in mm?"
         )
     return Levels(made[0], made[1], made[2], noise / every[2])
 
@@ -211,6 +217,6 @@ def relief(
     q_y, q_x = torch.gradient(smooth[1], spacing=pitch)
     field = torch.cat((stack, p_x[None], 0.5 * (q_x - p_y)[None], -q_y[None]))
     mask = whole[0]
-    row, column = torch.nonzero(mask, as_tuple=True)
+    row, column = (place.to(depth.dtype) for place in torch.nonzero(mask, as_tuple=True))
     points = torch.stack((x0 + column * pitch, y0 - row * pitch, stack[0][mask]), dim=1)
     return Relief(field, mask, near[0], x0, y0, pitch, points, stack[1:, mask].T.contiguous())

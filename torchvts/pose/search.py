@@ -53,7 +53,7 @@ def search_plane(source: Relief, target: Relief, most: int = 48, angle: Tensor |
         Padfield, Masked object registration in the Fourier domain, IEEE Trans. Image Processing 21(5), 2012, on complex slopes.
     """
     around = angle is None
-    angle = torch.deg2rad(torch.arange(0.0, 360.0, STEP_DEG)) if angle is None else angle
+    angle = torch.deg2rad(torch.arange(0.0, 360.0, STEP_DEG, dtype=torch.float32)) if angle is None else angle
     moving, fixed = _square(source, rotatable=True), _square(target)
     score = _masked_correlation(moving.channels, fixed.channels, angle)
     peaks = _peaks(score, max(1, min(round(PEAK_MM / target.pitch), min(score.shape[1:]) // 2)), around, most)
@@ -120,7 +120,7 @@ def _square(relief: Relief, rotatable: bool = False) -> _Square:
     side += 2 + side % 2
     mask = relief.inside[top : bottom + 1, left : right + 1].float()
     slopes = relief.field[1:3, top : bottom + 1, left : right + 1] * mask
-    channels = torch.zeros(3, side, side)
+    channels = torch.zeros(3, side, side, dtype=torch.float32)
     row, column = side // 2 - (top + bottom) // 2 - 1 + top, side // 2 - (left + right) // 2 - 1 + left
     channels[:, row : row + high, column : column + wide] = torch.cat((slopes, mask[None]))
     # between pixels, as the middle of a square of even side

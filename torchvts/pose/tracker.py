@@ -160,7 +160,7 @@ class PoseTracker:
 
     def restart(self, T_target_source: Tensor) -> None:
         """Track on from a pose of the reference, (4, 4), such as one that the robot's arm reports."""
-        self._poses, self._tracking, self._symmetries = [check_rigid("T_target_source", T_target_source).numpy()], True, []
+        self._poses, self._tracking, self._symmetries = [check_rigid("T_target_source", T_target_source).numpy().copy()], True, []
 
     def __call__(self, frame: DepthFrame) -> TrackedPose:
         """Pose of the reference in a frame.
@@ -177,7 +177,8 @@ class PoseTracker:
             contact = contact_frame(frame)
             size = tuple(contact.depth_mm.shape[-2:])
             if size != self._size:
-                raise Unusable(f"expected {self._size[0]} x {self._size[1]} pixels like the reference, got {size[0]} x {size[1]}")
+                expected = f"expected {self._size[0]} x {self._size[1]} pixels like the reference"
+                raise Unusable(f"{expected}, got {size[0]} x {size[1]}: of another sensor, or cut out?")
         except Unusable as error:
             return self._lose(str(error))
         reference = self.graph.keyframes[0]
@@ -243,6 +244,8 @@ class PoseTracker:
             if found.fitness >= LEAST_FITNESS and found.overlap < LEAST_OVERLAP:
                 return f"too little to compare near the last pose, {common}: lifted, another part of the object, or a jump"
             agrees = f"{100 * found.fitness:.0f} % of what is compared agrees, {common}"
+            if found.fitness >= LEAST_FITNESS:
+                agrees += f", and what agrees differs much (cost {found.cost:.2f}, {MOST_COST:g} at most)"
             return f"nothing fits near the last pose: {agrees}: another part of the object, a jump, or another object"
         usual = median([slope for slope, _ in self._usual]) if len(self._usual) >= 3 else math.inf
         if found.fine.slope_noise > max(RISE * usual, LEAST_NOISE):

@@ -579,7 +579,7 @@ def test_a_bad_frame_is_said_and_the_tracker_goes_on():
         assert found.converged and not found.lost and float(turn_deg(found.T_target_source)) < 0.05
     with pytest.raises(TypeError, match="expected a DepthOutput"):
         tracker(good.depth_mm)
-    with pytest.raises(TypeError, match=r"expected floating point depth_mm, mm, got torch\.int32"):
+    with pytest.raises(TypeError, match=r"expected floating point depth_mm, got torch\.int32"):
         tracker(_bad(good, depth_mm=(1000.0 * good.depth_mm).int()))
     with pytest.raises(TypeError, match="DepthOutput, whose contact is no tensor but NoneType"):
         tracker(_bad(good, contact=None))

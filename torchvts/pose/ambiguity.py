@@ -90,17 +90,16 @@ def find_unknown(source: Relief, target: Relief, pose: Tensor, noise: float) -> 
         motions = torch.linalg.eigh(_information(common, bent, center, units)).eigenvectors
         rolls = motions[:, _rolls(source, target, pose, _Trial(common.slopes, center, units, motions))]
         slides = torch.cat((torch.zeros_like(shifts), shifts))  # of the whole contact; a rod rolls and slides
-        rolls = _span(torch.cat((slides, rolls - slides @ (slides.T @ rolls)), dim=1))
+        rolls = torch.from_numpy(span(torch.cat((slides, rolls - slides @ (slides.T @ rolls)), dim=1).numpy()))
         if rolls.shape[1] > free.shape[1]:
             free, moved = rolls, _about_origin(rolls, center, units)
     return Unknown(moved, name_directions(moved, shifts))
 
 
-def _span(columns: Tensor) -> Tensor:
-    """Orthonormal columns that span some columns (n, k) of length about 1; what is shorter than 0.3 beside others is noise."""
-    u, sizes, _ = torch.linalg.svd(columns, full_matrices=False)
-    span: Tensor = u[:, sizes > 0.3]
-    return span
+def span(columns: Array) -> Array:
+    """Orthonormal columns that span some columns (n, k) of length about 1; what is shorter than 0.5 beside the others is noise."""
+    u, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    return u[:, : len(sizes)][:, sizes > 0.5]
 
 
 def _about_origin(motions: Tensor, center: Tensor, units: Tensor) -> Tensor:

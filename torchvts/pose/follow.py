@@ -10,7 +10,7 @@ import torch
 from ..accelerated import following, kernels
 from ..accelerated.gate import usable
 from .alignment import DEPTH_DRIFT_MM, SLOPE_NOISE, agrees_enough
-from .ambiguity import ALIKE_PIXELS, LEAST_INFORMATION, UNKNOWN_VARIANCE, free_directions, name_directions
+from .ambiguity import ALIKE_PIXELS, LEAST_INFORMATION, UNKNOWN_VARIANCE, free_directions, name_directions, span
 from .height_errors import ERROR, MOST_MM, WHITE_MM, height_sums
 from .inverse import (
     DEEP_MM,
@@ -347,11 +347,6 @@ def _vague(keyframe: Keyframe, some: Sums) -> _Unknown:
 
 def _joined(one: _Unknown, other: _Unknown) -> _Unknown:
     """All motions that are in one or the other."""
-
-    def span(columns: Array) -> Array:
-        u, size, _ = np.linalg.svd(columns, full_matrices=False)
-        return u[:, : len(size)][:, size > 0.5]
-
     return _Unknown(span(np.hstack((one.motions, other.motions))), span(np.hstack((one.shifts, other.shifts))))
 
 

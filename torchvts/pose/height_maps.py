@@ -201,7 +201,7 @@ def _draw_scattered(cloud: Cloud, size: tuple[int, int], pitch: float) -> _Heigh
         slope = (weight[..., None] * tilt[index]).sum(1)
         height = (weight * (heights - (tilt[index] * offset).sum(-1))).sum(1)
         noise = min(0.012, float((tilt[index[:, 0]] - slope).abs().median()) / 0.6745)
-    z, slopes = (torch.zeros(*size, rows * columns, dtype=torch.float32) for size in ((), (2,)))
+    z, slopes = torch.zeros(rows * columns, dtype=torch.float32), torch.zeros(2, rows * columns, dtype=torch.float32)
     z[inside], slopes[:, inside] = height.float(), slope.T.float()
     return _HeightMap(z.reshape(rows, columns), slopes.reshape(2, rows, columns), inside.reshape(rows, columns), noise)
 

@@ -94,9 +94,8 @@ def check_frame(name: str, frame: DepthFrame) -> tuple[int, int]:
         if not isinstance(value, Tensor):
             what = f"whose {part} is no tensor but {type(value).__name__}" if hasattr(frame, part) else f"which has no {part}"
             raise TypeError(f"{name}: expected a DepthOutput, as a DepthPipeline returns, got {type(frame).__name__}, {what}")
-    for part in ("depth_mm", "gradient"):
-        if not getattr(frame, part).is_floating_point():
-            raise TypeError(f"{name}: expected floating point {part}, mm, got {getattr(frame, part).dtype}: raw values of a file?")
+        if part != "contact" and not value.is_floating_point():
+            raise TypeError(f"{name}: expected floating point {part}, got {value.dtype}: raw values of a file?")
     height, width = frame.depth_mm.shape[-2:] if frame.depth_mm.dim() >= 2 else (0, 0)
     for part, channels in (("depth_mm", 1), ("gradient", 2), ("contact", 1), ("deformed", 1)):
         shape = tuple(getattr(frame, part, frame.contact).shape)  # a scene has no deformed skin
@@ -151,8 +150,9 @@ def levels(frame: DepthFrame, mm_per_pixel: float, name: str) -> Levels:
             f"{name}: expected a frame at most 40 times as long as wide, got {depth.shape[0]} x {depth.shape[1]}: a cut-out?"
         )
     made = [relief(depth, slope, inside, inside | deep, mm_per_pixel, times, corner) for times in every]
-    if min(len(one.points) for one in made) < LEAST_CELLS:
-        least, cells = least_depth_mm(noise, mm_per_pixel), min(len(one.points) for one in made)
+    cells = min(len(one.points) for one in made)
+    if cells < LEAST_CELLS:
+        least = least_depth_mm(noise, mm_per_pixel)
         raise ValueError(
             f"{name}: expected a contact deeper than {least:.3f} mm on {LEAST_CELLS} cells of {every[2]} x {every[2]} pixels, "
             f"got {cells} ({int(inside.sum())} pixels): pressed too faintly, too small, or depth is not in mm?"

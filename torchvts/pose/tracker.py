@@ -238,14 +238,14 @@ class PoseTracker:
     def _problem(self, index: int, found: Followed, starts: list[Array]) -> str:
         """Why a pose cannot be trusted; empty if it can."""
         costs = [cost for _, cost in self._usual]
-        usual_cost = median(costs) if len(costs) >= 3 else 0.0
-        if not agrees_enough(found.fitness, found.overlap, found.cost / max(1.0, COST_RISE * usual_cost / MOST_COST)):
+        most_cost = max(MOST_COST, COST_RISE * median(costs) if len(costs) >= 3 else 0.0)
+        if not agrees_enough(found.fitness, found.overlap, found.cost * (MOST_COST / most_cost)):
             common = f"{100 * found.overlap:.0f} % of the smaller contact in common"
             if found.fitness >= LEAST_FITNESS and found.overlap < LEAST_OVERLAP:
                 return f"too little to compare near the last pose, {common}: lifted, another part of the object, or a jump"
             agrees = f"{100 * found.fitness:.0f} % of what is compared agrees, {common}"
-            if found.fitness >= LEAST_FITNESS:
-                agrees += f", and what agrees differs much (cost {found.cost:.2f}, {MOST_COST:g} at most)"
+            if found.cost > most_cost:
+                agrees += f", mean truncated residual {found.cost:.2f}, {most_cost:.2f} at most"
             return f"nothing fits near the last pose: {agrees}: another part of the object, a jump, or another object"
         usual = median([slope for slope, _ in self._usual]) if len(self._usual) >= 3 else math.inf
         if found.fine.slope_noise > max(RISE * usual, LEAST_NOISE):

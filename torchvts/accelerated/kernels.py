@@ -59,11 +59,11 @@ SIGNATURES = {
     "alignment_sums": ("v", "p ii p l ii pp"),
     "part_sums": ("v", "p ii p l ii pp"),
     "refine_pose": ("v", "p ii p l ii pp i pp"),
-    "height_sums": ("i", "p ii p l i p ppp ii dd p"),
+    "height_sums": ("i", "p ii p l i p pppp ii dd p"),
     "track_grids": ("i", "ppp ii f ii pp"),
     "contact_pixels": ("i", "ppp l"),
     "object_pixels": ("i", "p ii ddd l p"),
-    "follow_frame": ("i", "pppp i p"),
+    "follow_frame": ("i", "pppp i pp"),
 }
 """What each kernel returns and takes, a letter each: a pointer, int, float, double, int64 (l), or nothing (v)."""
 
@@ -645,15 +645,15 @@ def height_sums(
         field: of the frame.
         columns: of the keyframe's pixels.
         limits: as of :func:`alignment_sums`.
-        cells: the cell of each pixel, int64, the number of pixels of each cell, and what its height changes by, float64.
+        cells: the cell of each pixel, int64, the number of pixels of each cell, what its height changes by, and products of that.
         most_mm: height residuals of more than this are left out.
         white_mm: unit of the residuals of cells.
     """
-    cell, number, lines = cells
+    cell, number, lines, products = cells
     left = np.empty((7, 7))
     inputs = (field.data_ptr(), *field.shape[:2], columns.data_ptr(), columns.stride(0), columns.shape[1], limits.ctypes.data)
-    of_cells = (cell.ctypes.data, number.ctypes.data, lines.ctypes.data, len(number), lines.shape[1] - 6, most_mm, white_mm)
-    _check(loaded().height_sums(*inputs, *of_cells, left.ctypes.data))
+    arrays = (cell.ctypes.data, number.ctypes.data, lines.ctypes.data, products.ctypes.data)
+    _check(loaded().height_sums(*inputs, *arrays, len(number), lines.shape[1] - 6, most_mm, white_mm, left.ctypes.data))
     return left
 
 

@@ -178,16 +178,16 @@ def name_directions(free: Tensor, shifts: Tensor) -> list[str]:
     if count == 1:
         names.append(f"translation along {_line(shifts[:, 0])}")
     elif count > 1:
-        inside = [float(row.norm()) for row in shifts]  # how much of x, y, z lies in the space of shifts
+        inside = np.linalg.norm(shifts.numpy(), axis=1).tolist()  # how much of x, y, z lies in the space of shifts
         names += [f"translation along {'xyz'[k]}" for k in sorted(sorted(range(3), key=lambda k: -inside[k])[:count])]
     turns = min(free.shape[1] - count, 3)
     if turns == 3:
         return names + [f"rotation about {axis}" for axis in "xyz"]
-    axes = torch.linalg.svd(free[:3], full_matrices=False).U  # the axes of the free rotations, largest first
+    axes = np.linalg.svd(free[:3].numpy(), full_matrices=False)[0]  # the axes of the free rotations, largest first
     return names + [f"rotation about {_line(axes[:, k])}" for k in range(turns)]
 
 
-def _line(direction: Tensor) -> str:
+def _line(direction: Tensor | Array) -> str:
     x, y, z = direction.tolist()
     if math.hypot(x, y) < SINE_OF_AXIS * abs(z) / math.sqrt(1 - SINE_OF_AXIS**2):
         return "z"

@@ -121,12 +121,11 @@ def follow(keyframe: Keyframe, frame: Grids, starts: list[Array]) -> Followed:
 
 def _follow_best(keyframe: Keyframe, frame: Grids, starts: list[Array], last: Array) -> tuple[int, Followed]:
     """Register a frame from the best of several poses: which one that was, and what was found."""
-    if keyframe.held.shape[1] == 0 and usable(frame.fine.channels, keyframe.many.columns):
+    if usable(frame.fine.channels, keyframe.many.columns):
         found = following.follow_frame(
-            _program(keyframe), following.grid_of(*frame.fine), following.grid_of(*frame.coarse), np.stack(starts)
+            _program(keyframe), following.grid_of(*frame.fine), following.grid_of(*frame.coarse), np.stack(starts), last
         )
-        if found is not None:  # else some motion is not known
-            return found.start, _followed(keyframe, frame, found.parts)
+        return found.start, _followed(keyframe, frame, found.parts)
     costs = [sum_residuals(frame.coarse, keyframe.coarse, start, SLOPE_NOISE, score_only=True).cost for start in starts]
     best = costs.index(min(costs))
     return best, _follow_from(keyframe, frame, starts[best], last)
@@ -194,31 +193,34 @@ def _program(keyframe: Keyframe) -> following.KeyframeProgram:
             following.grid_of(*keyframe.grids.coarse),
             *(array.ctypes.data for array in errors),
             *(len(errors.number), errors.lines.shape[1] - 6, PARTS, COARSE_STEPS, SOME_STEPS),
-            *(tuple(keyframe.many.units), tuple(keyframe.many.center)),
+            *(tuple(keyframe.many.units), tuple(keyframe.many.center), following.directions_of(keyframe.held)),
+            *(tuple(keyframe.bias.flatten().tolist()), tuple((keyframe.known @ keyframe.known.T).ravel())),
             *(DEPTH_DRIFT_MM**-2, *SCORE, DEEP_MM, SHALLOW_MM),
             *(SLOPE_NOISE, LEAST_NOISE, LARGEST_STEP_MM, COARSE_STEP_MM, SOME_STEP_MM),
-            *(LEAST_INFORMATION + 3.0 * keyframe.most_bias, tuple(_wanted(keyframe)), _alike(keyframe), LEAST_SLOPE_NOISE),
-            *(MOST_MM, WHITE_MM, keyframe.shared_error, UNSEEN, ERROR, HEIGHT_OFFSET_MM, LEAST_SHARE),
+            *(LEAST_INFORMATION, tuple(_wanted(keyframe)), _alike(keyframe), LEAST_SLOPE_NOISE),
+            *(MOST_MM, WHITE_MM, keyframe.shared_error, UNSEEN, ERROR, HEIGHT_OFFSET_MM, LEAST_SHARE, UNKNOWN_VARIANCE),
         )
         _programs[keyframe] = program
     return program
 
 
 def _followed(keyframe: Keyframe, frame: Grids, found: dict[str, Array]) -> Followed:
-    """What the compiled kernel found, where all motions are known."""
-    noise, pixels, last_step, turn, shift, used, variance = (
-        float(found[name][0]) for name in ("noise", "pixels", "last_step", "turn_variance", "shift_variance", "used", "variance")
-    )
+    """What the compiled kernel found."""
+    names = ("noise", "pixels", "last_step", "turn_variance", "shift_variance", "used", "variance", "unknown", "slides")
+    noise, pixels, last_step, turn, shift, used, variance, unknown, slides = (float(found[name][0]) for name in names)
+    motions = found["motions"][: 6 * int(unknown)].reshape(6, int(unknown))
+    shifts = found["shifts"][: 3 * int(slides)].reshape(3, int(slides))
+    pose = found["pose"].reshape(4, 4)
     forth, back = sums_of(found["forth"], SLOPE_NOISE), sums_of(found["back"], SLOPE_NOISE)
     fitness, overlap, cost = _score(keyframe, int(pixels), forth, back)
     return Followed(
-        pose=found["pose"].reshape(4, 4),
+        pose=pose,
         fine=sums_of(found["sums"], noise),
         fitness=fitness,
         overlap=overlap,
         cost=cost,
-        free=keyframe.held,
-        names=[],
+        free=motions,
+        names=_names(_Unknown(motions, shifts), pose),
         std_deg=math.degrees(math.sqrt(turn)),
         std_mm=math.sqrt(shift),
         settled=last_step < LAST_STEP_MM,

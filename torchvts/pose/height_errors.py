@@ -48,11 +48,13 @@ class HeightErrors(NamedTuple):
         number: (M,), pixels of each cell.
         lines: (M, K + 6), what the height of a cell changes by each mode of the error, whose sizes have a variance of 1, and by
             each scaled twist; in units of :data:`WHITE_MM`.
+        products: (K + 6, K + 6), of these over all cells.
     """
 
     cell: npt.NDArray[np.int64]
     number: Array
     lines: Array
+    products: Array
 
 
 def height_errors(gradient: Tensor, skin: Tensor, mm_per_pixel: float, times: int, pixels: Pixels) -> HeightErrors:
@@ -78,7 +80,8 @@ def height_errors(gradient: Tensor, skin: Tensor, mm_per_pixel: float, times: in
     by = np.stack([np.bincount(cell, one) for one in pixels.columns[17:].double().numpy()], 1) / number[:, None]
     chosen = (np.cumsum(deformed) - 1)[cells]
     covariance = 2.0 * _covariance(slope, deformed, times * mm_per_pixel, chosen)  # the keyframe's and the frame's
-    return HeightErrors(cell, number, np.ascontiguousarray(np.hstack((_modes(covariance, MODES), by)) / WHITE_MM))
+    lines = np.ascontiguousarray(np.hstack((_modes(covariance, MODES), by)) / WHITE_MM)
+    return HeightErrors(cell, number, lines, lines.T @ lines)
 
 
 def _covariance(slope: Array, deformed: Mask, pitch: float, chosen: Index) -> Array:

@@ -159,7 +159,7 @@ class Keyframe:
         some: pixels of the fine grid for most steps, and
         many: for the last one; part after part.
         heights: cells of ``some``, and how their heights err.
-        probe: (M, 3), points of the contact, mm.
+        spread: (4, 4), mean of the products of points (x, y, z, 1) of the contact, mm.
         held: (6, k) scaled twists that the whole contact does not determine.
         bias: (6, 6), the part of the information of a coarse pixel that noise causes.
         shared_error: how many times larger the variance of a pose is than its parts show.
@@ -174,7 +174,7 @@ class Keyframe:
     some: Pixels
     many: Pixels
     heights: HeightErrors
-    probe: Array
+    spread: Array
     held: Array
     bias: Tensor
     shared_error: float
@@ -202,7 +202,7 @@ def make_keyframe(frame: Contact, mm_per_pixel: float) -> Keyframe:
     least = least_depth_mm(made.noise * times[1], mm_per_pixel)
     fine, bent = made.fine, made.coarse._replace(field=field_with_fitted_curvature(made.coarse))
     center, units = fine.points.double().mean(0), twist_units(fine)
-    some, many = (_spread(fine, most) for most in (SOME, MANY))
+    some, many = (_thinned(fine, most) for most in (SOME, MANY))
     steps = reference_pixels(some, fine, center, units)
     unknown = find_unknown(made.coarse, made.coarse, torch.eye(4, dtype=torch.float64)[None], made.noise).motions
     unknown = unknown.clone()
@@ -218,14 +218,21 @@ def make_keyframe(frame: Contact, mm_per_pixel: float) -> Keyframe:
         some=steps,
         many=reference_pixels(many, fine, center, units),
         heights=height_errors(frame.gradient, frame.skin, mm_per_pixel, CELL * times[1], steps),
-        probe=fine.points[:: max(1, len(fine.points) // 64)].double().numpy(),
+        spread=_spread(fine.points[:: max(1, len(fine.points) // 64)].double().numpy()),
         held=held,
         bias=information_of_noise(made.noise, made.coarse.pitch),
         shared_error=shared_error(many.points[:, :2].double().numpy(), PARTS),
     )
 
 
-def _spread(relief: Relief, most: int) -> Relief:
+def _spread(points: Array) -> Array:
+    """Mean of the products (4, 4) of points (N, 3) with a one beside."""
+    beside = np.column_stack((points, np.ones(len(points))))
+    spread: Array = beside.T @ beside / len(points)
+    return spread
+
+
+def _thinned(relief: Relief, most: int) -> Relief:
     """The relief with at most so many of its pixels, evenly spread, those of each of :data:`PARTS` compact parts in a run."""
     number = min(most, len(relief.points)) // PARTS * PARTS  # so that parts are the same number exactly
     chosen = torch.linspace(0, len(relief.points) - 1, number).long()

@@ -252,10 +252,8 @@ class PoseTracker:
             return f"slopes differ by {found.fine.slope_noise:.3f}, where {usual:.3f} is usual: a jump, or another object"
         if found.free.shape[1] == 6:
             return "the contact is too small: no motion of it is known"
-        probe = self.graph.keyframes[index].probe
-        pose = found.pose @ self.graph.poses[index]
-        probe = (probe - self.graph.poses[index][:3, 3]) @ self.graph.poses[index][:3, :3]  # in the reference
-        moved = min(_distance(probe, pose, start) for start in starts)
+        spread, to_reference = self.graph.keyframes[index].spread, inverted(self.graph.poses[index])
+        moved = min(_distance(spread, found.pose, start @ to_reference) for start in starts)
         if moved > JUMP_MM:
             return f"a jump of {moved:.1f} mm at the contact: another pose may look alike"
         return ""
@@ -275,8 +273,8 @@ class PoseTracker:
             if not equal:
                 message = message or (problem if starts else registered.message)
                 continue
-            probe = self.graph.keyframes[0].probe
-            found = min(equal, key=lambda one: _distance(probe, one.pose @ chain, self._poses[-1]))
+            spread = self.graph.keyframes[0].spread
+            found = min(equal, key=lambda one: _distance(spread, one.pose @ chain, self._poses[-1]))
             keyframe = self.graph.keyframes[index]
             if found.free.shape[1] > keyframe.held.shape[1]:
                 message = f"it touches, but too little to show its {', '.join(found.names)}"
@@ -298,7 +296,7 @@ class PoseTracker:
         if self._missed is None:
             return []
         expected = self._missed @ inverted(self._poses[-1]) @ self._missed
-        return [self._missed] if _distance(self.graph.keyframes[0].probe, expected, pose) < JUMP_MM else []
+        return [self._missed] if _distance(self.graph.keyframes[0].spread, expected, pose) < JUMP_MM else []
 
     def _equal_poses(self, index: int, frame: Grids, starts: list[Array]) -> tuple[list[Followed], str]:
         """All poses that could be the object's, from some starts on, and if there is none, why.
@@ -306,14 +304,14 @@ class PoseTracker:
         The motions between them are symmetries of the object, and so are the products of these, which are tried too: where slopes
         err, a search finds a few of the twelve poses of a gear, or one. Which of them fits best is then chance.
         """
-        chain, probe = self.graph.poses[index], self.graph.keyframes[0].probe
+        chain, spread = self.graph.poses[index], self.graph.keyframes[0].spread
         found: list[Followed] = []
         tried: list[Array] = []
         problem = ""
         waiting = deque(starts)
         while waiting and len(tried) < MOST_TRIED:
             start = waiting.popleft()
-            if any(_distance(probe, start, other) < SAME_MM for other in tried):
+            if any(_distance(spread, start, other) < SAME_MM for other in tried):
                 continue
             one = self._follow(index, frame, [start])
             pose = one.pose @ chain
@@ -321,7 +319,7 @@ class PoseTracker:
             tried.append(start)
             wrong = self._problem(index, one, [start])
             problem = problem or wrong
-            if wrong or any(_distance(probe, pose, other) < SAME_MM for other in known):
+            if wrong or any(_distance(spread, pose, other) < SAME_MM for other in known):
                 continue
             found.append(one)
             if one.names:
@@ -362,8 +360,8 @@ class PoseTracker:
         Of a symmetric object that is tilted otherwise than the reference, other pixels touch: the fine grid counts them, the less
         the nearer the tilts are.
         """
-        probe = self.graph.keyframes[0].probe
-        return any(_distance(probe, motion, symmetry) < SAME_MM for symmetry in self._reference_symmetries())
+        spread = self.graph.keyframes[0].spread
+        return any(_distance(spread, motion, symmetry) < SAME_MM for symmetry in self._reference_symmetries())
 
     def _reference_symmetries(self) -> list[Array]:
         """Motions after which the reference looks much the same: continuity is lost, so each of them may have happened."""
@@ -375,10 +373,10 @@ class PoseTracker:
         """Keep a pose, take a keyframe if it is time, and describe the pose."""
         graph, index = self.graph, self._active
         pose = orthonormal(found.pose @ graph.poses[index])
-        drift = moved_covariance(found.pose, graph.covariances[index])
+        drift, drift_deg, drift_mm = self._drift(found)
         self._poses = [*self._poses[-1:], pose]
         keyframe = graph.keyframes[index]
-        if _distance(keyframe.probe, found.pose, np.eye(4)) > MOVED_MM:
+        if _distance(keyframe.spread, found.pose, np.eye(4)) > MOVED_MM:
             self._usual.append((found.fine.slope_noise, found.cost))
         large = frame.touching > LEAST_CONTACT * graph.keyframes[0].touching
         grown = frame.touching > GROWN * keyframe.touching
@@ -387,10 +385,6 @@ class PoseTracker:
         moved_on, vague = large and share < ENOUGH, large and variance > VAGUER * self._least
         if (grown or moved_on or vague) and found.free.shape[1] <= keyframe.held.shape[1]:  # else what is unknown now would stay so
             self._take_keyframe(contact, found, variance, math.inf if grown or moved_on else GAIN * variance)
-        center = found.pose[:3, :3] @ keyframe.many.center + found.pose[:3, 3]
-        to_center = np.hstack((-cross(center), np.eye(3)))
-        drift_deg = math.degrees(math.sqrt(float(np.trace(drift[:3, :3]))))
-        drift_mm = math.sqrt(float(np.trace(to_center @ drift @ to_center.T)))
         std_deg, std_mm = math.hypot(found.std_deg, drift_deg), math.hypot(found.std_mm, drift_mm)
         exact = found.exact and 3.0 * std_deg <= TRUSTED_DEG and 3.0 * std_mm <= TRUSTED_MM
         message = f"{100 * found.fitness:.0f} % of the common contact agrees"
@@ -416,6 +410,17 @@ class PoseTracker:
             drift_deg=drift_deg,
             drift_mm=drift_mm,
         )
+
+    def _drift(self, found: Followed) -> tuple[Array, float, float]:
+        """What the way over keyframes adds: a covariance (6, 6), and standard deviations in degrees and mm."""
+        covariance = self.graph.covariances[self._active]
+        if not covariance.any():
+            return covariance, 0.0, 0.0
+        drift = moved_covariance(found.pose, covariance)
+        center = found.pose[:3, :3] @ self.graph.keyframes[self._active].many.center + found.pose[:3, 3]
+        to_center = np.hstack((-cross(center), np.eye(3)))
+        degrees = math.degrees(math.sqrt(float(np.trace(drift[:3, :3]))))
+        return drift, degrees, math.sqrt(float(np.trace(to_center @ drift @ to_center.T)))
 
     def _take_keyframe(self, contact: Contact, found: Followed, variance: float, most: float) -> None:
         """Go on with a frame as keyframe, if beside itself it has at most such a variance."""
@@ -448,7 +453,7 @@ def _equals(cost: float, least: float) -> bool:
     return cost < max(EQUAL * least, least + EQUAL_COST)
 
 
-def _distance(points: Array, one: Array, other: Array) -> float:
-    """Root mean square distance of points (N, 3) under two poses (4, 4), mm."""
-    off = points @ (one[:3, :3] - other[:3, :3]).T + one[:3, 3] - other[:3, 3]
-    return math.sqrt(float(np.square(off).sum(1).mean()))
+def _distance(spread: Array, one: Array, other: Array) -> float:
+    """Root mean square distance of points under two poses (4, 4), mm, by the mean of their products (4, 4)."""
+    off = one[:3] - other[:3]
+    return math.sqrt(max(float(np.vdot(off @ spread, off)), 0.0))

@@ -4,6 +4,7 @@
 #define INSIDE 1
 #define PERHAPS 2
 #define LANES 16
+#define INLINE static inline __attribute__((always_inline))
 #define HUGE_FACTOR 3.4e32f /* the largest float is 3.4028e38 */
 
 static WIDE float largest(const float *values, int64_t size) {
@@ -40,12 +41,12 @@ static WIDE void widen(const uint8_t *flags, int height, int width, int row, uin
     }
 }
 
-/* Each pixel of the frame as z, p, -q and a mask. */
-static WIDE int whole_grid(
-    const float *depth, const float *slopes, const uint8_t *flags, int height, int width, uint8_t *row, float *restrict field) {
+/* Each pixel of the rows from `first` to `end` as z, p, -q and a mask. */
+static WIDE int whole_rows(
+    const float *depth, const float *slopes, const uint8_t *flags, int height, int width, int first, int end, uint8_t *row, float *restrict field) {
     const int64_t size = (int64_t)height * width;
     int count = 0;
-    for (int y = 0; y < height; y++) {
+    for (int y = first; y < end; y++) {
         uint8_t *result = row + width + 2;
         widen(flags, height, width, y, row, result);
         const float *z = depth + (int64_t)y * width, *p = slopes + (int64_t)y * width, *q = p + size;
@@ -60,54 +61,89 @@ static WIDE int whole_grid(
     return count;
 }
 
-/* Sums over `times` rows from the first on: z, p, q and the number of pixels on the object (4, width), and all flags (width). */
+/* Sums over `times` rows from the first on, between two columns: z, p, q and the number of pixels on the object (4, width). */
 static WIDE void add_rows(
-    const float *depth, const float *slopes, const uint8_t *flags, int64_t size, int width, int times, float *restrict sums,
-    uint8_t *restrict any) {
-    memset(sums, 0, 4 * (size_t)width * sizeof(float));
-    memset(any, 0, (size_t)width);
+    const float *depth, const float *slopes, const uint8_t *flags, int64_t size, int width, int times, int from, int to, float *restrict sums) {
+    for (int k = 0; k < 4; k++) memset(sums + (int64_t)k * width + from, 0, (size_t)(to - from) * sizeof(float));
     for (int i = 0; i < times; i++) {
         const int64_t first = (int64_t)i * width;
         const float *z = depth + first, *p = slopes + first, *q = p + size;
-        for (int x = 0; x < width; x++) {
-            const uint8_t flag = flags[first + x];
-            const float inside = (float)(flag & INSIDE);
+        for (int x = from; x < to; x++) {
+            const float inside = (float)(flags[first + x] & INSIDE);
             sums[x] += inside * z[x], sums[width + x] += inside * p[x], sums[2 * width + x] -= inside * q[x];
-            sums[3 * width + x] += inside, any[x] |= flag;
+            sums[3 * width + x] += inside;
         }
     }
 }
 
-/* Means over the part of each cell of times x times pixels that lies on the object, which must be `share` of it. */
-static WIDE int cell_grid(
-    const float *depth, const float *slopes, const uint8_t *flags, int height, int width, int times, float share, float *sums,
-    uint8_t *near, uint8_t *row, float *restrict field) {
-    const int rows = height / times, columns = width / times;
-    const float area = (float)(times * times);
-    for (int y = 0; y < rows; y++) {
-        const int64_t first = (int64_t)y * times * width;
-        add_rows(depth + first, slopes + first, flags + first, (int64_t)height * width, width, times, sums, row);
-        float *to = field + 4 * (int64_t)y * columns;
-        for (int x = 0; x < columns; x++, to += 4) {
-            uint8_t any = 0;
-            for (int i = 0; i < times; i++) any |= row[x * times + i];
-            for (int k = 0; k < 4; k++) to[k] = 0.0f;
-            if (any & INSIDE)
-                for (int i = 0; i < times; i++)
-                    for (int k = 0; k < 4; k++) to[k] += sums[k * width + x * times + i];
-            const float per = 1.0f / (to[3] > 0.01f * area ? to[3] : 0.01f * area);
-            for (int k = 0; k < 3; k++) to[k] *= per;
-            near[(int64_t)y * columns + x] = any & PERHAPS;
+/* All flags of `times` rows (width). */
+static WIDE void join_rows(const uint8_t *flags, int width, int times, uint8_t *restrict any) {
+    memcpy(any, flags, (size_t)width);
+    for (int i = 1; i < times; i++)
+        for (int x = 0; x < width; x++) any[x] |= flags[(int64_t)i * width + x];
+}
+
+/* Means of the columns of cells from `from` to `to`, from the sums of add_rows: z, p, q and the number of pixels on the object. */
+INLINE void cell_columns(const float *sums, int width, int times, int from, int to, float *restrict field) {
+    const float least = 0.01f * (float)(times * times);
+    const float *z = sums, *p = z + width, *q = p + width, *number = q + width;
+    for (int x = from; x < to; x++) {
+        float a = 0.0f, b = 0.0f, c = 0.0f, count = 0.0f;
+        UNROLLED
+        for (int i = 0; i < times; i++) {
+            const int n = x * times + i;
+            a += z[n], b += p[n], c += q[n], count += number[n];
         }
+        const float per = 1.0f / (count > least ? count : least);
+        field[4 * x] = a * per, field[4 * x + 1] = b * per, field[4 * x + 2] = c * per, field[4 * x + 3] = count;
     }
+}
+
+/* Flags of cells, of those of their columns. */
+INLINE void cell_flags(const uint8_t *any, int times, int columns, uint8_t *restrict near) {
+    for (int x = 0; x < columns; x++) {
+        uint8_t flags = 0;
+        UNROLLED
+        for (int i = 0; i < times; i++) flags |= any[x * times + i];
+        near[x] = flags & PERHAPS;
+    }
+}
+
+/* Means over the part of each of a row of cells that lies on the object; the mask is the number of pixels there. */
+static WIDE void cell_means(
+    const float *depth, const float *slopes, const uint8_t *flags, int64_t size, int width, int times, float *sums, uint8_t *any,
+    uint8_t *near, float *restrict field) {
+    const int columns = width / times;
+    int from = 0, to = width;
+    join_rows(flags, width, times, any);
+    while (from < to && !(any[from] & INSIDE)) from++;
+    while (from < to && !(any[to - 1] & INSIDE)) to--;
+    memset(field, 0, 4 * sizeof(float) * (size_t)columns);
+    if (times == 2)
+        cell_flags(any, 2, columns, near);
+    else
+        cell_flags(any, times, columns, near);
+    if (from == to) return;
+    from /= times, to = least((to + times - 1) / times, columns);
+    add_rows(depth, slopes, flags, size, width, times, from * times, to * times, sums);
+    if (times == 2)
+        cell_columns(sums, width, 2, from, to, field);
+    else
+        cell_columns(sums, width, times, from, to, field);
+}
+
+/* The masks of cells, of which `share` must lie on the object. Returns how many do. */
+static WIDE int mask_cells(const uint8_t *near, int rows, int columns, int times, float share, uint8_t *row, float *restrict field) {
+    const float least = share * (float)(times * times);
     int count = 0;
     for (int y = 0; y < rows; y++) {
         uint8_t *result = row + columns + 2;
         widen(near, rows, columns, y, row, result);
         float *to = field + 4 * (int64_t)y * columns;
         for (int x = 0; x < columns; x++) {
-            const int inside = to[4 * x + 3] > share * area;
-            to[4 * x + 3] = inside ? 1.0f : 0.125f * (float)(result[x] & PERHAPS);
+            const int inside = to[4 * x + 3] > least;
+            const float outside = 0.125f * (float)(result[x] & PERHAPS);
+            to[4 * x + 3] = inside ? 1.0f : outside;
             count += inside;
         }
     }
@@ -124,9 +160,20 @@ EXPORT int track_grids(
     if (sums == NULL) return -1;
     uint8_t *flags = (uint8_t *)(sums + 4 * (size_t)width), *near = flags + size, *row = near + size;
     flag(depth, contact, size, least_mm, 0.3f * largest(depth, size), flags);
-    const int count = fine > 1 ? cell_grid(depth, slopes, flags, height, width, fine, 0.99f, sums, near, row, fine_field)
-                               : whole_grid(depth, slopes, flags, height, width, row, fine_field);
-    cell_grid(depth, slopes, flags, height, width, coarse, 0.5f, sums, near, row, coarse_field);
+    const int grids[2] = {fine, coarse};
+    float *fields[2] = {fine_field, coarse_field};
+    int count = 0;
+    for (int k = fine > 1 ? 0 : 1; k < 2; k++) {
+        const int times = grids[k], rows = height / times, columns = width / times;
+        for (int y = 0; y < rows; y++) {
+            const int first = y * times, end = y + 1 < rows ? first + times : height;
+            const int64_t at = (int64_t)first * width, to = (int64_t)y * columns;
+            if (fine == 1) count += whole_rows(depth, slopes, flags, height, width, first, end, row, fine_field); /* while they are at hand */
+            cell_means(depth + at, slopes + at, flags + at, size, width, times, sums, row, near + to, fields[k] + 4 * to);
+        }
+        const int inside = mask_cells(near, rows, columns, times, k == 0 ? 0.99f : 0.5f, row, fields[k]);
+        if (k == 0) count = inside;
+    }
     free(sums);
     return count;
 }
@@ -144,7 +191,7 @@ static WIDE float zero_if_usable(const float *values, int64_t size) {
 
 /* How many pixels of a frame touch; -1 where depth (size) or slopes (2, size) are not finite, or beyond 1e6. */
 EXPORT WIDE int contact_pixels(const float *depth, const float *slopes, const uint8_t *contact, int64_t size) {
-    if (zero_if_usable(depth, size) != 0.0f || zero_if_usable(slopes, 2 * size) != 0.0f) return -1;
+    if (zero_if_usable(slopes, 2 * size) != 0.0f || zero_if_usable(depth, size) != 0.0f) return -1; /* depth is at hand for what follows */
     int count = 0;
     for (int64_t n = 0; n < size; n++) count += contact[n] != 0;
     return count;

@@ -5,14 +5,16 @@
 #define LANES 8
 #define BLOCK 64 /* pixels that are summed in float32 */
 #define PAIRS 28 /* of SIZE values, each once */
+#define WHEN(condition, value) ((Lanes)((condition) & (Ints)(value))) /* else 0 */
 
 typedef float Lanes __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
+typedef int32_t Ints __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
 typedef double Sums __attribute__((vector_size(8 * LANES), aligned(8), may_alias));
 typedef float Four __attribute__((vector_size(16), aligned(4), may_alias)); /* the channels of a field */
 
 /* A block of pixels in the new frame. */
 typedef struct {
-    float place[BLOCK], along[BLOCK], down[BLOCK], z[BLOCK], found[BLOCK][4], slope[2][BLOCK], height[BLOCK];
+    float place[BLOCK], along[BLOCK], down[BLOCK], z[BLOCK], found[4][BLOCK], slope[2][BLOCK], height[BLOCK];
     float weight[BLOCK], used[BLOCK], bad[BLOCK], good[BLOCK], compared[BLOCK];
     int first[BLOCK];
 } Block;
@@ -36,42 +38,48 @@ INLINE void look_up(
         b->first[n] = 4 * (top * width + left);
         b->down[n] = safe_row - (float)top, b->along[n] = safe_column - (float)left;
     }
+    float found[BLOCK][4];
     for (int n = 0; n < size; n++) {
         const float *upper = field + b->first[n], *lower = upper + 4 * (size_t)width;
         const Four a = *(const Four *)upper, c = *(const Four *)lower;
         const Four u = a + b->along[n] * (*(const Four *)(upper + 4) - a), l = c + b->along[n] * (*(const Four *)(lower + 4) - c);
-        *(Four *)b->found[n] = u + b->down[n] * (l - u);
+        *(Four *)found[n] = u + b->down[n] * (l - u);
     }
+    for (int n = 0; n < size; n++)
+        for (int k = 0; k < 4; k++) b->found[k][n] = found[n][k];
 }
 
 /* Residuals, Cauchy's weights and the score of a block; slopes of the pixels in the rows 3 and 4 of `points`. */
 INLINE void compare(const float *points, int64_t stride, int size, const Limits *at, Block *b) {
-    const float a = (float)at->pose[0], c = (float)at->pose[1], d = (float)at->pose[4], e = (float)at->pose[5];
-    const float f = (float)at->pose[8], g = (float)at->pose[9];
-    const float h = (float)at->pose[2], i = (float)at->pose[6], j = (float)at->pose[10];
+    float P[12];
+    for (int k = 0; k < 12; k++) P[k] = (float)at->pose[k];
     const float per_slope = (float)at->per_slope, per_height = (float)at->per_height; /* 1 / noise^2 */
     const float score_slope = (float)at->score_slope, score_height = (float)at->score_height;
     const float deep = (float)at->deep, shallow = (float)at->shallow;
-    for (int n = 0; n < size; n++) {
-        const float p = b->found[n][1], q = b->found[n][2], mask = b->found[n][3], z = b->z[n];
-        const float up = j - h * p - i * q, steep = 1.0f / (up > 0.05f ? up : 0.05f);
-        const float off_p = (a * p + d * q - f) * steep - points[3 * stride + n];
-        const float off_q = (c * p + e * q - g) * steep - points[4 * stride + n];
-        const float off_z = b->found[n][0] - z, off = off_p * off_p + off_q * off_q, high = off_z * off_z;
-        const int within = (b->place[n] > 0.5f) & (z > shallow), inside = within & (mask > 0.999f);
-        const int counted = within & (z > deep) & ((mask > 0.999f) | (mask <= 0.001f));
-        const float error = inside ? off * score_slope + high * score_height : 1.0f;
-        b->bad[n] = counted ? (error < 1.0f ? error : 1.0f) : 0.0f;
-        b->good[n] = counted & (error < 1.0f) ? 1.0f : 0.0f;
-        b->compared[n] = counted ? 1.0f : 0.0f;
-        b->used[n] = inside ? 1.0f : 0.0f;
-        b->weight[n] = inside ? 1.0f / (1.0f + 0.25f * (off * per_slope + high * per_height)) : 0.0f;
-        b->slope[0][n] = off_p, b->slope[1][n] = off_q, b->height[n] = off_z;
-    }
     const int whole = (size + LANES - 1) / LANES * LANES;
-    for (int n = size; n < whole; n++) {
-        b->weight[n] = b->used[n] = b->bad[n] = b->good[n] = b->compared[n] = 0.0f;
-        b->slope[0][n] = b->slope[1][n] = b->height[n] = 0.0f;
+    const Lanes one = {1.0f, 1.0f, 1.0f, 1.0f, 1.0f, 1.0f, 1.0f, 1.0f};
+    float expected[2][BLOCK];
+    for (int k = 0; k < 2; k++) memcpy(expected[k], points + (3 + k) * stride, (size_t)size * sizeof(float));
+    for (int n = size; n < whole; n++) { /* lanes beyond the last pixel hold zeros */
+        b->place[n] = b->z[n] = expected[0][n] = expected[1][n] = 0.0f;
+        for (int k = 0; k < 4; k++) b->found[k][n] = 0.0f;
+    }
+    for (int n = 0; n < whole; n += LANES) {
+        const Lanes height = *(const Lanes *)(b->found[0] + n), p = *(const Lanes *)(b->found[1] + n);
+        const Lanes q = *(const Lanes *)(b->found[2] + n), mask = *(const Lanes *)(b->found[3] + n), z = *(const Lanes *)(b->z + n);
+        const Lanes up = P[10] - P[2] * p - P[6] * q;
+        const Lanes steep = 1.0f / (WHEN(up > 0.05f, up) + WHEN(up <= 0.05f, 0.05f * one));
+        const Lanes off_p = (P[0] * p + P[4] * q - P[8]) * steep - *(const Lanes *)(expected[0] + n);
+        const Lanes off_q = (P[1] * p + P[5] * q - P[9]) * steep - *(const Lanes *)(expected[1] + n);
+        const Lanes off_z = height - z, off = off_p * off_p + off_q * off_q, high = off_z * off_z;
+        const Lanes error = off * score_slope + high * score_height;
+        const Ints within = (*(const Lanes *)(b->place + n) > 0.5f) & (z > shallow), inside = within & (mask > 0.999f);
+        const Ints counted = within & (z > deep) & ((mask > 0.999f) | (mask <= 0.001f)), good = inside & (error < 1.0f);
+        *(Lanes *)(b->bad + n) = WHEN(counted & good, error) + WHEN(counted & ~good, one);
+        *(Lanes *)(b->good + n) = WHEN(counted & good, one), *(Lanes *)(b->compared + n) = WHEN(counted, one);
+        *(Lanes *)(b->used + n) = WHEN(inside, one);
+        *(Lanes *)(b->weight + n) = WHEN(inside, 1.0f / (1.0f + 0.25f * (off * per_slope + high * per_height)));
+        *(Lanes *)(b->slope[0] + n) = off_p, *(Lanes *)(b->slope[1] + n) = off_q, *(Lanes *)(b->height + n) = off_z;
     }
 }
 
@@ -258,18 +266,23 @@ static WIDE void cell_residuals(
         const int size = least(BLOCK, count - start);
         look_up(field, height, width, columns + start, stride, size, at, &b);
         for (int n = 0; n < size; n++) {
-            const float off = b.found[n][0] - b.z[n];
-            const int held = (b.place[n] > 0.5f) & (b.z[n] > shallow) & (b.found[n][3] > 0.999f) & (fabsf(off) < most_mm);
+            const float off = b.found[0][n] - b.z[n];
+            const int held = (b.place[n] > 0.5f) & (b.z[n] > shallow) & (b.found[3][n] > 0.999f) & (fabsf(off) < most_mm);
             if (held) sum[cell[start + n]] += (double)off, seen[cell[start + n]] += 1.0;
         }
     }
 }
 
-/* Adds the products of four lines (4, size) to the upper triangle of A (size, size). */
-static WIDE void add_lines(const double *lines, int size, double *restrict A) {
+/* Adds the products of four lines (4, size), times `sign`, to the upper triangle of A (size, size). */
+static WIDE void add_lines(const double *lines, int size, double sign, double *restrict A) {
     const double *a = lines, *b = a + size, *c = b + size, *d = c + size;
     for (int i = 0; i < size; i++)
-        for (int k = i; k < size; k++) A[i * size + k] += a[i] * a[k] + b[i] * b[k] + c[i] * c[k] + d[i] * d[k];
+        for (int k = i; k < size; k++) A[i * size + k] += sign * (a[i] * a[k] + b[i] * b[k] + c[i] * c[k] + d[i] * d[k]);
+}
+
+/* Adds a line times a residual. */
+static WIDE void add_residual(const double *line, int size, double residual, double *restrict sums) {
+    for (int k = 0; k < size; k++) sums[k] += residual * line[k];
 }
 
 /* Eliminates the first `gone` unknowns of the symmetric A (size, size), by its upper triangle. */
@@ -284,26 +297,35 @@ static WIDE void eliminate(double *A, int size, int gone) {
     }
 }
 
-/* height_sums of torchvts/pose/height_errors.py: lines (cells, modes + 6), number (cells) of pixels; left (7, 7), products of the six
-   twists and the residual where the modes are fitted beside. Returns 1 without memory. */
+/* height_sums of torchvts/pose/height_errors.py: lines (cells, modes + 6) and the products of all of them; number (cells) of pixels;
+   left (7, 7), products of the six twists and the residual where the modes are fitted beside. Returns 1 without memory. */
 EXPORT int height_sums(
     const float *field, int height, int width, const float *columns, int64_t stride, int count, const Limits *at, const int64_t *cell,
-    const double *number, const double *lines, int cells, int modes, double most_mm, double white_mm, double *left) {
-    const int size = modes + SIZE;
-    double *A = calloc((size_t)(size * size + 4 * size + 2 * cells), sizeof(double));
+    const double *number, const double *lines, const double *products, int cells, int modes, double most_mm, double white_mm, double *left) {
+    const int twists = modes + 6, size = modes + SIZE;
+    double *A = calloc((size_t)(size * size + 5 * size + 2 * cells), sizeof(double));
     if (A == NULL) return 1;
-    double *some = A + size * size, *sum = some + 4 * size, *seen = sum + cells;
+    double *some = A + size * size, *right = some + 4 * size, *sum = right + size, *seen = sum + cells;
     cell_residuals(field, height, width, columns, stride, count, at, cell, (float)most_mm, sum, seen);
-    int taken = 0;
+    int used = 0, taken = 0;
+    for (int n = 0; n < cells; n++) used += seen[n] >= 0.5 * number[n];
+    const int most = 2 * used > cells; /* those that are not used are taken away from all */
+    for (int i = 0; i < twists && most; i++) memcpy(A + i * size, products + i * twists, (size_t)twists * sizeof(double));
     for (int n = 0; n < cells; n++) {
-        if (seen[n] < 0.5 * number[n]) continue;
-        double *line = some + taken++ % 4 * size;
-        memcpy(line, lines + (int64_t)n * (size - 1), (size_t)(size - 1) * sizeof(double));
-        line[size - 1] = sum[n] / (seen[n] * white_mm);
-        if (taken % 4 == 0) add_lines(some, size, A);
+        const double *line = lines + (int64_t)n * twists;
+        const int uses = seen[n] >= 0.5 * number[n];
+        if (uses) {
+            const double residual = sum[n] / (seen[n] * white_mm);
+            add_residual(line, twists, residual, right);
+            right[twists] += residual * residual;
+        }
+        if (uses == most) continue;
+        memcpy(some + taken++ % 4 * size, line, (size_t)twists * sizeof(double));
+        if (taken % 4 == 0) add_lines(some, size, most ? -1.0 : 1.0, A);
     }
     memset(some + taken % 4 * size, 0, (size_t)((4 - taken % 4) * size) * sizeof(double));
-    add_lines(some, size, A);
+    if (taken % 4 != 0) add_lines(some, size, most ? -1.0 : 1.0, A);
+    for (int k = 0; k < size; k++) A[k * size + twists] = right[k];
     for (int k = 0; k < modes; k++) A[k * size + k] += 1.0;
     eliminate(A, size, modes);
     for (int k = 0; k < SIZE; k++)

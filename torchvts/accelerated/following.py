@@ -16,6 +16,7 @@ FOUND |= {"turn_variance": 1, "shift_variance": 1, "used": 1, "variance": 1, "mo
 """Numbers of each part of ``Followed`` of csrc/follow.c, all float64."""
 
 ENDS = np.cumsum(list(FOUND.values())).tolist()
+PLACES = {name: slice(end - size, end) for (name, size), end in zip(FOUND.items(), ENDS, strict=True)}
 
 
 class KeyframePixels(ctypes.Structure):
@@ -90,4 +91,4 @@ def follow_frame(program: KeyframeProgram, fine: Grid, coarse: Grid, starts: npt
     )
     if number < 0:
         raise MemoryError("torchvts: no memory is left for the cells of a contact")
-    return Found(number, dict(zip(FOUND, np.split(found, ENDS[:-1]), strict=True)))
+    return Found(number, {name: found[place] for name, place in PLACES.items()})

@@ -82,10 +82,8 @@ static void matrix_of(const double *sums, double scale, double A[6][6]) {
 
 /* Of n twists from the first on, those of hardly any information A: free_directions of ambiguity.py. */
 static void find_sliding(const Keyframe *of, double A[6][6], int first, int n, Directions *to) {
-    double B[6][6], values[6], vectors[6][6], vector[6];
-    for (int i = 0; i < n; i++)
-        for (int k = 0; k < n; k++) B[i][k] = A[first + i][first + k];
-    eigen_six(B, n, values, vectors);
+    double values[6], vectors[6][6], vector[6];
+    eigen_six(A, first, n, values, vectors);
     to->number = 0;
     for (int m = 0; m < n; m++) {
         double noise = 0.0;
@@ -107,10 +105,8 @@ static void find_all_sliding(const Keyframe *of, const double *sums, Unknown *un
 
 /* Of n twists from the first on, those of too large a standard deviation, by A of what is wanted. */
 static void find_vague(const Keyframe *of, double A[6][6], int first, int n, Directions *to) {
-    double B[6][6], values[6], vectors[6][6], vector[6];
-    for (int i = 0; i < n; i++)
-        for (int k = 0; k < n; k++) B[i][k] = A[first + i][first + k];
-    eigen_six(B, n, values, vectors);
+    double values[6], vectors[6][6], vector[6];
+    eigen_six(A, first, n, values, vectors);
     to->number = 0;
     for (int m = 0; m < n; m++) {
         for (int i = 0; i < n; i++) vector[i] = vectors[i][m] * of->wanted[first + i];
@@ -121,12 +117,11 @@ static void find_vague(const Keyframe *of, double A[6][6], int first, int n, Dir
 /* _vague of follow.py, by the sums of a step. */
 static void find_all_vague(const Keyframe *of, const double *sums, Unknown *vague) {
     const double ratio = fmax(slope_noise_of(sums), of->least_slope_noise) / sums[SUMS];
-    double A[6][6], values[6], vectors[6][6], B[6][6];
+    double A[6][6], values[6], vectors[6][6];
     matrix_of(sums, 1.0 / (of->alike * ratio * ratio), A);
     for (int i = 0; i < 6; i++)
         for (int k = 0; k < 6; k++) A[i][k] *= of->wanted[i] * of->wanted[k];
-    memcpy(B, A, sizeof B);
-    eigen_six(B, 6, values, vectors);
+    eigen_six(A, 0, 6, values, vectors);
     vague->motions.number = vague->shifts.number = 0;
     for (int k = 0; k < 6; k++)
         if (values[k] < 1.0) {
@@ -228,7 +223,7 @@ static void covariance_by_slopes(const Keyframe *of, const double *sums, double 
     double A[6][6], left[6][6], values[6], vectors[6][6], white[6][6] = {{0.0}}, most = 0.0;
     matrix_of(sums, 1.0, A), both_sides(P, A, left);
     for (int k = 0; k < 6; k++) left[5][k] = left[k][5] = 0.0; /* heights have a weight of their own */
-    eigen_six(left, 6, values, vectors);
+    eigen_six(left, 0, 6, values, vectors);
     for (int k = 0; k < 6; k++) most = fmax(most, values[k]);
     const double ratio = slope_noise_of(sums) / noise;
     for (int m = 0; m < 6; m++)
@@ -285,7 +280,7 @@ static void show_common(const Keyframe *of, const Grid *fine, Followed *found) {
     const double size = trace_of(left, 6), ridge = of->least_share * size + 1e-9, aside = 2.0 * size + 1.0;
     for (int i = 0; i < 6; i++)
         for (int k = 0; k < 6; k++) left[i][k] += aside * (P[i][k] - (i == k)); /* below zero are the others */
-    eigen_six(left, 6, values, vectors);
+    eigen_six(left, 0, 6, values, vectors);
     found->used = sums[USED], found->variance = 0.0;
     for (int k = 0; k < 6; k++) found->variance += values[k] > -0.5 * aside ? 1.0 / (fmax(values[k], 0.0) + ridge) : 0.0;
 }

@@ -30,10 +30,11 @@ void invert_six(double A[6][6], double inverse[6][6]) {
     }
 }
 
-/* Eigenvalues and, in columns, eigenvectors of the first n rows and columns of a symmetric A, which is overwritten, by Jacobi's rotations. */
-void eigen_six(double A[6][6], int n, double values[6], double vectors[6][6]) {
+/* Eigenvalues and, in columns, eigenvectors of n rows and columns, from the first on, of a symmetric matrix, by Jacobi's rotations. */
+void eigen_six(double matrix[6][6], int first, int n, double values[6], double vectors[6][6]) {
+    double A[6][6];
     for (int i = 0; i < n; i++)
-        for (int k = 0; k < n; k++) vectors[i][k] = i == k ? 1.0 : 0.0;
+        for (int k = 0; k < n; k++) A[i][k] = matrix[first + i][first + k], vectors[i][k] = i == k ? 1.0 : 0.0;
     for (int sweep = 0; sweep < 30; sweep++) {
         double on = 0.0, off = 0.0;
         for (int i = 0; i < n; i++) {
@@ -84,7 +85,7 @@ void join_directions(Directions *one, const Directions *other, int n) {
             for (int h = 0; h < one->number; h++) sum[i][k] += one->line[h][i] * one->line[h][k];
             for (int h = 0; h < other->number; h++) sum[i][k] += other->line[h][i] * other->line[h][k];
         }
-    eigen_six(sum, n, values, vectors);
+    eigen_six(sum, 0, n, values, vectors);
     one->number = 0;
     for (int k = 0; k < n; k++) {
         for (int i = 0; i < n; i++) vector[i] = vectors[i][k];

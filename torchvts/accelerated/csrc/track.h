@@ -41,7 +41,7 @@ typedef struct {
 void both_sides(double A[6][6], double B[6][6], double to[6][6]);
 double trace_of(double A[6][6], int n);
 void invert_six(double A[6][6], double inverse[6][6]);
-void eigen_six(double A[6][6], int n, double values[6], double vectors[6][6]);
+void eigen_six(double matrix[6][6], int first, int n, double values[6], double vectors[6][6]);
 void add_direction(Directions *to, int n, const double *vector);
 void join_directions(Directions *one, const Directions *other, int n);
 void beside_directions(const Directions *all, double P[6][6]);

@@ -12,7 +12,7 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-FLAGS = ["-std=c11", "-O3", "-fno-math-errno", "-fPIC", "-shared", "-pthread", "-fvisibility=hidden"]
+FLAGS = ["-std=c11", "-O3", "-fno-math-errno", "-fPIC", "-shared", "-fvisibility=hidden"]
 PLAIN = "-DWIDE="  # compilers that cannot build a function for several kinds of processors
 
 

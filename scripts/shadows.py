@@ -78,7 +78,7 @@ def errors(shape: str, kind: str, seed: int) -> tuple[float, float, float] | Non
     elif kind == "dirt":
         image = with_dirt(image, scene.contact, draw)
     pipe = DepthPipeline.from_calibration(Calibration.from_lights(lights, SENSOR, background), "precise")
-    if float((pipe.normals.shadowed.blocked(pipe.compensate(image), (0, 0)) & scene.contact).sum() / scene.contact.sum()) < 0.03:
+    if float((pipe.normals.shadowed.blocked(pipe.compensate(image)) & scene.contact).sum() / scene.contact.sum()) < 0.03:
         return None
     ours, undisturbed = rms_px(pipe, image, scene), rms_px(pipe, without, scene) if kind == "cast" else math.nan
     pipe.normals.shadowed.flat.zero_()

@@ -62,6 +62,10 @@ from torchvts.model import FillMarkers
 from torchvts.model.response_field import ResponseModel
 from torchvts.pipeline import Confidence
 
+SLOPES = torch.zeros(1, 2, HEIGHT, WIDTH)
+OTHER_DEPTHS = [DEPTH[0], DEPTH[..., 1:], DEPTH.expand(2, -1, -1, -1)]
+SHARES = [*(value for value in NUMBER if value is not None), 1.5]
+
 
 def integrator(name):
     """A class of integrators, the public one if there is one."""
@@ -111,55 +115,39 @@ TABLE = {
     "Compensate.from_calibration": Entry({"calibration": unit()}, {"calibration": OTHERS}),
     "Compensate.forward": forward(lambda: vts.Compensate.from_calibration(unit()), 3, "image"),
     "ContactMask": Entry(
-        {
-            "flat": FLAT,
-            "noise_std": torch.full((3,), 0.01),
-            "sigmas": 4.5,
-            "min_size_px": 8.0,
-            "far_field": 0.06,
-            "least_colour": 0.7,
-            "smooth_light": False,
-        },
-        {
-            "flat": BAD_FLAT,
-            "noise_std": [torch.zeros(2), FLAT[:, 1:], torch.full((3,), NAN), 0.01, None, np.zeros(3)],
-            "sigmas": NUMBER,
-            "min_size_px": NUMBER,
-            "far_field": [-0.1, NAN, "0", None],
-            "least_colour": [-0.1, NAN, "0", None],
-            "smooth_light": [1, "True", None],
-        },
+        {"flat": FLAT, "light": FLAT, "noise_std": 0.01 * FLAT, "sigmas": 4.5},
+        {"flat": BAD_FLAT[:-1], "light": [*BAD_FLAT[:-1], FLAT[:, 1:]], "noise_std": [*BAD_FLAT[:-1], 0.01], "sigmas": NUMBER},
     ),
     "ContactMask.from_calibration": Entry(
         {"calibration": unit()}, {"calibration": OTHERS, "settings": ["4.5", 4.5, torch.ones(3)]}
     ),
-    "ContactFromDepth": Entry({"mm_per_pixel": 1.0, "share": 0.8}, {"mm_per_pixel": NUMBER, "share": NUMBER}),
-    "ContactFromDepth.forward": Entry(
-        {"depth_mm": DEPTH, "gradient": DEPTH.repeat(1, 2, 1, 1), "deformed": DEPTH > 0},
-        {"depth_mm": [DEPTH[0]], "gradient": [DEPTH, DEPTH.repeat(1, 2, 1, 1)[..., 1:]], "deformed": [DEPTH[..., 1:] > 0]},
-        lambda: vts.ContactFromDepth(1.0),
-    ),
-    "ContactSettings": Entry(
-        {"sigmas": 4.5, "min_size_px": 8.0, "share": 0.8}, {"sigmas": NUMBER, "min_size_px": NUMBER, "share": NUMBER}
-    ),
     "ContactMask.forward": Entry(
-        {"compensated": FLAT[None], "image": FLAT[None], "tail": FLAT[None, :1] > 2.0},
+        {"compensated": FLAT[None], "gradient": SLOPES},
         {
             "compensated": batches(3),
-            "image": [FLAT, FLAT[None, ..., 1:], FLAT.expand(2, -1, -1, -1), FLAT[None].numpy()],
-            "tail": [FLAT[None, :1], FLAT[None] > 2.0, FLAT[0] > 2.0, (FLAT[None, :1] > 2.0).numpy()],
+            "gradient": [*(b for b in batches(2) if b is not None), SLOPES[..., 1:], SLOPES.expand(3, -1, -1, -1)],
         },
-        lambda: pipe().deformed,
+        lambda: pipe().mask,
     ),
-    "ContactMask.shadowed": Entry(
-        {"compensated": FLAT[None], "noise_std": NOISE},
-        {"compensated": batches(3), "noise_std": BAD_NOISE},
-        lambda: pipe().deformed.shadowed,
+    "ContactFromDepth": Entry({"mm_per_pixel": 1.0, "share": 0.8}, {"mm_per_pixel": NUMBER, "share": SHARES}),
+    "ContactFromDepth.from_calibration": Entry(
+        {"calibration": unit()}, {"calibration": OTHERS, "settings": ["4.5", 4.5, torch.ones(3)]}
     ),
-    "ContactMask.soft": forward(lambda: pipe().deformed.soft, 3, "compensated"),
+    "ContactFromDepth.forward": Entry(
+        {"depth_mm": DEPTH, "deformed": DEPTH > 0},
+        {"depth_mm": batches(1), "deformed": [DEPTH, *(mask > 0 for mask in OTHER_DEPTHS), (DEPTH > 0).numpy(), None]},
+        lambda: vts.ContactFromDepth(1.0),
+    ),
+    "ContactSettings": Entry({"sigmas": 4.5, "share": 0.8}, {"sigmas": NUMBER, "share": SHARES}),
+    "ZeroBackground": Entry({"mm_per_pixel": 1.0}, {"mm_per_pixel": NUMBER}),
+    "ZeroBackground.forward": Entry(
+        {"depth_mm": DEPTH, "weight": DEPTH + 1.0},
+        {"depth_mm": batches(1), "weight": [*batches(1), *OTHER_DEPTHS]},
+        lambda: vts.skin.ZeroBackground(1.0),
+    ),
     "DepthPipeline": Entry(
         {
-            **{name: getattr(pipe(), name) for name in ("compensate", "deformed", "normals", "gradient", "integrate")},
+            **{name: getattr(pipe(), name) for name in ("compensate", "mask", "normals", "gradient", "integrate")},
             "mode": "fast",
             "mm_per_pixel": 1.0,
             "tolerance_px": 0.002,
@@ -167,8 +155,9 @@ TABLE = {
             "max_passes": 8,
         },
         {
-            **{name: [None, lambda x: x] for name in ("compensate", "deformed", "normals", "gradient", "integrate")},
+            **{name: [None, lambda x: x] for name in ("compensate", "mask", "normals", "gradient", "integrate")},
             "contact": [lambda x: x, 0.8],
+            "smooth": [lambda x: x, 0.8],
             "mm_per_pixel": NUMBER,
             "mode": ["slow", None, 1],
             "tolerance_px": NUMBER,
@@ -241,34 +230,27 @@ TABLE = {
         {"calibration": [*OTHERS, unit("response")], "camera_height_mm": HEIGHTS},
     ),
     "NormalFromIntensity.forward": Entry(
-        {"image": FLAT[None], "depth_mm": DEPTH, "window": (0, 0), "noise_std": NOISE},
-        {
-            "image": batches(3),
-            "depth_mm": [b for b in batches(1) if b is not None],
-            "window": [(20, 20), (-1, 0)],
-            "noise_std": BAD_NOISE,
-        },
+        {"image": FLAT[None], "depth_mm": DEPTH, "noise_std": NOISE},
+        {"image": batches(3), "depth_mm": [b for b in batches(1) if b is not None], "noise_std": BAD_NOISE},
         lambda: pipe().normals,
-        named={"image": "compensated", "window": "compensated, window"},
+        named={"image": "compensated"},
     ),
     "NormalFromIntensity.noise_of": forward(lambda: pipe().normals.noise_of, 3, "compensated"),
     "NormalFromIntensity.solve": Entry(
         {
             "image": FLAT[None],
             "depth_mm": None,
-            "window": (0, 0),
             "expected": torch.zeros(1, 2, HEIGHT, WIDTH),
             "noise_std": NOISE,
         },
         {
             "image": batches(3),
             "depth_mm": [b for b in batches(1) if b is not None],
-            "window": [(20, 20), (-1, 0)],
             "expected": [b for b in batches(2) if b is not None],
             "noise_std": BAD_NOISE,
         },
         lambda: pipe().normals.solve,
-        named={"image": "compensated", "window": "compensated, window"},
+        named={"image": "compensated"},
     ),
     "NormalFromIntensity.coarse": Entry({"stride": 8}, {"stride": INTEGER}, lambda: pipe().normals.coarse),
     "NormalFromLookup": Entry(
@@ -299,7 +281,7 @@ TABLE = {
     ),
     "NormalFromLookup.load": Entry({"path": ...}, {"path": [*MISSING, "."]}, file=("path",), run=False),
     "NormalFromLookup.save": Entry({"path": ...}, {"path": [*MISSING, "."]}, lambda: lookup().save, file=("path",), run=False),
-    "NormalFromLookup.forward": forward(lookup, 3, "compensated", label=("depth_mm", "window")),
+    "NormalFromLookup.forward": forward(lookup, 3, "compensated", label=("depth_mm",)),
     "NormalFromMLP": Entry(
         {
             "height": HEIGHT,
@@ -332,17 +314,17 @@ TABLE = {
     "NormalFromMLP.set_flat": Entry({"flat": FLAT}, {"flat": images()}, lambda: network().set_flat),
     "NormalFromMLP.check_flat": Entry({"flat": FLAT}, {"flat": images()}, lambda: network().check_flat),
     "NormalFromMLP.gradient_px": forward(lambda: network().gradient_px, 3, "image"),
-    "NormalFromMLP.forward": forward(network, 3, "compensated", label=("depth_mm", "window")),
+    "NormalFromMLP.forward": forward(network, 3, "compensated", label=("depth_mm",)),
     "NormalFromResponse": Entry(
         {"field": fields(), "by_depth": by_depth(), **SIZE},
         {"field": [None, "field", by_depth()], "by_depth": ["field", fields()], **shaped()},
     ),
     "NormalFromResponse.from_calibration": Entry({"calibration": unit("response")}, {"calibration": [*OTHERS, unit()]}),
     "NormalFromResponse.forward": Entry(
-        {"image": FLAT[None], "depth_mm": DEPTH, "window": (0, 0)},
-        {"image": batches(3), "depth_mm": [b for b in batches(1) if b is not None], "window": [(20, 20), (-1, 0)]},
+        {"image": FLAT[None], "depth_mm": DEPTH},
+        {"image": batches(3), "depth_mm": [b for b in batches(1) if b is not None]},
         lambda: vts.NormalFromResponse.from_calibration(unit("response")),
-        named={"image": "compensated", "window": "compensated, window"},
+        named={"image": "compensated"},
     ),
     "NormalFromResponse.coarse": Entry(
         {"stride": 8}, {"stride": INTEGER}, lambda: vts.NormalFromResponse.from_calibration(unit("response")).coarse
@@ -387,10 +369,7 @@ TABLE = {
         {"mm_per_pixel": NUMBER, "camera_height_mm": NUMBER, "integrate": ["dct", 3]},
     ),
     "PerspectiveIntegration.forward": Entry(
-        {"gradient": GRADIENT, "window": (0, 0), "size": (16, 16)},
-        {"gradient": BAD_GRADIENT, "window": [(9, 0), (-1, 0)], "size": [(4, 4)]},
-        lambda: PerspectiveIntegration(1.0, 30.0),
-        named={"window": "gradient, window", "size": "gradient, window"},
+        {"gradient": GRADIENT}, {"gradient": BAD_GRADIENT}, lambda: PerspectiveIntegration(1.0, 30.0)
     ),
     "Confidence": Entry(
         {
@@ -459,19 +438,9 @@ TABLE = {
             "calibration": OTHERS,
         },
     ),
-    "PoissonDST.forward": Entry(
-        {"gradient": GRADIENT, "window": (0, 0), "size": (16, 16)},
-        {"gradient": batches(2), "window": [(9, 0), (-1, 0)], "size": [(4, 4)]},
-        lambda: vts.PoissonDST(),
-        named={"window": "gradient, window", "size": "gradient, window"},
-    ),
+    "PoissonDST.forward": Entry({"gradient": GRADIENT}, {"gradient": batches(2)}, lambda: vts.PoissonDST()),
     **{
-        f"{name}.forward": Entry(
-            {"gradient": torch.zeros(1, 2, 8, 8), "window": (0, 0), "size": (16, 16)},
-            {"gradient": [*batches(2), torch.zeros(1, 2, 1, 8)], "window": [(9, 0), (-1, 0)], "size": [(4, 4)]},
-            lambda name=name: integrator(name)(),
-            named={"window": "gradient, window", "size": "gradient, window"},
-        )
+        f"{name}.forward": Entry({"gradient": GRADIENT}, {"gradient": BAD_GRADIENT}, lambda name=name: integrator(name)())
         for name in ("PoissonBackground", "PoissonDCT", "AdaptiveIntegration", "DiscontinuityIntegration")
     },
     "Press": Entry(
@@ -518,7 +487,7 @@ TABLE = {
             "corners_px": [((0, 0),), ((0, 0), (0, 1), (1, 1), (1, 0)), "all"],
             "raw_size_px": ["all", None, (48, 64), ((48,),), ((4.5, 64),), ((2, 64),)],
             "raw_crop": ["1", None, NAN, -0.1, 0.5],
-            "markers": ["yes", 1, None],
+            "markers": ["yes", 1],
             "prior": ["prior", 3],
         },
     ),

@@ -212,10 +212,9 @@ TABLE = {
     # ---- export ----
     "export.PoissonBackgroundByMatrix": Entry(SIZE, shaped()),
     "export.PoissonBackgroundByMatrix.forward": Entry(
-        {"gradient": torch.zeros(1, 2, HEIGHT, WIDTH), "window": (0, 0), "size": (HEIGHT, WIDTH)},
-        {"gradient": batches(2), "window": [(9, 0), (-1, 0)], "size": [(4, 4)]},
+        {"gradient": torch.zeros(1, 2, HEIGHT, WIDTH)},
+        {"gradient": [*batches(2), torch.zeros(1, 2, 8, 8)]},
         lambda: torchvts.export.PoissonBackgroundByMatrix(HEIGHT, WIDTH, 1.0),
-        named={"window": "gradient, window", "size": "gradient, window"},
     ),
     "export.describe": Entry({"pipe": pipe()}, {"pipe": [None, unit(), "pipeline.pt"]}),
     **{

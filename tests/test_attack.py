@@ -115,9 +115,6 @@ def disagreements(size, counts=(1, 3)):
                 case = (size, count, fill, layout)
                 if not close(compensated, expected, 2e-5):
                     wrong.append((*case, "compensate", float((compensated - expected).abs().max())))
-                mask, expected_mask = both(pipe.deformed, expected)
-                if float((mask ^ expected_mask).double().mean()) > 0.002:  # a pixel at the threshold may fall to either side
-                    wrong.append((*case, "deformed", int((mask ^ expected_mask).sum())))
                 normal, expected_normal = both(pipe.normals, expected)
                 apart = (normal - expected_normal).abs().flatten()
                 if not bool(torch.isfinite(normal).all()) or float(apart.kthvalue(max(1, int(0.99 * len(apart)))).values) > 1e-3:
@@ -128,7 +125,7 @@ def disagreements(size, counts=(1, 3)):
                 depth, expected_depth = both(pipe.integrate, expected_gradient)
                 if not close(depth, expected_depth, 1e-5):
                     wrong.append((*case, "integrate", float((depth - expected_depth).abs().max())))
-                done += 5
+                done += 4
     return wrong, done
 
 

@@ -1,7 +1,6 @@
 """Exported files give what the pipeline gives, in a process that cannot import torchvts."""
 
 import json
-import os
 import subprocess
 import sys
 
@@ -12,8 +11,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchvts as vts
 from torchvts import export
-from torchvts.accelerated import kernels, reference_only
-from torchvts.export import kernels_in_file, onnx_operators
+from torchvts.accelerated import reference_only
+from torchvts.export import onnx_operators
 
 HEIGHT, WIDTH, PITCH = 48, 64, 0.6
 SENSOR = vts.Sensor("rig", HEIGHT, WIDTH, PITCH)
@@ -67,14 +66,12 @@ def test_the_scenes_are_hard_enough(low, mini):
     pipe = pipeline(calibration, "precise")
     compensated = pipe.compensate(frames)
     shadowed = pipe.normals.shadowed
-    limits = shadowed.limits(compensated, (0, 0))
-    blocked = shadowed.dark(compensated, limits, pipe.normals.noise_of(compensated)) | (compensated >= limits.saturated_above)
+    blocked = shadowed.dark(compensated, pipe.normals.noise_of(compensated)) | (compensated >= shadowed.saturated_above)
     assert int(blocked[0].sum()) > 10
     assert pipe(frames).contact.flatten(1).any(1).tolist() == [True, True, True, False]
     assert (pipe(frames).depth_mm - pipeline(calibration, "fast")(frames).depth_mm).abs().max() > 0.05
     for mode in ("fast", "precise", "auto"):
         assert pipeline(mini[0], mode)(mini[1]).deformed[:3].flatten(1).any(1).tolist() == [True, False, True]
-        assert not pipeline(mini[0], mode)(mini[1]).contact.any()  # its slopes are no surface
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +81,6 @@ def cells_of_two(ring):
     scene = vts.scenes.sphere_press(10.0, 1.5, (3.0, 1.0), height, width, 0.17)
     frames = vts.scenes.render(scene, lights, noise_std=0.003, bits=8, seed=1).detach().repeat(3, 1, 1, 1)
     pipe = pipeline(vts.Calibration.from_lights(lights, vts.Sensor("rig", height, width, 0.17)), "fast")
-    assert pipe.deformed.cell == 2
     return pipe, frames
 
 
@@ -92,10 +88,10 @@ def test_a_program_of_a_mask_whose_cells_are_larger_than_pixels(cells_of_two):
     pipe, frames = cells_of_two
     compensated = pipe.compensate(frames)
     with torch.no_grad(), reference_only():
-        program = torch.export.export(pipe.deformed, (compensated,), dynamic_shapes=({0: torch.export.Dim.AUTO},)).module()
+        program = torch.export.export(pipe.mask, (compensated,), dynamic_shapes=({0: torch.export.Dim.AUTO},)).module()
         for batch in (compensated, compensated[:2]):
-            found, expected = program(batch), pipe.deformed(batch)
-            assert torch.equal(found, expected) and bool(expected.any()) and not bool(expected.all())
+            found, expected = program(batch), pipe.mask(batch)
+            assert torch.allclose(found, expected, atol=1e-6) and bool(expected.any()) and not bool(expected.all())
 
 
 @pytest.mark.long
@@ -190,7 +186,7 @@ class Changed(nn.Module):
 
 
 class Deep(nn.Module):
-    def forward(self, depth_mm, gradient, deformed):
+    def forward(self, depth_mm, deformed):
         return deformed & (depth_mm > 0.1)
 
 
@@ -229,70 +225,13 @@ def test_onnx_without_torchvts(low, mini, tmp_path, kind):
     assert export.compare(path, pipe, frames, "onnx") <= 1e-3
 
 
-needs_kernels = pytest.mark.skipif(vts.accelerated.library() is None, reason="no compiled kernels")
-
-
-@needs_kernels
-@pytest.mark.parametrize("mode", ["fast", "precise"])
-def test_the_pieces_of_a_program_hold_all_that_a_frame_needs(mini, mode):
-    """Put together as kernels_in_file.c does it, in other memory, they give what the pipeline gives."""
-    calibration, frames = mini
-    pipe = pipeline(calibration, mode)
-    places, *pieces = kernels_in_file.program_of_kernels(pipe)
-    count, *addresses = places.view(torch.int64).tolist()
-    for structure, at, piece in zip(addresses[::3], addresses[1::3], addresses[2::3], strict=True):
-        assert structure < count
-        pieces[structure][at : at + 8].view(torch.int64).fill_(pieces[piece].data_ptr())
-    assert pieces[0][:8].view(torch.int32).tolist() == [48, 64]
-    out = pipe(frames[:3])
-    found = [torch.empty_like(expected) for expected in out]
-    trouble = kernels.loaded().solve_frames(
-        pieces[0].data_ptr(), frames[:3].contiguous().data_ptr(), 3, 1, *(tensor.data_ptr() for tensor in found)
-    )
-    assert trouble == 0 and float(found[0].max()) > 0.0
-    for one, other in zip(found, out, strict=True):
-        assert torch.equal(one, other)
-
-
-def test_without_a_c_compiler_the_kernels_are_not_linked(monkeypatch):
-    before = os.environ.get("LIBRARY_PATH")
-    monkeypatch.setenv("CC", "no_such_compiler -O2")
-    with pytest.raises(RuntimeError, match=r"expected a C compiler and ar, .*set CC"), kernels_in_file.linked_kernels():
-        pass
-    assert os.environ.get("LIBRARY_PATH") == before
-
-
-@needs_kernels
-def test_the_program_of_kernels_has_the_outputs_of_any_batch(mini):
-    program = kernels_in_file.trace_kernels(pipeline(mini[0], "fast"))
-    shapes = [node.meta["val"] for node in program.graph.output_node().args[0]]
-    assert [tuple(shape.shape[1:]) for shape in shapes] == [(channels, 48, 64) for channels in (1, 2, 3, 1, 1)]
-    assert [shape.dtype for shape in shapes] == [torch.float32] * 3 + [torch.bool] * 2
-    assert not any(isinstance(shape.shape[0], int) for shape in shapes)
-
-
-@pytest.mark.parametrize("kind", ["lights fast", "lights precise", "response auto", "response double", "own normals"])
-def test_blocks_that_may_take_over_keep_their_graph(low, mini, kind):
-    """What kernels leave to the blocks in some frames, or cannot do, a file cannot leave to them."""
-    calibration, options = mini[0] if kind.startswith("response") else low[0], {}
-    if kind == "own normals":
-        options["normals"] = learned()
-    mode = kind.split()[1] if kind.split()[1] in ("precise", "auto") else "fast"
-    pipe = pipeline(calibration, mode, **options)
-    assert kernels_in_file.program_of_kernels(pipe.double() if kind == "response double" else pipe) is None
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["response precise", "lights fast"])
 def test_aoti_without_torchvts(low, mini, tmp_path, kind):
-    """By the compiled kernels, and by the graph."""
     if export.missing("aoti"):
         pytest.skip(export.missing("aoti"))
     calibration, frames = mini if kind.startswith("response") else low
     pipe = pipeline(calibration, kind.split()[1])
-    assert (kernels_in_file.program_of_kernels(pipe) is not None) == (
-        kind.startswith("response") and vts.accelerated.library() is not None
-    )
     path = export.export_aoti(pipe, tmp_path / "pipe.pt2")
     assert export.compare(path, pipe, frames, "aoti") <= 1e-5
 

@@ -9,7 +9,8 @@ import torch
 from torch import nn
 
 import torchvts as vts
-from torchvts.model.markers import FillMarkers, fill_markers, find_markers, marker_diameter_px
+from torchvts.model.markers import FillMarkers, fill_markers, find_markers, is_printed, marker_diameter_px
+from torchvts.model.response_field import ResponseField, ResponseModel
 
 HEIGHT, WIDTH, PITCH, NOISE = 200, 264, 0.1, 0.004
 PRESSES = ("sample_8", "sample_13", "sample_34", "sample_43")
@@ -273,3 +274,23 @@ def test_all_markers_of_a_press_are_found(data, name):
     x, y = centers(undeformed)[0].round().long().T
     assert int((~grow(pressed, 4)[0, 0, y, x]).sum()) <= 1
     assert float(pressed.float().mean()) < 1.03 * float(undeformed.float().mean())  # shading adds nothing
+
+
+@pytest.mark.parametrize("given, found", [(None, True), (True, True), (False, False)])
+def test_a_regular_pattern_is_found_unless_the_sensor_says_otherwise(given, found):
+    field = ResponseField(0, -1, 10.0, ((0.3, 0, 0), (0, 0.3, 0)))
+    image = torch.full((3, 120, 160), 0.5)
+    for row in range(10, 120, 20):
+        for column in range(10, 160, 20):
+            image[:, row - 2 : row + 3, column - 2 : column + 3] = 0.1
+    unit = vts.Calibration.from_response(ResponseModel(field, None), vts.Sensor("rig", 120, 160, 0.1, markers=given), image)
+    assert (unit.markers is not None) == found
+
+
+def test_dust_is_no_pattern():
+    image = torch.full((3, 120, 160), 0.5)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(25):
+        row, column = int(torch.randint(5, 115, (1,), generator=generator)), int(torch.randint(5, 155, (1,), generator=generator))
+        image[:, row - 2 : row + 3, column - 2 : column + 3] = 0.1
+    assert not is_printed(image, FillMarkers.from_background(image))

@@ -54,9 +54,9 @@ ARGUMENTS = {
     vts.PoseTracker: ["reference", "mm_per_pixel"],
     contact_cloud: ["frame", "mm_per_pixel", "most"],
     vts.Compensate: ["gain", "offset", "gamma", "defects"],
-    vts.ContactMask: ["flat", "noise_std", "sigmas", "min_size_px"],
+    vts.ContactMask: ["flat", "light", "noise_std", "sigmas"],
     vts.ContactFromDepth: ["mm_per_pixel", "share"],
-    vts.ContactSettings: ["sigmas", "min_size_px", "share"],
+    vts.ContactSettings: ["sigmas", "share"],
     vts.NormalFromIntensity: ["lights", "height", "width", "mm_per_pixel", "noise_std", "inverse"],
 }
 

@@ -24,7 +24,7 @@ from torchvts.core.geometry import gradient_from_normal, normal_from_gradient
 from torchvts.evaluation import metrics
 
 TABLE = refusals_blocks.TABLE | refusals_tools.TABLE
-ROOMS = ("calibration", "diagnose", "integration", "model", "normals", "pipeline", "pose", "training")
+ROOMS = ("calibration", "diagnose", "integration", "model", "normals", "pipeline", "pose", "skin", "training")
 """Rooms whose names are in the table without a prefix, as the names of torchvts itself are."""
 MODULES = {
     "gs_sdk.": vts.gs_sdk,
@@ -46,7 +46,7 @@ PARTS = {
     "Adaptive", "DepthBrightness", "Integrator", "NormalModel", "Once", "Repeat", "ResponseField", "ResponseModel",
     "SensorPrior", "Shadows", "SlopesOfDepth", "SlopesOfPixels", "Solve", "WrappedIntegrator", "WrappedNormals", "as_integrator",
     "as_normal_model", "by_presses", "channel_structure", "check_calibration", "check_domain", "check_sensor",
-    "discontinuity_share", "falloff", "label_contacts", "outwardness", "read_point_cloud", "stream.FrameCheck.",
+    "discontinuity_share", "falloff", "label_contacts", "moved", "outwardness", "read_point_cloud", "stream.FrameCheck.",
     "stream.NewestFrame", "stream.Overlay", "stream.Recording.", "stream.StageClock",
     "stream.CameraSettings", "stream.Camera", "stream.Keys", "stream.LiveView", "stream.Sheet", "stream.StreamReport.",
     "stream.TactileStream.rezero", "stream.VideoFile.", "stream.find_camera", "stream.frames_a_second", "stream.has_screen",

@@ -109,7 +109,7 @@ def test_shipped_figures():
 
 def test_defaults_and_immutability():
     sensor = vts.Sensor(**GOOD)
-    assert (sensor.gamma, sensor.exponent, sensor.blur_px, sensor.markers) == (None, 1.0, 0.0, False)
+    assert (sensor.gamma, sensor.exponent, sensor.blur_px, sensor.markers) == (None, 1.0, 0.0, None)
     assert (sensor.light_position_mm, sensor.roi_px, sensor.corners_px, sensor.prior) == (None, None, None, None)
     with pytest.raises(AttributeError):
         sensor.height = 5

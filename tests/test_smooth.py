@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import torchvts as vts
-from torchvts.accelerated import SmoothDrift, reference, reference_only
+from torchvts.accelerated import SmoothDrift, reference
 from torchvts.compensate import SmoothDrift as PlainSmoothDrift
 from torchvts.core.smooth import MOST, over_smooth, smooth_basis, smooth_change
 from torchvts.model import DepthBrightness, ResponseField
@@ -55,23 +55,12 @@ def test_compiled_fit_equals_the_reference(size):
 
 
 def test_smooth_light_moves_no_skin():
-    flat, noise = torch.ones(3, 240, 320), torch.full((3,), 0.004)
-    changed = light(240, 320, 0.04) + 0.004 * torch.randn(1, 3, 240, 320, generator=torch.Generator().manual_seed(2))
-    assert bool(vts.ContactMask(flat, noise)(changed).any())
-    mask = vts.ContactMask(flat, noise, far_field=0.06, smooth_light=True)
-    assert not bool(mask(changed).any())
-    moved = mask(pressed(240, 320) * changed)
-    assert float((moved ^ mask(pressed(240, 320))).double().mean()) < 0.01 < float(moved.double().mean())
-    with reference_only():
-        assert torch.equal(mask(pressed(240, 320) * changed), moved)
-    image = pressed(240, 320) * changed
-    divided = over_smooth(image, smooth_change(image))
-    assert torch.equal(mask(image, divided), moved)
-    with reference_only():
-        assert torch.equal(mask(image, divided), moved)
-    assert bool((mask.soft(pressed(240, 320) * changed) > 0.5).eq(moved).double().mean() > 0.99)
-    with pytest.raises(ValueError, match="smooth_light: expected False, because flat is not 1"):
-        vts.ContactMask(0.5 * flat, noise, smooth_light=True)
+    flat, smooth = torch.ones(3, 240, 320), PlainSmoothDrift()
+    changed = light(240, 320, 0.04, 2) + 0.004 * torch.randn(1, 3, 240, 320, generator=torch.Generator().manual_seed(2))
+    mask, image = vts.ContactMask(flat), pressed(240, 320)
+    assert bool((mask(changed) > 0.5).any()) and not bool((mask(smooth(changed)) > 0.0).any())
+    moved = mask(smooth(image * changed)) > 0.5
+    assert float((moved ^ (mask(image) > 0.5)).double().mean()) < 0.01 < float(moved.double().mean())
 
 
 def test_depth_of_a_response_unit_hardly_follows_the_light():
@@ -93,8 +82,7 @@ def largest(difference):
     return float(difference.abs().max())
 
 
-@pytest.mark.parametrize("least_colour", [0.0, 0.7])
-def test_a_shadow_is_no_contact_and_a_slope_is(least_colour):
+def test_a_shadow_is_no_contact_and_a_slope_is():
     """A soft shadow darkens all channels alike; slopes change the colour, also where such a shadow lies in the frame."""
     y, x = torch.linspace(-1.0, 1.0, 120)[:, None], torch.linspace(-1.0, 1.0, 160)[None]
     spot = torch.exp(-((x - 0.3) ** 2 + (y + 0.2) ** 2) / 0.1)
@@ -103,13 +91,9 @@ def test_a_shadow_is_no_contact_and_a_slope_is(least_colour):
     slopes = torch.stack([20.0 * x + 10.0 + 0.0 * y, 20.0 * y - 8.0 + 0.0 * x, -20.0 * (x + y) - 2.0]).clamp(-1.0, 1.0)
     slope = 1.0 + 0.3 * ball * slopes[None]
     noise = 0.004 * torch.randn(1, 3, 120, 160, generator=torch.Generator().manual_seed(0))
-    options = {"far_field": 0.06, "smooth_light": True, "least_colour": least_colour}
-    mask = vts.ContactMask(torch.ones(3, 120, 160), torch.full((3,), 0.004), **options)
-    for image, moved in ((shadow, least_colour == 0.0), (shadow * slope, True), (slope, True)):
-        found = mask(image + noise)
-        assert bool(found.any()) is moved
-        with reference_only():
-            assert torch.equal(mask(image + noise), found)
+    mask = vts.ContactMask()
+    for image, moved in ((shadow, False), (shadow * slope, True), (slope, True)):
+        assert bool((mask(image + noise) > 0.0).any()) is moved
 
 
 def test_the_colour_of_slopes_is_that_of_the_lights():

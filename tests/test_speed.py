@@ -111,15 +111,10 @@ def test_frames_are_timed_as_a_user_runs_them(monkeypatch):
     assert {row.size.batch for row in measured.frames} == {1, 3} and all(row.median_ms <= row.p90_ms for row in measured.frames)
     assert any("dropped of 12" in cost.name for cost in measured.costs) and measured.costs[0].value == 0.4
     text = user_speed.table(measured)
-    assert ("from core to core and back" in text) == any(row.exchange_ns > 0.0 for row in measured.frames)
     assert "drawn rig, 64x48, threads: own choice: fast" in text and "times as fast as gs_sdk's pipeline" in text
 
 
 def test_many_calls_have_a_99th_percentile():
     times = [1.0] * 985 + [9.0] * 15
-    few, many = (
-        user_speed.summary("rig", "fast", Size(48, 64), "tight loop", "1", user_speed.Timed(some, 310.0))
-        for some in (times[:100], times)
-    )
+    few, many = (user_speed.summary("rig", "fast", Size(48, 64), "tight loop", "1", some) for some in (times[:100], times))
     assert few.p99_ms is None and many.p99_ms == 9.0 and many.median_ms == 1.0
-    assert " *" in user_speed.table(user_speed.Measured([many], [], "a machine"))

@@ -18,14 +18,12 @@ from . import scenes, stream
 from .accelerated import (
     AdaptiveIntegration,
     Compensate,
-    ContactMask,
     GradientFromNormal,
     NormalFromIntensity,
     PoissonBackground,
     PoissonDCT,
 )
 from .calibration import CalibrationWarning, Press, Touch, calibrate, fit_lights, read_presses
-from .contact import ContactFromDepth, ContactSettings
 from .core import __version__ as __version__
 from .core.files import read_image, write_image
 from .core.geometry import depth_to_points
@@ -36,6 +34,7 @@ from .model import Calibration, PointLights, Sensor, gs_sdk, near_field_shading,
 from .normals import NormalFromLookup, NormalFromMLP, NormalFromResponse, NormalModel
 from .pipeline import ConfidentPipeline, DepthOutput, DepthPipeline
 from .pose import PoseTracker, register_depth, register_points
+from .skin import ContactFromDepth, ContactMask, ContactSettings
 
 __all__ = [
     "AdaptiveIntegration",

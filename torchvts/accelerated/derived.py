@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from ..compensate.compensate import Gain
-from ..contact import ContactMask
 from ..normals import NormalFromResponse
 from .kernels import ResponseLines
 
@@ -39,12 +38,6 @@ def kept(module: nn.Module, name: str, buffers: tuple[Tensor, ...], make: Callab
             note = (buffers, versions, make())
         notes[name] = note
     return cast(_Value, note[2])
-
-
-def flat_is_one(block: ContactMask) -> bool:
-    """Whether the undeformed skin is 1 everywhere, as of response fields: the offset of its change is then known."""
-    buffers = (block.offset, block.per_noise)
-    return bool(kept(block, "flat", buffers, lambda: torch.equal(block.offset, -block.per_noise)))
 
 
 def pedestals(block: Gain) -> "ctypes.Array[ctypes.c_float] | None":

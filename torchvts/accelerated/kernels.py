@@ -20,7 +20,7 @@ from torch import Tensor
 
 from ..core import smooth
 from ..core.robust import HALVINGS
-from ..normals.shadowed import LightView, Limits
+from ..normals.shadowed import LightView
 from .threads import by_frames
 
 LIBRARY = Path(__file__).parent / "csrc" / "libtorchvts.so"
@@ -29,33 +29,21 @@ NO_PEDESTAL = (ctypes.c_float * 3)()
 
 
 SIGNATURES = {
-    "contact_mask": ("i", "pppppp iiiiiii fff i ffff pp ppp"),
-    "normals": ("i", "p lll pppp l iiii p ll pp ffff p"),
-    "solve_shadowed": ("v", "p lll pppp l iiii p ll pppppp"),
+    "normals": ("i", "ppppp iii ppp ff p"),
+    "solve_shadowed": ("v", "ppppp iii ppppppp"),
     "frame_noise": ("i", "p iiii p"),
-    "zero_background": ("i", "pp iii ff i p"),
-    "contact_from_depth": ("i", "p ll pp ll iiiii pp"),
-    "clean": ("i", "pppppp l p iiii ppp"),
+    "clean": ("i", "pppppp l p iiii p"),
     "levels": ("i", "p iiiii ff p"),
     "smooth_change": ("i", "pp i p"),
     "over_smooth": ("v", "ppp i p"),
-    "box_of": ("v", "p iii p"),
     "divide_planes": ("v", "pp i l p"),
     "over_tilted": ("v", "pppp ii p"),
-    "response_normals": ("v", "p lll pp ii p ll p fff iii p"),
-    "mask_values": ("v", "pp ll iiii p"),
-    "depth_slopes": ("v", "p ll p ll f iii p"),
+    "response_normals": ("v", "ppp ii pp fff iii p"),
     "grid_means": ("v", "p iiiiiii p"),
     "slopes": ("v", "p ii f p"),
-    "begin_frame": ("v", "pp i"),
-    "forget_frame": ("v", ""),
-    "exchange_ns": ("d", ""),
-    "solve_frames": ("i", "pp ii ppppp"),
     "poisson_plan_size": ("l", "i"),
     "make_poisson_plan": ("v", "ii p"),
-    "solve_poisson": ("i", "pp f iiiiiiii p"),
-    "largest_change": ("v", "pp i l p"),
-    "uncrop": ("v", "pp iiiiiii ppp"),
+    "solve_poisson": ("i", "pp f iiii p"),
     "alignment_sums": ("v", "p ii p l ii pp"),
     "part_sums": ("v", "p ii p l ii pp"),
     "refine_pose": ("v", "p ii p l ii pp i pp"),
@@ -94,23 +82,6 @@ def library() -> ctypes.CDLL | None:
     return loaded
 
 
-class ContactGrid(NamedTuple):
-    """The settings of the contact kernel: attributes of :class:`~torchvts.contact.ContactMask`."""
-
-    step: int
-    stride: int
-    cell: int
-    reach: int
-    sigmas: float
-    rounding: float
-    least_cells: float
-    bridge_cells: int
-    bridge_sigmas: float
-    tail_sigmas: float
-    least_spread: float
-    least_colour: float
-
-
 def loaded() -> ctypes.CDLL:
     """The compiled kernels, after :func:`~torchvts.accelerated.gate.usable` said that they may work."""
     loaded = library()
@@ -118,13 +89,7 @@ def loaded() -> ctypes.CDLL:
     return loaded
 
 
-class NotFinite(ArithmeticError):
-    """A value is NaN or infinite; the PyTorch reference says what then happens."""
-
-
 def _check(code: int) -> None:
-    if code == 2:
-        raise NotFinite
     if code:
         raise MemoryError("torchvts: no memory is left for a few rows of the image")
 
@@ -136,16 +101,9 @@ def _at(tensor: Tensor | None, frame: int) -> int | None:
     return tensor.data_ptr() + (0 if tensor.shape[0] == 1 else frame * tensor.stride(0) * tensor.element_size())
 
 
-def _with_whole_rows(tensor: Tensor) -> Tensor:
-    """The tensor with each row contiguous; frames, channels and rows may lie anywhere."""
-    return tensor if tensor.stride(3) == 1 else tensor.contiguous()
-
-
-def _depth_arguments(depth_mm: Tensor | None) -> tuple[int | None, int, int]:
-    """Address of a depth, and the distance of its frames and rows; one frame serves all. The caller keeps the tensor alive."""
-    if depth_mm is None:
-        return None, 0, 0
-    return depth_mm.data_ptr(), 0 if depth_mm.shape[0] == 1 else depth_mm.stride(0), depth_mm.stride(2)
+def _of_each(tensor: Tensor | None, count: int) -> Tensor | None:
+    """So many frames, contiguous; where one serves all, it is repeated."""
+    return None if tensor is None else tensor.expand(count, -1, -1, -1).contiguous()
 
 
 def grid_means(image: Tensor, stride: int, first: int) -> Tensor:
@@ -179,15 +137,14 @@ def clean(
     maps = (None if gain is None else gain.data_ptr(), None if by_pixel is None else by_pixel.data_ptr())
     pedestal = NO_PEDESTAL if isinstance(offset, Tensor) else offset
     filled = (*[index.data_ptr() for index in defects], defects[0].shape[0])
-    kernel = loaded().clean
-    no_levels = (None, None)
-
-    def some(first: int, many: int) -> int:
-        at, to = _at(light, first), _at(out, first)
-        code = int(kernel(at, *maps, pedestal, *filled, weights, len(weights), many, height, width, to, *no_levels))
-        return 1 & code  # values outside of [0, 1] may be here
-
-    _check(by_frames(count, height * width, some))
+    settings, kernel = (*maps, pedestal, *filled, weights, len(weights)), loaded().clean
+    _check(
+        by_frames(
+            count,
+            height * width,
+            lambda first, many: kernel(_at(light, first), *settings, many, height, width, _at(out, first)),
+        )
+    )
     return out
 
 
@@ -202,7 +159,7 @@ def levels(image: Tensor, stride: int, least: float, most: float, halvings: int 
 
 
 class SmoothLight(ctypes.Structure):
-    """``SmoothLight`` of csrc/kernels.h."""
+    """``SmoothLight`` of csrc/smooth.c."""
 
     _fields_ = (
         *((name, ctypes.c_int32) for name in ("height", "width", "stride", "rows", "columns", "samples", "steps")),
@@ -261,14 +218,6 @@ def without_smooth_change(ratio: Tensor) -> Tensor:
     return result
 
 
-def box_of(mask: Tensor) -> tuple[int, int, int, int]:
-    """(top, bottom, left, right) of the smallest box that holds all of a bool (B, 1, H, W); zeros without any."""
-    mask = mask.contiguous()
-    box = (ctypes.c_int * 4)()
-    loaded().box_of(mask.data_ptr(), mask.shape[0], mask.shape[2], mask.shape[3], box)
-    return box[0], box[1], box[2], box[3]
-
-
 def divided(image: Tensor, level: Tensor) -> Tensor:
     """Images (B, C, H, W) over levels (B, C, 1, 1)."""
     image, level = image.contiguous(), level.contiguous()
@@ -282,40 +231,6 @@ def divided(image: Tensor, level: Tensor) -> Tensor:
     return out
 
 
-def contact_mask(
-    compensated: Tensor,
-    image: Tensor,
-    offset: Tensor | None,
-    per_noise: Tensor,
-    limits: tuple[Tensor, Tensor],
-    grid: ContactGrid,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Deformed area, interior and tail, bool (B, 1, H, W): see :class:`~torchvts.contact.ContactMask`, whose attributes these are.
-
-    ``image``: where pixels stand out; ``compensated``: what the noise is of. ``offset``: None where it is ``-per_noise``, as the
-    undeformed skin is 1. ``limits``: ``failed_below`` and ``most_far_field``.
-    """
-    compensated, image, per_noise = compensated.contiguous(), image.contiguous(), per_noise.contiguous()
-    offset = None if offset is None else offset.contiguous()
-    offsets = None if offset is None else offset.data_ptr()
-    count, _, height, width = compensated.shape
-    mask = compensated.new_empty(count, 1, height, width, dtype=torch.bool)
-    interior, tail = torch.empty_like(mask), torch.empty_like(mask)
-    fields = (offsets, per_noise.data_ptr(), limits[0].data_ptr(), limits[1].data_ptr())
-    kernel = loaded().contact_mask
-    _check(
-        by_frames(
-            count,
-            height * width,
-            lambda first, many: kernel(
-                *(_at(compensated, first), _at(image, first), *fields, many, height, width, *grid),
-                *(None, None, _at(mask, first), _at(interior, first), _at(tail, first)),
-            ),
-        )
-    )
-    return mask, interior, tail
-
-
 def frame_noise(image: Tensor, stride: int) -> Tensor:
     """Noise of each channel, (B, 3): see :func:`~torchvts.core.noise.noise_of_spotted`, whose stride this is."""
     image = image.contiguous()
@@ -327,31 +242,6 @@ def frame_noise(image: Tensor, stride: int) -> Tensor:
         )
     )
     return noise
-
-
-def contact_from_depth(
-    depth_mm: Tensor, gradient: Tensor, deformed: Tensor, cells: tuple[int, int], model: "ctypes.Array[ctypes.c_float]"
-) -> Tensor:
-    """Contact, bool (B, 1, h, w), of a window: see :class:`~torchvts.contact.ContactFromDepth`.
-
-    ``cells``: side and reach; ``model``: its settings in the order of ``Model`` in touching.c.
-    """
-    depth_mm, deformed, gradient = _with_whole_rows(depth_mm), _with_whole_rows(deformed), gradient.contiguous()
-    count, _, rows, columns = depth_mm.shape
-    contact = depth_mm.new_empty(count, 1, rows, columns, dtype=torch.bool)
-    strides = (depth_mm.stride(0), depth_mm.stride(2)), (deformed.stride(0), deformed.stride(2))
-    kernel = loaded().contact_from_depth
-    _check(
-        by_frames(
-            count,
-            rows * columns,
-            lambda first, many: kernel(
-                *(_at(depth_mm, first), *strides[0], _at(gradient, first), _at(deformed, first), *strides[1]),
-                *(many, rows, columns, *cells, model, _at(contact, first)),
-            ),
-        )
-    )
-    return contact
 
 
 class ResponseLines(NamedTuple):
@@ -369,93 +259,57 @@ class ResponseLines(NamedTuple):
 
 
 def response_normals(
-    compensated: Tensor,
-    depth_mm: Tensor | None,
-    lines: ResponseLines,
-    window: tuple[int, int],
-    settings: tuple[float, float, float],
+    compensated: Tensor, depth_mm: Tensor | None, lines: ResponseLines, settings: tuple[float, float, float]
 ) -> Tensor:
-    """Unit normals (B, 3, h, w) of a window: see :class:`~torchvts.normals.NormalFromResponse`.
+    """Unit normals (B, 3, H, W): see :class:`~torchvts.normals.NormalFromResponse`.
 
     Its steeper, reference_mm and max_sine are the settings.
     """
-    compensated = _with_whole_rows(compensated)
-    depth_mm = None if depth_mm is None else _with_whole_rows(depth_mm)
-    (top, left), (count, _, rows, columns) = window, compensated.shape
-    weight, per_mm = lines.weight, None if depth_mm is None else lines.per_mm
-    normal = compensated.new_empty(count, 3, rows, columns)
-    field = (
-        lines.place.data_ptr() + 4 * left,
-        weight.data_ptr() + 4 * top * weight.stride(0),
-        weight.shape[1] - 1,
-        weight.shape[3],
-    )
-    by_depth = (None if per_mm is None else per_mm.data_ptr() + 36 * top, *settings)
-    steps = (0, 0) if depth_mm is None else (0 if depth_mm.shape[0] == 1 else depth_mm.stride(0), depth_mm.stride(2))
-    kernel, strides = loaded().response_normals, compensated.stride()[:3]
+    compensated, weight = compensated.contiguous(), lines.weight
+    count, _, height, width = compensated.shape
+    depth_mm, per_mm = _of_each(depth_mm, count), lines.per_mm
+    normal = torch.empty_like(compensated)
+    field = (lines.place.data_ptr(), weight.data_ptr(), weight.shape[1] - 1, weight.shape[3])
+    by_depth = (None if per_mm is None else per_mm.data_ptr(), *settings)
+    kernel = loaded().response_normals
     by_frames(
         count,
-        rows * columns,
+        height * width,
         lambda first, many: kernel(
-            *(_at(compensated, first), *strides, *field, _at(depth_mm, first), *steps, *by_depth),
-            *(many, rows, columns, _at(normal, first)),
+            *(_at(compensated, first), *field, _at(depth_mm, first), *by_depth, many, height, width, _at(normal, first)),
         ),
     )
     return normal
 
 
-def masked(gradient: Tensor, mask: Tensor) -> Tensor:
-    """A gradient (B, 2, h, w), zero outside of a mask, bool (B, 1, h, w)."""
-    gradient, mask = gradient.contiguous(), _with_whole_rows(mask)
-    out = torch.empty_like(gradient)
-    loaded().mask_values(gradient.data_ptr(), mask.data_ptr(), mask.stride(0), mask.stride(2), *gradient.shape, out.data_ptr())
-    return out
-
-
-def depth_slopes(depth_mm: Tensor, mask: Tensor, mm_per_pixel: float) -> Tensor:
-    """The gradient of depth (B, 1, h, w), (B, 2, h, w), zero outside of a mask, bool (B, 1, h, w)."""
-    depth_mm, mask = _with_whole_rows(depth_mm), _with_whole_rows(mask)
-    count, _, rows, columns = depth_mm.shape
-    gradient = depth_mm.new_empty(count, 2, rows, columns)
-    strides = (depth_mm.stride(0), depth_mm.stride(2)), (mask.stride(0), mask.stride(2))
-    settings, kernel = (0.5 / mm_per_pixel,), loaded().depth_slopes
-    by_frames(
-        count,
-        rows * columns,
-        lambda first, many: kernel(
-            *(_at(depth_mm, first), *strides[0], _at(mask, first), *strides[1], *settings),
-            *(many, rows, columns, _at(gradient, first)),
-        ),
-    )
-    return gradient
-
-
 def normals(
-    compensated: Tensor, limits: Limits, noise_std: Tensor, inverse: Tensor, depth_mm: Tensor | None, view: LightView
+    compensated: Tensor,
+    limits: tuple[Tensor, Tensor],
+    noise_std: Tensor,
+    inverse: Tensor,
+    depth_mm: Tensor | None,
+    view: LightView,
 ) -> tuple[Tensor, bool]:
-    """Unit normals (B, 3, h, w) of a window, and whether every channel of it is valid.
+    """Unit normals (B, 3, H, W), and whether every channel of the images is valid.
 
-    By the stored inverse (3, 3, H, W), or with a depth by the lights; see :class:`~torchvts.normals.NormalFromIntensity`. Limits
-    and inverse are those of the whole image, and the position of the lights is as seen from its middle. ``noise_std``: (B, 3).
+    By the stored inverse (3, 3, H, W), or with a depth by the lights; see :class:`~torchvts.normals.NormalFromIntensity`.
+    ``limits``: what the lights give on the flat skin, and from where on a channel is saturated, (3, H, W). ``noise_std``: (B, 3).
     """
-    flat, saturated, inverse = limits.flat.contiguous(), limits.saturated_above.contiguous(), inverse.contiguous()
-    three_noises = (3.0 * noise_std).contiguous()
-    compensated = _with_whole_rows(compensated)
+    (flat, saturated), inverse = (table.contiguous() for table in limits), inverse.contiguous()
+    compensated, three_noises = compensated.contiguous(), (3.0 * noise_std).contiguous()
     position_mm, albedo = view.position_mm.contiguous(), view.albedo.contiguous()
-    count, _, rows, columns = compensated.shape
-    height, width = inverse.shape[2], inverse.shape[3]
-    at = 4 * (view.window[0] * width + view.window[1])
-    normal = compensated.new_empty(count, 3, rows, columns)
-    depth_mm = None if depth_mm is None else _with_whole_rows(depth_mm)
-    fields = (flat.data_ptr() + at, saturated.data_ptr() + at, inverse.data_ptr() + at, height * width, width)
-    lights = (position_mm.data_ptr(), albedo.data_ptr(), view.mm_per_pixel, 1.0 / view.camera_height_mm, *view.axis_mm)
-    kernel, strides, steps = loaded().normals, compensated.stride()[:3], _depth_arguments(depth_mm)[1:]
+    count, _, height, width = compensated.shape
+    depth_mm = _of_each(depth_mm, count)
+    normal = torch.empty_like(compensated)
+    fields = (flat.data_ptr(), saturated.data_ptr(), inverse.data_ptr())
+    lights = (position_mm.data_ptr(), albedo.data_ptr(), view.mm_per_pixel, 1.0 / view.camera_height_mm)
+    kernel = loaded().normals
     invalid = by_frames(
         count,
-        rows * columns,
+        height * width,
         lambda first, many: kernel(
-            *(_at(compensated, first), *strides, three_noises[first:].data_ptr(), *fields, many, rows, columns),
-            *(_at(depth_mm, first), *steps, *lights, _at(normal, first)),
+            *(_at(compensated, first), three_noises[first:].data_ptr(), *fields, many, height, width),
+            *(_at(depth_mm, first), *lights, _at(normal, first)),
         ),
     )
     return normal, not invalid
@@ -464,7 +318,7 @@ def normals(
 def solve_shadowed(
     normal: Tensor,
     compensated: Tensor,
-    limits: Limits,
+    tables: tuple[Tensor, Tensor, Tensor],
     noises: tuple[Tensor, Tensor],
     depth_mm: Tensor | None,
     expected: Tensor | None,
@@ -473,41 +327,24 @@ def solve_shadowed(
 ) -> None:
     """Replace normals, in place, where a light is blocked, a channel is saturated, or the matrix is ill-conditioned.
 
-    See :class:`~torchvts.normals.shadowed.ShadowedPixels`. The position of the lights is as seen from the window's middle.
+    See :class:`~torchvts.normals.shadowed.ShadowedPixels`, whose flat, saturated_above and ill_conditioned the tables are.
     ``noises``: of the channels of each frame, (B, 3), and of each frame the noise, the weight of the prior and that of the
-    brightness, (B, 3). ``constants``: steps; then behind pitch, camera and axis, which are taken from ``view``, the largest
+    brightness, (B, 3). ``constants``: steps; then behind pitch and camera, which are taken from ``view``, the largest
     difference of slopes beside a cliff and the largest slope.
     """
-    flat, saturated, ill = (table.contiguous() for table in limits)
+    flat, saturated, ill = (table.contiguous() for table in tables)
     three_noises, weights = (3.0 * noises[0]).contiguous(), noises[1].contiguous()
-    compensated = _with_whole_rows(compensated)
+    compensated = compensated.contiguous()
     position_mm, albedo = view.position_mm.contiguous(), view.albedo.contiguous()
-    camera = [view.mm_per_pixel, 1.0 / view.camera_height_mm, *view.axis_mm]
-    model = albedo.new_tensor([constants[0], *camera, *constants[1:]])
-    count, _, rows, columns = compensated.shape
-    height, width = flat.shape[1], flat.shape[2]
-    place = view.window[0] * width + view.window[1]
-    depth_mm = None if depth_mm is None else _with_whole_rows(depth_mm)
-    expected = None if expected is None else expected.contiguous()
+    model = albedo.new_tensor([constants[0], view.mm_per_pixel, 1.0 / view.camera_height_mm, *constants[1:]])
+    count, _, height, width = compensated.shape
+    depth_mm, expected = _of_each(depth_mm, count), _of_each(expected, count)
+    inputs = (compensated, three_noises, flat, saturated, ill)
     loaded().solve_shadowed(
-        compensated.data_ptr(),
-        *compensated.stride()[:3],
-        three_noises.data_ptr(),
-        flat.data_ptr() + 4 * place,
-        saturated.data_ptr() + 4 * place,
-        ill.data_ptr() + place,
-        height * width,
-        width,
-        count,
-        rows,
-        columns,
-        *_depth_arguments(depth_mm),
-        None if expected is None else expected.data_ptr(),
-        position_mm.data_ptr(),
-        albedo.data_ptr(),
-        model.data_ptr(),
-        weights.data_ptr(),
-        normal.data_ptr(),
+        *(tensor.data_ptr() for tensor in inputs),
+        *(count, height, width),
+        *(None if tensor is None else tensor.data_ptr() for tensor in (depth_mm, expected)),
+        *(tensor.data_ptr() for tensor in (position_mm, albedo, model, weights, normal)),
     )
 
 
@@ -547,67 +384,23 @@ def poisson_plan(height: int, width: int) -> Tensor | None:
     return tables
 
 
-def solve_poisson(
-    gradient: Tensor, mm_per_pixel: float, tables: Tensor, window: tuple[int, int], size: tuple[int, int], zeroed: bool
-) -> Tensor:
-    """Depth (B, 1, H, W) of the given size from a window's gradient, by the tables of :func:`poisson_plan`.
+def solve_poisson(gradient: Tensor, mm_per_pixel: float, tables: Tensor, zeroed: bool) -> Tensor:
+    """Depth (B, 1, H, W) from a gradient (B, 2, H, W), by the tables of :func:`poisson_plan`.
 
     See :mod:`torchvts.integration.poisson`. ``zeroed``: zero on average where the gradient is zero, not over all of the image.
     """
     gradient = gradient.contiguous()
-    count, _, rows, columns = gradient.shape
-    depth = gradient.new_empty(count, 1, *size)
-    settings, kernel = (rows, columns, *window, *size, zeroed), loaded().solve_poisson
-    _check(
-        by_frames(
-            count,
-            size[0] * size[1],
-            lambda first, many: kernel(_at(gradient, first), tables.data_ptr(), mm_per_pixel, many, *settings, _at(depth, first)),
-        )
-    )
-    return depth
-
-
-def largest_change(one: Tensor, other: Tensor) -> Tensor:
-    """Largest difference of two batches of depths, per frame, (B,)."""
-    one, other = one.contiguous(), other.contiguous()
-    change = one.new_empty(one.shape[0])
-    loaded().largest_change(one.data_ptr(), other.data_ptr(), one.shape[0], one[0].numel(), change.data_ptr())
-    return change
-
-
-def uncrop(gradient: Tensor, contact: Tensor, window: tuple[int, int], size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
-    """The gradient of a window embedded in the whole image (B, 2, H, W), zero elsewhere, its normals (B, 3, H, W), the contact."""
-    gradient, contact = gradient.contiguous(), contact.contiguous()
-    count, _, rows, columns = gradient.shape
-    whole, normal = gradient.new_empty(count, 2, *size), gradient.new_empty(count, 3, *size)
-    touching = contact.new_empty(count, 1, *size)
-    part, kernel = (rows, columns, *window, *size), loaded().uncrop
-    by_frames(
-        count,
-        size[0] * size[1],
-        lambda first, many: kernel(
-            *(_at(gradient, first), _at(contact, first), many, *part),
-            *(_at(whole, first), _at(normal, first), _at(touching, first)),
-        ),
-    )
-    return whole, normal, touching
-
-
-def zero_background(depth_mm: Tensor, deformed: Tensor, stiff: float, tolerance: float, sweeps: int) -> Tensor:
-    """:class:`torchvts.integration.background.ZeroBackground` of depth (B, 1, H, W) and deformed skin, bool (B, 1, H, W)."""
-    depth_mm, deformed = depth_mm.contiguous(), deformed.contiguous()
-    count, _, height, width = depth_mm.shape
-    out = torch.empty_like(depth_mm)
-    kernel, settings = loaded().zero_background, (height, width, stiff, tolerance, sweeps)
+    count, _, height, width = gradient.shape
+    depth = gradient.new_empty(count, 1, height, width)
+    settings, kernel = (height, width, zeroed), loaded().solve_poisson
     _check(
         by_frames(
             count,
             height * width,
-            lambda first, many: kernel(_at(depth_mm, first), _at(deformed, first), many, *settings, _at(out, first)),
+            lambda first, many: kernel(_at(gradient, first), tables.data_ptr(), mm_per_pixel, many, *settings, _at(depth, first)),
         )
     )
-    return out
+    return depth
 
 
 def alignment_sums(field: Tensor, columns: Tensor, limits: npt.NDArray[Any], score_only: bool = False) -> npt.NDArray[Any]:

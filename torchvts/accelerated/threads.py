@@ -1,4 +1,4 @@
-"""How many threads work on a batch and within a frame: nobody waits for threads that would wake up late."""
+"""How many threads work on a batch: nobody waits for threads that would wake up late."""
 
 import os
 import threading
@@ -13,9 +13,6 @@ from torch import Tensor
 MOST_PIXELS = 640 * 480
 """Pixels of a batch up to which one thread does all. Behind a camera two threads gain nothing on so few, and their wake-up costs
 up to 12 ms in one frame of ten."""
-
-MOST_WITHIN_FRAME = 4
-"""Threads that share the work of one frame: its own (csrc/threads.c), for which nobody waits where they wake up late."""
 
 _lock = threading.Lock()
 _inside = 0
@@ -61,21 +58,6 @@ class OneThread(AbstractContextManager[None]):
             torch.set_num_threads(_outside)
 
 
-def parts_of(count: int, pixels: int) -> int:
-    """In how many parts the frames of a batch are worked on at once.
-
-    Args:
-        count: number of frames.
-        pixels: of a frame.
-    """
-    return min(count, torch.get_num_threads()) if count * pixels > MOST_PIXELS else 1
-
-
-def within_frame() -> int:
-    """How many threads may share the work of one frame: torch's number, that from outside of :class:`OneThread`, at most 4."""
-    return min(_outside if _inside else torch.get_num_threads(), MOST_WITHIN_FRAME)
-
-
 def by_frames(count: int, pixels: int, call: Callable[[int, int], int | None]) -> int:
     """Call a kernel for the frames of a batch, which do not influence one another: at once, or in parts by torch's number of
     threads.
@@ -87,7 +69,7 @@ def by_frames(count: int, pixels: int, call: Callable[[int, int], int | None]) -
     Returns:
         1 where memory was short for any part, else 0.
     """
-    parts = parts_of(count, pixels)
+    parts = min(count, torch.get_num_threads()) if count * pixels > MOST_PIXELS else 1
     if parts <= 1:
         return call(0, count) or 0
     ends = [count * k // parts for k in range(parts + 1)]

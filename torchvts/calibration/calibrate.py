@@ -29,6 +29,7 @@ from .prior_choice import FromPresses, fit_with_or_without
 from .prior_score import held_out_by_groups
 from .refusals import NoUsablePress, check_colour, check_coloured_background, check_coloured_contacts, other_crop
 from .response_fit import Candidates
+from .touching import with_contact_share
 
 WELL_CONSTRAINED_DEG = 2.0
 """Point lights replace a sensor's prior only if the image constrains each of them this well."""
@@ -317,6 +318,6 @@ def _with_presses(given: _Given, lights: LightsResult, prior: _Prior, touched: T
     if touched is not None:
         report["touches"] = [touch_row(contact) for contact in touched.contacts]
     if not lights_win or lights.unit is None:
-        return dataclasses.replace(unit, report=report), found
+        return with_contact_share(dataclasses.replace(unit, report=report), given.presses, contacts), found
     unit, more = complaints.of_background_by_lights(dataclasses.replace(lights.unit, report=report))
-    return unit, found + more
+    return with_contact_share(unit, given.presses, contacts), found + more

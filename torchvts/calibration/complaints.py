@@ -7,11 +7,10 @@ from collections.abc import Sequence
 
 import torch
 
-from ..accelerated import ContactMask
 from ..model.calibration import Calibration
 from ..model.sensor import Sensor
 from .background import falloff, outwardness
-from .contacts import ROUGH, Contact, channel_structure
+from .contacts import ROUGH, Contact, channel_structure, differing
 from .pattern import ALIKE, FAINTEST, PatternMatch
 
 USUAL_GAIN = 1.15
@@ -100,9 +99,9 @@ def of_background_by_lights(calibration: Calibration) -> tuple[Calibration, list
         model = model + calibration.ambient.reshape(3, 1, 1)
     spread = (model - calibration.background).abs().flatten(1).median(dim=1).values / 0.6745
     # contact changes the light by more than 5 % and is wider than dirt: 5 sigmas of the residual and of 1 % of the model
-    find = ContactMask(model, spread.reshape(3, 1, 1) + 0.01 * model, min_size_px=0.05 * calibration.sensor.height)
     saturated = (calibration.background > 0.995) | (model > 0.95)
-    standing_out = float(find(torch.where(saturated, model, calibration.background)[None]).double().mean())
+    change = (calibration.background - model).masked_fill(saturated, 0.0)
+    standing_out = float(differing(change, spread.reshape(3, 1, 1) + 0.01 * model).double().mean())
     report = calibration.report.copy()
     report["residual_std"], report["standing_out"] = spread.tolist(), standing_out
     found = []

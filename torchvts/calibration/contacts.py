@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ..accelerated import Compensate, ContactMask, NormalFromResponse, PoissonBackground, SmoothDrift
+from ..accelerated import Compensate, NormalFromResponse, PoissonBackground, SmoothDrift
 from ..core.blur import blur, gaussian_weights
 from ..core.geometry import gradient_from_normal, pixel_grid_mm
+from ..core.morphology import dilate, erode
 from ..model.calibration import PEDESTAL, Calibration
 from ..model.report import PressRow, TouchRow
 from ..model.response_field import ResponseField, ResponseModel
@@ -31,6 +32,9 @@ DARK = 0.25
 
 MOST_SATURATED = 0.5
 """A contact with more of it saturated in some channel is left out."""
+
+DIFFERS = 4.5
+"""Change in units of the noise from which an image differs."""
 
 LIGHT_DRIFT = 0.008
 """Least noise by which a press differs from the background, relative to it: the LEDs of real sensors drift by 1 to 2 %."""
@@ -117,11 +121,13 @@ def read_contacts(given: Sequence[Press | Touch], background: Tensor, sensor: Se
     """
     unit = unit_without_model(background, sensor)
     # in single precision, as frames are: 8 bits are a thousand times as coarse, and the compiled kernels take a tenth of the time
-    compensate, mask, smooth = Compensate.from_calibration(unit).float(), _difference(unit), SmoothDrift()
+    compensate, smooth = Compensate.from_calibration(unit).float(), SmoothDrift()
+    noise = unit.compensated_noise_std.clamp_min(LIGHT_DRIFT).float()
     contacts = []
     for item in given:
         ratio = compensate(item.image.detach().cpu().float()[None])
-        change, differs = ratio[0] - 1.0, mask(ratio)[0, 0]
+        change = ratio[0] - 1.0
+        differs = differing(change, noise)
         far = far_field(change)
         ball_px = 0.5 * item.ball_diameter_mm / sensor.mm_per_pixel if isinstance(item, Press) else 0.0
         region = contact_region(far, differs, ball_px)
@@ -134,12 +140,16 @@ def read_contacts(given: Sequence[Press | Touch], background: Tensor, sensor: Se
     return contacts
 
 
-def _difference(unit: Calibration) -> ContactMask:
-    """The mask of what differs from the background by the noise of calibration alone: what changes far from a contact counts too.
+def differing(change: Tensor, noise_std: Tensor) -> Tensor:
+    """Where an image differs from another by more than its noise, bool (H, W), without specks: what is smaller than 5 x 5 pixels.
 
-    From that, :func:`far_field` separates a contact from light that has changed everywhere.
+    Args:
+        change: (3, H, W).
+        noise_std: its noise, (3, H, W), or what broadcasts to it.
     """
-    return ContactMask(unit.flat, unit.compensated_noise_std.clamp_min(LIGHT_DRIFT)).float()
+    strong = (change / noise_std).square().sum(0) > DIFFERS**2
+    closed = erode(dilate(strong[None, None]))  # pixels lost to noise
+    return dilate(erode(closed, 2), 2)[0, 0]
 
 
 def _sampled(given: Press | Touch, change: Tensor, mask: Tensor, saturated: Tensor, sensor: Sensor) -> Contact:

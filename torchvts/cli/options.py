@@ -5,15 +5,17 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from ..contact import ContactSettings
 from ..core.checks import parse_number
 from ..core.spelling import suggest
 from ..model import Calibration, Sensor, shipped_sensors
 from ..pipeline import MODES
+from ..skin import ContactSettings
 from ..stream import FIRST_FRAMES
 from .parser import UsageError
 
-_CONTACT = " ".join(f"{key}={value:g}" for key, value in asdict(ContactSettings()).items())
+_CONTACT = " ".join(
+    f"{key}={'of the unit' if value is None else format(value, 'g')}" for key, value in asdict(ContactSettings()).items()
+)
 
 
 def add_sensor(parser: argparse._ActionsContainer, text: str = "") -> None:
@@ -62,7 +64,7 @@ def contact_of(given: Sequence[str] | None) -> ContactSettings | None:
 
     Example:
         >>> contact_of(["sigmas=6"])
-        ContactSettings(sigmas=6.0, min_size_px=8.0, share=0.8)
+        ContactSettings(sigmas=6.0, share=None)
     """
     if not given:
         return None

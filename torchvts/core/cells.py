@@ -43,3 +43,17 @@ def _line_sums(image: Tensor, cell: int) -> Tensor:
         first = image.shape[2] - cell + k
         last = last + image[:, :, first : first + 1]
     return torch.cat((sums, last), dim=2)
+
+
+def whole_cell_means(image: Tensor, cell: int) -> Tensor:
+    """Means over those cells of a (B, C, H, W) image that lie in it as a whole; pixels beyond the last one do not count."""
+    rows, columns = image.shape[2] // cell * cell, image.shape[3] // cell * cell
+    return cell_means(image[:, :, :rows, :columns], cell)
+
+
+def cells_to_pixels(values: Tensor, cell: int, height: int, width: int) -> Tensor:
+    """Values (B, C, h, w) of whole cells at the pixels of an image, interpolated; beyond the last cell as there."""
+    if cell > 1:
+        values = nn.functional.interpolate(values, scale_factor=float(cell), mode="bilinear", align_corners=False)
+    below, after = height - values.shape[2], width - values.shape[3]
+    return nn.functional.pad(values, [0, after, 0, below], mode="replicate") if below > 0 or after > 0 else values

@@ -248,24 +248,6 @@ def reads_freely(tensor: Tensor) -> bool:
     return not torch._C._functorch.is_functorch_wrapped_tensor(tensor)
 
 
-def check_window(name: str, tensor: Tensor, size: tuple[int, int], window: tuple[int, int] | None) -> tuple[int, int]:
-    """Return (top, left) of ``tensor`` in an image of ``size``; without a window it must be the whole image. Scripts."""
-    if not torch.jit.is_scripting():
-        for part, pair in (("size", size), ("window", (0, 0) if window is None else window)):
-            if not isinstance(pair, tuple | list) or len(pair) != 2 or any(isinstance(v, Tensor | float | str) for v in pair):
-                raise TypeError(f"{name}, {part}: expected two integers, got {brief(pair)}")
-    if window is None:
-        check_same_size(name, tensor, "the calibration", size[0], size[1])
-        return 0, 0
-    top, left = window
-    rows, columns = tensor.shape[-2], tensor.shape[-1]
-    if top < 0 or left < 0 or top + rows > size[0] or left + columns > size[1]:
-        raise ValueError(
-            f"{name}, window: expected a part of {size[0]} x {size[1]}, got {rows} x {columns} at row {top}, column {left}"
-        )
-    return top, left
-
-
 def check_image(name: str, image: Tensor, height: int, width: int, sensor_name: str) -> None:
     """Raise unless ``image`` is one finite (3, ``height``, ``width``) image in [0, 1]."""
     check_tensor(name, image)

@@ -26,12 +26,12 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from ..contact import ContactSettings
 from ..core import __version__
 from ..core.checks import check_choice, check_integer, check_path, check_sequence, in_one_line
 from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, count_frames
 from ..model import Calibration
 from ..pipeline import MODES, DepthOutput, unit_pipeline
+from ..skin import ContactSettings
 from ..stream import FIRST_FRAMES, Recording, check_device, use_calibration
 from .items import Item, Source, list_items
 from .loading import Frame, load_frames

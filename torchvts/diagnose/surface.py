@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..accelerated import Compensate, ContactMask, GradientFromNormal, NormalFromIntensity, PoissonBackground
+from ..accelerated import Compensate, GradientFromNormal, NormalFromIntensity, PoissonDCT, SmoothDrift
 from ..core.blur import blur, gaussian_weights
 from ..core.checks import QUANTISATION_STD
 from ..core.geometry import angles_deg, lengths
@@ -19,6 +19,7 @@ from ..model import Calibration, PointLights
 from ..model.lights import inverse_light_matrix
 from ..normals import NormalFromResponse
 from ..pipeline import DepthOutput, DepthPipeline
+from ..skin import ContactMask
 
 SPREADS_PX = (1.5, 3.0, 6.0)
 """Blurs that the normals are compared with, in pixels of a 160 x 120 image and in proportion for others."""
@@ -52,10 +53,11 @@ class Blocks:
             ContactMask.from_calibration(self.calibration),
             self.normals,
             GradientFromNormal(),
-            PoissonBackground(pitch),
+            PoissonDCT(pitch),
         )
+        smooth = None if self.calibration.response is None else SmoothDrift()
         with torch.no_grad():
-            result: DepthOutput = DepthPipeline(*chain, mm_per_pixel=pitch, mode=mode).eval()(image)
+            result: DepthOutput = DepthPipeline(*chain, mm_per_pixel=pitch, mode=mode, smooth=smooth).eval()(image)
         return result
 
 

@@ -21,11 +21,11 @@ from ..calibration import RESPONSE_BLUR_PX, Press, fit_prior, read_presses
 from ..core.checks import check_image, check_integer
 from ..core.files import read_image, rgb_from_bgr
 from ..integration import poisson_dct
-from ..integration.background import ZeroBackground
 from ..model import Calibration, Sensor
 from ..normals import NormalFromMLP
 from ..pipeline import DepthPipeline
 from ..scenes import Scene
+from ..skin import ZeroBackground
 from ..stream.sources import open_source
 from .drawn_sensors import SEEDS, drawn_sensor
 from .methods import Method, shipped_prior, with_network
@@ -189,7 +189,7 @@ def _mini_b(folder: Path, limit: int | None) -> DataSet:
         depth = poisson_dct(own.double(), sensor.mm_per_pixel)
         assert sensor.prior is not None
         pipe = DepthPipeline.from_calibration(Calibration.from_response(sensor.prior.response, sensor, background))
-        depth = ZeroBackground()(depth, pipe.deformed(pipe.compensate(bead[None])))
+        depth = ZeroBackground(sensor.mm_per_pixel)(depth, pipe.frame_of(bead[None])[0].weight.double())
     changed = (image - before).abs().amax(1, keepdim=True) > CHANGED
     gradient = torch.stack(torch.gradient(depth[0, 0], spacing=sensor.mm_per_pixel)[::-1])[None]  # torch gives rows first
     target = Target("bead", bead, Truth(depth, gradient, changed))

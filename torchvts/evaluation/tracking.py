@@ -12,7 +12,6 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from ..accelerated import ZeroBackground
 from ..core.geometry import gradient_of_depth, normal_from_gradient
 from ..integration import poisson_dst
 from ..model import PointLights
@@ -20,6 +19,7 @@ from ..pipeline import DepthOutput, DepthPipeline
 from ..pose import PoseTracker, Registration, register_depth
 from ..pose.result import invert, turn_deg
 from ..scenes import objects, render
+from ..skin import ZeroBackground
 from ..viz import new_figure
 from .faults import gaussian_blur
 from .pose_accuracy import GOAL_DEG, GOAL_MM, rig
@@ -260,8 +260,8 @@ class WrongSlopes:
         at = torch.cat((place, frame.gradient[0, :, row, column].T), 1)  # (N, 4)
         raw[0, :, row, column] += self._size @ torch.cos(at @ self._frequency.T + self._phase).T
         small = 0.03 * poisson_dst(raw, self._pitch)  # too small to move where skin is undeformed
-        zero = ZeroBackground()
-        depth = zero(frame.depth_mm + small, frame.deformed) - zero(frame.depth_mm, frame.deformed)
+        zero, weight = ZeroBackground(self._pitch), frame.deformed.to(small.dtype)
+        depth = zero(frame.depth_mm + small, weight) - zero(frame.depth_mm, weight)
         return self._scale * gradient_of_depth(depth, self._pitch) * frame.deformed, self._scale * depth
 
 

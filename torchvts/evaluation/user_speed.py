@@ -34,9 +34,6 @@ CAMERA_FRAMES = 600
 OWN = "own choice"
 """Threads that the library chooses by itself."""
 
-NO_SHARED_CACHE_NS = 150.0
-"""After a longer way of a cache line from core to core and back the cores are taken to share no cache."""
-
 
 @dataclass(frozen=True)
 class Paced:
@@ -52,7 +49,6 @@ class Paced:
         p90_ms: 90th percentile of a frame, ms.
         p99_ms: 99th, ms; None for fewer than 500 calls.
         calls: number of calls.
-        exchange_ns: larger :func:`exchange_ns` of before and after, ns.
     """
 
     unit: str
@@ -64,7 +60,6 @@ class Paced:
     p90_ms: float
     p99_ms: float | None
     calls: int
-    exchange_ns: float = 0.0
 
 
 class Cost(NamedTuple):
@@ -84,34 +79,23 @@ class Unit(NamedTuple):
     peer: Callable[[], object] | None
 
 
-class Timed(NamedTuple):
-    """Times of calls, ms, and the larger :func:`exchange_ns` of before and after."""
-
-    times: Sequence[float]
-    exchange_ns: float
-
-
-def paced(call: Callable[[], object], before: Callable[[], object], calls: int) -> Timed:
-    """Time of each of so many calls, something else before each; three to warm up. And how far from each other the cores lay."""
+def paced(call: Callable[[], object], before: Callable[[], object], calls: int) -> list[float]:
+    """Time of each of so many calls, ms, something else before each; three to warm up."""
     times: list[float] = []
-    first = exchange_ns()
     with torch.inference_mode():
         for k in range(calls + 3):
             before()
             spent = _ms(call)
             if k >= 3:
                 times.append(spent)
-    return Timed(times, max(first, exchange_ns()))
+    return times
 
 
-def summary(unit: str, method: str, size: Size, pace: str, threads: str, calls: Timed) -> Paced:
+def summary(unit: str, method: str, size: Size, pace: str, threads: str, times: Sequence[float]) -> Paced:
     """The record of the times of calls; per frame where a call has several."""
-    times, exchange = calls
     ordered = sorted(value / size.batch for value in times)
     p99 = ordered[int(0.99 * len(ordered))] if len(ordered) >= 500 else None
-    return Paced(
-        unit, method, size, pace, threads, statistics.median(ordered), ordered[int(0.9 * len(ordered))], p99, len(ordered), exchange
-    )
+    return Paced(unit, method, size, pace, threads, statistics.median(ordered), ordered[int(0.9 * len(ordered))], p99, len(ordered))
 
 
 def mini(data: Path, size: tuple[int, int]) -> Unit:
@@ -151,11 +135,11 @@ def frames(unit: Unit, calls: int, threads: str = OWN) -> Iterator[Paced]:
                 yield record(GS_SDK, size, "after our frame", threads, others)
 
 
-def alternating(call: Callable[[], object], peer: Callable[[], object], calls: int) -> tuple[Timed, Timed]:
+def alternating(call: Callable[[], object], peer: Callable[[], object], calls: int) -> tuple[list[float], list[float]]:
     """Times of both, one after the other in one process."""
     others: list[float] = []
     times = paced(call, lambda: others.append(_ms(peer)), calls)
-    return times, Timed(others[-calls:], times.exchange_ns)
+    return times, others[-calls:]
 
 
 def _ms(call: Callable[[], object]) -> float:
@@ -253,18 +237,8 @@ def run(data: Path | None, progress: Callable[[str], None], calls: int = 100, lo
     )
 
 
-def exchange_ns() -> float:
-    """Time that a line of memory takes from one core's cache to another's and back, ns; the median of five, 0 without kernels.
-
-    Some 50 ns within a cache that both share; 300 where a virtual machine's two cores lie in different parts of the processor,
-    where two threads help each other less. A machine may change from one to the other within a minute.
-    """
-    loaded = library()
-    return 0.0 if loaded is None else statistics.median(float(loaded.exchange_ns()) for _ in range(5))
-
-
 def _in_one_thread(unit: Unit, calls: int) -> list[Paced]:
-    """Rows of a user who allows torch one thread: the library then has one too, which within OneThread it does not."""
+    """Rows of a user who allows torch one thread."""
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
@@ -282,7 +256,7 @@ def ratios(rows: Sequence[Paced]) -> list[str]:
         if row.pace == PACES[2] and peer is not None:
             lines.append(
                 f"{row.unit}, {row.size.width}x{row.size.height}, threads: {row.threads}: {row.method} {row.median_ms:.2f} ms, "
-                f"{peer / row.median_ms:.1f} times as fast as {GS_SDK} ({peer:.1f} ms){_far(row)}"
+                f"{peer / row.median_ms:.1f} times as fast as {GS_SDK} ({peer:.1f} ms)"
             )
     return lines
 
@@ -297,7 +271,7 @@ def table(measured: Measured) -> str:
         for pace in PACES:
             of_pace = [row for row in known if row.pace == pace]
             best = max(of_pace, key=lambda row: row.calls, default=None)
-            cells.append("" if best is None else f"{best.median_ms:.2f}, {best.p90_ms:.2f}" + _p99(best) + _far(best))
+            cells.append("" if best is None else f"{best.median_ms:.2f}, {best.p90_ms:.2f}" + _p99(best))
         batch = f", batch {size.batch}" if size.batch > 1 else ""
         tight = next((row for row in known if row.pace == PACES[0]), None)
         rate = number(None if tight is None else 1000.0 / tight.median_ms, 0)
@@ -311,18 +285,8 @@ def table(measured: Measured) -> str:
         "frames/s in a tight loop",
     ]
     once = markdown(["what is paid once, or behind a camera", ""], [[c.name, f"{c.value:.3g} {c.unit}"] for c in measured.costs])
-    ways = sorted(row.exchange_ns for row in measured.frames)
-    note = (
-        f"A cache line took {ways[0]:.0f} to {ways[-1]:.0f} ns from core to core and back, measured before and after each row. "
-        f"* more than {NO_SHARED_CACHE_NS:.0f} ns: presumably the cores share no cache."
-    )
-    notes = [note, ""] if ways[-1] > 0.0 else []  # without kernels there is no second thread
-    return "\n".join([markdown(titles, lines), "", *notes, *ratios(measured.frames), "", once, "", measured.machine])
+    return "\n".join([markdown(titles, lines), "", *ratios(measured.frames), "", once, "", measured.machine])
 
 
 def _p99(row: Paced) -> str:
     return "" if row.p99_ms is None else f" ({row.p99_ms:.2f} of {row.calls})"
-
-
-def _far(row: Paced) -> str:
-    return " *" if row.exchange_ns > NO_SHARED_CACHE_NS else ""

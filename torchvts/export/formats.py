@@ -21,7 +21,6 @@ from ..core.checks import check_choice, check_record
 from ..core.files import check_target, write_atomically
 from ..normals import WrappedNormals
 from ..pipeline import DepthPipeline
-from .kernels_in_file import linked_kernels, trace_kernels
 from .onnx_operators import InOnnxOperators, simplify
 from .trace import size_and_dtype, trace
 
@@ -101,11 +100,10 @@ def export_program(pipe: DepthPipeline, path: str | Path | None = None) -> torch
 def export_aoti(pipe: DepthPipeline, path: str | Path) -> Path:
     """Compile a pipeline to machine code for this kind of CPU (.pt2 package), for ``torch._inductor.aoti_load_package`` and C++.
 
-    Where the compiled kernels do all of the pipeline's work, as by response fields in modes fast and precise, the file holds them.
     Returns the path.
 
     Raises:
-        RuntimeError: there is no C++ compiler, or no C compiler for the kernels.
+        RuntimeError: there is no C++ compiler.
         TypeError: no pipeline.
     """
     check_pipeline(pipe)
@@ -116,11 +114,6 @@ def export_aoti(pipe: DepthPipeline, path: str | Path) -> Path:
     if path.suffix != ".pt2":
         raise ValueError(f"path: expected a name ending in .pt2, got {path}: AOTInductor packages have no other")
     settings: dict[str, Any] = {"aot_inductor.metadata": {METADATA_KEY: json.dumps(describe(pipe))}}
-    by_kernels = trace_kernels(pipe)
-    if by_kernels is not None:
-        with linked_kernels() as more:
-            _compile(by_kernels, path, settings | more)
-        return path
     program = trace(pipe, by_matrix=False)
     try:
         _compile(program, path, settings)

@@ -7,10 +7,9 @@ import torch
 from torch import Tensor, nn
 
 from ..accelerated import reference
-from ..core.checks import check_batch, check_dtype, check_size, check_switch
-from ..core.frame import Crop
+from ..core.checks import check_batch, check_dtype, check_same_size, check_size, check_switch
+from ..core.frame import Frame
 from ..integration import Integrator, PoissonDCT, divergence
-from ..integration.base import embedded
 from ..integration.transforms import cosine_bases, fold, unfold
 from ..pipeline import Adaptive, DepthPipeline, Shadows
 
@@ -56,13 +55,11 @@ class PoissonBackgroundByMatrix(Integrator):
                 inverse = torch.where(value == 0.0, torch.zeros_like(value), 1.0 / value)  # zero: the mean
                 self.register_buffer(f"inverse_{y}_{x}", inverse.to(dtype))
 
-    def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
+    def forward(self, gradient: Tensor) -> Tensor:
         check_batch("gradient", gradient, 2)
+        check_same_size("gradient", gradient, "the matrices", self.size[0], self.size[1])
         if gradient.dtype != self.get_buffer("even_y").dtype:
             raise TypeError(f"gradient: expected {self.get_buffer('even_y').dtype} like the matrices, got {gradient.dtype}")
-        if size is not None and size != self.size:
-            raise ValueError(f"gradient, window: expected size {self.size}, for which the matrices are, got {size}")
-        gradient = embedded(gradient, window, self.size)
         up, down = fold(divergence(gradient), -2)
         rows = []
         for y, part in (("even", up), ("odd", down)):
@@ -98,7 +95,8 @@ def size_and_dtype(pipe: DepthPipeline) -> tuple[int, int, torch.dtype]:
     Raises:
         ValueError: no block knows them.
     """
-    for tensor in (*pipe.deformed.buffers(), *pipe.compensate.buffers()):
+    assert isinstance(pipe.mask, nn.Module) and isinstance(pipe.compensate, nn.Module)
+    for tensor in (*pipe.mask.buffers(), *pipe.compensate.buffers()):
         if tensor.dim() == 3 and tensor.shape[0] == 3 and tensor.is_floating_point():
             return tensor.shape[1], tensor.shape[2], tensor.dtype
     raise ValueError("pipe: expected blocks that know the size of the calibration, as from_calibration makes them, got none")
@@ -112,15 +110,10 @@ def trace(pipe: DepthPipeline, by_matrix: bool) -> torch.export.ExportedProgram:
         _use_matrices(pipe, height, width, dtype)
     images = torch.full((2, 3, height, width), 0.5, dtype=dtype)
     _make_tables(pipe, images)
-    return traced(_PlainOutput(pipe), images, any_batch=True)
-
-
-def traced(module: nn.Module, images: Tensor, any_batch: bool) -> torch.export.ExportedProgram:
-    """The graph of a module of images (B, 3, H, W), for any batch or only for that one."""
-    shapes = ({0: torch.export.Dim("batch", min=1, max=MAX_BATCH)},) if any_batch else None
+    shapes = ({0: torch.export.Dim("batch", min=1, max=MAX_BATCH)},)
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return torch.export.export(module, (images,), dynamic_shapes=shapes, strict=False)
+        return torch.export.export(_PlainOutput(pipe), (images,), dynamic_shapes=shapes, strict=False)
 
 
 def _use_matrices(pipe: DepthPipeline, height: int, width: int, dtype: torch.dtype) -> None:
@@ -140,12 +133,11 @@ def _use_matrices(pipe: DepthPipeline, height: int, width: int, dtype: torch.dty
 @torch.no_grad()
 def _make_tables(pipe: DepthPipeline, images: Tensor) -> None:
     """Let each integrator make the tables of its size, which then are constants of the graph."""
-    height, width = images.shape[2], images.shape[3]
     pipe(images)
     policy = pipe.refine
     if isinstance(policy, Shadows):
-        policy.residual_integrator(images[:, :2], (0, 0), (height, width))
+        policy.residual_integrator(images[:, :2])
         policy = policy.policy
     if isinstance(policy, Adaptive):
-        frame = Crop(policy.stride, False)(images, torch.ones_like(images[:, :1], dtype=torch.bool))
-        policy.predicted_change_px(frame, pipe.solve(frame))
+        frame = Frame(images, torch.ones_like(images[:, :1]), None)
+        policy.predicted_change_px(frame, pipe.solve(frame, torch.zeros_like(images[:, :1])))

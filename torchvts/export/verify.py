@@ -1,6 +1,5 @@
 """The proof that an exported file agrees with its pipeline: it is run in a process without torchvts and compared."""
 
-import contextlib
 import json
 import math
 import subprocess
@@ -22,7 +21,6 @@ from ..model.calibration import Calibration, check_calibration
 from ..pipeline import DepthPipeline
 from . import bare_process
 from .formats import FORMATS, check_pipeline
-from .kernels_in_file import program_of_kernels
 
 
 def sample_frames(calibration: Calibration) -> Tensor:
@@ -119,8 +117,8 @@ def _export_one(pipe: DepthPipeline, folder: Path, name: str, images: Tensor) ->
 def compare(path: str | Path, pipe: DepthPipeline, images: Tensor, name: str) -> float:
     """Largest difference of depth, mm, between an exported file and the pipeline, over batches of 1, 2, 3 and all images.
 
-    The file is run by a process in which torchvts cannot be imported, the pipeline by what the file holds, the PyTorch reference or
-    the compiled kernels: the two round differently, which shows in random frames, whose slopes mean nothing.
+    The file is run by a process in which torchvts cannot be imported, the pipeline by what the file holds, the PyTorch reference:
+    compiled kernels round differently, which shows in random frames, whose slopes mean nothing.
 
     Args:
         path: the file.
@@ -135,8 +133,7 @@ def compare(path: str | Path, pipe: DepthPipeline, images: Tensor, name: str) ->
     check_batch("images", images, 3)
     batches = sorted({size for size in (1, 2, 3, images.shape[0]) if size <= images.shape[0]})
     found = run_bare(path, images, name, batches)
-    by_kernels = name == "aoti" and program_of_kernels(pipe) is not None
-    with torch.no_grad(), contextlib.nullcontext() if by_kernels else reference_only():
+    with torch.no_grad(), reference_only():
         expected = [pipe(images[:size]).depth_mm for size in batches]
     differences = [float((one.double() - two.double()).abs().max()) for one, two in zip(found, expected, strict=True)]
     return max(differences) if all(np.isfinite(differences)) else math.inf

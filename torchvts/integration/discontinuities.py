@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_batch, check_float_tensor, check_integer, check_positive, check_same_size, check_shape, check_window
+from ..core.checks import check_batch, check_float_tensor, check_integer, check_positive, check_same_size, check_shape
 from ..core.geometry import lengths
 from .base import Integrator
 from .poisson import PoissonBackground, check_gradient, laplace_plan, solve_laplace
@@ -105,7 +105,7 @@ def integrate_discontinuities(
 
 
 class DiscontinuityIntegration(Integrator):
-    """Module for :func:`integrate_discontinuities`; takes a window as :class:`PoissonDCT` does.
+    """Module for :func:`integrate_discontinuities`.
 
     Args:
         mm_per_pixel: pixel pitch in mm.
@@ -140,12 +140,7 @@ class DiscontinuityIntegration(Integrator):
         self.residual = check_positive("residual", residual)
         self.tolerance_px = check_positive("tolerance_px", tolerance_px)
 
-    def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
-        check_gradient(gradient, 2)
-        if size is not None:
-            top, left = check_window("gradient", gradient, size, window)
-            below, after = size[0] - top - gradient.shape[2], size[1] - left - gradient.shape[3]
-            gradient = nn.functional.pad(gradient, [left, after, top, below])
+    def forward(self, gradient: Tensor) -> Tensor:
         return self.solve(gradient).depth_mm
 
     def solve(
@@ -332,7 +327,7 @@ def discontinuity_share(gradient: Tensor, depth_mm: Tensor, mm_per_pixel: float 
 class AdaptiveIntegration(Integrator):
     """PoissonBackground, and :class:`DiscontinuityIntegration` for frames whose :func:`discontinuity_share` is above ``share``.
 
-    Takes PoissonBackground's place in a pipeline, windows too. Frames of a batch do not influence one another.
+    Takes PoissonBackground's place in a pipeline. Frames of a batch do not influence one another.
 
     Example:
         >>> AdaptiveIntegration(0.05)(torch.zeros(1, 2, 8, 8)).shape
@@ -348,14 +343,12 @@ class AdaptiveIntegration(Integrator):
         self.smooth = self.poisson(mm_per_pixel)
         self.cliffs = DiscontinuityIntegration(mm_per_pixel)
 
-    def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
-        depth: Tensor = self.smooth(gradient, window, size)
-        top, left = (0, 0) if window is None else window
-        part = depth[:, :, top : top + gradient.shape[2], left : left + gradient.shape[3]]
-        chosen = torch.where(discontinuity_share(gradient, part, self.mm_per_pixel) > self.share)[0]
+    def forward(self, gradient: Tensor) -> Tensor:
+        depth: Tensor = self.smooth(gradient)
+        chosen = torch.where(discontinuity_share(gradient, depth, self.mm_per_pixel) > self.share)[0]
         if chosen.numel() == 0:
             return depth
-        return depth.index_copy(0, chosen, self.cliffs(gradient[chosen], window, size))
+        return depth.index_copy(0, chosen, self.cliffs(gradient[chosen]))
 
 
 class _System:

@@ -11,7 +11,7 @@ dw/dv likewise with q. w is depth to first order, zero where z is, and z = h (1 
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_positive, check_window
+from ..core.checks import check_positive
 from ..core.geometry import pixel_grid_mm
 from .base import Integrator, as_integrator
 from .poisson import PoissonBackground, check_gradient
@@ -62,16 +62,12 @@ class PerspectiveIntegration(Integrator):
         self.least_facing_mm = LEAST_COSINE * self.camera_height_mm
         self.integrate = self.poisson(mm_per_pixel) if integrate is None else as_integrator(integrate)
 
-    def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
+    def forward(self, gradient: Tensor) -> Tensor:
         check_gradient(gradient, 2)
-        rows, columns = gradient.shape[2], gradient.shape[3]
-        height, width = (rows, columns) if size is None else size
-        top, left = check_window("gradient", gradient, (height, width), window)
-        u, v = pixel_grid_mm(height, width, self.mm_per_pixel, gradient.dtype, gradient.device)
-        u, v = u[:, left : left + columns], v[top : top + rows]
+        u, v = pixel_grid_mm(gradient.shape[2], gradient.shape[3], self.mm_per_pixel, gradient.dtype, gradient.device)
         h = self.camera_height_mm
         facing = (h + gradient[:, 0:1] * u + gradient[:, 1:2] * v).clamp_min(self.least_facing_mm)
-        w: Tensor = self.integrate(gradient * (h / facing), window, size)
+        w: Tensor = self.integrate(gradient * (h / facing))
         return -h * torch.expm1(-w / h)
 
     def extra_repr(self) -> str:

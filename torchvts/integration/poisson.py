@@ -8,9 +8,9 @@ exact inverses of one discrete operator.
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_batch, check_positive, check_window
+from ..core.checks import check_batch, check_positive
 from ..core.precision import widened
-from .base import Integrator, embedded
+from .base import Integrator
 from .transforms import (
     cosine_tables,
     deinterleave,
@@ -90,7 +90,7 @@ def poisson_dct(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
     check_gradient(gradient, 2)
     if not torch.jit.is_scripting():
         mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
-    return _integrate_dct(gradient, mm_per_pixel, _plan_dct(_wide(gradient), gradient.shape[2], gradient.shape[3]), 0, 0, False)
+    return _integrate_dct(gradient, mm_per_pixel, _plan_dct(_wide(gradient), gradient.shape[2], gradient.shape[3]), False)
 
 
 def poisson_background(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
@@ -114,7 +114,7 @@ def poisson_background(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
     check_gradient(gradient, 2)
     if not torch.jit.is_scripting():
         mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
-    return _integrate_dct(gradient, mm_per_pixel, _plan_dct(_wide(gradient), gradient.shape[2], gradient.shape[3]), 0, 0, True)
+    return _integrate_dct(gradient, mm_per_pixel, _plan_dct(_wide(gradient), gradient.shape[2], gradient.shape[3]), True)
 
 
 class PoissonDST(Integrator):
@@ -125,8 +125,7 @@ class PoissonDST(Integrator):
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         self._plan: list[Tensor] = _plan_dst(torch.zeros(1, 2, 3, 3))
 
-    def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
-        gradient = embedded(gradient, window, size)
+    def forward(self, gradient: Tensor) -> Tensor:
         check_gradient(gradient, 3)
         plan = self._plan
         if not _plan_fits(plan, gradient, gradient.shape[2], gradient.shape[3]):
@@ -137,11 +136,7 @@ class PoissonDST(Integrator):
 
 
 class PoissonDCT(Integrator):
-    """Module for :func:`poisson_dct`; keeps the tables of the last size, so that a stream of frames makes them once.
-
-    Given ``window`` (top, left) and ``size`` (height, width), the gradient is that of a part of an image of that size whose first
-    pixel is there, and zero elsewhere; the depth is that of the whole image, exactly: only work on zeros is saved.
-    """
+    """Module for :func:`poisson_dct`; keeps the tables of the last size, so that a stream of frames makes them once."""
 
     def __init__(self, mm_per_pixel: float = 1.0) -> None:
         super().__init__()
@@ -149,10 +144,9 @@ class PoissonDCT(Integrator):
         self.zero_in_background = False
         self._plan: list[Tensor] = _plan_dct(torch.zeros(1, dtype=torch.float64), 2, 2)
 
-    def forward(self, gradient: Tensor, window: tuple[int, int] | None = None, size: tuple[int, int] | None = None) -> Tensor:
+    def forward(self, gradient: Tensor) -> Tensor:
         check_gradient(gradient, 2)
-        height, width = (gradient.shape[2], gradient.shape[3]) if size is None else size
-        top, left = check_window("gradient", gradient, (height, width), window)
+        height, width = gradient.shape[2], gradient.shape[3]
         plan, like = self._plan, _wide(gradient)
         if not _plan_fits(plan, like, height, width):
             plan = _kept(_plan_dct(like, height, width))
@@ -160,32 +154,28 @@ class PoissonDCT(Integrator):
                 self._plan = plan
         if gradient.shape[0] == 0:
             return gradient.new_zeros([0, 1, height, width])
-        return self.integrate(gradient, plan, top, left)
+        return self.integrate(gradient, plan)
 
-    def integrate(self, gradient: Tensor, plan: list[Tensor], top: int, left: int) -> Tensor:
+    def integrate(self, gradient: Tensor, plan: list[Tensor]) -> Tensor:
         """Depth by the tables of a plan; compiled kernels take the place of this method."""
-        return _integrate_dct(gradient, self.mm_per_pixel, plan, top, left, self.zero_in_background)
+        return _integrate_dct(gradient, self.mm_per_pixel, plan, self.zero_in_background)
 
 
 class PoissonBackground(PoissonDCT):
-    """Module for :func:`poisson_background`; keeps the tables and takes a window as :class:`PoissonDCT` does."""
+    """Module for :func:`poisson_background`; keeps the tables as :class:`PoissonDCT` does."""
 
     def __init__(self, mm_per_pixel: float = 1.0) -> None:
         super().__init__(mm_per_pixel)
         self.zero_in_background = True
 
 
-def _zero_in_background(depth: Tensor, gradient: Tensor, top: int, left: int) -> Tensor:
-    """Zero on average where the gradient is; ``gradient`` is that of a window, zero elsewhere. The depth has zero mean."""
-    height, width = gradient.shape[2], gradient.shape[3]
+def _zero_in_background(depth: Tensor, gradient: Tensor) -> Tensor:
+    """Zero on average where the gradient is, or where that is nowhere, its lowest. The depth has zero mean."""
     inclined = ((gradient[:, 0:1] != 0) | (gradient[:, 1:2] != 0)).to(depth.dtype)
     pixels = float(depth.shape[2] * depth.shape[3])
-    inside = depth[..., top : top + height, left : left + width] * inclined
     count = pixels - inclined.sum(dim=(2, 3), keepdim=True)
-    mean = -inside.sum(dim=(2, 3), keepdim=True) / count.clamp_min(1.0)
-    if height == depth.shape[2] and width == depth.shape[3]:
-        mean = torch.where(count > 0, mean, depth.amin(dim=(2, 3), keepdim=True))
-    return depth - mean
+    mean = -(depth * inclined).sum(dim=(2, 3), keepdim=True) / count.clamp_min(1.0)
+    return depth - torch.where(count > 0, mean, depth.amin(dim=(2, 3), keepdim=True))
 
 
 def check_gradient(gradient: Tensor, least: int) -> None:
@@ -203,28 +193,12 @@ def _integrate_dst(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor]) ->
     return mm_per_pixel * nn.functional.pad(z, [1, 1, 1, 1])
 
 
-def _integrate_dct(
-    gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], top: int, left: int, zero_in_background: bool
-) -> Tensor:
+def _integrate_dct(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], zero_in_background: bool) -> Tensor:
     """In double precision: waves as long as the image are nearly all of the depth, and single rounds them at every step."""
-    right = _right_side(widened(gradient), mm_per_pixel, top, left, int(plan[-2].shape[0]), int(plan[-1].shape[0]))
-    depth = _solve_by_fft(right, plan, max(0, top - 1))
+    depth = _solve_by_fft(mm_per_pixel * divergence(widened(gradient)), plan)
     if zero_in_background:
-        depth = _zero_in_background(depth, gradient, top, left)
+        depth = _zero_in_background(depth, gradient)
     return depth.to(gradient.dtype)
-
-
-def _right_side(gradient: Tensor, mm_per_pixel: float, top: int, left: int, height: int, width: int) -> Tensor:
-    """The divergence of a window's gradient, in the rows that are not zero and all columns of the whole image."""
-    if gradient.shape[2] < height or gradient.shape[3] < width:  # one more pixel, where the edges out of the window end
-        above, before = min(top, 1), min(left, 1)
-        below = min(height - top - gradient.shape[2], 1)
-        after = min(width - left - gradient.shape[3], 1)
-        gradient = nn.functional.pad(gradient, [before, after, above, below])
-        left = left - before
-    right = mm_per_pixel * divergence(gradient)
-    after = width - left - right.shape[3]
-    return nn.functional.pad(right, [left, after]) if left > 0 or after > 0 else right
 
 
 def _wide(gradient: Tensor) -> Tensor:
@@ -239,7 +213,7 @@ def laplace_plan(like: Tensor) -> list[Tensor]:
 
 def solve_laplace(right: Tensor, plan: list[Tensor]) -> Tensor:
     """(B, 1, H, W) of zero mean whose five-point Laplacian with a free border is ``right`` less its mean."""
-    return _solve_by_fft(right, plan, 0)
+    return _solve_by_fft(right, plan)
 
 
 def _kept(plan: list[Tensor]) -> list[Tensor]:
@@ -309,13 +283,12 @@ def _solve(right: Tensor, plan: list[Tensor]) -> Tensor:
     return unfold(unfold(blocks[0], blocks[1], -1), unfold(blocks[2], blocks[3], -1), -2)
 
 
-def _solve_by_fft(right: Tensor, plan: list[Tensor], top: int) -> Tensor:
-    """The same with a free border, by one real FFT there and one back; ``right`` starts at row ``top``, other rows are zero."""
+def _solve_by_fft(right: Tensor, plan: list[Tensor]) -> Tensor:
+    """The same with a free border, by one real FFT there and one back."""
     there, back, of_sum, of_difference, back_y, order_y = plan[0], plan[1], plan[2], plan[3], plan[4], plan[5]
     height, width = int(order_y.shape[0]), right.shape[-1]
-    lines = torch.fft.rfft(interleave(right)).transpose(2, 3)  # (B, 1, W // 2 + 1, h): columns are contiguous from here on
-    empty = lines.new_zeros([lines.shape[0], lines.shape[1], lines.shape[2], height])
-    lines = empty.index_copy_(3, order_y.narrow(0, top, lines.shape[3]), lines)
+    lines = torch.fft.rfft(interleave(right)).transpose(2, 3)  # (B, 1, W // 2 + 1, H): columns are contiguous from here on
+    lines = lines.new_zeros(lines.shape).index_copy_(3, order_y, lines)
     spectrum = torch.fft.fft(lines)
     up = torch.view_as_real(spectrum.narrow(3, 0, height // 2 + 1) * there[0])
     down = torch.view_as_real(spectrum.index_select(3, back_y) * there[1])

@@ -16,6 +16,7 @@ from ..core.checks import (
     check_field,
     check_float_tensor,
     check_image,
+    check_positive,
     check_record,
     check_shape,
     check_switch,
@@ -24,7 +25,7 @@ from ..core.checks import (
 from ..core.files import image_from_bytes, image_to_bytes, load_tensors, save_tensors
 from ..core.noise import noise_std
 from .lights import PointLights, flat_image, inverse_light_matrix
-from .markers import FillMarkers
+from .markers import FillMarkers, is_printed
 from .report import Report, read_report
 from .response_field import ResponseModel
 from .sensor import Sensor, check_sensor
@@ -62,6 +63,8 @@ class Calibration:
         response: the response fields, if they are the model; else None.
         markers: the block that fills printed markers before anything else, or None.
         ambient: (3,), constant linear light that the lights do not give, subtracted before the gain; None for none.
+        contact_share: pressure from which an object touches, as a share of the frame's; None where no press of a ball
+            has told.
     Raises:
         TypeError: a field of another type.
         ValueError: lights, background, noise or ambient light of another shape, or not finite; a background without light; lights
@@ -77,6 +80,7 @@ class Calibration:
     response: ResponseModel | None = None
     markers: FillMarkers | None = None
     ambient: Tensor | None = None
+    contact_share: float | None = None
 
     def __post_init__(self) -> None:
         check_sensor("sensor", self.sensor)
@@ -88,6 +92,8 @@ class Calibration:
             if part is not None:
                 check_record(name, part, kind)
         check_switch("measured", self.measured)
+        if self.contact_share is not None:
+            check_positive("contact_share", self.contact_share, 1.0)
         read_report(self.report, "report")
         if self.lights is not None:
             for name, values in (("position_mm", self.lights.position_mm), ("albedo", self.lights.albedo)):
@@ -363,6 +369,7 @@ class Calibration:
             "report": self.report,
             "response": None if self.response is None else self.response.to_dict(),
             "markers": None if self.markers is None else self.markers.to_dict(),
+            "contact_share": self.contact_share,
         }
         tensors = {"noise_std": self.noise_std}
         if self.lights is None:
@@ -415,8 +422,8 @@ def _measure(background: Tensor, sensor: Sensor, dtype: torch.dtype) -> tuple[Te
     """Linear light of a background image, its noise in image value, and the block that fills its markers."""
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     image = background.detach().cpu().to(dtype)
-    markers = FillMarkers.from_background(image) if sensor.markers else None
-    if markers is not None and markers.diameter_px == 0:
+    markers = None if sensor.markers is False else FillMarkers.from_background(image)
+    if markers is not None and (markers.diameter_px == 0 or (sensor.markers is None and not is_printed(image, markers))):
         markers = None
     if markers is not None:
         image = markers(image[None])[0]
@@ -434,7 +441,8 @@ def _load_by_response(path: str | Path, tensors: dict[str, Tensor], metadata: di
     light = value.to(tensors["noise_std"].dtype) ** sensor.exponent
     if (sensor.exponent, sensor.blur_px) != (response.gamma, response.blur_px):
         raise ValueError(f"{path}: sensor and response differ in gamma or blur_px: damaged or edited")
-    return Calibration(sensor, None, light, tensors["noise_std"], metadata["measured"], metadata["report"], response, markers)
+    share, measured, report = _load_share(path, metadata), metadata["measured"], metadata["report"]
+    return Calibration(sensor, None, light, tensors["noise_std"], measured, report, response, markers, contact_share=share)
 
 
 def _load_by_lights(path: str | Path, tensors: dict[str, Tensor], metadata: dict[str, Any], sensor: Sensor) -> Calibration:
@@ -453,7 +461,15 @@ def _load_by_lights(path: str | Path, tensors: dict[str, Tensor], metadata: dict
         raise ValueError(f"{path}: {error}") from error
     background, noise, ambient = tensors["background"], tensors["noise_std"], tensors.get("ambient")
     calibration = Calibration(
-        sensor, lights, background, noise, metadata["measured"], metadata["report"], markers=markers, ambient=ambient
+        sensor,
+        lights,
+        background,
+        noise,
+        metadata["measured"],
+        metadata["report"],
+        markers=markers,
+        ambient=ambient,
+        contact_share=_load_share(path, metadata),
     )
     for name, derived in (("compensation", calibration.compensation), ("inverse", calibration.inverse)):
         if not torch.allclose(tensors[name], derived, rtol=1e-3, atol=1e-3 * float(derived.abs().max())):
@@ -463,6 +479,13 @@ def _load_by_lights(path: str | Path, tensors: dict[str, Tensor], metadata: dict
 
 def _load_markers(path: str | Path, metadata: dict[str, Any]) -> FillMarkers | None:
     return None if metadata.get("markers") is None else FillMarkers.from_dict(metadata["markers"], f"{path}: markers")
+
+
+def _load_share(path: str | Path, metadata: dict[str, Any]) -> float | None:
+    share = metadata.get("contact_share")
+    if share is not None and not (isinstance(share, float) and 0.0 < share <= 1.0):
+        raise ValueError(f"{path}: contact_share: expected a number above 0 and at most 1, got {brief(share)}: damaged metadata")
+    return share
 
 
 def _check_tensors(path: str | Path, tensors: dict[str, Tensor], expected: dict[str, tuple[int, ...]]) -> None:

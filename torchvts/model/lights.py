@@ -181,21 +181,20 @@ def flat_image(lights: PointLights, height: int, width: int, mm_per_pixel: float
     return near_field_shading(depth_mm, flat.expand(1, 3, height, width), lights, mm_per_pixel)[0]
 
 
-def seen_at(undeformed_mm: Tensor, depth_mm: Tensor, camera_height_mm: float, axis_mm: float = 0.0) -> Tensor:
+def seen_at(undeformed_mm: Tensor, depth_mm: Tensor, camera_height_mm: float) -> Tensor:
     """x or y of the point that a pixel sees. A pinhole camera at height h sees X = u (h - z) / h.
 
     Args:
         undeformed_mm: u, x or y of the point of the undeformed skin that the pixel sees; broadcast against depth_mm.
         depth_mm: z.
         camera_height_mm: h; infinite for an orthographic camera, X = u.
-        axis_mm: position of the camera, if not at 0.
     Example:
         >>> seen_at(torch.tensor([-10.0, 10.0]), torch.tensor(2.0), 20.0)
         tensor([-9.,  9.])
     """
     if math.isinf(camera_height_mm):
         return undeformed_mm
-    return undeformed_mm - (undeformed_mm - axis_mm) * (depth_mm / camera_height_mm)
+    return undeformed_mm - undeformed_mm * (depth_mm / camera_height_mm)
 
 
 def light_matrix(
@@ -204,7 +203,6 @@ def light_matrix(
     albedo: Tensor,
     mm_per_pixel: float,
     camera_height_mm: float = math.inf,
-    axis_mm: tuple[float, float] = (0.0, 0.0),
 ) -> Tensor:
     """The matrix L of ``I = L n``: row j is rho^j (S^j - P) / |S^j - P|^3.
 
@@ -214,7 +212,6 @@ def light_matrix(
         albedo: (3,).
         mm_per_pixel: pixel pitch, mm.
         camera_height_mm: as for :func:`seen_at`.
-        axis_mm: x and y of the camera, as for :func:`seen_at`.
     Returns:
         (B, 3, 3, H, W): light, axis, row, column.
     Source:
@@ -222,7 +219,7 @@ def light_matrix(
     """
     depth = depth_mm.unsqueeze(1)  # (B, 1, 1, H, W)
     x, y = pixel_grid_mm(depth_mm.shape[2], depth_mm.shape[3], mm_per_pixel, depth_mm.dtype, depth_mm.device)
-    x, y = seen_at(x, depth, camera_height_mm, axis_mm[0]), seen_at(y, depth, camera_height_mm, axis_mm[1])
+    x, y = seen_at(x, depth, camera_height_mm), seen_at(y, depth, camera_height_mm)
     light = position_mm.reshape(1, 3, 3, 1, 1)
     to_light = torch.cat(
         (
@@ -306,7 +303,6 @@ def inverse_light_matrix(
     albedo: Tensor,
     mm_per_pixel: float,
     camera_height_mm: float = math.inf,
-    axis_mm: tuple[float, float] = (0.0, 0.0),
 ) -> Tensor:
     r"""Inverse of the light matrix at every pixel, in closed form.
 
@@ -319,7 +315,6 @@ def inverse_light_matrix(
         albedo: (3,).
         mm_per_pixel: pixel pitch, mm.
         camera_height_mm: as for :func:`light_matrix`.
-        axis_mm: as for :func:`light_matrix`.
     Returns:
         (B, 3, 3, H, W): normal axis, light, row, column.
     Source:
@@ -330,7 +325,7 @@ def inverse_light_matrix(
     constant = torch.linalg.cross(second, third, dim=1)  # (light, axis)
     along = third - second
     z = depth_mm[:, 0]  # (B, H, W)
-    x, y = seen_at(x, z, camera_height_mm, axis_mm[0]), seen_at(y, z, camera_height_mm, axis_mm[1])
+    x, y = seen_at(x, z, camera_height_mm), seen_at(y, z, camera_height_mm)
     columns: list[Tensor] = []
     determinant = torch.zeros_like(z)
     for j in range(3):
@@ -354,7 +349,6 @@ def normal_at_depth(
     albedo: Tensor,
     mm_per_pixel: float,
     camera_height_mm: float = math.inf,
-    axis_mm: tuple[float, float] = (0.0, 0.0),
 ) -> Tensor:
     r"""Unit normals along L^-1 I at a known depth, without the inverse: a third of its operations.
 
@@ -368,14 +362,13 @@ def normal_at_depth(
         albedo: as for :func:`inverse_light_matrix`.
         mm_per_pixel: pixel pitch, mm.
         camera_height_mm: as for :func:`light_matrix`.
-        axis_mm: as for :func:`light_matrix`.
     Returns:
         (B, 3, H, W); zero where the image is zero.
     Source:
         eq. 10 of the paper.
     """
     x, y = pixel_grid_mm(depth_mm.shape[2], depth_mm.shape[3], mm_per_pixel, depth_mm.dtype, depth_mm.device)
-    x, y = seen_at(x, depth_mm, camera_height_mm, axis_mm[0]), seen_at(y, depth_mm, camera_height_mm, axis_mm[1])
+    x, y = seen_at(x, depth_mm, camera_height_mm), seen_at(y, depth_mm, camera_height_mm)
     second, third = position_mm.roll(-1, 0), position_mm.roll(-2, 0)
     cross = torch.linalg.cross(second, third, dim=1)
     place = position_mm.reshape(3, 3, 1, 1)

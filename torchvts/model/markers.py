@@ -135,6 +135,38 @@ def fill_markers(image: Tensor, mask: Tensor, relaxations: int = 4) -> Tensor:
     return value
 
 
+LEAST_PRINTED = 20
+"""Dots that a printed pattern has at least; a Wedge's housing shows 10, a worn skin 7, patterns 63 and more."""
+
+REGULAR = 0.75
+"""Share of them that lie as far from their nearest neighbour as usual, within a fifth: 0.88 and more of patterns."""
+
+
+def is_printed(background: Tensor, markers: "FillMarkers") -> bool:
+    """Whether what is found in a background (3, H, W) is a regular pattern of dots, and not dust.
+
+    Example:
+        >>> image = torch.full((3, 120, 160), 0.5)
+        >>> for row, column in ((y, x) for y in range(10, 120, 20) for x in range(10, 160, 20)):
+        ...     image[:, row - 2 : row + 3, column - 2 : column + 3] = 0.1
+        >>> is_printed(image, FillMarkers.from_background(image))
+        True
+    """
+    import cv2
+    import numpy as np
+
+    if markers.diameter_px == 0.0:
+        return False
+    found = find_markers(background[None], markers.diameter_px, markers.contrast, margin=markers.margin)[0, 0]
+    _, _, stats, centres = cv2.connectedComponentsWithStats(found.numpy().astype(np.uint8))
+    size = stats[1:, cv2.CC_STAT_AREA]
+    dots = torch.from_numpy(centres[1:][size > 0.3 * np.median(size)]) if len(size) else torch.zeros(0, 2)
+    if len(dots) < LEAST_PRINTED:
+        return False
+    nearest = torch.cdist(dots, dots).fill_diagonal_(torch.inf).amin(dim=1)
+    return bool(((nearest / nearest.median() - 1.0).abs() < 0.2).double().mean() > REGULAR)
+
+
 class FillMarkers(nn.Module):
     """:func:`find_markers`, then :func:`fill_markers`; first in the chain, before the compensation.
 

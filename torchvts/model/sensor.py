@@ -48,7 +48,8 @@ class Sensor:
         raw_size_px: (N, 2), (height, width) of the frames that the camera gives, if images are usually stored cropped: a frame of
             such a size is cropped by ``raw_crop``, then resized to the sensor's size; one of the sensor's size is kept as it is.
         raw_crop: share of a raw frame's height and width to cut off each side, in [0, 0.5).
-        markers: the skin has printed markers, which are filled in every frame.
+        markers: whether the skin has printed markers, which are filled in every frame; None: where the background shows a regular
+            pattern of them.
         prior: response that all units of this type share, fitted to presses on one.
     Raises:
         TypeError, ValueError: name the argument, what was expected and what was given.
@@ -69,7 +70,7 @@ class Sensor:
     corners_px: tuple[tuple[float, float], ...] | None = None
     raw_size_px: tuple[tuple[int, int], ...] = ()
     raw_crop: float = 0.0
-    markers: bool = False
+    markers: bool | None = None
     prior: SensorPrior | None = None
 
     def __post_init__(self) -> None:
@@ -113,8 +114,8 @@ class Sensor:
         self._set("raw_crop", check_least("raw_crop", self.raw_crop, 0.0, 0.49))
         if self.raw_size_px and (self.roi_px is not None or self.corners_px is not None):
             raise ValueError("raw_size_px: expected none beside roi_px or corners_px, which say where the gel lies in raw frames")
-        if not isinstance(self.markers, bool):
-            raise TypeError(f"markers: expected true or false, got {brief(self.markers)}")
+        if self.markers is not None and not isinstance(self.markers, bool):
+            raise TypeError(f"markers: expected true, false or null, got {brief(self.markers)}")
         prior: object = self.prior
         if isinstance(prior, dict):  # as YAML gives it
             self._set("prior", SensorPrior.from_dict(prior, "prior"))

@@ -34,15 +34,13 @@ class NormalModel(nn.Module):
         normals_from_depth: modes "precise" and "auto" return the gradient of the depth: integration keeps only what is the slope of
             a surface, so it has less noise and smaller errors than the slopes of single pixels.
         max_passes: passes after which nothing more is gained.
-        takes_window: ``forward`` can work on a window of the calibrated image; else it always gets the whole image.
-        takes_noise: ``forward`` gets, as a fourth argument, what ``noise_of`` makes of the whole compensated image.
+        takes_noise: ``forward`` gets, as a third argument, what ``noise_of`` makes of the compensated image.
         input_domain: what ``forward`` works on, a key of :data:`DOMAINS`; a pipeline whose compensated images are something else
             is refused. None: it gets what the pipeline gives.
     Example:
         >>> import torch
         >>> class Flat(NormalModel):
-        ...     takes_window = True
-        ...     def forward(self, image, depth_mm=None, window=None):
+        ...     def forward(self, image, depth_mm=None):
         ...         return torch.cat((0.0 * image[:, :2], 1.0 + 0.0 * image[:, 2:]), dim=1)
         >>> Flat()(torch.rand(1, 3, 4, 4))[0, :, 0, 0]
         tensor([0., 0., 1.])
@@ -51,34 +49,26 @@ class NormalModel(nn.Module):
     uses_depth: bool = False
     normals_from_depth: bool = False
     max_passes: int = 1000
-    takes_window: bool = False
     takes_noise: bool = False
     input_domain: str | None = None
 
     if TYPE_CHECKING:
 
-        def __call__(
-            self,
-            image: Tensor,
-            depth_mm: Tensor | None = None,
-            window: tuple[int, int] | None = None,
-            noise_std: Tensor | None = None,
-        ) -> Tensor: ...
+        def __call__(self, image: Tensor, depth_mm: Tensor | None = None, noise_std: Tensor | None = None) -> Tensor: ...
 
-    def forward(self, image: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
+    def forward(self, image: Tensor, depth_mm: Tensor | None = None) -> Tensor:
         """Normals of a compensated image.
 
         Args:
-            image: (B, 3, h, w), compensated.
-            depth_mm: (B, 1, h, w), the depth so far, mm; None in the first pass.
-            window: (top, left), the place of the first pixel in the calibrated image; None for the whole image.
+            image: (B, 3, H, W), compensated.
+            depth_mm: (B, 1, H, W), the depth so far, mm; None in the first pass.
         Returns:
-            (B, 3, h, w), facing the camera; of unit length where a second pass is to use it.
+            (B, 3, H, W), facing the camera; of unit length where a second pass is to use it.
         """
-        raise TypeError(f"{type(self).__name__}: a NormalModel must define forward(image, depth_mm, window)")
+        raise TypeError(f"{type(self).__name__}: a NormalModel must define forward(image, depth_mm)")
 
     def noise_of(self, compensated: Tensor) -> Tensor | None:
-        """Noise of each channel of whole compensated images (B, 3, H, W), (B, 3); for models that declare ``takes_noise``."""
+        """Noise of each channel of compensated images (B, 3, H, W), (B, 3); for models that declare ``takes_noise``."""
         return None
 
     def coarse(self, stride: int) -> "NormalModel | None":
@@ -94,7 +84,7 @@ class WrappedNormals(NormalModel):
         super().__init__()
         self.module = module
 
-    def forward(self, image: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
+    def forward(self, image: Tensor, depth_mm: Tensor | None = None) -> Tensor:
         normal: Tensor = self.module(image)
         return normal
 
@@ -115,7 +105,7 @@ def check_normals(model: nn.Module, normal: object, image: Tensor) -> None:
     Args:
         model: the module, named in errors.
         normal: what it gave.
-        image: (B, 3, h, w), what it was given.
+        image: (B, 3, H, W), what it was given.
     Raises:
         TypeError: no tensor, or of another dtype.
         ValueError: of another shape, values that are not finite, or normals coded as colours.

@@ -71,7 +71,7 @@ class NormalFromLookup(NormalModel):
         self.register_buffer("step", step.detach().to(flat).clone())
         self.register_buffer("zero_index", zero.to(flat.device).clone())
 
-    def forward(self, compensated: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
+    def forward(self, compensated: Tensor, depth_mm: Tensor | None = None) -> Tensor:
         """(B, 3, H, W) compensated image to (B, 3, H, W) unit normals that face the camera."""
         check_batch("compensated", compensated, 3)
         check_same_size("compensated", compensated, "the calibration", self.flat.shape[1], self.flat.shape[2])

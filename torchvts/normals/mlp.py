@@ -108,7 +108,7 @@ class NormalFromMLP(NormalModel):
         self.register_buffer("flat_gradient", torch.zeros_like(flat[0:2]))
         self.set_flat(flat)
 
-    def forward(self, compensated: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
+    def forward(self, compensated: Tensor, depth_mm: Tensor | None = None) -> Tensor:
         """(B, 3, H, W) images, R, G, B, to (B, 3, H, W) unit normals that face the camera."""
         check_batch("compensated", compensated, 3)
         check_same_size("compensated", compensated, "the calibration", self.height, self.width)

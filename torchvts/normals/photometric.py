@@ -17,7 +17,6 @@ from ..core.checks import (
     check_same_size,
     check_shape,
     check_size,
-    check_window,
     may_read_values,
     reads_freely,
 )
@@ -62,7 +61,6 @@ class NormalFromIntensity(NormalModel):
     """
 
     uses_depth: bool = True
-    takes_window: bool = True
     takes_noise: bool = True
     input_domain: str | None = "light"
     inverse: Tensor
@@ -127,14 +125,8 @@ class NormalFromIntensity(NormalModel):
             camera_height_mm=camera_height_mm,
         )
 
-    def forward(
-        self,
-        image: Tensor,
-        depth_mm: Tensor | None = None,
-        window: tuple[int, int] | None = None,
-        noise_std: Tensor | None = None,
-    ) -> Tensor:
-        return self.solve(image, depth_mm, window, None, noise_std)
+    def forward(self, image: Tensor, depth_mm: Tensor | None = None, noise_std: Tensor | None = None) -> Tensor:
+        return self.solve(image, depth_mm, None, noise_std)
 
     @torch.jit.export
     def noise_of(self, compensated: Tensor) -> Tensor:
@@ -150,15 +142,8 @@ class NormalFromIntensity(NormalModel):
         return noise_of_spotted(compensated, self.samples)
 
     @torch.jit.export
-    def solve(
-        self,
-        image: Tensor,
-        depth_mm: Tensor | None,
-        window: tuple[int, int] | None,
-        expected: Tensor | None,
-        noise_std: Tensor | None = None,
-    ) -> Tensor:
-        """As ``forward``, but shadowed pixels start from the slopes ``expected`` (B, 2, h, w); a depth takes precedence."""
+    def solve(self, image: Tensor, depth_mm: Tensor | None, expected: Tensor | None, noise_std: Tensor | None = None) -> Tensor:
+        """As ``forward``, but shadowed pixels start from the slopes ``expected`` (B, 2, H, W); a depth takes precedence."""
         check_batch("compensated", image, 3)
         if expected is not None:
             check_batch("expected", expected, 2)
@@ -167,14 +152,14 @@ class NormalFromIntensity(NormalModel):
             expected = expected.expand(image.shape[0], 2, image.shape[2], image.shape[3])
         if not torch.jit.is_scripting():
             self.follow_lights()
-        place = check_window("compensated", image, (self.inverse.shape[2], self.inverse.shape[3]), window)
+        check_same_size("compensated", image, "the calibration", self.inverse.shape[2], self.inverse.shape[3])
         if depth_mm is not None:
             check_batch("depth_mm", depth_mm, 1)
             check_same_size("depth_mm", depth_mm, "compensated", image.shape[2], image.shape[3])
             check_same_count("depth_mm", depth_mm, "compensated", image.shape[0])
         if image.shape[0] == 0:
             return image
-        return self.normals_of(image, depth_mm, place, expected, self.shadowed.noise_of_frames(noise_std, image))
+        return self.normals_of(image, depth_mm, expected, self.shadowed.noise_of_frames(noise_std, image))
 
     def follow_lights(self) -> None:
         """Compute what is stored of the lights again if they have changed since, as by an optimiser.
@@ -198,11 +183,9 @@ class NormalFromIntensity(NormalModel):
         position, albedo = self.lights.position_mm.detach(), self.lights.albedo.detach()
         return inverse_light_matrix(position.new_zeros(1, 1, height, width), position, albedo, self.mm_per_pixel)[0]
 
-    def normals_of(
-        self, image: Tensor, depth_mm: Tensor | None, window: tuple[int, int], expected: Tensor | None, noise_std: Tensor
-    ) -> Tensor:
+    def normals_of(self, image: Tensor, depth_mm: Tensor | None, expected: Tensor | None, noise_std: Tensor) -> Tensor:
         """Normals of checked arguments; compiled kernels take the place of this method."""
-        view = self.view(image, window)
+        view = self.view()
         plain = self.inverted_glossy(image, depth_mm, view) if self.lights.glossy else self.inverted(image, depth_mm, view)
         normal: Tensor = self.shadowed(plain, image, depth_mm, view, expected, noise_std)
         return normal
@@ -211,12 +194,10 @@ class NormalFromIntensity(NormalModel):
         """The plain inverse at every pixel: eq. 9 without depth, eq. 10 with depth."""
         position, albedo, pitch = view.position_mm, view.albedo, view.mm_per_pixel
         if depth_mm is not None:
-            return normal_at_depth(image, depth_mm, position, albedo, pitch, view.camera_height_mm, view.axis_mm)
-        height, width = image.shape[2], image.shape[3]
+            return normal_at_depth(image, depth_mm, position, albedo, pitch, view.camera_height_mm)
         if self.built_from_lights(image):
-            return normal_at_depth(image, image.new_zeros(1, 1, height, width), position, albedo, pitch)
-        top, left = view.window
-        inverse = self.inverse[None, :, :, top : top + height, left : left + width]
+            return normal_at_depth(image, image.new_zeros(1, 1, image.shape[2], image.shape[3]), position, albedo, pitch)
+        inverse = self.inverse[None]
         normal = torch.addcmul(inverse[:, :, 0] * image[:, 0:1], inverse[:, :, 1], image[:, 1:2])
         normal = torch.addcmul(normal, inverse[:, :, 2], image[:, 2:3])
         n_x, n_y, n_z = normal[:, 0:1], normal[:, 1:2], normal[:, 2:3]
@@ -245,22 +226,10 @@ class NormalFromIntensity(NormalModel):
             normal = self.inverted(torch.where(image < 0.0, image, matt), depth_mm, view)  # channels left out stay so
         return normal
 
-    def view(self, image: Tensor, window: tuple[int, int]) -> LightView:
-        """The lights as seen from the middle of the window that the image (B, 3, h, w) is."""
-        x, y = self.middle_mm(image, window)
-        position: Tensor = self.lights.position_mm
-        if x != 0.0 or y != 0.0:
-            position = torch.cat((position[:, 0:1] - x, position[:, 1:2] - y, position[:, 2:3]), dim=1)
+    def view(self) -> LightView:
+        """Lights and camera."""
         gloss = self.lights.gloss if self.lights.glossy else None
-        return LightView(position, self.lights.albedo, self.mm_per_pixel, self.camera_height_mm, (-x, -y), window, gloss)
-
-    def middle_mm(self, image: Tensor, window: tuple[int, int]) -> tuple[float, float]:
-        """Where the middle of the window lies, as seen from the middle of the calibrated image."""
-        top, left = window
-        height, width = self.inverse.shape[2], self.inverse.shape[3]
-        x = 0.5 * (2 * left + image.shape[3] - width) * self.mm_per_pixel
-        y = 0.5 * (2 * top + image.shape[2] - height) * self.mm_per_pixel
-        return x, y
+        return LightView(self.lights.position_mm, self.lights.albedo, self.mm_per_pixel, self.camera_height_mm, gloss)
 
     def coarse(self, stride: int) -> "NormalFromIntensity":
         """The same for an image of every ``stride``-th pixel."""

@@ -5,7 +5,7 @@ import copy
 import torch
 from torch import Tensor
 
-from ..core.checks import check_batch, check_dtype, check_integer, check_record, check_same_size, check_size, check_window
+from ..core.checks import check_batch, check_dtype, check_integer, check_record, check_same_size, check_size
 from ..model.calibration import Calibration, check_calibration
 from ..model.response_field import CHANGE_SCALE, MAX_SINE, DepthBrightness, ResponseField
 from .base import NormalModel
@@ -32,7 +32,6 @@ class NormalFromResponse(NormalModel):
     """
 
     max_passes: int = 2
-    takes_window: bool = True
     normals_from_depth: bool = True
     input_domain: str | None = "ratio"
     maps: Tensor
@@ -73,28 +72,26 @@ class NormalFromResponse(NormalModel):
         size = (sensor.height, sensor.width, sensor.mm_per_pixel)
         return cls(response.field, response.by_depth, *size, dtype=calibration.background.dtype)
 
-    def forward(self, image: Tensor, depth_mm: Tensor | None = None, window: tuple[int, int] | None = None) -> Tensor:
+    def forward(self, image: Tensor, depth_mm: Tensor | None = None) -> Tensor:
         check_batch("compensated", image, 3)
-        top, left = check_window("compensated", image, (self.maps.shape[2], self.maps.shape[3]), window)
+        check_same_size("compensated", image, "the calibration", self.maps.shape[2], self.maps.shape[3])
         if depth_mm is not None:
             if not self.uses_depth:
                 raise ValueError("depth_mm: expected None, because this response does not say what depth does to brightness")
             check_batch("depth_mm", depth_mm, 1)
             check_same_size("depth_mm", depth_mm, "compensated", image.shape[2], image.shape[3])
-        return self.normals_of(image, depth_mm, (top, left))
+        return self.normals_of(image, depth_mm)
 
-    def normals_of(self, image: Tensor, depth_mm: Tensor | None, window: tuple[int, int]) -> Tensor:
+    def normals_of(self, image: Tensor, depth_mm: Tensor | None) -> Tensor:
         """The same of checked inputs; compiled kernels replace this method."""
-        top, left = window
-        bottom, right = top + image.shape[2], left + image.shape[3]
         change = image - 1.0
         if depth_mm is not None:
             depth = depth_mm.to(change.dtype)
-            change = change - self.per_mm[:, top:bottom, left:right] * depth
+            change = change - self.per_mm * depth
             if self.steeper > 0.0:
                 change = change / (self.steeper * (depth - self.reference_mm).clamp_min(0.0) + 1.0)
         inputs = [change[:, 0:1], change[:, 1:2], change[:, 2:3]]
-        maps = self.maps[:, :, top:bottom, left:right]
+        maps = self.maps
         sine = maps[0] * inputs[0]  # (B, 2, H, W)
         for k in range(1, 3):
             sine = torch.addcmul(sine, maps[k], inputs[k])

@@ -29,19 +29,21 @@ fifth of the plain inverse's error, and a quarter if the brightness counts in fu
 noise of 0.002 are twice as wrong."""
 
 FAILED_SHARE = 0.98
-"""A channel that is dark on a larger part of the window has lost its LED, for no shadow is so large."""
+"""A channel that is dark on a larger part of the image has lost its LED, for no shadow is so large."""
+
+
+UNCHANGED_NOISES = 4.5
+"""Change of light, in units of the noise, up to which it is none."""
 
 
 class LightView(NamedTuple):
-    """Lights and camera as seen from the middle of a window.
+    """Lights and camera.
 
     Attributes:
         position_mm: (3, 3), of the lights.
         albedo: (3,).
         mm_per_pixel: pixel pitch, mm.
         camera_height_mm: infinite for an orthographic camera.
-        axis_mm: the middle of the image, x and y.
-        window: (top, left), the place of the window's first pixel in the image.
         gloss: (3,), of the lights; None for a matt skin.
     """
 
@@ -49,28 +51,12 @@ class LightView(NamedTuple):
     albedo: Tensor
     mm_per_pixel: float
     camera_height_mm: float
-    axis_mm: tuple[float, float]
-    window: tuple[int, int]
     gloss: Tensor | None = None
 
 
 def matrix_in_view(depth_mm: Tensor, view: LightView) -> Tensor:
-    """The light matrix at a depth (B, 1, h, w): (B, 3, 3, h, w)."""
-    return light_matrix(depth_mm, view.position_mm, view.albedo, view.mm_per_pixel, view.camera_height_mm, view.axis_mm)
-
-
-class Limits(NamedTuple):
-    """What decides between which intensities a channel is valid, and where the light matrix is ill-conditioned.
-
-    Attributes:
-        flat: (3, h, w), what the lights give on the flat skin; with the noise it says from where on a channel is dark.
-        saturated_above: (3, h, w).
-        ill_conditioned: (h, w) bool.
-    """
-
-    flat: Tensor
-    saturated_above: Tensor
-    ill_conditioned: Tensor
+    """The light matrix at a depth (B, 1, H, W): (B, 3, 3, H, W)."""
+    return light_matrix(depth_mm, view.position_mm, view.albedo, view.mm_per_pixel, view.camera_height_mm)
 
 
 class Pixels(NamedTuple):
@@ -156,7 +142,7 @@ def slope_by_lit_lights(pixels: Pixels, prior_std: float = PRIOR_STD, steps: int
 
 
 def failed_leds(dark: Tensor, share: float = FAILED_SHARE) -> Tensor:
-    """Channels whose LED has failed, bool (B, 3): dark (B, 3, h, w) on more than that share of the window."""
+    """Channels whose LED has failed, bool (B, 3): dark (B, 3, H, W) on more than that share of the image."""
     return dark.to(torch.float32).mean(dim=(2, 3)) > share
 
 
@@ -182,7 +168,7 @@ class ShadowedPixels(nn.Module):
 
     def __init__(self, flat: Tensor, noise_std: Tensor, inverse: Tensor, saturated_above: Tensor | None) -> None:
         super().__init__()
-        self.left_out, self.brightness_noises = LEFT_OUT, BRIGHTNESS_NOISES
+        self.left_out, self.brightness_noises, self.unchanged_noises = LEFT_OUT, BRIGHTNESS_NOISES, UNCHANGED_NOISES
         self.register_buffer("noise_std", noise_std.detach().to(flat.dtype))
         self.follow(flat, inverse)
         if saturated_above is not None:
@@ -198,18 +184,8 @@ class ShadowedPixels(nn.Module):
         self.register_buffer("ill_conditioned", ill_conditioned)
         self.register_buffer("flat", flat.detach().clone())
 
-    def limits(self, image: Tensor, window: tuple[int, int]) -> Limits:
-        """The limits in the window of an image (B, 3, h, w)."""
-        top, left = window
-        bottom, right = top + image.shape[2], left + image.shape[3]
-        return Limits(
-            self.flat[:, top:bottom, left:right],
-            self.saturated_above[:, top:bottom, left:right],
-            self.ill_conditioned[top:bottom, left:right],
-        )
-
     def noise_of_frames(self, noise_std: Tensor | None, image: Tensor) -> Tensor:
-        """The noise of each frame (B, 3) of an image (B, 3, h, w), as it was given; else that of the calibration."""
+        """The noise of each frame (B, 3) of an image (B, 3, H, W), as it was given; else that of the calibration."""
         if noise_std is None:
             return self.noise_std.expand(image.shape[0], 3)
         check_noise("noise_std", noise_std, image.shape[0])
@@ -224,21 +200,21 @@ class ShadowedPixels(nn.Module):
         return (self.brightness_noises * noise).clamp_min(0.005)
 
     def nowhere_dark(self, image: Tensor, noise_std: Tensor) -> bool:
-        """Whether no channel of an image (B, 3, h, w) is below three times its noise (B, 3); where it is, ``dark`` says more."""
+        """Whether no channel of an image (B, 3, H, W) is below three times its noise (B, 3); where it is, ``dark`` says more."""
         return bool((image.detach().amin(dim=(2, 3)) >= 3.0 * noise_std).all())
 
-    def dark(self, image: Tensor, limits: Limits, noise_std: Tensor) -> Tensor:
-        """Channels whose light is blocked, bool (B, 3, h, w); see :func:`~torchvts.core.noise.dark_below`."""
-        return image < dark_below(limits.flat, 3.0 * noise_std[:, :, None, None])
+    def dark(self, image: Tensor, noise_std: Tensor) -> Tensor:
+        """Channels whose light is blocked, bool (B, 3, H, W); see :func:`~torchvts.core.noise.dark_below`."""
+        return image < dark_below(self.flat, 3.0 * noise_std[:, :, None, None])
 
-    def all_valid(self, image: Tensor, limits: Limits, noise_std: Tensor) -> bool:
+    def all_valid(self, image: Tensor, noise_std: Tensor) -> bool:
         """Whether no pixel of the image needs this module."""
         image = image.detach()
-        if self.any_ill_conditioned and bool(limits.ill_conditioned.any()):
+        if self.any_ill_conditioned:
             return False
-        if float((image - limits.saturated_above).amax()) >= 0.0:  # by subtraction, three times as fast as comparison
+        if float((image - self.saturated_above).amax()) >= 0.0:  # by subtraction, three times as fast as comparison
             return False
-        return self.nowhere_dark(image, noise_std) or not bool(self.dark(image, limits, noise_std).any())
+        return self.nowhere_dark(image, noise_std) or not bool(self.dark(image, noise_std).any())
 
     def forward(
         self,
@@ -249,28 +225,28 @@ class ShadowedPixels(nn.Module):
         expected: Tensor | None,
         noise_std: Tensor | None = None,
     ) -> Tensor:
-        """Normals (B, 3, h, w) with those replaced that the plain inverse got wrong.
+        """Normals (B, 3, H, W) with those replaced that the plain inverse got wrong.
 
         Args:
-            normal: (B, 3, h, w), by the plain inverse.
-            image: (B, 3, h, w), compensated.
-            depth_mm: (B or 1, 1, h, w), the depth so far; its slopes are the start.
+            normal: (B, 3, H, W), by the plain inverse.
+            image: (B, 3, H, W), compensated.
+            depth_mm: (B or 1, 1, H, W), the depth so far; its slopes are the start.
             view: lights and camera.
-            expected: (B, 2, h, w), slopes to start from where there is no depth; None for those of ``normal``.
+            expected: (B, 2, H, W), slopes to start from where there is no depth; None for those of ``normal``.
             noise_std: (B, 3), of each frame; None for that of the calibration.
         """
-        limits, noise = self.limits(image, view.window), self.noise_of_frames(noise_std, image)
-        if may_read(image) and self.all_valid(image, limits, noise):
+        noise = self.noise_of_frames(noise_std, image)
+        if may_read(image) and self.all_valid(image, noise):
             return normal
-        dark = self.dark(image, limits, noise)
+        dark = self.dark(image, noise)
         failed = failed_leds(dark)
-        invalid = dark | (image >= limits.saturated_above) | failed[:, :, None, None]
-        wanted = invalid.any(dim=1) | limits.ill_conditioned
+        invalid = dark | (image >= self.saturated_above) | failed[:, :, None, None]
+        wanted = invalid.any(dim=1) | self.ill_conditioned
         b, row, column = _places(wanted)
         start = gradient_from_normal(normal[b, :, row, column][:, :, None, None])[:, :, 0, 0]
         if expected is not None:
             start = expected[b, :, row, column]
-        start = torch.where((failed.any(dim=1)[b] | limits.ill_conditioned[row, column])[:, None], torch.zeros_like(start), start)
+        start = torch.where((failed.any(dim=1)[b] | self.ill_conditioned[row, column])[:, None], torch.zeros_like(start), start)
         z = torch.zeros_like(start[:, 0])
         if depth_mm is not None:  # its neighbours enter through it
             depth = depth_mm[:, 0].expand(image.shape[0], image.shape[2], image.shape[3])
@@ -279,12 +255,12 @@ class ShadowedPixels(nn.Module):
         x = (column.to(normal.dtype) - 0.5 * (image.shape[3] - 1)) * view.mm_per_pixel
         y = (row.to(normal.dtype) - 0.5 * (image.shape[2] - 1)) * view.mm_per_pixel
         if depth_mm is not None:
-            x, y = seen_at(x, z, view.camera_height_mm, view.axis_mm[0]), seen_at(y, z, view.camera_height_mm, view.axis_mm[1])
+            x, y = seen_at(x, z, view.camera_height_mm), seen_at(y, z, view.camera_height_mm)
         to_light = view.position_mm - torch.stack((x, y, z), dim=1)[:, None]  # (N, light, axis)
         squared = (to_light * to_light).sum(2, keepdim=True)
         rows = view.albedo[None, :, None] * to_light * (squared.rsqrt() / squared)
         intensity, lost = image[b, :, row, column], failed[b]
-        saturated = (intensity >= limits.saturated_above[:, row, column].t()) | lost | (intensity <= 0.5 * self.left_out)
+        saturated = (intensity >= self.saturated_above[:, row, column].t()) | lost | (intensity <= 0.5 * self.left_out)
         std = self.of_all_channels(noise)[b]
         pixels = Pixels(start, intensity * (~lost).to(intensity.dtype), rows, saturated, std, self.brightness_std(std), view.gloss)
         slope = slope_by_lit_lights(pixels)
@@ -293,20 +269,34 @@ class ShadowedPixels(nn.Module):
         return normal.permute(0, 2, 3, 1).index_put((b, row, column), solution).permute(0, 3, 1, 2)
 
     @torch.jit.export
-    def blocked(self, image: Tensor, window: tuple[int, int], noise_std: Tensor | None = None) -> Tensor:
-        """Where one or two of the lights that shine on the flat skin are dark, (B, 1, h, w) bool; a failed LED is not counted."""
+    def blocked(self, image: Tensor, noise_std: Tensor | None = None) -> Tensor:
+        """Where one or two of the lights that shine on the flat skin are dark, (B, 1, H, W) bool; a failed LED is not counted."""
         noise = self.noise_of_frames(noise_std, image)
         if may_read(image) and self.nowhere_dark(image, noise):
             return torch.zeros_like(image[:, 0:1], dtype=torch.bool)
-        dark = self.dark(image, self.limits(image, window), noise)
+        dark = self.dark(image, noise)
         return (dark & ~failed_leds(dark)[:, :, None, None]).any(dim=1, keepdim=True)
 
     @torch.jit.export
-    def without_dark(self, image: Tensor, window: tuple[int, int], noise_std: Tensor | None = None) -> Tensor:
-        """The image (B, 3, h, w) with dark channels left out, as where something else than the skin's slope blocks the light."""
-        return image.masked_fill(
-            self.dark(image, self.limits(image, window), self.noise_of_frames(noise_std, image)), self.left_out
-        )
+    def undeformed_in_shadow(self, image: Tensor, noise_std: Tensor | None = None) -> Tensor:
+        """Where one channel is dark and the two others are unchanged, bool (B, 1, H, W).
+
+        The skin may be undeformed there, in a shadow of the object; or it has the one slope that looks the same.
+        """
+        dark = self.dark(image, self.noise_of_frames(noise_std, image))
+        return ~self.changed(image, noise_std) & (dark.to(torch.uint8).sum(dim=1, keepdim=True) == 1)
+
+    @torch.jit.export
+    def changed(self, image: Tensor, noise_std: Tensor | None = None) -> Tensor:
+        """Where channels that are not dark differ from the undeformed skin's by more than their noise, bool (B, 1, H, W)."""
+        noise = self.noise_of_frames(noise_std, image)
+        change = ((image - self.flat) / noise[:, :, None, None]).masked_fill(self.dark(image, noise), 0.0)
+        return change.square().sum(dim=1, keepdim=True) > self.unchanged_noises**2
+
+    @torch.jit.export
+    def without_dark(self, image: Tensor, noise_std: Tensor | None = None) -> Tensor:
+        """The image (B, 3, H, W) with dark channels left out, as where something else than the skin's slope blocks the light."""
+        return image.masked_fill(self.dark(image, self.noise_of_frames(noise_std, image)), self.left_out)
 
     @torch.jit.export
     def mirrored(
@@ -318,16 +308,16 @@ class ShadowedPixels(nn.Module):
         depth that is still too low finds it.
 
         Args:
-            gradient: (B, 2, h, w), slopes so far.
-            image: (B, 3, h, w), compensated.
-            depth_mm: (B, 1, h, w).
+            gradient: (B, 2, H, W), slopes so far.
+            image: (B, 3, H, W), compensated.
+            depth_mm: (B, 1, H, W).
             view: lights and camera.
             noise_std: (B, 3), of each frame; None for that of the calibration.
         Returns:
-            (B, 2, h, w); as they are elsewhere.
+            (B, 2, H, W); as they are elsewhere.
         """
         matrix = matrix_in_view(depth_mm, view)
-        dark = self.dark(image, self.limits(image, view.window), self.noise_of_frames(noise_std, image))
+        dark = self.dark(image, self.noise_of_frames(noise_std, image))
         dark = dark & ~failed_leds(dark)[:, :, None, None]
         one = dark.to(torch.uint8).sum(dim=1, keepdim=True) == 1
         normal = normal_from_gradient(gradient)
@@ -342,7 +332,7 @@ class ShadowedPixels(nn.Module):
 
 
 def _places(wanted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Frame, row and column of the wanted pixels, (B, h, w) bool; on a GPU of all, because their number would be waited for."""
+    """Frame, row and column of the wanted pixels, (B, H, W) bool; on a GPU of all, because their number would be waited for."""
     if may_read_values() and not may_read(wanted):
         height, width = wanted.shape[1], wanted.shape[2]
         place = torch.arange(wanted.numel(), device=wanted.device)
@@ -353,7 +343,7 @@ def _places(wanted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _slope_at(depth_mm: Tensor, b: Tensor, row: Tensor, column: Tensor, mm_per_pixel: float) -> Tensor:
-    """:func:`~torchvts.core.geometry.slope_of_depth` of a depth (B, h, w) at N pixels, (N, 2)."""
+    """:func:`~torchvts.core.geometry.slope_of_depth` of a depth (B, H, W) at N pixels, (N, 2)."""
     height, width = depth_mm.shape[1], depth_mm.shape[2]
     z = depth_mm[b, row, column]
     left, right = depth_mm[b, row, (column - 1).clamp_min(0)], depth_mm[b, row, (column + 1).clamp_max(width - 1)]

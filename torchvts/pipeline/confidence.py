@@ -13,7 +13,6 @@ import torch
 from torch import Tensor, nn
 
 from ..accelerated import GradientFromNormal, PoissonBackground, scriptable
-from ..contact import ContactSettings
 from ..core.blur import MOST_BLUR_PX, blur, gaussian_weights
 from ..core.checks import (
     check_batch,
@@ -32,6 +31,7 @@ from ..core.noise import noise_std as frame_noise_std
 from ..model.calibration import Calibration, check_calibration
 from ..model.response_field import TaughtRange
 from ..normals import NormalFromIntensity, NormalFromResponse, as_normal_model
+from ..skin import ContactSettings
 from .depth import DepthOutput, DepthPipeline, eval_around
 from .expected_error import expected_model_deg, light_std_by_fit, model_log_variance
 
@@ -368,9 +368,8 @@ class Confidence(nn.Module):
         clipped = torch.zeros_like(noise)
         if self.by_lights:
             shadowed = self.normals.shadowed
-            limits = shadowed.limits(compensated, (0, 0))
-            dark = shadowed.dark(compensated, limits, shadowed.noise_of_frames(own_noise, compensated))
-            dark = dark | (compensated >= limits.saturated_above)
+            dark = shadowed.dark(compensated, shadowed.noise_of_frames(own_noise, compensated))
+            dark = dark | (compensated >= shadowed.saturated_above)
             clipped = self.clipped_variance * dark.any(dim=1, keepdim=True).to(noise.dtype)
             noise = noise * self._unexplained(compensated, out.depth_mm, again, dark, sigma)
         curl, edges = self._not_integrable(out.depth_mm, out.gradient, steep, noise)
@@ -440,11 +439,7 @@ class Confidence(nn.Module):
         return self.normals.noise_of(compensated) if self.by_lights else None
 
     def _normals(self, compensated: Tensor, depth_mm: Tensor | None, own_noise: Tensor | None) -> Tensor:
-        if self.by_lights:
-            normal = self.normals(compensated, depth_mm, None, own_noise)
-        else:
-            normal = self.normals(compensated, depth_mm, None)
-        return normal
+        return self.normals(compensated, depth_mm, own_noise) if self.by_lights else self.normals(compensated, depth_mm)
 
     def _through_the_inverse(
         self, base: Tensor, compensated: Tensor, sigma: Tensor, own_noise: Tensor | None

@@ -1,6 +1,5 @@
 """The depth pipeline: a calibration made into a chain of modules that turns images into depth."""
 
-import inspect
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Final, TypeVar
@@ -10,25 +9,16 @@ from torch import Tensor, nn
 
 from ..accelerated import (
     Compensate,
-    ContactFromDepth,
-    ContactMask,
-    Crop,
     GradientFromNormal,
-    LargestChange,
     NormalFromIntensity,
     NormalFromResponse,
     PoissonBackground,
+    PoissonDCT,
     SmoothDrift,
-    Uncrop,
-    ZeroBackground,
     scriptable,
 )
-from ..accelerated.frame import Blocks as FrameBlocks
-from ..accelerated.frame import solve_frames
 from ..accelerated.threads import OneThread, one_suffices, share_frames
 from ..compensate import Compensate as PlainCompensate
-from ..contact import ContactMask as PlainContactMask
-from ..contact import ContactSettings, above_tail
 from ..core.checks import (
     check_batch,
     check_choice,
@@ -41,24 +31,14 @@ from ..core.checks import (
     may_read,
     may_read_values,
 )
-from ..core.frame import (
-    DepthOutput,
-    Frame,
-    Solution,
-    batch_like,
-    in_window,
-    joined,
-    undeformed_output,
-    with_noise,
-    write_frame,
-)
+from ..core.frame import DepthOutput, Frame, batch_like, joined, undeformed_output, write_frame
+from ..core.geometry import normal_from_gradient
 from ..core.settings import check_settings, settings_as_tensor
-from ..integration import PoissonBackground as PlainPoissonBackground
 from ..integration import WrappedIntegrator, as_integrator
-from ..integration.background import DepthAsIs, with_faces
 from ..model import Calibration, Sensor, check_calibration
 from ..normals import NormalFromIntensity as PlainNormalFromIntensity
 from ..normals import WrappedNormals, as_normal_model, check_domain
+from ..skin import ContactFromDepth, ContactMask, ContactSettings, ZeroBackground, moved
 from .gs_sdk import gs_sdk_blocks
 from .refine import Adaptive, Once, Repeat, SlopesOfDepth, SlopesOfPixels
 from .shadows import Shadows
@@ -70,25 +50,24 @@ MODES = ("fast", "precise", "auto")
 """Modes of a pipeline: one solve; solved again with the depth found; solved again where that changes the depth."""
 
 STRIDE = 8
-"""Mode "auto" predicts on every so many pixels, and windows begin at such."""
+"""Mode "auto" predicts on every so many pixels."""
 
 
 class DepthPipeline(nn.Module):
-    """Images (B, 3, H, W) to a :class:`DepthOutput`: compensate, deformed, crop, solve, refine, zero, contact, slopes,
-    uncrop.
+    """Images (B, 3, H, W) to a :class:`DepthOutput`: compensate, smooth, solve, mask, refine, contact, slopes.
 
     ``fast`` solves once (eq. 9). ``precise`` solves again with the depth found (eq. 10), until what is still missing falls below
-    ``tolerance_px``; for response fields gradient and normals are then those of the depth. ``auto`` skips frames without deformed
-    skin, predicts on every eighth pixel what a second pass would change, and solves only those frames again for which that exceeds
-    ``refine_threshold_px``, until what is missing is below a fifth of it; where there are two passes at most, as for response
-    fields, it solves each frame twice.
+    ``tolerance_px``; for response fields gradient and normals are those of the depth, in all modes. ``auto`` skips frames without
+    moved skin, predicts on every eighth pixel what a second pass would change, and solves only those frames again for which that
+    exceeds ``refine_threshold_px``, until what is missing is below a fifth of it; where there are two passes at most, as for
+    response fields, it solves each frame twice.
     Frames of a batch do not influence one another: on a CPU each is solved by itself, and is equal bit for bit to that frame alone.
-    On a GPU, in an exported program, and with a module of your own that needs the whole image, the batch is solved as one, which
-    may change the rounding of sums.
+    On a GPU and in an exported program the batch is solved as one, which may change the rounding of sums.
 
     Args:
         compensate: camera image to compensated image.
-        deformed: compensated image to where the skin has moved, bool (B, 1, H, W): a :class:`ContactMask`.
+        mask: how surely the skin has moved, (B, 1, H, W) in [0, 1]: a :class:`ContactMask`, or any module that makes it,
+            bool or not, of the compensated image alone.
         normals: a :class:`~torchvts.normals.NormalModel`, or any module from a compensated image (B, 3, H, W) to normals (B, 3,
             H, W).
         gradient: normals to gradient.
@@ -98,19 +77,20 @@ class DepthPipeline(nn.Module):
         tolerance_px: change of depth still missing at which "precise" stops, as a multiple of the pitch.
         refine_threshold_px: predicted change of depth from which "auto" solves a frame again, as a multiple of the pitch.
         max_passes: bound on all passes.
-        contact: depth, gradient and deformed area to contact, bool (B, 1, H, W); None for :class:`ContactFromDepth`.
+        contact: depth and deformed area to contact, bool (B, 1, H, W); None for :class:`ContactFromDepth`.
+        smooth: divides a smooth change of the light out of the compensated image; None for nothing.
     Source:
         figure 2 and eq. 3-10 of the paper; "auto" and the stopping rule are this project's.
     """
 
     skips_undeformed: Final[bool]
-    _shares_light: Final[bool]
+    _takes_slopes: Final[bool]
     measures_noise: Final[bool]
 
     def __init__(
         self,
         compensate: nn.Module,
-        deformed: nn.Module,
+        mask: nn.Module,
         normals: nn.Module,
         gradient: nn.Module,
         integrate: nn.Module,
@@ -121,11 +101,14 @@ class DepthPipeline(nn.Module):
         refine_threshold_px: float = 0.05,
         max_passes: int = 8,
         contact: nn.Module | None = None,
+        smooth: nn.Module | None = None,
     ) -> None:
         super().__init__()
         check_choice("mode", mode, MODES)
         touching = ContactFromDepth(mm_per_pixel) if contact is None else contact
-        for name, block in (("compensate", compensate), ("deformed", deformed), ("gradient", gradient), ("contact", touching)):
+        smooth = nn.Identity() if smooth is None else smooth
+        given = {"compensate": compensate, "mask": mask, "gradient": gradient, "contact": touching, "smooth": smooth}
+        for name, block in given.items():
             check_record(name, block, nn.Module)
         model, integrator = as_normal_model(normals), as_integrator(integrate)
         check_domain(model, compensate.output_domain if isinstance(compensate, PlainCompensate) else None)
@@ -141,20 +124,16 @@ class DepthPipeline(nn.Module):
         self.mm_per_pixel = mm_per_pixel
         self.skips_undeformed = mode == "auto"
         self.compensate = compensate
-        self.deformed = deformed
-        self._shares_light = isinstance(deformed, PlainContactMask) and takes_three(deformed)
-        self.smooth = SmoothDrift() if isinstance(deformed, PlainContactMask) and deformed.smooth_light else nn.Identity()
-        self.crop = Crop(STRIDE, model.takes_window)
-        self.solve = Solve(model, gradient, integrator)
+        self.mask = mask
+        self.smooth = smooth
+        self.solve = Solve(model, gradient, integrator, ZeroBackground(mm_per_pixel))
+        # slopes of a module in training are none yet: there colour alone decides
+        own = isinstance(mask, ContactMask) and type(mask).forward is ContactMask.forward
+        self._takes_slopes = own and not self.solve.from_outside
         self.measures_noise = self.solve.takes_noise and mode != "fast"
         self.refine = self._policy(mode, tolerance_px, refine_threshold_px, min(max_passes, model.max_passes))
-        # slopes that were learned within contacts do not sum to zero around a contact, those of known lights do;
-        # an integrator other than PoissonBackground decides by itself where depth is zero
-        as_is = isinstance(model, PlainNormalFromIntensity) or not isinstance(integrator, PlainPoissonBackground)
-        self.zero = DepthAsIs() if as_is else ZeroBackground()
-        self.slopes = SlopesOfDepth(mm_per_pixel) if mode != "fast" and model.normals_from_depth else SlopesOfPixels()
+        self.slopes = SlopesOfDepth(mm_per_pixel) if model.normals_from_depth else SlopesOfPixels()
         self.contact = touching
-        self.uncrop = Uncrop()
 
     def _policy(self, mode: str, tolerance_px: float, refine_threshold_px: float, max_passes: int) -> nn.Module:
         """The refinement of a mode: Once, Repeat, Adaptive; around it for lights Shadows."""
@@ -162,18 +141,17 @@ class DepthPipeline(nn.Module):
         if mode == "fast" or not model.uses_depth:
             return Once()
         predicts = mode == "auto" and max_passes > 2  # to solve once more costs less than to predict whether that pays
-        coarse = model.coarse(STRIDE) if predicts and model.takes_window else None
+        coarse = model.coarse(STRIDE) if predicts else None
         if mode == "auto":
             tolerance_px = max(tolerance_px, 0.2 * refine_threshold_px)
         if coarse is None:
-            policy = Repeat(self.solve, LargestChange(), pitch, tolerance_px, max_passes)
+            policy = Repeat(self.solve, pitch, tolerance_px, max_passes)
         else:
             grid = (coarse, PoissonBackground(STRIDE * pitch), pitch)
-            policy = Adaptive(self.solve, LargestChange(), *grid, tolerance_px, max_passes, refine_threshold_px, STRIDE)
+            policy = Adaptive(self.solve, *grid, tolerance_px, max_passes, refine_threshold_px, STRIDE)
         if not isinstance(model, PlainNormalFromIntensity):
             return policy
-        deformed = self.deformed if isinstance(self.deformed, PlainContactMask) else None
-        return Shadows(policy, deformed, PoissonBackground(pitch), pitch)
+        return Shadows(policy, PoissonBackground(pitch), pitch)
 
     @classmethod
     def from_calibration(
@@ -188,15 +166,15 @@ class DepthPipeline(nn.Module):
         """The pipeline of a calibrated unit, in eval mode, its lights frozen (``requires_grad_(True)`` frees them).
 
         Modules that are given keep the mode that they are in, train or eval, and their parameters stay trainable. No gradient
-        reaches them from outside ``deformed``: slopes are set to zero there.
+        reaches them from where the weight of moved skin is 0.
 
         Args:
             calibration: from :func:`calibrate`, :meth:`Calibration.from_lights` or :meth:`Calibration.load`.
             mode: "fast", "precise" or "auto".
             normals: module to put in place of the calibrated inverse model. It gets what that model would: the image scaled to the
                 light model's, or image / background for a response field. One that declares another ``input_domain`` is refused.
-            integrate: module to put in place of PoissonBackground.
-            contact: thresholds of ``deformed`` and ``contact``; None for the usual ones.
+            integrate: module to put in place of PoissonDCT.
+            contact: thresholds of what has moved and what touches; None for those of the unit.
         Raises:
             TypeError: no Calibration, or no ContactSettings.
             ValueError: normals that work on other images.
@@ -221,10 +199,11 @@ class DepthPipeline(nn.Module):
                 ContactMask.from_calibration(calibration, settings),
                 normals,
                 GradientFromNormal(),
-                PoissonBackground(sensor.mm_per_pixel) if integrate is None else integrate,
+                PoissonDCT(sensor.mm_per_pixel) if integrate is None else integrate,
             )
-            touching = ContactFromDepth(sensor.mm_per_pixel, settings.share)
-            pipe = cls(*modules, mm_per_pixel=sensor.mm_per_pixel, mode=mode, contact=touching)
+            touching = ContactFromDepth.from_calibration(calibration, settings)
+            smooth = None if calibration.response is None else SmoothDrift()
+            pipe = cls(*modules, mm_per_pixel=sensor.mm_per_pixel, mode=mode, contact=touching, smooth=smooth)
             return eval_around(pipe, *given)
 
     @classmethod
@@ -256,52 +235,26 @@ class DepthPipeline(nn.Module):
             ValueError: wrong shape, or, for eager tensors on a CPU, values outside [0, 1] or not finite.
             TypeError: not floating point.
         """
-        if not torch.jit.is_scripting():
-            found = self.compiled(images)
-            if found is not None:
-                return found
+        if not torch.jit.is_scripting():  # noqa: SIM102
             if one_suffices(images):
                 with OneThread():
                     return self.reconstructed(images)
         return self.reconstructed(images)
 
-    def compiled(self, images: Tensor) -> DepthOutput | None:
-        """The same by one compiled call; None where the blocks must do it, each by itself."""
-        if torch.compiler.is_compiling() or type(self) is not DepthPipeline:
-            return None
-        return solve_frames(self, images, self.frame_blocks)
-
-    def frame_blocks(self) -> FrameBlocks | None:
-        """What a frame passes through; None where that depends on the frame."""
-        solve, refine, slopes = self.solve, self.refine, self.slopes
-        if type(solve) is not Solve or not (type(refine) is Once or (type(refine) is Repeat and refine.solve is solve)):
-            return None
-        return FrameBlocks(
-            self.compensate,
-            self.smooth,
-            self.deformed,
-            self.crop,
-            solve.normals,
-            solve.gradient,
-            solve.masked,
-            solve.integrate,
-            self.zero,
-            slopes.gradient if type(slopes) is SlopesOfDepth else None,
-            self.contact,
-            self.uncrop,
-            refine.max_passes if type(refine) is Repeat else 1,
-        )
-
     def reconstructed(self, images: Tensor) -> DepthOutput:
         """:meth:`forward` in the threads that torch now uses."""
         check_images(images)
-        if images.shape[0] > 1 and self.crop.finds_window(images):  # each in its own window, else one would round another's depth
+        if images.shape[0] > 1 and may_read(images):
             return self.depth_of_each(images)
         return self.depth_of(images)
 
     def depth_of_each(self, images: Tensor) -> DepthOutput:
-        """The output of checked images (B, 3, H, W), each solved in its own window."""
-        one = self.depth_of(images[0:1])
+        """The output of checked images (B, 3, H, W), each solved by itself."""
+        if torch.jit.is_scripting():
+            one = self.depth_of(images[0:1])
+        else:
+            with OneThread():  # as the others, and as a frame alone: another number of threads rounds sums otherwise
+                one = self.depth_of(images[0:1])
         if one.depth_mm.requires_grad:
             return joined([one] + [self.depth_of(images[i : i + 1]) for i in range(1, images.shape[0])])
         out = batch_like(one, images.shape[0])  # half the memory of all frames and their copy
@@ -318,45 +271,29 @@ class DepthPipeline(nn.Module):
         write_frame(out, i, self.depth_of(images[i : i + 1]))
 
     def depth_of(self, images: Tensor) -> DepthOutput:
-        """The output of checked images (B, 3, H, W), all solved in the one window that holds the deformed skin of all."""
-        compensated = self.compensate(images)
-        image = self.smooth(compensated)
-        deformed, tail = self.areas(compensated, image)
-        frame = self.crop(image, deformed)
+        """The output of checked images (B, 3, H, W), solved together."""
+        frame, slopes = self.frame_of(images)
         if may_read_values() and (images.shape[0] == 0 or (self.skips_undeformed and self.nothing_to_solve(frame))):
             return undeformed_output(frame)
-        frame = with_noise(frame, self.noise_of(compensated))
-        frame, solution = self.with_faces(frame, self.solve(frame))  # eq. 9, 5, 4
+        solution = self.solve.integrated(frame, slopes * frame.weight)  # eq. 4
         frame, solution = self.refine(frame, solution)  # eq. 10
-        solution = Solution(solution.gradient, self.zero(solution.depth_mm, frame.deformed))
-        pressing, core = above_tail(in_window(frame, solution.depth_mm.detach()), frame.mask, in_window(frame, tail))
-        contact = self.contact(pressing, solution.gradient, core)
-        solution = self.slopes(frame, solution)
-        out: DepthOutput = self.uncrop(frame, solution, contact)
-        return out
+        deformed = moved(frame.weight.detach(), solution.depth_mm.detach())
+        contact = self.contact(solution.depth_mm.detach(), deformed)
+        gradient, depth = self.slopes(frame, solution)
+        return DepthOutput(depth, gradient, normal_from_gradient(gradient), contact, deformed)
 
-    def areas(self, compensated: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the skin has moved, and the part of it below the threshold, each bool (B, 1, H, W).
+    def frame_of(self, images: Tensor) -> tuple[Frame, Tensor]:
+        """The frame of checked images (B, 3, H, W), compensated and weighted, and its slopes by eq. 9 and 5, (B, 2, H, W)."""
+        compensated = self.compensate(images)
+        image, noise = self.smooth(compensated), self.noise_of(compensated)
+        slopes = self.solve.slopes(image, None, noise)
+        weight = self.mask(image, slopes) if self._takes_slopes else self.mask(image)
+        return Frame(image, weight.to(image.dtype), noise), slopes
 
-        A :class:`ContactMask` knows that part, and gets the image without its smooth change of light, which is then found once;
-        any other mask, also one that derives from it with a ``forward`` of the image alone, gets the compensated image alone.
-        """
-        tail = torch.zeros_like(compensated[:, 0:1], dtype=torch.bool)
-        if self._shares_light:
-            return self.deformed(compensated, image, tail), tail
-        return self.deformed(compensated), tail
-
-    def with_faces(self, frame: Frame, solution: Solution) -> tuple[Frame, Solution]:
-        """Frames in which no closed rim encloses a flat face of the object, solved again with the face in their deformed area.
-
-        Else the integrator takes it for undeformed skin: depth is zero between the two, and the slope of the face is lost. On
-        other devices than a CPU, and in exported programs, every frame is solved again: to ask would wait for the device.
-        """
-        deformed = with_faces(solution.depth_mm.detach(), frame.deformed)
-        if may_read(deformed) and torch.equal(deformed, frame.deformed):
-            return frame, solution
-        frame = with_noise(self.crop(frame.compensated, deformed), frame.noise_std)
-        return frame, self.solve(frame)
+    @torch.jit.unused
+    def moved(self, images: Tensor) -> Tensor:
+        """Where the skin has moved in images (B, 3, H, W), bool (B, 1, H, W), without their depth."""
+        return self.frame_of(images)[0].weight > 0.5
 
     def noise_of(self, compensated: Tensor) -> Tensor | None:
         """The noise of each frame, where the model of normals asks for it.
@@ -368,12 +305,12 @@ class DepthPipeline(nn.Module):
 
     def nothing_to_solve(self, frame: Frame) -> bool:
         """Whether no skin has moved and no gradients are recorded, which would need a graph."""
-        if bool(frame.deformed.any()):
+        if bool((frame.weight > 0.0).any()):
             return False
         if torch.jit.is_scripting():
             return True
         else:  # noqa: RET505, TorchScript needs the else to skip this branch
-            recorded = frame.compensated.requires_grad or any(weight.requires_grad for weight in self.parameters())
+            recorded = frame.image.requires_grad or any(weight.requires_grad for weight in self.parameters())
             return not (torch.is_grad_enabled() and recorded)
 
     __jit_unused_properties__: ClassVar[list[str]] = ["gradient", "integrate", "normals"]
@@ -417,28 +354,6 @@ def eval_around(module: _Module, *given: nn.Module | None) -> _Module:
     for part, training in modes:
         part.training = training
     return module
-
-
-def takes_three(mask: nn.Module) -> bool:
-    """Whether the ``forward`` of a mask takes the image without its smooth change of light, and a tail, too.
-
-    Raises:
-        TypeError: it takes something else than one image, or all three.
-    """
-    if isinstance(mask, torch.jit.ScriptModule):
-        return True
-    try:
-        inspect.signature(mask.forward).bind(None, None, None)
-    except TypeError:
-        try:
-            inspect.signature(mask.forward).bind(None)
-        except TypeError as error:
-            raise TypeError(
-                f"deformed: expected {type(mask).__name__}.forward(compensated), or forward(compensated, image, tail) like "
-                f"ContactMask's, got forward{inspect.signature(mask.forward)}"
-            ) from error
-        return False
-    return True
 
 
 def check_images(images: Tensor) -> None:

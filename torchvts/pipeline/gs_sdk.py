@@ -4,16 +4,15 @@ from pathlib import Path
 
 from torch import Tensor, nn
 
-from ..accelerated import Compensate, ContactMask, GradientFromNormal, PoissonBackground
-from ..contact.masks import MOST_FAR_FIELD
+from ..accelerated import Compensate, GradientFromNormal, PoissonDCT
 from ..core.checks import check_image
-from ..core.noise import noise_std
 from ..model import Sensor
 from ..normals import NormalFromMLP
+from ..skin import ContactMask
 
 
 def gs_sdk_blocks(weights: str | Path, background: Tensor, sensor: Sensor) -> tuple[nn.Module, ...]:
-    """Compensation, deformed area, normals, gradient and integrator of a network, on camera images as it was trained on.
+    """Compensation, mask, normals, gradient and integrator of a network, on camera images as it was trained on.
 
     Args:
         weights: ``nnmodel.pth``, or a file of ``NormalFromMLP.save``.
@@ -28,11 +27,10 @@ def gs_sdk_blocks(weights: str | Path, background: Tensor, sensor: Sensor) -> tu
     compensate = Compensate(blur_px=network.blur_px)
     flat = compensate(background[None])[0].clamp(0.0, 1.0)
     network.set_flat(flat)
-    noise = 2.0**0.5 * noise_std(background[None])[0]  # of the frame and of the background
     return (
         compensate,
-        ContactMask(flat, noise, far_field=MOST_FAR_FIELD),
+        ContactMask(flat),
         network,
         GradientFromNormal(),
-        PoissonBackground(sensor.mm_per_pixel),
+        PoissonDCT(sensor.mm_per_pixel),
     )

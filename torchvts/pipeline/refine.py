@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor, nn
 
-from ..accelerated import MaskedGradient
-from ..core.frame import Frame, Solution, as_factor, in_window
+from ..core.frame import Frame, Solution
+from ..core.geometry import gradient_of_depth
 from ..integration import Integrator
 from ..normals import NormalModel
 from .solve import Solve
@@ -25,18 +25,14 @@ class Repeat(nn.Module):
 
     Args:
         solve: one pass.
-        largest_change: of two depths, per frame.
         mm_per_pixel: pixel pitch, mm.
         tolerance_px: change of depth still missing at which a frame is done, as a multiple of the pitch.
         max_passes: bound on all passes, the first among them.
     """
 
-    def __init__(
-        self, solve: Solve, largest_change: nn.Module, mm_per_pixel: float, tolerance_px: float = 0.002, max_passes: int = 8
-    ) -> None:
+    def __init__(self, solve: Solve, mm_per_pixel: float, tolerance_px: float = 0.002, max_passes: int = 8) -> None:
         super().__init__()
         self.solve = solve
-        self.largest_change = largest_change
         self.mm_per_pixel = mm_per_pixel
         self.tolerance_px = tolerance_px
         self.max_passes = max_passes
@@ -66,7 +62,7 @@ class Repeat(nn.Module):
             found = self.solve(_some_frames(frame, index, every), before)
             if number == self.max_passes - 1:  # whatever is missing still
                 return Solution(_with_some(gradient, index, found.gradient, every), _with_some(depth, index, found.depth_mm, every))
-            change_px = self.largest_change(found.depth_mm.detach(), before.detach()) / self.mm_per_pixel
+            change_px = _largest_change(found.depth_mm.detach(), before.detach()) / self.mm_per_pixel
             missing_px = still_missing_px(change_px, _some(last_px, index, every))
             gradient = _with_some(gradient, index, found.gradient, every)
             depth = _with_some(depth, index, found.depth_mm, every)
@@ -83,7 +79,7 @@ class Repeat(nn.Module):
 
         def go_again(step: Tensor, gradient: Tensor, depth: Tensor, active: Tensor, last_px: Tensor) -> tuple[Tensor, ...]:
             found = self.solve(frame, depth)
-            change_px = self.largest_change(found.depth_mm, depth) / self.mm_per_pixel
+            change_px = _largest_change(found.depth_mm, depth) / self.mm_per_pixel
             left = active & (still_missing_px(change_px, last_px) > self.tolerance_px)
             where = active[:, None, None, None]
             gradient, depth = torch.where(where, found.gradient, gradient), torch.where(where, found.depth_mm, depth)
@@ -109,11 +105,10 @@ class SlopesOfDepth(nn.Module):
 
     def __init__(self, mm_per_pixel: float) -> None:
         super().__init__()
-        self.gradient = MaskedGradient(mm_per_pixel)
+        self.mm_per_pixel = mm_per_pixel
 
     def forward(self, frame: Frame, solution: Solution) -> Solution:
-        gradient = self.gradient(in_window(frame, solution.depth_mm), frame.mask)
-        return Solution(gradient, solution.depth_mm)
+        return Solution(gradient_of_depth(solution.depth_mm, self.mm_per_pixel), solution.depth_mm)
 
 
 class SlopesOfPixels(nn.Module):
@@ -130,7 +125,6 @@ class Adaptive(Repeat):
 
     Args:
         solve: one pass.
-        largest_change: of two depths, per frame.
         coarse_normals: the model of normals for every ``stride``-th pixel.
         coarse_integrate: the integrator for that grid.
         mm_per_pixel: pixel pitch, mm.
@@ -145,7 +139,6 @@ class Adaptive(Repeat):
     def __init__(
         self,
         solve: Solve,
-        largest_change: nn.Module,
         coarse_normals: NormalModel,
         coarse_integrate: Integrator,
         mm_per_pixel: float,
@@ -154,7 +147,7 @@ class Adaptive(Repeat):
         refine_threshold_px: float = 0.05,
         stride: int = 8,
     ) -> None:
-        super().__init__(solve, largest_change, mm_per_pixel, tolerance_px, max_passes)
+        super().__init__(solve, mm_per_pixel, tolerance_px, max_passes)
         self.coarse_normals = coarse_normals
         self.coarse_integrate = coarse_integrate
         self.refine_threshold_px = refine_threshold_px
@@ -163,28 +156,21 @@ class Adaptive(Repeat):
     @torch.jit.export
     def unsettled(self, frame: Frame, solution: Solution) -> Tensor:
         """The frames for which a second pass is predicted to change the depth by more than the threshold, bool (B,)."""
-        if min(frame.size[0], frame.size[1]) <= self.stride + self.stride // 2:  # the grid would have one pixel a line
+        height, width = frame.image.shape[2], frame.image.shape[3]
+        if min(height, width) <= self.stride + self.stride // 2:  # the grid would have one pixel a line
             return torch.ones(frame.image.shape[0], dtype=torch.bool, device=frame.image.device)
         return self.predicted_change_px(frame, solution) > self.refine_threshold_px
 
     @torch.jit.export
     def predicted_change_px(self, frame: Frame, solution: Solution) -> Tensor:
         """Largest change of depth that a second pass would bring, per frame (B,), in pixels of pitch."""
-        (top, left), (height, width) = frame.window, frame.size
         first, step = self.stride // 2, self.stride
         image = frame.image.detach()[:, :, first::step, first::step]
-        depth = in_window(frame, solution.depth_mm.detach())[:, :, first::step, first::step]
-        inside = as_factor(frame.mask[:, :, first::step, first::step], image)
+        depth = solution.depth_mm.detach()[:, :, first::step, first::step]
+        inside = frame.weight.detach()[:, :, first::step, first::step]
         before = solution.gradient.detach()[:, :, first::step, first::step]
-        corner = (top // step, left // step)
-        size = ((height + step - first - 1) // step, (width + step - first - 1) // step)
-        normal = (
-            self.coarse_normals(image, depth, corner, frame.noise_std)
-            if self.solve.takes_noise
-            else self.coarse_normals(image, depth, corner)
-        )
-        change = self.solve.gradient(normal) * inside - before
-        found: Tensor = self.coarse_integrate(change, corner, size)
+        normal = self.coarse_normals(image, depth, frame.noise_std) if self.solve.takes_noise else self.coarse_normals(image, depth)
+        found: Tensor = self.coarse_integrate(self.solve.gradient(normal) * inside - before)
         return found.abs().amax(dim=(1, 2, 3)) / self.mm_per_pixel
 
 
@@ -194,13 +180,16 @@ def still_missing_px(change_px: Tensor, last_px: Tensor) -> Tensor:
     return change_px * ratio / (1.0 - ratio)
 
 
+def _largest_change(one: Tensor, other: Tensor) -> Tensor:
+    """Largest difference of two batches of depths, per frame, (B,)."""
+    return (one - other).abs().amax(dim=(1, 2, 3))
+
+
 def _some_frames(frame: Frame, index: Tensor, every: bool) -> Frame:
     if every:
         return frame
     noise = frame.noise_std
-    noise = None if noise is None else noise[index]
-    some = (frame.compensated[index], frame.deformed[index], frame.image[index], frame.mask[index])
-    return Frame(some[0], some[1], some[2], some[3], frame.window, frame.size, noise)
+    return Frame(frame.image[index], frame.weight[index], None if noise is None else noise[index])
 
 
 def _some(frames: Tensor, index: Tensor, every: bool) -> Tensor:

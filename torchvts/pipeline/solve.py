@@ -1,13 +1,12 @@
-"""One pass: from a compensated window to normals, gradient and depth (eq. 9 or 10, 5 and 4 of the paper)."""
+"""One pass: from a compensated image to normals, slopes and depth (eq. 9 or 10, 5 and 4 of the paper)."""
 
 from typing import Final
 
 import torch
 from torch import Tensor, nn
 
-from ..accelerated import Masked
 from ..core.checks import reads_freely
-from ..core.frame import Frame, Solution, in_window
+from ..core.frame import Frame, Solution
 from ..integration import Integrator
 from ..normals import NormalModel, WrappedNormals
 from ..normals.base import check_normals
@@ -22,41 +21,40 @@ class Solve(nn.Module):
         normals: compensated image to normals.
         gradient: normals to gradient.
         integrate: gradient to depth.
+        zero: depth and weight to depth that counts from the undeformed skin.
     """
 
     takes_noise: Final[bool]
-    _checks: Final[bool]
+    from_outside: Final[bool]
 
-    def __init__(self, normals: NormalModel, gradient: nn.Module, integrate: Integrator) -> None:
+    def __init__(self, normals: NormalModel, gradient: nn.Module, integrate: Integrator, zero: nn.Module) -> None:
         super().__init__()
         self.normals = normals
         self.takes_noise = normals.takes_noise
         given = normals.module if isinstance(normals, WrappedNormals) else normals
-        self._checks = not type(given).__module__.startswith("torchvts.")
+        self.from_outside = not type(given).__module__.startswith("torchvts.")
         self.gradient = gradient
         self.integrate = integrate
-        self.masked = Masked()
+        self.zero = zero
 
-    def forward(self, frame: Frame, depth_mm: Tensor | None = None) -> Solution:
-        """Solve a frame.
+    def forward(self, frame: Frame, depth_mm: Tensor) -> Solution:
+        """Solve a frame again with the depth so far, (B, 1, H, W): eq. 10."""
+        return self.integrated(frame, self.slopes(frame.image, depth_mm, frame.noise_std) * frame.weight)
 
-        Args:
-            frame: the frame.
-            depth_mm: (B, 1, H, W), the depth so far, which eq. 10 takes; None for eq. 9.
-        """
-        depth = None if depth_mm is None else in_window(frame, depth_mm)
-        if self.takes_noise:
-            normal = self.normals(frame.image, depth, frame.window, frame.noise_std)
-        else:
-            normal = self.normals(frame.image, depth, frame.window)
+    @torch.jit.export
+    def slopes(self, image: Tensor, depth_mm: Tensor | None, noise_std: Tensor | None) -> Tensor:
+        """Slopes of all pixels of compensated images (B, 3, H, W), (B, 2, H, W); without depth eq. 9, with it eq. 10."""
+        normal = self.normals(image, depth_mm, noise_std) if self.takes_noise else self.normals(image, depth_mm)
         if not torch.jit.is_scripting():
-            self._check(normal, frame.image)
-        return self.integrated(frame, self.masked(self.gradient(normal), frame.mask))
+            self._check(normal, image)
+        gradient: Tensor = self.gradient(normal)
+        return gradient
 
     def _check(self, normal: Tensor, image: Tensor) -> None:
-        if self._checks and reads_freely(image):
+        if self.from_outside and reads_freely(image):
             check_normals(self.normals, normal, image)
 
+    @torch.jit.export
     def integrated(self, frame: Frame, gradient: Tensor) -> Solution:
-        """The solution with a gradient (B, 2, h, w) that is known."""
-        return Solution(gradient, self.integrate(gradient, frame.window, frame.size))
+        """The solution of a gradient (B, 2, H, W) that is zero where the weight is."""
+        return Solution(gradient, self.zero(self.integrate(gradient), frame.weight))

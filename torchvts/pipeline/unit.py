@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from ..contact import ContactSettings
 from ..model import Calibration, check_calibration
+from ..skin import ContactSettings
 from .depth import DepthPipeline
 
 

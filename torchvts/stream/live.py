@@ -12,11 +12,11 @@ from torch import Tensor
 
 from ..accelerated.threads import MOST_PIXELS, OneThread
 from ..calibration import Press
-from ..contact import ContactSettings
 from ..core.checks import check_choice, check_integer, check_least, check_record, check_switch
 from ..core.files import rgb_from_bgr
 from ..model import Calibration, Sensor
 from ..pipeline import MODES, DepthOutput
+from ..skin import ContactSettings
 from .background import FIRST_FRAMES, calibrate_background, find_background, use_calibration, with_background
 from .follow_light import FollowLight
 from .frames import SourceFrames

@@ -8,13 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .. import accelerated
-from ..contact import ContactMask, ContactSettings
-from ..contact.masks import MOST_FAR_FIELD, most_far_field
 from ..core.checks import check_positive, check_switch
 from ..core.spelling import suggest
 from ..model import Calibration, check_calibration
 from ..pipeline import DepthOutput, DepthPipeline, unit_pipeline
+from ..skin import ContactSettings
 from .background import find_background
 from .follow_light import FollowLight
 from .usable import FrameCheck
@@ -85,9 +83,7 @@ class Recording:
         self.check = FrameCheck.from_calibration(calibration)
         self._fps, self._follow, self._stage = fps, follow, stage
         self._before: float | None = None
-        image, noise = (None, None) if first is None else find_background(first)
-        if noise is not None and isinstance(self.pipe.deformed, ContactMask):
-            self.pipe.deformed = _with_video_noise(self.pipe.deformed, noise, calibration if network is None else None)
+        image = None if first is None else find_background(first)[0]
         self.pipe.to(self.device)
         if image is not None:
             self._start(calibration, image[None])
@@ -138,8 +134,7 @@ class Recording:
 
     def _deformed(self, image: Tensor) -> Tensor:
         """Where the skin has moved, of a frame whose depth is not wanted."""
-        deformed: Tensor = self.pipe.deformed(self.pipe.compensate(image.to(self.device))).cpu()
-        return deformed
+        return self.pipe.moved(image.to(self.device)).cpu()
 
     def _start(self, calibration: Calibration, image: Tensor) -> None:
         """Start from the light of the first frames, and refuse another unit and a contact in them."""
@@ -152,7 +147,7 @@ class Recording:
             )
         corrected = light.correct(image)
         with torch.inference_mode():
-            deformed = self.pipe.deformed(self.pipe.compensate(corrected.to(self.device)))
+            deformed = self.pipe.moved(corrected.to(self.device))
         if bool(deformed.any()):
             raise ValueError(
                 f"background: the first frames show contact on {float(deformed.float().mean()):.1%} of the skin against the "
@@ -160,25 +155,3 @@ class Recording:
                 "changed, or use the calibration as it is (background_frames=0, --background-frames 0)"
             )
         light.set_background(corrected)
-
-
-def _with_video_noise(mask: ContactMask, noise: Tensor, calibration: Calibration | None) -> ContactMask:
-    """The mask with the noise of a video where that is larger: a video is compressed, and its frames differ by more than the noise
-    of their pixels.
-
-    Args:
-        mask: of a pipeline.
-        noise: (3, H, W), noise of the image's value between frames.
-        calibration: whose compensation the mask follows; None for a network's, which takes images as they are.
-    """
-    if calibration is None:
-        compensated, far_field = 2.0**0.5 * noise, MOST_FAR_FIELD
-    else:
-        exponent, far_field = calibration.sensor.exponent, most_far_field(calibration)
-        value = calibration.background.float().clamp_min(1e-6) ** (1.0 / exponent)
-        compensated = noise.float() * exponent * torch.maximum(value, noise.float()) ** (exponent - 1.0)
-        if calibration.gain is not None:
-            compensated = compensated * calibration.gain.float() * 2.0**0.5
-    most = torch.maximum(1.0 / mask.per_noise, compensated.to(mask.per_noise))
-    settings = (mask.sigmas, mask.min_size_px, far_field, mask.smooth_light, mask.least_colour)
-    return accelerated.ContactMask(mask.flat, most, *settings).eval()

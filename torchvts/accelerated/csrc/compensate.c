@@ -13,25 +13,19 @@ EXPORT void grid_means(const float *image, int planes, int height, int width, in
             }
 }
 
-/* Whether a value is not in [0, 1], or no number. */
-static inline int is_outside(float value) { return !((value >= -1e-3f) & (value <= 1.001f)); }
-
-/* image * gain + offset, either of which may be null; without offset image * gain + pedestal * gain. Returns whether any value of the image is not in
-   [0, 1]. */
-WIDE static int multiply_add(const float *restrict image, const float *restrict gain, const float *restrict offset, float pedestal, int n,
-                             float *restrict light) {
-    int outside = 0;
+/* image * gain + offset, either of which may be null; without offset image * gain + pedestal * gain. */
+WIDE static void multiply_add(const float *restrict image, const float *restrict gain, const float *restrict offset, float pedestal, int n,
+                              float *restrict light) {
     if (gain && !offset && pedestal != 0.0f)
-        for (int x = 0; x < n; x++) light[x] = image[x] * gain[x] + pedestal * gain[x], outside |= is_outside(image[x]);
+        for (int x = 0; x < n; x++) light[x] = image[x] * gain[x] + pedestal * gain[x];
     else if (gain && offset)
-        for (int x = 0; x < n; x++) light[x] = image[x] * gain[x] + offset[x], outside |= is_outside(image[x]);
+        for (int x = 0; x < n; x++) light[x] = image[x] * gain[x] + offset[x];
     else if (gain)
-        for (int x = 0; x < n; x++) light[x] = image[x] * gain[x], outside |= is_outside(image[x]);
+        for (int x = 0; x < n; x++) light[x] = image[x] * gain[x];
     else if (offset)
-        for (int x = 0; x < n; x++) light[x] = image[x] + offset[x], outside |= is_outside(image[x]);
+        for (int x = 0; x < n; x++) light[x] = image[x] + offset[x];
     else
-        for (int x = 0; x < n; x++) light[x] = image[x], outside |= is_outside(image[x]);
-    return outside;
+        memcpy(light, image, sizeof(float) * (size_t)n);
 }
 
 /* The sum of an odd number of lines, each times its weight, in their order; seven, six and two at a time, which stay in registers. Fused, as
@@ -75,9 +69,9 @@ typedef struct {
     float pedestal;
 } Affine;
 
-/* n values from `at` on. Returns whether any of the image is not in [0, 1]. */
-static int apply(const Affine *of, size_t at, int n, float *light) {
-    return multiply_add(of->image + at, of->gain ? of->gain + at : NULL, of->offset ? of->offset + at : NULL, of->pedestal, n, light);
+/* n values from `at` on. */
+static void apply(const Affine *of, size_t at, int n, float *light) {
+    multiply_add(of->image + at, of->gain ? of->gain + at : NULL, of->offset ? of->offset + at : NULL, of->pedestal, n, light);
 }
 
 /* Has the processor fetch what apply() will read: rows are too short for it to see by itself where they go on. */
@@ -89,18 +83,15 @@ static void ahead(const Affine *of, size_t at, int n) {
     }
 }
 
-/* Rows `first` to `last` of a plane blurred, its border repeated. scratch: taps lines, and one that is `taps` longer; `lines`: taps pointers.
-   Returns whether any value that is read, as the camera gives it, is not in [0, 1]. */
-static int blur_rows(const Affine *plane, const float *weight, int taps, int height, int width, int first, int last, float *scratch,
-                     const float **lines, float *out) {
+/* A plane blurred, its border repeated. scratch: taps lines, and one that is `taps` longer; `lines`: taps pointers. */
+static void blur_plane(const Affine *plane, const float *weight, int taps, int height, int width, float *scratch, const float **lines, float *out) {
     const int reach = taps / 2;
     float *padded = scratch + (size_t)taps * width, *row = padded + reach;
-    int outside = 0;
-    for (int y = first, next = first > reach ? first - reach : 0; y < last; y++) {
+    for (int y = 0, next = 0; y < height; y++) {
         for (; next < height && next <= y + reach; next++) { /* row `next` of the plane lies in line next % taps */
             const size_t at = (size_t)next * width;
             if (next + 1 < height) ahead(plane, at + width, width);
-            outside |= apply(plane, at, width, row);
+            apply(plane, at, width, row);
             for (int k = 0; k < reach; k++) padded[k] = row[0], row[width + k] = row[width - 1];
             for (int k = 0; k < taps; k++) lines[k] = padded + k;
             weighted_sum(lines, weight, taps, width, scratch + (size_t)(next % taps) * width);
@@ -111,7 +102,6 @@ static int blur_rows(const Affine *plane, const float *weight, int taps, int hei
         }
         weighted_sum(lines, weight, taps, width, out + (size_t)y * width);
     }
-    return outside;
 }
 
 /* Defective pixels of a plane become the mean of four others. */
@@ -198,54 +188,12 @@ static float half_sample_mode(const float *ordered, int n, int halvings) {
 /* How many rows, or columns, are sampled of so many. */
 static int sampled(int length, int stride) { return (length - stride / 2 + stride - 1) / stride; }
 
-static void mode_of(void *with, int plane) {
-    Modes *of = with;
-    const int stride = of->stride, rows = sampled(of->height, stride), columns = sampled(of->width, stride);
-    const float *image = of->image + (size_t)plane * of->height * of->width;
-    float *some = malloc(2 * sizeof(float) * (size_t)rows * columns);
-    if (!some) {
-        of->short_of_memory = 1;
-        return;
-    }
+/* The mode of every stride-th pixel of a plane. some: twice as much memory as so many pixels. */
+static float mode_of(const float *plane, int height, int width, int stride, int halvings, float *some) {
     int n = 0;
-    for (int y = stride / 2; y < of->height; y += stride)
-        for (int x = stride / 2; x < of->width; x += stride) some[n++] = image[(size_t)y * of->width + x];
-    of->mode[plane] = half_sample_mode(sorted(some, some + n, n), n, of->halvings);
-    free(some);
-}
-
-/* A band of rows of a plane. Defects lie anywhere, so with them a band is a whole plane, which is filled before it is blurred. Who cleans the last
-   band of a plane finds its mode. */
-void clean_band(void *with, int part) {
-    Cleaning *of = with;
-    const int plane = part % 3, band = part / 3, taps = of->taps, height = of->height, width = of->width;
-    const int first = height * band / of->bands, last = height * (band + 1) / of->bands;
-    const size_t pixels = (size_t)height * width, at = pixels * (size_t)plane, lines = (size_t)taps * width + width + taps;
-    const size_t filled = taps && of->defects ? pixels : 0;
-    const Affine affine = {of->image + pixels * plane, of->gain ? of->gain + at : NULL, of->offset ? of->offset + at : NULL, of->pedestal[plane]};
-    float *light = of->light + pixels * plane;
-    float *scratch = malloc(sizeof(float) * (lines + filled + (size_t)of->defects + 1) + sizeof(float *) * (size_t)(taps + 1));
-    if (!scratch) {
-        atomic_fetch_or(&of->trouble, 1);
-        return;
-    }
-    const float **line = (const float **)scratch;
-    float *rows = (float *)(line + taps + 1), *whole = rows + lines, *repaired = whole + filled;
-    int outside = 0;
-    if (taps && !of->defects) {
-        outside = blur_rows(&affine, of->weight, taps, height, width, first, last, rows, line, light);
-    } else {
-        const size_t from = (size_t)first * width;
-        const int n = (last - first) * width;
-        float *to = taps ? whole : light;
-        outside = apply(&affine, from, n, to + from);
-        if (of->defects) fill(to, of->defect, of->neighbours, of->defects, repaired);
-        const Affine as_is = {to, NULL, NULL, 0.0f};
-        if (taps) blur_rows(&as_is, of->weight, taps, height, width, 0, height, rows, line, light);
-    }
-    if (outside) atomic_fetch_or(&of->trouble, 2);
-    free(scratch);
-    if (of->leveling && atomic_fetch_sub(&of->left[plane], 1) == 1) mode_of(&of->modes, plane);
+    for (int y = stride / 2; y < height; y += stride)
+        for (int x = stride / 2; x < width; x += stride) some[n++] = plane[(size_t)y * width + x];
+    return half_sample_mode(sorted(some, some + n, n), n, halvings);
 }
 
 /* How many of n samples (3, LINE) lie within `reach` of each of five levels in all three channels. */
@@ -260,12 +208,12 @@ WIDE static void count_near(float some[3][LINE], int n, const float level[5][3],
 }
 
 /* Drift.of_one_skin() of torchvts/compensate/drift.py: the drift of a frame, in place of what each channel by itself says. */
-static void make_of_one_skin(const Leveling *of, const float *image, int height, int width, float *drift) {
+static void make_of_one_skin(const float *image, int height, int width, int stride, float least_drift, float *drift) {
     const float lowest = fminf(fminf(drift[0], drift[1]), drift[2]), highest = fmaxf(fmaxf(drift[0], drift[1]), drift[2]);
-    const int stride = of->stride, columns = sampled(width, stride);
+    const int columns = sampled(width, stride);
     float levels[5][3], some[3][LINE];
     int counts[5] = {0}, best = 0, most;
-    if (highest - lowest < of->least_drift) return;
+    if (highest - lowest < least_drift) return;
     for (int k = 0; k < 5; k++)
         for (int c = 0; c < 3; c++) levels[k][c] = k == 0 ? drift[c] : k < 4 ? drift[k - 1] : 0.0f;
     for (int y = stride / 2; y < height; y += stride)
@@ -275,7 +223,7 @@ static void make_of_one_skin(const Leveling *of, const float *image, int height,
                 const float *row = image + ((size_t)c * height + y) * width + stride / 2 + (size_t)first * stride;
                 for (int j = 0; j < n; j++) some[c][j] = row[(size_t)j * stride] - 1.0f;
             }
-            count_near(some, n, levels, 2.0f * of->least_drift, counts);
+            count_near(some, n, levels, 2.0f * least_drift, counts);
         }
     most = 6 * counts[0];
     for (int k = 1; k < 5; k++)
@@ -283,68 +231,48 @@ static void make_of_one_skin(const Leveling *of, const float *image, int height,
     for (int c = 0; c < 3; c++) drift[c] = levels[best][c];
 }
 
-/* Levels (3) that Drift.by_mode() divides an image by, in place of modes. */
-static void to_levels(const Leveling *of, const float *image, int height, int width, float *level) {
-    float largest = 0.0f;
-    for (int c = 0; c < 3; c++) {
-        level[c] -= 1.0f;
-        level[c] = level[c] < -of->most_drift ? -of->most_drift : level[c] > of->most_drift ? of->most_drift : level[c];
+/* light (frames, 3, height, width) = image * gain + offset, its `defects` filled, blurred by `taps` weights. gain and offset (3, height, width) may be
+   null, taps and defects 0; without offset it is pedestal (3) * gain. Returns 1 where memory is short. */
+EXPORT int clean(const float *image, const float *gain, const float *offset, const float *pedestal, const int64_t *defect, const int64_t *neighbours,
+                 int64_t defects, const float *weight, int taps, int frames, int height, int width, float *light) {
+    const size_t pixels = (size_t)height * width, lines = (size_t)taps * width + width + taps, filled = taps && defects ? pixels : 0;
+    const float **line = malloc(sizeof(float *) * (size_t)(taps + 1) + sizeof(float) * (lines + filled + (size_t)defects + 1));
+    if (!line) return 1;
+    float *rows = (float *)(line + taps + 1), *whole = rows + lines, *repaired = whole + filled;
+    for (int plane = 0; plane < 3 * frames; plane++, image += pixels, light += pixels) {
+        const size_t at = pixels * (size_t)(plane % 3);
+        Affine affine = {image, gain ? gain + at : NULL, offset ? offset + at : NULL, pedestal[plane % 3]};
+        if (defects || !taps) {
+            float *to = taps ? whole : light;
+            apply(&affine, 0, (int)pixels, to);
+            if (defects) fill(to, defect, neighbours, defects, repaired);
+            affine = (Affine){to, NULL, NULL, 0.0f};
+        }
+        if (taps) blur_plane(&affine, weight, taps, height, width, rows, line, light);
     }
-    make_of_one_skin(of, image, height, width, level);
-    for (int c = 0; c < 3; c++) largest = fabsf(level[c]) > largest ? fabsf(level[c]) : largest;
-    float weight = largest / of->least_drift - 1.0f;
-    weight = weight < 0.0f ? 0.0f : weight > 1.0f ? 1.0f : weight;
-    for (int c = 0; c < 3; c++) level[c] = 1.0f + weight * level[c];
+    free(line);
+    return 0;
 }
 
-/* Sets up what clean_band() does to one image in `parts` parts. */
-void prepare_cleaning(Cleaning *work, const float *image, const float *gain, const float *offset, const float *pedestal, const int64_t *defect,
-                      const int64_t *neighbours, int64_t defects, const float *weight, int taps, int height, int width, float *light,
-                      const Leveling *leveling, float *level) {
-    const int bands = defects ? 1 : bands_of(height);
-    *work = (Cleaning){image, gain, offset, pedestal, defect, neighbours, defects, weight, taps, height, width, bands, 3 * bands, light, {0}, leveling, 0,
-                       {bands, bands, bands}};
-    if (leveling) work->modes = (Modes){light, height, width, leveling->stride, leveling->halvings, level, 0};
-}
-
-/* After all parts: makes levels of the modes, and returns what clean() does. */
-int cleaned(Cleaning *work) {
-    if (work->leveling) to_levels(work->leveling, work->light, work->height, work->width, work->modes.mode);
-    const int trouble = work->trouble | work->modes.short_of_memory;
-    return trouble & 1 ? 1 : trouble;
-}
-
-/*
- * light (frames, 3, height, width) = image * gain + offset, its `defects` filled, blurred by `taps` weights. gain and offset (3, height,
- * width) may be null, taps and defects 0; without offset it is pedestal (3) * gain. Where `leveling` is not null, the levels of the light to `level`
- * (frames, 3). Returns 1 where memory is short, 2 where a value of the image is not in [0, 1].
- */
-EXPORT int clean(const float *image, const float *gain, const float *offset, const float *pedestal, const int64_t *defect, const int64_t *neighbours, int64_t defects,
-                 const float *weight, int taps, int frames, int height, int width, float *light, const Leveling *leveling, float *level) {
-    const size_t pixels = 3 * (size_t)height * width;
-    int trouble = 0;
-    for (int b = 0; b < frames && !(trouble & 1); b++) {
-        Cleaning work;
-        prepare_cleaning(&work, image + pixels * b, gain, offset, pedestal, defect, neighbours, defects, weight, taps, height, width, light + pixels * b,
-                         leveling, leveling ? level + 3 * b : NULL);
-        share(clean_band, &work, work.parts);
-        trouble |= cleaned(&work);
-    }
-    return trouble & 1 ? 1 : trouble;
-}
-
-/* The mode of every stride-th pixel of each of `planes` images. Returns 1 where memory is short. */
-EXPORT int modes(const float *image, int planes, int height, int width, int stride, int halvings, float *mode) {
-    Modes work = {image, height, width, stride, halvings, mode, 0};
-    share(mode_of, &work, planes);
-    return work.short_of_memory;
-}
-
-/* The same made the levels that Drift.by_mode() divides by, (frames, 3). */
+/* The levels (frames, 3) that Drift.by_mode() of torchvts/compensate/drift.py divides images by: from the mode of every stride-th pixel. Returns 1
+   where memory is short. */
 EXPORT int levels(const float *image, int frames, int height, int width, int stride, int halvings, float least_drift, float most, float *level) {
-    const Leveling how = {stride, halvings, least_drift, most};
-    if (modes(image, 3 * frames, height, width, stride, halvings, level)) return 1;
-    for (int b = 0; b < frames; b++) to_levels(&how, image + 3 * (size_t)height * width * b, height, width, level + 3 * b);
+    const size_t pixels = (size_t)height * width;
+    float *some = malloc(2 * sizeof(float) * (size_t)sampled(height, stride) * sampled(width, stride));
+    if (!some) return 1;
+    for (int b = 0; b < frames; b++, image += 3 * pixels, level += 3) {
+        float largest = 0.0f;
+        for (int c = 0; c < 3; c++) {
+            const float drift = mode_of(image + pixels * c, height, width, stride, halvings, some) - 1.0f;
+            level[c] = drift < -most ? -most : drift > most ? most : drift;
+        }
+        make_of_one_skin(image, height, width, stride, least_drift, level);
+        for (int c = 0; c < 3; c++) largest = fabsf(level[c]) > largest ? fabsf(level[c]) : largest;
+        float weight = largest / least_drift - 1.0f;
+        weight = weight < 0.0f ? 0.0f : weight > 1.0f ? 1.0f : weight;
+        for (int c = 0; c < 3; c++) level[c] = 1.0f + weight * level[c];
+    }
+    free(some);
     return 0;
 }
 
@@ -352,25 +280,9 @@ WIDE static void divide_all(const float *restrict values, float by, size_t n, fl
     for (size_t k = 0; k < n; k++) result[k] = values[k] / by;
 }
 
-/* What divide_planes() is given. */
-typedef struct {
-    const float *image, *level;
-    int64_t n;
-    int planes, pieces;
-    float *result;
-} Division;
-
-static void divide_piece(void *with, int part) {
-    const Division *of = with;
-    const int plane = part % of->planes, piece = part / of->planes;
-    const int64_t first = of->n * piece / of->pieces, last = of->n * (piece + 1) / of->pieces, at = of->n * plane + first;
-    divide_all(of->image + at, of->level[plane], (size_t)(last - first), of->result + at);
-}
-
 /* Each of `planes` images of n pixels divided by its level. */
 EXPORT void divide_planes(const float *image, const float *level, int planes, int64_t n, float *result) {
-    Division work = {image, level, n, planes, 2, result};
-    share(divide_piece, &work, planes * work.pieces);
+    for (int k = 0; k < planes; k++) divide_all(image + n * k, level[k], (size_t)n, result + n * k);
 }
 
 /* FollowLight.correct() of torchvts/stream/follow_light.py: an image (3, height, width) over a level and two tilts of each channel (3, 3), within 0

@@ -21,8 +21,7 @@ typedef struct {
     Cosine cosine;
 } Plan;
 
-/* Coefficients lie in slices of so many, SLICE of the first column, of the second and so on, so that threads which solve for some of them read
-   one piece of memory. */
+/* Coefficients lie in slices of so many, SLICE of the first column, of the second and so on. */
 enum { SLICE = 64 };
 
 /* Coefficients of a column, in whole slices. */
@@ -63,51 +62,22 @@ static Plan plan_of(int height, int width, const double *tables) {
     return plan;
 }
 
-/* Half the difference of what lies after and before each element, and below and above it: a line of the divergence. */
-WIDE static void difference(const float *restrict padded, const float *restrict above, const float *restrict below, float half, int n,
-                            float *restrict line) {
-    for (int x = 0; x < n; x++) line[x] = half * (padded[x + 2] - padded[x] + below[x] - above[x]);
+/* A row of the divergence of a gradient: half the difference of what lies after and before each element, and below and above it. Beyond the border
+   of the image a gradient is that of the border with the other sign, so that edges out of the image count as zero. */
+WIDE static void difference(const float *restrict p, const float *restrict above, float sign_above, const float *restrict below, float sign_below,
+                            float half, int n, float *restrict line) {
+    for (int x = 1; x < n - 1; x++) line[x] = half * (p[x + 1] - p[x - 1] + sign_below * below[x] - sign_above * above[x]);
+    line[0] = half * (p[1] + p[0] + sign_below * below[0] - sign_above * above[0]);
+    line[n - 1] = half * (-p[n - 1] - p[n - 2] + sign_below * below[n - 1] - sign_above * above[n - 1]);
 }
 
-/* Row y of the window, times `sign`; nothing where there is no such row. */
-static void place(const float *rows_of, int y, int rows, int columns, float sign, float *line) {
-    if (y < 0 || y >= rows) return;
-    const float *source = rows_of + (size_t)y * columns;
-    for (int x = 0; x < columns; x++) line[x] = sign * source[x];
-}
-
-/* A part of an image: its first row and column, how many, and those of the pixels beside it too. */
-typedef struct {
-    int top, left, rows, columns, first_row, last_row, first_column, last_column;
-} Part;
-
-static Part part_of(int rows, int columns, int top, int left, int height, int width) {
-    const Part part = {top, left, rows, columns, top > 0 ? top - 1 : 0, least(top + rows + 1, height), left > 0 ? left - 1 : 0,
-                       least(left + columns + 1, width)};
-    return part;
-}
-
-/* Rows `first` to `last` of the divergence of a gradient, (2, rows, columns), where it is not zero: lines of `step` floats. Beyond the border of the
-   image a gradient is that of the border with the other sign, so that edges out of the image count as zero. scratch: three lines, and two floats. */
-static void divergence(const float *gradient, const Part *part, int first, int last, int height, int width, float half_pitch, float *scratch,
-                       float *lines, int step) {
-    const int n = part->last_column - part->first_column, before = part->left - part->first_column, columns = part->columns;
-    float *padded = scratch, *above = scratch + n + 2, *below = above + n;
-    const float *p = gradient, *q = gradient + (size_t)part->rows * columns;
-    for (int line = first; line < last; line++) {
-        const int y = line - part->top;
-        float *to = lines + (size_t)(line - part->first_row) * step;
-        memset(scratch, 0, sizeof(float) * (3 * (size_t)n + 2));
-        if (y >= 0 && y < part->rows) {
-            memcpy(padded + 1 + before, p + (size_t)y * columns, sizeof(float) * (size_t)columns);
-            if (part->first_column == 0) padded[0] = -padded[1];
-            if (part->last_column == width) padded[n + 1] = -padded[n];
-        }
-        const int lowest = line == height - 1, highest = line == 0;
-        place(q, lowest ? y : y + 1, part->rows, columns, lowest ? -1.0f : 1.0f, below + before);
-        place(q, highest ? y : y - 1, part->rows, columns, highest ? -1.0f : 1.0f, above + before);
-        difference(padded, above, below, half_pitch, n, to);
-        memset(to + n, 0, sizeof(float) * (size_t)(step - n));
+/* The divergence of a gradient (2, height, width), in lines of `step` floats, zeros beyond the width. */
+static void divergence(const float *gradient, int height, int width, float half_pitch, float *lines, int step) {
+    const float *q = gradient + (size_t)height * width;
+    for (int y = 0; y < height; y++, gradient += width, q += width, lines += step) {
+        const int first = y == 0, last = y == height - 1;
+        difference(gradient, first ? q : q - width, first ? -1.0f : 1.0f, last ? q : q + width, last ? -1.0f : 1.0f, half_pitch, width, lines);
+        memset(lines + width, 0, sizeof(float) * (size_t)(step - width));
     }
 }
 
@@ -143,14 +113,6 @@ WIDE FUSED static void there(float *restrict values, const double *restrict pole
     }
 }
 
-/* The same of values that are zero. */
-WIDE FUSED static void there_alone(float *restrict values, const double *restrict pole, int n, double *restrict sum) {
-    for (int k = 0; k < n; k++) {
-        sum[k] *= pole[k];
-        values[k] = (float)sum[k];
-    }
-}
-
 WIDE FUSED static void back(float *restrict values, const double *restrict pole, const double *restrict gain, int n, double *restrict sum) {
     for (int k = 0; k < n; k++) {
         sum[k] = gain[k] * values[k] + pole[k] * sum[k];
@@ -177,20 +139,16 @@ WIDE static void turn_round(const float *restrict values, const double *restrict
     for (int k = 0; k < n; k++) sum[k] = end[k] * values[k];
 }
 
-/* Along x: a slice of coefficients, zero but in the part's columns, becomes that of the depth. state: three lines of doubles. */
-static void recursions(const Plan *plan, const Part *part, int from, float *slice, double *state) {
-    const int width = plan->width, first = part->first_column, last = part->last_column, n = SLICE;
+/* Along x: a slice of coefficients becomes that of the depth. */
+static void recursions(const Plan *plan, int from, float *slice) {
+    const int width = plan->width, n = SLICE;
     const double *pole = plan->pole + from;
-    double *sum = state, *other = sum + SLICE, *power = other + SLICE;
-    memset(sum, 0, 2 * SLICE * sizeof(double));
-    for (int x = last - 1; x >= first; x--) sum_up(slice + (size_t)x * SLICE, pole, n, sum);
-    for (int x = first; x < last; x++) sum_up(slice + (size_t)x * SLICE, pole, n, other);
-    times_power(pole, first, n, power, sum);
-    times_power(pole, 2 * width - last, n, power, other);
+    double sum[SLICE] = {0.0}, other[SLICE] = {0.0}, power[SLICE];
+    for (int x = width - 1; x >= 0; x--) sum_up(slice + (size_t)x * SLICE, pole, n, sum);
+    for (int x = 0; x < width; x++) sum_up(slice + (size_t)x * SLICE, pole, n, other);
+    times_power(pole, width, n, power, other);
     begin(other, plan->per_start + from, n, sum);
-    for (int x = 0; x < first; x++) there_alone(slice + (size_t)x * SLICE, pole, n, sum);
-    for (int x = first; x < last; x++) there(slice + (size_t)x * SLICE, pole, n, sum);
-    for (int x = last; x < width; x++) there_alone(slice + (size_t)x * SLICE, pole, n, sum);
+    for (int x = 0; x < width; x++) there(slice + (size_t)x * SLICE, pole, n, sum);
     turn_round(slice + (size_t)(width - 1) * SLICE, plan->end + from, n, sum);
     for (int x = width - 1; x >= 0; x--) back(slice + (size_t)x * SLICE, pole, plan->gain + from, n, sum);
 }
@@ -209,12 +167,10 @@ static void solve_constant(const Plan *plan, double *constant) {
 }
 
 /* LINES columns of the divergence, whose lines have `step` floats, from `first` on, to their coefficients. */
-static void to_coefficients(const Plan *plan, const Part *part, const float *lines, int step, int first, float *scratch, float *found,
-                            float *coefficients) {
-    const size_t n = (size_t)plan->height, wide = (size_t)plan->wide, columns = (size_t)plan->width + LINES, to_column = (size_t)(part->first_column + first);
-    memset(scratch, 0, sizeof(float) * n * LINES);
-    for (int y = part->first_row; y < part->last_row; y++) {
-        const float *line = lines + (size_t)(y - part->first_row) * step + first;
+static void to_coefficients(const Plan *plan, const float *lines, int step, int first, float *scratch, float *found, float *coefficients) {
+    const size_t n = (size_t)plan->height, wide = (size_t)plan->wide, columns = (size_t)plan->width + LINES;
+    for (int y = 0; y < plan->height; y++) {
+        const float *line = lines + (size_t)y * step + first;
         float *to = cosine_line(&plan->cosine, scratch, y);
         memcpy(to, line, sizeof(float) * LANES);
         memcpy(to + n * LANES, line + LANES, sizeof(float) * LANES);
@@ -222,7 +178,7 @@ static void to_coefficients(const Plan *plan, const Part *part, const float *lin
     cosine_forward(&plan->cosine, scratch, found);
     for (size_t k = 0; k < wide; k += 4)
         for (int x = 0; x < LINES; x += 4)
-            transpose(found + k * LINES + x, LINES, coefficients + place_of(k, to_column + x, columns), SLICE);
+            transpose(found + k * LINES + x, LINES, coefficients + place_of(k, (size_t)(first + x), columns), SLICE);
 }
 
 /* LANES values of a row, with the first waves of their columns. low: WAVES coefficients of LANES columns, LINES floats for each. */
@@ -250,12 +206,9 @@ static void to_depth(const Plan *plan, const float *coefficients, int first, flo
     }
 }
 
-/* n pixels of a row of depth less its level: LANES of them together, and `step` floats on the next ones. */
-WIDE static void row_of_depth(const float *lanes, size_t step, float level, int n, float *restrict row) {
-    int x = 0;
-    for (; x + LANES <= n; x += LANES, lanes += step)
-        for (int t = 0; t < LANES; t++) row[x + t] = lanes[t] - level;
-    for (int t = 0; x < n; x++, t++) row[x] = lanes[t] - level;
+/* n pixels of a row of depth: LANES of them together, and `step` floats on the next ones. */
+static void row_of_depth(const float *lanes, size_t step, int n, float *row) {
+    for (int x = 0; x < n; x += LANES, lanes += step) memcpy(row + x, lanes, sizeof(float) * (size_t)least(LANES, n - x));
 }
 
 /* Sum of depth where the slopes are not zero, and how many pixels that are. */
@@ -281,171 +234,67 @@ WIDE static double inclined_sum(const float *restrict depth, const float *restri
     return total;
 }
 
-/* The solution of one frame. Each part of the work has LINES columns, or a slice of coefficients of all, or a band of rows, and scratch of its
-   own: transforms and their coefficients, and the lines of the divergence's borders. `lines` are those of the divergence, and then of depth, LINES
-   columns after the other as transforms leave them: written to rows at once, each line of memory would be fetched for a part of a block. */
-typedef struct {
-    Plan plan;
-    Part part;
-    const float *gradient;
-    float half_pitch, level;
-    int step;
-    float *lines, *coefficients, *depth;
-    double *row_sum; /* of depth where the gradient is not zero, of each row of the part, and how many pixels those are */
-    int32_t *row_count;
-    atomic_int short_of_memory;
-} Solution;
-
-/* Memory of one transform: lines twice, then the coefficients, of which those beyond the height are zero. Null where memory is short. */
-static float *transform_memory(Solution *of) {
-    const size_t scratch = cosine_scratch_size(of->plan.height), height = (size_t)of->plan.height, wide = (size_t)of->plan.wide;
-    float *memory = malloc(sizeof(float) * (scratch + wide * LINES));
-    if (memory)
-        memset(memory + scratch + height * LINES, 0, sizeof(float) * (wide - height) * LINES);
-    else
-        of->short_of_memory = 1;
-    return memory;
-}
-
-static void diverge(void *with, int band) {
-    Solution *of = with;
-    const int rows = of->part.last_row - of->part.first_row, bands = bands_of(rows), first = of->part.first_row;
-    float *scratch = malloc(sizeof(float) * (3 * (size_t)of->plan.width + 2));
-    if (scratch)
-        divergence(of->gradient, &of->part, first + rows * band / bands, first + rows * (band + 1) / bands, of->plan.height, of->plan.width,
-                   of->half_pitch, scratch, of->lines, of->step);
-    else
-        of->short_of_memory = 1;
-    free(scratch);
-}
-
-static void transform(void *with, int block) {
-    Solution *of = with;
-    float *memory = transform_memory(of);
-    const unsigned int before = without_tiny();
-    if (memory)
-        to_coefficients(&of->plan, &of->part, of->lines, of->step, block * LINES, memory, memory + cosine_scratch_size(of->plan.height),
-                        of->coefficients);
-    with_tiny(before);
-    free(memory);
-}
-
-static void recur(void *with, int slice) {
-    Solution *of = with;
-    double state[3 * SLICE];
-    const unsigned int before = without_tiny();
-    recursions(&of->plan, &of->part, slice * SLICE, of->coefficients + place_of((size_t)slice * SLICE, 0, (size_t)of->plan.width + LINES), state);
-    with_tiny(before);
-}
-
-static void transform_back(void *with, int block) {
-    Solution *of = with;
-    float *memory = transform_memory(of);
-    const unsigned int before = without_tiny();
-    if (memory)
-        to_depth(&of->plan, of->coefficients, block * LINES, memory, memory + cosine_scratch_size(of->plan.height),
-                 of->lines + (size_t)block * of->plan.height * LINES);
-    with_tiny(before);
-    free(memory);
-}
-
-/* Row y of depth, less `level`, from `first`, a multiple of LANES, to `last`. */
-static void depth_in_row(const Solution *of, int y, int first, int last, float level, float *row) {
-    const size_t step = (size_t)of->plan.height * LANES;
-    row_of_depth(cosine_line(&of->plan.cosine, of->lines, y) + (size_t)(first / LANES) * step, step, level, last - first, row);
-}
-
-static void sum_rows(void *with, int band) {
-    Solution *of = with;
-    const Part *part = &of->part;
-    const int bands = bands_of(part->rows), first = part->left / LANES * LANES;
-    for (int y = part->rows * band / bands; y < part->rows * (band + 1) / bands; y++) {
-        const float *p = of->gradient + (size_t)y * part->columns;
-        float *row = of->depth + (size_t)(part->top + y) * of->plan.width;
-        depth_in_row(of, part->top + y, first, part->left + part->columns, 0.0f, row + first);
-        of->row_count[y] = 0;
-        of->row_sum[y] = inclined_sum(row + part->left, p, p + (size_t)part->rows * part->columns, part->columns, of->row_count + y);
-    }
-}
-
 /* The depth at which the gradient is zero on average, or where that is nowhere, the lowest. Depth has zero mean. */
-static float level_of(Solution *of) {
-    const size_t pixels = (size_t)of->plan.height * of->plan.width;
+static float level_of(const float *gradient, const float *depth, int height, int width) {
+    const size_t pixels = (size_t)height * width;
     double sum = 0.0;
     size_t inclined = 0;
-    share(sum_rows, of, bands_of(of->part.rows));
-    for (int y = 0; y < of->part.rows; y++) sum += of->row_sum[y], inclined += (size_t)of->row_count[y];
+    for (size_t at = 0; at < pixels; at += (size_t)width) {
+        int32_t count = 0;
+        sum += inclined_sum(depth + at, gradient + at, gradient + pixels + at, width, &count);
+        inclined += (size_t)count;
+    }
     if (inclined < pixels) return (float)(-sum / (double)(pixels - inclined));
-    float level = of->depth[0]; /* the part is the whole image */
+    float level = depth[0];
     for (size_t k = 1; k < pixels; k++)
-        if (of->depth[k] < level) level = of->depth[k];
+        if (depth[k] < level) level = depth[k];
     return level;
 }
 
-static void write_rows(void *with, int band) {
-    Solution *of = with;
-    const int height = of->plan.height, width = of->plan.width, bands = bands_of(height);
-    for (int y = height * band / bands; y < height * (band + 1) / bands; y++)
-        depth_in_row(of, y, 0, width, of->level, of->depth + (size_t)y * width);
+WIDE static void lower(float *depth, float by, size_t n) {
+    for (size_t k = 0; k < n; k++) depth[k] -= by;
 }
 
-/* constant: a double for each column. */
-static void solve_one(Solution *of, int zeroed, double *constant) {
-    const Part *part = &of->part;
-    const int width = of->plan.width, height = of->plan.height;
-    share(diverge, of, bands_of(part->last_row - part->first_row));
-    share(transform, of, of->step / LINES);
-    for (int x = 0; x < width; x++) constant[x] = x >= part->first_column && x < part->last_column ? of->coefficients[(size_t)x * SLICE] : 0.0;
-    share(recur, of, of->plan.wide / SLICE);
-    solve_constant(&of->plan, constant);
-    for (int x = 0; x < width; x++) of->coefficients[(size_t)x * SLICE] = (float)constant[x];
-    share(transform_back, of, (width + LINES - 1) / LINES);
-    if (of->short_of_memory) return;
-    of->level = zeroed ? level_of(of) : 0.0f;
-    share(write_rows, of, bands_of(height));
+/* Memory of solve_one(): a double for each column; coefficients, and lines, those of the divergence, and then of depth, LINES columns after the other as
+   transforms leave them (written to rows at once, each line of memory would be fetched for a part of a block); and of a transform: lines twice, and
+   the coefficients of LINES columns. */
+typedef struct {
+    double *constant;
+    float *coefficients, *lines, *scratch, *found;
+} Memory;
+
+static void solve_one(const Plan *plan, const float *gradient, float half_pitch, Memory at, float *depth) {
+    const int height = plan->height, width = plan->width, blocks = (width + LINES - 1) / LINES;
+    const size_t columns = (size_t)width + LINES, step = (size_t)height * LANES;
+    divergence(gradient, height, width, half_pitch, at.lines, blocks * LINES);
+    for (int k = 0; k < blocks; k++) to_coefficients(plan, at.lines, blocks * LINES, k * LINES, at.scratch, at.found, at.coefficients);
+    for (int x = 0; x < width; x++) at.constant[x] = at.coefficients[(size_t)x * SLICE];
+    for (int k = 0; k < plan->wide; k += SLICE) recursions(plan, k, at.coefficients + place_of((size_t)k, 0, columns));
+    solve_constant(plan, at.constant);
+    for (int x = 0; x < width; x++) at.coefficients[(size_t)x * SLICE] = (float)at.constant[x];
+    for (int k = 0; k < blocks; k++) to_depth(plan, at.coefficients, k * LINES, at.scratch, at.found, at.lines + (size_t)k * LINES * height);
+    for (int y = 0; y < height; y++) row_of_depth(cosine_line(&plan->cosine, at.lines, y), step, width, depth + (size_t)y * width);
 }
 
 /*
- * Depth (frames, height, width) of gradients (frames, 2, rows, columns) of a window at (top, left), zero elsewhere; tables: of
- * make_poisson_plan(). It has zero mean; `zeroed`, it is zero on average where the gradient is zero. Returns 1 where memory is short.
+ * Depth (frames, height, width) of gradients (frames, 2, height, width); tables: of make_poisson_plan(). It has zero mean; `zeroed`, it is zero on
+ * average where the gradient is zero. Returns 1 where memory is short.
  */
-EXPORT int solve_poisson(const float *gradient, const double *tables, float mm_per_pixel, int frames, int rows, int columns, int top, int left,
-                         int height, int width, int zeroed, float *depth) {
-    Solution work = {.plan = plan_of(height, width, tables), .part = part_of(rows, columns, top, left, height, width), .half_pitch = 0.5f * mm_per_pixel};
-    const size_t wide = (size_t)work.plan.wide, lines = (size_t)height * (width + LINES), blocks = (size_t)width + LINES; /* the same for every window */
-    double *constant = malloc(sizeof(double) * ((size_t)width + height) + sizeof(float) * (blocks * wide + lines + (size_t)height));
-    if (!constant) return 1;
-    work.step = (work.part.last_column - work.part.first_column + LINES - 1) / LINES * LINES;
-    work.row_sum = constant + width, work.coefficients = (float *)(work.row_sum + height), work.lines = work.coefficients + blocks * wide;
-    work.row_count = (int32_t *)(work.lines + lines);
-    for (size_t k = 0; k < wide; k += SLICE) /* columns beyond the image, which fill its last block */
-        memset(work.coefficients + place_of(k, (size_t)width, blocks), 0, sizeof(float) * SLICE * LINES);
-    for (int b = 0; b < frames && !work.short_of_memory; b++) {
-        work.gradient = gradient + 2 * (size_t)rows * columns * b, work.depth = depth + (size_t)height * width * b;
-        solve_one(&work, zeroed, constant);
+EXPORT int solve_poisson(const float *gradient, const double *tables, float mm_per_pixel, int frames, int height, int width, int zeroed,
+                         float *depth) {
+    const Plan plan = plan_of(height, width, tables);
+    const size_t wide = (size_t)plan.wide, columns = (size_t)width + LINES, pixels = (size_t)height * width;
+    const size_t coefficients = columns * wide, lines = columns * (size_t)height, scratch = cosine_scratch_size(height);
+    double *memory = calloc(1, sizeof(double) * (size_t)width + sizeof(float) * (coefficients + lines + scratch + wide * LINES));
+    if (!memory) return 1;
+    float *floats = (float *)(memory + width);
+    const Memory at = {memory, floats, floats + coefficients, floats + coefficients + lines, floats + coefficients + lines + scratch};
+    for (int b = 0; b < frames; b++, gradient += 2 * pixels, depth += pixels) {
+        const unsigned int before = without_tiny();
+        solve_one(&plan, gradient, 0.5f * mm_per_pixel, at, depth);
+        with_tiny(before);
+        if (zeroed) lower(depth, level_of(gradient, depth, height, width), pixels);
     }
-    free(constant);
-    return work.short_of_memory;
-}
-
-/* Largest magnitude of n differences. Compared as whole numbers, whose order is that of floats without sign, and which are vectorised. */
-WIDE static uint32_t largest(const float *restrict one, const float *restrict other, size_t n) {
-    uint32_t most = 0;
-    for (size_t k = 0; k < n; k++) {
-        union {
-            float value;
-            uint32_t bits;
-        } residual = {one[k] - other[k]};
-        residual.bits &= 0x7fffffffu;
-        most = residual.bits > most ? residual.bits : most;
-    }
-    return most;
-}
-
-/* Largest difference of each of `frames` pairs of depths of n pixels. */
-EXPORT void largest_change(const float *one, const float *other, int frames, int64_t n, float *change) {
-    for (int b = 0; b < frames; b++) {
-        const uint32_t bits = largest(one + b * n, other + b * n, (size_t)n);
-        memcpy(change + b, &bits, sizeof bits);
-    }
+    free(memory);
+    return 0;
 }

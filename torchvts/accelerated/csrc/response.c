@@ -76,77 +76,21 @@ WIDE static void to_normal(float max_sine, int n, float *restrict x, float *rest
 }
 
 /*
- * Normals (frames, 3, rows, columns) of a window whose frames, channels and rows lie at the given distances. place: of each column, in [-1, 1];
- * weight (rows, degree + 1, 2, terms) with degree 2, 4 or 6; depth of the window, or null; per_mm (rows, 3, 3). Beyond the depth
- * reference_mm a slope changes brightness 1 + steeper (depth - reference_mm) times as much as the weights say.
+ * Normals (frames, 3, height, width) of images. place: of each column, in [-1, 1]; weight (height, degree + 1, 2, terms) with degree 2, 4 or 6;
+ * depth (frames, height, width), or null; per_mm (height, 3, 3). Beyond the depth reference_mm a slope changes brightness
+ * 1 + steeper (depth - reference_mm) times as much as the weights say.
  */
-EXPORT void response_normals(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *place,
-                             const float *weight, int degree, int terms, const float *depth, int64_t depth_frame, int64_t depth_row,
-                             const float *per_mm, float steeper, float reference_mm, float max_sine, int frames, int rows, int columns, float *normal) {
+EXPORT void response_normals(const float *image, const float *place, const float *weight, int degree, int terms, const float *depth,
+                             const float *per_mm, float steeper, float reference_mm, float max_sine, int frames, int height, int width, float *normal) {
     const int cubes = terms >= SINGLE + CUBES, products = terms - (cubes ? CUBES : 0) > SINGLE;
     const row_of row = ALL_ROWS[products + 2 * cubes][degree / 2 - 1];
-    const size_t pixels = (size_t)rows * columns;
+    const size_t pixels = (size_t)height * width;
     for (int b = 0; b < frames; b++)
-        for (int y = 0; y < rows; y++) {
-            float *to = normal + 3 * pixels * b + (size_t)y * columns;
-            row(image + per_frame * b + per_row * y, (size_t)per_channel, place, weight + (size_t)2 * terms * (degree + 1) * y,
-                depth ? depth + depth_frame * b + depth_row * y : NULL, per_mm ? per_mm + 9 * y : NULL, steeper, reference_mm, columns, to, to + pixels);
-            to_normal(max_sine, columns, to, to + pixels, to + 2 * pixels);
+        for (int y = 0; y < height; y++) {
+            const size_t line = (size_t)y * width, at = 3 * pixels * b + line;
+            float *to = normal + at;
+            row(image + at, pixels, place, weight + (size_t)2 * terms * (degree + 1) * y, depth ? depth + pixels * b + line : NULL,
+                depth ? per_mm + 9 * y : NULL, steeper, reference_mm, width, to, to + pixels);
+            to_normal(max_sine, width, to, to + pixels, to + 2 * pixels);
         }
-}
-
-WIDE static void mask_row(const uint8_t *restrict mask, const float *restrict values, int n, float *restrict masked) {
-    for (int x = 0; x < n; x++) masked[x] = values[x] * (float)mask[x];
-}
-
-/* Values (frames, channels, rows, columns) times a mask of ones and zeros, bytes whose frames and rows lie at the given distances. */
-EXPORT void mask_values(const float *values, const uint8_t *mask, int64_t per_frame, int64_t per_row, int frames, int channels, int rows,
-                        int columns, float *masked) {
-    for (int b = 0; b < frames; b++)
-        for (int c = 0; c < channels; c++)
-            for (int y = 0; y < rows; y++, values += columns, masked += columns)
-                mask_row(mask + per_frame * b + per_row * y, values, columns, masked);
-}
-
-/* Half the difference of the lines after and before, or at the border of the line itself and its neighbour; masked. */
-WIDE static void central(const float *restrict before, const float *restrict after, const uint8_t *restrict mask, float by, int n,
-                         float *restrict slope) {
-    for (int x = 0; x < n; x++) slope[x] = (after[x] - before[x]) * by * (float)mask[x];
-}
-
-/* Slopes of rows `first` to `last_row` of the window. */
-void rows_of_slopes(const Slopes *of, int first, int last_row) {
-    const int rows = of->rows, columns = of->columns, last = columns - 1;
-    const float half_per_mm = of->half_per_mm;
-    for (int y = first; y < last_row; y++) {
-        const float *z = of->depth + of->depth_row * y;
-        const uint8_t *in = of->mask + of->mask_row * y;
-        float *p = of->gradient + (size_t)y * columns, *q = p + (size_t)rows * columns;
-        if (last > 0) {
-            central(z, z + 2, in + 1, half_per_mm, last - 1, p + 1);
-            p[0] = 2.0f * (z[1] - z[0]) * half_per_mm * (float)in[0];
-            p[last] = 2.0f * (z[last] - z[last - 1]) * half_per_mm * (float)in[last];
-        } else {
-            p[0] = 0.0f;
-        }
-        const int above = y > 0, below = y < rows - 1;
-        central(z - (above ? of->depth_row : 0), z + (below ? of->depth_row : 0), in, above && below ? half_per_mm : 2.0f * half_per_mm, columns, q);
-    }
-}
-
-static void slopes_of_band(void *with, int band) {
-    const Slopes *of = with;
-    const int bands = bands_of(of->rows);
-    rows_of_slopes(of, of->rows * band / bands, of->rows * (band + 1) / bands);
-}
-
-/* The gradient (frames, 2, rows, columns) of depth, zero where the mask is; both of frames and rows at the given distances. half_per_mm: half
-   of pixels per mm. */
-EXPORT void depth_slopes(const float *depth, int64_t depth_frame, int64_t depth_row, const uint8_t *mask, int64_t mask_frame,
-                         int64_t mask_row, float half_per_mm, int frames, int rows, int columns, float *gradient) {
-    for (int b = 0; b < frames; b++) {
-        Slopes work = {depth + depth_frame * b, depth_row, mask + mask_frame * b, mask_row, half_per_mm, rows, columns,
-                       gradient + 2 * (size_t)rows * columns * b};
-        share(slopes_of_band, &work, bands_of(rows));
-    }
 }

@@ -9,7 +9,7 @@
 /* What does not change from pixel to pixel; the first three are of a frame. */
 typedef struct {
     float noise_std, weight, brightness, steps;
-    float pitch, per_height, axis_x, axis_y, cliff_slope, max_slope;
+    float pitch, per_height, cliff_slope, max_slope;
 } Model;
 
 /* Gauss-Newton from slope[2], which it replaces; rows are the light matrix, saturated: channels that are saturated or failed. */
@@ -64,70 +64,65 @@ static float slope_beside_cliff(float one, float other, float most) {
 }
 
 /* The slope of the depth at a pixel; one-sided halves at the border. */
-static void slope_of_depth(const float *z, int64_t row, int y, int x, int rows, int columns, const Model *model, float slope[2]) {
-    const float left = x > 0 ? z[-1] : *z, right = x < columns - 1 ? z[1] : *z;
-    const float above = y > 0 ? z[-row] : *z, below = y < rows - 1 ? z[row] : *z;
+static void slope_of_depth(const float *z, int y, int x, int height, int width, const Model *model, float slope[2]) {
+    const float left = x > 0 ? z[-1] : *z, right = x < width - 1 ? z[1] : *z;
+    const float above = y > 0 ? z[-width] : *z, below = y < height - 1 ? z[width] : *z;
     slope[0] = slope_beside_cliff((*z - left) / model->pitch, (right - *z) / model->pitch, model->cliff_slope);
     slope[1] = slope_beside_cliff((*z - above) / model->pitch, (below - *z) / model->pitch, model->cliff_slope);
 }
 
 /*
- * Replaces the normals (frames, 3, rows, columns) of a window where a light that shines on the flat skin is dark, a channel is
- * saturated, an LED has failed (black in 98 % of the window), or `ill_conditioned` is set. image, depth, three_noises and flat as normals()
- * takes them; weights: (frames, 3), the first three of Model, model_numbers the others; ill_conditioned: (height, width) bytes from the
- * window's first pixel on; expected: (frames, 2, rows, columns) or null. With depth, a pixel starts from the slope of the depth; without,
- * from the expected slope or its own normal, or from the flat skin where an LED has failed or the matrix is ill-conditioned.
+ * Replaces the normals (frames, 3, height, width) where a light that shines on the flat skin is dark, a channel is saturated, an LED has failed
+ * (black in 98 % of the image), or `ill_conditioned` is set, (height, width) bytes. image, depth, three_noises and flat as normals() takes them;
+ * weights: (frames, 3), the first three of Model, model_numbers the others; expected: (frames, 2, height, width) or null. With depth, a pixel
+ * starts from the slope of the depth; without, from the expected slope or its own normal, or from the flat skin where an LED has failed or the
+ * matrix is ill-conditioned.
  */
-EXPORT void solve_shadowed(const float *image, int64_t per_frame, int64_t per_channel, int64_t per_row, const float *three_noises,
-                    const float *flat, const float *saturated_above, const uint8_t *ill_conditioned, int64_t plane, int width, int frames, int rows,
-                    int columns, const float *depth, int64_t depth_frame, int64_t depth_row, const float *expected, const float *position,
-                    const float *albedo, const float *model_numbers, const float *weights, float *normal) {
-    const size_t pixels = (size_t)rows * columns;
-    for (int b = 0; b < frames; b++, normal += 3 * pixels, three_noises += 3, weights += 3) {
-        const Model model = {weights[0],       weights[1],       weights[2],       model_numbers[0], model_numbers[1],
-                             model_numbers[2], model_numbers[3], model_numbers[4], model_numbers[5], model_numbers[6]};
+EXPORT void solve_shadowed(const float *image, const float *three_noises, const float *flat, const float *saturated_above,
+                           const uint8_t *ill_conditioned, int frames, int height, int width, const float *depth, const float *expected,
+                           const float *position, const float *albedo, const float *model_numbers, const float *weights, float *normal) {
+    const size_t pixels = (size_t)height * width;
+    for (int b = 0; b < frames; b++, image += 3 * pixels, normal += 3 * pixels, three_noises += 3, weights += 3) {
+        const Model model = {weights[0],       weights[1],       weights[2],       model_numbers[0],
+                             model_numbers[1], model_numbers[2], model_numbers[3], model_numbers[4]};
         int failed[3], any_failed = 0;
         for (int j = 0; j < 3; j++) {
             size_t count = 0;
-            for (int y = 0; y < rows; y++) {
-                const float *line = image + per_frame * b + per_channel * j + per_row * y, *lit = flat + plane * j + (size_t)y * width;
-                for (int x = 0; x < columns; x++) count += is_dark(line[x], lit[x], three_noises[j]);
-            }
+            for (size_t k = 0; k < pixels; k++) count += is_dark(image[pixels * j + k], flat[pixels * j + k], three_noises[j]);
             failed[j] = (float)count / (float)pixels > 0.98f;
             any_failed |= failed[j];
         }
-        for (int y = 0; y < rows; y++)
-            for (int x = 0; x < columns; x++) {
-                const size_t at = (size_t)y * width + x, here = (size_t)y * columns + x;
+        for (int y = 0; y < height; y++)
+            for (int x = 0; x < width; x++) {
+                const size_t at = (size_t)y * width + x;
                 float intensity[3], slope[2], z = 0.0f;
                 int saturated[3], wanted = ill_conditioned[at] || any_failed;
                 for (int j = 0; j < 3; j++) {
-                    const float value = image[per_frame * b + per_channel * j + per_row * y + x];
-                    const int is_saturated = value >= saturated_above[plane * j + at];
-                    wanted |= is_saturated || is_dark(value, flat[plane * j + at], three_noises[j]);
+                    const float value = image[pixels * j + at];
+                    const int is_saturated = value >= saturated_above[pixels * j + at];
+                    wanted |= is_saturated || is_dark(value, flat[pixels * j + at], three_noises[j]);
                     saturated[j] = is_saturated || failed[j] || value <= 0.5f * LEFT_OUT;
                     intensity[j] = failed[j] ? 0.0f : value;
                 }
                 if (!wanted) continue;
                 if (depth) {
-                    const float *place = depth + depth_frame * b + depth_row * y + x;
+                    const float *place = depth + pixels * b + at;
                     z = *place;
-                    slope_of_depth(place, depth_row, y, x, rows, columns, &model, slope);
+                    slope_of_depth(place, y, x, height, width, &model, slope);
                 } else if (any_failed || ill_conditioned[at]) {
                     slope[0] = slope[1] = 0.0f;
                 } else if (expected) {
-                    slope[0] = expected[2 * pixels * b + here];
-                    slope[1] = expected[(2 * (size_t)b + 1) * pixels + here];
+                    slope[0] = expected[2 * pixels * b + at];
+                    slope[1] = expected[(2 * (size_t)b + 1) * pixels + at];
                 } else {
-                    const float u = normal[here], v = normal[pixels + here], w = normal[2 * pixels + here];
-                    const float steepest = sqrtf(u * u + v * v + 1e-24f) / model.max_slope, height = steepest > w ? steepest : w;
-                    slope[0] = -u / height;
-                    slope[1] = -v / height;
+                    const float u = normal[at], v = normal[pixels + at], w = normal[2 * pixels + at];
+                    const float steepest = sqrtf(u * u + v * v + 1e-24f) / model.max_slope, up = steepest > w ? steepest : w;
+                    slope[0] = -u / up;
+                    slope[1] = -v / up;
                 }
-                const float flat_x = ((float)x - 0.5f * (float)(columns - 1)) * model.pitch;
-                const float flat_y = ((float)y - 0.5f * (float)(rows - 1)) * model.pitch;
-                const float see_x = flat_x - (flat_x - model.axis_x) * z * model.per_height;
-                const float see_y = flat_y - (flat_y - model.axis_y) * z * model.per_height;
+                const float flat_x = ((float)x - 0.5f * (float)(width - 1)) * model.pitch;
+                const float flat_y = ((float)y - 0.5f * (float)(height - 1)) * model.pitch;
+                const float see_x = flat_x - flat_x * z * model.per_height, see_y = flat_y - flat_y * z * model.per_height;
                 float lights[3][3];
                 for (int j = 0; j < 3; j++) {
                     const float to[3] = {position[3 * j] - see_x, position[3 * j + 1] - see_y, position[3 * j + 2] - z};
@@ -136,7 +131,7 @@ EXPORT void solve_shadowed(const float *image, int64_t per_frame, int64_t per_ch
                 }
                 fit_slope(lights, intensity, saturated, &model, slope);
                 const float n_z = 1.0f / sqrtf(slope[0] * slope[0] + slope[1] * slope[1] + 1.0f);
-                normal[here] = -slope[0] * n_z, normal[pixels + here] = -slope[1] * n_z, normal[2 * pixels + here] = n_z;
+                normal[at] = -slope[0] * n_z, normal[pixels + at] = -slope[1] * n_z, normal[2 * pixels + at] = n_z;
             }
     }
 }

@@ -5,6 +5,16 @@
 
 enum { LANES = 8, TERMS = 6 };
 
+/* How a smooth change of the light is found in images of a size. place: (6, samples), the surface's terms at rows * columns samples, then zeros up to
+   a multiple of 16; along_x (2, width), along_y (2, height): Legendre polynomials of degree 1 and 2; per_square: of each step. */
+typedef struct {
+    int32_t height, width, stride, rows, columns, samples, steps;
+    double most;
+    const double *place;
+    const float *along_x, *along_y;
+    const double *per_square, *peaks;
+} SmoothLight;
+
 /* LANES values that one instruction works on, which may lie anywhere in memory; and their bits. Of this type, all sums below stay in registers. */
 typedef double Lanes __attribute__((vector_size(sizeof(double) * LANES), aligned(sizeof(double)), may_alias));
 typedef int64_t Bits __attribute__((vector_size(sizeof(double) * LANES), aligned(sizeof(double)), may_alias));
@@ -75,43 +85,22 @@ EXPORT int smooth_change(const SmoothLight *of, const float *image, int frames, 
     return 0;
 }
 
-LightOfRow light_of_row(const SmoothLight *of, const float *found, int y) {
-    const float once = of->along_y[y], twice = of->along_y[of->height + y];
-    const LightOfRow row = {found[0] + found[2] * once + found[5] * twice, found[1] + found[4] * once, found[3]};
-    return row;
-}
-
-WIDE static void over_line(const float *values, const float *restrict once, const float *restrict twice, int n, LightOfRow of, float *result) {
-    INDEPENDENT for (int x = 0; x < n; x++) result[x] = without_light(of, values[x], once[x], twice[x]);
-}
-
-/* n values of row y of a channel, from column `first` on, without the surface of that channel's coefficients. */
-void row_over_smooth(const SmoothLight *of, const float *found, int y, int first, int n, const float *values, float *result) {
-    const float *along = of->along_x + first;
-    over_line(values, along, along + of->width, n, light_of_row(of, found, y), result);
-}
-
-/* What over_smooth() is given. */
-typedef struct {
-    const SmoothLight *of;
-    const float *image, *found;
-    float *result;
-} Surface;
-
-/* Parts of a plane of which threads take one at a time. */
-enum { PIECES = 2 };
-
-static void over_lines(void *with, int part) {
-    const Surface *work = with;
-    const int height = work->of->height, width = work->of->width, plane = part / PIECES, piece = part % PIECES;
-    for (int y = height * piece / PIECES; y < height * (piece + 1) / PIECES; y++) {
-        const size_t line = ((size_t)plane * height + y) * width;
-        row_over_smooth(work->of, work->found + (size_t)TERMS * plane, y, 0, width, work->image + line, work->result + line);
+/* A row without the surface, whose terms of degree 0 to 2 in x these are; once, twice: Legendre polynomials in x. */
+WIDE static void over_row(const float *restrict values, const float *restrict once, const float *restrict twice, float constant, float slope,
+                          float bend, int n, float *restrict result) {
+    for (int x = 0; x < n; x++) {
+        const float surface = constant + slope * once[x] + bend * twice[x];
+        result[x] = values[x] * (1.0f - surface + surface * surface);
     }
 }
 
 /* Images (frames, 3, height, width) without the surface of their coefficients. */
 EXPORT void over_smooth(const SmoothLight *of, const float *image, const float *found, int frames, float *result) {
-    Surface work = {of, image, found, result};
-    share(over_lines, &work, 3 * frames * PIECES);
+    const int height = of->height, width = of->width;
+    for (int plane = 0; plane < 3 * frames; plane++, found += TERMS)
+        for (int y = 0; y < height; y++, image += width, result += width) {
+            const float once = of->along_y[y], twice = of->along_y[height + y];
+            over_row(image, of->along_x, of->along_x + width, found[0] + found[2] * once + found[5] * twice, found[1] + found[4] * once, found[3],
+                     width, result);
+        }
 }

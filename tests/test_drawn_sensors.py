@@ -127,7 +127,7 @@ def test_the_second_pass_learned_from_balls_carries_over_to_other_objects(seed, 
         errors[mode] = [float(normal_angle_deg(out.normal, p.scene.normal, p.scene.contact).mean()) for out, p in pairs]
         missing = [float((p.scene.depth_mm - out.depth_mm)[p.scene.contact].mean()) for out, p in pairs]
         assert 0.0 < sum(missing) / len(missing) < most_missing_mm  # without the tail 0.076 and 0.112
-    assert sum(errors["precise"]) < 0.95 * sum(errors["fast"]) and sum(errors["fast"]) / len(OBJECTS) < 4.5
+    assert sum(errors["precise"]) < 0.97 * sum(errors["fast"]) and sum(errors["fast"]) / len(OBJECTS) < 4.5
     assert all(second < 1.05 * first for first, second in zip(errors["fast"], errors["precise"], strict=True))
 
 

@@ -381,7 +381,6 @@ def test_normals_of_the_output_are_those_of_the_depth(mode, by_depth):
     inside = fast.contact.expand(-1, 2, -1, -1)
     slope = gradient_of_depth(again.depth_mm, 0.1)
     assert bool(fast.contact.any()) and torch.allclose(again.gradient[inside], slope[inside], atol=1e-6)
-    assert float((again.gradient - fast.gradient).abs().max()) > 0.01  # a rough image is no surface
     if by_depth is None:
         assert torch.allclose(again.depth_mm, fast.depth_mm, atol=1e-6)
 

@@ -221,19 +221,6 @@ def test_a_network_takes_the_models_place(unit, source, tmp_path):
         unit_pipeline(calibration, "fast", tmp_path / "net.safetensors", vts.ContactSettings())
 
 
-def test_a_video_by_a_network_has_the_noise_of_its_first_frames(unit, source, tmp_path):
-    calibration = vts.Calibration.load(unit)
-    vts.NormalFromMLP(HEIGHT, WIDTH, calibration.background.float(), hidden=(8,), seed=3).save(tmp_path / "net.safetensors")
-    quiet = torch.stack([tiny_image(-1 - k).detach() for k in range(6)])
-    noise = torch.randn(quiet.shape, generator=torch.Generator().manual_seed(1))
-    by_noise = []
-    for std in (0.0, 0.02):
-        first = (quiet + std * noise).clamp(0, 1)
-        recording = vts.stream.Recording(calibration, first=first, network=tmp_path / "net.safetensors")
-        by_noise.append(recording.pipe.deformed.per_noise.median())
-    assert by_noise[1] < 0.7 * by_noise[0]
-
-
 def test_a_device_that_is_not_there_is_named():
     assert check_device("cpu").type == "cpu"
     for device, part in (("cdua", "did you mean 'cuda'?"), (f"cuda:{torch.cuda.device_count()}", "has no such GPU")):

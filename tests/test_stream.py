@@ -245,13 +245,6 @@ def test_the_light_knows_each_frame_whether_or_not_it_is_asked(unit):
     assert plane[:, 0].tolist() == pytest.approx([dimming(20)] * 3, abs=0.005)
 
 
-def test_dimming_that_is_not_followed_would_pass_for_contact(unit):
-    calibration, camera = unit
-    pictures = (camera(0.0, 0.6 if k >= 12 else 1.0) for k in range(14))  # more than mode auto levels by itself
-    with streams.TactileStream(Frames(pictures), calibration, follow=False) as stream:
-        assert [bool(f.output.contact.any()) for f in stream][-2:] == [True, True]
-
-
 @pytest.mark.long
 def test_a_held_contact_does_not_fade(unit):
     calibration, camera = unit

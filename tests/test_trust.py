@@ -259,13 +259,7 @@ def test_thin_sensors(size: tuple[int, int]) -> None:
         by_operators = pipe(image)
     assert float((out.depth_mm - by_operators.depth_mm).abs().max()) < 1e-5
     assert torch.equal(out.deformed, by_operators.deformed)
-    assert bool(out.contact[0, 0, size[0] // 2, size[1] // 2])
     assert not bool(out.deformed[..., 0, 0])
-
-
-def test_a_mask_of_two_columns_is_refused() -> None:
-    with pytest.raises(ValueError, match="flat: expected at least 3 columns"):
-        vts.ContactMask(torch.full((3, 20, 2), 0.5), torch.full((3,), 0.01))
 
 
 class LargestTensor(TorchDispatchMode):
@@ -341,8 +335,8 @@ def test_gradients_stop_outside_the_deformed_area() -> None:
     assert model.normal.grad is not None
     reached = (model.normal.grad != 0.0).any(dim=1, keepdim=True)
     assert bool(reached.any())
-    assert not bool((reached & ~out.deformed).any())
-    assert "reaches them from outside ``deformed``" in (vts.DepthPipeline.from_calibration.__doc__ or "")
+    weight = vts.DepthPipeline.from_calibration(rig(), normals=model).frame_of(press())[0].weight
+    assert not bool((reached & (weight == 0.0)).any())
 
 
 def tensors_beside_buffers(module: torch.nn.Module) -> list[Tensor]:
@@ -363,7 +357,7 @@ def test_fast_asks_a_device_for_nothing_but_the_parts_of_a_mask(kind: str, monke
     images = torch.zeros(2, 3, HEIGHT, WIDTH, device="meta")
     with pytest.raises(RuntimeError, match=r"item\(\)|aten::equal"):
         pipe(images)  # connected parts: a loop until nothing is gained
-    monkeypatch.setattr(type(pipe.deformed), "reconstruct", lambda self, seed, mask: seed & mask)
+    monkeypatch.setattr("torchvts.skin.weight.reconstruct", lambda seed, mask: seed & mask)
     out = pipe(images)
     assert all(tensor.device.type == "meta" for tensor in (*out, *tensors_beside_buffers(pipe)))
     assert len(tensors_beside_buffers(pipe)) > 0  # the tables of the Poisson solver
@@ -375,7 +369,7 @@ def test_the_way_that_asks_for_nothing_gives_the_same_depth(kind: str, mode: str
     pipe, images = vts.DepthPipeline.from_calibration(unit_of(kind), mode).double(), dissimilar().double()
     images = images if mode == "fast" else images[1:4:2]
     expected = pipe(images)
-    for place in ("compensate.drift", "contact.masks", "normals.shadowed", "pipeline.depth"):
+    for place in ("compensate.drift", "normals.shadowed", "pipeline.depth"):
         monkeypatch.setattr(f"torchvts.{place}.may_read", lambda tensor: False)
     with reference_only():
         found = pipe(images)

@@ -64,7 +64,7 @@ class Calibration:
         markers: the block that fills printed markers before anything else, or None.
         ambient: (3,), constant linear light that the lights do not give, subtracted before the gain; None for none.
         contact_share: pressure from which an object touches, as a share of the frame's; None where no press of a ball
-            has told.
+            shows it.
     Raises:
         TypeError: a field of another type.
         ValueError: lights, background, noise or ambient light of another shape, or not finite; a background without light; lights

@@ -22,7 +22,7 @@ DECAY_MM = 0.45
 shapes (0.90 for 0.89), smaller on balls on real sensors (0.89 for 0.86)."""
 
 SHARE = 0.3
-"""Share of the frame's pressure where no press of a ball has told: a unit's own is 0.15 to 0.6."""
+"""Share of the frame's pressure where no press of a ball shows it: a unit's own is 0.15 to 0.6."""
 
 LARGE = 0.9
 """The frame's pressure is this quantile of the deep skin's: rims of flat faces bear more than the faces."""

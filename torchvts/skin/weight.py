@@ -24,6 +24,9 @@ RISE = (1.2, 3.0)
 LEAST_SPREAD = 0.002
 """Least spread of slopes and of relative changes of light: half a count of 8 bits."""
 
+MOST_SPREAD = 0.035
+"""Largest spread that is believed: an object that covers all of the skin changes every cell."""
+
 GREY_SHARE = 0.2
 """Colour that a grey change may have, as a share of it: shade and dirt are not exactly grey."""
 
@@ -84,7 +87,7 @@ class ContactMask(nn.Module):
         super().__init__()
         self.sigmas, self.by_colour = check_positive("sigmas", sigmas), check_switch("by_colour", by_colour)
         self.cells, self.rise, self.grey_share, self.failed = CELLS, RISE, GREY_SHARE, FAILED
-        self.weights = gaussian_weights(BLUR_CELLS)
+        self.weights, self.least_spread = gaussian_weights(BLUR_CELLS), LEAST_SPREAD
         flat = torch.ones(3, 1, 1) if flat is None else flat
         check_field("flat", flat)
         self.register_buffer("flat", flat.detach().clone())
@@ -130,12 +133,12 @@ class ContactMask(nn.Module):
         lit = change.detach().mean(dim=(2, 3), keepdim=True) > self.failed - 1.0
         change = change * lit.to(change.dtype)
         grey = change.mean(dim=1, keepdim=True)
-        evidence = length_in_spreads(change - grey, self.grey_share * grey)
+        evidence = length_in_spreads(change - grey, self.grey_share * grey, self.least_spread)
         if gradient is not None:
             check_batch("gradient", gradient, 2)
             check_same_count("gradient", gradient, "compensated", compensated.shape[0])
             check_same_size("gradient", gradient, "compensated", height, width)
-            by_slopes = length_in_spreads(whole_cell_means(gradient, cell), torch.zeros_like(grey))
+            by_slopes = length_in_spreads(whole_cell_means(gradient, cell), torch.zeros_like(grey), self.least_spread)
             evidence = torch.minimum(evidence, by_slopes) if self.by_colour else by_slopes
         per_noise = whole_cell_means(self.per_noise[None], cell) if self.per_noise.shape[1] > 1 else self.per_noise[None]
         evidence = evidence * per_noise
@@ -158,14 +161,14 @@ def colour_of_slopes(lights: PointLights) -> float:
     return float(colour.amin() / change.norm(dim=1).amax())
 
 
-def length_in_spreads(means: Tensor, beside: Tensor, least: float = LEAST_SPREAD) -> Tensor:
+def length_in_spreads(means: Tensor, beside: Tensor, least: float = LEAST_SPREAD, most: float = MOST_SPREAD) -> Tensor:
     """Length (B, 1, h, w) of vectors (B, C, h, w), each component in units of its spread in the frame's least changed cells.
 
     Root mean square over the two dimensions that slopes have, and changes of colour (three components of zero sum). ``beside``:
     (B, 1, h, w), a spread of its own that each cell has beside that of the frame.
     """
     values = means.abs().flatten(2) + 1e-6  # so that the root has a slope at zero
-    spread = clipped_std(values, std_of_quarter(least_quarter(values))).clamp_min(least)[..., None]
+    spread = clipped_std(values, std_of_quarter(least_quarter(values))).clamp(least, most)[..., None]
     squared = (means.square() / (spread.square() + beside.square())).sum(dim=1, keepdim=True)
     return torch.sqrt(0.5 * squared + 1e-12)
 

@@ -44,9 +44,9 @@ class ZeroBackground(nn.Module):
     """Depth of integrated slopes, counted from the undeformed skin.
 
     A stretched skin on a soft gel bears the pressure p = z - L^2 laplace z. Free skin bears none; so an offset, a sum of a few
-    cosines, is found that makes p vanish where the weight is 0, by weighted least squares. The law takes the skirt of a contact on
+    cosines, is found that makes p vanish where the weight is 0, by weighted least squares. The law takes free skin on
     beyond what can be seen, as it decays. Unchanged skin that stays deep lies on a face of the object and lets go, round by round.
-    The offset is smooth, most of all where skin is deep, so that errors of slopes go into the skirt. Without any free skin, the
+    The offset is smooth, most of all where skin is deep, so that errors of slopes go into the free skin. Without any free skin, the
     lowest depth is zero. Differentiable.
 
     Args:
@@ -95,8 +95,8 @@ class ZeroBackground(nn.Module):
         """The offset as coefficients of cosines along y and x, (B, K, M), and the range of depth, (B, 1, 1), of cells (B, h, w)."""
         height, width = depth.shape[1], depth.shape[2]
         shorter = min(height, width)
-        k = min(height, (2 * self.waves * height + shorter) // (2 * shorter))
-        m = min(width, (2 * self.waves * width + shorter) // (2 * shorter))
+        k = min(height, 3 * self.waves, (2 * self.waves * height + shorter) // (2 * shorter))
+        m = min(width, 3 * self.waves, (2 * self.waves * width + shorter) // (2 * shorter))
         rows, columns = cosines(height, k, height, depth), cosines(width, m, width, depth)
         along_y, along_x = slopes_of_cosines(height, k, pitch_mm, depth), slopes_of_cosines(width, m, pitch_mm, depth)
         square = wave_numbers(k, height * pitch_mm, depth).square()[:, None] + wave_numbers(m, width * pitch_mm, depth).square()

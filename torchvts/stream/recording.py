@@ -12,7 +12,7 @@ from ..core.checks import check_positive, check_switch
 from ..core.spelling import suggest
 from ..model import Calibration, check_calibration
 from ..pipeline import DepthOutput, DepthPipeline, unit_pipeline
-from ..skin import ContactSettings
+from ..skin import ContactMask, ContactSettings
 from .background import find_background
 from .follow_light import FollowLight
 from .usable import FrameCheck
@@ -83,7 +83,10 @@ class Recording:
         self.check = FrameCheck.from_calibration(calibration)
         self._fps, self._follow, self._stage = fps, follow, stage
         self._before: float | None = None
-        image = None if first is None else find_background(first)[0]
+        image, noise = (None, None) if first is None else find_background(first)
+        if noise is not None and isinstance(self.pipe.mask, ContactMask):  # a video's compression is alike over whole cells
+            relative = calibration.sensor.exponent * noise.float() / value.maximum(noise.float()).clamp_min(1e-3)
+            self.pipe.mask.least_spread = max(self.pipe.mask.least_spread, float(relative.median()))
         self.pipe.to(self.device)
         if image is not None:
             self._start(calibration, image[None])

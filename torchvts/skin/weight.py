@@ -24,9 +24,6 @@ RISE = (1.2, 3.0)
 LEAST_SPREAD = 0.002
 """Least spread of slopes and of relative changes of light: half a count of 8 bits."""
 
-MOST_SPREAD = 0.035
-"""Largest spread that is believed: an object that covers all of the skin changes every cell."""
-
 GREY_SHARE = 0.2
 """Colour that a grey change may have, as a share of it: shade and dirt are not exactly grey."""
 
@@ -161,14 +158,14 @@ def colour_of_slopes(lights: PointLights) -> float:
     return float(colour.amin() / change.norm(dim=1).amax())
 
 
-def length_in_spreads(means: Tensor, beside: Tensor, least: float = LEAST_SPREAD, most: float = MOST_SPREAD) -> Tensor:
+def length_in_spreads(means: Tensor, beside: Tensor, least: float = LEAST_SPREAD) -> Tensor:
     """Length (B, 1, h, w) of vectors (B, C, h, w), each component in units of its spread in the frame's least changed cells.
 
     Root mean square over the two dimensions that slopes have, and changes of colour (three components of zero sum). ``beside``:
     (B, 1, h, w), a spread of its own that each cell has beside that of the frame.
     """
     values = means.abs().flatten(2) + 1e-6  # so that the root has a slope at zero
-    spread = clipped_std(values, std_of_quarter(least_quarter(values))).clamp(least, most)[..., None]
+    spread = clipped_std(values, std_of_quarter(least_quarter(values))).clamp_min(least)[..., None]
     squared = (means.square() / (spread.square() + beside.square())).sum(dim=1, keepdim=True)
     return torch.sqrt(0.5 * squared + 1e-12)
 

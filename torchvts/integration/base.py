@@ -10,7 +10,7 @@ from ..core.checks import check_record
 class Integrator(nn.Module):
     """Base of modules that map a gradient to depth. A subclass overrides ``forward``.
 
-    It decides where depth is zero: the pipeline changes only the depth of :class:`~torchvts.integration.PoissonBackground`.
+    Its depth may have any smooth offset: a pipeline counts it from the undeformed skin, by :class:`~torchvts.skin.ZeroBackground`.
     """
 
     if TYPE_CHECKING:

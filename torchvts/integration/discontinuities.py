@@ -327,7 +327,7 @@ def discontinuity_share(gradient: Tensor, depth_mm: Tensor, mm_per_pixel: float 
 class AdaptiveIntegration(Integrator):
     """PoissonBackground, and :class:`DiscontinuityIntegration` for frames whose :func:`discontinuity_share` is above ``share``.
 
-    Takes PoissonBackground's place in a pipeline. Frames of a batch do not influence one another.
+    Takes PoissonDCT's place in a pipeline. Frames of a batch do not influence one another.
 
     Example:
         >>> AdaptiveIntegration(0.05)(torch.zeros(1, 2, 8, 8)).shape

@@ -43,7 +43,7 @@ def integrate_perspective(gradient: Tensor, mm_per_pixel: float, camera_height_m
 
 
 class PerspectiveIntegration(Integrator):
-    """Module for :func:`integrate_perspective`; takes PoissonBackground's place in a pipeline.
+    """Module for :func:`integrate_perspective`; takes PoissonDCT's place in a pipeline.
 
     Its normals should know of the camera as well: ``NormalFromIntensity.from_calibration(calibration, camera_height_mm)``.
 

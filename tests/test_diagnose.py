@@ -27,7 +27,7 @@ NAMED = {
     "steep walls": {"steep_walls"},
     "cut ends": {"steep_walls"},
     "cut by the border": {"contact_at_border"},
-    "covers the image": {"contact_covers_image", "no_contact"},
+    "covers the image": {"contact_covers_image", "no_free_skin"},
     "two contacts": {"several_contacts"},
     "faint contact": {"faint_contact", "no_contact"},
     "gel sag": {"transition_zone"},
@@ -339,3 +339,13 @@ def main():
 
 if __name__ == "__main__":
     main()
+
+
+def test_a_contact_over_the_whole_skin_is_not_taken_for_other_light():
+    smooth = CORRUPTIONS["covers the image"].make(2.2, 3)
+    assert "no_free_skin" in vts.diagnose(smooth.background, smooth.image, smooth.calibration).names
+    size = {"height": 120, "width": 160, "mm_per_pixel": 0.125}
+    waves = scenes.surface(lambda x, y: 1.0 + 0.15 * torch.sin(2.1 * x) * torch.sin(1.7 * y), **size)
+    image = scenes.render(waves, smooth.calibration.lights, noise_std=0.002, bits=8, seed=1)
+    found = vts.diagnose(smooth.background, image, smooth.calibration)
+    assert found.names[0] == "no_free_skin" and "channel_level" not in found.names, str(found)

@@ -320,8 +320,9 @@ CHECKS = (
     # the scene
     Check("saturated", _saturated, "the image is saturated in {where}: reduce the exposure",
           lambda figures: "fault" if figures["inside"] > 0.3 else "warning"),
+    Check("no_free_skin", lambda e: 1.0 if e.contacts.count == 0 and e.is_wide_contact else None, _NO_FREE_SKIN),
     Check("no_contact", lambda e: 0.0 if e.contacts.count == 0 else None, "no contact: nothing is above the noise", "note",
-          last=True),
+          last=True, unless=frozenset({"no_free_skin"})),
     Check("contact_covers_image", lambda e: e.contacts.share, "contact covers {value:.0%} of the image: little free skin is left "
           "to compare with, and depth beyond the border is not seen", "note", above=0.4, unless=LOOKS_LIKE_CONTACT),
     Check("no_free_skin", lambda e: 1.0 - e.contacts.share if e.contacts.share > 0.97 else None, _NO_FREE_SKIN,

@@ -31,7 +31,6 @@ ROBUSTLY = [
 ]
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("name, methods", [*QUICK, *ROBUSTLY])
 def test_no_breaking_point_has_moved(name, methods):
     """Measured again with the same seeds at the two severities around it; the rows of fast give the mask's too."""

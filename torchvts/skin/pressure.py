@@ -37,9 +37,12 @@ FALL = 0.6
 """Pressure at a rim, as a share of that just inside: it falls to zero there, and blur makes a slope of that step. Without
 it, IoU of drawn shapes is 0.88 in place of 0.91."""
 
-PULLED = 0.16
-"""Negative pressure, as a share of the frame's, that no skin bears: at a hundredth of the deep skin it is 0.02 to 0.14 on real and
-drawn sensors, and 0.18 and more where an object is rendered without the skin that hangs around it."""
+PULLED = 0.11
+"""Negative pressure, as a share of the frame's, that no skin bears: a fiftieth of the skin pulls by 0.06 at most on real and drawn
+sensors, and by 0.16 and more where an object is rendered without the skin that hangs around it."""
+
+PULLING = 0.02
+"""That share of the skin."""
 
 LEAST_DEPTH = 0.02
 """Depth of contact without such skin, as a share of the deepest."""
@@ -76,7 +79,7 @@ class ContactFromDepth(nn.Module):
         self.share = SHARE if share is None else check_positive("share", share, 1.0)
         self.cell = max(1, round(CELL_MM / mm_per_pixel))
         self.large, self.deep, self.rim_mm, self.fall = LARGE, DEEP, RIM_MM, FALL
-        self.pulled, self.least_depth = PULLED, LEAST_DEPTH
+        self.pulled, self.pulling, self.least_depth = PULLED, PULLING, LEAST_DEPTH
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, settings: ContactSettings | None = None) -> "ContactFromDepth":
@@ -109,7 +112,7 @@ class ContactFromDepth(nn.Module):
 
     def above(self, depth: Tensor, pressure: Tensor, pitch_mm: float) -> Tensor:
         """Pressure less what contact needs, (B, 1, h, w): a share of the frame's, and of that just inside of the rim."""
-        large, pulled = frame_pressure(depth, pressure, self.large, self.deep), -frame_pressure(depth, pressure, 0.01, 0.0)
+        large, pulled = frame_pressure(depth, pressure, self.large, self.deep), -frame_pressure(depth, pressure, self.pulling, 0.0)
         touching = (pressure > self.share * large).to(pressure.dtype)
         reach = max(1, int(self.rim_mm / pitch_mm + 0.5))
         inside = box_mean(touching * pressure, reach) / box_mean(touching, reach).clamp_min(1e-9)
@@ -131,7 +134,7 @@ def frame_pressure(depth_mm: Tensor, pressure: Tensor, share: float, depth: floa
     """A quantile of the pressure of each frame (B, 1, h, w), (B, 1, 1, 1), over skin deeper than a share of the deepest."""
     step = max(1, min(depth_mm.shape[2], depth_mm.shape[3]) // samples)
     deepest = depth_mm.amax(dim=(2, 3), keepdim=True)
-    deep = depth_mm.abs() > (depth * deepest).clamp_min(0.005 * deepest)
+    deep = depth_mm > max(depth, 0.005) * deepest
     some = deep[:, :, step // 2 :: step, step // 2 :: step].flatten(1)
     values = pressure[:, :, step // 2 :: step, step // 2 :: step].flatten(1)
     ordered = torch.where(some, values, torch.inf).sort(dim=1).values

@@ -1,7 +1,6 @@
 """Large data sets: every frame once and the same, whatever the batch, the workers, the processes, and wherever a run was killed."""
 
 import contextlib
-import io
 import json
 import os
 import signal
@@ -10,7 +9,6 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from conftest import bgr, tiny_image, write_film
@@ -55,21 +53,6 @@ def whole(unit, frames, tmp_path_factory):
 def contents(out):
     """Every result with its bytes; nothing half written is beside them."""
     return {str(p.relative_to(out)): p.read_bytes() for p in sorted(out.rglob("*")) if p.is_file() and STATE not in p.parts}
-
-
-def check_shares(found, whole):
-    """Images are the same bytes in any process. A process that only follows the light of a film's frame takes what has moved from
-    its weight, without its depth, so that depths of films are alike within 0.01 mm."""
-    assert found.keys() == whole.keys()
-    for name, expected in whole.items():
-        if name.startswith("film"):
-            one, two = (np.load(io.BytesIO(data))["depth_mm"] for data in (found[name], expected))
-            assert np.abs(one - two).max() < 0.01
-        elif name == "frames.csv":
-            one, two = ([line for line in data.splitlines() if b"film" not in line] for data in (found[name], expected))
-            assert one == two and len(one) == 101
-        else:
-            assert found[name] == expected
 
 
 def finished(out):
@@ -145,7 +128,7 @@ def test_killed_processes_lose_nothing_and_the_next_run_goes_on(unit, frames, wh
         printed = second.communicate()[0]
         assert second.returncode == 0, printed
         assert "wrote 120 frames" in printed and "by an earlier run" in printed
-    check_shares(contents(out), whole)
+    assert contents(out) == whole
 
 
 def test_every_frame_is_in_one_share(unit, frames, whole, tmp_path):
@@ -160,7 +143,7 @@ def test_every_frame_is_in_one_share(unit, frames, whole, tmp_path):
         report = worker.run(4, 0)
         done += worker.done
     assert (done, report.rows) == (120, 120)
-    check_shares(contents(tmp_path), whole)
+    assert contents(tmp_path) == whole
 
 
 def test_a_torn_record_a_lost_file_and_a_changed_image_are_computed_again(unit, tmp_path):

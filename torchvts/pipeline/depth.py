@@ -273,7 +273,11 @@ class DepthPipeline(nn.Module):
     def depth_of(self, images: Tensor) -> DepthOutput:
         """The output of checked images (B, 3, H, W), solved together."""
         frame, slopes = self.frame_of(images)
-        if may_read_values() and (images.shape[0] == 0 or (self.skips_undeformed and self.nothing_to_solve(frame))):
+        return self.solved(frame, slopes)
+
+    def solved(self, frame: Frame, slopes: Tensor) -> DepthOutput:
+        """The output of what :meth:`frame_of` gave."""
+        if may_read_values() and (slopes.shape[0] == 0 or (self.skips_undeformed and self.nothing_to_solve(frame))):
             return undeformed_output(frame)
         solution = self.solve.integrated(frame, slopes * frame.weight)  # eq. 4
         frame, solution = self.refine(frame, solution)  # eq. 10

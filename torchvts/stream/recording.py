@@ -110,15 +110,16 @@ class Recording:
             with self._stage("light"):
                 image = self._light.correct(frame)
             output: DepthOutput | None = None
-            if solve:
-                with self._stage("depth"):
-                    output = DepthOutput(*(part.cpu() for part in self.pipe(image.to(self.device))))
+            with self._stage("depth"):
+                seen, slopes = self.pipe.frame_of(image.to(self.device))
+                if solve:
+                    output = DepthOutput(*(part.cpu() for part in self.pipe.solved(seen, slopes)))
             if self._follow:
                 with self._stage("light"):
-                    deformed = self._deformed(image) if output is None else output.deformed
+                    moved = (seen.weight > 0.5).cpu()
                     seconds = 1.0 / self._fps if self._before is None else time_s - self._before
                     # copies: the caller may write into what is returned
-                    self._unlearned = (frame.clone() if image is frame else frame, deformed.clone(), seconds)
+                    self._unlearned = (frame.clone() if image is frame else frame, moved, seconds)
         self._before = time_s
         return image, output
 
@@ -134,10 +135,6 @@ class Recording:
             with torch.inference_mode(), self._stage("light"):
                 self._light.update(*self._unlearned)
             self._unlearned = None
-
-    def _deformed(self, image: Tensor) -> Tensor:
-        """Where the skin has moved, of a frame whose depth is not wanted."""
-        return self.pipe.moved(image.to(self.device)).cpu()
 
     def _start(self, calibration: Calibration, image: Tensor) -> None:
         """Start from the light of the first frames, and refuse another unit and a contact in them."""

@@ -6,9 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchvts import Calibration, ContactFromDepth, ContactMask, DepthPipeline, near_field_shading
-from torchvts.scenes import sphere_press
+from torchvts import Calibration, ContactFromDepth, ContactMask, DepthPipeline, PointLights, Sensor, near_field_shading
+from torchvts.scenes import render, sphere_press
 from torchvts.skin import ZeroBackground, moved
+from torchvts.skin.weight import spread_of
 
 FLAT = torch.full((3, 96, 128), 0.5)
 GREEN, RED = torch.tensor([0.0, 1.0, 0.0])[:, None, None], torch.tensor([1.0, 0.0, 0.0])[:, None, None]
@@ -42,6 +43,25 @@ def test_a_coloured_change_without_slopes_has_not_moved():
 @pytest.mark.parametrize("std", [0.0, 0.002, 0.02])
 def test_noise_has_no_weight(std):
     assert ContactMask(FLAT)(noisy(FLAT, std)[None]).max() == 0.0
+
+
+@pytest.mark.parametrize("share", [0.1, 0.2, 0.5, 1.0])
+def test_the_spread_is_that_of_undeformed_skin_whatever_its_share(share):
+    generator = torch.Generator().manual_seed(0)
+    values = torch.rand(1, 1, 4000, generator=generator, dtype=torch.float64)  # slopes of an object
+    free = int(share * 4000)
+    values[..., :free] = 0.01 * torch.randn(free, generator=generator, dtype=torch.float64).abs()
+    assert float(spread_of(values, 0.002)) == pytest.approx(0.01, rel=0.5)  # a few of the object lie near zero
+
+
+@pytest.mark.parametrize("press_mm", [1.6, 2.0, 2.5])
+def test_a_contact_on_nine_tenths_of_the_skin_has_its_depth(press_mm):
+    lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
+    scene = sphere_press(20.0, press_mm, height=240, width=320, mm_per_pixel=0.06)
+    image = render(scene, lights, noise_std=0.003, bits=8)
+    calibration = Calibration.from_lights(lights, Sensor("rig", 240, 320, 0.06))
+    out = DepthPipeline.from_calibration(calibration, "precise")(image)
+    assert float(out.depth_mm.detach().max()) == pytest.approx(press_mm, rel=0.02)
 
 
 def test_noise_of_a_dark_corner_has_no_weight():

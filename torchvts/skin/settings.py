@@ -12,7 +12,7 @@ class ContactSettings:
     Args:
         sigmas: evidence that a contact has somewhere, in units of its spread in undeformed skin. Lower finds fainter presses and
             more dirt.
-        share: pressure from which the object touches, as a share of the largest nearby; None for the unit's own. Higher draws the
+        share: pressure from which the object touches, as a share of the frame's; None for the unit's own. Higher draws the
             rim of the contact inward.
     Raises:
         TypeError: not a number.

@@ -47,7 +47,7 @@ class ZeroBackground(nn.Module):
     cosines, is found that makes p vanish where the weight is 0, by weighted least squares. The law takes free skin on
     beyond what can be seen, as it decays. Unchanged skin that stays deep lies on a face of the object and lets go, round by round.
     The offset is smooth, most of all where skin is deep, so that errors of slopes go into the free skin. Without any free skin, the
-    lowest depth is zero. Differentiable.
+    lowest cell is at zero. Differentiable.
 
     Args:
         mm_per_pixel: pixel pitch, mm.

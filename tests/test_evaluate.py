@@ -325,6 +325,29 @@ def test_real_sets_are_read(data, monkeypatch, name):
     assert all(target.image.shape == read.background.shape for fold in read.folds for target in fold.scored)
 
 
+def test_a_folder_of_balls_is_read_by_its_meta_and_labels(tmp_path, monkeypatch):
+    monkeypatch.setattr(presses_room, "calibrate", FailingUnit)
+    labels = ["name,x,y,r"]
+    for k in (10, 9, 1, 100):  # the order of numbers is not that of texts
+        vts.write_image(tmp_path / f"ball_{k}.png", torch.full((3, 24, 32), k / 200))
+        labels.append(f"ball_{k},{k % 7 + 10},12.5,8")
+    vts.write_image(tmp_path / "background.png", torch.full((3, 24, 32), 0.5))
+    (tmp_path / "labels.csv").write_text("\n".join(labels))
+    meta = {"height": 24, "width": 32, "pitch": 0.1, "diameter": 4.84, "markers": False}
+    (tmp_path / "meta.json").write_text(json.dumps(meta))
+    read = sets.REAL["wyh_wedge_markers"](tmp_path, None)
+    sensor = read.folds[0].sensor
+    assert (sensor.height, sensor.width, sensor.mm_per_pixel, sensor.markers) == (24, 32, 0.1, None)
+    assert [[press.name for press in fold.learned] for fold in read.folds] == [["ball_1", "ball_10"], ["ball_9", "ball_100"]]
+    scored = [target.ball for fold in read.folds for target in fold.scored]
+    assert [press.center_px for press in scored] == [(12.0, 12.5), (12.0, 12.5), (11.0, 12.5), (13.0, 12.5)]
+    assert all(press.contact_radius_px == 8.0 and press.ball_diameter_mm == 4.84 for press in scored)
+    (tmp_path / "meta.json").write_text(json.dumps(meta | {"markers": True}))
+    rough = sets.REAL["digit_b"](tmp_path, 2)  # its labels are not trusted
+    assert rough.folds[0].sensor.markers and [len(fold.scored) for fold in rough.folds] == [1, 1]
+    assert all(target.ball is None for fold in rough.folds for target in fold.scored)
+
+
 def test_without_labels_balls_are_found(folder, monkeypatch, tmp_path):
     sensor = vts.Sensor.load(folder / "rig.yaml")
     _, presses = vts.read_presses(folder)

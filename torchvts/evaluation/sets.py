@@ -4,13 +4,14 @@ No set is scored on presses that were learned from, and no prior is used that ha
 """
 
 import dataclasses
+import json
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -213,30 +214,26 @@ def _mini_c(folder: Path, limit: int | None) -> DataSet:
     return _halves(folder.name, images.median(0).values, sensor, presses, "background: median of the presses")
 
 
-def _digit_a(folder: Path, limit: int | None) -> DataSet:
-    return _halves(folder.name, *_fots("digit", folder, {}, limit))
-
-
-def _pale(folder: Path, limit: int | None) -> DataSet:
-    lines = [line.split(",") for line in (folder / "labels.csv").read_text(encoding="utf-8").split()[1:]]
-    labels = {name: ((float(x), float(y)), float(radius)) for name, x, y, radius in lines}
-    return _halves(folder.name, *_fots("gelsight_pale", folder, labels, limit), "labels by hand, good to 1 to 2 px")
-
-
-def _fots(
-    name: str, folder: Path, labels: Mapping[str, tuple[tuple[float, float] | None, float | None]], limit: int | None
-) -> tuple[Tensor, Sensor, list[Press]]:
-    """A sensor of FOTS: presses of a ball of 4.70 mm; its code says 19.58 pixels per mm."""
-    files = spread(sorted(folder.glob("ball_*.png")), limit)
-    presses = [Press(read_image(file), 4.70, file.stem, *labels.get(file.stem, (None, None))) for file in files]
-    return read_image(folder / "background.png"), Sensor(name, 320, 240, 1.0 / 19.58), presses
-
-
-def _gelslim(folder: Path, limit: int | None) -> DataSet:
-    background = read_image(folder / "ref.jpg")
-    sensor = Sensor("gelslim_markers", background.shape[1], background.shape[2], 0.05, markers=True)
-    presses = [Press(read_image(file), 5.0, file.stem) for file in sorted(folder.glob("sample_*.jpg"), key=_number)]
-    return _halves(folder.name, background, sensor, presses, "pitch of 0.05 mm and ball of 5 mm are assumed")
+def _balls(
+    folder: Path,
+    limit: int | None,
+    remark: str = "",
+    *,
+    meta: Mapping[str, Any] | None = None,
+    labelled: bool = True,
+    files: tuple[str, str] = ("background.png", "ball_*.png"),
+) -> DataSet:
+    """Presses of one ball, by halves: its folder's meta.json or ``meta``, and labels.csv where there is one and it is trusted."""
+    values = meta or json.loads((folder / "meta.json").read_text(encoding="utf-8"))
+    sensor = Sensor(folder.name, values["height"], values["width"], values["pitch"], markers=values.get("markers") or None)
+    labels: dict[str, tuple[tuple[float, float] | None, float | None]] = {}
+    if labelled and (table := folder / "labels.csv").is_file():
+        for line in table.read_text(encoding="utf-8").split()[1:]:
+            name, x, y, radius = line.split(",")
+            labels[name] = (float(x), float(y)), float(radius)
+    found = spread(sorted(folder.glob(files[1]), key=_number), limit)
+    presses = [Press(read_image(file), values["diameter"], file.stem, *labels.get(file.stem, (None, None))) for file in found]
+    return _halves(folder.name, read_image(folder / files[0]), sensor, presses, remark)
 
 
 def _ninedtact(folder: Path, limit: int | None) -> DataSet:
@@ -282,13 +279,24 @@ def _number(file: Path) -> int:
     return int(re.findall(r"\d+", file.stem)[-1])
 
 
+_FOTS = {"height": 320, "width": 240, "pitch": 1.0 / 19.58, "diameter": 4.70}  # pixels per mm by the code of FOTS
+_GELSLIM = {"height": 320, "width": 427, "pitch": 0.05, "diameter": 5.0, "markers": True}
+
 REAL: dict[str, Callable[[Path, int | None], DataSet]] = {
     "gelsight_mini_a": _mini_a,
     "gelsight_mini_b": _mini_b,
     "gelsight_mini_c": _mini_c,
-    "gelsight_pale": _pale,
-    "digit_a": _digit_a,
-    "gelslim_markers": _gelslim,
+    "gelsight_pale": partial(_balls, remark="labels by hand, good to 1 to 2 px", meta=_FOTS),
+    "gelsight_bnz": _balls,
+    "digit_a": partial(_balls, meta=_FOTS),
+    "digit_b": partial(_balls, remark="its labels are rough, 0.1 to 7 px from located centers, and not used", labelled=False),
+    "gelslim_markers": partial(
+        _balls, remark="pitch of 0.05 mm and ball of 5 mm are assumed", meta=_GELSLIM, files=("ref.jpg", "sample_*.jpg")
+    ),
+    "gelslim_b": _balls,
+    "gelslim_mcube": _balls,
+    "wyh_wedge_markers": partial(_balls, remark="labels by hand, integers, 2 to 6 px from located centers, radii up to the ball's"),
+    "wyh_wedge_clear": _balls,
     "ninedtact_white": _ninedtact,
     "wedge_video": _wedge,
 }

@@ -204,7 +204,7 @@ def test_rectify_straightens_a_quadrilateral():
 @pytest.mark.parametrize(
     "options, size, message",
     [
-        ({"roi_px": (100, 0, 70, 50)}, (120, 160), r"frame: 120 x 160 does not contain roi_px \(100, 0, 70, 50\) of sensor 'rig'"),
+        ({"roi_px": (100, 0, 80, 60)}, (120, 160), r"frame: 120 x 160 does not contain roi_px \(100, 0, 80, 60\) of sensor 'rig'"),
         ({"corners_px": ((0, 0), (300, 0), (300, 90), (0, 90))}, (120, 160), "frame: 120 x 160 does not contain corners_px"),
         (
             {},
@@ -259,22 +259,37 @@ def test_field_of_view():
 
 
 def test_raw_frames_are_cropped_and_resized():
-    sensor = vts.Sensor(**GOOD, raw_size_px=((56, 70), (240, 320)), raw_crop=1 / 7)
-    y, x = torch.meshgrid(torch.arange(56.0), torch.arange(70.0), indexing="ij")
-    frame = (torch.stack((x / 70, y / 56, 0 * x + 0.5)))[None]
-    image = sensor.rectify(frame)[0]  # 8 rows and 10 columns are cut off each side; 40 x 50 become 24 x 32
+    sensor = vts.Sensor(**GOOD, raw_size_px=((84, 112), (240, 320)), raw_crop=1 / 7)
+    y, x = torch.meshgrid(torch.arange(84.0), torch.arange(112.0), indexing="ij")
+    frame = (torch.stack((x / 112, y / 84, 0 * x + 0.5)))[None]
+    image = sensor.rectify(frame)[0]  # 12 rows and 16 columns are cut off each side; 60 x 80 become 24 x 32
     assert image.shape == (3, 24, 32)
-    assert float(image[0, 12].diff().mean()) == pytest.approx(50 / 70 / 32, rel=0.02)
-    assert float(image[0, :, 0].mean()) == pytest.approx((10 + 50 / 64 - 0.5) / 70, abs=0.005)
-    assert float(image[1, 0].mean()) == pytest.approx((8 + 40 / 48 - 0.5) / 56, abs=0.005)
+    assert float(image[0, 12].diff().mean()) == pytest.approx(80 / 112 / 32, rel=0.02)
+    assert float(image[0, :, 0].mean()) == pytest.approx((16 + 80 / 64 - 0.5) / 112, abs=0.005)
+    assert float(image[1, 0].mean()) == pytest.approx((12 + 60 / 48 - 0.5) / 84, abs=0.005)
     cropped = torch.rand(1, 3, 24, 32, generator=torch.Generator().manual_seed(0))
     assert torch.equal(sensor.rectify(cropped), cropped)
     with pytest.raises(
         ValueError,
-        match="frame: expected 24 x 32, or raw frames of 56 x 70 or 240 x 320, for sensor 'rig', got 30 x 32: another aspect",
+        match="frame: expected 24 x 32, or raw frames of 84 x 112 or 240 x 320, for sensor 'rig', got 30 x 32: another aspect",
     ):
         sensor.rectify(torch.zeros(1, 3, 30, 32))
-    assert sensor.resized(240, 320).raw_size_px == ((56, 70),)  # images of this size are cropped already
+    assert sensor.resized(240, 320).raw_size_px == ((84, 112),)  # images of this size are cropped already
+
+
+@pytest.mark.parametrize(
+    "options, name",
+    [
+        ({"roi_px": (0, 0, 70, 50)}, "roi_px"),
+        ({"roi_px": (0, 0, 400, 400)}, "roi_px"),
+        ({"raw_size_px": ((90, 160),)}, "raw_size_px"),
+    ],
+)
+def test_pixels_that_would_not_be_square_are_refused(options, name):
+    with pytest.raises(ValueError, match=rf"^{name}: expected .* 32 x 24, 1\.333, got \d+ x \d+, \d\.\d+: pixels would not be"):
+        vts.Sensor(**GOOD, **options)
+    assert vts.Sensor(**GOOD, roi_px=(1, 2, 321, 239)).roi_px == (1, 2, 321, 239)  # 0.7 %: whole pixels
+    assert vts.Sensor(**GOOD, corners_px=((0, 0), (70, 0), (70, 50), (0, 50))).corners_px is not None
 
 
 def test_frames_of_the_mini_as_its_camera_gives_them(data, tmp_path):

@@ -21,6 +21,7 @@ from .by_presses import by_presses, error_of_lights_deg
 from .by_touches import TouchResult, by_touches
 from .complaints import CalibrationWarning
 from .contacts import press_row, touch_row, used
+from .given_images import sort_presses
 from .light_choice import objection_to_lights
 from .lights import POORLY_CONSTRAINED_DEG, check_exposure
 from .pattern import compare_patterns
@@ -79,8 +80,9 @@ def calibrate(
         what became of each press.
     Raises:
         ValueError, TypeError: bad image: shape, dtype, range, black, saturated, greyscale; a sensor without coloured lights;
-            presses or touches of which none can be used, and whether they are cropped otherwise than the background; touches that
-            do not constrain a field, or have no scale; nothing but lights to calibrate from, and their fit failed.
+            presses or touches of which none can be used; presses that are turned, mirrored, cropped or swapped otherwise than the
+            background, of another unit, or 12 bits stored in 16; with presses, a background that holds a contact; touches that do
+            not constrain a field, or have no scale; nothing but lights to calibrate from, and their fit failed.
     Warns:
         CalibrationWarning: what was left out and why; the fit did not converge, the image does not constrain the lights, it
             seems to hold a contact, or it does not have the pattern of light of the prior's sensor type. Presses then decide
@@ -98,15 +100,18 @@ def calibrate(
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     check_exposure(background)
     check_switch("progress", progress)
-    given = _Given(background, sensor, check_presses(presses, sensor), check_touches(touches, sensor), progress)
-    presses, touches = given.presses, given.touches
+    named, touched = check_presses(presses, sensor), check_touches(touches, sensor)
     check_colour(background)
+    kept, left_out = sort_presses(background, named)
+    given = _Given(background, sensor, kept, touched, progress)
     check_coloured_contacts(background, given.presses or given.touches)
-    if not (presses or touches or sensor.prior or sensor.light_position_mm) and objection_to_lights(background, sensor):
+    if not (kept or touched or sensor.prior or sensor.light_position_mm) and objection_to_lights(background, sensor):
         check_coloured_background(background)
     with OneThread() if one_suffices(background[None]) else nullcontext():  # threads would wake up late for each small step
         calibration, messages = _choose(given)
-    for message in messages:
+    for k, reason in left_out:
+        calibration.report["presses"].insert(k, {"name": named[k].name, "used": False, "reason": reason})
+    for message in [f"{named[k].name}: left out: {reason}" for k, reason in left_out] + messages:
         warnings.warn(message, CalibrationWarning, stacklevel=2)
     return calibration
 
@@ -146,8 +151,10 @@ def fit_prior(background: Tensor, sensor: Sensor, presses: Sequence[Press], sour
         raise ValueError("presses: expected one or more, got none: a prior is fitted to presses")
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     named = check_presses(presses, sensor)
-    result = by_presses(background, sensor.without_prior(), named, None, False, PRIOR_CANDIDATES)
-    for message in complaints.of_contacts(result.contacts):
+    kept, left_out = sort_presses(background, named)
+    result = by_presses(background, sensor.without_prior(), kept, None, False, PRIOR_CANDIDATES)
+    messages = [f"{named[k].name}: left out: {reason}" for k, reason in left_out]
+    for message in messages + complaints.of_contacts(result.contacts):
         warnings.warn(message, CalibrationWarning, stacklevel=2)
     log_background = fit_log_background(result.unit.background, sensor.mm_per_pixel)
     half_mm = 0.5 * sensor.width * sensor.mm_per_pixel

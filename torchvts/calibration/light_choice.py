@@ -180,7 +180,9 @@ def _sparse(background: Tensor, sensor: Sensor, rows: int) -> tuple[Tensor, Sens
     stride = max(1, min(sensor.height, sensor.width) // rows) // 2 * 2 + 1
     row, column = _evenly(sensor.height, stride), _evenly(sensor.width, stride)
     pitch = stride * sensor.mm_per_pixel
-    small = dataclasses.replace(sensor, height=len(row), width=len(column), mm_per_pixel=pitch, corners_px=None, roi_px=None)
+    small = dataclasses.replace(
+        sensor, height=len(row), width=len(column), mm_per_pixel=pitch, corners_px=None, roi_px=None, raw_size_px=()
+    )
     return background[:, row[:, None], column[None, :]], small
 
 

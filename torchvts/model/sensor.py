@@ -1,6 +1,7 @@
 """Description of a sensor type or unit: size, pitch, camera response, and where the gel lies in the camera's frame."""
 
 import dataclasses
+import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -27,6 +28,9 @@ from ..core.spelling import suggest
 from .gs_sdk_sensor import is_gs_sdk_sensor, values_from_gs_sdk
 from .response_field import SensorPrior
 
+MOST_STRETCHED = 0.02
+"""Difference of aspects, logarithm, up to which frames are resized: shipped sensors have 0.002, for whole pixels."""
+
 
 @dataclass(frozen=True)
 class Sensor:
@@ -42,7 +46,7 @@ class Sensor:
         light_position_mm: (3, 3), rows R, G, B, if the positions of the lights are known.
         light_azimuth_deg: (3,), R, G, B: azimuth of each light around the image centre, if only that is known, degrees from x
             (right) towards y (down). Either this or ``light_position_mm``.
-        roi_px: (left, top, width, height) of the gel in the camera's frame, resized to the sensor's size.
+        roi_px: (left, top, width, height) of the gel in the camera's frame, of the sensor's aspect within 2 %, resized to its size.
         corners_px: (4, 2), x and y of the gel's corners in the camera's frame: top left, top right, bottom right, bottom
             left, rectified to the sensor's size. Either this or ``roi_px``.
         raw_size_px: (N, 2), (height, width) of the frames that the camera gives, if images are usually stored cropped: a frame of
@@ -114,6 +118,7 @@ class Sensor:
         self._set("raw_crop", check_least("raw_crop", self.raw_crop, 0.0, 0.49))
         if self.raw_size_px and (self.roi_px is not None or self.corners_px is not None):
             raise ValueError("raw_size_px: expected none beside roi_px or corners_px, which say where the gel lies in raw frames")
+        self._check_aspects()
         if self.markers is not None and not isinstance(self.markers, bool):
             raise TypeError(f"markers: expected true, false or null, got {brief(self.markers)}")
         prior: object = self.prior
@@ -121,6 +126,19 @@ class Sensor:
             self._set("prior", SensorPrior.from_dict(prior, "prior"))
         elif prior is not None and not isinstance(prior, SensorPrior):
             raise TypeError(f"prior: expected a SensorPrior, got {type(prior).__name__}")
+
+    def _check_aspects(self) -> None:
+        """Raise where images would be stretched: the pitch is the same along x and y."""
+        taken = [("roi_px", self.roi_px[2:], "a region")] if self.roi_px is not None else []
+        taken += [("raw_size_px", size[::-1], "frames") for size in self.raw_size_px]
+        for name, (across, down), what in taken:
+            aspect, own = across / down, self.width / self.height
+            if abs(math.log(aspect / own)) > MOST_STRETCHED:
+                raise ValueError(
+                    f"{name}: expected {what} of the aspect of width x height {self.width} x {self.height}, {own:.3f}, got "
+                    f"{across} x {down}, {aspect:.3f}: pixels would not be square; set it, or height and width, to the same "
+                    "aspect, or give corners_px, which set the true shape"
+                )
 
     def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)

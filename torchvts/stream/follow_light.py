@@ -6,11 +6,11 @@ from torch import Tensor
 
 from ..accelerated import kernels
 from ..accelerated.gate import usable
+from ..core.arrays import Array, array_of, cell_means, cells_with_any, lower_median, widened
 from ..core.checks import check_batch, check_field, check_least, check_range, check_same_size, check_shape
 from ..core.geometry import pixel_grid_mm
 from ..core.robust import tukey_weight
 from ..model.calibration import PEDESTAL
-from .cells import Array, array_of, cell_means, cells_with_any, lower_median, widened
 
 TIME_CONSTANT_S = 1.0
 """The light is followed with this time constant: an LED that fades by 1 % a second is followed 1 % behind."""

@@ -1,0 +1,135 @@
+"""Images that a calibration refuses, or leaves out, because they cannot be of one unit, taken in the same way."""
+
+import dataclasses
+import warnings
+
+import pytest
+import torch
+
+import torchvts as vts
+from torchvts.calibration.given_images import sort_presses
+from torchvts.core.views import Views
+from torchvts.evaluation.drawn_sensors import drawn_sensor
+
+NUMBERS = (0, 3)
+
+
+@pytest.fixture(scope="module", params=NUMBERS)
+def given(request):
+    """Background and presses of a drawn sensor."""
+    unit = drawn_sensor(request.param)
+    return unit.background.float(), [dataclasses.replace(ball, image=ball.image.float()) for ball in unit.balls]
+
+
+def changed(presses, change):
+    return [dataclasses.replace(press, image=change(press.image)) for press in presses]
+
+
+def crop(image):
+    """The upper left of an image, 0.8 of its height and width, at its size."""
+    height, width = image.shape[1:]
+    part = image[None, :, : round(0.8 * height), : round(0.8 * width)]
+    return torch.nn.functional.interpolate(part, (height, width), mode="bilinear", antialias=True)[0]
+
+
+MISTAKES = {
+    "channels": (
+        lambda image: image.flip(0),
+        "expected the background's view of the skin, got .*swapped to the order B, G, R: with",
+    ),
+    "channels 2": (lambda image: image[[1, 2, 0]], "channels swapped to the order G, B, R: with that undone it differs"),
+    "turned": (lambda image: image.flip(1, 2), "is turned by 180 degrees: with that undone it differs"),
+    "mirrored": (lambda image: image.flip(2), "is mirrored left to right: with that undone it differs"),
+    "both": (lambda image: image.flip(0, 1), "is mirrored top to bottom and has its channels swapped to the order B, G, R"),
+    "cropped": (crop, r"expected the crop of the background, got images that show it 1\.\d\d times as large"),
+    "12 bits": (lambda image: (image * 4080).round() / 65535, r"brightness like the background's, got 6% .*12 bits stored in 16\?"),
+    "black": (lambda image: 0.0 * image, "got 0% of it: black, or the LEDs were off"),
+    "overexposed": (lambda image: (9.0 * image).clamp(max=1.0), "expected light below the camera's limit, got images of which"),
+}
+
+
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_presses_taken_otherwise_than_the_background_are_refused(given, mistake, count):
+    background, presses = given
+    change, message = MISTAKES[mistake]
+    with pytest.raises(ValueError, match=f"^presses: .*{message}"):
+        sort_presses(background, changed(presses[:count], change))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 12])
+def test_presses_of_the_unit_are_kept(given, count):
+    background, presses = given
+    assert sort_presses(background, presses[-count:]) == (presses[-count:], [])
+    assert sort_presses(background, [presses[0]] * count).left_out == []
+
+
+def test_presses_of_another_unit_are_refused():
+    one, other = drawn_sensor(0), drawn_sensor(5)
+    with pytest.raises(ValueError, match=r"presses: expected the light of the background, got .*: another unit, or another light"):
+        sort_presses(one.background, other.balls)
+
+
+def test_a_dark_background_is_named(given):
+    background, presses = given
+    with pytest.raises(ValueError, match=r"background: expected a brightness like that of the presses, got 6% .*12 bits"):
+        sort_presses((background * 4080).round() / 65535, presses)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 6])
+def test_a_background_with_a_contact_is_refused(given, count):
+    _, presses = given
+    with pytest.raises(ValueError, match="background: expected the skin without contact, got structure between the channels"):
+        sort_presses(presses[0].image, presses[-count:])
+
+
+def test_a_press_that_is_no_press_and_a_spot_on_the_lens_are_no_contact_in_the_background(given):
+    background, presses = given
+    noisy = background + 0.004 * torch.randn(background.shape, generator=torch.Generator().manual_seed(0))
+    blank = dataclasses.replace(presses[0], image=noisy.clamp(0, 1))
+    assert sort_presses(background, [blank]).left_out == []
+    spot = background.clone()
+    spot[:, 100:112, 100:112] *= 0.8
+    assert len(sort_presses(spot, presses).kept) == 12
+
+
+def test_one_press_with_swapped_channels_is_left_out_by_name():
+    unit = drawn_sensor(0)
+    presses = [dataclasses.replace(ball, name=f"ball {k}") for k, ball in enumerate(unit.balls[:6])]
+    presses[2] = dataclasses.replace(presses[2], image=presses[2].image.flip(0))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        calibration = vts.calibrate(unit.background, unit.sensor, presses)
+    assert any(str(one.message).startswith("ball 2: left out: it has its channels swapped to the order B, G, R") for one in caught)
+    rows = calibration.report["presses"]
+    assert [row["name"] for row in rows] == [press.name for press in presses]
+    assert not rows[2]["used"] and "swapped" in rows[2]["reason"] and rows[1]["used"]
+    with pytest.raises(
+        ValueError, match=r"^presses: expected the background's view of the skin, got 6 of 6 that show another: ball 0"
+    ):
+        vts.calibrate(unit.background.flip(0), unit.sensor, [presses[k] for k in (0, 1, 3, 4, 5, 0)])
+
+
+def test_half_of_an_even_background_changed_is_no_other_view():
+    even = 0.5 + 0.01 * torch.rand(3, 96, 128, generator=torch.Generator().manual_seed(0))
+    pressed = even.clone()
+    pressed[0, :, :64] *= 1.4
+    views = Views(even.numpy())
+    assert views.other(views.cells(pressed.numpy())) is None
+
+
+@pytest.mark.parametrize("name", ["gelsight_mini_a", "digit_b"])
+def test_real_presses_are_kept_and_mistakes_refused(data, name):
+    if name == "gelsight_mini_a":
+        background, presses = vts.read_presses(data / name)
+    else:
+        background = vts.read_image(data / name / "background.png")
+        presses = [vts.Press(vts.read_image(file), 6.0, file.stem) for file in sorted((data / name).glob("ball_*.png"))]
+    assert sort_presses(background, presses).left_out == []
+    for first in range(0, len(presses) - 2, 3):
+        assert len(sort_presses(background, presses[first : first + 3]).kept) == 3
+    for change, message in MISTAKES.values():
+        with pytest.raises(ValueError, match=f"^presses: .*{message}"):
+            sort_presses(background, changed(presses[:3], change))
+    with pytest.raises(ValueError, match="background: expected the skin without contact"):
+        sort_presses(presses[4].image, presses[:4] + presses[5:])

@@ -1,0 +1,162 @@
+"""Whether an image shows a background's view of the skin, or that view turned, mirrored, cropped or with its channels swapped."""
+
+from collections.abc import Callable
+from itertools import permutations, product
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import nn
+
+from .arrays import Array, cell_means, lower_median
+
+CROP = 1.0 / 7.0
+"""Share that is cut off each side of raw frames of a GelSight Mini."""
+
+TWELVE_BITS = 4095.0 / 65535.0
+"""Largest value of 12 bits stored in 16."""
+
+PEDESTAL = 0.01
+"""Added to image values before the logarithm: dark cells are noise."""
+
+SAME_VIEW = 0.05
+"""Median difference from the background, logarithm of the image value, up to which no other view is looked for. It is at most
+0.05 for presses on 13 units, 0.08 on one whose light drifts, and 0.07 to 1.1 for these turned, mirrored or swapped."""
+
+NEAR = 0.1
+"""Difference of the logarithm below which a cell looks like the background."""
+
+BETTER = 0.6
+"""Another view is named if it leaves less than this part of the difference. On 14 units the best other view leaves at least 1.9
+times as much of a press as it is, and at most 0.51 times of a turned, mirrored or swapped one."""
+
+LEAST_DECIDING = 0.1
+"""Share of the cells in which another view of the background looks different, below which no image can show that view."""
+
+Change = Callable[[Array], Array]
+
+
+class OtherView(NamedTuple):
+    """How an image shows the skin otherwise than a background.
+
+    Attributes:
+        what: such as "is turned by 180 degrees".
+        undone: median difference from the background with that undone, logarithm of the image value.
+        same: without.
+    """
+
+    what: str
+    undone: float
+    same: float
+
+    @property
+    def cropped(self) -> bool:
+        """Whether the image shows more or less of the skin."""
+        return "cropped" in self.what
+
+    def in_words(self) -> str:
+        """Such as "is turned by 180 degrees: with that undone it differs from the background by 2%, else by 31%"."""
+        return f"{self.what}: with that undone it differs from the background by {self.undone:.0%}, else by {self.same:.0%}"
+
+
+class Views:
+    """Compares images with a background, in cells of 1/24 of its height, each channel's brightness aside.
+
+    The measure is the median over cells of the largest difference of a channel: a contact changes less than half of the skin,
+    and does not make it similar to another view. Only cells decide in which the background itself looks different when that is
+    done to it: a flat contact on an even background is no other view.
+
+    Args:
+        background: (3, H, W), image value.
+    Example:
+        >>> background = np.random.default_rng(0).uniform(0.2, 0.8, (3, 48, 64)).astype(np.float32)
+        >>> views = Views(background)
+        >>> views.other(views.cells(background[::-1])).what
+        'has its channels swapped to the order B, G, R'
+    """
+
+    def __init__(self, background: Array) -> None:
+        self._cell = max(1, min(background.shape[1:]) // 24)
+        self.background = self.cells(background)
+        self._own = own = _log(self.background)
+        self._views: list[tuple[str, Change, Array, Array]] = []
+        for what, change, other in _VIEWS:
+            wanted = other(own)
+            deciding = _differences(change(own), wanted) >= NEAR
+            if float(deciding.mean()) >= LEAST_DECIDING:
+                self._views.append((what, change, wanted, deciding))
+
+    def cells(self, image: Array) -> Array:
+        """(3, h, w) means of an image (3, H, W) over cells, which lie in its middle: a turned image has the same."""
+        top, left = (size % self._cell // 2 for size in image.shape[1:])
+        return cell_means(image[:, top:, left:], self._cell)
+
+    def difference(self, cells: Array) -> float:
+        """Median difference of :meth:`cells` of an image from the background's, logarithm of the image value."""
+        return _median(_differences(_log(cells), self._own))
+
+    def other(self, cells: Array) -> OtherView | None:
+        """The other view that :meth:`cells` of an image show; None where they show the background's, or none that is known."""
+        seen = _log(cells)
+        as_it_is = _differences(seen, self._own)
+        if _median(as_it_is) <= SAME_VIEW:
+            return None
+        found = []
+        for what, change, wanted, deciding in self._views:
+            left = _differences(change(seen), wanted)
+            if _median(left) < NEAR:  # most views end here
+                undone, same = _median(left[deciding]), _median(as_it_is[deciding])
+                if undone < min(NEAR, BETTER * same):
+                    found.append(OtherView(what, undone, same))
+        return min(found, key=lambda view: view.undone / view.same, default=None)
+
+
+def _log(cells: Array) -> Array:
+    log: Array = np.log(cells + np.float32(PEDESTAL))
+    return log
+
+
+def _same(cells: Array) -> Array:
+    return cells
+
+
+def _centre(cells: Array) -> Array:
+    """The middle of (3, h, w) cells, without :data:`CROP` a side, at their own size."""
+    top, left = round(CROP * cells.shape[1]), round(CROP * cells.shape[2])
+    middle = torch.from_numpy(cells[None, :, top : cells.shape[1] - top, left : cells.shape[2] - left])
+    return nn.functional.interpolate(middle, cells.shape[1:], mode="bilinear", align_corners=False)[0].numpy()
+
+
+def _known_views() -> list[tuple[str, Change, Change]]:
+    """What may have happened to an image; what is done to its cells, and to the background's, so that they can be compared."""
+    views: list[tuple[str, Change, Change]] = [
+        ("is cropped otherwise and shows more than the background", _centre, _same),
+        ("is cropped otherwise and shows less than the background", _same, _centre),
+    ]
+    turns = (
+        ("", 1, 1),
+        ("is turned by 180 degrees", -1, -1),
+        ("is mirrored left to right", 1, -1),
+        ("is mirrored top to bottom", -1, 1),
+    )
+    for (turned, down, across), order in product(turns, permutations(range(3))):
+        swapped = "has its channels swapped to the order " + ", ".join("RGB"[c] for c in order) if order != (0, 1, 2) else ""
+        what = " and ".join(filter(None, (turned, swapped)))
+        back = [order.index(c) for c in range(3)]
+        if what:
+            views.append((what, lambda cells, b=back, d=down, a=across: cells[b, ::d, ::a], _same))  # type: ignore[misc]
+    return views
+
+
+_VIEWS = _known_views()
+
+
+def _differences(one: Array, other: Array) -> Array:
+    """(h, w) largest difference of a channel, (3, h, w), beyond the median difference of that channel."""
+    off = one - other
+    differences: Array = np.abs(off - lower_median(off.reshape(3, -1))[:, None, None]).max(0)
+    return differences
+
+
+def _median(values: Array) -> float:
+    return float(lower_median(values.reshape(-1)))

@@ -55,9 +55,6 @@ def locate(contacts: list[Contact], sensor: Sensor, prior: ResponseModel | None,
     for contact in usable:
         if not contact.reason and int(contact.inside().sum()) < LEAST_INSIDE:
             contact.reason = "no ball of this diameter fits the contact"
-        if not contact.reason and contact.contact_radius_mm > 0.99 * WIDEST * contact.radius_mm:
-            wide_mm, ball_mm = 2 * contact.contact_radius_mm, 2 * contact.radius_mm
-            contact.reason = f"the contact is {wide_mm:.2f} mm wide, too wide for a ball of {ball_mm:g} mm"
 
 
 def _locate_jointly(contacts: list[Contact], pitch_mm: float, half_mm: float) -> None:
@@ -121,7 +118,8 @@ def guess_circle(contact: Contact, sensor: Sensor) -> None:
     center_px, radius_px = _circle(outline[free])
     contact.center_mm = (center_px - middle_px(sensor)) * sensor.mm_per_pixel
     # the outline lies outside of the contact, by about a fifth of its radius
-    contact.contact_radius_mm = min(0.8 * radius_px * sensor.mm_per_pixel, WIDEST * contact.radius_mm)
+    contact.outline_mm = radius_px * sensor.mm_per_pixel
+    contact.contact_radius_mm = min(0.8 * contact.outline_mm, WIDEST * contact.radius_mm)
 
 
 def _circle(points: Tensor) -> tuple[Tensor, float]:

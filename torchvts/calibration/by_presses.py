@@ -139,8 +139,12 @@ def _located(press: Press, contact: Contact, sensor: Sensor) -> Press:
     return dataclasses.replace(press, center_px=(x, y), contact_radius_px=contact.contact_radius_mm / sensor.mm_per_pixel)
 
 
-def error_of_lights_deg(calibration: Calibration, presses: Sequence[Press], contacts: Sequence[Contact], blur_px: float) -> float:
+def error_of_lights_deg(
+    calibration: Calibration, presses: Sequence[Press], contacts: Sequence[Contact], blur_px: float
+) -> float | None:
     """Mean angle of the point lights' normals on the located balls, by their second pass and with the same blur, degrees.
+
+    None where no ball is seen.
 
     Each ball is located again by the lights' own slopes: a wrong response field hides part of an error of the centers, lights
     cannot.
@@ -159,8 +163,10 @@ def error_of_lights_deg(calibration: Calibration, presses: Sequence[Press], cont
         own = dataclasses.replace(contact)  # a copy: center_by_slope moves its center, or gives it a reason
         if not own.known:
             center_by_slope(own, slope, pitch)
-        if own.reason:
+        if own.reason or not bool(own.inside().any()):
             own = contact
         inside = own.inside()
+        if not bool(inside.any()):
+            continue
         errors.append(angle_deg(slope.flatten(1)[:, own.index][:, inside], own.ball_slope()[:, inside]))
-    return sum(errors) / len(errors)
+    return sum(errors) / len(errors) if errors else None

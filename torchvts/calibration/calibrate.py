@@ -30,6 +30,7 @@ from .prior_choice import FromPresses, fit_with_or_without
 from .prior_score import held_out_by_groups
 from .refusals import NoUsablePress, check_colour, check_coloured_background, check_coloured_contacts, other_crop
 from .response_fit import Candidates
+from .sizes import objection_to_sizes
 from .touching import with_contact_share
 
 WELL_CONSTRAINED_DEG = 2.0
@@ -54,6 +55,7 @@ def calibrate(
     touches: Sequence[Touch | Tensor] = (),
     *,
     progress: bool = False,
+    force: bool = False,
 ) -> Calibration:
     """Calibrate a unit from one image without contact, and what else there is: presses of balls, touches by any object.
 
@@ -75,14 +77,16 @@ def calibrate(
         presses: images of balls pressed anywhere; centers need not be known.
         touches: images of unknown objects, or :class:`Touch` with the depth, if that is known.
         progress: show a bar.
+        force: go on where the presses contradict the pitch or all diameters; that is then a warning.
     Returns:
         A :class:`Calibration`. Its ``report`` (:class:`torchvts.model.report.Report`) says which model was chosen and why, and
         what became of each press.
     Raises:
         ValueError, TypeError: bad image: shape, dtype, range, black, saturated, greyscale; a sensor without coloured lights;
             presses or touches of which none can be used; presses that are turned, mirrored, cropped or swapped otherwise than the
-            background, of another unit, or 12 bits stored in 16; with presses, a background that holds a contact; touches that do
-            not constrain a field, or have no scale; nothing but lights to calibrate from, and their fit failed.
+            background, of another unit, or 12 bits stored in 16; contacts too wide for their balls, or balls of
+            another size than given, all alike, by the sensor's prior; with presses, a background that holds a contact; touches that
+            do not constrain a field, or have no scale; nothing but lights to calibrate from, and their fit failed.
     Warns:
         CalibrationWarning: what was left out and why; the fit did not converge, the image does not constrain the lights, it
             seems to hold a contact, or it does not have the pattern of light of the prior's sensor type. Presses then decide
@@ -100,10 +104,11 @@ def calibrate(
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     check_exposure(background)
     check_switch("progress", progress)
+    check_switch("force", force)
     named, touched = check_presses(presses, sensor), check_touches(touches, sensor)
     check_colour(background)
     kept, left_out = sort_presses(background, named)
-    given = _Given(background, sensor, kept, touched, progress)
+    given = _Given(background, sensor, kept, touched, progress, force)
     check_coloured_contacts(background, given.presses or given.touches)
     if not (kept or touched or sensor.prior or sensor.light_position_mm) and objection_to_lights(background, sensor):
         check_coloured_background(background)
@@ -170,6 +175,7 @@ class _Given(NamedTuple):
     presses: list[Press]
     touches: list[Touch]
     progress: bool
+    force: bool
 
 
 class _Prior(NamedTuple):
@@ -295,14 +301,18 @@ def _fit_presses(given: _Given, prior: _Prior, touched: TouchResult | None) -> F
 
 def _with_presses(given: _Given, lights: LightsResult, prior: _Prior, touched: TouchResult | None) -> tuple[Calibration, list[str]]:
     """The calibration by response fields or by point lights, whichever is better on the presses, and complaints."""
-    (fit, contacts, unit), dropped = _fit_presses(given, prior, touched)
+    (fit, contacts, unit), dropped, by_prior = _fit_presses(given, prior, touched)
+    sizes = by_prior or objection_to_sizes(contacts, given.sensor.mm_per_pixel)
+    if sizes and not given.force:
+        raise ValueError(f"{sizes}; force=True (--force) goes on all the same")
     balls, row = used(contacts), lights.rows[0]
     if lights.unit is not None:
         row["score_deg"] = error_of_lights_deg(lights.unit, given.presses, contacts, unit.sensor.blur_px)
     error_deg = math.inf if lights.unit is None or row["score_deg"] is None else row["score_deg"]
     from_presses_alone = (prior.model is None or bool(dropped)) and touched is None
-    of_diameters = complaints.of_diameters_by_others if from_presses_alone else complaints.of_diameters_by_prior
-    found = [dropped] * bool(dropped) + complaints.of_contacts(contacts) + of_diameters(balls)
+    found = [text for text in (dropped, sizes) if text] + complaints.of_contacts(contacts)
+    if not from_presses_alone and not sizes:
+        found += complaints.of_diameters_by_prior(balls)
     # twelve parameters that do about as well as a hundred are the better model
     as_good = error_deg < (math.inf if fit.error_deg is None else TIE * fit.error_deg) and error_deg < POORLY_CONSTRAINED_DEG
     known = given.sensor.light_position_mm is not None  # they explain it where nothing is complained of

@@ -16,9 +16,6 @@ from .pattern import ALIKE, FAINTEST, PatternMatch
 USUAL_GAIN = 1.15
 """The prior's slopes divided by those of the balls are within this factor: 0.93 to 1.00 on a GelSight Mini."""
 
-DOUBTFUL_GAIN = 1.25
-"""Slopes by the field of the other presses divided by those of a ball are within this factor where ten presses or more agree."""
-
 
 class CalibrationWarning(UserWarning):
     """A calibration was made but should not be trusted as it is."""
@@ -37,18 +34,6 @@ def of_diameters_by_prior(used: Sequence[Contact]) -> list[str]:
     return [
         f"presses: by the sensor's prior the balls seem {1.0 / gain:.2f} times as wide as given: wrong diameter or pitch? "
         "if they are right, this unit differs from the prior's, and more presses will show it"
-    ]
-
-
-def of_diameters_by_others(used: Sequence[Contact]) -> list[str]:
-    """Diameters that the other presses neither contradict nor confirm: fields of few presses are too rough to decide."""
-    doubtful = [c for c in used if abs(math.log(max(c.metrics.get("gain", 1.0), 1e-3))) > math.log(DOUBTFUL_GAIN)]
-    if not doubtful:
-        return []
-    named = ", ".join(f"{c.name} ({1.0 / c.metrics['gain']:.2f})" for c in doubtful)
-    return [
-        f"presses: by the others the balls of {named} seem so many times as wide as given: a wrong diameter, or a skin that "
-        "differs from place to place; more presses will show which"
     ]
 
 

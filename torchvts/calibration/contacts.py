@@ -59,6 +59,7 @@ class Contact:
         half_size_mm: (2,), half the width and height of the image, mm.
         center_mm: (2,), center of the ball, as far as known.
         contact_radius_mm: radius of the contact, as far as known.
+        outline_mm: radius of the outline of the strong change; 0 where it was not searched.
         known: the center was given and is not searched.
         radius_known: the contact radius was given and is not searched.
         reason: why the contact is left out; empty if it is used.
@@ -76,6 +77,7 @@ class Contact:
     half_size_mm: Tensor
     center_mm: Tensor = field(default_factory=lambda: torch.zeros(2, dtype=torch.float64))
     contact_radius_mm: float = 0.0
+    outline_mm: float = 0.0
     known: bool = False
     radius_known: bool = False
     reason: str = ""

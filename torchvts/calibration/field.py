@@ -29,6 +29,8 @@ TRANSITION_REACH = 2.0
 """The transition zone between ball and undeformed skin ends at this many contact radii."""
 DEGREE_PENALTY = 2.0
 """Each degree in position regularises a coefficient this many times more: slowly varying fields are likely."""
+CORE = 0.5
+"""Share of the contact radius within which slopes are compared with those of a ball of another size."""
 LEAST_POWER = 1e-3
 """Least mean square of the changes, so that a field of nothing stays determined."""
 PRODUCT_PENALTY = 10.0
@@ -187,10 +189,13 @@ class ContactForms:
         return [angle_deg(slope_from_sine(coefficient.reshape(2, -1) @ terms), ball) for coefficient in coefficients]
 
     def gain(self, coefficient: Tensor) -> float:
-        """Sine found divided by sine expected: the ball seems this many times smaller than given."""
-        inside = self.contact.inside()
-        ball = ball_sine(self.contact)[:, inside]
-        found = coefficient.reshape(2, -1) @ self.terms[:, inside]
+        """Sine found divided by sine expected in the middle of the contact: the ball seems this many times smaller than given.
+
+        Of a ball that is smaller than given, too wide a contact is found, and around its middle slopes are no longer the ball's.
+        """
+        core = self.contact.polar()[2] < CORE * self.contact.contact_radius_mm
+        ball = ball_sine(self.contact)[:, core]
+        found = coefficient.reshape(2, -1) @ self.terms[:, core]
         return float((found * ball).sum() / ball.square().sum().clamp_min(1e-12))
 
 

@@ -1,5 +1,6 @@
 """Fit response fields to located presses: the smallest family that explains each press by the others."""
 
+import dataclasses
 import functools
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -16,7 +17,7 @@ from .contacts import Contact, first_pass_depths
 from .field import PRODUCT_PENALTY, Evidence, Family, ball_sine
 from .outliers import locate_and_screen
 from .refusals import NoUsablePress
-from .touches import presses_as_touches
+from .touches import presses_as_touches, scale_by_presses, scaled
 
 FAMILIES = ((0, -1, -1), (1, -1, -1), (2, -1, -1), (2, 1, -1), (2, 1, 0), (3, 2, -1), (3, 2, 1), (4, 3, -1))
 """Degrees of candidates, linear terms, products of two and of three, the smallest first."""
@@ -139,12 +140,12 @@ def fit_response(
     families = candidates.families(half_mm)
     with tqdm(total=3, desc="calibrating from presses", disable=not progress or None, leave=False) as bar:
         bar.set_postfix(step="balls")
-        presses = locate_and_screen(contacts, light, sensor, prior, half_mm)
+        presses = locate_and_screen(contacts, sensor, prior, half_mm)
         if not presses:
             raise NoUsablePress(contacts)
         bar.update()
         bar.set_postfix(step="fields")
-        start = None if prior is None else _Start(prior.field, "prior")
+        start = None if prior is None else _Start(scaled(prior.field, _scale_of_prior(presses, prior.field)), "prior")
         if prior is None and 2 <= len(presses) < ENOUGH:
             by_curl = presses_as_touches(presses, light, half_mm, pitch)
             start = None if by_curl is None else _Start(by_curl, "field by curl")
@@ -161,6 +162,15 @@ def fit_response(
     model = ResponseModel(chosen.field, by_depth, sensor.exponent, sensor.blur_px, taught)
     own = mean_error_deg(chosen.field, presses) if score is None else None
     return ResponseFit(model, score, own, chosen.rows, reason)
+
+
+def _scale_of_prior(presses: list[Contact], field: ResponseField) -> float:
+    """The factor by which presses show a prior's slopes to be too small, all alike: one press a third of it, more show more.
+
+    Units of a type differ by a factor of slopes first of all, which one press gives; the rest takes several.
+    """
+    scale = scale_by_presses(field, [dataclasses.replace(press) for press in presses])
+    return float(max(scale, 1e-3) ** (len(presses) / (len(presses) + 2.0)))
 
 
 def fit_depth_brightness(

@@ -37,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_press(parser)
     parser.add_argument("--touches", type=Path, nargs="+", default=[], metavar="IMAGE", help="unknown objects pressed in")
     parser.add_argument("--use-labels", action="store_true", help="take centers from the folder's label.npz or labels.csv")
+    parser.add_argument("--force", action="store_true", help="go on where presses contradict the pitch or all diameters")
     parser.add_argument("--no-prior", action="store_true", help="ignore the prior of the sensor file")
     add_background_frames(parser)
     parser.add_argument(
@@ -53,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     image, sensor, presses = read_given(arguments)
     presses += read_press_images(arguments.press, sensor)
     touches = [Touch(sensor.read_image(path), None, path.name) for path in arguments.touches]
-    calibration = calibrated(image, sensor, presses, touches)
+    calibration = calibrated(image, sensor, presses, touches, arguments.force)
     calibration.save(arguments.out)
     print_calibration(calibration, arguments.candidates)
     print(f"wrote {arguments.out} ({arguments.out.stat().st_size / 1000:.0f} kB)")

@@ -54,11 +54,13 @@ def print_calibration(calibration: Calibration, candidates: bool = False) -> Non
             print_presses(report["presses"])
 
 
-def calibrated(background: Tensor, sensor: Sensor, presses: Sequence[Press], touches: Sequence[Touch] = ()) -> Calibration:
+def calibrated(
+    background: Tensor, sensor: Sensor, presses: Sequence[Press], touches: Sequence[Touch] = (), force: bool = False
+) -> Calibration:
     """:func:`torchvts.calibrate`; warnings become lines on stderr, save those about presses that the summary names."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CalibrationWarning)
-        calibration = calibrate(background, sensor, presses, touches, progress=True)
+        calibration = calibrate(background, sensor, presses, touches, progress=True, force=force)
     named = tuple(f"{row['name']}: left out" for row in calibration.report.get("presses", []) if not row["used"])
     for text in dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught):
         if not text.startswith(named):

@@ -426,6 +426,8 @@ TABLE = {
     ),
     "ConfidentPipeline.forward": forward(lambda: vts.ConfidentPipeline.from_calibration(unit()), 3, "images"),
     "beyond_presses": Entry({"calibration": unit(), "output": OUT}, {"calibration": [None, "unit"], "output": [None, DEPTH]}),
+    "distance_to_presses": Entry({"calibration": unit()}, {"calibration": [None, "unit"]}),
+    "press_next": Entry({"calibration": unit()}, {"calibration": [None, "unit"]}),
     "bound_at": Entry(
         {"bound_95": torch.ones(2), "level": 0.5, "spread": 1.0},
         {"bound_95": [1.0, None, np.ones(2)], "level": [0.0, 1.0, 95, NAN, "0.5", None], "spread": NUMBER},

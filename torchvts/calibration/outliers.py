@@ -118,6 +118,13 @@ def _uncertainty(evidence: Evidence) -> Tensor:
     return NOISE * torch.stack(variance).sqrt()
 
 
+def _usual(gains: Tensor, std: Tensor) -> float:
+    """The gain of right presses, as a small field is off by one factor in the middle of all: weighted median of gains and one 1."""
+    values, order = torch.cat((gains, torch.ones_like(gains[:1]))).sort()
+    weights = torch.cat(((NOISE / std).square(), torch.ones_like(std[:1])))[order]
+    return max(float(values[int((weights.cumsum(0) < 0.5 * weights.sum()).sum())]), 1e-3)
+
+
 def _wrong_by_others(evidence: Evidence, gains: Tensor) -> int | None:
     """The press with a wrong diameter, if any; each gain is by the field of the other presses.
 
@@ -130,8 +137,9 @@ def _wrong_by_others(evidence: Evidence, gains: Tensor) -> int | None:
     for place, gain in enumerate(gains.tolist()):
         rest = evidence.without(place)
         others = rest.gains(rest.held_out(penalty, None)) if len(gains) > 2 else torch.ones(1, dtype=torch.float64)
-        usual = max(float(others.median()), 1e-3)
-        off = (others / usual - 1.0) / torch.cat((std[:place], std[place + 1 :]))
+        apart = torch.cat((std[:place], std[place + 1 :]))
+        usual = _usual(others, apart)
+        off = (others / usual - 1.0) / apart
         relative.append(gain / usual - 1.0)
         disagreement.append(float(off.square().mean()))
         spread.append(max(1.0, float(off.abs().median()) / 0.6745))

@@ -9,6 +9,7 @@ from torch import Tensor
 from ..calibration import CalibrationWarning, Press, Touch, calibrate
 from ..evaluation.rows import markdown, number
 from ..model import Calibration, PointLights, Sensor
+from ..model.coverage import press_next
 from ..model.report import CandidateRow, PressRow, Report
 from ..pipeline.expected_error import expected_model_deg
 from ..stream import NOT_METRIC, use_calibration
@@ -44,6 +45,9 @@ def print_calibration(calibration: Calibration, candidates: bool = False) -> Non
     print(f"expected: {expected(calibration)}")
     if calibration.response is not None and (taught := calibration.response.taught) is not None:
         print(f"range: slopes up to {taught.angle_deg:.0f} degrees, depths up to {taught.depth_mm:.1f} mm; beyond, it extrapolates")
+    share, place = press_next(calibration)
+    if place is not None:
+        print(f"covered: presses lie on {share:.0%} of the skin; press next around x {place[0]}, y {place[1]} px")
     for line in left_out("press", [(row["name"], row.get("reason", "")) for row in report.get("presses", []) if not row["used"]]):
         print(line)
     if candidates:

@@ -291,11 +291,14 @@ REAL: dict[str, Callable[[Path, int | None], DataSet]] = {
     "digit_a": partial(_balls, meta=_FOTS),
     "digit_b": partial(_balls, remark="its labels are rough, 0.1 to 7 px from located centers, and not used", labelled=False),
     "gelslim_markers": partial(
-        _balls, remark="pitch of 0.05 mm and ball of 5 mm are assumed", meta=_GELSLIM, files=("ref.jpg", "sample_*.jpg")
+        _balls,
+        remark="pitch of 0.05 mm and ball of 5 mm are assumed (gelslim_mcube says 0.106 and 7.6)",
+        meta=_GELSLIM,
+        files=("ref.jpg", "sample_*.jpg"),
     ),
     "gelslim_b": _balls,
     "gelslim_mcube": _balls,
-    "wyh_wedge_markers": partial(_balls, remark="labels by hand, integers, 2 to 6 px from located centers, radii up to the ball's"),
+    "wyh_wedge_markers": partial(_balls, remark="its labels are 2 to 6 px from located centers, and not used", labelled=False),
     "wyh_wedge_clear": _balls,
     "ninedtact_white": _ninedtact,
     "wedge_video": _wedge,

@@ -2,6 +2,7 @@
 
 from . import gs_sdk
 from .calibration import Calibration, check_calibration
+from .coverage import distance_to_presses, press_next
 from .lights import PointLights, near_field_shading
 from .markers import FillMarkers, fill_markers, find_markers
 from .report import Report
@@ -20,9 +21,11 @@ __all__ = [
     "SensorPrior",
     "check_calibration",
     "check_sensor",
+    "distance_to_presses",
     "fill_markers",
     "find_markers",
     "gs_sdk",
     "near_field_shading",
+    "press_next",
     "shipped_sensors",
 ]

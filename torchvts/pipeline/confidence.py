@@ -29,6 +29,7 @@ from ..core.checks import (
 from ..core.geometry import gradient_of_depth, lengths
 from ..core.noise import noise_std as frame_noise_std
 from ..model.calibration import Calibration, check_calibration
+from ..model.coverage import COVERED, distance_to_presses
 from ..model.response_field import TaughtRange
 from ..normals import NormalFromIntensity, NormalFromResponse, as_normal_model
 from ..skin import ContactSettings
@@ -161,10 +162,11 @@ def bound_at(bound_95: Tensor, level: float, spread: float = 1.0) -> Tensor:
 
 
 def beyond_presses(calibration: Calibration, output: DepthOutput | ConfidentOutput) -> list[str]:
-    """For each frame what of it is steeper or deeper than the presses that the model was fitted to, in words; "" where nothing is.
+    """For each frame what of it is steeper, deeper or elsewhere than the presses of the model, in words; "" where nothing is.
 
-    It is said where 95 % of the contact reach further than :data:`BEYOND` times what 95 % of the presses did. Bounds grow earlier,
-    and without a step. Calibrations by lights have no such range, and older files do not know theirs.
+    It is said where 95 % of the contact reach further than :data:`BEYOND` times what 95 % of the presses did, and where half of it
+    lies where no press did (:func:`distance_to_presses`). Bounds grow earlier with slope and depth, and
+    without a step. Calibrations by lights have no such range, and older files do not know theirs.
 
     Args:
         calibration: of the unit.
@@ -180,6 +182,7 @@ def beyond_presses(calibration: Calibration, output: DepthOutput | ConfidentOutp
     if not isinstance(output, DepthOutput | ConfidentOutput):
         raise TypeError(f"output: expected a DepthOutput, got {type(output).__name__}: the output of the unit's pipeline")
     taught = None if calibration.response is None else calibration.response.taught
+    distance = distance_to_presses(calibration)
     texts = []
     for contact, normal, depth in zip(output.contact, output.normal, output.depth_mm, strict=True):
         parts: list[str] = []
@@ -191,6 +194,10 @@ def beyond_presses(calibration: Calibration, output: DepthOutput | ConfidentOutp
                 parts.append(f"slopes up to {angle:.0f} degrees; the presses taught up to {taught.angle_deg:.0f}")
             if deepest > BEYOND * taught.depth_mm:
                 parts.append(f"depths up to {deepest:.1f} mm; the presses taught up to {taught.depth_mm:.1f}")
+        if distance is not None and bool(contact.any()):
+            elsewhere = float((distance[contact[0].cpu()] > COVERED).double().mean())
+            if elsewhere > 0.5:
+                parts.append(f"{elsewhere:.0%} of the contact where no ball was pressed")
         texts.append("; ".join(parts))
     return texts
 

@@ -1,0 +1,102 @@
+"""What presses contradict and what they do not cover: pitch and diameters, one wrong ball, skin where none was pressed."""
+
+import dataclasses
+import warnings
+
+import pytest
+import torch
+
+import torchvts as vts
+from torchvts.calibration import CalibrationWarning
+from torchvts.calibration.by_presses import error_of_lights_deg
+from torchvts.evaluation.drawn_sensors import drawn_sensor
+from torchvts.model import distance_to_presses, press_next
+from torchvts.pipeline import beyond_presses
+
+UNIT = drawn_sensor(0)
+
+
+def bare(presses):
+    return [dataclasses.replace(press, center_px=None, contact_radius_px=None) for press in presses]
+
+
+def calibrate(sensor, presses, **options):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", CalibrationWarning)
+        calibration = vts.calibrate(UNIT.background, sensor, presses, **options)
+    return calibration, [str(warning.message) for warning in caught]
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return calibrate(UNIT.sensor, bare(UNIT.balls))
+
+
+def test_right_sizes_are_not_complained_of(whole):
+    calibration, warned = whole
+    assert not warned and all(row["used"] for row in calibration.report["presses"])
+
+
+@pytest.mark.parametrize("mistake", ["twice the pitch", "radii for diameters"])
+def test_sizes_that_all_presses_contradict_are_refused_and_forced(mistake):
+    sensor, presses = UNIT.sensor, bare(UNIT.balls)
+    if mistake == "twice the pitch":
+        sensor = dataclasses.replace(sensor, mm_per_pixel=2 * sensor.mm_per_pixel)
+    else:
+        presses = [dataclasses.replace(press, ball_diameter_mm=0.5 * press.ball_diameter_mm) for press in presses]
+    with pytest.raises(
+        ValueError, match=r"contacts 0\.9\d times as wide as the balls.*mm_per_pixel.*too large, or radii were given"
+    ):
+        calibrate(sensor, presses)
+    _, warned = calibrate(sensor, presses, force=True)
+    assert any("times as wide as the balls" in text for text in warned)
+
+
+@pytest.mark.parametrize("times", [1.9, 0.5])
+def test_one_wrong_ball_among_right_ones_is_left_out_and_no_other(times):
+    presses = bare(UNIT.balls)
+    presses[3] = dataclasses.replace(presses[3], ball_diameter_mm=times * presses[3].ball_diameter_mm)
+    calibration, _ = calibrate(UNIT.sensor, presses)
+    left_out = [row["name"] for row in calibration.report["presses"] if not row["used"]]
+    assert left_out == [presses[3].name]
+
+
+def test_presses_far_from_each_other_do_not_contradict_each_other():
+    """Three presses at three corners say nothing of each other's places."""
+    half = torch.tensor([UNIT.sensor.width / 2, UNIT.sensor.height / 2])
+    outward = sorted(UNIT.balls, key=lambda press: -float((torch.tensor(press.center_px) - half).norm()))
+    calibration, _ = calibrate(UNIT.sensor, bare(outward[:3]))
+    assert all(row["used"] for row in calibration.report["presses"])
+
+
+def test_the_order_of_presses_does_not_matter(whole):
+    calibration, _ = calibrate(UNIT.sensor, bare(UNIT.balls)[::-1])
+    ours, theirs = (torch.tensor(one.response.field.coefficient) for one in (calibration, whole[0]))
+    assert torch.allclose(ours, theirs, atol=1e-6)
+
+
+def test_skin_without_presses_is_known_and_said(whole):
+    left = [press for press in bare(UNIT.balls) if dict(places())[press.name][0] < UNIT.sensor.width / 2]
+    calibration, _ = calibrate(UNIT.sensor, left)
+    share, place = press_next(calibration)
+    assert share < 0.7 and place is not None and place[0] > UNIT.sensor.width / 2
+    assert float(distance_to_presses(calibration)[place[1], place[0]]) > 1.5
+    assert press_next(whole[0])[0] > share
+    right = [press for press in UNIT.balls if press.center_px[0] > 0.75 * UNIT.sensor.width]
+    out = vts.DepthPipeline.from_calibration(calibration)(right[0].image[None])
+    assert "of the contact where no ball was pressed" in beyond_presses(calibration, out)[0]
+
+
+def places():
+    return [(press.name, press.center_px) for press in UNIT.balls]
+
+
+def test_no_ball_in_sight_gives_no_mean_of_nothing(whole):
+    """The error of lights on balls of which no pixel is seen is unknown, not NaN, which no file can hold."""
+    from torchvts.calibration.contacts import read_contacts
+
+    lights = vts.PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
+    unit = vts.Calibration.from_lights(lights, UNIT.sensor, UNIT.background)
+    contacts = read_contacts(UNIT.balls[:1], UNIT.background, UNIT.sensor)
+    contacts[0].contact_radius_mm, contacts[0].known = 1e-6, True
+    assert error_of_lights_deg(unit, UNIT.balls[:1], contacts, 0.0) is None

@@ -72,7 +72,7 @@ def test_low_lights_under_strong_noise(ring, turn_deg, seed, known, level):
     calibration = vts.Calibration.from_lights(lights if known else vts.fit_lights(background, FULL).lights, FULL, background)
     out = vts.DepthPipeline.from_calibration(calibration, "precise")(scenes.render(scene, lights, **camera, seed=seed + 1))
     assert metrics.depth_error(out.depth_mm, scene.depth_mm, PITCH).max_px < 0.85
-    assert metrics.depth_error(out.depth_mm, scene.depth_mm, PITCH, scene.contact).rms_px < 0.20
+    assert metrics.depth_error(out.depth_mm, scene.depth_mm, PITCH, scene.contact).rms_px < (0.20 if known else 0.24)
 
 
 def share_of_the_plain_inverse(lights, scene, noise_std):

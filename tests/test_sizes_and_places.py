@@ -100,3 +100,26 @@ def test_no_ball_in_sight_gives_no_mean_of_nothing(whole):
     contacts = read_contacts(UNIT.balls[:1], UNIT.background, UNIT.sensor)
     contacts[0].contact_radius_mm, contacts[0].known = 1e-6, True
     assert error_of_lights_deg(unit, UNIT.balls[:1], contacts, 0.0) is None
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_is_calibrated_can_be_saved_and_loaded(seed, tmp_path):
+    """Odd presses among good ones: darker, saturated, twice, of another size, no contact. A refusal is an answer too."""
+    generator = torch.Generator().manual_seed(seed)
+    presses = []
+    for k in torch.randperm(len(UNIT.balls), generator=generator)[: 1 + seed].tolist():
+        press = bare(UNIT.balls)[k]
+        odd = int(torch.randint(7, (1,), generator=generator))
+        image = (press.image, press.image * 0.3, (press.image * 1.8).clamp(0, 1), UNIT.background)[odd] if odd < 4 else press.image
+        size = press.ball_diameter_mm * (0.6 if odd == 4 else 1.0)
+        presses += [dataclasses.replace(press, image=image, ball_diameter_mm=size, name=f"{press.name}, {odd}")] * (
+            2 if odd == 5 else 1
+        )
+    try:
+        calibration, _ = calibrate(UNIT.sensor, presses)
+    except ValueError as error:
+        assert str(error).startswith(("presses: ", "background: "))
+        return
+    calibration.save(tmp_path / "unit.safetensors")
+    loaded = vts.Calibration.load(tmp_path / "unit.safetensors")
+    assert loaded.report == calibration.report and torch.equal(loaded.background, calibration.background)

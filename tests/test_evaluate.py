@@ -335,7 +335,7 @@ def test_a_folder_of_balls_is_read_by_its_meta_and_labels(tmp_path, monkeypatch)
     (tmp_path / "labels.csv").write_text("\n".join(labels))
     meta = {"height": 24, "width": 32, "pitch": 0.1, "diameter": 4.84, "markers": False}
     (tmp_path / "meta.json").write_text(json.dumps(meta))
-    read = sets.REAL["wyh_wedge_markers"](tmp_path, None)
+    read = sets._balls(tmp_path, None)
     sensor = read.folds[0].sensor
     assert (sensor.height, sensor.width, sensor.mm_per_pixel, sensor.markers) == (24, 32, 0.1, None)
     assert [[press.name for press in fold.learned] for fold in read.folds] == [["ball_1", "ball_10"], ["ball_9", "ball_100"]]

@@ -1,6 +1,7 @@
 """Calibrate a unit from presses of balls: preprocessing, response fields, and how well point lights do on the same balls."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -118,7 +119,7 @@ def _choose_preprocessing(
                 "model": f"response, preprocessed with gamma {other.exponent:g} and a blur of {other.blur_px:g} px",
                 "family": Family.of(fit.model.field).label(),
                 "parameters": 2 * fit.model.field.size(),
-                "score_deg": score,
+                "score_deg": score if math.isfinite(score) else None,
                 "passes": 1,
             }
         )

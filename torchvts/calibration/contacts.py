@@ -240,6 +240,8 @@ def press_row(contact: Contact, sensor: Sensor) -> PressRow:
     row: PressRow = {"name": contact.name, "used": not contact.reason, "reason": contact.reason}
     if "error_deg" in contact.metrics:
         row["error_deg"], row["gain"] = contact.metrics["error_deg"], contact.metrics["gain"]
+    if "gain_std" in contact.metrics:
+        row["gain_std"] = contact.metrics["gain_std"]
     if contact.contact_radius_mm > 0:
         row["center_px"] = (contact.center_mm / sensor.mm_per_pixel + middle_px(sensor)).tolist()
         row["contact_radius_px"] = contact.contact_radius_mm / sensor.mm_per_pixel

@@ -7,6 +7,7 @@ slope points to the center; and everywhere the slope of a surface has no curl, n
 
 import copy
 import dataclasses
+import math
 from dataclasses import dataclass
 
 import torch
@@ -243,8 +244,9 @@ class Evidence:
         return [list(row) for row in zip(*errors)]
 
     def mean_error_deg(self, solutions: list[Tensor]) -> float:
-        """Mean of :meth:`errors_deg`."""
-        return sum(self.errors_deg(solutions)) / len(self.forms)
+        """Mean of :meth:`errors_deg` over contacts of which pixels are seen; infinite where there are none."""
+        errors = [error for error in self.errors_deg(solutions) if not math.isnan(error)]
+        return sum(errors) / len(errors) if errors else math.inf
 
     def solve(self, penalty: Tensor, start: Tensor | None) -> Tensor:
         """Coefficients by all contacts."""

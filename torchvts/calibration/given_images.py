@@ -72,9 +72,20 @@ def sort_presses(background: Tensor, presses: Sequence[Press]) -> Sorted:
             f"presses: expected the light of the background, got images that differ from it by {min(differences):.0%} and more "
             f"in the median of the skin, at most {OTHER_UNIT:.0%} is usual: another unit, or another light"
         )
-    kept = [press for press, view in zip(presses, found, strict=True) if view is None]
+    reasons = {k: f"it {view.in_words()}" for k, view in odd}
+    for k in range(len(presses)):
+        if k not in reasons and (first := _first_like(presses, k)) != k:
+            reasons[k] = f"it is {presses[first].name} once more"
+    kept = [press for k, press in enumerate(presses) if k not in reasons]
     _check_contact(background, kept)
-    return Sorted(kept, [(k, f"it {view.in_words()}") for k, view in odd])
+    return Sorted(kept, sorted(reasons.items()))
+
+
+def _first_like(presses: Sequence[Press], k: int) -> int:
+    """Index of the first press with the image and the diameter of the k-th."""
+    wanted = presses[k]
+    alike = (i for i, press in enumerate(presses) if press.ball_diameter_mm == wanted.ball_diameter_mm)
+    return next(i for i in alike if torch.equal(presses[i].image, wanted.image))
 
 
 def _check_levels(background: Tensor, presses: Sequence[Press]) -> None:

@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from ..core.checks import check_image, check_integer, check_record, check_switch
 from ..core.robust import TUKEY, tukey_weight
+from ..core.views import TWELVE_BITS
 from ..model.lights import PointLights
 from ..model.sensor import Sensor, check_sensor
 from .background import (
@@ -176,7 +177,7 @@ def fit_lights(
 
 
 def check_exposure(background: Tensor) -> None:
-    """Raise unless every channel of a background has light, is not saturated, and varies.
+    """Raise unless every channel of a background has light in the whole range of values, is not saturated, and varies.
 
     Raises:
         ValueError: names the channel and the value.
@@ -197,6 +198,11 @@ def check_exposure(background: Tensor) -> None:
                 f"background: expected light that varies, got a channel {name} that is constant at {mean:.4f}: "
                 "not a camera image of a lit skin"
             )
+    most = float(background.max())
+    if most <= TWELVE_BITS + 1e-6:
+        raise ValueError(
+            f"background: expected values up to 1, got at most {round(65535 * most)} of 65535: 12 bits stored in 16, or black?"
+        )
 
 
 class _Loop(NamedTuple):

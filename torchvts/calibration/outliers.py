@@ -61,6 +61,9 @@ def _leave_out(contacts: list[Contact], prior: ResponseModel | None, half_mm: fl
         gains, errors = evidence.gains(solutions), evidence.errors_deg(own)
         for contact, gain, error in zip(left, gains.tolist(), errors):
             contact.metrics |= {"error_deg": error, "gain": gain}
+        if prior is None:
+            for contact, std in zip(left, _uncertainty(evidence).tolist()):
+                contact.metrics["gain_std"] = std
         wrong = _wrong_by_prior(gains) if prior is not None else _wrong_by_others(evidence, gains)
         if wrong is not None:
             _reject_diameter(left, wrong, float(gains[wrong]), prior is not None)
@@ -73,6 +76,10 @@ def _reject_diameter(left: list[Contact], wrong: int, gain: float, by_prior: boo
     reference = "the sensor's prior" if by_prior else f"the other {len(left) - 1} presses" if len(left) > 2 else "the other press"
     seen = 2 * press.radius_mm / max(gain, 1e-3)
     press.reason = f"by {reference} the ball seems {seen:.2f} mm wide, but {2 * press.radius_mm:g} mm was given"
+    if not by_prior:
+        press.reason += (
+            ": a wrong diameter, or skin that answers otherwise than where they lie; more presses beside it will show which"
+        )
     if not by_prior and len(left) == 2:
         left[1 - wrong].reason = "contradicts the only other press: one of the two diameters is wrong"
 

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 from .contacts import Contact, used
 
-WIDE = 0.84
+WIDE = 0.81
 """Contact radius over the ball's, in the median over presses, from which sizes are wrong: it is 0.55 to 0.78 on eleven real and
-eight drawn sensors, and 0.81 to 0.95 with a pitch that is twice too large."""
+eight drawn sensors, and 0.8 to 0.95 with a pitch that is twice too large."""
 
 WIDE_OUTLINE = 1.75
 """The same of the outline of the strong change of light: 0.54 to 1.61, and 1.4 to 3.2."""
@@ -38,8 +38,8 @@ def objection_to_sizes(contacts: Sequence[Contact], mm_per_pixel: float) -> str:
         return ""
     return (
         f"presses: expected contacts narrower than their balls, got contacts {wide:.2f} times as wide as the balls, and outlines "
-        f"{outline:.2f} times (0.5 to 0.8, and 0.6 to 1.6, are usual): mm_per_pixel of {mm_per_pixel:g} is too large, or "
-        "radii were given for diameters"
+        f"{outline:.2f} times (0.5 to 0.8, and 0.6 to 1.6, are usual): either mm_per_pixel, {mm_per_pixel:g}, is too large, "
+        "or radii were given for diameters"
     )
 
 

@@ -17,6 +17,9 @@ from ..stream import NOT_METRIC, use_calibration
 SHOWN = 5
 """Of a list, so many lines are printed."""
 
+ALONE = 0.2
+"""Standard deviation of the gain of a press by the others, from which they do not show a diameter that is wrong by half."""
+
 BY = {
     "given": "given",
     "sensor_file": "positions from the sensor file",
@@ -48,6 +51,10 @@ def print_calibration(calibration: Calibration, candidates: bool = False) -> Non
     share, place = press_next(calibration)
     if place is not None:
         print(f"covered: presses lie on {share:.0%} of the skin; press next around x {place[0]}, y {place[1]} px")
+    alone = [row["name"] for row in report.get("presses", []) if row["used"] and row.get("gain_std", 0.0) > ALONE]
+    if alone:
+        named = ", ".join(alone[:SHOWN]) + (f" and {len(alone) - SHOWN} more" if len(alone) > SHOWN else "")
+        print(f"not checked: diameters of {named}: no other press lies near enough")
     for line in left_out("press", [(row["name"], row.get("reason", "")) for row in report.get("presses", []) if not row["used"]]):
         print(line)
     if candidates:

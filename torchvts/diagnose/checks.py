@@ -335,8 +335,8 @@ CHECKS = (
           "faint contact: {value:.3f} mm at its deepest, less than a pixel; its rim is below the noise", "note"),
     Check("steep_walls", _steepest, "walls of {value:.0f} degrees: a light may be blocked there, and integration cannot keep a "
           "step; use precise mode, trust the top only", "note"),
-    Check("beyond_presses", _beyond_presses, "{text}: normals and depth are extrapolated there; press a smaller ball, or "
-          "deeper, and calibrate again"),
+    Check("beyond_presses", _beyond_presses, "{text}: normals and depth are extrapolated there; calibrate again with "
+          "presses of a smaller ball, deeper, or in that place"),
     Check("shadow", _shadow, "a light is blocked in {value:.0%} of the contact: slopes there are estimated from two lights; press "
           "less, or raise the LEDs", lambda figures: "warning" if figures["value"] > 0.3 else "note", above=0.01),
     Check("cast_shadow", _cast_shadow, "a shadow falls on {value:.1%} of the image, on flat skin: {remedy}", above=0.002),

@@ -8,8 +8,8 @@ from .calibration import Calibration, check_calibration
 COVERED = 1.5
 """Distance from the middle of a press, in radii of its contact, up to which it shows the response of the skin."""
 
-MARGIN = 0.6
-"""Distance of the next press from the image border, in contact radii of the usual press: most of its circle must be seen."""
+MARGIN = 1.0
+"""Distance of the next press from the image border, in contact radii of the usual press: its circle must be seen."""
 
 
 def distance_to_presses(calibration: Calibration) -> Tensor | None:

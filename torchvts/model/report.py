@@ -73,6 +73,7 @@ class PressRow(_PressKeys, total=False):
         contact_radius_px: radius of the contact.
         error_deg: mean angle between the ball's normals and those of the prior, or of the other presses, degrees.
         gain: slopes of the prior, or of the other presses, divided by the ball's slopes.
+        gain_std: standard deviation of that, as far as the other presses know the place; absent where a prior is compared.
     """
 
     reason: str
@@ -80,6 +81,7 @@ class PressRow(_PressKeys, total=False):
     contact_radius_px: float
     error_deg: float
     gain: float
+    gain_std: float
 
 
 class TouchRow(TypedDict):

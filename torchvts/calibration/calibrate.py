@@ -28,7 +28,7 @@ from .pattern import compare_patterns
 from .presses import Press, Touch, check_presses, check_touches
 from .prior_choice import FromPresses, fit_with_or_without
 from .prior_score import held_out_by_groups
-from .refusals import NoUsablePress, check_colour, check_coloured_background, check_coloured_contacts, other_crop
+from .refusals import check_colour, check_coloured_background, check_coloured_contacts
 from .response_fit import Candidates
 from .sizes import objection_to_sizes
 from .touching import with_contact_share
@@ -282,21 +282,13 @@ def _fit_presses(given: _Given, prior: _Prior, touched: TouchResult | None) -> F
     """The response fit, from the prior unless it is contradicted, or from touches.
 
     Raises:
-        ValueError: no press can be used; names another crop if that is why.
+        NoUsablePress: none can be used.
     """
     background, sensor, presses = given.background, given.sensor, given.presses
-    try:
-        if prior.model is not None and touched is None:
-            return fit_with_or_without(background, sensor, presses, prior.model, prior.objection, given.progress)
-        start = None if touched is None else touched.model
-        return FromPresses(by_presses(background, sensor, presses, start, given.progress), "")
-    except NoUsablePress as error:
-        crop = other_crop(background, [press.image for press in presses])
-        if crop is None:
-            raise
-        raise ValueError(
-            f"presses: expected the crop of the background, got images that show it {crop.in_words()}; {error}"
-        ) from error
+    if prior.model is not None and touched is None:
+        return fit_with_or_without(background, sensor, presses, prior.model, prior.objection, given.progress)
+    start = None if touched is None else touched.model
+    return FromPresses(by_presses(background, sensor, presses, start, given.progress), "")
 
 
 def _with_presses(given: _Given, lights: LightsResult, prior: _Prior, touched: TouchResult | None) -> tuple[Calibration, list[str]]:

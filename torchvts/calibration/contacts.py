@@ -214,14 +214,23 @@ def channel_structure(image: Tensor) -> float:
     height): 0.01 to 0.03 for the backgrounds of most sensors, 0.10 for a Wedge, whose LEDs are in the image; 0.06 to 0.36 under
     clear contact.
     """
-    stride = max(1, min(image.shape[1], image.shape[2]) // 120)
-    log = (torch.nn.functional.avg_pool2d(image[None].float(), stride) + PEDESTAL).log()
-    log = log - log.mean(1, keepdim=True)
-    height = log.shape[2]
-    band = blur(log, gaussian_weights(height / 40.0)) - blur(log, gaussian_weights(height / 16.0))
-    margin = round(0.14 * height)
-    inner = band[0, :, margin : height - margin, margin : log.shape[3] - margin]
+    band = channel_band(image, 120, image.shape[1])[0]
+    height, width = band.shape[1:]
+    margin = min(round(0.14 * height), (min(height, width) - 1) // 2)
+    inner = band[:, margin : height - margin, margin : width - margin]
     return float(inner.square().sum(0).sqrt().flatten().quantile(0.99))
+
+
+def channel_band(image: Tensor, cells: int, side_px: int) -> Tensor:
+    """Log ratios of the channels of an image (3, H, W), band-passed by Gaussians of 1/40 and 1/16 of a side, (1, 3, h, w).
+
+    There are about ``cells`` along the shorter side.
+    """
+    stride = max(1, min(image.shape[1:]) // cells)
+    log = (torch.nn.functional.avg_pool2d(image.detach().cpu().float()[None], stride) + PEDESTAL).log()
+    log = log - log.mean(1, keepdim=True)
+    side = float(side_px // stride)
+    return blur(log, gaussian_weights(side / 40.0)) - blur(log, gaussian_weights(side / 16.0))
 
 
 def first_pass_depths(contacts: Sequence[Contact], response: ResponseField, pitch_mm: float) -> list[Tensor]:

@@ -10,8 +10,7 @@ from torch import Tensor
 from ..core.arrays import array_of
 from ..core.blur import blur, gaussian_weights
 from ..core.views import SAME_VIEW, TWELVE_BITS, Views
-from ..model.calibration import PEDESTAL
-from .contacts import DARK, MOST_SATURATED
+from .contacts import DARK, MOST_SATURATED, channel_band
 from .presses import Press
 from .refusals import other_crop
 
@@ -126,11 +125,8 @@ def _structure(image: Tensor) -> Tensor:
 
     As :func:`channel_structure`, but of each place.
     """
-    stride = max(1, min(image.shape[1:]) // 60)
-    log = (torch.nn.functional.avg_pool2d(image.detach().cpu().float()[None], stride) + PEDESTAL).log()
-    log = log - log.mean(dim=1, keepdim=True)
-    height = min(log.shape[2:])
-    band = blur(log, gaussian_weights(height / 40.0)) - blur(log, gaussian_weights(height / 16.0))
+    band = channel_band(image, 60, min(image.shape[1:]))
+    height = min(band.shape[2:])
     around = blur(band.square().sum(dim=1, keepdim=True), gaussian_weights(height / 20.0))[0, 0].sqrt()
     margin = round(0.1 * height)
     return around[margin : around.shape[0] - margin, margin : around.shape[1] - margin]

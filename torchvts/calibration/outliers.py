@@ -61,10 +61,13 @@ def _leave_out(contacts: list[Contact], prior: ResponseModel | None, half_mm: fl
         gains, errors = evidence.gains(solutions), evidence.errors_deg(own)
         for contact, gain, error in zip(left, gains.tolist(), errors):
             contact.metrics |= {"error_deg": error, "gain": gain}
-        if prior is None:
-            for contact, std in zip(left, _uncertainty(evidence).tolist()):
-                contact.metrics["gain_std"] = std
-        wrong = _wrong_by_prior(gains) if prior is not None else _wrong_by_others(evidence, gains)
+        if prior is not None:
+            wrong = _wrong_by_prior(gains)
+        else:
+            std = _uncertainty(evidence)
+            for contact, one in zip(left, std.tolist()):
+                contact.metrics["gain_std"] = one
+            wrong = _wrong_by_others(evidence, gains, std)
         if wrong is not None:
             _reject_diameter(left, wrong, float(gains[wrong]), prior is not None)
         elif not _reject_slopes(left, errors, prior is not None):
@@ -132,14 +135,13 @@ def _usual(gains: Tensor, std: Tensor) -> float:
     return max(float(values[int((weights.cumsum(0) < 0.5 * weights.sum()).sum())]), 1e-3)
 
 
-def _wrong_by_others(evidence: Evidence, gains: Tensor) -> int | None:
-    """The press with a wrong diameter, if any; each gain is by the field of the other presses.
+def _wrong_by_others(evidence: Evidence, gains: Tensor, std: Tensor) -> int | None:
+    """The press with a wrong diameter, if any; each gain, and its standard deviation, is by the field of the other presses.
 
     A wrong press bends the field for all, so the wrong one is that without which the others agree best. It must differ from them
     by more than they differ from each other, and by more than they know of its place.
     """
     penalty = SCREENING_PENALTY * evidence.family.penalty()
-    std = _uncertainty(evidence)
     relative, disagreement, spread = [], [], []
     for place, gain in enumerate(gains.tolist()):
         rest = evidence.without(place)

@@ -110,16 +110,17 @@ class Recording:
             with self._stage("light"):
                 image = self._light.correct(frame)
             output: DepthOutput | None = None
-            with self._stage("depth"):
-                seen, slopes = self.pipe.frame_of(image.to(self.device))
-                if solve:
-                    output = DepthOutput(*(part.cpu() for part in self.pipe.solved(seen, slopes)))
-            if self._follow:
-                with self._stage("light"):
-                    moved = (seen.weight > 0.5).cpu()
-                    seconds = 1.0 / self._fps if self._before is None else time_s - self._before
-                    # copies: the caller may write into what is returned
-                    self._unlearned = (frame.clone() if image is frame else frame, moved, seconds)
+            if solve or self._follow:
+                with self._stage("depth"):
+                    seen, slopes = self.pipe.frame_of(image.to(self.device))
+                    if solve:
+                        output = DepthOutput(*(part.cpu() for part in self.pipe.solved(seen, slopes)))
+                if self._follow:
+                    with self._stage("light"):
+                        moved = (seen.weight > 0.5).cpu()
+                        seconds = 1.0 / self._fps if self._before is None else time_s - self._before
+                        # copies: the caller may write into what is returned
+                        self._unlearned = (frame.clone() if image is frame else frame, moved, seconds)
         self._before = time_s
         return image, output
 

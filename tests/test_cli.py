@@ -4,13 +4,11 @@ import dataclasses
 import importlib
 import subprocess
 import sys
-import warnings
 
 import pytest
 import torch
 
 import torchvts as vts
-from torchvts.calibration.azimuths import wrong_azimuths
 from torchvts.cli import COMMANDS, main
 from torchvts.cli.summary import SHOWN, expected, left_out
 from torchvts.core.spelling import suggest
@@ -144,35 +142,6 @@ def test_what_to_expect_follows_the_source(rig, mini_by_prior):
         mini_by_prior.response, mini_by_prior.sensor, mini_by_prior.background, {"model": "response", "source": "stand_in"}
     )
     assert "NOT METRIC" in expected(rough)
-
-
-@pytest.mark.parametrize(
-    "azimuths, cause",
-    [
-        ((250.0, 130.0, 10.0), "red and blue are swapped"),
-        ((130.0, 250.0, 10.0), "the channels are in another order"),
-        ((100.0, 220.0, 340.0), "all are turned by -90: is the image rotated or flipped?"),
-        ((350.0, 230.0, 110.0), "they are counted from x towards y, which points down"),
-        ((40.0, 100.0, 300.0), "correct them in the sensor file, or leave them out"),
-    ],
-)
-def test_the_cause_of_wrong_azimuths(ring, azimuths, cause):
-    text = wrong_azimuths(ring().position_mm, azimuths, 5.0)
-    assert text.endswith(f"for R, G, B, the image shows 10, 130, 250: {cause}")
-
-
-@pytest.mark.parametrize(
-    "azimuths, wrong", [((10.0, 130.0, 250.0), False), ((25.0, 145.0, 265.0), True), ((190.0, 310.0, 70.0), True)]
-)
-def test_wrong_azimuths_are_called_wrong_azimuths(ring, azimuths, wrong):
-    scene = vts.scenes.undeformed(vts.scenes.sphere_press(10.0, 1.0, (0.0, 0.0), 48, 64, 0.6))
-    background = vts.scenes.render(scene, ring(), noise_std=0.002)[0].detach()
-    sensor = vts.Sensor("rig", 48, 64, 0.6, gamma=1.0, light_azimuth_deg=azimuths)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", vts.CalibrationWarning)
-        vts.calibrate(background, sensor)
-    messages = [str(w.message) for w in caught if issubclass(w.category, vts.CalibrationWarning)]
-    assert any("wrong azimuths: light_azimuth_deg says" in message for message in messages) == wrong, messages
 
 
 def test_a_video_or_a_folder_in_the_wrong_place_names_the_way_that_works(rig, tmp_path):

@@ -11,7 +11,7 @@ import references
 import torch
 
 import torchvts as vts
-from torchvts.calibration.background import AMBIENT, GLOSS, VIGNETTING, BackgroundPixels, paraboloid_start
+from torchvts.calibration.background import BackgroundPixels, paraboloid_start
 from torchvts.calibration.levenberg import LevenbergMarquardt, residual_and_jacobian
 
 scenes = vts.scenes
@@ -132,9 +132,6 @@ def test_the_response_of_the_camera_is_part_of_the_model(ring, small_sensor):
     assert furthest_mm(vts.fit_lights(image, small_sensor).lights, lights) > 5.0
 
 
-VIGNETTED, LIT = "three lights, vignetting", "three lights, ambient light"
-
-
 def seen(scene, lights, vignetting=0.0, ambient=0.0, gamma=1.0, noise_std=0.003, bits=8):
     """A camera with ambient light, which is added to what the lens lets through."""
     light = scenes.render(scene, lights, vignetting=vignetting) + ambient
@@ -151,47 +148,27 @@ def largest_px(calibration, lights, **camera):
     return float((out.depth_mm - scene.depth_mm).abs().max()) / 0.25
 
 
-CAMERAS = {
-    "clean": ({}, "three lights", 1.0),
-    "vignetting": ({"vignetting": 0.2}, VIGNETTED, 1.0),
-    "ambient": ({"ambient": 0.1}, LIT, 1.0),
-    "gamma": ({"gamma": 2.2}, "three lights", 2.2),
-    "gamma, vignetting": ({"gamma": 2.2, "vignetting": 0.2}, VIGNETTED, 2.2),
-}
-
-
-QUICK_CAMERAS = ("ambient", "gamma, vignetting")
-
-
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.long] * (name not in QUICK_CAMERAS)) for name in CAMERAS])
-def test_the_camera_is_found_and_the_depth_does_not_feel_it(low_rig, small_sensor, name):
-    camera, family, gamma = CAMERAS[name]
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+def test_the_camera_is_found_and_the_depth_does_not_feel_it(low_rig, small_sensor, gamma):
     flat = scenes.undeformed(scenes.sphere_press(10, 1, (0, 0), 120, 160, 0.25))
     with warnings.catch_warnings():
         warnings.simplefilter("error", vts.CalibrationWarning)
-        calibration = vts.calibrate(seen(flat, low_rig, **camera)[0], small_sensor)
+        calibration = vts.calibrate(seen(flat, low_rig, gamma=gamma)[0], small_sensor)
     report = calibration.report
-    assert (report["model"], report["family"], report["gamma"]) == ("point_lights", family, gamma)
+    assert (report["model"], report["family"], report["gamma"]) == ("point_lights", "three lights", gamma)
     assert furthest_mm(calibration.lights, low_rig) < 0.1
-    assert report["vignetting"] == pytest.approx(camera.get("vignetting", 0.0), abs=0.02)
-    assert report["ambient"] == pytest.approx([camera.get("ambient", 0.0)] * 3, abs=0.005)
-    assert largest_px(calibration, low_rig, **camera) < 0.3
+    assert largest_px(calibration, low_rig, gamma=gamma) < 0.3
     assert json.loads(json.dumps(report)) == report
 
 
-def test_the_table_of_candidates_says_what_was_tried_and_why_not(low_rig, small_sensor):
-    calibration = vts.calibrate(rest(low_rig, small_sensor, noise_std=0.003, vignetting=0.2), small_sensor)
-    first, *others = calibration.report["candidates"]
-    assert (
-        first["family"] == VIGNETTED
-        and first["parameters"] == 13
-        and first["note"].startswith("one image constrains the lights to 0.0 deg")
-    )
-    assert {row["family"] for row in others} >= {"three lights", LIT}
-    assert all(row["model"] == "point lights" and row["held_out"] > 0 for row in others)
-    assert next(row for row in others if row["family"] == LIT)["note"].startswith("rejected: ")
-    assert "three lights, vignetting: the smallest within 1%" in calibration.report["reason"]
-    assert "-> 0.0%" in calibration.report["reason"]
+@pytest.mark.parametrize("camera", [{"vignetting": 0.2}, {"ambient": 0.1}])
+def test_what_lights_do_not_explain_is_said(low_rig, small_sensor, camera):
+    """The fit is of lights alone: a lens that darkens the corners, or stray light, leaves a misfit."""
+    flat = scenes.undeformed(scenes.sphere_press(10, 1, (0, 0), 120, 160, 0.25))
+    with warnings.catch_warnings(record=True):
+        warnings.simplefilter("always")
+        report = vts.calibrate(seen(flat, low_rig, **camera)[0], small_sensor).report
+    assert max(report["misfit"]) > 0.008 and "misfit of" in report["candidates"][0]["note"]
 
 
 def test_ambient_light_survives_the_file(tmp_path, low_rig, small_sensor):
@@ -205,44 +182,6 @@ def test_ambient_light_survives_the_file(tmp_path, low_rig, small_sensor):
     assert float((rested[0] - loaded.flat).abs().max()) < 1e-5
     with pytest.raises(ValueError, match=r"ambient: expected \(3,\) finite values of at least 0"):
         vts.Calibration.from_lights(low_rig, small_sensor, ambient=torch.tensor([0.1, -0.1, 0.1]))
-
-
-@pytest.mark.parametrize("vignetting", [0.0, pytest.param(0.2, marks=pytest.mark.long)])
-def test_known_azimuths_are_kept(low_rig, vignetting):
-    sensor = vts.Sensor("rig", 120, 160, 0.25, light_azimuth_deg=(10.0, 130.0, 250.0))
-    calibration = vts.calibrate(rest(low_rig, sensor, noise_std=0.005, bits=8, vignetting=vignetting), sensor)
-    azimuth = torch.rad2deg(torch.atan2(calibration.lights.position_mm[:, 1], calibration.lights.position_mm[:, 0]))
-    assert azimuth.tolist() == pytest.approx([10.0, 130.0, -110.0], abs=1e-3)
-    assert calibration.report["family"] == "three lights at known azimuths" + ", vignetting" * (vignetting > 0)
-    assert calibration.report["candidates"][0]["parameters"] == (10 if vignetting else 9)
-    assert furthest_mm(calibration.lights, low_rig) < 0.2
-
-
-def test_azimuths_in_the_wrong_order_are_complained_of(low_rig):
-    sensor = vts.Sensor("rig", 120, 160, 0.25, light_azimuth_deg=(130.0, 10.0, 250.0))
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", vts.CalibrationWarning)
-        calibration = vts.calibrate(rest(low_rig, sensor, noise_std=0.005, bits=8), sensor)
-    assert any("the image shows 10, 130, 250: red and green are swapped" in str(warning.message) for warning in caught)
-    free = next(row for row in calibration.report["candidates"] if row["family"] == "three lights")
-    assert "rejected: light R is -120 deg off the azimuth in the sensor file" in free["note"]
-
-
-def test_an_azimuth_that_no_file_names_is_refused(tiny):
-    with pytest.raises(ValueError, match="known_azimuth: sensor 'rig' names no light_azimuth_deg"):
-        vts.fit_lights(tiny[1], tiny[0], known_azimuth=True)
-    with pytest.raises(TypeError, match="vignetting: expected True or False, got int"):
-        vts.fit_lights(tiny[1], tiny[0], vignetting=3)
-
-
-@pytest.mark.parametrize("extra", [{"vignetting": True}, pytest.param({"ambient": True}, marks=pytest.mark.long)])
-def test_the_stated_spread_of_a_larger_model_is_the_true_one(low_rig, small_sensor, extra):
-    scores = []
-    for seed in range(4):
-        image = rest(low_rig, small_sensor, noise_std=0.01, bits=8, vignetting=0.2 * ("vignetting" in extra), seed=seed)
-        fit = vts.fit_lights(image, small_sensor, **extra)
-        scores.append((fit.lights.position_mm.detach() - low_rig.position_mm).double() / fit.position_std_mm)
-    assert 0.5 < float(torch.stack(scores).square().mean().sqrt()) < 2.0
 
 
 TACTO_MM = torch.tensor([[-17.3205, -10.0, 17.0], [17.3205, -10.0, 17.0], [0.0, 20.0, 17.0]])  # manifest.json, v up
@@ -332,23 +271,6 @@ def test_levenberg_marquardt_solves_independent_problems():
     assert bool((losses[1:] <= losses[:-1]).all()), "a step that would raise the loss is not taken"
 
 
-def test_levenberg_marquardt_ties_groups():
-    """Two groups of two numbers, the second number shared: the least squares of the joint problem."""
-    tie = torch.zeros(2, 2, 3, dtype=torch.float64)
-    tie[0, 0, 0] = tie[1, 0, 1] = tie[0, 1, 2] = tie[1, 1, 2] = 1.0
-    place, target = torch.tensor([0.0, 1.0, 3.0], dtype=torch.float64), torch.tensor([[1.0, 2.0, 4.5], [0.0, -1.0, 7.0]]).double()
-    parameter = torch.zeros(2, 2, dtype=torch.float64, requires_grad=True)
-    optimiser = LevenbergMarquardt(parameter, tie=tie)
-    for _ in range(30):
-        optimiser.step(lambda values: values[:, :1] + values[:, 1:] * place - target)
-    design = torch.zeros(6, 3, dtype=torch.float64)
-    design[:3, 0] = design[3:, 1] = 1.0
-    design[:, 2] = place.repeat(2)
-    expected = torch.linalg.lstsq(design, target.flatten()).solution
-    assert parameter.detach()[:, 0].tolist() == pytest.approx(expected[:2].tolist(), abs=1e-9)
-    assert parameter.detach()[:, 1].tolist() == pytest.approx([float(expected[2])] * 2, abs=1e-9)
-
-
 def test_levenberg_marquardt_weighs_residuals():
     target, weight = torch.tensor([[1.0, 2.0, 9.0]], dtype=torch.float64), torch.tensor([[3.0, 1.0, 0.0]], dtype=torch.float64)
     parameter = torch.zeros(1, 1, dtype=torch.float64, requires_grad=True)
@@ -418,13 +340,12 @@ def test_a_renderers_material_is_no_matt_skin(out_mm, height_mm, azimuth_deg):
     assert float((fit.lights.position_mm.detach() - torch.from_numpy(lights)).norm(dim=1).max()) < 1.0
 
 
-@pytest.mark.parametrize("value", [0.1, 0.0, -0.05, -0.5, 2.0])
-@pytest.mark.parametrize("terms", [(), (GLOSS,), (VIGNETTING,), (AMBIENT,), (GLOSS, VIGNETTING, AMBIENT)])
-def test_the_derivatives_of_a_background_are_those_of_its_model(tiny, terms, value):
-    """Where a lens would let through less than nothing, the model keeps its least, and so do its derivatives."""
+@pytest.mark.parametrize("gloss", [None, 0.1, 0.0, -0.05, 2.0])
+def test_the_derivatives_of_a_background_are_those_of_its_model(tiny, gloss):
     pixels = BackgroundPixels.of(tiny[1].double(), tiny[0])
-    parameter = torch.cat((paraboloid_start(pixels), torch.full((3, len(terms)), value, dtype=torch.float64)), dim=1)
-    pixels = pixels._replace(terms=terms)
+    parameter = paraboloid_start(pixels)
+    if gloss is not None:
+        parameter = torch.cat((parameter, torch.full((3, 1), gloss, dtype=torch.float64)), dim=1)
     found, expected = pixels.linearised(parameter), residual_and_jacobian(pixels.residual, parameter)
     assert torch.equal(found[0], expected[0])
     assert (found[1] - expected[1]).abs().max() <= 1e-12 * expected[1].abs().max()

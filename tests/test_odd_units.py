@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import json
-import sys
 import warnings
 
 import cv2
@@ -12,9 +11,9 @@ import pytest
 import torch
 
 import torchvts as vts
-from torchvts.calibration.light_choice import objection_to_lights
-from torchvts.calibration.pattern import compare_patterns
-from torchvts.calibration.refusals import NoUsablePress, colour_share, colour_variation, other_crop
+from torchvts.calibration.by_lights import objection_to_lights
+from torchvts.calibration.given_images import colour_share, colour_variation
+from torchvts.calibration.objections import to_background_of_prior
 from torchvts.cli.summary import expected
 from torchvts.model.response_field import CHANGE_SCALE, ResponseField, ResponseModel, SensorPrior, fit_log_background
 from torchvts.stream import use_calibration
@@ -139,7 +138,6 @@ def test_an_odd_background_gives_a_unit_that_can_be_used_or_a_refusal(name, comp
         assert "background: " in str(error) and ("give presses" in str(error) or "no coloured lights" in str(error))
         return
     json.dumps(calibration.report, allow_nan=False)
-    assert not any(row.get("misfit") == 0.0 and row["score_deg"] is None for row in calibration.report["candidates"])
     assert float(calibration.defects.double().mean()) < 0.05
     with torch.inference_mode():
         out = vts.DepthPipeline.from_calibration(calibration, "fast")(press(light, (1.0, 1.0), 50)[None])
@@ -153,7 +151,7 @@ def test_lights_that_cannot_win_are_not_fitted_beside_presses(monkeypatch):
     def refuse(*_):
         raise AssertionError("fitted")
 
-    monkeypatch.setattr("torchvts.calibration.light_choice.fit_lights", refuse)
+    monkeypatch.setattr("torchvts.calibration.by_lights.fit_lights", refuse)
     calibration, _ = calibrate(camera(ODD["bright edges"]), SENSOR, presses(ODD["bright edges"]))
     first = calibration.report["candidates"][0]
     assert first["score_deg"] is None and first["note"].startswith("not fitted: the background of ") and "misfit" not in first
@@ -211,8 +209,8 @@ CHANGED = {
     "turned by 180 degrees": lambda image: image.flip(1, 2),
     "mirrored left to right": lambda image: image.flip(2),
     "mirrored top to bottom": lambda image: image.flip(1),
-    "with channels in the order BGR": lambda image: image.flip(0),
-    "turned by 180 degrees, with channels in the order BGR": lambda image: image.flip(0, 1, 2),
+    "has its channels swapped to the order B, G, R": lambda image: image.flip(0),
+    "turned by 180 degrees and has its channels swapped to the order B, G, R": lambda image: image.flip(0, 1, 2),
 }
 
 
@@ -221,7 +219,7 @@ def test_a_turned_mirrored_or_swapped_background_is_named(change):
     sensor = dataclasses.replace(SENSOR, prior=prior(other_light()))
     image = CHANGED[change](camera(other_light()))
     _, warned = calibrate(image, sensor)
-    assert any(f"looks like that pattern {change} (correlation 1.00" in text for text in warned), warned
+    assert any(f"{change}: with that undone it differs from the background by " in text for text in warned), warned
 
 
 def test_a_prior_on_a_background_that_is_not_its_own_is_not_metric(tmp_path):
@@ -241,15 +239,13 @@ def test_another_unit_of_the_same_type_is_not_named(gain, shift_px):
     sensor = dataclasses.replace(SENSOR, prior=prior(other_light()))
     light = other_light().roll(shift_px, (2, 1))[:, 4:-4, 6:-6] + 0.02 * smooth(3)[:, 4:-4, 6:-6]
     light = torch.nn.functional.interpolate(light[None], (HEIGHT, WIDTH), mode="bilinear")[0]
-    match = compare_patterns(camera(light * torch.tensor(gain).reshape(3, 1, 1)), sensor)
-    assert match.fits and match.named == "" and match.likeness > 0.9
+    assert to_background_of_prior(camera(light * torch.tensor(gain).reshape(3, 1, 1)), sensor) == []
 
 
 def test_a_pattern_of_another_type_is_named():
     sensor = dataclasses.replace(SENSOR, prior=prior(other_light()))
     for name in ("smooth 1", "saddle", "bright edges", "pale"):
-        match = compare_patterns(camera(ODD[name]), sensor)
-        assert not match.fits, (name, match)
+        assert to_background_of_prior(camera(ODD[name]), sensor), name
 
 
 def test_presses_that_contradict_the_prior_calibrate_without_it():
@@ -315,33 +311,12 @@ def zoomed(image, scale, shift_px):
     return torch.from_numpy(array).permute(2, 0, 1)
 
 
-@pytest.mark.parametrize(
-    "scale, shift_px", [(0.8, (5, -4)), *(pytest.param(*crop, marks=pytest.mark.long) for crop in ((1.0, (10, 0)), (1.25, (0, 0))))]
-)
-def test_frames_cropped_otherwise_are_named(scale, shift_px):
+@pytest.mark.parametrize("scale, shift_px", [(0.8, (0, 0)), (1.25, (0, 0)), (0.8, (5, -4)), (1.0, (15, 0))])
+def test_presses_cropped_otherwise_are_refused(scale, shift_px):
     y, x = axes()
     light = torch.stack(
         (0.3 + 0.3 * torch.exp(-6 * (x - 0.2) ** 2 - 3 * y**2), 0.5 - 0.2 * (y * x + y**2), 0.4 + 0.2 * (3 * x).sin())
     )
-    images = [zoomed(one.image, scale, shift_px) for one in presses(light)]
-    crop = other_crop(camera(light), images)
-    assert crop is not None and crop.scale == pytest.approx(scale, abs=0.03)
-    assert crop.shift_px == pytest.approx(shift_px, abs=2.0)
-    assert other_crop(camera(light), [one.image for one in presses(light)]) is None
-    assert other_crop(camera(light), [0.1 * images[0]]) is None  # dark: it shows nothing
-    assert other_crop(camera(light), [0.1 * images[0], *images]) == crop
-
-
-def test_presses_that_cannot_be_used_because_of_their_crop_say_so(monkeypatch):
-    def unusable(*_):
-        raise NoUsablePress([])
-
-    monkeypatch.setattr(sys.modules["torchvts.calibration.calibrate"], "by_presses", unusable)
-    light = ODD["smooth 2"]
-    images = [dataclasses.replace(one, image=zoomed(one.image, 1.25, (0, 0))) for one in presses(light)]
-    with pytest.raises(
-        ValueError, match=r"presses: expected the crop of the background, got images that show it 1\.2\d times as large"
-    ):
+    images = [dataclasses.replace(one, image=zoomed(one.image, scale, shift_px)) for one in presses(light)]
+    with pytest.raises(ValueError, match=r"presses: expected the (background's view of the skin|light of the background)"):
         vts.calibrate(camera(light), SENSOR, images)
-    with pytest.raises(NoUsablePress, match="presses: none can be used"):
-        vts.calibrate(camera(light), SENSOR, presses(light))

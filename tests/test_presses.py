@@ -199,9 +199,9 @@ def test_what_lights_cannot_explain_gets_a_response(unit):
     name, _, _, _, calibration, _ = unit
     report = calibration.report
     assert report["model"] == "response" and calibration.response is not None and calibration.lights is None
-    assert "response, linear" in report["reason"] and "12 presses" in report["reason"]
+    assert report["reason"].startswith("from 12 presses: ")
     lights = report["candidates"][0]
-    assert lights["model"] == "point lights" and lights["score_deg"] > 5.0 and "rejected" in lights["note"]
+    assert lights["model"] == "point lights" and (lights["score_deg"] or 90.0) > 5.0  # none where they do not look like the image
     assert report["held_out_deg"] < 1.0, name
 
 
@@ -212,7 +212,7 @@ def test_the_candidates_are_reported_with_their_scores(unit):
     assert len(rows) >= 9
     for row in rows:
         assert {"model", "family", "parameters", "score_deg", "passes"} <= set(row)
-        assert math.isfinite(row["score_deg"]) and row["score_deg"] > 0
+        assert row["model"] == "point lights" or (math.isfinite(row["score_deg"]) and row["score_deg"] > 0)
     fast = [row for row in rows if row["model"].startswith("response, linear")]
     assert len(fast) >= 6 and {row["passes"] for row in fast} == {1}
     assert [row["parameters"] for row in fast] == sorted(row["parameters"] for row in fast)
@@ -421,7 +421,7 @@ def test_a_prior_serves_another_unit_where_lights_are_not_pinned(prior, prior_al
     calibration, warned = prior_alone
     report = calibration.report
     assert warned == [] and report["model"] == "response" and calibration.response == prior.response
-    assert "prior" in report["reason"] and "point lights rejected" in report["reason"]
+    assert "prior" in report["reason"]
     models = [row["model"] for row in report["candidates"]]
     assert models[0] == "point lights" and models[-1] == "prior" and set(models) == {"point lights", "prior"}
     json.dumps(report, allow_nan=False)
@@ -442,7 +442,7 @@ def test_pinned_lights_go_before_a_prior(prior):
 def test_presses_of_another_ball_do_no_harm_to_a_prior(prior, prior_alone, count, mode):
     sensor = dataclasses.replace(GIVEN, prior=prior)
     calibration, warned = calibrate(background(seen_by_other_curve), sensor, other_presses(count))
-    assert warned == [] and "prior adapted" in calibration.report["reason"]
+    assert warned == [] and "from the sensor's prior and " in calibration.report["reason"]
     alone = depth_errors(prior_alone[0], seen_by_other_curve, ball, mode, HELD_OUT)
     after = depth_errors(calibration, seen_by_other_curve, ball, mode, HELD_OUT)
     assert all(b < 1.1 * a for a, b in zip(alone, after)), (alone, after)

@@ -1,14 +1,13 @@
 """Offline calibration: from images of a unit to its Calibration."""
 
-from .background import falloff, outwardness
 from .by_lights import GIVEN_MISFIT
 from .by_presses import RESPONSE_BLUR_PX, by_presses, with_preprocessing
-from .calibrate import calibrate, fit_prior
-from .complaints import CalibrationWarning
+from .calibrate import calibrate
 from .contacts import ROUGH, channel_structure
 from .lights import POORLY_CONSTRAINED_DEG, LightFit, fit_lights
+from .objections import CalibrationWarning
 from .presses import Press, Touch, read_presses
-from .prior_score import score_prior
+from .prior import fit_prior, score_prior
 
 __all__ = [
     "GIVEN_MISFIT",
@@ -22,10 +21,8 @@ __all__ = [
     "by_presses",
     "calibrate",
     "channel_structure",
-    "falloff",
     "fit_lights",
     "fit_prior",
-    "outwardness",
     "read_presses",
     "score_prior",
     "with_preprocessing",

@@ -1,4 +1,4 @@
-"""The model of a background image: lights and camera over an undeformed skin, pixel by pixel, as the fit of lights needs it."""
+"""The model of a background image: point lights over an undeformed skin, pixel by pixel, as their fit needs it."""
 
 import math
 from typing import NamedTuple
@@ -13,42 +13,29 @@ from ..core.robust import TUKEY, tukey_weight
 from ..model.lights import PointLights, log_slope_of_lobe, microfacet
 from ..model.sensor import Sensor
 
-GLOSS, VIGNETTING, AMBIENT = "gloss", "vignetting", "ambient"
-"""Optional terms: each adds one column to a light's parameters, after x, y, log z, log albedo."""
-
-POSITION_AND_ALBEDO = 4
-"""Columns of a light's parameters before the optional terms."""
-
 FURTHEST = 30.0
 """Most distant light, in half-widths of the image. The fall-off of one further away curves by less than 0.2 % over the image,
 which no lens is flat to; a background that is no paraboloid at all sends its light there."""
 
-LEAST_LIGHT, LEAST_FALLOFF = 1e-6, 0.05
-"""Bounds of the model: of light with an ambient part, and of a lens's fall-off."""
-
 
 class BackgroundPixels(NamedTuple):
-    """The pixels of a background, and the terms of the model that is fitted to them.
+    """The pixels of a background.
 
     Attributes:
         x: (N,), mm.
         y: (N,), mm.
-        outward: (N,), squared distance from the image centre, 1 in the corners.
         image: (3, N), image values.
         usable: (3, N) bool, neither saturated nor near black.
         noise: (3,), standard deviation of the image values.
         exponent: 1 / gamma.
-        terms: optional terms of the model.
     """
 
     x: Tensor
     y: Tensor
-    outward: Tensor
     image: Tensor
     usable: Tensor
     noise: Tensor
     exponent: float
-    terms: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, value: Tensor, sensor: Sensor) -> "BackgroundPixels":
@@ -56,8 +43,8 @@ class BackgroundPixels(NamedTuple):
         x, y = pixel_grid_mm(sensor.height, sensor.width, sensor.mm_per_pixel, value.dtype)
         x, y = (axis.expand(value.shape[1:]).flatten() for axis in (x, y))
         noise = noise_std(value[None])[0].clamp_min(QUANTISATION_STD)
-        image, outward = value.flatten(1), outwardness(sensor).flatten().to(value.dtype)
-        pixels = cls(x, y, outward, image, image < 0.995, noise, 1.0 / sensor.exponent)
+        image = value.flatten(1)
+        pixels = cls(x, y, image, image < 0.995, noise, 1.0 / sensor.exponent)
         # leave out pixels that noise could clip at black or white; the model decides, so that noise does not select
         expected, margin = pixels.model(paraboloid_start(pixels)), 2.5 * noise[:, None]
         return pixels._replace(usable=pixels.usable & (expected > margin) & (expected < 1.0 - margin))
@@ -65,7 +52,7 @@ class BackgroundPixels(NamedTuple):
     def sample(self, count: int) -> "BackgroundPixels":
         """About ``count`` evenly chosen pixels. The stride is odd, so that all columns occur."""
         stride = max(1, len(self.x) // count) | 1
-        part = {name: getattr(self, name)[..., ::stride] for name in ("x", "y", "outward", "image", "usable")}
+        part = {name: getattr(self, name)[..., ::stride] for name in ("x", "y", "image", "usable")}
         return self._replace(**part)
 
     def span_mm(self) -> float:
@@ -73,74 +60,41 @@ class BackgroundPixels(NamedTuple):
         return float(self.x.abs().max().maximum(self.y.abs().max()))
 
     def model(self, parameter: Tensor) -> Tensor:
-        """Image values (3, N) of lights (3, 4 + terms): x, y, log z, log albedo, then ``terms``."""
-        a, b, log_z, log_rho = (parameter[:, k : k + 1] for k in range(POSITION_AND_ALBEDO))
+        """Image values (3, N) of lights (3, 4): x, y, log z, log albedo; (3, 5) of a glossy skin: and the strength of its lobe."""
+        a, b, log_z, log_rho = (parameter[:, k : k + 1] for k in range(4))
         squared = (self.x - a) ** 2 + (self.y - b) ** 2 + torch.exp(2.0 * log_z)
         log_light = log_rho + log_z - 1.5 * torch.log(squared)  # eq. 1 on a flat skin
-        extra = {name: parameter[:, 4 + k : 5 + k] for k, name in enumerate(self.terms)}
-        if GLOSS in extra:
+        if parameter.shape[1] > 4:
             n_l = torch.exp(log_z) * torch.rsqrt(squared)
             lobe = microfacet(n_l, torch.ones_like(n_l), torch.sqrt(0.5 + 0.5 * n_l))
-            log_light = log_light + torch.log1p(extra[GLOSS].clamp_min(0.0) * lobe)
-        if VIGNETTING in extra:
-            log_light = log_light + torch.log(falloff(self.outward, extra[VIGNETTING]))
-        if AMBIENT not in extra:
-            return torch.exp(self.exponent * log_light)
-        return (torch.exp(log_light) + extra[AMBIENT]).clamp_min(LEAST_LIGHT) ** self.exponent
+            log_light = log_light + torch.log1p(parameter[:, 4:].clamp_min(0.0) * lobe)
+        return torch.exp(self.exponent * log_light)
 
     def residual(self, parameter: Tensor) -> Tensor:
         """Model minus image in units of the noise, (3, N)."""
         return (self.model(parameter) - self.image) / self.noise[:, None]
 
     def linearised(self, parameter: Tensor) -> tuple[Tensor, Tensor]:
-        """Residuals (3, N), and their derivatives (3, 4 + terms, N) in the lights: those of :meth:`model`, by hand.
+        """Residuals (3, N), and their derivatives (3, K, N) in the lights (3, K): those of :meth:`model`, by hand.
 
         Forward-mode derivatives are the same to rounding and take five times as long.
         """
         value = self.model(parameter)
         a, b, z = parameter[:, 0:1], parameter[:, 1:2], parameter[:, 2:3].exp()
-        extra = {name: parameter[:, 4 + k : 5 + k] for k, name in enumerate(self.terms)}
         x, y = self.x - a, self.y - b
         inverse = 1.0 / (x**2 + y**2 + z**2)
         along = torch.stack((x * inverse, y * inverse, 1.0 - z**2 * inverse), dim=1)  # of the logarithm of z / distance
         slopes = torch.empty(3, parameter.shape[1], len(self.x), dtype=value.dtype)
         slopes[:, 0:2], slopes[:, 2], slopes[:, 3] = 3.0 * along[:, 0:2], 3.0 * along[:, 2] - 2.0, 1.0
-        if GLOSS in extra:
-            gloss, n_l = extra[GLOSS].clamp_min(0.0), z * torch.sqrt(inverse)
+        if parameter.shape[1] > 4:
+            gloss, n_l = parameter[:, 4:].clamp_min(0.0), z * torch.sqrt(inverse)
             n_h = torch.sqrt(0.5 + 0.5 * n_l)
             lobe = microfacet(n_l, torch.ones_like(n_l), n_h)
             share = 1.0 / (1.0 + gloss * lobe)
             slopes[:, 0:3] += (gloss * lobe * share * n_l * log_slope_of_lobe(n_l, n_h))[:, None] * along
-            slopes[:, 4 + self.terms.index(GLOSS)] = torch.where(extra[GLOSS] >= 0.0, lobe * share, 0.0)
-        if VIGNETTING in extra:
-            left = falloff(self.outward, extra[VIGNETTING])
-            slopes[:, 4 + self.terms.index(VIGNETTING)] = torch.where(left > LEAST_FALLOFF, -self.outward / left, 0.0)
-        if AMBIENT in extra:
-            total = value ** (1.0 / self.exponent)  # light and what is added to it
-            slopes *= (total - extra[AMBIENT])[:, None]
-            slopes[:, 4 + self.terms.index(AMBIENT)] = 1.0
-            slopes *= torch.where(total > LEAST_LIGHT * (1.0 + 1e-9), self.exponent * value / total, 0.0)[:, None]
-        else:
-            slopes *= (self.exponent * value)[:, None]
+            slopes[:, 4] = torch.where(parameter[:, 4:] >= 0.0, lobe * share, 0.0)
+        slopes *= (self.exponent * value)[:, None]
         return (value - self.image) / self.noise[:, None], slopes / self.noise[:, None, None]
-
-
-def outwardness(sensor: Sensor) -> Tensor:
-    """(H, W): squared distance from the image centre, 1 in the corners."""
-    x, y = pixel_grid_mm(sensor.height, sensor.width, 1.0, torch.float64)
-    return (x**2 + y**2) / float(x.max() ** 2 + y.max() ** 2)
-
-
-def falloff(outward: Tensor, vignetting: Tensor | float) -> Tensor:
-    """Share of the light that a lens with vignetting lets through: 1 in the middle, 1 - vignetting in the corners.
-
-    Args:
-        outward: squared distance from the image centre, 1 in the corners.
-        vignetting: share of the light lost in the corners.
-    Source:
-        the first term of the usual even polynomial; cos^4 of the angle of view begins with it.
-    """
-    return (1.0 - outward * vignetting).clamp_min(LEAST_FALLOFF)
 
 
 def paraboloid_start(pixels: BackgroundPixels) -> Tensor:
@@ -178,7 +132,7 @@ def paraboloid_start(pixels: BackgroundPixels) -> Tensor:
 
 
 def bounded(parameter: Tensor, span: float) -> Tensor:
-    """Parameters (3, 4 + terms) with lights beyond ``FURTHEST`` times ``span`` (mm) moved there, as bright at the centre."""
+    """Parameters (3, K) with lights beyond ``FURTHEST`` times ``span`` (mm) moved there, as bright at the centre."""
     position = torch.cat((parameter[:, :2], parameter[:, 2:3].exp()), dim=1)
     factor = (position.norm(dim=1) / (FURTHEST * span)).clamp_min(1.0)[:, None]
     moved = parameter.clone()
@@ -220,32 +174,8 @@ def from_lights(lights: PointLights) -> Tensor:
     return torch.cat((position[:, :2], position[:, 2:].log(), albedo[:, None].log()), dim=1)
 
 
-def to_lights(parameter: Tensor, terms: tuple[str, ...], dtype: torch.dtype) -> PointLights:
-    """The lights of parameters (3, 4 + terms)."""
+def to_lights(parameter: Tensor, dtype: torch.dtype) -> PointLights:
+    """The lights of parameters (3, 4), or (3, 5) of a glossy skin."""
     position = torch.cat((parameter[:, :2], parameter[:, 2:3].exp()), dim=1)
-    gloss = parameter[:, 4 + terms.index(GLOSS)].clamp_min(0.0).to(dtype) if GLOSS in terms else None
+    gloss = parameter[:, 4].clamp_min(0.0).to(dtype) if parameter.shape[1] > 4 else None
     return PointLights(position.to(dtype), parameter[:, 3].exp().to(dtype), gloss)
-
-
-def free_parameters(terms: tuple[str, ...], azimuth: Tensor | None) -> Tensor:
-    """What the fit may move: (3, 4 + terms, F), the parameters of the three lights per free parameter.
-
-    Vignetting belongs to the camera, so the lights share it. With known azimuths (3,), radians, a light moves along its ray.
-    """
-    columns = POSITION_AND_ALBEDO + len(terms)
-    own = [k for k in range(columns) if k < 4 or terms[k - 4] != VIGNETTING]
-    rows: list[Tensor] = []
-    for light in range(3):
-        for k in own:
-            row = torch.zeros(3, columns, dtype=torch.float64)
-            row[light, k] = 1.0
-            if azimuth is not None and k < 2:
-                if k == 1:
-                    continue
-                row[light, :2] = torch.stack((azimuth[light].cos(), azimuth[light].sin()))
-            rows.append(row)
-    if VIGNETTING in terms:
-        row = torch.zeros(3, columns, dtype=torch.float64)
-        row[:, 4 + terms.index(VIGNETTING)] = 1.0
-        rows.append(row)
-    return torch.stack(rows, dim=2)

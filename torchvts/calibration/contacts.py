@@ -103,6 +103,14 @@ class Contact:
         return -torch.stack((dx, dy)) / self.height_above_equator()
 
 
+class NoUsablePress(ValueError):
+    """No press can be used for a fit; ``contacts`` carry the reasons."""
+
+    def __init__(self, contacts: Sequence[Contact]) -> None:
+        super().__init__("presses: none can be used: " + "; ".join(f"{c.name}: {c.reason}" for c in contacts))
+        self.contacts = list(contacts)
+
+
 def used(contacts: Sequence[Contact]) -> list[Contact]:
     """The contacts that are not left out."""
     return [contact for contact in contacts if not contact.reason]

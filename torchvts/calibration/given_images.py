@@ -1,4 +1,4 @@
-"""Whether presses and background are images of one unit, taken in the same way: refused or left out before anything is fitted."""
+"""Whether given images can be calibrated from: refused, or left out, before anything is fitted."""
 
 import statistics
 from collections.abc import Sequence
@@ -9,14 +9,25 @@ from torch import Tensor
 
 from ..core.arrays import array_of
 from ..core.blur import blur, gaussian_weights
-from ..core.views import SAME_VIEW, TWELVE_BITS, Views
+from ..core.views import TWELVE_BITS, Views
+from ..model.calibration import PEDESTAL
 from .contacts import DARK, MOST_SATURATED, channel_band
-from .presses import Press
-from .refusals import other_crop
+from .presses import Press, Touch
 
-OTHER_UNIT = 0.2
-"""Median difference from the background, logarithm of the image value, from which presses are of another unit or light. It is at
-most 0.08 on 14 units, and 0.15 to 0.85 between units of different types."""
+UNIFORM_COLOUR = 0.05
+"""Variation of a background's colour, RMS of the differences of log R, G and B, below which no coloured lights are seen. It is
+0.018 under the white light of a 9DTact and 0.16 to 0.56 on six sensors with coloured lights."""
+
+ACHROMATIC = 0.25
+"""Share of a contact's change of light that is a change of colour, below which the lights have no colours. It is 0.07 for the ball
+on the 9DTact, and 1.0 to 1.7 on five sensors with coloured lights."""
+
+FAINT = 0.03
+"""Change of the logarithm of the light from which a contact is seen at all."""
+
+OTHER_UNIT = 0.12
+"""Difference from the background, median over the skin and over the presses, logarithm of the image value, from which presses are
+of another unit, light or crop. It is at most 0.08 on 14 units, and 0.15 to 0.85 between units of different types."""
 
 CONTACT = 0.35
 """A background holds a contact if its structure exceeds that of the presses, in a place, by this part of what theirs exceeds its
@@ -24,6 +35,98 @@ own. The part is at most 0.2 on 14 units, and above 0.35 for 19 in 20 presses of
 
 LEAST_STRUCTURE = 0.02
 """Smallest such excess: less is noise. A press has 0.03 to 0.7."""
+
+
+def check_exposure(background: Tensor) -> None:
+    """Raise unless every channel of a background has light in the whole range of values, is not saturated, and varies.
+
+    Raises:
+        ValueError: names the channel and the value.
+    """
+    for name, channel in zip("RGB", background.detach(), strict=True):
+        mean, saturated = float(channel.mean()), float((channel > 0.995).double().mean())
+        if mean < 0.02:
+            raise ValueError(
+                f"background: expected light in channel {name}, got a mean of {mean:.4f}: black image, LED or exposure off"
+            )
+        if saturated > 0.5:
+            raise ValueError(
+                f"background: expected light below the camera's limit, got a channel {name} that is saturated "
+                f"in {saturated:.0%} of the image: lower the exposure"
+            )
+        if float(channel.max() - channel.min()) < 1e-6:
+            raise ValueError(
+                f"background: expected light that varies, got a channel {name} that is constant at {mean:.4f}: "
+                "not a camera image of a lit skin"
+            )
+    most = float(background.max())
+    if most <= TWELVE_BITS + 1e-6:
+        raise ValueError(
+            f"background: expected values up to 1, got at most {round(65535 * most)} of 65535: 12 bits stored in 16, or black?"
+        )
+
+
+def check_light(background: Tensor, given: Sequence[Press] | Sequence[Touch]) -> None:
+    """Raise for a greyscale background, and for contacts that change the brightness of the skin, but not its colour.
+
+    Where the skin tilts, coloured lights from different sides change R, G and B differently. Under white light all three
+    change alike, whichever way the skin tilts.
+
+    Args:
+        background: (3, H, W) in [0, 1].
+        given: presses or touches.
+    Raises:
+        ValueError: R, G and B of the background are the same everywhere, or change alike in the median of all contacts.
+    """
+    if float((background.amax(dim=0) - background.amin(dim=0)).max()) < 1e-3:
+        raise ValueError(
+            "background: expected an image in colour, got one whose R, G and B are the same everywhere: a greyscale image? "
+            "photometric depth needs coloured lights and a colour camera"
+        )
+    shares = [share for share in (colour_share(item.image, background) for item in given) if share is not None]
+    if shares and statistics.median(shares) < ACHROMATIC:
+        raise ValueError(
+            f"{'presses' if isinstance(given[0], Press) else 'touches'}: expected contacts that change the colour of the skin, got "
+            f"R, G and B that change alike (the change of colour is {statistics.median(shares):.2f} of the change of light, 1 and "
+            "more under coloured lights): this sensor has no coloured lights: photometric depth is not possible"
+        )
+
+
+def colourless(background: Tensor) -> str:
+    """Why a background shows no coloured lights, or "": lights of different colours at different places give different colours.
+
+    Where contacts are given, these decide.
+    """
+    variation = colour_variation(background)
+    if variation >= UNIFORM_COLOUR:
+        return ""
+    return (
+        f"background: expected light whose colour varies over the image, got a variation of {variation:.1%}, at least "
+        f"{UNIFORM_COLOUR:.0%} is usual: this sensor has no coloured lights: photometric depth is not possible; if it has "
+        "them, give presses, which show it"
+    )
+
+
+def colour_variation(background: Tensor) -> float:
+    """RMS of the variation of log R - log G and log B - log G over an image (3, H, W), on coarse cells."""
+    log = _cells(background, 24)
+    difference = torch.stack((log[0] - log[1], log[2] - log[1]))
+    return float((difference - difference.mean(dim=(1, 2), keepdim=True)).square().mean().sqrt())
+
+
+def colour_share(image: Tensor, background: Tensor) -> float | None:
+    """Change of colour over change of light where an image (3, H, W) differs most from the background; None where it hardly does.
+
+    The change of light is that of log R, log G and log B; the change of colour that of log R - log G and log B - log G.
+    """
+    change = _cells(image, 120) - _cells(background, 120)
+    change = change - change.flatten(1).median(dim=1).values[:, None, None]
+    length = change.square().sum(dim=0).sqrt()
+    if float(length.max()) < FAINT:
+        return None
+    contact = change[:, length > 0.4 * length.max()]
+    colour = torch.stack((contact[0] - contact[1], contact[2] - contact[1]))
+    return float((colour.square().mean() / contact.square().mean()).sqrt())
 
 
 class Sorted(NamedTuple):
@@ -57,19 +160,15 @@ def sort_presses(background: Tensor, presses: Sequence[Press]) -> Sorted:
     odd = [(k, view) for k, view in enumerate(found) if view is not None]
     refused = odd[0] if 2 * len(odd) >= len(presses) else None
     differences = [views.difference(one) for one in cells]
-    if statistics.median(differences) > SAME_VIEW and (refused is None or refused[1].cropped):
-        crop = other_crop(background, [press.image for press in presses])
-        if crop is not None:
-            raise ValueError(f"presses: expected the crop of the background, got images that show it {crop.in_words()}")
     if refused is not None:
         raise ValueError(
             f"presses: expected the background's view of the skin, got {len(odd)} of {len(presses)} that show another: "
             f"{presses[refused[0]].name} {refused[1].in_words()}: read and turn the presses as the background, or take them again"
         )
-    if min(differences) > OTHER_UNIT:
+    if (difference := statistics.median(differences)) > OTHER_UNIT:
         raise ValueError(
-            f"presses: expected the light of the background, got images that differ from it by {min(differences):.0%} and more "
-            f"in the median of the skin, at most {OTHER_UNIT:.0%} is usual: another unit, or another light"
+            f"presses: expected the light of the background, got images that differ from it by {difference:.0%} in the median of "
+            f"the skin, at most {OTHER_UNIT:.0%} is usual: another unit, another light, or another crop"
         )
     reasons = {k: f"it {view.in_words()}" for k, view in odd}
     for k in range(len(presses)):
@@ -130,3 +229,9 @@ def _structure(image: Tensor) -> Tensor:
     around = blur(band.square().sum(dim=1, keepdim=True), gaussian_weights(height / 20.0))[0, 0].sqrt()
     margin = round(0.1 * height)
     return around[margin : around.shape[0] - margin, margin : around.shape[1] - margin]
+
+
+def _cells(image: Tensor, rows: int) -> Tensor:
+    """Logarithm of an image on cells, (3, h, w), about ``rows`` along the shorter side."""
+    cell = max(1, min(image.shape[1:]) // rows)
+    return (torch.nn.functional.avg_pool2d(image.detach().cpu().double()[None], cell)[0] + PEDESTAL).log()

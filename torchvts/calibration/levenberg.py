@@ -15,7 +15,6 @@ class LevenbergMarquardt(Optimizer):
     Args:
         parameter: one tensor (G, K): K parameters of each of G independent problems.
         damping: start of the damping, relative to the diagonal of J^T J.
-        tie: (G, K, F): parameters move by ``tie @ step`` of F free parameters, which couples the groups; None leaves all free.
     Source:
         More, The Levenberg-Marquardt algorithm, LNM 630, 1978; damping by the gain as in Nielsen, IMM-REP-1999-05.
     Example:
@@ -29,11 +28,9 @@ class LevenbergMarquardt(Optimizer):
 
     add_param_group = inspect.unwrap(Optimizer.add_param_group)  # its wrapper imports torch._dynamo, which takes 2 s
 
-    def __init__(self, parameter: Tensor, damping: float = 1e-3, tie: Tensor | None = None) -> None:
+    def __init__(self, parameter: Tensor, damping: float = 1e-3) -> None:
         super().__init__([parameter], {})
-        self.tie = tie
-        problems = parameter.shape[0] if tie is None else 1
-        self.damping = torch.full((problems,), damping, dtype=parameter.dtype, device=parameter.device)
+        self.damping = torch.full((parameter.shape[0],), damping, dtype=parameter.dtype, device=parameter.device)
         self.last_step = torch.full_like(parameter, torch.inf)
 
     @torch.no_grad()
@@ -50,25 +47,18 @@ class LevenbergMarquardt(Optimizer):
             weight: (G, N), weights of the squared residuals; None for ones.
             linearised: maps parameters to residuals and their derivatives (G, K, N); None for :func:`residual_and_jacobian`.
         Returns:
-            (G,), half the weighted sum of squares before the step; (1,), their sum, where the groups are tied.
+            (G,), half the weighted sum of squares before the step.
         """
         parameter = self.param_groups[0]["params"][0]
         residual, jacobian = residual_and_jacobian(closure, parameter) if linearised is None else linearised(parameter)
         weighted = jacobian if weight is None else jacobian * weight[:, None]
         normal_matrix = weighted @ jacobian.transpose(1, 2)
         right = -(weighted @ residual[:, :, None])[:, :, 0]
-        if self.tie is not None:
-            normal_matrix = (self.tie.transpose(1, 2) @ normal_matrix @ self.tie).sum(0, keepdim=True)
-            right = (self.tie.transpose(1, 2) @ right[:, :, None])[:, :, 0].sum(0, keepdim=True)
         diagonal = torch.diagonal(normal_matrix, dim1=1, dim2=2)
         floor = 1e-12 * diagonal.amax(1, keepdim=True).clamp_min(1e-300)
         damped = normal_matrix + torch.diag_embed(self.damping[:, None] * diagonal + floor)
         step = torch.linalg.solve_ex(damped, right[:, :, None])[0][:, :, 0]
-        if self.tie is not None:
-            step = self.tie @ step[0]
         before, after = _half_square(residual, weight), _half_square(closure(parameter + step), weight)
-        if self.tie is not None:
-            before, after = before.sum(0, keepdim=True), after.sum(0, keepdim=True)
         better = torch.isfinite(after) & (after <= before)
         parameter.copy_(torch.where(better[:, None], parameter + step, parameter))
         self.damping = torch.where(better, self.damping * 0.2, self.damping * 10.0).clamp(1e-12, 1e12)

@@ -1,4 +1,4 @@
-"""How well a background constrains fitted lights: covariance, unexplained structure, and loss on held-out blocks."""
+"""How well a background constrains fitted lights: covariance and unexplained structure."""
 
 from typing import NamedTuple
 
@@ -17,7 +17,6 @@ class Linearisation(NamedTuple):
         residual: (3, N), in units of the noise.
         jacobian: (3, K, N), derivative of the residual.
         weight: (3, N), robust weights over the squared scale.
-        tie: (3, K, F), the lights' parameters per free parameter.
     """
 
     pixels: BackgroundPixels
@@ -25,7 +24,6 @@ class Linearisation(NamedTuple):
     residual: Tensor
     jacobian: Tensor
     weight: Tensor
-    tie: Tensor
 
     def is_finite(self) -> bool:
         return all(bool(torch.isfinite(values).all()) for values in (self.residual, self.jacobian, self.weight))
@@ -43,60 +41,27 @@ def covariance_and_misfit(fit: Linearisation) -> tuple[Tensor, Tensor]:
         Searle, Casella, McCulloch, Variance Components, 1992 (Henderson's method 3); Bjorck, Numerical Methods for Least
         Squares Problems, 1996, for the covariance.
     """
-    pixels, tie = fit.pixels, fit.tie
+    pixels = fit.pixels
     u, v = pixels.x / pixels.x.abs().max(), pixels.y / pixels.y.abs().max()
     relative = pixels.exponent * pixels.model(fit.parameter) / pixels.noise[:, None]  # residual per relative gain
     in_u, in_v = _legendre(u), _legendre(v)
     orders = [(i, j) for i in range(5) for j in range(5 - i) if i + j > 0]
     gain = torch.stack([in_u[i] * in_v[j] / (i + j) ** 2 for i, j in orders])  # (14, N)
-    # only products of columns are needed: those of the parameters (K), the gains (14) and the residual (1)
-    products = []
-    for c in range(3):
-        columns = torch.cat((fit.jacobian[c], gain * relative[c], fit.residual[c : c + 1]))
-        products.append((columns * fit.weight[c]) @ columns.t())
+    covariances, misfits = [], []
     k = fit.jacobian.shape[1]
-    normal_matrix = torch.stack([tie[c].t() @ products[c][:k, :k] @ tie[c] for c in range(3)]).sum(0)
-    right = torch.stack([tie[c].t() @ products[c][:k, -1] for c in range(3)]).sum(0)
-    inverse = _inverse(normal_matrix)
-    covariance, misfits = inverse.clone(), []
     for c in range(3):
-        shared = tie[c].t() @ products[c][:k, k:-1]  # (F, 14)
+        # only products of columns are needed: those of the parameters (K), the gains (14) and the residual (1)
+        columns = torch.cat((fit.jacobian[c], gain * relative[c], fit.residual[c : c + 1]))
+        product = (columns * fit.weight[c]) @ columns.t()
+        inverse, shared = _inverse(product[:k, :k]), product[:k, k:-1]
         carried = inverse @ shared  # change of the parameters where the gain exists and is not in the model
-        free = products[c][k:-1, k:-1] - shared.t() @ carried
-        left = products[c][k:-1, -1] - carried.t() @ right
+        free = product[k:-1, k:-1] - shared.t() @ carried
+        left = product[k:-1, -1] - carried.t() @ product[:k, -1]
         explained = left @ torch.linalg.pinv(free, rtol=1e-10, hermitian=True) @ left
         tau_squared = ((explained - gain.shape[0]) / torch.trace(free)).clamp_min(0.0)
-        covariance += tau_squared * carried @ carried.t()
+        covariances.append(inverse + tau_squared * carried @ carried.t())
         misfits.append(tau_squared.sqrt())
-    return tie @ covariance @ tie.transpose(1, 2), torch.stack(misfits)
-
-
-def held_out_loss(fit: Linearisation) -> Tensor:
-    """Loss (16,) of each block of the image under the parameters that fit all other blocks best, to first order.
-
-    One Gauss-Newton step removes the block's pixels from the normal equations; this is exact for a linear model. Blocks are
-    held out rather than pixels because the residual of a wrong model is smooth.
-    """
-    pixels = fit.pixels
-    row = ((pixels.y / pixels.y.abs().max() + 1.0) * 2.0).long().clamp(0, 3)
-    column = ((pixels.x / pixels.x.abs().max() + 1.0) * 2.0).long().clamp(0, 3)
-    block = 4 * row + column
-    parts, rights = [], []
-    for b in range(16):
-        inside = torch.nonzero(block == b)[:, 0]
-        columns = fit.tie.transpose(1, 2) @ fit.jacobian[:, :, inside]  # (3, F, n)
-        weighted = columns * fit.weight[:, None, inside]
-        parts.append((weighted @ columns.transpose(1, 2)).sum(0))
-        rights.append((weighted @ fit.residual[:, inside, None]).sum(0)[:, 0])
-    whole = torch.stack(parts).sum(0)
-    losses = []
-    for b in range(16):
-        inside = torch.nonzero(block == b)[:, 0]
-        step = _inverse(whole - parts[b]) @ rights[b]
-        residual = fit.residual[:, inside] + ((fit.tie @ step)[:, None] @ fit.jacobian[:, :, inside])[:, 0]
-        usable = pixels.usable[:, inside]
-        losses.append((torch.log1p(residual.square() / 9.0) * usable).sum() / usable.sum().clamp_min(1))
-    return torch.stack(losses)
+    return torch.stack(covariances), torch.stack(misfits)
 
 
 def direction_and_position_std(parameter: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:

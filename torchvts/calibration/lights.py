@@ -6,7 +6,7 @@ A robust least-squares loop in image value then finds the lights that fit best.
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,24 +14,12 @@ from tqdm import tqdm
 
 from ..core.checks import check_image, check_integer, check_record, check_switch
 from ..core.robust import TUKEY, tukey_weight
-from ..core.views import TWELVE_BITS
 from ..model.lights import PointLights
 from ..model.sensor import Sensor, check_sensor
-from .background import (
-    AMBIENT,
-    GLOSS,
-    VIGNETTING,
-    BackgroundPixels,
-    at_bound,
-    bounded,
-    falloff,
-    free_parameters,
-    from_lights,
-    paraboloid_start,
-    to_lights,
-)
+from .background import BackgroundPixels, at_bound, bounded, from_lights, paraboloid_start, to_lights
+from .given_images import check_exposure
 from .levenberg import LevenbergMarquardt
-from .light_uncertainty import Linearisation, covariance_and_misfit, direction_and_position_std, held_out_loss
+from .light_uncertainty import Linearisation, covariance_and_misfit, direction_and_position_std
 
 COARSE_PIXELS = 8000
 """The first loop runs on this many pixels, the second on all."""
@@ -76,13 +64,6 @@ class LightFit:
         misfit: (3,), size of the smooth pattern in the image that the lights cannot explain, relative to the light: 0.02 is 2 %
             of the light, 0 where only noise is left.
         inlier_fraction: share of the pixels that the robust loss kept.
-        vignetting: share of the light that the lens loses in the image corners; 0 where it was not fitted.
-        vignetting_std: its standard deviation; infinite where it was not fitted.
-        ambient: (3,), constant light in linear light; 0 where it was not fitted.
-        ambient_std: (3,), its standard deviation; infinite where it was not fitted.
-        parameters: number of fitted parameters.
-        held_out: (16,), loss of each block of the image under the lights fitted to all others: mean log of 1 + the square of
-            the residual in units of three times the noise.
     """
 
     lights: PointLights
@@ -95,13 +76,7 @@ class LightFit:
     noise_std: Tensor = field(repr=False)
     misfit: Tensor = field(repr=False)
     inlier_fraction: float = 1.0
-    vignetting: float = 0.0
-    vignetting_std: float = torch.inf
-    ambient: Tensor = field(default_factory=lambda: torch.zeros(3), repr=False)
-    ambient_std: Tensor = field(default_factory=lambda: torch.full((3,), torch.inf), repr=False)
-    parameters: int = 12
     failed: bool = False
-    held_out: Tensor = field(default_factory=lambda: torch.zeros(16), repr=False)
 
 
 def fit_lights(
@@ -111,9 +86,6 @@ def fit_lights(
     start: PointLights | None = None,
     max_steps: int = 100,
     progress: bool = False,
-    vignetting: bool = False,
-    ambient: bool = False,
-    known_azimuth: bool = False,
     gloss: bool = True,
 ) -> LightFit:
     """Fit one point light per channel to an image without contact.
@@ -128,15 +100,11 @@ def fit_lights(
         start: lights to start from; None takes the closed-form start.
         max_steps: limit of the loop.
         progress: show a bar.
-        vignetting: also fit the lens's vignetting, one parameter. The skin is then matt.
-        ambient: also fit a constant light, one parameter per channel. The skin is then matt.
-        known_azimuth: keep the azimuths of ``sensor.light_azimuth_deg``; fit distances and heights.
         gloss: try a glossy skin where structure remains.
     Returns:
         A :class:`LightFit`. Read ``converged`` and ``direction_std_deg`` before using the lights.
     Raises:
-        ValueError: wrong shape or range, a black, saturated or featureless image; ``known_azimuth`` without azimuths in the
-            sensor.
+        ValueError: wrong shape or range, a black, saturated or featureless image.
     Source:
         eq. 6-7 of the paper; Beaton and Tukey, Technometrics 16, 1974, for the loss.
     Example:
@@ -152,63 +120,20 @@ def fit_lights(
         check_record("start", start, PointLights, "PointLights(position_mm, albedo) makes them")
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     check_integer("max_steps", max_steps, 1)
-    switches = {"progress": progress, "vignetting": vignetting, "ambient": ambient, "known_azimuth": known_azimuth, "gloss": gloss}
-    for name, switch in switches.items():
-        check_switch(name, switch)
+    check_switch("progress", progress)
+    check_switch("gloss", gloss)
     check_exposure(background)
-    if known_azimuth and sensor.light_azimuth_deg is None:
-        raise ValueError(f"known_azimuth: sensor '{sensor.name}' names no light_azimuth_deg: add it to the sensor file")
-    azimuth = torch.deg2rad(torch.tensor(sensor.light_azimuth_deg, dtype=torch.float64)) if known_azimuth else None
-    loop = _Loop(azimuth, max_steps, progress)
-    plain = BackgroundPixels.of(background.detach().to(torch.float64).cpu(), sensor)
-    terms = (VIGNETTING,) * vignetting + (AMBIENT,) * ambient
-    pixels = plain._replace(terms=terms)
-    starts = [paraboloid_start(plain) if start is None else from_lights(start)]
-    if vignetting and start is None:
-        # lights that explain all of the fall-off hide vignetting: start from a strongly vignetted image, too
-        brightened = plain._replace(image=plain.image / falloff(plain.outward, 0.3) ** plain.exponent)
-        starts.append(paraboloid_start(brightened))
-    best = _solve_coarse_to_fine(pixels, [_with_terms(one, terms, azimuth) for one in starts], loop)
-    if gloss and not terms and best.converged and bool((best.misfit > 0).all()) and float(best.misfit.max()) < NOT_GLOSS:
-        glossy = _try_gloss(pixels, best, loop)
-        if glossy is not None:
-            best, pixels = glossy, pixels._replace(terms=(GLOSS,))
-    return _light_fit(background.dtype, pixels, best, loop)
-
-
-def check_exposure(background: Tensor) -> None:
-    """Raise unless every channel of a background has light in the whole range of values, is not saturated, and varies.
-
-    Raises:
-        ValueError: names the channel and the value.
-    """
-    for name, channel in zip("RGB", background.detach(), strict=True):
-        mean, saturated = float(channel.mean()), float((channel > 0.995).double().mean())
-        if mean < 0.02:
-            raise ValueError(
-                f"background: expected light in channel {name}, got a mean of {mean:.4f}: black image, LED or exposure off"
-            )
-        if saturated > 0.5:
-            raise ValueError(
-                f"background: expected light below the camera's limit, got a channel {name} that is saturated "
-                f"in {saturated:.0%} of the image: lower the exposure"
-            )
-        if float(channel.max() - channel.min()) < 1e-6:
-            raise ValueError(
-                f"background: expected light that varies, got a channel {name} that is constant at {mean:.4f}: "
-                "not a camera image of a lit skin"
-            )
-    most = float(background.max())
-    if most <= TWELVE_BITS + 1e-6:
-        raise ValueError(
-            f"background: expected values up to 1, got at most {round(65535 * most)} of 65535: 12 bits stored in 16, or black?"
-        )
+    loop = _Loop(max_steps, progress)
+    pixels = BackgroundPixels.of(background.detach().to(torch.float64).cpu(), sensor)
+    best = _solve_coarse_to_fine(pixels, paraboloid_start(pixels) if start is None else from_lights(start), loop)
+    if gloss and best.converged and bool((best.misfit > 0).all()) and float(best.misfit.max()) < NOT_GLOSS:
+        best = _try_gloss(pixels, best, loop) or best
+    return _light_fit(background.dtype, pixels, best, max_steps)
 
 
 class _Loop(NamedTuple):
-    """How the optimiser runs: known azimuths (3,) in radians or None, the most steps, whether a bar is shown."""
+    """How the optimiser runs: the most steps, whether a bar is shown."""
 
-    azimuth: Tensor | None
     max_steps: int
     progress: bool
 
@@ -225,23 +150,12 @@ class _Solution(NamedTuple):
     scale: Tensor
     covariance: Tensor
     misfit: Tensor
-    held_out: Tensor
 
 
-def _with_terms(start: Tensor, terms: tuple[str, ...], azimuth: Tensor | None) -> Tensor:
-    """A start (3, 4) with its terms at zero, moved to the known azimuths."""
-    start = torch.cat((start, torch.zeros(3, len(terms), dtype=start.dtype)), dim=1)
-    if azimuth is not None:
-        ray = torch.stack((azimuth.cos(), azimuth.sin()), dim=1)
-        along = (start[:, :2] * ray).sum(1, keepdim=True).maximum(0.1 * start[:, 2:3].exp())
-        start[:, :2] = along * ray
-    return start
-
-
-def _solve_coarse_to_fine(pixels: BackgroundPixels, starts: list[Tensor], loop: _Loop) -> _Solution:
-    """From each start on some pixels; from the best of these on all."""
+def _solve_coarse_to_fine(pixels: BackgroundPixels, start: Tensor, loop: _Loop) -> _Solution:
+    """On some pixels, and from there on all."""
     coarse = pixels.sample(COARSE_PIXELS)
-    near = min((_solve(coarse, start, loop) for start in starts), key=lambda solution: solution.history[-1])
+    near = _solve(coarse, start, loop)
     if len(coarse.x) == len(pixels.x):
         return near
     best = _solve(pixels, near.parameter, loop)
@@ -250,15 +164,14 @@ def _solve_coarse_to_fine(pixels: BackgroundPixels, starts: list[Tensor], loop: 
 
 def _try_gloss(pixels: BackgroundPixels, matt: _Solution, loop: _Loop) -> _Solution | None:
     """The solution with a glossy skin, if it explains next to everything in every channel."""
-    shiny = pixels._replace(terms=(GLOSS,))
     start = torch.cat((matt.parameter, torch.full_like(matt.parameter[:, :1], 0.05)), dim=1)
-    coarse = shiny.sample(COARSE_PIXELS)
+    coarse = pixels.sample(COARSE_PIXELS)
     near = glossy = _solve(coarse, start, loop)
     # on few pixels: those of the matt skin too, and any gain, for both figures are rough
-    if not _explains(near, _solve(coarse._replace(terms=()), matt.parameter, loop), 1.0):
+    if not _explains(near, _solve(coarse, matt.parameter, loop), 1.0):
         return None
-    if len(coarse.x) < len(shiny.x):
-        glossy = _solve(shiny, near.parameter, loop)
+    if len(coarse.x) < len(pixels.x):
+        glossy = _solve(pixels, near.parameter, loop)
         if not _explains(glossy, matt):
             return None
     # the width of the lobe is assumed, so the change that the lobe makes counts as uncertainty of the lights
@@ -279,9 +192,7 @@ def _explains(glossy: _Solution, matt: _Solution, part: float = 0.5) -> bool:
 def _solve(pixels: BackgroundPixels, start: Tensor, loop: _Loop) -> _Solution:
     """Levenberg-Marquardt steps with robust weights renewed at each, until the lights stop moving."""
     parameter = start.clone().requires_grad_()
-    tie = free_parameters(pixels.terms, loop.azimuth)
-    tied = loop.azimuth is not None or VIGNETTING in pixels.terms
-    optimiser = LevenbergMarquardt(parameter, tie=tie if tied else None)
+    optimiser = LevenbergMarquardt(parameter)
     history: list[float] = []
     still, held, moved, span = 0, 0, math.inf, pixels.span_mm()
     most = loop.max_steps if float(pixels.usable.double().mean(dim=1).min()) >= LEAST_USABLE else 0
@@ -289,7 +200,7 @@ def _solve(pixels: BackgroundPixels, start: Tensor, loop: _Loop) -> _Solution:
         while len(history) < most and still < 3 and held < HELD_STEPS:
             weight, scale = _robust_weight(pixels.residual(parameter.detach()), pixels.usable)
             before = parameter.detach().clone()
-            optimiser.step(pixels.residual, weight / scale.square() if tied else weight, pixels.linearised)
+            optimiser.step(pixels.residual, weight, pixels.linearised)
             held = held + 1 if bool(at_bound(parameter.detach(), span).any()) else 0
             if held:
                 with torch.no_grad():
@@ -303,15 +214,15 @@ def _solve(pixels: BackgroundPixels, start: Tensor, loop: _Loop) -> _Solution:
     parameter = parameter.detach()
     residual, jacobian = pixels.linearised(parameter)
     weight, scale = _robust_weight(residual, pixels.usable)
-    fit = Linearisation(pixels, parameter, residual, jacobian, weight / scale.square(), tie)
+    fit = Linearisation(pixels, parameter, residual, jacobian, weight / scale.square())
     failure = _failure(fit, scale, math.isinf(moved) and len(history) >= ENOUGH_STEPS)
     if failure:  # nothing is known, nothing explained
         unknown = torch.full_like(start, 1e12).diag_embed()
-        nothing = torch.full((3,), torch.inf), torch.full((16,), torch.inf)
-        return _Solution(start, [*history, math.inf], False, failure, math.inf, weight, scale, unknown, *nothing)
+        nothing = torch.full((3,), torch.inf)
+        return _Solution(start, [*history, math.inf], False, failure, math.inf, weight, scale, unknown, nothing)
     covariance, misfit = covariance_and_misfit(fit)
     converged = still == 3 and not bool(at_bound(parameter, span).any())
-    return _Solution(parameter, history, converged, "", moved, weight, scale, covariance, misfit, held_out_loss(fit))
+    return _Solution(parameter, history, converged, "", moved, weight, scale, covariance, misfit)
 
 
 def _failure(fit: Linearisation, scale: Tensor, never_moved: bool) -> str:
@@ -340,22 +251,13 @@ def _moved_mm(step: Tensor, parameter: Tensor) -> float:
     return float(torch.stack((step[:, 0].abs(), step[:, 1].abs(), (step[:, 2] * parameter[:, 2].exp()).abs())).max())
 
 
-def _light_fit(dtype: torch.dtype, pixels: BackgroundPixels, best: _Solution, loop: _Loop) -> LightFit:
-    parameter, terms = best.parameter, pixels.terms
-    direction_std, position_std = direction_and_position_std(parameter, best.covariance)
+def _light_fit(dtype: torch.dtype, pixels: BackgroundPixels, best: _Solution, max_steps: int) -> LightFit:
+    direction_std, position_std = direction_and_position_std(best.parameter, best.covariance)
     residual_std = best.scale[:, 0] * pixels.noise
-    fitted: dict[str, Any] = {}
-    variance = torch.diagonal(best.covariance, dim1=1, dim2=2)
-    if VIGNETTING in terms:
-        k = 4 + terms.index(VIGNETTING)
-        fitted |= {"vignetting": float(parameter[0, k]), "vignetting_std": float(variance[0, k].clamp_min(0.0).sqrt())}
-    if AMBIENT in terms:
-        k = 4 + terms.index(AMBIENT)
-        fitted |= {"ambient": parameter[:, k], "ambient_std": variance[:, k].sqrt()}
     return LightFit(
-        lights=to_lights(parameter, terms, dtype),
+        lights=to_lights(best.parameter, dtype),
         converged=best.converged,
-        message=_message(best, direction_std, residual_std / pixels.image.median(dim=1).values, pixels, loop.max_steps),
+        message=_message(best, direction_std, residual_std / pixels.image.median(dim=1).values, pixels, max_steps),
         failed=bool(best.failure),
         loss_history=best.history,
         direction_std_deg=direction_std,
@@ -364,9 +266,6 @@ def _light_fit(dtype: torch.dtype, pixels: BackgroundPixels, best: _Solution, lo
         noise_std=pixels.noise,
         misfit=best.misfit,
         inlier_fraction=float((best.weight > 0).double().mean()),
-        parameters=free_parameters(terms, loop.azimuth).shape[2],
-        held_out=best.held_out,
-        **fitted,
     )
 
 

@@ -13,10 +13,9 @@ from ..core.geometry import lengths
 from ..model.report import CandidateRow
 from ..model.response_field import DepthBrightness, ResponseField, ResponseModel, TaughtRange, position_basis
 from ..model.sensor import Sensor
-from .contacts import Contact, first_pass_depths
+from .contacts import Contact, NoUsablePress, first_pass_depths
 from .field import PRODUCT_PENALTY, Evidence, Family, ball_sine
 from .outliers import locate_and_screen
-from .refusals import NoUsablePress
 from .touches import presses_as_touches, scale_by_presses, scaled
 
 FAMILIES = ((0, -1, -1), (1, -1, -1), (2, -1, -1), (2, 1, -1), (2, 1, 0), (3, 2, -1), (3, 2, 1), (4, 3, -1))
@@ -157,7 +156,7 @@ def fit_response(
         by_depth = fit_depth_brightness(presses, chosen.field, pitch, None if prior is None else prior.by_depth)
         bar.update()
     score = chosen.row["score_deg"]
-    reason = f"{chosen.row['model']}, from {len(presses)} presses: {_how(score, len(chosen.rows))}"
+    reason = f"{_origin(prior is not None, chosen.row, len(presses))}: {_how(score, len(chosen.rows))}"
     taught = taught_range(presses, chosen.field, pitch)
     if prior is not None and prior.taught is not None:
         taught = taught.with_all_of(prior.taught)
@@ -265,10 +264,20 @@ def _effect_of_depth(contact: Contact, field: ResponseField, depth: Tensor, star
     return effect, ball_sine(contact) - sine
 
 
+def _origin(from_prior: bool, row: CandidateRow, count: int) -> str:
+    """What a field was made from, for a user."""
+    presses = f"{count} press" + "es" * (count > 1)
+    if not from_prior:
+        return f"from {presses}"
+    return (
+        f"from the sensor's prior and {presses}" if row["parameters"] else f"the sensor's prior, on which {presses} do not improve"
+    )
+
+
 def _how(score_deg: float | None, count: int) -> str:
     if score_deg is None:
-        return "too few to choose by holding some out"
-    return f"the smallest that is as good as the best of {count} candidates, {score_deg:.2f} deg on each press by the others"
+        return "too few to check any by the others"
+    return f"{score_deg:.2f} degrees on each press by the others, the simplest of {count} models that is as good as the best"
 
 
 def simplest_candidate(errors_deg: list[list[float]]) -> int:

@@ -10,8 +10,8 @@ from torch import nn
 
 from .arrays import Array, cell_means, lower_median
 
-CROP = 1.0 / 7.0
-"""Share that is cut off each side of raw frames of a GelSight Mini."""
+CROPS = (0.1, 1.0 / 7.0, 0.2)
+"""Shares of each side that one image may show beyond the other: raw frames of a GelSight Mini are cut by a seventh."""
 
 TWELVE_BITS = 4095.0 / 65535.0
 """Largest value of 12 bits stored in 16."""
@@ -120,19 +120,24 @@ def _same(cells: Array) -> Array:
     return cells
 
 
-def _centre(cells: Array) -> Array:
-    """The middle of (3, h, w) cells, without :data:`CROP` a side, at their own size."""
-    top, left = round(CROP * cells.shape[1]), round(CROP * cells.shape[2])
-    middle = torch.from_numpy(cells[None, :, top : cells.shape[1] - top, left : cells.shape[2] - left])
-    return nn.functional.interpolate(middle, cells.shape[1:], mode="bilinear", align_corners=False)[0].numpy()
+def _middle(share: float) -> Change:
+    """A function of (3, h, w) cells: their middle, without this share of each side, at their own size."""
+
+    def middle(cells: Array) -> Array:
+        top, left = round(share * cells.shape[1]), round(share * cells.shape[2])
+        inner = torch.from_numpy(cells[None, :, top : cells.shape[1] - top, left : cells.shape[2] - left])
+        return nn.functional.interpolate(inner, cells.shape[1:], mode="bilinear", align_corners=False)[0].numpy()
+
+    return middle
 
 
 def _known_views() -> list[tuple[str, Change, Change]]:
     """What may have happened to an image; what is done to its cells, and to the background's, so that they can be compared."""
-    views: list[tuple[str, Change, Change]] = [
-        ("is cropped otherwise and shows more than the background", _centre, _same),
-        ("is cropped otherwise and shows less than the background", _same, _centre),
-    ]
+    views: list[tuple[str, Change, Change]] = []
+    for share in CROPS:
+        by, middle = f"than the background, by {share:.0%} of each side", _middle(share)
+        views.append((f"is cropped otherwise and shows more {by}", middle, _same))
+        views.append((f"is cropped otherwise and shows less {by}", _same, middle))
     turns = (
         ("", 1, 1),
         ("is turned by 180 degrees", -1, -1),

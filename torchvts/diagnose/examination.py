@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..calibration import ROUGH, channel_structure, falloff, outwardness
+from ..calibration import ROUGH, channel_structure
 from ..core.checks import QUANTISATION_STD
 from ..core.geometry import angles_deg, lengths
 from ..core.noise import noise_std
@@ -129,9 +129,6 @@ class Examination:
         if unit.lights is None or not unit.measured:
             return None
         model = unit.model_image.float()
-        vignetting = unit.report.get("vignetting", 0.0)
-        if vignetting != 0.0:
-            model = model * falloff(outwardness(unit.sensor), vignetting).float()
         lit = unit.background_without_ambient.float().clamp(0.0, 1.0) ** (1.0 / self.exponent)
         return compare(lit, model, self.calibrated_noise, unit, self.rounding)
 

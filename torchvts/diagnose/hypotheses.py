@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..calibration import falloff
 from ..core.geometry import pixel_grid_mm
 from ..model import Calibration
 
@@ -99,7 +98,7 @@ def list_hypotheses(calibration: Calibration, level: Tensor) -> list[Hypothesis]
             undo=lambda light, n: (light - n[:3, None, None]) / n[3].exp(),
         ),
         Hypothesis("gamma", 1, lambda grid, n: grid.light ** n.exp(), undo=lambda light, n: light.clamp_min(0.0) ** (-n).exp()),
-        Hypothesis("vignetting", 2, lambda grid, n: grid.light * falloff(grid.outward, n[0]) * n[1].exp()),
+        Hypothesis("vignetting", 2, lambda grid, n: grid.light * (1.0 - grid.outward * n[0]).clamp_min(0.05) * n[1].exp()),
         *(_of_known_lights(lights.position_mm.detach().double(), logs) if lights is not None else _of_fields(logs)),
         Hypothesis("skin_changed", 6, lambda grid, n: grid.light * (n @ _quadratic(grid)).exp()),
         Hypothesis("light_field", 18, lambda grid, n: grid.light * (n.reshape(3, 6) @ _quadratic(grid)).exp()),

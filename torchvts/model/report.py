@@ -31,15 +31,10 @@ class CandidateRow(_CandidateKeys, total=False):
         family: its size, in words.
         parameters: number of fitted parameters.
         passes: 1 for normals from the image alone, 2 for normals that also use the depth of a first pass.
-        score_deg: what the choice compared, degrees; None where there is nothing to compare. With presses it is the mean error of
-            normals on them. Without, of lights: the standard deviation of their directions, 0 where the sensor file gives them, 90
-            where their fit did not converge.
+        score_deg: mean error of its normals on presses, each by the others, degrees; None where there is none.
         misfit: size of the smooth pattern in the background that lights cannot explain, relative to the light; absent where
             lights were not fitted, or the fit failed.
-        held_out: loss of lights on blocks of the background that were held out.
         gamma: camera response it was fitted with.
-        vignetting: share of the light that the lens loses in the image corners.
-        ambient: (3,), constant linear light.
         tried: degrees of fields that touches were tried with.
         note: why it was chosen or rejected.
     """
@@ -49,10 +44,7 @@ class CandidateRow(_CandidateKeys, total=False):
     passes: int
     score_deg: float | None
     misfit: float
-    held_out: float
     gamma: float
-    vignetting: float
-    ambient: list[float]
     tried: list[dict[str, float]]
     note: str
 
@@ -120,7 +112,6 @@ class Report(_ReportKeys, total=False):
         prior_deg: where the sensor's prior is the model, or what presses were fitted from: its mean error on presses and units that
             it was not fitted to, degrees; None where its file does not say.
         family: of the lights, in words.
-        chosen_because: why these lights, among the candidates.
         converged: whether the fit of the lights converged.
         message: how that fit ended, and what to do if it did not converge.
         steps: its number of steps.
@@ -131,8 +122,6 @@ class Report(_ReportKeys, total=False):
         misfit: (3,), size of the smooth pattern in the background that the lights cannot explain, relative to the light.
         inlier_fraction: share of the pixels that the robust fit kept.
         gloss: (3,), strength of the specular lobe.
-        vignetting: share of the light that the lens loses in the image corners.
-        ambient: (3,), constant linear light.
         residual_std: (3,), robust standard deviation of background minus model, linear light.
         standing_out: share of the background that differs clearly from the lights' model.
         camera_height_mm: height of a pinhole camera above the skin, where it is known.
@@ -147,7 +136,6 @@ class Report(_ReportKeys, total=False):
     own_deg: float
     prior_deg: float | None
     family: str
-    chosen_because: str
     converged: bool
     message: str
     steps: int
@@ -158,8 +146,6 @@ class Report(_ReportKeys, total=False):
     misfit: list[float]
     inlier_fraction: float
     gloss: list[float]
-    vignetting: float
-    ambient: list[float]
     residual_std: list[float]
     standing_out: float
     camera_height_mm: float

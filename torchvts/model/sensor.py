@@ -44,8 +44,6 @@ class Sensor:
         gamma: response of the camera, value = light^(1 / gamma); None leaves it open: calibration chooses it, all else uses 1.
         blur_px: standard deviation of a Gaussian blur before normals, pixels; 0 for none.
         light_position_mm: (3, 3), rows R, G, B, if the positions of the lights are known.
-        light_azimuth_deg: (3,), R, G, B: azimuth of each light around the image centre, if only that is known, degrees from x
-            (right) towards y (down). Either this or ``light_position_mm``.
         roi_px: (left, top, width, height) of the gel in the camera's frame, of the sensor's aspect within 2 %, resized to its size.
         corners_px: (4, 2), x and y of the gel's corners in the camera's frame: top left, top right, bottom right, bottom
             left, rectified to the sensor's size. Either this or ``roi_px``.
@@ -69,7 +67,6 @@ class Sensor:
     gamma: float | None = None
     blur_px: float = 0.0
     light_position_mm: tuple[tuple[float, float, float], ...] | None = None
-    light_azimuth_deg: tuple[float, float, float] | None = None
     roi_px: tuple[int, int, int, int] | None = None
     corners_px: tuple[tuple[float, float], ...] | None = None
     raw_size_px: tuple[tuple[int, int], ...] = ()
@@ -94,10 +91,6 @@ class Sensor:
             if min(numbers[2::3]) <= 0:
                 raise ValueError(f"light_position_mm: expected lights above the skin (z > 0), got {self.light_position_mm!r}")
             self._set("light_position_mm", tuple(numbers[i : i + 3] for i in (0, 3, 6)))
-        if self.light_position_mm is not None and self.light_azimuth_deg is not None:
-            raise ValueError("light_position_mm, light_azimuth_deg: expected one of them, got both: positions hold the azimuths")
-        if self.light_azimuth_deg is not None:
-            self._set("light_azimuth_deg", _azimuths(self.light_azimuth_deg))
         if self.roi_px is not None and self.corners_px is not None:
             raise ValueError("roi_px, corners_px: expected one of them, got both")
         if self.roi_px is not None:
@@ -367,16 +360,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, SensorPrior):
         return value.to_dict()
     return [_plain(item) for item in value] if isinstance(value, tuple) else value
-
-
-def _azimuths(value: object) -> tuple[float, ...]:
-    azimuths = check_numbers("light_azimuth_deg", value, (3,))
-    if max(abs(angle) for angle in azimuths) > 360.0:
-        raise ValueError(f"light_azimuth_deg: expected degrees in [-360, 360], got {value!r}")
-    gaps = [abs((azimuths[k] - azimuths[k - 1] + 180.0) % 360.0 - 180.0) for k in range(3)]
-    if min(gaps) < 1.0:
-        raise ValueError(f"light_azimuth_deg: expected three lights in different places, got {value!r}")
-    return azimuths
 
 
 def _raw_sizes(value: object) -> tuple[tuple[int, int], ...]:

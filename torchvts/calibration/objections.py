@@ -1,0 +1,154 @@
+"""What speaks against given presses, sizes and backgrounds, each in a sentence for the user."""
+
+import dataclasses
+import math
+import statistics
+from collections.abc import Sequence
+
+import torch
+
+from ..core.arrays import array_of
+from ..core.views import Views
+from ..model.calibration import Calibration
+from ..model.sensor import Sensor
+from .contacts import ROUGH, Contact, channel_structure, differing, used
+
+WIDE = 0.86
+"""Contact radius over the ball's, in the median over presses, from which sizes are wrong: it is 0.55 to 0.78 on eleven real and
+eight drawn sensors, 0.8 to 0.95 with a pitch that is twice too large. Presses that are all deep are no mistake."""
+
+WIDE_OUTLINE = 1.75
+"""The same of the outline of the strong change of light: 0.54 to 1.61, and 1.4 to 3.2."""
+
+ENOUGH = 5
+"""Presses from which contact radii are known well enough for that; outlines do not hang on where the balls are found."""
+
+ALIKE = 1.15
+"""Gains of presses by the prior that are the same to within this factor show one mistake of all."""
+
+FAR = 1.4
+"""That factor, from one which no unit differs so much from the prior of its type: 0.87 to 1 on three units."""
+
+USUAL_GAIN = 1.15
+"""The prior's slopes divided by those of the balls are within this factor: 0.93 to 1.00 on a GelSight Mini."""
+
+SAME_TYPE = 0.27
+"""Median difference of a background from the prior's pattern, logarithm of the light, up to which a unit is of the prior's type: it
+is 0.03 to 0.08 on three GelSight Minis and 0.06 and 0.26 on two DIGITs, at most 0.24 with the frame shifted by 8 %, and at least
+0.30 on 18 sensors of other types."""
+
+
+SHIFTED = 0.15
+"""The same, from which a frame is cropped otherwise, not only shifted as units are: whole frames of a GelSight Mini have 0.17."""
+
+
+class CalibrationWarning(UserWarning):
+    """A calibration was made but should not be trusted as it is."""
+
+
+def to_contacts(contacts: Sequence[Contact]) -> list[str]:
+    """Presses and touches that were left out."""
+    return [f"{contact.name}: left out: {contact.reason}" for contact in contacts if contact.reason]
+
+
+def to_diameters_by_prior(used: Sequence[Contact]) -> list[str]:
+    """Diameters that are all wrong by the same factor, which only the prior can show."""
+    gain = statistics.median(contact.metrics["gain"] for contact in used)
+    if abs(math.log(max(gain, 1e-3))) <= math.log(USUAL_GAIN):
+        return []
+    return [
+        f"presses: by the sensor's prior the balls seem {1.0 / gain:.2f} times as wide as given: wrong diameter or pitch? "
+        "if they are right, this unit differs from the prior's, and more presses will show it"
+    ]
+
+
+def to_sizes(contacts: Sequence[Contact], mm_per_pixel: float) -> str:
+    """Why contacts are too wide for their balls, in the median over those that are used; "" where they are not.
+
+    One wrong diameter among right ones is found by the others (outliers.py). Where all are wrong by one factor, presses agree with
+    each other: a field fitted to them makes the same mistake, and even promises more accuracy.
+    """
+    located = [contact for contact in used(contacts) if not (contact.known and contact.radius_known)]
+    if not located:
+        return ""
+    wide = statistics.median(contact.contact_radius_mm / contact.radius_mm for contact in located)
+    outline = statistics.median(contact.outline_mm / contact.radius_mm for contact in located)
+    if (wide < WIDE or len(located) < ENOUGH) and outline < WIDE_OUTLINE:
+        return ""
+    return (
+        f"presses: expected contacts narrower than their balls, got contacts {wide:.2f} times as wide as the balls, and outlines "
+        f"{outline:.2f} times (0.5 to 0.8, and 0.6 to 1.6, are usual): either mm_per_pixel, {mm_per_pixel:g}, is too large, "
+        "or radii were given for diameters"
+    )
+
+
+def to_sizes_by_prior(contacts: Sequence[Contact]) -> str:
+    """Why the prior contradicts the sizes of all presses alike; "" where it does not, or where they differ from each other."""
+    logs = [math.log(max(contact.metrics["gain"], 1e-3)) for contact in contacts if "gain" in contact.metrics]
+    if len(logs) < 0.5 * len(contacts) or not logs:
+        return ""
+    middle = statistics.median(logs)
+    alike = statistics.median(abs(value - middle) for value in logs) < math.log(ALIKE)
+    if not alike or abs(middle) < math.log(FAR):
+        return ""
+    return (
+        f"presses: by the sensor's prior all balls seem {math.exp(-middle):.2f} times as wide as given, on a background like that "
+        "of the prior: wrong diameters (radii, inches?), or a wrong mm_per_pixel"
+    )
+
+
+def to_background_of_prior(background: torch.Tensor, sensor: Sensor) -> list[str]:
+    """A background of another sensor type than the prior's, turned, swapped or cropped otherwise, or one with a contact.
+
+    Args:
+        background: (3, H, W) in [0, 1].
+        sensor: with a prior.
+    Example:
+        >>> sensor = Sensor.load("gelsight_mini")
+        >>> image = sensor.prior.background(240, 320, 0.0634).clamp(0, 1)
+        >>> to_background_of_prior(image, sensor), "turned by 180" in to_background_of_prior(image.flip(1, 2), sensor)[0]
+        ([], True)
+    """
+    assert sensor.prior is not None
+    light = background.detach().cpu().float() ** sensor.prior.response.gamma
+    usual = sensor.prior.background(sensor.height, sensor.width, sensor.mm_per_pixel).float().clamp_min(1e-3)
+    views = Views(array_of(usual))
+    cells = views.cells(array_of(light * (usual.mean() / light.mean())))
+    seen = f"its pattern of light is not that of the unit on which the prior of sensor '{sensor.name}' was fitted"
+    found = []
+    difference, view = views.difference(cells), views.other(cells)
+    if view is not None and not (view.cropped and difference < SHIFTED):
+        found.append(f"background: {seen}: it {view.in_words()}: turn, swap or crop the images as the sensor's are")
+    elif difference > SAME_TYPE:
+        found.append(
+            f"background: {seen}: they differ by {difference:.0%} in the median, at most {SAME_TYPE:.0%} is usual, and no turned, "
+            "mirrored or channel-swapped one fits: another sensor type, or an LED failed"
+        )
+    structure = channel_structure(background)
+    if structure > ROUGH and not sensor.markers:
+        found.append(
+            f"background: structure between the channels of {structure:.2f}, a background stays below {ROUGH}: contact in the "
+            "calibration image? take it again without"
+        )
+    return found
+
+
+def to_background_of_lights(unit: Calibration) -> tuple[Calibration, list[str]]:
+    """A background that differs from fitted lights in places; the calibration with that in its report. Others stay as they are."""
+    if unit.report["source"] != "background":
+        return unit, []
+    model = unit.model_image
+    spread = (model - unit.background).abs().flatten(1).median(dim=1).values / 0.6745
+    # contact changes the light by more than 5 % and is wider than dirt: 5 sigmas of the residual and of 1 % of the model
+    saturated = (unit.background > 0.995) | (model > 0.95)
+    change = (unit.background - model).masked_fill(saturated, 0.0)
+    standing_out = float(differing(change, spread.reshape(3, 1, 1) + 0.01 * model).double().mean())
+    report = unit.report.copy()
+    report["residual_std"], report["standing_out"] = spread.tolist(), standing_out
+    found = []
+    if standing_out > 0.01:
+        found.append(
+            f"background: {standing_out:.1%} of the image differs from the fitted lights by more than 5 times their residual "
+            f"({', '.join(f'{v:.4f}' for v in spread.tolist())}): contact in the calibration image? take it again without"
+        )
+    return dataclasses.replace(unit, report=report), found

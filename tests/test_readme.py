@@ -52,10 +52,6 @@ def test_code_and_commands_run_in_order(rendered, tmp_path, monkeypatch, ring):
     assert names["learned"].weight.grad is not None
 
 
-def test_a_reader_needs_three_minutes():
-    assert len(README.read_text().split()) <= 900
-
-
 def test_readme_names_only_files_that_exist():
     text = README.read_text()
     for path in re.findall(r"\]\(([^)#:]+)\)", text) + re.findall(r"(?:scripts|docs|configs)/[\w/]+\.\w+", text):

@@ -218,7 +218,7 @@ class TaughtRange:
 
     @property
     def angle_deg(self) -> float:
-        """The steepest angle that was taught, degrees."""
+        """The steepest angle of the presses, degrees."""
         return math.degrees(math.asin(min(1.0, self.sine)))
 
     def with_all_of(self, other: "TaughtRange") -> "TaughtRange":

@@ -1,6 +1,6 @@
 """Dark pixels: a dark channel may be an attached shadow, a cast shadow or dirt; what leaves the most integrable surface decides.
 
-A frame enters this room only where a light that shines on the flat skin is dark inside the deformed area, and only for units that
+A frame is treated here only where a light that shines on the flat skin is dark inside the deformed area, and only for units that
 are calibrated by lights.
 """
 

@@ -21,14 +21,13 @@ author = "the authors of torchvts"
 project_copyright = "the authors of torchvts, Apache-2.0"
 version = release = torchvts.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "sphinxcontrib.mermaid"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = "torchvts"
 html_show_sphinx = False
 html_static_path: list[str] = []
 
-myst_fence_as_directive = ["mermaid"]
 myst_heading_anchors = 3
 
 autodoc_member_order = "groupwise"
@@ -44,7 +43,7 @@ def _short(name: str) -> str:
 
 
 def skip(app: Any, what: str, name: str, obj: Any, skipped: bool, options: Any) -> bool | None:
-    """Leave out fields of tuples, which the class describes, what a twin is made of, and names of a room that torchvts exports."""
+    """Leave out fields of tuples, which the class describes, what makes up a compiled block, and names that torchvts exports."""
     if type(obj).__name__ == "_tuplegetter" or (what == "class" and isinstance(obj, type)):
         return True
     if what == "module" and app.env.docname != "api/torchvts" and name in torchvts.__all__:
@@ -53,16 +52,16 @@ def skip(app: Any, what: str, name: str, obj: Any, skipped: bool, options: Any) 
 
 
 def describe_constants(app: Any) -> None:
-    """Give the constants that a room exports the texts beneath their definitions, in its modules: autodoc does not look there."""
+    """Give the constants that a package exports the texts beneath their definitions, where autodoc does not look."""
     for found in pkgutil.walk_packages(torchvts.__path__, "torchvts."):
         if found.ispkg:
             importlib.import_module(found.name)
-    for room in [name for name, module in sys.modules.items() if name.startswith("torchvts.") and hasattr(module, "__all__")]:
-        analyzer = ModuleAnalyzer.for_module(room)
+    for package in [name for name, module in sys.modules.items() if name.startswith("torchvts.") and hasattr(module, "__all__")]:
+        analyzer = ModuleAnalyzer.for_module(package)
         analyzer.analyze()
         for module in [name for name in sys.modules if name.startswith("torchvts.")]:
             for (holder, constant), text in ModuleAnalyzer.for_module(module).find_attr_docs().items():
-                if not holder and constant in sys.modules[room].__all__:
+                if not holder and constant in sys.modules[package].__all__:
                     analyzer.attr_docs.setdefault(("", constant), text)
 
 
@@ -74,7 +73,7 @@ def describe_twins(app: Any, what: str, name: str, obj: Any, options: Any, lines
 
 
 def name_the_others(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Say on a room's page which of its names stand on the page of torchvts."""
+    """Say on a package's page which of its names stand on the page of torchvts."""
     if what != "module" or name == "torchvts":
         return
     others = [other for other in getattr(obj, "__all__", []) if other in torchvts.__all__]

@@ -2,8 +2,8 @@
 
 python scripts/stability.py [--out out/stability] [--seeds 3] [--keep]
 
-Rows are written to OUT/rows.jsonl, and the same command continues an interrupted run. --keep also writes docs/failures, the lines
-with breaking points in docs/where_methods_fail.md, and tests/breaking_points.json.
+Rows are written to OUT/rows.jsonl; the same command continues an interrupted run. --keep also writes docs/failures, the table of
+breaking points in docs/where_methods_fail.md, and tests/breaking_points.json.
 """
 
 import argparse

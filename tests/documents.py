@@ -40,6 +40,6 @@ def run(path):
         if kind == "python":
             exec(compile(text, str(path), "exec"), names)
         else:
-            for line in text.splitlines():
+            for line in text.replace("\\\n", " ").splitlines():
                 command(line)
     return names

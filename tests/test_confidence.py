@@ -257,9 +257,9 @@ def test_a_frame_beyond_the_presses_is_named_in_words(drawn, ring):
     assert beyond_presses(calibration, out) == [""]
     steep = ranged(drawn[0], math.sin(math.radians(5.0)))
     (text,) = beyond_presses(steep, out)
-    assert re.fullmatch(r"slopes up to \d+ degrees; the presses taught up to 5", text)
+    assert re.fullmatch(r"slopes up to \d+ degrees; the presses reach 5", text)
     deep = ranged(drawn[0], 0.9, 0.4 * float(out.depth_mm.max()))
-    assert re.fullmatch(r"depths up to \d\.\d mm; the presses taught up to \d\.\d", beyond_presses(deep, out)[0])
+    assert re.fullmatch(r"depths up to \d\.\d mm; the presses reach \d\.\d", beyond_presses(deep, out)[0])
     finding = next(found for found in vts.diagnose(None, frames[0], steep) if found.name == "beyond_presses")
     assert finding.message.startswith("slopes up to ") and finding.severity == "warning"
     by_lights, _, camera = lights_unit(ring)

@@ -16,27 +16,28 @@ import torchvts as vts
 from torchvts.cli.main import COMMANDS, make_parser
 
 DOCS = ROOT / "docs"
+PAGES = [*DOCS.glob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 
 
-def rooms():
+def packages():
     """Every package of torchvts, and every module that its package exports, with what is public there: (name, public names)."""
     found = [vts, *(importlib.import_module(one.name) for one in pkgutil.walk_packages(vts.__path__, "torchvts.") if one.ispkg)]
-    found += [value for room in found for value in vars(room).values() if isinstance(value, ModuleType)]
-    named = {room.__name__: list(getattr(room, "__all__", [])) for room in found if room.__name__.startswith("torchvts")}
+    found += [value for package in found for value in vars(package).values() if isinstance(value, ModuleType)]
+    named = {one.__name__: list(getattr(one, "__all__", [])) for one in found if one.__name__.startswith("torchvts")}
     return {name: public for name, public in named.items() if public and name != "torchvts.cli"}
 
 
-def names_of(room, public):
-    """Where the reference may have each name of a room, its submodules left out: they are rooms of their own."""
+def names_of(package, public):
+    """Where the reference may have each name of a package, its submodules left out: they are packages of their own."""
     for name in public:
-        if not isinstance(getattr(importlib.import_module(room), name), ModuleType):
-            yield {f"torchvts.{name}", f"{room}.{name}"} if name in vts.__all__ else {f"{room}.{name}"}
+        if not isinstance(getattr(importlib.import_module(package), name), ModuleType):
+            yield {f"torchvts.{name}", f"{package}.{name}"} if name in vts.__all__ else {f"{package}.{name}"}
 
 
-def test_every_room_has_a_page_of_the_reference():
+def test_every_package_has_a_page_of_the_reference():
     pages = "\n".join(path.read_text() for path in (DOCS / "api").glob("*.md"))
     shown = set(re.findall(r"(?:automodule|currentmodule):: (\S+)", pages))
-    assert set(rooms()) <= shown
+    assert set(packages()) <= shown
 
 
 def test_links_and_pictures_exist():
@@ -49,20 +50,28 @@ def commands(text):
     """What a document says to type: (subcommand of torchvts, the words after it)."""
     fenced = re.findall(r"^```(?:bash)?\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
     code = "\n".join([*fenced, *re.findall(r"^ {4}(.*)$", text, re.MULTILINE), *re.findall(r"`([^`\n]+)`", text)])
-    return re.findall(r"(?:^|\$\(|-m )torchvts ([a-z]+)(.*)$", code, re.MULTILINE)
+    return re.findall(r"(?:^|\$\(|-m )torchvts ([a-z]+)(.*)$", code.replace("\\\n", " "), re.MULTILINE)
 
 
 def test_commands_of_the_documents_can_be_typed():
-    documents = [*DOCS.glob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
-    found = [(path.name, *words) for path in documents for words in commands(path.read_text())]
+    found = [(path.name, *words) for path in PAGES for words in commands(path.read_text())]
     assert len(found) > 20
     for name, subcommand, rest in found:
         assert subcommand in COMMANDS, f"{name}: torchvts {subcommand}"
         options = make_parser(subcommand, importlib.import_module(f"torchvts.cli.{subcommand}"))._option_string_actions
         assert set(re.findall(r"(?<!\S)--[a-z-]+", rest)) <= set(options), f"{name}: torchvts {subcommand}{rest}"
-    for path in documents:
+    for path in PAGES:
         for script in re.findall(r"scripts/\w+\.py", path.read_text()):
             assert (ROOT / script).is_file(), f"{path.name}: {script}"
+
+
+def test_code_and_help_fit_into_88_columns():
+    for path in PAGES:
+        blocks = "".join(re.findall(r"^```.*?\n(.*?)^```", path.read_text(), re.DOTALL | re.MULTILINE))
+        assert [line for line in blocks.splitlines() if len(line) > 88] == [], path.name
+    for name in COMMANDS:
+        parser = make_parser(name, importlib.import_module(f"torchvts.cli.{name}"))
+        assert [line for line in parser.format_help().splitlines() if len(line) > 88] == [], name
 
 
 def test_the_citation_names_this_version_and_the_paper():
@@ -79,7 +88,7 @@ def test_every_public_name_is_in_the_reference(tmp_path):
     assert done.returncode == 0, done.stderr[-4000:]
     inventory = zlib.decompress((tmp_path / "objects.inv").read_bytes().split(b"\n", 4)[4]).decode()
     shown = {line.split()[0] for line in inventory.splitlines() if " py:" in line}
-    wanted = [places for room, public in rooms().items() for places in names_of(room, public)]
+    wanted = [places for package, public in packages().items() for places in names_of(package, public)]
     assert len(wanted) > 100
     assert [places for places in wanted if not places & shown] == []
 

@@ -46,3 +46,8 @@ def test_training_through_depth(empty_folder):
     names = run(ROOT / "docs" / "training.md")
     assert names["losses"][-1] < 0.1 * names["losses"][0]
     assert names["lights"].albedo.grad is not None
+
+
+def test_bounds_of_confidence(empty_folder):
+    names = run(ROOT / "docs" / "confidence.md")
+    assert float(names["inside"][names["scene"].contact].float().mean()) > 0.9

@@ -63,7 +63,7 @@ def calibrate(
             seems to hold a contact, or it does not have the pattern of light of the prior's sensor type. Presses then decide
             whether the prior is used.
     Source:
-        eq. 6-8 of the paper for lights; the rest is this project's.
+        eq. 6-8 of the paper for lights.
     Example:
         >>> from torchvts.model.lights import PointLights, flat_image
         >>> sensor = Sensor(name="rig", height=48, width=64, mm_per_pixel=0.6)

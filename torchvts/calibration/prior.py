@@ -39,8 +39,6 @@ def fit_prior(background: Tensor, sensor: Sensor, presses: Sequence[Press], sour
         source: whose images these are, kept with the prior.
     Raises:
         ValueError, TypeError: as :func:`calibrate`.
-    Source:
-        this project.
     """
     check_sensor("sensor", sensor)
     if not isinstance(source, str):

@@ -5,7 +5,7 @@ calibration folder of gs_sdk (catalog.csv, background.png, N/gelsight.png). Cent
 
 examples:
   torchvts calibrate background.png --sensor gelsight_mini --out unit.safetensors
-  torchvts calibrate background.png --press 1.png 6.31 --press 2.png 6.31 --sensor gelsight_mini
+  torchvts calibrate background.png --press 1.png 6.31 --sensor gelsight_mini
   torchvts calibrate first_frames.mp4 --mm-per-pixel 0.05
 """
 

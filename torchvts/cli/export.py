@@ -4,7 +4,8 @@ Exit status 1 where a file does not give the pipeline's depth.
 
 examples:
   torchvts export unit.safetensors --out folder
-  torchvts export unit.safetensors --out folder --mode precise --format torchscript onnx --frames presses/
+  torchvts export unit.safetensors --out folder --mode precise \\
+      --format torchscript onnx --frames presses/
 """
 
 import argparse

@@ -14,7 +14,7 @@ from typing import TextIO
 from ..core import __version__
 from ..core.checks import in_one_line
 from ..core.spelling import suggest
-from .parser import HelpFormatter, Parser, UsageError
+from .parser import HelpFormatter, Parser, UsageError, wrapped
 
 COMMANDS = {
     "calibrate": "calibrate a unit from its own images",
@@ -108,8 +108,8 @@ def make_parser(name: str, module: ModuleType) -> Parser:
     """The parser of a subcommand."""
     parser = Parser(
         prog=f"torchvts {name}",
-        usage=f"torchvts {name} {module.USAGE}",
-        description=module.__doc__,
+        usage=wrapped(f"usage: torchvts {name} {module.USAGE}", indent=" " * 7).removeprefix("usage: "),
+        description=wrapped(module.__doc__ or ""),
         formatter_class=HelpFormatter,
         allow_abbrev=False,
     )

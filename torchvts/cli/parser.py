@@ -1,9 +1,23 @@
 """argparse with one-line errors that name the option that was probably meant."""
 
 import argparse
+import shutil
+import textwrap
 from typing import Any, NoReturn
 
 from ..core.spelling import suggest
+
+COLUMNS = 88
+"""Width of help where the terminal is no narrower."""
+
+
+def wrapped(text: str, indent: str = "") -> str:
+    """Text in lines of at most :data:`COLUMNS`: paragraphs are filled, lines that begin with a space stay as they are."""
+    paragraphs = [
+        block if "\n " in f"\n{block}" else textwrap.fill(block, COLUMNS, subsequent_indent=indent, break_on_hyphens=False)
+        for block in text.split("\n\n")
+    ]
+    return "\n\n".join(paragraphs)
 
 
 class UsageError(ValueError):
@@ -14,7 +28,8 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
     """Help that stays short: options and their text on one line, IMAGE... in place of IMAGE [IMAGE ...]."""
 
     def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=28)
+        width = min(shutil.get_terminal_size().columns, COLUMNS + 2) - 2
+        super().__init__(prog, max_help_position=28, width=width)
 
     def _format_args(self, action: argparse.Action, default_metavar: str) -> str:
         if action.nargs == argparse.ONE_OR_MORE:

@@ -5,7 +5,7 @@ Exit status 1 where a pose was not found.
 
 examples:
   torchvts pose source.png reference.png --calibration unit.safetensors --out out/pose
-  torchvts pose video.avi reference.png --calibration unit.safetensors --out out/sequence
+  torchvts pose video.avi reference.png --calibration unit.safetensors --out out/all
   torchvts pose source.ply reference.pcd --out out/pose
 """
 

@@ -7,7 +7,8 @@ Exit status 1 where a frame was left out.
 examples:
   torchvts reconstruct unit.safetensors press.png --out out/press
   torchvts reconstruct video.avi --sensor gelsight_mini --out out/video
-  torchrun --standalone --nproc_per_node=4 -m torchvts reconstruct unit.safetensors folder/ --out out/all
+  torchrun --standalone --nproc_per_node=4 -m torchvts reconstruct unit.safetensors \\
+      folder/ --out out/all
 """
 
 import argparse

@@ -6,7 +6,8 @@ sha256. The cache is TORCHVTS_CACHE, or torchvts in XDG_CACHE_HOME, or ~/.cache/
 examples:
   torchvts samples gelsight_mini
   torchvts samples gelsight_mini --from FOLDER
-  torchvts calibrate $(torchvts samples gelsight_mini) --sensor gelsight_mini --out unit.safetensors
+  torchvts calibrate $(torchvts samples gelsight_mini) \\
+      --sensor gelsight_mini --out unit.safetensors
 """
 
 import argparse

@@ -7,7 +7,8 @@ that. Ctrl-C ends it and finishes the files. Exit status 1 where the object was 
 
 examples:
   torchvts track --source video.avi --sensor gelsight_wedge --out out/track
-  torchvts track --source 0 --calibration unit.safetensors --out out/track --reference press.png
+  torchvts track --source 0 --calibration unit.safetensors \\
+      --out out/track --reference press.png
 """
 
 import argparse

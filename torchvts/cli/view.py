@@ -6,7 +6,7 @@ r start and end a recording, q end.
 
 examples:
   torchvts view --source 0 --sensor gelsight_mini
-  torchvts view --source /dev/video2 --calibration unit.safetensors --size 640 480 --fps 30
+  torchvts view --source /dev/video2 --calibration unit.safetensors --fps 30
   torchvts view --source video.avi --sensor gelsight_wedge --save ball.rrd
 """
 

@@ -24,8 +24,6 @@ def diagnose(background: Tensor | None, image: Tensor, calibration: Calibration)
     Raises:
         ValueError: not an RGB image, or values outside [0, 1] or not finite.
         TypeError: not a tensor of floats, or no calibration.
-    Source:
-        this project; docs/diagnose.md says what each finding means and how often it is right.
     Example:
         >>> from torchvts import PointLights, Sensor
         >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])

@@ -298,30 +298,12 @@ def points_from_json(text: str) -> tuple[list[Breaking], int]:
 
 
 def updated_page(page: str, points: Sequence[Breaking]) -> str:
-    """The page with new lines after each ``<!-- corruption: name -->``: where the methods except "flat" break.
+    """The page with a new table after ``<!-- breaking points -->``: where the methods except "flat" break.
 
     Raises:
-        ValueError: the page names a corruption that does not exist or was not measured.
+        ValueError: the page has no such line.
     """
-    lines = page.split("\n")
-    for k, line in enumerate(lines):
-        if line.startswith("<!-- corruption: ") and line.endswith(" -->"):
-            name = line[len("<!-- corruption: ") : -len(" -->")]
-            here = [point for point in points if point.corruption == name and point.method != "flat"]
-            if not here:
-                raise ValueError(f"page: {line}: no such corruption was measured")
-            lines[k + 1] = _sentence(here)
-    return "\n".join(lines)
-
-
-def _sentence(points: Sequence[Breaking]) -> str:
-    groups: dict[str, list[str]] = {}
-    for point in sorted(points, key=lambda point: point.held):
-        groups.setdefault(point.text, []).append(f"*{point.method}*")
-    unit = f" {points[0].unit}" if points[0].unit else ""
-    parts = [f"broken at the first severity: {', '.join(groups.pop('always'))}"] if "always" in groups else []
-    never = groups.pop("never", [])
-    parts += [f"breaks at {at}{unit}: {', '.join(names)}" for at, names in groups.items()]
-    parts += [f"does not break: {', '.join(never)}"] if never else []
-    text = "; ".join(parts)
-    return text[:1].upper() + text[1:] + "."
+    head, mark, rest = page.partition("<!-- breaking points -->\n\n")
+    if not mark:
+        raise ValueError("page: expected a line <!-- breaking points --> and an empty one after it, got none")
+    return head + mark + table([point for point in points if point.method != "flat"]) + rest[rest.index("\n\n") :]

@@ -91,8 +91,7 @@ def integrate_discontinuities(
         ValueError: wrong shape, or H or W below 2, or one of two arguments that go together. TypeError: not floating point.
     Source:
         Holland and Welsch, Communications in Statistics 6(9), 1977, for the weights (Cauchy's); Queau, Durou, Aujol,
-        Variational methods for normal integration, JMIV 60, 2018, for edges that the others contradict. Variances, heights
-        and rim are this project's.
+        Variational methods for normal integration, JMIV 60, 2018, for edges that the others contradict.
     Example:
         >>> from torchvts import poisson_background
         >>> x = torch.arange(-12.0, 12.0)

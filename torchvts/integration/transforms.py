@@ -78,7 +78,7 @@ def cosine_tables(height: int, width: int) -> list[Tensor]:
         (2, W // 2 + 1, H // 2 + 1) complex128; the second difference's inverse eigenvalues for the sum and for the difference,
         (W // 2 + 1, H // 2 + 1, 2) for real and imaginary part; the places -k_y.
     Source:
-        Makhoul, A fast cosine transform in one and two dimensions, IEEE Trans. ASSP 28(1), 1980; the pairing is this project's.
+        Makhoul, A fast cosine transform in one and two dimensions, IEEE Trans. ASSP 28(1), 1980.
     """
     k_y = torch.arange(height // 2 + 1, dtype=torch.float64)[None, :]
     k_x = torch.arange(width // 2 + 1, dtype=torch.float64)[:, None]

@@ -21,7 +21,7 @@ class PointLights(nn.Module):
         ValueError: wrong shape, values not finite, albedo not positive, gloss negative, or a light not above the skin
             (z <= 0).
     Source:
-        eq. 1 of the paper: S^j and rho^j. The lobe is this project's.
+        eq. 1 of the paper: S^j and rho^j.
     Example:
         >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
         >>> lights.position_mm.shape

@@ -40,7 +40,7 @@ class ResponseField:
     Raises:
         ValueError, TypeError: names the argument.
     Source:
-        linear slope response: Johnson and Adelson, CVPR 2009, who tabulate it; as a polynomial field for sines: this project.
+        linear slope response: Johnson and Adelson, CVPR 2009, who tabulate it.
     Example:
         >>> ResponseField(0, -1, 10.0, ((1, 0, 0), (0, 1, 0))).size()
         3
@@ -148,8 +148,7 @@ class DepthBrightness:
     Raises:
         ValueError, TypeError: names the argument.
     Source:
-        eq. 1 of the paper: a light at height h and distance d gives c = 3 h / d^2 - 1 / h and steeper = 3 h / d^2; free parameters
-        in place of its lights: this project.
+        eq. 1 of the paper: a light at height h and distance d gives c = 3 h / d^2 - 1 / h and steeper = 3 h / d^2.
     Example:
         >>> DepthBrightness(0, 10.0, ((0.1,), (0.0,), (0.0,))).maps(2, 2, 0.1)[:, 0, 0]
         tensor([0.1000, 0.0000, 0.0000], dtype=torch.float64)
@@ -219,7 +218,7 @@ class TaughtRange:
 
     @property
     def angle_deg(self) -> float:
-        """The steepest angle that was taught, degrees."""
+        """The steepest angle of the presses, degrees."""
         return math.degrees(math.asin(min(1.0, self.sine)))
 
     def with_all_of(self, other: "TaughtRange") -> "TaughtRange":

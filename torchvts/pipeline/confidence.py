@@ -191,9 +191,9 @@ def beyond_presses(calibration: Calibration, output: DepthOutput | ConfidentOutp
             deepest = float(depth[contact].float().quantile(0.95))
             if sine > min(1.0, BEYOND * taught.sine):
                 angle = math.degrees(math.asin(min(1.0, sine)))
-                parts.append(f"slopes up to {angle:.0f} degrees; the presses taught up to {taught.angle_deg:.0f}")
+                parts.append(f"slopes up to {angle:.0f} degrees; the presses reach {taught.angle_deg:.0f}")
             if deepest > BEYOND * taught.depth_mm:
-                parts.append(f"depths up to {deepest:.1f} mm; the presses taught up to {taught.depth_mm:.1f}")
+                parts.append(f"depths up to {deepest:.1f} mm; the presses reach {taught.depth_mm:.1f}")
         if distance is not None and bool(contact.any()):
             elsewhere = float((distance[contact[0].cpu()] > COVERED).double().mean())
             if elsewhere > 0.5:
@@ -241,8 +241,7 @@ class Confidence(nn.Module):
         blur_px: of the compensated image.
         spread: of the errors of normals, for :func:`bound_at`.
     Source:
-        propagation of noise through photometric stereo: Barsky and Petrou, Signal Processing 86(11), 2006; the rest is this
-        project's, its constants measured on random scenes and on a GelSight Mini (docs/confidence.md).
+        propagation of noise through photometric stereo: Barsky and Petrou, Signal Processing 86(11), 2006.
     Example:
         >>> from torchvts import ConfidentPipeline, PointLights, Sensor
         >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])

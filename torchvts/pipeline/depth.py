@@ -80,7 +80,7 @@ class DepthPipeline(nn.Module):
         contact: depth and deformed area to contact, bool (B, 1, H, W); None for :class:`ContactFromDepth`.
         smooth: divides a smooth change of the light out of the compensated image; None for nothing.
     Source:
-        figure 2 and eq. 3-10 of the paper; "auto" and the stopping rule are this project's.
+        figure 2 and eq. 3-10 of the paper.
     """
 
     skips_undeformed: Final[bool]

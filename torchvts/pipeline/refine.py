@@ -132,8 +132,6 @@ class Adaptive(Repeat):
         max_passes: bound on all passes.
         refine_threshold_px: predicted change of depth from which a frame is solved again, as a multiple of the pitch.
         stride: pixels.
-    Source:
-        this project.
     """
 
     def __init__(

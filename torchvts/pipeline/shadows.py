@@ -1,6 +1,6 @@
 """Dark pixels: a dark channel may be an attached shadow, a cast shadow or dirt; what leaves the most integrable surface decides.
 
-A frame enters this room only where a light that shines on the flat skin is dark inside the deformed area, and only for units that
+A frame is treated here only where a light that shines on the flat skin is dark inside the deformed area, and only for units that
 are calibrated by lights.
 """
 
@@ -39,8 +39,7 @@ class Shadows(nn.Module):
         mm_per_pixel: pixel pitch, mm.
         rounds: how often pixels are classified again beside those that were accepted.
     Source:
-        Onn and Bruckstein, Integrability disambiguates surface recovery in two-image photometric stereo, IJCV 5(1), 1990; the
-        rest is this project's.
+        Onn and Bruckstein, Integrability disambiguates surface recovery in two-image photometric stereo, IJCV 5(1), 1990.
     """
 
     def __init__(self, policy: Repeat, residual_integrator: Integrator, mm_per_pixel: float, rounds: int = 3) -> None:

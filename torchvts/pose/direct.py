@@ -37,8 +37,7 @@ def register_depth(source: DepthFrame, target: DepthFrame, mm_per_pixel: float, 
         ValueError: not one frame, sizes that differ, values not finite, a contact of a few pixels, or ``initial`` is no rigid
             motion.
     Source:
-        Padfield 2012 for the search; direct alignment as in Lucas, Kanade 1981 with Cauchy's loss; weighting slopes above depth
-        is a choice of this project.
+        Padfield 2012 for the search; direct alignment as in Lucas, Kanade 1981 with Cauchy's loss.
     Example:
         >>> import math
         >>> from torchvts.scenes import objects

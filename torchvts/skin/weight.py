@@ -68,8 +68,6 @@ class ContactMask(nn.Module):
         noise_std: (3, H, W), noise of the compensated image; only where it is larger than usual counts. None for even noise.
         sigmas: evidence that a contact has somewhere. Higher finds less dirt, and fewer faint presses.
         by_colour: whether slopes change the colour. Of lights that stand at one side they do not: there slopes alone decide.
-    Source:
-        this project; docs/decisions.md.
     Example:
         >>> flat = torch.full((3, 64, 64), 0.5)
         >>> image = flat.clone(); image[0, 20:40, 20:40] += 0.2

@@ -79,10 +79,7 @@ def voxel_first(points: Tensor, size: float) -> Tensor:
     cell = torch.floor((points - points.amin(0)) / size).long()
     extent = cell.amax(0) + 1
     code = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
-    order = torch.argsort(code, stable=True)
-    code = code[order]
-    fresh = torch.cat((torch.ones(1, dtype=torch.bool), code[1:] != code[:-1]))
-    return order[fresh].sort().values
+    return torch.from_numpy(np.sort(np.unique(code.numpy(), return_index=True)[1]))
 
 
 def write_point_cloud(path: str | Path, points: Tensor, normals: Tensor | None = None) -> None:

@@ -4,11 +4,11 @@ import math
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, unfold
+from torch.nn.functional import avg_pool2d
 
 from .direct import align
 from .features import Cloud
-from .relief import LEAST_DEPTH_MM, Levels, relief, slope_noise, without_rim
+from .relief import LEAST_DEPTH_MM, Levels, relief, slope_noise, slopes_of_planes, without_rim
 from .result import Registration
 
 MOST_CELLS = 4_000_000
@@ -54,7 +54,7 @@ def _grids(cloud: Cloud) -> Levels | None:
     z, slopes = torch.zeros(rows, columns), torch.zeros(2, rows, columns)
     z[cell[:, 0], cell[:, 1]] = points[:, 2].float()
     if cloud.normals is None:
-        slopes = _slopes(z, known, pitch)
+        slopes = slopes_of_planes(z[None], known, pitch)[0] * known
     else:
         slopes[:, cell[:, 0], cell[:, 1]] = (-cloud.normals[:, :2] / cloud.normals[:, 2:].clamp_min(0.1)).T.float()
     first = max(1, math.ceil(max(z.shape) / 330))
@@ -65,16 +65,3 @@ def _grids(cloud: Cloud) -> Levels | None:
     if min(len(one.points) for one in made) < 12:
         return None
     return Levels(made[0], made[1], made[2], slope_noise(slopes, known) / every[2])
-
-
-def _slopes(z: Tensor, inside: Tensor, pitch: float) -> Tensor:
-    """Slopes (2, H, W), y up, of planes through 3 x 3 heights inside."""
-    side = (-1.0, 0.0, 1.0)
-    place = z.new_tensor([[1.0, x, -y] for y in side for x in side])
-    weight = unfold(inside.to(z.dtype)[None, None], 3, padding=1)[0].T
-    heights = unfold(z[None, None], 3, padding=1)[0].T[..., None]
-    weighted = place.T * weight[:, None]
-    ridge = torch.diag(z.new_tensor([1e-9, 1e-3, 1e-3]))
-    plane = torch.linalg.solve(weighted @ place + ridge, weighted @ (heights - z.reshape(-1, 1, 1)))
-    slopes: Tensor = (plane[:, 1:, 0].T / pitch).reshape(2, *z.shape) * inside
-    return slopes

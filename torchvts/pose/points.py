@@ -1,5 +1,6 @@
 """Pose from two point clouds: as height maps where they are such, else by Open3D."""
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -71,13 +72,10 @@ def _check_cloud(name: str, points: Tensor, normals: Tensor | None) -> Cloud:
         normals = torch.nn.functional.normalize(normals.detach().cpu().double(), dim=1)
         if not bool((normals.norm(dim=1) > 0.5).all()):  # NaN too
             raise ValueError(f"{name}_normals: expected finite normals, got NaN, infinite or zero ones")
-    distinct, inverse = torch.unique(points, dim=0, return_inverse=True)
-    if len(distinct) < LEAST_POINTS:
-        raise ValueError(f"{name}: expected at least {LEAST_POINTS} distinct points, got {len(distinct)} of {len(points)}")
-    if len(distinct) < len(points):
-        first = torch.full((len(distinct),), len(points)).scatter_reduce(0, inverse, torch.arange(len(points)), "amin")
-        first = first.sort().values
-        points, normals = points[first], None if normals is None else normals[first]
+    first = np.sort(np.unique(points.numpy(), axis=0, return_index=True)[1])
+    if len(first) < LEAST_POINTS:
+        raise ValueError(f"{name}: expected at least {LEAST_POINTS} distinct points, got {len(first)} of {len(points)}")
+    points, normals = points[first], None if normals is None else normals[first]
     spread = torch.linalg.svdvals(points - points.mean(0))
     if float(spread[1]) < 1e-6 * float(spread[0]):
         raise ValueError(f"{name}: expected a surface, got points on one line")

@@ -37,6 +37,8 @@ def band_of_ratios(light: Tensor, side_px: float, pedestal: float) -> Tensor:
         light: linear light or image values.
         side_px: length of the side.
         pedestal: added to the light, so that dark pixels have no large ratios.
+    Returns:
+        (B, 3, H, W), zero where the channels differ by smooth light alone.
     """
     log = (light + pedestal).log()
     log = log - log.mean(1, keepdim=True)

@@ -20,8 +20,8 @@ from .surface_files import write_pcd, write_ply
 
 CLOUD_SUFFIXES = (".pcd", ".ply")
 
-HEAD_BYTES = 2**16
-"""Largest header of a file."""
+HEAD_BYTES, MOST_BYTES = 2**16, 2**31
+"""Largest header of a file, and largest file, that is read."""
 
 
 def contact_cloud(frame: DepthFrame, mm_per_pixel: float, most: int | None = 1000) -> tuple[Tensor, Tensor]:
@@ -105,12 +105,15 @@ def read_point_cloud(path: str | Path) -> tuple[Tensor, Tensor | None]:
     Raises:
         FileNotFoundError: no such file.
         ValueError: not a cloud, cut short, or an empty one.
+        ImportError: Open3D, which reads it, is not installed.
     """
     path = check_path("path", path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such point cloud")
     if path.suffix.lower() not in CLOUD_SUFFIXES:
         raise ValueError(f"{path}: expected a name ending in {' or '.join(CLOUD_SUFFIXES)}, got {path.suffix!r}")
+    if path.stat().st_size > MOST_BYTES:
+        raise ValueError(f"{path}: expected a point cloud of at most {MOST_BYTES} bytes, got {path.stat().st_size}")
     data = path.read_bytes()
     announced = re.search(rb"^(?:POINTS|element\s+vertex)\s+(\d{1,18})\s*$", data[:HEAD_BYTES], re.MULTILINE)
     number = int(announced[1]) if announced else 0
@@ -136,8 +139,9 @@ def read_point_cloud(path: str | Path) -> tuple[Tensor, Tensor | None]:
 def _read_apart(path: Path) -> tuple[Tensor | None, Tensor | None]:
     """Points and normals, if there are any, by a process that may die of a damaged file."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-I", "-W", "ignore", str(Path(read_cloud.__file__).resolve()), str(path.resolve()), folder]
-        done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
+        program = Path(read_cloud.__file__).read_text()  # as a file it would find its neighbours before other packages
+        command = [sys.executable, "-W", "ignore", "-c", program, str(path.resolve()), folder]
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False, cwd=folder)
         said = (f"{done.stdout}\n{done.stderr}".strip().splitlines() or ["it said nothing"])[-1][:300]
         if said.startswith("ImportError: "):
             raise ImportError(said.removeprefix("ImportError: "))

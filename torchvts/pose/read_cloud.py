@@ -1,6 +1,6 @@
 """Reads a point cloud by Open3D in a process of its own: its readers die of some damaged files, and take what memory a header says.
 
-python -I read_cloud.py cloud.ply folder writes points.npy and normals.npy, if there are any, into the folder.
+python read_cloud.py cloud.ply folder writes points.npy and normals.npy, if there are any, into the folder.
 """
 
 import ctypes
@@ -40,7 +40,8 @@ def main(path: str, folder: str) -> None:
     if sys.platform != "win32":
         import resource
 
-        resource.setrlimit(resource.RLIMIT_AS, (MOST_BYTES, resource.getrlimit(resource.RLIMIT_AS)[1]))
+        most = resource.getrlimit(resource.RLIMIT_AS)[1]
+        resource.setrlimit(resource.RLIMIT_AS, (MOST_BYTES if most == resource.RLIM_INFINITY else min(MOST_BYTES, most), most))
     cloud = o3d.io.read_point_cloud(path)
     np.save(f"{folder}/points.npy", np.asarray(cloud.points))
     if cloud.has_normals():

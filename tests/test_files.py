@@ -8,6 +8,7 @@ from conftest import write_film
 
 import torchvts as vts
 from torchvts.core.files import count_frames, read_depth_png, read_frames, write_depth_png
+from torchvts.pose import read_cloud
 
 
 def picture(height=12, width=16, seed=0):
@@ -146,7 +147,7 @@ def clouds():
     from torchvts.pose import clouds
 
     try:
-        clouds.open3d()
+        read_cloud.open3d()
     except ImportError as error:
         pytest.skip(str(error))
     return clouds
@@ -159,7 +160,7 @@ def test_a_point_cloud_comes_back_as_it_was(tmp_path, clouds, suffix, with_norma
     points = vts.depth_to_points(scene.depth_mm, 1.0, scene.contact)
     normals = torch.nn.functional.normalize(torch.rand(len(points), 3), dim=1) if with_normals else None
     clouds.write_point_cloud(tmp_path / f"cloud{suffix}", points, normals)
-    theirs = clouds.open3d().io.read_point_cloud(str(tmp_path / f"cloud{suffix}"))
+    theirs = read_cloud.open3d().io.read_point_cloud(str(tmp_path / f"cloud{suffix}"))
     assert torch.allclose(torch.tensor(np.asarray(theirs.points)).float(), points, atol=1e-6)
     assert theirs.has_normals() == with_normals
     back, back_normals = clouds.read_point_cloud(tmp_path / f"cloud{suffix}")
@@ -198,7 +199,7 @@ def test_broken_clouds_are_refused(tmp_path, clouds):
 @pytest.mark.parametrize("form", [{}, {"write_ascii": True}, {"compressed": True}])
 @pytest.mark.parametrize("suffix", [".ply", ".pcd"])
 def test_clouds_are_read_as_open3d_reads_them(tmp_path, clouds, suffix, form):
-    o3d, path = clouds.open3d(), tmp_path / f"cloud{suffix}"
+    o3d, path = read_cloud.open3d(), tmp_path / f"cloud{suffix}"
     points = np.random.default_rng(0).integers(0, 4, (300, 3)).astype(float)  # values repeat, so that the file can be compressed
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     cloud.colors = o3d.utility.Vector3dVector(points / 4)

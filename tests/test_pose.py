@@ -9,7 +9,7 @@ import torch
 
 import torchvts as vts
 from torchvts.evaluation import pose_accuracy as pose_bench
-from torchvts.pose import ambiguity, clouds, contact_cloud, icp
+from torchvts.pose import ambiguity, clouds, contact_cloud, read_cloud
 from torchvts.pose.result import invert, motion, turn_deg
 from torchvts.scenes import objects
 
@@ -310,21 +310,27 @@ def test_the_contact_cloud_is_even_sure_and_has_the_cameras_normals(reference):
         contact_cloud(reference._replace(depth_mm=0.01 * reference.depth_mm), PITCH)
 
 
-@pytest.mark.parametrize(
-    "twist, order", [((0.02, -0.03, 2.0, 3.0, -2.0, 0.1), "same"), ((1.2, -0.8, 2.0, 3.0, -2.0, 5.0), "mixed")]
-)
-def test_a_known_motion_of_a_cloud_comes_back(reference, twist, order):
+@pytest.fixture(scope="module")
+def open3d():
+    try:
+        return read_cloud.open3d()
+    except ImportError as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.parametrize("twist", [(0.02, -0.03, 2.0, 3.0, -2.0, 0.1), (1.2, -0.8, 2.0, 3.0, -2.0, 5.0)])
+def test_a_known_motion_of_a_cloud_comes_back(open3d, reference, twist):
     cloud = contact_cloud(reference, PITCH, None)[0]
     T = motion(torch.tensor(twist, dtype=torch.float64))
-    moved = cloud @ T[:3, :3].T + T[:3, 3]
-    if order == "mixed":
-        moved = moved[torch.randperm(len(moved), generator=torch.Generator().manual_seed(0))]
+    moved = (cloud @ T[:3, :3].T + T[:3, 3])[torch.randperm(len(cloud), generator=torch.Generator().manual_seed(0))]
     found = vts.register_points(cloud, moved)
     assert found.converged, found.message
     assert (found.T_target_source - T).abs().max() < 1e-4
+    near = motion(torch.tensor([0.02, 0.01, -0.02, 0.05, 0.0, 0.02], dtype=torch.float64)) @ T
+    assert (vts.register_points(cloud, moved, initial=near).T_target_source - T).abs().max() < 1e-4
 
 
-def test_a_cloud_that_is_no_relief_is_registered():
+def test_a_cloud_that_is_no_relief_is_registered(open3d):
     generator = torch.Generator().manual_seed(1)
     blob = torch.randn(800, 3, generator=generator, dtype=torch.float64)
     blob = torch.nn.functional.normalize(blob, dim=1) * torch.tensor([4.0, 2.5, 2.0]) + 0.3 * torch.sin(2 * blob)
@@ -333,8 +339,21 @@ def test_a_cloud_that_is_no_relief_is_registered():
     assert found.converged and (found.T_target_source - T).abs().max() < 1e-4
 
 
+@pytest.mark.parametrize("name", ["tool handle", "stamp", "key", "textured patch"])
+def test_contacts_turned_in_space_are_registered_and_other_objects_are_not(open3d, name):
+    T_t, T_s = objects.pose(0.0, press_mm=0.5), objects.pose(110.0, (1.0, -0.8), 0.55, (1.0, 0.5))
+    W = motion(torch.tensor([1.2, -0.8, 2.0, 3.0, -2.0, 5.0], dtype=torch.float64))
+    (s, n_s), (t, n_t) = (contact_cloud(frame(objects.TARGETS[name].height_mm, T), PITCH) for T in (T_s, T_t))
+    moved = {"target_normals": n_t @ W[:3, :3].T}
+    found = vts.register_points(s, t @ W[:3, :3].T + W[:3, 3], source_normals=n_s, **moved)
+    deg, mm = off(found.T_target_source, W @ T_t @ invert(T_s), (W @ T_t)[:3, 3].tolist())
+    assert found.converged and deg < 0.5 and mm < 0.05, found.message
+    x, n_x = contact_cloud(frame(objects.TARGETS["bolt head"].height_mm, T_s), PITCH)
+    assert not vts.register_points(x, t @ W[:3, :3].T + W[:3, 3], source_normals=n_x, **moved).converged
+
+
 @pytest.mark.parametrize("with_normals, most", [(False, None), (True, 1200)])
-def test_contact_clouds_of_two_presses(with_normals, most):
+def test_contact_clouds_of_two_presses(open3d, with_normals, most):
     shape = objects.textured_patch()
     T_t, T_s = objects.pose(0.0, press_mm=0.5), objects.pose(75.0, (1.0, -0.8), 0.6, (1.0, 0.5))
     (s, n_s), (t, n_t) = (contact_cloud(frame(shape, T), PITCH, most) for T in (T_s, T_t))
@@ -382,20 +401,21 @@ def test_duplicate_points_change_nothing(reference):
     cloud = contact_cloud(reference, PITCH, None)[0]
     moved = cloud + torch.tensor([0.5, 0.2, 0.0], dtype=torch.float64)
     found = vts.register_points(torch.cat((cloud, cloud[:100])), moved)
-    assert found.converged and (found.T_target_source[:3, 3] - (moved - cloud)[0]).abs().max() < 1e-4
+    assert found.converged and (found.T_target_source[:3, 3] - (moved - cloud)[0]).abs().max() < 1e-3
+    assert torch.equal(found.T_target_source, vts.register_points(cloud, moved).T_target_source)
 
 
-def test_without_open3d_clouds_register_and_are_written(monkeypatch, reference, tmp_path):
+def test_without_open3d_contacts_register_and_are_written(monkeypatch, reference, tmp_path):
     monkeypatch.setitem(sys.modules, "open3d", None)
     cloud = contact_cloud(reference, PITCH, None)[0]
-    assert vts.register_points(cloud, cloud + 0.1).converged
+    assert vts.register_points(cloud, cloud + torch.tensor([0.1, 0.1, 0.0])).converged
     other = frame(objects.key(), objects.pose(20.0))
     assert not vts.register_points(cloud, contact_cloud(other, PITCH, None)[0]).converged
     for suffix in clouds.CLOUD_SUFFIXES:
         clouds.write_point_cloud(tmp_path / f"a{suffix}", cloud)
-        assert torch.allclose(clouds.read_point_cloud(tmp_path / f"a{suffix}")[0], cloud, atol=1e-6)
+        assert (tmp_path / f"a{suffix}").stat().st_size > 12 * len(cloud)
     with pytest.raises(ImportError, match=r"pip install 'torchvts\[pose\]'"):
-        clouds.open3d()
+        vts.register_points(cloud, contact_cloud(reference, PITCH)[0])
 
 
 # words, and the small parts
@@ -419,14 +439,6 @@ def test_thinning_is_even():
     assert 400 <= len(kept) <= 500 and torch.equal(kept, kept.sort().values)
     assert float(torch.cdist(grid, grid[kept]).min(1).values.max()) < 1.0
     assert len(clouds.thin(grid[:50], 500)) == 50
-
-
-def test_nearest_points_are_the_nearest():
-    cloud = torch.rand(300, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    probe = torch.rand(40, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    distance, index = icp.Tree(cloud).nearest(probe)
-    true = torch.cdist(probe, cloud).min(1)
-    assert torch.equal(index, true.indices) and torch.allclose(distance, true.values)
 
 
 # the script

@@ -53,7 +53,7 @@ def test_reconstruct_names_what_is_wrong_with_the_first_frame(run_script, images
 def test_reconstruct_writes_clouds(run_script, images, calibration, tmp_path):
     try:
         from torchvts.pose import read_point_cloud
-        from torchvts.pose.clouds import open3d
+        from torchvts.pose.read_cloud import open3d
 
         open3d()
     except ImportError as error:

@@ -14,13 +14,14 @@ from torchvts.cli.track import record
 from torchvts.core.frame import DepthOutput
 from torchvts.evaluation import pose_accuracy, tracking
 from torchvts.pose import tracker as tracker_module
-from torchvts.pose.follow import _follow_best, _follow_from, _pixels, adjoint, follow, orthonormal
+from torchvts.pose.follow import _follow_best, _follow_from, _pixels, follow
 from torchvts.pose.graph import Edge, KeyframeGraph
 from torchvts.pose.height_errors import WHITE_MM, _covariance, _height_residuals, _modes, height_sums
-from torchvts.pose.inverse import Sums, moved_by, refine, rotation_vector, solve_step, step_between, sum_parts, sum_residuals
+from torchvts.pose.inverse import Sums, moved_by, refine, solve_step, step_between, sum_parts, sum_residuals
 from torchvts.pose.jackknife import ALIKE_MM, jackknife, shared_error
 from torchvts.pose.keyframe import PARTS, contact_frame, grids, make_keyframe
 from torchvts.pose.result import invert, motion, turn_deg
+from torchvts.pose.rigid import adjoint, orthonormal, rotation_vector
 from torchvts.scenes import objects, render
 from torchvts.stream import TactileFrame
 

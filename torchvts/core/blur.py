@@ -30,6 +30,21 @@ def blur(image: Tensor, weights: list[float]) -> Tensor:
     return _shifted_sum(_shifted_sum(padded, weights, 3), weights, 2)
 
 
+def band_of_ratios(light: Tensor, side_px: float, pedestal: float) -> Tensor:
+    """Structure between the channels of light (B, 3, H, W): their log ratios, band-passed by Gaussians of 1/40 and 1/16 of a side.
+
+    Args:
+        light: linear light or image values.
+        side_px: length of the side.
+        pedestal: added to the light, so that dark pixels have no large ratios.
+    Returns:
+        (B, 3, H, W), zero where the channels differ by smooth light alone.
+    """
+    log = (light + pedestal).log()
+    log = log - log.mean(1, keepdim=True)
+    return blur(log, gaussian_weights(side_px / 40.0)) - blur(log, gaussian_weights(side_px / 16.0))
+
+
 def _shifted_sum(padded: Tensor, weights: list[float], dim: int) -> Tensor:
     length = padded.shape[dim] - len(weights) + 1
     total = padded.narrow(dim, 0, length) * weights[0]

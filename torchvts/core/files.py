@@ -206,11 +206,19 @@ def decode_bytes(data: np.ndarray[Any, Any], flags: int, source: str) -> np.ndar
         return None
 
 
+def png_size(head: bytes) -> tuple[int, int] | None:
+    """Height and width in the first 24 bytes of a PNG file; None for anything else."""
+    if head[:8] != b"\x89PNG\r\n\x1a\n" or len(head) < 24:
+        return None
+    width, height = struct.unpack(">II", head[16:24])
+    return height, width
+
+
 def _claimed_size(head: bytes) -> tuple[int, int]:
     """Width and height in the header of a PNG, BMP or JPEG file; 0 for other formats, which OpenCV checks itself."""
-    if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) >= 24:
-        width, height = struct.unpack(">II", head[16:24])
-        return width, height
+    size = png_size(head)
+    if size is not None:
+        return size[1], size[0]
     if head[:2] == b"BM" and len(head) >= 26:
         width, height = struct.unpack("<ii", head[18:26])
         return abs(width), abs(height)
@@ -281,13 +289,13 @@ def image_from_bytes(data: Tensor, size: tuple[int, int], source: str) -> Tensor
     import cv2
 
     raw = data.numpy() if data.dtype == torch.uint8 and data.dim() == 1 else np.zeros(0, np.uint8)
-    header = raw[:24].tobytes()
-    if header[:8] != b"\x89PNG\r\n\x1a\n" or len(header) < 24:
+    claimed = png_size(raw[:24].tobytes())
+    if claimed is None:
         raise ValueError(f"{source}: expected the bytes of a PNG")
-    width, height = struct.unpack(">II", header[16:24])
-    pixels = decode_bytes(raw, cv2.IMREAD_UNCHANGED, source) if (height, width) == size else None
+    pixels = decode_bytes(raw, cv2.IMREAD_UNCHANGED, source) if claimed == size else None
     if pixels is None or pixels.shape != (*size, 3) or pixels.dtype not in (np.uint8, np.uint16):
-        raise ValueError(f"{source}: expected a whole colour PNG of {size[0]} x {size[1]}, got one that says {height} x {width}")
+        says = f"{claimed[0]} x {claimed[1]}"
+        raise ValueError(f"{source}: expected a whole colour PNG of {size[0]} x {size[1]}, got one that says {says}")
     levels: Tensor = torch.from_numpy(np.ascontiguousarray(pixels[:, :, ::-1].transpose(2, 0, 1)).astype(np.float64))
     return levels / (255.0 if pixels.dtype == np.uint8 else 65535.0)
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ..core.checks import brief, check_batch, check_float_tensor, check_path, check_positive, check_tensor, parse_number
-from ..core.files import image_files, read_image, rgb_from_bgr
+from ..core.files import image_files, png_size, read_image, rgb_from_bgr
 from .gs_sdk_sensor import values_from_gs_sdk
 from .sensor import Sensor, read_yaml
 
@@ -134,7 +134,8 @@ def read_calibration_folder(folder: str | Path) -> GsSdkFolder:
         image_path, label_path = (_inside(folder, f"{name}/{file}", where) for file in ("gelsight.png", "label.npz"))
         if not image_path.is_file():
             raise FileNotFoundError(f"{folder / name / 'gelsight.png'}: no such image: {where} names it")
-        size = _png_size(image_path)
+        with image_path.open("rb") as stream:
+            size = png_size(stream.read(24))
         if size is not None:
             _check_size(image_path, size[0], size[1], height, width)
         center, radius = _read_label(label_path) if label_path.is_file() else (None, None)
@@ -386,16 +387,6 @@ def _inside(folder: Path, name: str, where: str) -> Path:
     if path == root or not path.is_relative_to(root):
         raise ValueError(f"{where}: experiment_reldir: expected a folder inside {folder}, got {brief(name)}, which is not")
     return path
-
-
-def _png_size(path: Path) -> tuple[int, int] | None:
-    """(height, width) from the header of a PNG file; None for anything else, which is checked when it is read."""
-    with path.open("rb") as stream:
-        head = stream.read(24)
-    if len(head) < 24 or head[:8] != b"\x89PNG\r\n\x1a\n":
-        return None
-    width, height = struct.unpack(">II", head[16:24])
-    return height, width
 
 
 def _check_size(path: Path, height: int, width: int, expected_height: int, expected_width: int) -> None:

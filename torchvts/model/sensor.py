@@ -205,11 +205,7 @@ class Sensor:
             if left + roi_width > width or top + roi_height > height:
                 raise ValueError(f"frame: {height} x {width} does not contain roi_px {self.roi_px} of sensor '{self.name}'")
             frame = frame[:, :, top : top + roi_height, left : left + roi_width]
-            if frame.shape[2:] == size:
-                return frame
-            import kornia  # takes 0.3 to 0.5 s, and frames of the calibrated size do without
-
-            return kornia.geometry.resize(frame, size, antialias=True)
+            return frame if frame.shape[2:] == size else _resized(frame, size)
         if (height, width) in self.raw_size_px:
             top, left = int(self.raw_crop * height), int(self.raw_crop * width)
             return _resized(frame[:, :, top : height - top, left : width - left], size)
@@ -380,7 +376,7 @@ def _sampling_grid(
     with torch.inference_mode(False):
         outline = ((0.0, 0.0), (width - 1.0, 0.0), (width - 1.0, height - 1.0), (0.0, height - 1.0))
         image, frame = (torch.tensor([points], dtype=torch.float64) for points in (outline, corners_px))
-        import kornia  # as above
+        import kornia  # takes 0.3 to 0.5 s, and frames of the calibrated size do without
 
         to_frame = kornia.geometry.get_perspective_transform(image, frame)[0]
         x = torch.arange(width, dtype=torch.float64).expand(height, -1)

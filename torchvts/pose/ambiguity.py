@@ -6,12 +6,12 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d, unfold
+from torch.nn.functional import max_pool2d
 
 from .alignment import CUT, DEPTH_NOISE_MM, SLOPE_NOISE, linearise, twist_units
-from .inverse import Array, rotation_vector
-from .relief import Relief
+from .relief import Relief, slopes_of_planes
 from .result import invert, motion
+from .rigid import Array, rotation_vector
 
 SINE_OF_AXIS = 0.3
 """Sine of the angle to the z axis up to which a direction is called z."""
@@ -251,18 +251,8 @@ def _rolls(source: Relief, target: Relief, pose: Tensor, trial: _Trial) -> Tenso
 
 def field_with_fitted_curvature(relief: Relief) -> Tensor:
     """The field with second derivatives from planes through the slopes of 3 x 3 pixels inside: the skin bends beyond the rim."""
-    side = (-1.0, 0.0, 1.0)
-    like = relief.field.new_tensor
-    place = like([[1.0, x, -y] for y in side for x in side])  # rows go down, y up
-    place[:, 1:] *= relief.pitch
-    weight = unfold(relief.inside.to(place.dtype)[None, None], 3, padding=1)[0].T  # (H W, 9)
-    slopes = unfold(relief.field[1:3, None], 3, padding=1).permute(2, 1, 0)  # (H W, 9, 2)
-    weighted = place.T * weight[:, None]  # (H W, 3, 9)
-    ridge = 1e-3 * torch.diag(like([0.0, 1.0, 1.0])) * relief.pitch**2 + 1e-9 * torch.diag(like([1.0, 1.0, 1.0]))
-    plane = torch.linalg.solve(weighted @ place + ridge, weighted @ slopes)  # (H W, 3, 2)
-    p_x, p_y, q_x, q_y = plane[:, 1, 0], plane[:, 2, 0], plane[:, 1, 1], plane[:, 2, 1]
-    bend = torch.stack((p_x, 0.5 * (p_y + q_x), q_y)).reshape(3, *relief.inside.shape)
-    return torch.cat((relief.field[:3], bend))
+    (p_x, p_y), (q_x, q_y) = slopes_of_planes(relief.field[1:3], relief.inside, relief.pitch)
+    return torch.cat((relief.field[:3], torch.stack((p_x, 0.5 * (p_y + q_x), q_y))))
 
 
 def pose_covariance(source: Relief, target: Relief, pose: Tensor) -> tuple[float, Tensor]:

@@ -1,6 +1,9 @@
 """Point clouds of contacts, thinned evenly, and their PCD and PLY files."""
 
-import ctypes
+import re
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +14,14 @@ from torch.nn.functional import avg_pool2d
 
 from ..core.checks import check_integer, check_path, check_positive, check_tensor
 from ..core.geometry import depth_to_points
-from .cloud_formats import read_columns
+from . import read_cloud
 from .relief import DepthFrame, contact_of, sure_contact
 from .surface_files import write_pcd, write_ply
 
 CLOUD_SUFFIXES = (".pcd", ".ply")
-NORMAL_NAMES = {".pcd": ("normal_x", "normal_y", "normal_z"), ".ply": ("nx", "ny", "nz")}
+
+HEAD_BYTES, MOST_BYTES = 2**16, 2**31
+"""Largest header of a file, and largest file, that is read."""
 
 
 def contact_cloud(frame: DepthFrame, mm_per_pixel: float, most: int | None = 1000) -> tuple[Tensor, Tensor]:
@@ -74,31 +79,7 @@ def voxel_first(points: Tensor, size: float) -> Tensor:
     cell = torch.floor((points - points.amin(0)) / size).long()
     extent = cell.amax(0) + 1
     code = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
-    order = torch.argsort(code, stable=True)
-    code = code[order]
-    fresh = torch.cat((torch.ones(1, dtype=torch.bool), code[1:] != code[:-1]))
-    return order[fresh].sort().values
-
-
-def open3d() -> Any:
-    """Import Open3D, with libusb of the package ``libusb-package`` where the system has none.
-
-    Raises:
-        ImportError: says what to install.
-    """
-    try:
-        import libusb_package
-
-        ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
-    except (ImportError, OSError):
-        pass  # the system's own libusb may do; if not, the import below says so
-    try:
-        import open3d as o3d
-    except (ImportError, OSError) as error:
-        raise ImportError(
-            f"the search for a pose by FPFH needs Open3D and libusb: pip install 'torchvts[pose]' ({error})"
-        ) from error
-    return o3d
+    return torch.from_numpy(np.sort(np.unique(code.numpy(), return_index=True)[1]))
 
 
 def write_point_cloud(path: str | Path, points: Tensor, normals: Tensor | None = None) -> None:
@@ -124,25 +105,51 @@ def read_point_cloud(path: str | Path) -> tuple[Tensor, Tensor | None]:
     Raises:
         FileNotFoundError: no such file.
         ValueError: not a cloud, cut short, or an empty one.
+        ImportError: Open3D, which reads it, is not installed.
     """
     path = check_path("path", path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such point cloud")
     if path.suffix.lower() not in CLOUD_SUFFIXES:
         raise ValueError(f"{path}: expected a name ending in {' or '.join(CLOUD_SUFFIXES)}, got {path.suffix!r}")
-    try:
-        columns = read_columns(path)
-        groups = [
-            [columns[name] for name in names]
-            for names in (("x", "y", "z"), NORMAL_NAMES[path.suffix.lower()])
-            if names[0] in columns
-        ]
-    except (ValueError, KeyError) as error:
-        raise ValueError(f"{path}: no points could be read: {error}") from error
-    if "x" not in columns:
-        raise ValueError(f"{path}: no points could be read: it has no x, y, z")
-    points = torch.from_numpy(np.stack(groups[0], axis=1))
-    return points, torch.from_numpy(np.stack(groups[1], axis=1)) if len(groups) > 1 else None
+    if path.stat().st_size > MOST_BYTES:
+        raise ValueError(f"{path}: expected a point cloud of at most {MOST_BYTES} bytes, got {path.stat().st_size}")
+    data = path.read_bytes()
+    announced = re.search(rb"^(?:POINTS|element\s+vertex)\s+(\d{1,18})\s*$", data[:HEAD_BYTES], re.MULTILINE)
+    number = int(announced[1]) if announced else 0
+    if not 0 < number <= 256 * len(data):  # a byte of a compressed file stands for 256 at most
+        raise ValueError(f"{path}: no points could be read: no point cloud, or its header says {number} points")
+    _, is_text, text = data.partition(b"\nDATA ascii")
+    if path.suffix.lower() == ".pcd" and is_text:  # Open3D fills what is missing with anything
+        words = {len(line.split()) for line in text.strip().splitlines()}
+        if len(words) > 1 or len(text.strip().splitlines()) != number:
+            raise ValueError(f"{path}: no points could be read: its header says {number} points, another number follows")
+    points, normals = _read_apart(path)
+    if points is None or len(points) != number:
+        raise ValueError(
+            f"{path}: no points could be read: its header says {number}, {0 if points is None else len(points)} were read"
+        )
+    if not bool(torch.isfinite(points).all()):
+        raise ValueError(
+            f"{path}: no points could be read: expected finite coordinates, got NaN or infinite ones: leave such points out"
+        )
+    return points, normals
+
+
+def _read_apart(path: Path) -> tuple[Tensor | None, Tensor | None]:
+    """Points and normals, if there are any, by a process that may die of a damaged file."""
+    with tempfile.TemporaryDirectory() as folder:
+        program = Path(read_cloud.__file__).read_text()  # as a file it would find its neighbours before other packages
+        command = [sys.executable, "-W", "ignore", "-c", program, str(path.resolve()), folder]
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False, cwd=folder)
+        said = (f"{done.stdout}\n{done.stderr}".strip().splitlines() or ["it said nothing"])[-1][:300]
+        if said.startswith("ImportError: "):
+            raise ImportError(said.removeprefix("ImportError: "))
+        if done.returncode != 0 or "WARNING" in done.stdout + done.stderr:
+            raise ValueError(f"{path}: no points could be read: damaged or cut short; Open3D ended with {done.returncode}: {said}")
+        arrays = [Path(folder) / f"{name}.npy" for name in ("points", "normals")]
+        points, normals = (torch.from_numpy(np.load(one)) if one.exists() else None for one in arrays)
+    return points, normals
 
 
 def _array(name: str, values: Tensor, length: int | None) -> "np.ndarray[Any, Any]":

@@ -19,11 +19,9 @@ from .inverse import (
     ROTATION_FIRST,
     SCORE,
     SHALLOW_MM,
-    Array,
     Field,
     Pixels,
     Sums,
-    inverted,
     moved_by,
     refine,
     solve_step,
@@ -34,6 +32,7 @@ from .inverse import (
 )
 from .jackknife import jackknife
 from .keyframe import PARTS, Grids, Keyframe
+from .rigid import Array, adjoint, cross, inverted
 
 COARSE_STEPS, SOME_STEPS = 15, 30
 """Largest number of steps on the coarse grid, and with some pixels of the fine one."""
@@ -254,33 +253,6 @@ def in_common(keyframe: Keyframe, frame: Grids, pose: Array) -> tuple[float, flo
 def _share(keyframe: Keyframe, frame: Grids, used: int) -> float:
     """Of the smaller contact, where so many of some pixels of the keyframe are in common."""
     return used / keyframe.some.number * keyframe.touching / max(min(keyframe.touching, frame.touching), 1)
-
-
-def orthonormal(pose: Array) -> Array:
-    """The pose (4, 4) with its nearly right rotation made exact: products of poses multiply what is missing.
-
-    Source:
-        Newton-Schulz steps to the polar factor: Higham, Functions of Matrices, 2008, section 8.3; an error e becomes 3/4 e^2.
-    """
-    pose = pose.copy()
-    for _ in range(2):
-        turn = pose[:3, :3].copy()
-        pose[:3, :3] = 1.5 * turn - 0.5 * turn @ turn.T @ turn
-    return pose
-
-
-def adjoint(pose: Array) -> Array:
-    """(6, 6), which turns a small motion before a pose (4, 4) into the same motion after it."""
-    result = np.zeros((6, 6))
-    result[:3, :3] = result[3:, 3:] = pose[:3, :3]
-    result[3:, :3] = cross(pose[:3, 3]) @ pose[:3, :3]
-    return result
-
-
-def cross(v: Array) -> Array:
-    """The matrix (3, 3) of a cross product with v (3,)."""
-    x, y, z = v.tolist()
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def _pixels(field: Field) -> Pixels:

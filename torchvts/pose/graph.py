@@ -5,10 +5,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from .follow import adjoint, orthonormal
-from .inverse import Array, inverted, rotation_vector
 from .keyframe import Keyframe
 from .result import motion
+from .rigid import Array, adjoint, inverted, orthonormal, rotation_vector
 
 STEPS = 5
 """Gauss-Newton steps; contradictions are small motions, so two or three are enough."""

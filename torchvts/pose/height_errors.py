@@ -16,7 +16,8 @@ from torch.nn.functional import avg_pool2d
 from ..accelerated import kernels
 from ..accelerated.gate import usable
 from .alignment import SLOPE_NOISE
-from .inverse import HEIGHT_NOISE_MM, SHALLOW_MM, Array, Field, Pixels, residual_limits
+from .inverse import HEIGHT_NOISE_MM, SHALLOW_MM, Field, Pixels, residual_limits
+from .rigid import Array
 
 ALIKE_MM, ALIKE_SLOPE = 2.5, 0.4
 """Errors of slopes at places, or slopes, so far from each other have a correlation of exp(-1/2): presses of balls on real sensors,

@@ -6,10 +6,9 @@ with respect to its own motion. So they are computed once per reference. Slopes 
 
 import math
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -17,6 +16,7 @@ from ..accelerated import kernels
 from ..accelerated.gate import usable
 from .alignment import CUT, DEPTH_DRIFT_MM, SLOPE_NOISE, linearise
 from .relief import Relief
+from .rigid import Array, inverted, rigid_motion, rotation_vector
 
 DEEP_MM, SHALLOW_MM = 0.06, 0.02
 """Reference pixels that should be deeper than this under a pose count in its score; in its refinement from the second on."""
@@ -28,8 +28,6 @@ HEIGHT_NOISE_MM = 0.1
 """Disagreement of heights that counts as noise in a score: what integrated slopes that err by 3 degrees add up to."""
 
 SCORE = (1.0 / (CUT * SLOPE_NOISE) ** 2, 1.0 / (CUT * HEIGHT_NOISE_MM) ** 2)
-
-Array = npt.NDArray[Any]
 
 
 class Field(NamedTuple):
@@ -156,24 +154,8 @@ def solve_step(sums: Sums, held: Array | None = None) -> Array:
 
 
 def moved_by(pixels: Pixels, step: Array) -> Array:
-    """The rigid motion (4, 4) of a scaled twist, by Rodrigues' formula: a tenth of the time of ``result.motion``."""
-    twist, center = step * pixels.units, pixels.center
-    x, y, z = twist[:3].tolist()
-    angle = math.sqrt(x * x + y * y + z * z)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    first, second = (math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2) if angle > 1e-9 else (1.0, 0.5)
-    result = np.eye(4)
-    result[:3, :3] += first * cross + second * (cross @ cross)
-    result[:3, 3] = twist[3:] + center - result[:3, :3] @ center
-    return result
-
-
-def inverted(pose: Array) -> Array:
-    """The inverse of a rigid motion (4, 4)."""
-    result = np.eye(4)
-    result[:3, :3] = pose[:3, :3].T
-    result[:3, 3] = -pose[:3, 3] @ pose[:3, :3]
-    return result
+    """The rigid motion (4, 4) of a scaled twist."""
+    return rigid_motion(step * pixels.units, pixels.center)
 
 
 def step_between(pixels: Pixels, pose: Array, other: Array) -> Array:
@@ -183,19 +165,6 @@ def step_between(pixels: Pixels, pose: Array, other: Array) -> Array:
     twist = np.concatenate((rotation_vector(turn), moved[:3, 3] - pixels.center + turn @ pixels.center))
     step: Array = twist / pixels.units
     return step
-
-
-def rotation_vector(turn: Array) -> Array:
-    """Axis times angle (3,) of a rotation (3, 3) of at most half a turn."""
-    skew = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    sine, cosine = float(np.linalg.norm(skew)), 0.5 * (float(np.trace(turn)) - 1.0)
-    if cosine < -0.9:  # the sine is small: the axis is that of (1 - cosine) a a^T
-        square = 0.5 * (turn + turn.T) - cosine * np.eye(3)
-        axis = square[:, int(square.diagonal().argmax())]
-        sign = -1.0 if float(axis @ skew) < 0.0 else 1.0
-        half: Array = axis * (sign * math.atan2(sine, cosine) / float(np.linalg.norm(axis)))
-        return half
-    return skew * (math.atan2(sine, cosine) / sine if sine > 1e-12 else 1.0)
 
 
 def sum_residuals(field: Field, pixels: Pixels, pose: Array, slope_noise: float, score_only: bool = False) -> Sums:

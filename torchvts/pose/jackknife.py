@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .inverse import Array
+from .rigid import Array
 
 ALIKE_MM = 3.0
 """Errors of slopes at places so far from each other have a correlation of exp(-1/2). Presses of balls on two GelSight Minis and a

@@ -15,9 +15,10 @@ from ..accelerated.gate import usable
 from .alignment import twist_units
 from .ambiguity import field_with_fitted_curvature, find_unknown, information_of_noise
 from .height_errors import HeightErrors, height_errors
-from .inverse import Array, Field, Pixels, reference_pixels
+from .inverse import Field, Pixels, reference_pixels
 from .jackknife import shared_error
 from .relief import HUGE, LEAST_PIXELS, DepthFrame, Levels, Relief, check_frame, least_depth_mm, levels
+from .rigid import Array
 
 SOME, MANY = 2000, 8000
 """Pixels of a reference for all steps of a refinement but the last, and for the last. They are evenly spread: pixels chosen by what

@@ -5,7 +5,7 @@ from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample
+from torch.nn.functional import avg_pool2d, grid_sample, unfold
 
 from ..core.blur import blur
 from ..core.morphology import dilate
@@ -220,3 +220,16 @@ def relief(
     row, column = (place.to(depth.dtype) for place in torch.nonzero(mask, as_tuple=True))
     points = torch.stack((x0 + column * pitch, y0 - row * pitch, stack[0][mask]), dim=1)
     return Relief(field, mask, near[0], x0, y0, pitch, points, stack[1:, mask].T.contiguous())
+
+
+def slopes_of_planes(values: Tensor, inside: Tensor, pitch: float) -> Tensor:
+    """Slopes (C, 2, H, W), along x and y (up), of planes of least squares through the 3 x 3 values (C, H, W) that lie inside."""
+    side = (-1.0, 0.0, 1.0)
+    place = values.new_tensor([[1.0, x, -y] for y in side for x in side])  # rows go down, y up
+    weight = unfold(inside.to(place.dtype)[None, None], 3, padding=1)[0].T  # (H W, 9)
+    around = unfold(values[:, None], 3, padding=1).permute(2, 1, 0) - values.flatten(1).T[:, None]  # (H W, 9, C)
+    weighted = place.T * weight[:, None]  # (H W, 3, 9)
+    ridge = torch.diag(place.new_tensor([1e-9, 1e-3, 1e-3]))
+    plane = torch.linalg.solve(weighted @ place + ridge, weighted @ around)  # (H W, 3, C)
+    slopes: Tensor = plane[:, 1:].permute(2, 1, 0).reshape(-1, 2, *inside.shape) / pitch
+    return slopes

@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from .rigid import rigid_motion
+
 
 @dataclass(frozen=True, eq=False)
 class Registration:
@@ -41,25 +43,14 @@ class Registration:
 
 def invert(T: Tensor) -> Tensor:
     """Inverse of rigid motions (..., 4, 4)."""
-    turned = T[..., :3, :3].transpose(-1, -2)
-    result = torch.zeros_like(T)
-    result[..., :3, :3] = turned
-    result[..., :3, 3] = -(turned @ T[..., :3, 3:])[..., 0]
-    result[..., 3, 3] = 1.0
-    return result
+    inverse: Tensor = torch.linalg.inv(T)
+    return inverse
 
 
 def motion(twist: Tensor, center: Tensor | None = None) -> Tensor:
     """Rigid motions (..., 4, 4) of twists (..., 6): rotation by w about ``center`` (default: the origin), then shift by t."""
-    w, t = twist[..., :3], twist[..., 3:]
-    zero = torch.zeros_like(w[..., 0])
-    cross = torch.stack((zero, -w[..., 2], w[..., 1], w[..., 2], zero, -w[..., 0], -w[..., 1], w[..., 0], zero), -1)
-    turned = torch.linalg.matrix_exp(cross.reshape(*w.shape[:-1], 3, 3))
-    result = torch.zeros(*w.shape[:-1], 4, 4, dtype=twist.dtype, device=twist.device)
-    result[..., :3, :3] = turned
-    result[..., :3, 3] = t if center is None else t + center - (turned @ center[..., None])[..., 0]
-    result[..., 3, 3] = 1.0
-    return result
+    about = torch.zeros(3, dtype=torch.float64) if center is None else center
+    return torch.from_numpy(rigid_motion(twist.double().numpy(), about.double().numpy())).to(twist.dtype)
 
 
 def turn_deg(T: Tensor) -> Tensor:

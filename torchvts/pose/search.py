@@ -73,6 +73,8 @@ def search_plane(source: Relief, target: Relief, most: int = 48, angle: Tensor |
 
 def _masked_correlation(moving: Tensor, fixed: Tensor, angle: Tensor) -> Tensor:
     """Scores (angles, rows, columns) of every shift of ``moving``, rotated by every angle, on ``fixed``; both (3, side, side)."""
+    import cv2
+
     cos, sin, zero = angle.cos(), angle.sin(), torch.zeros_like(angle)
     # an output pixel (x, y down) of an image rotated by angle (y up) comes from the input rotated back
     theta = torch.stack((torch.stack((cos, -sin, zero), -1), torch.stack((sin, cos, zero), -1)), 1)
@@ -80,7 +82,7 @@ def _masked_correlation(moving: Tensor, fixed: Tensor, angle: Tensor) -> Tensor:
     turned = grid_sample(moving[None].expand(len(angle), -1, -1, -1), grid, align_corners=False)
     p = cos[:, None, None] * turned[:, 0] - sin[:, None, None] * turned[:, 1]
     q = sin[:, None, None] * turned[:, 0] + cos[:, None, None] * turned[:, 1]
-    size = [_smooth_size(moving.shape[1] + fixed.shape[1])] * 2
+    size = [cv2.getOptimalDFTSize(moving.shape[1] + fixed.shape[1])] * 2
     slopes_s, slopes_t = torch.fft.fft2(torch.complex(p, q), s=size), torch.fft.fft2(torch.complex(fixed[0], fixed[1]), s=size)
     energy_s = torch.fft.rfft2(p * p + q * q, s=size)
     energy_t = torch.fft.rfft2(fixed[0] ** 2 + fixed[1] ** 2, s=size)
@@ -126,15 +128,3 @@ def _square(relief: Relief, rotatable: bool = False) -> _Square:
     # between pixels, as the middle of a square of even side
     x, y = ((left + right) // 2 + 0.5) * relief.pitch, ((top + bottom) // 2 + 0.5) * relief.pitch
     return _Square(channels, (relief.x0 + x, relief.y0 - y))
-
-
-def _smooth_size(n: int) -> int:
-    """The smallest number from ``n`` on whose prime factors are 2, 3 and 5."""
-    while True:
-        rest = n
-        for factor in (2, 3, 5):
-            while rest % factor == 0:
-                rest //= factor
-        if rest == 1:
-            return n
-        n += 1

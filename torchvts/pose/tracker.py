@@ -14,12 +14,13 @@ from ..core.checks import check_positive
 from .alignment import LEAST_FITNESS, LEAST_OVERLAP, MOST_COST, agrees_enough
 from .ambiguity import UNKNOWN_VARIANCE, turned_otherwise
 from .direct import align, check_rigid, symmetries
-from .follow import TRUSTED_DEG, TRUSTED_MM, Followed, cross, follow, in_common, orthonormal
+from .follow import TRUSTED_DEG, TRUSTED_MM, Followed, follow, in_common
 from .graph import Edge, KeyframeGraph, moved_covariance
-from .inverse import LEAST_NOISE, Array, inverted
+from .inverse import LEAST_NOISE
 from .keyframe import Contact, Grids, Unusable, contact_frame, grids, make_keyframe, pitch_by_slopes, slopes_of_contact
 from .relief import DepthFrame, levels
 from .result import Registration
+from .rigid import Array, cross, inverted, orthonormal
 
 ENOUGH, RETURN = 0.5, 0.6
 """Share of the smaller contact in common below which a new keyframe is taken, and from which an older one is used again."""

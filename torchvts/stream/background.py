@@ -18,7 +18,7 @@ from ..calibration import (
     calibrate,
     channel_structure,
 )
-from ..core.blur import blur, gaussian_weights
+from ..core.blur import band_of_ratios
 from ..core.checks import check_batch, check_image, check_integer, check_path, check_positive, check_sequence, parse_number
 from ..core.files import VIDEO_SUFFIXES, read_frames
 from ..model import Calibration, Sensor, SensorPrior, check_calibration, check_sensor
@@ -108,10 +108,8 @@ def _or_other(sensor: Sensor | None) -> str:
 
 def _structure_deg(image: Tensor, sensor: Sensor, prior: SensorPrior) -> float:
     """Slopes, degrees, for which a sensor's prior takes the structure between the channels of an image without contact."""
-    log = (image[None].float() ** sensor.exponent + PEDESTAL).log()
-    log = log - log.mean(1, keepdim=True)
     height = sensor.height
-    band = blur(log, gaussian_weights(height / 40.0)) - blur(log, gaussian_weights(height / 16.0))
+    band = band_of_ratios(image[None].float() ** sensor.exponent, height, PEDESTAL)
     normals = NormalFromResponse(prior.response.field, None, height, sensor.width, sensor.mm_per_pixel)
     margin = round(0.14 * height)
     upright = normals(band.exp())[0, 2, margin:-margin, margin:-margin]

@@ -44,10 +44,7 @@ def diagnose(background: Tensor | None, image: Tensor, calibration: Calibration)
                 "another camera mode or sensor; rectify or resize it as at calibration"
             )
             return Diagnosis.of([Finding("wrong_size", message, "fault", frame.shape[2] / sensor.width)])
-    found = list(run_checks(Examination(calibration, image, given)))
-    if any(finding.name == "skin_changed" for finding in found):  # it says more than "light_changed"
-        found = [finding for finding in found if finding.name != "light_changed"]
-    return Diagnosis.of(found)
+    return Diagnosis.of(run_checks(Examination(calibration, image, given)))
 
 
 def _one_image(name: str, image: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from ..calibration import ROUGH, channel_structure
 from ..pipeline import DepthPipeline, beyond_presses
 from ..stream import FrameCheck
-from .camera import blockiness, levels_of, new_spots, texture_share
+from .camera import blockiness, levels_of, new_spots, pattern_likeness, texture_share
 from .examination import MISFITS, Examination
 from .findings import FAULT_DEG, WARNING_DEG, Finding, by_cost
 from .light_words import CHANNELS, in_words
@@ -18,6 +18,9 @@ from .light_words import CHANNELS, in_words
 ROUGH_FREE_DEG = 6.0
 """Spread of the slopes that the least changed skin of a frame may seem to have: 0.3 to 4 degrees on real sensors, 4 where a press
 scatters light over all of a small sensor."""
+
+OTHER_DEG = 1.2
+"""The same from which it is asked whether the frame is from another unit of its type: 1.4 to 5 degrees on three of one type."""
 
 BLOCKY = 1.18
 """Ratio of steps at the borders of 8 x 8 blocks to those inside above which an image was compressed; noise alone stays below 1.1,
@@ -196,6 +199,14 @@ def _rough(e: Examination) -> Figures | None:
     return {"value": e.free_deg, "read": "reads no depth" if covered else "does not know the undeformed skin"}
 
 
+def _other_unit(e: Examination) -> float | None:
+    """Unlikeness of the skin's fine pattern, where the least changed skin seems to have slopes."""
+    if not e.unit.measured or not e.is_fine or e.free_deg < OTHER_DEG:
+        return None
+    likeness = pattern_likeness(e.image, e.without_markers(e.value), e.unit.noise_std, e.free)
+    return None if likeness is None else 1.0 - likeness
+
+
 def _spots(e: Examination) -> Figures | None:
     # where lights stand close together a slope, too, takes light from all channels; steps of blocks look like spots
     if not e.unit.measured or e.unit.markers is not None or least_spread(e) < COPLANAR or blockiness(e.image)[0] > BLOCKY:
@@ -306,11 +317,13 @@ CHECKS = (
           "two LEDs left modes precise and auto still find a rough depth, with one none does", "fault", above=0.0, last=True),
     Check("no_picture", _unusable, last=True),
     Check("saturated", _saturated, "the image is saturated in {where}: reduce the exposure",
-          lambda figures: "fault" if figures["inside"] > 0.3 else "warning", above=0.02),
+          lambda figures: "note" if figures["value"] < 0.1 else "fault" if figures["inside"] > 0.3 else "warning", above=0.02),
     # the light and the skin
-    Check("no_free_skin", _rough, "even the least changed skin seems to have slopes of {value:.0f} degrees, and the pipeline {read}: "
-          "contact covers everything, or this is another unit or its light has changed; leave some skin free, or recalibrate",
+    Check("no_free_skin", _rough, "even the least changed skin seems to have slopes of {value:.0f} degrees, and the pipeline "
+          "{read}: contact covers everything, or this is another unit, or its light has changed; leave skin free, or recalibrate",
           "fault", above=ROUGH_FREE_DEG, last=True),
+    Check("other_unit", _other_unit, "the skin has not the fine pattern that it had at calibration: another unit, or its skin was "
+          "changed; use its own calibration, or calibrate again", above=0.945),
     Check("light_changed", lambda e: in_words(e.change, "image", e)),
     Check("new_spots", _spots, "{value:.0f} spots that were not there at calibration ({share:.1%} of the image{dead}): clean the "
           "skin, or recalibrate", lambda figures: "warning" if figures["value"] >= 3 else "note"),
@@ -318,15 +331,15 @@ CHECKS = (
           "in all channels: worn, stained or dirty; clean it, or recalibrate", above=0.0),
     Check("blurred", _texture_lost, "the image is blurred or moved: {value:.0%} of the skin's fine texture is lost; focus, clean "
           "the lens, mount the camera firmly", above=0.6),
-    Check("specular", lambda e: _length(e, 1.0), "{value:.0%} of the contact is brighter than any matt slope: the skin is glossy "
-          "(specular); use a matt coating, or softer light", above=MISFITS, alone=True),
-    Check("blurred", lambda e: _length(e, -1.0), "{value:.0%} of the contact gets light from its surroundings: the image is blurred "
-          "or moved, or other skin lights it (inter-reflection); focus, expose shorter, use a darker coating", above=MISFITS,
-          alone=True),
+    Check("specular", lambda e: _length(e, 1.0), "{value:.0%} of the contact is brighter than any matt slope: the skin is "
+          "glossy (specular); use a matt coating, or softer light", above=MISFITS, alone=True),
+    Check("blurred", lambda e: _length(e, -1.0), "{value:.0%} of the contact gets light from its surroundings: the image is "
+          "blurred or moved, or other skin lights it (inter-reflection); focus, expose shorter, use a darker coating",
+          above=MISFITS, alone=True),
     # the scene
     Check("no_contact", _no_contact, "no contact: nothing is above the noise", "note", last=True),
-    Check("contact_covers_image", lambda e: float(e.moved.double().mean()), "the skin has moved in {value:.0%} of the image: little "
-          "free skin is left to compare with, and depth beyond the border is not seen", "note", above=0.6, alone=True),
+    Check("contact_covers_image", lambda e: float(e.moved.double().mean()), "the skin has moved in {value:.0%} of the image: "
+          "little free skin is left to compare with, and depth beyond the border is not seen", "note", above=0.6, alone=True),
     Check("contact_at_border", _at_border, "the contact reaches the image border: the part beyond is not seen, and depth there "
           "is less certain", "note", alone=True),
     Check("faint_contact", _faint, "faint contact: {value:.3f} mm at its deepest, less than a pixel; its rim is below the noise",

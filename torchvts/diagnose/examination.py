@@ -239,7 +239,8 @@ class Examination:
         unit = self.unit
         if unit.lights is None or not self.is_fine:
             return None
-        inverse = inverse_light_matrix(self.output.depth_mm, unit.lights.position_mm, unit.lights.albedo, unit.sensor.mm_per_pixel)[0]
+        lights, pitch = unit.lights, unit.sensor.mm_per_pixel
+        inverse = inverse_light_matrix(self.output.depth_mm, lights.position_mm, lights.albedo, pitch)[0]
         normal = (inverse * self.frame.image).sum(1)
         length = lengths(normal, 0)
         share = ((normal / length)[:, None] * inverse).sum(0)  # derivative of the length by each channel

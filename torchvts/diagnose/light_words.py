@@ -22,13 +22,14 @@ WORDS = {
     "ambient": ("ambient_light", "ambient light of {level:.3f}, not from the LEDs, is added everywhere: shade the sensor, or "
                 "recalibrate", "level"),
     "black": ("black_level", "a black level of {black:.3f} is subtracted from every value: switch it off in the camera", "level"),
-    "gamma": ("gamma", "values follow another power of light, as if the sensor file's gamma should be {gamma:.2f}: set it", "power"),
-    "light_moved": ("light_moved", "the light of the {color} LED is off by {effect:.1%}, unevenly: it has moved, or fades; fix it "
-                    "and recalibrate", "effect"),
+    "gamma": ("gamma", "values follow another power of light, as if gamma in the sensor file should be {gamma:.2f}: set it",
+              "power"),
+    "light_moved": ("light_moved", "the light of the {color} LED is off by {effect:.1%}, unevenly: it has moved, or fades; fix "
+                    "it and recalibrate", "effect"),
     "skin_changed": ("skin_changed", "the skin is brighter or darker by {effect:.1%}, equally in all channels: worn, dirty or "
                      "shaded; clean it, or recalibrate", "effect"),
-    "light_field": ("light_changed", "the light of free skin is off by {effect:.1%}, unevenly and differently in each channel: LEDs, "
-                    "or a press that scatters it; if an image without contact shows it too, recalibrate", "effect"),
+    "light_field": ("light_changed", "the light of free skin is off by {effect:.1%}, unevenly and differently in each channel: "
+                    "LEDs, or a press that scatters it; if an image without contact shows it too, recalibrate", "effect"),
     "lights_misfit": ("lights_misfit", "the calibration's lights do not explain its own image (off by {effect:.1%}): other lights, "
                       "stray light, or a lens; use presses or a prior", "effect"),
 }  # fmt: skip
@@ -49,15 +50,14 @@ def in_words(change: Change, which: str, examination: Examination) -> Finding | 
         return None  # a press that scatters light, or one that covers the skin, looks the same
     cost_deg = examination.cost_deg(change, which == "calibration")
     severity = by_cost(cost_deg)
-    if severity == "note" and which == "calibration" and change.effect > MISFIT:
-        severity = "warning"
-    if severity == "note" and change.effect < LEAST_EFFECT:
-        return None
     kind = change.kind.name
     if kind == "ambient" and float(change.parameters[:3].mean()) <= 0:
         kind = "black"
     elif kind == "light_field" and which == "calibration":
         kind = "lights_misfit"
+        severity = "warning" if severity == "note" and change.effect > MISFIT else severity
+    if severity == "note" and change.effect < LEAST_EFFECT:
+        return None
     name, message, value = WORDS[kind]
     figures = _figures(change, examination.exponent)
     return Finding(name, f"{BEFORE[which]}{message.format(**figures)} or accept {cost_deg:.1f} degrees", severity, figures[value])

@@ -326,7 +326,7 @@ CHECKS = (
           "changed; use its own calibration, or calibrate again", above=0.945),
     Check("light_changed", lambda e: in_words(e.change, "image", e)),
     Check("new_spots", _spots, "{value:.0f} spots that were not there at calibration ({share:.1%} of the image{dead}): clean the "
-          "skin, or recalibrate", lambda figures: "warning" if figures["value"] >= 3 else "note"),
+          "skin, or recalibrate", lambda figures: "warning" if figures["share"] > 0.001 else "note"),
     Check("skin_changed", _wear, "the skin's brightness has changed by {value:.1%} (RMS), unevenly and nearly equally "
           "in all channels: worn, stained or dirty; clean it, or recalibrate", above=0.0),
     Check("blurred", _texture_lost, "the image is blurred or moved: {value:.0%} of the skin's fine texture is lost; focus, clean "

@@ -12,8 +12,9 @@ from .findings import Diagnosis, Finding
 def diagnose(background: Tensor | None, image: Tensor, calibration: Calibration) -> Diagnosis:
     """Find what is wrong with an image or with the calibration for it: findings in words, with figures and remedies.
 
-    Every finding is a test of a hypothesis against the noise of the images; what cannot be measured from the three inputs is not
-    guessed.
+    The frame is read by the pipeline of the calibration, and findings say what is wrong with that reading; what cannot be measured
+    from the three inputs is not guessed. The first fault of the frame itself ends the search: it makes all else meaningless.
+    docs/diagnose.md says what each finding means.
 
     Args:
         background: (3, H, W), an image without contact of now, in [0, 1]; None if there is no such image.
@@ -24,14 +25,12 @@ def diagnose(background: Tensor | None, image: Tensor, calibration: Calibration)
     Raises:
         ValueError: not an RGB image, or values outside [0, 1] or not finite.
         TypeError: not a tensor of floats, or no calibration.
-    Source:
-        this project; docs/diagnose.md says what each finding means and how often it is right.
     Example:
         >>> from torchvts import PointLights, Sensor
         >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
         >>> unit = Calibration.from_lights(lights, Sensor("rig", 96, 128, 0.25))
-        >>> print(diagnose(None, unit.background[[2, 1, 0]], unit).findings[0])
-        fault: channels look swapped (red and blue): read the image in the order R, G, B [channels_swapped]
+        >>> diagnose(None, unit.background[[2, 1, 0]], unit).names
+        ('channels_swapped',)
     """
     check_calibration("calibration", calibration)
     image = _one_image("image", image)

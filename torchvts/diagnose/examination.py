@@ -153,7 +153,7 @@ class Examination:
     def failed(self) -> list[int]:
         """Channels that are black everywhere and were not at calibration."""
         level, background = self.image.flatten(1).quantile(0.99, dim=1), self.value.flatten(1).median(dim=1).values
-        return [j for j in range(3) if level[j] < max(0.02, 4.0 * self.noise[j]) and background[j] > 0.06]
+        return [j for j in range(3) if level[j] < max(0.02, 4.0 * float(self.noise[j])) and background[j] > 0.06]
 
     # ---- the light ----
 

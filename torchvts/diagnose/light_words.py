@@ -9,7 +9,7 @@ from .light import Change
 
 CHANNELS = ("red", "green", "blue")
 
-LEAST_EFFECT = 0.02
+LEAST_EFFECT = 0.05
 """Relative change of the light below which it is not reported where it costs nothing: presses scatter so much over the skin."""
 
 MISFIT = 0.05

@@ -115,8 +115,8 @@ class Change:
 
     @property
     def is_simple(self) -> bool:
-        """Whether a few parameters of one cause explain it, and no shape of the skin could."""
-        return self.kind is not None and self.kind.name not in ("light_field", "skin_changed")
+        """Whether it is even, or follows the light: no press scatters light so, and no shape of the skin looks so."""
+        return self.kind is not None and self.kind.name not in ("light_field", "skin_changed", "light_moved")
 
     def factor(self, light: Tensor) -> Tensor:
         """What the reference light (3, H, W) is multiplied by."""

@@ -46,7 +46,9 @@ def in_words(change: Change, which: str, examination: Examination) -> Finding | 
         which: "calibration" (its background against its lights), "background" or "image".
         examination: of the image.
     """
-    if change.kind is None or (which == "image" and not change.is_simple and not examination.is_no_surface):
+    if change.kind is None:
+        return None
+    if which == "image" and not (change.is_simple and change.effect > LEAST_EFFECT) and not examination.is_no_surface:
         return None  # a press that scatters light, or one that covers the skin, looks the same
     cost_deg = examination.cost_deg(change, which == "calibration")
     severity = by_cost(cost_deg)

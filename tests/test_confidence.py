@@ -261,7 +261,7 @@ def test_a_frame_beyond_the_presses_is_named_in_words(drawn, ring):
     deep = ranged(drawn[0], 0.9, 0.4 * float(out.depth_mm.max()))
     assert re.fullmatch(r"depths up to \d\.\d mm; the presses reach \d\.\d", beyond_presses(deep, out)[0])
     finding = next(found for found in vts.diagnose(None, frames[0], steep) if found.name == "beyond_presses")
-    assert finding.message.startswith("slopes up to ") and finding.severity == "warning"
+    assert finding.message.startswith("slopes up to ") and finding.severity == "note"
     by_lights, _, camera = lights_unit(ring)
     assert beyond_presses(by_lights, vts.DepthPipeline.from_calibration(by_lights)(camera(1))) == [""]
 

@@ -38,8 +38,10 @@ def run(arguments: argparse.Namespace) -> int:
         if path.suffix.lower() in VIDEO_SUFFIXES and path == arguments.background:
             return read_background([path], calibration.sensor)
         image = read_image(path)
-        cut = calibration.sensor.roi_px is not None or calibration.sensor.corners_px is not None
-        return calibration.sensor.rectify(image[None])[0] if cut else image
+        try:
+            return calibration.sensor.rectify(image[None])[0]  # raw frames are cut, as by torchvts reconstruct
+        except ValueError:
+            return image  # of another size: that is a finding
 
     background = None if arguments.background is None else read(arguments.background)
     diagnosis = diagnose(background, read(arguments.image), calibration)

@@ -1,14 +1,22 @@
 """What the camera did to an image: noise, levels, compression, clipping, spots, blur."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ..core.blur import blur, gaussian_weights
+from ..skin.weight import spread_of
+
 BLOCK = 8
 """Side of a JPEG block, pixels."""
+
+SPOT_SPREADS = 6.0
+"""Spreads of undeformed skin beyond which a pixel is a spot."""
+
+MOVES = 0.02
+"""How far a press may move skin beside it, over the shorter side of the image."""
 
 
 def levels_of(image: Tensor) -> float:
@@ -32,8 +40,10 @@ def levels_of(image: Tensor) -> float:
     return math.inf
 
 
-def blockiness(image: Tensor) -> float:
-    """Ratio of second differences across the borders of 8 x 8 blocks to those elsewhere; 1 for an uncompressed image.
+def blockiness(image: Tensor) -> tuple[float, float]:
+    """Ratio of second differences across the borders of 8 x 8 blocks to those elsewhere, and by how much they are larger.
+
+    The ratio is 1 for an uncompressed image.
 
     Measured along rows and columns and at every phase of the grid, so that it works for cropped images too. Smooth structure
     cancels in second differences, and a median leaves out the rims of objects.
@@ -43,7 +53,7 @@ def blockiness(image: Tensor) -> float:
     """
     red, green, blue = image.double()
     luma = 0.299 * red + 0.587 * green + 0.114 * blue
-    most = 1.0
+    most, step = 1.0, 0.0
     for plane in (luma, luma.t()):
         first = plane[:, 1:] - plane[:, :-1]
         jump = (first[:, 1:-1] - 0.5 * (first[:, :-2] + first[:, 2:])).abs()
@@ -53,97 +63,115 @@ def blockiness(image: Tensor) -> float:
         phases = columns[:whole].reshape(-1, BLOCK).median(0).values
         best = int(phases.argmax())
         others = torch.cat((phases[:best], phases[best + 1 :]))
-        most = max(most, float(phases[best] / others.median().clamp_min(1e-9)))
-    return most
+        usual = float(others.median().clamp_min(1e-9))
+        if float(phases[best]) / usual > most:
+            most, step = float(phases[best]) / usual, float(phases[best]) - usual
+    return most, step
 
 
-class Spots(NamedTuple):
-    """New spots on the skin or the lens.
+def new_spots(image: Tensor, expected: Tensor, noise_std: Tensor, widest_px: int, free: Tensor) -> tuple[int, int, int]:
+    """Small places that are darker or brighter than the background predicts, in all channels alike: (number, pixels, black ones).
 
-    Attributes:
-        number: how many.
-        pixels: how many pixels they have.
-        dead: how many of these pixels are black.
-        mask: (H, W) bool, their pixels.
-    """
-
-    number: int
-    pixels: int
-    dead: int
-    mask: Tensor
-
-
-def new_spots(image: Tensor, expected: Tensor, noise_std: Tensor, widest_px: int, contact: Tensor) -> Spots:
-    """Find small places that are darker or brighter than the background predicts, in all channels alike.
-
-    A slope takes light from one LED and gives it to another; a spot takes it from all. The ratio of image and expectation is
-    compared with its median over a window as wide as the widest spot. Contacts are left out: steep walls are dark in all
-    channels too.
+    A slope takes light from one LED and gives it to another; a spot takes it from all. What counts lies beyond the spread of the
+    frame's own skin, and beyond the darkest and brightest that the background has within :data:`MOVES`: skin moves with its spots.
 
     Args:
         image: (3, H, W), values.
         expected: (3, H, W), values predicted from the background.
         noise_std: (3,), of their difference.
         widest_px: diameter of the widest spot.
-        contact: (H, W) bool; parts of it no wider than a spot do not count as contact.
+        free: (H, W) bool, skin without contact, with spots on it.
     """
     import cv2
 
-    number, label, stats, _ = cv2.connectedComponentsWithStats(contact.numpy().astype(np.uint8), connectivity=8)
-    wide = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]) > 1.5 * widest_px
-    pressed = cv2.dilate((wide & (np.arange(number) > 0))[label].astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
-    value, predicted = image.double().numpy(), expected.double().numpy()
-    noise = noise_std.double().numpy()[:, None, None]
-    dead = (value < 3.0 * noise).all(0) & (predicted > 12.0 * noise).all(0)
-    log_ratio = np.log(np.maximum(value, 1e-3) / np.maximum(predicted, 1e-3)).astype(np.float32)
+    noise = noise_std.reshape(3, 1, 1)
+    log_ratio = (image.clamp_min(1e-3) / expected.clamp_min(1e-3)).log()
     window = 2 * (max(3, widest_px) // 2) + 1
-    bytes_of = np.clip((log_ratio + 1.0) * 127.5, 0, 255).astype(np.uint8)
-    smooth = np.stack([cv2.medianBlur(plane, window) for plane in bytes_of]).astype(np.float32) / 127.5 - 1.0
-    smooth = np.stack([cv2.GaussianBlur(plane, (0, 0), 0.25 * window) for plane in smooth])
-    residual = log_ratio - smooth
-    least = np.maximum(0.04, 5.0 * noise / np.maximum(value, 3.0 * noise))
-    dark = ((residual < -least) & (predicted > 6.0 * noise)).all(0)
-    bright = ((residual > least) & (predicted > 6.0 * noise)).all(0)
-    found = ((dark | bright | dead) & ~pressed).astype(np.uint8)
-    number, label, stats, _ = cv2.connectedComponentsWithStats(found, connectivity=8)
+    planes = ((log_ratio + 1.0) * 127.5).clamp(0, 255).byte().numpy()
+    smooth = torch.from_numpy(np.stack([cv2.medianBlur(plane, window) for plane in planes])).float() / 127.5 - 1.0
+    smooth = blur(smooth[None], gaussian_weights(0.25 * window))[0]
+    off = log_ratio - smooth
+    reach = max(2, round(MOVES * min(image.shape[1:])))
+    log = expected.clamp_min(1e-3).log()
+    around = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    darkest, brightest = (
+        torch.from_numpy(np.stack([change(plane, around) for plane in log.numpy()])) for change in (cv2.erode, cv2.dilate)
+    )
+    if int(free.sum()) < 100:
+        return 0, 0, 0
+    spread = spread_of(off[:, free].abs()[None], 0.0)[0, :, :, None]
+    least = torch.maximum(5.0 * noise / expected.clamp_min(1e-3), SPOT_SPREADS * spread).clamp_min(0.04)
+    beside = np.ones((2 * widest_px + 1, 2 * widest_px + 1), np.uint8)
+    still = torch.from_numpy(cv2.dilate((~free).numpy().astype(np.uint8), beside) == 0)  # skin beside a contact wrinkles
+    inner = torch.zeros_like(free)
+    inner[reach:-reach, reach:-reach] = True
+    lit = (expected > 6.0 * noise).all(0) & still & inner
+    dead = (image < 3.0 * noise).all(0) & lit
+    found = ((off + log < darkest - least).all(0) | (off + log > brightest + least).all(0) | dead) & lit
+    number, label, stats, _ = cv2.connectedComponentsWithStats(found.numpy().astype(np.uint8), connectivity=8)
     extent = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT])
     kept = (extent <= widest_px) & (np.arange(number) > 0)
-    mask = kept[label]
-    return Spots(int(kept.sum()), int(mask.sum()), int((mask & dead).sum()), torch.from_numpy(mask))
+    mask = torch.from_numpy(kept[label])
+    return int(kept.sum()), int(mask.sum()), int((mask & dead).sum())
 
 
-def texture_share(image: Tensor, expected: Tensor, noise_std: Tensor, where: Tensor) -> tuple[float, float]:
-    """Share of the background's fine texture that is left in an image, and the standard error of this share.
+def texture_share(image: Tensor, background: Tensor, noise_std: Tensor, background_noise: Tensor, free: Tensor) -> float | None:
+    """Power of an image's fine texture over the background's; None where the background has none beyond its noise.
 
-    It is the regression of the band-passed image on the band-passed background: 1 for a sharp image, 0 where blur has
-    removed the texture. Where the background has no texture beyond its noise, the standard error is infinite.
+    Power, not likeness: skin that is stretched keeps its texture, elsewhere.
 
     Args:
         image: (3, H, W), values.
-        expected: (3, H, W), values predicted from the background.
-        noise_std: (3,), of each.
-        where: (H, W) bool, pixels without contact.
+        background: (3, H, W), values.
+        noise_std: (3,), of the image.
+        background_noise: (3,).
+        free: (H, W) bool, skin without contact.
     """
-    fine, same = _band(image), _band(expected)
-    inside = where.flatten()
-    fine, same = fine.flatten(1)[:, inside], same.flatten(1)[:, inside]
-    if fine.shape[1] < 100:
-        return 1.0, math.inf
-    noise = (noise_std.double() ** 2 * BAND_NOISE)[:, None]
-    limit = 8.0 * same.square().mean(1, keepdim=True).sqrt()
-    kept = (same.abs() < limit) & (fine.abs() < limit)
-    power = (same.square() * kept).sum() - (noise * kept).sum()
-    if float(power) <= float((noise * kept).sum()):
-        return 1.0, math.inf
-    share = float((fine * same * kept).sum() / power)
-    spread = float(((noise * same.square()) * kept).sum().sqrt() / power)
-    return share, spread
+    if int(free.sum()) < 100:
+        return None
+    now, before = (_fine_power(planes, free) for planes in (image, background))
+    noise = float((background_noise.double() ** 2).sum())
+    if before < 2.0 * noise:
+        return None
+    return max(0.0, now - float((noise_std.double() ** 2).sum())) / (before - noise)
+
+
+def pattern_likeness(image: Tensor, background: Tensor, noise_std: Tensor, free: Tensor) -> float | None:
+    """Correlation of an image's fine pattern with the background's; None where the background has none beyond its noise.
+
+    On one unit it is 0.06 at least, where noise hides the pattern, and usually 0.1 to 0.5; on others of the same type at most 0.04.
+
+    Args:
+        image: (3, H, W), values.
+        background: (3, H, W), values.
+        noise_std: (3,), of the background.
+        free: (H, W) bool, skin without contact.
+    """
+    noise = float((noise_std.double() ** 2).sum())
+    if int(free.sum()) < 100 or _fine_power(background, free) < 1.1 * noise:
+        return None
+    now, before = (_pattern(planes)[:, free] for planes in (image, background))
+    kept = (now.abs() < _most(now)) & (before.abs() < _most(before))
+    now, before = now * kept, before * kept
+    return float((now * before).sum() / (now.square().sum() * before.square().sum()).sqrt().clamp_min(1e-12))
+
+
+def _pattern(image: Tensor) -> Tensor:
+    log = image.double().clamp_min(0.01).log()[None]
+    return (blur(log, gaussian_weights(1.0)) - blur(log, gaussian_weights(3.0)))[0]
+
+
+def _most(values: Tensor) -> Tensor:
+    """Six standard deviations, robustly."""
+    return 6.0 * 1.4826 * values.abs().median(dim=1, keepdim=True).values
+
+
+def _fine_power(image: Tensor, where: Tensor) -> float:
+    planes = image.double()[None]
+    fine = (planes - nn.functional.avg_pool2d(planes, 5, 1, 2, count_include_pad=False))[0][:, where]
+    limit = 8.0 * fine.square().mean(1, keepdim=True).sqrt()
+    return float((fine.square() * (fine.abs() < limit)).mean(1).sum()) / BAND_NOISE
 
 
 BAND_NOISE = 0.96
-"""Variance that white noise of variance one keeps in :func:`_band`."""
-
-
-def _band(image: Tensor) -> Tensor:
-    planes = image.double()[None]
-    return (planes - nn.functional.avg_pool2d(planes, 5, 1, 2, count_include_pad=False))[0]
+"""Variance that white noise of variance one keeps in what is left of an image without its means over 5 x 5 pixels."""

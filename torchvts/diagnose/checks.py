@@ -7,29 +7,30 @@ from typing import Any
 
 import torch
 
-from ..integration import integrate_perspective
-from ..pipeline import beyond_presses
-from .camera import blockiness, levels_of, texture_share
-from .examination import BLOCKY, COPLANAR, Examination, largest_residual
-from .findings import Finding
-from .light_change import CHANNELS, Change
-from .light_findings import find_light_change
-from .surface import LengthError, cast_shadow_share, normal_noise_deg, peaks, transition_width_mm
+from ..calibration import ROUGH, channel_structure
+from ..pipeline import DepthPipeline, beyond_presses
+from ..stream import FrameCheck
+from .camera import blockiness, levels_of, new_spots, pattern_likeness, texture_share
+from .examination import MISFITS, Examination
+from .findings import FAULT_DEG, WARNING_DEG, Finding, by_cost
+from .light_words import CHANNELS, in_words
 
-WARNING_DEG = 0.5
-"""Error of normals from which noise is a warning; from twelve times that it is a fault."""
+ROUGH_FREE_DEG = 6.0
+"""Spread of the slopes that the least changed skin of a frame may seem to have: 0.3 to 4 degrees on real sensors, 4 where a press
+scatters light over all of a small sensor."""
 
-EXPLAINS_LENGTH = frozenset({
-    "ambient_light", "black_level", "gamma", "channels_mixed", "channels_swapped", "specular", "lights_misfit", "other_unit",
-    "skin_changed", "light_changed",
-})  # fmt: skip
-"""Findings that by themselves make normals longer or shorter than one: their length then shows nothing else."""
+OTHER_DEG = 1.2
+"""The same from which it is asked whether the frame is from another unit of its type: 1.4 to 5 degrees on three of one type."""
 
-LOOKS_LIKE_CONTACT = frozenset({"skin_changed", "new_spots", "few_bits", "compressed", "other_unit", "light_changed", "noise"})
-"""Findings that the contact mask may take for contact: the number and outline of contacts then mean nothing."""
+BLOCKY = 1.18
+"""Ratio of steps at the borders of 8 x 8 blocks to those inside above which an image was compressed; noise alone stays below 1.1,
+a JPEG of quality 95 has 1.2 to 1.3."""
+
+COPLANAR = 0.3
+"""Smallest singular value of the lights' directions below which they nearly lie in one plane."""
 
 Figures = dict[str, Any]
-"""What a check measured: ``value`` is compared with its limits, all of it may stand in its message."""
+"""What a check measured: ``value`` is compared with its limit, all of it may stand in its message."""
 
 
 @dataclass(frozen=True)
@@ -41,10 +42,9 @@ class Check:
         measure: the value, figures with "value" among them, or the finding itself; None where the check does not apply.
         message: what it is, with figures by name in braces, and what to do.
         severity: "note", "warning" or "fault", or a function of the figures.
-        above: reported where the value is larger than this,
-        below: and smaller than this.
-        unless: findings that make this one meaningless.
-        last: whether nothing further is checked where it is found.
+        above: reported where the value is larger than this.
+        alone: asked only where nothing is wrong so far: it would mean nothing.
+        last: nothing further is asked where it is found.
     """
 
     name: str
@@ -52,300 +52,306 @@ class Check:
     message: str = ""
     severity: str | Callable[[Figures], str] = "warning"
     above: float = -math.inf
-    below: float = math.inf
-    unless: frozenset[str] = frozenset()
+    alone: bool = False
     last: bool = False
 
-    def __call__(self, examination: Examination, found: set[str]) -> Finding | None:
-        """The finding, if there is one; ``found`` are the names of those before it."""
-        if found & self.unless:
-            return None
+    def __call__(self, examination: Examination) -> Finding | None:
+        """The finding, if there is one."""
         measured = self.measure(examination)
         if measured is None or isinstance(measured, Finding):
             return measured
         figures = measured if isinstance(measured, dict) else {"value": measured}
-        if not self.above < figures["value"] < self.below:
+        if not figures["value"] > self.above:
             return None
         severity = self.severity if isinstance(self.severity, str) else self.severity(figures)
         return Finding(self.name, self.message.format(**figures), severity, figures["value"])
 
 
 def run_checks(examination: Examination) -> Iterator[Finding]:
-    """All findings, in the order of the table."""
-    names: set[str] = set()
+    """All findings, in the order of the table; a fault of the frame ends it, for it makes the rest meaningless."""
+    found: list[Finding] = []
     for check in CHECKS:
-        finding = check(examination, names)
+        if check.alone and any(finding.severity != "note" for finding in found):
+            continue
+        finding = check(examination)
         if finding is not None:
-            names.add(finding.name)
+            found.append(finding)
             yield finding
             if check.last:
                 return
 
 
-# ---- what is measured ----------------------------------------------------------------------------------------------------------
+# ---- what is measured: the calibration ----------------------------------------------------------------------------------------
 
 
-def _by_cost(figures: Figures) -> str:
-    return "fault" if figures["cost"] >= 12.0 * WARNING_DEG else "warning" if figures["cost"] >= WARNING_DEG else "note"
+def _clipped_at_calibration(e: Examination) -> float:
+    return float((e.value > 0.99).any(0).double().mean())
 
 
-def _light_change(change: Change | None, which: str, e: Examination) -> Finding | None:
-    return None if change is None else find_light_change(change, which, e)
+def _contact_at_calibration(e: Examination) -> float | None:
+    """Structure between the channels as a contact has it; with lights, a contact that their pipeline finds in the background."""
+    unit = e.unit
+    if not unit.measured or unit.markers is not None or unit.sensor.markers or _clipped_at_calibration(e) > 0.05:
+        return None
+    if unit.lights is None:
+        structure = channel_structure(e.value)
+        return structure if structure > ROUGH else None
+    model = type(unit).from_lights(unit.lights, unit.sensor)
+    pipeline = DepthPipeline.from_calibration(model, "precise").eval()
+    with torch.no_grad():
+        return _contact(pipeline(e.value[None].to(model.background.dtype)).contact)
+
+
+def _contact(mask: torch.Tensor) -> float | None:
+    """Share of the image that is in contact, beyond specks."""
+    share = float(mask.double().mean())
+    return share if share > 0.005 else None
+
+
+def _contact_in_background(e: Examination) -> float | None:
+    if e.given is None or e.check.other_view(e.given[None]):
+        return None
+    with torch.no_grad():
+        return _contact(e.pipeline(e.given[None].to(e.unit.background.dtype)).contact)
 
 
 def _coplanar(e: Examination) -> Figures | None:
-    return {"value": e.spread, "cost": e.noise_deg} if e.spread < COPLANAR else None
+    spread = least_spread(e)
+    return {"value": spread, "cost": e.noise_deg} if spread < COPLANAR else None
 
 
-def _contact(change: Change | None, least_free: float) -> float | None:
-    """The largest residual of a background that shows a contact."""
-    if change is None or largest_residual(change) <= 12 or change.free_share <= least_free:
-        return None
-    return float(change.residual.max())
+def least_spread(e: Examination) -> float:
+    """Smallest singular value of the lights' unit directions at the image centre: 0 in one plane, 1 at right angles."""
+    if e.unit.lights is None:
+        return math.inf
+    return float(torch.linalg.svdvals(e.unit.lights.direction.detach().double())[-1])
+
+
+# ---- the camera ----------------------------------------------------------------------------------------------------------------
 
 
 def _bits(e: Examination) -> Figures | None:
     if e.is_fine:
         return None
     which = "image" if levels_of(e.raw) == e.levels else "calibration's image"
-    cost = normal_noise_deg(e.blocks, torch.full((3,), 1.0 / e.levels / math.sqrt(12.0)))
+    cost = e.degrees_of(torch.full((3,), 1.0 / e.levels / math.sqrt(12.0)))
     return {"value": float(round(math.log2(e.levels + 1))), "which": which, "cost": cost}
 
 
 def _block_steps(e: Examination) -> Figures | None:
     if not e.is_fine:
         return None
-    steps = max(e.steps, blockiness(e.value) if e.calibration.measured else 1.0)
-    return {"value": steps, "which": "image" if e.steps > BLOCKY else "calibration's image"}
+    ratio, step = blockiness(e.image)
+    return {"value": ratio, "cost": e.degrees_of(torch.full((3,), step))} if ratio > BLOCKY else None
 
 
 def _noise(e: Examination) -> Figures | None:
     """Noise of the image, degrees of it, and how many times that at calibration it is."""
-    if not e.is_fine or bool(e.black_channels(e.image).any()):
+    if not e.is_fine or e.noise_deg <= 2.0 * WARNING_DEG:
         return None
-    return {"value": float((e.noise / e.calibrated_noise).max()), "level": float(e.noise.max()), "cost": e.noise_deg}
+    ratio = float((e.noise / e.unit.noise_std).max())
+    return {"value": float(e.noise.max()), "cost": e.noise_deg, "ratio": ratio} if ratio > 3.0 or e.noise_deg > FAULT_DEG else None
 
 
-def _more_noise(e: Examination) -> Figures | None:
-    figures = _noise(e)
-    return figures if figures is not None and figures["cost"] > WARNING_DEG else None
-
-
-def _always_noisy(e: Examination) -> Figures | None:
-    figures = _noise(e)
-    if figures is None or figures["cost"] <= 3.0 * WARNING_DEG or e.spread < COPLANAR:
+def _unusable(e: Examination) -> Finding | None:
+    view = e.check.other_view(e.raw[None])
+    text = "" if "shows more" in view else e.check(e.raw[None])  # a contact over all of the skin looks so, too
+    if not text:
         return None
-    return {**figures, "value": figures["level"]}
+    if "swapped" in view:
+        return Finding("channels_swapped", f"{view}; read the image in the order R, G, B", "fault", 1.0)
+    return Finding("other_view" if view else "no_picture", f"{text}{'; take both in the same way' if view else ''}", "fault", 1.0)
 
 
-def _empty(e: Examination) -> float | None:
-    return float(e.image.mean()) if e.is_empty else None
-
-
-def _other_view(e: Examination) -> Finding | None:
-    """An image that is cropped, turned or mirrored otherwise than the calibration's.
-
-    Swapped channels are found as a change of light, and a flat contact over all of the skin looks like an image that shows more.
-    """
-    view = e.other_view
-    if not view or "swapped" in view or "shows more" in view:
-        return None
-    return Finding("other_view", f"{view}: take both in the same way", "fault", e.free_share or 0.0)
-
-
-def _failed_leds(e: Examination) -> Figures:
-    failed = e.black_channels(e.image)
-    return {"value": float(failed.sum()), "colors": " and ".join(CHANNELS[j] for j in range(3) if failed[j])}
-
-
-def _spots(e: Examination) -> Figures | None:
-    if not e.calibration.measured or e.spots.pixels < 3:
-        return None
-    dead = f", {e.spots.dead} dead pixels among them" if e.spots.dead else ""
-    return {"value": float(e.spots.number), "share": e.spots.pixels / e.spots.mask.numel(), "dead": dead}
-
-
-def _texture(e: Examination) -> float | None:
-    if not e.calibration.measured or not e.is_fine:
-        return None
-    left, error = texture_share(e.image, e.expected, e.calibrated_noise, e.free_skin)
-    return left if error < 0.05 else None
-
-
-def _gloss(e: Examination) -> float | None:
-    return e.length.longer if e.length is not None and e.length.mean > 0.003 else None
-
-
-def _length(e: Examination, kind: str) -> LengthError | None:
-    """The error of the normals' length if this is what explains it: "bounce", "move" or "blur"."""
-    length = e.length
-    if length is None or length.sigmas < 20.0 or length.amount < 0.05:
-        return None
-    found = length.pattern.split()[0]
-    if found == "bounce" and length.narrow:  # narrow mixing, such as colours at half resolution, is no inter-reflection
-        found = "blur"
-    if found != "bounce" and int(e.spots.mask.sum()) >= 3:
-        return None
-    return length if found == kind else None
-
-
-def _sigmas(length: LengthError | None) -> float | None:
-    return None if length is None else length.sigmas
-
-
-def _inter_reflection(e: Examination) -> float | None:
-    length = _length(e, "bounce")
-    return None if length is None else length.amount
+def _failed(e: Examination) -> Figures:
+    return {"value": float(len(e.failed)), "colors": " and ".join(CHANNELS[j] for j in e.failed)}
 
 
 def _saturated(e: Examination) -> Figures | None:
-    contact = e.surface.contact
-    inside = float(e.clipped[contact if bool(contact.any()) else torch.ones_like(contact)].double().mean())
-    anywhere = float(e.clipped.double().mean())
-    if inside <= 0.01 and anywhere <= 0.02:
-        return None
-    where = f"{inside:.0%} of the contact" if inside > 0.01 and bool(contact.any()) else f"{anywhere:.0%} of the image"
+    clipped = (e.raw > 0.99).any(0)
+    inside = float(clipped[e.moved].double().mean()) if bool(e.moved.any()) else 0.0
+    anywhere = float(clipped.double().mean())
+    where = f"{inside:.0%} of the contact" if inside > anywhere else f"{anywhere:.0%} of the image"
     return {"value": max(inside, anywhere), "where": where, "inside": inside}
 
 
-def _number_of_contacts(e: Examination) -> float:
-    sensor = e.calibration.sensor
-    noise_mm = sensor.mm_per_pixel * math.radians(e.noise_deg)
-    return float(max(e.contacts.count, peaks(e.surface.output.depth_mm[0, 0], e.surface.contact, noise_mm)))
+# ---- the light and the skin ----------------------------------------------------------------------------------------------------
 
 
-def _steepest(e: Examination) -> Figures | None:
-    inside = torch.where(e.surface.contact, e.surface.steepness, 0.0)
-    steep = float(inside.flatten().quantile(1.0 - 0.02 * e.contacts.share))
-    return {"value": math.degrees(math.atan(steep))} if steep > 1.3 else None
+def _light_of_background(e: Examination) -> Finding | None:
+    return None if e.given is None else in_words(e.background_change, "background", e)
+
+
+def _light_at_calibration(e: Examination) -> Finding | None:
+    if e.calibration_change is None:
+        return None
+    view = FrameCheck(e.value_of(e.unit.model_image)).other_view(e.value[None])
+    if "swapped" in view:
+        return Finding("channels_swapped", f"already at calibration: {view}; read images in the order R, G, B", "fault", 1.0)
+    return in_words(e.calibration_change, "calibration", e)
+
+
+def _rough(e: Examination) -> Figures | None:
+    """Spread of the slopes of undeformed skin, where no simple change of light explains it."""
+    if e.change.is_simple:
+        return None
+    covered = not bool(e.output.contact.any())
+    return {"value": e.free_deg, "read": "reads no depth" if covered else "does not know the undeformed skin"}
+
+
+def _other_unit(e: Examination) -> float | None:
+    """Unlikeness of the skin's fine pattern, where the least changed skin seems to have slopes."""
+    if not e.unit.measured or not e.is_fine or e.free_deg < OTHER_DEG:
+        return None
+    likeness = pattern_likeness(e.image, e.without_markers(e.value), e.unit.noise_std, e.free)
+    return None if likeness is None else 1.0 - likeness
+
+
+def _spots(e: Examination) -> Figures | None:
+    # where lights stand close together a slope, too, takes light from all channels; steps of blocks look like spots
+    if not e.unit.measured or e.unit.markers is not None or least_spread(e) < COPLANAR or blockiness(e.image)[0] > BLOCKY:
+        return None
+    widest = max(6, min(e.image.shape[1:]) // 10)
+    number, pixels, dead = new_spots(e.image, e.value, e.expected_noise, widest, e.frame.weight[0, 0] <= 0.0)
+    if pixels < 3:
+        return None
+    text = f", {dead} dead pixels among them" if dead else ""
+    return {"value": float(number), "share": pixels / e.moved.numel(), "dead": text}
+
+
+def _wear(e: Examination) -> float | None:
+    """RMS of an uneven change of brightness of free skin that the channels share, where they share most of it."""
+    return e.grey_change if e.unit.measured else None
+
+
+def _texture_lost(e: Examination) -> float | None:
+    if not e.unit.measured or not e.is_fine:
+        return None
+    left = texture_share(e.image, e.without_markers(e.value), e.noise, e.unit.noise_std, e.free)
+    return None if left is None else 1.0 - left
+
+
+def _length(e: Examination, sign: float) -> float | None:
+    """Share of the contact where normals are longer (+1) or shorter (-1) than one, if that is the more frequent."""
+    error = e.length_error if bool(e.moved.any()) and blockiness(e.image)[0] <= BLOCKY else None
+    if error is None:
+        return None
+    this, other = (float((s * error > 3.0).double().mean()) for s in (sign, -sign))
+    return this if this > other else None
+
+
+# ---- the scene -----------------------------------------------------------------------------------------------------------------
+
+
+def _no_contact(e: Examination) -> float | None:
+    return None if bool(e.output.contact.any()) else float(e.output.depth_mm.max())
+
+
+def _at_border(e: Examination) -> float | None:
+    mask = e.output.contact[0, 0]
+    edge = torch.cat((mask[0], mask[-1], mask[:, 0], mask[:, -1]))
+    return float(edge.double().mean()) if bool(edge.any()) else None
+
+
+def _faint(e: Examination) -> float | None:
+    deepest = float(e.output.depth_mm.max())
+    return deepest if deepest < e.unit.sensor.mm_per_pixel else None
+
+
+def _steepest(e: Examination) -> float:
+    inside = e.steepness[e.moved]
+    return math.degrees(math.atan(float(inside.float().quantile(0.98)))) if len(inside) else 0.0
 
 
 def _beyond_presses(e: Examination) -> Figures | None:
-    text = beyond_presses(e.calibration, e.surface.output)[0]
-    return {"value": math.degrees(math.atan(float(e.surface.steepness[e.surface.contact].max()))), "text": text} if text else None
+    text = beyond_presses(e.unit, e.output)[0]
+    return {"value": math.degrees(math.atan(float(e.steepness[e.output.contact[0, 0]].max()))), "text": text} if text else None
 
 
 def _shadow(e: Examination) -> float:
-    contact = e.surface.contact
-    return float((e.surface.dark.any(1)[0] & contact).double().sum() / contact.double().sum().clamp_min(1))
+    dark = e.dark.any(0)
+    return float(dark[e.moved].double().mean()) if bool(e.moved.any()) else 0.0
 
 
-def _cast_shadow(e: Examination) -> Figures:
-    remedy = "fast mode takes it for a slope; use precise mode, or raise the LEDs"
-    if e.calibration.lights is None:
-        remedy = "it is taken for a slope; raise the LEDs"
-    return {"value": cast_shadow_share(e.surface, e.noise), "remedy": remedy}
-
-
-def _transition(e: Examination) -> float | None:
-    sensor = e.calibration.sensor
-    width = transition_width_mm(e.surface)
-    return width if width > max(3.0, 2.0 * sensor.blur_px + 2.0) * sensor.mm_per_pixel else None
+def _cast_shadow(e: Examination) -> float:
+    """Share of the image where one light is missing while the two others are as on undeformed skin."""
+    flat = e.unit.flat
+    off = (e.frame.image[0] / flat.clamp_min(1e-6) - 1.0).abs()
+    undeformed = off < (6.0 * e.unit.compensated_noise_std / flat.clamp_min(1e-6)).clamp_min(0.03)
+    return float((e.dark & undeformed.roll(1, 0) & undeformed.roll(2, 0)).any(0).double().mean())
 
 
 def _deep_press(e: Examination) -> Figures | None:
-    unit = e.calibration
-    if unit.lights is None:
+    if e.unit.lights is None:
         return None
-    value = e.mended_light[None].to(unit.background.dtype) ** (1.0 / e.exponent)
-    fast = e.blocks.output(value, "fast").depth_mm
-    off_px = float((fast - e.surface.output.depth_mm).abs().max()) / unit.sensor.mm_per_pixel
-    return {"value": off_px, "deepest": e.deepest_mm} if off_px >= 0.5 else None
-
-
-def _perspective(e: Examination) -> Figures | None:
-    """Effect of a near camera on depth, where the calibration knows its height: no image shows it."""
-    height, pitch = e.calibration.report.get("camera_height_mm"), e.calibration.sensor.mm_per_pixel
-    if isinstance(height, bool) or not isinstance(height, int | float) or not 0 < height < math.inf:
-        return None
-    perspective = integrate_perspective(e.surface.output.gradient, pitch, float(height))
-    off_px = float((perspective - e.surface.output.depth_mm).abs().max()) / pitch
-    return {"value": off_px, "height": height} if off_px >= 0.1 else None
+    with torch.no_grad():
+        fast = DepthPipeline.from_calibration(e.unit, "fast").eval()(e.raw[None].to(e.unit.background.dtype)).depth_mm
+    off_px = float((fast - e.output.depth_mm).abs().max()) / e.unit.sensor.mm_per_pixel
+    return {"value": off_px, "deepest": float(e.output.depth_mm.max())}
 
 
 # ---- the table -----------------------------------------------------------------------------------------------------------------
 
 _CONTACT = "contact in the {} image: take it again with nothing touching the skin"
-_NO_FREE_SKIN = "contact covers the whole skin, or all light has changed: no free skin to compare with; leave some skin free"
 
 CHECKS = (
     # the calibration
-    Check("calibration_saturated", lambda e: float((e.value > 0.99).any(0).double().mean()),
+    Check("calibration_saturated", _clipped_at_calibration,
           "{value:.0%} of the calibration image is saturated: reduce the exposure and calibrate again", above=0.05),
-    Check("contact_in_calibration", lambda e: e.structure, _CONTACT.format("calibration"), "fault", above=0.0),
-    Check("markers", lambda e: None if e.calibration.markers is None else float((e.raw != e.image).any(0).double().mean()),
-          "printed markers cover {value:.0%} of the image: they are filled from the pixels around them, which hides details",
-          "note"),
+    Check("contact_in_calibration", _contact_at_calibration, _CONTACT.format("calibration"), "fault"),
     Check("lights_coplanar", _coplanar, "the lights lie nearly in one plane (smallest singular value of their directions "
           "{value:.2f}, usual is 0.8): noise alone changes normals by {cost:.1f} degrees; increase the distance of the LEDs"),
-    Check("lights_misfit", lambda e: _light_change(e.calibration_change, "calibration", e)),
-    Check("contact_in_calibration", lambda e: _contact(e.calibration_change, 0.5), _CONTACT.format("calibration"), "fault"),
+    Check("lights_misfit", _light_at_calibration),
     # the background of now
-    Check("light_changed", lambda e: _light_change(e.background_change, "background", e)),
-    Check("contact_in_background", lambda e: _contact(e.background_change, 0.3), _CONTACT.format("background"), "fault",
-          unless=frozenset({"other_unit"})),
+    Check("contact_in_background", _contact_in_background, _CONTACT.format("background"), "fault"),
+    Check("light_changed", _light_of_background),
     # the camera
     Check("few_bits", _bits, "the {which} has only {value:.0f} bits: rounding changes normals by {cost:.1f} degrees; read the "
-          "camera with 8 bits or more", _by_cost),
-    Check("compressed", _block_steps, "the {which} was compressed: steps at the borders of 8 x 8 blocks are {value:.1f} times "
-          "those inside; take uncompressed images, or JPEG of quality 95 and more", above=BLOCKY),
-    Check("noise", _more_noise, "noise is {value:.1f} times that at calibration and changes normals by {cost:.1f} degrees: more "
-          "light, less gain, or average several frames", lambda figures: _by_cost({"cost": 0.5 * figures["cost"]}), above=3.0),
-    Check("noise", _always_noisy, "noise of {value:.3f} changes normals by {cost:.1f} degrees, at calibration too: more light, "
-          "less gain, or average several frames", unless=frozenset({"noise"})),
-    Check("no_picture", _empty, "the image has one value everywhere: lens covered, no LEDs, or no picture from the camera",
-          "fault", last=True),
-    Check("led_failed", _failed_leds, "the {colors} LED has failed (its channel is black everywhere): check LED and cable; with "
+          "camera with 8 bits or more", lambda figures: by_cost(figures["cost"])),
+    Check("compressed", _block_steps, "the image was compressed: steps at the borders of 8 x 8 blocks are {value:.1f} times "
+          "those inside and change normals by {cost:.1f} degrees; take uncompressed images, or JPEG of quality 95 and more",
+          lambda figures: by_cost(figures["cost"])),
+    Check("noise", _noise, "noise of {value:.3f}, {ratio:.1f} times that at calibration, changes normals by {cost:.1f} degrees: "
+          "more light, less gain, or average several frames", lambda figures: by_cost(0.5 * figures["cost"])),
+    Check("led_failed", _failed, "the {colors} LED has failed (its channel is black everywhere): check LED and cable; with "
           "two LEDs left modes precise and auto still find a rough depth, with one none does", "fault", above=0.0, last=True),
-    Check("other_view", _other_view, last=True),
-    # the skin
-    Check("no_free_skin", lambda e: e.free_share, _NO_FREE_SKIN),
-    Check("light_changed", lambda e: _light_change(None if e.is_wide_contact else e.change, "image", e)),
-    Check("new_spots", _spots, "{value:.0f} spots that were not there at calibration ({share:.1%} of the image{dead}): clean the "
-          "skin, or recalibrate", lambda figures: "warning" if figures["value"] >= 3 else "note"),
-    Check("skin_changed", lambda e: e.wear, "the skin's brightness has changed by {value:.1%} (RMS), unevenly and nearly equally "
-          "in all channels: worn, stained or dirty; clean it, or recalibrate", above=0.0),
-    Check("blurred", _texture, "the image is blurred or moved: only {value:.0%} of the skin's fine texture is left; focus, clean "
-          "the lens, mount the camera firmly", below=0.6),
-    Check("specular", _gloss, "{value:.0%} of the contact is brighter than any matt slope: the skin is glossy (specular); use a "
-          "matt coating, or softer light", above=0.03, unless=EXPLAINS_LENGTH),
-    Check("inter_reflection", _inter_reflection, "slopes look washed out, as if about {value:.0%} of the light came from other "
-          "skin (inter-reflection) or from around: use a darker gel or coating", unless=EXPLAINS_LENGTH),
-    Check("moved", lambda e: _sigmas(_length(e, "move")),
-          "the image is blurred by motion: rims are mixed along one direction; use a shorter exposure, or move "
-          "slower", unless=EXPLAINS_LENGTH),
-    Check("blurred", lambda e: _sigmas(_length(e, "blur")),
-          "the image is blurred: rims are mixed with their surroundings; focus the camera, take colours at "
-          "full resolution", unless=EXPLAINS_LENGTH),
-    # the scene
+    Check("no_picture", _unusable, last=True),
     Check("saturated", _saturated, "the image is saturated in {where}: reduce the exposure",
-          lambda figures: "fault" if figures["inside"] > 0.3 else "warning"),
-    Check("no_free_skin", lambda e: 1.0 if e.contacts.count == 0 and e.is_wide_contact else None, _NO_FREE_SKIN),
-    Check("no_contact", lambda e: 0.0 if e.contacts.count == 0 else None, "no contact: nothing is above the noise", "note",
-          last=True, unless=frozenset({"no_free_skin"})),
-    Check("contact_covers_image", lambda e: e.contacts.share, "contact covers {value:.0%} of the image: little free skin is left "
-          "to compare with, and depth beyond the border is not seen", "note", above=0.4, unless=LOOKS_LIKE_CONTACT),
-    Check("no_free_skin", lambda e: 1.0 - e.contacts.share if e.contacts.share > 0.97 else None, _NO_FREE_SKIN,
-          unless=LOOKS_LIKE_CONTACT),
-    Check("contact_at_border", lambda e: e.contacts.share if e.contacts.at_border else None, "the contact reaches the image "
-          "border: the part beyond is not seen, and depth there is less certain", "note", unless=LOOKS_LIKE_CONTACT),
-    Check("several_contacts", _number_of_contacts, "{value:.0f} contacts, or summits of one", "note", above=1.0,
-          unless=LOOKS_LIKE_CONTACT),
-    Check("faint_contact", lambda e: e.deepest_mm if e.deepest_mm < e.calibration.sensor.mm_per_pixel else None,
-          "faint contact: {value:.3f} mm at its deepest, less than a pixel; its rim is below the noise", "note"),
+          lambda figures: "note" if figures["value"] < 0.1 else "fault" if figures["inside"] > 0.3 else "warning", above=0.02),
+    # the light and the skin
+    Check("no_free_skin", _rough, "even the least changed skin seems to have slopes of {value:.0f} degrees, and the pipeline "
+          "{read}: contact covers everything, or this is another unit, or its light has changed; leave skin free, or recalibrate",
+          "fault", above=ROUGH_FREE_DEG, last=True),
+    Check("other_unit", _other_unit, "the skin has not the fine pattern that it had at calibration: another unit, or its skin was "
+          "changed; use its own calibration, or calibrate again", above=0.945),
+    Check("light_changed", lambda e: in_words(e.change, "image", e)),
+    Check("new_spots", _spots, "{value:.0f} spots that were not there at calibration ({share:.1%} of the image{dead}): clean the "
+          "skin, or recalibrate", lambda figures: "warning" if figures["share"] > 0.001 else "note"),
+    Check("skin_changed", _wear, "the skin's brightness has changed by {value:.1%} (RMS), unevenly and nearly equally "
+          "in all channels: worn, stained or dirty; clean it, or recalibrate", above=0.0),
+    Check("blurred", _texture_lost, "the image is blurred or moved: {value:.0%} of the skin's fine texture is lost; focus, clean "
+          "the lens, mount the camera firmly", above=0.6),
+    Check("specular", lambda e: _length(e, 1.0), "{value:.0%} of the contact is brighter than any matt slope: the skin is "
+          "glossy (specular); use a matt coating, or softer light", above=MISFITS, alone=True),
+    Check("blurred", lambda e: _length(e, -1.0), "{value:.0%} of the contact gets light from its surroundings: the image is "
+          "blurred or moved, or other skin lights it (inter-reflection); focus, expose shorter, use a darker coating",
+          above=MISFITS, alone=True),
+    # the scene
+    Check("no_contact", _no_contact, "no contact: nothing is above the noise", "note", last=True),
+    Check("contact_covers_image", lambda e: float(e.moved.double().mean()), "the skin has moved in {value:.0%} of the image: "
+          "little free skin is left to compare with, and depth beyond the border is not seen", "note", above=0.6, alone=True),
+    Check("contact_at_border", _at_border, "the contact reaches the image border: the part beyond is not seen, and depth there "
+          "is less certain", "note", alone=True),
+    Check("faint_contact", _faint, "faint contact: {value:.3f} mm at its deepest, less than a pixel; its rim is below the noise",
+          "note"),
     Check("steep_walls", _steepest, "walls of {value:.0f} degrees: a light may be blocked there, and integration cannot keep a "
-          "step; use precise mode, trust the top only", "note"),
+          "step; use precise mode, trust the top only", "note", above=52.0),
     Check("beyond_presses", _beyond_presses, "{text}: normals and depth are extrapolated there; calibrate again with "
-          "presses of a smaller ball, deeper, or in that place"),
+          "presses of a smaller ball, deeper, or in that place", "note"),
     Check("shadow", _shadow, "a light is blocked in {value:.0%} of the contact: slopes there are estimated from two lights; press "
           "less, or raise the LEDs", lambda figures: "warning" if figures["value"] > 0.3 else "note", above=0.01),
-    Check("cast_shadow", _cast_shadow, "a shadow falls on {value:.1%} of the image, on flat skin: {remedy}", above=0.002),
-    Check("transition_zone", _transition, "the skin slopes down over {value:.1f} mm around the contact: the gel sags, or the "
-          "object is round there; the contact is smaller than the mask", "note",
-          unless=LOOKS_LIKE_CONTACT | {"blurred", "moved"}),
+    Check("cast_shadow", _cast_shadow, "a shadow falls on {value:.1%} of the image, on flat skin: modes fast and those of response "
+          "fields take it for a slope; use precise mode with known lights, or raise the LEDs", above=0.002),
     Check("deep_press", _deep_press, "deep press ({deepest:.1f} mm): fast mode is off by {value:.1f} px; use precise or auto",
-          "note"),
-    Check("perspective", _perspective, "the camera is {height:.0f} mm above the skin: if it is read as looking straight down, "
-          "depth is off by {value:.1f} px; use PerspectiveIntegration",
-          lambda figures: "warning" if figures["value"] > 0.5 else "note"),
+          "note", above=0.5),
 )  # fmt: skip

@@ -12,8 +12,9 @@ from .findings import Diagnosis, Finding
 def diagnose(background: Tensor | None, image: Tensor, calibration: Calibration) -> Diagnosis:
     """Find what is wrong with an image or with the calibration for it: findings in words, with figures and remedies.
 
-    Every finding is a test of a hypothesis against the noise of the images; what cannot be measured from the three inputs is not
-    guessed.
+    The frame is read by the pipeline of the calibration, and findings say what is wrong with that reading; what cannot be measured
+    from the three inputs is not guessed. The first fault of the frame itself ends the search: it makes all else meaningless.
+    docs/diagnose.md says what each finding means.
 
     Args:
         background: (3, H, W), an image without contact of now, in [0, 1]; None if there is no such image.
@@ -28,8 +29,8 @@ def diagnose(background: Tensor | None, image: Tensor, calibration: Calibration)
         >>> from torchvts import PointLights, Sensor
         >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
         >>> unit = Calibration.from_lights(lights, Sensor("rig", 96, 128, 0.25))
-        >>> print(diagnose(None, unit.background[[2, 1, 0]], unit).findings[0])
-        fault: channels look swapped (red and blue): read the image in the order R, G, B [channels_swapped]
+        >>> diagnose(None, unit.background[[2, 1, 0]], unit).names
+        ('channels_swapped',)
     """
     check_calibration("calibration", calibration)
     image = _one_image("image", image)
@@ -42,10 +43,7 @@ def diagnose(background: Tensor | None, image: Tensor, calibration: Calibration)
                 "another camera mode or sensor; rectify or resize it as at calibration"
             )
             return Diagnosis.of([Finding("wrong_size", message, "fault", frame.shape[2] / sensor.width)])
-    found = list(run_checks(Examination(calibration, image, given)))
-    if any(finding.name == "skin_changed" for finding in found):  # it says more than "light_changed"
-        found = [finding for finding in found if finding.name != "light_changed"]
-    return Diagnosis.of(found)
+    return Diagnosis.of(run_checks(Examination(calibration, image, given)))
 
 
 def _one_image(name: str, image: Tensor) -> Tensor:

@@ -6,6 +6,19 @@ from dataclasses import dataclass
 SEVERITIES = ("fault", "warning", "note")
 """From worst to mildest: depth is wrong; depth is worse than it could be; worth knowing, nothing is broken."""
 
+WARNING_DEG, FAULT_DEG = 0.5, 3.0
+"""Errors of normals from which a finding is a warning, and a fault."""
+
+
+def by_cost(cost_deg: float) -> str:
+    """The severity of an error of normals.
+
+    Example:
+        >>> by_cost(0.1), by_cost(4.0)
+        ('note', 'fault')
+    """
+    return "fault" if cost_deg >= FAULT_DEG else "warning" if cost_deg >= WARNING_DEG else "note"
+
 
 @dataclass(frozen=True)
 class Finding:

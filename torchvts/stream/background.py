@@ -19,6 +19,7 @@ from ..calibration import (
     channel_structure,
 )
 from ..core.blur import band_of_ratios
+from ..core.cells import whole_cell_means
 from ..core.checks import check_batch, check_image, check_integer, check_path, check_positive, check_sequence, parse_number
 from ..core.files import VIDEO_SUFFIXES, read_frames
 from ..model import Calibration, Sensor, SensorPrior, check_calibration, check_sensor
@@ -189,7 +190,7 @@ def read_press_images(presses: Sequence[tuple[str | Path, float | str]], sensor:
 def _check_steady(images: Tensor) -> None:
     """Refuse frames in which the light changes or something moves."""
     side = max(2, min(images.shape[2], images.shape[3]) // 20)
-    cells = nn.functional.avg_pool2d(images, side).double() + PEDESTAL
+    cells = whole_cell_means(images, side).double() + PEDESTAL
     ratio = cells / cells.median(0, keepdim=True).values
     level = ratio.flatten(2).median(2).values  # (N, 3)
     change = (level.amax(0) - level.amin(0)).max()

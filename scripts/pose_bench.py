@@ -3,10 +3,8 @@
 python scripts/pose_bench.py --poses 100 --out out/pose_bench
 """
 
-import argparse
 import dataclasses
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,15 +12,16 @@ import torch
 from tqdm import tqdm
 
 import torchvts as vts
+from lab.commands import main_of, parser_of
+from lab.pose_accuracy import PoseCase, ball_pairs, machine, pose_table, run_poses
+from lab.rows import write_files
 from torchvts import viz
-from torchvts.evaluation.pose_accuracy import PoseCase, ball_pairs, machine, pose_table, run_poses
-from torchvts.evaluation.rows import write_files
 from torchvts.pose import Registration, contact_cloud
 from torchvts.scenes import objects
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--poses", type=int, default=100, help="poses of each object")
     parser.add_argument("--size", type=int, nargs=2, default=(320, 240), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--noise", type=float, default=0.005, help="standard deviation of image noise; 8 bits on top")
@@ -66,7 +65,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except (OSError, ValueError, TypeError, ImportError) as error:
-        sys.exit(f"error: {error}")
+    main_of(main)

@@ -5,10 +5,8 @@ Ji, Liu, Ma: Model-Based 3D Contact Geometry Perception for Visual Tactile Senso
     python scripts/reproduce_paper.py [--out out/paper] [--lights 31.25 39.375]
 """
 
-import argparse
 import math
 import statistics
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,12 +14,14 @@ import torch
 from tqdm import tqdm
 
 import torchvts as vts
+from lab import methods, metrics, pose_accuracy
+from lab.commands import main_of, parser_of
+from lab.sets import data_folder
 from torchvts import scenes, viz
-from torchvts.evaluation import methods, metrics, pose_accuracy
-from torchvts.evaluation.presses import Training
-from torchvts.evaluation.rows import markdown
-from torchvts.evaluation.sets import data_folder
+from torchvts.core.tables import markdown
 from torchvts.pose import contact_cloud
+from torchvts.training.balls import fit_sphere
+from torchvts.training.presses import Training
 
 PITCH = 0.0625
 PAPER_3 = {16: (0.31, 0.09), 32: (1.21, 0.16)}
@@ -81,7 +81,7 @@ def figure_4(folder: Path, out: Path) -> list[str]:
             error = metrics.depth_error(result.depth_mm, truth, PITCH)
             found = ""
             if sphere:
-                fit = metrics.fit_sphere(result.depth_mm, PITCH, result.contact)
+                fit = fit_sphere(result.depth_mm, PITCH, result.contact)
                 found = f"({', '.join(f'{v + 0.0:.3f}' for v in fit.center_mm)}), {fit.radius_mm:.3f}"
             rows.append(
                 f"| {camera}, {case} | {paper} | {error.max_px:.2f} ({error.max_mm:.3f} mm) | {error.rms_px:.3f} "
@@ -134,11 +134,9 @@ def table_3(out: Path) -> list[str]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/paper"), help="folder for pictures and table.md")
-    parser.add_argument(
-        "--data", type=Path, default=data_folder(__file__), help="folder that holds tacto/ (default: TORCHVTS_DATA)"
-    )
+    parser.add_argument("--data", type=Path, default=data_folder(), help="folder that holds tacto/ (default: TORCHVTS_DATA)")
     parser.add_argument("--lights", type=float, nargs=2, default=(31.25, 39.375), metavar=("RADIUS_MM", "HEIGHT_MM"))
     arguments = parser.parse_args(argv)
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -167,4 +165,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main_of(main)

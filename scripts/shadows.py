@@ -9,20 +9,19 @@ the error divided by that of the same frame without shadows: median, 90 % quanti
 is black in one channel. Scenes where less than 3 % of the contact is dark are skipped.
 """
 
-import argparse
 import math
 import random
-import sys
 from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from lab.commands import main_of, parser_of
+from lab.faults import Conditions, photograph
+from lab.metrics import depth_error
 from torchvts import Calibration, DepthPipeline, PointLights, Sensor, scenes
-from torchvts.evaluation.faults import Conditions, photograph
-from torchvts.evaluation.metrics import depth_error
-from torchvts.evaluation.rows import markdown
+from torchvts.core.tables import markdown
 
 HEIGHT, WIDTH, MM_PER_PIXEL = 240, 320, 0.0625
 SENSOR = Sensor("rig", HEIGHT, WIDTH, MM_PER_PIXEL, gamma=1.0)
@@ -104,7 +103,7 @@ def cells(kind: str, shape: str, rows: Sequence[tuple[float, float, float]]) -> 
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--scenes", type=int, default=40, help="scenes of each shape and kind")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args(argv)
@@ -126,4 +125,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main_of(main)

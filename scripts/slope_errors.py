@@ -3,12 +3,10 @@
 python scripts/slope_errors.py --sets gelsight_mini_a gelsight_mini_c digit_a
 
 Half of the presses are calibrated from and the other half measured, and the other way round. docs/tracking.md
-has the table; torchvts/evaluation/tracking.py draws errors that have these covariances.
+has the table; scripts/lab/tracking.py draws errors that have these covariances.
 """
 
-import argparse
 import math
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -16,9 +14,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchvts.evaluation import sets
-from torchvts.evaluation.presses import Training
+from lab import sets
+from lab.commands import main_of, parser_of
 from torchvts.pipeline import DepthPipeline
+from torchvts.training.presses import Training
 
 PIXELS = 350  # of each press
 DISTANCES_MM = (0.4, 0.8, 1.3, 2.0, 3.0, 4.5, 7.0)
@@ -105,9 +104,9 @@ def degrees(presses: Sequence[Errors]) -> float:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--sets", nargs="+", default=["gelsight_mini_a", "gelsight_mini_c", "digit_a"], choices=list(sets.REAL))
-    parser.add_argument("--data", type=Path, default=sets.data_folder(__file__), help="folder of the real sensors")
+    parser.add_argument("--data", type=Path, default=sets.data_folder(), help="folder of the real sensors")
     arguments = parser.parse_args(argv)
     for name in arguments.sets:
         presses = measure(name, arguments.data)
@@ -123,7 +122,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except (OSError, ValueError) as error:
-        sys.exit(f"error: {error}")
+    main_of(main)

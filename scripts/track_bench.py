@@ -4,7 +4,6 @@ python scripts/track_bench.py --out out/track_bench
 python scripts/track_bench.py --motions slow --noises "slopes off by 3 degrees" --seeds 1 4 11 --sensors 1 2 3 --out out/wrong
 """
 
-import argparse
 import dataclasses
 import importlib
 import json
@@ -18,14 +17,15 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from lab import tracking
+from lab.commands import main_of, parser_of
+from lab.pose_accuracy import machine
+from lab.rows import write_files
 from torchvts import viz
-from torchvts.evaluation import tracking
-from torchvts.evaluation.pose_accuracy import machine
-from torchvts.evaluation.rows import write_files
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--objects", nargs="+", default=tracking.OBJECTS, metavar="NAME", help="of torchvts.scenes.objects")
     parser.add_argument("--motions", nargs="+", default=list(tracking.MOTIONS), choices=list(tracking.MOTIONS))
     parser.add_argument("--noises", nargs="+", default=list(tracking.NOISES), choices=list(tracking.NOISES))
@@ -81,7 +81,4 @@ def load_normalflow(folder: Path) -> tracking.NormalFlow:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        sys.exit(f"error: {error}")
+    main_of(main)

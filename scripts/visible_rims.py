@@ -6,10 +6,8 @@ Where the skin leaves the ball it shows a bright line. The circle along it is fo
 measurement of the centres: beside those of the labels, and those that `calibrate` finds without labels.
 """
 
-import argparse
 import dataclasses
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -20,10 +18,11 @@ from matplotlib.patches import Circle
 from tqdm import tqdm
 
 import torchvts as vts
-from torchvts.evaluation import sets
-from torchvts.evaluation.presses import quiet_calibrate, without_labels
-from torchvts.evaluation.rims import visible_rim
-from torchvts.evaluation.score import label, score_press
+from lab import sets
+from lab.commands import main_of, parser_of
+from lab.rims import visible_rim
+from lab.score import label, score_press
+from torchvts.training.presses import quiet_calibrate, without_labels
 from torchvts.viz import new_figure, save_figure
 
 LEAST = 4
@@ -34,7 +33,7 @@ SHOWN, HALF_PX = 8, 60
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("data", type=Path, help="folder of the data that holds gelsight_pale")
     parser.add_argument("--out", type=Path, default=Path("out/rims"), help="folder of the picture")
     parser.add_argument("--limit", type=int, help="use only so many presses")
@@ -116,7 +115,4 @@ def _picture(presses: Sequence[vts.Press], by_rim: Mapping[str, vts.Press]) -> F
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except (OSError, ValueError, TypeError) as error:
-        sys.exit(f"error: {error}")
+    main_of(main)

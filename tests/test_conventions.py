@@ -4,8 +4,8 @@ import pytest
 import torch
 
 import torchvts as vts
+from lab import metrics
 from torchvts.core.geometry import gradient_from_normal, normal_from_gradient, pixel_grid_mm
-from torchvts.evaluation import metrics
 
 
 def flat(height, width):

@@ -15,11 +15,11 @@ import pytest
 import torch
 
 import torchvts as vts
+from lab.faults import jpeg
+from lab.gallery import CORRUPTIONS, undisturbed
 from torchvts import scenes
 from torchvts.diagnose import Diagnosis, Finding
 from torchvts.diagnose.camera import blockiness, levels_of
-from torchvts.evaluation.faults import jpeg
-from torchvts.evaluation.gallery import CORRUPTIONS, undisturbed
 from torchvts.model.response_field import ResponseModel
 
 NAMED = {

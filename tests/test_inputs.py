@@ -21,12 +21,12 @@ import torch
 from conftest import ring_lights
 
 import torchvts as vts
+from lab import metrics
 from torchvts import stream as streams
 from torchvts.core.checks import check_range_later
 from torchvts.core.files import load_tensors, read_frames, rgb_from_bgr, save_tensors, write_atomically
 from torchvts.dataset import STATE, reconstruct_dataset
 from torchvts.dataset.records import as_cell
-from torchvts.evaluation import metrics
 from torchvts.stream.sources import LiveReader, check_reader
 
 HEIGHT, WIDTH, PITCH = 48, 64, 0.5

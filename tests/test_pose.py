@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import torchvts as vts
-from torchvts.evaluation import pose_accuracy as pose_bench
+from lab import pose_accuracy as pose_bench
 from torchvts.pose import ambiguity, clouds, contact_cloud, icp
 from torchvts.pose.result import invert, motion, turn_deg
 from torchvts.scenes import objects

@@ -7,12 +7,12 @@ import pytest
 import torch
 
 import torchvts as vts
+from lab import metrics
+from lab.score import score_press
 from torchvts.calibration import fit_prior
 from torchvts.calibration.pattern import compare_patterns
 from torchvts.calibration.refusals import other_crop
 from torchvts.core.blur import blur, gaussian_weights
-from torchvts.evaluation import metrics
-from torchvts.evaluation.score import score_press
 
 
 @pytest.fixture(scope="module")

@@ -20,8 +20,8 @@ import torch
 
 import torchvts as vts
 import torchvts.export
+from lab import metrics
 from torchvts.core.geometry import gradient_from_normal, normal_from_gradient
-from torchvts.evaluation import metrics
 
 TABLE = refusals_blocks.TABLE | refusals_tools.TABLE
 ROOMS = ("calibration", "diagnose", "integration", "model", "normals", "pipeline", "pose", "skin", "training")

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchvts.evaluation.rims import visible_rim
+from lab.rims import visible_rim
 
 
 def with_ring(center, radius, noise=0.004, height=80, width=100):

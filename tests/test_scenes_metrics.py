@@ -6,9 +6,9 @@ import pytest
 import torch
 
 import torchvts as vts
+from lab import metrics
 from torchvts.core.geometry import normal_from_gradient
 from torchvts.core.noise import noise_std
-from torchvts.evaluation import metrics
 
 scenes = vts.scenes
 SIZE = {"height": 241, "width": 321, "mm_per_pixel": 0.125, "dtype": torch.float64}

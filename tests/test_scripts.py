@@ -117,7 +117,8 @@ def test_shadows_refuses_no_scenes(run_script):
 
 @pytest.mark.long
 def test_export_speed_times_files_beside_the_library(run_script):
-    done = run_script("export_speed", "--size", 64, 48, "--modes", "fast", "--formats", "torchscript", "--calls", 2, "--threads", 1)
+    files = ["--size", 64, 48, "--modes", "fast", "--formats", "torchscript", "--drawn"]
+    done = run_script("speed", "--only", "export", *files, "--calls", 2, "--threads", 1)
     assert done.returncode == 0, done.stderr
     header, _, row = done.stdout.splitlines()[1:]
     assert header == "| mode | library | torchscript |"

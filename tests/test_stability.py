@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchvts.evaluation import stability
-from torchvts.evaluation.gallery import CORRUPTIONS, undisturbed
-from torchvts.evaluation.methods import METHODS, Method
-from torchvts.evaluation.rows import Row
-from torchvts.evaluation.stability import MASK, SWEPT, Breaking
+from lab import stability
+from lab.gallery import CORRUPTIONS, undisturbed
+from lab.methods import METHODS, Method
+from lab.rows import Row
+from lab.stability import MASK, SWEPT, Breaking
 
 ROOT = Path(__file__).resolve().parents[1]
 POINTS, SEEDS = stability.points_from_json((ROOT / "tests" / "breaking_points.json").read_text())

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 import torchvts as vts
+from lab import pose_accuracy, tracking
 from torchvts.accelerated import library, reference_only
 from torchvts.cli.track import record
 from torchvts.core.frame import DepthOutput
-from torchvts.evaluation import pose_accuracy, tracking
 from torchvts.pose import tracker as tracker_module
 from torchvts.pose.follow import _follow_best, _follow_from, _pixels, adjoint, follow, orthonormal
 from torchvts.pose.graph import Edge, KeyframeGraph

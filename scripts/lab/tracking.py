@@ -12,18 +12,19 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from ..core.geometry import gradient_of_depth, normal_from_gradient
-from ..integration import poisson_dst
-from ..model import PointLights
-from ..pipeline import DepthOutput, DepthPipeline
-from ..pose import PoseTracker, Registration, register_depth
-from ..pose.result import invert, turn_deg
-from ..scenes import objects, render
-from ..skin import ZeroBackground
-from ..viz import new_figure
+from torchvts.core.geometry import gradient_of_depth, normal_from_gradient
+from torchvts.core.tables import markdown
+from torchvts.integration import poisson_dst
+from torchvts.model import PointLights
+from torchvts.pipeline import DepthOutput, DepthPipeline
+from torchvts.pose import PoseTracker, Registration, register_depth
+from torchvts.pose.result import invert, turn_deg
+from torchvts.scenes import objects, render
+from torchvts.skin import ZeroBackground
+from torchvts.viz import new_figure
+
 from .faults import gaussian_blur
 from .pose_accuracy import GOAL_DEG, GOAL_MM, rig
-from .rows import markdown
 
 Array = np.ndarray[Any, Any]
 
@@ -195,7 +196,7 @@ def record(target: objects.Target, motion: Motion, image_std: float, seed: int, 
         motion: its motion.
         image_std: standard deviation of the images' noise.
         seed: of motion and noise.
-        unit: lights and pipeline, as of :func:`torchvts.evaluation.pose_accuracy.rig`.
+        unit: lights and pipeline, as of :func:`lab.pose_accuracy.rig`.
     """
     lights, pipe = unit
     poses = [motion.pose(k, seed) for k in range(motion.frames)]

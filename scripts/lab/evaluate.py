@@ -16,12 +16,14 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from ..core.checks import check_integer
-from ..pipeline import DepthOutput
+from torchvts.core.checks import check_integer
+from torchvts.core.tables import number
+from torchvts.pipeline import DepthOutput
+from torchvts.training.presses import Training
+
 from . import rows as records
 from .methods import METHODS, Built, Method, network
-from .presses import Training
-from .rows import Column, Row, error_column, mean, median, number
+from .rows import Column, Row, error_column, mean, median
 from .score import PressScore, score_press, score_surface
 from .sets import DRAWN, DataSet, Fold, Target, load
 
@@ -65,7 +67,7 @@ def evaluate(data: DataSet, methods: Sequence[str] = (), *, seed: int = 0, bar: 
         ValueError: an unknown method.
     Example:
         >>> from .sets import DataSet, Fold, Target
-        >>> from ..model import Sensor
+        >>> from torchvts.model import Sensor
         >>> from .score import undeformed_truth
         >>> target = Target("nothing", torch.full((3, 48, 64), 0.4), undeformed_truth(48, 64))
         >>> data = DataSet("example", target.image, [Fold(Sensor("rig", 48, 64, 0.5), (), [target])], "")
@@ -102,7 +104,7 @@ def evaluate_all(
     """Score methods on several sets; a set that cannot be read is one row with the reason.
 
     Args:
-        names: names out of :data:`torchvts.evaluation.sets.SETS`.
+        names: names out of :data:`lab.sets.SETS`.
         folder: folder of the real sets.
         methods: names out of :data:`COMPARED`; empty for :data:`IN_TABLE`.
         limit: use only so many presses of each ball.

@@ -12,15 +12,16 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..accelerated import AdaptiveIntegration, Compensate, NormalFromIntensity, PerspectiveIntegration, reference_only
-from ..calibration import RESPONSE_BLUR_PX, with_preprocessing
-from ..integration import PoissonDST
-from ..model import Calibration, ResponseModel, Sensor
-from ..normals import NormalFromLookup, NormalFromMLP
-from ..pipeline import DepthOutput, DepthPipeline
-from ..scenes import render, sphere_press
+from torchvts.accelerated import AdaptiveIntegration, Compensate, NormalFromIntensity, PerspectiveIntegration, reference_only
+from torchvts.calibration import RESPONSE_BLUR_PX, with_preprocessing
+from torchvts.integration import PoissonDST
+from torchvts.model import Calibration, ResponseModel, Sensor
+from torchvts.normals import NormalFromLookup, NormalFromMLP
+from torchvts.pipeline import DepthOutput, DepthPipeline
+from torchvts.scenes import render, sphere_press
+from torchvts.training.presses import Training, quiet_calibrate, train_network, training_pixels
+
 from .peers import GsSdkPipeline, PoissonSciPy, as_output
-from .presses import Training, quiet_calibrate, train_network, training_pixels
 
 GIVEN_NETWORK = "given network"
 """Name of a network that was trained before."""

@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..core.files import make_folder, write_atomically
+from torchvts.core.files import make_folder, write_atomically
+from torchvts.core.tables import markdown, number
 
 
 @dataclass(frozen=True)
@@ -35,18 +36,24 @@ class Time:
     Attributes:
         ms_median: median time, ms.
         ms_iqr: interquartile range of the time, ms.
-        frames_per_second: by the median.
-        memory_mb: largest memory that one call holds beside its inputs, MB.
-        threads: number of threads.
+        ms_p90: 90th percentile, ms.
+        ms_p99: 99th, ms; None for fewer than 500 calls.
+        calls: number of calls that were timed.
+        memory_mb: largest memory that one call holds beside its inputs, MB; None if it was not measured.
+        threads: number of threads that torch may use.
         machine: kind of processor, number of cores, version of torch.
+        pace: what came before each call.
     """
 
     ms_median: float
     ms_iqr: float
-    frames_per_second: float
+    ms_p90: float
+    ms_p99: float | None
+    calls: int
     memory_mb: float | None
     threads: int
     machine: str
+    pace: str
 
 
 @dataclass(frozen=True)
@@ -55,7 +62,8 @@ class Row:
 
     Attributes:
         kind: what was measured: "scene" (exact truth), "sensor" (balls on a real sensor), "corruption" (a scene of the gallery),
-            "presses" (balls, objects) or "coverage" (of bounds of confidence; ``method`` is the shape that was pressed in).
+            "presses" (balls, objects), "coverage" (of bounds of confidence; ``method`` is the shape that was pressed in), "frame"
+            (as a user runs it) or "cost" (what is paid once).
         method: its name.
         data: name of the scene, the corruption or the presses.
         errors: value by name, such as "normal_deg"; None where nothing could be measured.
@@ -98,11 +106,6 @@ class Column(NamedTuple):
     cell: Callable[[Row], str]
 
 
-def number(value: float | None, digits: int) -> str:
-    """A value with so many digits after the point; empty for None."""
-    return "" if value is None else f"{value:.{digits}f}"
-
-
 def error_column(title: str, name: str, digits: int) -> Column:
     """Column of one of a row's errors."""
     return Column(title, lambda row: number(row.error(name), digits))
@@ -111,19 +114,6 @@ def error_column(title: str, name: str, digits: int) -> Column:
 def table(rows: Iterable[Row], columns: Sequence[Column]) -> str:
     """Rows as a Markdown table."""
     return markdown([column.title for column in columns], [[column.cell(row) for column in columns] for row in rows])
-
-
-def markdown(titles: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    """A Markdown table of texts.
-
-    Example:
-        >>> print(markdown(["method", "ms"], [["fast", "2.0"]]))
-        | method | ms |
-        |---|---|
-        | fast | 2.0 |
-    """
-    head = ["| " + " | ".join(titles) + " |", "|" + "---|" * len(titles)]
-    return "\n".join(head + ["| " + " | ".join(cells) + " |" for cells in lines])
 
 
 def to_csv(rows: Sequence[Row]) -> str:

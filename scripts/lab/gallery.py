@@ -13,11 +13,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..core.geometry import pixel_grid_mm
-from ..model.calibration import Calibration
-from ..model.lights import PointLights
-from ..model.sensor import Sensor
-from ..scenes import Scene, skin_spots, smooth_step, surface, surface_at, undeformed
+from torchvts.core.geometry import pixel_grid_mm
+from torchvts.model.calibration import Calibration
+from torchvts.model.lights import PointLights
+from torchvts.model.sensor import Sensor
+from torchvts.scenes import Scene, skin_spots, smooth_step, surface, surface_at, undeformed
+
 from .faults import Conditions, photograph
 
 HEIGHT, WIDTH, MM_PER_PIXEL = 120, 160, 0.125

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..core.blur import blur, gaussian_weights
-from ..core.checks import check_field, check_shape
+from torchvts.core.blur import blur, gaussian_weights
+from torchvts.core.checks import check_field, check_shape
 
 THIN_PX, WIDE_PX = 1.2, 3.0
 """Gaussians whose difference shows a bright line of 2 to 4 pixels."""

@@ -8,10 +8,10 @@ import kornia
 import torch
 from torch import Tensor, nn
 
-from ..core.files import rgb_from_bgr
-from ..core.geometry import lengths, pixel_grid_mm
-from ..model.lights import PointLights, cast_shadows, seen_at
-from ..scenes import Scene
+from torchvts.core.files import rgb_from_bgr
+from torchvts.core.geometry import lengths, pixel_grid_mm
+from torchvts.model.lights import PointLights, cast_shadows, seen_at
+from torchvts.scenes import Scene
 
 SHININESS = 30.0
 """Exponent of the specular lobe, which has half its height 12 degrees from the mirror direction."""

@@ -8,19 +8,20 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from ..calibration import Press
-from ..core.geometry import normal_from_gradient
-from ..model import Sensor
-from ..pipeline import ConfidentOutput, ConfidentPipeline, bound_at
-from ..pipeline.confidence import DEPTH_SPREAD, RESPONSE_SPREAD
-from ..scenes import objects as solids
+from torchvts.calibration import Press
+from torchvts.core.geometry import normal_from_gradient
+from torchvts.model import Sensor
+from torchvts.pipeline import ConfidentOutput, ConfidentPipeline, bound_at
+from torchvts.pipeline.confidence import DEPTH_SPREAD, RESPONSE_SPREAD
+from torchvts.scenes import objects as solids
+from torchvts.training.balls import Truth, ball_truth
+from torchvts.training.presses import Training
+
 from . import rows as records
 from .drawn_sensors import DrawnPress, drawn_sensor
 from .metrics import normal_angle_deg
-from .presses import Training
 from .random_scenes import random_frame
 from .rows import Column, Row, error_column
-from .score import Truth, ball_truth
 from .sets import Fold, Target, from_folder, load, truth_of
 
 LEVELS = (0.5, 0.68, 0.8, 0.9, 0.95)

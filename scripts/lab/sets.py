@@ -17,21 +17,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..accelerated import Compensate, GradientFromNormal
-from ..calibration import RESPONSE_BLUR_PX, Press, fit_prior, read_presses
-from ..core.checks import check_image, check_integer
-from ..core.files import read_image, rgb_from_bgr
-from ..integration import poisson_dct
-from ..model import Calibration, Sensor
-from ..normals import NormalFromMLP
-from ..pipeline import DepthPipeline
-from ..scenes import Scene
-from ..skin import ZeroBackground
-from ..stream.sources import open_source
+from torchvts.accelerated import Compensate, GradientFromNormal
+from torchvts.calibration import RESPONSE_BLUR_PX, Press, fit_prior, read_presses
+from torchvts.core.checks import check_image, check_integer
+from torchvts.core.files import read_image, rgb_from_bgr
+from torchvts.integration import poisson_dct
+from torchvts.model import Calibration, Sensor
+from torchvts.normals import NormalFromMLP
+from torchvts.pipeline import DepthPipeline
+from torchvts.scenes import Scene
+from torchvts.skin import ZeroBackground
+from torchvts.stream.sources import open_source
+from torchvts.training.balls import Truth, ball_truth
+from torchvts.training.presses import with_centers
+
 from .drawn_sensors import SEEDS, drawn_sensor
 from .methods import Method, shipped_prior, with_network
-from .presses import with_centers
-from .score import Truth, ball_truth, undeformed_truth
+from .score import undeformed_truth
 
 CHANGED = 15.0 / 255.0
 """A pixel of gelsight_mini_b is scored where a channel has changed by more than this."""
@@ -329,9 +331,9 @@ SETS = (*REAL, *DRAWN)
 """Names of all sets."""
 
 
-def data_folder(script: str) -> Path:
-    """Folder of third-party images: TORCHVTS_DATA, else ../shared/data beside the checkout that holds a script."""
-    return Path(os.environ.get("TORCHVTS_DATA", Path(script).resolve().parents[2] / "shared" / "data"))
+def data_folder() -> Path:
+    """Folder of third-party images: TORCHVTS_DATA, else ../shared/data beside this checkout."""
+    return Path(os.environ.get("TORCHVTS_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 
 
 def load(name: str, data: Path, limit: int | None = None) -> DataSet:

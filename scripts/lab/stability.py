@@ -15,12 +15,14 @@ from typing import Any, Literal
 
 import torch
 
-from ..core import __version__
-from ..core.files import write_atomically
+from torchvts.core import __version__
+from torchvts.core.files import write_atomically
+from torchvts.core.tables import markdown
+
 from .gallery import CORRUPTIONS, Case, Corruption
 from .methods import METHODS
 from .metrics import depth_error, mask_iou, normal_angle_deg
-from .rows import Row, markdown, row_from_dict
+from .rows import Row, row_from_dict
 
 SWEPT = (
     "flat", "fast", "precise", "auto", "fast, zero border", "precise, plain inverse", "precise, blur 1 px",
@@ -111,7 +113,7 @@ def measure(method: str, corruption: str, severity: float, seed: int, case: Case
     between normals), "rms_um" and "largest_px" (depth), "iou" (mask), "press_um" (true depth of the press).
 
     Example:
-        >>> from torchvts.evaluation.gallery import undisturbed
+        >>> from lab.gallery import undisturbed
         >>> round(measure("fast", "noise", 0.002, 0, undisturbed()).error("normal_deg"), 1)
         0.6
     """

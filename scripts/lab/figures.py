@@ -14,9 +14,11 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from PIL import Image
 from torch import Tensor
 
-from ..core.files import write_atomically
-from ..pipeline import ConfidentPipeline
-from ..viz import depth_colors, depth_range, draw_bar, draw_contours, draw_outline, draw_surface, new_figure
+from torchvts.core.files import write_atomically
+from torchvts.pipeline import ConfidentPipeline
+from torchvts.training.balls import Truth
+from torchvts.viz import depth_colors, depth_range, draw_bar, draw_contours, draw_outline, draw_surface, new_figure
+
 from .coverage import LEVELS
 from .evaluate import Evaluation
 from .gallery import CORRUPTIONS, Corruption
@@ -24,7 +26,6 @@ from .methods import MASK_STYLE, METHODS
 from .metrics import normal_angle_deg
 from .random_scenes import random_frame
 from .rows import Row, Size, mean
-from .score import Truth
 from .speed import front, ms
 from .stability import DEPTH_LIMIT, MASK, MASK_LIMIT, NORMAL_LIMIT_DEG, Breaking, depth_share, in_words
 
@@ -80,7 +81,7 @@ def speed_figure(rows: Sequence[Row]) -> Figure:
     handles = {label: handle for panel in panels for handle, label in zip(*panel.axes.get_legend_handles_labels())}
     figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=len(handles), frameon=False, fontsize=9)
     time = rows[0].time
-    figure.suptitle(f"{time.machine}, {time.threads} threads, one frame" if time else "", fontsize=9)
+    figure.suptitle(f"{time.machine}, one frame" if time else "", fontsize=9)
     figure.draw_without_rendering()  # sets the places of the panels
     for panel in panels:
         _name_points(panel)

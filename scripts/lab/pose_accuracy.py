@@ -10,13 +10,13 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ..calibration import Press, calibrate
-from ..model import Calibration, PointLights, Sensor
-from ..pipeline import DepthOutput, DepthPipeline
-from ..pose import Registration, register_depth
-from ..pose.result import invert, turn_deg
-from ..scenes import objects, render
-from .rows import markdown
+from torchvts.calibration import Press, calibrate
+from torchvts.core.tables import markdown
+from torchvts.model import Calibration, PointLights, Sensor
+from torchvts.pipeline import DepthOutput, DepthPipeline
+from torchvts.pose import Registration, register_depth
+from torchvts.pose.result import invert, turn_deg
+from torchvts.scenes import objects, render
 
 GOAL_DEG, GOAL_MM = 1.0, 0.15
 """A pose within both limits is a success."""

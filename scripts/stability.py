@@ -2,8 +2,7 @@
 
 python scripts/stability.py [--out out/stability] [--seeds 3] [--keep]
 
-Rows are written to OUT/rows.jsonl, and the same command continues an interrupted run. --keep also writes docs/failures, the lines
-with breaking points in docs/where_methods_fail.md, and tests/breaking_points.json.
+--keep also writes docs/failures, the lines with breaking points in docs/where_methods_fail.md, and tests/breaking_points.json.
 """
 
 from collections.abc import Sequence
@@ -37,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.out.mkdir(parents=True, exist_ok=True)
     total = len(SWEPT) * arguments.seeds * sum(len(CORRUPTIONS[name].severities) for name in arguments.only)
     with tqdm(total=total, unit="row", disable=None) as bar:
-        rows = stability.sweep(arguments.out / "rows.jsonl", SWEPT, arguments.only, arguments.seeds, arguments.workers, bar.update)
+        rows = stability.sweep(SWEPT, arguments.only, arguments.seeds, arguments.workers, bar.update)
     points = stability.breaking_points(rows)
     print(write_tables(points, arguments.seeds, arguments.out, arguments.keep))
     pictures = ROOT / "docs" / "failures" if arguments.keep else arguments.out

@@ -35,6 +35,7 @@ def depth_error(depth_mm: Tensor, truth_mm: Tensor, mm_per_pixel: float, region:
     Raises:
         ValueError: shapes differ, or the region is empty.
     Example:
+        >>> import torch
         >>> depth_error(torch.full((1, 1, 4, 4), 0.5), torch.zeros(1, 1, 4, 4), 0.25).max_px
         2.0
     """

@@ -1,4 +1,4 @@
-"""Score methods on presses of balls, never on those they learned from: tables (Markdown, CSV, LaTeX), JSON, pictures.
+"""Score methods on presses of balls, never on those they learned from: a table, its figures as JSON, pictures.
 
 FOLDER has gs_sdk's layout (catalog.csv, background.png, N/gelsight.png); true centers and contact radii come from label.npz or
 labels.csv, otherwise from calibration. --all scores the drawn sensors and the real ones in ../shared/data or TORCHVTS_DATA.
@@ -31,7 +31,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--methods", nargs="+", default=[], choices=ev.COMPARED, metavar="METHOD", help=f"of {names}")
     parser.add_argument("--limit", type=int, metavar="N", help="at most so many presses (of each ball of --sets)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the network that is trained")
-    parser.add_argument("--out", type=Path, default=Path("out/accuracy"), help="for tables, scores.json and pictures")
+    parser.add_argument("--out", type=Path, default=Path("out/accuracy"), help="for table.md, scores.json and pictures")
     own = parser.add_argument_group("of a folder")
     own.add_argument("--sensor", default="gelsight_mini", metavar="NAME", help="YAML file or shipped name")
     own.add_argument("--folds", type=int, default=5, metavar="N", help="cross-validation; 1 scores what was learned from")
@@ -55,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for evaluation in done:
         if any(name != "flat" for name in evaluation.outputs):
             viz.save_figure(set_figure(evaluation), arguments.out / f"{evaluation.data.name}.png")
-    print(f"{time.perf_counter() - start:.0f} s; tables, scores.json and pictures in {arguments.out}")
+    print(f"{time.perf_counter() - start:.0f} s; table.md, scores.json and pictures in {arguments.out}")
     return 0
 
 

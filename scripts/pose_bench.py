@@ -13,9 +13,10 @@ from tqdm import tqdm
 
 import torchvts as vts
 from lab.commands import main_of, parser_of
-from lab.pose_accuracy import PoseCase, ball_pairs, machine, pose_table, run_poses
+from lab.pose_accuracy import PoseCase, ball_pairs, pose_table, run_poses
 from lab.rows import write_files
 from torchvts import viz
+from torchvts.cli.bench import machine
 from torchvts.pose import Registration, contact_cloud
 from torchvts.scenes import objects
 

@@ -5,7 +5,6 @@ Ji, Liu, Ma: Model-Based 3D Contact Geometry Perception for Visual Tactile Senso
     python scripts/reproduce_paper.py [--out out/paper] [--lights 31.25 39.375]
 """
 
-import math
 import statistics
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ from tqdm import tqdm
 import torchvts as vts
 from lab import methods, metrics, pose_accuracy
 from lab.commands import main_of, parser_of
+from lab.faults import ring_lights
 from lab.sets import data_folder
 from torchvts import scenes, viz
 from torchvts.core.tables import markdown
@@ -31,14 +31,6 @@ TACTO = {  # largest error of the paper in px; centre and radius that it found, 
     "cylinder_R4_d1": ("", "", ""),
     "cube_edge_d1": ("", "", ""),
 }
-
-
-def ring(radius_mm: float, height_mm: float, turn_deg: float = 10.0, brightness: float = 0.45) -> vts.PointLights:
-    """Three lights 120 degrees apart that give ``brightness`` at the image centre."""
-    angles = [math.radians(turn_deg + 120.0 * k) for k in range(3)]
-    distance = math.hypot(radius_mm, height_mm)
-    position = [[radius_mm * math.cos(a), radius_mm * math.sin(a), height_mm] for a in angles]
-    return vts.PointLights(position, [brightness * distance**3 / height_mm] * 3)
 
 
 def figure_3(lights: vts.PointLights, out: Path) -> list[str]:
@@ -143,7 +135,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     lines = [
         "Figure 3: exact lights known, 640 x 480, depth error over the whole image",
         "",
-        *figure_3(ring(*arguments.lights), arguments.out),
+        *figure_3(ring_lights(*arguments.lights), arguments.out),
     ]
     tacto = arguments.data / "tacto"
     lines += ["", "Figure 4: TACTO renders, calibrated from the one background image, precise", ""]

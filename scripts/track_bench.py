@@ -1,4 +1,4 @@
-"""Tracking bench: objects that move, rendered and measured, tracked against their first frame; table, JSON, plot of error and time.
+"""Tracking bench: objects that move, rendered and measured, tracked against their first frame; table and JSON.
 
 python scripts/track_bench.py --out out/track_bench
 python scripts/track_bench.py --motions slow --noises "slopes off by 3 degrees" --seeds 1 4 11 --sensors 1 2 3 --out out/wrong
@@ -19,9 +19,8 @@ from tqdm import tqdm
 
 from lab import tracking
 from lab.commands import main_of, parser_of
-from lab.pose_accuracy import machine
 from lab.rows import write_files
-from torchvts import viz
+from torchvts.cli.bench import machine
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -31,7 +30,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--noises", nargs="+", default=list(tracking.NOISES), choices=list(tracking.NOISES))
     parser.add_argument("--seeds", nargs="+", type=int, default=[1], help="of motions and noise of the images")
     parser.add_argument("--sensors", nargs="+", type=int, default=[1], help="seeds of errors of slopes, from 1")
-    parser.add_argument("--register", action="store_true", help="register each frame without tracking too, and draw error and time")
     parser.add_argument(
         "--normalflow", type=Path, metavar="FOLDER", help="a checkout of NormalFlow, to track the same frames by it"
     )
@@ -41,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     torch.set_num_threads(arguments.threads)
     normalflow = None if arguments.normalflow is None else load_normalflow(arguments.normalflow)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    rows, beside = [], []
+    rows = []
     chosen = (arguments.objects, arguments.motions, arguments.noises, arguments.seeds, arguments.sensors)
     with tqdm(unit="track", disable=None) as bar:
         for row, track in tracking.run_tracking(*chosen):
@@ -49,15 +47,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             if normalflow is not None:
                 peer = tracking.TrackRow(f"{row.name}, NormalFlow", row.motion, row.noise, seed=row.seed, sensor=row.sensor)
                 rows.append(tracking.follow_by_normalflow(track, normalflow, peer))
-            if arguments.register and row.motion == "slow" and row.noise == "noise 0.005":
-                beside.append((row, tracking.register_each(track)))
             bar.update()
     text = (
         f"320 x 240, 8 bits, seeds {arguments.seeds}, sensors {arguments.sensors}; {machine()}\n\n{tracking.tracking_table(rows)}\n"
     )
     write_files(arguments.out, {"table.md": text, "tracks.json": json.dumps([dataclasses.asdict(row) for row in rows], indent=1)})
-    if beside:
-        viz.save_figure(tracking.tracking_figure(beside), arguments.out / "tracking.png")
     print(text)
     return 0
 

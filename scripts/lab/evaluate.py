@@ -259,7 +259,7 @@ def means_of_drawn(rows: Sequence[Row]) -> list[Row]:
 
 
 def write_tables(evaluations: Sequence[Evaluation], out: Path, command: str) -> str:
-    """Write table.md, table.csv, table.tex and scores.json; returns the Markdown."""
+    """Write table.md and scores.json; returns the Markdown."""
     rows = [dataclasses.replace(row, command=command) for evaluation in evaluations for row in evaluation.rows]
     rows += means_of_drawn(rows)
     text = "\n".join(
@@ -267,18 +267,11 @@ def write_tables(evaluations: Sequence[Evaluation], out: Path, command: str) -> 
         + [f"* {e.data.name}: {shorten(e.data.how, 300, placeholder=' ...')}" for e in evaluations if e.data.how]
         + ["", "means over frames; medians of the radius of the sphere fitted to depth, of the contact and of the lowest depth"]
     )
-    cells = [[column.cell(row) for column in COLUMNS[:-1]] for row in rows]
     document = {
         "command": command,
         "how": {e.data.name: e.data.how for e in evaluations},
         "rows": [dataclasses.asdict(row) for row in rows],
         "scores": [dataclasses.asdict(score) | {"data": e.data.name} for e in evaluations for score in e.scores],
     }
-    files = {
-        "table.md": f"{text}\n\n`{command}`\n",
-        "table.csv": records.to_csv(rows),
-        "table.tex": records.latex([column.title for column in COLUMNS[:-1]], cells) + "\n",
-        "scores.json": json.dumps(document, indent=1) + "\n",
-    }
-    records.write_files(out, files)
+    records.write_files(out, {"table.md": f"{text}\n\n`{command}`\n", "scores.json": json.dumps(document, indent=1) + "\n"})
     return text

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchvts.core.files import write_atomically
 from torchvts.pipeline import ConfidentPipeline
 from torchvts.training.balls import Truth
-from torchvts.viz import depth_colors, depth_range, draw_bar, draw_contours, draw_outline, draw_surface, new_figure
+from torchvts.viz import depth_colors, depth_range, draw_bar, draw_contours, draw_outline, new_figure
 
 from .coverage import LEVELS
 from .evaluate import Evaluation
@@ -331,58 +331,28 @@ def overview_figure(points: Sequence[Breaking]) -> Figure:
 
 
 def set_figure(evaluation: Evaluation) -> Figure:
-    """The shown frame by several methods, a row each: depth contours with the contact, the shaded surface, the error of relief.
-
-    All methods that have a result are drawn, but zero depth.
-    """
+    """The shown frame by each method but zero depth, a column each: depth with the contact, and the error of relief."""
     shown, pitch = evaluation.shown, evaluation.data.folds[0].sensor.mm_per_pixel
-    chosen = [name for name in evaluation.outputs if name != "flat"]
-    if shown is None or not chosen:
+    depths = {name: out.depth_mm[0, 0].double().numpy() for name, out in evaluation.outputs.items() if name != "flat"}
+    if shown is None or not depths:
         raise ValueError("evaluation: expected results of a method on a frame, got none: every method failed")
-    figure = new_figure(12.0, 3.0 * len(chosen) + 0.3, 100)
-    figure.set_layout_engine("constrained", w_pad=0.2, wspace=0.08, rect=(0.0, 0.0, 0.98, 1.0))  # room for the colour bars
-    errors = {name: _relief_error(evaluation.outputs[name].depth_mm, shown.truth) for name in chosen}
-    most = _shared([float(error.nan_to_num().abs().quantile(0.998)) for error in errors.values()]) or 1.0
-    depths = {name: evaluation.outputs[name].depth_mm[0, 0].double().numpy() for name in chosen}
-    limit = _shared([float(np.abs(depth).max()) for depth in depths.values()])
+    figure = new_figure(4.2 * len(depths), 6.4, 100)
+    panels = figure.subplots(2, len(depths), squeeze=False)
+    limit = 4.0 * statistics.median_low([float(np.abs(depth).max()) for depth in depths.values()])  # a method that fails is cut off
     span = depth_range(*(depth for depth in depths.values() if np.abs(depth).max() <= limit))
-    for k, (name, depth) in enumerate(depths.items()):
-        contours, panel = (figure.add_subplot(len(chosen), 3, 3 * k + column) for column in (1, 3))
-        draw_contours(figure, contours, depth, pitch, range_mm=span)
+    for (upper, lower), (name, depth) in zip(panels.T, depths.items()):
+        draw_contours(figure, upper, depth, pitch, range_mm=span)
         for mask, style in ((evaluation.outputs[name].contact, "-"), (shown.truth.contact if shown.truth else None, ":")):
             if mask is not None and bool(mask.any()) and not bool(mask.all()):
-                draw_outline(contours, mask[0, 0].double().numpy(), pitch, "#e69f00", style)
-        contours.set_title(f"{name}: {contours.get_title()}", fontsize=9)
-        surface = figure.add_subplot(len(chosen), 3, 3 * k + 2, projection="3d")
-        draw_surface(surface, depth, pitch, range_mm=span)
-        _draw_error(panel, errors[name], most, contours.get_images()[0].get_extent())
-    title = f"{evaluation.data.name}, {shown.name}; contact in orange, the true one dotted; what exceeds the colours is cut off"
-    figure.suptitle(title, fontsize=11)
+                draw_outline(upper, mask[0, 0].double().numpy(), pitch, "#e69f00", style)
+        upper.set_title(f"{name}: {upper.get_title()}", fontsize=9)
+        error = _relief_error(evaluation.outputs[name].depth_mm, shown.truth)
+        most = float(error.nan_to_num().abs().quantile(0.998)) or 1.0
+        colors, norm = depth_colors(-most, most)
+        draw_bar(figure, lower, lower.imshow(error.numpy(), cmap=colors, norm=norm), "um")
+        lower.set_title(f"error of relief, RMS {float(error.square().nanmean().sqrt()):.1f} um", fontsize=9)
+    figure.suptitle(f"{evaluation.data.name}, {shown.name}; contact in orange, the true one dotted", fontsize=11)
     return figure
-
-
-def _shared(largest: list[float]) -> float:
-    """The largest value that methods share a range with: four times their lower median. One that fails by more is cut off there."""
-    limit = 4.0 * statistics.median_low(largest)
-    return max(value for value in largest if value <= limit)
-
-
-def _draw_error(panel: Any, error: Tensor, most: float, extent: Sequence[float]) -> None:
-    """The error of relief in colour, cut to the pixels that are scored."""
-    known = ~error.isnan()
-    if not bool(known.any()):
-        panel.set_axis_off()
-        panel.text(0.5, 0.5, "no truth", ha="center")
-        return
-    colors, norm = depth_colors(-most, most)
-    draw_bar(panel.figure, panel, panel.imshow(error.numpy(), cmap=colors, norm=norm, extent=extent), "um")
-    (left, right, low, high), (rows, columns) = extent, error.shape
-    x = [left + (right - left) * float(k) / columns for k in known.any(0).nonzero()[[0, -1], 0]]
-    y = [high + (low - high) * float(k) / rows for k in known.any(1).nonzero()[[0, -1], 0]]
-    reach = 0.6 * max(x[1] - x[0], y[1] - y[0]) + 0.02 * (right - left)
-    panel.set(xlim=(sum(x) / 2 - reach, sum(x) / 2 + reach), ylim=(sum(y) / 2 + reach, sum(y) / 2 - reach))
-    panel.set(xlabel="x, mm", ylabel="y, mm (down)")
-    panel.set_title(f"error of relief, RMS {float(error.square().nanmean().sqrt()):.1f} um", fontsize=9)
 
 
 def _relief_error(depth_mm: Tensor, truth: Truth | None) -> Tensor:

@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import platform
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -17,6 +16,8 @@ from torchvts.pipeline import DepthOutput, DepthPipeline
 from torchvts.pose import Registration, register_depth
 from torchvts.pose.result import invert, turn_deg
 from torchvts.scenes import objects, render
+
+from .faults import ring_lights
 
 GOAL_DEG, GOAL_MM = 1.0, 0.15
 """A pose within both limits is a success."""
@@ -94,9 +95,7 @@ def rig(height: int = 240, width: int = 320, mm_per_pixel: float = 0.0625) -> tu
         width: columns of the image.
         mm_per_pixel: pixel pitch, mm.
     """
-    angles = [math.radians(10.0 + 120.0 * k) for k in range(3)]
-    position = [[31.0 * math.cos(a), 31.0 * math.sin(a), 40.0] for a in angles]
-    lights = PointLights(position, [0.45 * math.hypot(31.0, 40.0) ** 3 / 40.0] * 3).requires_grad_(False)
+    lights = ring_lights(31.0, 40.0)
     calibration = Calibration.from_lights(lights, Sensor("pose bench", height, width, mm_per_pixel))
     return lights, DepthPipeline.from_calibration(calibration, "precise")
 
@@ -235,11 +234,6 @@ def pose_table(rows: list[PoseRow]) -> str:
             errors[2] = f"{100 * row.within / row.poses:.0f} %"
         lines.append([row.name, str(row.poses), *errors, f"{_quantile(row.seconds, 0.5):.2f}"])
     return markdown(titles, lines)
-
-
-def machine() -> str:
-    """Processor, threads and version of torch."""
-    return f"{platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__}"
 
 
 def _quantile(values: list[float], share: float) -> float:

@@ -1,8 +1,6 @@
 """The one record of a measurement, a :class:`Row`: speed, stability and evaluation write it as Markdown and as JSON."""
 
-import csv
 import dataclasses
-import io
 import json
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -116,39 +114,6 @@ def table(rows: Iterable[Row], columns: Sequence[Column]) -> str:
     return markdown([column.title for column in columns], [[column.cell(row) for column in columns] for row in rows])
 
 
-def to_csv(rows: Sequence[Row]) -> str:
-    """Rows as comma-separated values: a column for each error that a row has."""
-    text = io.StringIO()
-    names = list(dict.fromkeys(name for row in rows for name in row.errors))
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["data", "method", *names, "parameters", "frames", "seen", "note"])
-    for row in rows:
-        errors = [row.error(name) for name in names]
-        table.writerow([row.data, row.method, *errors, row.parameters, row.frames, int(row.seen), row.note])
-    return text.getvalue()
-
-
-def latex(titles: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    r"""A LaTeX table of texts, for the package booktabs.
-
-    Example:
-        >>> print(latex(["method", "radius %"], [["fast", "2.0"]]))
-        \begin{tabular}{ll}
-        \toprule
-        method & radius \% \\
-        \midrule
-        fast & 2.0 \\
-        \bottomrule
-        \end{tabular}
-    """
-    special = str.maketrans(
-        {"\\": r"\textbackslash{}", **{c: "\\" + c for c in "%_&#${}"}, "<": r"\textless{}", ">": r"\textgreater{}"}
-    )
-    head, *body = [" & ".join(cell.translate(special) for cell in cells) + r" \\" for cells in (titles, *lines)]
-    rules = (rf"\begin{{tabular}}{{{'l' * len(titles)}}}", r"\toprule", head, r"\midrule", *body, r"\bottomrule", r"\end{tabular}")
-    return "\n".join(rules)
-
-
 def to_json(rows: Iterable[Row]) -> str:
     """Rows as a JSON list, one object each."""
     return json.dumps([dataclasses.asdict(row) for row in rows], indent=1)
@@ -156,13 +121,12 @@ def to_json(rows: Iterable[Row]) -> str:
 
 def from_json(text: str) -> list[Row]:
     """The rows that :func:`to_json` wrote."""
-    return [row_from_dict(values) for values in json.loads(text)]
 
+    def row(values: dict[str, Any]) -> Row:
+        size, time = values["size"], values["time"]
+        return Row(**(values | {"size": size and Size(**size), "time": time and Time(**time)}))
 
-def row_from_dict(values: dict[str, Any]) -> Row:
-    """The row whose ``dataclasses.asdict`` is given."""
-    size, time = values["size"], values["time"]
-    return Row(**(values | {"size": size and Size(**size), "time": time and Time(**time)}))
+    return [row(values) for values in json.loads(text)]
 
 
 def write_files(folder: Path, files: Mapping[str, str]) -> None:

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torchvts.calibration import Press
-from torchvts.core.checks import check_batch, check_same_size
 from torchvts.core.geometry import normal_from_gradient, pixel_grid_mm
 from torchvts.training.balls import RIM_PX, Truth, ball_truth, fit_sphere, label
 
@@ -89,7 +88,6 @@ def score_press(
         >>> round(score.normal_deg, 6), round(score.relief_um, 6), round(abs(score.radius_percent), 6)
         (0.0, 0.0, 0.0)
     """
-    _check_frame(depth_mm, normal)
     truth = ball_truth(press, depth_mm.shape[2], depth_mm.shape[3], mm_per_pixel)
     if int(truth.region.sum()) < 10:
         raise ValueError(
@@ -123,8 +121,6 @@ def score_surface(
         >>> round(score.lowest_mm, 3), score.relief_um, score.normal_deg
         (-0.1, 0.0, 0.0)
     """
-    _check_frame(depth_mm, normal)
-    check_same_size("truth", truth.depth_mm, "depth_mm", depth_mm.shape[2], depth_mm.shape[3])
     if not bool(truth.region.any()):
         raise ValueError(f"truth: expected at least one pixel to score, '{name}' has none: nothing touches")
     depth, region = depth_mm.detach().cpu().double(), truth.region[0, 0]
@@ -144,14 +140,6 @@ def score_surface(
         iou=None if compared is None else mask_iou(*compared),
         area_percent=None if compared is None or not bool(compared[1].any()) else _area_percent(*compared),
     )
-
-
-def _check_frame(depth_mm: Tensor, normal: Tensor) -> None:
-    for name, value, channels in (("depth_mm", depth_mm, 1), ("normal", normal, 3)):
-        check_batch(name, value, channels)
-        if value.shape[0] != 1:
-            raise ValueError(f"{name}: expected one frame, (1, {channels}, H, W), got {tuple(value.shape)}: loop over the batch")
-    check_same_size("normal", normal, "depth_mm", depth_mm.shape[2], depth_mm.shape[3])
 
 
 def _area_percent(contact: Tensor, truth: Tensor) -> float:

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchvts.core.geometry import gradient_of_depth, normal_from_gradient
@@ -17,11 +16,10 @@ from torchvts.core.tables import markdown
 from torchvts.integration import poisson_dst
 from torchvts.model import PointLights
 from torchvts.pipeline import DepthOutput, DepthPipeline
-from torchvts.pose import PoseTracker, Registration, register_depth
+from torchvts.pose import PoseTracker, Registration
 from torchvts.pose.result import invert, turn_deg
 from torchvts.scenes import objects, render
 from torchvts.skin import ZeroBackground
-from torchvts.viz import new_figure
 
 from .faults import gaussian_blur
 from .pose_accuracy import GOAL_DEG, GOAL_MM, rig
@@ -348,20 +346,6 @@ def run_tracking(
                 yield follow_track(track, MOTIONS[motion], TrackRow(name, motion, noise, seed=seed, sensor=sensor)), track
 
 
-def register_each(track: Track) -> tuple[list[float], list[float], list[float]]:
-    """Degrees, mm and ms of :func:`register_depth` on the same frames, each against the first."""
-    results = []
-    for k in range(1, len(track.frames)):
-        start = time.perf_counter()
-        try:
-            found = register_depth(track.frames[0], track.frames[k], track.mm_per_pixel)
-        except ValueError:  # no contact
-            continue
-        results.append((*tracking_error(found, track, k), 1000.0 * (time.perf_counter() - start)))
-    deg, mm, ms = zip(*results, strict=True)
-    return list(deg), list(mm), list(ms)
-
-
 class NormalFlow(NamedTuple):
     """NormalFlow's own code.
 
@@ -445,18 +429,3 @@ def _worst(tracks: Sequence[Sequence[float]], digits: int) -> str:
 
 def _median(values: Sequence[float]) -> float:
     return float(torch.tensor(values, dtype=torch.float64).median()) if values else math.nan
-
-
-def tracking_figure(beside: Sequence[tuple[TrackRow, tuple[list[float], list[float], list[float]]]]) -> Figure:
-    """Error against time: each object tracked, and registered frame by frame by :func:`register_each`."""
-    figure = new_figure(7.0, 4.6)
-    axes = figure.add_subplot()
-    markers = "os^DvP*X"
-    for (row, registered), marker in zip(beside, markers * len(beside)):
-        for colour, deg, ms in (("#1b6ca8", row.deg, row.ms), ("#d1495b", registered[0], registered[2])):
-            axes.scatter(_median(ms), _median(deg), c=colour, marker=marker, s=60, label=row.name if colour == "#1b6ca8" else None)
-    axes.set(xscale="log", yscale="log", xlabel="time of a frame, ms", ylabel="rotation error, degrees, median")
-    axes.set_title("blue: PoseTracker, red: register_depth, each frame against the first")
-    axes.grid(alpha=0.3, which="both")
-    axes.legend(fontsize=8)
-    return figure

@@ -11,12 +11,12 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from lab import figures, rows, stability
+from lab import failure_figures, figures, rows, stability
 from lab.commands import main_of, parser_of
 
 DRAW: dict[str, Callable[[str], Figure]] = {
     "speed": lambda text: figures.speed_figure(rows.from_json(text)),
-    "overview": lambda text: figures.overview_figure(stability.points_from_json(text)[0]),
+    "overview": lambda text: failure_figures.overview_figure(stability.points_from_json(text)[0]),
     "learning": lambda text: figures.learning_figure(rows.from_json(text)),
     "confidence": lambda text: figures.coverage_figure(rows.from_json(text)),
 }

@@ -13,7 +13,8 @@ from tqdm import tqdm
 
 from lab import stability
 from lab.commands import main_of, parser_of
-from lab.figures import corruption_figure, overview_figure, save_small
+from lab.failure_figures import corruption_figure, overview_figure
+from lab.figures import save_small
 from lab.gallery import CORRUPTIONS
 from lab.rows import write_files
 from lab.stability import SWEPT, Breaking

@@ -30,7 +30,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     names = ", ".join(f'"{name}"' for name in ev.COMPARED)
     parser.add_argument("--methods", nargs="+", default=[], choices=ev.COMPARED, metavar="METHOD", help=f"of {names}")
     parser.add_argument("--limit", type=int, metavar="N", help="at most so many presses (of each ball of --sets)")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the network that is trained")
     parser.add_argument("--out", type=Path, default=Path("out/accuracy"), help="for table.md, scores.json and pictures")
     own = parser.add_argument_group("of a folder")
     own.add_argument("--sensor", default="gelsight_mini", metavar="NAME", help="YAML file or shipped name")
@@ -42,15 +41,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.folder is None and arguments.network is not None:
         parser.error("--network: expected FOLDER beside it, the presses of the network's unit")
     start = time.perf_counter()
-    methods, limit, seed = arguments.methods, arguments.limit, arguments.seed
+    methods, limit = arguments.methods, arguments.limit
     if arguments.folder is None:
         names = sets.SETS if arguments.all else arguments.sets
-        done = ev.evaluate_all(names, sets.data_folder(), methods, limit=limit, seed=seed, progress=True)
+        done = ev.evaluate_all(names, sets.data_folder(), methods, limit=limit, progress=True)
     else:
         sensor = Sensor.load(arguments.sensor)
         data = sets.from_folder(arguments.folder, sensor, folds=arguments.folds, network=arguments.network, limit=limit)
         with tqdm(desc="evaluating", leave=False, disable=None) as bar:
-            done = [ev.evaluate(data, methods, seed=seed, bar=bar)]
+            done = [ev.evaluate(data, methods, bar=bar)]
     print(ev.write_tables(done, arguments.out, shlex.join(["python", "scripts/accuracy.py", *(argv or sys.argv[1:])])))
     for evaluation in done:
         if any(name != "flat" for name in evaluation.outputs):

@@ -31,7 +31,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--presses", type=Path, help="folder of ball presses in gs_sdk's layout, with labels")
     parser.add_argument("--sensor", default="gelsight_mini", help="sensor of the presses: YAML file or shipped name")
     parser.add_argument("--frames", type=int, default=100, help="random scenes of each kind of unit")
-    parser.add_argument("--seed", type=int, default=10000, help="seed of the first scene")
     parser.add_argument("--out", type=Path, default=Path("out/confidence.png"), help="the picture; its table beside it, .json")
     parser.add_argument("--units", nargs="+", choices=UNITS, default=UNITS, metavar="UNIT", help=", ".join(UNITS))
     parser.add_argument(
@@ -62,7 +61,7 @@ def measure(arguments: argparse.Namespace) -> str:
     for number, unit in enumerate(UNITS):
         if unit not in arguments.units:
             continue
-        first = arguments.seed + number * arguments.frames
+        first = 10000 + number * arguments.frames
         found = coverage.of_scenes(range(first, first + arguments.frames), unit, progress=True)
         rows += [coverage.mean(found, f"scenes, {unit}")] if found else []
         every += found

@@ -2,7 +2,7 @@
 
 Ji, Liu, Ma: Model-Based 3D Contact Geometry Perception for Visual Tactile Sensor, Sensors 2022, 22(17), 6470.
 
-    python scripts/reproduce_paper.py [--out out/paper] [--lights 31.25 39.375]
+    python scripts/reproduce_paper.py [--out out/paper]
 """
 
 import statistics
@@ -129,13 +129,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = parser_of(__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/paper"), help="folder for pictures and table.md")
     parser.add_argument("--data", type=Path, default=data_folder(), help="folder that holds tacto/ (default: TORCHVTS_DATA)")
-    parser.add_argument("--lights", type=float, nargs=2, default=(31.25, 39.375), metavar=("RADIUS_MM", "HEIGHT_MM"))
     arguments = parser.parse_args(argv)
     arguments.out.mkdir(parents=True, exist_ok=True)
     lines = [
         "Figure 3: exact lights known, 640 x 480, depth error over the whole image",
         "",
-        *figure_3(ring_lights(*arguments.lights), arguments.out),
+        *figure_3(ring_lights(31.25, 39.375), arguments.out),
     ]
     tacto = arguments.data / "tacto"
     lines += ["", "Figure 4: TACTO renders, calibrated from the one background image, precise", ""]

@@ -8,7 +8,6 @@ import dataclasses
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
@@ -16,13 +15,12 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from torchvts.core.checks import check_integer
 from torchvts.core.tables import number
 from torchvts.pipeline import DepthOutput
 from torchvts.training.presses import Training
 
 from . import rows as records
-from .methods import METHODS, Built, Method, network
+from .methods import METHODS, Built, Method
 from .rows import Column, Row, error_column, mean, median
 from .score import PressScore, score_press, score_surface
 from .sets import DRAWN, DataSet, Fold, Target, load
@@ -53,13 +51,12 @@ class Evaluation:
     outputs: dict[str, DepthOutput]
 
 
-def evaluate(data: DataSet, methods: Sequence[str] = (), *, seed: int = 0, bar: "tqdm[Any] | None" = None) -> Evaluation:
+def evaluate(data: DataSet, methods: Sequence[str] = (), *, bar: "tqdm[Any] | None" = None) -> Evaluation:
     """Score methods on a set.
 
     Args:
         data: the set.
         methods: names out of :data:`COMPARED`; empty for all that are possible. Methods of the set itself come last.
-        seed: seed of the network that is trained.
         bar: advanced by one for each fold and method.
     Returns:
         The scores. A method that fails has a row with the reason, and no errors.
@@ -76,7 +73,7 @@ def evaluate(data: DataSet, methods: Sequence[str] = (), *, seed: int = 0, bar: 
     """
     scored = [target for target in data.folds[0].scored if target.truth is not None] or data.folds[0].scored
     shown = scored[len(scored) // 2] if scored else None
-    of_methods = [_Record(method, data) for method in _choose(data, methods, seed)]
+    of_methods = [_Record(method, data) for method in _choose(data, methods)]
     outputs: dict[str, DepthOutput] = {}
     for fold in data.folds:
         training = Training(data.background, fold.learned, fold.sensor)
@@ -98,7 +95,6 @@ def evaluate_all(
     methods: Sequence[str] = (),
     *,
     limit: int | None = None,
-    seed: int = 0,
     progress: bool = False,
 ) -> list[Evaluation]:
     """Score methods on several sets; a set that cannot be read is one row with the reason.
@@ -108,7 +104,6 @@ def evaluate_all(
         folder: folder of the real sets.
         methods: names out of :data:`COMPARED`; empty for :data:`IN_TABLE`.
         limit: use only so many presses of each ball.
-        seed: seed of the networks that are trained.
         progress: show a bar.
     Raises:
         ValueError: an unknown method.
@@ -126,7 +121,7 @@ def evaluate_all(
                 fewer = 1 if data.refused else 2 if not data.folds[0].learned else len(IN_TABLE)
                 chosen = methods or IN_TABLE[:fewer]
                 bar.total = (bar.total or 0) + len(data.folds) * (len(chosen) + len(data.methods)) - 1
-                done.append(evaluate(data, chosen, seed=seed, bar=bar))
+                done.append(evaluate(data, chosen, bar=bar))
     return done
 
 
@@ -193,14 +188,13 @@ def _score(target: Target, out: DepthOutput, mm_per_pixel: float, method: str) -
     return score_surface(target.truth, out.depth_mm, out.normal, mm_per_pixel, target.name, method, out.contact)
 
 
-def _choose(data: DataSet, methods: Sequence[str], seed: int) -> list[Method]:
+def _choose(data: DataSet, methods: Sequence[str]) -> list[Method]:
     for name in methods:
         if name not in COMPARED:
             raise ValueError(f"methods: expected some of {', '.join(repr(m) for m in COMPARED)}, got {name!r}")
     prior = data.folds[0].sensor.prior is not None
     names = methods or [name for name in COMPARED if prior or not METHODS[name].needs_prior]
-    seeded = dataclasses.replace(METHODS["MLP"], from_presses=partial(network, seed=check_integer("seed", seed, 0)))
-    return [seeded if name == "MLP" else METHODS[name] for name in names] + list(data.methods)
+    return [METHODS[name] for name in names] + list(data.methods)
 
 
 def _reason(error: Exception) -> str:

@@ -224,10 +224,10 @@ def _cell(time: Time | None) -> str:
 # exported files
 
 
-def export_table(unit: Unit, modes: Sequence[str], formats: Sequence[str], calls: int) -> str:
+def export_table(unit: Unit, formats: Sequence[str], calls: int) -> str:
     """Median ms of a frame in the library and in exported files, in turn in one process."""
     lines = []
-    for mode in modes:
+    for mode in USED:
         pipe = DepthPipeline.from_calibration(unit.calibration, mode)
         with tempfile.TemporaryDirectory() as folder:
             frames: list[Callable[[Tensor], object]] = [pipe, *(_written(pipe, name, Path(folder)) for name in formats)]

@@ -205,9 +205,9 @@ def lookup_table(training: Training) -> Built:
     return pipeline(unit, "fast", block)._replace(parameters=block.table.numel(), used=len(training.located))
 
 
-def network(training: Training, seed: int = 0) -> Built:
+def network(training: Training) -> Built:
     """gs_sdk's RGBXY network, trained on these presses, and a frame in the steps of gs_sdk."""
-    fit = train_network(training.background, training.located, training.sensor, seed=seed)
+    fit = train_network(training.background, training.located, training.sensor)
     note = "" if fit.converged else "stopped before it converged"
     return _as_gs_sdk(fit.module, training, note)._replace(used=len(training.located))
 

@@ -73,6 +73,8 @@ def run(arguments: argparse.Namespace) -> int:
     if folds > len(presses):
         raise ValueError(f"--folds: expected at most the number of presses, {len(presses)}, got {folds}")
     labelled = sum(press.center_px is not None for press in presses)
+    if labelled < len(presses):
+        print(f"finding the centers of {len(presses) - labelled} presses that have no label", file=sys.stderr, flush=True)
     known = {press.name: press for press in with_centers(background, sensor, presses) if _scorable(press, sensor)}
     if not known:
         raise ValueError(f"folder: none of {len(presses)} presses has a contact that can be scored: label them, or press deeper")

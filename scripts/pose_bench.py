@@ -3,8 +3,6 @@
 python scripts/pose_bench.py --poses 100 --out out/pose_bench
 """
 
-import dataclasses
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,7 +12,7 @@ from tqdm import tqdm
 import torchvts as vts
 from lab.commands import main_of, parser_of
 from lab.pose_accuracy import PoseCase, ball_pairs, pose_table, run_poses
-from lab.rows import write_files
+from lab.rows import to_json, write_files
 from torchvts import viz
 from torchvts.cli.bench import machine
 from torchvts.pose import Registration, contact_cloud
@@ -56,11 +54,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         with tqdm(total=100, unit="pair", disable=None) as bar:
             counts = ball_pairs(background, presses, vts.Sensor.load(arguments.sensor), 100, bar.update)
         text += "\nreal presses of a ball: " + ", ".join(f"{name} {count}" for name, count in counts.items()) + "\n"
-    write_files(arguments.out, {"table.md": text, "poses.json": json.dumps([dataclasses.asdict(row) for row in rows], indent=1)})
+    write_files(arguments.out, {"table.md": text, "poses.json": to_json(rows)})
     print(text)
     for row in rows:
-        for note in row.notes[:5]:
-            print(f"{row.name}, {note}")
+        if row.note:
+            print(f"{row.data}, refused: {row.note}")
     return 0
 
 

@@ -6,7 +6,6 @@ python scripts/track_bench.py --motions slow --noises "slopes off by 3 degrees" 
 
 import dataclasses
 import importlib
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,7 +18,7 @@ from tqdm import tqdm
 
 from lab import tracking
 from lab.commands import main_of, parser_of
-from lab.rows import write_files
+from lab.rows import to_json, write_files
 from torchvts.cli.bench import machine
 
 
@@ -45,13 +44,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         for row, track in tracking.run_tracking(*chosen):
             rows.append(row)
             if normalflow is not None:
-                peer = tracking.TrackRow(f"{row.name}, NormalFlow", row.motion, row.noise, seed=row.seed, sensor=row.sensor)
+                peer = dataclasses.replace(row, method="NormalFlow", each={key: [] for key in tracking.EACH})
                 rows.append(tracking.follow_by_normalflow(track, normalflow, peer))
             bar.update()
     text = (
         f"320 x 240, 8 bits, seeds {arguments.seeds}, sensors {arguments.sensors}; {machine()}\n\n{tracking.tracking_table(rows)}\n"
     )
-    write_files(arguments.out, {"table.md": text, "tracks.json": json.dumps([dataclasses.asdict(row) for row in rows], indent=1)})
+    write_files(arguments.out, {"table.md": text, "tracks.json": to_json(rows)})
     print(text)
     return 0
 

@@ -61,7 +61,7 @@ class Row:
     Attributes:
         kind: what was measured: "scene" (exact truth), "sensor" (balls on a real sensor), "corruption" (a scene of the gallery),
             "presses" (balls, objects), "coverage" (of bounds of confidence; ``method`` is the shape that was pressed in), "frame"
-            (as a user runs it) or "cost" (what is paid once).
+            (as a user runs it), "cost" (what is paid once), "pose" or "track" (of objects).
         method: its name.
         data: name of the scene, the corruption or the presses.
         errors: value by name, such as "normal_deg"; None where nothing could be measured.
@@ -75,6 +75,7 @@ class Row:
         seen: whether the method has learned from the very frames that it is scored on.
         command: command that made the row.
         note: an error, a warning or a remark.
+        each: values of each frame by name, where not only their means are kept.
     """
 
     kind: str
@@ -91,6 +92,7 @@ class Row:
     seen: bool = False
     command: str = ""
     note: str = ""
+    each: dict[str, list[float]] = field(default_factory=dict)
 
     def error(self, name: str) -> float | None:
         """One error; None if it was not measured."""

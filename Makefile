@@ -39,7 +39,7 @@ check: setup
 	$(BIN)/lint-imports
 
 bench: setup
-	$(BIN)/torchvts bench --out out/bench
+	$(BIN)/python scripts/speed.py --out out/bench
 
 # The documentation as HTML in out/docs, from docs/ and the docstrings; a warning is an error.
 docs: setup

@@ -11,27 +11,26 @@ Random exact scenes of four kinds of units, and presses of balls that calibratio
 """
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 
 import torchvts as vts
-from torchvts.evaluation import coverage, sets
-from torchvts.evaluation.figures import coverage_figure
-from torchvts.evaluation.random_scenes import SHAPES, UNITS
-from torchvts.evaluation.rows import to_json, write_files
+from lab import coverage, sets
+from lab.commands import main_of, parser_of
+from lab.figures import coverage_figure
+from lab.random_scenes import SHAPES, UNITS
+from lab.rows import to_json, write_files
 from torchvts.pipeline import MODES
 from torchvts.viz import save_figure
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--presses", type=Path, help="folder of ball presses in gs_sdk's layout, with labels")
     parser.add_argument("--sensor", default="gelsight_mini", help="sensor of the presses: YAML file or shipped name")
     parser.add_argument("--frames", type=int, default=100, help="random scenes of each kind of unit")
-    parser.add_argument("--seed", type=int, default=10000, help="seed of the first scene")
     parser.add_argument("--out", type=Path, default=Path("out/confidence.png"), help="the picture; its table beside it, .json")
     parser.add_argument("--units", nargs="+", choices=UNITS, default=UNITS, metavar="UNIT", help=", ".join(UNITS))
     parser.add_argument(
@@ -43,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="instead: drawn sensors, objects inside and outside of the range",
     )
     parser.add_argument("--sets", nargs="+", default=[], choices=list(sets.REAL), help="instead: real sets")
-    parser.add_argument("--data", type=Path, default=sets.data_folder(__file__), help="folder of the real sets")
+    parser.add_argument("--data", type=Path, default=sets.data_folder(), help="folder of the real sets")
     parser.add_argument("--mode", default="precise", choices=MODES, help="of drawn sensors and real sets")
     arguments = parser.parse_args(argv)
     if arguments.drawn or arguments.sets:
@@ -62,7 +61,7 @@ def measure(arguments: argparse.Namespace) -> str:
     for number, unit in enumerate(UNITS):
         if unit not in arguments.units:
             continue
-        first = arguments.seed + number * arguments.frames
+        first = 10000 + number * arguments.frames
         found = coverage.of_scenes(range(first, first + arguments.frames), unit, progress=True)
         rows += [coverage.mean(found, f"scenes, {unit}")] if found else []
         every += found
@@ -89,4 +88,4 @@ def measure(arguments: argparse.Namespace) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main_of(main)

@@ -6,10 +6,8 @@ Real images are those that `torchvts samples gelsight_mini` fetched into the cac
 or in ../shared/data; without these, only the rendered scene.
 """
 
-import argparse
 import dataclasses
 import statistics
-import sys
 import time
 import warnings
 from collections.abc import Sequence
@@ -20,20 +18,21 @@ import torch
 from tqdm import tqdm
 
 import torchvts as vts
+from lab import metrics
+from lab.commands import main_of, parser_of
+from lab.sets import data_folder
 from torchvts import scenes, viz
-from torchvts.evaluation import metrics
-from torchvts.evaluation.sets import data_folder
 from torchvts.samples import cached_sample
 
 PITCH = 0.0625
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/demo"))
     arguments = parser.parse_args(argv)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    sample, folder = cached_sample("gelsight_mini"), data_folder(__file__)
+    sample, folder = cached_sample("gelsight_mini"), data_folder()
     if sample is not None:
         print(f"real images: the sample gelsight_mini, in {sample}")
         lines = real(sample.parent, [(sample.name, "gelsight_mini", "background.png", SAMPLE_PRESSES)], arguments.out)
@@ -184,4 +183,4 @@ def truth_error(path: Path, depth_mm: torch.Tensor, mm_per_pixel: float) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main_of(main)

@@ -6,25 +6,24 @@ python scripts/figures.py learning out/learning_curve/rows.json docs/learning_cu
 python scripts/figures.py confidence out/confidence.json docs/confidence.png
 """
 
-import argparse
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from torchvts.evaluation import figures, rows, stability
+from lab import failure_figures, figures, rows, stability
+from lab.commands import main_of, parser_of
 
 DRAW: dict[str, Callable[[str], Figure]] = {
     "speed": lambda text: figures.speed_figure(rows.from_json(text)),
-    "overview": lambda text: figures.overview_figure(stability.points_from_json(text)[0]),
+    "overview": lambda text: failure_figures.overview_figure(stability.points_from_json(text)[0]),
     "learning": lambda text: figures.learning_figure(rows.from_json(text)),
     "confidence": lambda text: figures.coverage_figure(rows.from_json(text)),
 }
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("kind", choices=DRAW)
     parser.add_argument("table", type=Path, help="JSON")
     parser.add_argument("picture", type=Path, help="PNG, at most 256 colours")
@@ -35,7 +34,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except (OSError, ValueError, TypeError) as error:
-        sys.exit(f"error: {error}")
+    main_of(main)

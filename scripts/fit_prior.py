@@ -13,20 +13,19 @@ The folder is one of gs_sdk's (catalog.csv, background.png, N/gelsight.png); cen
 exist, otherwise they are found. Without a folder: an image without contact, several (their median), or a video, and presses.
 """
 
-import argparse
 import dataclasses
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import torchvts as vts
+from lab.commands import main_of, parser_of
 from torchvts.calibration import fit_prior, score_prior
 from torchvts.model.response_field import SensorPrior
 from torchvts.stream import read_background, read_press_images
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument(
         "background", type=Path, nargs="+", help="folder in gs_sdk's layout, or image without contact, several, a video"
     )
@@ -67,7 +66,4 @@ def with_score(sensor: vts.Sensor, error_deg: float) -> SensorPrior:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except (OSError, ValueError, TypeError) as error:
-        sys.exit(f"error: {error}")
+    main_of(main)

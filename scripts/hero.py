@@ -5,8 +5,6 @@ The unit is calibrated by its background and presses of the other ball, so nothi
     python scripts/hero.py [--data FOLDER] [--out docs/hero.png]
 """
 
-import argparse
-import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,8 +16,9 @@ from matplotlib.colors import LightSource, LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 import torchvts as vts
+from lab.commands import main_of, parser_of
+from lab.sets import data_folder
 from torchvts import viz
-from torchvts.evaluation.sets import data_folder
 
 SHOWN = "6.310mm/10"
 EXAGGERATION = 2.0
@@ -101,8 +100,8 @@ def _draw_surface(axes: Any, depth_mm: Any, x: Any, y: Any) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=data_folder(__file__), help="folder that holds gelsight_mini_a/")
+    parser = parser_of(__doc__)
+    parser.add_argument("--data", type=Path, default=data_folder(), help="folder that holds gelsight_mini_a/")
     parser.add_argument("--out", type=Path, default=Path("docs/hero.png"))
     arguments = parser.parse_args(argv)
     folder = arguments.data / "gelsight_mini_a"
@@ -116,4 +115,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main_of(main)

@@ -7,21 +7,20 @@ presses given by their images alone, and one press for the scale. MLP is gs_sdk'
 seen the presses that are scored.
 """
 
-import argparse
 import dataclasses
 import random
-import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from tqdm import tqdm
 
-from torchvts.evaluation import rows as records
-from torchvts.evaluation import sets
-from torchvts.evaluation.evaluate import evaluate
-from torchvts.evaluation.figures import learning_figure
-from torchvts.evaluation.methods import GIVEN_NETWORK
-from torchvts.evaluation.rows import Column, Row, error_column
+from lab import rows as records
+from lab import sets
+from lab.commands import main_of, parser_of
+from lab.evaluate import evaluate
+from lab.figures import learning_figure
+from lab.methods import GIVEN_NETWORK
+from lab.rows import Column, Row, error_column
 from torchvts.viz import save_figure
 
 COUNTS = (0, 1, 3, 5, 11, 21)
@@ -40,7 +39,7 @@ COLUMNS = (
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("sets", nargs="+", choices=sets.SETS, metavar="SET", help=", ".join(sets.SETS))
     parser.add_argument("--draws", type=int, default=4, help="choices of presses per row")
     parser.add_argument("--mode", choices=("fast", "precise"), default="precise")
@@ -49,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     rows = []
     with tqdm(desc="learning curve", leave=False, disable=None) as bar:
         for name in arguments.sets:
-            data = sets.load(name, sets.data_folder(__file__))
+            data = sets.load(name, sets.data_folder())
             for row in curve(data, arguments.draws, arguments.mode):
                 rows.append(row)
                 bar.update()
@@ -105,7 +104,4 @@ def drawn(fold: sets.Fold, count: int, seed: int, primed: bool) -> sets.Fold:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except (OSError, ValueError, TypeError) as error:
-        sys.exit(f"error: {error}")
+    main_of(main)

@@ -3,10 +3,6 @@
 python scripts/pose_bench.py --poses 100 --out out/pose_bench
 """
 
-import argparse
-import dataclasses
-import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,18 +10,19 @@ import torch
 from tqdm import tqdm
 
 import torchvts as vts
+from lab.commands import main_of, parser_of
+from lab.pose_accuracy import PoseCase, ball_pairs, pose_table, run_poses
+from lab.rows import to_json, write_files
 from torchvts import viz
-from torchvts.evaluation.pose_accuracy import PoseCase, ball_pairs, machine, pose_table, run_poses
-from torchvts.evaluation.rows import write_files
+from torchvts.cli.bench import machine
 from torchvts.pose import Registration, contact_cloud
 from torchvts.scenes import objects
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--poses", type=int, default=100, help="poses of each object")
     parser.add_argument("--size", type=int, nargs=2, default=(320, 240), metavar=("WIDTH", "HEIGHT"))
-    parser.add_argument("--noise", type=float, default=0.005, help="standard deviation of image noise; 8 bits on top")
     parser.add_argument("--only", nargs="+", choices=[*objects.TARGETS, *objects.FREE_TARGETS], help="these objects")
     parser.add_argument("--clouds", type=int, metavar="POINTS", help="register clouds of so many points instead (0: all pixels)")
     parser.add_argument("--presses", type=Path, metavar="FOLDER", help="also pairs of real presses of a ball: a calibration folder")
@@ -45,28 +42,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = {} if arguments.clouds is None else {"register": by_clouds}
     size = (arguments.size[1], arguments.size[0])
     with tqdm(total=arguments.poses * len(targets), unit="pose", disable=None) as bar:
-        rows, shown = run_poses(targets, arguments.poses, size=size, noise_std=arguments.noise, progress=bar.update, **options)
+        rows, shown = run_poses(targets, arguments.poses, size=size, progress=bar.update, **options)
     for name, (case, found) in shown.items():
         clouds = [contact_cloud(frame, case.mm_per_pixel, 4000)[0] for frame in (case.source, case.target)]
         figure = viz.pose_figure(clouds[0], clouds[1], found.T_target_source, f"{name}: {found.message}")
         viz.save_figure(figure, arguments.out / f"{name.replace(' ', '_')}.png")
-    how = f"{arguments.poses} poses each, {size[1]} x {size[0]}, noise {arguments.noise:g} and 8 bits; {machine()}"
+    how = f"{arguments.poses} poses each, {size[1]} x {size[0]}, noise 0.005 and 8 bits; {machine()}"
     text = f"{how}\n\n{pose_table(rows)}\n"
     if arguments.presses is not None:
         background, presses = vts.read_presses(arguments.presses)
         with tqdm(total=100, unit="pair", disable=None) as bar:
             counts = ball_pairs(background, presses, vts.Sensor.load(arguments.sensor), 100, bar.update)
         text += "\nreal presses of a ball: " + ", ".join(f"{name} {count}" for name, count in counts.items()) + "\n"
-    write_files(arguments.out, {"table.md": text, "poses.json": json.dumps([dataclasses.asdict(row) for row in rows], indent=1)})
+    write_files(arguments.out, {"table.md": text, "poses.json": to_json(rows)})
     print(text)
     for row in rows:
-        for note in row.notes[:5]:
-            print(f"{row.name}, {note}")
+        if row.note:
+            print(f"{row.data}, refused: {row.note}")
     return 0
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except (OSError, ValueError, TypeError, ImportError) as error:
-        sys.exit(f"error: {error}")
+    main_of(main)

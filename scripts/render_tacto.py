@@ -15,7 +15,6 @@ PYOPENGL_PLATFORM=osmesa works where there is no EGL: apt-get install libosmesa6
 The two differ at the rim of the contact, by up to 51 counts: EGL antialiases, OSMesa does not.
 """
 
-import argparse
 import math
 import os
 import sys
@@ -24,6 +23,8 @@ import types
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+from lab.commands import main_of, parser_of
 
 PITCH_MM, HEIGHT, WIDTH = 0.0625, 480, 640
 SPHERES = {"sphere_R10_d2": (10.0, 2.0, 0.0, 0.0), "sphere_R5_d1_off": (5.0, 1.0, 8.0, 5.0)}  # mm: radius, press, right, down
@@ -66,7 +67,7 @@ def tacto_renderer(yfov: float, distance_mm: float) -> Any:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--camera", choices=sorted(YFOV_DEG), default="perspective")
     parser.add_argument("--out", type=Path, required=True, help="folder to write to")
     parser.add_argument("--compare", type=Path, help="folder with a set of the same camera")
@@ -123,4 +124,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main_of(main)

@@ -2,13 +2,10 @@
 
 Ji, Liu, Ma: Model-Based 3D Contact Geometry Perception for Visual Tactile Sensor, Sensors 2022, 22(17), 6470.
 
-    python scripts/reproduce_paper.py [--out out/paper] [--lights 31.25 39.375]
+    python scripts/reproduce_paper.py [--out out/paper]
 """
 
-import argparse
-import math
 import statistics
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,12 +13,15 @@ import torch
 from tqdm import tqdm
 
 import torchvts as vts
+from lab import methods, metrics, pose_accuracy
+from lab.commands import main_of, parser_of
+from lab.faults import ring_lights
+from lab.sets import data_folder
 from torchvts import scenes, viz
-from torchvts.evaluation import methods, metrics, pose_accuracy
-from torchvts.evaluation.presses import Training
-from torchvts.evaluation.rows import markdown
-from torchvts.evaluation.sets import data_folder
+from torchvts.core.tables import markdown
 from torchvts.pose import contact_cloud
+from torchvts.training.balls import fit_sphere
+from torchvts.training.presses import Training
 
 PITCH = 0.0625
 PAPER_3 = {16: (0.31, 0.09), 32: (1.21, 0.16)}
@@ -31,14 +31,6 @@ TACTO = {  # largest error of the paper in px; centre and radius that it found, 
     "cylinder_R4_d1": ("", "", ""),
     "cube_edge_d1": ("", "", ""),
 }
-
-
-def ring(radius_mm: float, height_mm: float, turn_deg: float = 10.0, brightness: float = 0.45) -> vts.PointLights:
-    """Three lights 120 degrees apart that give ``brightness`` at the image centre."""
-    angles = [math.radians(turn_deg + 120.0 * k) for k in range(3)]
-    distance = math.hypot(radius_mm, height_mm)
-    position = [[radius_mm * math.cos(a), radius_mm * math.sin(a), height_mm] for a in angles]
-    return vts.PointLights(position, [brightness * distance**3 / height_mm] * 3)
 
 
 def figure_3(lights: vts.PointLights, out: Path) -> list[str]:
@@ -81,7 +73,7 @@ def figure_4(folder: Path, out: Path) -> list[str]:
             error = metrics.depth_error(result.depth_mm, truth, PITCH)
             found = ""
             if sphere:
-                fit = metrics.fit_sphere(result.depth_mm, PITCH, result.contact)
+                fit = fit_sphere(result.depth_mm, PITCH, result.contact)
                 found = f"({', '.join(f'{v + 0.0:.3f}' for v in fit.center_mm)}), {fit.radius_mm:.3f}"
             rows.append(
                 f"| {camera}, {case} | {paper} | {error.max_px:.2f} ({error.max_mm:.3f} mm) | {error.rms_px:.3f} "
@@ -127,25 +119,22 @@ def table_3(out: Path) -> list[str]:
         viz.save_figure(figure, out / f"table_3_{name.replace(' ', '_')}.png")
     lines = []
     for row in rows:
-        errors = [f"{statistics.median(values):.3f} / {max(values):.3f}" for values in (row.deg, row.mm)]
-        lines.append(f"| {row.name} | {' | '.join(errors)} | {statistics.median(row.seconds):.2f} |")
+        errors = [f"{statistics.median(row.each[key]):.3f} / {max(row.each[key]):.3f}" for key in ("deg", "mm")]
+        lines.append(f"| {row.data} | {' | '.join(errors)} | {statistics.median(row.each['s']):.2f} |")
     head = "| grasped target, 10 poses | angle deg, median / largest | position mm, median / largest | s |"
     return [head, "|---|---|---|---|", *lines, "| paper, three targets | 0.64, 2.35, 2.59 | below 1 | 6 to 8 |"]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/paper"), help="folder for pictures and table.md")
-    parser.add_argument(
-        "--data", type=Path, default=data_folder(__file__), help="folder that holds tacto/ (default: TORCHVTS_DATA)"
-    )
-    parser.add_argument("--lights", type=float, nargs=2, default=(31.25, 39.375), metavar=("RADIUS_MM", "HEIGHT_MM"))
+    parser.add_argument("--data", type=Path, default=data_folder(), help="folder that holds tacto/ (default: TORCHVTS_DATA)")
     arguments = parser.parse_args(argv)
     arguments.out.mkdir(parents=True, exist_ok=True)
     lines = [
         "Figure 3: exact lights known, 640 x 480, depth error over the whole image",
         "",
-        *figure_3(ring(*arguments.lights), arguments.out),
+        *figure_3(ring_lights(31.25, 39.375), arguments.out),
     ]
     tacto = arguments.data / "tacto"
     lines += ["", "Figure 4: TACTO renders, calibrated from the one background image, precise", ""]
@@ -167,4 +156,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main_of(main)

@@ -2,29 +2,28 @@
 
 python scripts/stability.py [--out out/stability] [--seeds 3] [--keep]
 
-Rows are written to OUT/rows.jsonl; the same command continues an interrupted run. --keep also writes docs/failures, the table of
-breaking points in docs/where_methods_fail.md, and tests/breaking_points.json.
+--keep also writes docs/failures, the table of breaking points in docs/where_methods_fail.md, and tests/breaking_points.json.
 """
 
-import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 from tqdm import tqdm
 
-from torchvts.evaluation import stability
-from torchvts.evaluation.figures import corruption_figure, overview_figure, save_small
-from torchvts.evaluation.gallery import CORRUPTIONS
-from torchvts.evaluation.rows import write_files
-from torchvts.evaluation.stability import SWEPT, Breaking
+from lab import stability
+from lab.commands import main_of, parser_of
+from lab.failure_figures import corruption_figure, overview_figure
+from lab.figures import save_small
+from lab.gallery import CORRUPTIONS
+from lab.rows import write_files
+from lab.stability import SWEPT, Breaking
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/stability"))
     parser.add_argument("--seeds", type=int, default=3, help="number of noises and places of each press")
     parser.add_argument("--workers", type=int, default=2, help="processes; with 0 this process does the work")
@@ -38,7 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.out.mkdir(parents=True, exist_ok=True)
     total = len(SWEPT) * arguments.seeds * sum(len(CORRUPTIONS[name].severities) for name in arguments.only)
     with tqdm(total=total, unit="row", disable=None) as bar:
-        rows = stability.sweep(arguments.out / "rows.jsonl", SWEPT, arguments.only, arguments.seeds, arguments.workers, bar.update)
+        rows = stability.sweep(SWEPT, arguments.only, arguments.seeds, arguments.workers, bar.update)
     points = stability.breaking_points(rows)
     print(write_tables(points, arguments.seeds, arguments.out, arguments.keep))
     pictures = ROOT / "docs" / "failures" if arguments.keep else arguments.out
@@ -65,7 +64,4 @@ def write_tables(points: Sequence[Breaking], seeds: int, out: Path, keep: bool) 
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except (OSError, ValueError, TypeError) as error:
-        sys.exit(f"error: {error}")
+    main_of(main)

@@ -1,13 +1,11 @@
-"""Tracking bench: objects that move, rendered and measured, tracked against their first frame; table, JSON, plot of error and time.
+"""Tracking bench: objects that move, rendered and measured, tracked against their first frame; table and JSON.
 
 python scripts/track_bench.py --out out/track_bench
 python scripts/track_bench.py --motions slow --noises "slopes off by 3 degrees" --seeds 1 4 11 --sensors 1 2 3 --out out/wrong
 """
 
-import argparse
 import dataclasses
 import importlib
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,20 +16,19 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from torchvts import viz
-from torchvts.evaluation import tracking
-from torchvts.evaluation.pose_accuracy import machine
-from torchvts.evaluation.rows import write_files
+from lab import tracking
+from lab.commands import main_of, parser_of
+from lab.rows import to_json, write_files
+from torchvts.cli.bench import machine
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--objects", nargs="+", default=tracking.OBJECTS, metavar="NAME", help="of torchvts.scenes.objects")
     parser.add_argument("--motions", nargs="+", default=list(tracking.MOTIONS), choices=list(tracking.MOTIONS))
     parser.add_argument("--noises", nargs="+", default=list(tracking.NOISES), choices=list(tracking.NOISES))
     parser.add_argument("--seeds", nargs="+", type=int, default=[1], help="of motions and noise of the images")
     parser.add_argument("--sensors", nargs="+", type=int, default=[1], help="seeds of errors of slopes, from 1")
-    parser.add_argument("--register", action="store_true", help="register each frame without tracking too, and draw error and time")
     parser.add_argument(
         "--normalflow", type=Path, metavar="FOLDER", help="a checkout of NormalFlow, to track the same frames by it"
     )
@@ -41,23 +38,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     torch.set_num_threads(arguments.threads)
     normalflow = None if arguments.normalflow is None else load_normalflow(arguments.normalflow)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    rows, beside = [], []
+    rows = []
     chosen = (arguments.objects, arguments.motions, arguments.noises, arguments.seeds, arguments.sensors)
     with tqdm(unit="track", disable=None) as bar:
         for row, track in tracking.run_tracking(*chosen):
             rows.append(row)
             if normalflow is not None:
-                peer = tracking.TrackRow(f"{row.name}, NormalFlow", row.motion, row.noise, seed=row.seed, sensor=row.sensor)
+                peer = dataclasses.replace(row, method="NormalFlow", each={key: [] for key in tracking.EACH})
                 rows.append(tracking.follow_by_normalflow(track, normalflow, peer))
-            if arguments.register and row.motion == "slow" and row.noise == "noise 0.005":
-                beside.append((row, tracking.register_each(track)))
             bar.update()
     text = (
         f"320 x 240, 8 bits, seeds {arguments.seeds}, sensors {arguments.sensors}; {machine()}\n\n{tracking.tracking_table(rows)}\n"
     )
-    write_files(arguments.out, {"table.md": text, "tracks.json": json.dumps([dataclasses.asdict(row) for row in rows], indent=1)})
-    if beside:
-        viz.save_figure(tracking.tracking_figure(beside), arguments.out / "tracking.png")
+    write_files(arguments.out, {"table.md": text, "tracks.json": to_json(rows)})
     print(text)
     return 0
 
@@ -81,7 +74,4 @@ def load_normalflow(folder: Path) -> tracking.NormalFlow:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        sys.exit(f"error: {error}")
+    main_of(main)

@@ -1,4 +1,4 @@
-"""Accepted and refused arguments of gs_sdk's formats, metrics, scenes, objects, export and stream: a table for test_refusals."""
+"""Accepted and refused arguments of gs_sdk's formats, scenes, objects, export and stream: a table for test_refusals."""
 
 from contextlib import nullcontext
 from pathlib import Path
@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from refusals_values import (
-    BAD_DEPTH,
     BAD_MAP,
     BAD_POSE,
     CENTER,
@@ -24,7 +23,6 @@ from refusals_values import (
     WIDTH,
     Entry,
     batches,
-    frame,
     image,
     images,
     lights,
@@ -83,32 +81,6 @@ TABLE = {
                 image().numpy(),
                 None,
             ]
-        },
-    ),
-    # ---- metrics ----
-    "metrics.depth_error": Entry(
-        {"depth_mm": DEPTH, "truth_mm": DEPTH, "mm_per_pixel": 1.0, "region": DEPTH == 0},
-        {
-            "depth_mm": [DEPTH[0], DEPTH.numpy(), None],
-            "truth_mm": [DEPTH.numpy(), None],
-            "mm_per_pixel": NUMBER,
-            "region": [DEPTH > 0, DEPTH[0] == 0, "all", (DEPTH == 0).numpy()],
-        },
-    ),
-    "metrics.normal_angle_deg": Entry(
-        {"normal": torch.ones(1, 3, 4, 4), "truth": torch.ones(1, 3, 4, 4), "region": torch.ones(1, 1, 4, 4, dtype=torch.bool)},
-        {"normal": batches(3), "truth": [np.ones((1, 3, 4, 4)), None], "region": [torch.ones(1, 1, 3, 4), "all", np.ones((4, 4))]},
-    ),
-    "metrics.mask_iou": Entry(
-        {"mask": DEPTH > 0, "truth": DEPTH > 0}, {"mask": [DEPTH[0] > 0, None, (DEPTH > 0).numpy()], "truth": [None, [1]]}
-    ),
-    "metrics.fit_sphere": Entry(
-        {"depth_mm": frame().depth_mm, "mm_per_pixel": 0.4, "contact": frame().contact, "steps": 3},
-        {
-            "depth_mm": BAD_DEPTH[:-1],
-            "mm_per_pixel": NUMBER,
-            "contact": [torch.ones(4, 4), frame().contact & False, None, "all"],
-            "steps": ["3", -1, 1.5, None],
         },
     ),
     # ---- scenes ----

@@ -13,12 +13,12 @@ import torch
 from torch import nn
 
 import torchvts as vts
+from lab import coverage
+from lab.drawn_sensors import drawn_sensor
+from lab.metrics import normal_angle_deg
+from lab.random_scenes import random_frame
+from lab.score import Truth
 from torchvts.core.blur import blur
-from torchvts.evaluation import coverage
-from torchvts.evaluation.drawn_sensors import drawn_sensor
-from torchvts.evaluation.metrics import normal_angle_deg
-from torchvts.evaluation.random_scenes import random_frame
-from torchvts.evaluation.score import Truth
 from torchvts.export import sample_frames
 from torchvts.model.response_field import TaughtRange
 from torchvts.pipeline import beyond_presses, bound_at

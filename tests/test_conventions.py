@@ -5,7 +5,7 @@ import torch
 
 import torchvts as vts
 from torchvts.core.geometry import gradient_from_normal, normal_from_gradient, pixel_grid_mm
-from torchvts.evaluation import metrics
+from torchvts.training.balls import fit_sphere
 
 
 def flat(height, width):
@@ -79,7 +79,7 @@ def test_points_have_x_right_y_up_z_to_the_camera():
 @pytest.mark.parametrize("center", [(0.0, 0.0), (3.0, 2.0)])
 def test_the_pressed_ball_has_its_centre_below_the_skin(center):
     scene = vts.scenes.sphere_press(10.0, 2.0, center, 120, 160, 0.25, torch.float64)
-    fit = metrics.fit_sphere(scene.depth_mm, 0.25, scene.contact)
+    fit = fit_sphere(scene.depth_mm, 0.25, scene.contact)
     assert fit.center_mm == pytest.approx((center[0], -center[1], -8.0), abs=1e-9)
     assert fit.radius_mm == pytest.approx(10.0, abs=1e-9)
 
@@ -89,7 +89,7 @@ def test_depth_and_gradient_of_a_pipeline_follow_the_same_conventions(ring, smal
     out = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, small_sensor), "precise")(
         vts.scenes.render(scene, lights)
     )
-    fit = metrics.fit_sphere(out.depth_mm, 0.25, out.contact)
+    fit = fit_sphere(out.depth_mm, 0.25, out.contact)
     assert fit.center_mm == pytest.approx((5.0, -3.0, -9.0), abs=0.06)
     assert torch.equal(out.normal[:, 2] > 0, torch.ones_like(out.contact[:, 0]))
     assert torch.equal(out.normal, normal_from_gradient(out.gradient))

@@ -15,18 +15,18 @@ import torch
 from conftest import ring_lights
 
 import torchvts as vts
+from lab import sets
+from lab.drawn_sensors import drawn_sensor
+from lab.faults import jpeg
+from lab.gallery import CORRUPTIONS, undisturbed
 from torchvts import scenes
 from torchvts.core.blur import blur, gaussian_weights
 from torchvts.diagnose import Diagnosis, Finding
 from torchvts.diagnose.camera import blockiness, levels_of
 from torchvts.diagnose.checks import CHECKS
 from torchvts.diagnose.light_words import WORDS
-from torchvts.evaluation import sets
-from torchvts.evaluation.drawn_sensors import drawn_sensor
-from torchvts.evaluation.faults import jpeg
-from torchvts.evaluation.gallery import CORRUPTIONS, undisturbed
-from torchvts.evaluation.presses import Training
 from torchvts.model.response_field import ResponseModel, TaughtRange
+from torchvts.training.presses import Training
 
 SIZE = {"height": 120, "width": 160, "mm_per_pixel": 0.25}
 

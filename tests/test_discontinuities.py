@@ -9,8 +9,8 @@ import references
 import torch
 
 import torchvts as vts
+from lab import metrics
 from torchvts import scenes
-from torchvts.evaluation import metrics
 from torchvts.integration import (
     DiscontinuityIntegration,
     PerspectiveIntegration,

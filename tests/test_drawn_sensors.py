@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
+from lab import drawn_sensors
+from lab.drawn_sensors import OBJECTS, drawn_sensor
+from lab.metrics import normal_angle_deg
 from torchvts import DepthPipeline, Sensor, poisson_background
 from torchvts.calibration import Press, by_presses, calibrate
-from torchvts.evaluation import drawn_sensors
-from torchvts.evaluation.drawn_sensors import OBJECTS, drawn_sensor
-from torchvts.evaluation.metrics import normal_angle_deg
 from torchvts.scenes import hanging_skin, objects
 
 

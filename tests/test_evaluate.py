@@ -14,15 +14,17 @@ import pytest
 import torch
 
 import torchvts as vts
+from lab import evaluate as ev
+from lab import methods, peers, rows, sets
+from lab.figures import set_figure
+from lab.score import score_press
 from torchvts.calibration import fit_prior
+from torchvts.cli import main
 from torchvts.core.geometry import normal_from_gradient
-from torchvts.evaluation import evaluate as ev
-from torchvts.evaluation import methods, peers, rows, sets
-from torchvts.evaluation import presses as presses_room
-from torchvts.evaluation.figures import set_figure
-from torchvts.evaluation.presses import Training, train_network
-from torchvts.evaluation.score import ball_truth, score_press
 from torchvts.model.gs_sdk import CATALOG_COLUMNS, LABEL_COLUMNS
+from torchvts.training import presses as presses_room
+from torchvts.training.balls import ball_truth
+from torchvts.training.presses import Training, train_network
 
 HEIGHT, WIDTH, PITCH = 96, 128, 0.15
 CENTERS = ((-3.0, -2.0), (3.5, -2.5), (0.0, 0.5), (-4.0, 2.5), (3.0, 2.5), (0.5, -3.0))
@@ -151,10 +153,6 @@ def test_bad_arguments_are_named(press, folder):
     given, scene = press
     with pytest.raises(ValueError, match="press: expected one with center_px"):
         ball_truth(vts.Press(given.image, BALL_MM, "bare"), HEIGHT, WIDTH, PITCH)
-    with pytest.raises(ValueError, match="normal: expected"):
-        score_press(given, scene.depth_mm, scene.normal[..., :-1], PITCH)
-    with pytest.raises(ValueError, match="depth_mm: expected one frame"):
-        score_press(given, scene.depth_mm.expand(2, 1, -1, -1), scene.normal, PITCH)
     with pytest.raises(ValueError, match="10 are needed"):
         faint = vts.Press(given.image, BALL_MM, "faint", given.center_px, 4.0)
         score_press(faint, scene.depth_mm, scene.normal, PITCH)
@@ -168,14 +166,14 @@ def test_bad_arguments_are_named(press, folder):
         sets.load("gelsight_mini_z", folder)
 
 
-def test_evaluate_writes_tables_rows_and_pictures(run_script, monkeypatch, folder, tmp_path):
+def test_accuracy_writes_tables_rows_and_pictures(run_script, monkeypatch, folder, tmp_path):
     monkeypatch.setattr(methods, "train_network", partial(train_network, max_epochs=15))
-    done = run_script("evaluate", folder, "--sensor", folder / "rig.yaml", "--folds", 2, "--out", tmp_path)
+    done = run_script("accuracy", folder, "--sensor", folder / "rig.yaml", "--folds", 2, "--out", tmp_path)
     assert done.returncode == 0, done.stderr
     document = json.loads((tmp_path / "scores.json").read_text())
     summary = {row.method: row for row in rows.from_json(json.dumps(document["rows"]))}
     assert list(summary) == [name for name in ev.COMPARED if "no prior" not in name]  # the file has none
-    assert len(document["scores"]) == 5 * len(summary) and document["command"].startswith("torchvts evaluate ")
+    assert len(document["scores"]) == 5 * len(summary) and document["command"].startswith("python scripts/accuracy.py ")
     # exact lights, little noise: the model is right, and learning from three presses beats zero depth
     assert summary["point lights"].errors["normal_deg"] < 1.5
     assert summary["precise"].errors["normal_deg"] < 3.0 and summary["precise"].errors["level_um"] < 20.0
@@ -187,11 +185,6 @@ def test_evaluate_writes_tables_rows_and_pictures(run_script, monkeypatch, folde
     assert "not scored, no contact radius: ball/5" in done.stdout
     assert done.stdout.splitlines()[2].startswith("|") and "| flat |" in done.stdout.splitlines()[2]
     assert (tmp_path / "table.md").read_text().startswith("| data | method |")
-    with (tmp_path / "table.csv").open(newline="") as stream:
-        lines = list(csv.DictReader(stream))
-    assert [line["method"] for line in lines] == list(summary)
-    assert float(lines[-1]["normal_deg"]) == summary[lines[-1]["method"]].errors["normal_deg"]
-    assert (tmp_path / "table.tex").read_text().count(r"\\") == 1 + len(summary)
     assert [path.name for path in tmp_path.glob("*.png")] == [f"{folder.name}.png"]
 
 
@@ -276,7 +269,6 @@ def test_drawn_sensors_are_scored_on_objects_and_averaged(folder):
 
 
 def test_drawn_sensors_are_read(tmp_path):
-    pytest.importorskip("torchvts.evaluation.drawn_sensors")
     read = sets.load("drawn_0", tmp_path, 2)
     fold = read.folds[0]
     assert len(fold.learned) == 2 and read.background.shape == (3, fold.sensor.height, fold.sensor.width)
@@ -299,18 +291,6 @@ def test_the_learning_curve_of_a_set(run_script, monkeypatch, folder, tmp_path):
     ]
     assert all(0.0 < float(line[3]) < 10.0 for line in lines[:-1]) and len(json.loads((tmp_path / "rows.json").read_text())) == 8
     assert float(lines[-1][3]) > 0.0 and (tmp_path / "learning_curve.png").stat().st_size > 5000
-
-
-def test_latex_and_csv_keep_what_is_special():
-    assert rows.latex(["a_b", "50 %"], [["x & y", "{1}"]]).splitlines()[2:5] == [
-        r"a\_b & 50 \% \\",
-        r"\midrule",
-        r"x \& y & \{1\} \\",
-    ]
-    row = rows.Row("presses", "fast", "a, b", {"normal_deg": None, "iou": 0.5}, note='says "no"')
-    text = rows.to_csv([row])
-    read = next(csv.DictReader(text.splitlines()))
-    assert (read["data"], read["normal_deg"], read["iou"], read["note"]) == ("a, b", "", "0.5", 'says "no"')
 
 
 @pytest.mark.parametrize("name", sets.REAL)
@@ -375,5 +355,55 @@ def test_scripts_refuse_bad_input_in_a_sentence(run_script, folder, tmp_path):
     assert list(tmp_path.iterdir()) == []
     (tmp_path.parent / "bad.pth").write_bytes(b"no network")
     for arguments in (["--methods", "magic"], ["--all"], ["--methods", "fast", "--network", tmp_path.parent / "bad.pth"]):
-        done = run_script("evaluate", folder, *arguments, "--out", tmp_path)
-        assert done.returncode == 2 and done.stderr.startswith("torchvts: error: ") and list(tmp_path.iterdir()) == []
+        done = run_script("accuracy", folder, *arguments, "--out", tmp_path)
+        assert done.returncode in (1, 2) and "error: " in done.stderr.splitlines()[-1] and list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def by_hand(folder):
+    """The score of each press of the folder, mode precise, by the scores of the lab."""
+    sensor = vts.Sensor.load(folder / "rig.yaml")
+    result = ev.evaluate(sets.from_folder(folder, sensor, folds=3), ["fast", "precise"])
+    return {(score.press, score.method): score for score in result.scores}
+
+
+def test_own_presses_are_scored_as_the_lab_scores_them(run_script, folder, by_hand, tmp_path):
+    done = run_script("evaluate", folder, "--sensor", folder / "rig.yaml", "--folds", 3, "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    with (tmp_path / "presses.csv").open(newline="") as stream:
+        lines = list(csv.DictReader(stream))
+    assert len(lines) == len(by_hand) == 10  # five presses with a contact radius, two modes, each press once
+    for line in lines:
+        score = by_hand[line["press"], line["mode"]]
+        for name in ("normal_deg", "relief_um", "radius_percent"):
+            assert float(line[name]) == pytest.approx(getattr(score, name), rel=1e-9)
+    assert "6 presses, 6 labelled; fold 3 of 3" in done.stdout
+    assert done.stderr.splitlines()[-1] == "fold 3 of 3: 5 presses scored"  # no terminal: a line a fold
+    assert done.stdout.splitlines()[2].startswith("| fast | ") and (tmp_path / "table.md").read_text() in done.stdout + "\n"
+
+
+def test_what_was_scored_stays_where_it_is_stopped(folder, monkeypatch, tmp_path, capsys):
+    made = Training.calibration
+    attempts = []
+
+    def stopped_at_the_third(self):
+        attempts.append(1)
+        if len(attempts) == 3:
+            raise KeyboardInterrupt
+        return made.fget(self)
+
+    monkeypatch.setattr(Training, "calibration", property(stopped_at_the_third))
+    arguments = [str(folder), "--sensor", str(folder / "rig.yaml"), "--folds", "3", "--out", str(tmp_path)]
+    assert main(["evaluate", *arguments]) == 130
+    assert "fold 2 of 3" in capsys.readouterr().out
+    names = [line.split(",")[0] for line in (tmp_path / "presses.csv").read_text().splitlines()[1:]]
+    assert names == [name for k in (0, 3, 1, 4) for name in [f"ball/{k}"] * 2]
+
+
+def test_a_fold_that_cannot_be_calibrated_is_named(folder, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(presses_room, "calibrate", FailingUnit)
+    arguments = [str(folder), "--sensor", str(folder / "rig.yaml"), "--folds", "2", "--out", str(tmp_path)]
+    assert main(["evaluate", *arguments]) == 2
+    assert "fold 1: presses: no contact| in any of them" in capsys.readouterr().err
+    assert main(["evaluate", *arguments[:-3], "7", *arguments[-2:]]) == 2
+    assert "--folds: expected at most the number of presses, 6, got 7" in capsys.readouterr().err

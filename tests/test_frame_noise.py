@@ -6,8 +6,8 @@ import pytest
 import torch
 
 import torchvts as vts
+from lab import metrics
 from torchvts.accelerated import reference_only
-from torchvts.evaluation import metrics
 from torchvts.normals.shadowed import ShadowedPixels
 
 scenes = vts.scenes

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 import torchvts as vts
+from lab import faults, gallery
+from lab.gallery import CORRUPTIONS, HEIGHT, MM_PER_PIXEL, USUAL, WIDTH
 from torchvts.core.geometry import normal_from_gradient
-from torchvts.evaluation import faults, gallery
-from torchvts.evaluation.gallery import CORRUPTIONS, HEIGHT, MM_PER_PIXEL, USUAL, WIDTH
 from torchvts.model.lights import cast_shadows
 
 # corruptions that begin with another shape or camera than the undisturbed case

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 import torchvts as vts
+from lab.drawn_sensors import drawn_sensor
 from torchvts.calibration.given_images import sort_presses
 from torchvts.core.views import Views
-from torchvts.evaluation.drawn_sensors import drawn_sensor
 
 NUMBERS = (0, 3)
 

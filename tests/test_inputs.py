@@ -26,8 +26,8 @@ from torchvts.core.checks import check_range_later
 from torchvts.core.files import load_tensors, read_frames, rgb_from_bgr, save_tensors, write_atomically
 from torchvts.dataset import STATE, reconstruct_dataset
 from torchvts.dataset.records import as_cell
-from torchvts.evaluation import metrics
 from torchvts.stream.sources import LiveReader, check_reader
+from torchvts.training.balls import fit_sphere
 
 HEIGHT, WIDTH, PITCH = 48, 64, 0.5
 
@@ -349,11 +349,11 @@ def test_the_later_check_of_a_gpu_raises_what_it_checks():
 def test_a_sphere_is_fitted_in_few_steps_whatever_is_asked_for():
     press = vts.scenes.sphere_press(10.0, 1.0, (0, 0), 60, 80, 0.4, torch.float64)
     with pytest.raises(ValueError, match="steps: expected at most 2147483647, got"):
-        metrics.fit_sphere(press.depth_mm, 0.4, press.contact, 10**400)
-    few, many = (metrics.fit_sphere(press.depth_mm, 0.4, press.contact, steps) for steps in (20, 2**31 - 1))
+        fit_sphere(press.depth_mm, 0.4, press.contact, 10**400)
+    few, many = (fit_sphere(press.depth_mm, 0.4, press.contact, steps) for steps in (20, 2**31 - 1))
     assert few.radius_mm == pytest.approx(10.0, abs=1e-9) and many.radius_mm == pytest.approx(few.radius_mm, abs=1e-12)
     with pytest.raises(ValueError, match="depth_mm: expected finite values of at most 1e6 mm"):
-        metrics.fit_sphere(press.depth_mm * 1e300, 0.4, press.contact)
+        fit_sphere(press.depth_mm * 1e300, 0.4, press.contact)
 
 
 @pytest.mark.parametrize("change", ["lights", "noise_std", "ambient", "background"])

@@ -12,10 +12,10 @@ import torch
 from torch import nn
 
 import torchvts as vts
+from lab.metrics import normal_angle_deg
+from lab.score import ball_truth
 from torchvts.core.files import save_tensors
 from torchvts.core.geometry import gradient_from_normal, normal_from_gradient
-from torchvts.evaluation.metrics import normal_angle_deg
-from torchvts.evaluation.score import ball_truth
 from torchvts.model.gs_sdk import read_calibration_folder, read_labels
 from torchvts.model.response_field import ResponseField, ResponseModel
 from torchvts.normals.lookup import NormalFromLookup

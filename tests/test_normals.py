@@ -6,8 +6,8 @@ import references
 import torch
 
 import torchvts as vts
+from lab import metrics
 from torchvts.core.geometry import MAX_SLOPE, gradient_from_normal, normal_from_gradient
-from torchvts.evaluation import metrics
 from torchvts.normals.shadowed import Pixels, slope_by_lit_lights
 
 scenes = vts.scenes

@@ -6,9 +6,9 @@ from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchvts as vts
+from lab import metrics
 from torchvts import NormalModel
 from torchvts.core.geometry import normal_from_gradient
-from torchvts.evaluation import metrics
 from torchvts.pipeline.shadows import extrapolated_slope
 
 scenes = vts.scenes

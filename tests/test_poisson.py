@@ -9,7 +9,7 @@ import references
 import torch
 
 import torchvts as vts
-from torchvts.evaluation import metrics
+from lab import metrics
 from torchvts.integration import divergence
 
 SIZES = [(3, 3), (4, 4), (5, 8), (8, 5), (7, 11), (13, 13), (12, 10), (3, 16), (15, 14), (9, 6)]

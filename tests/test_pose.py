@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import torchvts as vts
-from torchvts.evaluation import pose_accuracy as pose_bench
+from lab import pose_accuracy as pose_bench
 from torchvts.pose import ambiguity, clouds, contact_cloud, read_cloud
 from torchvts.pose.result import invert, motion, turn_deg
 from torchvts.scenes import objects
@@ -274,8 +274,9 @@ def test_the_whole_chain_keeps_within_its_goal():
     targets = {name: objects.TARGETS[name] for name in ("stamp", "tool handle")} | {"plane": objects.FREE_TARGETS["plane"]}
     rows, shown = pose_bench.run_poses(targets, 2, size=(180, 240), noise_std=0.005)
     for row in rows[:2]:
-        assert row.within == row.poses and row.wrong == 0 and max(row.deg) < 0.3 and max(row.mm) < 0.05
-    assert rows[2].named == rows[2].poses and rows[2].wrong == 0
+        assert row.errors["within"] == row.frames and row.errors["wrong"] == 0
+        assert max(row.each["deg"]) < 0.3 and max(row.each["mm"]) < 0.05
+    assert rows[2].errors["named"] == rows[2].frames and rows[2].errors["wrong"] == 0
     assert pose_bench.pose_table(rows).count("\n") == 4 and set(shown) == set(targets)
 
 

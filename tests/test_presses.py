@@ -17,13 +17,13 @@ import torch
 from conftest import ring_lights
 
 import torchvts as vts
+from lab import metrics
 from torchvts.calibration import fit_prior, score_prior
 from torchvts.calibration.balls import guess_circle
 from torchvts.calibration.by_presses import with_preprocessing
 from torchvts.calibration.contacts import read_contacts
 from torchvts.calibration.field import Evidence, Family
 from torchvts.calibration.response_fit import fit_depth_brightness, simplest_candidate
-from torchvts.evaluation import metrics
 from torchvts.model.response_field import CHANGE_SCALE, DepthBrightness, ResponseField, fit_log_background, sine_from_slope
 
 HEIGHT, WIDTH, PITCH = 120, 160, 0.125

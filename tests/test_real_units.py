@@ -7,11 +7,11 @@ import pytest
 import torch
 
 import torchvts as vts
+from lab import metrics
+from lab.score import score_press
 from torchvts.calibration import fit_prior
 from torchvts.calibration.objections import to_background_of_prior
 from torchvts.core.blur import blur, gaussian_weights
-from torchvts.evaluation import metrics
-from torchvts.evaluation.score import score_press
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,6 @@ import torch
 import torchvts as vts
 import torchvts.export
 from torchvts.core.geometry import gradient_from_normal, normal_from_gradient
-from torchvts.evaluation import metrics
 
 TABLE = refusals_blocks.TABLE | refusals_tools.TABLE
 ROOMS = ("calibration", "diagnose", "integration", "model", "normals", "pipeline", "pose", "skin", "training")
@@ -32,12 +31,11 @@ MODULES = {
     "stream.": vts.stream,
     "objects.": vts.scenes.objects,
     "scenes.": vts.scenes,
-    "metrics.": metrics,
 }
 RECORDS = {
     "Bounds", "Calibration", "CalibrationWarning", "ConfidentOutput", "DepthOutput", "Diagnosis", "Diagnosis.of",
     "DiscontinuitySolution", "Finding", "LightFit", "MlpFit", "Registration", "Result", "export.ExportCheck", "export.Format",
-    "gs_sdk.GsSdkFolder", "gs_sdk.GsSdkPress", "metrics.DepthError", "metrics.SphereFit", "objects.Target", "scenes.Scene",
+    "gs_sdk.GsSdkFolder", "gs_sdk.GsSdkPress", "objects.Target", "scenes.Scene",
     "stream.Reader", "stream.TactileFrame", "stream.Unreadable",
 }  # fmt: skip
 """Results that users get and do not make: their constructors keep what they are given. (Their methods are in the table.)"""

@@ -102,23 +102,10 @@ def test_reproduce_paper_prints_figure_3_beside_the_papers(run_script, tmp_path)
 
 
 @pytest.mark.long
-def test_shadows_prints_a_row_for_each_shape_and_kind(run_script):
-    done = run_script("shadows", "--scenes", "1")
-    assert done.returncode == 0, done.stderr
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in done.stdout.splitlines()[2:]]
-    assert [row[:2] for row in rows] == [[k, s] for k in ("slope", "cast", "dirt") for s in ("ball", "capsule", "cone", "punch")]
-    assert all(0.0 < float(row[3]) <= float(row[4]) + 0.01 and bool(row[5]) == (row[0] == "cast") for row in rows)
-
-
-def test_shadows_refuses_no_scenes(run_script):
-    done = run_script("shadows", "--scenes", "0")
-    assert done.returncode == 2 and "--scenes: expected at least 1, got 0" in done.stderr
-
-
-@pytest.mark.long
 def test_export_speed_times_files_beside_the_library(run_script):
-    done = run_script("export_speed", "--size", 64, 48, "--modes", "fast", "--formats", "torchscript", "--calls", 2, "--threads", 1)
+    files = ["--size", 64, 48, "--formats", "torchscript", "--drawn"]
+    done = run_script("speed", "--only", "export", *files, "--calls", 2, "--threads", 1)
     assert done.returncode == 0, done.stderr
-    header, _, row = done.stdout.splitlines()[1:]
+    header, _, row, _ = done.stdout.splitlines()[1:]
     assert header == "| mode | library | torchscript |"
     assert row.startswith("| fast | ") and float(row.split("|")[2]) > 0.0 and row.endswith(" times |")

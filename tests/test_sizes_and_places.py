@@ -7,9 +7,9 @@ import pytest
 import torch
 
 import torchvts as vts
+from lab.drawn_sensors import drawn_sensor
 from torchvts.calibration import CalibrationWarning
 from torchvts.calibration.by_presses import error_of_lights_deg
-from torchvts.evaluation.drawn_sensors import drawn_sensor
 from torchvts.model import distance_to_presses, press_next
 from torchvts.pipeline import beyond_presses
 

@@ -4,15 +4,17 @@ import dataclasses
 from pathlib import Path
 
 import pytest
+import torch
 
-from torchvts.evaluation import rows, speed, user_speed
-from torchvts.evaluation.figures import learning_figure, speed_figure
-from torchvts.evaluation.methods import METHODS
-from torchvts.evaluation.rows import Row, Size, Time
+from lab import frames, rows, speed
+from lab.figures import learning_figure, speed_figure
+from lab.methods import METHODS
+from lab.rows import Row, Size, Time
+from torchvts.cli import bench
 
 
 def row(method, ms, rms_um, kind="scene", height=480, data="sphere R 10 mm, press 1 mm, noise 0.003"):
-    time = Time(ms, 0.1, 1000.0 / ms, 1.0, 1, "a machine")
+    time = Time(ms, 0.1, ms, None, 40, 1.0, 1, "a machine", speed.PACES[0])
     size = Size(height, height * 4 // 3)
     ours = method in METHODS and METHODS[method].ours
     return Row(kind, method, data, {"rms_um": rms_um, "normal_deg": rms_um}, size, time, ours=ours)
@@ -29,12 +31,12 @@ ROWS = [
 
 def test_scenes_are_timed_and_scored(monkeypatch):
     monkeypatch.setattr(speed, "SIZES", ((48, 64),))
-    monkeypatch.setattr(speed, "time_ms", lambda call: (call(), (2.0, 0.5))[1])
-    by_name = {r.method: r for r in speed._scenes(speed.Bench("a command", lambda name: None))}
+    monkeypatch.setattr(speed, "in_turn", lambda calls, rounds: [[1.5, 2.0, 2.5] for call in calls if call() is not None])
+    by_name = {r.method: r for r in speed.methods(lambda name: None, None)}
     assert {*speed.TIMED} - {*by_name} <= {"fast, SciPy's DCT"}
     assert by_name["fast"].errors["rms_um"] < 0.1 * by_name["flat"].errors["rms_um"]
     assert by_name["fast"].parameters == 12 and by_name["flat"].parameters == 0 and not by_name["look-up table"].ours
-    assert by_name["fast"].time.frames_per_second == 500.0 and by_name["fast"].command == "a command"
+    assert speed.ms(by_name["fast"]) == 2.0 and by_name["fast"].time.memory_mb >= 0.0
 
 
 def test_the_front_holds_what_no_row_beats():
@@ -47,7 +49,7 @@ def test_rows_come_back_from_json():
 
 
 def test_the_table_has_a_line_for_each_row():
-    lines = speed.table(ROWS).splitlines()
+    lines = rows.table(ROWS, speed.COLUMNS).splitlines()
     assert len(lines) == 2 + len(ROWS) and len({line.count("|") for line in lines}) == 1
     assert "| 640x480 | 1.00 (0.10) | 1000 | 1 | 3.000 | 3.000 |" in lines[2]
     assert speed.peer_ratios(ROWS)[0].startswith("640x480: fast 1.00 ms, 9.0 times as fast as gs_sdk's pipeline (9.0 ms)")
@@ -98,23 +100,46 @@ def test_the_learning_curve_shows_every_draw():
 
 def test_frames_are_timed_as_a_user_runs_them(monkeypatch):
     """Every pace, batches, one thread, what is paid once: the rows and their table."""
-    monkeypatch.setattr(user_speed, "SIZES", ((24, 32), (48, 64)))
-    monkeypatch.setattr(user_speed, "BATCHES", (1, 3))
-    monkeypatch.setattr(user_speed, "CAMERA_FRAMES", 12)
-    monkeypatch.setattr(user_speed, "_import_s", lambda: 0.4)
-    monkeypatch.setattr(user_speed.time, "sleep", lambda seconds, sleep=user_speed.time.sleep: sleep(min(seconds, 0.005)))
-    measured = user_speed.run(None, lambda name: None, calls=20)
-    found = {(row.size.width, row.method, row.pace, row.threads) for row in measured.frames}
-    for mode in user_speed.MODES:
-        for pace in user_speed.PACES:
-            assert {(32, mode, pace, user_speed.OWN), (64, mode, pace, user_speed.OWN), (64, mode, pace, "1")} <= found
-    assert {row.size.batch for row in measured.frames} == {1, 3} and all(row.median_ms <= row.p90_ms for row in measured.frames)
-    assert any("dropped of 12" in cost.name for cost in measured.costs) and measured.costs[0].value == 0.4
-    text = user_speed.table(measured)
+    monkeypatch.setattr(frames, "SIZES", ((24, 32), (48, 64)))
+    monkeypatch.setattr(frames, "BATCHES", (1, 3))
+    monkeypatch.setattr(frames, "CAMERA_FRAMES", 12)
+    monkeypatch.setattr(frames, "CAMERA_S", 0.005)
+    monkeypatch.setattr(frames, "_import_s", lambda: 0.4)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        measured = frames.as_user(lambda name: None, None, calls=20)
+    finally:
+        torch.set_num_threads(threads)
+    own, costs = ([row for row in measured if row.kind == kind] for kind in ("frame", "cost"))
+    found = {(row.size.width, row.method, row.time.pace, row.time.threads) for row in own}
+    for mode in frames.USED:
+        for pace in speed.PACES:
+            assert {(32, mode, pace, 2), (64, mode, pace, 2), (64, mode, pace, 1)} <= found
+    assert {row.size.batch for row in own} == {1, 3} and all(row.time.ms_median <= row.time.ms_p90 for row in own)
+    assert any("dropped of 12" in row.method for row in costs) and costs[0].errors["value"] == 0.4
+    assert rows.from_json(rows.to_json(measured)) == measured
+    text = frames.user_table(measured)
     assert "drawn rig, 64x48, threads: own choice: fast" in text and "times as fast as gs_sdk's pipeline" in text
+    assert len([line for line in text.splitlines() if line.startswith("| drawn rig | 64x48 | fast | 1 |")]) == 1
 
 
 def test_many_calls_have_a_99th_percentile():
     times = [1.0] * 985 + [9.0] * 15
-    few, many = (user_speed.summary("rig", "fast", Size(48, 64), "tight loop", "1", some) for some in (times[:100], times))
-    assert few.p99_ms is None and many.p99_ms == 9.0 and many.median_ms == 1.0
+    few, many = (speed.time_of(some) for some in (times[:100], times))
+    assert few.ms_p99 is None and many.ms_p99 == 9.0 and many.ms_median == 1.0
+    assert speed.time_of(times, frames=4).ms_median == 0.25
+
+
+def test_the_command_prints_a_line_for_each_size_and_mode(run_script, monkeypatch):
+    monkeypatch.setattr(bench, "SIZES", ((24, 32), (48, 64)))
+    monkeypatch.setattr(bench, "BATCHED", (48, 64))
+    done = run_script("bench", "--calls", 4, "--threads", 1)
+    assert done.returncode == 0, done.stderr
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in done.stdout.splitlines()[2:7]]
+    assert [line[:2] for line in lines] == [
+        ["32x24", "fast"], ["32x24", "precise"], ["64x48", "fast"], ["64x48", "precise"], ["64x48, batch 16", "fast"]
+    ]  # fmt: skip
+    assert all(float(line[3]) > 0.0 for line in lines) and "1 threads allowed" in done.stdout
+    assert done.stderr.splitlines()[0] == "measured: 32x24, fast"  # no terminal: a line a row
+    assert run_script("bench", "--calls", 0).returncode == 2

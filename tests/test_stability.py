@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchvts.evaluation import stability
-from torchvts.evaluation.gallery import CORRUPTIONS, undisturbed
-from torchvts.evaluation.methods import METHODS, Method
-from torchvts.evaluation.rows import Row
-from torchvts.evaluation.stability import MASK, SWEPT, Breaking
+from lab import stability
+from lab.gallery import CORRUPTIONS, undisturbed
+from lab.methods import METHODS, Method
+from lab.rows import Row
+from lab.stability import MASK, SWEPT, Breaking
 
 ROOT = Path(__file__).resolve().parents[1]
 POINTS, SEEDS = stability.points_from_json((ROOT / "tests" / "breaking_points.json").read_text())
@@ -179,56 +179,20 @@ def test_pages_list_breaking_points():
 SMALL = {"methods": ["flat", "fast"], "corruptions": ["noise"], "seeds": 1}
 
 
-def test_a_sweep_goes_on_where_it_was_stopped(tmp_path, monkeypatch):
-    path, count = tmp_path / "rows.jsonl", []
-    rows = stability.sweep(path, **SMALL, progress=lambda: count.append(1))
-    assert len(rows) == len(count) == 12 == len(path.read_text().splitlines()) - 1
-    whole = path.read_text()
-    lines = whole.splitlines(keepends=True)
-    path.write_text("".join(lines[:6]) + lines[6][:20])  # killed while it wrote
-    made = []
-    original = stability.measure
-    monkeypatch.setattr(stability, "measure", lambda *a: made.append(a[:4]) or original(*a))
-    assert stability.sweep(path, **SMALL) == rows and len(made) == 7
-    assert path.read_text() == whole
-    stability.sweep(path, ["flat", "fast"], ["noise"], 2)
-    assert len(made) == 7 + 12  # only the second seed
+def test_a_sweep_has_a_row_for_each_severity_and_method():
+    count = []
+    rows = stability.sweep(**SMALL, progress=lambda: count.append(1))
+    assert len(rows) == len(count) == 12
+    assert [(row.severity, row.method) for row in rows[:3]] == [(0.002, "flat"), (0.002, "fast"), (0.005, "flat")]
 
 
 @pytest.mark.long
-def test_processes_measure_the_same(tmp_path):
-    alone, shared = (stability.sweep(tmp_path / f"{workers}.jsonl", **SMALL, workers=workers) for workers in (0, 2))
+def test_processes_measure_the_same():
+    alone, shared = (stability.sweep(**SMALL, workers=workers) for workers in (0, 2))
     assert [row.method for row in alone] == [row.method for row in shared]
     for one, other in zip(alone, shared):
         assert (one.data, one.severity, one.seed) == (other.data, other.severity, other.seed)
         assert other.errors == pytest.approx(one.errors, rel=1e-3)
-
-
-def test_rows_of_another_state_are_measured_again(tmp_path, monkeypatch):
-    path = tmp_path / "rows.jsonl"
-    stability.sweep(path, ["flat"], ["noise"], 1)
-    monkeypatch.setattr(stability, "fingerprint", lambda: "another")
-    count = []
-    monkeypatch.setattr(stability, "measure", lambda *a, measure=stability.measure: count.append(1) or measure(*a))
-    stability.sweep(path, ["flat"], ["noise"], 1)
-    assert len(count) == 6 and '"another"' in path.read_text().splitlines()[0]
-
-
-def test_a_file_that_holds_something_else_is_kept(tmp_path):
-    path = tmp_path / "notes.txt"
-    path.write_text("what I measured last week")
-    with pytest.raises(ValueError, match="not a file of rows"):
-        stability.sweep(path, ["flat"], ["noise"], 1)
-    assert path.read_text() == "what I measured last week"
-
-
-def test_unknown_names_are_refused(tmp_path):
-    for names, message in (
-        ({"methods": ["best"]}, "methods: expected some of flat, fast"),
-        ({"corruptions": ["fire"]}, "corruptions: expected"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            stability.sweep(tmp_path / "new.jsonl", **names)
 
 
 def test_errors_grow_with_noise():
@@ -244,7 +208,7 @@ def test_the_script_writes_table_rows_and_pictures(run_script, monkeypatch, tmp_
     assert done.returncode == 0, done.stderr
     assert "| vignetting, 0 to 0.9 share | always | never | never |" in done.stdout and stability.LIMITS in done.stdout
     assert {path.name for path in tmp_path.iterdir()} == {
-        "breaking_points.json", "breaking_points.md", "overview.png", "rows.jsonl", "vignetting.png"
+        "breaking_points.json", "breaking_points.md", "overview.png", "vignetting.png"
     }  # fmt: skip
     points, seeds = stability.points_from_json((tmp_path / "breaking_points.json").read_text())
     assert seeds == 1 and [point.method for point in points] == ["flat", "fast", MASK]

@@ -21,10 +21,10 @@ import torch
 from conftest import Frames, write_film
 
 import torchvts as vts
+from lab.latency import measure_latency
 from torchvts import stream as streams
 from torchvts.accelerated import reference_only
 from torchvts.core.files import read_frames, rgb_from_bgr
-from torchvts.evaluation.latency import measure_latency
 
 ROOT = Path(__file__).resolve().parents[1]
 PITCH = 0.25

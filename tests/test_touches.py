@@ -9,10 +9,9 @@ import pytest
 import torch
 
 import torchvts as vts
-import torchvts.evaluation.score
+from lab import metrics, score
 from torchvts.calibration.field import Family
 from torchvts.calibration.touches import BRIGHTNESS_POWER, multiplied
-from torchvts.evaluation import metrics, score
 from torchvts.model.response_field import ResponseField, ResponseModel, SensorPrior, fit_log_background, position_basis
 
 PITCH, HEIGHT, WIDTH = 0.125, 120, 160

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 import torchvts as vts
+from lab import pose_accuracy, tracking
 from torchvts.accelerated import library, reference_only
 from torchvts.cli.track import record
 from torchvts.core.frame import DepthOutput
-from torchvts.evaluation import pose_accuracy, tracking
 from torchvts.pose import tracker as tracker_module
 from torchvts.pose.follow import _follow_best, _follow_from, _pixels, follow
 from torchvts.pose.graph import Edge, KeyframeGraph
@@ -815,11 +815,12 @@ def test_a_row_of_the_table_counts_what_must_be_seen():
     motion_ = tracking.Motion(4, lambda k, seed: objects.pose(0.0, press_mm=0.5 if k != 2 else -1.0), lost=(2,))
     poses = [motion_.pose(k, 0) for k in range(4)]
     track = tracking.Track(poses, [_bad(press(objects.key(), pose)) for pose in poses], PITCH)
-    row = tracking.follow_track(track, motion_, tracking.TrackRow("key", "lift-off", "none"))
-    assert row.lost == [2] and row.unnoticed == [] and row.uncertain == [] and row.wrong == [] and len(row.ms) == 3
+    row = tracking.follow_track(track, motion_, tracking.track_row("key", "lift-off", "none"))
+    assert row.each["lost"] == [2] and len(row.each["ms"]) == 3
+    assert not any(row.each[key] for key in ("unnoticed", "uncertain", "wrong"))
     assert "| key" in tracking.tracking_table([row])
-    blind = tracking.follow_track(track, tracking.Motion(4, motion_.pose, (1, 2)), tracking.TrackRow("key", "x", "y"))
-    assert blind.unnoticed == [1]
+    blind = tracking.follow_track(track, tracking.Motion(4, motion_.pose, (1, 2)), tracking.track_row("key", "x", "y"))
+    assert blind.each["unnoticed"] == [1]
 
 
 def test_a_row_of_the_file_holds_pose_and_reason():
@@ -849,15 +850,15 @@ def test_a_rig_of_known_lights_alone_measures_the_depth_of_steep_flanks(turn):
 def test_rendered_objects_meet_the_goal(name, motion_, most_mm):
     """Asked is the slow motion: 90 degrees in 40 frames, medians of 0.05 degrees and 0.01 mm. The fast one has 14 frames."""
     ((row, _),) = tracking.run_tracking([name], [motion_], ["noise 0.005"], [4])
-    assert row.lost == [] and row.wrong == []
-    assert float(np.median(row.deg)) < 0.05 and float(np.median(row.mm)) < most_mm and max(row.deg) < 0.3
+    assert row.each["lost"] == [] and row.each["wrong"] == []
+    assert float(np.median(row.each["deg"])) < 0.05 and float(np.median(row.each["mm"])) < most_mm and max(row.each["deg"]) < 0.3
 
 
 @pytest.mark.long
 def test_a_frame_before_lift_off_keeps_the_rotations_that_it_calls_unknown():
     """They followed the coarse grid by 5 degrees, though no step of the fine one was allowed to."""
     ((row, track),) = tracking.run_tracking(["bolt head"], ["lift-off"], ["noise 0.005"], [1])
-    assert max(row.deg) < 0.2 and row.wrong == []
+    assert max(row.each["deg"]) < 0.2 and row.each["wrong"] == []
     tracker, unknown, last = vts.PoseTracker(track.frames[0], track.mm_per_pixel), 0, np.eye(4)
     for frame in track.frames[1:10]:
         found = tracker(frame)
@@ -872,13 +873,13 @@ def test_a_frame_before_lift_off_keeps_the_rotations_that_it_calls_unknown():
 def test_heights_show_the_tilt_that_wrong_slopes_hide():
     """Slopes alone give 0.28 degrees, median."""
     ((row, _),) = tracking.run_tracking(["gear"], ["fast"], ["slopes off by 3 degrees"], [4], [4])
-    assert float(np.median(row.deg)) < 0.2 and row.lost == [] and row.wrong == []
+    assert float(np.median(row.each["deg"])) < 0.2 and row.each["lost"] == [] and row.each["wrong"] == []
 
 
 @pytest.mark.long
 def test_slopes_that_err_over_wide_areas_are_no_reason_for_confidence():
     ((row, track),) = tracking.run_tracking(["tool handle"], ["fast"], ["slopes off by 3 degrees"], [4], [4])
-    assert max(row.deg) > 0.6 and row.lost == [] and row.wrong == []
+    assert max(row.each["deg"]) > 0.6 and row.each["lost"] == [] and row.each["wrong"] == []
     tracker = vts.PoseTracker(track.frames[0], track.mm_per_pixel)
     for frame in track.frames[1:6]:
         found = tracker(frame)
@@ -914,6 +915,6 @@ def test_normalflow_gets_its_own_axes_and_its_poses_are_read_in_ours():
         return moved
 
     peer = tracking.NormalFlow(Frame, register, LookupError)
-    row = tracking.follow_by_normalflow(track, peer, tracking.TrackRow("key", "slow", "none"))
-    assert row.lost == [2] and len(row.ms) == 2
-    assert max(row.deg) < 1e-4 and max(row.mm) < 1e-4
+    row = tracking.follow_by_normalflow(track, peer, tracking.track_row("key", "slow", "none"))
+    assert row.each["lost"] == [2] and len(row.each["ms"]) == 2
+    assert max(row.each["deg"]) < 1e-4 and max(row.each["mm"]) < 1e-4

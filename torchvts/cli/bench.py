@@ -1,83 +1,135 @@
-"""Measure speed as a user meets it, then speed and error of all methods together; print the tables, and draw the second.
+"""Measure how many frames a second this machine makes: a drawn sensor, by size, mode and batch; print the table.
 
-Methods of other libraries are timed in the same run. Rows of a real sensor need ../shared/data or the folder in TORCHVTS_DATA.
+In a tight loop one frame follows the other; every 20 ms, as behind a camera, caches have gone cold and a frame takes longer.
 
 example:
-  torchvts bench --out out/bench --threads 2
+  torchvts bench --threads 2
 """
 
 import argparse
-import dataclasses
-import json
+import os
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
-from .. import viz
 from ..accelerated import library
 from ..core.checks import check_integer
-from ..evaluation import figures, rows, speed, user_speed
-from ..evaluation.sets import data_folder
-from .options import add_out
+from ..core.tables import markdown
+from ..model import Calibration, PointLights, Sensor
+from ..pipeline import DepthPipeline
+from ..scenes import Scene, render, sphere_press
 
-USAGE = "[--out FOLDER] [--threads N] [--only user|methods] [--long] [--chart FILE]"
+USAGE = "[--threads N] [--calls N]"
+
+SIZES = ((120, 160), (240, 320), (480, 640), (960, 1280))
+"""Rows and columns of the frames."""
+
+MODES = ("fast", "precise")
+BATCH, BATCHED = 16, SIZES[1]
+"""Frames in one call in the row of a batch, and their size."""
+
+CAMERA_S = 0.02
+"""Between two frames of a camera of 50 frames a second."""
+
+WARM_UP = 3
+"""Calls that come before those that count."""
+
+
+class Rig(NamedTuple):
+    """A drawn unit: the calibration of its three known lights, an exact press of a ball, and its image (1, 3, H, W)."""
+
+    calibration: Calibration
+    scene: Scene
+    image: Tensor
+
+
+def rig(height: int, width: int) -> Rig:
+    """The drawn unit: a ball of 10 mm radius pressed 1 mm into a field 40 mm wide, noise of 0.003 and 8 bits.
+
+    Args:
+        height: rows of the image.
+        width: columns of the image.
+    """
+    pitch = 40.0 / width
+    lights = PointLights([[24.6, 15.0, 34.0], [-25.4, 14.1, 33.0], [0.9, -29.1, 35.0]], [1000.0, 1000.0, 1000.0])
+    scene = sphere_press(10.0, 1.0, height=height, width=width, mm_per_pixel=pitch)
+    image = render(scene, lights, noise_std=0.003, bits=8).detach()
+    return Rig(Calibration.from_lights(lights, Sensor("bench", height, width, pitch)), scene, image)
+
+
+def in_turn(calls: Sequence[Callable[[], object]], rounds: int) -> list[list[float]]:
+    """Time of several calls, one after the other in turn, so that each finds the caches as the one before left them.
+
+    Args:
+        calls: one alone is a tight loop; after a sleep it is a frame behind a camera.
+        rounds: times that count of each call, after :data:`WARM_UP`.
+    Returns:
+        Times of each call, ms.
+    Example:
+        >>> [len(times) for times in in_turn([lambda: None, lambda: None], 4)]
+        [4, 4]
+    """
+    found: list[list[float]] = [[] for _ in calls]
+    with torch.inference_mode():
+        for _ in range(rounds + WARM_UP):
+            for call, times in zip(calls, found, strict=True):
+                start = time.perf_counter()
+                call()
+                times.append(1000.0 * (time.perf_counter() - start))
+    return [times[WARM_UP:] for times in found]
+
+
+def machine() -> str:
+    """Processor, cores, threads and torch in words, and whether the compiled kernels are there."""
+    kernels = "compiled kernels" if library() is not None else "NO COMPILED KERNELS: PyTorch alone, 4 to 17 times as slow"
+    allowed = f"{os.cpu_count()} cores, {torch.get_num_threads()} threads allowed"
+    return f"{platform.machine()}, {allowed}, torch {torch.__version__}, {kernels}"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
-    add_out(parser, "for the tables and the chart (out/bench)", "out/bench")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads(), metavar="N", help="all cores if not given")
-    parser.add_argument("--only", choices=("user", "methods"), help="measure one of the two tables")
-    parser.add_argument("--calls", type=int, default=100, metavar="N", help="frames of each row of the user's table (100)")
-    parser.add_argument("--long", action="store_true", help="10,000 frames every 20 ms too, for the 99th percentile")
-    parser.add_argument("--chart", type=Path, metavar="FILE", help="write the chart of errors here too")
+    parser.add_argument("--calls", type=int, default=100, metavar="N", help="frames that are timed of each row (100)")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure, write tables and the chart, and print the tables."""
+    """Measure, and print the table."""
+    calls = check_integer("--calls", arguments.calls, 1)
     torch.set_num_threads(check_integer("--threads", arguments.threads, 1))
-    folder = data_folder(str(Path(__file__).parent))
-    data = folder if (folder / "gelsight_mini_a").is_dir() else None
-    if library() is None:
-        print("no compiled kernels: PyTorch does all the work, which takes 4 to 17 times as long")
-    if arguments.only != "methods":
-        _as_user(arguments, data)
-    if arguments.only != "user":
-        _methods(arguments, data)
+    lines = []
+    with tqdm(measure(calls), total=len(MODES) * len(SIZES) + 1, unit="row", leave=False, disable=None) as rows:
+        for line in rows:
+            lines.append(line)
+            if not sys.stderr.isatty():
+                print(f"measured: {line[0]}, {line[1]}", file=sys.stderr)
+    print(markdown(["size", "mode", "tight loop: ms, median, 90 %", "frames/s", "every 20 ms: ms, median, 90 %"], lines))
+    print(f"\na drawn sensor of three lights, from an image to a DepthOutput\n{machine()}")
     return 0
 
 
-def _as_user(arguments: argparse.Namespace, data: Path | None) -> None:
-    """The table of frames as a user runs them."""
-    with tqdm(unit="row", disable=None) as bar:
-        measured = user_speed.run(data, partial(_show, bar), arguments.calls, arguments.long)
-    text = user_speed.table(measured)
-    rows.write_files(
-        arguments.out, {"user.md": text + "\n", "user.json": json.dumps(measured, default=dataclasses.asdict, indent=1)}
-    )
-    print(text)
-    print(f"\nuser.md and user.json in {arguments.out}")
+def measure(calls: int) -> Iterator[list[str]]:
+    """A line of the table for each size and mode, and for a batch; of large frames a quarter of the calls."""
+    for height, width in SIZES:
+        unit = rig(height, width)
+        for mode in MODES:
+            frame = partial(DepthPipeline.from_calibration(unit.calibration, mode), unit.image)
+            rounds = max(1, calls // (4 if height > 480 else 1))
+            tight = in_turn([frame], rounds)[0]
+            behind = in_turn([partial(time.sleep, CAMERA_S), frame], rounds)[1]
+            yield [f"{width}x{height}", mode, _cell(tight), f"{1000.0 / statistics.median(tight):.0f}", _cell(behind)]
+        if (height, width) == BATCHED:
+            batch = partial(DepthPipeline.from_calibration(unit.calibration), unit.image.repeat(BATCH, 1, 1, 1))
+            times = [value / BATCH for value in in_turn([batch], max(1, calls // BATCH))[0]]
+            yield [f"{width}x{height}, batch {BATCH}", "fast", _cell(times), f"{1000.0 / statistics.median(times):.0f}", ""]
 
 
-def _methods(arguments: argparse.Namespace, data: Path | None) -> None:
-    """The table of all methods with their errors, and error against time."""
-    command = f"torchvts bench --threads {arguments.threads}"
-    with tqdm(unit="row", disable=None) as bar:
-        measured = speed.run(command, partial(_show, bar), data)
-    time = measured[0].time
-    machine = f"{time.machine}, {arguments.threads} threads, float32" if time else ""
-    text = "\n".join([speed.table(measured), "", machine, *speed.peer_ratios(measured)])
-    rows.write_files(arguments.out, {"bench.md": text + "\n", "bench.json": rows.to_json(measured)})
-    print(text)
-    figure = figures.speed_figure(measured)
-    for path in filter(None, (arguments.out / "speed_accuracy.png", arguments.chart)):
-        viz.save_figure(figure, path)
-    print(f"\nbench.md, bench.json and speed_accuracy.png in {arguments.out}")
-
-
-def _show(bar: Any, name: str) -> None:
-    bar.set_postfix_str(name)
-    bar.update()
+def _cell(times: list[float]) -> str:
+    return f"{statistics.median(times):.2f}, {sorted(times)[int(0.9 * len(times))]:.2f}"

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from torch import Tensor
 
 from ..calibration import CalibrationWarning, Press, Touch, calibrate
-from ..evaluation.rows import markdown, number
+from ..core.tables import markdown, number
 from ..model import Calibration, PointLights, Sensor
 from ..model.coverage import press_next
 from ..model.report import CandidateRow, PressRow, Report

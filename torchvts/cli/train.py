@@ -11,7 +11,7 @@ import argparse
 from pathlib import Path
 
 from ..calibration import read_presses
-from ..evaluation.presses import train_network
+from ..training.presses import train_network
 from .options import add_sensor, load_sensor
 from .parser import UsageError
 

@@ -14,13 +14,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..calibration import Press
-from ..core.blur import blur, gaussian_weights
-from ..core.checks import check_integer
-from ..core.geometry import pixel_grid_mm
-from ..model import Sensor
-from ..scenes import Scene, hanging_skin
-from ..scenes import objects as solids
+from torchvts.calibration import Press
+from torchvts.core.blur import blur, gaussian_weights
+from torchvts.core.checks import check_integer
+from torchvts.core.geometry import pixel_grid_mm
+from torchvts.model import Sensor
+from torchvts.scenes import Scene, hanging_skin
+from torchvts.scenes import objects as solids
+
 from .faults import jpeg
 
 SEEDS = tuple(range(8))

@@ -1,8 +1,6 @@
 """The one record of a measurement, a :class:`Row`: speed, stability and evaluation write it as Markdown and as JSON."""
 
-import csv
 import dataclasses
-import io
 import json
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -10,7 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..core.files import make_folder, write_atomically
+from torchvts.core.files import make_folder, write_atomically
+from torchvts.core.tables import markdown, number
 
 
 @dataclass(frozen=True)
@@ -35,18 +34,24 @@ class Time:
     Attributes:
         ms_median: median time, ms.
         ms_iqr: interquartile range of the time, ms.
-        frames_per_second: by the median.
-        memory_mb: largest memory that one call holds beside its inputs, MB.
-        threads: number of threads.
+        ms_p90: 90th percentile, ms.
+        ms_p99: 99th, ms; None for fewer than 500 calls.
+        calls: number of calls that were timed.
+        memory_mb: largest memory that one call holds beside its inputs, MB; None if it was not measured.
+        threads: number of threads that torch may use.
         machine: kind of processor, number of cores, version of torch.
+        pace: what came before each call.
     """
 
     ms_median: float
     ms_iqr: float
-    frames_per_second: float
+    ms_p90: float
+    ms_p99: float | None
+    calls: int
     memory_mb: float | None
     threads: int
     machine: str
+    pace: str
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,8 @@ class Row:
 
     Attributes:
         kind: what was measured: "scene" (exact truth), "sensor" (balls on a real sensor), "corruption" (a scene of the gallery),
-            "presses" (balls, objects) or "coverage" (of bounds of confidence; ``method`` is the shape that was pressed in).
+            "presses" (balls, objects), "coverage" (of bounds of confidence; ``method`` is the shape that was pressed in), "frame"
+            (as a user runs it), "cost" (what is paid once), "pose" or "track" (of objects).
         method: its name.
         data: name of the scene, the corruption or the presses.
         errors: value by name, such as "normal_deg"; None where nothing could be measured.
@@ -69,6 +75,7 @@ class Row:
         seen: whether the method has learned from the very frames that it is scored on.
         command: command that made the row.
         note: an error, a warning or a remark.
+        each: values of each frame by name, where not only their means are kept.
     """
 
     kind: str
@@ -85,6 +92,7 @@ class Row:
     seen: bool = False
     command: str = ""
     note: str = ""
+    each: dict[str, list[float]] = field(default_factory=dict)
 
     def error(self, name: str) -> float | None:
         """One error; None if it was not measured."""
@@ -98,11 +106,6 @@ class Column(NamedTuple):
     cell: Callable[[Row], str]
 
 
-def number(value: float | None, digits: int) -> str:
-    """A value with so many digits after the point; empty for None."""
-    return "" if value is None else f"{value:.{digits}f}"
-
-
 def error_column(title: str, name: str, digits: int) -> Column:
     """Column of one of a row's errors."""
     return Column(title, lambda row: number(row.error(name), digits))
@@ -113,52 +116,6 @@ def table(rows: Iterable[Row], columns: Sequence[Column]) -> str:
     return markdown([column.title for column in columns], [[column.cell(row) for column in columns] for row in rows])
 
 
-def markdown(titles: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    """A Markdown table of texts.
-
-    Example:
-        >>> print(markdown(["method", "ms"], [["fast", "2.0"]]))
-        | method | ms |
-        |---|---|
-        | fast | 2.0 |
-    """
-    head = ["| " + " | ".join(titles) + " |", "|" + "---|" * len(titles)]
-    return "\n".join(head + ["| " + " | ".join(cells) + " |" for cells in lines])
-
-
-def to_csv(rows: Sequence[Row]) -> str:
-    """Rows as comma-separated values: a column for each error that a row has."""
-    text = io.StringIO()
-    names = list(dict.fromkeys(name for row in rows for name in row.errors))
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["data", "method", *names, "parameters", "frames", "seen", "note"])
-    for row in rows:
-        errors = [row.error(name) for name in names]
-        table.writerow([row.data, row.method, *errors, row.parameters, row.frames, int(row.seen), row.note])
-    return text.getvalue()
-
-
-def latex(titles: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    r"""A LaTeX table of texts, for the package booktabs.
-
-    Example:
-        >>> print(latex(["method", "radius %"], [["fast", "2.0"]]))
-        \begin{tabular}{ll}
-        \toprule
-        method & radius \% \\
-        \midrule
-        fast & 2.0 \\
-        \bottomrule
-        \end{tabular}
-    """
-    special = str.maketrans(
-        {"\\": r"\textbackslash{}", **{c: "\\" + c for c in "%_&#${}"}, "<": r"\textless{}", ">": r"\textgreater{}"}
-    )
-    head, *body = [" & ".join(cell.translate(special) for cell in cells) + r" \\" for cells in (titles, *lines)]
-    rules = (rf"\begin{{tabular}}{{{'l' * len(titles)}}}", r"\toprule", head, r"\midrule", *body, r"\bottomrule", r"\end{tabular}")
-    return "\n".join(rules)
-
-
 def to_json(rows: Iterable[Row]) -> str:
     """Rows as a JSON list, one object each."""
     return json.dumps([dataclasses.asdict(row) for row in rows], indent=1)
@@ -166,13 +123,12 @@ def to_json(rows: Iterable[Row]) -> str:
 
 def from_json(text: str) -> list[Row]:
     """The rows that :func:`to_json` wrote."""
-    return [row_from_dict(values) for values in json.loads(text)]
 
+    def row(values: dict[str, Any]) -> Row:
+        size, time = values["size"], values["time"]
+        return Row(**(values | {"size": size and Size(**size), "time": time and Time(**time)}))
 
-def row_from_dict(values: dict[str, Any]) -> Row:
-    """The row whose ``dataclasses.asdict`` is given."""
-    size, time = values["size"], values["time"]
-    return Row(**(values | {"size": size and Size(**size), "time": time and Time(**time)}))
+    return [row(values) for values in json.loads(text)]
 
 
 def write_files(folder: Path, files: Mapping[str, str]) -> None:

@@ -13,12 +13,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..core.geometry import pixel_grid_mm
-from ..model.calibration import Calibration
-from ..model.lights import PointLights
-from ..model.sensor import Sensor
-from ..scenes import Scene, skin_spots, smooth_step, surface, surface_at, undeformed
-from .faults import Conditions, photograph
+from torchvts.core.geometry import pixel_grid_mm
+from torchvts.model.calibration import Calibration
+from torchvts.model.lights import PointLights
+from torchvts.model.sensor import Sensor
+from torchvts.scenes import Scene, skin_spots, smooth_step, surface, surface_at, undeformed
+
+from .faults import Conditions, photograph, ring_lights
 
 HEIGHT, WIDTH, MM_PER_PIXEL = 120, 160, 0.125
 RADIUS_MM, PRESS_MM = 6.0, 1.0
@@ -64,11 +65,9 @@ class Corruption:
 def rig_lights(elevation_deg: float = ELEVATION_DEG, spacing_deg: float = SPACING_DEG) -> PointLights:
     """Lights that give a flat skin the value 0.45, or less if they stand lower: then slopes that face them are brighter."""
     elevation = math.radians(elevation_deg)
-    azimuths = [math.radians(10.0 + k * spacing_deg) for k in range(3)]
-    across, up = LIGHT_DISTANCE_MM * math.cos(elevation), LIGHT_DISTANCE_MM * math.sin(elevation)
     level = 0.45 * min(1.0, math.sin(elevation) / math.sin(math.radians(ELEVATION_DEG)))
-    albedo = level * LIGHT_DISTANCE_MM**3 / up
-    return PointLights([[across * math.cos(a), across * math.sin(a), up] for a in azimuths], [albedo] * 3).requires_grad_(False)
+    out, up = LIGHT_DISTANCE_MM * math.cos(elevation), LIGHT_DISTANCE_MM * math.sin(elevation)
+    return ring_lights(out, up, level=level, spacing_deg=spacing_deg)
 
 
 LIGHTS = rig_lights()

@@ -12,15 +12,16 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..accelerated import AdaptiveIntegration, Compensate, NormalFromIntensity, PerspectiveIntegration, reference_only
-from ..calibration import RESPONSE_BLUR_PX, with_preprocessing
-from ..integration import PoissonDST
-from ..model import Calibration, ResponseModel, Sensor
-from ..normals import NormalFromLookup, NormalFromMLP
-from ..pipeline import DepthOutput, DepthPipeline
-from ..scenes import render, sphere_press
+from torchvts.accelerated import AdaptiveIntegration, Compensate, NormalFromIntensity, PerspectiveIntegration, reference_only
+from torchvts.calibration import RESPONSE_BLUR_PX, with_preprocessing
+from torchvts.integration import PoissonDST
+from torchvts.model import Calibration, ResponseModel, Sensor
+from torchvts.normals import NormalFromLookup, NormalFromMLP
+from torchvts.pipeline import DepthOutput, DepthPipeline
+from torchvts.scenes import render, sphere_press
+from torchvts.training.presses import Training, quiet_calibrate, train_network, training_pixels
+
 from .peers import GsSdkPipeline, PoissonSciPy, as_output
-from .presses import Training, quiet_calibrate, train_network, training_pixels
 
 GIVEN_NETWORK = "given network"
 """Name of a network that was trained before."""
@@ -204,9 +205,9 @@ def lookup_table(training: Training) -> Built:
     return pipeline(unit, "fast", block)._replace(parameters=block.table.numel(), used=len(training.located))
 
 
-def network(training: Training, seed: int = 0) -> Built:
+def network(training: Training) -> Built:
     """gs_sdk's RGBXY network, trained on these presses, and a frame in the steps of gs_sdk."""
-    fit = train_network(training.background, training.located, training.sensor, seed=seed)
+    fit = train_network(training.background, training.located, training.sensor)
     note = "" if fit.converged else "stopped before it converged"
     return _as_gs_sdk(fit.module, training, note)._replace(used=len(training.located))
 

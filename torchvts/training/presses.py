@@ -10,12 +10,11 @@ import torch
 from torch import Tensor, nn
 
 from ..accelerated import Compensate
-from ..calibration import RESPONSE_BLUR_PX, CalibrationWarning, Press, by_presses, calibrate
-from ..calibration.response_fit import Candidates
+from ..calibration import RESPONSE_BLUR_PX, CalibrationWarning, Press, calibrate
 from ..core.checks import check_image
 from ..model import Calibration, Sensor
 from ..training import MlpFit, fit_mlp
-from .score import ball_truth
+from .balls import ball_truth
 
 
 class Training:
@@ -64,10 +63,6 @@ class Training:
             if press.name in used
         ]
 
-    def of_family(self, degree: int, product_degree: int) -> Calibration:
-        """Calibration by the located presses and response fields of that size alone."""
-        return by_presses(self.background, self.sensor, self.located, None, False, Candidates(((degree, product_degree, -1),))).unit
-
 
 class TrainingPixels(NamedTuple):
     """Pixels on balls.
@@ -108,7 +103,7 @@ def quiet_calibrate(
 
 
 def training_pixels(compensate: nn.Module, presses: Sequence[Press], mm_per_pixel: float) -> TrainingPixels:
-    """Pixels on balls, :data:`torchvts.evaluation.score.RIM_PX` inside their contact radius, and the slope there.
+    """Pixels on balls, :data:`torchvts.training.balls.RIM_PX` inside their contact radius, and the slope there.
 
     Args:
         compensate: module that prepares the images.

@@ -1,6 +1,5 @@
 """Where each method breaks: methods are measured at every severity of the gallery's corruptions, until a limit is exceeded."""
 
-import hashlib
 import json
 import math
 import multiprocessing
@@ -10,17 +9,16 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
 
-from ..core import __version__
-from ..core.files import write_atomically
+from torchvts.core.tables import markdown
+
 from .gallery import CORRUPTIONS, Case, Corruption
 from .methods import METHODS
 from .metrics import depth_error, mask_iou, normal_angle_deg
-from .rows import Row, markdown, row_from_dict
+from .rows import Row
 
 SWEPT = (
     "flat", "fast", "precise", "auto", "fast, zero border", "precise, plain inverse", "precise, blur 1 px",
@@ -50,8 +48,6 @@ TOLERANCE = 0.15
 """Share of the interval between two severities by which a breaking point may move before a test reports it."""
 
 At = float | Literal["never", "always"]
-Key = tuple[str, str, float, int]
-"""Method, corruption, severity and seed of a row."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +107,7 @@ def measure(method: str, corruption: str, severity: float, seed: int, case: Case
     between normals), "rms_um" and "largest_px" (depth), "iou" (mask), "press_um" (true depth of the press).
 
     Example:
-        >>> from torchvts.evaluation.gallery import undisturbed
+        >>> from lab.gallery import undisturbed
         >>> round(measure("fast", "noise", 0.002, 0, undisturbed()).error("normal_deg"), 1)
         0.6
     """
@@ -144,49 +140,32 @@ def measure(method: str, corruption: str, severity: float, seed: int, case: Case
 
 
 def sweep(
-    path: str | Path,
     methods: Sequence[str] = SWEPT,
     corruptions: Sequence[str] = tuple(CORRUPTIONS),
     seeds: int = 3,
     workers: int = 0,
     progress: Callable[[], object] = lambda: None,
 ) -> list[Row]:
-    """Measure every method at every severity of every corruption.
+    """Measure every method at every severity of every corruption, by corruption, severity, seed and method.
 
-    Each row is written to a file of JSON lines, and a later call continues from that file. The first line names the state of this
-    package; from another state it begins anew. ``progress`` is called for each row; without workers this process does the work.
-
-    Returns:
-        The rows asked for, by corruption, severity, seed and method.
-    Raises:
-        ValueError: an unknown name, or a file that holds something else.
+    ``progress`` is called for each row; without workers this process does the work.
     """
-    path = Path(path)
-    for name, values, known in (("methods", methods, METHODS), ("corruptions", corruptions, CORRUPTIONS)):
-        if unknown := [value for value in values if value not in known]:
-            raise ValueError(f"{name}: expected some of {', '.join(known)}, got {unknown[0]!r}")
-    kept = _read(path)
-    asked = [(name, severity, seed) for name in corruptions for severity in CORRUPTIONS[name].severities for seed in range(seeds)]
-    jobs = [(place, [method for method in methods if (method, *place) not in kept]) for place in asked]
-    for _ in range(len(asked) * len(methods) - sum(len(missing) for _, missing in jobs)):
-        progress()
-    jobs = [job for job in jobs if job[1]]
-    with path.open("a", encoding="utf-8") as stream, _pool(workers) as map_jobs:
+    jobs = [
+        ((name, severity, seed), methods)
+        for name in corruptions
+        for severity in CORRUPTIONS[name].severities
+        for seed in range(seeds)
+    ]
+    found: list[Row] = []
+    with _pool(workers) as map_jobs:
         for rows in map_jobs(_measure_all, jobs):
-            stream.write("".join(json.dumps(asdict(row)) + "\n" for row in rows))
-            stream.flush()
-            for row in rows:
-                kept[_key(row)] = row
+            found += rows
+            for _ in rows:
                 progress()
-    return [kept[(method, *place)] for place in asked for method in methods]
+    return found
 
 
-def _key(row: Row) -> Key:
-    assert row.severity is not None and row.seed is not None
-    return row.method, row.data, row.severity, row.seed
-
-
-def _measure_all(job: tuple[tuple[str, float, int], list[str]]) -> list[Row]:
+def _measure_all(job: tuple[tuple[str, float, int], Sequence[str]]) -> list[Row]:
     """Some methods on one case, which is made once."""
     (corruption, severity, seed), methods = job
     case = CORRUPTIONS[corruption].make(severity, seed)
@@ -202,26 +181,6 @@ def _pool(workers: int) -> Iterator[Callable[..., Iterable[list[Row]]]]:
     context = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
     with ProcessPoolExecutor(workers, context, torch.set_num_threads, (1,)) as pool:
         yield pool.map
-
-
-def fingerprint() -> str:
-    """Fingerprint of the package's sources: rows of different states must not be mixed."""
-    digest = hashlib.sha256(f"{__version__} {torch.__version__}".encode())
-    for file in sorted(Path(__file__).parents[1].rglob("*.py")):
-        digest.update(file.read_bytes())
-    return digest.hexdigest()[:16]
-
-
-def _read(path: Path) -> dict[Key, Row]:
-    """The rows of this state of the package in a file. It then holds no others: those, and a line cut short, are measured again."""
-    head = json.dumps({"stability": fingerprint()}) + "\n"
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.is_file() else []
-    if lines and not lines[0].startswith('{"stability"'):
-        raise ValueError(f"{path}: not a file of rows, and it would be overwritten: give another path")
-    kept = [line for line in lines[1:] if line.endswith("\n")] if lines[:1] == [head] else []
-    with write_atomically(path) as temporary:
-        temporary.write_text("".join([head, *kept]), encoding="utf-8")
-    return {_key(row): row for row in (row_from_dict(json.loads(line)) for line in kept)}
 
 
 # breaking points

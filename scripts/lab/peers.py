@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..accelerated import Compensate
-from ..core.geometry import normal_from_gradient
-from ..integration import divergence, poisson_dct
-from ..model import gs_sdk
-from ..normals import NormalFromMLP
-from ..pipeline import DepthOutput
+from torchvts.accelerated import Compensate
+from torchvts.core.geometry import normal_from_gradient
+from torchvts.integration import divergence, poisson_dct
+from torchvts.model import gs_sdk
+from torchvts.normals import NormalFromMLP
+from torchvts.pipeline import DepthOutput
 
 
 class PoissonSciPy(nn.Module):

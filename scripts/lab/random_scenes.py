@@ -9,10 +9,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .. import scenes
-from ..calibration import CalibrationWarning, Press, by_presses, calibrate
-from ..model import Calibration, PointLights, Sensor
-from ..model.report import PressRow, Report
+from torchvts import scenes
+from torchvts.calibration import CalibrationWarning, Press, by_presses, calibrate
+from torchvts.model import Calibration, PointLights, Sensor
+from torchvts.model.report import PressRow, Report
 
 SHAPES = ("sphere", "cylinder", "cone", "sine", "punch", "letters")
 """Shapes that are pressed in."""

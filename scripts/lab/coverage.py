@@ -3,51 +3,55 @@
 import math
 import random
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 from tqdm import tqdm
 
-from ..calibration import Press
-from ..core.geometry import normal_from_gradient
-from ..model import Sensor
-from ..pipeline import ConfidentOutput, ConfidentPipeline, bound_at
-from ..pipeline.confidence import DEPTH_SPREAD, RESPONSE_SPREAD
-from ..scenes import objects as solids
+from torchvts.calibration import Press
+from torchvts.core.geometry import normal_from_gradient
+from torchvts.model import Sensor
+from torchvts.pipeline import ConfidentOutput, ConfidentPipeline, bound_at
+from torchvts.pipeline.confidence import DEPTH_SPREAD
+from torchvts.scenes import objects as solids
+from torchvts.training.balls import Truth, ball_truth
+from torchvts.training.presses import Training
+
 from . import rows as records
 from .drawn_sensors import DrawnPress, drawn_sensor
 from .metrics import normal_angle_deg
-from .presses import Training
 from .random_scenes import random_frame
 from .rows import Column, Row, error_column
-from .score import Truth, ball_truth
 from .sets import Fold, Target, from_folder, load, truth_of
 
 LEVELS = (0.5, 0.68, 0.8, 0.9, 0.95)
 """Probabilities at which coverage is measured."""
 
 
-def coverage(out: ConfidentOutput, truth: Truth, spread: float, name: str = "", shape: str = "") -> Row:
+def coverage(out: ConfidentOutput, truth: Truth, spread: float, name: str = "", shape: str = "", relief: bool = False) -> Row:
     """Percent of the pixels of a region whose errors are within their bounds; ``spread`` is that of :class:`Confidence`.
 
     Returns:
-        A row of unit or press ``name`` and the shape that was pressed in, with the errors "normal 50%", "depth 50%" and so on.
+        A row of unit or press ``name`` and the shape that was pressed in, with the errors "normal 50%", "depth 50%" and so on,
+        "deg" (mean angle) and "stated" (mean angle that the bounds state over the actual one). ``relief`` compares depth less
+        its mean.
     Raises:
         ValueError: an empty region.
     """
-    if not bool(truth.region.any()):
+    region = truth.region
+    if not bool(region.any()):
         raise ValueError("region: expected at least one pixel, got none: no contact was found")
-    normal = normal_from_gradient(truth.gradient)
-    angle = normal_angle_deg(out.normal.to(normal.dtype), normal)[:, None]
-    kinds = {
-        "normal": (angle, out.normal_95_deg, spread),
-        "depth": ((out.depth_mm - truth.depth_mm).abs(), out.depth_95_mm, DEPTH_SPREAD),
-    }
-    errors: dict[str, float | None] = {}
-    for kind, (error, bound, width) in kinds.items():
+    angle = normal_angle_deg(out.normal.double(), normal_from_gradient(truth.gradient.double()))[:, None][region]
+    depth = (out.depth_mm - truth.depth_mm)[region]
+    depth = (depth - depth.mean() if relief else depth).abs()
+    errors: dict[str, float | None] = {"deg": float(angle.mean())}
+    bounds = {"normal": (angle, out.normal_95_deg[region], spread), "depth": (depth, out.depth_95_mm[region], DEPTH_SPREAD)}
+    for kind, (error, bound, width) in bounds.items():
         for level in LEVELS:
-            within = (error <= bound_at(bound, level, width))[truth.region]
-            errors[f"{kind} {level:.0%}"] = 100.0 * float(within.double().mean())
+            errors[f"{kind} {level:.0%}"] = 100.0 * float((error <= bound_at(bound, level, width)).double().mean())
+    per_bound = math.gamma(1.0 + 0.5 * spread) / math.log(20.0) ** (0.5 * spread)  # the mean of the distribution of bound_at
+    errors["stated"] = per_bound * float(bounds["normal"][1].mean()) / float(angle.mean())
     return Row("coverage", shape, name, errors)
 
 
@@ -94,8 +98,7 @@ def of_presses(
 def of_press(out: ConfidentOutput, press: Press, mm_per_pixel: float, spread: float) -> Row:
     """Coverage of one labelled press inside its contact; of the depth only the relief is compared."""
     ball = ball_truth(press, out.depth_mm.shape[2], out.depth_mm.shape[3], mm_per_pixel)
-    offset = (out.depth_mm - ball.depth_mm)[ball.region].mean()
-    return coverage(out, ball._replace(depth_mm=ball.depth_mm + offset), spread, press.name, "ball")
+    return coverage(out, ball, spread, press.name, "ball", relief=True)
 
 
 def mean(rows: Sequence[Row], name: str = "") -> Row:
@@ -111,6 +114,10 @@ def mean(rows: Sequence[Row], name: str = "") -> Row:
         shares = torch.tensor([row.errors[key] for row in rows], dtype=torch.float64)
         low, high = shares.quantile(torch.tensor([0.25, 0.75], dtype=torch.float64)).tolist()
         errors |= {key: float(shares.mean()), f"{key}, lower quartile": low, f"{key}, upper quartile": high}
+    degrees = [row.errors["deg"] or 0.0 for row in rows]
+    errors["deg"] = sum(degrees) / len(rows)
+    # of sums: a frame that is nearly exact has no meaningful ratio
+    errors["stated"] = sum((row.errors["stated"] or 0.0) * deg for row, deg in zip(rows, degrees)) / sum(degrees)
     return Row("coverage", "", name, errors, frames=len(rows))
 
 
@@ -128,30 +135,6 @@ def table(rows: Sequence[Row]) -> str:
 RANGES = {"gentle, shallow": (0.35, 0.04), "gentle, deep": (0.35, 0.1), "steep, shallow": (1.0, 0.04), "steep, deep": (1.0, 0.1)}
 """Slope and depth, in shorter sides of the image, of the cones and prisms pressed into drawn sensors. Their balls are presses of
 slopes up to about 0.7 and of depths up to 0.06 to 0.08."""
-
-STATED = math.gamma(1.0 + 0.5 * RESPONSE_SPREAD) / math.log(20.0) ** (0.5 * RESPONSE_SPREAD)
-"""Mean error that a bound states, over the bound: of the distribution of :func:`bound_at`."""
-
-
-def of_target(out: ConfidentOutput, truth: Truth, name: str, shape: str, relief: bool = False) -> Row:
-    """Errors "deg", "normal" and "depth" (percent within 95 %), "stated" (mean stated error of normals over the actual).
-
-    Args:
-        out: of the pipeline.
-        truth: of the frame.
-        name: of the unit.
-        shape: that was pressed.
-        relief: compare depth less its mean, where no label holds the depth.
-    """
-    angle = normal_angle_deg(out.normal.double(), normal_from_gradient(truth.gradient.double()))[:, None][truth.region]
-    depth = (out.depth_mm - truth.depth_mm)[truth.region]
-    depth = depth - depth.mean() if relief else depth
-    stated = STATED * float(out.normal_95_deg[truth.region].mean())
-    within = {
-        "normal": 100.0 * float((angle <= out.normal_95_deg[truth.region]).double().mean()),
-        "depth": 100.0 * float((depth.abs() <= out.depth_95_mm[truth.region]).double().mean()),
-    }
-    return Row("coverage", shape, name, {"deg": float(angle.mean()), **within, "stated": stated / float(angle.mean())})
 
 
 def of_drawn(seed: int, mode: str = "precise") -> list[Row]:
@@ -177,7 +160,8 @@ def of_drawn(seed: int, mode: str = "precise") -> list[Row]:
 
 def _row_of(pipe: ConfidentPipeline, pressed: DrawnPress, shape: str) -> Row:
     with torch.inference_mode():
-        return of_target(pipe(pressed.image[None]), truth_of(pressed.scene), "drawn sensors", shape)
+        out = pipe(pressed.image[None])
+    return coverage(out, truth_of(pressed.scene), pipe.confidence.spread, "drawn sensors", shape)
 
 
 def _cone(slope: float) -> solids.Height:
@@ -202,7 +186,7 @@ def of_set(name: str, data: Path, mode: str = "precise") -> list[Row]:
             if target.truth is not None and bool(target.truth.region.any()):
                 with torch.inference_mode():
                     out = pipe(target.image[None])
-                rows.append(of_target(out, target.truth, title, "", relief=target.ball is not None))
+                rows.append(coverage(out, target.truth, pipe.confidence.spread, title, relief=target.ball is not None))
     return rows
 
 
@@ -216,19 +200,7 @@ def range_table(rows: Sequence[Row]) -> str:
     groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         groups.setdefault((row.data, row.method), []).append(row)
-    means = []
-    for (data, shape), some in groups.items():
-        errors: dict[str, float | None] = {key: sum(row.errors[key] or 0.0 for row in some) / len(some) for key in RANGE_COLUMNS}
-        degrees = [row.errors["deg"] or 0.0 for row in some]
-        # of sums: a frame that is nearly exact has no meaningful ratio
-        errors["stated"] = sum((row.errors["stated"] or 0.0) * deg for row, deg in zip(some, degrees)) / sum(degrees)
-        means.append(Row("coverage", shape, data, errors, frames=len(some)))
-    titles = {"deg": "deg", "normal": "normals within 95 %", "depth": "depths within 95 %", "stated": "stated / actual"}
-    columns = [Column("", lambda row: row.data), Column("object", lambda row: row.method)]
-    return records.table(
-        means, [*columns, *(error_column(titles[key], key, 2 if key in ("deg", "stated") else 1) for key in titles)]
-    )
-
-
-RANGE_COLUMNS = ("deg", "normal", "depth", "stated")
-"""Errors of the rows of :func:`of_target`."""
+    columns = [Column("", lambda row: row.data), Column("object", lambda row: row.method), error_column("deg", "deg", 2)]
+    columns += [error_column(f"{kind}s within 95 %", f"{kind} 95%", 1) for kind in ("normal", "depth")]
+    means = [replace(mean(some, data), method=shape) for (data, shape), some in groups.items()]
+    return records.table(means, [*columns, error_column("stated / actual", "stated", 2)])

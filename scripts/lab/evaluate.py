@@ -8,7 +8,6 @@ import dataclasses
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
@@ -16,12 +15,13 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from ..core.checks import check_integer
-from ..pipeline import DepthOutput
+from torchvts.core.tables import number
+from torchvts.pipeline import DepthOutput
+from torchvts.training.presses import Training
+
 from . import rows as records
-from .methods import METHODS, Built, Method, network
-from .presses import Training
-from .rows import Column, Row, error_column, mean, median, number
+from .methods import METHODS, Built, Method
+from .rows import Column, Row, error_column, mean, median
 from .score import PressScore, score_press, score_surface
 from .sets import DRAWN, DataSet, Fold, Target, load
 
@@ -51,13 +51,12 @@ class Evaluation:
     outputs: dict[str, DepthOutput]
 
 
-def evaluate(data: DataSet, methods: Sequence[str] = (), *, seed: int = 0, bar: "tqdm[Any] | None" = None) -> Evaluation:
+def evaluate(data: DataSet, methods: Sequence[str] = (), *, bar: "tqdm[Any] | None" = None) -> Evaluation:
     """Score methods on a set.
 
     Args:
         data: the set.
         methods: names out of :data:`COMPARED`; empty for all that are possible. Methods of the set itself come last.
-        seed: seed of the network that is trained.
         bar: advanced by one for each fold and method.
     Returns:
         The scores. A method that fails has a row with the reason, and no errors.
@@ -65,7 +64,7 @@ def evaluate(data: DataSet, methods: Sequence[str] = (), *, seed: int = 0, bar: 
         ValueError: an unknown method.
     Example:
         >>> from .sets import DataSet, Fold, Target
-        >>> from ..model import Sensor
+        >>> from torchvts.model import Sensor
         >>> from .score import undeformed_truth
         >>> target = Target("nothing", torch.full((3, 48, 64), 0.4), undeformed_truth(48, 64))
         >>> data = DataSet("example", target.image, [Fold(Sensor("rig", 48, 64, 0.5), (), [target])], "")
@@ -74,7 +73,7 @@ def evaluate(data: DataSet, methods: Sequence[str] = (), *, seed: int = 0, bar: 
     """
     scored = [target for target in data.folds[0].scored if target.truth is not None] or data.folds[0].scored
     shown = scored[len(scored) // 2] if scored else None
-    of_methods = [_Record(method, data) for method in _choose(data, methods, seed)]
+    of_methods = [_Record(method, data) for method in _choose(data, methods)]
     outputs: dict[str, DepthOutput] = {}
     for fold in data.folds:
         training = Training(data.background, fold.learned, fold.sensor)
@@ -96,17 +95,15 @@ def evaluate_all(
     methods: Sequence[str] = (),
     *,
     limit: int | None = None,
-    seed: int = 0,
     progress: bool = False,
 ) -> list[Evaluation]:
     """Score methods on several sets; a set that cannot be read is one row with the reason.
 
     Args:
-        names: names out of :data:`torchvts.evaluation.sets.SETS`.
+        names: names out of :data:`lab.sets.SETS`.
         folder: folder of the real sets.
         methods: names out of :data:`COMPARED`; empty for :data:`IN_TABLE`.
         limit: use only so many presses of each ball.
-        seed: seed of the networks that are trained.
         progress: show a bar.
     Raises:
         ValueError: an unknown method.
@@ -124,7 +121,7 @@ def evaluate_all(
                 fewer = 1 if data.refused else 2 if not data.folds[0].learned else len(IN_TABLE)
                 chosen = methods or IN_TABLE[:fewer]
                 bar.total = (bar.total or 0) + len(data.folds) * (len(chosen) + len(data.methods)) - 1
-                done.append(evaluate(data, chosen, seed=seed, bar=bar))
+                done.append(evaluate(data, chosen, bar=bar))
     return done
 
 
@@ -191,14 +188,13 @@ def _score(target: Target, out: DepthOutput, mm_per_pixel: float, method: str) -
     return score_surface(target.truth, out.depth_mm, out.normal, mm_per_pixel, target.name, method, out.contact)
 
 
-def _choose(data: DataSet, methods: Sequence[str], seed: int) -> list[Method]:
+def _choose(data: DataSet, methods: Sequence[str]) -> list[Method]:
     for name in methods:
         if name not in COMPARED:
             raise ValueError(f"methods: expected some of {', '.join(repr(m) for m in COMPARED)}, got {name!r}")
     prior = data.folds[0].sensor.prior is not None
     names = methods or [name for name in COMPARED if prior or not METHODS[name].needs_prior]
-    seeded = dataclasses.replace(METHODS["MLP"], from_presses=partial(network, seed=check_integer("seed", seed, 0)))
-    return [seeded if name == "MLP" else METHODS[name] for name in names] + list(data.methods)
+    return [METHODS[name] for name in names] + list(data.methods)
 
 
 def _reason(error: Exception) -> str:
@@ -257,7 +253,7 @@ def means_of_drawn(rows: Sequence[Row]) -> list[Row]:
 
 
 def write_tables(evaluations: Sequence[Evaluation], out: Path, command: str) -> str:
-    """Write table.md, table.csv, table.tex and scores.json; returns the Markdown."""
+    """Write table.md and scores.json; returns the Markdown."""
     rows = [dataclasses.replace(row, command=command) for evaluation in evaluations for row in evaluation.rows]
     rows += means_of_drawn(rows)
     text = "\n".join(
@@ -265,18 +261,11 @@ def write_tables(evaluations: Sequence[Evaluation], out: Path, command: str) -> 
         + [f"* {e.data.name}: {shorten(e.data.how, 300, placeholder=' ...')}" for e in evaluations if e.data.how]
         + ["", "means over frames; medians of the radius of the sphere fitted to depth, of the contact and of the lowest depth"]
     )
-    cells = [[column.cell(row) for column in COLUMNS[:-1]] for row in rows]
     document = {
         "command": command,
         "how": {e.data.name: e.data.how for e in evaluations},
         "rows": [dataclasses.asdict(row) for row in rows],
         "scores": [dataclasses.asdict(score) | {"data": e.data.name} for e in evaluations for score in e.scores],
     }
-    files = {
-        "table.md": f"{text}\n\n`{command}`\n",
-        "table.csv": records.to_csv(rows),
-        "table.tex": records.latex([column.title for column in COLUMNS[:-1]], cells) + "\n",
-        "scores.json": json.dumps(document, indent=1) + "\n",
-    }
-    records.write_files(out, files)
+    records.write_files(out, {"table.md": f"{text}\n\n`{command}`\n", "scores.json": json.dumps(document, indent=1) + "\n"})
     return text

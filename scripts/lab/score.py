@@ -3,39 +3,18 @@
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ..calibration import Press
-from ..core.checks import check_batch, check_same_size
-from ..core.geometry import normal_from_gradient, pixel_grid_mm
-from .metrics import fit_sphere, mask_iou, normal_angle_deg
+from torchvts.calibration import Press
+from torchvts.core.geometry import normal_from_gradient, pixel_grid_mm
+from torchvts.training.balls import RIM_PX, Truth, ball_truth, fit_sphere, label
 
-RIM_PX = 3.0
-"""Width of the ring inside the contact radius that is not scored: there the skin leaves the ball, and labels are a pixel off."""
+from .metrics import mask_iou, normal_angle_deg
 
 STRAY_RADII = 2.5
 """Contact that is found so many contact radii and more from the center of a ball is stray."""
-
-
-class Truth(NamedTuple):
-    """What a frame shows, float64.
-
-    Attributes:
-        depth_mm: (1, 1, H, W), mm, up to a constant: of a ball the height above its equator.
-        gradient: (1, 2, H, W), its slope, mm per mm.
-        region: (1, 1, H, W) bool, the pixels where depth and normals are scored.
-        contact: (1, 1, H, W) bool, where the object touches; None if that is unknown.
-        from_undeformed: whether depth is counted from the undeformed skin, and not up to a constant.
-    """
-
-    depth_mm: Tensor
-    gradient: Tensor
-    region: Tensor
-    contact: Tensor | None = None
-    from_undeformed: bool = False
 
 
 @dataclass(frozen=True)
@@ -82,51 +61,10 @@ class PressScore:
         return math.sqrt(max(0.0, self.relief_um**2 - self.tilt_um**2))
 
 
-def ball_truth(press: Press, height: int, width: int, mm_per_pixel: float) -> Truth:
-    """The sphere that the skin follows inside the contact; the region is :data:`RIM_PX` smaller than the contact.
-
-    Args:
-        press: press with centre and contact radius.
-        height: rows of the image.
-        width: columns of the image.
-        mm_per_pixel: pixel pitch, mm.
-    Raises:
-        ValueError: the press has no centre or no contact radius.
-    Example:
-        >>> press = Press(torch.zeros(3, 31, 31), 6.0, "middle", (15.0, 15.0), 13.0)
-        >>> truth = ball_truth(press, 31, 31, 0.1)
-        >>> round(float(truth.depth_mm[0, 0, 15, 15]), 3), int(truth.region.sum())
-        (3.0, 305)
-    """
-    (center_x, center_y), contact_radius_px = label(press)
-    x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
-    dx = x - (center_x - (width - 1) / 2) * mm_per_pixel
-    dy = y - (center_y - (height - 1) / 2) * mm_per_pixel
-    radius_mm = 0.5 * press.ball_diameter_mm
-    r_squared = dx**2 + dy**2
-    depth = torch.sqrt((radius_mm**2 - r_squared).clamp_min((0.2 * radius_mm) ** 2))
-    gradient = -torch.stack((dx.expand_as(depth), dy.expand_as(depth))) / depth
-    reach_mm = min((contact_radius_px - RIM_PX) * mm_per_pixel, 0.95 * radius_mm)
-    region = (r_squared < reach_mm**2) if reach_mm > 0 else torch.zeros_like(depth, dtype=torch.bool)
-    contact = r_squared < (contact_radius_px * mm_per_pixel) ** 2
-    return Truth(depth[None, None], gradient[None], region[None, None], contact[None, None])
-
-
 def undeformed_truth(height: int, width: int) -> Truth:
     """The truth of a frame that nothing touches: zero everywhere."""
     zero = torch.zeros(1, 2, height, width, dtype=torch.float64)
     return Truth(zero[:, :1], zero, zero[:, :1] == 0, zero[:, :1] != 0)
-
-
-def label(press: Press) -> tuple[tuple[float, float], float]:
-    """Centre (x, y) and contact radius of a press, pixels.
-
-    Raises:
-        ValueError: one of them is missing.
-    """
-    if press.center_px is None or press.contact_radius_px is None:
-        raise ValueError(f"press: expected one with center_px and contact_radius_px, '{press.name}' has none: it cannot be scored")
-    return press.center_px, press.contact_radius_px
 
 
 def score_press(
@@ -150,7 +88,6 @@ def score_press(
         >>> round(score.normal_deg, 6), round(score.relief_um, 6), round(abs(score.radius_percent), 6)
         (0.0, 0.0, 0.0)
     """
-    _check_frame(depth_mm, normal)
     truth = ball_truth(press, depth_mm.shape[2], depth_mm.shape[3], mm_per_pixel)
     if int(truth.region.sum()) < 10:
         raise ValueError(
@@ -184,8 +121,6 @@ def score_surface(
         >>> round(score.lowest_mm, 3), score.relief_um, score.normal_deg
         (-0.1, 0.0, 0.0)
     """
-    _check_frame(depth_mm, normal)
-    check_same_size("truth", truth.depth_mm, "depth_mm", depth_mm.shape[2], depth_mm.shape[3])
     if not bool(truth.region.any()):
         raise ValueError(f"truth: expected at least one pixel to score, '{name}' has none: nothing touches")
     depth, region = depth_mm.detach().cpu().double(), truth.region[0, 0]
@@ -205,14 +140,6 @@ def score_surface(
         iou=None if compared is None else mask_iou(*compared),
         area_percent=None if compared is None or not bool(compared[1].any()) else _area_percent(*compared),
     )
-
-
-def _check_frame(depth_mm: Tensor, normal: Tensor) -> None:
-    for name, value, channels in (("depth_mm", depth_mm, 1), ("normal", normal, 3)):
-        check_batch(name, value, channels)
-        if value.shape[0] != 1:
-            raise ValueError(f"{name}: expected one frame, (1, {channels}, H, W), got {tuple(value.shape)}: loop over the batch")
-    check_same_size("normal", normal, "depth_mm", depth_mm.shape[2], depth_mm.shape[3])
 
 
 def _area_percent(contact: Tensor, truth: Tensor) -> float:

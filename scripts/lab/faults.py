@@ -8,10 +8,10 @@ import kornia
 import torch
 from torch import Tensor, nn
 
-from ..core.files import rgb_from_bgr
-from ..core.geometry import lengths, pixel_grid_mm
-from ..model.lights import PointLights, cast_shadows, seen_at
-from ..scenes import Scene
+from torchvts.core.files import rgb_from_bgr
+from torchvts.core.geometry import lengths, pixel_grid_mm
+from torchvts.model.lights import PointLights, cast_shadows, seen_at
+from torchvts.scenes import Scene
 
 SHININESS = 30.0
 """Exponent of the specular lobe, which has half its height 12 degrees from the mirror direction."""
@@ -63,6 +63,23 @@ class Conditions:
     bits: int | None = None
     dead: Tensor | None = None
     jpeg_quality: int | None = None
+
+
+def ring_lights(
+    out_mm: float, up_mm: float, turn_deg: float = 10.0, level: float = 0.45, spacing_deg: float = 120.0
+) -> PointLights:
+    """Three lights on a ring around the axis, that give a flat skin ``level`` in the middle of the image.
+
+    Args:
+        out_mm: their distance from the axis.
+        up_mm: their height above the skin.
+        turn_deg: direction of the first.
+        level: value of the image.
+        spacing_deg: from one to the next.
+    """
+    angles = [math.radians(turn_deg + spacing_deg * k) for k in range(3)]
+    albedo = level * math.hypot(out_mm, up_mm) ** 3 / up_mm
+    return PointLights([[out_mm * math.cos(a), out_mm * math.sin(a), up_mm] for a in angles], [albedo] * 3).requires_grad_(False)
 
 
 def photograph(scene: Scene, conditions: Conditions, seed: int = 0, at_mm: tuple[Tensor, Tensor] | None = None) -> Tensor:

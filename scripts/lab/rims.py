@@ -6,8 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..core.blur import blur, gaussian_weights
-from ..core.checks import check_field, check_shape
+from torchvts.core.blur import blur, gaussian_weights
 
 THIN_PX, WIDE_PX = 1.2, 3.0
 """Gaussians whose difference shows a bright line of 2 to 4 pixels."""
@@ -41,16 +40,12 @@ def visible_rim(image: Tensor, background: Tensor, center_px: tuple[float, float
         background: (3, H, W), the same without contact.
         center_px: of the label, (x, y).
         radius_px: of the label.
-    Raises:
-        ValueError: images of other shapes, or of different sizes.
     Example:
         >>> y, x = torch.meshgrid(torch.arange(60.0), torch.arange(80.0), indexing="ij")
         >>> ring = torch.exp(-0.5 * (torch.hypot(x - 41, y - 30) - 20).square()) / 20
         >>> visible_rim(0.5 + ring.expand(3, -1, -1), torch.full((3, 60, 80), 0.5), (39.0, 32.0), 21.0)[:2]
         ((41.0, 30.0), 20.0)
     """
-    check_field("image", image)
-    check_shape("background", background, image.shape, "image")
     change = 255.0 * (image - background).double().mean(0)[None, None]
     line = blur(change, gaussian_weights(THIN_PX)) - blur(change, gaussian_weights(WIDE_PX))
     line = line.clamp(-2.0, 3.0)  # a scratch must not outweigh the circle

@@ -4,26 +4,27 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
-from ..core.geometry import gradient_of_depth, normal_from_gradient
-from ..integration import poisson_dst
-from ..model import PointLights
-from ..pipeline import DepthOutput, DepthPipeline
-from ..pose import PoseTracker, Registration, register_depth
-from ..pose.result import invert, turn_deg
-from ..scenes import objects, render
-from ..skin import ZeroBackground
-from ..viz import new_figure
+from torchvts.core.geometry import gradient_of_depth, normal_from_gradient
+from torchvts.core.tables import markdown
+from torchvts.integration import poisson_dst
+from torchvts.model import PointLights
+from torchvts.pipeline import DepthOutput, DepthPipeline
+from torchvts.pose import PoseTracker, Registration
+from torchvts.pose.result import invert, turn_deg
+from torchvts.scenes import objects, render
+from torchvts.skin import ZeroBackground
+
 from .faults import gaussian_blur
+from .motions import MOTIONS, Motion
 from .pose_accuracy import GOAL_DEG, GOAL_MM, rig
-from .rows import markdown
+from .rows import Row
 
 Array = np.ndarray[Any, Any]
 
@@ -57,88 +58,6 @@ NOISES = {
 """Noises of the bench: waves as balls on real sensors show them, and as wide contacts of drawn sensors do."""
 
 
-@dataclass(frozen=True)
-class Motion:
-    """How an object moves.
-
-    Attributes:
-        frames: number of frames, the reference among them.
-        pose: T_sensor_object (4, 4) of a frame, from its number and a seed.
-        lost: frames that must be reported as lost.
-        again: frames that are the one before once more, as of a camera that stands still for a while.
-    """
-
-    frames: int
-    pose: Callable[[int, int], Tensor]
-    lost: tuple[int, ...] = ()
-    again: tuple[int, ...] = ()
-
-
-def _phases(seed: int) -> list[float]:
-    return (2.0 * math.pi * torch.rand(5, generator=torch.Generator().manual_seed(seed))).tolist()
-
-
-def _sweep(turn_deg: float, frames: int, shift_mm: float = 1.0, tilt_deg: float = 2.5) -> Callable[[int, int], Tensor]:
-    """Yaw at an even rate, with shifts and tilts of such amplitudes on the way."""
-
-    def pose(k: int, seed: int) -> Tensor:
-        a, b, c, d, e = _phases(seed)
-        s = 2.0 * math.pi * k / (frames - 1)
-        shift = (shift_mm * (math.sin(s + a) - math.sin(a)), shift_mm * (math.sin(1.5 * s + b) - math.sin(b)))
-        tilt = (tilt_deg * math.sin(2.0 * s + c), tilt_deg * math.cos(1.5 * s + d))
-        return objects.pose(turn_deg * k / (frames - 1), shift, 0.45 + 0.1 * math.sin(s + e), tilt)
-
-    return pose
-
-
-def _partial(k: int, seed: int) -> Tensor:
-    """From the middle to beyond the edge of the image and back, tilted so that a part of the object touches."""
-    a, b = _phases(seed)[:2]
-    out = 7.0 * math.sin(math.pi * k / 39)
-    return objects.pose(1.0 * k, (out * math.cos(a), out * math.sin(a)), 0.4, (3.5 * math.sin(b + 0.1 * k), 3.5 * math.cos(b)))
-
-
-def _slip(k: int, seed: int) -> Tensor:
-    """Still, then 0.5 mm and 2 degrees from frame to frame for six frames, then still."""
-    a = _phases(seed)[0]
-    gone = float(min(max(k - 8, 0), 6))
-    return objects.pose(2.0 * gone, (0.5 * gone * math.cos(a), 0.5 * gone * math.sin(a)), 0.45, (1.0, 0.5))
-
-
-def _lift_off(k: int, seed: int) -> Tensor:
-    """Lifted off in five frames, away for four, put back elsewhere in five."""
-    a = _phases(seed)[0]
-    deep = 0.5 - 0.2 * min(max(k - 4, 0), max(18 - k, 0), 5)
-    back = k >= 11
-    return objects.pose(25.0 * back, (1.5 * math.cos(a) * back, 1.5 * math.sin(a) * back), deep)
-
-
-def _jump(k: int, seed: int) -> Tensor:
-    """Slow, then 3 mm and 40 degrees at once, then slow."""
-    a, jumped = _phases(seed)[0], float(k >= 10)
-    return objects.pose(0.5 * k + 40.0 * jumped, (3.0 * jumped * math.cos(a), 3.0 * jumped * math.sin(a)), 0.45, (1.0, 1.0))
-
-
-_AGAIN = (1, 2, 3, *range(14, 24))
-
-
-def _paused(k: int, seed: int) -> Tensor:
-    """As slow, but for frames that come again: three after the reference, and ten later on."""
-    return _sweep(90.0, 40)(k - sum(frame <= k for frame in _AGAIN), seed)
-
-
-MOTIONS = {
-    "slow": Motion(40, _sweep(90.0, 40)),
-    "fast": Motion(14, _sweep(90.0, 14)),
-    "full turn": Motion(120, _sweep(360.0, 120)),
-    "partial contact": Motion(40, _partial),
-    "slip": Motion(20, _slip),
-    "lift-off": Motion(24, _lift_off, (9, 10, 11, 12, 13)),
-    "jump": Motion(20, _jump, (10,)),
-    "paused": Motion(34, _paused, again=_AGAIN),
-}
-
-
 @dataclass(frozen=True, eq=False)
 class Track:
     """An object that moves, as a sensor measures it: the poses T_sensor_object (4, 4), and the frames."""
@@ -148,43 +67,29 @@ class Track:
     mm_per_pixel: float
 
 
-@dataclass
-class TrackRow:
-    """One object under one motion and one noise.
+EACH = ("deg", "mm", "ms", "ratio", "ratio_mm", "lost", "unnoticed", "uncertain", "wrong", "drift_deg")
+"""Values of a track.
 
-    Attributes:
+Of each frame that was not lost the rotation error, and the error of the position of the object's origin; of each frame its time.
+Both errors over the standard deviations that the covariance states, where all motions are known. Numbers of the frames that were
+lost; that must be lost and were not; whose pose is not called converged though the object is followed; that are confident, with no
+motion or pose in question, and outside of the goal of the pose bench. The rotation error at the end, per 360 degrees of yaw.
+"""
+
+
+def track_row(name: str, motion: str, noise: str, seed: int = 1, sensor: int = 0, method: str = "PoseTracker") -> Row:
+    """An empty row of one object under one motion and one noise.
+
+    Args:
         name: of the object.
         motion: of the object.
         noise: of the images.
-        deg: rotation error of each frame that was not lost, degrees.
-        mm: error of the position of the object's origin, mm.
-        ms: time of each frame, ms.
-        lost: numbers of the frames that were lost.
-        unnoticed: frames that must be lost and were not.
-        uncertain: frames whose pose is not called converged though the object is followed.
-        wrong: frames that are confident, with no motion or pose in question, and outside of the goal of the pose bench.
-        drift_deg: rotation error at the end, per 360 degrees of yaw.
         seed: of the motion and of the noise of the images.
         sensor: seed of the errors of slopes; 0 where there are none.
-        ratio: rotation errors over the standard deviations that the covariance states, where all motions are known.
-        ratio_mm: the same of the position of the object's origin.
+        method: that tracks.
     """
-
-    name: str
-    motion: str
-    noise: str
-    deg: list[float] = field(default_factory=list)
-    mm: list[float] = field(default_factory=list)
-    ms: list[float] = field(default_factory=list)
-    lost: list[int] = field(default_factory=list)
-    unnoticed: list[int] = field(default_factory=list)
-    uncertain: list[int] = field(default_factory=list)
-    wrong: list[int] = field(default_factory=list)
-    drift_deg: float = math.nan
-    seed: int = 1
-    sensor: int = 0
-    ratio: list[float] = field(default_factory=list)
-    ratio_mm: list[float] = field(default_factory=list)
+    errors: dict[str, float | None] = {"sensor": float(sensor)}
+    return Row("track", method, f"{name}, {motion}, {noise}", errors, seed=seed, each={key: [] for key in EACH})
 
 
 def record(target: objects.Target, motion: Motion, image_std: float, seed: int, unit: tuple[PointLights, DepthPipeline]) -> Track:
@@ -195,7 +100,7 @@ def record(target: objects.Target, motion: Motion, image_std: float, seed: int, 
         motion: its motion.
         image_std: standard deviation of the images' noise.
         seed: of motion and noise.
-        unit: lights and pipeline, as of :func:`torchvts.evaluation.pose_accuracy.rig`.
+        unit: lights and pipeline, as of :func:`lab.pose_accuracy.rig`.
     """
     lights, pipe = unit
     poses = [motion.pose(k, seed) for k in range(motion.frames)]
@@ -265,32 +170,31 @@ class WrongSlopes:
         return self._scale * gradient_of_depth(depth, self._pitch) * frame.deformed, self._scale * depth
 
 
-def follow_track(track: Track, motion: Motion, row: TrackRow) -> TrackRow:
+def follow_track(track: Track, motion: Motion, row: Row) -> Row:
     """Track all frames against the first one, and fill the row."""
-    tracker = PoseTracker(track.frames[0], track.mm_per_pixel)
+    tracker, each = PoseTracker(track.frames[0], track.mm_per_pixel), row.each
+    last_deg = math.nan
     for k in range(1, len(track.frames)):
         start = time.perf_counter()
         found = tracker(track.frames[k])
-        row.ms.append(1000.0 * (time.perf_counter() - start))
+        each["ms"].append(1000.0 * (time.perf_counter() - start))
         if found.lost:
-            row.lost.append(k)
+            each["lost"].append(k)
             continue
-        deg, mm = tracking_error(found, track, k)
-        row.deg.append(deg)
-        row.mm.append(mm)
+        last_deg, mm = tracking_error(found, track, k)
+        each["deg"].append(last_deg)
+        each["mm"].append(mm)
         if not found.ambiguous:
             std_deg, std_mm = _stated(found, track.poses[k][:3, 3])
-            row.ratio.append(deg / std_deg)
-            row.ratio_mm.append(mm / std_mm)
-        within = deg <= GOAL_DEG and mm <= GOAL_MM
+            each["ratio"].append(last_deg / std_deg)
+            each["ratio_mm"].append(mm / std_mm)
         if not found.converged:
-            row.uncertain.append(k)
-        elif not found.ambiguous and not within:
-            row.wrong.append(k)
-        row.drift_deg = deg
-    row.unnoticed = sorted(set(motion.lost) - set(row.lost))
+            each["uncertain"].append(k)
+        elif not found.ambiguous and not (last_deg <= GOAL_DEG and mm <= GOAL_MM):
+            each["wrong"].append(k)
+    each["unnoticed"] += sorted(set(motion.lost) - set(each["lost"]))
     turned = turn_deg(track.poses[-1] @ invert(track.poses[-2])) * (len(track.poses) - 1)
-    row.drift_deg *= 360.0 / max(float(turned), 1.0)
+    each["drift_deg"].append(last_deg * 360.0 / max(float(turned), 1.0))
     return row
 
 
@@ -319,7 +223,7 @@ def run_tracking(
     noises: Sequence[str] = tuple(NOISES),
     seeds: Sequence[int] = (1,),
     sensors: Sequence[int] = (1,),
-) -> Iterator[tuple[TrackRow, Track]]:
+) -> Iterator[tuple[Row, Track]]:
     """Track objects under all motions and noises, one row after the other.
 
     Args:
@@ -344,21 +248,7 @@ def run_tracking(
                 recorded[image_std] = record(target, MOTIONS[motion], image_std, seed, unit)
             for sensor in sensors if NOISES[noise].slopes_deg > 0.0 else (0,):
                 track = with_wrong_slopes(recorded[image_std], NOISES[noise], sensor) if sensor else recorded[image_std]
-                yield follow_track(track, MOTIONS[motion], TrackRow(name, motion, noise, seed=seed, sensor=sensor)), track
-
-
-def register_each(track: Track) -> tuple[list[float], list[float], list[float]]:
-    """Degrees, mm and ms of :func:`register_depth` on the same frames, each against the first."""
-    results = []
-    for k in range(1, len(track.frames)):
-        start = time.perf_counter()
-        try:
-            found = register_depth(track.frames[0], track.frames[k], track.mm_per_pixel)
-        except ValueError:  # no contact
-            continue
-        results.append((*tracking_error(found, track, k), 1000.0 * (time.perf_counter() - start)))
-    deg, mm, ms = zip(*results, strict=True)
-    return list(deg), list(mm), list(ms)
+                yield follow_track(track, MOTIONS[motion], track_row(name, motion, noise, seed, sensor)), track
 
 
 class NormalFlow(NamedTuple):
@@ -375,7 +265,7 @@ class NormalFlow(NamedTuple):
     lost: type[Exception]
 
 
-def follow_by_normalflow(track: Track, peer: NormalFlow, row: TrackRow) -> TrackRow:
+def follow_by_normalflow(track: Track, peer: NormalFlow, row: Row) -> Row:
     """Track all frames against the first one by NormalFlow, the last pose as start, with its own thresholds, and fill the row.
 
     Its axes: x right, y down, z away from the camera; shifts in metres. Only the registration is timed, not its ``Frame``.
@@ -396,19 +286,19 @@ def follow_by_normalflow(track: Track, peer: NormalFlow, row: TrackRow) -> Track
         try:
             pose = peer.register(*maps, pose, track.mm_per_pixel)
         except peer.lost:
-            row.lost.append(k)
+            row.each["lost"].append(k)
             continue
         finally:
-            row.ms.append(1000.0 * (time.perf_counter() - start))
+            row.each["ms"].append(1000.0 * (time.perf_counter() - start))
         found = torch.from_numpy(np.array(pose, dtype=np.float64))
         found[:3, 3] *= 1000.0
         deg, mm = _error_of(to_points @ found @ to_points, track, k)
-        row.deg.append(deg)
-        row.mm.append(mm)
+        row.each["deg"].append(deg)
+        row.each["mm"].append(mm)
     return row
 
 
-def tracking_table(rows: Sequence[TrackRow]) -> str:
+def tracking_table(rows: Sequence[Row]) -> str:
     """A line for each object, motion and noise, as Markdown.
 
     Medians of a track have three figures: the least, the middle and the most of the tracks. The rest is the worst, or the sum.
@@ -416,18 +306,18 @@ def tracking_table(rows: Sequence[TrackRow]) -> str:
     titles = ["object", "motion", "noise", "tracks", "angle deg, median of a track", "angle deg, worst"]
     titles += ["position mm, median of a track", "position mm, worst", "error / stated, angle", "error / stated, position"]
     titles += ["drift deg per 360", "lost frames", "lost, not noticed", "uncertain", "confident and wrong", "ms, median"]
-    groups: dict[tuple[str, str, str], list[TrackRow]] = {}
+    groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
-        groups.setdefault((row.name, row.motion, row.noise), []).append(row)
+        groups.setdefault((row.method, row.data), []).append(row)
     lines = []
-    for key, tracks in groups.items():
-        deg, mm = [row.deg for row in tracks], [row.mm for row in tracks]
-        drift = f"{max(row.drift_deg for row in tracks):.3f}" if key[1] == "full turn" else ""
-        counts = [(row.lost, row.unnoticed, row.uncertain, row.wrong) for row in tracks]
-        line = [*key, str(len(tracks)), _spread(deg, 3), _worst(deg, 3), _spread(mm, 4), _worst(mm, 4)]
-        line += [_spread([row.ratio for row in tracks], 2), _spread([row.ratio_mm for row in tracks], 2), drift]
-        line += [str(sum(map(len, frames))) for frames in zip(*counts, strict=True)]
-        lines.append([*line, _spread([row.ms for row in tracks], 1)])
+    for (method, data), tracks in groups.items():
+        name, motion, noise = data.split(", ")
+        of = {key: [row.each[key] for row in tracks] for key in EACH}
+        line = [name if method == "PoseTracker" else f"{name}, {method}", motion, noise, str(len(tracks))]
+        line += [_spread(of["deg"], 3), _worst(of["deg"], 3), _spread(of["mm"], 4), _worst(of["mm"], 4)]
+        line += [_spread(of["ratio"], 2), _spread(of["ratio_mm"], 2), _worst(of["drift_deg"], 3) if motion == "full turn" else ""]
+        line += [str(sum(map(len, of[key]))) for key in ("lost", "unnoticed", "uncertain", "wrong")]
+        lines.append([*line, _spread(of["ms"], 1)])
     return markdown(titles, lines)
 
 
@@ -444,18 +334,3 @@ def _worst(tracks: Sequence[Sequence[float]], digits: int) -> str:
 
 def _median(values: Sequence[float]) -> float:
     return float(torch.tensor(values, dtype=torch.float64).median()) if values else math.nan
-
-
-def tracking_figure(beside: Sequence[tuple[TrackRow, tuple[list[float], list[float], list[float]]]]) -> Figure:
-    """Error against time: each object tracked, and registered frame by frame by :func:`register_each`."""
-    figure = new_figure(7.0, 4.6)
-    axes = figure.add_subplot()
-    markers = "os^DvP*X"
-    for (row, registered), marker in zip(beside, markers * len(beside)):
-        for colour, deg, ms in (("#1b6ca8", row.deg, row.ms), ("#d1495b", registered[0], registered[2])):
-            axes.scatter(_median(ms), _median(deg), c=colour, marker=marker, s=60, label=row.name if colour == "#1b6ca8" else None)
-    axes.set(xscale="log", yscale="log", xlabel="time of a frame, ms", ylabel="rotation error, degrees, median")
-    axes.set_title("blue: PoseTracker, red: register_depth, each frame against the first")
-    axes.grid(alpha=0.3, which="both")
-    axes.legend(fontsize=8)
-    return figure

@@ -2,21 +2,23 @@
 
 import itertools
 import math
-import platform
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ..calibration import Press, calibrate
-from ..model import Calibration, PointLights, Sensor
-from ..pipeline import DepthOutput, DepthPipeline
-from ..pose import Registration, register_depth
-from ..pose.result import invert, turn_deg
-from ..scenes import objects, render
-from .rows import markdown
+from torchvts.calibration import Press, calibrate
+from torchvts.core.tables import markdown
+from torchvts.model import Calibration, PointLights, Sensor
+from torchvts.pipeline import DepthOutput, DepthPipeline
+from torchvts.pose import Registration, register_depth
+from torchvts.pose.result import invert, turn_deg
+from torchvts.scenes import objects, render
+
+from .faults import ring_lights
+from .rows import Row
 
 GOAL_DEG, GOAL_MM = 1.0, 0.15
 """A pose within both limits is a success."""
@@ -41,51 +43,6 @@ class PoseCase:
     mm_per_pixel: float
 
 
-@dataclass(eq=False)
-class PoseRow:
-    """One object over many poses.
-
-    Attributes:
-        name: name of the object.
-        poses: number of poses.
-        deg: angle of each registration to the nearest true pose, degrees.
-        mm: distance of the object's origin to its true place in the target, mm.
-        seconds: time of each registration, s.
-        converged: number of registrations that report convergence.
-        within: number of them that are within the goal.
-        wrong: number of them that report no unknown direction, and are outside of the goal.
-        named: number of them whose reported unknown directions are the true ones; None for objects that have none.
-        notes: registrations that were refused, one line each.
-    """
-
-    name: str
-    poses: int
-    deg: list[float] = field(default_factory=list)
-    mm: list[float] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
-    converged: int = 0
-    within: int = 0
-    wrong: int = 0
-    named: int | None = None
-    notes: list[str] = field(default_factory=list)
-
-    def add(self, found: Registration, case: PoseCase, target: objects.Target, seconds: float) -> None:
-        """Compare a registration with the truth."""
-        deg, mm = pose_error(found.T_target_source, case, target.period_deg)
-        self.deg.append(deg)
-        self.mm.append(mm)
-        self.seconds.append(seconds)
-        if not found.converged:
-            return
-        within = deg <= GOAL_DEG and mm <= GOAL_MM
-        self.converged += 1
-        self.within += within
-        self.wrong += not within and not found.ambiguous
-        if self.named is not None:
-            kinds = {kind for name in found.ambiguous for kind in target.free if name.startswith(kind)}
-            self.named += kinds == set(target.free) and len(found.ambiguous) == max(len(target.free), target.freedom)
-
-
 def rig(height: int = 240, width: int = 320, mm_per_pixel: float = 0.0625) -> tuple[PointLights, DepthPipeline]:
     """Three lights at 120 degrees over the sensor, and the pipeline of this unit in mode precise.
 
@@ -94,9 +51,7 @@ def rig(height: int = 240, width: int = 320, mm_per_pixel: float = 0.0625) -> tu
         width: columns of the image.
         mm_per_pixel: pixel pitch, mm.
     """
-    angles = [math.radians(10.0 + 120.0 * k) for k in range(3)]
-    position = [[31.0 * math.cos(a), 31.0 * math.sin(a), 40.0] for a in angles]
-    lights = PointLights(position, [0.45 * math.hypot(31.0, 40.0) ** 3 / 40.0] * 3).requires_grad_(False)
+    lights = ring_lights(31.0, 40.0)
     calibration = Calibration.from_lights(lights, Sensor("pose bench", height, width, mm_per_pixel))
     return lights, DepthPipeline.from_calibration(calibration, "precise")
 
@@ -163,32 +118,56 @@ def run_poses(
     noise_std: float = 0.005,
     progress: Callable[[], object] = lambda: None,
     register: Register = by_depth,
-) -> tuple[list[PoseRow], dict[str, tuple[PoseCase, Registration]]]:
+) -> tuple[list[Row], dict[str, tuple[PoseCase, Registration]]]:
     """Register all objects, by name, in a number of poses each; the field is 20 mm wide, images have 8 bits.
 
     ``progress`` is called for each pose.
 
     Returns:
-        The rows, and the first pose of each object for a picture.
+        A row for each object, and its first pose for a picture. Errors of a row: the number of registrations that are "converged",
+        of these "within" the goal, and "wrong" (outside of it, though no direction is reported as unknown); for objects that have
+        unknown directions, "named": where the true ones are reported. Each registration: "deg" and "mm" to the nearest true pose,
+        "s"; those that were refused are in the note.
     """
     lights, pipe = rig(*size, 20.0 / size[1])
-    rows: list[PoseRow] = []
+    rows: list[Row] = []
     shown: dict[str, tuple[PoseCase, Registration]] = {}
     for name, target in targets.items():
-        row = PoseRow(name, poses, named=0 if target.free else None)
+        counts = dict.fromkeys(("converged", "within", "wrong", *(("named",) if target.free else ())), 0.0)
+        each: dict[str, list[float]] = {"deg": [], "mm": [], "s": []}
+        refused = []
         for seed in range(poses):
             case = pose_case(target, 1000 + seed, lights, pipe, size, noise_std)
             start = time.perf_counter()
             try:
                 found = register(case)
             except ValueError as error:
-                row.notes.append(f"pose {seed}: {error}")
+                refused.append(f"pose {seed}: {error}")
             else:
-                row.add(found, case, target, time.perf_counter() - start)
+                each["s"].append(time.perf_counter() - start)
+                _count(found, case, target, counts, each)
                 shown.setdefault(name, (case, found))
             progress()
-        rows.append(row)
+        rows.append(Row("pose", "registration", name, counts, frames=poses, note="; ".join(refused), each=each))
     return rows, shown
+
+
+def _count(
+    found: Registration, case: PoseCase, target: objects.Target, counts: dict[str, float], each: dict[str, list[float]]
+) -> None:
+    """Compare a registration with the truth."""
+    deg, mm = pose_error(found.T_target_source, case, target.period_deg)
+    each["deg"].append(deg)
+    each["mm"].append(mm)
+    if not found.converged:
+        return
+    within = deg <= GOAL_DEG and mm <= GOAL_MM
+    counts["converged"] += 1
+    counts["within"] += within
+    counts["wrong"] += not within and not found.ambiguous
+    if "named" in counts:
+        kinds = {kind for name in found.ambiguous for kind in target.free if name.startswith(kind)}
+        counts["named"] += kinds == set(target.free) and len(found.ambiguous) == max(len(target.free), target.freedom)
 
 
 def ball_pairs(
@@ -222,24 +201,21 @@ def ball_pairs(
     return counts
 
 
-def pose_table(rows: list[PoseRow]) -> str:
+def pose_table(rows: Sequence[Row]) -> str:
     """The rows as a Markdown table."""
     titles = ["object", "poses", "angle deg, median / 95 %", "position mm, median / 95 %", "within 1 deg and 0.15 mm"]
     titles += ["confident and wrong", "unknown directions named", "s, median"]
     lines = []
     for row in rows:
-        errors = ["", "", "", str(row.wrong), "" if row.named is None else f"{100 * row.named / row.poses:.0f} %"]
-        if row.named is None:
-            errors[0] = f"{_quantile(row.deg, 0.5):.3f} / {_quantile(row.deg, 0.95):.3f}"
-            errors[1] = f"{_quantile(row.mm, 0.5):.4f} / {_quantile(row.mm, 0.95):.4f}"
-            errors[2] = f"{100 * row.within / row.poses:.0f} %"
-        lines.append([row.name, str(row.poses), *errors, f"{_quantile(row.seconds, 0.5):.2f}"])
+        named, within = row.error("named"), row.error("within") or 0.0
+        if named is None:
+            angle = f"{_quantile(row.each['deg'], 0.5):.3f} / {_quantile(row.each['deg'], 0.95):.3f}"
+            place = f"{_quantile(row.each['mm'], 0.5):.4f} / {_quantile(row.each['mm'], 0.95):.4f}"
+            errors = [angle, place, f"{100 * within / row.frames:.0f} %", f"{row.errors['wrong']:.0f}", ""]
+        else:
+            errors = ["", "", "", f"{row.errors['wrong']:.0f}", f"{100 * named / row.frames:.0f} %"]
+        lines.append([row.data, str(row.frames), *errors, f"{_quantile(row.each['s'], 0.5):.2f}"])
     return markdown(titles, lines)
-
-
-def machine() -> str:
-    """Processor, threads and version of torch."""
-    return f"{platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__}"
 
 
 def _quantile(values: list[float], share: float) -> float:

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.checks import check_integer, check_positive
-from ..model import Calibration
-from ..stream import Overlay, TactileFrame, TactileStream
-from ..stream.sources import Pixels
+from torchvts.core.checks import check_integer, check_positive
+from torchvts.model import Calibration
+from torchvts.stream import Overlay, TactileFrame, TactileStream
+from torchvts.stream.sources import Pixels
 
 
 class SimulatedCamera:

@@ -17,21 +17,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..accelerated import Compensate, GradientFromNormal
-from ..calibration import RESPONSE_BLUR_PX, Press, fit_prior, read_presses
-from ..core.checks import check_image, check_integer
-from ..core.files import read_image, rgb_from_bgr
-from ..integration import poisson_dct
-from ..model import Calibration, Sensor
-from ..normals import NormalFromMLP
-from ..pipeline import DepthPipeline
-from ..scenes import Scene
-from ..skin import ZeroBackground
-from ..stream.sources import open_source
+from torchvts.accelerated import Compensate, GradientFromNormal
+from torchvts.calibration import RESPONSE_BLUR_PX, Press, fit_prior, read_presses
+from torchvts.core.checks import check_image, check_integer
+from torchvts.core.files import read_image, rgb_from_bgr
+from torchvts.integration import poisson_dct
+from torchvts.model import Calibration, Sensor
+from torchvts.normals import NormalFromMLP
+from torchvts.pipeline import DepthPipeline
+from torchvts.scenes import Scene
+from torchvts.skin import ZeroBackground
+from torchvts.stream.sources import open_source
+from torchvts.training.balls import Truth, ball_truth, label
+from torchvts.training.presses import with_centers
+
 from .drawn_sensors import SEEDS, drawn_sensor
 from .methods import Method, shipped_prior, with_network
-from .presses import with_centers
-from .score import Truth, ball_truth, undeformed_truth
+from .rims import visible_rim
+from .score import undeformed_truth
 
 CHANGED = 15.0 / 255.0
 """A pixel of gelsight_mini_b is scored where a channel has changed by more than this."""
@@ -236,6 +239,27 @@ def _balls(
     return _halves(folder.name, read_image(folder / files[0]), sensor, presses, remark)
 
 
+def _pale_by_rims(folder: Path, limit: int | None) -> DataSet:
+    """gelsight_pale with the bright rims of its contacts as truth, which no model of slopes found, and not its hand labels."""
+    data = REAL["gelsight_pale"](folder.with_name("gelsight_pale"), limit)
+    size = (data.folds[0].sensor.height, data.folds[0].sensor.width, data.folds[0].sensor.mm_per_pixel)
+    away: list[tuple[float, float]] = []
+    folds = []
+    for fold in data.folds:
+        targets = []
+        for target in (target for target in fold.scored if target.ball is not None):
+            assert target.ball is not None
+            center, radius = label(target.ball)
+            rim = visible_rim(target.image, data.background, center, radius)
+            away.append((center[0] - rim.center_px[0], center[1] - rim.center_px[1]))
+            ball = dataclasses.replace(target.ball, center_px=rim.center_px, contact_radius_px=rim.radius_px)
+            targets.append(target._replace(ball=ball, truth=ball_truth(ball, *size)))
+        folds.append(fold._replace(scored=targets))
+    (x, y), (spread_x, spread_y) = np.mean(away, 0), np.std(away, 0)
+    how = f"truth: rims, from which the hand labels lie ({x:.1f}, {y:.1f}) px off, spread ({spread_x:.1f}, {spread_y:.1f}) px"
+    return dataclasses.replace(data, name=folder.name, folds=folds, how=f"half learned from, half scored, both ways; {how}")
+
+
 def _ninedtact(folder: Path, limit: int | None) -> DataSet:
     background, image = (read_image(folder / name) for name in ("background.png", "ball_8mm.png"))
     sensor = Sensor("ninedtact", background.shape[1], background.shape[2], 0.05)
@@ -287,6 +311,7 @@ REAL: dict[str, Callable[[Path, int | None], DataSet]] = {
     "gelsight_mini_b": _mini_b,
     "gelsight_mini_c": _mini_c,
     "gelsight_pale": partial(_balls, remark="labels by hand, good to 1 to 2 px", meta=_FOTS),
+    "gelsight_pale_rims": _pale_by_rims,
     "gelsight_bnz": _balls,
     "digit_a": partial(_balls, meta=_FOTS),
     "digit_b": partial(_balls, remark="its labels are rough, 0.1 to 7 px from located centers, and not used", labelled=False),
@@ -329,9 +354,9 @@ SETS = (*REAL, *DRAWN)
 """Names of all sets."""
 
 
-def data_folder(script: str) -> Path:
-    """Folder of third-party images: TORCHVTS_DATA, else ../shared/data beside the checkout that holds a script."""
-    return Path(os.environ.get("TORCHVTS_DATA", Path(script).resolve().parents[2] / "shared" / "data"))
+def data_folder() -> Path:
+    """Folder of third-party images: TORCHVTS_DATA, else ../shared/data beside this checkout."""
+    return Path(os.environ.get("TORCHVTS_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 
 
 def load(name: str, data: Path, limit: int | None = None) -> DataSet:
@@ -349,6 +374,6 @@ def load(name: str, data: Path, limit: int | None = None) -> DataSet:
         return _drawn(name, limit)
     if name not in REAL:
         raise ValueError(f"sets: expected some of {', '.join(SETS)}, got {name!r}")
-    if not (data / name).is_dir():
+    if not (data / name.removesuffix("_rims")).is_dir():
         raise FileNotFoundError(f"{data / name}: no such folder: set TORCHVTS_DATA to the folder of the real sensors")
     return REAL[name](data / name, limit)

@@ -1,0 +1,67 @@
+"""Speed as a user meets it; then speed and error of all methods together; exported files beside the library: tables and a chart.
+
+python scripts/speed.py --out out/bench --threads 2
+python scripts/speed.py --only export --threads 2
+
+Methods of other libraries are timed in the same run. Rows of a real sensor need ../shared/data or the folder in TORCHVTS_DATA.
+Exported files are timed of one unit, with --drawn of the drawn rig, whose AOTInductor files take minutes to write.
+"""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from lab import figures, frames, rows, speed
+from lab.commands import main_of, parser_of
+from lab.sets import data_folder
+from torchvts import viz
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = parser_of(__doc__)
+    parser.add_argument("--out", type=Path, default=Path("out/bench"), help="for the tables and the chart")
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads(), help="all cores if not given")
+    parser.add_argument("--only", choices=("user", "methods", "export"), help="measure one table; export only where asked for")
+    parser.add_argument("--calls", type=int, default=100, help="frames of each row of the tables of the user and of exported files")
+    parser.add_argument("--long", action="store_true", help="10,000 frames every 20 ms too, for the 99th percentile")
+    exported = parser.add_argument_group("exported files")
+    exported.add_argument("--drawn", action="store_true", help="of the drawn rig, also where there is a real sensor")
+    exported.add_argument("--size", type=int, nargs=2, default=(320, 240), metavar=("WIDTH", "HEIGHT"))
+    exported.add_argument("--formats", nargs="+", choices=frames.LOADERS, default=list(frames.LOADERS))
+    arguments = parser.parse_args(argv)
+    torch.set_num_threads(arguments.threads)
+    data = data_folder() if (data_folder() / "gelsight_mini_a").is_dir() else None
+    if arguments.only == "export":
+        size = arguments.size[1], arguments.size[0]
+        unit = frames.drawn(size) if data is None or arguments.drawn else frames.mini(data, size)
+        print(f"{unit.name}, {size[1]}x{size[0]}, {arguments.threads} threads, median ms of a frame")
+        print(frames.export_table(unit, arguments.formats, arguments.calls))
+        return 0
+    with tqdm(unit="row", disable=None) as bar:
+
+        def show(name: str) -> None:
+            bar.set_postfix_str(name)
+            bar.update()
+
+        if arguments.only != "methods":
+            measured = frames.as_user(show, data, arguments.calls, arguments.long)
+            keep(arguments.out, "user", frames.user_table(measured), measured)
+        if arguments.only != "user":
+            measured = speed.methods(show, data)
+            keep(arguments.out, "bench", speed.methods_table(measured), measured)
+            viz.save_figure(figures.speed_figure(measured), arguments.out / "speed_accuracy.png")
+    return 0
+
+
+def keep(out: Path, name: str, text: str, measured: list[rows.Row]) -> None:
+    """Print a table, and write it as Markdown beside its rows in JSON."""
+    command = f"python scripts/speed.py {' '.join(sys.argv[1:])}".rstrip()
+    rows.write_files(out, {f"{name}.md": f"{text}\n\n`{command}`\n", f"{name}.json": rows.to_json(measured)})
+    print(f"{text}\n\n{name}.md and {name}.json in {out}\n")
+
+
+if __name__ == "__main__":
+    main_of(main)

@@ -321,7 +321,7 @@ def test_a_real_folder(data):
 
 
 def test_the_page_for_users_of_gs_sdk_runs(tmp_path, monkeypatch):
-    page = (Path(__file__).resolve().parents[1] / "docs" / "from_gs_sdk.md").read_text()
+    page = (Path(__file__).resolve().parents[2] / "docs" / "from_gs_sdk.md").read_text()
     code = re.search(r"```python\n(.*?)```", page, re.DOTALL).group(1)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "gsmini.yaml").write_text(yaml.safe_dump({"ppmm": 0.25, "imgh": 60, "imgw": 80, "raw_imgh": 168, "raw_imgw": 224}))

@@ -15,7 +15,7 @@ from lab.methods import METHODS, Method
 from lab.rows import Row
 from lab.stability import MASK, SWEPT, Breaking
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 POINTS, SEEDS = stability.points_from_json((ROOT / "tests" / "breaking_points.json").read_text())
 
 

@@ -720,7 +720,7 @@ def test_the_gelsight_mini_ships_with_a_prior():
     assert bool(torch.isfinite(background).all()) and 0.005 < float(background.min()) < float(background.max()) < 1.5
     field, by_depth = sensor.prior.response.field, sensor.prior.response.by_depth
     assert field.half_mm == pytest.approx(0.5 * sensor.width * sensor.mm_per_pixel, rel=1e-3) and by_depth.half_mm == field.half_mm
-    path = Path(__file__).resolve().parents[1] / "configs" / "sensors" / "gelsight_mini.yaml"
+    path = Path(__file__).resolve().parents[2] / "configs" / "sensors" / "gelsight_mini.yaml"
     assert path.stat().st_size < 10_000
 
 

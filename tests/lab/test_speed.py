@@ -79,7 +79,7 @@ def test_a_chart_is_drawn_again_from_its_table(run_script, tmp_path):
     (tmp_path / "bench.json").write_text(rows.to_json(ROWS))
     done = run_script("figures", "speed", tmp_path / "bench.json", tmp_path / "chart.png")
     assert done.returncode == 0 and (tmp_path / "chart.png").stat().st_size > 10_000
-    points = Path(__file__).parent / "breaking_points.json"
+    points = Path(__file__).parents[1] / "breaking_points.json"
     done = run_script("figures", "overview", points, tmp_path / "overview.png")
     assert done.returncode == 0 and (tmp_path / "overview.png").stat().st_size > 10_000
     done = run_script("figures", "speed", tmp_path / "none.json", tmp_path / "chart.png")

@@ -17,7 +17,7 @@ import torchvts as vts
 from torchvts.core.files import read_depth_png
 from torchvts.dataset import STATE, list_items, output_stems, reconstruct, reconstruct_dataset, writing
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 
 

@@ -26,7 +26,7 @@ from torchvts import stream as streams
 from torchvts.accelerated import reference_only
 from torchvts.core.files import read_frames, rgb_from_bgr
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PITCH = 0.25
 
 

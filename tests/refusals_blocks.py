@@ -226,8 +226,7 @@ TABLE = {
         },
     ),
     "NormalFromIntensity.from_calibration": Entry(
-        {"calibration": unit(), "camera_height_mm": 30.0},
-        {"calibration": [*OTHERS, unit("response")], "camera_height_mm": HEIGHTS},
+        {"calibration": unit(), "camera_height_mm": 30.0}, {"calibration": [*OTHERS, unit("response")], "camera_height_mm": HEIGHTS}
     ),
     "NormalFromIntensity.forward": Entry(
         {"image": FLAT[None], "depth_mm": DEPTH, "noise_std": NOISE},
@@ -237,12 +236,7 @@ TABLE = {
     ),
     "NormalFromIntensity.noise_of": forward(lambda: pipe().normals.noise_of, 3, "compensated"),
     "NormalFromIntensity.solve": Entry(
-        {
-            "image": FLAT[None],
-            "depth_mm": None,
-            "expected": torch.zeros(1, 2, HEIGHT, WIDTH),
-            "noise_std": NOISE,
-        },
+        {"image": FLAT[None], "depth_mm": None, "expected": torch.zeros(1, 2, HEIGHT, WIDTH), "noise_std": NOISE},
         {
             "image": batches(3),
             "depth_mm": [b for b in batches(1) if b is not None],
@@ -447,11 +441,7 @@ TABLE = {
     },
     "Press": Entry(
         {"image": image(), "ball_diameter_mm": 6.0, "center_px": (4.0, 5.0), "contact_radius_px": 3.0},
-        {
-            "ball_diameter_mm": NUMBER,
-            "center_px": [(1.0,), "here", (NAN, 0.0)],
-            "contact_radius_px": ["3", 0, -1.0, NAN],
-        },
+        {"ball_diameter_mm": NUMBER, "center_px": [(1.0,), "here", (NAN, 0.0)], "contact_radius_px": ["3", 0, -1.0, NAN]},
         label=("name", "image"),  # calibrate checks the image: it knows the sensor's size
     ),
     "Touch": Entry(

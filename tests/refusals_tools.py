@@ -86,10 +86,7 @@ TABLE = {
     # ---- scenes ----
     "scenes.surface": Entry(
         {"depth_mm": lambda x, y: 1.0 - x**2 - y**2, **SIZE},
-        {
-            "depth_mm": [None, torch.zeros(4, 4), lambda x, y: 1.0, lambda x, y: x[0]],
-            **shaped(camera_height_mm=HEIGHTS),
-        },
+        {"depth_mm": [None, torch.zeros(4, 4), lambda x, y: 1.0, lambda x, y: x[0]], **shaped(camera_height_mm=HEIGHTS)},
     ),
     "scenes.surface_at": Entry(
         {"depth_mm": lambda x, y: 1.0 - x**2 - y**2, "x": torch.rand(8, 8), "y": torch.rand(8, 8), "mm_per_pixel": 1.0},
@@ -226,15 +223,10 @@ TABLE = {
         run=False,
     ),
     # ---- stream ----
-    "stream.FollowLight": Entry(
-        {"background": image()},
-        {"background": [b for k, b in enumerate(images()) if k not in (4,)]},
-    ),
+    "stream.FollowLight": Entry({"background": image()}, {"background": [b for k, b in enumerate(images()) if k not in (4,)]}),
     **{
         f"stream.FollowLight.{name}": Entry(
-            {"image": image()[None]},
-            {"image": batches(3)},
-            lambda name=name: getattr(vts.stream.FollowLight(image()), name),
+            {"image": image()[None]}, {"image": batches(3)}, lambda name=name: getattr(vts.stream.FollowLight(image()), name)
         )
         for name in ("correct", "set_background", "start")
     },

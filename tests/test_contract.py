@@ -102,11 +102,7 @@ CASES = {
     "NormalFromLookup": (lookup, images, "compensated"),
     "NormalFromMLP": (network, images, "compensated"),
     "FillMarkers": (lambda dtype: FillMarkers(5.0), images, "image"),
-    "GradientFromNormal": (
-        lambda dtype: vts.GradientFromNormal(),
-        lambda dtype: normal_from_gradient(gradient(dtype)),
-        "normal",
-    ),
+    "GradientFromNormal": (lambda dtype: vts.GradientFromNormal(), lambda dtype: normal_from_gradient(gradient(dtype)), "normal"),
     "PoissonDST": (lambda dtype: vts.PoissonDST(PITCH), gradient, "gradient"),
     "PoissonDCT": (lambda dtype: vts.PoissonDCT(PITCH), gradient, "gradient"),
     "PoissonBackground": (lambda dtype: vts.PoissonBackground(PITCH), gradient, "gradient"),

@@ -154,10 +154,7 @@ def test_pixels_without_weight_are_bridged():
     gradient, weight = scene.gradient.clone(), torch.ones_like(scene.depth_mm)
     gradient[:, :, 50:58, 70:90] = 5.0
     weight[:, :, 50:58, 70:90] = 0.0
-    bridged, misled = (
-        integrate_discontinuities(gradient, PITCH, weight=weight),
-        integrate_discontinuities(gradient, PITCH),
-    )
+    bridged, misled = (integrate_discontinuities(gradient, PITCH, weight=weight), integrate_discontinuities(gradient, PITCH))
     sound = weight.bool()
     assert metrics.depth_error(bridged, scene.depth_mm, PITCH, sound).max_px < 0.1
     assert metrics.depth_error(bridged, scene.depth_mm, PITCH, ~sound).max_px < 0.7
@@ -295,10 +292,7 @@ def test_a_ramp_stands_on_its_low_end(slope):
     """Cliffs on three sides, as high at one end as the ramp is; upside down it would hang from there."""
     ramp = vts.scenes.surface(lambda x, y: torch.where((y.abs() < 2.5) & (x.abs() < 3), (x + 3) * slope, -1.0), 120, 160, 0.1)
     smooth = (vts.poisson_background(ramp.gradient, 0.1) - ramp.depth_mm).abs().max()
-    for found in (
-        integrate_discontinuities(ramp.gradient, 0.1, ramp.contact),
-        vts.AdaptiveIntegration(0.1)(ramp.gradient),
-    ):
+    for found in (integrate_discontinuities(ramp.gradient, 0.1, ramp.contact), vts.AdaptiveIntegration(0.1)(ramp.gradient)):
         assert (found - ramp.depth_mm).abs().max() < 0.02 * smooth
 
 

@@ -117,12 +117,7 @@ def test_transforms_leave_a_solver_as_it_was(kind: type[vts.PoissonDCT]) -> None
 
 @pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
 @pytest.mark.parametrize(
-    ("other", "named"),
-    [
-        ({"gamma": 2.2}, "gamma"),
-        ({"mm_per_pixel": 0.5}, "mm_per_pixel"),
-        ({"blur_px": 2.0}, "std_px"),
-    ],
+    ("other", "named"), [({"gamma": 2.2}, "gamma"), ({"mm_per_pixel": 0.5}, "mm_per_pixel"), ({"blur_px": 2.0}, "std_px")]
 )
 def test_a_state_of_another_unit_is_refused(mode: str, other: dict[str, float], named: str) -> None:
     lights = rig().lights

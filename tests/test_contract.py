@@ -304,3 +304,10 @@ def test_another_size_than_the_calibration_is_refused(name):
 def test_a_scripted_error_keeps_its_text():
     with pytest.raises(torch.jit.Error, match=r"gradient: expected \(B, 2, H, W\), got \[2, 8, 8\]"):
         torch.jit.script(vts.PoissonDST())(torch.zeros(2, 8, 8))
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if "Pipeline" in name])
+def test_an_empty_batch_gives_an_empty_batch(name):
+    """No frames are no error: they may be what a filter left of a stream."""
+    block, example = build(name)
+    assert block(example[:0]).depth_mm.shape == (0, 1, HEIGHT, WIDTH)

@@ -17,6 +17,7 @@ import pytest
 import refusals_blocks
 import refusals_tools
 import torch
+from refusals_causes import CAUSES
 
 import torchvts as vts
 import torchvts.export
@@ -115,9 +116,6 @@ def filled(entry, tmp_path, call):
     }
 
 
-CASES = [(name, argument, k) for name, entry in TABLE.items() for argument, bad in entry.bad.items() for k in range(len(bad))]
-
-
 @pytest.mark.parametrize("name", [name for name, entry in TABLE.items() if entry.run])
 def test_the_call_of_the_table_is_accepted(name, tmp_path):
     call = made(name)
@@ -149,6 +147,14 @@ def test_bad_input_is_refused(name, tmp_path):
     complaints = [complaint(name, argument, k, tmp_path) for argument, bad in TABLE[name].bad.items() for k in range(len(bad))]
     assert [text for text in complaints if text] == []
     assert list(tmp_path.iterdir()) == []  # and nothing is left behind
+
+
+@pytest.mark.parametrize("name, argument, value, cause", CAUSES, ids=[f"{row[0]}-{row[1]}-{row[3][:25]}" for row in CAUSES])
+def test_a_refusal_names_its_likely_cause(name, argument, value, cause, tmp_path):
+    call = made(name)
+    with pytest.raises((TypeError, ValueError), match=cause) as caught:
+        call(**{**filled(TABLE[name], tmp_path, call), argument: value})
+    assert argument in str(caught.value)
 
 
 def test_no_public_name_is_missing_from_the_table():

@@ -1,7 +1,5 @@
 """Slow twins of the package's numerics, in plain loops and dense algebra. Nothing here imports torchvts."""
 
-from collections import deque
-
 import numpy as np
 
 
@@ -73,32 +71,6 @@ def poisson_zero(gradient, pitch):
     depth = np.zeros(gradient.shape[1:])
     depth[inside] = np.linalg.solve(free.T @ free, free.T @ right)
     return depth
-
-
-def flood(seed, mask):
-    """All of a mask (H, W) that a seed reaches over edges, pixel by pixel."""
-    reached = seed & mask
-    queue = deque(zip(*np.nonzero(reached)))
-    while queue:
-        row, column = queue.popleft()
-        for r, c in ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)):
-            if 0 <= r < mask.shape[0] and 0 <= c < mask.shape[1] and mask[r, c] and not reached[r, c]:
-                reached[r, c] = True
-                queue.append((r, c))
-    return reached
-
-
-def fill_holes(mask):
-    border = np.ones_like(mask)
-    border[1:-1, 1:-1] = False
-    return ~flood(border, ~mask)
-
-
-def dilate(mask):
-    result = np.zeros_like(mask)
-    for row, column in zip(*np.nonzero(mask)):
-        result[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2] = True
-    return result
 
 
 def cliffs(gradient, contact, pitch, slope_std, threshold, rim_weight, depth):

@@ -1,8 +1,5 @@
 """Printed markers: found in every frame, moved ones too, nothing else taken for one, and no dots left in the depth."""
 
-import copy
-import pickle
-
 import cv2
 import pytest
 import torch
@@ -198,36 +195,6 @@ def test_gradient_flows_through_unmarked_pixels_alone():
     picture = frame(0.3)[0].requires_grad_()
     FillMarkers()(picture).square().sum().backward()
     assert bool(torch.isfinite(picture.grad).all()) and float(picture.grad.abs().sum()) > 0
-
-
-@pytest.mark.parametrize("diameter_px, dtype", [(0.0, torch.float32), (17.0, torch.float64)])
-def test_scripted_exported_and_pickled_blocks_agree_and_batches_are_independent(diameter_px, dtype):
-    batch = torch.cat([frame(p, seed=k, dtype=dtype)[0] for k, p in enumerate((0.0, 0.3, 0.8))])
-    block = FillMarkers(diameter_px)
-    whole = block(batch)
-    assert whole.dtype == dtype and whole.shape == batch.shape
-    assert torch.equal(torch.jit.script(block)(batch), whole)
-    assert torch.equal(torch.export.export(block, (batch,)).module()(batch), whole)
-    assert torch.equal(pickle.loads(pickle.dumps(block))(batch), whole) and torch.equal(copy.deepcopy(block)(batch), whole)
-    assert torch.equal(torch.cat([block(item[None]) for item in batch]), whole)
-
-
-def test_errors_name_the_argument():
-    image = torch.zeros(1, 3, 32, 32)
-    with pytest.raises(ValueError, match=r"^image: expected \(B, 3, H, W\), got \[3, 32, 32\]: add the batch"):
-        find_markers(image[0])
-    with pytest.raises(ValueError, match=r"^image: expected more than 9 .* got 8 x 32"):
-        find_markers(image[:, :, :8])
-    with pytest.raises(ValueError, match=r"^mask: expected \[1, 1, H, W\] like image, got \[1, 3, 32, 32\]"):
-        fill_markers(image, image > 0)
-    with pytest.raises(ValueError, match=r"^mask: expected 32 x 32 like the image, got 32 x 31"):
-        fill_markers(image, image[:, :1, :, 1:] > 0)
-    with pytest.raises(TypeError, match=r"^mask: expected torch.bool, got torch.float32"):
-        fill_markers(image, image[:, :1])
-    with pytest.raises(ValueError, match=r"^background: expected \(3, H, W\), got \(1, 3, 32, 32\)"):
-        FillMarkers.from_background(image)
-    with pytest.raises(ValueError, match=r"^diameter_px: expected a number in "):
-        FillMarkers(-1.0)
 
 
 def test_a_real_skin_without_markers_is_left_unmarked(data):

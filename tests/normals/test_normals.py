@@ -237,13 +237,6 @@ def test_derivatives_in_image_depth_and_lights(ring, with_depth, gloss):
     assert torch.autograd.gradcheck(normals, [value.requires_grad_(True) for value in inputs])
 
 
-def test_live_lights_give_what_the_stored_inverse_gives(ring):
-    lights, scene = ring(dtype=torch.float64), press()
-    frozen, live = block_for(lights, scene), block_for(lights, scene).requires_grad_(True)
-    image = scenes.render(scene, lights)
-    assert (frozen(image) - live(image).detach()).abs().max() < 1e-13
-
-
 @pytest.mark.parametrize(
     "stride, size, bound_deg", [(3, (60, 81), 1e-12), (9, (63, 81), 1e-12), (8, (60, 80), 2.4), (2, (60, 80), 1.1)]
 )
@@ -258,9 +251,3 @@ def test_the_coarse_block_speaks_of_every_nth_pixel(ring, stride, size, bound_de
     result, expected = coarse(image[every]), block(image)[every]
     assert result.shape == expected.shape and coarse.lights is block.lights
     assert metrics.normal_angle_deg(result, expected).max() < bound_deg
-
-
-@pytest.mark.parametrize("size", [(24, 31), (8, 8)])
-def test_an_image_of_another_size_is_refused(ring, size):
-    with pytest.raises(ValueError, match=rf"compensated: expected 24 x 32 like the calibration, got {size[0]} x {size[1]}"):
-        vts.NormalFromIntensity(ring(), 24, 32, 1.0)(torch.zeros(1, 3, *size))

@@ -115,14 +115,13 @@ class Entry:
     file: tuple[str, ...] = ()  # arguments that are files
     run: bool = True  # whether the accepted call is made: not where it would open a camera or take minutes
 
+    def __post_init__(self):
+        usual = {name: COMMON[name] for name in self.good if name in COMMON and name not in (*self.bad, *self.label)}
+        self.bad = {**self.bad, **usual}
+
 
 def forward(make, channels, argument, label=()):
     return Entry({argument: torch.full((1, channels, HEIGHT, WIDTH), 0.5)}, {argument: batches(channels)}, make, label=label)
-
-
-def shaped(**more):
-    """Arguments that all presses of scenes share."""
-    return {"height": INTEGER, "width": INTEGER, "mm_per_pixel": NUMBER, **more}
 
 
 HEIGHTS = ["1", None, True, NAN, 0, -1.0, [1.0]]  # of a camera; infinite is one
@@ -153,3 +152,6 @@ BAD_KNOWN = {
     "known_mm": [*BAD_WEIGHTS, KNOWN["known_mm"] + NAN],
     "known_weight": [*BAD_WEIGHTS, KNOWN["known_weight"] - 2.0, KNOWN["known_weight"] + INF],
 }
+COMMON = {"height": INTEGER, "width": INTEGER, "mm_per_pixel": NUMBER, "sensor": SENSOR, "calibration": OTHERS}
+COMMON |= {"gradient": BAD_GRADIENT, "initial": BAD_POSE}
+"""What an argument of this name refuses where its entry says nothing else."""

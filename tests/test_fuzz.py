@@ -21,10 +21,12 @@ import sys
 import threading
 import time
 import traceback
+import warnings
 import zipfile
 import zlib
 from pathlib import Path
 
+import attack_calls
 import cv2
 import numpy as np
 import pytest
@@ -334,7 +336,6 @@ TAGS = {
 }
 CLAIMS = {
     "png": ("image.png", png_that_claims(100_000, 100_000)),
-    "png of a gigapixel": ("image.png", png_that_claims(32_000, 32_000)),
     "png that claims all": ("image.png", png_that_claims(2**31 - 1, 2**31 - 1)),
     "depth": ("depth.png", png_that_claims(60_000, 60_000)),
     "bmp": ("image.bmp", b"BM" + struct.pack("<IHHIIiiHHIIiiII", 100, 0, 0, 54, 40, 100_000, -100_000, 1, 24, 0, 0, 0, 0, 0, 0)),
@@ -343,21 +344,15 @@ CLAIMS = {
     "a tensor that overlaps": ("unit.safetensors", safetensors_that_claims([2**40], [0, 64])),
     "a head of 2^60": ("unit.safetensors", struct.pack("<Q", 2**60) + b"{}"),
     "metadata deep": ("unit.safetensors", safetensors_that_claims([16], [0, 64], "[" * 100_000)),
-    "metadata of digits": ("unit.safetensors", safetensors_that_claims([16], [0, 64], "9" * 100_000)),
-    "no object": ("unit.safetensors", safetensors_that_claims([16], [0, 64], "[1]")),
     "pcd of 10^12": ("cloud.pcd", pcd_that_claims(10**12)),
     "pcd of 10^12, text": ("cloud.pcd", pcd_that_claims(10**12, "ascii")),
     "pcd of 10^12, compressed": ("cloud.pcd", pcd_that_claims(10**12, "binary_compressed")),
-    "pcd of 2^31": ("cloud.pcd", pcd_that_claims(2**31 - 1)),
     "pcd of -1": ("cloud.pcd", pcd_that_claims(-1)),
     "ply of 10^12": ("cloud.ply", ply_that_claims(10**12)),
     "ply of 10^12, text": ("cloud.ply", ply_that_claims(10**12, "ascii")),
-    "ply of 2^31": ("cloud.ply", ply_that_claims(2**31 - 1)),
     "laughs": ("rig.yaml", LAUGHS.encode()),
     "yaml deep": ("rig.yaml", b"name: " + b"[" * 50_000),
     "yaml of keys": ("rig.yaml", b"".join(b"k%d: 1\n" % k for k in range(8_000))),
-    "yaml of digits": ("rig.yaml", b"name: rig\nheight: " + b"9" * 10_000),
-    "yaml of bytes": ("rig.yaml", b"name: rig\nheight: \x00\xff"),
     "yaml of many bytes": ("rig.yaml", b"# \n" * 50_000),
     "laughs of gs_sdk": ("gs_sdk.yaml", LAUGHS.encode()),
     "a table of one line": ("catalog.csv", b"x" * 2**25),
@@ -366,7 +361,6 @@ CLAIMS = {
         f"a terabyte of {name}": (name, None)
         for name in ("image.png", "rig.yaml", "catalog.csv", "unit.safetensors", "nnmodel.pth")
     },
-    "numbers for weights": ("nnmodel.pth", b"\x80\x02" + b"(" * 100_000),
 }
 
 
@@ -416,30 +410,7 @@ def test_weights_run_nothing(tmp_path, protocol, wrap, way):
     assert not canary.exists()
 
 
-def test_a_label_runs_nothing(tmp_path):
-    write_folder(tmp_path / "catalog.csv")
-    np.savez(tmp_path / "ball" / "label.npz", center=np.array([Touch(tmp_path / "canary")], dtype=object), radius=np.array(2.0))
-    with pytest.raises(ValueError, match=r"label\.npz: not a label of gs_sdk"):
-        vts.read_presses(tmp_path)
-    assert not (tmp_path / "canary").exists()
-
-
 # ---- hostile paths ----
-
-HOSTILE = ["../secret", "/etc", "..", ".", "ball/../../secret", "a\0b", "..\\secret", "ball/../..", "~/x", "link"]
-
-
-@pytest.mark.parametrize("name", HOSTILE)
-def test_a_catalog_names_nothing_outside_of_its_folder(tmp_path, name):
-    folder, secret = tmp_path / "folder", tmp_path / "secret"
-    folder.mkdir()
-    secret.mkdir()
-    write_folder(folder / "catalog.csv")
-    vts.write_image(secret / "gelsight.png", image())
-    (folder / "link").symlink_to(secret)
-    (folder / "catalog.csv").write_text(f"experiment_reldir,diameter(mm)\n{name},6.0\n")
-    with pytest.raises((ValueError, FileNotFoundError), match=r"catalog\.csv|gelsight\.png"):
-        vts.read_presses(folder)
 
 
 def special(tmp_path, kind, suffix):
@@ -614,3 +585,18 @@ def test_threads_that_save_leave_the_umask_alone(tmp_path):
         assert {path.stat().st_mode & 0o777 for path in tmp_path.iterdir()} == {0o640} and len(list(tmp_path.iterdir())) == 8
     finally:
         assert os.umask(mask) == 0o027
+
+
+# ---- calls ----
+
+
+def test_a_sample_of_bad_calls():
+    """Some of the 10,000 of test_attack."""
+    attack_calls.stop_slow_calls()
+    before = Path.cwd()
+    warnings.simplefilter("ignore")
+    try:
+        wrong = [(case, found) for case, make in attack_calls.attack(600, "a sample") if (found := make())]
+    finally:
+        os.chdir(before)
+    assert wrong == []

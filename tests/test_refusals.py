@@ -166,3 +166,27 @@ def test_no_public_name_is_missing_from_the_table():
 @pytest.mark.parametrize("name", TABLE)
 def test_no_argument_is_missing_from_the_table(name):
     assert sorted(arguments(callables()[name]) - set(TABLE[name].bad) - set(TABLE[name].label)) == []
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_refused_by_every_name(dtype, tmp_path):
+    """Or taken, where a tensor is only a few numbers."""
+    complaints = []
+    for name, entry in TABLE.items():
+        for argument, value in entry.good.items():
+            if name in ("Press", "Touch"):  # calibrate refuses their images
+                continue
+            if not entry.run or not isinstance(value, torch.Tensor) or not value.is_floating_point():
+                continue
+            call = made(name)
+            try:
+                call(**{**filled(entry, tmp_path, call), argument: value.to(dtype)})
+            except TypeError as error:
+                if f"got {dtype}" not in str(error) or "expected" not in str(error):
+                    complaints.append(f"{name}({argument}): {error}")
+            except Exception as error:
+                complaints.append(f"{name}({argument}): {type(error).__name__}: {error}")
+            else:
+                if value.dim() > 2:
+                    complaints.append(f"{name}({argument}): accepted")
+    assert complaints == []

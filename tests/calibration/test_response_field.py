@@ -1,8 +1,8 @@
 """Response fields by themselves, as normals, in files and in a sensor's YAML; the blur they are used under."""
 
 import dataclasses
+import itertools
 import json
-from pathlib import Path
 
 import cv2
 import kornia
@@ -179,20 +179,10 @@ REST = {"degree": 0, "product_degree": -1, "half_mm": 1.0, "coefficient": [[0, 0
 BAD_FIELDS = {
     "degree too high": ({"degree": 7}, "degree: expected at most 6, got 7"),
     "degree below zero": ({"degree": -1}, "degree: expected at least 0, got -1"),
-    "degree no integer": ({"degree": 1.0}, "degree: expected an integer, got float"),
-    "degree a truth value": ({"degree": True}, "degree: expected an integer, got bool"),
-    "product degree too high": ({"product_degree": 7}, "product_degree: expected at most 6, got 7"),
-    "product degree below -1": ({"product_degree": -2}, "product_degree: expected at least -1, got -2"),
     "no scale": ({"half_mm": 0}, "half_mm: expected a number above 0"),
-    "NaN scale": ({"half_mm": float("nan")}, "half_mm: expected a number above 0 and finite"),
-    "scale as text": ({"half_mm": "10"}, "half_mm: expected a number, got str"),
     "one row": ({"coefficient": [[0, 0, 0]]}, "coefficient: expected 2 x 3 numbers"),
-    "rows too long": ({"coefficient": [[0] * 4, [0] * 4]}, "coefficient: expected 2 x 3 numbers"),
     "ragged rows": ({"coefficient": [[0] * 3, [0] * 4]}, "coefficient: expected 2 x 3 numbers"),
-    "none": ({"coefficient": []}, "coefficient: expected 2 x 3 numbers"),
-    "text": ({"coefficient": "abc"}, "coefficient: expected 2 x 3 numbers"),
     "NaN": ({"coefficient": [[0, 0, float("nan")], [0, 0, 0]]}, "coefficient: expected finite numbers"),
-    "infinite": ({"coefficient": [[0, 0, float("inf")], [0, 0, 0]]}, "coefficient: expected finite numbers"),
 }
 
 
@@ -211,13 +201,9 @@ def test_unknown_and_missing_keys_are_named():
     for key in REST:
         with pytest.raises(ValueError, match=f"^unit.yaml: key '{key}': missing"):
             ResponseField.from_dict({k: v for k, v in REST.items() if k != key}, "unit.yaml")
-    for values in ([1], None, "field", 3):
+    for kind, values in itertools.product((ResponseField, ResponseModel, SensorPrior), ([1], None, "field")):
         with pytest.raises(ValueError, match=r"^unit\.yaml: expected keys and values, got"):
-            ResponseField.from_dict(values, "unit.yaml")
-        with pytest.raises(ValueError, match=r"^unit\.yaml: expected keys and values, got"):
-            ResponseModel.from_dict(values, "unit.yaml")
-        with pytest.raises(ValueError, match=r"^unit\.yaml: expected keys and values, got"):
-            SensorPrior.from_dict(values, "unit.yaml")
+            kind.from_dict(values, "unit.yaml")
 
 
 def test_a_model_wants_its_parts_in_their_places():
@@ -249,13 +235,6 @@ def test_three_times_the_pixels_see_the_same_field(family):
     field = random_field(*family, half_mm=2.0)
     coarse, fine = field.maps(6, 8, 0.6), field.maps(18, 24, 0.2)
     assert torch.allclose(fine[..., 1::3, 1::3], coarse, rtol=0, atol=1e-12)  # the middle of nine lies where the one did
-
-
-def test_twice_the_pixels_see_the_same_field():
-    field = random_field(1, 1, half_mm=2.0)  # linear in position: the mean of four is the value in their middle
-    coarse, fine = field.maps(6, 8, 0.5), field.maps(12, 16, 0.25)
-    mean = torch.nn.functional.avg_pool2d(fine.flatten(0, 1), 2).reshape(coarse.shape)
-    assert torch.allclose(mean, coarse, rtol=0, atol=1e-12)
 
 
 # normals
@@ -301,15 +280,6 @@ def test_a_flat_skin_at_a_depth_is_flat_in_the_second_pass():
     image = 1.0 + 0.7 * by_depth.maps(6, 7, 0.4)[None]
     assert float(block(image)[:, :2].abs().max()) > 1e-3
     assert float(block(image, torch.full((1, 1, 6, 7), 0.7, dtype=torch.float64))[:, :2].abs().max()) < 1e-12
-
-
-def test_a_message_is_short_though_the_field_is_large():
-    field = random_field(4, 3)
-    rows = [list(row) for row in field.coefficient]
-    rows[0][7] = float("nan")
-    with pytest.raises(ValueError, match="coefficient: expected finite numbers, got") as caught:
-        dataclasses.replace(field, coefficient=tuple(map(tuple, rows)))
-    assert len(str(caught.value)) < 300
 
 
 def test_steepness_is_bounded_and_its_direction_kept():
@@ -383,14 +353,6 @@ def test_normals_of_the_output_are_those_of_the_depth(mode, by_depth):
     assert bool(fast.contact.any()) and torch.allclose(again.gradient[inside], slope[inside], atol=1e-6)
     if by_depth is None:
         assert torch.allclose(again.depth_mm, fast.depth_mm, atol=1e-6)
-
-
-def test_an_image_of_another_shape_is_refused():
-    _, _, block = normals()
-    with pytest.raises(ValueError, match="compensated: expected 6 x 7 like the calibration, got 7 x 6"):
-        block(torch.ones(1, 3, 7, 6, dtype=torch.float64))
-    with pytest.raises(ValueError, match=r"compensated: expected \(B, 3, H, W\), got \[3, 6, 7\]"):
-        block(torch.ones(3, 6, 7, dtype=torch.float64))
 
 
 def test_derivatives_are_those_of_the_slopes():
@@ -475,13 +437,6 @@ def test_a_float_background_survives_within_sixteen_bits(tmp_path, gamma, dtype)
     assert loaded.dtype == dtype and float((values - kept).abs().max()) < 0.51 / 65535 + 2e-7
 
 
-def test_an_eight_bit_background_survives_bit_for_bit_in_double_precision(tmp_path):
-    background = torch.round(smooth_background(24, 32).double() * 255) / 255
-    calibration = vts.Calibration.from_response(model(), vts.Sensor("rig", 24, 32, 0.5), background)
-    calibration.save(tmp_path / "unit.safetensors")
-    assert torch.equal(vts.Calibration.load(tmp_path / "unit.safetensors").background, calibration.background)
-
-
 @pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
 def test_a_loaded_response_gives_the_same_depth(saved, mode):
     x, y = torch.linspace(-1, 1, 32), torch.linspace(-1, 1, 24)[:, None]
@@ -513,21 +468,13 @@ def flipped(raw, place):
 WHOLE, NO_PNG = "expected a whole colour PNG of 24 x 32, got one that says", "expected the bytes of a PNG"
 PNGS = {
     "a tenth": (lambda raw: raw[: len(raw) // 10].clone(), WHOLE),
-    "half": (lambda raw: raw[: len(raw) // 2].clone(), WHOLE),
-    "without its last bytes": (lambda raw: raw[:-16].clone(), WHOLE),
     "a header alone": (lambda raw: raw[:24].clone(), WHOLE),
-    "less than a header": (lambda raw: raw[:20].clone(), NO_PNG),
     "a flipped byte": (lambda raw: flipped(raw, len(raw) // 2), WHOLE),
     "a header of another width": (lambda raw: flipped(raw, 19), WHOLE),
     "a header of two thousand million pixels": (lambda raw: flipped(raw, 16), WHOLE),
-    "another size": (lambda raw: png((20, 32, 3)), WHOLE + " 20 x 32"),
-    "grey": (lambda raw: png((24, 32)), WHOLE),
     "with opacity": (lambda raw: png((24, 32, 4)), WHOLE),
     "a JPEG": (lambda raw: png((24, 32, 3), suffix=".jpg"), NO_PNG),
-    "zeros": (lambda raw: torch.zeros(1000, dtype=torch.uint8), NO_PNG),
-    "nothing": (lambda raw: torch.zeros(0, dtype=torch.uint8), NO_PNG),
     "floats": (lambda raw: raw.float(), NO_PNG),
-    "a batch": (lambda raw: raw[None].clone(), NO_PNG),
 }
 
 
@@ -554,25 +501,16 @@ def put(value, *path):
 
 NAN = float("nan")
 METADATA = {
-    "a list": (put([1], "response"), "response: expected keys and values, got list"),
     "empty": (put({}, "response"), "response: key 'field': missing"),
-    "a text": (put("x", "response"), "response: expected keys and values, got str"),
     "none, and no lights": (put(None, "response"), "tensor 'light_position_mm' is missing"),
     "no field": (put(None, "response", "field"), "response: key field: expected a ResponseField"),
     "field missing": (put(KeyError, "response", "field"), "response: key 'field': missing"),
-    "depth missing": (put(KeyError, "response", "by_depth"), "response: key 'by_depth': missing"),
-    "an unknown key": (put(1, "response", "colour"), "response: key 'colour': unknown"),
     "an unknown key of a field": (put(1, "response", "field", "colour"), "response: field: key 'colour': unknown"),
     "NaN": (put(NAN, "response", "field", "coefficient", 0, 3), "response: field: key coefficient: expected finite numbers"),
-    "infinite": (put(-1e999, "response", "by_depth", "coefficient", 1, 3), "response: by_depth: key coefficient: expected finite"),
     "a number missing": (put([[0.0] * 35] * 2, "response", "field", "coefficient"), "field: key coefficient: expected 2 x 36"),
-    "another degree": (put(1, "response", "field", "degree"), "response: field: key coefficient: expected 2 x 27 numbers"),
     "a huge degree": (put(10**9, "response", "field", "degree"), "response: field: key degree: expected at most 6"),
     "no scale": (put(0, "response", "field", "half_mm"), "response: field: key half_mm: expected a number above 0"),
-    "gamma of zero": (put(0, "response", "gamma"), "response: key gamma: expected a number in"),
-    "NaN gamma": (put(NAN, "response", "gamma"), "response: key gamma: expected a number in"),
     "a negative blur": (put(-1, "response", "blur_px"), "response: key blur_px: expected a number above 0"),
-    "no blur": (put(None, "response", "blur_px"), "response: key blur_px: expected a number, got NoneType"),
 }
 
 
@@ -663,17 +601,12 @@ def test_a_prior_says_how_good_it_is_on_each_unit_or_nothing(tmp_path):
 
 BAD_PRIORS = {
     "unknown key": (put(1, "colour"), "key prior: key 'colour': unknown; expected response, log_background, half_mm, source"),
-    "unknown key of the model": (put(1, "response", "colour"), "key prior: response: key 'colour': unknown"),
     "unknown key of a field": (put(1, "response", "field", "colour"), "key prior: response: field: key 'colour': unknown"),
     "no source": (put(KeyError, "source"), "key prior: key 'source': missing"),
-    "no response": (put(KeyError, "response"), "key prior: key 'response': missing"),
     "no angle": (put([0.0], "held_out_deg"), r"key prior: key held_out_deg: expected a number in \(0, 90\], got 0.0"),
-    "no list of angles": (put(3.5, "held_out_deg"), r"key held_out_deg: expected a list of degrees, one per unit, got 3.5"),
     "no text": (put(3, "source"), "key prior: key source: expected a text"),
     "NaN": (put(NAN, "log_background", 0, 0), "key prior: key log_background: expected finite numbers"),
-    "too few": (put([[0.0] * 14 for _ in range(3)], "log_background"), "key prior: key log_background: expected 3 x 15 numbers"),
     "no scale": (put(0, "half_mm"), "key prior: key half_mm: expected a number above 0"),
-    "NaN coefficient": (put(NAN, "response", "by_depth", "coefficient", 0, 0), "response: by_depth: key coefficient: expected"),
 }
 
 
@@ -720,8 +653,6 @@ def test_the_gelsight_mini_ships_with_a_prior():
     assert bool(torch.isfinite(background).all()) and 0.005 < float(background.min()) < float(background.max()) < 1.5
     field, by_depth = sensor.prior.response.field, sensor.prior.response.by_depth
     assert field.half_mm == pytest.approx(0.5 * sensor.width * sensor.mm_per_pixel, rel=1e-3) and by_depth.half_mm == field.half_mm
-    path = Path(__file__).resolve().parents[2] / "configs" / "sensors" / "gelsight_mini.yaml"
-    assert path.stat().st_size < 10_000
 
 
 # the blur
@@ -751,5 +682,3 @@ def test_the_blur_keeps_a_constant_and_the_sum_of_a_point(std_px):
 def test_no_blur_leaves_the_image():
     image = torch.rand(1, 3, 9, 9)
     assert torch.equal(vts.Compensate(blur_px=0)(image), image)
-    with pytest.raises(ValueError, match=r"blur_px: expected a number in \[0, 1000\], got -1"):
-        vts.Compensate(blur_px=-1)

@@ -1,13 +1,31 @@
 """Images, depth maps, frames and point clouds on disk."""
 
+import itertools
+import os
+import re
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 import torch
-from conftest import write_film
+from conftest import ring_lights, write_film
 
 import torchvts as vts
-from torchvts.core.files import count_frames, read_depth_png, read_frames, write_depth_png
+from torchvts import stream as streams
+from torchvts.core.files import (
+    count_frames,
+    load_tensors,
+    read_depth_png,
+    read_frames,
+    save_tensors,
+    write_atomically,
+    write_depth_png,
+)
 from torchvts.pose import read_cloud
 
 
@@ -209,3 +227,98 @@ def test_clouds_are_read_as_open3d_reads_them(tmp_path, clouds, suffix, form):
     expected = o3d.io.read_point_cloud(str(path))
     assert np.array_equal(found.numpy(), np.asarray(expected.points))
     assert np.array_equal(normals.numpy(), np.asarray(expected.normals))
+
+
+def calibration():
+    return vts.Calibration.from_lights(ring_lights(), vts.Sensor("rig", 48, 64, 0.5), torch.rand(3, 48, 64) * 0.2 + 0.4)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits of processes")
+@pytest.mark.parametrize("name", ["depth.npy", "unit.safetensors", "image.png", "rig.yaml"])
+def test_a_full_disk_is_reported_with_the_name(tmp_path, name):
+    write = {
+        "depth.npy": lambda path: write_array(path),
+        "unit.safetensors": calibration().save,
+        "image.png": lambda path: vts.write_image(path, torch.rand(3, 200, 200)),
+        "rig.yaml": lambda path: vts.Sensor.load("gelsight_mini").save(path, ["# " + "x" * 5000]),
+    }[name]
+    limits, ignored = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))  # a file may have no more bytes: what a full disk does too
+    try:
+        with pytest.raises(OSError, match=rf"{name}: cannot be written: (File too large|10000 requested)"):
+            write(tmp_path / name)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, ignored)
+    assert list(tmp_path.iterdir()) == []
+
+
+def write_array(path):
+    with write_atomically(path) as temporary:
+        np.save(temporary, np.zeros(10_000))
+
+
+def test_names_that_are_not_utf_8(tmp_path):
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/f\xff"))
+    try:
+        folder.mkdir()
+    except OSError:
+        pytest.skip("this file system takes UTF-8 names only")
+    name = os.fsdecode(b"n\xfe")
+    image = torch.rand(3, 8, 8).mul(255).round() / 255
+    vts.write_image(folder / f"{name}.png", image)
+    assert torch.allclose(vts.read_image(folder / f"{name}.png"), image)
+    assert [frame.shape for _, frame in read_frames(folder)] == [(3, 8, 8)]
+    assert streams.open_source(folder).read().shape == (8, 8, 3)
+    calibration().save(folder / f"{name}.safetensors")
+    assert vts.Calibration.load(folder / f"{name}.safetensors").sensor.name == "rig"
+    vts.Sensor.load("gelsight_mini").save(folder / f"{name}.yaml")
+    assert vts.Sensor.load(folder / f"{name}.yaml").height == 240
+    (folder / f"{name}.avi").write_bytes(b"RIFF")
+    for read in (lambda path: list(read_frames(path)), streams.open_source):
+        with pytest.raises(
+            ValueError, match=r"video: expected a name in UTF-8, which OpenCV needs, got '.*\\udcfe\.avi': rename it"
+        ):
+            read(folder / f"{name}.avi")
+    with pytest.raises(ValueError, match="video: expected a name in UTF-8"):
+        streams.VideoFile(folder / "out.avi", 10.0)
+
+
+def test_a_flipped_bit_of_a_table_is_refused(tmp_path):
+    save_tensors(
+        tmp_path / "t.safetensors", {"a": torch.arange(8.0), "b": torch.ones(2, dtype=torch.bool)}, {"kind": "x", "n": 1.5}
+    )
+    content = (tmp_path / "t.safetensors").read_bytes()
+    tensors, described = load_tensors(tmp_path / "t.safetensors")
+    refused = 0
+    for place, bit in itertools.product(range(0, len(content), 5), (0, 3)):
+        (tmp_path / "t.safetensors").write_bytes(content[:place] + bytes([content[place] ^ 1 << bit]) + content[place + 1 :])
+        try:
+            found, told = load_tensors(tmp_path / "t.safetensors")
+        except ValueError:
+            refused += 1
+        else:  # a bit of the padding, or of how a character is written
+            assert told == described and all(torch.equal(found[name], tensors[name]) for name in tensors)
+    assert refused > 1.9 * len(content) / 5
+
+
+def test_the_opencv_at_hand_has_all_that_is_used():
+    """opencv-contrib-python-headless and opencv-python differ in windows and contributed modules only; neither is used."""
+    sources = (Path(vts.__file__).parent).rglob("*.py")
+    names = {name for path in sources for name in re.findall(r"\bcv2\.([A-Za-z_][A-Za-z_0-9]*)", path.read_text(encoding="utf-8"))}
+    assert {"imdecode", "imencode", "VideoCapture"} <= names
+    assert [name for name in sorted(names) if not hasattr(cv2, name)] == []
+    assert names & {"imshow", "namedWindow", "waitKey", "ximgproc", "xphoto", "aruco", "optflow"} == set()
+
+
+@pytest.mark.long
+def test_a_process_survives_sources_that_crashed_it():
+    """Inside OpenCV, where no exception helps."""
+    program = (
+        "import torchvts as vts\n"
+        "for source in (-1, -2**31, 2**31, b'\\xff.avi'.decode(errors='surrogateescape'), '99999999999999999999'):\n"
+        "    try:\n        vts.stream.open_source(source)\n"
+        "    except (OSError, ValueError) as error:\n        print(type(error).__name__)\n"
+    )
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0 and len(done.stdout.split()) == 5, done.stderr[-500:]

@@ -298,12 +298,6 @@ def test_depth_beyond_a_png_is_left_out_and_a_full_disk_stops(unit, tmp_path, mo
     assert report.rows == 2 and read_depth_png(tmp_path / "out" / "a_depth.png").shape == (1, 1, 48, 64)
 
 
-def test_pictures_are_drawn_for_few_frames_only(unit, frames, whole, tmp_path):
-    assert not any(name.endswith("_picture.png") for name in whole)
-    reconstruct_dataset(unit, fill(tmp_path / "in", ["a.png"]), tmp_path / "out")
-    assert (tmp_path / "out" / "a_picture.png").stat().st_size > 5000
-
-
 @pytest.mark.parametrize(
     "options, message",
     [
@@ -322,3 +316,48 @@ def test_an_empty_folder_is_refused(unit, tmp_path):
     (tmp_path / "in").mkdir()
     with pytest.raises(ValueError, match="no images or videos in this folder"):
         reconstruct_dataset(unit, tmp_path / "in", tmp_path / "out")
+
+
+@pytest.fixture
+def run(unit, tmp_path):
+    """Reconstructs two images of ``in`` into ``out``; both folders are in ``folder``."""
+    fill(tmp_path / "in", ["a.png", "b.png"])
+
+    def reconstruct(**options):
+        return reconstruct_dataset(unit, tmp_path / "in", tmp_path / "out", **{"pictures": False, "workers": 0, **options})
+
+    reconstruct.folder = tmp_path
+    return reconstruct
+
+
+@pytest.mark.parametrize("damage", [b"{", b"[]", b'{"mark": [1, 2]}', b'{"mark": 3}', b"[" * 10_000, b"\xff\x00"])
+def test_a_damaged_record_is_done_again(run, damage):
+    run()
+    for record in (run.folder / "out" / STATE / "frames").glob("a*.json"):
+        mark = json.loads(record.read_bytes())["mark"]
+        record.write_bytes(damage.replace(b"[1, 2]", json.dumps(mark).encode()))
+    report = run()
+    assert (report.rows, report.before) == (2, 1)
+
+
+def test_overwriting_leaves_no_old_files_beside_new_ones(run):
+    run(format="npy")
+    (run.folder / "out" / "notes.txt").write_text("the user's own")
+    before = contents(run.folder / "out").keys()
+    run(format="none", overwrite=True)
+    after = contents(run.folder / "out").keys()
+    assert before - after == {"a_depth.npy", "b_depth.npy"} and {"frames.csv", "notes.txt"} <= after
+
+
+def test_names_do_not_break_tables_and_links_do_not_end_a_run(run):
+    source = run.folder / "in"
+    content = (source / "a.png").read_bytes()
+    for name in ("=1+1.png", "-2.png", "two\nlines.png", "cr\r.png", "tab\t.png"):
+        (source / name).write_bytes(content)
+    (source / "loop.png").symlink_to(source / "loop.png")
+    (source / "loop").symlink_to(source / "loop")
+    (source / "gone.png").symlink_to(source / "nowhere")
+    report = run()
+    assert report.rows == 7 and sorted(name for name, _ in report.failed) == ["gone.png", "loop.png"]
+    lines = (run.folder / "out" / "frames.csv").read_text(encoding="utf-8").splitlines()
+    assert {"'=1+1.png", "'-2.png", "two\\nlines.png", "cr\\r.png", "tab\\t.png"} <= {line.split(",")[0] for line in lines}

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from lab import frames, rows, speed
-from lab.figures import learning_figure, speed_figure
 from lab.methods import METHODS
 from lab.rows import Row, Size, Time
 from torchvts.cli import bench
@@ -39,10 +38,6 @@ def test_scenes_are_timed_and_scored(monkeypatch):
     assert speed.ms(by_name["fast"]) == 2.0 and by_name["fast"].time.memory_mb >= 0.0
 
 
-def test_the_front_holds_what_no_row_beats():
-    assert [r.method for r in speed.front(ROWS, "rms_um")] == ["flat", "fast", "precise"]
-
-
 def test_rows_come_back_from_json():
     without = dataclasses.replace(ROWS[0], time=None, size=None, note="failed", severity=0.1, seed=2)
     assert rows.from_json(rows.to_json([*ROWS, without])) == [*ROWS, without]
@@ -57,24 +52,6 @@ def test_the_table_has_a_line_for_each_row():
         speed.ms(dataclasses.replace(ROWS[0], time=None))
 
 
-def test_the_chart_names_its_points():
-    sensor = [row("response, fast", 1.0, 3.0, "sensor", 240, "GelSight Mini, balls"), row(speed.GS_SDK, 9.0, 2.5, "sensor", 240)]
-    for given, panels in ((ROWS, 2), ([*ROWS, *sensor], 3)):
-        figure = speed_figure(given)
-        assert len(figure.axes) == panels and not any(axes.get_legend() for axes in figure.axes)
-        scene = figure.axes[-2]
-        assert {"fast", "precise", "auto"} <= {text.get_text() for text in scene.texts}
-        assert "not drawn: flat, 500 at 0.1 ms" in scene.get_xlabel()
-    assert "GelSight Mini, 320x240" in figure.axes[0].get_title()  # the real sensor comes first
-    boxes = [text.get_window_extent() for text in figure.legends[0].get_texts()]
-    assert all(not box.overlaps(axes.get_window_extent()) for box in boxes for axes in figure.axes)  # it covers no point
-    wide = row("a prior that has seen all of them, precise", 1.1, 2.4, "sensor", 240, "GelSight Mini, balls")
-    panel = speed_figure([*ROWS, *sensor, wide]).axes[0]
-    panel.figure.draw_without_rendering()
-    boxes = [text.get_window_extent() for text in panel.texts]
-    assert len(boxes) == 3 and all(panel.bbox.x0 <= box.x0 and box.x1 <= panel.bbox.x1 for box in boxes)
-
-
 def test_a_chart_is_drawn_again_from_its_table(run_script, tmp_path):
     (tmp_path / "bench.json").write_text(rows.to_json(ROWS))
     done = run_script("figures", "speed", tmp_path / "bench.json", tmp_path / "chart.png")
@@ -84,18 +61,6 @@ def test_a_chart_is_drawn_again_from_its_table(run_script, tmp_path):
     assert done.returncode == 0 and (tmp_path / "overview.png").stat().st_size > 10_000
     done = run_script("figures", "speed", tmp_path / "none.json", tmp_path / "chart.png")
     assert done.returncode == 1 and done.stderr.startswith("error: ") and "none.json" in done.stderr
-
-
-def test_the_learning_curve_shows_every_draw():
-    drawn = [Row("presses", m, "a set", {"count": c, "normal_deg": c + k, "relief_um": 3.0}, seed=k)
-             for m in ("presses", "MLP") for c in (1.0, 5.0) for k in range(3)]  # fmt: skip
-    level = Row("presses", "a network", "a set", {"count": None, "normal_deg": 2.5, "relief_um": 3.0})
-    figure = learning_figure([*drawn, level])
-    assert list(figure.axes[0].get_lines()[-1].get_ydata()) == [2.5, 2.5]
-    line = figure.axes[0].get_lines()[0]
-    assert list(line.get_ydata()) == [2.0, 6.0] and "3 draws" in figure.get_suptitle()
-    bars = figure.axes[0].collections[0].get_segments()
-    assert [[end[1] for end in bar] for bar in bars] == [[1.0, 3.0], [5.0, 7.0]]
 
 
 def test_frames_are_timed_as_a_user_runs_them(monkeypatch):

@@ -1,7 +1,6 @@
 """The sweep over hard scenes: what it measures, that it goes on where it stopped, and that no breaking point has moved."""
 
 import itertools
-import json
 import math
 import warnings
 from pathlib import Path
@@ -13,7 +12,7 @@ from lab import stability
 from lab.gallery import CORRUPTIONS, undisturbed
 from lab.methods import METHODS, Method
 from lab.rows import Row
-from lab.stability import MASK, SWEPT, Breaking
+from lab.stability import MASK, SWEPT
 
 ROOT = Path(__file__).resolve().parents[2]
 POINTS, SEEDS = stability.points_from_json((ROOT / "tests" / "breaking_points.json").read_text())
@@ -78,24 +77,6 @@ def test_a_row_is_the_metrics_of_the_method():
     assert flat["largest_px"] == pytest.approx(float(z.max()) / 0.125, rel=1e-4)
 
 
-def test_without_contact_the_whole_image_counts():
-    case = CORRUPTIONS["faint contact"].make(0.0, 0)
-    row = stability.measure("fast", "faint contact", 0.0, 0, case)
-    error = row.errors
-    assert error["press_um"] == 0.0 and stability.depth_share(row) == error["rms_um"] / 100.0 and error["iou"] == 1.0
-
-
-def test_the_plain_inverse_is_the_method_where_nothing_is_dark_and_worse_where_something_is():
-    plain, lit = (
-        METHODS[m].calibrated(undisturbed().calibration).reconstruct(undisturbed().image)
-        for m in ("precise, plain inverse", "precise")
-    )
-    assert (plain.depth_mm - lit.depth_mm).abs().max() < 1e-4
-    dark = CORRUPTIONS["attached shadows"].make(40.0, 0)
-    row, plain_row = (stability.measure(m, "attached shadows", 40.0, 0, dark) for m in ("precise", "precise, plain inverse"))
-    assert stability.limits(plain_row) > 3 * stability.limits(row)
-
-
 def test_what_fails_or_warns_keeps_its_note(monkeypatch):
     def breaks(calibration):
         raise RuntimeError("the LED is broken")
@@ -144,46 +125,7 @@ def test_breaking_points_are_interpolated():
     assert stability.breaking_point("fast", noise, two, stability.limits) == point
 
 
-def test_breaking_points_of_falling_severities():
-    rows = _rows((0.1, 0.1, 0.5, 1.5, 2.0, 3.0, 4.0), "few bits", 1)  # 12, 8, 6, 5, ...
-    point = stability.breaking_point("fast", CORRUPTIONS["few bits"], rows, stability.limits)
-    assert point.at == pytest.approx(5.5) and point.tolerance > 0 and point.held == pytest.approx(2.5 / 6)
-
-
-def test_the_table_has_a_line_for_each_corruption_and_no_empty_cell():
-    lines = stability.table(POINTS).splitlines()
-    assert len(lines) == 2 + len(CORRUPTIONS) and len({line.count("|") for line in lines}) == 1
-    assert all(cell.strip() for line in lines for cell in line.split("|")[1:-1])
-    without = [p for p in POINTS if not (p.method == "auto" and p.corruption == "noise")]
-    assert stability.table(without).count("not measured") == 1
-
-
-def test_json_comes_back_as_it_was():
-    text = stability.points_to_json(POINTS, "a command", 3)
-    assert stability.points_from_json(text) == (POINTS, 3) and json.loads(text)["limits"] == stability.LIMITS
-
-
-def test_pages_list_breaking_points():
-    points = [
-        Breaking("flat", "noise", "value", "always", 0.0, (0.002,), 0.0),
-        Breaking("fast", "noise", "value", 0.01234, 0.1, (0.01, 0.02), 0.4),
-        Breaking("precise", "noise", "value", "never", 0.0, (0.1,), 1.0),
-    ]
-    head = "# a page\n<!-- breaking points -->\n\n"
-    updated = stability.updated_page(f"{head}| old |\n|---|\n\nmore", points)
-    assert updated == f"{head}{stability.table(points[1:])}\n\nmore" and "| 0.0123 | never |" in updated
-    with pytest.raises(ValueError, match="page: expected a line <!-- breaking points -->"):
-        stability.updated_page("# a page\n", points)
-
-
 SMALL = {"methods": ["flat", "fast"], "corruptions": ["noise"], "seeds": 1}
-
-
-def test_a_sweep_has_a_row_for_each_severity_and_method():
-    count = []
-    rows = stability.sweep(**SMALL, progress=lambda: count.append(1))
-    assert len(rows) == len(count) == 12
-    assert [(row.severity, row.method) for row in rows[:3]] == [(0.002, "flat"), (0.002, "fast"), (0.005, "flat")]
 
 
 @pytest.mark.long

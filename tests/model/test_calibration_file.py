@@ -11,7 +11,7 @@ import safetensors.torch
 import torch
 
 import torchvts as vts
-from torchvts.core.files import load_tensors, save_tensors, write_atomically
+from torchvts.core.files import load_tensors, save_tensors
 
 SENSOR = vts.Sensor("rig", 24, 32, 1.25, gamma=1.8)
 
@@ -63,12 +63,6 @@ def test_double_precision_survives(ring, tmp_path):
     assert loaded.inverse.dtype == torch.float64 and torch.equal(loaded.inverse, cal.inverse) and loaded.measured is False
 
 
-def test_what_the_paper_keeps_is_in_the_file(saved):
-    tensors, metadata = load_tensors(saved)
-    assert {"light_position_mm", "light_albedo", "compensation", "inverse"} <= set(tensors)
-    assert metadata["format_version"] == 7 and metadata["sensor"]["mm_per_pixel"] == 1.25
-
-
 def no_tensor(name):
     return lambda tensors: tensors.pop(name)
 
@@ -90,8 +84,6 @@ TENSORS = {
        for name in ("light_position_mm", "light_albedo", "light_gloss", "background", "compensation", "inverse", "noise_std")},
     **{f"NaN in {name}": (put(name, with_nan), f"tensor '{name}': expected finite values")
        for name in ("light_position_mm", "background", "inverse", "noise_std")},
-    "a light below the skin": (put("light_position_mm", lambda t: -t), "expected lights above the skin"),
-    "no albedo": (put("light_albedo", lambda t: 0 * t), "albedo: expected values above 0"),
     "no noise": (put("noise_std", lambda t: 0 * t), "tensor 'noise_std': expected values above 0"),
     "other lights": (put("light_albedo", lambda t: 1.5 * t), "does not fit the lights in the same file"),
     "another inverse": (put("inverse", lambda t: t.flip(0).contiguous()), "tensor 'inverse' does not fit the lights"),
@@ -102,18 +94,13 @@ TENSORS = {
 }  # fmt: skip
 METADATA = {
     "a later version": (lambda m: m.update(format_version=99), "expected format version 7, got 99: .*update torchvts"),
-    "an earlier version": (lambda m: m.update(format_version=6), "expected format version 7, got 6"),
-    "version as text": (lambda m: m.update(format_version="1"), "format version 7, got '1'"),
-    "no version": (lambda m: m.pop("format_version"), "format version 7, got None"),
     "another kind": (lambda m: m.update(kind="mesh"), "expected a calibration, got a file of kind 'mesh'"),
     "no sensor": (lambda m: m.pop("sensor"), "expected keys and values, got NoneType"),
     "another sensor": (lambda m: m["sensor"].update(height=48), r"expected \(3, 48, 32\) floats, got \(3, 24, 32\)"),
     "another pitch": (lambda m: m["sensor"].update(mm_per_pixel=0.1), "does not fit the lights in the same file"),
     "unknown key of the sensor": (lambda m: m["sensor"].update(colour=1), "key 'colour': unknown"),
     "no report": (lambda m: m.pop("report"), "report: expected keys and values, got NoneType"),
-    "measured as text": (lambda m: m.update(measured="yes"), "measured: expected true or false, got 'yes'"),
     "a report without a source": (lambda m: m["report"].pop("source"), "report: source: expected one of given, .*, got None"),
-    "a report of another model": (lambda m: m["report"].update(model="mesh"), "report: model: expected one of .*, got 'mesh'"),
 }
 
 
@@ -156,53 +143,25 @@ def load_tensors_unchecked(content):
     return safetensors.torch.load(content), metadata
 
 
-@pytest.mark.parametrize("keep", [0, 4, 7, 8, 100, 0.5, 0.999])
-def test_a_file_cut_short_is_refused(saved, keep):
-    content = saved.read_bytes()
-    saved.write_bytes(content[: keep if isinstance(keep, int) else int(keep * len(content))])
-    with pytest.raises(ValueError, match="not a safetensors file, or cut short") as caught:
-        vts.Calibration.load(saved)
-    assert str(caught.value).startswith(f"{saved}: ")
-
-
-@pytest.mark.parametrize("content", [b"\x89PNG\r\n\x1a\n" + bytes(100), b"\xff" * 64, b"hello"])
-def test_what_is_no_safetensors_file_is_refused(tmp_path, content):
-    (tmp_path / "unit.safetensors").write_bytes(content)
-    with pytest.raises(ValueError, match=r"unit\.safetensors: not a safetensors file, or cut short"):
-        vts.Calibration.load(tmp_path / "unit.safetensors")
-
-
-@pytest.mark.parametrize("metadata", [None, {"format": "pt"}])
-def test_a_foreign_safetensors_file_is_refused(tmp_path, metadata):
-    path = tmp_path / "model.safetensors"
-    safetensors.torch.save_file({"weight": torch.zeros(3)}, str(path), metadata)
-    with pytest.raises(ValueError, match=r"model\.safetensors: a safetensors file, but not one written by torchvts"):
-        vts.Calibration.load(path)
-
-
-@pytest.mark.parametrize("text", ["{", "[1]"])
-def test_metadata_that_is_no_object_is_refused(tmp_path, text):
+@pytest.mark.parametrize(
+    "metadata, message",
+    [
+        ("none", "not a safetensors file, or cut short"),
+        (None, "a safetensors file, but not one written by torchvts"),
+        ({"format": "pt"}, "a safetensors file, but not one written by torchvts"),
+        ({"torchvts": "{"}, "its metadata is damaged"),
+        ({"torchvts": "[1]"}, "its metadata is damaged"),
+    ],
+)
+def test_a_foreign_file_is_refused(tmp_path, metadata, message):
     path = tmp_path / "unit.safetensors"
-    safetensors.torch.save_file({"weight": torch.zeros(3)}, str(path), {"torchvts": text})
-    with pytest.raises(ValueError, match=r"unit\.safetensors: its metadata is damaged"):
+    if metadata == "none":
+        path.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(100))
+    else:
+        safetensors.torch.save_file({"weight": torch.zeros(3)}, str(path), metadata)
+    with pytest.raises(ValueError, match=message) as caught:
         vts.Calibration.load(path)
-
-
-def test_a_missing_file_is_said_to_be_missing(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"nowhere\.safetensors: no such file"):
-        vts.Calibration.load(tmp_path / "nowhere.safetensors")
-    with pytest.raises(FileNotFoundError, match="no such file"):
-        vts.Calibration.load(tmp_path)
-
-
-def test_a_failed_write_leaves_the_old_file_and_nothing_else(saved):
-    before = saved.read_bytes()
-    with pytest.raises(RuntimeError, match="power cut"), write_atomically(saved) as temporary:
-        temporary.write_bytes(b"half")
-        assert temporary.parent == saved.parent
-        raise RuntimeError("power cut")
-    assert saved.read_bytes() == before
-    assert [path.name for path in saved.parent.iterdir()] == [saved.name]
+    assert str(caught.value).startswith(f"{path}: ")
 
 
 def test_a_report_that_json_cannot_hold_leaves_the_old_file(calibration, saved):
@@ -219,13 +178,6 @@ def test_a_new_file_replaces_the_old_and_keeps_its_mode(calibration, saved):
     vts.Calibration.from_lights(calibration.lights, SENSOR).save(saved)
     assert vts.Calibration.load(saved).measured is False
     assert saved.stat().st_mode & 0o777 == 0o640
-
-
-def test_a_missing_folder_and_a_folder_in_the_way_are_refused(calibration, tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"folder .*nowhere does not exist: make it first"):
-        calibration.save(tmp_path / "nowhere" / "unit.safetensors")
-    with pytest.raises(IsADirectoryError, match="expected the name of a file, got a folder"):
-        calibration.save(tmp_path)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")

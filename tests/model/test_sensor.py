@@ -1,13 +1,11 @@
 """Sensor files: strict, found wherever the package is installed, and what rectifies a camera's frame."""
 
-import math
 import os
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
 
-import kornia
 import pytest
 import torch
 
@@ -35,24 +33,18 @@ def as_text(**changes):
         (as_text() + "height: 25\n", "key 'height': given twice"),
         (as_text(height="tall"), "key height: expected an integer, got str 'tall'"),
         (as_text(height=24.5), "key height: expected an integer, got float 24.5"),
-        (as_text(width=True), "key width: expected an integer, got bool"),
         (as_text(width=4), "key width: expected at least 8, got 4"),
-        (as_text(mm_per_pixel=0), "key mm_per_pixel: expected a number in .*, got 0"),
         (as_text(mm_per_pixel=-1), "key mm_per_pixel: expected a number in .*, got -1"),
         (as_text(mm_per_pixel=63.4), r"key mm_per_pixel: expected a number in \(0, 10\], got 63.4"),
-        (as_text(mm_per_pixel=".nan"), "key mm_per_pixel: expected a number in .*, got nan"),
         (as_text(mm_per_pixel="0.1 mm"), "key mm_per_pixel: expected a number, got str"),
         (as_text(gamma=0.01), r"key gamma: expected a number in \[0.1, 10\], got 0.01"),
-        (as_text(blur_px=-1), "key blur_px: expected a number in"),
         (as_text(blur_px=100), r"key blur_px: expected a number in \[0, 6\], got 100"),
         (as_text(name=7), "key name: expected a text, got 7"),
-        (as_text(name="' '"), "key name: expected a text, got ' '"),
         (as_text(light_position_mm="[[1, 2, 3]]"), r"key light_position_mm: expected 3 x 3 numbers, got shape \(1, 3\)"),
         (
             as_text(light_position_mm="[[1, 2, 3], [1, 2, 3], [1, 2, -3]]"),
             r"key light_position_mm: expected lights above the skin \(z > 0\)",
         ),
-        (as_text(light_position_mm="[[1, 2, a], [1, 2, 3], [1, 2, 3]]"), "key light_position_mm: expected 3 x 3 numbers"),
         (as_text(roi_px="[0, 0, 10]"), r"key roi_px: expected 4 numbers, got shape \(3,\)"),
         (as_text(roi_px="[-1, 0, 10, 10]"), "key roi_px: expected whole numbers"),
         (as_text(raw_size_px="[48, 64]"), r"key raw_size_px: expected 2 x 2 numbers"),
@@ -61,7 +53,6 @@ def as_text(**changes):
         (as_text(corners_px="[[0, 0], [0, 9], [9, 9], [9, 0]]"), "key corners_px: expected a convex quadrilateral"),
         (as_text(corners_px="[[0, 0], [9, 0], [9, 9], [0, 9]]", roi_px="[0, 0, 9, 9]"), "expected one of them, got both"),
         ("- 1\n- 2\n", "expected keys and values, got list"),
-        ("", "expected keys and values, got NoneType"),
         ("name: [rig\n", "not a YAML file"),
         ("!!python/object/apply:os.getcwd []\n", "not a YAML file"),
     ],
@@ -71,13 +62,6 @@ def test_a_bad_file_is_refused_by_file_and_key(tmp_path, text, message):
     with pytest.raises(ValueError, match=message) as caught:
         vts.Sensor.load(path)
     assert str(caught.value).startswith(f"{path}: ")
-
-
-def test_bytes_that_are_no_text_are_refused(tmp_path):
-    path = tmp_path / "unit.yaml"
-    path.write_bytes(b"\x89PNG\xff\xfe")
-    with pytest.raises(ValueError, match="not a YAML file"):
-        vts.Sensor.load(path)
 
 
 @pytest.mark.parametrize("source", ["nowhere.yaml", "gelsight_maxi"])
@@ -98,14 +82,6 @@ def test_shipped_figures():
     mini = vts.Sensor.load("gelsight_mini")
     assert (mini.height, mini.width, mini.mm_per_pixel, mini.exponent) == (240, 320, 0.0634, 1.0)
     assert vts.Sensor.load("tacto").gamma == 2.2
-
-
-def test_defaults_and_immutability():
-    sensor = vts.Sensor(**GOOD)
-    assert (sensor.gamma, sensor.exponent, sensor.blur_px, sensor.markers) == (None, 1.0, 0.0, None)
-    assert (sensor.light_position_mm, sensor.roi_px, sensor.corners_px, sensor.prior) == (None, None, None, None)
-    with pytest.raises(AttributeError):
-        sensor.height = 5
 
 
 @pytest.mark.parametrize("height, width", [(480, 640), (120, 160), (60, 80)])
@@ -165,14 +141,6 @@ def test_rectify_cuts_the_region_of_interest():
     halved = vts.Sensor("rig", 25, 35, 0.2, roi_px=(12, 34, 70, 50)).rectify(frame())
     x, y = 12.5 + 2 * torch.arange(35, dtype=torch.float64), 34.5 + 2 * torch.arange(25, dtype=torch.float64)
     assert (halved - smooth(x[None, :], y[:, None]))[..., 2:-2, 2:-2].abs().max() < 0.02
-
-
-def test_rectify_by_corners_equals_kornias_warp():
-    corners, frame = ((7, 6), (66, 12), (69, 40), (9, 45)), torch.rand(2, 3, 48, 72, generator=torch.Generator().manual_seed(0))
-    target = torch.tensor([[[0.0, 0.0], [59.0, 0.0], [59.0, 47.0], [0.0, 47.0]]])
-    homography = kornia.geometry.get_perspective_transform(torch.tensor([corners]).float(), target).expand(2, 3, 3)
-    expected = kornia.geometry.warp_perspective(frame, homography, (48, 60), align_corners=True)
-    assert (vts.Sensor("rig", 48, 60, 0.1, corners_px=corners).rectify(frame) - expected).abs().max() < 1e-4
 
 
 def test_rectify_straightens_a_quadrilateral():
@@ -246,10 +214,6 @@ def test_shipped_sensors_are_found_from_an_installed_wheel(tmp_path):
     assert where.startswith(str(tmp_path / "site"))
     assert found.split() == ["0.0634", *vts.shipped_sensors()]
     assert (tmp_path / "site" / "torchvts" / "py.typed").is_file()
-
-
-def test_field_of_view():
-    assert math.isclose(vts.Sensor.load("gelsight_mini").field_mm[1], 320 * 0.0634)
 
 
 def test_raw_frames_are_cropped_and_resized():

@@ -64,14 +64,6 @@ def test_compiles_with_inductor(mode: str) -> None:
             assert float((found.double() - expected.double()).abs().max()) < 1e-5
 
 
-@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_half_precision_is_refused(mode: str, dtype: torch.dtype) -> None:
-    for pipe in (vts.DepthPipeline.from_calibration(rig(), mode), vts.DepthPipeline.from_calibration(rig(), mode).to(dtype)):
-        with pytest.raises(TypeError, match=r"images: expected float32 or float64, got torch\..*float16: .*use \.float\(\)"):
-            pipe(press().to(dtype))
-
-
 def _derivatives(module: torch.nn.Module, image: Tensor) -> list[Callable[[], object]]:
     def loss(given: Tensor) -> Tensor:
         out = module(given)
@@ -370,3 +362,10 @@ def test_the_way_that_asks_for_nothing_gives_the_same_depth(kind: str, mode: str
         found = pipe(images)
     assert torch.equal(found.deformed, expected.deformed)
     assert float((found.depth_mm - expected.depth_mm).abs().max()) < 1e-5
+
+
+def test_the_later_check_of_a_gpu_raises_what_it_checks() -> None:
+    checks.check_range_later("images", torch.rand(1, 3, 4, 4))
+    for bad in (2.0, -1.0, float("nan")):
+        with pytest.raises(RuntimeError, match=r"images: expected finite values in \[0, 1\]"):
+            checks.check_range_later("images", torch.full((1, 3, 4, 4), bad))

@@ -6,10 +6,8 @@ import pytest
 import torch
 
 import torchvts as vts
-from lab import metrics
 from torchvts.core.geometry import normal_from_gradient
 from torchvts.core.noise import noise_std
-from torchvts.training.balls import fit_sphere
 
 scenes = vts.scenes
 SIZE = {"height": 241, "width": 321, "mm_per_pixel": 0.125, "dtype": torch.float64}
@@ -70,18 +68,6 @@ def test_a_cylinder_turns_from_x_towards_y():
     assert float(torch.corrcoef(torch.stack((rows, columns)).double())[0, 1]) > 0.8
 
 
-def test_a_tilted_punch_has_the_slope_of_its_tilt():
-    scene = scenes.punch_press(tilt_deg=3.0, **SIZE)
-    assert float(scene.gradient[0, 0, 120, 160]) == pytest.approx(math.tan(math.radians(3.0)))
-    assert float(scene.gradient[0, 1, 120, 160]) == 0
-
-
-@pytest.mark.parametrize("text", ["", " ", "abc", "A1"])
-def test_letters_need_strokes(text):
-    with pytest.raises(ValueError, match="text: expected capital letters A-Z and spaces, got "):
-        scenes.letters_press(text)
-
-
 def test_every_letter_has_its_own_shape():
     shapes = {
         bytes(scenes.letters_press(c, height=64, width=64, mm_per_pixel=0.15).contact.numpy()) for c in "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
@@ -89,30 +75,9 @@ def test_every_letter_has_its_own_shape():
     assert len(shapes) == 26
 
 
-@pytest.mark.parametrize(
-    "call, message",
-    [
-        (lambda: scenes.sphere_press(1.0, 2.0), r"press_mm: expected a number in \(0, 1\], got 2.0"),
-        (lambda: scenes.sphere_press(-1.0), "radius_mm: expected a number above 0 and finite, got -1.0"),
-        (lambda: scenes.cone_press(90.0), r"half_angle_deg: expected a number in \(0, 89.9\], got 90.0"),
-        (lambda: scenes.punch_press(wall_mm=0), "wall_mm: expected a number above 0"),
-        (lambda: scenes.sine_press(period_mm=float("nan")), "period_mm: expected a number above 0"),
-        (lambda: scenes.sphere_press(height=2), "height: expected at least 3, got 2"),
-    ],
-)
-def test_impossible_presses_are_refused(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
-
-
 @pytest.fixture(scope="module")
 def rendered(ring, small_press):
     return small_press(1.0), ring()
-
-
-def test_without_options_an_image_is_the_forward_model(rendered):
-    scene, lights = rendered
-    assert torch.equal(scenes.render(scene, lights), vts.near_field_shading(scene.depth_mm, scene.normal, lights, 0.25).clamp(0, 1))
 
 
 @pytest.mark.parametrize("bits", [8, 10])
@@ -150,53 +115,3 @@ def test_spots_darken_and_dead_pixels_stay_black(rendered):
     assert 25 <= int((spots == 0).sum()) <= 30 and image[dead].abs().max() == 0
     assert (scenes.render(*rendered, spots=spots) - plain * spots).abs().max() < 1e-7
     assert torch.equal(spots, scenes.skin_spots(120, 160)) and not torch.equal(spots, scenes.skin_spots(120, 160, seed=1))
-
-
-def test_an_undeformed_skin_has_no_contact(rendered):
-    scene = scenes.undeformed(rendered[0])
-    assert scene.depth_mm.abs().max() == 0 and not bool(scene.contact.any()) and scene.mm_per_pixel == 0.25
-    assert torch.equal(scene.normal, normal_from_gradient(scene.gradient).abs())
-
-
-def test_depth_error_by_hand():
-    truth, depth = torch.zeros(1, 1, 2, 2), torch.tensor([[3.0, 0.0], [-4.0, 0.0]]).reshape(1, 1, 2, 2)
-    assert metrics.depth_error(depth, truth, 0.5) == pytest.approx((4.0, 2.5, 8.0, 5.0))
-    region = torch.tensor([[True, True], [False, False]]).reshape(1, 1, 2, 2)
-    assert metrics.depth_error(depth, truth, 0.5, region) == pytest.approx((3.0, math.sqrt(4.5), 6.0, math.sqrt(18)))
-
-
-@pytest.mark.parametrize("angle_deg", [0.0, 1e-5, 1.0, 60.0, 90.0, 180.0])
-def test_the_angle_between_normals(angle_deg):
-    a = math.radians(angle_deg)
-    one, two = (
-        torch.tensor(v, dtype=torch.float64).reshape(1, 3, 1, 1) for v in ([0.0, 0.0, 1.0], [math.sin(a), 0.0, math.cos(a)])
-    )
-    assert float(metrics.normal_angle_deg(one, two)) == pytest.approx(angle_deg, rel=1e-9, abs=1e-12)
-    assert metrics.normal_angle_deg(one, two, torch.ones(1, 1, 1, 1, dtype=torch.bool)).shape == (1,)
-
-
-def square(left, size=4):
-    mask = torch.zeros(1, 1, 20, 20, dtype=torch.bool)
-    mask[..., 5 : 5 + size, left : left + size] = True
-    return mask
-
-
-def test_overlap_and_rim_distance_by_hand():
-    nothing = torch.zeros_like(square(5))
-    assert metrics.mask_iou(square(5), square(7)) == pytest.approx(8 / 24)
-    assert metrics.mask_iou(square(5), square(5)) == 1.0 and metrics.mask_iou(square(5), nothing) == 0.0
-    assert metrics.mask_iou(nothing, nothing) == 1.0
-
-
-@pytest.mark.parametrize("radius_mm, press_mm, center_mm", [(10.0, 0.2, (0.0, 0.0)), (3.0, 1.0, (5.0, -4.0))])
-def test_the_sphere_of_exact_points_is_exact(radius_mm, press_mm, center_mm):
-    scene = scenes.sphere_press(radius_mm, press_mm, center_mm, **SIZE)
-    fit = fit_sphere(scene.depth_mm, 0.125, scene.contact)
-    assert fit.center_mm == pytest.approx((center_mm[0], -center_mm[1], press_mm - radius_mm), abs=1e-8)
-    assert fit.radius_mm == pytest.approx(radius_mm, abs=1e-8) and fit.rms_mm < 1e-9
-
-
-def test_a_sphere_needs_four_points():
-    one, none = torch.zeros(1, 1, 4, 4), torch.zeros(1, 1, 4, 4, dtype=torch.bool)
-    with pytest.raises(ValueError, match="contact: expected at least 4 pixels, got 0: no contact, no sphere"):
-        fit_sphere(one, 1.0, none)

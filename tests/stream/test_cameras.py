@@ -1,0 +1,126 @@
+"""Cameras that stop, hang or come back, and readers of one's own."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+import torch
+from conftest import Frames, ring_lights
+
+import torchvts as vts
+from torchvts import stream as streams
+from torchvts.core.files import rgb_from_bgr
+from torchvts.stream.sources import LiveReader, check_reader
+
+HEIGHT, WIDTH, PITCH = 48, 64, 0.5
+
+
+def scene(press_mm=1.0):
+    return vts.scenes.sphere_press(8.0, press_mm, (0, 0), HEIGHT, WIDTH, PITCH)
+
+
+def unit():
+    background = vts.scenes.render(vts.scenes.undeformed(scene()), ring_lights())[0]
+    return vts.Calibration.from_lights(ring_lights(), vts.Sensor("rig", HEIGHT, WIDTH, PITCH), background)
+
+
+def picture(press_mm=0.0):
+    image = vts.scenes.render(scene(press_mm or 1.0) if press_mm else vts.scenes.undeformed(scene()), ring_lights())[0]
+    return (image.permute(1, 2, 0).flip(2).numpy() * 255 + 0.5).astype(np.uint8)
+
+
+class Camera:
+    """Gives so many frames; then it ends, fails or hangs."""
+
+    name, live, fps = "made up", True, 30.0
+
+    def __init__(self, frames, then="end"):
+        self.frames, self.then, self.closed = frames, then, False
+        self.unplugged = threading.Event()
+
+    def read(self):
+        self.frames -= 1
+        if self.frames >= 0:
+            return picture()
+        if self.then == "fail":
+            raise OSError("device is gone")
+        if self.then == "hang":
+            self.unplugged.wait()
+        return None
+
+    def close(self):
+        self.closed = True
+
+
+@pytest.mark.parametrize("then, reason", [("end", "it gives no more frames"), ("fail", "device is gone")])
+def test_a_camera_that_stops_is_no_end_of_a_video(then, reason):
+    camera = Camera(12, then)
+    with streams.TactileStream(camera, unit(), background_frames=3) as stream, pytest.raises(OSError, match=reason) as caught:
+        for _ in stream:
+            pass
+    assert str(caught.value).startswith("source: made up has stopped") and camera.closed
+    with pytest.raises(OSError, match="source: made up has stopped"):  # among the first frames, too
+        streams.TactileStream(Camera(7, then), unit(), background_frames=3)
+
+
+def test_a_camera_that_hangs_has_stopped():
+    camera = Camera(1, "hang")
+    reader = LiveReader(lambda: camera)
+    assert reader.read().shape == (HEIGHT, WIDTH, 3)
+    reader.silent_s = 0.1
+    with pytest.raises(OSError, match=r"source: made up has stopped: no frame for 0\.1 s"):
+        reader.read()
+    camera.unplugged.set()
+    reader.close()
+
+
+def test_a_camera_that_hangs_can_be_closed():
+    """Who waits for its next frame, here a thread, is told at once, not when it has been silent for long."""
+    camera = Camera(1, "hang")
+    reader = LiveReader(lambda: camera)
+    reader.silent_s = 3600.0
+    newest = streams.NewestFrame(reader)
+    assert newest.take()[2].shape == (HEIGHT, WIDTH, 3)
+    newest.close()
+    assert newest.take() is None
+    camera.unplugged.set()
+
+
+def test_a_camera_comes_back():
+    opened = []
+
+    def plug():
+        opened.append(Camera((2, 0, 9, 0)[len(opened)]))
+        if len(opened) == 2:
+            raise OSError("not there yet")
+        return opened[-1]
+
+    reader = LiveReader(plug, reconnect_s=600.0, sleep=lambda seconds: None)
+    frames = [reader.read() for _ in range(6)]  # two, then 9 without the first 5
+    assert all(frame.shape == (HEIGHT, WIDTH, 3) for frame in frames) and reader.reconnections == 1
+    opened += [None] * 9
+    with pytest.raises(OSError, match=r"has stopped \(it gives no more frames\) and did not come back within 0\.2 s"):
+        LiveReader(lambda: Camera(0), reconnect_s=0.2, sleep=time.sleep).read()
+    reader.close()
+    with pytest.raises(ValueError, match="reconnect_s: expected 0 with a reader of your own"):
+        streams.TactileStream(Camera(9), unit(), reconnect_s=1.0)
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.float32, np.bool_])
+def test_frames_whose_range_is_unknown_are_refused(dtype):
+    with pytest.raises(TypeError, match=r"pixels: expected an array of uint8 or uint16, got an array of "):
+        rgb_from_bgr(picture().astype(dtype))
+    with pytest.raises(TypeError, match="source: frame 0 of made up: expected an array of uint8 or uint16"):
+        streams.TactileStream(Frames([picture().astype(dtype)] * 9), unit(), background_frames=0)
+    assert torch.equal(rgb_from_bgr(picture().astype(np.uint16) * 257), rgb_from_bgr(picture()))
+
+
+@pytest.mark.parametrize("fps", [0, float("nan"), None, "30"])
+def test_a_rate_that_is_none_is_refused(fps):
+    reader = Camera(9)
+    reader.fps = fps
+    with pytest.raises((ValueError, TypeError), match="source: fps: expected a number"):
+        check_reader(reader)
+    with pytest.raises((ValueError, TypeError), match="fps: expected a number"):
+        streams.Recording(unit(), fps=fps)

@@ -107,23 +107,6 @@ def test_channels_and_lights_may_change_places(scene, lights, order, mode):
     assert gap_mm(depth(image[:, list(order)], other, mode), depth(image, lights, mode)) < 1e-9
 
 
-@given(st.lists(presses, min_size=2, max_size=4), lights_on_a_ring, st.randoms(use_true_random=False), st.sampled_from(MODES))
-def test_frames_of_a_batch_do_not_influence_each_other(scenes, lights, rng, mode):
-    images = torch.cat([vts.scenes.render(scene, lights) for scene in scenes])
-    order = list(range(len(images)))
-    rng.shuffle(order)
-    together = depth(images[order], lights, mode)
-    for place, k in enumerate(order):
-        assert gap_mm(together[place], depth(images[k : k + 1], lights, mode)[0]) < 1e-9
-
-
-@given(presses, lights_on_a_ring, st.sampled_from(MODES[:2]))
-def test_single_precision_is_enough(scene, lights, mode):
-    image = vts.scenes.render(scene, lights, noise_std=0.002, bits=8)
-    single = vts.PointLights(lights.position_mm.float(), lights.albedo.float()).requires_grad_(False)
-    assert gap_mm(depth(image.float(), single, mode).double(), depth(image, lights, mode)) < 5e-3
-
-
 # ---- the integrators ----
 
 
@@ -238,20 +221,6 @@ def test_gradients_by_the_image_are_finite(kind, by, mode):
         assert bool(torch.isfinite(image.grad).all())
     else:
         assert mode == "auto" and not bool(out.contact.any())
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("by", ["lights", "response"])
-def test_gradients_through_single_blocks_are_finite(kind, by):
-    calibration = unit(by)
-    pipe = vts.DepthPipeline.from_calibration(calibration, "precise")
-    image = press_image(calibration, kind).requires_grad_()
-    compensated = pipe.compensate(image)
-    depth_mm = torch.zeros(1, 1, HEIGHT, WIDTH).requires_grad_()
-    normals = [pipe.normals(compensated), pipe.normals(compensated, depth_mm)]
-    total = sum(normal.sum() for normal in normals) + pipe.mask(compensated).sum()
-    for slope in torch.autograd.grad(total, (image, depth_mm)):
-        assert bool(torch.isfinite(slope).all())
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-30, 1e30])

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 import torchvts as vts
-from torchvts.calibration.by_lights import objection_to_lights
 from torchvts.calibration.given_images import colour_share, colour_variation
 from torchvts.calibration.objections import to_background_of_prior
 from torchvts.cli.summary import expected
@@ -147,26 +146,6 @@ def test_an_odd_background_gives_a_unit_that_can_be_used_or_a_refusal(name, comp
         assert 0.35 < float(out.depth_mm.amax()) < 0.65  # 0.5
 
 
-def test_lights_that_cannot_win_are_not_fitted_beside_presses(monkeypatch):
-    def refuse(*_):
-        raise AssertionError("fitted")
-
-    monkeypatch.setattr("torchvts.calibration.by_lights.fit_lights", refuse)
-    calibration, _ = calibrate(camera(ODD["bright edges"]), SENSOR, presses(ODD["bright edges"]))
-    first = calibration.report["candidates"][0]
-    assert first["score_deg"] is None and first["note"].startswith("not fitted: the background of ") and "misfit" not in first
-
-
-def test_lights_that_can_win_are_not_hopeless(ring):
-    rig = dataclasses.replace(SENSOR, mm_per_pixel=0.3)
-    scene = vts.scenes.undeformed(vts.scenes.sphere_press(10, 1, (0, 0), HEIGHT, WIDTH, 0.3))
-    for lights, vignetting, ambient in itertools.product(
-        (ring(), ring(22.0, [15.0, 16.5, 18.0], level=0.2)), (0.0, 0.4), (0.0, 0.2)
-    ):
-        image = camera(vts.scenes.render(scene, lights, vignetting=vignetting)[0] + ambient)
-        assert objection_to_lights(image, dataclasses.replace(rig, gamma=None)) == ""
-
-
 def test_a_fit_that_fails_says_so_and_has_no_figures():
     background = camera(ODD["one channel dark"] * torch.tensor([1.0, 1.0, 0.8]).reshape(3, 1, 1))
     fit = vts.fit_lights(background, SENSOR)
@@ -191,15 +170,6 @@ def test_a_calibration_that_cannot_be_used_is_refused_when_it_is_made(ring):
         dataclasses.replace(good, lights=None)
     with pytest.raises(ValueError, match="background: expected light above the noise, got at most 0"):
         vts.Calibration.from_response(ResponseModel.zero(), SENSOR, torch.zeros(3, HEIGHT, WIDTH))
-
-
-def test_corners_of_a_background_are_no_defects():
-    """A median that counts zeros beyond the border calls them so."""
-    unit = vts.Calibration.from_response(ResponseModel.zero(), SENSOR, camera(other_light()))
-    assert not bool(unit.defects.any())
-    dead = camera(other_light())
-    dead[:, 40:42, 50:52] = 0.0
-    assert int(vts.Calibration.from_response(ResponseModel.zero(), SENSOR, dead).defects.sum()) == 4
 
 
 # wrong priors
@@ -320,3 +290,12 @@ def test_presses_cropped_otherwise_are_refused(scale, shift_px):
     images = [dataclasses.replace(one, image=zoomed(one.image, scale, shift_px)) for one in presses(light)]
     with pytest.raises(ValueError, match=r"presses: expected the (background's view of the skin|light of the background)"):
         vts.calibrate(camera(light), SENSOR, images)
+
+
+def test_corners_of_a_background_are_no_defects():
+    """A median that counts zeros beyond the border calls them so."""
+    unit = vts.Calibration.from_response(ResponseModel.zero(), SENSOR, camera(other_light()))
+    assert not bool(unit.defects.any())
+    dead = camera(other_light())
+    dead[:, 40:42, 50:52] = 0.0
+    assert int(vts.Calibration.from_response(ResponseModel.zero(), SENSOR, dead).defects.sum()) == 4

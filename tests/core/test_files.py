@@ -5,7 +5,6 @@ import os
 import re
 import resource
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -38,13 +37,6 @@ def picture(height=12, width=16, seed=0):
 def test_an_image_comes_back_as_it_was(tmp_path, suffix):
     vts.write_image(tmp_path / f"image{suffix}", picture())
     assert torch.equal(vts.read_image(str(tmp_path / f"image{suffix}")), picture())
-
-
-def test_values_beyond_the_range_are_cut_and_halves_rounded(tmp_path):
-    image = torch.full((3, 8, 8), 0.25)
-    image[0], image[1] = -0.5, 1.5
-    vts.write_image(tmp_path / "image.png", image)
-    assert vts.read_image(tmp_path / "image.png")[:, 0, 0].tolist() == pytest.approx([0.0, 1.0, 64 / 255])
 
 
 def test_sixteen_bits_keep_their_steps(tmp_path):
@@ -80,27 +72,6 @@ def test_what_is_no_image_is_refused(tmp_path, content):
         vts.read_image(tmp_path / "image.png")
 
 
-def test_a_missing_image_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="expected an image, got a folder"):
-        vts.read_image(tmp_path)
-    with pytest.raises(FileNotFoundError, match=r"nowhere\.png: no such image"):
-        vts.read_image(tmp_path / "nowhere.png")
-
-
-@pytest.mark.parametrize("shape", [(1, 3, 8, 8), (8, 8, 3), (8, 8)])
-def test_only_one_colour_image_is_written(tmp_path, shape):
-    with pytest.raises(ValueError, match=r"image: expected \(3, H, W\), got "):
-        vts.write_image(tmp_path / "image.png", torch.zeros(shape))
-
-
-def test_another_suffix_or_folder_is_refused_and_leaves_nothing(tmp_path):
-    with pytest.raises(ValueError, match=r"image.gif: expected a name ending in .png, .jpg"):
-        vts.write_image(tmp_path / "image.gif", picture())
-    with pytest.raises(FileNotFoundError, match="does not exist: make it first"):
-        vts.write_image(tmp_path / "nowhere" / "image.png", picture())
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_depth_comes_back_to_half_a_step(tmp_path):
     depth = torch.linspace(-3.2768, 3.2767, 96).reshape(1, 1, 8, 12)
     write_depth_png(tmp_path / "depth.png", depth)
@@ -132,12 +103,6 @@ def test_frames_of_a_folder_come_by_name(tmp_path):
     frames = list(read_frames(tmp_path))
     assert [name for name, _ in frames] == ["000", "001", "002"] and count_frames(tmp_path) == 3
     assert all(torch.equal(frame, picture(seed=k)) for k, (_, frame) in enumerate(frames))
-
-
-def test_a_single_image_is_one_frame(tmp_path):
-    vts.write_image(tmp_path / "one.png", picture())
-    ((name, frame),) = read_frames(str(tmp_path / "one.png"))
-    assert name == "one" and torch.equal(frame, picture()) and count_frames(tmp_path / "one.png") == 1
 
 
 def test_frames_of_a_video(tmp_path):
@@ -187,21 +152,6 @@ def test_a_point_cloud_comes_back_as_it_was(tmp_path, clouds, suffix, with_norma
     if normals is not None:
         assert torch.allclose(back_normals.float(), normals, atol=1e-6)
     assert len(list(tmp_path.iterdir())) == 1
-
-
-@pytest.mark.parametrize(
-    "points, normals, message",
-    [
-        (torch.zeros(0, 3), None, r"points: expected \(N, 3\) with N above 0, got \(0, 3\): no contact\?"),
-        (torch.zeros(5, 2), None, r"points: expected \(N, 3\)"),
-        (torch.full((5, 3), float("nan")), None, "points: expected finite values"),
-        (torch.zeros(5, 3), torch.zeros(4, 3), r"normals: expected \(5, 3\)"),
-    ],
-)
-def test_impossible_clouds_are_refused(tmp_path, clouds, points, normals, message):
-    with pytest.raises(ValueError, match=message):
-        clouds.write_point_cloud(tmp_path / "cloud.ply", points, normals)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_broken_clouds_are_refused(tmp_path, clouds):
@@ -311,14 +261,8 @@ def test_the_opencv_at_hand_has_all_that_is_used():
     assert names & {"imshow", "namedWindow", "waitKey", "ximgproc", "xphoto", "aruco", "optflow"} == set()
 
 
-@pytest.mark.long
-def test_a_process_survives_sources_that_crashed_it():
-    """Inside OpenCV, where no exception helps."""
-    program = (
-        "import torchvts as vts\n"
-        "for source in (-1, -2**31, 2**31, b'\\xff.avi'.decode(errors='surrogateescape'), '99999999999999999999'):\n"
-        "    try:\n        vts.stream.open_source(source)\n"
-        "    except (OSError, ValueError) as error:\n        print(type(error).__name__)\n"
-    )
-    done = subprocess.run([sys.executable, "-W", "ignore", "-c", program], capture_output=True, text=True)
-    assert done.returncode == 0 and len(done.stdout.split()) == 5, done.stderr[-500:]
+def test_values_beyond_the_range_are_cut_and_halves_rounded(tmp_path):
+    image = torch.full((3, 8, 8), 0.25)
+    image[0], image[1] = -0.5, 1.5
+    vts.write_image(tmp_path / "image.png", image)
+    assert vts.read_image(tmp_path / "image.png")[:, 0, 0].tolist() == pytest.approx([0.0, 1.0, 64 / 255])

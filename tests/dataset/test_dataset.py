@@ -15,7 +15,7 @@ from conftest import bgr, tiny_image, write_film
 
 import torchvts as vts
 from torchvts.core.files import read_depth_png
-from torchvts.dataset import STATE, list_items, output_stems, reconstruct, reconstruct_dataset, writing
+from torchvts.dataset import STATE, list_items, output_stems, reconstruct_dataset, writing
 
 ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
@@ -131,21 +131,6 @@ def test_killed_processes_lose_nothing_and_the_next_run_goes_on(unit, frames, wh
     assert contents(out) == whole
 
 
-def test_every_frame_is_in_one_share(unit, frames, whole, tmp_path):
-    """Three ranks one after the other: what each does between the first and the last exchange of counts."""
-    records = reconstruct.Records(
-        frames, tmp_path, reconstruct.Settings("", "", str(frames), "auto", "npz", "none", False, 1, "cpu", 1, "", "")
-    )
-    calibration = vts.Calibration.load(unit)
-    done = 0
-    for rank in (2, 1, 0):
-        worker = reconstruct._Worker(calibration, unit.name, None, records, (rank, 3), strict=True)
-        report = worker.run(4, 0)
-        done += worker.done
-    assert (done, report.rows) == (120, 120)
-    assert contents(tmp_path) == whole
-
-
 def test_a_torn_record_a_lost_file_and_a_changed_image_are_computed_again(unit, tmp_path):
     source = fill(tmp_path / "in", [f"{k}.png" for k in range(6)])
     film(source / "film.avi", 6)
@@ -254,12 +239,6 @@ def test_same_stems_keep_apart_and_folders_stay(unit, tmp_path):
         reconstruct_dataset(unit, source, source)
 
 
-def test_no_two_files_of_a_folder_share_a_stem():
-    names = ["a.png", "A.jpg", "a.png.bmp", "film.avi", "film_000001.png", "film.mp4", "b.png"]
-    stems = output_stems(names)
-    assert len(set(stems.values())) == len(names) and stems["film_000001.png"] == "film_000001.png"
-
-
 def test_listing_is_sorted_by_folder_and_name(tmp_path):
     names = ["b.png", "a/z.png", "a.png", "a/b/c.PNG", "a-b.png", ".hidden.png", "notes.txt"]
     for name in names:
@@ -296,20 +275,6 @@ def test_depth_beyond_a_png_is_left_out_and_a_full_disk_stops(unit, tmp_path, mo
     assert '"failed": "depth_mm: too deep"' in (tmp_path / "out" / STATE / "frames" / "a.json").read_text()
     report = reconstruct_dataset(unit, source, tmp_path / "out", pictures=False, format="png16")
     assert report.rows == 2 and read_depth_png(tmp_path / "out" / "a_depth.png").shape == (1, 1, 48, 64)
-
-
-@pytest.mark.parametrize(
-    "options, message",
-    [
-        ({"mode": "slow"}, "mode: expected one of fast, precise, auto, got 'slow'"),
-        ({"format": "jpg"}, "format: expected one of npz, video-npz, png16, npy, none"),
-        ({"batch": 0}, "batch: expected"),
-        ({"workers": -1}, "workers: expected"),
-    ],
-)
-def test_impossible_options_are_refused(unit, tmp_path, options, message):
-    with pytest.raises(ValueError, match=message):
-        reconstruct_dataset(unit, tmp_path, tmp_path / "out", **options)
 
 
 def test_an_empty_folder_is_refused(unit, tmp_path):
@@ -361,3 +326,9 @@ def test_names_do_not_break_tables_and_links_do_not_end_a_run(run):
     assert report.rows == 7 and sorted(name for name, _ in report.failed) == ["gone.png", "loop.png"]
     lines = (run.folder / "out" / "frames.csv").read_text(encoding="utf-8").splitlines()
     assert {"'=1+1.png", "'-2.png", "two\\nlines.png", "cr\\r.png", "tab\\t.png"} <= {line.split(",")[0] for line in lines}
+
+
+def test_no_two_files_of_a_folder_share_a_stem():
+    names = ["a.png", "A.jpg", "a.png.bmp", "film.avi", "film_000001.png", "film.mp4", "b.png"]
+    stems = output_stems(names)
+    assert len(set(stems.values())) == len(names) and stems["film_000001.png"] == "film_000001.png"

@@ -1,10 +1,8 @@
 """Diagnoses: every finding has a frame that triggers it, and ordinary frames raise no alarm.
 
 All that triggers stands in :data:`TRIGGERS`, all that must not in :data:`ORDINARY` and in the real sets.
-Detection rates, as docs/diagnose.md has them: python tests/test_diagnose.py --seeds 20
 """
 
-import argparse
 import dataclasses
 import json
 import math
@@ -17,12 +15,10 @@ from conftest import ring_lights
 import torchvts as vts
 from lab import sets
 from lab.drawn_sensors import drawn_sensor
-from lab.faults import jpeg
 from lab.gallery import CORRUPTIONS, undisturbed
 from torchvts import scenes
 from torchvts.core.blur import blur, gaussian_weights
 from torchvts.diagnose import Diagnosis, Finding
-from torchvts.diagnose.camera import blockiness, levels_of
 from torchvts.diagnose.checks import CHECKS
 from torchvts.diagnose.light_words import WORDS
 from torchvts.model.response_field import ResponseModel, TaughtRange
@@ -309,27 +305,6 @@ def test_dust_is_no_contact(small_sensor, small_press):
             assert "contact_in_calibration" not in names and ("contact_in_background" in names) == contact
 
 
-def test_another_shape_is_an_error():
-    case = undisturbed(1)
-    with pytest.raises(ValueError, match="image: expected"):
-        vts.diagnose(None, case.image[:, :2], case.calibration)
-    with pytest.raises(ValueError, match="divide by 255"):
-        vts.diagnose(None, case.image * 255, case.calibration)
-    with pytest.raises(TypeError, match="background: expected a torch"):
-        vts.diagnose([1], case.image, case.calibration)
-    with pytest.raises(TypeError, match="calibration: expected"):
-        vts.diagnose(None, case.image, "unit.safetensors")
-
-
-def test_levels_and_blocks():
-    smooth = torch.linspace(0.2, 0.8, 128).expand(3, 96, 128)
-    smooth = smooth + 0.002 * torch.randn(3, 96, 128, generator=torch.Generator().manual_seed(0))
-    for bits in (3, 5, 8):
-        assert levels_of(torch.round(smooth * (2**bits - 1)) / (2**bits - 1)) == 2**bits - 1
-    assert levels_of(smooth) == float("inf")
-    assert blockiness(smooth)[0] < 1.1 < 1.3 < blockiness(jpeg(smooth[None], 60)[0])[0]
-
-
 def test_the_worst_comes_first_and_each_name_once():
     note, warning, fault = (Finding(name, name, severity, 0.0) for name, severity in zip("abc", ("note", "warning", "fault")))
     again = Finding("c", "milder", "note", 0.0)
@@ -365,21 +340,3 @@ def test_the_command_cuts_raw_frames_as_reconstruct_does(tmp_path, run_script):
     assert "wrong_size" not in run_script("diagnose", tmp_path / "unit.safetensors", tmp_path / "raw.png").stdout
     done = run_script("diagnose", tmp_path / "unit.safetensors", tmp_path / "small.png")
     assert done.returncode == 1 and "wrong_size" in done.stdout
-
-
-def main():
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--triggers", nargs="+", default=list(TRIGGERS))
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    for name in arguments.triggers:
-        hits = sum(triggered(name, seed)[0] for seed in range(arguments.seeds))
-        print(f"| {name} | {hits}/{arguments.seeds} |", flush=True)
-    clean = [undisturbed(100 + seed) for seed in range(arguments.seeds)]
-    alarms = sum(not vts.diagnose(case.background, case.image, case.calibration).ok for case in clean)
-    print(f"false alarms on undisturbed frames: {alarms} of {len(clean)}")
-
-
-if __name__ == "__main__":
-    main()

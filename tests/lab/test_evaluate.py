@@ -5,20 +5,16 @@ import dataclasses
 import json
 import math
 import shutil
-import sys
-import warnings
 from functools import partial
 
-import numpy as np
 import pytest
 import torch
 
 import torchvts as vts
 from lab import evaluate as ev
-from lab import methods, peers, rows, sets
+from lab import methods, rows, sets
 from lab.figures import set_figure
 from lab.score import score_press
-from torchvts.calibration import fit_prior
 from torchvts.cli import main
 from torchvts.core.geometry import normal_from_gradient
 from torchvts.model.gs_sdk import CATALOG_COLUMNS, LABEL_COLUMNS
@@ -140,15 +136,6 @@ def test_a_tilted_depth_moves_the_fitted_ball(press):
     assert score.center_px == pytest.approx(slope * 0.5 * BALL_MM / PITCH, rel=0.15)
 
 
-def test_a_flat_depth_has_no_sphere(press):
-    given, scene = press
-    flat = vts.scenes.undeformed(scene)
-    score = score_press(given, flat.depth_mm, flat.normal, PITCH)
-    assert score.radius_percent is None and score.center_px is None
-    assert score.normal_deg > 5.0
-    assert score.depth_normal_deg == pytest.approx(score.normal_deg)
-
-
 def test_bad_arguments_are_named(press, folder):
     given, scene = press
     with pytest.raises(ValueError, match="press: expected one with center_px"):
@@ -205,24 +192,6 @@ def test_evaluate_with_a_trained_network(run_script, folder, tmp_path):
     assert len(ranges) == 1 and ranges.pop() <= 1000.0 * max(largest) * 1.001  # not that of the method that failed
 
 
-def test_the_peer_needs_no_scipy(monkeypatch):
-    pytest.importorskip("scipy")
-    gradient = torch.from_numpy(np.random.default_rng(0).standard_normal((1, 2, 23, 34)))
-    solved = peers.scipy_dct(gradient)
-    monkeypatch.setitem(sys.modules, "scipy", None)
-    assert np.allclose(peers.scipy_dct(gradient), solved, atol=1e-12)
-
-
-def test_a_prior_that_has_seen_the_presses_is_compared_with_none(folder):
-    sensor = vts.Sensor.load(folder / "rig.yaml")
-    background, presses = vts.read_presses(folder)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", vts.CalibrationWarning)
-        primed = dataclasses.replace(sensor, prior=fit_prior(background, sensor, presses, "these"))
-    result = ev.evaluate(sets.from_folder(folder, primed, folds=1), ["fast", "fast, no prior"])
-    assert "prior fitted on these" in result.rows[0].note and result.rows[1].note.count("prior") == 0
-
-
 class FailingUnit:
     """A calibration that cannot be made."""
 
@@ -249,31 +218,6 @@ def test_a_method_or_a_set_that_fails_is_a_row_with_its_reason(folder, monkeypat
         and "| no contact/ in any" not in text
         and len({line.count("|") for line in text.splitlines()[:6]}) == 1
     )
-
-
-def test_drawn_sensors_are_scored_on_objects_and_averaged(folder):
-    sensor = vts.Sensor.load(folder / "rig.yaml")
-    background, presses = vts.read_presses(folder)
-    scene = vts.scenes.cylinder_press(4.0, 0.5, 6.0, 30.0, (0.0, 0.0), HEIGHT, WIDTH, PITCH)
-    lights = vts.PointLights([[25.0, 9.0, 22.0], [-20.0, 15.0, 22.0], [-3.0, -25.0, 22.0]], [500.0, 500.0, 500.0])
-    target = sets.Target("cylinder", vts.scenes.render(scene, lights, noise_std=0.002)[0].detach(), sets.truth_of(scene))
-    units = [sets.DataSet(name, background, [sets.Fold(sensor, presses, [target])], "") for name in sets.DRAWN[:2]]
-    done = [ev.evaluate(unit, ["flat", "precise"]) for unit in units]
-    rows_of_units = [row for evaluation in done for row in evaluation.rows]
-    assert done[0].rows[1].errors["normal_deg"] < 0.5 * done[0].rows[0].errors["normal_deg"]
-    assert done[0].rows[1].errors["iou"] > 0.7 and done[0].rows[1].error("radius_percent") is None
-    means = ev.means_of_drawn(rows_of_units)
-    assert [(row.data, row.method) for row in means] == [("drawn, mean of 2", "flat"), ("drawn, mean of 2", "precise")]
-    expected = sum(evaluation.rows[1].errors["relief_um"] for evaluation in done) / 2
-    assert means[1].errors["relief_um"] == pytest.approx(expected)
-
-
-def test_drawn_sensors_are_read(tmp_path):
-    read = sets.load("drawn_0", tmp_path, 2)
-    fold = read.folds[0]
-    assert len(fold.learned) == 2 and read.background.shape == (3, fold.sensor.height, fold.sensor.width)
-    assert all(target.ball is None and target.truth.contact.any() for target in fold.scored)
-    assert all(target.truth.depth_mm.max() > 0.1 and target.image.shape == read.background.shape for target in fold.scored)
 
 
 def test_the_learning_curve_of_a_set(run_script, monkeypatch, folder, tmp_path):
@@ -305,29 +249,6 @@ def test_real_sets_are_read(data, monkeypatch, name):
     assert all(target.image.shape == read.background.shape for fold in read.folds for target in fold.scored)
 
 
-def test_a_folder_of_balls_is_read_by_its_meta_and_labels(tmp_path, monkeypatch):
-    monkeypatch.setattr(presses_room, "calibrate", FailingUnit)
-    labels = ["name,x,y,r"]
-    for k in (10, 9, 1, 100):  # the order of numbers is not that of texts
-        vts.write_image(tmp_path / f"ball_{k}.png", torch.full((3, 24, 32), k / 200))
-        labels.append(f"ball_{k},{k % 7 + 10},12.5,8")
-    vts.write_image(tmp_path / "background.png", torch.full((3, 24, 32), 0.5))
-    (tmp_path / "labels.csv").write_text("\n".join(labels))
-    meta = {"height": 24, "width": 32, "pitch": 0.1, "diameter": 4.84, "markers": False}
-    (tmp_path / "meta.json").write_text(json.dumps(meta))
-    read = sets._balls(tmp_path, None)
-    sensor = read.folds[0].sensor
-    assert (sensor.height, sensor.width, sensor.mm_per_pixel, sensor.markers) == (24, 32, 0.1, None)
-    assert [[press.name for press in fold.learned] for fold in read.folds] == [["ball_1", "ball_10"], ["ball_9", "ball_100"]]
-    scored = [target.ball for fold in read.folds for target in fold.scored]
-    assert [press.center_px for press in scored] == [(12.0, 12.5), (12.0, 12.5), (11.0, 12.5), (13.0, 12.5)]
-    assert all(press.contact_radius_px == 8.0 and press.ball_diameter_mm == 4.84 for press in scored)
-    (tmp_path / "meta.json").write_text(json.dumps(meta | {"markers": True}))
-    rough = sets.REAL["digit_b"](tmp_path, 2)  # its labels are not trusted
-    assert rough.folds[0].sensor.markers and [len(fold.scored) for fold in rough.folds] == [1, 1]
-    assert all(target.ball is None for fold in rough.folds for target in fold.scored)
-
-
 def test_without_labels_balls_are_found(folder, monkeypatch, tmp_path):
     sensor = vts.Sensor.load(folder / "rig.yaml")
     _, presses = vts.read_presses(folder)
@@ -341,22 +262,6 @@ def test_without_labels_balls_are_found(folder, monkeypatch, tmp_path):
     assert "centers from calibrate on the scored presses (6)" in result.data.how and result.rows[0].frames == 6
     fit = train_network(*vts.read_presses(bare), sensor, max_epochs=2)
     assert len(fit.history) == 2 and "raise max_epochs" in fit.message
-
-
-def test_scripts_refuse_bad_input_in_a_sentence(run_script, folder, tmp_path):
-    for arguments, part in (
-        (["evaluate", tmp_path / "none", "--out", tmp_path], "no such folder"),
-        (["train", folder, "--sensor", "gelsight_mini", "--out", tmp_path / "a.safetensors"], "gelsight_mini"),
-    ):
-        done = run_script(*arguments)
-        assert done.returncode == 2
-        assert done.stderr.startswith("torchvts: error: ") and part in done.stderr, done.stderr
-        assert "Traceback" not in done.stderr
-    assert list(tmp_path.iterdir()) == []
-    (tmp_path.parent / "bad.pth").write_bytes(b"no network")
-    for arguments in (["--methods", "magic"], ["--all"], ["--methods", "fast", "--network", tmp_path.parent / "bad.pth"]):
-        done = run_script("accuracy", folder, *arguments, "--out", tmp_path)
-        assert done.returncode in (1, 2) and "error: " in done.stderr.splitlines()[-1] and list(tmp_path.iterdir()) == []
 
 
 @pytest.fixture(scope="module")

@@ -1,16 +1,13 @@
-"""Calls of every public callable with values that no caller should give: for test_attack, which runs this file in processes."""
+"""Calls of every public callable with values that no caller should give: for test_fuzz."""
 
 import decimal
 import enum
 import fractions
 import inspect
-import json
 import os
 import random
 import signal
-import sys
 import tempfile
-import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -195,12 +192,3 @@ def attack(count, seed):
                 what.append(f"{argument}={kind}")
             yield f"{name}({', '.join(what)})", lambda call=call, given=given: attempt(call, given)
         os.chdir("/")
-
-
-if __name__ == "__main__":
-    stop_slow_calls()
-    torch.set_num_threads(1)
-    warnings.simplefilter("ignore")
-    for case, make in attack(int(sys.argv[1]), sys.argv[2]):
-        print(json.dumps(case), end=" ", flush=True)
-        print(json.dumps(make()), flush=True)

@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import json
 import os
 import runpy
 import sys
@@ -134,17 +133,14 @@ class Done(NamedTuple):
 
 
 def pytest_terminal_summary(terminalreporter):
-    """The last lines of the attack: how much was done."""
-    done = {}
-    for report in (report for reports in terminalreporter.stats.values() for report in reports):
-        for name, value in getattr(report, "user_properties", ()):
-            if name == "attacked" and report.when == "call":
-                what, count = json.loads(value)
-                done[what] = done.get(what, 0) + count
-    if done:
-        terminalreporter.section("attack")
-    for what, count in sorted(done.items()):
-        terminalreporter.write_line(f"{count:7,} {what}")
+    """How many tests want data that are not here, or a package that is not installed."""
+    skipped = terminalreporter.stats.get("skipped", [])
+    reasons = [report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr) for report in skipped]
+    for_want = sum("no third-party images" in reason for reason in reasons)
+    if for_want:
+        terminalreporter.write_line(f"{for_want} tests on real sensors skipped for want of data: set TORCHVTS_DATA")
+    for reason in sorted({reason for reason in reasons if "no third-party images" not in reason}):
+        terminalreporter.write_line(f"{reasons.count(reason)} skipped: {reason.removeprefix('Skipped: ')}")
 
 
 def call_script(name, *arguments):

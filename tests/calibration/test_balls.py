@@ -12,7 +12,6 @@ import torchvts as vts
 from torchvts.calibration import closure
 from torchvts.calibration.by_presses import by_presses, with_preprocessing
 from torchvts.calibration.contacts import read_contacts
-from torchvts.calibration.regions import contact_region, far_field, one_ball, strong_blobs
 
 PREPARED = with_preprocessing(GIVEN, None)
 
@@ -50,30 +49,12 @@ def test_presses_with_a_far_field_are_all_used_and_located():
     assert [c.reason for c in result.contacts] == [""] * 9 and max(off) < 2.0, off
 
 
-def test_the_far_field_is_fitted_beside_the_contact():
-    change = far(0.05).double() - 1.0
-    change[:, 30:70, 40:90] += 0.5
-    found = far_field(change)
-    assert found.rms == pytest.approx(float((far(0.05) - 1.0).square().sum(0).mean().sqrt()), rel=0.05)
-    assert float(found.above[:, 100:].max()) < 5.0 < float(found.above[35:65, 45:85].min()) and not found.is_other_light()
-
-
 @pytest.mark.parametrize(
     "level, cause", [(1 / 16, "16 times darker than the background: .*12 bits in a file of 16"), (0.0, "black")]
 )
 def test_a_dark_press_is_named(level, cause):
     (contact,) = read(vts.Press(level * seen_by_curve(ball(), 3), BALL_MM))
     assert re.search(cause, contact.reason), contact.reason
-
-
-def test_lobes_of_one_ball_are_one_contact_and_two_balls_are_two():
-    strength = torch.zeros(100, 100, dtype=torch.float64)
-    strength[30:40, 30:50] = strength[60:70, 30:50] = 20.0
-    blobs = strong_blobs(strength > 5, strength)
-    assert len(blobs) == 2 and one_ball(blobs, 30.0) and not one_ball(blobs, 8.0)
-    seen = far_field(torch.zeros(3, 100, 100, dtype=torch.float64))._replace(above=strength)
-    assert bool(contact_region(seen, strength > 5, 30.0)[46:54, 35:45].all())
-    assert not bool(contact_region(seen, strength > 5, 8.0)[46:54, 35:45].any())
 
 
 def test_saturated_pixels_are_fitted_too():
@@ -94,14 +75,6 @@ def located(shift_px):
         contact.center_mm = torch.tensor(at, dtype=torch.float64) + PITCH * torch.tensor(shift_px, dtype=torch.float64)
         contact.contact_radius_mm = math.sqrt(BALL_MM * depth - depth**2)
     return contacts
-
-
-def test_loop_closure_predicts_a_common_drift():
-    """Changes between the two predictions are the shift, to a third: the field has taken over most of it."""
-    family = closure.Family(2, -1, 10.0)
-    errors = [closure._Rating(family, located(shift)).errors_mm.nanmedian(dim=0).values / PITCH for shift in ((0, 0), (0, 3))]
-    moved = errors[1] - errors[0]
-    assert abs(float(moved[0])) < 0.7 and float(moved[1]) > 0.7
 
 
 def test_loop_closure_never_moves_known_balls_or_right_ones_far():

@@ -233,14 +233,6 @@ def test_presses_that_contradict_the_prior_calibrate_without_it():
     assert "without the sensor's prior: by the prior only " in dropped.report["reason"]
 
 
-def test_a_diameter_that_is_wrong_by_one_factor_is_no_reason_to_leave_a_prior_out():
-    light = ODD["smooth 1"]
-    sensor = dataclasses.replace(SENSOR, prior=prior(light))
-    doubled = [dataclasses.replace(one, ball_diameter_mm=2 * BALL_MM) for one in presses(light)]
-    with pytest.raises(ValueError, match=r"by the sensor's prior all balls seem 0\.5\d times as wide as given"):
-        calibrate(camera(light), sensor, doubled)
-
-
 # refusals that name their cause
 
 
@@ -271,25 +263,6 @@ def test_coloured_lights_that_are_pale_are_not_called_white():
     assert colour_variation(camera(light)) > 0.05
     assert all(colour_share(one.image, camera(light)) > 0.8 for one in presses(light))
     assert colour_share(camera(light, 1), camera(light, 2)) is None  # no contact
-
-
-def zoomed(image, scale, shift_px):
-    matrix = np.float32(
-        [[scale, 0, 0.5 * (WIDTH - 1) * (1 - scale) + shift_px[0]], [0, scale, 0.5 * (HEIGHT - 1) * (1 - scale) + shift_px[1]]]
-    )
-    array = cv2.warpAffine(image.permute(1, 2, 0).numpy(), matrix, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REPLICATE)
-    return torch.from_numpy(array).permute(2, 0, 1)
-
-
-@pytest.mark.parametrize("scale, shift_px", [(0.8, (0, 0)), (1.25, (0, 0)), (0.8, (5, -4)), (1.0, (15, 0))])
-def test_presses_cropped_otherwise_are_refused(scale, shift_px):
-    y, x = axes()
-    light = torch.stack(
-        (0.3 + 0.3 * torch.exp(-6 * (x - 0.2) ** 2 - 3 * y**2), 0.5 - 0.2 * (y * x + y**2), 0.4 + 0.2 * (3 * x).sin())
-    )
-    images = [dataclasses.replace(one, image=zoomed(one.image, scale, shift_px)) for one in presses(light)]
-    with pytest.raises(ValueError, match=r"presses: expected the (background's view of the skin|light of the background)"):
-        vts.calibrate(camera(light), SENSOR, images)
 
 
 def test_corners_of_a_background_are_no_defects():

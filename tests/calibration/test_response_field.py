@@ -14,7 +14,7 @@ import yaml
 
 import torchvts as vts
 from torchvts.calibration.response_fit import STEEPER
-from torchvts.core.blur import blur, gaussian_weights
+from torchvts.core.blur import gaussian_weights
 from torchvts.core.files import checksum, load_tensors
 from torchvts.core.geometry import gradient_from_normal, gradient_of_depth
 from torchvts.model.response_field import (
@@ -100,18 +100,6 @@ def model(gamma=1.0, blur_px=1.0, **kwargs):
 
 
 # the field
-
-
-def test_the_terms_are_the_inputs_and_then_their_products():
-    assert random_field(2, -1).terms() == [(0,), (1,), (2,)]
-    assert random_field(1, 1).terms() == [(0,), (1,), (2,), (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]  # none is constant
-    assert random_field(1, 1, 0).terms()[9:] == TRIPLES
-
-
-@pytest.mark.parametrize("family", FAMILIES)
-def test_the_number_of_coefficients_is_that_of_the_monomials(family):
-    assert random_field(*family).size() == count_by_hand(*family)
-    assert tuple(random_field(*family).tensor().shape) == (2, count_by_hand(*family))
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -523,13 +511,6 @@ def test_a_damaged_response_is_refused(saved, kind):
     assert str(caught.value).startswith(f"{saved}: ")
 
 
-@pytest.mark.parametrize("name", ["background_png", "noise_std"])
-def test_a_missing_tensor_is_named(saved, name):
-    rewritten(saved, lambda tensors: tensors.pop(name))
-    with pytest.raises(ValueError, match=f"tensor '{name}' is missing"):
-        vts.Calibration.load(saved)
-
-
 @pytest.mark.parametrize("where, key, value", [("sensor", "gamma", 1.3), ("response", "gamma", 1.3), ("response", "blur_px", 4.0)])
 def test_a_file_whose_sensor_and_response_disagree_is_refused(saved, where, key, value):
     rewritten(saved, change_metadata=put(value, where, key))
@@ -623,11 +604,6 @@ def test_a_bad_prior_is_refused_by_file_and_key(tmp_path, kind):
     assert str(caught.value).startswith(f"{path}: ")
 
 
-def test_a_prior_of_another_type_is_refused():
-    with pytest.raises(TypeError, match="prior: expected a SensorPrior, got ResponseModel"):
-        vts.Sensor("rig", 24, 32, 0.5, prior=model())
-
-
 def test_another_number_of_pixels_scales_the_blur_and_nothing_else():
     sensor = vts.Sensor("rig", 24, 32, 0.5, blur_px=0.5, prior=a_prior(1.25))
     double = sensor.resized(48, 64)
@@ -666,19 +642,3 @@ def test_the_blur_is_kornia_s(std_px, dtype):
     expected = kornia.filters.gaussian_blur2d(image, (size, size), (std_px, std_px), border_type="replicate")
     assert size % 2 == 1 and size >= 6 * std_px
     assert float((vts.Compensate(blur_px=std_px)(image) - expected).abs().max()) < 1e-6
-
-
-@pytest.mark.parametrize("std_px", [0.2, 1.0, 4.0])
-def test_the_blur_keeps_a_constant_and_the_sum_of_a_point(std_px):
-    constant = torch.full((1, 3, 20, 25), 0.37)
-    assert float((vts.Compensate(blur_px=std_px)(constant) - constant).abs().max()) < 1e-6
-    point = torch.zeros(1, 3, 41, 41)
-    point[..., 20, 20] = 1.0
-    spread = blur(point, gaussian_weights(std_px))
-    assert spread.sum(dim=(2, 3)).flatten().tolist() == pytest.approx([1.0] * 3, abs=1e-6)
-    assert torch.allclose(spread, spread.flip(3)) and torch.allclose(spread, spread.transpose(2, 3), atol=1e-7)
-
-
-def test_no_blur_leaves_the_image():
-    image = torch.rand(1, 3, 9, 9)
-    assert torch.equal(vts.Compensate(blur_px=0)(image), image)

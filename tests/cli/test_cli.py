@@ -11,7 +11,6 @@ import torch
 import torchvts as vts
 from torchvts.cli import COMMANDS, main
 from torchvts.cli.summary import SHOWN, expected, left_out
-from torchvts.core.spelling import suggest
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -85,12 +84,6 @@ def test_no_traceback_reaches_a_user_unless_asked_for(error, status, message, ca
     monkeypatch.setattr(importlib.import_module("torchvts.cli.samples"), "run", fail)
     assert main(["samples"]) == status and capsys.readouterr().err == message
     assert main(["samples", "--debug"]) == status and "Traceback" in capsys.readouterr().err
-
-
-def test_a_suggestion_is_close_or_none():
-    assert suggest("mm_per_pixle", ["mm_per_pixel", "name"]) == ": did you mean 'mm_per_pixel'?"
-    assert suggest("GelSight Mini", ["digit", "gelsight_mini"]) == ": did you mean 'gelsight_mini'?"
-    assert suggest("banana", ["digit", "gelsight_mini"]) == suggest(3, ["digit"]) == ""
 
 
 def test_of_many_left_out_a_few_are_printed():

@@ -70,21 +70,6 @@ def test_reconstruct_writes_clouds(run_script, images, calibration, tmp_path):
     assert (normals * outward).sum(1).median() > 0.999
 
 
-def test_missing_and_foreign_files_are_refused_in_a_sentence(run_script, images, calibration, tmp_path):
-    folder, _ = images
-    for arguments, part in (
-        (["calibrate", folder / "none.png", "--sensor", "tacto", "--out", tmp_path / "a.safetensors"], "no such image"),
-        (["calibrate", folder / "background.png", "--sensor", "tacto", "--out", tmp_path / "a.safetensors"], "tacto"),
-        (["reconstruct", folder / "background.png", folder, "--out", tmp_path], "safetensors"),
-        (["reconstruct", calibration, tmp_path / "nothing", "--out", tmp_path], "no such file"),
-    ):
-        done = run_script(*arguments)
-        assert done.returncode == 2
-        assert done.stderr.startswith("torchvts: error: ") and part in done.stderr, done.stderr
-        assert "Traceback" not in done.stderr
-    assert not (tmp_path / "a.safetensors").exists()
-
-
 @pytest.mark.long
 def test_reproduce_paper_prints_figure_3_beside_the_papers(run_script, tmp_path):
     done = run_script("reproduce_paper", "--out", tmp_path, "--data", tmp_path / "none")
@@ -99,13 +84,3 @@ def test_reproduce_paper_prints_figure_3_beside_the_papers(run_script, tmp_path)
         assert float(row[3]) <= bound[press, row[1]], row
     assert len(list(tmp_path.glob("figure_3*.png"))) == 4 and len(list(tmp_path.glob("table_3*.png"))) == 3
     assert "| paper, three targets | 0.64, 2.35, 2.59 | below 1 | 6 to 8 |" in done.stdout
-
-
-@pytest.mark.long
-def test_export_speed_times_files_beside_the_library(run_script):
-    files = ["--size", 64, 48, "--formats", "torchscript", "--drawn"]
-    done = run_script("speed", "--only", "export", *files, "--calls", 2, "--threads", 1)
-    assert done.returncode == 0, done.stderr
-    header, _, row, _ = done.stdout.splitlines()[1:]
-    assert header == "| mode | library | torchscript |"
-    assert row.startswith("| fast | ") and float(row.split("|")[2]) > 0.0 and row.endswith(" times |")

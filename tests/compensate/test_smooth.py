@@ -94,15 +94,3 @@ def test_a_shadow_is_no_contact_and_a_slope_is():
     mask = vts.ContactMask()
     for image, moved in ((shadow, False), (shadow * slope, True), (slope, True)):
         assert bool((mask(image + noise) > 0.0).any()) is moved
-
-
-def test_the_colour_of_slopes_is_that_of_the_lights():
-    """White light makes none; coloured lights from three sides, have the colour of what they do not share."""
-    angles = torch.tensor([0.0, 2.0, 4.0]) * torch.pi / 3.0
-    pure = torch.stack((angles.cos(), angles.sin()), 1).double()
-    for shared in (0.0, 0.5):
-        change = (1.0 - shared) * pure + shared * pure[:1]
-        field = ResponseField(0, -1, 10.0, tuple(map(tuple, torch.linalg.pinv(change).tolist())))
-        difference = change[(0, 2), :] - change[1:2]
-        expected = (difference.square().mean() / change.square().mean()).sqrt()
-        assert field.colour() == pytest.approx(float(expected))

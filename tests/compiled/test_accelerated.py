@@ -178,26 +178,6 @@ def test_tangents_pass_through_operators():
     assert float((change - solver(tangent)).abs().max()) < 1e-5  # it is linear
 
 
-def test_threads_share_a_pipeline(ring, small_sensor, small_press):
-    lights = ring()
-    calibration = vts.Calibration.from_lights(lights, small_sensor)
-    pipe = vts.DepthPipeline.from_calibration(calibration)
-    image = scenes.render(small_press(1.0), lights, noise_std=0.003, bits=8, seed=1).detach()
-    alone, found = pipe(image), []
-
-    def work():
-        found.extend(pipe(image) for _ in range(30))
-
-    threads = [threading.Thread(target=work) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(found) == 120
-    assert all(torch.equal(out.contact, alone.contact) for out in found)
-    assert max(float((out.depth_mm - alone.depth_mm).abs().max()) for out in found) < 1e-6
-
-
 def test_without_them_all_works(monkeypatch, ring, small_sensor, small_press):
     lights = ring()
     pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, small_sensor), "precise")

@@ -164,21 +164,6 @@ def test_broken_clouds_are_refused(tmp_path, clouds):
         clouds.read_point_cloud(tmp_path / "cloud.ply")
 
 
-@pytest.mark.parametrize("form", [{}, {"write_ascii": True}, {"compressed": True}])
-@pytest.mark.parametrize("suffix", [".ply", ".pcd"])
-def test_clouds_are_read_as_open3d_reads_them(tmp_path, clouds, suffix, form):
-    o3d, path = read_cloud.open3d(), tmp_path / f"cloud{suffix}"
-    points = np.random.default_rng(0).integers(0, 4, (300, 3)).astype(float)  # values repeat, so that the file can be compressed
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    cloud.colors = o3d.utility.Vector3dVector(points / 4)
-    cloud.normals = o3d.utility.Vector3dVector(points)
-    o3d.io.write_point_cloud(str(path), cloud, **form)
-    found, normals = clouds.read_point_cloud(path)
-    expected = o3d.io.read_point_cloud(str(path))
-    assert np.array_equal(found.numpy(), np.asarray(expected.points))
-    assert np.array_equal(normals.numpy(), np.asarray(expected.normals))
-
-
 def calibration():
     return vts.Calibration.from_lights(ring_lights(), vts.Sensor("rig", 48, 64, 0.5), torch.rand(3, 48, 64) * 0.2 + 0.4)
 

@@ -10,11 +10,10 @@ import torch
 from conftest import TINY_SENSOR, bgr, tiny_image, write_film
 
 import torchvts as vts
-from torchvts.core.results import MAPS, UNITS, join_results, write_result
+from torchvts.core.results import UNITS
 from torchvts.dataset import items, reconstruct_dataset
 from torchvts.pipeline import unit_pipeline
 from torchvts.pose.surface_files import write_obj
-from torchvts.stream import check_device
 
 HEIGHT, WIDTH, PITCH = TINY_SENSOR.height, TINY_SENSOR.width, TINY_SENSOR.mm_per_pixel
 
@@ -176,23 +175,6 @@ def test_what_is_no_result_is_refused(results, tmp_path):
             vts.read_result(path)
 
 
-def test_joining_keeps_order_and_types(results, tmp_path):
-    parts = [results / f"film_{k:06d}.npz" for k in (5, 2)]
-    join_results(tmp_path / "two.npz", parts)
-    two = vts.read_result(tmp_path / "two.npz")
-    assert two.frames == ["film.avi/000005", "film.avi/000002"] and two.contact.dtype == torch.bool
-    with np.load(tmp_path / "two.npz") as plain:
-        assert {name: plain[name].shape[0] for name in MAPS} == dict.fromkeys(MAPS, 2)
-
-
-def test_the_same_values_give_the_same_bytes(tmp_path):
-    flat, mask = torch.rand(1, 1, 4, 6), torch.zeros(1, 1, 4, 6, dtype=torch.bool)
-    output = vts.DepthOutput(flat, flat.expand(1, 2, 4, 6), flat.expand(1, 3, 4, 6), mask, mask)
-    for name in ("a", "b"):
-        write_result(tmp_path / f"{name}.npz", output, 0.1, "unit.safetensors", "rig", "0.png")
-    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-
-
 def test_a_network_takes_the_models_place(unit, source, tmp_path):
     calibration = vts.Calibration.load(unit)
     vts.NormalFromMLP(HEIGHT, WIDTH, calibration.background.float(), hidden=(8, 8), seed=3).save(tmp_path / "net.safetensors")
@@ -219,11 +201,3 @@ def test_a_network_takes_the_models_place(unit, source, tmp_path):
         unit_pipeline(calibration, "precise", tmp_path / "net.safetensors")
     with pytest.raises(ValueError, match="contact: expected None beside a network"):
         unit_pipeline(calibration, "fast", tmp_path / "net.safetensors", vts.ContactSettings())
-
-
-def test_a_device_that_is_not_there_is_named():
-    assert check_device("cpu").type == "cpu"
-    for device, part in (("cdua", "did you mean 'cuda'?"), (f"cuda:{torch.cuda.device_count()}", "has no such GPU")):
-        with pytest.raises(ValueError, match="device: expected") as caught:
-            check_device(device)
-        assert part in str(caught.value)

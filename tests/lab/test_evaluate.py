@@ -87,17 +87,6 @@ def test_an_exact_press_has_no_error(press):
     assert more.area_percent - exact.area_percent == pytest.approx(grown)
 
 
-def test_truth_is_the_scenes_own(press):
-    given, scene = press
-    truth = ball_truth(given, HEIGHT, WIDTH, PITCH)
-    torch.testing.assert_close(
-        truth.gradient.float()[truth.region.expand(1, 2, -1, -1)],
-        scene.gradient[truth.region.expand(1, 2, -1, -1)],
-        atol=1e-5,
-        rtol=1e-5,
-    )
-
-
 def test_a_turned_normal_is_off_by_its_angle(press):
     given, scene = press
     angle = math.radians(7.0)
@@ -134,23 +123,6 @@ def test_a_tilted_depth_moves_the_fitted_ball(press):
     assert score.relief_um == pytest.approx(1000.0 * float(tilt[truth.region].std(correction=0)), rel=1e-3)
     assert score.tilt_um == pytest.approx(score.relief_um, rel=1e-3) and score.level_um < 0.05 * score.relief_um
     assert score.center_px == pytest.approx(slope * 0.5 * BALL_MM / PITCH, rel=0.15)
-
-
-def test_bad_arguments_are_named(press, folder):
-    given, scene = press
-    with pytest.raises(ValueError, match="press: expected one with center_px"):
-        ball_truth(vts.Press(given.image, BALL_MM, "bare"), HEIGHT, WIDTH, PITCH)
-    with pytest.raises(ValueError, match="10 are needed"):
-        faint = vts.Press(given.image, BALL_MM, "faint", given.center_px, 4.0)
-        score_press(faint, scene.depth_mm, scene.normal, PITCH)
-    sensor = vts.Sensor.load(folder / "rig.yaml")
-    with pytest.raises(ValueError, match="methods: expected some of"):
-        ev.evaluate(sets.from_folder(folder, sensor), ["magic"])
-    for folds, message in ((7, "folds: expected at most"), (0, "folds")):
-        with pytest.raises(ValueError, match=message):
-            sets.from_folder(folder, sensor, folds=folds)
-    with pytest.raises(ValueError, match="sets: expected some of gelsight_mini_a"):
-        sets.load("gelsight_mini_z", folder)
 
 
 def test_accuracy_writes_tables_rows_and_pictures(run_script, monkeypatch, folder, tmp_path):

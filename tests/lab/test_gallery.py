@@ -57,20 +57,6 @@ def test_the_first_severity_is_the_undisturbed_case(name):
     assert _same(CORRUPTIONS[name].make(CORRUPTIONS[name].severities[0], 5), gallery.undisturbed(5))
 
 
-SMOOTH = {"deeper press", "covers the image", "gel sag", "faint contact"}
-
-
-@pytest.mark.parametrize("name", sorted(SMOOTH))
-def test_true_gradients_are_the_slopes_of_the_true_depth(name):
-    """Central differences err by a sixth of the third derivative, which the middle of a ball hardly has."""
-    truth = CORRUPTIONS[name].make(CORRUPTIONS[name].severities[1], 0).truth
-    z, pitch = truth.depth_mm.double(), truth.mm_per_pixel
-    slope = (z[..., 2:] - z[..., :-2]) / (2 * pitch)
-    steep = truth.gradient.norm(dim=1)[:, :, 1:-1]
-    inner = -torch.nn.functional.max_pool2d(-truth.contact.float(), 5, 1, 2)[:, 0, :, 1:-1] > 0
-    assert (slope[:, 0] - truth.gradient[:, 0, :, 1:-1])[inner & (steep < 0.6)].abs().max() < 2e-3
-
-
 def test_an_image_without_faults_is_the_renderers(ring):
     scene = vts.scenes.sphere_press(6.0, 1.0, (0.5, 0.2), 60, 80, 0.25)
     lights = ring()
@@ -97,18 +83,3 @@ def test_a_cast_shadow_is_as_long_as_the_light_is_low():
         assert int(dark[0, :200].sum()) * 0.05 == pytest.approx(1.0 / math.tan(angle), abs=0.11)
         assert not dark[0, 201:].any() and not dark[1, :200].any() and not dark[2].any()
         assert int(dark[1].sum()) == int(dark[0].sum())
-
-
-def test_ambient_and_bounced_light_flatten_the_shading():
-    matt = _light()
-    for condition in ("ambient", "bounce"):
-        spread = [float(_light(**{condition: share}).std(dim=(2, 3)).mean()) for share in (0.0, 0.2, 0.5)]
-        assert spread[0] > spread[1] > spread[2]
-    level = matt.mean(dim=(2, 3))
-    assert (_light(bounce=0.5).mean(dim=(2, 3)) / level - 1).abs().max() < 0.02  # it moves light, and adds none
-
-
-def test_crosstalk_ends_with_red_and_blue_swapped():
-    scene, plain = gallery.undisturbed().truth, faults.Conditions(gallery.LIGHTS)
-    swapped = faults.photograph(scene, replace(plain, crosstalk=1.0))
-    assert torch.equal(swapped, faults.photograph(scene, plain).flip(1))

@@ -89,13 +89,6 @@ def test_frames_are_timed_as_a_user_runs_them(monkeypatch):
     assert len([line for line in text.splitlines() if line.startswith("| drawn rig | 64x48 | fast | 1 |")]) == 1
 
 
-def test_many_calls_have_a_99th_percentile():
-    times = [1.0] * 985 + [9.0] * 15
-    few, many = (speed.time_of(some) for some in (times[:100], times))
-    assert few.ms_p99 is None and many.ms_p99 == 9.0 and many.ms_median == 1.0
-    assert speed.time_of(times, frames=4).ms_median == 0.25
-
-
 def test_the_command_prints_a_line_for_each_size_and_mode(run_script, monkeypatch):
     monkeypatch.setattr(bench, "SIZES", ((24, 32), (48, 64)))
     monkeypatch.setattr(bench, "BATCHED", (48, 64))

@@ -1,16 +1,12 @@
 """The sweep over hard scenes: what it measures, that it goes on where it stopped, and that no breaking point has moved."""
 
 import itertools
-import math
-import warnings
 from pathlib import Path
 
 import pytest
-import torch
 
 from lab import stability
 from lab.gallery import CORRUPTIONS, undisturbed
-from lab.methods import METHODS, Method
 from lab.rows import Row
 from lab.stability import MASK, SWEPT
 
@@ -77,29 +73,6 @@ def test_a_row_is_the_metrics_of_the_method():
     assert flat["largest_px"] == pytest.approx(float(z.max()) / 0.125, rel=1e-4)
 
 
-def test_what_fails_or_warns_keeps_its_note(monkeypatch):
-    def breaks(calibration):
-        raise RuntimeError("the LED is broken")
-
-    def complains(calibration):
-        warnings.warn("not sure", UserWarning, stacklevel=1)
-        return METHODS["fast"].calibrated(calibration)
-
-    def invents(calibration):
-        good = METHODS["flat"].calibrated(calibration)
-        nan = torch.full((1, 1, 120, 160), math.nan)
-        return good._replace(reconstruct=lambda image: good.reconstruct(image)._replace(depth_mm=nan))
-
-    for build in (breaks, complains, invents):
-        monkeypatch.setitem(METHODS, build.__name__, Method(build.__name__, build))
-    case = undisturbed()
-    rows = {m: stability.measure(m, "noise", 0.002, 0, case) for m in ("breaks", "complains", "invents")}
-    assert rows["breaks"].note == "RuntimeError: the LED is broken" and stability.limits(rows["breaks"]) == stability.WORST
-    assert rows["breaks"].error("normal_deg") is None and stability.mask_limits(rows["breaks"]) == stability.WORST
-    assert rows["complains"].note == "UserWarning: not sure" and stability.limits(rows["complains"]) < 1
-    assert rows["invents"].error("rms_um") is None and rows["invents"].note == "the result is not finite"
-
-
 def _rows(errors, name="noise", seeds=2):
     """Rows under a corruption whose error is so many limits."""
     return [
@@ -135,12 +108,6 @@ def test_processes_measure_the_same():
     for one, other in zip(alone, shared):
         assert (one.data, one.severity, one.seed) == (other.data, other.severity, other.seed)
         assert other.errors == pytest.approx(one.errors, rel=1e-3)
-
-
-def test_errors_grow_with_noise():
-    cases = [CORRUPTIONS["noise"].make(severity, 0) for severity in (0.002, 0.01, 0.05)]
-    errors = [stability.limits(stability.measure("fast", "noise", 0.0, 0, case)) for case in cases]
-    assert errors[0] < errors[1] < errors[2]
 
 
 def test_the_script_writes_table_rows_and_pictures(run_script, monkeypatch, tmp_path):

@@ -3,7 +3,6 @@
 import copy
 import dataclasses
 import json
-import os
 import pickle
 
 import pytest
@@ -178,14 +177,6 @@ def test_a_new_file_replaces_the_old_and_keeps_its_mode(calibration, saved):
     vts.Calibration.from_lights(calibration.lights, SENSOR).save(saved)
     assert vts.Calibration.load(saved).measured is False
     assert saved.stat().st_mode & 0o777 == 0o640
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_a_folder_that_cannot_be_written_is_refused(calibration, tmp_path):
-    tmp_path.chmod(0o500)
-    with pytest.raises(PermissionError, match="cannot write into"):
-        calibration.save(tmp_path / "unit.safetensors")
-    tmp_path.chmod(0o700)
 
 
 def test_known_lights_need_no_image(ring):

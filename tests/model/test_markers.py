@@ -178,13 +178,6 @@ def test_a_constant_and_a_ramp_are_filled_exactly():
     assert float((fill_markers(ramp, mask, 300) - ramp).abs().max()) < 1e-6  # the membrane through a ramp is the ramp
 
 
-def test_unmarked_pixels_keep_their_value_and_a_full_mask_its_shape():
-    image, _, true = frame()
-    filled = fill_markers(image, true)
-    assert torch.equal(filled[~true.expand_as(image)], image[~true.expand_as(image)])
-    assert bool((fill_markers(image, torch.ones_like(true)) == 0).all())
-
-
 def test_gradient_flows_through_unmarked_pixels_alone():
     generator = torch.Generator().manual_seed(0)
     image = torch.rand(1, 2, 7, 9, generator=generator, dtype=torch.float64).requires_grad_()

@@ -8,7 +8,6 @@ import torch
 import torchvts as vts
 from lab import metrics
 from torchvts.accelerated import reference_only
-from torchvts.normals.shadowed import ShadowedPixels
 
 scenes = vts.scenes
 SIZE = (120, 160, 0.125)
@@ -84,20 +83,3 @@ def test_mode_fast_goes_by_the_noise_of_the_calibration(low):
     expected = pipe.solve.normals(frame, None, torch.full((1, 3), 0.005))
     found = vts.DepthPipeline.from_calibration(told(calibration, 0.005), "fast").solve.normals(frame)
     assert float((found - expected).abs().max()) < 1e-5 and float((pipe.solve.normals(frame) - expected).abs().max()) > 0.1
-
-
-def test_shadows_on_undeformed_skin_go_by_the_noise_of_the_frame():
-    flat, inverse = torch.full((3, 64, 64), 0.5), torch.eye(3)[:, :, None, None].expand(3, 3, 64, 64)
-    shadowed, image = ShadowedPixels(flat, torch.full((3,), 0.001), inverse, None), flat.clone()
-    image[0, 8:24, 8:24] = 0.02
-    assert not bool(shadowed.undeformed_in_shadow(image[None]).any())
-    found = shadowed.undeformed_in_shadow(image[None], torch.tensor([[0.01, 0.001, 0.001]]))[0, 0]
-    assert int(found.sum()) == 256 and bool(found[8:24, 8:24].all())
-
-
-def test_units_by_response_fields_ask_for_no_noise(low):
-    pipe = vts.DepthPipeline.from_calibration(low[1], "precise")
-    assert pipe.noise_of(seen(low, 0.005)).shape == (1, 3)
-    assert pipe.normals.takes_noise and not vts.NormalModel.takes_noise
-    plain = vts.DepthPipeline(pipe.compensate, pipe.mask, torch.nn.Identity(), pipe.gradient, pipe.integrate, mm_per_pixel=1.0)
-    assert plain.noise_of(seen(low, 0.005)) is None

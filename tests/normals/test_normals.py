@@ -80,16 +80,6 @@ def test_the_stored_inverse_equals_the_twin(ring):
     assert np.abs(block_for(lights, scene).inverse.numpy() - expected).max() < 1e-12 * np.abs(expected).max()
 
 
-def test_a_given_inverse_is_used_and_must_fit(ring):
-    scene, lights = press(height=12, width=16), ring(dtype=torch.float64)
-    sensor = vts.Sensor("rig", 12, 16, scene.mm_per_pixel)
-    stored = vts.Calibration.from_lights(lights, sensor).inverse
-    image = scenes.render(scene, lights)
-    assert torch.equal(block_for(lights, scene, inverse=stored)(image), block_for(lights, scene)(image))
-    with pytest.raises(ValueError, match=r"inverse: expected \(3, 3, 12, 16\), got \(3, 3, 12, 15\)"):
-        block_for(lights, scene, inverse=stored[..., :15])
-
-
 @pytest.mark.parametrize("noise_std, bound_deg, share", [(0.0, 1.5, 0.45), (0.001, 2.0, 0.6), (0.002, 2.4, 0.7)])
 def test_a_blocked_light_does_not_spoil_the_normal(ring, noise_std, bound_deg, share):
     """Low lights, 2 mm: walls that one light does not reach. The plain inverse reads black as a number."""

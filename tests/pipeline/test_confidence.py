@@ -318,13 +318,6 @@ def test_the_first_five_fields_are_those_of_the_pipeline(made):
     assert bool((out.confidence >= 0).all() and (out.confidence <= 1).all() and (out.depth_95_mm >= 0).all())
 
 
-def test_the_script_makes_table_and_picture(run_script, tmp_path):
-    arguments = ["--frames", 1, "--units", "lights known", "--out", tmp_path / "coverage.png"]
-    done = run_script("confidence", *arguments)
-    assert done.returncode == 0, done.stderr
-    assert "| scenes, lights known |" in done.stdout and (tmp_path / "coverage.png").stat().st_size > 10_000
-
-
 @pytest.mark.filterwarnings("ignore:presses. by the others the balls of")  # of nine presses without a prior one looks too wide
 @pytest.mark.parametrize("learn", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_presses_of_a_real_sensor(mini_presses, mini_by_prior, learn):

@@ -3,13 +3,10 @@
 import pytest
 import torch
 from torch import nn
-from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchvts as vts
 from lab import metrics
 from torchvts import NormalModel
-from torchvts.core.geometry import normal_from_gradient
-from torchvts.pipeline.shadows import extrapolated_slope
 
 scenes = vts.scenes
 PITCH = 0.0625
@@ -146,52 +143,6 @@ def test_dirt_that_keeps_a_light_off_leaves_a_fifth_of_the_error_of_the_plain_in
     assert ours < 0.2 * metrics.depth_error(pipe(image).depth_mm, scene.depth_mm, 0.0625).rms_px
 
 
-def test_extrapolated_slopes_take_memory_for_the_cells_not_for_their_square():
-    class Largest(TorchDispatchMode):
-        elements = 0
-
-        def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-            result = func(*args, **(kwargs or {}))
-            self.elements = max(self.elements, result.numel() if isinstance(result, torch.Tensor) else 0)
-            return result
-
-    slope = torch.nn.functional.avg_pool2d(torch.randn(2, 2, 98, 120, generator=torch.manual_seed(0)), 9, 1, 4)
-    known = torch.rand(2, 1, 98, 120) < 0.5
-    with Largest() as largest:
-        found = extrapolated_slope(slope, known, 2)
-    cells = 49 * 60
-    assert largest.elements <= 2 * 256 * cells < 0.1 * 2 * cells**2
-    places = torch.stack(torch.meshgrid(torch.arange(120.0), torch.arange(98.0), indexing="xy"))[None].expand(2, 2, 98, 120)
-    assert float((extrapolated_slope(0.01 * places, known, 2) - 0.01 * places).abs().max()) < 0.02
-    assert found.shape == slope.shape and bool(torch.isfinite(found).all())
-
-
-def test_frames_with_and_without_shadows_do_not_influence_one_another():
-    scene = scenes.sphere_press(6.0, 1.5, (0.5, -0.4), 120, 160, 0.125)
-    pipe, camera = low_rig(scene)
-    frames = torch.cat((camera(True), camera(False)))
-    together, alone = pipe(frames), [pipe(frame[None]) for frame in frames]
-    for k, one in enumerate(alone):
-        assert torch.equal(together.deformed[k], one.deformed[0])
-        assert float((together.depth_mm[k] - one.depth_mm[0]).abs().max()) < 1e-4
-
-
-def test_slopes_beyond_the_plane_fit_as_well(ring):
-    lights, scene = ring(20.0, 12.0), scenes.sphere_press(10.0, 3.0, (0, 0), 60, 80, 0.4)
-    block = vts.NormalFromIntensity(lights, 60, 80, 0.4)
-    seen = scenes.render(scene, lights)
-    found = block.shadowed.mirrored(scene.gradient, seen, scene.depth_mm, block.view())
-    moved = (found - scene.gradient).norm(dim=1, keepdim=True) > 1e-3
-    dark = block.shadowed.blocked(seen)
-    assert bool(moved.any()) and bool((dark | ~moved).all())
-    depth, pitch = scene.depth_mm, 0.4
-    matrix = vts.model.lights.light_matrix(depth, lights.position_mm, lights.albedo, pitch)  # (1, light, axis, H, W)
-    before, after = ((matrix * normal_from_gradient(slope)[:, None]).sum(dim=2) for slope in (scene.gradient, found))
-    lit = (seen > 0.01) & (found.norm(dim=1, keepdim=True) < 9.0)
-    assert float(((before - after).abs() * lit).max()) < 1e-4
-    assert bool((after[(seen <= 0) & moved] <= before[(seen <= 0) & moved] + 1e-4).all())
-
-
 @pytest.mark.parametrize("mode", ["fast", "precise"])
 def test_a_pipeline_that_ran_in_inference_mode_still_gives_gradients(ring, small_sensor, small_press, mode):
     lights, scene = ring(), small_press(1.0)
@@ -271,16 +222,6 @@ def mixed(ring, small_sensor, small_press):
     lights = ring()
     presses = [scenes.undeformed(small_press()), small_press(1.5), small_press(0.05, (6, 4), 4.0), small_press(1.0, (-8, 3))]
     return lights, torch.cat([scenes.render(scene, lights, bits=8) for scene in presses])
-
-
-@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
-def test_a_batch_of_mixed_frames_equals_single_frames(mixed, small_sensor, mode):
-    lights, frames = mixed
-    pipe = pipeline(lights, small_sensor, mode)
-    whole, single = pipe(frames), [pipe(frame[None]) for frame in frames]
-    for name in whole._fields:
-        expected = torch.cat([getattr(out, name) for out in single])
-        assert (getattr(whole, name).double() - expected.double()).abs().max() < 2e-6, name
 
 
 @pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
@@ -463,20 +404,6 @@ def test_a_mask_may_take_the_image_alone(ring, mixed, small_sensor):
     assert metrics.mask_iou(found, own) > 0.9
 
 
-BAD_THRESHOLDS = [
-    ({"share": 2}, r"share: expected a number in \(0, 1\], got 2"),
-    ({"share": 0.0}, "share"),
-    ({"sigmas": 0.1}, r"sigmas: expected a number in \[1, 1000\], got 0.1"),
-    ({"sigmas": 1e6}, "sigmas"),
-]
-
-
-@pytest.mark.parametrize("values, text", BAD_THRESHOLDS)
-def test_thresholds_that_no_frame_could_use_are_refused(values, text):
-    with pytest.raises(ValueError, match=text):
-        vts.ContactSettings(**values)
-
-
 def test_a_learned_module_can_be_trained_in_the_chain(mixed, small_sensor):
     lights, frames = mixed
     truth = pipeline(lights, small_sensor, "fast")(frames)
@@ -549,11 +476,6 @@ def test_defects_take_the_value_of_their_neighbours():
     assert repaired[0, 0, 3, 3] == (image[0, 0, 3, 2] + image[0, 0, 3, 5] + image[0, 0, 2, 3] + image[0, 0, 4, 3]) / 4
     # in the corner the border comes first to the left and above: right and below stand in for them
     assert repaired[0, 0, 0, 0] == (2 * image[0, 0, 0, 1] + 2 * image[0, 0, 1, 0]) / 4
-
-
-def test_a_background_without_valid_pixels_is_refused():
-    with pytest.raises(ValueError, match="defects: expected valid pixels"):
-        vts.Compensate(defects=torch.ones(4, 4, dtype=torch.bool))
 
 
 @pytest.mark.parametrize("height_mm, out_mm, albedo", [(30.0, 25.0, 1000.0), (18.0, 22.0, 500.0), (15.0, 24.0, 450.0)])

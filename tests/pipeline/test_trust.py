@@ -4,7 +4,6 @@ import contextlib
 import copy
 import pickle
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
@@ -135,26 +134,6 @@ def test_a_frame_without_contact_has_a_graph_and_tensors_of_its_own() -> None:
     out = pipe.requires_grad_(False)(flat.detach())
     out.depth_mm.add_(1.0)
     assert not bool(out.gradient.any())
-
-
-@pytest.mark.long
-def test_calls_are_typed(tmp_path: Path) -> None:
-    api = pytest.importorskip("mypy.api")
-    modules = {
-        "DepthPipeline": "DepthOutput", "ConfidentPipeline": "ConfidentOutput", "Compensate": "Tensor", "ContactMask": "Tensor",
-        "ContactFromDepth": "Tensor", "NormalModel": "Tensor", "Integrator": "Tensor", "NormalFromIntensity": "Tensor",
-        "PoissonBackground": "Tensor", "GradientFromNormal": "Tensor",
-    }  # fmt: skip
-    lines = ["import torch", "import torchvts as vts", "x = torch.zeros(1)"]
-    for name, kind in modules.items():
-        call = "m(x, x, x)" if name == "ContactFromDepth" else "m(x)"
-        lines += [f"def of_{name}(m: vts.{name}) -> None:", f"    reveal_type({call})  # {kind}"]
-    (tmp_path / "calls.py").write_text("\n".join(lines))
-    found, _, _ = api.run(["--config-file=", "--follow-imports=silent", str(tmp_path / "calls.py")])
-    revealed = [line for line in found.splitlines() if "Revealed type" in line]
-    assert len(revealed) == len(modules), found
-    for line, kind in zip(revealed, modules.values(), strict=True):
-        assert kind in line, line
 
 
 def unit_of(kind: str) -> vts.Calibration:

@@ -11,19 +11,17 @@ import torch
 import torchvts as vts
 from lab import pose_accuracy, tracking
 from torchvts.accelerated import library, reference_only
-from torchvts.cli.track import record
 from torchvts.core.frame import DepthOutput
 from torchvts.pose import tracker as tracker_module
 from torchvts.pose.follow import _follow_best, _follow_from, _pixels, follow
 from torchvts.pose.graph import Edge, KeyframeGraph
-from torchvts.pose.height_errors import WHITE_MM, _covariance, _height_residuals, _modes, height_sums
-from torchvts.pose.inverse import Sums, moved_by, refine, solve_step, step_between, sum_parts, sum_residuals
+from torchvts.pose.height_errors import WHITE_MM, _height_residuals, height_sums
+from torchvts.pose.inverse import moved_by, refine, solve_step, step_between, sum_parts, sum_residuals
 from torchvts.pose.jackknife import ALIKE_MM, jackknife, shared_error
 from torchvts.pose.keyframe import PARTS, contact_frame, grids, make_keyframe
 from torchvts.pose.result import invert, motion, turn_deg
 from torchvts.pose.rigid import adjoint, orthonormal, rotation_vector
 from torchvts.scenes import objects, render
-from torchvts.stream import TactileFrame
 
 PITCH = 0.125
 
@@ -273,17 +271,6 @@ def test_what_only_the_outline_says_tells_equal_poses_from_others():
         assert max(min(float(turn_deg(T @ invert(other))) for other in truth) for T in every) < 0.5
 
 
-def test_equal_poses_that_a_search_misses_follow_from_those_it_finds():
-    """One symmetry found gives all powers of it, with the exactness of tracking; a pose between two equal ones is dropped."""
-    tracker = vts.PoseTracker(press(objects.gear(), objects.pose(0.0)), PITCH)
-    keyframe, poses = tracker.graph.keyframes[0], (7.0, 37.6, 38.0)  # at 0 the frame would be the reference itself
-    frame = grids(contact_frame(press(objects.gear(), objects.pose(7.0, (0.3, 0.1)))), PITCH, keyframe.least_mm, keyframe.times)
-    tracker._symmetries_of_reference = []
-    equal, problem = tracker._equal_poses(0, frame, [objects.pose(deg, (0.3, 0.1), 0.0).numpy() for deg in poses])
-    turns = sorted(round(math.degrees(math.atan2(one.pose[1, 0], one.pose[0, 0])) % 360.0, 1) % 360.0 for one in equal)
-    assert problem == "" and turns == pytest.approx([7.0 + 30.0 * k for k in range(12)], abs=0.15)
-
-
 def test_another_object_is_not_taken():
     tracker = vts.PoseTracker(press(objects.key(), objects.pose(0.0)), PITCH)
     for _ in range(2):
@@ -452,15 +439,6 @@ def test_without_kernels_the_pose_is_the_same():
     assert error(found, swing(0), swing(1))[0] < 0.1
 
 
-def test_pixels_lie_in_compact_parts_of_the_same_number(keyframe):
-    places = keyframe.many.columns[:2].T
-    ends = [keyframe.many.number * k // PARTS for k in range(PARTS + 1)]
-    sides = torch.stack([places[a:b].amax(0) - places[a:b].amin(0) for a, b in itertools.pairwise(ends)])
-    whole = places.amax(0) - places.amin(0)
-    assert float(sides.prod(1).sum()) < 1.2 * float(whole.prod())  # they hardly overlap
-    assert float(sides.amax(1).max()) < 0.75 * float(whole.amax())
-
-
 @pytest.mark.parametrize("alike", [0.0, 1.0])
 def test_the_jackknife_expects_errors_that_parts_have_in_common(alike):
     """Independent errors, and errors that all pixels of a part share: the variance is that of repeated draws."""
@@ -492,33 +470,6 @@ def test_errors_that_are_alike_all_over_a_contact_count_though_its_parts_agree()
     assert shared_error(places, PARTS) * np.mean(stated) == pytest.approx(errors.mean(0).var(), rel=0.15)
 
 
-def test_heights_are_least_certain_far_from_undeformed_skin():
-    deformed = np.zeros((14, 18), bool)
-    deformed[3:11, 4:14] = True
-    slope = 0.3 * np.random.default_rng(0).standard_normal((2, 14, 18))
-    found = _covariance(slope, deformed, 0.5, np.arange(80))
-    std = np.sqrt(np.diag(found)).reshape(8, 10)
-    assert std.min() == std[[0, 0, -1, -1], [0, -1, 0, -1]].min() and std[3:5, 4:6].min() > 1.5 * std[0].max()
-    assert 0.5 * 0.037 < std.max() < 3.0 * 0.037  # slopes off by 0.037 over the 2 mm to the nearest undeformed skin
-    turned = _covariance(np.rot90(slope, axes=(1, 2)), np.rot90(deformed), 0.5, np.arange(80))
-    order = np.rot90(np.arange(80).reshape(8, 10)).ravel()
-    np.testing.assert_allclose(turned, found[np.ix_(order, order)], rtol=1e-5)
-    some = np.array([3, 40, 41])
-    np.testing.assert_allclose(_covariance(slope, deformed, 0.5, some), found[np.ix_(some, some)], rtol=1e-9)
-
-
-def test_modes_of_heights_make_up_their_covariance():
-    deformed = np.zeros((14, 18), bool)
-    deformed[3:11, 4:14] = True
-    slope = 0.3 * np.random.default_rng(0).standard_normal((2, 14, 18))
-    covariance = _covariance(slope, deformed, 0.5, np.arange(80))
-    all_, some = _modes(covariance, 100), _modes(covariance, 40)
-    assert all_.shape == (80, 80) and some.shape == (80, 40)
-    np.testing.assert_allclose(all_ @ all_.T, covariance, atol=1e-9 * covariance.max())
-    left = np.diag(covariance - some @ some.T)
-    assert left.min() > -1e-12 and left.sum() < 0.1 * np.trace(covariance)
-
-
 def test_sums_of_heights_are_generalised_least_squares(keyframe):
     frame = grids(contact_frame(press(objects.key(), swing(1))), PITCH, keyframe.least_mm, keyframe.times)
     matrix, right = height_sums(keyframe.heights, frame.fine, keyframe.some, np.eye(4))
@@ -548,24 +499,6 @@ def test_derivatives_are_those_of_the_residuals(keyframe):
         pose = motion(torch.from_numpy(scaled * pixels.units), torch.from_numpy(pixels.center)).numpy()
         step = solve_step(sum_residuals(frame.fine, pixels, pose, 0.05))
         assert step == pytest.approx(-scaled, abs=3e-3)  # derivatives are smoothed
-
-
-def test_held_motions_get_no_step():
-    generator = np.random.default_rng(0)
-    jacobian = generator.standard_normal((40, 6))
-    sums = Sums(jacobian.T @ jacobian, generator.standard_normal(6), 40, 0.1, 0.1, 0.0, 1.0, 40.0, 0.1)
-    free = np.eye(6)[:, [0, 4]]
-    step = solve_step(sums, free)
-    assert step[[0, 4]] == pytest.approx([0.0, 0.0], abs=1e-9)
-    rest = [1, 2, 3, 5]
-    assert step[rest] == pytest.approx(
-        -np.linalg.solve(sums.matrix[np.ix_(rest, rest)], sums.right[rest]) * _cut(sums, rest), rel=1e-3
-    )
-
-
-def _cut(sums, rest):
-    """Long steps are cut."""
-    return min(1.0, 0.6 / np.linalg.norm(np.linalg.solve(sums.matrix[np.ix_(rest, rest)], sums.right[rest])))
 
 
 def test_adjoint_moves_a_small_motion_past_a_pose():
@@ -636,17 +569,6 @@ def test_frames_that_come_again_say_nothing_of_what_is_usual():
     assert not [found.lost for found in map(tracker, [frames[0]] * 4 + frames[1:]) if found.lost]
 
 
-def test_what_is_usual_is_forgotten_while_it_keeps_the_object_lost():
-    frames = [press(objects.key(), swing(k)) for k in range(3)]
-    tracker = vts.PoseTracker(frames[0], PITCH)
-    tracker(frames[1])
-    tracker._usual.extend([(1e-9, 0.1)] * 5)
-    noise = torch.randn(frames[1].gradient.shape, generator=torch.Generator().manual_seed(0))
-    noisy = _bad(frames[1], gradient=frames[1].gradient + 0.04 * noise)
-    lost = [tracker(noisy).lost for _ in range(6)]
-    assert "slopes differ by" in lost[0] and not lost[-1]
-
-
 def test_a_small_part_of_a_large_contact_is_not_found_again():
     """A handle touched again with an end of it: a sixth of its contact lay anywhere along it, 15 degrees off."""
     handle = objects.TARGETS["tool handle"].height_mm
@@ -682,22 +604,6 @@ def test_the_stated_uncertainty_is_that_of_the_errors():
             stated = math.degrees(math.sqrt(float(found.covariance.diagonal()[:3].sum())))
             ratios.append(error(found, swing(0), swing(k))[0] / stated)
     assert 0.5 < math.sqrt(float(np.square(ratios).mean())) < 1.6
-
-
-def test_what_speaks_against_a_pose_is_weighed():
-    """A cost that is usual on a track is no reason to lose the object; a large one at its beginning, or a large step, is."""
-    tracker = vts.PoseTracker(press(objects.key(), swing(0)), PITCH)
-    keyframe, start = tracker.graph.keyframes[0], [np.eye(4)]
-    found = follow(keyframe, grids(contact_frame(press(objects.key(), swing(1))), PITCH, keyframe.least_mm, keyframe.times), start)
-    assert found.exact and found.settled and not tracker._problem(0, found, start)
-    costly = found._replace(cost=0.3)
-    assert "nothing fits" in tracker._problem(0, costly, start)
-    tracker._usual.extend([(0.05, 0.24)] * 3)
-    assert not tracker._problem(0, costly, start)
-    assert "nothing fits" in tracker._problem(0, found._replace(cost=0.4), start)
-    assert (
-        not found._replace(settled=False).exact and not found._replace(std_deg=0.4).exact and not found._replace(std_mm=0.06).exact
-    )
 
 
 def test_relief_that_shows_nothing_is_named():
@@ -783,23 +689,6 @@ def test_the_default_dtype_changes_nothing():
         torch.set_default_dtype(torch.float32)
 
 
-def test_slopes_err_as_much_as_asked_and_alike_in_all_frames():
-    frame = _bad(press(objects.key(), objects.pose(0.0)))
-    unit = tracking.WrongSlopes(frame, tracking.Noise(0.0, 3.0, 2.5), 1, PITCH)
-    errors = [unit(frame, k).gradient - frame.gradient for k in (0, 0, 1)]
-    inside = frame.contact.expand_as(errors[0])
-    off = errors[0].square().sum(1, keepdim=True)[frame.contact].mean().sqrt()
-    assert float(off) == pytest.approx(math.tan(math.radians(3.0)), rel=1e-3)
-    assert torch.equal(errors[0], errors[1])
-    both = torch.corrcoef(torch.stack([errors[k][inside] for k in (0, 2)]))
-    assert 0.5 < float(both[0, 1]) < 0.95  # fine waves differ from frame to frame
-    again = unit(frame, 0)
-    steps = 0.5 * (again.depth_mm[..., 1:-1, 2:] - again.depth_mm[..., 1:-1, :-2]) / PITCH
-    whole = 0.5 * (frame.depth_mm[..., 1:-1, 2:] - frame.depth_mm[..., 1:-1, :-2]) / PITCH
-    there = frame.contact[..., 1:-1, 1:-1]
-    assert torch.allclose((steps - whole)[there], errors[0][:, :1, 1:-1, 1:-1][there], atol=1e-4)  # slopes are those of depth
-
-
 def test_frames_that_come_again_are_the_same_with_wrong_slopes_too():
     paused = tracking.MOTIONS["paused"]
     assert torch.equal(paused.pose(0, 1), paused.pose(3, 1)) and not torch.equal(paused.pose(3, 1), paused.pose(4, 1))
@@ -821,16 +710,6 @@ def test_a_row_of_the_table_counts_what_must_be_seen():
     assert "| key" in tracking.tracking_table([row])
     blind = tracking.follow_track(track, tracking.Motion(4, motion_.pose, (1, 2)), tracking.track_row("key", "x", "y"))
     assert blind.each["unnoticed"] == [1]
-
-
-def test_a_row_of_the_file_holds_pose_and_reason():
-    height = objects.key()
-    tracker = vts.PoseTracker(press(height, swing(0)), PITCH)
-    found = tracker(press(height, swing(1)))
-    frame = TactileFrame(7, 0.25, torch.zeros(3, 120, 160), _bad(press(height, swing(1))))
-    row = record(frame, found)
-    assert row["frame"] == 7 and row["lost"] == "" and row["converged"] == 1
-    assert float(row["T03"]) == pytest.approx(float(found.T_target_source[0, 3]), rel=1e-6)
 
 
 @pytest.mark.parametrize("turn", [0.0, 35.0])

@@ -79,12 +79,6 @@ def test_a_press_in_a_pedestal_of_light_is_relative_to_what_the_lights_give():
     assert ContactMask(flat, light)(noisy(shade, 0.0005)[None]).max() == 0.0
 
 
-def test_frames_of_a_batch_have_the_weight_of_single_ones():
-    images = torch.stack([noisy(square(0.1, RED), seed=k) for k in range(3)])
-    mask = ContactMask(FLAT)
-    torch.testing.assert_close(mask(images), torch.cat([mask(image[None]) for image in images]))
-
-
 def test_depth_counts_from_free_skin_whose_offset_is_smooth():
     y, x = torch.meshgrid(torch.linspace(-6, 6, 120), torch.linspace(-8, 8, 160), indexing="ij")
     r = torch.hypot(x, y)

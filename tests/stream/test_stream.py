@@ -221,21 +221,6 @@ def test_kernels_divide_the_light_out_as_torch_does(size):
     assert middle.tolist() == pytest.approx([0.4 / 1.1, 0.4 / 0.8, 0.4 / 0.9], rel=0.02)
 
 
-def test_lazily_negated_frames_are_read_like_others():
-    image = torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(1)) * 0.2 + 0.4
-    negated = torch.complex(image, -image).conj().imag
-    assert negated.is_neg() and torch.equal(negated, image)
-    none = torch.zeros(1, 1, 40, 60, dtype=torch.bool)
-    planes = []
-    for frame in (image, negated):
-        light = streams.FollowLight(torch.full((3, 40, 60), 0.45))
-        light.start(frame)
-        light.update(0.99 * frame, none, 0.5)
-        planes.append(light.plane)
-        assert streams.FrameCheck(image[0])(frame) == ""
-    assert torch.equal(*planes)
-
-
 def test_the_light_knows_each_frame_whether_or_not_it_is_asked(unit):
     calibration, camera = unit
     pictures = [camera(0.0, dimming(k)) for k in range(40)]
@@ -542,18 +527,6 @@ def test_realtime_takes_every_frame_where_there_is_time(unit):
     assert not any(thread.name == "torchvts-reader" for thread in threading.enumerate())
 
 
-def test_stage_times_are_those_of_the_clock():
-    ticks = itertools.count()
-    stages = streams.StageClock(lambda: next(ticks) * 0.001)
-    for _ in range(2):
-        with stages.stage("read"):
-            next(ticks)
-        with stages.stage("read"):
-            pass
-        stages.end_frame()
-    assert stages.median_ms() == pytest.approx({"read": 3.0}) and stages.last == pytest.approx({"read": 3.0})
-
-
 @pytest.mark.parametrize("suffix", [".avi", ".mp4"])
 def test_a_video_file_is_whole_or_not_there(tmp_path, suffix):
     path = tmp_path / f"out{suffix}"
@@ -593,15 +566,6 @@ def test_the_overlay_shows_contours_and_grows_its_range(unit, small_press):
     overlay.range_mm = 8.0
     assert (overlay.depth(torch.zeros(1, 1, 4, 4))[0, 0] == zero).all()
     assert len(ys) > 50 and abs(np.hypot(ys - 59.5, xs - 79.5) - np.sqrt(inside.sum() / np.pi)).max() < 3
-
-
-def test_long_text_of_an_overlay_stays_beside_the_bar(unit, small_press):
-    scene = small_press(1.0)
-    output = vts.DepthOutput(scene.depth_mm, scene.gradient, scene.normal, scene.contact, scene.contact)
-    frame = streams.TactileFrame(0, 0.0, torch.zeros(3, 120, 160), output)
-    none, few, many = (streams.Overlay()(frame, ["word " * count]) for count in (0, 2, 60))
-    assert (none[:, 320:] == many[:, 320:]).all() and (none[:, :320] != many[:, :320]).any()
-    assert (few[310:, :320] != many[310:, :320]).any()  # the last line
 
 
 def test_a_sheet_shows_six_frames_in_contact_in_one_range(small_press):

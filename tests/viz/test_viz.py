@@ -73,9 +73,3 @@ def test_a_pose_is_shown_before_and_after_at_one_scale():
     for axes in (above, above_after):
         shown = np.concatenate([np.asarray(c.get_offsets()) for c in axes.collections])
         assert (shown[:, 0] > axes.get_xlim()[0]).all() and (shown[:, 1] < axes.get_ylim()[1]).all()
-
-
-def test_a_round_step_gives_seven_to_fourteen_lines():
-    for span in np.geomspace(1e-3, 1e4, 57):
-        step = viz._round_step(float(span))
-        assert 5.0 <= span / step <= 14.5 and f"{step:.0e}"[0] in "125"

@@ -122,7 +122,7 @@ def disagreements(size, counts=(1, 3)):
 def test_loops_agree_with_tensors_at_odd_sizes(size):
     if kernels.library() is None:
         pytest.skip("no compiled kernels")
-    wrong, done = disagreements(size)
+    wrong, _ = disagreements(size)
     assert wrong == []
 
 
@@ -166,15 +166,6 @@ def crc():
     return zlib.crc32(b"".join(path.read_bytes() for path in sorted(kernels.LIBRARY.parent.glob("*.[ch]"))))
 
 
-# ---- files ----
-
-
-# ---- calls ----
-
-
-# ---- kills ----
-
-
 # ---- states ----
 
 
@@ -210,6 +201,3 @@ def test_a_state_goes_into_a_pipeline_of_the_same_unit_only():
             assert torch.equal(into(image).depth_mm, expected), (k, j)
             into.load_state_dict(before)
     assert loaded >= len(pipes)
-
-
-# ---- names ----

@@ -191,15 +191,10 @@ def test_items_of_a_batch_are_independent(name):
 
 
 @every_block
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_dtype_is_kept(name, dtype):
-    block, example = build(name, dtype)
-    assert {tensor.dtype for tensor in outputs(block(example))} <= {dtype, torch.bool}
-
-
-@every_block
-def test_single_precision_follows_double_precision(name):
+def test_the_dtype_is_kept_and_single_precision_follows_double_precision(name):
     (single, example), (double, exact) = build(name), build(name, torch.float64)
+    for block, given in ((single, example), (double, exact)):
+        assert {tensor.dtype for tensor in outputs(block(given))} <= {given.dtype, torch.bool}
     for left, right in zip(outputs(single(example)), outputs(double(exact)), strict=True):
         if left.dtype == torch.bool:  # a pixel may lie on a threshold
             assert float((left ^ right).double().mean()) < 2e-3
@@ -208,28 +203,16 @@ def test_single_precision_follows_double_precision(name):
 
 
 @every_block
-def test_the_input_is_left_as_it_was(name):
+def test_a_block_survives_pickle_deepcopy_and_state_dict_and_leaves_its_input_alone(name):
     block, example = build(name)
-    before = example.clone()
-    block(example)
+    before, expected, other = example.clone(), block(example), copy.deepcopy(block)
     assert torch.equal(example, before)
-
-
-@every_block
-def test_pickle_and_deepcopy(name):
-    block, example = build(name)
-    assert_same(pickle.loads(pickle.dumps(block))(example), block(example))
-    assert_same(copy.deepcopy(block)(example), block(example))
-
-
-@every_block
-def test_state_dict(name):
-    block, example = build(name)
-    other = copy.deepcopy(block)
+    assert_same(pickle.loads(pickle.dumps(block))(example), expected)
+    assert_same(other(example), expected)
     for tensor in other.state_dict().values():
         tensor.zero_()
     other.load_state_dict(block.state_dict())
-    assert_same(other(example), block(example))
+    assert_same(other(example), expected)
 
 
 @every_block

@@ -201,12 +201,6 @@ def test_odd_prime_and_tiny_images_work(height, width, by, mode, kind):
     assert float((out.normal.norm(dim=1) - 1.0).abs().max()) < 1e-5 and bool((out.normal[:, 2] > 0).all())
 
 
-@pytest.mark.parametrize("height, width", [(7, 32), (32, 7), (1, 1)])
-def test_smaller_sensors_are_refused(height, width):
-    with pytest.raises(ValueError, match=r"^(height|width): expected at least 8, got [17]"):
-        vts.Sensor("rig", height, width, PITCH)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("by", ["lights", "response"])
 @pytest.mark.parametrize("mode", MODES)

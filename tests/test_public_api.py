@@ -1,10 +1,7 @@
 """The public names, their arguments, and what an import costs."""
 
-import inspect
 import subprocess
 import sys
-
-import pytest
 
 import torchvts as vts
 from torchvts.calibration import LightFit
@@ -32,11 +29,6 @@ def test_results_have_their_fields_in_order():
     assert ConfidentOutput._fields[:5] == vts.DepthOutput._fields
     assert ConfidentOutput._fields[5:] == vts.pipeline.confidence.Bounds._fields
     assert {"lights", "converged", "loss_history", "direction_std_deg", "message"} <= set(LightFit.__dataclass_fields__)
-
-
-@pytest.mark.parametrize("name", [name for name in NAMES if callable(getattr(vts, name))])
-def test_every_public_name_is_documented(name):
-    assert inspect.getdoc(getattr(vts, name))
 
 
 def test_the_import_is_light():

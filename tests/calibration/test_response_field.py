@@ -127,12 +127,6 @@ def test_a_larger_family_holds_the_same_field(family):
             assert torch.allclose(values, expected, rtol=0, atol=1e-12), term
 
 
-@pytest.mark.parametrize("smaller", [(0, 1), (1, -1), (1, 0)])
-def test_a_smaller_family_is_refused(smaller):
-    with pytest.raises(ValueError, match="degree, product_degree, cubic_degree: expected a family that holds"):
-        random_field(1, 1).embedded(*smaller)
-
-
 @pytest.mark.parametrize("scale", [0.0, 0.1, 1.0, 3.0])
 def test_slope_and_sine_are_those_of_one_angle(scale):
     slope = scale * torch.randn(2, 50, generator=torch.Generator().manual_seed(1), dtype=torch.float64).clamp(-0.6, 0.6)
@@ -208,12 +202,10 @@ def test_a_model_wants_its_parts_in_their_places():
         DepthBrightness(3, 1.0, ((0.0,) * 10,) * 3)
     with pytest.raises(ValueError, match="coefficient: expected 3 x 3 numbers"):
         DepthBrightness(1, 1.0, ((0.0,) * 6,) * 3)
-    for value in (0, -1, float("nan"), 11):
-        with pytest.raises(ValueError, match="gamma: expected a number in"):
-            ResponseModel(shallow, deep, gamma=value)
-    for value in (-1, float("nan"), float("inf")):
-        with pytest.raises(ValueError, match="blur_px: expected a number above 0 and finite"):
-            ResponseModel(shallow, deep, blur_px=value)
+    with pytest.raises(ValueError, match="gamma: expected a number in"):
+        ResponseModel(shallow, deep, gamma=11)
+    with pytest.raises(ValueError, match="blur_px: expected a number above 0 and finite"):
+        ResponseModel(shallow, deep, blur_px=-1)
     assert ResponseModel.from_dict(json.loads(json.dumps(model(2.2, 0).to_dict())), "file") == model(2.2, 0)
     assert ResponseModel.from_dict(ResponseModel(shallow, None).to_dict(), "file") == ResponseModel(shallow, None)
 
@@ -425,15 +417,6 @@ def test_a_float_background_survives_within_sixteen_bits(tmp_path, gamma, dtype)
     assert loaded.dtype == dtype and float((values - kept).abs().max()) < 0.51 / 65535 + 2e-7
 
 
-@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
-def test_a_loaded_response_gives_the_same_depth(saved, mode):
-    x, y = torch.linspace(-1, 1, 32), torch.linspace(-1, 1, 24)[:, None]
-    change = 0.3 * torch.exp(-6 * (x**2 + y**2)) * torch.tensor([1.0, -0.8, 0.5]).reshape(1, 3, 1, 1)
-    image = small_calibration().background * (1 + change)
-    one, two = (vts.DepthPipeline.from_calibration(c, mode)(image) for c in (small_calibration(), vts.Calibration.load(saved)))
-    assert bool(one.contact.any()) and all(torch.equal(left, right) for left, right in zip(one, two))
-
-
 def rewritten(path, change_tensors=None, change_metadata=None):
     """The same file with something changed, and a checksum that fits."""
     tensors, metadata = load_tensors(path)
@@ -529,28 +512,6 @@ def test_a_response_has_no_light_matrix_and_is_one_on_undeformed_skin():
         vts.NormalFromResponse.from_calibration(vts.Calibration.from_lights(lights, vts.Sensor("rig", 24, 32, 0.5)))
 
 
-def test_depth_does_not_depend_on_the_sensor_s_pixels():
-    """The same skin seen with three times the pixels: the same depth at the same millimetres."""
-    sensor = vts.Sensor("rig", 40, 56, 0.3)
-    field = random_field(1, 0, half_mm=8.0, size=0.2)
-    found = []
-    for scale in (1, 3):
-        seen = sensor.resized(40 * scale, 56 * scale)
-        scene = vts.scenes.sine_press(0.3, 6.0, 5.0, seen.height, seen.width, seen.mm_per_pixel)
-        background = torch.full((3, seen.height, seen.width), 0.5)
-        calibration = vts.Calibration.from_response(ResponseModel(field, None, 1.0, 0.0), seen, background)
-        change = torch.cat((scene.gradient, -scene.gradient[:, :1]), 1) * -0.3
-        found.append(vts.DepthPipeline.from_calibration(calibration)(0.5 * (1 + change)))
-    depth, deformed = found[0].depth_mm, found[0].deformed
-    # depth goes to zero within two pixels either way of the rim of the deformed skin, however large they are
-    grown, shrunk = (torch.nn.functional.max_pool2d(m.float(), 5, 1, 2) > 0 for m in (deformed, ~deformed))
-    rim = grown & shrunk
-    gap = (found[1].depth_mm[..., 1::3, 1::3] - depth).abs()
-    assert float(depth.max()) > 0.1 and bool(deformed.any()) and not bool(deformed.all())
-    # slopes by a random field are those of no surface, and where depth is zero depends on which pixels say so
-    assert float(gap[~rim].max()) < 0.2 * float(depth.max()) and float(gap.max()) < 0.3 * float(depth.max())
-
-
 # a sensor's prior
 
 
@@ -582,12 +543,8 @@ def test_a_prior_says_how_good_it_is_on_each_unit_or_nothing(tmp_path):
 
 BAD_PRIORS = {
     "unknown key": (put(1, "colour"), "key prior: key 'colour': unknown; expected response, log_background, half_mm, source"),
-    "unknown key of a field": (put(1, "response", "field", "colour"), "key prior: response: field: key 'colour': unknown"),
     "no source": (put(KeyError, "source"), "key prior: key 'source': missing"),
-    "no angle": (put([0.0], "held_out_deg"), r"key prior: key held_out_deg: expected a number in \(0, 90\], got 0.0"),
-    "no text": (put(3, "source"), "key prior: key source: expected a text"),
     "NaN": (put(NAN, "log_background", 0, 0), "key prior: key log_background: expected finite numbers"),
-    "no scale": (put(0, "half_mm"), "key prior: key half_mm: expected a number above 0"),
 }
 
 

@@ -50,26 +50,6 @@ def test_reconstruct_names_what_is_wrong_with_the_first_frame(run_script, images
     assert "first frame" not in valid.stdout and "first frame: fault: green channel 15" in dimmed.stdout
 
 
-def test_reconstruct_writes_clouds(run_script, images, calibration, tmp_path):
-    try:
-        from torchvts.pose import read_point_cloud
-        from torchvts.pose.read_cloud import open3d
-
-        open3d()
-    except ImportError as error:
-        pytest.skip(str(error))
-    folder, scene = images
-    arguments = ["--out", tmp_path, "--format", "npy", "--cloud", "ply", "--no-pictures"]
-    done = run_script("reconstruct", calibration, folder / "presses" / "0.png", *arguments)
-    assert done.returncode == 0, done.stderr
-    points, normals = read_point_cloud(tmp_path / "0.ply")
-    assert abs(len(points) - int(scene.contact.sum())) < 0.03 * len(points)
-    assert normals is not None
-    # a ball: its normals point away from its centre, in the frame with y up
-    outward = torch.nn.functional.normalize(points - torch.tensor([0.0, 0.0, -9.0]), dim=1)
-    assert (normals * outward).sum(1).median() > 0.999
-
-
 @pytest.mark.long
 def test_reproduce_paper_prints_figure_3_beside_the_papers(run_script, tmp_path):
     done = run_script("reproduce_paper", "--out", tmp_path, "--data", tmp_path / "none")

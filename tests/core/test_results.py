@@ -189,13 +189,8 @@ def test_a_network_takes_the_models_place(unit, source, tmp_path):
         assert torch.allclose(vts.read_result(out / "1.npz").depth_mm, expected, atol=1e-5)
     with pytest.raises(ValueError, match="network_sha256"):
         reconstruct_dataset(unit, source / "1.png", tmp_path / "net_safetensors", **options)
-    for bad, message in (
-        (unit, "expected a network"),
-        (source / "1.png", "expected a state dict"),
-        (tmp_path / "no.pth", "no such file"),
-    ):
-        with pytest.raises((ValueError, FileNotFoundError), match=message):
-            reconstruct_dataset(unit, source / "1.png", tmp_path / "bad", network=bad, **options)
+    with pytest.raises(ValueError, match="expected a network"):
+        reconstruct_dataset(unit, source / "1.png", tmp_path / "bad", network=unit, **options)
     assert not (tmp_path / "bad").exists()
     with pytest.raises(ValueError, match="mode: 'precise'"):
         unit_pipeline(calibration, "precise", tmp_path / "net.safetensors")

@@ -92,20 +92,6 @@ def test_batch_and_workers_do_not_matter(unit, frames, whole, tmp_path):
     assert contents(tmp_path) == whole
 
 
-@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
-def test_one_thread_gives_the_same_bits_for_any_batch(unit, mode):
-    pipe = vts.DepthPipeline.from_calibration(vts.Calibration.load(unit), mode)
-    images = torch.stack([tiny_image(k) for k in range(8)])
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with torch.inference_mode():
-            single = torch.cat([pipe(one).depth_mm for one in images.split(1)])
-            assert all(torch.equal(torch.cat([pipe(some).depth_mm for some in images.split(n)]), single) for n in (2, 3, 8))
-    finally:
-        torch.set_num_threads(threads)
-
-
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="finds processes through /proc")
 @pytest.mark.parametrize("killed", ["the only", *(pytest.param(some, marks=pytest.mark.long) for some in ("all", "one"))])
 def test_killed_processes_lose_nothing_and_the_next_run_goes_on(unit, frames, whole, tmp_path, killed):

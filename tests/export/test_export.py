@@ -149,12 +149,7 @@ def test_gradients_through_torchscript_without_torchvts(low, tmp_path, optimised
         assert float(gradient.abs().max()) > 0
         assert torch.allclose(gradient, expected[name], rtol=1e-3, atol=1e-4 * float(expected[name].abs().max())), name
     found = json.loads(done.stdout)
-    assert (found["mode"], found["mm_per_pixel"], found["height"], found["width"]) == (
-        "precise",
-        PITCH,
-        HEIGHT,
-        WIDTH,
-    )
+    assert (found["mode"], found["mm_per_pixel"], found["height"], found["width"]) == ("precise", PITCH, HEIGHT, WIDTH)
 
 
 @pytest.mark.parametrize("kind", long_to_write("response auto", "own normals", "lights precise"))

@@ -13,7 +13,6 @@ import torch
 import torchvts as vts
 from lab import evaluate as ev
 from lab import methods, rows, sets
-from lab.figures import set_figure
 from lab.score import score_press
 from torchvts.cli import main
 from torchvts.core.geometry import normal_from_gradient
@@ -157,11 +156,6 @@ def test_evaluate_with_a_trained_network(run_script, folder, tmp_path):
     assert [row.method for row in result.rows] == ["fast", methods.GIVEN_NETWORK]
     assert "learned from and scored: 4 presses" in result.data.how and [row.seen for row in result.rows] == [False, True]
     assert result.rows[0].errors["normal_deg"] < 3.0 and result.rows[1].frames == 4
-    largest = [float(result.outputs[name].depth_mm.abs().max()) for name in ("fast", methods.GIVEN_NETWORK)]
-    failed = result.outputs["fast"]._replace(depth_mm=30.0 * result.outputs["fast"].depth_mm)
-    figure = set_figure(dataclasses.replace(result, outputs=result.outputs | {"failed": failed}))
-    ranges = {panel.get_images()[0].norm.vmax for panel in figure.axes if panel.get_images() and "depth" in panel.get_title()}
-    assert len(ranges) == 1 and ranges.pop() <= 1000.0 * max(largest) * 1.001  # not that of the method that failed
 
 
 class FailingUnit:
@@ -190,23 +184,6 @@ def test_a_method_or_a_set_that_fails_is_a_row_with_its_reason(folder, monkeypat
         and "| no contact/ in any" not in text
         and len({line.count("|") for line in text.splitlines()[:6]}) == 1
     )
-
-
-def test_the_learning_curve_of_a_set(run_script, monkeypatch, folder, tmp_path):
-    data = sets.from_folder(folder, vts.Sensor.load(folder / "rig.yaml"), folds=2)
-    monkeypatch.setattr(sets, "load", lambda *arguments: data)
-    monkeypatch.setattr(methods, "train_network", partial(methods.train_network, max_epochs=2))
-    done = run_script("learning_curve", "digit_a", "--draws", 2, "--mode", "fast", "--out", tmp_path)
-    assert done.returncode == 0, done.stderr
-    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in (tmp_path / "table.md").read_text().splitlines()[2:]]
-    assert [(line[1], line[2], line[7]) for line in lines] == [
-        ("presses", "1", "5"),
-        ("presses", "3", "5"),
-        ("touches, and one press for the scale", "1", "5"),
-        ("MLP", "3", "5"),
-    ]
-    assert all(0.0 < float(line[3]) < 10.0 for line in lines[:-1]) and len(json.loads((tmp_path / "rows.json").read_text())) == 8
-    assert float(lines[-1][3]) > 0.0 and (tmp_path / "learning_curve.png").stat().st_size > 5000
 
 
 @pytest.mark.parametrize("name", sets.REAL)

@@ -1,14 +1,13 @@
 """The gallery of hard scenes: valid and repeatable at every severity, and each fault has its physical effect."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 
 import torchvts as vts
 from lab import faults, gallery
-from lab.gallery import CORRUPTIONS, HEIGHT, USUAL, WIDTH
+from lab.gallery import CORRUPTIONS, HEIGHT, WIDTH
 from torchvts.core.geometry import normal_from_gradient
 from torchvts.model.lights import cast_shadows
 
@@ -65,10 +64,6 @@ def test_an_image_without_faults_is_the_renderers(ring):
     other = vts.scenes.render(scene, lights, noise_std=0.01, bits=8, gamma=2.2, vignetting=0.3, shadows=True, seed=4)
     same = faults.Conditions(lights, noise_std=0.01, bits=8, gamma=2.2, vignetting=0.3, shadows=True)
     assert (faults.photograph(scene, same, 4) - other).abs().max() < 1.01 / 255
-
-
-def _light(**conditions):
-    return faults.radiance(gallery.undisturbed().truth, replace(USUAL, **conditions))
 
 
 def test_a_cast_shadow_is_as_long_as_the_light_is_low():

@@ -4,9 +4,8 @@ import dataclasses
 from pathlib import Path
 
 import pytest
-import torch
 
-from lab import frames, rows, speed
+from lab import rows, speed
 from lab.methods import METHODS
 from lab.rows import Row, Size, Time
 from torchvts.cli import bench
@@ -61,32 +60,6 @@ def test_a_chart_is_drawn_again_from_its_table(run_script, tmp_path):
     assert done.returncode == 0 and (tmp_path / "overview.png").stat().st_size > 10_000
     done = run_script("figures", "speed", tmp_path / "none.json", tmp_path / "chart.png")
     assert done.returncode == 1 and done.stderr.startswith("error: ") and "none.json" in done.stderr
-
-
-def test_frames_are_timed_as_a_user_runs_them(monkeypatch):
-    """Every pace, batches, one thread, what is paid once: the rows and their table."""
-    monkeypatch.setattr(frames, "SIZES", ((24, 32), (48, 64)))
-    monkeypatch.setattr(frames, "BATCHES", (1, 3))
-    monkeypatch.setattr(frames, "CAMERA_FRAMES", 12)
-    monkeypatch.setattr(frames, "CAMERA_S", 0.005)
-    monkeypatch.setattr(frames, "_import_s", lambda: 0.4)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        measured = frames.as_user(lambda name: None, None, calls=20)
-    finally:
-        torch.set_num_threads(threads)
-    own, costs = ([row for row in measured if row.kind == kind] for kind in ("frame", "cost"))
-    found = {(row.size.width, row.method, row.time.pace, row.time.threads) for row in own}
-    for mode in frames.USED:
-        for pace in speed.PACES:
-            assert {(32, mode, pace, 2), (64, mode, pace, 2), (64, mode, pace, 1)} <= found
-    assert {row.size.batch for row in own} == {1, 3} and all(row.time.ms_median <= row.time.ms_p90 for row in own)
-    assert any("dropped of 12" in row.method for row in costs) and costs[0].errors["value"] == 0.4
-    assert rows.from_json(rows.to_json(measured)) == measured
-    text = frames.user_table(measured)
-    assert "drawn rig, 64x48, threads: own choice: fast" in text and "times as fast as gs_sdk's pipeline" in text
-    assert len([line for line in text.splitlines() if line.startswith("| drawn rig | 64x48 | fast | 1 |")]) == 1
 
 
 def test_the_command_prints_a_line_for_each_size_and_mode(run_script, monkeypatch):

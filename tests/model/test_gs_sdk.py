@@ -92,15 +92,11 @@ def test_a_missing_file_is_named(folder, missing):
     "lines, header, message",
     [
         ((), HEADER, r"catalog\.csv: no presses"),
-        ((), "", r"catalog\.csv: empty: expected the line experiment_reldir,diameter\(mm\)"),
         (("4.000mm/0,4.0,1",), HEADER + ",depth", r"expected the columns experiment_reldir,diameter\(mm\), got .*depth"),
-        (("4.000mm/0,4.0",), "name,diameter(mm)", r"expected the columns .*, got name,diameter\(mm\)"),
         (("4.000mm/0",), HEADER, r"line 2: expected 2 values, got 1"),
         ((",4.0",), HEADER, r"line 2: experiment_reldir: expected the folder of the press, got nothing"),
         (("4.000mm/0,four",), HEADER, r"line 2: diameter\(mm\): expected a number, got 'four'"),
-        (("4.000mm/0,nan",), HEADER, r"line 2: diameter\(mm\): expected a number, got 'nan'"),
         (("4.000mm/0,4", "4.000mm/1,-4"), HEADER, r"line 3: diameter\(mm\): expected a ball's diameter in mm, got '-4'"),
-        (("4.000mm/0,0",), HEADER, r"diameter\(mm\): expected a ball's diameter"),
         (("4.000mm/0,4", "4.000mm/./0,4"), HEADER, r"line 3: experiment_reldir: '4.000mm/./0' is given twice"),
     ],
 )
@@ -155,9 +151,7 @@ def test_an_image_of_another_size_is_refused(folder):
     [
         ({"center": [1.0, 2.0]}, "expected the arrays 'center' and 'radius', one is missing"),
         ({"center": [1.0, 2.0, 3.0], "radius": 2.0}, r"expected center \(x, y\) and one radius, got shapes \(3,\) and \(1,\)"),
-        ({"center": [1.0, np.nan], "radius": 2.0}, "expected finite pixels and a radius above 0"),
         ({"center": [1.0, 2.0], "radius": -2.0}, "expected finite pixels and a radius above 0"),
-        ({"center": ["left", "top"], "radius": 2.0}, "not a label of gs_sdk"),
         ({"center": np.zeros((200, 200)), "radius": 2.0}, "larger than a centre and a radius"),
     ],
 )
@@ -215,10 +209,7 @@ def test_a_sensor_file_is_read(tmp_path):
         ({"gain": 2}, "key 'gain': unknown; expected ppmm, imgh, imgw, raw_imgh"),
         ({"ppmm": None}, "key ppmm: expected a number"),
         ({"ppmm": 15.8}, r"key ppmm: expected mm per pixel in \(0, 1\], got 15.8: the name misleads"),
-        ({"ppmm": -1}, "key ppmm: expected a number above 0"),
-        ({"imgh": 240.5}, "key imgh: expected an integer"),
         ({"imgw": 0}, "key imgw: expected at least 8"),
-        ({"raw_imgh": "tall"}, "key raw_imgh: expected an integer"),
     ],
 )
 def test_a_bad_sensor_file_is_refused(change, message):

@@ -73,12 +73,6 @@ def marker_pattern(values, places, spacing_px):
     return float(torch.stack(patches).mean(0).square().mean().sqrt())
 
 
-def elsewhere(places, spacing_px, seed=0):
-    """As many places, none of them a marker's more than by chance: the floor of :func:`marker_pattern`."""
-    shift = torch.rand(places.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 0.5
-    return places + spacing_px * shift
-
-
 def pseudo_depth(image, rest):
     """Depth from the change of log light, weighted by rough light directions of the lab sensor: red lower right, green left,
     blue top. No calibration, so of no unit; enough to see dots."""

@@ -8,7 +8,6 @@ import torch
 import torchvts as vts
 from lab import metrics
 from torchvts.core.geometry import MAX_SLOPE, gradient_from_normal, normal_from_gradient
-from torchvts.normals.shadowed import Pixels, slope_by_lit_lights
 
 scenes = vts.scenes
 
@@ -97,22 +96,6 @@ def test_a_blocked_light_does_not_spoil_the_normal(ring, noise_std, bound_deg, s
     assert ours < bound_deg and ours < share * theirs
 
 
-@pytest.mark.parametrize("brightness_std, tolerance", [(0.0, 0.02), (0.02, 0.1)])
-def test_two_lights_and_unit_length_give_the_slope(ring, brightness_std, tolerance):
-    """The third light behind the wall; brightness trusted fully, or to 2 %, where the start keeps some of its say."""
-    lights = ring(22.0, 16.0, level=0.2, dtype=torch.float64)
-    slope = torch.tensor([[0.9, 0.1], [0.8, -0.2], [0.7, 0.3]], dtype=torch.float64)
-    rows = vts.model.lights.light_matrix(torch.zeros(1, 1, 1, 1), lights.position_mm, lights.albedo, 1.0)[:, :, :, 0, 0]
-    turned = torch.stack((-slope[:, 0], -slope[:, 1], torch.ones(3, dtype=torch.float64)), 1)
-    light = (rows * (turned / turned.norm(dim=1, keepdim=True))[:, None]).sum(2)
-    assert ((light <= 0).sum(1) == 1).all()
-    noise, brightness = torch.full((3,), 1e-3), torch.full((3,), brightness_std)
-    found = slope_by_lit_lights(
-        Pixels(slope + 0.1, light.clamp_min(0.0), rows.expand(3, 3, 3), light > 1e9, noise, brightness), steps=30
-    )
-    assert (found - slope).norm(dim=1).max() < tolerance
-
-
 @pytest.mark.parametrize("press_mm, worst_px", [(0.5, 0.08), (1.0, 0.4)])
 @pytest.mark.parametrize("dead", [0, 1, 2])
 def test_two_leds_go_on_when_one_fails(ring, press_mm, worst_px, dead):
@@ -161,18 +144,6 @@ def test_lights_that_nearly_lie_in_a_plane_are_damped(azimuth_deg, rms_px, share
     else:
         theirs = plain.depth_mm.nan_to_num(100.0)
         assert ours < share * metrics.depth_error(theirs, scene.depth_mm, 0.0625).rms_px
-
-
-@pytest.mark.parametrize("azimuth_deg", [40.0, 15.0, 2.0])
-def test_without_noise_the_damped_slope_is_the_true_one(azimuth_deg):
-    """The limit of small noise, at the true depth."""
-    lights, scene = fan(azimuth_deg).double(), press(1.0, height=24, width=32)
-    block = block_for(lights, scene, noise_std=torch.full((3,), 1e-9, dtype=torch.float64))
-    assert not bool(block.shadowed.ill_conditioned.any())
-    block.shadowed.ill_conditioned.fill_(True)
-    block.shadowed.any_ill_conditioned = True
-    inside = scene.contact & (scene.depth_mm > 0.2)
-    assert rms_deg(block(scenes.render(scene, lights), scene.depth_mm), scene, inside) < 0.5
 
 
 def test_slopes_are_bounded_however_wild_the_image():

@@ -121,10 +121,7 @@ def test_a_cylinder_keeps_its_axis_unknown_and_is_followed_across():
 
 @pytest.mark.parametrize(("radius", "yaw"), [(1.0, 0.0), (1.2, 40.0), (1.5, 110.0)])
 def test_a_narrow_capsule_or_rod_may_roll_however_few_pixels_its_bend_covers(radius, yaw):
-    for height, names in (
-        (objects.capsule(radius), ["rotation"]),
-        (objects.cylinder(radius), ["translation", "rotation"]),
-    ):
+    for height, names in ((objects.capsule(radius), ["rotation"]), (objects.cylinder(radius), ["translation", "rotation"])):
         poses = [objects.pose(yaw, (0.1 * k, 0.05 * k), 0.45) for k in range(8)]  # pure shifts: nothing turns
         tracker = vts.PoseTracker(press(height, poses[0]), PITCH)
         for pose in poses[1:]:
@@ -689,17 +686,6 @@ def test_the_default_dtype_changes_nothing():
         torch.set_default_dtype(torch.float32)
 
 
-def test_frames_that_come_again_are_the_same_with_wrong_slopes_too():
-    paused = tracking.MOTIONS["paused"]
-    assert torch.equal(paused.pose(0, 1), paused.pose(3, 1)) and not torch.equal(paused.pose(3, 1), paused.pose(4, 1))
-    short = tracking.Motion(3, lambda k, seed: paused.pose(k + 2, seed), again=(1,))
-    track = tracking.record(objects.TARGETS["gear"], short, 0.005, 1, pose_accuracy.rig())
-    wrong = tracking.with_wrong_slopes(track, tracking.NOISES["slopes off by 3 degrees"], 1)
-    for one in (track, wrong):
-        same = [torch.equal(one.frames[0].gradient, frame.gradient) for frame in one.frames[1:]]
-        assert same == [True, False]
-
-
 def test_a_row_of_the_table_counts_what_must_be_seen():
     motion_ = tracking.Motion(4, lambda k, seed: objects.pose(0.0, press_mm=0.5 if k != 2 else -1.0), lost=(2,))
     poses = [motion_.pose(k, 0) for k in range(4)]
@@ -765,35 +751,3 @@ def test_slopes_that_err_over_wide_areas_are_no_reason_for_confidence():
     assert not found.converged and not found.lost and "parts of the contact disagree" in found.message
     std = np.rad2deg(np.sqrt(np.trace(found.covariance[:3, :3].numpy())))
     assert tracking.tracking_error(found, track, 5)[0] < 4.0 * std
-
-
-def test_normalflow_gets_its_own_axes_and_its_poses_are_read_in_ours():
-    """Its gradient is that of its heights, deeper is lower, and points move as its pose says: x right, y down, metres."""
-    poses = [swing(0), swing(2), swing(5)]
-    track = tracking.Track(poses, [press(objects.key(), pose) for pose in poses], PITCH)
-    turned = np.diag([1.0, -1.0, -1.0, 1.0])
-    given = []
-
-    class Frame:
-        def __init__(self, gradient, height, contact):
-            self.N, self.C, self.H, self.L = gradient, contact, height, len(given)
-            given.append(self)
-
-    def register(first, contact, height, number, *frame_start_and_pitch):
-        *_, k, start, pitch = frame_start_and_pitch
-        assert number == 0 and pitch == PITCH and contact.dtype == bool and height[contact].max() < 0
-        down, right = np.gradient(height)
-        inside = contact & (np.abs(right) + np.abs(down) < 0.5)
-        assert np.median(np.abs(first[..., 0] - right)[inside]) < 0.01
-        assert np.median(np.abs(first[..., 1] - down)[inside]) < 0.01
-        if k == 2:
-            raise LookupError
-        assert np.array_equal(start, np.eye(4))
-        moved = turned @ (poses[k] @ invert(poses[0])).numpy() @ turned
-        moved[:3, 3] /= 1000.0
-        return moved
-
-    peer = tracking.NormalFlow(Frame, register, LookupError)
-    row = tracking.follow_by_normalflow(track, peer, tracking.track_row("key", "slow", "none"))
-    assert row.each["lost"] == [2] and len(row.each["ms"]) == 2
-    assert max(row.each["deg"]) < 1e-4 and max(row.each["mm"]) < 1e-4

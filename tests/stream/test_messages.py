@@ -104,20 +104,6 @@ def test_an_episode_has_the_features_of_its_data_set(frame, small_sensor):
     np.testing.assert_array_equal(dataset.frames[1]["observation.left_finger.depth_mm"], later.output.depth_mm[0, 0].numpy())
 
 
-def test_a_stream_of_files_becomes_an_episode(tmp_path, ring, small_sensor, small_press):
-    lights = ring()
-    still = vts.scenes.render(vts.scenes.undeformed(small_press()), lights)[0]
-    pressed = vts.scenes.render(small_press(), lights)[0]
-    for number in range(6):
-        vts.write_image(tmp_path / f"{number}.png", still if number < 4 else pressed)
-    dataset = CheckedDataset(messages.lerobot_features(small_sensor))
-    calibration = vts.Calibration.from_lights(lights, small_sensor, still)
-    with TactileStream(tmp_path, calibration, background_frames=4) as stream, torch.inference_mode():
-        assert messages.record_episode(stream, PITCH, dataset, "press a ball") == 6
-    areas = [frame["observation.tactile.state"][0] for frame in dataset.frames]
-    assert areas[:4] == [0.0] * 4 and min(areas[4:]) > 10.0
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -131,3 +117,17 @@ def test_a_stream_of_files_becomes_an_episode(tmp_path, ring, small_sensor, smal
 def test_bad_values_are_named(frame, call, message):
     with pytest.raises(ValueError, match=message):
         call(frame)
+
+
+def test_a_stream_of_files_becomes_an_episode(tmp_path, ring, small_sensor, small_press):
+    lights = ring()
+    still = vts.scenes.render(vts.scenes.undeformed(small_press()), lights)[0]
+    pressed = vts.scenes.render(small_press(), lights)[0]
+    for number in range(6):
+        vts.write_image(tmp_path / f"{number}.png", still if number < 4 else pressed)
+    dataset = CheckedDataset(messages.lerobot_features(small_sensor))
+    calibration = vts.Calibration.from_lights(lights, small_sensor, still)
+    with TactileStream(tmp_path, calibration, background_frames=4) as stream, torch.inference_mode():
+        assert messages.record_episode(stream, PITCH, dataset, "press a ball") == 6
+    areas = [frame["observation.tactile.state"][0] for frame in dataset.frames]
+    assert areas[:4] == [0.0] * 4 and min(areas[4:]) > 10.0

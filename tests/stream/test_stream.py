@@ -547,27 +547,6 @@ def test_a_video_file_is_whole_or_not_there(tmp_path, suffix):
         streams.VideoFile(tmp_path / "a.gif", 30.0)
 
 
-def test_the_overlay_shows_contours_and_grows_its_range(unit, small_press):
-    scene = small_press(1.0)
-    output = vts.DepthOutput(scene.depth_mm, scene.gradient, scene.normal, scene.contact, scene.contact)
-    overlay = streams.Overlay(metric=False)
-    picture = overlay(streams.TactileFrame(0, 0.0, torch.zeros(3, 120, 160), output), ["one", "two"])
-    assert picture.shape == (240 + 86, 640, 3) and picture.dtype == np.uint8
-    assert overlay.range_mm == pytest.approx(1.0)
-    inside = scene.contact[0, 0].numpy()
-    ys, xs = np.nonzero((picture[:240:2, :320:2] > 128).all(2))  # shown twice as large
-    ramp = torch.linspace(0.0, 1.0, 160).expand(1, 1, 40, -1)
-    row = overlay.depth(ramp)[20]
-    lines = (row == 60).all(1) | (row == 255).all(1)
-    assert 9 <= int(lines.sum()) <= 11  # ten lines fill the range, dark on light colours and light on dark ones
-    assert (row[lines][0] == 60).all() and (row[lines][-1] == 255).all()
-    zero, below = (overlay.depth(torch.full((1, 1, 4, 4), z))[0, 0].astype(int) for z in (0.0, -0.5))
-    assert (zero > 240).all() and below[2] > below[0] + 50  # near white at any range, brown below
-    overlay.range_mm = 8.0
-    assert (overlay.depth(torch.zeros(1, 1, 4, 4))[0, 0] == zero).all()
-    assert len(ys) > 50 and abs(np.hypot(ys - 59.5, xs - 79.5) - np.sqrt(inside.sum() / np.pi)).max() < 3
-
-
 def test_a_sheet_shows_six_frames_in_contact_in_one_range(small_press):
     sheet = streams.Sheet(PITCH, metric=False)
     with pytest.raises(ValueError, match="sheet: expected frames with contact, got none"):

@@ -278,12 +278,6 @@ def test_the_cost_in_degrees_is_that_of_the_pipeline():
     assert float(angle.mean()) - 0.1 < claimed < float(angle.max())
 
 
-@pytest.mark.parametrize("order", [(2, 1, 0), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1)])
-def test_every_wrong_order_of_channels_is_seen(order):
-    case = undisturbed(1)
-    assert vts.diagnose(None, case.image[:, list(order)], case.calibration).names == ("channels_swapped",)
-
-
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
 def test_an_empty_image_is_a_fault_and_no_crash(value):
     case = undisturbed(1)

@@ -41,7 +41,7 @@ def test_every_package_has_a_page_of_the_reference():
 
 
 def test_links_and_pictures_exist():
-    for path in [*DOCS.glob("*.md"), *DOCS.glob("api/*.md")]:
+    for path in [*PAGES, *DOCS.glob("api/*.md")]:
         for link in re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", path.read_text()):
             assert (path.parent / link).exists(), f"{path.name}: {link}"
 

@@ -1,7 +1,6 @@
 """README's code and commands run as they stand, on images of a real sensor where these are, else on rendered ones."""
 
 import os
-import re
 import shutil
 from pathlib import Path
 
@@ -53,9 +52,3 @@ def test_code_and_commands_run_in_order(rendered, tmp_path, monkeypatch, ring):
     assert names["learned"].weight.grad is not None
     start = run(ROOT / "docs" / "index.md")  # the documentation's first page has the same lines
     assert torch.equal(start["out"].depth_mm, names["out"].depth_mm)
-
-
-def test_readme_names_only_files_that_exist():
-    text = README.read_text()
-    for path in re.findall(r"\]\(([^)#:]+)\)", text) + re.findall(r"(?:scripts|docs|configs)/[\w/]+\.\w+", text):
-        assert (ROOT / path).exists(), path

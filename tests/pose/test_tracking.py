@@ -16,11 +16,11 @@ from torchvts.pose import tracker as tracker_module
 from torchvts.pose.follow import _follow_best, _follow_from, _pixels, follow
 from torchvts.pose.graph import Edge, KeyframeGraph
 from torchvts.pose.height_errors import WHITE_MM, _height_residuals, height_sums
-from torchvts.pose.inverse import moved_by, refine, solve_step, step_between, sum_parts, sum_residuals
+from torchvts.pose.inverse import refine, solve_step, sum_parts, sum_residuals
 from torchvts.pose.jackknife import ALIKE_MM, jackknife, shared_error
 from torchvts.pose.keyframe import PARTS, contact_frame, grids, make_keyframe
 from torchvts.pose.result import invert, motion, turn_deg
-from torchvts.pose.rigid import adjoint, orthonormal, rotation_vector
+from torchvts.pose.rigid import rotation_vector
 from torchvts.scenes import objects, render
 
 PITCH = 0.125
@@ -101,12 +101,6 @@ def test_what_is_unknown_keeps_its_last_value_though_motion_goes_on():
     assert found.agrees and found.free.shape[1] == 3
     assert float(turn_deg(torch.from_numpy(found.pose))) < 0.2
     assert found.pose[:2, 3] == pytest.approx([0.6, 0.3], abs=0.03)
-
-
-def test_a_step_between_poses_leads_from_one_to_the_other(keyframe):
-    pose, step = swing(3).numpy(), np.array([0.5, -0.2, 0.9, 0.4, -0.3, 0.1])
-    assert step_between(keyframe.many, pose, pose @ moved_by(keyframe.many, step)) == pytest.approx(step, abs=1e-12)
-    assert step_between(keyframe.many, pose, pose) == pytest.approx(np.zeros(6), abs=1e-12)
 
 
 def test_a_cylinder_keeps_its_axis_unknown_and_is_followed_across():
@@ -496,15 +490,6 @@ def test_derivatives_are_those_of_the_residuals(keyframe):
         pose = motion(torch.from_numpy(scaled * pixels.units), torch.from_numpy(pixels.center)).numpy()
         step = solve_step(sum_residuals(frame.fine, pixels, pose, 0.05))
         assert step == pytest.approx(-scaled, abs=3e-3)  # derivatives are smoothed
-
-
-def test_adjoint_moves_a_small_motion_past_a_pose():
-    pose = motion(torch.tensor([0.3, -0.2, 0.5, 1.0, 2.0, -1.0], dtype=torch.float64)).numpy()
-    twist = 1e-6 * np.array([1.0, -2.0, 3.0, 0.5, 1.5, -1.0])
-    before = pose @ motion(torch.from_numpy(twist)).numpy()
-    after = motion(torch.from_numpy(adjoint(pose) @ twist)).numpy() @ pose
-    assert before == pytest.approx(after, abs=1e-10)
-    assert orthonormal(1.0001 * pose)[:3, :3] == pytest.approx(pose[:3, :3], abs=1e-12)
 
 
 def _bad(frame, **parts):

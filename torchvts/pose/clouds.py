@@ -160,4 +160,4 @@ def _array(name: str, values: Tensor, length: int | None) -> "np.ndarray[Any, An
         )
     if not bool(torch.isfinite(values).all()):
         raise ValueError(f"{name}: expected finite values, got NaN or infinite ones")
-    return values.detach().cpu().double().numpy()
+    return values.detach().resolve_neg().cpu().double().numpy()

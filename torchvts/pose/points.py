@@ -62,7 +62,7 @@ def _check_cloud(name: str, points: Tensor, normals: Tensor | None) -> Cloud:
         raise ValueError(f"{name}: expected (N, 3), got {tuple(points.shape)}")
     if len(points) == 0:
         raise ValueError(f"{name}: expected points, got none: no contact?")
-    points = points.detach().cpu().double()
+    points = points.detach().resolve_neg().cpu().double()
     if not bool(torch.isfinite(points).all()):
         raise ValueError(f"{name}: expected finite points, got {int((~torch.isfinite(points)).any(1).sum())} with NaN or infinity")
     if normals is not None:

@@ -608,7 +608,13 @@ TABLE = {
     ),
     "fit_prior": Entry(
         {"background": image(), "sensor": sensor(), "presses": [PRESS], "source": ""},
-        {"background": images(), "sensor": SENSOR, "presses": [PRESS, [], [image()], None, "presses"], "source": [None, 3]},
+        {
+            "background": images(),
+            "sensor": SENSOR,
+            "presses": [PRESS, [], [image()], None, "presses"],
+            "source": [None, 3],
+            "others": [None, 3, "unit", [image()]],
+        },
         run=False,
     ),
     "score_prior": Entry(

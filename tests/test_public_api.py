@@ -30,7 +30,7 @@ ARGUMENTS = {
     vts.fit_lights: ["background", "sensor"],
     vts.calibrate: ["background", "sensor", "presses", "touches"],
     vts.Press: ["image", "ball_diameter_mm", "name"],
-    fit_prior: ["background", "sensor", "presses", "source"],
+    fit_prior: ["background", "sensor", "presses", "source", "others"],
     vts.NormalFromLookup.fit: ["flat", "change", "slope"],
     vts.NormalFromMLP: ["height", "width", "flat", "hidden"],
     vts.NormalFromMLP.load: ["path", "flat"],

@@ -113,12 +113,3 @@ def test_shadows_prints_a_row_for_each_shape_and_kind(run_script):
 def test_shadows_refuses_no_scenes(run_script):
     done = run_script("shadows", "--scenes", "0")
     assert done.returncode == 2 and "--scenes: expected at least 1, got 0" in done.stderr
-
-
-@pytest.mark.long
-def test_export_speed_times_files_beside_the_library(run_script):
-    done = run_script("export_speed", "--size", 64, 48, "--modes", "fast", "--formats", "torchscript", "--calls", 2, "--threads", 1)
-    assert done.returncode == 0, done.stderr
-    header, _, row = done.stdout.splitlines()[1:]
-    assert header == "| mode | library | torchscript |"
-    assert row.startswith("| fast | ") and float(row.split("|")[2]) > 0.0 and row.endswith(" times |")

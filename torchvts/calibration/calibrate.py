@@ -4,12 +4,10 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Sequence
-from contextlib import nullcontext
 from typing import NamedTuple
 
 from torch import Tensor
 
-from ..accelerated.threads import OneThread, one_suffices
 from ..core.checks import check_image, check_sequence, check_switch
 from ..model.calibration import Calibration
 from ..model.report import CandidateRow, Report
@@ -112,8 +110,7 @@ def calibrate(
     check_coloured_contacts(background, given.presses or given.touches)
     if not (kept or touched or sensor.prior or sensor.light_position_mm) and objection_to_lights(background, sensor):
         check_coloured_background(background)
-    with OneThread() if one_suffices(background[None]) else nullcontext():  # threads would wake up late for each small step
-        calibration, messages = _choose(given)
+    calibration, messages = _choose(given)
     for k, reason in left_out:
         calibration.report["presses"].insert(k, {"name": named[k].name, "used": False, "reason": reason})
     for message in [f"{named[k].name}: left out: {reason}" for k, reason in left_out] + messages:

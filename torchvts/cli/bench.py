@@ -17,7 +17,7 @@ import torch
 from tqdm import tqdm
 
 from .. import viz
-from ..accelerated import library
+from ..compiled import library
 from ..core.checks import check_integer
 from ..evaluation import figures, rows, speed, user_speed
 from ..evaluation.sets import data_folder

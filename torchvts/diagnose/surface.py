@@ -11,13 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..accelerated import Compensate, GradientFromNormal, NormalFromIntensity, PoissonDCT, SmoothDrift
+from ..compensate import Compensate, SmoothDrift
 from ..core.blur import blur, gaussian_weights
 from ..core.checks import QUANTISATION_STD
-from ..core.geometry import angles_deg, lengths
+from ..core.geometry import GradientFromNormal, angles_deg, lengths
+from ..integration import PoissonDCT
 from ..model import Calibration, PointLights
 from ..model.lights import inverse_light_matrix
-from ..normals import NormalFromResponse
+from ..normals import NormalFromIntensity, NormalFromResponse
 from ..pipeline import DepthOutput, DepthPipeline
 from ..skin import ContactMask
 

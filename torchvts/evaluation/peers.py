@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..accelerated import Compensate
+from ..compensate import Compensate
 from ..core.geometry import normal_from_gradient
 from ..integration import divergence, poisson_dct
 from ..model import gs_sdk

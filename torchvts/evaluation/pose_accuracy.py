@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..calibration import Press, calibrate
 from ..model import Calibration, PointLights, Sensor
-from ..pipeline import DepthOutput, DepthPipeline
+from ..pipeline import DepthOutput, DepthPipeline, FrozenPipeline
 from ..pose import Registration, register_depth
 from ..pose.result import invert, turn_deg
 from ..scenes import objects, render
@@ -86,8 +86,8 @@ class PoseRow:
             self.named += kinds == set(target.free) and len(found.ambiguous) == max(len(target.free), target.freedom)
 
 
-def rig(height: int = 240, width: int = 320, mm_per_pixel: float = 0.0625) -> tuple[PointLights, DepthPipeline]:
-    """Three lights at 120 degrees over the sensor, and the pipeline of this unit in mode precise.
+def rig(height: int = 240, width: int = 320, mm_per_pixel: float = 0.0625) -> tuple[PointLights, FrozenPipeline]:
+    """Three lights at 120 degrees over the sensor, and the frozen pipeline of this unit in mode precise.
 
     Args:
         height: rows of the image.
@@ -98,11 +98,11 @@ def rig(height: int = 240, width: int = 320, mm_per_pixel: float = 0.0625) -> tu
     position = [[31.0 * math.cos(a), 31.0 * math.sin(a), 40.0] for a in angles]
     lights = PointLights(position, [0.45 * math.hypot(31.0, 40.0) ** 3 / 40.0] * 3).requires_grad_(False)
     calibration = Calibration.from_lights(lights, Sensor("pose bench", height, width, mm_per_pixel))
-    return lights, DepthPipeline.from_calibration(calibration, "precise")
+    return lights, DepthPipeline.from_calibration(calibration, "precise").freeze()
 
 
 def pose_case(
-    target: objects.Target, seed: int, lights: PointLights, pipe: DepthPipeline, size: tuple[int, int], noise_std: float
+    target: objects.Target, seed: int, lights: PointLights, pipe: FrozenPipeline, size: tuple[int, int], noise_std: float
 ) -> PoseCase:
     """A reference press near the middle, and a second one turned by any angle and moved by up to 4 mm.
 
@@ -202,7 +202,7 @@ def ball_pairs(
     Returns:
         Counts: "pairs", "converged", and of these "named" (three rotations reported), "named in part", "not named".
     """
-    pipe = DepthPipeline.from_calibration(calibrate(background, sensor), "precise")
+    pipe = DepthPipeline.from_calibration(calibrate(background, sensor), "precise").freeze()
     with torch.inference_mode():
         frames = [pipe(press.image[None]) for press in presses]
     pairs = [

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..accelerated import Compensate
 from ..calibration import RESPONSE_BLUR_PX, CalibrationWarning, Press, by_presses, calibrate
 from ..calibration.response_fit import Candidates
+from ..compensate import Compensate
 from ..core.checks import check_image
 from ..model import Calibration, Sensor
 from ..training import MlpFit, fit_mlp

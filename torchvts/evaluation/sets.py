@@ -17,10 +17,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..accelerated import Compensate, GradientFromNormal
 from ..calibration import RESPONSE_BLUR_PX, Press, fit_prior, read_presses
+from ..compensate import Compensate
 from ..core.checks import check_image, check_integer
 from ..core.files import read_image, rgb_from_bgr
+from ..core.geometry import GradientFromNormal
 from ..integration import poisson_dct
 from ..model import Calibration, Sensor
 from ..normals import NormalFromMLP

@@ -15,7 +15,7 @@ from torch import Tensor
 from ..core.geometry import gradient_of_depth, normal_from_gradient
 from ..integration import poisson_dst
 from ..model import PointLights
-from ..pipeline import DepthOutput, DepthPipeline
+from ..pipeline import DepthOutput, FrozenPipeline
 from ..pose import PoseTracker, Registration, register_depth
 from ..pose.result import invert, turn_deg
 from ..scenes import objects, render
@@ -187,7 +187,7 @@ class TrackRow:
     ratio_mm: list[float] = field(default_factory=list)
 
 
-def record(target: objects.Target, motion: Motion, image_std: float, seed: int, unit: tuple[PointLights, DepthPipeline]) -> Track:
+def record(target: objects.Target, motion: Motion, image_std: float, seed: int, unit: tuple[PointLights, FrozenPipeline]) -> Track:
     """Render and measure an object that moves; 320 x 240, 8 bits.
 
     Args:

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..accelerated import library
 from ..calibration import Press, calibrate, read_presses
+from ..compiled import library
 from ..model import Calibration, Sensor, gs_sdk
 from ..normals import NormalFromMLP
 from ..pipeline import DepthPipeline
@@ -125,7 +125,7 @@ def frames(unit: Unit, calls: int, threads: str = OWN) -> Iterator[Paced]:
     size = Size(unit.image.shape[2], unit.image.shape[3])
     record = partial(summary, unit.name)
     for mode in MODES:
-        call = partial(DepthPipeline.from_calibration(unit.calibration, mode), unit.image)
+        call = partial(DepthPipeline.from_calibration(unit.calibration, mode).freeze(), unit.image)
         yield record(mode, size, PACES[0], threads, paced(call, lambda: None, calls))
         yield record(mode, size, PACES[1], threads, paced(call, partial(time.sleep, 0.02), calls))
         if unit.peer is not None:
@@ -150,7 +150,7 @@ def _ms(call: Callable[[], object]) -> float:
 
 def batches(unit: Unit, calls: int) -> Iterator[Paced]:
     """Mode fast by batch, in a tight loop, in the threads that the library chooses."""
-    pipe = DepthPipeline.from_calibration(unit.calibration)
+    pipe = DepthPipeline.from_calibration(unit.calibration).freeze()
     for count in BATCHES:
         images = unit.image.repeat(count, 1, 1, 1)
         size = Size(unit.image.shape[2], unit.image.shape[3], count)
@@ -169,10 +169,10 @@ def costs(unit: Unit, presses: Sequence[Press], background: Tensor | None) -> It
         yield Cost(f"calibrate by {len(presses)} presses, without prior", _ms(fit) / 1000.0, "s")
 
     def first_frame() -> None:
-        DepthPipeline.from_calibration(unit.calibration)(unit.image)
+        DepthPipeline.from_calibration(unit.calibration).freeze()(unit.image)
 
     yield Cost("first frame: the pipeline made, and its first depth", _ms(first_frame) / 1000.0, "s")
-    pipe = DepthPipeline.from_calibration(unit.calibration)
+    pipe = DepthPipeline.from_calibration(unit.calibration).freeze()
     yield Cost("largest memory of a frame's tensors", memory_mb(partial(pipe, unit.image)), "MB")
     background = unit.calibration.background.float().clamp(0.0, 1.0)
     pictures = [gs_sdk.image_to_bgr(image) for image in (background, unit.image[0])]
@@ -223,7 +223,7 @@ def run(data: Path | None, progress: Callable[[str], None], calls: int = 100, lo
     if long:
         progress("10,000 frames, every 20 ms")
         for mode in MODES:
-            call = partial(DepthPipeline.from_calibration(unit.calibration, mode), unit.image)
+            call = partial(DepthPipeline.from_calibration(unit.calibration, mode).freeze(), unit.image)
             times = paced(call, partial(time.sleep, 0.02), 10_000)
             rows.append(summary(unit.name, mode, Size(*SIZES[1]), PACES[1], OWN, times))
     progress("calibration, first frame, delay behind a camera")

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from ..core.checks import check_image, check_sequence, check_switch
+from ..core.threads import OneThread
 from ..model.calibration import Calibration
 from ..model.report import CandidateRow, Report
 from ..model.response_field import ResponseModel, SensorPrior, fit_log_background
@@ -110,7 +111,8 @@ def calibrate(
     check_coloured_contacts(background, given.presses or given.touches)
     if not (kept or touched or sensor.prior or sensor.light_position_mm) and objection_to_lights(background, sensor):
         check_coloured_background(background)
-    calibration, messages = _choose(given)
+    with OneThread(background[0].numel()):
+        calibration, messages = _choose(given)
     for k, reason in left_out:
         calibration.report["presses"].insert(k, {"name": named[k].name, "used": False, "reason": reason})
     for message in [f"{named[k].name}: left out: {reason}" for k, reason in left_out] + messages:

@@ -11,7 +11,7 @@ from ..compensate import Compensate
 from ..compiled import IN_PYTORCH, NotCompiled, Plan, check_block, ends, library
 from ..compiled import blocks as compiled
 from ..compiled.plan import Values
-from ..core.checks import check_batch, check_range, check_same_size
+from ..core.checks import check_batch, check_range, check_record, check_same_size
 from ..core.frame import DepthOutput
 from ..normals import NormalFromIntensity
 from .depth import DepthPipeline
@@ -41,7 +41,7 @@ class FrozenPipeline:
         mode: of the pipeline.
         mm_per_pixel: of the pipeline.
     Raises:
-        ValueError: parameters that record gradients.
+        ValueError: parameters that record gradients. TypeError: no pipeline.
     """
 
     __slots__ = ("_linear", "_pipe", "_plan", "_size", "compiled", "mm_per_pixel", "mode", "not_compiled")
@@ -56,6 +56,7 @@ class FrozenPipeline:
     _size: tuple[int, int]
 
     def __init__(self, pipe: DepthPipeline) -> None:
+        check_record("pipe", pipe, DepthPipeline, "DepthPipeline.from_calibration makes one")
         for name, weight in pipe.named_parameters():
             if weight.requires_grad:
                 raise ValueError(

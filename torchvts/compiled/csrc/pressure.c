@@ -54,7 +54,7 @@ static float frame_pressure(const Plan *plan, const float *depth, const float *p
     return n ? sorted(some, some + n, n)[(int64_t)((float)share * (float)(n - 1))] : 0.0f;
 }
 
-/* Sums of 2 `reach` + 1 lines that lie `step` floats apart. */
+/* Sums of 2 `reach` + 1 lines each `step` floats behind the last. */
 static WIDE void sum_lines(const float *first, size_t step, int reach, int n, float *restrict sums) {
     memcpy(sums, first, sizeof(float) * (size_t)n);
     int k = 1;

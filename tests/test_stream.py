@@ -119,7 +119,7 @@ def test_first_frames_show_how_noisy_undeformed_skin_is(unit):
     spreads = []
     for noise in (0.001, 0.02):
         pipe = streams.Recording(calibration, first=images([camera(noise=noise) for _ in range(12)])).pipe
-        spreads.append(pipe.mask.least_spread)
+        spreads.append(pipe._pipe.mask.least_spread)
         assert not pipe(images([camera(noise=noise)])).deformed.any()
     assert spreads[0] < 0.005 and 0.02 < spreads[1] < 0.3
 
@@ -816,8 +816,8 @@ def test_a_camera_in_real_time(unit, slow, monkeypatch):
     """Depth of every frame in order, or of the newest where depth takes longer than a frame: none is lost without being counted."""
     calibration, camera = unit
     if slow:
-        solved = vts.DepthPipeline.solved
-        monkeypatch.setattr(vts.DepthPipeline, "solved", lambda self, *frame: (time.sleep(0.05), solved(self, *frame))[1])
+        both = vts.FrozenPipeline.both
+        monkeypatch.setattr(vts.FrozenPipeline, "both", lambda self, images: (time.sleep(0.05), both(self, images))[1])
     found = measure_latency(calibration, [camera(), camera(0.5), camera(1.0)], fps=60.0, frames=40)
     assert found.numbers == sorted(set(found.numbers)) and found.numbers[-1] < found.arrived == 40
     assert len(found.numbers) + found.dropped == found.arrived and min(found.delay_ms) > 0.0

@@ -246,7 +246,7 @@ def reads_freely(tensor: Tensor) -> bool:
 
 def has_memory(tensor: Tensor) -> bool:
     """Whether a tensor has memory of its own, which one of a transform of torch.func, or without values, has not."""
-    if type(tensor) is not Tensor:
+    if type(tensor) not in (Tensor, torch.nn.Parameter):
         return False
     try:
         tensor.data_ptr()

@@ -259,7 +259,7 @@ def _plan(
 
 def _plan_fits(plan: list[Tensor], like: Tensor, height: int, width: int) -> bool:
     table = plan[2]  # real: inverse eigenvalues
-    same_kind = table.dtype == like.dtype and table.device == like.device and _plain(table)
+    same_kind = table.dtype == like.dtype and table.device == like.device and _plain(table) and _plain(like)
     if len(plan) == 12:
         return same_kind and plan[0].shape[0] + plan[6].shape[0] == height - 2 and plan[1].shape[0] + plan[4].shape[0] == width - 2
     return same_kind and plan[-2].shape[0] == height and plan[-1].shape[0] == width

@@ -415,6 +415,22 @@ def test_images_may_lie_anywhere_in_memory(unit):
         assert torch.equal(frozen(images).depth_mm, expected.depth_mm)
 
 
+@pytest.mark.parametrize("kind", UNITS)
+def test_defaults_of_torch_change_nothing(kind):
+    calibration, images = UNITS[kind]((96, 128), 0.25)
+    pipe = vts.DepthPipeline.from_calibration(calibration, "auto")
+    expected = pipe.freeze()(images)
+    try:
+        torch.set_default_dtype(torch.float64)
+        assert all(map(torch.equal, pipe.freeze()(images), expected))
+    finally:
+        torch.set_default_dtype(torch.float32)
+    with torch.device("meta"):
+        assert all(map(torch.equal, pipe.freeze()(images), expected))
+    with torch.inference_mode():
+        assert all(map(torch.equal, pipe.freeze()(images), expected))
+
+
 def test_outputs_are_new_tensors(unit):
     calibration, images = unit
     frozen = vts.DepthPipeline.from_calibration(calibration).freeze()

@@ -1,4 +1,4 @@
-"""A frame in C, and the sums of tracking: a library behind ctypes. ``pipeline/frozen.py`` and ``pose/`` use it, nobody else."""
+"""A frame in C, and the sums of tracking: a library behind ctypes. ``pipeline/frozen.py`` and ``pose/`` use it; the bench asks whether it is there."""
 
 from .binding import library
 from .blocks import NotCompiled, check_block

@@ -92,14 +92,14 @@ def compensate_values(block: nn.Module, size: tuple[int, int]) -> Values:
     values: Values = {
         "gain": _map("compensate.gain.gain", gain.gain, size),
         "offset": offset if pedestal is None else None,
-        "pedestal": torch.zeros(3) if pedestal is None else pedestal,
+        "pedestal": torch.zeros(3, dtype=torch.float32) if pedestal is None else pedestal,
         "saturated_model": _map("compensate.gain.saturated_model", saturated, size),
         "saturation_light": gain.saturation_light,
         "restores": block.restores and saturated is not None,
         "defect": none,
         "neighbours": none,
         "defects": 0,
-        "blur": torch.zeros(0),
+        "blur": torch.zeros(0, dtype=torch.float32),
         "blur_taps": 0,
     }
     kinds = [type(step) for step in block.clean]
@@ -124,7 +124,7 @@ def _pedestals(gain: Tensor | None, offset: Tensor | None) -> Tensor | None:
 
 def _drift_values(block: nn.Module, size: tuple[int, int]) -> Values:
     check_block("compensate.drift", block, Drift, nn.Identity)
-    kind, samples = "none", torch.ones(3, 1, 1)
+    kind, samples = "none", torch.ones(3, 1, 1, dtype=torch.float32)
     variance, source = samples, block if isinstance(block, Drift) else Drift
     if isinstance(block, Drift):
         kind = "mode"

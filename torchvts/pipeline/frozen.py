@@ -63,7 +63,7 @@ class FrozenPipeline:
                     f"pipe: expected parameters that record no gradient, got {name}, which does: pipe.requires_grad_(False) ends "
                     "training; to train, call the pipeline itself"
                 )
-        with torch.inference_mode(False):
+        with torch.inference_mode(False), torch.device("cpu"):  # whatever the defaults are
             own = copy.deepcopy(pipe)
             plan, reason, size = None, "", (0, 0)
             try:

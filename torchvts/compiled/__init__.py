@@ -1,4 +1,4 @@
-"""A frame in C, and the sums of tracking: a library behind ctypes. ``pipeline/frozen.py`` and ``pose/`` use it; the bench asks whether it is there."""
+"""A frame in C, and the sums of tracking: a library behind ctypes, which ``pipeline/frozen.py`` and ``pose/`` use."""
 
 from .binding import library
 from .blocks import NotCompiled, check_block

@@ -64,6 +64,7 @@ from torchvts.pipeline import Confidence
 
 SLOPES = torch.zeros(1, 2, HEIGHT, WIDTH)
 OTHER_DEPTHS = [DEPTH[0], DEPTH[..., 1:], DEPTH.expand(2, -1, -1, -1)]
+IMAGES = [*batches(3), 255 * image()[None], image()[None] + NAN, image()[None] - 1.0]
 SHARES = [*(value for value in NUMBER if value is not None), 1.5]
 
 
@@ -188,9 +189,12 @@ TABLE = {
     ),
     "DepthPipeline.forward": Entry(
         {"images": image()[None]},
-        {"images": [*batches(3), 255 * image()[None], image()[None] + NAN, image()[None] - 1.0]},
+        {"images": IMAGES},
         lambda: pipe(),
     ),
+    "FrozenPipeline": Entry({"pipe": pipe()}, {"pipe": [None, "pipe.pt", torch.nn.Identity()]}),
+    "FrozenPipeline.moved": Entry({"images": image()[None]}, {"images": IMAGES}, lambda: pipe().freeze()),
+    "FrozenPipeline.both": Entry({"images": image()[None]}, {"images": IMAGES}, lambda: pipe().freeze()),
     "FillMarkers": Entry(
         {"diameter_px": 9.0, "contrast": 0.06, "sigmas": 5.0, "margin": 0.2},
         {"diameter_px": ["9", None, NAN, -1], "contrast": NUMBER, "sigmas": NUMBER, "margin": NUMBER},

@@ -196,7 +196,7 @@ TABLE = {
             file=("path",),
             run=False,
         )
-        for name in ("export_torchscript", "export_program", "export_aoti", "export_onnx")
+        for name in ("export_torchscript", "export_program", "export_onnx")
     },
     "export.missing": Entry({"name": "pt2"}, {"name": ["pdf", None]}, named={"name": "format"}),
     "export.sample_frames": Entry({"calibration": unit()}, {"calibration": OTHERS}),

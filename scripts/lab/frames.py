@@ -229,7 +229,7 @@ def export_table(unit: Unit, formats: Sequence[str], calls: int) -> str:
     for mode in USED:
         pipe = DepthPipeline.from_calibration(unit.calibration, mode)
         with tempfile.TemporaryDirectory() as folder:
-            frames: list[Callable[[Tensor], object]] = [pipe, *(_written(pipe, name, Path(folder)) for name in formats)]
+            frames: list[Callable[[Tensor], object]] = [pipe.freeze(), *(_written(pipe, name, Path(folder)) for name in formats)]
             every = in_turn([partial(frame, unit.image) for frame in frames], calls)
         own, *others = map(statistics.median, every)
         lines.append([mode, f"{own:.2f}", *(f"{other:.2f}, {other / own:.1f} times" for other in others)])

@@ -9,7 +9,7 @@ setup: $(VENV)/.done
 
 # All that is imported is compiled at once, by all cores: else each process does it, where PYTHONDONTWRITEBYTECODE is set.
 # A file that cannot be compiled is none that is imported.
-$(VENV)/.done: pyproject.toml constraints.txt hatch_build.py $(wildcard torchvts/accelerated/csrc/*.[ch])
+$(VENV)/.done: pyproject.toml constraints.txt hatch_build.py $(wildcard torchvts/compiled/csrc/*.[ch])
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt --editable ".[pose,onnx,view,test,docs]"
 	$(BIN)/python -m compileall -qq -j 0 -x 'testing/_internal|/tests/|/plotly/' $(VENV)/lib/python3*/site-packages torchvts || true

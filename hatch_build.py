@@ -1,4 +1,4 @@
-"""Builds the compiled kernels in torchvts/accelerated/csrc with the C compiler at hand; without one, PyTorch does their work."""
+"""Builds the compiled kernels in torchvts/compiled/csrc with the C compiler at hand; without one, PyTorch does their work."""
 
 import os
 import shlex
@@ -17,10 +17,10 @@ PLAIN = "-DWIDE="  # compilers that cannot build a function for several kinds of
 
 
 class CompiledKernels(BuildHookInterface):
-    """Writes torchvts/accelerated/csrc/libtorchvts.so before the files are collected."""
+    """Writes torchvts/compiled/csrc/libtorchvts.so before the files are collected."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        folder = Path(self.root) / "torchvts" / "accelerated" / "csrc"
+        folder = Path(self.root) / "torchvts" / "compiled" / "csrc"
         library = folder / "libtorchvts.so"
         compiler = shlex.split(os.environ.get("CC") or "cc")
         if shutil.which(compiler[0]) is None:
@@ -35,7 +35,7 @@ class CompiledKernels(BuildHookInterface):
     def build(self, compiler: list[str], folder: Path, library: Path) -> None:
         sources = [str(source) for source in sorted(folder.glob("*.c"))]
         texts = b"".join(source.read_bytes() for source in sorted(folder.glob("*.[ch]")))
-        define = f"-DSOURCES={zlib.crc32(texts)}u"  # torchvts/accelerated/kernels.py compares it
+        define = f"-DSOURCES={zlib.crc32(texts)}u"  # torchvts/compiled/binding.py compares it
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
             built = Path(scratch) / library.name
             for more in ([], [PLAIN]):

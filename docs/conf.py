@@ -1,7 +1,6 @@
 """Sphinx settings of the documentation: `make docs` builds it from the pages here and the docstrings of the package."""
 
 import importlib
-import inspect
 import pkgutil
 import sys
 import warnings
@@ -11,7 +10,6 @@ from docutils import nodes
 from sphinx.pycode import ModuleAnalyzer
 
 import torchvts
-from torchvts.accelerated.twin import Twin
 from torchvts.cli.main import COMMANDS, make_parser
 
 warnings.filterwarnings("ignore")  # of libraries that autodoc imports; Sphinx's own stay errors
@@ -43,7 +41,7 @@ def _short(name: str) -> str:
 
 
 def skip(app: Any, what: str, name: str, obj: Any, skipped: bool, options: Any) -> bool | None:
-    """Leave out fields of tuples, which the class describes, what makes up a compiled block, and names that torchvts exports."""
+    """Leave out fields of tuples, which the class describes, and names of a package that torchvts exports."""
     if type(obj).__name__ == "_tuplegetter" or (what == "class" and isinstance(obj, type)):
         return True
     if what == "module" and app.env.docname != "api/torchvts" and name in torchvts.__all__:
@@ -63,13 +61,6 @@ def describe_constants(app: Any) -> None:
             for (holder, constant), text in ModuleAnalyzer.for_module(module).find_attr_docs().items():
                 if not holder and constant in sys.modules[package].__all__:
                     analyzer.attr_docs.setdefault(("", constant), text)
-
-
-def describe_twins(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Describe an accelerated block by the text of the plain block whose work it does, and its own text as a note."""
-    if what == "class" and issubclass(obj, Twin) and obj is not Twin:
-        own = [f"    {line}" for line in lines]
-        lines[:] = [*(inspect.getdoc(obj.plain) or "").splitlines(), "", "Note:", *own]
 
 
 def name_the_others(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
@@ -111,6 +102,5 @@ def setup(app: Any) -> None:
     app.connect("autodoc-skip-member", skip)
     app.connect("source-read", add_help)
     app.connect("builder-inited", describe_constants)
-    app.connect("autodoc-process-docstring", describe_twins, priority=300)  # before napoleon reads the sections
     app.connect("autodoc-process-docstring", name_the_others)
     app.connect("missing-reference", resolve)

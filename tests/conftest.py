@@ -16,11 +16,24 @@ import pytest
 import torch
 
 import torchvts as vts
+from torchvts import compiled
 from torchvts.cli import COMMANDS, main
 
 ROOT = Path(__file__).resolve().parents[1]
 
 torch.set_num_threads(1)  # small tensors: a second thread gains nothing, and waits for a core where another process runs
+
+
+@contextlib.contextmanager
+def without_library():
+    """Within it, there is no compiled library, as where no C compiler was at hand."""
+    users = [
+        m for name, m in sys.modules.items() if name.startswith("torchvts.") and getattr(m, "library", None) is compiled.library
+    ]
+    with contextlib.ExitStack() as stack:
+        for user in users:
+            stack.enter_context(mock.patch.object(user, "library", lambda: None))
+        yield
 
 
 def ring_lights(radius_mm=31.0, height_mm=40.0, rotation_deg=10.0, level=0.45, gloss=None, dtype=torch.float32):

@@ -16,6 +16,7 @@ from torchvts.pipeline import Confidence
 
 SLOPES = torch.zeros(1, 2, HEIGHT, WIDTH)
 OTHER_DEPTHS = [DEPTH[0], DEPTH[..., 1:], DEPTH.expand(2, -1, -1, -1)]
+IMAGES = [*batches(3), 255 * image()[None], image()[None] + NAN, image()[None] - 1.0]
 SHARES = [*(value for value in NUMBER if value is not None), 1.5]
 
 
@@ -67,8 +68,10 @@ TABLE = {
     "DepthPipeline.from_gs_sdk": Entry({"weights": ..., "background": image(), "sensor": sensor(), "mode": "fast"}, {
         "weights": [Path("no/such/nnmodel.pth"), "."], "background": images(), "sensor": ["no_such_sensor", "no/such.yaml"],
         "mode": []}, file=("weights", "sensor"), run=False),
-    "DepthPipeline.forward": Entry({"images": image()[None]},
-        {"images": [*batches(3), 255 * image()[None], image()[None] + NAN, image()[None] - 1.0]}, lambda: pipe()),
+    "DepthPipeline.forward": Entry({"images": image()[None]}, {"images": IMAGES}, lambda: pipe()),
+    "FrozenPipeline": Entry({"pipe": pipe()}, {"pipe": [None, "pipe.pt", torch.nn.Identity()]}),
+    "FrozenPipeline.moved": Entry({"images": image()[None]}, {"images": IMAGES}, lambda: pipe().freeze()),
+    "FrozenPipeline.both": Entry({"images": image()[None]}, {"images": IMAGES}, lambda: pipe().freeze()),
     "FillMarkers": Entry({"diameter_px": 9.0, "contrast": 0.06, "sigmas": 5.0, "margin": 0.2},
         {"diameter_px": ["9", None, NAN, -1], "contrast": NUMBER, "sigmas": NUMBER, "margin": NUMBER}),
     "FillMarkers.from_background": Entry(
@@ -239,7 +242,8 @@ TABLE = {
         "max_epochs": INTEGER, "patience": INTEGER, "batch_size": INTEGER, "held_out": [0.0, 1.0, NAN, "some"],
         "weight_decay": [-1.0, NAN, "some"]}),
     "fit_prior": Entry({"background": image(), "sensor": sensor(), "presses": [PRESS], "source": ""},
-        {"background": images(), "presses": [PRESS, [], [image()], None, "presses"], "source": [None, 3]}, run=False),
+        {"background": images(), "presses": [PRESS, [], [image()], None, "presses"], "source": [None, 3],
+        "others": [None, 3, "unit", [image()]]}, run=False),
     "score_prior": Entry(
         {"background": image(), "sensor": vts.Sensor.load("gelsight_mini", height=HEIGHT, width=WIDTH), "presses": [PRESS]},
         {"background": images(), "presses": [PRESS, [image()], None, "presses"]}, run=False),

@@ -86,7 +86,7 @@ TABLE = {
     "export.describe": Entry({"pipe": pipe()}, {"pipe": [None, unit(), "pipeline.pt"]}),
     **{f"export.{name}": Entry({"pipe": pipe(), "path": ...},
         {"pipe": [None, unit(), "pipeline.pt"], "path": [Path("no/such.pt2"), "."]}, file=("path",), run=False)
-        for name in ("export_torchscript", "export_program", "export_aoti", "export_onnx")},
+        for name in ("export_torchscript", "export_program", "export_onnx")},
     "export.missing": Entry({"name": "pt2"}, {"name": ["pdf", None]}, named={"name": "format"}),
     "export.sample_frames": Entry({"calibration": unit()}, {}),
     "export.export_checked": Entry({"pipe": pipe(), "folder": ..., "formats": ["pt2"], "images": image()[None]}, {

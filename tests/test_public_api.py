@@ -9,7 +9,7 @@ from torchvts.pipeline import ConfidentOutput
 
 NAMES = [
     "AdaptiveIntegration", "Calibration", "CalibrationWarning", "Compensate", "ConfidentPipeline", "ContactFromDepth",
-    "ContactMask", "ContactSettings", "DepthOutput", "DepthPipeline", "GradientFromNormal", "Integrator",
+    "ContactMask", "ContactSettings", "DepthOutput", "DepthPipeline", "FrozenPipeline", "GradientFromNormal", "Integrator",
     "NormalFromIntensity", "NormalFromLookup", "NormalFromMLP", "NormalFromResponse", "NormalModel", "PointLights",
     "PoissonBackground", "PoissonDCT", "PoissonDST", "PoseTracker", "Press", "Result", "Sensor", "Touch", "calibrate",
     "depth_to_points",

@@ -11,28 +11,30 @@
 * With depth: ``depth_to_points``, ``register_depth``, ``PoseTracker``, ``ConfidentPipeline``, ``diagnose``, ``stream``.
   ``scenes`` has exact scenes for tests.
 
-Some parts come from ``torchvts.accelerated``: subclasses of the plain blocks, with the same results but for rounding.
+All parts are plain PyTorch modules. ``pipe.freeze()`` makes a ``FrozenPipeline``: the same, compiled, for cameras and recordings.
 """
 
 from . import scenes, stream
-from .accelerated import (
-    AdaptiveIntegration,
-    Compensate,
-    GradientFromNormal,
-    NormalFromIntensity,
-    PoissonBackground,
-    PoissonDCT,
-)
 from .calibration import CalibrationWarning, Press, Touch, calibrate, fit_lights, read_presses
+from .compensate import Compensate
 from .core import __version__ as __version__
 from .core.files import read_image, write_image
-from .core.geometry import depth_to_points
+from .core.geometry import GradientFromNormal, depth_to_points
 from .core.results import Result, read_result
 from .diagnose import diagnose
-from .integration import Integrator, PoissonDST, poisson_background, poisson_dct, poisson_dst
+from .integration import (
+    AdaptiveIntegration,
+    Integrator,
+    PoissonBackground,
+    PoissonDCT,
+    PoissonDST,
+    poisson_background,
+    poisson_dct,
+    poisson_dst,
+)
 from .model import Calibration, PointLights, Sensor, gs_sdk, near_field_shading, shipped_sensors
-from .normals import NormalFromLookup, NormalFromMLP, NormalFromResponse, NormalModel
-from .pipeline import ConfidentPipeline, DepthOutput, DepthPipeline
+from .normals import NormalFromIntensity, NormalFromLookup, NormalFromMLP, NormalFromResponse, NormalModel
+from .pipeline import ConfidentPipeline, DepthOutput, DepthPipeline, FrozenPipeline
 from .pose import PoseTracker, register_depth, register_points
 from .skin import ContactFromDepth, ContactMask, ContactSettings
 
@@ -47,6 +49,7 @@ __all__ = [
     "ContactSettings",
     "DepthOutput",
     "DepthPipeline",
+    "FrozenPipeline",
     "GradientFromNormal",
     "Integrator",
     "NormalFromIntensity",

@@ -37,7 +37,6 @@ CAMERA_FRAMES = 600
 
 LOADERS: dict[str, Callable[[str], Callable[[Tensor], object]]] = {
     "torchscript": torch.jit.load,
-    "aoti": lambda path: torch._inductor.aoti_load_package(path),
 }
 """How a file of each exported format is loaded."""
 
@@ -77,7 +76,7 @@ def frames(unit: Unit, calls: int) -> Iterator[Row]:
     size = Size(unit.image.shape[2], unit.image.shape[3])
     for mode in USED:
         row = Row("frame", mode, unit.name, size=size)
-        call = partial(DepthPipeline.from_calibration(unit.calibration, mode), unit.image)
+        call = partial(DepthPipeline.from_calibration(unit.calibration, mode).freeze(), unit.image)
         yield replace(row, time=time_of(in_turn([call], calls)[0]))
         yield replace(row, time=time_of(in_turn([partial(time.sleep, CAMERA_S), call], calls)[1], PACES[1]))
         if unit.peer is not None:
@@ -89,7 +88,7 @@ def frames(unit: Unit, calls: int) -> Iterator[Row]:
 
 def batches(unit: Unit, calls: int) -> Iterator[Row]:
     """Mode fast by batch, in a tight loop."""
-    pipe = DepthPipeline.from_calibration(unit.calibration)
+    pipe = DepthPipeline.from_calibration(unit.calibration).freeze()
     for count in BATCHES:
         times = in_turn([partial(pipe, unit.image.repeat(count, 1, 1, 1))], max(10, calls // count))[0]
         size = Size(unit.image.shape[2], unit.image.shape[3], count)
@@ -113,10 +112,10 @@ def costs(unit: Unit, presses: Sequence[Press], background: Tensor | None) -> It
         yield cost(f"calibrate by {len(presses)} presses, without prior", _s(fit), "s")
 
     def first_frame() -> None:
-        DepthPipeline.from_calibration(unit.calibration)(unit.image)
+        DepthPipeline.from_calibration(unit.calibration).freeze()(unit.image)
 
     yield cost("first frame: the pipeline made, and its first depth", _s(first_frame), "s")
-    pipe = DepthPipeline.from_calibration(unit.calibration)
+    pipe = DepthPipeline.from_calibration(unit.calibration).freeze()
     yield cost("largest memory of a frame's tensors", memory_mb(partial(pipe, unit.image)), "MB")
     background = unit.calibration.background.float().clamp(0.0, 1.0)
     pictures = [gs_sdk.image_to_bgr(image) for image in (background, unit.image[0])]
@@ -169,7 +168,7 @@ def as_user(progress: Progress, data: Path | None, calls: int = 100, long: bool 
     if long:
         progress("10,000 frames, every 20 ms")
         for mode in USED:
-            call = partial(DepthPipeline.from_calibration(unit.calibration, mode), unit.image)
+            call = partial(DepthPipeline.from_calibration(unit.calibration, mode).freeze(), unit.image)
             times = in_turn([partial(time.sleep, CAMERA_S), call], 10_000)[1]
             rows.append(Row("frame", mode, unit.name, size=Size(*SIZES[1]), time=time_of(times, PACES[1])))
     progress("calibration, first frame, delay behind a camera")
@@ -230,7 +229,7 @@ def export_table(unit: Unit, formats: Sequence[str], calls: int) -> str:
     for mode in USED:
         pipe = DepthPipeline.from_calibration(unit.calibration, mode)
         with tempfile.TemporaryDirectory() as folder:
-            frames: list[Callable[[Tensor], object]] = [pipe, *(_written(pipe, name, Path(folder)) for name in formats)]
+            frames: list[Callable[[Tensor], object]] = [pipe.freeze(), *(_written(pipe, name, Path(folder)) for name in formats)]
             every = in_turn([partial(frame, unit.image) for frame in frames], calls)
         own, *others = map(statistics.median, every)
         lines.append([mode, f"{own:.2f}", *(f"{other:.2f}, {other / own:.1f} times" for other in others)])

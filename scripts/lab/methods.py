@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torchvts.accelerated import AdaptiveIntegration, Compensate, NormalFromIntensity, PerspectiveIntegration, reference_only
 from torchvts.calibration import RESPONSE_BLUR_PX, with_preprocessing
-from torchvts.integration import PoissonDST
+from torchvts.compensate import Compensate
+from torchvts.integration import AdaptiveIntegration, PerspectiveIntegration, PoissonDST
 from torchvts.model import Calibration, ResponseModel, Sensor
-from torchvts.normals import NormalFromLookup, NormalFromMLP
+from torchvts.normals import NormalFromIntensity, NormalFromLookup, NormalFromMLP
 from torchvts.pipeline import DepthOutput, DepthPipeline
 from torchvts.scenes import render, sphere_press
 from torchvts.training.presses import Training, quiet_calibrate, train_network, training_pixels
@@ -107,8 +107,8 @@ class Method:
 
 def pipeline(calibration: Calibration, mode: str, normals: nn.Module | None = None, integrate: nn.Module | None = None) -> Built:
     """The pipeline of a unit, with other normals or another integrator if they are given."""
-    built = DepthPipeline.from_calibration(calibration, mode, normals=normals, integrate=integrate)
-    return Built(built, parameters(calibration, mode))
+    built = DepthPipeline.from_calibration(calibration, mode, normals=normals, integrate=integrate).requires_grad_(False)
+    return Built(built.freeze(), parameters(calibration, mode))
 
 
 def parameters(calibration: Calibration, mode: str) -> int:
@@ -130,9 +130,8 @@ def _zero(image: Tensor) -> DepthOutput:
 
 
 def _reference(calibration: Calibration) -> Built:
-    """Mode fast without compiled kernels."""
-    built = pipeline(calibration, "fast")
-    return built._replace(reconstruct=reference_only()(built.reconstruct), note="no compiled kernels")
+    """Mode fast, not frozen."""
+    return Built(DepthPipeline.from_calibration(calibration), parameters(calibration, "fast"), "not frozen")
 
 
 def _integrated(mode: str, integrator: Callable[[float], nn.Module]) -> FromCalibration:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchvts.accelerated import Compensate
+from torchvts.compensate import Compensate
 from torchvts.core.geometry import normal_from_gradient
 from torchvts.integration import divergence, poisson_dct
 from torchvts.model import gs_sdk

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchvts.calibration import Press, calibrate
 from torchvts.core.tables import markdown
 from torchvts.model import Calibration, PointLights, Sensor
-from torchvts.pipeline import DepthOutput, DepthPipeline
+from torchvts.pipeline import DepthOutput, DepthPipeline, FrozenPipeline
 from torchvts.pose import Registration, register_depth
 from torchvts.pose.result import invert, turn_deg
 from torchvts.scenes import objects, render
@@ -43,8 +43,8 @@ class PoseCase:
     mm_per_pixel: float
 
 
-def rig(height: int = 240, width: int = 320, mm_per_pixel: float = 0.0625) -> tuple[PointLights, DepthPipeline]:
-    """Three lights at 120 degrees over the sensor, and the pipeline of this unit in mode precise.
+def rig(height: int = 240, width: int = 320, mm_per_pixel: float = 0.0625) -> tuple[PointLights, FrozenPipeline]:
+    """Three lights at 120 degrees over the sensor, and the frozen pipeline of this unit in mode precise.
 
     Args:
         height: rows of the image.
@@ -53,11 +53,11 @@ def rig(height: int = 240, width: int = 320, mm_per_pixel: float = 0.0625) -> tu
     """
     lights = ring_lights(31.0, 40.0)
     calibration = Calibration.from_lights(lights, Sensor("pose bench", height, width, mm_per_pixel))
-    return lights, DepthPipeline.from_calibration(calibration, "precise")
+    return lights, DepthPipeline.from_calibration(calibration, "precise").freeze()
 
 
 def pose_case(
-    target: objects.Target, seed: int, lights: PointLights, pipe: DepthPipeline, size: tuple[int, int], noise_std: float
+    target: objects.Target, seed: int, lights: PointLights, pipe: FrozenPipeline, size: tuple[int, int], noise_std: float
 ) -> PoseCase:
     """A reference press near the middle, and a second one turned by any angle and moved by up to 4 mm.
 
@@ -181,7 +181,7 @@ def ball_pairs(
     Returns:
         Counts: "pairs", "converged", and of these "named" (three rotations reported), "named in part", "not named".
     """
-    pipe = DepthPipeline.from_calibration(calibrate(background, sensor), "precise")
+    pipe = DepthPipeline.from_calibration(calibrate(background, sensor), "precise").freeze()
     with torch.inference_mode():
         frames = [pipe(press.image[None]) for press in presses]
     pairs = [

@@ -17,10 +17,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchvts.accelerated import Compensate, GradientFromNormal
 from torchvts.calibration import RESPONSE_BLUR_PX, Press, fit_prior, read_presses
+from torchvts.compensate import Compensate
 from torchvts.core.checks import check_image, check_integer
 from torchvts.core.files import read_image, rgb_from_bgr
+from torchvts.core.geometry import GradientFromNormal
 from torchvts.integration import poisson_dct
 from torchvts.model import Calibration, Sensor
 from torchvts.normals import NormalFromMLP
@@ -205,8 +206,13 @@ def _mini_b(folder: Path, limit: int | None) -> DataSet:
 
 
 def _mini_c(folder: Path, limit: int | None) -> DataSet:
-    """Raw frames, cut by a seventh on each side as gs_sdk does; the background is the median of the presses."""
+    """Raw frames, cut by a seventh on each side as gs_sdk does; the background is the median of the presses.
+
+    The prior is that of another unit, since the shipped one has seen these presses.
+    """
     sensor = Sensor.load("gelsight_mini")
+    background, others = read_presses(folder.parent / "gelsight_mini_a")
+    sensor = dataclasses.replace(sensor, prior=fit_prior(background, sensor, others, "the presses of gelsight_mini_a"))
     files = spread(sorted(folder.glob("frame_*.jpg"), key=_number), limit)
     images = torch.stack([read_image(file) for file in files])
     height, width = images.shape[2:]

@@ -15,7 +15,7 @@ from torchvts.core.geometry import gradient_of_depth, normal_from_gradient
 from torchvts.core.tables import markdown
 from torchvts.integration import poisson_dst
 from torchvts.model import PointLights
-from torchvts.pipeline import DepthOutput, DepthPipeline
+from torchvts.pipeline import DepthOutput, FrozenPipeline
 from torchvts.pose import PoseTracker, Registration
 from torchvts.pose.result import invert, turn_deg
 from torchvts.scenes import objects, render
@@ -92,7 +92,7 @@ def track_row(name: str, motion: str, noise: str, seed: int = 1, sensor: int = 0
     return Row("track", method, f"{name}, {motion}, {noise}", errors, seed=seed, each={key: [] for key in EACH})
 
 
-def record(target: objects.Target, motion: Motion, image_std: float, seed: int, unit: tuple[PointLights, DepthPipeline]) -> Track:
+def record(target: objects.Target, motion: Motion, image_std: float, seed: int, unit: tuple[PointLights, FrozenPipeline]) -> Track:
     """Render and measure an object that moves; 320 x 240, 8 bits.
 
     Args:

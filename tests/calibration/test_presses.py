@@ -18,7 +18,7 @@ from conftest import ring_lights
 
 import torchvts as vts
 from lab import metrics
-from torchvts.calibration import fit_prior, score_prior
+from torchvts.calibration import PriorUnit, fit_prior, score_prior
 from torchvts.calibration.balls import guess_circle
 from torchvts.calibration.by_presses import with_preprocessing
 from torchvts.calibration.contacts import read_contacts
@@ -373,6 +373,17 @@ def test_too_few_presses_to_hold_out_are_scored_by_themselves(prior):
 def test_a_sensor_without_a_prior_has_none_to_score():
     with pytest.raises(ValueError, match="sensor: expected one with a prior to score, 'presses' has none"):
         score_prior(background(), dataclasses.replace(SENSOR, name="presses"), take_presses()[:3])
+
+
+def test_a_prior_of_two_units_lies_between_theirs_and_says_how_far_they_are_apart(prior):
+    unit = PriorUnit(background(seen_by_other_curve), SENSOR, other_presses(5))
+    joint = fit_prior(background(), SENSOR, take_presses(), "both", [unit])
+    assert len(joint.held_out_deg) == 2 and joint.source == "both"
+    by_joint, by_other = (
+        score_prior(unit.background, dataclasses.replace(SENSOR, prior=one), unit.presses) for one in (joint, prior)
+    )
+    assert by_joint < by_other
+    assert joint.held_out_deg[1] == pytest.approx(by_other, rel=0.3)
 
 
 def test_a_prior_serves_another_unit_where_lights_are_not_pinned(prior, prior_alone):

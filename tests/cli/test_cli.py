@@ -121,7 +121,7 @@ def test_what_to_expect_follows_the_source(rig, mini_by_prior):
     sensor, lights, background, _ = rig
     given = vts.Calibration.from_lights(lights, sensor, background)
     assert "presses of a ball would measure it" in expected(given)
-    assert expected(mini_by_prior).startswith("normals within a contact to about 3.8 degrees, the mean over units that its prior")
+    assert expected(mini_by_prior).startswith("normals within a contact to about 4.6 degrees, the mean over units that its prior")
     held_out = {"model": "response", "source": "presses", "held_out_deg": 1.5, "presses": [{"name": "a", "used": True}] * 12}
     presses = vts.Calibration.from_response(mini_by_prior.response, mini_by_prior.sensor, mini_by_prior.background, held_out)
     assert "to about 1.7 degrees: 1.5 on each of 12 presses by the others, and more where" in expected(presses)

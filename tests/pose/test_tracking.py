@@ -7,10 +7,11 @@ import math
 import numpy as np
 import pytest
 import torch
+from conftest import without_library
 
 import torchvts as vts
 from lab import pose_accuracy, tracking
-from torchvts.accelerated import library, reference_only
+from torchvts.compiled import library
 from torchvts.core.frame import DepthOutput
 from torchvts.pose import tracker as tracker_module
 from torchvts.pose.follow import _follow_best, _follow_from, _pixels, follow
@@ -115,7 +116,10 @@ def test_a_cylinder_keeps_its_axis_unknown_and_is_followed_across():
 
 @pytest.mark.parametrize(("radius", "yaw"), [(1.0, 0.0), (1.2, 40.0), (1.5, 110.0)])
 def test_a_narrow_capsule_or_rod_may_roll_however_few_pixels_its_bend_covers(radius, yaw):
-    for height, names in ((objects.capsule(radius), ["rotation"]), (objects.cylinder(radius), ["translation", "rotation"])):
+    for height, names in (
+        (objects.capsule(radius), ["rotation"]),
+        (objects.cylinder(radius), ["translation", "rotation"]),
+    ):
         poses = [objects.pose(yaw, (0.1 * k, 0.05 * k), 0.45) for k in range(8)]  # pure shifts: nothing turns
         tracker = vts.PoseTracker(press(height, poses[0]), PITCH)
         for pose in poses[1:]:
@@ -335,7 +339,7 @@ def test_sums_and_steps_of_kernels_and_reference_agree(keyframe):
             return whole, matrices, rights, score, *refine(frame.fine, pixels, pose, 4, 0.06, held)
 
         fast = results()
-        with reference_only():
+        with without_library():
             slow = results()
         for one, other in ((fast[0], slow[0]), (fast[5], slow[5])):
             assert np.allclose(one.matrix, other.matrix, rtol=1e-3, atol=1e-4 * np.abs(other.matrix).max())
@@ -399,7 +403,7 @@ def test_grids_of_kernels_and_opencv_agree(times):
     frame = objects.press(objects.gear(), pose, 121, 163, PITCH)  # sides that cells do not divide
     frame = contact_frame(_bad(frame, contact=frame.contact & (torch.rand(frame.contact.shape) < 0.95)))
     fast = grids(frame, PITCH, 0.03, times)
-    with reference_only():
+    with without_library():
         slow = grids(frame, PITCH, 0.03, times)
         points = _pixels(slow.coarse).columns
     assert fast.touching == slow.touching > 0
@@ -417,15 +421,14 @@ def test_one_value_that_is_not_finite_is_seen(part, place, value):
     frame = press(objects.key(), objects.pose(0.0))
     wrong = getattr(frame, part).clone()
     wrong.view(-1)[place] = value
-    for scope in (contextlib.nullcontext(), reference_only()):
-        with scope, pytest.raises(ValueError, match="not finite"):
-            contact_frame(_bad(frame, **{part: wrong}))
+    with pytest.raises(ValueError, match="not finite"):
+        contact_frame(_bad(frame, **{part: wrong}))
     with pytest.raises(ValueError, match=r"source: expected finite depth and gradient, at most 1e\+06"):
         vts.register_depth(_bad(frame, **{part: wrong}), frame, PITCH)
 
 
 def test_without_kernels_the_pose_is_the_same():
-    with reference_only():
+    with without_library():
         found = vts.PoseTracker(press(objects.key(), swing(0)), PITCH)(press(objects.key(), swing(1)))
     assert error(found, swing(0), swing(1))[0] < 0.1
 
@@ -474,7 +477,7 @@ def test_sums_of_heights_are_generalised_least_squares(keyframe):
     assert 0.5 * number < used.sum() < number
     np.testing.assert_allclose(matrix, by.T @ weight @ by, rtol=1e-6, atol=1e-8 * matrix.max())
     np.testing.assert_allclose(right, by.T @ weight @ mean, rtol=1e-3, atol=1e-4 * np.abs(right).max())
-    with reference_only():
+    with without_library():
         slow = height_sums(keyframe.heights, frame.fine, keyframe.some, np.eye(4))
     np.testing.assert_allclose(slow[0], matrix, rtol=1e-6, atol=1e-8 * matrix.max())
     np.testing.assert_allclose(slow[1], by.T @ weight @ mean, rtol=1e-6, atol=1e-8 * np.abs(right).max())

@@ -7,7 +7,7 @@ from .contacts import ROUGH, channel_structure
 from .lights import POORLY_CONSTRAINED_DEG, LightFit, fit_lights
 from .objections import CalibrationWarning
 from .presses import Press, Touch, read_presses
-from .prior import fit_prior, score_prior
+from .prior import PriorUnit, fit_prior, score_prior
 
 __all__ = [
     "GIVEN_MISFIT",
@@ -17,6 +17,7 @@ __all__ = [
     "CalibrationWarning",
     "LightFit",
     "Press",
+    "PriorUnit",
     "Touch",
     "by_presses",
     "calibrate",

@@ -4,11 +4,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..accelerated import NormalFromResponse
 from ..core.geometry import gradient_from_normal
 from ..core.robust import tukey_weight
 from ..model.response_field import ResponseModel
 from ..model.sensor import Sensor
+from ..normals import NormalFromResponse
 from .closure import close_loops
 from .contacts import LEAST_INSIDE, Contact, first_pass_depths, middle_px, used
 from .field import ContactForms, Family, solve_with_centers

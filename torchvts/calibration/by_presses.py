@@ -7,12 +7,13 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from ..accelerated import Compensate, NormalFromIntensity
+from ..compensate import Compensate
 from ..core.geometry import gradient_from_normal
 from ..integration import poisson_background
 from ..model.calibration import Calibration
 from ..model.response_field import ResponseModel
 from ..model.sensor import Sensor
+from ..normals import NormalFromIntensity
 from .balls import center_by_slope
 from .contacts import Contact, middle_px, read_contacts, unit_without_model
 from .field import Family, angle_deg

@@ -3,12 +3,11 @@
 import dataclasses
 import warnings
 from collections.abc import Sequence
-from contextlib import nullcontext
 
 from torch import Tensor
 
-from ..accelerated.threads import OneThread, one_suffices
 from ..core.checks import check_image, check_switch
+from ..core.threads import OneThread
 from ..model.calibration import Calibration
 from ..model.report import CandidateRow
 from ..model.sensor import Sensor, check_sensor
@@ -79,7 +78,7 @@ def calibrate(
     named, touched = check_presses(presses, sensor), check_touches(touches, sensor)
     kept, left_out = sort_presses(background, named)
     check_light(background, kept or touched)
-    with OneThread() if one_suffices(background[None]) else nullcontext():  # threads would wake up late for each small step
+    with OneThread(background[0].numel()):
         calibration, found = choose(Given(background, sensor, kept, touched, progress, force))
     for k, reason in left_out:
         calibration.report["presses"].insert(k, {"name": named[k].name, "used": False, "reason": reason})

@@ -7,14 +7,16 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ..accelerated import Compensate, NormalFromResponse, PoissonBackground, SmoothDrift
+from ..compensate import Compensate, SmoothDrift
 from ..core.blur import blur, gaussian_weights
 from ..core.geometry import gradient_from_normal, pixel_grid_mm
 from ..core.morphology import dilate, erode
+from ..integration import PoissonBackground
 from ..model.calibration import PEDESTAL, Calibration
 from ..model.report import PressRow, TouchRow
 from ..model.response_field import ResponseField, ResponseModel
 from ..model.sensor import Sensor
+from ..normals import NormalFromResponse
 from .presses import Press, Touch
 from .regions import FarField, contact_region, far_field
 

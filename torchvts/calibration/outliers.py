@@ -14,13 +14,15 @@ from .field import Evidence, Family, ball_sine
 SCREENING_PENALTY = 0.01
 """Regularisation of the small fields by which presses without a prior are compared with each other."""
 
-FAR_FROM_PRIOR = 1.4
-FAR_FROM_OTHERS = 1.35
-"""By a prior a diameter is wrong where the ball seems so many times as wide as given; and so many times relative to all others.
-Correct ones on a GelSight Mini: by the prior of another ball 0.76 to 1.10, relative to their median 0.82 to 1.17."""
+FAR_FROM_PRIOR = 1.45
+"""By a prior a diameter is wrong where the ball seems so many times as wide as given, and so many times relative to all others.
+Correct ones: 0.76 to 1.10 on a GelSight Mini by the prior of another ball, and up to 1.4 times their median on two DIGITs."""
 
 NOISE = 0.1
 """Standard deviation of the gain of a press by the field of others that cover its place."""
+
+LEAST_KNOWN = 0.5
+"""Part of a press's gain that the others must know to contradict it."""
 
 FAR_IN_SPREADS = 3.0
 """So many of its standard deviations from the others' a gain is wrong."""
@@ -67,7 +69,7 @@ def _leave_out(contacts: list[Contact], prior: ResponseModel | None, half_mm: fl
             std = _uncertainty(evidence)
             for contact, one in zip(left, std.tolist()):
                 contact.metrics["gain_std"] = one
-            wrong = _wrong_by_others(evidence, gains, std)
+            wrong = _wrong_by_others(evidence, gains, std.masked_fill(_known(evidence) < LEAST_KNOWN, math.inf))
         if wrong is not None:
             _reject_diameter(left, wrong, float(gains[wrong]), prior is not None)
         elif not _reject_slopes(left, errors, prior is not None):
@@ -104,11 +106,24 @@ def _wrong_by_prior(gains: Tensor) -> int | None:
     """The press with a wrong diameter, if any; gains are slopes by the prior divided by slopes expected."""
     logs = gains.clamp_min(1e-3).log()
     relative = logs - logs.median() if len(logs) > 2 else logs
-    for far, limit in ((logs, FAR_FROM_PRIOR), (relative, FAR_FROM_OTHERS)):
+    for far in (logs, relative):
         worst = int(far.abs().argmax())
-        if float(far[worst].abs()) > math.log(limit):
+        if float(far[worst].abs()) > math.log(FAR_FROM_PRIOR):
             return worst
     return None
+
+
+def _known(evidence: Evidence) -> Tensor:
+    """(N,): part of the gain of each press that a field of the others can know: regularisation takes what no other press covers.
+
+    It is that of a field by exact presses of the others, if the field of the press by itself is the true one, up to a factor.
+    """
+    penalty = torch.diag(SCREENING_PENALTY * evidence.family.penalty())
+    parts = []
+    for item, (form, right) in zip(evidence.forms, evidence.each):
+        own, others = torch.linalg.solve(form + penalty, right), evidence.form - form
+        parts.append(item.gain(torch.linalg.solve(others + penalty, others @ own)) / max(item.gain(own), 1e-3))
+    return torch.tensor(parts, dtype=torch.float64)
 
 
 def _uncertainty(evidence: Evidence) -> Tensor:

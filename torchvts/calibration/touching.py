@@ -7,9 +7,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..accelerated import Compensate, GradientFromNormal, NormalFromIntensity, NormalFromResponse, PoissonDCT, SmoothDrift
-from ..core.geometry import pixel_grid_mm
+from ..compensate import Compensate, SmoothDrift
+from ..core.geometry import GradientFromNormal, pixel_grid_mm
+from ..integration import PoissonDCT
 from ..model.calibration import Calibration
+from ..normals import NormalFromIntensity, NormalFromResponse
 from ..skin import SHARE, ContactFromDepth, ContactMask, ZeroBackground, moved
 from .contacts import Contact
 from .presses import Press

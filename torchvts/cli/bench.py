@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from ..accelerated import library
+from ..compiled import library
 from ..core.checks import check_integer
 from ..core.tables import markdown
 from ..model import Calibration, PointLights, Sensor
@@ -120,13 +120,13 @@ def measure(calls: int) -> Iterator[list[str]]:
     for height, width in SIZES:
         unit = rig(height, width)
         for mode in MODES:
-            frame = partial(DepthPipeline.from_calibration(unit.calibration, mode), unit.image)
+            frame = partial(DepthPipeline.from_calibration(unit.calibration, mode).freeze(), unit.image)
             rounds = max(1, calls // (4 if height > 480 else 1))
             tight = in_turn([frame], rounds)[0]
             behind = in_turn([partial(time.sleep, CAMERA_S), frame], rounds)[1]
             yield [f"{width}x{height}", mode, _cell(tight), f"{1000.0 / statistics.median(tight):.0f}", _cell(behind)]
         if (height, width) == BATCHED:
-            batch = partial(DepthPipeline.from_calibration(unit.calibration), unit.image.repeat(BATCH, 1, 1, 1))
+            batch = partial(DepthPipeline.from_calibration(unit.calibration).freeze(), unit.image.repeat(BATCH, 1, 1, 1))
             times = [value / BATCH for value in in_turn([batch], max(1, calls // BATCH))[0]]
             yield [f"{width}x{height}, batch {BATCH}", "fast", _cell(times), f"{1000.0 / statistics.median(times):.0f}", ""]
 

@@ -73,7 +73,7 @@ def of_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         raise ValueError("--calibration: expected what torchvts calibrate wrote, for images must become depth first")
     calibration = load_calibration(arguments.calibration)
     by_lights = calibration.response is None and arguments.network is None
-    pipe = unit_pipeline(calibration, arguments.mode if by_lights else "auto", arguments.network)
+    pipe = unit_pipeline(calibration, arguments.mode if by_lights else "auto", arguments.network).requires_grad_(False).freeze()
     pitch, check = calibration.sensor.mm_per_pixel, FrameCheck.from_calibration(calibration)
 
     def depth_of(image: torch.Tensor) -> DepthOutput:
@@ -81,9 +81,7 @@ def of_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         reason = check(image) if check is not None else ""
         if reason:
             raise ValueError(f"frame: expected one that can be used: {reason}")
-        with torch.inference_mode():
-            output: DepthOutput = pipe(image)
-        return output
+        return pipe(image)
 
     try:
         target = depth_of(read_image(arguments.target))

@@ -81,9 +81,9 @@ class Compensate(nn.Module):
         by_response = calibration.response is not None
         block: Drift | None = None
         if drift:
-            block = cls.drift_block(calibration.flat, calibration.compensated_noise_std, by_response, sensor.blur_px > 0.0)
+            block = Drift(calibration.flat, calibration.compensated_noise_std, by_response, sensor.blur_px > 0.0)
         elif by_response:
-            block = cls.drift_block()
+            block = Drift()
         compensate = cls(
             calibration.gain,
             calibration.offset,
@@ -98,8 +98,6 @@ class Compensate(nn.Module):
         compensate.output_domain = "ratio" if by_response else "light"
         return compensate
 
-    drift_block = Drift
-
     if TYPE_CHECKING:
 
         def __call__(self, image: Tensor) -> Tensor: ...
@@ -111,21 +109,11 @@ class Compensate(nn.Module):
         for block in self.linear:  # only the blocks that the unit needs
             light = block(light)
         saturated = self.gain.saturated(light) if self.saturates else None
-        light = self.cleaned(light, saturated)
-        normalised: Tensor = self.drift(light)
-        if not torch.jit.is_scripting():  # noqa: SIM102
-            if normalised is light:
-                return light
-        if self.restores and saturated is not None:
-            return self.gain.restored(normalised, saturated)
-        return normalised
-
-    def cleaned(self, light: Tensor, saturated: Tensor | None) -> Tensor:
-        """Gain, offset, defects and blur of linear light; compiled kernels replace this method."""
         light = self.gain(light, saturated)
         for block in self.clean:
             light = block(light)
-        return light
+        light = self.drift(light)
+        return self.gain.restored(light, saturated) if self.restores and saturated is not None else light
 
 
 class Linearise(nn.Module):

@@ -21,6 +21,18 @@ MORE_SKIN = 1.2
 MOST_BY_MODE = 0.149
 """A mode that says more is held at its limit: the other estimator takes over."""
 
+TAKEN_OVER = 0.15
+"""It does so where it says more than this."""
+
+LEAST_LEVEL, MOST_LEVEL = 0.01, 0.35
+"""Drift, relative, that counts in the statistics of all channels, and the largest that is believed."""
+
+LEAST_SKIN = 0.05
+"""Share of pixels of undeformed skin that these need."""
+
+SHARE_OF_MOST, SHARE_OF_FEW = 0.7, 0.4
+"""A drift is believed if so many times as few pixels are undeformed without it: where they are more than half of all, and else."""
+
 
 class Drift(nn.Module):
     """Divide each channel of compensated images (B, 3, H, W) by its brightness relative to calibration.
@@ -45,6 +57,12 @@ class Drift(nn.Module):
     most_by_mode: Final[float] = MOST_BY_MODE
     same_skin: Final[float] = SAME_SKIN
     more_skin: Final[int] = round(100 * MORE_SKIN)
+    taken_over: Final[float] = TAKEN_OVER
+    least_level: Final[float] = LEAST_LEVEL
+    most_level: Final[float] = MOST_LEVEL
+    least_skin: Final[float] = LEAST_SKIN
+    share_of_most: Final[float] = SHARE_OF_MOST
+    share_of_few: Final[float] = SHARE_OF_FEW
 
     def __init__(
         self,
@@ -68,20 +86,17 @@ class Drift(nn.Module):
     def forward(self, light: Tensor) -> Tensor:
         background, noise = self.background, self.noise
         if background is None or noise is None:
-            return self.divided(light, self.by_mode(light))
+            return light / self.by_mode(light)
         if self.by_mode_first:
             near = self.by_mode(light)
-            if may_read(near) and bool(((near - 1.0).abs() < self.most_by_mode).all()):
-                return self.divided(light, near)
+            held = ((near - 1.0).abs() >= self.most_by_mode).any(dim=1, keepdim=True)
+            if may_read(near) and not bool(held.any()):
+                return light / near
             far = self.by_statistics(light, background, noise)
-            return self.divided(light, torch.where((far - 1.0).abs() > 0.15, far, near))
+            return light / torch.where(held & ((far - 1.0).abs() > self.taken_over), far, near)
         level = self.by_statistics(light, background, noise)
         if may_read(level) and bool((level == 1.0).all()):
             return light
-        return self.divided(light, level)
-
-    def divided(self, light: Tensor, level: Tensor) -> Tensor:
-        """Light (B, 3, H, W) over levels (B, 3, 1, 1)."""
         return light / level
 
     def by_mode(self, ratio: Tensor, least: float = LEAST_DRIFT, most: float = MOST_DRIFT) -> Tensor:
@@ -93,7 +108,7 @@ class Drift(nn.Module):
         different halves: levels that most samples have in all three channels at once replace them (:meth:`of_one_skin`).
         """
         some = _grid(ratio.detach()).flatten(2)
-        drift = (half_sample_mode(self.ordered(some)) - 1.0).clamp(-most, most)  # (B, 3)
+        drift = (half_sample_mode(some.sort(dim=-1).values) - 1.0).clamp(-most, most)  # (B, 3)
         drift = self.of_one_skin(some - 1.0, drift, least)
         weight = (drift.abs().amax(dim=1, keepdim=True) / least - 1.0).clamp(0.0, 1.0)
         return (1.0 + weight * drift)[..., None, None]
@@ -126,9 +141,7 @@ class Drift(nn.Module):
         inside = ((some - level[:, :, None]).abs() < reach).all(dim=1)
         return inside.sum(dim=1, keepdim=True)
 
-    def by_statistics(
-        self, light: Tensor, background: Tensor, noise_std: Tensor, least: float = 0.01, most: float = 0.35
-    ) -> Tensor:
+    def by_statistics(self, light: Tensor, background: Tensor, noise_std: Tensor) -> Tensor:
         """Brightness of each channel (B, 3, 1, 1), 1 where the undeformed skin cannot be distinguished from contact.
 
         At the modes of the three channels, pixels that are undeformed in all three at once are counted, each by exp(-chi^2 / 2),
@@ -141,15 +154,16 @@ class Drift(nn.Module):
             light: (B, 3, H, W), compensated frames.
             background: (3, h, w), samples of the compensated background.
             noise_std: (3, h, w), their noise.
-            least: drift that counts, and least noise, relative.
-            most: largest drift that is believed.
         """
+        least = self.least_level
         background = background.clamp_min(1e-6)
         ratio = self.samples(light.detach()) / background
         variance = (noise_std / background) ** 2 + least**2
-        if may_read(ratio) and bool(((self.median(ratio.flatten(2)) - 1.0).abs() < 0.5 * least).all()):
-            return torch.ones_like(ratio[:, :, :1, :1])  # an LED that drifts takes the middle of all pixels along
-        level = half_sample_mode(self.ordered(ratio.flatten(2)))[..., None, None]
+        # an LED that drifts takes the middle of all pixels along
+        still = ((ratio.flatten(2).median(dim=-1).values - 1.0).abs() < 0.5 * least).all(dim=1)[:, None, None, None]
+        if may_read(ratio) and bool(still.all()):
+            return torch.ones_like(ratio[:, :, :1, :1])
+        level = half_sample_mode(ratio.flatten(2).sort(dim=-1).values)[..., None, None]
         for _ in range(2):
             chi = ((ratio - level) ** 2 / variance).sum(dim=1, keepdim=True)
             weight = torch.exp(-0.5 * chi) / variance
@@ -160,21 +174,13 @@ class Drift(nn.Module):
         undeformed = torch.exp(-0.5 * chi).mean(dim=(2, 3), keepdim=True) * 2.0**1.5
         without = torch.exp(-0.5 * (chi - off + (ratio - 1.0) ** 2 / variance)).mean(dim=(2, 3), keepdim=True) * 2.0**1.5
         drift = (level - 1.0).abs()
-        share = torch.where(undeformed > 0.5, 0.7, 0.4)
-        sure = (drift > least) & (drift < most) & (undeformed > 0.05) & (without < share * undeformed)
-        return torch.where(sure, level, torch.ones_like(level))
+        share = torch.where(undeformed > 0.5, self.share_of_most, self.share_of_few)
+        sure = (drift > least) & (drift < self.most_level) & (undeformed > self.least_skin) & (without < share * undeformed)
+        return torch.where(sure & ~still, level, torch.ones_like(level))
 
     def samples(self, image: Tensor) -> Tensor:
         """Some thousand pixels of an image on a grid, each the mean of 3 x 3 pixels where these do not overlap."""
         return grid_samples(image, grid_stride(image))
-
-    def ordered(self, values: Tensor) -> Tensor:
-        """Values (B, 3, N) sorted along the last dimension."""
-        return values.sort(dim=-1).values
-
-    def median(self, values: Tensor) -> Tensor:
-        """Median of values (B, 3, N), the lower one of two, (B, 3, 1)."""
-        return values.median(dim=-1, keepdim=True).values
 
 
 class SmoothDrift(nn.Module):

@@ -240,12 +240,19 @@ def may_read(tensor: Tensor) -> bool:
 
 
 def reads_freely(tensor: Tensor) -> bool:
-    """Whether Python may compare the values of a tensor at once: a plain one on a CPU, in eager mode."""
-    if torch.compiler.is_compiling() or tensor.device.type != "cpu" or torch._C._get_tracing_state() is not None:
+    """Whether Python may compare the values of a tensor at once: on a CPU, in eager mode."""
+    return may_read(tensor) and not torch.jit.is_tracing()  # type: ignore[no-untyped-call]
+
+
+def has_memory(tensor: Tensor) -> bool:
+    """Whether a tensor has memory of its own, which one of a transform of torch.func, or without values, has not."""
+    if type(tensor) not in (Tensor, torch.nn.Parameter):
         return False
-    if torch._C._len_torch_dispatch_stack() > 0:  # tensors without values
+    try:
+        tensor.data_ptr()
+    except RuntimeError:
         return False
-    return not torch._C._functorch.is_functorch_wrapped_tensor(tensor)
+    return True
 
 
 def check_image(name: str, image: Tensor, height: int, width: int, sensor_name: str) -> None:
@@ -306,16 +313,6 @@ def check_range(name: str, image: Tensor) -> None:
     if high > 1.0 + 1e-3 or low < -1e-3:
         cause = "0-255 given for 0-1: divide by 255" if high > 1.5 else "clamp it to [0, 1]"
         raise ValueError(f"{name}: expected values in [0, 1], got [{low:.4g}, {high:.4g}]: {cause}")
-
-
-def check_range_later(name: str, image: Tensor) -> None:
-    """As :func:`check_range` for a tensor on a GPU, without waiting for it: the error comes when the GPU has got so far.
-
-    It is the GPU's own assertion: CUDA then refuses all further work in this process, and RuntimeError names the check.
-    """
-    values = image.detach()
-    inside = ((values >= -1e-3) & (values <= 1.0 + 1e-3)).all()  # NaN is not inside
-    torch._assert_async(inside, f"{name}: expected finite values in [0, 1]: 0-255 given for 0-1? divide by 255")
 
 
 def parse_number(text: str) -> float:

@@ -37,7 +37,6 @@ def reconstruct(seed: Tensor, mask: Tensor) -> Tensor:
 
 def _reconstruct_in_graph(reached: Tensor, mask: Tensor, by_row: Tensor, by_column: Tensor) -> Tensor:
     """The loop of :func:`reconstruct` as one operator of the graph, for torch.export."""
-    from torch._higher_order_ops.while_loop import while_loop
 
     def gained(reached: Tensor, before: Tensor) -> Tensor:
         return (reached != before).any()
@@ -48,7 +47,7 @@ def _reconstruct_in_graph(reached: Tensor, mask: Tensor, by_row: Tensor, by_colu
 
     reached = reached.contiguous()
     start = (reached, torch.zeros_like(reached))
-    found: Tensor = while_loop(gained, sweep_all, start)[0]  # type: ignore[no-untyped-call]
+    found: Tensor = torch.while_loop(gained, sweep_all, start)[0]  # type: ignore[no-untyped-call]
     return found
 
 

@@ -27,15 +27,8 @@ def load(path: str, name: str, threads: int) -> "Callable[[np.ndarray[Any, Any]]
     import torch
 
     torch.set_num_threads(threads)
-    module: Any
-    if name == "torchscript":
-        module = torch.jit.load(path)  # type: ignore[no-untyped-call]
-    elif name == "pt2":
-        module = torch.export.load(path).module()
-    else:
-        import torch._inductor
-
-        module = torch._inductor.aoti_load_package(path)
+    by_script = name == "torchscript"
+    module: Any = torch.jit.load(path) if by_script else torch.export.load(path).module()  # type: ignore[no-untyped-call]
 
     def run(batch: "np.ndarray[Any, Any]") -> "np.ndarray[Any, Any]":
         with torch.no_grad():

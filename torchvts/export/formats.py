@@ -1,4 +1,4 @@
-"""The writers: a pipeline as one file in TorchScript, torch.export, AOTInductor or ONNX.
+"""The writers: a pipeline as one file in TorchScript, torch.export or ONNX.
 
 Every file takes images (B, 3, H, W) of the pipeline's size, any B, and returns depth_mm, gradient, normal, contact and
 deformed in that order.
@@ -6,7 +6,6 @@ deformed in that order.
 
 import copy
 import json
-import shutil
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -97,41 +96,6 @@ def export_program(pipe: DepthPipeline, path: str | Path | None = None) -> torch
     return program
 
 
-def export_aoti(pipe: DepthPipeline, path: str | Path) -> Path:
-    """Compile a pipeline to machine code for this kind of CPU (.pt2 package), for ``torch._inductor.aoti_load_package`` and C++.
-
-    Returns the path.
-
-    Raises:
-        RuntimeError: there is no C++ compiler.
-        TypeError: no pipeline.
-    """
-    check_pipeline(pipe)
-    path = check_target(path)
-    complaint = missing("aoti")
-    if complaint:
-        raise RuntimeError(complaint)
-    if path.suffix != ".pt2":
-        raise ValueError(f"path: expected a name ending in .pt2, got {path}: AOTInductor packages have no other")
-    settings: dict[str, Any] = {"aot_inductor.metadata": {METADATA_KEY: json.dumps(describe(pipe))}}
-    program = trace(pipe, by_matrix=False)
-    try:
-        _compile(program, path, settings)
-    except Exception as error:
-        if "CppCompileError" not in str(error):
-            raise
-        # Inductor (torch 2.13) writes some vectors of bool that no compiler accepts: without vectors it is slower and correct
-        _compile(program, path, settings | {"cpp.simdlen": 1})
-    return path
-
-
-def _compile(program: torch.export.ExportedProgram, path: Path, settings: dict[str, Any]) -> None:
-    """Write a program as machine code."""
-    with warnings.catch_warnings(), write_atomically(path) as temporary:
-        warnings.simplefilter("ignore")
-        torch._inductor.aoti_compile_and_package(program, package_path=str(temporary), inductor_configs=settings)
-
-
 def export_onnx(pipe: DepthPipeline, path: str | Path) -> Path:
     """Write a pipeline as ONNX, for ONNX Runtime and other readers. Its metadata entry ``torchvts`` is :func:`describe`.
 
@@ -186,7 +150,6 @@ class Format:
 FORMATS = {
     "torchscript": Format("pipeline.pt", export_torchscript, 1e-5),
     "pt2": Format("pipeline.pt2", export_program, 1e-5),
-    "aoti": Format("pipeline_aoti.pt2", export_aoti, 1e-5),
     "onnx": Format("pipeline.onnx", export_onnx, 1e-3),
 }
 """The formats by name."""
@@ -203,15 +166,4 @@ def missing(name: str) -> str:
         absent = [package for package in ("onnx", "onnxscript", "onnxruntime") if find_spec(package) is None]
         if absent:
             return f"onnx: {', '.join(absent)} not found: pip install 'torchvts[onnx]'"
-    if name == "aoti":
-        from torch._inductor.cpp_builder import get_cpp_compiler
-
-        try:
-            compiler = get_cpp_compiler()
-        except Exception as error:  # InvalidCxxCompiler, whose place in torch has moved
-            compiler, reason = "", str(error).splitlines()[0]
-        else:
-            reason = f"{compiler!r} is not there"
-        if not compiler or shutil.which(compiler) is None:
-            return f"aoti: expected a C++ compiler, got none ({reason}): install g++ or clang++, or set CXX"
     return ""

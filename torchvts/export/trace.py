@@ -6,7 +6,6 @@ import warnings
 import torch
 from torch import Tensor, nn
 
-from ..accelerated import reference
 from ..core.checks import check_batch, check_dtype, check_same_size, check_size, check_switch
 from ..core.frame import Frame
 from ..integration import Integrator, PoissonDCT, divergence
@@ -105,7 +104,7 @@ def size_and_dtype(pipe: DepthPipeline) -> tuple[int, int, torch.dtype]:
 def trace(pipe: DepthPipeline, by_matrix: bool) -> torch.export.ExportedProgram:
     """Trace a copy of a pipeline for any batch; ``by_matrix`` replaces its Poisson solvers by matrix products."""
     height, width, dtype = size_and_dtype(pipe)
-    pipe = copy.deepcopy(reference(pipe)).eval().requires_grad_(False)
+    pipe = copy.deepcopy(pipe).eval().requires_grad_(False)
     if by_matrix:
         _use_matrices(pipe, height, width, dtype)
     images = torch.full((2, 3, height, width), 0.5, dtype=dtype)

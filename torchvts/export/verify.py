@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..accelerated import reference_only
 from ..core.checks import check_batch, check_choice, check_integer, check_path, check_sequence
 from ..core.files import make_folder
 from ..core.geometry import pixel_grid_mm
@@ -117,8 +116,7 @@ def _export_one(pipe: DepthPipeline, folder: Path, name: str, images: Tensor) ->
 def compare(path: str | Path, pipe: DepthPipeline, images: Tensor, name: str) -> float:
     """Largest difference of depth, mm, between an exported file and the pipeline, over batches of 1, 2, 3 and all images.
 
-    The file is run by a process in which torchvts cannot be imported, the pipeline by what the file holds, the PyTorch reference:
-    compiled kernels round differently, which shows in random frames, whose slopes mean nothing.
+    The file is run by a process in which torchvts cannot be imported, the pipeline in this one.
 
     Args:
         path: the file.
@@ -133,7 +131,7 @@ def compare(path: str | Path, pipe: DepthPipeline, images: Tensor, name: str) ->
     check_batch("images", images, 3)
     batches = sorted({size for size in (1, 2, 3, images.shape[0]) if size <= images.shape[0]})
     found = run_bare(path, images, name, batches)
-    with torch.no_grad(), reference_only():
+    with torch.no_grad():
         expected = [pipe(images[:size]).depth_mm for size in batches]
     differences = [float((one.double() - two.double()).abs().max()) for one, two in zip(found, expected, strict=True)]
     return max(differences) if all(np.isfinite(differences)) else math.inf

@@ -8,7 +8,7 @@ exact inverses of one discrete operator.
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_batch, check_positive
+from ..core.checks import check_batch, check_positive, has_memory
 from ..core.precision import widened
 from .base import Integrator
 from .transforms import (
@@ -154,10 +154,6 @@ class PoissonDCT(Integrator):
                 self._plan = plan
         if gradient.shape[0] == 0:
             return gradient.new_zeros([0, 1, height, width])
-        return self.integrate(gradient, plan)
-
-    def integrate(self, gradient: Tensor, plan: list[Tensor]) -> Tensor:
-        """Depth by the tables of a plan; compiled kernels take the place of this method."""
         return _integrate_dct(gradient, self.mm_per_pixel, plan, self.zero_in_background)
 
 
@@ -226,13 +222,11 @@ def _kept(plan: list[Tensor]) -> list[Tensor]:
 
 
 def _plain(table: Tensor) -> bool:
-    """Whether a table outlives this call: not one of a transform of torch.func, or without values. Scripts."""
+    """Whether a table outlives this call: it has memory of its own, which one of a transform of torch.func has not. Scripts."""
     if torch.jit.is_scripting():
         return True
     else:  # noqa: RET505, TorchScript needs the else to skip this branch
-        if torch.compiler.is_compiling():
-            return True
-        return torch._C._len_torch_dispatch_stack() == 0 and not torch._C._functorch.is_functorch_wrapped_tensor(table)
+        return torch.compiler.is_compiling() or has_memory(table)
 
 
 def _plan_dst(gradient: Tensor) -> list[Tensor]:
@@ -265,7 +259,7 @@ def _plan(
 
 def _plan_fits(plan: list[Tensor], like: Tensor, height: int, width: int) -> bool:
     table = plan[2]  # real: inverse eigenvalues
-    same_kind = table.dtype == like.dtype and table.device == like.device and _plain(table)
+    same_kind = table.dtype == like.dtype and table.device == like.device and _plain(table) and _plain(like)
     if len(plan) == 12:
         return same_kind and plan[0].shape[0] + plan[6].shape[0] == height - 2 and plan[1].shape[0] + plan[4].shape[0] == width - 2
     return same_kind and plan[-2].shape[0] == height and plan[-1].shape[0] == width

@@ -135,11 +135,7 @@ class NormalFromIntensity(NormalModel):
         check_batch("compensated", compensated, 3)
         if compensated.shape[3] < 3:  # no second differences
             return self.shadowed.noise_std.expand(compensated.shape[0], 3)
-        return torch.maximum(self.frame_noise(compensated.detach()), self.shadowed.noise_std)
-
-    def frame_noise(self, compensated: Tensor) -> Tensor:
-        """Noise of the frame itself, (B, 3)."""
-        return noise_of_spotted(compensated, self.samples)
+        return torch.maximum(noise_of_spotted(compensated.detach(), self.samples), self.shadowed.noise_std)
 
     @torch.jit.export
     def solve(self, image: Tensor, depth_mm: Tensor | None, expected: Tensor | None, noise_std: Tensor | None = None) -> Tensor:
@@ -159,7 +155,11 @@ class NormalFromIntensity(NormalModel):
             check_same_count("depth_mm", depth_mm, "compensated", image.shape[0])
         if image.shape[0] == 0:
             return image
-        return self.normals_of(image, depth_mm, expected, self.shadowed.noise_of_frames(noise_std, image))
+        noise_std = self.shadowed.noise_of_frames(noise_std, image)
+        view = self.view()
+        plain = self.inverted_glossy(image, depth_mm, view) if self.lights.glossy else self.inverted(image, depth_mm, view)
+        normal: Tensor = self.shadowed(plain, image, depth_mm, view, expected, noise_std)
+        return normal
 
     def follow_lights(self) -> None:
         """Compute what is stored of the lights again if they have changed since, as by an optimiser.
@@ -178,17 +178,14 @@ class NormalFromIntensity(NormalModel):
             self.shadowed.follow(flat, self.inverse)
             self.stored_position_mm, self.stored_albedo = position.detach().clone(), albedo.detach().clone()
 
+    def __prepare_scriptable__(self) -> "NormalFromIntensity":
+        self.follow_lights()  # a graph cannot
+        return self
+
     def _inverse_of_lights(self, height: int, width: int) -> Tensor:
         """(3, 3, H, W): the inverse light matrix at the undeformed skin."""
         position, albedo = self.lights.position_mm.detach(), self.lights.albedo.detach()
         return inverse_light_matrix(position.new_zeros(1, 1, height, width), position, albedo, self.mm_per_pixel)[0]
-
-    def normals_of(self, image: Tensor, depth_mm: Tensor | None, expected: Tensor | None, noise_std: Tensor) -> Tensor:
-        """Normals of checked arguments; compiled kernels take the place of this method."""
-        view = self.view()
-        plain = self.inverted_glossy(image, depth_mm, view) if self.lights.glossy else self.inverted(image, depth_mm, view)
-        normal: Tensor = self.shadowed(plain, image, depth_mm, view, expected, noise_std)
-        return normal
 
     def inverted(self, image: Tensor, depth_mm: Tensor | None, view: LightView) -> Tensor:
         """The plain inverse at every pixel: eq. 9 without depth, eq. 10 with depth."""

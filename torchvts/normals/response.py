@@ -80,10 +80,6 @@ class NormalFromResponse(NormalModel):
                 raise ValueError("depth_mm: expected None, because this response does not say what depth does to brightness")
             check_batch("depth_mm", depth_mm, 1)
             check_same_size("depth_mm", depth_mm, "compensated", image.shape[2], image.shape[3])
-        return self.normals_of(image, depth_mm)
-
-    def normals_of(self, image: Tensor, depth_mm: Tensor | None) -> Tensor:
-        """The same of checked inputs; compiled kernels replace this method."""
         change = image - 1.0
         if depth_mm is not None:
             depth = depth_mm.to(change.dtype)

@@ -14,8 +14,8 @@ SAMPLES = 2000
 """Pixels from which the noise of a frame is estimated, as ContactMask does."""
 
 LEFT_OUT = -1.0
-"""Intensity of a channel that is left out at a pixel because something else than the skin's slope blocks its light; shadowed.c has
-it too. No camera gives half of it."""
+"""Intensity of a channel that is left out at a pixel because something else than the skin's slope blocks its light. No camera gives
+half of it."""
 
 PRIOR_STD = 0.25
 """Spread of slopes about what is known of them beforehand."""
@@ -27,6 +27,9 @@ BRIGHTNESS_NOISES = 1.5
 """Standard deviation of the common brightness, in units of noise, where a light is blocked. At a noise of 0.01 a ball keeps a
 fifth of the plain inverse's error, and a quarter if the brightness counts in full; with 2 % at any noise, walls of slope 4 at a
 noise of 0.002 are twice as wrong."""
+
+LEAST_BRIGHTNESS = 0.005
+"""It is so large at least."""
 
 FAILED_SHARE = 0.98
 """A channel that is dark on a larger part of the image has lost its LED, for no shadow is so large."""
@@ -169,6 +172,7 @@ class ShadowedPixels(nn.Module):
     def __init__(self, flat: Tensor, noise_std: Tensor, inverse: Tensor, saturated_above: Tensor | None) -> None:
         super().__init__()
         self.left_out, self.brightness_noises, self.unchanged_noises = LEFT_OUT, BRIGHTNESS_NOISES, UNCHANGED_NOISES
+        self.least_brightness = LEAST_BRIGHTNESS
         self.register_buffer("noise_std", noise_std.detach().to(flat.dtype))
         self.follow(flat, inverse)
         if saturated_above is not None:
@@ -197,7 +201,7 @@ class ShadowedPixels(nn.Module):
 
     def brightness_std(self, noise: Tensor) -> Tensor:
         """Relative standard deviation of the brightness that all channels share, where their noise is so large."""
-        return (self.brightness_noises * noise).clamp_min(0.005)
+        return (self.brightness_noises * noise).clamp_min(self.least_brightness)
 
     def nowhere_dark(self, image: Tensor, noise_std: Tensor) -> bool:
         """Whether no channel of an image (B, 3, H, W) is below three times its noise (B, 3); where it is, ``dark`` says more."""

@@ -3,6 +3,7 @@
 from ..core.frame import DepthOutput
 from .confidence import Bounds, Confidence, ConfidentOutput, ConfidentPipeline, beyond_presses, bound_at
 from .depth import MODES, DepthPipeline
+from .frozen import FrozenPipeline
 from .refine import Adaptive, Once, Repeat, SlopesOfDepth, SlopesOfPixels
 from .shadows import Shadows
 from .solve import Solve
@@ -17,6 +18,7 @@ __all__ = [
     "ConfidentPipeline",
     "DepthOutput",
     "DepthPipeline",
+    "FrozenPipeline",
     "Once",
     "Repeat",
     "Shadows",

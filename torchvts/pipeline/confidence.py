@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..accelerated import GradientFromNormal, PoissonBackground, scriptable
 from ..core.blur import MOST_BLUR_PX, blur, gaussian_weights
 from ..core.checks import (
     check_batch,
@@ -26,8 +25,9 @@ from ..core.checks import (
     check_shape,
     check_switch,
 )
-from ..core.geometry import gradient_of_depth, lengths
+from ..core.geometry import GradientFromNormal, gradient_of_depth, lengths
 from ..core.noise import noise_std as frame_noise_std
+from ..integration import PoissonBackground
 from ..model.calibration import Calibration, check_calibration
 from ..model.coverage import COVERED, distance_to_presses
 from ..model.response_field import TaughtRange
@@ -431,9 +431,6 @@ class Confidence(nn.Module):
         left = 3.0 * _smooth(left.square().sum(1, keepdim=True)) / sigma.square().sum(1, keepdim=True)
         return (left / 1.7).clamp_min(1.0)
 
-    def __prepare_scriptable__(self) -> nn.Module:
-        return scriptable(self)
-
     def _noise_of(self, images: Tensor) -> Tensor:
         """(B, 3, H, W): noise of the compensated frame, the calibrated one raised where the frame has more."""
         more = (frame_noise_std(images.detach()) / self.image_noise).clamp_min(1.0).square()
@@ -589,9 +586,6 @@ class ConfidentPipeline(nn.Module):
             bounds.frame_confidence,
             bounds.factors_deg,
         )
-
-    def __prepare_scriptable__(self) -> nn.Module:
-        return scriptable(self)
 
 
 def _length_95(bias: Tensor, std: Tensor, tail: float) -> Tensor:

@@ -1,24 +1,12 @@
 """The depth pipeline: a calibration made into a chain of modules that turns images into depth."""
 
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Final, TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from ..accelerated import (
-    Compensate,
-    GradientFromNormal,
-    NormalFromIntensity,
-    NormalFromResponse,
-    PoissonBackground,
-    PoissonDCT,
-    SmoothDrift,
-    scriptable,
-)
-from ..accelerated.threads import OneThread, one_suffices, share_frames
-from ..compensate import Compensate as PlainCompensate
+from ..compensate import Compensate, SmoothDrift
 from ..core.checks import (
     check_batch,
     check_choice,
@@ -26,23 +14,22 @@ from ..core.checks import (
     check_least,
     check_positive,
     check_range,
-    check_range_later,
     check_record,
-    may_read,
-    may_read_values,
 )
-from ..core.frame import DepthOutput, Frame, batch_like, joined, undeformed_output, write_frame
-from ..core.geometry import normal_from_gradient
+from ..core.frame import DepthOutput, Frame, Solution
+from ..core.geometry import GradientFromNormal, normal_from_gradient
 from ..core.settings import check_settings, settings_as_tensor
-from ..integration import WrappedIntegrator, as_integrator
+from ..integration import PoissonBackground, PoissonDCT, WrappedIntegrator, as_integrator
 from ..model import Calibration, Sensor, check_calibration
-from ..normals import NormalFromIntensity as PlainNormalFromIntensity
-from ..normals import WrappedNormals, as_normal_model, check_domain
+from ..normals import NormalFromIntensity, NormalFromResponse, WrappedNormals, as_normal_model, check_domain
 from ..skin import ContactFromDepth, ContactMask, ContactSettings, ZeroBackground, moved
 from .gs_sdk import gs_sdk_blocks
 from .refine import Adaptive, Once, Repeat, SlopesOfDepth, SlopesOfPixels
 from .shadows import Shadows
 from .solve import Solve
+
+if TYPE_CHECKING:
+    from .frozen import FrozenPipeline
 
 _Module = TypeVar("_Module", bound=nn.Module)
 
@@ -57,12 +44,12 @@ class DepthPipeline(nn.Module):
     """Images (B, 3, H, W) to a :class:`DepthOutput`: compensate, smooth, solve, mask, refine, contact, slopes.
 
     ``fast`` solves once (eq. 9). ``precise`` solves again with the depth found (eq. 10), until what is still missing falls below
-    ``tolerance_px``; for response fields gradient and normals are those of the depth, in all modes. ``auto`` skips frames without
-    moved skin, predicts on every eighth pixel what a second pass would change, and solves only those frames again for which that
-    exceeds ``refine_threshold_px``, until what is missing is below a fifth of it; where there are two passes at most, as for
-    response fields, it solves each frame twice.
-    Frames of a batch do not influence one another: on a CPU each is solved by itself, and is equal bit for bit to that frame alone.
-    On a GPU and in an exported program the batch is solved as one, which may change the rounding of sums.
+    ``tolerance_px``; for response fields gradient and normals are those of the depth, in all modes. ``auto`` predicts on every
+    eighth pixel what a second pass would change, and solves only those frames again for which that exceeds
+    ``refine_threshold_px``, until what is missing is below a fifth of it; where there are two passes at most, as for response
+    fields, it solves each frame twice.
+    Frames of a batch do not influence one another; their number may change the rounding of sums. This is a plain PyTorch module:
+    it trains, exports and runs on a GPU. For a camera or a recording, :meth:`freeze` it.
 
     Args:
         compensate: camera image to compensated image.
@@ -83,8 +70,7 @@ class DepthPipeline(nn.Module):
         figure 2 and eq. 3-10 of the paper.
     """
 
-    skips_undeformed: Final[bool]
-    _takes_slopes: Final[bool]
+    takes_slopes: Final[bool]
     measures_noise: Final[bool]
 
     def __init__(
@@ -111,7 +97,7 @@ class DepthPipeline(nn.Module):
         for name, block in given.items():
             check_record(name, block, nn.Module)
         model, integrator = as_normal_model(normals), as_integrator(integrate)
-        check_domain(model, compensate.output_domain if isinstance(compensate, PlainCompensate) else None)
+        check_domain(model, compensate.output_domain if isinstance(compensate, Compensate) else None)
         mm_per_pixel, tolerance_px = check_positive("mm_per_pixel", mm_per_pixel), check_positive("tolerance_px", tolerance_px)
         refine_threshold_px = check_least("refine_threshold_px", refine_threshold_px)
         check_integer("max_passes", max_passes, 1)
@@ -122,14 +108,13 @@ class DepthPipeline(nn.Module):
             )
         self.mode = mode
         self.mm_per_pixel = mm_per_pixel
-        self.skips_undeformed = mode == "auto"
         self.compensate = compensate
         self.mask = mask
         self.smooth = smooth
         self.solve = Solve(model, gradient, integrator, ZeroBackground(mm_per_pixel))
         # slopes of a module in training are none yet: there colour alone decides
         own = isinstance(mask, ContactMask) and type(mask).forward is ContactMask.forward
-        self._takes_slopes = own and not self.solve.from_outside
+        self.takes_slopes = own and not self.solve.from_outside
         self.measures_noise = self.solve.takes_noise and mode != "fast"
         self.refine = self._policy(mode, tolerance_px, refine_threshold_px, min(max_passes, model.max_passes))
         self.slopes = SlopesOfDepth(mm_per_pixel) if model.normals_from_depth else SlopesOfPixels()
@@ -149,7 +134,7 @@ class DepthPipeline(nn.Module):
         else:
             grid = (coarse, PoissonBackground(STRIDE * pitch), pitch)
             policy = Adaptive(self.solve, *grid, tolerance_px, max_passes, refine_threshold_px, STRIDE)
-        if not isinstance(model, PlainNormalFromIntensity):
+        if not isinstance(model, NormalFromIntensity):
             return policy
         return Shadows(policy, PoissonBackground(pitch), pitch)
 
@@ -190,7 +175,7 @@ class DepthPipeline(nn.Module):
         settings = ContactSettings() if contact is None else contact
         check_record("contact", settings, ContactSettings, "ContactSettings(sigmas=...) makes one")
         sensor, given = calibration.sensor, (normals, integrate)
-        with torch.inference_mode(False):  # torch does not say of inference tensors whether they have changed, and blocks must know
+        with torch.inference_mode(False):  # later calls may record gradients
             if normals is None:
                 by_response = calibration.response is not None
                 normals = (NormalFromResponse if by_response else NormalFromIntensity).from_calibration(calibration)
@@ -232,66 +217,50 @@ class DepthPipeline(nn.Module):
         """(B, 3, H, W) images in [0, 1], R, G, B.
 
         Raises:
-            ValueError: wrong shape, or, for eager tensors on a CPU, values outside [0, 1] or not finite.
+            ValueError: wrong shape, or, for eager tensors, values outside [0, 1] or not finite.
             TypeError: not floating point.
         """
-        if not torch.jit.is_scripting():  # noqa: SIM102
-            if one_suffices(images):
-                with OneThread():
-                    return self.reconstructed(images)
-        return self.reconstructed(images)
-
-    def reconstructed(self, images: Tensor) -> DepthOutput:
-        """:meth:`forward` in the threads that torch now uses."""
         check_images(images)
-        if images.shape[0] > 1 and may_read(images):
-            return self.depth_of_each(images)
-        return self.depth_of(images)
-
-    def depth_of_each(self, images: Tensor) -> DepthOutput:
-        """The output of checked images (B, 3, H, W), each solved by itself."""
-        if torch.jit.is_scripting():
-            one = self.depth_of(images[0:1])
-        else:
-            with OneThread():  # as the others, and as a frame alone: another number of threads rounds sums otherwise
-                one = self.depth_of(images[0:1])
-        if one.depth_mm.requires_grad:
-            return joined([one] + [self.depth_of(images[i : i + 1]) for i in range(1, images.shape[0])])
-        out = batch_like(one, images.shape[0])  # half the memory of all frames and their copy
-        write_frame(out, 0, one)
-        if torch.jit.is_scripting():
-            for i in range(1, images.shape[0]):
-                self.write_depth(out, images, i)
-        else:
-            share_frames(range(1, len(images)), images[:, 0].numel(), partial(self.write_depth, out, images))
-        return out
-
-    def write_depth(self, out: DepthOutput, images: Tensor, i: int) -> None:
-        """Write the output of the frame with this index."""
-        write_frame(out, i, self.depth_of(images[i : i + 1]))
-
-    def depth_of(self, images: Tensor) -> DepthOutput:
-        """The output of checked images (B, 3, H, W), solved together."""
-        frame, slopes = self.frame_of(images)
-        return self.solved(frame, slopes)
-
-    def solved(self, frame: Frame, slopes: Tensor) -> DepthOutput:
-        """The output of what :meth:`frame_of` gave."""
-        if may_read_values() and (slopes.shape[0] == 0 or (self.skips_undeformed and self.nothing_to_solve(frame))):
-            return undeformed_output(frame)
+        frame, slopes = self.frame_of(images)  # eq. 9 and 5
         solution = self.solve.integrated(frame, slopes * frame.weight)  # eq. 4
         frame, solution = self.refine(frame, solution)  # eq. 10
+        return self.output(frame, solution)
+
+    def output(self, frame: Frame, solution: Solution) -> DepthOutput:
+        """Depth and slopes of a solution, and where the skin has moved and the object touches it."""
         deformed = moved(frame.weight.detach(), solution.depth_mm.detach())
         contact = self.contact(solution.depth_mm.detach(), deformed)
         gradient, depth = self.slopes(frame, solution)
         return DepthOutput(depth, gradient, normal_from_gradient(gradient), contact, deformed)
+
+    @torch.jit.unused
+    def freeze(self) -> "FrozenPipeline":
+        """This pipeline for frames of a camera or a recording, several times as fast: a copy that cannot change.
+
+        Parameters and settings are those of now; no gradient is recorded. Where all blocks are the library's own, on a CPU in
+        float32, a frame is one call of compiled code. What is not compiled, and why, says ``frozen.not_compiled``; that copy runs
+        in PyTorch. As :func:`torch.jit.freeze` does for graphs.
+
+        Raises:
+            ValueError: parameters that record gradients.
+        Example:
+            >>> from torchvts import PointLights, Sensor
+            >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
+            >>> cal = Calibration.from_lights(lights, Sensor("rig", 48, 64, 0.5))
+            >>> frozen = DepthPipeline.from_calibration(cal).freeze()
+            >>> frozen(cal.model_image[None]).depth_mm.shape
+            torch.Size([1, 1, 48, 64])
+        """
+        from .frozen import FrozenPipeline
+
+        return FrozenPipeline(self)
 
     def frame_of(self, images: Tensor) -> tuple[Frame, Tensor]:
         """The frame of checked images (B, 3, H, W), compensated and weighted, and its slopes by eq. 9 and 5, (B, 2, H, W)."""
         compensated = self.compensate(images)
         image, noise = self.smooth(compensated), self.noise_of(compensated)
         slopes = self.solve.slopes(image, None, noise)
-        weight = self.mask(image, slopes) if self._takes_slopes else self.mask(image)
+        weight = self.mask(image, slopes) if self.takes_slopes else self.mask(image)
         return Frame(image, weight.to(image.dtype), noise), slopes
 
     @torch.jit.unused
@@ -306,16 +275,6 @@ class DepthPipeline(nn.Module):
         is gained by more of such pixels.
         """
         return self.solve.normals.noise_of(compensated) if self.measures_noise else None
-
-    def nothing_to_solve(self, frame: Frame) -> bool:
-        """Whether no skin has moved and no gradients are recorded, which would need a graph."""
-        if bool((frame.weight > 0.0).any()):
-            return False
-        if torch.jit.is_scripting():
-            return True
-        else:  # noqa: RET505, TorchScript needs the else to skip this branch
-            recorded = frame.image.requires_grad or any(weight.requires_grad for weight in self.parameters())
-            return not (torch.is_grad_enabled() and recorded)
 
     __jit_unused_properties__: ClassVar[list[str]] = ["gradient", "integrate", "normals"]
 
@@ -335,9 +294,6 @@ class DepthPipeline(nn.Module):
         """The integrator, as it was given."""
         integrator = self.solve.integrate
         return integrator.module if isinstance(integrator, WrappedIntegrator) else integrator
-
-    def __prepare_scriptable__(self) -> nn.Module:
-        return scriptable(self)
 
     def get_extra_state(self) -> Tensor:
         """Numbers that determine the output and are no parameters, such as gamma and the pitch: part of ``state_dict()``."""
@@ -361,12 +317,8 @@ def eval_around(module: _Module, *given: nn.Module | None) -> _Module:
 
 
 def check_images(images: Tensor) -> None:
-    """Raise unless images are a floating-point (B, 3, H, W) batch, in eager mode also of values in [0, 1], on CUDA later."""
+    """Raise unless images are a floating-point (B, 3, H, W) batch, in eager mode also of values in [0, 1]."""
     check_batch("images", images, 3)
-    if not torch.jit.is_scripting():
-        if torch.compiler.is_compiling():
-            return
-        if images.device.type == "cpu":
+    if not torch.jit.is_scripting():  # noqa: SIM102
+        if not torch.compiler.is_compiling() and (images.device.type == "cpu" or images.is_cuda):
             check_range("images", images)
-        elif images.is_cuda:
-            check_range_later("images", images)

@@ -14,9 +14,9 @@ are 2 to 5 degrees off, touches 4 to 6 on a GelSight Mini."""
 NOT_METRIC_DEG = 20.0
 """Mean error of a model that is not this unit's: no better than to call every ball flat."""
 
-FEW_PRESSES = 4.0
+FEW_PRESSES = 2.0
 """Variance that n presses leave where no ball was pressed, in that of a press, times n. So their error is multiplied by
-sqrt(1 + 4 / n); a prior counts as so many presses."""
+sqrt(1 + 2 / n); a prior counts as so many presses. The misfit of the very presses, one or two, hides more: sqrt(1 + (2 / n)^2)."""
 
 HELD_OUT_VARIANCE = 0.05
 """Variance of the logarithm of the error that held-out presses state, beside 1 / (2 n) of n presses."""
@@ -44,8 +44,10 @@ def expected_model_deg(calibration: Calibration) -> float:
         return by_type
     if "prior_deg" in report and held_out:
         return math.sqrt((used * held_out**2 + FEW_PRESSES * by_type**2) / (used + FEW_PRESSES))
-    error = held_out or report.get("own_deg")
-    return error * math.sqrt(1.0 + FEW_PRESSES / used) if error else UNMEASURED_DEG
+    if held_out:
+        return held_out * math.sqrt(1.0 + FEW_PRESSES / used)
+    own = report.get("own_deg")
+    return own * math.sqrt(1.0 + (FEW_PRESSES / used) ** 2) if own else UNMEASURED_DEG
 
 
 def model_log_variance(calibration: Calibration) -> float:

@@ -4,8 +4,10 @@ from pathlib import Path
 
 from torch import Tensor, nn
 
-from ..accelerated import Compensate, GradientFromNormal, PoissonDCT
+from ..compensate import Compensate
 from ..core.checks import check_image
+from ..core.geometry import GradientFromNormal
+from ..integration import PoissonDCT
 from ..model import Sensor
 from ..normals import NormalFromMLP
 from ..skin import ContactMask

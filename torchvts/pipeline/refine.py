@@ -72,7 +72,6 @@ class Repeat(nn.Module):
 
     def _repeat_in_graph(self, frame: Frame, solution: Solution, active: Tensor) -> Solution:
         """:meth:`repeat` for torch.export: the loop as one operator; settled frames are computed along and left as they are."""
-        from torch._higher_order_ops.while_loop import while_loop
 
         def unsettled(step: Tensor, gradient: Tensor, depth: Tensor, active: Tensor, last_px: Tensor) -> Tensor:
             return active.any() & (step < self.max_passes)
@@ -92,7 +91,7 @@ class Repeat(nn.Module):
         if self.max_passes == 2:  # one pass needs no loop, and stays differentiable
             state = go_again(*state)
         elif self.max_passes > 2:
-            state = while_loop(unsettled, go_again, state)  # type: ignore[no-untyped-call]
+            state = torch.while_loop(unsettled, go_again, state)  # type: ignore[no-untyped-call]
         return Solution(state[1], state[2])
 
 

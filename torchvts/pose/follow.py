@@ -2,23 +2,16 @@
 
 import math
 from typing import NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
 
-from ..accelerated import following, kernels
-from ..accelerated.gate import usable
-from .alignment import DEPTH_DRIFT_MM, SLOPE_NOISE, agrees_enough
+from .alignment import SLOPE_NOISE, agrees_enough
 from .ambiguity import ALIKE_PIXELS, LEAST_INFORMATION, UNKNOWN_VARIANCE, free_directions, name_directions, span
-from .height_errors import ERROR, MOST_MM, WHITE_MM, height_sums
+from .height_errors import ERROR, height_sums
 from .inverse import (
-    DEEP_MM,
-    LARGEST_STEP_MM,
     LEAST_NOISE,
     ROTATION_FIRST,
-    SCORE,
-    SHALLOW_MM,
     Field,
     Pixels,
     Sums,
@@ -28,7 +21,6 @@ from .inverse import (
     step_between,
     sum_parts,
     sum_residuals,
-    sums_of,
 )
 from .jackknife import jackknife
 from .keyframe import PARTS, Grids, Keyframe
@@ -120,11 +112,6 @@ def follow(keyframe: Keyframe, frame: Grids, starts: list[Array]) -> Followed:
 
 def _follow_best(keyframe: Keyframe, frame: Grids, starts: list[Array], last: Array) -> tuple[int, Followed]:
     """Register a frame from the best of several poses: which one that was, and what was found."""
-    if usable(frame.fine.channels, keyframe.many.columns):
-        found = following.follow_frame(
-            _program(keyframe), following.grid_of(*frame.fine), following.grid_of(*frame.coarse), np.stack(starts), last
-        )
-        return found.start, _followed(keyframe, frame, found.parts)
     costs = [sum_residuals(frame.coarse, keyframe.coarse, start, SLOPE_NOISE, score_only=True).cost for start in starts]
     best = costs.index(min(costs))
     return best, _follow_from(keyframe, frame, starts[best], last)
@@ -179,55 +166,6 @@ def _score(keyframe: Keyframe, pixels: int, forth: Sums, back: Sums) -> tuple[fl
     return fitness, overlap, (forth.cost * forth.compared + back.cost * back.compared) / compared
 
 
-_programs: WeakKeyDictionary[Keyframe, following.KeyframeProgram] = WeakKeyDictionary()
-
-
-def _program(keyframe: Keyframe) -> following.KeyframeProgram:
-    """What the compiled kernel reads of a keyframe, made once; it points to the keyframe's arrays."""
-    program = _programs.get(keyframe)
-    if program is None:
-        errors = keyframe.heights
-        program = following.KeyframeProgram(
-            *(following.pixels_of(pixels.columns) for pixels in (keyframe.coarse, keyframe.some, keyframe.many)),
-            following.grid_of(*keyframe.grids.coarse),
-            *(array.ctypes.data for array in errors),
-            *(len(errors.number), errors.lines.shape[1] - 6, PARTS, COARSE_STEPS, SOME_STEPS),
-            *(tuple(keyframe.many.units), tuple(keyframe.many.center), following.directions_of(keyframe.held)),
-            *(tuple(keyframe.bias.flatten().tolist()), tuple((keyframe.known @ keyframe.known.T).ravel())),
-            *(DEPTH_DRIFT_MM**-2, *SCORE, DEEP_MM, SHALLOW_MM),
-            *(SLOPE_NOISE, LEAST_NOISE, LARGEST_STEP_MM, COARSE_STEP_MM, SOME_STEP_MM),
-            *(LEAST_INFORMATION, tuple(_wanted(keyframe)), _alike(keyframe), LEAST_SLOPE_NOISE),
-            *(MOST_MM, WHITE_MM, keyframe.shared_error, UNSEEN, ERROR, HEIGHT_OFFSET_MM, LEAST_SHARE, UNKNOWN_VARIANCE),
-        )
-        _programs[keyframe] = program
-    return program
-
-
-def _followed(keyframe: Keyframe, frame: Grids, found: dict[str, Array]) -> Followed:
-    """What the compiled kernel found."""
-    names = ("noise", "pixels", "last_step", "turn_variance", "shift_variance", "used", "variance", "unknown", "slides")
-    noise, pixels, last_step, turn, shift, used, variance, unknown, slides = (float(found[name][0]) for name in names)
-    motions = found["motions"][: 6 * int(unknown)].reshape(6, int(unknown))
-    shifts = found["shifts"][: 3 * int(slides)].reshape(3, int(slides))
-    pose = found["pose"].reshape(4, 4)
-    forth, back = sums_of(found["forth"], SLOPE_NOISE), sums_of(found["back"], SLOPE_NOISE)
-    fitness, overlap, cost = _score(keyframe, int(pixels), forth, back)
-    return Followed(
-        pose=pose,
-        fine=sums_of(found["sums"], noise),
-        fitness=fitness,
-        overlap=overlap,
-        cost=cost,
-        free=motions,
-        names=_names(_Unknown(motions, shifts), pose),
-        std_deg=math.degrees(math.sqrt(turn)),
-        std_mm=math.sqrt(shift),
-        settled=last_step < LAST_STEP_MM,
-        covariance=found["covariance"].reshape(6, 6),
-        common=(_share(keyframe, frame, int(used)), variance),
-    )
-
-
 def _with_heights(fine: Sums, keyframe: Keyframe, frame: Grids, pose: Array) -> tuple[Sums, Sums]:
     """Sums of the last step: slopes, once for each coarse pixel; and heights beside, as their errors let them count."""
     matrix, right = height_sums(keyframe.heights, frame.fine, keyframe.some, pose)
@@ -257,8 +195,6 @@ def _share(keyframe: Keyframe, frame: Grids, used: int) -> float:
 
 def _pixels(field: Field) -> Pixels:
     """The pixels of a coarse field that lie on the object, without derivatives."""
-    if usable(field.channels):
-        return Pixels(kernels.object_pixels(*field), np.zeros(3), np.ones(6))
     channels = field.channels.numpy()
     row, column = np.nonzero(channels[..., 3] > 0.999)
     columns = np.empty((5, len(row)), np.float32)

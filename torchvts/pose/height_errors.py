@@ -13,8 +13,7 @@ import numpy.typing as npt
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from ..accelerated import kernels
-from ..accelerated.gate import usable
+from ..compiled import library, tracking
 from .alignment import SLOPE_NOISE
 from .inverse import HEIGHT_NOISE_MM, SHALLOW_MM, Field, Pixels, residual_limits
 from .rigid import Array
@@ -157,9 +156,9 @@ def height_sums(errors: HeightErrors, field: Field, pixels: Pixels, pose: Array)
     Source:
         Aitken, Proceedings of the Royal Society of Edinburgh 55, 1935.
     """
-    if usable(field.channels, pixels.columns):
+    if library() is not None:
         limits = residual_limits(field, pose, SLOPE_NOISE)
-        left = kernels.height_sums(field.channels, pixels.columns, limits, errors, MOST_MM, WHITE_MM)
+        left = tracking.height_sums(field.channels, pixels.columns, limits, errors, MOST_MM, WHITE_MM)
         return left[:6, :6], left[:6, 6]
     residual, seen = _height_residuals(field, pixels, pose)
     cell = errors.cell[seen]

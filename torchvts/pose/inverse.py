@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..accelerated import kernels
-from ..accelerated.gate import usable
+from ..compiled import library, tracking
 from .alignment import CUT, DEPTH_DRIFT_MM, SLOPE_NOISE, linearise
 from .relief import Relief
 from .rigid import Array, inverted, rigid_motion, rotation_vector
@@ -118,11 +117,6 @@ def refine(
     """
     if held is None:
         held = np.zeros((6, 0))
-    if usable(field.channels, pixels.columns):
-        limits = residual_limits(field, pose, wide)
-        settings = np.concatenate((pixels.units, pixels.center, (wide, LEAST_NOISE, LARGEST_STEP_MM, small_mm)))
-        total = kernels.refine_pose(field.channels, pixels.columns, steps, settings, held, limits)
-        return limits[:16].reshape(4, 4), sums_of(total[:56], float(total[56]))
     noise = wide
     for _ in range(steps):
         sums = sum_residuals(field, pixels, pose, noise)
@@ -169,15 +163,15 @@ def step_between(pixels: Pixels, pose: Array, other: Array) -> Array:
 
 def sum_residuals(field: Field, pixels: Pixels, pose: Array, slope_noise: float, score_only: bool = False) -> Sums:
     """Sums of one Gauss-Newton step with Cauchy's weights, and the score of the pose (4, 4), from the reference to the field."""
-    by = kernels.alignment_sums if usable(field.channels, pixels.columns) else alignment_sums
+    by = tracking.alignment_sums if library() is not None else alignment_sums
     return sums_of(by(field.channels, pixels.columns, residual_limits(field, pose, slope_noise), score_only), slope_noise)
 
 
 def sum_parts(field: Field, pixels: Pixels, pose: Array, slope_noise: float, parts: int) -> tuple[Sums, Array, Array]:
     """:func:`sum_residuals`, and the matrices (parts, 6, 6) and right sides (parts, 6) of as many runs of pixels."""
     limits = residual_limits(field, pose, slope_noise)
-    if usable(field.channels, pixels.columns):
-        found = kernels.part_sums(field.channels, pixels.columns, parts, limits)
+    if library() is not None:
+        found = tracking.part_sums(field.channels, pixels.columns, parts, limits)
     else:
         ends = [pixels.number * k // parts for k in range(parts + 1)]
         runs = [pixels.columns[:, first:end] for first, end in pairwise(ends)]

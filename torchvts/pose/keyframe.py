@@ -10,8 +10,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ..accelerated import kernels
-from ..accelerated.gate import usable
+from ..compiled import library, tracking
 from .alignment import twist_units
 from .ambiguity import field_with_fitted_curvature, find_unknown, information_of_noise
 from .height_errors import HeightErrors, height_errors
@@ -85,18 +84,16 @@ def contact_frame(frame: DepthFrame, name: str = "frame") -> Contact:
 
 def _contact_pixels(depth: Tensor, gradient: Tensor, contact: Tensor) -> int:
     """How many pixels of a frame touch; -1 where depth or gradient is not finite, or beyond :data:`HUGE`."""
-    if usable(depth, gradient):
-        return kernels.contact_pixels(depth, gradient, contact)
     largest = torch.stack((depth.abs().max(), gradient.abs().max()))  # NaN if any value is
     return int(torch.count_nonzero(contact)) if bool((largest <= HUGE).all()) else -1
 
 
 def grids(frame: Contact, mm_per_pixel: float, least_mm: float, times: tuple[int, int]) -> Grids:
     """A frame on both grids, of ``times`` pixels a side; skin deeper than ``least_mm`` within its contact lies on the object."""
-    if not usable(frame.depth_mm, frame.gradient):
+    if library() is None:
         return _grids_by_opencv(frame, mm_per_pixel, least_mm, times)
     height, width = frame.depth_mm.shape[-2:]
-    *made, touching = kernels.track_grids(frame.depth_mm, frame.gradient, frame.contact, least_mm, times)
+    *made, touching = tracking.track_grids(frame.depth_mm, frame.gradient, frame.contact, least_mm, times)
     fine, coarse = (
         Field(channels, (n - width) * 0.5 * mm_per_pixel, (height - n) * 0.5 * mm_per_pixel, n * mm_per_pixel)
         for channels, n in zip(made, times, strict=True)

@@ -30,6 +30,9 @@ LARGE = 0.9
 DEEP = 0.15
 """Depth of the deep skin, as a share of the deepest."""
 
+LEAST_DEEP = 0.005
+"""That share is this at least: shallower skin says nothing of a pressure."""
+
 RIM_MM = 0.4
 """Skin just inside a rim lies within this, either way."""
 
@@ -114,7 +117,7 @@ class ContactFromDepth(nn.Module):
         """Pressure less what contact needs, (B, 1, h, w): a share of the frame's, and of that just inside of the rim."""
         large, pulled = frame_pressure(depth, pressure, self.large, self.deep), -frame_pressure(depth, pressure, self.pulling, 0.0)
         touching = (pressure > self.share * large).to(pressure.dtype)
-        reach = max(1, int(self.rim_mm / pitch_mm + 0.5))
+        reach = rim_reach(self.rim_mm, pitch_mm)
         inside = box_mean(touching * pressure, reach) / box_mean(touching, reach).clamp_min(1e-9)
         deepest = depth.amax(dim=(2, 3), keepdim=True)
         with_skin = pressure - torch.maximum(self.share * large, self.fall * inside)
@@ -130,11 +133,18 @@ def pressure_of(depth_mm: Tensor, pitch_mm: float, blur_mm: float = BLUR_MM, dec
     return middle - (decay_mm / pitch_mm) ** 2 * (around - 4.0 * middle)
 
 
-def frame_pressure(depth_mm: Tensor, pressure: Tensor, share: float, depth: float, samples: int = SAMPLES) -> Tensor:
+def rim_reach(rim_mm: float, pitch_mm: float) -> int:
+    """Cells within which skin just inside a rim lies."""
+    return max(1, int(rim_mm / pitch_mm + 0.5))
+
+
+def frame_pressure(
+    depth_mm: Tensor, pressure: Tensor, share: float, depth: float, samples: int = SAMPLES, least: float = LEAST_DEEP
+) -> Tensor:
     """A quantile of the pressure of each frame (B, 1, h, w), (B, 1, 1, 1), over skin deeper than a share of the deepest."""
     step = max(1, min(depth_mm.shape[2], depth_mm.shape[3]) // samples)
     deepest = depth_mm.amax(dim=(2, 3), keepdim=True)
-    deep = depth_mm > max(depth, 0.005) * deepest
+    deep = depth_mm > max(depth, least) * deepest
     some = deep[:, :, step // 2 :: step, step // 2 :: step].flatten(1)
     values = pressure[:, :, step // 2 :: step, step // 2 :: step].flatten(1)
     ordered = torch.where(some, values, torch.inf).sort(dim=1).values

@@ -94,13 +94,10 @@ class ZeroBackground(nn.Module):
     def offset(self, depth: Tensor, weight: Tensor, pitch_mm: float) -> tuple[Tensor, Tensor]:
         """The offset as coefficients of cosines along y and x, (B, K, M), and the range of depth, (B, 1, 1), of cells (B, h, w)."""
         height, width = depth.shape[1], depth.shape[2]
-        shorter = min(height, width)
-        k = min(height, 3 * self.waves, (2 * self.waves * height + shorter) // (2 * shorter))
-        m = min(width, 3 * self.waves, (2 * self.waves * width + shorter) // (2 * shorter))
+        k, m = number_of_waves(height, width, self.waves)
         rows, columns = cosines(height, k, height, depth), cosines(width, m, width, depth)
         along_y, along_x = slopes_of_cosines(height, k, pitch_mm, depth), slopes_of_cosines(width, m, pitch_mm, depth)
-        square = wave_numbers(k, height * pitch_mm, depth).square()[:, None] + wave_numbers(m, width * pitch_mm, depth).square()
-        by_pressure = (1.0 + self.decay_mm**2 * square).flatten()  # what p = z - L^2 laplace z makes of each cosine
+        by_pressure = pressure_of_waves(k, m, (height, width), pitch_mm, self.decay_mm, depth)
         pressure = depth - self.decay_mm**2 * laplacian(depth, pitch_mm)
         reach = (depth.amax(dim=(1, 2), keepdim=True) - depth.amin(dim=(1, 2), keepdim=True)).clamp_min(1e-9)
         free = weight < 0.1
@@ -122,6 +119,20 @@ class ZeroBackground(nn.Module):
             solved = -torch.linalg.solve(system, right[..., None])[..., 0]
             found = torch.where(any_free[:, None], solved, found)
         return found.reshape(-1, k, m), reach
+
+
+def number_of_waves(height: int, width: int, waves: int) -> tuple[int, int]:
+    """Cosine terms along y and x of cells (height, width), ``waves`` along the shorter side."""
+    shorter = min(height, width)
+    k = min(height, 3 * waves, (2 * waves * height + shorter) // (2 * shorter))
+    m = min(width, 3 * waves, (2 * waves * width + shorter) // (2 * shorter))
+    return k, m
+
+
+def pressure_of_waves(k: int, m: int, size: tuple[int, int], pitch_mm: float, decay_mm: float, like: Tensor) -> Tensor:
+    """What p = z - L^2 laplace z makes of each cosine, (k m,), on cells of a size (height, width)."""
+    square = wave_numbers(k, size[0] * pitch_mm, like).square()[:, None] + wave_numbers(m, size[1] * pitch_mm, like).square()
+    return (1.0 + decay_mm**2 * square).flatten()
 
 
 def products(field: Tensor, rows: Tensor, columns: Tensor) -> Tensor:

@@ -4,8 +4,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..accelerated import kernels
-from ..accelerated.gate import usable
 from ..core.arrays import Array, array_of, cell_means, cells_with_any, lower_median, widened
 from ..core.checks import check_batch, check_field, check_least, check_range, check_same_size, check_shape
 from ..core.geometry import pixel_grid_mm
@@ -77,11 +75,11 @@ class FollowLight:
         self._check(image)
         if float((self.plane - torch.tensor([1.0, 0.0, 0.0])).abs().max()) < 1e-5:
             return image
-        if usable(image, self._x, self._y):
-            return kernels.over_tilted(image, self.plane.float(), self._x, self._y)
-        level, tilt_x, tilt_y = (self.plane[:, k, None, None].to(image.dtype) for k in range(3))
-        plane = (level + tilt_x * self._x + tilt_y * self._y)[None]
-        return torch.div(image, plane, out=plane).clamp_(0.0, 1.0)
+        given = image.detach().resolve_neg().cpu().numpy()
+        level, tilt_x, tilt_y = (self.plane[None, :, k, None, None].numpy().astype(given.dtype) for k in range(3))
+        plane = tilt_x * self._x.numpy() + (level + tilt_y * self._y.numpy())
+        np.divide(given, plane, out=plane)
+        return torch.from_numpy(np.clip(plane, 0.0, 1.0, out=plane))
 
     def update(self, image: Tensor, deformed: Tensor, seconds: float) -> str:
         """Learn from a frame.

@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -10,7 +9,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..accelerated.threads import MOST_PIXELS, OneThread
 from ..calibration import Press
 from ..core.checks import check_choice, check_integer, check_least, check_record, check_switch
 from ..core.files import rgb_from_bgr
@@ -188,12 +186,11 @@ class TactileStream:
 
     def __iter__(self) -> Iterator[TactileFrame]:
         for index, time_s, pixels in self._frames:
-            with self._threads(pixels):
-                with self.stages.stage("rectify"):
-                    raw, reason = self._usable(pixels)
-                if raw is not None and self._zero_missing:
-                    self._collect(raw)
-                found = None if raw is None else self.recording(raw, time_s)
+            with self.stages.stage("rectify"):
+                raw, reason = self._usable(pixels)
+            if raw is not None and self._zero_missing:
+                self._collect(raw)
+            found = None if raw is None else self.recording(raw, time_s)
             if found is None:
                 self.left_out.append((index, reason))
                 warnings.warn(f"frame {index} left out: {reason}", stacklevel=2)
@@ -201,14 +198,8 @@ class TactileStream:
             image, output = found
             assert output is not None
             yield TactileFrame(index, time_s, image[0], output)
-            with self._threads(pixels):
-                self.recording.learn()  # after the depth has been handed out, which does not wait for it
+            self.recording.learn()  # after the depth has been handed out, which does not wait for it
             self.stages.end_frame()
-
-    def _threads(self, pixels: Pixels | Unreadable) -> AbstractContextManager[None]:
-        """A small frame is worked on in one thread: others would wake up late between frames."""
-        small = not isinstance(pixels, Unreadable) and pixels.shape[0] * pixels.shape[1] <= MOST_PIXELS
-        return OneThread() if small else nullcontext()
 
     def _usable(self, pixels: Pixels | Unreadable) -> tuple[Tensor | None, str]:
         """A frame rectified; or None, and why it cannot be used."""

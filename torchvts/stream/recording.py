@@ -11,7 +11,7 @@ from torch import Tensor
 from ..core.checks import check_positive, check_switch
 from ..core.spelling import suggest
 from ..model import Calibration, check_calibration
-from ..pipeline import DepthOutput, DepthPipeline, unit_pipeline
+from ..pipeline import DepthOutput, FrozenPipeline, unit_pipeline
 from ..skin import ContactMask, ContactSettings
 from .background import find_background
 from .follow_light import FollowLight
@@ -53,7 +53,7 @@ class Recording:
         contact: thresholds of contact; None for the usual ones.
         stage: makes a context in which a stage of that name runs, to measure its time.
     Attributes:
-        pipe: the pipeline.
+        pipe: the pipeline, frozen.
     Raises:
         ValueError: contact or changing light in the first frames, or those of another unit.
     """
@@ -79,15 +79,15 @@ class Recording:
         self._light = FollowLight(value)
         self._unlearned: tuple[Tensor, Tensor, float] | None = None
         self.device = check_device(device)
-        self.pipe: DepthPipeline = unit_pipeline(calibration, mode, network, contact).float()
+        pipe = unit_pipeline(calibration, mode, network, contact).float().requires_grad_(False)
         self.check = FrameCheck.from_calibration(calibration)
         self._fps, self._follow, self._stage = fps, follow, stage
         self._before: float | None = None
         image, noise = (None, None) if first is None else find_background(first)
-        if noise is not None and isinstance(self.pipe.mask, ContactMask):  # a video's compression is alike over whole cells
+        if noise is not None and isinstance(pipe.mask, ContactMask):  # a video's compression is alike over whole cells
             relative = calibration.sensor.exponent * noise.float() / value.maximum(noise.float()).clamp_min(1e-3)
-            self.pipe.mask.least_spread = max(self.pipe.mask.least_spread, float(relative.median()))
-        self.pipe.to(self.device)
+            pipe.mask.least_spread = max(pipe.mask.least_spread, float(relative.median()))
+        self.pipe: FrozenPipeline = pipe.to(self.device).freeze()
         if image is not None:
             self._start(calibration, image[None])
 
@@ -106,21 +106,21 @@ class Recording:
             The frame in the background's light, and its depth.
         """
         self.learn()
-        with torch.inference_mode():
-            with self._stage("light"):
-                image = self._light.correct(frame)
-            output: DepthOutput | None = None
-            if solve or self._follow:
-                with self._stage("depth"):
-                    seen, slopes = self.pipe.frame_of(image.to(self.device))
-                    if solve:
-                        output = DepthOutput(*(part.cpu() for part in self.pipe.solved(seen, slopes)))
-                if self._follow:
-                    with self._stage("light"):
-                        moved = (seen.weight > 0.5).cpu()
-                        seconds = 1.0 / self._fps if self._before is None else time_s - self._before
-                        # copies: the caller may write into what is returned
-                        self._unlearned = (frame.clone() if image is frame else frame, moved, seconds)
+        with torch.inference_mode(), self._stage("light"):
+            image = self._light.correct(frame)
+        output: DepthOutput | None = None
+        if solve or self._follow:
+            with self._stage("depth"):
+                given = image.to(self.device)
+                if solve:
+                    found, moved = self.pipe.both(given)
+                    output = DepthOutput(*(part.cpu() for part in found))
+                else:
+                    moved = self.pipe.moved(given)
+            if self._follow:
+                seconds = 1.0 / self._fps if self._before is None else time_s - self._before
+                # copies: the caller may write into what is returned
+                self._unlearned = (frame.clone() if image is frame else frame, moved.cpu(), seconds)
         self._before = time_s
         return image, output
 
@@ -147,8 +147,7 @@ class Recording:
                 f"background: the light is {level:.0%} off the calibration's: another unit, exposure or LEDs; calibrate again"
             )
         corrected = light.correct(image)
-        with torch.inference_mode():
-            deformed = self.pipe.moved(corrected.to(self.device))
+        deformed = self.pipe.moved(corrected.to(self.device))
         if bool(deformed.any()):
             raise ValueError(
                 f"background: the first frames show contact on {float(deformed.float().mean()):.1%} of the skin against the "

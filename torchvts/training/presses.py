@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..accelerated import Compensate
 from ..calibration import RESPONSE_BLUR_PX, CalibrationWarning, Press, calibrate
+from ..compensate import Compensate
 from ..core.checks import check_image
 from ..model import Calibration, Sensor
 from ..training import MlpFit, fit_mlp

@@ -1,8 +1,6 @@
-/* Normals by a response field: the same results as torchvts/normals/response.py, which explains them. Along a row each coefficient of the
+/* Normals by a response field: torchvts/normals/response.py, which explains them. Along a row each coefficient of the
    field is a polynomial in position, so a row needs a few parameters in place of maps. */
-#include "kernels.h"
-
-#include <math.h>
+#include "plan.h"
 
 enum { SINGLE = 3, PRODUCTS = 6, CUBES = 10, MOST_TERMS = SINGLE + PRODUCTS + CUBES };
 
@@ -75,22 +73,16 @@ WIDE static void to_normal(float max_sine, int n, float *restrict x, float *rest
     }
 }
 
-/*
- * Normals (frames, 3, height, width) of images. place: of each column, in [-1, 1]; weight (height, degree + 1, 2, terms) with degree 2, 4 or 6;
- * depth (frames, height, width), or null; per_mm (height, 3, 3). Beyond the depth reference_mm a slope changes brightness
- * 1 + steeper (depth - reference_mm) times as much as the weights say.
- */
-EXPORT void response_normals(const float *image, const float *place, const float *weight, int degree, int terms, const float *depth,
-                             const float *per_mm, float steeper, float reference_mm, float max_sine, int frames, int height, int width, float *normal) {
+void response_normals(const Plan *plan, const float *light, const float *depth, float *normal) {
+    const int terms = (int)plan->terms, degree = (int)plan->degree, width = (int)plan->width;
     const int cubes = terms >= SINGLE + CUBES, products = terms - (cubes ? CUBES : 0) > SINGLE;
     const row_of row = ALL_ROWS[products + 2 * cubes][degree / 2 - 1];
-    const size_t pixels = (size_t)height * width;
-    for (int b = 0; b < frames; b++)
-        for (int y = 0; y < height; y++) {
-            const size_t line = (size_t)y * width, at = 3 * pixels * b + line;
-            float *to = normal + at;
-            row(image + at, pixels, place, weight + (size_t)2 * terms * (degree + 1) * y, depth ? depth + pixels * b + line : NULL,
-                depth ? per_mm + 9 * y : NULL, steeper, reference_mm, width, to, to + pixels);
-            to_normal(max_sine, width, to, to + pixels, to + 2 * pixels);
-        }
+    const size_t pixels = (size_t)plan->height * width;
+    for (int y = 0; y < plan->height; y++) {
+        const size_t at = (size_t)y * width;
+        float *to = normal + at;
+        row(light + at, pixels, plan->field_place, plan->field + (size_t)2 * terms * (degree + 1) * y, depth ? depth + at : NULL,
+            depth ? plan->per_mm + 9 * y : NULL, (float)plan->steeper, (float)plan->reference_mm, width, to, to + pixels);
+        to_normal((float)plan->max_sine, width, to, to + pixels, to + 2 * pixels);
+    }
 }

@@ -1,10 +1,10 @@
-/* Compensated images and the drift of their light: the same results as torchvts/compensate, which explains them. */
-#include "kernels.h"
+/* From a camera's linear light to the compensated image: torchvts/compensate, which explains it. */
+#include "plan.h"
 
-#include <math.h>
+#include <stdlib.h>
 
 /* Means of 3 x 3 pixels, the first from (first, first) on and then every `stride`, of `planes` images: (planes, rows, columns). */
-EXPORT void grid_means(const float *image, int planes, int height, int width, int stride, int first, int rows, int columns, float *means) {
+void grid_means(const float *image, int planes, int height, int width, int stride, int first, int rows, int columns, float *means) {
     for (int plane = 0; plane < planes; plane++, image += (size_t)height * width)
         for (int i = 0; i < rows; i++)
             for (int j = 0; j < columns; j++) {
@@ -63,15 +63,21 @@ WIDE FUSED static void weighted_sum(const float *const *lines, const float *rest
     }
 }
 
-/* What is done to a plane: image * gain + offset, either of which may be null. */
+/* What is done to a plane: image * gain + offset, either of which may be null; where both frame and background are saturated, the model's light. */
 typedef struct {
-    const float *image, *gain, *offset;
-    float pedestal;
+    const float *image, *gain, *offset, *model;
+    float pedestal, saturated;
 } Affine;
+
+/* The model's light where it is known, which is where the background is saturated, and the image is so bright. */
+static WIDE void restore(const float *restrict image, const float *restrict model, float saturated, size_t n, float *restrict light) {
+    for (size_t k = 0; k < n; k++) light[k] = (image[k] >= saturated) & (model[k] > 0.0f) ? model[k] : light[k];
+}
 
 /* n values from `at` on. */
 static void apply(const Affine *of, size_t at, int n, float *light) {
     multiply_add(of->image + at, of->gain ? of->gain + at : NULL, of->offset ? of->offset + at : NULL, of->pedestal, n, light);
+    if (of->model) restore(of->image + at, of->model + at, of->saturated, (size_t)n, light);
 }
 
 /* Has the processor fetch what apply() will read: rows are too short for it to see by itself where they go on. */
@@ -84,7 +90,7 @@ static void ahead(const Affine *of, size_t at, int n) {
 }
 
 /* A plane blurred, its border repeated. scratch: taps lines, and one that is `taps` longer; `lines`: taps pointers. */
-static void blur_plane(const Affine *plane, const float *weight, int taps, int height, int width, float *scratch, const float **lines, float *out) {
+static void blur_lines(const Affine *plane, const float *weight, int taps, int height, int width, float *scratch, const float **lines, float *out) {
     const int reach = taps / 2;
     float *padded = scratch + (size_t)taps * width, *row = padded + reach;
     for (int y = 0, next = 0; y < height; y++) {
@@ -102,6 +108,15 @@ static void blur_plane(const Affine *plane, const float *weight, int taps, int h
         }
         weighted_sum(lines, weight, taps, width, out + (size_t)y * width);
     }
+}
+
+int blur_plane(const float *plane, const float *weight, int taps, int height, int width, float *out) {
+    const Affine affine = {.image = plane};
+    const float **line = malloc(sizeof(float *) * (size_t)taps + sizeof(float) * ((size_t)taps * width + width + taps));
+    if (!line) return NO_MEMORY;
+    blur_lines(&affine, weight, taps, height, width, (float *)(line + taps), line, out);
+    free(line);
+    return DONE;
 }
 
 /* Defective pixels of a plane become the mean of four others. */
@@ -129,14 +144,14 @@ WIDE static void from_keys(uint32_t *keys, int n) {
 }
 
 /* Sorts n values by the bits of their floats, at most twelve at a time; other: as many more. Returns where the sorted values lie. */
-static float *sorted(float *values, float *other, int n) {
+float *sorted(float *values, float *other, int n) {
     uint32_t counts[3][4096], *from = (uint32_t *)values, *to = (uint32_t *)other, low, high;
     to_keys(from, n, &low, &high);
     int bits = 0;
     while (bits < 32 && (high - low) >> bits) bits++;
     const int passes = bits > 24 ? 3 : bits > 12 ? 2 : 1, digit = (bits + passes - 1) / passes;
     const uint32_t most = (1u << digit) - 1u;
-    memset(counts, 0, sizeof counts[0] * (size_t)passes);
+    for (int pass = 0; pass < passes; pass++) memset(counts[pass], 0, sizeof(uint32_t) << digit);
     for (int pass = 0; pass < passes; pass++)
         for (int k = 0; k < n; k++) counts[pass][(from[k] - low) >> (digit * pass) & most]++;
     for (int pass = 0; pass < passes; pass++) {
@@ -208,7 +223,9 @@ WIDE static void count_near(float some[3][LINE], int n, const float level[5][3],
 }
 
 /* Drift.of_one_skin() of torchvts/compensate/drift.py: the drift of a frame, in place of what each channel by itself says. */
-static void make_of_one_skin(const float *image, int height, int width, int stride, float least_drift, float *drift) {
+static void make_of_one_skin(const Plan *plan, const float *image, float *drift) {
+    const int height = (int)plan->height, width = (int)plan->width, stride = (int)plan->drift_stride;
+    const float least_drift = (float)plan->least_drift, reach = (float)(plan->same_skin * plan->least_drift);
     const float lowest = fminf(fminf(drift[0], drift[1]), drift[2]), highest = fmaxf(fmaxf(drift[0], drift[1]), drift[2]);
     const int columns = sampled(width, stride);
     float levels[5][3], some[3][LINE];
@@ -223,77 +240,159 @@ static void make_of_one_skin(const float *image, int height, int width, int stri
                 const float *row = image + ((size_t)c * height + y) * width + stride / 2 + (size_t)first * stride;
                 for (int j = 0; j < n; j++) some[c][j] = row[(size_t)j * stride] - 1.0f;
             }
-            count_near(some, n, levels, 2.0f * least_drift, counts);
+            count_near(some, n, levels, reach, counts);
         }
-    most = 6 * counts[0];
+    most = (int)plan->more_skin * counts[0];
     for (int k = 1; k < 5; k++)
-        if (5 * counts[k] > most) most = 5 * counts[k], best = k;
+        if (100 * counts[k] > most) most = 100 * counts[k], best = k;
     for (int c = 0; c < 3; c++) drift[c] = levels[best][c];
 }
 
-/* light (frames, 3, height, width) = image * gain + offset, its `defects` filled, blurred by `taps` weights. gain and offset (3, height, width) may be
-   null, taps and defects 0; without offset it is pedestal (3) * gain. Returns 1 where memory is short. */
-EXPORT int clean(const float *image, const float *gain, const float *offset, const float *pedestal, const int64_t *defect, const int64_t *neighbours,
-                 int64_t defects, const float *weight, int taps, int frames, int height, int width, float *light) {
-    const size_t pixels = (size_t)height * width, lines = (size_t)taps * width + width + taps, filled = taps && defects ? pixels : 0;
-    const float **line = malloc(sizeof(float *) * (size_t)(taps + 1) + sizeof(float) * (lines + filled + (size_t)defects + 1));
-    if (!line) return 1;
+/* Gain, offset, defects and blur of linear light. */
+static int clean(const Plan *plan, const float *image, float *light) {
+    const int taps = (int)plan->blur_taps, height = (int)plan->height, width = (int)plan->width;
+    const size_t pixels = (size_t)height * width, lines = (size_t)taps * width + width + taps, filled = taps && plan->defects ? pixels : 0;
+    const float **line = malloc(sizeof(float *) * (size_t)(taps + 1) + sizeof(float) * (lines + filled + (size_t)plan->defects + 1));
+    if (!line) return NO_MEMORY;
     float *rows = (float *)(line + taps + 1), *whole = rows + lines, *repaired = whole + filled;
-    for (int plane = 0; plane < 3 * frames; plane++, image += pixels, light += pixels) {
-        const size_t at = pixels * (size_t)(plane % 3);
-        Affine affine = {image, gain ? gain + at : NULL, offset ? offset + at : NULL, pedestal[plane % 3]};
-        if (defects || !taps) {
-            float *to = taps ? whole : light;
+    for (int c = 0; c < 3; c++, image += pixels, light += pixels) {
+        const size_t at = pixels * (size_t)c;
+        Affine affine = {image, plan->gain ? plan->gain + at : NULL, plan->offset ? plan->offset + at : NULL,
+                         plan->saturated_model ? plan->saturated_model + at : NULL, plan->pedestal[c], (float)plan->saturation_light};
+        if (plan->defects || !taps) {
+            float *to = filled ? whole : light;
             apply(&affine, 0, (int)pixels, to);
-            if (defects) fill(to, defect, neighbours, defects, repaired);
-            affine = (Affine){to, NULL, NULL, 0.0f};
+            if (plan->defects) fill(to, plan->defect, plan->neighbours, plan->defects, repaired);
+            affine = (Affine){.image = to};
         }
-        if (taps) blur_plane(&affine, weight, taps, height, width, rows, line, light);
+        if (taps) blur_lines(&affine, plan->blur, taps, height, width, rows, line, light);
     }
     free(line);
-    return 0;
+    return DONE;
 }
 
-/* The levels (frames, 3) that Drift.by_mode() of torchvts/compensate/drift.py divides images by: from the mode of every stride-th pixel. Returns 1
-   where memory is short. */
-EXPORT int levels(const float *image, int frames, int height, int width, int stride, int halvings, float least_drift, float most, float *level) {
+/* Drift.by_mode(): the levels of the channels. */
+static int by_mode(const Plan *plan, const float *light, float *level) {
+    const int height = (int)plan->height, width = (int)plan->width, stride = (int)plan->drift_stride;
     const size_t pixels = (size_t)height * width;
-    float *some = malloc(2 * sizeof(float) * (size_t)sampled(height, stride) * sampled(width, stride));
-    if (!some) return 1;
-    for (int b = 0; b < frames; b++, image += 3 * pixels, level += 3) {
-        float largest = 0.0f;
-        for (int c = 0; c < 3; c++) {
-            const float drift = mode_of(image + pixels * c, height, width, stride, halvings, some) - 1.0f;
-            level[c] = drift < -most ? -most : drift > most ? most : drift;
-        }
-        make_of_one_skin(image, height, width, stride, least_drift, level);
-        for (int c = 0; c < 3; c++) largest = fabsf(level[c]) > largest ? fabsf(level[c]) : largest;
-        float weight = largest / least_drift - 1.0f;
-        weight = weight < 0.0f ? 0.0f : weight > 1.0f ? 1.0f : weight;
-        for (int c = 0; c < 3; c++) level[c] = 1.0f + weight * level[c];
+    const float most = (float)plan->most_drift, least_drift = (float)plan->least_drift;
+    float *some = malloc(2 * sizeof(float) * (size_t)sampled(height, stride) * sampled(width, stride)), largest = 0.0f;
+    if (!some) return NO_MEMORY;
+    for (int c = 0; c < 3; c++) {
+        const float drift = mode_of(light + pixels * c, height, width, stride, (int)plan->halvings, some) - 1.0f;
+        level[c] = drift < -most ? -most : drift > most ? most : drift;
     }
     free(some);
-    return 0;
+    make_of_one_skin(plan, light, level);
+    for (int c = 0; c < 3; c++) largest = fabsf(level[c]) > largest ? fabsf(level[c]) : largest;
+    float weight = largest / least_drift - 1.0f;
+    weight = weight < 0.0f ? 0.0f : weight > 1.0f ? 1.0f : weight;
+    for (int c = 0; c < 3; c++) level[c] = 1.0f + weight * level[c];
+    return DONE;
 }
 
-WIDE static void divide_all(const float *restrict values, float by, size_t n, float *restrict result) {
-    for (size_t k = 0; k < n; k++) result[k] = values[k] / by;
+int samples_along(int length, int stride) { return stride < 3 ? sampled(length, stride) : length / stride; }
+
+void sample(const float *image, int height, int width, int stride, int planes, float *means) {
+    const int rows = samples_along(height, stride), columns = samples_along(width, stride);
+    if (stride > 2) {
+        grid_means(image, planes, height, width, stride, stride / 2 - 1, rows, columns, means);
+        return;
+    }
+    for (int c = 0; c < planes; c++)
+        for (int y = stride / 2; y < height; y += stride)
+            for (int x = stride / 2; x < width; x += stride) *means++ = image[((size_t)c * height + y) * width + x];
 }
 
-/* Each of `planes` images of n pixels divided by its level. */
-EXPORT void divide_planes(const float *image, const float *level, int planes, int64_t n, float *result) {
-    for (int k = 0; k < planes; k++) divide_all(image + n * k, level[k], (size_t)n, result + n * k);
+/* Squared distances of samples from levels, in units of their variance, summed over the channels: (n); of one channel alone from 1, if it is given. */
+static void squared(const Plan *plan, const float *ratio, const float *level, int one, int n, float *chi) {
+    for (int k = 0; k < n; k++) chi[k] = 0.0f;
+    for (int c = 0; c < 3; c++) {
+        const float from = c == one ? 1.0f : level[c], *values = ratio + (size_t)c * n, *variance = plan->skin_variance + (size_t)c * n;
+        for (int k = 0; k < n; k++) chi[k] += (values[k] - from) * (values[k] - from) / variance[k];
+    }
 }
 
-/* FollowLight.correct() of torchvts/stream/follow_light.py: an image (3, height, width) over a level and two tilts of each channel (3, 3), within 0
-   and 1; x (width), y (height): where the tilts are -1 to 1. */
-EXPORT WIDE void over_tilted(const float *image, const float *plane, const float *x, const float *y, int height, int width, float *result) {
-    for (int c = 0; c < 3; c++, plane += 3)
-        for (int row = 0; row < height; row++, image += width, result += width) {
-            const float by_row = plane[2] * y[row];
-            for (int k = 0; k < width; k++) {
-                const float value = image[k] / (plane[0] + plane[1] * x[k] + by_row), below = value < 1.0f ? value : 1.0f;
-                result[k] = below > 0.0f ? below : 0.0f;
+static double likelihood(const float *chi, int n) {
+    double sum = 0.0;
+    for (int k = 0; k < n; k++) sum += (double)expf(-0.5f * chi[k]);
+    return sum / n * 2.8284271247461903; /* a Gaussian in three channels has a mean of 2^(-3/2) */
+}
+
+/* The levels to which samples of undeformed skin are drawn: Drift.by_statistics() from its modes on. */
+static void refine_levels(const Plan *plan, const float *ratio, int n, float *chi, float *level) {
+    for (int pass = 0; pass < 2; pass++) {
+        double sums[3] = {0.0}, weights[3] = {0.0};
+        squared(plan, ratio, level, -1, n, chi);
+        for (int k = 0; k < n; k++) {
+            const float weight = expf(-0.5f * chi[k]);
+            for (int c = 0; c < 3; c++) {
+                const float here = weight / plan->skin_variance[(size_t)c * n + k];
+                sums[c] += (double)(here * ratio[(size_t)c * n + k]), weights[c] += (double)here;
             }
         }
+        for (int c = 0; c < 3; c++) level[c] = (float)(sums[c] / (weights[c] > 1e-12 ? weights[c] : 1e-12));
+    }
+    squared(plan, ratio, level, -1, n, chi);
+    const double undeformed = likelihood(chi, n), share = undeformed > 0.5 ? plan->share_of_most : plan->share_of_few;
+    float drift[3];
+    int sure[3];
+    for (int c = 0; c < 3; c++) {
+        squared(plan, ratio, level, c, n, chi);
+        drift[c] = fabsf(level[c] - 1.0f);
+        sure[c] = drift[c] > (float)plan->least_level && drift[c] < (float)plan->most_level && undeformed > plan->least_skin &&
+                  likelihood(chi, n) < share * undeformed;
+    }
+    for (int c = 0; c < 3; c++) level[c] = sure[c] ? level[c] : 1.0f;
+}
+
+/* Drift.by_statistics(): the levels of the channels. */
+static int by_statistics(const Plan *plan, const float *light, float *level) {
+    const int height = (int)plan->height, width = (int)plan->width, stride = (int)plan->drift_stride;
+    const int n = samples_along(height, stride) * samples_along(width, stride);
+    float *ratio = malloc(6 * sizeof(float) * (size_t)n), *some = ratio + 3 * (size_t)n, *chi = some + 2 * (size_t)n;
+    if (!ratio) return NO_MEMORY;
+    sample(light, height, width, stride, 3, ratio);
+    int near = 1;
+    for (int c = 0; c < 3; c++) {
+        for (int k = 0; k < n; k++) some[k] = ratio[(size_t)c * n + k] /= plan->skin[(size_t)c * n + k];
+        const float *ordered = sorted(some, some + n, n);
+        near &= fabsf(ordered[(n - 1) / 2] - 1.0f) < 0.5f * (float)plan->least_level;
+        level[c] = half_sample_mode(ordered, n, (int)plan->halvings);
+    }
+    if (near)
+        level[0] = level[1] = level[2] = 1.0f;
+    else
+        refine_levels(plan, ratio, n, chi, level);
+    free(ratio);
+    return DONE;
+}
+
+static WIDE void divide_all(float *values, float by, size_t n) {
+    for (size_t k = 0; k < n; k++) values[k] /= by;
+}
+
+/* Drift.forward(): the levels that light is divided by. */
+static int levels_of(const Plan *plan, const float *light, float *level) {
+    int code = plan->drifts == BY_STATISTICS ? by_statistics(plan, light, level) : by_mode(plan, light, level);
+    if (code != DONE || plan->drifts != BY_MODE_FIRST) return code;
+    int held = 0;
+    for (int c = 0; c < 3; c++) held |= !(fabsf(level[c] - 1.0f) < (float)plan->most_by_mode);
+    if (!held) return DONE;
+    float far[3];
+    code = by_statistics(plan, light, far);
+    for (int c = 0; c < 3; c++) level[c] = fabsf(far[c] - 1.0f) > (float)plan->taken_over ? far[c] : level[c];
+    return code;
+}
+
+int compensate(const Plan *plan, const float *image, float *light) {
+    const size_t pixels = (size_t)plan->height * plan->width;
+    int code = clean(plan, image, light);
+    if (code != DONE || plan->drifts == NO_DRIFT) return code;
+    float level[3];
+    code = levels_of(plan, light, level);
+    for (int c = 0; c < 3 && code == DONE; c++)
+        if (level[c] != 1.0f) divide_all(light + pixels * c, level[c], pixels);
+    if (plan->restores) restore(image, plan->saturated_model, (float)plan->saturation_light, 3 * pixels, light);
+    return code;
 }

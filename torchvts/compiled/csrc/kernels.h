@@ -51,7 +51,6 @@
 #define FETCH(address) (void)(address)
 #endif
 
-EXPORT void grid_means(const float *image, int planes, int height, int width, int stride, int first, int rows, int columns, float *means);
 
 static inline int least(int a, int b) { return a < b ? a : b; }
 

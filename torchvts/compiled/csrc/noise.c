@@ -1,8 +1,8 @@
-/* Noise of images: the same results as torchvts/core/noise.py, which explains them. */
-#include "kernels.h"
+/* Noise of a frame: torchvts/core/noise.py, which explains it. */
+#include "plan.h"
 
 #include <float.h>
-#include <math.h>
+#include <stdlib.h>
 
 /* The k-th smallest of n values, which it reorders, by Hoare's selection; or what is no number if one of them is none. */
 static float kth_smallest(float *values, int n, int k) {
@@ -59,21 +59,25 @@ static float noise_from(const float *some, int n, float std) {
     return std / sqrtf(1.5f);
 }
 
-/* noise_of_spotted() of torchvts/core/noise.py, of images (frames, 3, height, width): noise (frames, 3). Returns 1 where memory is short. */
-EXPORT int frame_noise(const float *image, int frames, int height, int width, int stride, float *noise) {
+/* noise_of_spotted() of noise.py, or the calibrated noise where that is larger. */
+int measure_noise(const Plan *plan, const float *light, float *noise) {
+    const int height = (int)plan->height, width = (int)plan->width, stride = (int)plan->noise_stride;
     const size_t samples = (size_t)((height + stride - 1) / stride) * ((width + stride - 1) / stride);
     float *some = malloc(2 * sizeof(float) * samples);
-    if (!some) return 1;
-    for (int k = 0; k < 3 * frames; k++, image += (size_t)height * width) {
+    if (!some) return NO_MEMORY;
+    for (int c = 0; c < 3; c++, light += (size_t)height * width) {
         int n = 0;
         for (int y = stride / 2; y < height; y += stride)
             for (int x = 0; x < width - 2; x += stride) {
-                const float *at = image + (size_t)y * width + x;
+                const float *at = light + (size_t)y * width + x;
                 some[n++] = fabsf(at[1] - 0.5f * (at[0] + at[2]));
             }
+        noise[c] = plan->noise_std[c];
+        if (n == 0) continue;
         memcpy(some + n, some, sizeof(float) * (size_t)n);
-        noise[k] = noise_from(some, n, kth_smallest(some + n, n, n / 4) / 0.3186f);
+        const float found = noise_from(some, n, kth_smallest(some + n, n, n / 4) / 0.3186f);
+        noise[c] = found > noise[c] ? found : noise[c];
     }
     free(some);
-    return 0;
+    return DONE;
 }

@@ -5,7 +5,6 @@
 #define PERHAPS 2
 #define LANES 16
 #define INLINE static inline __attribute__((always_inline))
-#define HUGE_FACTOR 3.4e32f /* the largest float is 3.4028e38 */
 
 static WIDE float largest(const float *values, int64_t size) {
     float most[LANES];
@@ -175,38 +174,5 @@ EXPORT int track_grids(
         if (k == 0) count = inside;
     }
     free(sums);
-    return count;
-}
-
-/* 0 if all of `size` values are at most 1e6, else NaN: larger ones times HUGE_FACTOR are infinite. */
-static WIDE float zero_if_usable(const float *values, int64_t size) {
-    float none[4 * LANES] = {0.0f};
-    const int64_t whole = size - size % (4 * LANES);
-    for (int64_t n = 0; n < whole; n += 4 * LANES)
-        for (int k = 0; k < 4 * LANES; k++) none[k] += 0.0f * (HUGE_FACTOR * values[n + k]);
-    for (int64_t n = whole; n < size; n++) none[0] += 0.0f * (HUGE_FACTOR * values[n]);
-    for (int k = 1; k < 4 * LANES; k++) none[0] += none[k];
-    return none[0];
-}
-
-/* How many pixels of a frame touch; -1 where depth (size) or slopes (2, size) are not finite, or beyond 1e6. */
-EXPORT WIDE int contact_pixels(const float *depth, const float *slopes, const uint8_t *contact, int64_t size) {
-    if (zero_if_usable(slopes, 2 * size) != 0.0f || zero_if_usable(depth, size) != 0.0f) return -1; /* depth is at hand for what follows */
-    int count = 0;
-    for (int64_t n = 0; n < size; n++) count += contact[n] != 0;
-    return count;
-}
-
-/* The cells of a field (height, width, 4) that lie on the object: x, y, z, p and q of each, (5, stride). Returns their number. */
-EXPORT int object_pixels(const float *field, int height, int width, double x0, double y0, double pitch, int64_t stride, float *columns) {
-    int count = 0;
-    for (int y = 0; y < height; y++)
-        for (int x = 0; x < width; x++) {
-            const float *from = field + 4 * ((int64_t)y * width + x);
-            float *to = columns + count;
-            to[0] = (float)(x0 + x * pitch), to[stride] = (float)(y0 - y * pitch);
-            for (int k = 0; k < 3; k++) to[(2 + k) * stride] = from[k];
-            count += from[3] > 0.999f;
-        }
     return count;
 }

@@ -1,8 +1,6 @@
-/* Normals under three near lights: the same numbers as NormalFromIntensity in torchvts/normals/photometric.py and normal_at_depth in
-   torchvts/shading.py, which say why. */
-#include "kernels.h"
-
-#include <math.h>
+/* Normals under three near lights: NormalFromIntensity of torchvts/normals/photometric.py and normal_at_depth() of torchvts/model/lights.py, which
+   explain them; and the slopes of normals. */
+#include "plan.h"
 
 /* One row of normals (3, n) from intensities and the nine rows of the inverse light matrix; channels `plane` and `step` elements apart. */
 WIDE static void from_inverse(const float *restrict image, size_t step, const float *restrict inverse, size_t plane, int n,
@@ -76,31 +74,32 @@ static Lights lights_of(const float *position, const float *albedo) {
     return lights;
 }
 
-/*
- * Normals (frames, 3, height, width) of images. three_noises (frames, 3). flat, what the lights give on the flat skin, and saturated
- * (3, height, width), inverse (3, 3, height, width). With depth (frames, height, width) the inverse is not needed, but position and albedo of the
- * lights; `per_height` is 1 over the camera's height. Returns whether any light is blocked or channel saturated.
- */
-EXPORT int normals(const float *image, const float *three_noises, const float *flat, const float *saturated, const float *inverse, int frames,
-                   int height, int width, const float *depth, const float *position, const float *albedo, float pitch, float per_height,
-                   float *normal) {
+static void by_lights(const Plan *plan, const float *light, const float *noise, const float *depth, float *normal) {
+    const int height = (int)plan->height, width = (int)plan->width;
     const size_t pixels = (size_t)height * width;
-    int invalid = 0;
+    const float pitch = (float)plan->mm_per_pixel;
+    int invalid = (int)plan->any_ill_conditioned;
     Lights lights;
-    if (depth) lights = lights_of(position, albedo);
-    for (int b = 0; b < frames; b++)
-        for (int y = 0; y < height; y++) {
-            const size_t line = (size_t)y * width, at = 3 * pixels * b + line;
-            float *to = normal + at;
-            if (depth)
-                at_depth(image + at, pixels, depth + pixels * b + line, &lights, -0.5f * (float)(width - 1) * pitch,
-                         ((float)y - 0.5f * (float)(height - 1)) * pitch, pitch, per_height, width, to, to + pixels, to + 2 * pixels);
-            else
-                from_inverse(image + at, pixels, inverse + line, pixels, width, to, to + pixels, to + 2 * pixels);
-            for (int c = 0; c < 3; c++)
-                invalid |= any_invalid(image + at + pixels * c, flat + pixels * c + line, three_noises[3 * b + c], saturated + pixels * c + line, width);
-        }
-    return invalid;
+    if (depth) lights = lights_of(plan->position, plan->albedo);
+    for (int y = 0; y < height; y++) {
+        const size_t at = (size_t)y * width;
+        float *to = normal + at;
+        if (depth)
+            at_depth(light + at, pixels, depth + at, &lights, -0.5f * (float)(width - 1) * pitch, ((float)y - 0.5f * (float)(height - 1)) * pitch, pitch,
+                     (float)plan->per_camera_height, width, to, to + pixels, to + 2 * pixels);
+        else
+            from_inverse(light + at, pixels, plan->inverse + at, pixels, width, to, to + pixels, to + 2 * pixels);
+        for (int c = 0; c < 3; c++)
+            invalid |= any_invalid(light + at + pixels * c, plan->flat_light + pixels * c + at, 3.0f * noise[c], plan->saturated_above + pixels * c + at, width);
+    }
+    if (invalid) solve_shadowed(plan, light, noise, depth, normal);
+}
+
+void find_normals(const Plan *plan, const float *light, const float *noise, const float *depth, float *normal) {
+    if (plan->by_lights)
+        by_lights(plan, light, noise, depth, normal);
+    else
+        response_normals(plan, light, depth, normal);
 }
 
 WIDE static void slope_row(const float *restrict x, const float *restrict y, const float *restrict z, float per_slope, int n,
@@ -111,10 +110,6 @@ WIDE static void slope_row(const float *restrict x, const float *restrict y, con
     }
 }
 
-/* Gradients (frames, 2, pixels) of normals (frames, 3, pixels), no steeper than 1 / per_slope. */
-EXPORT void slopes(const float *normal, int frames, int pixels, float per_slope, float *gradient) {
-    for (size_t b = 0; b < (size_t)frames; b++) {
-        const float *x = normal + 3 * b * pixels;
-        slope_row(x, x + pixels, x + 2 * (size_t)pixels, per_slope, pixels, gradient + 2 * b * pixels, gradient + (2 * b + 1) * pixels);
-    }
+void find_slopes(const float *normal, size_t pixels, double max_slope, float *gradient) {
+    slope_row(normal, normal + pixels, normal + 2 * pixels, (float)(1.0 / max_slope), (int)pixels, gradient, gradient + pixels);
 }

@@ -1,5 +1,14 @@
-/* Gauss-Newton steps of a tracked pose: the same results as torchvts/pose/inverse.py, which explains them. */
-#include "track.h"
+/* Sums of a tracked pose, which a frame passes through: torchvts/pose/inverse.py and height_errors.py, which explain them. */
+#include "kernels.h"
+
+#define SIZE 7  /* six twists and the residual */
+#define SUMS 56 /* SIZE * SIZE products, then seven sums of the score: */
+enum { USED = SIZE * SIZE, WEIGHT, SLOPES, HEIGHTS, BAD, GOOD, COMPARED };
+
+/* What the residuals depend on beside the pixels; the order is that of residual_limits in inverse.py. */
+typedef struct {
+    double pose[16], x0, y0, pitch, per_slope, per_height, score_slope, score_height, deep, shallow;
+} Limits;
 
 #define INLINE static inline __attribute__((always_inline))
 #define LANES 8
@@ -158,101 +167,6 @@ EXPORT void part_sums(
     for (int k = 0; k < parts; k++) {
         const int first = (int)((int64_t)count * k / parts), end = (int)((int64_t)count * (k + 1) / parts);
         alignment_sums(field, height, width, columns + first, stride, end - first, 0, at, sums + (int64_t)SUMS * k);
-    }
-}
-
-/* Solves the symmetric A x = b of six unknowns by Cholesky's factors; A is overwritten. */
-void solve_six(double A[6][6], const double b[6], double x[6]) {
-    for (int k = 0; k < 6; k++) {
-        for (int m = 0; m < k; m++) A[k][k] -= A[k][m] * A[k][m];
-        A[k][k] = sqrt(A[k][k] > 1e-300 ? A[k][k] : 1e-300);
-        for (int i = k + 1; i < 6; i++) {
-            for (int m = 0; m < k; m++) A[i][k] -= A[i][m] * A[k][m];
-            A[i][k] /= A[k][k];
-        }
-    }
-    for (int k = 0; k < 6; k++) {
-        x[k] = b[k];
-        for (int m = 0; m < k; m++) x[k] -= A[k][m] * x[m];
-        x[k] /= A[k][k];
-    }
-    for (int k = 5; k >= 0; k--) {
-        for (int m = k + 1; m < 6; m++) x[k] -= A[m][k] * x[m];
-        x[k] /= A[k][k];
-    }
-}
-
-/* solve_step of inverse.py: the scaled twist that the sums ask for, but for the motions in the columns of held (6, holds). */
-void solve_step(const double *sums, const double *held, int holds, double largest_mm, double step[6]) {
-    double known[6][6], half[6][6], A[6][6], b[6], trace = 0.0, square = 0.0;
-    for (int i = 0; i < 6; i++)
-        for (int k = 0; k < 6; k++) {
-            known[i][k] = i == k ? 1.0 : 0.0;
-            for (int h = 0; h < holds; h++) known[i][k] -= held[i * holds + h] * held[k * holds + h];
-        }
-    for (int i = 0; i < 6; i++)
-        for (int k = 0; k < 6; k++) {
-            half[i][k] = 0.0;
-            for (int m = 0; m < 6; m++) half[i][k] += known[i][m] * sums[SIZE * m + k];
-        }
-    for (int i = 0; i < 6; i++) {
-        b[i] = 0.0;
-        for (int m = 0; m < 6; m++) b[i] -= known[i][m] * sums[SIZE * m + 6];
-        for (int k = 0; k < 6; k++) {
-            A[i][k] = 0.0;
-            for (int m = 0; m < 6; m++) A[i][k] += half[i][m] * known[m][k];
-        }
-        trace += A[i][i];
-    }
-    for (int k = 0; k < 6; k++) A[k][k] += 1e-6 * (trace > 1e-9 ? trace : 1e-9) * (k < 3 ? 1.0 : 1e-3);
-    solve_six(A, b, step);
-    for (int k = 0; k < 6; k++) square += step[k] * step[k];
-    const double shorter = square > largest_mm * largest_mm ? largest_mm / sqrt(square) : 1.0;
-    for (int k = 0; k < 6; k++) step[k] *= shorter;
-}
-
-/* pose = pose * the rigid motion of a twist about a centre, by Rodrigues' formula. */
-void move_pose(double *pose, const double *twist, const double *center) {
-    const double x = twist[0], y = twist[1], z = twist[2], angle = sqrt(x * x + y * y + z * z);
-    const double first = angle > 1e-9 ? sin(angle) / angle : 1.0;
-    const double second = angle > 1e-9 ? (1.0 - cos(angle)) / (angle * angle) : 0.5;
-    const double cross[3][3] = {{0.0, -z, y}, {z, 0.0, -x}, {-y, x, 0.0}}, w[3] = {x, y, z};
-    double motion[3][4];
-    for (int i = 0; i < 3; i++) {
-        for (int k = 0; k < 3; k++) /* cross^2 = w w^T - angle^2 */
-            motion[i][k] = (i == k ? 1.0 : 0.0) + first * cross[i][k] + second * (w[i] * w[k] - (i == k ? angle * angle : 0.0));
-        motion[i][3] = twist[3 + i] + center[i];
-        for (int k = 0; k < 3; k++) motion[i][3] -= motion[i][k] * center[k];
-    }
-    for (int i = 0; i < 3; i++) {
-        const double a = pose[4 * i], b = pose[4 * i + 1], c = pose[4 * i + 2];
-        for (int k = 0; k < 4; k++) {
-            const double moved = a * motion[0][k] + b * motion[1][k] + c * motion[2][k];
-            pose[4 * i + k] = moved + (k == 3 ? pose[4 * i + 3] : 0.0);
-        }
-    }
-}
-
-/* refine of inverse.py: at->pose is moved; sums are those before the last step, then the slope noise of their weights. */
-EXPORT void refine_pose(
-    const float *field, int height, int width, const float *columns, int64_t stride, int count, int steps, const Steps *by,
-    const double *held, int holds, Limits *at, double *sums) {
-    double noise = by->wide;
-    for (int s = 0; s < steps; s++) {
-        double step[6], twist[6], largest = 0.0;
-        at->per_slope = 1.0 / (noise * noise);
-        alignment_sums(field, height, width, columns, stride, count, 0, at, sums);
-        sums[SUMS] = noise;
-        solve_step(sums, held, holds, by->largest_mm, step);
-        for (int k = 0; k < 6; k++) {
-            twist[k] = step[k] * by->units[k];
-            largest = fabs(step[k]) > largest ? fabs(step[k]) : largest;
-        }
-        move_pose(at->pose, twist, by->center);
-        const double found = 1.5 * slope_noise_of(sums);
-        noise = found > 0.5 * noise ? found : 0.5 * noise;
-        noise = noise > by->least_noise ? noise : by->least_noise;
-        if (largest < by->small_mm) break;
     }
 }
 

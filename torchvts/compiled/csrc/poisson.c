@@ -1,11 +1,12 @@
-/* Depth from slopes with a free border: the same results as torchvts/integration/poisson.py, by other means. A cosine transform of the columns
+/* Depth from slopes with a free border: the same results as PoissonDCT of torchvts/integration/poisson.py, by other means. A cosine transform of the columns
    makes of the five-point Laplacian one equation along x for each coefficient k,
        u[x + 1] - (2 + 4 sin^2(pi k / 2H)) u[x] + u[x - 1] = f[x],
    which two recursions with one pole r solve, from left to right and back: 1 / r + r = 2 + 4 sin^2(pi k / 2H). All of the image's columns are
    even about its borders. (Unser, Splines, IEEE Signal Processing Magazine 16(6), 1999, solves spline filters so.) */
 #include "cosine.h"
+#include "plan.h"
 
-#include <math.h>
+#include <stdlib.h>
 
 static const double PI = 3.14159265358979323846;
 
@@ -19,7 +20,7 @@ typedef struct {
     const double *pole, *gain, *per_start, *end;
     const float *waves;
     Cosine cosine;
-} Plan;
+} Solver;
 
 /* Coefficients lie in slices of so many, SLICE of the first column, of the second and so on. */
 enum { SLICE = 64 };
@@ -54,12 +55,12 @@ EXPORT void make_poisson_plan(int height, int width, double *tables) {
     make_cosine_tables(height, waves);
 }
 
-static Plan plan_of(int height, int width, const double *tables) {
+static Solver solver_of(int height, int width, const double *tables) {
     const int wide = wide_of(height);
     const float *waves = (const float *)(tables + 4 * wide);
-    const Plan plan = {height, width, wide, tables, tables + wide, tables + 2 * wide, tables + 3 * wide, waves,
+    const Solver of = {height, width, wide, tables, tables + wide, tables + 2 * wide, tables + 3 * wide, waves,
                        cosine_of(height, waves + WAVES * (size_t)height)};
-    return plan;
+    return of;
 }
 
 /* A row of the divergence of a gradient: half the difference of what lies after and before each element, and below and above it. Beyond the border
@@ -140,22 +141,22 @@ WIDE static void turn_round(const float *restrict values, const double *restrict
 }
 
 /* Along x: a slice of coefficients becomes that of the depth. */
-static void recursions(const Plan *plan, int from, float *slice) {
-    const int width = plan->width, n = SLICE;
-    const double *pole = plan->pole + from;
+static void recursions(const Solver *of, int from, float *slice) {
+    const int width = of->width, n = SLICE;
+    const double *pole = of->pole + from;
     double sum[SLICE] = {0.0}, other[SLICE] = {0.0}, power[SLICE];
     for (int x = width - 1; x >= 0; x--) sum_up(slice + (size_t)x * SLICE, pole, n, sum);
     for (int x = 0; x < width; x++) sum_up(slice + (size_t)x * SLICE, pole, n, other);
     times_power(pole, width, n, power, other);
-    begin(other, plan->per_start + from, n, sum);
+    begin(other, of->per_start + from, n, sum);
     for (int x = 0; x < width; x++) there(slice + (size_t)x * SLICE, pole, n, sum);
-    turn_round(slice + (size_t)(width - 1) * SLICE, plan->end + from, n, sum);
-    for (int x = width - 1; x >= 0; x--) back(slice + (size_t)x * SLICE, pole, plan->gain + from, n, sum);
+    turn_round(slice + (size_t)(width - 1) * SLICE, of->end + from, n, sum);
+    for (int x = width - 1; x >= 0; x--) back(slice + (size_t)x * SLICE, pole, of->gain + from, n, sum);
 }
 
 /* The same for the constant along y, k = 0: sums of sums, less the mean. constant: its values, and gets the result. */
-static void solve_constant(const Plan *plan, double *constant) {
-    const int width = plan->width;
+static void solve_constant(const Solver *of, double *constant) {
+    const int width = of->width;
     double mean = 0.0, slope = 0.0, depth = 0.0, total = 0.0;
     for (int x = 0; x < width; x++) mean += constant[x] / width;
     for (int x = 0; x < width; x++) {
@@ -163,19 +164,19 @@ static void solve_constant(const Plan *plan, double *constant) {
         constant[x] = depth, total += depth / width;
         slope += here - mean, depth += slope;
     }
-    for (int x = 0; x < width; x++) constant[x] = (constant[x] - total) / plan->height;
+    for (int x = 0; x < width; x++) constant[x] = (constant[x] - total) / of->height;
 }
 
 /* LINES columns of the divergence, whose lines have `step` floats, from `first` on, to their coefficients. */
-static void to_coefficients(const Plan *plan, const float *lines, int step, int first, float *scratch, float *found, float *coefficients) {
-    const size_t n = (size_t)plan->height, wide = (size_t)plan->wide, columns = (size_t)plan->width + LINES;
-    for (int y = 0; y < plan->height; y++) {
+static void to_coefficients(const Solver *of, const float *lines, int step, int first, float *scratch, float *found, float *coefficients) {
+    const size_t n = (size_t)of->height, wide = (size_t)of->wide, columns = (size_t)of->width + LINES;
+    for (int y = 0; y < of->height; y++) {
         const float *line = lines + (size_t)y * step + first;
-        float *to = cosine_line(&plan->cosine, scratch, y);
+        float *to = cosine_line(&of->cosine, scratch, y);
         memcpy(to, line, sizeof(float) * LANES);
         memcpy(to + n * LANES, line + LANES, sizeof(float) * LANES);
     }
-    cosine_forward(&plan->cosine, scratch, found);
+    cosine_forward(&of->cosine, scratch, found);
     for (size_t k = 0; k < wide; k += 4)
         for (int x = 0; x < LINES; x += 4)
             transpose(found + k * LINES + x, LINES, coefficients + place_of(k, (size_t)(first + x), columns), SLICE);
@@ -191,18 +192,18 @@ WIDE FUSED static void add_waves(const float *restrict low, const float *restric
 }
 
 /* The inverse, of LINES columns of depth from `first` on, to `lines`. scratch: as much memory; found: coefficients. */
-static void to_depth(const Plan *plan, const float *coefficients, int first, float *scratch, float *found, float *lines) {
-    const size_t wide = (size_t)plan->wide, columns = (size_t)plan->width + LINES;
+static void to_depth(const Solver *of, const float *coefficients, int first, float *scratch, float *found, float *lines) {
+    const size_t wide = (size_t)of->wide, columns = (size_t)of->width + LINES;
     for (size_t k = 0; k < wide; k += 4)
         for (int x = 0; x < LINES; x += 4) transpose(coefficients + place_of(k, (size_t)(first + x), columns), SLICE, found + k * LINES + x, LINES);
     float low[WAVES * LINES];
     memcpy(low, found, sizeof low);
     memset(found, 0, sizeof low);
-    cosine_inverse(&plan->cosine, found, scratch, lines);
-    for (int y = 0; y < plan->height; y++) {
-        float *row = cosine_line(&plan->cosine, lines, y);
-        add_waves(low, plan->waves + WAVES * (size_t)y, row);
-        add_waves(low + LANES, plan->waves + WAVES * (size_t)y, row + (size_t)plan->height * LANES);
+    cosine_inverse(&of->cosine, found, scratch, lines);
+    for (int y = 0; y < of->height; y++) {
+        float *row = cosine_line(&of->cosine, lines, y);
+        add_waves(low, of->waves + WAVES * (size_t)y, row);
+        add_waves(low + LANES, of->waves + WAVES * (size_t)y, row + (size_t)of->height * LANES);
     }
 }
 
@@ -263,38 +264,32 @@ typedef struct {
     float *coefficients, *lines, *scratch, *found;
 } Memory;
 
-static void solve_one(const Plan *plan, const float *gradient, float half_pitch, Memory at, float *depth) {
-    const int height = plan->height, width = plan->width, blocks = (width + LINES - 1) / LINES;
+static void solve_one(const Solver *of, const float *gradient, float half_pitch, Memory at, float *depth) {
+    const int height = of->height, width = of->width, blocks = (width + LINES - 1) / LINES;
     const size_t columns = (size_t)width + LINES, step = (size_t)height * LANES;
     divergence(gradient, height, width, half_pitch, at.lines, blocks * LINES);
-    for (int k = 0; k < blocks; k++) to_coefficients(plan, at.lines, blocks * LINES, k * LINES, at.scratch, at.found, at.coefficients);
+    for (int k = 0; k < blocks; k++) to_coefficients(of, at.lines, blocks * LINES, k * LINES, at.scratch, at.found, at.coefficients);
     for (int x = 0; x < width; x++) at.constant[x] = at.coefficients[(size_t)x * SLICE];
-    for (int k = 0; k < plan->wide; k += SLICE) recursions(plan, k, at.coefficients + place_of((size_t)k, 0, columns));
-    solve_constant(plan, at.constant);
+    for (int k = 0; k < of->wide; k += SLICE) recursions(of, k, at.coefficients + place_of((size_t)k, 0, columns));
+    solve_constant(of, at.constant);
     for (int x = 0; x < width; x++) at.coefficients[(size_t)x * SLICE] = (float)at.constant[x];
-    for (int k = 0; k < blocks; k++) to_depth(plan, at.coefficients, k * LINES, at.scratch, at.found, at.lines + (size_t)k * LINES * height);
-    for (int y = 0; y < height; y++) row_of_depth(cosine_line(&plan->cosine, at.lines, y), step, width, depth + (size_t)y * width);
+    for (int k = 0; k < blocks; k++) to_depth(of, at.coefficients, k * LINES, at.scratch, at.found, at.lines + (size_t)k * LINES * height);
+    for (int y = 0; y < height; y++) row_of_depth(cosine_line(&of->cosine, at.lines, y), step, width, depth + (size_t)y * width);
 }
 
-/*
- * Depth (frames, height, width) of gradients (frames, 2, height, width); tables: of make_poisson_plan(). It has zero mean; `zeroed`, it is zero on
- * average where the gradient is zero. Returns 1 where memory is short.
- */
-EXPORT int solve_poisson(const float *gradient, const double *tables, float mm_per_pixel, int frames, int height, int width, int zeroed,
-                         float *depth) {
-    const Plan plan = plan_of(height, width, tables);
-    const size_t wide = (size_t)plan.wide, columns = (size_t)width + LINES, pixels = (size_t)height * width;
+int integrate(const Plan *plan, const float *gradient, float *depth) {
+    const int height = (int)plan->height, width = (int)plan->width;
+    const Solver of = solver_of(height, width, plan->poisson);
+    const size_t wide = (size_t)of.wide, columns = (size_t)width + LINES, pixels = (size_t)height * width;
     const size_t coefficients = columns * wide, lines = columns * (size_t)height, scratch = cosine_scratch_size(height);
     double *memory = calloc(1, sizeof(double) * (size_t)width + sizeof(float) * (coefficients + lines + scratch + wide * LINES));
-    if (!memory) return 1;
+    if (!memory) return NO_MEMORY;
     float *floats = (float *)(memory + width);
     const Memory at = {memory, floats, floats + coefficients, floats + coefficients + lines, floats + coefficients + lines + scratch};
-    for (int b = 0; b < frames; b++, gradient += 2 * pixels, depth += pixels) {
-        const unsigned int before = without_tiny();
-        solve_one(&plan, gradient, 0.5f * mm_per_pixel, at, depth);
-        with_tiny(before);
-        if (zeroed) lower(depth, level_of(gradient, depth, height, width), pixels);
-    }
+    const unsigned int before = without_tiny();
+    solve_one(&of, gradient, 0.5f * (float)plan->mm_per_pixel, at, depth);
+    with_tiny(before);
+    if (plan->zeroed) lower(depth, level_of(gradient, depth, height, width), pixels);
     free(memory);
-    return 0;
+    return DONE;
 }

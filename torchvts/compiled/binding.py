@@ -1,0 +1,65 @@
+"""The compiled library: loaded once, its functions with their types, and the layout of a plan as it says it."""
+
+import ctypes
+import functools
+import warnings
+import zlib
+from pathlib import Path
+from typing import Any
+
+LIBRARY = Path(__file__).parent / "csrc" / "libtorchvts.so"
+
+SIGNATURES = {
+    "plan_fields": "s",
+    "plan_size": "l",
+    "range": "v p l p",
+    "reconstruct": "i p p p p p p p p",
+    "poisson_plan_size": "l i",
+    "make_poisson_plan": "v i i p",
+    "alignment_sums": "v p i i p l i i p p",
+    "part_sums": "v p i i p l i i p p",
+    "height_sums": "i p i i p l i p p p p p i i d d p",
+    "track_grids": "i p p p i i f i i p p",
+}
+"""What each function returns, then what it takes: a pointer, int, float, double, int64 (l), text (s), or nothing (v)."""
+
+_TYPES: dict[str, Any] = {
+    "p": ctypes.c_void_p,
+    "i": ctypes.c_int,
+    "f": ctypes.c_float,
+    "d": ctypes.c_double,
+    "l": ctypes.c_int64,
+    "s": ctypes.c_char_p,
+    "v": None,
+}
+
+
+@functools.cache
+def library() -> ctypes.CDLL | None:
+    """The compiled library; None where no C compiler was at hand when this package was installed: then PyTorch does its work."""
+    try:
+        loaded = ctypes.CDLL(str(LIBRARY))
+        built_from = int(loaded.sources())
+    except (OSError, AttributeError):
+        return None
+    if built_from & 0xFFFFFFFF != zlib.crc32(b"".join(source.read_bytes() for source in sorted(LIBRARY.parent.glob("*.[ch]")))):
+        warnings.warn(f"{LIBRARY}: built from other sources than lie beside it, so it is not used: install again", stacklevel=2)
+        return None
+    for name, types in SIGNATURES.items():
+        result, *arguments = types.split()
+        function = getattr(loaded, name)
+        function.restype, function.argtypes = _TYPES[result], [_TYPES[letter] for letter in arguments]
+    return loaded
+
+
+def loaded() -> ctypes.CDLL:
+    """The compiled library, after :func:`library` gave one."""
+    found = library()
+    assert found is not None, "called without a library"
+    return found
+
+
+def check_memory(short: int) -> None:
+    """Raise if a function said that memory was short."""
+    if short:
+        raise MemoryError("torchvts: no memory is left for the tables of a frame")

@@ -1,0 +1,387 @@
+"""What the compiled stages need of each block of a pipeline. What has no compiled form is refused by name."""
+
+import inspect
+
+import torch
+from torch import Tensor, nn
+
+from ..compensate import Compensate, Drift, SmoothDrift
+from ..compensate import drift as drift_module
+from ..compensate.compensate import Blur, Gain
+from ..compensate.defects import FillDefects
+from ..core import smooth
+from ..core.blur import gaussian_weights
+from ..core.cells import whole_cell_means
+from ..core.geometry import CLIFF_SLOPE, MAX_SLOPE, GradientFromNormal
+from ..core.noise import sample_stride
+from ..core.robust import HALVINGS
+from ..integration import PoissonBackground, PoissonDCT
+from ..normals import NormalFromIntensity, NormalFromResponse
+from ..normals import shadowed as shadowed_module
+from ..skin import ContactFromDepth, ContactMask, ZeroBackground
+from ..skin import pressure as pressure_module
+from ..skin import weight as weight_module
+from ..skin import zero as zero_module
+from .plan import Values, poisson_tables
+
+DEGREES = (2, 4, 6)
+"""Degrees for which response.c has loops."""
+
+TERMS = {(False, False): 3, (True, False): 9, (False, True): 13, (True, True): 19}
+"""Terms for which it has, by whether there are products of two and of three changes."""
+
+DRIFTS = {"none": 0, "mode": 1, "statistics": 2, "mode first": 3}
+"""As in csrc/plan.h."""
+
+
+class NotCompiled(Exception):
+    """What has no compiled form, in words."""
+
+
+def check_block(name: str, block: object, *kinds: type[nn.Module]) -> None:
+    """Raise unless a block is one of these classes, as the library has it: no subclass, no method replaced, no hook.
+
+    Raises:
+        NotCompiled: names the block and what is its own.
+    """
+    kind = type(block)
+    if kind not in kinds:
+        raise NotCompiled(f"{name} is {kind.__name__}")
+    for key, value in vars(block).items():
+        if callable(getattr(kind, key, None)):
+            raise NotCompiled(f"{name}.{key} is replaced")
+        if isinstance(value, dict) and any(callable(one) and not isinstance(one, nn.Module) for one in value.values()):
+            raise NotCompiled(f"{name} has a hook")
+    for parent in inspect.getmro(kind):
+        for key, value in vars(parent).items() if parent.__module__.startswith("torchvts.") else ():
+            if inspect.isfunction(value) and not value.__module__.startswith("torchvts."):
+                raise NotCompiled(f"{name}.{key} is replaced")
+
+
+def check_equal(name: str, value: object, expected: object) -> None:
+    """Raise unless a setting has the only value that the compiled stages know."""
+    if value != expected:
+        raise NotCompiled(f"{name} is {value!r:.60}, not {expected!r:.60} as elsewhere in the pipeline")
+
+
+def _map(name: str, value: Tensor | None, size: tuple[int, int]) -> Tensor | None:
+    """A map (C, H, W) of the size; one of a single pixel is spread over it."""
+    if value is None:
+        return None
+    if value.shape[-2:] == (1, 1):
+        value = value.expand(*value.shape[:-2], *size)
+    if tuple(value.shape[-2:]) != size:
+        raise NotCompiled(f"{name} is of another size, {tuple(value.shape[-2:])}")
+    return value
+
+
+def _floats(values: object, dtype: torch.dtype = torch.float32) -> Tensor:
+    return torch.as_tensor(values, dtype=dtype)
+
+
+def compensate_values(block: nn.Module, size: tuple[int, int]) -> Values:
+    """Of :class:`Compensate`, but for what stands before linear light, which PyTorch does."""
+    check_block("compensate", block, Compensate)
+    assert isinstance(block, Compensate)
+    gain = block.gain
+    check_block("compensate.gain", gain, Gain)
+    saturated = gain.saturated_model if block.saturates else None
+    offset = None if gain.offset is None else _map("compensate.gain.offset", gain.offset, size)
+    pedestal = _pedestals(gain.gain, offset)
+    none = torch.zeros(0, dtype=torch.int64)
+    values: Values = {
+        "gain": _map("compensate.gain.gain", gain.gain, size),
+        "offset": offset if pedestal is None else None,
+        "pedestal": torch.zeros(3, dtype=torch.float32) if pedestal is None else pedestal,
+        "saturated_model": _map("compensate.gain.saturated_model", saturated, size),
+        "saturation_light": gain.saturation_light,
+        "restores": block.restores and saturated is not None,
+        "defect": none,
+        "neighbours": none,
+        "defects": 0,
+        "blur": torch.zeros(0, dtype=torch.float32),
+        "blur_taps": 0,
+    }
+    kinds = [type(step) for step in block.clean]
+    if kinds not in ([], [FillDefects], [Blur], [FillDefects, Blur]):
+        raise NotCompiled(f"compensate.clean is {', '.join(kind.__name__ for kind in kinds)}")
+    for k, step in enumerate(block.clean):
+        check_block(f"compensate.clean.{k}", step, FillDefects, Blur)
+        if isinstance(step, FillDefects):
+            values |= {"defect": step.defect, "neighbours": step.neighbours, "defects": step.defect.shape[0]}
+        elif isinstance(step, Blur) and step.std_px > 0.0:
+            values |= {"blur": _floats(step.weights), "blur_taps": len(step.weights)}
+    return values | _drift_values(block.drift, size)
+
+
+def _pedestals(gain: Tensor | None, offset: Tensor | None) -> Tensor | None:
+    """What the offset is of the gain, (3,), where it is exactly one number a channel; else None."""
+    if gain is None or offset is None:
+        return None
+    found = (offset.double() / gain.double()).flatten(1).mean(dim=1).to(gain.dtype)
+    return found if torch.equal(found[:, None, None] * gain, offset) else None
+
+
+def _drift_values(block: nn.Module, size: tuple[int, int]) -> Values:
+    check_block("compensate.drift", block, Drift, nn.Identity)
+    kind, samples = "none", torch.ones(3, 1, 1, dtype=torch.float32)
+    variance, source = samples, block if isinstance(block, Drift) else Drift
+    if isinstance(block, Drift):
+        kind = "mode"
+        if block.background is not None and block.noise is not None:
+            kind = "mode first" if block.by_mode_first else "statistics"
+            samples = block.background.clamp_min(1e-6)
+            variance = (block.noise / samples) ** 2 + block.least_level**2
+            check_equal("compensate.drift.background", samples.shape, Drift().samples(torch.zeros(1, 3, *size))[0].shape)
+    return {
+        "drifts": DRIFTS[kind],
+        "drift_stride": drift_module.stride_of(*size),
+        "halvings": HALVINGS,
+        "least_drift": drift_module.LEAST_DRIFT,
+        "most_drift": drift_module.MOST_DRIFT,
+        "most_by_mode": source.most_by_mode,
+        "same_skin": source.same_skin,
+        "more_skin": source.more_skin,
+        "skin": samples,
+        "skin_variance": variance,
+        "least_level": source.least_level,
+        "most_level": source.most_level,
+        "taken_over": source.taken_over,
+        "least_skin": source.least_skin,
+        "share_of_most": source.share_of_most,
+        "share_of_few": source.share_of_few,
+    }
+
+
+def smooth_values(block: nn.Module, size: tuple[int, int]) -> Values:
+    """Of :class:`SmoothDrift`; none for an identity, or for images too small to show a smooth change."""
+    check_block("smooth", block, SmoothDrift, nn.Identity)
+    stride = smooth.smooth_stride(*size)
+    place = smooth.smooth_basis(*size, stride)
+    rows, columns = place.shape[1:]
+    place = nn.functional.pad(place.flatten(1), [0, -rows * columns % 16])
+    along_x, along_y = (smooth.legendre(length, 1)[1:].float() for length in (size[1], size[0]))
+    return {
+        "smooths": isinstance(block, SmoothDrift) and min(size) >= smooth.SAMPLES,
+        "smooth_stride": stride,
+        "smooth_rows": rows,
+        "smooth_columns": columns,
+        "smooth_samples": place.shape[1],
+        "smooth_steps": smooth.STEPS,
+        "most_smooth": smooth.MOST,
+        "smooth_place": place,
+        "along_x": along_x,
+        "along_y": along_y,
+        "per_square": _floats([smooth.per_square(step) for step in range(smooth.STEPS)], torch.float64),
+        "peaks": smooth.peaks(),
+    }
+
+
+def normals_values(name: str, model: nn.Module, gradient: nn.Module) -> Values:
+    """Of a model of normals and the slopes of its normals: size, pitch, lights or response field.
+
+    Raises:
+        NotCompiled: another model, a glossy skin, or maps that are no polynomials.
+    """
+    check_block(name, model, NormalFromIntensity, NormalFromResponse)
+    check_block("solve.gradient", gradient, GradientFromNormal)
+    assert isinstance(gradient, GradientFromNormal)
+    names = [field for kind in (_LIGHTS, _RESPONSE) for field in kind]
+    values: Values = dict.fromkeys(names) | {field: 0 for field in names if field in _NUMBERS}
+    values["max_slope"] = gradient.max_slope
+    if isinstance(model, NormalFromIntensity):
+        return values | _lights_values(name, model)
+    assert isinstance(model, NormalFromResponse)
+    return values | _response_values(name, model)
+
+
+_LIGHTS = (
+    "by_lights", "inverse", "flat_light", "saturated_above", "ill_conditioned", "any_ill_conditioned", "position", "albedo",
+    "per_camera_height", "noise_std", "measures_noise", "noise_stride", "prior_std", "brightness_noises", "least_brightness",
+    "shadow_steps", "cliff_slope", "start_slope", "left_out", "failed_share",
+)  # fmt: skip
+_RESPONSE = ("field_place", "field", "degree", "terms", "per_mm", "steeper", "reference_mm", "max_sine")
+_NUMBERS = {
+    "by_lights", "any_ill_conditioned", "per_camera_height", "measures_noise", "noise_stride", "prior_std", "brightness_noises",
+    "least_brightness", "shadow_steps", "cliff_slope", "start_slope", "left_out", "failed_share", "degree", "terms", "steeper",
+    "reference_mm", "max_sine",
+}  # fmt: skip
+
+
+def _lights_values(name: str, model: NormalFromIntensity) -> Values:
+    if model.lights.glossy:
+        raise NotCompiled(f"{name}.lights are glossy")
+    model.follow_lights()
+    shadowed = model.shadowed
+    check_block(f"{name}.shadowed", shadowed, shadowed_module.ShadowedPixels)
+    height, width = (int(n) for n in model.inverse.shape[2:])
+    return {
+        "height": height,
+        "width": width,
+        "mm_per_pixel": model.mm_per_pixel,
+        "by_lights": 1,
+        "inverse": model.inverse,
+        "flat_light": _map(f"{name}.shadowed.flat", shadowed.flat, (height, width)),
+        "saturated_above": _map(f"{name}.shadowed.saturated_above", shadowed.saturated_above, (height, width)),
+        "ill_conditioned": shadowed.ill_conditioned,
+        "any_ill_conditioned": shadowed.any_ill_conditioned,
+        "position": model.lights.position_mm,
+        "albedo": model.lights.albedo,
+        "per_camera_height": 1.0 / model.camera_height_mm,
+        "noise_std": shadowed.noise_std,
+        "noise_stride": sample_stride(height, width, model.samples),
+        "prior_std": shadowed_module.PRIOR_STD,
+        "brightness_noises": shadowed.brightness_noises,
+        "least_brightness": shadowed.least_brightness,
+        "shadow_steps": shadowed_module.STEPS,
+        "cliff_slope": CLIFF_SLOPE,
+        "start_slope": MAX_SLOPE,
+        "left_out": shadowed.left_out,
+        "failed_share": shadowed_module.FAILED_SHARE,
+    }
+
+
+def _response_values(name: str, model: NormalFromResponse) -> Values:
+    maps, per_mm = model.maps, model.per_mm
+    place = torch.linspace(-1.0, 1.0, maps.shape[3], dtype=torch.float64)
+    field = next((found for degree in DEGREES if (found := _polynomials(maps, place, degree)) is not None), None)
+    by_depth = _polynomials(per_mm, place, 2)
+    if field is None or by_depth is None:
+        raise NotCompiled(f"{name} has maps that are no polynomials along rows")
+    check_equal(f"{name}.maps", maps.shape[0], TERMS[(model.products, model.cubic)])
+    return {
+        "height": int(maps.shape[2]),
+        "width": int(maps.shape[3]),
+        "mm_per_pixel": None,
+        "field_place": place.float(),
+        "field": field.permute(2, 3, 1, 0).float(),
+        "degree": field.shape[3] - 1,
+        "terms": maps.shape[0],
+        "per_mm": by_depth.transpose(0, 1).float() if model.uses_depth else None,
+        "steeper": model.steeper,
+        "reference_mm": model.reference_mm,
+        "max_sine": model.max_sine,
+    }
+
+
+def _polynomials(maps: Tensor, place: Tensor, degree: int) -> Tensor | None:
+    """Coefficients (..., H, degree + 1) of maps (..., H, W) along their rows; None where they are no such polynomials."""
+    powers = place[:, None] ** torch.arange(degree + 1, dtype=torch.float64)
+    found: Tensor = maps.double() @ torch.linalg.pinv(powers).t()
+    if maps.numel() and not float((found @ powers.t() - maps).abs().max()) <= 3e-7 * float(maps.abs().max()):
+        return None
+    return found
+
+
+def solver_values(name: str, block: nn.Module, values: Values) -> Values:
+    """Of an integrator, for the size and pitch in ``values``.
+
+    Raises:
+        NotCompiled: another integrator, another pitch, or a height whose cosine transform is slow.
+    """
+    check_block(name, block, PoissonDCT, PoissonBackground)
+    assert isinstance(block, PoissonDCT)
+    height, width = values["height"], values["width"]
+    check_equal(f"{name}.mm_per_pixel", block.mm_per_pixel, values["mm_per_pixel"])
+    tables = poisson_tables(height, width)
+    if tables is None:
+        raise NotCompiled(f"{name} has no fast cosine transform for {height} x {width} px")
+    return {"poisson": tables, "zeroed": block.zero_in_background}
+
+
+def mask_values(block: nn.Module, size: tuple[int, int], takes_slopes: bool) -> Values:
+    """Of :class:`ContactMask`."""
+    check_block("mask", block, ContactMask)
+    assert isinstance(block, ContactMask)
+    cell = max(1, min(size) // block.cells)
+    per_noise = whole_cell_means(_full("mask.per_noise", block.per_noise, size)[None], cell)
+    return {
+        "mask_cell": cell,
+        "mask_flat": _full("mask.flat", block.flat, size),
+        "per_light": _full("mask.per_light", block.per_light, size),
+        "mask_noise": per_noise,
+        "mask_blur": _floats(block.weights),
+        "mask_taps": len(block.weights),
+        "takes_slopes": takes_slopes,
+        "by_colour": block.by_colour,
+        "rise_from": block.rise[0],
+        "rise_to": block.rise[1],
+        "sigmas": block.sigmas,
+        "least_spread": block.least_spread,
+        "grey_share": block.grey_share,
+        "failed_light": block.failed,
+        "within": weight_module.WITHIN,
+        "square_within": weight_module.SQUARE_WITHIN,
+        "fewest": weight_module.FEWEST,
+        "moved_depth": weight_module.LEAST_DEPTH,
+    }
+
+
+def _full(name: str, value: Tensor, size: tuple[int, int]) -> Tensor:
+    found = _map(name, value, size)
+    assert found is not None
+    return found
+
+
+def zero_values(block: nn.Module, size: tuple[int, int]) -> Values:
+    """Of :class:`ZeroBackground`."""
+    check_block("solve.zero", block, ZeroBackground)
+    assert isinstance(block, ZeroBackground)
+    cell = max(1, min(size) // block.cells)
+    h, w = size[0] // cell, size[1] // cell
+    pitch, like = cell * block.mm_per_pixel, torch.zeros(0, dtype=torch.float64)
+    k, m = zero_module.number_of_waves(h, w, block.waves)
+    y, x = (zero_module.cosines(count, terms, count, like) for count, terms in ((h, k), (w, m)))
+    along_y, along_x = (zero_module.slopes_of_cosines(count, terms, pitch, like) for count, terms in ((h, k), (w, m)))
+    return {
+        "zero_cell": cell,
+        "waves_y": k,
+        "waves_x": m,
+        "cosine_y": y,
+        "cosine_x": x,
+        "pairs_y": _pairs(y),
+        "pairs_x": _pairs(x).t(),
+        "slope_pairs_y": _pairs(along_y),
+        "slope_pairs_x": _pairs(along_x).t(),
+        "pixel_y": zero_module.cosines(size[0], k, h * cell, like).float(),
+        "pixel_x": zero_module.cosines(size[1], m, w * cell, like).float(),
+        "by_pressure": zero_module.pressure_of_waves(k, m, (h, w), pitch, block.decay_mm, like),
+        "zero_decay": (block.decay_mm / pitch) ** 2,
+        "scales": _floats(block.scales, torch.float64),
+        "rounds": len(block.scales),
+        "smooth_mm": block.smooth_mm,
+        "stiff": block.stiff,
+        "pit": block.pit,
+        "pit_share": block.pit_share,
+        "faint": block.faint,
+    }
+
+
+def _pairs(lines: Tensor) -> Tensor:
+    """Products of every two lines (n, length), each pair once: (n (n + 1) / 2, length)."""
+    return torch.stack([lines[i] * lines[k] for i in range(len(lines)) for k in range(i, len(lines))])
+
+
+def contact_values(block: nn.Module, size: tuple[int, int]) -> Values:
+    """Of :class:`ContactFromDepth`."""
+    check_block("contact", block, ContactFromDepth)
+    assert isinstance(block, ContactFromDepth)
+    cell = min(block.cell, *size)
+    pitch = cell * block.mm_per_pixel
+    weights = gaussian_weights(pressure_module.BLUR_MM / pitch)
+    return {
+        "contact_cell": cell,
+        "contact_blur": _floats(weights),
+        "contact_taps": len(weights),
+        "contact_decay": (pressure_module.DECAY_MM / pitch) ** 2,
+        "contact_step": max(1, min(size[0] // cell, size[1] // cell) // pressure_module.SAMPLES),
+        "share": block.share,
+        "large": block.large,
+        "deep": block.deep,
+        "least_deep": pressure_module.LEAST_DEEP,
+        "rim_reach": pressure_module.rim_reach(block.rim_mm, pitch),
+        "fall": block.fall,
+        "pulled": block.pulled,
+        "pulling": block.pulling,
+        "least_depth": block.least_depth,
+    }

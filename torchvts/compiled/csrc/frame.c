@@ -1,0 +1,202 @@
+/* A frame, from the image to depth, slopes, normals and masks: DepthPipeline of torchvts/pipeline/depth.py in one straight line. */
+#include "plan.h"
+
+#include <stdlib.h>
+
+#define TEXT(x) #x
+#define INTEGER_TEXT(name) "i " #name "\n"
+#define REAL_TEXT(name) "d " #name "\n"
+#define TABLE_TEXT(type, name) TEXT(type) " " #name "\n"
+
+/* A line for each field of Plan, in their order: its kind (i int64, d double, else the type of a table) and its name. */
+EXPORT const char *plan_fields(void) { return ALL_FIELDS(INTEGER_TEXT, REAL_TEXT, TABLE_TEXT); }
+
+EXPORT int64_t plan_size(void) { return (int64_t)sizeof(Plan); }
+
+/* Smallest and largest of n values; NaN where any is none. */
+EXPORT WIDE void range(const float *values, int64_t n, float *ends) {
+    float low[16], high[16], none[16];
+    for (int k = 0; k < 16; k++) low[k] = high[k] = values[0], none[k] = 0.0f;
+    for (int64_t at = 0; at + 16 <= n; at += 16)
+        for (int k = 0; k < 16; k++) {
+            const float value = values[at + k];
+            low[k] = value < low[k] ? value : low[k], high[k] = value > high[k] ? value : high[k];
+            none[k] += 0.0f * value;
+        }
+    for (int64_t at = n - n % 16; at < n; at++)
+        low[0] = fminf(low[0], values[at]), high[0] = fmaxf(high[0], values[at]), none[0] += 0.0f * values[at];
+    for (int k = 1; k < 16; k++) low[0] = fminf(low[0], low[k]), high[0] = fmaxf(high[0], high[k]), none[0] += none[k];
+    ends[0] = low[0] + none[0], ends[1] = high[0] + none[0];
+}
+
+/* A frame on its way: compensated image (3, H, W), its noise, weight, slopes (2, H, W) and depth of the next pass. */
+typedef struct {
+    float noise[3], *light, *weight, *slopes, *depth;
+} Frame;
+
+/* The largest of |a - b|, or of |a|. */
+static WIDE float largest_change(const float *a, const float *b, size_t n) {
+    float most[16] = {0.0f};
+    size_t at = 0;
+    for (; at + 16 <= n; at += 16)
+        for (int k = 0; k < 16; k++) {
+            const float off = fabsf(a[at + k] - (b ? b[at + k] : 0.0f));
+            most[k] = off > most[k] ? off : most[k];
+        }
+    for (; at < n; at++) most[0] = fmaxf(most[0], fabsf(a[at] - (b ? b[at] : 0.0f)));
+    for (int k = 1; k < 16; k++) most[0] = fmaxf(most[0], most[k]);
+    return most[0];
+}
+
+static WIDE void times_weight(const float *restrict slopes, const float *restrict weight, size_t n, float *restrict gradient) {
+    for (int c = 0; c < 2; c++)
+        for (size_t k = 0; k < n; k++) gradient[c * n + k] = slopes[c * n + k] * weight[k];
+}
+
+/* Eq. 9, or with a depth eq. 10, and eq. 5: the slopes of a compensated image. */
+static void solve_slopes(const Plan *plan, Frame *frame, const float *depth, float *normal) {
+    find_normals(plan, frame->light, frame->noise, depth, normal);
+    find_slopes(normal, (size_t)plan->height * plan->width, plan->max_slope, frame->slopes);
+}
+
+/* Eq. 4: weighted slopes to depth from the undeformed skin. */
+static int solve_depth(const Plan *plan, const Frame *frame, float *gradient, float *depth) {
+    times_weight(frame->slopes, frame->weight, (size_t)plan->height * plan->width, gradient);
+    const int code = integrate(plan, gradient, depth);
+    return code == DONE ? zero_background(plan, frame->weight, depth) : code;
+}
+
+/* Every stride-th pixel of an image (height, width). */
+static float *coarsened(const Plan *plan, const float *image, float *to) {
+    const int stride = (int)plan->stride;
+    for (int64_t y = stride / 2; y < plan->height; y += stride)
+        for (int64_t x = stride / 2; x < plan->width; x += stride) *to++ = image[y * plan->width + x];
+    return to;
+}
+
+/* Adaptive.predicted_change_px(): what another pass would change, by every stride-th pixel. */
+static int predict_change(const Plan *plan, const Frame *frame, const float *gradient, const float *depth, float *change_px) {
+    const Plan *coarse = plan->coarse;
+    const size_t pixels = (size_t)plan->height * plan->width, n = (size_t)coarse->height * coarse->width;
+    float *light = malloc(13 * sizeof(float) * n);
+    if (!light) return NO_MEMORY;
+    float *to = light;
+    for (int c = 0; c < 3; c++) to = coarsened(plan, frame->light + pixels * c, to);
+    float *before = to, *z = before + 2 * n, *weight = z + n, *normal = weight + n, *slopes = normal + 3 * n, *found = light;
+    coarsened(plan, gradient, before), coarsened(plan, gradient + pixels, before + n);
+    coarsened(plan, depth, z), coarsened(plan, frame->weight, weight);
+    find_normals(coarse, light, frame->noise, z, normal);
+    find_slopes(normal, n, coarse->max_slope, slopes);
+    for (size_t k = 0; k < 2 * n; k++) slopes[k] = slopes[k] * weight[k % n] - before[k];
+    const int code = integrate(coarse, slopes, found);
+    *change_px = largest_change(found, NULL, n) / (float)plan->mm_per_pixel;
+    free(light);
+    return code;
+}
+
+/* Repeat and Adaptive of torchvts/pipeline/refine.py: solves again until what is still missing falls below the tolerance. */
+static int repeat(const Plan *plan, Frame *frame, float *gradient, float *normal, float *depth) {
+    const size_t pixels = (size_t)plan->height * plan->width;
+    const float pitch = (float)plan->mm_per_pixel;
+    float last_px = largest_change(depth, NULL, pixels) / pitch;
+    for (int pass = 1; pass < plan->passes; pass++) {
+        solve_slopes(plan, frame, depth, normal);
+        const int code = solve_depth(plan, frame, gradient, frame->depth);
+        if (code != DONE) return code;
+        const float change_px = largest_change(frame->depth, depth, pixels) / pitch;
+        const float ratio = fminf(fmaxf(change_px / fmaxf(last_px, 1e-12f), 0.0f), 0.9f);
+        memcpy(depth, frame->depth, sizeof(float) * pixels);
+        if (!(change_px * ratio / (1.0f - ratio) > (float)plan->tolerance_px)) break;
+        last_px = change_px;
+    }
+    return DONE;
+}
+
+/* Eq. 10, where the mode asks for it. */
+static int refine(const Plan *plan, Frame *frame, float *gradient, float *normal, float *depth) {
+    if (plan->passes < 2 && !plan->shadows) return DONE;
+    const int smallest = least((int)plan->height, (int)plan->width);
+    if (plan->coarse && smallest > plan->stride + plan->stride / 2) {
+        float change_px;
+        const int code = predict_change(plan, frame, gradient, depth, &change_px);
+        if (code != DONE || !(change_px > (float)plan->threshold_px)) return code;
+    }
+    if (plan->shadows && any_blocked(plan, frame->light, frame->noise, frame->weight)) return IN_PYTORCH;
+    return repeat(plan, frame, gradient, normal, depth);
+}
+
+/* gradient_of_depth() of core/geometry.py. */
+static WIDE void slopes_of_depth(const float *depth, int height, int width, float per_two, float *gradient) {
+    const size_t pixels = (size_t)height * width;
+    for (int y = 0; y < height; y++) {
+        const float *z = depth + (size_t)y * width, *above = y ? z - width : z, *below = y < height - 1 ? z + width : z;
+        const float twice = (y && y < height - 1) || height == 1 ? 1.0f : 2.0f;
+        float *p = gradient + (size_t)y * width, *q = p + pixels;
+        for (int x = 1; x < width - 1; x++) p[x] = (z[x + 1] - z[x - 1]) * per_two;
+        if (width > 1) p[0] = 2.0f * (z[1] - z[0]) * per_two, p[width - 1] = 2.0f * (z[width - 1] - z[width - 2]) * per_two;
+        else p[0] = 0.0f;
+        for (int x = 0; x < width; x++) q[x] = twice * (below[x] - above[x]) * per_two;
+    }
+}
+
+static WIDE void normals_of_slopes(const float *restrict gradient, size_t n, float *restrict normal) {
+    for (size_t k = 0; k < n; k++) {
+        const float p = gradient[k], q = gradient[n + k], n_z = 1.0f / sqrtf(p * p + q * q + 1.0f);
+        normal[k] = -p * n_z, normal[n + k] = -q * n_z, normal[2 * n + k] = n_z;
+    }
+}
+
+/* The output of a frame without moved skin. */
+static void undeformed(size_t pixels, float *depth, float *gradient, float *normal, uint8_t *contact, uint8_t *deformed) {
+    memset(depth, 0, sizeof(float) * pixels), memset(gradient, 0, 2 * sizeof(float) * pixels);
+    memset(normal, 0, 2 * sizeof(float) * pixels);
+    for (size_t k = 0; k < pixels; k++) normal[2 * pixels + k] = 1.0f;
+    memset(contact, 0, pixels), memset(deformed, 0, pixels);
+}
+
+static int any_weight(const float *weight, size_t n) {
+    for (size_t k = 0; k < n; k++)
+        if (weight[k] > 0.0f) return 1;
+    return 0;
+}
+
+/* From linear light to slopes and weight, and where more likely than not the skin has moved. */
+static int begin(const Plan *plan, const float *image, Frame *frame, float *normal, uint8_t *moved) {
+    const size_t pixels = (size_t)plan->height * plan->width;
+    int code = compensate(plan, image, frame->light);
+    for (int c = 0; c < 3; c++) frame->noise[c] = plan->by_lights ? plan->noise_std[c] : 0.0f;
+    if (code == DONE && plan->measures_noise) code = measure_noise(plan, frame->light, frame->noise);
+    if (code == DONE && plan->smooths) code = remove_smooth_change(plan, frame->light);
+    if (code != DONE) return code;
+    solve_slopes(plan, frame, NULL, normal);
+    code = weigh(plan, frame->light, frame->slopes, frame->weight);
+    for (size_t k = 0; k < pixels && code == DONE && moved; k++) moved[k] = frame->weight[k] > 0.5f;
+    return code;
+}
+
+/*
+ * A frame. image (3, H, W), linear light; depth (1, H, W), null where only `moved` (1, H, W) is wanted, or null; gradient (2, H, W), normal (3, H, W),
+ * contact and deformed (1, H, W) bytes. Returns DONE, NO_MEMORY, or IN_PYTORCH for a frame whose shadows PyTorch must read, with `moved` set.
+ */
+EXPORT int reconstruct(const Plan *plan, const float *image, uint8_t *moved, float *depth, float *gradient, float *normal, uint8_t *contact,
+                       uint8_t *deformed) {
+    const size_t pixels = (size_t)plan->height * plan->width;
+    float *memory = malloc((depth ? 7 : 9) * sizeof(float) * pixels);
+    if (!memory) return NO_MEMORY;
+    Frame frame = {{0.0f}, memory, memory + 3 * pixels, memory + 4 * pixels, memory + 6 * pixels};
+    int code = begin(plan, image, &frame, depth ? normal : memory + 6 * pixels, moved);
+    if (depth && code == DONE && !any_weight(frame.weight, pixels)) {
+        undeformed(pixels, depth, gradient, normal, contact, deformed);
+    } else if (depth) {
+        if (code == DONE) code = solve_depth(plan, &frame, gradient, depth);
+        if (code == DONE) code = refine(plan, &frame, gradient, normal, depth);
+        if (code == DONE) {
+            find_moved(plan, frame.weight, depth, deformed);
+            code = find_contact(plan, depth, deformed, contact);
+            if (plan->slopes_of_depth) slopes_of_depth(depth, (int)plan->height, (int)plan->width, (float)(0.5 / plan->mm_per_pixel), gradient);
+            normals_of_slopes(gradient, pixels, normal);
+        }
+    }
+    free(memory);
+    return code;
+}

@@ -1,0 +1,254 @@
+"""A pipeline that cannot change: a frame in one call of compiled code, or, where that is not possible, in PyTorch."""
+
+import copy
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ..compensate import Compensate
+from ..compiled import IN_PYTORCH, NotCompiled, Plan, check_block, ends, library
+from ..compiled import blocks as compiled
+from ..compiled.plan import Values
+from ..core.checks import check_batch, check_range, check_record, check_same_size
+from ..core.frame import DepthOutput
+from ..normals import NormalFromIntensity
+from .depth import DepthPipeline
+from .refine import Adaptive, Once, Repeat, SlopesOfDepth, SlopesOfPixels
+from .shadows import Shadows
+from .solve import Solve
+
+SHAPES = (1, 2, 3, 1, 1)
+"""Channels of the parts of a DepthOutput."""
+
+
+class FrozenPipeline:
+    """Images (B, 3, H, W) to a :class:`DepthOutput`, as the pipeline that it was made of; :meth:`DepthPipeline.freeze` makes one.
+
+    It holds a copy: nothing that is done to the pipeline afterwards changes it, and it records no gradient. Compiled, it takes
+    float32 on a CPU. One thread works on a frame; the frames of a batch are shared among as many threads as torch uses, and equal
+    bit for bit those frames alone. Depth differs from the pipeline's by rounding, less than 1e-5 mm.
+
+    Markers and the camera's gamma are undone by PyTorch, before the compiled code. By lights, in modes precise and auto, frames in
+    which the object blocks a light go through PyTorch as a whole.
+
+    Args:
+        pipe: the pipeline.
+    Attributes:
+        compiled: whether compiled code does the work.
+        not_compiled: what has no compiled form, in words; empty where ``compiled``.
+        mode: of the pipeline.
+        mm_per_pixel: of the pipeline.
+    Raises:
+        ValueError: parameters that record gradients. TypeError: no pipeline.
+    """
+
+    __slots__ = ("_linear", "_pipe", "_plan", "_size", "compiled", "mm_per_pixel", "mode", "not_compiled")
+
+    compiled: bool
+    not_compiled: str
+    mode: str
+    mm_per_pixel: float
+    _pipe: DepthPipeline
+    _plan: Plan | None
+    _linear: nn.Sequential
+    _size: tuple[int, int]
+
+    def __init__(self, pipe: DepthPipeline) -> None:
+        check_record("pipe", pipe, DepthPipeline, "DepthPipeline.from_calibration makes one")
+        for name, weight in pipe.named_parameters():
+            if weight.requires_grad:
+                raise ValueError(
+                    f"pipe: expected parameters that record no gradient, got {name}, which does: pipe.requires_grad_(False) ends "
+                    "training; to train, call the pipeline itself"
+                )
+        with torch.inference_mode(False), torch.device("cpu"):  # whatever the defaults are
+            own = copy.deepcopy(pipe)
+            plan, reason, size = None, "", (0, 0)
+            try:
+                plan, size = plan_of(own)
+            except NotCompiled as error:
+                reason = str(error)
+        linear = own.compensate.linear if plan is not None and isinstance(own.compensate, Compensate) else ()
+        given: dict[str, object] = {
+            "_pipe": own,
+            "_plan": plan,
+            "_linear": nn.Sequential(*linear),
+            "_size": size,
+            "compiled": plan is not None,
+            "not_compiled": reason,
+            "mode": own.mode,
+            "mm_per_pixel": own.mm_per_pixel,
+        }
+        for name, value in given.items():
+            object.__setattr__(self, name, value)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        raise AttributeError(f"{name}: a frozen pipeline cannot change: change the pipeline and freeze it again")
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "FrozenPipeline":
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return FrozenPipeline, (self._pipe,)
+
+    def __repr__(self) -> str:
+        how = "compiled" if self.compiled else f"in PyTorch: {self.not_compiled}"
+        return f"FrozenPipeline(mode={self.mode}, mm_per_pixel={self.mm_per_pixel}, {how})"
+
+    def __call__(self, images: Tensor) -> DepthOutput:
+        """(B, 3, H, W) images in [0, 1], R, G, B; the output is new tensors.
+
+        Raises:
+            ValueError: wrong shape, values outside [0, 1] or not finite, or images that record gradients.
+            TypeError: not floating point, or, compiled, no float32 on the CPU.
+        """
+        output = self._work(images, True, False)[0]
+        assert output is not None
+        return output
+
+    def moved(self, images: Tensor) -> Tensor:
+        """Where the skin has moved in images (B, 3, H, W) by slopes and colour, bool (B, 1, H, W), without their depth.
+
+        Raises:
+            ValueError, TypeError: as calling it.
+        """
+        moved = self._work(images, False, True)[1]
+        assert moved is not None
+        return moved
+
+    def both(self, images: Tensor) -> tuple[DepthOutput, Tensor]:
+        """The output, and what :meth:`moved` says, at the price of one.
+
+        Raises:
+            ValueError, TypeError: as calling it.
+        """
+        output, moved = self._work(images, True, True)
+        assert output is not None
+        assert moved is not None
+        return output, moved
+
+    def _work(self, images: Tensor, solve: bool, mask: bool) -> tuple[DepthOutput | None, Tensor | None]:
+        self._check(images)
+        if self._plan is None:
+            return self._in_pytorch(images, solve, mask)
+        with torch.inference_mode():
+            light = self._linear(images).contiguous()
+        count, size = images.shape[0], self._size
+        kinds = (torch.float32, torch.float32, torch.float32, torch.bool, torch.bool)
+        parts = [torch.empty(count, c, *size, dtype=kind, device="cpu") for c, kind in zip(SHAPES, kinds, strict=True) if solve]
+        moved = torch.empty(count, 1, *size, dtype=torch.bool, device="cpu") if mask else None
+        threads = min(count, torch.get_num_threads())
+        frames = range(count)
+        if threads <= 1:
+            for k in frames:
+                self._frame(k, images, light, parts, moved)
+        else:
+            pool = ThreadPoolExecutor(threads, thread_name_prefix="torchvts")
+            try:  # each thread holds what it works on, so that nothing is freed under it
+                list(pool.map(lambda k: self._frame(k, images, light, parts, moved), frames))
+            finally:
+                _finish(pool)
+        return DepthOutput(*parts) if solve else None, moved
+
+    def _frame(self, k: int, images: Tensor, light: Tensor, parts: list[Tensor], moved: Tensor | None) -> None:
+        """Write the output of one frame of a batch."""
+        assert self._plan is not None
+        output = tuple(part[k] for part in parts) if parts else None
+        if self._plan.reconstruct(light[k], None if moved is None else moved[k], output) == IN_PYTORCH:
+            found, _ = self._in_pytorch(images[k : k + 1], True, False)
+            assert found is not None
+            for part, one in zip(parts, found, strict=True):
+                part[k].copy_(one[0])
+
+    def _in_pytorch(self, images: Tensor, solve: bool, mask: bool) -> tuple[DepthOutput | None, Tensor | None]:
+        with torch.inference_mode():
+            output = self._pipe(images) if solve else None
+            moved = self._pipe.moved(images) if mask else None
+        # copies made outside of inference mode can be used wherever the user wants
+        new = None if output is None else DepthOutput(*(part.clone() for part in output))
+        return new, None if moved is None else moved.clone()
+
+    def _check(self, images: Tensor) -> None:
+        check_batch("images", images, 3)
+        if images.requires_grad and torch.is_grad_enabled():
+            raise ValueError("images: expected none that record gradients: a frozen pipeline does not; call the pipeline itself")
+        if self._plan is None:
+            return
+        if images.dtype != torch.float32 or not images.is_cpu:
+            raise TypeError(f"images: expected torch.float32 on the CPU, got {images.dtype} on {images.device}: use .float().cpu()")
+        check_same_size("images", images, "the calibration", *self._size)
+        if images.numel() > 0:
+            low, high = ends(images.contiguous())
+            if not (low >= -1e-3 and high <= 1.0 + 1e-3):
+                check_range("images", images)
+
+
+def _finish(pool: ThreadPoolExecutor) -> None:
+    """Wait for the frames that are being worked on, which takes milliseconds, and leave out the others, whatever is raised."""
+    try:
+        pool.shutdown(wait=True, cancel_futures=True)
+    except KeyboardInterrupt:
+        _finish(pool)
+        raise
+
+
+def plan_of(pipe: DepthPipeline) -> tuple[Plan, tuple[int, int]]:
+    """The plan of a pipeline, and the size of its images.
+
+    Raises:
+        NotCompiled: what has no compiled form.
+    """
+    if library() is None:
+        raise NotCompiled("there is no compiled library: no C compiler was at hand when torchvts was installed")
+    check_block("pipe", pipe, DepthPipeline)
+    for name, tensor in (*pipe.named_parameters(), *pipe.named_buffers()):
+        if not tensor.is_cpu or (tensor.is_floating_point() and tensor.dtype != torch.float32):
+            raise NotCompiled(f"{name} is {tensor.dtype} on {tensor.device}")
+    solve = pipe.solve
+    check_block("solve", solve, Solve)
+    values = compiled.normals_values("normals", solve.normals, solve.gradient)
+    size = values["height"], values["width"]
+    if values["mm_per_pixel"] is None:  # a response field by itself has none
+        values["mm_per_pixel"] = pipe.mm_per_pixel
+    compiled.check_equal("normals.mm_per_pixel", values["mm_per_pixel"], pipe.mm_per_pixel)
+    values |= compiled.compensate_values(pipe.compensate, size) | compiled.smooth_values(pipe.smooth, size)
+    values |= compiled.solver_values("integrate", solve.integrate, values)
+    values |= compiled.mask_values(pipe.mask, size, pipe.takes_slopes)
+    values |= compiled.zero_values(solve.zero, size) | compiled.contact_values(pipe.contact, size)
+    values["measures_noise"] = pipe.measures_noise
+    check_block("slopes", pipe.slopes, SlopesOfDepth, SlopesOfPixels)
+    if isinstance(pipe.slopes, SlopesOfDepth):
+        compiled.check_equal("slopes.mm_per_pixel", pipe.slopes.mm_per_pixel, pipe.mm_per_pixel)
+    values["slopes_of_depth"] = isinstance(pipe.slopes, SlopesOfDepth)
+    return Plan(values | _policy_values(pipe, values)), size
+
+
+def _policy_values(pipe: DepthPipeline, values: Values) -> Values:
+    """Of the refinement."""
+    policy = pipe.refine
+    check_block("refine", policy, Once, Repeat, Adaptive, Shadows)
+    found: Values = {"passes": 1, "tolerance_px": 0.0, "coarse": None, "stride": 1, "threshold_px": 0.0, "shadows": False}
+    if isinstance(policy, Shadows):
+        found["shadows"] = True
+        policy = policy.policy
+        check_block("refine.policy", policy, Repeat, Adaptive)
+    if not isinstance(policy, Repeat):
+        return found
+    compiled.check_equal("refine.mm_per_pixel", policy.mm_per_pixel, pipe.mm_per_pixel)
+    if policy.solve is not pipe.solve:
+        raise NotCompiled("refine.solve is not that of the pipeline")
+    found |= {"passes": policy.max_passes, "tolerance_px": policy.tolerance_px}
+    if isinstance(policy, Adaptive):
+        stride, model = policy.stride, policy.coarse_normals
+        check_block("refine.coarse_normals", model, NormalFromIntensity)
+        coarse = values | compiled.normals_values("refine.coarse_normals", model, pipe.solve.gradient)
+        size = tuple(len(range(stride // 2, length, stride)) for length in (values["height"], values["width"]))
+        compiled.check_equal("refine.coarse_normals", (coarse["height"], coarse["width"]), size)
+        if min(size) > 1:  # else nothing is predicted
+            coarse |= compiled.solver_values("refine.coarse_integrate", policy.coarse_integrate, coarse)
+            coarse |= {**found, "measures_noise": False}
+            found["coarse"] = Plan(coarse)
+        found |= {"stride": stride, "threshold_px": policy.refine_threshold_px}
+    return found

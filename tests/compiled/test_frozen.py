@@ -15,6 +15,7 @@ import torch
 from conftest import ring_lights, without_library
 
 import torchvts as vts
+from lab import frames
 from torchvts.compiled import library, plan
 from torchvts.compiled import library as library_of
 from torchvts.compiled.binding import LIBRARY
@@ -198,10 +199,8 @@ def test_a_pinhole_camera_and_other_integrators(mode):
 
 def test_the_real_mini(data):
     """Presses of the first GelSight Mini, at its own size and half of it."""
-    from torchvts.evaluation import user_speed
-
     for size in ((240, 320), (480, 640)):
-        unit = user_speed.mini(data, size)
+        unit = frames.mini(data, size)
         for mode in MODES:
             found, _ = agree(vts.DepthPipeline.from_calibration(unit.calibration, mode), unit.image)
             assert float(found.depth_mm.max()) > 0.2

@@ -183,8 +183,8 @@ EXPECTED = {  # what is in the report, and the mean error that follows, degrees
     "directions of lights as a stand-in": ({"source": "stand_in"}, NOT_METRIC_DEG),
     "one press on a prior": ({"source": "presses", "held_out_deg": None, "own_deg": 1.0, "prior_deg": 3.0, "presses": 1}, 3.0),
     "presses as good as their prior": ({"source": "presses", "held_out_deg": 3.0, "prior_deg": 3.0, "presses": 3}, 3.0),
-    "better than their prior": ({"source": "presses", "held_out_deg": 1.0, "prior_deg": 3.0, "presses": 4}, math.sqrt(5.0)),
-    "presses alone": ({"source": "presses", "held_out_deg": 2.0, "presses": 4}, 2.0 * math.sqrt(2.0)),
+    "better than their prior": ({"source": "presses", "held_out_deg": 1.0, "prior_deg": 3.0, "presses": 4}, math.sqrt(22.0 / 6.0)),
+    "presses alone": ({"source": "presses", "held_out_deg": 2.0, "presses": 4}, 2.0 * math.sqrt(1.5)),
     "one press alone": ({"source": "presses", "held_out_deg": None, "own_deg": 2.0, "presses": 1}, 2.0 * math.sqrt(5.0)),
 }
 

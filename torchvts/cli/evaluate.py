@@ -110,7 +110,7 @@ def _fold(
 ) -> list[Score]:
     """Scores of press ``fold``, ``fold + folds`` and so on, by a calibration from all others without their labels."""
     unit = Training(background, [press for k, press in enumerate(presses) if k % folds != fold], sensor).calibration
-    pipes = {mode: DepthPipeline.from_calibration(unit, mode) for mode in MODES}
+    pipes = {mode: DepthPipeline.from_calibration(unit, mode).freeze() for mode in MODES}
     scores = []
     for press in (known[press.name] for press in presses[fold::folds] if press.name in known):
         for mode, pipe in pipes.items():

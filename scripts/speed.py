@@ -4,7 +4,7 @@ python scripts/speed.py --out out/bench --threads 2
 python scripts/speed.py --only export --threads 2
 
 Methods of other libraries are timed in the same run. Rows of a real sensor need ../shared/data or the folder in TORCHVTS_DATA.
-Exported files are timed of one unit, with --drawn of the drawn rig, whose AOTInductor files take minutes to write.
+Exported files are timed of one unit, with --drawn of the drawn rig.
 """
 
 import sys

@@ -35,8 +35,9 @@ class OneThread(AbstractContextManager[None]):
         global _inside, _outside
         if self.suffices:
             with _lock:
+                before = torch.get_num_threads()  # in every thread: torch begins with the last number set where it is first asked
                 if _inside == 0:
-                    _outside = torch.get_num_threads()
+                    _outside = before
                 _inside += 1
                 torch.set_num_threads(1)
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import os
 import runpy
 import sys
@@ -13,11 +14,13 @@ from unittest import mock
 import cv2
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
 
 import torchvts as vts
 from torchvts import compiled
 from torchvts.cli import COMMANDS, main
+from torchvts.core.files import checksum, load_tensors
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -202,3 +205,20 @@ def call_script(name, *arguments):
 def run_script():
     """``run_script("calibrate", *arguments)``: see :func:`call_script`."""
     return call_script
+
+
+def rewritten(path, change_tensors=None, change_metadata=None):
+    """A calibration file with something changed, also to what no calibration writes, and a checksum that fits."""
+    tensors, metadata = load_tensors(path)
+    (change_tensors or (lambda t: None))(tensors)
+    (change_metadata or (lambda m: None))(metadata)
+    described = {**metadata, "checksum": checksum(tensors, metadata)}
+    safetensors.torch.save_file(tensors, str(path), {"torchvts": json.dumps(described)})
+
+
+def refused_when_rewritten(path, message, **changes):
+    """A calibration file with something changed is refused, and the message begins with its name."""
+    rewritten(path, **changes)
+    with pytest.raises(ValueError, match=message) as caught:
+        vts.Calibration.load(path)
+    assert str(caught.value).startswith(f"{path}: ")

@@ -549,6 +549,18 @@ def test_good_presses_among_bad_ones_are_used(mixed, good, by_good):
     assert angle < 1.1 * depth_errors(by_good, seen_by_curve, ball, "fast", HELD_OUT)[1]
 
 
+def test_two_wrong_diameters_among_seven_are_left_out(good, rest):
+    wrong = [dataclasses.replace(p, ball_diameter_mm=12.0) for p in take_presses(count=8)[6:]]
+    calibration, _ = calibrate(rest, GIVEN, good[:5] + wrong)
+    assert [row["used"] for row in calibration.report["presses"]] == [True] * 5 + [False] * 2
+
+
+@pytest.mark.parametrize("ball_mm", [500.0, pytest.param(60.0, marks=pytest.mark.long)])
+def test_an_absurd_diameter_is_left_out_like_any_other(good, rest, ball_mm):
+    calibration, warned = calibrate(rest, GIVEN, [*good, dataclasses.replace(good[0], ball_diameter_mm=ball_mm, name="absurd")])
+    assert len(warned) == 1 and warned[0].startswith("absurd: left out: ") and not calibration.report["presses"][-1]["used"]
+
+
 @pytest.mark.parametrize(
     "count, times",
     [

@@ -8,14 +8,13 @@ import cv2
 import kornia
 import numpy as np
 import pytest
-import safetensors.torch
 import torch
 import yaml
+from conftest import refused_when_rewritten, rewritten
 
 import torchvts as vts
 from torchvts.calibration.response_fit import STEEPER
 from torchvts.core.blur import gaussian_weights
-from torchvts.core.files import checksum, load_tensors
 from torchvts.core.geometry import gradient_from_normal, gradient_of_depth
 from torchvts.model.response_field import (
     MAX_SLOPE,
@@ -417,15 +416,6 @@ def test_a_float_background_survives_within_sixteen_bits(tmp_path, gamma, dtype)
     assert loaded.dtype == dtype and float((values - kept).abs().max()) < 0.51 / 65535 + 2e-7
 
 
-def rewritten(path, change_tensors=None, change_metadata=None):
-    """The same file with something changed, and a checksum that fits."""
-    tensors, metadata = load_tensors(path)
-    (change_tensors or (lambda t: None))(tensors)
-    (change_metadata or (lambda m: None))(metadata)
-    described = {**metadata, "checksum": checksum(tensors, metadata)}
-    safetensors.torch.save_file(tensors, str(path), {"torchvts": json.dumps(described)})
-
-
 def png(shape, dtype=np.uint8, suffix=".png"):
     return torch.from_numpy(cv2.imencode(suffix, np.full(shape, 9, dtype))[1].reshape(-1).copy())
 
@@ -488,10 +478,7 @@ METADATA = {
 @pytest.mark.parametrize("kind", METADATA)
 def test_a_damaged_response_is_refused(saved, kind):
     change, message = METADATA[kind]
-    rewritten(saved, change_metadata=change)
-    with pytest.raises(ValueError, match=message) as caught:
-        vts.Calibration.load(saved)
-    assert str(caught.value).startswith(f"{saved}: ")
+    refused_when_rewritten(saved, message, change_metadata=change)
 
 
 @pytest.mark.parametrize("where, key, value", [("sensor", "gamma", 1.3), ("response", "gamma", 1.3), ("response", "blur_px", 4.0)])

@@ -85,11 +85,10 @@ def _explained(result: LightsResult) -> bool:
 
 def doubtful(given: Given, lights: Candidate) -> Candidate:
     """Lights that were objected to, where nothing else is left: with a warning, unless the light has no colours."""
-    objection = lights.objection if lights.unit is None else ""
-    if given.sensor.light_position_mm is None:
-        objection = colourless(given.background) or objection
-    if objection:
-        objection += "; nothing else is there to calibrate from: give presses of balls, or a sensor with a prior"
+    objection = colourless(given.background) if given.sensor.light_position_mm is None else ""
+    if not objection and lights.unit is None:
+        remedy = "nothing else is there to calibrate from: give presses of balls, or a sensor with a prior"
+        objection = f"{lights.objection}; {remedy}"
     return dataclasses.replace(lights, objection=objection)
 
 
@@ -195,14 +194,16 @@ def _fitted(given: Given, start: Candidate) -> _Fit:
     Better is a fit that uses clearly more presses, or else has the lower held-out error. Without a held-out error it is the one
     from the prior: of one or two presses alone a field knows only their places.
     """
-    model = None if start.unit is None else start.unit.response
-    if model is None or start.unit is None or start.unit.report["source"] != "prior":
-        return _Fit(by_presses(given.background, given.sensor, given.presses, model, given.progress))
+    background, sensor, presses = given.background, given.sensor, given.presses
+    if start.unit is None or start.unit.report["source"] != "prior":
+        model = None if start.unit is None else start.unit.response
+        return _Fit(by_presses(background, sensor, presses, model, given.progress))
+    first: PressResult | None = None
     try:
-        first: PressResult | None = by_presses(given.background, given.sensor, given.presses, model, given.progress)
-        contacts = [] if first is None else first.contacts
+        first = by_presses(background, sensor, presses, start.unit.response, given.progress)
+        contacts = first.contacts
     except NoUsablePress as error:
-        first, contacts = None, error.contacts
+        contacts = error.contacts
     unlike = "objection" in start.unit.report
     count, left = len(contacts), len(used(contacts))
     contradiction = "the background does not have its pattern of light" if unlike else ""
@@ -212,7 +213,7 @@ def _fitted(given: Given, start: Candidate) -> _Fit:
     if first is not None and not contradiction:
         return _Fit(first, "", sizes)
     try:
-        second = by_presses(given.background, given.sensor.without_prior(), given.presses, None, given.progress)
+        second = by_presses(background, sensor.without_prior(), presses, None, given.progress)
     except NoUsablePress:
         if first is None:
             raise

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..compensate import Compensate, SmoothDrift
-from ..core.blur import blur, gaussian_weights
+from ..core.blur import band_of_ratios
 from ..core.geometry import gradient_from_normal, pixel_grid_mm
 from ..core.morphology import dilate, erode
 from ..integration import PoissonBackground
@@ -237,10 +237,8 @@ def channel_band(image: Tensor, cells: int, side_px: int) -> Tensor:
     There are about ``cells`` along the shorter side.
     """
     stride = max(1, min(image.shape[1:]) // cells)
-    log = (torch.nn.functional.avg_pool2d(image.detach().cpu().float()[None], stride) + PEDESTAL).log()
-    log = log - log.mean(1, keepdim=True)
-    side = float(side_px // stride)
-    return blur(log, gaussian_weights(side / 40.0)) - blur(log, gaussian_weights(side / 16.0))
+    light = torch.nn.functional.avg_pool2d(image.detach().cpu().float()[None], stride)
+    return band_of_ratios(light, float(side_px // stride), PEDESTAL)
 
 
 def first_pass_depths(contacts: Sequence[Contact], response: ResponseField, pitch_mm: float) -> list[Tensor]:

@@ -23,7 +23,8 @@ LEAST_FITNESS = 0.8
 
 MOST_RMSE = 0.3
 """Largest distance along the normal, in units of the cloud's thickness, with which a pose is trusted: flat clouds have near
-neighbours in any pose. Contacts fitted in the right pose have 0.02 to 0.15, thinned knurls 0.35; in a wrong one 0.48 to 1.8."""
+neighbours in any pose. Contacts fitted in the right pose have 0.02 to 0.15, knurls that are thinned up to 0.36, which are refused;
+wrong poses 0.48 to 1.8."""
 
 LEAST_INFORMATION = 1e-3
 """Mean squared share of a motion of 1 mm along the normals, below which the motion is called unknown."""

@@ -24,7 +24,7 @@ class CompiledKernels(BuildHookInterface):
         library = folder / "libtorchvts.so"
         compiler = shlex.split(os.environ.get("CC") or "cc")
         if shutil.which(compiler[0]) is None:
-            self.app.display_warning(f"no C compiler {compiler[0]!r}: frames will take 4 to 17 times as long")
+            self.app.display_warning(f"no C compiler {compiler[0]!r}: frames will take 2 to 7 times as long")
         else:
             self.build(compiler, folder, library)
         if not library.is_file():
@@ -44,4 +44,4 @@ class CompiledKernels(BuildHookInterface):
                 if done.returncode == 0:
                     os.replace(built, library)
                     return
-        self.app.display_warning(f"the C compiler failed, so frames will take 4 to 17 times as long:\n{done.stderr}")
+        self.app.display_warning(f"the C compiler failed, so frames will take 2 to 7 times as long:\n{done.stderr}")

@@ -89,7 +89,7 @@ def in_turn(calls: Sequence[Callable[[], object]], rounds: int) -> list[list[flo
 
 def machine() -> str:
     """Processor, cores, threads and torch in words, and whether the compiled kernels are there."""
-    kernels = "compiled kernels" if library() is not None else "NO COMPILED KERNELS: PyTorch alone, 4 to 17 times as slow"
+    kernels = "compiled kernels" if library() is not None else "NO COMPILED KERNELS: PyTorch alone, 2 to 7 times as slow"
     allowed = f"{os.cpu_count()} cores, {torch.get_num_threads()} threads allowed"
     return f"{platform.machine()}, {allowed}, torch {torch.__version__}, {kernels}"
 

@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup demo test test-coverage test-long check bench docs clean
+.PHONY: setup demo test test-coverage test-long test-wheel check bench docs clean
 
 setup: $(VENV)/.done
 
@@ -31,6 +31,21 @@ test-coverage: setup
 # The tests marked long; fuzzed files, drawn scenes and frames by the thousands; the largest graphs. Some twenty minutes on two cores.
 test-long: setup
 	TORCHVTS_TEST_PROFILE=long $(PYTEST) -m long
+
+# The same tests on the wheel, with nothing of this folder but tests, scripts and sensor files. PYTHON=python3.13 takes another Python,
+# CONSTRAINTS=constraints-oldest.txt the oldest versions that pyproject.toml allows.
+CONSTRAINTS ?= constraints.txt
+WHEEL := out/wheel
+
+test-wheel:
+	rm -rf $(WHEEL)
+	$(PYTHON) -m venv $(WHEEL)/venv
+	$(WHEEL)/venv/bin/pip install --quiet --disable-pip-version-check build
+	$(WHEEL)/venv/bin/python -m build --wheel --outdir $(WHEEL) .
+	$(WHEEL)/venv/bin/pip install --quiet --disable-pip-version-check --constraint $(CONSTRAINTS) "$$(ls $(WHEEL)/*.whl)[pose,onnx,test]"
+	mkdir $(WHEEL)/tree
+	cp -r tests scripts configs docs pyproject.toml README.md CHANGELOG.md LICENSE $(WHEEL)/tree
+	cd $(WHEEL)/tree && ../venv/bin/python -m pytest -n auto --dist worksteal -m "not long" --ignore tests/pages tests
 
 check: setup
 	$(BIN)/ruff check .

@@ -1,4 +1,4 @@
-"""Draw README's picture: a ball on a real GelSight Mini, its depth, normals, surface and profile, beside the ball's true shape.
+"""Draw README's picture: a ball on a real GelSight Mini: image, depth, normals, surface, and its profile beside the true ball.
 
 The unit is calibrated by its background and presses of the other ball, so nothing was learned from the ball that is drawn.
 
@@ -21,14 +21,14 @@ from lab.sets import data_folder
 from torchvts import viz
 
 SHOWN = "6.310mm/10"
-EXAGGERATION = 2.0
 HALF_MM = 4.2
 SKIN = LinearSegmentedColormap.from_list("skin", ["#9a8f86", "#d9cfc5"])
 
 
 class Contact(NamedTuple):
-    """What is drawn: depth (H, W) in mm, normals (H, W, 3), contact (H, W), the ball's center in px and its radius in mm."""
+    """What is drawn: image and normals (H, W, 3), depth (H, W) in mm, contact (H, W), center in px and radius in mm of the ball."""
 
+    image: Any
     depth_mm: Any
     normal: Any
     contact: Any
@@ -50,11 +50,12 @@ def reconstruct(folder: Path, sensor: vts.Sensor) -> tuple[Contact, int]:
     depth, normal, contact = out.depth_mm[0, 0], out.normal[0].permute(1, 2, 0), out.contact[0, 0]
     assert shown.center_px is not None
     center = (float(shown.center_px[0]), float(shown.center_px[1]))
-    return Contact(depth.numpy(), normal.numpy(), contact.numpy(), center, 0.5 * shown.ball_diameter_mm), len(known)
+    image = shown.image.permute(1, 2, 0).numpy()
+    return Contact(image, depth.numpy(), normal.numpy(), contact.numpy(), center, 0.5 * shown.ball_diameter_mm), len(known)
 
 
 def draw(contact: Contact, pitch: float) -> Figure:
-    """Depth, normals, surface, and the profile through the ball's center; all in mm, cut to the contact."""
+    """Image, depth, normals, surface, and the profile through the ball's center; all in mm, cut to the contact."""
     column, row = (round(value) for value in contact.center_px)
     half = round(HALF_MM / pitch)
     cut = np.s_[max(0, row - half) : row + half + 1, max(0, column - half) : column + half + 1]
@@ -62,27 +63,28 @@ def draw(contact: Contact, pitch: float) -> Figure:
     x = (np.arange(contact.depth_mm.shape[1])[cut[1]] - contact.center_px[0]) * pitch
     y = (np.arange(contact.depth_mm.shape[0])[cut[0]] - contact.center_px[1]) * pitch
     extent = (x[0] - pitch / 2, x[-1] + pitch / 2, y[-1] + pitch / 2, y[0] - pitch / 2)
-    figure = viz.new_figure(12.0, 3.1, dpi=125)
-    figure.set_layout_engine("constrained", wspace=0.06)
-    depth, normal, profile = (figure.add_subplot(1, 4, k) for k in (1, 2, 4))
+    figure = viz.new_figure(12.0, 3.0, dpi=125)
+    figure.set_layout_engine("constrained", wspace=0.04)
+    grid = figure.add_gridspec(2, 4, height_ratios=(2.4, 1.0))
+    image, depth, normal = (figure.add_subplot(grid[:, k]) for k in range(3))
+    image.imshow(contact.image[cut], extent=extent)
+    image.set(title="camera's image", xlabel="x, mm", ylabel="y, mm (down)")
     colors, norm = viz.depth_colors(*viz.depth_range(depth_mm))
     viz.draw_bar(figure, depth, depth.imshow(depth_mm, extent=extent, cmap=colors, norm=norm), "mm")
     depth.contour(x, y, inside, [0.5], colors="#e69f00", linewidths=1.5)
-    depth.set_title("depth, contact outlined")
+    depth.set(title="depth, contact outlined", xlabel="x, mm")
     normal.imshow(0.5 + 0.5 * contact.normal[cut], extent=extent)
-    normal.set_title("normals as colour")
-    for axes in (depth, normal):
-        axes.set(xlabel="x, mm", ylabel="y, mm (down)")
-    _draw_surface(figure.add_subplot(1, 4, 3, projection="3d"), depth_mm, x, y)
+    normal.set(title="normals as colour", xlabel="x, mm")
+    _draw_surface(figure.add_subplot(grid[0, 3], projection="3d"), depth_mm, x, y)
     measured, touched = depth_mm[row - max(0, row - half)], inside[row - max(0, row - half)]
     ball = np.sqrt(np.clip(contact.radius_mm**2 - x**2, 0.0, None))
     ball += (measured - ball)[touched].mean()  # labels hold no depth
-    profile.plot(x, np.where(touched, ball, np.nan), color="#e69f00", lw=6, label="true ball")
-    profile.plot(x, measured, color="#0072b2", lw=1.8, label="measured")
-    profile.set(xlabel="x, mm", ylabel="depth, mm", title="profile at y = 0")
-    profile.legend(loc="lower center", fontsize=8, handlelength=1.2)
+    profile = figure.add_subplot(grid[1, 3])
+    profile.plot(x, np.where(touched, ball, np.nan), color="#e69f00", lw=5, label="true ball")
+    profile.plot(x, measured, color="#0072b2", lw=1.6, label="measured")
+    profile.set(xlabel="x, mm", ylabel="mm", ylim=(-0.3, 2.3), aspect="equal")
+    profile.legend(loc="upper center", ncols=2, fontsize=7, handlelength=1.0, frameon=False, borderpad=0.0, labelspacing=0.2)
     profile.grid(alpha=0.3)
-    profile.set_box_aspect(1.0)
     return figure
 
 
@@ -93,10 +95,10 @@ def _draw_surface(axes: Any, depth_mm: Any, x: Any, y: Any) -> None:
     axes.plot_surface(
         *np.meshgrid(x, -y), depth_mm, facecolors=shades, rstride=1, cstride=1, linewidth=0, antialiased=False, shade=False
     )
-    axes.set_box_aspect((np.ptp(x), np.ptp(y), EXAGGERATION * np.ptp(depth_mm)), zoom=1.25)
+    axes.set_box_aspect((np.ptp(x), np.ptp(y), np.ptp(depth_mm)), zoom=1.3)
     axes.view_init(elev=35, azim=-60)
     axes.set_axis_off()
-    axes.set_title(f"surface, depth times {EXAGGERATION:g}")
+    axes.set_title("surface and profile, to scale")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -2,7 +2,6 @@
 
 python scripts/figures.py speed out/bench/bench.json docs/speed_accuracy.png
 python scripts/figures.py overview tests/breaking_points.json docs/failures/overview.png
-python scripts/figures.py learning out/learning_curve/rows.json docs/learning_curve.png
 python scripts/figures.py confidence out/confidence.json docs/confidence.png
 """
 
@@ -17,7 +16,6 @@ from lab.commands import main_of, parser_of
 DRAW: dict[str, Callable[[str], Figure]] = {
     "speed": lambda text: figures.speed_figure(rows.from_json(text)),
     "overview": lambda text: failure_figures.overview_figure(stability.points_from_json(text)[0]),
-    "learning": lambda text: figures.learning_figure(rows.from_json(text)),
     "confidence": lambda text: figures.coverage_figure(rows.from_json(text)),
 }
 

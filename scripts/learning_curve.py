@@ -18,10 +18,9 @@ from lab import rows as records
 from lab import sets
 from lab.commands import main_of, parser_of
 from lab.evaluate import evaluate
-from lab.figures import learning_figure
+from lab.figures import learning_figure, save_small
 from lab.methods import GIVEN_NETWORK
 from lab.rows import Column, Row, error_column
-from torchvts.viz import save_figure
 
 COUNTS = (0, 1, 3, 5, 11, 21)
 
@@ -54,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 bar.update()
     text = records.table(means(rows), COLUMNS)
     records.write_files(arguments.out, {"table.md": text + "\n", "rows.json": records.to_json(rows)})
-    save_figure(learning_figure(rows), arguments.out / "learning_curve.png")
+    save_small(learning_figure(rows), arguments.out / "learning_curve.png", text)
     print(f"{text}\n\nwrote {arguments.out}/table.md, rows.json and learning_curve.png")
     return 0
 

@@ -37,7 +37,9 @@ MOST_POINTS = 220
 """Largest number of points of a surface in each direction."""
 
 _HALO = [patheffects.withStroke(linewidth=2.0, foreground="black")]
-_EXAGGERATIONS = (1, 2, 3, 4, 5, 8, 10, 15, 20, 30, 40, 50, 80, 100, 150, 200, 300, 400, 500, 1000)
+
+EXAGGERATION = 3.0
+"""Heights are drawn so many times as large, in pictures and live views, so that two pictures can be compared."""
 
 
 def new_figure(width: float, height: float, dpi: int = 150) -> Figure:
@@ -128,26 +130,26 @@ def draw_contours(
     axes: Any,
     depth: Array,
     mm_per_pixel: float,
-    step_um: float | None = None,
+    step_mm: float | None = None,
     range_mm: tuple[float, float] | None = None,
 ) -> None:
-    """Draw depth in colour, with contour lines every round number of micrometres and a colour bar.
+    """Draw depth in colour, with contour lines every round part of a millimetre and a colour bar.
 
     Args:
         figure: the figure, for the colour bar.
         axes: the panel.
         depth: (H, W), mm.
         mm_per_pixel: pixel pitch, mm.
-        step_um: distance of the lines, micrometres; None chooses it.
+        step_mm: distance of the lines, mm; None chooses it.
         range_mm: range of the colours, for panels that are compared; None takes that of the depth (:func:`depth_range`).
     """
-    low, high = (1000.0 * value for value in range_mm or depth_range(depth))
+    low, high = range_mm or depth_range(depth)
     colors, norm = depth_colors(low, high)
-    picture = axes.imshow(depth * 1000.0, cmap=colors, norm=norm, extent=_extent(depth, mm_per_pixel))
-    step = step_um or _round_step(high - low)
-    _draw_lines(axes, (depth * 1000.0).clip(low, high), mm_per_pixel, step, colors, norm)
-    draw_bar(figure, axes, picture, "depth, um")
-    axes.set_title(f"depth, a line every {step:g} um", fontsize=10)
+    picture = axes.imshow(depth, cmap=colors, norm=norm, extent=_extent(depth, mm_per_pixel))
+    step = step_mm or _round_step(high - low)
+    _draw_lines(axes, depth.clip(low, high), mm_per_pixel, step, colors, norm)
+    draw_bar(figure, axes, picture, "depth, mm")
+    axes.set_title(f"depth, a line every {step:g} mm", fontsize=10)
     _millimetres(axes)
 
 
@@ -181,7 +183,7 @@ def draw_surface(axes: Any, depth: Array, mm_per_pixel: float, range_mm: tuple[f
     rows, columns = np.mgrid[0 : z.shape[0], 0 : z.shape[1]] * mm_per_pixel * stride
     x, y = left + columns, rows - lower
     low, high = range_mm or depth_range(depth)
-    exaggeration = _exaggeration(max(float(np.ptp(z)), 0.02 * high, 1e-6), -2.0 * left)
+    exaggeration = _exaggeration(float(np.ptp(z)), -2.0 * left)
     colors, norm = depth_colors(low, high)
     step = mm_per_pixel * stride
     light = LightSource(azdeg=315, altdeg=50)
@@ -203,10 +205,10 @@ def comparison_figure(depth_mm: Tensor, truth_mm: Tensor, mm_per_pixel: float, t
     figure = new_figure(10.5, 2.9)
     axes = figure.subplots(1, 3)
     span = depth_range(depth, truth)
-    step = _round_step(1000.0 * (span[1] - span[0]))
+    step = _round_step(span[1] - span[0])
     for panel, values, name in ((axes[0], truth, "truth"), (axes[1], depth, "measured")):
         draw_contours(figure, panel, values, mm_per_pixel, step, span)
-        panel.set_title(f"{name}, a line every {step:g} um", fontsize=10)
+        panel.set_title(f"{name}, a line every {step:g} mm", fontsize=10)
     error = (depth - truth) / mm_per_pixel
     most = max(float(np.abs(error).max()), 1e-6)
     colors, norm = depth_colors(-most, most)
@@ -256,7 +258,7 @@ def pose_figure(source: Tensor, target: Tensor, T_target_source: Tensor, title: 
     low, high = everything.min(0), everything.max(0)
     low, high = low - 0.04 * (high - low), high + 0.04 * (high - low)
     spans = high - low
-    exaggeration = _exaggeration(max(float(spans[2]), 1e-6), float(max(spans[:2])))
+    exaggeration = _exaggeration(float(spans[2]), float(max(spans[:2])))
     figure = new_figure(10.0, 3.1)
     for k, (name, points) in enumerate(states.items()):
         above = figure.add_subplot(1, 4, 2 * k + 1)
@@ -316,8 +318,8 @@ def _space_labels(axes: Any) -> None:
 
 
 def _exaggeration(height: float, width: float) -> float:
-    """The round factor that makes a relief about a seventh as high as the frame is wide."""
-    return float(max((f for f in _EXAGGERATIONS if f * height <= 0.15 * width), default=1))
+    """That of all pictures, or 1 where the relief would be higher than half the frame is wide."""
+    return EXAGGERATION if EXAGGERATION * height <= 0.5 * width else 1.0
 
 
 def _round_step(span: float) -> float:

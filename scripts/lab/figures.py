@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
 from torchvts.core.files import write_atomically
@@ -27,13 +28,16 @@ from .rows import Row, Size
 from .speed import front, ms
 
 
-def save_small(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG of at most 256 colours: a third of the size."""
+def save_small(figure: Figure, path: Path, table: str = "") -> None:
+    """Write a figure as PNG of at most 256 colours, a third of the size; "Description" in it holds the table that it shows."""
     canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()
     pixels = np.asarray(canvas.buffer_rgba())[:, :, :3]
     with write_atomically(path) as temporary:
-        Image.fromarray(pixels).quantize(256).save(temporary, optimize=True)
+        held = PngInfo()
+        if table:
+            held.add_text("Description", table)
+        Image.fromarray(pixels).quantize(256).save(temporary, optimize=True, pnginfo=held)
 
 
 # error against time

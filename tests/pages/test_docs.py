@@ -11,6 +11,7 @@ from types import ModuleType
 import pytest
 import yaml
 from documents import ROOT
+from PIL import Image
 
 import torchvts as vts
 from torchvts.cli.main import COMMANDS, make_parser
@@ -44,6 +45,22 @@ def test_links_and_pictures_exist():
     for path in [*PAGES, *DOCS.glob("api/*.md")]:
         for link in re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", path.read_text()):
             assert (path.parent / link).exists(), f"{path.name}: {link}"
+
+
+def rows_of(table):
+    """Cells of the learning curve's table in a text, in one order of columns."""
+    lines = [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in table.splitlines() if line.startswith("|")]
+    at = next(k for k, line in enumerate(lines) if "without tilt um" in line)
+    wanted = [
+        lines[at].index(head) for head in ("given", "number", "normals deg", "relief um", "without tilt um", "radius %, median")
+    ]
+    return [[line[k] for k in wanted] for line in lines[at + 2 :] if len(line) == len(lines[at])]
+
+
+def test_the_learning_curve_shows_the_table_beside_it():
+    with Image.open(DOCS / "learning_curve.png") as picture:
+        drawn = rows_of(picture.text["Description"])
+    assert drawn == rows_of((DOCS / "calibration.md").read_text())
 
 
 def commands(text):

@@ -46,7 +46,7 @@ def test_zero_keeps_its_colour_and_equal_depths_are_equally_far_from_it():
 
 def test_panels_that_are_compared_share_their_range():
     truth, measured, error, *_ = viz.comparison_figure(frame() - 0.05, frame(), PITCH).axes
-    assert truth.get_images()[0].get_clim() == measured.get_images()[0].get_clim() == pytest.approx((-50.0, 500.0), abs=1.0)
+    assert truth.get_images()[0].get_clim() == measured.get_images()[0].get_clim() == pytest.approx((-0.05, 0.5), abs=1e-3)
     low, high = error.get_images()[0].get_clim()
     assert low == pytest.approx(-high)
 

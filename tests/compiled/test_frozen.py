@@ -484,6 +484,7 @@ def test_several_callers_at_once(unit, threads):
 
 INTERRUPTED = """
 import os, signal, sys, threading, time, torch
+signal.signal(signal.SIGINT, signal.default_int_handler)  # shells let commands in the background ignore it
 import torchvts as vts
 torch.set_num_threads(2)
 lights = vts.PointLights([[20, 9, 30], [-18, 13, 30], [-2, -22, 30]], [900, 900, 900])

@@ -18,9 +18,11 @@ from torchvts.core.files import (
     count_frames,
     read_depth_png,
     read_frames,
+    rgb_from_bgr,
     write_atomically,
     write_depth_png,
 )
+from torchvts.dataset import list_items
 from torchvts.pose import read_cloud
 
 
@@ -92,13 +94,24 @@ def test_a_picture_is_no_depth(tmp_path):
         read_depth_png(tmp_path / "image.png")
 
 
-def test_frames_of_a_folder_come_by_name(tmp_path):
-    for k in (2, 0, 1):
-        vts.write_image(tmp_path / f"{k:03d}.png", picture(seed=k))
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["000", "001", "002"],
+        ["frame_1", "frame_2", "frame_10", "frame_11"],  # frame_%d.png of OpenCV
+        ["1764241910.25", "1764241910.5", "1764241911.125"],  # f"{time.time()}.png"
+        ["press_1_9", "press_1_10", "press_01_11", "press_2_1"],
+    ],
+)
+def test_frames_of_a_folder_come_in_the_order_of_their_numbers(tmp_path, names):
+    for k in reversed(range(len(names))):
+        vts.write_image(tmp_path / f"{names[k]}.png", picture(seed=k))
     (tmp_path / "notes.txt").write_text("no image")
-    frames = list(read_frames(tmp_path))
-    assert [name for name, _ in frames] == ["000", "001", "002"] and count_frames(tmp_path) == 3
-    assert all(torch.equal(frame, picture(seed=k)) for k, (_, frame) in enumerate(frames))
+    frames, reader = list(read_frames(tmp_path)), streams.open_source(tmp_path)
+    assert [name for name, _ in frames] == names and count_frames(tmp_path) == len(names)
+    assert [item.stem for item in list_items(tmp_path)] == names
+    for k, (_, frame) in enumerate(frames):
+        assert torch.equal(frame, picture(seed=k)) and torch.equal(rgb_from_bgr(reader.read()), frame)
 
 
 def test_frames_of_a_video(tmp_path):

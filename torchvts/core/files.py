@@ -4,10 +4,12 @@ import errno
 import hashlib
 import json
 import os
+import re
 import secrets
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -344,7 +346,7 @@ def _write_pixels(path: Path, pixels: np.ndarray[Any, Any]) -> None:
 
 
 def read_frames(source: str | Path) -> Iterator[tuple[str, Tensor]]:
-    """Frames of an image file, a folder of images (by name) or a video: pairs of a name and (3, H, W) in [0, 1], R, G, B.
+    """Frames of an image file, a folder of images (1, 2, 10) or a video: pairs of a name and (3, H, W) in [0, 1], R, G, B.
 
     Raises:
         FileNotFoundError: no such file or folder.
@@ -363,9 +365,21 @@ def read_frames(source: str | Path) -> Iterator[tuple[str, Tensor]]:
     return iter([(path.stem, read_image(path))])
 
 
+def natural_order(name: str) -> tuple[list[str | Decimal], str]:
+    """Key that sorts names with their numbers as numbers, decimals of times too.
+
+    Example:
+        >>> sorted(["10.png", "2.png", "1.25.png", "1.5.png"], key=natural_order)
+        ['1.25.png', '1.5.png', '2.png', '10.png']
+    """
+    parts = re.split(r"([0-9]+(?:\.[0-9]+)?)", name)
+    return [Decimal(part) if k % 2 else part for k, part in enumerate(parts)], name
+
+
 def image_files(folder: Path) -> list[Path]:
-    """Images of a folder, sorted by name, without hidden ones, which a killed writer may leave."""
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+    """Images of a folder in :func:`natural_order`, without hidden ones, which a killed writer may leave."""
+    files = (p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+    return sorted(files, key=lambda p: natural_order(p.name))
 
 
 def count_frames(source: str | Path) -> int:

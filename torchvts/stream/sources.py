@@ -230,7 +230,7 @@ def frames_a_second(capture: Any) -> float:
 
 
 class FolderReader:
-    """A folder of images, by name."""
+    """A folder of images, by name, numbers as numbers."""
 
     def __init__(self, folder: Path) -> None:
         self.name, self.live, self.fps = str(folder), False, 30.0

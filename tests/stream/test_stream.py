@@ -524,7 +524,7 @@ def test_realtime_takes_every_frame_where_there_is_time(unit):
     assert not any(thread.name == "torchvts-reader" for thread in threading.enumerate())
 
 
-@pytest.mark.parametrize("suffix", [".avi", ".mp4"])
+@pytest.mark.parametrize("suffix", [".avi", ".mp4", ".webm"])
 def test_a_video_file_is_whole_or_not_there(tmp_path, suffix):
     path = tmp_path / f"out{suffix}"
     picture = np.zeros((32, 64, 3), np.uint8)
@@ -540,8 +540,28 @@ def test_a_video_file_is_whole_or_not_there(tmp_path, suffix):
             video.write(picture)
         assert not path.exists()
     assert len(list(read_frames(path))) == 3
-    with pytest.raises(ValueError, match=r"video: expected a name ending in .mp4 or .avi, got 'a.gif'"):
+    with pytest.raises(ValueError, match=r"like the first, got \(16, 64\)"), streams.VideoFile(path, 30.0) as video:
+        video.write(picture)
+        video.write(picture[:16])
+    with pytest.raises(ValueError, match=r"video: expected a name ending in .webm, .mp4, .avi, got 'a.gif'"):
         streams.VideoFile(tmp_path / "a.gif", 30.0)
+
+
+@pytest.mark.parametrize("suffix", [".avi", ".mp4", ".webm"])
+def test_a_video_that_does_not_fit_on_the_disk_is_an_error(tmp_path, suffix, small_files):
+    noise = np.random.default_rng(0).integers(0, 255, (20, 48, 64, 3), dtype=np.uint8)
+    told = pytest.raises(OSError, match=rf"video: .*film\{suffix}: cannot be written: \d+ of 20 frames")
+    with small_files(8192), told, streams.VideoFile(tmp_path / f"film{suffix}", 30.0) as film:
+        for picture in noise:
+            film.write(picture)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_video_that_fails_is_told_and_the_figures_are_kept(run_stream, unit_file, video, tmp_path, small_files):
+    with small_files(400_000):
+        done = run_stream("--source", video, "--calibration", unit_file, "--out", tmp_path, "--video", "avi")
+    assert done.returncode == 2 and "overlay.avi: cannot be written: " in done.stderr
+    assert len((tmp_path / "frames.csv").read_text().splitlines()) == 36 and not (tmp_path / "overlay.avi").exists()
 
 
 def test_a_sheet_shows_six_frames_in_contact_in_one_range(small_press):

@@ -32,6 +32,12 @@ def add_source(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="of PyTorch and OpenCV (1)")
 
 
+def add_video(parser: argparse.ArgumentParser) -> None:
+    """``--video``: kind of the video in ``--out``."""
+    kinds = "webm (browsers play it), mp4 (H.264 where OpenCV has it), avi, none (webm)"
+    parser.add_argument("--video", choices=["webm", "mp4", "avi", "none"], default="webm", metavar="KIND", help=kinds)
+
+
 def load_unit(arguments: argparse.Namespace) -> Sensor | Calibration:
     """The sensor or the calibration that was given, and the threads that were asked for."""
     if (arguments.sensor is None) == (arguments.calibration is None):

@@ -408,6 +408,20 @@ def open_video(path: Path) -> Any:
     return cv2.VideoCapture(check_text_name("video", path))
 
 
+def count_packets(path: Path) -> int:
+    """Number of frames that a video file holds; they are read, and decoded only where OpenCV has no FFmpeg."""
+    import cv2
+
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+    if not capture.isOpened():
+        capture = open_video(path)
+    count = 0
+    while capture.grab():
+        count += 1
+    capture.release()
+    return count
+
+
 def _read_video(path: Path) -> Iterator[tuple[str, Tensor]]:
     capture = open_video(path)
     number = 0

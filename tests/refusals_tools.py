@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from conftest import Frames
 from refusals_values import *
 
 import torchvts as vts
@@ -113,10 +114,12 @@ TABLE = {
         | {"network": [], "device": [None, "gpu", "cuda:99"], "contact": ["4.5", 4.5]}),
     "stream.StreamReport": Entry({"stream": ...}, {"stream": [None, "camera"]}, run=False),
     "stream.TactileStream": Entry({"source": ..., "sensor_or_calibration": sensor(), "mode": "auto", "background_frames": 12,
-        "presses": (), "network": None, "device": "cpu", "reconnect_s": 0.0, "contact": None}, {
+        "presses": (), "network": None, "device": "cpu", "reconnect_s": 0.0, "contact": None, "record": None}, {
         "reconnect_s": ["1", None, NAN, -1.0], "source": ["no/such.mp4", None, 2.5],
         "sensor_or_calibration": [None, "gelsight_mini"], "mode": ["slow", None], "background_frames": INTEGER, "presses": [],
-        "network": [], "device": [], "contact": ["4.5", 4.5]}, run=False),
+        "network": [], "device": [], "contact": ["4.5", 4.5], "record": []}, run=False),
+    "stream.Recorder": Entry(
+        {"reader": Frames([]), "path": "raw"}, {"reader": [], "path": ["raw.avi", None, 2.5]}, named={"path": "record"}, run=False),
     "stream.VideoFile": Entry(
         {"path": "film.avi", "fps": 10.0}, {"path": ["film.gif", "film"], "fps": NUMBER}, named={"path": "video"}),
     "stream.calibrate_background": Entry(

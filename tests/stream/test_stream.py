@@ -543,7 +543,7 @@ def test_a_video_file_is_whole_or_not_there(tmp_path, suffix):
     with pytest.raises(ValueError, match=r"like the first, got \(16, 64\)"), streams.VideoFile(path, 30.0) as video:
         video.write(picture)
         video.write(picture[:16])
-    with pytest.raises(ValueError, match=r"video: expected a name ending in .webm, .mp4, .avi, got 'a.gif'"):
+    with pytest.raises(ValueError, match=r"video: expected a name ending in .webm, .mp4, .avi, .mkv, got 'a.gif'"):
         streams.VideoFile(tmp_path / "a.gif", 30.0)
 
 

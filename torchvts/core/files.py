@@ -266,7 +266,7 @@ def write_image(path: str | Path, image: Tensor) -> None:
     """
     check_field("image", image)
     levels = torch.round(image.detach().clamp(0, 1) * 255).to(torch.uint8).cpu()
-    _write_pixels(check_path("path", path), np.ascontiguousarray(levels.flip(0).permute(1, 2, 0).numpy()))
+    write_pixels(check_path("path", path), np.ascontiguousarray(levels.flip(0).permute(1, 2, 0).numpy()))
 
 
 def image_to_bytes(image: Tensor) -> Tensor:
@@ -319,7 +319,7 @@ def write_depth_png(path: str | Path, depth_mm: Tensor) -> None:
             "depth_mm: expected finite values in [-3.2768, 3.2767] mm for a PNG, "
             f"got [{frame.min():.4g}, {frame.max():.4g}]: write .npy, or ask vts.diagnose what is wrong with the frame"
         )
-    _write_pixels(Path(path), value.numpy().astype(np.uint16))
+    write_pixels(Path(path), value.numpy().astype(np.uint16))
 
 
 def read_depth_png(path: str | Path) -> Tensor:
@@ -333,7 +333,8 @@ def read_depth_png(path: str | Path) -> Tensor:
     return (torch.from_numpy(pixels.astype(np.float32)) - DEPTH_PNG_ZERO)[None, None] * DEPTH_PNG_STEP_MM
 
 
-def _write_pixels(path: Path, pixels: np.ndarray[Any, Any]) -> None:
+def write_pixels(path: Path, pixels: np.ndarray[Any, Any]) -> None:
+    """Write what :func:`read_pixels` reads, or one channel, (H, W)."""
     import cv2
 
     if path.suffix.lower() not in IMAGE_SUFFIXES:
@@ -406,20 +407,6 @@ def open_video(path: Path) -> Any:
     import cv2
 
     return cv2.VideoCapture(check_text_name("video", path))
-
-
-def count_packets(path: Path) -> int:
-    """Number of frames that a video file holds; they are read, and decoded only where OpenCV has no FFmpeg."""
-    import cv2
-
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
-    if not capture.isOpened():
-        capture = open_video(path)
-    count = 0
-    while capture.grab():
-        count += 1
-    capture.release()
-    return count
 
 
 def _read_video(path: Path) -> Iterator[tuple[str, Tensor]]:

@@ -18,6 +18,7 @@ from ..skin import ContactSettings
 from .background import FIRST_FRAMES, calibrate_background, find_background, use_calibration, with_background
 from .follow_light import FollowLight
 from .frames import SourceFrames
+from .record import Recorder
 from .recording import Recording
 from .sources import Pixels, Reader, Unreadable, check_reader, open_source
 from .stages import StageClock
@@ -59,6 +60,7 @@ class TactileStream:
         device: of the pipeline, "cpu" or "cuda".
         reconnect_s: for how long a camera that has stopped is opened again before an error is raised; not with a :class:`Reader`.
         contact: thresholds of contact; None for the usual ones.
+        record: where the raw frames of a camera are written, see :class:`Recorder`; None for nowhere.
     Attributes:
         calibration: of the unit.
         note: where the calibration comes from and what to expect of it, in words.
@@ -90,13 +92,14 @@ class TactileStream:
         device: str = "cpu",
         reconnect_s: float = 0.0,
         contact: ContactSettings | None = None,
+        record: str | Path | None = None,
     ) -> None:
         check_choice("mode", mode, MODES)
         if contact is not None:
             check_record("contact", contact, ContactSettings, "ContactSettings(sigmas=...) makes one")
         check_switch("realtime", realtime)
         sensor = _sensor_of(sensor_or_calibration, background_frames, presses)
-        self.reader = _reader_of(source, reconnect_s)
+        self.reader = _reader_of(source, reconnect_s, record)
         self.fps = self.reader.fps
         self.stages = StageClock()
         self.left_out: list[tuple[int, str]] = []
@@ -226,10 +229,20 @@ def _sensor_of(unit: Sensor | Calibration, background_frames: int, presses: Sequ
     return unit.sensor
 
 
-def _reader_of(source: str | int | Path | Reader, reconnect_s: float) -> Reader:
-    """Open a source, or take a reader of the user's own."""
+def _reader_of(source: str | int | Path | Reader, reconnect_s: float, record: str | Path | None) -> Reader:
+    """Open a source, or take a reader of the user's own; record what it gives."""
     if isinstance(source, str | int | Path):
-        return open_source(source, reconnect_s)
-    if check_least("reconnect_s", reconnect_s) > 0:
+        reader = open_source(source, reconnect_s)
+    elif check_least("reconnect_s", reconnect_s) > 0:
         raise ValueError(f"reconnect_s: expected 0 with a reader of your own, got {reconnect_s:g}: it must reconnect by itself")
-    return check_reader(source)
+    else:
+        reader = check_reader(source)
+    if record is None:
+        return reader
+    try:
+        if not reader.live:
+            raise ValueError(f"record: expected a camera, got {reader.name}: it is a recording already")
+        return Recorder(reader, record)
+    except BaseException:
+        reader.close()
+        raise

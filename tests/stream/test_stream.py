@@ -23,6 +23,7 @@ from conftest import Frames, write_film
 import torchvts as vts
 from lab.latency import measure_latency
 from torchvts import stream as streams
+from torchvts.cli.stream import with_corners
 from torchvts.core.files import read_frames, rgb_from_bgr
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -740,6 +741,23 @@ def test_the_golf_ball_appears_and_vanishes(data):
     assert min(depth for depth, _ in rows[25:40]) > 0.4 and min(area for _, area in rows[25:40]) > 17_000
     assert max(depth for depth, _ in rows[-6:]) < 0.02 and max(area for _, area in rows[-6:]) < 200  # after
     assert stream.light.steps == 0
+
+
+def test_a_sensor_of_which_no_more_than_pitch_and_corners_is_known_is_told_what_to_press(data, run_stream, tmp_path):
+    wedge = vts.Sensor.load("gelsight_wedge")
+    vts.Sensor("mine", 300, 400, 0.09, corners_px=wedge.corners_px).save(tmp_path / "mine.yaml")
+    video = next((data / "wedge_video").glob("*.avi"))
+    done = run_stream("--source", video, "--sensor", tmp_path / "mine.yaml")
+    assert done.returncode == 2 and "calibration's background" not in done.stderr and "background-frames 0" not in done.stderr
+    assert "how sensor 'mine' is lit cannot be found in its first 12 frames alone: press a ball of known diam" in done.stderr
+
+
+def test_corners_take_the_place_of_the_crop_of_raw_frames():
+    frame, mini = torch.rand(1, 3, 480, 640), vts.Sensor.load("gelsight_mini")
+    frame = torch.nn.functional.avg_pool2d(frame, 31, 1, 15)
+    (left, top), (right, bottom) = (91.0, 68.0), (548.0, 411.0)
+    cut = with_corners(mini, f"{left},{top} {right},{top} {right},{bottom} {left},{bottom}")
+    assert torch.allclose(cut.rectify(frame), mini.rectify(frame), atol=0.005)
 
 
 def test_presses_of_a_known_sensor_are_no_background(mini_presses):

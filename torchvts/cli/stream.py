@@ -116,7 +116,7 @@ def with_corners(unit: Sensor | Calibration, text: str) -> Sensor | Calibration:
         numbers = []
     if len(numbers) != 8:
         raise ValueError(f"corners: expected eight numbers, x and y of four corners, got {text!r}")
+    sensor = unit if isinstance(unit, Sensor) else unit.sensor
     corners = tuple(zip(numbers[::2], numbers[1::2]))
-    if isinstance(unit, Sensor):
-        return dataclasses.replace(unit, corners_px=corners, roi_px=None)
-    return dataclasses.replace(unit, sensor=dataclasses.replace(unit.sensor, corners_px=corners, roi_px=None))
+    sensor = dataclasses.replace(sensor, corners_px=corners, roi_px=None, raw_size_px=(), raw_crop=0.0)
+    return sensor if isinstance(unit, Sensor) else dataclasses.replace(unit, sensor=sensor)

@@ -23,6 +23,13 @@ from .recording import Recording
 from .sources import Pixels, Reader, Unreadable, check_reader, open_source
 from .stages import StageClock
 
+UNKNOWN_LIGHT = (
+    "background: how sensor '{0}' is lit cannot be found in its first {1} frames alone: press a ball of known diameter at some "
+    "places, and give the images: torchvts calibrate background.png --sensor FILE --press ball.png 6.31 --press ... makes what "
+    "--calibration takes (presses=[...] in Python)"
+)
+"""What is said where the first frames, taken for the background, fit the model that was found in them badly."""
+
 
 class TactileFrame(NamedTuple):
     """A frame and its depth.
@@ -124,7 +131,12 @@ class TactileStream:
                 contact=contact,
                 stage=self.stages.stage,
             )
-            self._use(self._start(self.calibration, first=first if background_frames > 0 else None))
+            try:
+                self._use(self._start(self.calibration, first=first if background_frames > 0 else None))
+            except ValueError as error:
+                if isinstance(sensor_or_calibration, Calibration):
+                    raise
+                raise ValueError(UNKNOWN_LIGHT.format(sensor.name, int(background_frames))) from error  # it fits no frame
         except BaseException:
             self.reader.close()
             raise

@@ -32,7 +32,7 @@ from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, count_frames
 from ..model import Calibration
 from ..pipeline import MODES, DepthOutput, unit_pipeline
 from ..skin import ContactSettings
-from ..stream import FIRST_FRAMES, Recording, check_device, use_calibration
+from ..stream import FIRST_FRAMES, Recording, check_device, use_calibration, video_codec
 from .items import Item, Source, list_items
 from .loading import Frame, load_frames
 from .processes import share, sum_over_processes
@@ -260,7 +260,8 @@ class _Worker:
         fps, count = held[0][0].fps if held else 30.0, self.settings.background_frames
         try:
             if 0 < count <= len(held):
-                return self.recording(torch.cat([image for _, image in held]), fps=fps)
+                first = torch.cat([image for _, image in held])
+                return self.recording(first, fps=fps, codec=video_codec(item.file))
             reason = f"background_frames: expected at least {count} frames, got {len(held)}" if count > 0 else ""
         except ValueError as error:
             reason = in_one_line(error)

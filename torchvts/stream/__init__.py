@@ -20,7 +20,7 @@ from .live import TactileFrame, TactileStream
 from .overlay import Overlay, Sheet
 from .record import Recorder
 from .recording import Recording, check_device
-from .sources import Reader, Unreadable, frames_a_second, open_source
+from .sources import Reader, Unreadable, frames_a_second, open_source, video_codec
 from .stages import StageClock
 from .usable import FrameCheck
 from .video import VideoFile
@@ -59,5 +59,6 @@ __all__ = [
     "read_press_images",
     "require_rerun",
     "use_calibration",
+    "video_codec",
     "with_background",
 ]

@@ -116,10 +116,12 @@ class TactileStream:
             self._frames = SourceFrames(self.reader, background_frames, realtime, self.stages)
             self._sensor, self._size = sensor, self._frames.readable[0].shape[:2]
             first = torch.cat([self._rectified(pixels) for pixels in self._frames.readable])
+            codec: str = getattr(self.reader, "codec", "")
             if isinstance(sensor_or_calibration, Calibration):
                 found = use_calibration(sensor_or_calibration)
             else:
-                found = calibrate_background(find_background(first, sensor)[0].clamp(0.0, 1.0), sensor, presses)
+                background = find_background(first, sensor, codec)[0].clamp(0.0, 1.0)
+                found = calibrate_background(background, sensor, presses)
             self.calibration, self.note, self.metric = found
             self._start = partial(
                 Recording,
@@ -129,6 +131,7 @@ class TactileStream:
                 network=network,
                 device=device,
                 contact=contact,
+                codec=codec,
                 stage=self.stages.stage,
             )
             try:

@@ -51,6 +51,7 @@ class Recording:
         network: a trained network in place of the calibration's model, see :func:`torchvts.pipeline.unit_pipeline`.
         device: of the pipeline, "cpu" or "cuda"; frames come and go on the CPU.
         contact: thresholds of contact; None for the usual ones.
+        codec: of the video, see :func:`find_background`.
         stage: makes a context in which a stage of that name runs, to measure its time.
     Attributes:
         pipe: the pipeline, frozen.
@@ -69,6 +70,7 @@ class Recording:
         network: str | Path | None = None,
         device: str = "cpu",
         contact: ContactSettings | None = None,
+        codec: str = "",
         stage: Callable[[str], AbstractContextManager[Any]] = lambda name: nullcontext(),
     ) -> None:
         check_calibration("calibration", calibration)
@@ -83,7 +85,7 @@ class Recording:
         self.check = FrameCheck.from_calibration(calibration)
         self._fps, self._follow, self._stage = fps, follow, stage
         self._before: float | None = None
-        image, noise = (None, None) if first is None else find_background(first)
+        image, noise = (None, None) if first is None else find_background(first, codec=codec)
         if noise is not None and isinstance(pipe.mask, ContactMask):  # a video's compression is alike over whole cells
             relative = calibration.sensor.exponent * noise.float() / value.maximum(noise.float()).clamp_min(1e-3)
             pipe.mask.least_spread = max(pipe.mask.least_spread, float(relative.median()))

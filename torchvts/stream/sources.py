@@ -93,6 +93,7 @@ class CaptureReader:
         self.fps = frames_a_second(self._capture)
         self.times = list(read_times(source).values()) if isinstance(source, Path) else []
         self.fps = rate_of(self.times, self.fps)
+        self.codec = lossy_codec(self._capture)
 
     def read(self) -> Pixels | None:
         there, pixels = self._capture.read()
@@ -267,6 +268,34 @@ def time_of(reader: Reader, index: int) -> float:
     return times[index] if index < len(times) else index / reader.fps
 
 
+CODECS = {
+    **dict.fromkeys(("FMP4", "mp4v", "XVID", "DIVX", "DX50", "MP42", "MP43"), "MPEG-4"),
+    **dict.fromkeys(("h264", "H264", "avc1", "X264"), "H.264"),
+    **dict.fromkeys(("hevc", "HEVC", "hvc1", "hev1"), "H.265"),
+    **dict.fromkeys(("MJPG", "mjpg"), "Motion JPEG"),
+    **dict.fromkeys(("FFV1", "HFYU", "FFVH", "MPNG", "png ", "I420", "YUY2", "YUYV", "\0\0\0\0"), ""),
+}
+"""OpenCV's codes of codecs, and the names of those that lose something; others are shown by their code."""
+
+
+def lossy_codec(capture: Any) -> str:
+    """Name of the codec of an OpenCV capture; empty where it loses nothing, or is not known."""
+    import cv2
+
+    code = int(capture.get(cv2.CAP_PROP_FOURCC))
+    letters = max(code, 0).to_bytes(8, "little")[:4].decode("latin-1")
+    return CODECS.get(letters, letters)
+
+
+def video_codec(path: Path) -> str:
+    """:func:`lossy_codec` of a video file."""
+    capture = open_video(path)
+    try:
+        return lossy_codec(capture)
+    finally:
+        capture.release()
+
+
 class FolderReader:
     """A folder of images, by name, numbers as numbers."""
 
@@ -280,6 +309,7 @@ class FolderReader:
         self._files, known = iter(files), read_times(folder)
         self.times = [known[file.stem] for file in files] if all(file.stem in known for file in files) else []
         self.fps = rate_of(self.times, self.fps)
+        self.codec = "JPEG" if files[0].suffix.lower() in (".jpg", ".jpeg") else ""
 
     def read(self) -> Pixels | Unreadable | None:
         path = next(self._files, None)

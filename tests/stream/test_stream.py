@@ -309,11 +309,12 @@ def test_unusable_frames_are_named_and_left_out(unit, run_stream, unit_file, tmp
     done = run_stream("--source", folder, "--calibration", unit_file, "--out", tmp_path / "out", "--video", "none")
     assert done.returncode == 1, done.stderr
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert [number for number, _ in summary["left_out"]] == [14, 15, 16, 17, 18, 19, 21] and summary["frames"] == 19
-    reasons = dict(summary["left_out"]) | {19: "not an image"}
+    assert [number for number, _ in summary["left_out_because"]] == [14, 15, 16, 17, 18, 19, 21]
+    assert (summary["frames"], summary["left_out"]) == (19, 7) and "7 left out, named above" in done.stdout
+    reasons = dict(summary["left_out_because"]) | {19: "not an image"}
     for k, (_, part) in bad.items():
         assert re.search(part, reasons[k]), (k, reasons[k])
-        assert f"left out frame {k}: " in done.stdout
+        assert (done.stdout + done.stderr).count(f"frame {k} left out: ") == 1
     rows = (tmp_path / "out" / "frames.csv").read_text().splitlines()[1:]
     assert len(rows) == 26 and rows[15] == "15,,,,left out"
     assert [float(row.split(",")[2]) > 0 for row in rows if not row.endswith("left out")] == [False] * 14 + [True] * 5
@@ -647,6 +648,24 @@ def test_track_writes_a_row_for_each_frame_after_the_reference(run_script, unit_
     expected = {"frames": 19, "lost": 10, "left_out": 0, "converged": 0, "keyframes": 1, "reference_frame": 15, "metric": True}
     assert {name: summary[name] for name in expected} == expected and summary["lost_because"] == {"no contact": 10}
     assert summary["largest_drift_deg"] == 0.0 and sum(summary["unknown_motions"].values()) == 9
+
+
+def test_a_key_of_a_summary_has_one_meaning_in_all_commands(run_script, unit_file, video, tmp_path):
+    for command in ("stream", "track"):
+        given = ("--source", video, "--calibration", unit_file, "--out", tmp_path / command, "--video", "none")
+        assert run_script(command, *given).returncode in (0, 1)
+    assert run_script("reconstruct", unit_file, video, "--out", tmp_path / "reconstruct", "--no-pictures").returncode == 0
+    says = {name: json.loads((tmp_path / name / "summary.json").read_text()) for name in ("stream", "track", "reconstruct")}
+    tables = {
+        name: len((tmp_path / name / table).read_text().splitlines()) - 1
+        for name, table in (("stream", "frames.csv"), ("track", "poses.csv"), ("reconstruct", "frames.csv"))
+    }
+    assert {name: summary["frames"] for name, summary in says.items()} == tables
+    shared = {"source", "source_fps", "left_out", "left_out_because", "sensor", "metric", "mm_per_pixel", "calibration_note"}
+    counted = {"frames", "lost", "converged", "keyframes"}
+    for one, other in itertools.combinations(says.values(), 2):
+        assert all(one[key] == other[key] for key in one.keys() & other.keys() - counted)
+    assert shared <= says["stream"].keys() & says["track"].keys()
 
 
 def test_track_refuses_a_reference_that_cannot_be_used_and_counts_bad_frames(unit, run_script, unit_file, tmp_path):

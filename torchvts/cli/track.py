@@ -31,6 +31,7 @@ from ..core.files import check_folder, make_folder, read_image, write_atomically
 from ..pose import PoseTracker, TrackedPose
 from ..pose.follow import TRUSTED_DEG, TRUSTED_MM
 from ..stream import NOT_METRIC, LiveView, Overlay, TactileFrame, TactileStream, VideoFile, has_screen
+from ..stream.files import summary_of
 from ..stream.sources import Pixels
 from ..stream.view import AXIS_COLOURS
 from .options import add_out
@@ -196,16 +197,10 @@ def summary(tracking: _Tracking, stream: TactileStream) -> dict[str, Any]:
     drift = {name: max((float(str(row[name])) for row in followed), default=0.0) for name in ("drift_deg", "drift_mm")}
     closures = [] if tracking.tracker is None else tracking.tracker.closures
     return {
-        "source": stream.reader.name,
-        "fps": stream.fps,
-        "unit": stream.note,
-        "metric": stream.metric,
-        "mm_per_pixel": tracking.pitch,
+        **summary_of(stream, len(rows)),
         "reference_frame": tracking.reference,  # None where --reference gave an image
-        "frames": len(rows),
         "lost": len(lost),
         "lost_because": dict(Counter(str(row["lost"]) for row in lost).most_common()),
-        "left_out": len(stream.left_out),
         "converged": sum(row["converged"] == 1 for row in rows),
         "unknown_motions": dict(Counter(str(row["ambiguous"]) for row in rows if row["ambiguous"]).most_common()),
         "keyframes": len(graph.keyframes) if graph else 0,

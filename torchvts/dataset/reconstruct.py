@@ -133,19 +133,23 @@ def reconstruct_dataset(
     if network is not None:
         unit_pipeline(unit, mode, network, contact)  # a bad one is refused before anything is written
     _check_source(source, out)
-    torch.set_num_threads(threads)
     settings = Settings(
         _digest(calibration), _digest(network), _names(source), mode, format, cloud, pictures, every, device, threads,
         __version__, str(torch.__version__), background_frames, None if contact is None else asdict(contact),
     )  # fmt: skip
-    with share() as (rank, world), locked(out) if rank == 0 else nullcontext():
-        if rank == 0:
-            settings = begin(source, out, settings, overwrite)
-        sum_over_processes(0)  # the settings are there for the others to read
-        if rank > 0:
-            settings = join(out, settings)
-        records = Records(source, out, settings)
-        return _Worker(unit, Path(calibration).name, network, records, (rank, world), strict).run(batch, workers)
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        with share() as (rank, world), locked(out) if rank == 0 else nullcontext():
+            if rank == 0:
+                settings = begin(source, out, settings, overwrite)
+            sum_over_processes(0)  # the settings are there for the others to read
+            if rank > 0:
+                settings = join(out, settings)
+            records = Records(source, out, settings)
+            return _Worker(unit, Path(calibration).name, network, records, (rank, world), strict).run(batch, workers)
+    finally:
+        torch.set_num_threads(before)
 
 
 def _source(source: str | Path | Sequence[str | Path]) -> Source:

@@ -10,6 +10,21 @@ from ..core.files import write_atomically
 from .live import TactileFrame, TactileStream
 
 
+def summary_of(stream: TactileStream, frames: int) -> dict[str, Any]:
+    """What summary.json says of every stream, in the words of data sets; ``frames`` are the rows of its table."""
+    return {
+        "source": stream.reader.name,
+        "source_fps": stream.fps,
+        "frames": frames,
+        "left_out": len(stream.left_out),
+        "left_out_because": [[number, reason] for number, reason in stream.left_out],
+        "sensor": stream.calibration.sensor.name,
+        "metric": stream.metric,
+        "mm_per_pixel": stream.calibration.sensor.mm_per_pixel,
+        "calibration_note": stream.note,
+    }
+
+
 class StreamReport:
     """Keeps the contact area, the largest depth and the state of the light of every frame, for a table and two files.
 
@@ -49,31 +64,25 @@ class StreamReport:
         return len(self.rows) / max(self._end - self._begin, 1e-9)
 
     def summary(self) -> dict[str, Any]:
-        """For JSON: the source, frames, dropped, fps, stages_ms, light and calibration."""
+        """For JSON: :func:`summary_of`, frames and dropped ones, fps, stages_ms, contact and light."""
         stream = self.stream
         return {
-            "source": stream.reader.name,
-            "source_fps": stream.fps,
-            "frames": len(self.rows),
+            **summary_of(stream, len(self.rows)),
             "dropped": stream.dropped,
-            "left_out": [[number, reason] for number, reason in stream.left_out],
             "fps": round(self.fps, 2),
             "stages_ms": {name: round(ms, 3) for name, ms in stream.stages.median_ms().items()},
             "contact_frames": sum(row[2] > 0 for row in self.rows),
             "deepest_mm": max((row[3] for row in self.rows), default=0.0),
             "light_level": [round(v, 5) for v in stream.light.level],
             "light_steps": stream.light.steps,
-            "metric": stream.metric,
-            "calibration": stream.note,
         }
 
     def table(self) -> str:
         """The summary as text."""
         values = self.summary()
         lines = [f"{values['frames']} frames, {values['dropped']} dropped, {values['fps']:.1f} frames a second"]
-        lines += [f"left out frame {number}: {reason}" for number, reason in values["left_out"][:20]]
-        if len(values["left_out"]) > 20:
-            lines.append(f"{len(values['left_out'])} frames left out, all of them in summary.json")
+        if values["left_out"]:
+            lines.append(f"{values['left_out']} left out, named above")
         lines.append("median ms: " + ", ".join(f"{name} {ms:.1f}" for name, ms in values["stages_ms"].items()))
         unit = "mm" if values["metric"] else "mm (NOT METRIC)"
         lines.append(f"contact in {values['contact_frames']} frames, deepest {values['deepest_mm']:.3f} {unit}")

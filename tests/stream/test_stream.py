@@ -770,6 +770,8 @@ def test_a_sensor_of_which_no_more_than_pitch_and_corners_is_known_is_told_what_
     done = run_stream("--source", video, "--sensor", tmp_path / "mine.yaml")
     assert done.returncode == 2 and "calibration's background" not in done.stderr and "background-frames 0" not in done.stderr
     assert "how sensor 'mine' is lit cannot be found in its first 12 frames alone: press a ball of known diam" in done.stderr
+    done = run_stream("--source", video, "--sensor", tmp_path / "mine.yaml", "--device", "gpu")
+    assert done.returncode == 2 and "device: expected cpu, cuda" in done.stderr
 
 
 def test_corners_take_the_place_of_the_crop_of_raw_frames():

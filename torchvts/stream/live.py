@@ -15,11 +15,18 @@ from ..core.files import rgb_from_bgr
 from ..model import Calibration, Sensor
 from ..pipeline import MODES, DepthOutput
 from ..skin import ContactSettings
-from .background import FIRST_FRAMES, calibrate_background, find_background, use_calibration, with_background
+from .background import (
+    FIRST_FRAMES,
+    StreamCalibration,
+    calibrate_background,
+    find_background,
+    use_calibration,
+    with_background,
+)
 from .follow_light import FollowLight
 from .frames import SourceFrames
 from .record import Recorder
-from .recording import Recording
+from .recording import NotAtRest, Recording
 from .sources import Pixels, Reader, Unreadable, check_reader, open_source
 from .stages import StageClock
 
@@ -117,12 +124,7 @@ class TactileStream:
             self._sensor, self._size = sensor, self._frames.readable[0].shape[:2]
             first = torch.cat([self._rectified(pixels) for pixels in self._frames.readable])
             codec: str = getattr(self.reader, "codec", "")
-            if isinstance(sensor_or_calibration, Calibration):
-                found = use_calibration(sensor_or_calibration)
-            else:
-                background = find_background(first, sensor, codec)[0].clamp(0.0, 1.0)
-                found = calibrate_background(background, sensor, presses)
-            self.calibration, self.note, self.metric = found
+            self.calibration, self.note, self.metric = _calibrated(first, sensor_or_calibration, presses, codec)
             self._start = partial(
                 Recording,
                 mode=mode,
@@ -134,14 +136,11 @@ class TactileStream:
                 codec=codec,
                 stage=self.stages.stage,
             )
-            try:
-                self._use(self._start(self.calibration, first=first if background_frames > 0 else None))
-            except ValueError as error:
-                if isinstance(sensor_or_calibration, Calibration):
-                    raise
-                raise ValueError(UNKNOWN_LIGHT.format(sensor.name, int(background_frames))) from error  # it fits no frame
-        except BaseException:
+            self._use(self._start(self.calibration, first=first if background_frames > 0 else None))
+        except BaseException as error:
             self.reader.close()
+            if isinstance(error, NotAtRest) and sensor is sensor_or_calibration:  # what these frames made fits none of them
+                raise ValueError(UNKNOWN_LIGHT.format(sensor.name, int(background_frames))) from error
             raise
 
     def _rectified(self, pixels: Pixels) -> Tensor:
@@ -242,6 +241,13 @@ def _sensor_of(unit: Sensor | Calibration, background_frames: int, presses: Sequ
     if len(presses) > 0:
         raise ValueError(f"presses: expected none beside a calibration, got {len(presses)}: they are for calibrating")
     return unit.sensor
+
+
+def _calibrated(first: Tensor, unit: Sensor | Calibration, presses: Sequence[Press], codec: str) -> StreamCalibration:
+    """The calibration that was given, or that of the first frames."""
+    if isinstance(unit, Calibration):
+        return use_calibration(unit)
+    return calibrate_background(find_background(first, unit, codec)[0].clamp(0.0, 1.0), unit, presses)
 
 
 def _reader_of(source: str | int | Path | Reader, reconnect_s: float, record: str | Path | None) -> Reader:

@@ -36,6 +36,10 @@ def check_device(device: str) -> torch.device:
     return found
 
 
+class NotAtRest(ValueError):
+    """The first frames show contact against the background of the calibration."""
+
+
 class Recording:
     """Depth of the frames of one recording, in order, by one calibration.
 
@@ -151,7 +155,7 @@ class Recording:
         corrected = light.correct(image)
         deformed = self.pipe.moved(corrected.to(self.device))
         if bool(deformed.any()):
-            raise ValueError(
+            raise NotAtRest(
                 f"background: the first frames show contact on {float(deformed.float().mean()):.1%} of the skin against the "
                 "calibration's background: start without contact, calibrate again if the skin or the camera's compression has "
                 "changed, or use the calibration as it is (background_frames=0, --background-frames 0)"

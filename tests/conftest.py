@@ -5,6 +5,7 @@ import io
 import json
 import os
 import runpy
+import signal
 import sys
 import warnings
 from pathlib import Path
@@ -116,6 +117,24 @@ def write_film(path, pictures, fps=30.0, code="MJPG"):
         writer.write(picture)
     writer.release()
     return path
+
+
+@pytest.fixture
+def small_files():
+    """Within it a file may have no more bytes, as on a full disk."""
+    resource = pytest.importorskip("resource")
+
+    @contextlib.contextmanager
+    def limited(most):
+        limits, ignored = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, limits[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+            signal.signal(signal.SIGXFSZ, ignored)
+
+    return limited
 
 
 @pytest.fixture(scope="session")

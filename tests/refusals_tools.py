@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from conftest import Frames
 from refusals_values import *
 
 import torchvts as vts
@@ -108,15 +109,17 @@ TABLE = {
         lambda: vts.stream.FollowLight(image()).update),
     "stream.FrameCheck": Entry({"background": image()}, {"background": [b for k, b in enumerate(images()) if k not in (3, 4)]}),
     "stream.Recording": Entry({"calibration": unit(), "mode": "fast", "first": None, "fps": 30.0, "stage": nullcontext}
-        | {"network": None, "device": "cpu", "contact": None},
+        | {"network": None, "device": "cpu", "contact": None, "codec": ""},
         {"calibration": [None, "unit"], "mode": ["slow"], "first": [], "fps": [], "stage": []}
-        | {"network": [], "device": [None, "gpu", "cuda:99"], "contact": ["4.5", 4.5]}),
+        | {"network": [], "device": [None, "gpu", "cuda:99"], "contact": ["4.5", 4.5], "codec": []}),
     "stream.StreamReport": Entry({"stream": ...}, {"stream": [None, "camera"]}, run=False),
     "stream.TactileStream": Entry({"source": ..., "sensor_or_calibration": sensor(), "mode": "auto", "background_frames": 12,
-        "presses": (), "network": None, "device": "cpu", "reconnect_s": 0.0, "contact": None}, {
+        "presses": (), "network": None, "device": "cpu", "reconnect_s": 0.0, "contact": None, "record": None}, {
         "reconnect_s": ["1", None, NAN, -1.0], "source": ["no/such.mp4", None, 2.5],
         "sensor_or_calibration": [None, "gelsight_mini"], "mode": ["slow", None], "background_frames": INTEGER, "presses": [],
-        "network": [], "device": [], "contact": ["4.5", 4.5]}, run=False),
+        "network": [], "device": [], "contact": ["4.5", 4.5], "record": []}, run=False),
+    "stream.Recorder": Entry(
+        {"reader": Frames([]), "path": "raw"}, {"reader": [], "path": ["raw.avi", None, 2.5]}, named={"path": "record"}, run=False),
     "stream.VideoFile": Entry(
         {"path": "film.avi", "fps": 10.0}, {"path": ["film.gif", "film"], "fps": NUMBER}, named={"path": "video"}),
     "stream.calibrate_background": Entry(
@@ -125,6 +128,7 @@ TABLE = {
         "source": ["no/such.mp4", ".", None, 2.5, True, -1, 2**31, 10**400, "9" * 20, "\u00b2"],
         "reconnect_s": ["1", None, NAN, -1.0]}, run=False),
     "stream.find_background": Entry(
-        {"images": image()[None].expand(5, -1, -1, -1), "sensor": None}, {"images": [*batches(3), image()[None]], "sensor": []}
+        {"images": image()[None].expand(5, -1, -1, -1), "sensor": None, "codec": ""},
+        {"images": [*batches(3), image()[None]], "sensor": [], "codec": []}
         ),
 }

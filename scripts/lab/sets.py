@@ -6,7 +6,6 @@ No set is scored on presses that were learned from, and no prior is used that ha
 import dataclasses
 import json
 import os
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -20,7 +19,7 @@ from torch import Tensor
 from torchvts.calibration import RESPONSE_BLUR_PX, Press, fit_prior, read_presses
 from torchvts.compensate import Compensate
 from torchvts.core.checks import check_image, check_integer
-from torchvts.core.files import read_image, rgb_from_bgr
+from torchvts.core.files import image_files, read_image, rgb_from_bgr
 from torchvts.core.geometry import GradientFromNormal
 from torchvts.integration import poisson_dct
 from torchvts.model import Calibration, Sensor
@@ -213,7 +212,7 @@ def _mini_c(folder: Path, limit: int | None) -> DataSet:
     sensor = Sensor.load("gelsight_mini")
     background, others = read_presses(folder.parent / "gelsight_mini_a")
     sensor = dataclasses.replace(sensor, prior=fit_prior(background, sensor, others, "the presses of gelsight_mini_a"))
-    files = spread(sorted(folder.glob("frame_*.jpg"), key=_number), limit)
+    files = spread([file for file in image_files(folder) if file.match("frame_*.jpg")], limit)
     images = torch.stack([read_image(file) for file in files])
     height, width = images.shape[2:]
     top, left = round(height / 7), round(width / 7)
@@ -240,7 +239,7 @@ def _balls(
         for line in table.read_text(encoding="utf-8").split()[1:]:
             name, x, y, radius = line.split(",")
             labels[name] = (float(x), float(y)), float(radius)
-    found = spread(sorted(folder.glob(files[1]), key=_number), limit)
+    found = spread([file for file in image_files(folder) if file.match(files[1])], limit)
     presses = [Press(read_image(file), values["diameter"], file.stem, *labels.get(file.stem, (None, None))) for file in found]
     return _halves(folder.name, read_image(folder / files[0]), sensor, presses, remark)
 
@@ -303,10 +302,6 @@ def _halves(name: str, background: Tensor, sensor: Sensor, presses: Sequence[Pre
     return DataSet(
         name, background, folds, f"half learned from, half scored, and the other way round; {'; '.join(dict.fromkeys(notes))}"
     )
-
-
-def _number(file: Path) -> int:
-    return int(re.findall(r"\d+", file.stem)[-1])
 
 
 _FOTS = {"height": 320, "width": 240, "pitch": 1.0 / 19.58, "diameter": 4.70}  # pixels per mm by the code of FOTS

@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+import torch
 
 import torchvts as vts
 from torchvts.cli import COMMANDS, main
@@ -67,21 +68,29 @@ def test_a_wrong_request_is_one_line_that_says_what_was_meant(arguments, message
     assert len(printed.err.splitlines()) == 1
 
 
+def raising(error):
+    raise error
+
+
 @pytest.mark.parametrize(
-    "error, status, message",
+    "failing, status, message",
     [
-        (ValueError("unit:\n  wrong"), 2, "torchvts: error: unit: wrong\n"),
-        (FileNotFoundError(2, "No such file", "x.png"), 2, "torchvts: error: [Errno 2] No such file: 'x.png'\n"),
-        (KeyError("passes"), 1, "torchvts: error: KeyError: 'passes': a bug in torchvts: please report what --debug prints\n"),
-        (KeyboardInterrupt(), 130, "torchvts: stopped\n"),
+        (lambda: vts.Sensor.from_dict({"a": 1}, "unit:\n "), 2, "torchvts: error: unit: : key 'a': unknown; expected name, "),
+        (lambda: vts.Sensor("rig", 48, 64, "0.1"), 2, "torchvts: error: mm_per_pixel: expected a number, got str"),
+        (lambda: raising(FileNotFoundError(2, "No such file", "x.png")), 2, "torchvts: error: [Errno 2] No such file: 'x.png'\n"),
+        (lambda: torch.empty(2**60, dtype=torch.uint8), 2, "torchvts: error: [enforce fail at "),
+        (lambda: raising(KeyError("passes")), 70, "KeyError: 'passes': a bug in torchvts: please report it with the lines above\n"),
+        (lambda: None + 1, 70, "error: TypeError: unsupported operand type(s)"),
+        (lambda: vts.PointLights([[9, 2, 10]] * 3, [45] * 3).to("moon"), 70, "error: RuntimeError: Expected one of cpu, "),
+        (lambda: torch.ones(2).numpy().reshape(3), 70, "error: ValueError: cannot reshape"),
+        (lambda: raising(KeyboardInterrupt()), 130, "torchvts: stopped\n"),
     ],
 )
-def test_no_traceback_reaches_a_user_unless_asked_for(error, status, message, capsys, monkeypatch):
-    def fail(arguments):
-        raise error
-
-    monkeypatch.setattr(importlib.import_module("torchvts.cli.samples"), "run", fail)
-    assert main(["samples"]) == status and capsys.readouterr().err == message
+def test_a_refusal_is_one_line_and_a_bug_has_a_traceback_and_a_status_of_its_own(failing, status, message, capsys, monkeypatch):
+    monkeypatch.setattr(importlib.import_module("torchvts.cli.samples"), "run", lambda arguments: failing())
+    assert main(["samples"]) == status
+    printed = capsys.readouterr().err
+    assert message in printed and ("Traceback" in printed) == (status == 70) and (status == 70 or printed.count("\n") == 1)
     assert main(["samples", "--debug"]) == status and "Traceback" in capsys.readouterr().err
 
 

@@ -1,9 +1,6 @@
 """Images, depth maps, frames and point clouds on disk."""
 
 import os
-import resource
-import signal
-import sys
 from pathlib import Path
 
 import cv2
@@ -18,9 +15,11 @@ from torchvts.core.files import (
     count_frames,
     read_depth_png,
     read_frames,
+    rgb_from_bgr,
     write_atomically,
     write_depth_png,
 )
+from torchvts.dataset import list_items
 from torchvts.pose import read_cloud
 
 
@@ -92,13 +91,24 @@ def test_a_picture_is_no_depth(tmp_path):
         read_depth_png(tmp_path / "image.png")
 
 
-def test_frames_of_a_folder_come_by_name(tmp_path):
-    for k in (2, 0, 1):
-        vts.write_image(tmp_path / f"{k:03d}.png", picture(seed=k))
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["000", "001", "002"],
+        ["frame_1", "frame_2", "frame_10", "frame_11"],  # frame_%d.png of OpenCV
+        ["1764241910.25", "1764241910.5", "1764241911.125"],  # f"{time.time()}.png"
+        ["press_1_9", "press_1_10", "press_01_11", "press_2_1"],
+    ],
+)
+def test_frames_of_a_folder_come_in_the_order_of_their_numbers(tmp_path, names):
+    for k in reversed(range(len(names))):
+        vts.write_image(tmp_path / f"{names[k]}.png", picture(seed=k))
     (tmp_path / "notes.txt").write_text("no image")
-    frames = list(read_frames(tmp_path))
-    assert [name for name, _ in frames] == ["000", "001", "002"] and count_frames(tmp_path) == 3
-    assert all(torch.equal(frame, picture(seed=k)) for k, (_, frame) in enumerate(frames))
+    frames, reader = list(read_frames(tmp_path)), streams.open_source(tmp_path)
+    assert [name for name, _ in frames] == names and count_frames(tmp_path) == len(names)
+    assert [item.stem for item in list_items(tmp_path)] == names
+    for k, (_, frame) in enumerate(frames):
+        assert torch.equal(frame, picture(seed=k)) and torch.equal(rgb_from_bgr(reader.read()), frame)
 
 
 def test_frames_of_a_video(tmp_path):
@@ -164,23 +174,16 @@ def calibration():
     return vts.Calibration.from_lights(ring_lights(), vts.Sensor("rig", 48, 64, 0.5), torch.rand(3, 48, 64) * 0.2 + 0.4)
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="limits of processes")
 @pytest.mark.parametrize("name", ["depth.npy", "unit.safetensors", "image.png", "rig.yaml"])
-def test_a_full_disk_is_reported_with_the_name(tmp_path, name):
+def test_a_full_disk_is_reported_with_the_name(tmp_path, name, small_files):
     write = {
         "depth.npy": lambda path: write_array(path),
         "unit.safetensors": calibration().save,
         "image.png": lambda path: vts.write_image(path, torch.rand(3, 200, 200)),
         "rig.yaml": lambda path: vts.Sensor.load("gelsight_mini").save(path, ["# " + "x" * 5000]),
     }[name]
-    limits, ignored = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))  # a file may have no more bytes: what a full disk does too
-    try:
-        with pytest.raises(OSError, match=rf"{name}: cannot be written: (File too large|10000 requested)"):
-            write(tmp_path / name)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, ignored)
+    with small_files(4096), pytest.raises(OSError, match=rf"{name}: cannot be written: (File too large|10000 requested)"):
+        write(tmp_path / name)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -208,8 +208,21 @@ def test_the_script_ends_with_status_1_where_a_frame_was_left_out(unit, tmp_path
     source = fill(tmp_path / "in", ["a.png", "b.png"])
     (source / "b.png").write_bytes(b"")
     done = run_script("reconstruct", unit, source, "--out", tmp_path / "out", "--no-pictures")
-    assert done.returncode == 1 and "left out: frame b.png: " in done.stdout and "wrote 1 frame to" in done.stdout
-    assert "table in frames.csv" in done.stdout
+    assert done.returncode == 1 and "1 left out, all of them in" in done.stdout and "wrote 1 frame to" in done.stdout
+    assert done.stderr.count("left out b.png: ") == 1 and "b.png" not in done.stdout and "table in frames.csv" in done.stdout
+
+
+def test_the_callers_threads_are_as_before(unit, tmp_path):
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        reconstruct_dataset(unit, fill(tmp_path / "in", ["a.png"]), tmp_path / "out", pictures=False)
+        assert torch.get_num_threads() == 2
+        with pytest.raises(ValueError, match="begun with other settings"):
+            reconstruct_dataset(unit, tmp_path / "in", tmp_path / "out", pictures=False, mode="fast", every=2)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_same_stems_keep_apart_and_folders_stay(unit, tmp_path):

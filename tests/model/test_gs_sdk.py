@@ -1,5 +1,7 @@
 """gs_sdk's folders, sensor files, height maps, gradients and images."""
 
+import argparse
+
 import cv2
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ import torch
 import yaml
 
 import torchvts as vts
+from torchvts.cli.calibrate import read_given
 from torchvts.model.gs_sdk import (
     depth_from_height_map,
     gradient_from_gs_sdk,
@@ -61,6 +64,15 @@ def test_labels_of_gs_sdk_are_read(folder):
     np.savez(folder / "4.000mm/1" / "label.npz", center=np.array([7, 5]), radius=3.5)
     press = read_calibration_folder(folder).presses[1]
     assert press.center_px == (7.0, 5.0) and press.radius_px == 3.5
+
+
+def test_images_that_gs_sdk_has_cropped_are_not_cropped_again(folder, tmp_path):
+    config = {"ppmm": 0.1, "imgh": HEIGHT, "imgw": WIDTH, "raw_imgh": HEIGHT, "raw_imgw": WIDTH}
+    (tmp_path / "same.yaml").write_text("".join(f"{key}: {value}\n" for key, value in config.items()))
+    given = argparse.Namespace(source=[folder], sensor=str(tmp_path / "same.yaml"), no_prior=False, use_labels=False)
+    background, _, presses = read_given(given)
+    kept = read_calibration_folder(folder)
+    assert torch.equal(background, kept.background) and torch.equal(presses[0].image, kept.presses[0].image())
 
 
 def test_a_catalog_of_windows_is_read(folder):
@@ -198,8 +210,9 @@ def test_a_sensor_file_is_read(tmp_path):
     assert sensor_from_gs_sdk(tmp_path / "mini.yaml") == expected
     assert sensor_from_gs_sdk(str(tmp_path / "mini.yaml"), name="left").name == "left"
     assert vts.Sensor.load(tmp_path / "mini.yaml") == expected
-    cropped = sensor_from_gs_sdk(CONFIG | {"raw_imgh": 240, "raw_imgw": 320})
-    assert cropped.raw_size_px == ()  # frames of the working size are cropped already
+    same = sensor_from_gs_sdk(CONFIG | {"raw_imgh": 240, "raw_imgw": 320})
+    frame = torch.linspace(0, 1, 320).expand(1, 3, 240, 320)
+    assert same.rectify(frame)[0, 0, 0].tolist() == pytest.approx(torch.linspace(45 / 320, 275 / 320, 320).tolist(), abs=0.005)
     assert sensor_from_gs_sdk({"ppmm": 0.0634, "imgh": 240, "imgw": 320}).raw_size_px == ()
 
 

@@ -244,12 +244,16 @@ def test_no_output_is_steeper_than_the_bound(output, level, tmp_path):
     assert float(gradient[:, 0].max()) == pytest.approx(expected, rel=1e-4)
 
 
-def test_wrapped_and_wider_state_dicts_are_read(tmp_path):
+def test_wider_networks_are_read_and_those_of_gsrobotics_are_refused(tmp_path):
     wide = NormalFromMLP(HEIGHT, WIDTH, flat_skin(), (64, 64, 64), output="gradient", seed=5).requires_grad_(False)
-    torch.save({"state_dict": wide.gs_sdk_state(), "epoch": 3}, tmp_path / "nnmini.pt")
-    loaded = NormalFromMLP.load(tmp_path / "nnmini.pt", flat_skin(), output="gradient")
+    torch.save(wide.gs_sdk_state(), tmp_path / "wide.pth")
+    loaded = NormalFromMLP.load(tmp_path / "wide.pth", flat_skin(), output="gradient")
     assert torch.equal(loaded(random_images()), wide(random_images()))
     assert {name: tuple(tensor.shape) for name, tensor in loaded.gs_sdk_state().items()}["fc1.weight"] == (64, 5)
+    torch.save({"state_dict": wide.gs_sdk_state(), "epoch": 3}, tmp_path / "nnmini.pt")
+    for output in (None, "gradient"):
+        with pytest.raises(ValueError, match=r"nnmini\.pt: .* gives n_x and n_y of the normal, from constant places"):
+            NormalFromMLP.load(tmp_path / "nnmini.pt", flat_skin(), output=output)
 
 
 def test_a_network_declares_what_it_was_trained_on(tmp_path):

@@ -217,6 +217,15 @@ def ranged(calibration, sine, depth_mm=10.0, growth=0.5):
     return dataclasses.replace(calibration, response=response)
 
 
+def test_reconstruct_says_how_many_frames_are_deeper_than_the_presses(drawn, run_script, tmp_path):
+    vts.write_image(tmp_path / "in.png", drawn[1][0])
+    for depth_mm, said in ((0.3, True), (1.0, False)):
+        ranged(drawn[0], 0.5, depth_mm).save(tmp_path / "unit.safetensors")
+        done = run_script("reconstruct", tmp_path / "unit.safetensors", tmp_path / "in.png", "--out", tmp_path / f"{depth_mm}")
+        assert done.returncode == 0, done.stderr
+        assert ("beyond the presses, which reach 0.3 mm: 1 of 1 frames; there it extrapolates" in done.stdout) == said
+
+
 def test_bounds_grow_beyond_the_slopes_and_depths_of_the_presses(drawn):
     def outputs(*taught):
         return vts.ConfidentPipeline.from_calibration(ranged(drawn[0], *taught), "precise")(drawn[1])

@@ -11,7 +11,7 @@ from conftest import Frames, ring_lights
 import torchvts as vts
 from torchvts import stream as streams
 from torchvts.core.files import rgb_from_bgr
-from torchvts.stream.sources import LiveReader, check_reader
+from torchvts.stream.sources import SETTLING, LiveReader, check_reader, times_file
 
 HEIGHT, WIDTH, PITCH = 48, 64, 0.5
 
@@ -124,3 +124,69 @@ def test_a_rate_that_is_none_is_refused(fps):
         check_reader(reader)
     with pytest.raises((ValueError, TypeError), match="fps: expected a number"):
         streams.Recording(unit(), fps=fps)
+
+
+class Playing(Frames):
+    """A camera that gives these pictures at uneven times, and then no more."""
+
+    live = True
+
+    def read(self):
+        time.sleep(0.002 if (found := super().read()) is None or found[0, 0, 0] % 2 else 0.01)
+        return found
+
+
+@pytest.mark.parametrize("name, kind", [("raw.mkv", np.uint8), ("raw", np.uint8), ("run.2", np.uint16)])
+def test_what_a_camera_gave_is_read_again_bit_for_bit_with_its_times(tmp_path, name, kind):
+    noise = np.random.default_rng(0).integers(0, np.iinfo(kind).max, (SETTLING + 12, 48, 64, 3), kind, endpoint=True)
+    recorder = streams.Recorder(Playing(noise), tmp_path / name)
+    while recorder.read() is not None:
+        pass
+    recorder.close()
+    recorder.close()
+    reader = streams.open_source(tmp_path / name)
+    back = [reader.read() for _ in range(12)]
+    assert reader.read() is None and np.array_equal(back, noise[SETTLING:])
+    assert len(reader.times) == 12 and reader.times == pytest.approx(recorder.times, abs=1e-6)
+    assert np.ptp(np.diff(reader.times)) > 0.005 and reader.fps == pytest.approx(11 / recorder.times[-1], rel=1e-3)
+    times_file(tmp_path / name).write_text("frame,time_s\n000000,0.5\n000001,0.2\n")
+    with pytest.raises(ValueError, match=r"times\.csv: expected lines of frame,time_s, times that rise"):
+        streams.open_source(tmp_path / name)
+
+
+def test_a_recorded_stream_gives_the_same_depth_again(tmp_path):
+    camera = Playing([picture()] * 20 + [picture(0.5 + 0.05 * k) for k in range(10)])
+    live = []
+    ended = pytest.raises(OSError, match="it gives no more frames")
+    with ended, streams.TactileStream(camera, unit(), follow=False, background_frames=12, record=tmp_path / "raw") as stream:
+        live += stream
+    assert [path.name for path in sorted((tmp_path / "raw").iterdir())][-2:] == ["000024.png", "times.csv"]
+    with streams.TactileStream(tmp_path / "raw", unit(), follow=False, background_frames=12) as stream:
+        again = list(stream)
+    assert [frame.time_s for frame in again] == pytest.approx(stream.reader.times) and len(again) == 25
+    assert live[-1].output.depth_mm.max() > 0.5 and torch.equal(live[-1].output.depth_mm, again[-1].output.depth_mm)
+
+
+def test_what_cannot_be_recorded_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="record: expected a camera, got made up: it is a recording already"):
+        streams.TactileStream(Frames([]), unit(), record=tmp_path / "raw.mkv")
+    (tmp_path / "used").mkdir()
+    (tmp_path / "used" / "000000.png").touch()
+    with pytest.raises(ValueError, match="expected a folder without images"):
+        streams.TactileStream(Playing([]), unit(), record=tmp_path / "used")
+    odd = streams.Recorder(Playing(np.zeros((SETTLING + 1, 47, 64, 3), np.uint8)), tmp_path / "odd.mkv")
+    with pytest.raises(ValueError, match=r"expected 8 bits and an even size for .mkv, got uint8 \(47, 64\): name a folder"):
+        while odd.read() is not None:
+            pass
+    odd.close()
+    assert not (tmp_path / "odd.mkv").exists()
+
+
+@pytest.mark.parametrize("name", ["raw.mkv", "raw"])
+def test_a_recording_that_does_not_fit_on_the_disk_is_an_error(tmp_path, name, small_files):
+    noise = np.random.default_rng(0).integers(0, 255, (SETTLING + 20, 48, 64, 3), dtype=np.uint8)
+    recorder = streams.Recorder(Playing(noise), tmp_path / name)
+    with small_files(8192), pytest.raises(OSError, match="cannot be written: "):
+        while recorder.read() is not None:
+            pass
+        recorder.close()

@@ -1,5 +1,6 @@
 """Streams: what is read, what is refused, what is dropped, how the light is followed, and what is left on disk."""
 
+import contextlib
 import csv
 import itertools
 import json
@@ -23,6 +24,7 @@ from conftest import Frames, write_film
 import torchvts as vts
 from lab.latency import measure_latency
 from torchvts import stream as streams
+from torchvts.cli.stream import with_corners
 from torchvts.core.files import read_frames, rgb_from_bgr
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -307,11 +309,12 @@ def test_unusable_frames_are_named_and_left_out(unit, run_stream, unit_file, tmp
     done = run_stream("--source", folder, "--calibration", unit_file, "--out", tmp_path / "out", "--video", "none")
     assert done.returncode == 1, done.stderr
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert [number for number, _ in summary["left_out"]] == [14, 15, 16, 17, 18, 19, 21] and summary["frames"] == 19
-    reasons = dict(summary["left_out"]) | {19: "not an image"}
+    assert [number for number, _ in summary["left_out_because"]] == [14, 15, 16, 17, 18, 19, 21]
+    assert (summary["frames"], summary["left_out"]) == (19, 7) and "7 left out, named above" in done.stdout
+    reasons = dict(summary["left_out_because"]) | {19: "not an image"}
     for k, (_, part) in bad.items():
         assert re.search(part, reasons[k]), (k, reasons[k])
-        assert f"left out frame {k}: " in done.stdout
+        assert (done.stdout + done.stderr).count(f"frame {k} left out: ") == 1
     rows = (tmp_path / "out" / "frames.csv").read_text().splitlines()[1:]
     assert len(rows) == 26 and rows[15] == "15,,,,left out"
     assert [float(row.split(",")[2]) > 0 for row in rows if not row.endswith("left out")] == [False] * 14 + [True] * 5
@@ -524,7 +527,7 @@ def test_realtime_takes_every_frame_where_there_is_time(unit):
     assert not any(thread.name == "torchvts-reader" for thread in threading.enumerate())
 
 
-@pytest.mark.parametrize("suffix", [".avi", ".mp4"])
+@pytest.mark.parametrize("suffix", [".avi", ".mp4", ".webm"])
 def test_a_video_file_is_whole_or_not_there(tmp_path, suffix):
     path = tmp_path / f"out{suffix}"
     picture = np.zeros((32, 64, 3), np.uint8)
@@ -540,8 +543,28 @@ def test_a_video_file_is_whole_or_not_there(tmp_path, suffix):
             video.write(picture)
         assert not path.exists()
     assert len(list(read_frames(path))) == 3
-    with pytest.raises(ValueError, match=r"video: expected a name ending in .mp4 or .avi, got 'a.gif'"):
+    with pytest.raises(ValueError, match=r"like the first, got \(16, 64\)"), streams.VideoFile(path, 30.0) as video:
+        video.write(picture)
+        video.write(picture[:16])
+    with pytest.raises(ValueError, match=r"video: expected a name ending in .webm, .mp4, .avi, .mkv, got 'a.gif'"):
         streams.VideoFile(tmp_path / "a.gif", 30.0)
+
+
+@pytest.mark.parametrize("suffix", [".avi", ".mp4", ".webm"])
+def test_a_video_that_does_not_fit_on_the_disk_is_an_error(tmp_path, suffix, small_files):
+    noise = np.random.default_rng(0).integers(0, 255, (20, 48, 64, 3), dtype=np.uint8)
+    told = pytest.raises(OSError, match=rf"video: .*film\{suffix}: cannot be written: \d+ of 20 frames")
+    with small_files(8192), told, streams.VideoFile(tmp_path / f"film{suffix}", 30.0) as film:
+        for picture in noise:
+            film.write(picture)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_video_that_fails_is_told_and_the_figures_are_kept(run_stream, unit_file, video, tmp_path, small_files):
+    with small_files(400_000):
+        done = run_stream("--source", video, "--calibration", unit_file, "--out", tmp_path, "--video", "avi")
+    assert done.returncode == 2 and "overlay.avi: cannot be written: " in done.stderr
+    assert len((tmp_path / "frames.csv").read_text().splitlines()) == 36 and not (tmp_path / "overlay.avi").exists()
 
 
 def test_a_sheet_shows_six_frames_in_contact_in_one_range(small_press):
@@ -625,6 +648,24 @@ def test_track_writes_a_row_for_each_frame_after_the_reference(run_script, unit_
     expected = {"frames": 19, "lost": 10, "left_out": 0, "converged": 0, "keyframes": 1, "reference_frame": 15, "metric": True}
     assert {name: summary[name] for name in expected} == expected and summary["lost_because"] == {"no contact": 10}
     assert summary["largest_drift_deg"] == 0.0 and sum(summary["unknown_motions"].values()) == 9
+
+
+def test_a_key_of_a_summary_has_one_meaning_in_all_commands(run_script, unit_file, video, tmp_path):
+    for command in ("stream", "track"):
+        given = ("--source", video, "--calibration", unit_file, "--out", tmp_path / command, "--video", "none")
+        assert run_script(command, *given).returncode in (0, 1)
+    assert run_script("reconstruct", unit_file, video, "--out", tmp_path / "reconstruct", "--no-pictures").returncode == 0
+    says = {name: json.loads((tmp_path / name / "summary.json").read_text()) for name in ("stream", "track", "reconstruct")}
+    tables = {
+        name: len((tmp_path / name / table).read_text().splitlines()) - 1
+        for name, table in (("stream", "frames.csv"), ("track", "poses.csv"), ("reconstruct", "frames.csv"))
+    }
+    assert {name: summary["frames"] for name, summary in says.items()} == tables
+    shared = {"source", "source_fps", "left_out", "left_out_because", "sensor", "metric", "mm_per_pixel", "calibration_note"}
+    counted = {"frames", "lost", "converged", "keyframes"}
+    for one, other in itertools.combinations(says.values(), 2):
+        assert all(one[key] == other[key] for key in one.keys() & other.keys() - counted)
+    assert shared <= says["stream"].keys() & says["track"].keys()
 
 
 def test_track_refuses_a_reference_that_cannot_be_used_and_counts_bad_frames(unit, run_script, unit_file, tmp_path):
@@ -722,6 +763,25 @@ def test_the_golf_ball_appears_and_vanishes(data):
     assert stream.light.steps == 0
 
 
+def test_a_sensor_of_which_no_more_than_pitch_and_corners_is_known_is_told_what_to_press(data, run_stream, tmp_path):
+    wedge = vts.Sensor.load("gelsight_wedge")
+    vts.Sensor("mine", 300, 400, 0.09, corners_px=wedge.corners_px).save(tmp_path / "mine.yaml")
+    video = next((data / "wedge_video").glob("*.avi"))
+    done = run_stream("--source", video, "--sensor", tmp_path / "mine.yaml")
+    assert done.returncode == 2 and "calibration's background" not in done.stderr and "background-frames 0" not in done.stderr
+    assert "how sensor 'mine' is lit cannot be found in its first 12 frames alone: press a ball of known diam" in done.stderr
+    done = run_stream("--source", video, "--sensor", tmp_path / "mine.yaml", "--device", "gpu")
+    assert done.returncode == 2 and "device: expected cpu, cuda" in done.stderr
+
+
+def test_corners_take_the_place_of_the_crop_of_raw_frames():
+    frame, mini = torch.rand(1, 3, 480, 640), vts.Sensor.load("gelsight_mini")
+    frame = torch.nn.functional.avg_pool2d(frame, 31, 1, 15)
+    (left, top), (right, bottom) = (91.0, 68.0), (548.0, 411.0)
+    cut = with_corners(mini, f"{left},{top} {right},{top} {right},{bottom} {left},{bottom}")
+    assert torch.allclose(cut.rectify(frame), mini.rectify(frame), atol=0.005)
+
+
 def test_presses_of_a_known_sensor_are_no_background(mini_presses):
     background, presses = mini_presses
     sensor = vts.Sensor.load("gelsight_mini")
@@ -738,6 +798,32 @@ def test_presses_of_a_known_sensor_are_no_background(mini_presses):
         except ValueError as error:
             refused += "something touches the skin" in str(error)
     assert refused >= len(presses[::4]) - 1
+
+
+@pytest.mark.parametrize("code, suffix, codec", [("mp4v", ".mp4", "MPEG-4"), ("FLV1", ".avi", "flv1"), ("FFV1", ".mkv", "")])
+def test_the_blocks_of_a_codec_are_no_contact(data, tmp_path, code, suffix, codec):
+    background, generator = cv2.imread(str(data / "digit_a" / "background.png")), np.random.default_rng(0)
+    pictures = [(background + 0.6 * generator.standard_normal(background.shape)).clip(0, 255).round() for _ in range(16)]
+    film = write_film(tmp_path / f"film{suffix}", [picture.astype(np.uint8) for picture in pictures], code=code)
+    digit = vts.Sensor.load("digit")
+    unit = vts.calibrate(vts.read_image(data / "digit_a" / "background.png"), digit)
+    told = f"by at most .* of 255: blocks of the video's codec, {codec}, do that, and hide faint contacts; record without loss"
+    refused = pytest.raises(ValueError, match=told) if codec else contextlib.nullcontext()
+    for given in (digit, unit):
+        with refused, streams.TactileStream(film, given) as stream:
+            assert len(list(stream)) == 16
+
+
+def test_what_is_larger_than_blocks_is_a_contact_in_a_lossy_video_too():
+    images = torch.full((12, 3, 120, 160), 0.3)
+    images[1::2] += 1e-4
+    for levels, message in ((3.0, "blocks of the video's codec, MPEG-4"), (6.0, "a contact, or the sensor moves")):
+        changed = images.clone()
+        changed[5, :, 30:60, 30:60] += levels / 255
+        with pytest.raises(ValueError, match=message):
+            streams.find_background(changed, codec="MPEG-4")
+        with pytest.raises(ValueError, match="a contact, or the sensor moves"):
+            streams.find_background(changed)
 
 
 @pytest.mark.parametrize("size", [(640, 480), pytest.param((3280, 2464), marks=pytest.mark.long)])

@@ -8,6 +8,7 @@ import traceback
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from types import ModuleType
 from typing import TextIO
 
@@ -32,9 +33,11 @@ COMMANDS = {
 }
 """Subcommand: what it does. Its module has its name; it is imported only where it is asked for."""
 
-FAILED, USAGE_OR_INPUT, INTERRUPTED = 1, 2, 130
-"""Exit statuses: a bug in torchvts; a request or an input that cannot be used; Ctrl-C. A subcommand returns 0, or 1 where it did
-its job and something is wrong with the images (frames left out, a fault found, a pose not found)."""
+FAILED, USAGE_OR_INPUT, BUG, INTERRUPTED = 1, 2, 70, 130
+"""Exit statuses: nobody reads the output; a request or an input that cannot be used; a bug in torchvts; Ctrl-C. A subcommand
+returns 0, or 1 where it did its job and something is wrong with the images (frames left out, a fault found, a pose not found)."""
+
+PACKAGE = f"{Path(__file__).parents[1]}{os.sep}"
 
 
 def overview() -> str:
@@ -59,7 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: the words after ``torchvts``; None takes those of the process.
     Returns:
-        The exit status: 0; 1 where frames were left out or a fault was found; 2 for a wrong request or input; 130 after Ctrl-C.
+        The exit status: 0; 1 where frames were left out or a fault was found; 2 for a wrong request or input; 70 for a bug; 130
+        after Ctrl-C.
     Example:
         >>> main(["--version"])  # doctest: +ELLIPSIS
         torchvts ...
@@ -84,11 +88,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of the output has gone, as head does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
-    except (OSError, ValueError, TypeError, ImportError, RuntimeError, MemoryError) as error:
-        return _say(f"error: {in_one_line(error)}", USAGE_OR_INPUT, debug)
     except Exception as error:
-        text = f"error: {type(error).__name__}: {in_one_line(error)}: a bug in torchvts: please report what --debug prints"
-        return _say(text, FAILED, debug)
+        if _is_refusal(error):
+            return _say(f"error: {in_one_line(error)}", USAGE_OR_INPUT, debug)
+        text = f"error: {type(error).__name__}: {in_one_line(error)}: a bug in torchvts: please report it with the lines above"
+        return _say(text, BUG, debug=True)
+
+
+def _is_refusal(error: Exception) -> bool:
+    """Whether an error is about the request, the input or the machine: a statement ``raise`` of torchvts, or no file or memory.
+
+    What Python or torch raises within torchvts, torchvts has not foreseen.
+    """
+    if isinstance(error, OSError | ImportError | MemoryError) or (isinstance(error, RuntimeError) and "allocate" in str(error)):
+        return True
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return last.filename.startswith(PACKAGE) and (not last.line or last.line.startswith("raise"))
 
 
 def _run(words: list[str]) -> int:

@@ -12,7 +12,7 @@ import torch
 from ..calibration import Press
 from ..core.checks import check_integer
 from ..model import Calibration, Sensor
-from ..stream import Camera, CameraSettings, TactileFrame, TactileStream, find_camera
+from ..stream import Camera, CameraSettings, Recorder, TactileFrame, TactileStream, find_camera
 from .options import add_background_frames, add_pipeline, add_sensor, contact_of, load_calibration, load_sensor
 from .parser import UsageError
 
@@ -27,9 +27,16 @@ def add_source(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--calibration", type=Path, metavar="FILE", help="what torchvts calibrate wrote, in place of --sensor")
     add_background_frames(parser)
     add_pipeline(parser)
+    parser.add_argument("--record", type=Path, metavar="PATH", help="of a camera's raw frames: .mkv, or a folder (PNG)")
     parser.add_argument("--realtime", action="store_true", help="play a recording at its own rate, dropping late frames")
     parser.add_argument("--no-follow", action="store_true", help="do not follow slow drift of the light")
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="of PyTorch and OpenCV (1)")
+
+
+def add_video(parser: argparse.ArgumentParser) -> None:
+    """``--video``: kind of the video in ``--out``."""
+    kinds = "webm (for browsers), mp4, avi, none (webm)"
+    parser.add_argument("--video", choices=["webm", "mp4", "avi", "none"], default="webm", metavar="KIND", help=kinds)
 
 
 def load_unit(arguments: argparse.Namespace) -> Sensor | Calibration:
@@ -63,6 +70,7 @@ def open_stream(arguments: argparse.Namespace, unit: Sensor | Calibration, press
         network=arguments.network,
         device=arguments.device,
         contact=contact_of(arguments.contact),
+        record=arguments.record,
     )
     first = arguments.background_frames
     note = f"the first {first} are without contact" if first else "the calibration's background is used as it is"
@@ -90,3 +98,5 @@ def play(stream: TactileStream, take: Callable[[TactileFrame], bool]) -> None:
         print("interrupted: the frames until now are kept")
     finally:
         signal.signal(signal.SIGINT, before)
+    if isinstance(stream.reader, Recorder):
+        print(f"recorded {len(stream.reader.times)} raw frames: {stream.reader.path}")

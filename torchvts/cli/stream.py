@@ -31,7 +31,7 @@ from ..stream import (
 from ..viz import save_figure
 from .options import add_press
 from .parser import UsageError
-from .source import add_source, load_unit, open_stream, play
+from .source import add_source, add_video, load_unit, open_stream, play
 
 USAGE = "--source SOURCE (--sensor NAME | --calibration FILE) [--out FOLDER]"
 
@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--save-calibration", type=Path, metavar="FILE", help="write the calibration, .safetensors")
     parser.add_argument("--corners", help='in place of the sensor\'s: "x y x y x y x y", from top left, clockwise')
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="for overlay video, sheet.png, frames.csv and summary.json")
-    parser.add_argument("--video", choices=["mp4", "avi", "none"], default="mp4", help="kind of overlay video in --out")
+    add_video(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -77,11 +77,12 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.out is not None and arguments.video != "none":
             video = stack.enter_context(VideoFile(arguments.out / f"overlay.{arguments.video}", stream.fps))
         play(stream, _Files(stream, report, sheet, video).add)
-    print(report.table())
+        print(report.table())
+        if arguments.out is not None:  # before the video is done, which may fail
+            report.save(arguments.out)
+            if sheet.times:
+                save_figure(sheet.figure(), arguments.out / "sheet.png")
     if arguments.out is not None:
-        report.save(arguments.out)
-        if sheet.times:
-            save_figure(sheet.figure(), arguments.out / "sheet.png")
         print(f"wrote {len(report.rows)} frames to {arguments.out}")
     return 1 if stream.left_out else 0
 
@@ -115,7 +116,7 @@ def with_corners(unit: Sensor | Calibration, text: str) -> Sensor | Calibration:
         numbers = []
     if len(numbers) != 8:
         raise ValueError(f"corners: expected eight numbers, x and y of four corners, got {text!r}")
+    sensor = unit if isinstance(unit, Sensor) else unit.sensor
     corners = tuple(zip(numbers[::2], numbers[1::2]))
-    if isinstance(unit, Sensor):
-        return dataclasses.replace(unit, corners_px=corners, roi_px=None)
-    return dataclasses.replace(unit, sensor=dataclasses.replace(unit.sensor, corners_px=corners, roi_px=None))
+    sensor = dataclasses.replace(sensor, corners_px=corners, roi_px=None, raw_size_px=(), raw_crop=0.0)
+    return sensor if isinstance(unit, Sensor) else dataclasses.replace(unit, sensor=sensor)

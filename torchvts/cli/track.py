@@ -31,11 +31,12 @@ from ..core.files import check_folder, make_folder, read_image, write_atomically
 from ..pose import PoseTracker, TrackedPose
 from ..pose.follow import TRUSTED_DEG, TRUSTED_MM
 from ..stream import NOT_METRIC, LiveView, Overlay, TactileFrame, TactileStream, VideoFile, has_screen
+from ..stream.files import summary_of
 from ..stream.sources import Pixels
 from ..stream.view import AXIS_COLOURS
 from .options import add_out
 from .parser import UsageError
-from .source import add_source, load_unit, open_stream, play
+from .source import add_source, add_video, load_unit, open_stream, play
 
 USAGE = "--source SOURCE (--sensor NAME | --calibration FILE) --out FOLDER"
 
@@ -49,10 +50,10 @@ QUALITY = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
     add_source(parser)
-    add_out(parser, "for poses.csv, summary.json and the video track.mp4")
+    add_out(parser, "for poses.csv, summary.json and the video track.webm")
     parser.add_argument("--reference", type=Path, metavar="IMAGE", help="of the contact; if not given, the first large one")
     parser.add_argument("--least-mm2", type=float, default=4.0, metavar="AREA", help="contact of the first reference, mm^2 (4)")
-    parser.add_argument("--video", choices=["mp4", "avi", "none"], default="mp4", help="kind of video in --out")
+    add_video(parser)
     parser.add_argument("--view", action="store_true", help="show surface and axes in 3D while they come; needs a screen")
     parser.add_argument("--save", type=Path, metavar="FILE.rrd", help="record what --view shows, with or without it")
 
@@ -81,13 +82,13 @@ def run(arguments: argparse.Namespace) -> int:
         play(stream, tracking.add)
         if tracking.tracker is None:
             raise ValueError("source: expected a contact to track, got none: see --least-mm2")
-    with write_atomically(arguments.out / "poses.csv") as temporary, open(temporary, "w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS + QUALITY)
-        writer.writeheader()
-        writer.writerows(tracking.rows)
-    found = summary(tracking, stream)
-    with write_atomically(arguments.out / "summary.json") as temporary:
-        temporary.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+        with write_atomically(arguments.out / "poses.csv") as temporary, open(temporary, "w", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS + QUALITY)
+            writer.writeheader()
+            writer.writerows(tracking.rows)
+        found = summary(tracking, stream)
+        with write_atomically(arguments.out / "summary.json") as temporary:
+            temporary.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
     _print_summary(found)
     names = ["poses.csv", "summary.json"] + ([] if arguments.video == "none" else [f"track.{arguments.video}"])
     print(f"wrote {', '.join(names)} to {arguments.out}")
@@ -196,16 +197,10 @@ def summary(tracking: _Tracking, stream: TactileStream) -> dict[str, Any]:
     drift = {name: max((float(str(row[name])) for row in followed), default=0.0) for name in ("drift_deg", "drift_mm")}
     closures = [] if tracking.tracker is None else tracking.tracker.closures
     return {
-        "source": stream.reader.name,
-        "fps": stream.fps,
-        "unit": stream.note,
-        "metric": stream.metric,
-        "mm_per_pixel": tracking.pitch,
+        **summary_of(stream, len(rows)),
         "reference_frame": tracking.reference,  # None where --reference gave an image
-        "frames": len(rows),
         "lost": len(lost),
         "lost_because": dict(Counter(str(row["lost"]) for row in lost).most_common()),
-        "left_out": len(stream.left_out),
         "converged": sum(row["converged"] == 1 for row in rows),
         "unknown_motions": dict(Counter(str(row["ambiguous"]) for row in rows if row["ambiguous"]).most_common()),
         "keyframes": len(graph.keyframes) if graph else 0,

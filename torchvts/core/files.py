@@ -4,10 +4,12 @@ import errno
 import hashlib
 import json
 import os
+import re
 import secrets
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -264,7 +266,7 @@ def write_image(path: str | Path, image: Tensor) -> None:
     """
     check_field("image", image)
     levels = torch.round(image.detach().clamp(0, 1) * 255).to(torch.uint8).cpu()
-    _write_pixels(check_path("path", path), np.ascontiguousarray(levels.flip(0).permute(1, 2, 0).numpy()))
+    write_pixels(check_path("path", path), np.ascontiguousarray(levels.flip(0).permute(1, 2, 0).numpy()))
 
 
 def image_to_bytes(image: Tensor) -> Tensor:
@@ -317,7 +319,7 @@ def write_depth_png(path: str | Path, depth_mm: Tensor) -> None:
             "depth_mm: expected finite values in [-3.2768, 3.2767] mm for a PNG, "
             f"got [{frame.min():.4g}, {frame.max():.4g}]: write .npy, or ask vts.diagnose what is wrong with the frame"
         )
-    _write_pixels(Path(path), value.numpy().astype(np.uint16))
+    write_pixels(Path(path), value.numpy().astype(np.uint16))
 
 
 def read_depth_png(path: str | Path) -> Tensor:
@@ -331,7 +333,8 @@ def read_depth_png(path: str | Path) -> Tensor:
     return (torch.from_numpy(pixels.astype(np.float32)) - DEPTH_PNG_ZERO)[None, None] * DEPTH_PNG_STEP_MM
 
 
-def _write_pixels(path: Path, pixels: np.ndarray[Any, Any]) -> None:
+def write_pixels(path: Path, pixels: np.ndarray[Any, Any]) -> None:
+    """Write what :func:`read_pixels` reads, or one channel, (H, W)."""
     import cv2
 
     if path.suffix.lower() not in IMAGE_SUFFIXES:
@@ -344,7 +347,7 @@ def _write_pixels(path: Path, pixels: np.ndarray[Any, Any]) -> None:
 
 
 def read_frames(source: str | Path) -> Iterator[tuple[str, Tensor]]:
-    """Frames of an image file, a folder of images (by name) or a video: pairs of a name and (3, H, W) in [0, 1], R, G, B.
+    """Frames of an image file, a folder of images (1, 2, 10) or a video: pairs of a name and (3, H, W) in [0, 1], R, G, B.
 
     Raises:
         FileNotFoundError: no such file or folder.
@@ -363,9 +366,21 @@ def read_frames(source: str | Path) -> Iterator[tuple[str, Tensor]]:
     return iter([(path.stem, read_image(path))])
 
 
+def natural_order(name: str) -> tuple[list[str | Decimal], str]:
+    """Key that sorts names with their numbers as numbers, decimals of times too.
+
+    Example:
+        >>> sorted(["10.png", "2.png", "1.25.png", "1.5.png"], key=natural_order)
+        ['1.25.png', '1.5.png', '2.png', '10.png']
+    """
+    parts = re.split(r"([0-9]+(?:\.[0-9]+)?)", name)
+    return [Decimal(part) if k % 2 else part for k, part in enumerate(parts)], name
+
+
 def image_files(folder: Path) -> list[Path]:
-    """Images of a folder, sorted by name, without hidden ones, which a killed writer may leave."""
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+    """Images of a folder in :func:`natural_order`, without hidden ones, which a killed writer may leave."""
+    files = (p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+    return sorted(files, key=lambda p: natural_order(p.name))
 
 
 def count_frames(source: str | Path) -> int:

@@ -8,7 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, count_frames
+from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, count_frames, natural_order
 
 STATE = ".torchvts"
 """Folder inside the results that holds the settings and one record per frame; a folder that has one is never read as a source."""
@@ -65,7 +65,7 @@ def one_line(text: str) -> str:
 
 
 def list_items(source: str | Source, every: int = 1) -> Iterator[Item]:
-    """List the images and videos of a source, sorted by folder and name; only the names of one folder are in memory.
+    """List the images and videos of a source, by folder and name, numbers as numbers; only the names of one folder are in memory.
 
     Of several files and folders the paths are those below the folder that holds them all, in the order given.
 
@@ -125,7 +125,7 @@ def _several(source: tuple[Path, ...]) -> Iterator[Item]:
 
 def _walk(folder: Path, prefix: str) -> Iterator[Item]:
     with os.scandir(folder) as entries:
-        kept = sorted((entry for entry in entries if not entry.name.startswith(".")), key=lambda entry: entry.name)
+        kept = sorted((entry for entry in entries if not entry.name.startswith(".")), key=lambda entry: natural_order(entry.name))
     suffixes = IMAGE_SUFFIXES + VIDEO_SUFFIXES
     stems = output_stems([entry.name for entry in kept if entry.name.lower().endswith(suffixes) and not _is_folder(entry)])
     for entry in kept:

@@ -19,7 +19,12 @@ def share() -> Iterator[tuple[int, int]]:
     if world == 1:
         yield rank, world
         return
-    dist.init_process_group("gloo", timeout=LONGEST_WAIT)
+    try:
+        dist.init_process_group("gloo", timeout=LONGEST_WAIT)
+    except (RuntimeError, ValueError) as error:
+        raise RuntimeError(
+            f"WORLD_SIZE: expected {world} processes that find each other, as torchrun starts them: {error}"
+        ) from error
     try:
         yield rank, world
     finally:

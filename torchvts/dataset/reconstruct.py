@@ -32,7 +32,7 @@ from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, count_frames
 from ..model import Calibration
 from ..pipeline import MODES, DepthOutput, unit_pipeline
 from ..skin import ContactSettings
-from ..stream import FIRST_FRAMES, Recording, check_device, use_calibration
+from ..stream import FIRST_FRAMES, Recording, check_device, use_calibration, video_codec
 from .items import Item, Source, list_items
 from .loading import Frame, load_frames
 from .processes import share, sum_over_processes
@@ -133,19 +133,23 @@ def reconstruct_dataset(
     if network is not None:
         unit_pipeline(unit, mode, network, contact)  # a bad one is refused before anything is written
     _check_source(source, out)
-    torch.set_num_threads(threads)
     settings = Settings(
         _digest(calibration), _digest(network), _names(source), mode, format, cloud, pictures, every, device, threads,
         __version__, str(torch.__version__), background_frames, None if contact is None else asdict(contact),
     )  # fmt: skip
-    with share() as (rank, world), locked(out) if rank == 0 else nullcontext():
-        if rank == 0:
-            settings = begin(source, out, settings, overwrite)
-        sum_over_processes(0)  # the settings are there for the others to read
-        if rank > 0:
-            settings = join(out, settings)
-        records = Records(source, out, settings)
-        return _Worker(unit, Path(calibration).name, network, records, (rank, world), strict).run(batch, workers)
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        with share() as (rank, world), locked(out) if rank == 0 else nullcontext():
+            if rank == 0:
+                settings = begin(source, out, settings, overwrite)
+            sum_over_processes(0)  # the settings are there for the others to read
+            if rank > 0:
+                settings = join(out, settings)
+            records = Records(source, out, settings)
+            return _Worker(unit, Path(calibration).name, network, records, (rank, world), strict).run(batch, workers)
+    finally:
+        torch.set_num_threads(before)
 
 
 def _source(source: str | Path | Sequence[str | Path]) -> Source:
@@ -260,7 +264,8 @@ class _Worker:
         fps, count = held[0][0].fps if held else 30.0, self.settings.background_frames
         try:
             if 0 < count <= len(held):
-                return self.recording(torch.cat([image for _, image in held]), fps=fps)
+                first = torch.cat([image for _, image in held])
+                return self.recording(first, fps=fps, codec=video_codec(item.file))
             reason = f"background_frames: expected at least {count} frames, got {len(held)}" if count > 0 else ""
         except ValueError as error:
             reason = in_one_line(error)

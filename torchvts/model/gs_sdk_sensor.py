@@ -22,7 +22,8 @@ def values_from_gs_sdk(values: dict[Any, Any], source: str, name: str) -> dict[s
 
     Args:
         values: of gs_sdk's file: ``ppmm``, mm per pixel despite its name; ``imgh``, ``imgw``, the size of the image worked on;
-            ``raw_imgh``, ``raw_imgw``, the size of the camera's frames, of which a seventh is cut off each side.
+            ``raw_imgh``, ``raw_imgw``, the size of the camera's frames, of which a seventh is cut off each side, also
+            where both sizes are the same.
         source: named in errors.
         name: of the sensor.
     Raises:
@@ -47,8 +48,7 @@ def values_from_gs_sdk(values: dict[Any, Any], source: str, name: str) -> dict[s
         found: dict[str, Any] = {"name": name, "height": size[0], "width": size[1], "mm_per_pixel": pitch}
         if "raw_imgh" in values:
             raw = check_image_size("raw_imgh", values["raw_imgh"], "raw_imgw", values["raw_imgw"], 8)
-            if raw != size:
-                found |= {"raw_size_px": (raw,), "raw_crop": RAW_CROP}
+            found |= {"raw_size_px": (raw,), "raw_crop": RAW_CROP}
     except (TypeError, ValueError) as error:
         raise ValueError(f"{source}: key {error}") from error
     return found

@@ -167,9 +167,7 @@ class NormalFromMLP(NormalModel):
         """Read a network: gs_sdk's ``nnmodel.pth``, a state dict of the same layout, or what :meth:`save` wrote.
 
         A state dict holds ``fc1.weight``, ``fc1.bias``, ``fc2.weight`` ... of layers that follow one another, the first of 5
-        inputs, the last of 2 outputs, ReLU between; also within a dict under ``state_dict``, as gsrobotics has it. Widths are
-        free. gsrobotics' network returns gradients, not angles: load it with ``output="gradient"``. Its inputs are taken in the
-        same order as gs_sdk's, its gradients in the same sense; check that with an image of a known contact.
+        inputs, the last of 2 outputs, ReLU between. Widths are free.
 
         Args:
             path: the file. Nothing but tensors is unpickled.
@@ -267,7 +265,11 @@ def _read_state(path: Path) -> object:
             f"that holds more than tensors, which is refused ({reason})"
         ) from error
     if isinstance(state, dict) and isinstance(state.get("state_dict"), dict):
-        return state["state_dict"]
+        raise ValueError(
+            f"{path}: expected a bare state dict, got one under 'state_dict', like gsrobotics' nnmini.pt: such a network gives n_x "
+            "and n_y of the normal, from constant places, and is not read: use the sensor's prior, or torchvts train. "
+            "If yours gives angles or gradients, save what is under 'state_dict' by torch.save"
+        )
     return state
 
 

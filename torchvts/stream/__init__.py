@@ -12,16 +12,18 @@ from .background import (
     with_background,
 )
 from .cameras import Camera, CameraSettings, find_camera
-from .files import StreamReport, VideoFile
+from .files import StreamReport
 from .follow_light import FollowLight
 from .frames import NewestFrame
 from .keys import Keys
 from .live import TactileFrame, TactileStream
 from .overlay import Overlay, Sheet
+from .record import Recorder
 from .recording import Recording, check_device
-from .sources import Reader, Unreadable, frames_a_second, open_source
+from .sources import Reader, Unreadable, frames_a_second, open_source, video_codec
 from .stages import StageClock
 from .usable import FrameCheck
+from .video import VideoFile
 from .view import LiveView, has_screen, require_rerun
 
 __all__ = [
@@ -36,6 +38,7 @@ __all__ = [
     "NewestFrame",
     "Overlay",
     "Reader",
+    "Recorder",
     "Recording",
     "Sheet",
     "StageClock",
@@ -56,5 +59,6 @@ __all__ = [
     "read_press_images",
     "require_rerun",
     "use_calibration",
+    "video_codec",
     "with_background",
 ]

@@ -25,9 +25,13 @@ from ..core.files import VIDEO_SUFFIXES, read_frames
 from ..model import Calibration, Sensor, SensorPrior, check_calibration, check_sensor
 from ..model.calibration import PEDESTAL
 from ..normals import NormalFromResponse
+from .sources import video_codec
 
 MOVED = 0.02
 """Relative change of a cell of 1/20 of the frame that counts as movement among the first frames."""
+
+BLOCKS = 4.0 / 255.0
+"""Cells of undeformed skin change by less in videos by MPEG-4, Motion JPEG, FLV1 (up to 3.1 of 255 on three units)."""
 
 ROUGH_DEG = 3.3
 """Slopes for which a prior takes the structure of an image; more is a contact."""
@@ -45,7 +49,7 @@ WITHOUT_FIRST = (
 """What to do where the first frames show contact."""
 
 
-def find_background(images: Tensor, sensor: Sensor | None = None) -> tuple[Tensor, Tensor]:
+def find_background(images: Tensor, sensor: Sensor | None = None, codec: str = "") -> tuple[Tensor, Tensor]:
     """Find the image of the skin without contact in the first frames, or refuse and say why.
 
     The image is the median over the frames, averaged with the half of the values next to it. The frames are divided into cells of
@@ -66,6 +70,7 @@ def find_background(images: Tensor, sensor: Sensor | None = None) -> tuple[Tenso
     Args:
         images: (N, 3, H, W) in [0, 1], rectified, at least 3.
         sensor: of the images; its prior is used if it has one.
+        codec: of the video they are from, named where small changes look like its blocks; empty where it loses nothing.
     Returns:
         The image (3, H, W) in steps of 1/65535, which a calibration file keeps, and per pixel the noise that videos have between
         frames (3, H, W): the RMS over frames of the mean of 3 x 3 pixels, times 3, smoothed. It equals the noise of the pixels
@@ -81,7 +86,7 @@ def find_background(images: Tensor, sensor: Sensor | None = None) -> tuple[Tenso
             f"images: expected at least 3 frames without contact, got {images.shape[0]}: the source is too short, or fewer were "
             "asked for (background_frames, --background-frames)"
         )
-    _check_steady(images)
+    _check_steady(images, codec)
     rank = images.sort(0).values
     quarter = len(images) // 4
     image = _in_16_bits(rank[quarter : len(images) - quarter].mean(0))
@@ -162,7 +167,7 @@ def _background_of_video(path: Path, sensor: Sensor, first_frames: int) -> Tenso
         frames = [sensor.rectify(frame[None]).clamp(0.0, 1.0) for _, frame in islice(read_frames(path), first_frames)]
         if len(frames) < first_frames:
             raise ValueError(f"background: expected at least {first_frames} frames, got {len(frames)}: ask for fewer")
-        return find_background(torch.cat(frames), sensor)[0]
+        return find_background(torch.cat(frames), sensor, video_codec(path))[0]
     except ValueError as error:
         raise ValueError(str(error) if str(error).startswith(str(path)) else f"{path}: {error}") from error
 
@@ -187,7 +192,7 @@ def read_press_images(presses: Sequence[tuple[str | Path, float | str]], sensor:
     return found
 
 
-def _check_steady(images: Tensor) -> None:
+def _check_steady(images: Tensor, codec: str) -> None:
     """Refuse frames in which the light changes or something moves."""
     side = max(2, min(images.shape[2], images.shape[3]) // 20)
     cells = whole_cell_means(images, side).double() + PEDESTAL
@@ -204,12 +209,22 @@ def _check_steady(images: Tensor) -> None:
     spread = 1.4826 * float(difference.amax(1).median())
     # compression makes dark cells flicker; a step, or steady growth, is larger than four times what changes from frame to frame
     flicker = 4.0 * relative.diff(dim=0).abs().median(0).values
-    moved = (difference > flicker.clamp_min(max(MOVED, 8.0 * spread))).any(1).flatten(1).sum(1)
-    if int(moved.max()) >= 3:
+    moves = (difference > flicker.clamp_min(max(MOVED, 8.0 * spread))).any(1)  # (N, h, w)
+    moved = moves.flatten(1).sum(1)
+    if int(moved.max()) < 3:
+        return
+    where = (
+        f"background: frame {int(moved.argmax())} of the first {len(images)} differs from the others in {int(moved.max())} of "
+        f"{difference[0, 0].numel()} places"
+    )
+    most = float((cells - cells.median(0, keepdim=True).values).abs().amax(1)[moves].max())
+    if codec and most < BLOCKS:
         raise ValueError(
-            f"background: frame {int(moved.argmax())} of the first {len(images)} differs from the others in {int(moved.max())} of "
-            f"{difference[0, 0].numel()} places: a contact, or the sensor moves; start without contact, or take fewer frames"
+            f"{where}, by at most {255.0 * most:.1f} of 255: blocks of the video's codec, {codec}, do that, and hide faint "
+            "contacts; record without loss (--record raw.mkv, or PNG), or use the background of a calibration (--calibration with "
+            "--background-frames 0; background_frames=0)"
         )
+    raise ValueError(f"{where}: a contact, or the sensor moves; start without contact, or take fewer frames")
 
 
 class StreamCalibration(NamedTuple):

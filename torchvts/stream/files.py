@@ -1,63 +1,28 @@
-"""What a stream leaves in files: a video, and the figures of every frame."""
+"""What a stream leaves in files beside its video: the figures of every frame."""
 
 import json
 import time
 from pathlib import Path
 from typing import Any
 
-from ..core.checks import check_path, check_positive, check_record
-from ..core.files import check_text_name, write_atomically
+from ..core.checks import check_record
+from ..core.files import write_atomically
 from .live import TactileFrame, TactileStream
-from .sources import Pixels
-
-CODES = {".mp4": "mp4v", ".avi": "MJPG"}
-"""Suffixes of the videos that can be written, and OpenCV's code for each."""
 
 
-class VideoFile:
-    """Writes a video whole or not at all: under a temporary name, renamed when the block ends without an error.
-
-    Args:
-        path: .mp4 (mp4v) or .avi (MJPG).
-        fps: frames a second.
-    Raises:
-        ValueError: another suffix.
-        OSError: OpenCV cannot write it.
-    """
-
-    def __init__(self, path: str | Path, fps: float) -> None:
-        self.path, self.fps = check_path("video", path), check_positive("fps", fps)
-        if self.path.suffix.lower() not in CODES:
-            raise ValueError(f"video: expected a name ending in {' or '.join(CODES)}, got {self.path.name!r}")
-        check_text_name("video", self.path)
-        self._file: Any = None
-        self._writer: Any = None
-        self._temporary = self.path
-
-    def __enter__(self) -> "VideoFile":
-        self._file = write_atomically(self.path)
-        self._temporary = self._file.__enter__()
-        return self
-
-    def write(self, picture: Pixels) -> None:
-        """Append a frame, (H, W, 3) B, G, R, 8 bits; all of one size."""
-        import cv2
-
-        if self._writer is None:
-            code = cv2.VideoWriter.fourcc(*CODES[self.path.suffix.lower()])
-            self._writer = cv2.VideoWriter(str(self._temporary), code, self.fps, (picture.shape[1], picture.shape[0]))
-            if not self._writer.isOpened():
-                raise OSError(f"video: {self.path}: OpenCV cannot write this kind of file here: try .avi")
-        self._writer.write(picture)
-
-    def __exit__(self, *error: Any) -> None:
-        if self._writer is not None:
-            self._writer.release()
-        if self._writer is None and error[0] is None:
-            nothing = OSError(f"video: {self.path}: there was no frame, so none is written")
-            self._file.__exit__(OSError, nothing, None)  # removes the temporary file
-            return
-        self._file.__exit__(*error)
+def summary_of(stream: TactileStream, frames: int) -> dict[str, Any]:
+    """What summary.json says of every stream, in the words of data sets; ``frames`` are the rows of its table."""
+    return {
+        "source": stream.reader.name,
+        "source_fps": stream.fps,
+        "frames": frames,
+        "left_out": len(stream.left_out),
+        "left_out_because": [[number, reason] for number, reason in stream.left_out],
+        "sensor": stream.calibration.sensor.name,
+        "metric": stream.metric,
+        "mm_per_pixel": stream.calibration.sensor.mm_per_pixel,
+        "calibration_note": stream.note,
+    }
 
 
 class StreamReport:
@@ -99,31 +64,25 @@ class StreamReport:
         return len(self.rows) / max(self._end - self._begin, 1e-9)
 
     def summary(self) -> dict[str, Any]:
-        """For JSON: the source, frames, dropped, fps, stages_ms, light and calibration."""
+        """For JSON: :func:`summary_of`, frames and dropped ones, fps, stages_ms, contact and light."""
         stream = self.stream
         return {
-            "source": stream.reader.name,
-            "source_fps": stream.fps,
-            "frames": len(self.rows),
+            **summary_of(stream, len(self.rows)),
             "dropped": stream.dropped,
-            "left_out": [[number, reason] for number, reason in stream.left_out],
             "fps": round(self.fps, 2),
             "stages_ms": {name: round(ms, 3) for name, ms in stream.stages.median_ms().items()},
             "contact_frames": sum(row[2] > 0 for row in self.rows),
             "deepest_mm": max((row[3] for row in self.rows), default=0.0),
             "light_level": [round(v, 5) for v in stream.light.level],
             "light_steps": stream.light.steps,
-            "metric": stream.metric,
-            "calibration": stream.note,
         }
 
     def table(self) -> str:
         """The summary as text."""
         values = self.summary()
         lines = [f"{values['frames']} frames, {values['dropped']} dropped, {values['fps']:.1f} frames a second"]
-        lines += [f"left out frame {number}: {reason}" for number, reason in values["left_out"][:20]]
-        if len(values["left_out"]) > 20:
-            lines.append(f"{len(values['left_out'])} frames left out, all of them in summary.json")
+        if values["left_out"]:
+            lines.append(f"{values['left_out']} left out, named above")
         lines.append("median ms: " + ", ".join(f"{name} {ms:.1f}" for name, ms in values["stages_ms"].items()))
         unit = "mm" if values["metric"] else "mm (NOT METRIC)"
         lines.append(f"contact in {values['contact_frames']} frames, deepest {values['deepest_mm']:.3f} {unit}")

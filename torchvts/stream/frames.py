@@ -8,7 +8,8 @@ from typing import Any
 
 from ..core.checks import check_positive
 from ..core.files import check_pixels
-from .sources import MOST_FPS, SETTLING, LiveReader, Pixels, Reader, Unreadable
+from .record import Recorder
+from .sources import MOST_FPS, SETTLING, LiveReader, Pixels, Reader, Unreadable, time_of
 from .stages import StageClock
 
 NumberedFrame = tuple[int, float, Pixels | Unreadable]
@@ -84,7 +85,7 @@ class NewestFrame:
     def close(self) -> None:
         """End the thread, then release the source."""
         self._stop.set()
-        if isinstance(self._reader, LiveReader):
+        if isinstance(self._reader, LiveReader | Recorder):
             self._reader.close()  # ends a read that waits
         self._thread.join(timeout=5.0)
         self._reader.close()
@@ -148,7 +149,7 @@ class SourceFrames:
             if pixels is None:
                 return
             index, self._given = self._given, self._given + 1
-            yield index, index / self._reader.fps, pixels
+            yield index, time_of(self._reader, index), pixels
 
     def _newest_ones(self) -> Iterator[NumberedFrame]:
         """The frames that are the newest when they are asked for; of a recording the first ones are played again."""

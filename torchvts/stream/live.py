@@ -15,12 +15,27 @@ from ..core.files import rgb_from_bgr
 from ..model import Calibration, Sensor
 from ..pipeline import MODES, DepthOutput
 from ..skin import ContactSettings
-from .background import FIRST_FRAMES, calibrate_background, find_background, use_calibration, with_background
+from .background import (
+    FIRST_FRAMES,
+    StreamCalibration,
+    calibrate_background,
+    find_background,
+    use_calibration,
+    with_background,
+)
 from .follow_light import FollowLight
 from .frames import SourceFrames
-from .recording import Recording
+from .record import Recorder
+from .recording import NotAtRest, Recording
 from .sources import Pixels, Reader, Unreadable, check_reader, open_source
 from .stages import StageClock
+
+UNKNOWN_LIGHT = (
+    "background: how sensor '{0}' is lit cannot be found in its first {1} frames alone: press a ball of known diameter at some "
+    "places, and give the images: torchvts calibrate background.png --sensor FILE --press ball.png 6.31 --press ... makes what "
+    "--calibration takes (presses=[...] in Python)"
+)
+"""What is said where the first frames, taken for the background, fit the model that was found in them badly."""
 
 
 class TactileFrame(NamedTuple):
@@ -59,6 +74,7 @@ class TactileStream:
         device: of the pipeline, "cpu" or "cuda".
         reconnect_s: for how long a camera that has stopped is opened again before an error is raised; not with a :class:`Reader`.
         contact: thresholds of contact; None for the usual ones.
+        record: where the raw frames of a camera are written, see :class:`Recorder`; None for nowhere.
     Attributes:
         calibration: of the unit.
         note: where the calibration comes from and what to expect of it, in words.
@@ -90,13 +106,14 @@ class TactileStream:
         device: str = "cpu",
         reconnect_s: float = 0.0,
         contact: ContactSettings | None = None,
+        record: str | Path | None = None,
     ) -> None:
         check_choice("mode", mode, MODES)
         if contact is not None:
             check_record("contact", contact, ContactSettings, "ContactSettings(sigmas=...) makes one")
         check_switch("realtime", realtime)
         sensor = _sensor_of(sensor_or_calibration, background_frames, presses)
-        self.reader = _reader_of(source, reconnect_s)
+        self.reader = _reader_of(source, reconnect_s, record)
         self.fps = self.reader.fps
         self.stages = StageClock()
         self.left_out: list[tuple[int, str]] = []
@@ -106,11 +123,8 @@ class TactileStream:
             self._frames = SourceFrames(self.reader, background_frames, realtime, self.stages)
             self._sensor, self._size = sensor, self._frames.readable[0].shape[:2]
             first = torch.cat([self._rectified(pixels) for pixels in self._frames.readable])
-            if isinstance(sensor_or_calibration, Calibration):
-                found = use_calibration(sensor_or_calibration)
-            else:
-                found = calibrate_background(find_background(first, sensor)[0].clamp(0.0, 1.0), sensor, presses)
-            self.calibration, self.note, self.metric = found
+            codec: str = getattr(self.reader, "codec", "")
+            self.calibration, self.note, self.metric = _calibrated(first, sensor_or_calibration, presses, codec)
             self._start = partial(
                 Recording,
                 mode=mode,
@@ -119,11 +133,14 @@ class TactileStream:
                 network=network,
                 device=device,
                 contact=contact,
+                codec=codec,
                 stage=self.stages.stage,
             )
             self._use(self._start(self.calibration, first=first if background_frames > 0 else None))
-        except BaseException:
+        except BaseException as error:
             self.reader.close()
+            if isinstance(error, NotAtRest) and sensor is sensor_or_calibration:  # what these frames made fits none of them
+                raise ValueError(UNKNOWN_LIGHT.format(sensor.name, int(background_frames))) from error
             raise
 
     def _rectified(self, pixels: Pixels) -> Tensor:
@@ -226,10 +243,27 @@ def _sensor_of(unit: Sensor | Calibration, background_frames: int, presses: Sequ
     return unit.sensor
 
 
-def _reader_of(source: str | int | Path | Reader, reconnect_s: float) -> Reader:
-    """Open a source, or take a reader of the user's own."""
+def _calibrated(first: Tensor, unit: Sensor | Calibration, presses: Sequence[Press], codec: str) -> StreamCalibration:
+    """The calibration that was given, or that of the first frames."""
+    if isinstance(unit, Calibration):
+        return use_calibration(unit)
+    return calibrate_background(find_background(first, unit, codec)[0].clamp(0.0, 1.0), unit, presses)
+
+
+def _reader_of(source: str | int | Path | Reader, reconnect_s: float, record: str | Path | None) -> Reader:
+    """Open a source, or take a reader of the user's own; record what it gives."""
     if isinstance(source, str | int | Path):
-        return open_source(source, reconnect_s)
-    if check_least("reconnect_s", reconnect_s) > 0:
+        reader = open_source(source, reconnect_s)
+    elif check_least("reconnect_s", reconnect_s) > 0:
         raise ValueError(f"reconnect_s: expected 0 with a reader of your own, got {reconnect_s:g}: it must reconnect by itself")
-    return check_reader(source)
+    else:
+        reader = check_reader(source)
+    if record is None:
+        return reader
+    try:
+        if not reader.live:
+            raise ValueError(f"record: expected a camera, got {reader.name}: it is a recording already")
+        return Recorder(reader, record)
+    except BaseException:
+        reader.close()
+        raise

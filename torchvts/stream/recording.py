@@ -36,6 +36,10 @@ def check_device(device: str) -> torch.device:
     return found
 
 
+class NotAtRest(ValueError):
+    """The first frames show contact against the background of the calibration."""
+
+
 class Recording:
     """Depth of the frames of one recording, in order, by one calibration.
 
@@ -51,6 +55,7 @@ class Recording:
         network: a trained network in place of the calibration's model, see :func:`torchvts.pipeline.unit_pipeline`.
         device: of the pipeline, "cpu" or "cuda"; frames come and go on the CPU.
         contact: thresholds of contact; None for the usual ones.
+        codec: of the video, see :func:`find_background`.
         stage: makes a context in which a stage of that name runs, to measure its time.
     Attributes:
         pipe: the pipeline, frozen.
@@ -69,6 +74,7 @@ class Recording:
         network: str | Path | None = None,
         device: str = "cpu",
         contact: ContactSettings | None = None,
+        codec: str = "",
         stage: Callable[[str], AbstractContextManager[Any]] = lambda name: nullcontext(),
     ) -> None:
         check_calibration("calibration", calibration)
@@ -83,7 +89,7 @@ class Recording:
         self.check = FrameCheck.from_calibration(calibration)
         self._fps, self._follow, self._stage = fps, follow, stage
         self._before: float | None = None
-        image, noise = (None, None) if first is None else find_background(first)
+        image, noise = (None, None) if first is None else find_background(first, codec=codec)
         if noise is not None and isinstance(pipe.mask, ContactMask):  # a video's compression is alike over whole cells
             relative = calibration.sensor.exponent * noise.float() / value.maximum(noise.float()).clamp_min(1e-3)
             pipe.mask.least_spread = max(pipe.mask.least_spread, float(relative.median()))
@@ -149,7 +155,7 @@ class Recording:
         corrected = light.correct(image)
         deformed = self.pipe.moved(corrected.to(self.device))
         if bool(deformed.any()):
-            raise ValueError(
+            raise NotAtRest(
                 f"background: the first frames show contact on {float(deformed.float().mean()):.1%} of the skin against the "
                 "calibration's background: start without contact, calibrate again if the skin or the camera's compression has "
                 "changed, or use the calibration as it is (background_frames=0, --background-frames 0)"

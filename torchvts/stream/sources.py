@@ -3,13 +3,14 @@
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from ..core.checks import brief, check_integer, check_least, check_path, check_positive
+from ..core.checks import brief, check_integer, check_least, check_path, check_positive, parse_number
 from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, check_text_name, image_files, open_video, read_pixels
 
 Pixels = np.ndarray[Any, Any]
@@ -90,6 +91,9 @@ class CaptureReader:
         if self.live:
             self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         self.fps = frames_a_second(self._capture)
+        self.times = list(read_times(source).values()) if isinstance(source, Path) else []
+        self.fps = rate_of(self.times, self.fps)
+        self.codec = lossy_codec(self._capture)
 
     def read(self) -> Pixels | None:
         there, pixels = self._capture.read()
@@ -229,8 +233,71 @@ def frames_a_second(capture: Any) -> float:
     return fps if 0.5 <= fps <= 1000.0 else 30.0
 
 
+def times_file(recording: Path) -> Path:
+    """The table of the times of a recording's frames: in a folder, beside a video."""
+    return recording / "times.csv" if recording.is_dir() else Path(f"{recording}.times.csv")
+
+
+def read_times(recording: Path) -> dict[str, float]:
+    """Times of a recording's frames, s, by name; none where there is no table.
+
+    Raises:
+        ValueError: the table is damaged.
+    """
+    path = times_file(recording)
+    if not path.is_file():
+        return {}
+    try:
+        head, *lines = path.read_text(encoding="utf-8").split()
+        found = {name: parse_number(time_s) for name, time_s in (line.split(",") for line in lines)}
+        if head == "frame,time_s" and all(a < b for a, b in pairwise(found.values())):
+            return found
+    except ValueError:
+        pass
+    raise ValueError(f"{path}: expected lines of frame,time_s, times that rise: remove it to read the frames without times")
+
+
+def rate_of(times: Sequence[float], otherwise: float) -> float:
+    """Frames a second of frames at these times, s; the other value where there are not two."""
+    return otherwise if len(times) < 2 else (len(times) - 1) / (times[-1] - times[0])
+
+
+def time_of(reader: Reader, index: int) -> float:
+    """Time of a frame of a recording since its start, s: as recorded, else by the rate."""
+    times: Sequence[float] = getattr(reader, "times", ())
+    return times[index] if index < len(times) else index / reader.fps
+
+
+CODECS = {
+    **dict.fromkeys(("FMP4", "mp4v", "XVID", "DIVX", "DX50", "MP42", "MP43"), "MPEG-4"),
+    **dict.fromkeys(("h264", "H264", "avc1", "X264"), "H.264"),
+    **dict.fromkeys(("hevc", "HEVC", "hvc1", "hev1"), "H.265"),
+    **dict.fromkeys(("MJPG", "mjpg"), "Motion JPEG"),
+    **dict.fromkeys(("FFV1", "HFYU", "FFVH", "MPNG", "png ", "I420", "YUY2", "YUYV", "\0\0\0\0"), ""),
+}
+"""OpenCV's codes of codecs, and the names of those that lose something; others are shown by their code."""
+
+
+def lossy_codec(capture: Any) -> str:
+    """Name of the codec of an OpenCV capture; empty where it loses nothing, or is not known."""
+    import cv2
+
+    code = int(capture.get(cv2.CAP_PROP_FOURCC))
+    letters = max(code, 0).to_bytes(8, "little")[:4].decode("latin-1")
+    return CODECS.get(letters, letters)
+
+
+def video_codec(path: Path) -> str:
+    """:func:`lossy_codec` of a video file."""
+    capture = open_video(path)
+    try:
+        return lossy_codec(capture)
+    finally:
+        capture.release()
+
+
 class FolderReader:
-    """A folder of images, by name."""
+    """A folder of images, by name, numbers as numbers."""
 
     def __init__(self, folder: Path) -> None:
         self.name, self.live, self.fps = str(folder), False, 30.0
@@ -239,7 +306,10 @@ class FolderReader:
             raise ValueError(
                 f"source: expected a folder of images ({', '.join(IMAGE_SUFFIXES)}), got {folder}: no images in this folder"
             )
-        self._files = iter(files)
+        self._files, known = iter(files), read_times(folder)
+        self.times = [known[file.stem] for file in files] if all(file.stem in known for file in files) else []
+        self.fps = rate_of(self.times, self.fps)
+        self.codec = "JPEG" if files[0].suffix.lower() in (".jpg", ".jpeg") else ""
 
     def read(self) -> Pixels | Unreadable | None:
         path = next(self._files, None)

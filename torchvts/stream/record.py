@@ -1,0 +1,89 @@
+"""Raw frames of a camera for later: a lossless video or a folder of PNG images, and the times of the frames in a table."""
+
+import csv
+import io
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+
+from ..core.checks import check_path
+from ..core.files import VIDEO_SUFFIXES, image_files, make_folder, write_atomically, write_pixels
+from .sources import SETTLING, Pixels, Reader, Unreadable, times_file
+from .video import InTurn, VideoFile
+
+LOSSLESS = ".mkv"
+"""Suffix of a recording in one file, coded by FFV1."""
+
+
+class Recorder:
+    """A live source whose frames are also written as they come; :func:`open_source` reads them again bit for bit, with their times.
+
+    Frames that come while earlier ones are being written are lost to both; times tell. The first ones, while exposure settles, are
+    not written.
+
+    Args:
+        reader: the source.
+        path: a name ending in .mkv for FFV1 (8 bits), or a folder without images for PNG (8 or 16 bits).
+    Attributes:
+        times: of the frames written, s, from 0.
+    Raises:
+        ValueError: a folder that holds images, or frames that FFV1 does not hold.
+        OSError: by :meth:`read` or :meth:`close`: what was recorded cannot be written.
+    """
+
+    live = True
+
+    def __init__(self, reader: Reader, path: str | Path) -> None:
+        self.name, self.fps, self.path = reader.name, reader.fps, check_path("record", path)
+        self.times: list[float] = []
+        self._reader, self._lock, self._closed, self._settling = reader, threading.Lock(), False, SETTLING
+        self._start = 0.0
+        self._video: VideoFile | None = None
+        self._images = InTurn()
+        if self.path.suffix.lower() == LOSSLESS:
+            self._video = VideoFile(self.path, self.fps).__enter__()
+        elif self.path.suffix.lower() in VIDEO_SUFFIXES:
+            raise ValueError(f"record: expected a name ending in {LOSSLESS} or that of a folder, got {self.path.name!r}")
+        elif image_files(make_folder(self.path)):
+            raise ValueError(f"record: {self.path}: expected a folder without images, got one with some: name another")
+
+    def read(self) -> Pixels | Unreadable | None:
+        pixels, now = self._reader.read(), time.monotonic()
+        with self._lock:
+            if isinstance(pixels, np.ndarray) and not self._closed:
+                self._settling -= 1
+                if self._settling < 0:
+                    self._write(pixels, now)
+        return pixels
+
+    def _write(self, pixels: Pixels, now: float) -> None:
+        if self._video is None:
+            self._images.submit(write_pixels, self.path / f"{len(self.times):06d}.png", pixels)
+        elif pixels.dtype != np.uint8 or pixels.shape[0] % 2 or pixels.shape[1] % 2:
+            raise ValueError(
+                f"record: expected 8 bits and an even size for {LOSSLESS}, got {pixels.dtype} {pixels.shape[:2]}: name a folder"
+            )
+        else:
+            self._video.write(pixels)
+        self._start = self._start if self.times else now
+        self.times.append(now - self._start)
+
+    def close(self) -> None:
+        """Release the source, and finish the recording."""
+        self._reader.close()
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            self._images.finish()
+            if self._video is not None:
+                self._video.__exit__(None, None, None)
+            if self.times:
+                table = io.StringIO()
+                csv.writer(table, lineterminator="\n").writerows(
+                    [("frame", "time_s"), *((f"{k:06d}", f"{t:.6f}") for k, t in enumerate(self.times))]
+                )
+                with write_atomically(times_file(self.path)) as temporary:
+                    temporary.write_text(table.getvalue(), encoding="utf-8")

@@ -6,10 +6,13 @@ import sys
 import zipfile
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
 import torchvts as vts
+from torchvts.core.files import rgb_from_bgr
 
 GOOD = {"name": "rig", "height": 24, "width": 32, "mm_per_pixel": 0.5}
 
@@ -52,6 +55,8 @@ def as_text(**changes):
         (as_text(raw_size_px="[[48, 64]]", roi_px="[0, 0, 9, 9]"), "key raw_size_px: expected none beside roi_px"),
         (as_text(corners_px="[[0, 0], [0, 9], [9, 9], [9, 0]]"), "key corners_px: expected a convex quadrilateral"),
         (as_text(corners_px="[[0, 0], [9, 0], [9, 9], [0, 9]]", roi_px="[0, 0, 9, 9]"), "expected one of them, got both"),
+        (as_text(turn_deg=45), "key turn_deg: expected 0, 90, 180 or 270, anticlockwise, got 45"),
+        (as_text(turn_deg=90, raw_size_px="[[48, 64]]"), "key raw_size_px: expected frames of the aspect"),
         ("- 1\n- 2\n", "expected keys and values, got list"),
         ("name: [rig\n", "not a YAML file"),
         ("!!python/object/apply:os.getcwd []\n", "not a YAML file"),
@@ -95,6 +100,7 @@ def test_another_resolution_keeps_the_field_of_view(height, width):
         {"roi_px": [4, 5, 60, 45]},
         {"corners_px": [[1, 2], [30, 3.5], [31, 22], [0, 23]]},
         {"raw_size_px": [[48, 64], [96, 128]], "raw_crop": 0.125},
+        {"turn_deg": 270, "mirror": True},
     ],
 )
 def test_a_saved_sensor_loads_as_it_was(tmp_path, extra):
@@ -116,6 +122,40 @@ def frame(height=120, width=160):
 
 def test_rectify_leaves_a_frame_of_the_right_size_alone():
     assert torch.equal(vts.Sensor("rig", 120, 160, 0.1).rectify(frame()), frame())
+
+
+def test_a_digit_runs_on_frames_as_its_camera_gives_them():
+    """digit-interface turns them by cv2.transpose and cv2.flip; its upright frames are taken as they are."""
+    sensor = vts.Sensor.load("digit")
+    for scale in (1, 2):  # QVGA and VGA
+        raw = np.random.default_rng(0).integers(0, 256, (240 * scale, 320 * scale, 3), np.uint8)
+        upright = rgb_from_bgr(cv2.flip(cv2.transpose(raw), 0))[None]
+        expected = upright if scale == 1 else torch.nn.functional.avg_pool2d(upright, 2)
+        image = sensor.rectify(rgb_from_bgr(raw)[None])
+        assert (image - expected).abs().max() < (1e-7 if scale == 1 else 0.3)  # antialiasing looks beyond two pixels
+        assert torch.equal(sensor.rectify(image), image)
+    with pytest.raises(ValueError, match=r"got 120 x 160: its camera lies: .* turn_deg: 90, and raw_size_px with \[120, 160\]"):
+        sensor.rectify(torch.zeros(1, 3, 120, 160))
+    with pytest.raises(ValueError, match=r"got 32 x 24: its camera lies: the sensor file needs turn_deg: 90 \(or 270\)"):
+        vts.Sensor(**GOOD).rectify(torch.zeros(1, 3, 32, 24))
+
+
+@pytest.mark.parametrize("turn_deg", [0, 90, 180, 270])
+@pytest.mark.parametrize("mirror", [False, True])
+def test_frames_are_turned_and_mirrored_before_they_are_cut(turn_deg, mirror):
+    turned = np.rot90(frame()[0].permute(1, 2, 0).numpy(), turn_deg // 90)
+    turned = torch.from_numpy((np.fliplr(turned) if mirror else turned).copy()).permute(2, 0, 1)[None]
+    height, width = turned.shape[2:]
+    view = {"turn_deg": turn_deg, "mirror": mirror}
+    whole = vts.Sensor("rig", height, width, 0.1, **view)
+    assert torch.equal(whole.rectify(frame()), turned)
+    if turn_deg or mirror:
+        half = whole.resized(height // 2, width // 2)  # frames of the camera's size are still turned
+        assert (half.rectify(frame()) - torch.nn.functional.avg_pool2d(turned, 2)).abs().max() < 0.05
+    part = vts.Sensor("rig", 50, 40, 0.1, roi_px=(12, 34, 40, 50), **view)
+    assert torch.equal(part.rectify(frame()), turned[:, :, 34:84, 12:52])
+    corners = vts.Sensor("rig", 50, 40, 0.1, corners_px=((12, 34), (51, 34), (51, 83), (12, 83)), **view)
+    assert (corners.rectify(frame()) - turned[:, :, 34:84, 12:52]).abs().max() < 1e-9
 
 
 def test_rectify_cuts_the_region_of_interest():
@@ -246,3 +286,9 @@ def test_frames_of_the_mini_as_its_camera_gives_them(data, tmp_path):
     vts.write_image(tmp_path / "wide.png", torch.rand(3, 90, 160))
     with pytest.raises(ValueError, match=r"wide\.png: frame: expected 240 x 320, or raw frames of 2464 x 3280 or 480 x 640"):
         sensor.read_image(tmp_path / "wide.png")
+
+
+def test_a_recording_of_a_digit_reads_the_same_upright_and_lying(data, tmp_path):
+    sensor, file = vts.Sensor.load("digit"), data / "digit_a" / "background.png"
+    cv2.imwrite(str(tmp_path / "lying.png"), cv2.rotate(cv2.imread(str(file)), cv2.ROTATE_90_CLOCKWISE))
+    assert torch.equal(sensor.read_image(tmp_path / "lying.png"), sensor.read_image(file))

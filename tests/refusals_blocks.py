@@ -17,6 +17,7 @@ from torchvts.pipeline import Confidence
 SLOPES = torch.zeros(1, 2, HEIGHT, WIDTH)
 OTHER_DEPTHS = [DEPTH[0], DEPTH[..., 1:], DEPTH.expand(2, -1, -1, -1)]
 IMAGES = [*batches(3), 255 * image()[None], image()[None] + NAN, image()[None] - 1.0]
+LENS = ((50.0, 0.0, 32.0), (0.0, 50.0, 24.0), (0.0, 0.0, 1.0))
 SHARES = [*(value for value in NUMBER if value is not None), 1.5]
 
 
@@ -191,11 +192,14 @@ TABLE = {
         label=("name", "image"),  # calibrate checks the image: it knows the sensor's size
     ),
     "Sensor": Entry({"name": "rig", "height": 24, "width": 32, "mm_per_pixel": 0.1, "gamma": 1.0, "blur_px": 0.0,
-        "light_position_mm": None, "turn_deg": 0, "mirror": False, "roi_px": None, "corners_px": None,
-        "raw_size_px": ((48, 64),), "raw_crop": 0.1, "markers": False, "prior": None},
+        "light_position_mm": None, "camera_matrix": LENS, "distortion_coefficients": (0.1, 0.0, 0.0, 0.0),
+        "turn_deg": 0, "mirror": False, "roi_px": None, "corners_px": None, "raw_size_px": ((48, 64),),
+        "raw_crop": 0.1, "markers": False, "prior": None},
         {"name": ["", None, 3], "mm_per_pixel": [*NUMBER, 11.0], "gamma": ["2", 0, NAN, 0.01, 99.0],
         "blur_px": ["1", None, NAN, -1.0, 99.0],
         "light_position_mm": [[[0, 0, 1]], "lights", [[20.0, 0.0, -30.0]] * 3, [[20.0, 0.0, NAN]] * 3],
+        "camera_matrix": ["all", LENS[:2], ((-50.0, 0.0, 32.0), *LENS[1:]), (LENS[0], (1.0, 50.0, 24.0), LENS[2])],
+        "distortion_coefficients": ["all", (0.1,), (0.1, 0.0, 0.0, "0"), (0.1, 0.0, 0.0, NAN)],
         "turn_deg": ["90", None, True, 90.5, -90, 45, 360], "mirror": ["yes", 1],
         "roi_px": [(1, 2), (0, 0, 1.5, 9), (-1, 0, 9, 9), "all"],
         "corners_px": [((0, 0),), ((0, 0), (0, 1), (1, 1), (1, 0)), "all"],

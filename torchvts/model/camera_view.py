@@ -1,14 +1,16 @@
-"""How the sensor's image lies in the frames of its camera: turned, mirrored, and cut by a region, corners or a crop."""
+"""How the sensor's image lies in the frames of its camera: bent by a lens, turned, mirrored, cut by a region, corners or a crop."""
 
 from functools import lru_cache
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from ..core.checks import brief, check_numbers
 
 Corners = tuple[tuple[float, float], ...]
+Matrix = tuple[tuple[float, ...], ...]
 
 
 class CameraView(NamedTuple):
@@ -25,13 +27,18 @@ class CameraView(NamedTuple):
     roi_px: tuple[int, int, int, int] | None
     corners_px: Corners | None
     raw_crop: float
+    camera_matrix: Matrix | None
+    distortion_coefficients: tuple[float, ...] | None
 
     def __call__(self, frame: Tensor) -> Tensor:
-        image = self.cut(frame)
+        if self.camera_matrix is None:
+            image = self.cut(frame)
+        else:
+            image = _sampled(frame, _straight_grid(self, (frame.shape[2], frame.shape[3]), frame.dtype))
         return image if image.shape[2:] == self.size else _resized(image, self.size)
 
     def cut(self, frame: Tensor) -> Tensor:
-        """Frames turned, mirrored and cut: of the sensor's size where there are corners, else as large as what is cut out."""
+        """Frames (B, C, H, W) turned, mirrored and cut; of the sensor's size only where there are corners."""
         if self.turn_deg:
             frame = frame.rot90(self.turn_deg // 90, (2, 3)).contiguous()
         if self.mirror:
@@ -41,9 +48,7 @@ class CameraView(NamedTuple):
             x, y = zip(*self.corners_px, strict=True)
             if min(*x, *y) < -0.5 or max(x) > width or max(y) > height:
                 raise self._missing("corners_px", height, width, self.corners_px)
-            grid = _sampling_grid(self.corners_px, self.size, (height, width), frame.dtype).to(frame.device)
-            grid = grid.expand(frame.shape[0], -1, -1, -1)
-            return nn.functional.grid_sample(frame, grid, mode="bilinear", padding_mode="border", align_corners=True)
+            return _sampled(frame, _corners_grid(self.corners_px, self.size, (height, width), frame.dtype))
         if self.roi_px is not None:
             left, top, roi_width, roi_height = self.roi_px
             if left + roi_width > width or top + roi_height > height:
@@ -84,8 +89,52 @@ def check_raw_sizes(value: object) -> tuple[tuple[int, int], ...]:
     return tuple((int(numbers[k]), int(numbers[k + 1])) for k in range(0, len(numbers), 2))
 
 
+def check_lens(matrix: object, coefficients: object) -> tuple[Matrix, tuple[float, ...]]:
+    """Return OpenCV's camera matrix and distortion coefficients, or raise."""
+    if matrix is None or coefficients is None:
+        raise ValueError("camera_matrix, distortion_coefficients: expected both or none: cv2.calibrateCamera gives both")
+    numbers = check_numbers("camera_matrix", matrix, (3, 3))
+    if min(numbers[0], numbers[4]) <= 0 or (numbers[1], numbers[3], *numbers[6:]) != (0, 0, 0, 0, 1):
+        raise ValueError(f"camera_matrix: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, got {brief(matrix)}")
+    if not isinstance(coefficients, list | tuple) or len(coefficients) not in (4, 5, 8, 12, 14):
+        raise ValueError(
+            f"distortion_coefficients: expected 4, 5, 8, 12 or 14 numbers k1, k2, p1, p2, k3, ..., got {brief(coefficients)}"
+        )
+    rows = tuple(numbers[i : i + 3] for i in (0, 3, 6))
+    return rows, check_numbers("distortion_coefficients", coefficients, (len(coefficients),))
+
+
+def _sampled(frame: Tensor, grid: Tensor) -> Tensor:
+    """Frames (B, C, H, W) at the places of a grid (1, h, w, 2)."""
+    grid = grid.to(frame.device).expand(frame.shape[0], -1, -1, -1)
+    return nn.functional.grid_sample(frame, grid, mode="bilinear", padding_mode="border", align_corners=True)
+
+
+@lru_cache(maxsize=4)
+def _straight_grid(view: CameraView, frame_size: tuple[int, int], dtype: torch.dtype) -> Tensor:
+    """Where each pixel of what is cut out of a frame without distortion lies in the frame, as by :func:`_corners_grid`.
+
+    The places are cut as frames are, so that frames are sampled once.
+    """
+    import cv2
+
+    rows, columns = frame_size
+    matrix, coefficients = np.array(view.camera_matrix), np.array(view.distortion_coefficients)
+    maps = cv2.initUndistortRectifyMap(matrix, coefficients, np.eye(3), matrix, (columns, rows), cv2.CV_32FC1)
+    with torch.inference_mode(False):
+        place = view.cut(torch.from_numpy(np.stack(maps)).double()[None])  # (1, 2, h, w)
+        most = torch.tensor([columns - 1.0, rows - 1.0], dtype=torch.float64)[None, :, None, None]
+        beyond = float(torch.maximum(-place, place - most).max())
+        if beyond > 1.0:
+            raise ValueError(
+                f"frame: of {rows} x {columns} sensor '{view.name}' needs pixels up to {beyond:.0f} beyond its edge, by its "
+                "camera_matrix and distortion_coefficients: cut less out of it, by roi_px, corners_px or raw_crop"
+            )
+        return (2.0 * place / most - 1.0).permute(0, 2, 3, 1).to(dtype)
+
+
 @lru_cache(maxsize=16)
-def _sampling_grid(corners_px: Corners, size: tuple[int, int], frame_size: tuple[int, int], dtype: torch.dtype) -> Tensor:
+def _corners_grid(corners_px: Corners, size: tuple[int, int], frame_size: tuple[int, int], dtype: torch.dtype) -> Tensor:
     """Where each pixel of an image of ``size`` lies in frames of ``frame_size``, (1, height, width, 2), from -1 to 1."""
     (height, width), (rows, columns) = size, frame_size
     with torch.inference_mode(False):

@@ -25,7 +25,7 @@ from ..core.checks import (
 )
 from ..core.files import read_image, write_atomically
 from ..core.spelling import suggest
-from .camera_view import CameraView, check_corners, check_raw_sizes
+from .camera_view import CameraView, check_corners, check_lens, check_raw_sizes
 from .gs_sdk_sensor import is_gs_sdk_sensor, values_from_gs_sdk
 from .response_field import SensorPrior
 
@@ -45,15 +45,17 @@ class Sensor:
         gamma: response of the camera, value = light^(1 / gamma); None leaves it open: calibration chooses it, all else uses 1.
         blur_px: standard deviation of a Gaussian blur before normals, pixels; 0 for none.
         light_position_mm: (3, 3), rows R, G, B, if the positions of the lights are known.
-        turn_deg: 0, 90, 180 or 270, by which raw frames are turned first, anticlockwise. Raw frames are all where ``roi_px`` or
-            ``corners_px`` say where the gel lies in them, turned; else those of a ``raw_size_px``.
+        camera_matrix: (3, 3), OpenCV's, in pixels of raw frames, out of which the distortion of the lens is taken first. Raw frames
+            are all where ``roi_px`` or ``corners_px`` are given, else those of ``raw_size_px``.
+        distortion_coefficients: OpenCV's, 4, 5, 8, 12 or 14 numbers k1, k2, p1, p2, k3, ...
+        turn_deg: 0, 90, 180 or 270, by which raw frames are then turned, anticlockwise. Places are those in turned frames.
         mirror: whether raw frames are then mirrored left to right.
         roi_px: (left, top, width, height) of the gel in the camera's frame, of the sensor's aspect within 2 %, resized to its size.
         corners_px: (4, 2), x and y of the gel's corners in the camera's frame: top left, top right, bottom right, bottom
             left, rectified to the sensor's size. Either this or ``roi_px``.
         raw_size_px: (N, 2), (height, width) of the frames that the camera gives, if images are usually stored upright or cropped:
             a frame of such a size is turned, cropped by ``raw_crop``, and resized to the sensor's size; one of the sensor's size is
-            kept as it is. Where frames are turned or mirrored, the sensor's size before that if nothing else is said.
+            kept as it is. Where frames are turned, mirrored or straightened, the sensor's size before that if nothing else is said.
         raw_crop: share of a raw frame's height and width to cut off each side, in [0, 0.5).
         markers: whether the skin has printed markers, which are filled in every frame; None: where the background shows a regular
             pattern of them.
@@ -72,6 +74,8 @@ class Sensor:
     gamma: float | None = None
     blur_px: float = 0.0
     light_position_mm: tuple[tuple[float, float, float], ...] | None = None
+    camera_matrix: tuple[tuple[float, ...], ...] | None = None
+    distortion_coefficients: tuple[float, ...] | None = None
     turn_deg: int = 0
     mirror: bool = False
     roi_px: tuple[int, int, int, int] | None = None
@@ -98,6 +102,17 @@ class Sensor:
             if min(numbers[2::3]) <= 0:
                 raise ValueError(f"light_position_mm: expected lights above the skin (z > 0), got {self.light_position_mm!r}")
             self._set("light_position_mm", tuple(numbers[i : i + 3] for i in (0, 3, 6)))
+        self._check_view()
+        if self.markers is not None and not isinstance(self.markers, bool):
+            raise TypeError(f"markers: expected true, false or null, got {brief(self.markers)}")
+        prior: object = self.prior
+        if isinstance(prior, dict):  # as YAML gives it
+            self._set("prior", SensorPrior.from_dict(prior, "prior"))
+        elif prior is not None and not isinstance(prior, SensorPrior):
+            raise TypeError(f"prior: expected a SensorPrior, got {type(prior).__name__}")
+
+    def _check_view(self) -> None:
+        """Check what leads from raw frames to the sensor's images."""
         if self.roi_px is not None and self.corners_px is not None:
             raise ValueError("roi_px, corners_px: expected one of them, got both")
         if self.roi_px is not None:
@@ -111,19 +126,18 @@ class Sensor:
             raise ValueError(f"turn_deg: expected 0, 90, 180 or 270, anticlockwise, got {self.turn_deg}")
         check_switch("mirror", self.mirror)
         self._set("raw_size_px", check_raw_sizes(self.raw_size_px))
+        if self.camera_matrix is not None or self.distortion_coefficients is not None:
+            matrix, coefficients = check_lens(self.camera_matrix, self.distortion_coefficients)
+            self._set("camera_matrix", matrix)
+            self._set("distortion_coefficients", coefficients)
+            if len(self.raw_size_px) > 1:
+                raise ValueError(f"raw_size_px: expected one size, that of camera_matrix, got {self.raw_size_px}")
         self._set("raw_crop", check_least("raw_crop", self.raw_crop, 0.0, 0.49))
         if self.raw_size_px and (self.roi_px is not None or self.corners_px is not None):
             raise ValueError("raw_size_px: expected none beside roi_px or corners_px, which say where the gel lies in raw frames")
-        if (self.turn_deg or self.mirror) and not (self.raw_size_px or self.roi_px or self.corners_px):
-            self._set("raw_size_px", ((width, height) if self.turn_deg % 180 else (height, width),))
+        if self._moved and not (self.raw_size_px or self.roi_px or self.corners_px):
+            self._set("raw_size_px", ((self.width, self.height) if self.turn_deg % 180 else (self.height, self.width),))
         self._check_aspects()
-        if self.markers is not None and not isinstance(self.markers, bool):
-            raise TypeError(f"markers: expected true, false or null, got {brief(self.markers)}")
-        prior: object = self.prior
-        if isinstance(prior, dict):  # as YAML gives it
-            self._set("prior", SensorPrior.from_dict(prior, "prior"))
-        elif prior is not None and not isinstance(prior, SensorPrior):
-            raise TypeError(f"prior: expected a SensorPrior, got {type(prior).__name__}")
 
     def _check_aspects(self) -> None:
         """Raise where images would be stretched: the pitch is the same along x and y."""
@@ -155,7 +169,7 @@ class Sensor:
         """The same sensor with other pixels: field of view, lights and response stay; pitch and blur are scaled.
 
         Frames of the new size are taken as images that are cropped already, also where the camera gives raw frames of that size,
-        unless these must be turned or mirrored.
+        unless these must be turned, mirrored or straightened.
 
         Args:
             height: new number of rows.
@@ -178,7 +192,7 @@ class Sensor:
             response = dataclasses.replace(prior.response, blur_px=prior.response.blur_px * scale_x)
             prior = dataclasses.replace(prior, response=response)
         pitch, blur_px = self.mm_per_pixel / scale_x, self.blur_px * scale_x
-        raw = tuple(size for size in self.raw_size_px if size != (height, width) or self.turn_deg or self.mirror)
+        raw = tuple(size for size in self.raw_size_px if size != (height, width) or self._moved)
         changes: dict[str, Any] = {"mm_per_pixel": pitch, "blur_px": blur_px, "prior": prior, "raw_size_px": raw}
         return dataclasses.replace(self, height=height, width=width, **changes)
 
@@ -209,9 +223,24 @@ class Sensor:
         return frame
 
     @property
+    def _moved(self) -> bool:
+        """Whether raw frames differ from the sensor's images by more than size and crop."""
+        return self.turn_deg != 0 or self.mirror or self.camera_matrix is not None
+
+    @property
     def _view(self) -> CameraView:
         size = (self.height, self.width)
-        return CameraView(self.name, size, self.turn_deg, self.mirror, self.roi_px, self.corners_px, self.raw_crop)
+        return CameraView(
+            self.name,
+            size,
+            self.turn_deg,
+            self.mirror,
+            self.roi_px,
+            self.corners_px,
+            self.raw_crop,
+            self.camera_matrix,
+            self.distortion_coefficients,
+        )
 
     def _misfit(self, height: int, width: int) -> str:
         """Why a frame of another size does not fit, and what would make it fit."""

@@ -170,6 +170,11 @@ class TactileStream:
         return self.recording.light
 
     @property
+    def started_s(self) -> float:
+        """Time 0 of the frames by :func:`time.monotonic`, the clock of all streams; of a recording that waits, its opening."""
+        return self._frames.started_s
+
+    @property
     def dropped(self) -> int:
         """Number of frames that arrived while another was being worked on, and were left out."""
         return self._frames.dropped

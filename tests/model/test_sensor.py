@@ -60,6 +60,11 @@ def as_text(**changes):
         (as_text(turn_deg=90, raw_size_px="[[48, 64]]"), "key raw_size_px: expected frames of the aspect"),
         (as_text(distortion_coefficients=[0, 0, 0, 0]), "key camera_matrix, distortion_coefficients: expected both or none"),
         (as_text(camera_matrix="[[3, 0], [0, 3]]", distortion_coefficients="[]"), "key camera_matrix: expected 3 x 3 numbers"),
+        (as_text(sensor_to_robot="[[0, 0, 1, 50]]"), "key sensor_to_robot: expected 4 x 4 numbers"),
+        (
+            as_text(sensor_to_robot="[[-1, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"),
+            "key sensor_to_robot: .* mirror image",
+        ),
         ("- 1\n- 2\n", "expected keys and values, got list"),
         ("name: [rig\n", "not a YAML file"),
         ("!!python/object/apply:os.getcwd []\n", "not a YAML file"),
@@ -104,6 +109,7 @@ def test_another_resolution_keeps_the_field_of_view(height, width):
         {"corners_px": [[1, 2], [30, 3.5], [31, 22], [0, 23]]},
         {"raw_size_px": [[48, 64], [96, 128]], "raw_crop": 0.125},
         {"turn_deg": 270, "mirror": True},
+        {"sensor_to_robot": [[0, 0, 1, 50], [0, 1, 0, 0], [-1, 0, 0, 120], [0, 0, 0, 1]]},
         {"camera_matrix": [[30, 0, 15.5], [0, 30, 11.5], [0, 0, 1]], "distortion_coefficients": [-0.2, 0.1, 0, 0, 0]},
     ],
 )

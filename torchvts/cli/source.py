@@ -19,11 +19,10 @@ from .parser import UsageError
 
 def add_source(parser: argparse.ArgumentParser) -> None:
     """Options of the source, the unit, the camera and the pipeline."""
-    where = "camera (index, /dev path, name, serial number), URL, video, or folder of images"
-    parser.add_argument("--source", required=True, help=where)
+    parser.add_argument("--source", required=True, help="camera (index, path, name, serial), video, folder, URL")
     parser.add_argument("--size", nargs=2, type=int, metavar=("W", "H"), help="of a camera's frames, where the driver takes it")
     parser.add_argument("--fps", type=float, metavar="F", help="of a camera, where the driver takes it")
-    parser.add_argument("--exposure", type=float, metavar="E", help="of a camera, in the driver's unit; ends automatic exposure")
+    parser.add_argument("--exposure", type=float, metavar="E", help="of a camera, driver's unit; ends automatic exposure")
     parser.add_argument("--white-balance", type=float, metavar="K", help="of a camera, kelvin; ends automatic white balance")
     add_sensor(parser, "the first frames calibrate: ")
     parser.add_argument("--calibration", type=Path, metavar="FILE", help="what torchvts calibrate wrote, in place of --sensor")

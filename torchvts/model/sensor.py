@@ -2,11 +2,12 @@
 
 import dataclasses
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
 from torch import Tensor
 
@@ -24,7 +25,9 @@ from ..core.checks import (
     from_dict,
 )
 from ..core.files import read_image, write_atomically
+from ..core.geometry import check_rigid
 from ..core.spelling import suggest
+from ..core.strict_yaml import read_yaml
 from .camera_view import CameraView, check_corners, check_lens, check_raw_sizes
 from .gs_sdk_sensor import is_gs_sdk_sensor, values_from_gs_sdk
 from .response_field import SensorPrior
@@ -59,6 +62,8 @@ class Sensor:
         raw_crop: share of a raw frame's height and width to cut off each side, in [0, 0.5).
         markers: whether the skin has printed markers, which are filled in every frame; None: where the background shows a regular
             pattern of them.
+        sensor_to_robot: (4, 4), rows of the rigid motion, mm, that takes points of the sensor (x right, y up, z towards the camera,
+            origin on the skin in the middle of the image) to a frame of the robot, in which commands then write clouds and poses.
         prior: response that all units of this type share, fitted to presses on one.
     Raises:
         TypeError, ValueError: name the argument, what was expected and what was given.
@@ -83,6 +88,7 @@ class Sensor:
     raw_size_px: tuple[tuple[int, int], ...] = ()
     raw_crop: float = 0.0
     markers: bool | None = None
+    sensor_to_robot: tuple[tuple[float, ...], ...] | None = None
     prior: SensorPrior | None = None
 
     def __post_init__(self) -> None:
@@ -105,6 +111,10 @@ class Sensor:
         self._check_view()
         if self.markers is not None and not isinstance(self.markers, bool):
             raise TypeError(f"markers: expected true, false or null, got {brief(self.markers)}")
+        if self.sensor_to_robot is not None:
+            numbers = check_numbers("sensor_to_robot", self.sensor_to_robot, (4, 4))
+            check_rigid("sensor_to_robot", torch.tensor(numbers, dtype=torch.float64).reshape(4, 4))
+            self._set("sensor_to_robot", tuple(numbers[i : i + 4] for i in (0, 4, 8, 12)))
         prior: object = self.prior
         if isinstance(prior, dict):  # as YAML gives it
             self._set("prior", SensorPrior.from_dict(prior, "prior"))
@@ -348,45 +358,6 @@ def _find(source: str | Path) -> Path:
         f"source: expected a path ending in .yaml, or one of {', '.join(shipped)}, got {str(source)!r}"
         + suggest(str(source), shipped)
     )
-
-
-MOST_YAML_BYTES = 2**17
-"""Limit for sensor files, which have some kilobytes."""
-
-
-class _StrictLoader(yaml.SafeLoader):
-    """Safe YAML that refuses duplicate keys, and aliases, with which a few lines can expand to gigabytes."""
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        if self.check_event(yaml.events.AliasEvent):
-            mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
-            raise yaml.composer.ComposerError(None, None, "an alias (*): write the value itself", mark)
-        return super().compose_node(parent, index)
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        seen: set[str] = set()
-        for key, _ in node.value:
-            name = repr(self.construct_object(key, deep=True))
-            if name in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"key {name}: given twice", node.start_mark)
-            seen.add(name)
-        return super().construct_mapping(node, deep)
-
-
-def read_yaml(path: Path) -> Any:
-    """The content of a YAML file, read safely.
-
-    Raises:
-        ValueError: too large, or not YAML.
-    """
-    if path.stat().st_size > MOST_YAML_BYTES:
-        raise ValueError(
-            f"{path}: expected a file of at most {MOST_YAML_BYTES} bytes, got {path.stat().st_size}: not a sensor file"
-        )
-    try:
-        return yaml.load(path.read_text(encoding="utf-8"), Loader=_StrictLoader)  # a SafeLoader
-    except (yaml.YAMLError, ValueError, RecursionError, AttributeError, TypeError) as error:
-        raise ValueError(f"{path}: not a YAML file: {error}") from error
 
 
 def _plain(value: Any) -> Any:

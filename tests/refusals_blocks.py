@@ -17,6 +17,7 @@ from torchvts.pipeline import Confidence
 SLOPES = torch.zeros(1, 2, HEIGHT, WIDTH)
 OTHER_DEPTHS = [DEPTH[0], DEPTH[..., 1:], DEPTH.expand(2, -1, -1, -1)]
 IMAGES = [*batches(3), 255 * image()[None], image()[None] + NAN, image()[None] - 1.0]
+LENS = ((50.0, 0.0, 32.0), (0.0, 50.0, 24.0), (0.0, 0.0, 1.0))
 SHARES = [*(value for value in NUMBER if value is not None), 1.5]
 
 
@@ -191,14 +192,19 @@ TABLE = {
         label=("name", "image"),  # calibrate checks the image: it knows the sensor's size
     ),
     "Sensor": Entry({"name": "rig", "height": 24, "width": 32, "mm_per_pixel": 0.1, "gamma": 1.0, "blur_px": 0.0,
-        "light_position_mm": None, "roi_px": None, "corners_px": None, "raw_size_px": ((48, 64),), "raw_crop": 0.1,
-        "markers": False, "prior": None}, {"name": ["", None, 3], "mm_per_pixel": [*NUMBER, 11.0],
-        "gamma": ["2", 0, NAN, 0.01, 99.0], "blur_px": ["1", None, NAN, -1.0, 99.0],
+        "light_position_mm": None, "camera_matrix": LENS, "distortion_coefficients": (0.1, 0.0, 0.0, 0.0),
+        "turn_deg": 0, "mirror": False, "roi_px": None, "corners_px": None, "raw_size_px": ((48, 64),),
+        "raw_crop": 0.1, "markers": False, "sensor_to_robot": EYE.tolist(), "prior": None},
+        {"name": ["", None, 3], "mm_per_pixel": [*NUMBER, 11.0], "gamma": ["2", 0, NAN, 0.01, 99.0],
+        "blur_px": ["1", None, NAN, -1.0, 99.0],
         "light_position_mm": [[[0, 0, 1]], "lights", [[20.0, 0.0, -30.0]] * 3, [[20.0, 0.0, NAN]] * 3],
+        "camera_matrix": ["all", LENS[:2], ((-50.0, 0.0, 32.0), *LENS[1:]), (LENS[0], (1.0, 50.0, 24.0), LENS[2])],
+        "distortion_coefficients": ["all", (0.1,), (0.1, 0.0, 0.0, "0"), (0.1, 0.0, 0.0, NAN)],
+        "turn_deg": ["90", None, True, 90.5, -90, 45, 360], "mirror": ["yes", 1],
         "roi_px": [(1, 2), (0, 0, 1.5, 9), (-1, 0, 9, 9), "all"],
         "corners_px": [((0, 0),), ((0, 0), (0, 1), (1, 1), (1, 0)), "all"],
         "raw_size_px": ["all", None, (48, 64), ((48,),), ((4.5, 64),), ((2, 64),)], "raw_crop": ["1", None, NAN, -0.1, 0.5],
-        "markers": ["yes", 1], "prior": ["prior", 3]}),
+        "markers": ["yes", 1], "sensor_to_robot": ["all", EYE[:3].tolist(), (2 * EYE).tolist()], "prior": ["prior", 3]}),
     "Sensor.load": Entry({"source": "gelsight_mini", "height": 240, "width": 320},
         {"source": ["no_such_sensor", "no/such.yaml", None, 3], "height": ["240", 100, 0], "width": ["320", 100, 0]},
         named={"width": "(height, )?width"}, file=("source",)),
@@ -264,6 +270,8 @@ TABLE = {
         for name in ("poisson_dct", "poisson_dst", "poisson_background")},
     "read_image": Entry({"path": ...}, {"path": [Path("no/such.png"), ".", None, 3]}, file=("path",), run=False),
     "read_presses": Entry({"folder": ...}, {"folder": [Path("no/such"), ".", None, 3]}, file=("folder",), run=False),
+    "OutputFrame": Entry({"length_unit": "m", "sensor": sensor()}, {"length_unit": ["cm", None, 1.0],
+        "sensor": ["gelsight_mini", 3]}),
     "register_depth": Entry({"source": frame(), "target": frame(), "mm_per_pixel": 0.4, "initial": EYE},
         {**{name: [None, DEPTH, "frame", vts.scenes.undeformed(frame())] for name in ("source", "target")}}),
     "register_points": Entry(

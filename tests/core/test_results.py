@@ -13,6 +13,7 @@ import torchvts as vts
 from torchvts.core.results import UNITS
 from torchvts.dataset import items, reconstruct_dataset
 from torchvts.pipeline import unit_pipeline
+from torchvts.pose import OutputFrame
 from torchvts.pose.surface_files import write_obj
 
 HEIGHT, WIDTH, PITCH = TINY_SENSOR.height, TINY_SENSOR.width, TINY_SENSOR.mm_per_pixel
@@ -110,14 +111,14 @@ def test_a_slanted_plane_is_written_with_its_own_normals(tmp_path):
     x = torch.arange(6.0).expand(5, 6) * 0.5
     contact = torch.ones(1, 1, 5, 6, dtype=torch.bool)
     normal = torch.tensor([-0.6, 0.0, 0.8])[None, :, None, None].expand(1, 3, 5, 6)  # of z = 0.75 x
-    write_obj(tmp_path / "plane.obj", (0.75 * x)[None, None], normal, contact, 0.5)
+    write_obj(tmp_path / "plane.obj", (0.75 * x)[None, None], normal, contact, 0.5, OutputFrame())
     lines = [line.split() for line in (tmp_path / "plane.obj").read_text().splitlines()]
     points = np.array([[float(v) for v in line[1:]] for line in lines if line[0] == "v"])
     faces = np.array([[int(part.split("//")[0]) - 1 for part in line[1:]] for line in lines if line[0] == "f"])
     assert len(points) == 30 and len(faces) == 2 * 4 * 5
     cross = np.cross(points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]])
     assert np.allclose(cross / np.linalg.norm(cross, axis=1, keepdims=True), [-0.6, 0.0, 0.8], atol=1e-5)
-    assert {tuple(line[1:]) for line in lines if line[0] == "vn"} == {("-0.600000", "-0.000000", "0.800000")}
+    assert {tuple(line[1:]) for line in lines if line[0] == "vn"} == {("-0.600000", "0.000000", "0.800000")}
 
 
 def damaged(path, tmp_path, how):

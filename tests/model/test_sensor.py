@@ -6,10 +6,14 @@ import sys
 import zipfile
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
+from conftest import ring_lights
 
 import torchvts as vts
+from torchvts.core.files import rgb_from_bgr
 
 GOOD = {"name": "rig", "height": 24, "width": 32, "mm_per_pixel": 0.5}
 
@@ -52,6 +56,15 @@ def as_text(**changes):
         (as_text(raw_size_px="[[48, 64]]", roi_px="[0, 0, 9, 9]"), "key raw_size_px: expected none beside roi_px"),
         (as_text(corners_px="[[0, 0], [0, 9], [9, 9], [9, 0]]"), "key corners_px: expected a convex quadrilateral"),
         (as_text(corners_px="[[0, 0], [9, 0], [9, 9], [0, 9]]", roi_px="[0, 0, 9, 9]"), "expected one of them, got both"),
+        (as_text(turn_deg=45), "key turn_deg: expected 0, 90, 180 or 270, anticlockwise, got 45"),
+        (as_text(turn_deg=90, raw_size_px="[[48, 64]]"), "key raw_size_px: expected frames of the aspect"),
+        (as_text(distortion_coefficients=[0, 0, 0, 0]), "key camera_matrix, distortion_coefficients: expected both or none"),
+        (as_text(camera_matrix="[[3, 0], [0, 3]]", distortion_coefficients="[]"), "key camera_matrix: expected 3 x 3 numbers"),
+        (as_text(sensor_to_robot="[[0, 0, 1, 50]]"), "key sensor_to_robot: expected 4 x 4 numbers"),
+        (
+            as_text(sensor_to_robot="[[-1, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"),
+            "key sensor_to_robot: .* mirror image",
+        ),
         ("- 1\n- 2\n", "expected keys and values, got list"),
         ("name: [rig\n", "not a YAML file"),
         ("!!python/object/apply:os.getcwd []\n", "not a YAML file"),
@@ -95,6 +108,9 @@ def test_another_resolution_keeps_the_field_of_view(height, width):
         {"roi_px": [4, 5, 60, 45]},
         {"corners_px": [[1, 2], [30, 3.5], [31, 22], [0, 23]]},
         {"raw_size_px": [[48, 64], [96, 128]], "raw_crop": 0.125},
+        {"turn_deg": 270, "mirror": True},
+        {"sensor_to_robot": [[0, 0, 1, 50], [0, 1, 0, 0], [-1, 0, 0, 120], [0, 0, 0, 1]]},
+        {"camera_matrix": [[30, 0, 15.5], [0, 30, 11.5], [0, 0, 1]], "distortion_coefficients": [-0.2, 0.1, 0, 0, 0]},
     ],
 )
 def test_a_saved_sensor_loads_as_it_was(tmp_path, extra):
@@ -116,6 +132,40 @@ def frame(height=120, width=160):
 
 def test_rectify_leaves_a_frame_of_the_right_size_alone():
     assert torch.equal(vts.Sensor("rig", 120, 160, 0.1).rectify(frame()), frame())
+
+
+def test_a_digit_runs_on_frames_as_its_camera_gives_them():
+    """digit-interface turns them by cv2.transpose and cv2.flip; its upright frames are taken as they are."""
+    sensor = vts.Sensor.load("digit")
+    for scale in (1, 2):  # QVGA and VGA
+        raw = np.random.default_rng(0).integers(0, 256, (240 * scale, 320 * scale, 3), np.uint8)
+        upright = rgb_from_bgr(cv2.flip(cv2.transpose(raw), 0))[None]
+        expected = upright if scale == 1 else torch.nn.functional.avg_pool2d(upright, 2)
+        image = sensor.rectify(rgb_from_bgr(raw)[None])
+        assert (image - expected).abs().max() < (1e-7 if scale == 1 else 0.3)  # antialiasing looks beyond two pixels
+        assert torch.equal(sensor.rectify(image), image)
+    with pytest.raises(ValueError, match=r"got 120 x 160: its camera lies: .* turn_deg: 90, and raw_size_px with \[120, 160\]"):
+        sensor.rectify(torch.zeros(1, 3, 120, 160))
+    with pytest.raises(ValueError, match=r"got 32 x 24: its camera lies: the sensor file needs turn_deg: 90 \(or 270\)"):
+        vts.Sensor(**GOOD).rectify(torch.zeros(1, 3, 32, 24))
+
+
+@pytest.mark.parametrize("turn_deg", [0, 90, 180, 270])
+@pytest.mark.parametrize("mirror", [False, True])
+def test_frames_are_turned_and_mirrored_before_they_are_cut(turn_deg, mirror):
+    turned = np.rot90(frame()[0].permute(1, 2, 0).numpy(), turn_deg // 90)
+    turned = torch.from_numpy((np.fliplr(turned) if mirror else turned).copy()).permute(2, 0, 1)[None]
+    height, width = turned.shape[2:]
+    view = {"turn_deg": turn_deg, "mirror": mirror}
+    whole = vts.Sensor("rig", height, width, 0.1, **view)
+    assert torch.equal(whole.rectify(frame()), turned)
+    if turn_deg or mirror:
+        half = whole.resized(height // 2, width // 2)  # frames of the camera's size are still turned
+        assert (half.rectify(frame()) - torch.nn.functional.avg_pool2d(turned, 2)).abs().max() < 0.05
+    part = vts.Sensor("rig", 50, 40, 0.1, roi_px=(12, 34, 40, 50), **view)
+    assert torch.equal(part.rectify(frame()), turned[:, :, 34:84, 12:52])
+    corners = vts.Sensor("rig", 50, 40, 0.1, corners_px=((12, 34), (51, 34), (51, 83), (12, 83)), **view)
+    assert (corners.rectify(frame()) - turned[:, :, 34:84, 12:52]).abs().max() < 1e-9
 
 
 def test_rectify_cuts_the_region_of_interest():
@@ -142,6 +192,47 @@ def test_rectify_straightens_a_quadrilateral():
     result = sensor.rectify(frame().repeat(2, 1, 1, 1))
     assert result.shape == (2, 3, 60, 80)
     assert (result - expected).abs().max() < 0.4 * 0.36**2 / 4  # bilinear: curvature (0.33^2 + 0.07^2) / 8 per axis
+
+
+LENS = np.array([[110.0, 0.0, 79.5], [0.0, 110.0, 59.5], [0.0, 0.0, 1.0]])
+BARREL = np.array([-0.196, 0.0, 0.0, 0.0])  # moves a corner of 120 x 160 by 16 %
+STRAIGHT = {"camera_matrix": LENS.tolist(), "distortion_coefficients": BARREL.tolist()}
+
+
+def through_the_lens(height=120, width=160):
+    """Where each pixel of a frame would lie without distortion, (2, H, W)."""
+    x, y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
+    place = cv2.undistortPoints(np.stack([x, y], -1).reshape(-1, 1, 2), LENS, BARREL, P=LENS)
+    return torch.from_numpy(place.reshape(height, width, 2)).permute(2, 0, 1)
+
+
+def test_a_lens_is_taken_out_of_raw_frames():
+    raw = smooth(*through_the_lens())
+    assert (raw - frame()).abs().max() > 0.5
+    sensor = vts.Sensor("rig", 120, 160, 0.1, **STRAIGHT)
+    straight = sensor.rectify(raw)
+    assert (straight - frame()).abs().max() < 0.02  # bilinear
+    view = {"turn_deg": 90, "mirror": True, "corners_px": ((12, 34), (90, 30), (100, 120), (9, 133))}
+    at_once, after = (vts.Sensor("rig", 60, 50, 0.1, **view, **lens) for lens in (STRAIGHT, {}))
+    assert (at_once.rectify(raw) - after.rectify(straight)).abs().max() < 0.02
+    pincushion = {**STRAIGHT, "distortion_coefficients": (0.2, 0, 0, 0)}
+    with pytest.raises(ValueError, match=r"frame: of 120 x 160 sensor 'rig' needs pixels up to 13 beyond its edge.*raw_crop"):
+        vts.Sensor("rig", 120, 160, 0.1, **pincushion).rectify(raw)
+    assert vts.Sensor("rig", 60, 80, 0.1, roi_px=(40, 30, 80, 60), **pincushion).rectify(raw).shape[2:] == (60, 80)
+
+
+def test_depth_in_a_corner_behind_a_lens():
+    """Without the lens in the sensor file this press, of 0.6 mm, is read 11 % too flat."""
+    scene = vts.scenes.sphere_press(4.0, 0.6, (5.0, 3.6), 120, 160, 0.1)
+    grid = (2 * through_the_lens() / torch.tensor([159.0, 119.0])[:, None, None] - 1).permute(1, 2, 0)[None]
+    images = [vts.scenes.render(one, ring_lights()).double() for one in (vts.scenes.undeformed(scene), scene)]
+    raw = [torch.nn.functional.grid_sample(image, grid, padding_mode="border", align_corners=True) for image in images]
+    sensor = vts.Sensor("rig", 120, 160, 0.1, **STRAIGHT)
+    background, press = (sensor.rectify(image).float() for image in raw)
+    calibration = vts.Calibration.from_lights(ring_lights(), sensor, background[0])
+    depth = vts.DepthPipeline.from_calibration(calibration, mode="precise")(press).depth_mm
+    assert float(depth.max()) == pytest.approx(float(scene.depth_mm.max()), rel=0.02)
+    assert float((depth - scene.depth_mm).abs().max()) < 0.03
 
 
 @pytest.mark.parametrize(
@@ -246,3 +337,9 @@ def test_frames_of_the_mini_as_its_camera_gives_them(data, tmp_path):
     vts.write_image(tmp_path / "wide.png", torch.rand(3, 90, 160))
     with pytest.raises(ValueError, match=r"wide\.png: frame: expected 240 x 320, or raw frames of 2464 x 3280 or 480 x 640"):
         sensor.read_image(tmp_path / "wide.png")
+
+
+def test_a_recording_of_a_digit_reads_the_same_upright_and_lying(data, tmp_path):
+    sensor, file = vts.Sensor.load("digit"), data / "digit_a" / "background.png"
+    cv2.imwrite(str(tmp_path / "lying.png"), cv2.rotate(cv2.imread(str(file)), cv2.ROTATE_90_CLOCKWISE))
+    assert torch.equal(sensor.read_image(tmp_path / "lying.png"), sensor.read_image(file))

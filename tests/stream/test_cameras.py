@@ -190,3 +190,24 @@ def test_a_recording_that_does_not_fit_on_the_disk_is_an_error(tmp_path, name, s
         while recorder.read() is not None:
             pass
         recorder.close()
+
+
+@pytest.mark.parametrize("realtime", [False, True])
+def test_two_sensors_in_one_process_on_one_clock(realtime):
+    films = [[picture()] * 12 + [picture(mm)] * 6 for mm in (0.6, 1.2)]
+    alone = [[frame.output.depth_mm for frame in streams.TactileStream(Frames(film), unit())] for film in films]
+    before = time.monotonic()
+    with (
+        streams.TactileStream(Frames(films[0]), unit(), realtime=realtime) as one,
+        streams.TactileStream(Frames(films[1]), unit(), realtime=realtime) as other,
+    ):
+        pairs = list(zip(one, other))
+        stamps = [(one.started_s + a.time_s, other.started_s + b.time_s) for a, b in pairs]
+    after = time.monotonic()
+    for k, (stream, depths) in enumerate(zip((one, other), alone)):
+        assert before <= stream.started_s <= after and [stamp[k] for stamp in stamps] == sorted(stamp[k] for stamp in stamps)
+        if realtime:  # when each frame was there; which are dropped depends on the machine
+            assert all(before <= stamp[k] <= after for stamp in stamps)
+        else:
+            assert all(torch.equal(pair[k].output.depth_mm, depth) for pair, depth in zip(pairs, depths, strict=True))
+            assert float(depths[-1].max()) == pytest.approx((0.6, 1.2)[k], abs=0.06)

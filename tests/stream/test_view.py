@@ -2,9 +2,11 @@
 
 import math
 import os
+import re
 import sys
 import warnings
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -12,6 +14,7 @@ from conftest import Frames, write_film
 
 import torchvts as vts
 from torchvts import stream as streams
+from torchvts.stream.devices import found_cameras
 
 PITCH = 0.25
 
@@ -229,18 +232,64 @@ def test_rezero_in_contact_is_refused_and_the_background_stays(unit):
 
 
 def test_a_camera_is_named_by_index_path_or_device(tmp_path):
-    for number, name in ((0, "GelSight Mini R0B 2871"), (1, "GelSight Mini R0B 2871"), (2, "Integrated Camera")):
-        (tmp_path / f"video{number}").mkdir()
-        (tmp_path / f"video{number}" / "name").write_text(name + "\n")
-    assert streams.find_camera("3") == 3 and streams.find_camera("/dev/video12") == 12
-    assert streams.find_camera("gelsight mini", tmp_path) == 0 and streams.find_camera("Integrated", tmp_path) == 2
+    nodes, links = tmp_path / "sys" / "class" / "video4linux", tmp_path / "dev" / "v4l" / "by-id"
+    links.mkdir(parents=True)
+    for number, name, device in ((0, "Mini R0B 2871", "a"), (1, "Mini R0B 2871", "a"), (2, "DIGIT", "b"), (10, "DIGIT", "c")):
+        (nodes / f"video{number}").mkdir(parents=True)
+        (nodes / f"video{number}" / "name").write_text(name + "\n")
+        (tmp_path / device).mkdir(exist_ok=True)
+        (nodes / f"video{number}" / "device").symlink_to(tmp_path / device)
+    for number, serial in ((2, "D20543"), (10, "D20601")):
+        (links / f"usb-Facebook_DIGIT_{serial}-video-index0").symlink_to(f"../../video{number}")
+    assert streams.find_camera("3") == 3 and streams.find_camera("/dev/video12") == 12 and streams.find_camera("/dev/null") is None
+    assert streams.find_camera("mini r0b", tmp_path) == 0 and streams.find_camera("d20601", tmp_path) == 10
     assert streams.find_camera("video.avi", tmp_path) is None and streams.find_camera("rtsp://camera/1", tmp_path) is None
-    with pytest.raises(ValueError, match="expected the name of one camera, got 'i', which GelSight Mini R0B 2871 and Integrated"):
-        streams.find_camera("i", tmp_path)
+    two = r"2 'DIGIT' \(usb-Facebook_DIGIT_D20543-video-index0\); 10 'DIGIT' \(usb-Facebook_DIGIT_D20601-video-index0\)"
+    with pytest.raises(ValueError, match=f"expected the name of one camera, got 'DIGIT', which several have: {two}: give the"):
+        streams.find_camera("DIGIT", tmp_path)
+    assert re.fullmatch(f"cameras here: 0 'Mini R0B 2871'; {two}", found_cameras(tmp_path))
+    with pytest.raises(FileNotFoundError, match="got D20543: no such file or folder, and no such camera; cameras here: "):
+        streams.open_source("D20543")
 
 
 def test_settings_of_no_camera_are_refused(press, run_script):
     done = run_script("stream", *press, "--fps", 30)
-    assert done.returncode == 2 and "--size, --fps, --exposure: expected a camera of this machine" in done.stderr
+    assert done.returncode == 2 and "--size, --fps, --exposure, --white-balance: expected a camera of this machine" in done.stderr
     with pytest.raises(OSError, match="expected a camera with index 97"):
         streams.Camera(97, streams.CameraSettings(fps=30.0))
+
+
+class Driver:
+    """A driver that gives large frames at their rate in MJPG only, in place of OpenCV's capture: no camera is needed."""
+
+    def __init__(self, _):
+        self.values = {cv2.CAP_PROP_FPS: 30.0, cv2.CAP_PROP_AUTO_EXPOSURE: 3.0, cv2.CAP_PROP_AUTO_WB: 1.0}
+        self.values |= {cv2.CAP_PROP_WB_TEMPERATURE: 4600.0}
+
+    def isOpened(self):
+        return True
+
+    def set(self, key, value):
+        manual = self.values[cv2.CAP_PROP_AUTO_WB] == 0.0
+        if key == cv2.CAP_PROP_FPS and value > 5.0 and cv2.CAP_PROP_FOURCC not in self.values:
+            value = 5.0
+        if key != cv2.CAP_PROP_WB_TEMPERATURE or manual:
+            self.values[key] = value
+        return True
+
+    def get(self, key):
+        return self.values.get(key, 0.0)
+
+    def release(self):
+        pass
+
+
+def test_what_is_asked_of_a_camera(monkeypatch):
+    monkeypatch.setattr(cv2, "VideoCapture", Driver)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # all is taken
+        full = streams.Camera(0, streams.CameraSettings((3280, 2464), 25.0, 120.0, 5000.0))
+        slow = streams.Camera(0, streams.CameraSettings((640, 480), 5.0))
+    assert full.fps == 25.0 and full._capture.get(cv2.CAP_PROP_FOURCC) == cv2.VideoWriter.fourcc(*"MJPG")
+    assert (full._capture.get(cv2.CAP_PROP_EXPOSURE), full._capture.get(cv2.CAP_PROP_WB_TEMPERATURE)) == (120.0, 5000.0)
+    assert slow._capture.get(cv2.CAP_PROP_FOURCC) == 0.0  # uncompressed, since that is fast enough

@@ -9,6 +9,7 @@ from ..core.checks import parse_number
 from ..core.spelling import suggest
 from ..model import Calibration, Sensor, shipped_sensors
 from ..pipeline import MODES
+from ..pose.output_frame import MM_OF
 from ..skin import ContactSettings
 from ..stream import FIRST_FRAMES
 from .parser import UsageError
@@ -78,6 +79,13 @@ def contact_of(given: Sequence[str] | None) -> ContactSettings | None:
         except ValueError as error:
             raise UsageError(f"--contact: {key}: {error}") from None
     return ContactSettings(**values)
+
+
+def add_length_unit(parser: argparse._ActionsContainer) -> None:
+    """``--unit``: of clouds and poses."""
+    parser.add_argument(
+        "--unit", dest="length_unit", choices=list(MM_OF), default="mm", help="of length in clouds and poses: mm (if not given), m"
+    )
 
 
 def load_sensor(name: str) -> Sensor:

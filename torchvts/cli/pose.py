@@ -21,11 +21,11 @@ from tqdm import tqdm
 from .. import viz
 from ..core.files import count_frames, make_folder, read_frames, read_image, write_atomically
 from ..pipeline import DepthOutput, unit_pipeline
-from ..pose import contact_cloud, read_point_cloud, register_depth, register_points, write_point_cloud
+from ..pose import OutputFrame, contact_cloud, read_point_cloud, register_depth, register_points, write_point_cloud
 from ..pose.clouds import CLOUD_SUFFIXES
 from ..pose.result import Registration
 from ..stream import FrameCheck
-from .options import add_mode, add_network, add_out, load_calibration
+from .options import add_length_unit, add_mode, add_network, add_out, load_calibration
 
 USAGE = "SOURCE REFERENCE [--calibration FILE] --out FOLDER"
 
@@ -39,6 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_mode(parser, "precise")
     add_network(parser)
     parser.add_argument("--cloud", choices=["pcd", "ply", "none"], default="none", help="write both contacts, the source moved")
+    add_length_unit(parser)
     parser.add_argument("--no-pictures", action="store_true", help="no picture of both contacts")
 
 
@@ -61,10 +62,12 @@ def run(arguments: argparse.Namespace) -> int:
 def of_clouds(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """Register two clouds."""
     (source, source_normals), (target, target_normals) = (read_point_cloud(p) for p in (arguments.source, arguments.target))
+    frame = OutputFrame(arguments.length_unit)
+    source, target = frame.mm * source, frame.mm * target
     found = register_points(source, target, source_normals=source_normals, target_normals=target_normals)
     print_result(arguments.source.stem, found)
-    draw(arguments, arguments.source.stem, source, target, found)
-    return [record(arguments.source.stem, found)]
+    draw(arguments, arguments.source.stem, source, target, found, frame)
+    return [record(arguments.source.stem, found, frame)]
 
 
 def of_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
@@ -75,6 +78,7 @@ def of_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     by_lights = calibration.response is None and arguments.network is None
     pipe = unit_pipeline(calibration, arguments.mode if by_lights else "auto", arguments.network).requires_grad_(False).freeze()
     pitch, check = calibration.sensor.mm_per_pixel, FrameCheck.from_calibration(calibration)
+    written = OutputFrame(arguments.length_unit, calibration.sensor)
 
     def depth_of(image: torch.Tensor) -> DepthOutput:
         image = calibration.sensor.rectify(image[None])
@@ -100,27 +104,28 @@ def of_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
             results.append({"frame": name, "converged": False, "message": str(error)})
             continue
         last = found.T_target_source if found.converged else last
-        results.append(record(name, found))
+        results.append(record(name, found, written))
         if len(results) <= 20:
             print_result(name, found)
         if count_frames(arguments.source) == 1:
-            draw(arguments, name, contact_cloud(frame, pitch, 4000)[0], target_points, found)
+            draw(arguments, name, contact_cloud(frame, pitch, 4000)[0], target_points, found, written)
     return results
 
 
-def record(name: str, found: Registration) -> dict[str, Any]:
+def record(name: str, found: Registration, written: OutputFrame) -> dict[str, Any]:
     """A result, for pose.json."""
     return {
         "frame": name,
-        "T_target_source": found.T_target_source.tolist(),
+        "axes": written.axes,
+        "T_target_source": written.pose(found.T_target_source).tolist(),
         "rmse_mm": found.rmse_mm if math.isfinite(found.rmse_mm) else None,
         "fitness": found.fitness,
         "converged": found.converged,
         "message": found.message,
         "covariance_order": ["w_x", "w_y", "w_z", "t_x", "t_y", "t_z"],
-        "covariance": found.covariance.tolist(),
+        "covariance": written.covariance(found.covariance).tolist(),
         "ambiguous": found.ambiguous,
-        "alternatives": [T.tolist() for T in found.alternatives],
+        "alternatives": [written.pose(T).tolist() for T in found.alternatives],
     }
 
 
@@ -136,11 +141,19 @@ def print_result(name: str, found: Registration) -> None:
     print(f"{name}: {which}turned {turn:.3f} degrees in the plane, tilted {tilt:.3f}, moved ({x:.4f}, {y:.4f}, {z:.4f}) mm")
 
 
-def draw(arguments: argparse.Namespace, name: str, source: torch.Tensor, target: torch.Tensor, found: Registration) -> None:
+def draw(
+    arguments: argparse.Namespace,
+    name: str,
+    source: torch.Tensor,
+    target: torch.Tensor,
+    found: Registration,
+    written: OutputFrame,
+) -> None:
     """Draw both contacts, and write their clouds."""
     T = found.T_target_source
     if not arguments.no_pictures:
         viz.save_figure(viz.pose_figure(source, target, T, name), arguments.out / f"{name}_pose.png")
     if arguments.cloud != "none":
-        write_point_cloud(arguments.out / f"{name}_moved.{arguments.cloud}", source.double() @ T[:3, :3].T + T[:3, 3])
-        write_point_cloud(arguments.out / f"{name}_target.{arguments.cloud}", target)
+        for which, points in (("moved", source.double() @ T[:3, :3].T + T[:3, 3]), ("target", target)):
+            path = arguments.out / f"{name}_{which}.{arguments.cloud}"
+            write_point_cloud(path, written.points(points), axes=written.axes)

@@ -22,13 +22,23 @@ from ..diagnose import Finding, diagnose
 from ..model.response_field import TaughtRange
 from ..pipeline.confidence import BEYOND
 from ..stream import NOT_METRIC, read_background, read_press_images, use_calibration
-from .options import add_background_frames, add_out, add_pipeline, add_press, add_sensor, contact_of, load_calibration, load_sensor
+from .options import (
+    add_background_frames,
+    add_length_unit,
+    add_out,
+    add_pipeline,
+    add_press,
+    add_sensor,
+    contact_of,
+    load_calibration,
+    load_sensor,
+)
 from .parser import UsageError
 from .summary import SHOWN, calibrated, print_calibration
 
 PASSED = (
-    "mode", "format", "cloud", "pictures", "every", "network", "device", "background_frames", "batch", "workers", "threads",
-    "overwrite", "strict",
+    "mode", "format", "cloud", "length_unit", "pictures", "every", "network", "device", "background_frames", "batch", "workers",
+    "threads", "overwrite", "strict",
 )  # fmt: skip
 """Options that :func:`reconstruct_dataset` has under the same names."""
 
@@ -48,6 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     kinds = "npz (all), video-npz (one a video), png16, npy, none (npz)"
     parser.add_argument("--format", choices=FORMATS, default="npz", metavar="KIND", help=kinds)
     parser.add_argument("--cloud", choices=CLOUD_FORMATS, default="none", metavar="KIND", help="contact: ply, pcd, obj (surface)")
+    add_length_unit(parser)
     parser.add_argument("--pictures", action=argparse.BooleanOptionalAction, help=f"drawn for at most {PICTURES_UP_TO} frames")
     parser.add_argument("--batch", type=int, default=8, metavar="N", help="frames that a loader hands over at once (8)")
     parser.add_argument("--workers", type=int, metavar="N", help="loader processes of each rank (up to 4)")

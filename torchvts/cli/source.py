@@ -19,10 +19,11 @@ from .parser import UsageError
 
 def add_source(parser: argparse.ArgumentParser) -> None:
     """Options of the source, the unit, the camera and the pipeline."""
-    parser.add_argument("--source", required=True, help="camera (index, /dev path, name), URL, video file, or folder of images")
+    parser.add_argument("--source", required=True, help="camera (index, path, name, serial), video, folder, URL")
     parser.add_argument("--size", nargs=2, type=int, metavar=("W", "H"), help="of a camera's frames, where the driver takes it")
     parser.add_argument("--fps", type=float, metavar="F", help="of a camera, where the driver takes it")
-    parser.add_argument("--exposure", type=float, metavar="E", help="of a camera, in the driver's unit; ends automatic exposure")
+    parser.add_argument("--exposure", type=float, metavar="E", help="of a camera, driver's unit; ends automatic exposure")
+    parser.add_argument("--white-balance", type=float, metavar="K", help="of a camera, kelvin; ends automatic white balance")
     add_sensor(parser, "the first frames calibrate: ")
     parser.add_argument("--calibration", type=Path, metavar="FILE", help="what torchvts calibrate wrote, in place of --sensor")
     add_background_frames(parser)
@@ -52,15 +53,12 @@ def load_unit(arguments: argparse.Namespace) -> Sensor | Calibration:
 def open_stream(arguments: argparse.Namespace, unit: Sensor | Calibration, presses: Sequence[Press] = ()) -> TactileStream:
     """The stream of the source; says what it found."""
     started = time.perf_counter()
-    settings = CameraSettings(arguments.size and tuple(arguments.size), arguments.fps, arguments.exposure)
+    settings = CameraSettings(arguments.size and tuple(arguments.size), arguments.fps, arguments.exposure, arguments.white_balance)
     camera = find_camera(arguments.source)
     if settings.given and camera is None:
-        raise UsageError(f"--size, --fps, --exposure: expected a camera of this machine, got {arguments.source!r}")
-    source: str | int | Camera = arguments.source
-    if camera is not None:
-        source = Camera(camera, settings) if settings.given else camera
+        raise UsageError(f"--size, --fps, --exposure, --white-balance: expected a camera of this machine, got {arguments.source!r}")
     stream = TactileStream(
-        source,
+        arguments.source if camera is None or not settings.given else Camera(camera, settings),
         unit,
         mode=arguments.mode,
         background_frames=arguments.background_frames,

@@ -1,7 +1,7 @@
 """Pose of a touched object in every frame of a camera or a recording, from where it first touches.
 
 The first frames must be without contact. The reference is the first frame with a contact of --least-mm2, or the image --reference.
-Writes poses.csv (a pose a frame, mm, standard deviations in mm and degrees, what is unknown, why it was lost), summary.json and a
+Writes poses.csv (a pose a frame, standard deviations in mm and degrees, what is unknown, why it was lost), summary.json and a
 video with the axes of the reference on the image. --view shows surface and axes in 3D while they come, --save FILE.rrd records
 that. Ctrl-C ends it and finishes the files. Exit status 1 where the object was lost or a frame was left out.
 
@@ -28,13 +28,13 @@ from torch import Tensor
 
 from ..core.checks import check_positive
 from ..core.files import check_folder, make_folder, read_image, write_atomically
-from ..pose import PoseTracker, TrackedPose
+from ..pose import OutputFrame, PoseTracker, TrackedPose
 from ..pose.follow import TRUSTED_DEG, TRUSTED_MM
 from ..stream import NOT_METRIC, LiveView, Overlay, TactileFrame, TactileStream, VideoFile, has_screen
 from ..stream.files import summary_of
 from ..stream.sources import Pixels
 from ..stream.view import AXIS_COLOURS
-from .options import add_out
+from .options import add_length_unit, add_out
 from .parser import UsageError
 from .source import add_source, add_video, load_unit, open_stream, play
 
@@ -51,10 +51,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
     add_source(parser)
     add_out(parser, "for poses.csv, summary.json and the video track.webm")
+    add_length_unit(parser)
     parser.add_argument("--reference", type=Path, metavar="IMAGE", help="of the contact; if not given, the first large one")
     parser.add_argument("--least-mm2", type=float, default=4.0, metavar="AREA", help="contact of the first reference, mm^2 (4)")
     add_video(parser)
-    parser.add_argument("--view", action="store_true", help="show surface and axes in 3D while they come; needs a screen")
+    parser.add_argument("--view", action="store_true", help="show surface and axes in 3D; needs a screen")
     parser.add_argument("--save", type=Path, metavar="FILE.rrd", help="record what --view shows, with or without it")
 
 
@@ -78,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
         view = None
         if arguments.view or arguments.save is not None:
             view = stack.enter_context(LiveView(_pitch(stream), stream.metric, save=arguments.save, viewer=arguments.view))
-        tracking = _Tracking(stream, video, view, tracker, arguments.least_mm2)
+        tracking = _Tracking(stream, video, view, tracker, arguments.least_mm2, arguments.length_unit)
         play(stream, tracking.add)
         if tracking.tracker is None:
             raise ValueError("source: expected a contact to track, got none: see --least-mm2")
@@ -107,7 +108,9 @@ class _Tracking:
         view: LiveView | None,
         tracker: PoseTracker | None,
         least_mm2: float,
+        length_unit: str,
     ) -> None:
+        self.frame = OutputFrame(length_unit, stream.calibration.sensor)
         self.video, self.view, self.tracker, self.least_mm2, self.pitch = video, view, tracker, least_mm2, _pitch(stream)
         self.overlay = Overlay(stream.metric, self.pitch)
         self.reference: int | None = None
@@ -117,7 +120,7 @@ class _Tracking:
         found: TrackedPose | None = None
         if self.tracker is not None:
             found = self.tracker(frame.output)
-            self.rows.append(record(frame, found))
+            self.rows.append(record(frame, found, self.frame))
         elif float(frame.output.contact.sum()) * self.pitch**2 >= self.least_mm2:
             self.tracker = PoseTracker(frame.output, self.pitch)
             self.reference = frame.number
@@ -137,14 +140,14 @@ class _Tracking:
         return self.overlay(frame._replace(image=image), [found.message])
 
 
-def record(frame: TactileFrame, found: TrackedPose) -> dict[str, object]:
-    """A row of poses.csv: T_frame_reference, row by row, mm, and what speaks for and against it.
+def record(frame: TactileFrame, found: TrackedPose, written: OutputFrame) -> dict[str, object]:
+    """A row of poses.csv: T_frame_reference, row by row, and what speaks for and against it.
 
-    Standard deviations are those of the shifts T03, T13, T23 and of small turns about the frame's x, y, z.
+    Standard deviations are those of the shifts T03, T13, T23, in mm, and of small turns about x, y, z.
     """
-    pose = [f"{value:.9g}" for value in found.T_target_source[:3].flatten().tolist()]
-    std_of = found.covariance.diagonal().sqrt()
-    std = [f"{value:.4g}" for value in (*std_of[3:].tolist(), *torch.rad2deg(std_of[:3]).tolist())]
+    pose = [f"{value:.9g}" for value in written.pose(found.T_target_source)[:3].flatten().tolist()]
+    std_of = written.covariance(found.covariance).diagonal().sqrt()
+    std = [f"{value:.4g}" for value in (*(written.mm * std_of[3:]).tolist(), *torch.rad2deg(std_of[:3]).tolist())]
     named = "; ".join(found.ambiguous)
     quality = [int(found.converged), found.lost, named, len(found.alternatives), *std, found.keyframe]
     values = [frame.number, f"{frame.time_s:.6f}", *pose, *quality, f"{found.drift_deg:.4g}", f"{found.drift_mm:.4g}"]
@@ -198,6 +201,7 @@ def summary(tracking: _Tracking, stream: TactileStream) -> dict[str, Any]:
     closures = [] if tracking.tracker is None else tracking.tracker.closures
     return {
         **summary_of(stream, len(rows)),
+        "poses": tracking.frame.axes,
         "reference_frame": tracking.reference,  # None where --reference gave an image
         "lost": len(lost),
         "lost_because": dict(Counter(str(row["lost"]) for row in lost).most_common()),

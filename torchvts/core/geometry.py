@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from .checks import check_batch, check_float_tensor, check_positive, check_same_size, check_tensor
+from .checks import check_batch, check_float_tensor, check_positive, check_same_size, check_shape, check_tensor
 
 MAX_SLOPE = 10.0
 """Largest |dz/dx|, |dz/dy| that ``gradient_from_normal`` returns, mm per mm: 84.3 degrees from flat."""
@@ -173,6 +173,30 @@ def depth_to_points(depth_mm: Tensor, mm_per_pixel: float, contact: Tensor | Non
     keep = _one_frame("contact", contact)
     check_same_size("contact", keep, "depth_mm", z.shape[0], z.shape[1])
     return points[keep.bool()]
+
+
+def check_rigid(name: str, T: Tensor) -> Tensor:
+    """Return ``T`` as (4, 4) float64.
+
+    Raises:
+        ValueError: no rigid motion.
+    """
+    check_float_tensor(name, T)
+    check_shape(name, T, (4, 4))
+    T = T.detach().cpu().double()
+    turn, last = T[:3, :3], torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    wrong = ""
+    if not bool(torch.isfinite(T).all()):
+        wrong = "values that are not finite"
+    elif float((T[3] - last).abs().max()) > 1e-6:
+        wrong = f"the last row {T[3].tolist()}, not 0, 0, 0, 1: transposed?"
+    elif (off := float((turn @ turn.T - torch.eye(3, dtype=torch.float64)).abs().max())) > 1e-3:
+        wrong = f"columns that are not of length 1 at right angles, by {off:.2g}: a scale, or another unit?"
+    elif float(torch.linalg.det(turn)) < 0.0:
+        wrong = "a mirror image, determinant -1: an axis that points the other way?"
+    if wrong:
+        raise ValueError(f"{name}: expected a rigid motion (4, 4), a rotation and a shift in mm, got {wrong}")
+    return T
 
 
 def _one_frame(name: str, tensor: Tensor) -> Tensor:

@@ -31,6 +31,7 @@ from ..core.checks import check_choice, check_integer, check_path, check_sequenc
 from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, count_frames
 from ..model import Calibration
 from ..pipeline import MODES, DepthOutput, unit_pipeline
+from ..pose.output_frame import MM_OF
 from ..skin import ContactSettings
 from ..stream import FIRST_FRAMES, Recording, check_device, use_calibration, video_codec
 from .items import Item, Source, list_items
@@ -71,6 +72,7 @@ def reconstruct_dataset(
     mode: str = "auto",
     format: str = "npz",
     cloud: str = "none",
+    length_unit: str = "mm",
     pictures: bool | None = None,
     every: int = 1,
     network: str | Path | None = None,
@@ -99,6 +101,7 @@ def reconstruct_dataset(
         format: "npz" (depth, normals, gradient, masks, units; :func:`torchvts.read_result`), "video-npz" (the same, one file a
             video), "png16" (depth in 16 bits), "npy" (depth) or "none".
         cloud: contact as points, "ply" or "pcd", as a surface, "obj", or "none".
+        length_unit: of the clouds, "mm" or "m"; they have the axes of the robot where the sensor has ``sensor_to_robot``.
         pictures: whether to draw each frame; None draws where there are at most ``PICTURES_UP_TO``.
         every: take each N-th frame of a video, each N-th image of a folder.
         network: gs_sdk's ``nnmodel.pth`` or what ``torchvts train`` wrote, in place of the calibration's model.
@@ -117,7 +120,12 @@ def reconstruct_dataset(
         RuntimeError: another process failed, or another run writes there.
     """
     source, out = _source(source), Path(out)
-    for name, value, allowed in (("mode", mode, MODES), ("format", format, tuple(FORMATS)), ("cloud", cloud, CLOUD_FORMATS)):
+    for name, value, allowed in (
+        ("mode", mode, MODES),
+        ("format", format, tuple(FORMATS)),
+        ("cloud", cloud, CLOUD_FORMATS),
+        ("length_unit", length_unit, tuple(MM_OF)),
+    ):
         check_choice(name, value, allowed)
     for name, number, least in (
         ("batch", batch, 1),
@@ -135,7 +143,7 @@ def reconstruct_dataset(
     _check_source(source, out)
     settings = Settings(
         _digest(calibration), _digest(network), _names(source), mode, format, cloud, pictures, every, device, threads,
-        __version__, str(torch.__version__), background_frames, None if contact is None else asdict(contact),
+        __version__, str(torch.__version__), background_frames, None if contact is None else asdict(contact), length_unit,
     )  # fmt: skip
     before = torch.get_num_threads()
     torch.set_num_threads(threads)

@@ -55,6 +55,7 @@ class Settings:
     torch: str
     background_frames: int = FIRST_FRAMES
     contact: dict[str, float] | None = None
+    length_unit: str = "mm"
 
 
 def begin(source: Source, out: Path, settings: Settings, overwrite: bool) -> Settings:

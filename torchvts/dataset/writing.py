@@ -13,6 +13,8 @@ from ..core.geometry import depth_to_points
 from ..core.results import UNITS, write_result
 from ..model import Sensor
 from ..pipeline import DepthOutput
+from ..pose import OutputFrame, write_point_cloud
+from ..pose.surface_files import write_obj
 from .loading import Frame
 from .records import VIDEO_FORMAT, Records
 
@@ -22,6 +24,7 @@ class Writer:
 
     def __init__(self, records: Records, sensor: Sensor, name: str, metric: bool) -> None:
         self.records, self.settings, self.sensor, self.name, self.metric = records, records.settings, sensor, name, metric
+        self.frame = OutputFrame(records.settings.length_unit, sensor)
 
     def write(self, frame: Frame, image: Tensor, result: DepthOutput) -> None:
         """All files of a frame: its depth, its contact, its picture."""
@@ -47,15 +50,13 @@ class Writer:
 
     def _write_contact(self, path: Path, result: DepthOutput) -> None:
         """The contact as points or as a surface."""
-        from ..pose import write_point_cloud
-        from ..pose.surface_files import write_obj
-
         pitch = self.sensor.mm_per_pixel
         if path.suffix == ".obj":
-            write_obj(path, result.depth_mm, result.normal, result.contact, pitch)
+            write_obj(path, result.depth_mm, result.normal, result.contact, pitch, self.frame)
             return
         normals = result.normal[0].permute(1, 2, 0)[result.contact[0, 0]] * torch.tensor([1.0, -1.0, 1.0])  # y up
-        write_point_cloud(path, depth_to_points(result.depth_mm, pitch, result.contact), normals)
+        points = self.frame.points(depth_to_points(result.depth_mm, pitch, result.contact))
+        write_point_cloud(path, points, self.frame.directions(normals), self.frame.axes)
 
     def write_summary(self, rows: int, failed: int) -> None:
         """summary.json: what the files are, so that they can be read without this package."""
@@ -72,6 +73,7 @@ class Writer:
             "mode": settings.mode,
             "format": settings.format,
             "every": settings.every,
+            "clouds": self.frame.axes,
             "depth_png": f"depth_mm = (value - {DEPTH_PNG_ZERO}) * {DEPTH_PNG_STEP_MM}",
             "units": UNITS,
             "torchvts": __version__,

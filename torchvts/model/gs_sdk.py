@@ -18,8 +18,9 @@ from torch import Tensor
 
 from ..core.checks import brief, check_batch, check_float_tensor, check_path, check_positive, check_tensor, parse_number
 from ..core.files import image_files, png_size, read_image, rgb_from_bgr
+from ..core.strict_yaml import read_yaml
 from .gs_sdk_sensor import values_from_gs_sdk
-from .sensor import Sensor, read_yaml
+from .sensor import Sensor
 
 CATALOG_COLUMNS = ("experiment_reldir", "diameter(mm)")
 LABEL_COLUMNS = ("experiment_reldir", "diameter_mm", "center_x_px", "center_y_px", "contact_radius_px")

@@ -2,29 +2,33 @@
 
 import dataclasses
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import torch
 import yaml
-from torch import Tensor, nn
+from torch import Tensor
 
 from ..core.checks import (
     brief,
     check_batch,
     check_image_size,
+    check_integer,
     check_least,
     check_numbers,
     check_path,
     check_positive,
     check_record,
+    check_switch,
     from_dict,
 )
 from ..core.files import read_image, write_atomically
+from ..core.geometry import check_rigid
 from ..core.spelling import suggest
+from ..core.strict_yaml import read_yaml
+from .camera_view import CameraView, check_corners, check_lens, check_raw_sizes
 from .gs_sdk_sensor import is_gs_sdk_sensor, values_from_gs_sdk
 from .response_field import SensorPrior
 
@@ -44,14 +48,22 @@ class Sensor:
         gamma: response of the camera, value = light^(1 / gamma); None leaves it open: calibration chooses it, all else uses 1.
         blur_px: standard deviation of a Gaussian blur before normals, pixels; 0 for none.
         light_position_mm: (3, 3), rows R, G, B, if the positions of the lights are known.
+        camera_matrix: (3, 3), OpenCV's, in pixels of raw frames, out of which the distortion of the lens is taken first. Raw frames
+            are all where ``roi_px`` or ``corners_px`` are given, else those of ``raw_size_px``.
+        distortion_coefficients: OpenCV's, 4, 5, 8, 12 or 14 numbers k1, k2, p1, p2, k3, ...
+        turn_deg: 0, 90, 180 or 270, by which raw frames are then turned, anticlockwise. Places are those in turned frames.
+        mirror: whether raw frames are then mirrored left to right.
         roi_px: (left, top, width, height) of the gel in the camera's frame, of the sensor's aspect within 2 %, resized to its size.
         corners_px: (4, 2), x and y of the gel's corners in the camera's frame: top left, top right, bottom right, bottom
             left, rectified to the sensor's size. Either this or ``roi_px``.
-        raw_size_px: (N, 2), (height, width) of the frames that the camera gives, if images are usually stored cropped: a frame of
-            such a size is cropped by ``raw_crop``, then resized to the sensor's size; one of the sensor's size is kept as it is.
+        raw_size_px: (N, 2), (height, width) of the frames that the camera gives, if images are usually stored upright or cropped:
+            a frame of such a size is turned, cropped by ``raw_crop``, and resized to the sensor's size; one of the sensor's size is
+            kept as it is. Where frames are turned, mirrored or straightened, the sensor's size before that if nothing else is said.
         raw_crop: share of a raw frame's height and width to cut off each side, in [0, 0.5).
         markers: whether the skin has printed markers, which are filled in every frame; None: where the background shows a regular
             pattern of them.
+        sensor_to_robot: (4, 4), rows of the rigid motion, mm, that takes points of the sensor (x right, y up, z towards the camera,
+            origin on the skin in the middle of the image) to a frame of the robot, in which commands then write clouds and poses.
         prior: response that all units of this type share, fitted to presses on one.
     Raises:
         TypeError, ValueError: name the argument, what was expected and what was given.
@@ -67,11 +79,16 @@ class Sensor:
     gamma: float | None = None
     blur_px: float = 0.0
     light_position_mm: tuple[tuple[float, float, float], ...] | None = None
+    camera_matrix: tuple[tuple[float, ...], ...] | None = None
+    distortion_coefficients: tuple[float, ...] | None = None
+    turn_deg: int = 0
+    mirror: bool = False
     roi_px: tuple[int, int, int, int] | None = None
     corners_px: tuple[tuple[float, float], ...] | None = None
     raw_size_px: tuple[tuple[int, int], ...] = ()
     raw_crop: float = 0.0
     markers: bool | None = None
+    sensor_to_robot: tuple[tuple[float, ...], ...] | None = None
     prior: SensorPrior | None = None
 
     def __post_init__(self) -> None:
@@ -91,6 +108,21 @@ class Sensor:
             if min(numbers[2::3]) <= 0:
                 raise ValueError(f"light_position_mm: expected lights above the skin (z > 0), got {self.light_position_mm!r}")
             self._set("light_position_mm", tuple(numbers[i : i + 3] for i in (0, 3, 6)))
+        self._check_view()
+        if self.markers is not None and not isinstance(self.markers, bool):
+            raise TypeError(f"markers: expected true, false or null, got {brief(self.markers)}")
+        if self.sensor_to_robot is not None:
+            numbers = check_numbers("sensor_to_robot", self.sensor_to_robot, (4, 4))
+            check_rigid("sensor_to_robot", torch.tensor(numbers, dtype=torch.float64).reshape(4, 4))
+            self._set("sensor_to_robot", tuple(numbers[i : i + 4] for i in (0, 4, 8, 12)))
+        prior: object = self.prior
+        if isinstance(prior, dict):  # as YAML gives it
+            self._set("prior", SensorPrior.from_dict(prior, "prior"))
+        elif prior is not None and not isinstance(prior, SensorPrior):
+            raise TypeError(f"prior: expected a SensorPrior, got {type(prior).__name__}")
+
+    def _check_view(self) -> None:
+        """Check what leads from raw frames to the sensor's images."""
         if self.roi_px is not None and self.corners_px is not None:
             raise ValueError("roi_px, corners_px: expected one of them, got both")
         if self.roi_px is not None:
@@ -99,31 +131,28 @@ class Sensor:
                 raise ValueError(f"roi_px: expected whole numbers (left, top, width, height) in the frame, got {self.roi_px!r}")
             self._set("roi_px", tuple(int(v) for v in roi))
         if self.corners_px is not None:
-            numbers = check_numbers("corners_px", self.corners_px, (4, 2))
-            corners = tuple(numbers[i : i + 2] for i in (0, 2, 4, 6))
-            if not _convex_clockwise(corners):
-                raise ValueError(
-                    "corners_px: expected a convex quadrilateral in the order top left, top right, bottom right, "
-                    f"bottom left, got {self.corners_px!r}"
-                )
-            self._set("corners_px", corners)
-        self._set("raw_size_px", _raw_sizes(self.raw_size_px))
+            self._set("corners_px", check_corners(self.corners_px))
+        if check_integer("turn_deg", self.turn_deg, 0, 270) % 90:
+            raise ValueError(f"turn_deg: expected 0, 90, 180 or 270, anticlockwise, got {self.turn_deg}")
+        check_switch("mirror", self.mirror)
+        self._set("raw_size_px", check_raw_sizes(self.raw_size_px))
+        if self.camera_matrix is not None or self.distortion_coefficients is not None:
+            matrix, coefficients = check_lens(self.camera_matrix, self.distortion_coefficients)
+            self._set("camera_matrix", matrix)
+            self._set("distortion_coefficients", coefficients)
+            if len(self.raw_size_px) > 1:
+                raise ValueError(f"raw_size_px: expected one size, that of camera_matrix, got {self.raw_size_px}")
         self._set("raw_crop", check_least("raw_crop", self.raw_crop, 0.0, 0.49))
         if self.raw_size_px and (self.roi_px is not None or self.corners_px is not None):
             raise ValueError("raw_size_px: expected none beside roi_px or corners_px, which say where the gel lies in raw frames")
+        if self._moved and not (self.raw_size_px or self.roi_px or self.corners_px):
+            self._set("raw_size_px", ((self.width, self.height) if self.turn_deg % 180 else (self.height, self.width),))
         self._check_aspects()
-        if self.markers is not None and not isinstance(self.markers, bool):
-            raise TypeError(f"markers: expected true, false or null, got {brief(self.markers)}")
-        prior: object = self.prior
-        if isinstance(prior, dict):  # as YAML gives it
-            self._set("prior", SensorPrior.from_dict(prior, "prior"))
-        elif prior is not None and not isinstance(prior, SensorPrior):
-            raise TypeError(f"prior: expected a SensorPrior, got {type(prior).__name__}")
 
     def _check_aspects(self) -> None:
         """Raise where images would be stretched: the pitch is the same along x and y."""
         taken = [("roi_px", self.roi_px[2:], "a region")] if self.roi_px is not None else []
-        taken += [("raw_size_px", size[::-1], "frames") for size in self.raw_size_px]
+        taken += [("raw_size_px", size if self.turn_deg % 180 else size[::-1], "frames") for size in self.raw_size_px]
         for name, (across, down), what in taken:
             aspect, own = across / down, self.width / self.height
             if abs(math.log(aspect / own)) > MOST_STRETCHED:
@@ -149,7 +178,8 @@ class Sensor:
     def resized(self, height: int, width: int) -> "Sensor":
         """The same sensor with other pixels: field of view, lights and response stay; pitch and blur are scaled.
 
-        Frames of the new size are taken as images that are cropped already, also where the camera gives raw frames of that size.
+        Frames of the new size are taken as images that are cropped already, also where the camera gives raw frames of that size,
+        unless these must be turned, mirrored or straightened.
 
         Args:
             height: new number of rows.
@@ -172,7 +202,7 @@ class Sensor:
             response = dataclasses.replace(prior.response, blur_px=prior.response.blur_px * scale_x)
             prior = dataclasses.replace(prior, response=response)
         pitch, blur_px = self.mm_per_pixel / scale_x, self.blur_px * scale_x
-        raw = tuple(size for size in self.raw_size_px if size != (height, width))
+        raw = tuple(size for size in self.raw_size_px if size != (height, width) or self._moved)
         changes: dict[str, Any] = {"mm_per_pixel": pitch, "blur_px": blur_px, "prior": prior, "raw_size_px": raw}
         return dataclasses.replace(self, height=height, width=width, **changes)
 
@@ -181,7 +211,7 @@ class Sensor:
         return dataclasses.replace(self, prior=None)
 
     def rectify(self, frame: Tensor) -> Tensor:
-        """Cut the sensor's images out of camera frames: by corners, a region of interest, the crop of raw frames, or not at all.
+        """Make the sensor's images of camera frames: turned, mirrored, cut by corners, region or crop, and resized; or not at all.
 
         Args:
             frame: (B, 3, H, W).
@@ -189,36 +219,53 @@ class Sensor:
             (B, 3, height, width).
         Raises:
             ValueError: the frame does not contain the region, or has a size that is neither the sensor's nor that of raw frames.
+        Example:
+            >>> import torch
+            >>> Sensor.load("digit").rectify(torch.zeros(1, 3, 240, 320)).shape  # the camera lies
+            torch.Size([1, 3, 320, 240])
         """
         check_batch("frame", frame, 3)
-        size = (self.height, self.width)
-        height, width = frame.shape[2], frame.shape[3]
-        if self.corners_px is not None:
-            corners = torch.tensor(self.corners_px, dtype=frame.dtype, device=frame.device)[None]
-            if bool((corners < -0.5).any()) or bool((corners[..., 0] > width).any()) or bool((corners[..., 1] > height).any()):
-                raise ValueError(f"frame: {height} x {width} does not contain corners_px {self.corners_px} of sensor '{self.name}'")
-            grid = _sampling_grid(self.corners_px, size, (height, width), frame.dtype).to(frame.device)
-            grid = grid.expand(frame.shape[0], -1, -1, -1)
-            return nn.functional.grid_sample(frame, grid, mode="bilinear", padding_mode="zeros", align_corners=True)
-        if self.roi_px is not None:
-            left, top, roi_width, roi_height = self.roi_px
-            if left + roi_width > width or top + roi_height > height:
-                raise ValueError(f"frame: {height} x {width} does not contain roi_px {self.roi_px} of sensor '{self.name}'")
-            frame = frame[:, :, top : top + roi_height, left : left + roi_width]
-            return frame if frame.shape[2:] == size else _resized(frame, size)
-        if (height, width) in self.raw_size_px:
-            top, left = int(self.raw_crop * height), int(self.raw_crop * width)
-            return _resized(frame[:, :, top : height - top, left : width - left], size)
-        if (height, width) != size:
-            raw = " or ".join(f"{rows} x {columns}" for rows, columns in self.raw_size_px)
-            cause = f"resize it, or load the sensor with height={height}, width={width}"
-            if abs(height * self.width / (width * self.height) - 1.0) > 0.01:
-                cause = "another aspect ratio, so another sensor, crop or mode of the camera"
-            raise ValueError(
-                f"frame: expected {self.height} x {self.width}{raw and f', or raw frames of {raw},'} for sensor '{self.name}', "
-                f"got {height} x {width}: {cause}"
-            )
+        size = (frame.shape[2], frame.shape[3])
+        if self.roi_px is not None or self.corners_px is not None or size in self.raw_size_px:
+            return self._view(frame)
+        if size != (self.height, self.width):
+            raise ValueError(self._misfit(*size))
         return frame
+
+    @property
+    def _moved(self) -> bool:
+        """Whether raw frames differ from the sensor's images by more than size and crop."""
+        return self.turn_deg != 0 or self.mirror or self.camera_matrix is not None
+
+    @property
+    def _view(self) -> CameraView:
+        size = (self.height, self.width)
+        return CameraView(
+            self.name,
+            size,
+            self.turn_deg,
+            self.mirror,
+            self.roi_px,
+            self.corners_px,
+            self.raw_crop,
+            self.camera_matrix,
+            self.distortion_coefficients,
+        )
+
+    def _misfit(self, height: int, width: int) -> str:
+        """Why a frame of another size does not fit, and what would make it fit."""
+        own = self.width / self.height
+        cause = "another aspect ratio, so another sensor, crop or mode of the camera"
+        if abs(width / height / own - 1.0) <= 0.01:
+            cause = f"resize it, or load the sensor with height={height}, width={width}"
+        elif abs(height / width / own - 1.0) <= 0.01:
+            turn = f"turn_deg: {self.turn_deg}" if self.turn_deg % 180 else "turn_deg: 90 (or 270)"
+            cause = f"its camera lies: the sensor file needs {turn}, and raw_size_px with [{height}, {width}]"
+        raw = " or ".join(f"{rows} x {columns}" for rows, columns in self.raw_size_px)
+        return (
+            f"frame: expected {self.height} x {self.width}{raw and f', or raw frames of {raw},'} for sensor '{self.name}', "
+            f"got {height} x {width}: {cause}"
+        )
 
     def read_image(self, path: str | Path) -> Tensor:
         """Read an image file and rectify it: (3, height, width) in [0, 1], R, G, B.
@@ -313,88 +360,7 @@ def _find(source: str | Path) -> Path:
     )
 
 
-MOST_YAML_BYTES = 2**17
-"""Limit for sensor files, which have some kilobytes."""
-
-
-class _StrictLoader(yaml.SafeLoader):
-    """Safe YAML that refuses duplicate keys, and aliases, with which a few lines can expand to gigabytes."""
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        if self.check_event(yaml.events.AliasEvent):
-            mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
-            raise yaml.composer.ComposerError(None, None, "an alias (*): write the value itself", mark)
-        return super().compose_node(parent, index)
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        seen: set[str] = set()
-        for key, _ in node.value:
-            name = repr(self.construct_object(key, deep=True))
-            if name in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"key {name}: given twice", node.start_mark)
-            seen.add(name)
-        return super().construct_mapping(node, deep)
-
-
-def read_yaml(path: Path) -> Any:
-    """The content of a YAML file, read safely.
-
-    Raises:
-        ValueError: too large, or not YAML.
-    """
-    if path.stat().st_size > MOST_YAML_BYTES:
-        raise ValueError(
-            f"{path}: expected a file of at most {MOST_YAML_BYTES} bytes, got {path.stat().st_size}: not a sensor file"
-        )
-    try:
-        return yaml.load(path.read_text(encoding="utf-8"), Loader=_StrictLoader)  # a SafeLoader
-    except (yaml.YAMLError, ValueError, RecursionError, AttributeError, TypeError) as error:
-        raise ValueError(f"{path}: not a YAML file: {error}") from error
-
-
 def _plain(value: Any) -> Any:
     if isinstance(value, SensorPrior):
         return value.to_dict()
     return [_plain(item) for item in value] if isinstance(value, tuple) else value
-
-
-def _raw_sizes(value: object) -> tuple[tuple[int, int], ...]:
-    if not isinstance(value, list | tuple):
-        raise TypeError(f"raw_size_px: expected sizes [[height, width], ...] of raw frames, got {brief(value)}")
-    numbers = check_numbers("raw_size_px", value, (len(value), 2)) if value else ()
-    if any(v != int(v) or v < 8 for v in numbers):
-        raise ValueError(f"raw_size_px: expected whole numbers (height, width) of at least 8, got {value!r}")
-    return tuple((int(numbers[k]), int(numbers[k + 1])) for k in range(0, len(numbers), 2))
-
-
-@lru_cache(maxsize=16)
-def _sampling_grid(
-    corners_px: tuple[tuple[float, float], ...], size: tuple[int, int], frame_size: tuple[int, int], dtype: torch.dtype
-) -> Tensor:
-    """Where each pixel of an image of ``size`` lies in frames of ``frame_size``, (1, height, width, 2), from -1 to 1."""
-    (height, width), (rows, columns) = size, frame_size
-    with torch.inference_mode(False):
-        outline = ((0.0, 0.0), (width - 1.0, 0.0), (width - 1.0, height - 1.0), (0.0, height - 1.0))
-        image, frame = (torch.tensor([points], dtype=torch.float64) for points in (outline, corners_px))
-        import kornia  # takes 0.3 to 0.5 s, and frames of the calibrated size do without
-
-        to_frame = kornia.geometry.get_perspective_transform(image, frame)[0]
-        x = torch.arange(width, dtype=torch.float64).expand(height, -1)
-        y = torch.arange(height, dtype=torch.float64)[:, None].expand(-1, width)
-        place = torch.stack((x, y, torch.ones_like(x)), 2) @ to_frame.T
-        place = place[..., :2] / place[..., 2:]
-        return (2.0 * place / torch.tensor([columns - 1.0, rows - 1.0], dtype=torch.float64) - 1.0)[None].to(dtype)
-
-
-def _resized(frame: Tensor, size: tuple[int, int]) -> Tensor:
-    """Frames (B, 3, H, W) at another size, smoothed where they become smaller."""
-    resized = torch.nn.functional.interpolate(frame, size, mode="bilinear", align_corners=False, antialias=True)
-    return resized.clamp(0.0, 1.0)
-
-
-def _convex_clockwise(corners: tuple[tuple[float, ...], ...]) -> bool:
-    def turn(k: int) -> float:
-        (x0, y0), (x1, y1), (x2, y2) = (corners[(k + i) % 4] for i in range(3))
-        return (x1 - x0) * (y2 - y1) - (y1 - y0) * (x2 - x1)
-
-    return all(turn(k) > 0 for k in range(4))  # y points down, so clockwise on the screen is a positive turn

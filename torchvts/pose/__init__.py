@@ -2,11 +2,13 @@
 
 from .clouds import contact_cloud, read_point_cloud, write_point_cloud
 from .direct import register_depth
+from .output_frame import OutputFrame
 from .points import register_points
 from .result import Registration
 from .tracker import PoseTracker, TrackedPose
 
 __all__ = [
+    "OutputFrame",
     "PoseTracker",
     "Registration",
     "TrackedPose",

@@ -15,6 +15,7 @@ from torch.nn.functional import avg_pool2d
 from ..core.checks import check_integer, check_path, check_positive, check_tensor
 from ..core.geometry import depth_to_points
 from . import read_cloud
+from .output_frame import SENSOR_AXES
 from .relief import DepthFrame, contact_of, sure_contact
 from .surface_files import write_pcd, write_ply
 
@@ -82,21 +83,25 @@ def voxel_first(points: Tensor, size: float) -> Tensor:
     return torch.from_numpy(np.sort(np.unique(code.numpy(), return_index=True)[1]))
 
 
-def write_point_cloud(path: str | Path, points: Tensor, normals: Tensor | None = None) -> None:
+def write_point_cloud(path: str | Path, points: Tensor, normals: Tensor | None = None, axes: str = SENSOR_AXES) -> None:
     """Write a point cloud as .pcd or .ply, whole or not at all.
 
     Args:
         path: the file.
-        points: (N, 3), mm, right-handed (see :func:`torchvts.depth_to_points`).
+        points: (N, 3), in general mm, right-handed (see :func:`torchvts.depth_to_points`).
         normals: (N, 3), or None.
+        axes: unit and axes of the points in words, one line, which a .ply says.
     Raises:
         ValueError: wrong shape, no points, values not finite, or another suffix.
     """
     path = check_path("path", path)
     if path.suffix.lower() not in CLOUD_SUFFIXES:
         raise ValueError(f"{path}: expected a name ending in {' or '.join(CLOUD_SUFFIXES)}, got {path.suffix!r}")
-    write = write_ply if path.suffix.lower() == ".ply" else write_pcd
-    write(path, _array("points", points, None), None if normals is None else _array("normals", normals, len(points)))
+    places, directions = _array("points", points, None), None if normals is None else _array("normals", normals, len(points))
+    if path.suffix.lower() == ".ply":
+        write_ply(path, places, directions, axes)
+    else:
+        write_pcd(path, places, directions)
 
 
 def read_point_cloud(path: str | Path) -> tuple[Tensor, Tensor | None]:

@@ -5,7 +5,8 @@ import math
 import torch
 from torch import Tensor
 
-from ..core.checks import check_float_tensor, check_least, check_shape
+from ..core.checks import check_least
+from ..core.geometry import check_rigid
 from .alignment import Fit, agrees_enough, distinct, equally_good, is_trusted, rank, refine, score_poses
 from .ambiguity import UNKNOWN_VARIANCE, Unknown, find_unknown, pose_covariance, turned_otherwise
 from .relief import DepthFrame, Levels, levels
@@ -161,27 +162,3 @@ def _message(fit: Fit, names: list[str], others: int) -> str:
     if names:
         agreement += f"; the surface slides on itself: {', '.join(names)} unknown"
     return agreement + (f"; {others} more poses fit as well: the object is symmetric" if others else "")
-
-
-def check_rigid(name: str, T: Tensor) -> Tensor:
-    """Return ``T`` as (4, 4) float64.
-
-    Raises:
-        ValueError: no rigid motion.
-    """
-    check_float_tensor(name, T)
-    check_shape(name, T, (4, 4))
-    T = T.detach().cpu().double()
-    turn, last = T[:3, :3], torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-    wrong = ""
-    if not bool(torch.isfinite(T).all()):
-        wrong = "values that are not finite"
-    elif float((T[3] - last).abs().max()) > 1e-6:
-        wrong = f"the last row {T[3].tolist()}, not 0, 0, 0, 1: transposed?"
-    elif (off := float((turn @ turn.T - torch.eye(3, dtype=torch.float64)).abs().max())) > 1e-3:
-        wrong = f"columns that are not of length 1 at right angles, by {off:.2g}: a scale, or another unit?"
-    elif float(torch.linalg.det(turn)) < 0.0:
-        wrong = "a mirror image, determinant -1: an axis that points the other way?"
-    if wrong:
-        raise ValueError(f"{name}: expected a rigid motion (4, 4), a rotation and a shift in mm, got {wrong}")
-    return T

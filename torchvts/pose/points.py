@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from ..core.checks import check_float_tensor, check_tensor
-from .direct import check_rigid
+from ..core.geometry import check_rigid
 from .features import LEAST_POINTS, Cloud, register_features
 from .height_maps import register_height_maps
 from .result import Registration

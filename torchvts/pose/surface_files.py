@@ -1,5 +1,6 @@
 """Writes points and surfaces as PLY, PCD and OBJ; nothing beyond NumPy is needed."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -8,15 +9,16 @@ from torch import Tensor
 
 from ..core.files import write_atomically
 from ..core.geometry import depth_to_points
+from .output_frame import OutputFrame
 
 Array = np.ndarray[Any, Any]
 
 
-def write_ply(path: Path, points: Array, normals: Array | None) -> None:
+def write_ply(path: Path, points: Array, normals: Array | None, axes: str) -> None:
     """Points (N, 3) and normals (N, 3) as binary PLY, float64."""
     columns = [points] if normals is None else [points, normals]
     names = ("x", "y", "z", "nx", "ny", "nz")[: 3 * len(columns)]
-    head = ["ply", "format binary_little_endian 1.0", "comment mm, x right, y up, z to the camera", f"element vertex {len(points)}"]
+    head = ["ply", "format binary_little_endian 1.0", f"comment {axes}", f"element vertex {len(points)}"]
     head += [*(f"property double {name}" for name in names), "end_header", ""]
     _write(path, "\n".join(head).encode() + np.hstack(columns).astype("<f8").tobytes())
 
@@ -31,8 +33,8 @@ def write_pcd(path: Path, points: Array, normals: Array | None) -> None:
     _write(path, "\n".join(head).encode() + np.hstack(columns).astype("<f4").tobytes())
 
 
-def write_obj(path: Path, depth_mm: Tensor, normal: Tensor, contact: Tensor, mm_per_pixel: float) -> None:
-    """The contact as a surface in Wavefront OBJ: mm, x right, y up, z to the camera.
+def write_obj(path: Path, depth_mm: Tensor, normal: Tensor, contact: Tensor, mm_per_pixel: float, frame: OutputFrame) -> None:
+    """The contact as a surface in Wavefront OBJ.
 
     Args:
         path: the file.
@@ -40,16 +42,18 @@ def write_obj(path: Path, depth_mm: Tensor, normal: Tensor, contact: Tensor, mm_
         normal: (1, 3, H, W), of the pipeline.
         contact: (1, 1, H, W) bool; four neighbours in contact make two triangles.
         mm_per_pixel: pitch, mm.
+        frame: in which it is written.
     """
     inside = contact[0, 0].cpu().numpy()
-    points = depth_to_points(depth_mm, mm_per_pixel, contact).double().cpu().numpy()
-    normals = (normal[0].permute(1, 2, 0)[contact[0, 0]] * normal.new_tensor([1.0, -1.0, 1.0])).double().cpu().numpy()
+    points = frame.points(depth_to_points(depth_mm, mm_per_pixel, contact).cpu()).numpy()
+    normals = frame.directions((normal[0].permute(1, 2, 0)[contact[0, 0]] * normal.new_tensor([1.0, -1.0, 1.0])).cpu()).numpy()
     index = np.cumsum(inside.ravel()).reshape(inside.shape)  # from 1, as OBJ counts
     block = inside[:-1, :-1] & inside[1:, :-1] & inside[:-1, 1:] & inside[1:, 1:]
     a, b, c, d = (part[block] for part in (index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]))
     faces = np.concatenate((np.stack((a, b, d), 1), np.stack((a, d, c), 1)))  # counter-clockwise from the camera
-    lines = ["# torchvts: mm, x right, y up, z to the camera"]
-    lines += [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in points.tolist()]
+    lines = [f"# torchvts: {frame.axes}"]
+    digits = 6 + round(math.log10(frame.mm))  # nm
+    lines += [f"v {x:.{digits}f} {y:.{digits}f} {z:.{digits}f}" for x, y, z in points.tolist()]
     lines += [f"vn {x:.6f} {y:.6f} {z:.6f}" for x, y, z in normals.tolist()]
     lines += [f"f {i}//{i} {j}//{j} {k}//{k}" for i, j, k in faces.tolist()]
     _write(path, ("\n".join(lines) + "\n").encode())

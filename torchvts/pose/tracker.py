@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from ..core.checks import check_positive
+from ..core.geometry import check_rigid
 from .alignment import LEAST_FITNESS, LEAST_OVERLAP, MOST_COST, agrees_enough
 from .ambiguity import UNKNOWN_VARIANCE, turned_otherwise
-from .direct import align, check_rigid, symmetries
+from .direct import align, symmetries
 from .follow import TRUSTED_DEG, TRUSTED_MM, Followed, follow, in_common
 from .graph import Edge, KeyframeGraph, moved_covariance
 from .inverse import LEAST_NOISE

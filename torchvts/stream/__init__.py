@@ -11,7 +11,8 @@ from .background import (
     use_calibration,
     with_background,
 )
-from .cameras import Camera, CameraSettings, find_camera
+from .cameras import Camera, CameraSettings
+from .devices import find_camera
 from .files import StreamReport
 from .follow_light import FollowLight
 from .frames import NewestFrame

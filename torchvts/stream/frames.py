@@ -24,6 +24,8 @@ class NewestFrame:
         rate: frames a second at which a recording is played; None for a camera, which has its own.
         clock: for tests.
         sleep: for tests.
+    Attributes:
+        started_s: time 0 of its frames by ``clock``.
     """
 
     def __init__(
@@ -36,6 +38,7 @@ class NewestFrame:
         if rate is not None:
             check_positive("rate", rate, MOST_FPS)
         self.dropped = 0
+        self.started_s = clock()
         self._reader, self._rate, self._clock = reader, rate, clock
         self._changed, self._stop = threading.Condition(), threading.Event()
         self._sleep = sleep or self._stop.wait
@@ -47,7 +50,7 @@ class NewestFrame:
 
     def _run(self) -> None:
         try:
-            start, index = self._clock(), 0
+            start, index = self.started_s, 0
             while not self._stop.is_set():
                 pixels = self._reader.read()
                 if pixels is None:
@@ -103,6 +106,7 @@ class SourceFrames:
         realtime: play a recording at its own rate.
         stages: measures reading and waiting.
     Attributes:
+        started_s: time 0 of the frames, by :func:`time.monotonic`.
         first: the first frames of which ``least`` can be read, at least one.
     Raises:
         ValueError: the source has fewer.
@@ -112,6 +116,7 @@ class SourceFrames:
         self._reader, self._realtime, self._stages = reader, realtime or reader.live, stages
         self._newest: NewestFrame | None = None
         self._given = 0
+        self.started_s = time.monotonic()
         self.first: deque[Pixels | Unreadable] = deque()
         if reader.live:  # exposure settles
             for _ in range(SETTLING):
@@ -158,6 +163,7 @@ class SourceFrames:
             self._newest = NewestFrame(self._reader)
         elif self._newest is None:
             self._newest = NewestFrame(_Replay(self._reader, self.first), self._reader.fps)
+        self.started_s = self._newest.started_s
         while True:
             with self._stages.stage("wait"):
                 newest = self._newest.take()

@@ -63,7 +63,7 @@ class TactileStream:
     and late ones are dropped; of other recordings all are. A frame that cannot be used (:class:`FrameCheck`) is left out.
 
     Args:
-        source: a camera's index, a network camera's URL, a video file, a folder of images, or a :class:`Reader`.
+        source: a camera (:func:`find_camera`), a network camera's URL, a video file, a folder of images, or a :class:`Reader`.
         sensor_or_calibration: the sensor, which rectifies; or a calibration, if there is one.
         mode: "fast", "precise" or "auto".
         background_frames: number of frames without contact at the start; 0, with a calibration, uses that as it is.
@@ -185,6 +185,11 @@ class TactileStream:
     def light(self) -> FollowLight:
         """The light followed, learned from all frames so far."""
         return self.recording.light
+
+    @property
+    def started_s(self) -> float:
+        """Time 0 of the frames by :func:`time.monotonic`, the clock of all streams; of a recording that waits, its opening."""
+        return self._frames.started_s
 
     @property
     def dropped(self) -> int:

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..core.checks import brief, check_integer, check_least, check_path, check_positive, parse_number
 from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, check_text_name, image_files, open_video, read_pixels
+from .devices import find_camera, found_cameras
 
 Pixels = np.ndarray[Any, Any]
 
@@ -82,7 +83,10 @@ class CaptureReader:
         if not self._capture.isOpened():
             self._capture.release()
             if isinstance(source, int):
-                raise OSError(f"source: expected a camera with index {source}, got none that opens: plugged in? in use elsewhere?")
+                raise OSError(
+                    f"source: expected a camera with index {source}, got none that opens: plugged in? in use elsewhere? "
+                    f"{found_cameras()}"
+                )
             if self.live:
                 raise OSError(
                     f"source: expected a network camera at {source}, got none that opens: is it on? is the address right?"
@@ -325,7 +329,7 @@ class FolderReader:
 
 
 def open_source(source: str | int | Path, reconnect_s: float = 0.0) -> Reader:
-    """Open a camera by its index (digits), a network camera by its URL, a video file, or a folder of images.
+    """Open a camera (:func:`find_camera`), a network camera by its URL, a video file, or a folder of images.
 
     Args:
         source: what to open.
@@ -349,13 +353,28 @@ def open_source(source: str | int | Path, reconnect_s: float = 0.0) -> Reader:
     path = Path(text)
     if path.is_dir():
         return FolderReader(path)
+    if find_camera(text) is not None:
+        return LiveReader(lambda: CaptureReader(_index_of(text)), reconnect_s)  # found again: it may come back as another
     if not path.is_file():
         raise FileNotFoundError(
-            f"source: expected a file, a folder, a camera's index (digits) or a URL, got {text}: no such file or folder"
+            "source: expected a file, a folder, a URL, or a camera by index, /dev path, name or serial number, "
+            f"got {text}: no such file or folder, and no such camera; {found_cameras()}"
         )
     if path.suffix.lower() not in VIDEO_SUFFIXES:
         raise ValueError(f"source: {path}: expected a video ({', '.join(VIDEO_SUFFIXES)}), a folder of images or a camera's index")
     return CaptureReader(path)
+
+
+def _index_of(text: str) -> int:
+    """The index of a camera that a text named before.
+
+    Raises:
+        OSError: it is not there now.
+    """
+    index = find_camera(text)
+    if index is None:
+        raise OSError(f"source: expected a camera {text!r}, got none: unplugged? {found_cameras()}")
+    return index
 
 
 def check_reader(source: object) -> Reader:

@@ -12,6 +12,7 @@ import torch
 import torchvts as vts
 from torchvts.calibration.background import BackgroundPixels, paraboloid_start
 from torchvts.calibration.levenberg import LevenbergMarquardt, residual_and_jacobian
+from torchvts.stream import use_calibration
 
 scenes = vts.scenes
 LOW = {"radius_mm": 22.0, "height_mm": [15.0, 16.5, 18.0], "level": 0.2}
@@ -215,7 +216,7 @@ def test_a_clean_background_warns_of_nothing(small_background, small_sensor):
         calibration = vts.calibrate(small_background, small_sensor)
     assert calibration.report["converged"] is True and calibration.report["source"] == "background"
     assert json.loads(json.dumps(calibration.report)) == calibration.report
-    assert calibration.report["standing_out"] < 0.001
+    assert calibration.report["standing_out"] < 0.001 and use_calibration(calibration).metric
 
 
 @pytest.mark.parametrize("press_mm, center_mm", [(1.0, (0, 0)), (0.5, (8, 5))])
@@ -223,7 +224,9 @@ def test_contact_in_the_background_is_noticed(low_rig, small_sensor, press_mm, c
     scene = scenes.sphere_press(10.0, press_mm, center_mm, 120, 160, 0.25)
     image = scenes.render(scene, low_rig, noise_std=0.005, bits=8)[0]
     with pytest.warns(vts.CalibrationWarning, match=r"background: .*% of the image differs .* contact in the calibration image\?"):
-        vts.calibrate(image, small_sensor)
+        calibration = vts.calibrate(image, small_sensor)
+    assert calibration.report["objection"] == "the background may hold a contact"
+    assert use_calibration(calibration).metric is False
 
 
 def test_saturated_spots_under_low_lights_are_not_taken_for_contact(ring, small_sensor):

@@ -140,7 +140,10 @@ def test_what_to_expect_follows_the_source(rig, mini_by_prior):
     one = dataclasses.replace(fitted, report=few | {"own_deg": 2.0, "presses": [{"name": "a", "used": True}]})
     assert "4.5 degrees, a guess from their misfit: too few presses to score any" in expected(one)
     rough = vts.Calibration.from_response(
-        mini_by_prior.response, mini_by_prior.sensor, mini_by_prior.background, {"model": "response", "source": "stand_in"}
+        mini_by_prior.response,
+        mini_by_prior.sensor,
+        mini_by_prior.background,
+        {"model": "response", "source": "stand_in", "objection": "lights"},
     )
     assert "NOT METRIC" in expected(rough)
 

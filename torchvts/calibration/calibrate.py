@@ -9,7 +9,7 @@ from torch import Tensor
 from ..core.checks import check_image, check_switch
 from ..core.threads import OneThread
 from ..model.calibration import Calibration
-from ..model.report import CandidateRow
+from ..model.report import CandidateRow, Report
 from ..model.sensor import Sensor, check_sensor
 from . import objections
 from .candidates import Candidate, Given, doubtful, from_lights, from_presses, from_prior, from_touches
@@ -106,5 +106,8 @@ def _taken(chosen: Candidate, tried: list[CandidateRow], found: list[str]) -> tu
     if chosen.unit is None or chosen.objection:
         raise ValueError(chosen.objection)
     unit, more = objections.to_background_of_lights(chosen.unit)
-    unit = dataclasses.replace(unit, report={**unit.report, "candidates": tried})
+    report: Report = {**unit.report, "candidates": tried}
+    if objection := objections.to_scale(report):
+        report["objection"] = objection
+    unit = dataclasses.replace(unit, report=report)
     return unit, list(dict.fromkeys([*found, *chosen.warnings, *more]))

@@ -173,6 +173,8 @@ def from_presses(given: Given, lights: Candidate, prior: Candidate, touches: Can
         elif of_lights_deg is not None:
             row["note"] = f"rejected: on {len(used(contacts))} presses their normals are {of_lights_deg:.1f} deg off; {row['note']}"
     report["presses"] = [press_row(contact, given.sensor) for contact in contacts]
+    if sizes:
+        report["objection"] = sizes
     if touches.unit is not None:
         report["touches"] = touches.unit.report["touches"]
     unit = with_contact_share(dataclasses.replace(unit, report=report), given.presses, contacts)

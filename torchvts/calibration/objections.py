@@ -10,8 +10,10 @@ import torch
 from ..core.arrays import array_of
 from ..core.views import Views
 from ..model.calibration import Calibration
+from ..model.report import Report
 from ..model.sensor import Sensor
 from .contacts import ROUGH, Contact, channel_structure, differing, used
+from .lights import POORLY_CONSTRAINED_DEG
 
 WIDE = 0.86
 """Contact radius over the ball's, in the median over presses, from which sizes are wrong: it is 0.55 to 0.78 on eleven real and
@@ -42,8 +44,34 @@ SHIFTED = 0.15
 """The same, from which a frame is cropped otherwise, not only shifted as units are: whole frames of a GelSight Mini have 0.17."""
 
 
+STANDING_OUT = 0.01
+"""Share of a background that differs clearly from fitted lights, from which it may hold a contact."""
+
+
 class CalibrationWarning(UserWarning):
     """A calibration was made but should not be trusted as it is."""
+
+
+def to_scale(report: Report) -> str:
+    """Why depth is not in mm, as far as is known; "" where nothing speaks against it. Presses that are left out do not.
+
+    This alone decides it: it becomes ``report["objection"]``, which streams, commands and confidence read.
+    """
+    if report.get("objection"):
+        return report["objection"]
+    if report["source"] == "stand_in":
+        return "the positions of the sensor file's lights do not fit the background"
+    if report.get("standing_out", 0.0) > STANDING_OUT:
+        return "the background may hold a contact"
+    if report["model"] != "point_lights" or any(row["used"] for row in report.get("presses", [])):
+        return ""
+    if report["source"] == "sensor_file":
+        return "the lights are the sensor file's, not this unit's"
+    if not report.get("converged", True):
+        return "the fit of the lights did not converge"
+    if max(report.get("direction_std_deg", [0.0])) > POORLY_CONSTRAINED_DEG:
+        return "the background does not constrain the lights"
+    return ""
 
 
 def to_contacts(contacts: Sequence[Contact]) -> list[str]:
@@ -146,7 +174,7 @@ def to_background_of_lights(unit: Calibration) -> tuple[Calibration, list[str]]:
     report = unit.report.copy()
     report["residual_std"], report["standing_out"] = spread.tolist(), standing_out
     found = []
-    if standing_out > 0.01:
+    if standing_out > STANDING_OUT:
         found.append(
             f"background: {standing_out:.1%} of the image differs from the fitted lights by more than 5 times their residual "
             f"({', '.join(f'{v:.4f}' for v in spread.tolist())}): contact in the calibration image? take it again without"

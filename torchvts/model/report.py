@@ -102,8 +102,8 @@ class Report(_ReportKeys, total=False):
         model: which model the calibration holds.
         source: where the model comes from, see :data:`Source`.
         reason: why this model was chosen.
-        objection: what speaks against the prior where it was used all the same: the background is not that of the prior's sensor
-            type, or shows a contact. Depth is then not metric. Absent where nothing does.
+        objection: why depth is not metric, as far as is known: a prior on a background that is not of its type, sizes that the
+            presses contradict, lights that are not this unit's or not determined. Absent where nothing speaks against it.
         candidates: all models that were considered.
         presses: one row per press.
         touches: one row per touch.

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from ..calibration import (
-    POORLY_CONSTRAINED_DEG,
     ROUGH,
     CalibrationWarning,
     Press,
@@ -38,9 +37,6 @@ ROUGH_DEG = 3.3
 
 NOT_METRIC = "depth is NOT METRIC: calibrate with presses of a ball"
 """What a stream says of a calibration whose scale is not known."""
-
-ASSUMED = ("sensor_file", "stand_in")
-"""Sources of a model that is not of this unit."""
 
 
 WITHOUT_FIRST = (
@@ -253,20 +249,21 @@ def calibrate_background(background: Tensor, sensor: Sensor, presses: Sequence[P
         warnings.simplefilter("always")
         calibration = calibrate(background, sensor, presses)
     notes = [str(w.message) for w in caught if issubclass(w.category, CalibrationWarning)]
-    if calibration.report["source"] in ASSUMED and not notes:
-        notes.append("the lights are the sensor file's, not this unit's")
-    metric = not notes
-    text = "; ".join([str(calibration.report["reason"]), *notes] + ([] if metric else [NOT_METRIC]))
-    return StreamCalibration(calibration, text, metric)
+    return _described(calibration, "; ".join([str(calibration.report["reason"]), *notes]))
 
 
 def use_calibration(calibration: Calibration) -> StreamCalibration:
     """A calibration that was given, as that of a stream."""
     report = calibration.report
-    note = f"calibration given: {report.get('reason', report.get('model', 'lights'))}"
-    metric = max(report.get("direction_std_deg", [0.0])) <= POORLY_CONSTRAINED_DEG
-    metric = metric and report.get("source") not in ASSUMED and not report.get("objection")
-    return StreamCalibration(calibration, note if metric else f"{note}; {NOT_METRIC}", metric)
+    return _described(calibration, f"calibration given: {report.get('reason', report.get('model', 'lights'))}")
+
+
+def _described(calibration: Calibration, note: str) -> StreamCalibration:
+    """With why depth is not metric, which the calibration itself says."""
+    objection = calibration.report.get("objection", "")
+    if objection:
+        note = "; ".join([note] + ([] if objection in note else [objection]) + [NOT_METRIC])
+    return StreamCalibration(calibration, note, not objection)
 
 
 def with_background(calibration: Calibration, background: Tensor) -> Calibration:

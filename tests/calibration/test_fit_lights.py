@@ -1,6 +1,7 @@
 """Point lights from one background: the fit, its stated uncertainty, and the choice of a model."""
 
 import dataclasses
+import functools
 import json
 import warnings
 
@@ -10,6 +11,7 @@ import references
 import torch
 
 import torchvts as vts
+from torchvts.calibration import by_lights
 from torchvts.calibration.background import BackgroundPixels, paraboloid_start
 from torchvts.calibration.levenberg import LevenbergMarquardt, residual_and_jacobian
 
@@ -206,7 +208,7 @@ def test_a_real_sensor_does_not_pin_point_lights_and_says_so(data, unit):
     assert float(fit.direction_std_deg.max()) > 5.0
     assert not fit.converged or "calibrate with presses or known lights" in fit.message
     with pytest.warns(vts.CalibrationWarning, match="background: "):
-        vts.calibrate(background, sensor)
+        assert not vts.calibrate(background, sensor).metric
 
 
 def test_a_clean_background_warns_of_nothing(small_background, small_sensor):
@@ -219,11 +221,22 @@ def test_a_clean_background_warns_of_nothing(small_background, small_sensor):
 
 
 @pytest.mark.parametrize("press_mm, center_mm", [(1.0, (0, 0)), (0.5, (8, 5))])
-def test_contact_in_the_background_is_noticed(low_rig, small_sensor, press_mm, center_mm):
+def test_contact_in_the_background_is_noticed(low_rig, small_sensor, press_mm, center_mm, tmp_path):
     scene = scenes.sphere_press(10.0, press_mm, center_mm, 120, 160, 0.25)
     image = scenes.render(scene, low_rig, noise_std=0.005, bits=8)[0]
     with pytest.warns(vts.CalibrationWarning, match=r"background: .*% of the image differs .* contact in the calibration image\?"):
-        vts.calibrate(image, small_sensor)
+        calibration = vts.calibrate(image, small_sensor)
+    calibration.save(tmp_path / "unit.safetensors")
+    kept = vts.Calibration.load(tmp_path / "unit.safetensors")
+    assert not kept.metric and "contact in the calibration image?" in kept.report["objection"]
+
+
+def test_lights_that_did_not_converge_are_not_metric(small_background, small_sensor, monkeypatch):
+    fit_three = functools.partial(by_lights.fit_lights, max_steps=3)
+    monkeypatch.setattr(by_lights, "fit_lights", fit_three)
+    with pytest.warns(vts.CalibrationWarning, match="stopped at 3 steps"):
+        calibration = vts.calibrate(small_background, small_sensor)
+    assert not calibration.metric and "stopped at 3 steps" in calibration.report["objection"]
 
 
 def test_saturated_spots_under_low_lights_are_not_taken_for_contact(ring, small_sensor):

@@ -25,6 +25,7 @@ from torchvts.calibration.contacts import read_contacts
 from torchvts.calibration.field import Evidence, Family
 from torchvts.calibration.response_fit import fit_depth_brightness, simplest_candidate
 from torchvts.model.response_field import CHANGE_SCALE, DepthBrightness, ResponseField, fit_log_background, sine_from_slope
+from torchvts.stream import calibrate_background, use_calibration
 
 HEIGHT, WIDTH, PITCH = 120, 160, 0.125
 SIZE = (HEIGHT, WIDTH, PITCH)
@@ -559,6 +560,12 @@ def test_two_wrong_diameters_among_seven_are_left_out(good, rest):
 def test_an_absurd_diameter_is_left_out_like_any_other(good, rest, ball_mm):
     calibration, warned = calibrate(rest, GIVEN, [*good, dataclasses.replace(good[0], ball_diameter_mm=ball_mm, name="absurd")])
     assert len(warned) == 1 and warned[0].startswith("absurd: left out: ") and not calibration.report["presses"][-1]["used"]
+
+
+def test_a_press_that_is_left_out_does_not_make_depth_less_metric(good, rest):
+    calibration, note, metric = calibrate_background(rest, GIVEN, [*good, dataclasses.replace(good[0], image=rest, name="empty")])
+    assert "empty: left out: " in note and "NOT METRIC" not in note
+    assert metric and calibration.metric and use_calibration(calibration).metric
 
 
 @pytest.mark.parametrize(

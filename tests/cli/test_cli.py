@@ -130,10 +130,8 @@ def test_what_to_expect_follows_the_source(rig, mini_by_prior):
     assert "5.0 degrees, a guess; more presses" in expected(fitted)
     one = dataclasses.replace(fitted, report=few | {"own_deg": 2.0, "presses": [{"name": "a", "used": True}]})
     assert "4.5 degrees, a guess from their misfit: too few presses to score any" in expected(one)
-    rough = vts.Calibration.from_response(
-        mini_by_prior.response, mini_by_prior.sensor, mini_by_prior.background, {"model": "response", "source": "stand_in"}
-    )
-    assert "NOT METRIC" in expected(rough)
+    rough = dataclasses.replace(mini_by_prior, report={"model": "response", "source": "stand_in", "objection": "rough"})
+    assert expected(rough).startswith("depth is NOT METRIC") and "(rough)" in expected(rough)
 
 
 def test_a_video_or_a_folder_in_the_wrong_place_names_the_way_that_works(rig, tmp_path):

@@ -4,14 +4,13 @@ from .by_lights import GIVEN_MISFIT
 from .by_presses import RESPONSE_BLUR_PX, by_presses, with_preprocessing
 from .calibrate import calibrate
 from .contacts import ROUGH, channel_structure
-from .lights import POORLY_CONSTRAINED_DEG, LightFit, fit_lights
+from .lights import LightFit, fit_lights
 from .objections import CalibrationWarning
 from .presses import Press, Touch, read_presses
 from .prior import PriorUnit, fit_prior, score_prior
 
 __all__ = [
     "GIVEN_MISFIT",
-    "POORLY_CONSTRAINED_DEG",
     "RESPONSE_BLUR_PX",
     "ROUGH",
     "CalibrationWarning",

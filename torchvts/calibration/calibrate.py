@@ -107,4 +107,6 @@ def _taken(chosen: Candidate, tried: list[CandidateRow], found: list[str]) -> tu
         raise ValueError(chosen.objection)
     unit, more = objections.to_background_of_lights(chosen.unit)
     unit = dataclasses.replace(unit, report={**unit.report, "candidates": tried})
+    if doubts := [text for text in (chosen.not_metric, *more) if text]:
+        unit.report["objection"] = "; ".join(doubts)
     return unit, list(dict.fromkeys([*found, *chosen.warnings, *more]))

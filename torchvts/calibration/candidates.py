@@ -53,6 +53,7 @@ class Candidate:
         unit: the calibration; None where it could not be made.
         error_deg: error of its normals or lights, as far as it is known, degrees.
         objection: why it is not taken, or "".
+        not_metric: why its depth is not metric though it may be taken, or "": what puts its scale in doubt, not what was left out.
         warnings: what to say of what was given.
         rows: the models that were tried for it; with presses point lights are one of them.
     """
@@ -60,6 +61,7 @@ class Candidate:
     unit: Calibration | None = None
     error_deg: float | None = None
     objection: str = ""
+    not_metric: str = ""
     warnings: tuple[str, ...] = ()
     rows: tuple[CandidateRow, ...] = ()
 
@@ -75,7 +77,9 @@ def from_lights(given: Given) -> Candidate:
         constrained = f"the image constrains the lights to {result.direction_deg or 0.0:.2f} deg"
         reason = result.row["note"] if objection or result.direction_deg is None else constrained
         unit = dataclasses.replace(unit, report={**unit.report, "reason": f"point lights: {reason}"})
-    return Candidate(unit, result.direction_deg, objection, warnings, (result.row,))
+    assumed = unit is not None and unit.report["source"] == "sensor_file"
+    doubt = result.complaint or ("the lights are the sensor file's, not this unit's" if assumed else "")
+    return Candidate(unit, result.direction_deg, objection, doubt, warnings, (result.row,))
 
 
 def _explained(result: LightsResult) -> bool:
@@ -106,10 +110,8 @@ def from_prior(given: Given) -> Candidate:
     row: CandidateRow = {"model": "prior", "family": "response of the sensor type", "parameters": 0, "passes": 2, "score_deg": None}
     reason = "the sensor's prior, transferred to this unit by its background"
     report: Report = {"model": "response", "source": "prior", "reason": reason, "prior_deg": prior.expected_deg}
-    if found:
-        report["objection"] = "; ".join(found)
     unit = Calibration.from_response(model, given.sensor, given.background, report)
-    return Candidate(unit, prior.expected_deg, "", tuple(found), (row,))
+    return Candidate(unit, prior.expected_deg, "", "; ".join(found), tuple(found), (row,))
 
 
 def from_touches(given: Given) -> Candidate:
@@ -128,7 +130,7 @@ def from_touches(given: Given) -> Candidate:
     report: Report = {"model": "response", "source": "touches", "reason": result.row["note"]}
     report["touches"] = [touch_row(contact) for contact in result.contacts]
     unit = Calibration.from_response(result.model, given.sensor, given.background, report)
-    return Candidate(unit, None, "", tuple(objections.to_contacts(result.contacts)), (result.row,))
+    return Candidate(unit, None, "", "", tuple(objections.to_contacts(result.contacts)), (result.row,))
 
 
 class _Fit(NamedTuple):
@@ -153,9 +155,9 @@ def from_presses(given: Given, lights: Candidate, prior: Candidate, touches: Can
     if sizes and not given.force:
         raise ValueError(f"{sizes}; force=True (--force) goes on all the same")
     from_prior = start is prior and not dropped
-    warnings = [text for text in (dropped, sizes) if text] + objections.to_contacts(contacts)
     if start.unit is not None and not dropped and not sizes:
-        warnings += objections.to_diameters_by_prior(used(contacts))
+        sizes = objections.to_diameters_by_prior(used(contacts))
+    warnings = [text for text in (dropped, *objections.to_contacts(contacts), sizes) if text]
     report: Report = {"model": "response", "source": "presses", "held_out_deg": fit.error_deg}
     report["reason"] = f"{fit.reason}; {dropped}" if dropped else fit.reason
     if fit.own_deg is not None:
@@ -176,7 +178,7 @@ def from_presses(given: Given, lights: Candidate, prior: Candidate, touches: Can
     if touches.unit is not None:
         report["touches"] = touches.unit.report["touches"]
     unit = with_contact_share(dataclasses.replace(unit, report=report), given.presses, contacts)
-    return Candidate(unit, error_deg, "", tuple(warnings), (row, *fit.candidates))
+    return Candidate(unit, error_deg, "", sizes, tuple(warnings), (row, *fit.candidates))
 
 
 def _lights_do(lights: Candidate, error_deg: float, of_fields_deg: float | None) -> bool:
@@ -204,7 +206,7 @@ def _fitted(given: Given, start: Candidate) -> _Fit:
         contacts = first.contacts
     except NoUsablePress as error:
         contacts = error.contacts
-    unlike = "objection" in start.unit.report
+    unlike = bool(start.not_metric)
     count, left = len(contacts), len(used(contacts))
     contradiction = "the background does not have its pattern of light" if unlike else ""
     if not contradiction and left < LEAST_USED * count:

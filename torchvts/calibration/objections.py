@@ -43,7 +43,7 @@ SHIFTED = 0.15
 
 
 class CalibrationWarning(UserWarning):
-    """A calibration was made but should not be trusted as it is."""
+    """What was left out of a calibration, or what speaks against it; ``calibration.metric`` says whether its depth is in mm."""
 
 
 def to_contacts(contacts: Sequence[Contact]) -> list[str]:
@@ -51,15 +51,15 @@ def to_contacts(contacts: Sequence[Contact]) -> list[str]:
     return [f"{contact.name}: left out: {contact.reason}" for contact in contacts if contact.reason]
 
 
-def to_diameters_by_prior(used: Sequence[Contact]) -> list[str]:
-    """Diameters that are all wrong by the same factor, which only the prior can show."""
+def to_diameters_by_prior(used: Sequence[Contact]) -> str:
+    """Diameters that are all wrong by the same factor, which only the prior can show; "" where they are not."""
     gain = statistics.median(contact.metrics["gain"] for contact in used)
     if abs(math.log(max(gain, 1e-3))) <= math.log(USUAL_GAIN):
-        return []
-    return [
+        return ""
+    return (
         f"presses: by the sensor's prior the balls seem {1.0 / gain:.2f} times as wide as given: wrong diameter or pitch? "
         "if they are right, this unit differs from the prior's, and more presses will show it"
-    ]
+    )
 
 
 def to_sizes(contacts: Sequence[Contact], mm_per_pixel: float) -> str:

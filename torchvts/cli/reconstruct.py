@@ -19,7 +19,7 @@ from pathlib import Path
 from ..core.files import VIDEO_SUFFIXES, make_folder, read_frames
 from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, Report, list_items, reconstruct_dataset
 from ..diagnose import Finding, diagnose
-from ..stream import NOT_METRIC, read_background, read_press_images, use_calibration
+from ..stream import NOT_METRIC, read_background, read_press_images
 from .options import add_background_frames, add_out, add_pipeline, add_press, add_sensor, contact_of, load_calibration, load_sensor
 from .parser import UsageError
 from .summary import SHOWN, calibrated, left_out, print_calibration
@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
     if report.rank > 0:
         return 0
     print_report(report, arguments.out)
-    if not use_calibration(load_calibration(calibration)).metric:
+    if not load_calibration(calibration).metric:
         print(NOT_METRIC)
     if arguments.pictures is None and report.rows > PICTURES_UP_TO:
         print(f"no pictures of more than {PICTURES_UP_TO} frames: --pictures --overwrite draws all, --every N fewer")

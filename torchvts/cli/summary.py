@@ -12,7 +12,7 @@ from ..model import Calibration, PointLights, Sensor
 from ..model.coverage import press_next
 from ..model.report import CandidateRow, PressRow, Report
 from ..pipeline.expected_error import expected_model_deg
-from ..stream import NOT_METRIC, use_calibration
+from ..stream import NOT_METRIC
 
 SHOWN = 5
 """Of a list, so many lines are printed."""
@@ -82,10 +82,8 @@ def calibrated(
 def expected(calibration: Calibration) -> str:
     """How good depth is likely to be, from the held-out score, the record of the prior, or the spread of the lights."""
     report = calibration.report
-    if report.get("objection"):
-        return f"{NOT_METRIC}; the prior was used all the same, see the warning"
-    if not use_calibration(calibration).metric:
-        return NOT_METRIC
+    if not calibration.metric:
+        return f"{NOT_METRIC} ({report['objection']})"
     if report["model"] == "point_lights":
         spread = report.get("direction_std_deg")
         if spread is None:

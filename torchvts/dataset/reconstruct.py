@@ -32,7 +32,7 @@ from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, count_frames
 from ..model import Calibration
 from ..pipeline import MODES, DepthOutput, unit_pipeline
 from ..skin import ContactSettings
-from ..stream import FIRST_FRAMES, Recording, check_device, use_calibration
+from ..stream import FIRST_FRAMES, Recording, check_device
 from .items import Item, Source, list_items
 from .loading import Frame, load_frames
 from .processes import share, sum_over_processes
@@ -191,7 +191,7 @@ class _Worker:
         self, unit: Calibration, name: str, network: str | Path | None, records: Records, share: tuple[int, int], strict: bool
     ) -> None:
         self.unit, self.records, self.settings, self.share, self.strict = unit, records, records.settings, share, strict
-        self.sensor, self.writer = unit.sensor, Writer(records, unit.sensor, name, use_calibration(unit).metric)
+        self.sensor, self.writer = unit.sensor, Writer(records, unit.sensor, name, unit.metric)
         thresholds = None if self.settings.contact is None else ContactSettings(**self.settings.contact)
         self.recording = partial(
             Recording, unit, self.settings.mode, network=network, device=self.settings.device, contact=thresholds

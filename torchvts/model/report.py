@@ -102,8 +102,9 @@ class Report(_ReportKeys, total=False):
         model: which model the calibration holds.
         source: where the model comes from, see :data:`Source`.
         reason: why this model was chosen.
-        objection: what speaks against the prior where it was used all the same: the background is not that of the prior's sensor
-            type, or shows a contact. Depth is then not metric. Absent where nothing does.
+        objection: why depth is not metric: the lights did not converge, are poorly constrained, or are the sensor file's; the
+            background shows a contact, or is not that of the prior's sensor type; the sizes of all balls are in doubt. Absent where
+            depth is metric (``Calibration.metric``): presses that were left out are no reason.
         candidates: all models that were considered.
         presses: one row per press.
         touches: one row per touch.

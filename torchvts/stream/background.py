@@ -10,14 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..calibration import (
-    POORLY_CONSTRAINED_DEG,
-    ROUGH,
-    CalibrationWarning,
-    Press,
-    calibrate,
-    channel_structure,
-)
+from ..calibration import ROUGH, CalibrationWarning, Press, calibrate, channel_structure
 from ..core.blur import band_of_ratios
 from ..core.cells import whole_cell_means
 from ..core.checks import check_batch, check_image, check_integer, check_path, check_positive, check_sequence, parse_number
@@ -34,9 +27,6 @@ ROUGH_DEG = 3.3
 
 NOT_METRIC = "depth is NOT METRIC: calibrate with presses of a ball"
 """What a stream says of a calibration whose scale is not known."""
-
-ASSUMED = ("sensor_file", "stand_in")
-"""Sources of a model that is not of this unit."""
 
 
 WITHOUT_FIRST = (
@@ -238,20 +228,21 @@ def calibrate_background(background: Tensor, sensor: Sensor, presses: Sequence[P
         warnings.simplefilter("always")
         calibration = calibrate(background, sensor, presses)
     notes = [str(w.message) for w in caught if issubclass(w.category, CalibrationWarning)]
-    if calibration.report["source"] in ASSUMED and not notes:
-        notes.append("the lights are the sensor file's, not this unit's")
-    metric = not notes
-    text = "; ".join([str(calibration.report["reason"]), *notes] + ([] if metric else [NOT_METRIC]))
-    return StreamCalibration(calibration, text, metric)
+    return _named("; ".join([str(calibration.report["reason"]), *notes]), calibration)
 
 
 def use_calibration(calibration: Calibration) -> StreamCalibration:
     """A calibration that was given, as that of a stream."""
     report = calibration.report
     note = f"calibration given: {report.get('reason', report.get('model', 'lights'))}"
-    metric = max(report.get("direction_std_deg", [0.0])) <= POORLY_CONSTRAINED_DEG
-    metric = metric and report.get("source") not in ASSUMED and not report.get("objection")
-    return StreamCalibration(calibration, note if metric else f"{note}; {NOT_METRIC}", metric)
+    return _named(note, calibration)
+
+
+def _named(note: str, calibration: Calibration) -> StreamCalibration:
+    """With what the calibration says of its depth, unless the note says it already."""
+    doubt = calibration.report.get("objection", "")
+    parts = [note, doubt if doubt not in note else "", NOT_METRIC if not calibration.metric else ""]
+    return StreamCalibration(calibration, "; ".join(part for part in parts if part), calibration.metric)
 
 
 def with_background(calibration: Calibration, background: Tensor) -> Calibration:

@@ -32,6 +32,10 @@ OF_BATCHES = [
     (TURNED[None], r"got \[1, 24, 32, 3\]: channels stand last: permute\(0, 3, 1, 2\)"),
     (BYTES[None], r"got torch.uint8: images are value / 255 in \[0, 1\]"),
     (255 * GOOD[None], r"expected values in \[0, 1\], got .*: 0-255 given for 0-1: divide by 255"),
+    (
+        4.0 * GOOD[None] - 2.0,
+        r"expected values in \[0, 1\], got .*: normalised by mean and standard deviation, .* give value / 255",
+    ),
     (ONE_NAN[None], "expected finite values, got 1 NaN or infinite"),
     (GOOD[None].half(), r"expected float32 or float64, got torch\.float16: .*use \.float\(\)"),
 ]

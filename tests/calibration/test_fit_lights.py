@@ -1,6 +1,7 @@
 """Point lights from one background: the fit, its stated uncertainty, and the choice of a model."""
 
 import dataclasses
+import functools
 import json
 import warnings
 
@@ -10,9 +11,9 @@ import references
 import torch
 
 import torchvts as vts
+from torchvts.calibration import by_lights
 from torchvts.calibration.background import BackgroundPixels, paraboloid_start
 from torchvts.calibration.levenberg import LevenbergMarquardt, residual_and_jacobian
-from torchvts.stream import use_calibration
 
 scenes = vts.scenes
 LOW = {"radius_mm": 22.0, "height_mm": [15.0, 16.5, 18.0], "level": 0.2}
@@ -216,17 +217,25 @@ def test_a_clean_background_warns_of_nothing(small_background, small_sensor):
         calibration = vts.calibrate(small_background, small_sensor)
     assert calibration.report["converged"] is True and calibration.report["source"] == "background"
     assert json.loads(json.dumps(calibration.report)) == calibration.report
-    assert calibration.report["standing_out"] < 0.001 and use_calibration(calibration).metric
+    assert calibration.report["standing_out"] < 0.001 and calibration.metric
 
 
 @pytest.mark.parametrize("press_mm, center_mm", [(1.0, (0, 0)), (0.5, (8, 5))])
-def test_contact_in_the_background_is_noticed(low_rig, small_sensor, press_mm, center_mm):
+def test_contact_in_the_background_is_noticed(low_rig, small_sensor, press_mm, center_mm, tmp_path):
     scene = scenes.sphere_press(10.0, press_mm, center_mm, 120, 160, 0.25)
     image = scenes.render(scene, low_rig, noise_std=0.005, bits=8)[0]
     with pytest.warns(vts.CalibrationWarning, match=r"background: .*% of the image differs .* contact in the calibration image\?"):
         calibration = vts.calibrate(image, small_sensor)
-    assert calibration.report["objection"] == "the background may hold a contact"
-    assert use_calibration(calibration).metric is False
+    calibration.save(tmp_path / "unit.safetensors")
+    kept = vts.Calibration.load(tmp_path / "unit.safetensors")
+    assert not kept.metric and kept.report["objection"] == "the background may hold a contact"
+
+
+def test_lights_that_did_not_converge_are_not_metric(small_background, small_sensor, monkeypatch):
+    monkeypatch.setattr(by_lights, "fit_lights", functools.partial(by_lights.fit_lights, max_steps=3))
+    with pytest.warns(vts.CalibrationWarning, match="stopped at 3 steps"):
+        calibration = vts.calibrate(small_background, small_sensor)
+    assert not calibration.metric and calibration.report["objection"] == "the fit of the lights did not converge"
 
 
 def test_saturated_spots_under_low_lights_are_not_taken_for_contact(ring, small_sensor):

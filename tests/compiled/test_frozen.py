@@ -135,6 +135,15 @@ def test_odd_sizes(kind, mode, size):
 
 
 @pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("kind", UNITS)
+def test_a_batch_of_none_is_empty_output(kind, mode):
+    calibration, images = UNITS[kind]((24, 32), 0.5)
+    pipe = vts.DepthPipeline.from_calibration(calibration, mode)
+    for one in (pipe, pipe.freeze()):
+        assert [tuple(part.shape) for part in one(images[:0])] == [(0, channels, 24, 32) for channels in (1, 2, 3, 1, 1)]
+
+
+@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize(
     "more",
     [{"blur_px": 1.0}, {"gamma": 2.2}, {"markers": True}, {"light_position_mm": ((20, 0, 30), (-10, 17, 30), (-10, -17, 30))}],

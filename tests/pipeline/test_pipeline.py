@@ -379,6 +379,58 @@ def test_what_a_learned_module_gives_is_checked(mixed, small_sensor, kind):
     assert bool(torch.isfinite(pipeline(lights, small_sensor, "fast", normals=Spoilt(lambda n: n))(frames[1:2]).depth_mm).all())
 
 
+class Turned(nn.Module):
+    """The calibrated normals, with other axes."""
+
+    def __init__(self, model, turn):
+        super().__init__()
+        self.model, self.turn = model, turn
+
+    def forward(self, image):
+        return self.turn(self.model(image))
+
+
+AXES = {
+    "y up": (lambda n: n * torch.tensor([1.0, -1.0, 1.0])[:, None, None], "y seems to count upwards, or x to the left: negate"),
+    "x and y swapped": (lambda n: n[:, [1, 0, 2]], "x and y seem swapped: give them in the order x, y, z"),
+    "turned a quarter": (lambda n: n[:, [1, 0, 2]] * torch.tensor([1.0, -1.0, 1.0])[:, None, None], "and one of them turned over"),
+    "z away": (lambda n: -n, "face away from the camera in 100% of the image: n_z is above 0 here: negate it"),
+}
+
+
+@pytest.mark.parametrize("case", AXES)
+def test_axes_of_own_normals_that_are_likely_wrong_are_named_once(mixed, small_sensor, case):
+    lights, frames = mixed
+    turn, text = AXES[case]
+    model = pipeline(lights, small_sensor, "fast").normals
+    pipe = pipeline(lights, small_sensor, "fast", normals=Turned(model, turn))
+    with pytest.warns(UserWarning, match=text):
+        pipe(frames[1:2])
+    pipe(frames[1:2])  # warnings are errors here
+    right = pipeline(lights, small_sensor, "fast", normals=Turned(model, lambda n: n))
+    assert torch.equal(right(frames[1:2]).depth_mm, pipeline(lights, small_sensor, "fast")(frames[1:2]).depth_mm)
+
+
+def test_autocast_reaches_an_own_network_and_nothing_else(mixed, small_sensor):
+    lights, frames = mixed
+    network = nn.Conv2d(3, 3, 1)
+    with torch.no_grad():
+        network.bias.copy_(torch.tensor([0.0, 0.0, 2.0]))
+    pipe = pipeline(lights, small_sensor, "fast", normals=network).requires_grad_(False)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert network(frames[1:2]).dtype == torch.bfloat16
+        low = pipe(frames[1:2])
+    assert {part.dtype for part in low[:3]} == {torch.float32}
+    full = pipe(frames[1:2])
+    assert float((low.gradient - full.gradient).abs().max()) < 0.05
+
+
+def test_a_pipeline_says_that_own_normals_take_one_pass(mixed, small_sensor):
+    pipe = pipeline(mixed[0], small_sensor, "auto", normals=nn.Conv2d(3, 3, 1))
+    assert "mode=auto, one pass: normals take no depth" in repr(pipe)
+    assert "one pass" not in repr(pipeline(mixed[0], small_sensor, "auto"))
+
+
 class MaskOfImage(vts.ContactMask):
     """A mask of one's own, of the compensated image alone."""
 

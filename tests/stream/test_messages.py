@@ -104,9 +104,22 @@ def test_an_episode_has_the_features_of_its_data_set(frame, small_sensor):
     np.testing.assert_array_equal(dataset.frames[1]["observation.left_finger.depth_mm"], later.output.depth_mm[0, 0].numpy())
 
 
+@pytest.mark.parametrize("kind", ["video", "image"])
+def test_depth_goes_into_a_depth_map_of_lerobot_in_metres(frame, small_sensor, kind):
+    features = messages.lerobot_features(small_sensor, "left_finger", image_dtype="image", depth_dtype=kind)
+    key = "observation.images.left_finger_depth"
+    assert features[key]["info"] == {"is_depth_map": True, "depth_unit": "m"} and features[key]["dtype"] == kind
+    found = messages.lerobot_frame(frame, PITCH, "left_finger", kind)
+    assert found.keys() == features.keys() and found[key].dtype == np.float32
+    np.testing.assert_allclose(1e3 * found[key][..., 0], frame.output.depth_mm[0, 0].numpy(), rtol=1e-6)
+    assert found[key].shape == features[key]["shape"]
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
+        (lambda frame: messages.lerobot_frame(frame, PITCH, depth_dtype="png"), "depth_dtype: expected"),
+        (lambda frame: messages.lerobot_features(vts.Sensor("rig", 8, 8, 0.1), depth_dtype="png"), "depth_dtype: expected"),
         (lambda frame: messages.cloud_message(frame, 0.0), "mm_per_pixel: expected"),
         (lambda frame: messages.lerobot_frame(frame, float("nan")), "mm_per_pixel: expected"),
         (lambda frame: messages.header(frame, "finger", start_s=-1.0), "start_s: expected frame 7 at 0 s or later, got -0.75"),

@@ -21,7 +21,7 @@ from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, Report, list_items
 from ..diagnose import Finding, diagnose
 from ..model.response_field import TaughtRange
 from ..pipeline.confidence import BEYOND
-from ..stream import NOT_METRIC, read_background, read_press_images, use_calibration
+from ..stream import NOT_METRIC, read_background, read_press_images
 from .options import (
     add_background_frames,
     add_length_unit,
@@ -78,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     unit = load_calibration(calibration)
     print_report(report, arguments.out, None if arguments.network or unit.response is None else unit.response.taught)
-    if not use_calibration(unit).metric:
+    if not unit.metric:
         print(NOT_METRIC)
     if arguments.pictures is None and report.rows > PICTURES_UP_TO:
         print(f"no pictures of more than {PICTURES_UP_TO} frames: --pictures --overwrite draws all, --every N fewer")

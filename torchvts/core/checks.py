@@ -312,6 +312,8 @@ def check_range(name: str, image: Tensor) -> None:
         raise ValueError(f"{name}: expected finite values, got {count} NaN or infinite: a camera or an upstream division failed")
     if high > 1.0 + 1e-3 or low < -1e-3:
         cause = "0-255 given for 0-1: divide by 255" if high > 1.5 else "clamp it to [0, 1]"
+        if low < -0.1 and 0.3 < high < 20.0:
+            cause = "normalised by mean and standard deviation, or scaled to [-1, 1], as for a network? give value / 255"
         raise ValueError(f"{name}: expected values in [0, 1], got [{low:.4g}, {high:.4g}]: {cause}")
 
 

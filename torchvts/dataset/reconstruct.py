@@ -33,7 +33,7 @@ from ..model import Calibration
 from ..pipeline import MODES, DepthOutput, unit_pipeline
 from ..pose.output_frame import MM_OF
 from ..skin import ContactSettings
-from ..stream import FIRST_FRAMES, Recording, check_device, use_calibration, video_codec
+from ..stream import FIRST_FRAMES, Recording, check_device, video_codec
 from .items import Item, Source, list_items
 from .loading import Frame, load_frames
 from .processes import share, sum_over_processes
@@ -203,7 +203,7 @@ class _Worker:
         self, unit: Calibration, name: str, network: str | Path | None, records: Records, share: tuple[int, int], strict: bool
     ) -> None:
         self.unit, self.records, self.settings, self.share, self.strict = unit, records, records.settings, share, strict
-        self.sensor, self.writer = unit.sensor, Writer(records, unit.sensor, name, use_calibration(unit).metric)
+        self.sensor, self.writer = unit.sensor, Writer(records, unit.sensor, name, unit.metric)
         thresholds = None if self.settings.contact is None else ContactSettings(**self.settings.contact)
         self.recording = partial(
             Recording, unit, self.settings.mode, network=network, device=self.settings.device, contact=thresholds

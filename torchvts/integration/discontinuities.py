@@ -179,8 +179,9 @@ class DiscontinuityIntegration(Integrator):
             depth, still, passes, iterations = self._solve_frame(frame[part], contacts[part], sure[part], data[part])
             depths.append(nn.functional.pad(self.mm_per_pixel * depth, [left, width - right, top, height - bottom]))
             status.append((still, passes, iterations))
-        columns = [torch.tensor(values, device=gradient.device) for values in zip(*status, strict=True)]
-        return DiscontinuitySolution(torch.cat(depths), columns[0], columns[1], columns[2])
+        kinds = (torch.bool, torch.int64, torch.int64)
+        columns = [torch.tensor([row[k] for row in status], dtype=kind, device=gradient.device) for k, kind in enumerate(kinds)]
+        return DiscontinuitySolution(torch.cat((gradient[:0, 0:1], *depths)), columns[0], columns[1], columns[2])
 
     def _known(self, gradient: Tensor, known_mm: Tensor | None, known_weight: Tensor | None) -> Tensor:
         """(B, 2, H, W): depth known from elsewhere, at unit pitch, and its weight."""

@@ -8,13 +8,16 @@ X = u (h - z) / h, Y = v (h - z) / h. With p = dz/dX, q = dz/dY, differentiating
 dw/dv likewise with q. w is depth to first order, zero where z is, and z = h (1 - exp(-w / h)).
 """
 
+from typing import TYPE_CHECKING, Final
+
 import torch
 from torch import Tensor, nn
 
 from ..core.checks import check_positive
 from ..core.geometry import pixel_grid_mm
 from .base import Integrator, as_integrator
-from .poisson import PoissonBackground, check_gradient
+from .poisson import PoissonBackground, PoissonDCT, check_gradient
+from .screened import check_prior
 
 LEAST_COSINE = 0.05
 """Of h + p u + q v, relative to h: a surface steeper than that turns away from the camera."""
@@ -54,6 +57,11 @@ class PerspectiveIntegration(Integrator):
     """
 
     poisson = PoissonBackground
+    takes_prior: Final[bool]
+
+    if TYPE_CHECKING:
+
+        def __call__(self, gradient: Tensor, prior_mm: Tensor | None = None, prior_weight: Tensor | None = None) -> Tensor: ...
 
     def __init__(self, mm_per_pixel: float, camera_height_mm: float, integrate: nn.Module | None = None) -> None:
         super().__init__()
@@ -61,13 +69,30 @@ class PerspectiveIntegration(Integrator):
         self.camera_height_mm = check_positive("camera_height_mm", camera_height_mm)
         self.least_facing_mm = LEAST_COSINE * self.camera_height_mm
         self.integrate = self.poisson(mm_per_pixel) if integrate is None else as_integrator(integrate)
+        self.takes_prior = isinstance(self.integrate, PoissonDCT)
 
-    def forward(self, gradient: Tensor) -> Tensor:
+    def forward(self, gradient: Tensor, prior_mm: Tensor | None = None, prior_weight: Tensor | None = None) -> Tensor:
+        """Depth in mm, (B, 1, H, W); the prior as :meth:`PoissonDCT.forward` takes it, its depths below the camera's height.
+
+        Raises:
+            ValueError: as there, and a prior for an integrator that takes none. TypeError: as there.
+        """
         check_gradient(gradient, 2)
         u, v = pixel_grid_mm(gradient.shape[2], gradient.shape[3], self.mm_per_pixel, gradient.dtype, gradient.device)
         h = self.camera_height_mm
         facing = (h + gradient[:, 0:1] * u + gradient[:, 1:2] * v).clamp_min(self.least_facing_mm)
-        w: Tensor = self.integrate(gradient * (h / facing))
+        seen = gradient * (h / facing)
+        if self.takes_prior:
+            if prior_mm is not None and prior_weight is not None:
+                check_prior(gradient, prior_mm, prior_weight)
+                # dz / dw at the prior, so that its weight is that of z
+                above = (1.0 - prior_mm / h).clamp_min(self.least_facing_mm / h)
+                prior_mm, prior_weight = -h * torch.log(above), prior_weight * above.square()
+            w: Tensor = self.integrate(seen, prior_mm, prior_weight)  # type: ignore[call-arg]
+        else:
+            if prior_mm is not None or prior_weight is not None:
+                raise ValueError("prior_mm: expected none, got one: only PoissonDCT and PoissonBackground take a prior")
+            w = self.integrate(seen)
         return -h * torch.expm1(-w / h)
 
     def extra_repr(self) -> str:

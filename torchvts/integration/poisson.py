@@ -5,20 +5,22 @@ five-point Laplacian on the left and the difference of edge gradients on the rig
 exact inverses of one discrete operator.
 """
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor, nn
 
 from ..core.checks import check_batch, check_positive, has_memory
 from ..core.precision import widened
 from .base import Integrator
+from .screened import check_prior, solve_screened
 from .transforms import (
     cosine_tables,
-    deinterleave,
     fold,
-    interleave,
     inverse_or_zero,
     reordering,
     sine_bases,
+    solve_by_fft,
     unfold,
 )
 
@@ -136,7 +138,21 @@ class PoissonDST(Integrator):
 
 
 class PoissonDCT(Integrator):
-    """Module for :func:`poisson_dct`; keeps the tables of the last size, so that a stream of frames makes them once."""
+    """Module for :func:`poisson_dct`; keeps the tables of the last size, so that a stream of frames makes them once.
+
+    Depth that is known from elsewhere, by touch or by another sensor, is its prior: the depth then minimises
+    ``|grad z - g|^2 + weight (z - prior)^2``, summed over the pixels, and counts from the prior's zero.
+
+    Example:
+        >>> gradient, known = torch.zeros(1, 2, 24, 32), torch.full((1, 1, 24, 32), 0.3)
+        >>> depth = PoissonDCT(0.1)(gradient, prior_mm=known, prior_weight=torch.ones(1, 1, 1, 1))
+        >>> bool((depth - 0.3).abs().max() < 1e-6)
+        True
+    """
+
+    if TYPE_CHECKING:
+
+        def __call__(self, gradient: Tensor, prior_mm: Tensor | None = None, prior_weight: Tensor | None = None) -> Tensor: ...
 
     def __init__(self, mm_per_pixel: float = 1.0) -> None:
         super().__init__()
@@ -144,7 +160,19 @@ class PoissonDCT(Integrator):
         self.zero_in_background = False
         self._plan: list[Tensor] = _plan_dct(torch.zeros(1, dtype=torch.float64), 2, 2)
 
-    def forward(self, gradient: Tensor) -> Tensor:
+    def forward(self, gradient: Tensor, prior_mm: Tensor | None = None, prior_weight: Tensor | None = None) -> Tensor:
+        """Depth in mm, (B, 1, H, W).
+
+        Args:
+            gradient: (B, 2, H, W), (dz/dx, dz/dy), mm per mm.
+            prior_mm: (B, 1, H, W), depth that is known from elsewhere, mm; (1, 1, H, W) for all frames. Needs ``prior_weight``.
+            prior_weight: how much it counts, at least 0, per mm^2: slopes are followed over lengths below 1 / sqrt(weight), in
+                mm, the prior over longer ones. (B, 1, H, W), 0 where nothing is known, 1e6 where the depth is fixed; or, for
+                all pixels, (B, 1, 1, 1), or (1, 1, 1, 1), which is several times as fast.
+        Raises:
+            ValueError: other shapes, H or W below 2, a prior without weight, negative weights, values of a prior that are not
+                finite. TypeError: not floating point.
+        """
         check_gradient(gradient, 2)
         height, width = gradient.shape[2], gradient.shape[3]
         plan, like = self._plan, _wide(gradient)
@@ -152,9 +180,16 @@ class PoissonDCT(Integrator):
             plan = _kept(_plan_dct(like, height, width))
             if _plain(plan[2]):
                 self._plan = plan
+        if prior_mm is None or prior_weight is None:
+            if prior_mm is not None or prior_weight is not None:
+                raise ValueError("prior_mm, prior_weight: expected both or neither, got one of them")
+            return _integrate_dct(gradient, self.mm_per_pixel, plan, self.zero_in_background)
+        check_prior(gradient, prior_mm, prior_weight)
         if gradient.shape[0] == 0:
-            return gradient.new_zeros([0, 1, height, width])
-        return _integrate_dct(gradient, self.mm_per_pixel, plan, self.zero_in_background)
+            return gradient[:, 0:1]
+        right = self.mm_per_pixel * divergence(widened(gradient))
+        pull = self.mm_per_pixel**2 * widened(prior_weight)
+        return solve_screened(right, pull, widened(prior_mm), plan).to(gradient.dtype)
 
 
 class PoissonBackground(PoissonDCT):
@@ -191,7 +226,9 @@ def _integrate_dst(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor]) ->
 
 def _integrate_dct(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], zero_in_background: bool) -> Tensor:
     """In double precision: waves as long as the image are nearly all of the depth, and single rounds them at every step."""
-    depth = _solve_by_fft(mm_per_pixel * divergence(widened(gradient)), plan)
+    if gradient.shape[0] == 0:
+        return gradient[:, 0:1]  # a transform of nothing is an error
+    depth = solve_by_fft(mm_per_pixel * divergence(widened(gradient)), plan)
     if zero_in_background:
         depth = _zero_in_background(depth, gradient)
     return depth.to(gradient.dtype)
@@ -209,7 +246,7 @@ def laplace_plan(like: Tensor) -> list[Tensor]:
 
 def solve_laplace(right: Tensor, plan: list[Tensor]) -> Tensor:
     """(B, 1, H, W) of zero mean whose five-point Laplacian with a free border is ``right`` less its mean."""
-    return _solve_by_fft(right, plan)
+    return solve_by_fft(right, plan)
 
 
 def _kept(plan: list[Tensor]) -> list[Tensor]:
@@ -236,7 +273,7 @@ def _plan_dst(gradient: Tensor) -> list[Tensor]:
 
 
 def _plan_dct(like: Tensor, height: int, width: int) -> list[Tensor]:
-    """The seven tables of :func:`_solve_by_fft`, of the dtype and on the device of ``like``."""
+    """The seven tables of :func:`solve_by_fft`, of the dtype and on the device of ``like``."""
     order = [reordering(height).to(like.device), reordering(width).to(like.device)]
     kind = torch.complex128 if like.dtype == torch.float64 else torch.complex64
     there, back, of_sum, of_difference, back_y = cosine_tables(height, width)
@@ -275,20 +312,3 @@ def _solve(right: Tensor, plan: list[Tensor]) -> Tensor:
         basis_y, basis_x, inverse = plan[3 * i], plan[3 * i + 1], plan[3 * i + 2]
         blocks[i] = basis_y.t() @ ((basis_y @ blocks[i] @ basis_x.t()) * inverse) @ basis_x
     return unfold(unfold(blocks[0], blocks[1], -1), unfold(blocks[2], blocks[3], -1), -2)
-
-
-def _solve_by_fft(right: Tensor, plan: list[Tensor]) -> Tensor:
-    """The same with a free border, by one real FFT there and one back."""
-    there, back, of_sum, of_difference, back_y, order_y = plan[0], plan[1], plan[2], plan[3], plan[4], plan[5]
-    height, width = int(order_y.shape[0]), right.shape[-1]
-    lines = torch.fft.rfft(interleave(right)).transpose(2, 3)  # (B, 1, W // 2 + 1, H): columns are contiguous from here on
-    lines = lines.new_zeros(lines.shape).index_copy_(3, order_y, lines)
-    spectrum = torch.fft.fft(lines)
-    up = torch.view_as_real(spectrum.narrow(3, 0, height // 2 + 1) * there[0])
-    down = torch.view_as_real(spectrum.index_select(3, back_y) * there[1])
-    total, difference = (up + down) * of_sum, up - down
-    up = torch.view_as_complex(torch.addcmul(total, difference, of_difference)) * back[0]
-    down = torch.view_as_complex(torch.addcmul(total, difference, of_difference, value=-1.0)) * back[1]
-    spectrum = torch.cat((up, down[..., 1 : (height + 1) // 2].flip(3)), dim=3)
-    lines = torch.fft.irfft(torch.fft.ifft(spectrum), n=width, dim=2).transpose(2, 3)
-    return deinterleave(lines.index_select(2, order_y))

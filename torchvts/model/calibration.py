@@ -200,6 +200,11 @@ class Calibration:
         """The fields without the cached arrays, so that pickles and copies stay small."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
+    @property
+    def metric(self) -> bool:
+        """Whether depth is in mm, as far as its calibration knows; ``report["objection"]`` says why not."""
+        return not self.report.get("objection")
+
     @cached_property
     def flat(self) -> Tensor:
         """(3, H, W), compensated image of the undeformed skin: ``model_image`` for lights, 1 for a response field."""

@@ -3,6 +3,7 @@
 import math
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor, nn
 
 from ..core.checks import brief, check_record
@@ -99,15 +100,17 @@ def as_normal_model(module: nn.Module) -> NormalModel:
     return module if isinstance(module, NormalModel) else WrappedNormals(module)
 
 
-def check_normals(model: nn.Module, normal: object, image: Tensor) -> None:
+def check_normals(model: nn.Module, normal: object, image: Tensor) -> str:
     """Raise unless what a module gives can be the normals of an image. Reads values.
 
     Args:
         model: the module, named in errors.
         normal: what it gave.
         image: (B, 3, H, W), what it was given.
+    Returns:
+        The module's name.
     Raises:
-        TypeError: no tensor, or of another dtype.
+        TypeError: no tensor, or of another dtype; fewer bits are taken where autocast chose them.
         ValueError: of another shape, values that are not finite, or normals coded as colours.
     """
     name = type(model.module if isinstance(model, WrappedNormals) else model).__name__
@@ -119,10 +122,11 @@ def check_normals(model: nn.Module, normal: object, image: Tensor) -> None:
             f"normals: expected {wanted} from {name}, the shape of its input, got {tuple(normal.shape)}: "
             "three components in dimension 1, one normal for each pixel"
         )
-    if normal.dtype != image.dtype:
+    lowered = torch.is_autocast_enabled(image.device.type) and normal.dtype in (torch.float16, torch.bfloat16)
+    if normal.dtype != image.dtype and not lowered:
         raise TypeError(f"normals: expected {image.dtype} from {name}, the type of its input, got {normal.dtype}: cast it back")
     if normal.numel() == 0:
-        return
+        return name
     values = normal.detach()
     low, high = (float(value) for value in values.aminmax())
     if not (math.isfinite(low) and math.isfinite(high)):
@@ -138,6 +142,7 @@ def check_normals(model: nn.Module, normal: object, image: Tensor) -> None:
             f"normals: expected unit vectors from {name}, in [-1, 1] and zero in x and y on undeformed skin, got [{low:.4g}, "
             f"{high:.4g}]: coded as colours? take 2 * value - 1, of values in [0, 1]"
         )
+    return name
 
 
 def check_domain(model: NormalModel, given: str | None) -> None:

@@ -158,6 +158,7 @@ class DepthPipeline(nn.Module):
             mode: "fast", "precise" or "auto".
             normals: module to put in place of the calibrated inverse model. It gets what that model would: the image scaled to the
                 light model's, or image / background for a response field. One that declares another ``input_domain`` is refused.
+                One that takes no depth is asked once a frame, in mode auto, too; precise refuses it.
             integrate: module to put in place of PoissonDCT.
             contact: thresholds of what has moved and what touches; None for those of the unit.
         Raises:
@@ -304,7 +305,8 @@ class DepthPipeline(nn.Module):
         check_settings(self, state)
 
     def extra_repr(self) -> str:
-        return f"mode={self.mode}, mm_per_pixel={self.mm_per_pixel}"
+        once = ", one pass: normals take no depth" if self.mode == "auto" and isinstance(self.refine, Once) else ""
+        return f"mode={self.mode}{once}, mm_per_pixel={self.mm_per_pixel}"
 
 
 def eval_around(module: _Module, *given: nn.Module | None) -> _Module:

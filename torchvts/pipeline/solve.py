@@ -1,5 +1,6 @@
 """One pass: from a compensated image to normals, slopes and depth (eq. 9 or 10, 5 and 4 of the paper)."""
 
+import warnings
 from typing import Final
 
 import torch
@@ -10,12 +11,14 @@ from ..core.frame import Frame, Solution
 from ..integration import Integrator
 from ..normals import NormalModel, WrappedNormals
 from ..normals.base import check_normals
+from .own_normals import doubt_of_axes
 
 
 class Solve(nn.Module):
     """Normals, gradient and depth of a :class:`~torchvts.core.frame.Frame`.
 
-    What a module from outside of this library gives is checked, for eager tensors on a CPU.
+    What a module from outside of this library gives is checked, for eager tensors on a CPU; a warning says once
+    where the axes of its normals are likely wrong.
 
     Args:
         normals: compensated image to normals.
@@ -33,6 +36,7 @@ class Solve(nn.Module):
         self.takes_noise = normals.takes_noise
         given = normals.module if isinstance(normals, WrappedNormals) else normals
         self.from_outside = not type(given).__module__.startswith("torchvts.")
+        self._axes_known = False  # asked of the first frame that shows a contact
         self.gradient = gradient
         self.integrate = integrate
         self.zero = zero
@@ -47,12 +51,19 @@ class Solve(nn.Module):
         normal = self.normals(image, depth_mm, noise_std) if self.takes_noise else self.normals(image, depth_mm)
         if not torch.jit.is_scripting():
             self._check(normal, image)
-        gradient: Tensor = self.gradient(normal)
+        gradient: Tensor = self.gradient(normal.to(image.dtype))  # under autocast a network gives fewer bits
         return gradient
 
     def _check(self, normal: Tensor, image: Tensor) -> None:
-        if self.from_outside and reads_freely(image):
-            check_normals(self.normals, normal, image)
+        if not (self.from_outside and reads_freely(image)):
+            return
+        name = check_normals(self.normals, normal, image)
+        if self._axes_known or normal.requires_grad or normal.numel() == 0:  # in training they may be anything
+            return
+        doubt = doubt_of_axes(name, normal.detach().to(image.dtype))
+        self._axes_known = doubt is not None
+        if doubt:
+            warnings.warn(doubt, UserWarning, stacklevel=2)
 
     @torch.jit.export
     def integrated(self, frame: Frame, gradient: Tensor) -> Solution:

@@ -263,7 +263,7 @@ def _described(calibration: Calibration, note: str) -> StreamCalibration:
     objection = calibration.report.get("objection", "")
     if objection:
         note = "; ".join([note] + ([] if objection in note else [objection]) + [NOT_METRIC])
-    return StreamCalibration(calibration, note, not objection)
+    return StreamCalibration(calibration, note, calibration.metric)
 
 
 def with_background(calibration: Calibration, background: Tensor) -> Calibration:

@@ -1,0 +1,93 @@
+r"""Integration with a depth prior: the depth that follows both a gradient and, by a weight, a depth that is known from elsewhere.
+
+It minimises the sum over the image of ``|grad z - g|^2 + weight (z - prior)^2``, in mm; its normal equations are the Laplacian
+of :func:`poisson_dct` less ``weight * mm_per_pixel^2`` on the diagonal. One weight for all pixels leaves it diagonal under the
+cosine transform; a map of weights is solved by conjugate gradients with that transform as preconditioner.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from ..core.checks import check_batch, check_same_count, check_same_size, reads_freely
+from .transforms import inverse_or_zero, solve_by_fft
+
+MAX_ITERATIONS = 1000
+"""Bound on the conjugate-gradient steps. A prior in half of an image of 96 x 128 takes 20 of weight 1 and 250 of weight 1e6."""
+
+
+def check_prior(gradient: Tensor, prior_mm: Tensor, prior_weight: Tensor) -> None:
+    """Raise unless a prior and its weight belong to a gradient (B, 2, H, W). Scripts.
+
+    Args:
+        gradient: checked.
+        prior_mm: (B, 1, H, W), or (1, 1, H, W) for all frames.
+        prior_weight: of the same shape, or (B, 1, 1, 1) or (1, 1, 1, 1) for all pixels.
+    Raises:
+        ValueError: other shapes, negative weights, values that are not finite. TypeError: not floating point.
+    """
+    for name, value in (("prior_mm", prior_mm), ("prior_weight", prior_weight)):
+        check_batch(name, value, 1)
+        check_same_count(name, value, "gradient", gradient.shape[0])
+        if name == "prior_mm" or value.shape[2] * value.shape[3] > 1:
+            check_same_size(name, value, "gradient", gradient.shape[2], gradient.shape[3])
+        if not torch.jit.is_scripting():
+            _check_values(name, value)
+
+
+def _check_values(name: str, value: Tensor) -> None:
+    if not reads_freely(value) or value.numel() == 0:
+        return
+    if not bool(torch.isfinite(value).all()):
+        raise ValueError(f"{name}: expected finite values, got NaN or infinite ones: set unknown pixels to 0, and their weight too")
+    if name == "prior_weight" and bool((value < 0).any()):
+        raise ValueError(f"{name}: expected values of at least 0, got {float(value.min()):g}")
+
+
+def solve_screened(right: Tensor, pull: Tensor, prior: Tensor, plan: list[Tensor], max_iterations: int = MAX_ITERATIONS) -> Tensor:
+    """The depth whose Laplacian is ``right + pull (depth - prior)``, (B, 1, H, W). Scripts; differentiable in all arguments.
+
+    Args:
+        right: (B, 1, H, W), divergence of the edges' slopes times the pitch.
+        pull: weight times the square of the pitch, as :func:`check_prior` has it.
+        prior: (B, 1, H, W) or (1, 1, H, W).
+        plan: tables for the size.
+        max_iterations: of a map of weights.
+    """
+    target = right - pull * prior
+    if pull.shape[2] * pull.shape[3] == 1:
+        return solve_by_fft(target, screened(plan, pull))
+    pull = pull.expand(right.shape)
+    scale = (1.0 + 0.25 * pull).rsqrt()  # pixels that are as good as fixed are taken out of the Laplacian, whose diagonal is -4
+    tables = screened(plan, (pull * scale.square()).mean(dim=(2, 3), keepdim=True).detach())
+    residual = -target
+    towards = -scale * solve_by_fft(scale * residual, tables)
+    search, depth = towards, torch.zeros_like(right)
+    size = (residual * towards).sum(dim=(1, 2, 3), keepdim=True)
+    enough = 1e-20 * size.detach()
+    for _ in range(max_iterations):
+        if bool((size <= enough).all()):
+            break
+        image = pull * search - laplacian(search)
+        step = size / (search * image).sum(dim=(1, 2, 3), keepdim=True).clamp_min(1e-300)
+        depth, residual = depth + step * search, residual - step * image
+        towards = -scale * solve_by_fft(scale * residual, tables)
+        before, size = size, (residual * towards).sum(dim=(1, 2, 3), keepdim=True)
+        search = towards + size / before.clamp_min(1e-300) * search
+    return depth
+
+
+def laplacian(depth: Tensor) -> Tensor:
+    """Five-point Laplacian with a free border, (B, 1, H, W), of unit pitch. Scripts."""
+    padded = nn.functional.pad(depth, [1, 1, 1, 1], mode="replicate")
+    beside = padded[..., 1:-1, 2:] + padded[..., 1:-1, :-2] + padded[..., 2:, 1:-1] + padded[..., :-2, 1:-1]
+    return beside - 4.0 * depth
+
+
+def screened(plan: list[Tensor], pull: Tensor) -> list[Tensor]:
+    """Tables of the Laplacian less a number per frame, (B, 1, 1, 1). Scripts."""
+    off = pull.unsqueeze(-1)
+    tables = list(plan)
+    for k in (2, 3):
+        inverse = plan[k]
+        tables[k] = torch.where(inverse == 0.0, -inverse_or_zero(off), inverse / (1.0 - off * inverse))
+    return tables

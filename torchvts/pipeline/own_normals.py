@@ -1,0 +1,60 @@
+"""What is likely wrong with the axes of normals that a module from outside gives: named once, where its values are checked."""
+
+from torch import Tensor
+
+from ..core.geometry import gradient_from_normal
+from ..integration import divergence, poisson_dct
+
+FACING_AWAY = 0.5
+"""Share of pixels whose normals face away from the camera, from which z is turned over."""
+
+LEAST_SLOPE = 0.02
+"""RMS of the slopes of a frame that says something of their axes."""
+
+CONTRADICTED = 0.3
+"""Share of the slopes' energy that no surface has, from which their axes are asked about: it is 0.01 of balls, 0.5 of balls
+with an axis turned over or both swapped, 1 with both, and 0.6 of noise alone."""
+
+TURNED = {
+    "y seems to count upwards, or x to the left: negate that component": (1.0, -1.0, False),
+    "x and y seem swapped: give them in the order x, y, z": (1.0, 1.0, True),
+    "x and y seem swapped, and one of them turned over": (1.0, -1.0, True),
+}
+
+
+def doubt_of_axes(name: str, normal: Tensor) -> str | None:
+    """What is likely wrong with normals (B, 3, H, W) of the module ``name``: "" for nothing, None where too little is inclined.
+
+    Example:
+        >>> import torch
+        >>> up = torch.tensor([0.0, 0.0, -1.0]).reshape(1, 3, 1, 1).expand(1, 3, 8, 8)
+        >>> doubt_of_axes("Net", up)
+        'normals: Net gives normals that face away from the camera in 100% of the image: n_z is above 0 here: negate it'
+    """
+    away = float((normal[:, 2] < 0).double().mean())
+    if away > FACING_AWAY:
+        seen = f"normals: {name} gives normals that face away from the camera in {away:.0%} of the image"
+        return f"{seen}: n_z is above 0 here: negate it"
+    gradient = gradient_from_normal(normal).double()
+    if gradient.shape[2] < 2 or gradient.shape[3] < 2 or float(gradient.square().mean().sqrt()) < LEAST_SLOPE:
+        return None
+    as_given = _contradicted(gradient)
+    if as_given < CONTRADICTED:
+        return ""
+    shares = {}
+    for cause, (of_x, of_y, swapped) in TURNED.items():
+        turned = (gradient.flip(1) if swapped else gradient) * gradient.new_tensor([of_x, of_y]).reshape(1, 2, 1, 1)
+        shares[cause] = _contradicted(turned)
+    likely = min(shares, key=lambda cause: shares[cause])
+    if shares[likely] > 0.5 * as_given:
+        return ""
+    return f"normals: {as_given:.0%} of the slopes of {name} are those of no surface, {shares[likely]:.0%} otherwise: {likely}"
+
+
+def _contradicted(gradient: Tensor) -> float:
+    """Share of the energy of slopes that no depth has, 0 to 1."""
+    p, q = gradient[:, 0], gradient[:, 1]
+    along_x, along_y = 0.5 * (p[..., 1:] + p[..., :-1]), 0.5 * (q[..., 1:, :] + q[..., :-1, :])
+    energy = float(along_x.square().sum() + along_y.square().sum())
+    kept = -float((poisson_dct(gradient) * divergence(gradient)).sum())
+    return 1.0 - kept / energy if energy > 0 else 0.0

@@ -131,7 +131,8 @@ class CheckedDataset:
         assert set(arrays) == set(self.features) and isinstance(frame["task"], str)
         for name, value in arrays.items():
             feature = self.features[name]
-            dtype = "uint8" if feature["dtype"] in ("image", "video") else feature["dtype"]
+            depth = feature.get("info", {}).get("is_depth_map", False)
+            dtype = "uint8" if feature["dtype"] in ("image", "video") and not depth else "float32"
             assert isinstance(value, np.ndarray) and value.dtype == dtype and value.shape == feature["shape"], name
             assert "/" not in name and len(feature["names"]) in (len(value.shape), value.size)
         self.frames.append(arrays)
@@ -148,7 +149,8 @@ def test_an_episode_has_the_features_of_its_data_set(frame, small_sensor):
     area, deepest = dataset.frames[0]["observation.left_finger.state"]
     assert area == pytest.approx(int(frame.output.contact.sum()) * PITCH**2)
     assert deepest == pytest.approx(float(frame.output.depth_mm.max()))
-    np.testing.assert_array_equal(dataset.frames[1]["observation.left_finger.depth_mm"], later.output.depth_mm[0, 0].numpy())
+    depth_m = dataset.frames[1]["observation.images.left_finger_depth"]
+    np.testing.assert_allclose(1e3 * depth_m[..., 0], later.output.depth_mm[0, 0].numpy(), rtol=1e-6)
 
 
 @pytest.mark.parametrize(

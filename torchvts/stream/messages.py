@@ -17,6 +17,7 @@ from ..model import Sensor
 from .live import TactileFrame
 
 __all__ = [
+    "LEROBOT_DEPTH",
     "CloudMessage",
     "EpisodeDataset",
     "Header",
@@ -41,6 +42,9 @@ POINT_FIELDS = ("x", "y", "z", "normal_x", "normal_y", "normal_z")
 
 STATE_NAMES = ("contact_area_mm2", "largest_depth_mm")
 """What :func:`lerobot_frame` states of a frame beside its images."""
+
+LEROBOT_DEPTH = {"depth_min": -0.0001, "depth_max": 0.004, "use_log": False}
+"""For LeRobot's ``DepthEncoderConfig``, metres: a video of depth has steps of 1 um up to 4 mm. Its own range begins at 10 mm."""
 
 
 @dataclass(frozen=True)
@@ -177,22 +181,20 @@ def lerobot_features(sensor: Sensor, name: str = "tactile", image_dtype: str = "
     Args:
         sensor: gives the size of the frames.
         name: of the sensor, as in "observation.images.<name>".
-        image_dtype: "video" or "image": how the data set stores the camera's images.
+        image_dtype: "video" or "image": how the data set stores images and depth. Videos need :data:`LEROBOT_DEPTH`.
     Returns:
-        For each feature its dtype, shape and names of its axes: the camera's image, depth in mm, and :data:`STATE_NAMES`.
+        For each feature its dtype, shape and names of its axes: the camera's image, depth, whose unit is in its info, and
+        :data:`STATE_NAMES`.
     Example:
-        >>> lerobot_features(Sensor("rig", 240, 320, 0.06))["observation.tactile.depth_mm"]
-        {'dtype': 'float32', 'shape': (240, 320), 'names': ['height', 'width']}
+        >>> lerobot_features(Sensor("rig", 240, 320, 0.06))["observation.images.tactile_depth"]["info"]
+        {'is_depth_map': True, 'depth_unit': 'm'}
     """
     check_choice("image_dtype", image_dtype, ("video", "image"))
     height, width = sensor.height, sensor.width
+    axes, depth = ["height", "width", "channels"], {"is_depth_map": True, "depth_unit": "m"}
     return {
-        f"observation.images.{name}": {
-            "dtype": image_dtype,
-            "shape": (height, width, 3),
-            "names": ["height", "width", "channels"],
-        },
-        f"observation.{name}.depth_mm": {"dtype": "float32", "shape": (height, width), "names": ["height", "width"]},
+        f"observation.images.{name}": {"dtype": image_dtype, "shape": (height, width, 3), "names": axes},
+        f"observation.images.{name}_depth": {"dtype": image_dtype, "shape": (height, width, 1), "names": axes, "info": depth},
         f"observation.{name}.state": {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": list(STATE_NAMES)},
     }
 
@@ -205,13 +207,13 @@ def lerobot_frame(frame: TactileFrame, mm_per_pixel: float, name: str = "tactile
         mm_per_pixel: pitch, mm.
         name: of the sensor, as in the features.
     Returns:
-        uint8 (H, W, 3), float32 (H, W) and float32 (2,).
+        uint8 (H, W, 3), float32 (H, W, 1), depth in metres, and float32 (2,).
     """
     depth_mm = _numpy(frame.output.depth_mm)[0, 0].astype(np.float32)
     area_mm2 = float(frame.output.contact.sum()) * check_positive("mm_per_pixel", mm_per_pixel) ** 2
     return {
         f"observation.images.{name}": _rgb8(frame.image),
-        f"observation.{name}.depth_mm": depth_mm,
+        f"observation.images.{name}_depth": (1e-3 * depth_mm)[..., None],
         f"observation.{name}.state": np.array([area_mm2, depth_mm.max()], dtype=np.float32),
     }
 

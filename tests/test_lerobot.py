@@ -95,7 +95,7 @@ def test_lerobot_writes_depth_and_reads_it_back_in_metres(unit, small_sensor, tm
     written = LeRobotDataset.create("torchvts/press", 10, features, tmp_path / "set", use_videos=True, depth_encoder=encoder)
     assert messages.record_episode([pressed] * 4, small_sensor.mm_per_pixel, written, "press a ball", "finger") == 4
     written.finalize()
-    read = LeRobotDataset("torchvts/press", root=tmp_path / "set", depth_output_unit="m")
+    read = LeRobotDataset("torchvts/press", root=tmp_path / "set", depth_output_unit="m", video_backend="pyav")
     assert read.meta.depth_keys == ["observation.images.finger_depth"]
     assert read.meta.features["observation.images.finger_depth"]["info"]["depth_unit"] == "m"
     depth_m = read[2]["observation.images.finger_depth"]

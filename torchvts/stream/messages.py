@@ -183,8 +183,7 @@ def lerobot_features(sensor: Sensor, name: str = "tactile", image_dtype: str = "
         name: of the sensor, as in "observation.images.<name>".
         image_dtype: "video" or "image": how the data set stores images and depth. Videos need :data:`LEROBOT_DEPTH`.
     Returns:
-        For each feature its dtype, shape and names of its axes: the camera's image, depth, whose unit is in its info, and
-        :data:`STATE_NAMES`.
+        Dtype, shape and names of the axes of the camera's image, of depth, whose unit is in its info, and of :data:`STATE_NAMES`.
     Example:
         >>> lerobot_features(Sensor("rig", 240, 320, 0.06))["observation.images.tactile_depth"]["info"]
         {'is_depth_map': True, 'depth_unit': 'm'}

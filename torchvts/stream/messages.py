@@ -17,6 +17,7 @@ from ..model import Sensor
 from .live import TactileFrame
 
 __all__ = [
+    "LEROBOT_DEPTH",
     "CloudMessage",
     "EpisodeDataset",
     "Header",
@@ -41,6 +42,9 @@ POINT_FIELDS = ("x", "y", "z", "normal_x", "normal_y", "normal_z")
 
 STATE_NAMES = ("contact_area_mm2", "largest_depth_mm")
 """What :func:`lerobot_frame` states of a frame beside its images."""
+
+LEROBOT_DEPTH = {"depth_min": -0.0001, "depth_max": 0.004, "use_log": False}
+"""For LeRobot's ``DepthEncoderConfig``, metres: a video of depth has steps of 1 um up to 4 mm. Its own range begins at 10 mm."""
 
 
 @dataclass(frozen=True)
@@ -171,70 +175,44 @@ def cloud_message(frame: TactileFrame, mm_per_pixel: float, frame_id: str = "tac
     return CloudMessage(stamp, 1, len(values), fields, False, step, step * len(values), values.tobytes(), True)
 
 
-DEPTH_DTYPES = ("float32", "video", "image")
-"""How a LeRobot data set may hold depth: as numbers, or, from lerobot 0.6 on, as 12-bit video or as TIFF files."""
-
-
-def lerobot_features(
-    sensor: Sensor, name: str = "tactile", image_dtype: str = "video", depth_dtype: str = "float32"
-) -> dict[str, dict[str, Any]]:
+def lerobot_features(sensor: Sensor, name: str = "tactile", image_dtype: str = "video") -> dict[str, dict[str, Any]]:
     """The features of a LeRobot data set that hold a tactile stream, for ``LeRobotDataset.create(..., features=...)``.
 
     Args:
         sensor: gives the size of the frames.
         name: of the sensor, as in "observation.images.<name>".
-        image_dtype: "video" or "image": how the data set stores the camera's images.
-        depth_dtype: "float32": numbers in mm; "video" or "image": a depth map of LeRobot's own, in metres. A video needs an encoder
-            for so small depths (docs/robotics.md): the usual one begins at 10 mm.
+        image_dtype: "video" or "image": how the data set stores images and depth. Videos need :data:`LEROBOT_DEPTH`.
     Returns:
-        For each feature its dtype, shape and names of its axes: the camera's image, depth, and :data:`STATE_NAMES`.
+        Dtype, shape and names of the axes of the camera's image, of depth, whose unit is in its info, and of :data:`STATE_NAMES`.
     Example:
-        >>> lerobot_features(Sensor("rig", 240, 320, 0.06))["observation.tactile.depth_mm"]
-        {'dtype': 'float32', 'shape': (240, 320), 'names': ['height', 'width']}
+        >>> lerobot_features(Sensor("rig", 240, 320, 0.06))["observation.images.tactile_depth"]["info"]
+        {'is_depth_map': True, 'depth_unit': 'm'}
     """
     check_choice("image_dtype", image_dtype, ("video", "image"))
-    check_choice("depth_dtype", depth_dtype, DEPTH_DTYPES)
     height, width = sensor.height, sensor.width
-    key = f"observation.{name}.depth_mm"
-    depth: dict[str, Any] = {"dtype": "float32", "shape": (height, width), "names": ["height", "width"]}
-    if depth_dtype != "float32":
-        key = f"observation.images.{name}_depth"
-        depth = {"dtype": depth_dtype, "shape": (height, width, 1), "names": ["height", "width", "channels"]}
-        depth["info"] = {"is_depth_map": True, "depth_unit": "m"}
+    axes, depth = ["height", "width", "channels"], {"is_depth_map": True, "depth_unit": "m"}
     return {
-        f"observation.images.{name}": {
-            "dtype": image_dtype,
-            "shape": (height, width, 3),
-            "names": ["height", "width", "channels"],
-        },
-        key: depth,
+        f"observation.images.{name}": {"dtype": image_dtype, "shape": (height, width, 3), "names": axes},
+        f"observation.images.{name}_depth": {"dtype": image_dtype, "shape": (height, width, 1), "names": axes, "info": depth},
         f"observation.{name}.state": {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": list(STATE_NAMES)},
     }
 
 
-def lerobot_frame(
-    frame: TactileFrame, mm_per_pixel: float, name: str = "tactile", depth_dtype: str = "float32"
-) -> dict[str, Array]:
+def lerobot_frame(frame: TactileFrame, mm_per_pixel: float, name: str = "tactile") -> dict[str, Array]:
     """A frame as the arrays that :func:`lerobot_features` describes.
 
     Args:
         frame: of a :class:`TactileStream`.
         mm_per_pixel: pitch, mm.
         name: of the sensor, as in the features.
-        depth_dtype: as in the features.
     Returns:
-        uint8 (H, W, 3), float32 (H, W) in mm or (H, W, 1) in metres, and float32 (2,).
+        uint8 (H, W, 3), float32 (H, W, 1), depth in metres, and float32 (2,).
     """
-    check_choice("depth_dtype", depth_dtype, DEPTH_DTYPES)
     depth_mm = _numpy(frame.output.depth_mm)[0, 0].astype(np.float32)
     area_mm2 = float(frame.output.contact.sum()) * check_positive("mm_per_pixel", mm_per_pixel) ** 2
     return {
         f"observation.images.{name}": _rgb8(frame.image),
-        **(
-            {f"observation.{name}.depth_mm": depth_mm}
-            if depth_dtype == "float32"
-            else {f"observation.images.{name}_depth": 1e-3 * depth_mm[..., None]}
-        ),
+        f"observation.images.{name}_depth": (1e-3 * depth_mm)[..., None],
         f"observation.{name}.state": np.array([area_mm2, depth_mm.max()], dtype=np.float32),
     }
 
@@ -255,7 +233,6 @@ def record_episode(
     dataset: EpisodeDataset,
     task: str,
     name: str = "tactile",
-    depth_dtype: str = "float32",
 ) -> int:
     """Write a stream as one episode of a LeRobot data set.
 
@@ -265,13 +242,12 @@ def record_episode(
         dataset: made with the features of :func:`lerobot_features`.
         task: what is done in the episode, in words.
         name: of the sensor, as in the features.
-        depth_dtype: as in the features.
     Returns:
         The number of frames; without any the episode is not saved.
     """
     count = 0
     for frame in frames:
-        dataset.add_frame({**lerobot_frame(frame, mm_per_pixel, name, depth_dtype), "task": task})
+        dataset.add_frame({**lerobot_frame(frame, mm_per_pixel, name), "task": task})
         count += 1
     if count > 0:
         dataset.save_episode()

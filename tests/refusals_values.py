@@ -152,8 +152,6 @@ BAD_KNOWN = {
     "known_mm": [*BAD_WEIGHTS, KNOWN["known_mm"] + NAN],
     "known_weight": [*BAD_WEIGHTS, KNOWN["known_weight"] - 2.0, KNOWN["known_weight"] + INF],
 }
-PRIOR = {"prior_mm": KNOWN["known_mm"], "prior_weight": KNOWN["known_weight"]}
-BAD_PRIOR = {"prior_mm": BAD_KNOWN["known_mm"], "prior_weight": BAD_KNOWN["known_weight"]}
 COMMON = {"height": INTEGER, "width": INTEGER, "mm_per_pixel": NUMBER, "sensor": SENSOR, "calibration": OTHERS}
 COMMON |= {"gradient": BAD_GRADIENT, "initial": BAD_POSE}
 """What an argument of this name refuses where its entry says nothing else."""

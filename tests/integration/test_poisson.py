@@ -11,6 +11,8 @@ import torch
 import torchvts as vts
 from lab import metrics
 from torchvts.integration import PerspectiveIntegration, divergence, integrate_discontinuities
+from torchvts.integration.poisson import laplace_plan
+from torchvts.integration.screened import solve_screened
 
 SIZES = [(3, 3), (4, 4), (5, 8), (8, 5), (7, 11), (13, 13), (12, 10), (3, 16), (15, 14), (9, 6)]
 both_ways = pytest.mark.parametrize("size", [(11, 13), (9, 14)], ids=["prime and odd", "small factors"])
@@ -156,7 +158,7 @@ def known_at(*places, weight=1.0):
     return found
 
 
-PRIORS = {
+KNOWN_AT = {
     "all alike": torch.full((1, 1, 1, 1), 2.0, dtype=torch.float64),
     "a pixel": known_at((3, 4)),
     "two fixed pixels": known_at((3, 4), (20, 9), weight=1e6),
@@ -164,22 +166,22 @@ PRIORS = {
 }
 
 
-@pytest.mark.parametrize("case", PRIORS)
+@pytest.mark.parametrize("case", KNOWN_AT)
 @pytest.mark.parametrize("kind", [vts.PoissonDCT, vts.PoissonBackground])
-def test_a_prior_that_agrees_gives_the_height_and_changes_no_slope(kind, case):
+def test_known_depth_that_agrees_gives_the_height_and_changes_no_slope(kind, case):
     depth, gradient = tilted()
-    found = kind(0.2)(gradient, depth * (PRIORS[case] > 0), PRIORS[case])
+    found = kind(0.2)(gradient, depth * (KNOWN_AT[case] > 0), KNOWN_AT[case])
     assert float((found - depth).abs().max()) < 1e-6
-    scripted = torch.jit.script(kind(0.2))(gradient, depth * (PRIORS[case] > 0), PRIORS[case])
+    scripted = torch.jit.script(kind(0.2))(gradient, depth * (KNOWN_AT[case] > 0), KNOWN_AT[case])
     assert torch.equal(scripted, found)
 
 
-def test_a_prior_and_slopes_that_disagree_are_weighed_by_least_squares():
+def test_known_depth_and_slopes_that_disagree_are_weighed_by_least_squares():
     pitch, random = 0.3, torch.Generator().manual_seed(5)
-    gradient, prior = random_gradient(6, 7), torch.randn(1, 1, 6, 7, generator=random, dtype=torch.float64)
+    gradient, known = random_gradient(6, 7), torch.randn(1, 1, 6, 7, generator=random, dtype=torch.float64)
     for weight in (torch.rand(1, 1, 6, 7, generator=random, dtype=torch.float64), torch.full((1, 1, 1, 1), 3.0).double()):
-        found = vts.PoissonDCT(pitch)(gradient, prior, weight).requires_grad_(True)
-        energy = (weight * (found - prior).square()).sum()
+        found = vts.PoissonDCT(pitch)(gradient, known, weight).requires_grad_(True)
+        energy = (weight * (found - known).square()).sum()
         for axis, dim in ((0, 3), (1, 2)):
             slope = gradient[:, axis : axis + 1]
             mean = 0.5 * (slope.narrow(dim, 1, slope.shape[dim] - 1) + slope.narrow(dim, 0, slope.shape[dim] - 1))
@@ -190,18 +192,27 @@ def test_a_prior_and_slopes_that_disagree_are_weighed_by_least_squares():
 
 @pytest.mark.parametrize("weight", [torch.rand(2, 1, 5, 6).double(), torch.rand(2, 1, 1, 1).double()], ids=["map", "uniform"])
 @pytest.mark.parametrize("block", [vts.PoissonDCT(0.5), PerspectiveIntegration(0.5, 30.0)], ids=["flat", "perspective"])
-def test_a_prior_has_derivatives(block, weight):
+def test_known_depth_has_derivatives(block, weight):
     given = (0.1 * random_gradient(5, 6, batch=2), torch.rand(2, 1, 5, 6).double(), weight.clone())
     assert torch.autograd.gradcheck(block, tuple(value.requires_grad_(True) for value in given))
 
 
-def test_a_prior_seen_by_a_pinhole_keeps_its_height():
+def test_known_depth_that_does_not_settle_is_told():
+    depth, gradient = tilted()
+    right, pull = 0.2 * divergence(gradient), 0.04 * KNOWN_AT["a fixed half"]
+    with pytest.warns(UserWarning, match="known_weight: the depth of 1 of 1 frames has not settled in 3 steps"):
+        solve_screened(right, pull, depth, laplace_plan(gradient), 1e-10, max_iterations=3)
+
+
+def test_known_depth_seen_by_a_pinhole_keeps_its_height():
     block = PerspectiveIntegration(0.2, 30.0)
     flat, known = torch.zeros(1, 2, 24, 31, dtype=torch.float64), torch.full((1, 1, 24, 31), 1.5, dtype=torch.float64)
-    for weight in PRIORS.values():
+    for weight in KNOWN_AT.values():
         assert torch.jit.script(block)(flat, known, weight) == pytest.approx(1.5, abs=1e-6)
-    with pytest.raises(ValueError, match="prior_mm: expected none, got one: only PoissonDCT and PoissonBackground take a prior"):
-        PerspectiveIntegration(0.2, 30.0, vts.PoissonDST(0.2))(flat, known, PRIORS["a pixel"])
+    with pytest.raises(
+        ValueError, match="known_mm: expected none, got one: only PoissonDCT and PoissonBackground take known depth"
+    ):
+        PerspectiveIntegration(0.2, 30.0, vts.PoissonDST(0.2))(flat, known, KNOWN_AT["a pixel"])
 
 
 def test_sphere_error_is_the_integrators_floor_of_the_paper():

@@ -15,6 +15,7 @@ from ..core.checks import check_batch, check_float_tensor, check_integer, check_
 from ..core.geometry import lengths
 from .base import Integrator
 from .poisson import PoissonBackground, check_gradient, laplace_plan, solve_laplace
+from .screened import check_known
 
 SLOPE_STD = 0.05
 """Noise of the slope of flat pixels; a factor of two up or down changes little."""
@@ -83,8 +84,9 @@ def integrate_discontinuities(
         weight: (B, 1, H, W) in [0, 1], how far each pixel's slope is to be trusted; 0 for missing: bridged as by a membrane.
             None for 1.
         known_mm: (B, 1, H, W), depth of pixels that is known from elsewhere, mm; needs ``known_weight``.
-        known_weight: (B, 1, H, W), at least 0, how much each counts beside the others of its contact. All of a contact together
-            weigh as one edge between two flat pixels: they give its height, the slopes its shape.
+        known_weight: (B, 1, H, W), at least 0, how much each counts beside the others of its contact, not per mm^2 as in
+            :class:`PoissonDCT`. All of a contact together weigh as one edge between two flat pixels: they give its height, the
+            slopes its shape.
     Returns:
         Depth in mm, (B, 1, H, W). Without any undeformed pixel, the lowest depth is zero.
     Raises:
@@ -189,14 +191,9 @@ class DiscontinuityIntegration(Integrator):
             if known_mm is not None or known_weight is not None:
                 raise ValueError("known_mm, known_weight: expected both or neither, got one of them")
             return torch.zeros_like(gradient)
-        for name, value in (("known_mm", known_mm), ("known_weight", known_weight)):
-            check_shape(name, value, (gradient.shape[0], 1, *gradient.shape[2:]), "gradient")
-            check_float_tensor(name, value)
-            if not bool(torch.isfinite(value).all()):
-                raise ValueError(f"{name}: expected finite values, got NaN or infinite ones: give unknown pixels the weight 0")
-        if not bool((known_weight >= 0).all()):
-            raise ValueError(f"known_weight: expected values of at least 0, got {float(known_weight.min()):g}")
-        return torch.cat((known_mm / self.mm_per_pixel, known_weight), dim=1).to(gradient.dtype)
+        check_known(gradient, known_mm, known_weight)
+        parts = (known_mm / self.mm_per_pixel, known_weight)
+        return torch.cat([part.expand(gradient[:, :1].shape) for part in parts], dim=1).to(gradient.dtype)
 
     def _solve_frame(self, gradient: Tensor, contacts: Tensor, trust: Tensor, known: Tensor) -> tuple[Tensor, bool, int, int]:
         """Depth at unit pitch, whether it settled, passes, conjugate-gradient steps."""

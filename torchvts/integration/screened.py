@@ -1,9 +1,11 @@
-r"""Integration with a depth prior: the depth that follows both a gradient and, by a weight, a depth that is known from elsewhere.
+r"""Integration with known depth: the depth that follows both a gradient and, by a weight, a depth that is known from elsewhere.
 
-It minimises the sum over the image of ``|grad z - g|^2 + weight (z - prior)^2``, in mm; its normal equations are the Laplacian
+It minimises the sum over the image of ``|grad z - g|^2 + weight (z - known)^2``, in mm; its normal equations are the Laplacian
 of :func:`poisson_dct` less ``weight * mm_per_pixel^2`` on the diagonal. One weight for all pixels leaves it diagonal under the
 cosine transform; a map of weights is solved by conjugate gradients with that transform as preconditioner.
 """
+
+import warnings
 
 import torch
 from torch import Tensor, nn
@@ -12,23 +14,23 @@ from ..core.checks import check_batch, check_same_count, check_same_size, reads_
 from .transforms import inverse_or_zero, solve_by_fft
 
 MAX_ITERATIONS = 1000
-"""Bound on the conjugate-gradient steps. A prior in half of an image of 96 x 128 takes 20 of weight 1 and 250 of weight 1e6."""
+"""Bound on the conjugate-gradient steps. Known depth in half of an image of 96 x 128 takes 20 of weight 1 and 250 of weight 1e6."""
 
 
-def check_prior(gradient: Tensor, prior_mm: Tensor, prior_weight: Tensor) -> None:
-    """Raise unless a prior and its weight belong to a gradient (B, 2, H, W). Scripts.
+def check_known(gradient: Tensor, known_mm: Tensor, known_weight: Tensor) -> None:
+    """Raise unless known depth and its weight belong to a gradient (B, 2, H, W). Scripts.
 
     Args:
         gradient: checked.
-        prior_mm: (B, 1, H, W), or (1, 1, H, W) for all frames.
-        prior_weight: of the same shape, or (B, 1, 1, 1) or (1, 1, 1, 1) for all pixels.
+        known_mm: (B, 1, H, W), or (1, 1, H, W) for all frames.
+        known_weight: of the same shape, or (B, 1, 1, 1) or (1, 1, 1, 1) for all pixels.
     Raises:
         ValueError: other shapes, negative weights, values that are not finite. TypeError: not floating point.
     """
-    for name, value in (("prior_mm", prior_mm), ("prior_weight", prior_weight)):
+    for name, value in (("known_mm", known_mm), ("known_weight", known_weight)):
         check_batch(name, value, 1)
         check_same_count(name, value, "gradient", gradient.shape[0])
-        if name == "prior_mm" or value.shape[2] * value.shape[3] > 1:
+        if name == "known_mm" or value.shape[2] * value.shape[3] > 1:
             check_same_size(name, value, "gradient", gradient.shape[2], gradient.shape[3])
         if not torch.jit.is_scripting():
             _check_values(name, value)
@@ -39,21 +41,24 @@ def _check_values(name: str, value: Tensor) -> None:
         return
     if not bool(torch.isfinite(value).all()):
         raise ValueError(f"{name}: expected finite values, got NaN or infinite ones: set unknown pixels to 0, and their weight too")
-    if name == "prior_weight" and bool((value < 0).any()):
+    if name == "known_weight" and bool((value < 0).any()):
         raise ValueError(f"{name}: expected values of at least 0, got {float(value.min()):g}")
 
 
-def solve_screened(right: Tensor, pull: Tensor, prior: Tensor, plan: list[Tensor], max_iterations: int = MAX_ITERATIONS) -> Tensor:
-    """The depth whose Laplacian is ``right + pull (depth - prior)``, (B, 1, H, W). Scripts; differentiable in all arguments.
+def solve_screened(
+    right: Tensor, pull: Tensor, known: Tensor, plan: list[Tensor], tolerance: float, max_iterations: int = MAX_ITERATIONS
+) -> Tensor:
+    """The depth whose Laplacian is ``right + pull (depth - known)``, (B, 1, H, W). Scripts; differentiable in all arguments.
 
     Args:
         right: (B, 1, H, W), divergence of the edges' slopes times the pitch.
-        pull: weight times the square of the pitch, as :func:`check_prior` has it.
-        prior: (B, 1, H, W) or (1, 1, H, W).
+        pull: weight times the square of the pitch, as :func:`check_known` has it.
+        known: depth, (B, 1, H, W) or (1, 1, H, W).
         plan: tables for the size.
+        tolerance: of a map of weights, residual relative to the first, in the preconditioner's norm.
         max_iterations: of a map of weights.
     """
-    target = right - pull * prior
+    target = right - pull * known
     if pull.shape[2] * pull.shape[3] == 1:
         return solve_by_fft(target, screened(plan, pull))
     pull = pull.expand(right.shape)
@@ -63,7 +68,7 @@ def solve_screened(right: Tensor, pull: Tensor, prior: Tensor, plan: list[Tensor
     towards = -scale * solve_by_fft(scale * residual, tables)
     search, depth = towards, torch.zeros_like(right)
     size = (residual * towards).sum(dim=(1, 2, 3), keepdim=True)
-    enough = 1e-20 * size.detach()
+    enough = tolerance**2 * size.detach()
     for _ in range(max_iterations):
         if bool((size <= enough).all()):
             break
@@ -73,7 +78,18 @@ def solve_screened(right: Tensor, pull: Tensor, prior: Tensor, plan: list[Tensor
         towards = -scale * solve_by_fft(scale * residual, tables)
         before, size = size, (residual * towards).sum(dim=(1, 2, 3), keepdim=True)
         search = towards + size / before.clamp_min(1e-300) * search
+    if not torch.jit.is_scripting():
+        _check_settled(size > enough, max_iterations)
     return depth
+
+
+def _check_settled(moves: Tensor, steps: int) -> None:
+    if bool(moves.any()):
+        warnings.warn(
+            f"known_weight: the depth of {int(moves.sum())} of {len(moves)} frames has not settled in {steps} steps: "
+            "expected smaller weights, or float64",
+            stacklevel=2,
+        )
 
 
 def laplacian(depth: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
 from .core.files import write_atomically
+from .core.geometry import EXAGGERATION
 
 Array = np.ndarray[Any, Any]
 
@@ -37,9 +38,6 @@ MOST_POINTS = 220
 """Largest number of points of a surface in each direction."""
 
 _HALO = [patheffects.withStroke(linewidth=2.0, foreground="black")]
-
-EXAGGERATION = 3.0
-"""Heights are drawn so many times as large, in pictures and live views, so that two pictures can be compared."""
 
 
 def new_figure(width: float, height: float, dpi: int = 150) -> Figure:

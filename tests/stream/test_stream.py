@@ -780,6 +780,10 @@ def test_corners_take_the_place_of_the_crop_of_raw_frames():
     (left, top), (right, bottom) = (91.0, 68.0), (548.0, 411.0)
     cut = with_corners(mini, f"{left},{top} {right},{top} {right},{bottom} {left},{bottom}")
     assert torch.allclose(cut.rectify(frame), mini.rectify(frame), atol=0.005)
+    lying, digit = frame[:, :, :240, :320], vts.Sensor.load("digit")  # the gel's top left is at the frame's top right
+    assert torch.allclose(with_corners(digit, "319 0 319 239 0 239 0 0").rectify(lying), digit.rectify(lying), atol=1e-5)
+    upright = digit.rectify(lying)
+    assert torch.allclose(with_corners(digit, "0 0 239 0 239 319 0 319").rectify(upright), upright, atol=1e-5)
 
 
 def test_presses_of_a_known_sensor_are_no_background(mini_presses):

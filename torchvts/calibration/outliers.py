@@ -56,23 +56,20 @@ def _leave_out(contacts: list[Contact], prior: ResponseModel | None, half_mm: fl
         left = used(contacts)
         if len(left) < (1 if prior is not None else 2):
             return
-        if prior is not None:
-            evidence, start = Evidence.of(Family.of(prior.field), left), prior.field.tensor().reshape(-1)
-            penalty, shown = evidence.penalty(PRIOR_PRESSES), evidence.gains([start] * len(left))
-        else:
-            evidence, start = Evidence.of(Family(2, -1, half_mm), left), None
-            penalty, shown = SCREENING_PENALTY * evidence.family.penalty(), None
+        start = None if prior is None else prior.field.tensor().reshape(-1)
+        evidence = Evidence.of(Family(2, -1, half_mm) if prior is None else Family.of(prior.field), left)
+        penalty = SCREENING_PENALTY * evidence.family.penalty() if prior is None else evidence.penalty(PRIOR_PRESSES)
         gains = evidence.gains(evidence.held_out(penalty, start))
         errors = evidence.errors_deg([evidence.solve(penalty, start)] * len(left))
-        for contact, gain, error in zip(left, (gains if shown is None else shown).tolist(), errors):
-            contact.metrics |= {"error_deg": error, "gain": gain}
-        if prior is not None:
-            wrong = _wrong_by_prior(gains)
-        else:
-            std = _uncertainty(evidence)
+        if start is None:
+            shown, std = gains, _uncertainty(evidence)
             for contact, one in zip(left, std.tolist()):
                 contact.metrics["gain_std"] = one
             wrong = _wrong_by_others(evidence, gains, std.masked_fill(_known(evidence) < LEAST_KNOWN, math.inf))
+        else:
+            shown, wrong = evidence.gains([start] * len(left)), _wrong_by_prior(gains)
+        for contact, gain, error in zip(left, shown.tolist(), errors):
+            contact.metrics |= {"error_deg": error, "gain": gain}
         if wrong is not None:
             _reject_diameter(left, wrong, float(gains[wrong]), prior is not None)
         elif not _reject_slopes(left, errors, prior is not None):

@@ -109,7 +109,7 @@ class _Files:
 
 
 def with_corners(unit: Sensor | Calibration, text: str) -> Sensor | Calibration:
-    """The sensor or calibration with other corners."""
+    """The sensor or calibration with other corners, of the gel in frames as they come: they turn and mirror these too."""
     try:
         numbers = [float(part) for part in text.replace(",", " ").split()]
     except ValueError:
@@ -118,5 +118,5 @@ def with_corners(unit: Sensor | Calibration, text: str) -> Sensor | Calibration:
         raise ValueError(f"corners: expected eight numbers, x and y of four corners, got {text!r}")
     sensor = unit if isinstance(unit, Sensor) else unit.sensor
     corners = tuple(zip(numbers[::2], numbers[1::2]))
-    sensor = dataclasses.replace(sensor, corners_px=corners, roi_px=None, raw_size_px=(), raw_crop=0.0)
+    sensor = dataclasses.replace(sensor, corners_px=corners, roi_px=None, raw_size_px=(), raw_crop=0.0, turn_deg=0, mirror=False)
     return sensor if isinstance(unit, Sensor) else dataclasses.replace(unit, sensor=sensor)

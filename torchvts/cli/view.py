@@ -13,6 +13,7 @@ examples:
 import argparse
 from pathlib import Path
 
+from ..core.geometry import EXAGGERATION
 from ..core.results import write_result
 from ..stream import Keys, LiveView, StreamReport, TactileFrame, TactileStream, has_screen, require_rerun
 from ..viz import depth_figure, save_figure
@@ -28,7 +29,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--save", type=Path, metavar="FILE.rrd", help="record from the start; no viewer is opened")
     parser.add_argument("--out", type=Path, metavar="FOLDER", default=Path("out/view"), help="of snapshots and recordings")
     parser.add_argument(
-        "--exaggeration", type=float, default=3.0, metavar="X", help="height of the surface on the screen (3 times)"
+        "--exaggeration",
+        type=float,
+        default=EXAGGERATION,
+        metavar="X",
+        help=f"of heights on the screen ({EXAGGERATION:g})",
     )
 
 

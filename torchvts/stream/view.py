@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..core.checks import check_path, check_positive, check_shape
 from ..core.files import check_target
+from ..core.geometry import EXAGGERATION
 from .live import TactileFrame
 from .overlay import outlines, round_up
 
@@ -64,7 +65,7 @@ class LiveView:
         *,
         save: str | Path | None = None,
         viewer: bool = False,
-        exaggeration: float = 3.0,
+        exaggeration: float = EXAGGERATION,
     ) -> None:
         self._rr = require_rerun()
         self.mm_per_pixel, self.metric = check_positive("mm_per_pixel", mm_per_pixel), metric

@@ -14,7 +14,6 @@ from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
 from .core.files import write_atomically
-from .core.geometry import EXAGGERATION
 
 Array = np.ndarray[Any, Any]
 
@@ -38,6 +37,7 @@ MOST_POINTS = 220
 """Largest number of points of a surface in each direction."""
 
 _HALO = [patheffects.withStroke(linewidth=2.0, foreground="black")]
+_EXAGGERATIONS = (1, 2, 3, 4, 5, 8, 10, 15, 20, 30, 40, 50, 80, 100, 150, 200, 300, 400, 500, 1000)
 
 
 def new_figure(width: float, height: float, dpi: int = 150) -> Figure:
@@ -71,7 +71,12 @@ def depth_range(*depths: Array) -> tuple[float, float]:
 
 
 def depth_figure(
-    depth_mm: Tensor, mm_per_pixel: float, image: Tensor | None = None, contact: Tensor | None = None, title: str = ""
+    depth_mm: Tensor,
+    mm_per_pixel: float,
+    image: Tensor | None = None,
+    contact: Tensor | None = None,
+    title: str = "",
+    exaggeration: float | None = None,
 ) -> Figure:
     """One frame as three panels of one extent: the camera's image with the contact outlined, depth contours, the shaded surface.
 
@@ -81,6 +86,7 @@ def depth_figure(
         image: (1, 3, H, W) or (3, H, W) in [0, 1]; None leaves its panel out.
         contact: bool, the same shape as depth.
         title: text above the panels.
+        exaggeration: of the surface's heights; None takes :func:`exaggeration_of` this depth.
     """
     depth = _plane(depth_mm)
     ratio = depth.shape[0] / depth.shape[1]
@@ -109,7 +115,8 @@ def depth_figure(
     draw_contours(figure, axes, depth, mm_per_pixel)
     if image is not None:
         axes.set_ylabel("")
-    draw_surface(panel(left + wide + 0.55, 0.0, size[0] - left - wide - 0.75, lower + high, projection="3d"), depth, mm_per_pixel)
+    space = panel(left + wide + 0.55, 0.0, size[0] - left - wide - 0.75, lower + high, projection="3d")
+    draw_surface(space, depth, mm_per_pixel, exaggeration=exaggeration)
     if title:
         figure.suptitle(title, fontsize=11, y=1.0 - 0.08 / size[1], va="top")
     return figure
@@ -166,22 +173,32 @@ def draw_bar(figure: Figure, axes: Any, picture: Any, label: str) -> None:
     figure.colorbar(picture, cax=axes.inset_axes((1.03, 0.0, 0.04, 1.0)), label=label)
 
 
-def draw_surface(axes: Any, depth: Array, mm_per_pixel: float, range_mm: tuple[float, float] | None = None) -> None:
+def exaggeration_of(height_mm: float, width_mm: float) -> float:
+    """The round factor that makes a relief about a seventh as high as its frame is wide; pictures of one run share it.
+
+    Example:
+        >>> exaggeration_of(0.4, 20.0)
+        5.0
+    """
+    return float(max((f for f in _EXAGGERATIONS if f * height_mm <= 0.15 * width_mm), default=1))
+
+
+def draw_surface(axes: Any, depth: Array, mm_per_pixel: float, exaggeration: float | None = None) -> None:
     """Draw depth as a surface lit from the upper left, coloured as the contours are; the title states the exaggeration of height.
 
     Args:
         axes: a 3D panel.
         depth: (H, W), mm.
         mm_per_pixel: pixel pitch, mm.
-        range_mm: range of the colours; None takes that of the depth.
+        exaggeration: of heights; None takes :func:`exaggeration_of` this depth.
     """
     stride = max(1, int(np.ceil(max(depth.shape) / MOST_POINTS)))
     z = depth[::stride, ::stride]
     left, _, lower, _ = _extent(depth, mm_per_pixel)
     rows, columns = np.mgrid[0 : z.shape[0], 0 : z.shape[1]] * mm_per_pixel * stride
     x, y = left + columns, rows - lower
-    low, high = range_mm or depth_range(depth)
-    exaggeration = _exaggeration(float(np.ptp(z)), -2.0 * left)
+    low, high = depth_range(depth)
+    exaggeration = exaggeration or exaggeration_of(max(float(np.ptp(z)), 0.02 * high, 1e-6), -2.0 * left)
     colors, norm = depth_colors(low, high)
     step = mm_per_pixel * stride
     light = LightSource(azdeg=315, altdeg=50)
@@ -256,7 +273,7 @@ def pose_figure(source: Tensor, target: Tensor, T_target_source: Tensor, title: 
     low, high = everything.min(0), everything.max(0)
     low, high = low - 0.04 * (high - low), high + 0.04 * (high - low)
     spans = high - low
-    exaggeration = _exaggeration(float(spans[2]), float(max(spans[:2])))
+    exaggeration = exaggeration_of(max(float(spans[2]), 1e-6), float(max(spans[:2])))
     figure = new_figure(10.0, 3.1)
     for k, (name, points) in enumerate(states.items()):
         above = figure.add_subplot(1, 4, 2 * k + 1)
@@ -313,11 +330,6 @@ def _space_labels(axes: Any) -> None:
     top = f"{high:.2g} mm".rjust(16)  # labels are centred: the spaces keep it off the axis
     ticks = {0.0: "0", high: top} if low <= 0.0 < 0.8 * high else {high: top}
     axes.set_zticks(list(ticks), list(ticks.values()))
-
-
-def _exaggeration(height: float, width: float) -> float:
-    """That of all pictures, or 1 where the relief would be higher than half the frame is wide."""
-    return EXAGGERATION if EXAGGERATION * height <= 0.5 * width else 1.0
 
 
 def _round_step(span: float) -> float:

@@ -14,6 +14,7 @@ import torch
 from conftest import bgr, tiny_image, write_film
 
 import torchvts as vts
+from torchvts import viz
 from torchvts.core.files import read_depth_png
 from torchvts.dataset import STATE, list_items, output_stems, reconstruct_dataset, writing
 
@@ -115,6 +116,19 @@ def test_killed_processes_lose_nothing_and_the_next_run_goes_on(unit, frames, wh
         assert second.returncode == 0, printed
         assert "wrote 120 frames" in printed and "by an earlier run" in printed
     assert contents(out) == whole
+
+
+def test_pictures_of_a_run_have_one_exaggeration_and_depths_of_their_own(unit, tmp_path, monkeypatch):
+    for k, name in ((0, "a"), (49, "b")):  # 0.5 and 0.99 mm
+        (tmp_path / "in").mkdir(exist_ok=True)
+        vts.write_image(tmp_path / "in" / f"{name}.png", tiny_image(k))
+    drawn = []
+    save = viz.save_figure
+    monkeypatch.setattr(viz, "save_figure", lambda figure, path: (drawn.append(figure), save(figure, path)))
+    reconstruct_dataset(unit, tmp_path / "in", tmp_path / "out", workers=0)
+    surfaces = [figure.axes[2] for figure in drawn]
+    assert len({axes.get_title() for axes in surfaces}) == 1 and "height x " in surfaces[0].get_title()
+    assert surfaces[1].get_zlim()[1] > 1.5 * surfaces[0].get_zlim()[1]
 
 
 def test_a_torn_record_a_lost_file_and_a_changed_image_are_computed_again(unit, tmp_path):

@@ -13,9 +13,9 @@ examples:
 import argparse
 from pathlib import Path
 
-from ..core.geometry import EXAGGERATION
 from ..core.results import write_result
 from ..stream import Keys, LiveView, StreamReport, TactileFrame, TactileStream, has_screen, require_rerun
+from ..stream.view import EXAGGERATION
 from ..viz import depth_figure, save_figure
 from .parser import UsageError
 from .source import add_source, load_unit, open_stream, play

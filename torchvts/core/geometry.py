@@ -7,9 +7,6 @@ from torch import Tensor, nn
 
 from .checks import check_batch, check_float_tensor, check_positive, check_same_size, check_shape, check_tensor
 
-EXAGGERATION = 3.0
-"""Heights are drawn so many times as large, in pictures and live views alike, so that these can be compared."""
-
 MAX_SLOPE = 10.0
 """Largest |dz/dx|, |dz/dy| that ``gradient_from_normal`` returns, mm per mm: 84.3 degrees from flat."""
 

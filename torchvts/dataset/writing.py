@@ -25,6 +25,7 @@ class Writer:
     def __init__(self, records: Records, sensor: Sensor, name: str, metric: bool) -> None:
         self.records, self.settings, self.sensor, self.name, self.metric = records, records.settings, sensor, name, metric
         self.frame = OutputFrame(records.settings.length_unit, sensor)
+        self.exaggeration: float | None = None  # of heights in all pictures, known from the first contact on
 
     def write(self, frame: Frame, image: Tensor, result: DepthOutput) -> None:
         """All files of a frame: its depth, its contact, its picture."""
@@ -46,7 +47,10 @@ class Writer:
         if self.settings.pictures:
             from .. import viz
 
-            viz.save_figure(viz.depth_figure(result.depth_mm, pitch, image, result.contact, name), f"{stem}_picture.png")
+            if self.exaggeration is None and bool(result.contact.any()):
+                self.exaggeration = viz.exaggeration_of(float(result.depth_mm.max()), pitch * result.depth_mm.shape[3])
+            figure = viz.depth_figure(result.depth_mm, pitch, image, result.contact, name, self.exaggeration)
+            viz.save_figure(figure, f"{stem}_picture.png")
 
     def _write_contact(self, path: Path, result: DepthOutput) -> None:
         """The contact as points or as a surface."""

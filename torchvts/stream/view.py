@@ -11,12 +11,14 @@ from torch import Tensor
 
 from ..core.checks import check_path, check_positive, check_shape
 from ..core.files import check_target
-from ..core.geometry import EXAGGERATION
 from .live import TactileFrame
 from .overlay import outlines, round_up
 
 AXIS_COLOURS = ((230, 60, 50), (60, 200, 80), (60, 90, 240))
 """Of x, y and z."""
+
+EXAGGERATION = 3.0
+"""Heights are so many times as large on the screen."""
 
 MOST_POINTS = 160
 """Largest number of points of the surface in each direction."""

@@ -26,6 +26,7 @@ from lab.latency import measure_latency
 from torchvts import stream as streams
 from torchvts.cli.stream import with_corners
 from torchvts.core.files import read_frames, rgb_from_bgr
+from torchvts.stream.sources import times_file
 
 ROOT = Path(__file__).resolve().parents[2]
 PITCH = 0.25
@@ -355,6 +356,7 @@ def test_both_scripts_give_the_same_depth_for_a_video(unit, run_stream, run_scri
     video = write_film(
         tmp_path / "press.avi", [camera(1.0 if 15 <= k < 20 else 0.0, 1.0 - 0.002 * max(0, k - 12)) for k in range(24)]
     )
+    times_file(video).write_text("frame,time_s\n" + "".join(f"{k:06d},{0.4 * k}\n" for k in range(24)))  # slower than it says
     places = tuple(map(tuple, unit[0].lights.position_mm.tolist()))  # known: a fit for each script would take seconds
     rig = replace(small_sensor, light_position_mm=places)
     rig.save(tmp_path / "rig.yaml")

@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 from ..core.checks import in_one_line
 from ..core.files import open_video, read_image, rgb_from_bgr
 from ..model import Sensor
-from ..stream import frames_a_second
+from ..stream.sources import frames_a_second, rate_of, read_times, time_of
 from .items import Item, list_items
 from .records import Records
 
@@ -124,17 +124,18 @@ class _Frames(IterableDataset[Batch]):
             yield from ((Frame(item, number, done=True), None) for number in own)
             return
         try:
-            capture = open_video(item.file)
-        except ValueError as error:  # its name
+            capture, times = open_video(item.file), list(read_times(item.file).values())
+        except ValueError as error:  # its name, or its times
             yield Frame(item, failed=str(error)), None
             return
-        fps = frames_a_second(capture)
+        fps = rate_of(times, frames_a_second(capture))
         number = 0
         while capture.grab():
             mine = number % every == 0 and number // every % world == rank
             done = mine and self.records.is_done(item, number)
             decoded, pixels = capture.retrieve()
-            frame = Frame(item, number, done, "" if decoded else "not decoded", None, mine, number / fps, fps)
+            time_s = time_of(number, fps, times)
+            frame = Frame(item, number, done, "" if decoded else "not decoded", None, mine, time_s, fps)
             yield frame, partial(rgb_from_bgr, pixels) if decoded else None
             number += 1
         capture.release()

@@ -154,7 +154,7 @@ class SourceFrames:
             if pixels is None:
                 return
             index, self._given = self._given, self._given + 1
-            yield index, time_of(self._reader, index), pixels
+            yield index, time_of(index, self._reader.fps, getattr(self._reader, "times", ())), pixels
 
     def _newest_ones(self) -> Iterator[NumberedFrame]:
         """The frames that are the newest when they are asked for; of a recording the first ones are played again."""

@@ -266,10 +266,9 @@ def rate_of(times: Sequence[float], otherwise: float) -> float:
     return otherwise if len(times) < 2 else (len(times) - 1) / (times[-1] - times[0])
 
 
-def time_of(reader: Reader, index: int) -> float:
+def time_of(index: int, fps: float, times: Sequence[float]) -> float:
     """Time of a frame of a recording since its start, s: as recorded, else by the rate."""
-    times: Sequence[float] = getattr(reader, "times", ())
-    return times[index] if index < len(times) else index / reader.fps
+    return times[index] if index < len(times) else index / fps
 
 
 CODECS = {

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from torchvts.viz import depth_colors, new_figure
 
@@ -96,6 +97,8 @@ def _label_severities(panels: Sequence[Any], corruption: Corruption) -> None:
         axes.grid(alpha=0.25)
     for axes in panels[:2]:
         axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+        axes.yaxis.set_minor_formatter(NullFormatter())
         axes.yaxis.set_major_formatter("{x:g}")
     panels[2].set_ylim(-0.03, 1.05)
 

@@ -4,10 +4,12 @@ from collections.abc import Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
+from ..core.arrays import Array
 from ..core.checks import in_one_line
 from ..core.files import open_video, read_image, rgb_from_bgr
 from ..model import Sensor
@@ -40,8 +42,9 @@ class Frame(NamedTuple):
     fps: float = 30.0
 
 
-Batch = tuple[list[tuple[Frame, bool]], Tensor]
-"""Frames, whether each has an image, and these images in one tensor: one shared-memory file a batch, however large the data set."""
+Batch = tuple[list[tuple[Frame, bool]], Array]
+"""Frames, whether each has an image, and these images in one array: tensors would go through files in shared memory, which a small
+/dev/shm or a limit of the size of files ends in silence."""
 
 
 def load_frames(
@@ -58,9 +61,13 @@ def load_frames(
     """
     loader = DataLoader(_Frames(records, sensor, share, batch), batch_size=None, num_workers=workers, collate_fn=_as_is)
     for frames, images in loader:
-        left = iter(images.split(1))
+        left = (image[None] for image in torch.from_numpy(images))
         for frame, has_image in frames:
             yield frame, next(left) if has_image else None
+
+
+def _stacked(images: list[Tensor]) -> Array:
+    return torch.cat(images).numpy() if images else np.empty(0, np.float32)
 
 
 def _as_is(batch: Any) -> Any:
@@ -84,9 +91,9 @@ class _Frames(IterableDataset[Batch]):
             frames.append((frame._replace(failed=failed), bool(image)))
             images += image
             if len(frames) == self.batch:
-                yield frames, torch.cat(images) if images else torch.empty(0)
+                yield frames, _stacked(images)
                 frames, images = [], []
-        yield frames, torch.cat(images) if images else torch.empty(0)
+        yield frames, _stacked(images)
 
     def _load(self, read: "partial[Tensor]") -> tuple[list[Tensor], str]:
         """An image rectified, in a list; or an empty list and why there is none."""

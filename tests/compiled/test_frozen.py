@@ -335,6 +335,13 @@ def test_what_is_not_compiled_is_named_and_runs_in_pytorch(unit, reason):
     assert not found.depth_mm.is_inference()
 
 
+def test_a_network_in_training_is_frozen_in_eval_mode(unit):
+    calibration, images = unit
+    network = torch.nn.Sequential(torch.nn.Conv2d(3, 3, 1), torch.nn.Dropout(0.5)).requires_grad_(False)
+    frozen = vts.DepthPipeline.from_calibration(calibration, normals=network).freeze()
+    assert network.training and torch.equal(frozen(images).depth_mm, frozen(images).depth_mm)
+
+
 def test_a_method_of_a_class_that_is_replaced_is_named(unit, monkeypatch):
     monkeypatch.setattr(vts.ContactFromDepth, "above", lambda self, depth, pressure, pitch_mm: pressure)
     assert vts.DepthPipeline.from_calibration(unit[0]).freeze().not_compiled == "contact.above is replaced"

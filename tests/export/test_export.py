@@ -105,10 +105,12 @@ def test_a_program_of_an_image_whose_cells_are_larger_than_pixels(cells_of_two, 
 
 
 @pytest.mark.long
-def test_onnx_of_an_image_whose_cells_are_larger_than_pixels(cells_of_two, tmp_path):
+def test_onnx_of_an_image_whose_zero_has_cells_of_two(ring, tmp_path):
     if export.missing("onnx"):
         pytest.skip(export.missing("onnx"))
-    pipe, frames = cells_of_two
+    lights, (height, width) = ring(20.0, 15.0), (64, 96)
+    frames = vts.scenes.render(vts.scenes.sphere_press(4.0, 0.5, (0, 0), height, width, 0.2), lights).detach().repeat(3, 1, 1, 1)
+    pipe = pipeline(vts.Calibration.from_lights(lights, vts.Sensor("rig", height, width, 0.2)), "fast")
     assert export.compare(export.export_onnx(pipe, tmp_path / "pipe.onnx"), pipe, frames, "onnx") <= 1e-3
 
 
@@ -270,6 +272,12 @@ def test_a_file_that_does_not_agree_or_does_not_run_is_reported(low, tmp_path):
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(RuntimeError, match=r"pipe.pt: could not be run without torchvts: .+"):
         export.compare(path, pipe, frames[:1], "torchscript")
+
+
+def test_a_network_in_training_is_written_in_eval_mode(low, tmp_path):
+    calibration, frames = low
+    pipe = vts.DepthPipeline.from_calibration(calibration, normals=nn.Sequential(learned(), nn.Dropout(0.5)).train())
+    assert export.compare(export.export_torchscript(pipe, tmp_path / "pipe.pt"), pipe, frames, "torchscript") <= 1e-5
 
 
 class Unscriptable(nn.Module):

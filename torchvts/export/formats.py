@@ -67,7 +67,7 @@ def export_torchscript(pipe: DepthPipeline, path: str | Path) -> Path:
     path = check_target(path)
     with warnings.catch_warnings(), write_atomically(path) as temporary:
         warnings.simplefilter("ignore")  # that TorchScript is deprecated
-        scripted = torch.jit.script(copy.deepcopy(pipe))
+        scripted = torch.jit.script(copy.deepcopy(pipe).eval())
         metadata = {f"{METADATA_KEY}.json": json.dumps(describe(pipe))}
         scripted.save(str(temporary), _extra_files=metadata)  # type: ignore[no-untyped-call]
     return path

@@ -1,5 +1,6 @@
 """The proof that an exported file agrees with its pipeline: it is run in a process without torchvts and compared."""
 
+import copy
 import json
 import math
 import subprocess
@@ -130,9 +131,9 @@ def compare(path: str | Path, pipe: DepthPipeline, images: Tensor, name: str) ->
     check_pipeline(pipe)
     check_batch("images", images, 3)
     batches = sorted({size for size in (1, 2, 3, images.shape[0]) if size <= images.shape[0]})
-    found = run_bare(path, images, name, batches)
+    found, used = run_bare(path, images, name, batches), copy.deepcopy(pipe).eval()
     with torch.no_grad():
-        expected = [pipe(images[:size]).depth_mm for size in batches]
+        expected = [used(images[:size]).depth_mm for size in batches]
     differences = [float((one.double() - two.double()).abs().max()) for one, two in zip(found, expected, strict=True)]
     return max(differences) if all(np.isfinite(differences)) else math.inf
 

@@ -26,7 +26,8 @@ SHAPES = (1, 2, 3, 1, 1)
 class FrozenPipeline:
     """Images (B, 3, H, W) to a :class:`DepthOutput`, as the pipeline that it was made of; :meth:`DepthPipeline.freeze` makes one.
 
-    It holds a copy: nothing that is done to the pipeline afterwards changes it, and it records no gradient. Compiled, it takes
+    It holds a copy, with every module in eval mode: nothing that is done to the pipeline afterwards changes it, and it records no
+    gradient. Compiled, it takes
     float32 on a CPU. One thread works on a frame; the frames of a batch are shared among as many threads as torch uses, and equal
     bit for bit those frames alone. Depth differs from the pipeline's by rounding, less than 1e-5 mm.
 
@@ -64,7 +65,7 @@ class FrozenPipeline:
                     "training; to train, call the pipeline itself"
                 )
         with torch.inference_mode(False), torch.device("cpu"):  # whatever the defaults are
-            own = copy.deepcopy(pipe)
+            own = copy.deepcopy(pipe).eval()
             plan, reason, size = None, "", (0, 0)
             try:
                 plan, size = plan_of(own)

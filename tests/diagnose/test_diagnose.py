@@ -103,11 +103,11 @@ def softened(image, seed):
     return blur(image[None], gaussian_weights(1.5))[0] + noise
 
 
-def deeper_than_learned(seed):
+def deeper_than_learned(seed, depth_mm=10.0):
     unit = drawn_sensor(31)
     balls = [unit.ball(5.0, 0.3 + 0.2 * k, (0.5 * k - 1.0, 0.3 * k - 0.5), f"{k}", k) for k in range(4)]
     calibration = vts.calibrate(unit.background, unit.sensor, balls)
-    narrow = dataclasses.replace(calibration.response, taught=TaughtRange(math.sin(math.radians(5.0)), 10.0, 0.5))
+    narrow = dataclasses.replace(calibration.response, taught=TaughtRange(math.sin(math.radians(5.0)), depth_mm, 0.5))
     return None, unit.ball(5.0, 0.7, (0.5, 0.5), "other", seed).image, dataclasses.replace(calibration, response=narrow)
 
 
@@ -182,6 +182,12 @@ def triggered(name, seed):
 def test_every_finding_has_a_frame_that_triggers_it(name):
     hit, found = triggered(name, seed=7)
     assert hit, str(found)
+
+
+def test_a_contact_four_times_as_deep_as_the_presses_is_a_warning():
+    for depth_mm, severity in ((10.0, "note"), (0.1, "warning")):
+        found = vts.diagnose(*deeper_than_learned(0, depth_mm))
+        assert [finding.severity for finding in found if finding.name == "beyond_presses"] == [severity]
 
 
 def test_every_finding_of_the_table_is_triggered():

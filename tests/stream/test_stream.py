@@ -344,11 +344,13 @@ def test_black_lines_are_named_and_those_of_the_background_are_not(unit):
     """One black row was a contact on nine tenths of the skin."""
     background, frame = unit[0].background, unit[0].background[None].clone()
     frame[:, :, 70] = 0.0
-    assert "1 rows or columns of the frame are black" in streams.FrameCheck(background)(frame)
+    assert "1 rows or columns of the frame are black or of one colour" in streams.FrameCheck(background)(frame)
     assert streams.FrameCheck(frame[0])(frame) == ""
     frame = background[None].clone()
     frame[:, :, 90:] = 0.0  # a transfer that ended early
-    assert "30 rows or columns of the frame are black: it was cut short" in streams.FrameCheck(background)(frame)
+    assert "30 rows or columns of the frame are black or of one colour: it was cut short" in streams.FrameCheck(background)(frame)
+    frame[:, :, 90:] = 128.0 / 255.0  # what decoders of JPEG put there
+    assert "30 rows or columns of the frame are black or of one colour: it was cut short" in streams.FrameCheck(background)(frame)
 
 
 def test_both_scripts_give_the_same_depth_for_a_video(unit, run_stream, run_script, small_sensor, tmp_path):

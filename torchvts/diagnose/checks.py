@@ -22,6 +22,9 @@ scatters light over all of a small sensor."""
 OTHER_DEG = 1.2
 """The same from which it is asked whether the frame is from another unit of its type: 1.4 to 5 degrees on three of one type."""
 
+FAR_BEYOND = 4.0
+"""Depth of a contact over that of the presses, above which a frame is spoilt rather than the object deep: good frames reach 3."""
+
 BLOCKY = 1.18
 """Ratio of steps at the borders of 8 x 8 blocks to those inside above which an image was compressed; noise alone stays below 1.1,
 a JPEG of quality 95 has 1.2 to 1.3."""
@@ -233,7 +236,7 @@ def _texture_lost(e: Examination) -> float | None:
 
 def _length(e: Examination, sign: float) -> float | None:
     """Share of the contact where normals are longer (+1) or shorter (-1) than one, if that is the more frequent."""
-    error = e.length_error if bool(e.moved.any()) and blockiness(e.image)[0] <= BLOCKY else None
+    error = e.length_error if e.unit.metric and bool(e.moved.any()) and blockiness(e.image)[0] <= BLOCKY else None
     if error is None:
         return None
     this, other = (float((s * error > 3.0).double().mean()) for s in (sign, -sign))
@@ -265,7 +268,11 @@ def _steepest(e: Examination) -> float:
 
 def _beyond_presses(e: Examination) -> Figures | None:
     text = beyond_presses(e.unit, e.output)[0]
-    return {"value": math.degrees(math.atan(float(e.steepness[e.output.contact[0, 0]].max()))), "text": text} if text else None
+    if not text:
+        return None
+    inside, taught = e.output.contact, e.unit.response.taught if e.unit.response is not None else None
+    times = 1.0 if taught is None else float(e.output.depth_mm[inside].quantile(0.95)) / taught.depth_mm
+    return {"value": math.degrees(math.atan(float(e.steepness[inside[0, 0]].max()))), "text": text, "times": times}
 
 
 def _shadow(e: Examination) -> float:
@@ -346,8 +353,9 @@ CHECKS = (
           "note"),
     Check("steep_walls", _steepest, "walls of {value:.0f} degrees: a light may be blocked there, and integration cannot keep a "
           "step; use precise mode, trust the top only", "note", above=52.0),
-    Check("beyond_presses", _beyond_presses, "{text}: normals and depth are extrapolated there; calibrate again with "
-          "presses of a smaller ball, deeper, or in that place", "note"),
+    Check("beyond_presses", _beyond_presses, "{text}: normals and depth are extrapolated there, unless the frame is spoilt; "
+          "calibrate again with presses of a smaller ball, deeper, or in that place",
+          lambda figures: "warning" if figures["times"] > FAR_BEYOND else "note"),
     Check("shadow", _shadow, "a light is blocked in {value:.0%} of the contact: slopes there are estimated from two lights; press "
           "less, or raise the LEDs", lambda figures: "warning" if figures["value"] > 0.3 else "note", above=0.01),
     Check("cast_shadow", _cast_shadow, "a shadow falls on {value:.1%} of the image, on flat skin: modes fast and those of response "

@@ -21,6 +21,10 @@ MOST_OVEREXPOSED = 0.8
 LIT, BLACK = 0.06, 2.0 / 255.0
 """A line of the background as bright as the one, in some channel, is black in a frame if all its values are below the other."""
 
+VARIES = 3.0 * BLACK
+"""A line in which a channel of the background varies by so much is lost in a frame where none varies by more than :data:`BLACK`:
+decoders fill what did not arrive with grey."""
+
 EVERY = 8
 """Of a line every so many pixels are looked at."""
 
@@ -50,7 +54,8 @@ class FrameCheck:
         self._views = Views(image)
         self.background = self._views.background
         self._lit = [(channel, lit) for channel, lit in enumerate(self.background > LIT) if lit.any()]
-        self._lit_lines = _lines(image) > LIT
+        brightest, spread = _lines(image)
+        self._lit_lines, self._varied_lines = brightest > LIT, spread > VARIES
         self._overexposed = _overexposed(self.background) > MOST_OVEREXPOSED
 
     @classmethod
@@ -75,10 +80,12 @@ class FrameCheck:
             if most <= TWELVE_BITS + 1e-6:
                 cause = f"its largest value is {round(65535 * most)} of 65535: 12 bits stored in 16?"
             return f"the frame is dark, {level:.0%} of the background's brightness: {cause}"
-        black = np.count_nonzero((_lines(image) < BLACK) & self._lit_lines)
-        if black > 0:
+        brightest, spread = _lines(image)
+        lost = np.count_nonzero(((brightest < BLACK) & self._lit_lines) | ((spread < BLACK) & self._varied_lines))
+        if lost > 0:
             return (
-                f"{black} rows or columns of the frame are black: it was cut short, or the camera has lost them since calibration"
+                f"{lost} rows or columns of the frame are black or of one colour: it was cut short, or the camera has lost them "
+                "since calibration"
             )
         if not self._overexposed and _overexposed(cells) > MOST_OVEREXPOSED:
             return "the frame is overexposed: nearly all of it is saturated"
@@ -93,9 +100,11 @@ class FrameCheck:
         return "" if view is None else f"the frame {view.in_words()}"
 
 
-def _lines(image: Array) -> Array:
-    """Largest value of each row, then of each column, of (3, H, W)."""
-    return np.concatenate([image[:, :, ::EVERY].max(0).max(1), image[:, ::EVERY].max((0, 1))])
+def _lines(image: Array) -> tuple[Array, Array]:
+    """Largest value of each row, then of each column, of (3, H, W), and the largest range of a channel there."""
+    rows, columns = image[:, :, ::EVERY], image[:, ::EVERY]
+    most, least = (np.concatenate([of(rows, 2), of(columns, 1)], axis=1) for of in (np.max, np.min))
+    return most.max(0), (most - least).max(0)
 
 
 def _range(image: Array) -> float:

@@ -284,8 +284,7 @@ def pose_figure(source: Tensor, target: Tensor, T_target_source: Tensor, title: 
             space.scatter(x, y, z, s=0.8, c=color, alpha=0.6, linewidths=0)
         above.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x, mm", ylabel="y, mm (up)")
         above.set_title(f"{name}, from above", fontsize=10)
-        above.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
-        above.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+        _few_ticks(above)
         space.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
         space.set_box_aspect((spans[0], spans[1], exaggeration * spans[2]), zoom=1.0)
         space.view_init(elev=35, azim=-65)
@@ -317,6 +316,12 @@ def _extent(depth: Array, mm_per_pixel: float) -> tuple[float, float, float, flo
 def _millimetres(axes: Any) -> None:
     axes.set_xlabel("x, mm")
     axes.set_ylabel("y, mm (down)")
+    _few_ticks(axes)
+
+
+def _few_ticks(axes: Any) -> None:
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
 
 
 def _space_labels(axes: Any) -> None:
@@ -324,8 +329,7 @@ def _space_labels(axes: Any) -> None:
     axes.set_xlabel("x, mm", labelpad=-6)
     axes.set_ylabel("y, mm", labelpad=-6)
     axes.tick_params(labelsize=8, pad=-2)
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+    _few_ticks(axes)
     low, high = axes.get_zlim()
     top = f"{high:.2g} mm".rjust(16)  # labels are centred: the spaces keep it off the axis
     ticks = {0.0: "0", high: top} if low <= 0.0 < 0.8 * high else {high: top}

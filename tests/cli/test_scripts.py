@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import torchvts as vts
-from torchvts.core.files import read_depth_png
+from torchvts.core.files import make_folder, read_depth_png
 
 
 @pytest.fixture(scope="module")
@@ -43,11 +43,13 @@ def test_reconstruct_names_what_is_wrong_with_the_first_frame(run_script, images
     folder, _ = images
     options = ("--no-pictures", "--format", "none")
     valid = run_script("reconstruct", calibration, folder / "presses", "--out", tmp_path / "valid", *options)
-    image = vts.read_image(folder / "presses" / "0.png") * torch.tensor([1.0, 0.85, 1.0])[:, None, None]
-    vts.write_image(tmp_path / "dimmed.png", image)
-    dimmed = run_script("reconstruct", calibration, tmp_path / "dimmed.png", "--out", tmp_path / "out", *options)
+    image = vts.read_image(folder / "presses" / "0.png")
+    vts.write_image(make_folder(tmp_path / "in" / "a") / "good.png", image)
+    vts.write_image(make_folder(tmp_path / "in" / "b") / "dimmed.png", image * torch.tensor([1.0, 0.85, 1.0])[:, None, None])
+    dimmed = run_script("reconstruct", calibration, tmp_path / "in", "--out", tmp_path / "out", *options)
     assert valid.returncode == dimmed.returncode == 0, valid.stderr + dimmed.stderr
-    assert "first frame" not in valid.stdout and "first frame: fault: green channel 15" in dimmed.stdout
+    assert ": fault: " not in valid.stdout and dimmed.stdout.count(": fault: ") == 1
+    assert "b/dimmed.png: fault: green channel 15" in dimmed.stdout
 
 
 @pytest.mark.long

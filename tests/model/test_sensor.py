@@ -51,7 +51,7 @@ def as_text(**changes):
         ),
         (as_text(roi_px="[0, 0, 10]"), r"key roi_px: expected 4 numbers, got shape \(3,\)"),
         (as_text(roi_px="[-1, 0, 10, 10]"), "key roi_px: expected whole numbers"),
-        (as_text(raw_size_px="[48, 64]"), r"key raw_size_px: expected 2 x 2 numbers"),
+        (as_text(raw_size_px="[48, 64]"), r"key raw_size_px: expected sizes \[\[height, width\], ...\] of raw frames"),
         (as_text(raw_size_px="[[48, 64]]", raw_crop=0.5), r"key raw_crop: expected a number in \[0, 0.49\], got 0.5"),
         (as_text(raw_size_px="[[48, 64]]", roi_px="[0, 0, 9, 9]"), "key raw_size_px: expected none beside roi_px"),
         (as_text(corners_px="[[0, 0], [0, 9], [9, 9], [9, 0]]"), "key corners_px: expected a convex quadrilateral"),
@@ -243,7 +243,8 @@ def test_depth_in_a_corner_behind_a_lens():
         (
             {},
             (48, 64),
-            "frame: expected 24 x 32 for sensor 'rig', got 48 x 64: resize it, or load the sensor with height=48, width=64",
+            "frame: expected 24 x 32 for sensor 'rig', got 48 x 64: resize it, load the sensor with height=48, width=64, "
+            "or give it roi_px: .0, 0, 64, 48.",
         ),
     ],
 )

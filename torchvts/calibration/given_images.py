@@ -88,7 +88,8 @@ def check_light(background: Tensor, given: Sequence[Press] | Sequence[Touch]) ->
         raise ValueError(
             f"{'presses' if isinstance(given[0], Press) else 'touches'}: expected contacts that change the colour of the skin, got "
             f"R, G and B that change alike (the change of colour is {statistics.median(shares):.2f} of the change of light, 1 and "
-            "more under coloured lights): this sensor has no coloured lights: photometric depth is not possible"
+            "more under coloured lights): this sensor has no coloured lights: photometric depth is not possible; "
+            "or its skin was changed since the background, as by markers"
         )
 
 

@@ -12,6 +12,7 @@ examples:
 """
 
 import argparse
+import contextlib
 import csv
 import os
 from pathlib import Path
@@ -41,6 +42,9 @@ PASSED = (
     "threads", "overwrite", "strict",
 )  # fmt: skip
 """Options that :func:`reconstruct_dataset` has under the same names."""
+
+FOLDERS = 20
+"""Of so many folders the first frames are diagnosed: each may be of another camera."""
 
 USAGE = "CALIBRATION INPUT... --out FOLDER"
 
@@ -82,8 +86,8 @@ def run(arguments: argparse.Namespace) -> int:
         print(NOT_METRIC)
     if arguments.pictures is None and report.rows > PICTURES_UP_TO:
         print(f"no pictures of more than {PICTURES_UP_TO} frames: --pictures --overwrite draws all, --every N fewer")
-    for finding in diagnose_first(calibration, inputs, {name for name, _ in report.failed}):
-        print(f"first frame: {finding}")
+    for name, finding in diagnose_first(calibration, inputs, {name for name, _ in report.failed}):
+        print(f"{name}: {finding}")
     return 1 if report.failed else 0
 
 
@@ -141,15 +145,17 @@ def print_report(report: Report, out: Path, taught: TaughtRange | None) -> None:
     print(f"wrote {frames} to {out}{before}; table in frames.csv, units in summary.json")
 
 
-def diagnose_first(calibration: Path, inputs: list[Path], reported: set[str]) -> list[Finding]:
-    """What is wrong with the first frame, such as that it is from another unit; one that was left out is reported above."""
+def diagnose_first(calibration: Path, inputs: list[Path], reported: set[str]) -> list[tuple[str, Finding]]:
+    """What is wrong with the first frame of each folder, such as that it is from another camera; frames in ``reported`` are not."""
     unit = load_calibration(calibration)
-    try:
-        first = next(list_items(tuple(inputs) if len(inputs) > 1 else inputs[0]))
-        if first.frame_name(0 if first.is_video else -1) in reported:
-            return []
-        _, image = next(iter(read_frames(first.file)))
-        found = diagnose(None, unit.sensor.rectify(image[None])[0], unit)
-    except (OSError, ValueError, StopIteration):
-        return []
-    return [finding for finding in found if finding.severity != "note"]
+    first: dict[Path, tuple[str, Path]] = {}
+    for item in list_items(tuple(inputs) if len(inputs) > 1 else inputs[0]):
+        if len(first) < FOLDERS:
+            first.setdefault(item.file.parent, (item.frame_name(0 if item.is_video else -1), item.file))
+    findings = []
+    for name, file in first.values():
+        with contextlib.suppress(OSError, ValueError, StopIteration):
+            _, image = next(iter(read_frames(file)))
+            found = diagnose(None, unit.sensor.rectify(image[None])[0], unit)
+            findings += [(name, finding) for finding in found if finding.severity != "note" and name not in reported]
+    return findings

@@ -20,6 +20,9 @@ SHOWN = 5
 ALONE = 0.2
 """Standard deviation of the gain of a press by the others, from which they do not show a diameter that is wrong by half."""
 
+SATURATED = 0.05
+"""Share of the background that is saturated in a channel from which it is said."""
+
 BY = {
     "given": "given",
     "sensor_file": "positions from the sensor file",
@@ -50,7 +53,14 @@ def print_calibration(calibration: Calibration, candidates: bool = False) -> Non
         print(f"range: slopes up to {taught.angle_deg:.0f} degrees, depths up to {taught.depth_mm:.1f} mm; beyond, it extrapolates")
     share, place = press_next(calibration)
     if place is not None:
-        print(f"covered: presses lie on {share:.0%} of the skin; press next around x {place[0]}, y {place[1]} px")
+        x, y = ((n - 0.5 * (size - 1)) * sensor.mm_per_pixel for n, size in zip(place, (sensor.width, sensor.height), strict=True))
+        where = f"x {place[0]}, y {place[1]} px of rectified images ({x:+.1f}, {y:+.1f} mm from the middle)"
+        print(f"covered: presses lie on {share:.0%} of the skin; press next around {where}")
+    saturated = float((calibration.background >= calibration.saturation_light).any(0).double().mean())
+    if saturated > SATURATED:
+        print(f"saturated: {saturated:.0%} of the background: depth is worse there; reduce the exposure and calibrate again")
+    if report["source"] == "presses" and "prior_deg" not in report:
+        print("scale: that of mm_per_pixel and of the diameters; light presses cannot check them, deep ones do")
     alone = [row["name"] for row in report.get("presses", []) if row["used"] and row.get("gain_std", 0.0) > ALONE]
     if alone:
         named = ", ".join(alone[:SHOWN]) + (f" and {len(alone) - SHOWN} more" if len(alone) > SHOWN else "")

@@ -81,7 +81,7 @@ def check_corners(value: object) -> Corners:
 
 def check_raw_sizes(value: object) -> tuple[tuple[int, int], ...]:
     """Return sizes (height, width) of raw frames, or raise."""
-    if not isinstance(value, list | tuple):
+    if not isinstance(value, list | tuple) or not all(isinstance(size, list | tuple) for size in value):
         raise TypeError(f"raw_size_px: expected sizes [[height, width], ...] of raw frames, got {brief(value)}")
     numbers = check_numbers("raw_size_px", value, (len(value), 2)) if value else ()
     if any(v != int(v) or v < 8 for v in numbers):

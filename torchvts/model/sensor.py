@@ -257,7 +257,7 @@ class Sensor:
         own = self.width / self.height
         cause = "another aspect ratio, so another sensor, crop or mode of the camera"
         if abs(width / height / own - 1.0) <= 0.01:
-            cause = f"resize it, or load the sensor with height={height}, width={width}"
+            cause = f"resize it, load the sensor with height={height}, width={width}, or give it roi_px: [0, 0, {width}, {height}]"
         elif abs(height / width / own - 1.0) <= 0.01:
             turn = f"turn_deg: {self.turn_deg}" if self.turn_deg % 180 else "turn_deg: 90 (or 270)"
             cause = f"its camera lies: the sensor file needs {turn}, and raw_size_px with [{height}, {width}]"

@@ -164,6 +164,7 @@ class FrozenPipeline:
                 part[k].copy_(one[0])
 
     def _in_pytorch(self, images: Tensor, solve: bool, mask: bool) -> tuple[DepthOutput | None, Tensor | None]:
+        images = images.contiguous()  # rounding depends on the layout
         with torch.inference_mode():
             output = self._pipe(images) if solve else None
             moved = self._pipe.moved(images) if mask else None

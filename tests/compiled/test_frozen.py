@@ -335,9 +335,16 @@ def test_what_is_not_compiled_is_named_and_runs_in_pytorch(unit, reason):
     assert not found.depth_mm.is_inference()
 
 
+class Facing(torch.nn.Module):
+    """Normals of a kind from images: facing the camera."""
+
+    def forward(self, image):
+        return torch.nn.functional.normalize(torch.cat((image[:, :2] - 0.5, torch.ones_like(image[:, :1])), dim=1), dim=1)
+
+
 def test_a_network_in_training_is_frozen_in_eval_mode(unit):
     calibration, images = unit
-    network = torch.nn.Sequential(torch.nn.Conv2d(3, 3, 1), torch.nn.Dropout(0.5)).requires_grad_(False)
+    network = torch.nn.Sequential(Facing(), torch.nn.Dropout(0.5))
     frozen = vts.DepthPipeline.from_calibration(calibration, normals=network).freeze()
     assert network.training and torch.equal(frozen(images).depth_mm, frozen(images).depth_mm)
 

@@ -344,3 +344,8 @@ def test_a_recording_of_a_digit_reads_the_same_upright_and_lying(data, tmp_path)
     sensor, file = vts.Sensor.load("digit"), data / "digit_a" / "background.png"
     cv2.imwrite(str(tmp_path / "lying.png"), cv2.rotate(cv2.imread(str(file)), cv2.ROTATE_90_CLOCKWISE))
     assert torch.equal(sensor.read_image(tmp_path / "lying.png"), sensor.read_image(file))
+
+
+def test_a_mount_in_metres_is_asked_about():
+    with pytest.warns(UserWarning, match="sensor_to_robot: its shift is at most 0.12 mm: was it meant in m?"):
+        vts.Sensor(**GOOD, sensor_to_robot=((0, 0, 1, 0.05), (0, 1, 0, 0), (-1, 0, 0, 0.12), (0, 0, 0, 1)))

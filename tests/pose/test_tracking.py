@@ -711,7 +711,7 @@ def test_rendered_objects_meet_the_goal(name, motion_, most_mm):
 def test_a_frame_before_lift_off_keeps_the_rotations_that_it_calls_unknown():
     """They followed the coarse grid by 5 degrees, though no step of the fine one was allowed to."""
     ((row, track),) = tracking.run_tracking(["bolt head"], ["lift-off"], ["noise 0.005"], [1])
-    assert max(row.each["deg"]) < 0.28 and row.each["wrong"] == []
+    assert max(row.each["deg"]) < 0.2 and row.each["wrong"] == []
     tracker, unknown, last = vts.PoseTracker(track.frames[0], track.mm_per_pixel), 0, np.eye(4)
     for frame in track.frames[1:10]:
         found = tracker(frame)
@@ -726,7 +726,7 @@ def test_a_frame_before_lift_off_keeps_the_rotations_that_it_calls_unknown():
 def test_heights_show_the_tilt_that_wrong_slopes_hide():
     """Slopes alone give 0.33 degrees, median."""
     ((row, _),) = tracking.run_tracking(["gear"], ["fast"], ["slopes off by 3 degrees"], [4], [4])
-    assert float(np.median(row.each["deg"])) < 0.2 and row.each["lost"] == [] and row.each["wrong"] == []
+    assert float(np.median(row.each["deg"])) < 0.28 and row.each["lost"] == [] and row.each["wrong"] == []
 
 
 @pytest.mark.long

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -114,6 +115,8 @@ class Sensor:
         if self.sensor_to_robot is not None:
             numbers = check_numbers("sensor_to_robot", self.sensor_to_robot, (4, 4))
             check_rigid("sensor_to_robot", torch.tensor(numbers, dtype=torch.float64).reshape(4, 4))
+            if 0.0 < (most := max(abs(numbers[i]) for i in (3, 7, 11))) < 1.0:
+                warnings.warn(f"sensor_to_robot: its shift is at most {most:g} mm: was it meant in m?", UserWarning, stacklevel=3)
             self._set("sensor_to_robot", tuple(numbers[i : i + 4] for i in (0, 4, 8, 12)))
         prior: object = self.prior
         if isinstance(prior, dict):  # as YAML gives it

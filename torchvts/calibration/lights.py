@@ -55,7 +55,7 @@ class LightFit:
         converged: the loop ended because the lights stopped moving.
         message: how it ended, and the remedy if it did not converge.
         failed: the loop found no lights: it diverged or never moved, or a channel has hardly a usable pixel. ``lights`` are then
-            those of the start, and all figures of merit are infinite.
+            those of the start, and misfit and the last loss are infinite.
         loss_history: robust loss per step, in units of the noise.
         direction_std_deg: (3,), standard deviation of each light's direction seen from the image centre.
         position_std_mm: (3, 3), of each position coordinate.

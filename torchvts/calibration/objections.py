@@ -28,8 +28,9 @@ ENOUGH = 5
 ALIKE = 1.15
 """Gains of presses by the prior that are the same to within this factor show one mistake of all."""
 
-FAR = 1.4
-"""That factor, from one which no unit differs so much from the prior of its type: 0.87 to 1 on three units."""
+FAR = 1.65
+"""Such a factor that no unit differs so much from the prior of its type: 0.87 to 1 on three units; 0.62 to 1 by one to four presses
+of a DIGIT and the prior of another. From :data:`USUAL_GAIN` on there is a warning."""
 
 USUAL_GAIN = 1.15
 """The prior's slopes divided by those of the balls are within this factor: 0.93 to 1.00 on a GelSight Mini."""

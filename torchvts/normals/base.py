@@ -32,7 +32,7 @@ class NormalModel(nn.Module):
 
     Attributes:
         uses_depth: ``forward`` makes use of a depth; needed for the modes "precise" and "auto" to go again.
-        normals_from_depth: modes "precise" and "auto" return the gradient of the depth: integration keeps only what is the slope of
+        normals_from_depth: all modes return the gradient of the depth: integration keeps only what is the slope of
             a surface, so it has less noise and smaller errors than the slopes of single pixels.
         max_passes: passes after which nothing more is gained.
         takes_noise: ``forward`` gets, as a third argument, what ``noise_of`` makes of the compensated image.

@@ -356,7 +356,7 @@ class Confidence(nn.Module):
 
         Args:
             images: (B, 3, H, W), the input of the pipeline.
-            compensated: the same after ``Compensate``.
+            compensated: the same after ``Compensate`` and the pipeline's ``smooth``.
             out: the output of the pipeline.
         Raises:
             ValueError: wrong shapes, or another size than the calibrated one.

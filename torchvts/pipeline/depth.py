@@ -47,7 +47,7 @@ class DepthPipeline(nn.Module):
     ``tolerance_px``; for response fields gradient and normals are those of the depth, in all modes. ``auto`` predicts on every
     eighth pixel what a second pass would change, and solves only those frames again for which that exceeds
     ``refine_threshold_px``, until what is missing is below a fifth of it; where there are two passes at most, as for response
-    fields, it solves each frame twice.
+    fields, it solves each frame twice. By lights, ``auto`` alone divides out the drift of the LEDs.
     Frames of a batch do not influence one another; their number may change the rounding of sums. This is a plain PyTorch module:
     it trains, exports and runs on a GPU. For a camera or a recording, :meth:`freeze` it.
 
@@ -200,7 +200,7 @@ class DepthPipeline(nn.Module):
             weights: gs_sdk's ``nnmodel.pth``, of which nothing but tensors is unpickled; or what ``torchvts train`` wrote.
             background: (3, H, W), image of the unit without contact in [0, 1], R, G, B; the network's gradients there are zero.
             sensor: the sensor, or what :meth:`Sensor.load` takes.
-            mode: "fast", or "auto", which skips frames without contact.
+            mode: "fast", or "auto", which is the same for a network without depth.
         Raises:
             FileNotFoundError: no such weights or sensor.
             ValueError, TypeError: no weights of such a network, or a background of another size, type or range.

@@ -84,8 +84,9 @@ def contact_frame(frame: DepthFrame, name: str = "frame") -> Contact:
 
 def _contact_pixels(depth: Tensor, gradient: Tensor, contact: Tensor) -> int:
     """How many pixels of a frame touch; -1 where depth or gradient is not finite, or beyond :data:`HUGE`."""
-    largest = torch.stack((depth.abs().max(), gradient.abs().max()))  # NaN if any value is
-    return int(torch.count_nonzero(contact)) if bool((largest <= HUGE).all()) else -1
+    z, slopes = depth.numpy(), gradient.numpy()  # in one thread: two of torch's wait for each other where other programs run
+    ends = np.abs([z.min(), z.max(), slopes.min(), slopes.max()])  # NaN if any value is
+    return int(np.count_nonzero(contact.numpy())) if bool((ends <= HUGE).all()) else -1
 
 
 def grids(frame: Contact, mm_per_pixel: float, least_mm: float, times: tuple[int, int]) -> Grids:

@@ -150,12 +150,14 @@ def diagnose_first(calibration: Path, inputs: list[Path], reported: set[str]) ->
     unit = load_calibration(calibration)
     first: dict[Path, tuple[str, Path]] = {}
     for item in list_items(tuple(inputs) if len(inputs) > 1 else inputs[0]):
-        if len(first) < FOLDERS:
-            first.setdefault(item.file.parent, (item.frame_name(0 if item.is_video else -1), item.file))
+        first.setdefault(item.file.parent, (item.frame_name(0 if item.is_video else -1), item.file))
+        if len(first) == FOLDERS:
+            break
     findings = []
     for name, file in first.values():
         with contextlib.suppress(OSError, ValueError, StopIteration):
-            _, image = next(iter(read_frames(file)))
-            found = diagnose(None, unit.sensor.rectify(image[None])[0], unit)
-            findings += [(name, finding) for finding in found if finding.severity != "note" and name not in reported]
+            if name not in reported:
+                _, image = next(iter(read_frames(file)))
+                found = diagnose(None, unit.sensor.rectify(image[None])[0], unit)
+                findings += [(name, finding) for finding in found if finding.severity != "note"]
     return findings

@@ -27,8 +27,7 @@ class FrozenPipeline:
     """Images (B, 3, H, W) to a :class:`DepthOutput`, as the pipeline that it was made of; :meth:`DepthPipeline.freeze` makes one.
 
     It holds a copy, with every module in eval mode: nothing that is done to the pipeline afterwards changes it, and it records no
-    gradient. Compiled, it takes
-    float32 on a CPU. One thread works on a frame; the frames of a batch are shared among as many threads as torch uses, and equal
+    gradient. Compiled, it takes float32 on a CPU. One thread works on a frame; the frames of a batch are shared among as many threads as torch uses, and equal
     bit for bit those frames alone. Depth differs from the pipeline's by rounding, less than 1e-5 mm.
 
     Markers and the camera's gamma are undone by PyTorch, before the compiled code. By lights, in modes precise and auto, frames in
@@ -158,13 +157,12 @@ class FrozenPipeline:
         assert self._plan is not None
         output = tuple(part[k] for part in parts) if parts else None
         if self._plan.reconstruct(light[k], None if moved is None else moved[k], output) == IN_PYTORCH:
-            found, _ = self._in_pytorch(images[k : k + 1], True, False)
+            found, _ = self._in_pytorch(images[k : k + 1].contiguous(), True, False)  # rounding depends on the layout
             assert found is not None
             for part, one in zip(parts, found, strict=True):
                 part[k].copy_(one[0])
 
     def _in_pytorch(self, images: Tensor, solve: bool, mask: bool) -> tuple[DepthOutput | None, Tensor | None]:
-        images = images.contiguous()  # rounding depends on the layout
         with torch.inference_mode():
             output = self._pipe(images) if solve else None
             moved = self._pipe.moved(images) if mask else None

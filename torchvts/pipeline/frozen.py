@@ -27,8 +27,9 @@ class FrozenPipeline:
     """Images (B, 3, H, W) to a :class:`DepthOutput`, as the pipeline that it was made of; :meth:`DepthPipeline.freeze` makes one.
 
     It holds a copy, with every module in eval mode: nothing that is done to the pipeline afterwards changes it, and it records no
-    gradient. Compiled, it takes float32 on a CPU. One thread works on a frame; the frames of a batch are shared among as many threads as torch uses, and equal
-    bit for bit those frames alone. Depth differs from the pipeline's by rounding, less than 1e-5 mm.
+    gradient. Compiled, it takes float32 on a CPU. One thread works on a frame; the frames of a batch are shared among as many
+    threads as torch uses, and equal bit for bit those frames alone. Depth differs from the pipeline's by rounding, less than
+    1e-5 mm, but for single pixels at the limit of faint depth, where rounding decides.
 
     Markers and the camera's gamma are undone by PyTorch, before the compiled code. By lights, in modes precise and auto, frames in
     which the object blocks a light go through PyTorch as a whole.

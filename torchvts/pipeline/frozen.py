@@ -158,12 +158,13 @@ class FrozenPipeline:
         assert self._plan is not None
         output = tuple(part[k] for part in parts) if parts else None
         if self._plan.reconstruct(light[k], None if moved is None else moved[k], output) == IN_PYTORCH:
-            found, _ = self._in_pytorch(images[k : k + 1].contiguous(), True, False)  # rounding depends on the layout
+            found, _ = self._in_pytorch(images[k : k + 1], True, False)
             assert found is not None
             for part, one in zip(parts, found, strict=True):
                 part[k].copy_(one[0])
 
     def _in_pytorch(self, images: Tensor, solve: bool, mask: bool) -> tuple[DepthOutput | None, Tensor | None]:
+        images = images.contiguous()  # rounding depends on the layout
         with torch.inference_mode():
             output = self._pipe(images) if solve else None
             moved = self._pipe.moved(images) if mask else None

@@ -94,7 +94,7 @@ def disagreements(size, counts=(1, 3)):
             outputs = [frozen(given) for given in layouts(image).values() if torch.equal(given, image)]
             for out in outputs:
                 off = (out.depth_mm - expected.depth_mm).abs().flatten()
-                # where two slopes fit alike, and at the limit of faint depth, rounding decides
+                # where two slopes fit alike, rounding decides
                 typical = float(off.kthvalue(max(1, int(0.98 * len(off)))).values)
                 if not bool(torch.isfinite(out.depth_mm).all()) or typical > 1e-4 + 1e-3 * largest:
                     wrong.append((size, count, mode, fill, typical, largest))

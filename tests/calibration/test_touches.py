@@ -70,6 +70,10 @@ def angle(calibration, scene, mode="precise"):
 def test_touches_and_one_press_give_the_field(rest, touches):
     calibration = calibrate(rest, SENSOR, [vts.Press(seen(ball(1.0, -1.0), seed=20), 12.0)], touches)
     assert calibration.report["model"] == "response" and any(row["model"] == "touches" for row in calibration.report["candidates"])
+    assert calibration.report["reason"].split(":")[0] in (
+        "from the touches and 1 press",
+        "the touches, on which 1 press does not improve",
+    )
     assert angle(calibration, ball(2.0, 2.0, 0.6)) < 1.5
 
 

@@ -37,16 +37,8 @@ def agree(pipe, images, depth_mm=DEPTH_MM):
     with torch.inference_mode():
         plain, weight = pipe(images), pipe.frame_of(images)[0].weight
     found, moved = frozen.both(images)
-    off = (found.depth_mm - plain.depth_mm).abs()
-    # depth of a few thousandths of the range takes its weight: a pixel at that limit jumps
-    both = torch.stack((found.depth_mm.abs(), plain.depth_mm.abs()))
-    jumps = (off > depth_mm) & ((both.amin(0) - weight * both.amax(0)).abs() <= depth_mm)
-    assert float(off[~jumps].max()) <= depth_mm and int(jumps.sum()) <= 2
-    beside = torch.nn.functional.max_pool2d(jumps.float(), 3, 1, 1) > 0.0
-    assert (
-        float((found.normal - plain.normal).abs()[~beside.expand_as(plain.normal)].max())
-        <= 1e-4 + 2.0 * depth_mm / pipe.mm_per_pixel
-    )
+    assert float((found.depth_mm - plain.depth_mm).abs().max()) <= depth_mm
+    assert float((found.normal - plain.normal).abs().max()) <= 1e-4 + 2.0 * depth_mm / pipe.mm_per_pixel
     assert torch.equal(moved, frozen.moved(images))
     sure = (weight - 0.5).abs() > 1e-5
     assert not bool(((moved != (weight > 0.5)) & sure).any())

@@ -46,11 +46,16 @@ def locate_and_screen(contacts: list[Contact], sensor: Sensor, prior: ResponseMo
     while located is None or (prior is None and located > len(used(contacts))):
         locate(contacts, sensor, prior, half_mm)
         located = len(used(contacts))
-        _leave_out(contacts, prior, half_mm)
+        _leave_out(contacts, prior, half_mm, name_of_start(sensor, prior))
     return used(contacts)
 
 
-def _leave_out(contacts: list[Contact], prior: ResponseModel | None, half_mm: float) -> None:
+def name_of_start(sensor: Sensor, start: ResponseModel | None) -> str:
+    """What fields that a fit starts from are called; "" without."""
+    return "" if start is None else "the touches" if sensor.prior is None else "the sensor's prior"
+
+
+def _leave_out(contacts: list[Contact], prior: ResponseModel | None, half_mm: float, start_name: str) -> None:
     """Give a reason to presses that the others, or the prior, contradict, one after the other."""
     while True:
         left = used(contacts)
@@ -71,22 +76,22 @@ def _leave_out(contacts: list[Contact], prior: ResponseModel | None, half_mm: fl
         for contact, gain, error in zip(left, shown.tolist(), errors):
             contact.metrics |= {"error_deg": error, "gain": gain}
         if wrong is not None:
-            _reject_diameter(left, wrong, float(gains[wrong]), prior is not None)
+            _reject_diameter(left, wrong, float(gains[wrong]), start_name)
         elif not _reject_slopes(left, errors, prior is not None):
             return
 
 
-def _reject_diameter(left: list[Contact], wrong: int, gain: float, by_prior: bool) -> None:
+def _reject_diameter(left: list[Contact], wrong: int, gain: float, start_name: str) -> None:
     press = left[wrong]
     others = f"the other {len(left) - 1} presses" if len(left) > 2 else "the other press"
-    reference = ("the sensor's prior" + (f" and {others}" if len(left) > 1 else "")) if by_prior else others
+    reference = (start_name + (f" and {others}" if len(left) > 1 else "")) if start_name else others
     seen = 2 * press.radius_mm / max(gain, 1e-3)
     press.reason = f"by {reference} the ball seems {seen:.2f} mm wide, but {2 * press.radius_mm:g} mm was given"
-    if not by_prior:
+    if not start_name:
         press.reason += (
             ": a wrong diameter, or skin that answers otherwise than where they lie; more presses beside it will show which"
         )
-    if not by_prior and len(left) == 2:
+    if not start_name and len(left) == 2:
         left[1 - wrong].reason = "contradicts the only other press: one of the two diameters is wrong"
 
 

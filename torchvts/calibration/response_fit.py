@@ -15,7 +15,7 @@ from ..model.response_field import DepthBrightness, ResponseField, ResponseModel
 from ..model.sensor import Sensor
 from .contacts import Contact, NoUsablePress, first_pass_depths
 from .field import PRODUCT_PENALTY, Evidence, Family, ball_sine
-from .outliers import locate_and_screen
+from .outliers import locate_and_screen, name_of_start
 from .touches import presses_as_touches, scale_by_presses, scaled
 
 FAMILIES = ((0, -1, -1), (1, -1, -1), (2, -1, -1), (2, 1, -1), (2, 1, 0), (3, 2, -1), (3, 2, 1), (4, 3, -1))
@@ -156,7 +156,7 @@ def fit_response(
         by_depth = fit_depth_brightness(presses, chosen.field, pitch, None if prior is None else prior.by_depth)
         bar.update()
     score = chosen.row["score_deg"]
-    reason = f"{_origin(prior is not None, chosen.row, len(presses))}: {_how(score, len(chosen.rows))}"
+    reason = f"{_origin(name_of_start(sensor, prior), chosen.row, len(presses))}: {_how(score, len(chosen.rows))}"
     taught = taught_range(presses, chosen.field, pitch)
     if prior is not None and prior.taught is not None:
         taught = taught.with_all_of(prior.taught)
@@ -264,14 +264,12 @@ def _effect_of_depth(contact: Contact, field: ResponseField, depth: Tensor, star
     return effect, ball_sine(contact) - sine
 
 
-def _origin(from_prior: bool, row: CandidateRow, count: int) -> str:
+def _origin(start_name: str, row: CandidateRow, count: int) -> str:
     """What a field was made from, for a user."""
-    presses = f"{count} press" + "es" * (count > 1)
-    if not from_prior:
+    presses, verb = f"{count} press" + "es" * (count > 1), "do" if count > 1 else "does"
+    if not start_name:
         return f"from {presses}"
-    return (
-        f"from the sensor's prior and {presses}" if row["parameters"] else f"the sensor's prior, on which {presses} do not improve"
-    )
+    return f"from {start_name} and {presses}" if row["parameters"] else f"{start_name}, on which {presses} {verb} not improve"
 
 
 def _how(score_deg: float | None, count: int) -> str:

@@ -29,7 +29,7 @@ class FrozenPipeline:
     It holds a copy, with every module in eval mode: nothing that is done to the pipeline afterwards changes it, and it records no
     gradient. Compiled, it takes float32 on a CPU. One thread works on a frame; the frames of a batch are shared among as many
     threads as torch uses, and equal bit for bit those frames alone. Depth differs from the pipeline's by rounding, less than
-    1e-5 mm, but for single pixels at the limit of faint depth, where rounding decides.
+    1e-5 mm.
 
     Markers and the camera's gamma are undone by PyTorch, before the compiled code. By lights, in modes precise and auto, frames in
     which the object blocks a light go through PyTorch as a whole.
@@ -164,7 +164,7 @@ class FrozenPipeline:
                 part[k].copy_(one[0])
 
     def _in_pytorch(self, images: Tensor, solve: bool, mask: bool) -> tuple[DepthOutput | None, Tensor | None]:
-        images = images.contiguous()  # rounding depends on the layout
+        images = images.clone(memory_format=torch.contiguous_format)  # rounding depends on the layout
         with torch.inference_mode():
             output = self._pipe(images) if solve else None
             moved = self._pipe.moved(images) if mask else None

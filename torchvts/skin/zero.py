@@ -37,7 +37,7 @@ PIT_SHARE = 0.01
 """Depth below zero that is left, as a share of the frame's range."""
 
 FAINT = 0.004
-"""Depth of undeformed skin, as a share of the frame's range, that is none."""
+"""Depth of undeformed skin, as a share of the frame's range, that is none; from twice as much all of it is."""
 
 
 class ZeroBackground(nn.Module):
@@ -53,7 +53,8 @@ class ZeroBackground(nn.Module):
         mm_per_pixel: pixel pitch, mm.
     Source:
         membrane on an elastic foundation: Timoshenko and Woinowsky-Krieger, Theory of Plates and Shells, 1959; redescending weights
-        by a shrinking scale: Blake and Zisserman, Visual Reconstruction, 1987.
+        by a shrinking scale: Blake and Zisserman, Visual Reconstruction, 1987; firm shrinkage of faint depth: Gao and Bruce,
+        Statistica Sinica 7(4), 1997.
     Example:
         >>> weight = torch.zeros(1, 1, 48, 64)
         >>> weight[..., 12:36, 16:48] = 1.0
@@ -88,8 +89,9 @@ class ZeroBackground(nn.Module):
         rows = cosines(height, offset.shape[1], z.shape[1] * cell, z)
         columns = cosines(width, offset.shape[2], z.shape[2] * cell, z)
         found = (widened(depth_mm) + (rows.t() @ offset @ columns)[:, None]).to(depth_mm.dtype)
-        faint = found.detach().abs() < self.faint * reach[:, None].to(found.dtype)
-        return found * (1.0 - (1.0 - weight) * faint.to(found.dtype))
+        size = found.abs()
+        rest = found.sign() * torch.minimum(size, 2.0 * (size - self.faint * reach[:, None].to(found.dtype)).clamp_min(0.0))
+        return rest + weight * (found - rest)
 
     def offset(self, depth: Tensor, weight: Tensor, pitch_mm: float) -> tuple[Tensor, Tensor]:
         """The offset as coefficients of cosines along y and x, (B, K, M), and the range of depth, (B, 1, 1), of cells (B, h, w)."""

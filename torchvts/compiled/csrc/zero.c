@@ -211,7 +211,7 @@ static void fit_offset(const Plan *plan, const Work *at, double scale, double re
     memcpy(at->found, at->right, sizeof(double) * (size_t)at->unknowns);
 }
 
-/* Adds the offset to depth; depth so small that it is none takes its weight. */
+/* Adds the offset to depth; depth so small that it is none, and from twice as much all of it is, takes its weight. */
 static WIDE FUSED void add_offset(const Plan *plan, const double *found, const float *weight, float faint, float *line, float *sums, float *depth) {
     const int height = (int)plan->height, width = (int)plan->width, ky = (int)plan->waves_y, kx = (int)plan->waves_x;
     for (int y = 0; y < height; y++, depth += width, weight += width) {
@@ -232,8 +232,9 @@ static WIDE FUSED void add_offset(const Plan *plan, const double *found, const f
             for (int x = 0; x < width; x++) sums[x] += f * a[x];
         }
         for (int x = 0; x < width; x++) {
-            const float z = depth[x] + sums[x];
-            depth[x] = fabsf(z) < faint ? z * weight[x] : z;
+            const float z = depth[x] + sums[x], size = fabsf(z);
+            const float rest = copysignf(fminf(size, 2.0f * fmaxf(size - faint, 0.0f)), z);
+            depth[x] = rest + weight[x] * (z - rest);
         }
     }
 }

@@ -11,7 +11,7 @@ from torch import nn
 
 import torchvts as vts
 from torchvts.core.geometry import normal_from_gradient
-from torchvts.integration import PerspectiveIntegration
+from torchvts.integration import DiscontinuityIntegration, PerspectiveIntegration
 from torchvts.model import FillMarkers
 
 HEIGHT, WIDTH, PITCH = 48, 64, 0.6
@@ -107,6 +107,8 @@ CASES = {
     "PoissonDCT": (lambda dtype: vts.PoissonDCT(PITCH), gradient, "gradient"),
     "PoissonBackground": (lambda dtype: vts.PoissonBackground(PITCH), gradient, "gradient"),
     "PerspectiveIntegration": (lambda dtype: PerspectiveIntegration(PITCH, 400.0), gradient, "gradient"),
+    "DiscontinuityIntegration": (lambda dtype: DiscontinuityIntegration(PITCH), gradient, "gradient"),
+    "AdaptiveIntegration": (lambda dtype: vts.AdaptiveIntegration(PITCH), gradient, "gradient"),
     "ZeroBackground": (lambda dtype: Beside(vts.skin.ZeroBackground(PITCH), dtype), depth, "depth_mm"),
     "ContactFromDepth": (lambda dtype: Beside(vts.ContactFromDepth(PITCH), torch.bool), depth, "depth_mm"),
     "DepthPipeline fast": (pipe("fast"), images, "images"),
@@ -118,7 +120,17 @@ CASES = {
 }
 FREE = ("gradient", "normal", "depth_mm")
 SIZED = [name for name, (_, _, argument) in CASES.items() if argument not in FREE and name != "FillMarkers"]
+IN_PYTHON = ("DiscontinuityIntegration", "AdaptiveIntegration")
+"""Blocks whose solver is Python code, which no script holds."""
+SCRIPTED = [name for name in CASES if name not in IN_PYTHON]
 every_block = pytest.mark.parametrize("name", CASES)
+every_scripted_block = pytest.mark.parametrize("name", SCRIPTED)
+
+
+def test_every_public_block_is_among_the_cases():
+    public = {name for name, kind in vars(vts).items() if isinstance(kind, type) and issubclass(kind, nn.Module)}
+    bases, others = {"Integrator", "NormalModel"}, {"PointLights", "ConfidentPipeline"}  # no image in, or a pipeline in a pipeline
+    assert public - bases - others == {name.split()[0] for name in CASES} & public
 
 
 @functools.cache
@@ -149,14 +161,14 @@ def assert_same(one, two, tolerance=0.0):
 
 
 # The optimiser of TorchScript unfolds a pipeline to 100,000 lines, at 2 to 20 s for the first call.
-QUICKLY_OPTIMISED = [name for name in CASES if "Pipeline" not in name or name == "DepthPipeline fast"]
+QUICKLY_OPTIMISED = [name for name in SCRIPTED if "Pipeline" not in name or name == "DepthPipeline fast"]
 
 
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float64, 1e-11), (torch.float32, 2e-4)])
 @pytest.mark.parametrize(
     "name, optimised",
-    [(name, name in QUICKLY_OPTIMISED) for name in CASES]
-    + [pytest.param(name, True, marks=pytest.mark.long) for name in CASES if name not in QUICKLY_OPTIMISED],
+    [(name, name in QUICKLY_OPTIMISED) for name in SCRIPTED]
+    + [pytest.param(name, True, marks=pytest.mark.long) for name in SCRIPTED if name not in QUICKLY_OPTIMISED],
 )
 def test_torchscript_gives_what_eager_gives(name, optimised, dtype, tolerance):
     block, example = build(name, dtype)
@@ -164,7 +176,7 @@ def test_torchscript_gives_what_eager_gives(name, optimised, dtype, tolerance):
         assert_same(scripted(name, dtype)(example), block(example), tolerance)
 
 
-@every_block
+@every_scripted_block
 def test_a_script_survives_its_file(name):
     block, example = build(name, torch.float64)
     stream = io.BytesIO()
@@ -193,13 +205,14 @@ def test_items_of_a_batch_are_independent(name):
 @every_block
 def test_the_dtype_is_kept_and_single_precision_follows_double_precision(name):
     (single, example), (double, exact) = build(name), build(name, torch.float64)
+    tolerance = 1e-3 if name in IN_PYTHON else 2e-4  # their solves end at a residual of 1e-3
     for block, given in ((single, example), (double, exact)):
         assert {tensor.dtype for tensor in outputs(block(given))} <= {given.dtype, torch.bool}
     for left, right in zip(outputs(single(example)), outputs(double(exact)), strict=True):
         if left.dtype == torch.bool:  # a pixel may lie on a threshold
             assert float((left ^ right).double().mean()) < 2e-3
             continue
-        assert float((left.double() - right.double()).abs().max()) < 2e-4 * max(1.0, float(right.double().abs().max()))
+        assert float((left.double() - right.double()).abs().max()) < tolerance * max(1.0, float(right.double().abs().max()))
 
 
 @every_block
@@ -234,7 +247,7 @@ def test_a_non_contiguous_input_changes_nothing(name):
 def test_forward_derivatives_are_those_of_difference_quotients(name):
     block, example = build(name, torch.float64)
     example = example.clamp(0.05, 0.95)
-    tangent, step = 1e-3 * torch.randn(example.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64), 3e-6
+    tangent, step = 1e-3 * torch.randn(example.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64), 1e-5
     _, derivative = torch.func.jvp(lambda images: block(images).depth_mm, (example,), (tangent,))
     quotient = (block(example + step * tangent).depth_mm - block(example - step * tangent).depth_mm) / (2.0 * step)
     assert float((derivative - quotient).abs().max()) < 1e-8 < 1e-4 < float(derivative.abs().max())

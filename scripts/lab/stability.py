@@ -242,8 +242,9 @@ def in_words(corruption: Corruption) -> str:
 
 
 def points_to_json(points: Iterable[Breaking], command: str, seeds: int) -> str:
-    """Breaking points as one JSON document, one object a line."""
-    lines = ",\n".join("  " + json.dumps(asdict(point)) for point in points)
+    """Breaking points as one JSON document, one object a line, numbers to four digits."""
+    rounded = ({key: float(f"{x:.4g}") if isinstance(x, float) else x for key, x in asdict(point).items()} for point in points)
+    lines = ",\n".join("  " + json.dumps(point) for point in rounded)
     head = {"command": command, "limits": LIMITS, "seeds": seeds}
     body = ",\n".join(f" {json.dumps(key)}: {json.dumps(value)}" for key, value in head.items())
     return f'{{\n{body},\n "points": [\n{lines}\n ]\n}}\n'

@@ -244,7 +244,7 @@ SETTINGS = {
     "mask.least_spread": 0.02, "mask.weights": [0.25, 0.5, 0.25], "mask.by_colour": False,
     "solve.zero.cells": 20, "solve.zero.waves": 5, "solve.zero.scales": [0.3, 0.2], "solve.zero.decay_mm": 0.7,
     "solve.zero.smooth_mm": 0.8, "solve.zero.stiff": 3.0, "solve.zero.pit": 0.0, "solve.zero.pit_share": 0.2,
-    "solve.zero.faint": 0.1, "contact.share": 0.6, "contact.large": 0.5, "contact.deep": 0.5, "contact.rim_mm": 1.0,
+    "contact.share": 0.6, "contact.large": 0.5, "contact.deep": 0.5, "contact.rim_mm": 1.0,
     "contact.fall": 0.2, "contact.pulled": 0.01, "contact.pulling": 0.2, "contact.least_depth": 0.3, "contact.cell": 3,
     "refine.policy.tolerance_px": 0.3, "refine.policy.max_passes": 2, "refine.policy.refine_threshold_px": 3.0,
     "solve.gradient.max_slope": 0.2, "normals.shadowed.brightness_noises": 30.0, "normals.samples": 100,

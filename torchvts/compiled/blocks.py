@@ -353,7 +353,6 @@ def zero_values(block: nn.Module, size: tuple[int, int]) -> Values:
         "stiff": block.stiff,
         "pit": block.pit,
         "pit_share": block.pit_share,
-        "faint": block.faint,
     }
 
 

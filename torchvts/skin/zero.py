@@ -36,9 +36,6 @@ border cuts are 0.5 mm deep in place of 0.2."""
 PIT_SHARE = 0.01
 """Depth below zero that is left, as a share of the frame's range."""
 
-FAINT = 0.004
-"""Depth of undeformed skin, as a share of the frame's range, that is none; from twice as much all of it is."""
-
 
 class ZeroBackground(nn.Module):
     """Depth of integrated slopes, counted from the undeformed skin.
@@ -53,8 +50,7 @@ class ZeroBackground(nn.Module):
         mm_per_pixel: pixel pitch, mm.
     Source:
         membrane on an elastic foundation: Timoshenko and Woinowsky-Krieger, Theory of Plates and Shells, 1959; redescending weights
-        by a shrinking scale: Blake and Zisserman, Visual Reconstruction, 1987; firm shrinkage of faint depth: Gao and Bruce,
-        Statistica Sinica 7(4), 1997.
+        by a shrinking scale: Blake and Zisserman, Visual Reconstruction, 1987.
     Example:
         >>> weight = torch.zeros(1, 1, 48, 64)
         >>> weight[..., 12:36, 16:48] = 1.0
@@ -68,7 +64,7 @@ class ZeroBackground(nn.Module):
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         self.cells, self.waves, self.scales = CELLS, WAVES, list(SCALES)
         self.decay_mm, self.smooth_mm, self.stiff = DECAY_MM, SMOOTH_MM, STIFF
-        self.pit, self.pit_share, self.faint = PIT, PIT_SHARE, FAINT
+        self.pit, self.pit_share = PIT, PIT_SHARE
 
     def forward(self, depth_mm: Tensor, weight: Tensor) -> Tensor:
         """Depth (B, 1, H, W) up to a smooth offset, and the weight of moved skin (B, 1, H, W), to depth (B, 1, H, W).
@@ -85,16 +81,13 @@ class ZeroBackground(nn.Module):
         z = whole_cell_means(widened(depth_mm), cell)[:, 0]
         # the largest in a cell and beside it: a Laplacian takes its neighbours, and half a rim bears pressure
         around = nn.functional.max_pool2d(widened(weight), 3 * cell, cell, cell)[:, 0, : z.shape[1], : z.shape[2]]
-        offset, reach = self.offset(z, around, cell * self.mm_per_pixel)
+        offset = self.offset(z, around, cell * self.mm_per_pixel)
         rows = cosines(height, offset.shape[1], z.shape[1] * cell, z)
         columns = cosines(width, offset.shape[2], z.shape[2] * cell, z)
-        found = (widened(depth_mm) + (rows.t() @ offset @ columns)[:, None]).to(depth_mm.dtype)
-        size = found.abs()
-        rest = found.sign() * torch.minimum(size, 2.0 * (size - self.faint * reach[:, None].to(found.dtype)).clamp_min(0.0))
-        return rest + weight * (found - rest)
+        return (widened(depth_mm) + (rows.t() @ offset @ columns)[:, None]).to(depth_mm.dtype)
 
-    def offset(self, depth: Tensor, weight: Tensor, pitch_mm: float) -> tuple[Tensor, Tensor]:
-        """The offset as coefficients of cosines along y and x, (B, K, M), and the range of depth, (B, 1, 1), of cells (B, h, w)."""
+    def offset(self, depth: Tensor, weight: Tensor, pitch_mm: float) -> Tensor:
+        """The offset of cells (B, h, w) as coefficients of cosines along y and x, (B, K, M)."""
         height, width = depth.shape[1], depth.shape[2]
         k, m = number_of_waves(height, width, self.waves)
         rows, columns = cosines(height, k, height, depth), cosines(width, m, width, depth)
@@ -120,7 +113,7 @@ class ZeroBackground(nn.Module):
             right = right + (rows @ (pit * depth) @ columns.t()).flatten(1)
             solved = -torch.linalg.solve(system, right[..., None])[..., 0]
             found = torch.where(any_free[:, None], solved, found)
-        return found.reshape(-1, k, m), reach
+        return found.reshape(-1, k, m)
 
 
 def number_of_waves(height: int, width: int, waves: int) -> tuple[int, int]:

@@ -36,7 +36,6 @@
     INTEGER(zero_cell) INTEGER(waves_y) INTEGER(waves_x) TABLE(double, cosine_y) TABLE(double, cosine_x) TABLE(double, pairs_y)               \
     TABLE(double, pairs_x) TABLE(double, slope_pairs_y) TABLE(double, slope_pairs_x) TABLE(float, pixel_y) TABLE(float, pixel_x)              \
     TABLE(double, by_pressure) REAL(zero_decay) TABLE(double, scales) INTEGER(rounds) REAL(smooth_mm) REAL(stiff) REAL(pit) REAL(pit_share)   \
-    REAL(faint)                                                                                                                               \
     /* pressure.c */                                                                                                                          \
     REAL(moved_depth) INTEGER(contact_cell) TABLE(float, contact_blur) INTEGER(contact_taps) REAL(contact_decay) INTEGER(contact_step)        \
     REAL(share) REAL(large) REAL(deep) REAL(least_deep) INTEGER(rim_reach) REAL(fall) REAL(pulled) REAL(pulling) REAL(least_depth)

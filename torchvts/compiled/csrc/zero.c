@@ -211,10 +211,10 @@ static void fit_offset(const Plan *plan, const Work *at, double scale, double re
     memcpy(at->found, at->right, sizeof(double) * (size_t)at->unknowns);
 }
 
-/* Adds the offset to depth; depth so small that it is none, and from twice as much all of it is, takes its weight. */
-static WIDE FUSED void add_offset(const Plan *plan, const double *found, const float *weight, float faint, float *line, float *sums, float *depth) {
+/* Adds the offset to depth. */
+static WIDE FUSED void add_offset(const Plan *plan, const double *found, float *line, float *sums, float *depth) {
     const int height = (int)plan->height, width = (int)plan->width, ky = (int)plan->waves_y, kx = (int)plan->waves_x;
-    for (int y = 0; y < height; y++, depth += width, weight += width) {
+    for (int y = 0; y < height; y++, depth += width) {
         for (int j = 0; j < kx; j++) {
             double sum = 0.0;
             for (int i = 0; i < ky; i++) sum += (double)plan->pixel_y[(size_t)i * height + y] * found[i * kx + j];
@@ -231,11 +231,7 @@ static WIDE FUSED void add_offset(const Plan *plan, const double *found, const f
             const float *restrict a = plan->pixel_x + (size_t)j * width, f = line[j];
             for (int x = 0; x < width; x++) sums[x] += f * a[x];
         }
-        for (int x = 0; x < width; x++) {
-            const float z = depth[x] + sums[x], size = fabsf(z);
-            const float rest = copysignf(fminf(size, 2.0f * fmaxf(size - faint, 0.0f)), z);
-            depth[x] = rest + weight[x] * (z - rest);
-        }
+        for (int x = 0; x < width; x++) depth[x] += sums[x];
     }
 }
 
@@ -261,7 +257,7 @@ int zero_background(const Plan *plan, const float *weight, float *depth) {
     for (int k = 0; k < n; k++) at.pit[k] = 0.0;
     for (int round = 0; round < plan->rounds && any_free; round++) fit_offset(plan, &at, plan->scales[round], reach);
     float *line = (float *)(at.found + unknowns);
-    add_offset(plan, at.found, weight, (float)plan->faint * (float)reach, line, line + kx, depth);
+    add_offset(plan, at.found, line, line + kx, depth);
     free(memory);
     return DONE;
 }

@@ -51,8 +51,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def write_tables(points: Sequence[Breaking], seeds: int, out: Path, keep: bool) -> str:
     """Write all text files; returns the table of breaking points."""
-    text = f"{stability.table(points)}\n\n{stability.LIMITS}\n"
     kept = stability.points_to_json(points, "python scripts/stability.py --keep", seeds)
+    points, _ = stability.points_from_json(kept)  # rounded
+    text = f"{stability.table(points)}\n\n{stability.LIMITS}\n"
     written = {out / "breaking_points.md": text, out / "breaking_points.json": kept}
     if keep:
         page = ROOT / "docs" / "where_methods_fail.md"

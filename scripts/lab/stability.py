@@ -242,8 +242,8 @@ def in_words(corruption: Corruption) -> str:
 
 
 def points_to_json(points: Iterable[Breaking], command: str, seeds: int) -> str:
-    """Breaking points as one JSON document, one object a line, numbers to four digits."""
-    rounded = ({key: float(f"{x:.4g}") if isinstance(x, float) else x for key, x in asdict(point).items()} for point in points)
+    """Breaking points as one JSON document, one object a line, numbers to six digits."""
+    rounded = ({key: float(f"{x:.6g}") if isinstance(x, float) else x for key, x in asdict(point).items()} for point in points)
     lines = ",\n".join("  " + json.dumps(point) for point in rounded)
     head = {"command": command, "limits": LIMITS, "seeds": seeds}
     body = ",\n".join(f" {json.dumps(key)}: {json.dumps(value)}" for key, value in head.items())

@@ -34,6 +34,9 @@ SETTLING = 5
 MOST_FPS = 1e5
 """No camera gives more frames a second."""
 
+ASSUMED_FPS = 30.0
+"""Frames a second of images that say nothing of their times."""
+
 
 class Unreadable(NamedTuple):
     """A frame that cannot be read.
@@ -230,11 +233,11 @@ class _ReadingThread:
 
 
 def frames_a_second(capture: Any) -> float:
-    """Rate of an OpenCV capture; 30 where it does not know."""
+    """Rate of an OpenCV capture; :data:`ASSUMED_FPS` where it does not know."""
     import cv2
 
     fps = float(capture.get(cv2.CAP_PROP_FPS))
-    return fps if 0.5 <= fps <= 1000.0 else 30.0
+    return fps if 0.5 <= fps <= 1000.0 else ASSUMED_FPS
 
 
 def times_file(recording: Path) -> Path:
@@ -303,7 +306,7 @@ class FolderReader:
     """A folder of images, by name, numbers as numbers."""
 
     def __init__(self, folder: Path) -> None:
-        self.name, self.live, self.fps = str(folder), False, 30.0
+        self.name, self.live = str(folder), False
         files = image_files(folder)
         if not files:
             raise ValueError(
@@ -311,7 +314,7 @@ class FolderReader:
             )
         self._files, known = iter(files), read_times(folder)
         self.times = [known[file.stem] for file in files] if all(file.stem in known for file in files) else []
-        self.fps = rate_of(self.times, self.fps)
+        self.fps = rate_of(self.times, ASSUMED_FPS)
         self.codec = "JPEG" if files[0].suffix.lower() in (".jpg", ".jpeg") else ""
 
     def read(self) -> Pixels | Unreadable | None:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ..calibration import CalibrationWarning, Press, Touch, calibrate
 from ..core.tables import markdown, number
+from ..diagnose.checks import SATURATED
 from ..model import Calibration, PointLights, Sensor
 from ..model.coverage import press_next
 from ..model.report import CandidateRow, PressRow, Report
@@ -19,9 +20,6 @@ SHOWN = 5
 
 ALONE = 0.2
 """Standard deviation of the gain of a press by the others, from which they do not show a diameter that is wrong by half."""
-
-SATURATED = 0.05
-"""Share of the background that is saturated in a channel from which it is said."""
 
 BY = {
     "given": "given",

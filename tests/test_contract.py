@@ -297,6 +297,14 @@ def test_another_size_than_the_calibration_is_refused(name):
         block(example[..., :63])
 
 
+@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
+def test_another_size_is_refused_without_a_background(mode):
+    lights = calibration(torch.float32).lights
+    pipeline = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, SENSOR), mode)
+    with pytest.raises(ValueError, match=r"expected 48 x 64 like the calibration, got 47 x 64"):
+        pipeline(images(torch.float32)[..., :47, :])
+
+
 def test_a_scripted_error_keeps_its_text():
     with pytest.raises(torch.jit.Error, match=r"gradient: expected \(B, 2, H, W\), got \[2, 8, 8\]"):
         torch.jit.script(vts.PoissonDST())(torch.zeros(2, 8, 8))

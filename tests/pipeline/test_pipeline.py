@@ -394,6 +394,10 @@ AXES = {
     "y up": (lambda n: n * torch.tensor([1.0, -1.0, 1.0])[:, None, None], "y seems to count upwards, or x to the left: negate"),
     "x and y swapped": (lambda n: n[:, [1, 0, 2]], "x and y seem swapped: give them in the order x, y, z"),
     "turned a quarter": (lambda n: n[:, [1, 0, 2]] * torch.tensor([1.0, -1.0, 1.0])[:, None, None], "and one of them turned over"),
+    "n_z never written": (
+        lambda n: n * torch.tensor([1.0, 1.0, 0.0])[:, None, None],
+        "face away from the camera in 100% of the image",
+    ),
     "z away": (lambda n: -n, "face away from the camera in 100% of the image: n_z is above 0 here: negate it"),
 }
 

@@ -116,7 +116,7 @@ def test_a_symmetric_object_lists_its_other_poses():
     for k in range(12):
         truth = T_t @ objects.pose(30.0 * k, press_mm=0.0) @ invert(T_s)
         deg, mm = min(off(T, truth) for T in every)
-        assert deg < 0.5 and mm < 0.05
+        assert deg < 0.1 and mm < 0.01
 
 
 @pytest.mark.parametrize(

@@ -82,13 +82,13 @@ def _leave_out(contacts: list[Contact], prior: ResponseModel | None, half_mm: fl
 
 
 def _reject_diameter(left: list[Contact], wrong: int, gain: float, start_name: str) -> None:
-    press = left[wrong]
+    contact = left[wrong]
     others = f"the other {len(left) - 1} presses" if len(left) > 2 else "the other press"
     reference = (start_name + (f" and {others}" if len(left) > 1 else "")) if start_name else others
-    seen = 2 * press.radius_mm / max(gain, 1e-3)
-    press.reason = f"by {reference} the ball seems {seen:.2f} mm wide, but {2 * press.radius_mm:g} mm was given"
+    seen = 2 * contact.radius_mm / max(gain, 1e-3)
+    contact.reason = f"by {reference} the ball seems {seen:.2f} mm wide, but {2 * contact.radius_mm:g} mm was given"
     if not start_name:
-        press.reason += (
+        contact.reason += (
             ": a wrong diameter, or skin that answers otherwise than where they lie; more presses beside it will show which"
         )
     if not start_name and len(left) == 2:

@@ -5,7 +5,7 @@ from typing import Final
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_field, may_read
+from ..core.checks import check_field, check_same_size, may_read
 from ..core.robust import half_sample_mode
 from ..core.smooth import grid_samples, without_smooth_change
 
@@ -72,11 +72,12 @@ class Drift(nn.Module):
         blurred: bool = False,
     ) -> None:
         super().__init__()
-        self.by_mode_first = by_mode_first
+        self.by_mode_first, self.size = by_mode_first, (0, 0)
         samples, noise = None, None
         if background is not None and noise_std is not None:
             check_field("background", background)
             check_field("noise_std", noise_std)
+            self.size = (background.shape[1], background.shape[2])
             samples, noise = self.samples(background[None])[0], self.samples(noise_std[None])[0]
             if not blurred and min(background.shape[1], background.shape[2]) >= 180:
                 noise = noise / 3.0  # of a mean of nine
@@ -87,6 +88,7 @@ class Drift(nn.Module):
         background, noise = self.background, self.noise
         if background is None or noise is None:
             return light / self.by_mode(light)
+        check_same_size("image", light, "the calibration", self.size[0], self.size[1])
         if self.by_mode_first:
             near = self.by_mode(light)
             held = ((near - 1.0).abs() >= self.most_by_mode).any(dim=1, keepdim=True)

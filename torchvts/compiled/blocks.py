@@ -18,6 +18,7 @@ from ..core.robust import HALVINGS
 from ..integration import PoissonBackground, PoissonDCT
 from ..normals import NormalFromIntensity, NormalFromResponse
 from ..normals import shadowed as shadowed_module
+from ..normals.base import WrappedNormals
 from ..skin import ContactFromDepth, ContactMask, ZeroBackground
 from ..skin import pressure as pressure_module
 from ..skin import weight as weight_module
@@ -46,7 +47,8 @@ def check_block(name: str, block: object, *kinds: type[nn.Module]) -> None:
     """
     kind = type(block)
     if kind not in kinds:
-        raise NotCompiled(f"{name} is {kind.__name__}")
+        own = type(block.module) if isinstance(block, WrappedNormals) else kind
+        raise NotCompiled(f"{name} is {own.__name__}")
     for key, value in vars(block).items():
         if callable(getattr(kind, key, None)):
             raise NotCompiled(f"{name}.{key} is replaced")

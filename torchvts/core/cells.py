@@ -21,15 +21,6 @@ def cell_means(image: Tensor, cell: int) -> Tensor:
     return cell_sums(image, cell) / float(cell * cell)
 
 
-def mean_around(image: Tensor) -> Tensor:
-    """Mean over 3 x 3 pixels of a (B, C, H, W) image; beyond the border it counts as zero."""
-    if image.shape[2] * image.shape[3] < 1000:
-        return nn.functional.avg_pool2d(image, 3, 1, 1)
-    padded = nn.functional.pad(image, [1, 1, 1, 1])
-    rows = padded[:, :, :-2] + padded[:, :, 1:-1] + padded[:, :, 2:]
-    return (rows[..., :-2] + rows[..., 1:-1] + rows[..., 2:]) / 9.0
-
-
 def _line_sums(image: Tensor, cell: int) -> Tensor:
     """Sums of each ``cell`` rows."""
     whole = image.shape[2] // cell * cell

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 
@@ -43,8 +42,3 @@ class DepthOutput(NamedTuple):
     normal: Tensor
     contact: Tensor
     deformed: Tensor
-
-
-def as_factor(mask: Tensor, like: Tensor) -> Tensor:
-    """A bool mask as zeros and ones of the dtype of ``like``."""
-    return mask.to(torch.uint8).to(like.dtype)  # four times as fast as straight from bool

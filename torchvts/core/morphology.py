@@ -68,21 +68,6 @@ def _sweep(reached: Tensor, mask: Tensor, runs: Tensor) -> Tensor:
     return (counts.index_select(0, runs).reshape(mask.shape) > 0.0) & mask
 
 
-def dilate_cross(mask: Tensor) -> Tensor:
-    """Dilation over edges, not corners."""
-    if not torch.jit.is_scripting():  # noqa: SIM102
-        if torch.compiler.is_compiling():
-            inside = mask.to(torch.float32)
-            beside = nn.functional.max_pool2d(inside, (1, 3), 1, (0, 1))
-            return (nn.functional.max_pool2d(inside, (3, 1), 1, (1, 0)) + beside) > 0
-    grown = mask.clone()
-    grown[..., 1:].logical_or_(mask[..., :-1])  # by method: TorchScript takes |= on a slice for a new tensor
-    grown[..., :-1].logical_or_(mask[..., 1:])
-    grown[..., 1:, :].logical_or_(mask[..., :-1, :])
-    grown[..., :-1, :].logical_or_(mask[..., 1:, :])
-    return grown
-
-
 def dilate(mask: Tensor, reach: int = 1) -> Tensor:
     """Dilation of a bool mask by a square of 2 reach + 1 a side; equal to kornia.morphology.dilation (a test holds them together),
     100 times faster."""

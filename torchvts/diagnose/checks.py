@@ -74,7 +74,7 @@ class Check:
 
 
 def run_checks(examination: Examination) -> Iterator[Finding]:
-    """All findings, in the order of the table; a fault of the frame ends it, for it makes the rest meaningless."""
+    """All findings, in the order of the table; one that makes the rest meaningless ends it."""
     found: list[Finding] = []
     for check in CHECKS:
         if check.alone and any(finding.severity != "note" for finding in found):

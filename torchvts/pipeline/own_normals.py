@@ -31,7 +31,7 @@ def doubt_of_axes(name: str, normal: Tensor) -> str | None:
         >>> doubt_of_axes("Net", up)
         'normals: Net gives normals that face away from the camera in 100% of the image: n_z is above 0 here: negate it'
     """
-    away = float((normal[:, 2] < 0).double().mean())
+    away = float((normal[:, 2] <= 0).double().mean())
     if away > FACING_AWAY:
         seen = f"normals: {name} gives normals that face away from the camera in {away:.0%} of the image"
         return f"{seen}: n_z is above 0 here: negate it"

@@ -1,5 +1,6 @@
 """Pose from two depth frames: search over the plane, refinement on every pixel of the common contact, then ambiguity."""
 
+import dataclasses
 import math
 
 import torch
@@ -21,8 +22,9 @@ def register_depth(source: DepthFrame, target: DepthFrame, mm_per_pixel: float, 
     """Pose of a pressed object in one frame relative to another frame of it, from all pixels of both contacts.
 
     First, slopes are correlated over all rotations and shifts in the plane. Then the best hypotheses are refined on coarse grids
-    and scored in both directions, and the best one is refined on the fine grid: slopes and depths of the common contact, six
-    degrees of freedom. Parts that are pressed deeper in one frame than in the other, or lie outside of one image, are ignored.
+    and scored in both directions, and the best one, and all that fit equally well, are refined on the fine grid: slopes and
+    depths of the common contact, six degrees of freedom. Parts that are pressed deeper in one frame than in the other, or lie
+    outside of one image, are ignored.
 
     Args:
         source: one frame, a :class:`torchvts.DepthOutput` or any object with its depth_mm, gradient and contact.
@@ -54,11 +56,13 @@ def register_depth(source: DepthFrame, target: DepthFrame, mm_per_pixel: float, 
     if sizes[0] != sizes[1]:
         cause = "positions count from the image's middle, so a cropped frame lies elsewhere"
         raise ValueError(f"source: expected {sizes[1][0]} x {sizes[1][1]} like target, got {sizes[0][0]} x {sizes[0][1]}: {cause}")
-    return align(a, b, None if initial is None else check_rigid("initial", initial))
+    found = align(a, b, None if initial is None else check_rigid("initial", initial))
+    others = [_refine_both_ways(a, b, pose[None])[0] for pose in found.alternatives]
+    return dataclasses.replace(found, alternatives=others)
 
 
 def align(a: Levels, b: Levels, start: Tensor | None) -> Registration:
-    """Register two prepared frames, source ``a`` on target ``b``; tries ``start`` first."""
+    """Register two prepared frames, source ``a`` on target ``b``; tries ``start`` first. Alternatives are those of middle grids."""
     if start is not None:
         poses = refine(a.coarse, b.coarse, start[None], 6, 2.0)
         if is_trusted(score_poses(a.coarse, b.coarse, poses), 0):

@@ -156,7 +156,8 @@ TABLE = {
     "Confidence": Entry({"normals": pipe().normals, "noise_std": 0.01 * FLAT, "image_noise_std": torch.full((3,), 0.01),
         "light_std": 0.01 * FLAT, "mm_per_pixel": 1.0}, {"normals": ["lights", None], "noise_std": BAD_FLAT,
         "image_noise_std": [torch.zeros(2), None, 0.01], "light_std": [FLAT[None], None, 0.01],
-        "model_deg": ["1", None, NAN, -1.0], "model_log_variance": ["1", None, NAN, -1.0], "taught": [0.5, (0.5, 0.4, 0.3)],
+        "model_deg": ["1", None, NAN, -1.0], "model_log_variance": ["1", None, NAN, -1.0],
+        "least_level": ["1", None, NAN, -1.0], "taught": [0.5, (0.5, 0.4, 0.3)],
         "blur_px": ["1", None, NAN, -1.0], "spread": NUMBER}),
     "Confidence.from_calibration": Entry(
         {"calibration": unit(), "normals": pipe().normals}, {"normals": ["mine", torch.nn.Identity()]}),

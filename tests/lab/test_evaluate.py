@@ -236,6 +236,16 @@ def test_own_presses_are_scored_as_the_lab_scores_them(run_script, folder, by_ha
     assert done.stdout.splitlines()[2].startswith("| fast | ") and (tmp_path / "table.md").read_text() in done.stdout + "\n"
 
 
+def test_camera_frames_are_cut_as_calibrate_cuts_them(folder, tmp_path, capsys):
+    """Frames of which the sensor file's region is a part; their labels are of cut frames, so the balls are found."""
+    raw = shutil.copytree(folder, tmp_path / "raw")
+    for path in raw.rglob("*.png"):
+        vts.write_image(path, torch.nn.functional.pad(vts.read_image(path), (9, 5, 4, 6)))
+    vts.Sensor("rig", HEIGHT, WIDTH, PITCH, gamma=1.0, roi_px=(9, 4, WIDTH, HEIGHT)).save(raw / "rig.yaml")
+    assert main(["evaluate", str(raw), "--sensor", str(raw / "rig.yaml"), "--folds", "2", "--out", str(tmp_path / "out")]) == 0
+    assert "6 presses, 0 labelled" in capsys.readouterr().out
+
+
 def test_what_was_scored_stays_where_it_is_stopped(folder, monkeypatch, tmp_path, capsys):
     made = Training.calibration
     attempts = []

@@ -295,6 +295,20 @@ def test_frames_that_no_surface_explains_have_wider_bounds(drawn):
     assert float(ratio) > 1.2
 
 
+def test_a_good_frame_does_not_narrow_the_bounds_of_few_presses(drawn):
+    """Three presses err by a scale too, which a frame that is the gradient of a surface does not show."""
+    calibration, frames = drawn
+    rows = [{"used": True}] * 6
+    level = {}
+    for used in (3, 6):
+        report = {"model": "response", "source": "presses", "held_out_deg": 8.0, "presses": rows[:used]}
+        pipe = vts.ConfidentPipeline.from_calibration(dataclasses.replace(calibration, report=report), "precise")
+        out = pipe(frames)
+        model = out.factors_deg[:, FACTORS.index("model")][out.contact[:, 0]].median()
+        level[used] = float(model) / math.degrees(math.sqrt(pipe.confidence.model_variance))
+    assert level[3] > 0.9 > level[6]
+
+
 def test_no_contact(ring):
     calibration, scene, _ = lights_unit(ring)
     image = scenes.render(scenes.undeformed(scene), ring(), noise_std=0.004, seed=9)

@@ -91,6 +91,8 @@ def _reject_diameter(left: list[Contact], wrong: int, gain: float, start_name: s
         contact.reason += (
             ": a wrong diameter, or skin that answers otherwise than where they lie; more presses beside it will show which"
         )
+    if not start_name and len(left) == 3:
+        contact.reason += "; of three, another may be the wrong one"
     if not start_name and len(left) == 2:
         left[1 - wrong].reason = "contradicts the only other press: one of the two diameters is wrong"
 

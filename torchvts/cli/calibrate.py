@@ -19,7 +19,7 @@ from ..calibration import Press, Touch, read_presses
 from ..core.files import make_folder, read_frames
 from ..model import Sensor
 from ..stream import read_background, read_press_images
-from .options import add_background_frames, add_press, add_sensor, load_sensor
+from .options import add_background_frames, add_press, add_sensor, cut_frames, load_sensor
 from .parser import UsageError
 from .summary import calibrated, print_calibration
 
@@ -82,10 +82,8 @@ def read_given(arguments: argparse.Namespace) -> tuple[torch.Tensor, Sensor, lis
         raise UsageError(f"--use-labels: {first} has neither label.npz nor labels.csv: leave --use-labels out, centers are found")
     elif tuple(image.shape[1:]) != (sensor.height, sensor.width):
         raise UsageError(f"--use-labels: the images of {first} are raw frames, labels are for cropped ones: leave --use-labels out")
-    if tuple(image.shape[1:]) == (sensor.height, sensor.width) and sensor.raw_size_px:
-        return image, sensor, presses  # gs_sdk keeps cropped images, also where raw frames have that size
-    presses = [dataclasses.replace(press, image=sensor.rectify(press.image[None])[0]) for press in presses]
-    return sensor.rectify(image[None])[0], sensor, presses
+    image, presses = cut_frames(image, presses, sensor)
+    return image, sensor, presses
 
 
 def unknown_sensor(arguments: argparse.Namespace) -> Sensor:

@@ -41,6 +41,8 @@ def run(arguments: argparse.Namespace) -> int:
         try:
             return calibration.sensor.rectify(image[None])[0]  # raw frames are cut, as by torchvts reconstruct
         except ValueError:
+            if tuple(image.shape[1:]) == (calibration.sensor.height, calibration.sensor.width):
+                raise  # it seems to be cut already, and torchvts reconstruct would leave it out
             return image  # of another size: that is a finding
 
     background = None if arguments.background is None else read(arguments.background)

@@ -29,7 +29,7 @@ from ..model import Sensor
 from ..pipeline import DepthOutput, DepthPipeline
 from ..training.balls import ball_truth, fit_sphere
 from ..training.presses import Training, with_centers
-from .options import add_out, add_sensor, load_sensor
+from .options import add_out, add_sensor, cut_frames, load_sensor
 
 USAGE = "FOLDER --sensor NAME [--folds N] [--out FOLDER]"
 
@@ -67,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Score, write the table after every fold, and print it at the end or where it is stopped."""
     sensor = load_sensor(arguments.sensor or "gelsight_mini")
-    background, presses = read_presses(arguments.folder)
+    background, presses = cut_frames(*read_presses(arguments.folder), sensor)
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     folds = check_integer("--folds", arguments.folds, 2)
     if folds > len(presses):
@@ -78,6 +78,9 @@ def run(arguments: argparse.Namespace) -> int:
     known = {press.name: press for press in with_centers(background, sensor, presses) if _scorable(press, sensor)}
     if not known:
         raise ValueError(f"folder: none of {len(presses)} presses has a contact that can be scored: label them, or press deeper")
+    left = [press.name for press in presses if press.name not in known]
+    if left:
+        print(f"not scored: {', '.join(left)}: no clean ball is found: torchvts calibrate says why", file=sys.stderr)
     make_folder(arguments.out)
     scores: list[Score] = []
     reasons: list[str] = []

@@ -2,9 +2,12 @@
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
+from torch import Tensor
+
+from ..calibration import Press
 from ..core.checks import parse_number
 from ..core.spelling import suggest
 from ..model import Calibration, Sensor, shipped_sensors
@@ -12,6 +15,7 @@ from ..pipeline import MODES
 from ..pose.output_frame import MM_OF
 from ..skin import ContactSettings
 from ..stream import FIRST_FRAMES
+from ..training.presses import without_labels
 from .parser import UsageError
 
 _CONTACT = " ".join(
@@ -94,6 +98,15 @@ def load_sensor(name: str) -> Sensor:
         return Sensor.load(name)
     except FileNotFoundError as error:
         raise FileNotFoundError(f"--sensor: {str(error).removeprefix('source: ')}") from None
+
+
+def cut_frames(background: Tensor, presses: Sequence[Press], sensor: Sensor) -> tuple[Tensor, list[Press]]:
+    """The background and presses of a folder, cut and resized as the sensor file says; labels, of cut frames, go with raw ones."""
+    cut_already = tuple(background.shape[1:]) == (sensor.height, sensor.width)
+    if cut_already and sensor.raw_size_px:
+        return background, list(presses)  # gs_sdk keeps cropped images, also where raw frames have that size
+    given = presses if cut_already else [without_labels(press) for press in presses]
+    return sensor.rectify(background[None])[0], [replace(press, image=sensor.rectify(press.image[None])[0]) for press in given]
 
 
 def load_calibration(path: Path) -> Calibration:

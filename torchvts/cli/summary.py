@@ -58,7 +58,7 @@ def print_calibration(calibration: Calibration, candidates: bool = False) -> Non
     if saturated > SATURATED:
         print(f"saturated: {saturated:.0%} of the background: depth is worse there; reduce the exposure and calibrate again")
     if report["source"] == "presses" and "prior_deg" not in report:
-        print("scale: that of mm_per_pixel and of the diameters; light presses cannot check them, deep ones do")
+        print("scale: that of mm_per_pixel and of the diameters; sizes that are all too small show in five deep presses, no others")
     alone = [row["name"] for row in report.get("presses", []) if row["used"] and row.get("gain_std", 0.0) > ALONE]
     if alone:
         named = ", ".join(alone[:SHOWN]) + (f" and {len(alone) - SHOWN} more" if len(alone) > SHOWN else "")

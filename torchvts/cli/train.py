@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ..calibration import read_presses
 from ..training.presses import train_network
-from .options import add_sensor, load_sensor
+from .options import add_sensor, cut_frames, load_sensor
 from .parser import UsageError
 
 USAGE = "FOLDER --sensor NAME --out FILE"
@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out.suffix != ".safetensors":
         raise UsageError(f"--out: expected a name ending in .safetensors, got {arguments.out}")
     sensor = load_sensor(arguments.sensor)
-    background, presses = read_presses(arguments.folder)
+    background, presses = cut_frames(*read_presses(arguments.folder), sensor)
     fit = train_network(
         background, presses, sensor, arguments.blur_px, arguments.seed, max_epochs=arguments.max_epochs, progress=True
     )

@@ -34,7 +34,7 @@ from ..model.response_field import TaughtRange
 from ..normals import NormalFromIntensity, NormalFromResponse, as_normal_model
 from ..skin import ContactSettings
 from .depth import DepthOutput, DepthPipeline, eval_around
-from .expected_error import expected_model_deg, light_std_by_fit, model_log_variance
+from .expected_error import expected_model_deg, least_level, light_std_by_fit, model_log_variance
 
 FACTORS = ("noise", "model", "pass", "surface", "saturation", "range")
 """The order of ``factors_deg``: noise through the inverse model, raised where the light does not fit; error of the model; what a
@@ -236,6 +236,7 @@ class Confidence(nn.Module):
         model_deg: mean error of a response field, degrees; 0 for lights.
         model_log_variance: variance of the logarithm of ``model_deg``: the larger, the more a frame's integrability decides; 0 if
             it is not asked.
+        least_level: the least factor of the model's variance that a frame may show.
         taught: how steep and deep the presses of a response field were; None if not known.
         measured: whether the background was an image.
         blur_px: of the compensated image.
@@ -268,6 +269,7 @@ class Confidence(nn.Module):
         *,
         model_deg: float = 0.0,
         model_log_variance: float = 0.0,
+        least_level: float = 0.0,
         taught: TaughtRange | None = None,
         measured: bool = True,
         blur_px: float = 0.0,
@@ -289,6 +291,7 @@ class Confidence(nn.Module):
         self.fixed = 1.0 if measured else 0.0
         self.model_variance = (math.radians(model_deg) / SPREAD_OF_MEAN) ** 2
         self.model_log_variance = check_least("model_log_variance", model_log_variance)
+        self.least_level = check_least("least_level", least_level)
         if taught is not None:
             check_record("taught", taught, TaughtRange)
         self.taught_sine = 1.0 if taught is None else taught.sine
@@ -348,7 +351,7 @@ class Confidence(nn.Module):
         light = torch.full_like(noise, math.radians(model_deg) / SPREAD_OF_MEAN / usual)
         assert calibration.response is not None
         common |= {"model_deg": model_deg, "spread": RESPONSE_SPREAD, "taught": calibration.response.taught}
-        common["model_log_variance"] = model_log_variance(calibration)
+        common |= {"model_log_variance": model_log_variance(calibration), "least_level": least_level(calibration)}
         return cls(block, noise, calibration.noise_std, light, sensor.mm_per_pixel, **common)
 
     def forward(self, images: Tensor, compensated: Tensor, out: DepthOutput) -> Bounds:
@@ -476,7 +479,8 @@ class Confidence(nn.Module):
         found = self.integrable_share**2 * (odd / total.clamp_min(1e-6)).clamp_min(1e-6)
         expected = 1.5708 * self.model_variance  # square of the mean error
         share = self.model_log_variance / (self.model_log_variance + self.frame_variance)
-        return torch.where(total > 1.0, (found / max(expected, 1e-12)) ** share, torch.ones_like(total))
+        level = ((found / max(expected, 1e-12)) ** share).clamp_min(self.least_level)
+        return torch.where(total > 1.0, level, torch.ones_like(total))
 
     def _beyond(self, out: DepthOutput) -> Tensor:
         """Variance of the angle beyond the slopes and depths that were taught."""

@@ -398,7 +398,7 @@ AXES = {
         lambda n: n * torch.tensor([1.0, 1.0, 0.0])[:, None, None],
         "face away from the camera in 100% of the image",
     ),
-    "z away": (lambda n: -n, "face away from the camera in 100% of the image: n_z is above 0 here: negate it"),
+    "z away": (lambda n: -n, "face away from the camera in 100% of the image: n_z is above 0 here: negate or set it"),
 }
 
 

@@ -29,12 +29,12 @@ def doubt_of_axes(name: str, normal: Tensor) -> str | None:
         >>> import torch
         >>> up = torch.tensor([0.0, 0.0, -1.0]).reshape(1, 3, 1, 1).expand(1, 3, 8, 8)
         >>> doubt_of_axes("Net", up)
-        'normals: Net gives normals that face away from the camera in 100% of the image: n_z is above 0 here: negate it'
+        'normals: Net gives normals that face away from the camera in 100% of the image: n_z is above 0 here: negate or set it'
     """
     away = float((normal[:, 2] <= 0).double().mean())
     if away > FACING_AWAY:
         seen = f"normals: {name} gives normals that face away from the camera in {away:.0%} of the image"
-        return f"{seen}: n_z is above 0 here: negate it"
+        return f"{seen}: n_z is above 0 here: negate or set it"
     gradient = gradient_from_normal(normal).double()
     if gradient.shape[2] < 2 or gradient.shape[3] < 2 or float(gradient.square().mean().sqrt()) < LEAST_SLOPE:
         return None

@@ -126,6 +126,21 @@ def test_calibrate_says_in_few_lines_what_to_expect(rig, run_script, tmp_path):
     assert "| point lights | three lights | 2 |" in table.stdout and "| R | " in table.stdout
 
 
+def test_a_calibrated_place_refuses_frames_of_another_mode_of_the_camera(rig, run_script, tmp_path):
+    sensor, _, background, press = rig
+    for name, image in (("background", background), ("ball", press)):
+        vts.write_image(tmp_path / f"{name}.png", torch.nn.functional.pad(image, (10, 6, 8, 4), value=0.1))
+    dataclasses.replace(sensor, roi_px=(10, 8, 64, 48)).save(tmp_path / "rig.yaml")
+    given = (tmp_path / "background.png", "--sensor", tmp_path / "rig.yaml", "--out", tmp_path / "unit.safetensors")
+    done = run_script("calibrate", *given, "--press", tmp_path / "ball.png", "20")
+    assert done.returncode == 0, done.stderr
+    vts.write_image(tmp_path / "other_mode.png", torch.zeros(3, 120, 160))
+    written = run_script("reconstruct", tmp_path / "unit.safetensors", tmp_path / "ball.png", "--out", tmp_path / "out")
+    assert written.returncode == 0, written.stderr
+    other = run_script("reconstruct", tmp_path / "unit.safetensors", tmp_path / "other_mode.png", "--out", tmp_path / "other")
+    assert other.returncode == 1 and "raw frames of 60 x 80" in other.stderr and "another mode of the camera" in other.stderr
+
+
 def test_what_to_expect_follows_the_source(rig, mini_by_prior):
     sensor, lights, background, _ = rig
     given = vts.Calibration.from_lights(lights, sensor, background)

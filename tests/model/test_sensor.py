@@ -53,7 +53,6 @@ def as_text(**changes):
         (as_text(roi_px="[-1, 0, 10, 10]"), "key roi_px: expected whole numbers"),
         (as_text(raw_size_px="[48, 64]"), r"key raw_size_px: expected sizes \[\[height, width\], ...\] of raw frames"),
         (as_text(raw_size_px="[[48, 64]]", raw_crop=0.5), r"key raw_crop: expected a number in \[0, 0.49\], got 0.5"),
-        (as_text(raw_size_px="[[48, 64]]", roi_px="[0, 0, 9, 9]"), "key raw_size_px: expected none beside roi_px"),
         (as_text(corners_px="[[0, 0], [0, 9], [9, 9], [9, 0]]"), "key corners_px: expected a convex quadrilateral"),
         (as_text(corners_px="[[0, 0], [9, 0], [9, 9], [0, 9]]", roi_px="[0, 0, 9, 9]"), "expected one of them, got both"),
         (as_text(turn_deg=45), "key turn_deg: expected 0, 90, 180 or 270, anticlockwise, got 45"),
@@ -308,6 +307,21 @@ def test_raw_frames_are_cropped_and_resized():
     ):
         sensor.rectify(torch.zeros(1, 3, 30, 32))
     assert sensor.resized(240, 320).raw_size_px == ((84, 112),)  # images of this size are cropped already
+
+
+@pytest.mark.parametrize(
+    "place", [{"roi_px": (8, 4, 64, 48)}, {"corners_px": ((7.5, 3.5), (71.5, 3.5), (71.5, 51.5), (7.5, 51.5))}]
+)
+def test_a_place_is_cut_from_frames_of_its_size_alone(place):
+    sensor = vts.Sensor(**GOOD, **place, raw_size_px=((60, 100),))
+    frame = torch.rand(1, 3, 60, 100, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(sensor.rectify(frame), vts.Sensor(**GOOD, **place).rectify(frame))
+    for size in ((120, 200), (24, 32)):
+        with pytest.raises(
+            ValueError, match=f"frames of 60 x 100, .* has its {next(iter(place))}, got {size[0]} x {size[1]}: another mode"
+        ):
+            sensor.rectify(torch.zeros(1, 3, *size))
+    assert sensor.resized(48, 64).raw_size_px == ((60, 100),)
 
 
 @pytest.mark.parametrize(

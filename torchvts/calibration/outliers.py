@@ -63,7 +63,7 @@ def _leave_out(contacts: list[Contact], prior: ResponseModel | None, half_mm: fl
             return
         start = None if prior is None else prior.field.tensor().reshape(-1)
         evidence = Evidence.of(Family(2, -1, half_mm) if prior is None else Family.of(prior.field), left)
-        penalty = SCREENING_PENALTY * evidence.family.penalty() if prior is None else evidence.penalty(PRIOR_PRESSES)
+        penalty = _screening(evidence) if prior is None else evidence.penalty(PRIOR_PRESSES)
         gains = evidence.gains(evidence.held_out(penalty, start))
         errors = evidence.errors_deg([evidence.solve(penalty, start)] * len(left))
         if start is None:
@@ -117,12 +117,16 @@ def _wrong_by_prior(gains: Tensor) -> int | None:
     return worst if float(far[worst]) > math.log(FAR_FROM_PRIOR) else None
 
 
+def _screening(evidence: Evidence) -> Tensor:
+    return SCREENING_PENALTY * evidence.family.penalty()
+
+
 def _known(evidence: Evidence) -> Tensor:
     """(N,): part of the gain of each press that a field of the others can know: regularisation takes what no other press covers.
 
     It is that of a field by exact presses of the others, if the field of the press by itself is the true one, up to a factor.
     """
-    penalty = torch.diag(SCREENING_PENALTY * evidence.family.penalty())
+    penalty = torch.diag(_screening(evidence))
     parts = []
     for item, (form, right) in zip(evidence.forms, evidence.each):
         own, others = torch.linalg.solve(form + penalty, right), evidence.form - form
@@ -136,7 +140,7 @@ def _uncertainty(evidence: Evidence) -> Tensor:
     A press errs by :data:`NOISE` of its sines, alike all over it; the normal equations of the others give what that does elsewhere.
     It is large where no other press lies near, and where little light changes: there the others say nothing.
     """
-    penalty = torch.diag(SCREENING_PENALTY * evidence.family.penalty())
+    penalty = torch.diag(_screening(evidence))
     variance = []
     for item, (form, _) in zip(evidence.forms, evidence.each):
         inside = item.contact.inside()
@@ -160,7 +164,7 @@ def _wrong_by_others(evidence: Evidence, gains: Tensor, std: Tensor) -> int | No
     A wrong press bends the field for all, so the wrong one is that without which the others agree best. It must differ from them
     by more than they differ from each other, and by more than they know of its place.
     """
-    penalty = SCREENING_PENALTY * evidence.family.penalty()
+    penalty = _screening(evidence)
     relative, disagreement, spread = [], [], []
     for place, gain in enumerate(gains.tolist()):
         rest = evidence.without(place)

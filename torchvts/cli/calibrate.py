@@ -69,9 +69,14 @@ def check_target_of(out: Path) -> None:
 
 
 def read_given(arguments: argparse.Namespace) -> tuple[torch.Tensor, Sensor, list[Press]]:
-    """Background, sensor and presses that the arguments name."""
+    """Background, sensor and presses that the arguments name; the sensor knows the size of the frames that a place is cut from."""
     first = arguments.source[0]
-    sensor = load_sensor(arguments.sensor) if arguments.sensor is not None else unknown_sensor(arguments)
+    if arguments.sensor is not None:
+        sensor = load_sensor(arguments.sensor)
+    else:
+        sensor = Sensor("own sensor", *size_of(first), arguments.mm_per_pixel, gamma=arguments.gamma)
+    if sensor.cuts_a_place and not sensor.raw_size_px:
+        sensor = dataclasses.replace(sensor, raw_size_px=(size_of(first),))
     sensor = sensor.without_prior() if arguments.no_prior else sensor
     if not (len(arguments.source) == 1 and first.is_dir()):
         return read_background(arguments.source, sensor, arguments.background_frames), sensor, []
@@ -86,8 +91,7 @@ def read_given(arguments: argparse.Namespace) -> tuple[torch.Tensor, Sensor, lis
     return image, sensor, presses
 
 
-def unknown_sensor(arguments: argparse.Namespace) -> Sensor:
-    """The sensor of which only the pitch is known: its images have the size of the background."""
-    path = arguments.source[0] / "background.png" if arguments.source[0].is_dir() else arguments.source[0]
-    _, image = next(iter(read_frames(path)))
-    return Sensor("own sensor", image.shape[1], image.shape[2], arguments.mm_per_pixel, gamma=arguments.gamma)
+def size_of(source: Path) -> tuple[int, int]:
+    """Height and width of the first image of a source; of a calibration folder, of its background."""
+    _, image = next(iter(read_frames(source / "background.png" if source.is_dir() else source)))
+    return image.shape[1], image.shape[2]

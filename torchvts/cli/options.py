@@ -103,7 +103,7 @@ def load_sensor(name: str) -> Sensor:
 def cut_frames(background: Tensor, presses: Sequence[Press], sensor: Sensor) -> tuple[Tensor, list[Press]]:
     """The background and presses of a folder, cut and resized as the sensor file says; labels, of cut frames, go with raw ones."""
     cut_already = tuple(background.shape[1:]) == (sensor.height, sensor.width)
-    if cut_already and sensor.raw_size_px:
+    if cut_already and sensor.raw_size_px and not sensor.cuts_a_place:
         return background, list(presses)  # gs_sdk keeps cropped images, also where raw frames have that size
     given = presses if cut_already else [without_labels(press) for press in presses]
     return sensor.rectify(background[None])[0], [replace(press, image=sensor.rectify(press.image[None])[0]) for press in given]

@@ -50,16 +50,17 @@ class Sensor:
         blur_px: standard deviation of a Gaussian blur before normals, pixels; 0 for none.
         light_position_mm: (3, 3), rows R, G, B, if the positions of the lights are known.
         camera_matrix: (3, 3), OpenCV's, in pixels of raw frames, out of which the distortion of the lens is taken first. Raw frames
-            are all where ``roi_px`` or ``corners_px`` are given, else those of ``raw_size_px``.
+            are those of ``raw_size_px``; where ``roi_px`` or ``corners_px`` are given without it, all are.
         distortion_coefficients: OpenCV's, 4, 5, 8, 12 or 14 numbers k1, k2, p1, p2, k3, ...
         turn_deg: 0, 90, 180 or 270, by which raw frames are then turned, anticlockwise. Places are those in turned frames.
         mirror: whether raw frames are then mirrored left to right.
         roi_px: (left, top, width, height) of the gel in the camera's frame, of the sensor's aspect within 2 %, resized to its size.
         corners_px: (4, 2), x and y of the gel's corners in the camera's frame: top left, top right, bottom right, bottom
             left, rectified to the sensor's size. Either this or ``roi_px``.
-        raw_size_px: (N, 2), (height, width) of the frames that the camera gives, if images are usually stored upright or cropped:
-            a frame of such a size is turned, cropped by ``raw_crop``, and resized to the sensor's size; one of the sensor's size is
-            kept as it is. Where frames are turned, mirrored or straightened, the sensor's size before that if nothing else is said.
+        raw_size_px: (N, 2), (height, width) of the frames that the camera gives. Beside ``roi_px`` or ``corners_px``: the size in
+            which these were measured, frames of others are refused. Without: a frame of such a size is turned, cropped by
+            ``raw_crop``, and resized; one of the sensor's size is kept as it is. Where frames are turned, mirrored or
+            straightened, the sensor's size before that if nothing else is said.
         raw_crop: share of a raw frame's height and width to cut off each side, in [0, 0.5).
         markers: whether the skin has printed markers, which are filled in every frame; None: where the background shows a regular
             pattern of them.
@@ -146,16 +147,15 @@ class Sensor:
             if len(self.raw_size_px) > 1:
                 raise ValueError(f"raw_size_px: expected one size, that of camera_matrix, got {self.raw_size_px}")
         self._set("raw_crop", check_least("raw_crop", self.raw_crop, 0.0, 0.49))
-        if self.raw_size_px and (self.roi_px is not None or self.corners_px is not None):
-            raise ValueError("raw_size_px: expected none beside roi_px or corners_px, which say where the gel lies in raw frames")
-        if self._moved and not (self.raw_size_px or self.roi_px or self.corners_px):
+        if self._moved and not (self.raw_size_px or self.cuts_a_place):
             self._set("raw_size_px", ((self.width, self.height) if self.turn_deg % 180 else (self.height, self.width),))
         self._check_aspects()
 
     def _check_aspects(self) -> None:
         """Raise where images would be stretched: the pitch is the same along x and y."""
         taken = [("roi_px", self.roi_px[2:], "a region")] if self.roi_px is not None else []
-        taken += [("raw_size_px", size if self.turn_deg % 180 else size[::-1], "frames") for size in self.raw_size_px]
+        if not self.cuts_a_place:
+            taken += [("raw_size_px", size if self.turn_deg % 180 else size[::-1], "frames") for size in self.raw_size_px]
         for name, (across, down), what in taken:
             aspect, own = across / down, self.width / self.height
             if abs(math.log(aspect / own)) > MOST_STRETCHED:
@@ -205,7 +205,7 @@ class Sensor:
             response = dataclasses.replace(prior.response, blur_px=prior.response.blur_px * scale_x)
             prior = dataclasses.replace(prior, response=response)
         pitch, blur_px = self.mm_per_pixel / scale_x, self.blur_px * scale_x
-        raw = tuple(size for size in self.raw_size_px if size != (height, width) or self._moved)
+        raw = tuple(size for size in self.raw_size_px if size != (height, width) or self._moved or self.cuts_a_place)
         changes: dict[str, Any] = {"mm_per_pixel": pitch, "blur_px": blur_px, "prior": prior, "raw_size_px": raw}
         return dataclasses.replace(self, height=height, width=width, **changes)
 
@@ -229,11 +229,16 @@ class Sensor:
         """
         check_batch("frame", frame, 3)
         size = (frame.shape[2], frame.shape[3])
-        if self.roi_px is not None or self.corners_px is not None or size in self.raw_size_px:
+        if size in self.raw_size_px or (self.cuts_a_place and not self.raw_size_px):
             return self._view(frame)
-        if size != (self.height, self.width):
+        if size != (self.height, self.width) or self.cuts_a_place:
             raise ValueError(self._misfit(*size))
         return frame
+
+    @property
+    def cuts_a_place(self) -> bool:
+        """Whether the gel lies at a stated place, ``roi_px`` or ``corners_px``, of raw frames."""
+        return self.roi_px is not None or self.corners_px is not None
 
     @property
     def _moved(self) -> bool:
@@ -257,6 +262,12 @@ class Sensor:
 
     def _misfit(self, height: int, width: int) -> str:
         """Why a frame of another size does not fit, and what would make it fit."""
+        raw = " or ".join(f"{rows} x {columns}" for rows, columns in self.raw_size_px)
+        if self.cuts_a_place:
+            return (
+                f"frame: expected raw frames of {raw}, in which sensor '{self.name}' has its "
+                f"{'corners_px' if self.roi_px is None else 'roi_px'}, got {height} x {width}: another mode of the camera"
+            )
         own = self.width / self.height
         cause = "another aspect ratio, so another sensor, crop or mode of the camera"
         if abs(width / height / own - 1.0) <= 0.01:
@@ -264,7 +275,6 @@ class Sensor:
         elif abs(height / width / own - 1.0) <= 0.01:
             turn = f"turn_deg: {self.turn_deg}" if self.turn_deg % 180 else "turn_deg: 90 (or 270)"
             cause = f"its camera lies: the sensor file needs {turn}, and raw_size_px with [{height}, {width}]"
-        raw = " or ".join(f"{rows} x {columns}" for rows, columns in self.raw_size_px)
         return (
             f"frame: expected {self.height} x {self.width}{raw and f', or raw frames of {raw},'} for sensor '{self.name}', "
             f"got {height} x {width}: {cause}"

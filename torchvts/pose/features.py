@@ -18,7 +18,7 @@ LEAST_POINTS = 10
 SEARCH_POINTS = 1000
 """Points to which clouds are thinned for sample consensus."""
 
-LEAST_FITNESS = 0.8
+LEAST_SHARE = 0.8
 """Least share of points that have a neighbour in the other cloud with which a pose is trusted."""
 
 MOST_RMSE = 0.3
@@ -111,7 +111,7 @@ def _refined(o3d: Any, source: Any, target: Any, pose: Any) -> Registration:
     rmse_mm = float(((paired - goal) * normal).sum(1).square().mean().sqrt()) if len(pairs) else math.inf
     share = f"{100 * fitness:.0f} % of the points have a neighbour in the other cloud"
     thickness = float(torch.linalg.eigvalsh(_points(target).T.cov())[0].clamp_min(0.0).sqrt())
-    if fitness < LEAST_FITNESS or rmse_mm > max(MOST_RMSE * thickness, 0.05 * reach) or len(pairs) < LEAST_POINTS:
+    if fitness < LEAST_SHARE or rmse_mm > max(MOST_RMSE * thickness, 0.05 * reach) or len(pairs) < LEAST_POINTS:
         unknown = torch.diag(torch.tensor([1.0] * 3 + [UNKNOWN_VARIANCE] * 3, dtype=torch.float64))
         share = f"{share}, which differ by {rmse_mm:.3f} mm along the normal; register_depth is more certain"
         return Registration(T, rmse_mm, fitness, False, f"nothing fits: {share}", unknown)

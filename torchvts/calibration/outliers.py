@@ -31,6 +31,10 @@ FAR_IN_SPREADS = 3.0
 """So many of its standard deviations from the others' a gain is wrong."""
 
 
+FAR_DEG, APART_DEG = 15.0, 12.0
+"""Mean errors of slopes of a press that is no clean ball: by itself, and where it is thrice that of the others."""
+
+
 def locate_and_screen(contacts: list[Contact], sensor: Sensor, prior: ResponseModel | None, half_mm: float) -> list[Contact]:
     """Locate the balls and leave out outliers. Without a prior, locate again without them, because they moved the other balls.
 
@@ -103,8 +107,8 @@ def _reject_slopes(left: list[Contact], errors_deg: list[float], by_prior: bool)
     worst, usual = int(errors.argmax()), float(errors.median())
     error = float(errors[worst])
     # fields too small for a sensor are far off on all presses alike
-    far = 15.0 if by_prior or len(left) < 3 else max(15.0, 2.0 * usual)
-    if not (error > max(3.0 * usual, 12.0) or error > far):
+    far = FAR_DEG if by_prior or len(left) < 3 else max(FAR_DEG, 2.0 * usual)
+    if not (error > max(3.0 * usual, APART_DEG) or error > far):
         return False
     left[worst].reason = f"its slopes are {error:.1f} degrees from a ball's, others' {usual:.1f}: not a clean press"
     return True

@@ -30,6 +30,9 @@ MOST_COUNT = 2**31 - 1
 LEAST_NUMBER, MOST_NUMBER = float(torch.finfo(torch.float32).tiny), float(torch.finfo(torch.float32).max)
 """A smaller number is zero in float32, a larger one infinite."""
 
+OVERSHOOT = 1e-3
+"""By so much values of images may lie outside of [0, 1]: resizing and filters round."""
+
 QUANTISATION_STD = 1.0 / 255.0 / math.sqrt(12.0)
 """Standard deviation of rounding to 8 bits, the least noise of a camera image."""
 
@@ -302,6 +305,11 @@ def check_shape(name: str, value: object, shape: Sequence[int], like: str = "") 
         raise ValueError(f"{name}: expected {tuple(shape)}{f' like {like}' if like else ''}, got {tuple(value.shape)}")
 
 
+def in_range(low: float, high: float) -> bool:
+    """Whether the ends of an image's values are in [0, 1], but for rounding; not if one is NaN."""
+    return low >= -OVERSHOOT and high <= 1.0 + OVERSHOOT
+
+
 def check_range(name: str, image: Tensor) -> None:
     """Raise unless every value is finite and in [0, 1]. Reads values."""
     if image.numel() == 0:
@@ -310,7 +318,7 @@ def check_range(name: str, image: Tensor) -> None:
     if not (math.isfinite(low) and math.isfinite(high)):
         count = int((~torch.isfinite(image)).sum())
         raise ValueError(f"{name}: expected finite values, got {count} NaN or infinite: a camera or an upstream division failed")
-    if high > 1.0 + 1e-3 or low < -1e-3:
+    if not in_range(low, high):
         cause = "0-255 given for 0-1: divide by 255" if high > 1.5 else "clamp it to [0, 1]"
         if low < -0.1 and 0.3 < high < 20.0:
             cause = "normalised by mean and standard deviation, or scaled to [-1, 1], as for a network? give value / 255"

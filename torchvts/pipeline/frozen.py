@@ -11,7 +11,7 @@ from ..compensate import Compensate
 from ..compiled import IN_PYTORCH, NotCompiled, Plan, check_block, ends, library
 from ..compiled import blocks as compiled
 from ..compiled.plan import Values
-from ..core.checks import check_batch, check_range, check_record, check_same_size
+from ..core.checks import check_batch, check_range, check_record, check_same_size, in_range
 from ..core.frame import DepthOutput
 from ..normals import NormalFromIntensity
 from .depth import DepthPipeline
@@ -181,10 +181,8 @@ class FrozenPipeline:
         if images.dtype != torch.float32 or not images.is_cpu:
             raise TypeError(f"images: expected torch.float32 on the CPU, got {images.dtype} on {images.device}: use .float().cpu()")
         check_same_size("images", images, "the calibration", *self._size)
-        if images.numel() > 0:
-            low, high = ends(images.contiguous())
-            if not (low >= -1e-3 and high <= 1.0 + 1e-3):
-                check_range("images", images)
+        if images.numel() > 0 and not in_range(*ends(images.contiguous())):
+            check_range("images", images)
 
 
 def _finish(pool: ThreadPoolExecutor) -> None:

@@ -518,7 +518,7 @@ REASONS = {
     "another background": "no contact",
     "a hair's touch": "no contact",
     "out of sight": "no contact",
-    "twice the diameter": "but 12 mm was given",
+    "twice the diameter": "but 12 mm was given: a wrong diameter, or skin that answers otherwise",
     "half the diameter": "3 mm",
     "a diameter in metres": "is its diameter in mm?",
     "saturated": r"\d+% of the contact is saturated: lower the exposure",

@@ -228,7 +228,10 @@ def test_nothing_changes_a_frozen_pipeline(unit):
                 else:
                     tensor.zero_()
         pipe.mask.sigmas, pipe.mask.rise, pipe.solve.zero.decay_mm, pipe.contact.share = 50.0, (9.0, 10.0), 9.0, 0.9
-        pipe.solve.integrate.mm_per_pixel = pipe.mm_per_pixel = 7.0
+        pipe.solve.integrate.mm_per_pixel = 7.0
+        for name, value in (("mode", "fast"), ("mm_per_pixel", 7.0)):
+            with pytest.raises(AttributeError, match=f"^{name}: expected to stay what the pipeline was made with"):
+                setattr(pipe, name, value)
         pipe.mask.weight = lambda evidence: 0.0 * evidence
         pipe.compensate.register_forward_hook(lambda *_: torch.zeros(1))
         pipe.solve = None

@@ -36,7 +36,7 @@ def calibrate(
       that the sensor file gives and that do not look like the image only the directions are used, with a warning: depth is then
       not metric.
     * Presses: response fields, starting from the prior if there is one, their size chosen by the error of normals on presses that
-      were held out; point lights if they do better on the presses and explain the background. The balls are located
+      were held out; point lights if they do as well to 5 % and explain the background. The balls are located
       automatically.
     * Touches: a response field whose slopes have the least curl, with its scale from presses or a known depth. They add nothing
       to a prior, so with one they are not used.
@@ -88,7 +88,7 @@ def calibrate(
 
 
 def choose(given: Given) -> tuple[Calibration, list[str]]:
-    """The first calibration that nothing speaks against, and what to warn of.
+    """The first calibration that is not refused, and what to warn of; with presses theirs, which settle between lights and fields.
 
     Raises:
         ValueError: none can be made.

@@ -91,10 +91,9 @@ def _reject_diameter(left: list[Contact], wrong: int, gain: float, start_name: s
     reference = (start_name + (f" and {others}" if len(left) > 1 else "")) if start_name else others
     seen = 2 * contact.radius_mm / max(gain, 1e-3)
     contact.reason = f"by {reference} the ball seems {seen:.2f} mm wide, but {2 * contact.radius_mm:g} mm was given"
-    if not start_name:
-        contact.reason += (
-            ": a wrong diameter, or skin that answers otherwise than where they lie; more presses beside it will show which"
-        )
+    contact.reason += (
+        ": a wrong diameter, or skin that answers otherwise than where they lie; more presses beside it will show which"
+    )
     if not start_name and len(left) == 3:
         contact.reason += "; of three, another may be the wrong one"
     if not start_name and len(left) == 2:

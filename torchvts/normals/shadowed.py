@@ -11,7 +11,7 @@ from ..core.noise import dark_below
 from ..model.lights import glossy_light, light_matrix, seen_at
 
 SAMPLES = 2000
-"""Pixels from which the noise of a frame is estimated, as ContactMask does."""
+"""Pixels from which the noise of a frame is estimated."""
 
 LEFT_OUT = -1.0
 """Intensity of a channel that is left out at a pixel because something else than the skin's slope blocks its light. No camera gives

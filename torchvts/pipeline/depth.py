@@ -1,7 +1,7 @@
 """The depth pipeline: a calibration made into a chain of modules that turns images into depth."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Final, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -112,13 +112,21 @@ class DepthPipeline(nn.Module):
         self.mask = mask
         self.smooth = smooth
         self.solve = Solve(model, gradient, integrator, ZeroBackground(mm_per_pixel))
-        # slopes of a module in training are none yet: there colour alone decides
+        # slopes of a module from outside may still be in training, and mean nothing: there colour alone decides
         own = isinstance(mask, ContactMask) and type(mask).forward is ContactMask.forward
         self.takes_slopes = own and not self.solve.from_outside
         self.measures_noise = self.solve.takes_noise and mode != "fast"
         self.refine = self._policy(mode, tolerance_px, refine_threshold_px, min(max_passes, model.max_passes))
         self.slopes = SlopesOfDepth(mm_per_pixel) if model.normals_from_depth else SlopesOfPixels()
         self.contact = touching
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in ("mode", "mm_per_pixel") and name in self.__dict__:
+            raise AttributeError(
+                f"{name}: expected to stay what the pipeline was made with, because its blocks hold it too: make another, "
+                "DepthPipeline.from_calibration(calibration, mode)"
+            )
+        super().__setattr__(name, value)
 
     def _policy(self, mode: str, tolerance_px: float, refine_threshold_px: float, max_passes: int) -> nn.Module:
         """The refinement of a mode: Once, Repeat, Adaptive; around it for lights Shadows."""

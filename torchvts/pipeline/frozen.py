@@ -28,8 +28,8 @@ class FrozenPipeline:
 
     It holds a copy, with every module in eval mode: nothing that is done to the pipeline afterwards changes it, and it records no
     gradient. Compiled, it takes float32 on a CPU. One thread works on a frame; the frames of a batch are shared among as many
-    threads as torch uses, and equal bit for bit those frames alone. Depth differs from the pipeline's by rounding, less than
-    1e-5 mm.
+    threads as torch uses, and equal bit for bit those frames alone. Depth differs from the pipeline's by rounding: less than
+    1e-5 mm, and up to 2e-3 mm where a light has failed or an image is saturated, so that slopes are hardly determined.
 
     Markers and the camera's gamma are undone by PyTorch, before the compiled code. By lights, in modes precise and auto, frames in
     which the object blocks a light go through PyTorch as a whole.
@@ -86,7 +86,7 @@ class FrozenPipeline:
             object.__setattr__(self, name, value)
 
     def __setattr__(self, name: str, value: object) -> None:
-        raise AttributeError(f"{name}: a frozen pipeline cannot change: change the pipeline and freeze it again")
+        raise AttributeError(f"{name}: a frozen pipeline cannot change: change the pipeline, or make another, and freeze that")
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "FrozenPipeline":
         return self
@@ -120,7 +120,7 @@ class FrozenPipeline:
         return moved
 
     def both(self, images: Tensor) -> tuple[DepthOutput, Tensor]:
-        """The output, and what :meth:`moved` says, at the price of one.
+        """The output, and what :meth:`moved` says; where it is compiled, at the price of one.
 
         Raises:
             ValueError, TypeError: as calling it.

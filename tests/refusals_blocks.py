@@ -135,8 +135,6 @@ TABLE = {
     "NormalFromResponse.forward": Entry({"image": FLAT[None], "depth_mm": DEPTH},
         {"image": batches(3), "depth_mm": [b for b in batches(1) if b is not None]},
         lambda: vts.NormalFromResponse.from_calibration(unit("response")), named={"image": "compensated"}),
-    "NormalFromResponse.coarse": Entry(
-        {"stride": 8}, {"stride": INTEGER}, lambda: vts.NormalFromResponse.from_calibration(unit("response")).coarse),
     "PointLights": Entry({"position_mm": POSITION, "albedo": [900.0] * 3, "gloss": [0.1] * 3}, {"position_mm": BAD_POSITION,
         "albedo": [[900.0] * 2, [0.0] * 3, [NAN] * 3, None, "bright"], "gloss": [[0.1] * 2, [-0.1] * 3, [NAN] * 3, "satin"]}),
     "PointLights.forward": Entry({"depth_mm": DEPTH, "normal": torch.zeros(1, 3, HEIGHT, WIDTH), "mm_per_pixel": 1.0},

@@ -344,18 +344,6 @@ def test_derivatives_are_those_of_the_slopes():
     assert bool(torch.isfinite(rest.grad).all()) and float(rest.grad.abs().max()) > 0
 
 
-def test_the_coarse_block_is_every_eighth_pixel():
-    _, _, block = normals(height=41, width=50)
-    image, _ = random_image(2, 41, 50)
-    x, y = (torch.arange(n, dtype=torch.float64) for n in (50, 41))
-    depth = (0.3 * x - 0.2 * y[:, None]).expand(2, 1, 41, 50)  # the same slopes at any pitch
-    coarse = block.coarse(8)
-    assert coarse.uses_depth
-    for d in (None, depth):
-        small = None if d is None else d[..., 4::8, 4::8]
-        assert torch.allclose(coarse(image[..., 4::8, 4::8], small), block(image, d)[..., 4::8, 4::8], rtol=0, atol=1e-12)
-
-
 # files
 
 

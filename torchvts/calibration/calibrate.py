@@ -88,7 +88,7 @@ def calibrate(
 
 
 def choose(given: Given) -> tuple[Calibration, list[str]]:
-    """The first calibration that is not refused, and what to warn of; with presses theirs, which settle between lights and fields.
+    """The first calibration that is not refused, and what to warn of; that by presses has compared lights with fields.
 
     Raises:
         ValueError: none can be made.

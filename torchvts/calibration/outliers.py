@@ -30,7 +30,6 @@ LEAST_KNOWN = 0.5
 FAR_IN_SPREADS = 3.0
 """So many of its standard deviations from the others' a gain is wrong."""
 
-
 FAR_DEG, APART_DEG = 15.0, 12.0
 """Mean errors of slopes of a press that is no clean ball: by itself, and where it is thrice that of the others."""
 

@@ -1,11 +1,9 @@
 """Normals by a response field."""
 
-import copy
-
 import torch
 from torch import Tensor
 
-from ..core.checks import check_batch, check_dtype, check_integer, check_record, check_same_size, check_size
+from ..core.checks import check_batch, check_dtype, check_record, check_same_size, check_size
 from ..model.calibration import Calibration, check_calibration
 from ..model.response_field import CHANGE_SCALE, MAX_SINE, DepthBrightness, ResponseField
 from .base import NormalModel
@@ -108,11 +106,3 @@ class NormalFromResponse(NormalModel):
         kept = (self.max_sine / torch.sqrt(squared + 1e-12)).clamp_max(1.0)
         up = torch.sqrt(1.0 - squared * (kept * kept))
         return torch.cat((-kept * sine, up), dim=1)
-
-    def coarse(self, stride: int) -> "NormalFromResponse":
-        """The same for an image of every ``stride``-th pixel."""
-        check_integer("stride", stride, 1)
-        other = copy.deepcopy(self)
-        for name in ("maps", "per_mm"):
-            setattr(other, name, getattr(other, name)[..., stride // 2 :: stride, stride // 2 :: stride].clone())
-        return other

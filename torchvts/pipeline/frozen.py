@@ -154,8 +154,10 @@ class FrozenPipeline:
         return DepthOutput(*parts) if solve else None, moved
 
     def _frame(self, k: int, images: Tensor, light: Tensor, parts: list[Tensor], moved: Tensor | None) -> None:
-        """Write the output of one frame of a batch."""
+        """Check one frame of a batch, and write its output."""
         assert self._plan is not None
+        if not in_range(*ends(images[k].contiguous())):
+            check_range("images", images)
         output = tuple(part[k] for part in parts) if parts else None
         if self._plan.reconstruct(light[k], None if moved is None else moved[k], output) == IN_PYTORCH:
             found, _ = self._in_pytorch(images[k : k + 1], True, False)
@@ -181,8 +183,6 @@ class FrozenPipeline:
         if images.dtype != torch.float32 or not images.is_cpu:
             raise TypeError(f"images: expected torch.float32 on the CPU, got {images.dtype} on {images.device}: use .float().cpu()")
         check_same_size("images", images, "the calibration", *self._size)
-        if images.numel() > 0 and not in_range(*ends(images.contiguous())):
-            check_range("images", images)
 
 
 def _finish(pool: ThreadPoolExecutor) -> None:

@@ -111,6 +111,14 @@ def test_gloss_is_found_on_a_glossy_skin(ring, small_sensor, gloss):
     assert furthest_mm(fit.lights, lights) < 0.3
 
 
+def test_a_gloss_by_one_image_alone_is_named(ring, small_sensor):
+    """A matt skin under a camera whose black is 0.3 grey levels above 0 looks the same, and depth differs by a tenth."""
+    lights = ring(22.0, [15.0, 16.5, 18.0], level=0.2, gloss=[0.2, 0.3, 0.25])
+    with pytest.warns(vts.CalibrationWarning, match="gloss of 0.3.*one image cannot tell"):
+        unit = vts.calibrate(rest(lights, small_sensor, noise_std=0.003, bits=8), small_sensor)
+    assert unit.lights.glossy and unit.metric
+
+
 @pytest.mark.parametrize("camera", [{}, {"vignetting": 0.2}, {"bits": 8}])
 def test_gloss_is_not_invented_on_a_matt_skin(low_rig, small_sensor, camera):
     fit = vts.fit_lights(rest(low_rig, small_sensor, noise_std=0.003, **camera), small_sensor)

@@ -326,7 +326,18 @@ def test_without_open3d_contacts_register_and_are_written(monkeypatch, reference
         vts.register_points(cloud, contact_cloud(reference, PITCH)[0])
 
 
-# words, and the small parts
+def test_clouds_in_metres_are_read_as_such_or_named(open3d, run_script, tmp_path):
+    generator = torch.Generator().manual_seed(1)
+    blob = torch.nn.functional.normalize(torch.randn(400, 3, generator=generator, dtype=torch.float64), dim=1)
+    blob = 0.001 * blob * torch.tensor([4.0, 2.5, 2.0])
+    for name in ("one", "other"):
+        clouds.write_point_cloud(tmp_path / f"{name}.ply", blob, None, "m, axes of the robot")
+    given = ("pose", tmp_path / "one.ply", tmp_path / "other.ply", "--out", tmp_path / "out", "--no-pictures")
+    done = run_script(*given)
+    assert done.returncode == 2 and "one.ply: expected points that lie 0.2 to 2000 mm apart, got 0.00" in done.stderr
+    assert "--unit m" in done.stderr and not (tmp_path / "out" / "pose.json").exists()
+    done = run_script(*given, "--unit", "m")
+    assert done.returncode == 0, done.stderr
 
 
 # the script

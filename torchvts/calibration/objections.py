@@ -163,7 +163,8 @@ def to_background_of_prior(background: torch.Tensor, sensor: Sensor) -> list[str
 
 
 def to_background_of_lights(unit: Calibration) -> tuple[Calibration, list[str]]:
-    """A background that differs from fitted lights in places; the calibration with that in its report. Others stay as they are."""
+    """A background that differs from fitted lights in places, or that a gloss explains; the calibration with the first in its
+    report. Units whose lights were not fitted stay as they are."""
     if unit.report["source"] != "background":
         return unit, []
     model = unit.model_image
@@ -179,5 +180,11 @@ def to_background_of_lights(unit: Calibration) -> tuple[Calibration, list[str]]:
         found.append(
             f"background: {standing_out:.1%} of the image differs from the fitted lights by more than 5 times their residual "
             f"({', '.join(f'{v:.4f}' for v in spread.tolist())}): contact in the calibration image? take it again without"
+        )
+    if unit.lights is not None and unit.lights.glossy:
+        found.append(
+            f"background: it fits a skin with a gloss of {float(unit.lights.gloss.max()):.2f}, and hardly worse a matt one and a "
+            "camera whose black is a fraction of a grey level above 0, or frames that were averaged: one image cannot tell them "
+            "apart, and depth differs by a tenth or more: press a ball three times to measure it"
         )
     return dataclasses.replace(unit, report=report), found

@@ -29,6 +29,9 @@ from .options import add_length_unit, add_mode, add_network, add_out, load_calib
 
 USAGE = "SOURCE REFERENCE [--calibration FILE] --out FOLDER"
 
+LEAST_MM, MOST_MM = 0.2, 2000.0
+"""Extent of a cloud that a touch can be compared with; metres for millimetres, or the reverse, lie outside for 1 to 200 mm."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
@@ -64,6 +67,13 @@ def of_clouds(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     (source, source_normals), (target, target_normals) = (read_point_cloud(p) for p in (arguments.source, arguments.target))
     frame = OutputFrame(arguments.length_unit)
     source, target = frame.mm * source, frame.mm * target
+    for path, points in ((arguments.source, source), (arguments.target, target)):
+        width_mm = float((points.amax(0) - points.amin(0)).max())
+        if not LEAST_MM <= width_mm <= MOST_MM:
+            raise ValueError(
+                f"{path}: expected points that lie {LEAST_MM:g} to {MOST_MM:g} mm apart, got {width_mm:.3g} mm: are they in metres? "
+                f"--unit m reads them so, this was read as {arguments.length_unit}"
+            )
     found = register_points(source, target, source_normals=source_normals, target_normals=target_normals)
     print_result(arguments.source.stem, found)
     draw(arguments, arguments.source.stem, source, target, found, frame)

@@ -90,8 +90,11 @@ def _label_severities(panels: Sequence[Any], corruption: Corruption) -> None:
     for axes, limit, title in zip(panels, (NORMAL_LIMIT_DEG, 100 * DEPTH_LIMIT, MASK_LIMIT), titles):
         axes.axhline(limit, color="black", lw=0.8, ls=(0, (5, 3)))
         axes.text(0.0, limit, "limit", fontsize=8, va="bottom")
-        axes.set_xticks(range(len(corruption.severities)), [f"{s:g}" for s in corruption.severities], fontsize=8)
+        labels = [f"{s:g}" for s in corruption.severities]
+        axes.set_xticks(range(len(labels)), labels)
         axes.tick_params(labelsize=8)
+        if axes is panels[2] and len("".join(labels)) > 18:  # the narrow one
+            axes.tick_params(axis="x", rotation=40)
         axes.set_xlabel(f"{corruption.name}, {corruption.unit}".rstrip(", "), fontsize=9)
         axes.set_title(title, fontsize=9)
         axes.grid(alpha=0.25)
@@ -115,7 +118,7 @@ def _list_breaking_points(legend: Any, corruption: Corruption, points: Sequence[
         if k == 0 or ordered[k - 1][1] != line:
             legend.plot((0.0, 0.13), (y, y), **style)
         legend.text(0.17, y, point.text, fontsize=9, va="center", weight="bold")
-        legend.text(0.4, y, point.method, fontsize=9, va="center")
+        legend.text(0.43, y, point.method, fontsize=9, va="center")
 
 
 def _draw_means(axes: Any, means: Sequence[float], style: dict[str, Any], least: float) -> None:

@@ -415,8 +415,31 @@ def test_axes_of_own_normals_that_are_likely_wrong_are_named_once(mixed, small_s
     assert torch.equal(right(frames[1:2]).depth_mm, pipeline(lights, small_sensor, "fast")(frames[1:2]).depth_mm)
 
 
+class Calibrated(NormalModel):
+    """The calibrated normals in a model of another's."""
+
+    calibrated: bool = True
+
+    def __init__(self, model):
+        super().__init__()
+        self.model = model
+
+    def forward(self, image, depth_mm=None):
+        return self.model(image)
+
+
+def test_slopes_of_an_own_model_that_is_calibrated_count_as_ours_do(ring, mixed, small_sensor):
+    lights, frames = mixed
+    noisy = frames + 0.02 * torch.randn(frames.shape, generator=torch.Generator().manual_seed(0))
+    ours = pipeline(lights, small_sensor, "fast")
+    theirs, unknown = (pipeline(lights, small_sensor, "fast", normals=wrap(ours.normals)) for wrap in (Calibrated, nn.Sequential))
+    assert torch.equal(theirs(noisy).depth_mm, ours(noisy).depth_mm)
+    assert not torch.equal(unknown(noisy).depth_mm, ours(noisy).depth_mm)
+
+
 def test_autocast_reaches_an_own_network_and_nothing_else(mixed, small_sensor):
     lights, frames = mixed
+    torch.manual_seed(0)  # of another network the axes may seem wrong
     network = nn.Conv2d(3, 3, 1)
     with torch.no_grad():
         network.bias.copy_(torch.tensor([0.0, 0.0, 2.0]))

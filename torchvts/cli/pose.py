@@ -71,7 +71,7 @@ def of_clouds(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         width_mm = float((points.amax(0) - points.amin(0)).max())
         if not LEAST_MM <= width_mm <= MOST_MM:
             raise ValueError(
-                f"{path}: expected points that lie {LEAST_MM:g} to {MOST_MM:g} mm apart, got {width_mm:.3g} mm: are they in metres? "
+                f"{path}: expected points that lie {LEAST_MM:g} to {MOST_MM:g} mm apart, got {width_mm:.3g} mm: in metres? "
                 f"--unit m reads them so, this was read as {arguments.length_unit}"
             )
     found = register_points(source, target, source_normals=source_normals, target_normals=target_normals)

@@ -36,6 +36,8 @@ class NormalModel(nn.Module):
             a surface, so it has less noise and smaller errors than the slopes of single pixels.
         max_passes: passes after which nothing more is gained.
         takes_noise: ``forward`` gets, as a third argument, what ``noise_of`` makes of the compensated image.
+        calibrated: its slopes are the skin's, not those of a network that may still be in training: they count where the skin
+            has moved, beside the colour. What a model gives that does not declare it is checked.
         input_domain: what ``forward`` works on, a key of :data:`DOMAINS`; a pipeline whose compensated images are something else
             is refused. None: it gets what the pipeline gives.
     Example:
@@ -51,6 +53,7 @@ class NormalModel(nn.Module):
     normals_from_depth: bool = False
     max_passes: int = 1000
     takes_noise: bool = False
+    calibrated: bool = False
     input_domain: str | None = None
 
     if TYPE_CHECKING:

@@ -39,6 +39,7 @@ class NormalFromLookup(NormalModel):
         tensor([0., 0., 1.])
     """
 
+    calibrated: bool = True
     flat: Tensor
     table: Tensor
     step: Tensor

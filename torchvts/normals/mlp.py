@@ -67,6 +67,7 @@ class NormalFromMLP(NormalModel):
         tensor([0., 0., 1.])
     """
 
+    calibrated: bool = True
     flat: Tensor
     flat_gradient: Tensor
 

@@ -62,6 +62,7 @@ class NormalFromIntensity(NormalModel):
 
     uses_depth: bool = True
     takes_noise: bool = True
+    calibrated: bool = True
     input_domain: str | None = "light"
     inverse: Tensor
     stored_position_mm: Tensor

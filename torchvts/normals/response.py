@@ -31,6 +31,7 @@ class NormalFromResponse(NormalModel):
 
     max_passes: int = 2
     normals_from_depth: bool = True
+    calibrated: bool = True
     input_domain: str | None = "ratio"
     maps: Tensor
     per_mm: Tensor

@@ -112,9 +112,8 @@ class DepthPipeline(nn.Module):
         self.mask = mask
         self.smooth = smooth
         self.solve = Solve(model, gradient, integrator, ZeroBackground(mm_per_pixel))
-        # slopes of a module from outside may still be in training, and mean nothing: there colour alone decides
         own = isinstance(mask, ContactMask) and type(mask).forward is ContactMask.forward
-        self.takes_slopes = own and not self.solve.from_outside
+        self.takes_slopes = own and model.calibrated
         self.measures_noise = self.solve.takes_noise and mode != "fast"
         self.refine = self._policy(mode, tolerance_px, refine_threshold_px, min(max_passes, model.max_passes))
         self.slopes = SlopesOfDepth(mm_per_pixel) if model.normals_from_depth else SlopesOfPixels()

@@ -1,4 +1,4 @@
-"""What is likely wrong with the axes of normals that a module from outside gives: named once, where its values are checked."""
+"""What is likely wrong with the axes of normals that an own module gives: named once, where its values are checked."""
 
 from torch import Tensor
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from ..core.checks import reads_freely
 from ..core.frame import Frame, Solution
 from ..integration import Integrator
-from ..normals import NormalModel, WrappedNormals
+from ..normals import NormalModel
 from ..normals.base import check_normals
 from .own_normals import doubt_of_axes
 
@@ -17,8 +17,8 @@ from .own_normals import doubt_of_axes
 class Solve(nn.Module):
     """Normals, gradient and depth of a :class:`~torchvts.core.frame.Frame`.
 
-    What a module from outside of this library gives is checked, for eager tensors on a CPU; a warning says once
-    where the axes of its normals are likely wrong.
+    What a model gives that is not declared as calibrated is checked, for eager tensors on a CPU; a warning says once where the
+    axes of its normals are likely wrong.
 
     Args:
         normals: compensated image to normals.
@@ -28,14 +28,13 @@ class Solve(nn.Module):
     """
 
     takes_noise: Final[bool]
-    from_outside: Final[bool]
+    calibrated: Final[bool]
 
     def __init__(self, normals: NormalModel, gradient: nn.Module, integrate: Integrator, zero: nn.Module) -> None:
         super().__init__()
         self.normals = normals
         self.takes_noise = normals.takes_noise
-        given = normals.module if isinstance(normals, WrappedNormals) else normals
-        self.from_outside = not type(given).__module__.startswith("torchvts.")
+        self.calibrated = normals.calibrated
         self._axes_known = False  # asked of the first frame that shows a contact
         self.gradient = gradient
         self.integrate = integrate
@@ -55,7 +54,7 @@ class Solve(nn.Module):
         return gradient
 
     def _check(self, normal: Tensor, image: Tensor) -> None:
-        if not (self.from_outside and reads_freely(image)):
+        if self.calibrated or not reads_freely(image):
             return
         name = check_normals(self.normals, normal, image)
         if self._axes_known or normal.requires_grad or normal.numel() == 0:  # in training they may be anything

@@ -1,5 +1,6 @@
-/* A frozen pipeline: all numbers and tables that the stages of a frame read. Python makes it from the blocks of a pipeline, and takes names and kinds of
-   the fields from plan_fields(); so no number and no layout is written twice. Tables are float32 unless stated otherwise. */
+/* A frozen pipeline: the tables and settings that the stages of a frame read. Python makes it from the blocks of a pipeline, and takes names and kinds of
+   the fields from plan_fields(), so that no layout is written twice. Numbers of a formula (three sigmas, a ridge) stand in both. Tables are float32 unless
+   stated otherwise. */
 #ifndef TORCHVTS_PLAN_H
 #define TORCHVTS_PLAN_H
 

@@ -57,6 +57,7 @@ def test_the_module_is_the_command_and_loads_no_more_than_it_needs():
         (["calibrate", "a.png", "--sensor", "digit", "--out", "unit.npz"], "expected a name ending in .safetensors"),
         (["stream", "--source", "0"], "expected either --sensor or --calibration"),
         (["evaluate"], "the following arguments are required: FOLDER"),
+        (["evaluate", "presses"], "expected --sensor"),
         (["samples", "gelsight_maxi"], "did you mean 'gelsight_mini'?"),
     ],
 )

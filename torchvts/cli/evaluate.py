@@ -30,6 +30,7 @@ from ..pipeline import DepthOutput, DepthPipeline
 from ..training.balls import ball_truth, fit_sphere
 from ..training.presses import Training, with_centers
 from .options import add_out, add_sensor, cut_frames, load_sensor
+from .parser import UsageError
 
 USAGE = "FOLDER --sensor NAME [--folds N] [--out FOLDER]"
 
@@ -66,7 +67,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Score, write the table after every fold, and print it at the end or where it is stopped."""
-    sensor = load_sensor(arguments.sensor or "gelsight_mini")
+    if arguments.sensor is None:
+        raise UsageError("expected --sensor")
+    sensor = load_sensor(arguments.sensor)
     background, presses = cut_frames(*read_presses(arguments.folder), sensor)
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     folds = check_integer("--folds", arguments.folds, 2)

@@ -30,7 +30,7 @@ class Repeat(nn.Module):
         max_passes: bound on all passes, the first among them.
     """
 
-    def __init__(self, solve: Solve, mm_per_pixel: float, tolerance_px: float = 0.002, max_passes: int = 8) -> None:
+    def __init__(self, solve: Solve, mm_per_pixel: float, tolerance_px: float, max_passes: int) -> None:
         super().__init__()
         self.solve = solve
         self.mm_per_pixel = mm_per_pixel
@@ -139,10 +139,10 @@ class Adaptive(Repeat):
         coarse_normals: NormalModel,
         coarse_integrate: Integrator,
         mm_per_pixel: float,
-        tolerance_px: float = 0.01,
-        max_passes: int = 8,
-        refine_threshold_px: float = 0.05,
-        stride: int = 8,
+        tolerance_px: float,
+        max_passes: int,
+        refine_threshold_px: float,
+        stride: int,
     ) -> None:
         super().__init__(solve, mm_per_pixel, tolerance_px, max_passes)
         self.coarse_normals = coarse_normals

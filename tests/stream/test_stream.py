@@ -96,9 +96,8 @@ def images(pictures):
 
 def test_the_background_is_the_mean_without_the_noise(unit):
     calibration, camera = unit
-    image, noise = streams.find_background(images([camera() for _ in range(12)]))
+    image = streams.find_background(images([camera() for _ in range(12)]))
     assert (image - calibration.background).abs().mean() < 0.0015
-    assert noise.mean() == pytest.approx(0.0042, rel=0.15)
 
 
 @pytest.mark.parametrize(
@@ -117,14 +116,32 @@ def test_first_frames_with_contact_or_other_light_are_refused(unit, frames, mess
 
 
 def test_first_frames_show_how_noisy_undeformed_skin_is(unit):
-    """Compression and grain of a video are spread over whole cells: the least spread of the weight is theirs, and no less."""
+    """White noise averages out in cells; the grain of compression, here of 8 x 8 pixels, does not."""
     calibration, camera = unit
     spreads = []
-    for noise in (0.001, 0.02):
-        pipe = streams.Recording(calibration, first=images([camera(noise=noise) for _ in range(12)])).pipe
+    for noise, grain in ((0.001, 0.0), (0.02, 0.0), (0.001, 10.0)):
+        generator = np.random.default_rng(0)
+
+        def picture(noise=noise, grain=grain, generator=generator):
+            plain = camera(noise=noise)
+            blocks = grain * generator.standard_normal((plain.shape[0] // 8, plain.shape[1] // 8, 3)).repeat(8, 0).repeat(8, 1)
+            return (plain + blocks).clip(0, 255).astype(np.uint8)
+
+        pipe = streams.Recording(calibration, first=images([picture() for _ in range(12)])).pipe
         spreads.append(pipe._pipe.mask.least_spread)
-        assert not pipe(images([camera(noise=noise)])).deformed.any()
-    assert spreads[0] < 0.005 and 0.02 < spreads[1] < 0.3
+        assert not pipe(images([picture()])).deformed.any()
+    assert spreads[0] < 0.005 and 0.01 < spreads[1] < 0.06 < spreads[2]
+
+
+def test_white_noise_in_the_first_frames_costs_no_depth(unit, small_press):
+    """It was taken for that of whole cells: depth lay up to twice as far off as without first frames."""
+    calibration, camera = unit
+    first = images([camera(noise=0.01) for _ in range(12)])
+    frame, errors = images([camera(0.5, noise=0.01)]), []
+    for given in (None, first):
+        depth = streams.Recording(calibration, "precise", given, follow=False)(frame, 0.0)[1].depth_mm
+        errors.append(float((depth - small_press(0.5).depth_mm).square().mean().sqrt()))
+    assert errors[1] < 1.1 * errors[0], errors
 
 
 def check_press(stream, small_press):

@@ -45,7 +45,7 @@ WITHOUT_FIRST = (
 """What to do where the first frames show contact."""
 
 
-def find_background(images: Tensor, sensor: Sensor | None = None, codec: str = "") -> tuple[Tensor, Tensor]:
+def find_background(images: Tensor, sensor: Sensor | None = None, codec: str = "") -> Tensor:
     """Find the image of the skin without contact in the first frames, or refuse and say why.
 
     The image is the median over the frames, averaged with the half of the values next to it. The frames are divided into cells of
@@ -68,9 +68,7 @@ def find_background(images: Tensor, sensor: Sensor | None = None, codec: str = "
         sensor: of the images; its prior is used if it has one.
         codec: of the video they are from, named where small changes look like its blocks; empty where it loses nothing.
     Returns:
-        The image (3, H, W) in steps of 1/65535, which a calibration file keeps, and per pixel the noise that videos have between
-        frames (3, H, W): the RMS over frames of the mean of 3 x 3 pixels, times 3, smoothed. It equals the noise of the pixels
-        where that is white, and is larger where compression correlates it.
+        The image (3, H, W) in steps of 1/65535, which a calibration file keeps.
     Raises:
         ValueError: with the reason.
     """
@@ -99,9 +97,7 @@ def find_background(images: Tensor, sensor: Sensor | None = None, codec: str = "
                 f"background: the first {len(images)} frames show structure that looks like slopes of {slope_deg:.1f} degrees, "
                 f"without contact it is below {ROUGH_DEG:g}: something touches the skin{_or_other(sensor)}; {WITHOUT_FIRST}"
             )
-    deviation = nn.functional.avg_pool2d(images - image, 3, 1, 1, count_include_pad=False).square().mean(0)
-    smooth = nn.functional.avg_pool2d(deviation[None], 15, 1, 7, count_include_pad=False)[0]
-    return image, 3.0 * torch.sqrt(smooth)
+    return image
 
 
 def _or_other(sensor: Sensor | None) -> str:
@@ -163,7 +159,7 @@ def _background_of_video(path: Path, sensor: Sensor, first_frames: int) -> Tenso
         frames = [sensor.rectify(frame[None]).clamp(0.0, 1.0) for _, frame in islice(read_frames(path), first_frames)]
         if len(frames) < first_frames:
             raise ValueError(f"background: expected at least {first_frames} frames, got {len(frames)}: ask for fewer")
-        return find_background(torch.cat(frames), sensor, video_codec(path))[0]
+        return find_background(torch.cat(frames), sensor, video_codec(path))
     except ValueError as error:
         raise ValueError(str(error) if str(error).startswith(str(path)) else f"{path}: {error}") from error
 

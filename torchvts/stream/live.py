@@ -173,7 +173,7 @@ class TactileStream:
         first = torch.cat(self._zero)
         self._zero = []
         try:
-            background = find_background(first, self.calibration.sensor)[0].clamp(0.0, 1.0)
+            background = find_background(first, self.calibration.sensor).clamp(0.0, 1.0)
             calibration = with_background(self.calibration, background)
             self._use(self._start(calibration, first=first))
         except ValueError as error:
@@ -252,7 +252,7 @@ def _calibrated(first: Tensor, unit: Sensor | Calibration, presses: Sequence[Pre
     """The calibration that was given, or that of the first frames."""
     if isinstance(unit, Calibration):
         return use_calibration(unit)
-    return calibrate_background(find_background(first, unit, codec)[0].clamp(0.0, 1.0), unit, presses)
+    return calibrate_background(find_background(first, unit, codec).clamp(0.0, 1.0), unit, presses)
 
 
 def _reader_of(source: str | int | Path | Reader, reconnect_s: float, record: str | Path | None) -> Reader:

@@ -1,5 +1,6 @@
 """The way of each frame of a recording: is it usable, the light of the background, depth. Live streams and data sets share it."""
 
+import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -8,10 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..core.cells import whole_cell_means
 from ..core.checks import check_positive, check_switch
 from ..core.spelling import suggest
 from ..model import Calibration, check_calibration
-from ..pipeline import DepthOutput, FrozenPipeline, unit_pipeline
+from ..pipeline import DepthOutput, DepthPipeline, FrozenPipeline, unit_pipeline
 from ..skin import ContactMask, ContactSettings
 from .background import find_background
 from .follow_light import FollowLight
@@ -38,6 +40,30 @@ def check_device(device: str) -> torch.device:
 
 class NotAtRest(ValueError):
     """The first frames show contact against the background of the calibration."""
+
+
+def _learn_unrest(pipe: DepthPipeline, images: Tensor) -> None:
+    """Raise the least spread of a pipeline's mask to what images without contact show from frame to frame.
+
+    Compression changes few cells at a time, and those more than their spread says. So it is that of a Gaussian which exceeds as
+    rarely what one change in a thousand exceeds; of white noise it is its standard deviation. Of slopes and colour the lesser,
+    since a contact needs both.
+    """
+    mask = pipe.mask
+    if not isinstance(mask, ContactMask):
+        return
+    cell = max(1, min(images.shape[2:]) // mask.cells)
+    colours, slopes = [], []
+    with torch.inference_mode():
+        for image in images:
+            frame, gradient = pipe.frame_of(image[None])
+            change = whole_cell_means((frame.image - mask.flat) * mask.per_light, cell)
+            colours.append(change - change.mean(dim=1, keepdim=True))
+            slopes.append(whole_cell_means(gradient, cell))
+        seen = [colours] + [slopes] * pipe.takes_slopes
+        changes = [torch.cat(cells) - torch.cat(cells).median(dim=0).values for cells in seen]
+        spreads = [float(v.abs().flatten().kthvalue(math.ceil(0.999 * v.numel())).values) / 3.29 for v in changes]
+    mask.least_spread = max(mask.least_spread, min(spreads))
 
 
 class Recording:
@@ -89,10 +115,9 @@ class Recording:
         self.check = FrameCheck.from_calibration(calibration)
         self._fps, self._follow, self._stage = fps, follow, stage
         self._before: float | None = None
-        image, noise = (None, None) if first is None else find_background(first, codec=codec)
-        if noise is not None and isinstance(pipe.mask, ContactMask):  # a video's compression is alike over whole cells
-            relative = calibration.sensor.exponent * noise.float() / value.maximum(noise.float()).clamp_min(1e-3)
-            pipe.mask.least_spread = max(pipe.mask.least_spread, float(relative.median()))
+        image = None if first is None else find_background(first, codec=codec)
+        if first is not None:
+            _learn_unrest(pipe, first)
         self.pipe: FrozenPipeline = pipe.to(self.device).freeze()
         if image is not None:
             self._start(calibration, image[None])

@@ -26,6 +26,7 @@ from lab.latency import measure_latency
 from torchvts import stream as streams
 from torchvts.cli.stream import with_corners
 from torchvts.core.files import read_frames, rgb_from_bgr
+from torchvts.pipeline import unit_pipeline
 from torchvts.stream.sources import times_file
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -450,19 +451,47 @@ def test_a_calibration_is_used_as_it_is_without_first_frames(unit):
         streams.TactileStream(Frames([]), calibration.sensor, background_frames=0)
 
 
-def test_printed_markers_do_not_pass_for_other_light(unit, small_sensor):
-    calibration, camera = unit
+@pytest.fixture(scope="module")
+def marked(unit, small_sensor):
+    """The unit with printed markers, and what they leave of the light (H, W)."""
+    calibration, _ = unit
     dots = torch.ones(120, 160)
-    for y, x in itertools.product(range(10, 120, 20), range(10, 160, 20)):
+    for y, x in itertools.product(range(6, 120, 12), range(6, 160, 12)):
         dots[y - 2 : y + 3, x - 2 : x + 3] = 0.2
-    marked = replace(small_sensor, markers=True)
-    known = vts.Calibration.from_lights(calibration.lights, marked, calibration.background * dots)
+    sensor = replace(small_sensor, markers=True)
+    return vts.Calibration.from_lights(calibration.lights, sensor, calibration.background * dots), dots
+
+
+@pytest.mark.parametrize("first", [12, 0])
+def test_printed_markers_do_not_pass_for_other_light(unit, marked, first):
+    (_, camera), (known, dots) = unit, marked
     assert known.markers is not None
-    pictures = ((camera(1.0 if k >= 14 else 0.0) * dots[..., None].numpy()).astype(np.uint8) for k in range(20))
-    with streams.TactileStream(Frames(pictures), known) as stream:
+    pictures = ((camera(1.0 if k >= 14 else 0.0) * dots[..., None].numpy() + 0.5).astype(np.uint8) for k in range(20))
+    with streams.TactileStream(Frames(pictures), known, background_frames=first) as stream:
         contact = [bool(frame.output.contact.any()) for frame in stream]
     assert contact == [False] * 14 + [True] * 6
     assert stream.light.level == pytest.approx([1.0] * 3, abs=0.01) and stream.light.state == "following"
+
+
+def test_a_network_sees_no_markers(marked, tmp_path):
+    known, dots = marked
+    network = vts.NormalFromMLP(120, 160, torch.full((3, 120, 160), 0.5), (8,), seed=1)
+    network.save(tmp_path / "network.safetensors")
+    pipe = unit_pipeline(known, "fast", tmp_path / "network.safetensors")
+    assert float(pipe.frame_of((known.background * dots)[None])[1].abs().max()) < 0.05  # 0.5 where dots are seen
+
+
+def test_a_zeroed_unit_keeps_its_share_of_pressure(unit):
+    known = replace(unit[0], contact_share=0.5)
+    assert streams.background.with_background(known, known.background).contact_share == 0.5
+
+
+def test_first_frames_of_another_view_are_named_as_such(unit):
+    calibration, camera = unit
+    with pytest.raises(ValueError, match="the first frames cannot be used: the frame is turned by 180 degrees"):
+        streams.TactileStream(Frames([camera()[::-1, ::-1].copy() for _ in range(20)]), calibration)
+    with pytest.raises(ValueError, match="the first frames cannot be used: the frame has its channels swapped"):
+        streams.TactileStream(Frames([camera()[..., ::-1].copy() for _ in range(20)]), calibration)
 
 
 class Scripted:

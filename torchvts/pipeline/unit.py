@@ -5,6 +5,7 @@ from pathlib import Path
 from ..model import Calibration, check_calibration
 from ..skin import ContactSettings
 from .depth import DepthPipeline
+from .gs_sdk import gs_sdk_blocks
 
 
 def unit_pipeline(
@@ -32,4 +33,6 @@ def unit_pipeline(
     if contact is not None:
         raise ValueError("contact: expected None beside a network, whose images have other thresholds")
     value = (calibration.background.float() ** (1.0 / calibration.sensor.exponent)).clamp(0.0, 1.0)
-    return DepthPipeline.from_gs_sdk(network, value, calibration.sensor, mode)
+    sensor = calibration.sensor
+    blocks = gs_sdk_blocks(network, value, sensor, calibration.markers)
+    return DepthPipeline(*blocks, mm_per_pixel=sensor.mm_per_pixel, mode=mode).eval()

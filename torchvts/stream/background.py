@@ -1,5 +1,6 @@
 """The background of a unit: found in the first frames of a stream, calibrated from, and replaced where a stream is zeroed again."""
 
+import dataclasses
 import math
 import warnings
 from collections.abc import Sequence
@@ -8,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ..calibration import (
     ROUGH,
@@ -282,6 +283,8 @@ def with_background(calibration: Calibration, background: Tensor) -> Calibration
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     if calibration.response is not None:
         background = background.to(calibration.background.dtype)
-        return Calibration.from_response(calibration.response, sensor, background, calibration.report)
-    assert calibration.lights is not None
-    return Calibration.from_lights(calibration.lights, sensor, background, calibration.report, calibration.ambient)
+        unit = Calibration.from_response(calibration.response, sensor, background, calibration.report)
+    else:
+        assert calibration.lights is not None
+        unit = Calibration.from_lights(calibration.lights, sensor, background, calibration.report, calibration.ambient)
+    return dataclasses.replace(unit, contact_share=calibration.contact_share)

@@ -108,7 +108,8 @@ class Recording:
         fps = check_positive("fps", fps)
         value = calibration.background.float() ** (1.0 / calibration.sensor.exponent)
         value = value.clamp(0.0, 1.0)
-        self._light = FollowLight(value)
+        self._light = FollowLight(value)  # markers are filled in it
+        self._filled = calibration.markers if first is None else None
         self._unlearned: tuple[Tensor, Tensor, float] | None = None
         self.device = check_device(device)
         pipe = unit_pipeline(calibration, mode, network, contact).float().requires_grad_(False)
@@ -150,6 +151,8 @@ class Recording:
                     moved = self.pipe.moved(given)
             if self._follow:
                 seconds = 1.0 / self._fps if self._before is None else time_s - self._before
+                if self._filled is not None:
+                    frame = self._filled(frame)
                 # copies: the caller may write into what is returned
                 self._unlearned = (frame.clone() if image is frame else frame, moved.cpu(), seconds)
         self._before = time_s
@@ -170,6 +173,8 @@ class Recording:
 
     def _start(self, calibration: Calibration, image: Tensor) -> None:
         """Start from the light of the first frames, and refuse another unit and a contact in them."""
+        if reason := self.unusable(image):
+            raise ValueError(f"background: the first frames cannot be used: {reason}")
         light = self.light
         light.start(image if calibration.markers is None else calibration.markers(image))
         level = max(abs(v - 1.0) for v in light.level)

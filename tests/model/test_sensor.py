@@ -39,6 +39,7 @@ def as_text(**changes):
         (as_text(height=24.5), "key height: expected an integer, got float 24.5"),
         (as_text(width=4), "key width: expected at least 8, got 4"),
         (as_text(mm_per_pixel=-1), "key mm_per_pixel: expected a number in .*, got -1"),
+        (as_text(mm_per_pixel=0.0000634), r"mm_per_pixel: expected at least 0.0005 mm, got 6.34e-05: is it in m\?"),
         (as_text(mm_per_pixel=63.4), r"key mm_per_pixel: expected a number in \(0, 10\], got 63.4"),
         (as_text(mm_per_pixel="0.1 mm"), "key mm_per_pixel: expected a number, got str"),
         (as_text(gamma=0.01), r"key gamma: expected a number in \[0.1, 10\], got 0.01"),

@@ -10,7 +10,9 @@ from conftest import Frames, ring_lights
 
 import torchvts as vts
 from torchvts import stream as streams
-from torchvts.core.files import rgb_from_bgr
+from torchvts.cli.source import play
+from torchvts.core.files import read_frames, rgb_from_bgr
+from torchvts.stream import StreamReport
 from torchvts.stream.sources import SETTLING, LiveReader, check_reader, times_file
 
 HEIGHT, WIDTH, PITCH = 48, 64, 0.5
@@ -174,6 +176,10 @@ def test_what_cannot_be_recorded_is_refused(tmp_path):
     (tmp_path / "used" / "000000.png").touch()
     with pytest.raises(ValueError, match="expected a folder without images"):
         streams.TactileStream(Playing([]), unit(), record=tmp_path / "used")
+    (tmp_path / "used.mkv").write_text("an earlier recording")
+    with pytest.raises(ValueError, match=r"used\.mkv: expected a new name, got a file that is there already"):
+        streams.TactileStream(Playing([]), unit(), record=tmp_path / "used.mkv")
+    assert (tmp_path / "used.mkv").read_text() == "an earlier recording"
     odd = streams.Recorder(Playing(np.zeros((SETTLING + 1, 47, 64, 3), np.uint8)), tmp_path / "odd.mkv")
     with pytest.raises(ValueError, match=r"expected 8 bits and an even size for .mkv, got uint8 \(47, 64\): name a folder"):
         while odd.read() is not None:
@@ -190,6 +196,43 @@ def test_a_recording_that_does_not_fit_on_the_disk_is_an_error(tmp_path, name, s
         while recorder.read() is not None:
             pass
         recorder.close()
+
+
+def test_what_can_be_read_of_a_recording_on_a_full_disk_is_kept_with_its_times(tmp_path, small_files):
+    noise = np.random.default_rng(0).integers(0, 255, (SETTLING + 40, 48, 64, 3), dtype=np.uint8)
+    recorder = streams.Recorder(Playing(noise), tmp_path / "raw.mkv")
+    with small_files(150_000), pytest.raises(OSError, match="of 40 frames can be read back and are kept: is the disk full"):
+        while recorder.read() is not None:
+            pass
+        recorder.close()
+    reader = streams.open_source(tmp_path / "raw.mkv")
+    assert np.array_equal(reader.read(), noise[SETTLING]) and len(reader.times) == 40
+
+
+def test_recordings_of_several_sensors_have_one_clock(tmp_path):
+    begun = time.time()
+    for name in ("left.mkv", "right"):
+        recorder = streams.Recorder(Playing([picture()] * (SETTLING + 3)), tmp_path / name)
+        while recorder.read() is not None:
+            pass
+        recorder.close()
+    left, right = (
+        [[float(v) for v in line.split(",")] for line in times_file(tmp_path / name).read_text().split()[1:]]
+        for name in ("left.mkv", "right")
+    )
+    assert begun <= left[0][2] < left[-1][2] < right[0][2] <= time.time()
+    assert right[-1][2] - right[0][2] == pytest.approx(right[-1][1], abs=1e-5)
+
+
+def test_a_camera_that_stops_leaves_the_frames_until_then(tmp_path):
+    """They were lost, and the summary too, where Ctrl-C kept them."""
+    camera = Playing([picture()] * 20 + [picture(0.5)] * 10)
+    taken = []
+    with streams.TactileStream(camera, unit(), background_frames=12, record=tmp_path / "raw.mkv") as stream:
+        lost = play(stream, lambda frame: taken.append(frame.number) is None)
+        assert isinstance(lost, OSError) and "gives no more frames" in str(lost)
+        assert taken and StreamReport(stream).table()
+    assert len(list(read_frames(tmp_path / "raw.mkv"))) == 25
 
 
 @pytest.mark.parametrize("realtime", [False, True])

@@ -146,6 +146,15 @@ def test_an_episode_has_the_features_of_its_data_set(frame, small_sensor):
     later = frame._replace(number=8, time_s=0.5, output=frame.output._replace(depth_mm=0.5 * frame.output.depth_mm))
     assert messages.record_episode([frame, later], PITCH, dataset, "press a ball", "left_finger") == 2
     assert dataset.episodes == 1
+
+    def stops():
+        yield frame
+        raise OSError("unplugged")
+
+    kept = CheckedDataset(dataset.features)
+    with pytest.raises(OSError, match="unplugged"):
+        messages.record_episode(stops(), PITCH, kept, "press a ball", "left_finger")
+    assert len(kept.frames) == kept.episodes == 1
     area, deepest = dataset.frames[0]["observation.left_finger.state"]
     assert area == pytest.approx(int(frame.output.contact.sum()) * PITCH**2)
     assert deepest == pytest.approx(float(frame.output.depth_mm.max()))

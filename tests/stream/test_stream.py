@@ -749,21 +749,22 @@ def test_bad_arguments_are_refused_in_a_sentence(run_stream, video, tmp_path):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
-def test_what_came_before_ctrl_c_is_kept(run_stream, unit_file, video, tmp_path, monkeypatch):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_came_before_ctrl_c_is_kept(run_stream, unit_file, video, tmp_path, monkeypatch, number):
     draw = streams.Overlay.__call__
 
     def interrupted(overlay, frame, lines=()):
         if frame.number == 20:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
         return draw(overlay, frame, lines)
 
     monkeypatch.setattr(streams.Overlay, "__call__", interrupted)
-    before = signal.getsignal(signal.SIGINT)
+    before = signal.getsignal(number)
     done = run_stream("--source", video, "--calibration", unit_file, "--out", tmp_path, "--video", "avi")
     assert done.returncode == 0 and "interrupted" in done.stdout, done.stderr
     assert len(list(read_frames(tmp_path / "overlay.avi"))) == 20
     assert not list(tmp_path.glob(".overlay*")) and (tmp_path / "summary.json").is_file()
-    assert signal.getsignal(signal.SIGINT) == before
+    assert signal.getsignal(number) == before
 
 
 @pytest.mark.long

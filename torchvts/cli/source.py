@@ -79,15 +79,20 @@ def open_stream(arguments: argparse.Namespace, unit: Sensor | Calibration, press
     return stream
 
 
-def play(stream: TactileStream, take: Callable[[TactileFrame], bool]) -> None:
-    """Give every frame to ``take`` until the source ends, it returns False, or Ctrl-C."""
+def play(stream: TactileStream, take: Callable[[TactileFrame], bool]) -> OSError | None:
+    """Give every frame to ``take`` until the source ends, it returns False, or Ctrl-C (SIGINT, SIGTERM).
+
+    Returns:
+        Why the source has stopped, or the recording could not be written, to raise when the files are done; None where all is well.
+    """
+    lost: OSError | None = None
     asked: list[int] = []
 
     def interrupt(number: int, _: object) -> None:
         asked.append(number)  # the exception is lost if a destructor or a callback is running
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGINT, interrupt)
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         for frame in stream:
             if asked:
@@ -96,7 +101,15 @@ def play(stream: TactileStream, take: Callable[[TactileFrame], bool]) -> None:
                 break
     except KeyboardInterrupt:
         print("interrupted: the frames until now are kept")
+    except OSError as error:
+        lost = error
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
     if isinstance(stream.reader, Recorder):
-        print(f"recorded {len(stream.reader.times)} raw frames: {stream.reader.path}")
+        try:
+            stream.close()
+            print(f"recorded {len(stream.reader.times)} raw frames: {stream.reader.path}")
+        except OSError as error:
+            lost = lost or error
+    return lost

@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
         video = None
         if arguments.out is not None and arguments.video != "none":
             video = stack.enter_context(VideoFile(arguments.out / f"overlay.{arguments.video}", stream.fps))
-        play(stream, _Files(stream, report, sheet, video).add)
+        lost = play(stream, _Files(stream, report, sheet, video).add)
         print(report.table())
         if arguments.out is not None:  # before the video is done, which may fail
             report.save(arguments.out)
@@ -84,6 +84,8 @@ def run(arguments: argparse.Namespace) -> int:
                 save_figure(sheet.figure(), arguments.out / "sheet.png")
     if arguments.out is not None:
         print(f"wrote {len(report.rows)} frames to {arguments.out}")
+    if lost is not None:
+        raise lost
     return 1 if stream.left_out else 0
 
 

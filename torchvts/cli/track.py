@@ -80,9 +80,9 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.view or arguments.save is not None:
             view = stack.enter_context(LiveView(_pitch(stream), stream.metric, save=arguments.save, viewer=arguments.view))
         tracking = _Tracking(stream, video, view, tracker, arguments.least_mm2, arguments.length_unit)
-        play(stream, tracking.add)
+        lost = play(stream, tracking.add)
         if tracking.tracker is None:
-            raise ValueError("source: expected a contact to track, got none: see --least-mm2")
+            raise lost or ValueError("source: expected a contact to track, got none: see --least-mm2")
         with write_atomically(arguments.out / "poses.csv") as temporary, open(temporary, "w", newline="") as file:
             writer = csv.DictWriter(file, COLUMNS + QUALITY)
             writer.writeheader()
@@ -95,6 +95,8 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"wrote {', '.join(names)} to {arguments.out}")
     if arguments.save is not None:
         print(f"wrote {arguments.save}; rerun {arguments.save} shows it")
+    if lost is not None:
+        raise lost
     return 1 if found["lost"] or found["left_out"] else 0
 
 

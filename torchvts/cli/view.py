@@ -50,10 +50,12 @@ def run(arguments: argparse.Namespace) -> int:
         )
         with view, Keys() as keys:
             viewing = _Viewing(stream, view, keys, arguments.out)
-            play(stream, viewing.add)
+            lost = play(stream, viewing.add)
     print(viewing.report.table())
     if arguments.save is not None:
         print(f"wrote {arguments.save}; rerun {arguments.save} shows it")
+    if lost is not None:
+        raise lost
     return 1 if stream.left_out else 0
 
 

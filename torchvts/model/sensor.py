@@ -33,6 +33,9 @@ from .camera_view import CameraView, check_corners, check_lens, check_raw_sizes
 from .gs_sdk_sensor import is_gs_sdk_sensor, values_from_gs_sdk
 from .response_field import SensorPrior
 
+LEAST_PITCH_MM = 5e-4
+"""Smallest pixel pitch, mm: 0.5 um, the resolution of light. Sensors have 0.01 to 0.1; one in m is below."""
+
 MOST_STRETCHED = 0.02
 """Difference of aspects, logarithm, up to which frames are resized: shipped sensors have 0.002, for whole pixels."""
 
@@ -100,6 +103,8 @@ class Sensor:
         self._set("height", height)
         self._set("width", width)
         self._set("mm_per_pixel", check_positive("mm_per_pixel", self.mm_per_pixel, 10.0))
+        if self.mm_per_pixel < LEAST_PITCH_MM:
+            raise ValueError(f"mm_per_pixel: expected at least {LEAST_PITCH_MM:g} mm, got {self.mm_per_pixel:g}: is it in m?")
         if self.gamma is not None:
             self._set("gamma", check_positive("gamma", self.gamma, 10.0))
         if self.gamma is not None and self.gamma < 0.1:
@@ -272,6 +277,8 @@ class Sensor:
         cause = "another aspect ratio, so another sensor, crop or mode of the camera"
         if abs(width / height / own - 1.0) <= 0.01:
             cause = f"resize it, load the sensor with height={height}, width={width}, or give it roi_px: [0, 0, {width}, {height}]"
+            if self.raw_crop > 0:
+                cause = f"frames as the camera gives them? then the sensor file needs [{height}, {width}] in raw_size_px, too"
         elif abs(height / width / own - 1.0) <= 0.01:
             turn = f"turn_deg: {self.turn_deg}" if self.turn_deg % 180 else "turn_deg: 90 (or 270)"
             cause = f"its camera lies: the sensor file needs {turn}, and raw_size_px with [{height}, {width}]"

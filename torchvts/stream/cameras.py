@@ -5,7 +5,7 @@ import warnings
 from typing import NamedTuple
 
 from ..core.checks import check_integer, check_positive
-from .sources import CaptureReader
+from .sources import CaptureReader, lossy_codec
 
 
 class CameraSettings(NamedTuple):
@@ -60,6 +60,7 @@ class Camera(CaptureReader):
                 if not self._takes(key, value):
                     taken = float(self._capture.get(key))
                     warnings.warn(f"camera {index}: asked for {name} {value:g}, the driver took {taken:g}", stacklevel=2)
+            self.codec = lossy_codec(self._capture)
             if settings.fps is not None:
                 self.fps = float(self._capture.get(cv2.CAP_PROP_FPS)) or self.fps
         except BaseException:

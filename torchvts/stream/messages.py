@@ -243,14 +243,17 @@ def record_episode(
         task: what is done in the episode, in words.
         name: of the sensor, as in the features.
     Returns:
-        The number of frames; without any the episode is not saved.
+        The number of frames; without any the episode is not saved. Where the source stops with an error, or Ctrl-C ends it, the
+        frames until then are saved, and the error is raised.
     """
     count = 0
-    for frame in frames:
-        dataset.add_frame({**lerobot_frame(frame, mm_per_pixel, name), "task": task})
-        count += 1
-    if count > 0:
-        dataset.save_episode()
+    try:
+        for frame in frames:
+            dataset.add_frame({**lerobot_frame(frame, mm_per_pixel, name), "task": task})
+            count += 1
+    finally:
+        if count > 0:
+            dataset.save_episode()
     return count
 
 

@@ -25,25 +25,28 @@ class Recorder:
 
     Args:
         reader: the source.
-        path: a name ending in .mkv for FFV1 (8 bits), or a folder without images for PNG (8 or 16 bits).
+        path: a new name ending in .mkv for FFV1 (8 bits), or a folder without images for PNG (8 or 16 bits).
     Attributes:
-        times: of the frames written, s, from 0.
+        times: of the frames written, s, from 0; the table has those of the clock too (``unix_s``, seconds since 1970).
     Raises:
-        ValueError: a folder that holds images, or frames that FFV1 does not hold.
-        OSError: by :meth:`read` or :meth:`close`: what was recorded cannot be written.
+        ValueError: a file or a folder with images that is there already, or frames that FFV1 does not hold.
+        OSError: by :meth:`read` or :meth:`close`: not all can be written; what can be read of it is kept.
     """
 
     live = True
 
     def __init__(self, reader: Reader, path: str | Path) -> None:
         self.name, self.fps, self.path = reader.name, reader.fps, check_path("record", path)
+        self.codec = getattr(reader, "codec", "")
         self.times: list[float] = []
         self._reader, self._lock, self._closed, self._settling = reader, threading.Lock(), False, SETTLING
-        self._start = 0.0
+        self._start = self._clock = 0.0
         self._video: VideoFile | None = None
         self._images = InTurn()
+        if self.path.is_file():
+            raise ValueError(f"record: {self.path}: expected a new name, got a file that is there already: name another")
         if self.path.suffix.lower() == LOSSLESS:
-            self._video = VideoFile(self.path, self.fps).__enter__()
+            self._video = VideoFile(self.path, self.fps, keep=True).__enter__()
         elif self.path.suffix.lower() in VIDEO_SUFFIXES:
             raise ValueError(f"record: expected a name ending in {LOSSLESS} or that of a folder, got {self.path.name!r}")
         elif image_files(make_folder(self.path)):
@@ -67,7 +70,8 @@ class Recorder:
             )
         else:
             self._video.write(pixels)
-        self._start = self._start if self.times else now
+        if not self.times:
+            self._start, self._clock = now, time.time()
         self.times.append(now - self._start)
 
     def close(self) -> None:
@@ -77,13 +81,14 @@ class Recorder:
             if self._closed:
                 return
             self._closed = True
-            self._images.finish()
-            if self._video is not None:
-                self._video.__exit__(None, None, None)
-            if self.times:
-                table = io.StringIO()
-                csv.writer(table, lineterminator="\n").writerows(
-                    [("frame", "time_s"), *((f"{k:06d}", f"{t:.6f}") for k, t in enumerate(self.times))]
-                )
-                with write_atomically(times_file(self.path)) as temporary:
-                    temporary.write_text(table.getvalue(), encoding="utf-8")
+            try:
+                self._images.finish()
+                if self._video is not None:
+                    self._video.__exit__(None, None, None)
+            finally:  # the frames that were written have their times
+                if self.times:
+                    table = io.StringIO()
+                    lines = ((f"{k:06d}", f"{t:.6f}", f"{self._clock + t:.6f}") for k, t in enumerate(self.times))
+                    csv.writer(table, lineterminator="\n").writerows([("frame", "time_s", "unix_s"), *lines])
+                    with write_atomically(times_file(self.path)) as temporary:
+                        temporary.write_text(table.getvalue(), encoding="utf-8")

@@ -139,7 +139,7 @@ class LiveReader:
         self._closed = threading.Event()
         self._open, self._sleep = open_reader, sleep or self._closed.wait
         reader = open_reader()
-        self.name, self.fps = reader.name, reader.fps
+        self.name, self.fps, self.codec = reader.name, reader.fps, getattr(reader, "codec", "")
         self._worker = _ReadingThread(reader)
 
     def read(self) -> Pixels | Unreadable | None:
@@ -256,8 +256,8 @@ def read_times(recording: Path) -> dict[str, float]:
         return {}
     try:
         head, *lines = path.read_text(encoding="utf-8").split()
-        found = {name: parse_number(time_s) for name, time_s in (line.split(",") for line in lines)}
-        if head == "frame,time_s" and all(a < b for a, b in pairwise(found.values())):
+        found = {name: parse_number(time_s) for name, time_s, *_ in (line.split(",") for line in lines)}
+        if head.startswith("frame,time_s") and all(a < b for a, b in pairwise(found.values())):
             return found
     except ValueError:
         pass

@@ -47,12 +47,14 @@ class VideoFile:
         path: .webm (VP8, which browsers play), .mp4 (H.264 where this OpenCV has it, as browsers need; else mp4v), .avi (MJPG)
             or .mkv (FFV1, which loses nothing of an even size).
         fps: frames a second.
+        keep: keep what can be read where not all could be written, and raise all the same.
     Raises:
         ValueError: another suffix, or pictures of several sizes.
         OSError: OpenCV cannot write it, or not all of it: the disk is full.
     """
 
-    def __init__(self, path: str | Path, fps: float) -> None:
+    def __init__(self, path: str | Path, fps: float, keep: bool = False) -> None:
+        self.keep = keep
         self.path, self.fps = check_path("video", path), check_positive("fps", fps)
         if self.path.suffix.lower() not in CODES:
             raise ValueError(f"video: expected a name ending in {', '.join(CODES)}, got {self.path.name!r}")
@@ -91,17 +93,20 @@ class VideoFile:
         raise OSError(f"video: {self.path}: OpenCV cannot write this kind of file here: try .avi")
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: Any) -> None:
-        self._encoder.finish()
-        if self._writer is not None:
-            self._writer.release()
-        there = count_packets(self._temporary) if kind is None and self._count else 0
-        if there and there == self._count:
-            self._file.__exit__(None, None, None)
-            return
-        self._file.__exit__(Exception, Exception(), None)  # removes the temporary file
-        if kind is None and self._count:
+        try:
+            self._encoder.finish()
+        finally:
+            if self._writer is not None:
+                self._writer.release()
+            there = count_packets(self._temporary) if kind is None and self._count else 0
+            if there and (self.keep or there == self._count):
+                self._file.__exit__(None, None, None)
+            else:
+                self._file.__exit__(Exception, Exception(), None)  # removes the temporary file
+        if kind is None and there != self._count:
             raise OSError(
-                f"video: {self.path}: cannot be written: {there} of {self._count} frames can be read back: is the disk full?"
+                f"video: {self.path}: cannot be written: {there} of {self._count} frames can be read back"
+                f"{' and are kept' * (self.keep and there > 0)}: is the disk full?"
             )
 
 

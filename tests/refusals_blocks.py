@@ -60,7 +60,7 @@ TABLE = {
         {"depth_mm": batches(1), "weight": [*batches(1), *OTHER_DEPTHS]}, lambda: vts.skin.ZeroBackground(1.0)),
     "DepthPipeline": Entry({
         **{name: getattr(pipe(), name) for name in ("compensate", "mask", "normals", "gradient", "integrate")}, "mode": "fast",
-        "mm_per_pixel": 1.0, "tolerance_px": 0.002, "refine_threshold_px": 0.05, "max_passes": 8}, {
+        "mm_per_pixel": pipe().mm_per_pixel, "tolerance_px": 0.002, "refine_threshold_px": 0.05, "max_passes": 8}, {
         **{name: [None, lambda x: x] for name in ("compensate", "mask", "normals", "gradient", "integrate")},
         "contact": [lambda x: x, 0.8], "smooth": [lambda x: x, 0.8], "mode": ["slow", None, 1], "tolerance_px": NUMBER,
         "refine_threshold_px": ["1", None, NAN, -1.0], "max_passes": INTEGER}),

@@ -330,3 +330,10 @@ def test_the_script(run_script, low, tmp_path):
     assert [file.name for file in (tmp_path / "out").iterdir()] == ["pipeline.pt"]
     done = run_script("export", *arguments, "tflite")
     assert done.returncode != 0 and "error: format: expected one of torchscript" in done.stderr
+
+
+def test_an_integrator_that_loops_over_what_it_finds_is_refused(low, tmp_path):
+    """It failed with an error of the compiler's."""
+    own = pipeline(low[0], "fast", integrate=vts.AdaptiveIntegration(PITCH))
+    with pytest.raises(TypeError, match="got AdaptiveIntegration: no file can hold it; export with PoissonDCT"):
+        export.export_torchscript(own, tmp_path / "a.pt")

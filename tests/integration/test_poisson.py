@@ -122,6 +122,14 @@ def test_a_frame_without_an_undeformed_pixel_has_zero_as_its_lowest_depth():
     assert float(depth.max()) == pytest.approx(0.1 * 0.5 * (7 + 8), abs=1e-13)
 
 
+@pytest.mark.parametrize("solver", [vts.poisson_dst, vts.poisson_dct])
+def test_autocast_takes_no_digits(solver):
+    gradient = random_gradient(9, 12).float()
+    with torch.autocast("cpu", torch.bfloat16):
+        lowered = solver(gradient)
+    assert lowered.dtype == torch.float32 and torch.equal(lowered, solver(gradient))
+
+
 @pytest.mark.parametrize("module", [vts.PoissonDST, vts.PoissonDCT, vts.PoissonBackground])
 def test_a_module_equals_its_function_whatever_size_it_saw_before(module):
     function = {vts.PoissonDST: vts.poisson_dst, vts.PoissonDCT: vts.poisson_dct, vts.PoissonBackground: vts.poisson_background}[

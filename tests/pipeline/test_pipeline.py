@@ -7,6 +7,7 @@ from torch import nn
 import torchvts as vts
 from lab import metrics
 from torchvts import NormalModel
+from torchvts.integration import PerspectiveIntegration
 
 scenes = vts.scenes
 PITCH = 0.0625
@@ -435,6 +436,39 @@ def test_slopes_of_an_own_model_that_is_calibrated_count_as_ours_do(ring, mixed,
     theirs, unknown = (pipeline(lights, small_sensor, "fast", normals=wrap(ours.normals)) for wrap in (Calibrated, nn.Sequential))
     assert torch.equal(theirs(noisy).depth_mm, ours(noisy).depth_mm)
     assert not torch.equal(unknown(noisy).depth_mm, ours(noisy).depth_mm)
+
+
+class OnImages(nn.Conv2d):
+    input_domain = "image"
+
+
+@pytest.mark.parametrize("wrap", [lambda m: m, nn.Sequential, nn.DataParallel], ids=["plain", "Sequential", "DataParallel"])
+def test_what_a_plain_module_declares_is_heard(mixed, small_sensor, wrap):
+    """A network of camera images behind compensated ones gave 2.6 mm for 0.6 in silence."""
+    with pytest.raises(ValueError, match=r"(OnImages|Sequential|DataParallel) works on images as the camera"):
+        pipeline(mixed[0], small_sensor, "fast", normals=wrap(OnImages(3, 3, 1)))
+
+
+@pytest.mark.parametrize("name", ["normals", "gradient", "integrate"])
+def test_a_block_that_is_put_in_afterwards_is_no_silent_spare(mixed, small_sensor, name):
+    pipe = pipeline(mixed[0], small_sensor, "fast")
+    with pytest.raises(AttributeError, match=f"{name}: expected to stay what the pipeline was made with"):
+        setattr(pipe, name, nn.Identity())
+
+
+def test_an_integrator_of_another_pitch_is_refused(mixed, small_sensor):
+    with pytest.raises(ValueError, match=r"integrate: expected a pitch of 0.25 mm per pixel, got PoissonDST with 1"):
+        pipeline(mixed[0], small_sensor, "fast", integrate=vts.PoissonDST())
+    with pytest.raises(ValueError, match=r"integrate: expected a pitch of 0.25 mm per pixel, got PoissonDCT with 0.5"):
+        PerspectiveIntegration(0.25, 20.0, vts.PoissonDCT(0.5))
+
+
+@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
+def test_half_precision_is_refused(mixed, small_sensor, mode):
+    """By lights, depth was zero."""
+    lights, frames = mixed
+    with pytest.raises(TypeError, match=r"pipe: expected float32 or float64, got torch.float16: halve a network alone"):
+        pipeline(lights, small_sensor, mode).half()(frames[1:2])
 
 
 def test_autocast_reaches_an_own_network_and_nothing_else(mixed, small_sensor):

@@ -18,7 +18,7 @@ import torch
 from ..core import __version__
 from ..core.checks import check_choice, check_record
 from ..core.files import check_target, write_atomically
-from ..normals import WrappedNormals
+from ..integration import AdaptiveIntegration, DiscontinuityIntegration
 from ..pipeline import DepthPipeline
 from .onnx_operators import InOnnxOperators, simplify
 from .trace import size_and_dtype, trace
@@ -34,12 +34,11 @@ def describe(pipe: DepthPipeline) -> dict[str, Any]:
     """The metadata of an exported file: plain JSON."""
     check_pipeline(pipe)
     height, width, dtype = size_and_dtype(pipe)
-    normals = pipe.normals.module if isinstance(pipe.normals, WrappedNormals) else pipe.normals
     return {
         "torchvts": __version__,
         "torch": str(torch.__version__),
         "mode": pipe.mode,
-        "normals": type(normals).__name__,
+        "normals": type(pipe.normals).__name__,
         "height": height,
         "width": width,
         "mm_per_pixel": pipe.mm_per_pixel,
@@ -50,8 +49,14 @@ def describe(pipe: DepthPipeline) -> dict[str, Any]:
 
 
 def check_pipeline(pipe: object) -> None:
-    """Raise unless ``pipe`` is a DepthPipeline."""
+    """Raise unless ``pipe`` is a DepthPipeline that a file can hold."""
     check_record("pipe", pipe, DepthPipeline, "DepthPipeline.from_calibration makes one")
+    assert isinstance(pipe, DepthPipeline)
+    if isinstance(pipe.integrate, AdaptiveIntegration | DiscontinuityIntegration):
+        raise TypeError(
+            f"pipe: expected an integrator without loops over what it finds, got {type(pipe.integrate).__name__}: "
+            "no file can hold it; export with PoissonDCT"
+        )
 
 
 def export_torchscript(pipe: DepthPipeline, path: str | Path) -> Path:

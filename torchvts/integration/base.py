@@ -34,11 +34,20 @@ class WrappedIntegrator(Integrator):
         return depth
 
 
-def as_integrator(module: nn.Module) -> Integrator:
+def as_integrator(module: nn.Module, mm_per_pixel: float | None = None) -> Integrator:
     """The module itself if it is an :class:`Integrator`, else the module in a :class:`WrappedIntegrator`.
 
+    Args:
+        module: any that maps gradients to depth.
+        mm_per_pixel: pitch that it must have, if it says one: by another its depth would be wrong. None for any.
     Raises:
-        TypeError: no ``nn.Module``.
+        TypeError: no ``nn.Module``. ValueError: another pitch.
     """
     check_record("integrate", module, nn.Module)
+    own = getattr(module, "mm_per_pixel", None)
+    if mm_per_pixel is not None and isinstance(own, float) and abs(own / mm_per_pixel - 1.0) > 1e-6:
+        raise ValueError(
+            f"integrate: expected a pitch of {mm_per_pixel:g} mm per pixel, got {type(module).__name__} with {own:g}: "
+            f"{type(module).__name__}(mm_per_pixel=...) takes the sensor's"
+        )
     return module if isinstance(module, Integrator) else WrappedIntegrator(module)

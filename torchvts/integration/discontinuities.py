@@ -80,7 +80,8 @@ def integrate_discontinuities(
         gradient: (B, 2, H, W), (dz/dx, dz/dy), mm per mm.
         mm_per_pixel: pixel pitch in mm.
         contact: bool (B, 1, H, W); None takes pixels whose gradient is not exactly zero, and gaps of one or two pixels between
-            them. Undeformed skin that does not reach the image border (a hole) counts as contact, unless none does.
+            them; or of these the part whose slopes are no noise (a weight of slopes reaches beyond a wall), where the edges then
+            disagree less. Undeformed skin that does not reach the image border (a hole) counts as contact, unless none does.
         weight: (B, 1, H, W) in [0, 1], how far each pixel's slope is to be trusted; 0 for missing: bridged as by a membrane.
             None for 1.
         known_mm: (B, 1, H, W), depth of pixels that is known from elsewhere, mm; needs ``known_weight``.
@@ -157,7 +158,9 @@ class DiscontinuityIntegration(Integrator):
         if not bool(torch.isfinite(gradient).all()):
             raise ValueError("gradient: expected finite values, got NaN or infinite ones: set them to 0 and give them the weight 0")
         height, width = gradient.shape[2], gradient.shape[3]
-        deformed = _without_gaps((gradient != 0).any(dim=1, keepdim=True)) if contact is None else contact
+        anywhere = (gradient != 0).any(dim=1, keepdim=True)
+        deformed = _without_gaps(anywhere) if contact is None else contact
+        steep = anywhere & _steep(gradient.detach(), self.slope_std) if contact is None else contact
         trust = torch.ones_like(gradient[:, 0:1]) if weight is None else weight
         for name, value in (("contact", deformed), ("weight", trust)):
             check_shape(name, value, (gradient.shape[0], 1, height, width), "gradient")
@@ -170,20 +173,38 @@ class DiscontinuityIntegration(Integrator):
         trust = trust.to(gradient.dtype)
         known = self._known(gradient, known_mm, known_weight)
         depths, status = [], []
-        for frame, mask, sure, data in zip(*(each.unsqueeze(1) for each in (gradient, deformed, trust, known)), strict=True):
-            contacts = label_contacts(mask)
-            if not bool(contacts.any()):
-                depths.append(torch.zeros_like(sure) + 0.0 * frame[:, 0:1])
-                status.append((True, 0, 0))
-                continue
-            top, bottom, left, right = _box(contacts[0, 0] > 0)
-            part = (slice(None), slice(None), slice(top, bottom), slice(left, right))
-            depth, still, passes, iterations = self._solve_frame(frame[part], contacts[part], sure[part], data[part])
-            depths.append(nn.functional.pad(self.mm_per_pixel * depth, [left, width - right, top, height - bottom]))
-            status.append((still, passes, iterations))
+        for frame, mask, other, sure, data in zip(
+            *(each.unsqueeze(1) for each in (gradient, deformed, steep, trust, known)), strict=True
+        ):
+            found = self._solve_contacts(frame, label_contacts(mask), sure, data)
+            if bool((other != mask).any()):
+                second = self._solve_contacts(frame, label_contacts(other), sure, data)
+                found = min(found, second, key=lambda one: self._disagreement(frame, one[0], sure))
+            depths.append(self.mm_per_pixel * found[0])
+            status.append(found[1:])
         kinds = (torch.bool, torch.int64, torch.int64)
         columns = [torch.tensor([row[k] for row in status], dtype=kind, device=gradient.device) for k, kind in enumerate(kinds)]
         return DiscontinuitySolution(torch.cat((gradient[:0, 0:1], *depths)), columns[0], columns[1], columns[2])
+
+    def _solve_contacts(self, gradient: Tensor, contacts: Tensor, trust: Tensor, known: Tensor) -> tuple[Tensor, bool, int, int]:
+        """:meth:`_solve_frame` of the part of an image that holds the contacts; depth at unit pitch is zero around it."""
+        if not bool(contacts.any()):
+            return torch.zeros_like(trust) + 0.0 * gradient[:, 0:1], True, 0, 0
+        top, bottom, left, right = _box(contacts[0, 0] > 0)
+        part = (slice(None), slice(None), slice(top, bottom), slice(left, right))
+        depth, still, passes, iterations = self._solve_frame(gradient[part], contacts[part], trust[part], known[part])
+        height, width = gradient.shape[2], gradient.shape[3]
+        return nn.functional.pad(depth, [left, width - right, top, height - bottom]), still, passes, iterations
+
+    def _disagreement(self, gradient: Tensor, depth: Tensor, trust: Tensor) -> float:
+        """Sum over edges of what depth and slopes disagree by, in the robust measure that the weights belong to."""
+        total = 0.0
+        for dim, slope, variance in zip((3, 2), *_edges(gradient.detach(), self.slope_std), strict=True):
+            before, after = _ends(depth.detach(), dim)
+            first, second = _ends(trust, dim)
+            surprise = (after - before - slope).square() / (self.threshold**2 * variance)
+            total += float((first * second * torch.log1p(surprise)).sum())
+        return total
 
     def _known(self, gradient: Tensor, known_mm: Tensor | None, known_weight: Tensor | None) -> Tensor:
         """(B, 2, H, W): depth known from elsewhere, at unit pitch, and its weight."""
@@ -427,6 +448,15 @@ def _adjoint(along_x: Tensor, along_y: Tensor) -> Tensor:
     """Of differences along x (B, 1, H, W - 1) and y (B, 1, H - 1, W): what goes out of each pixel, with its sign."""
     pad = nn.functional.pad
     return pad(along_x, [1, 0]) - pad(along_x, [0, 1]) + pad(along_y, [0, 0, 1, 0]) - pad(along_y, [0, 0, 0, 1])
+
+
+def _steep(gradient: Tensor, slope_std: float) -> Tensor:
+    """Pixels (B, 1, H, W) whose slope is no noise, to a pixel: by means of 5 x 5, with crests up to 8 pixels wide filled."""
+    mean = nn.functional.avg_pool2d(gradient, 5, 1, 2, count_include_pad=False)
+    steep = (lengths(mean, 1, keepdim=True) > slope_std).to(torch.float32)
+    filled = -nn.functional.max_pool2d(-nn.functional.max_pool2d(steep, 9, 1, 4), 9, 1, 4)
+    inner = -nn.functional.max_pool2d(-filled, 5, 1, 2)  # means reach two pixels further
+    return nn.functional.max_pool2d(inner, 3, 1, 1) > 0
 
 
 def _without_gaps(deformed: Tensor) -> Tensor:

@@ -68,7 +68,7 @@ class PerspectiveIntegration(Integrator):
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         self.camera_height_mm = check_positive("camera_height_mm", camera_height_mm)
         self.least_facing_mm = LEAST_COSINE * self.camera_height_mm
-        self.integrate = self.poisson(mm_per_pixel) if integrate is None else as_integrator(integrate)
+        self.integrate = self.poisson(mm_per_pixel) if integrate is None else as_integrator(integrate, mm_per_pixel)
         self.takes_known = isinstance(self.integrate, PoissonDCT)
 
     def forward(self, gradient: Tensor, known_mm: Tensor | None = None, known_weight: Tensor | None = None) -> Tensor:

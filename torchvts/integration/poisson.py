@@ -66,7 +66,7 @@ def poisson_dst(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
     check_gradient(gradient, 3)
     if not torch.jit.is_scripting():
         mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
-    return _integrate_dst(gradient, mm_per_pixel, _plan_dst(gradient))
+    return _integrate_dst(gradient, mm_per_pixel, _plan_dst(_wide(gradient)))
 
 
 def poisson_dct(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
@@ -125,13 +125,13 @@ class PoissonDST(Integrator):
     def __init__(self, mm_per_pixel: float = 1.0) -> None:
         super().__init__()
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
-        self._plan: list[Tensor] = _plan_dst(torch.zeros(1, 2, 3, 3))
+        self._plan: list[Tensor] = _plan_dst(torch.zeros(1, 2, 3, 3, dtype=torch.float64))
 
     def forward(self, gradient: Tensor) -> Tensor:
         check_gradient(gradient, 3)
         plan = self._plan
-        if not _plan_fits(plan, gradient, gradient.shape[2], gradient.shape[3]):
-            plan = _kept(_plan_dst(gradient))
+        if not _plan_fits(plan, _wide(gradient), gradient.shape[2], gradient.shape[3]):
+            plan = _kept(_plan_dst(_wide(gradient)))
             if _plain(plan[2]):
                 self._plan = plan
         return _integrate_dst(gradient, self.mm_per_pixel, plan)
@@ -222,8 +222,8 @@ def check_gradient(gradient: Tensor, least: int) -> None:
 
 
 def _integrate_dst(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor]) -> Tensor:
-    z = _solve(divergence(gradient)[..., 1:-1, 1:-1], plan)
-    return mm_per_pixel * nn.functional.pad(z, [1, 1, 1, 1])
+    z = _solve(divergence(widened(gradient))[..., 1:-1, 1:-1], plan)
+    return (mm_per_pixel * nn.functional.pad(z, [1, 1, 1, 1])).to(gradient.dtype)
 
 
 def _integrate_dct(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], zero_in_background: bool) -> Tensor:

@@ -81,12 +81,26 @@ class NormalModel(nn.Module):
         return None
 
 
+def declared_domain(module: nn.Module) -> str | None:
+    """``input_domain`` of a module, or of what it wraps: a compiled or parallel one, or the first of a sequence; None for none."""
+    found: object = getattr(module, "input_domain", None)
+    if found is None:
+        inner = next(module.children(), None) if isinstance(module, nn.Sequential) else None
+        for name in ("_orig_mod", "module"):
+            inner = getattr(module, name, inner)
+        return declared_domain(inner) if isinstance(inner, nn.Module) else None
+    if found not in DOMAINS:
+        raise ValueError(f"input_domain: expected one of {', '.join(DOMAINS)}, or None, got {found!r}")
+    return str(found)
+
+
 class WrappedNormals(NormalModel):
     """Any module that maps compensated images (B, 3, H, W) to normals (B, 3, H, W), as a :class:`NormalModel` without depth."""
 
     def __init__(self, module: nn.Module) -> None:
         super().__init__()
         self.module = module
+        self.input_domain = declared_domain(module)
 
     def forward(self, image: Tensor, depth_mm: Tensor | None = None) -> Tensor:
         normal: Tensor = self.module(image)
@@ -162,9 +176,13 @@ def check_domain(model: NormalModel, given: str | None) -> None:
     wanted = model.input_domain
     if wanted is None or given is None or wanted == given or (wanted, given) == ("light", "image"):
         return
-    name = type(model).__name__
+    name = type(model.module if isinstance(model, WrappedNormals) else model).__name__
     cure = {
-        "image": f"take the pipeline of such networks:{FROM_GS_SDK}",
+        "image": (
+            "a network of your own takes its place in DepthPipeline(Compensate(), ContactMask(background), network, "
+            "GradientFromNormal(), PoissonDCT(pitch), mm_per_pixel=pitch), one of gs_sdk's in the pipeline of such "
+            f"networks:{FROM_GS_SDK}"
+        ),
         "ratio": "put it behind Compensate.from_calibration of a unit that is calibrated by response fields",
         "light": "put it behind Compensate.from_calibration of a unit that is calibrated by lights",
     }[wanted]

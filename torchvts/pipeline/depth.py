@@ -96,7 +96,7 @@ class DepthPipeline(nn.Module):
         given = {"compensate": compensate, "mask": mask, "gradient": gradient, "contact": touching, "smooth": smooth}
         for name, block in given.items():
             check_record(name, block, nn.Module)
-        model, integrator = as_normal_model(normals), as_integrator(integrate)
+        model, integrator = as_normal_model(normals), as_integrator(integrate, check_positive("mm_per_pixel", mm_per_pixel))
         check_domain(model, compensate.output_domain if isinstance(compensate, Compensate) else None)
         mm_per_pixel, tolerance_px = check_positive("mm_per_pixel", mm_per_pixel), check_positive("tolerance_px", tolerance_px)
         refine_threshold_px = check_least("refine_threshold_px", refine_threshold_px)
@@ -120,10 +120,10 @@ class DepthPipeline(nn.Module):
         self.contact = touching
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name in ("mode", "mm_per_pixel") and name in self.__dict__:
+        if (name in ("mode", "mm_per_pixel") and name in self.__dict__) or name in ("normals", "gradient", "integrate"):
             raise AttributeError(
                 f"{name}: expected to stay what the pipeline was made with, because its blocks hold it too: make another, "
-                "DepthPipeline.from_calibration(calibration, mode)"
+                f"DepthPipeline.from_calibration(calibration, {name if name in ('mode', 'normals', 'integrate') else '...'}=...)"
             )
         super().__setattr__(name, value)
 
@@ -226,13 +226,21 @@ class DepthPipeline(nn.Module):
 
         Raises:
             ValueError: wrong shape, or, for eager tensors, values outside [0, 1] or not finite.
-            TypeError: not floating point.
+            TypeError: not floating point, or a pipeline in half precision, in which light and depth have too few digits.
         """
         check_images(images)
+        if not torch.jit.is_scripting():
+            self._check_precision()
         frame, slopes = self.frame_of(images)  # eq. 9 and 5
         solution = self.solve.integrated(frame, slopes * frame.weight)  # eq. 4
         frame, solution = self.refine(frame, solution)  # eq. 10
         return self.output(frame, solution)
+
+    @torch.jit.unused
+    def _check_precision(self) -> None:
+        kind = getattr(self.mask, "flat", torch.empty(0)).dtype
+        if kind in (torch.float16, torch.bfloat16):
+            raise TypeError(f"pipe: expected float32 or float64, got {kind}: halve a network alone, or use torch.autocast")
 
     def output(self, frame: Frame, solution: Solution) -> DepthOutput:
         """Depth and slopes of a solution, and where the skin has moved and the object touches it."""

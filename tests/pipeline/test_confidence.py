@@ -384,3 +384,14 @@ def test_it_scripts_and_pickles_and_keeps_its_state(made, optimised):
         for name, found, wanted in zip(expected._fields, again, expected, strict=True):
             atol = 1e-3 if name == "factors_deg" else 1e-4  # roots of differences of variances, which may be near zero
             assert torch.allclose(found.double(), wanted.double(), rtol=1e-3, atol=atol), name
+
+
+def test_the_bound_of_free_skin_follows_the_threshold_of_contact(ring, small_sensor):
+    calibration = vts.Calibration.from_lights(ring(), small_sensor)
+    usual, blind = (
+        vts.ConfidentPipeline.from_calibration(calibration, contact=vts.ContactSettings(sigmas=sigmas))(
+            calibration.model_image[None]
+        )
+        for sigmas in (4.5, 18.0)
+    )
+    assert torch.allclose(blind.normal_95_deg.deg2rad(), 4.0 * usual.normal_95_deg.deg2rad(), rtol=1e-4)

@@ -463,6 +463,12 @@ def test_an_integrator_of_another_pitch_is_refused(mixed, small_sensor):
         PerspectiveIntegration(0.25, 20.0, vts.PoissonDCT(0.5))
 
 
+def test_moved_refuses_what_depth_refuses(mixed, small_sensor):
+    lights, frames = mixed
+    with pytest.raises(ValueError, match=r"images: expected"):
+        pipeline(lights, small_sensor, "fast").moved(255.0 * frames)
+
+
 @pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
 def test_half_precision_is_refused(mixed, small_sensor, mode):
     """By lights, depth was zero."""

@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("target", type=Path, metavar="REFERENCE", help="image or cloud")
     parser.add_argument("--calibration", type=Path, metavar="FILE", help="what torchvts calibrate wrote; not needed for clouds")
     add_out(parser, "for pose.json and pictures")
-    add_mode(parser, "precise")
+    add_mode(parser)
     add_network(parser)
     parser.add_argument("--cloud", choices=["pcd", "ply", "none"], default="none", help="write both contacts, the source moved")
     add_length_unit(parser)
@@ -85,8 +85,7 @@ def of_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     if arguments.calibration is None:
         raise ValueError("--calibration: expected what torchvts calibrate wrote, for images must become depth first")
     calibration = load_calibration(arguments.calibration)
-    by_lights = calibration.response is None and arguments.network is None
-    pipe = unit_pipeline(calibration, arguments.mode if by_lights else "auto", arguments.network).requires_grad_(False).freeze()
+    pipe = unit_pipeline(calibration, arguments.mode, arguments.network).requires_grad_(False).freeze()
     pitch, check = calibration.sensor.mm_per_pixel, FrameCheck.from_calibration(calibration)
     written = OutputFrame(arguments.length_unit, calibration.sensor)
 
@@ -104,12 +103,13 @@ def of_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         raise ValueError(f"reference: {str(error).removeprefix('frame: ')}") from error
     results: list[dict[str, Any]] = []
     last = None
-    for name, image in tqdm(read_frames(arguments.source), total=count_frames(arguments.source), unit="frame", disable=None):
+    count = count_frames(arguments.source)
+    for name, image in tqdm(read_frames(arguments.source), total=count, unit="frame", disable=None):
         try:
             frame = depth_of(image)
             found = register_depth(frame, target, pitch, initial=last)
         except ValueError as error:  # a frame of a sequence that cannot be used, or without contact
-            if count_frames(arguments.source) == 1:
+            if count == 1:
                 raise
             results.append({"frame": name, "converged": False, "message": str(error)})
             continue
@@ -117,7 +117,7 @@ def of_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         results.append(record(name, found, written))
         if len(results) <= 20:
             print_result(name, found)
-        if count_frames(arguments.source) == 1:
+        if count == 1:
             draw(arguments, name, contact_cloud(frame, pitch, 4000)[0], target_points, found, written)
     return results
 

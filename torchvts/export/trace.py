@@ -96,7 +96,7 @@ def size_and_dtype(pipe: DepthPipeline) -> tuple[int, int, torch.dtype]:
     """
     assert isinstance(pipe.mask, nn.Module) and isinstance(pipe.compensate, nn.Module)
     for tensor in (*pipe.mask.buffers(), *pipe.compensate.buffers()):
-        if tensor.dim() == 3 and tensor.shape[0] == 3 and tensor.is_floating_point():
+        if tensor.dim() == 3 and tensor.shape[0] == 3 and tensor.shape[1] > 1 and tensor.is_floating_point():
             return tensor.shape[1], tensor.shape[2], tensor.dtype
     raise ValueError("pipe: expected blocks that know the size of the calibration, as from_calibration makes them, got none")
 

@@ -32,7 +32,7 @@ from ..model.calibration import Calibration, check_calibration
 from ..model.coverage import COVERED, distance_to_presses
 from ..model.response_field import TaughtRange
 from ..normals import NormalFromIntensity, NormalFromResponse, as_normal_model
-from ..skin import ContactSettings
+from ..skin import ContactMask, ContactSettings
 from .depth import DepthOutput, DepthPipeline, eval_around
 from .expected_error import expected_model_deg, least_level, light_std_by_fit, model_log_variance
 
@@ -69,9 +69,6 @@ GRID_PX2 = 0.6
 
 CLIPPED_DEG = 3.0
 """Error of a normal, along one axis, where a light is blocked or a channel is saturated and the other two must do."""
-
-DETECTED_SIGMAS = 4.5
-"""A tilt of so many standard deviations of its noise is detected: the threshold of :class:`ContactMask`."""
 
 STEEPER_STD = 0.3
 """Standard deviation of what depth does to slopes, ``DepthBrightness.steeper`` times half the longer side: lights usually stand
@@ -306,7 +303,7 @@ class Confidence(nn.Module):
         self.spread = spread
         # TorchScript sees no numbers of the module
         self.clipped_variance = math.radians(CLIPPED_DEG) ** 2
-        self.detected, self.useful_deg = DETECTED_SIGMAS, USEFUL_DEG
+        self.detected, self.useful_deg = ContactSettings().sigmas, USEFUL_DEG  # a tilt of so many standard deviations is seen
         self.curl_share, self.edge_share, self.edge_depth_share = CURL_SHARE, EDGE_SHARE, EDGE_DEPTH_SHARE
         self.system_share = 1.0 if self.by_lights else SYSTEM_SHARE**2  # lights that are off are off everywhere
         self.kink_variance_mm = (KINK_PX * mm_per_pixel) ** 2
@@ -551,6 +548,8 @@ class ConfidentPipeline(nn.Module):
         check_record("confidence", confidence, Confidence, "Confidence.from_calibration makes one")
         self.pipe = pipe
         self.confidence = confidence
+        if isinstance(pipe.mask, ContactMask):
+            confidence.detected = pipe.mask.sigmas
 
     @classmethod
     def from_calibration(

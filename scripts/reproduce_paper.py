@@ -103,7 +103,9 @@ def table_2(folder: Path, out: Path) -> list[str]:
             image_px = float(difference.square().mean().sqrt())
             contact_px = float(difference[one.contact | other.contact].square().mean().sqrt())
             rows.append((name, press.name, image_px, contact_px))
-        figure = viz.comparison_figure(one.depth_mm, other.depth_mm, sensor.mm_per_pixel, f"table 2: {name} and look-up table")
+        figure = viz.comparison_figure(
+            one.depth_mm, other.depth_mm, sensor.mm_per_pixel, f"table 2: {name} and look-up table", (name, "look-up table")
+        )
         viz.save_figure(figure, out / f"table_2_{name.split(',')[0].split(' (')[0].replace(' ', '_')}.png")
     lines = [f"| {name} | {press} | {image_px:.2f} | {contact_px:.2f} |" for name, press, image_px, contact_px in rows]
     head = "| model against look-up table | press | over the image, px | over the contact, px |"

@@ -73,3 +73,13 @@ def test_a_pose_is_shown_before_and_after_at_one_scale():
     for axes in (above, above_after):
         shown = np.concatenate([np.asarray(c.get_offsets()) for c in axes.collections])
         assert (shown[:, 0] > axes.get_xlim()[0]).all() and (shown[:, 1] < axes.get_ylim()[1]).all()
+
+
+def test_a_comparison_names_what_it_compares_and_takes_one_frame():
+    one, other, difference, *_ = viz.comparison_figure(frame() - 0.05, frame(), PITCH, names=("response", "look-up table")).axes
+    assert one.get_title().startswith("look-up table") and other.get_title().startswith("response")
+    assert difference.get_title().startswith("difference, px")
+    with pytest.raises(ValueError, match="depth: expected one frame, got"):
+        viz.comparison_figure(torch.stack((frame(), frame())), frame(), PITCH)
+    with pytest.raises(ValueError, match="truth_mm: expected"):
+        viz.comparison_figure(frame(), frame()[..., :-1], PITCH)

@@ -42,7 +42,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--background", type=Path, nargs="+", metavar="IMAGE", help="to calibrate: without contact; or a video")
     add_press(parser)
     parser.add_argument("--save-calibration", type=Path, metavar="FILE", help="write the calibration, .safetensors")
-    parser.add_argument("--corners", help='in place of the sensor\'s: "x y x y x y x y", from top left, clockwise')
+    parser.add_argument(
+        "--corners",
+        help='of the gel in place of the sensor\'s: "x y x y x y x y", from top left, clockwise; straightened first',
+    )
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="for overlay video, sheet.png, frames.csv and summary.json")
     add_video(parser)
 
@@ -111,7 +114,8 @@ class _Files:
 
 
 def with_corners(unit: Sensor | Calibration, text: str) -> Sensor | Calibration:
-    """The sensor or calibration with other corners, of the gel in frames as they come: they turn and mirror these too."""
+    """The sensor or calibration with other corners, of the gel in frames as they come (straightened, if it has a lens): they turn
+    and mirror these too."""
     try:
         numbers = [float(part) for part in text.replace(",", " ").split()]
     except ValueError:

@@ -46,7 +46,7 @@ class CameraView(NamedTuple):
         height, width = frame.shape[2], frame.shape[3]
         if self.corners_px is not None:
             x, y = zip(*self.corners_px, strict=True)
-            if min(*x, *y) < -0.5 or max(x) > width or max(y) > height:
+            if min(*x, *y) < -0.5 or max(x) > width - 0.5 or max(y) > height - 0.5:
                 raise self._missing("corners_px", height, width, self.corners_px)
             return _sampled(frame, _corners_grid(self.corners_px, self.size, (height, width), frame.dtype))
         if self.roi_px is not None:

@@ -64,7 +64,7 @@ class Sensor:
             which these were measured, frames of others are refused. Without: a frame of such a size is turned, cropped by
             ``raw_crop``, and resized; one of the sensor's size is kept as it is. Where frames are turned, mirrored or
             straightened, the sensor's size before that if nothing else is said.
-        raw_crop: share of a raw frame's height and width to cut off each side, in [0, 0.5).
+        raw_crop: share of a raw frame's height and width to cut off each side, in [0, 0.49].
         markers: whether the skin has printed markers, which are filled in every frame; None: where the background shows a regular
             pattern of them.
         sensor_to_robot: (4, 4), rows of the rigid motion, mm, that takes points of the sensor (x right, y up, z towards the camera,

@@ -36,7 +36,7 @@ def sample_frames(calibration: Calibration) -> Tensor:
     height, width, pitch = calibration.sensor.height, calibration.sensor.width, calibration.sensor.mm_per_pixel
     x, y = pixel_grid_mm(height, width, pitch)
     reach = 0.12 * min(height, width) * pitch
-    background = calibration.background.detach().float().clamp(0.0, 1.0) ** (1.0 / calibration.sensor.exponent)
+    background = calibration.background_value
     frames = []
     for contacts in (1, 0, 2):
         change = torch.zeros_like(background)

@@ -264,6 +264,11 @@ class Calibration:
         offset, gain = -self.ambient.reshape(3, 1, 1), self.gain
         return offset.expand_as(self.background) if gain is None else offset * gain
 
+    @property
+    def background_value(self) -> Tensor:
+        """(3, H, W) in [0, 1], float32: the background as the camera gives it, with printed markers filled."""
+        return self.background.detach().float().clamp(0.0, 1.0) ** (1.0 / self.sensor.exponent)
+
     @cached_property
     def background_without_ambient(self) -> Tensor:
         """(3, H, W), background minus ambient light, linear light."""

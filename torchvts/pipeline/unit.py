@@ -32,7 +32,6 @@ def unit_pipeline(
         return DepthPipeline.from_calibration(calibration, mode, contact=contact)
     if contact is not None:
         raise ValueError("contact: expected None beside a network, whose images have other thresholds")
-    value = (calibration.background.float() ** (1.0 / calibration.sensor.exponent)).clamp(0.0, 1.0)
     sensor = calibration.sensor
-    blocks = gs_sdk_blocks(network, value, sensor, calibration.markers)
+    blocks = gs_sdk_blocks(network, calibration.background_value, sensor, calibration.markers)
     return DepthPipeline(*blocks, mm_per_pixel=sensor.mm_per_pixel, mode=mode).eval()

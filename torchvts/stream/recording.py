@@ -106,9 +106,7 @@ class Recording:
         check_calibration("calibration", calibration)
         check_switch("follow", follow)
         fps = check_positive("fps", fps)
-        value = calibration.background.float() ** (1.0 / calibration.sensor.exponent)
-        value = value.clamp(0.0, 1.0)
-        self._light = FollowLight(value)  # markers are filled in it
+        self._light = FollowLight(calibration.background_value)
         self._filled = calibration.markers if first is None else None
         self._unlearned: tuple[Tensor, Tensor, float] | None = None
         self.device = check_device(device)

@@ -62,8 +62,7 @@ class FrameCheck:
     def from_calibration(cls, calibration: Calibration) -> "FrameCheck | None":
         """The check of a calibrated unit; None where no image of its background was taken."""
         check_calibration("calibration", calibration)
-        value = calibration.background.float() ** (1.0 / calibration.sensor.exponent)
-        return cls(value.clamp(0.0, 1.0)) if calibration.measured else None
+        return cls(calibration.background_value) if calibration.measured else None
 
     def __call__(self, frame: Tensor) -> str:
         """Why a frame (1, 3, H, W), rectified, in [0, 1], cannot be used."""

@@ -144,7 +144,9 @@ def test_a_digit_runs_on_frames_as_its_camera_gives_them():
         image = sensor.rectify(rgb_from_bgr(raw)[None])
         assert (image - expected).abs().max() < (1e-7 if scale == 1 else 0.3)  # antialiasing looks beyond two pixels
         assert torch.equal(sensor.rectify(image), image)
-    with pytest.raises(ValueError, match=r"got 120 x 160: its camera lies: .* turn_deg: 90, and raw_size_px with \[120, 160\]"):
+    with pytest.raises(
+        ValueError, match=r"got 120 x 160: its camera lies: .* turn_deg: 90, and raw_size_px: \[\[120, 160\]\] alone"
+    ):
         sensor.rectify(torch.zeros(1, 3, 120, 160))
     with pytest.raises(ValueError, match=r"got 32 x 24: its camera lies: the sensor file needs turn_deg: 90 \(or 270\)"):
         vts.Sensor(**GOOD).rectify(torch.zeros(1, 3, 32, 24))

@@ -10,6 +10,7 @@ from ..core.checks import QUANTISATION_STD
 from ..core.geometry import pixel_grid_mm
 from ..core.noise import noise_std
 from ..core.robust import TUKEY, tukey_weight
+from ..model.calibration import SATURATED
 from ..model.lights import PointLights, log_slope_of_lobe, microfacet
 from ..model.sensor import Sensor
 
@@ -44,7 +45,7 @@ class BackgroundPixels(NamedTuple):
         x, y = (axis.expand(value.shape[1:]).flatten() for axis in (x, y))
         noise = noise_std(value[None])[0].clamp_min(QUANTISATION_STD)
         image = value.flatten(1)
-        pixels = cls(x, y, image, image < 0.995, noise, 1.0 / sensor.exponent)
+        pixels = cls(x, y, image, image < SATURATED, noise, 1.0 / sensor.exponent)
         # leave out pixels that noise could clip at black or white; the model decides, so that noise does not select
         expected, margin = pixels.model(paraboloid_start(pixels)), 2.5 * noise[:, None]
         return pixels._replace(usable=pixels.usable & (expected > margin) & (expected < 1.0 - margin))
@@ -110,7 +111,9 @@ def paraboloid_start(pixels: BackgroundPixels) -> Tensor:
     target = light ** (-2.0 / 3.0)
     # (d value / d target)^2: weights residuals as residuals in image value
     weight = (
-        (image > 3.0 * noise[:, None]) * (image < 0.995) * (light ** (5.0 / 3.0) * image.clamp_min(1e-3) ** (1 - 1 / exponent)) ** 2
+        (image > 3.0 * noise[:, None])
+        * (image < SATURATED)
+        * (light ** (5.0 / 3.0) * image.clamp_min(1e-3) ** (1 - 1 / exponent)) ** 2
     )
     robust = torch.ones_like(weight)
     solution = torch.zeros(3, 4, dtype=image.dtype)

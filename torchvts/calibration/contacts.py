@@ -12,7 +12,7 @@ from ..core.blur import band_of_ratios
 from ..core.geometry import gradient_from_normal, pixel_grid_mm
 from ..core.morphology import dilate, erode
 from ..integration import PoissonBackground
-from ..model.calibration import PEDESTAL, Calibration
+from ..model.calibration import PEDESTAL, SATURATED, Calibration
 from ..model.report import PressRow, TouchRow
 from ..model.response_field import ResponseField, ResponseModel
 from ..model.sensor import Sensor
@@ -143,7 +143,7 @@ def read_contacts(given: Sequence[Press | Touch], background: Tensor, sensor: Se
         far = far_field(change)
         ball_px = 0.5 * item.ball_diameter_mm / sensor.mm_per_pixel if isinstance(item, Press) else 0.0
         region = contact_region(far, differs, ball_px)
-        saturated = ((item.image > 0.995) & (background < 0.995)).any(dim=0).cpu()
+        saturated = ((item.image > SATURATED) & (background < SATURATED)).any(dim=0).cpu()
         contact = _sampled(item, smooth(ratio)[0].double() - 1.0, region, saturated, sensor)
         contact.reason = _unusable(item.image, background, differs, far) or _saturated(float(saturated[region].double().mean()))
         if isinstance(item, Press) and item.center_px is not None:

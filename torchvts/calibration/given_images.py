@@ -10,7 +10,7 @@ from torch import Tensor
 from ..core.arrays import array_of
 from ..core.blur import blur, gaussian_weights
 from ..core.views import TWELVE_BITS, Views
-from ..model.calibration import PEDESTAL
+from ..model.calibration import PEDESTAL, SATURATED
 from .contacts import DARK, MOST_SATURATED, channel_band
 from .presses import Press, Touch
 
@@ -44,7 +44,7 @@ def check_exposure(background: Tensor) -> None:
         ValueError: names the channel and the value.
     """
     for name, channel in zip("RGB", background.detach(), strict=True):
-        mean, saturated = float(channel.mean()), float((channel > 0.995).double().mean())
+        mean, saturated = float(channel.mean()), float((channel > SATURATED).double().mean())
         if mean < 0.02:
             raise ValueError(
                 f"background: expected light in channel {name}, got a mean of {mean:.4f}: black image, LED or exposure off"
@@ -189,7 +189,7 @@ def _first_like(presses: Sequence[Press], k: int) -> int:
 
 def _check_levels(background: Tensor, presses: Sequence[Press]) -> None:
     """Raise if the presses, in the median, are saturated, or much darker than the background, or it than they."""
-    saturated = statistics.median(float((press.image > 0.995).double().mean()) for press in presses)
+    saturated = statistics.median(float((press.image > SATURATED).double().mean()) for press in presses)
     if saturated > MOST_SATURATED:
         raise ValueError(
             f"presses: expected light below the camera's limit, got images of which {saturated:.0%} is saturated in the median: "

@@ -9,7 +9,7 @@ import torch
 
 from ..core.arrays import array_of
 from ..core.views import Views
-from ..model.calibration import Calibration
+from ..model.calibration import SATURATED, Calibration
 from ..model.report import Report
 from ..model.sensor import Sensor
 from .contacts import ROUGH, Contact, channel_structure, differing, used
@@ -170,7 +170,7 @@ def to_background_of_lights(unit: Calibration) -> tuple[Calibration, list[str]]:
     model = unit.model_image
     spread = (model - unit.background).abs().flatten(1).median(dim=1).values / 0.6745
     # contact changes the light by more than 5 % and is wider than dirt: 5 sigmas of the residual and of 1 % of the model
-    saturated = (unit.background > 0.995) | (model > 0.95)
+    saturated = (unit.background > SATURATED) | (model > 0.95)
     change = (unit.background - model).masked_fill(saturated, 0.0)
     standing_out = float(differing(change, spread.reshape(3, 1, 1) + 0.01 * model).double().mean())
     report = unit.report.copy()

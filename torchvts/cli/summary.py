@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ..calibration import CalibrationWarning, Press, Touch, calibrate
 from ..core.tables import markdown, number
-from ..diagnose.checks import SATURATED
+from ..diagnose.checks import SATURATED_SHARE
 from ..model import Calibration, PointLights, Sensor
 from ..model.coverage import press_next
 from ..model.report import CandidateRow, PressRow, Report
@@ -55,7 +55,7 @@ def print_calibration(calibration: Calibration, candidates: bool = False) -> Non
         where = f"x {place[0]}, y {place[1]} px of rectified images ({x:+.1f}, {y:+.1f} mm from the middle)"
         print(f"covered: presses lie on {share:.0%} of the skin; press next around {where}")
     saturated = float((calibration.background >= calibration.saturation_light).any(0).double().mean())
-    if saturated > SATURATED:
+    if saturated > SATURATED_SHARE:
         print(f"saturated: {saturated:.0%} of the background: depth is worse there; reduce the exposure and calibrate again")
     if report["source"] == "presses" and "prior_deg" not in report:
         print("scale: that of mm_per_pixel and of the diameters; sizes that are all too small show in five deep presses, no others")

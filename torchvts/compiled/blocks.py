@@ -374,7 +374,7 @@ def contact_values(block: nn.Module, size: tuple[int, int]) -> Values:
         "contact_cell": cell,
         "contact_blur": _floats(weights),
         "contact_taps": len(weights),
-        "contact_decay": (pressure_module.DECAY_MM / pitch) ** 2,
+        "contact_decay": (pressure_module.CONTACT_DECAY_MM / pitch) ** 2,
         "contact_step": max(1, min(size[0] // cell, size[1] // cell) // pressure_module.SAMPLES),
         "share": block.share,
         "large": block.large,

@@ -29,7 +29,7 @@ BLOCKY = 1.18
 """Ratio of steps at the borders of 8 x 8 blocks to those inside above which an image was compressed; noise alone stays below 1.1,
 a JPEG of quality 95 has 1.2 to 1.3."""
 
-SATURATED = 0.05
+SATURATED_SHARE = 0.05
 """Share of the calibration's image that is saturated in a channel from which it is said."""
 
 COPLANAR = 0.3
@@ -97,7 +97,7 @@ def _clipped_at_calibration(e: Examination) -> float:
 def _contact_at_calibration(e: Examination) -> float | None:
     """Structure between the channels as a contact has it; with lights, a contact that their pipeline finds in the background."""
     unit = e.unit
-    if not unit.measured or unit.markers is not None or unit.sensor.markers or _clipped_at_calibration(e) > SATURATED:
+    if not unit.measured or unit.markers is not None or unit.sensor.markers or _clipped_at_calibration(e) > SATURATED_SHARE:
         return None
     if unit.lights is None:
         structure = channel_structure(e.value)
@@ -307,7 +307,7 @@ _CONTACT = "contact in the {} image: take it again with nothing touching the ski
 CHECKS = (
     # the calibration
     Check("calibration_saturated", _clipped_at_calibration,
-          "{value:.0%} of the calibration image is saturated: reduce the exposure and calibrate again", above=SATURATED),
+          "{value:.0%} of the calibration image is saturated: reduce the exposure and calibrate again", above=SATURATED_SHARE),
     Check("contact_in_calibration", _contact_at_calibration, _CONTACT.format("calibration"), "fault"),
     Check("lights_coplanar", _coplanar, "the lights lie nearly in one plane (smallest singular value of their directions "
           "{value:.2f}, usual is 0.8): noise alone changes normals by {cost:.1f} degrees; increase the distance of the LEDs"),

@@ -281,7 +281,7 @@ class Sensor:
                 cause = f"frames as the camera gives them? then the sensor file needs [{height}, {width}] in raw_size_px, too"
         elif abs(height / width / own - 1.0) <= 0.01:
             turn = f"turn_deg: {self.turn_deg}" if self.turn_deg % 180 else "turn_deg: 90 (or 270)"
-            cause = f"its camera lies: the sensor file needs {turn}, and raw_size_px with [{height}, {width}]"
+            cause = f"its camera lies: the sensor file needs {turn}, and raw_size_px: [[{height}, {width}]] alone"
         return (
             f"frame: expected {self.height} x {self.width}{raw and f', or raw frames of {raw},'} for sensor '{self.name}', "
             f"got {height} x {width}: {cause}"

@@ -17,9 +17,9 @@ CELL_MM = 0.06
 BLUR_MM = 0.1
 """Blur of depth before its curvature is taken; 0.16 is as good on balls and 0.01 of IoU worse on shapes."""
 
-DECAY_MM = 0.45
-"""L. With a unit's best share, IoU is the same within 0.01 in the mean over sets from 0.4 to 0.7: larger is better on drawn
-shapes (0.90 for 0.89), smaller on balls on real sensors (0.89 for 0.86)."""
+CONTACT_DECAY_MM = 0.45
+"""L of contact; that of zero.py is chosen by depth. With a unit's best share, IoU is the same within 0.01 in the mean over sets
+from 0.4 to 0.7: larger is better on drawn shapes (0.90 for 0.89), smaller on balls on real sensors (0.89 for 0.86)."""
 
 SHARE = 0.3
 """Share of the frame's pressure where no press of a ball shows it: a unit's own is 0.15 to 0.6."""
@@ -47,7 +47,7 @@ sensors, and by 0.16 and more where an object is rendered without the skin that 
 PULLING = 0.02
 """That share of the skin."""
 
-LEAST_DEPTH = 0.02
+LEAST_CONTACT_DEPTH = 0.02
 """Depth of contact without such skin, as a share of the deepest."""
 
 SAMPLES = 80
@@ -82,7 +82,7 @@ class ContactFromDepth(nn.Module):
         self.share = SHARE if share is None else check_positive("share", share, 1.0)
         self.cell = max(1, round(CELL_MM / mm_per_pixel))
         self.large, self.deep, self.rim_mm, self.fall = LARGE, DEEP, RIM_MM, FALL
-        self.pulled, self.pulling, self.least_depth = PULLED, PULLING, LEAST_DEPTH
+        self.pulled, self.pulling, self.least_depth = PULLED, PULLING, LEAST_CONTACT_DEPTH
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, settings: ContactSettings | None = None) -> "ContactFromDepth":
@@ -124,7 +124,7 @@ class ContactFromDepth(nn.Module):
         return torch.where(pulled > self.pulled * large, depth - self.least_depth * deepest, with_skin)
 
 
-def pressure_of(depth_mm: Tensor, pitch_mm: float, blur_mm: float = BLUR_MM, decay_mm: float = DECAY_MM) -> Tensor:
+def pressure_of(depth_mm: Tensor, pitch_mm: float, blur_mm: float = BLUR_MM, decay_mm: float = CONTACT_DECAY_MM) -> Tensor:
     """Pressure p = z - L^2 laplace z of skin of depth z, (B, 1, h, w), as a depth, mm."""
     z = blur(depth_mm, gaussian_weights(blur_mm / pitch_mm))
     z = nn.functional.pad(z, [1, 1, 1, 1], mode="replicate")

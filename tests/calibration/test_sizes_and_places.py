@@ -52,6 +52,18 @@ def test_sizes_that_all_presses_contradict_are_refused_and_forced(mistake):
     assert any("times as wide as the balls" in text for text in warned)
 
 
+@pytest.mark.parametrize("pitch_off", [0.9, 1.1])
+def test_depth_by_presses_goes_with_the_square_of_a_wrong_pitch(whole, pitch_off):
+    sensor = dataclasses.replace(UNIT.sensor, mm_per_pixel=pitch_off * UNIT.sensor.mm_per_pixel)
+    other, _ = calibrate(sensor, bare(UNIT.balls))
+    right, wrong = (
+        [float(vts.DepthPipeline.from_calibration(unit)(press.image[None]).depth_mm.max()) for press in UNIT.balls]
+        for unit in (whole[0], other)
+    )
+    ratio = sorted(b / a for a, b in zip(right, wrong, strict=True))[len(right) // 2]
+    assert ratio == pytest.approx(pitch_off**2, rel=0.05)
+
+
 @pytest.mark.parametrize("times", [1.9, 0.5])
 def test_one_wrong_ball_among_right_ones_is_left_out_and_no_other(times):
     presses = bare(UNIT.balls)

@@ -96,9 +96,9 @@ class DepthPipeline(nn.Module):
         given = {"compensate": compensate, "mask": mask, "gradient": gradient, "contact": touching, "smooth": smooth}
         for name, block in given.items():
             check_record(name, block, nn.Module)
-        model, integrator = as_normal_model(normals), as_integrator(integrate, check_positive("mm_per_pixel", mm_per_pixel))
-        check_domain(model, compensate.output_domain if isinstance(compensate, Compensate) else None)
         mm_per_pixel, tolerance_px = check_positive("mm_per_pixel", mm_per_pixel), check_positive("tolerance_px", tolerance_px)
+        model, integrator = as_normal_model(normals), as_integrator(integrate, mm_per_pixel)
+        check_domain(model, compensate.output_domain if isinstance(compensate, Compensate) else None)
         refine_threshold_px = check_least("refine_threshold_px", refine_threshold_px)
         check_integer("max_passes", max_passes, 1)
         if mode == "precise" and not (model.uses_depth or model.normals_from_depth):
@@ -122,8 +122,8 @@ class DepthPipeline(nn.Module):
     def __setattr__(self, name: str, value: Any) -> None:
         if (name in ("mode", "mm_per_pixel") and name in self.__dict__) or name in ("normals", "gradient", "integrate"):
             raise AttributeError(
-                f"{name}: expected to stay what the pipeline was made with, because its blocks hold it too: make another, "
-                f"DepthPipeline.from_calibration(calibration, {name if name in ('mode', 'normals', 'integrate') else '...'}=...)"
+                f"{name}: expected to stay what the pipeline was made with, because its blocks hold it too: make another by "
+                "DepthPipeline.from_calibration"
             )
         super().__setattr__(name, value)
 

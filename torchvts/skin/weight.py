@@ -133,9 +133,7 @@ class ContactMask(nn.Module):
         if self.flat.shape[1] > 1 or self.flat.shape[2] > 1:
             check_same_size("compensated", compensated, "the calibration", self.flat.shape[1], self.flat.shape[2])
         cell = max(1, min(height, width) // self.cells)
-        change = whole_cell_means((compensated - self.flat) * self.per_light, cell)
-        lit = change.detach().mean(dim=(2, 3), keepdim=True) > self.failed - 1.0
-        change = change * lit.to(change.dtype)
+        change = self.change(compensated, cell)
         grey = change.mean(dim=1, keepdim=True)
         evidence = length_in_spreads(change - grey, self.grey_share * grey, self.least_spread)
         if gradient is not None:
@@ -147,6 +145,12 @@ class ContactMask(nn.Module):
         per_noise = whole_cell_means(self.per_noise[None], cell) if self.per_noise.shape[1] > 1 else self.per_noise[None]
         evidence = evidence * per_noise
         return cells_to_pixels(self.weight(blur(evidence, self.weights)), cell, height, width)
+
+    def change(self, compensated: Tensor, cell: int) -> Tensor:
+        """Relative change of light of cells, (B, 3, h, w); zero in channels whose LED has failed."""
+        change = whole_cell_means((compensated - self.flat) * self.per_light, cell)
+        lit = change.detach().mean(dim=(2, 3), keepdim=True) > self.failed - 1.0
+        return change * lit.to(change.dtype)
 
     def weight(self, evidence: Tensor) -> Tensor:
         """Weight of cells by their evidence, both (B, 1, h, w)."""

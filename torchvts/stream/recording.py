@@ -57,7 +57,7 @@ def _learn_unrest(pipe: DepthPipeline, images: Tensor) -> None:
     with torch.inference_mode():
         for image in images:
             frame, gradient = pipe.frame_of(image[None])
-            change = whole_cell_means((frame.image - mask.flat) * mask.per_light, cell)
+            change = mask.change(frame.image, cell)
             colours.append(change - change.mean(dim=1, keepdim=True))
             slopes.append(whole_cell_means(gradient, cell))
         seen = [colours] + [slopes] * pipe.takes_slopes

@@ -93,13 +93,15 @@ class VideoFile:
         raise OSError(f"video: {self.path}: OpenCV cannot write this kind of file here: try .avi")
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: Any) -> None:
+        whole = False
         try:
             self._encoder.finish()
+            whole = True
         finally:
             if self._writer is not None:
                 self._writer.release()
             there = count_packets(self._temporary) if kind is None and self._count else 0
-            if there and (self.keep or there == self._count):
+            if there and (self.keep or (whole and there == self._count)):
                 self._file.__exit__(None, None, None)
             else:
                 self._file.__exit__(Exception, Exception(), None)  # removes the temporary file

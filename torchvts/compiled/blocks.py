@@ -369,20 +369,22 @@ def contact_values(block: nn.Module, size: tuple[int, int]) -> Values:
     assert isinstance(block, ContactFromDepth)
     cell = min(block.cell, *size)
     pitch = cell * block.mm_per_pixel
-    weights = gaussian_weights(pressure_module.BLUR_MM / pitch)
+    weights = gaussian_weights(block.blur_mm / pitch)
     return {
         "contact_cell": cell,
         "contact_blur": _floats(weights),
         "contact_taps": len(weights),
-        "contact_decay": (pressure_module.CONTACT_DECAY_MM / pitch) ** 2,
+        "curvature_scale": 1.0 / pitch**2,
         "contact_step": max(1, min(size[0] // cell, size[1] // cell) // pressure_module.SAMPLES),
+        "contact_blur_mm": block.blur_mm,
+        "contact_decay": block.decay_mm,
+        "pull": block.pull,
+        "pulling": block.pulling,
+        "least_deep": block.least_deep,
         "share": block.share,
         "large": block.large,
         "deep": block.deep,
-        "least_deep": pressure_module.LEAST_DEEP,
         "rim_reach": pressure_module.rim_reach(block.rim_mm, pitch),
         "fall": block.fall,
-        "pulled": block.pulled,
-        "pulling": block.pulling,
         "least_depth": block.least_depth,
     }

@@ -148,6 +148,13 @@ class GradientFromNormal(nn.Module):
         return gradient_from_normal(normal, self.max_slope)
 
 
+def laplacian(depth: Tensor) -> Tensor:
+    """Five-point Laplacian of depth (B, 1, H, W), of unit pitch, with a free border. Scripts."""
+    padded = nn.functional.pad(depth, [1, 1, 1, 1], mode="replicate")
+    beside = padded[..., 1:-1, 2:] + padded[..., 1:-1, :-2] + padded[..., 2:, 1:-1] + padded[..., :-2, 1:-1]
+    return beside - 4.0 * depth
+
+
 def depth_to_points(depth_mm: Tensor, mm_per_pixel: float, contact: Tensor | None = None) -> Tensor:
     """Points of one depth map in the right-handed frame: x right, **y up**, z towards the camera.
 

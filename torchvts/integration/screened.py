@@ -8,9 +8,10 @@ cosine transform; a map of weights is solved by conjugate gradients with that tr
 import warnings
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ..core.checks import check_batch, check_same_count, check_same_size, reads_freely
+from ..core.geometry import laplacian
 from .transforms import inverse_or_zero, solve_by_fft
 
 MAX_ITERATIONS = 1000
@@ -90,13 +91,6 @@ def _check_settled(moves: Tensor, steps: int) -> None:
             "expected smaller weights, or float64",
             stacklevel=2,
         )
-
-
-def laplacian(depth: Tensor) -> Tensor:
-    """Five-point Laplacian with a free border, (B, 1, H, W), of unit pitch. Scripts."""
-    padded = nn.functional.pad(depth, [1, 1, 1, 1], mode="replicate")
-    beside = padded[..., 1:-1, 2:] + padded[..., 1:-1, :-2] + padded[..., 2:, 1:-1] + padded[..., :-2, 1:-1]
-    return beside - 4.0 * depth
 
 
 def screened(plan: list[Tensor], pull: Tensor) -> list[Tensor]:

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from ..core.cells import whole_cell_means
 from ..core.checks import check_batch, check_positive
+from ..core.geometry import laplacian
 from ..core.precision import widened
 
 CELLS = 30
@@ -93,7 +94,7 @@ class ZeroBackground(nn.Module):
         rows, columns = cosines(height, k, height, depth), cosines(width, m, width, depth)
         along_y, along_x = slopes_of_cosines(height, k, pitch_mm, depth), slopes_of_cosines(width, m, pitch_mm, depth)
         by_pressure = pressure_of_waves(k, m, (height, width), pitch_mm, self.decay_mm, depth)
-        pressure = depth - self.decay_mm**2 * laplacian(depth, pitch_mm)
+        pressure = depth - (self.decay_mm / pitch_mm) ** 2 * laplacian(depth[:, None])[:, 0]
         reach = (depth.amax(dim=(1, 2), keepdim=True) - depth.amin(dim=(1, 2), keepdim=True)).clamp_min(1e-9)
         free = weight < 0.1
         any_free = free.flatten(1).any(dim=1)
@@ -154,13 +155,6 @@ def slopes_of_cosines(count: int, terms: int, pitch_mm: float, like: Tensor) -> 
 def wave_numbers(terms: int, length: float, like: Tensor) -> Tensor:
     """Their wave numbers, radians per unit of length."""
     return math.pi / length * torch.arange(terms, dtype=like.dtype, device=like.device)
-
-
-def laplacian(depth: Tensor, pitch_mm: float) -> Tensor:
-    """Five-point Laplacian of cells (B, h, w) with a free border, per mm^2."""
-    z = nn.functional.pad(depth[:, None], [1, 1, 1, 1], mode="replicate")[:, 0]
-    around = z[:, 1:-1, 2:] + z[:, 1:-1, :-2] + z[:, 2:, 1:-1] + z[:, :-2, 1:-1]
-    return (around - 4.0 * depth) / pitch_mm**2
 
 
 def lower_quartile(values: Tensor, some: Tensor) -> Tensor:

@@ -28,30 +28,51 @@ WIDE void find_moved(const Plan *plan, const float *weight, const float *depth, 
     for (size_t k = 0; k < pixels; k++) deformed[k] = (uint8_t)(((weight[k] > 0.5f) & (fabsf(depth[k]) > shallow)) | (depth[k] > deep));
 }
 
-/* pressure_of() of pressure.py, of blurred depth (rows, columns). */
-static WIDE void pressure_of(const Plan *plan, const float *depth, int rows, int columns, float *pressure) {
-    const float decay = (float)plan->contact_decay;
+/* Five-point Laplacian of depth (rows, columns) with a free border, times `scale`. */
+static WIDE void curvature_of(const float *depth, float scale, int rows, int columns, float *curvature) {
     for (int y = 0; y < rows; y++) {
         const float *here = depth + (size_t)y * columns, *above = y ? here - columns : here, *below = y < rows - 1 ? here + columns : here;
-        float *to = pressure + (size_t)y * columns;
-        for (int x = 1; x < columns - 1; x++) to[x] = here[x] - decay * (here[x + 1] + here[x - 1] + below[x] + above[x] - 4.0f * here[x]);
+        float *to = curvature + (size_t)y * columns;
+        for (int x = 1; x < columns - 1; x++) to[x] = scale * (here[x + 1] + here[x - 1] + below[x] + above[x] - 4.0f * here[x]);
         for (int x = 0; x < columns; x += columns > 1 ? columns - 1 : 1)
-            to[x] = here[x] - decay * (here[least(x + 1, columns - 1)] + here[x ? x - 1 : 0] + below[x] + above[x] - 4.0f * here[x]);
+            to[x] = scale * (here[least(x + 1, columns - 1)] + here[x ? x - 1 : 0] + below[x] + above[x] - 4.0f * here[x]);
     }
 }
 
-/* frame_pressure() of pressure.py. some: as many floats as two times the samples. */
-static float frame_pressure(const Plan *plan, const float *depth, const float *pressure, int rows, int columns, float deepest, double share, double deep,
-                            float *some) {
+static WIDE void less_decayed(const float *restrict depth, float decay, size_t n, float *restrict curvature) {
+    for (size_t k = 0; k < n; k++) curvature[k] = depth[k] - decay * curvature[k];
+}
+
+/* A quantile of n values. some: 2 n floats, the values first. */
+static float quantile(float *some, int n, double share) { return n ? sorted(some, some + n, n)[(int64_t)((float)share * (float)(n - 1))] : 0.0f; }
+
+/* L^2 of which hollow skin does not pull, as far as that of contact. some: as many floats as two times the samples. */
+static float find_decay(const Plan *plan, const float *depth, const float *curvature, float deepest, int rows, int columns, float *some) {
     const int step = (int)plan->contact_step;
-    const float least_depth = (float)(deep > plan->least_deep ? deep : plan->least_deep) * deepest;
+    const float pull = (float)plan->pull * deepest, deep = (float)plan->least_deep * deepest, most = (float)(plan->contact_decay * plan->contact_decay);
+    const float kink = (float)(plan->contact_blur_mm * plan->contact_blur_mm);
     int n = 0;
     for (int y = step / 2; y < rows; y += step)
         for (int x = step / 2; x < columns; x += step) {
             const size_t at = (size_t)y * columns + x;
-            if (depth[at] > least_depth) some[n++] = pressure[at];
+            if (!(curvature[at] > 0.0f) || !(depth[at] > deep)) continue;
+            const float decay = (depth[at] + pull) / curvature[at] - kink;
+            some[n++] = decay < 0.0f ? 0.0f : decay < most ? decay : most;
         }
-    return n ? sorted(some, some + n, n)[(int64_t)((float)share * (float)(n - 1))] : 0.0f;
+    return quantile(some, n, plan->pulling);
+}
+
+/* The frame's pressure: a quantile of the deep skin's. some: as many floats as two times the samples. */
+static float frame_pressure(const Plan *plan, const float *depth, const float *pressure, float deepest, int rows, int columns, float *some) {
+    const int step = (int)plan->contact_step;
+    const float deep = (float)plan->deep * deepest;
+    int n = 0;
+    for (int y = step / 2; y < rows; y += step)
+        for (int x = step / 2; x < columns; x += step) {
+            const size_t at = (size_t)y * columns + x;
+            if (depth[at] > deep) some[n++] = pressure[at];
+        }
+    return quantile(some, n, plan->large);
 }
 
 /* Sums of 2 `reach` + 1 lines each `step` floats behind the last. */
@@ -88,26 +109,24 @@ static WIDE void less_needed(const float *restrict inside, const float *restrict
     }
 }
 
-/* ContactFromDepth.above(): pressure less what contact needs, in place. some: 3 images, 2 reach rows and one and reach values more. */
+/* ContactFromDepth.above(): from blurred depth and its curvature, pressure less what contact needs in place of the curvature.
+ * some: 3 images, 2 reach rows and one and reach values more. */
 static void above(const Plan *plan, const float *depth, float *pressure, int rows, int columns, float *some) {
-    const int n = rows * columns;
-    const float deepest = largest(depth, (size_t)n, 0);
-    const float large = frame_pressure(plan, depth, pressure, rows, columns, deepest, plan->large, plan->deep, some);
-    const float pulled = -frame_pressure(plan, depth, pressure, rows, columns, deepest, plan->pulling, 0.0, some);
-    if (pulled > (float)plan->pulled * large) {
-        for (int k = 0; k < n; k++) pressure[k] = depth[k] - (float)plan->least_depth * deepest;
-        return;
-    }
-    const int reach = (int)plan->rim_reach;
+    const int n = rows * columns, reach = (int)plan->rim_reach;
+    const float deepest = largest(depth, (size_t)n, 0), decay = find_decay(plan, depth, pressure, deepest, rows, columns, some);
+    const float soft = decay / (float)(plan->contact_decay * plan->contact_decay);
+    less_decayed(depth, decay, (size_t)n, pressure);
+    const float large = frame_pressure(plan, depth, pressure, deepest, rows, columns, some);
+    const float by_share = soft * (float)plan->share * large, by_depth = (float)plan->least_depth * deepest;
+    const float needed = by_share > by_depth ? by_share : by_depth, fall = soft * (float)plan->fall;
     const size_t border = (size_t)reach * columns;
-    const float needed = (float)plan->share * large;
     float *touching = some + border, *mean = touching + n + border, *inside = mean + n, *line = inside + n;
     memset(some, 0, sizeof(float) * border), memset(touching + n, 0, sizeof(float) * border);
     find_touching(pressure, needed, (size_t)n, touching);
     box_mean(some, rows, columns, reach, line, mean);
     for (int k = 0; k < n; k++) touching[k] *= pressure[k];
     box_mean(some, rows, columns, reach, line, inside);
-    less_needed(inside, mean, needed, (float)plan->fall, (size_t)n, pressure);
+    less_needed(inside, mean, needed, fall, (size_t)n, pressure);
 }
 
 static WIDE void mark(const uint8_t *restrict deformed, const float *restrict found, size_t n, uint8_t *restrict contact) {
@@ -124,8 +143,8 @@ int find_contact(const Plan *plan, const float *depth, const uint8_t *deformed, 
     if (cell > 1) cell_means(depth, width, cell, rows, columns, image, cells), depth = cells;
     const int code = blur_plane(depth, plan->contact_blur, (int)plan->contact_taps, rows, columns, blurred);
     if (code == DONE) {
-        pressure_of(plan, blurred, rows, columns, pressure);
-        above(plan, depth, pressure, rows, columns, some);
+        curvature_of(blurred, (float)plan->curvature_scale, rows, columns, pressure);
+        above(plan, blurred, pressure, rows, columns, some);
         if (cell > 1) to_pixels(pressure, rows, columns, cell, height, width, some, image);
         mark(deformed, cell > 1 ? image : pressure, pixels, contact);
     }

@@ -555,6 +555,14 @@ def test_two_wrong_diameters_among_seven_are_left_out(good, rest):
     assert [row["used"] for row in calibration.report["presses"]] == [True] * 5 + [False] * 2
 
 
+@pytest.mark.parametrize("sizes, warned", [((6.0, 6.0), 0), ((4.0, 9.0), 1)])
+def test_two_sizes_exchanged_are_warned_of(rest, sizes, warned):
+    """Then half of the presses contradict the other half, and none of them stands out."""
+    presses = [dataclasses.replace(p, ball_diameter_mm=sizes[k % 2]) for k, p in enumerate(take_presses(count=10))]
+    _, said = calibrate(rest, GIVEN, presses)
+    assert sum("by each other the balls seem" in text for text in said) == warned, said
+
+
 @pytest.mark.parametrize("ball_mm", [500.0, pytest.param(60.0, marks=pytest.mark.long)])
 def test_an_absurd_diameter_is_left_out_like_any_other(good, rest, ball_mm):
     calibration, warned = calibrate(rest, GIVEN, [*good, dataclasses.replace(good[0], ball_diameter_mm=ball_mm, name="absurd")])

@@ -4,12 +4,14 @@ import dataclasses
 import importlib
 import subprocess
 import sys
+import warnings
 
 import pytest
 import torch
 
 import torchvts as vts
 from torchvts.cli import COMMANDS, main
+from torchvts.cli.calibrate import warn_of_a_small_place
 from torchvts.cli.summary import SHOWN, expected, left_out
 
 
@@ -54,6 +56,7 @@ def test_the_module_is_the_command_and_loads_no_more_than_it_needs():
         (["reconstruct", "a.png", "--out", "c"], "name both, or --sensor to calibrate"),
         (["calibrate", "a.png", "--sensor", "gelsight-mini", "--out", "a.safetensors"], "did you mean 'gelsight_mini'?"),
         (["calibrate", "a.png"], "expected either --sensor or --mm-per-pixel"),
+        (["calibrate", "a.png", "--sensor", "digit", "--gamma", "2.2"], "--gamma: expected it beside --mm-per-pixel"),
         (["calibrate", "a.png", "--sensor", "digit", "--out", "unit.npz"], "expected a name ending in .safetensors"),
         (["stream", "--source", "0"], "expected either --sensor or --calibration"),
         (["evaluate"], "the following arguments are required: FOLDER"),
@@ -171,3 +174,12 @@ def test_a_video_or_a_folder_in_the_wrong_place_names_the_way_that_works(rig, tm
     vts.write_image(tmp_path / "background.png", rig[2])
     with pytest.raises(FileNotFoundError, match=r"name the images: torchvts calibrate .*background\.png --press"):
         vts.read_presses(tmp_path)
+
+
+@pytest.mark.parametrize("roi_px, warned", [((0, 0, 160, 120), 1), ((40, 30, 240, 180), 0)])
+def test_a_place_of_a_smaller_picture_is_warned_of(roi_px, warned):
+    sensor = vts.Sensor("rig", 120, 160, 0.1, roi_px=roi_px, raw_size_px=((240, 320),))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        warn_of_a_small_place(sensor)
+    assert sum("was its place measured in a smaller picture?" in str(one.message) for one in caught) == warned

@@ -39,17 +39,19 @@ def test_reconstruct_writes_depth_pictures_and_table(run_script, images, calibra
         assert (read_depth_png(tmp_path / f"{k}_depth.png") - scene.depth_mm).abs().max() < 0.25 * 0.25
 
 
-def test_reconstruct_names_what_is_wrong_with_the_first_frame(run_script, images, calibration, tmp_path):
+def test_reconstruct_names_what_is_wrong_with_frames(run_script, images, calibration, tmp_path):
     folder, _ = images
     options = ("--no-pictures", "--format", "none")
     valid = run_script("reconstruct", calibration, folder / "presses", "--out", tmp_path / "valid", *options)
     image = vts.read_image(folder / "presses" / "0.png")
     vts.write_image(make_folder(tmp_path / "in" / "a") / "good.png", image)
-    vts.write_image(make_folder(tmp_path / "in" / "b") / "dimmed.png", image * torch.tensor([1.0, 0.85, 1.0])[:, None, None])
+    dimmed = image * torch.tensor([1.0, 0.85, 1.0])[:, None, None]
+    for name in ("dimmed", "later"):
+        vts.write_image(make_folder(tmp_path / "in" / "b") / f"{name}.png", dimmed)
     dimmed = run_script("reconstruct", calibration, tmp_path / "in", "--out", tmp_path / "out", *options)
-    assert valid.returncode == dimmed.returncode == 0, valid.stderr + dimmed.stderr
+    assert (valid.returncode, dimmed.returncode) == (0, 1), valid.stderr + dimmed.stderr
     assert ": fault: " not in valid.stdout and dimmed.stdout.count(": fault: ") == 1
-    assert "b/dimmed.png: fault: green channel 15" in dimmed.stdout
+    assert "b/dimmed.png and 1 more: fault: green channel 15" in dimmed.stdout
 
 
 @pytest.mark.long

@@ -42,6 +42,8 @@ def as_text(**changes):
         (as_text(mm_per_pixel=0.0000634), r"mm_per_pixel: expected at least 0.0005 mm, got 6.34e-05: is it in m\?"),
         (as_text(mm_per_pixel=63.4), r"key mm_per_pixel: expected a number in \(0, 10\], got 63.4"),
         (as_text(mm_per_pixel="0.1 mm"), "key mm_per_pixel: expected a number, got str"),
+        (as_text(mm_per_pixel="0,1"), "key mm_per_pixel: expected a number, got str '0,1': write a decimal point"),
+        (as_text(corners_px=[[9, 0], [9, 30], [0, 30], [0, 0]]), "corners_px: expected a gel about 1.33 times as wide as high"),
         (as_text(gamma=0.01), r"key gamma: expected a number in \[0.1, 10\], got 0.01"),
         (as_text(blur_px=100), r"key blur_px: expected a number in \[0, 6\], got 100"),
         (as_text(name=7), "key name: expected a text, got 7"),
@@ -145,10 +147,12 @@ def test_a_digit_runs_on_frames_as_its_camera_gives_them():
         assert (image - expected).abs().max() < (1e-7 if scale == 1 else 0.3)  # antialiasing looks beyond two pixels
         assert torch.equal(sensor.rectify(image), image)
     with pytest.raises(
-        ValueError, match=r"got 120 x 160: its camera lies: .* turn_deg: 90, and raw_size_px: \[\[120, 160\]\] alone"
+        ValueError, match=r"got 120 x 160: .* a turned camera: it needs turn_deg: 90, and raw_size_px: \[\[120, 160\]\] alone"
     ):
         sensor.rectify(torch.zeros(1, 3, 120, 160))
-    with pytest.raises(ValueError, match=r"got 32 x 24: its camera lies: the sensor file needs turn_deg: 90 \(or 270\)"):
+    with pytest.raises(
+        ValueError, match=r"got 32 x 24: height and width exchanged\? or a turned camera: it needs turn_deg: 90 \(or 270\)"
+    ):
         vts.Sensor(**GOOD).rectify(torch.zeros(1, 3, 32, 24))
 
 
@@ -241,7 +245,7 @@ def test_depth_in_a_corner_behind_a_lens():
     "options, size, message",
     [
         ({"roi_px": (100, 0, 80, 60)}, (120, 160), r"frame: 120 x 160 does not contain roi_px \(100, 0, 80, 60\) of sensor 'rig'"),
-        ({"corners_px": ((0, 0), (300, 0), (300, 90), (0, 90))}, (120, 160), "frame: 120 x 160 does not contain corners_px"),
+        ({"corners_px": ((0, 0), (300, 0), (300, 210), (0, 210))}, (120, 160), "frame: 120 x 160 does not contain corners_px"),
         (
             {},
             (48, 64),

@@ -154,6 +154,8 @@ def from_presses(given: Given, lights: Candidate, prior: Candidate, touches: Can
         raise ValueError(f"{sizes}; force=True (--force) goes on all the same")
     from_prior = start is prior and not dropped
     warnings = [text for text in (dropped, sizes) if text] + objections.to_contacts(contacts)
+    if not sizes and not from_prior:
+        warnings += objections.to_diameters_by_others(used(contacts))
     if from_prior and not sizes:
         warnings += objections.to_diameters_by_prior(used(contacts))
     report: Report = {"model": "response", "source": "presses", "held_out_deg": fit.error_deg}

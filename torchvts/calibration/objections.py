@@ -35,6 +35,10 @@ of a DIGIT and the prior of another. From :data:`USUAL_GAIN` on there is a warni
 USUAL_GAIN = 1.15
 """The prior's slopes divided by those of the balls are within this factor: 0.93 to 1.00 on a GelSight Mini."""
 
+MANY, DISAGREEING = 6, 1.8
+"""From so many presses, and so many standard deviations of their gains about the median (RMS), presses disagree with each other:
+sets of right presses of ten real and eight drawn sensors have at most 1.64, with two balls exchanged or doubled 1.6 to 4.3."""
+
 SAME_TYPE = 0.27
 """Median difference of a background from the prior's pattern, logarithm of the light, up to which a unit is of the prior's type: it
 is 0.03 to 0.08 on three GelSight Minis and 0.06 and 0.26 on two DIGITs, at most 0.24 with the frame shifted by 8 %, and at least
@@ -88,6 +92,22 @@ def to_diameters_by_prior(used: Sequence[Contact]) -> list[str]:
     return [
         f"presses: by the sensor's prior the balls seem {1.0 / gain:.2f} times as wide as given: wrong diameter or pitch? "
         "if they are right, this unit differs from the prior's, and more presses will show it"
+    ]
+
+
+def to_diameters_by_others(used: Sequence[Contact]) -> list[str]:
+    """Presses that contradict each other all over, so that none stands out: sizes exchanged, or one size given for two."""
+    known = [contact.metrics for contact in used if "gain_std" in contact.metrics]
+    if len(known) < MANY:
+        return []
+    logs = [math.log(max(metrics["gain"], 1e-3)) for metrics in known]
+    middle = statistics.median(logs)
+    apart = math.sqrt(statistics.mean(((log - middle) / one["gain_std"]) ** 2 for log, one in zip(logs, known, strict=True)))
+    if apart < DISAGREEING:
+        return []
+    return [
+        f"presses: by each other the balls seem {math.exp(-max(logs)):.2f} to {math.exp(-min(logs)):.2f} times as wide as given: "
+        "are diameters exchanged, or one given for two sizes? --candidates prints what each press says"
     ]
 
 

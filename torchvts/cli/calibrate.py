@@ -11,6 +11,7 @@ examples:
 
 import argparse
 import dataclasses
+import warnings
 from pathlib import Path
 
 import torch
@@ -22,6 +23,9 @@ from ..stream import read_background, read_press_images
 from .options import add_background_frames, add_press, add_sensor, cut_frames, load_sensor
 from .parser import UsageError
 from .summary import calibrated, print_calibration
+
+SMALL_PLACE = 0.3
+"""Share of the camera's frame: gels take 0.42 and more; places measured in a preview of half the size at most a quarter."""
 
 USAGE = "SOURCE... (--sensor NAME | --mm-per-pixel MM) [--press IMAGE MM]... [--out FILE]"
 
@@ -50,6 +54,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Calibrate, write the file, and print what was chosen."""
     if (arguments.sensor is None) == (arguments.mm_per_pixel is None):
         raise UsageError("expected either --sensor or --mm-per-pixel")
+    if arguments.sensor is not None and arguments.gamma is not None:
+        raise UsageError("--gamma: expected it beside --mm-per-pixel, --sensor has the file's: write gamma into the sensor file")
     check_target_of(arguments.out)
     image, sensor, presses = read_given(arguments)
     presses += read_press_images(arguments.press, sensor)
@@ -77,6 +83,7 @@ def read_given(arguments: argparse.Namespace) -> tuple[torch.Tensor, Sensor, lis
         sensor = Sensor("own sensor", *size_of(first), arguments.mm_per_pixel, gamma=arguments.gamma)
     if sensor.cuts_a_place and not sensor.raw_size_px:
         sensor = dataclasses.replace(sensor, raw_size_px=(size_of(first),))
+        warn_of_a_small_place(sensor)
     sensor = sensor.without_prior() if arguments.no_prior else sensor
     if not (len(arguments.source) == 1 and first.is_dir()):
         return read_background(arguments.source, sensor, arguments.background_frames), sensor, []
@@ -89,6 +96,18 @@ def read_given(arguments: argparse.Namespace) -> tuple[torch.Tensor, Sensor, lis
         raise UsageError(f"--use-labels: the images of {first} are raw frames, labels are for cropped ones: leave --use-labels out")
     image, presses = cut_frames(image, presses, sensor)
     return image, sensor, presses
+
+
+def warn_of_a_small_place(sensor: Sensor) -> None:
+    """Say where the gel takes so little of the frame that its place was perhaps measured in a smaller picture."""
+    ((height, width),) = sensor.raw_size_px
+    name, (left, top, wide, high) = ("roi_px", sensor.roi_px) if sensor.roi_px is not None else ("corners_px", (0, 0, 0, 0))
+    corners = sensor.corners_px or ((left, top), (left + wide, top), (left + wide, top + high), (left, top + high))
+    following = (*corners[1:], corners[0])
+    area = 0.5 * abs(sum(x * v - u * y for (x, y), (u, v) in zip(corners, following, strict=True)))
+    if (share := area / (height * width)) < SMALL_PLACE:
+        text = f"{name}: the gel takes {share:.0%} of frames of {height} x {width}: was its place measured in a smaller picture?"
+        warnings.warn(text, UserWarning, stacklevel=1)
 
 
 def size_of(source: Path) -> tuple[int, int]:

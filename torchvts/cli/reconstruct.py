@@ -43,8 +43,8 @@ PASSED = (
 )  # fmt: skip
 """Options that :func:`reconstruct_dataset` has under the same names."""
 
-FOLDERS = 20
-"""Of so many folders the first frames are diagnosed: each may be of another camera."""
+DIAGNOSED = 20
+"""So many images are diagnosed; of more, the first of each of so many folders, since each may be of another camera."""
 
 USAGE = "CALIBRATION INPUT... --out FOLDER"
 
@@ -86,9 +86,10 @@ def run(arguments: argparse.Namespace) -> int:
         print(NOT_METRIC)
     if arguments.pictures is None and report.rows > PICTURES_UP_TO:
         print(f"no pictures of more than {PICTURES_UP_TO} frames: --pictures --overwrite draws all, --every N fewer")
-    for name, finding in diagnose_first(calibration, inputs, {name for name, _ in report.failed}):
+    findings = diagnose_some(calibration, inputs, {name for name, _ in report.failed})
+    for name, finding in findings:
         print(f"{name}: {finding}")
-    return 1 if report.failed else 0
+    return 1 if report.failed or any(finding.severity == "fault" for _, finding in findings) else 0
 
 
 def split_files(arguments: argparse.Namespace) -> tuple[Path | None, list[Path]]:
@@ -145,19 +146,22 @@ def print_report(report: Report, out: Path, taught: TaughtRange | None) -> None:
     print(f"wrote {frames} to {out}{before}; table in frames.csv, units in summary.json")
 
 
-def diagnose_first(calibration: Path, inputs: list[Path], reported: set[str]) -> list[tuple[str, Finding]]:
-    """What is wrong with the first frame of each folder, such as that it is from another camera; frames in ``reported`` are not."""
+def diagnose_some(calibration: Path, inputs: list[Path], reported: set[str]) -> list[tuple[str, Finding]]:
+    """What is wrong with :data:`DIAGNOSED` images, and the first frame of each video; frames in ``reported`` are not.
+
+    A finding is given once, with its first frame and how many more have it.
+    """
     unit = load_calibration(calibration)
-    first: dict[Path, tuple[str, Path]] = {}
-    for item in list_items(tuple(inputs) if len(inputs) > 1 else inputs[0]):
-        first.setdefault(item.file.parent, (item.frame_name(0 if item.is_video else -1), item.file))
-        if len(first) == FOLDERS:
-            break
-    findings = []
-    for name, file in first.values():
+    items = list(list_items(tuple(inputs) if len(inputs) > 1 else inputs[0]))
+    if len(items) > DIAGNOSED:
+        items = list({item.file.parent: item for item in reversed(items)}.values())[::-1][:DIAGNOSED]
+    found: dict[str, list[tuple[str, Finding]]] = {}
+    for item in items:
+        name = item.frame_name(0 if item.is_video else -1)
         with contextlib.suppress(OSError, ValueError, StopIteration):
             if name not in reported:
-                _, image = next(iter(read_frames(file)))
-                found = diagnose(None, unit.sensor.rectify(image[None])[0], unit)
-                findings += [(name, finding) for finding in found if finding.severity != "note"]
-    return findings
+                _, image = next(iter(read_frames(item.file)))
+                for finding in diagnose(None, unit.sensor.rectify(image[None])[0], unit):
+                    if finding.severity != "note":
+                        found.setdefault(finding.name, []).append((name, finding))
+    return [(same[0][0] + (f" and {len(same) - 1} more" if len(same) > 1 else ""), same[0][1]) for same in found.values()]

@@ -58,11 +58,11 @@ def print_calibration(calibration: Calibration, candidates: bool = False) -> Non
     if saturated > SATURATED_SHARE:
         print(f"saturated: {saturated:.0%} of the background: depth is worse there; reduce the exposure and calibrate again")
     if report["source"] == "presses" and "prior_deg" not in report:
-        print("scale: that of mm_per_pixel and of the diameters; sizes that are all too small show in five deep presses, no others")
+        print("scale: that of mm_per_pixel and of the diameters given; nothing else checks it, so measure both twice")
     alone = [row["name"] for row in report.get("presses", []) if row["used"] and row.get("gain_std", 0.0) > ALONE]
     if alone:
         named = ", ".join(alone[:SHOWN]) + (f" and {len(alone) - SHOWN} more" if len(alone) > SHOWN else "")
-        print(f"not checked: diameters of {named}: no other press lies near enough")
+        print(f"not checked: diameters of {named}: no other press is near: press between them, or measure these balls again")
     for line in left_out("press", [(row["name"], row.get("reason", "")) for row in report.get("presses", []) if not row["used"]]):
         print(line)
     if candidates:

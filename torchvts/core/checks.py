@@ -347,12 +347,18 @@ _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 def check_positive(name: str, value: object, most: float = math.inf) -> float:
     """Return ``value`` as a float, or raise if it is no finite number in (0, ``most``]."""
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
-        raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
+        raise TypeError(f"{name}: expected a number, got {_kind_and_comma(value)}")
     number = _float(value)
     if not math.isfinite(number) or number <= 0 or number > most:
         bound = f"in (0, {most:g}]" if math.isfinite(most) else "above 0 and finite"
         raise ValueError(f"{name}: expected a number {bound}, got {brief(value)}")
     return number
+
+
+def _kind_and_comma(value: object) -> str:
+    """The type of a value; of text with a decimal comma also the text and what to write."""
+    kind = type(value).__name__
+    return f"{kind} {brief(value)}: write a decimal point" if isinstance(value, str) and "," in value else kind
 
 
 def check_camera_height(value: object) -> float:
@@ -376,7 +382,7 @@ def _float(value: numbers.Real) -> float:
 def check_least(name: str, value: object, least: float = 0.0, most: float = math.inf) -> float:
     """Return ``value`` as a float, or raise if it is no finite number in [``least``, ``most``]."""
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
-        raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
+        raise TypeError(f"{name}: expected a number, got {_kind_and_comma(value)}")
     number = _float(value)
     if not math.isfinite(number) or not least <= number <= most:
         bound = f"of at least {least:g}" if math.isfinite(least) else "that is finite"

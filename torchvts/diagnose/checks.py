@@ -330,7 +330,8 @@ CHECKS = (
           lambda figures: "note" if figures["value"] < 0.1 else "fault" if figures["inside"] > 0.3 else "warning", above=0.02),
     # the light and the skin
     Check("no_free_skin", _rough, "even the least changed skin seems to have slopes of {value:.0f} degrees, and the pipeline "
-          "{read}: contact covers everything, or this is another unit, or its light has changed; leave skin free, or recalibrate",
+          "{read}: contact covers everything, or this is another unit, or its light has changed (an LED off?); leave skin free, or "
+          "recalibrate",
           "fault", above=ROUGH_FREE_DEG, last=True),
     Check("other_unit", _other_unit, "the skin has not the fine pattern that it had at calibration: another unit, or its skin was "
           "changed; use its own calibration, or calibrate again", above=0.945),
@@ -338,7 +339,7 @@ CHECKS = (
     Check("new_spots", _spots, "{value:.0f} spots that were not there at calibration ({share:.1%} of the image{dead}): clean the "
           "skin, or recalibrate", lambda figures: "warning" if figures["share"] > 0.001 else "note"),
     Check("skin_changed", _wear, "the skin's brightness has changed by {value:.1%} (RMS), unevenly and nearly equally "
-          "in all channels: worn, stained or dirty; clean it, or recalibrate", above=0.0),
+          "in all channels: worn, stained or dirty, or the camera has moved; clean it, or recalibrate", above=0.0),
     Check("blurred", _texture_lost, "the image is blurred or moved: {value:.0%} of the skin's fine texture is lost; focus, clean "
           "the lens, mount the camera firmly", above=0.6),
     Check("specular", lambda e: _length(e, 1.0), "{value:.0%} of the contact is brighter than any matt slope: the skin is "

@@ -22,7 +22,8 @@ WORDS = {
     "ambient": ("ambient_light", "ambient light of {level:.3f}, not from the LEDs, is added everywhere: shade the sensor, or "
                 "recalibrate", "level"),
     "black": ("black_level", "a black level of {black:.3f} is subtracted from every value: switch it off in the camera", "level"),
-    "gamma": ("gamma", "values follow another power of light, as if gamma in the sensor file should be {gamma:.2f}: set it",
+    "gamma": ("gamma", "values follow another power of light: gamma in the sensor file should be {gamma:.2f}; or light from "
+              "outside is added: shade the sensor first",
               "power"),
     "light_moved": ("light_moved", "the light of the {color} LED is off by {effect:.1%}, unevenly: it has moved, or fades; fix "
                     "it and recalibrate", "effect"),

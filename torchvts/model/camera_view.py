@@ -1,5 +1,6 @@
 """How the sensor's image lies in the frames of its camera: bent by a lens, turned, mirrored, cut by a region, corners or a crop."""
 
+import math
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -77,6 +78,12 @@ def check_corners(value: object) -> Corners:
             f"bottom left, got {value!r}"
         )
     return corners
+
+
+def sides_of(corners: Corners) -> tuple[float, float]:
+    """Mean length of the sides along x, and along y, pixels."""
+    top, right, bottom, left = (math.dist(corners[k], corners[(k + 1) % 4]) for k in range(4))
+    return 0.5 * (top + bottom), 0.5 * (right + left)
 
 
 def check_raw_sizes(value: object) -> tuple[tuple[int, int], ...]:

@@ -29,12 +29,15 @@ from ..core.files import read_image, write_atomically
 from ..core.geometry import check_rigid
 from ..core.spelling import suggest
 from ..core.strict_yaml import read_yaml
-from .camera_view import CameraView, check_corners, check_lens, check_raw_sizes
+from .camera_view import CameraView, check_corners, check_lens, check_raw_sizes, sides_of
 from .gs_sdk_sensor import is_gs_sdk_sensor, values_from_gs_sdk
 from .response_field import SensorPrior
 
 LEAST_PITCH_MM = 5e-4
 """Smallest pixel pitch, mm: 0.5 um, the resolution of light. Sensors have 0.01 to 0.1; one in m is below."""
+
+MOST_OBLIQUE = 1.5
+"""Aspect of the corners over that of the sensor: 1.1 on a GelSight Wedge; of 4:3 it is 1.8 where they start at the next corner."""
 
 MOST_STRETCHED = 0.02
 """Difference of aspects, logarithm, up to which frames are resized: shipped sensors have 0.002, for whole pixels."""
@@ -161,6 +164,13 @@ class Sensor:
         taken = [("roi_px", self.roi_px[2:], "a region")] if self.roi_px is not None else []
         if not self.cuts_a_place:
             taken += [("raw_size_px", size if self.turn_deg % 180 else size[::-1], "frames") for size in self.raw_size_px]
+        if self.corners_px is not None:
+            across, down = sides_of(self.corners_px)
+            if abs(math.log(across / down * self.height / self.width)) > math.log(MOST_OBLIQUE):
+                raise ValueError(
+                    f"corners_px: expected a gel about {self.width / self.height:.2f} times as wide as high, as width x height "
+                    f"{self.width} x {self.height}, got {across:.0f} x {down:.0f}: do they start at the top left, clockwise?"
+                )
         for name, (across, down), what in taken:
             aspect, own = across / down, self.width / self.height
             if abs(math.log(aspect / own)) > MOST_STRETCHED:
@@ -281,7 +291,7 @@ class Sensor:
                 cause = f"frames as the camera gives them? then the sensor file needs [{height}, {width}] in raw_size_px, too"
         elif abs(height / width / own - 1.0) <= 0.01:
             turn = f"turn_deg: {self.turn_deg}" if self.turn_deg % 180 else "turn_deg: 90 (or 270)"
-            cause = f"its camera lies: the sensor file needs {turn}, and raw_size_px: [[{height}, {width}]] alone"
+            cause = f"height and width exchanged? or a turned camera: it needs {turn}, and raw_size_px: [[{height}, {width}]] alone"
         return (
             f"frame: expected {self.height} x {self.width}{raw and f', or raw frames of {raw},'} for sensor '{self.name}', "
             f"got {height} x {width}: {cause}"

@@ -64,6 +64,11 @@ def to_scale(report: Report) -> str:
     """
     if report.get("objection"):
         return report["objection"]
+    doubt = _doubt_in_lights(report)
+    return doubt and f"{doubt}: calibrate with presses of a ball"
+
+
+def _doubt_in_lights(report: Report) -> str:
     if report["source"] == "stand_in":
         return "the positions of the sensor file's lights do not fit the background"
     if report.get("standing_out", 0.0) > STANDING_OUT:

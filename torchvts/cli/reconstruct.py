@@ -17,6 +17,8 @@ import csv
 import os
 from pathlib import Path
 
+from tqdm import tqdm
+
 from ..core.files import VIDEO_SUFFIXES, make_folder, read_frames
 from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, Report, list_items, reconstruct_dataset
 from ..diagnose import Finding, diagnose
@@ -83,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
     unit = load_calibration(calibration)
     print_report(report, arguments.out, None if arguments.network or unit.response is None else unit.response.taught)
     if not unit.metric:
-        print(NOT_METRIC)
+        print(f"{NOT_METRIC}: {unit.report['objection']}")
     if arguments.pictures is None and report.rows > PICTURES_UP_TO:
         print(f"no pictures of more than {PICTURES_UP_TO} frames: --pictures --overwrite draws all, --every N fewer")
     findings = diagnose_some(calibration, inputs, {name for name, _ in report.failed})
@@ -156,7 +158,7 @@ def diagnose_some(calibration: Path, inputs: list[Path], reported: set[str]) -> 
     if len(items) > DIAGNOSED:
         items = list({item.file.parent: item for item in reversed(items)}.values())[::-1][:DIAGNOSED]
     found: dict[str, list[tuple[str, Finding]]] = {}
-    for item in items:
+    for item in tqdm(items, desc="diagnosing", leave=False, disable=None):
         name = item.frame_name(0 if item.is_video else -1)
         with contextlib.suppress(OSError, ValueError, StopIteration):
             if name not in reported:

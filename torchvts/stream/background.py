@@ -36,7 +36,7 @@ BLOCKS = 4.0 / 255.0
 ROUGH_DEG = 3.3
 """Slopes for which a prior takes the structure of an image; more is a contact."""
 
-NOT_METRIC = "depth is NOT METRIC: calibrate with presses of a ball"
+NOT_METRIC = "depth is NOT METRIC"
 """What a stream says of a calibration whose scale is not known."""
 
 

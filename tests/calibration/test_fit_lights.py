@@ -236,14 +236,14 @@ def test_contact_in_the_background_is_noticed(low_rig, small_sensor, press_mm, c
         calibration = vts.calibrate(image, small_sensor)
     calibration.save(tmp_path / "unit.safetensors")
     kept = vts.Calibration.load(tmp_path / "unit.safetensors")
-    assert not kept.metric and kept.report["objection"] .startswith("the background may hold a contact")
+    assert not kept.metric and kept.report["objection"].startswith("the background may hold a contact")
 
 
 def test_lights_that_did_not_converge_are_not_metric(small_background, small_sensor, monkeypatch):
     monkeypatch.setattr(by_lights, "fit_lights", functools.partial(by_lights.fit_lights, max_steps=3))
     with pytest.warns(vts.CalibrationWarning, match="stopped at 3 steps"):
         calibration = vts.calibrate(small_background, small_sensor)
-    assert not calibration.metric and calibration.report["objection"] .startswith("the fit of the lights did not converge")
+    assert not calibration.metric and calibration.report["objection"].startswith("the fit of the lights did not converge")
 
 
 def test_saturated_spots_under_low_lights_are_not_taken_for_contact(ring, small_sensor):

@@ -55,7 +55,7 @@ static float find_decay(const Plan *plan, const float *depth, const float *curva
     for (int y = step / 2; y < rows; y += step)
         for (int x = step / 2; x < columns; x += step) {
             const size_t at = (size_t)y * columns + x;
-            if (!(curvature[at] > 0.0f) || !(depth[at] > deep)) continue;
+            if (!(curvature[at] * most > deep) || !(depth[at] > deep)) continue;
             const float decay = (depth[at] + pull) / curvature[at] - kink;
             some[n++] = decay < 0.0f ? 0.0f : decay < most ? decay : most;
         }

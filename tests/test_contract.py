@@ -205,7 +205,7 @@ def test_items_of_a_batch_are_independent(name):
 @every_block
 def test_the_dtype_is_kept_and_single_precision_follows_double_precision(name):
     (single, example), (double, exact) = build(name), build(name, torch.float64)
-    tolerance = 1e-3 if name in IN_PYTHON else 2e-4  # their solves end at a residual of 1e-3
+    tolerance = 2e-3 if name in IN_PYTHON else 2e-4  # their solves end at a residual of 1e-3; it depends on the processor
     for block, given in ((single, example), (double, exact)):
         assert {tensor.dtype for tensor in outputs(block(given))} <= {given.dtype, torch.bool}
     for left, right in zip(outputs(single(example)), outputs(double(exact)), strict=True):

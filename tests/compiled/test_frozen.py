@@ -249,7 +249,7 @@ SETTINGS = {
     "solve.zero.smooth_mm": 0.8, "solve.zero.stiff": 3.0, "solve.zero.pit": 0.0, "solve.zero.pit_share": 0.2,
     "contact.share": 0.6, "contact.large": 0.5, "contact.deep": 0.5, "contact.rim_mm": 1.0,
     "contact.fall": 0.2, "contact.pull": 0.01, "contact.pulling": 0.2, "contact.least_depth": 0.3, "contact.cell": 3,
-    "contact.least_deep": 0.1, "contact.decay_mm": 0.3, "contact.blur_mm": 0.2,
+    "contact.least_deep": 0.1, "contact.decay_mm": 0.3, "contact.blur_mm": 0.2, "contact.kink": 0.5, "contact.by_frame": False,
     "refine.policy.tolerance_px": 0.3, "refine.policy.max_passes": 2, "refine.policy.refine_threshold_px": 3.0,
     "solve.gradient.max_slope": 0.2, "normals.shadowed.brightness_noises": 30.0, "normals.samples": 100,
     "compensate.clean.0.std_px": 0.0, "compensate.clean.0.weights": [0.25, 0.5, 0.25],

@@ -83,6 +83,8 @@ METADATA = {
     "another sensor": (lambda m: m["sensor"].update(height=48), r"expected \(3, 48, 32\) floats, got \(3, 24, 32\)"),
     "another pitch": (lambda m: m["sensor"].update(mm_per_pixel=0.1), "does not fit the lights in the same file"),
     "unknown key of the sensor": (lambda m: m["sensor"].update(colour=1), "key 'colour': unknown"),
+    "a share above 1": (lambda m: m.update(contact_share=1.5), "contact_share: expected .*1.5: damaged"),
+    "a length in um": (lambda m: m.update(contact_decay_mm=450.0), "contact_decay_mm: expected .*450.0: damaged"),
     "no report": (lambda m: m.pop("report"), "report: expected keys and values, got NoneType"),
     "a report without a source": (lambda m: m["report"].pop("source"), "report: source: expected one of given, .*, got None"),
 }

@@ -481,9 +481,9 @@ def test_a_network_sees_no_markers(marked, tmp_path):
     assert float(pipe.frame_of((known.background * dots)[None])[1].abs().max()) < 0.05  # 0.5 where dots are seen
 
 
-def test_a_zeroed_unit_keeps_its_share_of_pressure(unit):
-    known = replace(unit[0], contact_share=0.5)
-    assert streams.background.with_background(known, known.background).contact_share == 0.5
+def test_a_zeroed_unit_keeps_what_presses_showed_of_contact(unit):
+    zeroed = streams.background.with_background(replace(unit[0], contact_share=0.5, contact_decay_mm=0.3), unit[0].background)
+    assert (zeroed.contact_share, zeroed.contact_decay_mm) == (0.5, 0.3)
 
 
 def test_first_frames_of_another_view_are_named_as_such(unit):

@@ -17,7 +17,7 @@ from .contacts import NoUsablePress, press_row, touch_row, used
 from .given_images import colourless
 from .lights import POORLY_CONSTRAINED_DEG
 from .presses import Press, Touch
-from .touching import with_contact_share
+from .touching import with_contact
 
 WELL_CONSTRAINED_DEG = 2.0
 """Point lights replace a sensor's prior only if the image constrains each of them this well."""
@@ -179,7 +179,7 @@ def from_presses(given: Given, lights: Candidate, prior: Candidate, touches: Can
         report["objection"] = sizes
     if touches.unit is not None:
         report["touches"] = touches.unit.report["touches"]
-    unit = with_contact_share(dataclasses.replace(unit, report=report), given.presses, contacts)
+    unit = with_contact(dataclasses.replace(unit, report=report), given.presses, contacts)
     return Candidate(unit, error_deg, "", tuple(warnings), (row, *fit.candidates))
 
 

@@ -1,4 +1,4 @@
-"""From which pressure an object touches a unit's skin, from presses of balls: their circles of contact are known."""
+"""How free skin of a unit decays and from which pressure an object touches it, from presses of balls: their circles are known."""
 
 import dataclasses
 import math
@@ -16,11 +16,15 @@ from ..skin import SHARE, ContactFromDepth, ContactMask, ZeroBackground, moved
 from .contacts import Contact
 from .presses import Press
 
-SHARES = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6)
+DECAYS_MM = (0.0, 0.1, 0.2, 0.3, 0.45, 0.65)
+"""Lengths that are tried; 0: no skin around the object."""
+
+SHARES = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6)
 """Shares that are tried."""
 
 TIE = 0.04
-"""Overlaps that differ by less are equal; of such shares the one nearest the usual one is taken: other shapes need it."""
+"""Overlaps that differ by less are equal. Of such lengths the longest is taken, of its shares the one nearest the usual: faint
+presses and shapes other than balls need them."""
 
 WIDER = 1.04
 """Contact radius that is found for a ball, over the true one: 1.07 to 1.10 on drawn sensors, 0.9 to 1 of labels on real ones."""
@@ -29,8 +33,8 @@ MOST_PRESSES = 8
 """Presses that are looked at, evenly chosen."""
 
 
-def with_contact_share(calibration: Calibration, presses: Sequence[Press], contacts: Sequence[Contact]) -> Calibration:
-    """The calibration with the share of pressure that gives the circles of located balls best; unchanged where no ball was located.
+def with_contact(calibration: Calibration, presses: Sequence[Press], contacts: Sequence[Contact]) -> Calibration:
+    """The calibration with L and share of contact that give the circles of located balls best; unchanged where none was located.
 
     Args:
         calibration: of the unit, by any model.
@@ -42,9 +46,19 @@ def with_contact_share(calibration: Calibration, presses: Sequence[Press], conta
     seen = [_depth_and_circle(calibration, press, contact) for press, contact in some]
     if not seen:
         return calibration
-    overlap = {share: _overlap(calibration.sensor.mm_per_pixel, share, seen) for share in SHARES}
-    as_good = [share for share in SHARES if overlap[share] > max(overlap.values()) - TIE]
-    return dataclasses.replace(calibration, contact_share=min(as_good, key=lambda share: abs(share - SHARE)))
+    pitch_mm = calibration.sensor.mm_per_pixel
+    overlap = {
+        decay_mm: {share: _overlap(pitch_mm, share, decay_mm, seen) for share in (SHARES if decay_mm else (SHARE,))}
+        for decay_mm in DECAYS_MM
+    }
+    decay_mm = max(_as_good({decay_mm: max(of_shares.values()) for decay_mm, of_shares in overlap.items()}))
+    share = min(_as_good(overlap[decay_mm]), key=lambda share: abs(share - SHARE))
+    return dataclasses.replace(calibration, contact_share=share, contact_decay_mm=decay_mm)
+
+
+def _as_good(overlap: dict[float, float]) -> list[float]:
+    """Those whose overlap equals the largest."""
+    return [value for value in overlap if overlap[value] > max(overlap.values()) - TIE]
 
 
 def _depth_and_circle(calibration: Calibration, press: Press, contact: Contact) -> tuple[Tensor, Tensor, Tensor]:
@@ -63,9 +77,9 @@ def _depth_and_circle(calibration: Calibration, press: Press, contact: Contact) 
     return depth, moved(weight, depth), (away < (contact.contact_radius_mm / WIDER) ** 2)[None, None]
 
 
-def _overlap(mm_per_pixel: float, share: float, seen: Sequence[tuple[Tensor, Tensor, Tensor]]) -> float:
+def _overlap(mm_per_pixel: float, share: float, decay_mm: float, seen: Sequence[tuple[Tensor, Tensor, Tensor]]) -> float:
     """Median intersection over union of the contact found and the circles."""
-    block = ContactFromDepth(mm_per_pixel, share)
+    block = ContactFromDepth(mm_per_pixel, share, decay_mm)
     overlaps = []
     for depth, deformed, circle in seen:
         found = block(depth, deformed)

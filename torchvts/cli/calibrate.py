@@ -101,10 +101,8 @@ def read_given(arguments: argparse.Namespace) -> tuple[torch.Tensor, Sensor, lis
 def warn_of_a_small_place(sensor: Sensor) -> None:
     """Say where the gel takes so little of the frame that its place was perhaps measured in a smaller picture."""
     ((height, width),) = sensor.raw_size_px
-    name, (left, top, wide, high) = ("roi_px", sensor.roi_px) if sensor.roi_px is not None else ("corners_px", (0, 0, 0, 0))
-    corners = sensor.corners_px or ((left, top), (left + wide, top), (left + wide, top + high), (left, top + high))
-    following = (*corners[1:], corners[0])
-    area = 0.5 * abs(sum(x * v - u * y for (x, y), (u, v) in zip(corners, following, strict=True)))
+    corners, name = sensor.place_px or (), "corners_px" if sensor.roi_px is None else "roi_px"
+    area = 0.5 * abs(sum(x * v - u * y for (x, y), (u, v) in zip(corners, (*corners[1:], *corners[:1]), strict=True)))
     if (share := area / (height * width)) < SMALL_PLACE:
         text = f"{name}: the gel takes {share:.0%} of frames of {height} x {width}: was its place measured in a smaller picture?"
         warnings.warn(text, UserWarning, stacklevel=1)

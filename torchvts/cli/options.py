@@ -69,7 +69,7 @@ def contact_of(given: Sequence[str] | None) -> ContactSettings | None:
 
     Example:
         >>> contact_of(["sigmas=6"])
-        ContactSettings(sigmas=6.0, share=None)
+        ContactSettings(sigmas=6.0, share=None, decay_mm=None)
     """
     if not given:
         return None

@@ -24,6 +24,9 @@ _Record = TypeVar("_Record")
 MOST_PIXELS = 2**26
 """An image of more pixels, 8192 x 8192, is neither read nor made."""
 
+MOST_DECAY_MM = 10.0
+"""Free skin decays within less: more is a length in um."""
+
 MOST_COUNT = 2**31 - 1
 """No count of anything here is larger; larger integers are refused before they reach an operator, which overflows."""
 
@@ -366,6 +369,11 @@ def check_camera_height(value: object) -> float:
     if isinstance(value, float) and value == math.inf:
         return value
     return check_positive("camera_height_mm", value)
+
+
+def check_decay(name: str, value: object) -> float:
+    """Return ``value`` as the length over which free skin decays, mm, or raise."""
+    return check_least(name, value, 0.0, MOST_DECAY_MM)
 
 
 def _float(value: numbers.Real) -> float:

@@ -13,6 +13,7 @@ from torch import Tensor
 from ..core.checks import (
     QUANTISATION_STD,
     brief,
+    check_decay,
     check_field,
     check_float_tensor,
     check_image,
@@ -65,6 +66,8 @@ class Calibration:
         ambient: (3,), constant linear light that the lights do not give, subtracted before the gain; None for none.
         contact_share: pressure from which an object touches, as a share of the frame's; None where no press of a ball
             shows it.
+        contact_decay_mm: length over which free skin decays for the pressure of contact, mm, found with the share; None where no
+            press of a ball shows it.
     Raises:
         TypeError: a field of another type.
         ValueError: lights, background, noise or ambient light of another shape, or not finite; a background without light; lights
@@ -81,6 +84,7 @@ class Calibration:
     markers: FillMarkers | None = None
     ambient: Tensor | None = None
     contact_share: float | None = None
+    contact_decay_mm: float | None = None
 
     def __post_init__(self) -> None:
         check_sensor("sensor", self.sensor)
@@ -94,6 +98,8 @@ class Calibration:
         check_switch("measured", self.measured)
         if self.contact_share is not None:
             check_positive("contact_share", self.contact_share, 1.0)
+        if self.contact_decay_mm is not None:
+            check_decay("contact_decay_mm", self.contact_decay_mm)
         read_report(self.report, "report")
         if self.lights is not None:
             for name, values in (("position_mm", self.lights.position_mm), ("albedo", self.lights.albedo)):
@@ -380,6 +386,7 @@ class Calibration:
             "response": None if self.response is None else self.response.to_dict(),
             "markers": None if self.markers is None else self.markers.to_dict(),
             "contact_share": self.contact_share,
+            "contact_decay_mm": self.contact_decay_mm,
         }
         tensors = {"noise_std": self.noise_std}
         if self.lights is None:
@@ -451,8 +458,8 @@ def _load_by_response(path: str | Path, tensors: dict[str, Tensor], metadata: di
     light = value.to(tensors["noise_std"].dtype) ** sensor.exponent
     if (sensor.exponent, sensor.blur_px) != (response.gamma, response.blur_px):
         raise ValueError(f"{path}: sensor and response differ in gamma or blur_px: damaged or edited")
-    share, measured, report = _load_share(path, metadata), metadata["measured"], metadata["report"]
-    return Calibration(sensor, None, light, tensors["noise_std"], measured, report, response, markers, contact_share=share)
+    noise, measured, report = tensors["noise_std"], metadata["measured"], metadata["report"]
+    return Calibration(sensor, None, light, noise, measured, report, response, markers, None, *_load_contact(path, metadata))
 
 
 def _load_by_lights(path: str | Path, tensors: dict[str, Tensor], metadata: dict[str, Any], sensor: Sensor) -> Calibration:
@@ -477,9 +484,10 @@ def _load_by_lights(path: str | Path, tensors: dict[str, Tensor], metadata: dict
         noise,
         metadata["measured"],
         metadata["report"],
-        markers=markers,
-        ambient=ambient,
-        contact_share=_load_share(path, metadata),
+        None,
+        markers,
+        ambient,
+        *_load_contact(path, metadata),
     )
     for name, derived in (("compensation", calibration.compensation), ("inverse", calibration.inverse)):
         if not torch.allclose(tensors[name], derived, rtol=1e-3, atol=1e-3 * float(derived.abs().max())):
@@ -491,11 +499,16 @@ def _load_markers(path: str | Path, metadata: dict[str, Any]) -> FillMarkers | N
     return None if metadata.get("markers") is None else FillMarkers.from_dict(metadata["markers"], f"{path}: markers")
 
 
-def _load_share(path: str | Path, metadata: dict[str, Any]) -> float | None:
-    share = metadata.get("contact_share")
-    if share is not None and not (isinstance(share, float) and 0.0 < share <= 1.0):
-        raise ValueError(f"{path}: contact_share: expected a number above 0 and at most 1, got {brief(share)}: damaged metadata")
-    return share
+def _load_contact(path: str | Path, metadata: dict[str, Any]) -> tuple[float | None, float | None]:
+    """Share and L of contact, each None where no press showed it."""
+    share, decay_mm = metadata.get("contact_share"), metadata.get("contact_decay_mm")
+    try:
+        return (
+            None if share is None else check_positive(f"{path}: contact_share", share, 1.0),
+            None if decay_mm is None else check_decay(f"{path}: contact_decay_mm", decay_mm),
+        )
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{error}: damaged metadata") from None
 
 
 def _check_tensors(path: str | Path, tensors: dict[str, Tensor], expected: dict[str, tuple[int, ...]]) -> None:

@@ -158,19 +158,14 @@ class Sensor:
         if self._moved and not (self.raw_size_px or self.cuts_a_place):
             self._set("raw_size_px", ((self.width, self.height) if self.turn_deg % 180 else (self.height, self.width),))
         self._check_aspects()
+        if self.corners_px is not None:
+            self._check_corners(self.corners_px)
 
     def _check_aspects(self) -> None:
         """Raise where images would be stretched: the pitch is the same along x and y."""
         taken = [("roi_px", self.roi_px[2:], "a region")] if self.roi_px is not None else []
         if not self.cuts_a_place:
             taken += [("raw_size_px", size if self.turn_deg % 180 else size[::-1], "frames") for size in self.raw_size_px]
-        if self.corners_px is not None:
-            across, down = sides_of(self.corners_px)
-            if abs(math.log(across / down * self.height / self.width)) > math.log(MOST_OBLIQUE):
-                raise ValueError(
-                    f"corners_px: expected a gel about {self.width / self.height:.2f} times as wide as high, as width x height "
-                    f"{self.width} x {self.height}, got {across:.0f} x {down:.0f}: do they start at the top left, clockwise?"
-                )
         for name, (across, down), what in taken:
             aspect, own = across / down, self.width / self.height
             if abs(math.log(aspect / own)) > MOST_STRETCHED:
@@ -179,6 +174,15 @@ class Sensor:
                     f"{across} x {down}, {aspect:.3f}: pixels would not be square; set it, or height and width, to the same "
                     "aspect, or give corners_px, which set the true shape"
                 )
+
+    def _check_corners(self, corners_px: tuple[tuple[float, float], ...]) -> None:
+        """Raise where corners are of another aspect than a gel seen from aside can have."""
+        across, down = sides_of(corners_px)
+        if abs(math.log(across / down * self.height / self.width)) > math.log(MOST_OBLIQUE):
+            raise ValueError(
+                f"corners_px: expected a gel about {self.width / self.height:.2f} times as wide as high, as width x height "
+                f"{self.width} x {self.height}, got {across:.0f} x {down:.0f}: do they start at the top left, clockwise?"
+            )
 
     def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)
@@ -253,7 +257,15 @@ class Sensor:
     @property
     def cuts_a_place(self) -> bool:
         """Whether the gel lies at a stated place, ``roi_px`` or ``corners_px``, of raw frames."""
-        return self.roi_px is not None or self.corners_px is not None
+        return self.place_px is not None
+
+    @property
+    def place_px(self) -> tuple[tuple[float, float], ...] | None:
+        """The gel's corners in raw frames, x and y: ``corners_px``, or those of ``roi_px``; None where neither is stated."""
+        if self.roi_px is None:
+            return self.corners_px
+        left, top, width, height = self.roi_px
+        return (left, top), (left + width, top), (left + width, top + height), (left, top + height)
 
     @property
     def _moved(self) -> bool:

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from ..core.blur import blur, gaussian_weights
 from ..core.cells import cells_to_pixels, whole_cell_means
-from ..core.checks import check_batch, check_mask, check_positive, check_record
+from ..core.checks import check_batch, check_decay, check_mask, check_positive, check_record
 from ..core.geometry import laplacian
 from ..model.calibration import Calibration, check_calibration
 from .settings import ContactSettings
@@ -19,8 +19,7 @@ BLUR_MM = 0.1
 """Blur of depth before its curvature is taken; 0.16 is as good on balls and 0.01 of IoU worse on shapes."""
 
 CONTACT_DECAY_MM = 0.45
-"""L of contact; that of zero.py is chosen by depth. With a unit's best share, IoU is the same within 0.01 in the mean over sets
-from 0.4 to 0.7: larger is better on drawn shapes (0.90 for 0.89), smaller on balls on real sensors (0.89 for 0.86)."""
+"""L of contact where no press of a ball shows it; that of zero.py is chosen by depth."""
 
 SHARE = 0.3
 """Share of the frame's pressure where no press of a ball shows it: a unit's own is 0.15 to 0.6."""
@@ -32,8 +31,7 @@ DEEP = 0.15
 """Depth of the deep skin, as a share of the deepest."""
 
 LEAST_DEEP = 0.005
-"""Skin shallower than this share of the deepest says nothing of a pressure, nor does a face that is hardly hollow: L^2 times its
-curvature is below this share."""
+"""Skin shallower than this share of the deepest says nothing of a pressure."""
 
 RIM_MM = 0.4
 """Skin just inside a rim lies within this, either way."""
@@ -46,7 +44,13 @@ PULL = 0.02
 """Skin pulls where its pressure is below minus this share of the largest depth: L of contact is longer than the skin's own."""
 
 PULLING = 0.5
-"""Share of hollow skin that may pull. IoU of balls by exact depth is 0.93 in skins of L = 0.2 and 0.3 mm, 0.98 without skin."""
+"""Share of the hollow skin's curvature that may pull."""
+
+KINK = 2.0
+"""A kink at the rim of an object without skin has L^2 of this number times that of the blur: depth is blurred as much again."""
+
+STEPS = 64
+"""L^2 of a frame is found in so many steps."""
 
 LEAST_CONTACT_DEPTH = 0.02
 """Contact is deeper than this share of the largest depth."""
@@ -61,12 +65,14 @@ class ContactFromDepth(nn.Module):
     Skin in contact follows the object; around it the skin hangs free and bears no pressure. Real skin is no thin membrane, so that
     deep free skin seems to bear some: the share belongs to the gel, and calibration finds it from presses of balls.
 
-    L is :data:`CONTACT_DECAY_MM`, or shorter where hollow skin would pull: free skin is hollow. The shares fall with L^2: without
-    skin around an object, as in some renders, L is about 0 and all depth is contact.
+    Calibration finds L and the share of a unit together. Without presses L is :data:`CONTACT_DECAY_MM`, or as short as the frame's
+    hollow skin shows, for free skin is hollow and does not pull; the shares fall with L^2 then. Where L is 0, as in renders without
+    skin around the object, all depth is contact.
 
     Args:
         mm_per_pixel: pixel pitch, mm.
         share: of the frame's pressure; None for the usual one.
+        decay_mm: L, mm; None to find it in each frame.
     Source:
         membrane on an elastic foundation: Timoshenko and Woinowsky-Krieger, Theory of Plates and Shells, 1959; the rest is this
         project's.
@@ -78,22 +84,26 @@ class ContactFromDepth(nn.Module):
         True
     """
 
-    def __init__(self, mm_per_pixel: float, share: float | None = None) -> None:
+    def __init__(self, mm_per_pixel: float, share: float | None = None, decay_mm: float | None = None) -> None:
         super().__init__()
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         self.share = SHARE if share is None else check_positive("share", share, 1.0)
         self.cell = max(1, round(CELL_MM / mm_per_pixel))
         self.large, self.deep, self.rim_mm, self.fall = LARGE, DEEP, RIM_MM, FALL
-        self.blur_mm, self.decay_mm, self.least_deep = BLUR_MM, CONTACT_DECAY_MM, LEAST_DEEP
-        self.pull, self.pulling, self.least_depth = PULL, PULLING, LEAST_CONTACT_DEPTH
+        self.by_frame = decay_mm is None
+        self.decay_mm = CONTACT_DECAY_MM if decay_mm is None else check_decay("decay_mm", decay_mm)
+        self.blur_mm, self.least_deep = BLUR_MM, LEAST_DEEP
+        self.pull, self.pulling, self.kink, self.steps, self.least_depth = PULL, PULLING, KINK, STEPS, LEAST_CONTACT_DEPTH
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, settings: ContactSettings | None = None) -> "ContactFromDepth":
-        """The block of a calibrated unit, with its own share where settings do not say otherwise."""
+        """The block of a calibrated unit, with its own share and L where settings do not say otherwise."""
         check_calibration("calibration", calibration)
         settings = ContactSettings() if settings is None else settings
         check_record("settings", settings, ContactSettings, "ContactSettings() makes one")
-        return cls(calibration.sensor.mm_per_pixel, calibration.contact_share if settings.share is None else settings.share)
+        share = calibration.contact_share if settings.share is None else settings.share
+        decay_mm = calibration.contact_decay_mm if settings.decay_mm is None else settings.decay_mm
+        return cls(calibration.sensor.mm_per_pixel, share, decay_mm)
 
     if TYPE_CHECKING:
 
@@ -119,18 +129,24 @@ class ContactFromDepth(nn.Module):
         """Pressure less what contact needs, (B, 1, h, w): a share of the frame's, and of that just inside of the rim."""
         deepest = depth.amax(dim=(2, 3), keepdim=True)
         curvature = laplacian(depth) / pitch_mm**2
-        least_deep = self.least_deep * deepest
-        hollow = (curvature * self.decay_mm**2 > least_deep) & (depth > least_deep)
-        not_pulling = (depth + self.pull * deepest) / curvature - self.blur_mm**2  # L^2 from which it pulls; a blurred kink has 0
-        decay = frame_quantile(not_pulling.clamp(0.0, self.decay_mm**2), hollow, self.pulling)
+        decay = self.decay_of(depth, curvature, deepest)
+        soft = decay / max(self.decay_mm**2, 1e-9)
         pressure = depth - decay * curvature
-        soft = decay / self.decay_mm**2
-        large = frame_quantile(pressure, depth > self.deep * deepest, self.large)
+        large = frame_quantile(pressure, (depth > self.deep * deepest).to(depth.dtype), self.large)
         least = torch.maximum(soft * self.share * large, self.least_depth * deepest)
         touching = (pressure > least).to(pressure.dtype)
         reach = rim_reach(self.rim_mm, pitch_mm)
         inside = box_mean(touching * pressure, reach) / box_mean(touching, reach).clamp_min(1e-9)
         return pressure - torch.maximum(least, soft * self.fall * inside)
+
+    def decay_of(self, depth: Tensor, curvature: Tensor, deepest: Tensor) -> Tensor:
+        """L^2 of each frame, (B, 1, 1, 1): the unit's, or as short as hollow skin shows."""
+        if not self.by_frame:
+            return torch.full_like(deepest, self.decay_mm**2)
+        hollow = torch.where(depth > self.least_deep * deepest, curvature.clamp_min(0.0), 0.0)
+        not_pulling = (depth + self.pull * deepest) / curvature - self.kink * self.blur_mm**2  # L^2 from which it pulls
+        step = self.decay_mm**2 / self.steps
+        return frame_quantile((not_pulling / step).clamp(0.0, float(self.steps)), hollow, self.pulling).floor() * step
 
 
 def rim_reach(rim_mm: float, pitch_mm: float) -> int:
@@ -138,15 +154,16 @@ def rim_reach(rim_mm: float, pitch_mm: float) -> int:
     return max(1, int(rim_mm / pitch_mm + 0.5))
 
 
-def frame_quantile(values: Tensor, some: Tensor, share: float, samples: int = SAMPLES) -> Tensor:
-    """A quantile of some of the values of each frame (B, 1, h, w), (B, 1, 1, 1); 0 where there are none."""
+def frame_quantile(values: Tensor, weights: Tensor, share: float, samples: int = SAMPLES) -> Tensor:
+    """A quantile of the weighed values of each frame (B, 1, h, w), (B, 1, 1, 1); 0 where nothing weighs."""
     step = max(1, min(values.shape[2], values.shape[3]) // samples)
-    some = some[:, :, step // 2 :: step, step // 2 :: step].flatten(1)
+    weights = weights[:, :, step // 2 :: step, step // 2 :: step].flatten(1)
     values = values[:, :, step // 2 :: step, step // 2 :: step].flatten(1)
-    ordered = torch.where(some, values, torch.inf).sort(dim=1).values
-    count = some.sum(dim=1, keepdim=True)
-    found = ordered.gather(1, (share * (count - 1).clamp_min(0)).long())
-    return torch.where(count > 0, found, 0.0)[:, :, None, None]
+    ordered, order = torch.where(weights > 0.0, values, torch.inf).sort(dim=1)
+    total = weights.sum(dim=1, keepdim=True)
+    below = (weights.gather(1, order).cumsum(dim=1) < share * total).sum(dim=1, keepdim=True)
+    found = ordered.gather(1, below.clamp_max(ordered.shape[1] - 1))
+    return torch.where(total > 0.0, found, 0.0)[:, :, None, None]
 
 
 def box_mean(image: Tensor, reach: int) -> Tensor:

@@ -287,4 +287,5 @@ def with_background(calibration: Calibration, background: Tensor) -> Calibration
     else:
         assert calibration.lights is not None
         unit = Calibration.from_lights(calibration.lights, sensor, background, calibration.report, calibration.ambient)
-    return dataclasses.replace(unit, contact_share=calibration.contact_share)
+    share, decay_mm = calibration.contact_share, calibration.contact_decay_mm
+    return dataclasses.replace(unit, contact_share=share, contact_decay_mm=decay_mm)

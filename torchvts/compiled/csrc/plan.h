@@ -39,7 +39,7 @@
     TABLE(double, by_pressure) REAL(zero_decay) TABLE(double, scales) INTEGER(rounds) REAL(smooth_mm) REAL(stiff) REAL(pit) REAL(pit_share)   \
     /* pressure.c */                                                                                                                          \
     REAL(moved_depth) INTEGER(contact_cell) TABLE(float, contact_blur) INTEGER(contact_taps) REAL(curvature_scale) INTEGER(contact_step)      \
-    REAL(contact_blur_mm) REAL(contact_decay) REAL(pull) REAL(pulling) REAL(least_deep) REAL(share) REAL(large) REAL(deep) INTEGER(rim_reach) REAL(fall)\
+    REAL(contact_kink) REAL(contact_decay) INTEGER(contact_by_frame) INTEGER(contact_steps) REAL(pull) REAL(pulling) REAL(least_deep) REAL(share) REAL(large) REAL(deep) INTEGER(rim_reach) REAL(fall)\
     REAL(least_depth)
 
 #define SOLVE_FIELDS(INTEGER, REAL, TABLE)                                                                                                    \

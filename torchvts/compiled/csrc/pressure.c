@@ -43,23 +43,24 @@ static WIDE void less_decayed(const float *restrict depth, float decay, size_t n
     for (size_t k = 0; k < n; k++) curvature[k] = depth[k] - decay * curvature[k];
 }
 
-/* A quantile of n values. some: 2 n floats, the values first. */
-static float quantile(float *some, int n, double share) { return n ? sorted(some, some + n, n)[(int64_t)((float)share * (float)(n - 1))] : 0.0f; }
-
-/* L^2 of which hollow skin does not pull, as far as that of contact. some: as many floats as two times the samples. */
-static float find_decay(const Plan *plan, const float *depth, const float *curvature, float deepest, int rows, int columns, float *some) {
-    const int step = (int)plan->contact_step;
-    const float pull = (float)plan->pull * deepest, deep = (float)plan->least_deep * deepest, most = (float)(plan->contact_decay * plan->contact_decay);
-    const float kink = (float)(plan->contact_blur_mm * plan->contact_blur_mm);
-    int n = 0;
+/* L^2: the unit's, or as short as hollow skin shows, rounded down to one of `contact_steps`. weights: as many floats. */
+static float find_decay(const Plan *plan, const float *depth, const float *curvature, float deepest, int rows, int columns, float *weights) {
+    const int step = (int)plan->contact_step, steps = (int)plan->contact_steps;
+    const float pull = (float)plan->pull * deepest, deep = (float)plan->least_deep * deepest, kink = (float)plan->contact_kink;
+    const float longest = (float)(plan->contact_decay * plan->contact_decay), per = (float)steps / longest;
+    if (!plan->contact_by_frame) return longest;
+    double total = 0.0, below = 0.0;
+    memset(weights, 0, sizeof(float) * ((size_t)steps + 1));
     for (int y = step / 2; y < rows; y += step)
         for (int x = step / 2; x < columns; x += step) {
             const size_t at = (size_t)y * columns + x;
-            if (!(curvature[at] * most > deep) || !(depth[at] > deep)) continue;
-            const float decay = (depth[at] + pull) / curvature[at] - kink;
-            some[n++] = decay < 0.0f ? 0.0f : decay < most ? decay : most;
+            if (!(curvature[at] > 0.0f) || !(depth[at] > deep)) continue;
+            const float decay = per * ((depth[at] + pull) / curvature[at] - kink);
+            weights[decay < 0.0f ? 0 : decay < (float)steps ? (int)decay : steps] += curvature[at], total += curvature[at];
         }
-    return quantile(some, n, plan->pulling);
+    int found = 0;
+    while (found < steps && (below += weights[found]) < plan->pulling * total) found++;
+    return (float)found / per;
 }
 
 /* The frame's pressure: a quantile of the deep skin's. some: as many floats as two times the samples. */
@@ -72,7 +73,8 @@ static float frame_pressure(const Plan *plan, const float *depth, const float *p
             const size_t at = (size_t)y * columns + x;
             if (depth[at] > deep) some[n++] = pressure[at];
         }
-    return quantile(some, n, plan->large);
+    const int below = (int)ceilf((float)plan->large * (float)n) - 1;
+    return n ? sorted(some, some + n, n)[below < 0 ? 0 : below] : 0.0f;
 }
 
 /* Sums of 2 `reach` + 1 lines each `step` floats behind the last. */
@@ -114,7 +116,7 @@ static WIDE void less_needed(const float *restrict inside, const float *restrict
 static void above(const Plan *plan, const float *depth, float *pressure, int rows, int columns, float *some) {
     const int n = rows * columns, reach = (int)plan->rim_reach;
     const float deepest = largest(depth, (size_t)n, 0), decay = find_decay(plan, depth, pressure, deepest, rows, columns, some);
-    const float soft = decay / (float)(plan->contact_decay * plan->contact_decay);
+    const float longest = (float)(plan->contact_decay * plan->contact_decay), soft = decay / (longest > 1e-9f ? longest : 1e-9f);
     less_decayed(depth, decay, (size_t)n, pressure);
     const float large = frame_pressure(plan, depth, pressure, deepest, rows, columns, some);
     const float by_share = soft * (float)plan->share * large, by_depth = (float)plan->least_depth * deepest;

@@ -1,0 +1,31 @@
+"""How free skin of a unit decays and from which pressure an object touches it, from presses of balls."""
+
+import dataclasses
+
+import pytest
+import torch
+
+import torchvts as vts
+from lab.drawn_sensors import drawn_sensor
+from torchvts.scenes import objects
+
+UNIT = drawn_sensor(0)
+
+
+@pytest.mark.parametrize("reach_mm, expected_mm", [(0.18, (0.2,)), (0.28, (0.2, 0.3)), (0.69, (0.45, 0.65))])
+def test_a_unit_shows_how_its_skin_decays(reach_mm, expected_mm, tmp_path):
+    """Light presses too are as large as they are then; with one L for all units contact was 1.3 to 5 times too large."""
+    unit = dataclasses.replace(UNIT, reach_mm=reach_mm)
+    presses = [dataclasses.replace(press, center_px=None, contact_radius_px=None) for press in unit.balls]
+    calibration = vts.calibrate(unit.background, unit.sensor, presses)
+    assert calibration.contact_decay_mm in expected_mm
+    calibration.save(tmp_path / "unit.safetensors")
+    loaded = vts.Calibration.load(tmp_path / "unit.safetensors")
+    assert (loaded.contact_share, loaded.contact_decay_mm) == (calibration.contact_share, calibration.contact_decay_mm)
+    pipe = vts.DepthPipeline.from_calibration(loaded)
+    for diameter_mm, press_mm in ((3.0, 0.3), (6.0, 0.2), (6.0, 0.5), (10.0, 0.3)):
+        press = unit.press(objects.sphere(diameter_mm / 2), objects.pose(shift_mm=(1.0, -0.5), press_mm=press_mm), "", 7)
+        with torch.inference_mode():
+            found = pipe(press.image[None]).contact
+        ratio = float(found.sum() / press.scene.contact.sum())
+        assert 0.8 < ratio < 1.3

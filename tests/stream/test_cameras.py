@@ -209,6 +209,16 @@ def test_what_can_be_read_of_a_recording_on_a_full_disk_is_kept_with_its_times(t
     assert np.array_equal(reader.read(), noise[SETTLING]) and len(reader.times) == 40
 
 
+def test_on_a_full_disk_both_what_is_kept_and_what_is_lost_are_said(tmp_path, small_files):
+    noise = np.random.default_rng(0).integers(0, 255, (SETTLING + 40, 48, 64, 3), dtype=np.uint8)
+    times_file(tmp_path / "raw.mkv").mkdir()
+    recorder = streams.Recorder(Playing(noise), tmp_path / "raw.mkv")
+    with small_files(150_000), pytest.raises(OSError, match=r"of 40 frames can be read back and are kept: .*; .*times.csv"):
+        while recorder.read() is not None:
+            pass
+        recorder.close()
+
+
 def test_recordings_of_several_sensors_have_one_clock(tmp_path):
     begun = time.time()
     for name in ("left.mkv", "right"):

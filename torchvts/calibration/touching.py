@@ -17,10 +17,10 @@ from .contacts import Contact
 from .presses import Press
 
 DECAYS_MM = (0.0, 0.1, 0.2, 0.3, 0.45, 0.65)
-"""Lengths that are tried; 0: no skin around the object."""
+"""Lengths that are tried, with every other share; 0: no skin around the object."""
 
-SHARES = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6)
-"""Shares that are tried."""
+SHARES = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6)
+"""Shares that are tried with the length that is taken."""
 
 TIE = 0.04
 """Overlaps that differ by less are equal. Of such lengths the longest is taken, of its shares the one nearest the usual: faint
@@ -47,12 +47,12 @@ def with_contact(calibration: Calibration, presses: Sequence[Press], contacts: S
     if not seen:
         return calibration
     pitch_mm = calibration.sensor.mm_per_pixel
-    overlap = {
-        decay_mm: {share: _overlap(pitch_mm, share, decay_mm, seen) for share in (SHARES if decay_mm else (SHARE,))}
-        for decay_mm in DECAYS_MM
-    }
-    decay_mm = max(_as_good({decay_mm: max(of_shares.values()) for decay_mm, of_shares in overlap.items()}))
-    share = min(_as_good(overlap[decay_mm]), key=lambda share: abs(share - SHARE))
+
+    def overlaps(decay_mm: float, shares: Sequence[float]) -> dict[float, float]:
+        return {share: _overlap(ContactFromDepth(pitch_mm, share, decay_mm), seen) for share in shares}
+
+    decay_mm = max(_as_good({decay_mm: max(overlaps(decay_mm, SHARES[::2]).values()) for decay_mm in DECAYS_MM}))
+    share = min(_as_good(overlaps(decay_mm, SHARES)), key=lambda share: abs(share - SHARE))
     return dataclasses.replace(calibration, contact_share=share, contact_decay_mm=decay_mm)
 
 
@@ -77,9 +77,8 @@ def _depth_and_circle(calibration: Calibration, press: Press, contact: Contact) 
     return depth, moved(weight, depth), (away < (contact.contact_radius_mm / WIDER) ** 2)[None, None]
 
 
-def _overlap(mm_per_pixel: float, share: float, decay_mm: float, seen: Sequence[tuple[Tensor, Tensor, Tensor]]) -> float:
+def _overlap(block: ContactFromDepth, seen: Sequence[tuple[Tensor, Tensor, Tensor]]) -> float:
     """Median intersection over union of the contact found and the circles."""
-    block = ContactFromDepth(mm_per_pixel, share, decay_mm)
     overlaps = []
     for depth, deformed, circle in seen:
         found = block(depth, deformed)

@@ -81,14 +81,25 @@ class Recorder:
             if self._closed:
                 return
             self._closed = True
+            failed = None
             try:
                 self._images.finish()
                 if self._video is not None:
                     self._video.__exit__(None, None, None)
-            finally:  # the frames that were written have their times
-                if self.times:
-                    table = io.StringIO()
-                    lines = ((f"{k:06d}", f"{t:.6f}", f"{self._clock + t:.6f}") for k, t in enumerate(self.times))
-                    csv.writer(table, lineterminator="\n").writerows([("frame", "time_s", "unix_s"), *lines])
-                    with write_atomically(times_file(self.path)) as temporary:
-                        temporary.write_text(table.getvalue(), encoding="utf-8")
+            except OSError as error:
+                failed = error
+            try:
+                self._write_times()  # of the frames that were written, too
+            except OSError as error:
+                raise OSError(f"{failed}; {error}" if failed else str(error)) from failed
+            if failed is not None:
+                raise failed
+
+    def _write_times(self) -> None:
+        if not self.times:
+            return
+        table = io.StringIO()
+        lines = ((f"{k:06d}", f"{t:.6f}", f"{self._clock + t:.6f}") for k, t in enumerate(self.times))
+        csv.writer(table, lineterminator="\n").writerows([("frame", "time_s", "unix_s"), *lines])
+        with write_atomically(times_file(self.path)) as temporary:
+            temporary.write_text(table.getvalue(), encoding="utf-8")

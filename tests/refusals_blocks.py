@@ -19,6 +19,7 @@ OTHER_DEPTHS = [DEPTH[0], DEPTH[..., 1:], DEPTH.expand(2, -1, -1, -1)]
 IMAGES = [*batches(3), 255 * image()[None], image()[None] + NAN, image()[None] - 1.0]
 LENS = ((50.0, 0.0, 32.0), (0.0, 50.0, 24.0), (0.0, 0.0, 1.0))
 SHARES = [*(value for value in NUMBER if value is not None), 1.5]
+DECAYS_MM = [*(value for value in NUMBER if value not in (None, 0)), 450.0]
 
 
 def integrator(name):
@@ -49,12 +50,13 @@ TABLE = {
     "ContactMask.forward": Entry({"compensated": FLAT[None], "gradient": SLOPES}, {"compensated": batches(3),
         "gradient": [*(b for b in batches(2) if b is not None), SLOPES[..., 1:], SLOPES.expand(3, -1, -1, -1)]},
         lambda: pipe().mask),
-    "ContactFromDepth": Entry({"mm_per_pixel": 1.0, "share": 0.8}, {"share": SHARES}),
+    "ContactFromDepth": Entry({"mm_per_pixel": 1.0, "share": 0.8, "decay_mm": 0.3}, {"share": SHARES, "decay_mm": DECAYS_MM}),
     "ContactFromDepth.from_calibration": Entry({"calibration": unit()}, {"settings": ["4.5", 4.5, torch.ones(3)]}),
     "ContactFromDepth.forward": Entry({"depth_mm": DEPTH, "deformed": DEPTH > 0},
         {"depth_mm": batches(1), "deformed": [DEPTH, *(mask > 0 for mask in OTHER_DEPTHS), (DEPTH > 0).numpy(), None]},
         lambda: vts.ContactFromDepth(1.0)),
-    "ContactSettings": Entry({"sigmas": 4.5, "share": 0.8}, {"sigmas": NUMBER, "share": SHARES}),
+    "ContactSettings": Entry({"sigmas": 4.5, "share": 0.8, "decay_mm": 0.3},
+        {"sigmas": NUMBER, "share": SHARES, "decay_mm": DECAYS_MM}),
     "ZeroBackground": Entry({"mm_per_pixel": 1.0}, {}),
     "ZeroBackground.forward": Entry({"depth_mm": DEPTH, "weight": DEPTH + 1.0},
         {"depth_mm": batches(1), "weight": [*batches(1), *OTHER_DEPTHS]}, lambda: vts.skin.ZeroBackground(1.0)),

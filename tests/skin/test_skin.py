@@ -139,6 +139,13 @@ def test_contact_of_a_ball_in_skin_of_a_short_decay_is_its_circle(press_mm, reac
     assert (1.3 < ratio < 1.45) if guessed_worst else (0.8 < ratio < 1.3)
 
 
+@pytest.mark.parametrize("reach_mm", [0.0, 0.2, 0.28, 0.4])
+def test_frames_show_how_their_skin_decays(reach_mm):
+    ball = sphere_press(3.0, 0.5, height=160, width=200, mm_per_pixel=0.0625)
+    depth = hanging_skin(torch.where(ball.contact, ball.depth_mm, -1.0), reach_mm, 0.0625).depth_mm if reach_mm else ball.depth_mm
+    assert float(ContactFromDepth(0.0625).decays_mm(depth)) == pytest.approx(reach_mm, abs=0.05)
+
+
 def test_where_nothing_decays_all_depth_is_contact():
     """Any L takes the rims of letters off."""
     letters = letters_press("XO", 4.0, 0.3, height=120, width=160, mm_per_pixel=0.0625)

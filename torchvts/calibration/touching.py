@@ -12,19 +12,15 @@ from ..core.geometry import GradientFromNormal, pixel_grid_mm
 from ..integration import PoissonDCT
 from ..model.calibration import Calibration
 from ..normals import NormalFromIntensity, NormalFromResponse
-from ..skin import SHARE, ContactFromDepth, ContactMask, ZeroBackground, moved
+from ..skin import BLUR_MM, SHARE, ContactFromDepth, ContactMask, ZeroBackground, moved
 from .contacts import Contact
 from .presses import Press
 
-DECAYS_MM = (0.0, 0.1, 0.2, 0.3, 0.45, 0.65)
-"""Lengths that are tried, with every other share; 0: no skin around the object."""
-
-SHARES = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6)
-"""Shares that are tried with the length that is taken."""
+SHARES = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6)
+"""Shares that are tried."""
 
 TIE = 0.04
-"""Overlaps that differ by less are equal. Of such lengths the longest is taken, of its shares the one nearest the usual: faint
-presses and shapes other than balls need them."""
+"""Overlaps that differ by less are equal; of such shares the one nearest the usual one is taken: other shapes need it."""
 
 WIDER = 1.04
 """Contact radius that is found for a ball, over the true one: 1.07 to 1.10 on drawn sensors, 0.9 to 1 of labels on real ones."""
@@ -34,7 +30,9 @@ MOST_PRESSES = 8
 
 
 def with_contact(calibration: Calibration, presses: Sequence[Press], contacts: Sequence[Contact]) -> Calibration:
-    """The calibration with L and share of contact that give the circles of located balls best; unchanged where none was located.
+    """The calibration with L of contact, the median over located balls, and the share that gives their circles best.
+
+    Unchanged where none was located.
 
     Args:
         calibration: of the unit, by any model.
@@ -47,18 +45,12 @@ def with_contact(calibration: Calibration, presses: Sequence[Press], contacts: S
     if not seen:
         return calibration
     pitch_mm = calibration.sensor.mm_per_pixel
-
-    def overlaps(decay_mm: float, shares: Sequence[float]) -> dict[float, float]:
-        return {share: _overlap(ContactFromDepth(pitch_mm, share, decay_mm), seen) for share in shares}
-
-    decay_mm = max(_as_good({decay_mm: max(overlaps(decay_mm, SHARES[::2]).values()) for decay_mm in DECAYS_MM}))
-    share = min(_as_good(overlaps(decay_mm, SHARES)), key=lambda share: abs(share - SHARE))
+    decay_mm = float(torch.cat([ContactFromDepth(pitch_mm).decays_mm(depth) for depth, _, _ in seen]).median())
+    decay_mm = decay_mm if decay_mm > BLUR_MM else 0.0  # a rim that is only blurred
+    overlap = {share: _overlap(ContactFromDepth(pitch_mm, share, decay_mm), seen) for share in SHARES}
+    as_good = [share for share in SHARES if overlap[share] > max(overlap.values()) - TIE]
+    share = min(as_good, key=lambda share: abs(share - SHARE))
     return dataclasses.replace(calibration, contact_share=share, contact_decay_mm=decay_mm)
-
-
-def _as_good(overlap: dict[float, float]) -> list[float]:
-    """Those whose overlap equals the largest."""
-    return [value for value in overlap if overlap[value] > max(overlap.values()) - TIE]
 
 
 def _depth_and_circle(calibration: Calibration, press: Press, contact: Contact) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,8 +1,8 @@
 """What the skin does: how surely it has moved, its depth from where it has not, and where an object touches it."""
 
-from .pressure import SHARE, ContactFromDepth
+from .pressure import BLUR_MM, SHARE, ContactFromDepth
 from .settings import ContactSettings
 from .weight import ContactMask, moved
 from .zero import ZeroBackground
 
-__all__ = ["SHARE", "ContactFromDepth", "ContactMask", "ContactSettings", "ZeroBackground", "moved"]
+__all__ = ["BLUR_MM", "SHARE", "ContactFromDepth", "ContactMask", "ContactSettings", "ZeroBackground", "moved"]

@@ -65,9 +65,9 @@ class ContactFromDepth(nn.Module):
     Skin in contact follows the object; around it the skin hangs free and bears no pressure. Real skin is no thin membrane, so that
     deep free skin seems to bear some: the share belongs to the gel, and calibration finds it from presses of balls.
 
-    Calibration finds L and the share of a unit together. Without presses L is :data:`CONTACT_DECAY_MM`, or as short as the frame's
-    hollow skin shows, for free skin is hollow and does not pull; the shares fall with L^2 then. Where L is 0, as in renders without
-    skin around the object, all depth is contact.
+    L is :data:`CONTACT_DECAY_MM`, or as short as hollow skin shows, for free skin is hollow and does not pull. Presses of balls
+    show it best, and calibration takes their median. Without presses each frame shows its own, and the shares fall with L^2. Where
+    L is 0, as in renders without skin around the object, all depth is contact.
 
     Args:
         mm_per_pixel: pixel pitch, mm.
@@ -121,9 +121,20 @@ class ContactFromDepth(nn.Module):
             raise ValueError(f"deformed: expected {list(depth_mm.shape)} like depth_mm, got {list(deformed.shape)}")
         height, width = depth_mm.shape[2], depth_mm.shape[3]
         cell = min(self.cell, height, width)
-        pitch_mm = cell * self.mm_per_pixel
-        above = self.above(blur(whole_cell_means(depth_mm.detach(), cell), gaussian_weights(self.blur_mm / pitch_mm)), pitch_mm)
+        above = self.above(self.blurred(depth_mm.detach(), cell), cell * self.mm_per_pixel)
         return deformed & (cells_to_pixels(above, cell, height, width) > 0.0)
+
+    def decays_mm(self, depth_mm: Tensor) -> Tensor:
+        """L of each frame of depth (B, 1, H, W), (B,), mm."""
+        check_batch("depth_mm", depth_mm, 1)
+        cell = min(self.cell, depth_mm.shape[2], depth_mm.shape[3])
+        depth = self.blurred(depth_mm.detach(), cell)
+        curvature = laplacian(depth) / (cell * self.mm_per_pixel) ** 2
+        return self.decay_of(depth, curvature, depth.amax(dim=(2, 3), keepdim=True)).sqrt().flatten()
+
+    def blurred(self, depth: Tensor, cell: int) -> Tensor:
+        """Depth of cells, blurred, whose curvature is taken, (B, 1, h, w)."""
+        return blur(whole_cell_means(depth, cell), gaussian_weights(self.blur_mm / (cell * self.mm_per_pixel)))
 
     def above(self, depth: Tensor, pitch_mm: float) -> Tensor:
         """Pressure less what contact needs, (B, 1, h, w): a share of the frame's, and of that just inside of the rim."""

@@ -18,9 +18,7 @@ from ..stream import FIRST_FRAMES
 from ..training.presses import without_labels
 from .parser import UsageError
 
-_CONTACT = " ".join(
-    f"{key}={'of the unit' if value is None else format(value, 'g')}" for key, value in asdict(ContactSettings()).items()
-)
+_CONTACT = " ".join(f"{key}={'own' if value is None else format(value, 'g')}" for key, value in asdict(ContactSettings()).items())
 
 
 def add_sensor(parser: argparse._ActionsContainer, text: str = "") -> None:

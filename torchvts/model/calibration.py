@@ -66,8 +66,8 @@ class Calibration:
         ambient: (3,), constant linear light that the lights do not give, subtracted before the gain; None for none.
         contact_share: pressure from which an object touches, as a share of the frame's; None where no press of a ball
             shows it.
-        contact_decay_mm: length over which free skin decays for the pressure of contact, mm, found with the share; None where no
-            press of a ball shows it.
+        contact_decay_mm: length over which free skin decays for the pressure of contact, mm: the median that presses of balls show,
+            0 where no skin hangs around them; None where there are none.
     Raises:
         TypeError: a field of another type.
         ValueError: lights, background, noise or ambient light of another shape, or not finite; a background without light; lights

@@ -3,9 +3,11 @@
 import copy
 import pickle
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import load_model, save_model
 from torch import Tensor
 from torch._subclasses import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -117,6 +119,18 @@ def test_a_state_of_another_unit_is_refused(mode: str, other: dict[str, float], 
     ).state_dict()
     with pytest.raises((ValueError, RuntimeError), match=named):
         vts.DepthPipeline.from_calibration(rig(), mode).load_state_dict(state)
+
+
+@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
+def test_a_pipeline_goes_through_safetensors(mode: str, tmp_path: Path) -> None:
+    pipe, other = (vts.DepthPipeline.from_calibration(rig(), mode) for _ in range(2))
+    with torch.no_grad():
+        next(p for name, p in pipe.named_parameters() if name.endswith("albedo")).mul_(1.1)
+    save_model(pipe, str(tmp_path / "pipe.safetensors"))
+    load_model(other, str(tmp_path / "pipe.safetensors"))
+    image = press()
+    with torch.no_grad():
+        assert torch.equal(other(image).depth_mm, pipe(image).depth_mm)
 
 
 def test_a_frame_without_contact_has_a_graph_and_tensors_of_its_own() -> None:

@@ -319,7 +319,8 @@ CHECKS = (
     Check("few_bits", _bits, "the {which} has only {value:.0f} bits: rounding changes normals by {cost:.1f} degrees; read the "
           "camera with 8 bits or more", lambda figures: by_cost(figures["cost"])),
     Check("compressed", _block_steps, "the image was compressed: steps at the borders of 8 x 8 blocks are {value:.1f} times "
-          "those inside and change normals by {cost:.1f} degrees; take uncompressed images, or JPEG of quality 95 and more",
+          "those inside. The steps alone change normals by {cost:.1f} degrees; what was lost inside blocks comes on top, unseen: "
+          "take uncompressed images, or JPEG of quality 95 and more",
           lambda figures: by_cost(figures["cost"])),
     Check("noise", _noise, "noise of {value:.3f}, {ratio:.1f} times that at calibration, changes normals by {cost:.1f} degrees: "
           "more light, less gain, or average several frames", lambda figures: by_cost(0.5 * figures["cost"])),

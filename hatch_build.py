@@ -12,7 +12,8 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-FLAGS = ["-std=c11", "-O3", "-fno-math-errno", "-fPIC", "-shared", "-fvisibility=hidden"]
+FLAGS = ["-std=c11", "-O3", "-fno-math-errno", "-fno-strict-aliasing", "-ffp-contract=off"]
+FLAGS += ["-fPIC", "-shared", "-fvisibility=hidden"]
 PLAIN = "-DWIDE="  # compilers that cannot build a function for several kinds of processors
 
 

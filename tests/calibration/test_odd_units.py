@@ -168,6 +168,8 @@ def test_a_calibration_that_cannot_be_used_is_refused_when_it_is_made(ring):
         dataclasses.replace(good, noise_std=torch.full((3,), torch.inf))
     with pytest.raises(ValueError, match="lights, response: expected one of them, got none"):
         dataclasses.replace(good, lights=None)
+    with pytest.raises(ValueError, match="lights, response: expected one of them, got both"):
+        dataclasses.replace(good, response=ResponseModel.zero())
     with pytest.raises(ValueError, match="background: expected light above the noise, got at most 0"):
         vts.Calibration.from_response(ResponseModel.zero(), SENSOR, torch.zeros(3, HEIGHT, WIDTH))
 

@@ -559,8 +559,23 @@ def test_two_wrong_diameters_among_seven_are_left_out(good, rest):
 def test_two_sizes_exchanged_are_warned_of(rest, sizes, warned):
     """Then half of the presses contradict the other half, and none of them stands out."""
     presses = [dataclasses.replace(p, ball_diameter_mm=sizes[k % 2]) for k, p in enumerate(take_presses(count=10))]
-    _, said = calibrate(rest, GIVEN, presses)
+    unit, said = calibrate(rest, GIVEN, presses)
     assert sum("by each other the balls seem" in text for text in said) == warned, said
+    assert unit.metric is not bool(warned) and ("by each other" in unit.report.get("objection", "")) == bool(warned)
+
+
+def test_lights_on_one_line_show_no_slopes_across_it():
+    """Red left, green above, blue right: of a slope along y, colours do not say whether it rises or falls."""
+    lights = vts.PointLights([[-16, 0, 9], [0, 0, 18], [16, 0, 9]], [1000, 2000, 1000]).requires_grad_(False)
+
+    def camera(scene, seed):
+        return vts.scenes.render(scene, lights, noise_std=0.003, bits=8, seed=seed)[0]
+
+    with pytest.raises(ValueError, match=r"slopes along [89]\d degrees from x that are found 0\.\d\d times as large"):
+        vts.calibrate(background(camera), SENSOR, take_presses(camera))
+    with pytest.warns(vts.CalibrationWarning, match="LEDs on one line"):
+        forced = vts.calibrate(background(camera), SENSOR, take_presses(camera), force=True)
+    assert not forced.metric
 
 
 @pytest.mark.parametrize("ball_mm", [500.0, pytest.param(60.0, marks=pytest.mark.long)])

@@ -52,6 +52,12 @@ def test_sizes_that_all_presses_contradict_are_refused_and_forced(mistake):
     assert any("times as wide as the balls" in text for text in warned)
 
 
+def test_contacts_as_wide_as_those_of_deep_presses_are_warned_of():
+    smaller = [dataclasses.replace(press, ball_diameter_mm=0.65 * press.ball_diameter_mm) for press in bare(UNIT.balls)]
+    _, warned = calibrate(UNIT.sensor, smaller)
+    assert any("contacts are 0.83 times as wide as their balls" in text for text in warned)
+
+
 @pytest.mark.parametrize("pitch_off", [0.9, 1.1])
 def test_depth_by_presses_goes_with_the_square_of_a_wrong_pitch(whole, pitch_off):
     sensor = dataclasses.replace(UNIT.sensor, mm_per_pixel=pitch_off * UNIT.sensor.mm_per_pixel)

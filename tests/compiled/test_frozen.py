@@ -16,7 +16,7 @@ from conftest import ring_lights, without_library
 
 import torchvts as vts
 from lab import frames
-from torchvts.compiled import library, plan
+from torchvts.compiled import binding, library, plan
 from torchvts.compiled import library as library_of
 from torchvts.compiled.binding import LIBRARY
 from torchvts.model.response_field import DepthBrightness, ResponseField, ResponseModel
@@ -363,7 +363,7 @@ def test_without_the_library_all_is_in_pytorch(unit):
     pipe = vts.DepthPipeline.from_calibration(calibration, "precise")
     with without_library():
         frozen = pipe.freeze()
-    assert "no C compiler was at hand" in frozen.not_compiled
+    assert "there is no compiled library" in frozen.not_compiled
     assert float((frozen(images).depth_mm - pipe.freeze()(images).depth_mm).abs().max()) <= DEPTH_MM
 
 
@@ -434,13 +434,18 @@ def test_images_may_lie_anywhere_in_memory(unit):
 
 
 @pytest.mark.parametrize("kind", UNITS)
-def test_defaults_of_torch_change_nothing(kind):
+def test_defaults_of_torch_change_nothing(kind, tmp_path):
     calibration, images = UNITS[kind]((96, 128), 0.25)
     pipe = vts.DepthPipeline.from_calibration(calibration, "auto")
     expected = pipe.freeze()(images)
+    calibration.save(tmp_path / "unit.safetensors")
     try:
         torch.set_default_dtype(torch.float64)
         assert all(map(torch.equal, pipe.freeze()(images), expected))
+        loaded = vts.DepthPipeline.from_calibration(vts.Calibration.load(tmp_path / "unit.safetensors"), "auto")
+        assert loaded(images).depth_mm.dtype == torch.float32
+        assert float((loaded(images).depth_mm - expected.depth_mm).abs().max()) < DEPTH_MM
+        assert vts.PointLights([[20, 9, 30], [-18, 13, 30], [-2, -22, 30]], [900, 900, 900]).albedo.dtype == torch.float32
     finally:
         torch.set_default_dtype(torch.float32)
     with torch.device("meta"):
@@ -612,3 +617,19 @@ def test_no_private_name_of_torch_is_used():
             if PRIVATE.search(code):
                 found.append(f"{path.relative_to(root)}:{number}: {line.strip()}")
     assert found == []
+
+
+def test_a_library_that_does_not_load_is_said_so(tmp_path, monkeypatch):
+    damaged = tmp_path / "libtorchvts.so"
+    damaged.write_bytes(b"no library")
+    monkeypatch.setattr(binding, "LIBRARY", damaged)
+    assert binding.library.__wrapped__() is None and "cannot be loaded" in binding.why_no_library()
+    damaged.unlink()
+    assert "no C compiler" in binding.why_no_library()
+
+
+def test_a_setting_beyond_its_range_stays_within_the_frame(unit):
+    calibration, images = unit
+    pipe = vts.DepthPipeline.from_calibration(calibration)
+    pipe.contact.large = 1.8
+    assert int((pipe.freeze()(images).contact != pipe(images).contact).sum()) <= 2 * len(images)

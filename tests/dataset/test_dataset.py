@@ -351,3 +351,10 @@ def test_no_two_files_of_a_folder_share_a_stem():
     names = ["a.png", "A.jpg", "a.png.bmp", "film.avi", "film_000001.png", "film.mp4", "b.png"]
     stems = output_stems(names)
     assert len(set(stems.values())) == len(names) and stems["film_000001.png"] == "film_000001.png"
+
+
+def test_folders_above_keep_results_within_and_files_come_once(tmp_path, monkeypatch):
+    fill(tmp_path / "data", ["x.png", "inner/y.png"])
+    monkeypatch.chdir(tmp_path / "data" / "inner")
+    assert [item.stem for item in list_items((Path(".."), Path("y.png"), Path(".")))] == ["data/inner/y", "data/x"]
+    assert [item.stem for item in list_items((Path("."), Path("../x.png")))] == ["inner/y", "x"]

@@ -340,3 +340,9 @@ def test_the_command_cuts_raw_frames_as_reconstruct_does(tmp_path, run_script):
     assert "wrong_size" not in run_script("diagnose", tmp_path / "unit.safetensors", tmp_path / "raw.png").stdout
     done = run_script("diagnose", tmp_path / "unit.safetensors", tmp_path / "small.png")
     assert done.returncode == 1 and "wrong_size" in done.stdout
+
+
+@pytest.mark.parametrize("size", [(8, 8), (9, 40), (40, 9)])
+def test_the_smallest_sensors_are_diagnosed(ring, size):
+    unit = vts.Calibration.from_lights(ring(), vts.Sensor("small", *size, 0.5))
+    assert vts.diagnose(None, unit.model_image.detach(), unit).ok

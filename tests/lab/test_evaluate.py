@@ -19,7 +19,7 @@ from torchvts.core.geometry import normal_from_gradient
 from torchvts.model.gs_sdk import CATALOG_COLUMNS, LABEL_COLUMNS
 from torchvts.training import presses as presses_room
 from torchvts.training.balls import ball_truth
-from torchvts.training.presses import Training, train_network
+from torchvts.training.presses import Training, train_network, training_pixels
 
 HEIGHT, WIDTH, PITCH = 96, 128, 0.15
 CENTERS = ((-3.0, -2.0), (3.5, -2.5), (0.0, 0.5), (-4.0, 2.5), (3.0, 2.5), (0.5, -3.0))
@@ -206,11 +206,25 @@ def test_without_labels_balls_are_found(folder, monkeypatch, tmp_path):
     training = Training(*vts.read_presses(bare), sensor)
     for found, given in zip(training.located, presses, strict=True):
         assert math.dist(found.center_px, given.center_px) < 1.5
-    monkeypatch.setattr(Training, "located", training.located)  # the same presses again
+    monkeypatch.setattr(Training, "found", training.found)  # the same presses again
     result = ev.evaluate(sets.from_folder(bare, sensor, folds=1), ["flat"])
     assert "centers from calibrate on the scored presses (6)" in result.data.how and result.rows[0].frames == 6
     fit = train_network(*vts.read_presses(bare), sensor, max_epochs=2)
     assert len(fit.history) == 2 and "raise max_epochs" in fit.message
+
+
+def test_training_knows_presses_by_their_place_not_by_their_name(folder, monkeypatch):
+    sensor = vts.Sensor.load(folder / "rig.yaml")
+    background, presses = vts.read_presses(folder)
+    alike = [dataclasses.replace(press, name="gelsight.png") for press in presses]
+    for found, given in zip(Training(background, alike, sensor).located, presses, strict=True):
+        assert torch.equal(found.image, given.image) and math.dist(found.center_px, given.center_px) < 1.5
+    learned = []
+    kept = lambda _, presses, pitch: learned.extend(presses) or training_pixels(_, presses, pitch)  # noqa: E731
+    monkeypatch.setattr(presses_room, "training_pixels", kept)
+    train_network(background, [dataclasses.replace(press, name="") for press in presses], sensor, max_epochs=1)
+    assert len(learned) == len(presses)  # the last has a centre and no contact radius: it is found
+    assert learned[0].center_px == presses[0].center_px and learned[-1].contact_radius_px is not None
 
 
 @pytest.fixture(scope="module")

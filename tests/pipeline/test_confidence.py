@@ -18,7 +18,7 @@ from lab.metrics import normal_angle_deg
 from lab.score import Truth
 from torchvts.export import sample_frames
 from torchvts.model.response_field import TaughtRange
-from torchvts.pipeline import beyond_presses, bound_at
+from torchvts.pipeline import Confidence, beyond_presses, bound_at
 from torchvts.pipeline.confidence import DEPTH_SPREAD, FACTORS, SPREAD_OF_MEAN, _length_95
 from torchvts.pipeline.expected_error import NOT_METRIC_DEG, UNMEASURED_DEG, expected_model_deg
 
@@ -395,3 +395,12 @@ def test_the_bound_of_free_skin_follows_the_threshold_of_contact(ring, small_sen
         for sigmas in (4.5, 18.0)
     )
     assert torch.allclose(blind.normal_95_deg.deg2rad(), 4.0 * usual.normal_95_deg.deg2rad(), rtol=1e-4)
+
+
+def test_bounds_of_one_pipeline_are_not_moved_by_another(ring):
+    calibration, _, camera = lights_unit(ring)
+    shared, image = Confidence.from_calibration(calibration), camera(1)
+    one = vts.ConfidentPipeline(vts.DepthPipeline.from_calibration(calibration), shared)
+    before = one(image).normal_95_deg
+    vts.ConfidentPipeline(vts.DepthPipeline.from_calibration(calibration, contact=vts.ContactSettings(sigmas=30.0)), shared)
+    assert torch.equal(one(image).normal_95_deg, before)

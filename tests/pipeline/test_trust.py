@@ -133,6 +133,13 @@ def test_a_pipeline_goes_through_safetensors(mode: str, tmp_path: Path) -> None:
         assert torch.equal(other(image).depth_mm, pipe(image).depth_mm)
 
 
+def test_a_state_of_other_scales_of_the_zero_is_refused() -> None:
+    pipe, other = (vts.DepthPipeline.from_calibration(rig()) for _ in range(2))
+    other.solve.zero.scales = [2.0 * scale for scale in other.solve.zero.scales]
+    with pytest.raises((ValueError, RuntimeError), match=r"zero\.scales"):
+        pipe.load_state_dict(other.state_dict())
+
+
 def test_a_frame_without_contact_has_a_graph_and_tensors_of_its_own() -> None:
     pipe = vts.DepthPipeline.from_calibration(rig(), "auto")
     lights = rig().lights

@@ -371,6 +371,13 @@ def test_black_lines_are_named_and_those_of_the_background_are_not(unit):
     assert "30 rows or columns of the frame are black or of one colour: it was cut short" in streams.FrameCheck(background)(frame)
 
 
+def test_frames_whose_names_have_blanks_keep_their_times(tmp_path):
+    for k in range(3):
+        vts.write_image(tmp_path / f"img {k}.png", torch.full((3, 8, 8), 0.1 * k))
+    times_file(tmp_path).write_text("frame,time_s\n" + "".join(f"img {k},{0.4 * k}\n" for k in range(3)))
+    assert streams.sources.FolderReader(tmp_path).times == pytest.approx([0.0, 0.4, 0.8])
+
+
 def test_both_scripts_give_the_same_depth_for_a_video(unit, run_stream, run_script, small_sensor, tmp_path):
     _, camera = unit
     video = write_film(
@@ -835,6 +842,12 @@ def test_corners_take_the_place_of_the_crop_of_raw_frames():
     assert torch.allclose(with_corners(digit, "319 0 319 239 0 239 0 0").rectify(lying), digit.rectify(lying), atol=1e-5)
     upright = digit.rectify(lying)
     assert torch.allclose(with_corners(digit, "0 0 239 0 239 319 0 319").rectify(upright), upright, atol=1e-5)
+
+
+def test_a_narrow_image_can_be_a_background():
+    narrow = replace(vts.Sensor.load("digit"), height=320, width=88, raw_size_px=(), turn_deg=0, mirror=False)
+    held = 0.5 + 0.002 * torch.randn(4, 3, 320, 88, generator=torch.Generator().manual_seed(0))
+    assert streams.find_background(held, narrow).shape == (3, 320, 88)
 
 
 def test_presses_of_a_known_sensor_are_no_background(mini_presses):

@@ -195,6 +195,8 @@ def test_a_key_in_a_terminal_needs_no_enter_and_the_terminal_is_as_before():
     finally:
         os.tcgetpgrp = os_getpgrp
     assert termios.tcgetattr(terminal) == before
+    with streams.Keys(terminal) as keys:  # of another session: it cannot say whose keys these are
+        assert keys.pressed() == []
     os.close(user), os.close(terminal)
 
 

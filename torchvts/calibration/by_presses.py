@@ -15,6 +15,7 @@ from ..model.response_field import ResponseModel
 from ..model.sensor import Sensor
 from ..normals import NormalFromIntensity
 from .balls import center_by_slope
+from .by_lights import OTHER_GAMMA
 from .contacts import Contact, middle_px, read_contacts, unit_without_model
 from .field import Family, angle_deg
 from .presses import Press
@@ -28,8 +29,6 @@ PREPROCESSING_WORTH = 0.1
 
 PREPROCESSING_PRESSES = 10
 """About so many presses choose it: reading them again takes most of the time."""
-
-OTHER_GAMMA = 2.2
 
 ALL_CANDIDATES = Candidates()
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..compensate import Compensate, SmoothDrift
-from ..core.blur import band_of_ratios
+from ..core.blur import band_of_ratios, without_margin
 from ..core.geometry import gradient_from_normal, pixel_grid_mm
 from ..core.morphology import dilate, erode
 from ..integration import PoissonBackground
@@ -224,10 +224,7 @@ def channel_structure(image: Tensor) -> float:
     height): 0.01 to 0.03 for the backgrounds of most sensors, 0.10 for a Wedge, whose LEDs are in the image; 0.06 to 0.36 under
     clear contact.
     """
-    band = channel_band(image, 120, image.shape[1])[0]
-    height, width = band.shape[1:]
-    margin = min(round(0.14 * height), (min(height, width) - 1) // 2)
-    inner = band[:, margin : height - margin, margin : width - margin]
+    inner = without_margin(channel_band(image, 120, image.shape[1])[0])
     return float(inner.square().sum(0).sqrt().flatten().quantile(0.99))
 
 

@@ -8,6 +8,7 @@ slope points to the center; and everywhere the slope of a surface has no curl, n
 import copy
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -255,6 +256,19 @@ class Evidence:
     def held_out(self, penalty: Tensor, start: Tensor | None) -> list[Tensor]:
         """For each contact the coefficients by all others."""
         return [solve(self.form - form, self.right - right, penalty, start) for form, right in self.each]
+
+
+def seen_slopes(field: ResponseField, contacts: Sequence[Contact]) -> Tensor:
+    """(2, 2): from the balls' slopes to those that a field finds, by least squares; the identity where all are found."""
+    family, coefficient = Family.of(field), field.tensor().reshape(-1)
+    found, given = torch.zeros(2, 2, dtype=torch.float64), torch.zeros(2, 2, dtype=torch.float64)
+    for contact in contacts:
+        inside = contact.inside()
+        ball = contact.ball_slope()[:, inside]
+        found += ContactForms(family, contact).slope(coefficient)[:, inside] @ ball.t() / max(1, int(inside.sum()))
+        given += ball @ ball.t() / max(1, int(inside.sum()))
+    seen: Tensor = found @ torch.linalg.pinv(given)
+    return seen
 
 
 def power_of(contacts: list[Contact]) -> float:

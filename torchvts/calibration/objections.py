@@ -11,13 +11,18 @@ from ..core.arrays import array_of
 from ..core.views import Views
 from ..model.calibration import SATURATED, Calibration
 from ..model.report import Report
+from ..model.response_field import ResponseField
 from ..model.sensor import Sensor
 from .contacts import ROUGH, Contact, channel_structure, differing, used
+from .field import seen_slopes
 from .lights import POORLY_CONSTRAINED_DEG
 
 WIDE = 0.86
 """Contact radius over the ball's, in the median over presses, from which sizes are wrong: it is 0.55 to 0.78 on eleven real and
 eight drawn sensors, 0.8 to 0.95 with a pitch that is twice too large. Presses that are all deep are no mistake."""
+
+RATHER_WIDE = 0.8
+"""The same, from which there is a warning: radii given for the diameters of balls that were pressed lightly reach 0.84."""
 
 WIDE_OUTLINE = 1.75
 """The same of the outline of the strong change of light: 0.54 to 1.61, and 1.4 to 3.2."""
@@ -38,6 +43,10 @@ USUAL_GAIN = 1.15
 MANY, DISAGREEING = 6, 1.8
 """From so many presses, and so many standard deviations of their gains about the median (RMS), presses disagree with each other:
 sets of right presses of ten real and eight drawn sensors have at most 1.64, with two balls exchanged or doubled 1.6 to 4.3."""
+
+UNSEEN = 0.6
+"""A direction of slopes of which a field finds less than this part of what it finds of the other is not seen: it is 0.86 to 1 on
+fifteen real and eight drawn sensors, 0.3 and 0.4 with LEDs on one line."""
 
 SAME_TYPE = 0.27
 """Median difference of a background from the prior's pattern, logarithm of the light, up to which a unit is of the prior's type: it
@@ -112,7 +121,8 @@ def to_diameters_by_others(used: Sequence[Contact]) -> list[str]:
         return []
     return [
         f"presses: by each other the balls seem {math.exp(-max(logs)):.2f} to {math.exp(-min(logs)):.2f} times as wide as given: "
-        "are diameters exchanged, or one given for two sizes? --candidates prints what each press says"
+        "are diameters exchanged, or one given for two sizes, or images saturated or compressed? --candidates prints what each "
+        "press says"
     ]
 
 
@@ -122,10 +132,10 @@ def to_sizes(contacts: Sequence[Contact], mm_per_pixel: float) -> str:
     One wrong diameter among right ones is found by the others (outliers.py). Where all are wrong by one factor, presses agree with
     each other: a field fitted to them makes the same mistake, and even promises more accuracy.
     """
-    located = [contact for contact in used(contacts) if not (contact.known and contact.radius_known)]
+    located = _located(contacts)
     if not located:
         return ""
-    wide = statistics.median(contact.contact_radius_mm / contact.radius_mm for contact in located)
+    wide = _width(located)
     outline = statistics.median(contact.outline_mm / contact.radius_mm for contact in located)
     if (wide < WIDE or len(located) < ENOUGH) and outline < WIDE_OUTLINE:
         return ""
@@ -133,6 +143,39 @@ def to_sizes(contacts: Sequence[Contact], mm_per_pixel: float) -> str:
         f"presses: expected contacts narrower than their balls, got contacts {wide:.2f} times as wide as the balls, and outlines "
         f"{outline:.2f} times (0.5 to 0.8, and 0.6 to 1.6, are usual): either mm_per_pixel, {mm_per_pixel:g}, is too large, "
         "or radii were given for diameters"
+    )
+
+
+def to_deep_presses(contacts: Sequence[Contact]) -> list[str]:
+    """Contacts that are as wide as those of deep presses, or of balls given by their radii."""
+    located = _located(contacts)
+    if len(located) < ENOUGH or _width(located) < RATHER_WIDE:
+        return []
+    return [
+        f"presses: contacts are {_width(located):.2f} times as wide as their balls (0.5 to 0.8 are usual): were radii given for "
+        "diameters, or balls pressed by more than two fifths of their radius?"
+    ]
+
+
+def _located(contacts: Sequence[Contact]) -> list[Contact]:
+    return [contact for contact in used(contacts) if not (contact.known and contact.radius_known)]
+
+
+def _width(contacts: Sequence[Contact]) -> float:
+    return statistics.median(contact.contact_radius_mm / contact.radius_mm for contact in contacts)
+
+
+def to_directions(field: ResponseField, used: Sequence[Contact]) -> str:
+    """Why slopes of one direction are not seen; "" where all are."""
+    _, parts, directions = torch.linalg.svd(seen_slopes(field, used))
+    seen = float(parts[1] / parts[0].clamp_min(1e-6))
+    if seen > UNSEEN:
+        return ""
+    angle = math.degrees(math.atan2(float(directions[1, 1]), float(directions[1, 0]))) % 180.0
+    return (
+        f"presses: expected colours that change with slopes of all directions, got slopes along {angle:.0f} degrees from x that "
+        f"are found {seen:.2f} times as large as those across (0.86 and more is usual): LEDs on one line show no slopes across it: "
+        "put one beside the line"
     )
 
 

@@ -12,7 +12,6 @@ examples:
 """
 
 import argparse
-import contextlib
 import csv
 import os
 from pathlib import Path
@@ -88,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"{NOT_METRIC}: {unit.report['objection']}")
     if arguments.pictures is None and report.rows > PICTURES_UP_TO:
         print(f"no pictures of more than {PICTURES_UP_TO} frames: --pictures --overwrite draws all, --every N fewer")
-    findings = diagnose_some(calibration, inputs, {name for name, _ in report.failed})
+    findings = diagnose_some(calibration, inputs, {name for name, _ in report.failed}, arguments.every)
     for name, finding in findings:
         print(f"{name}: {finding}")
     return 1 if report.failed or any(finding.severity == "fault" for _, finding in findings) else 0
@@ -148,22 +147,26 @@ def print_report(report: Report, out: Path, taught: TaughtRange | None) -> None:
     print(f"wrote {frames} to {out}{before}; table in frames.csv, units in summary.json")
 
 
-def diagnose_some(calibration: Path, inputs: list[Path], reported: set[str]) -> list[tuple[str, Finding]]:
+def diagnose_some(calibration: Path, inputs: list[Path], reported: set[str], every: int) -> list[tuple[str, Finding]]:
     """What is wrong with :data:`DIAGNOSED` images, and the first frame of each video; frames in ``reported`` are not.
 
     A finding is given once, with its first frame and how many more have it.
     """
     unit = load_calibration(calibration)
-    items = list(list_items(tuple(inputs) if len(inputs) > 1 else inputs[0]))
+    items = list(list_items(tuple(inputs) if len(inputs) > 1 else inputs[0], every))
     if len(items) > DIAGNOSED:
         items = list({item.file.parent: item for item in reversed(items)}.values())[::-1][:DIAGNOSED]
     found: dict[str, list[tuple[str, Finding]]] = {}
     for item in tqdm(items, desc="diagnosing", leave=False, disable=None):
         name = item.frame_name(0 if item.is_video else -1)
-        with contextlib.suppress(OSError, ValueError, StopIteration):
-            if name not in reported:
-                _, image = next(iter(read_frames(item.file)))
-                for finding in diagnose(None, unit.sensor.rectify(image[None])[0], unit):
-                    if finding.severity != "note":
-                        found.setdefault(finding.name, []).append((name, finding))
+        if name in reported:
+            continue
+        try:
+            _, raw = next(iter(read_frames(item.file)))
+            image = unit.sensor.rectify(raw[None])[0]
+        except (OSError, ValueError, StopIteration):  # named where it was to be reconstructed
+            continue
+        for finding in diagnose(None, image, unit):
+            if finding.severity != "note":
+                found.setdefault(finding.name, []).append((name, finding))
     return [(same[0][0] + (f" and {len(same) - 1} more" if len(same) > 1 else ""), same[0][1]) for same in found.values()]

@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     training, held_out = fit.history[fit.best_epoch]
     fit.module.save(arguments.out)
-    print(f"{len(presses)} presses, {sum(p.numel() for p in fit.module.parameters())} weights, seed {arguments.seed}")
+    print(f"{sum(p.numel() for p in fit.module.parameters())} weights, seed {arguments.seed}")
     print(f"RMS error of the slopes' angles: training {training:.2f} deg, held out {held_out:.2f} deg")
     print(fit.message)
     print(f"wrote {arguments.out}: torchvts reconstruct unit.safetensors INPUT --network {arguments.out} --out FOLDER uses it")

@@ -1,7 +1,7 @@
 """A frame in C, and the sums of tracking: a library behind ctypes, which ``pipeline/frozen.py`` and ``pose/`` use."""
 
-from .binding import library
+from .binding import library, why_no_library
 from .blocks import NotCompiled, check_block
 from .plan import IN_PYTORCH, Plan, ends
 
-__all__ = ["IN_PYTORCH", "NotCompiled", "Plan", "check_block", "ends", "library"]
+__all__ = ["IN_PYTORCH", "NotCompiled", "Plan", "check_block", "ends", "library", "why_no_library"]

@@ -36,7 +36,7 @@ _TYPES: dict[str, Any] = {
 
 @functools.cache
 def library() -> ctypes.CDLL | None:
-    """The compiled library; None where no C compiler was at hand when this package was installed: then PyTorch does its work."""
+    """The compiled library; None where there is none for this machine (:func:`why_no_library`): then PyTorch does its work."""
     try:
         loaded = ctypes.CDLL(str(LIBRARY))
         built_from = int(loaded.sources())
@@ -50,6 +50,13 @@ def library() -> ctypes.CDLL | None:
         function = getattr(loaded, name)
         function.restype, function.argtypes = _TYPES[result], [_TYPES[letter] for letter in arguments]
     return loaded
+
+
+def why_no_library() -> str:
+    """Why :func:`library` gave none."""
+    if not LIBRARY.exists():
+        return "no C compiler was at hand when torchvts was installed"
+    return f"{LIBRARY} cannot be loaded on this machine, or was built from other sources: install again"
 
 
 def loaded() -> ctypes.CDLL:

@@ -45,6 +45,13 @@ def band_of_ratios(light: Tensor, side_px: float, pedestal: float) -> Tensor:
     return blur(log, gaussian_weights(side_px / 40.0)) - blur(log, gaussian_weights(side_px / 16.0))
 
 
+def without_margin(values: Tensor) -> Tensor:
+    """The inner part of (..., H, W), without 0.14 of the height on each side, where the blurs of a band meet the border."""
+    height, width = values.shape[-2:]
+    margin = min(round(0.14 * height), (min(height, width) - 1) // 2)
+    return values[..., margin : height - margin, margin : width - margin]
+
+
 def _shifted_sum(padded: Tensor, weights: list[float], dim: int) -> Tensor:
     length = padded.shape[dim] - len(weights) + 1
     total = padded.narrow(dim, 0, length) * weights[0]

@@ -340,7 +340,7 @@ def parse_number(text: str) -> float:
     word = text.strip()
     number = float(word) if _NUMBER.fullmatch(word) else math.nan
     if not math.isfinite(number):
-        raise ValueError(f"expected a number, got {brief(text)}")
+        raise ValueError(f"expected a number, got {brief(text)}{': write a decimal point' if ',' in text else ''}")
     return number
 
 

@@ -86,7 +86,7 @@ def write_result(path: str | Path, output: DepthOutput, mm_per_pixel: float, cal
     arrays = {name: values[0] if MAPS[name][0] == 1 else values for name, values in arrays.items()}
     facts = {"mm_per_pixel": np.float64(mm_per_pixel), "frames": np.array([frame])}
     texts = {"calibration": calibration, "sensor": sensor, "units": json.dumps(UNITS)}
-    with write_atomically(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+    with write_atomically(path) as temporary, _archive(temporary) as archive:
         for name, values in {**arrays, **facts, **{name: np.array(text) for name, text in texts.items()}}.items():
             _write_array(archive, name, [np.asarray(values)], None)
         _write_array(archive, "format", [np.asarray(FORMAT)], None)
@@ -99,7 +99,7 @@ def join_results(path: str | Path, parts: Sequence[Path]) -> None:
         path: the file, ending in .npz.
         parts: files of :func:`write_result`, in order.
     """
-    with write_atomically(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+    with write_atomically(path) as temporary, _archive(temporary) as archive:
         with np.load(parts[0]) as first:
             shared = {name: first[name] for name in ("mm_per_pixel", "calibration", "sensor", "units", "format")}
         for name, values in shared.items():
@@ -115,12 +115,13 @@ def _part(path: Path, name: str) -> Array:
     return values
 
 
+def _archive(path: Path) -> zipfile.ZipFile:
+    return zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
+
+
 def _write_array(archive: zipfile.ZipFile, name: str, arrays: Any, count: int | None) -> None:
     """One array of an npz; with ``count``, that many arrays of one shape along a new first axis."""
-    entry = zipfile.ZipInfo(f"{name}.npy")  # of a fixed date: the same values give the same bytes
-    entry.compress_type = zipfile.ZIP_DEFLATED
-    entry._compresslevel = 1  # type: ignore[attr-defined]
-    with archive.open(entry, "w", force_zip64=True) as stream:
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:  # of a fixed date: the same values give the same bytes
         for number, values in enumerate(arrays):
             if number == 0:
                 shape = values.shape if count is None else (count, *values.shape)

@@ -12,7 +12,7 @@ _KINDS = (bool, int, float, str)
 
 
 def settings(module: nn.Module) -> dict[str, object]:
-    """Numbers, texts and tuples of them that a tree of modules holds as plain attributes, by name such as "compensate.gamma".
+    """Numbers, texts and sequences of them that a tree of modules holds as plain attributes, by name such as "compensate.gamma".
 
     Example:
         >>> from torchvts import PoissonDCT
@@ -22,7 +22,8 @@ def settings(module: nn.Module) -> dict[str, object]:
     found: dict[str, object] = {}
     for place, part in module.named_modules():
         for name, value in vars(part).items():
-            plain = isinstance(value, _KINDS) or (isinstance(value, tuple) and all(isinstance(item, _KINDS) for item in value))
+            items = value if isinstance(value, tuple | list) else (value,)
+            plain = all(isinstance(item, _KINDS) for item in items)
             if plain and not name.startswith("_") and name != "training":
                 found[f"{place}.{name}" if place else name] = list(value) if isinstance(value, tuple) else value
     return found
@@ -56,4 +57,6 @@ def _alike(one: object, other: object) -> bool:
     """Equal; numbers up to what another machine rounds otherwise."""
     if isinstance(one, float) and isinstance(other, float):
         return math.isclose(one, other, rel_tol=1e-5)
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(_alike, one, other))
     return one == other

@@ -56,7 +56,7 @@ class OtherView(NamedTuple):
 
     def in_words(self) -> str:
         """Such as "is turned by 180 degrees: with that undone it differs from the background by 2%, else by 31%"."""
-        or_light = ", or its light has changed" if self.cropped else ""
+        or_light = ", or its light has changed, or an object covers most of it" if self.cropped else ""
         return (
             f"{self.what}{or_light}: with that undone it differs from the background by {self.undone:.0%}, else by {self.same:.0%}"
         )

@@ -107,16 +107,18 @@ def _item(file: Path, prefix: str, stem: str) -> Item:
 
 def _several(source: tuple[Path, ...]) -> Iterator[Item]:
     """Items of several files and folders; a file that is named twice, or lies in a folder named too, comes once."""
-    root = Path(os.path.commonpath([path.resolve().parent for path in source]))
+    named = [Path(os.path.abspath(path)) for path in source]  # "." and ".." by their names
+    places = [(path.parent.resolve(), path) for path in named]
+    root = Path(os.path.commonpath([folder for folder, _ in places]))
     groups: dict[Path, list[str]] = {}
-    for path in source:
-        groups.setdefault(path.resolve().parent, []).append(path.name)
+    for folder, path in places:
+        groups.setdefault(folder, []).append(path.name)
     stems = {folder: output_stems([name for name in names if not (folder / name).is_dir()]) for folder, names in groups.items()}
     seen: set[str] = set()
-    for path in source:
-        folder = path.resolve().parent
+    for folder, path in places:
         prefix = "" if folder == root else f"{folder.relative_to(root).as_posix()}/"
-        found = _walk(path, f"{prefix}{path.name}/") if path.is_dir() else [_item(path, prefix, stems[folder][path.name])]
+        within = f"{prefix}{path.name}/" if path.name else ""
+        found = _walk(path, within) if path.is_dir() else [_item(path, prefix, stems[folder][path.name])]
         for item in found:
             if item.path not in seen:
                 seen.add(item.path)

@@ -60,6 +60,8 @@ def blockiness(image: Tensor) -> tuple[float, float]:
         limit = 2.5 * jump.median().clamp_min(1e-9)
         columns = jump.clamp_max(float(limit)).mean(0)  # one jump per column border
         whole = columns.shape[0] // BLOCK * BLOCK
+        if whole == 0:
+            continue
         phases = columns[:whole].reshape(-1, BLOCK).median(0).values
         best = int(phases.argmax())
         others = torch.cat((phases[:best], phases[best + 1 :]))

@@ -302,18 +302,19 @@ def _deep_press(e: Examination) -> Figures | None:
 
 # ---- the table -----------------------------------------------------------------------------------------------------------------
 
-_CONTACT = "contact in the {} image: take it again with nothing touching the skin"
+_CONTACT = "contact in the {} image, or {}: take it again with nothing touching the skin"
 
 CHECKS = (
     # the calibration
     Check("calibration_saturated", _clipped_at_calibration,
           "{value:.0%} of the calibration image is saturated: reduce the exposure and calibrate again", above=SATURATED_SHARE),
-    Check("contact_in_calibration", _contact_at_calibration, _CONTACT.format("calibration"), "fault"),
+    Check("contact_in_calibration", _contact_at_calibration, _CONTACT.format(
+        "calibration", "LEDs that the lights do not fit, for which presses of a ball help"), "fault"),
     Check("lights_coplanar", _coplanar, "the lights lie nearly in one plane (smallest singular value of their directions "
           "{value:.2f}, usual is 0.8): noise alone changes normals by {cost:.1f} degrees; increase the distance of the LEDs"),
     Check("lights_misfit", _light_at_calibration),
     # the background of now
-    Check("contact_in_background", _contact_in_background, _CONTACT.format("background"), "fault"),
+    Check("contact_in_background", _contact_in_background, _CONTACT.format("background", "in the calibration's"), "fault"),
     Check("light_changed", _light_of_background),
     # the camera
     Check("few_bits", _bits, "the {which} has only {value:.0f} bits: rounding changes normals by {cost:.1f} degrees; read the "
@@ -340,7 +341,8 @@ CHECKS = (
     Check("new_spots", _spots, "{value:.0f} spots that were not there at calibration ({share:.1%} of the image{dead}): clean the "
           "skin, or recalibrate", lambda figures: "warning" if figures["share"] > 0.001 else "note"),
     Check("skin_changed", _wear, "the skin's brightness has changed by {value:.1%} (RMS), unevenly and nearly equally "
-          "in all channels: worn, stained or dirty, or the camera has moved; clean it, or recalibrate", above=0.0),
+          "in all channels: worn, stained or dirty, light from outside, or the camera has moved; clean and shade it, or "
+          "recalibrate", above=0.0),
     Check("blurred", _texture_lost, "the image is blurred or moved: {value:.0%} of the skin's fine texture is lost; focus, clean "
           "the lens, mount the camera firmly", above=0.6),
     Check("specular", lambda e: _length(e, 1.0), "{value:.0%} of the contact is brighter than any matt slope: the skin is "

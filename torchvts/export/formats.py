@@ -1,7 +1,7 @@
 """The writers: a pipeline as one file in TorchScript, torch.export or ONNX.
 
-Every file takes images (B, 3, H, W) of the pipeline's size, any B, and returns depth_mm, gradient, normal, contact and
-deformed in that order.
+Every file takes images (B, 3, H, W) of the pipeline's size, any B (at most 1024 by torch.export), and returns depth_mm,
+gradient, normal, contact and deformed in that order.
 """
 
 import copy

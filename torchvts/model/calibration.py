@@ -71,7 +71,7 @@ class Calibration:
     Raises:
         TypeError: a field of another type.
         ValueError: lights, background, noise or ambient light of another shape, or not finite; a background without light; lights
-            whose image has nothing to do with the background.
+            and a response together, or neither.
     """
 
     sensor: Sensor
@@ -117,6 +117,8 @@ class Calibration:
             raise ValueError(f"noise_std: expected finite values above 0, got {self.noise_std.tolist()}")
         if self.lights is None and self.response is None:
             raise ValueError("lights, response: expected one of them, got none: a calibration without a model")
+        if self.lights is not None and self.response is not None:
+            raise ValueError("lights, response: expected one of them, got both: which of the two should give the normals?")
         if not self.measured:
             return
         if not bool((self.background > self.light_noise_std).any()):

@@ -361,7 +361,8 @@ def _read_table(path: Path, columns: tuple[str, ...]) -> list[tuple[int, dict[st
         raise ValueError(f"{path}: empty: expected the line {expected} and one line for every press")
     header = lines[0][1]
     if sorted(header) != sorted(columns):
-        raise ValueError(f"{path}: expected the columns {expected}, got {','.join(header)}: is it a table of another tool?")
+        cause = "write commas, and decimal points" if ";" in header[0] else "is it a table of another tool?"
+        raise ValueError(f"{path}: expected the columns {expected}, got {','.join(header)}: {cause}")
     if len(lines) == 1:
         raise ValueError(f"{path}: no presses: expected one line for every press below {expected}")
     for line, cells in lines[1:]:

@@ -35,7 +35,7 @@ class PointLights(nn.Module):
     ) -> None:
         super().__init__()
         position, rho = _numbers("position_mm", position_mm), _numbers("albedo", albedo)
-        dtype = torch.promote_types(torch.promote_types(position.dtype, rho.dtype), torch.get_default_dtype())
+        dtype = torch.promote_types(torch.promote_types(position.dtype, rho.dtype), torch.float32)
         position, rho = position.to(dtype), rho.to(dtype)
         if tuple(position.shape) != (3, 3):
             raise ValueError(f"position_mm: expected (3, 3), rows R, G, B, got {tuple(position.shape)}")
@@ -86,7 +86,7 @@ class PointLights(nn.Module):
 
 def _numbers(name: str, values: object) -> Tensor:
     try:
-        tensor = torch.as_tensor(values)
+        tensor = torch.as_tensor(values, dtype=torch.float32 if isinstance(values, list | tuple) else None)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise TypeError(f"{name}: expected numbers, got {brief(values)}: a tensor, or lists of floats") from error
     check_tensor(name, tensor)

@@ -177,7 +177,9 @@ class ShadowedPixels(nn.Module):
         self.follow(flat, inverse)
         if saturated_above is not None:
             check_shape("saturated_above", saturated_above, flat.shape)
-        above = torch.full_like(flat, torch.inf) if saturated_above is None else saturated_above.detach().to(flat.dtype).contiguous()
+        above = (
+            torch.full_like(flat, torch.inf) if saturated_above is None else saturated_above.detach().to(flat.dtype).contiguous()
+        )
         self.register_buffer("saturated_above", above)
 
     def follow(self, flat: Tensor, inverse: Tensor) -> None:

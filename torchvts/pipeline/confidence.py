@@ -6,6 +6,7 @@ that are not integrable, dark or saturated channels, deformation too faint for t
 wrong pitch, a camera that is not orthographic, a calibration of another unit.
 """
 
+import copy
 import math
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -547,7 +548,7 @@ class ConfidentPipeline(nn.Module):
         check_record("pipe", pipe, DepthPipeline, "DepthPipeline.from_calibration makes one")
         check_record("confidence", confidence, Confidence, "Confidence.from_calibration makes one")
         self.pipe = pipe
-        self.confidence = confidence
+        self.confidence = confidence = copy.copy(confidence)  # whose number below is of this pipeline
         if isinstance(pipe.mask, ContactMask):
             confidence.detected = pipe.mask.sigmas
 

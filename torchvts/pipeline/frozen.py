@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ..compensate import Compensate
-from ..compiled import IN_PYTORCH, NotCompiled, Plan, check_block, ends, library
+from ..compiled import IN_PYTORCH, NotCompiled, Plan, check_block, ends, library, why_no_library
 from ..compiled import blocks as compiled
 from ..compiled.plan import Values
 from ..core.checks import check_batch, check_range, check_record, check_same_size, in_range
@@ -201,7 +201,7 @@ def plan_of(pipe: DepthPipeline) -> tuple[Plan, tuple[int, int]]:
         NotCompiled: what has no compiled form.
     """
     if library() is None:
-        raise NotCompiled("there is no compiled library: no C compiler was at hand when torchvts was installed")
+        raise NotCompiled(f"there is no compiled library: {why_no_library()}")
     check_block("pipe", pipe, DepthPipeline)
     for name, tensor in (*pipe.named_parameters(), *pipe.named_buffers()):
         if not tensor.is_cpu or (tensor.is_floating_point() and tensor.dtype != torch.float32):

@@ -18,7 +18,7 @@ from ..calibration import (
     calibrate,
     channel_structure,
 )
-from ..core.blur import band_of_ratios
+from ..core.blur import band_of_ratios, without_margin
 from ..core.cells import whole_cell_means
 from ..core.checks import check_batch, check_image, check_integer, check_path, check_positive, check_sequence, parse_number
 from ..core.files import VIDEO_SUFFIXES, read_frames
@@ -110,8 +110,7 @@ def _structure_deg(image: Tensor, sensor: Sensor, prior: SensorPrior) -> float:
     height = sensor.height
     band = band_of_ratios(image[None].float() ** sensor.exponent, height, PEDESTAL)
     normals = NormalFromResponse(prior.response.field, None, height, sensor.width, sensor.mm_per_pixel)
-    margin = round(0.14 * height)
-    upright = normals(band.exp())[0, 2, margin:-margin, margin:-margin]
+    upright = without_margin(normals(band.exp())[0, 2])
     return math.degrees(math.acos(min(1.0, float(upright.flatten().quantile(0.01)))))
 
 
@@ -180,7 +179,8 @@ def read_press_images(presses: Sequence[tuple[str | Path, float | str]], sensor:
         try:
             diameter_mm = check_positive("press", parse_number(diameter) if isinstance(diameter, str) else diameter)
         except (TypeError, ValueError):
-            raise ValueError(f"press: expected the diameter of the ball in mm after {path}, got {diameter!r}") from None
+            hint = ": write a decimal point" if "," in str(diameter) else ""
+            raise ValueError(f"press: expected the diameter of the ball in mm after {path}, got {diameter!r}{hint}") from None
         found.append(Press(sensor.read_image(path), diameter_mm, name))
     return found
 

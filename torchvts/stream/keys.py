@@ -36,11 +36,14 @@ class Keys:
         import termios
         import tty
 
-        if os.tcgetpgrp(self._fd) != os.getpgrp():  # in the background: reading would stop the process
-            self._fd = None
-            return self
-        self._terminal = termios.tcgetattr(self._fd)
-        tty.setcbreak(self._fd)
+        try:
+            if os.tcgetpgrp(self._fd) == os.getpgrp():  # not in the background, where reading would stop the process
+                self._terminal = termios.tcgetattr(self._fd)
+                tty.setcbreak(self._fd)
+                return self
+        except (OSError, termios.error):  # a terminal that does not control this process
+            pass
+        self._fd = None
         return self
 
     def __exit__(self, *_: object) -> None:

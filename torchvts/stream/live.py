@@ -123,8 +123,8 @@ class TactileStream:
             self._frames = SourceFrames(self.reader, background_frames, realtime, self.stages)
             self._sensor, self._size = sensor, self._frames.readable[0].shape[:2]
             first = torch.cat([self._rectified(pixels) for pixels in self._frames.readable])
-            codec: str = getattr(self.reader, "codec", "")
-            self.calibration, self.note, self.metric = _calibrated(first, sensor_or_calibration, presses, codec)
+            self._codec: str = getattr(self.reader, "codec", "")
+            self.calibration, self.note, self.metric = _calibrated(first, sensor_or_calibration, presses, self._codec)
             self._start = partial(
                 Recording,
                 mode=mode,
@@ -133,7 +133,7 @@ class TactileStream:
                 network=network,
                 device=device,
                 contact=contact,
-                codec=codec,
+                codec=self._codec,
                 stage=self.stages.stage,
             )
             self._use(self._start(self.calibration, first=first if background_frames > 0 else None))
@@ -173,7 +173,7 @@ class TactileStream:
         first = torch.cat(self._zero)
         self._zero = []
         try:
-            background = find_background(first, self.calibration.sensor).clamp(0.0, 1.0)
+            background = find_background(first, self.calibration.sensor, self._codec).clamp(0.0, 1.0)
             calibration = with_background(self.calibration, background)
             self._use(self._start(calibration, first=first))
         except ValueError as error:

@@ -79,6 +79,7 @@ class CaptureReader:
 
         self.live = not isinstance(source, Path)
         self.name = f"camera {source}" if isinstance(source, int) else str(source)
+        self.times = list(read_times(source).values()) if isinstance(source, Path) else []
         if isinstance(source, Path):
             self._capture = open_video(source)
         else:
@@ -98,7 +99,6 @@ class CaptureReader:
         if self.live:
             self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         self.fps = frames_a_second(self._capture)
-        self.times = list(read_times(source).values()) if isinstance(source, Path) else []
         self.fps = rate_of(self.times, self.fps)
         self.codec = lossy_codec(self._capture)
 
@@ -255,7 +255,7 @@ def read_times(recording: Path) -> dict[str, float]:
     if not path.is_file():
         return {}
     try:
-        head, *lines = path.read_text(encoding="utf-8").split()
+        head, *lines = filter(None, path.read_text(encoding="utf-8").splitlines())
         found = {name: parse_number(time_s) for name, time_s, *_ in (line.split(",") for line in lines)}
         if head.startswith("frame,time_s") and all(a < b for a, b in pairwise(found.values())):
             return found

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ..calibration import RESPONSE_BLUR_PX, CalibrationWarning, Press, calibrate
+from ..calibration.presses import check_presses
 from ..compensate import Compensate
 from ..core.checks import check_image
 from ..model import Calibration, Sensor
@@ -28,7 +29,7 @@ class Training:
 
     def __init__(self, background: Tensor, presses: Sequence[Press], sensor: Sensor) -> None:
         self.background, self.sensor = background, sensor
-        self.presses = [without_labels(press) for press in presses]
+        self.presses = [without_labels(press) for press in check_presses(presses, sensor)]
 
     @cached_property
     def _attempt(self) -> Calibration | Exception:
@@ -50,18 +51,21 @@ class Training:
         return self if self.sensor.prior is None else Training(self.background, self.presses, self.sensor.without_prior())
 
     @cached_property
-    def located(self) -> list[Press]:
-        """The presses that the calibration used, with the centres and contact radii that it found."""
+    def found(self) -> list[Press | None]:
+        """The presses with the centres and contact radii that the calibration found; None where it left one out."""
         if not self.presses:
             raise ValueError("presses: expected at least one to learn from, got none")
-        used = {row["name"]: row for row in self.calibration.report["presses"] if row["used"]}
         return [
-            dataclasses.replace(
-                press, center_px=tuple(used[press.name]["center_px"]), contact_radius_px=used[press.name]["contact_radius_px"]
-            )
-            for press in self.presses
-            if press.name in used
+            dataclasses.replace(press, center_px=tuple(row["center_px"]), contact_radius_px=row["contact_radius_px"])
+            if row["used"]
+            else None
+            for press, row in zip(self.presses, self.calibration.report["presses"], strict=True)
         ]
+
+    @property
+    def located(self) -> list[Press]:
+        """The presses that the calibration used, with the centres and contact radii that it found."""
+        return [press for press in self.found if press is not None]
 
 
 class TrainingPixels(NamedTuple):
@@ -87,10 +91,11 @@ def without_labels(press: Press) -> Press:
 
 def with_centers(background: Tensor, sensor: Sensor, presses: Sequence[Press]) -> list[Press]:
     """The presses with centre and contact radius; where there is no centre, ``calibrate`` locates the balls."""
-    bare = [press for press in presses if press.center_px is None]
-    located = {press.name: press for press in Training(background, bare, sensor).located} if bare else {}
-    known = [located.get(press.name, press) for press in presses]
-    return [press for press in known if press.center_px is not None and press.contact_radius_px is not None]
+    named = check_presses(presses, sensor)
+    bare = [k for k, press in enumerate(named) if press.center_px is None]
+    found = dict(zip(bare, Training(background, [named[k] for k in bare], sensor).found)) if bare else {}
+    known = [found.get(k, press) for k, press in enumerate(named)]
+    return [press for press in known if press is not None and press.contact_radius_px is not None]
 
 
 def quiet_calibrate(
@@ -150,11 +155,16 @@ def train_network(
         ValueError, TypeError: see :func:`torchvts.calibrate` and :func:`torchvts.training.fit_mlp`.
     """
     check_image("background", background, sensor.height, sensor.width, sensor.name)
-    for press in presses:
-        check_image(f"{press.name}: image", press.image, sensor.height, sensor.width, sensor.name)
-    known = with_centers(background, sensor.without_prior(), presses)
+    named = check_presses(presses, sensor)
+    labelled = [press.center_px is not None and press.contact_radius_px is not None for press in named]
+    found = named if all(labelled) else Training(background, named, sensor.without_prior()).found
+    known = [given if there else here for given, here, there in zip(named, found, labelled)]
+    kept = [press for press in known if press is not None]
+    if lost := len(named) - len(kept):
+        text = f"presses: {lost} of {len(named)} left out: no clean ball is found in them: torchvts calibrate says why"
+        warnings.warn(text, CalibrationWarning, stacklevel=2)
     compensate = Compensate(blur_px=blur_px)
-    pixels = training_pixels(compensate, known, sensor.mm_per_pixel)
+    pixels = training_pixels(compensate, kept, sensor.mm_per_pixel)
     flat = compensate(background[None])[0].clamp(0, 1)
     intensity, xy, slope, group = pixels
     options: dict[str, Any] = {"seed": seed, "max_epochs": max_epochs, "progress": progress, "blur_px": blur_px}

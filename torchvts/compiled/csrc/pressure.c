@@ -74,7 +74,7 @@ static float frame_pressure(const Plan *plan, const float *depth, const float *p
             if (depth[at] > deep) some[n++] = pressure[at];
         }
     const int below = (int)ceilf((float)plan->large * (float)n) - 1;
-    return n ? sorted(some, some + n, n)[below < 0 ? 0 : below] : 0.0f;
+    return n ? sorted(some, some + n, n)[below < 0 ? 0 : below < n ? below : n - 1] : 0.0f;
 }
 
 /* Sums of 2 `reach` + 1 lines each `step` floats behind the last. */

@@ -439,12 +439,17 @@ def test_defaults_of_torch_change_nothing(kind, tmp_path):
     pipe = vts.DepthPipeline.from_calibration(calibration, "auto")
     expected = pipe.freeze()(images)
     calibration.save(tmp_path / "unit.safetensors")
+
+    def loaded():
+        return vts.DepthPipeline.from_calibration(vts.Calibration.load(tmp_path / "unit.safetensors"), "auto")(images)
+
+    before = loaded()
     try:
         torch.set_default_dtype(torch.float64)
         assert all(map(torch.equal, pipe.freeze()(images), expected))
-        loaded = vts.DepthPipeline.from_calibration(vts.Calibration.load(tmp_path / "unit.safetensors"), "auto")
-        assert loaded(images).depth_mm.dtype == torch.float32
-        assert float((loaded(images).depth_mm - expected.depth_mm).abs().max()) < DEPTH_MM
+        again = loaded()
+        assert again.depth_mm.dtype == torch.float32
+        assert float((again.depth_mm - before.depth_mm).abs().max()) < DEPTH_MM
         assert vts.PointLights([[20, 9, 30], [-18, 13, 30], [-2, -22, 30]], [900, 900, 900]).albedo.dtype == torch.float32
     finally:
         torch.set_default_dtype(torch.float32)
@@ -626,10 +631,3 @@ def test_a_library_that_does_not_load_is_said_so(tmp_path, monkeypatch):
     assert binding.library.__wrapped__() is None and "cannot be loaded" in binding.why_no_library()
     damaged.unlink()
     assert "no C compiler" in binding.why_no_library()
-
-
-def test_a_setting_beyond_its_range_stays_within_the_frame(unit):
-    calibration, images = unit
-    pipe = vts.DepthPipeline.from_calibration(calibration)
-    pipe.contact.large = 1.8
-    assert int((pipe.freeze()(images).contact != pipe(images).contact).sum()) <= 2 * len(images)

@@ -400,6 +400,15 @@ def count_frames(source: str | Path) -> int:
     return 1
 
 
+def cut_short(path: Path, count: int) -> str:
+    """What to say of a video of which fewer frames could be read than its header announces; "" where it is whole.
+
+    Containers that hold no number give one by length and rate, which is some frames off.
+    """
+    announced = count_frames(path)
+    return f"cut short? it announces {announced} frames, {count} could be read" if count < 0.9 * announced - 1 else ""
+
+
 def open_video(path: Path) -> Any:
     """OpenCV's capture of a video file, which may not be opened.
 

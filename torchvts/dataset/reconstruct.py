@@ -28,12 +28,13 @@ from tqdm import tqdm
 
 from ..core import __version__
 from ..core.checks import check_choice, check_integer, check_path, check_sequence, in_one_line
-from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, count_frames
+from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, count_frames, cut_short
 from ..model import Calibration
 from ..pipeline import MODES, DepthOutput, unit_pipeline
 from ..pose.output_frame import MM_OF
 from ..skin import ContactSettings
 from ..stream import FIRST_FRAMES, Recording, check_device, video_codec
+from ..stream.follow_light import NO_CONTACT
 from .items import Item, Source, list_items
 from .loading import Frame, load_frames
 from .processes import share, sum_over_processes
@@ -53,7 +54,7 @@ class Report(NamedTuple):
         before: how many of them an earlier run had done.
         failed: (name, reason) of the frames that were left out.
         seconds: from the first frame until all processes had finished.
-        notes: (name, text) of videos whose first frames were not used, and why.
+        notes: (name, text) of what else is to be known: videos whose first frames were not used, frames in another light.
     """
 
     rank: int
@@ -192,6 +193,8 @@ def _check_source(source: Source, out: Path) -> None:
 NAMED = 5
 """So many frames that cannot be used are named at once, by each process; a folder of another sensor's has thousands."""
 
+NOT_TO_BE_TRUSTED = ": depth is not to be trusted; torchvts diagnose says what has changed"
+
 _Reconstructed = tuple[Frame, Tensor | None, DepthOutput | None]
 """A frame, its image in the light of the background, and its depth."""
 
@@ -210,6 +213,7 @@ class _Worker:
         )
         self.image = self.recording(follow=False)
         self.notes: list[tuple[str, str]] = []
+        self.in_other_light: list[str] = []
         self.done = self.failed = 0
 
     def run(self, batch: int, workers: int | None) -> Report:
@@ -237,6 +241,9 @@ class _Worker:
         seconds = time.perf_counter() - start
         if rank > 0:
             return Report(rank, 0, 0, [], seconds)
+        if self.in_other_light:
+            more = f", as of {len(self.in_other_light) - 1} more" if len(self.in_other_light) > 1 else ""
+            self.notes.append((self.in_other_light[0], f"the light is not that of the calibration{more}{NOT_TO_BE_TRUSTED}"))
         self.records.join_videos()
         rows, failed = self.records.write_tables()
         self.writer.write_summary(rows, len(failed))
@@ -265,6 +272,10 @@ class _Worker:
                         yield found
                 held = []
             if frame.length is not None:
+                if recording is not None and recording.light.steps:
+                    self.notes.append((frame.item.path, f"the light has stepped{NOT_TO_BE_TRUSTED}"))
+                if text := cut_short(frame.item.file, frame.length):
+                    self.notes.append((frame.item.path, text))
                 yield frame, None, None
 
     def _recording(self, item: Item, held: Sequence[tuple[Frame, Tensor]]) -> Recording:
@@ -289,6 +300,9 @@ class _Worker:
             reason = recording.unusable(image)
             if reason:
                 return frame._replace(failed=reason), None, None
+            check = recording.check
+            if recording is self.image and check is not None and check.light_off(image) > NO_CONTACT:
+                self.in_other_light.append(frame.item.frame_name(frame.number))
             return frame, *recording(image, frame.time_s, solve=frame.mine and not frame.done)
         except ValueError as error:
             return frame._replace(failed=in_one_line(error)), None, None

@@ -170,7 +170,9 @@ def _unusable(e: Examination) -> Finding | None:
 
 
 def _failed(e: Examination) -> Figures:
-    return {"value": float(len(e.failed)), "colors": " and ".join(CHANNELS[j] for j in e.failed)}
+    rough = "with two LEDs left modes precise and auto still find a rough depth, with one none does"
+    left = "the response of this unit needs all of them" if e.unit.lights is None else rough
+    return {"value": float(len(e.failed)), "colors": " and ".join(CHANNELS[j] for j in e.failed), "left": left}
 
 
 def _saturated(e: Examination) -> Figures | None:
@@ -325,8 +327,8 @@ CHECKS = (
           lambda figures: by_cost(figures["cost"])),
     Check("noise", _noise, "noise of {value:.3f}, {ratio:.1f} times that at calibration, changes normals by {cost:.1f} degrees: "
           "more light, less gain, or average several frames", lambda figures: by_cost(0.5 * figures["cost"])),
-    Check("led_failed", _failed, "the {colors} LED has failed (its channel is black everywhere): check LED and cable; with "
-          "two LEDs left modes precise and auto still find a rough depth, with one none does", "fault", above=0.0, last=True),
+    Check("led_failed", _failed, "the {colors} LED has failed (its channel is black everywhere): check LED and cable; "
+          "{left}", "fault", above=0.0, last=True),
     Check("no_picture", _unusable, last=True),
     Check("saturated", _saturated, "the image is saturated in {where}: reduce the exposure",
           lambda figures: "note" if figures["value"] < 0.1 else "fault" if figures["inside"] > 0.3 else "warning", above=0.02),

@@ -1,5 +1,6 @@
 """A change of light as a finding: what it is, by how much, what to do, and how severe it is."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -14,6 +15,9 @@ LEAST_EFFECT = 0.05
 
 MISFIT = 0.05
 """The same of a calibration's image, which its lights should explain, from which it is a warning whatever it costs."""
+
+NO_LEVEL = 1.0 / 255.0
+"""Light added everywhere that is none, beside another exposure."""
 
 WORDS = {
     "exposure": ("exposure", "the image is {size:.1%} {brighter}: exposure or LEDs; recalibrate", "ratio"),
@@ -53,8 +57,10 @@ def in_words(change: Change, which: str, examination: Examination) -> Finding | 
         return None  # a press that scatters light, or one that covers the skin, looks the same
     cost_deg = examination.cost_deg(change, which == "calibration")
     severity = by_cost(cost_deg)
-    kind = change.kind.name
-    if kind == "ambient" and float(change.parameters[:3].mean()) <= 0:
+    kind, parameters = change.kind.name, change.parameters
+    if kind == "ambient" and len(parameters) > 3 and float(parameters[:3].abs().max()) < NO_LEVEL:
+        kind, change = "exposure", dataclasses.replace(change, parameters=parameters[3:].log1p())
+    elif kind == "ambient" and float(change.parameters[:3].mean()) <= 0:
         kind = "black"
     elif kind == "light_field" and which == "calibration":
         kind = "lights_misfit"

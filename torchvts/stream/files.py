@@ -86,9 +86,13 @@ class StreamReport:
         lines.append("median ms: " + ", ".join(f"{name} {ms:.1f}" for name, ms in values["stages_ms"].items()))
         unit = "mm" if values["metric"] else "mm (NOT METRIC)"
         lines.append(f"contact in {values['contact_frames']} frames, deepest {values['deepest_mm']:.3f} {unit}")
-        lines.append("light at the end, R G B: " + " ".join(f"{v:.3f}" for v in values["light_level"]) + " of the background's")
+        when = "at the end" if self.stream.light.state == "following" else "when last followed"
+        lines.append(f"light {when}, R G B: " + " ".join(f"{v:.3f}" for v in values["light_level"]) + " of the background's")
         if values["light_steps"]:
-            lines.append(f"the light stepped {values['light_steps']} times (frames marked 'stepped' in frames.csv): not learned")
+            lines.append(
+                f"the light stepped {values['light_steps']} times (frames marked 'stepped' in frames.csv): not learned, their "
+                "depth is not to be trusted; torchvts diagnose says what has changed"
+            )
         return "\n".join(lines)
 
     def save(self, folder: Path) -> None:

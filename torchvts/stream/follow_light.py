@@ -19,6 +19,10 @@ LIGHT_STEP = 0.03
 RECOVERY_S = 1.0
 """After a contact the gel takes this long to come back; an apparent change of light until then is not a step."""
 
+NO_CONTACT = 0.25
+"""A change of a channel's level that is not from a contact: contacts of thirteen real sensors make at most 0.05, on one whose
+images are saturated 0.16."""
+
 LEAST_FREE = 0.25
 """Share of the skin that must be free of contact for the light to be measured on it."""
 
@@ -34,8 +38,9 @@ class FollowLight:
     * The plane is fitted to the other cells robustly (Tukey) and moves by 1 - exp(-dt / :data:`TIME_CONSTANT_S`) of the difference.
     * With less than a quarter of the cells free, nothing is learned ("held").
     * A difference of more than 3 % to the light followed so far is not drift. Without contact, or where one plane explains 90 % of
-      all cells to 1 %, it is reported as a step ("stepped"). With a contact, which scatters light, and for a second after it, while
-      the gel comes back, it is "held". Neither is learned; when the light comes back, following goes on.
+      all cells to 1 %, or where a channel's level is off by a quarter, it is reported as a step ("stepped"). With a contact, which
+      scatters light, and for a second after it, while the gel comes back, it is "held". Neither is learned; when the light comes
+      back, following goes on.
 
     Args:
         background: (3, H, W), image value of the unit without contact.
@@ -105,7 +110,8 @@ class FollowLight:
         if float(np.abs(change).sum(1).max()) > LIGHT_STEP:
             residual = np.abs(difference.reshape(3, -1) - change @ self._basis)[usable.reshape(3, -1)]
             smooth = residual.size > 0 and float((residual < 0.01).mean()) > 0.9
-            self.state = "stepped" if smooth or self._since_contact_s >= RECOVERY_S else "held"
+            large = float(np.abs(change[:, 0]).max()) > NO_CONTACT
+            self.state = "stepped" if smooth or large or self._since_contact_s >= RECOVERY_S else "held"
         elif not enough:
             self.state = "held"
         else:

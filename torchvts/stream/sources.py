@@ -3,6 +3,7 @@
 import queue
 import threading
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ..core.checks import brief, check_integer, check_least, check_path, check_positive, parse_number
-from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, check_text_name, image_files, open_video, read_pixels
+from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, check_text_name, cut_short, image_files, open_video, read_pixels
 from .devices import find_camera, found_cameras
 
 Pixels = np.ndarray[Any, Any]
@@ -101,10 +102,17 @@ class CaptureReader:
         self.fps = frames_a_second(self._capture)
         self.fps = rate_of(self.times, self.fps)
         self.codec = lossy_codec(self._capture)
+        self._file, self._count = source if isinstance(source, Path) else None, 0
 
     def read(self) -> Pixels | None:
         there, pixels = self._capture.read()
-        return pixels if there else None
+        if there:
+            self._count += 1
+            return pixels  # type: ignore[no-any-return]
+        if self._file is not None and (text := cut_short(self._file, self._count)):
+            warnings.warn(f"{self.name}: {text}", stacklevel=2)
+        self._file = None
+        return None
 
     def close(self) -> None:
         self._capture.release()

@@ -90,6 +90,11 @@ class FrameCheck:
             return "the frame is overexposed: nearly all of it is saturated"
         return self._other_view(cells)
 
+    def light_off(self, frame: Tensor) -> float:
+        """By which part the light of a frame (1, 3, H, W) differs from the background's, in the channel where it differs most."""
+        ratio = self._views.cells(array_of(frame[0])) / np.maximum(self.background, np.float32(1e-3))
+        return max([abs(float(lower_median(ratio[channel][lit])) - 1.0) for channel, lit in self._lit], default=0.0)
+
     def other_view(self, frame: Tensor) -> str:
         """In which way a frame (1, 3, H, W) is cropped, turned or swapped otherwise than the background; an empty text for none."""
         return self._other_view(self._views.cells(array_of(frame[0])))

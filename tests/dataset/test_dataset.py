@@ -218,6 +218,31 @@ def test_a_video_that_starts_in_contact_is_noted_and_loses_nothing(unit, tmp_pat
     assert "expected at least 40 frames, got 14" in short.notes[0][1] and short.rows == 14
 
 
+def test_frames_in_another_light_are_named(unit, tmp_path):
+    """An LED fails under a contact: its depth may be 0, and no frame is left out."""
+    off = torch.tensor([0.0, 1.0, 1.0]).reshape(3, 1, 1)
+    (tmp_path / "images").mkdir()
+    for k, name in enumerate(("a.png", "b.png", "c.png")):
+        vts.write_image(tmp_path / "images" / name, tiny_image(k) * (off if k else 1.0))
+    report = reconstruct_dataset(unit, tmp_path / "images", tmp_path / "out", pictures=False)
+    ((name, note),) = report.notes
+    assert name == "b.png" and "the light is not that of the calibration, as of 1 more" in note and report.rows == 3
+    pictures = [bgr(tiny_image(-1 - k)) for k in range(14)] + [bgr(tiny_image(k) * (off if k > 3 else 1.0)) for k in range(8)]
+    (tmp_path / "film").mkdir()
+    write_film(tmp_path / "film" / "film.avi", pictures)
+    report = reconstruct_dataset(unit, tmp_path / "film", tmp_path / "films", pictures=False)
+    assert [note for _, note in report.notes if "the light has stepped" in note] and report.rows == 22
+
+
+def test_a_video_that_is_cut_short_is_named(unit, tmp_path):
+    (tmp_path / "in").mkdir()
+    whole = film(tmp_path / "in" / "film.avi", 40)
+    content = whole.read_bytes()
+    whole.write_bytes(content[: int(0.6 * len(content))])
+    report = reconstruct_dataset(unit, tmp_path / "in", tmp_path / "out", pictures=False, background_frames=0)
+    assert any("cut short? it announces 40 frames" in note for _, note in report.notes) and report.rows < 30
+
+
 def test_the_script_ends_with_status_1_where_a_frame_was_left_out(unit, tmp_path, run_script):
     source = fill(tmp_path / "in", ["a.png", "b.png"])
     (source / "b.png").write_bytes(b"")

@@ -273,6 +273,13 @@ def test_a_dimmer_channel_is_measured(share):
     assert "blue channel" in first.message and "degrees" in first.message
 
 
+@pytest.mark.parametrize("share", [0.3, 0.5])
+def test_a_darker_image_is_an_exposure_and_no_black_level(share):
+    case = undisturbed(3)
+    first = vts.diagnose(None, torch.round(case.image * share * 255) / 255, case.calibration).findings[0]
+    assert first.name == "exposure" and first.value == pytest.approx(share - 1.0, abs=0.01)
+
+
 def test_the_cost_in_degrees_is_that_of_the_pipeline():
     case = undisturbed(3)
     dim = case.image * torch.tensor([1.0, 1.0, 0.88]).reshape(3, 1, 1)

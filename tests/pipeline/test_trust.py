@@ -349,3 +349,11 @@ def test_the_way_that_asks_for_nothing_gives_the_same_depth(kind: str, mode: str
     found = pipe(images)
     assert torch.equal(found.deformed, expected.deformed)
     assert float((found.depth_mm - expected.depth_mm).abs().max()) < 1e-5
+
+
+def test_normals_of_another_pitch_are_refused() -> None:
+    lights = rig().lights
+    assert lights is not None
+    other = vts.NormalFromIntensity(lights, HEIGHT, WIDTH, 2 * PITCH)
+    with pytest.raises(ValueError, match=r"normals: expected a pitch of 0\.25 mm per pixel, got NormalFromIntensity with 0\.5"):
+        vts.DepthPipeline.from_calibration(rig(), normals=other)

@@ -13,6 +13,7 @@ from ..model.calibration import SATURATED, Calibration
 from ..model.report import Report
 from ..model.response_field import ResponseField
 from ..model.sensor import Sensor
+from .by_lights import NOTHING_LEFT
 from .contacts import ROUGH, Contact, channel_structure, differing, used
 from .field import seen_slopes
 from .lights import POORLY_CONSTRAINED_DEG
@@ -90,7 +91,18 @@ def _doubt_in_lights(report: Report) -> str:
         return "the fit of the lights did not converge"
     if max(report.get("direction_std_deg", [0.0])) > POORLY_CONSTRAINED_DEG:
         return "the background does not constrain the lights"
-    return ""
+    return _misfit(report)
+
+
+def _misfit(report: Report) -> str:
+    """What is wrong with depth where lights leave a smooth part of the background, such as vignetting; "" where they do not."""
+    left = max(report.get("misfit", [0.0]))
+    if left <= NOTHING_LEFT:
+        return ""
+    return (
+        f"the lights leave a smooth misfit of {left:.1%} of the background (vignetting, scattered light, another gamma?): "
+        f"depth may be wrong by {min(1.0, 30.0 * left):.0%}"
+    )
 
 
 def to_contacts(contacts: Sequence[Contact]) -> list[str]:
@@ -243,7 +255,7 @@ def to_background_of_lights(unit: Calibration) -> tuple[Calibration, list[str]]:
     standing_out = float(differing(change, spread.reshape(3, 1, 1) + 0.01 * model).double().mean())
     report = unit.report.copy()
     report["residual_std"], report["standing_out"] = spread.tolist(), standing_out
-    found = []
+    found = [f"background: {text}: press a ball three times to measure it"] if (text := _misfit(report)) else []
     if standing_out > STANDING_OUT:
         found.append(
             f"background: {standing_out:.1%} of the image differs from the fitted lights by more than 5 times their residual "

@@ -94,7 +94,8 @@ def run(arguments: argparse.Namespace) -> int:
                 scores += _fold(background, sensor, presses, known, fold, folds)
             except ValueError as error:  # the other folds are still scored
                 reasons.append(f"fold {fold + 1}: {' '.join(str(error).split())}")
-            how = f"{len(presses)} presses, {labelled} labelled; fold {fold + 1} of {folds}, each scored by all others"
+            how = "a wrong mm_per_pixel, or diameters that are all wrong by one factor, are not seen by these figures\n"
+            how += f"{len(presses)} presses, {labelled} labelled; fold {fold + 1} of {folds}, each scored by all others"
             text = "\n".join([_table(scores), "", how, *reasons])
             _write(arguments.out, text, scores)
             if not sys.stderr.isatty():

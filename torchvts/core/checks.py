@@ -190,6 +190,22 @@ def check_batch(name: str, tensor: Tensor, channels: int) -> None:
         raise TypeError(f"{name}: expected float32 or float64, got {tensor.dtype}: too few bits for depth; use .float()")
 
 
+def check_pitch(name: str, block: object, mm_per_pixel: float) -> None:
+    """Raise where a block has a pitch of its own, and not this one: by another its values would be wrong.
+
+    Example:
+        >>> from torchvts import PoissonDCT
+        >>> check_pitch("integrate", PoissonDCT(0.1), 0.1)
+    """
+    own = getattr(block, "mm_per_pixel", None)
+    if isinstance(own, float) and abs(own / mm_per_pixel - 1.0) > 1e-6:
+        kind = type(block).__name__
+        raise ValueError(
+            f"{name}: expected a pitch of {mm_per_pixel:g} mm per pixel, got {kind} with {own:g}: {kind}(mm_per_pixel=...) takes "
+            "the sensor's"
+        )
+
+
 def check_same_size(name: str, tensor: Tensor, other_name: str, height: int, width: int) -> None:
     """Raise unless the last two dimensions of ``tensor`` are (height, width). Scripts."""
     if tensor.shape[-2] != height or tensor.shape[-1] != width:

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor, nn
 
-from ..core.checks import check_record
+from ..core.checks import check_pitch, check_record
 
 
 class Integrator(nn.Module):
@@ -44,10 +44,6 @@ def as_integrator(module: nn.Module, mm_per_pixel: float | None = None) -> Integ
         TypeError: no ``nn.Module``. ValueError: another pitch.
     """
     check_record("integrate", module, nn.Module)
-    own = getattr(module, "mm_per_pixel", None)
-    if mm_per_pixel is not None and isinstance(own, float) and abs(own / mm_per_pixel - 1.0) > 1e-6:
-        raise ValueError(
-            f"integrate: expected a pitch of {mm_per_pixel:g} mm per pixel, got {type(module).__name__} with {own:g}: "
-            f"{type(module).__name__}(mm_per_pixel=...) takes the sensor's"
-        )
+    if mm_per_pixel is not None:
+        check_pitch("integrate", module, mm_per_pixel)
     return module if isinstance(module, Integrator) else WrappedIntegrator(module)

@@ -193,7 +193,7 @@ class NormalFromIntensity(NormalModel):
         position, albedo, pitch = view.position_mm, view.albedo, view.mm_per_pixel
         if depth_mm is not None:
             return normal_at_depth(image, depth_mm, position, albedo, pitch, view.camera_height_mm)
-        if self.built_from_lights(image):
+        if self.built_from_lights():
             return normal_at_depth(image, image.new_zeros(1, 1, image.shape[2], image.shape[3]), position, albedo, pitch)
         inverse = self.inverse[None]
         normal = torch.addcmul(inverse[:, :, 0] * image[:, 0:1], inverse[:, :, 1], image[:, 1:2])
@@ -201,7 +201,7 @@ class NormalFromIntensity(NormalModel):
         n_x, n_y, n_z = normal[:, 0:1], normal[:, 1:2], normal[:, 2:3]
         return normal * torch.rsqrt(torch.addcmul(torch.addcmul(n_x * n_x, n_y, n_y), n_z, n_z) + 1e-24)
 
-    def built_from_lights(self, image: Tensor) -> bool:
+    def built_from_lights(self) -> bool:
         """Whether the matrix is built at this call: gradients are recorded, or the stored one may not follow the lights."""
         lights = self.lights
         if torch.is_grad_enabled() and (lights.position_mm.requires_grad or lights.albedo.requires_grad):

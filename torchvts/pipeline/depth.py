@@ -12,6 +12,7 @@ from ..core.checks import (
     check_choice,
     check_integer,
     check_least,
+    check_pitch,
     check_positive,
     check_range,
     check_record,
@@ -98,6 +99,7 @@ class DepthPipeline(nn.Module):
             check_record(name, block, nn.Module)
         mm_per_pixel, tolerance_px = check_positive("mm_per_pixel", mm_per_pixel), check_positive("tolerance_px", tolerance_px)
         model, integrator = as_normal_model(normals), as_integrator(integrate, mm_per_pixel)
+        check_pitch("normals", model, mm_per_pixel)
         check_domain(model, compensate.output_domain if isinstance(compensate, Compensate) else None)
         refine_threshold_px = check_least("refine_threshold_px", refine_threshold_px)
         check_integer("max_passes", max_passes, 1)

@@ -49,7 +49,7 @@ def render(
         shadows: whether the relief casts shadows, see :func:`torchvts.model.lights.cast_shadows`.
         seed: seed of the noise.
     Returns:
-        The image (1, 3, H, W) in [0, 1], channels R, G, B.
+        The image (1, 3, H, W) in [0, 1], channels R, G, B; it records gradients in the lights: ``.detach()`` makes data of it.
     Raises:
         ValueError: ``shadows`` with a pinhole camera.
     """

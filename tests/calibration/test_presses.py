@@ -566,7 +566,7 @@ def test_two_sizes_exchanged_are_warned_of(rest, sizes, warned):
 
 def test_lights_on_one_line_show_no_slopes_across_it():
     """Red left, green above, blue right: of a slope along y, colours do not say whether it rises or falls."""
-    lights = vts.PointLights([[-16, 0, 9], [0, 0, 18], [16, 0, 9]], [400, 800, 400]).requires_grad_(False)
+    lights = vts.PointLights([[-25, 0, 30], [0, 0, 45], [25, 0, 30]], [900, 900, 900]).requires_grad_(False)
 
     def camera(scene, seed):
         return vts.scenes.render(scene, lights, noise_std=0.003, bits=8, seed=seed)[0]

@@ -30,6 +30,9 @@ GLOSS_MISFIT = 0.01
 NOT_GLOSS = 0.1
 """A matt skin that leaves more relative structure than this is not tried as a glossy one: no gloss of this lobe width helps."""
 
+GLOSSY_STEPS = 4
+"""A glossy skin gets so many times the steps: its loop ends after 70 to 450, in a field of 19 mm with a gloss of 0.3 after 800."""
+
 HELD_STEPS = 10
 """Steps with a light at the bound after which it will not come back."""
 
@@ -127,7 +130,7 @@ def fit_lights(
     pixels = BackgroundPixels.of(background.detach().to(torch.float64).cpu(), sensor)
     best = _solve_coarse_to_fine(pixels, paraboloid_start(pixels) if start is None else from_lights(start), loop)
     if gloss and best.converged and bool((best.misfit > 0).all()) and float(best.misfit.max()) < NOT_GLOSS:
-        best = _try_gloss(pixels, best, loop) or best
+        best = _try_gloss(pixels, best, loop._replace(max_steps=GLOSSY_STEPS * loop.max_steps)) or best
     return _light_fit(background.dtype, pixels, best, max_steps)
 
 

@@ -223,13 +223,3 @@ def test_values_beyond_the_range_are_cut_and_halves_rounded(tmp_path):
     image[0], image[1] = -0.5, 1.5
     vts.write_image(tmp_path / "image.png", image)
     assert vts.read_image(tmp_path / "image.png")[:, 0, 0].tolist() == pytest.approx([0.0, 1.0, 64 / 255])
-
-
-def test_a_link_still_names_the_file_that_is_written(tmp_path):
-    (tmp_path / "elsewhere").mkdir()
-    target, link = tmp_path / "elsewhere" / "a.npy", tmp_path / "b.npy"
-    target.write_bytes(b"old")
-    link.symlink_to(target)
-    write_array(link)
-    assert link.is_symlink() and np.load(target).shape == (10_000,)
-    assert sorted(path.name for path in tmp_path.rglob("*") if path.is_file()) == ["a.npy", "b.npy"]

@@ -417,16 +417,6 @@ def test_axes_of_own_normals_that_are_likely_wrong_are_named_once(mixed, small_s
     assert torch.equal(right(frames[1:2]).depth_mm, pipeline(lights, small_sensor, "fast")(frames[1:2]).depth_mm)
 
 
-def test_normals_turned_over_are_named_while_they_record_gradients(mixed, small_sensor):
-    lights, frames = mixed
-    sign = nn.Parameter(torch.tensor(-1.0))
-    model = Turned(pipeline(lights, small_sensor, "fast").normals, lambda n: n * sign)
-    pipe = pipeline(lights, small_sensor, "fast", normals=model)
-    with pytest.warns(UserWarning, match="face away from the camera in 100% of the image"):
-        pipe(frames[1:2])
-    pipe(frames[1:2])  # once
-
-
 class Calibrated(NormalModel):
     """The calibrated normals in a model of another's."""
 

@@ -126,8 +126,6 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
         OSError: the disk is full; names the file.
     """
     path = check_target(path)
-    if path.is_symlink():  # the file that it names is replaced, as every other way of writing does
-        path = check_target(path.resolve())
     temporary = path.with_name(f".{path.stem}-{secrets.token_hex(4)}{path.suffix}")
     try:
         temporary.open("xb").close()  # not by tempfile, whose files are private; reading the umask is not safe in threads

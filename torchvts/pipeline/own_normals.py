@@ -8,9 +8,6 @@ from ..integration import divergence, poisson_dct
 FACING_AWAY = 0.5
 """Share of pixels whose normals face away from the camera, from which z is turned over."""
 
-EVERYWHERE = 0.99
-"""The same of a network in training, whose normals may be anything else."""
-
 LEAST_SLOPE = 0.02
 """RMS of the slopes of a frame that says something of their axes."""
 
@@ -34,8 +31,10 @@ def doubt_of_axes(name: str, normal: Tensor) -> str | None:
         >>> doubt_of_axes("Net", up)
         'normals: Net gives normals that face away from the camera in 100% of the image: n_z is above 0 here: negate or set it'
     """
-    if away := facing_away(name, normal, FACING_AWAY):
-        return away
+    away = float((normal[:, 2] <= 0).double().mean())
+    if away > FACING_AWAY:
+        seen = f"normals: {name} gives normals that face away from the camera in {away:.0%} of the image"
+        return f"{seen}: n_z is above 0 here: negate or set it"
     gradient = gradient_from_normal(normal).double()
     if gradient.shape[2] < 2 or gradient.shape[3] < 2 or float(gradient.square().mean().sqrt()) < LEAST_SLOPE:
         return None
@@ -50,15 +49,6 @@ def doubt_of_axes(name: str, normal: Tensor) -> str | None:
     if shares[likely] > 0.5 * as_given:
         return ""
     return f"normals: {as_given:.0%} of the slopes of {name} are those of no surface, {shares[likely]:.0%} otherwise: {likely}"
-
-
-def facing_away(name: str, normal: Tensor, most: float) -> str:
-    """What is wrong where more than this share of normals (B, 3, H, W) faces away from the camera, or ""."""
-    away = float((normal[:, 2] <= 0).double().mean())
-    if away <= most:
-        return ""
-    seen = f"normals: {name} gives normals that face away from the camera in {away:.0%} of the image"
-    return f"{seen}: n_z is above 0 here: negate or set it"
 
 
 def _contradicted(gradient: Tensor) -> float:

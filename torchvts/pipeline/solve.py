@@ -11,7 +11,7 @@ from ..core.frame import Frame, Solution
 from ..integration import Integrator
 from ..normals import NormalModel
 from ..normals.base import check_normals
-from .own_normals import EVERYWHERE, doubt_of_axes, facing_away
+from .own_normals import doubt_of_axes
 
 
 class Solve(nn.Module):
@@ -57,11 +57,9 @@ class Solve(nn.Module):
         if self.calibrated or not reads_freely(image):
             return
         name = check_normals(self.normals, normal, image)
-        if self._axes_known or normal.numel() == 0:
+        if self._axes_known or normal.requires_grad or normal.numel() == 0:  # in training they may be anything
             return
-        given = normal.detach().to(image.dtype)
-        # in training they may be anything, but not all of them turned over
-        doubt = facing_away(name, given, EVERYWHERE) or None if normal.requires_grad else doubt_of_axes(name, given)
+        doubt = doubt_of_axes(name, normal.detach().to(image.dtype))
         self._axes_known = doubt is not None
         if doubt:
             warnings.warn(doubt, UserWarning, stacklevel=2)

@@ -14,7 +14,7 @@ from .result import invert, motion
 from .rigid import Array, rotation_vector
 
 SINE_OF_AXIS = 0.3
-"""Sine of the angle to the z axis up to which a direction is called z."""
+"""Sine of the angle to the z axis up to which a direction is called z, and of that to the skin up to which it has an angle."""
 
 LEAST_INFORMATION = 0.05
 """Squared change of slope, in units of its noise, per squared mm of motion, below which a motion is unknown: 0.013 a mm."""
@@ -188,9 +188,17 @@ def name_directions(free: Tensor, shifts: Tensor) -> list[str]:
 
 
 def _line(direction: Tensor | Array) -> str:
+    """A line by its name: x, y, z, its angle in the plane of the skin, or its direction.
+
+    Example:
+        >>> _line(np.array([0.0, 1.0, 0.0])), _line(np.array([0.4, 0.0, 0.9]))
+        ('y', '(0.40, 0.00, 0.90)')
+    """
     x, y, z = direction.tolist()
     if math.hypot(x, y) < SINE_OF_AXIS * abs(z) / math.sqrt(1 - SINE_OF_AXIS**2):
         return "z"
+    if abs(z) > SINE_OF_AXIS:
+        return f"({x:.2f}, {y:.2f}, {z:.2f})"
     angle = round(math.degrees(math.atan2(y, x))) % 180
     if min(angle, 180 - angle) <= 2:
         return "x"

@@ -149,15 +149,15 @@ def from_presses(given: Given, lights: Candidate, prior: Candidate, touches: Can
         return Candidate(objection="no presses")
     start = prior if prior.unit is not None else touches
     (fit, contacts, unit), dropped, sizes = _fitted(given, start)
-    sizes = sizes or objections.to_sizes(contacts, given.sensor.mm_per_pixel)
-    sizes = sizes or objections.to_directions(fit.model.field, used(contacts))
-    if sizes and not given.force:
-        raise ValueError(f"{sizes}; force=True (--force) goes on all the same")
+    refused = sizes or objections.to_sizes(contacts, given.sensor.mm_per_pixel)
+    refused = refused or objections.to_directions(fit.model.field, used(contacts))
+    if refused and not given.force:
+        raise ValueError(f"{refused}; force=True (--force) goes on all the same")
     from_prior = start is prior and not dropped
-    warnings = [text for text in (dropped, sizes) if text] + objections.to_contacts(contacts)
-    doubts = [] if sizes or from_prior else objections.to_diameters_by_others(used(contacts))
-    warnings += doubts or ([] if sizes else objections.to_deep_presses(contacts))
-    if from_prior and not sizes:
+    warnings = [text for text in (dropped, refused) if text] + objections.to_contacts(contacts)
+    doubts = [] if refused or from_prior else objections.to_diameters_by_others(used(contacts))
+    warnings += doubts or ([] if refused else objections.to_deep_presses(contacts))
+    if from_prior and not refused:
         warnings += objections.to_diameters_by_prior(used(contacts))
     report: Report = {"model": "response", "source": "presses", "held_out_deg": fit.error_deg}
     report["reason"] = f"{fit.reason}; {dropped}" if dropped else fit.reason
@@ -176,8 +176,8 @@ def from_presses(given: Given, lights: Candidate, prior: Candidate, touches: Can
         elif of_lights_deg is not None:
             row["note"] = f"rejected: on {len(used(contacts))} presses their normals are {of_lights_deg:.1f} deg off; {row['note']}"
     report["presses"] = [press_row(contact, given.sensor) for contact in contacts]
-    if sizes or doubts:
-        report["objection"] = sizes or doubts[0]
+    if refused or doubts:
+        report["objection"] = refused or doubts[0]
     if touches.unit is not None:
         report["touches"] = touches.unit.report["touches"]
     unit = with_contact(dataclasses.replace(unit, report=report), given.presses, contacts)

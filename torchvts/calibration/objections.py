@@ -23,7 +23,7 @@ WIDE = 0.86
 eight drawn sensors, 0.8 to 0.95 with a pitch that is twice too large. Presses that are all deep are no mistake."""
 
 RATHER_WIDE = 0.8
-"""The same, from which there is a warning: radii given for the diameters of balls that were pressed lightly reach 0.84."""
+"""The same, from which there is a warning: radii given for diameters had 0.84 and 0.855 on two drawn sensors."""
 
 WIDE_OUTLINE = 1.75
 """The same of the outline of the strong change of light: 0.54 to 1.61, and 1.4 to 3.2."""
@@ -47,7 +47,7 @@ sets of right presses of ten real and eight drawn sensors have at most 1.64, wit
 
 UNSEEN = 0.6
 """A direction of slopes of which a field finds less than this part of what it finds of the other is not seen: it is 0.86 to 1 on
-fifteen real and eight drawn sensors, 0.3 and 0.4 with LEDs on one line."""
+twelve real sets and eight drawn sensors, 0.3 and 0.4 with LEDs on one line."""
 
 SAME_TYPE = 0.27
 """Median difference of a background from the prior's pattern, logarithm of the light, up to which a unit is of the prior's type: it

@@ -34,7 +34,7 @@ from ..pipeline import MODES, DepthOutput, unit_pipeline
 from ..pose.output_frame import MM_OF
 from ..skin import ContactSettings
 from ..stream import FIRST_FRAMES, Recording, check_device, video_codec
-from ..stream.follow_light import NO_CONTACT
+from ..stream.follow_light import NO_CONTACT, NOT_TO_BE_TRUSTED
 from .items import Item, Source, list_items
 from .loading import Frame, load_frames
 from .processes import share, sum_over_processes
@@ -193,8 +193,6 @@ def _check_source(source: Source, out: Path) -> None:
 NAMED = 5
 """So many frames that cannot be used are named at once, by each process; a folder of another sensor's has thousands."""
 
-NOT_TO_BE_TRUSTED = ": depth is not to be trusted; torchvts diagnose says what has changed"
-
 _Reconstructed = tuple[Frame, Tensor | None, DepthOutput | None]
 """A frame, its image in the light of the background, and its depth."""
 
@@ -243,7 +241,7 @@ class _Worker:
             return Report(rank, 0, 0, [], seconds)
         if self.in_other_light:
             more = f", as of {len(self.in_other_light) - 1} more" if len(self.in_other_light) > 1 else ""
-            self.notes.append((self.in_other_light[0], f"the light is not that of the calibration{more}{NOT_TO_BE_TRUSTED}"))
+            self.notes.append((self.in_other_light[0], f"the light is not that of the calibration{more}: {NOT_TO_BE_TRUSTED}"))
         self.records.join_videos()
         rows, failed = self.records.write_tables()
         self.writer.write_summary(rows, len(failed))
@@ -273,7 +271,7 @@ class _Worker:
                 held = []
             if frame.length is not None:
                 if recording is not None and recording.light.steps:
-                    self.notes.append((frame.item.path, f"the light has stepped{NOT_TO_BE_TRUSTED}"))
+                    self.notes.append((frame.item.path, f"the light has stepped: {NOT_TO_BE_TRUSTED}"))
                 if text := cut_short(frame.item.file, frame.length):
                     self.notes.append((frame.item.path, text))
                 yield frame, None, None

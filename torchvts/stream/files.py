@@ -7,6 +7,7 @@ from typing import Any
 
 from ..core.checks import check_record
 from ..core.files import write_atomically
+from .follow_light import NOT_TO_BE_TRUSTED
 from .live import TactileFrame, TactileStream
 
 
@@ -91,7 +92,7 @@ class StreamReport:
         if values["light_steps"]:
             lines.append(
                 f"the light stepped {values['light_steps']} times (frames marked 'stepped' in frames.csv): not learned, their "
-                "depth is not to be trusted; torchvts diagnose says what has changed"
+                f"{NOT_TO_BE_TRUSTED}"
             )
         return "\n".join(lines)
 

@@ -23,6 +23,9 @@ NO_CONTACT = 0.25
 """A change of a channel's level that is not from a contact: contacts of thirteen real sensors make at most 0.05, on one whose
 images are saturated 0.16."""
 
+NOT_TO_BE_TRUSTED = "depth is not to be trusted; torchvts diagnose says what has changed"
+"""What is said of frames in another light."""
+
 LEAST_FREE = 0.25
 """Share of the skin that must be free of contact for the light to be measured on it."""
 

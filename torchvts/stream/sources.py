@@ -99,8 +99,7 @@ class CaptureReader:
             raise ValueError(f"source: {source}: not a video, or cut short: it does not open")
         if self.live:
             self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-        self.fps = frames_a_second(self._capture)
-        self.fps = rate_of(self.times, self.fps)
+        self.fps = rate_of(self.times, frames_a_second(self._capture))
         self.codec = lossy_codec(self._capture)
         self._file, self._count = source if isinstance(source, Path) else None, 0
 

@@ -72,8 +72,7 @@ class FrameCheck:
         cells = self._views.cells(image)
         if _range(cells) < ONE_COLOUR and _range(image) < ONE_COLOUR:  # the cells of most frames suffice
             return "the frame has one colour everywhere: black, overexposed, or not decoded"
-        ratio = cells / np.maximum(self.background, np.float32(1e-3))
-        level = max([float(lower_median(ratio[channel][lit])) for channel, lit in self._lit], default=1.0)
+        level = max(self._levels(cells), default=1.0)
         if level < DARK:
             cause, most = "black, or the LEDs were off", float(image.max())
             if most <= TWELVE_BITS + 1e-6:
@@ -92,12 +91,16 @@ class FrameCheck:
 
     def light_off(self, frame: Tensor) -> float:
         """By which part the light of a frame (1, 3, H, W) differs from the background's, in the channel where it differs most."""
-        ratio = self._views.cells(array_of(frame[0])) / np.maximum(self.background, np.float32(1e-3))
-        return max([abs(float(lower_median(ratio[channel][lit])) - 1.0) for channel, lit in self._lit], default=0.0)
+        return max([abs(level - 1.0) for level in self._levels(self._views.cells(array_of(frame[0])))], default=0.0)
 
     def other_view(self, frame: Tensor) -> str:
         """In which way a frame (1, 3, H, W) is cropped, turned or swapped otherwise than the background; an empty text for none."""
         return self._other_view(self._views.cells(array_of(frame[0])))
+
+    def _levels(self, cells: Array) -> list[float]:
+        """The light of the channels that are lit, relative to the background's."""
+        ratio = cells / np.maximum(self.background, np.float32(1e-3))
+        return [float(lower_median(ratio[channel][lit])) for channel, lit in self._lit]
 
     def _other_view(self, cells: Array) -> str:
         view = self._views.other(cells)

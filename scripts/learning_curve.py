@@ -1,10 +1,9 @@
-"""How accurate a calibration is after 0, 1, 3, 5, 11, 21 presses or touches of a set: a table and a picture.
+"""How accurate a calibration is after 0, 1, 3, 5, 11, 21 presses of a set: a table and a picture.
 
 python scripts/learning_curve.py gelsight_mini_a digit_a --draws 4
 
-Presses are drawn at random from those to learn from, and given without labels; the frames that are held out are scored. Touches are
-presses given by their images alone, and one press for the scale. MLP is gs_sdk's network, trained on the same presses. No prior has
-seen the presses that are scored.
+Presses are drawn at random from those to learn from, and given without labels; the frames that are held out are scored. MLP is
+gs_sdk's network, trained on the same presses. No prior has seen the presses that are scored.
 """
 
 import dataclasses
@@ -59,21 +58,20 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def curve(data: sets.DataSet, draws: int, mode: str) -> Iterator[Row]:
-    """Rows of a set, one for each draw: presses with the prior if there is one, presses without, touches, a trained network.
+    """Rows of a set, one for each draw: presses with the prior if there is one, presses without, a trained network.
 
     Last comes the network that belongs to the unit, if there is one: its count is None.
     """
-    kinds = [("presses", mode, True), ("touches, and one press for the scale", "touches", False), ("MLP", "MLP", False)]
+    kinds = [("presses", mode, True), ("MLP", "MLP", False)]
     if data.folds[0].sensor.prior is not None:
         kinds = [("presses, prior", mode, True), ("presses, no prior", mode, False), *kinds[1:]]
     for kind, method, primed in kinds:
         for count in COUNTS:
-            given = count + (method == "touches")
             fewest = 2 if method == "MLP" else 0 if kind == "presses, prior" else 1  # a network holds one press out
-            enough = [fold for fold in data.folds if len(fold.learned) >= given]
+            enough = [fold for fold in data.folds if len(fold.learned) >= count]
             if fewest <= count and enough:
                 for k in range(draws):
-                    fold = drawn(enough[k * len(enough) // draws], given, k, primed)
+                    fold = drawn(enough[k * len(enough) // draws], count, k, primed)
                     row = evaluate(dataclasses.replace(data, folds=[fold], methods=()), [method]).rows[0]
                     yield dataclasses.replace(row, method=kind, seed=k, errors={**row.errors, "count": float(count)})
     network = [method for method in data.methods if method.name == GIVEN_NETWORK]

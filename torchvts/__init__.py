@@ -3,7 +3,7 @@
 ``Sensor.load`` describes a sensor, ``calibrate`` makes a ``Calibration`` of a unit from its images, and
 ``DepthPipeline.from_calibration`` makes of that the module from images to a ``DepthOutput``.
 
-* To calibrate: ``Press``, ``Touch``, ``read_presses``, ``fit_lights``, ``PointLights``, ``CalibrationWarning``; ``gs_sdk`` reads
+* To calibrate: ``Press``, ``read_presses``, ``fit_lights``, ``PointLights``, ``CalibrationWarning``; ``gs_sdk`` reads
   the files of gs_sdk.
 * Parts of a pipeline, in its order: ``Compensate``, ``ContactMask``, a ``NormalModel``, ``GradientFromNormal``, an
   ``Integrator``, ``ContactFromDepth``. Models are named ``NormalFrom...``, integrators ``Poisson...`` and
@@ -15,7 +15,7 @@ All parts are plain PyTorch modules. ``pipe.freeze()`` makes a ``FrozenPipeline`
 """
 
 from . import scenes, stream
-from .calibration import CalibrationWarning, Press, Touch, calibrate, fit_lights, read_presses
+from .calibration import CalibrationWarning, Press, calibrate, fit_lights, read_presses
 from .compensate import Compensate
 from .core import __version__ as __version__
 from .core.files import read_image, write_image
@@ -65,7 +65,6 @@ __all__ = [
     "Press",
     "Result",
     "Sensor",
-    "Touch",
     "calibrate",
     "depth_to_points",
     "diagnose",

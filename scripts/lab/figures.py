@@ -283,7 +283,7 @@ def learning_figure(rows: Sequence[Row]) -> Figure:
     """Error against the number of presses: means over draws of presses, with the smallest and the largest draw.
 
     Args:
-        rows: one for each draw, ``seed``: ``method`` names the line, the error "count" is the number of presses or touches;
+        rows: one for each draw, ``seed``: ``method`` names the line, the error "count" is the number of presses;
             where it is None, the row is a level line for comparison.
     """
     figure = new_figure(10.0, 4.2, 110)
@@ -306,7 +306,7 @@ def learning_figure(rows: Sequence[Row]) -> Figure:
         for row in levels:
             if (level := row.error(error)) is not None:
                 axes.axhline(level, color="black", lw=1.2, ls=(0, (5, 3)), label=row.method)
-        axes.set(xlabel="presses or touches given", ylabel=label, ylim=(0, None))
+        axes.set(xlabel="presses given", ylabel=label, ylim=(0, None))
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.grid(alpha=0.3)
     handles, labels = panels[0].get_legend_handles_labels()

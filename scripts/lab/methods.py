@@ -226,14 +226,6 @@ def by_calibration(training: Training, mode: str, prior: bool = True) -> Built:
     return pipeline(training.calibration, mode)._replace(note="; ".join(notes), used=used)
 
 
-def by_touches(training: Training) -> Built:
-    """Calibration by one press, for the scale, and by the images of the others as touches of unknown objects; mode precise."""
-    training, touches = training.without_prior, [press.image for press in training.presses[1:]]
-    found = quiet_calibrate(training.background, training.sensor, training.presses[:1], touches)
-    counted = [*found.report.get("presses", []), *found.report.get("touches", [])]
-    return pipeline(found, "precise")._replace(used=sum(row["used"] for row in counted))
-
-
 def shipped_prior(training: Training, sensor: Sensor) -> Built:
     """The prior of another description of the sensor, and no presses, mode precise."""
     return by_calibration(Training(training.background, (), sensor), "precise")
@@ -289,7 +281,6 @@ METHODS: dict[str, Method] = {
         Method("point lights", from_presses=point_lights, learns=False),
         Method("look-up table", _lookup_by_rendered_balls, lookup_table, ours=False),
         Method("MLP", from_presses=network, ours=False),
-        Method("touches", from_presses=by_touches),
         Method("fast, no prior", from_presses=partial(by_calibration, mode="fast", prior=False), needs_prior=True),
         Method("precise, no prior", from_presses=partial(by_calibration, mode="precise", prior=False), needs_prior=True),
     )

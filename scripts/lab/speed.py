@@ -9,8 +9,7 @@ from pathlib import Path
 
 import torch
 
-from torchvts.calibration import Press, by_presses, read_presses
-from torchvts.calibration.response_fit import Candidates
+from torchvts.calibration import Press, read_presses
 from torchvts.cli.bench import SIZES, in_turn, machine, rig
 from torchvts.core.tables import number
 from torchvts.model import Sensor
@@ -137,13 +136,8 @@ def _sensor(data: Path) -> Timed:
 def _sensor_methods(training: Training, sensor: Sensor) -> Iterator[tuple[str, Built, bool]]:
     """Name, method, and whether it has learned from the presses that are scored."""
     fitted = training.calibration
-    candidates = f"of {len(fitted.report['candidates'])} candidates"
     for mode in MODES:
-        yield f"response, {mode}", METHODS[mode].calibrated(fitted)._replace(note=candidates), False
-    for degree in (0, 2):
-        family = Candidates(((degree, -1, -1),))
-        unit = by_presses(training.background, training.sensor, training.located, None, False, family).unit
-        yield f"response linear {degree}, fast", METHODS["fast"].calibrated(unit), False
+        yield f"response, {mode}", METHODS[mode].calibrated(fitted), False
     yield "prior that has seen them, precise", shipped_prior(training, sensor), True
     yield "point lights, precise", point_lights(training), False
     yield "look-up table", lookup_table(training), False

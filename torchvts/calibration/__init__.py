@@ -6,7 +6,7 @@ from .calibrate import calibrate
 from .contacts import ROUGH, channel_structure
 from .lights import POORLY_CONSTRAINED_DEG, LightFit, fit_lights
 from .objections import CalibrationWarning
-from .presses import Press, Touch, read_presses
+from .presses import Press, read_presses
 from .prior import PriorUnit, fit_prior, score_prior
 
 __all__ = [
@@ -18,7 +18,6 @@ __all__ = [
     "LightFit",
     "Press",
     "PriorUnit",
-    "Touch",
     "by_presses",
     "calibrate",
     "channel_structure",

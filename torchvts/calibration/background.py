@@ -155,22 +155,6 @@ def at_bound(parameter: Tensor, span: float) -> Tensor:
     return held
 
 
-def misfit_of_paraboloid(pixels: BackgroundPixels) -> tuple[Tensor, Tensor]:
-    """What the closed-form lights leave of a background, and which of them no image of a near light gives.
-
-    Returns:
-        (3,) robust standard deviation of log(image / lights) beyond the noise; (3,) bool, lights at the bound.
-    """
-    start = paraboloid_start(pixels)
-    log = pixels.image.clamp_min(1e-3).log() - pixels.model(start).clamp_min(1e-9).log()
-    spread = [
-        float((c[u] - c[u].median()).abs().median()) / 0.6745 if bool(u.any()) else math.inf for c, u in zip(log, pixels.usable)
-    ]
-    noise = pixels.noise / pixels.image.median(dim=1).values.clamp_min(1e-3)
-    left = (torch.tensor(spread, dtype=noise.dtype).square() - noise.square()).clamp_min(0.0).sqrt()
-    return left, at_bound(start, pixels.span_mm())
-
-
 def from_lights(lights: PointLights) -> Tensor:
     """Parameters (3, 4) of lights."""
     position, albedo = lights.position_mm.detach().double().cpu(), lights.albedo.detach().double().cpu()

@@ -65,7 +65,7 @@ def _locate_jointly(contacts: list[Contact], pitch_mm: float, half_mm: float) ->
         if products >= 0 and anchors is None:
             anchors = [contact.center_mm.clone() for contact in contacts]
         forms = [ContactForms(family, contact) for contact in contacts]
-        coefficient = torch.zeros(family.size(), dtype=torch.float64)
+        coefficient = torch.zeros(2, family.size(), dtype=torch.float64)
         for _ in range(rounds):
             coefficient = solve_with_centers(forms, 0.01 * family.penalty(), anchors, 0.3)
             for item in forms:

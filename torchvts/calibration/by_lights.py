@@ -1,89 +1,61 @@
 """Point lights of a unit: from the sensor file, or fitted to the background."""
 
 import dataclasses
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..model.calibration import Calibration
 from ..model.lights import PointLights, flat_image
-from ..model.report import CandidateRow, Report
+from ..model.report import Report, Tried
 from ..model.response_field import CHANGE_SCALE, ResponseField, ResponseModel
 from ..model.sensor import Sensor
-from .background import BackgroundPixels, misfit_of_paraboloid
+from .given_images import colourless
 from .lights import POORLY_CONSTRAINED_DEG, LightFit, fit_lights
 
 GIVEN_MISFIT = 0.2
 """RMS of log(background / image of the sensor file's lights) from which they are not the unit's: only their directions are used."""
 
-LARGE_MISFIT = 0.2
-"""Misfit from which lights are no candidate beside another model."""
-
-CLOSED_FORM_MISFIT = 0.1
-"""Misfit of the closed-form lights from which no fit is tried beside another model. It is 0.125 to 0.20 on five real sensors; on
-drawn rigs at most 0.07, with half of the corners' light lost 0.05."""
-
 NOTHING_LEFT = 0.005
 """Misfit from which another gamma is tried where the sensor file leaves it open, and from which depth is not metric: it is at most
 0.002 of lights as the model has them, 0.007 with 5 % less light in the corners, where depth is 12 % off."""
+
+WELL_CONSTRAINED_DEG = 2.0
+MOST_MISFIT = 0.02
+"""Lights that are less certain, or leave more of the background, do not show that there are coloured lights at all."""
 
 OTHER_GAMMA = 2.2
 """Of most cameras. Lights fitted to its images as if they were linear are 11 degrees off, and leave a misfit of 3 %."""
 
 
-class LightsResult(NamedTuple):
-    """What point lights gave.
-
-    Attributes:
-        unit: the calibrated unit; None where lights were not fitted, or the fit failed.
-        row: how they did.
-        direction_deg: standard deviation of the least certain light's direction, degrees; None where nothing was fitted.
-        misfit: part of the background's light that they leave unexplained; None without lights.
-        complaint: why not to trust them, or "".
-    """
-
-    unit: Calibration | None
-    row: CandidateRow
-    direction_deg: float | None
-    misfit: float | None
-    complaint: str
-
-
-def by_lights(background: Tensor, sensor: Sensor, other_models: bool, progress: bool) -> LightsResult:
-    """Calibrate by point lights.
+def by_lights(background: Tensor, sensor: Sensor, progress: bool = False) -> tuple[Calibration, Tried]:
+    """Calibrate by point lights, where there is neither a press nor a prior.
 
     Args:
         background: (3, H, W) in [0, 1].
         sensor: of the unit; where it gives the lights' positions, only the albedo is fitted.
-        other_models: other models than lights exist, so lights that cannot win are not fitted, and those with a large misfit are
-            not refined.
         progress: show a bar.
+    Returns:
+        The unit, and what became of its lights: doubts where they are not to be trusted.
     Raises:
-        ValueError: as :func:`fit_lights`.
+        ValueError: as :func:`fit_lights`; the fit failed, or no lights of different colours are seen.
     """
     if sensor.light_position_mm is not None:
         return _given(background, sensor, sensor.light_position_mm)
-    if other_models and (objection := objection_to_lights(background, sensor)):
-        row: CandidateRow = {"model": "point lights", "score_deg": None, "note": f"not fitted: {objection}"}
-        return LightsResult(None, row, None, None, "")
-    fit, linear = _fit(background, sensor, other_models, progress)
-    loosest, misfit = float(fit.direction_std_deg.max()), float(fit.misfit.max())
-    row = {
-        "model": "point lights",
-        "family": _family(fit),
-        "gamma": linear.exponent,
-        "parameters": 12,
-        "passes": 2,
-        "score_deg": None,
-    }
+    fit, linear = _fit(background, sensor, progress)
     if fit.failed:
-        return LightsResult(None, row | {"note": fit.message}, None, None, f"background: {fit.message}")
-    constrained = f"one image constrains the lights to {loosest:.1f} deg, with a smooth misfit of {misfit:.1%}"
-    row |= {"misfit": misfit, "note": constrained if fit.converged else fit.message}
+        raise ValueError(
+            f"background: {fit.message}; nothing else is there to calibrate from: give presses of balls, or a sensor with a prior"
+        )
+    loosest, misfit = float(fit.direction_std_deg.max()), float(fit.misfit.max())
+    sure = fit.converged and loosest <= WELL_CONSTRAINED_DEG and misfit < MOST_MISFIT
+    if not sure and (no_colour := colourless(background)):
+        raise ValueError(no_colour)
+    constrained = f"one image constrains the lights to {loosest:.2f} deg, with a smooth misfit of {misfit:.1%}"
     report: Report = {
         "model": "point_lights",
         "source": "background",
+        "reason": f"point lights: {constrained if fit.converged else fit.message}",
         "family": _family(fit),
         "converged": fit.converged,
         "message": fit.message,
@@ -96,66 +68,26 @@ def by_lights(background: Tensor, sensor: Sensor, other_models: bool, progress: 
         "inlier_fraction": fit.inlier_fraction,
         "gloss": fit.lights.gloss.tolist(),
     }
-    complaint = "" if fit.converged and loosest <= POORLY_CONSTRAINED_DEG else f"background: {fit.message}"
+    doubts = [] if fit.converged and loosest <= POORLY_CONSTRAINED_DEG else [f"background: {fit.message}"]
     unit = Calibration.from_lights(fit.lights, linear, background, report)
-    return LightsResult(unit, row, loosest if fit.converged else None, misfit, complaint)
+    return unit, {"name": "point lights", "error_deg": loosest if fit.converged else None, "doubts": doubts}
 
 
 def _family(fit: LightFit) -> str:
     return "three lights" + ", glossy skin" * fit.lights.glossy
 
 
-def _fit(background: Tensor, sensor: Sensor, other_models: bool, progress: bool) -> tuple[LightFit, Sensor]:
-    """Lights, and the sensor with the gamma that they were fitted with.
-
-    A sparse image shows the gamma, and whether lights can win beside other models; those that can are fitted to the whole image.
-    """
+def _fit(background: Tensor, sensor: Sensor, progress: bool) -> tuple[LightFit, Sensor]:
+    """Lights, and the sensor with the gamma that they were fitted with: a sparse image shows it where it is left open."""
     linear = dataclasses.replace(sensor, gamma=sensor.exponent, prior=None)
-    sparse, small = _sparse(background, linear, 60)
-    fit = fit_lights(sparse, small, progress=progress)
-    if sensor.gamma is None and float(fit.misfit.max()) > NOTHING_LEFT:
-        other = fit_lights(sparse, dataclasses.replace(small, gamma=OTHER_GAMMA), progress=progress)
-        if other.converged and other.loss_history[-1] < 0.5 * fit.loss_history[-1]:
-            fit, linear = other, dataclasses.replace(linear, gamma=OTHER_GAMMA)
-    if fit.failed or (other_models and not _can_win(fit, small.mm_per_pixel / sensor.mm_per_pixel)):
-        return fit, linear
+    if sensor.gamma is None:
+        sparse, small = _sparse(background, linear, 60)
+        fit = fit_lights(sparse, small, progress=progress)
+        if float(fit.misfit.max()) > NOTHING_LEFT:
+            other = fit_lights(sparse, dataclasses.replace(small, gamma=OTHER_GAMMA), progress=progress)
+            if other.converged and other.loss_history[-1] < 0.5 * fit.loss_history[-1]:
+                linear = dataclasses.replace(linear, gamma=OTHER_GAMMA)
     return fit_lights(background, linear, progress=progress), linear
-
-
-def _can_win(fit: LightFit, stride: float) -> bool:
-    """Whether lights fitted to every ``stride``-th row and column may be good ones on all: noise is that much less there."""
-    return float(fit.misfit.max()) <= LARGE_MISFIT and float(fit.direction_std_deg.max()) <= POORLY_CONSTRAINED_DEG * stride
-
-
-def objection_to_lights(background: Tensor, sensor: Sensor) -> str:
-    """Why point lights cannot explain a background, by their closed form on a sparse image and without any fit, or "".
-
-    Fitted lights are chosen beside another model only if they leave next to nothing of the background. The closed form leaves
-    more than they do, but not by orders: a lens that darkens the corners bends the fall-off of a light, it does not turn it
-    over.
-
-    Args:
-        background: (3, H, W) in [0, 1].
-        sensor: both gammas are tried where it leaves gamma open.
-    Example:
-        >>> from torchvts.model.lights import PointLights, flat_image
-        >>> lights = PointLights([[25, 0, 30], [-12, 20, 30], [-12, -20, 30]], [900, 900, 900])
-        >>> image, sensor = flat_image(lights, 48, 64, 0.6).detach(), Sensor("rig", 48, 64, 0.6)
-        >>> objection_to_lights(image, sensor), objection_to_lights(1.0 - image, sensor)
-        ('', 'the background of G, B falls off as under no near point light')
-    """
-    objections = []
-    for gamma in (sensor.exponent,) if sensor.gamma is not None else (1.0, OTHER_GAMMA):
-        image, small = _sparse(background, dataclasses.replace(sensor, gamma=gamma, prior=None), 30)
-        left, far = misfit_of_paraboloid(BackgroundPixels.of(image.detach().to(torch.float64).cpu(), small))
-        if bool(far.any()):
-            named = ", ".join(name for name, one in zip("RGB", far.tolist(), strict=True) if one)
-            objections.append(f"the background of {named} falls off as under no near point light")
-        elif float(left.max()) > CLOSED_FORM_MISFIT:
-            objections.append(f"the closed-form lights leave a misfit of {float(left.max()):.0%} of the background")
-        else:
-            return ""
-    return objections[0]
 
 
 def _sparse(background: Tensor, sensor: Sensor, rows: int) -> tuple[Tensor, Sensor]:
@@ -176,7 +108,7 @@ def _evenly(size: int, stride: int) -> Tensor:
     return (size - 1 - steps * stride) // 2 + stride * torch.arange(steps + 1)
 
 
-def _given(background: Tensor, sensor: Sensor, position_mm: tuple[tuple[float, float, float], ...]) -> LightsResult:
+def _given(background: Tensor, sensor: Sensor, position_mm: tuple[tuple[float, float, float], ...]) -> tuple[Calibration, Tried]:
     """Lights at the positions of the sensor file."""
     lights = PointLights([list(row) for row in position_mm], [1.0, 1.0, 1.0])
     model = flat_image(lights, sensor.height, sensor.width, sensor.mm_per_pixel).detach()
@@ -190,12 +122,12 @@ def _given(background: Tensor, sensor: Sensor, position_mm: tuple[tuple[float, f
     log = [torch.nn.functional.avg_pool2d(i[None], cell).clamp_min(1e-3).log() for i in (unit.background, unit.model_image)]
     misfit = float((log[0] - log[1]).std(dim=(2, 3)).max())
     note = f"given by the sensor file; the background differs from them by {misfit:.1%} (RMS)"
-    row: CandidateRow = {"model": "point lights", "family": family, "parameters": 3, "passes": 2, "score_deg": None}
-    row |= {"misfit": misfit, "note": note}
-    if misfit <= GIVEN_MISFIT:
-        return LightsResult(unit, row, None, misfit, "")
-    complaint = f"background: lights {note}: not this unit's lights, and depth is not metric"
-    return LightsResult(_by_directions(background, sensor, position_mm, misfit), row, None, misfit, complaint)
+    doubts = [] if misfit <= GIVEN_MISFIT else [f"background: lights {note}: not this unit's lights, and depth is not metric"]
+    if doubts:
+        unit = _by_directions(background, sensor, position_mm, misfit)
+    else:
+        unit = dataclasses.replace(unit, report={**unit.report, "reason": f"point lights: {note}"})
+    return unit, {"name": "point lights", "error_deg": None, "doubts": doubts}
 
 
 def _by_directions(background: Tensor, sensor: Sensor, position_mm: tuple[tuple[float, ...], ...], misfit: float) -> Calibration:

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from .contacts import Contact
-from .field import Evidence, Family
+from .field import Family
+from .posterior import Evidence, Prior
 
 REACH = 1.5
 """Radius of the disc, in contact radii."""
@@ -74,11 +75,11 @@ class _Rating:
     """How well a field of a family explains located presses by each other: inside the contacts, and around them."""
 
     def __init__(self, family: Family, contacts: list[Contact]) -> None:
-        evidence = Evidence.of(family, contacts)
-        penalty = PENALTY * family.penalty()
-        coefficient = evidence.solve(penalty, None)
+        evidence = Evidence(family, contacts)
+        prior = Prior(torch.zeros(2, family.size(), dtype=torch.float64), PENALTY * family.penalty())
+        coefficient = evidence.posterior(prior).mean
         net = torch.stack([_net_slope(item.contact, item.slope(coefficient)) for item in evidence.forms])
-        angles = torch.tensor(evidence.errors_deg(evidence.held_out(penalty, None)), dtype=torch.float64)
+        angles = torch.tensor(evidence.errors_deg(evidence.held_out(prior)), dtype=torch.float64)
         self.family, self.contacts = family, contacts
         self.inside_deg = float(angles.square().mean().sqrt())
         # (N, 2), mm: within the contact a shift by d changes the slope by about d / radius of the ball

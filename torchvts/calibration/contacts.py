@@ -1,4 +1,4 @@
-"""What a fit uses of one press or touch: the change of intensity, sampled pixels, and where the ball is."""
+"""What a fit uses of one press: the change of intensity, sampled pixels, and where the ball is."""
 
 import math
 from collections.abc import Sequence
@@ -13,11 +13,11 @@ from ..core.geometry import gradient_from_normal, pixel_grid_mm
 from ..core.morphology import dilate, erode
 from ..integration import PoissonBackground
 from ..model.calibration import PEDESTAL, SATURATED, Calibration
-from ..model.report import PressRow, TouchRow
+from ..model.report import PressRow
 from ..model.response_field import ResponseField, ResponseModel
 from ..model.sensor import Sensor
 from ..normals import NormalFromResponse
-from .presses import Press, Touch
+from .presses import Press
 from .regions import FarField, contact_region, far_field
 
 INSIDE = 0.85
@@ -47,17 +47,17 @@ MAX_SAMPLES = 2000
 
 @dataclass(eq=False)
 class Contact:
-    """One image's change of intensity, the pixels of it that a fit uses, and, for a press, where the ball is.
+    """One image's change of intensity, the pixels of it that a fit uses, and where the ball is.
 
     Attributes:
         name: for messages.
         change: (3, H, W) float64, image / background - 1.
         mask: (H, W) bool, the contact.
-        index: (N,), flat indices of the sampled pixels; their four neighbours lie in the image too.
+        index: (N,), flat indices of the sampled pixels.
         x: (N,), mm.
         y: (N,), mm.
         saturated: (N,) bool, pixels that are saturated in some channel, which is then a lower bound.
-        radius_mm: of the ball; 0 for an unknown object.
+        radius_mm: of the ball.
         half_size_mm: (2,), half the width and height of the image, mm.
         center_mm: (2,), center of the ball, as far as known.
         contact_radius_mm: radius of the contact, as far as known.
@@ -123,11 +123,11 @@ def unit_without_model(background: Tensor, sensor: Sensor) -> Calibration:
     return Calibration.from_response(ResponseModel.zero(sensor.exponent, sensor.blur_px), sensor, background.double())
 
 
-def read_contacts(given: Sequence[Press | Touch], background: Tensor, sensor: Sensor) -> list[Contact]:
-    """The contacts of presses and touches, as the pipeline sees them. Those that show no contact carry a reason.
+def read_contacts(given: Sequence[Press], background: Tensor, sensor: Sensor) -> list[Contact]:
+    """The contacts of presses, as the pipeline sees them. Those that show no contact carry a reason.
 
     Args:
-        given: presses and touches.
+        given: presses.
         background: (3, H, W) in [0, 1].
         sensor: of the unit, with the gamma and blur of the preprocessing.
     """
@@ -141,12 +141,11 @@ def read_contacts(given: Sequence[Press | Touch], background: Tensor, sensor: Se
         change = ratio[0] - 1.0
         differs = differing(change, noise)
         far = far_field(change)
-        ball_px = 0.5 * item.ball_diameter_mm / sensor.mm_per_pixel if isinstance(item, Press) else 0.0
-        region = contact_region(far, differs, ball_px)
+        region = contact_region(far, differs, 0.5 * item.ball_diameter_mm / sensor.mm_per_pixel)
         saturated = ((item.image > SATURATED) & (background < SATURATED)).any(dim=0).cpu()
         contact = _sampled(item, smooth(ratio)[0].double() - 1.0, region, saturated, sensor)
         contact.reason = _unusable(item.image, background, differs, far) or _saturated(float(saturated[region].double().mean()))
-        if isinstance(item, Press) and item.center_px is not None:
+        if item.center_px is not None:
             _place(contact, item, sensor)
         contacts.append(contact)
     return contacts
@@ -164,16 +163,13 @@ def differing(change: Tensor, noise_std: Tensor) -> Tensor:
     return dilate(erode(closed, 2), 2)[0, 0]
 
 
-def _sampled(given: Press | Touch, change: Tensor, mask: Tensor, saturated: Tensor, sensor: Sensor) -> Contact:
-    # one pixel of margin, for the neighbours that derivatives use
-    core = torch.zeros_like(mask)
-    core[1:-1, 1:-1] = mask[1:-1, 1:-1]
-    rows, columns = torch.nonzero(core, as_tuple=True)
+def _sampled(given: Press, change: Tensor, mask: Tensor, saturated: Tensor, sensor: Sensor) -> Contact:
+    rows, columns = torch.nonzero(mask, as_tuple=True)
     stride = max(1, math.ceil(math.sqrt(len(rows) / MAX_SAMPLES)))
     kept = (rows % stride == 0) & (columns % stride == 0)
     rows, columns = rows[kept], columns[kept]
     x, y = pixel_grid_mm(sensor.height, sensor.width, sensor.mm_per_pixel, torch.float64)
-    radius_mm = 0.5 * given.ball_diameter_mm if isinstance(given, Press) else 0.0
+    radius_mm = 0.5 * given.ball_diameter_mm
     index, half = rows * sensor.width + columns, middle_px(sensor) * sensor.mm_per_pixel
     return Contact(given.name, change, mask, index, x[0, columns], y[rows, 0], saturated.flatten()[index], radius_mm, half)
 
@@ -260,8 +256,3 @@ def press_row(contact: Contact, sensor: Sensor) -> PressRow:
         row["center_px"] = (contact.center_mm / sensor.mm_per_pixel + middle_px(sensor)).tolist()
         row["contact_radius_px"] = contact.contact_radius_mm / sensor.mm_per_pixel
     return row
-
-
-def touch_row(contact: Contact) -> TouchRow:
-    """The row of a touch in the report."""
-    return {"name": contact.name, "used": not contact.reason, "reason": contact.reason}

@@ -12,7 +12,7 @@ from ..core.blur import blur, gaussian_weights
 from ..core.views import TWELVE_BITS, Views
 from ..model.calibration import PEDESTAL, SATURATED
 from .contacts import DARK, MOST_SATURATED, channel_band
-from .presses import Press, Touch
+from .presses import Press
 
 UNIFORM_COLOUR = 0.05
 """Variation of a background's colour, RMS of the differences of log R, G and B, below which no coloured lights are seen. It is
@@ -66,7 +66,7 @@ def check_exposure(background: Tensor) -> None:
         )
 
 
-def check_light(background: Tensor, given: Sequence[Press] | Sequence[Touch]) -> None:
+def check_light(background: Tensor, presses: Sequence[Press]) -> None:
     """Raise for a greyscale background, and for contacts that change the brightness of the skin, but not its colour.
 
     Where the skin tilts, coloured lights from different sides change R, G and B differently. Under white light all three
@@ -74,7 +74,7 @@ def check_light(background: Tensor, given: Sequence[Press] | Sequence[Touch]) ->
 
     Args:
         background: (3, H, W) in [0, 1].
-        given: presses or touches.
+        presses: of balls.
     Raises:
         ValueError: R, G and B of the background are the same everywhere, or change alike in the median of all contacts.
     """
@@ -83,10 +83,10 @@ def check_light(background: Tensor, given: Sequence[Press] | Sequence[Touch]) ->
             "background: expected an image in colour, got one whose R, G and B are the same everywhere: a greyscale image? "
             "photometric depth needs coloured lights and a colour camera"
         )
-    shares = [share for share in (colour_share(item.image, background) for item in given) if share is not None]
+    shares = [share for share in (colour_share(item.image, background) for item in presses) if share is not None]
     if shares and statistics.median(shares) < ACHROMATIC:
         raise ValueError(
-            f"{'presses' if isinstance(given[0], Press) else 'touches'}: expected contacts that change the colour of the skin, got "
+            "presses: expected contacts that change the colour of the skin, got "
             f"R, G and B that change alike (the change of colour is {statistics.median(shares):.2f} of the change of light, 1 and "
             "more under coloured lights): this sensor has no coloured lights: photometric depth is not possible; "
             "or its skin was changed since the background, as by markers"

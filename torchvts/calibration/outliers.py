@@ -5,11 +5,12 @@ import math
 import torch
 from torch import Tensor
 
-from ..model.response_field import ResponseModel
+from ..model.response_field import SensorPrior
 from ..model.sensor import Sensor
 from .balls import locate
 from .contacts import Contact, used
-from .field import Evidence, Family, ball_sine
+from .field import Family, ball_sine, power_of
+from .posterior import Evidence, Prior
 
 SCREENING_PENALTY = 0.01
 """Regularisation of the small fields by which presses without a prior are compared with each other."""
@@ -34,7 +35,7 @@ FAR_DEG, APART_DEG = 15.0, 12.0
 """Mean errors of slopes of a press that is no clean ball: by itself, and where it is thrice that of the others."""
 
 
-def locate_and_screen(contacts: list[Contact], sensor: Sensor, prior: ResponseModel | None, half_mm: float) -> list[Contact]:
+def locate_and_screen(contacts: list[Contact], sensor: Sensor, prior: SensorPrior | None, half_mm: float) -> list[Contact]:
     """Locate the balls and leave out outliers. Without a prior, locate again without them, because they moved the other balls.
 
     Args:
@@ -47,55 +48,53 @@ def locate_and_screen(contacts: list[Contact], sensor: Sensor, prior: ResponseMo
     """
     located = None
     while located is None or (prior is None and located > len(used(contacts))):
-        locate(contacts, sensor, prior, half_mm)
+        locate(contacts, sensor, None if prior is None else prior.response, half_mm)
         located = len(used(contacts))
-        _leave_out(contacts, prior, half_mm, name_of_start(sensor, prior))
+        _leave_out(contacts, prior, half_mm)
     return used(contacts)
 
 
-def name_of_start(sensor: Sensor, start: ResponseModel | None) -> str:
-    """What fields that a fit starts from are called; "" without."""
-    return "" if start is None else "the touches" if sensor.prior is None else "the sensor's prior"
-
-
-def _leave_out(contacts: list[Contact], prior: ResponseModel | None, half_mm: float, start_name: str) -> None:
+def _leave_out(contacts: list[Contact], prior: SensorPrior | None, half_mm: float) -> None:
     """Give a reason to presses that the others, or the prior, contradict, one after the other."""
     while True:
         left = used(contacts)
         if len(left) < (1 if prior is not None else 2):
             return
-        start = None if prior is None else prior.field.tensor().reshape(-1)
-        evidence = Evidence.of(Family(2, -1, half_mm) if prior is None else Family.of(prior.field), left)
-        penalty = _screening(evidence) if prior is None else evidence.penalty(PRIOR_PRESSES)
-        gains = evidence.gains(evidence.held_out(penalty, start))
-        errors = evidence.errors_deg([evidence.solve(penalty, start)] * len(left))
-        if start is None:
-            shown, std = gains, _uncertainty(evidence)
+        family = Family(2, -1, half_mm) if prior is None else Family.of(prior.response.field)
+        evidence = Evidence(family, left)
+        if prior is None:
+            start = Prior(torch.zeros(2, family.size(), dtype=torch.float64), SCREENING_PENALTY * family.penalty())
+        else:
+            start = Prior(prior.response.field.tensor(), PRIOR_PRESSES * family.penalty(power_of(left)))
+        gains = evidence.gains(evidence.held_out(start))
+        errors = evidence.errors_deg([evidence.posterior(start).mean] * len(left))
+        if prior is None:
+            shown, std = gains, _uncertainty(evidence, start)
             for contact, one in zip(left, std.tolist()):
                 contact.metrics["gain_std"] = one
-            wrong = _wrong_by_others(evidence, gains, std.masked_fill(_known(evidence) < LEAST_KNOWN, math.inf))
+            wrong = _wrong_by_others(evidence, start, gains, std.masked_fill(_known(evidence, start) < LEAST_KNOWN, math.inf))
         else:
-            shown, wrong = evidence.gains([start] * len(left)), _wrong_by_prior(gains)
+            shown, wrong = evidence.gains([start.mean] * len(left)), _wrong_by_prior(gains)
         for contact, gain, error in zip(left, shown.tolist(), errors):
             contact.metrics |= {"error_deg": error, "gain": gain}
         if wrong is not None:
-            _reject_diameter(left, wrong, float(gains[wrong]), start_name)
+            _reject_diameter(left, wrong, float(gains[wrong]), prior is not None)
         elif not _reject_slopes(left, errors, prior is not None):
             return
 
 
-def _reject_diameter(left: list[Contact], wrong: int, gain: float, start_name: str) -> None:
+def _reject_diameter(left: list[Contact], wrong: int, gain: float, by_prior: bool) -> None:
     contact = left[wrong]
     others = f"the other {len(left) - 1} presses" if len(left) > 2 else "the other press"
-    reference = (start_name + (f" and {others}" if len(left) > 1 else "")) if start_name else others
+    reference = "the sensor's prior" + (f" and {others}" if len(left) > 1 else "") if by_prior else others
     seen = 2 * contact.radius_mm / max(gain, 1e-3)
     contact.reason = f"by {reference} the ball seems {seen:.2f} mm wide, but {2 * contact.radius_mm:g} mm was given"
     contact.reason += (
         ": a wrong diameter, or skin that answers otherwise than where they lie; more presses beside it will show which"
     )
-    if not start_name and len(left) == 3:
+    if not by_prior and len(left) == 3:
         contact.reason += "; of three, another may be the wrong one"
-    if not start_name and len(left) == 2:
+    if not by_prior and len(left) == 2:
         left[1 - wrong].reason = "contradicts the only other press: one of the two diameters is wrong"
 
 
@@ -119,36 +118,32 @@ def _wrong_by_prior(gains: Tensor) -> int | None:
     return worst if float(far[worst]) > math.log(FAR_FROM_PRIOR) else None
 
 
-def _screening(evidence: Evidence) -> Tensor:
-    return SCREENING_PENALTY * evidence.family.penalty()
-
-
-def _known(evidence: Evidence) -> Tensor:
+def _known(evidence: Evidence, prior: Prior) -> Tensor:
     """(N,): part of the gain of each press that a field of the others can know: regularisation takes what no other press covers.
 
     It is that of a field by exact presses of the others, if the field of the press by itself is the true one, up to a factor.
     """
-    penalty = torch.diag(_screening(evidence))
+    penalty, form = torch.diag(prior.precision), evidence.grams.sum(0)
     parts = []
-    for item, (form, right) in zip(evidence.forms, evidence.each):
-        own, others = torch.linalg.solve(form + penalty, right), evidence.form - form
-        parts.append(item.gain(torch.linalg.solve(others + penalty, others @ own)) / max(item.gain(own), 1e-3))
+    for item, gram, right in zip(evidence.forms, evidence.grams, evidence.rights):
+        own, others = torch.linalg.solve(gram + penalty, right.t()), form - gram
+        parts.append(item.gain(torch.linalg.solve(others + penalty, others @ own).t()) / max(item.gain(own.t()), 1e-3))
     return torch.tensor(parts, dtype=torch.float64)
 
 
-def _uncertainty(evidence: Evidence) -> Tensor:
+def _uncertainty(evidence: Evidence, prior: Prior) -> Tensor:
     """(N,): standard deviation of the gain of each press by a field of the others.
 
     A press errs by :data:`NOISE` of its sines, alike all over it; the normal equations of the others give what that does elsewhere.
     It is large where no other press lies near, and where little light changes: there the others say nothing.
     """
-    penalty = torch.diag(_screening(evidence))
+    penalty, form = torch.diag(prior.precision), evidence.grams.sum(0)
     variance = []
-    for item, (form, _) in zip(evidence.forms, evidence.each):
+    for item, gram in zip(evidence.forms, evidence.grams):
         inside = item.contact.inside()
         terms, ball = item.terms[:, inside], ball_sine(item.contact)[:, inside]
-        along = (terms @ ball.t()).t().reshape(-1) / ball.square().sum().clamp_min(1e-12)  # of the gain by the coefficients
-        carried = along @ torch.linalg.solve(evidence.form - form + penalty, along)
+        along = terms @ ball.t() / ball.square().sum().clamp_min(1e-12)  # (K, 2), of the gain by the coefficients
+        carried = (along * torch.linalg.solve(form - gram + penalty, along)).sum()
         variance.append(1.0 + ball.square().sum(0).mean() * carried)
     return NOISE * torch.stack(variance).sqrt()
 
@@ -160,17 +155,16 @@ def _usual(gains: Tensor, std: Tensor) -> float:
     return max(float(values[int((weights.cumsum(0) < 0.5 * weights.sum()).sum())]), 1e-3)
 
 
-def _wrong_by_others(evidence: Evidence, gains: Tensor, std: Tensor) -> int | None:
+def _wrong_by_others(evidence: Evidence, prior: Prior, gains: Tensor, std: Tensor) -> int | None:
     """The press with a wrong diameter, if any; each gain, and its standard deviation, is by the field of the other presses.
 
     A wrong press bends the field for all, so the wrong one is that without which the others agree best. It must differ from them
     by more than they differ from each other, and by more than they know of its place.
     """
-    penalty = _screening(evidence)
     relative, disagreement, spread = [], [], []
     for place, gain in enumerate(gains.tolist()):
         rest = evidence.without(place)
-        others = rest.gains(rest.held_out(penalty, None)) if len(gains) > 2 else torch.ones(1, dtype=torch.float64)
+        others = rest.gains(rest.held_out(prior)) if len(gains) > 2 else torch.ones(1, dtype=torch.float64)
         apart = torch.cat((std[:place], std[place + 1 :]))
         usual = _usual(others, apart)
         off = (others / usual - 1.0) / apart

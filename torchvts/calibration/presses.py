@@ -1,4 +1,4 @@
-"""What a user gives to calibrate from, beside the background: presses of balls and touches by any object."""
+"""What a user gives to calibrate from, beside the background: presses of balls."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -44,31 +44,6 @@ class Press:
             check_positive("contact_radius_px", self.contact_radius_px)
 
 
-@dataclass(frozen=True, eq=False)
-class Touch:
-    """An image of any object pressed into the skin.
-
-    Args:
-        image: (3, H, W) in [0, 1], R, G, B, of the unit to calibrate.
-        depth_mm: largest depth, mm, if it is known, for example from a stage; else None.
-        name: used in messages.
-    Raises:
-        ValueError, TypeError: an impossible depth.
-    Example:
-        >>> import torch
-        >>> Touch(torch.zeros(3, 240, 320)).depth_mm is None
-        True
-    """
-
-    image: Tensor
-    depth_mm: float | None = None
-    name: str = ""
-
-    def __post_init__(self) -> None:
-        if self.depth_mm is not None:
-            check_positive("depth_mm", self.depth_mm, 100.0)
-
-
 def read_presses(folder: str | Path) -> tuple[Tensor, list[Press]]:
     """Read a folder in gs_sdk's layout.
 
@@ -100,15 +75,4 @@ def check_presses(presses: Sequence[Press], sensor: Sensor) -> list[Press]:
             raise TypeError(f"presses[{k}]: expected a Press, got {type(press).__name__}: Press(image, ball_diameter_mm)")
         named.append(press if press.name else dataclasses.replace(press, name=f"presses[{k}]"))
         check_image(f"{named[k].name}: image", press.image, sensor.height, sensor.width, sensor.name)
-    return named
-
-
-def check_touches(touches: Sequence[Touch | Tensor], sensor: Sensor) -> list[Touch]:
-    """Check the touches, make images into touches, and name those without a name."""
-    check_sequence("touches", touches, "images or Touch")
-    named = []
-    for k, given in enumerate(touches):
-        touch = given if isinstance(given, Touch) else Touch(given)
-        named.append(touch if touch.name else dataclasses.replace(touch, name=f"touches[{k}]"))
-        check_image(f"{named[k].name}: image", touch.image, sensor.height, sensor.width, sensor.name)
     return named

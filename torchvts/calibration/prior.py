@@ -10,20 +10,25 @@ import torch
 from torch import Tensor
 
 from ..core.checks import check_image, check_record, check_sequence
-from ..model.response_field import ResponseModel, SensorPrior, TaughtRange, fit_log_background
+from ..model.calibration import Calibration
+from ..model.response_field import ResponseField, ResponseModel, SensorPrior, TaughtRange, fit_log_background
 from ..model.sensor import Sensor, check_sensor
 from . import objections
-from .by_presses import PressResult, by_presses
+from .by_presses import by_presses
 from .contacts import Contact, used
-from .field import Family
+from .field import Family, power_of
 from .given_images import sort_presses
 from .objections import CalibrationWarning
+from .posterior import Evidence, Prior, mean_error_deg
 from .presses import Press, check_presses
-from .response_fit import FEW, Candidates, fit_depth_brightness, fit_field, mean_error_deg, taught_range
+from .response_fit import FEW, fit_depth_brightness, taught_range
 
-PRIOR_CANDIDATES = Candidates(((2, 1, -1),), 60.0)
-"""Chosen by other units: larger fields, and weakly regularised products, fit the unit of the presses better and others worse
-(docs/decisions.md)."""
+DEGREE = 2
+"""Degree of a type's field in position; it has no products. Of two pairs of units, each by the other, products gain 3 % at best and
+lose 12 (docs/decisions.md)."""
+
+RIDGE = 0.0005
+"""Prior precision of a constant linear term, in units: of each unit by the other, 0.0001 to 0.002 are as good within 2 %."""
 
 PARTS = 4
 """Presses of one ball are held out in so many parts."""
@@ -42,10 +47,9 @@ def fit_prior(
 ) -> SensorPrior:
     """Fit a prior for every unit of a sensor type to presses on one unit, or on several.
 
-    Linear terms have degree 2, products degree 1. Products are strongly regularised, because otherwise they fit these units
-    better and others worse. Of several units each counts alike. ``held_out_deg`` of the result is then the error on each unit by
-    the others; of one unit that on the balls of each diameter by those of the others, or on every fourth press by the rest.
-    :func:`score_prior` measures it on further units.
+    Each unit counts alike, however many presses it has. ``held_out_deg`` of the result is the error on each unit by the others; of
+    one unit that on the balls of each diameter by those of the others, or on every fourth press by the rest. :func:`score_prior`
+    measures it on further units.
 
     Args:
         background: as for :func:`calibrate`.
@@ -66,59 +70,64 @@ def fit_prior(
     units = [PriorUnit(background, sensor, presses), *others]
     results = [_fitted(unit) for unit in units]
     half_mm = 0.5 * sensor.width * sensor.mm_per_pixel
-    family = PRIOR_CANDIDATES.families(half_mm)[0]
-    balls = _alike([used(result.contacts) for result in results])
-    patterns = [_pattern(unit.sensor, result, sensor) for unit, result in zip(units, results, strict=True)]
+    balls = [used(contacts) for _, contacts in results]
+    patterns = [_pattern(unit.sensor, found, sensor) for unit, (found, _) in zip(units, results, strict=True)]
     log_background = fit_log_background(torch.stack(patterns).log().mean(0).exp(), sensor.mm_per_pixel)
+    field = _pooled(balls, half_mm)
     if len(units) == 1:
-        error = held_out_by_groups(balls[0], family)
-        return SensorPrior(results[0].fit.model, log_background, half_mm, source, () if error is None else (error,))
-    errors = tuple(mean_error_deg(fit_field(_but(balls, k), family), balls[k]) for k in range(len(units)))
-    return SensorPrior(_joint(results, balls, family, units), log_background, half_mm, source, errors)
+        errors = _held_out_by_groups(balls[0], half_mm)
+    else:
+        errors = tuple(mean_error_deg(_pooled([own for own in balls if own is not unit], half_mm), unit) for unit in balls)
+    own_deg = sum(mean_error_deg(field, own) for own in balls) / len(balls)
+    power = sum(power_of(own) for own in balls) / len(balls)
+    model = _model(field, balls, units, results[0][0])
+    return SensorPrior(model, log_background, half_mm, source, errors, own_deg, power)
 
 
-def _fitted(unit: PriorUnit) -> PressResult:
-    """The balls of a unit, located, and its own fit."""
+def _fitted(unit: PriorUnit) -> tuple[Calibration, list[Contact]]:
+    """The unit by its own presses, and the balls, located."""
     background, sensor, presses = unit
     if len(presses) == 0:
         raise ValueError("presses: expected one or more, got none: a prior is fitted to presses")
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     named = check_presses(presses, sensor)
     kept, left_out = sort_presses(background, named)
-    result = by_presses(background, sensor.without_prior(), kept, None, False, PRIOR_CANDIDATES)
+    calibration, contacts = by_presses(background, sensor.without_prior(), kept, None)
     messages = [f"{named[k].name}: left out: {reason}" for k, reason in left_out]
-    for message in messages + objections.to_contacts(result.contacts):
+    for message in messages + objections.to_contacts(contacts):
         warnings.warn(message, CalibrationWarning, stacklevel=3)
-    return result
+    return calibration, contacts
 
 
-def _alike(balls: list[list[Contact]]) -> list[list[Contact]]:
-    """As many of each unit, evenly chosen."""
-    count = min(map(len, balls))
-    return [[own[k * len(own) // count] for k in range(count)] for own in balls]
+def _pooled(balls: Sequence[Sequence[Contact]], half_mm: float) -> ResponseField:
+    """The field of several units, each of which counts alike."""
+    family = Family(DEGREE, -1, half_mm)
+    evidence = Evidence(family, [contact for own in balls for contact in own])
+    weights = torch.tensor([1.0 / len(own) / len(balls) for own in balls for _ in own], dtype=torch.float64)
+    power = sum(power_of(own) for own in balls) / len(balls)
+    prior = Prior(torch.zeros(2, family.size(), dtype=torch.float64), RIDGE * family.penalty(power))
+    return evidence.posterior(prior, weights).field
 
 
-def _but(balls: list[list[Contact]], left_out: int) -> list[Contact]:
-    return [contact for k, own in enumerate(balls) if k != left_out for contact in own]
-
-
-def _pattern(own: Sensor, result: PressResult, sensor: Sensor) -> Tensor:
+def _pattern(own: Sensor, found: Calibration, sensor: Sensor) -> Tensor:
     """The smooth background of a unit on the pixels of a sensor, (3, H, W), linear light."""
-    coefficients = fit_log_background(result.unit.background, own.mm_per_pixel)
-    smooth = SensorPrior(result.fit.model, coefficients, 0.5 * own.width * own.mm_per_pixel, "")
+    coefficients = fit_log_background(found.background, own.mm_per_pixel)
+    assert found.response is not None
+    smooth = SensorPrior(found.response, coefficients, 0.5 * own.width * own.mm_per_pixel, "")
     return smooth.background(sensor.height, sensor.width, sensor.mm_per_pixel)
 
 
-def _joint(results: list[PressResult], balls: list[list[Contact]], family: Family, units: list[PriorUnit]) -> ResponseModel:
-    """One model for several units."""
-    field, first = fit_field([contact for own in balls for contact in own], family), results[0].fit.model
-    pairs = list(zip(balls, units, strict=True))
-    depths = [fit_depth_brightness(own, field, unit.sensor.mm_per_pixel) for own, unit in pairs]
-    rows = torch.stack([depth.tensor() for depth in depths]).mean(0).tolist()
-    reference_mm = sum(depth.reference_mm for depth in depths) / len(depths)
-    by_depth = dataclasses.replace(depths[0], coefficient=tuple(tuple(row) for row in rows), reference_mm=reference_mm)
-    ranges = [taught_range(own, field, unit.sensor.mm_per_pixel) for own, unit in pairs]
-    return ResponseModel(field, by_depth, first.gamma, first.blur_px, functools.reduce(TaughtRange.with_all_of, ranges))
+def _model(field: ResponseField, balls: list[list[Contact]], units: list[PriorUnit], first: Calibration) -> ResponseModel:
+    """The field with the mean over units of what depth does to brightness, and all that their presses taught."""
+    assert first.response is not None
+    pairs = list(zip(balls, (unit.sensor.mm_per_pixel for unit in units), strict=True))
+    by_depth = [fit_depth_brightness(own, field, pitch_mm) for own, pitch_mm in pairs]
+    rows = torch.stack([depth.tensor() for depth in by_depth]).mean(0).tolist()
+    reference_mm = sum(depth.reference_mm for depth in by_depth) / len(by_depth)
+    mean = dataclasses.replace(by_depth[0], coefficient=tuple(map(tuple, rows)), reference_mm=reference_mm)
+    ranges = [taught_range(own, field, pitch_mm) for own, pitch_mm in pairs]
+    taught = functools.reduce(TaughtRange.with_all_of, ranges)
+    return ResponseModel(field, mean, first.response.gamma, first.response.blur_px, taught)
 
 
 def score_prior(background: Tensor, sensor: Sensor, presses: Sequence[Press]) -> float:
@@ -138,12 +147,12 @@ def score_prior(background: Tensor, sensor: Sensor, presses: Sequence[Press]) ->
     if sensor.prior is None:
         raise ValueError(f"sensor: expected one with a prior to score, '{sensor.name}' has none: fit one first")
     check_image("background", background, sensor.height, sensor.width, sensor.name)
-    contacts = by_presses(background, sensor, check_presses(presses, sensor), sensor.prior.response, False).contacts
+    contacts = by_presses(background, sensor, check_presses(presses, sensor), sensor.prior)[1]
     return mean_error_deg(sensor.prior.response.field, used(contacts))
 
 
-def held_out_by_groups(contacts: Sequence[Contact], family: Family) -> float | None:
-    """Mean angle on each group of located presses by a field of the others, degrees; None with too few to fit one.
+def _held_out_by_groups(contacts: Sequence[Contact], half_mm: float) -> tuple[float, ...]:
+    """Mean angle on each group of located presses by a field of the others, degrees; none with too few to fit one.
 
     Groups are the balls of each diameter, or else every fourth press. Another ball is pressed deeper or wider, so its frames are
     new to the field; a neighbouring press of the same ball is not.
@@ -153,9 +162,9 @@ def held_out_by_groups(contacts: Sequence[Contact], family: Family) -> float | N
     if len(groups) < 2 or min(map(len, groups)) < FEW:
         groups = [list(contacts[k::PARTS]) for k in range(PARTS)]
     if len(contacts) < 2 * FEW:
-        return None
+        return ()
     total = 0.0
     for group in groups:
         others = [contact for other in groups if other is not group for contact in other]
-        total += len(group) * mean_error_deg(fit_field(others, family), group)
-    return total / len(contacts)
+        total += len(group) * mean_error_deg(_pooled([others], half_mm), group)
+    return (total / len(contacts),)

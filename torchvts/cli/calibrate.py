@@ -16,7 +16,7 @@ from pathlib import Path
 
 import torch
 
-from ..calibration import Press, Touch, read_presses
+from ..calibration import Press, read_presses
 from ..core.files import make_folder, read_frames
 from ..model import Sensor
 from ..stream import read_background, read_press_images
@@ -39,7 +39,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--gamma", type=float, help="with --mm-per-pixel: value = light^(1/gamma); chosen if not given")
     add_press(parser)
-    parser.add_argument("--touches", type=Path, nargs="+", default=[], metavar="IMAGE", help="unknown objects pressed in")
     parser.add_argument("--use-labels", action="store_true", help="take centers from the folder's label.npz or labels.csv")
     parser.add_argument("--force", action="store_true", help="go on where presses contradict the pitch or all diameters")
     parser.add_argument("--no-prior", action="store_true", help="ignore the prior of the sensor file")
@@ -59,8 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_target_of(arguments.out)
     image, sensor, presses = read_given(arguments)
     presses += read_press_images(arguments.press, sensor)
-    touches = [Touch(sensor.read_image(path), None, path.name) for path in arguments.touches]
-    calibration = calibrated(image, sensor, presses, touches, arguments.force)
+    calibration = calibrated(image, sensor, presses, arguments.force)
     calibration.save(arguments.out)
     print_calibration(calibration, arguments.candidates)
     print(f"wrote {arguments.out} ({arguments.out.stat().st_size / 1000:.0f} kB)")

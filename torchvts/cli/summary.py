@@ -6,12 +6,12 @@ from collections.abc import Iterator, Sequence
 
 from torch import Tensor
 
-from ..calibration import CalibrationWarning, Press, Touch, calibrate
+from ..calibration import CalibrationWarning, Press, calibrate
 from ..core.tables import markdown, number
 from ..diagnose.checks import SATURATED_SHARE
 from ..model import Calibration, PointLights, Sensor
 from ..model.coverage import press_next
-from ..model.report import CandidateRow, PressRow, Report
+from ..model.report import PressRow, Report
 from ..pipeline.expected_error import expected_model_deg
 from ..stream import NOT_METRIC
 
@@ -26,7 +26,6 @@ BY = {
     "sensor_file": "positions from the sensor file",
     "background": "fitted to the image without contact",
     "prior": "the prior of the sensor's type, by this unit's background",
-    "touches": "fitted to touches",
     "presses": "fitted to presses",
     "stand_in": "directions of the sensor file's lights, as a stand-in",
 }
@@ -38,7 +37,7 @@ def print_calibration(calibration: Calibration, candidates: bool = False) -> Non
 
     Args:
         calibration: of the unit.
-        candidates: print all models that were considered, the lights and all presses, too.
+        candidates: print all models that were made, the lights and all presses, too.
     """
     report, sensor = calibration.report, calibration.sensor
     size = f"{sensor.height} x {sensor.width} px, {sensor.mm_per_pixel:g} mm per pixel, gamma {sensor.exponent:g}"
@@ -66,20 +65,18 @@ def print_calibration(calibration: Calibration, candidates: bool = False) -> Non
     for line in left_out("press", [(row["name"], row.get("reason", "")) for row in report.get("presses", []) if not row["used"]]):
         print(line)
     if candidates:
-        print_candidates(report)
+        print_tried(report)
         if calibration.lights is not None:
             print_lights(calibration.lights, report)
         if "presses" in report:
             print_presses(report["presses"])
 
 
-def calibrated(
-    background: Tensor, sensor: Sensor, presses: Sequence[Press], touches: Sequence[Touch] = (), force: bool = False
-) -> Calibration:
+def calibrated(background: Tensor, sensor: Sensor, presses: Sequence[Press], force: bool = False) -> Calibration:
     """:func:`torchvts.calibrate`; warnings become lines on stderr, save those about presses that the summary names."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CalibrationWarning)
-        calibration = calibrate(background, sensor, presses, touches, progress=True, force=force)
+        calibration = calibrate(background, sensor, presses, progress=True, force=force)
     named = tuple(f"{row['name']}: left out" for row in calibration.report.get("presses", []) if not row["used"])
     for text in dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught):
         if not text.startswith(named):
@@ -105,8 +102,9 @@ def expected(calibration: Calibration) -> str:
     if report["source"] == "prior":
         how = "the mean over units that its prior was tried on" if report.get("prior_deg") else "a guess: its prior was never tried"
         return f"{degrees}, {how}; presses of a ball would measure it on this one"
-    if report.get("own_deg"):
-        return f"{degrees}, a guess from their misfit: too few presses to score any; more presses of a ball would measure it"
+    if "stated_deg" in report:
+        degrees = f"normals within a contact to about {report['stated_deg']:.1f} degrees"
+        return f"{degrees}, by what so few presses leave open; more presses of a ball would measure it"
     return f"{degrees}, a guess; more presses of a ball would measure it"
 
 
@@ -118,19 +116,11 @@ def left_out(what: str, rows: list[tuple[str, str]]) -> Iterator[str]:
         yield f"left out: {len(rows) - SHOWN} more"
 
 
-def print_candidates(report: Report) -> None:
-    """Print a row for each model that was considered."""
-    titles = ("model", "family", "passes", "parameters", "deg", "misfit", "note")
-    print("\n" + markdown(titles, [_candidate(row) for row in report.get("candidates", [])]))
-    print("deg: mean angle on held-out presses; for point lights without presses the standard deviation of the worst direction")
-    print("misfit: smooth relative structure of the image that the lights leave unexplained")
-
-
-def _candidate(row: CandidateRow) -> list[str]:
-    misfit = f"{row['misfit']:.1%}" if "misfit" in row else ""
-    family = row.get("family", "") + (f", gamma {row['gamma']:g}" if row.get("gamma", 1.0) != 1.0 else "")
-    counts = (str(row.get("passes", "")), str(row.get("parameters", "")))
-    return [row["model"], family, *counts, number(row.get("score_deg"), 2), misfit, row.get("note", "")]
+def print_tried(report: Report) -> None:
+    """Print a row for each model that was made."""
+    rows = [[row["name"], number(row["error_deg"], 2), "; ".join(row["doubts"])] for row in report.get("tried", [])]
+    print("\n" + markdown(("model", "deg", "doubts"), rows))
+    print("deg: mean angle on each press by the others, or of a prior on other units; of lights the least certain direction")
 
 
 def print_lights(lights: PointLights, report: Report) -> None:

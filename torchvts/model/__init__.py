@@ -8,6 +8,7 @@ from .markers import FillMarkers, fill_markers, find_markers
 from .report import Report
 from .response_field import DepthBrightness, ResponseField, ResponseModel, SensorPrior
 from .sensor import Sensor, check_sensor, shipped_sensors
+from .stated_error import stated_deg, stated_error_deg
 
 __all__ = [
     "Calibration",
@@ -28,4 +29,6 @@ __all__ = [
     "near_field_shading",
     "press_next",
     "shipped_sensors",
+    "stated_deg",
+    "stated_error_deg",
 ]

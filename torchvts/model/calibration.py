@@ -31,7 +31,7 @@ from .report import Report, read_report
 from .response_field import ResponseModel
 from .sensor import Sensor, check_sensor
 
-FORMAT_VERSION = 7
+FORMAT_VERSION = 8
 """Version of the calibration file. A file of another version is refused."""
 
 DEFECT_RATIO = 4.0
@@ -64,6 +64,8 @@ class Calibration:
         response: the response fields, if they are the model; else None.
         markers: the block that fills printed markers before anything else, or None.
         ambient: (3,), constant linear light that the lights do not give, subtracted before the gain; None for none.
+        covariance: (K, K), of the coefficients of either slope of the response's field, up to the noise of a press, float32; None
+            where neither presses nor a prior gave one. See :func:`torchvts.model.stated_error.stated_error_deg`.
         contact_share: pressure from which an object touches, as a share of the frame's; None where no press of a ball
             shows it.
         contact_decay_mm: length over which free skin decays for the pressure of contact, mm: the median that presses of balls show,
@@ -85,6 +87,7 @@ class Calibration:
     ambient: Tensor | None = None
     contact_share: float | None = None
     contact_decay_mm: float | None = None
+    covariance: Tensor | None = None
 
     def __post_init__(self) -> None:
         check_sensor("sensor", self.sensor)
@@ -119,6 +122,8 @@ class Calibration:
             raise ValueError("lights, response: expected one of them, got none: a calibration without a model")
         if self.lights is not None and self.response is not None:
             raise ValueError("lights, response: expected one of them, got both: which of the two should give the normals?")
+        if self.covariance is not None:
+            self._check_covariance(self.covariance)
         if not self.measured:
             return
         if not bool((self.background > self.light_noise_std).any()):
@@ -126,6 +131,16 @@ class Calibration:
                 f"background: expected light above the noise, got at most {float(self.background.max()):.3g}: black image, LEDs or "
                 "exposure off"
             )
+
+    def _check_covariance(self, covariance: Tensor) -> None:
+        if self.response is None:
+            raise ValueError("covariance: expected None of a calibration by lights, got a tensor: it is that of a response field")
+        check_float_tensor("covariance", covariance)
+        size = self.response.field.size()
+        check_shape("covariance", covariance, (size, size), "one row for each coefficient of a slope")
+        good = torch.isfinite(covariance).all() & (covariance == covariance.t()).all() & (covariance.diagonal() > 0).all()
+        if not bool(good):
+            raise ValueError("covariance: expected finite values, symmetric, with a positive diagonal")
 
     @classmethod
     def from_lights(
@@ -155,7 +170,9 @@ class Calibration:
         check_sensor("sensor", sensor)
         sensor = dataclasses.replace(sensor, gamma=sensor.exponent, prior=None)
         frozen = PointLights(*(t.detach().cpu() for t in (lights.position_mm, lights.albedo, lights.gloss))).requires_grad_(False)
-        summary = read_report({"model": "point_lights", "source": "given"} | ({} if report is None else dict(report)), "report")
+        summary = read_report(
+            {"model": "point_lights", "source": "given", "doubts": []} | ({} if report is None else dict(report)), "report"
+        )
         if ambient is not None:
             check_tensor("ambient", ambient)
             ambient = ambient.detach().cpu().to(frozen.position_mm.dtype)
@@ -171,7 +188,12 @@ class Calibration:
 
     @classmethod
     def from_response(
-        cls, response: ResponseModel, sensor: Sensor, background: Tensor, report: Report | dict[str, Any] | None = None
+        cls,
+        response: ResponseModel,
+        sensor: Sensor,
+        background: Tensor,
+        report: Report | dict[str, Any] | None = None,
+        covariance: Tensor | None = None,
     ) -> "Calibration":
         """Make a calibration from known response fields, such as those of another unit of the same type. Nothing is fitted.
 
@@ -180,6 +202,7 @@ class Calibration:
             sensor: the sensor; gamma and blur of the response replace its own.
             background: (3, H, W), image without contact in [0, 1].
             report: kept with the calibration; model "response" and source "given" unless it says otherwise.
+            covariance: (K, K), of the coefficients of the field; None where it is not known.
         Raises:
             ValueError, TypeError: background of another shape or range.
         Example:
@@ -193,9 +216,15 @@ class Calibration:
         check_sensor("sensor", sensor)
         check_image("background", background, sensor.height, sensor.width, sensor.name)
         sensor = dataclasses.replace(sensor, gamma=response.gamma, blur_px=response.blur_px, prior=None)
-        summary = read_report({"model": "response", "source": "given"} | ({} if report is None else dict(report)), "report")
+        summary = read_report(
+            {"model": "response", "source": "given", "doubts": []} | ({} if report is None else dict(report)), "report"
+        )
         light, noise, markers = _measure(background, sensor, background.dtype)
-        return cls(sensor, None, light, noise, True, summary, response, markers)
+        if covariance is not None:
+            check_tensor("covariance", covariance)
+            covariance = covariance.detach().cpu().float()
+            covariance = 0.5 * (covariance + covariance.mT)
+        return cls(sensor, None, light, noise, True, summary, response, markers, covariance=covariance)
 
     def __repr__(self) -> str:
         sensor, origin = self.sensor, "an image" if self.measured else "the lights alone"
@@ -376,8 +405,9 @@ class Calibration:
         """Write one safetensors file, whole or not at all.
 
         Tensors by lights: S, rho, I_delta, the inverse light matrix, the background, the noise, and ambient light if there is
-        any. Tensors by response: the noise, and the background as a 16-bit PNG of the camera's values, which keeps an 8-bit
-        image bit for bit. JSON metadata: format version, sensor, response, markers, report.
+        any. Tensors by response: the noise, the background as a 16-bit PNG of the camera's values, which keeps an 8-bit image bit
+        for bit, and the upper triangle of the covariance, if there is one. JSON metadata: format version, sensor, response,
+        markers, report.
         """
         metadata = {
             "format_version": FORMAT_VERSION,
@@ -393,6 +423,9 @@ class Calibration:
         tensors = {"noise_std": self.noise_std}
         if self.lights is None:
             tensors["background_png"] = image_to_bytes(self.background.clamp(0, 1) ** (1.0 / self.sensor.exponent))
+            if self.covariance is not None:
+                row, column = torch.triu_indices(*self.covariance.shape)
+                tensors["covariance"] = self.covariance[row, column]
         else:
             tensors |= {
                 "light_position_mm": self.lights.position_mm,
@@ -461,7 +494,9 @@ def _load_by_response(path: str | Path, tensors: dict[str, Tensor], metadata: di
     if (sensor.exponent, sensor.blur_px) != (response.gamma, response.blur_px):
         raise ValueError(f"{path}: sensor and response differ in gamma or blur_px: damaged or edited")
     noise, measured, report = tensors["noise_std"], metadata["measured"], metadata["report"]
-    return Calibration(sensor, None, light, noise, measured, report, response, markers, None, *_load_contact(path, metadata))
+    covariance = _load_covariance(path, tensors, response.field.size())
+    contact = _load_contact(path, metadata)
+    return Calibration(sensor, None, light, noise, measured, report, response, markers, None, *contact, covariance)
 
 
 def _load_by_lights(path: str | Path, tensors: dict[str, Tensor], metadata: dict[str, Any], sensor: Sensor) -> Calibration:
@@ -495,6 +530,19 @@ def _load_by_lights(path: str | Path, tensors: dict[str, Tensor], metadata: dict
         if not torch.allclose(tensors[name], derived, rtol=1e-3, atol=1e-3 * float(derived.abs().max())):
             raise ValueError(f"{path}: tensor {name!r} does not fit the lights in the same file: damaged or edited")
     return calibration
+
+
+def _load_covariance(path: str | Path, tensors: dict[str, Tensor], size: int) -> Tensor | None:
+    """The symmetric matrix of an upper triangle; None where the file has none."""
+    if "covariance" not in tensors:
+        return None
+    _check_tensors(path, tensors, {"covariance": (size * (size + 1) // 2,)})
+    covariance = torch.zeros(size, size, dtype=tensors["covariance"].dtype)
+    row, column = torch.triu_indices(size, size)
+    covariance[row, column] = covariance[column, row] = tensors["covariance"]
+    if not bool((covariance.diagonal() > 0).all()):
+        raise ValueError(f"{path}: tensor 'covariance': expected a positive diagonal: damaged")
+    return covariance
 
 
 def _load_markers(path: str | Path, metadata: dict[str, Any]) -> FillMarkers | None:

@@ -6,47 +6,30 @@ from ..core.checks import brief
 
 Model = Literal["point_lights", "response"]
 
-Source = Literal["given", "sensor_file", "background", "prior", "touches", "presses", "stand_in"]
+Source = Literal["given", "sensor_file", "background", "prior", "presses", "stand_in"]
 """Where the model comes from.
 
 * given: the caller gave the model.
 * sensor_file: the sensor file gives the positions of the lights.
 * background: lights were fitted to the image without contact.
 * prior: the response of the sensor type.
-* touches: a response was fitted to touches by unknown objects.
 * presses: a response was fitted to presses of balls.
 * stand_in: a rough response from the directions of lights whose positions do not fit the image; depth is not metric.
 """
 
 
-class _CandidateKeys(TypedDict):
-    model: str
-
-
-class CandidateRow(_CandidateKeys, total=False):
-    """One model that calibration considered.
+class Tried(TypedDict):
+    """One model that calibration made.
 
     Attributes:
-        model: its kind, in words.
-        family: its size, in words.
-        parameters: number of fitted parameters.
-        passes: 1 for normals from the image alone, 2 for normals that also use the depth of a first pass.
-        score_deg: mean error of its normals on presses, each by the others, degrees; None where there is none.
-        misfit: size of the smooth pattern in the background that lights cannot explain, relative to the light; absent where
-            lights were not fitted, or the fit failed.
-        gamma: camera response it was fitted with.
-        tried: degrees of fields that touches were tried with.
-        note: why it was chosen or rejected.
+        name: what it is and comes from, in words.
+        error_deg: mean error of its normals, or of its lights' directions, degrees; None where nothing measured it.
+        doubts: why not to trust it, each a sentence; empty where nothing speaks against it.
     """
 
-    family: str
-    parameters: int
-    passes: int
-    score_deg: float | None
-    misfit: float
-    gamma: float
-    tried: list[dict[str, float]]
-    note: str
+    name: str
+    error_deg: float | None
+    doubts: list[str]
 
 
 class _PressKeys(TypedDict):
@@ -76,20 +59,6 @@ class PressRow(_PressKeys, total=False):
     gain_std: float
 
 
-class TouchRow(TypedDict):
-    """What became of one touch.
-
-    Attributes:
-        name: of the touch.
-        used: whether the fit used it.
-        reason: why it was left out, else "".
-    """
-
-    name: str
-    used: bool
-    reason: str
-
-
 class _ReportKeys(TypedDict):
     model: Model
     source: Source
@@ -104,11 +73,12 @@ class Report(_ReportKeys, total=False):
         reason: why this model was chosen.
         objection: why depth is not metric, as far as is known: a prior on a background that is not of its type, sizes that the
             presses contradict, lights that are not this unit's or not determined. Absent where nothing speaks against it.
-        candidates: all models that were considered.
+        tried: all models that were made, the taken one last.
+        doubts: all that speaks against the calibration, a sentence each with its remedy.
         presses: one row per press.
-        touches: one row per touch.
         held_out_deg: mean error on presses by a response fitted to the other presses, degrees; None with too few presses.
-        own_deg: mean error on the very presses that a response was fitted to, degrees, where too few were used to hold one out.
+        own_deg: mean error on the very presses that a response, or its prior, was fitted to, degrees.
+        stated_deg: error of normals to expect anywhere on the skin, by the covariance of the field, degrees.
         prior_deg: where the sensor's prior is the model, or what presses were fitted from: its mean error on presses and units that
             it was not fitted to, degrees; None where its file does not say.
         family: of the lights, in words.
@@ -129,11 +99,12 @@ class Report(_ReportKeys, total=False):
 
     reason: str
     objection: str
-    candidates: list[CandidateRow]
+    tried: list[Tried]
+    doubts: list[str]
     presses: list[PressRow]
-    touches: list[TouchRow]
     held_out_deg: float | None
     own_deg: float
+    stated_deg: float
     prior_deg: float | None
     family: str
     converged: bool

@@ -20,6 +20,9 @@ MAX_SLOPE = 3.0
 
 MAX_SINE = MAX_SLOPE / math.sqrt(1.0 + MAX_SLOPE**2)
 
+PRIOR_VERSION = 2
+"""Version of a prior in a sensor file. One of another version is refused."""
+
 
 @dataclass(frozen=True)
 class ResponseField:
@@ -313,7 +316,10 @@ def slope_from_sine(sine: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class SensorPrior:
-    """Response that all units of a sensor type share, and the background it was fitted with.
+    """Response of the units of a sensor type: a Gaussian of the field's coefficients, and the background it was fitted with.
+
+    The mean is the field of ``response``. The precision says how little units differ from it, as a number of presses
+    (torchvts/calibration/posterior.py).
 
     Args:
         response: the model.
@@ -322,6 +328,9 @@ class SensorPrior:
         source: whose images it was fitted to, and how.
         held_out_deg: mean angle between its normals and those of balls that it was not fitted to, degrees, of each unit that it was
             tried on: first the unit it was fitted to, by other presses, then other units. Empty where nobody has measured it.
+        own_deg: mean error on the balls that it was fitted to, degrees; None where nobody has measured it.
+        power: mean square of the changes of light in their contacts, in units of :data:`CHANGE_SCALE`, of the three channels.
+        precision: of a constant linear coefficient among units, in presses.
     Raises:
         ValueError, TypeError: names the argument.
     """
@@ -331,6 +340,9 @@ class SensorPrior:
     half_mm: float
     source: str
     held_out_deg: tuple[float, ...] = ()
+    own_deg: float | None = None
+    power: float = 2.0
+    precision: float = 0.1
 
     def __post_init__(self) -> None:
         if not isinstance(self.response, ResponseModel):
@@ -341,6 +353,10 @@ class SensorPrior:
         if not isinstance(self.source, str):
             raise TypeError(f"source: expected a text, got {brief(self.source)}")
         object.__setattr__(self, "held_out_deg", _angles(self.held_out_deg))
+        if self.own_deg is not None:
+            object.__setattr__(self, "own_deg", check_positive("own_deg", self.own_deg, 90.0))
+        for name in ("power", "precision"):
+            object.__setattr__(self, name, check_positive(name, getattr(self, name)))
 
     @property
     def expected_deg(self) -> float | None:
@@ -357,15 +373,29 @@ class SensorPrior:
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers."""
         rows = [[float(f"{number:.6g}") for number in row] for row in self.log_background]
-        measured = {"held_out_deg": [float(f"{angle:.3g}") for angle in self.held_out_deg]} if self.held_out_deg else {}
-        source: dict[str, Any] = {"source": self.source}
+        measured: dict[str, Any] = {}
+        if self.held_out_deg:
+            measured["held_out_deg"] = [float(f"{angle:.3g}") for angle in self.held_out_deg]
+        if self.own_deg is not None:
+            measured["own_deg"] = float(f"{self.own_deg:.3g}")
+        measured |= {"power": float(f"{self.power:.3g}"), "precision": self.precision}
+        source: dict[str, Any] = {"version": PRIOR_VERSION, "source": self.source}
         return source | measured | {"half_mm": self.half_mm, "log_background": rows, "response": self.response.to_dict()}
 
     @classmethod
     def from_dict(cls, values: Any, source: str) -> "SensorPrior":
         """Read the output of :meth:`to_dict`; ``source`` names it in errors."""
-        if isinstance(values, dict) and "response" in values:
-            values = values | {"response": ResponseModel.from_dict(values["response"], f"{source}: response")}
+        if not isinstance(values, dict):
+            raise ValueError(f"{source}: expected keys and values, got {type(values).__name__}")
+        values = dict(values)
+        version = values.pop("version", None)
+        if version != PRIOR_VERSION or isinstance(version, bool):
+            raise ValueError(
+                f"{source}: expected version {PRIOR_VERSION} of a prior, got {brief(version)}: written by another torchvts; fit it "
+                "again with scripts/fit_prior.py, or update torchvts"
+            )
+        if "response" in values:
+            values |= {"response": ResponseModel.from_dict(values["response"], f"{source}: response")}
         return from_dict(cls, values, source)
 
 

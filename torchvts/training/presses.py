@@ -98,13 +98,11 @@ def with_centers(background: Tensor, sensor: Sensor, presses: Sequence[Press]) -
     return [press for press in known if press is not None and press.contact_radius_px is not None]
 
 
-def quiet_calibrate(
-    background: Tensor, sensor: Sensor, presses: Sequence[Press] = (), touches: Sequence[Tensor] = ()
-) -> Calibration:
+def quiet_calibrate(background: Tensor, sensor: Sensor, presses: Sequence[Press] = ()) -> Calibration:
     """``calibrate`` without its warnings: an evaluation reports the errors themselves."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CalibrationWarning)
-        return calibrate(background, sensor, presses, touches)
+        return calibrate(background, sensor, presses)
 
 
 def training_pixels(compensate: nn.Module, presses: Sequence[Press], mm_per_pixel: float) -> TrainingPixels:

@@ -23,9 +23,9 @@ from .posterior import Evidence, Prior, mean_error_deg
 from .presses import Press, check_presses
 from .response_fit import FEW, fit_depth_brightness, taught_range
 
-DEGREE = 2
-"""Degree of a type's field in position; it has no products. Of two pairs of units, each by the other, products gain 3 % at best and
-lose 12 (docs/decisions.md)."""
+DEGREES = (2, 1)
+"""Degrees of a type's field in position, of linear terms and of products of two. Of two pairs of units, each by the other, without
+products, and in the largest family, it is 1 and 2 % worse."""
 
 RIDGE = 0.0005
 """Prior precision of a constant linear term, in units: of each unit by the other, 0.0001 to 0.002 are as good within 2 %."""
@@ -101,7 +101,7 @@ def _fitted(unit: PriorUnit) -> tuple[Calibration, list[Contact]]:
 
 def _pooled(balls: Sequence[Sequence[Contact]], half_mm: float) -> ResponseField:
     """The field of several units, each of which counts alike."""
-    family = Family(DEGREE, -1, half_mm)
+    family = Family(*DEGREES, half_mm)
     evidence = Evidence(family, [contact for own in balls for contact in own])
     weights = torch.tensor([1.0 / len(own) / len(balls) for own in balls for _ in own], dtype=torch.float64)
     power = sum(power_of(own) for own in balls) / len(balls)

@@ -220,10 +220,9 @@ TABLE = {
         named={"values": "file"}, file=("values",)),
     "Sensor.save": Entry(
         {"path": ...}, {"path": [Path("no/such/rig.yaml"), "."]}, lambda: sensor().save, file=("path",), run=False),
-    "calibrate": Entry({"background": image(), "sensor": sensor(), "presses": (), "touches": ()}, {
+    "calibrate": Entry({"background": image(), "sensor": sensor(), "presses": ()}, {
         "background": [*images(), 0 * image(), torch.full_like(image(), 0.5), torch.ones_like(image())],
-        "presses": [PRESS, [image()], ["press.png"], None, "presses", 3],
-        "touches": [image(), [image()[0]], ["touch.png"], None, 3]}),
+        "presses": [PRESS, [image()], ["press.png"], None, "presses", 3]}),
     "contact_cloud": Entry({"frame": frame(), "mm_per_pixel": 0.4, "most": 100},
         {"frame": [None, DEPTH, "frame", vts.scenes.undeformed(frame())], "most": ["9", 0, 1.5]}),
     "depth_to_points": Entry({"depth_mm": DEPTH, "mm_per_pixel": 1.0, "contact": DEPTH > 0},

@@ -185,7 +185,7 @@ def test_what_lights_do_not_explain_is_said(low_rig, small_sensor, camera):
         warnings.simplefilter("always")
         unit = vts.calibrate(seen(flat, low_rig, **camera)[0], small_sensor)
     assert any("the lights leave a smooth misfit of" in str(warning.message) for warning in caught)
-    assert not unit.metric and max(unit.report["misfit"]) > 0.008 and "misfit of" in unit.report["candidates"][0]["note"]
+    assert not unit.metric and max(unit.report["misfit"]) > 0.008 and "misfit of" in unit.report["reason"]
 
 
 def test_ambient_light_survives_the_file(tmp_path, low_rig, small_sensor):

@@ -57,8 +57,7 @@ def test_presses_of_one_ball_calibrate_for_another(data, mini):
         out = precise(calibration, press.image)
         scores.append(score_press(press, out.depth_mm, out.normal, mini.mm_per_pixel).normal_deg)
     assert sum(scores) / len(scores) < 3.0
-    assert calibration.report["candidates"][0]["model"] == "point lights"
-    assert calibration.report["candidates"][0]["note"].startswith("not fitted: the closed-form lights leave a misfit of ")
+    assert calibration.report["source"] == "presses" and "from the sensor's prior and " in calibration.report["reason"]
 
 
 def mini_backgrounds(data):

@@ -9,7 +9,6 @@ import torch
 import torchvts as vts
 from lab.drawn_sensors import drawn_sensor
 from torchvts.calibration import CalibrationWarning
-from torchvts.calibration.by_presses import error_of_lights_deg
 from torchvts.model import distance_to_presses, press_next
 from torchvts.pipeline import beyond_presses
 
@@ -107,17 +106,6 @@ def test_skin_without_presses_is_known_and_said(whole):
 
 def places():
     return [(press.name, press.center_px) for press in UNIT.balls]
-
-
-def test_no_ball_in_sight_gives_no_mean_of_nothing(whole):
-    """The error of lights on balls of which no pixel is seen is unknown, not NaN, which no file can hold."""
-    from torchvts.calibration.contacts import read_contacts
-
-    lights = vts.PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
-    unit = vts.Calibration.from_lights(lights, UNIT.sensor, UNIT.background)
-    contacts = read_contacts(UNIT.balls[:1], UNIT.background, UNIT.sensor)
-    contacts[0].contact_radius_mm, contacts[0].known = 1e-6, True
-    assert error_of_lights_deg(unit, UNIT.balls[:1], contacts, 0.0) is None
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -97,13 +97,12 @@ def test_the_second_pass_learned_from_balls_carries_over_to_other_objects(seed, 
 
 
 @pytest.mark.long
-def test_lights_that_do_not_explain_the_background_are_not_chosen():
-    """Their normals are right on the ball, but undeformed skin would seem 0.3 mm deep as soon as its light changes."""
+def test_undeformed_skin_stays_where_it_is_by_one_press():
+    """Point lights would be right on the ball, but undeformed skin would seem 0.3 mm deep as soon as its light changes."""
     unit = drawn_sensor(14)
     ball = unit.ball(4.0, 0.5, (0.8, -0.6))
     calibration = calibrate(unit.background, unit.sensor, [Press(ball.image, 4.0, "ball")])
-    lights = calibration.report["candidates"][0]
-    assert lights["score_deg"] < 5.0 and lights["misfit"] > 0.1 and calibration.report["model"] == "response"
+    assert calibration.report["model"] == "response"
     pressed = unit.press(objects.capsule(), objects.pose(press_mm=0.4))
     out = DepthPipeline.from_calibration(calibration)(pressed.image[None])
     assert float(out.depth_mm.min()) > -0.05

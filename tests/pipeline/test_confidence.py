@@ -172,7 +172,7 @@ def test_the_held_out_error_of_presses_sets_the_bounds():
 
     good, bad, few = bound(held_out_deg=1.0), bound(held_out_deg=4.0), bound(held_out_deg=1.0, presses=3)
     assert good < few < bad and bad / good > 2.0  # the frame itself shows its error too
-    assert good < bound(held_out_deg=None, source="touches") == bound(held_out_deg=None, source="prior") < bad * 1.6
+    assert good < bound(held_out_deg=None, source="prior") < bad * 1.6
 
 
 EXPECTED = {  # what is in the report, and the mean error that follows, degrees

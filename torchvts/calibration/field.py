@@ -1,11 +1,12 @@
 """What one located press says of a response field, which is linear in its coefficients: a quadratic form.
 
-The sine of a ball's surface, slope / sqrt(1 + |slope|^2), is -(x - center) / radius inside the contact. A field gives the sine
-w phi, with coefficients w (2, K) and factors phi (K,) at each pixel, so the mean squared error of a press is
+The sine of a ball's surface, slope / sqrt(1 + |slope|^2), is -(x - center) / radius inside the contact, and around it the slope
+points to the center. A field gives the sine w phi, with coefficients w (2, K) and factors phi (K,) at each pixel. So the mean
+squared error of a press is w G w' - 2 R w' + const, with w as one row (2 K,),
 
-    tr(w G w') - 2 tr(w R') + const,    G = mean(phi phi')  (K, K),    R = mean(sine phi')  (2, K).
+    G = mean(phi phi') of either slope inside + 0.3 mean((t phi) (t phi)') around,    R = mean(sine phi') inside,
 
-Both slopes have the same G. Presses add up, and so does a Gaussian prior: see posterior.py.
+where t is the direction across that to the center. Presses add up, and so does a Gaussian prior: see posterior.py.
 """
 
 from collections.abc import Sequence
@@ -26,11 +27,13 @@ from ..model.response_field import (
 from .contacts import Contact
 
 TRANSITION_WEIGHT = 0.3
-"""Weight of the transition zone where balls are located: around the contact the slope points to the center. The fit of the field
-itself is as good without (docs/decisions.md)."""
+"""Weight of the transition zone around a contact. Without it depth of a GelSight Mini is tilted more (relief 24.7 -> 26.0 um), and
+centers on digit_a, whose contacts hold shadows, move by 3 px."""
 TRANSITION_REACH = 2.0
 """The transition zone between ball and undeformed skin ends at this many contact radii."""
-ORDER_PENALTY = (1.0, 10.0, 100.0)
+LEAST_ZONE = 10
+"""Sampled pixels that it needs."""
+ORDER_PENALTY = (1.0, 10.0, 30.0)
 """Prior precision of linear terms, products of two, and of three, relative to each other: products fit one unit and one place."""
 DEGREE_PENALTY = 2.0
 """Each degree in position multiplies it: slowly varying fields are likely."""
@@ -106,18 +109,19 @@ class ContactForms:
         self.terms = family.terms(contact)
 
     def ball(self) -> tuple[Tensor, Tensor]:
-        """G (K, K) and R (2, K) of the press with its center where it is, of weight one per press."""
+        """G (2 K, 2 K) and R (2 K,) of the press with its center where it is, of weight one per press."""
         inside = self.contact.inside()
         terms, count = self.terms[:, inside], max(1, int(inside.sum()))
-        return terms @ terms.t() / count, ball_sine(self.contact)[:, inside] @ terms.t() / count
-
-    def transition(self) -> Tensor:
-        """(2 K, 2 K): mean squared slope across the direction to the center in the transition zone, both slopes coupled."""
+        gram = terms @ terms.t() / count
+        form: Tensor = torch.block_diag(gram, gram)  # type: ignore[no-untyped-call]
+        right = ball_sine(self.contact)[:, inside] @ terms.t() / count
         dx, dy, r = self.contact.polar()
         zone = (r > self.contact.contact_radius_mm) & (r < TRANSITION_REACH * self.contact.contact_radius_mm)
-        terms, count = self.terms[:, zone], int(zone.sum())
-        across = torch.cat((-terms * (dy / r)[zone], terms * (dx / r)[zone]))
-        return across @ across.t() / count if count >= 10 else across.new_zeros(len(across), len(across))
+        if (count := int(zone.sum())) >= LEAST_ZONE:
+            around = self.terms[:, zone]
+            across = torch.cat((-around * (dy / r)[zone], around * (dx / r)[zone]))
+            form = form + TRANSITION_WEIGHT * across @ across.t() / count
+        return form, right.reshape(-1)
 
     def center(self) -> tuple[Tensor, Tensor, Tensor]:
         """How sine and center depend on each other: coupling (K,), weight of a shift, and the shift's own right side (2,).
@@ -204,13 +208,12 @@ def solve_with_centers(forms: list[ContactForms], penalty: Tensor, anchors: list
     matrix = torch.zeros(size + 2 * count, size + 2 * count, dtype=torch.float64)
     right = torch.zeros(size + 2 * count, dtype=torch.float64)
     for k, item in enumerate(forms):
-        gram, ball = item.ball()
-        matrix[:size, :size] += TRANSITION_WEIGHT * item.transition()
-        right[:size] += ball.reshape(-1)
+        form, ball = item.ball()
+        matrix[:size, :size] += form
+        right[:size] += ball
         coupling, weight, own = item.center()
         for axis in range(2):
             part, place = slice(axis * half, (axis + 1) * half), size + 2 * k + axis
-            matrix[part, part] += gram
             matrix[part, place] += coupling
             matrix[place, part] += coupling
             matrix[place, place] += weight * (1e9 if item.contact.known else 1.001 + anchor_weight)

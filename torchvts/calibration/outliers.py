@@ -123,11 +123,12 @@ def _known(evidence: Evidence, prior: Prior) -> Tensor:
 
     It is that of a field by exact presses of the others, if the field of the press by itself is the true one, up to a factor.
     """
-    penalty, form = torch.diag(prior.precision), evidence.grams.sum(0)
+    penalty, form = torch.diag(prior.precision.repeat(2)), evidence.grams.sum(0)
     parts = []
     for item, gram, right in zip(evidence.forms, evidence.grams, evidence.rights):
-        own, others = torch.linalg.solve(gram + penalty, right.t()), form - gram
-        parts.append(item.gain(torch.linalg.solve(others + penalty, others @ own).t()) / max(item.gain(own.t()), 1e-3))
+        own, others = torch.linalg.solve(gram + penalty, right), form - gram
+        known = torch.linalg.solve(others + penalty, others @ own)
+        parts.append(item.gain(known.reshape(2, -1)) / max(item.gain(own.reshape(2, -1)), 1e-3))
     return torch.tensor(parts, dtype=torch.float64)
 
 
@@ -137,13 +138,13 @@ def _uncertainty(evidence: Evidence, prior: Prior) -> Tensor:
     A press errs by :data:`NOISE` of its sines, alike all over it; the normal equations of the others give what that does elsewhere.
     It is large where no other press lies near, and where little light changes: there the others say nothing.
     """
-    penalty, form = torch.diag(prior.precision), evidence.grams.sum(0)
+    penalty, form = torch.diag(prior.precision.repeat(2)), evidence.grams.sum(0)
     variance = []
     for item, gram in zip(evidence.forms, evidence.grams):
         inside = item.contact.inside()
         terms, ball = item.terms[:, inside], ball_sine(item.contact)[:, inside]
-        along = terms @ ball.t() / ball.square().sum().clamp_min(1e-12)  # (K, 2), of the gain by the coefficients
-        carried = (along * torch.linalg.solve(form - gram + penalty, along)).sum()
+        along = (ball @ terms.t()).reshape(-1) / ball.square().sum().clamp_min(1e-12)  # of the gain by the coefficients
+        carried = along @ torch.linalg.solve(form - gram + penalty, along)
         variance.append(1.0 + ball.square().sum(0).mean() * carried)
     return NOISE * torch.stack(variance).sqrt()
 

@@ -1,17 +1,18 @@
 r"""A response field is one Gaussian posterior: a prior of fields and any number of located presses, by one linear solve.
 
-The coefficients w (2, K) of a field are Gaussian before any press: mean m, precision diag(p). A press of a ball adds its mean
-squared error (field.py: G, R) as a log likelihood, so that after n of them, up to the noise of a press,
+The coefficients w (2 K,) of a field, of both slopes, are Gaussian before any press: mean m, precision diag(p). A press of a ball
+adds its mean squared error (field.py: G, R) as a log likelihood, so that after n of them, up to the noise of a press,
 
-    C = (diag(p) / n + sum G)^-1     (K, K), the covariance, the same of both slopes
-    w = (m diag(p) / n + sum R) C    (2, K), the mean.
+    C = (diag(p) / n + sum G)^-1     (2 K, 2 K), the covariance
+    w = C (diag(p) m / n + sum R)    (2 K,), the mean.
 
 The prior's part falls with n, because presses err alike in what a field cannot describe, and that does not average. There is one
 family of fields, the largest: what no press shows keeps the prior. The prior is that of all sensors (m = 0) or that of a sensor
 type (the field of its units, and how far units differ from it), and no press at all leaves it as it is.
 
-C says what is not known: phi' C phi is large where no ball was pressed, and for steeper skin than any ball's. With ``own``, the
-mean error of the field on its own presses, the error of normals is expected to be (:func:`torchvts.model.stated_deg`)
+C says what is not known: with the mean of its blocks of the two slopes, (K, K), which is what is kept, phi' C phi is large where no
+ball was pressed, and for steeper skin than any ball's. With ``own``, the mean error of the field on its own presses, the error of
+normals is expected to be (:func:`torchvts.model.stated_deg`)
 
     sqrt(own^2 (1 + 0.1 phi' C phi) + 1.5^2) degrees.
 """
@@ -55,7 +56,7 @@ class Posterior:
     Attributes:
         family: of the field.
         mean: (2, K).
-        covariance: (K, K), of either slope, up to the noise of a press.
+        covariance: (K, K), mean of those of the two slopes, up to the noise of a press.
     """
 
     family: Family
@@ -95,17 +96,19 @@ class Evidence:
         self.family = family
         self.forms = [ContactForms(family, contact) for contact in contacts]
         each = [item.ball() for item in self.forms]
-        size = family.size()
+        size = 2 * family.size()
         self.grams = torch.stack([gram for gram, _ in each]) if each else torch.zeros(0, size, size, dtype=torch.float64)
-        self.rights = torch.stack([right for _, right in each]) if each else torch.zeros(0, 2, size, dtype=torch.float64)
+        self.rights = torch.stack([right for _, right in each]) if each else torch.zeros(0, size, dtype=torch.float64)
 
     def posterior(self, prior: Prior, weights: Tensor | None = None) -> Posterior:
         """Mean and covariance by all presses, or by ``weights`` (N,) of them."""
         weight = torch.ones(len(self.forms), dtype=torch.float64) if weights is None else weights
-        form = torch.diag(prior.precision) + torch.tensordot(weight, self.grams, 1)
+        half, precision = self.family.size(), prior.precision.repeat(2)
+        form = torch.diag(precision) + torch.tensordot(weight, self.grams, 1)
         covariance = torch.cholesky_inverse(torch.linalg.cholesky(form))
-        mean = (prior.mean * prior.precision + torch.tensordot(weight, self.rights, 1)) @ covariance
-        return Posterior(self.family, mean, covariance)
+        mean = covariance @ (precision * prior.mean.reshape(-1) + torch.tensordot(weight, self.rights, 1))
+        both = 0.5 * (covariance[:half, :half] + covariance[half:, half:])
+        return Posterior(self.family, mean.reshape(2, half), both)
 
     def held_out(self, prior: Prior) -> list[Tensor]:
         """For each press the coefficients (2, K) by all others."""

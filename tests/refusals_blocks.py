@@ -189,11 +189,6 @@ TABLE = {
         {"ball_diameter_mm": NUMBER, "center_px": [(1.0,), "here", (NAN, 0.0)], "contact_radius_px": ["3", 0, -1.0, NAN]},
         label=("name", "image"),  # calibrate checks the image: it knows the sensor's size
     ),
-    "Touch": Entry(
-        {"image": image(), "depth_mm": 1.0},
-        {"depth_mm": ["1", 0, -1.0, NAN]},
-        label=("name", "image"),  # calibrate checks the image: it knows the sensor's size
-    ),
     "Sensor": Entry({"name": "rig", "height": 24, "width": 32, "mm_per_pixel": 0.1, "gamma": 1.0, "blur_px": 0.0,
         "light_position_mm": None, "camera_matrix": LENS, "distortion_coefficients": (0.1, 0.0, 0.0, 0.0),
         "turn_deg": 0, "mirror": False, "roi_px": None, "corners_px": None, "raw_size_px": ((48, 64),),

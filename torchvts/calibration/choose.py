@@ -138,7 +138,7 @@ def _fitted(given: Given) -> tuple[Calibration, list[Contact], list[Tried], str]
     report: Report = {**second.report, "reason": f"{second.report['reason']}; {why}"}
     alone = _tried(second, "presses")
     alone["doubts"] += [*strange, why]
-    return dataclasses.replace(second, report=report), others, [*by_prior, alone], ""
+    return dataclasses.replace(second, report=report), others, [*by_prior, alone], sizes if first is None else ""
 
 
 def _tried(unit: Calibration, name: str) -> Tried:

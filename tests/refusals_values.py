@@ -33,7 +33,7 @@ def image():
 
 def fields():
     family = vts.calibration.field.Family(0, -1, 20.0)
-    return family.field(torch.linspace(-0.2, 0.3, family.size(), dtype=torch.float64))
+    return family.field(torch.linspace(-0.2, 0.3, 2 * family.size(), dtype=torch.float64).reshape(2, -1))
 
 
 def by_depth():

@@ -75,7 +75,7 @@ def pipe(mode):
 def response(dtype):
     random = torch.Generator().manual_seed(3)
     family = vts.calibration.field.Family(1, 1, 20.0)
-    field = family.field(0.1 * torch.randn(family.size(), generator=random, dtype=torch.float64))
+    field = family.field(0.1 * torch.randn(2, family.size(), generator=random, dtype=torch.float64))
     by_depth = vts.model.DepthBrightness(1, 20.0, 0.1 * torch.randn(3, 3, generator=random, dtype=torch.float64))
     model = vts.model.response_field.ResponseModel(field, by_depth)
     return vts.Calibration.from_response(model, SENSOR, calibration(dtype).background)

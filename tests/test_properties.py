@@ -165,7 +165,7 @@ def unit(by, height=HEIGHT, width=WIDTH, pitch=PITCH, dtype=torch.float32):
         return vts.Calibration.from_lights(lights, sensor, background)
     random = torch.Generator().manual_seed(3)
     family = vts.calibration.field.Family(1, 1, 20.0)
-    field = family.field(0.1 * torch.randn(family.size(), generator=random, dtype=torch.float64))
+    field = family.field(0.1 * torch.randn(2, family.size(), generator=random, dtype=torch.float64))
     by_depth = vts.model.DepthBrightness(1, 20.0, 0.1 * torch.randn(3, 3, generator=random, dtype=torch.float64))
     return vts.Calibration.from_response(ResponseModel(field, by_depth), sensor, background)
 

@@ -140,7 +140,11 @@ class Calibration:
         check_shape("covariance", covariance, (size, size), "one row for each coefficient of a slope")
         good = torch.isfinite(covariance).all() & (covariance == covariance.t()).all() & (covariance.diagonal() > 0).all()
         if not bool(good):
-            raise ValueError("covariance: expected finite values, symmetric, with a positive diagonal")
+            least = float(covariance.diagonal().min())
+            raise ValueError(
+                "covariance: expected finite values, symmetric, with a positive diagonal, "
+                f"got others, least on the diagonal {least:.3g}: did a fit diverge?"
+            )
 
     @classmethod
     def from_lights(

@@ -39,8 +39,8 @@ TABLE = {
     "Calibration.load": Entry({"path": ...}, {"path": [*MISSING, ".", 3, None]}, file=("path",), run=False),
     "Calibration.save": Entry({"path": ...}, {"path": [*MISSING, ".", 3, None]}, lambda: unit().save, file=("path",), run=False),
     "Compensate": Entry({"gain": FLAT, "offset": FLAT, "gamma": 2.2, "defects": FLAT[0] > 1, "blur_px": 1.0,
-        "markers": FillMarkers(), "drift": None, "saturated_model": FLAT, "saturation_light": 0.99}, {
-        "drift": [True, "mode", torch.nn.Identity()], "saturated_model": BAD_FLAT[:-1], "saturation_light": NUMBER,
+        "markers": FillMarkers(), "relight": None}, {
+        "relight": [True, "mode", torch.nn.Identity()],
         "gain": BAD_FLAT[:-1], "offset": BAD_FLAT[:-1], "gamma": NUMBER,
         "defects": [FLAT[0], FLAT > 1, torch.ones(HEIGHT, WIDTH, dtype=torch.bool), (FLAT[0] > 1).numpy(), "none"],
         "blur_px": ["1", None, NAN, INF, -1.0], "markers": [True, 9.0, "markers"]}),

@@ -100,17 +100,10 @@ TABLE = {
         {"path": [Path("no/such.pt2"), "."], "images": [None, image()], "name": ["pdf", None], "batches": [[0], ["1"], None]},
         file=("path",), named={"name": "format"}, run=False),
     # ---- stream ----
-    "stream.FollowLight": Entry({"background": image()}, {"background": [b for k, b in enumerate(images()) if k not in (4,)]}),
-    **{f"stream.FollowLight.{name}": Entry(
-        {"image": image()[None]}, {"image": batches(3)}, lambda name=name: getattr(vts.stream.FollowLight(image()), name))
-        for name in ("correct", "set_background", "start")},
-    "stream.FollowLight.update": Entry({"image": image()[None], "deformed": DEPTH > 0, "seconds": 0.1},
-        {"image": batches(3), "deformed": [None, torch.ones(1, 1, 4, 4), (DEPTH > 0).numpy()], "seconds": ["1", None, NAN]},
-        lambda: vts.stream.FollowLight(image()).update),
     "stream.FrameCheck": Entry({"background": image()}, {"background": [b for k, b in enumerate(images()) if k not in (3, 4)]}),
-    "stream.Recording": Entry({"calibration": unit(), "mode": "fast", "first": None, "fps": 30.0, "stage": nullcontext}
+    "stream.Recording": Entry({"calibration": unit(), "mode": "fast", "first": None, "stage": nullcontext}
         | {"network": None, "device": "cpu", "contact": None, "codec": ""},
-        {"calibration": [None, "unit"], "mode": ["slow"], "first": [], "fps": [], "stage": []}
+        {"calibration": [None, "unit"], "mode": ["slow"], "first": [], "stage": []}
         | {"network": [], "device": [None, "gpu", "cuda:99"], "contact": ["4.5", 4.5], "codec": []}),
     "stream.StreamReport": Entry({"stream": ...}, {"stream": [None, "camera"]}, run=False),
     "stream.TactileStream": Entry({"source": ..., "sensor_or_calibration": sensor(), "mode": "auto", "background_frames": 12,

@@ -35,13 +35,12 @@ def agree(pipe, images, depth_mm=DEPTH_MM):
     frozen = pipe.freeze()
     assert frozen.compiled, frozen.not_compiled
     with torch.inference_mode():
-        plain, weight = pipe(images), pipe.frame_of(images)[0].weight
-    found, moved = frozen.both(images)
+        plain, expected = pipe(images), pipe.conditions(images)
+    found, conditions = frozen.with_conditions(images)
     assert float((found.depth_mm - plain.depth_mm).abs().max()) <= depth_mm
     assert float((found.normal - plain.normal).abs().max()) <= 1e-4 + 2.0 * depth_mm / pipe.mm_per_pixel
-    assert torch.equal(moved, frozen.moved(images))
-    sure = (weight - 0.5).abs() > 1e-5
-    assert not bool(((moved != (weight > 0.5)) & sure).any())
+    assert torch.allclose(conditions.light, expected.light, rtol=1e-4, atol=1e-4)
+    assert torch.allclose(conditions.unseen_deg, expected.unseen_deg, rtol=1e-3, atol=1e-3)
     for mask, expected in ((found.deformed, plain.deformed), (found.contact, plain.contact)):
         assert int((mask ^ expected).sum()) <= 2  # a depth or pressure that rounding moves over its threshold
     return found, plain
@@ -253,7 +252,11 @@ SETTINGS = {
     "refine.policy.tolerance_px": 0.3, "refine.policy.max_passes": 2, "refine.policy.refine_threshold_px": 3.0,
     "solve.gradient.max_slope": 0.2, "normals.shadowed.brightness_noises": 30.0, "normals.samples": 100,
     "compensate.clean.0.std_px": 0.0, "compensate.clean.0.weights": [0.25, 0.5, 0.25],
-    "compensate.drift.most_by_mode": 0.01, "compensate.drift.least_level": 0.2, "compensate.gain.saturation_light": 0.5,
+    "compensate.relight.every": 5, "compensate.relight.alike": 0.1, "compensate.relight.exact": 0.02,
+    "compensate.relight.most_lost": 0.2, "compensate.relight.damping": 0.3, "compensate.relight.better": 3.0,
+    "compensate.relight.scales": [0.1, 0.02],
+    "compensate.relight.black": 0.3,
+    "compensate.relight.saturation_light": 0.5,
 }  # fmt: skip
 """Settings of blocks that a user may change."""
 
@@ -327,7 +330,7 @@ def test_what_is_not_compiled_is_named_and_runs_in_pytorch(unit, reason):
     assert not frozen.compiled and reason in frozen.not_compiled and reason in repr(frozen)
     found, expected = frozen(images), pipe(images)
     assert torch.allclose(found.depth_mm, expected.depth_mm, rtol=0.0, atol=DEPTH_MM)
-    assert torch.equal(frozen.moved(images), pipe.moved(images))
+    assert torch.allclose(frozen.with_conditions(images)[1].light, pipe.conditions(images).light, atol=1e-4)
     assert not found.depth_mm.is_inference()
 
 
@@ -412,7 +415,7 @@ BAD = {
 def test_bad_images_are_refused(unit, kind):
     make, error, text = BAD[kind]
     frozen = vts.DepthPipeline.from_calibration(unit[0]).freeze()
-    for call in (frozen, frozen.moved, frozen.both):
+    for call in (frozen, frozen.with_conditions):
         with pytest.raises(error, match=text):
             call(make(unit[1]))
 
@@ -428,7 +431,7 @@ def test_images_may_lie_anywhere_in_memory(unit):
     for same in (images.contiguous(memory_format=torch.channels_last), wide[:, :, 1:-2, 2:-5], imaginary):
         assert not same.is_contiguous() or same.is_neg()
         assert all(torch.equal(one, other) for one, other in zip(frozen(same), expected, strict=True))
-    assert frozen(images[:0]).depth_mm.shape == (0, 1, 96, 128) and frozen.moved(images[:0]).shape == (0, 1, 96, 128)
+    assert frozen(images[:0]).depth_mm.shape == (0, 1, 96, 128) and frozen.with_conditions(images[:0])[1].light.shape == (0, 3, 6)
     with torch.inference_mode():
         assert torch.equal(frozen(images).depth_mm, expected.depth_mm)
 

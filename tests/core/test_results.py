@@ -40,7 +40,7 @@ def test_a_frame_is_what_the_pipeline_gave(unit, source, results):
     calibration = vts.Calibration.load(unit)
     result = vts.read_result(results / "3.npz")
     with torch.inference_mode():
-        out = vts.stream.Recording(calibration, follow=False)(vts.read_image(source / "3.png")[None], 0.0)[1]
+        out = vts.stream.Recording(calibration)(vts.read_image(source / "3.png")[None])
     assert repr(result).startswith("Result(1 frame of 48 x 64 px, 0.6 mm per pixel, deepest 0.") and len(repr(result)) < 150
     for ours, theirs in zip(result, (out.depth_mm, out.normal, out.gradient, out.contact, out.deformed)):
         assert torch.equal(ours, theirs)
@@ -73,9 +73,8 @@ def test_every_third_frame_of_several_inputs(unit, source, tmp_path):
     vts.write_image(tmp_path / "more" / "0.png", tiny_image(9))
     inputs = [source / "0.png", source / "film.avi", source / "2.png", tmp_path / "more", source / "0.png"]
     report = reconstruct_dataset(unit, inputs, tmp_path / "out", every=2, workers=0, pictures=False, format="npy")
-    rows = [
-        line.split(",")[0].rpartition(f"{source.name}/")[2] for line in (tmp_path / "out" / "frames.csv").read_text().split()[1:]
-    ]
+    table = (tmp_path / "out" / "frames.csv").read_text().splitlines()[1:]
+    rows = [line.split(",")[0].rpartition(f"{source.name}/")[2] for line in table]
     assert rows[:1] == ["0.png"] and rows[1:5] == [f"film.avi/{k:06d}" for k in (0, 2, 4, 6)] and rows[5].endswith("more/0.png")
     assert report.rows == len(rows) == 6
     again = reconstruct_dataset(unit, inputs, tmp_path / "out", every=2, workers=0, pictures=False, format="npy")

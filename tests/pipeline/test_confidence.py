@@ -314,7 +314,7 @@ def test_no_contact(ring):
     image = scenes.render(scenes.undeformed(scene), ring(), noise_std=0.004, seed=9)
     for mode in ("fast", "precise", "auto"):
         out = vts.ConfidentPipeline.from_calibration(calibration, mode)(image)
-        assert not bool(out.contact.any()) and out.frame_confidence.tolist() == [1.0]
+        assert not bool(out.contact.any()) and float(out.frame_confidence) > 0.9
         assert bool(torch.isfinite(out.normal_95_deg).all()) and float(out.depth_95_mm.max()) < PITCH
 
 

@@ -1,9 +1,10 @@
-"""Streams: what is read, what is refused, what is dropped, how the light is followed, and what is left on disk."""
+"""Streams: what is read, what is refused, what is dropped, other light, and what is left on disk."""
 
 import contextlib
 import csv
 import itertools
 import json
+import math
 import os
 import re
 import signal
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -140,7 +142,7 @@ def test_white_noise_in_the_first_frames_costs_no_depth(unit, small_press):
     first = images([camera(noise=0.01) for _ in range(12)])
     frame, errors = images([camera(0.5, noise=0.01)]), []
     for given in (None, first):
-        depth = streams.Recording(calibration, "precise", given, follow=False)(frame, 0.0)[1].depth_mm
+        depth = streams.Recording(calibration, "precise", given)(frame).depth_mm
         errors.append(float((depth - small_press(0.5).depth_mm).square().mean().sqrt()))
     assert errors[1] < 1.1 * errors[0], errors
 
@@ -163,7 +165,7 @@ def test_a_video_gives_contact_and_depth(unit, video, small_press):
     with streams.TactileStream(video, unit[0], mode="precise") as stream:
         check_press(stream, small_press)
     times = stream.stages.median_ms()
-    assert {"read", "rectify", "light", "depth"} <= set(times)
+    assert {"read", "rectify", "depth"} <= set(times)
     assert stream.metric
 
 
@@ -194,11 +196,13 @@ def test_a_given_calibration_is_held_against_the_first_frames(unit):
     calibration, camera = unit
     with pytest.raises(ValueError, match="first frames show contact"):
         streams.TactileStream(Frames([camera(0.5) for _ in range(12)]), calibration)
-    with pytest.raises(ValueError, match="the light is 30% off"):
-        streams.TactileStream(Frames([camera(0.0, 0.7) for _ in range(12)]), calibration)
-    with streams.TactileStream(Frames([camera(0.0, 0.9) for _ in range(12)]), calibration) as stream:
-        assert stream.light.level == pytest.approx([0.9] * 3, abs=0.005)
-        assert not any(bool(frame.output.contact.any()) for frame in stream)
+    for level in (0.9, 0.5, 1.3):
+        with streams.TactileStream(Frames([camera(0.0, level) for _ in range(12)]), calibration) as stream:
+            assert not any(bool(frame.output.contact.any()) for frame in stream)
+            assert stream.conditions.light[0, :, 0].tolist() == pytest.approx([level] * 3, abs=0.01)
+    with streams.TactileStream(Frames([255 - camera() for _ in range(13)]), calibration) as stream:
+        with pytest.warns(UserWarning, match=r"frame 0: .*the light is not that of the background"):
+            list(stream)
     with pytest.raises(ValueError, match="background_frames: expected at least 12 frames from made up, got 4"):
         streams.TactileStream(Frames([camera() for _ in range(4)]), calibration)
     with pytest.raises(TypeError, match="sensor_or_calibration: expected a Sensor or a Calibration, got str"):
@@ -209,54 +213,27 @@ def dimming(k):
     return 1.0 - 0.1 * min(1.0, max(0, k - 12) / 300)
 
 
-def test_slow_dimming_is_followed(unit, small_press):
+def hunting(k):
+    """Exposure that hunts."""
+    return 1.0 + 0.35 * math.sin(0.7 * k) - 0.1
+
+
+@pytest.mark.parametrize("brightness", [dimming, hunting])
+def test_each_frame_is_measured_in_its_own_light(unit, small_press, brightness):
     calibration, camera = unit
     truth = small_press(1.0)
 
-    def run(brightness, rest=300, pressed=5, follow=True):
-        pictures = (camera(1.0 if k >= 12 + rest else 0.0, brightness(k)) for k in range(12 + rest + pressed))
-        with streams.TactileStream(Frames(pictures), calibration, follow=follow) as stream:
+    def run(brightness):
+        pictures = (camera(1.0 if k >= 20 else 0.0, brightness(k) if k >= 12 else 1.0) for k in range(40))
+        with streams.TactileStream(Frames(pictures), calibration) as stream:
             frames = [(f.output.contact.any(), (f.output.depth_mm - truth.depth_mm).square().mean().sqrt()) for f in stream]
         contact, errors = zip(*frames)
-        return any(contact[: 12 + rest]), sum(errors[12 + rest :]) / max(1, pressed), stream
+        return any(contact[:20]), sum(errors[20:]) / 20, stream
 
-    _, still_error, _ = run(lambda k: 1.0, 3)
-    contact, error, stream = run(dimming)
-    assert not contact
-    assert error < 1.5 * still_error
-    assert stream.light.level == pytest.approx([0.9] * 3, abs=0.012) and stream.light.steps == 0
-
-
-@pytest.mark.parametrize("size", [(40, 60), (31, 45)])
-def test_the_light_is_divided_out(size):
-    light = streams.FollowLight(torch.full((3, *size), 0.5))
-    image = torch.rand(1, 3, *size, generator=torch.Generator().manual_seed(1))
-    assert light.correct(image) is image
-    light.plane = torch.tensor([[1.1, 0.2, -0.1], [0.8, 0.0, 0.3], [0.9, -0.3, 0.1]], dtype=torch.float64)
-    found = light.correct(image)
-    assert float(found.max()) == 1.0 and light.correct(image.double()).dtype is torch.float64
-    middle = light.correct(torch.full_like(image, 0.4))[0, :, size[0] // 2, size[1] // 2]
-    assert middle.tolist() == pytest.approx([0.4 / 1.1, 0.4 / 0.8, 0.4 / 0.9], rel=0.02)
-
-
-def test_the_light_knows_each_frame_whether_or_not_it_is_asked(unit):
-    calibration, camera = unit
-    pictures = [camera(0.0, dimming(k)) for k in range(40)]
-
-    def run(asked):
-        planes = []
-        with streams.TactileStream(Frames(pictures), calibration) as stream:
-            for frame in stream:
-                pixels = frame.image.numpy()
-                pixels *= 255.0  # the frame is the user's: nothing is learned from what they do with it
-                if asked:
-                    planes.append(stream.light.plane.clone())
-        return stream.light.plane, planes
-
-    plane, planes = run(asked=True)
-    assert torch.equal(plane, planes[-1]) and not torch.equal(planes[-1], planes[-2])
-    assert torch.equal(plane, run(asked=False)[0])
-    assert plane[:, 0].tolist() == pytest.approx([dimming(20)] * 3, abs=0.005)
+    _, still_error, _ = run(lambda k: 1.0)
+    contact, error, stream = run(brightness)
+    assert not contact and error < 1.3 * still_error
+    assert stream.conditions.light[0, :, 0].tolist() == pytest.approx([brightness(39)] * 3, abs=0.02) and stream.doubt == ""
 
 
 @pytest.mark.long
@@ -267,7 +244,6 @@ def test_a_held_contact_does_not_fade(unit):
         frames = [(float(f.output.depth_mm.max()), int(f.output.contact.sum())) for f in stream]
     first, last = np.mean(frames[15:25], 0), np.mean(frames[-10:], 0)
     assert last == pytest.approx(first, rel=0.01)
-    assert stream.light.level == pytest.approx([1.0] * 3, abs=0.003)
 
 
 def test_dimming_while_a_contact_is_held_is_followed_around_it(unit):
@@ -279,19 +255,20 @@ def test_dimming_while_a_contact_is_held_is_followed_around_it(unit):
     assert last == pytest.approx(first, rel=0.03)
 
 
-def test_a_sudden_step_is_reported_and_not_learned(unit):
+def test_a_step_of_the_light_is_in_the_table_and_a_dead_led_is_in_doubt(unit):
     calibration, camera = unit
-    pictures = (camera(0.0, 0.92 if 20 <= k < 80 else 1.0) for k in range(100))
-    with streams.TactileStream(Frames(pictures), calibration) as stream:
+    dead = np.array([1.0, 1.0, 0.0])  # of blue, green, red
+    pictures = [camera(0.0, 0.7 if 20 <= k < 40 else 1.0) for k in range(50)] + [
+        (camera() * dead).astype(np.uint8) for _ in range(5)
+    ]
+    with warnings.catch_warnings(record=True) as caught, streams.TactileStream(Frames(pictures), calibration) as stream:
+        warnings.simplefilter("always")
         report = streams.StreamReport(stream)
-        states = []
-        for frame in stream:
-            lines = report.add(frame)
-            states.append(stream.light.state)
-            assert ("LIGHT HAS CHANGED" in lines[0]) == (stream.light.state == "stepped")
-    assert states == ["following"] * 20 + ["stepped"] * 60 + ["following"] * 20
-    assert stream.light.level == pytest.approx([1.0] * 3, abs=0.003)
-    assert stream.light.steps == 1 and "stepped 1 times" in report.table()
+        lines = [report.add(frame)[0] for frame in stream]
+    assert [float(row[4][0]) for row in report.rows[:50]] == pytest.approx([1.0] * 20 + [0.7] * 20 + [1.0] * 10, abs=0.01)
+    assert ["IN DOUBT" in line for line in lines] == [False] * 50 + [True] * 5
+    assert "5 frames in doubt (see frames.csv), the first of them 50: channel R is black" in report.table()
+    assert len([w for w in caught if "channel R is black" in str(w.message)]) == 1
 
 
 def test_flickering_cells_are_no_movement_and_a_growing_contact_is(unit):
@@ -335,8 +312,8 @@ def test_unusable_frames_are_named_and_left_out(unit, run_stream, unit_file, tmp
         assert re.search(part, reasons[k]), (k, reasons[k])
         assert (done.stdout + done.stderr).count(f"frame {k} left out: ") == 1
     rows = (tmp_path / "out" / "frames.csv").read_text().splitlines()[1:]
-    assert len(rows) == 26 and rows[15] == "15,,,,left out"
-    assert [float(row.split(",")[2]) > 0 for row in rows if not row.endswith("left out")] == [False] * 14 + [True] * 5
+    assert len(rows) == 26 and rows[15].startswith('15,,,,,,,,"left out: the frame is dark')
+    assert [float(row.split(",")[2]) > 0 for row in rows if "left out" not in row] == [False] * 14 + [True] * 5
 
 
 @pytest.mark.parametrize("change", [0.3, -0.25])
@@ -477,7 +454,7 @@ def test_printed_markers_do_not_pass_for_other_light(unit, marked, first):
     with streams.TactileStream(Frames(pictures), known, background_frames=first) as stream:
         contact = [bool(frame.output.contact.any()) for frame in stream]
     assert contact == [False] * 14 + [True] * 6
-    assert stream.light.level == pytest.approx([1.0] * 3, abs=0.01) and stream.light.state == "following"
+    assert stream.conditions.light[0, :, 0].tolist() == pytest.approx([1.0] * 3, abs=0.01) and stream.doubt == ""
 
 
 def test_a_network_sees_no_markers(marked, tmp_path):
@@ -809,6 +786,7 @@ def test_a_process_ended_in_the_middle_leaves_a_whole_video_or_none(unit, unit_f
     assert not list(out.glob(".overlay*")) and (out / "summary.json").is_file()
 
 
+@pytest.mark.filterwarnings("ignore:frame .* could not be seen")
 def test_the_golf_ball_appears_and_vanishes(data):
     video = data / "wedge_video" / "golf_ball.avi"
     with streams.TactileStream(video, vts.Sensor.load("gelsight_wedge")) as stream:
@@ -818,7 +796,6 @@ def test_the_golf_ball_appears_and_vanishes(data):
     assert max(rows[:12]) == (0.0, 0)  # before
     assert min(depth for depth, _ in rows[25:40]) > 0.4 and min(area for _, area in rows[25:40]) > 17_000
     assert max(depth for depth, _ in rows[-6:]) < 0.02 and max(area for _, area in rows[-6:]) < 200  # after
-    assert stream.light.steps == 0
 
 
 def test_a_sensor_of_which_no_more_than_pitch_and_corners_is_known_is_told_what_to_press(data, run_stream, tmp_path):
@@ -913,8 +890,8 @@ def test_a_camera_in_real_time(unit, slow, monkeypatch):
     """Depth of every frame in order, or of the newest where depth takes longer than a frame: none is lost without being counted."""
     calibration, camera = unit
     if slow:
-        both = vts.FrozenPipeline.both
-        monkeypatch.setattr(vts.FrozenPipeline, "both", lambda self, images: (time.sleep(0.05), both(self, images))[1])
+        both = vts.FrozenPipeline.with_conditions
+        monkeypatch.setattr(vts.FrozenPipeline, "with_conditions", lambda self, images: (time.sleep(0.05), both(self, images))[1])
     found = measure_latency(calibration, [camera(), camera(0.5), camera(1.0)], fps=60.0, frames=40)
     assert found.numbers == sorted(set(found.numbers)) and found.numbers[-1] < found.arrived == 40
     assert len(found.numbers) + found.dropped == found.arrived and min(found.delay_ms) > 0.0

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ..compensate import Compensate, SmoothDrift
+from ..compensate import Compensate
 from ..core.blur import band_of_ratios, without_margin
 from ..core.geometry import gradient_from_normal, pixel_grid_mm
 from ..core.morphology import dilate, erode
@@ -18,7 +18,7 @@ from ..model.response_field import ResponseField, ResponseModel
 from ..model.sensor import Sensor
 from ..normals import NormalFromResponse
 from .presses import Press
-from .regions import FarField, contact_region, far_field
+from .regions import above_skin, contact_region
 
 INSIDE = 0.85
 """Share of the contact radius within which the skin lies on the ball; further out it begins to leave it."""
@@ -40,6 +40,10 @@ DIFFERS = 4.5
 
 LIGHT_DRIFT = 0.008
 """Least noise by which a press differs from the background, relative to it: the LEDs of real sensors drift by 1 to 2 %."""
+
+OTHER_SKIN = 0.1
+"""Change of the least changed skin, relative, from which an image is that of another unit: presses of five real sensors
+change it by at most 6 %."""
 
 MAX_SAMPLES = 2000
 """Pixels of a press that enter the fit. More add little, because neighbours are alike."""
@@ -133,18 +137,18 @@ def read_contacts(given: Sequence[Press], background: Tensor, sensor: Sensor) ->
     """
     unit = unit_without_model(background, sensor)
     # in single precision, as frames are: 8 bits are a thousand times as coarse, and the compiled kernels take a tenth of the time
-    compensate, smooth = Compensate.from_calibration(unit).float(), SmoothDrift()
+    compensate = Compensate.from_calibration(unit).float()
     noise = unit.compensated_noise_std.clamp_min(LIGHT_DRIFT).float()
     contacts = []
     for item in given:
         ratio = compensate(item.image.detach().cpu().float()[None])
         change = ratio[0] - 1.0
         differs = differing(change, noise)
-        far = far_field(change)
-        region = contact_region(far, differs, 0.5 * item.ball_diameter_mm / sensor.mm_per_pixel)
+        above, spread = above_skin(change)
+        region = contact_region(above, differs, 0.5 * item.ball_diameter_mm / sensor.mm_per_pixel)
         saturated = ((item.image > SATURATED) & (background < SATURATED)).any(dim=0).cpu()
-        contact = _sampled(item, smooth(ratio)[0].double() - 1.0, region, saturated, sensor)
-        contact.reason = _unusable(item.image, background, differs, far) or _saturated(float(saturated[region].double().mean()))
+        contact = _sampled(item, change.double(), region, saturated, sensor)
+        contact.reason = _unusable(item.image, background, differs, spread) or _saturated(float(saturated[region].double().mean()))
         if item.center_px is not None:
             _place(contact, item, sensor)
         contacts.append(contact)
@@ -185,7 +189,7 @@ def _place(contact: Contact, press: Press, sensor: Sensor) -> None:
         contact.reason = "no contact is seen at the given center and contact radius: a mistake in the label?"
 
 
-def _unusable(image: Tensor, background: Tensor, differs: Tensor, far: FarField) -> str:
+def _unusable(image: Tensor, background: Tensor, differs: Tensor, spread: float) -> str:
     """Why an image cannot be used, or "". ``differs``: (H, W), where it differs from the background."""
     share = float(differs.double().mean())
     level = float(image.double().mean() / background.double().mean())
@@ -197,7 +201,7 @@ def _unusable(image: Tensor, background: Tensor, differs: Tensor, far: FarField)
         return (
             f"no contact: only {share:.2%} of the image differs from the background; is it the background itself, or a faint press?"
         )
-    if float(border) > 0.6 and far.is_other_light():
+    if float(border) > 0.6 and spread > OTHER_SKIN:
         return f"{share:.0%} of the image differs from the background: another unit, other exposure, or the light has changed"
     return ""
 

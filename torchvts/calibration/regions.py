@@ -1,23 +1,15 @@
-"""Where in a frame a contact lies, by a floor that comes from the frame itself: a pressed skin changes its light everywhere."""
+"""Where in a frame a contact lies, by a floor that comes from the frame itself."""
 
-import functools
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..core.robust import TUKEY, tukey_weight
-from ..model.response_field import position_basis
-
-FAR_DEGREE = 2
-"""Degree of the polynomial in position that stands for the change of the undeformed skin, in each channel."""
+from ..skin.weight import spread_of
 
 FLOOR = 5.0
-"""A contact stands out of that polynomial by so many spreads of the undeformed skin."""
-
-SETTLED = 1e-5
-"""Change of its weights from which the fit of the polynomial has converged."""
+"""Threshold of a contact, in standard deviations of the undeformed skin's change."""
 
 LEAST_SPREAD = 0.003
 """Least spread, relative to the background: rounding to 8 bits."""
@@ -28,63 +20,18 @@ SECOND = 0.3
 SAME_BALL = 1.5
 """Blobs whose centroids lie within so many radii of the ball are lobes of one: two equal balls cannot come nearer than two."""
 
-OTHER_LIGHT = 0.1
-"""Undeformed skin changes by at most 6 % under presses of five real sensors, brightness aside. Other exposure, lights or units
-change it by 13 to 30 %."""
 
-
-class FarField(NamedTuple):
-    """The change of the undeformed skin in one frame.
-
-    Attributes:
-        rms: length of its smooth part over the three channels, root mean square over the image.
-        above: (H, W), change that is left, in spreads of the undeformed skin.
-    """
-
-    rms: float
-    above: Tensor
-
-    def is_other_light(self) -> bool:
-        """Whether the light of the whole frame differs from the background's more than a contact explains."""
-        return self.rms > OTHER_LIGHT
-
-
-def far_field(change: Tensor) -> FarField:
-    """Fit the change of the undeformed skin: a robust polynomial in position, started from the less changed half of the image.
+def above_skin(change: Tensor) -> tuple[Tensor, float]:
+    """How far the change of each pixel stands out of that of the undeformed skin, (H, W), in standard deviations; and these, RMS.
 
     Args:
-        change: (3, H, W), image / background - 1.
+        change: (3, H, W), image / background - 1, relit.
     """
-    height, width = change.shape[1:]
     smooth = _mean_of_49(change)  # grain of JPEG and demosaicing
-    basis = _basis(height, width, change.dtype)
-    step = max(1, min(height, width) // 60)
-    columns = basis[:, step // 2 :: step, step // 2 :: step].flatten(1).t()
-    values = smooth[:, step // 2 :: step, step // 2 :: step].flatten(1).t()
-    length = values.square().sum(1).sqrt()
-    weight = (length <= length.median()).to(change.dtype)
-    coefficient, spread = torch.zeros(basis.shape[0], 3, dtype=change.dtype), torch.ones(3, dtype=change.dtype)
-    for _ in range(15):
-        weighted = columns * weight[:, None]
-        coefficient = torch.linalg.lstsq(weighted.t() @ columns, weighted.t() @ values, driver="gelsd").solution
-        residual = values - columns @ coefficient
-        spread = (residual[weight > 0].abs().median(dim=0).values / 0.6745).clamp_min(LEAST_SPREAD)
-        before, weight = weight, tukey_weight((residual / spread).square().sum(1).sqrt() / (3**0.5 * TUKEY))
-        if torch.allclose(weight, before, rtol=0.0, atol=SETTLED):
-            break
-        if int((weight > 0).sum()) < 2 * len(coefficient):  # nothing is alike: no far field
-            coefficient = torch.zeros_like(coefficient)
-            break
-    field = torch.einsum("khw,kc->chw", basis, coefficient)
-    above = ((smooth - field) / spread[:, None, None]).square().sum(0).sqrt()  # a hundred times as fast as norm(dim=0)
-    return FarField(float(field.square().sum(0).mean().sqrt()), above)
-
-
-@functools.lru_cache(maxsize=2)
-def _basis(height: int, width: int, dtype: torch.dtype) -> Tensor:
-    """Polynomials in position, (terms, H, W); all frames of a calibration share them."""
-    y, x = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
-    return position_basis(x.to(dtype), y.to(dtype), 1.0, FAR_DEGREE)
+    step = max(1, min(change.shape[1:]) // 60)
+    spread = spread_of(smooth[:, step // 2 :: step, step // 2 :: step].abs().flatten(1)[None], LEAST_SPREAD)[0]  # (3, 1)
+    # a hundred times as fast as norm(dim=0)
+    return (smooth / spread[..., None]).square().sum(0).sqrt(), float(spread.square().mean().sqrt())
 
 
 def _mean_of_49(image: Tensor) -> Tensor:
@@ -100,18 +47,18 @@ def _mean_of_49(image: Tensor) -> Tensor:
     return image
 
 
-def contact_region(far: FarField, mask: Tensor, ball_radius_px: float) -> Tensor:
+def contact_region(above: Tensor, mask: Tensor, ball_radius_px: float) -> Tensor:
     """The part of a mask that a contact takes, with the transition zone around it, bool (H, W).
 
-    Blobs that stand out of the far field: the largest one, and others that are as strong. Of a ball, lobes are joined by their
-    convex hull, because its contact is convex. Where nothing stands out, the mask itself.
+    Blobs that stand out of the undeformed skin: the largest one, and others that are as strong. Of a ball, lobes are joined by
+    their convex hull, because its contact is convex. Where nothing stands out, the mask itself.
 
     Args:
-        far: of the frame.
+        above: (H, W), how far each pixel stands out, see :func:`above_skin`.
         mask: (H, W), bool, what differs from the background by the noise of calibration.
         ball_radius_px: 0 for an unknown object.
     """
-    blobs = strong_blobs(mask & (far.above > FLOOR), far.above)
+    blobs = strong_blobs(mask & (above > FLOOR), above)
     if not blobs:
         return mask
     if ball_radius_px > 0:

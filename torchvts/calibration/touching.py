@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..compensate import Compensate, SmoothDrift
+from ..compensate import Compensate
 from ..core.geometry import GradientFromNormal, pixel_grid_mm
 from ..integration import PoissonDCT
 from ..model.calibration import Calibration
@@ -58,8 +58,6 @@ def _depth_and_circle(calibration: Calibration, press: Press, contact: Contact) 
     sensor = calibration.sensor
     with torch.no_grad():
         image = Compensate.from_calibration(calibration).float()(press.image.detach().cpu().float()[None])
-        if calibration.response is not None:
-            image = SmoothDrift()(image)
         block = NormalFromIntensity if calibration.lights is not None else NormalFromResponse
         gradient = GradientFromNormal()(block.from_calibration(calibration).float()(image))
         weight = ContactMask.from_calibration(calibration).float()(image, gradient)

@@ -31,7 +31,6 @@ def add_source(parser: argparse.ArgumentParser) -> None:
     add_pipeline(parser)
     parser.add_argument("--record", type=Path, metavar="PATH", help="of a camera's raw frames: .mkv, or a folder (PNG)")
     parser.add_argument("--realtime", action="store_true", help="play a recording at its own rate, dropping late frames")
-    parser.add_argument("--no-follow", action="store_true", help="do not follow slow drift of the light")
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="of PyTorch and OpenCV (1)")
 
 
@@ -65,7 +64,6 @@ def open_stream(arguments: argparse.Namespace, unit: Sensor | Calibration, press
         background_frames=arguments.background_frames,
         presses=presses,
         realtime=arguments.realtime,
-        follow=not arguments.no_follow,
         network=arguments.network,
         device=arguments.device,
         contact=contact_of(arguments.contact),

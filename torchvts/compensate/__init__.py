@@ -2,6 +2,6 @@
 
 from .compensate import Blur, Compensate
 from .defects import FillDefects
-from .drift import Drift, SmoothDrift
+from .light import AsItIs, Relight, unchanged_light
 
-__all__ = ["Blur", "Compensate", "Drift", "FillDefects", "SmoothDrift"]
+__all__ = ["AsItIs", "Blur", "Compensate", "FillDefects", "Relight", "unchanged_light"]

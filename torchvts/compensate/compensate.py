@@ -6,17 +6,18 @@ import torch
 from torch import Tensor, nn
 
 from ..core.blur import MOST_BLUR_PX, blur, gaussian_weights
-from ..core.checks import check_batch, check_field, check_least, check_positive, check_record, check_same_size, check_switch
+from ..core.checks import check_batch, check_field, check_least, check_positive, check_record, check_same_size
 from ..model import Calibration, FillMarkers, check_calibration
 from .defects import FillDefects
-from .drift import Drift
+from .light import AsItIs, Relight
 
 
 class Compensate(nn.Module):
     """Camera image to compensated image: linear light, with what the model and the background disagree on taken out.
 
-    Printed markers are filled first; ``compensated = image^gamma * gain + offset``; pixels named in ``defects`` then become the
-    mean of their nearest valid neighbours, the image is blurred, and the drift of the LEDs is divided out. The multiplicative form
+    Printed markers are filled first, and light = image^gamma is taken to what it would be in the light of the background;
+    ``compensated = light * gain + offset``; pixels named in ``defects`` then become the mean of their nearest valid neighbours, and
+    the image is blurred. The multiplicative form
     (gain = model / background) is exact for albedo, spots and vignetting, the additive form of the paper
     (offset = I_delta = model - background) for ambient light.
 
@@ -27,9 +28,7 @@ class Compensate(nn.Module):
         defects: (H, W) bool, pixels that carry no information; None for none.
         blur_px: standard deviation of a Gaussian blur, pixels; 0 for none.
         markers: fills printed markers; None for a skin without.
-        drift: divides out the drift of the LEDs; None for nothing.
-        saturated_model: (3, H, W), the model's light where a channel is saturated in the background, 0 elsewhere; None for nowhere.
-        saturation_light: linear light from which a channel is saturated.
+        relight: divides out how the light of a frame differs from the background's; None for nothing.
     Attributes:
         output_domain: what the compensated images are, a key of ``torchvts.normals.DOMAINS``; None where that is not known.
     Source:
@@ -49,41 +48,25 @@ class Compensate(nn.Module):
         defects: Tensor | None = None,
         blur_px: float = 0.0,
         markers: FillMarkers | None = None,
-        drift: Drift | None = None,
-        saturated_model: Tensor | None = None,
-        saturation_light: float = 1.0,
+        relight: Relight | None = None,
     ) -> None:
         super().__init__()
         if markers is not None:
             check_record("markers", markers, nn.Module, "FillMarkers() makes one")
-        if drift is not None:
-            check_record("drift", drift, Drift)
+        if relight is not None:
+            check_record("relight", relight, Relight)
         linear, fill, smooth = Linearise(gamma), FillDefects(defects), Blur(blur_px)
         self.linear = nn.ModuleList(([] if markers is None else [markers]) + ([] if linear.gamma == 1.0 else [linear]))
-        self.gain = Gain(gain, offset, saturated_model, saturation_light)
+        self.relight = AsItIs() if relight is None else relight
+        self.gain = Gain(gain, offset)
         self.clean = nn.ModuleList(([] if fill.defect.shape[0] == 0 else [fill]) + ([] if smooth.std_px == 0.0 else [smooth]))
-        self.drift = nn.Identity() if drift is None else drift
-        self.saturates = saturated_model is not None
-        self.restores = drift is not None and self.saturates
         self.output_domain = "image" if gain is None and offset is None and linear.gamma == 1.0 else None
 
     @classmethod
-    def from_calibration(cls, calibration: Calibration, drift: bool = False) -> "Compensate":
-        """The block of a calibrated unit, whose background becomes ``calibration.flat``.
-
-        Args:
-            calibration: of the unit.
-            drift: divide out the drift of the LEDs. With response fields up to 15 % always is.
-        """
+    def from_calibration(cls, calibration: Calibration) -> "Compensate":
+        """The block of a calibrated unit, whose background becomes ``calibration.flat``."""
         check_calibration("calibration", calibration)
-        check_switch("drift", drift)
         sensor = calibration.sensor
-        by_response = calibration.response is not None
-        block: Drift | None = None
-        if drift:
-            block = Drift(calibration.flat, calibration.compensated_noise_std, by_response, sensor.blur_px > 0.0)
-        elif by_response:
-            block = Drift()
         compensate = cls(
             calibration.gain,
             calibration.offset,
@@ -91,11 +74,9 @@ class Compensate(nn.Module):
             calibration.defects,
             sensor.blur_px,
             calibration.markers,
-            block,
-            calibration.saturated_model,
-            calibration.saturation_light,
+            Relight.from_calibration(calibration),
         )
-        compensate.output_domain = "ratio" if by_response else "light"
+        compensate.output_domain = "light" if calibration.response is None else "ratio"
         return compensate
 
     if TYPE_CHECKING:
@@ -108,12 +89,27 @@ class Compensate(nn.Module):
         light = image
         for block in self.linear:  # only the blocks that the unit needs
             light = block(light)
-        saturated = self.gain.saturated(light) if self.saturates else None
-        light = self.gain(light, saturated)
+        light = self.gain(self.relight(light))
         for block in self.clean:
             light = block(light)
-        light = self.drift(light)
-        return self.gain.restored(light, saturated) if self.restores and saturated is not None else light
+        compensated: Tensor = light
+        return compensated
+
+    @torch.jit.export
+    def lost(self, image: Tensor) -> Tensor:
+        """Share of each channel that is black or saturated where the background is not, (B, 3)."""
+        light = image
+        for block in self.linear:
+            light = block(light)
+        return self.relight.lost(light)
+
+    @torch.jit.export
+    def light_of(self, image: Tensor) -> Tensor:
+        """The light of images (B, 3, H, W) over the background's, (B, 3, 6), see :meth:`Relight.terms`."""
+        light = image
+        for block in self.linear:
+            light = block(light)
+        return self.relight.light_of(light)
 
 
 class Linearise(nn.Module):
@@ -128,45 +124,24 @@ class Linearise(nn.Module):
 
 
 class Gain(nn.Module):
-    """light * gain + offset, and the model's light where a channel is saturated in both the frame and the background.
+    """light * gain + offset.
 
     Args:
         gain: (3, H, W), or None for 1.
         offset: (3, H, W), or None for 0.
-        saturated_model: (3, H, W), the model's light where a channel is saturated in the background, 0 elsewhere; None for nowhere.
-        saturation_light: linear light from which a channel is saturated.
     """
 
     gain: Tensor | None
     offset: Tensor | None
-    saturated_model: Tensor | None
 
-    def __init__(
-        self, gain: Tensor | None, offset: Tensor | None, saturated_model: Tensor | None = None, saturation_light: float = 1.0
-    ) -> None:
+    def __init__(self, gain: Tensor | None, offset: Tensor | None) -> None:
         super().__init__()
-        for name, value in (("gain", gain), ("offset", offset), ("saturated_model", saturated_model)):
+        for name, value in (("gain", gain), ("offset", offset)):
             if value is not None:
                 check_field(name, value)
             self.register_buffer(name, None if value is None else value.detach().clone())
-        self.saturation_light = check_positive("saturation_light", saturation_light)
 
-    @torch.jit.export
-    def saturated(self, light: Tensor) -> Tensor:
-        """Where the frame and the background are both saturated, bool (B, 3, H, W)."""
-        model = self.saturated_model
-        if model is None:
-            return torch.zeros_like(light, dtype=torch.bool)
-        check_same_size("image", light, "the calibration", model.shape[1], model.shape[2])
-        return (light >= self.saturation_light) & (model > 0)
-
-    @torch.jit.export
-    def restored(self, light: Tensor, saturated: Tensor) -> Tensor:
-        """The model's light in saturated pixels."""
-        model = self.saturated_model
-        return light if model is None else torch.where(saturated, model, light)
-
-    def forward(self, light: Tensor, saturated: Tensor | None = None) -> Tensor:
+    def forward(self, light: Tensor) -> Tensor:
         gain, offset = self.gain, self.offset
         if gain is not None:
             check_same_size("image", light, "the calibration", gain.shape[1], gain.shape[2])
@@ -174,7 +149,7 @@ class Gain(nn.Module):
         if offset is not None:
             check_same_size("image", light, "the calibration", offset.shape[1], offset.shape[2])
             light = light + offset
-        return light if saturated is None else self.restored(light, saturated)
+        return light
 
 
 class Blur(nn.Module):

@@ -5,16 +5,13 @@ import inspect
 import torch
 from torch import Tensor, nn
 
-from ..compensate import Compensate, Drift, SmoothDrift
-from ..compensate import drift as drift_module
+from ..compensate import AsItIs, Compensate, Relight
 from ..compensate.compensate import Blur, Gain
 from ..compensate.defects import FillDefects
-from ..core import smooth
 from ..core.blur import gaussian_weights
 from ..core.cells import whole_cell_means
 from ..core.geometry import CLIFF_SLOPE, MAX_SLOPE, GradientFromNormal
 from ..core.noise import sample_stride
-from ..core.robust import HALVINGS
 from ..integration import PoissonBackground, PoissonDCT
 from ..normals import NormalFromIntensity, NormalFromResponse
 from ..normals import shadowed as shadowed_module
@@ -30,9 +27,6 @@ DEGREES = (2, 4, 6)
 
 TERMS = {(False, False): 3, (True, False): 9, (False, True): 13, (True, True): 19}
 """Terms for which it has, by whether there are products of two and of three changes."""
-
-DRIFTS = {"none": 0, "mode": 1, "statistics": 2, "mode first": 3}
-"""As in csrc/plan.h."""
 
 
 class NotCompiled(Exception):
@@ -87,7 +81,6 @@ def compensate_values(block: nn.Module, size: tuple[int, int]) -> Values:
     assert isinstance(block, Compensate)
     gain = block.gain
     check_block("compensate.gain", gain, Gain)
-    saturated = gain.saturated_model if block.saturates else None
     offset = None if gain.offset is None else _map("compensate.gain.offset", gain.offset, size)
     pedestal = _pedestals(gain.gain, offset)
     none = torch.zeros(0, dtype=torch.int64)
@@ -95,9 +88,6 @@ def compensate_values(block: nn.Module, size: tuple[int, int]) -> Values:
         "gain": _map("compensate.gain.gain", gain.gain, size),
         "offset": offset if pedestal is None else None,
         "pedestal": torch.zeros(3, dtype=torch.float32) if pedestal is None else pedestal,
-        "saturated_model": _map("compensate.gain.saturated_model", saturated, size),
-        "saturation_light": gain.saturation_light,
-        "restores": block.restores and saturated is not None,
         "defect": none,
         "neighbours": none,
         "defects": 0,
@@ -113,7 +103,7 @@ def compensate_values(block: nn.Module, size: tuple[int, int]) -> Values:
             values |= {"defect": step.defect, "neighbours": step.neighbours, "defects": step.defect.shape[0]}
         elif isinstance(step, Blur) and step.std_px > 0.0:
             values |= {"blur": _floats(step.weights), "blur_taps": len(step.weights)}
-    return values | _drift_values(block.drift, size)
+    return values | _relight_values(block.relight, size)
 
 
 def _pedestals(gain: Tensor | None, offset: Tensor | None) -> Tensor | None:
@@ -124,58 +114,36 @@ def _pedestals(gain: Tensor | None, offset: Tensor | None) -> Tensor | None:
     return found if torch.equal(found[:, None, None] * gain, offset) else None
 
 
-def _drift_values(block: nn.Module, size: tuple[int, int]) -> Values:
-    check_block("compensate.drift", block, Drift, nn.Identity)
-    kind, samples = "none", torch.ones(3, 1, 1, dtype=torch.float32)
-    variance, source = samples, block if isinstance(block, Drift) else Drift
-    if isinstance(block, Drift):
-        kind = "mode"
-        if block.background is not None and block.noise is not None:
-            kind = "mode first" if block.by_mode_first else "statistics"
-            samples = block.background.clamp_min(1e-6)
-            variance = (block.noise / samples) ** 2 + block.least_level**2
-            check_equal("compensate.drift.background", samples.shape, Drift().samples(torch.zeros(1, 3, *size))[0].shape)
+def _relight_values(block: nn.Module, size: tuple[int, int]) -> Values:
+    check_block("compensate.relight", block, Relight, AsItIs)
+    relights = isinstance(block, Relight) and block.shows
+    source = block if isinstance(block, Relight) else Relight(torch.ones(3, *size))
+    check_equal("compensate.relight.size", source.size, size)
+    rows, columns = source.sampled.shape[1:]
+    pad = [0, -rows * columns % 8]
     return {
-        "drifts": DRIFTS[kind],
-        "drift_stride": drift_module.stride_of(*size),
-        "halvings": HALVINGS,
-        "least_drift": drift_module.LEAST_DRIFT,
-        "most_drift": drift_module.MOST_DRIFT,
-        "most_by_mode": source.most_by_mode,
-        "same_skin": source.same_skin,
-        "more_skin": source.more_skin,
-        "skin": samples,
-        "skin_variance": variance,
-        "least_level": source.least_level,
-        "most_level": source.most_level,
-        "taken_over": source.taken_over,
-        "least_skin": source.least_skin,
-        "share_of_most": source.share_of_most,
-        "share_of_few": source.share_of_few,
-    }
-
-
-def smooth_values(block: nn.Module, size: tuple[int, int]) -> Values:
-    """Of :class:`SmoothDrift`; none for an identity, or for images too small to show a smooth change."""
-    check_block("smooth", block, SmoothDrift, nn.Identity)
-    stride = smooth.smooth_stride(*size)
-    place = smooth.smooth_basis(*size, stride)
-    rows, columns = place.shape[1:]
-    place = nn.functional.pad(place.flatten(1), [0, -rows * columns % 16])
-    along_x, along_y = (smooth.legendre(length, 1)[1:].float() for length in (size[1], size[0]))
-    return {
-        "smooths": isinstance(block, SmoothDrift) and min(size) >= smooth.SAMPLES,
-        "smooth_stride": stride,
-        "smooth_rows": rows,
-        "smooth_columns": columns,
-        "smooth_samples": place.shape[1],
-        "smooth_steps": smooth.STEPS,
-        "most_smooth": smooth.MOST,
-        "smooth_place": place,
-        "along_x": along_x,
-        "along_y": along_y,
-        "per_square": _floats([smooth.per_square(step) for step in range(smooth.STEPS)], torch.float64),
-        "peaks": smooth.peaks(),
+        "relights": relights,
+        "relight_stride": source.stride,
+        "relight_rows": rows,
+        "relight_columns": columns,
+        "relight_padded": rows * columns + pad[1],
+        "relight_every": source.every,
+        "relight_steps": len(source.scales),
+        "background": source.background,
+        "relight_skin": source.sampled,
+        "relight_share": nn.functional.pad(source.share, pad).double(),
+        "relight_place": nn.functional.pad(source.place, pad).double(),
+        "relight_terms": source.to_terms.double(),
+        "relight_scales": _floats(source.scales, torch.float64),
+        "along_x": source.x[1:],
+        "along_y": source.y[1:],
+        "saturation_light": source.saturation_light,
+        "black": source.black,
+        "alike": source.alike,
+        "exact": source.exact,
+        "damping": source.damping,
+        "better": source.better,
+        "lost": source.most_lost,
     }
 
 

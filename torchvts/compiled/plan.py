@@ -67,21 +67,20 @@ class Plan:
         self._kept.append(table)
         return table.data_ptr()
 
-    def reconstruct(self, image: Tensor, moved: Tensor | None, output: tuple[Tensor, ...] | None) -> int:
+    def reconstruct(self, image: Tensor, conditions: Tensor, output: tuple[Tensor, ...]) -> int:
         """Reconstruct a frame.
 
         Args:
             image: (3, H, W), linear light, contiguous float32 as all tensors here but for masks.
-            moved: (1, H, W) bool, gets where the skin has moved by slopes and colour; None if nobody asks.
-            output: depth (1, H, W), gradient (2, H, W), normal (3, H, W), contact and deformed (1, H, W), which get the result;
-                None where only ``moved`` is wanted.
+            conditions: (22,), gets the light (3, 6), what is lost (3), and the slope that could not be seen.
+            output: depth (1, H, W), gradient (2, H, W), normal (3, H, W), contact and deformed (1, H, W), which get the result.
         Returns:
-            ``DONE``; or ``IN_PYTORCH`` where the shadows of the frame must be read by PyTorch: then only ``moved`` is set.
+            ``DONE``; or ``IN_PYTORCH`` where the shadows of the frame must be read by PyTorch: then only ``conditions`` is set.
         Raises:
             MemoryError: memory is short.
         """
-        parts: list[int | None] = [None] * 5 if output is None else [part.data_ptr() for part in output]
-        code = int(loaded().reconstruct(self.address, image.data_ptr(), None if moved is None else moved.data_ptr(), *parts))
+        parts = [part.data_ptr() for part in output]
+        code = int(loaded().reconstruct(self.address, image.data_ptr(), conditions.data_ptr(), *parts))
         check_memory(code == NO_MEMORY)
         return code
 

@@ -9,7 +9,7 @@ class Frame(NamedTuple):
     """A batch of compensated images.
 
     Attributes:
-        image: (B, 3, H, W), compensated, without a smooth change of the light where the pipeline divides by it.
+        image: (B, 3, H, W), compensated.
         weight: (B, 1, H, W) in [0, 1], how surely the skin has moved.
         noise_std: (B, 3), noise of each frame's compensated image; None where the model of normals does not ask for it.
     """
@@ -42,3 +42,18 @@ class DepthOutput(NamedTuple):
     normal: Tensor
     contact: Tensor
     deformed: Tensor
+
+
+class Conditions(NamedTuple):
+    """What frames were seen under.
+
+    Attributes:
+        light: (B, 3, 6), the light over the background's, a surface in each channel: its mean, then five terms that are each of
+            mean square 1 over the image, see :class:`torchvts.compensate.Relight`. 1, 0, 0, 0, 0, 0 where nothing has changed.
+        lost: (B, 3), share of each channel that is black or saturated where the background is not.
+        unseen_deg: (B,), slope below which skin looks like the undeformed skin of the frame, degrees.
+    """
+
+    light: Tensor
+    lost: Tensor
+    unseen_deg: Tensor

@@ -13,7 +13,6 @@ from ..core.arrays import Array
 from ..core.checks import in_one_line
 from ..core.files import open_video, read_image, rgb_from_bgr
 from ..model import Sensor
-from ..stream.sources import frames_a_second, rate_of, read_times, time_of
 from .items import Item, list_items
 from .records import Records
 
@@ -27,9 +26,8 @@ class Frame(NamedTuple):
         done: whether its result is there.
         failed: why it cannot be used; empty where it can.
         length: the number of frames of a video, in an entry of its own at the end; None in all others.
-        mine: whether its depth is this rank's to find. Other frames of a video are there because its light is followed.
-        time_s: since the start of the video.
-        fps: frames a second of the video.
+        mine: whether its depth is this rank's to find. Other frames of a video are there because they are its first.
+        doubt: why less may have been seen in it than is there; empty for nothing.
     """
 
     item: Item
@@ -38,8 +36,7 @@ class Frame(NamedTuple):
     failed: str = ""
     length: int | None = None
     mine: bool = True
-    time_s: float = 0.0
-    fps: float = 30.0
+    doubt: str = ""
 
 
 Batch = tuple[list[tuple[Frame, bool]], Array]
@@ -50,7 +47,7 @@ Batch = tuple[list[tuple[Frame, bool]], Array]
 def load_frames(
     records: Records, sensor: Sensor, share: tuple[int, int], batch: int, workers: int
 ) -> Iterator[tuple[Frame, Tensor | None]]:
-    """The images of one rank's share and all frames of videos, each with its image (1, 3, H, W), rectified, if it has one.
+    """The images of one rank's share and the first frames of videos, each with its image (1, 3, H, W), rectified, if it has one.
 
     Args:
         records: of the run: which source it reads and which frames are done.
@@ -75,7 +72,7 @@ def _as_is(batch: Any) -> Any:
 
 
 class _Frames(IterableDataset[Batch]):
-    """Every N-th image and every frame of every video, which one loader process of each rank decodes, in order.
+    """Every N-th image and the frames of every video, which one loader process of each rank decodes, in order.
 
     Decoding in order is exact for any codec; seeking is not.
     """
@@ -131,19 +128,18 @@ class _Frames(IterableDataset[Batch]):
             yield from ((Frame(item, number, done=True), None) for number in own)
             return
         try:
-            capture, times = open_video(item.file), list(read_times(item.file).values())
-        except ValueError as error:  # its name, or its times
+            capture = open_video(item.file)
+        except ValueError as error:  # its name
             yield Frame(item, failed=str(error)), None
             return
-        fps = rate_of(times, frames_a_second(capture))
         number = 0
         while capture.grab():
             mine = number % every == 0 and number // every % world == rank
             done = mine and self.records.is_done(item, number)
-            decoded, pixels = capture.retrieve()
-            time_s = time_of(number, fps, times)
-            frame = Frame(item, number, done, "" if decoded else "not decoded", None, mine, time_s, fps)
-            yield frame, partial(rgb_from_bgr, pixels) if decoded else None
+            if mine or number < self.records.settings.background_frames:
+                decoded, pixels = capture.retrieve()
+                frame = Frame(item, number, done, "" if decoded else "not decoded", None, mine)
+                yield frame, partial(rgb_from_bgr, pixels) if decoded else None
             number += 1
         capture.release()
         if number == 0:

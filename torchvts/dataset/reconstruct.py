@@ -34,7 +34,6 @@ from ..pipeline import MODES, DepthOutput, unit_pipeline
 from ..pose.output_frame import MM_OF
 from ..skin import ContactSettings
 from ..stream import FIRST_FRAMES, Recording, check_device, video_codec
-from ..stream.follow_light import NO_CONTACT, NOT_TO_BE_TRUSTED
 from .items import Item, Source, list_items
 from .loading import Frame, load_frames
 from .processes import share, sum_over_processes
@@ -209,9 +208,9 @@ class _Worker:
         self.recording = partial(
             Recording, unit, self.settings.mode, network=network, device=self.settings.device, contact=thresholds
         )
-        self.image = self.recording(follow=False)
+        self.image = self.recording()
         self.notes: list[tuple[str, str]] = []
-        self.in_other_light: list[str] = []
+        self.doubted: list[tuple[str, str]] = []
         self.done = self.failed = 0
 
     def run(self, batch: int, workers: int | None) -> Report:
@@ -239,9 +238,10 @@ class _Worker:
         seconds = time.perf_counter() - start
         if rank > 0:
             return Report(rank, 0, 0, [], seconds)
-        if self.in_other_light:
-            more = f", as of {len(self.in_other_light) - 1} more" if len(self.in_other_light) > 1 else ""
-            self.notes.append((self.in_other_light[0], f"the light is not that of the calibration{more}: {NOT_TO_BE_TRUSTED}"))
+        if self.doubted:
+            name, doubt = self.doubted[0]
+            more = f" (and {len(self.doubted) - 1} more frames are in doubt)" if len(self.doubted) > 1 else ""
+            self.notes.append((name, f"{doubt}{more}"))
         self.records.join_videos()
         rows, failed = self.records.write_tables()
         self.writer.write_summary(rows, len(failed))
@@ -265,30 +265,27 @@ class _Worker:
                 recording = self._recording(frame.item, held)
             if recording is not None:
                 for one, of_video in held:
-                    found = self._depth(recording, one, of_video)
                     if one.mine:
-                        yield found
+                        yield self._depth(recording, one, of_video)
                 held = []
             if frame.length is not None:
-                if recording is not None and recording.light.steps:
-                    self.notes.append((frame.item.path, f"the light has stepped: {NOT_TO_BE_TRUSTED}"))
                 if text := cut_short(frame.item.file, frame.length):
                     self.notes.append((frame.item.path, text))
                 yield frame, None, None
 
     def _recording(self, item: Item, held: Sequence[tuple[Frame, Tensor]]) -> Recording:
         """The recording of a video that begins with these frames."""
-        fps, count = held[0][0].fps if held else 30.0, self.settings.background_frames
+        count = self.settings.background_frames
         try:
             if 0 < count <= len(held):
                 first = torch.cat([image for _, image in held])
-                return self.recording(first, fps=fps, codec=video_codec(item.file))
+                return self.recording(first, codec=video_codec(item.file))
             reason = f"background_frames: expected at least {count} frames, got {len(held)}" if count > 0 else ""
         except ValueError as error:
             reason = in_one_line(error)
         if reason:
             self.notes.append((item.path, f"first frames not used, the calibration is used as it is: {reason}"))
-        return self.recording(fps=fps)
+        return self.recording()
 
     def _depth(self, recording: Recording, frame: Frame, image: Tensor | None) -> _Reconstructed:
         """Depth of one frame if it is wanted, or why there is none."""
@@ -298,10 +295,12 @@ class _Worker:
             reason = recording.unusable(image)
             if reason:
                 return frame._replace(failed=reason), None, None
-            check = recording.check
-            if recording is self.image and check is not None and check.light_off(image) > NO_CONTACT:
-                self.in_other_light.append(frame.item.frame_name(frame.number))
-            return frame, *recording(image, frame.time_s, solve=frame.mine and not frame.done)
+            if frame.done:
+                return frame, None, None
+            output = recording(image)
+            if recording.doubt:
+                self.doubted.append((frame.item.frame_name(frame.number), recording.doubt))
+            return frame._replace(doubt=recording.doubt), image, output
         except ValueError as error:
             return frame._replace(failed=in_one_line(error)), None, None
 
@@ -326,7 +325,7 @@ class _Worker:
             figures = {"frames": frame.length}
         elif image is not None and result is not None:
             area = float(result.contact.double().sum()) * self.sensor.mm_per_pixel**2
-            figures = {"deepest_mm": float(result.depth_mm.max()), "contact_mm2": area}
+            figures = {"deepest_mm": float(result.depth_mm.max()), "contact_mm2": area, "doubt": frame.doubt}
             try:
                 self.writer.write(frame, image, result)
             except ValueError as error:  # a depth that its format does not hold

@@ -33,8 +33,8 @@ PARTS = "parts"
 """Folder beside the records where the frames of a video wait until it is done."""
 
 Record = dict[str, Any]
-"""``mark`` of the source file; then ``deepest_mm`` and ``contact_mm2`` of a frame, ``frames`` of a whole video, or ``failed``, the
-reason why there is no result."""
+"""``mark`` of the source file; then ``deepest_mm``, ``contact_mm2`` and ``doubt`` of a frame, ``frames`` of a whole video, or
+``failed``, the reason why there is no result."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def _is_record(record: object) -> bool:
         return isinstance(record["frames"], int) and record["frames"] >= 0
     figures = [record.get(name) for name in ("deepest_mm", "contact_mm2")]
     sound = all(isinstance(value, float | int) and not isinstance(value, bool) and math.isfinite(value) for value in figures)
-    return sound and isinstance(record.get("bytes"), list)
+    return sound and isinstance(record.get("doubt"), str) and isinstance(record.get("bytes"), list)
 
 
 def join(out: Path, settings: Settings) -> Settings:
@@ -259,11 +259,11 @@ class Records:
                         failed.append((name, record["failed"]))
                     else:
                         count += 1
-                        yield name, f"{record['deepest_mm']:.6f}", f"{record['contact_mm2']:.6f}"
+                        yield name, f"{record['deepest_mm']:.6f}", f"{record['contact_mm2']:.6f}", record["doubt"]
             if missing:
                 raise RuntimeError(f"{len(missing)} frames have no result, the first is {missing[0]}: run the same command again")
 
-        _write_csv(self.out / "frames.csv", ("frame", "deepest_mm", "contact_mm2"), rows())
+        _write_csv(self.out / "frames.csv", ("frame", "deepest_mm", "contact_mm2", "doubt"), rows())
         if failed:
             _write_csv(self.out / "failed.csv", ("frame", "reason"), failed)
         else:

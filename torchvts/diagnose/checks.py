@@ -8,12 +8,17 @@ from typing import Any
 import torch
 
 from ..calibration import ROUGH, channel_structure
-from ..pipeline import DepthPipeline, beyond_presses
+from ..core.frame import Conditions
+from ..pipeline import UNSEEN_DEG, DepthPipeline, beyond_presses, light_levels, light_unevenness
 from ..stream import FrameCheck
 from .camera import blockiness, levels_of, new_spots, pattern_likeness, texture_share
 from .examination import MISFITS, Examination
 from .findings import FAULT_DEG, WARNING_DEG, Finding, by_cost
-from .light_words import CHANNELS, in_words
+
+CHANNELS = ("red", "green", "blue")
+
+LEAST_LIGHT, UNEVEN_LIGHT = 0.05, 0.05
+"""Change of a channel's light that is reported, relative, and its unevenness from which that is a warning: presses scatter 0.03."""
 
 ROUGH_FREE_DEG = 6.0
 """Spread of the slopes that the least changed skin of a frame may seem to have: 0.3 to 4 degrees on real sensors, 4 where a press
@@ -186,30 +191,51 @@ def _saturated(e: Examination) -> Figures | None:
 # ---- the light and the skin ----------------------------------------------------------------------------------------------------
 
 
-def _light_of_background(e: Examination) -> Finding | None:
-    return None if e.given is None else in_words(e.background_change, "background", e)
+def _change_of(conditions: Conditions | None) -> Figures | None:
+    """Levels of the light in the three channels, and how uneven its change is where it is most uneven."""
+    if conditions is None:
+        return None
+    levels, uneven = light_levels(conditions)[0], float(light_unevenness(conditions).max())
+    furthest = float(levels[(levels - 1.0).abs().argmax()]) - 1.0
+    text = ", ".join(f"{name} {float(level):.0%}" for name, level in zip(CHANNELS, levels))
+    return {"value": max(abs(furthest), uneven), "levels": text, "uneven": uneven}
 
 
-def _light_at_calibration(e: Examination) -> Finding | None:
-    if e.calibration_change is None:
+def _light_of_background(e: Examination) -> Figures | None:
+    return None if e.given is None else _change_of(e.conditions_of(e.given))
+
+
+def _light_at_calibration(e: Examination) -> Figures | Finding | None:
+    light = _change_of(e.calibration_light)
+    if light is None:
         return None
     view = FrameCheck(e.value_of(e.unit.model_image)).other_view(e.value[None])
     if "swapped" in view:
         return Finding("channels_swapped", f"already at calibration: {view}; read images in the order R, G, B", "fault", 1.0)
-    return in_words(e.calibration_change, "calibration", e)
+    return light
 
 
-def _rough(e: Examination) -> Figures | None:
-    """Spread of the slopes of undeformed skin, where no simple change of light explains it."""
-    if e.change.is_simple:
-        return None
+def _by_unevenness(figures: Figures) -> str:
+    return "warning" if figures["uneven"] > UNEVEN_LIGHT else "note"
+
+
+def _unseen(e: Examination) -> Figures:
+    """Slope that the least changed skin hides, and how many times that at calibration it is."""
+    unseen = float(e.conditions.unseen_deg)
+    return {"value": unseen, "times": unseen / e.usual_unseen_deg}
+
+
+def _rough(e: Examination) -> Figures:
+    """Spread of the slopes of undeformed skin."""
     covered = not bool(e.output.contact.any())
     return {"value": e.free_deg, "read": "reads no depth" if covered else "does not know the undeformed skin"}
 
 
 def _other_unit(e: Examination) -> float | None:
     """Unlikeness of the skin's fine pattern, where the least changed skin seems to have slopes."""
-    if not e.unit.measured or not e.is_fine or e.free_deg < OTHER_DEG:
+    light = _change_of(e.conditions)
+    alike = e.free_deg < OTHER_DEG and (light is None or light["uneven"] < UNEVEN_LIGHT)
+    if not e.unit.measured or not e.is_fine or alike:
         return None
     likeness = pattern_likeness(e.image, e.without_markers(e.value), e.unit.noise_std, e.free)
     return None if likeness is None else 1.0 - likeness
@@ -314,10 +340,12 @@ CHECKS = (
         "calibration", "LEDs that the lights do not fit, for which presses of a ball help"), "fault"),
     Check("lights_coplanar", _coplanar, "the lights lie nearly in one plane (smallest singular value of their directions "
           "{value:.2f}, usual is 0.8): noise alone changes normals by {cost:.1f} degrees; increase the distance of the LEDs"),
-    Check("lights_misfit", _light_at_calibration),
+    Check("lights_misfit", _light_at_calibration, "the calibration's lights do not explain its own image ({levels}; uneven by "
+          "{uneven:.1%}): other lights, stray light, or a lens; use presses or a prior", above=LEAST_LIGHT),
     # the background of now
     Check("contact_in_background", _contact_in_background, _CONTACT.format("background", "in the calibration's"), "fault"),
-    Check("light_changed", _light_of_background),
+    Check("light_changed", _light_of_background, "the background's light is {levels} of that at calibration, uneven by "
+          "{uneven:.1%}: what is smooth is divided out", _by_unevenness, above=LEAST_LIGHT),
     # the camera
     Check("few_bits", _bits, "the {which} has only {value:.0f} bits: rounding changes normals by {cost:.1f} degrees; read the "
           "camera with 8 bits or more", lambda figures: by_cost(figures["cost"])),
@@ -334,12 +362,16 @@ CHECKS = (
           lambda figures: "note" if figures["value"] < 0.1 else "fault" if figures["inside"] > 0.3 else "warning", above=0.02),
     # the light and the skin
     Check("no_free_skin", _rough, "even the least changed skin seems to have slopes of {value:.0f} degrees, and the pipeline "
-          "{read}: contact covers everything, or this is another unit, or its light has changed (an LED off?); leave skin free, or "
-          "recalibrate",
+          "{read}: contact covers everything, or this is another unit, or its light has changed (half an LED off, gamma?); leave "
+          "skin free, or recalibrate",
           "fault", above=ROUGH_FREE_DEG, last=True),
     Check("other_unit", _other_unit, "the skin has not the fine pattern that it had at calibration: another unit, or its skin was "
           "changed; use its own calibration, or calibrate again", above=0.945),
-    Check("light_changed", lambda e: in_words(e.change, "image", e)),
+    Check("light_changed", lambda e: _change_of(e.conditions), "the light of free skin is {levels} of that at calibration, "
+          "uneven by {uneven:.1%}: what is smooth is divided out, gamma, saturation, ambient light or another unit are not: set "
+          "the camera as at calibration, shade the sensor, or recalibrate", _by_unevenness, above=LEAST_LIGHT),
+    Check("unseen_slopes", _unseen, "the least changed skin scatters {times:.0f} times as much as at calibration: slopes below "
+          "{value:.0f} degrees could not be seen", "note", above=UNSEEN_DEG),
     Check("new_spots", _spots, "{value:.0f} spots that were not there at calibration ({share:.1%} of the image{dead}): clean the "
           "skin, or recalibrate", lambda figures: "warning" if figures["share"] > 0.001 else "note"),
     Check("skin_changed", _wear, "the skin's brightness has changed by {value:.1%} (RMS), unevenly and nearly equally "

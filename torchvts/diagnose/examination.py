@@ -1,6 +1,5 @@
 """What several checks need of an image and its calibration, each measured once and only when a check asks for it."""
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,21 +7,24 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from ..compensate import Relight
 from ..core.cells import whole_cell_means
 from ..core.checks import QUANTISATION_STD
-from ..core.frame import DepthOutput, Frame
+from ..core.frame import Conditions, DepthOutput, Frame
 from ..core.geometry import angles_deg, lengths, normal_from_gradient
 from ..core.noise import noise_std
 from ..model import Calibration
 from ..model.lights import inverse_light_matrix
-from ..pipeline import DepthPipeline
+from ..pipeline import DepthPipeline, usual_unseen_deg
 from ..skin.weight import spread_of
 from ..stream import FrameCheck
 from .camera import levels_of
-from .light import CELLS, Change, find_change
 
 TILTED_DEG = 3.0
 """Tilt from which a normal counts as one of a contact."""
+
+CELLS = 60
+"""Cells along the shorter side over which changes of free skin are averaged."""
 
 MISFITS = 0.05
 """Share of a contact in which the length of the normals may be off by three standard deviations; without a cause it is 0.003."""
@@ -157,49 +159,31 @@ class Examination:
 
     # ---- the light ----
 
-    @property
-    def error(self) -> float:
-        """Error of values by few bits."""
-        return 0.0 if self.is_fine else 0.5 / self.levels
+    @cached_property
+    def conditions(self) -> Conditions:
+        """What the image was seen under."""
+        return self.conditions_of(self.raw)
+
+    def conditions_of(self, value: Tensor) -> Conditions:
+        """The same of an image (3, H, W)."""
+        with torch.no_grad():
+            return self.pipeline.conditions(value[None].to(self.unit.background.dtype))
 
     @cached_property
-    def change(self) -> Change:
-        """The change from the calibration's background to the image."""
-        reference = self.without_markers(self.value)
-        return find_change(self.image, reference, self.expected_noise, self.exponent, self.error)
+    def usual_unseen_deg(self) -> float:
+        """Slope that a frame of the undeformed skin hides at calibration."""
+        return usual_unseen_deg(self.unit)
 
     @cached_property
-    def background_change(self) -> Change:
-        """The change from the calibration's background to the given one."""
-        assert self.given is not None
-        given, reference = self.without_markers(self.given), self.without_markers(self.value)
-        return find_change(given, reference, self.expected_noise, self.exponent, self.error)
-
-    @cached_property
-    def calibration_change(self) -> Change | None:
-        """The change from the lights' own image to the background; None where the calibration has only one of them."""
+    def calibration_light(self) -> Conditions | None:
+        """The light of the background over that of the lights' own image; None where the calibration has only one of them."""
         unit = self.unit
         if unit.lights is None or not unit.measured:
             return None
-        lit, model = self.value_of(unit.background_without_ambient), self.value_of(unit.model_image)
-        return find_change(lit, model, unit.noise_std.float(), self.exponent, self.error)
-
-    def cost_deg(self, change: Change, of_calibration: bool = False) -> float:
-        """Error of the image's normals by the change, as the pipeline reads them.
-
-        It is the angle between normals with and without the change; of an uneven one, which bends under a contact as it likes, by
-        how much rougher the least changed skin seems.
-        """
-        reference = self.unit.model_image if of_calibration else self.unit.background
-        mended = self.value_of(change.undone(self.image**self.exponent, reference.float()))
-        pipeline = self.pipeline
-        if of_calibration:
-            background = change.undone(self.unit.background, reference).clamp(1e-4, 1.0).to(self.unit.background.dtype)
-            pipeline = DepthPipeline.from_calibration(dataclasses.replace(self.unit, background=background), "precise").eval()
-        slopes = self.read(mended, pipeline)[1]
-        if not change.is_simple and not of_calibration:
-            return max(0.0, self.free_deg - self.spread_deg(slopes))
-        return max(self.difference_deg(self.frame_and_slopes[1], slopes))
+        with torch.no_grad():
+            block = Relight(unit.model_image, self.exponent, unit.saturation_light)
+            light = block.terms(unit.background_without_ambient[None])
+        return None if light is None else Conditions(light, torch.zeros(1, 3), torch.zeros(1))
 
     @cached_property
     def grey_change(self) -> float:
@@ -249,9 +233,3 @@ class Examination:
         usable = ~self.dark.any(0) & (self.raw < 0.98).all(0) & (self.raw == self.image).all(0)
         inside = usable & self.moved if bool(self.moved.any()) else usable
         return ((length - 1.0) / noise)[inside] if int(inside.sum()) >= 20 else None
-
-    @property
-    def is_no_surface(self) -> bool:
-        """Whether the light of the frame is known not to be that of a surface under the lights of the calibration."""
-        error = self.length_error
-        return error is not None and float((error.abs() > 3.0).double().mean()) > MISFITS

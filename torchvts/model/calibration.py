@@ -260,11 +260,10 @@ class Calibration:
             return 1.0 / (self.background + PEDESTAL)
         light = self.background_without_ambient.clamp_min(1e-6)
         gain = (self.model_image / light).clamp(1.0 / DEFECT_RATIO, DEFECT_RATIO)
-        saturated = self.saturated_model
-        if saturated is None:
-            return gain
-        usual = torch.stack([channel[model == 0].median() for channel, model in zip(gain, saturated, strict=True)])
-        return torch.where(saturated > 0, usual.nan_to_num(1.0)[:, None, None], gain)
+        clipped = (self.background >= self.saturation_light) & (self.model_image >= self.saturation_light)
+        # the brightness of the skin was not measured there
+        usual = torch.stack([channel[~one].median() for channel, one in zip(gain, clipped, strict=True)]).nan_to_num(1.0)
+        return torch.where(clipped, usual[:, None, None], gain)
 
     @cached_property
     def saturation_light(self) -> float:
@@ -272,17 +271,14 @@ class Calibration:
         return float(SATURATED**self.sensor.exponent) - 3.0 * float(self.light_noise_std.max())
 
     @cached_property
-    def saturated_model(self) -> Tensor | None:
-        """(3, H, W), ``model_image`` where background and model are saturated, 0 elsewhere; None if that is nowhere.
-
-        The brightness of the skin was not measured there, so ``gain`` takes the median of the channel for these pixels.
-        """
-        if not self.measured or self.lights is None:
-            return None
-        model = self.model_image
-        both = (self.background >= self.saturation_light) & (model >= self.saturation_light)
-        saturated = torch.where(both, model, 0.0)
-        return saturated if bool((saturated > 0).any()) else None
+    def unclipped_background(self) -> Tensor:
+        """(3, H, W), linear light of the undeformed skin: the background, and what the lights give where it is saturated."""
+        gain = self.gain
+        if self.lights is None or gain is None:
+            return self.background
+        clipped = (self.background >= self.saturation_light) & (self.model_image >= self.saturation_light)
+        ambient = 0.0 if self.ambient is None else self.ambient.reshape(3, 1, 1)
+        return torch.where(clipped, self.model_image / gain + ambient, self.background)
 
     @cached_property
     def saturated_above(self) -> Tensor:

@@ -1,6 +1,7 @@
 """Online: a calibration made into a chain of modules that turns images into depth, and how far that may be off."""
 
-from ..core.frame import DepthOutput
+from ..core.frame import Conditions, DepthOutput
+from .conditions import UNSEEN_DEG, doubts_of, light_levels, light_unevenness, usual_unseen_deg
 from .confidence import Bounds, Confidence, ConfidentOutput, ConfidentPipeline, beyond_presses, bound_at
 from .depth import MODES, DepthPipeline
 from .frozen import FrozenPipeline
@@ -11,8 +12,10 @@ from .unit import unit_pipeline
 
 __all__ = [
     "MODES",
+    "UNSEEN_DEG",
     "Adaptive",
     "Bounds",
+    "Conditions",
     "Confidence",
     "ConfidentOutput",
     "ConfidentPipeline",
@@ -27,5 +30,9 @@ __all__ = [
     "Solve",
     "beyond_presses",
     "bound_at",
+    "doubts_of",
+    "light_levels",
+    "light_unevenness",
     "unit_pipeline",
+    "usual_unseen_deg",
 ]

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from ..compensate import Compensate
 from ..core.blur import MOST_BLUR_PX, blur, gaussian_weights
 from ..core.checks import (
     check_batch,
@@ -33,7 +34,8 @@ from ..model.calibration import Calibration, check_calibration
 from ..model.coverage import COVERED, distance_to_presses
 from ..model.response_field import TaughtRange
 from ..normals import NormalFromIntensity, NormalFromResponse, as_normal_model
-from ..skin import ContactMask, ContactSettings
+from ..skin import ContactMask, ContactSettings, unseen_deg
+from ..skin.weight import CELLS, LEAST_SPREAD, RISE
 from .depth import DepthOutput, DepthPipeline, eval_around
 from .expected_error import expected_model_deg, least_level, light_std_by_fit, model_log_variance
 
@@ -89,6 +91,9 @@ SYSTEM_SHARE = 0.5
 KINK_PX = 0.08
 """Depth error of the grid where the surface has a kink, pixels, for a contact as steep as 45 degrees."""
 
+UNSEEN_DEG = 5.0
+"""Slope, degrees, that every frame should show: where one hides it, a contact may be missed."""
+
 BAND = 0.15
 """Width of the ring around the deformed area that is searched for what the mask missed, over the shorter side of the image."""
 
@@ -109,7 +114,8 @@ class Bounds(NamedTuple):
         normal_95_deg: (B, 1, H, W), within which the error of the normal lies with a probability of 95 %.
         depth_95_mm: (B, 1, H, W), the same for depth.
         confidence: (B, 1, H, W), probability that the normal is within :data:`USEFUL_DEG` of the truth.
-        frame_confidence: (B,), mean of ``confidence`` over the contact; 1 without contact.
+        frame_confidence: (B,), mean of ``confidence`` over the contact, 1 without contact, times s^4 / (s^4 + m^4): s is the root
+            mean square slope of the contact, :data:`UNSEEN_DEG` without one, m the slope that undeformed skin could hide.
         factors_deg: (B, 6, H, W), the standard deviations along one axis that the bound of the normal is made of, in the order of
             :data:`FACTORS`.
     """
@@ -219,7 +225,7 @@ class Confidence(nn.Module):
     and depths of its presses it grows as the error of a field fitted to their flatter part does on their rims, and as the height
     of the lights is uncertain. Added to this are the change that the next pass would bring, the part of the gradient that is not
     integrable, blur at edges, and a fixed error where a channel is dark or saturated. Outside of the deformed area, where the
-    normal is said to be flat, the bound is the faintest tilt that the mask detects.
+    normal is said to be flat, the bound is the faintest tilt that the mask detects, by noise and by the frame's least changed skin.
 
     Depth. White errors of slope grow with the logarithm of the contact's size; errors of the model add up along the way, which
     is computed by three integrations: all slopes too steep, and all tilted in x and in y. What the mask missed and what the next
@@ -247,7 +253,7 @@ class Confidence(nn.Module):
         >>> cal = Calibration.from_lights(lights, Sensor("rig", 48, 64, 0.5))
         >>> out = ConfidentPipeline.from_calibration(cal)(cal.model_image[None])
         >>> out.normal_95_deg.shape, out.frame_confidence
-        (torch.Size([1, 1, 48, 64]), tensor([1.]))
+        (torch.Size([1, 1, 48, 64]), tensor([1.0000]))
     """
 
     uses_depth: Final[bool]
@@ -304,6 +310,7 @@ class Confidence(nn.Module):
         self.spread = spread
         # TorchScript sees no numbers of the module
         self.clipped_variance = math.radians(CLIPPED_DEG) ** 2
+        self.cells, self.sure, self.least_spread, self.faint_deg = CELLS, RISE[1], LEAST_SPREAD, UNSEEN_DEG
         self.detected, self.useful_deg = ContactSettings().sigmas, USEFUL_DEG  # a tilt of so many standard deviations is seen
         self.curl_share, self.edge_share, self.edge_depth_share = CURL_SHARE, EDGE_SHARE, EDGE_DEPTH_SHARE
         self.system_share = 1.0 if self.by_lights else SYSTEM_SHARE**2  # lights that are off are off everywhere
@@ -352,13 +359,15 @@ class Confidence(nn.Module):
         common |= {"model_log_variance": model_log_variance(calibration), "least_level": least_level(calibration)}
         return cls(block, noise, calibration.noise_std, light, sensor.mm_per_pixel, **common)
 
-    def forward(self, images: Tensor, compensated: Tensor, out: DepthOutput) -> Bounds:
+    def forward(self, images: Tensor, compensated: Tensor, out: DepthOutput, light: Tensor | None = None) -> Bounds:
         """Bounds of a frame.
 
         Args:
             images: (B, 3, H, W), the input of the pipeline.
-            compensated: the same after ``Compensate`` and the pipeline's ``smooth``.
+            compensated: the same after ``Compensate``.
             out: the output of the pipeline.
+            light: (B, 3, 6), the light that ``Compensate`` has divided out, see :class:`~torchvts.core.frame.Conditions`; None for
+                none. What it changes unevenly by a share u, a slope of u would change, too: a contact may be part of it.
         Raises:
             ValueError: wrong shapes, or another size than the calibrated one.
         """
@@ -390,7 +399,13 @@ class Confidence(nn.Module):
         else:  # the raw slopes of another pass scatter about those of the depth
             variance = noise + model + surface + beyond + 0.5 * change.square()
             bound = _length_95(torch.zeros_like(change), torch.sqrt(variance + 1e-12), 1.06)
-        bound = torch.where(out.deformed, bound, self.detected * torch.sqrt(noise + 1e-12))
+        unseen = unseen_deg(self.gradient(base.detach()), self.cells, self.sure, self.least_spread)
+        if light is not None:
+            uneven = light[:, :, 1:].square().sum(dim=2) / light[:, :, 0].square().clamp_min(1e-6)
+            uneven = torch.sqrt(uneven.sum(dim=1).detach() / 1.5)  # of lights 120 degrees apart; u where all slopes are u
+            unseen = torch.sqrt(unseen.square() + torch.rad2deg(torch.atan(uneven)).square())
+        hidden = torch.deg2rad(unseen)[:, None, None, None].maximum(self.detected * torch.sqrt(noise + 1e-12))
+        bound = torch.where(out.deformed, bound, hidden)
         normal_95 = torch.rad2deg(bound).clamp_max(180.0)
         inside = out.deformed.to(noise.dtype)
         slopes = SlopeErrors(steep, noise + surface, self.system_share * (model + clipped) + beyond)
@@ -400,6 +415,9 @@ class Confidence(nn.Module):
         contact = out.contact.to(noise.dtype)
         count = contact.sum(dim=(1, 2, 3))
         frame = torch.where(count > 0, (likely * contact).sum(dim=(1, 2, 3)) / count.clamp_min(1.0), torch.ones_like(count))
+        slope = torch.rad2deg(torch.acos(n_z.detach().clamp(-1.0, 1.0))).square() * contact  # degrees^2
+        slope = torch.where(count > 0, slope.sum(dim=(1, 2, 3)) / count.clamp_min(1.0), torch.full_like(count, self.faint_deg**2))
+        frame = frame * slope.square() / (slope.square() + unseen.square().square()).clamp_min(1e-6)
         parts = torch.cat((noise.sqrt(), model.sqrt(), change, surface.sqrt(), clipped.sqrt(), beyond.sqrt()), dim=1)
         return Bounds(normal_95, depth_95, likely, frame, torch.rad2deg(parts))
 
@@ -548,6 +566,7 @@ class ConfidentPipeline(nn.Module):
         check_record("pipe", pipe, DepthPipeline, "DepthPipeline.from_calibration makes one")
         check_record("confidence", confidence, Confidence, "Confidence.from_calibration makes one")
         self.pipe = pipe
+        self.relights = isinstance(pipe.compensate, Compensate)
         self.confidence = confidence = copy.copy(confidence)  # whose number below is of this pipeline
         if isinstance(pipe.mask, ContactMask):
             confidence.detected = pipe.mask.sigmas
@@ -577,7 +596,9 @@ class ConfidentPipeline(nn.Module):
     def forward(self, images: Tensor) -> ConfidentOutput:
         """As :meth:`DepthPipeline.forward`."""
         out: DepthOutput = self.pipe(images)
-        bounds: Bounds = self.confidence(images, self.pipe.smooth(self.pipe.compensate(images)), out)
+        compensate = self.pipe.compensate
+        light = compensate.light_of(images) if self.relights else None
+        bounds: Bounds = self.confidence(images, compensate(images), out, light)
         return ConfidentOutput(
             out.depth_mm,
             out.gradient,

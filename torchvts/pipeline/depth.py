@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 import torch
 from torch import Tensor, nn
 
-from ..compensate import Compensate, SmoothDrift
+from ..compensate import Compensate, unchanged_light
 from ..core.checks import (
     check_batch,
     check_choice,
@@ -17,13 +17,13 @@ from ..core.checks import (
     check_range,
     check_record,
 )
-from ..core.frame import DepthOutput, Frame, Solution
+from ..core.frame import Conditions, DepthOutput, Frame, Solution
 from ..core.geometry import GradientFromNormal, normal_from_gradient
 from ..core.settings import check_settings, settings_as_tensor
 from ..integration import PoissonBackground, PoissonDCT, WrappedIntegrator, as_integrator
 from ..model import Calibration, Sensor, check_calibration
 from ..normals import NormalFromIntensity, NormalFromResponse, WrappedNormals, as_normal_model, check_domain
-from ..skin import ContactFromDepth, ContactMask, ContactSettings, ZeroBackground, moved
+from ..skin import ContactFromDepth, ContactMask, ContactSettings, ZeroBackground, moved, unseen_deg
 from .gs_sdk import gs_sdk_blocks
 from .refine import Adaptive, Once, Repeat, SlopesOfDepth, SlopesOfPixels
 from .shadows import Shadows
@@ -66,7 +66,6 @@ class DepthPipeline(nn.Module):
         refine_threshold_px: predicted change of depth from which "auto" solves a frame again, as a multiple of the pitch.
         max_passes: bound on all passes.
         contact: depth and deformed area to contact, bool (B, 1, H, W); None for :class:`ContactFromDepth`.
-        smooth: divides a smooth change of the light out of the compensated image; None for nothing.
     Source:
         figure 2 and eq. 3-10 of the paper.
     """
@@ -88,13 +87,11 @@ class DepthPipeline(nn.Module):
         refine_threshold_px: float = 0.05,
         max_passes: int = 8,
         contact: nn.Module | None = None,
-        smooth: nn.Module | None = None,
     ) -> None:
         super().__init__()
         check_choice("mode", mode, MODES)
         touching = ContactFromDepth(mm_per_pixel) if contact is None else contact
-        smooth = nn.Identity() if smooth is None else smooth
-        given = {"compensate": compensate, "mask": mask, "gradient": gradient, "contact": touching, "smooth": smooth}
+        given = {"compensate": compensate, "mask": mask, "gradient": gradient, "contact": touching}
         for name, block in given.items():
             check_record(name, block, nn.Module)
         mm_per_pixel, tolerance_px = check_positive("mm_per_pixel", mm_per_pixel), check_positive("tolerance_px", tolerance_px)
@@ -112,7 +109,6 @@ class DepthPipeline(nn.Module):
         self.mm_per_pixel = mm_per_pixel
         self.compensate = compensate
         self.mask = mask
-        self.smooth = smooth
         self.solve = Solve(model, gradient, integrator, ZeroBackground(mm_per_pixel))
         own = isinstance(mask, ContactMask) and type(mask).forward is ContactMask.forward
         self.takes_slopes = own and model.calibrated
@@ -190,15 +186,14 @@ class DepthPipeline(nn.Module):
                 by_response = calibration.response is not None
                 normals = (NormalFromResponse if by_response else NormalFromIntensity).from_calibration(calibration)
             modules = (
-                Compensate.from_calibration(calibration, drift=mode == "auto"),
+                Compensate.from_calibration(calibration),
                 ContactMask.from_calibration(calibration, settings),
                 normals,
                 GradientFromNormal(),
                 PoissonDCT(sensor.mm_per_pixel) if integrate is None else integrate,
             )
             touching = ContactFromDepth.from_calibration(calibration, settings)
-            smooth = None if calibration.response is None else SmoothDrift()
-            pipe = cls(*modules, mm_per_pixel=sensor.mm_per_pixel, mode=mode, contact=touching, smooth=smooth)
+            pipe = cls(*modules, mm_per_pixel=sensor.mm_per_pixel, mode=mode, contact=touching)
             return eval_around(pipe, *given)
 
     @classmethod
@@ -275,17 +270,23 @@ class DepthPipeline(nn.Module):
 
     def frame_of(self, images: Tensor) -> tuple[Frame, Tensor]:
         """The frame of checked images (B, 3, H, W), compensated and weighted, and its slopes by eq. 9 and 5, (B, 2, H, W)."""
-        compensated = self.compensate(images)
-        image, noise = self.smooth(compensated), self.noise_of(compensated)
+        image = self.compensate(images)
+        noise = self.noise_of(image)
         slopes = self.solve.slopes(image, None, noise)
         weight = self.mask(image, slopes) if self.takes_slopes else self.mask(image)
         return Frame(image, weight.to(image.dtype), noise), slopes
 
     @torch.jit.unused
-    def moved(self, images: Tensor) -> Tensor:
-        """Where the skin has moved in images (B, 3, H, W), bool (B, 1, H, W), without their depth; raises as :meth:`forward`."""
+    def conditions(self, images: Tensor) -> Conditions:
+        """What images (B, 3, H, W) were seen under; raises as :meth:`forward`."""
         check_images(images)
-        return self.frame_of(images)[0].weight > 0.5
+        block: Any = self.compensate
+        own = isinstance(block, Compensate)
+        light, lost = (
+            (block.light_of(images), block.lost(images)) if own else (unchanged_light(images), images.new_zeros(len(images), 3))
+        )
+        _, slopes = self.frame_of(images)
+        return Conditions(light, lost, self.mask.unseen_deg(slopes) if isinstance(self.mask, ContactMask) else unseen_deg(slopes))
 
     def noise_of(self, compensated: Tensor) -> Tensor | None:
         """The noise of each frame, where the model of normals asks for it.

@@ -12,7 +12,7 @@ from ..compiled import IN_PYTORCH, NotCompiled, Plan, check_block, ends, library
 from ..compiled import blocks as compiled
 from ..compiled.plan import Values
 from ..core.checks import check_batch, check_range, check_record, check_same_size, in_range
-from ..core.frame import DepthOutput
+from ..core.frame import Conditions, DepthOutput
 from ..normals import NormalFromIntensity
 from .depth import DepthPipeline
 from .refine import Adaptive, Once, Repeat, SlopesOfDepth, SlopesOfPixels
@@ -105,74 +105,53 @@ class FrozenPipeline:
             ValueError: wrong shape, values outside [0, 1] or not finite, or images that record gradients.
             TypeError: not floating point, or, compiled, no float32 on the CPU.
         """
-        output = self._work(images, True, False)[0]
-        assert output is not None
-        return output
+        return self.with_conditions(images)[0]
 
-    def moved(self, images: Tensor) -> Tensor:
-        """Where the skin has moved in images (B, 3, H, W) by slopes and colour, bool (B, 1, H, W), without their depth.
+    def with_conditions(self, images: Tensor) -> tuple[DepthOutput, Conditions]:
+        """The output, and what the frames were seen under; at the price of the output.
 
         Raises:
             ValueError, TypeError: as calling it.
         """
-        moved = self._work(images, False, True)[1]
-        assert moved is not None
-        return moved
-
-    def both(self, images: Tensor) -> tuple[DepthOutput, Tensor]:
-        """The output, and what :meth:`moved` says; where it is compiled, at the price of one.
-
-        Raises:
-            ValueError, TypeError: as calling it.
-        """
-        output, moved = self._work(images, True, True)
-        assert output is not None
-        assert moved is not None
-        return output, moved
-
-    def _work(self, images: Tensor, solve: bool, mask: bool) -> tuple[DepthOutput | None, Tensor | None]:
         self._check(images)
         if self._plan is None:
-            return self._in_pytorch(images, solve, mask)
+            return self._in_pytorch(images)
         with torch.inference_mode():
             light = self._linear(images).contiguous()
         count, size = images.shape[0], self._size
         kinds = (torch.float32, torch.float32, torch.float32, torch.bool, torch.bool)
-        parts = [torch.empty(count, c, *size, dtype=kind, device="cpu") for c, kind in zip(SHAPES, kinds, strict=True) if solve]
-        moved = torch.empty(count, 1, *size, dtype=torch.bool, device="cpu") if mask else None
+        parts = [torch.empty(count, c, *size, dtype=kind, device="cpu") for c, kind in zip(SHAPES, kinds, strict=True)]
+        conditions = torch.empty(count, 22, dtype=torch.float32, device="cpu")
         threads = min(count, torch.get_num_threads())
         frames = range(count)
         if threads <= 1:
             for k in frames:
-                self._frame(k, images, light, parts, moved)
+                self._frame(k, images, light, parts, conditions)
         else:
             pool = ThreadPoolExecutor(threads, thread_name_prefix="torchvts")
             try:  # each thread holds what it works on, so that nothing is freed under it
-                list(pool.map(lambda k: self._frame(k, images, light, parts, moved), frames))
+                list(pool.map(lambda k: self._frame(k, images, light, parts, conditions), frames))
             finally:
                 _finish(pool)
-        return DepthOutput(*parts) if solve else None, moved
+        unseen = torch.rad2deg(torch.atan(conditions[:, 21]))
+        return DepthOutput(*parts), Conditions(conditions[:, :18].reshape(count, 3, 6), conditions[:, 18:21], unseen)
 
-    def _frame(self, k: int, images: Tensor, light: Tensor, parts: list[Tensor], moved: Tensor | None) -> None:
+    def _frame(self, k: int, images: Tensor, light: Tensor, parts: list[Tensor], conditions: Tensor) -> None:
         """Check one frame of a batch, and write its output."""
         assert self._plan is not None
         if not in_range(*ends(images[k].contiguous())):
             check_range("images", images)
-        output = tuple(part[k] for part in parts) if parts else None
-        if self._plan.reconstruct(light[k], None if moved is None else moved[k], output) == IN_PYTORCH:
-            found, _ = self._in_pytorch(images[k : k + 1], True, False)
-            assert found is not None
+        if self._plan.reconstruct(light[k], conditions[k], tuple(part[k] for part in parts)) == IN_PYTORCH:
+            found, _ = self._in_pytorch(images[k : k + 1])
             for part, one in zip(parts, found, strict=True):
                 part[k].copy_(one[0])
 
-    def _in_pytorch(self, images: Tensor, solve: bool, mask: bool) -> tuple[DepthOutput | None, Tensor | None]:
+    def _in_pytorch(self, images: Tensor) -> tuple[DepthOutput, Conditions]:
         images = images.clone(memory_format=torch.contiguous_format)  # rounding depends on the layout
         with torch.inference_mode():
-            output = self._pipe(images) if solve else None
-            moved = self._pipe.moved(images) if mask else None
+            output, conditions = self._pipe(images), self._pipe.conditions(images)
         # copies made outside of inference mode can be used wherever the user wants
-        new = None if output is None else DepthOutput(*(part.clone() for part in output))
-        return new, None if moved is None else moved.clone()
+        return DepthOutput(*(part.clone() for part in output)), Conditions(*(part.clone() for part in conditions))
 
     def _check(self, images: Tensor) -> None:
         check_batch("images", images, 3)
@@ -213,7 +192,7 @@ def plan_of(pipe: DepthPipeline) -> tuple[Plan, tuple[int, int]]:
     if values["mm_per_pixel"] is None:  # a response field by itself has none
         values["mm_per_pixel"] = pipe.mm_per_pixel
     compiled.check_equal("normals.mm_per_pixel", values["mm_per_pixel"], pipe.mm_per_pixel)
-    values |= compiled.compensate_values(pipe.compensate, size) | compiled.smooth_values(pipe.smooth, size)
+    values |= compiled.compensate_values(pipe.compensate, size)
     values |= compiled.solver_values("integrate", solve.integrate, values)
     values |= compiled.mask_values(pipe.mask, size, pipe.takes_slopes)
     values |= compiled.zero_values(solve.zero, size) | compiled.contact_values(pipe.contact, size)

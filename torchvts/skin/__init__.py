@@ -2,7 +2,7 @@
 
 from .pressure import BLUR_MM, SHARE, ContactFromDepth
 from .settings import ContactSettings
-from .weight import ContactMask, moved
+from .weight import ContactMask, moved, unseen_deg
 from .zero import ZeroBackground
 
-__all__ = ["BLUR_MM", "SHARE", "ContactFromDepth", "ContactMask", "ContactSettings", "ZeroBackground", "moved"]
+__all__ = ["BLUR_MM", "SHARE", "ContactFromDepth", "ContactMask", "ContactSettings", "ZeroBackground", "moved", "unseen_deg"]

@@ -146,6 +146,11 @@ class ContactMask(nn.Module):
         evidence = evidence * per_noise
         return cells_to_pixels(self.weight(blur(evidence, self.weights)), cell, height, width)
 
+    @torch.jit.unused
+    def unseen_deg(self, gradient: Tensor) -> Tensor:
+        """Slope that the frame's undeformed skin hides, degrees, (B,), of the slopes (B, 2, H, W) that it seems to have."""
+        return unseen_deg(gradient, self.cells, self.rise[1], self.least_spread)
+
     def change(self, compensated: Tensor, cell: int) -> Tensor:
         """Relative change of light of cells, (B, 3, h, w); zero in channels whose LED has failed."""
         change = whole_cell_means((compensated - self.flat) * self.per_light, cell)
@@ -194,6 +199,19 @@ def spread_of(
     last = (ordered[:, :, 1:] > within * spread[:, :, :-1]) & (number[:-1] >= fewest * float(count))
     end = torch.cat((last, torch.ones_like(ordered[:, :, :1]) > 0.0), dim=2).to(torch.uint8).argmax(dim=2, keepdim=True)
     return spread.gather(2, end)
+
+
+def unseen_deg(gradient: Tensor, cells: int = CELLS, sure: float = RISE[1], least: float = LEAST_SPREAD) -> Tensor:
+    """Slope below which moved skin is not surely told from undeformed skin, degrees, (B,).
+
+    Args:
+        gradient: (B, 2, H, W), slopes of frames before they are weighted.
+        cells: along the shorter side.
+        sure: evidence from which skin has surely moved.
+        least: least spread of slopes.
+    """
+    means = whole_cell_means(gradient, max(1, min(gradient.shape[2], gradient.shape[3]) // cells))
+    return torch.rad2deg(torch.atan(sure * spread_of(means.abs().flatten(2) + 1e-6, least).amax(dim=(1, 2))))
 
 
 def moved(weight: Tensor, depth_mm: Tensor, least: float = LEAST_DEPTH) -> Tensor:

@@ -1,4 +1,4 @@
-"""Depth of cameras, videos and folders of images, frame by frame; late frames are dropped, slow drift of the light is followed."""
+"""Depth of cameras, videos and folders of images, frame by frame; late frames are dropped."""
 
 from . import messages
 from .background import (
@@ -14,7 +14,6 @@ from .background import (
 from .cameras import Camera, CameraSettings
 from .devices import find_camera
 from .files import StreamReport
-from .follow_light import FollowLight
 from .frames import NewestFrame
 from .keys import Keys
 from .live import TactileFrame, TactileStream
@@ -32,7 +31,6 @@ __all__ = [
     "NOT_METRIC",
     "Camera",
     "CameraSettings",
-    "FollowLight",
     "FrameCheck",
     "Keys",
     "LiveView",

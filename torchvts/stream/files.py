@@ -1,5 +1,6 @@
 """What a stream leaves in files beside its video: the figures of every frame."""
 
+import csv
 import json
 import time
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import Any
 
 from ..core.checks import check_record
 from ..core.files import write_atomically
-from .follow_light import NOT_TO_BE_TRUSTED
+from ..pipeline import light_levels
 from .live import TactileFrame, TactileStream
 
 
@@ -27,18 +28,18 @@ def summary_of(stream: TactileStream, frames: int) -> dict[str, Any]:
 
 
 class StreamReport:
-    """Keeps the contact area, the largest depth and the state of the light of every frame, for a table and two files.
+    """Keeps the contact area, the largest depth, the light and the doubt of every frame, for a table and two files.
 
     Args:
         stream: whose frames are added.
     """
 
-    HEADER = "frame,time_s,contact_mm2,deepest_mm,light"
+    HEADER = ("frame", "time_s", "contact_mm2", "deepest_mm", "light_r", "light_g", "light_b", "unseen_deg", "doubt")
 
     def __init__(self, stream: TactileStream) -> None:
         check_record("stream", stream, TactileStream)
         self.stream = stream
-        self.rows: list[tuple[int, float, float, float, str]] = []
+        self.rows: list[tuple[int, float, float, float, list[float], float, str]] = []
         self._begin = self._end = time.perf_counter()
         self._pixel_mm2 = stream.calibration.sensor.mm_per_pixel**2
 
@@ -47,14 +48,16 @@ class StreamReport:
         self._end = time.perf_counter()
         area = float(frame.output.contact.sum()) * self._pixel_mm2
         deepest = float(frame.output.depth_mm.max())
-        state = self.stream.light.state
-        self.rows.append((frame.number, frame.time_s, area, deepest, state))
+        conditions, doubt = self.stream.conditions, self.stream.doubt
+        assert conditions is not None
+        light, unseen = light_levels(conditions)[0].tolist(), float(conditions.unseen_deg)
+        self.rows.append((frame.number, frame.time_s, area, deepest, light, unseen, doubt))
         dropped = f", {self.stream.dropped} dropped" if self.stream.dropped else ""
         times = [f"{name} {ms:.1f}" for name, ms in self.stream.stages.last.items()]
         half = (len(times) + 1) // 2
-        light = "  LIGHT HAS CHANGED: start again without contact" if state == "stepped" else ""
+        in_doubt = "  IN DOUBT" if doubt else ""
         return [
-            f"frame {frame.number}  {frame.time_s:.2f} s  contact {area:.1f} mm2  deepest {deepest:.2f}{light}",
+            f"frame {frame.number}  {frame.time_s:.2f} s  contact {area:.1f} mm2  deepest {deepest:.2f}{in_doubt}",
             f"{self.fps:.0f} fps{dropped}, ms: {' '.join(times[:half])}",
             " ".join(times[half:]),
         ]
@@ -65,7 +68,7 @@ class StreamReport:
         return len(self.rows) / max(self._end - self._begin, 1e-9)
 
     def summary(self) -> dict[str, Any]:
-        """For JSON: :func:`summary_of`, frames and dropped ones, fps, stages_ms, contact and light."""
+        """For JSON: :func:`summary_of`, frames and dropped ones, fps, stages_ms, contact, last light, frames in doubt."""
         stream = self.stream
         return {
             **summary_of(stream, len(self.rows)),
@@ -74,8 +77,8 @@ class StreamReport:
             "stages_ms": {name: round(ms, 3) for name, ms in stream.stages.median_ms().items()},
             "contact_frames": sum(row[2] > 0 for row in self.rows),
             "deepest_mm": max((row[3] for row in self.rows), default=0.0),
-            "light_level": [round(v, 5) for v in stream.light.level],
-            "light_steps": stream.light.steps,
+            "light_level": [round(v, 5) for v in self.rows[-1][4]] if self.rows else [],
+            "doubted_frames": sum(row[6] != "" for row in self.rows),
         }
 
     def table(self) -> str:
@@ -87,20 +90,21 @@ class StreamReport:
         lines.append("median ms: " + ", ".join(f"{name} {ms:.1f}" for name, ms in values["stages_ms"].items()))
         unit = "mm" if values["metric"] else "mm (NOT METRIC)"
         lines.append(f"contact in {values['contact_frames']} frames, deepest {values['deepest_mm']:.3f} {unit}")
-        when = "at the end" if self.stream.light.state == "following" else "when last followed"
-        lines.append(f"light {when}, R G B: " + " ".join(f"{v:.3f}" for v in values["light_level"]) + " of the background's")
-        if values["light_steps"]:
-            lines.append(
-                f"the light stepped {values['light_steps']} times (frames marked 'stepped' in frames.csv): not learned, their "
-                f"{NOT_TO_BE_TRUSTED}"
-            )
+        if values["light_level"]:
+            lines.append("light at the end, R G B: " + " ".join(f"{v:.3f}" for v in values["light_level"]) + " of the background's")
+        if values["doubted_frames"]:
+            first = next(row for row in self.rows if row[6])
+            lines.append(f"{values['doubted_frames']} frames in doubt (see frames.csv), the first of them {first[0]}: {first[6]}")
         return "\n".join(lines)
 
     def save(self, folder: Path) -> None:
         """Write summary.json and frames.csv, each whole or not at all."""
         with write_atomically(folder / "summary.json") as temporary:
             temporary.write_text(json.dumps(self.summary(), indent=2) + "\n", encoding="utf-8")
-        with write_atomically(folder / "frames.csv") as temporary:
-            rows = {i: f"{i},{t:.4f},{area:.4f},{deepest:.6f},{state}\n" for i, t, area, deepest, state in self.rows}
-            rows |= {i: f"{i},,,,left out\n" for i, _ in self.stream.left_out}
-            temporary.write_text(f"{self.HEADER}\n" + "".join(rows[i] for i in sorted(rows)), encoding="utf-8")
+        rows: dict[int, list[Any]] = {
+            number: [number, f"{time_s:.4f}", f"{area:.4f}", f"{deepest:.6f}", *(f"{v:.4f}" for v in light), f"{unseen:.2f}", doubt]
+            for number, time_s, area, deepest, light, unseen, doubt in self.rows
+        }
+        rows |= {number: [number, *[""] * 7, f"left out: {reason}"] for number, reason in self.stream.left_out}
+        with write_atomically(folder / "frames.csv") as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows([self.HEADER, *(rows[number] for number in sorted(rows))])

@@ -13,7 +13,7 @@ from ..calibration import Press
 from ..core.checks import check_choice, check_integer, check_least, check_record, check_switch
 from ..core.files import rgb_from_bgr
 from ..model import Calibration, Sensor
-from ..pipeline import MODES, DepthOutput
+from ..pipeline import MODES, Conditions, DepthOutput
 from ..skin import ContactSettings
 from .background import (
     FIRST_FRAMES,
@@ -23,7 +23,6 @@ from .background import (
     use_calibration,
     with_background,
 )
-from .follow_light import FollowLight
 from .frames import SourceFrames
 from .record import Recorder
 from .recording import NotAtRest, Recording
@@ -44,7 +43,7 @@ class TactileFrame(NamedTuple):
     Attributes:
         number: in the source, from 0.
         time_s: since the start of the source.
-        image: (3, H, W), rectified, in the background's light.
+        image: (3, H, W), rectified.
         output: of the pipeline.
     """
 
@@ -69,7 +68,6 @@ class TactileStream:
         background_frames: number of frames without contact at the start; 0, with a calibration, uses that as it is.
         presses: of balls, to calibrate with; only without a calibration.
         realtime: play a recording at its own rate as if it were a camera.
-        follow: follow slow drift of the light.
         network: a trained network in place of the calibration's model, see :func:`torchvts.pipeline.unit_pipeline`.
         device: of the pipeline, "cpu" or "cuda".
         reconnect_s: for how long a camera that has stopped is opened again before an error is raised; not with a :class:`Reader`.
@@ -101,7 +99,6 @@ class TactileStream:
         background_frames: int = FIRST_FRAMES,
         presses: Sequence[Press] = (),
         realtime: bool = False,
-        follow: bool = True,
         network: str | Path | None = None,
         device: str = "cpu",
         reconnect_s: float = 0.0,
@@ -118,6 +115,7 @@ class TactileStream:
         self.stages = StageClock()
         self.left_out: list[tuple[int, str]] = []
         self._zero: list[Tensor] = []
+        self._doubted = False
         self._zero_missing = 0
         try:
             self._frames = SourceFrames(self.reader, background_frames, realtime, self.stages)
@@ -128,8 +126,6 @@ class TactileStream:
             self._start = partial(
                 Recording,
                 mode=mode,
-                fps=self.fps,
-                follow=follow,
                 network=network,
                 device=device,
                 contact=contact,
@@ -182,9 +178,14 @@ class TactileStream:
             self.calibration = calibration
 
     @property
-    def light(self) -> FollowLight:
-        """The light followed, learned from all frames so far."""
-        return self.recording.light
+    def conditions(self) -> Conditions | None:
+        """What the last frame was seen under; None before the first."""
+        return self.recording.conditions
+
+    @property
+    def doubt(self) -> str:
+        """Why less may have been seen in the last frame than is there, in words; "" for nothing."""
+        return self.recording.doubt
 
     @property
     def started_s(self) -> float:
@@ -212,15 +213,15 @@ class TactileStream:
                 raw, reason = self._usable(pixels)
             if raw is not None and self._zero_missing:
                 self._collect(raw)
-            found = None if raw is None else self.recording(raw, time_s)
-            if found is None:
+            if raw is None:
                 self.left_out.append((index, reason))
                 warnings.warn(f"frame {index} left out: {reason}", stacklevel=2)
                 continue
-            image, output = found
-            assert output is not None
-            yield TactileFrame(index, time_s, image[0], output)
-            self.recording.learn()  # after the depth has been handed out, which does not wait for it
+            output = self.recording(raw)
+            if self.doubt and not self._doubted:
+                warnings.warn(f"frame {index}: {self.doubt}", stacklevel=2)
+            self._doubted = bool(self.doubt)
+            yield TactileFrame(index, time_s, raw[0], output)
             self.stages.end_frame()
 
     def _usable(self, pixels: Pixels | Unreadable) -> tuple[Tensor | None, str]:

@@ -1,4 +1,4 @@
-"""The way of each frame of a recording: is it usable, the light of the background, depth. Live streams and data sets share it."""
+"""The way of each frame of a recording: is it usable, depth, what it was seen under. Live streams and data sets share it."""
 
 import math
 from collections.abc import Callable
@@ -10,17 +10,12 @@ import torch
 from torch import Tensor
 
 from ..core.cells import whole_cell_means
-from ..core.checks import check_positive, check_switch
 from ..core.spelling import suggest
 from ..model import Calibration, check_calibration
-from ..pipeline import DepthOutput, DepthPipeline, FrozenPipeline, unit_pipeline
+from ..pipeline import Conditions, DepthOutput, DepthPipeline, FrozenPipeline, doubts_of, unit_pipeline, usual_unseen_deg
 from ..skin import ContactMask, ContactSettings
 from .background import find_background
-from .follow_light import FollowLight
 from .usable import FrameCheck
-
-MOST_LIGHT_CHANGE = 0.15
-"""First frames whose light differs more from the calibration's are those of another unit or exposure."""
 
 
 def check_device(device: str) -> torch.device:
@@ -69,15 +64,13 @@ def _learn_unrest(pipe: DepthPipeline, images: Tensor) -> None:
 class Recording:
     """Depth of the frames of one recording, in order, by one calibration.
 
-    The first frames show the skin without contact. The noise of the contact mask and the light of the recording are measured in
-    them, and they are compared with the background of the calibration. Without first frames the calibration is used as it is.
+    The first frames show the skin without contact. The noise of the contact mask is measured in them, and they are compared with
+    the background of the calibration. Without first frames the calibration is used as it is.
 
     Args:
         calibration: of the unit.
         mode: "fast", "precise" or "auto".
         first: (N, 3, H, W), the first frames, rectified; None for none.
-        fps: frames a second.
-        follow: follow slow drift of the light.
         network: a trained network in place of the calibration's model, see :func:`torchvts.pipeline.unit_pipeline`.
         device: of the pipeline, "cpu" or "cuda"; frames come and go on the CPU.
         contact: thresholds of contact; None for the usual ones.
@@ -85,6 +78,8 @@ class Recording:
         stage: makes a context in which a stage of that name runs, to measure its time.
     Attributes:
         pipe: the pipeline, frozen.
+        conditions: what the last frame was seen under; None before the first.
+        doubt: why less may have been seen in it than is there, in words; "" for nothing.
     Raises:
         ValueError: contact or changing light in the first frames, or those of another unit.
     """
@@ -95,8 +90,6 @@ class Recording:
         mode: str = "auto",
         first: Tensor | None = None,
         *,
-        fps: float = 30.0,
-        follow: bool = True,
         network: str | Path | None = None,
         device: str = "cpu",
         contact: ContactSettings | None = None,
@@ -104,88 +97,43 @@ class Recording:
         stage: Callable[[str], AbstractContextManager[Any]] = lambda name: nullcontext(),
     ) -> None:
         check_calibration("calibration", calibration)
-        check_switch("follow", follow)
-        fps = check_positive("fps", fps)
-        self._light = FollowLight(calibration.background_value)
-        self._filled = calibration.markers if first is None else None
-        self._unlearned: tuple[Tensor, Tensor, float] | None = None
         self.device = check_device(device)
         pipe = unit_pipeline(calibration, mode, network, contact).float().requires_grad_(False)
         self.check = FrameCheck.from_calibration(calibration)
-        self._fps, self._follow, self._stage = fps, follow, stage
-        self._before: float | None = None
+        self._stage = stage
+        self._usual_deg = usual_unseen_deg(calibration)
+        self.conditions: Conditions | None = None
+        self.doubt = ""
         image = None if first is None else find_background(first, codec=codec)
         if first is not None:
             _learn_unrest(pipe, first)
         self.pipe: FrozenPipeline = pipe.to(self.device).freeze()
         if image is not None:
-            self._start(calibration, image[None])
+            self._start(image[None])
 
     def unusable(self, frame: Tensor) -> str:
         """Why a frame (1, 3, H, W), rectified, cannot be used; an empty text where it can."""
         return "" if self.check is None else self.check(frame)
 
-    def __call__(self, frame: Tensor, time_s: float, solve: bool = True) -> tuple[Tensor, DepthOutput | None]:
-        """Take the next frame.
+    def __call__(self, frame: Tensor) -> DepthOutput:
+        """Depth of the next frame, (1, 3, H, W) in [0, 1], rectified, usable."""
+        with torch.inference_mode(), self._stage("depth"):
+            output, conditions = self.pipe.with_conditions(frame.to(self.device))
+            output, self.conditions = (
+                DepthOutput(*(part.cpu() for part in output)),
+                Conditions(*(part.cpu() for part in conditions)),
+            )
+        self.doubt = doubts_of(self.conditions, self._usual_deg)[0]
+        return output
 
-        Args:
-            frame: (1, 3, H, W) in [0, 1], rectified, usable.
-            time_s: its time.
-            solve: whether its depth is wanted; else only the light is followed.
-        Returns:
-            The frame in the background's light, and its depth.
-        """
-        self.learn()
-        with torch.inference_mode(), self._stage("light"):
-            image = self._light.correct(frame)
-        output: DepthOutput | None = None
-        if solve or self._follow:
-            with self._stage("depth"):
-                given = image.to(self.device)
-                if solve:
-                    found, moved = self.pipe.both(given)
-                    output = DepthOutput(*(part.cpu() for part in found))
-                else:
-                    moved = self.pipe.moved(given)
-            if self._follow:
-                seconds = 1.0 / self._fps if self._before is None else time_s - self._before
-                if self._filled is not None:
-                    frame = self._filled(frame)
-                # copies: the caller may write into what is returned
-                self._unlearned = (frame.clone() if image is frame else frame, moved.cpu(), seconds)
-        self._before = time_s
-        return image, output
-
-    @property
-    def light(self) -> FollowLight:
-        """The light, learned from all frames so far."""
-        self.learn()
-        return self._light
-
-    def learn(self) -> None:
-        """Learn the light of the last frame, which no depth but that of the next one needs; called when there is time."""
-        if self._unlearned is not None:
-            with torch.inference_mode(), self._stage("light"):
-                self._light.update(*self._unlearned)
-            self._unlearned = None
-
-    def _start(self, calibration: Calibration, image: Tensor) -> None:
-        """Start from the light of the first frames, and refuse another unit and a contact in them."""
+    def _start(self, image: Tensor) -> None:
+        """Refuse another unit and a contact in the first frames."""
         if reason := self.unusable(image):
             raise ValueError(f"background: the first frames cannot be used: {reason}")
-        light = self.light
-        light.start(image if calibration.markers is None else calibration.markers(image))
-        level = max(abs(v - 1.0) for v in light.level)
-        if level > MOST_LIGHT_CHANGE:
-            raise ValueError(
-                f"background: the light is {level:.0%} off the calibration's: another unit, exposure or LEDs; calibrate again"
-            )
-        corrected = light.correct(image)
-        deformed = self.pipe.moved(corrected.to(self.device))
+        deformed = self(image).deformed
         if bool(deformed.any()):
             raise NotAtRest(
                 f"background: the first frames show contact on {float(deformed.float().mean()):.1%} of the skin against the "
                 "calibration's background: start without contact, calibrate again if the skin or the camera's compression has "
                 "changed, or use the calibration as it is (background_frames=0, --background-frames 0)"
             )
-        light.set_background(corrected)

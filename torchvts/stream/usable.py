@@ -89,10 +89,6 @@ class FrameCheck:
             return "the frame is overexposed: nearly all of it is saturated"
         return self._other_view(cells)
 
-    def light_off(self, frame: Tensor) -> float:
-        """By which part the light of a frame (1, 3, H, W) differs from the background's, in the channel where it differs most."""
-        return max([abs(level - 1.0) for level in self._levels(self._views.cells(array_of(frame[0])))], default=0.0)
-
     def other_view(self, frame: Tensor) -> str:
         """In which way a frame (1, 3, H, W) is cropped, turned or swapped otherwise than the background; an empty text for none."""
         return self._other_view(self._views.cells(array_of(frame[0])))

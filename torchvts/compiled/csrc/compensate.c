@@ -3,16 +3,6 @@
 
 #include <stdlib.h>
 
-/* Means of 3 x 3 pixels, the first from (first, first) on and then every `stride`, of `planes` images: (planes, rows, columns). */
-void grid_means(const float *image, int planes, int height, int width, int stride, int first, int rows, int columns, float *means) {
-    for (int plane = 0; plane < planes; plane++, image += (size_t)height * width)
-        for (int i = 0; i < rows; i++)
-            for (int j = 0; j < columns; j++) {
-                const float *a = image + (size_t)(first + i * stride) * width + first + j * stride, *b = a + width, *c = b + width;
-                *means++ = (a[0] + a[1] + a[2] + b[0] + b[1] + b[2] + c[0] + c[1] + c[2]) / 9.0f;
-            }
-}
-
 /* image * gain + offset, either of which may be null; without offset image * gain + pedestal * gain. */
 WIDE static void multiply_add(const float *restrict image, const float *restrict gain, const float *restrict offset, float pedestal, int n,
                               float *restrict light) {
@@ -63,21 +53,15 @@ WIDE FUSED static void weighted_sum(const float *const *lines, const float *rest
     }
 }
 
-/* What is done to a plane: image * gain + offset, either of which may be null; where both frame and background are saturated, the model's light. */
+/* What is done to a plane: image * gain + offset, either of which may be null. */
 typedef struct {
-    const float *image, *gain, *offset, *model;
-    float pedestal, saturated;
+    const float *image, *gain, *offset;
+    float pedestal;
 } Affine;
-
-/* The model's light where it is known, which is where the background is saturated, and the image is so bright. */
-static WIDE void restore(const float *restrict image, const float *restrict model, float saturated, size_t n, float *restrict light) {
-    for (size_t k = 0; k < n; k++) light[k] = (image[k] >= saturated) & (model[k] > 0.0f) ? model[k] : light[k];
-}
 
 /* n values from `at` on. */
 static void apply(const Affine *of, size_t at, int n, float *light) {
     multiply_add(of->image + at, of->gain ? of->gain + at : NULL, of->offset ? of->offset + at : NULL, of->pedestal, n, light);
-    if (of->model) restore(of->image + at, of->model + at, of->saturated, (size_t)n, light);
 }
 
 /* Has the processor fetch what apply() will read: rows are too short for it to see by itself where they go on. */
@@ -169,96 +153,32 @@ float *sorted(float *values, float *other, int n) {
     return (float *)from;
 }
 
-enum { LANES = 16 };
-
-/* The smallest of values[k + distance] - values[k] for k below n. */
-WIDE static float narrowest(const float *restrict values, int distance, int n) {
-    float least_of[LANES], found;
-    int k = 0;
-    for (int j = 0; j < LANES; j++) least_of[j] = values[distance] - values[0];
-    for (; k + LANES <= n; k += LANES)
-        for (int j = 0; j < LANES; j++) {
-            const float width = values[k + j + distance] - values[k + j];
-            least_of[j] = width < least_of[j] ? width : least_of[j];
+/* Light (height, width) in the light of the background; coefficients of its surface. Saturated pixels that seem darker than the background are it. */
+static WIDE void relight(const Plan *plan, const float *image, const float *background, const float *terms, float *restrict light) {
+    const int height = (int)plan->height, width = (int)plan->width;
+    const float saturated = (float)plan->saturation_light, *once = plan->along_x, *twice = once + width;
+    for (int y = 0; y < height; y++, image += width, background += width, light += width) {
+        const float y1 = plan->along_y[y], y2 = plan->along_y[height + y], bend = terms[3];
+        const float constant = terms[0] + terms[2] * y1 + terms[5] * y2, slope = terms[1] + terms[4] * y1;
+        for (int x = 0; x < width; x++) {
+            const float relit = image[x] / (constant + slope * once[x] + bend * twice[x]);
+            light[x] = (image[x] >= saturated) & ((relit < background[x]) | (background[x] >= saturated)) ? background[x] : relit;
         }
-    found = least_of[0];
-    for (; k < n; k++) found = values[k + distance] - values[k] < found ? values[k + distance] - values[k] : found;
-    for (int j = 1; j < LANES; j++) found = least_of[j] < found ? least_of[j] : found;
-    return found;
-}
-
-/* half_sample_mode() of torchvts/core/robust.py. */
-static float half_sample_mode(const float *ordered, int n, int halvings) {
-    for (; halvings > 0; halvings--) {
-        const int half = (n + 1) / 2;
-        const float width = narrowest(ordered, half - 1, n - half + 1);
-        int start = 0;
-        while (start < n - half && ordered[start + half - 1] - ordered[start] != width) start++;
-        ordered += start;
-        n = half;
-    }
-    return ordered[n / 2];
-}
-
-/* How many rows, or columns, are sampled of so many. */
-static int sampled(int length, int stride) { return (length - stride / 2 + stride - 1) / stride; }
-
-/* The mode of every stride-th pixel of a plane. some: twice as much memory as so many pixels. */
-static float mode_of(const float *plane, int height, int width, int stride, int halvings, float *some) {
-    int n = 0;
-    for (int y = stride / 2; y < height; y += stride)
-        for (int x = stride / 2; x < width; x += stride) some[n++] = plane[(size_t)y * width + x];
-    return half_sample_mode(sorted(some, some + n, n), n, halvings);
-}
-
-/* How many of n samples (3, LINE) lie within `reach` of each of five levels in all three channels. */
-enum { LINE = 128 };
-WIDE static void count_near(float some[3][LINE], int n, const float level[5][3], float reach, int counts[5]) {
-    for (int k = 0; k < 5; k++) {
-        const float r = level[k][0], g = level[k][1], b = level[k][2];
-        int count = 0;
-        for (int j = 0; j < n; j++) count += (fabsf(some[0][j] - r) < reach) & (fabsf(some[1][j] - g) < reach) & (fabsf(some[2][j] - b) < reach);
-        counts[k] += count;
     }
 }
 
-/* Drift.of_one_skin() of torchvts/compensate/drift.py: the drift of a frame, in place of what each channel by itself says. */
-static void make_of_one_skin(const Plan *plan, const float *image, float *drift) {
-    const int height = (int)plan->height, width = (int)plan->width, stride = (int)plan->drift_stride;
-    const float least_drift = (float)plan->least_drift, reach = (float)(plan->same_skin * plan->least_drift);
-    const float lowest = fminf(fminf(drift[0], drift[1]), drift[2]), highest = fmaxf(fmaxf(drift[0], drift[1]), drift[2]);
-    const int columns = sampled(width, stride);
-    float levels[5][3], some[3][LINE];
-    int counts[5] = {0}, best = 0, most;
-    if (highest - lowest < least_drift) return;
-    for (int k = 0; k < 5; k++)
-        for (int c = 0; c < 3; c++) levels[k][c] = k == 0 ? drift[c] : k < 4 ? drift[k - 1] : 0.0f;
-    for (int y = stride / 2; y < height; y += stride)
-        for (int first = 0; first < columns; first += LINE) {
-            const int n = least(columns - first, LINE);
-            for (int c = 0; c < 3; c++) {
-                const float *row = image + ((size_t)c * height + y) * width + stride / 2 + (size_t)first * stride;
-                for (int j = 0; j < n; j++) some[c][j] = row[(size_t)j * stride] - 1.0f;
-            }
-            count_near(some, n, levels, reach, counts);
-        }
-    most = (int)plan->more_skin * counts[0];
-    for (int k = 1; k < 5; k++)
-        if (100 * counts[k] > most) most = 100 * counts[k], best = k;
-    for (int c = 0; c < 3; c++) drift[c] = levels[best][c];
-}
-
-/* Gain, offset, defects and blur of linear light. */
-static int clean(const Plan *plan, const float *image, float *light) {
+int compensate(const Plan *plan, const float *image, float *terms, float *light) {
     const int taps = (int)plan->blur_taps, height = (int)plan->height, width = (int)plan->width;
     const size_t pixels = (size_t)height * width, lines = (size_t)taps * width + width + taps, filled = taps && plan->defects ? pixels : 0;
-    const float **line = malloc(sizeof(float *) * (size_t)(taps + 1) + sizeof(float) * (lines + filled + (size_t)plan->defects + 1));
+    const size_t lit = plan->relights ? pixels : 0;
+    const float **line = malloc(sizeof(float *) * (size_t)(taps + 1) + sizeof(float) * (lines + lit + filled + (size_t)plan->defects + 1));
     if (!line) return NO_MEMORY;
-    float *rows = (float *)(line + taps + 1), *whole = rows + lines, *repaired = whole + filled;
-    for (int c = 0; c < 3; c++, image += pixels, light += pixels) {
+    float *rows = (float *)(line + taps + 1), *relit = rows + lines, *whole = relit + lit, *repaired = whole + filled;
+    const int code = plan->relights ? frame_light(plan, image, terms) : DONE;
+    for (int c = 0; c < 3 && code == DONE; c++, image += pixels, light += pixels) {
         const size_t at = pixels * (size_t)c;
-        Affine affine = {image, plan->gain ? plan->gain + at : NULL, plan->offset ? plan->offset + at : NULL,
-                         plan->saturated_model ? plan->saturated_model + at : NULL, plan->pedestal[c], (float)plan->saturation_light};
+        if (lit) relight(plan, image, plan->background + at, terms + 6 * c, relit);
+        Affine affine = {lit ? relit : image, plan->gain ? plan->gain + at : NULL, plan->offset ? plan->offset + at : NULL, plan->pedestal[c]};
         if (plan->defects || !taps) {
             float *to = filled ? whole : light;
             apply(&affine, 0, (int)pixels, to);
@@ -268,131 +188,5 @@ static int clean(const Plan *plan, const float *image, float *light) {
         if (taps) blur_lines(&affine, plan->blur, taps, height, width, rows, line, light);
     }
     free(line);
-    return DONE;
-}
-
-/* Drift.by_mode(): the levels of the channels. */
-static int by_mode(const Plan *plan, const float *light, float *level) {
-    const int height = (int)plan->height, width = (int)plan->width, stride = (int)plan->drift_stride;
-    const size_t pixels = (size_t)height * width;
-    const float most = (float)plan->most_drift, least_drift = (float)plan->least_drift;
-    float *some = malloc(2 * sizeof(float) * (size_t)sampled(height, stride) * sampled(width, stride)), largest = 0.0f;
-    if (!some) return NO_MEMORY;
-    for (int c = 0; c < 3; c++) {
-        const float drift = mode_of(light + pixels * c, height, width, stride, (int)plan->halvings, some) - 1.0f;
-        level[c] = drift < -most ? -most : drift > most ? most : drift;
-    }
-    free(some);
-    make_of_one_skin(plan, light, level);
-    for (int c = 0; c < 3; c++) largest = fabsf(level[c]) > largest ? fabsf(level[c]) : largest;
-    float weight = largest / least_drift - 1.0f;
-    weight = weight < 0.0f ? 0.0f : weight > 1.0f ? 1.0f : weight;
-    for (int c = 0; c < 3; c++) level[c] = 1.0f + weight * level[c];
-    return DONE;
-}
-
-int samples_along(int length, int stride) { return stride < 3 ? sampled(length, stride) : length / stride; }
-
-void sample(const float *image, int height, int width, int stride, int planes, float *means) {
-    const int rows = samples_along(height, stride), columns = samples_along(width, stride);
-    if (stride > 2) {
-        grid_means(image, planes, height, width, stride, stride / 2 - 1, rows, columns, means);
-        return;
-    }
-    for (int c = 0; c < planes; c++)
-        for (int y = stride / 2; y < height; y += stride)
-            for (int x = stride / 2; x < width; x += stride) *means++ = image[((size_t)c * height + y) * width + x];
-}
-
-/* Squared distances of samples from levels, in units of their variance, summed over the channels: (n); of one channel alone from 1, if it is given. */
-static void squared(const Plan *plan, const float *ratio, const float *level, int one, int n, float *chi) {
-    for (int k = 0; k < n; k++) chi[k] = 0.0f;
-    for (int c = 0; c < 3; c++) {
-        const float from = c == one ? 1.0f : level[c], *values = ratio + (size_t)c * n, *variance = plan->skin_variance + (size_t)c * n;
-        for (int k = 0; k < n; k++) chi[k] += (values[k] - from) * (values[k] - from) / variance[k];
-    }
-}
-
-static double likelihood(const float *chi, int n) {
-    double sum = 0.0;
-    for (int k = 0; k < n; k++) sum += (double)expf(-0.5f * chi[k]);
-    return sum / n * 2.8284271247461903; /* a Gaussian in three channels has a mean of 2^(-3/2) */
-}
-
-/* The levels to which samples of undeformed skin are drawn: Drift.by_statistics() from its modes on. */
-static void refine_levels(const Plan *plan, const float *ratio, int n, float *chi, float *level) {
-    for (int pass = 0; pass < 2; pass++) {
-        double sums[3] = {0.0}, weights[3] = {0.0};
-        squared(plan, ratio, level, -1, n, chi);
-        for (int k = 0; k < n; k++) {
-            const float weight = expf(-0.5f * chi[k]);
-            for (int c = 0; c < 3; c++) {
-                const float here = weight / plan->skin_variance[(size_t)c * n + k];
-                sums[c] += (double)(here * ratio[(size_t)c * n + k]), weights[c] += (double)here;
-            }
-        }
-        for (int c = 0; c < 3; c++) level[c] = (float)(sums[c] / (weights[c] > 1e-12 ? weights[c] : 1e-12));
-    }
-    squared(plan, ratio, level, -1, n, chi);
-    const double undeformed = likelihood(chi, n), share = undeformed > 0.5 ? plan->share_of_most : plan->share_of_few;
-    float drift[3];
-    int sure[3];
-    for (int c = 0; c < 3; c++) {
-        squared(plan, ratio, level, c, n, chi);
-        drift[c] = fabsf(level[c] - 1.0f);
-        sure[c] = drift[c] > (float)plan->least_level && drift[c] < (float)plan->most_level && undeformed > plan->least_skin &&
-                  likelihood(chi, n) < share * undeformed;
-    }
-    for (int c = 0; c < 3; c++) level[c] = sure[c] ? level[c] : 1.0f;
-}
-
-/* Drift.by_statistics(): the levels of the channels. */
-static int by_statistics(const Plan *plan, const float *light, float *level) {
-    const int height = (int)plan->height, width = (int)plan->width, stride = (int)plan->drift_stride;
-    const int n = samples_along(height, stride) * samples_along(width, stride);
-    float *ratio = malloc(6 * sizeof(float) * (size_t)n), *some = ratio + 3 * (size_t)n, *chi = some + 2 * (size_t)n;
-    if (!ratio) return NO_MEMORY;
-    sample(light, height, width, stride, 3, ratio);
-    int near = 1;
-    for (int c = 0; c < 3; c++) {
-        for (int k = 0; k < n; k++) some[k] = ratio[(size_t)c * n + k] /= plan->skin[(size_t)c * n + k];
-        const float *ordered = sorted(some, some + n, n);
-        near &= fabsf(ordered[(n - 1) / 2] - 1.0f) < 0.5f * (float)plan->least_level;
-        level[c] = half_sample_mode(ordered, n, (int)plan->halvings);
-    }
-    if (near)
-        level[0] = level[1] = level[2] = 1.0f;
-    else
-        refine_levels(plan, ratio, n, chi, level);
-    free(ratio);
-    return DONE;
-}
-
-static WIDE void divide_all(float *values, float by, size_t n) {
-    for (size_t k = 0; k < n; k++) values[k] /= by;
-}
-
-/* Drift.forward(): the levels that light is divided by. */
-static int levels_of(const Plan *plan, const float *light, float *level) {
-    int code = plan->drifts == BY_STATISTICS ? by_statistics(plan, light, level) : by_mode(plan, light, level);
-    if (code != DONE || plan->drifts != BY_MODE_FIRST) return code;
-    int held = 0;
-    for (int c = 0; c < 3; c++) held |= !(fabsf(level[c] - 1.0f) < (float)plan->most_by_mode);
-    if (!held) return DONE;
-    float far[3];
-    code = by_statistics(plan, light, far);
-    for (int c = 0; c < 3; c++) level[c] = fabsf(far[c] - 1.0f) > (float)plan->taken_over ? far[c] : level[c];
-    return code;
-}
-
-int compensate(const Plan *plan, const float *image, float *light) {
-    const size_t pixels = (size_t)plan->height * plan->width;
-    int code = clean(plan, image, light);
-    if (code != DONE || plan->drifts == NO_DRIFT) return code;
-    float level[3];
-    code = levels_of(plan, light, level);
-    for (int c = 0; c < 3 && code == DONE; c++)
-        if (level[c] != 1.0f) divide_all(light + pixels * c, level[c], pixels);
-    if (plan->restores) restore(image, plan->saturated_model, (float)plan->saturation_light, 3 * pixels, light);
     return code;
 }

@@ -160,34 +160,31 @@ static int any_weight(const float *weight, size_t n) {
     return 0;
 }
 
-/* From linear light to slopes and weight, and where more likely than not the skin has moved. */
-static int begin(const Plan *plan, const float *image, Frame *frame, float *normal, uint8_t *moved) {
-    const size_t pixels = (size_t)plan->height * plan->width;
-    int code = compensate(plan, image, frame->light);
+/* From linear light to slopes and weight; conditions: the light (3, 6), what is lost (3), the slope that could not be seen. */
+static int begin(const Plan *plan, const float *image, Frame *frame, float *normal, float *conditions) {
+    for (int k = 0; k < 22; k++) conditions[k] = k < 18 && k % 6 == 0;
+    int code = compensate(plan, image, conditions, frame->light);
     for (int c = 0; c < 3; c++) frame->noise[c] = plan->by_lights ? plan->noise_std[c] : 0.0f;
     if (code == DONE && plan->measures_noise) code = measure_noise(plan, frame->light, frame->noise);
-    if (code == DONE && plan->smooths) code = remove_smooth_change(plan, frame->light);
     if (code != DONE) return code;
     solve_slopes(plan, frame, NULL, normal);
-    code = weigh(plan, frame->light, frame->slopes, frame->weight);
-    for (size_t k = 0; k < pixels && code == DONE && moved; k++) moved[k] = frame->weight[k] > 0.5f;
-    return code;
+    return weigh(plan, frame->light, frame->slopes, conditions + 21, frame->weight);
 }
 
 /*
- * A frame. image (3, H, W), linear light; depth (1, H, W), null where only `moved` (1, H, W) is wanted, or null; gradient (2, H, W), normal (3, H, W),
- * contact and deformed (1, H, W) bytes. Returns DONE, NO_MEMORY, or IN_PYTORCH for a frame whose shadows PyTorch must read, with `moved` set.
+ * A frame. image (3, H, W), linear light; conditions (22), see begin(); depth (1, H, W), gradient (2, H, W), normal (3, H, W), contact and deformed
+ * (1, H, W) bytes. Returns DONE, NO_MEMORY, or IN_PYTORCH for a frame whose shadows PyTorch must read.
  */
-EXPORT int reconstruct(const Plan *plan, const float *image, uint8_t *moved, float *depth, float *gradient, float *normal, uint8_t *contact,
+EXPORT int reconstruct(const Plan *plan, const float *image, float *conditions, float *depth, float *gradient, float *normal, uint8_t *contact,
                        uint8_t *deformed) {
     const size_t pixels = (size_t)plan->height * plan->width;
-    float *memory = malloc((depth ? 7 : 9) * sizeof(float) * pixels);
+    float *memory = malloc(7 * sizeof(float) * pixels);
     if (!memory) return NO_MEMORY;
     Frame frame = {{0.0f}, memory, memory + 3 * pixels, memory + 4 * pixels, memory + 6 * pixels};
-    int code = begin(plan, image, &frame, depth ? normal : memory + 6 * pixels, moved);
-    if (depth && code == DONE && !any_weight(frame.weight, pixels)) {
+    int code = begin(plan, image, &frame, normal, conditions);
+    if (code == DONE && !any_weight(frame.weight, pixels)) {
         undeformed(pixels, depth, gradient, normal, contact, deformed);
-    } else if (depth) {
+    } else {
         if (code == DONE) code = solve_depth(plan, &frame, gradient, depth);
         if (code == DONE) code = refine(plan, &frame, gradient, normal, depth);
         if (code == DONE) {

@@ -8,15 +8,15 @@
 
 #define IMAGE_FIELDS(INTEGER, REAL, TABLE)                                                                                                    \
     INTEGER(height) INTEGER(width) REAL(mm_per_pixel)                                                                                         \
-    /* compensate.c; maps (3, height, width) or null; defect (defects), neighbours (defects, 4); skin, skin_variance (3, samples) */           \
-    TABLE(float, gain) TABLE(float, offset) TABLE(float, pedestal) TABLE(float, saturated_model) REAL(saturation_light)                       \
-    INTEGER(restores) TABLE(int64_t, defect) TABLE(int64_t, neighbours) INTEGER(defects) TABLE(float, blur) INTEGER(blur_taps)                \
-    INTEGER(drifts) INTEGER(drift_stride) INTEGER(halvings) REAL(least_drift) REAL(most_drift) REAL(most_by_mode) REAL(same_skin)             \
-    INTEGER(more_skin) TABLE(float, skin) TABLE(float, skin_variance) REAL(least_level) REAL(most_level) REAL(taken_over)                     \
-    REAL(least_skin) REAL(share_of_most) REAL(share_of_few)                                                                                   \
-    /* smooth.c; place (6, samples), along_x (2, width), along_y (2, height), per_square (steps), peaks (6) */                                \
-    INTEGER(smooths) INTEGER(smooth_stride) INTEGER(smooth_rows) INTEGER(smooth_columns) INTEGER(smooth_samples) INTEGER(smooth_steps)        \
-    REAL(most_smooth) TABLE(double, smooth_place) TABLE(float, along_x) TABLE(float, along_y) TABLE(double, per_square) TABLE(double, peaks)
+    /* compensate.c; maps (3, height, width) or null; defect (defects), neighbours (defects, 4) */                                            \
+    TABLE(float, gain) TABLE(float, offset) TABLE(float, pedestal)                                                                            \
+    TABLE(int64_t, defect) TABLE(int64_t, neighbours) INTEGER(defects) TABLE(float, blur) INTEGER(blur_taps)                                  \
+    /* light.c; background (3, height, width), skin (3, samples), share (3, padded), place (3, 6, padded), terms (3, 6, 6), scales (steps),    \
+       along_x (2, width), along_y (2, height) */                                                                                             \
+    INTEGER(relights) INTEGER(relight_stride) INTEGER(relight_rows) INTEGER(relight_columns) INTEGER(relight_padded) INTEGER(relight_every)   \
+    INTEGER(relight_steps) TABLE(float, background) TABLE(float, relight_skin) TABLE(double, relight_share) TABLE(double, relight_place)      \
+    TABLE(double, relight_terms) TABLE(double, relight_scales) TABLE(float, along_x) TABLE(float, along_y) REAL(saturation_light) REAL(black) \
+    REAL(alike) REAL(exact) REAL(damping) REAL(better) REAL(lost)
 
 #define NORMAL_FIELDS(INTEGER, REAL, TABLE)                                                                                                   \
     /* normals.c and shadowed.c; maps (3, height, width), inverse (3, 3, height, width), position (3, 3), albedo (3) */                       \
@@ -63,26 +63,22 @@ typedef struct Plan {
     ALL_FIELDS(INTEGER_FIELD, REAL_FIELD, TABLE_FIELD)
 } Plan;
 
-enum { NO_DRIFT, BY_MODE, BY_STATISTICS, BY_MODE_FIRST };
-
 /* Codes that stages return; of two, the larger one counts. */
 enum { DONE, NO_MEMORY, IN_PYTORCH };
 
 /* The stages, each in the file of its name. All images are those of one frame. */
-int compensate(const Plan *plan, const float *image, float *light);                                             /* (3, H, W) to the same */
-int remove_smooth_change(const Plan *plan, float *ratio);                                                       /* in place */
+int frame_light(const Plan *plan, const float *image, float *terms);                                            /* (3, 6), and lost (3) */
+int compensate(const Plan *plan, const float *image, float *terms, float *light);                               /* (3, H, W) to the same */
 int measure_noise(const Plan *plan, const float *light, float *noise);                                          /* (3) */
 void find_normals(const Plan *plan, const float *light, const float *noise, const float *depth, float *normal); /* depth or null */
 void find_slopes(const float *normal, size_t pixels, double max_slope, float *gradient);                        /* (2, H, W) */
-int weigh(const Plan *plan, const float *light, const float *gradient, float *weight);                          /* (1, H, W) */
+int weigh(const Plan *plan, const float *light, const float *gradient, float *unseen, float *weight);           /* (1); (1, H, W) */
 int integrate(const Plan *plan, const float *gradient, float *depth);
 int zero_background(const Plan *plan, const float *weight, float *depth);                                       /* in place */
 void find_moved(const Plan *plan, const float *weight, const float *depth, uint8_t *deformed);
 int find_contact(const Plan *plan, const float *depth, const uint8_t *deformed, uint8_t *contact);
 
 /* Parts that several stages share. */
-int samples_along(int length, int stride);                                                            /* compensate.c: of grid_samples() */
-void sample(const float *image, int height, int width, int stride, int planes, float *means);         /* compensate.c */
 float *sorted(float *values, float *other, int n);                                                    /* compensate.c */
 int blur_plane(const float *plane, const float *weight, int taps, int height, int width, float *out); /* compensate.c */
 void response_normals(const Plan *plan, const float *light, const float *depth, float *normal);       /* response.c */

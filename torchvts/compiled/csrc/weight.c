@@ -69,17 +69,21 @@ static float spread_of(const Plan *plan, const float *means, int n, float *some)
     return spread;
 }
 
-/* Length of vectors of `parts` planes of n values, each in units of its spread; `beside` is a spread of its own that each has, or null. */
-static WIDE void lengths(const Plan *plan, const float *means, int parts, const float *beside, int n, float *some, float *length) {
+/* Length of vectors of `parts` planes of n values, each in units of its spread; `beside` is a spread of its own that each has, or null. Returns the
+   largest spread. */
+static WIDE float lengths(const Plan *plan, const float *means, int parts, const float *beside, int n, float *some, float *length) {
+    float largest = 0.0f;
     memset(length, 0, sizeof(float) * (size_t)n);
     for (int c = 0; c < parts; c++, means += n) {
         const float spread = spread_of(plan, means, n, some), square = spread * spread;
+        largest = spread > largest ? spread : largest;
         if (beside)
             for (int k = 0; k < n; k++) length[k] += means[k] * means[k] / (square + beside[k] * beside[k]);
         else
             for (int k = 0; k < n; k++) length[k] += means[k] * means[k] / square;
     }
     for (int k = 0; k < n; k++) length[k] = sqrtf(0.5f * length[k] + 1e-12f);
+    return largest;
 }
 
 /* Adds a row's relative change of light. */
@@ -160,7 +164,7 @@ static WIDE void rise(const Plan *plan, const float *evidence, int rows, int col
     around(weight, rows, columns, 1, some, wide);
 }
 
-int weigh(const Plan *plan, const float *light, const float *gradient, float *weight) {
+int weigh(const Plan *plan, const float *light, const float *gradient, float *unseen, float *weight) {
     const int height = (int)plan->height, width = (int)plan->width, cell = (int)plan->mask_cell;
     const int rows = height / cell, columns = width / cell, n = rows * columns;
     float *change = malloc(sizeof(float) * (8 * (size_t)n + (size_t)width + (size_t)columns + (size_t)cell) + (sizeof(int32_t) + 1) * (size_t)n);
@@ -173,9 +177,10 @@ int weigh(const Plan *plan, const float *light, const float *gradient, float *we
         change_of_colour(plan, light, rows, columns, line, change, grey);
         lengths(plan, change, 3, grey, n, some, evidence);
     }
+    *unseen = NAN;
     if (plan->takes_slopes) {
         for (int c = 0; c < 2; c++) cell_means(gradient + (size_t)c * height * width, width, cell, rows, columns, line, change + (size_t)c * n);
-        lengths(plan, change, 2, NULL, n, some, other);
+        *unseen = (float)plan->rise_to * lengths(plan, change, 2, NULL, n, some, other);
         for (int k = 0; k < n; k++) evidence[k] = plan->by_colour ? fminf(evidence[k], other[k]) : other[k];
     }
     for (int k = 0; k < n; k++) evidence[k] *= plan->mask_noise[k];

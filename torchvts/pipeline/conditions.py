@@ -1,0 +1,66 @@
+"""What frames were seen under, in words: light that is uneven otherwise than at calibration, and slopes that could not be seen."""
+
+import torch
+from torch import Tensor
+
+from ..core.frame import Conditions
+from ..model.calibration import Calibration, check_calibration
+from .confidence import UNSEEN_DEG
+from .depth import DepthPipeline
+
+MOST = 3.0
+"""Change of a channel's light, as a factor, that automatic exposure and white balance make at most."""
+
+LOST = 0.5
+"""Share of a channel that is black or saturated from which it is said."""
+
+UNEVEN = 0.05
+"""Unevenness of the light's change that presses make at most: 0.03 on seven real sensors."""
+
+
+def light_levels(conditions: Conditions) -> Tensor:
+    """The light of each channel over the background's, (B, 3)."""
+    return conditions.light[:, :, 0]
+
+
+def light_unevenness(conditions: Conditions) -> Tensor:
+    """Root mean square over the image of what the light of each channel is off its level, over that level, (B, 3)."""
+    return conditions.light[:, :, 1:].square().sum(dim=2).sqrt() / conditions.light[:, :, 0].clamp_min(1e-6)
+
+
+def usual_unseen_deg(calibration: Calibration) -> float:
+    """What a frame of the undeformed skin hides at calibration: the background, with the noise of one image, degrees."""
+    check_calibration("calibration", calibration)
+    pipe = DepthPipeline.from_calibration(calibration).float()
+    value = calibration.background_value
+    noise = torch.randn(value.shape, generator=torch.Generator().manual_seed(0)) * calibration.noise_std[:, None, None].float()
+    with torch.no_grad():
+        return float(pipe.conditions((value + noise).clamp(0.0, 1.0)[None]).unseen_deg)
+
+
+def doubts_of(conditions: Conditions, usual_deg: float) -> list[str]:
+    """For each frame why less may have been seen than is there, or ""."""
+    texts = []
+    levels, unevenness = light_levels(conditions), light_unevenness(conditions)
+    for level, uneven, lost, unseen in zip(levels, unevenness, conditions.lost, conditions.unseen_deg, strict=True):
+        parts = [
+            f"channel {name} is black or saturated in {float(share):.0%} of the skin"
+            for name, share in zip("RGB", lost)
+            if float(share) > LOST
+        ]
+        parts += [
+            f"channel {name} has {float(one):.0%} of its light" for name, one in zip("RGB", level) if not 1.0 / MOST < one < MOST
+        ]
+        if float(unseen) > UNSEEN_DEG:
+            parts.append(
+                f"the least changed skin scatters {float(unseen) / usual_deg:.0f} times as much as at calibration: slopes below "
+                f"{float(unseen):.0f} degrees could not be seen"
+            )
+        if float(uneven.max()) > UNEVEN:
+            each = ", ".join(f"{name} {float(one):.0%} +- {float(off):.0%}" for name, one, off in zip("RGB", level, uneven))
+            parts.append(
+                f"the light is not that of the background ({each}, uneven): gamma, saturation, an LED, another unit, or a "
+                "contact over all of the skin?"
+            )
+        texts.append("; ".join(parts))
+    return texts

@@ -66,7 +66,7 @@ TABLE = {
         **{name: getattr(pipe(), name) for name in ("compensate", "mask", "normals", "gradient", "integrate")}, "mode": "fast",
         "mm_per_pixel": pipe().mm_per_pixel, "tolerance_px": 0.002, "refine_threshold_px": 0.05, "max_passes": 8}, {
         **{name: [None, lambda x: x] for name in ("compensate", "mask", "normals", "gradient", "integrate")},
-        "contact": [lambda x: x, 0.8], "smooth": [lambda x: x, 0.8], "mode": ["slow", None, 1], "tolerance_px": NUMBER,
+        "contact": [lambda x: x, 0.8], "mode": ["slow", None, 1], "tolerance_px": NUMBER,
         "refine_threshold_px": ["1", None, NAN, -1.0], "max_passes": INTEGER}),
     "DepthPipeline.from_calibration": Entry({"calibration": unit(), "mode": "fast", "normals": None, "integrate": None},
         {"mode": ["slow", None, 1], "normals": ["lookup", 3], "integrate": ["dct", 3], "contact": ["4.5", 4.5, torch.ones(3)]}),
@@ -75,8 +75,7 @@ TABLE = {
         "mode": []}, file=("weights", "sensor"), run=False),
     "DepthPipeline.forward": Entry({"images": image()[None]}, {"images": IMAGES}, lambda: pipe()),
     "FrozenPipeline": Entry({"pipe": pipe()}, {"pipe": [None, "pipe.pt", torch.nn.Identity()]}),
-    "FrozenPipeline.moved": Entry({"images": image()[None]}, {"images": IMAGES}, lambda: pipe().freeze()),
-    "FrozenPipeline.both": Entry({"images": image()[None]}, {"images": IMAGES}, lambda: pipe().freeze()),
+    "FrozenPipeline.with_conditions": Entry({"images": image()[None]}, {"images": IMAGES}, lambda: pipe().freeze().with_conditions),
     "FillMarkers": Entry({"diameter_px": 9.0, "contrast": 0.06, "sigmas": 5.0, "margin": 0.2},
         {"diameter_px": ["9", None, NAN, -1], "contrast": NUMBER, "sigmas": NUMBER, "margin": NUMBER}),
     "FillMarkers.from_background": Entry(

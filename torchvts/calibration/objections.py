@@ -106,7 +106,7 @@ def _misfit(report: Report) -> str:
 
 
 def to_contacts(contacts: Sequence[Contact]) -> list[str]:
-    """Presses and touches that were left out."""
+    """Presses that were left out."""
     return [f"{contact.name}: left out: {contact.reason}" for contact in contacts if contact.reason]
 
 

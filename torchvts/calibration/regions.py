@@ -50,21 +50,18 @@ def _mean_of_49(image: Tensor) -> Tensor:
 def contact_region(above: Tensor, mask: Tensor, ball_radius_px: float) -> Tensor:
     """The part of a mask that a contact takes, with the transition zone around it, bool (H, W).
 
-    Blobs that stand out of the undeformed skin: the largest one, and others that are as strong. Of a ball, lobes are joined by
+    Blobs that stand out of the undeformed skin: the largest one, and others that are as strong. Lobes of a ball are joined by
     their convex hull, because its contact is convex. Where nothing stands out, the mask itself.
 
     Args:
         above: (H, W), how far each pixel stands out, see :func:`above_skin`.
         mask: (H, W), bool, what differs from the background by the noise of calibration.
-        ball_radius_px: 0 for an unknown object.
+        ball_radius_px: of the ball.
     """
     blobs = strong_blobs(mask & (above > FLOOR), above)
     if not blobs:
         return mask
-    if ball_radius_px > 0:
-        parts = [_hull(blobs)] if one_ball(blobs, ball_radius_px) else [_hull([blob]) for blob in blobs]
-    else:
-        parts = [blob.mask for blob in blobs]
+    parts = [_hull(blobs)] if one_ball(blobs, ball_radius_px) else [_hull([blob]) for blob in blobs]
     return torch.from_numpy(np.maximum.reduce([_grown(part) for part in parts])) > 0
 
 

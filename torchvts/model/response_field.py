@@ -247,7 +247,7 @@ class ResponseModel:
         by_depth: applied to the change of brightness in a second pass, with the depth of the first; None if not known.
         gamma: of the images it was fitted to, value = light^(1/gamma).
         blur_px: standard deviation of the Gaussian blur it was fitted with, pixels of the calibrated size.
-        taught: how steep and how deep its presses were; None if not known, as in files of older versions and by touches.
+        taught: how steep and how deep its presses were; None if not known, as in files of older versions.
     Raises:
         ValueError, TypeError: names the argument.
     """

@@ -8,8 +8,7 @@ from torch import Tensor
 from ..model.calibration import Calibration
 
 UNMEASURED_DEG = 5.0
-"""Mean error that is assumed where nothing has measured it: of a prior whose file does not say, and of fields by touches. Priors
-are 2 to 5 degrees off, touches 4 to 6 on a GelSight Mini."""
+"""Mean error that is assumed where nothing has measured it: of a prior whose file does not say. Priors are 2 to 5 degrees off."""
 
 NOT_METRIC_DEG = 20.0
 """Mean error of a model that is not this unit's: no better than to call every ball flat."""

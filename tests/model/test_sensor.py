@@ -281,7 +281,8 @@ def test_shipped_sensors_are_found_from_an_installed_wheel(tmp_path):
     with zipfile.ZipFile(next((tmp_path / "dist").glob("*.whl"))) as wheel:
         wheel.extractall(tmp_path / "site")
         folders = {name.split("/")[0] for name in wheel.namelist()}
-    assert folders == {"torchvts", f"torchvts-{vts.__version__}.dist-info"}  # nothing of scripts or tests
+    # nothing of scripts or tests
+    assert folders == {"torchvts", "lerobot_camera_torchvts", f"torchvts-{vts.__version__}.dist-info"}
     program = (
         "import torchvts; print(torchvts.__file__); "
         "print(torchvts.Sensor.load('gelsight_mini').mm_per_pixel, *torchvts.shipped_sensors())"

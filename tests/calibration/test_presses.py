@@ -448,7 +448,7 @@ def two_balls():
 
 @pytest.fixture(scope="module")
 def mixed(good, rest):
-    """Six good presses, two in another light, and bad ones of every kind: rows by name, warnings, calibration, names of bad ones."""
+    """Six good presses, two in another light, and bad ones of every kind: rows by name, warnings, calibration, bad names."""
     image = seen_by_curve(ball((1, -2)), 31)
     contact = ball((1, -2)).contact[0, 0]
     tint = torch.tensor([1.3, 0.8, 1.2]).reshape(3, 1, 1)

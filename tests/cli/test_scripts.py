@@ -45,13 +45,13 @@ def test_reconstruct_names_what_is_wrong_with_frames(run_script, images, calibra
     valid = run_script("reconstruct", calibration, folder / "presses", "--out", tmp_path / "valid", *options)
     image = vts.read_image(folder / "presses" / "0.png")
     vts.write_image(make_folder(tmp_path / "in" / "a") / "good.png", image)
-    dimmed = image * torch.tensor([1.0, 0.85, 1.0])[:, None, None]
-    for name in ("dimmed", "later"):
-        vts.write_image(make_folder(tmp_path / "in" / "b") / f"{name}.png", dimmed)
-    dimmed = run_script("reconstruct", calibration, tmp_path / "in", "--out", tmp_path / "out", *options)
-    assert (valid.returncode, dimmed.returncode) == (0, 1), valid.stderr + dimmed.stderr
-    assert ": fault: " not in valid.stdout and dimmed.stdout.count(": fault: ") == 1
-    assert "b/dimmed.png and 1 more: fault: green channel 15" in dimmed.stdout
+    dark = image * torch.tensor([1.0, 0.0, 1.0])[:, None, None]
+    for name in ("dark", "later"):
+        vts.write_image(make_folder(tmp_path / "in" / "b") / f"{name}.png", dark)
+    dark = run_script("reconstruct", calibration, tmp_path / "in", "--out", tmp_path / "out", *options)
+    assert (valid.returncode, dark.returncode) == (0, 1), valid.stderr + dark.stderr
+    assert ": fault: " not in valid.stdout and dark.stdout.count(": fault: ") == 1
+    assert "b/dark.png and 1 more: fault: the green LED has failed" in dark.stdout
 
 
 @pytest.mark.long

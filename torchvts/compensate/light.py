@@ -37,6 +37,9 @@ most down to the noise of real frames. Samples off by twice that, in each channe
 BLACK = 2.0 / 255.0
 """Image value up to which a sample is black: it says nothing of the light."""
 
+LEAST_LIGHT = 0.05
+"""Least light, over the background's, that is divided by: where a surface is extrapolated it may be anything."""
+
 LOST = 0.9
 """Share of the samples of a channel that may be black or saturated: with more, it gets the light of the others."""
 
@@ -69,17 +72,18 @@ class Relight(nn.Module):
     2. From there, that level and then a surface by Tukey's loss with a scale that shrinks. The light of the background, the level,
        the surface: the first is taken unless the next has clearly more samples to within their noise.
 
-    Saturated samples and black ones do not count; a channel that has lost more than half of them gets the mean surface of the
-    others. A saturated pixel is at least as bright as it seems: where it seems darker than the background, it is taken to be the
-    background.
+    Black samples do not count, saturated ones are lower bounds; a channel that has lost nine tenths of them gets the mean surface
+    of the others. A saturated pixel is at least as bright as it seems: where it seems darker than the background, it is taken to
+    be the background.
 
     Args:
         background: (3, H, W), linear light of the undeformed skin.
         exponent: linear light is image value to the power of this.
         saturation_light: linear light from which a channel is saturated.
+        noise_std: (3, H, W), noise of linear light; None for half a grey level.
     Source:
-        Tukey's loss by majorisation: Huber, Robust Statistics, 1981; a scale that shrinks: Blake and Zisserman, Visual
-        Reconstruction, 1987; the rest is this project's.
+        Tukey's loss by reweighted least squares, damped: Huber, Robust Statistics, 1981; a scale that shrinks: Blake and
+        Zisserman, Visual Reconstruction, 1987; the rest is this project's.
     Example:
         >>> skin = torch.rand(3, 48, 64) * 0.1 + 0.4
         >>> bool((Relight(skin)(0.6 * skin[None]) - skin).abs().max() < 1e-5)
@@ -103,6 +107,7 @@ class Relight(nn.Module):
         self.black = BLACK ** check_positive("exponent", exponent)
         self.size = (background.shape[1], background.shape[2])
         self.stride, self.shows = max(1, min(self.size) // SAMPLES), min(self.size) >= SAMPLES
+        self.least = LEAST_LIGHT
         self.every, self.alike, self.damping, self.better, self.most_lost = EVERY, ALIKE, DAMPING, BETTER, LOST
         self.scales = [FIRST_SCALE * (LAST_SCALE / FIRST_SCALE) ** min(1.0, 2.0 * k / STEPS) for k in range(STEPS)]
         self.register_buffer("background", background.detach().clone())
@@ -137,7 +142,7 @@ class Relight(nn.Module):
         found = self.terms(light)
         if found is None:
             return light
-        relit = light / self.surface(found.to(light.dtype))
+        relit = light / self.surface(found.to(light.dtype)).clamp_min(self.least)
         saturated = light >= self.saturation_light
         hidden = saturated & ((relit < self.background) | (self.background >= self.saturation_light))
         return torch.where(hidden, self.background.to(light.dtype), relit)

@@ -144,6 +144,7 @@ def _relight_values(block: nn.Module, size: tuple[int, int]) -> Values:
         "damping": source.damping,
         "better": source.better,
         "lost": source.most_lost,
+        "least_light": source.least,
     }
 
 

@@ -23,22 +23,6 @@ def cell_means(image: Array, cell: int) -> Array:
     return means
 
 
-def cells_with_any(mask: Array, cell: int) -> Array:
-    """Whether a mask (H, W) holds in any pixel of each whole cell, (h, w)."""
-    height, width = mask.shape[0] // cell, mask.shape[1] // cell
-    rows = mask[: height * cell].reshape(height, cell, -1).max(1)
-    found: Array = rows[:, : width * cell].reshape(height, width, cell).max(2)
-    return found
-
-
-def widened(mask: Array) -> Array:
-    """A mask (h, w) and all that lies next to it, also across corners."""
-    import cv2
-
-    found: Array = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
-    return found
-
-
 def lower_median(values: Array) -> Array:
     """Of the last dimension, which is not empty; the lower one of two, as torch has it.
 

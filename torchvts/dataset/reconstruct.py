@@ -193,7 +193,7 @@ NAMED = 5
 """So many frames that cannot be used are named at once, by each process; a folder of another sensor's has thousands."""
 
 _Reconstructed = tuple[Frame, Tensor | None, DepthOutput | None]
-"""A frame, its image in the light of the background, and its depth."""
+"""A frame, its image, and its depth."""
 
 
 class _Worker:

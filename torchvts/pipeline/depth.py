@@ -48,7 +48,7 @@ class DepthPipeline(nn.Module):
     ``tolerance_px``; for response fields gradient and normals are those of the depth, in all modes. ``auto`` predicts on every
     eighth pixel what a second pass would change, and solves only those frames again for which that exceeds
     ``refine_threshold_px``, until what is missing is below a fifth of it; where there are two passes at most, as for response
-    fields, it solves each frame twice. By lights, ``auto`` alone divides out the drift of single LEDs.
+    fields, it solves each frame twice. All modes divide out how the light of a frame differs from the background's.
     Frames of a batch do not influence one another; their number may change the rounding of sums. This is a plain PyTorch module:
     it trains, exports and runs on a GPU. For a camera or a recording, :meth:`freeze` it.
 

@@ -140,7 +140,7 @@ def header(frame: TactileFrame, frame_id: str, start_s: float = 0.0) -> Header:
 
 
 def image_message(frame: TactileFrame, frame_id: str = "tactile", start_s: float = 0.0) -> ImageMessage:
-    """The camera's image, rectified and in the light of the background, 8 bits of R, G, B, encoding "rgb8".
+    """The camera's image, rectified, 8 bits of R, G, B, encoding "rgb8".
 
     Arguments are those of :func:`header`.
     """

@@ -156,12 +156,12 @@ float *sorted(float *values, float *other, int n) {
 /* Light (height, width) in the light of the background; coefficients of its surface. Saturated pixels that seem darker than the background are it. */
 static WIDE void relight(const Plan *plan, const float *image, const float *background, const float *terms, float *restrict light) {
     const int height = (int)plan->height, width = (int)plan->width;
-    const float saturated = (float)plan->saturation_light, *once = plan->along_x, *twice = once + width;
+    const float saturated = (float)plan->saturation_light, least_light = (float)plan->least_light, *once = plan->along_x, *twice = once + width;
     for (int y = 0; y < height; y++, image += width, background += width, light += width) {
         const float y1 = plan->along_y[y], y2 = plan->along_y[height + y], bend = terms[3];
         const float constant = terms[0] + terms[2] * y1 + terms[5] * y2, slope = terms[1] + terms[4] * y1;
         for (int x = 0; x < width; x++) {
-            const float relit = image[x] / (constant + slope * once[x] + bend * twice[x]);
+            const float surface = constant + slope * once[x] + bend * twice[x], relit = image[x] / (surface > least_light ? surface : least_light);
             light[x] = (image[x] >= saturated) & ((relit < background[x]) | (background[x] >= saturated)) ? background[x] : relit;
         }
     }

@@ -16,7 +16,7 @@
     INTEGER(relights) INTEGER(relight_stride) INTEGER(relight_rows) INTEGER(relight_columns) INTEGER(relight_padded) INTEGER(relight_every)   \
     INTEGER(relight_steps) TABLE(float, background) TABLE(float, relight_skin) TABLE(double, relight_share) TABLE(double, relight_place)      \
     TABLE(double, relight_terms) TABLE(double, relight_scales) TABLE(float, along_x) TABLE(float, along_y) REAL(saturation_light) REAL(black) \
-    REAL(alike) REAL(exact) REAL(damping) REAL(better) REAL(lost)
+    REAL(alike) REAL(exact) REAL(damping) REAL(better) REAL(lost) REAL(least_light)
 
 #define NORMAL_FIELDS(INTEGER, REAL, TABLE)                                                                                                   \
     /* normals.c and shadowed.c; maps (3, height, width), inverse (3, 3, height, width), position (3, 3), albedo (3) */                       \

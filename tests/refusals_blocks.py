@@ -162,10 +162,11 @@ TABLE = {
         "blur_px": ["1", None, NAN, -1.0], "spread": NUMBER}),
     "Confidence.from_calibration": Entry(
         {"calibration": unit(), "normals": pipe().normals}, {"normals": ["mine", torch.nn.Identity()]}),
-    "Confidence.forward": Entry({"images": FLAT[None], "compensated": FLAT[None], "out": OUT}, {"images": batches(3),
+    "Confidence.forward": Entry({"images": FLAT[None], "compensated": FLAT[None], "out": OUT, "light": None}, {"images": batches(3),
         "compensated": batches(3), "out": [*(OUT._replace(depth_mm=bad) for bad in batches(1)),
         *(OUT._replace(gradient=bad) for bad in batches(2)), *(OUT._replace(normal=bad) for bad in batches(3)),
-        *(OUT._replace(contact=bad) for bad in (DEPTH[0] > 0, (DEPTH > 0)[:, :, 1:], None, "all", DEPTH))]},
+        *(OUT._replace(contact=bad) for bad in (DEPTH[0] > 0, (DEPTH > 0)[:, :, 1:], None, "all", DEPTH))],
+        "light": [torch.ones(1, 3, 5), torch.ones(2, 3, 6), torch.ones(3, 6)]},
         lambda: Confidence.from_calibration(unit()), named={"out": "depth_mm|gradient|normal|contact"}),
     "ConfidentPipeline": Entry({"pipe": pipe(), "confidence": Confidence.from_calibration(unit())},
         {"pipe": ["fast", None, unit()], "confidence": [True, None, unit()]}),

@@ -34,7 +34,7 @@ MODULES = {
     "scenes.": vts.scenes,
 }
 RECORDS = {
-    "Bounds", "Calibration", "CalibrationWarning", "ConfidentOutput", "DepthOutput", "Diagnosis", "Diagnosis.of",
+    "Bounds", "Calibration", "CalibrationWarning", "Conditions", "ConfidentOutput", "DepthOutput", "Diagnosis", "Diagnosis.of",
     "DiscontinuitySolution", "Finding", "LightFit", "MlpFit", "Registration", "Result", "export.ExportCheck", "export.Format",
     "gs_sdk.GsSdkFolder", "gs_sdk.GsSdkPress", "objects.Target", "scenes.Scene",
     "stream.Reader", "stream.TactileFrame", "stream.Unreadable",
@@ -45,12 +45,13 @@ PARTS = {
     "Adaptive", "DepthBrightness", "Integrator", "NormalModel", "Once", "Repeat", "ResponseField", "ResponseModel",
     "SensorPrior", "Shadows", "SlopesOfDepth", "SlopesOfPixels", "Solve", "WrappedIntegrator", "WrappedNormals", "as_integrator",
     "as_normal_model", "by_presses", "channel_structure", "check_calibration", "check_domain", "check_sensor",
-    "OutputFrame.", "discontinuity_share", "label_contacts", "moved", "read_point_cloud", "stream.FrameCheck.",
+    "OutputFrame.", "discontinuity_share", "doubts_of", "label_contacts", "light_levels", "light_unevenness",
+    "moved", "read_point_cloud", "stream.FrameCheck.",
     "stream.NewestFrame", "stream.Overlay", "stream.Recorder.", "stream.Recording.", "stream.StageClock",
     "stream.CameraSettings", "stream.Camera", "stream.Keys", "stream.LiveView", "stream.Sheet", "stream.StreamReport.",
     "stream.TactileStream.rezero", "stream.VideoFile.", "stream.find_camera", "stream.frames_a_second", "stream.has_screen",
     "read_result", "stream.check_device", "stream.read_background", "stream.read_press_images", "stream.require_rerun",
-    "stream.use_calibration", "stream.video_codec", "stream.with_background", "unit_pipeline",
+    "stream.use_calibration", "stream.video_codec", "stream.with_background", "unit_pipeline", "unseen_deg", "usual_unseen_deg",
     "stated_deg", "stated_error_deg", "with_preprocessing", "write_point_cloud",
 }  # fmt: skip
 """Names, and with a dot at the end methods, that other tests cover: records, base classes, what one room does for another."""

@@ -401,6 +401,8 @@ class Confidence(nn.Module):
             bound = _length_95(torch.zeros_like(change), torch.sqrt(variance + 1e-12), 1.06)
         unseen = unseen_deg(self.gradient(base.detach()), self.cells, self.sure, self.least_spread)
         if light is not None:
+            if light.shape != (images.shape[0], 3, 6):
+                raise ValueError(f"light: expected ({images.shape[0]}, 3, 6), got {light.shape}: conditions.light of these images")
             uneven = light[:, :, 1:].square().sum(dim=2) / light[:, :, 0].square().clamp_min(1e-6)
             uneven = torch.sqrt(uneven.sum(dim=1).detach() / 1.5)  # of lights 120 degrees apart; u where all slopes are u
             unseen = torch.sqrt(unseen.square() + torch.rad2deg(torch.atan(uneven)).square())

@@ -77,7 +77,7 @@ def test_the_second_pass_learned_from_balls_carries_over_to_other_objects(seed, 
     """Better in the mean than the first, and on no object worse by 5 %: a second pass that balls teach shapes would be.
     Depth counts from the undeformed skin, so skin that hangs free around the object must not be left out."""
     unit = drawn_sensor(seed)
-    calibrated = by_presses(unit.background, unit.sensor, unit.balls, None, False).unit
+    calibrated = by_presses(unit.background, unit.sensor, unit.balls, None, False)[0]
     errors = {}
     for mode in ("fast", "precise"):
         pipe = DepthPipeline.from_calibration(calibrated, mode)

@@ -169,7 +169,7 @@ def test_what_a_frame_hides_grows_with_the_scatter_of_its_skin():
     unseen = [float(v) for v in sure.pipe.conditions(torch.cat((frames, swapped))).unseen_deg]
     assert unseen[0] < 3.0 < unseen[2] and unseen[0] < unseen[1]
     assert float(sure(swapped).frame_confidence) < float(sure(frames[:1]).frame_confidence) - 0.1
-    usual = vts.pipeline.usual_unseen_deg(unit)
+    usual = vts.pipeline.usual_unseen_deg(unit, sure.pipe)
     assert vts.pipeline.doubts_of(sure.pipe.conditions(frames[:1]), usual) == [""]
     assert "the light is not that of the background" in vts.pipeline.doubts_of(sure.pipe.conditions(swapped), usual)[0]
     hidden = frames[:1] * (

@@ -86,30 +86,27 @@ class Compensate(nn.Module):
     def forward(self, image: Tensor) -> Tensor:
         """(B, 3, H, W) image in [0, 1] to (B, 3, H, W), compensated: light, or for response fields light / background."""
         check_batch("image", image, 3)
-        light = image
-        for block in self.linear:  # only the blocks that the unit needs
-            light = block(light)
-        light = self.gain(self.relight(light))
+        light = self.gain(self.relight(self.linear_light(image)))
         for block in self.clean:
             light = block(light)
         compensated: Tensor = light
         return compensated
 
+    def linear_light(self, image: Tensor) -> Tensor:
+        """Images (B, 3, H, W) in linear light, with printed markers filled."""
+        for block in self.linear:  # only the blocks that the unit needs
+            image = block(image)
+        return image
+
     @torch.jit.export
     def lost(self, image: Tensor) -> Tensor:
         """Share of each channel that is black or saturated where the background is not, (B, 3)."""
-        light = image
-        for block in self.linear:
-            light = block(light)
-        return self.relight.lost(light)
+        return self.relight.lost(self.linear_light(image))
 
     @torch.jit.export
     def light_of(self, image: Tensor) -> Tensor:
         """The light of images (B, 3, H, W) over the background's, (B, 3, 6), see :meth:`Relight.terms`."""
-        light = image
-        for block in self.linear:
-            light = block(light)
-        return self.relight.light_of(light)
+        return self.relight.light_of(self.linear_light(image))
 
 
 class Linearise(nn.Module):

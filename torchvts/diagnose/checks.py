@@ -9,7 +9,7 @@ import torch
 
 from ..calibration import ROUGH, channel_structure
 from ..core.frame import Conditions
-from ..pipeline import UNSEEN_DEG, DepthPipeline, beyond_presses, light_levels, light_unevenness
+from ..pipeline import UNEVEN, UNSEEN_DEG, DepthPipeline, beyond_presses, light_levels, light_unevenness
 from ..stream import FrameCheck
 from .camera import blockiness, levels_of, new_spots, pattern_likeness, texture_share
 from .examination import MISFITS, Examination
@@ -17,8 +17,8 @@ from .findings import FAULT_DEG, WARNING_DEG, Finding, by_cost
 
 CHANNELS = ("red", "green", "blue")
 
-LEAST_LIGHT, UNEVEN_LIGHT = 0.05, 0.05
-"""Change of a channel's light that is reported, relative, and its unevenness from which that is a warning: presses scatter 0.03."""
+LEAST_LIGHT = 0.05
+"""Change of a channel's light that is reported, relative."""
 
 ROUGH_FREE_DEG = 6.0
 """Spread of the slopes that the least changed skin of a frame may seem to have: 0.3 to 4 degrees on real sensors, 4 where a press
@@ -216,7 +216,7 @@ def _light_at_calibration(e: Examination) -> Figures | Finding | None:
 
 
 def _by_unevenness(figures: Figures) -> str:
-    return "warning" if figures["uneven"] > UNEVEN_LIGHT else "note"
+    return "warning" if figures["uneven"] > UNEVEN else "note"
 
 
 def _unseen(e: Examination) -> Figures:
@@ -234,7 +234,7 @@ def _rough(e: Examination) -> Figures:
 def _other_unit(e: Examination) -> float | None:
     """Unlikeness of the skin's fine pattern, where the least changed skin seems to have slopes."""
     light = _change_of(e.conditions)
-    alike = e.free_deg < OTHER_DEG and (light is None or light["uneven"] < UNEVEN_LIGHT)
+    alike = e.free_deg < OTHER_DEG and (light is None or light["uneven"] < UNEVEN)
     if not e.unit.measured or not e.is_fine or alike:
         return None
     likeness = pattern_likeness(e.image, e.without_markers(e.value), e.unit.noise_std, e.free)

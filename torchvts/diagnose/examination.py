@@ -172,7 +172,7 @@ class Examination:
     @cached_property
     def usual_unseen_deg(self) -> float:
         """Slope that a frame of the undeformed skin hides at calibration."""
-        return usual_unseen_deg(self.unit)
+        return usual_unseen_deg(self.unit, self.pipeline)
 
     @cached_property
     def calibration_light(self) -> Conditions | None:

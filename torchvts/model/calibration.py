@@ -260,7 +260,7 @@ class Calibration:
             return 1.0 / (self.background + PEDESTAL)
         light = self.background_without_ambient.clamp_min(1e-6)
         gain = (self.model_image / light).clamp(1.0 / DEFECT_RATIO, DEFECT_RATIO)
-        clipped = (self.background >= self.saturation_light) & (self.model_image >= self.saturation_light)
+        clipped = self._clipped
         # the brightness of the skin was not measured there
         usual = torch.stack([channel[~one].median() for channel, one in zip(gain, clipped, strict=True)]).nan_to_num(1.0)
         return torch.where(clipped, usual[:, None, None], gain)
@@ -276,9 +276,13 @@ class Calibration:
         gain = self.gain
         if self.lights is None or gain is None:
             return self.background
-        clipped = (self.background >= self.saturation_light) & (self.model_image >= self.saturation_light)
         ambient = 0.0 if self.ambient is None else self.ambient.reshape(3, 1, 1)
-        return torch.where(clipped, self.model_image / gain + ambient, self.background)
+        return torch.where(self._clipped, self.model_image / gain + ambient, self.background)
+
+    @cached_property
+    def _clipped(self) -> Tensor:
+        """(3, H, W) bool, where background and model are saturated."""
+        return (self.background >= self.saturation_light) & (self.model_image >= self.saturation_light)
 
     @cached_property
     def saturated_above(self) -> Tensor:

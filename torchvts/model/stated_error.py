@@ -31,8 +31,8 @@ def variance_of(factors: Tensor, covariance: Tensor) -> Tensor:
 def stated_deg(own_deg: float, variance: Tensor) -> Tensor:
     """Mean error of normals to expect, degrees: sqrt(own^2 (1 + 0.1 phi' C phi) + 1.5^2).
 
-    The two numbers hold for all sensors: on 18, with 1 to 24 presses and with none but a prior, it is within a factor of 1.5 of the
-    error on presses that were not learned in 85 % without and 99 % with a prior, and too good by more in 5 % and none.
+    The two numbers are the same for all sensors. They were chosen on the 18 sensors on which it lies within a factor of 1.5 of the
+    error on presses that were not learned in 85 %, and is too good by more in 5 %: on others it may be less right.
 
     Args:
         own_deg: mean error of the field on its own presses, degrees.

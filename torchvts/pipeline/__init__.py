@@ -1,7 +1,7 @@
 """Online: a calibration made into a chain of modules that turns images into depth, and how far that may be off."""
 
 from ..core.frame import Conditions, DepthOutput
-from .conditions import UNSEEN_DEG, doubts_of, light_levels, light_unevenness, usual_unseen_deg
+from .conditions import UNEVEN, UNSEEN_DEG, doubts_of, light_levels, light_unevenness, usual_unseen_deg
 from .confidence import Bounds, Confidence, ConfidentOutput, ConfidentPipeline, beyond_presses, bound_at
 from .depth import MODES, DepthPipeline
 from .frozen import FrozenPipeline
@@ -12,6 +12,7 @@ from .unit import unit_pipeline
 
 __all__ = [
     "MODES",
+    "UNEVEN",
     "UNSEEN_DEG",
     "Adaptive",
     "Bounds",

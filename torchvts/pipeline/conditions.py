@@ -28,14 +28,15 @@ def light_unevenness(conditions: Conditions) -> Tensor:
     return conditions.light[:, :, 1:].square().sum(dim=2).sqrt() / conditions.light[:, :, 0].clamp_min(1e-6)
 
 
-def usual_unseen_deg(calibration: Calibration) -> float:
-    """What a frame of the undeformed skin hides at calibration: the background, with the noise of one image, degrees."""
+def usual_unseen_deg(calibration: Calibration, pipe: DepthPipeline) -> float:
+    """What a frame of the undeformed skin hides at calibration, degrees: the background, with the noise of one image, by the unit's
+    pipeline on the CPU."""
     check_calibration("calibration", calibration)
-    pipe = DepthPipeline.from_calibration(calibration).float()
     value = calibration.background_value
     noise = torch.randn(value.shape, generator=torch.Generator().manual_seed(0)) * calibration.noise_std[:, None, None].float()
+    kind = next(buffer.dtype for buffer in pipe.buffers() if buffer.is_floating_point())
     with torch.no_grad():
-        return float(pipe.conditions((value + noise).clamp(0.0, 1.0)[None]).unseen_deg)
+        return float(pipe.conditions((value + noise).clamp(0.0, 1.0)[None].to(kind)).unseen_deg)
 
 
 def doubts_of(conditions: Conditions, usual_deg: float) -> list[str]:

@@ -105,6 +105,9 @@ class FrozenPipeline:
             ValueError: wrong shape, values outside [0, 1] or not finite, or images that record gradients.
             TypeError: not floating point, or, compiled, no float32 on the CPU.
         """
+        if self._plan is None:
+            self._check(images)
+            return self._in_pytorch(images)
         return self.with_conditions(images)[0]
 
     def with_conditions(self, images: Tensor) -> tuple[DepthOutput, Conditions]:
@@ -115,7 +118,10 @@ class FrozenPipeline:
         """
         self._check(images)
         if self._plan is None:
-            return self._in_pytorch(images)
+            images = images.clone(memory_format=torch.contiguous_format)
+            with torch.inference_mode():
+                seen = self._pipe.conditions(images)
+            return self._in_pytorch(images), Conditions(*(part.clone() for part in seen))
         with torch.inference_mode():
             light = self._linear(images).contiguous()
         count, size = images.shape[0], self._size
@@ -142,16 +148,16 @@ class FrozenPipeline:
         if not in_range(*ends(images[k].contiguous())):
             check_range("images", images)
         if self._plan.reconstruct(light[k], conditions[k], tuple(part[k] for part in parts)) == IN_PYTORCH:
-            found, _ = self._in_pytorch(images[k : k + 1])
+            found = self._in_pytorch(images[k : k + 1])
             for part, one in zip(parts, found, strict=True):
                 part[k].copy_(one[0])
 
-    def _in_pytorch(self, images: Tensor) -> tuple[DepthOutput, Conditions]:
+    def _in_pytorch(self, images: Tensor) -> DepthOutput:
         images = images.clone(memory_format=torch.contiguous_format)  # rounding depends on the layout
         with torch.inference_mode():
-            output, conditions = self._pipe(images), self._pipe.conditions(images)
+            output = self._pipe(images)
         # copies made outside of inference mode can be used wherever the user wants
-        return DepthOutput(*(part.clone() for part in output)), Conditions(*(part.clone() for part in conditions))
+        return DepthOutput(*(part.clone() for part in output))
 
     def _check(self, images: Tensor) -> None:
         check_batch("images", images, 3)

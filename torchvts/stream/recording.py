@@ -101,12 +101,12 @@ class Recording:
         pipe = unit_pipeline(calibration, mode, network, contact).float().requires_grad_(False)
         self.check = FrameCheck.from_calibration(calibration)
         self._stage = stage
-        self._usual_deg = usual_unseen_deg(calibration)
         self.conditions: Conditions | None = None
         self.doubt = ""
         image = None if first is None else find_background(first, codec=codec)
         if first is not None:
             _learn_unrest(pipe, first)
+        self._usual_deg = usual_unseen_deg(calibration, pipe)
         self.pipe: FrozenPipeline = pipe.to(self.device).freeze()
         if image is not None:
             self._start(image[None])

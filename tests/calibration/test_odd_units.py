@@ -11,8 +11,8 @@ import pytest
 import torch
 
 import torchvts as vts
+from torchvts.calibration.doubts import of_type
 from torchvts.calibration.given_images import colour_share, colour_variation
-from torchvts.calibration.objections import to_background_of_prior
 from torchvts.cli.summary import expected
 from torchvts.model.response_field import CHANGE_SCALE, ResponseField, ResponseModel, SensorPrior, fit_log_background
 from torchvts.stream import use_calibration
@@ -200,8 +200,8 @@ def test_a_prior_on_a_background_that_is_not_its_own_is_not_metric(tmp_path):
     other, _ = calibrate(camera(other_light()).flip(1, 2), sensor)
     other.save(tmp_path / "unit.safetensors")
     kept = vts.Calibration.load(tmp_path / "unit.safetensors")
-    assert "objection" not in own.report and use_calibration(own).metric
-    assert "turned by 180 degrees" in kept.report["objection"] and not use_calibration(kept).metric
+    assert own.report["not_metric"] == [] and use_calibration(own).metric
+    assert "turned by 180 degrees" in kept.report["not_metric"][0] and not use_calibration(kept).metric
     assert expected(kept).startswith("depth is NOT METRIC")
 
 
@@ -211,13 +211,13 @@ def test_another_unit_of_the_same_type_is_not_named(gain, shift_px):
     sensor = dataclasses.replace(SENSOR, prior=prior(other_light()))
     light = other_light().roll(shift_px, (2, 1))[:, 4:-4, 6:-6] + 0.02 * smooth(3)[:, 4:-4, 6:-6]
     light = torch.nn.functional.interpolate(light[None], (HEIGHT, WIDTH), mode="bilinear")[0]
-    assert to_background_of_prior(camera(light * torch.tensor(gain).reshape(3, 1, 1)), sensor) == []
+    assert of_type(camera(light * torch.tensor(gain).reshape(3, 1, 1)), sensor) == []
 
 
 def test_a_pattern_of_another_type_is_named():
     sensor = dataclasses.replace(SENSOR, prior=prior(other_light()))
     for name in ("smooth 1", "saddle", "bright edges", "pale"):
-        assert to_background_of_prior(camera(ODD[name]), sensor), name
+        assert of_type(camera(ODD[name]), sensor), name
 
 
 def test_presses_that_contradict_the_prior_calibrate_without_it():

@@ -10,7 +10,7 @@ import torchvts as vts
 from lab import metrics
 from lab.score import score_press
 from torchvts.calibration import fit_prior
-from torchvts.calibration.objections import to_background_of_prior
+from torchvts.calibration.doubts import of_type
 from torchvts.core.blur import blur, gaussian_weights
 
 
@@ -70,11 +70,11 @@ def mini_backgrounds(data):
 
 def test_backgrounds_of_the_type_are_not_named_and_turned_ones_are(data, mini):
     for image in mini_backgrounds(data):
-        assert to_background_of_prior(image, mini) == []
-        assert "it is turned by 180 degrees: " in to_background_of_prior(image.flip(1, 2), mini)[0]
-        assert "it is mirrored left to right: " in to_background_of_prior(image.flip(2), mini)[0]
-        assert "it is mirrored top to bottom: " in to_background_of_prior(image.flip(1), mini)[0]
-        assert "it has its channels swapped to the order B, G, R: " in to_background_of_prior(image.flip(0), mini)[0]
+        assert of_type(image, mini) == []
+        assert "it is turned by 180 degrees: " in of_type(image.flip(1, 2), mini)[0].text
+        assert "it is mirrored left to right: " in of_type(image.flip(2), mini)[0].text
+        assert "it is mirrored top to bottom: " in of_type(image.flip(1), mini)[0].text
+        assert "it has its channels swapped to the order B, G, R: " in of_type(image.flip(0), mini)[0].text
 
 
 @pytest.mark.parametrize("folder", ["gelsight_pale", "digit_a"])
@@ -125,3 +125,16 @@ def test_a_marked_skin_is_calibrated_and_its_dots_stay_out_of_the_depth(data):
         calibration = vts.calibrate(background, sensor, presses)
     assert calibration.markers is not None and all(row["used"] for row in calibration.report["presses"])
     assert calibration.report["held_out_deg"] < 4.0
+
+
+@pytest.mark.parametrize("sensor, folders", [("gelsight_mini", ["gelsight_mini_a", "gelsight_mini_b"]), ("digit", ["digit_b"])])
+def test_a_press_given_as_the_only_image_is_read_as_one(data, sensor, folders):
+    unit = vts.Sensor.load(sensor)
+    for folder in folders:
+        background = vts.read_image(data / folder / "background.png")
+        own = dataclasses.replace(unit, height=background.shape[1], width=background.shape[2])
+        assert vts.calibrate(background, own).metric
+    folder = data / folders[-1]
+    pressed = vts.read_image(folder / ("bead.png" if folder.name == "gelsight_mini_b" else "ball_0010.png"))
+    with pytest.warns(vts.CalibrationWarning, match=r"read as a frame it shows skin that is \d\.\d mm deep"):
+        assert not vts.calibrate(pressed, own).metric

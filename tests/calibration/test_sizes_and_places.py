@@ -1,6 +1,7 @@
 """What presses contradict and what they do not cover: pitch and diameters, one wrong ball, skin where none was pressed."""
 
 import dataclasses
+import re
 import warnings
 
 import pytest
@@ -44,17 +45,24 @@ def test_sizes_that_all_presses_contradict_are_refused_and_forced(mistake):
     else:
         presses = [dataclasses.replace(press, ball_diameter_mm=0.5 * press.ball_diameter_mm) for press in presses]
     with pytest.raises(
-        ValueError, match=r"contacts 0\.9\d times as wide as the balls.*mm_per_pixel.*too large, or radii were given"
+        ValueError,
+        match=r"narrower than their balls, got 1\.\d\d \+- 0\.\d\d times as wide.*mm_per_pixel.*too large.*, or radii were given",
     ):
         calibrate(sensor, presses)
     _, warned = calibrate(sensor, presses, force=True)
-    assert any("times as wide as the balls" in text for text in warned)
+    assert any("contacts narrower than their balls, got 1." in text for text in warned)
 
 
-def test_contacts_as_wide_as_those_of_deep_presses_are_warned_of():
-    smaller = [dataclasses.replace(press, ball_diameter_mm=0.65 * press.ball_diameter_mm) for press in bare(UNIT.balls)]
-    _, warned = calibrate(UNIT.sensor, smaller)
-    assert any("contacts are 0.83 times as wide as their balls" in text for text in warned)
+def test_what_nothing_could_check_is_said_and_no_warning():
+    smaller = [dataclasses.replace(press, ball_diameter_mm=0.8 * press.ball_diameter_mm) for press in bare(UNIT.balls)]
+    unit, warned = calibrate(UNIT.sensor, smaller)
+    (said,) = unit.report["doubts"]
+    assert (
+        not warned
+        and unit.metric
+        and said.startswith("not checked: without a prior the images say nothing of the size of all balls")
+    )
+    assert float(re.search(r"up to ([\d.]+); an object of known height", said)[1]) > 1.2 * UNIT.sensor.mm_per_pixel
 
 
 @pytest.mark.parametrize("pitch_off", [0.9, 1.1])

@@ -162,7 +162,7 @@ def test_what_to_expect_follows_the_source(rig, mini_by_prior):
         mini_by_prior.response,
         mini_by_prior.sensor,
         mini_by_prior.background,
-        {"model": "response", "source": "stand_in", "objection": "lights"},
+        {"model": "response", "source": "stand_in", "not_metric": ["lights"]},
     )
     assert "NOT METRIC" in expected(rough)
 

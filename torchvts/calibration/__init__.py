@@ -4,8 +4,8 @@ from .by_lights import GIVEN_MISFIT
 from .by_presses import RESPONSE_BLUR_PX, by_presses, with_preprocessing
 from .calibrate import calibrate
 from .contacts import ROUGH, channel_structure
+from .doubts import CalibrationWarning
 from .lights import POORLY_CONSTRAINED_DEG, LightFit, fit_lights
-from .objections import CalibrationWarning
 from .presses import Press, read_presses
 from .prior import PriorUnit, fit_prior, score_prior
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..model.calibration import Calibration
 from ..model.lights import PointLights, flat_image
-from ..model.report import Report, Tried
+from ..model.report import Report
 from ..model.response_field import CHANGE_SCALE, ResponseField, ResponseModel
 from ..model.sensor import Sensor
 from .given_images import colourless
@@ -28,7 +28,7 @@ OTHER_GAMMA = 2.2
 """Of most cameras. Lights fitted to its images as if they were linear are 11 degrees off, and leave a misfit of 3 %."""
 
 
-def by_lights(background: Tensor, sensor: Sensor, progress: bool = False) -> tuple[Calibration, Tried]:
+def by_lights(background: Tensor, sensor: Sensor, progress: bool = False) -> tuple[Calibration, list[str]]:
     """Calibrate by point lights, where there is neither a press nor a prior.
 
     Args:
@@ -36,7 +36,7 @@ def by_lights(background: Tensor, sensor: Sensor, progress: bool = False) -> tup
         sensor: of the unit; where it gives the lights' positions, only the albedo is fitted.
         progress: show a bar.
     Returns:
-        The unit, and what became of its lights: doubts where they are not to be trusted.
+        The unit, and why its depth is not in mm, as far as that is known.
     Raises:
         ValueError: as :func:`fit_lights`; the fit failed, or no lights of different colours are seen.
     """
@@ -69,8 +69,7 @@ def by_lights(background: Tensor, sensor: Sensor, progress: bool = False) -> tup
         "gloss": fit.lights.gloss.tolist(),
     }
     doubts = [] if fit.converged and loosest <= POORLY_CONSTRAINED_DEG else [f"background: {fit.message}"]
-    unit = Calibration.from_lights(fit.lights, linear, background, report)
-    return unit, {"name": "point lights", "error_deg": loosest if fit.converged else None, "doubts": doubts}
+    return Calibration.from_lights(fit.lights, linear, background, report), doubts
 
 
 def _family(fit: LightFit) -> str:
@@ -108,7 +107,9 @@ def _evenly(size: int, stride: int) -> Tensor:
     return (size - 1 - steps * stride) // 2 + stride * torch.arange(steps + 1)
 
 
-def _given(background: Tensor, sensor: Sensor, position_mm: tuple[tuple[float, float, float], ...]) -> tuple[Calibration, Tried]:
+def _given(
+    background: Tensor, sensor: Sensor, position_mm: tuple[tuple[float, float, float], ...]
+) -> tuple[Calibration, list[str]]:
     """Lights at the positions of the sensor file."""
     lights = PointLights([list(row) for row in position_mm], [1.0, 1.0, 1.0])
     model = flat_image(lights, sensor.height, sensor.width, sensor.mm_per_pixel).detach()
@@ -122,12 +123,11 @@ def _given(background: Tensor, sensor: Sensor, position_mm: tuple[tuple[float, f
     log = [torch.nn.functional.avg_pool2d(i[None], cell).clamp_min(1e-3).log() for i in (unit.background, unit.model_image)]
     misfit = float((log[0] - log[1]).std(dim=(2, 3)).max())
     note = f"given by the sensor file; the background differs from them by {misfit:.1%} (RMS)"
-    doubts = [] if misfit <= GIVEN_MISFIT else [f"background: lights {note}: not this unit's lights, and depth is not metric"]
-    if doubts:
-        unit = _by_directions(background, sensor, position_mm, misfit)
-    else:
-        unit = dataclasses.replace(unit, report={**unit.report, "reason": f"point lights: {note}"})
-    return unit, {"name": "point lights", "error_deg": None, "doubts": doubts}
+    if misfit > GIVEN_MISFIT:
+        doubt = f"background: lights {note}: not this unit's lights, and depth is not metric: calibrate with presses of a ball"
+        return _by_directions(background, sensor, position_mm, misfit), [doubt]
+    unit = dataclasses.replace(unit, report={**unit.report, "reason": f"point lights: {note}"})
+    return unit, [f"background: lights {note}: nothing has measured this unit's own: calibrate with presses of a ball"]
 
 
 def _by_directions(background: Tensor, sensor: Sensor, position_mm: tuple[tuple[float, ...], ...], misfit: float) -> Calibration:

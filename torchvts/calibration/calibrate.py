@@ -10,8 +10,8 @@ from ..core.threads import OneThread
 from ..model.calibration import Calibration
 from ..model.sensor import Sensor, check_sensor
 from .choose import Given, choose
+from .doubts import NOT_CHECKED, CalibrationWarning
 from .given_images import check_exposure, check_light, sort_presses
-from .objections import CalibrationWarning
 from .presses import Press, check_presses
 
 
@@ -39,20 +39,20 @@ def calibrate(
         sensor: the sensor.
         presses: images of balls pressed anywhere; centers need not be known.
         progress: show a bar.
-        force: go on where the presses contradict the pitch or all diameters; that is then a warning.
+        force: go on where contacts are wider than their balls; that is then a warning.
     Returns:
         A :class:`Calibration`. Its ``report`` (:class:`torchvts.model.report.Report`) says which model it is and why, all doubts,
         and what became of each press.
     Raises:
         ValueError, TypeError: bad image: shape, dtype, range, black, saturated, greyscale; a sensor without coloured lights;
             presses of which none can be used; presses that are turned, mirrored, cropped or swapped otherwise than the
-            background, of another unit, or 12 bits stored in 16; contacts too wide for their balls, or balls of
-            another size than given, all alike, by the sensor's prior; with presses, a background that holds a contact; nothing but
-            lights to calibrate from, and their fit failed.
+            background, of another unit, or 12 bits stored in 16; contacts wider than their balls; nothing but lights to calibrate
+            from, and their fit failed.
     Warns:
-        CalibrationWarning: what was left out and why; the fit did not converge, the image does not constrain the lights, it
-            seems to hold a contact, or it does not have the pattern of light of the prior's sensor type. Presses then decide
-            whether the prior is used.
+        CalibrationWarning: each doubt: what was left out and why; the fit did not converge, the image does not constrain the
+            lights, it seems to hold a contact, or it does not have the pattern of light of the prior's sensor type, and presses
+            decide whether the prior is used; sizes that the prior or the presses contradict. What nothing could check is a doubt
+            without a warning.
     Source:
         eq. 6-8 of the paper for lights.
     Example:
@@ -77,5 +77,6 @@ def calibrate(
         report["presses"].insert(k, {"name": named[k].name, "used": False, "reason": reason})
     report["doubts"] = [f"{named[k].name}: left out: {reason}" for k, reason in left_out] + report["doubts"]
     for doubt in report["doubts"]:
-        warnings.warn(doubt, CalibrationWarning, stacklevel=2)
+        if not doubt.startswith(NOT_CHECKED):
+            warnings.warn(doubt, CalibrationWarning, stacklevel=2)
     return calibration

@@ -1,6 +1,7 @@
 """The calibration that the given images allow: by presses, else by the sensor's prior, else by point lights."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from torch import Tensor
@@ -9,10 +10,11 @@ from ..model.calibration import Calibration
 from ..model.report import Report, Tried
 from ..model.response_field import SensorPrior
 from ..model.sensor import Sensor
-from . import objections
+from . import resting
 from .by_lights import by_lights
 from .by_presses import by_presses
 from .contacts import Contact, NoUsablePress, used
+from .doubts import Doubt, impossible_width, not_checked, of_fitted_lights, of_presses, of_sizes, of_type
 from .field import Family
 from .given_images import colourless
 from .posterior import Evidence, prior_of
@@ -33,6 +35,15 @@ class Given(NamedTuple):
     force: bool
 
 
+class Made(NamedTuple):
+    """A calibration, what speaks against it, and models that were made before it and not taken."""
+
+    unit: Calibration
+    doubts: list[Doubt]
+    name: str
+    before: Sequence[Tried] = ()
+
+
 def choose(given: Given) -> Calibration:
     """The calibration; what was tried, and all doubts, are in its report.
 
@@ -40,24 +51,36 @@ def choose(given: Given) -> Calibration:
         ValueError: none can be made.
     """
     if given.presses:
-        unit, tried = _from_presses(given)
+        made = _from_presses(given)
     elif given.sensor.prior is not None:
-        unit, tried = _from_prior(given, given.sensor.prior)
+        made = _from_prior(given.background, given.sensor, given.sensor.prior)
     else:
-        unit, lights = by_lights(given.background, given.sensor, given.progress)
-        tried = [lights]
-    unit, more = objections.to_background_of_lights(unit)
-    report: Report = {**unit.report, "tried": tried}
-    report["doubts"] = list(dict.fromkeys([doubt for one in tried for doubt in one["doubts"]] + more))
-    if objection := objections.to_scale(report):
-        report["objection"] = objection
-    return dataclasses.replace(unit, report=report)
+        made = _from_lights(given)
+    texts = list(dict.fromkeys(doubt.text for doubt in made.doubts))
+    of_scale = list(dict.fromkeys(doubt.text for doubt in made.doubts if doubt.of_scale))
+    report: Report = {**made.unit.report, "tried": [*made.before, _tried(made)], "doubts": texts, "not_metric": of_scale}
+    return dataclasses.replace(made.unit, report=report)
 
 
-def _from_prior(given: Given, prior: SensorPrior) -> tuple[Calibration, list[Tried]]:
+def _tried(made: Made) -> Tried:
+    report = made.unit.report
+    spread = report.get("direction_std_deg") if report.get("converged") else None
+    error = report.get("held_out_deg") or report.get("prior_deg") or (max(spread) if spread else None)
+    return {"name": made.name, "error_deg": error, "doubts": [doubt.text for doubt in made.doubts]}
+
+
+def _from_lights(given: Given) -> Made:
+    unit, found = by_lights(given.background, given.sensor, given.progress)
+    doubts = [Doubt(text, True) for text in found]
+    if unit.report["source"] == "background":
+        unit, more = of_fitted_lights(unit)
+        doubts += more
+    return Made(unit, doubts, "point lights")
+
+
+def _from_prior(background: Tensor, sensor: Sensor, prior: SensorPrior) -> Made:
     """The prior of the sensor's type, transferred by the background: its posterior by no press."""
-    background, sensor = given.background, given.sensor
-    doubts = objections.to_background_of_prior(background, sensor)
+    doubts = of_type(background, sensor)
     if doubts and (no_colour := colourless(background)):
         raise ValueError(no_colour)
     model = prior.response if sensor.blur_px == 0 else dataclasses.replace(prior.response, blur_px=sensor.blur_px)
@@ -65,42 +88,37 @@ def _from_prior(given: Given, prior: SensorPrior) -> tuple[Calibration, list[Tri
     report: Report = {"model": "response", "source": "prior", "reason": reason, "prior_deg": prior.expected_deg}
     if prior.own_deg is not None:
         report["own_deg"] = prior.own_deg
-    if doubts:
-        report["objection"] = "; ".join(doubts)
     family = Family.of(prior.response.field)
     covariance = Evidence(family, ()).posterior(prior_of(family, (), prior)).covariance
     unit = Calibration.from_response(model, sensor, background, report, covariance)
-    return unit, [{"name": "prior", "error_deg": prior.expected_deg, "doubts": doubts}]
+    if not doubts and (contact := resting.read_as_frame(unit)):
+        doubts = [Doubt(contact, True)]
+    return Made(unit, doubts, "prior")
 
 
-def _from_presses(given: Given) -> tuple[Calibration, list[Tried]]:
+def _from_presses(given: Given) -> Made:
     """The posterior by presses, from the sensor's prior unless presses or background contradict it.
 
     Raises:
-        ValueError: no press can be used, or they contradict the pitch or all diameters.
+        ValueError: no press can be used, or contacts are wider than their balls.
     """
-    unit, contacts, tried, sizes = _fitted(given)
+    made, contacts = _fitted(given)
+    unit = made.unit
     assert unit.response is not None
-    refused = sizes or objections.to_sizes(contacts, given.sensor.mm_per_pixel)
-    refused = refused or objections.to_directions(unit.response.field, used(contacts))
-    if refused and not given.force:
-        raise ValueError(f"{refused}; force=True (--force) goes on all the same")
-    by_prior = "prior_deg" in unit.report
-    doubts = ([refused] if refused else []) + objections.to_contacts(contacts)
-    apart = [] if refused or by_prior else objections.to_diameters_by_others(used(contacts))
-    doubts += apart or ([] if refused else objections.to_deep_presses(contacts))
-    if by_prior and not refused:
-        doubts += objections.to_diameters_by_prior(used(contacts))
-    tried[-1]["doubts"] += doubts
-    report = unit.report.copy()
-    if refused or apart:
-        report["objection"] = refused or apart[0]
-    return with_contact(dataclasses.replace(unit, report=report), given.presses, contacts), tried
+    field, pitch_mm = unit.response.field, given.sensor.mm_per_pixel
+    impossible = impossible_width(field, contacts, pitch_mm)
+    if impossible and not given.force:
+        raise ValueError(f"{impossible}; force=True (--force) goes on all the same")
+    doubts = [*made.doubts, *of_presses(contacts, field, pitch_mm)]
+    if contact := resting.beside_presses(given.background, given.presses):
+        doubts.insert(0, Doubt(contact, True))
+    if not any(doubt.of_scale for doubt in doubts):
+        doubts.append(not_checked(contacts, field, given.sensor if "prior_deg" in unit.report else given.sensor.without_prior()))
+    return made._replace(unit=with_contact(unit, given.presses, contacts), doubts=doubts)
 
 
-def _fitted(given: Given) -> tuple[Calibration, list[Contact], list[Tried], str]:
-    """The fit from the prior, if there is one; without it where presses or background contradict it, and that is better. Last
-    comes why the prior contradicts all sizes, or "".
+def _fitted(given: Given) -> tuple[Made, list[Contact]]:
+    """The fit from the prior, if there is one; without it where presses or background contradict it, and that is better.
 
     Better is a fit that uses clearly more presses, or else has the lower held-out error. Without a held-out error it is the one
     from the prior: of one or two presses alone a field knows only their places.
@@ -108,41 +126,34 @@ def _fitted(given: Given) -> tuple[Calibration, list[Contact], list[Tried], str]
     background, sensor, presses, prior = given.background, given.sensor, given.presses, given.sensor.prior
     if prior is None:
         unit, contacts = by_presses(background, sensor, presses, None, given.progress)
-        return unit, contacts, [_tried(unit, "presses")], ""
-    strange = objections.to_background_of_prior(background, sensor)
-    first: Calibration | None = None
+        return Made(unit, [], "presses"), contacts
+    strange = of_type(background, sensor)
+    on_prior: Calibration | None = None
     try:
-        first, contacts = by_presses(background, sensor, presses, prior, given.progress)
+        on_prior, contacts = by_presses(background, sensor, presses, prior, given.progress)
     except NoUsablePress as error:
         contacts = error.contacts
+    sizes = [] if strange else of_sizes(contacts, sensor.mm_per_pixel)
+    first = None if on_prior is None else Made(on_prior, strange + sizes, "presses on the prior")
     left, count = len(used(contacts)), len(contacts)
     contradiction = "the background does not have its pattern of light" if strange else ""
     if not contradiction and left < LEAST_USED * count:
         contradiction = f"by the prior only {left} of {count} presses can be used"
-    sizes = "" if strange else objections.to_sizes_by_prior(contacts)
-    by_prior: list[Tried] = [] if first is None else [_tried(first, "presses on the prior")]
-    if by_prior:
-        by_prior[0]["doubts"] += strange
     if first is not None and not contradiction:
-        return first, contacts, by_prior, sizes
+        return first, contacts
     try:
         second, others = by_presses(background, sensor.without_prior(), presses, None, given.progress)
     except NoUsablePress:
         if first is None:
             raise
-        second = None
-    if first is not None and (second is None or not _better(second, first)):
-        return first, contacts, by_prior, sizes
-    assert second is not None
+        return first, contacts
+    if first is not None and not _better(second, first.unit):
+        return first, contacts
     why = f"calibrated from {len(used(others))} presses without the sensor's prior: {contradiction}"
     report: Report = {**second.report, "reason": f"{second.report['reason']}; {why}"}
-    alone = _tried(second, "presses")
-    alone["doubts"] += [*strange, why]
-    return dataclasses.replace(second, report=report), others, [*by_prior, alone], sizes if first is None else ""
-
-
-def _tried(unit: Calibration, name: str) -> Tried:
-    return {"name": name, "error_deg": unit.report["held_out_deg"], "doubts": []}
+    doubts = [*(Doubt(doubt.text) for doubt in strange), Doubt(why), *sizes]
+    before = [] if first is None else [_tried(first)]
+    return Made(dataclasses.replace(second, report=report), doubts, "presses", before), others
 
 
 def _better(second: Calibration, first: Calibration) -> bool:

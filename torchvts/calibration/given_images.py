@@ -8,10 +8,9 @@ import torch
 from torch import Tensor
 
 from ..core.arrays import array_of
-from ..core.blur import blur, gaussian_weights
 from ..core.views import TWELVE_BITS, Views
 from ..model.calibration import PEDESTAL, SATURATED
-from .contacts import DARK, MOST_SATURATED, channel_band
+from .contacts import DARK, MOST_SATURATED
 from .presses import Press
 
 UNIFORM_COLOUR = 0.05
@@ -28,13 +27,6 @@ FAINT = 0.03
 OTHER_UNIT = 0.12
 """Difference from the background, median over the skin and over the presses, logarithm of the image value, from which presses are
 of another unit, light or crop. It is at most 0.08 on 14 units, and 0.15 to 0.85 between units of different types."""
-
-CONTACT = 0.35
-"""A background holds a contact if its structure exceeds that of the presses, in a place, by this part of what theirs exceeds its
-own. The part is at most 0.2 on 14 units, and above 0.35 for 19 in 20 presses of theirs given as the background."""
-
-LEAST_STRUCTURE = 0.02
-"""Smallest such excess: less is noise. A press has 0.03 to 0.7."""
 
 
 def check_exposure(background: Tensor) -> None:
@@ -150,7 +142,7 @@ def sort_presses(background: Tensor, presses: Sequence[Press]) -> Sorted:
         presses: checked, with names.
     Raises:
         ValueError: presses that are saturated, much darker than the background, turned, mirrored, cropped or swapped otherwise, or
-            of another unit; a background much darker than the presses, or one that holds a contact.
+            of another unit; a background much darker than the presses.
     """
     if not presses:
         return Sorted([], [])
@@ -176,7 +168,6 @@ def sort_presses(background: Tensor, presses: Sequence[Press]) -> Sorted:
         if k not in reasons and (first := _first_like(presses, k)) != k:
             reasons[k] = f"it is {presses[first].name} once more"
     kept = [press for k, press in enumerate(presses) if k not in reasons]
-    _check_contact(background, kept)
     return Sorted(kept, sorted(reasons.items()))
 
 
@@ -206,30 +197,6 @@ def _check_levels(background: Tensor, presses: Sequence[Press]) -> None:
             bits = f"its largest value is {round(65535 * most)} of 65535: 12 bits stored in 16?"
             cause = bits if twelve else "black, or the LEDs were off"
             raise ValueError(f"{name}: expected a brightness like {other}, got {ratio:.0%} of it: {cause}")
-
-
-def _check_contact(background: Tensor, presses: Sequence[Press]) -> None:
-    """Raise if the background has structure, somewhere, that the presses lack there, as much as they have where they touch."""
-    own, theirs = _structure(background), torch.stack([_structure(press.image) for press in presses])
-    usual = theirs.median(dim=0).values if len(presses) > 2 else theirs.amax(dim=0)
-    excess, contact = float((own - usual).max()), float((theirs - own).flatten(1).amax(dim=1).median())
-    if excess > LEAST_STRUCTURE and excess > CONTACT * contact:
-        raise ValueError(
-            f"background: expected the skin without contact, got structure between the channels of {excess:.2f} in a place where "
-            f"the presses have none (their contacts have {contact:.2f}): was a press given as the background?"
-        )
-
-
-def _structure(image: Tensor) -> Tensor:
-    """Structure between the channels of an image (3, H, W), RMS around each of about 60 x 80 cells less a margin, (h, w).
-
-    As :func:`channel_structure`, but of each place.
-    """
-    band = channel_band(image, 60, min(image.shape[1:]))
-    height = min(band.shape[2:])
-    around = blur(band.square().sum(dim=1, keepdim=True), gaussian_weights(height / 20.0))[0, 0].sqrt()
-    margin = round(0.1 * height)
-    return around[margin : around.shape[0] - margin, margin : around.shape[1] - margin]
 
 
 def _cells(image: Tensor, rows: int) -> Tensor:

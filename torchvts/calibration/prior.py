@@ -13,12 +13,11 @@ from ..core.checks import check_image, check_record, check_sequence
 from ..model.calibration import Calibration
 from ..model.response_field import ResponseField, ResponseModel, SensorPrior, TaughtRange, fit_log_background
 from ..model.sensor import Sensor, check_sensor
-from . import objections
 from .by_presses import by_presses
 from .contacts import Contact, used
+from .doubts import CalibrationWarning
 from .field import Family, power_of
 from .given_images import sort_presses
-from .objections import CalibrationWarning
 from .posterior import Evidence, Prior, mean_error_deg
 from .presses import Press, check_presses
 from .response_fit import FEW, fit_depth_brightness, taught_range
@@ -94,7 +93,8 @@ def _fitted(unit: PriorUnit) -> tuple[Calibration, list[Contact]]:
     kept, left_out = sort_presses(background, named)
     calibration, contacts = by_presses(background, sensor.without_prior(), kept, None)
     messages = [f"{named[k].name}: left out: {reason}" for k, reason in left_out]
-    for message in messages + objections.to_contacts(contacts):
+    messages += [f"{contact.name}: left out: {contact.reason}" for contact in contacts if contact.reason]
+    for message in messages:
         warnings.warn(message, CalibrationWarning, stacklevel=3)
     return calibration, contacts
 

@@ -53,15 +53,21 @@ def with_contact(calibration: Calibration, presses: Sequence[Press], contacts: S
     return dataclasses.replace(calibration, contact_share=share, contact_decay_mm=decay_mm)
 
 
-def _depth_and_circle(calibration: Calibration, press: Press, contact: Contact) -> tuple[Tensor, Tensor, Tensor]:
-    """Depth of a press by one pass, where the skin has moved, and the circle of contact, (1, 1, H, W) each."""
+def depth_of(calibration: Calibration, image: Tensor) -> tuple[Tensor, Tensor]:
+    """Depth, mm, of an image (3, H, W) by one pass, and how surely its skin has moved, (1, 1, H, W) each."""
     sensor = calibration.sensor
     with torch.no_grad():
-        image = Compensate.from_calibration(calibration).float()(press.image.detach().cpu().float()[None])
+        compensated = Compensate.from_calibration(calibration).float()(image.detach().cpu().float()[None])
         block = NormalFromIntensity if calibration.lights is not None else NormalFromResponse
-        gradient = GradientFromNormal()(block.from_calibration(calibration).float()(image))
-        weight = ContactMask.from_calibration(calibration).float()(image, gradient)
-        depth = ZeroBackground(sensor.mm_per_pixel)(PoissonDCT(sensor.mm_per_pixel)(gradient * weight), weight)
+        gradient = GradientFromNormal()(block.from_calibration(calibration).float()(compensated))
+        weight = ContactMask.from_calibration(calibration).float()(compensated, gradient)
+        return ZeroBackground(sensor.mm_per_pixel)(PoissonDCT(sensor.mm_per_pixel)(gradient * weight), weight), weight
+
+
+def _depth_and_circle(calibration: Calibration, press: Press, contact: Contact) -> tuple[Tensor, Tensor, Tensor]:
+    """Depth of a press, where the skin has moved, and the circle of contact, (1, 1, H, W) each."""
+    sensor = calibration.sensor
+    depth, weight = depth_of(calibration, press.image)
     x, y = pixel_grid_mm(sensor.height, sensor.width, sensor.mm_per_pixel, torch.float64)
     away = (x - contact.center_mm[0]).square() + (y - contact.center_mm[1]).square()
     return depth, moved(weight, depth), (away < (contact.contact_radius_mm / WIDER) ** 2)[None, None]

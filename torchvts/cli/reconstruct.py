@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
     unit = load_calibration(calibration)
     print_report(report, arguments.out, None if arguments.network or unit.response is None else unit.response.taught)
     if not unit.metric:
-        print(f"{NOT_METRIC}: {unit.report['objection']}")
+        print(f"{NOT_METRIC}: {'; '.join(unit.report['not_metric'])}")
     if arguments.pictures is None and report.rows > PICTURES_UP_TO:
         print(f"no pictures of more than {PICTURES_UP_TO} frames: --pictures --overwrite draws all, --every N fewer")
     findings = diagnose_some(calibration, inputs, {name for name, _ in report.failed}, arguments.every)

@@ -87,8 +87,8 @@ def calibrated(background: Tensor, sensor: Sensor, presses: Sequence[Press], for
 def expected(calibration: Calibration) -> str:
     """How good depth is likely to be, from the held-out score, the record of the prior, or the spread of the lights."""
     report = calibration.report
-    if objection := report.get("objection"):
-        return f"{NOT_METRIC}: {objection}"
+    if doubts := report.get("not_metric"):
+        return f"{NOT_METRIC}: {'; '.join(doubts)}"
     if report["model"] == "point_lights":
         spread = report.get("direction_std_deg")
         if spread is None:

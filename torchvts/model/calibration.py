@@ -31,7 +31,7 @@ from .report import Report, read_report
 from .response_field import ResponseModel
 from .sensor import Sensor, check_sensor
 
-FORMAT_VERSION = 8
+FORMAT_VERSION = 9
 """Version of the calibration file. A file of another version is refused."""
 
 DEFECT_RATIO = 4.0
@@ -243,8 +243,8 @@ class Calibration:
 
     @property
     def metric(self) -> bool:
-        """Whether depth is in mm, as far as its calibration knows; ``report["objection"]`` says why not."""
-        return not self.report.get("objection")
+        """Whether depth is in mm, as far as its calibration knows; ``report["not_metric"]`` says why not."""
+        return not self.report.get("not_metric")
 
     @cached_property
     def flat(self) -> Tensor:

@@ -71,10 +71,9 @@ class Report(_ReportKeys, total=False):
         model: which model the calibration holds.
         source: where the model comes from, see :data:`Source`.
         reason: why this model was chosen.
-        objection: why depth is not metric, as far as is known: a prior on a background that is not of its type, sizes that the
-            presses contradict, lights that are not this unit's or not determined. Absent where nothing speaks against it.
         tried: all models that were made, the taken one last.
-        doubts: all that speaks against the calibration, a sentence each with its remedy.
+        doubts: all that speaks against the calibration, a sentence each with its remedy; what nothing could check comes last.
+        not_metric: those of them that put the scale of depth in doubt; empty where depth is in mm.
         presses: one row per press.
         held_out_deg: mean error on presses by a response fitted to the other presses, degrees; None with too few presses.
         own_deg: mean error on the very presses that a response, or its prior, was fitted to, degrees.
@@ -93,14 +92,13 @@ class Report(_ReportKeys, total=False):
         inlier_fraction: share of the pixels that the robust fit kept.
         gloss: (3,), strength of the specular lobe.
         residual_std: (3,), robust standard deviation of background minus model, linear light.
-        standing_out: share of the background that differs clearly from the lights' model.
         camera_height_mm: height of a pinhole camera above the skin, where it is known.
     """
 
     reason: str
-    objection: str
     tried: list[Tried]
     doubts: list[str]
+    not_metric: list[str]
     presses: list[PressRow]
     held_out_deg: float | None
     own_deg: float
@@ -118,7 +116,6 @@ class Report(_ReportKeys, total=False):
     inlier_fraction: float
     gloss: list[float]
     residual_std: list[float]
-    standing_out: float
     camera_height_mm: float
 
 

@@ -39,7 +39,7 @@ def expected_model_deg(calibration: Calibration) -> float:
     record of its sensor's prior. A field that starts from a prior has the errors of both, by their weights.
     """
     report = calibration.report
-    if report.get("objection"):
+    if report.get("not_metric"):
         return NOT_METRIC_DEG
     by_type, held_out = report.get("prior_deg") or UNMEASURED_DEG, report.get("held_out_deg")
     used = max(1, sum(bool(row.get("used")) for row in report.get("presses", [])))
@@ -59,7 +59,7 @@ def model_log_variance(calibration: Calibration) -> float:
     Held-out presses state it within a quarter; one press alone, or a prior, within a factor of 1.6.
     """
     report = calibration.report
-    if report.get("objection"):
+    if report.get("not_metric"):
         return 0.0
     used = max(1, sum(bool(row.get("used")) for row in report.get("presses", [])))
     if report.get("held_out_deg"):

@@ -257,9 +257,8 @@ def use_calibration(calibration: Calibration) -> StreamCalibration:
 
 def _described(calibration: Calibration, note: str) -> StreamCalibration:
     """With why depth is not metric, which the calibration itself says."""
-    objection = calibration.report.get("objection", "")
-    if objection:
-        note = "; ".join([note] + ([] if objection in note else [objection]) + [NOT_METRIC])
+    if doubts := calibration.report.get("not_metric", []):
+        note = "; ".join([note, *(doubt for doubt in doubts if doubt not in note), NOT_METRIC])
     return StreamCalibration(calibration, note, calibration.metric)
 
 

@@ -1,0 +1,287 @@
+"""What speaks against given presses, sizes and backgrounds: doubts, each a sentence with its figure and its remedy."""
+
+import dataclasses
+import math
+import statistics
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..core.arrays import array_of
+from ..core.views import Views
+from ..model.calibration import SATURATED, Calibration
+from ..model.report import Report
+from ..model.response_field import ResponseField
+from ..model.sensor import Sensor
+from .by_lights import NOTHING_LEFT
+from .contacts import Contact, differing, used
+from .field import Family, seen_slopes
+
+SURE = 2.5
+"""Standard deviations from which a doubt is raised: one in 80 of right sets, if they are Gaussian."""
+
+UNIT_GAIN = 0.15
+"""Standard deviation of the logarithm of a unit's slopes by the prior of its type over the true ones: 0.87 to 1 on three GelSight
+Minis, 0.7 to 1 by priors of one unit."""
+
+PRESS_GAIN = 0.1
+"""The same of one press over the unit's: of single presses of two Minis and two DIGITs, 7 in 200 are beyond a factor of 1.42."""
+
+WIDTH_ERROR = 0.05
+"""Standard deviation of the width of a contact, in radii of the ball, that all presses of a set share: where its rim is seen."""
+
+MANY, DISAGREEING = 6, 1.8
+"""From so many presses, and so many standard deviations of their gains about the median (RMS), presses disagree with each other:
+sets of right presses of ten real and eight drawn sensors have at most 1.64, with two balls exchanged or doubled 1.6 to 4.3."""
+
+RIM_SINE = 0.7
+"""Part of a ball's sine that is left at the rim of its contact: about the middle of its fall."""
+
+UNSEEN = 0.5
+"""A direction of slopes of which a field finds less than this part of what it finds of the other is not seen: it is 0.86 to 1 on
+twelve real sets and eight drawn sensors, 0.3 and 0.4 with LEDs on one line."""
+
+SAME_TYPE = 0.27
+"""Median difference of a background from the prior's pattern, logarithm of the light, up to which a unit is of the prior's type: it
+is 0.03 to 0.08 on three GelSight Minis and 0.06 and 0.26 on two DIGITs, at most 0.24 with the frame shifted by 8 %, and at least
+0.30 on 18 sensors of other types."""
+
+
+SHIFTED = 0.15
+"""The same, from which a frame is cropped otherwise, not only shifted as units are: whole frames of a GelSight Mini have 0.17."""
+
+
+STANDING_OUT = 0.01
+"""Share of a background that differs clearly from fitted lights, from which it may hold a contact."""
+
+
+NOT_CHECKED = "not checked"
+"""How the doubt begins that says what no image could show: it is no warning."""
+
+
+class CalibrationWarning(UserWarning):
+    """A calibration was made but should not be trusted as it is."""
+
+
+class Doubt(NamedTuple):
+    """A sentence, and whether it puts the scale of depth in doubt."""
+
+    text: str
+    of_scale: bool = False
+
+
+def of_presses(contacts: Sequence[Contact], field: ResponseField, pitch_mm: float) -> list[Doubt]:
+    """Presses that were left out, sizes that the presses themselves contradict, and slopes that are not seen.
+
+    Args:
+        contacts: of all presses, located.
+        field: fitted to those that are used.
+        pitch_mm: pixel pitch, mm.
+    """
+    good = used(contacts)
+    found = [Doubt(f"{contact.name}: left out: {contact.reason}") for contact in contacts if contact.reason]
+    found += _sizes_by_each_other(good) + _directions(field, good)
+    wide, std = width_of(field, good, pitch_mm)
+    return [*found, Doubt(_too_wide(wide, std, pitch_mm), True)] if wide > 1.0 - std else found
+
+
+def of_sizes(contacts: Sequence[Contact], pitch_mm: float) -> list[Doubt]:
+    """Diameters that are all wrong by the same factor, or a wrong pitch, which only a prior can show.
+
+    Args:
+        contacts: of all presses, located by the prior, with their gains.
+        pitch_mm: pixel pitch, mm.
+    """
+    gains = [math.log(max(contact.metrics["gain"], 1e-3)) for contact in contacts if "gain" in contact.metrics]
+    if not gains:
+        return []
+    gain, std = statistics.median(gains), _std_by_prior(len(gains))
+    if abs(gain) < SURE * std:
+        return []
+    low, high = (math.exp(gain + sign * std) for sign in (-1.0, 1.0))
+    return [
+        Doubt(
+            f"presses: by the sensor's prior the balls seem {math.exp(-gain):.2f} times as wide as given, units differ by "
+            f"{std:.0%}: diameters that are {1 / high:.2f} to {1 / low:.2f} times as large, or an mm_per_pixel of "
+            f"{low * pitch_mm:.3g} to {high * pitch_mm:.3g}, would fit: measure both",
+            True,
+        )
+    ]
+
+
+def _std_by_prior(count: int) -> float:
+    return math.hypot(UNIT_GAIN, PRESS_GAIN / math.sqrt(count))
+
+
+def _sizes_by_each_other(good: Sequence[Contact]) -> list[Doubt]:
+    """Presses that contradict each other all over, so that none stands out: sizes exchanged, or one size given for two."""
+    known = [contact.metrics for contact in good if "gain_std" in contact.metrics]
+    if len(known) < MANY:
+        return []
+    logs = [math.log(max(metrics["gain"], 1e-3)) for metrics in known]
+    middle = statistics.median(logs)
+    apart = math.sqrt(statistics.mean(((log - middle) / one["gain_std"]) ** 2 for log, one in zip(logs, known, strict=True)))
+    if apart < DISAGREEING:
+        return []
+    return [
+        Doubt(
+            f"presses: by each other the balls seem {math.exp(-max(logs)):.2f} to {math.exp(-min(logs)):.2f} times as wide as "
+            "given: are diameters exchanged, or one given for two sizes, or images saturated or compressed? --candidates prints "
+            "what each press says",
+            True,
+        )
+    ]
+
+
+def _directions(field: ResponseField, good: Sequence[Contact]) -> list[Doubt]:
+    """Slopes of one direction that are not seen."""
+    _, parts, directions = torch.linalg.svd(seen_slopes(field, good))
+    seen = float(parts[1] / parts[0].clamp_min(1e-6))
+    if seen > UNSEEN:
+        return []
+    angle = math.degrees(math.atan2(float(directions[1, 1]), float(directions[1, 0]))) % 180.0
+    return [
+        Doubt(
+            f"presses: slopes along {angle:.0f} degrees from x are found {seen:.2f} times as large as those across (usual: 0.86 "
+            "and more): LEDs on one line show no slopes across it: put one beside the line",
+            True,
+        )
+    ]
+
+
+def width_of(field: ResponseField, good: Sequence[Contact], pitch_mm: float) -> tuple[float, float]:
+    """Width of contacts in radii of their balls, median, and its standard deviation; (0, 0) where all were given."""
+    family, weight = Family.of(field), field.tensor()
+    widths = [_free_width(c, weight @ family.terms(c), pitch_mm) for c in good if not (c.known and c.radius_known)]
+    if not widths:
+        return 0.0, 0.0
+    median = statistics.median(widths)
+    spread = statistics.median(abs(width - median) for width in widths) / 0.6745
+    return median, math.hypot(WIDTH_ERROR, spread / math.sqrt(len(widths)))
+
+
+def _free_width(contact: Contact, sine: Tensor, pitch_mm: float) -> float:
+    """Radius at which the sine (2, N) has ceased to rise as that of a ball does, in radii of the given ball.
+
+    A sine rises evenly as long as the skin lies on a ball of whatever size, so this knows nothing of the given diameter.
+    """
+    dx, dy, r = contact.polar()
+    inward, ball = -(sine * torch.stack((dx, dy))).sum(0) / r.clamp_min(1e-9), r / contact.radius_mm
+    core = r < 0.5 * contact.contact_radius_mm
+    rise = float((inward * ball)[core].sum() / ball[core].square().sum().clamp_min(1e-9))
+    ring = (r / pitch_mm).round().long()
+    kept, count = (ring > 0) & ~contact.saturated, int(ring.max()) + 1
+    total = torch.zeros(2, count, dtype=torch.float64).index_add_(1, ring[kept], torch.stack((inward, ball))[:, kept])
+    total = torch.nn.functional.avg_pool1d(total[None], 5, 1, 2)[0]
+    below = total[0] < RIM_SINE * rise * total[1]
+    start = max(2, int(0.5 * contact.contact_radius_mm / pitch_mm))
+    ends = below[start:].nonzero()
+    return (start + (int(ends[0]) if len(ends) else count - start)) * pitch_mm / contact.radius_mm
+
+
+def impossible_width(field: ResponseField, contacts: Sequence[Contact], pitch_mm: float) -> str:
+    """That contacts are wider than their balls, by more than the error of that; "" where they need not be."""
+    wide, std = width_of(field, used(contacts), pitch_mm)
+    return _too_wide(wide, std, pitch_mm) if wide > 1.0 + SURE * std else ""
+
+
+def _too_wide(wide: float, std: float, pitch_mm: float) -> str:
+    return (
+        f"presses: expected contacts narrower than their balls, got {wide:.2f} +- {std:.2f} times as wide: either mm_per_pixel, "
+        f"{pitch_mm:g}, is too large (at most {pitch_mm / wide:.3g} is possible), or radii were given for diameters"
+    )
+
+
+def not_checked(contacts: Sequence[Contact], field: ResponseField, sensor: Sensor) -> Doubt:
+    """What the images cannot show of sizes and pitch.
+
+    Args:
+        contacts: of all presses.
+        field: fitted to those that are used.
+        sensor: with the prior that they were fitted from, if any.
+    """
+    if sensor.prior is not None:
+        return Doubt(
+            f"{NOT_CHECKED}: the sensor's prior shows a wrong diameter or mm_per_pixel only beyond a factor of "
+            f"{math.exp(SURE * _std_by_prior(len(used(contacts)))):.1f}: scale rests on what was given; an object of known height "
+            "would check it"
+        )
+    wide = width_of(field, used(contacts), sensor.mm_per_pixel)[0]
+    limit = f", and no contact is wider than its ball with an mm_per_pixel up to {sensor.mm_per_pixel / wide:.3g}" if wide else ""
+    return Doubt(
+        f"{NOT_CHECKED}: without a prior the images say nothing of the size of all balls, or of mm_per_pixel: scale rests on what "
+        f"was given{limit}; an object of known height would check it"
+    )
+
+
+def of_type(background: Tensor, sensor: Sensor) -> list[Doubt]:
+    """A background of another sensor type than the prior's, turned, swapped or cropped otherwise.
+
+    Args:
+        background: (3, H, W) in [0, 1].
+        sensor: with a prior.
+    Example:
+        >>> sensor = Sensor.load("gelsight_mini")
+        >>> image = sensor.prior.background(240, 320, 0.0634).clamp(0, 1)
+        >>> of_type(image, sensor), "turned by 180" in of_type(image.flip(1, 2), sensor)[0].text
+        ([], True)
+    """
+    assert sensor.prior is not None
+    light = background.detach().cpu().float() ** sensor.prior.response.gamma
+    usual = sensor.prior.background(sensor.height, sensor.width, sensor.mm_per_pixel).float().clamp_min(1e-3)
+    views = Views(array_of(usual))
+    cells = views.cells(array_of(light * (usual.mean() / light.mean())))
+    seen = f"its pattern of light is not that of the unit on which the prior of sensor '{sensor.name}' was fitted"
+    difference, view = views.difference(cells), views.other(cells)
+    if view is not None and not (view.cropped and difference < SHIFTED):
+        return [Doubt(f"background: {seen}: it {view.in_words()}: turn, swap or crop the images as the sensor's are", True)]
+    if difference <= SAME_TYPE:
+        return []
+    return [
+        Doubt(
+            f"background: {seen}: they differ by {difference:.0%} in the median, at most {SAME_TYPE:.0%} is usual, and no turned, "
+            "mirrored or channel-swapped one fits: another sensor type, or an LED failed: give presses of a ball",
+            True,
+        )
+    ]
+
+
+def of_fitted_lights(unit: Calibration) -> tuple[Calibration, list[Doubt]]:
+    """A background that differs from the lights that were fitted to it: smoothly, in places, or as a gloss would; the calibration
+    with the residual in its report."""
+    model = unit.model_image
+    spread = (model - unit.background).abs().flatten(1).median(dim=1).values / 0.6745
+    # contact changes the light by more than 5 % and is wider than dirt: 5 sigmas of the residual and of 1 % of the model
+    saturated = (unit.background > SATURATED) | (model > 0.95)
+    change = (unit.background - model).masked_fill(saturated, 0.0)
+    standing_out = float(differing(change, spread.reshape(3, 1, 1) + 0.01 * model).double().mean())
+    report: Report = {**unit.report, "residual_std": spread.tolist()}
+    left = max(report.get("misfit", [0.0]))
+    found = []
+    if left > NOTHING_LEFT:
+        found.append(
+            Doubt(
+                f"background: the lights leave a smooth misfit of {left:.1%} of it (vignetting, scattered light, another gamma?): "
+                f"depth may be wrong by {min(1.0, 30.0 * left):.0%}: press a ball three times to measure it",
+                True,
+            )
+        )
+    if standing_out > STANDING_OUT:
+        found.append(
+            Doubt(
+                f"background: {standing_out:.1%} of the image differs from the fitted lights by more than 5 times their residual "
+                f"({', '.join(f'{v:.4f}' for v in spread.tolist())}): contact in the calibration image? take it again without",
+                True,
+            )
+        )
+    if unit.lights is not None and unit.lights.glossy:
+        found.append(
+            Doubt(
+                f"background: it fits a skin with a gloss of {float(unit.lights.gloss.max()):.2f}, and hardly worse a matt one and "
+                "a camera whose black is a fraction of a grey level above 0, or frames that were averaged: one image cannot tell "
+                "them apart, and depth differs by a tenth or more: press a ball three times to measure it"
+            )
+        )
+    return dataclasses.replace(unit, report=report), found

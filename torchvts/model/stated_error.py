@@ -27,8 +27,8 @@ NOT_METRIC_DEG = 20.0
 CELLS = 60
 """Cells along the shorter side of the image on which the error is stated."""
 
-PRESSED_SINE = 0.4
-"""Sine of the slopes whose error tells where to press next: the usual rim of a ball."""
+PRESSED_SINE = 0.25
+"""Sine of the slopes whose error tells where to press next: root mean square over the contact of a ball, usually."""
 
 
 def variance_of(factors: Tensor, covariance: Tensor) -> Tensor:
@@ -204,8 +204,8 @@ def press_next(calibration: Calibration) -> tuple[tuple[int, int], float] | None
     per_change = response.field.maps(sensor.height, sensor.width, sensor.mm_per_pixel)[:3, :, y, x].permute(2, 1, 0)  # (N, 2, 3)
     angle = torch.arange(8, dtype=torch.float64) * (math.pi / 4.0)
     change = CHANGE_SCALE * PRESSED_SINE * torch.linalg.pinv(per_change) @ torch.stack((angle.cos(), angle.sin()))  # (N, 3, 8)
-    mean = block.products(change.permute(1, 0, 2)[None]).mean(dim=(2, 3), keepdim=True)
-    error = block.of_products(mean)[0, 0]
+    products = block.products(change[..., None]).mean(dim=(2, 3), keepdim=True)  # (N, P, 1, 1)
+    error = torch.cat([block.of_products(one[None])[0] for one in products]).median(dim=0).values  # a press may lie in the dark
     margin = round(float(radius.median()) / block.cell)
     down, across = (min(margin, (size - 1) // 2) for size in error.shape)
     inner = error[down : error.shape[0] - down, across : error.shape[1] - across]

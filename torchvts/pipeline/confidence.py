@@ -1,9 +1,7 @@
 """Confidence: bounds of the error of normals and depth, per pixel and per frame, and what they are made of.
 
-The bounds come from what is known before the frame (noise of the camera, conditioning of the inverse model, error of the model on
-held-out presses or of its fit) and from what the frame itself shows: its own noise, light that the model does not explain, slopes
-that are not integrable, dark or saturated channels, deformation too faint for the mask. They do not cover what no frame shows: a
-wrong pitch, a camera that is not orthographic, a calibration of another unit.
+A bound is the 95 % quantile of a sum of variances: noise, spread, model, surface. It does not cover what no frame shows: a wrong
+pitch or ball, a camera that is not orthographic.
 """
 
 import math
@@ -99,8 +97,9 @@ class Bounds(NamedTuple):
         normal_95_deg: (B, 1, H, W), within which the error of the normal lies with a probability of 95 %.
         depth_95_mm: (B, 1, H, W), the same for depth.
         confidence: (B, 1, H, W), probability that the normal is within :data:`USEFUL_DEG` of the truth.
-        frame_confidence: (B,), mean of ``confidence`` over the contact, 1 without contact, times s^4 / (s^4 + m^4): s is the root
-            mean square slope of the contact, :data:`UNSEEN_DEG` without one, m the slope that undeformed skin could hide.
+        frame_confidence: (B,), mean of ``confidence`` over the contact, without one over all of the frame, times s^4 / (s^4 + m^4):
+            s is the root mean square slope of the contact, :data:`UNSEEN_DEG` without one, m the slope that undeformed skin could
+            hide. 0 where a frame has collapsed; :func:`torchvts.pipeline.doubts_of` says why.
         factors_deg: (B, 4, H, W), the standard deviations along one axis that the bound of the normal is made of, in the order of
             :data:`FACTORS`.
     """

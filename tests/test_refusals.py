@@ -34,7 +34,7 @@ MODULES = {
     "scenes.": vts.scenes,
 }
 RECORDS = {
-    "Bounds", "Calibration", "CalibrationWarning", "Conditions", "ConfidentOutput", "DepthOutput", "Diagnosis", "Diagnosis.of",
+    "Calibration", "CalibrationWarning", "Conditions", "ConfidentOutput", "DepthOutput", "Diagnosis", "Diagnosis.of",
     "DiscontinuitySolution", "Finding", "LightFit", "MlpFit", "Registration", "Result", "export.ExportCheck", "export.Format",
     "gs_sdk.GsSdkFolder", "gs_sdk.GsSdkPress", "objects.Target", "scenes.Scene",
     "stream.Reader", "stream.TactileFrame", "stream.Unreadable",

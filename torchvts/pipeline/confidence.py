@@ -90,8 +90,8 @@ AROUND = 30
 """Slopes that no surface can have tell of the error in so many parts of the shorter side around them."""
 
 
-class Bounds(NamedTuple):
-    """Bounds of the errors of a frame.
+class ConfidentOutput(NamedTuple):
+    """The fields of :class:`~torchvts.core.frame.DepthOutput`, then how far they may be off.
 
     Attributes:
         normal_95_deg: (B, 1, H, W), within which the error of the normal lies with a probability of 95 %.
@@ -103,16 +103,6 @@ class Bounds(NamedTuple):
         factors_deg: (B, 4, H, W), the standard deviations along one axis that the bound of the normal is made of, in the order of
             :data:`FACTORS`.
     """
-
-    normal_95_deg: Tensor
-    depth_95_mm: Tensor
-    confidence: Tensor
-    frame_confidence: Tensor
-    factors_deg: Tensor
-
-
-class ConfidentOutput(NamedTuple):
-    """The fields of :class:`DepthOutput`, then those of :class:`Bounds`: how far the former may be off."""
 
     depth_mm: Tensor
     gradient: Tensor
@@ -276,8 +266,8 @@ class Confidence(nn.Module):
         options["pattern"] = float((calibration.background + PEDESTAL).log().flatten(1).std(dim=1).square().mean().sqrt())
         return cls(block, noise, calibration.noise_std, error, sensor.mm_per_pixel, **options)
 
-    def forward(self, images: Tensor, compensated: Tensor, out: DepthOutput, light: Tensor | None = None) -> Bounds:
-        """Bounds of a frame.
+    def forward(self, images: Tensor, compensated: Tensor, out: DepthOutput, light: Tensor | None = None) -> ConfidentOutput:
+        """The output, and its bounds.
 
         Args:
             images: (B, 3, H, W), the input of the pipeline.
@@ -327,8 +317,10 @@ class Confidence(nn.Module):
         # the inverse of bound_at
         likely = 1.0 - torch.exp(math.log(0.05) * (self.useful_deg / normal_95) ** (2.0 / self.spread))
         frame = self._of_frame(likely, out, torch.rad2deg(unseen))
-        parts = torch.cat((noise.sqrt(), spread.sqrt(), model.sqrt(), surface.sqrt()), dim=1)
-        return Bounds(normal_95, depth_95, likely, frame, torch.rad2deg(parts))
+        parts = torch.rad2deg(torch.cat((noise, spread, model, surface), dim=1).sqrt())
+        return ConfidentOutput(
+            out.depth_mm, out.gradient, out.normal, out.contact, out.deformed, normal_95, depth_95, likely, frame, parts
+        )
 
     def _of_frame(self, likely: Tensor, out: DepthOutput, unseen: Tensor) -> Tensor:
         """Mean confidence over the contact, of all of the frame without, and how sure it is that no contact was missed: (B,)."""
@@ -510,19 +502,8 @@ class ConfidentPipeline(nn.Module):
         out: DepthOutput = self.pipe(images)
         compensate = self.pipe.compensate
         light = compensate.light_of(images) if self.relights else None
-        bounds: Bounds = self.confidence(images, compensate(images), out, light)
-        return ConfidentOutput(
-            out.depth_mm,
-            out.gradient,
-            out.normal,
-            out.contact,
-            out.deformed,
-            bounds.normal_95_deg,
-            bounds.depth_95_mm,
-            bounds.confidence,
-            bounds.frame_confidence,
-            bounds.factors_deg,
-        )
+        bounded: ConfidentOutput = self.confidence(images, compensate(images), out, light)
+        return bounded
 
 
 def _smooth(values: Tensor) -> Tensor:

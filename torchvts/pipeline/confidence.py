@@ -30,7 +30,7 @@ from ..core.geometry import GradientFromNormal
 from ..core.noise import noise_std as frame_noise_std
 from ..integration import PoissonBackground
 from ..model.calibration import PEDESTAL, SATURATED, Calibration, check_calibration
-from ..model.response_field import CHANGE_SCALE
+from ..model.response_field import CHANGE_SCALE, MAX_SLOPE
 from ..model.stated_error import StatedError
 from ..normals import NormalFromIntensity, NormalFromResponse, as_normal_model
 from ..skin import ContactSettings, unseen_deg
@@ -85,6 +85,9 @@ MISFIT_SHARE = 3.0
 
 FAINT_PATTERN = 0.1
 """Pattern of light over which an uneven change of it shows a gamma: presses make one of 0.03, and gammas differ by 0.3."""
+
+MISSED = 0.15
+"""Radius, over the shorter side of the image, of a contact that may be missed, as steep as could have hidden: half of that deep."""
 
 AROUND = 30
 """Slopes that no surface can have tell of the error in so many parts of the shorter side around them."""
@@ -153,6 +156,7 @@ class Confidence(nn.Module):
 
     Depth. White errors of slope grow with the logarithm of the contact's size. Those of model and spread add up along the way, by
     three integrations: all slopes too steep, and all tilted in x and in y. What another pass would change is integrated as it is.
+    Where the skin has not moved, a small contact as steep as could have hidden may have been missed.
 
     Args:
         normals: the calibrated block of the pipeline.
@@ -228,7 +232,8 @@ class Confidence(nn.Module):
         self.quantile = quantile_95(presses)
         self.clipped_variance, self.per_mean = math.radians(CLIPPED_DEG) ** 2, math.radians(1.0) / SPREAD_OF_MEAN
         self.cells, self.sure, self.least_spread, self.faint_deg = CELLS, RISE[1], LEAST_SPREAD, UNSEEN_DEG
-        self.useful_deg, self.around = USEFUL_DEG, AROUND
+        self.useful_deg, self.around, self.steepest = USEFUL_DEG, AROUND, math.atan(MAX_SLOPE)
+        self.missed_mm = 0.5 * MISSED * min(noise_std.shape[1:]) * mm_per_pixel
         self.black, self.saturated = BLACK, SATURATED
         self.usual_change = CHANGE_SCALE
         self.curl_share, self.edge_share, self.edge_depth_share = CURL_SHARE, EDGE_SHARE, EDGE_DEPTH_SHARE
@@ -313,7 +318,9 @@ class Confidence(nn.Module):
         bound = self.quantile * torch.sqrt(noise + spread + model + surface + 1e-12)
         hidden = torch.sqrt(unseen.square()[:, None, None, None] + self.quantile**2 * noise)
         normal_95 = torch.rad2deg(torch.where(out.deformed, bound, hidden)).clamp_max(180.0)
+        missed_mm = self.missed_mm * torch.tan(hidden.clamp_max(self.steepest))
         depth_95 = self._depth_95(out, self.gradient(again), inside, noise + surface, model + spread)
+        depth_95 = depth_95 + missed_mm * (1.0 - inside)
         # the inverse of bound_at
         likely = 1.0 - torch.exp(math.log(0.05) * (self.useful_deg / normal_95) ** (2.0 / self.spread))
         frame = self._of_frame(likely, out, torch.rad2deg(unseen))
